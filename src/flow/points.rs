@@ -1,0 +1,7 @@
+//! Points and rigid transforms: the vocabulary that every other room shares.
+
+/// A point or a displacement: x, y, z in metres (x forward, y left, z up in lidar convention).
+pub type Point = [f32; 3];
+
+/// A rigid motion, column vectors, metres. Named `target_from_source` where it is stored.
+pub type RigidTransform = nalgebra::Isometry3<f64>;

@@ -1,0 +1,17 @@
+//! Scene flow as a service: two lidar clouds in, the motion of every point out.
+//!
+//! ```text
+//! file - formats -> Problem -> flow::estimate -> Estimate -> formats - file
+//!                                  preprocess -> distance -> backend.start(distance, field)
+//!                                  loop { forward, query, backward, adam } -> early stop -> best flow
+//! ```
+//!
+//! [`flow`] is the numerics and knows nothing of files, clocks or services; everything else may
+//! know [`flow`].
+
+pub mod flow;
+
+#[cfg(feature = "service")]
+pub mod formats;
+#[cfg(feature = "service")]
+pub mod picture;

@@ -1,0 +1,3 @@
+//! The `fnsf` program: parse, dispatch, exit code.
+
+fn main() {}
