@@ -2,6 +2,17 @@
 //!
 //! No async, no input or output, no clock, no environment, no globals.
 
+pub mod backend;
+pub mod cpu;
+pub mod distance;
+mod early_stop;
+pub mod field;
+mod optimizer;
+mod options;
 mod points;
+mod random;
+mod watch;
 
+pub use options::*;
 pub use points::{Point, RigidTransform};
+pub use watch::*;

@@ -1,0 +1,66 @@
+//! The CPU backend: vector kernels on all cores. Knows nothing of the GPU backend.
+
+mod kernels;
+mod lanes;
+mod trainer;
+
+pub use kernels::Isa;
+
+use std::sync::Arc;
+
+use super::backend::{Backend, BackendError, Trainer};
+use super::distance::DistanceTransform;
+use super::options::Options;
+use super::points::Point;
+use kernels::Kernels;
+
+/// The CPU, or a set of its threads.
+pub struct CpuBackend {
+    isa: Isa,
+    kernels: Kernels,
+    threads: Arc<rayon::ThreadPool>,
+}
+
+impl CpuBackend {
+    /// The CPU's fastest instruction set on `threads` threads; on all cores where none are named.
+    ///
+    /// # Errors
+    /// Where the operating system gives no threads.
+    pub fn new(threads: Option<usize>) -> Result<Self, BackendError> {
+        Self::with_isa(Isa::available()[0], threads)
+    }
+
+    /// As [`Self::new`], with an instruction set of [`Isa::available`].
+    ///
+    /// # Errors
+    /// Where the operating system gives no threads.
+    ///
+    /// # Panics
+    /// Where the machine lacks the instruction set.
+    pub fn with_isa(isa: Isa, threads: Option<usize>) -> Result<Self, BackendError> {
+        let threads = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads.unwrap_or(0))
+            .thread_name(|i| format!("fnsf-cpu-{i}"))
+            .build()
+            .map_err(|error| BackendError::Threads(error.to_string()))?;
+        Ok(Self { isa, kernels: Kernels::new(isa), threads: Arc::new(threads) })
+    }
+}
+
+impl Backend for CpuBackend {
+    fn name(&self) -> String {
+        format!("cpu ({}, {} threads)", self.isa.name(), self.threads.current_num_threads())
+    }
+
+    fn start(
+        &self,
+        source: &[Point],
+        target: &[Point],
+        options: &Options,
+    ) -> Result<Box<dyn Trainer>, BackendError> {
+        let distance =
+            self.threads.install(|| DistanceTransform::build(source, target, &options.distance))?;
+        let threads = Arc::clone(&self.threads);
+        Ok(Box::new(trainer::CpuTrainer::new(self.kernels, threads, distance, source, options)))
+    }
+}

@@ -1,0 +1,137 @@
+//! Exact Euclidean distance transform in a narrow band, on bricks of 8x8x8 vertices.
+//!
+//! Space is empty almost everywhere: only bricks within the band of a target point are stored,
+//! with 16-bit distances; beyond the band a coarse far field goes on, so that a lost point is still
+//! pulled home. Deterministic whatever the number of threads. FNSF Section 3.2, eq. 4 and 5.
+
+use super::activate::{ABSENT, Index, VOLUME, within};
+use super::far::FarField;
+use super::grid::{Grid, trilinear};
+use super::options::{DistanceError, DistanceOptions};
+use super::{Sample, build};
+use crate::flow::Point;
+
+/// Marks a vertex of an active brick that lies beyond the band.
+pub(crate) const BEYOND: u16 = u16::MAX;
+
+/// The transform: distances at the vertices of active bricks, and a far field.
+#[derive(Debug)]
+pub struct Bricks {
+    grid: Grid,
+    inverse_cell: f32,
+    /// Metres of one code.
+    scale: f32,
+    index: Index,
+    /// 512 codes an active brick: distance in units of `scale`, or [`BEYOND`].
+    codes: Vec<u16>,
+    far: FarField,
+}
+
+impl Bricks {
+    /// Transforms `target` over a grid that covers both clouds.
+    ///
+    /// # Errors
+    /// [`DistanceError`] where the options make no sense, the clouds span too much space, or the
+    /// transform would take more than `options.max_bytes`.
+    pub fn build(
+        source: &[Point],
+        target: &[Point],
+        options: &DistanceOptions,
+    ) -> Result<Self, DistanceError> {
+        options.check()?;
+        let grid = Grid::covering(source, target, options.cell_m)?;
+        let mut cells: Vec<_> = target.iter().map(|&p| grid.nearest_vertex(p)).collect();
+        cells.sort_unstable();
+        cells.dedup();
+        let band = options.band_cells();
+        let index = Index::activate(&grid, &cells, band)?;
+        let needed = index.bytes()
+            + index.active * VOLUME * size_of::<u16>()
+            + FarField::bytes_over(&grid);
+        if needed > options.max_bytes {
+            return Err(DistanceError::Memory { needed, limit: options.max_bytes });
+        }
+        let codes = build::band_codes(&cells, &index, band);
+        let far = FarField::build(&grid, &cells, options.band_m);
+        Ok(Self {
+            inverse_cell: (1.0 / grid.cell) as f32,
+            scale: (options.cell_m / build::codes_per_cell(band)) as f32,
+            grid,
+            index,
+            codes,
+            far,
+        })
+    }
+
+    /// Trilinear distance and gradient at `point`, see [`Sample`].
+    #[inline]
+    pub fn sample(&self, point: Point) -> Sample {
+        let cell = self.grid.locate(point);
+        let (distance, slope) = match self.corners(cell.corner) {
+            Some(corners) => trilinear(corners, cell.fraction),
+            None => self.far.sample(cell.corner, cell.fraction),
+        };
+        Sample {
+            distance,
+            gradient: core::array::from_fn(|a| slope[a] * self.inverse_cell * cell.inside[a]),
+        }
+    }
+
+    /// The grid's geometry.
+    pub fn grid(&self) -> &Grid {
+        &self.grid
+    }
+
+    /// Active bricks.
+    pub fn active_bricks(&self) -> usize {
+        self.index.active
+    }
+
+    /// Bytes that the transform occupies.
+    pub fn bytes(&self) -> usize {
+        self.index.bytes()
+            + self.codes.len() * size_of::<u16>()
+            + self.far.distances.len() * size_of::<f32>()
+    }
+
+    /// Distances at the cell's eight corners; none where no corner is within the band.
+    #[inline]
+    fn corners(&self, corner: [u32; 3]) -> Option<[f32; 8]> {
+        let codes = if corner.iter().all(|c| c % 8 != 7) {
+            let brick = self.index.brick_of(corner);
+            if brick == ABSENT {
+                return None;
+            }
+            let start = brick as usize * VOLUME;
+            let codes = &self.codes[start..start + VOLUME];
+            let at = within(corner);
+            [0, 1, 8, 9, 64, 65, 72, 73].map(|step| codes[at + step])
+        } else {
+            core::array::from_fn(|i| self.code(corner_vertex(corner, i)))
+        };
+        if codes.iter().all(|&code| code != BEYOND) {
+            return Some(codes.map(|code| f32::from(code) * self.scale));
+        }
+        if codes.iter().all(|&code| code == BEYOND) {
+            return None;
+        }
+        Some(core::array::from_fn(|i| match codes[i] {
+            BEYOND => self.far.sample(corner_vertex(corner, i), [0.0; 3]).0,
+            code => f32::from(code) * self.scale,
+        }))
+    }
+
+    #[inline]
+    fn code(&self, vertex: [u32; 3]) -> u16 {
+        match self.index.brick_of(vertex) {
+            ABSENT => BEYOND,
+            brick => self.codes[brick as usize * VOLUME + within(vertex)],
+        }
+    }
+}
+
+/// Corner `i` of the cell at `corner`: bits 4, 2 and 1 step along x, y and z.
+fn corner_vertex(corner: [u32; 3], i: usize) -> [u32; 3] {
+    let i = i as u32;
+    [corner[0] + (i >> 2), corner[1] + (i >> 1 & 1), corner[2] + (i & 1)]
+}

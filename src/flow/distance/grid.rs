@@ -1,0 +1,105 @@
+//! The lattice that a distance transform is sampled on: where its vertices lie and which cell a
+//! point falls into. Knows no distances. Bounds as the published code draws them: both clouds and
+//! one cell on every side.
+
+use super::options::DistanceError;
+use crate::flow::Point;
+
+/// A lattice of vertices, `cell` metres apart.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Grid {
+    /// Position of vertex (0, 0, 0), metres.
+    pub origin: [f64; 3],
+    /// Distance between neighbouring vertices, metres.
+    pub cell: f64,
+    /// Vertices along each axis, at least 2.
+    pub vertices: [usize; 3],
+}
+
+/// A place between the vertices: the lower corner and the fraction beyond it.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Cell {
+    pub(crate) corner: [u32; 3],
+    pub(crate) fraction: [f32; 3],
+    /// 1 where the point lies within the grid on that axis, else 0.
+    pub(crate) inside: [f32; 3],
+}
+
+impl Grid {
+    /// The longest extent on an axis, metres: single-precision coordinates resolve 2 mm there.
+    pub const MAX_EXTENT_M: f64 = 20_000.0;
+
+    /// The grid that covers both clouds.
+    ///
+    /// # Errors
+    /// Where the target is empty or the clouds span more than [`Self::MAX_EXTENT_M`].
+    pub fn covering(source: &[Point], target: &[Point], cell: f64) -> Result<Self, DistanceError> {
+        if target.is_empty() {
+            return Err(DistanceError::EmptyTarget);
+        }
+        let mut low = [f32::INFINITY; 3];
+        let mut high = [f32::NEG_INFINITY; 3];
+        for point in source.iter().chain(target) {
+            for axis in 0..3 {
+                low[axis] = low[axis].min(point[axis]);
+                high[axis] = high[axis].max(point[axis]);
+            }
+        }
+        let extent: [f64; 3] = core::array::from_fn(|a| f64::from(high[a]) - f64::from(low[a]));
+        if extent.iter().any(|e| !(0.0..=Self::MAX_EXTENT_M).contains(e)) {
+            return Err(DistanceError::Extent {
+                x_m: extent[0],
+                y_m: extent[1],
+                z_m: extent[2],
+                limit_m: Self::MAX_EXTENT_M,
+            });
+        }
+        let first = low.map(|x| (f64::from(x) / cell - 1.0).floor());
+        let last = high.map(|x| (f64::from(x) / cell + 1.0).ceil());
+        Ok(Self {
+            origin: first.map(|x| x * cell),
+            cell,
+            vertices: core::array::from_fn(|a| (last[a] - first[a]) as usize + 2),
+        })
+    }
+
+    /// The vertex nearest to `point`, ties to even, as the published code rasterizes the target.
+    pub(crate) fn nearest_vertex(&self, point: Point) -> [u32; 3] {
+        core::array::from_fn(|axis| {
+            let at = (f64::from(point[axis]) - self.origin[axis]) / self.cell;
+            at.round_ties_even().clamp(0.0, (self.vertices[axis] - 1) as f64) as u32
+        })
+    }
+
+    /// Where `point` lies between the vertices; outside points are moved to the border.
+    #[inline]
+    pub(crate) fn locate(&self, point: Point) -> Cell {
+        let mut cell = Cell { corner: [0; 3], fraction: [0.0; 3], inside: [1.0; 3] };
+        for axis in 0..3 {
+            let last = (self.vertices[axis] - 1) as f64;
+            let at = (f64::from(point[axis]) - self.origin[axis]) / self.cell;
+            let clipped = at.clamp(0.0, last);
+            if clipped != at {
+                cell.inside[axis] = 0.0;
+            }
+            let corner = (clipped as u32).min(self.vertices[axis] as u32 - 2);
+            cell.corner[axis] = corner;
+            cell.fraction[axis] = (clipped - f64::from(corner)) as f32;
+        }
+        cell
+    }
+}
+
+/// Trilinear value of eight corners (`corners[4 x + 2 y + z]`) and its derivative by the fraction.
+#[inline]
+pub(crate) fn trilinear(corners: [f32; 8], fraction: [f32; 3]) -> (f32, [f32; 3]) {
+    let [x, y, z] = fraction;
+    let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
+    let along_z: [f32; 4] = core::array::from_fn(|i| mix(corners[2 * i], corners[2 * i + 1], z));
+    let slope_z: [f32; 4] = core::array::from_fn(|i| corners[2 * i + 1] - corners[2 * i]);
+    let (low, high) = (mix(along_z[0], along_z[1], y), mix(along_z[2], along_z[3], y));
+    let dx = high - low;
+    let dy = mix(along_z[1] - along_z[0], along_z[3] - along_z[2], x);
+    let dz = mix(mix(slope_z[0], slope_z[1], y), mix(slope_z[2], slope_z[3], y), x);
+    (mix(low, high, x), [dx, dy, dz])
+}

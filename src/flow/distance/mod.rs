@@ -1,0 +1,72 @@
+//! What a deformed point is pulled toward: the distance to the target cloud, anywhere in space.
+//!
+//! [`Bricks`] is the product's transform; [`dense`] is the published code's, for comparison.
+//! FNSF Section 3.2. Knows nothing of networks or losses.
+
+mod activate;
+mod bricks;
+mod build;
+pub mod dense;
+mod far;
+mod grid;
+mod options;
+
+pub use bricks::Bricks;
+pub use dense::DenseChamfer;
+pub use grid::Grid;
+pub use options::{DistanceError, DistanceOptions, Metric};
+
+use crate::flow::Point;
+
+/// The distance at a point and how it changes with the point.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Sample {
+    /// Metres to the target.
+    pub distance: f32,
+    /// Derivative of `distance` by x, y and z; zero along an axis on which the point lies outside
+    /// the grid.
+    pub gradient: Point,
+}
+
+/// A distance transform of the target, as the options asked for it.
+#[derive(Debug)]
+pub enum DistanceTransform {
+    /// Exact Euclidean, narrow band with a far field.
+    Bricks(Bricks),
+    /// The published code's chamfer metric on a dense grid.
+    Chamfer(DenseChamfer),
+}
+
+impl DistanceTransform {
+    /// Transforms `target` over a grid that covers both clouds.
+    ///
+    /// # Errors
+    /// [`DistanceError`] where the options make no sense or the clouds span too much space.
+    pub fn build(
+        source: &[Point],
+        target: &[Point],
+        options: &DistanceOptions,
+    ) -> Result<Self, DistanceError> {
+        Ok(match options.metric {
+            Metric::Euclidean => Self::Bricks(Bricks::build(source, target, options)?),
+            Metric::Chamfer => Self::Chamfer(DenseChamfer::build(source, target, options)?),
+        })
+    }
+
+    /// Trilinear distance and gradient at `point`.
+    #[inline]
+    pub fn sample(&self, point: Point) -> Sample {
+        match self {
+            Self::Bricks(bricks) => bricks.sample(point),
+            Self::Chamfer(dense) => dense.sample(point),
+        }
+    }
+
+    /// Bytes that the transform occupies.
+    pub fn bytes(&self) -> usize {
+        match self {
+            Self::Bricks(bricks) => bricks.bytes(),
+            Self::Chamfer(dense) => dense.bytes(),
+        }
+    }
+}

@@ -1,0 +1,61 @@
+//! Absolute early stopping, as the published code does it.
+//!
+//! The first loss is the best; a loss more than `min_delta` below the best is progress; as many
+//! iterations as `patience` without progress, or a loss that is not a number, are the end.
+
+use super::options::EarlyStopOptions;
+
+/// The rule's state.
+#[derive(Clone, Debug)]
+pub struct EarlyStop {
+    options: EarlyStopOptions,
+    best: Option<f64>,
+    without_progress: usize,
+}
+
+impl EarlyStop {
+    /// A rule that has seen nothing.
+    pub fn new(options: EarlyStopOptions) -> Self {
+        Self { options, best: None, without_progress: 0 }
+    }
+
+    /// Takes the next loss, metres; true where the optimization should end.
+    pub fn observe(&mut self, loss: f64) -> bool {
+        if loss.is_nan() {
+            return true;
+        }
+        match self.best {
+            Some(best) if loss >= best - self.options.min_delta_m => self.without_progress += 1,
+            _ => {
+                self.best = Some(loss);
+                self.without_progress = 0;
+            }
+        }
+        self.without_progress >= self.options.patience
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn stops_at(patience: usize, losses: &[f64]) -> Option<usize> {
+        let mut rule = EarlyStop::new(EarlyStopOptions { patience, min_delta_m: 1e-3 });
+        losses.iter().position(|&loss| rule.observe(loss))
+    }
+
+    #[test]
+    fn small_progress_is_no_progress() {
+        assert_eq!(stops_at(2, &[1.0, 0.9995, 0.9991, 0.5]), Some(2));
+    }
+
+    #[test]
+    fn progress_is_counted_from_the_best_loss_that_counted() {
+        assert_eq!(stops_at(2, &[1.0, 0.9995, 0.9985, 0.9984, 0.9983]), Some(4));
+    }
+
+    #[test]
+    fn a_loss_that_is_not_a_number_ends_it() {
+        assert_eq!(stops_at(5, &[1.0, f64::NAN]), Some(1));
+    }
+}

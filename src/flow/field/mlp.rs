@@ -1,0 +1,180 @@
+//! The coordinate network of FNSF: 3 -> 128, seven times 128 -> 128, 128 -> 3, ReLU between.
+//!
+//! Knows the shape, the Xavier start and the memory layout that the kernels of every backend
+//! share; computes nothing. FNSF Section 3; `g(p; theta)` there.
+
+use bytemuck::{Pod, Zeroable};
+
+use crate::flow::random::Random;
+
+/// Features of every hidden layer.
+pub const WIDTH: usize = 128;
+/// Layers from 128 to 128 features.
+pub const MIDDLE_LAYERS: usize = 7;
+/// Hidden layers: the first (3 -> 128) and the middle ones.
+pub const HIDDEN_LAYERS: usize = MIDDLE_LAYERS + 1;
+/// Parameters of the network: 116,483.
+pub const PARAMETERS: usize =
+    4 * WIDTH + MIDDLE_LAYERS * (WIDTH * WIDTH + WIDTH) + 3 * WIDTH + 3;
+
+/// Output features that lie together in memory, so that a kernel reads one stream.
+pub(crate) const PANEL: usize = 32;
+
+const FIRST: usize = 0;
+const MIDDLE: usize = 4 * WIDTH;
+const MIDDLE_STRIDE: usize = WIDTH * WIDTH + WIDTH;
+const LAST: usize = MIDDLE + MIDDLE_LAYERS * MIDDLE_STRIDE;
+/// Floats of the laid-out network: the parameters and padding to whole cache lines.
+pub(crate) const LAID_OUT: usize = (LAST + 3 * WIDTH + 3).next_multiple_of(16);
+
+/// One cache line of floats.
+#[derive(Clone, Copy, Pod, Zeroable)]
+#[repr(C, align(64))]
+pub(crate) struct Line([f32; 16]);
+
+/// A zeroed buffer of floats that starts on a cache line.
+#[derive(Clone)]
+pub(crate) struct Aligned(Vec<Line>);
+
+impl Aligned {
+    /// `floats` zeros, rounded up to a whole line.
+    pub(crate) fn zeros(floats: usize) -> Self {
+        Self(vec![Line::zeroed(); floats.div_ceil(16)])
+    }
+    pub(crate) fn as_slice(&self) -> &[f32] {
+        bytemuck::cast_slice(&self.0)
+    }
+    pub(crate) fn as_mut_slice(&mut self) -> &mut [f32] {
+        bytemuck::cast_slice_mut(&mut self.0)
+    }
+}
+
+/// The parameters of one network, or anything of their shape (gradients, moments).
+///
+/// Layout, in floats: first layer `W[3][128]`, bias; each middle layer `W` in panels of 32 output
+/// features (`[panel][input][32]`), bias; last layer `W[3][128]` (output-major), bias; padding.
+#[derive(Clone)]
+pub(crate) struct Parameters(Aligned);
+
+/// Where a layer's weights and biases begin.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct LayerAt {
+    pub(crate) weights: usize,
+    pub(crate) bias: usize,
+}
+
+/// The first layer, 3 -> 128.
+pub(crate) const fn first_layer() -> LayerAt {
+    LayerAt { weights: FIRST, bias: FIRST + 3 * WIDTH }
+}
+
+/// Middle layer `index` of 0..7, 128 -> 128.
+pub(crate) const fn middle_layer(index: usize) -> LayerAt {
+    let weights = MIDDLE + index * MIDDLE_STRIDE;
+    LayerAt { weights, bias: weights + WIDTH * WIDTH }
+}
+
+/// The last layer, 128 -> 3.
+pub(crate) const fn last_layer() -> LayerAt {
+    LayerAt { weights: LAST, bias: LAST + 3 * WIDTH }
+}
+
+/// The place of weight (`input`, `output`) within a middle layer's panels.
+pub(crate) const fn panel_index(input: usize, output: usize) -> usize {
+    (output / PANEL * WIDTH + input) * PANEL + output % PANEL
+}
+
+impl Parameters {
+    pub(crate) fn zeros() -> Self {
+        Self(Aligned::zeros(LAID_OUT))
+    }
+
+    /// Xavier-uniform weights, `U(-a, a)` with `a = sqrt(6 / (inputs + outputs))`, zero biases.
+    /// Drawn layer by layer, output by output, as a linear layer stores them.
+    pub(crate) fn xavier(random: &mut Random) -> Self {
+        let mut parameters = Self::zeros();
+        let floats = parameters.as_mut_slice();
+        let mut layer = |inputs: usize, outputs: usize, place: &dyn Fn(usize, usize) -> usize| {
+            let bound = (6.0 / (inputs + outputs) as f64).sqrt();
+            for output in 0..outputs {
+                for input in 0..inputs {
+                    floats[place(input, output)] = random.uniform(-bound, bound) as f32;
+                }
+            }
+        };
+        layer(3, WIDTH, &|i, o| FIRST + i * WIDTH + o);
+        for index in 0..MIDDLE_LAYERS {
+            let at = middle_layer(index).weights;
+            layer(WIDTH, WIDTH, &|i, o| at + panel_index(i, o));
+        }
+        layer(WIDTH, 3, &|i, o| LAST + o * WIDTH + i);
+        parameters
+    }
+
+    /// Multiplies the last layer by `factor`: zero starts the field at zero flow.
+    pub(crate) fn scale_last_layer(&mut self, factor: f32) {
+        for weight in &mut self.as_mut_slice()[LAST..LAST + 3 * WIDTH] {
+            *weight *= factor;
+        }
+    }
+
+    pub(crate) fn as_slice(&self) -> &[f32] {
+        self.0.as_slice()
+    }
+
+    pub(crate) fn as_mut_slice(&mut self) -> &mut [f32] {
+        self.0.as_mut_slice()
+    }
+}
+
+/// Writes the middle layers' transposes, in the same panels: entry (`output`, `input`) of `to` is
+/// entry (`input`, `output`) of `from`. Backward kernels then read one stream as well.
+pub(crate) fn transpose_middle_layer(from: &[f32], to: &mut [f32]) {
+    for output_panel in 0..WIDTH / PANEL {
+        for input_panel in 0..WIDTH / PANEL {
+            for input in input_panel * PANEL..(input_panel + 1) * PANEL {
+                let row = panel_index(input, output_panel * PANEL);
+                for lane in 0..PANEL {
+                    let output = output_panel * PANEL + lane;
+                    to[panel_index(output, input)] = from[row + lane];
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_network_has_the_published_number_of_parameters() {
+        assert_eq!(PARAMETERS, 116_483);
+        assert_eq!(LAST + 3 * WIDTH + 3, PARAMETERS);
+    }
+
+    #[test]
+    fn xavier_weights_fill_their_interval_and_biases_are_zero() {
+        let parameters = Parameters::xavier(&mut Random::new(3));
+        let floats = parameters.as_slice();
+        let at = middle_layer(4);
+        let bound = (6.0f32 / 256.0).sqrt();
+        let weights = &floats[at.weights..at.bias];
+        let largest = weights.iter().fold(0.0f32, |a, w| a.max(w.abs()));
+        assert!(largest <= bound && largest > 0.99 * bound, "{largest} of {bound}");
+        assert!(floats[at.bias..at.bias + WIDTH].iter().all(|&b| b == 0.0));
+    }
+
+    #[test]
+    fn transposing_twice_gives_the_layer_back() {
+        let parameters = Parameters::xavier(&mut Random::new(1));
+        let at = middle_layer(0);
+        let layer = &parameters.as_slice()[at.weights..at.bias];
+        let mut once = vec![0.0; layer.len()];
+        let mut twice = vec![0.0; layer.len()];
+        transpose_middle_layer(layer, &mut once);
+        transpose_middle_layer(&once, &mut twice);
+        assert_eq!(once[panel_index(5, 77)], layer[panel_index(77, 5)]);
+        assert_eq!(twice, layer);
+    }
+}
