@@ -4,4 +4,6 @@
 
 mod points;
 
+pub mod evaluate;
+
 pub use points::{Point, RigidTransform};
