@@ -423,6 +423,24 @@ mod tests {
     }
 
     #[test]
+    fn the_last_frame_of_the_longest_fastest_street_is_sane() {
+        let options = StreetOptions {
+            frames: 1000,
+            beams: 1,
+            azimuth_steps: 200,
+            movers: 256,
+            speed_mps: Some(40.0),
+            yaw_rate_rps: Some(-1.0),
+            ..StreetOptions::default()
+        };
+        let pair = Street::new(&options).unwrap().pair(998).unwrap();
+        assert!(pair.source.len() > 50);
+        let far = |point: &Point| !point.iter().all(|value| value.abs() < 121.0);
+        assert!(!pair.source.iter().chain(&pair.target).any(far));
+        assert!(pair.flow.iter().flatten().all(|value| value.abs() < 20.0));
+    }
+
+    #[test]
     fn frames_past_the_end_and_bad_options_are_refused() {
         let street = Street::new(&small(0)).unwrap();
         assert_eq!(street.frames(), 2);

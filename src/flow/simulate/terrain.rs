@@ -74,6 +74,14 @@ impl Terrain {
         self.first_side_street + block * BLOCK_M
     }
 
+    /// The side streets between two x.
+    pub(super) fn side_streets(&self, from: f64, to: f64) -> impl Iterator<Item = f64> {
+        let block = ((from - self.first_side_street) / BLOCK_M).ceil();
+        let first = self.first_side_street + block * BLOCK_M;
+        let streets = (0u32..).map(move |index| first + f64::from(index) * BLOCK_M);
+        streets.take_while(move |&x| x < to)
+    }
+
     /// Height of the ground, metres.
     pub(super) fn height(&self, x: f64, y: f64) -> f64 {
         let [a, b, c] = self.phases;
@@ -209,6 +217,16 @@ mod tests {
             );
             let height = terrain.height(x, y);
             assert!((HEIGHTS_M[0]..HEIGHTS_M[1]).contains(&height), "{height}");
+        }
+    }
+
+    #[test]
+    fn side_streets_are_found_by_either_way() {
+        let terrain = terrain();
+        let streets: Vec<f64> = terrain.side_streets(-130.0, 330.0).collect();
+        assert!((4..=5).contains(&streets.len()), "{streets:?}");
+        for street in streets {
+            assert!((terrain.side_street(street + 40.0) - street).abs() < 1e-9);
         }
     }
 

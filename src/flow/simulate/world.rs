@@ -7,7 +7,7 @@ use super::shapes::Shape;
 use super::terrain::Terrain;
 use crate::flow::RigidTransform;
 use crate::flow::random::Random;
-use nalgebra::Translation3;
+use nalgebra::{Translation3, UnitQuaternion};
 
 /// From the center line to the line of houses, metres.
 const HOUSES_M: f64 = 10.5;
@@ -115,13 +115,7 @@ impl World {
 
     /// Rows of houses along each side street, and a house at its end.
     fn add_side_streets(&mut self, terrain: &Terrain, [from, to]: [f64; 2], side: f64) {
-        let mut x = from;
-        while x < to {
-            let corner = terrain.side_street(x);
-            x += 60.0;
-            if (corner - x + 60.0).abs() > 30.0 {
-                continue;
-            }
+        for corner in terrain.side_streets(from, to) {
             for across in [10.5, -10.5] {
                 let row = Spot {
                     x: corner + across,
@@ -267,7 +261,7 @@ impl World {
     fn add(&mut self, terrain: &Terrain, shape: Shape, spot: Spot) {
         let [x, y] = terrain.place(spot.x, spot.lateral);
         let place = Translation3::new(x, y, terrain.height(x, y) + spot.above);
-        let turn = nalgebra::UnitQuaternion::from_euler_angles(0.0, 0.0, terrain.heading(spot.x));
+        let turn = UnitQuaternion::from_euler_angles(0.0, 0.0, terrain.heading(spot.x));
         self.solids.push(Solid {
             shape,
             world_from_solid: RigidTransform::from_parts(place, turn),
