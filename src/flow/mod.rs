@@ -11,7 +11,13 @@ mod optimizer;
 mod options;
 mod points;
 mod random;
+<<<<<<< HEAD
 mod watch;
+=======
+
+pub mod evaluate;
+pub mod simulate;
+>>>>>>> street
 
 pub use options::*;
 pub use points::{Point, RigidTransform};

@@ -23,6 +23,10 @@ pub struct Options {
     pub beta2: f32,
     /// Average.
     pub average: Option<f32>,
+    /// Dead.
+    pub dead: f32,
+    /// Norm.
+    pub norm: f32,
     /// Distances count no further than this, metres.
     pub truncation_m: Option<f32>,
     /// When to stop before `max_iterations`.

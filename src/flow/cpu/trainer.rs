@@ -142,7 +142,7 @@ impl CpuTrainer {
             loss: 0.0,
             query_seconds: 0.0,
         });
-        let weight = 1.0 / points.len() as f32;
+        let weight = 1.0 / points.len() as f32; let norm = self.options.norm * weight; let dead = self.options.dead;
         let truncation = self.options.truncation_m.unwrap_or(f32::INFINITY);
         let (kernels, distance, conditioning) = (self.kernels, &self.distance, self.conditioning);
         let (parameters, transposed) = (&self.parameters, &self.transposed);
@@ -171,8 +171,10 @@ impl CpuTrainer {
                         let sample =
                             distance.sample(core::array::from_fn(|a| point[a] + flow[a]));
                         chunk.loss += f64::from(sample.distance.min(truncation));
-                        let weight = if sample.distance < truncation { weight } else { 0.0 };
-                        tile.output_gradients[row] = sample.gradient.map(|g| g * weight);
+                        let weight = if sample.distance < truncation && sample.distance > dead { weight } else { 0.0 };
+                        let length = (flow[0]*flow[0]+flow[1]*flow[1]+flow[2]*flow[2]).sqrt();
+                        let pull = norm / length.max(1e-3);
+                        tile.output_gradients[row] = core::array::from_fn(|a| sample.gradient[a] * weight + flow[a]*pull);
                     }
                     chunk.query_seconds += watch.seconds() - began;
                     kernels.backward(parameters, transposed, &mut tile, &mut chunk.gradients);

@@ -7,7 +7,7 @@
 use super::activate::{ABSENT, Index, VOLUME, within};
 use super::far::FarField;
 use super::grid::{Grid, trilinear};
-use super::options::{DistanceError, DistanceOptions};
+use super::options::{DistanceError, DistanceOptions, Sites};
 use super::{Sample, build};
 use crate::flow::Point;
 
@@ -51,7 +51,11 @@ impl Bricks {
         if needed > options.max_bytes {
             return Err(DistanceError::Memory { needed, limit: options.max_bytes });
         }
-        let codes = build::band_codes(&cells, &index, band);
+        let points = match options.sites {
+            Sites::Cells => None,
+            Sites::Points => Some(build::sorted_points(&grid, target)),
+        };
+        let codes = build::band_codes(&cells, points.as_deref(), &index, band);
         let far = FarField::build(&grid, &cells, options.band_m);
         Ok(Self {
             inverse_cell: (1.0 / grid.cell) as f32,

@@ -4,10 +4,15 @@
 //! in y and over rows in x, 64 values at a time in 16-bit integers. No distance is approximated
 //! and no two bricks write the same value, so threads cannot change the result.
 
+use core::cmp::Ordering;
+
 use rayon::prelude::*;
 
 use super::activate::{ABSENT, EDGE, Index, VOLUME};
 use super::bricks::BEYOND;
+use super::exact_points::NearPoints;
+use super::grid::Grid;
+use crate::flow::Point;
 
 /// Farther than any sum of squares within the band; sums with it stay within 16 bits.
 const FAR: i16 = 0x3FFF;
@@ -17,10 +22,27 @@ pub(crate) fn codes_per_cell(band: i32) -> f64 {
     f64::from(BEYOND - 1) / f64::from(band)
 }
 
+/// A target point in cells, and the vertex that it is nearest to.
+pub(crate) type Site = ([u32; 3], [f32; 3]);
+
+/// The target's points in the order of their vertices.
+pub(crate) fn sorted_points(grid: &Grid, target: &[Point]) -> Vec<Site> {
+    let site = |&p: &Point| (grid.nearest_vertex(p), grid.in_cells(p).map(|c| c as f32));
+    let mut sites: Vec<_> = target.iter().map(site).collect();
+    sites.sort_unstable_by(|a, b| a.0.cmp(&b.0).then_with(|| a.1.partial_cmp(&b.1).unwrap_or(Ordering::Equal)));
+    sites
+}
+
 /// The codes of all active bricks, 512 a brick: the distance from each vertex to the nearest of
-/// `cells` (sorted, unique), or [`BEYOND`] where that is more than `band` cells.
-pub(crate) fn band_codes(cells: &[[u32; 3]], index: &Index, band: i32) -> Vec<u16> {
-    let columns = Columns::transform(cells, band);
+/// `cells` (sorted, unique), or of `points` where they are given, or [`BEYOND`] where that is more
+/// than `band` cells.
+pub(crate) fn band_codes(
+    cells: &[[u32; 3]],
+    points: Option<&[Site]>,
+    index: &Index,
+    band: i32,
+) -> Vec<u16> {
+    let columns = Columns::transform(cells, points, band);
     let per_cell = codes_per_cell(band);
     let codes_of_squares: Vec<u16> = (0..=band * band)
         .map(|square| (f64::from(square).sqrt() * per_cell).round() as u16)
@@ -68,13 +90,28 @@ struct Columns {
     layers: Vec<(u32, u32)>,
     /// Eight squared distances a layer, [`FAR`] beyond the band.
     squares: Vec<[i16; 8]>,
+    /// All points in cells, sorted by column, and where each column's begin; empty unless
+    /// distances are measured to points.
+    points: Vec<[f32; 3]>,
+    point_starts: Vec<u32>,
 }
 
 impl Columns {
-    fn transform(cells: &[[u32; 3]], band: i32) -> Self {
+    fn transform(cells: &[[u32; 3]], points: Option<&[Site]>, band: i32) -> Self {
         let last_row = cells.last().map_or(0, |cell| cell[0] as usize);
-        let mut columns =
-            Self { rows: vec![0; last_row + 2], y: vec![], layers: vec![], squares: vec![] };
+        let mut columns = Self {
+            rows: vec![0; last_row + 2],
+            y: vec![],
+            layers: vec![],
+            squares: vec![],
+            points: vec![],
+            point_starts: vec![],
+        };
+        for column in points.unwrap_or(&[]).chunk_by(|a, b| a.0[..2] == b.0[..2]) {
+            columns.point_starts.push(columns.points.len() as u32);
+            columns.points.extend(column.iter().map(|site| site.1));
+        }
+        columns.point_starts.push(columns.points.len() as u32);
         for column in cells.chunk_by(|a, b| a[..2] == b[..2]) {
             columns.rows[column[0][0] as usize + 1] += 1;
             columns.y.push(column[0][1] as i32);
@@ -120,6 +157,7 @@ impl Columns {
 struct Gather {
     /// Rows of the window around a stack of bricks: x and the range of columns.
     window: Vec<(i32, core::ops::Range<usize>)>,
+    near: NearPoints,
 }
 
 impl Gather {
@@ -143,8 +181,23 @@ impl Gather {
             let (x, y) = ((brick_x * EDGE) as i32, (brick_y * EDGE) as i32);
             self.open_window(columns, x, y, band);
             for layer in (0..EDGE).filter(|&z| bricks[z as usize] != ABSENT) {
-                let squares = self.gather(columns, x, y, block[2] * EDGE + layer, band);
                 let Some(codes) = own.next() else { return };
+                if !columns.points.is_empty() {
+                    let first = [x, y, ((block[2] * EDGE + layer) * EDGE) as i32].map(|c| c as f32);
+                    let runs = self.window.iter().map(|(_, range)| {
+                        let [start, end] =
+                            [range.start, range.end].map(|c| columns.point_starts[c] as usize);
+                        &columns.points[start..end]
+                    });
+                    self.near.collect(runs, first, band as f32 + 0.5);
+                    let per_cell = codes_per_cell(band) as f32;
+                    for (code, square) in codes.iter_mut().zip(self.near.squares()) {
+                        let distance = square.sqrt() * per_cell;
+                        *code = if distance < f32::from(BEYOND) { distance.round() as u16 } else { BEYOND };
+                    }
+                    continue;
+                }
+                let squares = self.gather(columns, x, y, block[2] * EDGE + layer, band);
                 for (code, square) in codes.iter_mut().zip(squares.as_flattened()) {
                     *code = codes_of_squares.get(*square as usize).copied().unwrap_or(BEYOND);
                 }

@@ -63,11 +63,16 @@ impl Grid {
         })
     }
 
+    /// `point` in cells from the origin.
+    pub(crate) fn in_cells(&self, point: Point) -> [f64; 3] {
+        core::array::from_fn(|a| (f64::from(point[a]) - self.origin[a]) / self.cell)
+    }
+
     /// The vertex nearest to `point`, ties to even, as the published code rasterizes the target.
     pub(crate) fn nearest_vertex(&self, point: Point) -> [u32; 3] {
+        let at = self.in_cells(point);
         core::array::from_fn(|axis| {
-            let at = (f64::from(point[axis]) - self.origin[axis]) / self.cell;
-            at.round_ties_even().clamp(0.0, (self.vertices[axis] - 1) as f64) as u32
+            at[axis].round_ties_even().clamp(0.0, (self.vertices[axis] - 1) as f64) as u32
         })
     }
 
@@ -75,11 +80,10 @@ impl Grid {
     #[inline]
     pub(crate) fn locate(&self, point: Point) -> Cell {
         let mut cell = Cell { corner: [0; 3], fraction: [0.0; 3], inside: [1.0; 3] };
+        let at = self.in_cells(point);
         for axis in 0..3 {
-            let last = (self.vertices[axis] - 1) as f64;
-            let at = (f64::from(point[axis]) - self.origin[axis]) / self.cell;
-            let clipped = at.clamp(0.0, last);
-            if clipped != at {
+            let clipped = at[axis].clamp(0.0, (self.vertices[axis] - 1) as f64);
+            if clipped != at[axis] {
                 cell.inside[axis] = 0.0;
             }
             let corner = (clipped as u32).min(self.vertices[axis] as u32 - 2);

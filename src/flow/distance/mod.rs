@@ -7,6 +7,7 @@ mod activate;
 mod bricks;
 mod build;
 pub mod dense;
+mod exact_points;
 mod far;
 mod grid;
 mod options;
@@ -14,7 +15,7 @@ mod options;
 pub use bricks::Bricks;
 pub use dense::DenseChamfer;
 pub use grid::Grid;
-pub use options::{DistanceError, DistanceOptions, Metric};
+pub use options::{DistanceError, DistanceOptions, Metric, Sites};
 
 use crate::flow::Point;
 

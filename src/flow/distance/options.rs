@@ -9,11 +9,22 @@ pub enum Metric {
     Chamfer,
 }
 
+/// What distances are measured to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Sites {
+    /// The vertices nearest to the target's points, as published.
+    Cells,
+    /// The target's points themselves.
+    Points,
+}
+
 /// Options of the distance transform.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DistanceOptions {
     /// How distance is measured.
     pub metric: Metric,
+    /// What distances are measured to, by [`Metric::Euclidean`].
+    pub sites: Sites,
     /// Edge of a cell, metres. FNSF Section 4: 0.1.
     pub cell_m: f64,
     /// Radius of the band in which distances are exact, metres. At most [`Self::MAX_BAND_CELLS`]
@@ -50,6 +61,7 @@ impl Default for DistanceOptions {
     fn default() -> Self {
         Self {
             metric: Metric::Euclidean,
+            sites: Sites::Cells,
             cell_m: 0.1,
             band_m: 2.0,
             max_bytes: 8 << 30,

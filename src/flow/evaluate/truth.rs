@@ -1,0 +1,221 @@
+//! What is known about a pair, and which of its rows are scored.
+//!
+//! One rule for every metric: a row counts where the truth is valid, the point is not ground, the
+//! estimate covers it and both flows are finite. It must not know any metric.
+
+use crate::flow::{Point, RigidTransform};
+
+/// Half the width of the square around the sensor that "close" means, metres (Argoverse 2).
+pub const CLOSE_HALF_WIDTH_M: f32 = 35.0;
+
+/// Why a flow could not be scored.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum EvaluateError {
+    /// An array does not have one row per point.
+    #[error("{what} has {found} rows where {expected} are needed")]
+    Length {
+        /// The array.
+        what: &'static str,
+        /// Rows of the true flow.
+        expected: usize,
+        /// Rows of the array.
+        found: usize,
+    },
+    /// A metric needs something that the truth does not hold.
+    #[error("the truth has no {what}")]
+    Missing {
+        /// What is missing.
+        what: &'static str,
+    },
+    /// A class index past the classes the accumulator was made for.
+    #[error("class {class} is not one of {classes} classes")]
+    UnknownClass {
+        /// The index found.
+        class: u8,
+        /// Number of classes.
+        classes: usize,
+    },
+    /// No row is valid, off the ground, covered and finite.
+    #[error("no point can be scored")]
+    NoPoints,
+}
+
+/// Ground truth of one pair: every slice has one row per source point.
+#[derive(Debug, Clone, Copy)]
+pub struct Truth<'a> {
+    /// True flow, metres per frame, ego motion included.
+    pub flow: &'a [Point],
+    /// Where the true flow is known.
+    pub valid: &'a [bool],
+    /// Points that move relative to the world.
+    pub dynamic: Option<&'a [bool]>,
+    /// Points on an object of a known class, parked or moving.
+    pub foreground: Option<&'a [bool]>,
+    /// Ground points, which are never scored.
+    pub ground: Option<&'a [bool]>,
+    /// Source points, metres, sensor frame: they say what is close.
+    pub source: Option<&'a [Point]>,
+    /// Ego motion as target_from_source: where a static source point is found in the target frame.
+    pub ego: Option<&'a RigidTransform>,
+}
+
+impl<'a> Truth<'a> {
+    /// Truth without masks: metrics that need one are left out.
+    pub fn new(flow: &'a [Point], valid: &'a [bool]) -> Self {
+        Self {
+            flow,
+            valid,
+            dynamic: None,
+            foreground: None,
+            ground: None,
+            source: None,
+            ego: None,
+        }
+    }
+
+    /// Checks that every array, the estimate's too, has one row per point of the true flow.
+    pub(super) fn check_lengths(
+        &self,
+        flow: &[Point],
+        covered: &[bool],
+    ) -> Result<(), EvaluateError> {
+        self.check_length("the flow", Some(flow.len()))?;
+        self.check_length("the coverage mask", Some(covered.len()))?;
+        self.check_length("the valid mask", Some(self.valid.len()))?;
+        self.check_length("the dynamic mask", self.dynamic.map(<[bool]>::len))?;
+        self.check_length("the foreground mask", self.foreground.map(<[bool]>::len))?;
+        self.check_length("the ground mask", self.ground.map(<[bool]>::len))?;
+        self.check_length("the source cloud", self.source.map(<[Point]>::len))
+    }
+
+    /// Checks one more array against the rows of the true flow.
+    pub(super) fn check_length(
+        &self,
+        what: &'static str,
+        rows: Option<usize>,
+    ) -> Result<(), EvaluateError> {
+        let expected = self.flow.len();
+        match rows {
+            Some(found) if found != expected => Err(EvaluateError::Length {
+                what,
+                expected,
+                found,
+            }),
+            _ => Ok(()),
+        }
+    }
+
+    /// The scored rows, in order. Lengths have been checked.
+    pub(super) fn scored(&self, flow: &[Point], covered: &[bool]) -> impl Iterator<Item = usize> {
+        (0..self.flow.len()).filter(move |&row| {
+            self.valid[row]
+                && covered[row]
+                && !self.ground.is_some_and(|ground| ground[row])
+                && is_finite(flow[row])
+                && is_finite(self.flow[row])
+        })
+    }
+}
+
+/// Whether a source point lies in the close square around the sensor.
+pub(super) fn is_close([x, y, _]: Point) -> bool {
+    x.abs() <= CLOSE_HALF_WIDTH_M && y.abs() <= CLOSE_HALF_WIDTH_M
+}
+
+fn is_finite(vector: Point) -> bool {
+    vector.iter().all(|component| component.is_finite())
+}
+
+/// The vector in double precision: sums and angles are taken there.
+pub(super) fn double(vector: Point) -> [f64; 3] {
+    vector.map(f64::from)
+}
+
+pub(super) fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+pub(super) fn norm(vector: [f64; 3]) -> f64 {
+    dot(vector, vector).sqrt()
+}
+
+/// End-point error of one row, metres.
+pub(super) fn end_point_error(estimate: [f64; 3], truth: [f64; 3]) -> f64 {
+    norm([0, 1, 2].map(|axis| estimate[axis] - truth[axis]))
+}
+
+/// A mean that is gathered one value at a time.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Mean {
+    sum: f64,
+    pub(super) count: usize,
+}
+
+impl Mean {
+    pub(super) fn add(&mut self, value: f64) {
+        self.sum += value;
+        self.count += 1;
+    }
+
+    pub(super) fn add_share(&mut self, holds: bool) {
+        self.add(f64::from(u8::from(holds)));
+    }
+
+    /// The mean, or none of nothing.
+    pub(super) fn value(&self) -> Option<f64> {
+        (self.count > 0).then(|| self.sum / self.count as f64)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_that_are_ground_invalid_uncovered_or_not_finite_are_not_scored() {
+        let flow = [
+            [0.0; 3],
+            [0.0; 3],
+            [0.0; 3],
+            [f32::NAN, 0.0, 0.0],
+            [0.0; 3],
+            [0.0; 3],
+        ];
+        let true_flow = [
+            [0.0; 3],
+            [0.0; 3],
+            [0.0; 3],
+            [0.0; 3],
+            [0.0, f32::INFINITY, 0.0],
+            [0.0; 3],
+        ];
+        let valid = [false, true, true, true, true, true];
+        let covered = [true, false, true, true, true, true];
+        let ground = [false, false, true, false, false, false];
+        let mut truth = Truth::new(&true_flow, &valid);
+        truth.ground = Some(&ground);
+        assert_eq!(truth.scored(&flow, &covered).collect::<Vec<_>>(), [5]);
+    }
+
+    #[test]
+    fn an_array_of_another_length_is_named() {
+        let flow = [[0.0; 3]; 2];
+        let mut truth = Truth::new(&flow, &[true, true]);
+        assert_eq!(truth.check_lengths(&flow, &[true; 2]), Ok(()));
+        truth.foreground = Some(&[true]);
+        let error = truth.check_lengths(&flow, &[true; 2]).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "the foreground mask has 1 rows where 2 are needed"
+        );
+        let error = truth.check_lengths(&flow[..1], &[true; 2]).unwrap_err();
+        assert!(error.to_string().starts_with("the flow has 1"));
+    }
+
+    #[test]
+    fn close_is_a_square_not_a_circle() {
+        assert!(is_close([35.0, -35.0, 90.0]));
+        assert!(!is_close([35.1, 0.0, 0.0]));
+        assert!(!is_close([f32::NAN, 0.0, 0.0]));
+    }
+}

@@ -1,0 +1,257 @@
+//! The spinning lidar: one ray per laser and step of azimuth, and what comes back.
+//!
+//! A sweep is taken at one instant. Columns run in parallel and each has its own random stream, so
+//! the sweep does not depend on the number of threads. It must not know what moves.
+
+use super::options::StreetOptions;
+use super::shapes::{Hit, Shape};
+use super::terrain::Terrain;
+use crate::flow::random::Random;
+use crate::flow::{Point, RigidTransform};
+use nalgebra::{Matrix3, Vector3};
+use rayon::prelude::*;
+use std::f64::consts::{PI, TAU};
+
+/// Returns from nearer or farther than this do not arrive, metres.
+const RANGES_M: [f64; 2] = [1.0, 120.0];
+/// Elevations of the top laser, of the middle of the fan, and of the bottom laser, degrees: one
+/// third of a degree apart above the middle, half a degree below, as the HDL-64E's are.
+const ELEVATIONS_DEG: [f64; 3] = [2.0, -8.5, -24.8];
+
+/// A solid as the sensor finds it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Target {
+    pub(super) shape: Shape,
+    /// Pose of the solid, sensor_from_solid.
+    pub(super) sensor_from_solid: RigidTransform,
+    /// The object it belongs to, -1 for none.
+    pub(super) object: i32,
+}
+
+/// One return of a sweep.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Return {
+    pub(super) point: Point,
+    pub(super) object: i32,
+    pub(super) is_ground: bool,
+}
+
+/// A lidar with its lasers.
+#[derive(Debug, Clone)]
+pub(super) struct Lidar {
+    seed: u64,
+    azimuth_steps: usize,
+    range_noise: f64,
+    dropout: f64,
+    /// Sine and cosine of elevation and constant range error of each laser.
+    lasers: Vec<([f64; 2], f64)>,
+}
+
+/// A target prepared for many rays from the sensor's origin.
+struct Prepared {
+    shape: Shape,
+    origin: Vector3<f64>,
+    solid_from_sensor: Matrix3<f64>,
+    object: i32,
+    nearest: f64,
+}
+
+/// What every ray of a sweep meets.
+struct Scene<'a> {
+    terrain: &'a Terrain,
+    world_from_sensor: &'a RigidTransform,
+    targets: Vec<Prepared>,
+    /// Per column: the targets it can meet, nearest first.
+    columns: Vec<Vec<u32>>,
+}
+
+impl Lidar {
+    /// A lidar whose lasers' range errors are drawn once.
+    pub(super) fn new(options: &StreetOptions, random: &mut Random) -> Self {
+        let laser = |index: usize| {
+            let share = index as f64 / (options.beams - 1).max(1) as f64;
+            let [top, middle, bottom] = ELEVATIONS_DEG;
+            let degrees = if share <= 0.5 {
+                top + (middle - top) * share * 2.0
+            } else {
+                middle + (bottom - middle) * (share * 2.0 - 1.0)
+            };
+            let (sin, cos) = degrees.to_radians().sin_cos();
+            ([sin, cos], options.beam_bias_m * random.normal())
+        };
+        Self {
+            seed: options.seed,
+            azimuth_steps: options.azimuth_steps,
+            range_noise: options.range_noise_m,
+            dropout: options.dropout,
+            lasers: (0..options.beams).map(laser).collect(),
+        }
+    }
+
+    /// One sweep, column by column, each from the top laser to the bottom one; sensor frame.
+    pub(super) fn sweep(
+        &self,
+        frame: usize,
+        terrain: &Terrain,
+        world_from_sensor: &RigidTransform,
+        targets: &[Target],
+    ) -> Vec<Return> {
+        let stream =
+            |column: usize| Random::stream(self.seed, (frame as u64) << 32 | column as u64);
+        let step = TAU / self.azimuth_steps as f64;
+        // A real sensor does not shoot at the same angles in every turn.
+        let phase = stream(self.azimuth_steps).uniform(0.0, step);
+        let scene = self.prepare(terrain, world_from_sensor, targets, phase);
+        let columns: Vec<Vec<Return>> = (0..self.azimuth_steps)
+            .into_par_iter()
+            .map(|column| {
+                let azimuth = phase + column as f64 * step - PI;
+                self.shoot(&scene, column, azimuth, &mut stream(column))
+            })
+            .collect();
+        columns.concat()
+    }
+
+    fn shoot(
+        &self,
+        scene: &Scene,
+        column: usize,
+        azimuth: f64,
+        random: &mut Random,
+    ) -> Vec<Return> {
+        let (sin, cos) = azimuth.sin_cos();
+        let mut returns = Vec::with_capacity(self.lasers.len());
+        for &([up, level], bias) in &self.lasers {
+            let direction = Vector3::new(cos * level, sin * level, up);
+            let Some((hit, object)) = scene.first_hit(column, &direction) else {
+                continue;
+            };
+            let lost = self.dropout * loss(hit);
+            let noise = self.range_noise * random.normal();
+            if random.uniform(0.0, 1.0) < lost {
+                continue;
+            }
+            let range = hit.range + bias + noise;
+            if (RANGES_M[0]..=RANGES_M[1]).contains(&range) {
+                returns.push(Return {
+                    point: (direction * range).map(|value| value as f32).into(),
+                    object: object.unwrap_or(-1),
+                    is_ground: object.is_none(),
+                });
+            }
+        }
+        returns
+    }
+
+    /// Sorts targets by distance and notes for each column which of them it can meet.
+    fn prepare<'a>(
+        &self,
+        terrain: &'a Terrain,
+        world_from_sensor: &'a RigidTransform,
+        targets: &[Target],
+        phase: f64,
+    ) -> Scene<'a> {
+        let reach = |target: &Target| {
+            let center = target.sensor_from_solid.translation.vector;
+            center.norm() - target.shape.bounding_radius()
+        };
+        let mut near: Vec<(f64, &Target)> = targets
+            .iter()
+            .map(|target| (reach(target), target))
+            .filter(|&(nearest, _)| nearest < RANGES_M[1])
+            .collect();
+        near.sort_by(|a, b| a.0.total_cmp(&b.0));
+
+        let mut columns = vec![Vec::new(); self.azimuth_steps];
+        let step = TAU / self.azimuth_steps as f64;
+        for (index, (_, target)) in near.iter().enumerate() {
+            let center = target.sensor_from_solid.translation.vector;
+            let [distance, radius] = [center.xy().norm(), target.shape.bounding_radius()];
+            let half = if distance > radius {
+                (radius / distance).asin()
+            } else {
+                PI
+            };
+            let azimuth = center.y.atan2(center.x) + PI - phase;
+            let first = ((azimuth - half) / step).floor() as i64;
+            let last = ((azimuth + half) / step).ceil() as i64;
+            let count = self.azimuth_steps as i64;
+            for column in first..=last.min(first + count - 1) {
+                columns[column.rem_euclid(count) as usize].push(index as u32);
+            }
+        }
+        Scene {
+            terrain,
+            world_from_sensor,
+            targets: near.into_iter().map(Prepared::new).collect(),
+            columns,
+        }
+    }
+}
+
+impl Prepared {
+    fn new((nearest, target): (f64, &Target)) -> Self {
+        let solid_from_sensor = target.sensor_from_solid.inverse();
+        Self {
+            shape: target.shape,
+            origin: solid_from_sensor.translation.vector,
+            solid_from_sensor: *solid_from_sensor.rotation.to_rotation_matrix().matrix(),
+            object: target.object,
+            nearest,
+        }
+    }
+}
+
+impl Scene<'_> {
+    /// The first thing on a ray: a solid with its object, or the ground with none.
+    fn first_hit(&self, column: usize, direction: &Vector3<f64>) -> Option<(Hit, Option<i32>)> {
+        let mut first: Option<(Hit, Option<i32>)> = None;
+        let mut limit = RANGES_M[1] + 1.0;
+        for &index in &self.columns[column] {
+            let target = &self.targets[index as usize];
+            if target.nearest > limit {
+                break;
+            }
+            let local = target.solid_from_sensor * direction;
+            if let Some(hit) = target.shape.hit(&target.origin, &local)
+                && hit.range < limit
+            {
+                limit = hit.range;
+                first = Some((hit, Some(target.object)));
+            }
+        }
+        let origin = self.world_from_sensor.translation.vector;
+        let world_direction = self.world_from_sensor.rotation * direction;
+        let ground = self.terrain.hit(&origin, &world_direction, limit);
+        ground.map(|hit| (hit, None)).or(first)
+    }
+}
+
+/// Chance that a return is too weak to be seen: it grows with range and with grazing incidence.
+fn loss(hit: Hit) -> f64 {
+    let far = hit.range / RANGES_M[1];
+    let grazing = (1.0 - hit.cosine).clamp(0.0, 1.0).powi(8);
+    (0.02 + 0.3 * far * far + 0.5 * grazing * far.sqrt()).min(0.98)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn loss_grows_with_range_and_grazing() {
+        let at = |range, cosine| loss(Hit { range, cosine });
+        assert!(at(5.0, 1.0) < 0.05);
+        assert!(at(100.0, 1.0) > at(20.0, 1.0));
+        assert!(at(50.0, 0.03) > at(50.0, 0.8) + 0.1);
+        assert!(at(120.0, 0.0) <= 0.98);
+    }
+
+    #[test]
+    fn lasers_fan_out_from_top_to_bottom() {
+        let lidar = Lidar::new(&StreetOptions::default(), &mut Random::new(0));
+        let elevation = |index: usize| lidar.lasers[index].0[0].asin().to_degrees();
+        assert!((elevation(0) - 2.0).abs() < 1e-9 && (elevation(63) + 24.8).abs() < 1e-9);
+        assert!((1..64).all(|index| elevation(index) < elevation(index - 1)));
+    }
+}

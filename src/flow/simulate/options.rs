@@ -1,0 +1,174 @@
+//! What can be asked of a simulated street, and what is refused.
+//!
+//! Sizes are bounded here, before anything is allocated.
+
+/// Time between frames, seconds.
+pub const FRAME_SECONDS: f64 = 0.1;
+
+/// Most rays of one sweep.
+const MAX_RAYS: usize = 1 << 20;
+/// Tightest turn of the street at the ego vehicle, metres: a tighter one would meet the houses.
+const MIN_RADIUS_M: f64 = 40.0;
+
+/// Options of a simulated street.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StreetOptions {
+    /// Places everything; the same seed gives the same street.
+    pub seed: u64,
+    /// Sweeps, 1 to 1,000.
+    pub frames: usize,
+    /// Lasers, 1 to 256, between 2 degrees up and 24.8 degrees down, dense in the upper half.
+    pub beams: usize,
+    /// Shots of each laser per turn, 16 to 8,192.
+    pub azimuth_steps: usize,
+    /// Moving cars, cyclists and pedestrians, at most 256.
+    pub movers: usize,
+    /// Forward speed of the ego vehicle, 0 to 40 m/s; drawn from the seed where none.
+    pub speed_mps: Option<f64>,
+    /// Yaw rate in the first frame, rad/s, positive to the left; drawn from the seed where none.
+    /// The street winds, so the rate changes later on.
+    pub yaw_rate_rps: Option<f64>,
+    /// Deviation of the noise of each range, 0 to 1 m.
+    pub range_noise_m: f64,
+    /// Deviation of the constant range error of each laser, 0 to 1 m.
+    pub beam_bias_m: f64,
+    /// How much of the usual loss of far and grazing returns there is, 0 (none) to 1.
+    pub dropout: f64,
+}
+
+impl Default for StreetOptions {
+    fn default() -> Self {
+        Self {
+            seed: 0,
+            frames: 2,
+            beams: 64,
+            azimuth_steps: 2000,
+            movers: 24,
+            speed_mps: None,
+            yaw_rate_rps: None,
+            range_noise_m: 0.02,
+            beam_bias_m: 0.01,
+            dropout: 1.0,
+        }
+    }
+}
+
+/// Why a street or a part of it was refused.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum StreetError {
+    /// An option is outside its range, or not a number.
+    #[error("{name} must lie between {low} and {high}, not {value}")]
+    OutOfRange {
+        /// The option.
+        name: &'static str,
+        /// What was asked for.
+        value: f64,
+        /// Least value allowed.
+        low: f64,
+        /// Greatest value allowed.
+        high: f64,
+    },
+    /// Lasers times shots are more than a sweep may have.
+    #[error("a sweep of {rays} rays is over the limit of {limit}")]
+    TooManyRays {
+        /// Rays asked for.
+        rays: usize,
+        /// Most rays allowed.
+        limit: usize,
+    },
+    /// A frame, or the frame after it, that the street does not have.
+    #[error("frame {frame} of a street of {frames} frames")]
+    NoSuchFrame {
+        /// The frame asked for.
+        frame: usize,
+        /// Frames of the street.
+        frames: usize,
+    },
+}
+
+impl StreetOptions {
+    /// Refuses what is not a number, out of range or too large.
+    pub(super) fn validate(&self) -> Result<(), StreetError> {
+        check("frames", self.frames as f64, [1.0, 1000.0])?;
+        check("beams", self.beams as f64, [1.0, 256.0])?;
+        check("azimuth_steps", self.azimuth_steps as f64, [16.0, 8192.0])?;
+        check("movers", self.movers as f64, [0.0, 256.0])?;
+        check("range_noise_m", self.range_noise_m, [0.0, 1.0])?;
+        check("beam_bias_m", self.beam_bias_m, [0.0, 1.0])?;
+        check("dropout", self.dropout, [0.0, 1.0])?;
+        if let Some(speed) = self.speed_mps {
+            check("speed_mps", speed, [0.0, 40.0])?;
+        }
+        if let Some(yaw_rate) = self.yaw_rate_rps {
+            check("yaw_rate_rps", yaw_rate, [-1.0, 1.0])?;
+        }
+        let rays = self.beams * self.azimuth_steps;
+        if rays > MAX_RAYS {
+            return Err(StreetError::TooManyRays {
+                rays,
+                limit: MAX_RAYS,
+            });
+        }
+        Ok(())
+    }
+
+    /// The curvature of the street at the first frame, 1/m, for the speed that was settled on.
+    pub(super) fn curvature(yaw_rate: f64, speed: f64) -> Result<f64, StreetError> {
+        let limit = speed / MIN_RADIUS_M;
+        check("yaw_rate_rps", yaw_rate, [-limit, limit])?;
+        Ok(if speed > 0.0 { yaw_rate / speed } else { 0.0 })
+    }
+}
+
+fn check(name: &'static str, value: f64, [low, high]: [f64; 2]) -> Result<(), StreetError> {
+    if (low..=high).contains(&value) {
+        return Ok(());
+    }
+    Err(StreetError::OutOfRange {
+        name,
+        value,
+        low,
+        high,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn refused(change: impl Fn(&mut StreetOptions)) -> String {
+        let mut options = StreetOptions::default();
+        change(&mut options);
+        options.validate().unwrap_err().to_string()
+    }
+
+    #[test]
+    fn values_that_are_zero_huge_or_not_a_number_are_refused() {
+        assert_eq!(StreetOptions::default().validate(), Ok(()));
+        assert!(refused(|o| o.frames = 0).starts_with("frames must"));
+        assert!(refused(|o| o.frames = usize::MAX).starts_with("frames must"));
+        assert!(refused(|o| o.beams = 0).starts_with("beams must"));
+        assert!(refused(|o| o.beams = usize::MAX).starts_with("beams must"));
+        assert!(refused(|o| o.azimuth_steps = 3).starts_with("azimuth_steps must"));
+        assert!(refused(|o| o.movers = 1 << 40).starts_with("movers must"));
+        assert!(refused(|o| o.range_noise_m = f64::NAN).contains("not NaN"));
+        assert!(refused(|o| o.beam_bias_m = -0.1).starts_with("beam_bias_m must"));
+        assert!(refused(|o| o.dropout = f64::INFINITY).starts_with("dropout must"));
+        assert!(refused(|o| o.speed_mps = Some(f64::NAN)).starts_with("speed_mps must"));
+        assert!(refused(|o| o.yaw_rate_rps = Some(9.0)).starts_with("yaw_rate_rps must"));
+    }
+
+    #[test]
+    fn beams_and_steps_are_bounded_together() {
+        let error = refused(|o| (o.beams, o.azimuth_steps) = (256, 8192));
+        assert!(error.contains("2097152 rays"), "{error}");
+    }
+
+    #[test]
+    fn a_turn_tighter_than_the_street_is_refused() {
+        assert_eq!(StreetOptions::curvature(0.1, 10.0), Ok(0.01));
+        assert_eq!(StreetOptions::curvature(0.0, 0.0), Ok(0.0));
+        assert!(StreetOptions::curvature(0.5, 10.0).is_err());
+        assert!(StreetOptions::curvature(0.1, 0.0).is_err());
+    }
+}
