@@ -1,8 +1,8 @@
 //! The seam to a device: what the solver asks of whatever computes.
 
-use super::distance::DistanceError;
+use super::distance::{DistanceError, DistanceOptions};
 use super::options::Options;
-use super::points::Point;
+use super::points::{Point, RigidTransform};
 use super::watch::{Interrupt, Watch};
 
 /// A device that can fit a field to a pair.
@@ -10,27 +10,47 @@ pub trait Backend: Send + Sync {
     /// The device's name, as reports show it.
     fn name(&self) -> String;
 
-    /// Builds the target's distance transform and a field at its start.
+    /// Builds the distance transform of `target` over a grid that covers both clouds.
     ///
     /// # Errors
-    /// [`BackendError`] where the pair does not fit or the device fails.
-    fn start(
+    /// [`BackendError`] where the clouds are refused or the device fails.
+    fn transform(
         &self,
         source: &[Point],
         target: &[Point],
+        options: &DistanceOptions,
+    ) -> Result<Box<dyn Transform>, BackendError>;
+}
+
+/// A target's distance transform on a device.
+pub trait Transform: Send {
+    /// Bytes that it occupies.
+    fn bytes(&self) -> usize;
+
+    /// The rigid motion target_from_source that aligns `source` with the target.
+    fn align(&self, source: &[Point]) -> RigidTransform;
+
+    /// A field at its start, to be fitted to `source`.
+    ///
+    /// # Errors
+    /// [`BackendError`] where the device fails.
+    fn start(
+        self: Box<Self>,
+        source: &[Point],
         options: &Options,
     ) -> Result<Box<dyn Trainer>, BackendError>;
 }
 
 /// One optimization in progress.
 pub trait Trainer: Send {
-    /// Does up to `steps` iterations.
+    /// Does up to `steps` iterations; looks at `watch` before each.
     ///
     /// # Errors
     /// [`BackendError`] where the device fails.
     fn advance(&mut self, steps: usize, watch: &dyn Watch) -> Result<Advance, BackendError>;
 
-    /// The best field so far at `points`: a displacement each, metres.
+    /// The result so far at `points`, which need not be the fitted ones: a displacement each,
+    /// metres.
     ///
     /// # Errors
     /// [`BackendError`] where the device fails.
@@ -40,7 +60,7 @@ pub trait Trainer: Send {
     fn report(&self) -> Report;
 }
 
-/// How an [`Trainer::advance`] ended.
+/// How a call of [`Trainer::advance`] ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Advance {
     /// All steps were done; more may follow.
@@ -56,20 +76,16 @@ pub enum Advance {
 }
 
 /// What a trainer has reached.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Report {
     /// Iterations done.
     pub iterations: usize,
-    /// The iteration whose field [`Trainer::evaluate`] uses, from 1.
+    /// The iteration, from 1, whose field [`Trainer::evaluate`] uses; the latest for an average.
     pub best_iteration: usize,
-    /// Its loss: mean distance to the target, metres.
+    /// Its loss, metres; the running mean of the batches' losses for an average.
     pub best_loss: f64,
-    /// Seconds in the distance query, summed over threads and divided by them.
+    /// Seconds in the distance query: the mean over the threads that ran it.
     pub query_seconds: f64,
-    /// Seconds in the network and its optimizer.
-    pub network_seconds: f64,
-    /// Bytes of the distance transform.
-    pub distance_bytes: usize,
 }
 
 /// Why a device could not go on.

@@ -7,7 +7,7 @@ use super::options::EarlyStopOptions;
 
 /// The rule's state.
 #[derive(Clone, Debug)]
-pub struct EarlyStop {
+pub(crate) struct EarlyStop {
     options: EarlyStopOptions,
     best: Option<f64>,
     without_progress: usize,
@@ -15,12 +15,12 @@ pub struct EarlyStop {
 
 impl EarlyStop {
     /// A rule that has seen nothing.
-    pub fn new(options: EarlyStopOptions) -> Self {
+    pub(crate) fn new(options: EarlyStopOptions) -> Self {
         Self { options, best: None, without_progress: 0 }
     }
 
     /// Takes the next loss, metres; true where the optimization should end.
-    pub fn observe(&mut self, loss: f64) -> bool {
+    pub(crate) fn observe(&mut self, loss: f64) -> bool {
         if loss.is_nan() {
             return true;
         }

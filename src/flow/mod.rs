@@ -1,24 +1,35 @@
 //! The numerics: scene flow of a pair of point clouds by run-time optimization.
 //!
-//! No async, no input or output, no clock, no environment, no globals.
-
+//! ```text
+//! Problem - preprocess - backend.transform - align - start - loop { advance } - evaluate - Estimate
+//! ```
+//!
+//! No async, no input or output, no clock, no environment, no globals. Deadlines, cancellation and
+//! time come in through a [`Watch`].
+mod points;
+mod options;
+mod error;
+mod watch;
+mod solver;
+mod preprocess;
+pub mod distance;
+pub mod ego;
+pub mod field;
+mod loss;
+mod optimizer;
+mod early_stop;
 pub mod backend;
 pub mod cpu;
-pub mod distance;
-mod early_stop;
-pub mod field;
-mod optimizer;
-mod options;
-mod points;
-mod random;
-<<<<<<< HEAD
-mod watch;
-=======
-
 pub mod evaluate;
 pub mod simulate;
->>>>>>> street
+mod random;
 
+#[cfg(test)]
+mod reference;
+
+pub use error::FlowError;
 pub use options::*;
 pub use points::{Point, RigidTransform};
-pub use watch::*;
+pub use preprocess::{MIN_POINTS, Problem};
+pub use solver::{DYNAMIC_M, Estimate, PhaseSeconds, StopReason, estimate};
+pub use watch::{Interrupt, Progress, Unwatched, Watch};

@@ -1,38 +1,145 @@
 //! Every hyper-parameter and its default: the presets are here and nowhere else.
 
 use super::distance::DistanceOptions;
+use super::points::RigidTransform;
+
+/// A named set of options.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Preset {
+    /// Ours: robust rigid alignment, then a short stochastic fit of what is left.
+    Default,
+    /// The published method with the published code's settings.
+    Paper,
+}
+
+impl Preset {
+    /// All presets.
+    pub const ALL: [Self; 2] = [Self::Default, Self::Paper];
+
+    /// The name that the command line and the service use.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Default => "default",
+            Self::Paper => "paper",
+        }
+    }
+
+    /// The preset's options. With `max_points` the clouds are sampled first, and `paper` takes
+    /// the published settings for sampled clouds instead of those for full ones.
+    pub fn options(self, max_points: Option<usize>) -> Options {
+        match self {
+            Self::Default => Options::stochastic(max_points),
+            Self::Paper => Options::published(max_points),
+        }
+    }
+}
 
 /// Options of one estimate. Start from a [`Preset`] and change what you must.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {
     /// Drives every random choice: the same seed gives the same bits.
     pub seed: u64,
+    /// Points drawn from each cloud before anything else; all of them where none.
+    pub max_points: Option<usize>,
+    /// Points with `|x|` or `|y|` beyond this are left out, metres.
+    pub range_m: Option<f32>,
+    /// What becomes of ground points.
+    pub ground: Ground,
+    /// The vehicle's own motion.
+    pub ego: Ego,
     /// The distance transform.
     pub distance: DistanceOptions,
+    /// What is minimized.
+    pub loss: LossOptions,
     /// What the network is fed.
     pub inputs: Inputs,
     /// Where the network starts.
     pub start: Start,
     /// Adam's step size at the first iteration.
     pub learning_rate: f32,
-    /// Points drawn for each iteration; all of them where none.
-    pub batch: Option<usize>,
     /// How the step size falls.
     pub decay: Decay,
-    /// Momentum decay.
-    pub beta2: f32,
-    /// Average.
-    pub average: Option<f32>,
-    /// Dead.
-    pub dead: f32,
-    /// Norm.
-    pub norm: f32,
-    /// Distances count no further than this, metres.
-    pub truncation_m: Option<f32>,
+    /// Points that an iteration looks at; all of them where none.
+    pub batch: Option<usize>,
+    /// Which of the fields on the way is the result.
+    pub keep: Keep,
     /// When to stop before `max_iterations`.
     pub early_stop: Option<EarlyStopOptions>,
     /// Iterations at most.
     pub max_iterations: usize,
+}
+
+impl Options {
+    /// FNSF as its published code runs it, for full and for sampled clouds.
+    fn published(max_points: Option<usize>) -> Self {
+        let (learning_rate, patience) = if max_points.is_some() { (0.01, 5) } else { (0.008, 10) };
+        Self {
+            seed: 0,
+            max_points,
+            range_m: None,
+            ground: Ground::Keep,
+            ego: Ego::Off,
+            distance: DistanceOptions::default(),
+            loss: LossOptions { margin_m: 0.0, truncation_m: None, flow_penalty: 0.0 },
+            inputs: Inputs::Raw,
+            start: Start::Xavier,
+            learning_rate,
+            decay: Decay::Constant,
+            batch: None,
+            keep: Keep::Best,
+            early_stop: Some(EarlyStopOptions { patience, min_delta_m: 1e-3 }),
+            max_iterations: 5000,
+        }
+    }
+
+    /// Ours; `docs/numerics.md` shows what each of these choices changes.
+    fn stochastic(max_points: Option<usize>) -> Self {
+        Self {
+            ego: Ego::Auto,
+            loss: LossOptions { margin_m: 0.1, truncation_m: None, flow_penalty: 0.02 },
+            inputs: Inputs::Centered { scale_m: 20.0 },
+            start: Start::ZeroFlow,
+            learning_rate: 0.008,
+            decay: Decay::Cosine,
+            batch: Some(2048),
+            keep: Keep::Average { decay: 0.9 },
+            early_stop: None,
+            max_iterations: 150,
+            ..Self::published(max_points)
+        }
+    }
+}
+
+/// What becomes of ground points.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ground {
+    /// They are points like any other.
+    Keep,
+    /// Those that the problem's masks name are left out.
+    Mask,
+}
+
+/// The vehicle's own motion, which carries every static point.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Ego {
+    /// It is part of what the field has to explain.
+    Off,
+    /// It is estimated first; the field explains the rest.
+    Auto,
+    /// It is known, as target_from_source; the field explains the rest.
+    Given(RigidTransform),
+}
+
+/// What is minimized: per point the distance, clamped, plus a penalty on the field's length.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LossOptions {
+    /// Distances below this are good enough, metres: a static surface is sampled at other places
+    /// by each sweep, and following the samples is not motion.
+    pub margin_m: f32,
+    /// Distances count no further than this, metres.
+    pub truncation_m: Option<f32>,
+    /// Weight of the field's length, metres of loss a metre of flow.
+    pub flow_penalty: f32,
 }
 
 /// What the network is fed.
@@ -40,7 +147,7 @@ pub struct Options {
 pub enum Inputs {
     /// Coordinates as they come, metres.
     Raw,
-    /// Coordinates about the cloud's mean, divided by this many metres.
+    /// Coordinates about the cloud's mean, divided by `scale_m`.
     Centered {
         /// Metres that become one.
         scale_m: f32,
@@ -48,7 +155,7 @@ pub enum Inputs {
 }
 
 /// Where the network starts.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Start {
     /// Xavier-uniform weights in every layer: flows of metres at first.
     Xavier,
@@ -57,14 +164,24 @@ pub enum Start {
 }
 
 /// How the step size falls.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Decay {
     /// It does not.
     Constant,
-    /// Linearly to zero at `max_iterations`.
-    Linear,
-    /// As a half cosine to zero.
+    /// Along half a cosine, to zero at `max_iterations`.
     Cosine,
+}
+
+/// Which of the fields on the way is the result.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Keep {
+    /// The one with the lowest loss.
+    Best,
+    /// The running average of the parameters.
+    Average {
+        /// Weight of the past at each iteration; ramped up over the first iterations.
+        decay: f32,
+    },
 }
 
 /// The stopping rule of the published code.

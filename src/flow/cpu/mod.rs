@@ -8,10 +8,11 @@ pub use kernels::Isa;
 
 use std::sync::Arc;
 
-use super::backend::{Backend, BackendError, Trainer};
-use super::distance::DistanceTransform;
+use super::backend::{Backend, BackendError, Trainer, Transform};
+use super::distance::{DistanceOptions, DistanceTransform};
+use super::ego;
 use super::options::Options;
-use super::points::Point;
+use super::points::{Point, RigidTransform};
 use kernels::Kernels;
 
 /// The CPU, or a set of its threads.
@@ -52,15 +53,40 @@ impl Backend for CpuBackend {
         format!("cpu ({}, {} threads)", self.isa.name(), self.threads.current_num_threads())
     }
 
-    fn start(
+    fn transform(
         &self,
         source: &[Point],
         target: &[Point],
+        options: &DistanceOptions,
+    ) -> Result<Box<dyn Transform>, BackendError> {
+        let distance =
+            self.threads.install(|| DistanceTransform::build(source, target, options))?;
+        let (kernels, threads) = (self.kernels, Arc::clone(&self.threads));
+        Ok(Box::new(CpuTransform { kernels, threads, distance }))
+    }
+}
+
+/// A distance transform in memory, and what will fit a field to it.
+struct CpuTransform {
+    kernels: Kernels,
+    threads: Arc<rayon::ThreadPool>,
+    distance: DistanceTransform,
+}
+
+impl Transform for CpuTransform {
+    fn bytes(&self) -> usize {
+        self.distance.bytes()
+    }
+
+    fn align(&self, source: &[Point]) -> RigidTransform {
+        ego::align(source, &self.distance)
+    }
+
+    fn start(
+        self: Box<Self>,
+        source: &[Point],
         options: &Options,
     ) -> Result<Box<dyn Trainer>, BackendError> {
-        let distance =
-            self.threads.install(|| DistanceTransform::build(source, target, &options.distance))?;
-        let threads = Arc::clone(&self.threads);
-        Ok(Box::new(trainer::CpuTrainer::new(self.kernels, threads, distance, source, options)))
+        Ok(Box::new(trainer::CpuTrainer::new(*self, source, options)))
     }
 }

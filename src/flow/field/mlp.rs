@@ -5,6 +5,8 @@
 
 use bytemuck::{Pod, Zeroable};
 
+use crate::flow::options::Inputs;
+use crate::flow::points::Point;
 use crate::flow::random::Random;
 
 /// Features of every hidden layer.
@@ -111,11 +113,9 @@ impl Parameters {
         parameters
     }
 
-    /// Multiplies the last layer by `factor`: zero starts the field at zero flow.
-    pub(crate) fn scale_last_layer(&mut self, factor: f32) {
-        for weight in &mut self.as_mut_slice()[LAST..LAST + 3 * WIDTH] {
-            *weight *= factor;
-        }
+    /// Makes the last layer zero, and with it the flow.
+    pub(crate) fn clear_last_layer(&mut self) {
+        self.as_mut_slice()[LAST..].fill(0.0);
     }
 
     pub(crate) fn as_slice(&self) -> &[f32] {
@@ -127,9 +127,45 @@ impl Parameters {
     }
 }
 
-/// Writes the middle layers' transposes, in the same panels: entry (`output`, `input`) of `to` is
-/// entry (`input`, `output`) of `from`. Backward kernels then read one stream as well.
-pub(crate) fn transpose_middle_layer(from: &[f32], to: &mut [f32]) {
+/// Points' coordinates to network inputs.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Conditioning {
+    center: Point,
+    scale: f32,
+}
+
+impl Conditioning {
+    pub(crate) fn new(points: &[Point], inputs: Inputs) -> Self {
+        match inputs {
+            Inputs::Raw => Self { center: [0.0; 3], scale: 1.0 },
+            Inputs::Centered { scale_m } => {
+                let mean = |axis: usize| {
+                    let sum: f64 = points.iter().map(|point| f64::from(point[axis])).sum();
+                    (sum / points.len().max(1) as f64) as f32
+                };
+                Self { center: [mean(0), mean(1), mean(2)], scale: 1.0 / scale_m }
+            }
+        }
+    }
+
+    #[inline]
+    pub(crate) fn apply(&self, point: Point) -> Point {
+        core::array::from_fn(|a| (point[a] - self.center[a]) * self.scale)
+    }
+}
+
+/// Writes the middle layers' transposes, in the same panels, so that backward kernels read one
+/// stream as well.
+pub(crate) fn transpose_middle_layers(from: &Parameters, to: &mut Parameters) {
+    for layer in 0..MIDDLE_LAYERS {
+        let at = middle_layer(layer);
+        let weights = at.weights..at.bias;
+        transpose(&from.as_slice()[weights.clone()], &mut to.as_mut_slice()[weights]);
+    }
+}
+
+/// Entry (`output`, `input`) of `to` becomes entry (`input`, `output`) of `from`.
+fn transpose(from: &[f32], to: &mut [f32]) {
     for output_panel in 0..WIDTH / PANEL {
         for input_panel in 0..WIDTH / PANEL {
             for input in input_panel * PANEL..(input_panel + 1) * PANEL {
@@ -172,8 +208,8 @@ mod tests {
         let layer = &parameters.as_slice()[at.weights..at.bias];
         let mut once = vec![0.0; layer.len()];
         let mut twice = vec![0.0; layer.len()];
-        transpose_middle_layer(layer, &mut once);
-        transpose_middle_layer(&once, &mut twice);
+        transpose(layer, &mut once);
+        transpose(&once, &mut twice);
         assert_eq!(once[panel_index(5, 77)], layer[panel_index(77, 5)]);
         assert_eq!(twice, layer);
     }

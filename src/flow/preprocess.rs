@@ -1,0 +1,139 @@
+//! Which rows of the two clouds take part: finite, in range, off the ground, sampled.
+//!
+//! Points that are left out keep their row in the result. Knows nothing of what comes after.
+
+use super::error::FlowError;
+use super::options::{Ground, Options};
+use super::points::Point;
+use super::random::Random;
+
+/// Two clouds, as they came.
+#[derive(Clone, Copy, Debug)]
+pub struct Problem<'a> {
+    /// N points of the earlier sweep, metres, in its sensor's frame.
+    pub source: &'a [Point],
+    /// M points of the later sweep, metres, in its sensor's frame.
+    pub target: &'a [Point],
+    /// N and M flags: which points are ground. Needed by [`Ground::Mask`].
+    pub ground: Option<[&'a [bool]; 2]>,
+}
+
+/// The points that take part.
+#[derive(Clone, Debug)]
+pub(crate) struct Selection {
+    /// Rows of the source, one for each of `source`.
+    pub(crate) rows: Vec<usize>,
+    pub(crate) source: Vec<Point>,
+    pub(crate) target: Vec<Point>,
+}
+
+/// Fewer points than this in a cloud determine no motion.
+pub const MIN_POINTS: usize = 3;
+
+/// Selects by `options`; refuses clouds of which too little is left.
+pub(crate) fn select(problem: &Problem, options: &Options) -> Result<Selection, FlowError> {
+    let masks = match (options.ground, problem.ground) {
+        (Ground::Keep, _) => [None, None],
+        (Ground::Mask, Some([source, target])) => [Some(source), Some(target)],
+        (Ground::Mask, None) => return Err(FlowError::NoGroundMask),
+    };
+    let mut rows = kept("source", problem.source, masks[0], options)?;
+    let mut target_rows = kept("target", problem.target, masks[1], options)?;
+    if let Some(max_points) = options.max_points {
+        // One permutation for both clouds, as the published code draws it.
+        let mut order: Vec<usize> = (0..rows.len().min(target_rows.len())).collect();
+        Random::stream(options.seed, 1).shuffle(&mut order);
+        order.truncate(max_points);
+        rows = order.iter().map(|&i| rows[i]).collect();
+        target_rows = order.iter().map(|&i| target_rows[i]).collect();
+    }
+    for (cloud, rows) in [("source", &rows), ("target", &target_rows)] {
+        if rows.len() < MIN_POINTS {
+            return Err(FlowError::TooFewPoints { cloud, points: rows.len() });
+        }
+    }
+    Ok(Selection {
+        source: rows.iter().map(|&row| problem.source[row]).collect(),
+        target: target_rows.iter().map(|&row| problem.target[row]).collect(),
+        rows,
+    })
+}
+
+/// The rows of `points` that are finite, in range and not masked.
+fn kept(
+    cloud: &'static str,
+    points: &[Point],
+    ground: Option<&[bool]>,
+    options: &Options,
+) -> Result<Vec<usize>, FlowError> {
+    if let Some(flags) = ground.map(<[bool]>::len)
+        && flags != points.len()
+    {
+        return Err(FlowError::GroundMaskLength { cloud, flags, points: points.len() });
+    }
+    let range = options.range_m.unwrap_or(f32::INFINITY);
+    Ok((0..points.len())
+        .filter(|&row| {
+            let [x, y, z] = points[row];
+            let finite = x.is_finite() && y.is_finite() && z.is_finite();
+            let in_range = x.abs() <= range && y.abs() <= range;
+            finite && in_range && !ground.is_some_and(|ground| ground[row])
+        })
+        .collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::options::Preset;
+
+    fn rows(options: &Options, source: &[Point], ground: Option<&[bool]>) -> Vec<usize> {
+        let problem =
+            Problem { source, target: source, ground: ground.map(|flags| [flags, flags]) };
+        select(&problem, options).expect("enough points").rows
+    }
+
+    #[test]
+    fn points_that_are_not_finite_out_of_range_or_ground_are_left_out() {
+        let source = [
+            [0.0; 3],
+            [f32::NAN, 0.0, 0.0],
+            [1.0, 2.0, 3.0],
+            [0.0, f32::INFINITY, 0.0],
+            [-60.0, 0.0, 0.0],
+            [5.0, 5.0, 90.0],
+            [6.0, 6.0, 0.0],
+        ];
+        let ground = [false, false, false, false, false, false, true];
+        let mut options = Preset::Default.options(None);
+        options.range_m = Some(51.2);
+        assert_eq!(rows(&options, &source, Some(&ground)), [0, 2, 5, 6]);
+        options.ground = Ground::Mask;
+        assert_eq!(rows(&options, &source, Some(&ground)), [0, 2, 5]);
+    }
+
+    #[test]
+    fn sampling_takes_distinct_rows_and_depends_on_the_seed() {
+        let source: Vec<Point> = (0..100).map(|i| [i as f32, 0.0, 0.0]).collect();
+        let mut options = Preset::Paper.options(Some(40));
+        let first = rows(&options, &source, None);
+        options.seed = 1;
+        let second = rows(&options, &source, None);
+        let mut unique = first.clone();
+        unique.sort_unstable();
+        unique.dedup();
+        assert_eq!(unique.len(), 40);
+        assert_ne!(first, second);
+    }
+
+    #[test]
+    fn too_few_points_and_missing_masks_are_named() {
+        let problem = Problem { source: &[[0.0; 3]], target: &[[0.0; 3]], ground: None };
+        let mut options = Preset::Default.options(None);
+        let error = select(&problem, &options).expect_err("one point");
+        assert!(matches!(error, FlowError::TooFewPoints { cloud: "source", points: 1 }));
+        options.ground = Ground::Mask;
+        let error = select(&problem, &options).expect_err("no mask");
+        assert!(matches!(error, FlowError::NoGroundMask));
+    }
+}

@@ -1,0 +1,88 @@
+//! The oracle: the paper's formulas in plain double-precision loops. Slow, obvious, test-only.
+//!
+//! Every kernel is tested against it. It shares no code with what it checks but the layout of
+//! [`Parameters`].
+
+use super::field::mlp::{
+    MIDDLE_LAYERS, PANEL, Parameters, WIDTH, first_layer, last_layer, middle_layer, panel_index,
+};
+
+/// The network as dense matrices: `weights[layer][output][input]`, `biases[layer][output]`.
+pub(crate) struct ReferenceNetwork {
+    pub(crate) weights: Vec<Vec<Vec<f64>>>,
+    pub(crate) biases: Vec<Vec<f64>>,
+}
+
+impl ReferenceNetwork {
+    /// Reads the laid-out parameters, or gradients, one by one.
+    pub(crate) fn read(parameters: &Parameters) -> Self {
+        assert_eq!(PANEL, 32, "the layout below is written for panels of 32");
+        let floats = parameters.as_slice();
+        let at = |place: usize| f64::from(floats[place]);
+        let mut weights = Vec::new();
+        let mut biases = Vec::new();
+        let first = first_layer();
+        weights.push(matrix(WIDTH, 3, |o, i| at(first.weights + i * WIDTH + o)));
+        biases.push((0..WIDTH).map(|o| at(first.bias + o)).collect());
+        for layer in 0..MIDDLE_LAYERS {
+            let place = middle_layer(layer);
+            weights.push(matrix(WIDTH, WIDTH, |o, i| at(place.weights + panel_index(i, o))));
+            biases.push((0..WIDTH).map(|o| at(place.bias + o)).collect());
+        }
+        let last = last_layer();
+        weights.push(matrix(3, WIDTH, |o, i| at(last.weights + o * WIDTH + i)));
+        biases.push((0..3).map(|o| at(last.bias + o)).collect());
+        Self { weights, biases }
+    }
+
+    /// Activations of every layer, the input first and the output last.
+    fn activations(&self, input: [f64; 3]) -> Vec<Vec<f64>> {
+        let mut layers = vec![input.to_vec()];
+        for (number, (weights, biases)) in self.weights.iter().zip(&self.biases).enumerate() {
+            let from = &layers[number];
+            let linear = weights.iter().zip(biases).map(|(row, bias)| {
+                bias + row.iter().zip(from).map(|(w, h)| w * h).sum::<f64>()
+            });
+            let last = number + 1 == self.weights.len();
+            layers.push(linear.map(|x| if last { x } else { x.max(0.0) }).collect());
+        }
+        layers
+    }
+
+    /// `g(input)`.
+    pub(crate) fn forward(&self, input: [f64; 3]) -> [f64; 3] {
+        let output = self.activations(input).pop().expect("a network has layers");
+        [output[0], output[1], output[2]]
+    }
+
+    /// Adds to `gradients` the derivative of `output_gradient . g(input)` by every parameter.
+    pub(crate) fn backward(&self, input: [f64; 3], output_gradient: [f64; 3], gradients: &mut Self) {
+        let layers = self.activations(input);
+        let mut delta = output_gradient.to_vec();
+        for number in (0..self.weights.len()).rev() {
+            for (output, d) in delta.iter().enumerate() {
+                gradients.biases[number][output] += d;
+                for (i, h) in layers[number].iter().enumerate() {
+                    gradients.weights[number][output][i] += d * h;
+                }
+            }
+            delta = (0..layers[number].len())
+                .map(|i| {
+                    let back: f64 =
+                        delta.iter().zip(&self.weights[number]).map(|(d, row)| d * row[i]).sum();
+                    if number == 0 || layers[number][i] > 0.0 { back } else { 0.0 }
+                })
+                .collect();
+        }
+    }
+
+    /// All weights and biases in one row.
+    pub(crate) fn flat(&self) -> Vec<f64> {
+        let weights = self.weights.iter().flatten().flatten();
+        weights.chain(self.biases.iter().flatten()).copied().collect()
+    }
+}
+
+fn matrix(rows: usize, columns: usize, entry: impl Fn(usize, usize) -> f64) -> Vec<Vec<f64>> {
+    (0..rows).map(|r| (0..columns).map(|c| entry(r, c)).collect()).collect()
+}
