@@ -30,8 +30,8 @@ pub fn shown_motion(source: &[Point], flow: &[Point], ego: Option<&RigidTransfor
     source.iter().zip(flow).map(residual).collect()
 }
 
-/// The speed, metres over the pair, at which colors are full: one of 0.1, 0.2, 0.5, 1, 2, 5, ...
-/// that nearly all of the moving points stay below.
+/// The speed, metres over the pair, at which colors are full: one of 0.1, 0.15, 0.2, 0.3,
+/// 0.4, 0.5, 0.6, 0.8, 1, 1.5, ... that nearly all of the moving points stay below.
 pub fn full_scale(motion: &[Point], valid: &[bool]) -> f32 {
     let mut moving: Vec<f32> = motion
         .iter()
@@ -48,11 +48,11 @@ pub fn full_scale(motion: &[Point], valid: &[bool]) -> f32 {
     round_up(*speed).max(LEAST_SCALE_M)
 }
 
-/// The next of 1, 2, 5, 10, 20, ... (and 0.1, 0.2, ...).
+/// The next of the round numbers that [`full_scale`] names.
 fn round_up(value: f32) -> f32 {
     let decade = 10.0_f32.powf(value.log10().floor());
-    let steps = [1.0, 2.0, 5.0, 10.0].map(|step| step * decade);
-    // A hair of slack: 0.2 m must not become 0.5 m for the rounding of a logarithm.
+    let steps = [1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0].map(|step| step * decade);
+    // A hair of slack: 0.2 m must not become 0.3 m for the rounding of a logarithm.
     steps
         .into_iter()
         .find(|step| *step >= value * 0.999)
@@ -84,7 +84,7 @@ mod tests {
     fn the_full_scale_is_a_round_number_that_covers_the_movers() {
         assert_eq!(full_scale(&[], &[]), 0.1);
         assert_eq!(full_scale(&[[0.0, 0.0, 0.0]; 9], &[true; 9]), 0.1);
-        assert!((full_scale(&[[1.3, 0.0, 0.0]; 9], &[true; 9]) - 2.0).abs() < 1e-6);
+        assert!((full_scale(&[[1.3, 0.0, 0.0]; 9], &[true; 9]) - 1.5).abs() < 1e-6);
         assert!((full_scale(&[[0.0, 0.2, 9.0]; 9], &[true; 9]) - 0.2).abs() < 1e-6);
         assert_eq!(full_scale(&[[7.0, 0.0, 0.0]; 9], &[false; 9]), 0.1);
     }
