@@ -22,6 +22,9 @@ pub(super) const MAGIC: &[u8] = b"ARROW1";
 /// Argoverse 2's names for a displacement, metres.
 pub(super) const FLOW_COLUMNS: [&str; 3] = ["flow_tx_m", "flow_ty_m", "flow_tz_m"];
 
+/// Writers may pad a buffer to this many bytes.
+const BUFFER_PADDING: u64 = 64;
+
 /// Bytes that a decoded point takes; what batches may cost together is priced with it.
 const POINT_BYTES: u64 = 12;
 
@@ -244,10 +247,22 @@ impl<'a> Batch<'a> {
             return Ok(Box::new(stored));
         }
         // Eight bytes say the length unfolded, -1 that it is not folded at all. Only as much as
-        // the rows need is ever read, so that number decides nothing.
+        // the rows need is ever read; a number that says otherwise is a broken file.
         let (unfolded, packed) = stored.split_first_chunk::<8>().ok_or_else(lacks)?;
         if i64::from_le_bytes(*unfolded) == -1 {
             return Ok(Box::new(packed));
+        }
+        let needed = match column.stored {
+            Stored::Number(scalar) => self.rows.saturating_mul(scalar.size()),
+            Stored::Bit => self.rows.div_ceil(8),
+            Stored::Other => 0,
+        } as u64;
+        let declared = u64::from_le_bytes(*unfolded);
+        if !(needed..=needed + BUFFER_PADDING).contains(&declared) {
+            return Err(KIND.malformed(format!(
+                "column {} declares {declared} bytes where its rows take {needed}",
+                shorten(&column.name)
+            )));
         }
         Ok(Box::new(lz4_flex::frame::FrameDecoder::new(packed)))
     }

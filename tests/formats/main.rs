@@ -3,6 +3,8 @@
 
 // cfg(test) is always set here; it tells clippy that the modules' plain functions are tests too.
 #[cfg(test)]
+mod bombs;
+#[cfg(test)]
 mod hostile;
 #[cfg(test)]
 mod real_data;
