@@ -86,6 +86,10 @@ fn read_npz(bytes: &[u8]) -> Result<Vec<Point>, FormatError> {
     match known[..] {
         [name] => npz.points(name),
         [] => {
+            // An array that is refused says more than a cloud that is missing.
+            for name in &names {
+                npz.header(name)?;
+            }
             let present = npz.described();
             Err(FileKind::Npz.missing("an N x 3 array, such as points", &present))
         }

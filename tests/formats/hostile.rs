@@ -22,6 +22,9 @@ fn object_arrays_are_refused_by_name() {
             .to_string()
             .contains("object arrays hold pickled Python and are refused")
     );
+    let pickled = npy("'|O'", false, "(2,)", &[0; 64]);
+    let error = refusal(&npz(&[("pcs", &pickled)]));
+    assert!(error.to_string().contains("pickled Python"), "{error}");
     let structured = refusal(&npy("[('x', '<f4')]", false, "(2,)", &[0; 64]));
     assert!(
         structured.to_string().contains("structured"),
