@@ -1,1 +1,31 @@
-//! stub
+//! Files in and out: clouds, pairs and flow in the formats that people have.
+//!
+//! Recognized by content, checked before anything is allocated, refused by name. It knows bytes
+//! and the vocabulary of `flow`; it must not know files, jobs, solvers or the command line.
+
+mod error;
+mod limits;
+mod sniff;
+
+mod cloud;
+mod flow_file;
+mod pair;
+
+mod bin;
+mod feather;
+mod json;
+mod lzf;
+mod npy;
+mod npz;
+mod pcd;
+mod ply;
+mod scalar;
+
+pub use cloud::{Cloud, CloudFormat, read_cloud, write_cloud};
+pub use error::{FileKind, FormatError};
+pub use flow_file::{FlowFile, FlowFormat, FlowTable, read_flow, write_flow};
+pub use limits::{MAX_COORDINATE_M, MAX_POINTS};
+pub use pair::{
+    Av2Labels, Ground, Pair, PairTruth, is_pair, read_av2_labels, read_pair, write_pair_npz,
+};
+pub use sniff::recognize;

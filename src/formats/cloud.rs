@@ -1,0 +1,260 @@
+//! One cloud in any format: reading by content, writing by choice.
+//!
+//! Row order is kept, because flow goes out in it. It must not know of flow or of labels.
+
+use std::io::Write;
+
+use crate::flow::Point;
+
+use super::error::{FileKind, FormatError, shorten};
+use super::feather::{self, Table, Values};
+use super::limits::{MAX_COORDINATE_M, check_value};
+use super::npz::Npz;
+use super::pcd::{self, Pcd};
+use super::ply::{self, Ply};
+use super::scalar::{Scalar, write_floats};
+use super::sniff::recognize;
+use super::{bin, npy};
+
+const AXES: [&str; 3] = ["x", "y", "z"];
+
+/// The points of one sweep, in the order of the file's rows.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Cloud {
+    /// x, y, z in metres. Finite, except for the rows counted by `no_return`.
+    pub points: Vec<Point>,
+    /// Rows that are NaN in x, y and z: PCD's way to say that a beam did not return. They keep
+    /// their row; only PCD files have them.
+    pub no_return: usize,
+}
+
+impl From<Vec<Point>> for Cloud {
+    fn from(points: Vec<Point>) -> Self {
+        Self {
+            points,
+            no_return: 0,
+        }
+    }
+}
+
+/// Reads a cloud of any known format.
+///
+/// The format is recognized by content. `name`, a file name, decides only for raw floats, which
+/// have no beginning of their own: `*.pcd.bin` has rows of five, `*.kitti.bin` of four.
+/// An `.npz` has one cloud if it has one N x 3 array, or one named `points`, `xyz` or `pc1`.
+///
+/// # Errors
+/// Every variant of [`FormatError`] except those of writing. Values that are not finite are
+/// refused by row and column, but for PCD's rows of three NaN; so is |coordinate| > 1e6 m.
+pub fn read_cloud(bytes: &[u8], name: Option<&str>) -> Result<Cloud, FormatError> {
+    match recognize(bytes, name)? {
+        FileKind::Npy => npy::read_file(bytes).map(Cloud::from),
+        FileKind::Npz => read_npz(bytes).map(Cloud::from),
+        FileKind::Ply => read_ply(bytes).map(Cloud::from),
+        FileKind::Pcd => read_pcd(bytes),
+        FileKind::Feather => read_feather(bytes).map(Cloud::from),
+        kind @ (FileKind::KittiBin | FileKind::NuscenesBin) => {
+            bin::read(bytes, kind).map(Cloud::from)
+        }
+        FileKind::Json => Err(FileKind::Json.unsupported("json holds flow here, not clouds")),
+    }
+}
+
+fn read_npz(bytes: &[u8]) -> Result<Vec<Point>, FormatError> {
+    let mut npz = Npz::open(bytes)?;
+    if npz.has("pc1") && npz.has("pc2") {
+        return Err(FormatError::Ambiguous(
+            "an npz with pc1 and pc2 is a pair, not one cloud".to_owned(),
+        ));
+    }
+    let names = npz.names();
+    let mut known: Vec<&str> = ["points", "xyz", "pc1"]
+        .into_iter()
+        .filter(|name| npz.has(name))
+        .collect();
+    if known.is_empty() {
+        for name in &names {
+            let is_cloud = npz.header(name).is_ok_and(|header| {
+                header.scalar.is_float() && header.table().is_some_and(|(_, columns)| columns >= 3)
+            });
+            let is_matrix = npz.header(name).is_ok_and(|header| header.shape == [4, 4]);
+            if is_cloud && (!is_matrix || names.len() == 1) {
+                known.push(name);
+            }
+        }
+    }
+    match known[..] {
+        [name] => npz.points(name),
+        [] => {
+            // An array that is refused says more than a cloud that is missing.
+            for name in &names {
+                npz.header(name)?;
+            }
+            let present = npz.described();
+            Err(FileKind::Npz.missing("an N x 3 array, such as points", &present))
+        }
+        _ => Err(FormatError::Ambiguous(format!(
+            "the npz has several clouds ({}); keep one, or name it points",
+            known
+                .iter()
+                .map(|name| shorten(name))
+                .collect::<Vec<String>>()
+                .join(", ")
+        ))),
+    }
+}
+
+fn read_ply(bytes: &[u8]) -> Result<Vec<Point>, FormatError> {
+    let kind = FileKind::Ply;
+    let ply = Ply::open(bytes)?;
+    refuse_integers(kind, |axis| ply.property(axis))?;
+    let mut points = Vec::new();
+    ply.each(&AXES, |row, values| {
+        if points.is_empty() {
+            // Here the declared count has been checked against the bytes.
+            points.reserve_exact(ply.rows()?);
+        }
+        points.push(point(kind, row, values)?);
+        Ok(())
+    })?;
+    Ok(points)
+}
+
+fn read_pcd(bytes: &[u8]) -> Result<Cloud, FormatError> {
+    let kind = FileKind::Pcd;
+    let pcd = Pcd::open(bytes)?;
+    refuse_integers(kind, |axis| pcd.field(axis))?;
+    let mut cloud = Cloud::default();
+    pcd.each(&AXES, |row, values| {
+        if cloud.points.is_empty() {
+            cloud.points.reserve_exact(pcd.rows());
+        }
+        if values.iter().all(|value| value.is_nan()) {
+            cloud.no_return += 1;
+            cloud.points.push([f32::NAN; 3]);
+        } else {
+            cloud.points.push(point(kind, row, values)?);
+        }
+        Ok(())
+    })?;
+    Ok(cloud)
+}
+
+fn read_feather(bytes: &[u8]) -> Result<Vec<Point>, FormatError> {
+    read_columns(&Table::open(bytes)?, AXES)
+}
+
+/// Three float columns of a feather table as points or displacements, in metres.
+pub(super) fn read_columns(table: &Table<'_>, names: [&str; 3]) -> Result<Vec<Point>, FormatError> {
+    let kind = FileKind::Feather;
+    for name in names {
+        if table.has(name) && !table.is_float(name) {
+            return Err(kind.unsupported(format!("column {name} is not of floats")));
+        }
+    }
+    let mut points = Vec::new();
+    for (axis, name) in names.into_iter().enumerate() {
+        table.each(name, |row, value| {
+            if points.is_empty() {
+                points = vec![[0.0; 3]; table.rows()];
+            }
+            let points: &mut Vec<Point> = &mut points;
+            points[row][axis] = check_value(kind, row, name, value)?;
+            Ok(())
+        })?;
+    }
+    Ok(points)
+}
+
+/// Integers have no unit: centimetres, millimetres and scaled coordinates all exist.
+fn refuse_integers(
+    kind: FileKind,
+    scalar_of: impl Fn(&str) -> Option<Scalar>,
+) -> Result<(), FormatError> {
+    for axis in AXES {
+        if scalar_of(axis).is_some_and(|scalar| !scalar.is_float()) {
+            return Err(
+                kind.unsupported(format!("{axis} is an integer; metres as floats are read"))
+            );
+        }
+    }
+    Ok(())
+}
+
+fn point(kind: FileKind, row: usize, values: &[f64]) -> Result<Point, FormatError> {
+    let mut point = [0.0; 3];
+    for ((coordinate, &value), axis) in point.iter_mut().zip(values).zip(AXES) {
+        *coordinate = if value.abs() <= MAX_COORDINATE_M {
+            value as f32
+        } else {
+            check_value(kind, row, axis, value)?
+        };
+    }
+    Ok(point)
+}
+
+/// The formats that a cloud can be written in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum CloudFormat {
+    /// N x 3 float32.
+    Npy,
+    /// Binary little endian, x y z float.
+    Ply,
+    /// Binary, x y z float32; the only one that can hold rows without return.
+    Pcd,
+    /// Columns x, y, z, float32, LZ4.
+    Feather,
+    /// KITTI rows, intensity 0.
+    KittiBin,
+}
+
+/// Writes a cloud.
+///
+/// # Errors
+/// `NotFinite` for rows without return in any format but PCD, which no reader would take back;
+/// `Write` and `Encode` where writing fails.
+pub fn write_cloud<W: Write>(
+    format: CloudFormat,
+    points: &[Point],
+    out: &mut W,
+) -> Result<(), FormatError> {
+    let kind = match format {
+        CloudFormat::Npy => FileKind::Npy,
+        CloudFormat::Ply => FileKind::Ply,
+        CloudFormat::Pcd => FileKind::Pcd,
+        CloudFormat::Feather => FileKind::Feather,
+        CloudFormat::KittiBin => FileKind::KittiBin,
+    };
+    let no_return =
+        |point: &Point| kind == FileKind::Pcd && point.iter().all(|value| value.is_nan());
+    for (row, values) in points
+        .iter()
+        .enumerate()
+        .filter(|(_, values)| !no_return(values))
+    {
+        point(kind, row, &values.map(f64::from))?;
+    }
+    match format {
+        CloudFormat::Npy => npy::write_points(out, points),
+        CloudFormat::Ply => {
+            let properties = AXES.map(|axis| ("float", axis));
+            ply::write_header(out, points.len(), &[], &properties)?;
+            write_floats(out, points.as_flattened())
+        }
+        CloudFormat::Pcd => {
+            pcd::write_header(out, points.len(), &AXES.map(|axis| (axis, 4, 'F')))?;
+            write_floats(out, points.as_flattened())
+        }
+        CloudFormat::Feather => {
+            let column = |axis: usize| -> Values<'_> {
+                Values::Floats(Box::new(points.iter().map(move |point| point[axis])))
+            };
+            feather::write(
+                out,
+                vec![("x", column(0)), ("y", column(1)), ("z", column(2))],
+            )
+        }
+        CloudFormat::KittiBin => bin::write_kitti(out, points),
+    }
+}

@@ -1,0 +1,116 @@
+//! What a file may cost: the largest counts, and the checks of values and of declared sizes.
+//!
+//! Sizes are checked here before anything is allocated; it must not know any single format.
+
+use crate::flow::Point;
+
+use super::error::{FileKind, FormatError};
+
+/// The most points that one cloud may have.
+pub const MAX_POINTS: usize = 50_000_000;
+
+/// The largest magnitude of a coordinate, metres: past it, float32 no longer resolves 6 cm.
+pub const MAX_COORDINATE_M: f64 = 1e6;
+
+/// Bytes that any compressed file may unfold to, however small it is.
+const UNFOLD_FLOOR: u64 = 32 << 20;
+
+/// Above the floor, a file may unfold to this many times its own length. Real sweeps reach 4.
+const UNFOLD_RATIO: u64 = 32;
+
+/// The most bytes that a compressed file may unfold to.
+const UNFOLD_CEILING: u64 = 4 << 30;
+
+/// Bytes that a compressed file of `file_len` bytes may unfold to, all its parts together.
+pub(super) fn unfold_limit(file_len: usize) -> u64 {
+    let by_length = (file_len as u64)
+        .saturating_mul(UNFOLD_RATIO)
+        .saturating_add(UNFOLD_FLOOR);
+    by_length.min(UNFOLD_CEILING)
+}
+
+/// Refuses more rows than [`MAX_POINTS`].
+pub(super) fn check_rows(kind: FileKind, rows: u64) -> Result<usize, FormatError> {
+    match usize::try_from(rows) {
+        Ok(rows) if rows <= MAX_POINTS => Ok(rows),
+        _ => Err(kind.too_large(format!(
+            "{rows} points are declared, {MAX_POINTS} are the most"
+        ))),
+    }
+}
+
+/// Refuses a table of `rows` rows of `stride` bytes that `present` bytes cannot hold.
+pub(super) fn check_size(
+    kind: FileKind,
+    rows: usize,
+    stride: usize,
+    present: usize,
+) -> Result<usize, FormatError> {
+    match rows.checked_mul(stride) {
+        Some(bytes) if bytes <= present => Ok(bytes),
+        _ => Err(kind.malformed(format!(
+            "{rows} rows of {stride} bytes are declared where {present} bytes are left"
+        ))),
+    }
+}
+
+/// A finite coordinate or displacement within [`MAX_COORDINATE_M`], in metres, as float32.
+pub(super) fn check_value(
+    kind: FileKind,
+    row: usize,
+    column: &str,
+    value: f64,
+) -> Result<f32, FormatError> {
+    if !value.is_finite() {
+        return Err(FormatError::NotFinite {
+            kind,
+            row,
+            column: column.to_owned(),
+            value,
+        });
+    }
+    if value.abs() > MAX_COORDINATE_M {
+        return Err(FormatError::OutOfRange {
+            kind,
+            row,
+            column: column.to_owned(),
+            value,
+            limit: MAX_COORDINATE_M,
+        });
+    }
+    Ok(value as f32)
+}
+
+/// A mask value: zero is false, any other number is true, NaN is refused.
+pub(super) fn check_flag(
+    kind: FileKind,
+    row: usize,
+    column: &str,
+    value: f64,
+) -> Result<bool, FormatError> {
+    if value.is_nan() {
+        return Err(FormatError::NotFinite {
+            kind,
+            row,
+            column: column.to_owned(),
+            value,
+        });
+    }
+    Ok(value != 0.0)
+}
+
+/// Refuses displacements or coordinates that no reader would take back.
+pub(super) fn check_points(
+    kind: FileKind,
+    name: &str,
+    points: &[Point],
+) -> Result<(), FormatError> {
+    for (row, point) in points.iter().enumerate() {
+        for (value, axis) in point.iter().zip(["x", "y", "z"]) {
+            if !value.is_finite() || f64::from(value.abs()) > MAX_COORDINATE_M {
+                check_value(kind, row, &format!("{name}.{axis}"), f64::from(*value))?;
+            }
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,220 @@
+//! numpy's `.npz`: named arrays in a zip archive, read one by one and only where asked for.
+//!
+//! An archive says how far it unfolds before it does; what it may cost is checked against that.
+
+use std::cell::Cell;
+use std::io::{Cursor, Read, Seek, Write};
+
+use zip::write::SimpleFileOptions;
+use zip::{CompressionMethod, ZipArchive, ZipWriter};
+
+use crate::flow::Point;
+
+use super::error::{FileKind, FormatError, shorten};
+use super::limits::unfold_limit;
+use super::npy::{self, Header, Place};
+
+const KIND: FileKind = FileKind::Npz;
+
+/// Data sets have ten arrays; a directory of thousands is not one of them.
+const MAX_MEMBERS: usize = 1024;
+
+/// The signature that every entry of a zip's central directory begins with.
+const DIRECTORY_ENTRY: &[u8; 4] = b"PK\x01\x02";
+
+/// An opened archive.
+pub(super) struct Npz<'a> {
+    archive: ZipArchive<Cursor<&'a [u8]>>,
+    /// Bytes that the arrays still to be read may unfold to.
+    budget: Cell<u64>,
+}
+
+impl<'a> Npz<'a> {
+    /// Reads the directory. Nothing is unfolded.
+    pub(super) fn open(bytes: &'a [u8]) -> Result<Self, FormatError> {
+        let entries = bytes
+            .windows(4)
+            .filter(|window| window == DIRECTORY_ENTRY)
+            .count();
+        if entries > MAX_MEMBERS {
+            return Err(KIND.too_large(format!("{entries} members, {MAX_MEMBERS} are the most")));
+        }
+        let archive = ZipArchive::new(Cursor::new(bytes)).map_err(broken)?;
+        Ok(Self {
+            archive,
+            budget: Cell::new(unfold_limit(bytes.len())),
+        })
+    }
+
+    /// Names of the arrays, without `.npy`.
+    pub(super) fn names(&self) -> Vec<String> {
+        let names = self.archive.file_names().flatten();
+        names
+            .filter_map(|name| name.strip_suffix(".npy").map(str::to_owned))
+            .collect()
+    }
+
+    pub(super) fn has(&self, name: &str) -> bool {
+        self.archive
+            .index_for_name(&format!("{name}.npy"))
+            .is_some()
+    }
+
+    /// Names and shapes, for a message.
+    pub(super) fn described(&mut self) -> Vec<String> {
+        let names = self.names();
+        let describe = |name: &String| match self.header(name) {
+            Ok(header) => format!("{} {:?}", shorten(name), header.shape),
+            Err(_) => shorten(name),
+        };
+        names.iter().map(describe).collect()
+    }
+
+    /// The header of one array.
+    pub(super) fn header(&mut self, name: &str) -> Result<Header, FormatError> {
+        self.with(name, |header, _| Ok(header))
+    }
+
+    /// N x 3 floats, in metres.
+    pub(super) fn points(&mut self, name: &str) -> Result<Vec<Point>, FormatError> {
+        let place = Place {
+            kind: KIND,
+            array: name,
+        };
+        self.with(name, |header, data| npy::read_points(place, &header, data))
+    }
+
+    /// N booleans: nonzero is true. `None` where there is no such array.
+    pub(super) fn mask(&mut self, name: &str) -> Result<Option<Vec<bool>>, FormatError> {
+        self.column(name, |value| value != 0.0)
+    }
+
+    /// N numbers, each tested by `is_true`. `None` where there is no such array.
+    pub(super) fn column(
+        &mut self,
+        name: &str,
+        is_true: impl Fn(f64) -> bool,
+    ) -> Result<Option<Vec<bool>>, FormatError> {
+        if !self.has(name) {
+            return Ok(None);
+        }
+        let place = Place {
+            kind: KIND,
+            array: name,
+        };
+        self.with(name, |header, data| {
+            npy::read_mask(place, &header, data, is_true)
+        })
+        .map(Some)
+    }
+
+    /// A 4 x 4 matrix. `None` where there is no such array.
+    pub(super) fn matrix(&mut self, name: &str) -> Result<Option<[[f64; 4]; 4]>, FormatError> {
+        if !self.has(name) {
+            return Ok(None);
+        }
+        let place = Place {
+            kind: KIND,
+            array: name,
+        };
+        self.with(name, |header, data| npy::read_matrix(place, &header, data))
+            .map(Some)
+    }
+
+    /// Opens a member, checks what its header declares, and hands its data to `read`.
+    fn with<T>(
+        &mut self,
+        name: &str,
+        read: impl FnOnce(Header, &mut dyn Read) -> Result<T, FormatError>,
+    ) -> Result<T, FormatError> {
+        let Some(index) = self.archive.index_for_name(&format!("{name}.npy")) else {
+            return Err(KIND.missing(format!("array {name}"), &self.names()));
+        };
+        let mut member = self.archive.by_index(index).map_err(broken)?;
+        let unfolded = member.size();
+        let header = Header::read(KIND, &mut member)?;
+        let declared = header.data_len(KIND)?;
+        if declared.checked_add(header.len as u64) != Some(unfolded) {
+            return Err(KIND.malformed(format!(
+                "array {} of shape {:?} needs {declared} bytes, the archive declares {unfolded} \
+                 with its header",
+                shorten(name),
+                header.shape
+            )));
+        }
+        let Some(left) = self.budget.get().checked_sub(declared) else {
+            return Err(KIND.too_large(format!(
+                "array {} unfolds to {declared} bytes, far more than a file of this length holds",
+                shorten(name)
+            )));
+        };
+        let mut data = member.take(declared);
+        let result = read(header, &mut data)?;
+        let untouched = data.limit();
+        self.budget.set(left.saturating_add(untouched));
+        if untouched == 0 {
+            // Only at its end does a member tell whether its checksum is right.
+            match data.into_inner().read(&mut [0]) {
+                Ok(0) => {}
+                Ok(_) => return Err(KIND.malformed(format!("array {} goes on", shorten(name)))),
+                Err(error) => {
+                    return Err(KIND.malformed(format!("array {}: {error}", shorten(name))));
+                }
+            }
+        }
+        Ok(result)
+    }
+}
+
+fn broken(error: zip::result::ZipError) -> FormatError {
+    match error {
+        zip::result::ZipError::UnsupportedArchive(what) => KIND.unsupported(what),
+        other => KIND.malformed(other.to_string()),
+    }
+}
+
+/// Writes arrays one by one into an archive, compressed as `numpy.savez_compressed` does.
+pub(super) struct NpzWriter<W: Write + Seek> {
+    archive: ZipWriter<W>,
+}
+
+impl<W: Write + Seek> NpzWriter<W> {
+    pub(super) fn new(out: W) -> Self {
+        Self {
+            archive: ZipWriter::new(out),
+        }
+    }
+
+    /// Starts an array; what `write` writes is the `.npy` file.
+    pub(super) fn array(
+        &mut self,
+        name: &str,
+        write: impl FnOnce(&mut ZipWriter<W>) -> Result<(), FormatError>,
+    ) -> Result<(), FormatError> {
+        // A fixed time stamp: the same flow gives the same bytes.
+        let options = SimpleFileOptions::default()
+            .compression_method(CompressionMethod::Deflated)
+            .last_modified_time(zip::DateTime::default())
+            .large_file(true);
+        self.archive
+            .start_file(format!("{name}.npy"), options)
+            .map_err(|error| KIND.encode(error))?;
+        write(&mut self.archive)
+    }
+
+    pub(super) fn points(&mut self, name: &str, points: &[Point]) -> Result<(), FormatError> {
+        self.array(name, |out| npy::write_points(out, points))
+    }
+
+    pub(super) fn mask(&mut self, name: &str, mask: &[bool]) -> Result<(), FormatError> {
+        self.array(name, |out| npy::write_mask(out, mask))
+    }
+
+    pub(super) fn matrix(&mut self, name: &str, matrix: &[[f64; 4]; 4]) -> Result<(), FormatError> {
+        self.array(name, |out| npy::write_matrix(out, matrix))
+    }
+
+    pub(super) fn finish(self) -> Result<W, FormatError> {
+        self.archive.finish().map_err(|error| KIND.encode(error))
+    }
+}

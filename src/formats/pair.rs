@@ -1,0 +1,271 @@
+//! A pair of sweeps with what is known about it: truth, ground, ego motion.
+//!
+//! `.npz` with the field's array names, and Argoverse 2's labels. It must not know of results.
+
+use std::io::{Cursor, Write};
+
+use nalgebra::{Matrix3, Matrix4};
+
+use crate::flow::{Point, RigidTransform};
+
+use super::cloud::read_columns;
+use super::error::{FileKind, FormatError};
+use super::feather::{FLOW_COLUMNS, Table};
+use super::limits::{check_flag, check_points};
+use super::npy;
+use super::npz::{Npz, NpzWriter};
+use super::sniff::is_zip;
+
+const KIND: FileKind = FileKind::Npz;
+
+/// How far a stored rotation may be from orthonormal: float32 matrices are within 1e-6 of it,
+/// and a scale or a shear that would move a point 100 m away by a decimetre is not.
+const RIGID_TOLERANCE: f64 = 1e-3;
+
+/// Two sweeps and what is known about the motion between them.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Pair {
+    /// The source sweep, N points, metres, in its own sensor frame.
+    pub source: Vec<Point>,
+    /// The target sweep, M points, metres, in its own sensor frame.
+    pub target: Vec<Point>,
+    /// The true motion, where it is known.
+    pub truth: Option<PairTruth>,
+    /// The ground of both sweeps, where it is known.
+    pub ground: Option<Ground>,
+    /// The ego motion `target_from_source`, where it is known.
+    pub ego: Option<RigidTransform>,
+}
+
+/// The true motion of a sweep's points.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PairTruth {
+    /// Displacement of each source point over the pair, metres, ego motion included.
+    pub flow: Vec<Point>,
+    /// Whether the displacement is known.
+    pub valid: Vec<bool>,
+    /// Whether the point moves by itself.
+    pub dynamic: Option<Vec<bool>>,
+    /// Whether the point lies on a labelled object.
+    pub foreground: Option<Vec<bool>>,
+}
+
+/// Which points of either sweep lie on the ground.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Ground {
+    /// One per source point.
+    pub source: Vec<bool>,
+    /// One per target point.
+    pub target: Vec<bool>,
+}
+
+/// Argoverse 2's labels of one sweep.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Av2Labels {
+    /// The true motion.
+    pub truth: PairTruth,
+    /// Which points lie on the ground.
+    pub ground: Vec<bool>,
+}
+
+/// Whether some bytes are an `.npz` with `pc1` and `pc2`.
+pub fn is_pair(bytes: &[u8]) -> bool {
+    is_zip(bytes) && Npz::open(bytes).is_ok_and(|npz| npz.has("pc1") && npz.has("pc2"))
+}
+
+/// Reads an `.npz` with `pc1` (N x 3), `pc2` (M x 3) and, where they are there, `flow` (N x 3),
+/// `valid` and `dynamic` (N), `ground1` (N), `ground2` (M), `ego_SE3` (4 x 4) and `box_id` (N,
+/// negative off every object) or `classes` (N, 0 off every object).
+///
+/// # Errors
+/// As for a cloud, and `RowCount` where arrays disagree, `Unsupported` where `ego_SE3` is not
+/// rigid or one of the two ground masks is missing.
+pub fn read_pair(bytes: &[u8]) -> Result<Pair, FormatError> {
+    if !is_zip(bytes) {
+        return Err(FormatError::Unrecognized(
+            "a pair is an npz with pc1 and pc2".to_owned(),
+        ));
+    }
+    let mut npz = Npz::open(bytes)?;
+    let source = npz.points("pc1")?;
+    let target = npz.points("pc2")?;
+    let truth = read_truth(&mut npz, source.len())?;
+    let ground = match (npz.mask("ground1")?, npz.mask("ground2")?) {
+        (Some(first), Some(second)) => {
+            check_count("ground1", first.len(), source.len())?;
+            check_count("ground2", second.len(), target.len())?;
+            Some(Ground {
+                source: first,
+                target: second,
+            })
+        }
+        (None, None) => None,
+        _ => return Err(KIND.unsupported("ground1 and ground2 come together or not at all")),
+    };
+    let ego = npz
+        .matrix("ego_SE3")?
+        .map(|rows| rigid(&rows))
+        .transpose()?;
+    Ok(Pair {
+        source,
+        target,
+        truth,
+        ground,
+        ego,
+    })
+}
+
+fn read_truth(npz: &mut Npz<'_>, count: usize) -> Result<Option<PairTruth>, FormatError> {
+    if !npz.has("flow") {
+        return Ok(None);
+    }
+    let flow = npz.points("flow")?;
+    check_count("flow", flow.len(), count)?;
+    let valid = npz.mask("valid")?.unwrap_or_else(|| vec![true; count]);
+    check_count("valid", valid.len(), count)?;
+    let dynamic = npz.mask("dynamic")?;
+    if let Some(dynamic) = &dynamic {
+        check_count("dynamic", dynamic.len(), count)?;
+    }
+    let foreground = match npz.column("box_id", |id| id >= 0.0)? {
+        None => npz.mask("classes")?,
+        on_object => on_object,
+    };
+    if let Some(foreground) = &foreground {
+        check_count("box_id or classes", foreground.len(), count)?;
+    }
+    Ok(Some(PairTruth {
+        flow,
+        valid,
+        dynamic,
+        foreground,
+    }))
+}
+
+pub(super) fn check_count(what: &str, found: usize, expected: usize) -> Result<(), FormatError> {
+    if found == expected {
+        Ok(())
+    } else {
+        Err(FormatError::RowCount {
+            what: what.to_owned(),
+            found,
+            expected,
+        })
+    }
+}
+
+/// The rigid transform that a 4 x 4 matrix is, refused if it scales, shears or mirrors.
+fn rigid(rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError> {
+    let matrix = Matrix4::from_fn(|row, column| rows[row][column]);
+    let rotation: Matrix3<f64> = matrix.fixed_view::<3, 3>(0, 0).into_owned();
+    let departure = (rotation.transpose() * rotation - Matrix3::identity())
+        .abs()
+        .max();
+    let last_row_is_plain = rows[3] == [0.0, 0.0, 0.0, 1.0];
+    let finite = matrix.iter().all(|value| value.is_finite());
+    if !finite || !last_row_is_plain || departure > RIGID_TOLERANCE || rotation.determinant() < 0.0
+    {
+        return Err(KIND.unsupported("ego_SE3 is not a rigid transform"));
+    }
+    let rotation = nalgebra::Rotation3::from_matrix_unchecked(rotation);
+    let rotation = nalgebra::UnitQuaternion::from_rotation_matrix(&rotation);
+    let translation = nalgebra::Translation3::new(rows[0][3], rows[1][3], rows[2][3]);
+    Ok(RigidTransform::from_parts(translation, rotation))
+}
+
+/// The 4 x 4 matrix of a rigid transform, row by row.
+pub(super) fn matrix_rows(transform: &RigidTransform) -> [[f64; 4]; 4] {
+    let matrix = transform.to_homogeneous();
+    std::array::from_fn(|row| std::array::from_fn(|column| matrix[(row, column)]))
+}
+
+/// Writes a pair with the array names that [`read_pair`] reads; `foreground` becomes `box_id`
+/// 0 on objects and -1 off them.
+///
+/// # Errors
+/// `RowCount` where the pair's parts disagree, `NotFinite` for values that could not be read
+/// back, `Write` and `Encode` where writing fails.
+pub fn write_pair_npz<W: Write>(pair: &Pair, out: &mut W) -> Result<(), FormatError> {
+    let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
+    let count = pair.source.len();
+    let mut points = |name: &str, points: &[Point]| {
+        check_points(KIND, name, points)?;
+        npz.points(name, points)
+    };
+    points("pc1", &pair.source)?;
+    points("pc2", &pair.target)?;
+    if let Some(truth) = &pair.truth {
+        check_count("flow", truth.flow.len(), count)?;
+        check_count("valid", truth.valid.len(), count)?;
+        points("flow", &truth.flow)?;
+        npz.mask("valid", &truth.valid)?;
+        if let Some(dynamic) = &truth.dynamic {
+            check_count("dynamic", dynamic.len(), count)?;
+            npz.mask("dynamic", dynamic)?;
+        }
+        if let Some(foreground) = &truth.foreground {
+            check_count("foreground", foreground.len(), count)?;
+            let ids: Vec<i32> = foreground
+                .iter()
+                .map(|&on| if on { 0 } else { -1 })
+                .collect();
+            npz.array("box_id", |out| npy::write_ids(out, &ids))?;
+        }
+    }
+    if let Some(ground) = &pair.ground {
+        check_count("ground1", ground.source.len(), count)?;
+        check_count("ground2", ground.target.len(), pair.target.len())?;
+        npz.mask("ground1", &ground.source)?;
+        npz.mask("ground2", &ground.target)?;
+    }
+    if let Some(ego) = &pair.ego {
+        npz.matrix("ego_SE3", &matrix_rows(ego))?;
+    }
+    out.write_all(npz.finish()?.get_ref())?;
+    Ok(())
+}
+
+/// Reads Argoverse 2's `flow_labels.feather`: `flow_tx_m`, `flow_ty_m`, `flow_tz_m`, and
+/// `is_ground_0` (or `is_ground`), `dynamic` (or `is_dynamic`), `is_valid` (or `valid`; all valid
+/// where it is missing) and `classes` (or `classes_0`).
+///
+/// Foreground is every class but 0, which is NONE: so Argoverse 2's own evaluation has it.
+///
+/// # Errors
+/// As for a cloud; `Missing` where flow or ground are not there.
+pub fn read_av2_labels(bytes: &[u8]) -> Result<Av2Labels, FormatError> {
+    let table = Table::open(bytes)?;
+    let flow = read_columns(&table, FLOW_COLUMNS)?;
+    let ground = match flags(&table, &["is_ground_0", "is_ground"])? {
+        Some(ground) => ground,
+        None => return Err(FileKind::Feather.missing("column is_ground_0", &table.names())),
+    };
+    let valid = flags(&table, &["is_valid", "valid"])?.unwrap_or_else(|| vec![true; flow.len()]);
+    let dynamic = flags(&table, &["dynamic", "is_dynamic"])?;
+    let foreground = flags(&table, &["classes", "classes_0"])?;
+    Ok(Av2Labels {
+        truth: PairTruth {
+            flow,
+            valid,
+            dynamic,
+            foreground,
+        },
+        ground,
+    })
+}
+
+/// The first of some columns that is there, as a mask: nonzero is true.
+pub(super) fn flags(table: &Table<'_>, names: &[&str]) -> Result<Option<Vec<bool>>, FormatError> {
+    let Some(name) = names.iter().find(|name| table.has(name)) else {
+        return Ok(None);
+    };
+    let mut mask = Vec::new();
+    table.each(name, |row, value| {
+        if mask.is_empty() {
+            mask.reserve_exact(table.rows());
+        }
+        mask.push(check_flag(FileKind::Feather, row, name, value)?);
+        Ok(())
+    })?;
+    Ok(Some(mask))
+}

@@ -1,0 +1,103 @@
+//! Which kind of file some bytes are: by their beginning, and by name only where they have none.
+//!
+//! It must not read past the beginning of a file that has one.
+
+use super::bin;
+use super::error::{FileKind, FormatError};
+use super::{feather, npy};
+
+/// Lines of comments that a PCD header may begin with.
+const MAX_COMMENT_LINES: usize = 32;
+
+/// Recognizes a file. `name` is a file name or path; only its ending is looked at, and only for
+/// raw floats, which begin with nothing of their own.
+///
+/// # Errors
+/// `Unrecognized`, with what the file seems to be instead where that can be told; `Ambiguous` for
+/// raw floats of which nothing says how many make a row.
+pub fn recognize(bytes: &[u8], name: Option<&str>) -> Result<FileKind, FormatError> {
+    if bytes.is_empty() {
+        return Err(FormatError::Unrecognized("it is empty".to_owned()));
+    }
+    if bytes.starts_with(npy::MAGIC) {
+        return Ok(FileKind::Npy);
+    }
+    if is_zip(bytes) {
+        return Ok(FileKind::Npz);
+    }
+    if bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r") || bytes.starts_with(b"ply ") {
+        return Ok(FileKind::Ply);
+    }
+    if bytes.starts_with(feather::MAGIC) {
+        return Ok(FileKind::Feather);
+    }
+    if is_pcd(bytes) {
+        return Ok(FileKind::Pcd);
+    }
+    if is_json(bytes) {
+        return Ok(FileKind::Json);
+    }
+    if let Some(other) = known_stranger(bytes) {
+        return Err(FormatError::Unrecognized(other.to_owned()));
+    }
+    let ending = ending(name.unwrap_or_default());
+    if ending.is_empty() || ending == "bin" {
+        return bin::recognize(bytes, name);
+    }
+    Err(FormatError::Unrecognized(format!(
+        "it is named .{ending} but does not begin as any known"
+    )))
+}
+
+/// The ending of a file name, in lower case, without its dot.
+pub(super) fn ending(name: &str) -> String {
+    let file = name.rsplit(['/', '\\']).next().unwrap_or_default();
+    match file.rsplit_once('.') {
+        Some((_, ending)) => ending.to_ascii_lowercase(),
+        None => String::new(),
+    }
+}
+
+/// Whether some bytes are a zip archive, as an `.npz` is.
+pub(super) fn is_zip(bytes: &[u8]) -> bool {
+    bytes.starts_with(b"PK\x03\x04") || bytes.starts_with(b"PK\x05\x06")
+}
+
+fn is_pcd(bytes: &[u8]) -> bool {
+    if bytes.starts_with(b"# .PCD") {
+        return true;
+    }
+    let mut lines = bytes.split(|&byte| byte == b'\n').take(MAX_COMMENT_LINES);
+    lines
+        .find(|line| !line.starts_with(b"#") && !line.trim_ascii().is_empty())
+        .is_some_and(|line| line.starts_with(b"VERSION ") || line.starts_with(b"FIELDS "))
+}
+
+fn is_json(bytes: &[u8]) -> bool {
+    let text = bytes.trim_ascii_start();
+    text.strip_prefix(b"{").is_some_and(|rest| {
+        let rest = rest.trim_ascii_start();
+        rest.starts_with(b"\"") || rest.starts_with(b"}")
+    })
+}
+
+/// Files that people send and that are something else.
+fn known_stranger(bytes: &[u8]) -> Option<&'static str> {
+    let beginnings: [(&[u8], &str); 6] = [
+        (b"FEA1", "it is feather version 1; write version 2"),
+        (b"\x89HDF", "it is HDF5; export the arrays as npz"),
+        (b"LASF", "it is LAS or LAZ; convert it to ply or pcd"),
+        (b"\x1f\x8b", "it is gzip-compressed; unpack it first"),
+        (b"ASTM-E57", "it is E57; convert it to ply or pcd"),
+        (
+            b"\x80",
+            "it looks like a Python pickle, which is never opened; save npz",
+        ),
+    ];
+    // A pickle's first byte alone is weak evidence: its second is the protocol number.
+    beginnings
+        .into_iter()
+        .find(|(beginning, _)| bytes.starts_with(beginning))
+        .filter(|(beginning, _)| beginning.len() > 1 || matches!(bytes.get(1), Some(2..=5)))
+        .map(|(_, what)| what)
+}

@@ -1,0 +1,15 @@
+//! Pictures of flow: color by direction, seen from above.
+//!
+//! It knows points and pixels; it must not know where either came from.
+
+mod motion;
+mod wheel;
+
+mod canvas;
+mod font;
+mod top_down;
+
+pub use canvas::{Image, PictureError, write_png};
+pub use motion::{full_scale, shown_motion};
+pub use top_down::{TopDown, TopDownOptions, top_down};
+pub use wheel::{INVALID_COLOR, color};

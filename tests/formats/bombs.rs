@@ -1,0 +1,163 @@
+//! Files that declare far more than they hold, read in a process of their own whose memory is
+//! then looked at: the refusal must come before the cost.
+
+use std::io::Write;
+
+use fnsf::formats::{read_cloud, read_flow, read_pair};
+
+use crate::samples::npy;
+
+/// What a hostile file may cost, and the process around it.
+const MAX_RESIDENT_KIB: u64 = 100 << 10;
+
+/// Set in the process that does the reading.
+const CHILD: &str = "FNSF_BOMBS_CHILD";
+
+#[test]
+fn hostile_files_are_refused_in_little_memory() {
+    if std::env::var_os(CHILD).is_none() {
+        let child = std::process::Command::new(std::env::current_exe().unwrap())
+            .args([
+                "--exact",
+                "bombs::hostile_files_are_refused_in_little_memory",
+            ])
+            .env(CHILD, "1")
+            .output()
+            .unwrap();
+        let log = String::from_utf8_lossy(&child.stdout);
+        assert!(child.status.success() && log.contains("1 passed"), "{log}");
+        return;
+    }
+    for (name, bytes) in bombs() {
+        assert!(bytes.len() < 4 << 20, "{name} is not small");
+        let refused = read_cloud(&bytes, None).is_err()
+            && read_flow(&bytes, None).is_err()
+            && read_pair(&bytes).is_err();
+        assert!(refused, "{name}");
+        if let Some(resident) = peak_resident_kib() {
+            assert!(resident < MAX_RESIDENT_KIB, "{name}: {resident} KiB");
+        }
+    }
+}
+
+/// The most memory that this process ever had, where the system says so.
+fn peak_resident_kib() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find(|line| line.starts_with("VmHWM:"))?;
+    line.split_ascii_whitespace().nth(1)?.parse().ok()
+}
+
+fn bombs() -> Vec<(&'static str, Vec<u8>)> {
+    let text = |text: &str| text.as_bytes().to_vec();
+    let ply = |encoding: &str, vertices: &str, before: &str| {
+        text(&format!(
+            "ply\nformat {encoding} 1.0\n{before}element vertex {vertices}\nproperty float x\n\
+             property float y\nproperty float z\nend_header\n1 2 3\n"
+        ))
+    };
+    let pcd = |width: &str, height: &str, count: &str, data: &str| {
+        let mut bytes = text(&format!(
+            "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 {count}\nWIDTH {width}\n\
+             HEIGHT {height}\nDATA {data}\n"
+        ));
+        bytes.extend([
+            9, 0, 0, 0, 0xff, 0xff, 0xff, 0xff, 1, 2, 3, 4, 5, 6, 7, 8, 9,
+        ]);
+        bytes
+    };
+    let huge = "18446744073709551615";
+    vec![
+        (
+            "npy of many rows",
+            npy("'<f4'", false, "(40000000, 3)", &[0; 12]),
+        ),
+        (
+            "npy that overflows",
+            npy("'<f8'", false, &format!("({huge}, {huge})"), &[0; 12]),
+        ),
+        (
+            "npy of no columns",
+            npy("'<f4'", false, "(40000000, 0)", &[]),
+        ),
+        (
+            "ply of many rows",
+            ply("binary_little_endian", "49000000", ""),
+        ),
+        (
+            "ply past every limit",
+            ply("binary_little_endian", huge, ""),
+        ),
+        ("ascii ply of many rows", ply("ascii", "49000000", "")),
+        (
+            "ply with a long element before",
+            ply(
+                "binary_big_endian",
+                "1",
+                &format!("element face {huge}\nproperty list uint double ids\n"),
+            ),
+        ),
+        ("pcd of many rows", pcd("49000000", "1", "1", "binary")),
+        ("pcd that overflows", pcd(huge, huge, "1", "binary")),
+        (
+            "pcd of many numbers",
+            pcd("40000000", "1", "9999999999", "ascii"),
+        ),
+        (
+            "compressed pcd that lies",
+            pcd("40000000", "1", "1", "binary_compressed"),
+        ),
+        ("npz that unfolds a thousandfold", zip_bomb(40_000_000)),
+        ("npz of many members", many_members()),
+        ("feather whose buffers lie", feather_bomb()),
+    ]
+}
+
+/// 40 million points of zeros: half a gigabyte in half a megabyte.
+fn zip_bomb(rows: usize) -> Vec<u8> {
+    let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    for name in ["pc1.npy", "flow.npy"] {
+        zip.start_file(name, zip::write::SimpleFileOptions::default())
+            .unwrap();
+        zip.write_all(&npy("'<f4'", false, &format!("({rows}, 3)"), &[]))
+            .unwrap();
+        let zeros = vec![0; 1 << 16];
+        let mut left = rows * 12;
+        while left > 0 {
+            let chunk = left.min(zeros.len());
+            zip.write_all(&zeros[..chunk]).unwrap();
+            left -= chunk;
+        }
+    }
+    zip.finish().unwrap().into_inner()
+}
+
+fn many_members() -> Vec<u8> {
+    let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    for index in 0..20_000 {
+        zip.start_file(
+            format!("{index}.npy"),
+            zip::write::SimpleFileOptions::default(),
+        )
+        .unwrap();
+    }
+    zip.finish().unwrap().into_inner()
+}
+
+/// A sound file whose compressed buffers are made to declare 2^62 bytes each.
+fn feather_bomb() -> Vec<u8> {
+    let mut bytes = Vec::new();
+    let zeros = vec![[0.0; 3]; 1000];
+    fnsf::formats::write_cloud(fnsf::formats::CloudFormat::Feather, &zeros, &mut bytes).unwrap();
+    let declared = 4000_u64.to_le_bytes();
+    let places: Vec<usize> = (0..bytes.len() - 8)
+        .filter(|&index| bytes[index..index + 8] == declared)
+        .collect();
+    assert!(
+        places.len() >= 3,
+        "compressed buffers begin with their length"
+    );
+    for place in places {
+        bytes[place..place + 8].copy_from_slice(&(1_u64 << 62).to_le_bytes());
+    }
+    bytes
+}

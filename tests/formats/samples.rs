@@ -1,0 +1,159 @@
+//! Small files of every format, made by hand or by our own writers.
+
+use fnsf::flow::{Point, RigidTransform};
+use fnsf::formats::{
+    CloudFormat, FlowFormat, FlowTable, Ground, Pair, PairTruth, write_cloud, write_flow,
+    write_pair_npz,
+};
+
+pub(crate) const CLOUD_FORMATS: [(CloudFormat, &str); 5] = [
+    (CloudFormat::Npy, "npy"),
+    (CloudFormat::Ply, "ply"),
+    (CloudFormat::Pcd, "pcd"),
+    (CloudFormat::Feather, "feather"),
+    (CloudFormat::KittiBin, "kitti.bin"),
+];
+
+pub(crate) const FLOW_FORMATS: [FlowFormat; 6] = [
+    FlowFormat::Npz,
+    FlowFormat::Npy,
+    FlowFormat::Feather,
+    FlowFormat::Ply,
+    FlowFormat::Pcd,
+    FlowFormat::Json,
+];
+
+/// `count` points on a spiral: all different, none at the origin.
+pub(crate) fn points(count: usize) -> Vec<Point> {
+    let point = |index: usize| {
+        let turn = index as f32 * 0.7;
+        [
+            turn.cos() * (5.0 + turn),
+            turn.sin() * (5.0 + turn),
+            turn * 0.01 - 1.0,
+        ]
+    };
+    (0..count).map(point).collect()
+}
+
+pub(crate) fn pattern(count: usize, every: usize) -> Vec<bool> {
+    (0..count)
+        .map(|index| index.is_multiple_of(every))
+        .collect()
+}
+
+pub(crate) fn ego() -> RigidTransform {
+    RigidTransform::new(
+        nalgebra::Vector3::new(-0.5, 0.01, 0.02),
+        nalgebra::Vector3::new(0.001, -0.002, 0.03),
+    )
+}
+
+pub(crate) fn pair(count: usize) -> Pair {
+    let source = points(count);
+    let target = points(count + 3);
+    let truth = PairTruth {
+        flow: source
+            .iter()
+            .map(|[x, y, z]| [x * 0.1, -y * 0.1, *z])
+            .collect(),
+        valid: pattern(count, 2),
+        dynamic: Some(pattern(count, 3)),
+        foreground: Some(pattern(count, 4)),
+    };
+    let ground = Ground {
+        source: pattern(count, 5),
+        target: pattern(count + 3, 6),
+    };
+    Pair {
+        source,
+        target,
+        truth: Some(truth),
+        ground: Some(ground),
+        ego: Some(ego()),
+    }
+}
+
+pub(crate) fn cloud_file(format: CloudFormat, points: &[Point]) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    write_cloud(format, points, &mut bytes).unwrap();
+    bytes
+}
+
+pub(crate) fn pair_file(pair: &Pair) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    write_pair_npz(pair, &mut bytes).unwrap();
+    bytes
+}
+
+pub(crate) fn flow_file(format: FlowFormat, pair: &Pair) -> Vec<u8> {
+    let truth = pair.truth.as_ref().unwrap();
+    let table = FlowTable {
+        source: &pair.source,
+        flow: &truth.flow,
+        valid: &truth.valid,
+        dynamic: truth.dynamic.as_deref(),
+        ego: pair.ego.as_ref(),
+    };
+    let mut bytes = Vec::new();
+    write_flow(format, &table, &mut bytes).unwrap();
+    bytes
+}
+
+/// An `.npy` file with a header of our choosing.
+pub(crate) fn npy(descr: &str, fortran: bool, shape: &str, data: &[u8]) -> Vec<u8> {
+    let fortran = if fortran { "True" } else { "False" };
+    let header = format!("{{'descr': {descr}, 'fortran_order': {fortran}, 'shape': {shape}, }}\n");
+    let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
+    bytes.extend(u16::try_from(header.len()).unwrap().to_le_bytes());
+    bytes.extend(header.as_bytes());
+    bytes.extend(data);
+    bytes
+}
+
+/// A zip of arrays, each a name and the bytes of an `.npy` file.
+pub(crate) fn npz(members: &[(&str, &[u8])]) -> Vec<u8> {
+    use std::io::Write;
+    let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    for (name, bytes) in members {
+        let options = zip::write::SimpleFileOptions::default();
+        zip.start_file(format!("{name}.npy"), options).unwrap();
+        zip.write_all(bytes).unwrap();
+    }
+    zip.finish().unwrap().into_inner()
+}
+
+pub(crate) fn floats(values: &[f32]) -> Vec<u8> {
+    values
+        .iter()
+        .flat_map(|value| value.to_le_bytes())
+        .collect()
+}
+
+/// A feather file of float32 columns.
+pub(crate) fn feather(columns: &[(&str, Vec<Option<f32>>)]) -> Vec<u8> {
+    use std::sync::Arc;
+    let column = |(name, values): &(&str, Vec<Option<f32>>)| {
+        let array = arrow_array::Float32Array::from(values.clone());
+        ((*name).to_owned(), Arc::new(array) as arrow_array::ArrayRef)
+    };
+    let batch = arrow_array::RecordBatch::try_from_iter_with_nullable(
+        columns
+            .iter()
+            .map(column)
+            .map(|(name, array)| (name, array, true)),
+    )
+    .unwrap();
+    let mut bytes = Vec::new();
+    let mut writer = arrow_ipc::writer::FileWriter::try_new(&mut bytes, &batch.schema()).unwrap();
+    writer.write(&batch).unwrap();
+    writer.finish().unwrap();
+    drop(writer);
+    bytes
+}
+
+/// Literals only: the simplest stream that an LZF reader must take.
+pub(crate) fn lzf_literals(bytes: &[u8]) -> Vec<u8> {
+    let run = |chunk: &[u8]| [&[chunk.len() as u8 - 1], chunk].concat();
+    bytes.chunks(32).flat_map(run).collect()
+}
