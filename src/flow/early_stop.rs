@@ -16,7 +16,11 @@ pub(crate) struct EarlyStop {
 impl EarlyStop {
     /// A rule that has seen nothing.
     pub(crate) fn new(options: EarlyStopOptions) -> Self {
-        Self { options, best: None, without_progress: 0 }
+        Self {
+            options,
+            best: None,
+            without_progress: 0,
+        }
     }
 
     /// Takes the next loss, metres; true where the optimization should end.
@@ -40,7 +44,10 @@ mod tests {
     use super::*;
 
     fn stops_at(patience: usize, losses: &[f64]) -> Option<usize> {
-        let mut rule = EarlyStop::new(EarlyStopOptions { patience, min_delta_m: 1e-3 });
+        let mut rule = EarlyStop::new(EarlyStopOptions {
+            patience,
+            min_delta_m: 1e-3,
+        });
         losses.iter().position(|&loss| rule.observe(loss))
     }
 

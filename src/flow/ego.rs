@@ -27,8 +27,11 @@ const DAMPING: f64 = 1e-6;
 /// The motion target_from_source that aligns `source` with the transform's target.
 pub fn align(source: &[Point], distance: &DistanceTransform) -> RigidTransform {
     let stride = source.len().div_ceil(SAMPLED).max(1);
-    let points: Vec<Point3<f64>> =
-        source.iter().step_by(stride).map(|p| Point3::from(p.map(f64::from))).collect();
+    let points: Vec<Point3<f64>> = source
+        .iter()
+        .step_by(stride)
+        .map(|p| Point3::from(p.map(f64::from)))
+        .collect();
     let mut target_from_source = RigidTransform::identity();
     for step in 0..STEPS {
         let shrunk = (step as f64 / SHRINKING_STEPS as f64).min(1.0);
@@ -61,8 +64,7 @@ fn gauss_newton_step(
         let residual = f64::from(sample.distance);
         let slope = Vector3::from(sample.gradient.map(f64::from));
         let turning = moved.coords.cross(&slope);
-        let jacobian =
-            Vector6::new(slope.x, slope.y, slope.z, turning.x, turning.y, turning.z);
+        let jacobian = Vector6::new(slope.x, slope.y, slope.z, turning.x, turning.y, turning.z);
         let weight = (scale * scale / (scale * scale + residual * residual)).powi(2);
         normal += jacobian * jacobian.transpose() * weight;
         gradient += jacobian * (weight * residual);

@@ -60,8 +60,17 @@ mod tests {
         // Single precision resolves 6e-8 of a value near 1: with steps of 1e-3 that is 6e-5.
         const TOLERANCE: f64 = 5e-4;
         const STEP: f64 = 1e-3;
-        let options = LossOptions { margin_m: 0.1, truncation_m: Some(2.0), flow_penalty: 0.3 };
-        for flow in [[0.2, 0.1, -0.3], [-1.0, 0.5, 0.25], [3.0, 0.0, 0.0], [-0.5, 0.2, 0.4]] {
+        let options = LossOptions {
+            margin_m: 0.1,
+            truncation_m: Some(2.0),
+            flow_penalty: 0.3,
+        };
+        for flow in [
+            [0.2, 0.1, -0.3],
+            [-1.0, 0.5, 0.25],
+            [3.0, 0.0, 0.0],
+            [-0.5, 0.2, 0.4],
+        ] {
             let gradient = loss(&options, flow).gradient;
             for axis in 0..3 {
                 let mut ahead = flow;
@@ -70,25 +79,57 @@ mod tests {
                 behind[axis] -= STEP;
                 let slope = (value(&options, ahead) - value(&options, behind)) / (2.0 * STEP);
                 let error = (slope - f64::from(gradient[axis])).abs();
-                assert!(error < TOLERANCE, "axis {axis} at {flow:?}: {slope} {gradient:?}");
+                assert!(
+                    error < TOLERANCE,
+                    "axis {axis} at {flow:?}: {slope} {gradient:?}"
+                );
             }
         }
     }
 
     #[test]
     fn the_published_loss_is_the_distance_itself() {
-        let options = LossOptions { margin_m: 0.0, truncation_m: None, flow_penalty: 0.0 };
-        let sample = Sample { distance: 0.7, gradient: [0.0, 1.0, 0.0] };
+        let options = LossOptions {
+            margin_m: 0.0,
+            truncation_m: None,
+            flow_penalty: 0.0,
+        };
+        let sample = Sample {
+            distance: 0.7,
+            gradient: [0.0, 1.0, 0.0],
+        };
         let loss = options.at(sample, [5.0, 5.0, 5.0]);
-        assert_eq!(loss, PointLoss { value: 0.7, gradient: [0.0, 1.0, 0.0] });
+        assert_eq!(
+            loss,
+            PointLoss {
+                value: 0.7,
+                gradient: [0.0, 1.0, 0.0]
+            }
+        );
     }
 
     #[test]
     fn points_within_the_margin_and_beyond_the_truncation_are_not_pulled() {
-        let options = LossOptions { margin_m: 0.1, truncation_m: Some(2.0), flow_penalty: 0.0 };
+        let options = LossOptions {
+            margin_m: 0.1,
+            truncation_m: Some(2.0),
+            flow_penalty: 0.0,
+        };
         for (distance, value) in [(0.05, 0.1), (3.0, 2.0)] {
-            let loss = options.at(Sample { distance, gradient: [1.0; 3] }, [0.0; 3]);
-            assert_eq!(loss, PointLoss { value, gradient: [0.0; 3] });
+            let loss = options.at(
+                Sample {
+                    distance,
+                    gradient: [1.0; 3],
+                },
+                [0.0; 3],
+            );
+            assert_eq!(
+                loss,
+                PointLoss {
+                    value,
+                    gradient: [0.0; 3]
+                }
+            );
         }
     }
 }

@@ -6,23 +6,23 @@
 //!
 //! No async, no input or output, no clock, no environment, no globals. Deadlines, cancellation and
 //! time come in through a [`Watch`].
-mod points;
-mod options;
-mod error;
-mod watch;
-mod solver;
-mod preprocess;
+pub mod backend;
+pub mod cpu;
 pub mod distance;
+mod early_stop;
 pub mod ego;
+mod error;
+pub mod evaluate;
 pub mod field;
 mod loss;
 mod optimizer;
-mod early_stop;
-pub mod backend;
-pub mod cpu;
-pub mod evaluate;
-pub mod simulate;
+mod options;
+mod points;
+mod preprocess;
 mod random;
+pub mod simulate;
+mod solver;
+mod watch;
 
 #[cfg(test)]
 mod reference;

@@ -35,8 +35,7 @@ impl AdamStep {
     ) {
         let [means, squares] = moments;
         let moments = means.iter_mut().zip(squares);
-        for ((gradient, parameter), (mean, square)) in
-            gradients.iter().zip(parameters).zip(moments)
+        for ((gradient, parameter), (mean, square)) in gradients.iter().zip(parameters).zip(moments)
         {
             *mean += (gradient - *mean) * (1.0 - BETA1) as f32;
             *square += (gradient * gradient - *square) * (1.0 - BETA2) as f32;
@@ -75,6 +74,9 @@ mod tests {
     fn the_first_step_has_the_length_of_the_learning_rate() {
         let mut x = [0.0f32, 0.0];
         AdamStep::new(1, 0.008).apply(&[3.0, -1e-3], &mut x, [&mut [0.0; 2], &mut [0.0; 2]]);
-        assert!((x[0] + 0.008).abs() < 1e-6 && (x[1] - 0.008).abs() < 1e-6, "{x:?}");
+        assert!(
+            (x[0] + 0.008).abs() < 1e-6 && (x[1] - 0.008).abs() < 1e-6,
+            "{x:?}"
+        );
     }
 }

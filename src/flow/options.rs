@@ -72,7 +72,11 @@ pub struct Options {
 impl Options {
     /// FNSF as its published code runs it, for full and for sampled clouds.
     fn published(max_points: Option<usize>) -> Self {
-        let (learning_rate, patience) = if max_points.is_some() { (0.01, 5) } else { (0.008, 10) };
+        let (learning_rate, patience) = if max_points.is_some() {
+            (0.01, 5)
+        } else {
+            (0.008, 10)
+        };
         Self {
             seed: 0,
             max_points,
@@ -80,14 +84,21 @@ impl Options {
             ground: Ground::Keep,
             ego: Ego::Off,
             distance: DistanceOptions::default(),
-            loss: LossOptions { margin_m: 0.0, truncation_m: None, flow_penalty: 0.0 },
+            loss: LossOptions {
+                margin_m: 0.0,
+                truncation_m: None,
+                flow_penalty: 0.0,
+            },
             inputs: Inputs::Raw,
             start: Start::Xavier,
             learning_rate,
             decay: Decay::Constant,
             batch: None,
             keep: Keep::Best,
-            early_stop: Some(EarlyStopOptions { patience, min_delta_m: 1e-3 }),
+            early_stop: Some(EarlyStopOptions {
+                patience,
+                min_delta_m: 1e-3,
+            }),
             max_iterations: 5000,
         }
     }
@@ -96,7 +107,11 @@ impl Options {
     fn stochastic(max_points: Option<usize>) -> Self {
         Self {
             ego: Ego::Auto,
-            loss: LossOptions { margin_m: 0.1, truncation_m: None, flow_penalty: 0.02 },
+            loss: LossOptions {
+                margin_m: 0.1,
+                truncation_m: None,
+                flow_penalty: 0.02,
+            },
             inputs: Inputs::Centered { scale_m: 20.0 },
             start: Start::ZeroFlow,
             learning_rate: 0.008,

@@ -49,7 +49,10 @@ pub(crate) fn select(problem: &Problem, options: &Options) -> Result<Selection, 
     }
     for (cloud, rows) in [("source", &rows), ("target", &target_rows)] {
         if rows.len() < MIN_POINTS {
-            return Err(FlowError::TooFewPoints { cloud, points: rows.len() });
+            return Err(FlowError::TooFewPoints {
+                cloud,
+                points: rows.len(),
+            });
         }
     }
     Ok(Selection {
@@ -69,7 +72,11 @@ fn kept(
     if let Some(flags) = ground.map(<[bool]>::len)
         && flags != points.len()
     {
-        return Err(FlowError::GroundMaskLength { cloud, flags, points: points.len() });
+        return Err(FlowError::GroundMaskLength {
+            cloud,
+            flags,
+            points: points.len(),
+        });
     }
     let range = options.range_m.unwrap_or(f32::INFINITY);
     Ok((0..points.len())
@@ -88,8 +95,11 @@ mod tests {
     use crate::flow::options::Preset;
 
     fn rows(options: &Options, source: &[Point], ground: Option<&[bool]>) -> Vec<usize> {
-        let problem =
-            Problem { source, target: source, ground: ground.map(|flags| [flags, flags]) };
+        let problem = Problem {
+            source,
+            target: source,
+            ground: ground.map(|flags| [flags, flags]),
+        };
         select(&problem, options).expect("enough points").rows
     }
 
@@ -128,10 +138,20 @@ mod tests {
 
     #[test]
     fn too_few_points_and_missing_masks_are_named() {
-        let problem = Problem { source: &[[0.0; 3]], target: &[[0.0; 3]], ground: None };
+        let problem = Problem {
+            source: &[[0.0; 3]],
+            target: &[[0.0; 3]],
+            ground: None,
+        };
         let mut options = Preset::Default.options(None);
         let error = select(&problem, &options).expect_err("one point");
-        assert!(matches!(error, FlowError::TooFewPoints { cloud: "source", points: 1 }));
+        assert!(matches!(
+            error,
+            FlowError::TooFewPoints {
+                cloud: "source",
+                points: 1
+            }
+        ));
         options.ground = Ground::Mask;
         let error = select(&problem, &options).expect_err("no mask");
         assert!(matches!(error, FlowError::NoGroundMask));

@@ -26,7 +26,9 @@ impl ReferenceNetwork {
         biases.push((0..WIDTH).map(|o| at(first.bias + o)).collect());
         for layer in 0..MIDDLE_LAYERS {
             let place = middle_layer(layer);
-            weights.push(matrix(WIDTH, WIDTH, |o, i| at(place.weights + panel_index(i, o))));
+            weights.push(matrix(WIDTH, WIDTH, |o, i| {
+                at(place.weights + panel_index(i, o))
+            }));
             biases.push((0..WIDTH).map(|o| at(place.bias + o)).collect());
         }
         let last = last_layer();
@@ -40,9 +42,10 @@ impl ReferenceNetwork {
         let mut layers = vec![input.to_vec()];
         for (number, (weights, biases)) in self.weights.iter().zip(&self.biases).enumerate() {
             let from = &layers[number];
-            let linear = weights.iter().zip(biases).map(|(row, bias)| {
-                bias + row.iter().zip(from).map(|(w, h)| w * h).sum::<f64>()
-            });
+            let linear = weights
+                .iter()
+                .zip(biases)
+                .map(|(row, bias)| bias + row.iter().zip(from).map(|(w, h)| w * h).sum::<f64>());
             let last = number + 1 == self.weights.len();
             layers.push(linear.map(|x| if last { x } else { x.max(0.0) }).collect());
         }
@@ -56,7 +59,12 @@ impl ReferenceNetwork {
     }
 
     /// Adds to `gradients` the derivative of `output_gradient . g(input)` by every parameter.
-    pub(crate) fn backward(&self, input: [f64; 3], output_gradient: [f64; 3], gradients: &mut Self) {
+    pub(crate) fn backward(
+        &self,
+        input: [f64; 3],
+        output_gradient: [f64; 3],
+        gradients: &mut Self,
+    ) {
         let layers = self.activations(input);
         let mut delta = output_gradient.to_vec();
         for number in (0..self.weights.len()).rev() {
@@ -68,9 +76,16 @@ impl ReferenceNetwork {
             }
             delta = (0..layers[number].len())
                 .map(|i| {
-                    let back: f64 =
-                        delta.iter().zip(&self.weights[number]).map(|(d, row)| d * row[i]).sum();
-                    if number == 0 || layers[number][i] > 0.0 { back } else { 0.0 }
+                    let back: f64 = delta
+                        .iter()
+                        .zip(&self.weights[number])
+                        .map(|(d, row)| d * row[i])
+                        .sum();
+                    if number == 0 || layers[number][i] > 0.0 {
+                        back
+                    } else {
+                        0.0
+                    }
                 })
                 .collect();
         }
@@ -79,10 +94,15 @@ impl ReferenceNetwork {
     /// All weights and biases in one row.
     pub(crate) fn flat(&self) -> Vec<f64> {
         let weights = self.weights.iter().flatten().flatten();
-        weights.chain(self.biases.iter().flatten()).copied().collect()
+        weights
+            .chain(self.biases.iter().flatten())
+            .copied()
+            .collect()
     }
 }
 
 fn matrix(rows: usize, columns: usize, entry: impl Fn(usize, usize) -> f64) -> Vec<Vec<f64>> {
-    (0..rows).map(|r| (0..columns).map(|c| entry(r, c)).collect()).collect()
+    (0..rows)
+        .map(|r| (0..columns).map(|c| entry(r, c)).collect())
+        .collect()
 }

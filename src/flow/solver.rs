@@ -100,7 +100,11 @@ pub fn estimate(
     };
     let aligned = match &ego {
         None => selection.source.clone(),
-        Some(motion) => selection.source.iter().map(|&point| moved(motion, point)).collect(),
+        Some(motion) => selection
+            .source
+            .iter()
+            .map(|&point| moved(motion, point))
+            .collect(),
     };
     let distance_bytes = transform.bytes();
     let mut trainer = transform.start(&aligned, options)?;
@@ -114,7 +118,9 @@ pub fn estimate(
             Advance::Interrupted(Interrupt::Deadline) => break StopReason::Deadline,
             Advance::Interrupted(Interrupt::Cancelled) => return Err(FlowError::Cancelled),
             Advance::Diverged => {
-                return Err(FlowError::Diverged { iteration: trainer.report().iterations });
+                return Err(FlowError::Diverged {
+                    iteration: trainer.report().iterations,
+                });
             }
         }
     };

@@ -123,10 +123,19 @@ impl Kernels {
         assert!(Isa::available().contains(&isa), "{isa:?} is not available");
         match isa {
             #[cfg(target_arch = "x86_64")]
-            Isa::Avx512 => Self { forward: forward_avx512, backward: backward_avx512 },
+            Isa::Avx512 => Self {
+                forward: forward_avx512,
+                backward: backward_avx512,
+            },
             #[cfg(target_arch = "x86_64")]
-            Isa::Avx2 => Self { forward: forward_avx2, backward: backward_avx2 },
-            _ => Self { forward: forward_portable, backward: backward_portable },
+            Isa::Avx2 => Self {
+                forward: forward_avx2,
+                backward: backward_avx2,
+            },
+            _ => Self {
+                forward: forward_portable,
+                backward: backward_portable,
+            },
         }
     }
 
@@ -251,7 +260,8 @@ unsafe fn forward<L: Lanes, const ROWS: usize, const VECTORS: usize>(
     unsafe {
         let at = first_layer();
         for column in (0..WIDTH).step_by(L::COUNT) {
-            let w: [L; 3] = core::array::from_fn(|i| L::load(weights.add(at.weights + i * WIDTH + column)));
+            let w: [L; 3] =
+                core::array::from_fn(|i| L::load(weights.add(at.weights + i * WIDTH + column)));
             let bias = L::load(weights.add(at.bias + column));
             for row in 0..rows {
                 let x = tile.inputs[row];
@@ -271,7 +281,11 @@ unsafe fn forward<L: Lanes, const ROWS: usize, const VECTORS: usize>(
                         L::load(weights.add(at.bias + column + v * L::COUNT))
                     });
                     let mut acc = [bias; ROWS];
-                    let a = Strided { at: from.add(row * STRIDE), row: STRIDE, step: 1 };
+                    let a = Strided {
+                        at: from.add(row * STRIDE),
+                        row: STRIDE,
+                        step: 1,
+                    };
                     multiply(&mut acc, WIDTH, a, weights.add(at.weights + panel), PANEL);
                     for r in 0..ROWS {
                         for v in 0..VECTORS {
@@ -318,8 +332,10 @@ unsafe fn backward<L: Lanes, const ROWS: usize, const TAIL: usize, const VECTORS
         let at = last_layer();
         let h = activations.add(MIDDLE_LAYERS * TILE * STRIDE);
         for column in (0..WIDTH).step_by(L::COUNT) {
-            let w: [L; 3] = core::array::from_fn(|o| L::load(weights.add(at.weights + o * WIDTH + column)));
-            let mut dw: [L; 3] = core::array::from_fn(|o| L::load(grads.add(at.weights + o * WIDTH + column)));
+            let w: [L; 3] =
+                core::array::from_fn(|o| L::load(weights.add(at.weights + o * WIDTH + column)));
+            let mut dw: [L; 3] =
+                core::array::from_fn(|o| L::load(grads.add(at.weights + o * WIDTH + column)));
             for row in 0..rows {
                 let g = tile.output_gradients[row].map(|g| L::splat(g));
                 let h = L::load(h.add(row * STRIDE + column));
@@ -359,8 +375,18 @@ unsafe fn backward<L: Lanes, const ROWS: usize, const TAIL: usize, const VECTORS
             for_columns::<L, VECTORS>(|column, panel| {
                 for row in (0..rows).step_by(ROWS) {
                     let mut acc = [[L::splat(0.0); VECTORS]; ROWS];
-                    let a = Strided { at: delta.add(row * STRIDE), row: STRIDE, step: 1 };
-                    multiply(&mut acc, WIDTH, a, transposes.add(at.weights + panel), PANEL);
+                    let a = Strided {
+                        at: delta.add(row * STRIDE),
+                        row: STRIDE,
+                        step: 1,
+                    };
+                    multiply(
+                        &mut acc,
+                        WIDTH,
+                        a,
+                        transposes.add(at.weights + panel),
+                        PANEL,
+                    );
                     for r in 0..ROWS {
                         for v in 0..VECTORS {
                             let place = (row + r) * STRIDE + column + v * L::COUNT;
@@ -376,7 +402,8 @@ unsafe fn backward<L: Lanes, const ROWS: usize, const TAIL: usize, const VECTORS
         let at = first_layer();
         add_column_sums::<L>(delta, rows, grads.add(at.bias));
         for column in (0..WIDTH).step_by(L::COUNT) {
-            let mut dw: [L; 3] = core::array::from_fn(|i| L::load(grads.add(at.weights + i * WIDTH + column)));
+            let mut dw: [L; 3] =
+                core::array::from_fn(|i| L::load(grads.add(at.weights + i * WIDTH + column)));
             for row in 0..rows {
                 let d = L::load(delta.add(row * STRIDE + column));
                 for i in 0..3 {
@@ -421,7 +448,17 @@ unsafe fn weight_gradient<L: Lanes, const ROWS: usize, const VECTORS: usize>(
                 acc[r][v] = L::load(to.add(r * PANEL + v * L::COUNT));
             }
         }
-        multiply(&mut acc, points, Strided { at: h, row: 1, step: STRIDE }, d, STRIDE);
+        multiply(
+            &mut acc,
+            points,
+            Strided {
+                at: h,
+                row: 1,
+                step: STRIDE,
+            },
+            d,
+            STRIDE,
+        );
         for r in 0..ROWS {
             for v in 0..VECTORS {
                 acc[r][v].store(to.add(r * PANEL + v * L::COUNT));
@@ -464,7 +501,11 @@ mod tests {
     fn worst(values: &[f64], reference: &[f64]) -> f64 {
         let scale = reference.iter().fold(1e-12f64, |a, r| a.max(r.abs()));
         let difference = |(v, r): (&f64, &f64)| (v - r).abs() / scale;
-        values.iter().zip(reference).map(difference).fold(0.0, f64::max)
+        values
+            .iter()
+            .zip(reference)
+            .map(difference)
+            .fold(0.0, f64::max)
     }
 
     #[test]
@@ -477,10 +518,15 @@ mod tests {
                 let inputs = points(rows, 11);
                 tile.load(inputs.iter().copied());
                 Kernels::new(isa).forward(&parameters, &mut tile);
-                let values: Vec<f64> =
-                    tile.outputs[..rows].iter().flatten().map(|&x| f64::from(x)).collect();
-                let expected: Vec<f64> =
-                    inputs.iter().flat_map(|x| reference.forward(x.map(f64::from))).collect();
+                let values: Vec<f64> = tile.outputs[..rows]
+                    .iter()
+                    .flatten()
+                    .map(|&x| f64::from(x))
+                    .collect();
+                let expected: Vec<f64> = inputs
+                    .iter()
+                    .flat_map(|x| reference.forward(x.map(f64::from)))
+                    .collect();
                 let error = worst(&values, &expected);
                 assert!(error < TOLERANCE, "{isa:?}, {rows} rows: {error}");
             }
@@ -523,7 +569,12 @@ mod tests {
         let mut gradients = ReferenceNetwork::read(&Parameters::zeros());
         reference.backward(input, pull, &mut gradients);
         let value = |network: &ReferenceNetwork| -> f64 {
-            network.forward(input).iter().zip(pull).map(|(o, p)| o * p).sum()
+            network
+                .forward(input)
+                .iter()
+                .zip(pull)
+                .map(|(o, p)| o * p)
+                .sum()
         };
         for (layer, output, i) in [(0, 17, 2), (1, 3, 99), (4, 120, 64), (7, 64, 5), (8, 1, 77)] {
             let weight = reference.weights[layer][output][i];

@@ -172,7 +172,9 @@ impl Lanes for F32x4 {
     }
     #[inline(always)]
     unsafe fn mul_add(self, factor: Self, addend: Self) -> Self {
-        Self(core::array::from_fn(|i| self.0[i] * factor.0[i] + addend.0[i]))
+        Self(core::array::from_fn(|i| {
+            self.0[i] * factor.0[i] + addend.0[i]
+        }))
     }
     #[inline(always)]
     unsafe fn relu(self) -> Self {
@@ -180,7 +182,9 @@ impl Lanes for F32x4 {
     }
     #[inline(always)]
     unsafe fn where_positive(self, gate: Self) -> Self {
-        Self(core::array::from_fn(|i| if gate.0[i] > 0.0 { self.0[i] } else { 0.0 }))
+        Self(core::array::from_fn(|i| {
+            if gate.0[i] > 0.0 { self.0[i] } else { 0.0 }
+        }))
     }
     #[inline(always)]
     unsafe fn sum(self) -> f32 {

@@ -44,13 +44,21 @@ impl CpuBackend {
             .thread_name(|i| format!("fnsf-cpu-{i}"))
             .build()
             .map_err(|error| BackendError::Threads(error.to_string()))?;
-        Ok(Self { isa, kernels: Kernels::new(isa), threads: Arc::new(threads) })
+        Ok(Self {
+            isa,
+            kernels: Kernels::new(isa),
+            threads: Arc::new(threads),
+        })
     }
 }
 
 impl Backend for CpuBackend {
     fn name(&self) -> String {
-        format!("cpu ({}, {} threads)", self.isa.name(), self.threads.current_num_threads())
+        format!(
+            "cpu ({}, {} threads)",
+            self.isa.name(),
+            self.threads.current_num_threads()
+        )
     }
 
     fn transform(
@@ -59,10 +67,15 @@ impl Backend for CpuBackend {
         target: &[Point],
         options: &DistanceOptions,
     ) -> Result<Box<dyn Transform>, BackendError> {
-        let distance =
-            self.threads.install(|| DistanceTransform::build(source, target, options))?;
+        let distance = self
+            .threads
+            .install(|| DistanceTransform::build(source, target, options))?;
         let (kernels, threads) = (self.kernels, Arc::clone(&self.threads));
-        Ok(Box::new(CpuTransform { kernels, threads, distance }))
+        Ok(Box::new(CpuTransform {
+            kernels,
+            threads,
+            distance,
+        }))
     }
 }
 

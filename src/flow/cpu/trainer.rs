@@ -86,7 +86,10 @@ impl CpuTrainer {
     /// The points of this iteration: one of equal parts, in turn.
     fn batch(&self) -> Range<usize> {
         let all = self.points.len();
-        let parts = self.options.batch.map_or(1, |batch| all.div_ceil(batch.max(1)));
+        let parts = self
+            .options
+            .batch
+            .map_or(1, |batch| all.div_ceil(batch.max(1)));
         let part = self.report.iterations % parts;
         part * all / parts..(part + 1) * all / parts
     }
@@ -97,11 +100,12 @@ impl CpuTrainer {
         let batch = self.batch();
         let tiles = batch.len().div_ceil(TILE);
         let chunks = chunk_count(tiles);
-        self.chunks.resize_with(chunks.max(self.chunks.len()), || Chunk {
-            gradients: Parameters::zeros(),
-            loss: 0.0,
-            query_seconds: 0.0,
-        });
+        self.chunks
+            .resize_with(chunks.max(self.chunks.len()), || Chunk {
+                gradients: Parameters::zeros(),
+                loss: 0.0,
+                query_seconds: 0.0,
+            });
         self.accumulate(batch.clone(), chunks, watch);
         let done = &self.chunks[..chunks];
         let loss = done.iter().map(|c| c.loss).sum::<f64>() / batch.len() as f64;
@@ -110,7 +114,10 @@ impl CpuTrainer {
         if !loss.is_finite() {
             return None;
         }
-        let stop = self.early_stop.as_mut().is_some_and(|rule| rule.observe(loss));
+        let stop = self
+            .early_stop
+            .as_mut()
+            .is_some_and(|rule| rule.observe(loss));
         self.keep(loss, stop);
         self.step(chunks);
         self.report.iterations += 1;
@@ -145,10 +152,14 @@ impl CpuTrainer {
                     tile.output_gradients[row] = loss.gradient.map(|g| g * weight);
                 }
                 chunk.query_seconds += watch.seconds() - began;
-                device.kernels.backward(parameters, transposed, &mut tile, &mut chunk.gradients);
+                device
+                    .kernels
+                    .backward(parameters, transposed, &mut tile, &mut chunk.gradients);
             }
         };
-        device.threads.install(|| chunks.par_iter_mut().enumerate().for_each(run));
+        device
+            .threads
+            .install(|| chunks.par_iter_mut().enumerate().for_each(run));
     }
 
     /// Takes the current parameters into the result. As in the published code, the iteration at
@@ -159,7 +170,9 @@ impl CpuTrainer {
             Keep::Best if loss <= self.report.best_loss && !stop => {
                 self.report.best_loss = loss;
                 self.report.best_iteration = iteration;
-                self.kept.as_mut_slice().copy_from_slice(self.parameters.as_slice());
+                self.kept
+                    .as_mut_slice()
+                    .copy_from_slice(self.parameters.as_slice());
             }
             Keep::Best => {}
             Keep::Average { decay } => {
@@ -169,7 +182,11 @@ impl CpuTrainer {
                 for (kept, parameter) in kept.zip(self.parameters.as_slice()) {
                     *kept += fresh * (parameter - *kept);
                 }
-                let before = if iteration == 1 { loss } else { self.report.best_loss };
+                let before = if iteration == 1 {
+                    loss
+                } else {
+                    self.report.best_loss
+                };
                 self.report.best_loss = before + f64::from(fresh) * (loss - before);
                 self.report.best_iteration = iteration;
             }
@@ -211,7 +228,11 @@ impl CpuTrainer {
 /// Chunks that `tiles` tiles are cut into: enough for many cores, few enough that adding their
 /// gradients stays small beside computing them.
 fn chunk_count(tiles: usize) -> usize {
-    if tiles < 88 { (tiles / 4).clamp(1, 8) } else { (tiles / 11).min(32) }
+    if tiles < 88 {
+        (tiles / 4).clamp(1, 8)
+    } else {
+        (tiles / 11).min(32)
+    }
 }
 
 /// The calling thread's working set.
@@ -249,12 +270,14 @@ impl Trainer for CpuTrainer {
         let (device, kept) = (&self.device, &self.kept);
         let (conditioning, working_sets) = (&self.conditioning, &self.tiles);
         device.threads.install(|| {
-            flow.par_chunks_mut(TILE).zip(points.par_chunks(TILE)).for_each(|(flow, points)| {
-                let mut tile = own_tile(working_sets);
-                tile.load(points.iter().map(|&point| conditioning.apply(point)));
-                device.kernels.forward(kept, &mut tile);
-                flow.copy_from_slice(&tile.outputs[..points.len()]);
-            });
+            flow.par_chunks_mut(TILE)
+                .zip(points.par_chunks(TILE))
+                .for_each(|(flow, points)| {
+                    let mut tile = own_tile(working_sets);
+                    tile.load(points.iter().map(|&point| conditioning.apply(point)));
+                    device.kernels.forward(kept, &mut tile);
+                    flow.copy_from_slice(&tile.outputs[..points.len()]);
+                });
         });
         Ok(flow)
     }

@@ -43,9 +43,17 @@ impl Index {
         let total = blocks.iter().product::<usize>();
         if total > MAX_BLOCKS {
             let bytes = |blocks: usize| blocks.saturating_mul(size_of::<u32>());
-            return Err(DistanceError::Memory { needed: bytes(total), limit: bytes(MAX_BLOCKS) });
+            return Err(DistanceError::Memory {
+                needed: bytes(total),
+                limit: bytes(MAX_BLOCKS),
+            });
         }
-        let mut index = Self { blocks, tables: vec![ABSENT; total], bricks: Vec::new(), active: 0 };
+        let mut index = Self {
+            blocks,
+            tables: vec![ABSENT; total],
+            bricks: Vec::new(),
+            active: 0,
+        };
         let reach = (band + EDGE as i32 - 1) / EDGE as i32;
         let limit = band * band;
         for cell in cells {

@@ -45,11 +45,13 @@ impl Bricks {
         cells.dedup();
         let band = options.band_cells();
         let index = Index::activate(&grid, &cells, band)?;
-        let needed = index.bytes()
-            + index.active * VOLUME * size_of::<u16>()
-            + FarField::bytes_over(&grid);
+        let needed =
+            index.bytes() + index.active * VOLUME * size_of::<u16>() + FarField::bytes_over(&grid);
         if needed > options.max_bytes {
-            return Err(DistanceError::Memory { needed, limit: options.max_bytes });
+            return Err(DistanceError::Memory {
+                needed,
+                limit: options.max_bytes,
+            });
         }
         let points = match options.sites {
             Sites::Cells => None,
@@ -137,5 +139,9 @@ impl Bricks {
 /// Corner `i` of the cell at `corner`: bits 4, 2 and 1 step along x, y and z.
 fn corner_vertex(corner: [u32; 3], i: usize) -> [u32; 3] {
     let i = i as u32;
-    [corner[0] + (i >> 2), corner[1] + (i >> 1 & 1), corner[2] + (i & 1)]
+    [
+        corner[0] + (i >> 2),
+        corner[1] + (i >> 1 & 1),
+        corner[2] + (i & 1),
+    ]
 }

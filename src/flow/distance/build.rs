@@ -29,7 +29,10 @@ pub(crate) type Site = ([u32; 3], [f32; 3]);
 pub(crate) fn sorted_points(grid: &Grid, target: &[Point]) -> Vec<Site> {
     let site = |&p: &Point| (grid.nearest_vertex(p), grid.in_cells(p).map(|c| c as f32));
     let mut sites: Vec<_> = target.iter().map(site).collect();
-    sites.sort_unstable_by(|a, b| a.0.cmp(&b.0).then_with(|| a.1.partial_cmp(&b.1).unwrap_or(Ordering::Equal)));
+    sites.sort_unstable_by(|a, b| {
+        a.0.cmp(&b.0)
+            .then_with(|| a.1.partial_cmp(&b.1).unwrap_or(Ordering::Equal))
+    });
     sites
 }
 
@@ -58,9 +61,11 @@ pub(crate) fn band_codes(
         rest = others;
         blocks.push((block, bricks, own));
     }
-    blocks.into_par_iter().for_each_init(Gather::default, |gather, (block, bricks, own)| {
-        gather.fill_block(&columns, block, bricks, band, &codes_of_squares, own);
-    });
+    blocks
+        .into_par_iter()
+        .for_each_init(Gather::default, |gather, (block, bricks, own)| {
+            gather.fill_block(&columns, block, bricks, band, &codes_of_squares, own);
+        });
     codes
 }
 
@@ -136,9 +141,15 @@ impl Columns {
                     above += 1;
                 }
                 let up = column.get(above).map(|c| c[2] as i32 - z);
-                let down = above.checked_sub(1).map(|below| z - column[below][2] as i32);
+                let down = above
+                    .checked_sub(1)
+                    .map(|below| z - column[below][2] as i32);
                 let nearest = up.into_iter().chain(down).min().unwrap_or(band + 1);
-                if nearest <= band { (nearest * nearest) as i16 } else { FAR }
+                if nearest <= band {
+                    (nearest * nearest) as i16
+                } else {
+                    FAR
+                }
             }));
         }
     }
@@ -146,9 +157,16 @@ impl Columns {
     /// The column's squared distances in brick layer `layer`, if it reaches there.
     fn at(&self, column: usize, layer: u32) -> Option<&[i16; 8]> {
         let (first, start) = self.layers[column];
-        let end = self.layers.get(column + 1).map_or(self.squares.len(), |next| next.1 as usize);
+        let end = self
+            .layers
+            .get(column + 1)
+            .map_or(self.squares.len(), |next| next.1 as usize);
         let place = start as usize + layer.checked_sub(first)? as usize;
-        if place < end { self.squares.get(place) } else { None }
+        if place < end {
+            self.squares.get(place)
+        } else {
+            None
+        }
     }
 }
 
@@ -193,13 +211,20 @@ impl Gather {
                     let per_cell = codes_per_cell(band) as f32;
                     for (code, square) in codes.iter_mut().zip(self.near.squares()) {
                         let distance = square.sqrt() * per_cell;
-                        *code = if distance < f32::from(BEYOND) { distance.round() as u16 } else { BEYOND };
+                        *code = if distance < f32::from(BEYOND) {
+                            distance.round() as u16
+                        } else {
+                            BEYOND
+                        };
                     }
                     continue;
                 }
                 let squares = self.gather(columns, x, y, block[2] * EDGE + layer, band);
                 for (code, square) in codes.iter_mut().zip(squares.as_flattened()) {
-                    *code = codes_of_squares.get(*square as usize).copied().unwrap_or(BEYOND);
+                    *code = codes_of_squares
+                        .get(*square as usize)
+                        .copied()
+                        .unwrap_or(BEYOND);
                 }
             }
         }
@@ -227,7 +252,9 @@ impl Gather {
             let mut along_y = [FAR; 64];
             let mut any = false;
             for column in range.clone() {
-                let Some(along_z) = columns.at(column, layer) else { continue };
+                let Some(along_z) = columns.at(column, layer) else {
+                    continue;
+                };
                 any = true;
                 for (lane, out) in along_y.as_chunks_mut::<8>().0.iter_mut().enumerate() {
                     let gap = y + lane as i32 - columns.y[column];

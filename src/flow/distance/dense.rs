@@ -29,10 +29,16 @@ impl DenseChamfer {
     ) -> Result<Self, DistanceError> {
         options.check()?;
         let grid = Grid::covering(source, target, options.cell_m)?;
-        let cells = grid.vertices.iter().try_fold(size_of::<f32>(), |n, &v| n.checked_mul(v));
+        let cells = grid
+            .vertices
+            .iter()
+            .try_fold(size_of::<f32>(), |n, &v| n.checked_mul(v));
         let needed = cells.unwrap_or(usize::MAX);
         if needed > options.max_bytes {
-            return Err(DistanceError::Memory { needed, limit: options.max_bytes });
+            return Err(DistanceError::Memory {
+                needed,
+                limit: options.max_bytes,
+            });
         }
         let [nx, ny, nz] = grid.vertices;
         let mut distances = vec![f32::INFINITY; nx * ny * nz];

@@ -63,10 +63,14 @@ impl NearPoints {
     fn keep_close(&mut self, center: [f32; 3]) {
         let [xs, ys, zs] = &self.all;
         self.squares.clear();
-        self.squares.extend(xs.iter().zip(ys).zip(zs).map(|((x, y), z)| {
-            (x - center[0]).powi(2) + (y - center[1]).powi(2) + (z - center[2]).powi(2)
-        }));
-        let nearest = self.squares.iter().fold(f32::INFINITY, |a, &b| if b < a { b } else { a });
+        self.squares
+            .extend(xs.iter().zip(ys).zip(zs).map(|((x, y), z)| {
+                (x - center[0]).powi(2) + (y - center[1]).powi(2) + (z - center[2]).powi(2)
+            }));
+        let nearest = self
+            .squares
+            .iter()
+            .fold(f32::INFINITY, |a, &b| if b < a { b } else { a });
         let limit = (nearest.sqrt() + DIAGONAL).powi(2);
         self.close.iter_mut().for_each(Vec::clear);
         for (i, &square) in self.squares.iter().enumerate() {

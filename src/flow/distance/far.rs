@@ -47,9 +47,11 @@ impl FarField {
             let [x, y, z] = cell.map(|c| ((c + pitch / 2) / pitch) as usize);
             squares[(x.min(nx - 1) * ny + y.min(ny - 1)) * nz + z.min(nz - 1)] = 0.0;
         }
-        squares.par_chunks_mut(nz).for_each_init(Envelope::default, |envelope, line| {
-            envelope.transform(line);
-        });
+        squares
+            .par_chunks_mut(nz)
+            .for_each_init(Envelope::default, |envelope, line| {
+                envelope.transform(line);
+            });
         squares.par_chunks_mut(ny * nz).for_each_init(
             || (Envelope::default(), vec![0.0; ny]),
             |(envelope, line), slab| {
@@ -80,7 +82,11 @@ impl FarField {
         for distance in &mut distances {
             *distance = (distance.sqrt() * scale).max(band_m as f32);
         }
-        Self { pitch, vertices, distances }
+        Self {
+            pitch,
+            vertices,
+            distances,
+        }
     }
 
     /// Distance at a place given in fine cells from the origin, and its derivative by fine cells.
@@ -88,9 +94,8 @@ impl FarField {
     pub(crate) fn sample(&self, corner: [u32; 3], fraction: [f32; 3]) -> (f32, [f32; 3]) {
         let scale = 1.0 / self.pitch as f32;
         let low = corner.map(|c| (c / self.pitch) as usize);
-        let within: [f32; 3] = core::array::from_fn(|a| {
-            ((corner[a] % self.pitch) as f32 + fraction[a]) * scale
-        });
+        let within: [f32; 3] =
+            core::array::from_fn(|a| ((corner[a] % self.pitch) as f32 + fraction[a]) * scale);
         let corners = core::array::from_fn(|i| {
             let at = |axis: usize, bit: usize| (low[axis] + bit).min(self.vertices[axis] - 1);
             let (x, y, z) = (at(0, i >> 2), at(1, i >> 1 & 1), at(2, i & 1));

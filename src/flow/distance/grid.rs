@@ -46,7 +46,10 @@ impl Grid {
             }
         }
         let extent: [f64; 3] = core::array::from_fn(|a| f64::from(high[a]) - f64::from(low[a]));
-        if extent.iter().any(|e| !(0.0..=Self::MAX_EXTENT_M).contains(e)) {
+        if extent
+            .iter()
+            .any(|e| !(0.0..=Self::MAX_EXTENT_M).contains(e))
+        {
             return Err(DistanceError::Extent {
                 x_m: extent[0],
                 y_m: extent[1],
@@ -72,14 +75,20 @@ impl Grid {
     pub(crate) fn nearest_vertex(&self, point: Point) -> [u32; 3] {
         let at = self.in_cells(point);
         core::array::from_fn(|axis| {
-            at[axis].round_ties_even().clamp(0.0, (self.vertices[axis] - 1) as f64) as u32
+            at[axis]
+                .round_ties_even()
+                .clamp(0.0, (self.vertices[axis] - 1) as f64) as u32
         })
     }
 
     /// Where `point` lies between the vertices; outside points are moved to the border.
     #[inline]
     pub(crate) fn locate(&self, point: Point) -> Cell {
-        let mut cell = Cell { corner: [0; 3], fraction: [0.0; 3], inside: [1.0; 3] };
+        let mut cell = Cell {
+            corner: [0; 3],
+            fraction: [0.0; 3],
+            inside: [1.0; 3],
+        };
         let at = self.in_cells(point);
         for axis in 0..3 {
             let clipped = at[axis].clamp(0.0, (self.vertices[axis] - 1) as f64);
@@ -101,9 +110,16 @@ pub(crate) fn trilinear(corners: [f32; 8], fraction: [f32; 3]) -> (f32, [f32; 3]
     let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
     let along_z: [f32; 4] = core::array::from_fn(|i| mix(corners[2 * i], corners[2 * i + 1], z));
     let slope_z: [f32; 4] = core::array::from_fn(|i| corners[2 * i + 1] - corners[2 * i]);
-    let (low, high) = (mix(along_z[0], along_z[1], y), mix(along_z[2], along_z[3], y));
+    let (low, high) = (
+        mix(along_z[0], along_z[1], y),
+        mix(along_z[2], along_z[3], y),
+    );
     let dx = high - low;
     let dy = mix(along_z[1] - along_z[0], along_z[3] - along_z[2], x);
-    let dz = mix(mix(slope_z[0], slope_z[1], y), mix(slope_z[2], slope_z[3], y), x);
+    let dz = mix(
+        mix(slope_z[0], slope_z[1], y),
+        mix(slope_z[2], slope_z[3], y),
+        x,
+    );
     (mix(low, high, x), [dx, dy, dz])
 }

@@ -47,11 +47,16 @@ impl DistanceOptions {
     pub(crate) fn check(&self) -> Result<(), DistanceError> {
         let positive = |x: f64| x.is_finite() && x > 0.0;
         if !positive(self.cell_m) || self.cell_m < 1e-3 {
-            return Err(DistanceError::Cell { cell_m: self.cell_m });
+            return Err(DistanceError::Cell {
+                cell_m: self.cell_m,
+            });
         }
         let cells = self.band_m / self.cell_m;
         if !positive(self.band_m) || !(1.0..=Self::MAX_BAND_CELLS).contains(&cells.round()) {
-            return Err(DistanceError::Band { band_m: self.band_m, cell_m: self.cell_m });
+            return Err(DistanceError::Band {
+                band_m: self.band_m,
+                cell_m: self.cell_m,
+            });
         }
         Ok(())
     }

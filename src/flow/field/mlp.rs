@@ -16,8 +16,7 @@ pub const MIDDLE_LAYERS: usize = 7;
 /// Hidden layers: the first (3 -> 128) and the middle ones.
 pub const HIDDEN_LAYERS: usize = MIDDLE_LAYERS + 1;
 /// Parameters of the network: 116,483.
-pub const PARAMETERS: usize =
-    4 * WIDTH + MIDDLE_LAYERS * (WIDTH * WIDTH + WIDTH) + 3 * WIDTH + 3;
+pub const PARAMETERS: usize = 4 * WIDTH + MIDDLE_LAYERS * (WIDTH * WIDTH + WIDTH) + 3 * WIDTH + 3;
 
 /// Output features that lie together in memory, so that a kernel reads one stream.
 pub(crate) const PANEL: usize = 32;
@@ -67,18 +66,27 @@ pub(crate) struct LayerAt {
 
 /// The first layer, 3 -> 128.
 pub(crate) const fn first_layer() -> LayerAt {
-    LayerAt { weights: FIRST, bias: FIRST + 3 * WIDTH }
+    LayerAt {
+        weights: FIRST,
+        bias: FIRST + 3 * WIDTH,
+    }
 }
 
 /// Middle layer `index` of 0..7, 128 -> 128.
 pub(crate) const fn middle_layer(index: usize) -> LayerAt {
     let weights = MIDDLE + index * MIDDLE_STRIDE;
-    LayerAt { weights, bias: weights + WIDTH * WIDTH }
+    LayerAt {
+        weights,
+        bias: weights + WIDTH * WIDTH,
+    }
 }
 
 /// The last layer, 128 -> 3.
 pub(crate) const fn last_layer() -> LayerAt {
-    LayerAt { weights: LAST, bias: LAST + 3 * WIDTH }
+    LayerAt {
+        weights: LAST,
+        bias: LAST + 3 * WIDTH,
+    }
 }
 
 /// The place of weight (`input`, `output`) within a middle layer's panels.
@@ -137,13 +145,19 @@ pub(crate) struct Conditioning {
 impl Conditioning {
     pub(crate) fn new(points: &[Point], inputs: Inputs) -> Self {
         match inputs {
-            Inputs::Raw => Self { center: [0.0; 3], scale: 1.0 },
+            Inputs::Raw => Self {
+                center: [0.0; 3],
+                scale: 1.0,
+            },
             Inputs::Centered { scale_m } => {
                 let mean = |axis: usize| {
                     let sum: f64 = points.iter().map(|point| f64::from(point[axis])).sum();
                     (sum / points.len().max(1) as f64) as f32
                 };
-                Self { center: [mean(0), mean(1), mean(2)], scale: 1.0 / scale_m }
+                Self {
+                    center: [mean(0), mean(1), mean(2)],
+                    scale: 1.0 / scale_m,
+                }
             }
         }
     }
@@ -160,7 +174,10 @@ pub(crate) fn transpose_middle_layers(from: &Parameters, to: &mut Parameters) {
     for layer in 0..MIDDLE_LAYERS {
         let at = middle_layer(layer);
         let weights = at.weights..at.bias;
-        transpose(&from.as_slice()[weights.clone()], &mut to.as_mut_slice()[weights]);
+        transpose(
+            &from.as_slice()[weights.clone()],
+            &mut to.as_mut_slice()[weights],
+        );
     }
 }
 
@@ -197,7 +214,10 @@ mod tests {
         let bound = (6.0f32 / 256.0).sqrt();
         let weights = &floats[at.weights..at.bias];
         let largest = weights.iter().fold(0.0f32, |a, w| a.max(w.abs()));
-        assert!(largest <= bound && largest > 0.99 * bound, "{largest} of {bound}");
+        assert!(
+            largest <= bound && largest > 0.99 * bound,
+            "{largest} of {bound}"
+        );
         assert!(floats[at.bias..at.bias + WIDTH].iter().all(|&b| b == 0.0));
     }
 
