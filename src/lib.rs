@@ -12,6 +12,8 @@
 pub mod flow;
 
 #[cfg(feature = "service")]
+pub mod cli;
+#[cfg(feature = "service")]
 pub mod formats;
 #[cfg(feature = "service")]
 pub mod picture;

@@ -1,3 +1,9 @@
 //! The `fnsf` program: parse, dispatch, exit code.
 
-fn main() {}
+use std::process::ExitCode;
+
+use clap::Parser;
+
+fn main() -> ExitCode {
+    fnsf::cli::run(fnsf::cli::Arguments::parse())
+}

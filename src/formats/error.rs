@@ -80,6 +80,9 @@ pub enum FormatError {
         /// What the file has instead.
         present: String,
     },
+    /// A matrix is no rigid motion.
+    #[error("{0}")]
+    Motion(&'static str),
     /// A value is NaN or infinite.
     #[error("{kind} file, row {row}, column {column}: {value} is not a finite number")]
     NotFinite {

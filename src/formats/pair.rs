@@ -4,23 +4,18 @@
 
 use std::io::{Cursor, Write};
 
-use nalgebra::{Matrix3, Matrix4};
-
 use crate::flow::{Point, RigidTransform};
 
 use super::cloud::read_columns;
 use super::error::{FileKind, FormatError};
 use super::feather::{FLOW_COLUMNS, Table};
 use super::limits::{check_flag, check_points};
+use super::motion::{matrix_rows, rigid};
 use super::npy;
 use super::npz::{Npz, NpzWriter};
 use super::sniff::is_zip;
 
 const KIND: FileKind = FileKind::Npz;
-
-/// How far a stored rotation may be from orthonormal: float32 matrices are within 1e-6 of it,
-/// and a scale or a shear that would move a point 100 m away by a decimetre is not.
-const RIGID_TOLERANCE: f64 = 1e-3;
 
 /// Two sweeps and what is known about the motion between them.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -152,31 +147,6 @@ pub(super) fn check_count(what: &str, found: usize, expected: usize) -> Result<(
             expected,
         })
     }
-}
-
-/// The rigid transform that a 4 x 4 matrix is, refused if it scales, shears or mirrors.
-fn rigid(rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError> {
-    let matrix = Matrix4::from_fn(|row, column| rows[row][column]);
-    let rotation: Matrix3<f64> = matrix.fixed_view::<3, 3>(0, 0).into_owned();
-    let departure = (rotation.transpose() * rotation - Matrix3::identity())
-        .abs()
-        .max();
-    let last_row_is_plain = rows[3] == [0.0, 0.0, 0.0, 1.0];
-    let finite = matrix.iter().all(|value| value.is_finite());
-    if !finite || !last_row_is_plain || departure > RIGID_TOLERANCE || rotation.determinant() < 0.0
-    {
-        return Err(KIND.unsupported("ego_SE3 is not a rigid transform"));
-    }
-    let rotation = nalgebra::Rotation3::from_matrix_unchecked(rotation);
-    let rotation = nalgebra::UnitQuaternion::from_rotation_matrix(&rotation);
-    let translation = nalgebra::Translation3::new(rows[0][3], rows[1][3], rows[2][3]);
-    Ok(RigidTransform::from_parts(translation, rotation))
-}
-
-/// The 4 x 4 matrix of a rigid transform, row by row.
-pub(super) fn matrix_rows(transform: &RigidTransform) -> [[f64; 4]; 4] {
-    let matrix = transform.to_homogeneous();
-    std::array::from_fn(|row| std::array::from_fn(|column| matrix[(row, column)]))
 }
 
 /// Writes a pair with the array names that [`read_pair`] reads; `foreground` becomes `box_id`

@@ -1,10 +1,14 @@
 //! The CPU backend: vector kernels on all cores. Knows nothing of the GPU backend.
 
+mod isa;
 mod kernels;
 mod lanes;
+mod passes;
 mod trainer;
+mod workload;
 
-pub use kernels::Isa;
+pub use isa::Isa;
+pub use workload::{NetworkWorkload, multiply_add_peak};
 
 use std::sync::Arc;
 

@@ -1,0 +1,52 @@
+//! `fnsf doctor`: what this machine offers, what is missing, and how to mend it.
+
+use std::time::Instant;
+
+use clap::Args;
+
+use super::failure::Failure;
+use super::machine::available_bytes;
+use crate::flow::cpu::{Isa, NetworkWorkload};
+
+/// Points of the measured cloud: tens of milliseconds at most.
+const POINTS: usize = 2048;
+/// Show devices and what they can do.
+#[derive(Debug, Args)]
+pub(super) struct Doctor {}
+
+impl Doctor {
+    pub(super) fn run(&self) -> Result<(), Failure> {
+        let threads = std::thread::available_parallelism().map_or(1, usize::from);
+        println!("fnsf {}", env!("CARGO_PKG_VERSION"));
+        println!("cpu: {threads} threads");
+        for (place, isa) in Isa::available().into_iter().enumerate() {
+            let used = if place == 0 { ", used" } else { "" };
+            println!(
+                "  {}: network at {:.0} GFLOP/s a thread{used}",
+                isa.name(),
+                network_speed(isa) / 1e9
+            );
+        }
+        if !Isa::available().contains(&Isa::Avx2) {
+            println!("  no AVX2: the portable kernels are several times slower");
+            println!("  in a virtual machine, pass the host's CPU features through");
+        }
+        match available_bytes() {
+            Some(bytes) => println!("memory: {:.1} GB available", bytes as f64 / 1e9),
+            None => println!("memory: this system does not say"),
+        }
+        println!("gpu: none, this version computes on the CPU only");
+        Ok(())
+    }
+}
+
+/// Floating-point operations a second, forward and backward, the best of a few short runs.
+fn network_speed(isa: Isa) -> f64 {
+    let mut work = NetworkWorkload::new(isa, POINTS);
+    let speed = |_| {
+        let began = Instant::now();
+        let operations = work.forward_and_backward();
+        operations / began.elapsed().as_secs_f64()
+    };
+    (0..5).map(speed).fold(0.0, f64::max)
+}

@@ -1,0 +1,40 @@
+//! What this machine is and what the process takes of it.
+
+use crate::flow::backend::{Backend, BackendError};
+use crate::flow::cpu::CpuBackend;
+
+/// Where the work is done.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub(super) enum Device {
+    /// The fastest that is there: the CPU, in this version.
+    Auto,
+    /// The CPU's vector units, on all cores.
+    Cpu,
+}
+
+impl Device {
+    /// Opens the device; `threads` bounds the CPU's.
+    pub(super) fn open(self, threads: Option<usize>) -> Result<Box<dyn Backend>, BackendError> {
+        match self {
+            Self::Auto | Self::Cpu => Ok(Box::new(CpuBackend::new(threads)?)),
+        }
+    }
+}
+
+/// The most memory that the process has held so far, bytes; none where the system does not say.
+pub(super) fn peak_resident_bytes() -> Option<u64> {
+    kibibytes("/proc/self/status", "VmHWM:")
+}
+
+/// Memory that could be taken now, bytes; none where the system does not say.
+pub(super) fn available_bytes() -> Option<u64> {
+    kibibytes("/proc/meminfo", "MemAvailable:")
+}
+
+/// The number of kB after `key` in one of the kernel's tables, as bytes.
+fn kibibytes(table: &str, key: &str) -> Option<u64> {
+    let table = std::fs::read_to_string(table).ok()?;
+    let line = table.lines().find_map(|line| line.strip_prefix(key))?;
+    let number = line.trim().strip_suffix("kB")?.trim();
+    number.parse::<u64>().ok().map(|kibibytes| kibibytes * 1024)
+}

@@ -1,0 +1,63 @@
+//! The command line: one file per subcommand. The only room that prints.
+//!
+//! Answers go to stdout, progress and errors to stderr. It knows the other rooms; none knows it.
+#![expect(
+    clippy::print_stdout,
+    clippy::print_stderr,
+    reason = "printing is what a command line is for"
+)]
+
+mod failure;
+mod files;
+mod machine;
+mod terminal;
+
+mod demo;
+mod doctor;
+mod eval;
+mod flow;
+mod synth;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+/// Scene flow: two lidar clouds in, the motion of every point out.
+#[derive(Debug, Parser)]
+#[command(name = "fnsf", version, propagate_version = true, max_term_width = 100)]
+#[command(after_help = "Start here:\n  \
+    fnsf demo                                  a simulated street, its flow, its error, a picture\n  \
+    fnsf flow a.pcd b.pcd -o flow.npz          two sweeps, any format\n  \
+    fnsf flow a.pcd b.pcd --picture flow.png   the same, to look at")]
+pub struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Demo(demo::Demo),
+    Flow(flow::Flow),
+    Eval(eval::Eval),
+    Synth(synth::Synth),
+    Doctor(doctor::Doctor),
+}
+
+/// Runs the command and turns its end into an exit code: 0 done, 2 usage, 65 bad input,
+/// 70 internal.
+pub fn run(arguments: Arguments) -> ExitCode {
+    let done = match arguments.command {
+        Command::Demo(command) => command.run(),
+        Command::Flow(command) => command.run(),
+        Command::Eval(command) => command.run(),
+        Command::Synth(command) => command.run(),
+        Command::Doctor(command) => command.run(),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            eprintln!("fnsf: {failure}");
+            failure.exit_code()
+        }
+    }
+}

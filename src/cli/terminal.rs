@@ -1,0 +1,72 @@
+//! A clock and a progress bar for the numerics, and numbers as people read them.
+
+use std::time::Instant;
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+
+use crate::flow::{Progress, Watch};
+
+/// Keeps time; shows iterations and loss where stderr is a terminal.
+pub(super) struct Terminal {
+    began: Instant,
+    bar: ProgressBar,
+}
+
+impl Terminal {
+    pub(super) fn new() -> Self {
+        let style = ProgressStyle::with_template(
+            "{spinner} {msg}  {wide_bar:.cyan/blue} {pos} of at most {len}  {elapsed}",
+        )
+        .unwrap_or_else(|_| ProgressStyle::default_bar());
+        // Hidden by itself where stderr is not a terminal.
+        let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
+        bar.set_style(style);
+        bar.set_message("preparing");
+        bar.tick();
+        Self {
+            began: Instant::now(),
+            bar,
+        }
+    }
+
+    /// Takes the bar away.
+    pub(super) fn finish(&self) {
+        self.bar.finish_and_clear();
+    }
+}
+
+impl Watch for Terminal {
+    fn seconds(&self) -> f64 {
+        self.began.elapsed().as_secs_f64()
+    }
+
+    fn progress(&self, progress: Progress) {
+        self.bar.set_length(progress.max_iterations as u64);
+        self.bar.set_position(progress.iteration as u64);
+        self.bar.set_message(format!("loss {:.4} m", progress.loss));
+    }
+}
+
+/// `1234567` as `1,234,567`.
+pub(super) fn grouped(number: usize) -> String {
+    let digits = number.to_string();
+    let mut out = String::new();
+    for (place, digit) in digits.chars().enumerate() {
+        if place > 0 && (digits.len() - place).is_multiple_of(3) {
+            out.push(',');
+        }
+        out.push(digit);
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::grouped;
+
+    #[test]
+    fn digits_are_grouped_by_three() {
+        let numbers = [0, 12, 999, 1000, 81_856, 1_234_567].map(grouped);
+        assert_eq!(numbers, ["0", "12", "999", "1,000", "81,856", "1,234,567"]);
+    }
+}

@@ -1,0 +1,91 @@
+//! Rigid motions as 4 x 4 matrices: in pairs, in flow files, and as text of 16 numbers.
+//!
+//! It must not know which motion it is.
+
+use nalgebra::{Matrix3, Matrix4, Rotation3, Translation3, UnitQuaternion};
+
+use crate::flow::RigidTransform;
+
+use super::error::FormatError;
+
+/// How far a stored rotation may be from orthonormal: float32 matrices are within 1e-6 of it,
+/// and a scale or a shear that would move a point 100 m away by a decimetre is not.
+const RIGID_TOLERANCE: f64 = 1e-3;
+
+/// Longest text that is taken for 16 numbers, bytes.
+const MAX_TEXT: usize = 4096;
+
+/// Reads a motion written as 16 numbers, row by row, between white space or commas.
+///
+/// # Errors
+/// [`FormatError::Motion`] where there are not 16 finite numbers or they are no rigid motion.
+pub fn read_motion(bytes: &[u8]) -> Result<RigidTransform, FormatError> {
+    let text = core::str::from_utf8(bytes).ok();
+    let Some(text) = text.filter(|text| text.len() <= MAX_TEXT) else {
+        return Err(FormatError::Motion("16 numbers as text are needed"));
+    };
+    let words = text.split(|c: char| c.is_whitespace() || c == ',');
+    let numbers: Result<Vec<f64>, _> = words.filter(|w| !w.is_empty()).map(str::parse).collect();
+    let Some(numbers) = numbers.ok().filter(|numbers| numbers.len() == 16) else {
+        return Err(FormatError::Motion("16 numbers as text are needed"));
+    };
+    rigid(&core::array::from_fn(|row| {
+        core::array::from_fn(|column| numbers[4 * row + column])
+    }))
+}
+
+/// The rigid transform that a 4 x 4 matrix is, refused if it scales, shears or mirrors.
+pub(super) fn rigid(rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError> {
+    let matrix = Matrix4::from_fn(|row, column| rows[row][column]);
+    let rotation: Matrix3<f64> = matrix.fixed_view::<3, 3>(0, 0).into_owned();
+    let departure = (rotation.transpose() * rotation - Matrix3::identity())
+        .abs()
+        .max();
+    let last_row_is_plain = rows[3] == [0.0, 0.0, 0.0, 1.0];
+    let finite = matrix.iter().all(|value| value.is_finite());
+    if !finite || !last_row_is_plain || departure > RIGID_TOLERANCE || rotation.determinant() < 0.0
+    {
+        return Err(FormatError::Motion("the matrix is not a rigid transform"));
+    }
+    let rotation =
+        UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
+    let translation = Translation3::new(rows[0][3], rows[1][3], rows[2][3]);
+    Ok(RigidTransform::from_parts(translation, rotation))
+}
+
+/// The 4 x 4 matrix of a rigid transform, row by row.
+pub fn matrix_rows(transform: &RigidTransform) -> [[f64; 4]; 4] {
+    let matrix = transform.to_homogeneous();
+    core::array::from_fn(|row| core::array::from_fn(|column| matrix[(row, column)]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_motion_comes_back_from_its_text() {
+        let motion = RigidTransform::new([1.0, -2.0, 0.5].into(), [0.1, 0.0, -0.3].into());
+        let text = matrix_rows(&motion)
+            .map(|row| row.map(|x| x.to_string()).join(" "))
+            .join("\n");
+        let read = read_motion(text.as_bytes()).expect("a rigid motion");
+        assert!(
+            (read.to_homogeneous() - motion.to_homogeneous())
+                .abs()
+                .max()
+                < 1e-12
+        );
+    }
+
+    #[test]
+    fn what_is_no_rigid_motion_is_refused() {
+        let scaled = "2 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1";
+        let mirrored = "-1 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1";
+        let short = "1 0 0 0";
+        let wild = "nan 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1";
+        for text in [scaled, mirrored, short, wild, "", "\u{fffd}"] {
+            assert!(read_motion(text.as_bytes()).is_err(), "{text}");
+        }
+    }
+}
