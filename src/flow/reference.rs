@@ -91,6 +91,26 @@ impl ReferenceNetwork {
         }
     }
 
+    /// Adam's step (Kingma and Ba 2015) number `iteration`, from 1.
+    pub(crate) fn adam_step(
+        &mut self,
+        gradients: &Self,
+        moments: &mut [Vec<f64>; 2],
+        iteration: i32,
+        learning_rate: f64,
+    ) {
+        let [means, squares] = moments;
+        let weights = self.weights.iter_mut().flatten().flatten();
+        let values = weights.chain(self.biases.iter_mut().flatten());
+        for (i, (value, g)) in values.zip(gradients.flat()).enumerate() {
+            means[i] = 0.9 * means[i] + 0.1 * g;
+            squares[i] = 0.999 * squares[i] + 0.001 * g * g;
+            let mean = means[i] / (1.0 - 0.9f64.powi(iteration));
+            let square = squares[i] / (1.0 - 0.999f64.powi(iteration));
+            *value -= learning_rate * mean / (square.sqrt() + 1e-8);
+        }
+    }
+
     /// All weights and biases in one row.
     pub(crate) fn flat(&self) -> Vec<f64> {
         let weights = self.weights.iter().flatten().flatten();

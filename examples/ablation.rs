@@ -1,0 +1,245 @@
+//! The table of `docs/numerics.md`: what each choice of the `default` preset changes, by
+//! experiment on pairs with ground truth.
+//!
+//! ```text
+//! cargo run --release --example ablation -- [--seeds N] [--max-points N] [--only TEXT] PAIR.npz...
+//! ```
+//!
+//! For each variant and pair, over the seeds: median EPE, the worst seed's EPE over the median,
+//! median Acc5, median EPE of moving points, median iterations and seconds.
+#![expect(
+    clippy::print_stdout,
+    reason = "the table is the answer of this program"
+)]
+
+use std::time::Instant;
+
+use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::distance::{Metric, Sites};
+use fnsf::flow::evaluate::{Truth, evaluate};
+use fnsf::flow::{
+    self, Decay, EarlyStopOptions, Ego, Ground, Inputs, Keep, Options, Preset, Problem, Start,
+    Watch,
+};
+use fnsf::formats::{Pair, read_pair};
+
+/// A clock for the numerics.
+struct Clock(Instant);
+
+impl Watch for Clock {
+    fn seconds(&self) -> f64 {
+        self.0.elapsed().as_secs_f64()
+    }
+}
+
+/// A named change to a preset.
+struct Variant {
+    name: &'static str,
+    preset: Preset,
+    change: fn(&mut Options),
+}
+
+const fn paper(name: &'static str, change: fn(&mut Options)) -> Variant {
+    Variant {
+        name,
+        preset: Preset::Paper,
+        change,
+    }
+}
+
+const fn ours(name: &'static str, change: fn(&mut Options)) -> Variant {
+    Variant {
+        name,
+        preset: Preset::Default,
+        change,
+    }
+}
+
+/// Stops only after a hundred iterations without a fall of 0.05 mm.
+const PATIENT: EarlyStopOptions = EarlyStopOptions {
+    patience: 100,
+    min_delta_m: 5e-5,
+};
+
+const VARIANTS: &[Variant] = &[
+    paper("paper", |_| {}),
+    paper("paper, chamfer transform", |o| {
+        o.distance.metric = Metric::Chamfer;
+    }),
+    paper("paper, exact points", |o| {
+        o.distance.sites = Sites::Points;
+    }),
+    paper("paper, patience 100, 0.05 mm, 400 iterations", |o| {
+        o.early_stop = Some(PATIENT);
+        o.max_iterations = 400;
+    }),
+    paper("paper, centered inputs / 20 m", |o| {
+        o.inputs = Inputs::Centered { scale_m: 20.0 };
+    }),
+    paper("paper, zero start", |o| o.start = Start::ZeroFlow),
+    paper("paper, truncation 2 m", |o| {
+        o.loss.truncation_m = Some(2.0);
+    }),
+    paper("paper, ego motion first", |o| o.ego = Ego::Auto),
+    paper("paper, ego motion first, centered, zero start", |o| {
+        o.ego = Ego::Auto;
+        o.inputs = Inputs::Centered { scale_m: 20.0 };
+        o.start = Start::ZeroFlow;
+    }),
+    paper(
+        "paper, batches of 2,048, cosine, average, 150 iterations",
+        |o| {
+            o.batch = Some(2048);
+            o.decay = Decay::Cosine;
+            o.keep = Keep::Average { decay: 0.9 };
+            o.early_stop = None;
+            o.max_iterations = 150;
+        },
+    ),
+    ours("default", |_| {}),
+    ours("default, ego motion alone", |o| o.max_iterations = 0),
+    ours("default, no ego motion", |o| o.ego = Ego::Off),
+    ours("default, no margin", |o| o.loss.margin_m = 0.0),
+    ours("default, no flow penalty", |o| o.loss.flow_penalty = 0.0),
+    ours("default, no margin, no penalty", |o| {
+        o.loss.margin_m = 0.0;
+        o.loss.flow_penalty = 0.0;
+    }),
+    ours("default, margin 0.05 m", |o| o.loss.margin_m = 0.05),
+    ours("default, margin 0.15 m", |o| o.loss.margin_m = 0.15),
+    ours("default, margin 0.2 m", |o| o.loss.margin_m = 0.2),
+    ours("default, penalty 0.01", |o| o.loss.flow_penalty = 0.01),
+    ours("default, penalty 0.05", |o| o.loss.flow_penalty = 0.05),
+    ours("default, truncation 1 m", |o| {
+        o.loss.truncation_m = Some(1.0);
+    }),
+    ours("default, raw inputs", |o| o.inputs = Inputs::Raw),
+    ours("default, centered / 5 m", |o| {
+        o.inputs = Inputs::Centered { scale_m: 5.0 };
+    }),
+    ours("default, centered / 50 m", |o| {
+        o.inputs = Inputs::Centered { scale_m: 50.0 };
+    }),
+    ours("default, Xavier start", |o| o.start = Start::Xavier),
+    ours("default, exact points", |o| {
+        o.distance.sites = Sites::Points;
+    }),
+    ours("default, step size 0.004", |o| o.learning_rate = 0.004),
+    ours("default, constant step size", |o| o.decay = Decay::Constant),
+    ours("default, best batch instead of average", |o| {
+        o.keep = Keep::Best;
+    }),
+    ours("default, batches of 1,024", |o| o.batch = Some(1024)),
+    ours("default, batches of 4,096", |o| o.batch = Some(4096)),
+    ours("default, all points each iteration", |o| o.batch = None),
+    ours("default, 75 iterations", |o| o.max_iterations = 75),
+    ours("default, 300 iterations", |o| o.max_iterations = 300),
+    ours("default, 600 iterations", |o| o.max_iterations = 600),
+    ours("default, 1,024 a batch, 300 iterations", |o| {
+        o.batch = Some(1024);
+        o.max_iterations = 300;
+    }),
+];
+
+/// One seed's result.
+struct Run {
+    epe: f64,
+    acc5: f64,
+    moving: f64,
+    iterations: f64,
+    seconds: f64,
+}
+
+fn run(backend: &CpuBackend, pair: &Pair, options: &Options) -> Result<Run, String> {
+    let ground = pair.ground.as_ref();
+    let problem = Problem {
+        source: &pair.source,
+        target: &pair.target,
+        ground: ground.map(|g| [g.source.as_slice(), g.target.as_slice()]),
+    };
+    let clock = Clock(Instant::now());
+    let estimate = flow::estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())?;
+    let known = pair.truth.as_ref().ok_or("the pair has no truth")?;
+    let truth = Truth {
+        dynamic: known.dynamic.as_deref(),
+        ground: ground.map(|g| g.source.as_slice()),
+        ..Truth::new(&known.flow, &known.valid)
+    };
+    let metrics = evaluate(&estimate.flow, &estimate.valid, &truth).map_err(|e| e.to_string())?;
+    Ok(Run {
+        epe: metrics.epe,
+        acc5: metrics.acc5,
+        moving: metrics.epe_dynamic.unwrap_or(f64::NAN),
+        iterations: estimate.iterations as f64,
+        seconds: estimate.seconds.total,
+    })
+}
+
+/// The middle of the values, and the largest.
+fn median_and_worst(runs: &[Run], value: fn(&Run) -> f64) -> [f64; 2] {
+    let mut values: Vec<f64> = runs.iter().map(value).collect();
+    values.sort_by(f64::total_cmp);
+    [values[values.len() / 2], values[values.len() - 1]]
+}
+
+fn main() -> Result<(), String> {
+    let mut seeds = 5;
+    let mut max_points = None;
+    let mut only = String::new();
+    let mut pairs = Vec::new();
+    let mut arguments = std::env::args().skip(1);
+    while let Some(argument) = arguments.next() {
+        let mut value = || arguments.next().ok_or(format!("{argument} needs a value"));
+        let number = |text: String| text.parse::<usize>().map_err(|e| e.to_string());
+        match argument.as_str() {
+            "--seeds" => seeds = number(value()?)?.max(1),
+            "--max-points" => max_points = Some(number(value()?)?),
+            "--only" => only = value()?,
+            path => {
+                let bytes = std::fs::read(path).map_err(|e| format!("{path}: {e}"))?;
+                let pair = read_pair(&bytes).map_err(|e| format!("{path}: {e}"))?;
+                pairs.push((path.to_owned(), pair));
+            }
+        }
+    }
+    let backend = CpuBackend::new(None).map_err(|e| e.to_string())?;
+    println!("| variant | pair | EPE | worst / median | Acc5 | EPE moving | iterations | s |");
+    println!("|---|---|---|---|---|---|---|---|");
+    for variant in VARIANTS.iter().filter(|v| v.name.contains(&only)) {
+        for (path, pair) in &pairs {
+            let mut options = variant.preset.options(max_points);
+            options.ground = if pair.ground.is_some() {
+                Ground::Mask
+            } else {
+                Ground::Keep
+            };
+            (variant.change)(&mut options);
+            let runs: Result<Vec<Run>, String> = (0..seeds)
+                .map(|seed| {
+                    options.seed = seed as u64;
+                    run(&backend, pair, &options)
+                })
+                .collect();
+            let name = std::path::Path::new(path)
+                .parent()
+                .and_then(|p| p.file_name());
+            let name = name.map_or(path.clone(), |name| name.to_string_lossy().into_owned());
+            match runs {
+                Ok(runs) => {
+                    let [epe, worst] = median_and_worst(&runs, |r| r.epe);
+                    let [acc5, _] = median_and_worst(&runs, |r| r.acc5);
+                    let [moving, _] = median_and_worst(&runs, |r| r.moving);
+                    let [iterations, _] = median_and_worst(&runs, |r| r.iterations);
+                    let [seconds, _] = median_and_worst(&runs, |r| r.seconds);
+                    println!(
+                        "| {} | {name} | {epe:.4} | {:.2} | {acc5:.3} | {moving:.3} | {iterations:.0} | {seconds:.2} |",
+                        variant.name,
+                        worst / epe
+                    );
+                }
+                Err(error) => println!("| {} | {name} | {error} | | | | | |", variant.name),
+            }
+        }
+    }
+    Ok(())
+}

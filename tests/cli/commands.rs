@@ -1,0 +1,190 @@
+//! Every command does its job, and its answers hold what the contract says.
+
+use std::path::Path;
+
+use super::program::{fnsf, json};
+
+/// A small simulated street in `folder/street`.
+fn street(folder: &Path) {
+    let ended = fnsf(
+        folder,
+        &["synth", "-o", "street", "--beams", "16", "--frames", "2"],
+    );
+    assert_eq!(ended.code, 0, "{}", ended.stderr);
+}
+
+#[test]
+fn synth_flow_and_eval_work_hand_in_hand_in_every_output_format() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder);
+    let mut first = None;
+    for format in ["npz", "npy", "feather", "ply", "pcd", "json"] {
+        let out = format!("flow.{format}");
+        let done = fnsf(folder, &["flow", "street/pair_0000.npz", "-o", &out]);
+        assert_eq!(done.code, 0, "{}", done.stderr);
+        assert!(
+            done.stderr.is_empty(),
+            "no bar without a terminal: {}",
+            done.stderr
+        );
+        let score = json(
+            folder,
+            &["eval", &out, "--truth", "street/pair_0000.npz", "--json"],
+        );
+        let epe = score["epe"].as_f64().expect("a number");
+        assert!(epe < 0.5, "{format}: {epe}");
+        let expected = *first.get_or_insert(epe);
+        assert!((epe - expected).abs() < 1e-6, "{format}: {epe} {expected}");
+    }
+}
+
+#[test]
+fn the_json_report_has_every_field_of_the_contract() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder);
+    let arguments = [
+        "flow",
+        "street/frame_0000.pcd",
+        "street/frame_0001.pcd",
+        "--json",
+        "--seed",
+        "4",
+        "--max-points",
+        "4000",
+        "--threads",
+        "1",
+    ];
+    let report = json(folder, &arguments);
+    let fields = [
+        "points",
+        "iterations",
+        "best_iteration",
+        "best_loss",
+        "stop_reason",
+        "device",
+        "preset",
+        "seed",
+        "ego_motion",
+        "seconds",
+        "peak_rss_bytes",
+    ];
+    for field in fields {
+        assert!(!report[field].is_null(), "{field} in {report}");
+    }
+    for phase in ["load", "precompute", "query", "network", "total"] {
+        assert!(
+            report["seconds"][phase].as_f64().is_some_and(|s| s >= 0.0),
+            "{phase}"
+        );
+    }
+    assert_eq!(report["points"], 4000);
+    assert_eq!(report["seed"], 4);
+    assert_eq!(report["preset"], "default");
+    let paper = json(folder, &[&arguments[..], &["--preset", "paper"]].concat());
+    assert!(paper["ego_motion"].is_null());
+    assert_eq!(paper["stop_reason"], "converged");
+}
+
+#[test]
+fn the_number_of_threads_does_not_change_the_file() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder);
+    let flow = |threads: &str, out: &str| {
+        let arguments = [
+            "flow",
+            "street/pair_0000.npz",
+            "--threads",
+            threads,
+            "-o",
+            out,
+        ];
+        assert_eq!(fnsf(folder, &arguments).code, 0);
+        std::fs::read(folder.join(out)).expect("the flow was written")
+    };
+    assert_eq!(flow("1", "one.npy"), flow("3", "three.npy"));
+}
+
+#[test]
+fn a_known_ego_motion_can_be_given_as_text_or_as_a_pair() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder);
+    std::fs::write(
+        folder.join("still.txt"),
+        "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n",
+    )
+    .expect("written");
+    let pair = "street/pair_0000.npz";
+    let report = json(folder, &["flow", pair, "--json", "--ego", "still.txt"]);
+    assert_eq!(
+        report["ego_motion"][0],
+        serde_json::json!([1.0, 0.0, 0.0, 0.0])
+    );
+    let report = json(folder, &["flow", pair, "--json", "--ego", pair]);
+    assert!(
+        report["ego_motion"][0][3]
+            .as_f64()
+            .is_some_and(|x| x < -0.1),
+        "{report}"
+    );
+    let report = json(folder, &["flow", pair, "--json", "--ego", "off"]);
+    assert!(report["ego_motion"].is_null());
+}
+
+#[test]
+fn the_demo_writes_a_flow_and_a_picture_and_prints_the_error() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let done = fnsf(folder.path(), &["demo"]);
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    assert!(done.stdout.contains("EPE"), "{}", done.stdout);
+    for name in ["demo/flow.npz", "demo/flow.png"] {
+        let size = std::fs::metadata(folder.path().join(name))
+            .expect("written")
+            .len();
+        assert!(size > 10_000, "{name}: {size} bytes");
+    }
+}
+
+#[test]
+fn doctor_names_the_devices_and_help_teaches() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let doctor = fnsf(folder.path(), &["doctor"]);
+    assert_eq!(doctor.code, 0);
+    assert!(doctor.stdout.contains("portable"), "{}", doctor.stdout);
+    for arguments in [
+        &["--help"][..],
+        &["flow", "--help"],
+        &["eval", "--help"],
+        &["synth", "--help"],
+    ] {
+        let help = fnsf(folder.path(), arguments);
+        assert_eq!(help.code, 0);
+        assert!(
+            help.stdout.contains("fnsf "),
+            "{arguments:?}: {}",
+            help.stdout
+        );
+    }
+}
+
+#[test]
+fn wrong_arguments_are_refused_with_exit_code_2_before_any_work() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let refused: [&[&str]; 7] = [
+        &["flow"],
+        &["flow", "a.npz"],
+        &["flow", "a.npz", "-o", "flow.xyz"],
+        &["flow", "a.npz", "-o", "flow.npz", "--preset", "best"],
+        &["flow", "a.npz", "-o", "flow.npz", "--range-m", "-3"],
+        &["synth", "-o", "s", "--beams", "0"],
+        &["fly"],
+    ];
+    for arguments in refused {
+        let ended = fnsf(folder.path(), arguments);
+        assert_eq!(ended.code, 2, "{arguments:?}: {}", ended.stderr);
+        assert!(!ended.stderr.is_empty());
+    }
+}

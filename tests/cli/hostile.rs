@@ -1,0 +1,167 @@
+//! Hostile files: one clear line, exit code 65, and hardly any memory.
+
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use super::program::fnsf;
+
+/// The most memory that a refused file may take, bytes.
+const MEMORY: u64 = 100 << 20;
+
+/// An array in numpy's format, as its header and data.
+fn npy(descr: &str, shape: &str, data: &[u8]) -> Vec<u8> {
+    let header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}\n");
+    let mut file = b"\x93NUMPY\x01\x00".to_vec();
+    file.extend(u16::try_from(header.len()).expect("short").to_le_bytes());
+    file.extend(header.as_bytes());
+    file.extend(data);
+    file
+}
+
+fn points(points: &[[f32; 3]]) -> Vec<u8> {
+    let data: Vec<u8> = points
+        .iter()
+        .flatten()
+        .flat_map(|x| x.to_le_bytes())
+        .collect();
+    npy("<f4", &format!("({}, 3)", points.len()), &data)
+}
+
+fn corpus() -> Vec<(&'static str, Vec<u8>)> {
+    let square: Vec<[f32; 3]> = (0..64)
+        .map(|i| [(i % 8) as f32, (i / 8) as f32, 0.0])
+        .collect();
+    let mut with_nan = square.clone();
+    with_nan[5][1] = f32::NAN;
+    let mut with_infinity = square.clone();
+    with_infinity[7][2] = f32::INFINITY;
+    let mut truncated = points(&square);
+    truncated.truncate(truncated.len() - 10);
+    let ply = |count: &str, body: &str| {
+        let header = "property float x\nproperty float y\nproperty float z\nend_header\n";
+        format!("ply\nformat ascii 1.0\nelement vertex {count}\n{header}{body}").into_bytes()
+    };
+    let pcd = |points: &str, data: &str| {
+        let fields = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1";
+        format!(
+            "# .PCD v0.7\nVERSION 0.7\n{fields}\nWIDTH {points}\nHEIGHT 1\nPOINTS {points}\nDATA {data}\n"
+        )
+        .into_bytes()
+    };
+    vec![
+        ("empty", Vec::new()),
+        ("garbage", vec![0xA5; 1000]),
+        ("text", b"hello, this is no point cloud\n".to_vec()),
+        ("truncated.npy", truncated),
+        ("huge count.npy", npy("<f4", "(4000000000, 3)", &[0; 24])),
+        (
+            "overflowing count.npy",
+            npy("<f4", "(9223372036854775807, 3)", &[0; 24]),
+        ),
+        ("objects.npy", npy("|O", "(4, 3)", &[0; 24])),
+        ("complex.npy", npy("<c8", "(1, 3)", &[0; 24])),
+        ("two columns.npy", npy("<f4", "(3, 2)", &[0; 24])),
+        ("nan.npy", points(&with_nan)),
+        ("infinity.npy", points(&with_infinity)),
+        ("no points.npy", points(&[])),
+        ("one point.npy", points(&[[1.0, 2.0, 3.0]])),
+        ("two far points.npy", points(&[[0.0; 3], [1e6, 0.0, 0.0]])),
+        (
+            "three far points.npy",
+            points(&[[0.0; 3], [1e6, 0.0, 0.0], [-1e6, 5.0, 5.0]]),
+        ),
+        ("huge count.ply", ply("4000000000", "0 0 0\n")),
+        ("negative count.ply", ply("-5", "0 0 0\n")),
+        ("short.ply", ply("3", "0 0 0\n1 1 1\n")),
+        ("nan.ply", ply("1", "nan 0 0\n")),
+        ("huge count.pcd", pcd("4000000000", "binary")),
+        (
+            "huge compressed.pcd",
+            pcd("4000000000", "binary_compressed"),
+        ),
+        ("short.pcd", pcd("3", "ascii")),
+        ("broken zip.npz", b"PK\x03\x04this is no archive".to_vec()),
+        (
+            "broken arrow.feather",
+            b"ARROW1\0\0garbage that is no table ARROW1".to_vec(),
+        ),
+    ]
+}
+
+/// The most memory that `fnsf flow FILE FILE` takes, bytes, by the system's own count.
+fn peak_memory(folder: &Path, file: &str) -> Option<u64> {
+    let mut child = Command::new(env!("CARGO_BIN_EXE_fnsf"))
+        .args(["flow", file, file, "-o", "out.npz"])
+        .current_dir(folder)
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("the program starts");
+    let status = format!("/proc/{}/status", child.id());
+    let mut peak = None;
+    while child.try_wait().expect("the child is ours").is_none() {
+        let text = std::fs::read_to_string(&status).unwrap_or_default();
+        let line = text.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+        let kilobytes = line.and_then(|l| l.trim().strip_suffix("kB")?.trim().parse::<u64>().ok());
+        peak = peak.max(kilobytes.map(|k| k * 1024));
+        std::thread::yield_now();
+    }
+    peak
+}
+
+#[test]
+fn every_hostile_file_gets_one_line_exit_code_65_and_little_memory() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    for (name, bytes) in corpus() {
+        std::fs::write(folder.join(name), bytes).expect("written");
+        let ended = fnsf(folder, &["flow", name, name, "-o", "out.npz"]);
+        assert_eq!(ended.code, 65, "{name}: {}", ended.stderr);
+        assert_eq!(ended.stderr.lines().count(), 1, "{name}: {}", ended.stderr);
+        assert!(
+            ended.stderr.starts_with("fnsf: "),
+            "{name}: {}",
+            ended.stderr
+        );
+        assert!(ended.stdout.is_empty(), "{name}: {}", ended.stdout);
+        assert!(!folder.join("out.npz").exists(), "{name} left a file");
+        if let Some(peak) = peak_memory(folder, name) {
+            assert!(peak < MEMORY, "{name}: {peak} bytes");
+        }
+    }
+}
+
+#[test]
+fn a_file_that_is_not_there_is_named() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let ended = fnsf(folder.path(), &["flow", "nowhere.npz", "-o", "out.npz"]);
+    assert_eq!(ended.code, 65);
+    assert!(ended.stderr.contains("nowhere.npz"), "{}", ended.stderr);
+}
+
+#[test]
+fn the_far_points_are_refused_for_their_extent() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let cloud = points(&[[0.0; 3], [5e5, 0.0, 0.0], [-4e5, 5.0, 5.0], [0.0, 0.0, 5.0]]);
+    std::fs::write(folder.path().join("far.npy"), cloud).expect("written");
+    let ended = fnsf(
+        folder.path(),
+        &["flow", "far.npy", "far.npy", "-o", "out.npz"],
+    );
+    assert_eq!(ended.code, 65);
+    assert!(ended.stderr.contains("900000"), "{}", ended.stderr);
+    assert!(ended.stderr.contains("range"), "{}", ended.stderr);
+}
+
+#[test]
+fn an_output_that_cannot_be_written_is_an_internal_failure_and_leaves_nothing() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    let done = fnsf(folder, &["synth", "-o", "street", "--beams", "8"]);
+    assert_eq!(done.code, 0);
+    let ended = fnsf(
+        folder,
+        &["flow", "street/pair_0000.npz", "-o", "missing/out.npz"],
+    );
+    assert_eq!(ended.code, 70, "{}", ended.stderr);
+    assert_eq!(ended.stderr.lines().count(), 1);
+}

@@ -1,0 +1,5 @@
+//! The program through its public door: real files, real processes, exit codes.
+
+mod commands;
+mod hostile;
+mod program;

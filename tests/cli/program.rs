@@ -1,0 +1,32 @@
+//! Runs the program and keeps what it said.
+
+use std::path::Path;
+use std::process::Command;
+
+/// How a run ended.
+pub(crate) struct Ended {
+    pub(crate) code: i32,
+    pub(crate) stdout: String,
+    pub(crate) stderr: String,
+}
+
+/// Runs `fnsf` in `folder`.
+pub(crate) fn fnsf(folder: &Path, arguments: &[&str]) -> Ended {
+    let output = Command::new(env!("CARGO_BIN_EXE_fnsf"))
+        .args(arguments)
+        .current_dir(folder)
+        .output()
+        .expect("the program starts");
+    Ended {
+        code: output.status.code().expect("no signal ended it"),
+        stdout: String::from_utf8(output.stdout).expect("text"),
+        stderr: String::from_utf8(output.stderr).expect("text"),
+    }
+}
+
+/// Runs `fnsf`, expects success, and reads its JSON answer.
+pub(crate) fn json(folder: &Path, arguments: &[&str]) -> serde_json::Value {
+    let ended = fnsf(folder, arguments);
+    assert_eq!(ended.code, 0, "{arguments:?}: {}", ended.stderr);
+    serde_json::from_str(&ended.stdout).expect("one JSON object")
+}

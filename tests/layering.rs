@@ -1,0 +1,192 @@
+//! The invariants of ARCHITECTURE.md that a compiler does not check: which room may see which,
+//! and what the numerics must never touch. Works on the sources' text, comments left out.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// A source file: its path below `src`, and its code without comments and test modules.
+struct Source {
+    path: String,
+    text: String,
+    code: String,
+}
+
+fn sources() -> Vec<Source> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
+    let mut files = Vec::new();
+    collect(&root, &mut files);
+    files.sort();
+    let below = |file: &Path| {
+        let relative = file.strip_prefix(&root).expect("found below the root");
+        relative.to_string_lossy().replace('\\', "/")
+    };
+    let read = |file: &PathBuf| {
+        let text = fs::read_to_string(file).expect("a source file is readable");
+        let product = text
+            .split("#[cfg(test)]\nmod tests")
+            .next()
+            .unwrap_or_default();
+        let lines = product
+            .lines()
+            .filter(|line| !line.trim_start().starts_with("//"));
+        let code = lines.collect::<Vec<_>>().join("\n");
+        Source {
+            path: below(file),
+            code,
+            text,
+        }
+    };
+    files.iter().map(read).collect()
+}
+
+fn collect(folder: &Path, files: &mut Vec<PathBuf>) {
+    for entry in fs::read_dir(folder).expect("a folder is readable") {
+        let path = entry.expect("an entry is readable").path();
+        if path.is_dir() {
+            collect(&path, files);
+        } else if path.extension().is_some_and(|extension| extension == "rs") {
+            files.push(path);
+        }
+    }
+}
+
+/// Every line of the files under `room` that holds one of `words`.
+fn uses(room: &str, words: &[&str]) -> Vec<String> {
+    let mut found = Vec::new();
+    for source in sources()
+        .iter()
+        .filter(|source| source.path.starts_with(room))
+    {
+        for line in source.code.lines() {
+            if words.iter().any(|word| line.contains(word)) {
+                found.push(format!("{}: {}", source.path, line.trim()));
+            }
+        }
+    }
+    found
+}
+
+#[test]
+fn the_numerics_know_nothing_of_the_rest() {
+    let outside = sources()
+        .iter()
+        .filter(|source| source.path.starts_with("flow/"))
+        .flat_map(|source| {
+            let foreign = |line: &&str| line.contains("crate::") && !line.contains("crate::flow");
+            let lines: Vec<_> = source
+                .code
+                .lines()
+                .filter(foreign)
+                .map(str::to_owned)
+                .collect();
+            lines
+        })
+        .collect::<Vec<_>>();
+    assert_eq!(outside, [""; 0]);
+}
+
+#[test]
+fn the_numerics_have_no_clock_no_files_no_environment_no_async_and_print_nothing() {
+    let forbidden = [
+        "std::time",
+        "std::fs",
+        "std::env",
+        "std::io",
+        "std::net",
+        "std::process",
+        "Instant",
+        "async ",
+        ".await",
+        "tokio",
+        "println!",
+        "static mut",
+        "thread_local!",
+        "OnceLock",
+        "LazyLock",
+    ];
+    assert_eq!(uses("flow/", &forbidden), [""; 0]);
+}
+
+#[test]
+fn the_solver_sees_only_the_backends_traits() {
+    assert_eq!(
+        uses("flow/solver.rs", &["cpu::", "gpu::", "distance::", "mlp"]),
+        [""; 0]
+    );
+}
+
+#[test]
+fn nothing_but_the_cpu_backend_sees_the_cpu_backend() {
+    let users = uses("flow/", &["cpu::"]);
+    let outside: Vec<_> = users
+        .iter()
+        .filter(|line| !line.starts_with("flow/cpu/"))
+        .collect();
+    assert!(outside.is_empty(), "{outside:#?}");
+}
+
+#[test]
+fn formats_and_pictures_know_no_solver_and_no_command_line() {
+    let forbidden = [
+        "crate::cli",
+        "flow::cpu",
+        "flow::estimate",
+        "flow::backend",
+        "clap",
+    ];
+    assert_eq!(uses("formats/", &forbidden), [""; 0]);
+    assert_eq!(uses("picture/", &forbidden), [""; 0]);
+    assert_eq!(uses("picture/", &["crate::formats"]), [""; 0]);
+}
+
+#[test]
+fn only_the_command_line_prints() {
+    let printing = ["println!", "eprintln!", "print!("];
+    let printers = uses("", &printing);
+    let outside: Vec<_> = printers
+        .iter()
+        .filter(|line| !line.starts_with("cli/"))
+        .collect();
+    assert!(outside.is_empty(), "{outside:#?}");
+}
+
+#[test]
+fn unsafe_code_stays_in_the_vector_kernels() {
+    let users = uses("", &["unsafe "]);
+    let outside: Vec<_> = users
+        .iter()
+        .filter(|line| !line.starts_with("flow/cpu/"))
+        .collect();
+    assert!(outside.is_empty(), "{outside:#?}");
+}
+
+#[test]
+fn hyper_parameters_are_written_in_the_options_alone() {
+    let users = uses(
+        "",
+        &["learning_rate:", "flow_penalty:", "margin_m:", "patience:"],
+    );
+    let literal = |line: &&String| {
+        let value = line.rsplit(": ").next().unwrap_or_default();
+        value.contains(|c: char| c.is_ascii_digit()) && !value.starts_with("f64")
+    };
+    let outside: Vec<_> = users
+        .iter()
+        .filter(|line| !line.starts_with("flow/options.rs") && !line.contains("fn "))
+        .filter(literal)
+        .collect();
+    assert!(outside.is_empty(), "{outside:#?}");
+}
+
+#[test]
+fn every_file_says_what_it_is_and_stays_short() {
+    for source in sources() {
+        assert!(
+            source.text.starts_with("//! "),
+            "{} does not say what it is",
+            source.path
+        );
+        let lines = source.text.lines().count();
+        assert!(lines <= 500, "{} has {lines} lines", source.path);
+    }
+}

@@ -1,0 +1,88 @@
+//! Pairs to solve, and how well they were solved.
+
+use std::path::PathBuf;
+
+use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::evaluate::{Metrics, Truth, evaluate};
+use fnsf::flow::simulate::{Street, StreetOptions};
+use fnsf::flow::{self, Estimate, Ground, Options, Problem, Unwatched};
+use fnsf::formats::{Pair, PairTruth, read_pair};
+
+/// The real pair of that name; none, said aloud, where there is no real data.
+pub(crate) fn real_pair(name: &str) -> Option<Pair> {
+    let Some(folder) = std::env::var_os("FNSF_REAL_DATA") else {
+        println!("FNSF_REAL_DATA is not set: {name} is not tested");
+        return None;
+    };
+    let path = PathBuf::from(folder).join(name).join("pair.npz");
+    let bytes = std::fs::read(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+    Some(read_pair(&bytes).unwrap_or_else(|e| panic!("{}: {e}", path.display())))
+}
+
+/// A simulated pair with its truth.
+pub(crate) fn street(options: &StreetOptions) -> Pair {
+    let simulated = Street::new(options)
+        .and_then(|street| street.pair(0))
+        .expect("a street");
+    Pair {
+        truth: Some(PairTruth {
+            valid: vec![true; simulated.source.len()],
+            flow: simulated.flow,
+            dynamic: Some(simulated.dynamic),
+            foreground: Some(simulated.foreground),
+        }),
+        ground: Some(fnsf::formats::Ground {
+            source: simulated.ground_source,
+            target: simulated.ground_target,
+        }),
+        ego: Some(simulated.target_from_source),
+        source: simulated.source,
+        target: simulated.target,
+    }
+}
+
+/// The pair's flow without its ground, on two threads.
+pub(crate) fn solve(pair: &Pair, options: &Options) -> Estimate {
+    let backend = CpuBackend::new(Some(2)).expect("threads");
+    let ground = pair.ground.as_ref().expect("the pair has ground masks");
+    let problem = Problem {
+        source: &pair.source,
+        target: &pair.target,
+        ground: Some([&ground.source, &ground.target]),
+    };
+    let options = Options {
+        ground: Ground::Mask,
+        ..options.clone()
+    };
+    flow::estimate(&backend, &problem, &options, &Unwatched).expect("a flow")
+}
+
+/// The error of the pair's flow by `options`.
+pub(crate) fn score(pair: &Pair, options: &Options) -> Metrics {
+    let estimate = solve(pair, options);
+    let known = pair.truth.as_ref().expect("the pair has truth");
+    let ground = pair.ground.as_ref().expect("the pair has ground masks");
+    let truth = Truth {
+        dynamic: known.dynamic.as_deref(),
+        ground: Some(&ground.source),
+        ..Truth::new(&known.flow, &known.valid)
+    };
+    evaluate(&estimate.flow, &estimate.valid, &truth).expect("points to score")
+}
+
+/// The middle EPE of several seeds, and the largest, metres.
+pub(crate) fn median_and_worst(pair: &Pair, options: &Options, seeds: u64) -> [f64; 2] {
+    let epe = |seed| {
+        score(
+            pair,
+            &Options {
+                seed,
+                ..options.clone()
+            },
+        )
+        .epe
+    };
+    let mut errors: Vec<f64> = (0..seeds).map(epe).collect();
+    errors.sort_by(f64::total_cmp);
+    [errors[errors.len() / 2], errors[errors.len() - 1]]
+}
