@@ -117,6 +117,9 @@ const VARIANTS: &[Variant] = &[
     ours("default, centered / 5 m", |o| {
         o.inputs = Inputs::Centered { scale_m: 5.0 };
     }),
+    ours("default, centered / 20 m", |o| {
+        o.inputs = Inputs::Centered { scale_m: 20.0 };
+    }),
     ours("default, centered / 50 m", |o| {
         o.inputs = Inputs::Centered { scale_m: 50.0 };
     }),
@@ -124,7 +127,7 @@ const VARIANTS: &[Variant] = &[
     ours("default, exact points", |o| {
         o.distance.sites = Sites::Points;
     }),
-    ours("default, step size 0.004", |o| o.learning_rate = 0.004),
+    ours("default, step size 0.008", |o| o.learning_rate = 0.008),
     ours("default, constant step size", |o| o.decay = Decay::Constant),
     ours("default, best batch instead of average", |o| {
         o.keep = Keep::Best;
@@ -205,7 +208,10 @@ fn main() -> Result<(), String> {
     let backend = CpuBackend::new(None).map_err(|e| e.to_string())?;
     println!("| variant | pair | EPE | worst / median | Acc5 | EPE moving | iterations | s |");
     println!("|---|---|---|---|---|---|---|---|");
-    for variant in VARIANTS.iter().filter(|v| v.name.contains(&only)) {
+    for variant in VARIANTS
+        .iter()
+        .filter(|v| only.is_empty() || v.name == only)
+    {
         for (path, pair) in &pairs {
             let mut options = variant.preset.options(max_points);
             options.ground = if pair.ground.is_some() {

@@ -1,0 +1,45 @@
+//! Clouds for the benchmarks: a simulated street, and real sweeps where there are any.
+
+use std::path::PathBuf;
+
+use fnsf::flow::Point;
+use fnsf::flow::simulate::{Street, StreetOptions};
+use fnsf::formats::read_pair;
+
+/// Two clouds and what they are.
+pub(crate) struct Scene {
+    pub(crate) name: String,
+    pub(crate) source: Vec<Point>,
+    pub(crate) target: Vec<Point>,
+}
+
+/// The simulated street and, where `FNSF_REAL_DATA` names a folder, its pairs; uncropped, with
+/// ground.
+pub(crate) fn scenes() -> Result<Vec<Scene>, String> {
+    let street = Street::new(&StreetOptions::default()).map_err(|e| e.to_string())?;
+    let pair = street.pair(0).map_err(|e| e.to_string())?;
+    let mut scenes = vec![Scene {
+        name: "simulated street".to_owned(),
+        source: pair.source,
+        target: pair.target,
+    }];
+    if let Some(folder) = std::env::var_os("FNSF_REAL_DATA") {
+        for name in ["av2_7fab", "kitti_0000", "small_gicp"] {
+            let path = PathBuf::from(&folder).join(name).join("pair.npz");
+            let bytes = std::fs::read(&path).map_err(|e| format!("{}: {e}", path.display()))?;
+            let pair = read_pair(&bytes).map_err(|e| format!("{}: {e}", path.display()))?;
+            scenes.push(Scene {
+                name: name.to_owned(),
+                source: pair.source,
+                target: pair.target,
+            });
+        }
+    }
+    Ok(scenes)
+}
+
+/// The middle of the values.
+pub(crate) fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
