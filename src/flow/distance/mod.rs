@@ -12,6 +12,8 @@ mod far;
 mod grid;
 mod options;
 mod point_sites;
+#[cfg(test)]
+mod tests;
 
 pub use bricks::Bricks;
 pub use dense::DenseChamfer;
