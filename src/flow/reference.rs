@@ -126,3 +126,49 @@ fn matrix(rows: usize, columns: usize, entry: impl Fn(usize, usize) -> f64) -> V
         .map(|r| (0..columns).map(|c| entry(r, c)).collect())
         .collect()
 }
+
+/// Euclidean distance from `at` to the nearest of `sites`.
+pub(crate) fn nearest_distance(at: [f64; 3], sites: &[[f64; 3]]) -> f64 {
+    let mut nearest = f64::INFINITY;
+    for site in sites {
+        let square: f64 = (0..3).map(|a| (at[a] - site[a]).powi(2)).sum();
+        nearest = nearest.min(square.sqrt());
+    }
+    nearest
+}
+
+/// Length of the shortest path of straight and diagonal steps from `at` to one of `sites`.
+pub(crate) fn nearest_chamfer(at: [f64; 3], sites: &[[f64; 3]]) -> f64 {
+    let mut nearest = f64::INFINITY;
+    for site in sites {
+        let mut gaps = [0, 1, 2].map(|a| (at[a] - site[a]).abs());
+        gaps.sort_by(f64::total_cmp);
+        let [c, b, a] = gaps;
+        let root = f64::sqrt;
+        nearest = nearest.min(a + (root(2.0) - 1.0) * b + (root(3.0) - root(2.0)) * c);
+    }
+    nearest
+}
+
+/// Trilinear value and gradient at `at`, in cells, of values known at whole places.
+pub(crate) fn trilinear(at: [f64; 3], value: impl Fn([u32; 3]) -> f64) -> (f64, [f64; 3]) {
+    let (mut sum, mut gradient) = (0.0, [0.0; 3]);
+    let fraction = at.map(|c| c - c.floor());
+    for corner in 0..8u32 {
+        let bits = [corner >> 2, corner >> 1 & 1, corner & 1];
+        let vertex = [0, 1, 2].map(|a| at[a].floor() as u32 + bits[a]);
+        let weight = [0, 1, 2].map(|a| {
+            if bits[a] == 1 {
+                fraction[a]
+            } else {
+                1.0 - fraction[a]
+            }
+        });
+        sum += weight.iter().product::<f64>() * value(vertex);
+        for axis in 0..3 {
+            let others: f64 = (0..3).filter(|&a| a != axis).map(|a| weight[a]).product();
+            gradient[axis] += (f64::from(bits[axis]) * 2.0 - 1.0) * others * value(vertex);
+        }
+    }
+    (sum, gradient)
+}

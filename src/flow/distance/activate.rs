@@ -12,6 +12,8 @@ pub(crate) const EDGE: u32 = 8;
 pub(crate) const VOLUME: usize = 512;
 /// Marks a block without a table and a brick that is not active.
 pub(crate) const ABSENT: u32 = u32::MAX;
+/// Bytes of a brick's 16-bit codes.
+pub(crate) const BRICK_BYTES: usize = VOLUME * size_of::<u16>();
 /// The most blocks: 64 MB of index.
 const MAX_BLOCKS: usize = 16 << 20;
 
@@ -32,11 +34,12 @@ impl Index {
     /// Marks every brick that has a vertex within `band` cells of an occupied vertex.
     ///
     /// # Errors
-    /// Where the grid has too many blocks.
+    /// Where the grid has too many blocks, or index and bricks would take more than `max_bytes`.
     pub(crate) fn activate(
         grid: &Grid,
         cells: &[[u32; 3]],
         band: i32,
+        max_bytes: usize,
     ) -> Result<Self, DistanceError> {
         let brick_counts = grid.vertices.map(|n| n.div_ceil(EDGE as usize));
         let blocks = brick_counts.map(|n| n.div_ceil(EDGE as usize));
@@ -56,7 +59,16 @@ impl Index {
         };
         let reach = (band + EDGE as i32 - 1) / EDGE as i32;
         let limit = band * band;
+        // Bricks are numbered by 32 bits.
+        let limit_bytes = max_bytes.min(ABSENT as usize * BRICK_BYTES);
         for cell in cells {
+            let needed = index.bytes() + index.active * BRICK_BYTES;
+            if needed > limit_bytes {
+                return Err(DistanceError::Memory {
+                    needed,
+                    limit: limit_bytes,
+                });
+            }
             let brick = cell.map(|c| (c / EDGE) as i32);
             let gaps: [_; 3] = core::array::from_fn(|a| (cell[a] % EDGE) as i32);
             // Squared gap along one axis between the cell and the brick `offset` away.
@@ -85,11 +97,9 @@ impl Index {
                 }
             }
         }
-        for brick in &mut index.bricks {
-            if *brick != ABSENT {
-                *brick = index.active as u32;
-                index.active += 1;
-            }
+        let active = index.bricks.iter_mut().filter(|brick| **brick != ABSENT);
+        for (number, brick) in (0..).zip(active) {
+            *brick = number;
         }
         Ok(index)
     }
@@ -101,8 +111,9 @@ impl Index {
             self.tables[block] = (self.bricks.len() / VOLUME) as u32;
             self.bricks.resize(self.bricks.len() + VOLUME, ABSENT);
         }
-        let place = within(brick);
-        self.bricks[self.tables[block] as usize * VOLUME + place] = 0;
+        let brick = &mut self.bricks[self.tables[block] as usize * VOLUME + within(brick)];
+        self.active += usize::from(*brick == ABSENT);
+        *brick = 0;
     }
 
     /// The number of the brick that holds `vertex`, or [`ABSENT`].

@@ -4,10 +4,12 @@
 //! with 16-bit distances; beyond the band a coarse far field goes on, so that a lost point is still
 //! pulled home. Deterministic whatever the number of threads. FNSF Section 3.2, eq. 4 and 5.
 
-use super::activate::{ABSENT, Index, VOLUME, within};
+use super::activate::{ABSENT, BRICK_BYTES, Index, VOLUME, within};
+use super::cell_sites::{CellGather, CellSites};
 use super::far::FarField;
 use super::grid::{Grid, trilinear};
 use super::options::{DistanceError, DistanceOptions, Sites};
+use super::point_sites::{PointGather, PointSites};
 use super::{Sample, build};
 use crate::flow::Point;
 
@@ -44,21 +46,30 @@ impl Bricks {
         cells.sort_unstable();
         cells.dedup();
         let band = options.band_cells();
-        let index = Index::activate(&grid, &cells, band)?;
+        let index = Index::activate(&grid, &cells, band, options.max_bytes)?;
+        let sites = match options.sites {
+            Sites::Cells => CellSites::bytes(cells.len(), band),
+            Sites::Points => PointSites::bytes(target.len()),
+        };
         let needed =
-            index.bytes() + index.active * VOLUME * size_of::<u16>() + FarField::bytes_over(&grid);
+            index.bytes() + index.active * BRICK_BYTES + FarField::bytes_over(&grid) + sites;
         if needed > options.max_bytes {
             return Err(DistanceError::Memory {
                 needed,
                 limit: options.max_bytes,
             });
         }
-        let points = match options.sites {
-            Sites::Cells => None,
-            Sites::Points => Some(build::sorted_points(&grid, target)),
+        let codes = match options.sites {
+            Sites::Cells => {
+                let sites = CellSites::new(&cells, band);
+                build::band_codes(&index, || CellGather::new(&sites))
+            }
+            Sites::Points => {
+                let sites = PointSites::new(&grid, target, band);
+                build::band_codes(&index, || PointGather::new(&sites))
+            }
         };
-        let codes = build::band_codes(&cells, points.as_deref(), &index, band);
-        let far = FarField::build(&grid, &cells, options.band_m);
+        let far = FarField::build(&grid, &cells, f64::from(band) * grid.cell);
         Ok(Self {
             inverse_cell: (1.0 / grid.cell) as f32,
             scale: (options.cell_m / build::codes_per_cell(band)) as f32,
@@ -121,14 +132,22 @@ impl Bricks {
         if codes.iter().all(|&code| code == BEYOND) {
             return None;
         }
-        Some(core::array::from_fn(|i| match codes[i] {
-            BEYOND => self.far.sample(corner_vertex(corner, i), [0.0; 3]).0,
-            code => f32::from(code) * self.scale,
+        Some(core::array::from_fn(|i| {
+            self.at_vertex(corner_vertex(corner, i))
         }))
     }
 
+    /// Metres at a vertex.
+    pub(super) fn at_vertex(&self, vertex: [u32; 3]) -> f32 {
+        match self.code(vertex) {
+            BEYOND => self.far.sample(vertex, [0.0; 3]).0,
+            code => f32::from(code) * self.scale,
+        }
+    }
+
+    /// The vertex's distance in units of `scale`, or [`BEYOND`].
     #[inline]
-    fn code(&self, vertex: [u32; 3]) -> u16 {
+    pub(super) fn code(&self, vertex: [u32; 3]) -> u16 {
         match self.index.brick_of(vertex) {
             ABSENT => BEYOND,
             brick => self.codes[brick as usize * VOLUME + within(vertex)],

@@ -89,10 +89,9 @@ impl Grid {
             fraction: [0.0; 3],
             inside: [1.0; 3],
         };
-        let at = self.in_cells(point);
-        for axis in 0..3 {
-            let clipped = at[axis].clamp(0.0, (self.vertices[axis] - 1) as f64);
-            if clipped != at[axis] {
+        for (axis, at) in self.in_cells(point).into_iter().enumerate() {
+            let clipped = at.clamp(0.0, (self.vertices[axis] - 1) as f64);
+            if clipped != at {
                 cell.inside[axis] = 0.0;
             }
             let corner = (clipped as u32).min(self.vertices[axis] as u32 - 2);
@@ -122,4 +121,20 @@ pub(crate) fn trilinear(corners: [f32; 8], fraction: [f32; 3]) -> (f32, [f32; 3]
         x,
     );
     (mix(low, high, x), [dx, dy, dz])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_grid_is_the_published_one() {
+        let source = [[-1.05, 2.0, 0.33]];
+        let target = [[3.0, 2.25, 0.33]];
+        let grid = Grid::covering(&source, &target, 0.1).unwrap();
+        let [x, y, z] = grid.origin;
+        assert!((x + 1.2).abs() < 1e-9 && (y - 1.9).abs() < 1e-9 && (z - 0.2).abs() < 1e-9);
+        // ceil((3.0 + 0.1 + 1.2) / 0.1) + 2, and so on.
+        assert_eq!(grid.vertices, [45, 7, 5]);
+    }
 }

@@ -6,11 +6,14 @@
 mod activate;
 mod bricks;
 mod build;
+mod cell_sites;
 pub mod dense;
-mod exact_points;
 mod far;
 mod grid;
 mod options;
+mod point_sites;
+#[cfg(test)]
+mod tests;
 
 pub use bricks::Bricks;
 pub use dense::DenseChamfer;

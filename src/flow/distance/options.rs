@@ -118,3 +118,131 @@ pub enum DistanceError {
         limit: usize,
     },
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::Point;
+    use crate::flow::distance::{Bricks, DistanceTransform};
+    use crate::flow::random::Random;
+
+    fn boxed(count: usize, size: [f64; 3]) -> Vec<Point> {
+        let mut random = Random::new(1);
+        let mut point = || size.map(|side| random.uniform(0.0, side) as f32);
+        (0..count).map(|_| point()).collect()
+    }
+
+    #[test]
+    fn clouds_that_span_too_much_are_refused() {
+        let strays = [[0.0; 3], [1e6, 0.0, 0.0]];
+        for metric in [Metric::Euclidean, Metric::Chamfer] {
+            let options = DistanceOptions {
+                metric,
+                ..DistanceOptions::default()
+            };
+            let build = |source: &[Point], target: &[Point]| {
+                DistanceTransform::build(source, target, &options).unwrap_err()
+            };
+            let extent = |error| matches!(error, DistanceError::Extent { .. });
+            assert!(extent(build(&strays, &[[0.0; 3]])));
+            assert!(extent(build(&[], &strays)));
+            assert!(extent(build(&[[f32::MIN; 3]], &[[f32::MAX; 3]])));
+            assert!(extent(build(&[], &[[f32::NAN; 3]])));
+            assert!(extent(build(&[], &[[f32::INFINITY, 0.0, 0.0]])));
+            assert_eq!(build(&[[0.0; 3]], &[]), DistanceError::EmptyTarget);
+        }
+    }
+
+    #[test]
+    fn transforms_that_would_not_fit_are_refused_before_they_are_built() {
+        let memory = |source: &[Point], target: &[Point], options: &DistanceOptions| {
+            let error = DistanceTransform::build(source, target, options).unwrap_err();
+            let DistanceError::Memory { needed, limit } = error else {
+                return false;
+            };
+            needed > limit
+        };
+        // 1e5 cells on every axis: 1e15.
+        let corners = [[-5000.0; 3], [5000.0; 3]];
+        let dense = DistanceOptions {
+            metric: Metric::Chamfer,
+            ..DistanceOptions::default()
+        };
+        assert!(memory(&[], &corners, &dense));
+        assert!(memory(&[], &corners, &DistanceOptions::default()));
+        // 2e7 cells on every axis: more bytes than 64 bits count.
+        let huge = [[-10_000.0; 3], [10_000.0; 3]];
+        for metric in [Metric::Chamfer, Metric::Euclidean] {
+            let options = DistanceOptions {
+                metric,
+                max_bytes: usize::MAX,
+                cell_m: 1e-3,
+                band_m: 0.02,
+                ..DistanceOptions::default()
+            };
+            assert!(memory(&[], &huge, &options));
+        }
+        let target = boxed(300, [9.0, 6.0, 3.0]);
+        let source = boxed(300, [30.0, 30.0, 9.0]);
+        for sites in [Sites::Cells, Sites::Points] {
+            let fits = DistanceOptions {
+                sites,
+                band_m: 6.4,
+                ..DistanceOptions::default()
+            };
+            let bytes = Bricks::build(&source, &target, &fits).unwrap().bytes();
+            for max_bytes in [0, 1000, bytes / 2] {
+                let options = DistanceOptions {
+                    max_bytes,
+                    ..fits.clone()
+                };
+                assert!(memory(&source, &target, &options));
+            }
+        }
+    }
+
+    /// Two thousand columns that each reach over 18 km would take 9 GB along z if empty space counted.
+    #[test]
+    fn tall_empty_columns_take_no_memory() {
+        let mut target = boxed(2000, [4.0, 4.0, 0.0]);
+        let high: Vec<_> = target.iter().map(|p| [p[0], p[1], 18_000.0]).collect();
+        target.extend(high);
+        let options = DistanceOptions {
+            max_bytes: 64 << 20,
+            band_m: 0.2,
+            ..DistanceOptions::default()
+        };
+        let bricks = Bricks::build(&[], &target, &options).unwrap();
+        assert_eq!(
+            bricks.sample(target[0]).distance,
+            bricks.sample(target[2000]).distance
+        );
+        assert!(bricks.bytes() < options.max_bytes);
+    }
+
+    #[test]
+    fn options_out_of_range_are_refused() {
+        let refused = |cell_m: f64, band_m: f64| {
+            let options = DistanceOptions {
+                cell_m,
+                band_m,
+                ..DistanceOptions::default()
+            };
+            DistanceTransform::build(&[], &[[0.0; 3]], &options).err()
+        };
+        for cell in [0.0, -0.1, 1e-4, f64::NAN, f64::INFINITY] {
+            assert!(matches!(
+                refused(cell, 2.0),
+                Some(DistanceError::Cell { .. })
+            ));
+        }
+        for band in [0.0, -2.0, 0.04, 6.46, 1e300, f64::NAN, f64::INFINITY] {
+            assert!(matches!(
+                refused(0.1, band),
+                Some(DistanceError::Band { .. })
+            ));
+        }
+        assert_eq!(refused(0.1, 0.1), None);
+        assert_eq!(refused(0.1, 6.4), None);
+    }
+}
