@@ -10,7 +10,7 @@ use super::distance::DistanceTransform;
 use super::points::{Point, RigidTransform};
 
 /// Points that are looked at: enough for millimetres, few enough for milliseconds.
-const SAMPLED: usize = 8192;
+const SAMPLED: usize = 16_384;
 /// Steps at most.
 const STEPS: usize = 30;
 /// Steps over which the weight's scale shrinks.
