@@ -17,3 +17,5 @@ pub mod cli;
 pub mod formats;
 #[cfg(feature = "service")]
 pub mod picture;
+#[cfg(feature = "service")]
+mod text;

@@ -9,9 +9,9 @@ use super::eval::print_score;
 use super::failure::Failure;
 use super::flow::{Estimation, Loading};
 use super::synth::labelled;
-use super::terminal::grouped;
 use crate::flow::simulate::{Street, StreetOptions};
 use crate::formats::FlowFile;
+use crate::text::grouped;
 
 /// Simulate a street, estimate its flow, print the error and draw it.
 #[derive(Debug, Args)]

@@ -7,11 +7,11 @@ use serde::Serialize;
 
 use super::failure::Failure;
 use super::files;
-use super::terminal::grouped;
 use crate::flow::evaluate::{
     Argoverse2, Metrics, Part, ThreeWay, Truth, evaluate, evaluate_argoverse2,
 };
 use crate::formats::{FlowFile, Pair, PairTruth};
+use crate::text::grouped;
 
 /// Compare a flow file with ground truth.
 ///

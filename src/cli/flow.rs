@@ -9,10 +9,11 @@ use serde::Serialize;
 use super::failure::Failure;
 use super::files;
 use super::machine::{Device, peak_resident_bytes};
-use super::terminal::{Terminal, grouped};
+use super::terminal::Terminal;
 use crate::flow::{self, Ego, Estimate, Ground, Options, Preset, Problem, Watch};
 use crate::formats::{FlowFormat, FlowTable, Pair, matrix_rows, write_flow};
 use crate::picture::{self, TopDown, TopDownOptions};
+use crate::text::grouped;
 
 /// Estimate the motion of every point between two sweeps.
 ///

@@ -7,9 +7,9 @@ use clap::Args;
 
 use super::failure::Failure;
 use super::files;
-use super::terminal::grouped;
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
 use crate::formats::{CloudFormat, Ground, Pair, PairTruth, write_cloud, write_pair_npz};
+use crate::text::grouped;
 
 /// Make a synthetic sequence with exact ground truth.
 ///

@@ -1,4 +1,4 @@
-//! A clock and a progress bar for the numerics, and numbers as people read them.
+//! A clock and a progress bar for the numerics,.
 
 use std::time::Instant;
 
@@ -44,29 +44,5 @@ impl Watch for Terminal {
         self.bar.set_length(progress.max_iterations as u64);
         self.bar.set_position(progress.iteration as u64);
         self.bar.set_message(format!("loss {:.4} m", progress.loss));
-    }
-}
-
-/// `1234567` as `1,234,567`.
-pub(super) fn grouped(number: usize) -> String {
-    let digits = number.to_string();
-    let mut out = String::new();
-    for (place, digit) in digits.chars().enumerate() {
-        if place > 0 && (digits.len() - place).is_multiple_of(3) {
-            out.push(',');
-        }
-        out.push(digit);
-    }
-    out
-}
-
-#[cfg(test)]
-mod tests {
-    use super::grouped;
-
-    #[test]
-    fn digits_are_grouped_by_three() {
-        let numbers = [0, 12, 999, 1000, 81_856, 1_234_567].map(grouped);
-        assert_eq!(numbers, ["0", "12", "999", "1,000", "81,856", "1,234,567"]);
     }
 }

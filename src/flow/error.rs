@@ -2,7 +2,7 @@
 
 use super::backend::BackendError;
 use super::distance::DistanceError;
-use super::preprocess::MIN_POINTS;
+use super::points::MIN_POINTS;
 
 /// Why an estimate was refused or failed.
 #[derive(Debug, thiserror::Error)]

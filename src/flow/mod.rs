@@ -29,7 +29,7 @@ mod reference;
 
 pub use error::FlowError;
 pub use options::*;
-pub use points::{Point, RigidTransform};
-pub use preprocess::{MIN_POINTS, Problem};
+pub use points::{MIN_POINTS, Point, RigidTransform};
+pub use preprocess::Problem;
 pub use solver::{DYNAMIC_M, Estimate, PhaseSeconds, StopReason, estimate};
 pub use watch::{Interrupt, Progress, Unwatched, Watch};

@@ -5,3 +5,6 @@ pub type Point = [f32; 3];
 
 /// A rigid motion, column vectors, metres. Named `target_from_source` where it is stored.
 pub type RigidTransform = nalgebra::Isometry3<f64>;
+
+/// Fewer points than this in a cloud determine no motion.
+pub const MIN_POINTS: usize = 3;

@@ -4,7 +4,7 @@
 
 use super::error::FlowError;
 use super::options::{Ground, Options};
-use super::points::Point;
+use super::points::{MIN_POINTS, Point};
 use super::random::Random;
 
 /// Two clouds, as they came.
@@ -26,9 +26,6 @@ pub(crate) struct Selection {
     pub(crate) source: Vec<Point>,
     pub(crate) target: Vec<Point>,
 }
-
-/// Fewer points than this in a cloud determine no motion.
-pub const MIN_POINTS: usize = 3;
 
 /// Selects by `options`; refuses clouds of which too little is left.
 pub(crate) fn select(problem: &Problem, options: &Options) -> Result<Selection, FlowError> {

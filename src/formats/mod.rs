@@ -5,6 +5,7 @@
 
 mod error;
 mod limits;
+mod lines;
 mod sniff;
 
 mod cloud;

@@ -7,6 +7,7 @@ use std::io::Write;
 
 use super::error::{FileKind, FormatError, shorten};
 use super::limits::{check_rows, check_size, unfold_limit};
+use super::lines::next_line;
 use super::lzf;
 use super::scalar::{ByteOrder, Scalar};
 
@@ -300,20 +301,6 @@ fn ascii_row(
         found = index + 1;
     }
     (found == numbers).then_some(())
-}
-
-/// The bytes up to a line feed, which is dropped; `None` at the end of the file.
-fn next_line<'a>(rest: &mut &'a [u8]) -> Option<&'a [u8]> {
-    if rest.is_empty() {
-        return None;
-    }
-    let end = rest
-        .iter()
-        .position(|&byte| byte == b'\n')
-        .unwrap_or(rest.len());
-    let line = &rest[..end];
-    *rest = rest.get(end + 1..).unwrap_or_default();
-    Some(line)
 }
 
 /// Writes the header of a binary file of `rows` points; fields as (name, size, type).

@@ -7,6 +7,7 @@ use std::io::Write;
 
 use super::error::{FileKind, FormatError, shorten};
 use super::limits::{check_rows, check_size};
+use super::lines::next_line;
 use super::scalar::{ByteOrder, Scalar};
 
 const KIND: FileKind = FileKind::Ply;
@@ -271,20 +272,6 @@ fn skip_list(count: Scalar, item: Scalar, order: ByteOrder, body: &mut &[u8]) ->
         .checked_add(count.size())?;
     *body = body.get(bytes..)?;
     Some(())
-}
-
-/// The bytes up to a line feed, which is dropped; `None` at the end of the file.
-fn next_line<'a>(rest: &mut &'a [u8]) -> Option<&'a [u8]> {
-    if rest.is_empty() {
-        return None;
-    }
-    let end = rest
-        .iter()
-        .position(|&byte| byte == b'\n')
-        .unwrap_or(rest.len());
-    let line = &rest[..end];
-    *rest = rest.get(end + 1..).unwrap_or_default();
-    Some(line)
 }
 
 fn scalar(name: &str) -> Option<Scalar> {

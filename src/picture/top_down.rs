@@ -4,6 +4,7 @@
 //! files.
 
 use crate::flow::{Point, RigidTransform};
+use crate::text::grouped;
 
 use super::canvas::{Align, Image, Rgb, TextStyle};
 use super::motion::{full_scale, shown_motion};
@@ -257,19 +258,6 @@ fn draw_title(image: &mut Image, view: View, scene: &TopDown<'_>, moving: usize)
         None => format!("{points} points"),
     };
     image.text([margin, margin + 18 * dot], &counts, small);
-}
-
-/// A count with commas between thousands.
-fn grouped(count: usize) -> String {
-    let digits = count.to_string();
-    let mut text = String::new();
-    for (index, digit) in digits.chars().enumerate() {
-        if index > 0 && (digits.len() - index).is_multiple_of(3) {
-            text.push(',');
-        }
-        text.push(digit);
-    }
-    text
 }
 
 /// The color wheel, turned as the picture is: up is forward.

@@ -13,59 +13,8 @@ use super::lanes::F32x4;
 #[cfg(target_arch = "x86_64")]
 use super::lanes::{F32x8, F32x16};
 use super::passes::{backward, forward};
-use crate::flow::field::mlp::{Aligned, HIDDEN_LAYERS, Parameters, WIDTH};
-
-/// Points in one tile: eight rows of activations of 96 points fill half of a 1 MiB cache.
-pub(crate) const TILE: usize = 96;
-/// Rows are padded to a multiple of this, which every kernel's row count divides.
-const ROW_STEP: usize = 12;
-/// Floats from one point's features to the next point's: 128 would map rows onto few cache sets.
-pub(super) const STRIDE: usize = WIDTH + 16;
-
-/// The working set of one thread: a tile's inputs, activations and deltas.
-pub(crate) struct Tile {
-    /// Points in the tile, at most [`TILE`].
-    pub(super) rows: usize,
-    /// Network inputs, x y z a point.
-    pub(crate) inputs: [[f32; 3]; TILE],
-    /// Network outputs of the last forward pass.
-    pub(crate) outputs: [[f32; 3]; TILE],
-    /// The loss's derivative by each output, read by the backward pass.
-    pub(crate) output_gradients: [[f32; 3]; TILE],
-    /// Rows of every hidden layer.
-    pub(super) activations: Aligned,
-    /// Loss derivatives by one layer's and the next lower layer's linear parts.
-    pub(super) deltas: [Aligned; 2],
-}
-
-impl Tile {
-    pub(crate) fn new() -> Self {
-        Self {
-            rows: 0,
-            inputs: [[0.0; 3]; TILE],
-            outputs: [[0.0; 3]; TILE],
-            output_gradients: [[0.0; 3]; TILE],
-            activations: Aligned::zeros(HIDDEN_LAYERS * TILE * STRIDE),
-            deltas: [Aligned::zeros(TILE * STRIDE), Aligned::zeros(TILE * STRIDE)],
-        }
-    }
-
-    /// Takes up to [`TILE`] inputs; the rest of the rows become zeros, with zero gradients.
-    pub(crate) fn load(&mut self, inputs: impl ExactSizeIterator<Item = [f32; 3]>) {
-        assert!(inputs.len() <= TILE, "a tile holds {TILE} points");
-        self.rows = inputs.len();
-        for (row, input) in self.inputs.iter_mut().zip(inputs) {
-            *row = input;
-        }
-        self.inputs[self.rows..].fill([0.0; 3]);
-        self.output_gradients[self.rows..].fill([0.0; 3]);
-    }
-
-    /// Rows including the padding to whole register tiles.
-    pub(super) fn padded_rows(&self) -> usize {
-        self.rows.next_multiple_of(ROW_STEP)
-    }
-}
+use super::tile::Tile;
+use crate::flow::field::mlp::Parameters;
 
 type Forward = unsafe fn(&Parameters, &mut Tile);
 type Backward = unsafe fn(&Parameters, &Parameters, &mut Tile, &mut Parameters);
@@ -110,7 +59,7 @@ impl Kernels {
 
     /// Adds the tile's parameter gradients to `gradients`, from its `output_gradients` and the
     /// activations of the last [`Self::forward`]. `transposed` holds the middle layers'
-    /// transposes, see [`crate::flow::field::mlp::transpose_middle_layer`].
+    /// transposes, see [`crate::flow::field::mlp::transpose_middle_layers`].
     pub(crate) fn backward(
         &self,
         parameters: &Parameters,
@@ -159,7 +108,7 @@ unsafe fn backward_portable(p: &Parameters, t: &Parameters, tile: &mut Tile, g: 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::flow::field::mlp::{MIDDLE_LAYERS, middle_layer, transpose_middle_layers};
+    use crate::flow::field::mlp::{MIDDLE_LAYERS, WIDTH, middle_layer, transpose_middle_layers};
     use crate::flow::random::Random;
     use crate::flow::reference::ReferenceNetwork;
 

@@ -4,6 +4,7 @@ mod isa;
 mod kernels;
 mod lanes;
 mod passes;
+mod tile;
 mod trainer;
 mod workload;
 

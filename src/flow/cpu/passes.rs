@@ -11,8 +11,8 @@
     reason = "registers are named by row and vector, as in the formulas"
 )]
 
-use super::kernels::{STRIDE, TILE, Tile};
 use super::lanes::Lanes;
+use super::tile::{STRIDE, TILE, Tile};
 use crate::flow::field::mlp::{
     MIDDLE_LAYERS, PANEL, Parameters, WIDTH, first_layer, last_layer, middle_layer,
 };

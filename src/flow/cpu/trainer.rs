@@ -9,7 +9,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use rayon::prelude::*;
 
 use super::CpuTransform;
-use super::kernels::{TILE, Tile};
+use super::tile::{TILE, Tile};
 use crate::flow::backend::{Advance, BackendError, Report, Trainer};
 use crate::flow::early_stop::EarlyStop;
 use crate::flow::field::mlp::{Conditioning, Parameters, transpose_middle_layers};

@@ -8,10 +8,11 @@
 )]
 
 use super::isa::Isa;
-use super::kernels::{Kernels, TILE, Tile};
+use super::kernels::Kernels;
 use super::lanes::{F32x4, Lanes};
 #[cfg(target_arch = "x86_64")]
 use super::lanes::{F32x8, F32x16};
+use super::tile::{TILE, Tile};
 use crate::flow::field::mlp::{MIDDLE_LAYERS, Parameters, WIDTH, transpose_middle_layers};
 use crate::flow::points::Point;
 use crate::flow::random::Random;

@@ -4,17 +4,15 @@
 //! with 16-bit distances; beyond the band a coarse far field goes on, so that a lost point is still
 //! pulled home. Deterministic whatever the number of threads. FNSF Section 3.2, eq. 4 and 5.
 
+use super::Sample;
 use super::activate::{ABSENT, BRICK_BYTES, Index, VOLUME, within};
+use super::build::{self, BEYOND};
 use super::cell_sites::{CellGather, CellSites};
 use super::far::FarField;
 use super::grid::{Grid, trilinear};
 use super::options::{DistanceError, DistanceOptions, Sites};
 use super::point_sites::{PointGather, PointSites};
-use super::{Sample, build};
 use crate::flow::Point;
-
-/// Marks a vertex of an active brick that lies beyond the band.
-pub(crate) const BEYOND: u16 = u16::MAX;
 
 /// The transform: distances at the vertices of active bricks, and a far field.
 #[derive(Debug)]

@@ -9,7 +9,9 @@ use core::ops::Range;
 use rayon::prelude::*;
 
 use super::activate::{ABSENT, EDGE, Index, VOLUME};
-use super::bricks::BEYOND;
+
+/// Marks a vertex of an active brick that lies beyond the band.
+pub(super) const BEYOND: u16 = u16::MAX;
 
 /// Bricks along a block's edge.
 const STRIP: usize = EDGE as usize;

@@ -6,8 +6,7 @@
 use core::ops::Range;
 
 use super::activate::EDGE;
-use super::bricks::BEYOND;
-use super::build::{Gather, Rows, codes_per_cell};
+use super::build::{BEYOND, Gather, Rows, codes_per_cell};
 
 /// Farther than any sum of squares within the band; sums with it stay within 16 bits.
 const FAR: i16 = 0x3FFF;

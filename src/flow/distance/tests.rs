@@ -119,7 +119,7 @@ fn check_every_vertex(name: &str, bricks: &Bricks, target: &[Point], band: f64, 
         let exact = reference::nearest_distance(at, sites);
         let value = f64::from(bricks.at_vertex(vertex)) / cell;
         let place = format!("{name}, band {band}, {vertex:?}: {value} for {exact}");
-        if bricks.code(vertex) != bricks::BEYOND {
+        if bricks.code(vertex) != build::BEYOND {
             assert!(exact <= band + tolerance, "{place}");
             assert!((value - exact).abs() <= tolerance, "{place}");
         } else {
