@@ -2,7 +2,7 @@
 //! experiment on pairs with ground truth.
 //!
 //! ```text
-//! cargo run --release --example ablation -- [--seeds N] [--max-points N] [--only TEXT] PAIR.npz...
+//! cargo run --release --example ablation -- [--seeds N] [--max-points N] [--only NAME] PAIR.npz...
 //! ```
 //!
 //! For each variant and pair, over the seeds: median EPE, the worst seed's EPE over the median,
@@ -99,19 +99,29 @@ const VARIANTS: &[Variant] = &[
     ours("default", |_| {}),
     ours("default, ego motion alone", |o| o.max_iterations = 0),
     ours("default, no ego motion", |o| o.ego = Ego::Off),
-    ours("default, no margin", |o| o.loss.margin_m = 0.0),
+    ours("default, no margin", no_margin),
+    ours("default, margin 0.1 m at every range", |o| {
+        o.loss.margin_quantile = None;
+    }),
+    ours("default, margin from 70% of the points", |o| {
+        o.loss.margin_quantile = Some(0.7);
+    }),
+    ours("default, margin from 80% of the points", |o| {
+        o.loss.margin_quantile = Some(0.8);
+    }),
     ours("default, no flow penalty", |o| o.loss.flow_penalty = 0.0),
-    ours("default, no margin, no penalty", |o| {
-        o.loss.margin_m = 0.0;
+    ours("default, no margin, no flow penalty", |o| {
+        no_margin(o);
         o.loss.flow_penalty = 0.0;
     }),
-    ours("default, margin 0.05 m", |o| o.loss.margin_m = 0.05),
-    ours("default, margin 0.15 m", |o| o.loss.margin_m = 0.15),
-    ours("default, margin 0.2 m", |o| o.loss.margin_m = 0.2),
-    ours("default, penalty 0.01", |o| o.loss.flow_penalty = 0.01),
-    ours("default, penalty 0.05", |o| o.loss.flow_penalty = 0.05),
-    ours("default, truncation 1 m", |o| {
-        o.loss.truncation_m = Some(1.0);
+    ours("default, flow penalty 0.01", |o| o.loss.flow_penalty = 0.01),
+    ours("default, flow penalty 0.05", |o| o.loss.flow_penalty = 0.05),
+    ours("default, no truncation", |o| o.loss.truncation_m = None),
+    ours("default, truncation 0.5 m", |o| {
+        o.loss.truncation_m = Some(0.5);
+    }),
+    ours("default, truncation 2 m", |o| {
+        o.loss.truncation_m = Some(2.0);
     }),
     ours("default, raw inputs", |o| o.inputs = Inputs::Raw),
     ours("default, centered / 5 m", |o| {
@@ -143,6 +153,11 @@ const VARIANTS: &[Variant] = &[
         o.max_iterations = 300;
     }),
 ];
+
+fn no_margin(options: &mut Options) {
+    options.loss.margin_m = 0.0;
+    options.loss.margin_quantile = None;
+}
 
 /// One seed's result.
 struct Run {

@@ -30,6 +30,9 @@ pub trait Transform: Send {
     /// The rigid motion target_from_source that aligns `source` with the target.
     fn align(&self, source: &[Point]) -> RigidTransform;
 
+    /// The distance to the target at each of `points`, metres.
+    fn distances(&self, points: &[Point]) -> Vec<f32>;
+
     /// A field at its start, to be fitted to `source`.
     ///
     /// # Errors

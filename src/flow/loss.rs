@@ -18,14 +18,15 @@ pub(crate) struct PointLoss {
 }
 
 impl LossOptions {
-    /// The loss where the deformed point sees `sample` and the field's displacement is `flow`.
+    /// The loss of `point` where it sees `sample` after the field moved it by `flow`.
     #[inline]
-    pub(crate) fn at(&self, sample: Sample, flow: Point) -> PointLoss {
+    pub(crate) fn at(&self, point: Point, sample: Sample, flow: Point) -> PointLoss {
         let truncation = self.truncation_m.unwrap_or(f32::INFINITY);
-        let pulled = sample.distance > self.margin_m && sample.distance < truncation;
+        let margin = self.margin_m.max(self.margin_slope * length(point));
+        let pulled = sample.distance > margin && sample.distance < truncation;
         let pull = if pulled { 1.0 } else { 0.0 };
-        let distance = sample.distance.max(self.margin_m).min(truncation);
-        let length = flow.iter().map(|f| f * f).sum::<f32>().sqrt();
+        let distance = sample.distance.max(margin).min(truncation);
+        let length = length(flow);
         let penalized = if length > SMALL_FLOW_M {
             length - SMALL_FLOW_M / 2.0
         } else {
@@ -37,6 +38,12 @@ impl LossOptions {
             gradient: core::array::from_fn(|a| pull * sample.gradient[a] + shrink * flow[a]),
         }
     }
+}
+
+/// Euclidean length.
+#[inline]
+pub(crate) fn length(vector: Point) -> f32 {
+    vector.iter().map(|x| x * x).sum::<f32>().sqrt()
 }
 
 #[cfg(test)]
@@ -52,7 +59,7 @@ mod tests {
         let gradient = [0.6f32, 0.0, -0.8];
         let flow = flow.map(|f| f as f32);
         let distance = 0.5 + gradient.iter().zip(flow).map(|(g, f)| g * f).sum::<f32>();
-        options.at(Sample { distance, gradient }, flow)
+        options.at([0.0; 3], Sample { distance, gradient }, flow)
     }
 
     #[test]
@@ -62,6 +69,8 @@ mod tests {
         const STEP: f64 = 1e-3;
         let options = LossOptions {
             margin_m: 0.1,
+            margin_slope: 0.0,
+            margin_quantile: None,
             truncation_m: Some(2.0),
             flow_penalty: 0.3,
         };
@@ -91,6 +100,8 @@ mod tests {
     fn the_published_loss_is_the_distance_itself() {
         let options = LossOptions {
             margin_m: 0.0,
+            margin_slope: 0.0,
+            margin_quantile: None,
             truncation_m: None,
             flow_penalty: 0.0,
         };
@@ -98,7 +109,7 @@ mod tests {
             distance: 0.7,
             gradient: [0.0, 1.0, 0.0],
         };
-        let loss = options.at(sample, [5.0, 5.0, 5.0]);
+        let loss = options.at([0.0; 3], sample, [5.0, 5.0, 5.0]);
         assert_eq!(
             loss,
             PointLoss {
@@ -112,6 +123,8 @@ mod tests {
     fn points_within_the_margin_and_beyond_the_truncation_are_not_pulled() {
         let options = LossOptions {
             margin_m: 0.1,
+            margin_slope: 0.0,
+            margin_quantile: None,
             truncation_m: Some(2.0),
             flow_penalty: 0.0,
         };

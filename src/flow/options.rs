@@ -86,6 +86,8 @@ impl Options {
             distance: DistanceOptions::default(),
             loss: LossOptions {
                 margin_m: 0.0,
+                margin_slope: 0.0,
+                margin_quantile: None,
                 truncation_m: None,
                 flow_penalty: 0.0,
             },
@@ -109,7 +111,9 @@ impl Options {
             ego: Ego::Auto,
             loss: LossOptions {
                 margin_m: 0.1,
-                truncation_m: None,
+                margin_slope: 0.0,
+                margin_quantile: Some(0.9),
+                truncation_m: Some(1.0),
                 flow_penalty: 0.02,
             },
             inputs: Inputs::Centered { scale_m: 10.0 },
@@ -151,6 +155,12 @@ pub struct LossOptions {
     /// Distances below this are good enough, metres: a static surface is sampled at other places
     /// by each sweep, and following the samples is not motion.
     pub margin_m: f32,
+    /// The margin grows with a point's range by this, metres a metre: so does the distance between
+    /// a lidar's samples.
+    pub margin_slope: f32,
+    /// Where given, `margin_slope` is raised to this quantile, 0 to 1, of distance over range
+    /// before the field moves anything: the sparser the clouds, the wider the margin.
+    pub margin_quantile: Option<f32>,
     /// Distances count no further than this, metres.
     pub truncation_m: Option<f32>,
     /// Weight of the field's length, metres of loss a metre of flow.

@@ -4,6 +4,7 @@
 
 use super::backend::{Advance, Backend};
 use super::error::FlowError;
+use super::loss::length;
 use super::options::{Ego, Options};
 use super::points::{Point, RigidTransform};
 use super::preprocess::{self, Problem};
@@ -107,7 +108,18 @@ pub fn estimate(
             .collect(),
     };
     let distance_bytes = transform.bytes();
-    let mut trainer = transform.start(&aligned, options)?;
+    let mut options = options.clone();
+    if let Some(share) = options.loss.margin_quantile {
+        let distances = transform.distances(&aligned);
+        let ranges = aligned.iter().map(|&point| length(point).max(1.0));
+        let slopes = distances
+            .iter()
+            .zip(ranges)
+            .map(|(d, range)| d / range)
+            .collect();
+        options.loss.margin_slope = options.loss.margin_slope.max(quantile(slopes, share));
+    }
+    let mut trainer = transform.start(&aligned, &options)?;
     let precomputed = watch.seconds();
 
     let stop_reason = loop {
@@ -158,6 +170,15 @@ pub fn estimate(
         },
         distance_bytes,
     })
+}
+
+/// The value below which `share` of the values lie; zero where there are none.
+fn quantile(mut values: Vec<f32>, share: f32) -> f32 {
+    if values.is_empty() {
+        return 0.0;
+    }
+    let place = (share.clamp(0.0, 1.0) * (values.len() - 1) as f32) as usize;
+    *values.select_nth_unstable_by(place, f32::total_cmp).1
 }
 
 /// `point`, moved rigidly.

@@ -100,6 +100,11 @@ impl Transform for CpuTransform {
         ego::align(source, &self.distance)
     }
 
+    fn distances(&self, points: &[Point]) -> Vec<f32> {
+        let sample = |&point: &Point| self.distance.sample(point).distance;
+        points.iter().map(sample).collect()
+    }
+
     fn start(
         self: Box<Self>,
         source: &[Point],

@@ -147,7 +147,7 @@ impl CpuTrainer {
                 for (row, point) in points.iter().enumerate() {
                     let flow = tile.outputs[row];
                     let deformed = core::array::from_fn(|a| point[a] + flow[a]);
-                    let loss = loss.at(device.distance.sample(deformed), flow);
+                    let loss = loss.at(*point, device.distance.sample(deformed), flow);
                     chunk.loss += f64::from(loss.value);
                     tile.output_gradients[row] = loss.gradient.map(|g| g * weight);
                 }
