@@ -130,6 +130,7 @@ mod tests {
         };
         for (distance, value) in [(0.05, 0.1), (3.0, 2.0)] {
             let loss = options.at(
+                [0.0; 3],
                 Sample {
                     distance,
                     gradient: [1.0; 3],
@@ -144,5 +145,24 @@ mod tests {
                 }
             );
         }
+    }
+
+    #[test]
+    fn the_margin_grows_with_range() {
+        let options = LossOptions {
+            margin_m: 0.1,
+            margin_slope: 0.01,
+            margin_quantile: None,
+            truncation_m: None,
+            flow_penalty: 0.0,
+        };
+        let sample = Sample {
+            distance: 0.3,
+            gradient: [1.0, 0.0, 0.0],
+        };
+        let near = options.at([20.0, 0.0, 0.0], sample, [0.0; 3]);
+        let far = options.at([0.0, 40.0, 0.0], sample, [0.0; 3]);
+        assert_eq!(near.gradient, sample.gradient);
+        assert_eq!((far.value, far.gradient), (0.4, [0.0; 3]));
     }
 }
