@@ -97,7 +97,7 @@ pub enum DistanceError {
     /// The clouds span too much space.
     #[error(
         "the clouds span {x_m:.0} x {y_m:.0} x {z_m:.0} m, more than {limit_m:.0} m on an axis: \
-         remove stray points or crop with a range"
+         remove stray points or crop with range_m"
     )]
     Extent {
         /// Extent along x, metres.
@@ -110,7 +110,7 @@ pub enum DistanceError {
         limit_m: f64,
     },
     /// The transform would not fit.
-    #[error("the distance transform needs {needed} bytes, {limit} are allowed: crop with a range")]
+    #[error("the distance transform needs {needed} bytes, {limit} are allowed: crop with range_m")]
     Memory {
         /// Bytes needed.
         needed: usize,
