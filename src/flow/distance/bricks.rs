@@ -57,6 +57,8 @@ impl Bricks {
                 limit: options.max_bytes,
             });
         }
+        // Before the bricks, so that what it needs meanwhile is free again.
+        let far = FarField::build(&grid, &cells, f64::from(band) * grid.cell);
         let codes = match options.sites {
             Sites::Cells => {
                 let sites = CellSites::new(&cells, band);
@@ -67,7 +69,6 @@ impl Bricks {
                 build::band_codes(&index, || PointGather::new(&sites))
             }
         };
-        let far = FarField::build(&grid, &cells, f64::from(band) * grid.cell);
         Ok(Self {
             inverse_cell: (1.0 / grid.cell) as f32,
             scale: (options.cell_m / build::codes_per_cell(band)) as f32,
