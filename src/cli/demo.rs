@@ -41,7 +41,8 @@ impl Demo {
             .map_err(Failure::internal)?;
 
         let loading = Loading::begin();
-        let solved = self.estimation.solve(&pair, &loading)?;
+        let estimation = self.estimation.clone().masking_ground();
+        let solved = estimation.solve(&pair, &loading)?;
         solved.report.print();
 
         let flow = self.output.join("flow.npz");

@@ -53,7 +53,7 @@ pub(super) struct Estimation {
     #[arg(long, value_enum, default_value_t = Device::Auto)]
     device: Device,
     /// CPU threads; all cores by default. The result does not depend on it
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
     /// The same seed gives the same bits
     #[arg(long, value_name = "N", default_value_t = 0)]
@@ -64,9 +64,10 @@ pub(super) struct Estimation {
     /// Leave out points with |x| or |y| beyond R metres
     #[arg(long, value_name = "R", value_parser = positive)]
     range_m: Option<f32>,
-    /// Keep ground points, or leave out those that the pair's ground1 and ground2 name
-    #[arg(long, value_enum, default_value_t = GroundChoice::Keep)]
-    ground: GroundChoice,
+    /// Keep ground points, or leave out those that the pair's ground1 and ground2 name; keep by
+    /// default, but mask in the demo
+    #[arg(long, value_enum)]
+    ground: Option<GroundChoice>,
     /// The vehicle's own motion: off, auto (estimate it first), or a file with the 4 x 4 matrix
     /// target_from_source; by default what the preset does
     #[arg(long, value_name = "off|auto|FILE")]
@@ -98,8 +99,8 @@ impl Estimation {
         options.seed = self.seed;
         options.range_m = self.range_m;
         options.ground = match self.ground {
-            GroundChoice::Keep => Ground::Keep,
-            GroundChoice::Mask => Ground::Mask,
+            None | Some(GroundChoice::Keep) => Ground::Keep,
+            Some(GroundChoice::Mask) => Ground::Mask,
         };
         match self.ego.as_deref() {
             None => {}
@@ -108,6 +109,12 @@ impl Estimation {
             Some(file) => options.ego = Ego::Given(files::read_motion(Path::new(file))?),
         }
         Ok(options)
+    }
+
+    /// Leaves ground out unless it is asked for.
+    pub(super) fn masking_ground(mut self) -> Self {
+        self.ground.get_or_insert(GroundChoice::Mask);
+        self
     }
 
     /// Estimates the pair's flow; `began` is when loading began, by the terminal's clock.

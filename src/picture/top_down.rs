@@ -115,7 +115,7 @@ pub fn top_down(scene: &TopDown<'_>, options: &TopDownOptions) -> Image {
     let range_m = options
         .range_m
         .filter(|range| *range > 0.0 && range.is_finite());
-    let range_m = range_m.unwrap_or_else(|| choose_range(scene.source));
+    let range_m = range_m.unwrap_or_else(|| choose_range(scene));
     let view = View {
         side: side as f32,
         range_m,
@@ -136,10 +136,12 @@ pub fn top_down(scene: &TopDown<'_>, options: &TopDownOptions) -> Image {
     image
 }
 
-fn choose_range(source: &[Point]) -> f32 {
-    let mut reach: Vec<f32> = source
-        .iter()
-        .map(|point| point[0].abs().max(point[1].abs()))
+/// Half the range that holds nearly all points with a flow.
+fn choose_range(scene: &TopDown) -> f32 {
+    let rows = scene.source.iter().zip(scene.valid);
+    let mut reach: Vec<f32> = rows
+        .filter(|(_, valid)| **valid)
+        .map(|(point, _)| point[0].abs().max(point[1].abs()))
         .filter(|m| m.is_finite())
         .collect();
     if reach.is_empty() {
