@@ -16,7 +16,23 @@ pub mod evaluate;
 pub mod field;
 mod loss;
 mod optimizer;
-mod options;
+mod options;//!
+//! ```
+//! use fnsf::flow::cpu::CpuBackend;
+//! use fnsf::flow::simulate::{Street, StreetOptions};
+//! use fnsf::flow::{Preset, Problem, Unwatched, estimate};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let street = StreetOptions { beams: 16, azimuth_steps: 400, ..StreetOptions::default() };
+//! let pair = Street::new(&street)?.pair(0)?;
+//! let problem = Problem { source: &pair.source, target: &pair.target, ground: None };
+//! let options = Preset::Default.options(None);
+//! let estimate = estimate(&CpuBackend::new(None)?, &problem, &options, &Unwatched)?;
+//! assert_eq!(estimate.flow.len(), pair.source.len());
+//! # Ok(())
+//! # }
+//! ```
+
 mod points;
 mod preprocess;
 mod random;
