@@ -6,17 +6,7 @@
 //!
 //! No async, no input or output, no clock, no environment, no globals. Deadlines, cancellation and
 //! time come in through a [`Watch`].
-pub mod backend;
-pub mod cpu;
-pub mod distance;
-mod early_stop;
-pub mod ego;
-mod error;
-pub mod evaluate;
-pub mod field;
-mod loss;
-mod optimizer;
-mod options;//!
+//!
 //! ```
 //! use fnsf::flow::cpu::CpuBackend;
 //! use fnsf::flow::simulate::{Street, StreetOptions};
@@ -33,12 +23,30 @@ mod options;//!
 //! # }
 //! ```
 
+// What goes in and comes out, and the loop between.
+mod error;
+mod options;
 mod points;
 mod preprocess;
-mod random;
-pub mod simulate;
 mod solver;
 mod watch;
+
+// What a point is pulled toward, and what moves it.
+pub mod distance;
+pub mod ego;
+pub mod field;
+mod loss;
+
+// How the field is fitted, and on what.
+pub mod backend;
+pub mod cpu;
+mod early_stop;
+mod optimizer;
+
+// How good a flow is, and streets to try it on.
+pub mod evaluate;
+mod random;
+pub mod simulate;
 
 #[cfg(test)]
 mod reference;
