@@ -158,8 +158,9 @@ pub struct LossOptions {
     /// The margin grows with a point's range by this, metres a metre: so does the distance between
     /// a lidar's samples.
     pub margin_slope: f32,
-    /// Where given, `margin_slope` is raised to this quantile, 0 to 1, of distance over range
-    /// before the field moves anything: the sparser the clouds, the wider the margin.
+    /// Where given, and the ego motion is known, `margin_slope` is raised to this quantile, 0 to 1,
+    /// of distance over range before the field moves anything: the sparser the clouds, the wider
+    /// the margin. Without the ego motion those distances are motion, and the slope stays.
     pub margin_quantile: Option<f32>,
     /// Distances count no further than this, metres.
     pub truncation_m: Option<f32>,

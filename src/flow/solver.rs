@@ -109,7 +109,7 @@ pub fn estimate(
     };
     let distance_bytes = transform.bytes();
     let mut options = options.clone();
-    if let Some(share) = options.loss.margin_quantile {
+    if let (Some(share), Some(_)) = (options.loss.margin_quantile, &ego) {
         let distances = transform.distances(&aligned);
         let ranges = aligned.iter().map(|&point| length(point).max(1.0));
         let slopes = distances
