@@ -8,6 +8,7 @@ use clap::Args;
 use super::eval::print_score;
 use super::failure::Failure;
 use super::flow::{Estimation, Loading};
+use super::output::say;
 use super::synth::labelled;
 use crate::flow::simulate::{Street, StreetOptions};
 use crate::formats::FlowFile;
@@ -31,11 +32,11 @@ impl Demo {
         })
         .map_err(Failure::internal)?;
         let mut pair = labelled(street.pair(0).map_err(Failure::internal)?);
-        println!(
+        say(format_args!(
             "a simulated street: {} points, then {}, 0.1 s apart",
             grouped(pair.source.len()),
             grouped(pair.target.len())
-        );
+        ))?;
         std::fs::create_dir_all(&self.output)
             .with_context(|| format!("cannot make {}", self.output.display()))
             .map_err(Failure::internal)?;
@@ -43,15 +44,21 @@ impl Demo {
         let loading = Loading::begin();
         let estimation = self.estimation.clone().masking_ground();
         let solved = estimation.solve(&pair, &loading)?;
-        solved.report.print();
+        solved.report.print()?;
 
         let flow = self.output.join("flow.npz");
         let picture = self.output.join("flow.png");
         solved.write(&pair, &flow)?;
         solved.draw(&pair, &picture)?;
-        println!("  wrote {} and {}", flow.display(), picture.display());
+        say(format_args!(
+            "  wrote {} and {}",
+            flow.display(),
+            picture.display()
+        ))?;
 
-        println!("against the simulator's truth, ground left out:");
+        say(format_args!(
+            "against the simulator's truth, ground left out:"
+        ))?;
         let truth = pair.truth.take().unwrap_or_default();
         let estimate = solved.estimate;
         let flow = FlowFile {

@@ -6,6 +6,7 @@ use clap::Args;
 
 use super::failure::Failure;
 use super::machine::available_bytes;
+use super::output::say;
 use crate::flow::cpu::{Isa, NetworkWorkload};
 
 /// Points of the measured cloud: tens of milliseconds at most.
@@ -17,25 +18,34 @@ pub(super) struct Doctor {}
 impl Doctor {
     pub(super) fn run(&self) -> Result<(), Failure> {
         let threads = std::thread::available_parallelism().map_or(1, usize::from);
-        println!("fnsf {}", env!("CARGO_PKG_VERSION"));
-        println!("cpu: {threads} threads");
+        say(format_args!("fnsf {}", env!("CARGO_PKG_VERSION")))?;
+        say(format_args!("cpu: {threads} threads"))?;
         for (place, isa) in Isa::available().into_iter().enumerate() {
             let used = if place == 0 { ", used" } else { "" };
-            println!(
+            say(format_args!(
                 "  {}: network at {:.0} GFLOP/s a thread{used}",
                 isa.name(),
                 network_speed(isa) / 1e9
-            );
+            ))?;
         }
         if !Isa::available().contains(&Isa::Avx2) {
-            println!("  no AVX2: the portable kernels are several times slower");
-            println!("  in a virtual machine, pass the host's CPU features through");
+            say(format_args!(
+                "  no AVX2: the portable kernels are several times slower"
+            ))?;
+            say(format_args!(
+                "  in a virtual machine, pass the host's CPU features through"
+            ))?;
         }
         match available_bytes() {
-            Some(bytes) => println!("memory: {:.1} GB available", bytes as f64 / 1e9),
-            None => println!("memory: this system does not say"),
+            Some(bytes) => say(format_args!(
+                "memory: {:.1} GB available",
+                bytes as f64 / 1e9
+            ))?,
+            None => say(format_args!("memory: this system does not say"))?,
         }
-        println!("gpu: none, this version computes on the CPU only");
+        say(format_args!(
+            "gpu: none, this version computes on the CPU only"
+        ))?;
         Ok(())
     }
 }

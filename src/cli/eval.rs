@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use super::failure::Failure;
 use super::files;
+use super::output::say;
 use crate::flow::evaluate::{
     Argoverse2, Metrics, Part, ThreeWay, Truth, evaluate, evaluate_argoverse2,
 };
@@ -108,21 +109,28 @@ impl Report {
     }
 
     /// What a person reads.
-    fn print(&self) {
+    fn print(&self) -> Result<(), Failure> {
         let metres = |value: Option<f64>| value.map_or("-".to_owned(), |m| format!("{m:.4} m"));
-        println!("{} points scored", grouped(self.points));
-        println!("  EPE          {:.4} m", self.epe);
-        println!("    moving     {}", metres(self.epe_dynamic));
-        println!("    static     {}", metres(self.epe_static));
-        println!("  Acc5, Acc10  {:.4}, {:.4}", self.acc5, self.acc10);
-        println!("  outliers     {:.4}", self.outliers);
-        println!("  angle        {:.4} rad", self.angle_error);
+        say(format_args!("{} points scored", grouped(self.points)))?;
+        say(format_args!("  EPE          {:.4} m", self.epe))?;
+        say(format_args!("    moving     {}", metres(self.epe_dynamic)))?;
+        say(format_args!("    static     {}", metres(self.epe_static)))?;
+        say(format_args!(
+            "  Acc5, Acc10  {:.4}, {:.4}",
+            self.acc5, self.acc10
+        ))?;
+        say(format_args!("  outliers     {:.4}", self.outliers))?;
+        say(format_args!("  angle        {:.4} rad", self.angle_error))?;
         if let Some(three_way) = &self.three_way {
-            println!("  three-way    {} (within 35 m)", metres(three_way.epe));
+            say(format_args!(
+                "  three-way    {} (within 35 m)",
+                metres(three_way.epe)
+            ))?;
         }
         if let Some(iou) = self.argoverse2.dynamic_iou {
-            println!("  moving IoU   {iou:.4}");
+            say(format_args!("  moving IoU   {iou:.4}"))?;
         }
+        Ok(())
     }
 }
 
@@ -148,7 +156,7 @@ fn score(flow: &FlowFile, truth: &PairTruth, pair: &Pair) -> Result<Report, Fail
 
 /// Prints how good a flow is, for people.
 pub(super) fn print_score(flow: &FlowFile, truth: &PairTruth, pair: &Pair) -> Result<(), Failure> {
-    score(flow, truth, pair).map(|report| report.print())
+    score(flow, truth, pair)?.print()
 }
 
 impl Eval {
@@ -161,9 +169,9 @@ impl Eval {
         let report = score(&flow, &truth, &pair)?;
         if self.json {
             let json = serde_json::to_string(&report).map_err(Failure::internal)?;
-            println!("{json}");
+            say(format_args!("{json}"))?;
         } else {
-            report.print();
+            report.print()?;
         }
         Ok(())
     }

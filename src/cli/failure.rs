@@ -17,6 +17,7 @@ enum Kind {
     Usage,
     BadInput,
     Internal,
+    ReaderGone,
 }
 
 impl Failure {
@@ -44,8 +45,22 @@ impl Failure {
         }
     }
 
+    /// Nobody reads the answer any more; whoever asked has what it wanted.
+    pub(super) fn reader_gone(error: impl Into<anyhow::Error>) -> Self {
+        Self {
+            kind: Kind::ReaderGone,
+            error: error.into(),
+        }
+    }
+
+    /// Whether there is something to say about it.
+    pub(super) fn is_worth_a_word(&self) -> bool {
+        self.kind != Kind::ReaderGone
+    }
+
     pub(super) fn exit_code(&self) -> ExitCode {
         ExitCode::from(match self.kind {
+            Kind::ReaderGone => 0,
             Kind::Usage => 2,
             Kind::BadInput => 65,
             Kind::Internal => 70,

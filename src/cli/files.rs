@@ -8,7 +8,7 @@ use anyhow::{Context, anyhow};
 
 use super::failure::Failure;
 use crate::flow::{Point, RigidTransform};
-use crate::formats::{self, FlowFile, FormatError, Pair, PairTruth};
+use crate::formats::{self, FileKind, FlowFile, FormatError, Pair, PairTruth};
 
 /// A whole file, up to the largest that is taken.
 pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, Failure> {
@@ -54,8 +54,16 @@ pub(super) fn read_flow(path: &Path) -> Result<FlowFile, Failure> {
 
 /// Ground truth: a pair with `flow`, or Argoverse 2's labels.
 pub(super) fn read_truth(path: &Path) -> Result<(PairTruth, Pair), Failure> {
-    read(path, |bytes, _| {
+    read(path, |bytes, name| {
         if !formats::is_pair(bytes) {
+            let kind = formats::recognize(bytes, name)?;
+            if kind != FileKind::Feather {
+                let detail = "truth is an npz pair with flow, or Argoverse 2's flow_labels.feather";
+                return Err(FormatError::Unsupported {
+                    kind,
+                    detail: detail.to_owned(),
+                });
+            }
             let labels = formats::read_av2_labels(bytes)?;
             let ground = formats::Ground {
                 source: labels.ground,
@@ -71,7 +79,7 @@ pub(super) fn read_truth(path: &Path) -> Result<(PairTruth, Pair), Failure> {
         match pair.truth.take() {
             Some(truth) => Ok((truth, pair)),
             None => Err(FormatError::Missing {
-                kind: formats::FileKind::Npz,
+                kind: FileKind::Npz,
                 what: "flow".to_owned(),
                 present: "two clouds without truth".to_owned(),
             }),

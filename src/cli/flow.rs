@@ -9,6 +9,7 @@ use serde::Serialize;
 use super::failure::Failure;
 use super::files;
 use super::machine::{Device, peak_resident_bytes};
+use super::output::say;
 use super::terminal::Terminal;
 use crate::flow::{self, Ego, Estimate, Ground, Options, Preset, Problem, Watch};
 use crate::formats::{FlowFormat, FlowTable, Pair, matrix_rows, write_flow};
@@ -53,7 +54,7 @@ pub(super) struct Estimation {
     #[arg(long, value_enum, default_value_t = Device::Auto)]
     device: Device,
     /// CPU threads; all cores by default. The result does not depend on it
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: Option<u16>,
     /// The same seed gives the same bits
     #[arg(long, value_name = "N", default_value_t = 0)]
@@ -240,26 +241,29 @@ pub(super) struct Seconds {
 
 impl Report {
     /// What a person reads.
-    pub(super) fn print(&self) {
+    pub(super) fn print(&self) -> Result<(), Failure> {
         let seconds = &self.seconds;
-        println!(
+        say(format_args!(
             "flow of {} points in {:.2} s on {}",
             grouped(self.points),
             seconds.total,
             self.device
-        );
-        println!(
+        ))?;
+        say(format_args!(
             "  load {:.2} s, precompute {:.2} s, query {:.2} s, network {:.2} s",
             seconds.load, seconds.precompute, seconds.query, seconds.network
-        );
-        println!(
+        ))?;
+        say(format_args!(
             "  preset {}, seed {}: {} iterations ({}), loss {:.4} m",
             self.preset, self.seed, self.iterations, self.stop_reason, self.best_loss
-        );
+        ))?;
         if let Some(motion) = self.ego_motion {
             let [x, y, z] = [motion[0][3], motion[1][3], motion[2][3]];
-            println!("  ego motion {x:.3}, {y:.3}, {z:.3} m (target from source)");
+            say(format_args!(
+                "  ego motion {x:.3}, {y:.3}, {z:.3} m (target from source)"
+            ))?;
         }
+        Ok(())
     }
 }
 
@@ -291,11 +295,11 @@ impl Flow {
         }
         if self.json {
             let json = serde_json::to_string(&solved.report).map_err(Failure::internal)?;
-            println!("{json}");
+            say(format_args!("{json}"))?;
         } else {
-            solved.report.print();
+            solved.report.print()?;
             for path in self.output.iter().chain(&self.picture) {
-                println!("  wrote {}", path.display());
+                say(format_args!("  wrote {}", path.display()))?;
             }
         }
         Ok(())

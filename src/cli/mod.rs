@@ -2,7 +2,6 @@
 //!
 //! Answers go to stdout, progress and errors to stderr. It knows the other rooms; none knows it.
 #![expect(
-    clippy::print_stdout,
     clippy::print_stderr,
     reason = "printing is what a command line is for"
 )]
@@ -10,6 +9,7 @@
 mod failure;
 mod files;
 mod machine;
+mod output;
 mod terminal;
 
 mod demo;
@@ -56,7 +56,9 @@ pub fn run(arguments: Arguments) -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            eprintln!("fnsf: {failure}");
+            if failure.is_worth_a_word() {
+                eprintln!("fnsf: {failure}");
+            }
             failure.exit_code()
         }
     }

@@ -7,6 +7,7 @@ use clap::Args;
 
 use super::failure::Failure;
 use super::files;
+use super::output::say;
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
 use crate::formats::{CloudFormat, Ground, Pair, PairTruth, write_cloud, write_pair_npz};
 use crate::text::grouped;
@@ -83,12 +84,12 @@ impl Synth {
             let path = self.output.join(format!("pair_{index:04}.npz"));
             files::write(&path, |file| write_pair_npz(&pair, file))?;
         }
-        println!(
+        say(format_args!(
             "{} frames, {} points, in {}",
             self.frames,
             grouped(points),
             self.output.display()
-        );
+        ))?;
         Ok(())
     }
 }

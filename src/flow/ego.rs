@@ -4,7 +4,7 @@
 //! scale shrinks from two metres to a cell, so that movers and occluded points lose their say. Needs
 //! no correspondences. Knows only the transform, never the target's points.
 
-use nalgebra::{Isometry3, Matrix6, Point3, Vector3, Vector6};
+use nalgebra::{Isometry3, Matrix6, Point3, Translation3, UnitQuaternion, Vector3, Vector6};
 
 use super::distance::DistanceTransform;
 use super::points::{Point, RigidTransform};
@@ -33,16 +33,22 @@ pub fn align(source: &[Point], distance: &DistanceTransform) -> RigidTransform {
         .step_by(stride)
         .map(|p| Point3::from(p.map(f64::from)))
         .collect();
+    let Some(center) = mean(&points) else {
+        return RigidTransform::identity();
+    };
     let mut target_from_source = RigidTransform::identity();
     for step in 0..STEPS {
         let shrunk = (step as f64 / SHRINKING_STEPS as f64).min(1.0);
         let scale = FIRST_SCALE_M * (LAST_SCALE_M / FIRST_SCALE_M).powf(shrunk);
-        let Some(update) = gauss_newton_step(&points, &target_from_source, distance, scale) else {
+        let pivot = target_from_source * center;
+        let moved: Vec<_> = points.iter().map(|p| target_from_source * p).collect();
+        let Some(update) = gauss_newton_step(&moved, pivot, distance, scale) else {
             break;
         };
         let translation = Vector3::new(update[0], update[1], update[2]);
-        let rotation = Vector3::new(update[3], update[4], update[5]);
-        target_from_source = Isometry3::new(translation, rotation) * target_from_source;
+        let rotation = UnitQuaternion::new(Vector3::new(update[3], update[4], update[5]));
+        let turn = Isometry3::rotation_wrt_point(rotation, pivot);
+        target_from_source = Translation3::from(translation) * turn * target_from_source;
         if shrunk == 1.0 && update.norm() < STEP_TOLERANCE {
             break;
         }
@@ -50,21 +56,28 @@ pub fn align(source: &[Point], distance: &DistanceTransform) -> RigidTransform {
     target_from_source
 }
 
-/// The update (translation, rotation vector) that minimizes the weighted, linearized distances.
+/// The middle of the points; none where there are none.
+fn mean(points: &[Point3<f64>]) -> Option<Point3<f64>> {
+    let sum: Vector3<f64> = points.iter().map(|p| p.coords).sum();
+    (!points.is_empty()).then(|| Point3::from(sum / points.len() as f64))
+}
+
+/// The update (translation, then rotation vector about `pivot`) that minimizes the weighted,
+/// linearized distances of the points. About their middle, so that clouds far from the origin are
+/// as well conditioned as near ones.
 fn gauss_newton_step(
     points: &[Point3<f64>],
-    target_from_source: &RigidTransform,
+    pivot: Point3<f64>,
     distance: &DistanceTransform,
     scale: f64,
 ) -> Option<Vector6<f64>> {
     let mut normal = Matrix6::identity() * DAMPING;
     let mut gradient = Vector6::zeros();
-    for point in points {
-        let moved = target_from_source * point;
+    for moved in points {
         let sample = distance.sample([moved.x as f32, moved.y as f32, moved.z as f32]);
         let residual = f64::from(sample.distance);
         let slope = Vector3::from(sample.gradient.map(f64::from));
-        let turning = moved.coords.cross(&slope);
+        let turning = (moved - pivot).cross(&slope);
         let jacobian = Vector6::new(slope.x, slope.y, slope.z, turning.x, turning.y, turning.z);
         let weight = (scale * scale / (scale * scale + residual * residual)).powi(2);
         normal += jacobian * jacobian.transpose() * weight;

@@ -188,3 +188,57 @@ fn wrong_arguments_are_refused_with_exit_code_2_before_any_work() {
         assert!(!ended.stderr.is_empty());
     }
 }
+
+#[test]
+fn a_reader_that_goes_away_is_no_failure() {
+    use std::process::{Command, Stdio};
+    let mut child = Command::new(env!("CARGO_BIN_EXE_fnsf"))
+        .arg("doctor")
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("the program starts");
+    drop(child.stdout.take());
+    let ended = child.wait_with_output().expect("the child is ours");
+    assert!(ended.status.success(), "{ended:?}");
+    assert!(ended.stderr.is_empty(), "{ended:?}");
+}
+
+#[test]
+fn clouds_far_from_the_origin_align_as_near_ones_do() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder);
+    // Single precision resolves 4 mm at 50 km; the motion is that of the same street at home.
+    let shifted = |name: &str| {
+        let pcd = std::fs::read(folder.join(name)).expect("written");
+        let cloud = fnsf::formats::read_cloud(&pcd, None)
+            .expect("a cloud")
+            .points;
+        let far: Vec<_> = cloud.iter().map(|p| [p[0] + 5e4, p[1], p[2]]).collect();
+        let mut file = Vec::new();
+        fnsf::formats::write_cloud(fnsf::formats::CloudFormat::Npy, &far, &mut file)
+            .expect("memory takes all");
+        std::fs::write(folder.join(format!("{name}.npy")), file).expect("written");
+    };
+    let names = ["street/frame_0000.pcd", "street/frame_0001.pcd"];
+    names.iter().for_each(|name| shifted(name));
+    let near = json(
+        folder,
+        &["flow", names[0], names[1], "-o", "near.npy", "--json"],
+    );
+    let far_names = names.map(|name| format!("{name}.npy"));
+    let far = json(
+        folder,
+        &[
+            "flow",
+            &far_names[0],
+            &far_names[1],
+            "-o",
+            "far.npy",
+            "--json",
+        ],
+    );
+    let turn = |report: &serde_json::Value| report["ego_motion"][1][0].as_f64().expect("a number");
+    assert!((turn(&near) - turn(&far)).abs() < 1e-3, "{near} {far}");
+}
