@@ -1,9 +1,9 @@
 //! Scene flow as a service: two lidar clouds in, the motion of every point out.
 //!
 //! ```text
-//! file - formats -> Problem -> flow::estimate -> Estimate -> formats - file
-//!                                  preprocess -> distance -> backend.start(distance, field)
-//!                                  loop { forward, query, backward, adam } -> early stop -> best flow
+//! file - formats -> Problem -> flow::estimate -> Estimate -> formats, picture - file
+//!     preprocess -> backend.transform -> align -> start
+//!     loop { forward, query, backward, Adam } -> early stop -> evaluate
 //! ```
 //!
 //! [`flow`] is the numerics and knows nothing of files, clocks or services; everything else may

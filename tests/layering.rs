@@ -53,6 +53,10 @@ fn collect(folder: &Path, files: &mut Vec<PathBuf>) {
 /// Every line of the files under `room` that holds one of `words`.
 fn uses(room: &str, words: &[&str]) -> Vec<String> {
     let mut found = Vec::new();
+    assert!(
+        sources().iter().any(|source| source.path.starts_with(room)),
+        "no file lies under {room}"
+    );
     for source in sources()
         .iter()
         .filter(|source| source.path.starts_with(room))

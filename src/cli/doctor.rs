@@ -11,6 +11,7 @@ use crate::flow::cpu::{Isa, NetworkWorkload};
 
 /// Points of the measured cloud: tens of milliseconds at most.
 const POINTS: usize = 2048;
+
 /// Show devices and what they can do.
 #[derive(Debug, Args)]
 pub(super) struct Doctor {}

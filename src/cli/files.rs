@@ -1,7 +1,7 @@
 //! Files on disk to values and back, with errors that name the file.
 
 use std::fs::{self, File};
-use std::io::{BufWriter, Write};
+use std::io::{BufWriter, Read, Write};
 use std::path::Path;
 
 use anyhow::{Context, anyhow};
@@ -10,9 +10,22 @@ use super::failure::Failure;
 use crate::flow::{Point, RigidTransform};
 use crate::formats::{self, FileKind, FlowFile, FormatError, Pair, PairTruth};
 
+/// The largest file that is read, bytes.
+const MAX_FILE: u64 = 4 << 30;
+
 /// A whole file, up to the largest that is taken.
 pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, Failure> {
-    fs::read(path)
+    let read = || -> anyhow::Result<Vec<u8>> {
+        let mut bytes = Vec::new();
+        File::open(path)?
+            .take(MAX_FILE + 1)
+            .read_to_end(&mut bytes)?;
+        if bytes.len() as u64 > MAX_FILE {
+            return Err(anyhow!("more than {MAX_FILE} bytes"));
+        }
+        Ok(bytes)
+    };
+    read()
         .with_context(|| format!("cannot read {}", path.display()))
         .map_err(Failure::bad_input)
 }
@@ -36,15 +49,21 @@ pub(super) fn read_cloud(path: &Path) -> Result<Vec<Point>, Failure> {
 
 /// Two sweeps in one `.npz`.
 pub(super) fn read_pair(path: &Path) -> Result<Pair, Failure> {
-    read(path, |bytes, _| {
-        if formats::is_pair(bytes) {
-            return formats::read_pair(bytes);
+    let bytes = read_bytes(path)?;
+    let name = path.file_name().map(|name| name.to_string_lossy());
+    let pair = if formats::is_pair(&bytes) {
+        formats::read_pair(&bytes)
+    } else {
+        match formats::read_cloud(&bytes, name.as_deref()) {
+            Ok(_) => {
+                let message = format!("{} is one cloud: give the target too", path.display());
+                return Err(Failure::usage(anyhow!(message)));
+            }
+            Err(error) => Err(error),
         }
-        // What it is instead: an error of its own, or a cloud where two are needed.
-        formats::read_cloud(bytes, path.to_str()).and(Err(FormatError::Ambiguous(
-            "this is one cloud: give the target's file too".to_owned(),
-        )))
-    })
+    };
+    pair.with_context(|| path.display().to_string())
+        .map_err(Failure::bad_input)
 }
 
 /// A flow of any format.
@@ -101,23 +120,43 @@ pub(super) fn read_motion(path: &Path) -> Result<RigidTransform, Failure> {
         .map_err(Failure::bad_input)
 }
 
-/// Writes a file through `writer`; a failed write leaves no half file under the name.
+/// Refuses, before any work, a file whose folder is not there.
+pub(super) fn check_writable(path: &Path) -> Result<(), Failure> {
+    let folder = path
+        .parent()
+        .filter(|folder| !folder.as_os_str().is_empty());
+    if folder.is_some_and(|folder| !folder.is_dir()) {
+        let message = format!("cannot write {}: its folder is not there", path.display());
+        return Err(Failure::internal(anyhow!(message)));
+    }
+    Ok(())
+}
+
+/// Writes a file through `writer`; a failed write leaves no half file under the name. Links are
+/// followed, and what is no regular file (a pipe, a device) is written in place.
 pub(super) fn write<E: std::error::Error + Send + Sync + 'static>(
     path: &Path,
     writer: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
 ) -> Result<(), Failure> {
-    let unfinished = path.with_added_extension("part");
-    let written = (|| -> anyhow::Result<()> {
-        let mut file = BufWriter::new(File::create(&unfinished)?);
-        writer(&mut file)?;
-        file.flush()?;
-        fs::rename(&unfinished, path)?;
-        Ok(())
-    })();
-    written
-        .with_context(|| format!("cannot write {}", path.display()))
-        .map_err(|error| {
+    let written = || -> anyhow::Result<()> {
+        let place = fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+        if place.exists() && !place.is_file() {
+            let mut file = BufWriter::new(File::create(&place)?);
+            writer(&mut file)?;
+            return Ok(file.flush()?);
+        }
+        let unfinished = place.with_added_extension(format!("{}.part", std::process::id()));
+        let mut file = BufWriter::new(File::create_new(&unfinished)?);
+        let done = writer(&mut file)
+            .map_err(anyhow::Error::from)
+            .and_then(|()| Ok(file.flush()?))
+            .and_then(|()| Ok(fs::rename(&unfinished, &place)?));
+        if done.is_err() {
             let _ = fs::remove_file(&unfinished);
-            Failure::internal(error)
-        })
+        }
+        done
+    };
+    written()
+        .with_context(|| format!("cannot write {}", path.display()))
+        .map_err(Failure::internal)
 }

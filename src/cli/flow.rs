@@ -60,8 +60,8 @@ pub(super) struct Estimation {
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub(super) seed: u64,
     /// Draw this many points from each cloud and leave out the rest
-    #[arg(long, value_name = "N")]
-    max_points: Option<usize>,
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(3..))]
+    max_points: Option<u32>,
     /// Leave out points with |x| or |y| beyond R metres
     #[arg(long, value_name = "R", value_parser = positive)]
     range_m: Option<f32>,
@@ -95,8 +95,10 @@ fn positive(text: &str) -> Result<f32, String> {
 }
 
 impl Estimation {
-    fn options(&self) -> Result<Options, Failure> {
-        let mut options = self.preset.options(self.max_points);
+    fn options(&self, pair: &Pair) -> Result<Options, Failure> {
+        let all = pair.source.len().max(pair.target.len());
+        let drawn = self.max_points.map(|points| points as usize);
+        let mut options = self.preset.options(drawn.filter(|&points| points < all));
         options.seed = self.seed;
         options.range_m = self.range_m;
         options.ground = match self.ground {
@@ -120,7 +122,7 @@ impl Estimation {
 
     /// Estimates the pair's flow; `began` is when loading began, by the terminal's clock.
     pub(super) fn solve(&self, pair: &Pair, began: &Loading) -> Result<Solved, Failure> {
-        let options = self.options()?;
+        let options = self.options(pair)?;
         let load = began.terminal.seconds();
         let backend = self
             .device
@@ -276,6 +278,13 @@ impl Flow {
         }
         if let Some(output) = &self.output {
             FlowFormat::from_path(output).map_err(Failure::usage)?;
+            files::check_writable(output)?;
+        }
+        if let Some(picture) = &self.picture {
+            if picture.extension().is_none_or(|ending| ending != "png") {
+                return Err(Failure::usage(anyhow!("a picture's name ends in .png")));
+            }
+            files::check_writable(picture)?;
         }
         let loading = Loading::begin();
         let pair = match &self.target {

@@ -16,7 +16,10 @@ impl Device {
     /// Opens the device; `threads` bounds the CPU's.
     pub(super) fn open(self, threads: Option<usize>) -> Result<Box<dyn Backend>, BackendError> {
         match self {
-            Self::Auto | Self::Cpu => Ok(Box::new(CpuBackend::new(threads)?)),
+            Self::Auto | Self::Cpu => {
+                let cores = std::thread::available_parallelism().map_or(1, usize::from);
+                Ok(Box::new(CpuBackend::new(Some(threads.unwrap_or(cores)))?))
+            }
         }
     }
 }

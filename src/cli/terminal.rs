@@ -1,4 +1,4 @@
-//! A clock and a progress bar for the numerics,.
+//! A clock and a progress bar for the numerics.
 
 use std::time::Instant;
 

@@ -2,7 +2,6 @@
 
 /// Decay of the mean of the gradients.
 const BETA1: f64 = 0.9;
-
 /// Decay of the mean of their squares.
 const BETA2: f64 = 0.999;
 /// Keeps the quotient finite.

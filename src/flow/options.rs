@@ -39,7 +39,7 @@ impl Preset {
 pub struct Options {
     /// Drives every random choice: the same seed gives the same bits.
     pub seed: u64,
-    /// Points drawn from each cloud before anything else; all of them where none.
+    /// Points drawn from what range and ground leave of each cloud; all of them where none.
     pub max_points: Option<usize>,
     /// Points with `|x|` or `|y|` beyond this are left out, metres.
     pub range_m: Option<f32>,

@@ -37,12 +37,14 @@ pub(crate) fn select(problem: &Problem, options: &Options) -> Result<Selection, 
     let mut rows = kept("source", problem.source, masks[0], options)?;
     let mut target_rows = kept("target", problem.target, masks[1], options)?;
     if let Some(max_points) = options.max_points {
-        // One permutation for both clouds, as the published code draws it.
-        let mut order: Vec<usize> = (0..rows.len().min(target_rows.len())).collect();
+        // One permutation for both clouds, as the published code draws it; but each cloud is drawn
+        // from all of its rows, which lie in the order of the scan.
+        let mut order: Vec<usize> = (0..rows.len().max(target_rows.len())).collect();
         Random::stream(options.seed, 1).shuffle(&mut order);
-        order.truncate(max_points);
-        rows = order.iter().map(|&i| rows[i]).collect();
-        target_rows = order.iter().map(|&i| target_rows[i]).collect();
+        for rows in [&mut rows, &mut target_rows] {
+            let drawn = order.iter().filter_map(|&i| rows.get(i).copied());
+            *rows = drawn.take(max_points).collect();
+        }
     }
     for (cloud, rows) in [("source", &rows), ("target", &target_rows)] {
         if rows.len() < MIN_POINTS {
@@ -131,6 +133,26 @@ mod tests {
         unique.dedup();
         assert_eq!(unique.len(), 40);
         assert_ne!(first, second);
+    }
+
+    #[test]
+    fn each_cloud_is_sampled_from_all_of_its_rows() {
+        let line = |count: usize| {
+            (0..count)
+                .map(|i| [i as f32, 0.0, 0.0])
+                .collect::<Vec<Point>>()
+        };
+        let (source, target) = (line(50), line(4000));
+        let problem = Problem {
+            source: &source,
+            target: &target,
+            ground: None,
+        };
+        let selection = select(&problem, &Preset::Default.options(Some(300))).expect("points");
+        assert_eq!(selection.source.len(), 50);
+        assert_eq!(selection.target.len(), 300);
+        let last = selection.target.iter().map(|p| p[0]).fold(0.0, f32::max);
+        assert!(last > 3000.0, "{last}");
     }
 
     #[test]

@@ -35,7 +35,7 @@ pub struct Estimate {
     pub iterations: usize,
     /// The iteration whose field is the result.
     pub best_iteration: usize,
-    /// The loss of the result, metres.
+    /// The loss of the result, metres; comparable within one preset and pair.
     pub best_loss: f64,
     /// Why it ended.
     pub stop_reason: StopReason,
@@ -118,6 +118,9 @@ pub fn estimate(
             .map(|(d, range)| d / range)
             .collect();
         options.loss.margin_slope = options.loss.margin_slope.max(quantile(slopes, share));
+    }
+    if watch.interrupt() == Some(Interrupt::Cancelled) {
+        return Err(FlowError::Cancelled);
     }
     let mut trainer = transform.start(&aligned, &options)?;
     let precomputed = watch.seconds();

@@ -9,7 +9,8 @@ pub struct Progress {
     pub iteration: usize,
     /// Iterations at most.
     pub max_iterations: usize,
-    /// Mean distance of the deformed points to the target, metres.
+    /// Mean loss of the iteration's points, metres: for the published method the distance to the
+    /// target.
     pub loss: f64,
 }
 

@@ -137,6 +137,7 @@ mod tests {
 
     /// The largest difference, relative to the largest reference value.
     fn worst(values: &[f64], reference: &[f64]) -> f64 {
+        assert!(values.iter().all(|v| v.is_finite()), "not finite");
         let scale = reference.iter().fold(1e-12f64, |a, r| a.max(r.abs()));
         let difference = |(v, r): (&f64, &f64)| (v - r).abs() / scale;
         values

@@ -11,9 +11,10 @@
 ///
 /// # Safety
 ///
-/// Every function requires the CPU features of the implementation; `load` and `store` require
-/// `COUNT` valid floats at the pointer.
-pub(super) trait Lanes: Copy {
+/// `COUNT` is the number of floats that `load` reads and `store` writes. Every function requires
+/// the CPU features of the implementation; `load` and `store` require `COUNT` valid floats at the
+/// pointer.
+pub(super) unsafe trait Lanes: Copy {
     /// Floats in one register.
     const COUNT: usize;
     unsafe fn splat(value: f32) -> Self;
@@ -42,7 +43,8 @@ mod x86 {
     #[derive(Clone, Copy)]
     pub(in crate::flow::cpu) struct F32x16(__m512);
 
-    impl Lanes for F32x16 {
+    // SAFETY: 16 floats fill the register.
+    unsafe impl Lanes for F32x16 {
         const COUNT: usize = 16;
 
         #[inline(always)]
@@ -94,7 +96,8 @@ mod x86 {
     #[derive(Clone, Copy)]
     pub(in crate::flow::cpu) struct F32x8(__m256);
 
-    impl Lanes for F32x8 {
+    // SAFETY: 8 floats fill the register.
+    unsafe impl Lanes for F32x8 {
         const COUNT: usize = 8;
 
         #[inline(always)]
@@ -149,7 +152,8 @@ mod x86 {
 #[derive(Clone, Copy)]
 pub(super) struct F32x4([f32; 4]);
 
-impl Lanes for F32x4 {
+// SAFETY: the array has 4 floats.
+unsafe impl Lanes for F32x4 {
     const COUNT: usize = 4;
 
     #[inline(always)]

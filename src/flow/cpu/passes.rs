@@ -12,7 +12,7 @@
 )]
 
 use super::lanes::Lanes;
-use super::tile::{STRIDE, TILE, Tile};
+use super::tile::{ROW_STEP, STRIDE, TILE, Tile};
 use crate::flow::field::mlp::{
     MIDDLE_LAYERS, PANEL, Parameters, WIDTH, first_layer, last_layer, middle_layer,
 };
@@ -29,8 +29,8 @@ struct Strided {
 /// `acc[r][..] += sum_k a[r][k] * b[k][..]`: `ROWS` x `VECTORS` registers.
 ///
 /// # Safety
-/// `a` has `ROWS` rows and `depth` steps, `b` has `depth` rows of `VECTORS` registers, 32 apart
-/// by `b_step`.
+/// `a` has `ROWS` rows and `depth` steps, `b` has `depth` rows of `VECTORS` registers, `b_step`
+/// floats apart.
 #[inline(always)]
 unsafe fn multiply<L: Lanes, const ROWS: usize, const VECTORS: usize>(
     acc: &mut [[L; VECTORS]; ROWS],
@@ -81,6 +81,9 @@ pub(super) unsafe fn forward<L: Lanes, const ROWS: usize, const VECTORS: usize>(
     parameters: &Parameters,
     tile: &mut Tile,
 ) {
+    const {
+        assert!(ROW_STEP.is_multiple_of(ROWS) && PANEL.is_multiple_of(VECTORS * L::COUNT));
+    }
     let rows = tile.padded_rows();
     let weights = parameters.as_slice().as_ptr();
     let activations = tile.activations.as_mut_slice().as_mut_ptr();
@@ -157,6 +160,10 @@ pub(super) unsafe fn backward<
     tile: &mut Tile,
     gradients: &mut Parameters,
 ) {
+    const {
+        assert!(ROW_STEP.is_multiple_of(ROWS) && PANEL.is_multiple_of(VECTORS * L::COUNT));
+        assert!((WIDTH % ROWS).is_multiple_of(TAIL));
+    }
     let rows = tile.padded_rows();
     let weights = parameters.as_slice().as_ptr();
     let transposes = transposed.as_slice().as_ptr();

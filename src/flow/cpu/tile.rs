@@ -7,7 +7,7 @@ use crate::flow::field::mlp::{Aligned, HIDDEN_LAYERS, WIDTH};
 /// Points in one tile: eight rows of activations of 96 points fill half of a 1 MiB cache.
 pub(crate) const TILE: usize = 96;
 /// Rows are padded to a multiple of this, which every kernel's row count divides.
-const ROW_STEP: usize = 12;
+pub(super) const ROW_STEP: usize = 12;
 /// Floats from one point's features to the next point's: 128 would map rows onto few cache sets.
 pub(super) const STRIDE: usize = WIDTH + 16;
 

@@ -393,6 +393,7 @@ mod tests {
                 .advance(STEPS as usize, &losses)
                 .expect("the cpu does not fail");
             let losses = losses.0.into_inner().expect("no test panics in it");
+            assert_eq!(losses.len(), expected.len(), "{isa:?}");
             for (loss, expected) in losses.iter().zip(&expected) {
                 let error = (loss - expected).abs() / expected;
                 assert!(error < TOLERANCE, "{isa:?}: {losses:?} {expected:?}");
