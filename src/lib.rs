@@ -14,8 +14,14 @@ pub mod flow;
 #[cfg(feature = "service")]
 pub mod cli;
 #[cfg(feature = "service")]
+mod clock;
+#[cfg(feature = "service")]
 pub mod formats;
 #[cfg(feature = "service")]
+pub mod job;
+#[cfg(feature = "service")]
 pub mod picture;
+#[cfg(feature = "service")]
+pub mod queue;
 #[cfg(feature = "service")]
 mod text;

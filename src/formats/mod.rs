@@ -27,7 +27,7 @@ pub use cloud::{Cloud, CloudFormat, read_cloud, write_cloud};
 pub use error::{FileKind, FormatError};
 pub use flow_file::{FlowFile, FlowFormat, FlowTable, read_flow, write_flow};
 pub use limits::{MAX_COORDINATE_M, MAX_POINTS};
-pub use motion::{matrix_rows, read_motion};
+pub use motion::{matrix_rows, read_motion, rigid_motion};
 pub use pair::{
     Av2Labels, Ground, Pair, PairTruth, is_pair, read_av2_labels, read_pair, write_pair_npz,
 };

@@ -29,13 +29,16 @@ pub fn read_motion(bytes: &[u8]) -> Result<RigidTransform, FormatError> {
     let Some(numbers) = numbers.ok().filter(|numbers| numbers.len() == 16) else {
         return Err(FormatError::Motion("16 numbers as text are needed"));
     };
-    rigid(&core::array::from_fn(|row| {
+    rigid_motion(&core::array::from_fn(|row| {
         core::array::from_fn(|column| numbers[4 * row + column])
     }))
 }
 
 /// The rigid transform that a 4 x 4 matrix is, refused if it scales, shears or mirrors.
-pub(super) fn rigid(rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError> {
+///
+/// # Errors
+/// [`FormatError::Motion`] where it is no rigid motion.
+pub fn rigid_motion(rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError> {
     let matrix = Matrix4::from_fn(|row, column| rows[row][column]);
     let rotation: Matrix3<f64> = matrix.fixed_view::<3, 3>(0, 0).into_owned();
     let departure = (rotation.transpose() * rotation - Matrix3::identity())

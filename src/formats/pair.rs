@@ -10,7 +10,7 @@ use super::cloud::read_columns;
 use super::error::{FileKind, FormatError};
 use super::feather::{FLOW_COLUMNS, Table};
 use super::limits::{check_flag, check_points};
-use super::motion::{matrix_rows, rigid};
+use super::motion::{matrix_rows, rigid_motion};
 use super::npy;
 use super::npz::{Npz, NpzWriter};
 use super::sniff::is_zip;
@@ -99,7 +99,7 @@ pub fn read_pair(bytes: &[u8]) -> Result<Pair, FormatError> {
     };
     let ego = npz
         .matrix("ego_SE3")?
-        .map(|rows| rigid(&rows))
+        .map(|rows| rigid_motion(&rows))
         .transpose()?;
     Ok(Pair {
         source,

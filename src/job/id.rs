@@ -1,0 +1,122 @@
+//! Names of jobs and of tenants: typed, short, and never a path.
+
+use std::fmt;
+use std::str::FromStr;
+use std::sync::Arc;
+
+use serde::{Serialize, Serializer};
+use uuid::Uuid;
+
+/// A job's name: a version 7 UUID, so that names sort by time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct JobId(Uuid);
+
+impl JobId {
+    /// A name that nobody has used.
+    pub fn fresh() -> Self {
+        Self(Uuid::now_v7())
+    }
+
+    /// From its 16 bytes.
+    pub fn from_bytes(bytes: [u8; 16]) -> Self {
+        Self(Uuid::from_bytes(bytes))
+    }
+
+    /// Its 16 bytes, which sort as the names do.
+    pub fn as_bytes(&self) -> &[u8; 16] {
+        self.0.as_bytes()
+    }
+}
+
+impl fmt::Display for JobId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.hyphenated().fmt(f)
+    }
+}
+
+impl Serialize for JobId {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+/// Not a job's or a tenant's name.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum InvalidId {
+    /// Not 8-4-4-4-12 hexadecimal digits.
+    #[error("a job's name is a UUID, such as 0192f0c1-7b7a-7000-8000-000000000000")]
+    Job,
+    /// Not 1 to 64 letters, digits, `-`, `_` or `.`.
+    #[error("a tenant's name has 1 to 64 letters, digits, '-', '_' or '.'")]
+    Tenant,
+}
+
+impl FromStr for JobId {
+    type Err = InvalidId;
+
+    fn from_str(text: &str) -> Result<Self, InvalidId> {
+        if text.len() != 36 {
+            return Err(InvalidId::Job);
+        }
+        Uuid::parse_str(text).map(Self).map_err(|_| InvalidId::Job)
+    }
+}
+
+/// Whose job it is.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Tenant(Arc<str>);
+
+impl Tenant {
+    /// Its name.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl Default for Tenant {
+    /// The tenant of a server without keys.
+    fn default() -> Self {
+        Self(Arc::from("default"))
+    }
+}
+
+impl FromStr for Tenant {
+    type Err = InvalidId;
+
+    fn from_str(text: &str) -> Result<Self, InvalidId> {
+        let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
+        if text.is_empty() || text.len() > 64 || !text.chars().all(plain) {
+            return Err(InvalidId::Tenant);
+        }
+        Ok(Self(Arc::from(text)))
+    }
+}
+
+impl fmt::Display for Tenant {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_come_back_from_their_text_and_paths_are_no_names() {
+        let id = JobId::fresh();
+        assert_eq!(id.to_string().parse(), Ok(id));
+        for wrong in ["", "../../etc/passwd", "0192f0c17b7a70008000000000000000", "x"] {
+            assert_eq!(wrong.parse::<JobId>(), Err(InvalidId::Job));
+        }
+        for wrong in ["", "a/b", "a b", &"x".repeat(65)] {
+            assert_eq!(wrong.parse::<Tenant>(), Err(InvalidId::Tenant));
+        }
+    }
+
+    #[test]
+    fn names_sort_by_time() {
+        let names: Vec<JobId> = (0..1000).map(|_| JobId::fresh()).collect();
+        assert!(names.is_sorted());
+    }
+}

@@ -1,0 +1,13 @@
+//! What a job is: its name, its options, its states, and what is known about it.
+//!
+//! The vocabulary that the doors, the queue and the workers share; it must not know any of them.
+
+mod id;
+mod options;
+mod record;
+
+pub use id::{InvalidId, JobId, Tenant};
+pub use options::{
+    DeviceChoice, EgoChoice, GroundChoice, InvalidOptions, JobOptions, PresetChoice, Priority,
+};
+pub use record::{Job, JobError, JobProgress, Kind, State};

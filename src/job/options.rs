@@ -1,0 +1,270 @@
+//! What a request may ask for: one set of names for the command line, HTTP and gRPC.
+//!
+//! Every field has a default and unknown keys are refused. What the names mean to the solver is
+//! said here and nowhere else; the presets' values stay in `flow/options.rs`.
+
+use std::time::Duration;
+
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use utoipa::ToSchema;
+
+use crate::flow::{self, Ego, Ground, MIN_POINTS, Preset, RigidTransform};
+use crate::formats::{matrix_rows, rigid_motion};
+
+/// The longest deadline that may be asked for.
+const MAX_DEADLINE: Duration = Duration::from_secs(24 * 60 * 60);
+
+/// How a pair's, or a sequence's, flow is found.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct JobOptions {
+    /// `default`: ours, robust and fast; `paper`: FNSF as published.
+    pub preset: PresetChoice,
+    /// The same seed gives the same bits.
+    pub seed: u64,
+    /// Draw this many points from each cloud and leave out the rest.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_points: Option<u32>,
+    /// Leave out points with |x| or |y| beyond this, metres.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub range_m: Option<f32>,
+    /// Keep ground points, or leave out those that the pair's own masks name.
+    pub ground: GroundChoice,
+    /// The vehicle's own motion: `off`, `auto` (estimate it first) or a 4 x 4 matrix
+    /// target_from_source; by default what the preset does.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<Object>)]
+    pub ego: Option<EgoChoice>,
+    /// Where the work is done.
+    pub device: DeviceChoice,
+    /// Milliseconds from the request's arrival after which the best flow so far is wanted.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub deadline_ms: Option<u64>,
+    /// Jobs of a higher priority are started first.
+    pub priority: Priority,
+}
+
+/// A named set of solver options.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum PresetChoice {
+    /// Ours: robust and fast.
+    #[default]
+    Default,
+    /// FNSF as published.
+    Paper,
+}
+
+impl PresetChoice {
+    /// The solver's preset.
+    pub fn preset(self) -> Preset {
+        match self {
+            Self::Default => Preset::Default,
+            Self::Paper => Preset::Paper,
+        }
+    }
+}
+
+/// What becomes of ground points.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[derive(clap::ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum GroundChoice {
+    /// They are points like any other.
+    #[default]
+    Keep,
+    /// Those that the pair's ground1 and ground2 name are left out.
+    Mask,
+}
+
+/// Where the work is done.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+#[derive(clap::ValueEnum)]
+pub enum DeviceChoice {
+    /// The fastest that is there: the CPU, in this version.
+    #[default]
+    Auto,
+    /// The CPU's vector units.
+    Cpu,
+}
+
+/// How urgent a job is. Higher ones always go first; within one, tenants share fairly.
+#[derive(
+    Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize,
+    ToSchema,
+)]
+#[serde(rename_all = "snake_case")]
+pub enum Priority {
+    /// Bulk work.
+    Low,
+    /// Everything else.
+    #[default]
+    Normal,
+    /// Somebody waits.
+    High,
+}
+
+impl Priority {
+    /// All priorities, lowest first.
+    pub const ALL: [Self; 3] = [Self::Low, Self::Normal, Self::High];
+
+    /// The name that requests and metrics use.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Low => "low",
+            Self::Normal => "normal",
+            Self::High => "high",
+        }
+    }
+}
+
+/// The vehicle's own motion.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum EgoChoice {
+    /// Part of what the field has to explain.
+    Off,
+    /// Estimated first.
+    Auto,
+    /// Known, as target_from_source.
+    Given(RigidTransform),
+}
+
+impl Serialize for EgoChoice {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        match self {
+            Self::Off => serializer.serialize_str("off"),
+            Self::Auto => serializer.serialize_str("auto"),
+            Self::Given(motion) => matrix_rows(motion).serialize(serializer),
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for EgoChoice {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let wanted = "ego is \"off\", \"auto\" or a 4 x 4 rigid matrix target_from_source";
+        match serde_json::Value::deserialize(deserializer)? {
+            serde_json::Value::String(name) if name == "off" => Ok(Self::Off),
+            serde_json::Value::String(name) if name == "auto" => Ok(Self::Auto),
+            rows @ serde_json::Value::Array(_) => {
+                let rows: [[f64; 4]; 4] =
+                    serde_json::from_value(rows).map_err(|_| D::Error::custom(wanted))?;
+                rigid_motion(&rows).map(Self::Given).map_err(D::Error::custom)
+            }
+            _ => Err(D::Error::custom(wanted)),
+        }
+    }
+}
+
+/// Options that make no sense.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum InvalidOptions {
+    /// Not the JSON object that is wanted.
+    #[error("options: {0}")]
+    Json(String),
+    /// Too few points to fit anything to.
+    #[error("options: max_points is {0}, at least {MIN_POINTS} are needed")]
+    MaxPoints(u32),
+    /// Not a positive number of metres.
+    #[error("options: range_m is {0}, a positive number of metres is needed")]
+    Range(f32),
+    /// No time at all, or more than a day.
+    #[error("options: deadline_ms is {0}, 1 to {max} are possible", max = MAX_DEADLINE.as_millis())]
+    Deadline(u64),
+}
+
+impl JobOptions {
+    /// Reads and checks one JSON object.
+    ///
+    /// # Errors
+    /// [`InvalidOptions`], which names the key and what it may be.
+    pub fn from_json(text: &[u8]) -> Result<Self, InvalidOptions> {
+        let options: Self =
+            serde_json::from_slice(text).map_err(|error| InvalidOptions::Json(error.to_string()))?;
+        options.check()?;
+        Ok(options)
+    }
+
+    /// One JSON object that [`JobOptions::from_json`] reads back.
+    pub fn to_json(&self) -> String {
+        serde_json::to_string(self).expect("every option has a JSON form")
+    }
+
+    /// Refuses values that make no sense.
+    ///
+    /// # Errors
+    /// [`InvalidOptions`], which names the key and what it may be.
+    pub fn check(&self) -> Result<(), InvalidOptions> {
+        if let Some(points) = self.max_points
+            && (points as usize) < MIN_POINTS
+        {
+            return Err(InvalidOptions::MaxPoints(points));
+        }
+        if let Some(range) = self.range_m
+            && !(range.is_finite() && range > 0.0)
+        {
+            return Err(InvalidOptions::Range(range));
+        }
+        if let Some(millis) = self.deadline_ms
+            && (millis == 0 || u128::from(millis) > MAX_DEADLINE.as_millis())
+        {
+            return Err(InvalidOptions::Deadline(millis));
+        }
+        Ok(())
+    }
+
+    /// The solver's options for clouds of which the larger has `points` points.
+    pub fn solver_options(&self, points: usize) -> flow::Options {
+        let drawn = self.max_points.map(|points| points as usize);
+        let mut options = self.preset.preset().options(drawn.filter(|&drawn| drawn < points));
+        options.seed = self.seed;
+        options.range_m = self.range_m;
+        options.ground = match self.ground {
+            GroundChoice::Keep => Ground::Keep,
+            GroundChoice::Mask => Ground::Mask,
+        };
+        match self.ego {
+            None => {}
+            Some(EgoChoice::Off) => options.ego = Ego::Off,
+            Some(EgoChoice::Auto) => options.ego = Ego::Auto,
+            Some(EgoChoice::Given(motion)) => options.ego = Ego::Given(motion),
+        }
+        options
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_empty_object_is_the_default_and_every_option_comes_back() {
+        assert_eq!(JobOptions::from_json(b"{}"), Ok(JobOptions::default()));
+        let text = br#"{"preset":"paper","seed":7,"max_points":8192,"range_m":51.2,"ground":"mask",
+            "ego":[[1,0,0,2],[0,1,0,0],[0,0,1,0],[0,0,0,1]],"device":"cpu","deadline_ms":300,"priority":"high"}"#;
+        let options = JobOptions::from_json(text).expect("good options");
+        assert_eq!(options.preset, PresetChoice::Paper);
+        assert_eq!(JobOptions::from_json(options.to_json().as_bytes()), Ok(options));
+    }
+
+    #[test]
+    fn unknown_keys_and_senseless_values_are_refused_by_name() {
+        for (text, said) in [
+            (r#"{"sead":1}"#, "unknown field `sead`"),
+            (r#"{"preset":"best"}"#, "unknown variant `best`, expected `default` or `paper`"),
+            (r#"{"max_points":2}"#, "max_points is 2"),
+            (r#"{"range_m":-1}"#, "range_m is -1"),
+            (r#"{"deadline_ms":0}"#, "deadline_ms is 0"),
+            (r#"{"ego":"yes"}"#, "ego is \"off\", \"auto\""),
+            (r#"{"ego":[[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}"#, "not a rigid"),
+            (r#"{"seed":-1}"#, "invalid value"),
+            (r#"{"seed":1,"seed":2}"#, "duplicate field"),
+            ("[]", "options: "),
+            ("", "options: "),
+        ] {
+            let error = JobOptions::from_json(text.as_bytes()).expect_err(text).to_string();
+            assert!(error.contains(said), "{text}: {error}");
+        }
+    }
+}

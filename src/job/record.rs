@@ -1,0 +1,141 @@
+//! All that is known about a job, and how it goes through its states.
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use super::id::{JobId, Tenant};
+use super::options::Priority;
+use crate::clock::Timestamp;
+
+/// Where a job is on its way. The last four are ends: nothing leaves them but by being asked for
+/// again.
+#[derive(
+    Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema,
+)]
+#[serde(rename_all = "snake_case")]
+pub enum State {
+    /// Waits for a device.
+    Queued,
+    /// A device works on it.
+    Running,
+    /// Its flow can be fetched.
+    Succeeded,
+    /// It was tried as often as is allowed, or cannot be done.
+    Failed,
+    /// Somebody did not want it any more.
+    Cancelled,
+    /// Its time was up before a device was free.
+    Expired,
+}
+
+impl State {
+    /// All states.
+    pub const ALL: [Self; 6] = [
+        Self::Queued,
+        Self::Running,
+        Self::Succeeded,
+        Self::Failed,
+        Self::Cancelled,
+        Self::Expired,
+    ];
+
+    /// Whether nothing more will happen.
+    pub fn is_end(self) -> bool {
+        !matches!(self, Self::Queued | Self::Running)
+    }
+
+    /// The name that answers and metrics use.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Queued => "queued",
+            Self::Running => "running",
+            Self::Succeeded => "succeeded",
+            Self::Failed => "failed",
+            Self::Cancelled => "cancelled",
+            Self::Expired => "expired",
+        }
+    }
+}
+
+/// What a job works on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Kind {
+    /// Two sweeps.
+    Pair,
+    /// Sweeps in order; its consecutive pairs are jobs of their own.
+    Sequence,
+}
+
+/// How far an optimization has come.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, ToSchema)]
+pub struct JobProgress {
+    /// Iterations done.
+    pub iteration: u32,
+    /// Iterations at most.
+    pub max_iterations: u32,
+    /// Mean loss of the latest iteration, metres.
+    pub loss: f64,
+}
+
+/// Why a job did not succeed.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct JobError {
+    /// A stable name for programs.
+    pub code: String,
+    /// What a person reads.
+    pub message: String,
+    /// Whether the same job may succeed when it is asked for again.
+    pub retryable: bool,
+}
+
+/// A job, as the queue knows it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Job {
+    /// Its name.
+    pub id: JobId,
+    /// Whose it is.
+    pub tenant: Tenant,
+    /// A pair or a sequence.
+    pub kind: Kind,
+    /// The sequence that it is a pair of.
+    pub parent: Option<JobId>,
+    /// Its place in that sequence, from 0.
+    pub place: u32,
+    /// Pairs of a sequence; 0 for a pair.
+    pub pairs: u32,
+    /// Pairs of a sequence that have not ended yet.
+    pub pairs_left: u32,
+    /// How urgent it is.
+    pub priority: Priority,
+    /// Where it is on its way.
+    pub state: State,
+    /// Whether it outlives its caller: a job that was promised, not one that somebody waits for.
+    pub durable: bool,
+    /// How often it was started; the fence token of the latest start.
+    pub attempt: u32,
+    /// Predicted compute seconds.
+    pub cost_seconds: f64,
+    /// The options, as JSON.
+    pub options: String,
+    /// When it was accepted.
+    pub created: Timestamp,
+    /// When it was first started.
+    pub started: Option<Timestamp>,
+    /// When it ended.
+    pub finished: Option<Timestamp>,
+    /// When the best flow so far is wanted.
+    pub deadline: Option<Timestamp>,
+    /// How far it has come.
+    pub progress: Option<JobProgress>,
+    /// Why its optimization stopped.
+    pub stop_reason: Option<String>,
+    /// Why it did not succeed.
+    pub error: Option<JobError>,
+    /// Whether it lies in the dead letters: given up after too many attempts.
+    pub dead: bool,
+    /// Whether its end is asked for.
+    pub cancel_requested: bool,
+    /// What the solver reports, as JSON.
+    pub report: Option<String>,
+}

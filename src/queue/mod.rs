@@ -1,0 +1,229 @@
+//! The durable queue: jobs in, leases out, every promise kept.
+//!
+//! It moves jobs and never looks inside a payload or at options; it must not know doors, workers
+//! or solvers. [`Queue`] is the contract and `contract.rs` its tests; [`SqliteQueue`] keeps it on
+//! one machine.
+
+mod backlog;
+mod lease;
+mod watchers;
+
+mod sqlite;
+
+#[cfg(test)]
+mod contract;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_trait::async_trait;
+use tokio::sync::watch;
+
+use crate::clock::Timestamp;
+use crate::job::{Job, JobError, JobId, JobProgress, Kind, Priority, State, Tenant};
+
+pub use backlog::{Backlog, Load};
+pub use lease::{Lease, Pulse, Signal};
+pub use sqlite::SqliteQueue;
+
+/// A job to be accepted.
+#[derive(Clone, Debug)]
+pub struct Submission {
+    /// Its name, under which its payload already lies.
+    pub id: JobId,
+    /// Whose it is.
+    pub tenant: Tenant,
+    /// A pair or a sequence.
+    pub kind: Kind,
+    /// Pairs of a sequence; ignored for a pair.
+    pub pairs: u32,
+    /// How urgent it is.
+    pub priority: Priority,
+    /// Predicted compute seconds, of each pair.
+    pub cost_seconds: f64,
+    /// The options, as JSON; opaque here.
+    pub options: String,
+    /// When the best flow so far is wanted; a job still queued then expires.
+    pub deadline: Option<Timestamp>,
+    /// Makes a repeated submission find the first one.
+    pub idempotency: Option<Idempotency>,
+    /// Whether it must outlive this process from now on. Without it, it ends with the process.
+    pub durable: bool,
+}
+
+/// What makes a repeated submission recognizable.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Idempotency {
+    /// The caller's key, unique for the tenant.
+    pub key: String,
+    /// Of payload and options: the same key with another one is a mistake.
+    pub fingerprint: [u8; 32],
+}
+
+/// What became of a submission.
+#[derive(Clone, Debug)]
+pub enum Submitted {
+    /// It was accepted.
+    New(Arc<Job>),
+    /// It had been accepted before, under this name; nothing was added.
+    Known(Arc<Job>),
+}
+
+/// Which jobs to list, latest first.
+#[derive(Clone, Debug)]
+pub struct Filter {
+    /// Whose.
+    pub tenant: Tenant,
+    /// In which state; any where none is given.
+    pub state: Option<State>,
+    /// Only those older than this one.
+    pub before: Option<JobId>,
+    /// At most so many.
+    pub limit: u32,
+}
+
+/// How an attempt ended.
+#[derive(Clone, Debug)]
+pub enum Outcome {
+    /// The result lies in store under this attempt.
+    Succeeded {
+        /// Why the optimization stopped.
+        stop_reason: String,
+        /// What the solver reports, as JSON.
+        report: String,
+    },
+    /// It failed; a retryable failure is tried again while attempts are left.
+    Failed(JobError),
+    /// The worker stopped because the job's end was asked for.
+    Cancelled,
+    /// The worker had to let go through no fault of the job: it is queued again as it was.
+    Released,
+}
+
+/// What became of an outcome.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Committed {
+    /// It stands.
+    Yes(State),
+    /// Somebody else holds the job now, or it has ended: nothing was changed.
+    Fenced,
+}
+
+/// How a queue treats jobs.
+#[derive(Clone, Debug)]
+pub struct QueueOptions {
+    /// Failures after which a job is given up.
+    pub max_attempts: u32,
+    /// Deaths of the process in a job's run, without a new snapshot between them, after which it
+    /// is given up.
+    pub max_crashes: u32,
+    /// Silence after which a running job is given to somebody else.
+    pub lease: Duration,
+    /// Wait before the second attempt; doubled for each one after it.
+    pub retry_delay: Duration,
+    /// Time that a job without a deadline may wait.
+    pub time_to_live: Duration,
+    /// Time that an ended job and its result are kept.
+    pub retention: Duration,
+}
+
+impl Default for QueueOptions {
+    fn default() -> Self {
+        Self {
+            max_attempts: 3,
+            max_crashes: 5,
+            lease: Duration::from_secs(60),
+            retry_delay: Duration::from_secs(1),
+            time_to_live: Duration::from_secs(7 * 24 * 3600),
+            retention: Duration::from_secs(24 * 3600),
+        }
+    }
+}
+
+/// Why the queue could not do what was asked.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum QueueError {
+    /// No such job, or it is another tenant's.
+    #[error("no job has this name")]
+    NotFound,
+    /// The idempotency key was used for something else; it belongs to this job.
+    #[error("the idempotency key was used with another payload, by job {0}")]
+    KeyReused(JobId),
+    /// Only an ended job can be asked for again.
+    #[error("the job has not ended: it is {}", .0.name())]
+    NotEnded(State),
+    /// The store failed.
+    #[error("the queue's store failed: {0}")]
+    Store(String),
+    /// The queue is closed.
+    #[error("the queue is closed")]
+    Closed,
+}
+
+/// Something that happened in the queue, for metrics and for whoever cleans up.
+#[derive(Clone, Debug)]
+pub enum Event {
+    /// A job was accepted.
+    Submitted(Arc<Job>),
+    /// A job was leased for the first time.
+    Started(Arc<Job>),
+    /// A job went back into the queue.
+    Requeued(Arc<Job>),
+    /// A lease ran out.
+    LeaseExpired(JobId),
+    /// A job ended.
+    Ended(Arc<Job>),
+    /// A job was forgotten: its payload, snapshot and result may go.
+    Forgotten(JobId),
+}
+
+/// The queue's contract. Whatever is answered has happened, and is on disk if the job is durable.
+#[async_trait]
+pub trait Queue: Send + Sync {
+    /// Accepts a job, and for a sequence all of its pairs.
+    async fn submit(&self, submission: Submission) -> Result<Submitted, QueueError>;
+
+    /// Makes a job outlive this process.
+    async fn make_durable(&self, id: JobId) -> Result<Arc<Job>, QueueError>;
+
+    /// One tenant's job; other tenants' jobs are not found.
+    async fn job(&self, tenant: &Tenant, id: JobId) -> Result<Arc<Job>, QueueError>;
+
+    /// The pairs of a sequence, in order.
+    async fn pairs(&self, id: JobId) -> Result<Vec<Arc<Job>>, QueueError>;
+
+    /// Jobs, latest first; pairs of sequences are not listed by themselves.
+    async fn list(&self, filter: Filter) -> Result<Vec<Arc<Job>>, QueueError>;
+
+    /// Ends a job: at once if it is queued, within an iteration if it runs.
+    async fn cancel(&self, id: JobId) -> Result<Arc<Job>, QueueError>;
+
+    /// Queues an ended job again, as if it had never been tried.
+    async fn requeue(&self, id: JobId) -> Result<Arc<Job>, QueueError>;
+
+    /// Follows a job: its state and, while it runs, every iteration.
+    async fn watch(&self, id: JobId) -> Result<watch::Receiver<Arc<Job>>, QueueError>;
+
+    /// Waits for the next job and takes it.
+    async fn lease(&self, worker: &str) -> Result<Lease, QueueError>;
+
+    /// Ends an attempt. Only the latest attempt of a running job counts.
+    async fn finish(
+        &self,
+        id: JobId,
+        attempt: u32,
+        outcome: Outcome,
+    ) -> Result<Committed, QueueError>;
+
+    /// What waits and what runs.
+    fn backlog(&self) -> Backlog;
+
+    /// When the oldest queued job was accepted.
+    async fn oldest_queued(&self) -> Result<Option<Timestamp>, QueueError>;
+
+    /// Which of some names belong to jobs.
+    async fn known(&self, ids: Vec<JobId>) -> Result<Vec<JobId>, QueueError>;
+}
+
+/// Progress as a worker reports it.
+pub type Progress = JobProgress;

@@ -1,0 +1,427 @@
+//! The embedded queue: one SQLite file in WAL mode, one writing thread, readers beside it.
+//!
+//! A promise is on disk before it is made (`synchronous = FULL`). One process at a time: a lock
+//! file sees to it, so that what ran when the last one died can be queued again at once.
+
+mod rows;
+mod schema;
+mod sweep;
+mod transitions;
+mod writer;
+
+#[cfg(test)]
+mod tests;
+
+use std::collections::HashMap;
+use std::fs::{File, TryLockError};
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use async_trait::async_trait;
+use rusqlite::{Connection, params};
+use tokio::sync::{Notify, mpsc, watch};
+
+use self::rows::{COLUMNS, state_code};
+use self::transitions::Effects;
+use self::writer::Writer;
+use super::backlog::{Backlog, Load};
+use super::lease::{Flags, Heart, Lease, Pulse};
+use super::watchers::Watchers;
+use super::{
+    Committed, Event, Filter, Outcome, Progress, Queue, QueueError, QueueOptions, Submission,
+    Submitted,
+};
+use crate::clock::Timestamp;
+use crate::job::{Job, JobId, Tenant};
+
+/// Connections that read.
+const READERS: usize = 2;
+
+/// The most rows that one list gives.
+const MAX_LISTED: u32 = 1000;
+
+/// A lease is prolonged on disk this often at most.
+const BEAT: Duration = Duration::from_secs(1);
+
+/// The embedded queue.
+pub struct SqliteQueue {
+    writer: Writer,
+    readers: [Arc<Mutex<Connection>>; READERS],
+    next_reader: AtomicU64,
+    shared: Arc<Shared>,
+    options: QueueOptions,
+    _lock: File,
+}
+
+/// What the writing thread tells everybody else.
+pub(in crate::queue) struct Shared {
+    watchers: Watchers,
+    backlog: Mutex<Backlog>,
+    running: Mutex<HashMap<JobId, Running>>,
+    ready: Notify,
+    events: mpsc::UnboundedSender<Event>,
+    commit_micros: AtomicU64,
+}
+
+/// A job that some worker holds.
+struct Running {
+    attempt: u32,
+    flags: Arc<Flags>,
+    durable: Arc<AtomicBool>,
+}
+
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Shared {
+    fn new(events: mpsc::UnboundedSender<Event>) -> Self {
+        Self {
+            watchers: Watchers::default(),
+            backlog: Mutex::default(),
+            running: Mutex::default(),
+            ready: Notify::new(),
+            events,
+            commit_micros: AtomicU64::new(0),
+        }
+    }
+
+    /// Tells what a commit has changed.
+    fn apply(&self, effects: Effects) {
+        {
+            let mut backlog = locked(&self.backlog);
+            let mut running = locked(&self.running);
+            for job in &effects.left {
+                backlog.left(job);
+            }
+            for job in &effects.stopped {
+                backlog.stopped(job);
+                if let Some(held) = running.remove(&job.id) {
+                    held.flags.lose();
+                }
+            }
+            for job in &effects.entered {
+                backlog.entered(job);
+            }
+            for job in &effects.started {
+                backlog.started(job);
+                let held = Running {
+                    attempt: job.attempt,
+                    flags: Arc::default(),
+                    durable: Arc::new(AtomicBool::new(job.durable)),
+                };
+                running.insert(job.id, held);
+            }
+            for id in &effects.cancel {
+                if let Some(held) = running.get(id) {
+                    held.flags.cancel();
+                }
+            }
+        }
+        for job in &effects.changed {
+            self.watchers.push(job);
+        }
+        if !effects.entered.is_empty() || !effects.changed.is_empty() {
+            self.ready.notify_waiters();
+        }
+        for event in effects.events {
+            let _nobody_listens_is_fine = self.events.send(event);
+        }
+    }
+
+    fn commit_seconds(&self, took: Duration) {
+        let micros = u64::try_from(took.as_micros()).unwrap_or(u64::MAX);
+        self.commit_micros.store(micros, Ordering::Relaxed);
+    }
+}
+
+impl SqliteQueue {
+    /// Opens or makes the queue in `folder`; what ran when it was last open is queued again.
+    /// `events` hears of everything that happens from now on.
+    ///
+    /// # Errors
+    /// Where another process has the queue open, the folder cannot be used, or the file is of a
+    /// newer version.
+    pub fn open(
+        folder: &Path,
+        options: QueueOptions,
+        events: mpsc::UnboundedSender<Event>,
+    ) -> Result<Self, QueueError> {
+        let store = |error: std::io::Error| {
+            QueueError::Store(format!("cannot use {}: {error}", folder.display()))
+        };
+        std::fs::create_dir_all(folder).map_err(store)?;
+        let lock = File::create(folder.join("queue.lock")).map_err(store)?;
+        match lock.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => {
+                return Err(QueueError::Store(format!(
+                    "another process has the queue in {} open",
+                    folder.display()
+                )));
+            }
+            Err(TryLockError::Error(error)) => return Err(store(error)),
+        }
+        let path = folder.join("queue.sqlite3");
+        let connection = schema::open_writer(&path)?;
+        let shared = Arc::new(Shared::new(events));
+        let mut effects = Effects::default();
+        connection.execute_batch("BEGIN IMMEDIATE")?;
+        sweep::recover(&connection, &mut effects, &options)?;
+        connection.execute_batch("COMMIT")?;
+        // Counted below from the store itself.
+        effects.entered.clear();
+        effects.left.clear();
+        effects.stopped.clear();
+        shared.apply(effects);
+        *locked(&shared.backlog) = count_backlog(&connection)?;
+        let open_reader = || schema::open_reader(&path).map(|reader| Arc::new(Mutex::new(reader)));
+        Ok(Self {
+            readers: [open_reader()?, open_reader()?],
+            next_reader: AtomicU64::new(0),
+            writer: Writer::start(connection, options.clone(), Arc::clone(&shared))?,
+            shared,
+            options,
+            _lock: lock,
+        })
+    }
+
+    /// Runs a query beside the writer.
+    async fn read<T: Send + 'static>(
+        &self,
+        query: impl FnOnce(&Connection) -> Result<T, QueueError> + Send + 'static,
+    ) -> Result<T, QueueError> {
+        let turn = self.next_reader.fetch_add(1, Ordering::Relaxed) as usize % READERS;
+        let reader = Arc::clone(&self.readers[turn]);
+        let read = tokio::task::spawn_blocking(move || query(&locked(&reader)));
+        read.await.map_err(|error| QueueError::Store(error.to_string()))?
+    }
+}
+
+/// What waits, from the store itself.
+fn count_backlog(connection: &Connection) -> Result<Backlog, QueueError> {
+    let sql = "SELECT tenant, priority, count(*), sum(cost) FROM jobs \
+               WHERE state = 0 AND kind = 0 GROUP BY tenant, priority";
+    let mut backlog = Backlog::default();
+    let mut statement = connection.prepare(sql)?;
+    let mut rows = statement.query([])?;
+    while let Some(row) = rows.next()? {
+        let place = (rows::tenant_at(row, 0)?, rows::priority_at(row, 1)?);
+        let jobs: u32 = row.get(2)?;
+        let load = Load {
+            jobs: u64::from(jobs),
+            seconds: row.get(3)?,
+        };
+        backlog.enter_many(place, load);
+    }
+    Ok(backlog)
+}
+
+/// A lease's way to the writer: every beat to those who follow, one a second to the disk.
+struct SqliteHeart {
+    id: JobId,
+    attempt: u32,
+    writer: Writer,
+    shared: Arc<Shared>,
+    options: QueueOptions,
+    last: AtomicI64,
+}
+
+impl Heart for SqliteHeart {
+    fn beat(&self, progress: Option<Progress>) {
+        if let Some(progress) = progress {
+            self.shared.watchers.progress(self.id, self.attempt, progress);
+        }
+        let now = Timestamp::now().as_millis();
+        let pause = BEAT.min(self.options.lease / 4).as_millis() as i64;
+        if now - self.last.load(Ordering::Relaxed) < pause {
+            return;
+        }
+        self.last.store(now, Ordering::Relaxed);
+        let (id, attempt, options) = (self.id, self.attempt, self.options.clone());
+        self.writer.write_later(move |connection, _| {
+            transitions::beat(connection, &options, id, attempt, progress)
+        });
+    }
+
+    fn snapshot_kept(&self) {
+        let (id, attempt) = (self.id, self.attempt);
+        self.writer
+            .write_later(move |connection, _| transitions::snapshot_kept(connection, id, attempt));
+    }
+}
+
+#[async_trait]
+impl Queue for SqliteQueue {
+    async fn submit(&self, submission: Submission) -> Result<Submitted, QueueError> {
+        let options = self.options.clone();
+        self.writer
+            .write(submission.durable, move |connection, effects| {
+                transitions::submit(connection, effects, &options, &submission)
+            })
+            .await
+    }
+
+    async fn make_durable(&self, id: JobId) -> Result<Arc<Job>, QueueError> {
+        if let Some(held) = locked(&self.shared.running).get(&id) {
+            held.durable.store(true, Ordering::Relaxed);
+        }
+        let change = move |connection: &Connection, effects: &mut Effects| {
+            let sql = "UPDATE jobs SET durable = 1 WHERE id = ?1 OR parent = ?1";
+            connection.prepare_cached(sql)?.execute([id.as_bytes()])?;
+            let job = Arc::new(rows::get(connection, id)?);
+            effects.changed.push(Arc::clone(&job));
+            Ok(job)
+        };
+        self.writer.write(true, change).await
+    }
+
+    async fn job(&self, tenant: &Tenant, id: JobId) -> Result<Arc<Job>, QueueError> {
+        let job = self.read(move |connection| rows::get(connection, id)).await?;
+        if job.tenant == *tenant {
+            Ok(Arc::new(job))
+        } else {
+            Err(QueueError::NotFound)
+        }
+    }
+
+    async fn pairs(&self, id: JobId) -> Result<Vec<Arc<Job>>, QueueError> {
+        let pairs = self.read(move |connection| rows::pairs(connection, id)).await?;
+        Ok(pairs.into_iter().map(Arc::new).collect())
+    }
+
+    async fn list(&self, filter: Filter) -> Result<Vec<Arc<Job>>, QueueError> {
+        let query = move |connection: &Connection| {
+            let before = filter.before.map_or([0xff; 16], |id| *id.as_bytes());
+            let limit = filter.limit.min(MAX_LISTED);
+            let (index, in_state) = match filter.state {
+                None => ("jobs_list", ""),
+                Some(_) => ("jobs_list_by_state", "AND state = ?4"),
+            };
+            let sql = format!(
+                "SELECT {COLUMNS} FROM jobs INDEXED BY {index} WHERE parent IS NULL \
+                 AND tenant = ?1 AND id < ?2 {in_state} ORDER BY id DESC LIMIT ?3"
+            );
+            let mut statement = connection.prepare_cached(&sql)?;
+            let tenant = filter.tenant.as_str();
+            let rows = match filter.state {
+                None => statement.query_map(params![tenant, before, limit], rows::job)?,
+                Some(state) => {
+                    let state = state_code(state);
+                    statement.query_map(params![tenant, before, limit, state], rows::job)?
+                }
+            };
+            Ok(rows.map(|job| job.map(Arc::new)).collect::<rusqlite::Result<_>>()?)
+        };
+        self.read(query).await
+    }
+
+    async fn cancel(&self, id: JobId) -> Result<Arc<Job>, QueueError> {
+        let options = self.options.clone();
+        let change = move |connection: &Connection, effects: &mut Effects| {
+            transitions::cancel(connection, effects, &options, id)
+        };
+        self.writer.write(true, change).await
+    }
+
+    async fn requeue(&self, id: JobId) -> Result<Arc<Job>, QueueError> {
+        let options = self.options.clone();
+        let change = move |connection: &Connection, effects: &mut Effects| {
+            transitions::requeue(connection, effects, &options, id)
+        };
+        self.writer.write(true, change).await
+    }
+
+    async fn watch(&self, id: JobId) -> Result<watch::Receiver<Arc<Job>>, QueueError> {
+        // Through the writer, so that no change falls between looking and following.
+        let shared = Arc::clone(&self.shared);
+        let change = move |connection: &Connection, _: &mut Effects| {
+            let job = Arc::new(rows::get(connection, id)?);
+            Ok(shared.watchers.follow(&job))
+        };
+        self.writer.write(false, change).await
+    }
+
+    async fn lease(&self, worker: &str) -> Result<Lease, QueueError> {
+        let worker: Arc<str> = Arc::from(worker);
+        loop {
+            let ready = self.shared.ready.notified();
+            let mut ready = std::pin::pin!(ready);
+            ready.as_mut().enable();
+            let (options, name) = (self.options.clone(), Arc::clone(&worker));
+            let claim = move |connection: &Connection, effects: &mut Effects| {
+                transitions::claim(connection, effects, &options, &name)
+            };
+            if let Some(job) = self.writer.write(false, claim).await? {
+                return Ok(self.hold(job));
+            }
+            ready.await;
+        }
+    }
+
+    async fn finish(
+        &self,
+        id: JobId,
+        attempt: u32,
+        outcome: Outcome,
+    ) -> Result<Committed, QueueError> {
+        let durable = locked(&self.shared.running)
+            .get(&id)
+            .is_some_and(|held| held.durable.load(Ordering::Relaxed));
+        let options = self.options.clone();
+        let change = move |connection: &Connection, effects: &mut Effects| {
+            transitions::finish(connection, effects, &options, id, attempt, outcome)
+        };
+        self.writer.write(durable, change).await
+    }
+
+    fn backlog(&self) -> Backlog {
+        locked(&self.shared.backlog).clone()
+    }
+
+    async fn oldest_queued(&self) -> Result<Option<Timestamp>, QueueError> {
+        self.read(sweep::oldest_queued).await
+    }
+
+    async fn known(&self, ids: Vec<JobId>) -> Result<Vec<JobId>, QueueError> {
+        let query = move |connection: &Connection| {
+            let mut known = Vec::new();
+            for id in ids {
+                if rows::find(connection, id)?.is_some() {
+                    known.push(id);
+                }
+            }
+            Ok(known)
+        };
+        self.read(query).await
+    }
+}
+
+impl SqliteQueue {
+    /// A worker's hold on a job that it has just claimed.
+    fn hold(&self, job: Arc<Job>) -> Lease {
+        let flags = match locked(&self.shared.running).get(&job.id) {
+            Some(held) if held.attempt == job.attempt => Arc::clone(&held.flags),
+            // It was lost between the claim and here.
+            _ => {
+                let flags = Flags::default();
+                flags.lose();
+                Arc::new(flags)
+            }
+        };
+        let heart = SqliteHeart {
+            id: job.id,
+            attempt: job.attempt,
+            writer: self.writer.clone(),
+            shared: Arc::clone(&self.shared),
+            options: self.options.clone(),
+            last: AtomicI64::new(Timestamp::now().as_millis()),
+        };
+        Lease {
+            job,
+            pulse: Pulse::new(flags, Arc::new(heart)),
+        }
+    }
+}

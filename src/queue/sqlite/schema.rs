@@ -1,0 +1,119 @@
+//! The table, its indexes, and how an older file becomes a newer one.
+//!
+//! One row a job. Every statement that must stay fast at a million rows names its index, and a
+//! test reads the plan: the planner's own choice costs a thousand times more.
+
+use std::time::Duration;
+
+use rusqlite::{Connection, TransactionBehavior};
+
+use crate::queue::QueueError;
+
+/// What this program reads and writes; kept in `user_version`.
+pub(super) const VERSION: i64 = 1;
+
+/// `due` is when the sweeper looks at a row next: the end of a queued job's time or of its delay,
+/// of a running job's lease, of an ended job's retention.
+const TABLE: &str = "
+CREATE TABLE jobs (
+    seq INTEGER PRIMARY KEY,
+    id BLOB NOT NULL,
+    tenant TEXT NOT NULL,
+    kind INTEGER NOT NULL,
+    parent BLOB,
+    place INTEGER NOT NULL,
+    pairs INTEGER NOT NULL,
+    pairs_left INTEGER NOT NULL,
+    priority INTEGER NOT NULL,
+    state INTEGER NOT NULL,
+    durable INTEGER NOT NULL,
+    delayed INTEGER NOT NULL,
+    attempt INTEGER NOT NULL,
+    failures INTEGER NOT NULL,
+    crashes INTEGER NOT NULL,
+    cost REAL NOT NULL,
+    virtual_start REAL NOT NULL,
+    virtual_finish REAL NOT NULL,
+    options TEXT NOT NULL,
+    idempotency_key TEXT,
+    fingerprint BLOB,
+    created INTEGER NOT NULL,
+    started INTEGER,
+    finished INTEGER,
+    deadline INTEGER,
+    expires INTEGER NOT NULL,
+    due INTEGER,
+    worker TEXT,
+    iteration INTEGER,
+    max_iterations INTEGER,
+    loss REAL,
+    stop_reason TEXT,
+    error_code TEXT,
+    error_message TEXT,
+    error_retryable INTEGER NOT NULL,
+    dead INTEGER NOT NULL,
+    cancel_requested INTEGER NOT NULL,
+    report TEXT
+);
+CREATE UNIQUE INDEX jobs_id ON jobs (id);
+CREATE UNIQUE INDEX jobs_key ON jobs (tenant, idempotency_key) WHERE idempotency_key IS NOT NULL;
+CREATE INDEX jobs_ready ON jobs (priority DESC, virtual_start, seq)
+    WHERE state = 0 AND kind = 0 AND delayed = 0;
+CREATE INDEX jobs_running ON jobs (priority, virtual_start) WHERE state = 1 AND kind = 0;
+CREATE INDEX jobs_tail ON jobs (tenant, priority, virtual_finish) WHERE state < 2 AND kind = 0;
+CREATE INDEX jobs_due ON jobs (due) WHERE due IS NOT NULL;
+CREATE INDEX jobs_age ON jobs (created) WHERE state = 0;
+CREATE INDEX jobs_list ON jobs (tenant, id) WHERE parent IS NULL;
+CREATE INDEX jobs_list_by_state ON jobs (tenant, state, id) WHERE parent IS NULL;
+CREATE INDEX jobs_parent ON jobs (parent, place) WHERE parent IS NOT NULL;
+";
+
+/// Opens the connection that writes.
+pub(super) fn open_writer(path: &std::path::Path) -> Result<Connection, QueueError> {
+    let mut connection = open(path)?;
+    connection.pragma_update(None, "journal_mode", "WAL")?;
+    migrate(&mut connection)?;
+    Ok(connection)
+}
+
+/// Opens a connection that only reads.
+pub(super) fn open_reader(path: &std::path::Path) -> Result<Connection, QueueError> {
+    let connection = open(path)?;
+    connection.pragma_update(None, "query_only", true)?;
+    Ok(connection)
+}
+
+fn open(path: &std::path::Path) -> Result<Connection, QueueError> {
+    const STATEMENTS: usize = 64;
+    let connection = Connection::open(path)?;
+    connection.busy_timeout(Duration::from_secs(10))?;
+    connection.pragma_update(None, "cache_size", -16_384)?;
+    connection.set_prepared_statement_cache_capacity(STATEMENTS);
+    Ok(connection)
+}
+
+fn migrate(connection: &mut Connection) -> Result<(), QueueError> {
+    let transaction = connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
+    let found: i64 = transaction.pragma_query_value(None, "user_version", |row| row.get(0))?;
+    match found {
+        0 => {
+            transaction.execute_batch(TABLE)?;
+            transaction.pragma_update(None, "user_version", VERSION)?;
+        }
+        VERSION => {}
+        newer => {
+            return Err(QueueError::Store(format!(
+                "the queue's file has version {newer}, this program knows {VERSION}: \
+                 run the newer program"
+            )));
+        }
+    }
+    transaction.commit()?;
+    Ok(())
+}
+
+impl From<rusqlite::Error> for QueueError {
+    fn from(error: rusqlite::Error) -> Self {
+        Self::Store(error.to_string())
+    }
+}

@@ -1,0 +1,159 @@
+//! What happens without being asked: times that run out, and the recovery after a crash.
+
+use std::sync::Arc;
+
+use rusqlite::{Connection, OptionalExtension, params};
+
+use super::rows::{self, COLUMNS};
+use super::transitions::{self, Effects, End};
+use crate::clock::Timestamp;
+use crate::job::{Job, JobError, JobId, State};
+use crate::queue::{Event, QueueError, QueueOptions};
+
+/// Rows that one sweep looks at.
+const AT_ONCE: u32 = 256;
+
+/// When the sweeper has something to do next.
+pub(super) fn next_due(connection: &Connection) -> Result<Option<Timestamp>, QueueError> {
+    let sql = "SELECT min(due) FROM jobs INDEXED BY jobs_due WHERE due IS NOT NULL";
+    let due: Option<i64> = connection.prepare_cached(sql)?.query_row([], |row| row.get(0))?;
+    Ok(due.map(Timestamp::from_millis))
+}
+
+/// Looks after every row whose time has come.
+pub(super) fn sweep(
+    connection: &Connection,
+    effects: &mut Effects,
+    options: &QueueOptions,
+) -> Result<(), QueueError> {
+    let now = Timestamp::now();
+    let sql = format!(
+        "SELECT {COLUMNS} FROM jobs INDEXED BY jobs_due WHERE due <= ?1 ORDER BY due LIMIT {AT_ONCE}"
+    );
+    let due: Vec<Job> = {
+        let mut statement = connection.prepare_cached(&sql)?;
+        let rows = statement.query_map([now.as_millis()], rows::job)?;
+        rows.collect::<rusqlite::Result<_>>()?
+    };
+    for job in due {
+        match job.state {
+            State::Queued => look_after_queued(connection, effects, options, &job, now)?,
+            State::Running => {
+                effects.events.push(Event::LeaseExpired(job.id));
+                let error = JobError {
+                    code: "lease_expired".to_owned(),
+                    message: "the device gave no sign of life".to_owned(),
+                    retryable: true,
+                };
+                transitions::fail(connection, effects, options, &job, error)?;
+            }
+            _ => forget(connection, effects, job.id)?,
+        }
+    }
+    Ok(())
+}
+
+/// The end of a queued job's time, or of its delay.
+fn look_after_queued(
+    connection: &Connection,
+    effects: &mut Effects,
+    options: &QueueOptions,
+    job: &Job,
+    now: Timestamp,
+) -> Result<(), QueueError> {
+    let sql = "UPDATE jobs SET delayed = 0, due = expires WHERE id = ?1 AND expires > ?2";
+    let woken = connection
+        .prepare_cached(sql)?
+        .execute(params![job.id.as_bytes(), now.as_millis()])?;
+    if woken > 0 {
+        effects.changed.push(Arc::new(rows::get(connection, job.id)?));
+        return Ok(());
+    }
+    let (code, message) = match job.deadline {
+        Some(_) => ("deadline_in_queue", "the deadline passed before a device was free"),
+        None => ("too_old", "no device was free for as long as a job may wait"),
+    };
+    let error = JobError {
+        code: code.to_owned(),
+        message: message.to_owned(),
+        retryable: true,
+    };
+    let how = End {
+        error: Some(error),
+        ..End::default()
+    };
+    transitions::end(connection, effects, options, job, State::Expired, how)?;
+    Ok(())
+}
+
+/// Removes an ended job and its pairs.
+fn forget(connection: &Connection, effects: &mut Effects, id: JobId) -> Result<(), QueueError> {
+    for pair in rows::pairs(connection, id)? {
+        effects.events.push(Event::Forgotten(pair.id));
+    }
+    let sql = "DELETE FROM jobs WHERE parent = ?1";
+    connection.prepare_cached(sql)?.execute([id.as_bytes()])?;
+    let sql = "DELETE FROM jobs WHERE id = ?1";
+    connection.prepare_cached(sql)?.execute([id.as_bytes()])?;
+    effects.events.push(Event::Forgotten(id));
+    Ok(())
+}
+
+/// After a crash or a stop: what ran is queued again at once, since nobody else can hold it; what
+/// somebody waited for on a connection that is gone is forgotten.
+pub(super) fn recover(
+    connection: &Connection,
+    effects: &mut Effects,
+    options: &QueueOptions,
+) -> Result<(), QueueError> {
+    let sql = format!("SELECT {COLUMNS} FROM jobs INDEXED BY jobs_running WHERE state = 1 AND kind = 0");
+    let running: Vec<Job> = {
+        let mut statement = connection.prepare_cached(&sql)?;
+        let rows = statement.query_map([], rows::job)?;
+        rows.collect::<rusqlite::Result<_>>()?
+    };
+    for job in running {
+        let sql = "UPDATE jobs SET crashes = crashes + 1 WHERE id = ?1 RETURNING crashes";
+        let crashes: u32 = connection
+            .prepare_cached(sql)?
+            .query_row([job.id.as_bytes()], |row| row.get(0))?;
+        if job.cancel_requested {
+            transitions::end(connection, effects, options, &job, State::Cancelled, End::default())?;
+        } else if crashes >= options.max_crashes {
+            let error = JobError {
+                code: "crashed".to_owned(),
+                message: format!("the process died {crashes} times while it worked on this job"),
+                retryable: true,
+            };
+            let how = End {
+                error: Some(error),
+                dead: true,
+                ..End::default()
+            };
+            transitions::end(connection, effects, options, &job, State::Failed, how)?;
+        } else {
+            transitions::requeue_running(connection, effects, &job, std::time::Duration::ZERO)?;
+        }
+    }
+    let sql = "SELECT id FROM jobs WHERE durable = 0 AND parent IS NULL AND state < 2";
+    let abandoned: Vec<[u8; 16]> = {
+        let mut statement = connection.prepare(sql)?;
+        let rows = statement.query_map([], |row| row.get(0))?;
+        rows.collect::<rusqlite::Result<_>>()?
+    };
+    for id in abandoned {
+        forget(connection, effects, JobId::from_bytes(id))?;
+    }
+    Ok(())
+}
+
+/// When the oldest queued job was accepted.
+pub(super) fn oldest_queued(connection: &Connection) -> Result<Option<Timestamp>, QueueError> {
+    let sql = "SELECT created FROM jobs INDEXED BY jobs_age WHERE state = 0 ORDER BY created LIMIT 1";
+    let created: Option<i64> = connection
+        .prepare_cached(sql)?
+        .query_row([], |row| row.get(0))
+        .optional()?;
+    Ok(created.map(Timestamp::from_millis))
+}
+

@@ -1,0 +1,140 @@
+//! The embedded queue against the contract, and what only it must show: plans, locks, files.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use rusqlite::params;
+use tokio::sync::mpsc;
+
+use super::{SqliteQueue, schema, sweep, transitions};
+use crate::queue::contract::{Stand, queue_contract};
+use crate::queue::{Event, Queue, QueueError, QueueOptions};
+
+/// A folder in which one queue after the other is opened.
+struct Folder(tempfile::TempDir);
+
+impl Folder {
+    fn new() -> Self {
+        Self(tempfile::tempdir().expect("a folder"))
+    }
+}
+
+impl Stand for Folder {
+    fn open(&mut self, options: QueueOptions) -> (Arc<dyn Queue>, mpsc::UnboundedReceiver<Event>) {
+        let (events, heard) = mpsc::unbounded_channel();
+        // The one before may take a moment to let go of its lock.
+        let patience = Instant::now() + Duration::from_secs(10);
+        loop {
+            match SqliteQueue::open(self.0.path(), options.clone(), events.clone()) {
+                Ok(queue) => return (Arc::new(queue), heard),
+                Err(error) => assert!(Instant::now() < patience, "{error}"),
+            }
+            std::thread::yield_now();
+        }
+    }
+}
+
+queue_contract!(Folder::new());
+
+/// Rows of the backlog that the plans are tried on.
+const BACKLOG: u32 = 20_000;
+
+/// What the planner does with a statement.
+fn plan(connection: &rusqlite::Connection, sql: &str, parameters: usize) -> String {
+    let mut statement = connection
+        .prepare(&format!("EXPLAIN QUERY PLAN {sql}"))
+        .expect("a good statement");
+    let values = vec![0i64; parameters];
+    let details = statement
+        .query_map(rusqlite::params_from_iter(values), |row| row.get::<_, String>(3))
+        .expect("a plan");
+    let details: Vec<String> = details.collect::<rusqlite::Result<_>>().expect("a plan");
+    details.join("; ")
+}
+
+#[test]
+fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
+    let folder = Folder::new();
+    let path = folder.0.path().join("queue.sqlite3");
+    let connection = schema::open_writer(&path).expect("a file");
+    connection.execute_batch("BEGIN").expect("a transaction");
+    for row in 0..BACKLOG {
+        connection
+            .execute(
+                "INSERT INTO jobs (id, tenant, kind, place, pairs, pairs_left, priority, state, \
+                 durable, delayed, attempt, failures, crashes, cost, virtual_start, \
+                 virtual_finish, options, created, expires, due, error_retryable, dead, \
+                 cancel_requested) VALUES (?1, 't', 0, 0, 0, 0, ?2, 0, 1, 0, 0, 0, 0, 1.0, ?1, \
+                 ?1 + 1, '{}', ?1, 9, 9, 0, 0, 0)",
+                params![row, row % 3],
+            )
+            .expect("a row");
+    }
+    connection.execute_batch("COMMIT; ANALYZE").expect("a commit");
+    let claim = plan(&connection, &transitions::claim_sql(), 3);
+    assert!(claim.contains("jobs_ready"), "{claim}");
+    for (sql, parameters) in [
+        (transitions::claim_sql(), 3),
+        (
+            "SELECT max(virtual_finish) FROM jobs INDEXED BY jobs_tail WHERE state < 2 AND \
+             kind = 0 AND tenant = ?1 AND priority = ?2"
+                .to_owned(),
+            2,
+        ),
+        (
+            "SELECT min(due) FROM jobs INDEXED BY jobs_due WHERE due IS NOT NULL".to_owned(),
+            0,
+        ),
+    ] {
+        let plan = plan(&connection, &sql, parameters);
+        assert!(!plan.contains("TEMP B-TREE"), "{sql}: {plan}");
+        assert!(!plan.contains("SCAN jobs") || plan.contains("INDEX"), "{sql}: {plan}");
+    }
+    assert!(sweep::next_due(&connection).expect("an answer").is_some());
+}
+
+#[test]
+fn a_second_process_is_refused_by_name() {
+    let mut folder = Folder::new();
+    let first = folder.open(QueueOptions::default());
+    let (events, _) = mpsc::unbounded_channel();
+    let second = SqliteQueue::open(folder.0.path(), QueueOptions::default(), events);
+    let error = second.err().expect("a refusal").to_string();
+    assert!(error.contains("another process has the queue"), "{error}");
+    drop(first);
+}
+
+#[test]
+fn a_newer_file_is_refused_and_left_alone() {
+    let folder = Folder::new();
+    let path = folder.0.path().join("queue.sqlite3");
+    let connection = schema::open_writer(&path).expect("a file");
+    connection
+        .pragma_update(None, "user_version", schema::VERSION + 1)
+        .expect("a pragma");
+    drop(connection);
+    let error = schema::open_writer(&path).expect_err("a refusal");
+    assert!(matches!(error, QueueError::Store(text) if text.contains("run the newer program")));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn submissions_at_the_same_time_share_commits_and_all_stand() {
+    const JOBS: usize = 200;
+    let mut folder = Folder::new();
+    let (queue, _events) = folder.open(QueueOptions::default());
+    let mut submissions = tokio::task::JoinSet::new();
+    for _ in 0..JOBS {
+        let queue = Arc::clone(&queue);
+        submissions.spawn(async move {
+            let submission = crate::queue::contract::submission("a");
+            queue.submit(submission).await
+        });
+    }
+    while let Some(submitted) = submissions.join_next().await {
+        submitted.expect("no panic").expect("accepted");
+    }
+    assert_eq!(queue.backlog().queued().jobs, JOBS as u64);
+    drop(queue);
+    let (queue, _events) = folder.open(QueueOptions::default());
+    assert_eq!(queue.backlog().queued().jobs, JOBS as u64);
+}
