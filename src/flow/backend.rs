@@ -3,6 +3,7 @@
 use super::distance::{DistanceError, DistanceOptions};
 use super::options::Options;
 use super::points::{Point, RigidTransform};
+use super::snapshot::TrainerState;
 use super::watch::{Interrupt, Watch};
 
 /// A device that can fit a field to a pair.
@@ -10,15 +11,17 @@ pub trait Backend: Send + Sync {
     /// The device's name, as reports show it.
     fn name(&self) -> String;
 
-    /// Builds the distance transform of `target` over a grid that covers both clouds.
+    /// Builds the distance transform of `target` over a grid that covers both clouds; looks at
+    /// `watch` between its pieces.
     ///
     /// # Errors
-    /// [`BackendError`] where the clouds are refused or the device fails.
+    /// [`BackendError`] where the clouds are refused, the watch interrupts or the device fails.
     fn transform(
         &self,
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,
+        watch: &dyn Watch,
     ) -> Result<Box<dyn Transform>, BackendError>;
 }
 
@@ -27,8 +30,9 @@ pub trait Transform: Send {
     /// Bytes that it occupies.
     fn bytes(&self) -> usize;
 
-    /// The rigid motion target_from_source that aligns `source` with the target.
-    fn align(&self, source: &[Point]) -> RigidTransform;
+    /// The rigid motion target_from_source that aligns `source` with the target; the motion so
+    /// far where `watch` interrupts.
+    fn align(&self, source: &[Point], watch: &dyn Watch) -> RigidTransform;
 
     /// The distance to the target at each of `points`, metres.
     fn distances(&self, points: &[Point]) -> Vec<f32>;
@@ -38,15 +42,16 @@ pub trait Transform: Send {
     /// # Errors
     /// [`BackendError`] where the device fails.
     fn start(
-        self: Box<Self>,
+        &self,
         source: &[Point],
         options: &Options,
-    ) -> Result<Box<dyn Trainer>, BackendError>;
+    ) -> Result<Box<dyn Trainer + '_>, BackendError>;
 }
 
 /// One optimization in progress.
 pub trait Trainer: Send {
-    /// Does up to `steps` iterations; looks at `watch` before each.
+    /// Does up to `steps` iterations; looks at `watch` before each. Comes back before the steps
+    /// are done where a snapshot is due, but never without an iteration.
     ///
     /// # Errors
     /// [`BackendError`] where the device fails.
@@ -61,12 +66,21 @@ pub trait Trainer: Send {
 
     /// What has been reached and what it took.
     fn report(&self) -> Report;
+
+    /// What the following iterations and the result depend on.
+    fn state(&self) -> TrainerState;
+
+    /// Goes on from `state`, which a trainer of the same points and options had.
+    fn restore(&mut self, state: TrainerState);
+
+    /// Ends after `max_iterations` at the latest, and lets the step size fall accordingly.
+    fn shorten(&mut self, max_iterations: usize);
 }
 
 /// How a call of [`Trainer::advance`] ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Advance {
-    /// All steps were done; more may follow.
+    /// All steps were done, or a snapshot is due; more may follow.
     Continues,
     /// The stopping rule fired.
     Converged,
@@ -96,8 +110,20 @@ pub struct Report {
 pub enum BackendError {
     /// The distance transform was refused.
     #[error(transparent)]
-    Distance(#[from] DistanceError),
+    Distance(DistanceError),
+    /// The watch asked for the end before there was anything to fit to.
+    #[error("interrupted before the first iteration")]
+    Interrupted(Interrupt),
     /// Threads could not be started.
     #[error("cannot start worker threads: {0}")]
     Threads(String),
+}
+
+impl From<DistanceError> for BackendError {
+    fn from(error: DistanceError) -> Self {
+        match error {
+            DistanceError::Interrupted(interrupt) => Self::Interrupted(interrupt),
+            error => Self::Distance(error),
+        }
+    }
 }

@@ -9,18 +9,32 @@ use super::options::EarlyStopOptions;
 #[derive(Clone, Debug)]
 pub(crate) struct EarlyStop {
     options: EarlyStopOptions,
-    best: Option<f64>,
-    without_progress: usize,
+    seen: Seen,
+}
+
+/// What the rule has seen.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Seen {
+    /// The lowest loss that counted as progress, metres.
+    pub(crate) best: Option<f64>,
+    /// Iterations since.
+    pub(crate) without_progress: usize,
 }
 
 impl EarlyStop {
     /// A rule that has seen nothing.
     pub(crate) fn new(options: EarlyStopOptions) -> Self {
-        Self {
-            options,
-            best: None,
-            without_progress: 0,
-        }
+        Self::resumed(options, Seen::default())
+    }
+
+    /// A rule that goes on from what it has seen.
+    pub(crate) fn resumed(options: EarlyStopOptions, seen: Seen) -> Self {
+        Self { options, seen }
+    }
+
+    /// What it has seen.
+    pub(crate) fn seen(&self) -> Seen {
+        self.seen
     }
 
     /// Takes the next loss, metres; true where the optimization should end.
@@ -28,14 +42,18 @@ impl EarlyStop {
         if loss.is_nan() {
             return true;
         }
-        match self.best {
-            Some(best) if loss >= best - self.options.min_delta_m => self.without_progress += 1,
+        match self.seen.best {
+            Some(best) if loss >= best - self.options.min_delta_m => {
+                self.seen.without_progress += 1;
+            }
             _ => {
-                self.best = Some(loss);
-                self.without_progress = 0;
+                self.seen = Seen {
+                    best: Some(loss),
+                    without_progress: 0,
+                };
             }
         }
-        self.without_progress >= self.options.patience
+        self.seen.without_progress >= self.options.patience
     }
 }
 

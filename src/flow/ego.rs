@@ -5,12 +5,16 @@
 //! no correspondences. Knows only the transform, never the target's points.
 
 use nalgebra::{Isometry3, Matrix6, Point3, Translation3, UnitQuaternion, Vector3, Vector6};
+use rayon::prelude::*;
 
 use super::distance::DistanceTransform;
 use super::points::{Point, RigidTransform};
+use super::watch::Watch;
 
 /// Points that are looked at: enough for millimetres, few enough for milliseconds.
 const SAMPLED: usize = 16_384;
+/// Points whose sums one thread takes at a time; sums are added in the points' order.
+const POINTS_AT_ONCE: usize = 1024;
 /// Steps at most.
 const STEPS: usize = 30;
 /// Steps over which the weight's scale shrinks.
@@ -25,8 +29,9 @@ const STEP_TOLERANCE: f64 = 1e-5;
 /// Keeps the normal equations solvable where the scene leaves a direction free.
 const DAMPING: f64 = 1e-6;
 
-/// The motion target_from_source that aligns `source` with the transform's target.
-pub fn align(source: &[Point], distance: &DistanceTransform) -> RigidTransform {
+/// The motion target_from_source that aligns `source` with the transform's target; the motion so
+/// far where the watch interrupts.
+pub fn align(source: &[Point], distance: &DistanceTransform, watch: &dyn Watch) -> RigidTransform {
     let stride = source.len().div_ceil(SAMPLED).max(1);
     let points: Vec<Point3<f64>> = source
         .iter()
@@ -38,6 +43,9 @@ pub fn align(source: &[Point], distance: &DistanceTransform) -> RigidTransform {
     };
     let mut target_from_source = RigidTransform::identity();
     for step in 0..STEPS {
+        if watch.interrupt().is_some() {
+            break;
+        }
         let shrunk = (step as f64 / SHRINKING_STEPS as f64).min(1.0);
         let scale = FIRST_SCALE_M * (LAST_SCALE_M / FIRST_SCALE_M).powf(shrunk);
         let pivot = target_from_source * center;
@@ -71,7 +79,27 @@ fn gauss_newton_step(
     distance: &DistanceTransform,
     scale: f64,
 ) -> Option<Vector6<f64>> {
+    let sums: Vec<_> = points
+        .par_chunks(POINTS_AT_ONCE)
+        .map(|points| normal_equations(points, pivot, distance, scale))
+        .collect();
     let mut normal = Matrix6::identity() * DAMPING;
+    let mut gradient = Vector6::zeros();
+    for (own_normal, own_gradient) in sums {
+        normal += own_normal;
+        gradient += own_gradient;
+    }
+    normal.cholesky().map(|factors| factors.solve(&-gradient))
+}
+
+/// The points' share of the normal equations: matrix and gradient.
+fn normal_equations(
+    points: &[Point3<f64>],
+    pivot: Point3<f64>,
+    distance: &DistanceTransform,
+    scale: f64,
+) -> (Matrix6<f64>, Vector6<f64>) {
+    let mut normal = Matrix6::zeros();
     let mut gradient = Vector6::zeros();
     for moved in points {
         let sample = distance.sample([moved.x as f32, moved.y as f32, moved.z as f32]);
@@ -83,7 +111,7 @@ fn gauss_newton_step(
         normal += jacobian * jacobian.transpose() * weight;
         gradient += jacobian * (weight * residual);
     }
-    normal.cholesky().map(|factors| factors.solve(&-gradient))
+    (normal, gradient)
 }
 
 #[cfg(test)]
@@ -92,6 +120,7 @@ mod tests {
     use crate::flow::distance::{DistanceOptions, Sites};
     use crate::flow::random::Random;
     use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
+    use crate::flow::watch::Unwatched;
 
     /// Seen: 0.02 to 0.08 degrees.
     const ACCURACY_DEG: f64 = 0.15;
@@ -152,7 +181,8 @@ mod tests {
                 let before = truth.inverse() * pair.target_from_source;
                 let source = moved(&pair.source, &before);
                 for sites in [Sites::Cells, Sites::Points] {
-                    let found = align(&source, &transform(&source, &pair.target, sites));
+                    let transform = transform(&source, &pair.target, sites);
+                    let found = align(&source, &transform, &Unwatched);
                     let (meters, degrees) = gap(&found, &truth);
                     assert!(
                         meters < accuracy_m(sites) && degrees < ACCURACY_DEG,
@@ -167,7 +197,8 @@ mod tests {
     fn identical_clouds_do_not_move() {
         let target = street(5).target;
         for sites in [Sites::Cells, Sites::Points] {
-            let found = align(&target, &transform(&target, &target, sites));
+            let transform = transform(&target, &target, sites);
+            let found = align(&target, &transform, &Unwatched);
             let (meters, degrees) = gap(&found, &RigidTransform::identity());
             assert!(
                 meters < accuracy_m(sites) && degrees < ACCURACY_DEG,
@@ -192,7 +223,8 @@ mod tests {
             (vec![[f32::NAN; 3], [0.0; 3]], vec![[1.0; 3]]),
         ];
         for (source, target) in scenes {
-            let found = align(&source, &transform(&source, &target, Sites::Cells));
+            let transform = transform(&source, &target, Sites::Cells);
+            let found = align(&source, &transform, &Unwatched);
             assert!(
                 found.to_homogeneous().iter().all(|value| value.is_finite()),
                 "{found}"

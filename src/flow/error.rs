@@ -3,6 +3,7 @@
 use super::backend::BackendError;
 use super::distance::DistanceError;
 use super::points::MIN_POINTS;
+use super::snapshot::SnapshotError;
 
 /// Why an estimate was refused or failed.
 #[derive(Debug, thiserror::Error)]
@@ -37,6 +38,9 @@ pub enum FlowError {
         /// Iterations done before.
         iteration: usize,
     },
+    /// What should be resumed is something else.
+    #[error(transparent)]
+    Snapshot(#[from] SnapshotError),
     /// The device could not go on.
     #[error(transparent)]
     Backend(#[from] BackendError),
@@ -49,9 +53,11 @@ impl FlowError {
             Self::TooFewPoints { .. } | Self::NoGroundMask | Self::GroundMaskLength { .. } => true,
             Self::Backend(BackendError::Distance(error)) => !matches!(
                 error,
-                DistanceError::Cell { .. } | DistanceError::Band { .. }
+                DistanceError::Cell { .. }
+                    | DistanceError::Band { .. }
+                    | DistanceError::Interrupted(_)
             ),
-            Self::Cancelled | Self::Diverged { .. } | Self::Backend(_) => false,
+            Self::Cancelled | Self::Diverged { .. } | Self::Snapshot(_) | Self::Backend(_) => false,
         }
     }
 }

@@ -24,10 +24,12 @@
 //! ```
 
 // What goes in and comes out, and the loop between.
+mod deadline;
 mod error;
 mod options;
 mod points;
 mod preprocess;
+mod snapshot;
 mod solver;
 mod watch;
 
@@ -55,5 +57,6 @@ pub use error::FlowError;
 pub use options::*;
 pub use points::{MIN_POINTS, Point, RigidTransform};
 pub use preprocess::Problem;
-pub use solver::{DYNAMIC_M, Estimate, PhaseSeconds, StopReason, estimate};
+pub use snapshot::{Snapshot, SnapshotError, TrainerState};
+pub use solver::{DYNAMIC_M, Estimate, PhaseSeconds, StopReason, estimate, resume};
 pub use watch::{Interrupt, Progress, Unwatched, Watch};

@@ -105,6 +105,28 @@ impl Options {
         }
     }
 
+    /// Iterations that a run usually takes: all of them where no rule stops it; the published rule
+    /// stops after 36 to 115.
+    pub fn expected_iterations(&self) -> usize {
+        match self.early_stop {
+            None => self.max_iterations,
+            Some(_) => self.max_iterations.min(60),
+        }
+    }
+
+    /// These options for a run that its deadline cuts short: batches, and a step size that falls to
+    /// zero within `iterations`.
+    pub(crate) fn hurried(&self, batch: usize, iterations: usize) -> Self {
+        Self {
+            decay: Decay::Cosine,
+            batch: Some(batch),
+            keep: Keep::Average { decay: 0.9 },
+            early_stop: None,
+            max_iterations: iterations,
+            ..self.clone()
+        }
+    }
+
     /// Ours; `docs/numerics.md` shows what each of these choices changes.
     fn stochastic(max_points: Option<usize>) -> Self {
         Self {
@@ -125,6 +147,28 @@ impl Options {
             early_stop: None,
             max_iterations: 150,
             ..Self::published(max_points)
+        }
+    }
+}
+
+/// How a run that its deadline cuts short is fitted.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Hurry {
+    /// Points an iteration looks at, least and most. Half of the fewest is no cheaper on two cores.
+    pub(crate) batches: [usize; 2],
+    /// Iterations that are worth smaller batches; with the largest batches, more are done.
+    pub(crate) iterations: usize,
+    /// With fewer iterations the field is worse than none: none are done.
+    pub(crate) least_iterations: usize,
+}
+
+impl Hurry {
+    /// With or without an ego motion to fall back to.
+    pub(crate) fn new(ego: bool) -> Self {
+        Self {
+            batches: [768, 2048],
+            iterations: 150,
+            least_iterations: if ego { 40 } else { 10 },
         }
     }
 }

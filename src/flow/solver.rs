@@ -1,13 +1,16 @@
 //! The loop: select, transform, align, then forward, query, backward and Adam until the end.
 //!
 //! FNSF Section 3: `theta* = argmin mean_p D(p + g(p; theta))`. Sees only the backend's traits.
+//! What becomes of it under a deadline is in `deadline.rs`.
 
-use super::backend::{Advance, Backend};
+use super::backend::{Advance, Backend, Report};
+use super::deadline::{self, Loop, Pace, Prepared};
 use super::error::FlowError;
 use super::loss::length;
 use super::options::{Ego, Options};
 use super::points::{Point, RigidTransform};
-use super::preprocess::{self, Problem};
+use super::preprocess::{self, Problem, Selection};
+use super::snapshot::{Snapshot, TrainerState};
 use super::watch::{Interrupt, Watch};
 
 /// Iterations that a backend may do without coming back.
@@ -84,20 +87,47 @@ pub struct PhaseSeconds {
 ///
 /// # Errors
 /// [`FlowError`] where the input is refused, the watch cancels or the device fails. A deadline is
-/// no error: the best flow so far comes back.
+/// no error: the best flow that the time allows comes back.
 pub fn estimate(
     backend: &dyn Backend,
     problem: &Problem,
     options: &Options,
     watch: &dyn Watch,
 ) -> Result<Estimate, FlowError> {
+    solve(backend, problem, options, None, watch)
+}
+
+/// Goes on where `snapshot` was taken, and ends as [`estimate`] would have, bit for bit.
+///
+/// # Errors
+/// As [`estimate`], and [`FlowError::Snapshot`] where the snapshot belongs to something else.
+pub fn resume(
+    backend: &dyn Backend,
+    problem: &Problem,
+    options: &Options,
+    snapshot: Snapshot,
+    watch: &dyn Watch,
+) -> Result<Estimate, FlowError> {
+    solve(backend, problem, options, Some(snapshot), watch)
+}
+
+fn solve(
+    backend: &dyn Backend,
+    problem: &Problem,
+    options: &Options,
+    snapshot: Option<Snapshot>,
+    watch: &dyn Watch,
+) -> Result<Estimate, FlowError> {
     let began = watch.seconds();
     let selection = preprocess::select(problem, options)?;
-    let transform = backend.transform(&selection.source, &selection.target, &options.distance)?;
-    let ego = match options.ego {
-        Ego::Off => None,
-        Ego::Auto => Some(transform.align(&selection.source)),
-        Ego::Given(target_from_source) => Some(target_from_source),
+    let state = snapshot
+        .map(|snapshot| snapshot.state_for(&selection, options))
+        .transpose()?;
+    let prepared = deadline::prepare(backend, &selection, options, watch)?;
+    let ego = match (&prepared, options.ego) {
+        (Some(prepared), _) => prepared.ego,
+        (None, Ego::Given(target_from_source)) => Some(target_from_source),
+        (None, _) => None,
     };
     let aligned = match &ego {
         None => selection.source.clone(),
@@ -107,45 +137,26 @@ pub fn estimate(
             .map(|&point| moved(motion, point))
             .collect(),
     };
-    let distance_bytes = transform.bytes();
-    let mut options = options.clone();
-    if let (Some(share), Some(_)) = (options.loss.margin_quantile, &ego) {
-        let distances = transform.distances(&aligned);
-        let ranges = aligned.iter().map(|&point| length(point).max(1.0));
-        let slopes = distances
-            .iter()
-            .zip(ranges)
-            .map(|(d, range)| d / range)
-            .collect();
-        options.loss.margin_slope = options.loss.margin_slope.max(quantile(slopes, share));
-    }
     if watch.interrupt() == Some(Interrupt::Cancelled) {
         return Err(FlowError::Cancelled);
     }
-    let mut trainer = transform.start(&aligned, &options)?;
-    let precomputed = watch.seconds();
-
-    let stop_reason = loop {
-        match trainer.advance(STEPS_AT_ONCE, watch)? {
-            Advance::Continues => {}
-            Advance::Converged => break StopReason::Converged,
-            Advance::Exhausted => break StopReason::MaxIterations,
-            Advance::Interrupted(Interrupt::Deadline) => break StopReason::Deadline,
-            Advance::Interrupted(Interrupt::Cancelled) => return Err(FlowError::Cancelled),
-            Advance::Diverged => {
-                return Err(FlowError::Diverged {
-                    iteration: trainer.report().iterations,
-                });
-            }
+    let fitted = match &prepared {
+        None => Fitted::nothing(aligned.len(), watch),
+        Some(prepared) => Fit {
+            selection: &selection,
+            aligned: &aligned,
+            asked: options,
+            prepared,
+            watch,
         }
+        .run(state)?,
     };
-    let residual = trainer.evaluate(&aligned)?;
 
     let mut flow = vec![[0.0; 3]; problem.source.len()];
     let mut valid = vec![false; problem.source.len()];
     let mut dynamic = ego.map(|_| vec![false; problem.source.len()]);
     for (i, &row) in selection.rows.iter().enumerate() {
-        let (from, to, residual) = (selection.source[i], aligned[i], residual[i]);
+        let (from, to, residual) = (selection.source[i], aligned[i], fitted.residual[i]);
         flow[row] = core::array::from_fn(|a| (to[a] - from[a]) + residual[a]);
         valid[row] = true;
         if let Some(dynamic) = &mut dynamic {
@@ -153,7 +164,8 @@ pub fn estimate(
             dynamic[row] = square >= DYNAMIC_M * DYNAMIC_M;
         }
     }
-    let report = trainer.report();
+    let report = fitted.report;
+    let precompute = fitted.precomputed - began;
     let total = watch.seconds() - began;
     Ok(Estimate {
         flow,
@@ -164,15 +176,127 @@ pub fn estimate(
         iterations: report.iterations,
         best_iteration: report.best_iteration,
         best_loss: report.best_loss,
-        stop_reason,
+        stop_reason: fitted.stop_reason,
         seconds: PhaseSeconds {
-            precompute: precomputed - began,
+            precompute,
             query: report.query_seconds,
-            network: total - (precomputed - began) - report.query_seconds,
+            network: total - precompute - report.query_seconds,
             total,
         },
-        distance_bytes,
+        distance_bytes: prepared.map_or(0, |prepared| prepared.transform.bytes()),
     })
+}
+
+/// One fit of a field to what is prepared.
+struct Fit<'a> {
+    selection: &'a Selection,
+    /// The source, the ego motion taken out.
+    aligned: &'a [Point],
+    asked: &'a Options,
+    prepared: &'a Prepared,
+    watch: &'a dyn Watch,
+}
+
+/// A fitted field at the source's points.
+struct Fitted {
+    residual: Vec<Point>,
+    report: Report,
+    stop_reason: StopReason,
+    /// When the first iteration could begin.
+    precomputed: f64,
+}
+
+impl Fitted {
+    /// No field at all: there was no time.
+    fn nothing(points: usize, watch: &dyn Watch) -> Self {
+        Self {
+            residual: vec![[0.0; 3]; points],
+            report: Report {
+                iterations: 0,
+                best_iteration: 0,
+                best_loss: f64::INFINITY,
+                query_seconds: 0.0,
+            },
+            stop_reason: StopReason::Deadline,
+            precomputed: watch.seconds(),
+        }
+    }
+}
+
+impl Fit<'_> {
+    /// Fits from the start, or from `state`.
+    fn run(&self, state: Option<TrainerState>) -> Result<Fitted, FlowError> {
+        let (prepared, watch) = (self.prepared, self.watch);
+        let mut options = self.with_margin();
+        let mut trainer = prepared.transform.start(self.aligned, &options)?;
+        let mut cut = !prepared.whole;
+        let pace = match watch.seconds_left() {
+            None => None,
+            Some(_) => Some(Pace::measure(trainer.as_mut(), self.aligned, watch)?),
+        };
+        let left = watch.seconds_left();
+        if let Some(state) = state {
+            trainer.restore(state);
+        } else if let (Some(pace), Some(left)) = (pace, left)
+            && let Some(hurried) = pace.hurried(&options, prepared, self.aligned.len(), left)
+        {
+            if hurried.max_iterations == 0 {
+                return Ok(Fitted::nothing(self.aligned.len(), watch));
+            }
+            cut = true;
+            options = hurried;
+            trainer = prepared.transform.start(self.aligned, &options)?;
+        }
+        let precomputed = watch.seconds();
+        let clock = Loop::begin(watch, pace, trainer.report().iterations);
+        let stop_reason = loop {
+            let done = trainer.report().iterations;
+            if let Some(fitting) = clock.shortened(done, &options) {
+                cut = true;
+                options.max_iterations = fitting;
+                trainer.shorten(fitting);
+            }
+            let (steps, early) = clock.next(done, STEPS_AT_ONCE);
+            match trainer.advance(steps, &early)? {
+                Advance::Continues if !cut && watch.snapshot_due() => {
+                    watch.snapshot(Snapshot::new(self.selection, self.asked, trainer.state()));
+                }
+                Advance::Continues => {}
+                Advance::Converged | Advance::Exhausted if cut => break StopReason::Deadline,
+                Advance::Converged => break StopReason::Converged,
+                Advance::Exhausted => break StopReason::MaxIterations,
+                Advance::Interrupted(Interrupt::Deadline) => break StopReason::Deadline,
+                Advance::Interrupted(Interrupt::Cancelled) => return Err(FlowError::Cancelled),
+                Advance::Diverged => {
+                    return Err(FlowError::Diverged {
+                        iteration: trainer.report().iterations,
+                    });
+                }
+            }
+        };
+        Ok(Fitted {
+            residual: deadline::evaluate(trainer.as_mut(), self.aligned, watch)?,
+            report: trainer.report(),
+            stop_reason,
+            precomputed,
+        })
+    }
+
+    /// The options, with the margin that the pair asks for.
+    fn with_margin(&self) -> Options {
+        let mut options = self.asked.clone();
+        if let (Some(share), Some(_)) = (options.loss.margin_quantile, &self.prepared.ego) {
+            let distances = self.prepared.transform.distances(self.aligned);
+            let ranges = self.aligned.iter().map(|&point| length(point).max(1.0));
+            let slopes = distances
+                .iter()
+                .zip(ranges)
+                .map(|(d, range)| d / range)
+                .collect();
+            options.loss.margin_slope = options.loss.margin_slope.max(quantile(slopes, share));
+        }
+        options
+    }
 }
 
 /// The value below which `share` of the values lie; zero where there are none.

@@ -13,11 +13,14 @@ pub use workload::{NetworkWorkload, multiply_add_peak};
 
 use std::sync::Arc;
 
+use rayon::prelude::*;
+
 use super::backend::{Backend, BackendError, Trainer, Transform};
 use super::distance::{DistanceOptions, DistanceTransform};
 use super::ego;
 use super::options::Options;
 use super::points::{Point, RigidTransform};
+use super::watch::Watch;
 use kernels::Kernels;
 
 /// The CPU, or a set of its threads.
@@ -71,10 +74,11 @@ impl Backend for CpuBackend {
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,
+        watch: &dyn Watch,
     ) -> Result<Box<dyn Transform>, BackendError> {
         let distance = self
             .threads
-            .install(|| DistanceTransform::build(source, target, options))?;
+            .install(|| DistanceTransform::build_watched(source, target, options, watch))?;
         let (kernels, threads) = (self.kernels, Arc::clone(&self.threads));
         Ok(Box::new(CpuTransform {
             kernels,
@@ -96,20 +100,22 @@ impl Transform for CpuTransform {
         self.distance.bytes()
     }
 
-    fn align(&self, source: &[Point]) -> RigidTransform {
-        ego::align(source, &self.distance)
+    fn align(&self, source: &[Point], watch: &dyn Watch) -> RigidTransform {
+        self.threads
+            .install(|| ego::align(source, &self.distance, watch))
     }
 
     fn distances(&self, points: &[Point]) -> Vec<f32> {
         let sample = |&point: &Point| self.distance.sample(point).distance;
-        points.iter().map(sample).collect()
+        self.threads
+            .install(|| points.par_iter().map(sample).collect())
     }
 
     fn start(
-        self: Box<Self>,
+        &self,
         source: &[Point],
         options: &Options,
-    ) -> Result<Box<dyn Trainer>, BackendError> {
-        Ok(Box::new(trainer::CpuTrainer::new(*self, source, options)))
+    ) -> Result<Box<dyn Trainer + '_>, BackendError> {
+        Ok(Box::new(trainer::CpuTrainer::new(self, source, options)))
     }
 }

@@ -5,6 +5,7 @@
 
 use super::grid::Grid;
 use super::options::DistanceError;
+use crate::flow::watch::{self, Watch};
 
 /// Vertices along a brick's edge, and bricks along a block's.
 pub(crate) const EDGE: u32 = 8;
@@ -16,6 +17,8 @@ pub(crate) const ABSENT: u32 = u32::MAX;
 pub(crate) const BRICK_BYTES: usize = VOLUME * size_of::<u16>();
 /// The most blocks: 64 MB of index.
 const MAX_BLOCKS: usize = 16 << 20;
+/// Occupied vertices between two looks at the watch: a few milliseconds.
+const CELLS_AT_ONCE: usize = 4096;
 
 /// Where each active brick is kept.
 #[derive(Debug)]
@@ -34,12 +37,14 @@ impl Index {
     /// Marks every brick that has a vertex within `band` cells of an occupied vertex.
     ///
     /// # Errors
-    /// Where the grid has too many blocks, or index and bricks would take more than `max_bytes`.
+    /// Where the grid has too many blocks, index and bricks would take more than `max_bytes`, or the
+    /// watch interrupts.
     pub(crate) fn activate(
         grid: &Grid,
         cells: &[[u32; 3]],
         band: i32,
         max_bytes: usize,
+        watch: &dyn Watch,
     ) -> Result<Self, DistanceError> {
         let brick_counts = grid.vertices.map(|n| n.div_ceil(EDGE as usize));
         let blocks = brick_counts.map(|n| n.div_ceil(EDGE as usize));
@@ -61,7 +66,10 @@ impl Index {
         let limit = band * band;
         // Bricks are numbered by 32 bits.
         let limit_bytes = max_bytes.min(ABSENT as usize * BRICK_BYTES);
-        for cell in cells {
+        for (number, cell) in cells.iter().enumerate() {
+            if number % CELLS_AT_ONCE == 0 {
+                watch::check(watch)?;
+            }
             let needed = index.bytes() + index.active * BRICK_BYTES;
             if needed > limit_bytes {
                 return Err(DistanceError::Memory {

@@ -5,14 +5,16 @@
 //! pulled home. Deterministic whatever the number of threads. FNSF Section 3.2, eq. 4 and 5.
 
 use super::Sample;
-use super::activate::{ABSENT, BRICK_BYTES, Index, VOLUME, within};
+use super::activate::{ABSENT, Index, VOLUME, within};
 use super::build::{self, BEYOND};
 use super::cell_sites::{CellGather, CellSites};
 use super::far::FarField;
 use super::grid::{Grid, trilinear};
+use super::layout::Layout;
 use super::options::{DistanceError, DistanceOptions, Sites};
 use super::point_sites::{PointGather, PointSites};
 use crate::flow::Point;
+use crate::flow::watch::{Unwatched, Watch};
 
 /// The transform: distances at the vertices of active bricks, and a far field.
 #[derive(Debug)]
@@ -38,35 +40,36 @@ impl Bricks {
         target: &[Point],
         options: &DistanceOptions,
     ) -> Result<Self, DistanceError> {
-        options.check()?;
-        let grid = Grid::covering(source, target, options.cell_m)?;
-        let mut cells: Vec<_> = target.iter().map(|&p| grid.nearest_vertex(p)).collect();
-        cells.sort_unstable();
-        cells.dedup();
-        let band = options.band_cells();
-        let index = Index::activate(&grid, &cells, band, options.max_bytes)?;
-        let sites = match options.sites {
-            Sites::Cells => CellSites::bytes(cells.len(), band),
-            Sites::Points => PointSites::bytes(target.len()),
-        };
-        let needed =
-            index.bytes() + index.active * BRICK_BYTES + FarField::bytes_over(&grid) + sites;
-        if needed > options.max_bytes {
-            return Err(DistanceError::Memory {
-                needed,
-                limit: options.max_bytes,
-            });
-        }
+        Self::build_watched(source, target, options, &Unwatched)
+    }
+
+    /// As [`Self::build`]; looks at `watch` between pieces of some milliseconds.
+    ///
+    /// # Errors
+    /// As [`Self::build`], and [`DistanceError::Interrupted`].
+    pub fn build_watched(
+        source: &[Point],
+        target: &[Point],
+        options: &DistanceOptions,
+        watch: &dyn Watch,
+    ) -> Result<Self, DistanceError> {
+        let Layout {
+            grid,
+            cells,
+            index,
+            band,
+            ..
+        } = Layout::plan(source, target, options, watch)?;
         // Before the bricks, so that what it needs meanwhile is free again.
-        let far = FarField::build(&grid, &cells, f64::from(band) * grid.cell);
+        let far = FarField::build(&grid, &cells, f64::from(band) * grid.cell, watch)?;
         let codes = match options.sites {
             Sites::Cells => {
                 let sites = CellSites::new(&cells, band);
-                build::band_codes(&index, || CellGather::new(&sites))
+                build::band_codes(&index, || CellGather::new(&sites), watch)?
             }
             Sites::Points => {
                 let sites = PointSites::new(&grid, target, band);
-                build::band_codes(&index, || PointGather::new(&sites))
+                build::band_codes(&index, || PointGather::new(&sites), watch)?
             }
         };
         Ok(Self {

@@ -9,6 +9,7 @@ use core::ops::Range;
 use rayon::prelude::*;
 
 use super::activate::{ABSENT, EDGE, Index, VOLUME};
+use crate::flow::watch::{self, Interrupt, Watch};
 
 /// Marks a vertex of an active brick that lies beyond the band.
 pub(super) const BEYOND: u16 = u16::MAX;
@@ -32,11 +33,13 @@ pub(super) fn codes_per_cell(band: i32) -> f64 {
     f64::from(BEYOND - 1) / f64::from(band)
 }
 
-/// The codes of all active bricks, 512 a brick, by as many gathers as there are threads.
+/// The codes of all active bricks, 512 a brick, by as many gathers as there are threads; nothing
+/// where the watch, looked at before every block, interrupts.
 pub(super) fn band_codes<G: Gather>(
     index: &Index,
     gather: impl Fn() -> G + Send + Sync,
-) -> Vec<u16> {
+    watch: &dyn Watch,
+) -> Result<Vec<u16>, Interrupt> {
     let mut codes = vec![0u16; index.active * VOLUME];
     let mut rest = codes.as_mut_slice();
     let mut blocks = Vec::new();
@@ -49,10 +52,12 @@ pub(super) fn band_codes<G: Gather>(
     }
     blocks
         .into_par_iter()
-        .for_each_init(gather, |gather, (block, bricks, own)| {
+        .try_for_each_init(gather, |gather, (block, bricks, own)| {
+            watch::check(watch)?;
             fill_block(gather, block, bricks, own);
-        });
-    codes
+            Ok(())
+        })?;
+    Ok(codes)
 }
 
 /// Blocks that have a table, in the order of their tables, with their coordinates.

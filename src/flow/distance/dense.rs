@@ -11,6 +11,7 @@ use super::Sample;
 use super::grid::{Grid, trilinear};
 use super::options::{DistanceError, DistanceOptions};
 use crate::flow::Point;
+use crate::flow::watch::{self, Interrupt, Unwatched, Watch};
 
 /// Length of the diagonal of a cell.
 const SQRT_3: f32 = 1.732_050_8;
@@ -32,6 +33,43 @@ impl DenseChamfer {
         target: &[Point],
         options: &DistanceOptions,
     ) -> Result<Self, DistanceError> {
+        Self::build_watched(source, target, options, &Unwatched)
+    }
+
+    /// As [`Self::build`]; looks at `watch` between planes.
+    ///
+    /// # Errors
+    /// As [`Self::build`], and [`DistanceError::Interrupted`].
+    pub fn build_watched(
+        source: &[Point],
+        target: &[Point],
+        options: &DistanceOptions,
+        watch: &dyn Watch,
+    ) -> Result<Self, DistanceError> {
+        let grid = Self::plan(source, target, options)?;
+        let [nx, ny, nz] = grid.vertices;
+        let mut distances = vec![f32::INFINITY; nx * ny * nz];
+        for &point in target {
+            let [x, y, z] = grid.nearest_vertex(point).map(|v| v as usize);
+            distances[(x * ny + y) * nz + z] = 0.0;
+        }
+        let strides = [ny * nz, nz, 1];
+        for axis in 0..3 {
+            sweep(&mut distances, grid.vertices, strides, axis, false, watch)?;
+            sweep(&mut distances, grid.vertices, strides, axis, true, watch)?;
+        }
+        for distance in &mut distances {
+            *distance *= grid.cell as f32;
+        }
+        Ok(Self { grid, distances })
+    }
+
+    /// The grid of the transform, refused where it would not fit.
+    pub(super) fn plan(
+        source: &[Point],
+        target: &[Point],
+        options: &DistanceOptions,
+    ) -> Result<Grid, DistanceError> {
         options.check()?;
         let grid = Grid::covering(source, target, options.cell_m)?;
         let bytes = grid
@@ -44,21 +82,7 @@ impl DenseChamfer {
         if needed > limit {
             return Err(DistanceError::Memory { needed, limit });
         }
-        let [nx, ny, nz] = grid.vertices;
-        let mut distances = vec![f32::INFINITY; nx * ny * nz];
-        for &point in target {
-            let [x, y, z] = grid.nearest_vertex(point).map(|v| v as usize);
-            distances[(x * ny + y) * nz + z] = 0.0;
-        }
-        let strides = [ny * nz, nz, 1];
-        for axis in 0..3 {
-            sweep(&mut distances, grid.vertices, strides, axis, false);
-            sweep(&mut distances, grid.vertices, strides, axis, true);
-        }
-        for distance in &mut distances {
-            *distance *= grid.cell as f32;
-        }
-        Ok(Self { grid, distances })
+        Ok(grid)
     }
 
     /// Trilinear distance and gradient at `point`, see [`Sample`].
@@ -95,7 +119,14 @@ impl DenseChamfer {
 
 /// One pass along `axis`: every cell takes the least of itself and the 3x3 cells of the plane
 /// before it, one, sqrt 2 or sqrt 3 cells away.
-fn sweep(distances: &mut [f32], counts: [usize; 3], strides: [usize; 3], axis: usize, back: bool) {
+fn sweep(
+    distances: &mut [f32],
+    counts: [usize; 3],
+    strides: [usize; 3],
+    axis: usize,
+    back: bool,
+    watch: &dyn Watch,
+) -> Result<(), Interrupt> {
     // z last wherever it can be: neighbors in memory are then neighbors in the plane.
     let (a, b) = [(1, 2), (0, 2), (0, 1)][axis];
     let planes = Planes {
@@ -107,6 +138,7 @@ fn sweep(distances: &mut [f32], counts: [usize; 3], strides: [usize; 3], axis: u
     let mut before = planes.empty();
     let mut current = planes.empty();
     for step in 0..counts[axis] {
+        watch::check(watch)?;
         let plane = if back { counts[axis] - 1 - step } else { step };
         planes.lower(
             &mut distances[plane * strides[axis]..],
@@ -115,6 +147,7 @@ fn sweep(distances: &mut [f32], counts: [usize; 3], strides: [usize; 3], axis: u
         );
         core::mem::swap(&mut before, &mut current);
     }
+    Ok(())
 }
 
 /// The planes across a sweep: their size and where their cells lie.

@@ -10,6 +10,7 @@
 use rayon::prelude::*;
 
 use super::grid::{Grid, trilinear};
+use crate::flow::watch::{self, Interrupt, Watch};
 
 /// The most coarse vertices: 8 M floats are 32 MB.
 const MAX_VERTICES: usize = 8 << 20;
@@ -43,19 +44,23 @@ impl FarField {
     }
 
     /// Transforms the occupied fine vertices `cells`; distances below the radius `band_m` are
-    /// raised to it.
-    pub(crate) fn build(grid: &Grid, cells: &[[u32; 3]], band_m: f64) -> Self {
+    /// raised to it. Nothing where the watch, looked at between slabs, interrupts.
+    pub(crate) fn build(
+        grid: &Grid,
+        cells: &[[u32; 3]],
+        band_m: f64,
+        watch: &dyn Watch,
+    ) -> Result<Self, Interrupt> {
         let (pitch, vertices) = Self::layout(grid);
         let [_, ny, nz] = vertices;
         let mut nearest = seeds(cells, pitch, vertices);
-        nearest
-            .par_chunks_mut(nz)
-            .for_each_init(Envelope::default, |envelope, line| {
-                envelope.transform(line);
-            });
-        nearest.par_chunks_mut(ny * nz).for_each_init(
+        nearest.par_chunks_mut(ny * nz).try_for_each_init(
             || (Envelope::default(), vec![Nearest::NONE; ny]),
             |(envelope, line), slab| {
+                watch::check(watch)?;
+                for line in slab.chunks_mut(nz) {
+                    envelope.transform(line);
+                }
                 for z in 0..nz {
                     for y in 0..ny {
                         line[y] = slab[y * nz + z];
@@ -65,9 +70,10 @@ impl FarField {
                         slab[y * nz + z] = line[y];
                     }
                 }
+                Ok(())
             },
-        );
-        transform_along_x(&mut nearest, vertices);
+        )?;
+        transform_along_x(&mut nearest, vertices, watch)?;
         let beside = Beside {
             cells,
             pitch,
@@ -75,12 +81,20 @@ impl FarField {
             nearest: &nearest,
         };
         let band = (band_m / grid.cell) as f32;
-        let meters = |at: usize| beside.distance(at, band) * grid.cell as f32;
-        Self {
+        let mut distances = vec![0.0; nearest.len()];
+        let slabs = distances.par_chunks_mut(ny * nz).enumerate();
+        slabs.try_for_each(|(slab, distances)| {
+            watch::check(watch)?;
+            for (at, distance) in (slab * ny * nz..).zip(distances) {
+                *distance = beside.distance(at, band) * grid.cell as f32;
+            }
+            Ok(())
+        })?;
+        Ok(Self {
             pitch,
             vertices,
-            distances: (0..nearest.len()).into_par_iter().map(meters).collect(),
-        }
+            distances,
+        })
     }
 
     /// Distance at a place given in fine cells from the origin, and its derivative by fine cells.
@@ -177,9 +191,14 @@ fn length(a: [u32; 3], b: [u32; 3]) -> f32 {
 
 /// The last pass, `y` by `y` through a copy with x innermost: columns of the whole grid are too
 /// far apart to be read one by one.
-fn transform_along_x(nearest: &mut [Nearest], [nx, ny, nz]: [usize; 3]) {
+fn transform_along_x(
+    nearest: &mut [Nearest],
+    [nx, ny, nz]: [usize; 3],
+    watch: &dyn Watch,
+) -> Result<(), Interrupt> {
     let mut columns = vec![Nearest::NONE; nz * nx];
     for y in 0..ny {
+        watch::check(watch)?;
         let row = |x: usize| (x * ny + y) * nz..(x * ny + y + 1) * nz;
         for x in 0..nx {
             for (z, &nearest) in nearest[row(x)].iter().enumerate() {
@@ -197,6 +216,7 @@ fn transform_along_x(nearest: &mut [Nearest], [nx, ny, nz]: [usize; 3]) {
             }
         }
     }
+    Ok(())
 }
 
 /// The lower envelope of unit parabolas: the one-dimensional squared distance transform.

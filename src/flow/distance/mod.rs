@@ -10,6 +10,7 @@ mod cell_sites;
 pub mod dense;
 mod far;
 mod grid;
+mod layout;
 mod options;
 mod point_sites;
 #[cfg(test)]
@@ -21,6 +22,7 @@ pub use grid::Grid;
 pub use options::{DistanceError, DistanceOptions, Metric, Sites};
 
 use crate::flow::Point;
+use crate::flow::watch::{Unwatched, Watch};
 
 /// The distance at a point and how it changes with the point.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -51,9 +53,26 @@ impl DistanceTransform {
         target: &[Point],
         options: &DistanceOptions,
     ) -> Result<Self, DistanceError> {
+        Self::build_watched(source, target, options, &Unwatched)
+    }
+
+    /// As [`Self::build`]; looks at `watch` between pieces of some milliseconds.
+    ///
+    /// # Errors
+    /// As [`Self::build`], and [`DistanceError::Interrupted`].
+    pub fn build_watched(
+        source: &[Point],
+        target: &[Point],
+        options: &DistanceOptions,
+        watch: &dyn Watch,
+    ) -> Result<Self, DistanceError> {
         Ok(match options.metric {
-            Metric::Euclidean => Self::Bricks(Bricks::build(source, target, options)?),
-            Metric::Chamfer => Self::Chamfer(DenseChamfer::build(source, target, options)?),
+            Metric::Euclidean => {
+                Self::Bricks(Bricks::build_watched(source, target, options, watch)?)
+            }
+            Metric::Chamfer => {
+                Self::Chamfer(DenseChamfer::build_watched(source, target, options, watch)?)
+            }
         })
     }
 

@@ -1,5 +1,7 @@
 //! The distance transform's options and errors; checked before anything is allocated.
 
+use crate::flow::watch::Interrupt;
+
 /// How distance is measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Metric {
@@ -117,6 +119,15 @@ pub enum DistanceError {
         /// Bytes allowed.
         limit: usize,
     },
+    /// The watch asked for the end.
+    #[error("the distance transform was interrupted")]
+    Interrupted(Interrupt),
+}
+
+impl From<Interrupt> for DistanceError {
+    fn from(interrupt: Interrupt) -> Self {
+        Self::Interrupted(interrupt)
+    }
 }
 
 #[cfg(test)]

@@ -1,0 +1,186 @@
+//! The trainer against the method in double precision, and what must not change its bits.
+
+use super::*;
+use crate::flow::backend::{Backend, Transform};
+use crate::flow::cpu::{CpuBackend, Isa};
+use crate::flow::distance::{DistanceOptions, DistanceTransform};
+use crate::flow::options::Preset;
+use crate::flow::reference::ReferenceNetwork;
+use crate::flow::watch::Unwatched;
+use std::sync::Mutex;
+
+/// Collects the losses.
+#[derive(Default)]
+struct Losses(Mutex<Vec<f64>>);
+
+impl Watch for Losses {
+    fn progress(&self, progress: Progress) {
+        self.0
+            .lock()
+            .expect("no test panics in it")
+            .push(progress.loss);
+    }
+}
+
+/// A wall and a box in front of it, and the same moved by a quarter of a metre.
+fn clouds(points: usize) -> [Vec<Point>; 2] {
+    let mut random = Random::new(5);
+    let source: Vec<Point> = (0..points)
+        .map(|i| {
+            let mut across = |width: f64| random.uniform(-width, width) as f32;
+            if i % 3 == 0 {
+                [4.0, across(1.0), across(1.0)]
+            } else {
+                [8.0, across(6.0), across(2.0)]
+            }
+        })
+        .collect();
+    let target = source
+        .iter()
+        .map(|p| [p[0] + 0.1, p[1] + 0.2, p[2]])
+        .collect();
+    [source, target]
+}
+
+fn transform(
+    isa: Isa,
+    threads: usize,
+    source: &[Point],
+    target: &[Point],
+    options: &Options,
+) -> Box<dyn Transform> {
+    let backend = CpuBackend::with_isa(isa, Some(threads)).expect("threads");
+    backend
+        .transform(source, target, &options.distance, &Unwatched)
+        .expect("small clouds")
+}
+
+fn fitted(isa: Isa, threads: usize, options: &Options, steps: usize) -> (Vec<f64>, Vec<Point>) {
+    let [source, target] = clouds(1500);
+    let losses = Losses::default();
+    let transform = transform(isa, threads, &source, &target, options);
+    let mut trainer = transform.start(&source, options).expect("a trainer");
+    trainer
+        .advance(steps, &losses)
+        .expect("the cpu does not fail");
+    let flow = trainer.evaluate(&source).expect("the cpu does not fail");
+    (losses.0.into_inner().expect("no test panics in it"), flow)
+}
+
+#[test]
+fn the_first_losses_are_those_of_the_method_in_double_precision() {
+    // Single against double precision, over ten steps that each move every weight by 0.008.
+    const TOLERANCE: f64 = 2e-3;
+    const STEPS: i32 = 10;
+    let [source, target] = clouds(200);
+    let options = Preset::Paper.options(None);
+    let mut network =
+        ReferenceNetwork::read(&Parameters::xavier(&mut Random::stream(options.seed, 0)));
+    let distance = DistanceTransform::build(&source, &target, &DistanceOptions::default())
+        .expect("small clouds");
+    let mut moments = [
+        vec![0.0; network.flat().len()],
+        vec![0.0; network.flat().len()],
+    ];
+    let mut expected = Vec::new();
+    for iteration in 1..=STEPS {
+        let mut gradients = ReferenceNetwork::read(&Parameters::zeros());
+        let mut loss = 0.0;
+        for point in &source {
+            let input = point.map(f64::from);
+            let flow = network.forward(input);
+            let sample = distance.sample(core::array::from_fn(|a| (input[a] + flow[a]) as f32));
+            loss += f64::from(sample.distance) / source.len() as f64;
+            let pull = sample.gradient.map(|g| f64::from(g) / source.len() as f64);
+            network.backward(input, pull, &mut gradients);
+        }
+        network.adam_step(&gradients, &mut moments, iteration, 0.008);
+        expected.push(loss);
+    }
+    for isa in Isa::available() {
+        let losses = Losses::default();
+        let transform = transform(isa, 2, &source, &target, &options);
+        let mut trainer = transform.start(&source, &options).expect("a trainer");
+        trainer
+            .advance(STEPS as usize, &losses)
+            .expect("the cpu does not fail");
+        let losses = losses.0.into_inner().expect("no test panics in it");
+        assert_eq!(losses.len(), expected.len(), "{isa:?}");
+        for (loss, expected) in losses.iter().zip(&expected) {
+            let error = (loss - expected).abs() / expected;
+            assert!(error < TOLERANCE, "{isa:?}: {losses:?} {expected:?}");
+        }
+    }
+}
+
+#[test]
+fn the_number_of_threads_does_not_change_a_bit() {
+    for preset in Preset::ALL {
+        let mut options = preset.options(None);
+        options.batch = options.batch.map(|_| 700);
+        let [one, two, five] =
+            [1, 2, 5].map(|threads| fitted(Isa::available()[0], threads, &options, 12));
+        assert_eq!(one, two, "{preset:?}");
+        assert_eq!(one, five, "{preset:?}");
+    }
+}
+
+#[test]
+fn seeds_give_different_fields() {
+    let mut options = Preset::Default.options(None);
+    let first = fitted(Isa::Portable, 1, &options, 3);
+    options.seed = 1;
+    assert_ne!(first, fitted(Isa::Portable, 1, &options, 3));
+}
+
+#[test]
+fn a_zero_start_is_no_flow() {
+    let options = Preset::Default.options(None);
+    let (_, flow) = fitted(Isa::available()[0], 1, &options, 0);
+    assert!(flow.iter().flatten().all(|&f| f == 0.0));
+}
+
+#[test]
+fn the_best_field_has_the_lowest_loss_and_not_the_last() {
+    let mut options = Preset::Paper.options(None);
+    options.early_stop = None;
+    // Steps this long overshoot after a while.
+    options.learning_rate = 0.05;
+    let [source, target] = clouds(500);
+    let losses = Losses::default();
+    let transform = transform(Isa::available()[0], 2, &source, &target, &options);
+    let mut trainer = transform.start(&source, &options).expect("a trainer");
+    trainer.advance(40, &losses).expect("the cpu does not fail");
+    let losses = losses.0.into_inner().expect("no test panics in it");
+    let lowest = losses.iter().copied().fold(f64::INFINITY, f64::min);
+    let report = trainer.report();
+    assert_eq!(report.best_loss, lowest);
+    assert_eq!(losses[report.best_iteration - 1], lowest);
+    assert!(
+        report.best_iteration < 40,
+        "the last iteration was the best: no overshoot"
+    );
+}
+
+#[test]
+fn every_point_is_in_one_batch_of_each_round() {
+    let [source, target] = clouds(1500);
+    let mut options = Preset::Default.options(None);
+    options.batch = Some(400);
+    let backend = CpuBackend::new(Some(1)).expect("threads");
+    let distance = DistanceTransform::build(&source, &target, &options.distance);
+    let device = CpuTransform {
+        kernels: backend.kernels,
+        threads: backend.threads,
+        distance: distance.expect("small clouds"),
+    };
+    let mut trainer = CpuTrainer::new(&device, &source, &options);
+    let mut covered = vec![0; 1500];
+    for _ in 0..4 {
+        let batch = trainer.batch();
+        assert!(batch.len() <= 400, "{batch:?}");
+        batch.for_each(|point| covered[point] += 1);
+        trainer.iterate(&Unwatched);
+    }
+    assert!(covered.iter().all(|&count| count == 1));
+}

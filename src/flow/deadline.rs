@@ -1,0 +1,279 @@
+//! How work is cut so that a deadline holds: coarser cells, cheaper iterations, fewer of them.
+//!
+//! A transform of four times coarser cells takes a thirtieth of the time. It is built first: it
+//! shows how fast the machine is, and it is there should nothing finer fit. Later the network's
+//! speed is measured on some points, and what is left is cut into as many iterations as fit, with
+//! the final evaluation set aside. Sees only the backend's traits.
+
+use super::backend::{Backend, BackendError, Trainer, Transform};
+use super::error::FlowError;
+use super::options::{Decay, Ego, Hurry, Options};
+use super::points::{Point, RigidTransform};
+use super::preprocess::Selection;
+use super::snapshot::Snapshot;
+use super::watch::{Interrupt, Progress, Watch};
+
+/// Time left from which nothing is measured before the transform, seconds a point of both clouds:
+/// twenty times what a slow core takes for the transform.
+const AMPLE_SECONDS_PER_POINT: f64 = 4e-5;
+/// The first transform's cells, in cells of the options.
+const COARSE: f64 = 4.0;
+/// Finer cells, best first, and what their transform takes in times of the first one: 20 to 35 and
+/// 3.6 to 4.5, measured on three sweeps. Wrong guesses cost accuracy, not the deadline.
+const FINER: [(f64, f64); 2] = [(1.0, 28.0), (2.0, 4.5)];
+/// Share of the time left that a finer transform may be expected to take.
+const EXPECTED_SHARE: f64 = 0.4;
+/// Share of the time left after which a finer transform is given up.
+const GIVEN_UP_SHARE: f64 = 0.6;
+/// Points that are aligned on other cells than the options': a millimetre is not to be had there.
+const ALIGNED: usize = 4096;
+/// Points on which the network's speed is measured: about a millisecond, whole tiles.
+const MEASURED: usize = 1536;
+/// What an iteration costs a point, in evaluations: forward, twice that backward, and the query.
+const ITERATION: f64 = 3.4;
+/// What is set aside for the final evaluation, in times of what it should take.
+const EVALUATION: f64 = 1.15;
+/// Set aside for what nobody measures, seconds.
+const SLACK: f64 = 0.006;
+/// Rows that are evaluated between two looks at the clock.
+const ROWS_AT_ONCE: usize = 9216;
+/// A run is shortened where less than this share of its iterations fits.
+const FITTING_SHARE: f64 = 0.95;
+/// Iterations between two such checks.
+const ITERATIONS_AT_ONCE: usize = 8;
+
+/// A watch whose deadline comes earlier.
+pub(crate) struct Early<'a> {
+    watch: &'a dyn Watch,
+    /// Seconds by which it does.
+    reserve: f64,
+}
+
+impl Watch for Early<'_> {
+    fn seconds(&self) -> f64 {
+        self.watch.seconds()
+    }
+    fn seconds_left(&self) -> Option<f64> {
+        self.watch.seconds_left().map(|left| left - self.reserve)
+    }
+    fn interrupt(&self) -> Option<Interrupt> {
+        let late = || self.seconds_left().is_some_and(|left| left <= 0.0);
+        let interrupt = self.watch.interrupt();
+        interrupt.or_else(|| late().then_some(Interrupt::Deadline))
+    }
+    fn progress(&self, progress: Progress) {
+        self.watch.progress(progress);
+    }
+    fn snapshot_due(&self) -> bool {
+        self.watch.snapshot_due()
+    }
+    fn snapshot(&self, snapshot: Snapshot) {
+        self.watch.snapshot(snapshot);
+    }
+}
+
+/// What the field is fitted to.
+pub(crate) struct Prepared {
+    pub(crate) transform: Box<dyn Transform>,
+    pub(crate) ego: Option<RigidTransform>,
+    /// Whether it is all that the options ask for.
+    pub(crate) whole: bool,
+}
+
+/// The finest transform that the time left holds, and the ego motion on it; none where the
+/// deadline leaves no time for any.
+pub(crate) fn prepare(
+    backend: &dyn Backend,
+    selection: &Selection,
+    options: &Options,
+    watch: &dyn Watch,
+) -> Result<Option<Prepared>, FlowError> {
+    let on_time = Early {
+        watch,
+        reserve: 0.0,
+    };
+    let transform = |coarser: f64, watch: &dyn Watch| {
+        let mut distance = options.distance.clone();
+        distance.cell_m *= coarser;
+        distance.band_m = distance.band_m.max(distance.cell_m);
+        match backend.transform(&selection.source, &selection.target, &distance, watch) {
+            Ok(transform) => Ok(Some(transform)),
+            Err(BackendError::Interrupted(Interrupt::Deadline)) => Ok(None),
+            Err(BackendError::Interrupted(Interrupt::Cancelled)) => Err(FlowError::Cancelled),
+            Err(error) => Err(error.into()),
+        }
+    };
+    let aligned = |transform: Box<dyn Transform>, whole: bool| {
+        let ego = match options.ego {
+            Ego::Off => None,
+            Ego::Given(target_from_source) => Some(target_from_source),
+            Ego::Auto if whole => Some(transform.align(&selection.source, &on_time)),
+            Ego::Auto => Some(transform.align(&thinned(&selection.source), &on_time)),
+        };
+        Prepared {
+            transform,
+            ego,
+            whole,
+        }
+    };
+    let points = selection.source.len() + selection.target.len();
+    let ample = AMPLE_SECONDS_PER_POINT * points as f64;
+    if watch.seconds_left().is_none_or(|left| left > ample) {
+        return Ok(transform(1.0, &on_time)?.map(|transform| aligned(transform, true)));
+    }
+    let began = watch.seconds();
+    let Some(coarse) = transform(COARSE, &on_time)? else {
+        return Ok(None);
+    };
+    let took = watch.seconds() - began;
+    for (coarser, cost) in FINER {
+        let left = on_time.seconds_left().unwrap_or(0.0);
+        if took * cost > left * EXPECTED_SHARE {
+            continue;
+        }
+        let early = Early {
+            watch,
+            reserve: left * (1.0 - GIVEN_UP_SHARE),
+        };
+        match transform(coarser, &early)? {
+            Some(transform) => return Ok(Some(aligned(transform, coarser == 1.0))),
+            None => break,
+        }
+    }
+    Ok(Some(aligned(coarse, false)))
+}
+
+/// At most [`ALIGNED`] of the points, evenly.
+fn thinned(points: &[Point]) -> Vec<Point> {
+    let stride = points.len().div_ceil(ALIGNED).max(1);
+    points.iter().step_by(stride).copied().collect()
+}
+
+/// How fast the network is, and what of the time is spoken for.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Pace {
+    /// Seconds that an evaluation takes a point.
+    point: f64,
+    /// Seconds for the final evaluation and all that follows.
+    evaluation: f64,
+}
+
+impl Pace {
+    /// Measures on some of the points; the second time, for the first warms up.
+    pub(crate) fn measure(
+        trainer: &mut dyn Trainer,
+        points: &[Point],
+        watch: &dyn Watch,
+    ) -> Result<Self, FlowError> {
+        let measured = &points[..points.len().min(MEASURED)];
+        trainer.evaluate(measured)?;
+        let began = watch.seconds();
+        trainer.evaluate(measured)?;
+        let point = (watch.seconds() - began) / measured.len() as f64;
+        Ok(Self {
+            point,
+            evaluation: point * points.len() as f64 * EVALUATION + SLACK,
+        })
+    }
+
+    /// The options that fit into `left` seconds; nothing where those that were asked for fit.
+    pub(crate) fn hurried(
+        &self,
+        options: &Options,
+        prepared: &Prepared,
+        points: usize,
+        left: f64,
+    ) -> Option<Options> {
+        let budget = (left - self.evaluation).max(0.0);
+        let iteration = |batch: usize| self.point * ITERATION * batch as f64;
+        let asked = options.batch.unwrap_or(points).min(points);
+        let needed = options.expected_iterations() as f64 * iteration(asked);
+        if prepared.whole && needed <= budget {
+            return None;
+        }
+        let Hurry {
+            batches: [least, most],
+            iterations,
+            least_iterations,
+        } = Hurry::new(prepared.ego.is_some());
+        let wished = iterations.min(options.max_iterations) as f64;
+        let fitting = budget / (wished * iteration(1));
+        let batch = (fitting as usize / least * least).clamp(least, most.max(least));
+        let batch = batch.min(asked);
+        let fitting = ((budget / iteration(batch)) as usize).min(options.max_iterations);
+        let enough = fitting >= least_iterations.min(options.max_iterations);
+        Some(options.hurried(batch, if enough { fitting } else { 0 }))
+    }
+}
+
+/// The loop's clock: when to stop iterating, and how many more iterations fit.
+pub(crate) struct Loop<'a> {
+    watch: &'a dyn Watch,
+    pace: Option<Pace>,
+    began: f64,
+    first: usize,
+}
+
+impl<'a> Loop<'a> {
+    /// Begins after `first` iterations; without a pace there is no deadline to keep.
+    pub(crate) fn begin(watch: &'a dyn Watch, pace: Option<Pace>, first: usize) -> Self {
+        Self {
+            watch,
+            pace,
+            began: watch.seconds(),
+            first,
+        }
+    }
+
+    /// Iterations that may be done at once, of `steps`, and the watch over them: it ends them while
+    /// there is time for one iteration and the evaluation.
+    pub(crate) fn next(&self, done: usize, steps: usize) -> (usize, Early<'a>) {
+        let reserve = self
+            .pace
+            .map_or(0.0, |pace| pace.evaluation + self.iteration(done));
+        let early = Early {
+            watch: self.watch,
+            reserve,
+        };
+        (if self.pace.is_some() { 1 } else { steps }, early)
+    }
+
+    /// Where the step size falls and the iterations up to the end do not fit: how many do.
+    pub(crate) fn shortened(&self, done: usize, options: &Options) -> Option<usize> {
+        let pace = self.pace?;
+        let since = done - self.first;
+        if options.decay != Decay::Cosine || since == 0 || !since.is_multiple_of(ITERATIONS_AT_ONCE)
+        {
+            return None;
+        }
+        let left = self.watch.seconds_left()? - pace.evaluation;
+        let fitting = (left / self.iteration(done)).max(0.0);
+        let wanted = options.max_iterations.saturating_sub(done) as f64;
+        (fitting < FITTING_SHARE * wanted).then_some(done + fitting as usize)
+    }
+
+    /// Seconds of one iteration: the mean so far.
+    fn iteration(&self, done: usize) -> f64 {
+        (self.watch.seconds() - self.began) / (done - self.first).max(1) as f64
+    }
+}
+
+/// The result so far at `points`; zero from where the deadline passes.
+pub(crate) fn evaluate(
+    trainer: &mut dyn Trainer,
+    points: &[Point],
+    watch: &dyn Watch,
+) -> Result<Vec<Point>, FlowError> {
+    if watch.seconds_left().is_none() {
+        return Ok(trainer.evaluate(points)?);
+    }
+    let mut flow = Vec::with_capacity(points.len());
+    for rows in points.chunks(ROWS_AT_ONCE) {
+        if watch.seconds_left().is_some_and(|left| left <= 0.0) {
+            break;
+        }
+        flow.extend(trainer.evaluate(rows)?);
+    }
+    flow.resize(points.len(), [0.0; 3]);
+    Ok(flow)
+}

@@ -1,0 +1,62 @@
+//! What a transform in bricks will occupy and cost, known before any distance is taken.
+
+use super::activate::{BRICK_BYTES, Index};
+use super::cell_sites::CellSites;
+use super::far::FarField;
+use super::grid::Grid;
+use super::options::{DistanceError, DistanceOptions, Sites};
+use super::point_sites::PointSites;
+use crate::flow::Point;
+use crate::flow::watch::Watch;
+
+/// The plan of a transform.
+pub(super) struct Layout {
+    pub(super) grid: Grid,
+    /// Occupied vertices, sorted, each once.
+    pub(super) cells: Vec<[u32; 3]>,
+    pub(super) index: Index,
+    /// The band's radius in cells.
+    pub(super) band: i32,
+    /// At most the bytes that building takes at once.
+    pub(super) bytes: usize,
+}
+
+impl Layout {
+    /// Plans the transform of `target` over a grid that covers both clouds.
+    ///
+    /// # Errors
+    /// Whatever the transform is refused for.
+    pub(super) fn plan(
+        source: &[Point],
+        target: &[Point],
+        options: &DistanceOptions,
+        watch: &dyn Watch,
+    ) -> Result<Self, DistanceError> {
+        options.check()?;
+        let grid = Grid::covering(source, target, options.cell_m)?;
+        let mut cells: Vec<_> = target.iter().map(|&p| grid.nearest_vertex(p)).collect();
+        cells.sort_unstable();
+        cells.dedup();
+        let band = options.band_cells();
+        let index = Index::activate(&grid, &cells, band, options.max_bytes, watch)?;
+        let sites = match options.sites {
+            Sites::Cells => CellSites::bytes(cells.len(), band),
+            Sites::Points => PointSites::bytes(target.len()),
+        };
+        let bytes =
+            index.bytes() + index.active * BRICK_BYTES + FarField::bytes_over(&grid) + sites;
+        if bytes > options.max_bytes {
+            return Err(DistanceError::Memory {
+                needed: bytes,
+                limit: options.max_bytes,
+            });
+        }
+        Ok(Self {
+            grid,
+            cells,
+            index,
+            band,
+            bytes,
+        })
+    }
+}
