@@ -12,16 +12,36 @@
 pub mod flow;
 
 #[cfg(feature = "service")]
+pub mod api;
+#[cfg(feature = "service")]
+pub mod app;
+#[cfg(feature = "service")]
+pub mod blobs;
+#[cfg(feature = "service")]
 pub mod cli;
 #[cfg(feature = "service")]
-mod clock;
+pub mod clock;
+#[cfg(feature = "service")]
+pub mod config;
+#[cfg(feature = "service")]
+pub mod cost;
+#[cfg(feature = "service")]
+pub mod engine;
 #[cfg(feature = "service")]
 pub mod formats;
 #[cfg(feature = "service")]
 pub mod job;
 #[cfg(feature = "service")]
+pub mod metrics;
+#[cfg(feature = "service")]
+pub mod payload;
+#[cfg(feature = "service")]
 pub mod picture;
 #[cfg(feature = "service")]
 pub mod queue;
 #[cfg(feature = "service")]
+pub mod telemetry;
+#[cfg(feature = "service")]
 mod text;
+#[cfg(feature = "service")]
+pub mod worker;

@@ -16,6 +16,7 @@ mod demo;
 mod doctor;
 mod eval;
 mod flow;
+mod serve;
 mod synth;
 
 use std::process::ExitCode;
@@ -27,6 +28,7 @@ use clap::{Parser, Subcommand};
 #[command(name = "fnsf", version, propagate_version = true, max_term_width = 100)]
 #[command(after_help = "Start here:\n  \
     fnsf demo                                  a simulated street, its flow, its error, a picture\n  \
+    fnsf serve                                 HTTP and gRPC on 127.0.0.1:8080\n  \
     fnsf flow a.pcd b.pcd -o flow.npz          two sweeps, any format\n  \
     fnsf flow a.pcd b.pcd --picture flow.png   the same, to look at")]
 pub struct Arguments {
@@ -37,6 +39,7 @@ pub struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Command {
     Demo(demo::Demo),
+    Serve(Box<serve::Serve>),
     Flow(flow::Flow),
     Eval(eval::Eval),
     Synth(synth::Synth),
@@ -48,6 +51,7 @@ enum Command {
 pub fn run(arguments: Arguments) -> ExitCode {
     let done = match arguments.command {
         Command::Demo(command) => command.run(),
+        Command::Serve(command) => command.run(),
         Command::Flow(command) => command.run(),
         Command::Eval(command) => command.run(),
         Command::Synth(command) => command.run(),

@@ -5,9 +5,11 @@
 mod id;
 mod options;
 mod record;
+mod report;
 
 pub use id::{InvalidId, JobId, Tenant};
 pub use options::{
     DeviceChoice, EgoChoice, GroundChoice, InvalidOptions, JobOptions, PresetChoice, Priority,
 };
 pub use record::{Job, JobError, JobProgress, Kind, State};
+pub use report::{PhaseSeconds, Report};

@@ -125,6 +125,8 @@ pub struct QueueOptions {
     pub time_to_live: Duration,
     /// Time that an ended job and its result are kept.
     pub retention: Duration,
+    /// The same for a job whose caller waited for it and has its answer.
+    pub answered_retention: Duration,
 }
 
 impl Default for QueueOptions {
@@ -136,6 +138,7 @@ impl Default for QueueOptions {
             retry_delay: Duration::from_secs(1),
             time_to_live: Duration::from_secs(7 * 24 * 3600),
             retention: Duration::from_secs(24 * 3600),
+            answered_retention: Duration::from_secs(60),
         }
     }
 }

@@ -227,11 +227,13 @@ struct SqliteHeart {
     shared: Arc<Shared>,
     options: QueueOptions,
     last: AtomicI64,
+    latest: Mutex<Option<Progress>>,
 }
 
 impl Heart for SqliteHeart {
     fn beat(&self, progress: Option<Progress>) {
         if let Some(progress) = progress {
+            *locked(&self.latest) = Some(progress);
             self.shared.watchers.progress(self.id, self.attempt, progress);
         }
         let now = Timestamp::now().as_millis();
@@ -241,6 +243,7 @@ impl Heart for SqliteHeart {
         }
         self.last.store(now, Ordering::Relaxed);
         let (id, attempt, options) = (self.id, self.attempt, self.options.clone());
+        let progress = *locked(&self.latest);
         self.writer.write_later(move |connection, _| {
             transitions::beat(connection, &options, id, attempt, progress)
         });
@@ -418,6 +421,7 @@ impl SqliteQueue {
             shared: Arc::clone(&self.shared),
             options: self.options.clone(),
             last: AtomicI64::new(Timestamp::now().as_millis()),
+            latest: Mutex::default(),
         };
         Lease {
             job,

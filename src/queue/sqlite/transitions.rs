@@ -354,11 +354,13 @@ pub(super) fn end(
     how: End,
 ) -> Result<State, QueueError> {
     let now = Timestamp::now();
+    let kept = if job.durable {
+        options.retention
+    } else {
+        options.answered_retention
+    };
     // A pair goes when its sequence goes.
-    let forget = job
-        .parent
-        .is_none()
-        .then(|| now.after(options.retention).as_millis());
+    let forget = job.parent.is_none().then(|| now.after(kept).as_millis());
     let sql = format!(
         "UPDATE jobs SET state = ?2, finished = ?3, due = ?4, stop_reason = ?5, report = ?6, \
          error_code = ?7, error_message = ?8, error_retryable = ?9, dead = ?10, worker = NULL, \

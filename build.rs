@@ -1,0 +1,37 @@
+//! Compiles the protocol, without protoc, where the service is built: the server's half for the
+//! library, the client's half for the tests.
+
+use std::env;
+use std::error::Error;
+use std::fs;
+use std::path::PathBuf;
+
+fn main() -> Result<(), Box<dyn Error>> {
+    println!("cargo:rerun-if-changed=proto");
+    if env::var_os("CARGO_FEATURE_SERVICE").is_none() {
+        return Ok(());
+    }
+    let mut compiler = protox::Compiler::new(["proto"])?;
+    compiler
+        .include_imports(true)
+        .open_file("fnsf/v1/scene_flow.proto")?;
+    let descriptors = compiler.file_descriptor_set();
+    let out = PathBuf::from(env::var("OUT_DIR")?);
+    fs::write(
+        out.join("scene_flow.bin"),
+        compiler.encode_file_descriptor_set(),
+    )?;
+    let client = out.join("client");
+    fs::create_dir_all(&client)?;
+    tonic_prost_build::configure()
+        .bytes(".")
+        .build_client(false)
+        .compile_fds(descriptors.clone())?;
+    tonic_prost_build::configure()
+        .bytes(".")
+        .build_server(false)
+        .build_transport(false)
+        .out_dir(client)
+        .compile_fds(descriptors)?;
+    Ok(())
+}

@@ -1,0 +1,96 @@
+//! The admin port: is it alive, is it ready, what does it measure. No job is ever seen here.
+//!
+//! It runs on a thread of its own, so that it answers whatever the service is doing.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::extract::State;
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use axum::{Json, Router};
+use serde_json::json;
+use tokio::sync::watch;
+
+use crate::clock::Timestamp;
+use crate::engine::{Device, Health};
+use crate::metrics::Metrics;
+use crate::queue::Queue;
+
+/// What readiness depends on.
+#[derive(Clone)]
+pub struct Readiness {
+    /// The devices; one that is ready is enough.
+    pub devices: Vec<Device>,
+    /// Whether the server is about to stop.
+    pub draining: watch::Receiver<bool>,
+}
+
+impl Readiness {
+    /// Why the server is not ready; nothing where it is.
+    pub fn obstacle(&self) -> Option<String> {
+        if *self.draining.borrow() {
+            return Some("the server is about to stop".to_owned());
+        }
+        let mut reasons = Vec::new();
+        for device in &self.devices {
+            match &*device.health().borrow() {
+                Health::Ready => return None,
+                Health::Starting => reasons.push(format!("{} is being tried", device.name())),
+                Health::Broken(why) => reasons.push(format!("{}: {why}", device.name())),
+            }
+        }
+        Some(reasons.join("; "))
+    }
+}
+
+#[derive(Clone)]
+struct Admin {
+    readiness: Readiness,
+    metrics: Arc<Metrics>,
+    queue: Arc<dyn Queue>,
+}
+
+/// The routes of the admin port.
+pub fn admin_router(
+    readiness: Readiness,
+    metrics: Arc<Metrics>,
+    queue: Arc<dyn Queue>,
+) -> Router {
+    Router::new()
+        .route("/livez", get(|| async { Json(json!({ "alive": true })) }))
+        .route("/readyz", get(ready))
+        .route("/metrics", get(expose))
+        .with_state(Admin {
+            readiness,
+            metrics,
+            queue,
+        })
+}
+
+async fn ready(State(admin): State<Admin>) -> Response {
+    match admin.readiness.obstacle() {
+        None => Json(json!({ "ready": true })).into_response(),
+        Some(reason) => {
+            let body = Json(json!({ "ready": false, "reason": reason }));
+            (StatusCode::SERVICE_UNAVAILABLE, body).into_response()
+        }
+    }
+}
+
+async fn expose(State(admin): State<Admin>, headers: HeaderMap) -> Response {
+    let oldest = match admin.queue.oldest_queued().await {
+        Ok(Some(oldest)) => oldest.until(Timestamp::now()),
+        Ok(None) | Err(_) => Duration::ZERO,
+    };
+    admin.metrics.backlog(&admin.queue.backlog(), oldest);
+    let accept = headers.get(header::ACCEPT).and_then(|value| value.to_str().ok());
+    let openmetrics = accept.is_some_and(|accept| accept.contains("application/openmetrics-text"));
+    let media = if openmetrics {
+        "application/openmetrics-text; version=1.0.0; charset=utf-8"
+    } else {
+        "text/plain; version=0.0.4; charset=utf-8"
+    };
+    ([(header::CONTENT_TYPE, media)], admin.metrics.expose(openmetrics)).into_response()
+}

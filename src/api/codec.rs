@@ -1,0 +1,214 @@
+//! Files to clouds, and flow to files: which formats the doors speak.
+//!
+//! It must not know HTTP's or gRPC's types; media types are text here.
+
+use super::error::ApiError;
+use crate::formats::{self, FlowFormat, FlowTable, MAX_COORDINATE_M};
+use crate::job::Report;
+use crate::payload::{StoredCloud, StoredFlow};
+
+/// A format that flow is answered in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum AnswerFormat {
+    /// One of the file formats.
+    File(FlowFormat),
+    /// Packed little-endian float32, x y z: nothing but the displacements.
+    Packed,
+}
+
+/// Every format with its media type and its name in an archive; the first is the default.
+pub(super) const ANSWER_FORMATS: [(AnswerFormat, &str, &str); 7] = [
+    (AnswerFormat::File(FlowFormat::Npz), "application/x-npz", "npz"),
+    (AnswerFormat::File(FlowFormat::Npy), "application/x-npy", "npy"),
+    (
+        AnswerFormat::File(FlowFormat::Feather),
+        "application/vnd.apache.arrow.file",
+        "feather",
+    ),
+    (AnswerFormat::File(FlowFormat::Ply), "application/x-ply", "ply"),
+    (AnswerFormat::File(FlowFormat::Pcd), "application/x-pcd", "pcd"),
+    (AnswerFormat::Packed, "application/octet-stream", "f32"),
+    (AnswerFormat::File(FlowFormat::Json), "application/json", "json"),
+];
+
+impl AnswerFormat {
+    fn entry(self) -> &'static (Self, &'static str, &'static str) {
+        let found = ANSWER_FORMATS.iter().find(|(format, ..)| *format == self);
+        found.unwrap_or(&ANSWER_FORMATS[0])
+    }
+
+    /// Its media type.
+    pub(super) fn media_type(self) -> &'static str {
+        self.entry().1
+    }
+
+    /// The ending of a file in it.
+    pub(super) fn ending(self) -> &'static str {
+        self.entry().2
+    }
+
+    /// Whether the source's points go into it.
+    pub(super) fn needs_points(self) -> bool {
+        matches!(self, Self::File(FlowFormat::Ply | FlowFormat::Pcd))
+    }
+
+    /// The format that an `Accept` header asks for, by its weights; npz where it does not mind.
+    ///
+    /// # Errors
+    /// [`ApiError::NotAcceptable`], which lists what there is.
+    pub(super) fn accepted(accept: Option<&str>) -> Result<Self, ApiError> {
+        let Some(accept) = accept.filter(|accept| !accept.trim().is_empty()) else {
+            return Ok(ANSWER_FORMATS[0].0);
+        };
+        let mut best: Option<(f32, Self)> = None;
+        for wanted in accept.split(',') {
+            let mut parts = wanted.split(';').map(str::trim);
+            let media = parts.next().unwrap_or_default().to_ascii_lowercase();
+            let weight = parts.find_map(|part| part.strip_prefix("q="));
+            let weight: f32 = weight.map_or(1.0, |weight| weight.parse().unwrap_or(0.0));
+            let known = ANSWER_FORMATS.iter().find(|(_, known, _)| {
+                *known == media || media == "*/*" || media == "application/*"
+            });
+            if let Some((format, ..)) = known
+                && weight > 0.0
+                && best.is_none_or(|(most, _)| weight > most)
+            {
+                best = Some((weight, *format));
+            }
+        }
+        best.map(|(_, format)| format).ok_or_else(|| {
+            let known: Vec<&str> = ANSWER_FORMATS.iter().map(|(_, media, _)| *media).collect();
+            ApiError::NotAcceptable(format!("flow comes as {}", known.join(", ")))
+        })
+    }
+
+    /// Some flow in this format. `points` are the source's where [`Self::needs_points`], and may be
+    /// empty otherwise; `job` is its job's name.
+    ///
+    /// # Errors
+    /// [`ApiError::Internal`] where the stored parts do not belong together.
+    pub(super) fn encode(
+        self,
+        flow: &StoredFlow,
+        points: &[crate::flow::Point],
+        report: &Report,
+        job: &str,
+    ) -> Result<Vec<u8>, ApiError> {
+        let format = match self {
+            Self::Packed => {
+                let values = flow.flow.as_flattened().iter();
+                return Ok(values.flat_map(|value| value.to_le_bytes()).collect());
+            }
+            Self::File(format) => format,
+        };
+        let source = if self.needs_points() { points } else { &flow.flow };
+        let table = FlowTable {
+            source,
+            flow: &flow.flow,
+            valid: &flow.valid,
+            dynamic: flow.dynamic.as_deref(),
+            ego: flow.ego.as_ref(),
+        };
+        let mut bytes = Vec::new();
+        formats::write_flow(format, &table, &mut bytes).map_err(ApiError::internal)?;
+        if format == FlowFormat::Json {
+            return with_report(&bytes, report, job);
+        }
+        Ok(bytes)
+    }
+}
+
+/// The JSON form carries the report's fields beside the flow.
+fn with_report(json: &[u8], report: &Report, job: &str) -> Result<Vec<u8>, ApiError> {
+    let rest = json.strip_prefix(b"{").ok_or(ApiError::Internal)?;
+    let mut head = serde_json::to_value(report).map_err(ApiError::internal)?;
+    if let Some(fields) = head.as_object_mut() {
+        fields.insert("job_id".to_owned(), job.into());
+    }
+    let mut bytes = serde_json::to_vec(&head).map_err(ApiError::internal)?;
+    bytes.pop();
+    bytes.push(b',');
+    bytes.extend(rest);
+    Ok(bytes)
+}
+
+/// One cloud of any format.
+///
+/// # Errors
+/// [`ApiError::BadInput`] or [`ApiError::TooLarge`], which name the part and what is wrong in it.
+pub(super) fn read_cloud(part: &str, bytes: &[u8], name: Option<&str>) -> Result<StoredCloud, ApiError> {
+    let cloud = formats::read_cloud(bytes, name).map_err(|error| in_part(part, error))?;
+    Ok(StoredCloud {
+        points: cloud.points,
+        ground: None,
+    })
+}
+
+/// Two clouds of one `.npz`, with their ground masks where they are there.
+///
+/// # Errors
+/// As for [`read_cloud`].
+pub(super) fn read_pair(part: &str, bytes: &[u8]) -> Result<[StoredCloud; 2], ApiError> {
+    let pair = formats::read_pair(bytes).map_err(|error| in_part(part, error))?;
+    let (source, target) = match pair.ground {
+        Some(ground) => (Some(ground.source), Some(ground.target)),
+        None => (None, None),
+    };
+    Ok([
+        StoredCloud {
+            points: pair.source,
+            ground: source,
+        },
+        StoredCloud {
+            points: pair.target,
+            ground: target,
+        },
+    ])
+}
+
+/// Refuses raw coordinates that a file with them would be refused for.
+///
+/// # Errors
+/// [`ApiError::BadInput`], which names the row and the value.
+pub(super) fn check_points(part: &str, points: &[crate::flow::Point]) -> Result<(), ApiError> {
+    let usable = |value: &f32| value.is_finite() && f64::from(value.abs()) <= MAX_COORDINATE_M;
+    let broken = points.iter().position(|point| !point.iter().all(usable));
+    match broken {
+        None => Ok(()),
+        Some(row) => Err(ApiError::BadInput(format!(
+            "{part}: row {row} is {:?}, not three finite coordinates within {MAX_COORDINATE_M} m",
+            points[row]
+        ))),
+    }
+}
+
+fn in_part(part: &str, error: formats::FormatError) -> ApiError {
+    match ApiError::from(error) {
+        ApiError::TooLarge(text) => ApiError::TooLarge(format!("{part}: {text}")),
+        ApiError::BadInput(text) => ApiError::BadInput(format!("{part}: {text}")),
+        other => other,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_heaviest_known_type_is_answered() {
+        let npz = AnswerFormat::File(FlowFormat::Npz);
+        let ply = AnswerFormat::File(FlowFormat::Ply);
+        for (accept, expected) in [
+            (None, Some(npz)),
+            (Some("*/*"), Some(npz)),
+            (Some("application/x-ply"), Some(ply)),
+            (Some("text/html, application/x-ply;q=0.5, */*;q=0.1"), Some(ply)),
+            (Some("application/x-npz;q=0, application/x-ply"), Some(ply)),
+            (Some("APPLICATION/X-PLY"), Some(ply)),
+            (Some("text/html"), None),
+            (Some("application/x-npz;q=nonsense"), None),
+        ] {
+            assert_eq!(AnswerFormat::accepted(accept).ok(), expected, "{accept:?}");
+        }
+    }
+}

@@ -1,0 +1,228 @@
+//! A job that is being put together: clouds come one by one and go straight into store.
+//!
+//! Nothing is promised before [`Draft::submit`]; a draft that is dropped leaves nothing behind.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use tokio::sync::OwnedSemaphorePermit;
+
+use super::admission::{Asked, Reservation};
+use super::auth::Caller;
+use super::error::ApiError;
+use super::service::Service;
+use crate::blobs::{Blob, Sync};
+use crate::clock::Timestamp;
+use crate::cost::CostModel;
+use crate::job::{Job, JobId, JobOptions, Kind};
+use crate::payload::StoredCloud;
+use crate::queue::{Idempotency, Submission, Submitted};
+
+/// Who waits for a job.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Promise {
+    /// Somebody waits on the line: the job ends with the call.
+    WhileAwaited,
+    /// Nobody has to: the job outlives everything once it is accepted.
+    Durable,
+}
+
+/// What is asked of a job before its clouds are there.
+#[derive(Clone, Debug)]
+pub struct Request {
+    /// How the flow is found.
+    pub options: JobOptions,
+    /// Who waits.
+    pub promise: Promise,
+    /// Makes a repeated submission find the first one.
+    pub idempotency_key: Option<String>,
+    /// When it arrived: deadlines count from here.
+    pub arrived: Instant,
+    /// What is left of the call's own deadline, if it has one.
+    pub time_left: Option<Duration>,
+}
+
+/// A job that is being put together.
+pub struct Draft {
+    service: Arc<Service>,
+    caller: Caller,
+    request: Request,
+    id: JobId,
+    frames: u32,
+    last: Option<Arc<StoredCloud>>,
+    nominal_seconds: f64,
+    fingerprint: blake3::Hasher,
+    submitted: bool,
+}
+
+impl Draft {
+    pub(super) fn new(service: Arc<Service>, caller: Caller, request: Request) -> Self {
+        let mut fingerprint = blake3::Hasher::new();
+        fingerprint.update(request.options.to_json().as_bytes());
+        Self {
+            service,
+            caller,
+            request,
+            id: JobId::fresh(),
+            frames: 0,
+            last: None,
+            nominal_seconds: 0.0,
+            fingerprint,
+            submitted: false,
+        }
+    }
+
+    /// Clouds so far.
+    pub fn frames(&self) -> u32 {
+        self.frames
+    }
+
+    /// Takes the next cloud, prices it with the one before, and puts it in store.
+    ///
+    /// # Errors
+    /// [`ApiError`] where the pair cannot be solved here, or the store fails.
+    pub async fn push(&mut self, cloud: StoredCloud) -> Result<(), ApiError> {
+        let service = Arc::clone(&self.service);
+        service.admission.check_points(cloud.points.len())?;
+        let limit = service.limits.max_frames;
+        if self.frames >= limit {
+            return Err(ApiError::TooLarge(format!(
+                "a sequence has more than the {limit} frames that this server takes"
+            )));
+        }
+        let cloud = Arc::new(cloud);
+        let before = self.last.replace(Arc::clone(&cloud));
+        let options = self.request.options.clone();
+        let work = {
+            let service = Arc::clone(&service);
+            move || -> Result<(f64, Vec<u8>), ApiError> {
+                let mut nominal = 0.0;
+                if let Some(before) = before {
+                    let price = service.admission.price(&before, &cloud, &options)?;
+                    nominal = CostModel::nominal(&price);
+                }
+                Ok((nominal, cloud.to_bytes()))
+            }
+        };
+        let (nominal, bytes) = service.compute(work).await?;
+        self.nominal_seconds += nominal;
+        self.fingerprint.update(&bytes);
+        let sync = match self.request.promise {
+            Promise::Durable => Sync::Yes,
+            Promise::WhileAwaited => Sync::No,
+        };
+        let blob = Blob::Frame(self.frames);
+        service.blobs.put(self.id, blob, Bytes::from(bytes), sync).await?;
+        self.frames += 1;
+        Ok(())
+    }
+
+    /// Submits the job: a pair for two clouds and `kind` pair, else a sequence. The answer says
+    /// whether it is new.
+    ///
+    /// # Errors
+    /// [`ApiError`] where clouds are missing, nothing more is accepted, or the store fails.
+    pub async fn submit(mut self, kind: Kind) -> Result<(Arc<Job>, bool), ApiError> {
+        match (kind, self.frames) {
+            (Kind::Pair, 2) | (Kind::Sequence, 2..) => {}
+            (Kind::Pair, _) => {
+                return Err(ApiError::BadRequest("a pair is two clouds".to_owned()));
+            }
+            (Kind::Sequence, _) => {
+                let text = "a sequence is at least two frames";
+                return Err(ApiError::BadRequest(text.to_owned()));
+            }
+        }
+        let _place = self.admit()?;
+        let submission = self.submission(kind);
+        match self.service.queue.submit(submission).await? {
+            Submitted::New(job) => {
+                self.submitted = true;
+                Ok((job, true))
+            }
+            Submitted::Known(job) => Ok((job, false)),
+        }
+    }
+
+    fn admit(&self) -> Result<Reservation, ApiError> {
+        self.service.check_draining()?;
+        self.service.admission.admit(&Asked {
+            tenant: &self.caller.tenant,
+            priority: self.request.options.priority,
+            nominal_seconds: self.nominal_seconds,
+            awaited: self.request.promise == Promise::WhileAwaited,
+        })
+    }
+
+    fn submission(&self, kind: Kind) -> Submission {
+        let pairs = self.frames - 1;
+        let options = &self.request.options;
+        let asked = options.deadline_ms.map(Duration::from_millis);
+        let spent = self.request.arrived.elapsed();
+        let left = asked.map(|asked| asked.saturating_sub(spent));
+        let left = left.into_iter().chain(self.request.time_left).min();
+        let key = self.request.idempotency_key.clone();
+        Submission {
+            id: self.id,
+            tenant: self.caller.tenant.clone(),
+            kind,
+            pairs,
+            priority: options.priority,
+            cost_seconds: self.nominal_seconds / f64::from(pairs),
+            options: options.to_json(),
+            deadline: left.map(|left| Timestamp::now().after(left)),
+            idempotency: key.map(|key| Idempotency {
+                key,
+                fingerprint: *self.fingerprint.finalize().as_bytes(),
+            }),
+            durable: self.request.promise == Promise::Durable,
+        }
+    }
+}
+
+impl Drop for Draft {
+    fn drop(&mut self) {
+        if self.submitted || self.frames == 0 {
+            return;
+        }
+        let (service, id) = (Arc::clone(&self.service), self.id);
+        tokio::spawn(async move { service.forget_blobs(id).await });
+    }
+}
+
+/// Room for a body's bytes, given back when it is dropped.
+#[derive(Debug, Default)]
+pub(super) struct Room {
+    held: Vec<OwnedSemaphorePermit>,
+    bytes: u64,
+}
+
+impl Room {
+    /// Takes room for `bytes` more.
+    ///
+    /// # Errors
+    /// [`ApiError::TooLarge`] where one request has too many, [`ApiError::ServerFull`] where all
+    /// requests together have.
+    pub(super) fn take(&mut self, service: &Service, bytes: usize) -> Result<(), ApiError> {
+        const UNIT: usize = 1 << 10;
+        let limit = service.limits.max_upload_bytes;
+        self.bytes += bytes as u64;
+        if self.bytes > limit {
+            return Err(ApiError::TooLarge(format!(
+                "the request's body has more than the {} MiB that this server takes",
+                limit >> 20
+            )));
+        }
+        service.metrics.uploaded(bytes);
+        let units = u32::try_from(bytes.div_ceil(UNIT)).unwrap_or(u32::MAX);
+        let room = Arc::clone(&service.room);
+        let permit = room.try_acquire_many_owned(units);
+        let permit = permit.map_err(|_| ApiError::ServerFull(Duration::from_secs(1)))?;
+        match self.held.last_mut() {
+            Some(last) => last.merge(permit),
+            None => self.held.push(permit),
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,304 @@
+//! Every way in which a request is refused, and what each door says then: one table.
+//!
+//! Status codes are here and nowhere else.
+
+use std::time::Duration;
+
+use crate::blobs::BlobError;
+use crate::formats::FormatError;
+use crate::job::{InvalidId, InvalidOptions, JobError, JobId};
+use crate::queue::QueueError;
+
+/// Why a request was refused, or its job gave no flow.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ApiError {
+    /// The request is not what the contract asks for.
+    #[error("{0}")]
+    BadRequest(String),
+    /// An option is unknown or makes no sense.
+    #[error("{0}")]
+    InvalidOptions(String),
+    /// A file cannot be read, or a pair cannot be solved.
+    #[error("{0}")]
+    BadInput(String),
+    /// More bytes, points or memory than is taken.
+    #[error("{0}")]
+    TooLarge(String),
+    /// The body came too slowly.
+    #[error("the request's body came too slowly")]
+    TooSlow,
+    /// No key, or one that is not known.
+    #[error("a valid key is needed: send Authorization: Bearer KEY")]
+    Unauthenticated,
+    /// The key may not do this.
+    #[error("this key may only read")]
+    Forbidden,
+    /// No such job, or it is somebody else's.
+    #[error("no job has this name")]
+    NotFound,
+    /// No such route.
+    #[error("there is nothing here; GET /docs lists what there is")]
+    NoRoute,
+    /// The route knows other methods.
+    #[error("this route does not know that method")]
+    Method,
+    /// No format that is asked for is known.
+    #[error("{0}")]
+    NotAcceptable(String),
+    /// The body's type is not taken.
+    #[error("{0}")]
+    UnsupportedMedia(String),
+    /// The range lies outside the result.
+    #[error("the range lies outside the result's {0} bytes")]
+    Range(u64),
+    /// The key was used for another payload.
+    #[error("the idempotency key was used with another payload; a retry is safe only with the same")]
+    KeyReused(JobId),
+    /// It has no result yet.
+    #[error("the job has not ended; GET it with ?wait=30 to wait for it")]
+    NotEnded(JobId),
+    /// It ended without a result.
+    #[error("the job failed: {}", .1.message)]
+    JobFailed(JobId, JobError),
+    /// Its deadline passed before a device was free.
+    #[error("the deadline passed before a device was free")]
+    Expired(JobId),
+    /// Somebody cancelled it.
+    #[error("the job was cancelled")]
+    Cancelled(JobId),
+    /// The tenant has as much waiting as it may have.
+    #[error("this tenant has as much waiting as it may; try again in {} s", .0.as_secs())]
+    TenantLimit(Duration),
+    /// The server has as much waiting as it may have.
+    #[error("the server is full; try again in {} s", .0.as_secs())]
+    ServerFull(Duration),
+    /// The server is about to stop.
+    #[error("the server is about to stop; another one will answer")]
+    Draining,
+    /// Something broke; the log says what.
+    #[error("something broke on the server")]
+    Internal,
+}
+
+/// What the doors say.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Row {
+    /// A stable name for programs.
+    pub code: &'static str,
+    /// HTTP's status.
+    pub http: u16,
+    /// gRPC's code, by its number.
+    pub grpc: i32,
+    /// Whether the same request may succeed later.
+    pub retryable: bool,
+    /// The `reason` under which the refusal is counted, where it is one.
+    pub rejection: Option<&'static str>,
+}
+
+const fn row(
+    code: &'static str,
+    http: u16,
+    grpc: i32,
+    retryable: bool,
+    rejection: Option<&'static str>,
+) -> Row {
+    Row {
+        code,
+        http,
+        grpc,
+        retryable,
+        rejection,
+    }
+}
+
+/// All that the doors ever say.
+const TABLE: [Row; 23] = [
+    row("bad_request", 400, 3, false, Some("bad_input")),
+    row("invalid_options", 400, 3, false, Some("bad_input")),
+    row("bad_input", 422, 3, false, Some("bad_input")),
+    row("too_large", 413, 3, false, Some("too_large")),
+    row("too_slow", 408, 4, true, Some("too_slow")),
+    row("unauthenticated", 401, 16, false, Some("unauthorized")),
+    row("forbidden", 403, 7, false, Some("unauthorized")),
+    row("not_found", 404, 5, false, None),
+    row("no_route", 404, 12, false, None),
+    row("method_not_allowed", 405, 12, false, None),
+    row("not_acceptable", 406, 3, false, None),
+    row("unsupported_media_type", 415, 3, false, None),
+    row("range_not_satisfiable", 416, 11, false, None),
+    row("idempotency_key_reused", 422, 6, false, None),
+    row("not_ended", 409, 9, true, None),
+    row("job_failed", 500, 10, true, None),
+    row("job_refused", 422, 9, false, None),
+    row("deadline_in_queue", 504, 4, true, None),
+    row("cancelled", 409, 1, false, None),
+    row("tenant_limit", 429, 8, true, Some("tenant_limit")),
+    row("server_full", 503, 14, true, Some("server_full")),
+    row("draining", 503, 14, true, Some("draining")),
+    row("internal", 500, 13, true, None),
+];
+
+impl Row {
+    /// The row of a code.
+    pub fn of(code: &str) -> Option<Self> {
+        TABLE.into_iter().find(|row| row.code == code)
+    }
+}
+
+impl ApiError {
+    /// The error's stable name.
+    pub fn code(&self) -> &'static str {
+        match self {
+            Self::BadRequest(_) => "bad_request",
+            Self::InvalidOptions(_) => "invalid_options",
+            Self::BadInput(_) => "bad_input",
+            Self::TooLarge(_) => "too_large",
+            Self::TooSlow => "too_slow",
+            Self::Unauthenticated => "unauthenticated",
+            Self::Forbidden => "forbidden",
+            Self::NotFound => "not_found",
+            Self::NoRoute => "no_route",
+            Self::Method => "method_not_allowed",
+            Self::NotAcceptable(_) => "not_acceptable",
+            Self::UnsupportedMedia(_) => "unsupported_media_type",
+            Self::Range(_) => "range_not_satisfiable",
+            Self::KeyReused(_) => "idempotency_key_reused",
+            Self::NotEnded(_) => "not_ended",
+            Self::JobFailed(_, error) if error.retryable => "job_failed",
+            Self::JobFailed(..) => "job_refused",
+            Self::Expired(_) => "deadline_in_queue",
+            Self::Cancelled(_) => "cancelled",
+            Self::TenantLimit(_) => "tenant_limit",
+            Self::ServerFull(_) => "server_full",
+            Self::Draining => "draining",
+            Self::Internal => "internal",
+        }
+    }
+
+    /// The error's row of the table.
+    pub fn row(&self) -> Row {
+        Row::of(self.code()).expect("every code has a row; a test goes through all of them")
+    }
+
+    /// When the same request may succeed, where that is known.
+    pub fn retry_after(&self) -> Option<Duration> {
+        match self {
+            Self::TenantLimit(after) | Self::ServerFull(after) => Some(*after),
+            Self::Draining => Some(Duration::from_secs(5)),
+            _ => None,
+        }
+    }
+
+    /// The job that it is about.
+    pub fn job(&self) -> Option<JobId> {
+        match self {
+            Self::KeyReused(id)
+            | Self::NotEnded(id)
+            | Self::JobFailed(id, _)
+            | Self::Expired(id)
+            | Self::Cancelled(id) => Some(*id),
+            _ => None,
+        }
+    }
+
+    /// Logs what broke and says no more of it than that.
+    pub fn internal(error: impl std::fmt::Display) -> Self {
+        tracing::error!(%error, "a request broke");
+        Self::Internal
+    }
+}
+
+impl From<QueueError> for ApiError {
+    fn from(error: QueueError) -> Self {
+        match error {
+            QueueError::NotFound => Self::NotFound,
+            QueueError::KeyReused(id) => Self::KeyReused(id),
+            QueueError::NotEnded(_) => Self::BadRequest(error.to_string()),
+            QueueError::Closed => Self::Draining,
+            QueueError::Store(_) => Self::internal(error),
+        }
+    }
+}
+
+impl From<BlobError> for ApiError {
+    fn from(error: BlobError) -> Self {
+        Self::internal(error)
+    }
+}
+
+impl From<InvalidOptions> for ApiError {
+    fn from(error: InvalidOptions) -> Self {
+        Self::InvalidOptions(error.to_string())
+    }
+}
+
+impl From<InvalidId> for ApiError {
+    fn from(error: InvalidId) -> Self {
+        match error {
+            InvalidId::Job => Self::NotFound,
+            InvalidId::Tenant => Self::BadRequest(error.to_string()),
+        }
+    }
+}
+
+impl From<FormatError> for ApiError {
+    fn from(error: FormatError) -> Self {
+        match error {
+            FormatError::TooLarge { .. } => Self::TooLarge(error.to_string()),
+            error => Self::BadInput(error.to_string()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::metrics::REJECTIONS;
+
+    #[test]
+    fn every_row_says_the_same_on_both_doors() {
+        let id = JobId::fresh();
+        let error = |retryable| JobError {
+            code: "x".to_owned(),
+            message: "x".to_owned(),
+            retryable,
+        };
+        let text = || "x".to_owned();
+        let second = Duration::from_secs(1);
+        let all = [
+            ApiError::BadRequest(text()),
+            ApiError::InvalidOptions(text()),
+            ApiError::BadInput(text()),
+            ApiError::TooLarge(text()),
+            ApiError::TooSlow,
+            ApiError::Unauthenticated,
+            ApiError::Forbidden,
+            ApiError::NotFound,
+            ApiError::NoRoute,
+            ApiError::Method,
+            ApiError::NotAcceptable(text()),
+            ApiError::UnsupportedMedia(text()),
+            ApiError::Range(1),
+            ApiError::KeyReused(id),
+            ApiError::NotEnded(id),
+            ApiError::JobFailed(id, error(true)),
+            ApiError::JobFailed(id, error(false)),
+            ApiError::Expired(id),
+            ApiError::Cancelled(id),
+            ApiError::TenantLimit(second),
+            ApiError::ServerFull(second),
+            ApiError::Draining,
+            ApiError::Internal,
+        ];
+        for error in all {
+            let row = error.row();
+            // The caller's fault is 4xx and never UNAVAILABLE, INTERNAL or the like.
+            let ours_by_http = row.http >= 500;
+            let ours_by_grpc = matches!(row.grpc, 4 | 10 | 13 | 14);
+            let slow = error == ApiError::TooSlow;
+            assert_eq!(ours_by_http, ours_by_grpc && !slow, "{error:?}");
+            assert!(row.retryable || error.retry_after().is_none(), "{error:?}");
+            assert!(row.rejection.is_none_or(|reason| REJECTIONS.contains(&reason)));
+        }
+    }
+}

@@ -1,0 +1,378 @@
+//! The calls, but for the streamed sequence.
+
+use std::pin::Pin;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tokio_stream::Stream;
+use tonic::{Request, Response, Status, Streaming};
+
+use super::chunks::{self, CloudBuilder};
+use super::proto::{self, scene_flow_server::SceneFlow};
+use super::{convert, sequence};
+use crate::api::auth::Caller;
+use crate::api::draft::{Promise, Request as DraftRequest, Room};
+use crate::api::error::ApiError;
+use crate::api::http::Arrived;
+use crate::api::service::{Answer, Service, Waited};
+use crate::job::{Job, JobId, JobOptions, Kind};
+
+/// A stream of answers.
+pub(super) type Answers<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+
+/// Messages that wait for a client that reads slowly.
+const AHEAD: usize = 4;
+
+/// The calls on a service.
+pub(super) struct Calls {
+    service: Arc<Service>,
+}
+
+/// Who calls, and until when.
+#[derive(Clone)]
+pub(super) struct Call {
+    pub(super) caller: Caller,
+    pub(super) arrived: Instant,
+    time_left: Option<Duration>,
+}
+
+impl Call {
+    fn of<T>(request: &Request<T>) -> Result<Self, ApiError> {
+        let extensions = request.extensions();
+        let caller = extensions.get::<Caller>().cloned();
+        let arrived = extensions.get::<Arrived>().map(|arrived| arrived.0);
+        Ok(Self {
+            caller: caller.ok_or(ApiError::Unauthenticated)?,
+            arrived: arrived.unwrap_or_else(Instant::now),
+            time_left: convert::time_left(request.metadata()),
+        })
+    }
+
+    /// What is asked of a job of this call.
+    pub(super) fn draft_request(&self, options: JobOptions, promise: Promise) -> DraftRequest {
+        let spent = self.arrived.elapsed();
+        let awaited = promise == Promise::WhileAwaited;
+        DraftRequest {
+            options,
+            promise,
+            idempotency_key: None,
+            arrived: self.arrived,
+            time_left: self
+                .time_left
+                .filter(|_| awaited)
+                .map(|left| left.saturating_sub(spent)),
+        }
+    }
+}
+
+/// The first message of a stream has to begin it.
+pub(super) fn no_begin() -> ApiError {
+    ApiError::BadRequest("the first message is begin, and there is one of it".to_owned())
+}
+
+impl Calls {
+    pub(super) fn new(service: &Arc<Service>) -> Self {
+        Self {
+            service: Arc::clone(service),
+        }
+    }
+
+    async fn named(&self, call: &Call, id: &str) -> Result<Arc<Job>, ApiError> {
+        self.service.job(&call.caller, id.parse::<JobId>()?).await
+    }
+
+    /// Reads a pair and submits it.
+    async fn read_pair(
+        &self,
+        call: &Call,
+        inbound: &mut Streaming<proto::EstimateFlowRequest>,
+    ) -> Result<(Arc<Job>, Option<Duration>), ApiError> {
+        use proto::estimate_flow_request::Part;
+        call.caller.may_write()?;
+        self.service.check_draining()?;
+        let begin = match chunks::next(&self.service, inbound).await?.and_then(|m| m.part) {
+            Some(Part::Begin(begin)) => begin,
+            _ => return Err(no_begin()),
+        };
+        let pause = u64::from(begin.progress_ms);
+        let options = convert::options(begin.options)?;
+        let request = call.draft_request(options, Promise::WhileAwaited);
+        let mut draft = self.service.draft(call.caller.clone(), request)?;
+        let mut room = Room::default();
+        let mut clouds = [CloudBuilder::default(), CloudBuilder::default()];
+        while let Some(message) = chunks::next(&self.service, inbound).await? {
+            let Some(Part::Cloud(piece)) = message.part else {
+                return Err(no_begin());
+            };
+            let (cloud, part) = match piece.cloud() {
+                proto::Cloud::Source => (&mut clouds[0], "source"),
+                proto::Cloud::Target => (&mut clouds[1], "target"),
+                proto::Cloud::Unspecified => {
+                    let text = "a chunk is of the source or of the target";
+                    return Err(ApiError::BadRequest(text.to_owned()));
+                }
+            };
+            let chunk = piece.chunk.unwrap_or_default();
+            cloud.take(&self.service, &mut room, part, &chunk)?;
+        }
+        for (cloud, part) in clouds.into_iter().zip(["source", "target"]) {
+            draft.push(cloud.finish(part)?).await?;
+        }
+        let (job, _) = draft.submit(Kind::Pair).await?;
+        Ok((job, (pause > 0).then(|| Duration::from_millis(pause))))
+    }
+}
+
+/// Sends progress until the job ends, then its flow.
+async fn send_flow(
+    service: &Arc<Service>,
+    id: JobId,
+    pause: Option<Duration>,
+    answers: &mpsc::Sender<Result<proto::EstimateFlowResponse, Status>>,
+) -> Result<(), ApiError> {
+    use proto::estimate_flow_response::Part;
+    let send = async |part: Part| {
+        let message = proto::EstimateFlowResponse { part: Some(part) };
+        answers.send(Ok(message)).await.is_ok()
+    };
+    let mut sent = None;
+    let job = loop {
+        match service.wait(id, pause).await? {
+            Waited::Ended(job) => break job,
+            Waited::StillOpen(_) if service.closing.is_cancelled() => {
+                return Err(ApiError::Draining);
+            }
+            Waited::StillOpen(job) => {
+                if job.progress.is_some() && job.progress != sent {
+                    sent = job.progress;
+                    let progress = job.progress.map(convert::progress).unwrap_or_default();
+                    if !send(Part::Progress(progress)).await {
+                        return Ok(());
+                    }
+                }
+            }
+        }
+    };
+    let answer = service.answer(&job).await?;
+    if !send(Part::Header(convert::header(&answer))).await {
+        return Ok(());
+    }
+    for piece in chunks::pieces(&answer, 0) {
+        if !send(Part::Chunk(piece)).await {
+            return Ok(());
+        }
+    }
+    Ok(())
+}
+
+/// Sends a stored flow from a row on.
+async fn send_result(
+    answer: Answer,
+    first: usize,
+    answers: mpsc::Sender<Result<proto::DownloadResultResponse, Status>>,
+) {
+    use proto::download_result_response::Part;
+    let header = Part::Header(convert::header(&answer));
+    let pieces = chunks::pieces(&answer, first).map(Part::Chunk);
+    for part in std::iter::once(header).chain(pieces) {
+        let message = proto::DownloadResultResponse { part: Some(part) };
+        if answers.send(Ok(message)).await.is_err() {
+            return;
+        }
+    }
+}
+
+#[tonic::async_trait]
+impl SceneFlow for Calls {
+    type EstimateFlowStream = Answers<proto::EstimateFlowResponse>;
+    type EstimateSequenceStream = Answers<proto::EstimateSequenceResponse>;
+    type WatchJobStream = Answers<proto::Job>;
+    type DownloadResultStream = Answers<proto::DownloadResultResponse>;
+
+    async fn estimate_flow(
+        &self,
+        request: Request<Streaming<proto::EstimateFlowRequest>>,
+    ) -> Result<Response<Self::EstimateFlowStream>, Status> {
+        let call = Call::of(&request)?;
+        let (job, pause) = self.read_pair(&call, &mut request.into_inner()).await?;
+        let awaited = self.service.cancel_when_dropped(job.id);
+        let (answers, stream) = mpsc::channel(AHEAD);
+        let service = Arc::clone(&self.service);
+        tokio::spawn(async move {
+            let sent = tokio::select! {
+                // The client is gone: the guard cancels the job.
+                () = answers.closed() => return,
+                sent = send_flow(&service, job.id, pause, &answers) => sent,
+            };
+            match sent {
+                Ok(()) => awaited.let_go(),
+                Err(error) => {
+                    let _gone_is_fine = answers.send(Err(error.into())).await;
+                }
+            }
+        });
+        Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
+    }
+
+    async fn estimate_sequence(
+        &self,
+        request: Request<Streaming<proto::EstimateSequenceRequest>>,
+    ) -> Result<Response<Self::EstimateSequenceStream>, Status> {
+        let call = Call::of(&request)?;
+        call.caller.may_write()?;
+        self.service.check_draining()?;
+        let answers = sequence::run(Arc::clone(&self.service), call, request.into_inner());
+        Ok(Response::new(Box::pin(answers)))
+    }
+
+    async fn submit_job(
+        &self,
+        request: Request<Streaming<proto::SubmitJobRequest>>,
+    ) -> Result<Response<proto::Job>, Status> {
+        use proto::submit_job_request::Part;
+        let call = Call::of(&request)?;
+        call.caller.may_write()?;
+        self.service.check_draining()?;
+        let mut inbound = request.into_inner();
+        let service = &self.service;
+        let begin = match chunks::next(service, &mut inbound).await?.and_then(|m| m.part) {
+            Some(Part::Begin(begin)) => begin,
+            _ => return Err(no_begin().into()),
+        };
+        let options = convert::options(begin.options)?;
+        let mut draft_request = call.draft_request(options, Promise::Durable);
+        let key = begin.idempotency_key;
+        draft_request.idempotency_key = (!key.is_empty()).then_some(key);
+        let mut draft = service.draft(call.caller.clone(), draft_request)?;
+        let mut room = Room::default();
+        let mut cloud: Option<CloudBuilder> = None;
+        loop {
+            let part = chunks::next(service, &mut inbound).await?.map(|m| m.part);
+            let place = format!("cloud {}", draft.frames());
+            match part {
+                Some(Some(Part::Chunk(chunk))) => match &mut cloud {
+                    Some(cloud) => cloud.take(service, &mut room, &place, &chunk)?,
+                    None => {
+                        let text = "a chunk belongs to a cloud: send next first";
+                        return Err(ApiError::BadRequest(text.to_owned()).into());
+                    }
+                },
+                Some(Some(Part::Next(_))) | None => {
+                    if let Some(cloud) = cloud.replace(CloudBuilder::default()) {
+                        draft.push(cloud.finish(&place)?).await?;
+                        room = Room::default();
+                    }
+                    if part.is_none() {
+                        break;
+                    }
+                }
+                Some(_) => return Err(no_begin().into()),
+            }
+        }
+        let kind = if draft.frames() > 2 { Kind::Sequence } else { Kind::Pair };
+        let (job, _) = draft.submit(kind).await?;
+        Ok(Response::new(convert::job(&job)))
+    }
+
+    async fn get_job(
+        &self,
+        request: Request<proto::GetJobRequest>,
+    ) -> Result<Response<proto::Job>, Status> {
+        let call = Call::of(&request)?;
+        let job = self.named(&call, &request.get_ref().id).await?;
+        let mut message = convert::job(&job);
+        let pairs = self.service.pairs(&job).await?;
+        message.pair_ids = pairs.iter().map(|pair| pair.id.to_string()).collect();
+        Ok(Response::new(message))
+    }
+
+    async fn list_jobs(
+        &self,
+        request: Request<proto::ListJobsRequest>,
+    ) -> Result<Response<proto::ListJobsResponse>, Status> {
+        const PAGE: u32 = 100;
+        let call = Call::of(&request)?;
+        let asked = request.into_inner();
+        let state = convert::wanted_state(asked.state)?;
+        let limit = match asked.page_size {
+            0 => PAGE,
+            size => size.min(1000),
+        };
+        let before = match asked.page_token.as_str() {
+            "" => None,
+            token => Some(token.parse::<JobId>().map_err(ApiError::from)?),
+        };
+        let jobs = self.service.jobs(&call.caller, state, before, limit).await?;
+        let full = jobs.len() == limit as usize;
+        let next = jobs.last().filter(|_| full).map(|job| job.id.to_string());
+        Ok(Response::new(proto::ListJobsResponse {
+            jobs: jobs.iter().map(|job| convert::job(job)).collect(),
+            next_page_token: next.unwrap_or_default(),
+        }))
+    }
+
+    async fn cancel_job(
+        &self,
+        request: Request<proto::CancelJobRequest>,
+    ) -> Result<Response<proto::Job>, Status> {
+        let call = Call::of(&request)?;
+        let id = request.get_ref().id.parse::<JobId>().map_err(ApiError::from)?;
+        let job = self.service.cancel(&call.caller, id).await?;
+        Ok(Response::new(convert::job(&job)))
+    }
+
+    async fn requeue_job(
+        &self,
+        request: Request<proto::RequeueJobRequest>,
+    ) -> Result<Response<proto::Job>, Status> {
+        let call = Call::of(&request)?;
+        let id = request.get_ref().id.parse::<JobId>().map_err(ApiError::from)?;
+        let job = self.service.requeue(&call.caller, id).await?;
+        Ok(Response::new(convert::job(&job)))
+    }
+
+    async fn watch_job(
+        &self,
+        request: Request<proto::WatchJobRequest>,
+    ) -> Result<Response<Self::WatchJobStream>, Status> {
+        let call = Call::of(&request)?;
+        let id = request.get_ref().id.parse::<JobId>().map_err(ApiError::from)?;
+        let mut news = self.service.watch(&call.caller, id).await?;
+        let closing = self.service.closing.clone();
+        let (answers, stream) = mpsc::channel(AHEAD);
+        tokio::spawn(async move {
+            loop {
+                let job = Arc::clone(&news.borrow_and_update());
+                let sent = answers.send(Ok(convert::job(&job))).await;
+                if sent.is_err() || job.state.is_end() {
+                    return;
+                }
+                tokio::select! {
+                    () = answers.closed() => return,
+                    () = closing.cancelled() => {
+                        let _gone_is_fine = answers.send(Err(ApiError::Draining.into())).await;
+                        return;
+                    }
+                    changed = news.changed() => if changed.is_err() { return },
+                }
+            }
+        });
+        Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
+    }
+
+    async fn download_result(
+        &self,
+        request: Request<proto::DownloadResultRequest>,
+    ) -> Result<Response<Self::DownloadResultStream>, Status> {
+        let call = Call::of(&request)?;
+        let asked = request.into_inner();
+        let job = self.named(&call, &asked.id).await?;
+        let answer = self.service.answer(&job).await?;
+        let first = usize::try_from(asked.first_row).unwrap_or(usize::MAX);
+        let (answers, stream) = mpsc::channel(AHEAD);
+        tokio::spawn(send_result(answer, first, answers));
+        Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
+    }
+}

@@ -1,0 +1,107 @@
+//! Clouds out of chunks, and flow into them.
+
+use tonic::Streaming;
+
+use super::proto;
+use crate::api::codec;
+use crate::api::draft::Room;
+use crate::api::error::ApiError;
+use crate::api::service::{Answer, Service};
+use crate::payload::{StoredCloud, points_from_le_bytes};
+
+/// Rows of one chunk of flow: below 1 MiB with its flags.
+const ROWS: usize = 80_000;
+
+/// The next message, within the time that a body may be silent.
+pub(super) async fn next<T>(
+    service: &Service,
+    inbound: &mut Streaming<T>,
+) -> Result<Option<T>, ApiError> {
+    let message = tokio::time::timeout(service.limits.body_idle, inbound.message()).await;
+    match message.map_err(|_| ApiError::TooSlow)? {
+        Ok(message) => Ok(message),
+        Err(status) if status.code() == tonic::Code::OutOfRange => {
+            let text = "a message is larger than 1 MiB: send smaller chunks";
+            Err(ApiError::TooLarge(text.to_owned()))
+        }
+        Err(status) => Err(ApiError::BadRequest(format!(
+            "the stream is broken: {}",
+            status.message()
+        ))),
+    }
+}
+
+/// A cloud that comes in pieces.
+#[derive(Default)]
+pub(super) struct CloudBuilder {
+    points: Vec<u8>,
+    ground: Vec<bool>,
+}
+
+impl CloudBuilder {
+    /// Takes a piece.
+    pub(super) fn take(
+        &mut self,
+        service: &Service,
+        room: &mut Room,
+        part: &str,
+        chunk: &proto::Chunk,
+    ) -> Result<(), ApiError> {
+        const POINT: usize = 12;
+        let bytes = chunk.points.len();
+        room.take(service, bytes + chunk.ground.len())?;
+        if !bytes.is_multiple_of(POINT) {
+            return Err(ApiError::BadInput(format!(
+                "{part}: a chunk has {bytes} bytes of points, not a multiple of {POINT}"
+            )));
+        }
+        if !chunk.ground.is_empty() && chunk.ground.len() != bytes / POINT {
+            return Err(ApiError::BadInput(format!(
+                "{part}: a chunk has {} points but {} ground flags",
+                bytes / POINT,
+                chunk.ground.len()
+            )));
+        }
+        self.points.extend_from_slice(&chunk.points);
+        self.ground.extend(chunk.ground.iter().map(|&flag| flag != 0));
+        Ok(())
+    }
+
+    /// The whole cloud, checked as a file's would be.
+    pub(super) fn finish(self, part: &str) -> Result<StoredCloud, ApiError> {
+        let points = points_from_le_bytes(&self.points);
+        codec::check_points(part, &points)?;
+        let ground = match self.ground.len() {
+            0 => None,
+            flags if flags == points.len() => Some(self.ground),
+            flags => {
+                return Err(ApiError::BadInput(format!(
+                    "{part}: {} points but {flags} ground flags",
+                    points.len()
+                )));
+            }
+        };
+        Ok(StoredCloud { points, ground })
+    }
+}
+
+/// A flow's rows from `first` on, in pieces.
+pub(super) fn pieces(answer: &Answer, first: usize) -> impl Iterator<Item = proto::FlowChunk> {
+    let flow = std::sync::Arc::clone(&answer.flow);
+    let rows = flow.flow.len();
+    (first.min(rows)..rows).step_by(ROWS).map(move |from| {
+        let to = (from + ROWS).min(rows);
+        let values = flow.flow[from..to].as_flattened().iter();
+        let bytes: Vec<u8> = values.flat_map(|value| value.to_le_bytes()).collect();
+        let flags: Vec<u8> = (from..to)
+            .map(|row| {
+                let dynamic = flow.dynamic.as_ref().is_some_and(|dynamic| dynamic[row]);
+                u8::from(flow.valid[row]) | u8::from(dynamic) << 1
+            })
+            .collect();
+        proto::FlowChunk {
+            flow: bytes.into(),
+            flags: flags.into(),
+        }
+    })
+}

@@ -1,0 +1,240 @@
+//! The protocol's messages to our vocabulary and back. Unknown numbers are refused by name.
+
+use std::time::Duration;
+
+use tonic::metadata::MetadataMap;
+
+use super::proto;
+use crate::api::error::ApiError;
+use crate::api::service::Answer;
+use crate::formats::rigid_motion;
+use crate::job::{
+    DeviceChoice, EgoChoice, GroundChoice, Job, JobError, JobOptions, JobProgress, Kind,
+    PresetChoice, Priority, State,
+};
+
+fn unknown(field: &str, number: i32) -> ApiError {
+    ApiError::InvalidOptions(format!("options: {field} has no value {number}"))
+}
+
+/// The options of a message; the defaults where there is none.
+pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, ApiError> {
+    let Some(message) = message else {
+        return Ok(JobOptions::default());
+    };
+    let preset = match proto::Preset::try_from(message.preset) {
+        Ok(proto::Preset::Unspecified | proto::Preset::Default) => PresetChoice::Default,
+        Ok(proto::Preset::Paper) => PresetChoice::Paper,
+        Err(_) => return Err(unknown("preset", message.preset)),
+    };
+    let ground = match proto::Ground::try_from(message.ground) {
+        Ok(proto::Ground::Unspecified | proto::Ground::Keep) => GroundChoice::Keep,
+        Ok(proto::Ground::Mask) => GroundChoice::Mask,
+        Err(_) => return Err(unknown("ground", message.ground)),
+    };
+    let priority = match proto::Priority::try_from(message.priority) {
+        Ok(proto::Priority::Unspecified | proto::Priority::Normal) => Priority::Normal,
+        Ok(proto::Priority::Low) => Priority::Low,
+        Ok(proto::Priority::High) => Priority::High,
+        Err(_) => return Err(unknown("priority", message.priority)),
+    };
+    let device = match message.device.as_str() {
+        "" | "auto" => DeviceChoice::Auto,
+        "cpu" => DeviceChoice::Cpu,
+        _ => {
+            let text = "options: device is \"auto\" or \"cpu\"";
+            return Err(ApiError::InvalidOptions(text.to_owned()));
+        }
+    };
+    let options = JobOptions {
+        preset,
+        seed: message.seed,
+        max_points: message.max_points,
+        range_m: message.range_m,
+        ground,
+        ego: ego(message.ego, &message.ego_motion)?,
+        device,
+        deadline_ms: message.deadline_ms,
+        priority,
+    };
+    options.check()?;
+    Ok(options)
+}
+
+fn ego(named: i32, motion: &[f64]) -> Result<Option<EgoChoice>, ApiError> {
+    let invalid = |text: &str| ApiError::InvalidOptions(format!("options: {text}"));
+    let named = proto::Ego::try_from(named).map_err(|_| unknown("ego", named))?;
+    match (named, motion.len()) {
+        (proto::Ego::Unspecified, 0) => Ok(None),
+        (proto::Ego::Off, 0) => Ok(Some(EgoChoice::Off)),
+        (proto::Ego::Auto, 0) => Ok(Some(EgoChoice::Auto)),
+        (proto::Ego::Unspecified, 16) => {
+            let rows = core::array::from_fn(|row| {
+                core::array::from_fn(|column| motion[4 * row + column])
+            });
+            let motion = rigid_motion(&rows).map_err(|error| invalid(&error.to_string()))?;
+            Ok(Some(EgoChoice::Given(motion)))
+        }
+        (proto::Ego::Unspecified, _) => Err(invalid("ego_motion has 16 numbers, row by row")),
+        _ => Err(invalid("ego and ego_motion exclude each other")),
+    }
+}
+
+/// The state that a filter names; any where unspecified.
+pub(super) fn wanted_state(number: i32) -> Result<Option<State>, ApiError> {
+    let found = match proto::State::try_from(number) {
+        Ok(proto::State::Unspecified) => None,
+        Ok(proto::State::Queued) => Some(State::Queued),
+        Ok(proto::State::Running) => Some(State::Running),
+        Ok(proto::State::Succeeded) => Some(State::Succeeded),
+        Ok(proto::State::Failed) => Some(State::Failed),
+        Ok(proto::State::Cancelled) => Some(State::Cancelled),
+        Ok(proto::State::Expired) => Some(State::Expired),
+        Err(_) => return Err(ApiError::BadRequest(format!("there is no state {number}"))),
+    };
+    Ok(found)
+}
+
+fn state(state: State) -> proto::State {
+    match state {
+        State::Queued => proto::State::Queued,
+        State::Running => proto::State::Running,
+        State::Succeeded => proto::State::Succeeded,
+        State::Failed => proto::State::Failed,
+        State::Cancelled => proto::State::Cancelled,
+        State::Expired => proto::State::Expired,
+    }
+}
+
+/// A job as a message.
+pub(super) fn job(job: &Job) -> proto::Job {
+    let moment = |moment: Option<crate::clock::Timestamp>| {
+        moment.map(|moment| moment.to_string()).unwrap_or_default()
+    };
+    proto::Job {
+        id: job.id.to_string(),
+        state: state(job.state).into(),
+        kind: match job.kind {
+            Kind::Pair => "pair".to_owned(),
+            Kind::Sequence => "sequence".to_owned(),
+        },
+        created_at: job.created.to_string(),
+        started_at: moment(job.started),
+        finished_at: moment(job.finished),
+        attempt: job.attempt,
+        progress: job.progress.map(progress),
+        stop_reason: job.stop_reason.clone().unwrap_or_default(),
+        error: job.error.as_ref().map(job_error),
+        pair_ids: Vec::new(),
+        pairs: job.pairs,
+        pairs_left: job.pairs_left,
+    }
+}
+
+pub(super) fn progress(progress: JobProgress) -> proto::Progress {
+    proto::Progress {
+        iteration: progress.iteration,
+        max_iterations: progress.max_iterations,
+        loss: progress.loss,
+    }
+}
+
+fn job_error(error: &JobError) -> proto::JobError {
+    proto::JobError {
+        code: error.code.clone(),
+        message: error.message.clone(),
+        retryable: error.retryable,
+    }
+}
+
+/// How a pair of a stream failed.
+pub(super) fn pair_error(error: &ApiError) -> proto::JobError {
+    match error {
+        ApiError::JobFailed(_, failure) => job_error(failure),
+        other => proto::JobError {
+            code: other.row().code.to_owned(),
+            message: other.to_string(),
+            retryable: other.row().retryable,
+        },
+    }
+}
+
+/// What is known about a flow before its rows.
+pub(super) fn header(answer: &Answer) -> proto::FlowHeader {
+    let report = &answer.report;
+    let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
+    let seconds = report.seconds;
+    let motion = report.ego_motion.as_ref();
+    proto::FlowHeader {
+        job_id: answer.job.id.to_string(),
+        stop_reason: report.stop_reason.clone(),
+        iterations: count(report.iterations),
+        best_loss: report.best_loss,
+        points: answer.flow.flow.len() as u64,
+        valid_points: report.points as u64,
+        ego_motion: motion.map(|rows| rows.as_flattened().to_vec()).unwrap_or_default(),
+        device: report.device.clone(),
+        seconds: Some(proto::Seconds {
+            precompute: seconds.precompute,
+            query: seconds.query,
+            network: seconds.network,
+            total: seconds.total,
+        }),
+    }
+}
+
+/// The call's own deadline, from `grpc-timeout`: at most eight digits and a unit.
+pub(super) fn time_left(metadata: &MetadataMap) -> Option<Duration> {
+    let text = metadata.get("grpc-timeout")?.to_str().ok()?;
+    let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
+    if digits.is_empty() || digits.len() > 8 {
+        return None;
+    }
+    let count: u64 = digits.parse().ok()?;
+    Some(match unit {
+        "H" => Duration::from_secs(count * 3600),
+        "M" => Duration::from_secs(count * 60),
+        "S" => Duration::from_secs(count),
+        "m" => Duration::from_millis(count),
+        "u" => Duration::from_micros(count),
+        "n" => Duration::from_nanos(count),
+        _ => return None,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn unknown_numbers_and_contradictions_are_refused_by_name() {
+        let refused = |change: fn(&mut proto::Options)| {
+            let mut message = proto::Options::default();
+            change(&mut message);
+            options(Some(message)).expect_err("a refusal").to_string()
+        };
+        assert!(refused(|o| o.preset = 9).contains("preset has no value 9"));
+        assert!(refused(|o| o.priority = -1).contains("priority has no value -1"));
+        assert!(refused(|o| o.device = "tpu".to_owned()).contains("device is"));
+        assert!(refused(|o| o.ego_motion = vec![1.0; 3]).contains("16 numbers"));
+        assert!(refused(|o| o.range_m = Some(f32::NAN)).contains("range_m"));
+        assert!(refused(|o| o.max_points = Some(1)).contains("max_points is 1"));
+        assert_eq!(options(Some(proto::Options::default())), Ok(JobOptions::default()));
+        assert_eq!(options(None), Ok(JobOptions::default()));
+    }
+
+    #[test]
+    fn deadlines_of_calls_are_read_in_every_unit() {
+        let read = |text: &'static str| {
+            let mut metadata = MetadataMap::new();
+            metadata.insert("grpc-timeout", text.parse().expect("plain text"));
+            time_left(&metadata)
+        };
+        assert_eq!(read("300m"), Some(Duration::from_millis(300)));
+        assert_eq!(read("2S"), Some(Duration::from_secs(2)));
+        assert_eq!(read("1H"), Some(Duration::from_secs(3600)));
+        for nonsense in ["", "S", "123456789S", "-1S", "5x"] {
+            assert_eq!(read(nonsense), None, "{nonsense}");
+        }
+    }
+}

@@ -1,0 +1,216 @@
+//! A streamed sequence: sweeps in, the flow of each consecutive pair out, in order.
+//!
+//! Two tasks and a bounded channel between them: the reader waits when the channel is full, so
+//! that memory stays bounded and the client feels it.
+
+use std::sync::Arc;
+
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Status, Streaming};
+
+use super::calls::{Call, no_begin};
+use super::chunks::{self, CloudBuilder};
+use super::{convert, proto};
+use crate::api::draft::{Promise, Room};
+use crate::api::error::ApiError;
+use crate::api::service::{Awaited, Service, Waited};
+use crate::job::{JobId, JobOptions, Kind};
+use crate::payload::StoredCloud;
+
+type Answers = mpsc::Sender<Result<proto::EstimateSequenceResponse, Status>>;
+
+/// A pair that is being worked on.
+struct Pending {
+    place: u32,
+    source: String,
+    target: String,
+    /// Its job, or why it has none.
+    job: Result<(JobId, Awaited), ApiError>,
+}
+
+/// A sweep that has arrived.
+struct Sweep {
+    name: String,
+    cloud: StoredCloud,
+}
+
+/// Starts both tasks.
+pub(super) fn run(
+    service: Arc<Service>,
+    call: Call,
+    inbound: Streaming<proto::EstimateSequenceRequest>,
+) -> ReceiverStream<Result<proto::EstimateSequenceResponse, Status>> {
+    let (answers, stream) = mpsc::channel(2);
+    let (pending, pairs) = mpsc::channel(service.limits.sequence_ahead.max(1));
+    let writing = (Arc::clone(&service), answers.clone());
+    tokio::spawn(async move { write(&writing.0, pairs, &writing.1).await });
+    tokio::spawn(async move {
+        let reader = Reader {
+            service,
+            call,
+            inbound,
+            pending,
+            place: 0,
+            last: None,
+        };
+        if let Err(error) = reader.run().await {
+            let _gone_is_fine = answers.send(Err(error.into())).await;
+        }
+    });
+    ReceiverStream::new(stream)
+}
+
+struct Reader {
+    service: Arc<Service>,
+    call: Call,
+    inbound: Streaming<proto::EstimateSequenceRequest>,
+    pending: mpsc::Sender<Pending>,
+    place: u32,
+    last: Option<Sweep>,
+}
+
+impl Reader {
+    async fn run(mut self) -> Result<(), ApiError> {
+        use proto::estimate_sequence_request::Part;
+        let first = chunks::next(&self.service, &mut self.inbound).await?;
+        let Some(Part::Begin(begin)) = first.and_then(|message| message.part) else {
+            return Err(no_begin());
+        };
+        let options = convert::options(begin.options)?;
+        let mut current: Option<(String, CloudBuilder)> = None;
+        let mut room = Room::default();
+        loop {
+            // A drive may pause for as long as it likes: only a dead connection ends it.
+            let message = self.inbound.message().await;
+            let message = message.map_err(|status| {
+                ApiError::BadRequest(format!("the stream is broken: {}", status.message()))
+            })?;
+            let ended = message.is_none();
+            match message.and_then(|message| message.part) {
+                Some(Part::Chunk(chunk)) => {
+                    let Some((name, cloud)) = &mut current else {
+                        let text = "a chunk belongs to a sweep: send sweep first";
+                        return Err(ApiError::BadRequest(text.to_owned()));
+                    };
+                    cloud.take(&self.service, &mut room, name, &chunk)?;
+                }
+                Some(Part::Sweep(sweep)) => {
+                    let next = (sweep.name, CloudBuilder::default());
+                    if let Some((name, cloud)) = current.replace(next) {
+                        self.take(name, cloud, &options).await?;
+                        room = Room::default();
+                    }
+                }
+                Some(Part::Begin(_)) => return Err(no_begin()),
+                None if ended => {
+                    if let Some((name, cloud)) = current.take() {
+                        self.take(name, cloud, &options).await?;
+                    }
+                    return Ok(());
+                }
+                None => return Err(ApiError::BadRequest("a message is empty".to_owned())),
+            }
+        }
+    }
+
+    /// Takes a whole sweep, and submits its pair with the one before.
+    async fn take(
+        &mut self,
+        name: String,
+        cloud: CloudBuilder,
+        options: &JobOptions,
+    ) -> Result<(), ApiError> {
+        let cloud = cloud.finish(&name)?;
+        let sweep = Sweep { name, cloud };
+        let Some(before) = self.last.take() else {
+            self.last = Some(sweep);
+            return Ok(());
+        };
+        let place = self.pending.reserve().await;
+        let Ok(place_in_line) = place else {
+            return Ok(());
+        };
+        let names = (before.name, sweep.name.clone());
+        let job = self.submit(before.cloud, sweep.cloud.clone(), options).await;
+        place_in_line.send(Pending {
+            place: self.place,
+            source: names.0,
+            target: names.1,
+            job,
+        });
+        self.place += 1;
+        self.last = Some(sweep);
+        Ok(())
+    }
+
+    async fn submit(
+        &self,
+        source: StoredCloud,
+        target: StoredCloud,
+        options: &JobOptions,
+    ) -> Result<(JobId, Awaited), ApiError> {
+        let request = self.call.draft_request(options.clone(), Promise::WhileAwaited);
+        let mut draft = self.service.draft(self.call.caller.clone(), request)?;
+        draft.push(source).await?;
+        draft.push(target).await?;
+        let (job, _) = draft.submit(Kind::Pair).await?;
+        Ok((job.id, self.service.cancel_when_dropped(job.id)))
+    }
+}
+
+/// Sends every pair's flow, in order, as soon as it is there. What is still pending when the
+/// client goes away is dropped, and so cancelled.
+async fn write(service: &Arc<Service>, mut pairs: mpsc::Receiver<Pending>, answers: &Answers) {
+    while let Some(pair) = pairs.recv().await {
+        let sent = tokio::select! {
+            () = answers.closed() => return,
+            sent = send(service, pair, answers) => sent,
+        };
+        if !sent {
+            return;
+        }
+    }
+}
+
+/// Sends one pair; false where nobody listens any more.
+async fn send(service: &Arc<Service>, pair: Pending, answers: &Answers) -> bool {
+    use proto::estimate_sequence_response::pair::Outcome;
+    use proto::estimate_sequence_response::{Pair, Part};
+    let message = |part: Part| Ok(proto::EstimateSequenceResponse { part: Some(part) });
+    let header = |outcome: Outcome| Pair {
+        place: pair.place,
+        source: pair.source.clone(),
+        target: pair.target.clone(),
+        outcome: Some(outcome),
+    };
+    let answer = match pair.job {
+        Err(error) => Err(error),
+        Ok((id, awaited)) => match service.wait(id, None).await {
+            Ok(Waited::Ended(job)) => {
+                awaited.let_go();
+                service.answer(&job).await
+            }
+            Ok(Waited::StillOpen(_)) => Err(ApiError::Draining),
+            Err(error) => Err(error),
+        },
+    };
+    match answer {
+        Err(error) => {
+            let failed = header(Outcome::Error(convert::pair_error(&error)));
+            answers.send(message(Part::Pair(failed))).await.is_ok()
+        }
+        Ok(answer) => {
+            let head = header(Outcome::Header(convert::header(&answer)));
+            if answers.send(message(Part::Pair(head))).await.is_err() {
+                return false;
+            }
+            for piece in chunks::pieces(&answer, 0) {
+                if answers.send(message(Part::Chunk(piece))).await.is_err() {
+                    return false;
+                }
+            }
+            true
+        }
+    }
+}

@@ -1,0 +1,51 @@
+//! Errors as gRPC statuses with rich details, from the same table as HTTP's.
+
+use std::collections::HashMap;
+
+use tonic::metadata::MetadataValue;
+use tonic::{Code, Status};
+use tonic_types::{ErrorDetails, StatusExt};
+
+use crate::api::error::{ApiError, Row};
+
+/// Who says so, in `google.rpc.ErrorInfo`.
+const DOMAIN: &str = "fnsf";
+
+/// The metadata in which the stable code stands, for clients without rich errors.
+const CODE_KEY: &str = "fnsf-code";
+
+/// The status of an error: `ErrorInfo` always, `RetryInfo` and a pushback where waiting helps.
+pub(in crate::api) fn status(error: ApiError) -> Status {
+    let row = error.row();
+    let mut about = HashMap::new();
+    if let Some(job) = error.job() {
+        about.insert("job_id".to_owned(), job.to_string());
+    }
+    if let ApiError::JobFailed(_, failure) = &error {
+        about.insert("job_error".to_owned(), failure.code.clone());
+    }
+    about.insert("retryable".to_owned(), row.retryable.to_string());
+    let mut details = ErrorDetails::with_error_info(row.code, DOMAIN, about);
+    let retry_after = error.retry_after();
+    details.set_retry_info(retry_after);
+    let code = Code::from_i32(row.grpc);
+    let mut status = Status::with_error_details(code, error.to_string(), details);
+    let metadata = status.metadata_mut();
+    metadata.insert(CODE_KEY, MetadataValue::from_static(row.code));
+    if let Some(after) = retry_after {
+        let millis = u64::try_from(after.as_millis()).unwrap_or(u64::MAX);
+        metadata.insert("grpc-retry-pushback-ms", MetadataValue::from(millis));
+    }
+    status
+}
+
+/// The row of the error that an answer of this door carries, if it does.
+pub(in crate::api) fn row_of(headers: &axum::http::HeaderMap) -> Option<Row> {
+    Row::of(headers.get(CODE_KEY)?.to_str().ok()?)
+}
+
+impl From<ApiError> for Status {
+    fn from(error: ApiError) -> Self {
+        status(error)
+    }
+}

@@ -1,0 +1,219 @@
+//! Flow on its way out: formats, ranges, entity tags, and a sequence's flows in one archive.
+
+use std::sync::Arc;
+
+use axum::body::{Body, Bytes};
+use axum::extract::{Extension, Path, State};
+use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use tokio_stream::wrappers::ReceiverStream;
+
+use super::problem::Problem;
+use crate::api::auth::Caller;
+use crate::api::codec::AnswerFormat;
+use crate::api::error::ApiError;
+use crate::api::service::{Answer, Service};
+use crate::job::{Job, Kind, State as JobState};
+
+/// A pair's flow, whole.
+pub(super) async fn flow(
+    service: &Arc<Service>,
+    answer: &Answer,
+    format: AnswerFormat,
+) -> Result<Response, ApiError> {
+    let bytes = service.encode(answer, format).await?;
+    let mut response = Body::from(bytes).into_response();
+    describe(&mut response, answer, format);
+    Ok(response)
+}
+
+/// The headers that every answer with a flow carries.
+fn describe(response: &mut Response, answer: &Answer, format: AnswerFormat) {
+    let report = &answer.report;
+    let headers = response.headers_mut();
+    let mut set = |name: &'static str, value: String| {
+        if let Ok(value) = HeaderValue::from_str(&value) {
+            headers.insert(name, value);
+        }
+    };
+    set("content-type", format.media_type().to_owned());
+    set("fnsf-job-id", answer.job.id.to_string());
+    set("fnsf-stop-reason", report.stop_reason.clone());
+    set("fnsf-iterations", report.iterations.to_string());
+    set("fnsf-seconds", format!("{:.6}", report.seconds.total));
+    set("etag", entity_tag(&answer.job, format));
+    set("accept-ranges", "bytes".to_owned());
+    set("vary", "accept".to_owned());
+    let name = format!("attachment; filename=\"{}.{}\"", answer.job.id, format.ending());
+    set("content-disposition", name);
+}
+
+/// A result never changes once it is there; another attempt or format is another entity.
+fn entity_tag(job: &Job, format: AnswerFormat) -> String {
+    format!("\"{}-{}-{}\"", job.id, job.attempt, format.ending())
+}
+
+/// Fetches a job's flow; of a sequence, a zip archive with one flow a pair.
+#[utoipa::path(
+    get,
+    path = "/v1/jobs/{id}/result",
+    tag = "jobs",
+    params(
+        ("id" = String, Path, description = "The job's name"),
+        ("Accept" = Option<String>, Header, description = "The format of the flow; application/x-npz by default"),
+        ("Range" = Option<String>, Header, description = "bytes=FROM-TO, for a pair"),
+        ("If-None-Match" = Option<String>, Header, description = "The entity tag of a copy that is there already"),
+    ),
+    responses(
+        (status = 200, description = "The flow", content_type = "application/x-npz"),
+        (status = 206, description = "A part of it"),
+        (status = 304, description = "The copy is still good"),
+        (status = 409, description = "The job has not ended, or was cancelled", body = Problem, content_type = "application/problem+json"),
+        (status = "4XX", description = "A refusal", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+pub(super) async fn result(
+    State(service): State<Arc<Service>>,
+    Extension(caller): Extension<Caller>,
+    Path(id): Path<String>,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
+    let text = |name: header::HeaderName| headers.get(name).and_then(|value| value.to_str().ok());
+    let job = service.job(&caller, id.parse()?).await?;
+    if job.kind == Kind::Sequence && job.state.is_end() {
+        // An archive is no flow format: whatever is accepted besides names its entries' format.
+        let entries = text(header::ACCEPT).filter(|accept| !accept.contains("application/zip"));
+        return archive(&service, &job, AnswerFormat::accepted(entries)?).await;
+    }
+    let format = AnswerFormat::accepted(text(header::ACCEPT))?;
+    let answer = service.answer(&job).await?;
+    let tag = entity_tag(&job, format);
+    let matches = |tags: &str| tags.split(',').any(|one| one.trim() == tag || one.trim() == "*");
+    if text(header::IF_NONE_MATCH).is_some_and(matches) {
+        let mut response = StatusCode::NOT_MODIFIED.into_response();
+        describe(&mut response, &answer, format);
+        return Ok(response);
+    }
+    let bytes = Bytes::from(service.encode(&answer, format).await?);
+    let fresh = text(header::IF_RANGE).is_none_or(|known| known == tag);
+    let range = text(header::RANGE).filter(|_| fresh);
+    let mut response = match range.and_then(|range| parse_range(range, bytes.len() as u64)) {
+        None => Body::from(bytes).into_response(),
+        Some(None) => return Err(ApiError::Range(bytes.len() as u64)),
+        Some(Some((first, last))) => {
+            let part = bytes.slice(first as usize..=last as usize);
+            let mut response = (StatusCode::PARTIAL_CONTENT, Body::from(part)).into_response();
+            let range = format!("bytes {first}-{last}/{}", bytes.len());
+            if let Ok(range) = HeaderValue::from_str(&range) {
+                response.headers_mut().insert(header::CONTENT_RANGE, range);
+            }
+            response
+        }
+    };
+    describe(&mut response, &answer, format);
+    Ok(response)
+}
+
+/// The first and last byte of a single range; nothing where the header is to be ignored, and
+/// nothing inside where no byte of it is there.
+fn parse_range(range: &str, length: u64) -> Option<Option<(u64, u64)>> {
+    let (from, to) = range.strip_prefix("bytes=")?.split_once('-')?;
+    if to.contains(',') {
+        return None;
+    }
+    let (first, last) = match (from.trim(), to.trim()) {
+        ("", last) => (length.saturating_sub(last.parse().ok()?), length.checked_sub(1)?),
+        (first, "") => (first.parse().ok()?, length.checked_sub(1)?),
+        (first, last) => {
+            let last: u64 = last.parse().ok()?;
+            (first.parse().ok()?, last.min(length.checked_sub(1)?))
+        }
+    };
+    Some((first <= last && first < length).then_some((first, last)))
+}
+
+/// The flows of a sequence in one archive, written as it is read.
+async fn archive(
+    service: &Arc<Service>,
+    sequence: &Arc<Job>,
+    format: AnswerFormat,
+) -> Result<Response, ApiError> {
+    if sequence.state != JobState::Succeeded {
+        service.answer(sequence).await?;
+    }
+    let pairs = service.pairs(sequence).await?;
+    let (pieces, stream) = tokio::sync::mpsc::channel::<Result<Bytes, std::io::Error>>(4);
+    let service = Arc::clone(service);
+    let runtime = tokio::runtime::Handle::current();
+    tokio::task::spawn_blocking(move || {
+        let mut zip = zip::ZipWriter::new_stream(Pipe(pieces.clone()));
+        let plain = zip::write::SimpleFileOptions::default()
+            .compression_method(zip::CompressionMethod::Stored);
+        let mut write = || -> Result<(), Box<dyn std::error::Error>> {
+            for pair in &pairs {
+                let bytes = runtime.block_on(async {
+                    let answer = service.answer(pair).await?;
+                    service.encode(&answer, format).await
+                })?;
+                zip.start_file(format!("{:06}.{}", pair.place, format.ending()), plain)?;
+                std::io::Write::write_all(&mut zip, &bytes)?;
+            }
+            Ok(())
+        };
+        let done = write().and_then(|()| Ok(zip.finish().map(drop)?));
+        if let Err(error) = done {
+            tracing::warn!(%error, "an archive was not finished");
+            let _gone_is_fine = pieces.blocking_send(Err(std::io::Error::other("not finished")));
+        }
+    });
+    let mut response = Body::from_stream(ReceiverStream::new(stream)).into_response();
+    let headers = response.headers_mut();
+    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/zip"));
+    let name = format!("attachment; filename=\"{}.zip\"", sequence.id);
+    for (header, value) in [("content-disposition", name), ("fnsf-job-id", sequence.id.to_string())] {
+        if let Ok(value) = HeaderValue::from_str(&value) {
+            headers.insert(header, value);
+        }
+    }
+    Ok(response)
+}
+
+/// Writes into a body that is being sent; held back where its reader is slow.
+struct Pipe(tokio::sync::mpsc::Sender<Result<Bytes, std::io::Error>>);
+
+impl std::io::Write for Pipe {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        let piece = Bytes::copy_from_slice(bytes);
+        let sent = self.0.blocking_send(Ok(piece));
+        sent.map_err(|_| std::io::ErrorKind::BrokenPipe)?;
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn single_ranges_are_cut_to_the_result_and_nonsense_is_ignored() {
+        for (range, expected) in [
+            ("bytes=0-9", Some(Some((0, 9)))),
+            ("bytes=90-", Some(Some((90, 99)))),
+            ("bytes=-5", Some(Some((95, 99)))),
+            ("bytes=-500", Some(Some((0, 99)))),
+            ("bytes=50-1000", Some(Some((50, 99)))),
+            ("bytes=100-", Some(None)),
+            ("bytes=9-0", Some(None)),
+            ("bytes=0-1,3-4", None),
+            ("lines=0-1", None),
+            ("bytes=a-b", None),
+        ] {
+            assert_eq!(parse_range(range, 100), expected, "{range}");
+        }
+        assert_eq!(parse_range("bytes=0-0", 0), None);
+    }
+}

@@ -1,0 +1,200 @@
+//! Request bodies: multipart files as they come, against the service's limits.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use axum::extract::multipart::{Field, Multipart, MultipartError};
+use axum::extract::{FromRequest, Request};
+use axum::http::header;
+use tokio::time::timeout;
+
+use crate::api::codec;
+use crate::api::draft::{Draft, Room};
+use crate::api::error::ApiError;
+use crate::api::service::Service;
+use crate::formats;
+use crate::job::JobOptions;
+use crate::payload::StoredCloud;
+
+/// The longest `options` part.
+const MAX_OPTIONS: usize = 64 << 10;
+
+/// A multipart body that is being read.
+pub(super) struct Body {
+    service: Arc<Service>,
+    multipart: Multipart,
+    room: Room,
+    decode_seconds: f64,
+}
+
+/// One part of a body.
+pub(super) enum Part {
+    /// The options.
+    Options(JobOptions),
+    /// A file: the field's name, the file's name, its bytes.
+    File(String, Option<String>, Vec<u8>),
+}
+
+impl Body {
+    /// Begins to read a request's body.
+    pub(super) async fn of(service: &Arc<Service>, request: Request) -> Result<Self, ApiError> {
+        if request.headers().contains_key(header::CONTENT_ENCODING) {
+            let text = "the body is compressed; send the files as they are";
+            return Err(ApiError::UnsupportedMedia(text.to_owned()));
+        }
+        let length = request.headers().get(header::CONTENT_LENGTH);
+        let length = length.and_then(|value| value.to_str().ok()?.parse::<u64>().ok());
+        let limit = service.limits.max_upload_bytes;
+        if length.is_some_and(|length| length > limit) {
+            return Err(ApiError::TooLarge(format!(
+                "the request's body has more than the {} MiB that this server takes",
+                limit >> 20
+            )));
+        }
+        let multipart = Multipart::from_request(request, &()).await.map_err(|_| {
+            let text = "send multipart/form-data, as curl -F source=@a.pcd -F target=@b.pcd does";
+            ApiError::UnsupportedMedia(text.to_owned())
+        })?;
+        Ok(Self {
+            service: Arc::clone(service),
+            multipart,
+            room: Room::default(),
+            decode_seconds: 0.0,
+        })
+    }
+
+    /// The next part, whole.
+    pub(super) async fn next(&mut self) -> Result<Option<Part>, ApiError> {
+        let idle = self.service.limits.body_idle;
+        let field = timeout(idle, self.multipart.next_field()).await;
+        let Some(field) = field.map_err(|_| ApiError::TooSlow)?.map_err(broken)? else {
+            return Ok(None);
+        };
+        let name = field.name().unwrap_or_default().to_owned();
+        let file = field.file_name().map(str::to_owned);
+        match name.as_str() {
+            "options" => {
+                let bytes = read(&self.service, &mut self.room, field, MAX_OPTIONS).await?;
+                Ok(Some(Part::Options(JobOptions::from_json(&bytes)?)))
+            }
+            "source" | "target" | "frame" => {
+                let bytes = read(&self.service, &mut self.room, field, usize::MAX).await?;
+                Ok(Some(Part::File(name, file, bytes)))
+            }
+            other => Err(ApiError::BadRequest(format!(
+                "there is no part named {other:?}; known are source, target, frame and options"
+            ))),
+        }
+    }
+
+    /// Reads a file's cloud beside the requests.
+    pub(super) async fn cloud(
+        &mut self,
+        part: String,
+        name: Option<String>,
+        bytes: Vec<u8>,
+    ) -> Result<StoredCloud, ApiError> {
+        let read = move || codec::read_cloud(&part, &bytes, name.as_deref());
+        self.timed(read).await
+    }
+
+    /// Reads a file that holds both clouds.
+    pub(super) async fn pair(&mut self, bytes: Vec<u8>) -> Result<[StoredCloud; 2], ApiError> {
+        self.timed(move || codec::read_pair("source", &bytes)).await
+    }
+
+    async fn timed<T: Send + 'static>(
+        &mut self,
+        read: impl FnOnce() -> Result<T, ApiError> + Send + 'static,
+    ) -> Result<T, ApiError> {
+        let began = Instant::now();
+        let done = self.service.compute(read).await?;
+        self.decode_seconds += began.elapsed().as_secs_f64();
+        Ok(done)
+    }
+
+    /// All that was spent on reading files.
+    pub(super) fn decode_seconds(&self) -> f64 {
+        self.decode_seconds
+    }
+}
+
+/// Reads one part to its end, piece by piece.
+async fn read(
+    service: &Service,
+    room: &mut Room,
+    mut field: Field<'_>,
+    limit: usize,
+) -> Result<Vec<u8>, ApiError> {
+    let mut bytes = Vec::new();
+    loop {
+        let piece = timeout(service.limits.body_idle, field.chunk()).await;
+        let Some(piece) = piece.map_err(|_| ApiError::TooSlow)?.map_err(broken)? else {
+            return Ok(bytes);
+        };
+        room.take(service, piece.len())?;
+        if bytes.len() + piece.len() > limit {
+            return Err(ApiError::TooLarge(format!("a part has more than {limit} bytes")));
+        }
+        bytes.extend_from_slice(&piece);
+    }
+}
+
+fn broken(error: MultipartError) -> ApiError {
+    ApiError::BadRequest(format!("the body is broken: {}", error.body_text()))
+}
+
+/// The two clouds of a pair, from its files in whatever order they came.
+#[derive(Default)]
+pub(super) struct PairFiles {
+    source: Option<(Option<String>, Vec<u8>)>,
+    target: Option<(Option<String>, Vec<u8>)>,
+}
+
+impl PairFiles {
+    /// Takes one file.
+    pub(super) fn take(
+        &mut self,
+        part: &str,
+        name: Option<String>,
+        bytes: Vec<u8>,
+    ) -> Result<(), ApiError> {
+        let place = match part {
+            "source" => &mut self.source,
+            "target" => &mut self.target,
+            _ => {
+                let text = "a pair is source and target; frames make a sequence, at /v1/sequences";
+                return Err(ApiError::BadRequest(text.to_owned()));
+            }
+        };
+        if place.replace((name, bytes)).is_some() {
+            return Err(ApiError::BadRequest(format!("{part} is there twice")));
+        }
+        Ok(())
+    }
+
+    /// Whether nothing has been taken.
+    pub(super) fn is_empty(&self) -> bool {
+        self.source.is_none() && self.target.is_none()
+    }
+
+    /// Reads the clouds and hands them to a draft.
+    pub(super) async fn push_to(self, body: &mut Body, draft: &mut Draft) -> Result<(), ApiError> {
+        let missing = |part: &str| {
+            ApiError::BadRequest(format!("the part {part} is missing: send source and target"))
+        };
+        let (name, bytes) = self.source.ok_or_else(|| missing("source"))?;
+        let clouds = match self.target {
+            Some((target_name, target)) => [
+                body.cloud("source".to_owned(), name, bytes).await?,
+                body.cloud("target".to_owned(), target_name, target).await?,
+            ],
+            None if formats::is_pair(&bytes) => body.pair(bytes).await?,
+            None => return Err(missing("target")),
+        };
+        for cloud in clouds {
+            draft.push(cloud).await?;
+        }
+        Ok(())
+    }
+}

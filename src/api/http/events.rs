@@ -1,0 +1,86 @@
+//! A job's news as server-sent events, to its end.
+
+use std::convert::Infallible;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::extract::{Extension, Path, State};
+use axum::response::sse::{Event, KeepAlive, Sse};
+use futures_util::Stream;
+use futures_util::stream;
+use tokio::sync::watch;
+
+use super::problem::Problem;
+use super::view::JobView;
+use crate::api::auth::Caller;
+use crate::api::error::ApiError;
+use crate::api::service::Service;
+use crate::job::{Job, State as JobState};
+
+/// A comment that keeps proxies from closing a quiet stream.
+const HEARTBEAT: Duration = Duration::from_secs(15);
+
+/// What a stream has told so far.
+struct Told {
+    service: Arc<Service>,
+    news: watch::Receiver<Arc<Job>>,
+    last: Option<(JobState, u32, u32)>,
+    ended: bool,
+}
+
+/// Follows a job: `state` events with the job, `progress` events with iteration and loss.
+///
+/// The stream begins with the job as it is, so that a client that lost it misses nothing that
+/// still matters, and ends with the job.
+#[utoipa::path(
+    get,
+    path = "/v1/jobs/{id}/events",
+    tag = "jobs",
+    params(("id" = String, Path, description = "The job's name")),
+    responses(
+        (status = 200, description = "Events", content_type = "text/event-stream"),
+        (status = 404, description = "No such job", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+pub(super) async fn follow_job(
+    State(service): State<Arc<Service>>,
+    Extension(caller): Extension<Caller>,
+    Path(id): Path<String>,
+) -> Result<Sse<impl Stream<Item = Result<Event, Infallible>>>, ApiError> {
+    let news = service.watch(&caller, id.parse()?).await?;
+    let told = Told {
+        service,
+        news,
+        last: None,
+        ended: false,
+    };
+    let events = stream::unfold(told, next);
+    Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(HEARTBEAT)))
+}
+
+/// The next event; nothing after the job's end, or when the server closes.
+async fn next(mut told: Told) -> Option<(Result<Event, Infallible>, Told)> {
+    if told.ended {
+        return None;
+    }
+    if told.last.is_some() {
+        let closing = told.service.closing.clone();
+        tokio::select! {
+            () = closing.cancelled() => return None,
+            changed = told.news.changed() => changed.ok()?,
+        }
+    }
+    let job = Arc::clone(&told.news.borrow_and_update());
+    let now = (job.state, job.attempt, job.pairs_left);
+    let same_state = told.last == Some(now);
+    told.last = Some(now);
+    told.ended = job.state.is_end();
+    let iteration = job.progress.map_or(0, |progress| progress.iteration);
+    let id = format!("{}.{iteration}", job.attempt);
+    let event = match job.progress {
+        Some(progress) if same_state => Event::default().event("progress").json_data(progress),
+        _ => Event::default().event("state").json_data(JobView::new(&job, &[])),
+    };
+    let event = event.unwrap_or_default().id(id);
+    Some((Ok(event), told))
+}

@@ -1,0 +1,108 @@
+//! What every request of both doors passes: its key is checked, it is counted, and a panic in it
+//! costs it alone.
+
+use std::any::Any;
+use std::sync::Arc;
+use std::time::Instant;
+
+use axum::Router;
+use axum::extract::{Request, State};
+use axum::http::{HeaderValue, header};
+use axum::middleware::{self, Next};
+use axum::response::{IntoResponse, Response};
+use tower_http::catch_panic::CatchPanicLayer;
+
+use crate::api::error::{ApiError, Row};
+use crate::api::grpc;
+use crate::api::service::Service;
+
+/// When a request arrived.
+#[derive(Clone, Copy, Debug)]
+pub(in crate::api) struct Arrived(pub(in crate::api) Instant);
+
+/// Puts the guards before all routes of a router.
+pub(in crate::api) fn guarded(router: Router, service: &Arc<Service>) -> Router {
+    let state = Arc::clone(service);
+    router
+        .layer(middleware::from_fn_with_state(Arc::clone(&state), check_key))
+        .layer(CatchPanicLayer::custom(panicked))
+        .layer(middleware::from_fn_with_state(state, count))
+}
+
+/// What anybody may see: the documentation and, over gRPC, health. Everything else takes a key.
+fn is_open(path: &str) -> bool {
+    matches!(path, "/openapi.json" | "/docs")
+        || path.starts_with("/docs/")
+        || path.starts_with("/grpc.health.v1.Health/")
+}
+
+fn is_grpc(request: &Request) -> bool {
+    let media = request.headers().get(header::CONTENT_TYPE);
+    media.is_some_and(|media| media.as_bytes().starts_with(b"application/grpc"))
+}
+
+async fn check_key(
+    State(service): State<Arc<Service>>,
+    mut request: Request,
+    next: Next,
+) -> Response {
+    request.extensions_mut().insert(Arrived(Instant::now()));
+    let shown = request.headers().get(header::AUTHORIZATION);
+    match service.caller(shown.and_then(|value| value.to_str().ok())) {
+        Ok(caller) => {
+            request.extensions_mut().insert(caller);
+        }
+        Err(_) if is_open(request.uri().path()) => {}
+        Err(error) if is_grpc(&request) => return refuse_grpc(error),
+        Err(error) => return error.into_response(),
+    }
+    next.run(request).await
+}
+
+fn refuse_grpc(error: ApiError) -> Response {
+    let row = error.row();
+    let mut response = grpc::status(error).into_http::<axum::body::Body>();
+    response.extensions_mut().insert(row);
+    response
+}
+
+/// Counts the answer, and the refusal where it is one.
+async fn count(State(service): State<Arc<Service>>, request: Request, next: Next) -> Response {
+    let door = if is_grpc(&request) { "grpc" } else { "http" };
+    let (method, path) = (request.method().clone(), request.uri().path().to_owned());
+    let began = Instant::now();
+    let mut response = next.run(request).await;
+    response
+        .headers_mut()
+        .insert("x-content-type-options", HeaderValue::from_static("nosniff"));
+    let status = response.status();
+    let row = response.extensions().get::<Row>().copied();
+    let row = row.or_else(|| grpc::row_of(response.headers()));
+    let class = match row {
+        Some(row) if row.http >= 500 => "server_error",
+        Some(_) => "client_error",
+        None if status.is_server_error() => "server_error",
+        None if status.is_client_error() => "client_error",
+        None => "ok",
+    };
+    service.metrics.request(door, class);
+    if let Some(reason) = row.and_then(|row| row.rejection) {
+        service.metrics.rejected(reason);
+    }
+    tracing::debug!(
+        %method,
+        path,
+        status = status.as_u16(),
+        code = row.map(|row| row.code),
+        seconds = began.elapsed().as_secs_f64(),
+        "answered"
+    );
+    response
+}
+
+fn panicked(panic: Box<dyn Any + Send + 'static>) -> Response {
+    let text = panic.downcast_ref::<&str>().copied();
+    let text = text.or_else(|| panic.downcast_ref::<String>().map(String::as_str));
+    ApiError::internal(format!("a handler panicked: {}", text.unwrap_or("without a word")))
+        .into_response()
+}

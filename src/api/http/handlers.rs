@@ -1,0 +1,409 @@
+//! What the routes do: estimate, submit, show, list, cancel, requeue.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::extract::{Extension, Path, Query, Request, State};
+use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use axum::Json;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use super::answer;
+use super::bodies::{Body, PairFiles, Part};
+use super::guard::Arrived;
+use super::prefer::Prefer;
+use super::problem::Problem;
+use super::view::{self, JobView};
+use crate::api::auth::Caller;
+use crate::api::codec::AnswerFormat;
+use crate::api::draft::{Draft, Promise, Request as DraftRequest};
+use crate::api::error::ApiError;
+use crate::api::service::{Service, Waited};
+use crate::job::{Job, JobId, JobOptions, Kind, State as JobState};
+
+/// The longest long poll.
+const MAX_POLL: Duration = Duration::from_secs(60);
+
+/// Jobs on a page, where nobody says.
+const PAGE: u32 = 100;
+
+/// What the headers of a submission say.
+struct Asked {
+    prefer: Prefer,
+    key: Option<String>,
+    arrived: Arrived,
+}
+
+impl Asked {
+    fn of(headers: &HeaderMap, arrived: Arrived) -> Result<Self, ApiError> {
+        let key = match headers.get("idempotency-key") {
+            None => None,
+            Some(value) => {
+                let text = value.to_str().map_err(|_| {
+                    ApiError::BadRequest("an idempotency key is plain text".to_owned())
+                })?;
+                Some(text.trim_matches('"').to_owned())
+            }
+        };
+        Ok(Self {
+            prefer: Prefer::from_headers(headers),
+            key,
+            arrived,
+        })
+    }
+
+    fn draft_request(&self, options: JobOptions, promise: Promise) -> DraftRequest {
+        let wait_is_deadline = promise == Promise::WhileAwaited && !self.prefer.respond_async;
+        DraftRequest {
+            options,
+            promise,
+            idempotency_key: self.key.clone(),
+            arrived: self.arrived.0,
+            time_left: self.prefer.wait.filter(|_| wait_is_deadline),
+        }
+    }
+}
+
+/// Estimates the flow of one pair and answers with it.
+///
+/// Without `Prefer` the answer comes when it is there. `Prefer: wait=N` is a deadline: after N
+/// seconds the best flow so far comes back, with `Fnsf-Stop-Reason: deadline`. With
+/// `Prefer: respond-async` the answer is a job; with `respond-async, wait=N` it is a job if the
+/// flow is not there after N seconds. A client that goes away cancels the work.
+#[utoipa::path(
+    post,
+    path = "/v1/flow",
+    tag = "flow",
+    request_body(content = super::openapi::PairBody, content_type = "multipart/form-data"),
+    params(
+        ("Accept" = Option<String>, Header, description = "The format of the flow; application/x-npz by default"),
+        ("Prefer" = Option<String>, Header, description = "respond-async, wait=N"),
+        ("Idempotency-Key" = Option<String>, Header, description = "A repeated request with the same key finds the first one's job"),
+    ),
+    responses(
+        (status = 200, description = "The flow, in the format that Accept names", content_type = "application/x-npz"),
+        (status = 202, description = "A job to ask after", body = JobView),
+        (status = "4XX", description = "A refusal", body = Problem, content_type = "application/problem+json"),
+        (status = "5XX", description = "A failure, or a full server with Retry-After", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+pub(super) async fn estimate(
+    State(service): State<Arc<Service>>,
+    Extension(caller): Extension<Caller>,
+    Extension(arrived): Extension<Arrived>,
+    headers: HeaderMap,
+    request: Request,
+) -> Result<Response, ApiError> {
+    let accept = headers.get(header::ACCEPT).and_then(|value| value.to_str().ok());
+    let format = AnswerFormat::accepted(accept)?;
+    let asked = Asked::of(&headers, arrived)?;
+    let promise = match asked.prefer {
+        Prefer {
+            respond_async: true,
+            wait: None,
+        } => Promise::Durable,
+        _ => Promise::WhileAwaited,
+    };
+    let (job, new) = submit_pair(&service, caller, &asked, promise, request).await?;
+    if promise == Promise::Durable {
+        return Ok(accepted(&job, asked.prefer));
+    }
+    // Whoever finds somebody else's job by its key must not cancel it.
+    let awaited = new.then(|| service.cancel_when_dropped(job.id));
+    let longest = asked.prefer.wait.filter(|_| asked.prefer.respond_async);
+    let response = match service.wait(job.id, longest).await? {
+        Waited::Ended(job) => {
+            let answer = service.answer(&job).await?;
+            answer::flow(&service, &answer, format).await
+        }
+        Waited::StillOpen(job) if longest.is_some() => {
+            let job = service.make_durable(&job).await?;
+            Ok(accepted(&job, asked.prefer))
+        }
+        Waited::StillOpen(_) => return Err(ApiError::Draining),
+    };
+    if let Some(awaited) = awaited {
+        awaited.let_go();
+    }
+    response
+}
+
+async fn submit_pair(
+    service: &Arc<Service>,
+    caller: Caller,
+    asked: &Asked,
+    promise: Promise,
+    request: Request,
+) -> Result<(Arc<Job>, bool), ApiError> {
+    caller.may_write()?;
+    service.check_draining()?;
+    let mut body = Body::of(service, request).await?;
+    let (mut files, mut options) = (PairFiles::default(), JobOptions::default());
+    while let Some(part) = body.next().await? {
+        match part {
+            Part::Options(read) => options = read,
+            Part::File(part, name, bytes) => files.take(&part, name, bytes)?,
+        }
+    }
+    let mut draft = service.draft(caller, asked.draft_request(options, promise))?;
+    files.push_to(&mut body, &mut draft).await?;
+    service.metrics.phase("decode", body.decode_seconds(), None);
+    draft.submit(Kind::Pair).await
+}
+
+/// Submits a pair or a sequence as a job.
+///
+/// The body is that of `/v1/flow` or of `/v1/sequences`. The answer comes when the job is safe on
+/// disk; from then on it is done, whatever happens to client and server.
+#[utoipa::path(
+    post,
+    path = "/v1/jobs",
+    tag = "jobs",
+    request_body(content = super::openapi::PairBody, content_type = "multipart/form-data"),
+    params(("Idempotency-Key" = Option<String>, Header, description = "A repeated request with the same key finds the first one's job")),
+    responses(
+        (status = 202, description = "A new job; Location names it", body = JobView),
+        (status = 200, description = "The job of an earlier request with the same key", body = JobView),
+        (status = "4XX", description = "A refusal", body = Problem, content_type = "application/problem+json"),
+        (status = "5XX", description = "A failure, or a full server with Retry-After", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+pub(super) async fn submit_job(
+    State(service): State<Arc<Service>>,
+    Extension(caller): Extension<Caller>,
+    Extension(arrived): Extension<Arrived>,
+    headers: HeaderMap,
+    request: Request,
+) -> Result<Response, ApiError> {
+    let asked = Asked::of(&headers, arrived)?;
+    submit(&service, caller, &asked, request).await
+}
+
+/// Submits a sequence: frames in order, the flow of each consecutive pair out.
+///
+/// `options` comes before the frames. Its result is a zip archive with one flow a pair; each pair
+/// is a job of its own, whose flow can be fetched as soon as it has succeeded.
+#[utoipa::path(
+    post,
+    path = "/v1/sequences",
+    tag = "jobs",
+    request_body(content = super::openapi::SequenceBody, content_type = "multipart/form-data"),
+    params(("Idempotency-Key" = Option<String>, Header, description = "A repeated request with the same key finds the first one's job")),
+    responses(
+        (status = 202, description = "A new job; Location names it", body = JobView),
+        (status = 200, description = "The job of an earlier request with the same key", body = JobView),
+        (status = "4XX", description = "A refusal", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+pub(super) async fn submit_sequence(
+    State(service): State<Arc<Service>>,
+    Extension(caller): Extension<Caller>,
+    Extension(arrived): Extension<Arrived>,
+    headers: HeaderMap,
+    request: Request,
+) -> Result<Response, ApiError> {
+    let asked = Asked::of(&headers, arrived)?;
+    submit(&service, caller, &asked, request).await
+}
+
+/// Takes a body of source and target, or of frames, as a durable job.
+async fn submit(
+    service: &Arc<Service>,
+    caller: Caller,
+    asked: &Asked,
+    request: Request,
+) -> Result<Response, ApiError> {
+    caller.may_write()?;
+    service.check_draining()?;
+    let mut body = Body::of(service, request).await?;
+    let mut files = PairFiles::default();
+    let mut options = JobOptions::default();
+    let mut frames: Option<Draft> = None;
+    while let Some(part) = body.next().await? {
+        match part {
+            Part::Options(_) if frames.is_some() => {
+                let text = "options come before the frames";
+                return Err(ApiError::BadRequest(text.to_owned()));
+            }
+            Part::Options(read) => options = read,
+            Part::File(part, name, bytes) if part == "frame" && files.is_empty() => {
+                let draft = match &mut frames {
+                    Some(draft) => draft,
+                    none => {
+                        let request = asked.draft_request(options.clone(), Promise::Durable);
+                        none.insert(service.draft(caller.clone(), request)?)
+                    }
+                };
+                let place = format!("frame {}", draft.frames());
+                draft.push(body.cloud(place, name, bytes).await?).await?;
+            }
+            Part::File(part, name, bytes) => files.take(&part, name, bytes)?,
+        }
+    }
+    let (job, new) = match frames {
+        Some(_) if !files.is_empty() => {
+            let text = "send source and target, or frames, but not both";
+            return Err(ApiError::BadRequest(text.to_owned()));
+        }
+        Some(draft) => draft.submit(Kind::Sequence).await?,
+        None => {
+            let request = asked.draft_request(options, Promise::Durable);
+            let mut draft = service.draft(caller, request)?;
+            files.push_to(&mut body, &mut draft).await?;
+            draft.submit(Kind::Pair).await?
+        }
+    };
+    service.metrics.phase("decode", body.decode_seconds(), Some(&job));
+    let mut response = accepted(&job, Prefer::default());
+    if !new {
+        *response.status_mut() = StatusCode::OK;
+    }
+    Ok(response)
+}
+
+/// 202, with where to ask.
+fn accepted(job: &Arc<Job>, prefer: Prefer) -> Response {
+    let mut response = (StatusCode::ACCEPTED, Json(JobView::new(job, &[]))).into_response();
+    let headers = response.headers_mut();
+    let mut set = |name: &'static str, value: String| {
+        if let Ok(value) = HeaderValue::from_str(&value) {
+            headers.insert(name, value);
+        }
+    };
+    set("location", view::path(job));
+    set("fnsf-job-id", job.id.to_string());
+    if let Some(applied) = prefer.applied() {
+        set("preference-applied", applied);
+    }
+    response
+}
+
+/// What a look at a job may ask for.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Look {
+    /// Seconds to wait for its end, at most 60.
+    wait: Option<u64>,
+}
+
+/// Shows a job; with `wait`, when it ends or the time is up.
+#[utoipa::path(
+    get,
+    path = "/v1/jobs/{id}",
+    tag = "jobs",
+    params(("id" = String, Path, description = "The job's name"), ("wait" = Option<u64>, Query, description = "Seconds to wait for its end, at most 60")),
+    responses(
+        (status = 200, description = "The job", body = JobView),
+        (status = 404, description = "No such job", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+pub(super) async fn get_job(
+    State(service): State<Arc<Service>>,
+    Extension(caller): Extension<Caller>,
+    Path(id): Path<String>,
+    look: Result<Query<Look>, axum::extract::rejection::QueryRejection>,
+) -> Result<Json<JobView>, ApiError> {
+    let Query(look) = look.map_err(|error| ApiError::BadRequest(error.body_text()))?;
+    let mut job = service.job(&caller, id.parse::<JobId>()?).await?;
+    if let Some(seconds) = look.wait
+        && !job.state.is_end()
+    {
+        let longest = Duration::from_secs(seconds).min(MAX_POLL);
+        job = match service.wait(job.id, Some(longest)).await? {
+            Waited::Ended(job) | Waited::StillOpen(job) => job,
+        };
+    }
+    let pairs = service.pairs(&job).await?;
+    Ok(Json(JobView::new(&job, &pairs)))
+}
+
+/// Which jobs to list.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Page {
+    /// Only those in this state.
+    state: Option<JobState>,
+    /// At most so many, 1 to 1000; 100 by default.
+    limit: Option<u32>,
+    /// Only those before this one: `next` of the page before.
+    before: Option<String>,
+}
+
+/// A page of jobs, latest first.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct JobPage {
+    jobs: Vec<JobView>,
+    /// The value of `before` for the next page; none on the last.
+    next: Option<String>,
+}
+
+/// Lists the caller's jobs, latest first.
+#[utoipa::path(
+    get,
+    path = "/v1/jobs",
+    tag = "jobs",
+    params(
+        ("state" = Option<JobState>, Query, description = "Only those in this state"),
+        ("limit" = Option<u32>, Query, description = "At most so many, 1 to 1000; 100 by default"),
+        ("before" = Option<String>, Query, description = "Only those before this one: next of the page before"),
+    ),
+    responses((status = 200, description = "A page of jobs", body = JobPage))
+)]
+pub(super) async fn list_jobs(
+    State(service): State<Arc<Service>>,
+    Extension(caller): Extension<Caller>,
+    page: Result<Query<Page>, axum::extract::rejection::QueryRejection>,
+) -> Result<Json<JobPage>, ApiError> {
+    let Query(page) = page.map_err(|error| ApiError::BadRequest(error.body_text()))?;
+    let before = page.before.as_deref().map(str::parse::<JobId>).transpose()?;
+    let limit = page.limit.unwrap_or(PAGE).clamp(1, 1000);
+    let jobs = service.jobs(&caller, page.state, before, limit).await?;
+    let full = jobs.len() == limit as usize;
+    let next = jobs.last().filter(|_| full).map(|job| job.id.to_string());
+    Ok(Json(JobPage {
+        jobs: jobs.iter().map(|job| JobView::new(job, &[])).collect(),
+        next,
+    }))
+}
+
+/// Cancels a job: at once if it waits, within an iteration if it runs.
+#[utoipa::path(
+    delete,
+    path = "/v1/jobs/{id}",
+    tag = "jobs",
+    params(("id" = String, Path, description = "The job's name")),
+    responses(
+        (status = 200, description = "The job; its end is asked for", body = JobView),
+        (status = 404, description = "No such job", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+pub(super) async fn cancel_job(
+    State(service): State<Arc<Service>>,
+    Extension(caller): Extension<Caller>,
+    Path(id): Path<String>,
+) -> Result<Json<JobView>, ApiError> {
+    let job = service.cancel(&caller, id.parse()?).await?;
+    Ok(Json(JobView::new(&job, &[])))
+}
+
+/// Queues a job again that failed, expired or was cancelled; of a sequence, the pairs that did.
+#[utoipa::path(
+    post,
+    path = "/v1/jobs/{id}/requeue",
+    tag = "jobs",
+    params(("id" = String, Path, description = "The job's name")),
+    responses(
+        (status = 200, description = "The job, queued", body = JobView),
+        (status = 400, description = "It has not ended, or has succeeded", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+pub(super) async fn requeue_job(
+    State(service): State<Arc<Service>>,
+    Extension(caller): Extension<Caller>,
+    Path(id): Path<String>,
+) -> Result<Json<JobView>, ApiError> {
+    let job = service.requeue(&caller, id.parse()?).await?;
+    Ok(Json(JobView::new(&job, &[])))
+}

@@ -1,0 +1,80 @@
+//! The contract as OpenAPI, made from the handlers themselves, and a page to try it.
+
+use std::sync::Arc;
+
+use axum::Router;
+use utoipa::openapi::security::{Http, HttpAuthScheme, SecurityScheme};
+use utoipa::{Modify, OpenApi, ToSchema};
+use utoipa_swagger_ui::SwaggerUi;
+
+use super::{answer, events, handlers};
+use crate::api::service::Service;
+use crate::job::JobOptions;
+
+/// The parts of a pair.
+#[derive(ToSchema)]
+#[expect(dead_code, reason = "it describes a body that is read part by part")]
+pub(super) struct PairBody {
+    /// The earlier sweep, in any format that fnsf reads; or an .npz with pc1 and pc2, and nothing
+    /// else.
+    #[schema(value_type = String, format = Binary)]
+    source: Vec<u8>,
+    /// The later sweep.
+    #[schema(value_type = Option<String>, format = Binary)]
+    target: Option<Vec<u8>>,
+    /// How the flow is found, as one JSON object.
+    options: Option<JobOptions>,
+}
+
+/// The parts of a sequence.
+#[derive(ToSchema)]
+#[expect(dead_code, reason = "it describes a body that is read part by part")]
+pub(super) struct SequenceBody {
+    /// How the flow is found, as one JSON object; before the frames.
+    options: Option<JobOptions>,
+    /// The sweeps in order, each a part named frame.
+    #[schema(value_type = Vec<String>, format = Binary)]
+    frame: Vec<Vec<u8>>,
+}
+
+struct Bearer;
+
+impl Modify for Bearer {
+    fn modify(&self, document: &mut utoipa::openapi::OpenApi) {
+        let scheme = SecurityScheme::Http(Http::new(HttpAuthScheme::Bearer));
+        let components = document.components.get_or_insert_with(Default::default);
+        components.add_security_scheme("key", scheme);
+    }
+}
+
+/// The whole contract.
+#[derive(OpenApi)]
+#[openapi(
+    info(
+        title = "fnsf",
+        description = "Scene flow as a service: two lidar clouds in, the motion of every point out."
+    ),
+    paths(
+        handlers::estimate,
+        handlers::submit_sequence,
+        handlers::submit_job,
+        handlers::list_jobs,
+        handlers::get_job,
+        handlers::cancel_job,
+        handlers::requeue_job,
+        events::follow_job,
+        answer::result,
+    ),
+    security((), ("key" = [])),
+    modifiers(&Bearer),
+    tags(
+        (name = "flow", description = "A pair in, its flow out, on one call"),
+        (name = "jobs", description = "Work that outlives the call"),
+    )
+)]
+struct Contract;
+
+/// `/openapi.json` and `/docs`.
+pub(super) fn router() -> Router<Arc<Service>> {
+    SwaggerUi::new("/docs").url("/openapi.json", Contract::openapi()).into()
+}

@@ -1,0 +1,30 @@
+//! The doors, and the service behind them that knows no protocol.
+//!
+//! `service` and what it uses are the same for both; only `http` sees axum's types and only `grpc`
+//! sees the protocol's.
+
+mod admission;
+mod auth;
+mod codec;
+mod draft;
+mod error;
+mod service;
+
+mod admin;
+mod grpc;
+mod http;
+mod listener;
+
+pub use admin::{Readiness, admin_router};
+pub use admission::{Admission, AdmissionLimits};
+pub use auth::{Caller, InvalidKey, Keys, MIN_KEY, Role};
+pub use error::ApiError;
+pub use listener::{ListenOptions, Listener, TlsError, tls_acceptor};
+pub use service::{Parts, Service, ServiceLimits};
+
+use std::sync::Arc;
+
+/// Everything on the public port: HTTP and gRPC.
+pub fn public_router(service: &Arc<Service>) -> axum::Router {
+    http::guarded(http::router(service).merge(grpc::router(service)), service)
+}

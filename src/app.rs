@@ -1,0 +1,279 @@
+//! The server: puts the parts together, starts them in order, and stops them in order.
+
+mod drain;
+mod upkeep;
+
+use std::net::SocketAddr;
+use std::str::FromStr;
+use std::sync::Arc;
+use std::thread;
+use std::time::Duration;
+
+use anyhow::{Context, anyhow};
+use tokio::sync::{mpsc, watch};
+use tokio::task::{JoinHandle, JoinSet};
+use tokio_util::sync::CancellationToken;
+
+use crate::api::{
+    Admission, AdmissionLimits, Caller, Keys, ListenOptions, Listener, Parts, Readiness, Role,
+    Service, ServiceLimits, admin_router, public_router, tls_acceptor,
+};
+use crate::blobs::Blobs;
+use crate::config::{Config, LimitsConfig, QueueConfig};
+use crate::cost::CostModel;
+use crate::engine::{Device, Health};
+use crate::flow::cpu::CpuBackend;
+use crate::job::Tenant;
+use crate::metrics::Metrics;
+use crate::queue::{Queue, QueueOptions, SqliteQueue};
+use crate::worker::{Drain, Worker, WorkerOptions};
+
+/// A server that runs.
+pub struct App {
+    public: SocketAddr,
+    admin: SocketAddr,
+    config: Config,
+    service: Arc<Service>,
+    devices: Vec<Device>,
+    workers: JoinSet<()>,
+    workers_drain: Drain,
+    draining: watch::Sender<bool>,
+    listener: JoinHandle<()>,
+    stop_listening: CancellationToken,
+    upkeep: JoinSet<()>,
+}
+
+impl App {
+    /// Starts everything. When this returns, both ports answer; devices may still be on trial.
+    ///
+    /// # Errors
+    /// Where a port, the data folder, a key or a device cannot be used, with what to do about it.
+    pub async fn start(config: Config) -> anyhow::Result<Self> {
+        config.check()?;
+        let openers = openers(&config.devices)?;
+        let names: Vec<String> = openers.iter().map(|(name, _)| name.clone()).collect();
+        let metrics = Arc::new(Metrics::new(&names));
+        let keys = keys(&config)?;
+
+        let (events, heard) = mpsc::unbounded_channel();
+        let queue = SqliteQueue::open(&config.data_dir, queue_options(&config.queue), events)
+            .with_context(|| format!("cannot open the queue in {}", config.data_dir.display()))?;
+        let queue: Arc<dyn Queue> = Arc::new(queue);
+        let blobs = Blobs::open(&config.data_dir.join("blobs"))
+            .with_context(|| format!("cannot use {}", config.data_dir.display()))?;
+
+        let mut devices = Vec::new();
+        for (name, threads) in openers {
+            let open = move || {
+                let backend = CpuBackend::new(Some(threads))?;
+                Ok(Box::new(backend) as Box<dyn crate::flow::backend::Backend>)
+            };
+            devices.push(Device::start(&name, Box::new(open))?);
+        }
+        let cost = Arc::new(CostModel::new());
+        let workers_drain = Drain::default();
+        let mut workers = JoinSet::new();
+        for device in &devices {
+            let worker = Worker {
+                queue: Arc::clone(&queue),
+                blobs: blobs.clone(),
+                device: device.clone(),
+                cost: Arc::clone(&cost),
+                metrics: Arc::clone(&metrics),
+                options: WorkerOptions {
+                    snapshot_interval: Duration::from_millis(config.queue.snapshot_interval_ms),
+                },
+                drain: workers_drain.clone(),
+            };
+            workers.spawn(worker.run());
+        }
+
+        let service = Arc::new(Service::new(Parts {
+            queue: Arc::clone(&queue),
+            blobs: blobs.clone(),
+            admission: Admission::new(
+                admission_limits(&config.limits),
+                Arc::clone(&queue),
+                cost,
+                devices.len(),
+            ),
+            metrics: Arc::clone(&metrics),
+            keys,
+            limits: service_limits(&config.limits),
+        }));
+        let upkeep = upkeep::start(&queue, &blobs, &metrics, &devices, heard);
+
+        let (draining, drains) = watch::channel(false);
+        let readiness = Readiness {
+            devices: devices.clone(),
+            draining: drains,
+        };
+        let admin = serve_admin(config.admin_listen, readiness, &metrics, &queue)?;
+        let tls = match &config.tls {
+            None => None,
+            Some(tls) => Some(tls_acceptor(&tls.certificate, &tls.key)?),
+        };
+        let listener = Listener::bind(
+            config.listen,
+            tls,
+            listen_options(&config.limits),
+            Arc::clone(&metrics),
+        );
+        let listener = listener
+            .await
+            .with_context(|| format!("cannot listen on {}", config.listen))?;
+        let public = listener.address()?;
+        let stop_listening = CancellationToken::new();
+        let router = public_router(&service);
+        let listener = tokio::spawn(listener.serve(router, stop_listening.clone()));
+        Ok(Self {
+            public,
+            admin,
+            config,
+            service,
+            devices,
+            workers,
+            workers_drain,
+            draining,
+            listener,
+            stop_listening,
+            upkeep,
+        })
+    }
+
+    /// Where HTTP and gRPC are served.
+    pub fn public_address(&self) -> SocketAddr {
+        self.public
+    }
+
+    /// Where health and metrics are served.
+    pub fn admin_address(&self) -> SocketAddr {
+        self.admin
+    }
+
+    /// Waits until a device has passed its trial.
+    ///
+    /// # Errors
+    /// Where none can.
+    pub async fn ready(&self) -> anyhow::Result<()> {
+        let mut reasons = Vec::new();
+        for device in &self.devices {
+            let mut health = device.health();
+            let tried = health.wait_for(|health| *health != Health::Starting).await?;
+            match &*tried {
+                Health::Broken(reason) => reasons.push(format!("{}: {reason}", device.name())),
+                _ => return Ok(()),
+            }
+        }
+        Err(anyhow!("no device can be used: {}", reasons.join("; ")))
+    }
+}
+
+/// Devices by their names in metrics, with their threads.
+fn openers(devices: &[String]) -> anyhow::Result<Vec<(String, usize)>> {
+    let cores = thread::available_parallelism().map_or(1, usize::from);
+    let mut openers = Vec::new();
+    for (place, device) in devices.iter().enumerate() {
+        let threads = match device.split_once(':') {
+            None if device == "cpu" || device == "auto" => Some(cores),
+            Some(("cpu", threads)) => usize::from_str(threads).ok(),
+            _ => None,
+        };
+        let threads = threads.filter(|threads| (1..=256).contains(threads));
+        let threads = threads.ok_or_else(|| {
+            anyhow!("devices: {device:?} is none; known are \"cpu\" and \"cpu:THREADS\"")
+        })?;
+        openers.push((format!("cpu{place}"), threads));
+    }
+    Ok(openers)
+}
+
+fn keys(config: &Config) -> anyhow::Result<Keys> {
+    let mut keys = Keys::default();
+    if let Some(key) = &config.api_key {
+        let caller = Caller {
+            tenant: Tenant::default(),
+            role: Role::Write,
+        };
+        keys.add(key.reveal(), caller).context("api_key")?;
+    }
+    for key in &config.keys {
+        let tenant = key.tenant.parse().context("keys")?;
+        let caller = Caller {
+            tenant,
+            role: key.role,
+        };
+        keys.add(key.key.reveal(), caller).context("keys")?;
+    }
+    Ok(keys)
+}
+
+fn queue_options(config: &QueueConfig) -> QueueOptions {
+    let seconds = Duration::from_secs;
+    QueueOptions {
+        max_attempts: config.max_attempts,
+        max_crashes: config.max_crashes,
+        lease: seconds(config.lease_seconds),
+        retry_delay: seconds(config.retry_delay_seconds),
+        time_to_live: seconds(config.time_to_live_seconds),
+        retention: seconds(config.retention_seconds),
+        answered_retention: seconds(config.answered_retention_seconds),
+    }
+}
+
+fn admission_limits(config: &LimitsConfig) -> AdmissionLimits {
+    AdmissionLimits {
+        max_points: config.max_points,
+        max_pair_bytes: config.max_pair_mib << 20,
+        max_wait: Duration::from_secs(config.max_wait_seconds),
+        max_queue: Duration::from_secs(config.max_queue_seconds),
+        max_tenant_queue: Duration::from_secs(config.max_tenant_queue_seconds),
+    }
+}
+
+fn service_limits(config: &LimitsConfig) -> ServiceLimits {
+    ServiceLimits {
+        max_upload_bytes: config.max_upload_mib << 20,
+        max_uploads_bytes: config.max_uploads_mib << 20,
+        max_frames: config.max_frames,
+        body_idle: Duration::from_secs(config.body_timeout_seconds),
+        sequence_ahead: config.sequence_ahead,
+    }
+}
+
+fn listen_options(config: &LimitsConfig) -> ListenOptions {
+    ListenOptions {
+        max_connections: config.max_connections,
+        header_timeout: Duration::from_secs(config.header_timeout_seconds),
+        write_timeout: Duration::from_secs(config.write_timeout_seconds),
+        ..ListenOptions::default()
+    }
+}
+
+/// Serves the admin port from a thread with a runtime of its own, to the end of the process.
+fn serve_admin(
+    address: SocketAddr,
+    readiness: Readiness,
+    metrics: &Arc<Metrics>,
+    queue: &Arc<dyn Queue>,
+) -> anyhow::Result<SocketAddr> {
+    let listener = std::net::TcpListener::bind(address)
+        .with_context(|| format!("cannot listen on {address}"))?;
+    listener.set_nonblocking(true)?;
+    let bound = listener.local_addr()?;
+    let router = admin_router(readiness, Arc::clone(metrics), Arc::clone(queue));
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()?;
+    let serve = move || {
+        let served = runtime.block_on(async move {
+            let listener = tokio::net::TcpListener::from_std(listener)?;
+            axum::serve(listener, router).await
+        });
+        if let Err(error) = served {
+            tracing::error!(%error, "the admin port has closed");
+        }
+    };
+    thread::Builder::new().name("admin".to_owned()).spawn(serve)?;
+    Ok(bound)
+}

@@ -1,0 +1,62 @@
+//! A small real pair that a device must solve before it is trusted with anybody's.
+
+use crate::flow::backend::Backend;
+use crate::flow::{self, Preset, Problem, Unwatched};
+
+/// A wall and a post in front of it, moved by this, metres.
+const MOTION: [f32; 3] = [0.2, 0.1, 0.0];
+
+/// How far the mean flow may be off, metres: a twentieth of what a wrong device would give, and
+/// wide enough for the few iterations of a trial.
+const TOLERANCE: f32 = 0.05;
+
+/// Iterations of the trial: enough to go through every kernel more than once.
+const ITERATIONS: usize = 12;
+
+/// Solves the pair and compares.
+pub(super) fn run(backend: &dyn Backend) -> Result<(), String> {
+    let mut source = Vec::new();
+    for row in 0..40u8 {
+        for column in 0..40u8 {
+            let (y, z) = (f32::from(row) * 0.25 - 5.0, f32::from(column) * 0.1 - 2.0);
+            source.push([8.0 + 0.3 * (y * 1.3).sin(), y, z]);
+            source.push([4.0 + z * 0.2, 0.02 * f32::from(column), y * 0.4]);
+            source.push([y, 6.0 + 0.2 * (z * 2.0).cos(), z]);
+        }
+    }
+    let target: Vec<_> = source
+        .iter()
+        .map(|point| core::array::from_fn(|axis| point[axis] + MOTION[axis]))
+        .collect();
+    let problem = Problem {
+        source: &source,
+        target: &target,
+        ground: None,
+    };
+    let mut options = Preset::Default.options(None);
+    options.max_iterations = ITERATIONS;
+    let estimate = flow::estimate(backend, &problem, &options, &Unwatched)
+        .map_err(|error| format!("it failed its trial: {error}"))?;
+    let mut error = 0.0;
+    for flow in &estimate.flow {
+        let square: f32 = (0..3).map(|axis| (flow[axis] - MOTION[axis]).powi(2)).sum();
+        error += square.sqrt() / source.len() as f32;
+    }
+    if error.is_finite() && error < TOLERANCE {
+        Ok(())
+    } else {
+        Err(format!("it failed its trial: its flow is off by {error} m"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::cpu::CpuBackend;
+
+    #[test]
+    fn the_cpu_passes_its_trial() {
+        let backend = CpuBackend::new(Some(1)).expect("threads");
+        assert_eq!(run(&backend), Ok(()));
+    }
+}

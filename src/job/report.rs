@@ -1,0 +1,78 @@
+//! What an estimate reports beside its flow; the command line prints it, the service keeps it.
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use super::options::JobOptions;
+use crate::flow::Estimate;
+use crate::formats::matrix_rows;
+
+/// How a flow was found.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Report {
+    /// Points that took part.
+    pub points: usize,
+    /// Iterations done.
+    pub iterations: usize,
+    /// The iteration whose field is the result.
+    pub best_iteration: usize,
+    /// Its loss, metres.
+    pub best_loss: f64,
+    /// `converged`, `max_iterations` or `deadline`.
+    pub stop_reason: String,
+    /// Where it was done.
+    pub device: String,
+    /// The preset's name.
+    pub preset: String,
+    /// The seed.
+    pub seed: u64,
+    /// target_from_source, row by row, where it is known.
+    pub ego_motion: Option<[[f64; 4]; 4]>,
+    /// Wall-clock seconds by phase.
+    pub seconds: PhaseSeconds,
+    /// The most memory that the process has held, where one process did one pair.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub peak_rss_bytes: Option<u64>,
+}
+
+/// Wall-clock seconds by phase; the paper's own breakdown.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct PhaseSeconds {
+    /// Reading files, where the same process did it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub load: Option<f64>,
+    /// Selection, distance transform and ego motion.
+    pub precompute: f64,
+    /// Distance queries.
+    pub query: f64,
+    /// Network, optimizer and the final evaluation.
+    pub network: f64,
+    /// All of it.
+    pub total: f64,
+}
+
+impl Report {
+    /// The report on an estimate that `device` made with `options`.
+    pub fn new(estimate: &Estimate, options: &JobOptions, device: String) -> Self {
+        let seconds = estimate.seconds;
+        Self {
+            points: estimate.points,
+            iterations: estimate.iterations,
+            best_iteration: estimate.best_iteration,
+            best_loss: estimate.best_loss,
+            stop_reason: estimate.stop_reason.name().to_owned(),
+            device,
+            preset: options.preset.preset().name().to_owned(),
+            seed: options.seed,
+            ego_motion: estimate.ego.as_ref().map(matrix_rows),
+            seconds: PhaseSeconds {
+                load: None,
+                precompute: seconds.precompute,
+                query: seconds.query,
+                network: seconds.network,
+                total: seconds.total,
+            },
+            peak_rss_bytes: None,
+        }
+    }
+}

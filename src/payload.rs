@@ -1,0 +1,267 @@
+//! What lies in store for a job: its clouds and its flow, as versioned bytes.
+//!
+//! Little endian; counts are checked against the bytes present, and a sum over all of them tells a
+//! torn file. It must not know where the bytes are kept.
+
+use crate::flow::{Estimate, Point, RigidTransform};
+use crate::formats::{matrix_rows, rigid_motion};
+
+const CLOUD: &[u8; 8] = b"fnsfcld1";
+const FLOW: &[u8; 8] = b"fnsfflw1";
+
+/// Bytes of the sum at the end.
+const SUM: usize = 16;
+
+/// Bytes that are not what they should be.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("stored bytes are damaged or of another version: {0}")]
+pub struct Damaged(&'static str);
+
+/// One sweep, as it waits for its turn.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct StoredCloud {
+    /// N points, metres; rows without return are NaN.
+    pub points: Vec<Point>,
+    /// N flags: which points are ground, where that is known.
+    pub ground: Option<Vec<bool>>,
+}
+
+/// The flow of a pair, as it waits to be fetched.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct StoredFlow {
+    /// N displacements, metres.
+    pub flow: Vec<Point>,
+    /// N flags: which rows have a flow.
+    pub valid: Vec<bool>,
+    /// N flags: which points move by themselves, where that is known.
+    pub dynamic: Option<Vec<bool>>,
+    /// The ego motion target_from_source, where it is known.
+    pub ego: Option<RigidTransform>,
+}
+
+impl StoredCloud {
+    /// The cloud as bytes.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let mut out = Writer::new(CLOUD, self.points.len(), 13 * self.points.len());
+        out.points(&self.points);
+        out.flags(self.ground.as_deref());
+        out.finish()
+    }
+
+    /// The cloud that some bytes are.
+    ///
+    /// # Errors
+    /// [`Damaged`] where they are torn or of another version.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, Damaged> {
+        let mut reader = Reader::new(CLOUD, bytes)?;
+        let cloud = Self {
+            points: reader.points()?,
+            ground: reader.flags()?,
+        };
+        reader.finish()?;
+        Ok(cloud)
+    }
+}
+
+impl StoredFlow {
+    /// The flow as bytes.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let mut out = Writer::new(FLOW, self.flow.len(), 14 * self.flow.len());
+        out.points(&self.flow);
+        out.flags(Some(&self.valid));
+        out.flags(self.dynamic.as_deref());
+        out.motion(self.ego.as_ref());
+        out.finish()
+    }
+
+    /// The flow that some bytes are.
+    ///
+    /// # Errors
+    /// [`Damaged`] where they are torn or of another version.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, Damaged> {
+        let mut reader = Reader::new(FLOW, bytes)?;
+        let flow = reader.points()?;
+        let valid = reader.flags()?.ok_or(Damaged("no mask"))?;
+        let stored = Self {
+            flow,
+            valid,
+            dynamic: reader.flags()?,
+            ego: reader.motion()?,
+        };
+        reader.finish()?;
+        Ok(stored)
+    }
+}
+
+impl From<Estimate> for StoredFlow {
+    fn from(estimate: Estimate) -> Self {
+        Self {
+            flow: estimate.flow,
+            valid: estimate.valid,
+            dynamic: estimate.dynamic,
+            ego: estimate.ego,
+        }
+    }
+}
+
+struct Writer(Vec<u8>);
+
+impl Writer {
+    fn new(magic: &[u8], rows: usize, expected: usize) -> Self {
+        let mut bytes = Vec::with_capacity(expected + 256);
+        bytes.extend(magic);
+        bytes.extend((rows as u64).to_le_bytes());
+        Self(bytes)
+    }
+
+    fn points(&mut self, points: &[Point]) {
+        if cfg!(target_endian = "little") {
+            self.0.extend_from_slice(bytemuck::cast_slice(points));
+        } else {
+            let values = points.as_flattened().iter();
+            self.0.extend(values.flat_map(|value| value.to_le_bytes()));
+        }
+    }
+
+    fn flags(&mut self, flags: Option<&[bool]>) {
+        self.0.push(u8::from(flags.is_some()));
+        self.0.extend(flags.unwrap_or_default().iter().map(|&flag| u8::from(flag)));
+    }
+
+    fn motion(&mut self, motion: Option<&RigidTransform>) {
+        self.0.push(u8::from(motion.is_some()));
+        if let Some(motion) = motion {
+            let values = matrix_rows(motion);
+            let values = values.as_flattened().iter();
+            self.0.extend(values.flat_map(|value| value.to_le_bytes()));
+        }
+    }
+
+    fn finish(mut self) -> Vec<u8> {
+        let sum = blake3::hash(&self.0);
+        self.0.extend(&sum.as_bytes()[..SUM]);
+        self.0
+    }
+}
+
+struct Reader<'a> {
+    rows: usize,
+    rest: &'a [u8],
+}
+
+impl<'a> Reader<'a> {
+    fn new(magic: &[u8], bytes: &'a [u8]) -> Result<Self, Damaged> {
+        let body = bytes.len().checked_sub(SUM).ok_or(Damaged("too short"))?;
+        let (body, sum) = bytes.split_at(body);
+        if blake3::hash(body).as_bytes()[..SUM] != *sum {
+            return Err(Damaged("the sum is wrong"));
+        }
+        let rest = body.strip_prefix(magic).ok_or(Damaged("the beginning is wrong"))?;
+        let mut reader = Self { rows: 0, rest };
+        let rows = u64::from_le_bytes(reader.array()?);
+        reader.rows = usize::try_from(rows).map_err(|_| Damaged("too many rows"))?;
+        Ok(reader)
+    }
+
+    fn take(&mut self, count: usize) -> Result<&'a [u8], Damaged> {
+        let (taken, rest) = self.rest.split_at_checked(count).ok_or(Damaged("too short"))?;
+        self.rest = rest;
+        Ok(taken)
+    }
+
+    fn array<const N: usize>(&mut self) -> Result<[u8; N], Damaged> {
+        let taken = self.take(N)?;
+        taken.try_into().map_err(|_| Damaged("too short"))
+    }
+
+    fn points(&mut self) -> Result<Vec<Point>, Damaged> {
+        let bytes = self.rows.checked_mul(12).ok_or(Damaged("too many rows"))?;
+        Ok(points_from_le_bytes(self.take(bytes)?))
+    }
+
+    fn flags(&mut self) -> Result<Option<Vec<bool>>, Damaged> {
+        let [there] = self.array()?;
+        if there == 0 {
+            return Ok(None);
+        }
+        let flags = self.take(self.rows)?;
+        Ok(Some(flags.iter().map(|&flag| flag != 0).collect()))
+    }
+
+    fn motion(&mut self) -> Result<Option<RigidTransform>, Damaged> {
+        let [there] = self.array()?;
+        if there == 0 {
+            return Ok(None);
+        }
+        let mut rows = [[0.0; 4]; 4];
+        for value in rows.as_flattened_mut() {
+            *value = f64::from_le_bytes(self.array()?);
+        }
+        let motion = rigid_motion(&rows).map_err(|_| Damaged("the motion is not rigid"))?;
+        Ok(Some(motion))
+    }
+
+    fn finish(self) -> Result<(), Damaged> {
+        if self.rest.is_empty() {
+            Ok(())
+        } else {
+            Err(Damaged("too long"))
+        }
+    }
+}
+
+/// Packed little-endian float32 triples as points; what is left over is ignored.
+pub fn points_from_le_bytes(bytes: &[u8]) -> Vec<Point> {
+    const POINT: usize = size_of::<Point>();
+    let mut points: Vec<Point> = vec![[0.0; 3]; bytes.len() / POINT];
+    let whole = &bytes[..points.len() * POINT];
+    bytemuck::cast_slice_mut::<Point, u8>(&mut points).copy_from_slice(whole);
+    if cfg!(target_endian = "big") {
+        for value in points.as_flattened_mut() {
+            *value = f32::from_bits(value.to_bits().swap_bytes());
+        }
+    }
+    points
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn flow() -> StoredFlow {
+        StoredFlow {
+            flow: vec![[1.0, -2.0, 0.5], [0.0; 3]],
+            valid: vec![true, false],
+            dynamic: Some(vec![false, true]),
+            ego: Some(RigidTransform::new([1.0, 2.0, 3.0].into(), [0.0, 0.0, 0.1].into())),
+        }
+    }
+
+    #[test]
+    fn clouds_and_flows_come_back_bit_for_bit() {
+        let cloud = StoredCloud {
+            points: vec![[1.5, f32::MIN_POSITIVE, -3.0]],
+            ground: Some(vec![true]),
+        };
+        assert_eq!(StoredCloud::from_bytes(&cloud.to_bytes()), Ok(cloud));
+        let stored = flow();
+        let back = StoredFlow::from_bytes(&stored.to_bytes()).expect("good bytes");
+        assert_eq!((back.flow, back.valid, back.dynamic), (stored.flow, stored.valid, stored.dynamic));
+        let [one, other] = [back.ego, stored.ego].map(|ego| ego.expect("a motion").to_homogeneous());
+        assert!((one - other).abs().max() < 1e-12);
+    }
+
+    #[test]
+    fn torn_and_edited_bytes_are_refused() {
+        let bytes = flow().to_bytes();
+        for end in 0..bytes.len() {
+            assert!(StoredFlow::from_bytes(&bytes[..end]).is_err(), "{end}");
+        }
+        for at in 0..bytes.len() {
+            let mut edited = bytes.clone();
+            edited[at] ^= 1;
+            assert!(StoredFlow::from_bytes(&edited).is_err(), "{at}");
+        }
+        assert!(StoredCloud::from_bytes(&bytes).is_err());
+    }
+}

@@ -1,0 +1,79 @@
+//! Logs on stderr, for people or for programs, and traces to a collector where one is configured.
+
+use opentelemetry::trace::TracerProvider;
+use opentelemetry_otlp::WithExportConfig;
+use opentelemetry_sdk::Resource;
+use opentelemetry_sdk::trace::SdkTracerProvider;
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
+use tracing_subscriber::{EnvFilter, Layer};
+
+use crate::config::{LogConfig, LogFormat};
+
+/// Why nothing can be logged.
+#[derive(Debug, thiserror::Error)]
+pub enum TelemetryError {
+    /// The filter makes no sense.
+    #[error("log.filter: {0}")]
+    Filter(#[from] tracing_subscriber::filter::ParseError),
+    /// The collector's address makes no sense.
+    #[error("otlp_endpoint: {0}")]
+    Otlp(#[from] opentelemetry_otlp::ExporterBuildError),
+    /// Somebody else logs already.
+    #[error("logging was started twice")]
+    Twice(#[from] tracing_subscriber::util::TryInitError),
+}
+
+/// Keeps traces flowing; what is left is sent when it is dropped.
+#[derive(Debug, Default)]
+pub struct Telemetry {
+    traces: Option<SdkTracerProvider>,
+}
+
+impl Telemetry {
+    /// Starts logging, and tracing to `otlp_endpoint` where there is one. Needs a runtime then.
+    ///
+    /// # Errors
+    /// [`TelemetryError`].
+    pub fn start(log: &LogConfig, otlp_endpoint: Option<&str>) -> Result<Self, TelemetryError> {
+        let filter: EnvFilter = log.filter.parse()?;
+        let lines = tracing_subscriber::fmt::layer().with_writer(std::io::stderr);
+        let lines = match log.format {
+            LogFormat::Human => lines.compact().boxed(),
+            LogFormat::Json => lines.json().flatten_event(true).boxed(),
+        };
+        let traces = otlp_endpoint.map(exporter).transpose()?;
+        let spans = traces.as_ref().map(|traces| {
+            let tracer = traces.tracer("fnsf");
+            tracing_opentelemetry::layer().with_tracer(tracer)
+        });
+        tracing_subscriber::registry()
+            .with(filter)
+            .with(lines)
+            .with(spans)
+            .try_init()?;
+        Ok(Self { traces })
+    }
+}
+
+fn exporter(endpoint: &str) -> Result<SdkTracerProvider, TelemetryError> {
+    let exporter = opentelemetry_otlp::SpanExporter::builder()
+        .with_tonic()
+        .with_endpoint(endpoint)
+        .build()?;
+    let resource = Resource::builder().with_service_name("fnsf").build();
+    Ok(SdkTracerProvider::builder()
+        .with_batch_exporter(exporter)
+        .with_resource(resource)
+        .build())
+}
+
+impl Drop for Telemetry {
+    fn drop(&mut self) {
+        if let Some(traces) = self.traces.take()
+            && let Err(error) = traces.shutdown()
+        {
+            tracing::warn!(%error, "the last traces were not sent");
+        }
+    }
+}

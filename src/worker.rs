@@ -1,0 +1,361 @@
+//! A worker: leases, runs, commits, acknowledges.
+//!
+//! One for each device. The only room that sees both the queue and the engine. The result is in
+//! store before the queue hears of it, and only the attempt that holds the job counts.
+
+mod job_watch;
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
+
+use self::job_watch::JobWatch;
+use crate::blobs::{Blob, BlobError, Blobs, Sync};
+use crate::clock::Timestamp;
+use crate::cost::CostModel;
+use crate::engine::{Device, EngineError, Work};
+use crate::flow::{Estimate, FlowError, Snapshot};
+use crate::job::{Job, JobError, JobOptions, Report};
+use crate::metrics::Metrics;
+use crate::payload::{Damaged, StoredCloud, StoredFlow};
+use crate::queue::{Committed, Lease, Outcome, Queue, QueueError, Signal};
+
+/// How a worker treats jobs.
+#[derive(Clone, Debug)]
+pub struct WorkerOptions {
+    /// Time between a running job's snapshots.
+    pub snapshot_interval: Duration,
+}
+
+/// How workers are told to stop.
+#[derive(Clone, Debug, Default)]
+pub struct Drain {
+    /// No new job is taken.
+    pub stop: CancellationToken,
+    /// What runs is put down, with a snapshot, and goes back to the queue.
+    pub release: CancellationToken,
+}
+
+/// What a worker works with.
+#[derive(Clone)]
+pub struct Worker {
+    /// Where jobs come from.
+    pub queue: Arc<dyn Queue>,
+    /// Where payloads and results lie.
+    pub blobs: Blobs,
+    /// What does the work.
+    pub device: Device,
+    /// What is learned about the time that work takes.
+    pub cost: Arc<CostModel>,
+    /// What is counted.
+    pub metrics: Arc<Metrics>,
+    /// How jobs are treated.
+    pub options: WorkerOptions,
+    /// How it is told to stop.
+    pub drain: Drain,
+}
+
+/// Why a job could not be taken from the store, or put back.
+#[derive(Debug, thiserror::Error)]
+enum StoreError {
+    #[error(transparent)]
+    Blob(#[from] BlobError),
+    #[error(transparent)]
+    Damaged(#[from] Damaged),
+    #[error("its options cannot be read: {0}")]
+    Options(#[from] crate::job::InvalidOptions),
+}
+
+impl Worker {
+    /// Works until it is told to stop.
+    pub async fn run(self) {
+        let mut committing: Option<JoinHandle<()>> = None;
+        loop {
+            if !self.device_is_ready().await {
+                break;
+            }
+            let lease = tokio::select! {
+                biased;
+                () = self.drain.stop.cancelled() => break,
+                lease = self.queue.lease(self.device.name()) => lease,
+            };
+            match lease {
+                Ok(lease) => {
+                    let attempt = self.attempt(&lease).await;
+                    if let Some(before) = committing.take() {
+                        let _its_own_errors_are_logged = before.await;
+                    }
+                    // The device goes on with the next job while this result reaches the disk.
+                    let worker = self.clone();
+                    committing = Some(tokio::spawn(async move {
+                        worker.commit(&lease, attempt).await;
+                    }));
+                }
+                Err(QueueError::Closed) => break,
+                Err(error) => {
+                    tracing::error!(%error, "no job can be leased");
+                    tokio::time::sleep(Duration::from_millis(500)).await;
+                }
+            }
+        }
+        if let Some(last) = committing {
+            let _its_own_errors_are_logged = last.await;
+        }
+    }
+
+    /// Waits until the device can work; false where the worker is to stop.
+    async fn device_is_ready(&self) -> bool {
+        let mut health = self.device.health();
+        tokio::select! {
+            biased;
+            () = self.drain.stop.cancelled() => false,
+            ready = health.wait_for(|health| *health == crate::engine::Health::Ready) => ready.is_ok(),
+        }
+    }
+
+    /// Runs one attempt; says how it ended, unless somebody else has the job now.
+    #[tracing::instrument(
+        name = "attempt",
+        skip_all,
+        fields(job = %lease.job.id, attempt = lease.job.attempt, device = self.device.name())
+    )]
+    async fn attempt(&self, lease: &Lease) -> Attempt {
+        let job = &lease.job;
+        let (work, keeper, options) = match self.prepare(lease).await {
+            Ok(prepared) => prepared,
+            Err(error) => {
+                tracing::error!(%error, "the payload cannot be read");
+                let retryable = matches!(error, StoreError::Blob(_));
+                return Attempt::failed("store", &error, retryable);
+            }
+        };
+        let began = Instant::now();
+        let solved = self.device.solve(work).await;
+        let took = began.elapsed();
+        let _its_own_errors_are_logged = keeper.await;
+        let released = self.drain.release.is_cancelled();
+        match solved {
+            Ok(estimate) => {
+                self.measure(job, &estimate, took);
+                tracing::info!(
+                    seconds = took.as_secs_f64(),
+                    iterations = estimate.iterations,
+                    stop_reason = estimate.stop_reason.name(),
+                    "solved"
+                );
+                let report = Report::new(&estimate, &options, self.device.name().to_owned());
+                Attempt::Solved(Box::new(report), StoredFlow::from(estimate))
+            }
+            Err(EngineError::Flow(FlowError::Cancelled)) => match lease.pulse.signal() {
+                Signal::Cancel => Attempt::Ended(Outcome::Cancelled),
+                Signal::Lost => Attempt::Lost,
+                Signal::Continue if released => Attempt::Ended(Outcome::Released),
+                Signal::Continue => Attempt::Lost,
+            },
+            Err(EngineError::Flow(error)) if error.is_input() => {
+                Attempt::failed("input_refused", &error, false)
+            }
+            Err(error) => {
+                tracing::error!(%error, "an attempt failed");
+                let code = match &error {
+                    EngineError::Flow(FlowError::Diverged { .. }) => "diverged",
+                    EngineError::Flow(_) | EngineError::Broken(_) => "device_failed",
+                    EngineError::Panicked(_) => "panicked",
+                };
+                if !matches!(error, EngineError::Flow(FlowError::Diverged { .. })) {
+                    self.metrics.device_lost();
+                }
+                Attempt::failed(code, &error, true)
+            }
+        }
+    }
+
+    /// Reads what the job needs, and starts the task that keeps its snapshots.
+    async fn prepare(
+        &self,
+        lease: &Lease,
+    ) -> Result<(Work, JoinHandle<()>, JobOptions), StoreError> {
+        let job = &lease.job;
+        let options = JobOptions::from_json(job.options.as_bytes())?;
+        let (owner, first) = match job.parent {
+            Some(sequence) => (sequence, job.place),
+            None => (job.id, 0),
+        };
+        let (source, target) = tokio::try_join!(
+            self.blobs.get(owner, Blob::Frame(first)),
+            self.blobs.get(owner, Blob::Frame(first + 1)),
+        )?;
+        let snapshot = self.earlier_snapshot(job).await;
+        let source = StoredCloud::from_bytes(&source)?;
+        let target = StoredCloud::from_bytes(&target)?;
+        let points = source.points.len().max(target.points.len());
+        let (snapshots, kept) = mpsc::channel(1);
+        let deadline = job.deadline.map(|deadline| {
+            // What comes after the flow takes its time too.
+            let left = Timestamp::now().until(deadline);
+            Instant::now() + left.saturating_sub(self.after_solving(job, points))
+        });
+        let watch = JobWatch::new(
+            lease.pulse.clone(),
+            deadline,
+            self.options.snapshot_interval,
+            self.drain.release.clone(),
+            snapshots,
+        );
+        let work = Work {
+            options: options.solver_options(points),
+            ground: source.ground.zip(target.ground).map(<[_; 2]>::from),
+            source: source.points,
+            target: target.points,
+            snapshot,
+            watch: Arc::new(watch),
+        };
+        Ok((work, self.keep_snapshots(lease, kept), options))
+    }
+
+    /// Time for the result to reach its caller.
+    fn after_solving(&self, job: &Job, points: usize) -> Duration {
+        const FOR_THE_DISK: Duration = Duration::from_millis(30);
+        const FOR_THE_CALLER: Duration = Duration::from_millis(8);
+        let disk = if job.durable { FOR_THE_DISK } else { Duration::ZERO };
+        FOR_THE_CALLER + disk + Duration::from_nanos(150 * points as u64)
+    }
+
+    /// Where an earlier attempt was put down, if it was.
+    async fn earlier_snapshot(&self, job: &Job) -> Option<Snapshot> {
+        if job.attempt == 1 {
+            return None;
+        }
+        let bytes = match self.blobs.get(job.id, Blob::Snapshot).await {
+            Ok(bytes) => bytes,
+            Err(error) if error.is_missing() => return None,
+            Err(error) => {
+                tracing::warn!(%error, "a snapshot cannot be read: the job starts afresh");
+                return None;
+            }
+        };
+        match Snapshot::from_bytes(&bytes) {
+            Ok(snapshot) => {
+                tracing::info!(iteration = snapshot.iterations(), "resumed");
+                self.metrics.resumed();
+                Some(snapshot)
+            }
+            Err(error) => {
+                tracing::warn!(%error, "a snapshot is damaged: the job starts afresh");
+                None
+            }
+        }
+    }
+
+    /// Writes every snapshot that comes, until the optimization ends.
+    fn keep_snapshots(&self, lease: &Lease, mut kept: mpsc::Receiver<Snapshot>) -> JoinHandle<()> {
+        let (blobs, metrics) = (self.blobs.clone(), Arc::clone(&self.metrics));
+        let (id, pulse) = (lease.job.id, lease.pulse.clone());
+        tokio::spawn(async move {
+            while let Some(snapshot) = kept.recv().await {
+                let bytes = Bytes::from(snapshot.to_bytes());
+                match blobs.put(id, Blob::Snapshot, bytes, Sync::No).await {
+                    Ok(()) => {
+                        metrics.snapshot_kept();
+                        pulse.snapshot_kept();
+                    }
+                    Err(error) => tracing::warn!(%error, "a snapshot was not kept"),
+                }
+            }
+        })
+    }
+
+    fn measure(&self, job: &Job, estimate: &Estimate, took: Duration) {
+        let seconds = estimate.seconds;
+        for (phase, seconds) in [
+            ("precompute", seconds.precompute),
+            ("query", seconds.query),
+            ("network", seconds.network),
+            ("total", seconds.total),
+        ] {
+            self.metrics.phase(phase, seconds, Some(job));
+        }
+        let resumed = job.attempt > 1;
+        let cut = estimate.stop_reason == crate::flow::StopReason::Deadline;
+        let predicted = self.cost.seconds(job.cost_seconds);
+        let ratio = took.as_secs_f64() / predicted.max(1e-6);
+        self.metrics.solved(estimate.iterations, estimate.stop_reason.name(), ratio);
+        if !resumed && !cut {
+            self.cost.learn(job.cost_seconds, took.as_secs_f64());
+        }
+    }
+
+    /// Puts the result in store, then ends the attempt in the queue.
+    async fn commit(&self, lease: &Lease, attempt: Attempt) {
+        let job = &lease.job;
+        let began = Instant::now();
+        let outcome = match attempt {
+            Attempt::Lost => return,
+            Attempt::Ended(outcome) => outcome,
+            Attempt::Solved(report, flow) => self.store(job, &report, &flow).await,
+        };
+        let succeeded = matches!(outcome, Outcome::Succeeded { .. });
+        match self.queue.finish(job.id, job.attempt, outcome).await {
+            Ok(Committed::Yes(state)) => {
+                if succeeded {
+                    self.metrics.phase("readback", began.elapsed().as_secs_f64(), Some(job));
+                }
+                if state.is_end() && let Err(error) = self.blobs.remove(job.id, Blob::Snapshot).await {
+                    tracing::warn!(%error, job = %job.id, "a snapshot was not removed");
+                }
+            }
+            Ok(Committed::Fenced) => {
+                tracing::warn!(job = %job.id, attempt = job.attempt, "a late result was thrown away");
+                if let Err(error) = self.blobs.remove(job.id, Blob::Result(job.attempt)).await {
+                    tracing::warn!(%error, job = %job.id, "a late result was not removed");
+                }
+            }
+            Err(error) => tracing::error!(%error, job = %job.id, "an outcome was not kept"),
+        }
+    }
+
+    async fn store(&self, job: &Job, report: &Report, flow: &StoredFlow) -> Outcome {
+        let bytes = Bytes::from(flow.to_bytes());
+        let sync = if job.durable { Sync::Yes } else { Sync::No };
+        let stored = self.blobs.put(job.id, Blob::Result(job.attempt), bytes, sync).await;
+        match (stored, serde_json::to_string(report)) {
+            (Ok(()), Ok(json)) => Outcome::Succeeded {
+                stop_reason: report.stop_reason.clone(),
+                report: json,
+            },
+            (Err(error), _) => {
+                tracing::error!(%error, job = %job.id, "a result was not kept");
+                Outcome::Failed(failure("store", &error, true))
+            }
+            (_, Err(error)) => Outcome::Failed(failure("store", &error, true)),
+        }
+    }
+}
+
+/// How an attempt ended.
+enum Attempt {
+    /// With a flow that is to be stored.
+    Solved(Box<Report>, StoredFlow),
+    /// Without one.
+    Ended(Outcome),
+    /// Somebody else has the job now.
+    Lost,
+}
+
+impl Attempt {
+    fn failed(code: &str, error: &dyn std::error::Error, retryable: bool) -> Self {
+        Self::Ended(Outcome::Failed(failure(code, error, retryable)))
+    }
+}
+
+fn failure(code: &str, error: &dyn std::error::Error, retryable: bool) -> JobError {
+    JobError {
+        code: code.to_owned(),
+        message: error.to_string(),
+        retryable,
+    }
+}
