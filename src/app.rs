@@ -159,7 +159,9 @@ impl App {
         let mut reasons = Vec::new();
         for device in &self.devices {
             let mut health = device.health();
-            let tried = health.wait_for(|health| *health != Health::Starting).await?;
+            let tried = health
+                .wait_for(|health| *health != Health::Starting)
+                .await?;
             match &*tried {
                 Health::Broken(reason) => reasons.push(format!("{}: {reason}", device.name())),
                 _ => return Ok(()),
@@ -274,6 +276,8 @@ fn serve_admin(
             tracing::error!(%error, "the admin port has closed");
         }
     };
-    thread::Builder::new().name("admin".to_owned()).spawn(serve)?;
+    thread::Builder::new()
+        .name("admin".to_owned())
+        .spawn(serve)?;
     Ok(bound)
 }

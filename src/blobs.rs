@@ -94,7 +94,13 @@ impl Blobs {
     ///
     /// # Errors
     /// Where it cannot be written; then nothing is there under this name that was not before.
-    pub async fn put(&self, id: JobId, blob: Blob, bytes: Bytes, sync: Sync) -> Result<(), BlobError> {
+    pub async fn put(
+        &self,
+        id: JobId,
+        blob: Blob,
+        bytes: Bytes,
+        sync: Sync,
+    ) -> Result<(), BlobError> {
         let store = match sync {
             Sync::Yes => &self.synced,
             Sync::No => &self.quick,
@@ -182,7 +188,12 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let blobs = Blobs::open(folder.path()).expect("a store");
         let (id, other) = (JobId::fresh(), JobId::fresh());
-        let all = [Blob::Frame(0), Blob::Frame(1), Blob::Snapshot, Blob::Result(3)];
+        let all = [
+            Blob::Frame(0),
+            Blob::Frame(1),
+            Blob::Snapshot,
+            Blob::Result(3),
+        ];
         for (sync, blob) in [Sync::Yes, Sync::No].into_iter().cycle().zip(all) {
             for id in [id, other] {
                 let bytes = Bytes::from(format!("{blob:?}"));

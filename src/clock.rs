@@ -62,7 +62,10 @@ mod tests {
     fn moments_are_shown_in_rfc_3339_with_milliseconds() {
         let moment = Timestamp::from_millis(1_700_000_000_120);
         assert_eq!(moment.to_string(), "2023-11-14T22:13:20.120Z");
-        assert_eq!(moment.after(Duration::from_secs(1)).as_millis(), 1_700_000_001_120);
+        assert_eq!(
+            moment.after(Duration::from_secs(1)).as_millis(),
+            1_700_000_001_120
+        );
         assert_eq!(moment.until(Timestamp::from_millis(0)), Duration::ZERO);
     }
 }

@@ -339,7 +339,10 @@ mod tests {
             ("listen = \"here\"", "listen"),
             ("listen = \"0.0.0.0:8080\"", "listen goes beyond loopback"),
             ("devices = []", "devices is empty"),
-            ("[[keys]]\ntenant = \"a\"\nrole = \"root\"\nkey = \"x\"", "root"),
+            (
+                "[[keys]]\ntenant = \"a\"\nrole = \"root\"\nkey = \"x\"",
+                "root",
+            ),
         ] {
             let error = load(text).expect_err(text).to_string();
             assert!(error.contains(said), "{text}: {error}");
@@ -354,6 +357,9 @@ mod tests {
         let key = config.api_key.clone().expect("a key");
         assert_eq!(key.reveal(), "a very long secret");
         let shown = format!("{config:?}{}", config.to_toml().expect("TOML"));
-        assert!(!shown.contains("secret") && shown.contains("***"), "{shown}");
+        assert!(
+            !shown.contains("secret") && shown.contains("***"),
+            "{shown}"
+        );
     }
 }

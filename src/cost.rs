@@ -37,7 +37,10 @@ impl CostModel {
 
     /// The seconds that work of `nominal` seconds takes here, by what was measured so far.
     pub fn seconds(&self, nominal: f64) -> f64 {
-        let log_factor = self.log_factor.lock().unwrap_or_else(PoisonError::into_inner);
+        let log_factor = self
+            .log_factor
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
         nominal * log_factor.map_or(1.0, f64::exp)
     }
 
@@ -47,7 +50,10 @@ impl CostModel {
         if !ratio.is_finite() {
             return;
         }
-        let mut log_factor = self.log_factor.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut log_factor = self
+            .log_factor
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
         let fresh = ratio.ln();
         *log_factor = Some(log_factor.map_or(fresh, |old| old + FRESH * (fresh - old)));
     }

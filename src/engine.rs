@@ -243,7 +243,13 @@ fn solve(backend: &dyn Backend, work: Work) -> Result<Estimate, FlowError> {
         ground: ground.map(|[source, target]| [source.as_slice(), target.as_slice()]),
     };
     if let Some(snapshot) = work.snapshot {
-        match flow::resume(backend, &problem, &work.options, snapshot, work.watch.as_ref()) {
+        match flow::resume(
+            backend,
+            &problem,
+            &work.options,
+            snapshot,
+            work.watch.as_ref(),
+        ) {
             Err(FlowError::Snapshot(error)) => {
                 tracing::warn!(%error, "a snapshot is of no use: the job starts afresh");
             }

@@ -71,12 +71,24 @@ struct DoorAndClass {
 
 /// The phases of a job, in order: the paper's own, and what a service adds around them.
 pub const PHASES: [&str; 7] = [
-    "decode", "precompute", "query", "network", "readback", "encode", "total",
+    "decode",
+    "precompute",
+    "query",
+    "network",
+    "readback",
+    "encode",
+    "total",
 ];
 /// Why requests are refused.
 pub const REJECTIONS: [&str; 8] = [
-    "too_large", "too_many_points", "bad_input", "tenant_limit", "server_full", "draining",
-    "unauthorized", "too_slow",
+    "too_large",
+    "too_many_points",
+    "bad_input",
+    "tenant_limit",
+    "server_full",
+    "draining",
+    "unauthorized",
+    "too_slow",
 ];
 const STOP_REASONS: [&str; 3] = ["converged", "max_iterations", "deadline"];
 /// The doors that requests come through.
@@ -155,7 +167,9 @@ impl Metrics {
     /// Makes every series, so that their number never changes.
     fn fill(&self, devices: &[String]) {
         for state in State::ALL.into_iter().filter(|state| state.is_end()) {
-            drop(self.finished.get_or_create(&Outcome { outcome: state.name() }));
+            drop(self.finished.get_or_create(&Outcome {
+                outcome: state.name(),
+            }));
         }
         for phase in PHASES {
             drop(self.phase_seconds.get_or_create(&Phase { phase }));
@@ -167,7 +181,9 @@ impl Metrics {
             drop(self.rejected.get_or_create(&Reason { reason }));
         }
         for priority in Priority::ALL {
-            drop(self.queue_depth.get_or_create(&Urgency { priority: priority.name() }));
+            drop(self.queue_depth.get_or_create(&Urgency {
+                priority: priority.name(),
+            }));
         }
         for door in DOORS {
             for class in CLASSES {
@@ -175,7 +191,9 @@ impl Metrics {
             }
         }
         for device in devices {
-            let label = DeviceLabel { device: device.clone() };
+            let label = DeviceLabel {
+                device: device.clone(),
+            };
             drop(self.device_busy_ratio.get_or_create(&label));
             drop(self.device_ready.get_or_create(&label));
         }
@@ -185,30 +203,112 @@ impl Metrics {
         let registry = &mut self.registry;
         let build = Info::new(vec![("version", env!("CARGO_PKG_VERSION"))]);
         registry.register("build", "What is running", build);
-        registry.register("jobs_submitted", "Jobs accepted, pairs of sequences included", self.submitted.clone());
-        registry.register("jobs_finished", "Jobs that have ended", self.finished.clone());
+        registry.register(
+            "jobs_submitted",
+            "Jobs accepted, pairs of sequences included",
+            self.submitted.clone(),
+        );
+        registry.register(
+            "jobs_finished",
+            "Jobs that have ended",
+            self.finished.clone(),
+        );
         registry.register("jobs_retried", "Jobs queued again", self.retried.clone());
-        registry.register("dead_letters", "Jobs given up after too many attempts", self.dead_letters.clone());
-        registry.register("leases_expired", "Leases that ran out", self.leases_expired.clone());
-        registry.register_with_unit("job_queue", "From acceptance to the first start", Unit::Seconds, self.queue_seconds.clone());
-        registry.register_with_unit("job_run", "From the first start to the end", Unit::Seconds, self.run_seconds.clone());
-        registry.register_with_unit("phase", "Time by phase of a job", Unit::Seconds, self.phase_seconds.clone());
-        registry.register("iterations", "Iterations of an optimization", self.iterations.clone());
-        registry.register("stop_reason", "Why optimizations stopped", self.stop_reason.clone());
+        registry.register(
+            "dead_letters",
+            "Jobs given up after too many attempts",
+            self.dead_letters.clone(),
+        );
+        registry.register(
+            "leases_expired",
+            "Leases that ran out",
+            self.leases_expired.clone(),
+        );
+        registry.register_with_unit(
+            "job_queue",
+            "From acceptance to the first start",
+            Unit::Seconds,
+            self.queue_seconds.clone(),
+        );
+        registry.register_with_unit(
+            "job_run",
+            "From the first start to the end",
+            Unit::Seconds,
+            self.run_seconds.clone(),
+        );
+        registry.register_with_unit(
+            "phase",
+            "Time by phase of a job",
+            Unit::Seconds,
+            self.phase_seconds.clone(),
+        );
+        registry.register(
+            "iterations",
+            "Iterations of an optimization",
+            self.iterations.clone(),
+        );
+        registry.register(
+            "stop_reason",
+            "Why optimizations stopped",
+            self.stop_reason.clone(),
+        );
         registry.register("queue_depth", "Jobs that wait", self.queue_depth.clone());
-        registry.register_with_unit("queue_work", "Compute time predicted for the jobs that wait", Unit::Seconds, self.queue_work_seconds.clone());
-        registry.register_with_unit("queue_oldest", "Age of the oldest job that waits", Unit::Seconds, self.queue_oldest_seconds.clone());
-        registry.register("jobs_running", "Jobs that a device works on", self.running.clone());
-        registry.register("device_busy_ratio", "Share of the last seconds that a device worked", self.device_busy_ratio.clone());
-        registry.register("device_ready", "Whether a device has passed its trial", self.device_ready.clone());
-        registry.register("device_lost", "Devices lost and opened again", self.device_lost.clone());
+        registry.register_with_unit(
+            "queue_work",
+            "Compute time predicted for the jobs that wait",
+            Unit::Seconds,
+            self.queue_work_seconds.clone(),
+        );
+        registry.register_with_unit(
+            "queue_oldest",
+            "Age of the oldest job that waits",
+            Unit::Seconds,
+            self.queue_oldest_seconds.clone(),
+        );
+        registry.register(
+            "jobs_running",
+            "Jobs that a device works on",
+            self.running.clone(),
+        );
+        registry.register(
+            "device_busy_ratio",
+            "Share of the last seconds that a device worked",
+            self.device_busy_ratio.clone(),
+        );
+        registry.register(
+            "device_ready",
+            "Whether a device has passed its trial",
+            self.device_ready.clone(),
+        );
+        registry.register(
+            "device_lost",
+            "Devices lost and opened again",
+            self.device_lost.clone(),
+        );
         registry.register("rejected", "Requests refused", self.rejected.clone());
         registry.register("requests", "Requests answered", self.requests.clone());
         registry.register("connections", "Open connections", self.connections.clone());
-        registry.register_with_unit("upload", "Bytes of request bodies", Unit::Bytes, self.upload_bytes.clone());
-        registry.register("snapshots", "Snapshots of running jobs kept", self.snapshots.clone());
-        registry.register("jobs_resumed", "Jobs taken up at a snapshot", self.resumed.clone());
-        registry.register("prediction_ratio", "Measured over predicted compute time", self.prediction_ratio.clone());
+        registry.register_with_unit(
+            "upload",
+            "Bytes of request bodies",
+            Unit::Bytes,
+            self.upload_bytes.clone(),
+        );
+        registry.register(
+            "snapshots",
+            "Snapshots of running jobs kept",
+            self.snapshots.clone(),
+        );
+        registry.register(
+            "jobs_resumed",
+            "Jobs taken up at a snapshot",
+            self.resumed.clone(),
+        );
+        registry.register(
+            "prediction_ratio",
+            "Measured over predicted compute time",
+            self.prediction_ratio.clone(),
+        );
         self
     }
 
@@ -242,7 +342,9 @@ impl Metrics {
         if job.pairs > 0 {
             return;
         }
-        let outcome = Outcome { outcome: job.state.name() };
+        let outcome = Outcome {
+            outcome: job.state.name(),
+        };
         self.finished.get_or_create(&outcome).inc();
         if job.dead {
             self.dead_letters.inc();
@@ -254,15 +356,26 @@ impl Metrics {
 
     /// Notes how long one phase of a job took.
     pub fn phase(&self, phase: &'static str, seconds: f64, job: Option<&Job>) {
-        let label = job.map(|job| JobLabel { job_id: job.id.to_string() });
+        let label = job.map(|job| JobLabel {
+            job_id: job.id.to_string(),
+        });
         let series = self.phase_seconds.get_or_create(&Phase { phase });
         series.observe(seconds, label, None);
     }
 
     /// Notes how an optimization ended, and how well its time was predicted.
-    pub fn solved(&self, iterations: usize, stop_reason: &'static str, measured_over_predicted: f64) {
+    pub fn solved(
+        &self,
+        iterations: usize,
+        stop_reason: &'static str,
+        measured_over_predicted: f64,
+    ) {
         self.iterations.observe(iterations as f64);
-        self.stop_reason.get_or_create(&Reason { reason: stop_reason }).inc();
+        self.stop_reason
+            .get_or_create(&Reason {
+                reason: stop_reason,
+            })
+            .inc();
         self.prediction_ratio.observe(measured_over_predicted);
     }
 
@@ -273,7 +386,9 @@ impl Metrics {
 
     /// Counts an answered request; `class` is one of [`CLASSES`].
     pub fn request(&self, door: &'static str, class: &'static str) {
-        self.requests.get_or_create(&DoorAndClass { door, class }).inc();
+        self.requests
+            .get_or_create(&DoorAndClass { door, class })
+            .inc();
     }
 
     /// Counts bytes of request bodies.
@@ -304,15 +419,21 @@ impl Metrics {
 
     /// Notes a device's health and its share of time at work.
     pub fn device(&self, name: &str, ready: bool, busy_ratio: f64) {
-        let label = DeviceLabel { device: name.to_owned() };
-        self.device_ready.get_or_create(&label).set(i64::from(ready));
+        let label = DeviceLabel {
+            device: name.to_owned(),
+        };
+        self.device_ready
+            .get_or_create(&label)
+            .set(i64::from(ready));
         self.device_busy_ratio.get_or_create(&label).set(busy_ratio);
     }
 
     /// Notes what waits and what runs.
     pub fn backlog(&self, backlog: &crate::queue::Backlog, oldest: Duration) {
         for priority in Priority::ALL {
-            let label = Urgency { priority: priority.name() };
+            let label = Urgency {
+                priority: priority.name(),
+            };
             let jobs = backlog.queued_at(priority).jobs;
             self.queue_depth.get_or_create(&label).set(jobs as i64);
         }
@@ -336,7 +457,9 @@ impl Metrics {
 }
 
 fn observe(series: &Seconds, took: Duration, job: &Job) {
-    let label = JobLabel { job_id: job.id.to_string() };
+    let label = JobLabel {
+        job_id: job.id.to_string(),
+    };
     series.observe(took.as_secs_f64(), Some(label), None);
 }
 

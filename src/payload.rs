@@ -125,7 +125,8 @@ impl Writer {
 
     fn flags(&mut self, flags: Option<&[bool]>) {
         self.0.push(u8::from(flags.is_some()));
-        self.0.extend(flags.unwrap_or_default().iter().map(|&flag| u8::from(flag)));
+        self.0
+            .extend(flags.unwrap_or_default().iter().map(|&flag| u8::from(flag)));
     }
 
     fn motion(&mut self, motion: Option<&RigidTransform>) {
@@ -156,7 +157,9 @@ impl<'a> Reader<'a> {
         if blake3::hash(body).as_bytes()[..SUM] != *sum {
             return Err(Damaged("the sum is wrong"));
         }
-        let rest = body.strip_prefix(magic).ok_or(Damaged("the beginning is wrong"))?;
+        let rest = body
+            .strip_prefix(magic)
+            .ok_or(Damaged("the beginning is wrong"))?;
         let mut reader = Self { rows: 0, rest };
         let rows = u64::from_le_bytes(reader.array()?);
         reader.rows = usize::try_from(rows).map_err(|_| Damaged("too many rows"))?;
@@ -164,7 +167,10 @@ impl<'a> Reader<'a> {
     }
 
     fn take(&mut self, count: usize) -> Result<&'a [u8], Damaged> {
-        let (taken, rest) = self.rest.split_at_checked(count).ok_or(Damaged("too short"))?;
+        let (taken, rest) = self
+            .rest
+            .split_at_checked(count)
+            .ok_or(Damaged("too short"))?;
         self.rest = rest;
         Ok(taken)
     }
@@ -233,7 +239,10 @@ mod tests {
             flow: vec![[1.0, -2.0, 0.5], [0.0; 3]],
             valid: vec![true, false],
             dynamic: Some(vec![false, true]),
-            ego: Some(RigidTransform::new([1.0, 2.0, 3.0].into(), [0.0, 0.0, 0.1].into())),
+            ego: Some(RigidTransform::new(
+                [1.0, 2.0, 3.0].into(),
+                [0.0, 0.0, 0.1].into(),
+            )),
         }
     }
 
@@ -246,8 +255,12 @@ mod tests {
         assert_eq!(StoredCloud::from_bytes(&cloud.to_bytes()), Ok(cloud));
         let stored = flow();
         let back = StoredFlow::from_bytes(&stored.to_bytes()).expect("good bytes");
-        assert_eq!((back.flow, back.valid, back.dynamic), (stored.flow, stored.valid, stored.dynamic));
-        let [one, other] = [back.ego, stored.ego].map(|ego| ego.expect("a motion").to_homogeneous());
+        assert_eq!(
+            (back.flow, back.valid, back.dynamic),
+            (stored.flow, stored.valid, stored.dynamic)
+        );
+        let [one, other] =
+            [back.ego, stored.ego].map(|ego| ego.expect("a motion").to_homogeneous());
         assert!((one - other).abs().max() < 1e-12);
     }
 

@@ -1,5 +1,7 @@
 //! Logs on stderr, for people or for programs, and traces to a collector where one is configured.
 
+use std::io::IsTerminal;
+
 use opentelemetry::trace::TracerProvider;
 use opentelemetry_otlp::WithExportConfig;
 use opentelemetry_sdk::Resource;
@@ -37,7 +39,9 @@ impl Telemetry {
     /// [`TelemetryError`].
     pub fn start(log: &LogConfig, otlp_endpoint: Option<&str>) -> Result<Self, TelemetryError> {
         let filter: EnvFilter = log.filter.parse()?;
-        let lines = tracing_subscriber::fmt::layer().with_writer(std::io::stderr);
+        let lines = tracing_subscriber::fmt::layer()
+            .with_writer(std::io::stderr)
+            .with_ansi(std::io::stderr().is_terminal());
         let lines = match log.format {
             LogFormat::Human => lines.compact().boxed(),
             LogFormat::Json => lines.json().flatten_event(true).boxed(),

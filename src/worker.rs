@@ -221,7 +221,11 @@ impl Worker {
     fn after_solving(&self, job: &Job, points: usize) -> Duration {
         const FOR_THE_DISK: Duration = Duration::from_millis(30);
         const FOR_THE_CALLER: Duration = Duration::from_millis(8);
-        let disk = if job.durable { FOR_THE_DISK } else { Duration::ZERO };
+        let disk = if job.durable {
+            FOR_THE_DISK
+        } else {
+            Duration::ZERO
+        };
         FOR_THE_CALLER + disk + Duration::from_nanos(150 * points as u64)
     }
 
@@ -283,7 +287,8 @@ impl Worker {
         let cut = estimate.stop_reason == crate::flow::StopReason::Deadline;
         let predicted = self.cost.seconds(job.cost_seconds);
         let ratio = took.as_secs_f64() / predicted.max(1e-6);
-        self.metrics.solved(estimate.iterations, estimate.stop_reason.name(), ratio);
+        self.metrics
+            .solved(estimate.iterations, estimate.stop_reason.name(), ratio);
         if !resumed && !cut {
             self.cost.learn(job.cost_seconds, took.as_secs_f64());
         }
@@ -302,9 +307,12 @@ impl Worker {
         match self.queue.finish(job.id, job.attempt, outcome).await {
             Ok(Committed::Yes(state)) => {
                 if succeeded {
-                    self.metrics.phase("readback", began.elapsed().as_secs_f64(), Some(job));
+                    self.metrics
+                        .phase("readback", began.elapsed().as_secs_f64(), Some(job));
                 }
-                if state.is_end() && let Err(error) = self.blobs.remove(job.id, Blob::Snapshot).await {
+                if state.is_end()
+                    && let Err(error) = self.blobs.remove(job.id, Blob::Snapshot).await
+                {
                     tracing::warn!(%error, job = %job.id, "a snapshot was not removed");
                 }
             }
@@ -321,7 +329,10 @@ impl Worker {
     async fn store(&self, job: &Job, report: &Report, flow: &StoredFlow) -> Outcome {
         let bytes = Bytes::from(flow.to_bytes());
         let sync = if job.durable { Sync::Yes } else { Sync::No };
-        let stored = self.blobs.put(job.id, Blob::Result(job.attempt), bytes, sync).await;
+        let stored = self
+            .blobs
+            .put(job.id, Blob::Result(job.attempt), bytes, sync)
+            .await;
         match (stored, serde_json::to_string(report)) {
             (Ok(()), Ok(json)) => Outcome::Succeeded {
                 stop_reason: report.stop_reason.clone(),

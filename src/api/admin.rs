@@ -53,11 +53,7 @@ struct Admin {
 }
 
 /// The routes of the admin port.
-pub fn admin_router(
-    readiness: Readiness,
-    metrics: Arc<Metrics>,
-    queue: Arc<dyn Queue>,
-) -> Router {
+pub fn admin_router(readiness: Readiness, metrics: Arc<Metrics>, queue: Arc<dyn Queue>) -> Router {
     Router::new()
         .route("/livez", get(|| async { Json(json!({ "alive": true })) }))
         .route("/readyz", get(ready))
@@ -85,12 +81,18 @@ async fn expose(State(admin): State<Admin>, headers: HeaderMap) -> Response {
         Ok(None) | Err(_) => Duration::ZERO,
     };
     admin.metrics.backlog(&admin.queue.backlog(), oldest);
-    let accept = headers.get(header::ACCEPT).and_then(|value| value.to_str().ok());
+    let accept = headers
+        .get(header::ACCEPT)
+        .and_then(|value| value.to_str().ok());
     let openmetrics = accept.is_some_and(|accept| accept.contains("application/openmetrics-text"));
     let media = if openmetrics {
         "application/openmetrics-text; version=1.0.0; charset=utf-8"
     } else {
         "text/plain; version=0.0.4; charset=utf-8"
     };
-    ([(header::CONTENT_TYPE, media)], admin.metrics.expose(openmetrics)).into_response()
+    (
+        [(header::CONTENT_TYPE, media)],
+        admin.metrics.expose(openmetrics),
+    )
+        .into_response()
 }

@@ -128,14 +128,22 @@ mod tests {
         assert!(keys.caller(None).is_ok());
         let short = keys.add("", caller("a", Role::Write));
         assert!(matches!(short, Err(InvalidKey::Short(_))));
-        keys.add("0123456789abcdef", caller("a", Role::Write)).expect("a key");
-        keys.add("fedcba9876543210", caller("b", Role::Read)).expect("a key");
+        keys.add("0123456789abcdef", caller("a", Role::Write))
+            .expect("a key");
+        keys.add("fedcba9876543210", caller("b", Role::Read))
+            .expect("a key");
         let twice = keys.add("fedcba9876543210", caller("c", Role::Read));
         assert!(matches!(twice, Err(InvalidKey::Twice(_))));
         let found = keys.caller(Some("Bearer fedcba9876543210")).expect("known");
         assert_eq!(found, caller("b", Role::Read));
         assert_eq!(found.may_write(), Err(ApiError::Forbidden));
-        for wrong in [None, Some(""), Some("Bearer "), Some("Basic 0123456789abcdef"), Some("Bearer x")] {
+        for wrong in [
+            None,
+            Some(""),
+            Some("Bearer "),
+            Some("Basic 0123456789abcdef"),
+            Some("Bearer x"),
+        ] {
             assert_eq!(keys.caller(wrong), Err(ApiError::Unauthenticated));
         }
     }

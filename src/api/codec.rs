@@ -18,17 +18,37 @@ pub(super) enum AnswerFormat {
 
 /// Every format with its media type and its name in an archive; the first is the default.
 pub(super) const ANSWER_FORMATS: [(AnswerFormat, &str, &str); 7] = [
-    (AnswerFormat::File(FlowFormat::Npz), "application/x-npz", "npz"),
-    (AnswerFormat::File(FlowFormat::Npy), "application/x-npy", "npy"),
+    (
+        AnswerFormat::File(FlowFormat::Npz),
+        "application/x-npz",
+        "npz",
+    ),
+    (
+        AnswerFormat::File(FlowFormat::Npy),
+        "application/x-npy",
+        "npy",
+    ),
     (
         AnswerFormat::File(FlowFormat::Feather),
         "application/vnd.apache.arrow.file",
         "feather",
     ),
-    (AnswerFormat::File(FlowFormat::Ply), "application/x-ply", "ply"),
-    (AnswerFormat::File(FlowFormat::Pcd), "application/x-pcd", "pcd"),
+    (
+        AnswerFormat::File(FlowFormat::Ply),
+        "application/x-ply",
+        "ply",
+    ),
+    (
+        AnswerFormat::File(FlowFormat::Pcd),
+        "application/x-pcd",
+        "pcd",
+    ),
     (AnswerFormat::Packed, "application/octet-stream", "f32"),
-    (AnswerFormat::File(FlowFormat::Json), "application/json", "json"),
+    (
+        AnswerFormat::File(FlowFormat::Json),
+        "application/json",
+        "json",
+    ),
 ];
 
 impl AnswerFormat {
@@ -101,7 +121,11 @@ impl AnswerFormat {
             }
             Self::File(format) => format,
         };
-        let source = if self.needs_points() { points } else { &flow.flow };
+        let source = if self.needs_points() {
+            points
+        } else {
+            &flow.flow
+        };
         let table = FlowTable {
             source,
             flow: &flow.flow,
@@ -136,7 +160,11 @@ fn with_report(json: &[u8], report: &Report, job: &str) -> Result<Vec<u8>, ApiEr
 ///
 /// # Errors
 /// [`ApiError::BadInput`] or [`ApiError::TooLarge`], which name the part and what is wrong in it.
-pub(super) fn read_cloud(part: &str, bytes: &[u8], name: Option<&str>) -> Result<StoredCloud, ApiError> {
+pub(super) fn read_cloud(
+    part: &str,
+    bytes: &[u8],
+    name: Option<&str>,
+) -> Result<StoredCloud, ApiError> {
     let cloud = formats::read_cloud(bytes, name).map_err(|error| in_part(part, error))?;
     Ok(StoredCloud {
         points: cloud.points,
@@ -202,7 +230,10 @@ mod tests {
             (None, Some(npz)),
             (Some("*/*"), Some(npz)),
             (Some("application/x-ply"), Some(ply)),
-            (Some("text/html, application/x-ply;q=0.5, */*;q=0.1"), Some(ply)),
+            (
+                Some("text/html, application/x-ply;q=0.5, */*;q=0.1"),
+                Some(ply),
+            ),
             (Some("application/x-npz;q=0, application/x-ply"), Some(ply)),
             (Some("APPLICATION/X-PLY"), Some(ply)),
             (Some("text/html"), None),

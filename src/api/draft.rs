@@ -113,7 +113,10 @@ impl Draft {
             Promise::WhileAwaited => Sync::No,
         };
         let blob = Blob::Frame(self.frames);
-        service.blobs.put(self.id, blob, Bytes::from(bytes), sync).await?;
+        service
+            .blobs
+            .put(self.id, blob, Bytes::from(bytes), sync)
+            .await?;
         self.frames += 1;
         Ok(())
     }

@@ -52,7 +52,9 @@ pub enum ApiError {
     #[error("the range lies outside the result's {0} bytes")]
     Range(u64),
     /// The key was used for another payload.
-    #[error("the idempotency key was used with another payload; a retry is safe only with the same")]
+    #[error(
+        "the idempotency key was used with another payload; a retry is safe only with the same"
+    )]
     KeyReused(JobId),
     /// It has no result yet.
     #[error("the job has not ended; GET it with ?wait=30 to wait for it")]
@@ -298,7 +300,10 @@ mod tests {
             let slow = error == ApiError::TooSlow;
             assert_eq!(ours_by_http, ours_by_grpc && !slow, "{error:?}");
             assert!(row.retryable || error.retry_after().is_none(), "{error:?}");
-            assert!(row.rejection.is_none_or(|reason| REJECTIONS.contains(&reason)));
+            assert!(
+                row.rejection
+                    .is_none_or(|reason| REJECTIONS.contains(&reason))
+            );
         }
     }
 }

@@ -26,5 +26,6 @@ use std::sync::Arc;
 
 /// Everything on the public port: HTTP and gRPC.
 pub fn public_router(service: &Arc<Service>) -> axum::Router {
-    http::guarded(http::router(service).merge(grpc::router(service)), service)
+    let calls = grpc::router(service).reset_fallback();
+    http::guarded(http::router(service).merge(calls), service)
 }

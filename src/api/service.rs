@@ -319,13 +319,19 @@ impl Service {
     ///
     /// # Errors
     /// Where the store fails.
-    pub(super) async fn encode(&self, answer: &Answer, format: AnswerFormat) -> Result<Vec<u8>, ApiError> {
+    pub(super) async fn encode(
+        &self,
+        answer: &Answer,
+        format: AnswerFormat,
+    ) -> Result<Vec<u8>, ApiError> {
         let began = std::time::Instant::now();
         let points = if format.needs_points() {
             let job = &answer.job;
             let (owner, place) = job.parent.map_or((job.id, 0), |parent| (parent, job.place));
             let bytes = self.blobs.get(owner, Blob::Frame(place)).await?;
-            StoredCloud::from_bytes(&bytes).map_err(ApiError::internal)?.points
+            StoredCloud::from_bytes(&bytes)
+                .map_err(ApiError::internal)?
+                .points
         } else {
             Vec::new()
         };
@@ -334,7 +340,8 @@ impl Service {
         let encoded = self
             .compute(move || format.encode(&flow, &points, &report, &name))
             .await?;
-        self.metrics.phase("encode", began.elapsed().as_secs_f64(), Some(&answer.job));
+        self.metrics
+            .phase("encode", began.elapsed().as_secs_f64(), Some(&answer.job));
         Ok(encoded)
     }
 

@@ -29,7 +29,10 @@ impl App {
         if timeout_at(to_finish, all(&mut self.workers)).await.is_err() {
             tracing::info!("what still runs is put down, to go on later");
             self.workers_drain.release.cancel();
-            if timeout_at(deadline - TO_CLOSE, all(&mut self.workers)).await.is_err() {
+            if timeout_at(deadline - TO_CLOSE, all(&mut self.workers))
+                .await
+                .is_err()
+            {
                 tracing::warn!("a job did not stop in time; its lease ends with the process");
             }
         }

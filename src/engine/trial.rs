@@ -6,9 +6,9 @@ use crate::flow::{self, Preset, Problem, Unwatched};
 /// A wall and a post in front of it, moved by this, metres.
 const MOTION: [f32; 3] = [0.2, 0.1, 0.0];
 
-/// How far the mean flow may be off, metres: a twentieth of what a wrong device would give, and
-/// wide enough for the few iterations of a trial.
-const TOLERANCE: f32 = 0.05;
+/// How far the mean flow may be off, metres: half of what a device that finds nothing would give,
+/// and wide enough for the few iterations of a trial.
+const TOLERANCE: f32 = 0.11;
 
 /// Iterations of the trial: enough to go through every kernel more than once.
 const ITERATIONS: usize = 12;

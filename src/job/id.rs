@@ -106,7 +106,12 @@ mod tests {
     fn names_come_back_from_their_text_and_paths_are_no_names() {
         let id = JobId::fresh();
         assert_eq!(id.to_string().parse(), Ok(id));
-        for wrong in ["", "../../etc/passwd", "0192f0c17b7a70008000000000000000", "x"] {
+        for wrong in [
+            "",
+            "../../etc/passwd",
+            "0192f0c17b7a70008000000000000000",
+            "x",
+        ] {
             assert_eq!(wrong.parse::<JobId>(), Err(InvalidId::Job));
         }
         for wrong in ["", "a/b", "a b", &"x".repeat(65)] {

@@ -67,8 +67,9 @@ impl PresetChoice {
 }
 
 /// What becomes of ground points.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[derive(clap::ValueEnum)]
+#[derive(
+    Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema, clap::ValueEnum,
+)]
 #[serde(rename_all = "snake_case")]
 pub enum GroundChoice {
     /// They are points like any other.
@@ -92,7 +93,17 @@ pub enum DeviceChoice {
 
 /// How urgent a job is. Higher ones always go first; within one, tenants share fairly.
 #[derive(
-    Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize,
+    Clone,
+    Copy,
+    Debug,
+    Default,
+    PartialEq,
+    Eq,
+    PartialOrd,
+    Ord,
+    Hash,
+    Serialize,
+    Deserialize,
     ToSchema,
 )]
 #[serde(rename_all = "snake_case")]
@@ -150,7 +161,9 @@ impl<'de> Deserialize<'de> for EgoChoice {
             rows @ serde_json::Value::Array(_) => {
                 let rows: [[f64; 4]; 4] =
                     serde_json::from_value(rows).map_err(|_| D::Error::custom(wanted))?;
-                rigid_motion(&rows).map(Self::Given).map_err(D::Error::custom)
+                rigid_motion(&rows)
+                    .map(Self::Given)
+                    .map_err(D::Error::custom)
             }
             _ => Err(D::Error::custom(wanted)),
         }
@@ -180,8 +193,8 @@ impl JobOptions {
     /// # Errors
     /// [`InvalidOptions`], which names the key and what it may be.
     pub fn from_json(text: &[u8]) -> Result<Self, InvalidOptions> {
-        let options: Self =
-            serde_json::from_slice(text).map_err(|error| InvalidOptions::Json(error.to_string()))?;
+        let options: Self = serde_json::from_slice(text)
+            .map_err(|error| InvalidOptions::Json(error.to_string()))?;
         options.check()?;
         Ok(options)
     }
@@ -217,7 +230,10 @@ impl JobOptions {
     /// The solver's options for clouds of which the larger has `points` points.
     pub fn solver_options(&self, points: usize) -> flow::Options {
         let drawn = self.max_points.map(|points| points as usize);
-        let mut options = self.preset.preset().options(drawn.filter(|&drawn| drawn < points));
+        let mut options = self
+            .preset
+            .preset()
+            .options(drawn.filter(|&drawn| drawn < points));
         options.seed = self.seed;
         options.range_m = self.range_m;
         options.ground = match self.ground {
@@ -245,25 +261,36 @@ mod tests {
             "ego":[[1,0,0,2],[0,1,0,0],[0,0,1,0],[0,0,0,1]],"device":"cpu","deadline_ms":300,"priority":"high"}"#;
         let options = JobOptions::from_json(text).expect("good options");
         assert_eq!(options.preset, PresetChoice::Paper);
-        assert_eq!(JobOptions::from_json(options.to_json().as_bytes()), Ok(options));
+        assert_eq!(
+            JobOptions::from_json(options.to_json().as_bytes()),
+            Ok(options)
+        );
     }
 
     #[test]
     fn unknown_keys_and_senseless_values_are_refused_by_name() {
         for (text, said) in [
             (r#"{"sead":1}"#, "unknown field `sead`"),
-            (r#"{"preset":"best"}"#, "unknown variant `best`, expected `default` or `paper`"),
+            (
+                r#"{"preset":"best"}"#,
+                "unknown variant `best`, expected `default` or `paper`",
+            ),
             (r#"{"max_points":2}"#, "max_points is 2"),
             (r#"{"range_m":-1}"#, "range_m is -1"),
             (r#"{"deadline_ms":0}"#, "deadline_ms is 0"),
             (r#"{"ego":"yes"}"#, "ego is \"off\", \"auto\""),
-            (r#"{"ego":[[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}"#, "not a rigid"),
+            (
+                r#"{"ego":[[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}"#,
+                "not a rigid",
+            ),
             (r#"{"seed":-1}"#, "invalid value"),
             (r#"{"seed":1,"seed":2}"#, "duplicate field"),
             ("[]", "options: "),
             ("", "options: "),
         ] {
-            let error = JobOptions::from_json(text.as_bytes()).expect_err(text).to_string();
+            let error = JobOptions::from_json(text.as_bytes())
+                .expect_err(text)
+                .to_string();
             assert!(error.contains(said), "{text}: {error}");
         }
     }

@@ -66,9 +66,14 @@ impl Backlog {
             load.map_or(0.0, |load| load.seconds)
         };
         let own = of(tenant);
-        let others = self.queued.keys().filter(|(of, at)| *at == priority && of != tenant);
+        let others = self
+            .queued
+            .keys()
+            .filter(|(of, at)| *at == priority && of != tenant);
         // Each other tenant gets as much as this one until its own is done.
-        let passing: f64 = others.map(|(other, _)| of(other).min(own + cost_seconds)).sum();
+        let passing: f64 = others
+            .map(|(other, _)| of(other).min(own + cost_seconds))
+            .sum();
         higher + own + passing + self.running.seconds
     }
 

@@ -281,12 +281,19 @@ pub(crate) async fn failures_are_retried_later_and_given_up_in_the_end(stand: &m
         let held = lease(&queue).await;
         assert_eq!((held.job.id, held.job.attempt), (job.id, attempt));
         let committed = finish(&queue, &held.job, failure(true)).await;
-        let expected = if attempt < 3 { State::Queued } else { State::Failed };
+        let expected = if attempt < 3 {
+            State::Queued
+        } else {
+            State::Failed
+        };
         assert_eq!(committed, Committed::Yes(expected));
     }
     let dead = queue.job(&job.tenant, job.id).await.expect("known");
     assert!(dead.dead);
-    assert_eq!(dead.error.as_ref().map(|error| error.code.as_str()), Some("broken"));
+    assert_eq!(
+        dead.error.as_ref().map(|error| error.code.as_str()),
+        Some("broken")
+    );
     let again = queue.requeue(job.id).await.expect("it has ended");
     assert!(!again.dead && again.state == State::Queued && again.error.is_none());
     assert_eq!(lease(&queue).await.job.attempt, 4);
@@ -300,7 +307,10 @@ pub(crate) async fn an_error_of_the_input_is_not_retried(stand: &mut impl Stand)
     let held = lease(&queue).await;
     let committed = finish(&queue, &held.job, failure(false)).await;
     assert_eq!(committed, Committed::Yes(State::Failed));
-    let failed = queue.job(&held.job.tenant, held.job.id).await.expect("known");
+    let failed = queue
+        .job(&held.job.tenant, held.job.id)
+        .await
+        .expect("known");
     assert!(!failed.dead);
 }
 
@@ -393,7 +403,11 @@ pub(crate) async fn a_job_that_kills_the_process_again_and_again_is_given_up(
         }
         drop((queue, events));
         (queue, events) = stand.open(options.clone());
-        let expected = if crash == 4 { State::Failed } else { State::Queued };
+        let expected = if crash == 4 {
+            State::Failed
+        } else {
+            State::Queued
+        };
         let now = queue.job(&job.tenant, job.id).await.expect("known");
         assert_eq!(now.state, expected, "after {crash} crashes");
         if now.state == State::Failed {
@@ -508,7 +522,10 @@ pub(crate) async fn followers_see_every_state(stand: &mut impl Stand) {
     let mut news = queue.watch(job.id).await.expect("known");
     assert_eq!(news.borrow_and_update().state, State::Queued);
     let held = lease(&queue).await;
-    timeout(PATIENCE, news.changed()).await.expect("in time").expect("followed");
+    timeout(PATIENCE, news.changed())
+        .await
+        .expect("in time")
+        .expect("followed");
     assert_eq!(news.borrow_and_update().state, State::Running);
     let progress = JobProgress {
         iteration: 7,
@@ -516,10 +533,16 @@ pub(crate) async fn followers_see_every_state(stand: &mut impl Stand) {
         loss: 0.25,
     };
     held.pulse.beat(Some(progress));
-    timeout(PATIENCE, news.changed()).await.expect("in time").expect("followed");
+    timeout(PATIENCE, news.changed())
+        .await
+        .expect("in time")
+        .expect("followed");
     assert_eq!(news.borrow_and_update().progress, Some(progress));
     finish(&queue, &held.job, done()).await;
-    timeout(PATIENCE, news.changed()).await.expect("in time").expect("followed");
+    timeout(PATIENCE, news.changed())
+        .await
+        .expect("in time")
+        .expect("followed");
     assert_eq!(news.borrow_and_update().state, State::Succeeded);
 }
 

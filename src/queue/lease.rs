@@ -61,7 +61,9 @@ pub struct Pulse {
 
 impl std::fmt::Debug for Pulse {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Pulse").field("signal", &self.signal()).finish_non_exhaustive()
+        f.debug_struct("Pulse")
+            .field("signal", &self.signal())
+            .finish_non_exhaustive()
     }
 }
 

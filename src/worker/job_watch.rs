@@ -55,7 +55,11 @@ impl Watch for JobWatch {
 
     fn seconds_left(&self) -> Option<f64> {
         let deadline = self.deadline?;
-        Some(deadline.saturating_duration_since(Instant::now()).as_secs_f64())
+        Some(
+            deadline
+                .saturating_duration_since(Instant::now())
+                .as_secs_f64(),
+        )
     }
 
     fn interrupt(&self) -> Option<Interrupt> {
@@ -64,7 +68,9 @@ impl Watch for JobWatch {
         if gone || put_down {
             return Some(Interrupt::Cancelled);
         }
-        let late = self.deadline.is_some_and(|deadline| deadline <= Instant::now());
+        let late = self
+            .deadline
+            .is_some_and(|deadline| deadline <= Instant::now());
         late.then_some(Interrupt::Deadline)
     }
 
@@ -81,13 +87,19 @@ impl Watch for JobWatch {
         if self.release.is_cancelled() {
             return !self.put_down.load(Ordering::Relaxed);
         }
-        let last = self.last_snapshot.lock().unwrap_or_else(PoisonError::into_inner);
+        let last = self
+            .last_snapshot
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
         last.elapsed() >= self.snapshot_interval
     }
 
     fn snapshot(&self, snapshot: Snapshot) {
         let releasing = self.release.is_cancelled();
-        *self.last_snapshot.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
+        *self
+            .last_snapshot
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner) = Instant::now();
         if releasing {
             // The last one is worth waiting for: the thread has nothing else to do.
             let _nobody_keeps_it_is_fine = self.snapshots.blocking_send(snapshot);

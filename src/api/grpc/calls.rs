@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use tokio::sync::mpsc;
-use tokio_stream::wrappers::ReceiverStream;
 use tokio_stream::Stream;
+use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::chunks::{self, CloudBuilder};
@@ -92,7 +92,10 @@ impl Calls {
         use proto::estimate_flow_request::Part;
         call.caller.may_write()?;
         self.service.check_draining()?;
-        let begin = match chunks::next(&self.service, inbound).await?.and_then(|m| m.part) {
+        let begin = match chunks::next(&self.service, inbound)
+            .await?
+            .and_then(|m| m.part)
+        {
             Some(Part::Begin(begin)) => begin,
             _ => return Err(no_begin()),
         };
@@ -237,7 +240,10 @@ impl SceneFlow for Calls {
         self.service.check_draining()?;
         let mut inbound = request.into_inner();
         let service = &self.service;
-        let begin = match chunks::next(service, &mut inbound).await?.and_then(|m| m.part) {
+        let begin = match chunks::next(service, &mut inbound)
+            .await?
+            .and_then(|m| m.part)
+        {
             Some(Part::Begin(begin)) => begin,
             _ => return Err(no_begin().into()),
         };
@@ -271,7 +277,11 @@ impl SceneFlow for Calls {
                 Some(_) => return Err(no_begin().into()),
             }
         }
-        let kind = if draft.frames() > 2 { Kind::Sequence } else { Kind::Pair };
+        let kind = if draft.frames() > 2 {
+            Kind::Sequence
+        } else {
+            Kind::Pair
+        };
         let (job, _) = draft.submit(kind).await?;
         Ok(Response::new(convert::job(&job)))
     }
@@ -304,7 +314,10 @@ impl SceneFlow for Calls {
             "" => None,
             token => Some(token.parse::<JobId>().map_err(ApiError::from)?),
         };
-        let jobs = self.service.jobs(&call.caller, state, before, limit).await?;
+        let jobs = self
+            .service
+            .jobs(&call.caller, state, before, limit)
+            .await?;
         let full = jobs.len() == limit as usize;
         let next = jobs.last().filter(|_| full).map(|job| job.id.to_string());
         Ok(Response::new(proto::ListJobsResponse {
@@ -318,7 +331,11 @@ impl SceneFlow for Calls {
         request: Request<proto::CancelJobRequest>,
     ) -> Result<Response<proto::Job>, Status> {
         let call = Call::of(&request)?;
-        let id = request.get_ref().id.parse::<JobId>().map_err(ApiError::from)?;
+        let id = request
+            .get_ref()
+            .id
+            .parse::<JobId>()
+            .map_err(ApiError::from)?;
         let job = self.service.cancel(&call.caller, id).await?;
         Ok(Response::new(convert::job(&job)))
     }
@@ -328,7 +345,11 @@ impl SceneFlow for Calls {
         request: Request<proto::RequeueJobRequest>,
     ) -> Result<Response<proto::Job>, Status> {
         let call = Call::of(&request)?;
-        let id = request.get_ref().id.parse::<JobId>().map_err(ApiError::from)?;
+        let id = request
+            .get_ref()
+            .id
+            .parse::<JobId>()
+            .map_err(ApiError::from)?;
         let job = self.service.requeue(&call.caller, id).await?;
         Ok(Response::new(convert::job(&job)))
     }
@@ -338,7 +359,11 @@ impl SceneFlow for Calls {
         request: Request<proto::WatchJobRequest>,
     ) -> Result<Response<Self::WatchJobStream>, Status> {
         let call = Call::of(&request)?;
-        let id = request.get_ref().id.parse::<JobId>().map_err(ApiError::from)?;
+        let id = request
+            .get_ref()
+            .id
+            .parse::<JobId>()
+            .map_err(ApiError::from)?;
         let mut news = self.service.watch(&call.caller, id).await?;
         let closing = self.service.closing.clone();
         let (answers, stream) = mpsc::channel(AHEAD);

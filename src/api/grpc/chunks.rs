@@ -63,7 +63,8 @@ impl CloudBuilder {
             )));
         }
         self.points.extend_from_slice(&chunk.points);
-        self.ground.extend(chunk.ground.iter().map(|&flag| flag != 0));
+        self.ground
+            .extend(chunk.ground.iter().map(|&flag| flag != 0));
         Ok(())
     }
 

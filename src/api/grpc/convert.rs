@@ -69,9 +69,8 @@ fn ego(named: i32, motion: &[f64]) -> Result<Option<EgoChoice>, ApiError> {
         (proto::Ego::Off, 0) => Ok(Some(EgoChoice::Off)),
         (proto::Ego::Auto, 0) => Ok(Some(EgoChoice::Auto)),
         (proto::Ego::Unspecified, 16) => {
-            let rows = core::array::from_fn(|row| {
-                core::array::from_fn(|column| motion[4 * row + column])
-            });
+            let rows =
+                core::array::from_fn(|row| core::array::from_fn(|column| motion[4 * row + column]));
             let motion = rigid_motion(&rows).map_err(|error| invalid(&error.to_string()))?;
             Ok(Some(EgoChoice::Given(motion)))
         }
@@ -172,7 +171,9 @@ pub(super) fn header(answer: &Answer) -> proto::FlowHeader {
         best_loss: report.best_loss,
         points: answer.flow.flow.len() as u64,
         valid_points: report.points as u64,
-        ego_motion: motion.map(|rows| rows.as_flattened().to_vec()).unwrap_or_default(),
+        ego_motion: motion
+            .map(|rows| rows.as_flattened().to_vec())
+            .unwrap_or_default(),
         device: report.device.clone(),
         seconds: Some(proto::Seconds {
             precompute: seconds.precompute,
@@ -219,7 +220,10 @@ mod tests {
         assert!(refused(|o| o.ego_motion = vec![1.0; 3]).contains("16 numbers"));
         assert!(refused(|o| o.range_m = Some(f32::NAN)).contains("range_m"));
         assert!(refused(|o| o.max_points = Some(1)).contains("max_points is 1"));
-        assert_eq!(options(Some(proto::Options::default())), Ok(JobOptions::default()));
+        assert_eq!(
+            options(Some(proto::Options::default())),
+            Ok(JobOptions::default())
+        );
         assert_eq!(options(None), Ok(JobOptions::default()));
     }
 

@@ -19,7 +19,10 @@ pub(super) use status::{row_of, status};
 
 /// The messages and the service, generated from `proto/fnsf/v1/scene_flow.proto`.
 #[expect(unreachable_pub, reason = "generated code is public to its module")]
-#[expect(unused_qualifications, reason = "generated code names everything in full")]
+#[expect(
+    unused_qualifications,
+    reason = "generated code names everything in full"
+)]
 mod proto {
     tonic::include_proto!("fnsf.v1");
 

@@ -132,7 +132,9 @@ impl Reader {
             return Ok(());
         };
         let names = (before.name, sweep.name.clone());
-        let job = self.submit(before.cloud, sweep.cloud.clone(), options).await;
+        let job = self
+            .submit(before.cloud, sweep.cloud.clone(), options)
+            .await;
         place_in_line.send(Pending {
             place: self.place,
             source: names.0,
@@ -150,7 +152,9 @@ impl Reader {
         target: StoredCloud,
         options: &JobOptions,
     ) -> Result<(JobId, Awaited), ApiError> {
-        let request = self.call.draft_request(options.clone(), Promise::WhileAwaited);
+        let request = self
+            .call
+            .draft_request(options.clone(), Promise::WhileAwaited);
         let mut draft = self.service.draft(self.call.caller.clone(), request)?;
         draft.push(source).await?;
         draft.push(target).await?;

@@ -44,7 +44,11 @@ fn describe(response: &mut Response, answer: &Answer, format: AnswerFormat) {
     set("etag", entity_tag(&answer.job, format));
     set("accept-ranges", "bytes".to_owned());
     set("vary", "accept".to_owned());
-    let name = format!("attachment; filename=\"{}.{}\"", answer.job.id, format.ending());
+    let name = format!(
+        "attachment; filename=\"{}.{}\"",
+        answer.job.id,
+        format.ending()
+    );
     set("content-disposition", name);
 }
 
@@ -88,7 +92,10 @@ pub(super) async fn result(
     let format = AnswerFormat::accepted(text(header::ACCEPT))?;
     let answer = service.answer(&job).await?;
     let tag = entity_tag(&job, format);
-    let matches = |tags: &str| tags.split(',').any(|one| one.trim() == tag || one.trim() == "*");
+    let matches = |tags: &str| {
+        tags.split(',')
+            .any(|one| one.trim() == tag || one.trim() == "*")
+    };
     if text(header::IF_NONE_MATCH).is_some_and(matches) {
         let mut response = StatusCode::NOT_MODIFIED.into_response();
         describe(&mut response, &answer, format);
@@ -122,7 +129,10 @@ fn parse_range(range: &str, length: u64) -> Option<Option<(u64, u64)>> {
         return None;
     }
     let (first, last) = match (from.trim(), to.trim()) {
-        ("", last) => (length.saturating_sub(last.parse().ok()?), length.checked_sub(1)?),
+        ("", last) => (
+            length.saturating_sub(last.parse().ok()?),
+            length.checked_sub(1)?,
+        ),
         (first, "") => (first.parse().ok()?, length.checked_sub(1)?),
         (first, last) => {
             let last: u64 = last.parse().ok()?;
@@ -168,9 +178,15 @@ async fn archive(
     });
     let mut response = Body::from_stream(ReceiverStream::new(stream)).into_response();
     let headers = response.headers_mut();
-    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/zip"));
+    headers.insert(
+        header::CONTENT_TYPE,
+        HeaderValue::from_static("application/zip"),
+    );
     let name = format!("attachment; filename=\"{}.zip\"", sequence.id);
-    for (header, value) in [("content-disposition", name), ("fnsf-job-id", sequence.id.to_string())] {
+    for (header, value) in [
+        ("content-disposition", name),
+        ("fnsf-job-id", sequence.id.to_string()),
+    ] {
         if let Ok(value) = HeaderValue::from_str(&value) {
             headers.insert(header, value);
         }

@@ -134,7 +134,9 @@ async fn read(
         };
         room.take(service, piece.len())?;
         if bytes.len() + piece.len() > limit {
-            return Err(ApiError::TooLarge(format!("a part has more than {limit} bytes")));
+            return Err(ApiError::TooLarge(format!(
+                "a part has more than {limit} bytes"
+            )));
         }
         bytes.extend_from_slice(&piece);
     }
@@ -181,7 +183,9 @@ impl PairFiles {
     /// Reads the clouds and hands them to a draft.
     pub(super) async fn push_to(self, body: &mut Body, draft: &mut Draft) -> Result<(), ApiError> {
         let missing = |part: &str| {
-            ApiError::BadRequest(format!("the part {part} is missing: send source and target"))
+            ApiError::BadRequest(format!(
+                "the part {part} is missing: send source and target"
+            ))
         };
         let (name, bytes) = self.source.ok_or_else(|| missing("source"))?;
         let clouds = match self.target {

@@ -79,7 +79,9 @@ async fn next(mut told: Told) -> Option<(Result<Event, Infallible>, Told)> {
     let id = format!("{}.{iteration}", job.attempt);
     let event = match job.progress {
         Some(progress) if same_state => Event::default().event("progress").json_data(progress),
-        _ => Event::default().event("state").json_data(JobView::new(&job, &[])),
+        _ => Event::default()
+            .event("state")
+            .json_data(JobView::new(&job, &[])),
     };
     let event = event.unwrap_or_default().id(id);
     Some((Ok(event), told))

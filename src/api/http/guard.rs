@@ -24,7 +24,10 @@ pub(in crate::api) struct Arrived(pub(in crate::api) Instant);
 pub(in crate::api) fn guarded(router: Router, service: &Arc<Service>) -> Router {
     let state = Arc::clone(service);
     router
-        .layer(middleware::from_fn_with_state(Arc::clone(&state), check_key))
+        .layer(middleware::from_fn_with_state(
+            Arc::clone(&state),
+            check_key,
+        ))
         .layer(CatchPanicLayer::custom(panicked))
         .layer(middleware::from_fn_with_state(state, count))
 }
@@ -53,17 +56,18 @@ async fn check_key(
             request.extensions_mut().insert(caller);
         }
         Err(_) if is_open(request.uri().path()) => {}
-        Err(error) if is_grpc(&request) => return refuse_grpc(error),
-        Err(error) => return error.into_response(),
+        Err(error) => return refused(&request, error),
     }
     next.run(request).await
 }
 
-fn refuse_grpc(error: ApiError) -> Response {
-    let row = error.row();
-    let mut response = grpc::status(error).into_http::<axum::body::Body>();
-    response.extensions_mut().insert(row);
-    response
+/// A refusal in the words of the door that the request came through.
+pub(super) fn refused(request: &Request, error: ApiError) -> Response {
+    if is_grpc(request) {
+        grpc::status(error).into_http::<axum::body::Body>()
+    } else {
+        error.into_response()
+    }
 }
 
 /// Counts the answer, and the refusal where it is one.
@@ -72,9 +76,10 @@ async fn count(State(service): State<Arc<Service>>, request: Request, next: Next
     let (method, path) = (request.method().clone(), request.uri().path().to_owned());
     let began = Instant::now();
     let mut response = next.run(request).await;
-    response
-        .headers_mut()
-        .insert("x-content-type-options", HeaderValue::from_static("nosniff"));
+    response.headers_mut().insert(
+        "x-content-type-options",
+        HeaderValue::from_static("nosniff"),
+    );
     let status = response.status();
     let row = response.extensions().get::<Row>().copied();
     let row = row.or_else(|| grpc::row_of(response.headers()));
@@ -103,6 +108,9 @@ async fn count(State(service): State<Arc<Service>>, request: Request, next: Next
 fn panicked(panic: Box<dyn Any + Send + 'static>) -> Response {
     let text = panic.downcast_ref::<&str>().copied();
     let text = text.or_else(|| panic.downcast_ref::<String>().map(String::as_str));
-    ApiError::internal(format!("a handler panicked: {}", text.unwrap_or("without a word")))
-        .into_response()
+    ApiError::internal(format!(
+        "a handler panicked: {}",
+        text.unwrap_or("without a word")
+    ))
+    .into_response()
 }

@@ -3,10 +3,10 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use axum::Json;
 use axum::extract::{Extension, Path, Query, Request, State};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use axum::Json;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
@@ -96,7 +96,9 @@ pub(super) async fn estimate(
     headers: HeaderMap,
     request: Request,
 ) -> Result<Response, ApiError> {
-    let accept = headers.get(header::ACCEPT).and_then(|value| value.to_str().ok());
+    let accept = headers
+        .get(header::ACCEPT)
+        .and_then(|value| value.to_str().ok());
     let format = AnswerFormat::accepted(accept)?;
     let asked = Asked::of(&headers, arrived)?;
     let promise = match asked.prefer {
@@ -255,7 +257,9 @@ async fn submit(
             draft.submit(Kind::Pair).await?
         }
     };
-    service.metrics.phase("decode", body.decode_seconds(), Some(&job));
+    service
+        .metrics
+        .phase("decode", body.decode_seconds(), Some(&job));
     let mut response = accepted(&job, Prefer::default());
     if !new {
         *response.status_mut() = StatusCode::OK;
@@ -357,7 +361,11 @@ pub(super) async fn list_jobs(
     page: Result<Query<Page>, axum::extract::rejection::QueryRejection>,
 ) -> Result<Json<JobPage>, ApiError> {
     let Query(page) = page.map_err(|error| ApiError::BadRequest(error.body_text()))?;
-    let before = page.before.as_deref().map(str::parse::<JobId>).transpose()?;
+    let before = page
+        .before
+        .as_deref()
+        .map(str::parse::<JobId>)
+        .transpose()?;
     let limit = page.limit.unwrap_or(PAGE).clamp(1, 1000);
     let jobs = service.jobs(&caller, page.state, before, limit).await?;
     let full = jobs.len() == limit as usize;

@@ -27,8 +27,14 @@ pub(super) fn router(service: &Arc<Service>) -> Router {
     Router::new()
         .route("/v1/flow", post(handlers::estimate))
         .route("/v1/sequences", post(handlers::submit_sequence))
-        .route("/v1/jobs", post(handlers::submit_job).get(handlers::list_jobs))
-        .route("/v1/jobs/{id}", get(handlers::get_job).delete(handlers::cancel_job))
+        .route(
+            "/v1/jobs",
+            post(handlers::submit_job).get(handlers::list_jobs),
+        )
+        .route(
+            "/v1/jobs/{id}",
+            get(handlers::get_job).delete(handlers::cancel_job),
+        )
         .route("/v1/jobs/{id}/requeue", post(handlers::requeue_job))
         .route("/v1/jobs/{id}/events", get(events::follow_job))
         .route("/v1/jobs/{id}/result", get(answer::result))

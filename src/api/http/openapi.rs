@@ -76,5 +76,7 @@ struct Contract;
 
 /// `/openapi.json` and `/docs`.
 pub(super) fn router() -> Router<Arc<Service>> {
-    SwaggerUi::new("/docs").url("/openapi.json", Contract::openapi()).into()
+    SwaggerUi::new("/docs")
+        .url("/openapi.json", Contract::openapi())
+        .into()
 }

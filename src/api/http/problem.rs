@@ -1,11 +1,13 @@
 //! Errors as RFC 9457 problems.
 
 use axum::Json;
+use axum::extract::Request;
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use utoipa::ToSchema;
 
+use super::guard;
 use crate::api::error::ApiError;
 use crate::job::JobError;
 
@@ -88,8 +90,8 @@ impl IntoResponse for ApiError {
     }
 }
 
-pub(super) async fn no_route() -> ApiError {
-    ApiError::NoRoute
+pub(super) async fn no_route(request: Request) -> Response {
+    guard::refused(&request, ApiError::NoRoute)
 }
 
 pub(super) async fn method() -> ApiError {

@@ -196,7 +196,8 @@ impl SqliteQueue {
         let turn = self.next_reader.fetch_add(1, Ordering::Relaxed) as usize % READERS;
         let reader = Arc::clone(&self.readers[turn]);
         let read = tokio::task::spawn_blocking(move || query(&locked(&reader)));
-        read.await.map_err(|error| QueueError::Store(error.to_string()))?
+        read.await
+            .map_err(|error| QueueError::Store(error.to_string()))?
     }
 }
 
@@ -234,7 +235,9 @@ impl Heart for SqliteHeart {
     fn beat(&self, progress: Option<Progress>) {
         if let Some(progress) = progress {
             *locked(&self.latest) = Some(progress);
-            self.shared.watchers.progress(self.id, self.attempt, progress);
+            self.shared
+                .watchers
+                .progress(self.id, self.attempt, progress);
         }
         let now = Timestamp::now().as_millis();
         let pause = BEAT.min(self.options.lease / 4).as_millis() as i64;
@@ -282,7 +285,9 @@ impl Queue for SqliteQueue {
     }
 
     async fn job(&self, tenant: &Tenant, id: JobId) -> Result<Arc<Job>, QueueError> {
-        let job = self.read(move |connection| rows::get(connection, id)).await?;
+        let job = self
+            .read(move |connection| rows::get(connection, id))
+            .await?;
         if job.tenant == *tenant {
             Ok(Arc::new(job))
         } else {
@@ -291,7 +296,9 @@ impl Queue for SqliteQueue {
     }
 
     async fn pairs(&self, id: JobId) -> Result<Vec<Arc<Job>>, QueueError> {
-        let pairs = self.read(move |connection| rows::pairs(connection, id)).await?;
+        let pairs = self
+            .read(move |connection| rows::pairs(connection, id))
+            .await?;
         Ok(pairs.into_iter().map(Arc::new).collect())
     }
 
@@ -316,7 +323,9 @@ impl Queue for SqliteQueue {
                     statement.query_map(params![tenant, before, limit, state], rows::job)?
                 }
             };
-            Ok(rows.map(|job| job.map(Arc::new)).collect::<rusqlite::Result<_>>()?)
+            Ok(rows
+                .map(|job| job.map(Arc::new))
+                .collect::<rusqlite::Result<_>>()?)
         };
         self.read(query).await
     }

@@ -53,9 +53,8 @@ pub(super) fn priority_at(row: &Row<'_>, column: usize) -> rusqlite::Result<Prio
 
 pub(super) fn tenant_at(row: &Row<'_>, column: usize) -> rusqlite::Result<Tenant> {
     let name: String = row.get(column)?;
-    name.parse().map_err(|_| {
-        rusqlite::Error::InvalidColumnType(column, name, rusqlite::types::Type::Text)
-    })
+    name.parse()
+        .map_err(|_| rusqlite::Error::InvalidColumnType(column, name, rusqlite::types::Type::Text))
 }
 
 /// One row as a job.

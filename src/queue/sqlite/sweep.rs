@@ -16,7 +16,9 @@ const AT_ONCE: u32 = 256;
 /// When the sweeper has something to do next.
 pub(super) fn next_due(connection: &Connection) -> Result<Option<Timestamp>, QueueError> {
     let sql = "SELECT min(due) FROM jobs INDEXED BY jobs_due WHERE due IS NOT NULL";
-    let due: Option<i64> = connection.prepare_cached(sql)?.query_row([], |row| row.get(0))?;
+    let due: Option<i64> = connection
+        .prepare_cached(sql)?
+        .query_row([], |row| row.get(0))?;
     Ok(due.map(Timestamp::from_millis))
 }
 
@@ -66,12 +68,20 @@ fn look_after_queued(
         .prepare_cached(sql)?
         .execute(params![job.id.as_bytes(), now.as_millis()])?;
     if woken > 0 {
-        effects.changed.push(Arc::new(rows::get(connection, job.id)?));
+        effects
+            .changed
+            .push(Arc::new(rows::get(connection, job.id)?));
         return Ok(());
     }
     let (code, message) = match job.deadline {
-        Some(_) => ("deadline_in_queue", "the deadline passed before a device was free"),
-        None => ("too_old", "no device was free for as long as a job may wait"),
+        Some(_) => (
+            "deadline_in_queue",
+            "the deadline passed before a device was free",
+        ),
+        None => (
+            "too_old",
+            "no device was free for as long as a job may wait",
+        ),
     };
     let error = JobError {
         code: code.to_owned(),
@@ -106,7 +116,8 @@ pub(super) fn recover(
     effects: &mut Effects,
     options: &QueueOptions,
 ) -> Result<(), QueueError> {
-    let sql = format!("SELECT {COLUMNS} FROM jobs INDEXED BY jobs_running WHERE state = 1 AND kind = 0");
+    let sql =
+        format!("SELECT {COLUMNS} FROM jobs INDEXED BY jobs_running WHERE state = 1 AND kind = 0");
     let running: Vec<Job> = {
         let mut statement = connection.prepare_cached(&sql)?;
         let rows = statement.query_map([], rows::job)?;
@@ -118,7 +129,14 @@ pub(super) fn recover(
             .prepare_cached(sql)?
             .query_row([job.id.as_bytes()], |row| row.get(0))?;
         if job.cancel_requested {
-            transitions::end(connection, effects, options, &job, State::Cancelled, End::default())?;
+            transitions::end(
+                connection,
+                effects,
+                options,
+                &job,
+                State::Cancelled,
+                End::default(),
+            )?;
         } else if crashes >= options.max_crashes {
             let error = JobError {
                 code: "crashed".to_owned(),
@@ -149,11 +167,11 @@ pub(super) fn recover(
 
 /// When the oldest queued job was accepted.
 pub(super) fn oldest_queued(connection: &Connection) -> Result<Option<Timestamp>, QueueError> {
-    let sql = "SELECT created FROM jobs INDEXED BY jobs_age WHERE state = 0 ORDER BY created LIMIT 1";
+    let sql =
+        "SELECT created FROM jobs INDEXED BY jobs_age WHERE state = 0 ORDER BY created LIMIT 1";
     let created: Option<i64> = connection
         .prepare_cached(sql)?
         .query_row([], |row| row.get(0))
         .optional()?;
     Ok(created.map(Timestamp::from_millis))
 }
-

@@ -46,7 +46,9 @@ fn plan(connection: &rusqlite::Connection, sql: &str, parameters: usize) -> Stri
         .expect("a good statement");
     let values = vec![0i64; parameters];
     let details = statement
-        .query_map(rusqlite::params_from_iter(values), |row| row.get::<_, String>(3))
+        .query_map(rusqlite::params_from_iter(values), |row| {
+            row.get::<_, String>(3)
+        })
         .expect("a plan");
     let details: Vec<String> = details.collect::<rusqlite::Result<_>>().expect("a plan");
     details.join("; ")
@@ -70,7 +72,9 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
             )
             .expect("a row");
     }
-    connection.execute_batch("COMMIT; ANALYZE").expect("a commit");
+    connection
+        .execute_batch("COMMIT; ANALYZE")
+        .expect("a commit");
     let claim = plan(&connection, &transitions::claim_sql(), 3);
     assert!(claim.contains("jobs_ready"), "{claim}");
     for (sql, parameters) in [
@@ -88,7 +92,10 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
     ] {
         let plan = plan(&connection, &sql, parameters);
         assert!(!plan.contains("TEMP B-TREE"), "{sql}: {plan}");
-        assert!(!plan.contains("SCAN jobs") || plan.contains("INDEX"), "{sql}: {plan}");
+        assert!(
+            !plan.contains("SCAN jobs") || plan.contains("INDEX"),
+            "{sql}: {plan}"
+        );
     }
     assert!(sweep::next_due(&connection).expect("an answer").is_some());
 }

@@ -11,9 +11,7 @@ use rusqlite::{Connection, OptionalExtension, params};
 use super::rows::{self, COLUMNS, kind_code, priority_code, state_code};
 use crate::clock::Timestamp;
 use crate::job::{Job, JobError, JobId, JobProgress, Kind, State};
-use crate::queue::{
-    Committed, Event, Outcome, QueueError, QueueOptions, Submission, Submitted,
-};
+use crate::queue::{Committed, Event, Outcome, QueueError, QueueOptions, Submission, Submitted};
 
 /// What follows a commit.
 #[derive(Debug, Default)]
@@ -58,9 +56,10 @@ pub(super) fn submit(
                    WHERE tenant = ?1 AND idempotency_key = ?2";
         let mut statement = connection.prepare_cached(sql)?;
         let known: Option<([u8; 16], Vec<u8>)> = statement
-            .query_row(params![submission.tenant.as_str(), idempotency.key], |row| {
-                Ok((row.get(0)?, row.get(1)?))
-            })
+            .query_row(
+                params![submission.tenant.as_str(), idempotency.key],
+                |row| Ok((row.get(0)?, row.get(1)?)),
+            )
             .optional()?;
         if let Some((id, fingerprint)) = known {
             let id = JobId::from_bytes(id);
@@ -268,8 +267,22 @@ pub(super) fn finish(
         _ => return Ok(Committed::Fenced),
     };
     let state = match outcome {
-        _ if job.cancel_requested => end(connection, effects, options, &job, State::Cancelled, End::default())?,
-        Outcome::Cancelled => end(connection, effects, options, &job, State::Cancelled, End::default())?,
+        _ if job.cancel_requested => end(
+            connection,
+            effects,
+            options,
+            &job,
+            State::Cancelled,
+            End::default(),
+        )?,
+        Outcome::Cancelled => end(
+            connection,
+            effects,
+            options,
+            &job,
+            State::Cancelled,
+            End::default(),
+        )?,
         Outcome::Succeeded {
             stop_reason,
             report,
@@ -459,7 +472,14 @@ pub(super) fn cancel(
             }
         }
         Kind::Pair if job.state == State::Queued => {
-            end(connection, effects, options, &job, State::Cancelled, End::default())?;
+            end(
+                connection,
+                effects,
+                options,
+                &job,
+                State::Cancelled,
+                End::default(),
+            )?;
         }
         Kind::Pair => effects.cancel.push(id),
     }

@@ -73,7 +73,9 @@ impl Writer {
             })
         });
         let command = Command { durable, change };
-        self.commands.send(command).map_err(|_| QueueError::Closed)?;
+        self.commands
+            .send(command)
+            .map_err(|_| QueueError::Closed)?;
         answered.await.map_err(|_| QueueError::Closed)?
     }
 
@@ -106,7 +108,9 @@ fn in_savepoint<T>(
     connection.prepare_cached("SAVEPOINT change")?.execute([])?;
     let done = change();
     if done.is_err() {
-        connection.prepare_cached("ROLLBACK TO change")?.execute([])?;
+        connection
+            .prepare_cached("ROLLBACK TO change")?
+            .execute([])?;
     }
     connection.prepare_cached("RELEASE change")?.execute([])?;
     done
@@ -116,7 +120,9 @@ fn run(connection: Connection, options: &QueueOptions, shared: &Shared, inbox: &
     let mut next_due = sweep::next_due(&connection).unwrap_or(None);
     loop {
         let now = Timestamp::now();
-        let sleep = next_due.map_or(MAX_SLEEP, |due| now.until(due)).min(MAX_SLEEP);
+        let sleep = next_due
+            .map_or(MAX_SLEEP, |due| now.until(due))
+            .min(MAX_SLEEP);
         let first = match inbox.recv_timeout(sleep) {
             Ok(command) => Some(command),
             Err(RecvTimeoutError::Timeout) => None,
@@ -135,12 +141,18 @@ fn run(connection: Connection, options: &QueueOptions, shared: &Shared, inbox: &
         let mut effects = Effects::default();
         let mut replies = Vec::with_capacity(commands.len());
         let began = Instant::now();
-        let done = transact(&connection, commands, &mut effects, &mut replies, |effects| {
-            if sweeping {
-                in_savepoint(&connection, || sweep::sweep(&connection, effects, options))?;
-            }
-            Ok(())
-        });
+        let done = transact(
+            &connection,
+            commands,
+            &mut effects,
+            &mut replies,
+            |effects| {
+                if sweeping {
+                    in_savepoint(&connection, || sweep::sweep(&connection, effects, options))?;
+                }
+                Ok(())
+            },
+        );
         shared.commit_seconds(began.elapsed());
         if done.is_ok() {
             shared.apply(effects);

@@ -1,0 +1,58 @@
+//! Clouds to send, and the bodies that carry them.
+
+use std::path::PathBuf;
+use std::sync::OnceLock;
+
+use fnsf::flow::Point;
+use fnsf::flow::simulate::{Street, StreetOptions};
+use fnsf::formats::{CloudFormat, write_cloud};
+use reqwest::multipart::{Form, Part};
+
+/// A simulated pair of about five thousand points.
+pub(crate) fn small_pair() -> &'static [Vec<Point>; 2] {
+    static PAIR: OnceLock<[Vec<Point>; 2]> = OnceLock::new();
+    PAIR.get_or_init(|| street(16, 400))
+}
+
+/// A simulated pair of about thirty thousand points: seconds of work for the published method.
+pub(crate) fn medium_pair() -> &'static [Vec<Point>; 2] {
+    static PAIR: OnceLock<[Vec<Point>; 2]> = OnceLock::new();
+    PAIR.get_or_init(|| street(32, 1000))
+}
+
+fn street(beams: usize, azimuth_steps: usize) -> [Vec<Point>; 2] {
+    let options = StreetOptions {
+        beams,
+        azimuth_steps,
+        ..StreetOptions::default()
+    };
+    let pair = Street::new(&options).and_then(|street| street.pair(0));
+    let pair = pair.expect("a street");
+    [pair.source, pair.target]
+}
+
+/// A cloud as a file.
+pub(crate) fn file(format: CloudFormat, points: &[Point]) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    write_cloud(format, points, &mut bytes).expect("written");
+    bytes
+}
+
+/// A multipart body with source, target and options.
+pub(crate) fn form([source, target]: &[Vec<Point>; 2], options: &str) -> Form {
+    let part =
+        |points: &[Point]| Part::bytes(file(CloudFormat::Npy, points)).file_name("cloud.npy");
+    Form::new()
+        .part("source", part(source))
+        .part("target", part(target))
+        .text("options", options.to_owned())
+}
+
+/// The folder with real pairs, where there is one.
+pub(crate) fn real_data() -> Option<PathBuf> {
+    let folder = std::env::var_os("FNSF_REAL_DATA").map(PathBuf::from);
+    if folder.is_none() {
+        eprintln!("FNSF_REAL_DATA is not set: real pairs are not tested");
+    }
+    folder
+}

@@ -1,0 +1,235 @@
+//! Runs the real server on ports of its own, and stops or kills it.
+
+use std::io::{BufRead, BufReader, Read};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+/// Long enough for a loaded machine; only a failure waits so long.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A running server. It is killed when it is dropped.
+pub(crate) struct Server {
+    child: Child,
+    pub(crate) public: String,
+    pub(crate) admin: String,
+    log: Arc<Mutex<String>>,
+    folder: Folder,
+}
+
+/// Where a server keeps its things.
+#[derive(Clone)]
+pub(crate) struct Folder(Arc<tempfile::TempDir>);
+
+impl Folder {
+    pub(crate) fn new() -> Self {
+        Self(Arc::new(tempfile::tempdir().expect("a folder")))
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        self.0.path()
+    }
+}
+
+impl Server {
+    /// A fresh server with the defaults and some more arguments.
+    pub(crate) fn start(arguments: &[&str]) -> Self {
+        Self::start_in(&Folder::new(), "", arguments)
+    }
+
+    /// A fresh server with some more lines of configuration.
+    pub(crate) fn with_config(config: &str) -> Self {
+        Self::start_in(&Folder::new(), config, &[])
+    }
+
+    /// A server on what another one left behind.
+    pub(crate) fn start_in(folder: &Folder, config: &str, arguments: &[&str]) -> Self {
+        let file: PathBuf = folder.path().join("fnsf.toml");
+        std::fs::write(&file, config).expect("a file");
+        let mut child = Command::new(env!("CARGO_BIN_EXE_fnsf"))
+            .args([
+                "serve",
+                "--listen",
+                "127.0.0.1:0",
+                "--admin-listen",
+                "127.0.0.1:0",
+            ])
+            .arg("--data-dir")
+            .arg(folder.path().join("data"))
+            .arg("--config")
+            .arg(&file)
+            .args(arguments)
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .expect("the program starts");
+        let log = Arc::new(Mutex::new(String::new()));
+        keep(child.stderr.take().expect("piped"), Arc::clone(&log));
+        let mut said = String::new();
+        let mut stdout = BufReader::new(child.stdout.take().expect("piped"));
+        stdout.read_line(&mut said).expect("a line");
+        let mut words = said.split([' ', ',', '\n']);
+        let addresses: Vec<String> = words
+            .by_ref()
+            .filter(|word| word.starts_with("127.0.0.1:"))
+            .map(str::to_owned)
+            .collect();
+        let [public, admin] = addresses.try_into().unwrap_or_else(|_| {
+            let log = log.lock().expect("no panic holds it");
+            panic!("it said {said:?} and logged {log}")
+        });
+        let server = Self {
+            child,
+            public,
+            admin,
+            log,
+            folder: folder.clone(),
+        };
+        server.until_ready();
+        server
+    }
+
+    pub(crate) fn folder(&self) -> Folder {
+        self.folder.clone()
+    }
+
+    pub(crate) fn id(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// The URL of a path of the public port.
+    pub(crate) fn url(&self, path: &str) -> String {
+        format!("http://{}{path}", self.public)
+    }
+
+    /// The URL of a path of the admin port.
+    pub(crate) fn admin_url(&self, path: &str) -> String {
+        format!("http://{}{path}", self.admin)
+    }
+
+    pub(crate) fn log(&self) -> String {
+        self.log.lock().expect("no panic holds it").clone()
+    }
+
+    fn until_ready(&self) {
+        let began = Instant::now();
+        while !self.is_ready() {
+            assert!(
+                began.elapsed() < PATIENCE,
+                "it is not ready: {}",
+                self.log()
+            );
+            thread::sleep(Duration::from_millis(10));
+        }
+    }
+
+    /// Whether the admin port says that it is ready.
+    pub(crate) fn is_ready(&self) -> bool {
+        plain_get(&self.admin, "/readyz").is_some_and(|answer| answer.starts_with("HTTP/1.1 200"))
+    }
+
+    /// Memory that it holds, bytes.
+    pub(crate) fn resident_bytes(&self) -> u64 {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.id()))
+            .expect("it runs on Linux");
+        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+        let kibibytes = line.and_then(|line| line.trim().strip_suffix("kB")?.trim().parse().ok());
+        kibibytes.map_or(0, |kibibytes: u64| kibibytes * 1024)
+    }
+
+    /// Sends it a signal.
+    pub(crate) fn signal(&self, name: &str) {
+        let id = self.id().to_string();
+        let sent = Command::new("kill")
+            .args([&format!("-{name}"), &id])
+            .status();
+        assert!(sent.expect("kill is there").success());
+    }
+
+    /// Kills it as a crash would, and waits until it is gone.
+    pub(crate) fn kill(mut self) -> Folder {
+        self.child.kill().expect("it runs");
+        self.child.wait().expect("it ends");
+        self.folder.clone()
+    }
+
+    /// Waits for its end.
+    pub(crate) fn wait(&mut self, longest: Duration) -> Option<ExitStatus> {
+        let began = Instant::now();
+        while began.elapsed() < longest {
+            if let Some(status) = self.child.try_wait().expect("it can be asked") {
+                return Some(status);
+            }
+            thread::sleep(Duration::from_millis(10));
+        }
+        None
+    }
+
+    /// A metric's value, all its series together.
+    pub(crate) fn metric(&self, name: &str) -> f64 {
+        let page = plain_get(&self.admin, "/metrics").expect("metrics");
+        let series = page.lines().filter(|line| {
+            line.strip_prefix(name)
+                .is_some_and(|rest| rest.starts_with(['{', ' ']))
+        });
+        series
+            .filter_map(|line| line.rsplit(' ').next()?.parse::<f64>().ok())
+            .sum()
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        let _it_may_have_ended = self.child.kill();
+        let _reaped = self.child.wait();
+    }
+}
+
+/// Keeps what a server logs.
+fn keep(mut from: impl Read + Send + 'static, log: Arc<Mutex<String>>) {
+    thread::spawn(move || {
+        let mut piece = [0; 4096];
+        while let Ok(count) = from.read(&mut piece) {
+            if count == 0 {
+                return;
+            }
+            let text = String::from_utf8_lossy(&piece[..count]).into_owned();
+            log.lock().expect("no panic holds it").push_str(&text);
+        }
+    });
+}
+
+/// A request without any library: what the admin port must answer whatever else happens.
+pub(crate) fn plain_get(address: &str, path: &str) -> Option<String> {
+    use std::io::Write;
+    let mut stream = std::net::TcpStream::connect(address).ok()?;
+    stream.set_read_timeout(Some(PATIENCE)).ok()?;
+    let request = format!("GET {path} HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n");
+    stream.write_all(request.as_bytes()).ok()?;
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).ok()?;
+    Some(answer)
+}
+
+/// Waits until a job has ended, by long polls; gives what is known about it.
+pub(crate) async fn ended(server: &Server, id: &str) -> Value {
+    let began = Instant::now();
+    loop {
+        let url = server.url(&format!("/v1/jobs/{id}?wait=20"));
+        let job: Value = reqwest::get(url)
+            .await
+            .expect("an answer")
+            .json()
+            .await
+            .expect("a job");
+        let state = job["state"].as_str().unwrap_or_else(|| panic!("{job}"));
+        if !matches!(state, "queued" | "running") {
+            return job;
+        }
+        assert!(began.elapsed() < PATIENCE * 3, "it has not ended: {job}");
+    }
+}
