@@ -200,7 +200,9 @@ impl Pace {
         let fitting = budget / (wished * iteration(1));
         let batch = (fitting as usize / least * least).clamp(least, most.max(least));
         let batch = batch.min(asked);
-        let fitting = ((budget / iteration(batch)) as usize).min(options.max_iterations);
+        // Never more work than was asked for, in more steps.
+        let most = options.max_iterations.saturating_mul(asked) / batch;
+        let fitting = ((budget / iteration(batch)) as usize).min(most);
         let enough = fitting >= least_iterations.min(options.max_iterations);
         Some(options.hurried(batch, if enough { fitting } else { 0 }))
     }
