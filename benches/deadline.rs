@@ -5,11 +5,8 @@
 //! ```
 #![expect(clippy::print_stdout, reason = "a benchmark prints its figures")]
 
-mod common;
-
 use std::time::Instant;
 
-use common::median;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Truth, evaluate};
 use fnsf::flow::{Ground, Interrupt, Options, Preset, Problem, Watch, estimate};
@@ -43,6 +40,12 @@ impl Watch for Clock {
         let late = self.seconds_left().is_some_and(|left| left <= 0.0);
         late.then_some(Interrupt::Deadline)
     }
+}
+
+/// The middle of the values.
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
 }
 
 /// One run: milliseconds, megabytes of the transform, iterations, EPE, EPE of movers.

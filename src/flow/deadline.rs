@@ -31,6 +31,9 @@ const ALIGNED: usize = 4096;
 const MEASURED: usize = 1536;
 /// What an iteration costs a point, in evaluations: forward, twice that backward, and the query.
 const ITERATION: f64 = 3.4;
+/// Where the step size falls, a run that is predicted to take this many times too long is begun
+/// all the same: the prediction is rough, and it can be shortened.
+const ROUGH: f64 = 1.35;
 /// What is set aside for the final evaluation, in times of what it should take.
 const EVALUATION: f64 = 1.15;
 /// Set aside for what nobody measures, seconds.
@@ -188,7 +191,11 @@ impl Pace {
         let iteration = |batch: usize| self.point * ITERATION * batch as f64;
         let asked = options.batch.unwrap_or(points).min(points);
         let needed = options.expected_iterations() as f64 * iteration(asked);
-        if prepared.whole && needed <= budget {
+        let tolerance = match options.decay {
+            Decay::Cosine => ROUGH,
+            Decay::Constant => 1.0,
+        };
+        if prepared.whole && needed <= budget * tolerance {
             return None;
         }
         let Hurry {
@@ -200,7 +207,9 @@ impl Pace {
         let fitting = budget / (wished * iteration(1));
         let batch = (fitting as usize / least * least).clamp(least, most.max(least));
         let batch = batch.min(asked);
-        let fitting = ((budget / iteration(batch)) as usize).min(options.max_iterations);
+        // Never more work than was asked for, in more steps.
+        let most = options.max_iterations.saturating_mul(asked) / batch;
+        let fitting = ((budget / iteration(batch)) as usize).min(most);
         let enough = fitting >= least_iterations.min(options.max_iterations);
         Some(options.hurried(batch, if enough { fitting } else { 0 }))
     }

@@ -4,4 +4,7 @@
 //! and pass. They never are part of the project.
 
 mod accuracy;
+mod deadlines;
+mod prices;
+mod resumption;
 mod scenes;

@@ -17,8 +17,8 @@ pub(crate) const ABSENT: u32 = u32::MAX;
 pub(crate) const BRICK_BYTES: usize = VOLUME * size_of::<u16>();
 /// The most blocks: 64 MB of index.
 const MAX_BLOCKS: usize = 16 << 20;
-/// Occupied vertices between two looks at the watch: a few milliseconds.
-const CELLS_AT_ONCE: usize = 4096;
+/// Runs of occupied vertices between two looks at the watch: a few milliseconds.
+const RUNS_AT_ONCE: usize = 4096;
 
 /// Where each active brick is kept.
 #[derive(Debug)]
@@ -56,72 +56,57 @@ impl Index {
                 limit: bytes(MAX_BLOCKS),
             });
         }
-        let mut index = Self {
+        let mut marks = Marks {
             blocks,
             tables: vec![ABSENT; total],
-            bricks: Vec::new(),
+            columns: Vec::new(),
             active: 0,
         };
         let reach = (band + EDGE as i32 - 1) / EDGE as i32;
         let limit = band * band;
+        // How far the band reaches along z from a column of bricks at each squared gap.
+        let along_z: Vec<i32> = (0..=limit).map(|gap| (limit - gap).isqrt()).collect();
         // Bricks are numbered by 32 bits.
         let limit_bytes = max_bytes.min(ABSENT as usize * BRICK_BYTES);
-        for (number, cell) in cells.iter().enumerate() {
-            if number % CELLS_AT_ONCE == 0 {
+        // Cells one above the other reach as far as their ends.
+        let above = |a: &[u32; 3], b: &[u32; 3]| a[..2] == b[..2] && b[2] == a[2] + 1;
+        for (number, run) in cells.chunk_by(above).enumerate() {
+            if number % RUNS_AT_ONCE == 0 {
                 watch::check(watch)?;
             }
-            let needed = index.bytes() + index.active * BRICK_BYTES;
+            let needed = marks.index_bytes() + marks.active * BRICK_BYTES;
             if needed > limit_bytes {
                 return Err(DistanceError::Memory {
                     needed,
                     limit: limit_bytes,
                 });
             }
-            let brick = cell.map(|c| (c / EDGE) as i32);
-            let gaps: [_; 3] = core::array::from_fn(|a| (cell[a] % EDGE) as i32);
-            // Squared gap along one axis between the cell and the brick `offset` away.
-            let gap = |axis: usize, offset: i32| {
-                let low = offset * EDGE as i32 - gaps[axis];
+            let at = run[0].map(|c| c as i32);
+            let top = run[run.len() - 1][2] as i32;
+            let [bx, by, _] = at.map(|c| c / EDGE as i32);
+            // Squared gap along one axis between the cell and a brick.
+            let gap = |axis: usize, brick: i32| {
+                let low = brick * EDGE as i32 - at[axis];
                 let high = low + EDGE as i32 - 1;
                 let gap = low.max(-high).max(0);
                 gap * gap
             };
-            let range = |axis: usize| {
-                let last = brick_counts[axis] as i32 - 1;
-                (brick[axis] - reach).max(0)..=(brick[axis] + reach).min(last)
-            };
-            for x in range(0) {
-                let along_x = gap(0, x - brick[0]);
-                for y in range(1) {
-                    let along_xy = along_x + gap(1, y - brick[1]);
+            let last = brick_counts.map(|n| n as i32 - 1);
+            for x in (bx - reach).max(0)..=(bx + reach).min(last[0]) {
+                let along_x = gap(0, x);
+                for y in (by - reach).max(0)..=(by + reach).min(last[1]) {
+                    let along_xy = along_x + gap(1, y);
                     if along_xy > limit {
                         continue;
                     }
-                    for z in range(2) {
-                        if along_xy + gap(2, z - brick[2]) <= limit {
-                            index.mark([x as u32, y as u32, z as u32]);
-                        }
-                    }
+                    let up = along_z[along_xy as usize];
+                    let low = (at[2] - up).max(0) / EDGE as i32;
+                    let high = ((top + up) / EDGE as i32).min(last[2]);
+                    marks.mark([x as u32, y as u32], low as u32, high as u32);
                 }
             }
         }
-        let active = index.bricks.iter_mut().filter(|brick| **brick != ABSENT);
-        for (number, brick) in (0..).zip(active) {
-            *brick = number;
-        }
-        Ok(index)
-    }
-
-    fn mark(&mut self, brick: [u32; 3]) {
-        let [bx, by, bz] = brick.map(|b| (b / EDGE) as usize);
-        let block = (bx * self.blocks[1] + by) * self.blocks[2] + bz;
-        if self.tables[block] == ABSENT {
-            self.tables[block] = (self.bricks.len() / VOLUME) as u32;
-            self.bricks.resize(self.bricks.len() + VOLUME, ABSENT);
-        }
-        let brick = &mut self.bricks[self.tables[block] as usize * VOLUME + within(brick)];
-        self.active += usize::from(*brick == ABSENT);
-        *brick = 0;
+        Ok(marks.numbered())
     }
 
     /// The number of the brick that holds `vertex`, or [`ABSENT`].
@@ -138,6 +123,60 @@ impl Index {
 
     pub(crate) fn bytes(&self) -> usize {
         (self.tables.len() + self.bricks.len()) * size_of::<u32>()
+    }
+}
+
+/// Bricks marked so far: a bit each, eight along z in a byte.
+struct Marks {
+    blocks: [usize; 3],
+    tables: Vec<u32>,
+    /// 64 columns a table, by x and y.
+    columns: Vec<u8>,
+    active: usize,
+}
+
+impl Marks {
+    /// Columns of a table.
+    const COLUMNS: usize = (EDGE * EDGE) as usize;
+
+    /// Marks the bricks from `low` to `high` along z.
+    fn mark(&mut self, [x, y]: [u32; 2], low: u32, high: u32) {
+        let [bx, by] = [x, y].map(|b| (b / EDGE) as usize);
+        let row = (bx * self.blocks[1] + by) * self.blocks[2];
+        let column = (x % EDGE * EDGE + y % EDGE) as usize;
+        for bz in low / EDGE..=high / EDGE {
+            let table = &mut self.tables[row + bz as usize];
+            if *table == ABSENT {
+                *table = (self.columns.len() / Self::COLUMNS) as u32;
+                self.columns.resize(self.columns.len() + Self::COLUMNS, 0);
+            }
+            let first = low.max(bz * EDGE) % EDGE;
+            let last = high.min(bz * EDGE + EDGE - 1) % EDGE;
+            let mask = (u8::MAX << first) & (u8::MAX >> (EDGE - 1 - last));
+            let bits = &mut self.columns[*table as usize * Self::COLUMNS + column];
+            self.active += (mask & !*bits).count_ones() as usize;
+            *bits |= mask;
+        }
+    }
+
+    /// Bytes of the index that these marks become.
+    fn index_bytes(&self) -> usize {
+        let entries = self.tables.len() + self.columns.len() * EDGE as usize;
+        entries * size_of::<u32>()
+    }
+
+    /// The marked bricks, numbered.
+    fn numbered(self) -> Index {
+        let mut numbers = 0..;
+        let bits = self.columns.iter();
+        let marked = bits.flat_map(|bits| (0..EDGE).map(move |z| bits >> z & 1 == 1));
+        let number = |marked: bool| marked.then(|| numbers.next()).flatten();
+        Index {
+            blocks: self.blocks,
+            tables: self.tables,
+            bricks: marked.map(number).map(|n| n.unwrap_or(ABSENT)).collect(),
+            active: self.active,
+        }
     }
 }
 

@@ -40,7 +40,12 @@ impl FarField {
     /// At most the bytes that [`Self::build`] will take over `grid`.
     pub(crate) fn bytes_over(grid: &Grid) -> usize {
         let bytes = size_of::<Nearest>() + size_of::<f32>();
-        Self::layout(grid).1.iter().product::<usize>() * bytes
+        Self::vertices_over(grid) * bytes
+    }
+
+    /// Coarse vertices over `grid`.
+    pub(crate) fn vertices_over(grid: &Grid) -> usize {
+        Self::layout(grid).1.iter().product()
     }
 
     /// Transforms the occupied fine vertices `cells`; distances below the radius `band_m` are

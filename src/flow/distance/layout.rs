@@ -17,8 +17,8 @@ pub(super) struct Layout {
     pub(super) index: Index,
     /// The band's radius in cells.
     pub(super) band: i32,
-    /// At most the bytes that building takes at once.
-    pub(super) bytes: usize,
+    /// At most the bytes of what the bricks are filled from.
+    pub(super) sites: usize,
 }
 
 impl Layout {
@@ -35,7 +35,11 @@ impl Layout {
         options.check()?;
         let grid = Grid::covering(source, target, options.cell_m)?;
         let mut cells: Vec<_> = target.iter().map(|&p| grid.nearest_vertex(p)).collect();
-        cells.sort_unstable();
+        // One comparison instead of three, half of them mispredicted.
+        cells.sort_unstable_by_key(|&cell| {
+            let [x, y, z] = cell.map(u128::from);
+            x << 64 | y << 32 | z
+        });
         cells.dedup();
         let band = options.band_cells();
         let index = Index::activate(&grid, &cells, band, options.max_bytes, watch)?;
@@ -56,7 +60,7 @@ impl Layout {
             cells,
             index,
             band,
-            bytes,
+            sites,
         })
     }
 }

@@ -13,6 +13,7 @@ mod grid;
 mod layout;
 mod options;
 mod point_sites;
+mod price;
 #[cfg(test)]
 mod tests;
 
@@ -20,6 +21,7 @@ pub use bricks::Bricks;
 pub use dense::DenseChamfer;
 pub use grid::Grid;
 pub use options::{DistanceError, DistanceOptions, Metric, Sites};
+pub use price::TransformPrice;
 
 use crate::flow::Point;
 use crate::flow::watch::{Unwatched, Watch};

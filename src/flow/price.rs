@@ -1,0 +1,85 @@
+//! What an estimate will take, known before anything is accepted: memory and work.
+//!
+//! Refuses what [`super::estimate`] would refuse, for a hundredth of its time and without its
+//! memory. Work is counted in multiply-adds of the network; what is not one is counted as the
+//! multiply-adds that take as long on a CPU. Knows no device and no time: a rate turns work into
+//! seconds.
+
+use super::distance::DistanceTransform;
+use super::error::FlowError;
+use super::field::mlp::{LAID_OUT, PARAMETERS};
+use super::options::{Ego, Options};
+use super::points::Point;
+use super::preprocess::{self, Problem};
+
+/// Passes over the network that an iteration takes a point: forward, and twice that backward.
+const PASSES: f64 = 3.0;
+/// An iteration's steps beside its points (gradients added, Adam, transposes), in points.
+const STEP_POINTS: f64 = 150.0;
+/// Multiply-adds that take as long as aligning: 30 steps over 16,384 points.
+const ALIGNING: f64 = 7e9;
+/// Multiply-adds that take as long as selecting and moving a point and its results.
+const POINT: f64 = 3e4;
+/// Sets of parameters that are held at once: of the network, its transposes, its optimizer, the
+/// result, and the most chunks of gradients.
+const PARAMETER_SETS: usize = 6 + 32;
+/// Copies of the source that are held at once: selected, aligned, the trainer's, flow twice.
+const POINT_COPIES: usize = 5;
+/// Working sets, one a thread, bytes in all: 28 threads.
+const WORKING_SETS: usize = 16 << 20;
+
+/// What an estimate will take.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Price {
+    /// Source points that take part.
+    pub source_points: usize,
+    /// Target points that take part.
+    pub target_points: usize,
+    /// Bricks of the distance transform; none of a dense one.
+    pub bricks: usize,
+    /// Bytes of the distance transform: what [`super::Estimate::distance_bytes`] will be.
+    pub transform_bytes: usize,
+    /// At most the bytes that are held at once on the device, but for the problem itself.
+    pub bytes: usize,
+    /// Work: multiply-adds of the network, and what takes as long as so many.
+    pub multiply_adds: f64,
+}
+
+impl Price {
+    /// Seconds on a device that does `rate` multiply-adds a second.
+    pub fn seconds(&self, rate: f64) -> f64 {
+        self.multiply_adds / rate
+    }
+}
+
+/// Prices the estimate of `problem` by `options`, with as many iterations as
+/// [`Options::expected_iterations`].
+///
+/// # Errors
+/// [`FlowError`] where [`super::estimate`] would refuse the input.
+pub fn price(problem: &Problem, options: &Options) -> Result<Price, FlowError> {
+    let selection = preprocess::select(problem, options)?;
+    let (source_points, target_points) = (selection.source.len(), selection.target.len());
+    let transform =
+        DistanceTransform::price(&selection.source, &selection.target, &options.distance)
+            .map_err(|error| FlowError::Backend(error.into()))?;
+    let batch = options.batch.unwrap_or(source_points).min(source_points) as f64;
+    let iterations = options.expected_iterations() as f64;
+    let passes = iterations * PASSES * (batch + STEP_POINTS) + source_points as f64;
+    let aligning = match options.ego {
+        Ego::Auto => ALIGNING,
+        Ego::Off | Ego::Given(_) => 0.0,
+    };
+    let points = (source_points + target_points) as f64 * POINT;
+    Ok(Price {
+        source_points,
+        target_points,
+        bricks: transform.bricks,
+        transform_bytes: transform.bytes,
+        bytes: transform.peak_bytes
+            + PARAMETER_SETS * LAID_OUT * size_of::<f32>()
+            + (POINT_COPIES * source_points + target_points) * size_of::<Point>()
+            + WORKING_SETS,
+        multiply_adds: transform.multiply_adds + passes * PARAMETERS as f64 + aligning + points,
+    })
+}

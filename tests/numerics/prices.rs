@@ -1,0 +1,114 @@
+//! What an estimate is priced at, against what it takes.
+
+use fnsf::flow::distance::{DistanceError, Metric, Sites};
+use fnsf::flow::simulate::StreetOptions;
+use fnsf::flow::{FlowError, Unwatched, backend::BackendError, cpu::CpuBackend};
+use fnsf::flow::{Ground, Options, Preset, Problem, estimate, price};
+
+use super::scenes::{real_pair, solve, street};
+
+/// Everything beside the transform's own bytes: sites, points and the network's working sets.
+const BESIDE_BYTES: usize = 48 << 20;
+const BESIDE_SHARE: f64 = 1.5;
+
+#[test]
+fn bytes_and_bricks_are_never_below_the_truth_and_not_far_above() {
+    let simulated = Some(street(&StreetOptions::default()));
+    let real = ["av2_7fab", "kitti_0000", "small_gicp"].map(real_pair);
+    for pair in [simulated].into_iter().chain(real).flatten() {
+        let ground = pair.ground.as_ref().expect("the pair has ground masks");
+        let problem = Problem {
+            source: &pair.source,
+            target: &pair.target,
+            ground: Some([&ground.source, &ground.target]),
+        };
+        for sites in [Sites::Cells, Sites::Points] {
+            for max_points in [None, Some(5000)] {
+                let mut options = Preset::Default.options(max_points);
+                options.ground = Ground::Mask;
+                options.distance.sites = sites;
+                options.max_iterations = 0;
+                let price = price(&problem, &options).expect("it is taken");
+                let estimate = solve(&pair, &options);
+                assert_eq!(price.source_points, estimate.points);
+                assert_eq!(price.transform_bytes, estimate.distance_bytes);
+                assert!(price.bytes >= estimate.distance_bytes);
+                let most = estimate.distance_bytes as f64 * BESIDE_SHARE;
+                assert!(price.bytes <= most as usize + BESIDE_BYTES, "{price:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn work_grows_with_iterations_points_and_detail() {
+    let pair = street(&StreetOptions {
+        azimuth_steps: 400,
+        ..StreetOptions::default()
+    });
+    let problem = Problem {
+        source: &pair.source,
+        target: &pair.target,
+        ground: None,
+    };
+    let work = |options: &Options| price(&problem, options).expect("taken").multiply_adds;
+    let base = Preset::Default.options(None);
+    let change = |change: fn(&mut Options)| {
+        let mut options = base.clone();
+        change(&mut options);
+        work(&options)
+    };
+    assert!(change(|o| o.max_iterations = 300) > work(&base));
+    assert!(change(|o| o.batch = None) > work(&base));
+    assert!(change(|o| o.distance.sites = Sites::Points) > work(&base));
+    assert!(change(|o| o.max_points = Some(1000)) < work(&base));
+    assert!(work(&Preset::Paper.options(None)) > work(&base));
+    let paper = price(&problem, &Preset::Paper.options(None)).expect("taken");
+    assert!((paper.seconds(2.0) - paper.multiply_adds / 2.0).abs() < f64::EPSILON);
+}
+
+#[test]
+fn what_the_estimate_refuses_has_no_price() {
+    let cloud = [[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.5], [2.0; 3]];
+    let wide = [[0.0; 3], [1e6, 0.0, 0.0], [0.0, 1.0, 0.5]];
+    let flags = [false; 2];
+    let backend = CpuBackend::new(Some(1)).expect("threads");
+    let mut options = Preset::Default.options(None);
+    options.max_iterations = 0;
+    let mut masked = options.clone();
+    masked.ground = Ground::Mask;
+    let mut tight = options.clone();
+    tight.distance.max_bytes = 1000;
+    let mut dense = tight.clone();
+    dense.distance.metric = Metric::Chamfer;
+    let cases = [
+        (&cloud[..2], None, &options),
+        (&wide[..], None, &options),
+        (&cloud[..], None, &masked),
+        (&cloud[..], Some([&flags[..], &flags[..]]), &masked),
+        (&cloud[..], None, &tight),
+        (&cloud[..], None, &dense),
+    ];
+    for (source, ground, options) in cases {
+        let problem = Problem {
+            source,
+            target: &cloud,
+            ground,
+        };
+        let refused = price(&problem, options).expect_err("refused");
+        let truth = estimate(&backend, &problem, options, &Unwatched).expect_err("refused");
+        assert_eq!(refused.to_string(), truth.to_string());
+        assert!(refused.is_input());
+    }
+    let problem = Problem {
+        source: &cloud,
+        target: &cloud,
+        ground: None,
+    };
+    assert!(matches!(
+        price(&problem, &tight),
+        Err(FlowError::Backend(BackendError::Distance(
+            DistanceError::Memory { .. }
+        )))
+    ));
+}

@@ -1,0 +1,204 @@
+//! An optimization put down and taken up again ends as if nothing had happened; bytes that are no
+//! snapshot of it are refused.
+
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::simulate::StreetOptions;
+use fnsf::flow::{
+    Estimate, FlowError, Interrupt, Options, Preset, Problem, Progress, Snapshot, SnapshotError,
+    StopReason, Watch, estimate, resume,
+};
+use fnsf::formats::Pair;
+
+use super::scenes::street;
+
+/// Asks for a snapshot after some iterations and ends the run once it has it.
+struct PutDown {
+    after: usize,
+    done: AtomicUsize,
+    taken: Mutex<Option<Snapshot>>,
+}
+
+impl PutDown {
+    fn after(after: usize) -> Self {
+        Self {
+            after,
+            done: AtomicUsize::new(0),
+            taken: Mutex::new(None),
+        }
+    }
+
+    fn taken(&self) -> std::sync::MutexGuard<'_, Option<Snapshot>> {
+        self.taken.lock().expect("no test panics in it")
+    }
+}
+
+impl Watch for PutDown {
+    fn interrupt(&self) -> Option<Interrupt> {
+        self.taken().is_some().then_some(Interrupt::Cancelled)
+    }
+    fn progress(&self, progress: Progress) {
+        self.done.store(progress.iteration, Ordering::Relaxed);
+    }
+    fn snapshot_due(&self) -> bool {
+        self.done.load(Ordering::Relaxed) >= self.after && self.taken().is_none()
+    }
+    fn snapshot(&self, snapshot: Snapshot) {
+        *self.taken() = Some(snapshot);
+    }
+}
+
+/// Lets a run go on to its end.
+struct Onward;
+
+impl Watch for Onward {}
+
+fn small_street() -> Pair {
+    street(&StreetOptions {
+        beams: 16,
+        azimuth_steps: 400,
+        ..StreetOptions::default()
+    })
+}
+
+fn run(
+    pair: &Pair,
+    options: &Options,
+    threads: usize,
+    snapshot: Option<Snapshot>,
+    watch: &dyn Watch,
+) -> Result<Estimate, FlowError> {
+    let backend = CpuBackend::new(Some(threads)).expect("threads");
+    let problem = Problem {
+        source: &pair.source,
+        target: &pair.target,
+        ground: None,
+    };
+    match snapshot {
+        None => estimate(&backend, &problem, options, watch),
+        Some(snapshot) => resume(&backend, &problem, options, snapshot, watch),
+    }
+}
+
+/// The snapshot after so many iterations, on its way through bytes.
+fn put_down(pair: &Pair, options: &Options, from: Option<Snapshot>, after: usize) -> Snapshot {
+    let watch = PutDown::after(after);
+    let error = run(pair, options, 2, from, &watch).expect_err("it is cancelled");
+    assert!(matches!(error, FlowError::Cancelled), "{error}");
+    let snapshot = watch.taken().take().expect("a snapshot was due");
+    assert_eq!(snapshot.iterations(), after);
+    Snapshot::from_bytes(&snapshot.to_bytes()).expect("whole bytes")
+}
+
+#[test]
+fn a_run_that_was_put_down_ends_with_the_bits_of_one_that_was_not() {
+    let pair = small_street();
+    for preset in Preset::ALL {
+        let mut options = preset.options(None);
+        options.batch = options.batch.map(|_| 700);
+        let undisturbed = run(&pair, &options, 2, None, &Onward).expect("a flow");
+        let halfway = undisturbed.iterations / 2;
+        for stops in [vec![1], vec![halfway], vec![2, 3, halfway, halfway + 5]] {
+            let mut snapshot = None;
+            for after in stops {
+                snapshot = Some(put_down(&pair, &options, snapshot, after));
+            }
+            let resumed = run(&pair, &options, 1, snapshot, &Onward).expect("a flow");
+            assert!(resumed.flow == undisturbed.flow, "{preset:?}");
+            assert_eq!(resumed.iterations, undisturbed.iterations);
+            assert_eq!(resumed.best_iteration, undisturbed.best_iteration);
+            assert_eq!(resumed.best_loss.to_bits(), undisturbed.best_loss.to_bits());
+            assert_eq!(resumed.stop_reason, undisturbed.stop_reason);
+        }
+        if preset == Preset::Paper {
+            assert_eq!(undisturbed.stop_reason, StopReason::Converged);
+        }
+    }
+}
+
+#[test]
+fn taking_snapshots_changes_nothing() {
+    /// Takes one after every iteration.
+    #[derive(Default)]
+    struct Always(AtomicUsize);
+    impl Watch for Always {
+        fn snapshot_due(&self) -> bool {
+            true
+        }
+        fn snapshot(&self, _: Snapshot) {
+            self.0.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+    let pair = small_street();
+    let mut options = Preset::Default.options(None);
+    options.max_iterations = 12;
+    let always = Always::default();
+    let watched = run(&pair, &options, 2, None, &always).expect("a flow");
+    let plain = run(&pair, &options, 2, None, &Onward).expect("a flow");
+    assert!(watched.flow == plain.flow);
+    // After the last iteration there is nothing to put down.
+    assert_eq!(always.0.into_inner(), 11);
+}
+
+#[test]
+fn torn_and_altered_snapshots_are_refused() {
+    // Every byte of the header and of the end, and bytes all over the floats.
+    const EDGE: usize = 128;
+    const STRIDE: usize = 9973;
+    let pair = small_street();
+    let options = Preset::Default.options(None);
+    let bytes = put_down(&pair, &options, None, 1).to_bytes();
+    for length in 0..bytes.len() {
+        assert!(
+            Snapshot::from_bytes(&bytes[..length]).is_err(),
+            "cut at {length}"
+        );
+    }
+    let longer = [bytes.as_slice(), &[0]].concat();
+    assert!(matches!(
+        Snapshot::from_bytes(&longer),
+        Err(SnapshotError::Length { .. })
+    ));
+    let places = (0..EDGE)
+        .chain((EDGE..bytes.len()).step_by(STRIDE))
+        .chain(bytes.len() - EDGE..bytes.len());
+    let mut altered = bytes.clone();
+    for place in places {
+        for flip in [1, 0x80, 0xFF] {
+            altered[place] ^= flip;
+            assert!(Snapshot::from_bytes(&altered).is_err(), "byte {place}");
+            altered[place] ^= flip;
+        }
+    }
+    assert!(Snapshot::from_bytes(&altered).is_ok());
+}
+
+#[test]
+fn a_foreign_snapshot_is_refused() {
+    let pair = small_street();
+    let options = Preset::Default.options(None);
+    let snapshot = put_down(&pair, &options, None, 2);
+    let mut other_seed = options.clone();
+    other_seed.seed = 1;
+    let mut longer = options.clone();
+    longer.max_iterations += 1;
+    let mut other_pair = pair.clone();
+    other_pair.target[7][1] += 0.25;
+    let foreign = [
+        (&pair, other_seed),
+        (&pair, longer),
+        (&pair, Preset::Default.options(Some(500))),
+        (&pair, Preset::Paper.options(None)),
+        (&other_pair, options),
+    ];
+    for (pair, options) in foreign {
+        let error = run(pair, &options, 2, Some(snapshot.clone()), &Onward).expect_err("foreign");
+        assert!(
+            matches!(error, FlowError::Snapshot(SnapshotError::Foreign)),
+            "{error}"
+        );
+        assert!(!error.is_input());
+    }
+}
