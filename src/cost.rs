@@ -7,8 +7,8 @@ use std::sync::{Mutex, PoisonError};
 
 use crate::flow::Price;
 
-/// Floating-point operations that a nominal second does.
-const NOMINAL_RATE: f64 = 1e11;
+/// Multiply-adds of a nominal second: two cores with wide vector units.
+const NOMINAL_RATE: f64 = 2e11;
 
 /// Weight of a new measurement.
 const FRESH: f64 = 0.1;
@@ -32,7 +32,7 @@ impl CostModel {
 
     /// Nominal seconds of some work.
     pub fn nominal(price: &Price) -> f64 {
-        price.multiply_adds * 2.0 / NOMINAL_RATE
+        price.seconds(NOMINAL_RATE)
     }
 
     /// The seconds that work of `nominal` seconds takes here, by what was measured so far.

@@ -128,7 +128,8 @@ impl Admission {
         Ok(price)
     }
 
-    /// Keeps a place for a job, or says when to come back.
+    /// Keeps a place for a job, or says when to come back. Asked for no seconds it costs nothing
+    /// and says whether a body is worth reading.
     ///
     /// # Errors
     /// [`ApiError::TenantLimit`] or [`ApiError::ServerFull`].

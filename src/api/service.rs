@@ -8,13 +8,13 @@ use std::time::Duration;
 use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 
-use super::admission::Admission;
+use super::admission::{Admission, Asked};
 use super::auth::{Caller, Keys};
 use super::codec::AnswerFormat;
-use super::draft::{Draft, Request};
+use super::draft::{Draft, Promise, Request};
 use super::error::ApiError;
 use crate::blobs::{Blob, Blobs};
-use crate::job::{Job, JobId, Kind, Report, State};
+use crate::job::{Job, JobId, Kind, Priority, Report, State};
 use crate::metrics::Metrics;
 use crate::payload::{StoredCloud, StoredFlow};
 use crate::queue::{Filter, Queue};
@@ -146,6 +146,30 @@ impl Service {
         let _turn = self.compute.acquire().await.map_err(ApiError::internal)?;
         let done = tokio::task::spawn_blocking(work).await;
         done.map_err(ApiError::internal)?
+    }
+
+    /// Refuses a caller whose job would be refused however small it is, before its clouds are
+    /// read: under overload a refusal must cost little.
+    ///
+    /// # Errors
+    /// [`ApiError::Forbidden`], [`ApiError::Draining`], [`ApiError::TenantLimit`] or
+    /// [`ApiError::ServerFull`].
+    pub fn check_room(
+        &self,
+        caller: &Caller,
+        priority: Priority,
+        promise: Promise,
+    ) -> Result<(), ApiError> {
+        caller.may_write()?;
+        self.check_draining()?;
+        self.admission
+            .admit(&Asked {
+                tenant: &caller.tenant,
+                priority,
+                nominal_seconds: 0.0,
+                awaited: promise == Promise::WhileAwaited,
+            })
+            .map(drop)
     }
 
     /// Begins a job whose clouds will follow.

@@ -3,4 +3,6 @@
 mod clouds;
 mod grpc;
 mod http;
+mod kills;
+mod load;
 mod server;

@@ -17,7 +17,7 @@ use crate::api::draft::{Promise, Request as DraftRequest, Room};
 use crate::api::error::ApiError;
 use crate::api::http::Arrived;
 use crate::api::service::{Answer, Service, Waited};
-use crate::job::{Job, JobId, JobOptions, Kind};
+use crate::job::{Job, JobId, JobOptions, Kind, Priority};
 
 /// A stream of answers.
 pub(super) type Answers<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
@@ -90,8 +90,9 @@ impl Calls {
         inbound: &mut Streaming<proto::EstimateFlowRequest>,
     ) -> Result<(Arc<Job>, Option<Duration>), ApiError> {
         use proto::estimate_flow_request::Part;
-        call.caller.may_write()?;
-        self.service.check_draining()?;
+        let awaited = Promise::WhileAwaited;
+        self.service
+            .check_room(&call.caller, Priority::High, awaited)?;
         let begin = match chunks::next(&self.service, inbound)
             .await?
             .and_then(|m| m.part)
@@ -101,7 +102,9 @@ impl Calls {
         };
         let pause = u64::from(begin.progress_ms);
         let options = convert::options(begin.options)?;
-        let request = call.draft_request(options, Promise::WhileAwaited);
+        self.service
+            .check_room(&call.caller, options.priority, awaited)?;
+        let request = call.draft_request(options, awaited);
         let mut draft = self.service.draft(call.caller.clone(), request)?;
         let mut room = Room::default();
         let mut clouds = [CloudBuilder::default(), CloudBuilder::default()];
@@ -236,8 +239,8 @@ impl SceneFlow for Calls {
     ) -> Result<Response<proto::Job>, Status> {
         use proto::submit_job_request::Part;
         let call = Call::of(&request)?;
-        call.caller.may_write()?;
-        self.service.check_draining()?;
+        self.service
+            .check_room(&call.caller, Priority::High, Promise::Durable)?;
         let mut inbound = request.into_inner();
         let service = &self.service;
         let begin = match chunks::next(service, &mut inbound)

@@ -1,7 +1,7 @@
 //! Request bodies: multipart files as they come, against the service's limits.
 
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use axum::extract::multipart::{Field, Multipart, MultipartError};
 use axum::extract::{FromRequest, Request};
@@ -111,6 +111,25 @@ impl Body {
         let done = self.service.compute(read).await?;
         self.decode_seconds += began.elapsed().as_secs_f64();
         Ok(done)
+    }
+
+    /// Takes what is still coming and throws it away, so that the client, which is still sending,
+    /// gets to read its answer; a body that is too long for that is cut off.
+    pub(super) async fn drain(mut self) {
+        const LONGEST: Duration = Duration::from_secs(2);
+        const MOST: usize = 16 << 20;
+        let drained = async {
+            let mut bytes = 0;
+            while let Ok(Some(mut field)) = self.multipart.next_field().await {
+                while let Ok(Some(piece)) = field.chunk().await {
+                    bytes += piece.len();
+                    if bytes > MOST {
+                        return;
+                    }
+                }
+            }
+        };
+        let _cut_off_is_fine = timeout(LONGEST, drained).await;
     }
 
     /// All that was spent on reading files.

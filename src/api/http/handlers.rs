@@ -21,7 +21,7 @@ use crate::api::codec::AnswerFormat;
 use crate::api::draft::{Draft, Promise, Request as DraftRequest};
 use crate::api::error::ApiError;
 use crate::api::service::{Service, Waited};
-use crate::job::{Job, JobId, JobOptions, Kind, State as JobState};
+use crate::job::{Job, JobId, JobOptions, Kind, Priority, State as JobState};
 
 /// The longest long poll.
 const MAX_POLL: Duration = Duration::from_secs(60);
@@ -139,20 +139,41 @@ async fn submit_pair(
     promise: Promise,
     request: Request,
 ) -> Result<(Arc<Job>, bool), ApiError> {
-    caller.may_write()?;
-    service.check_draining()?;
     let mut body = Body::of(service, request).await?;
+    match read_pair(service, &caller, asked, promise, &mut body).await {
+        Ok(draft) => {
+            service.metrics.phase("decode", body.decode_seconds(), None);
+            draft.submit(Kind::Pair).await
+        }
+        Err(error) => {
+            body.drain().await;
+            Err(error)
+        }
+    }
+}
+
+/// Reads source, target and options. With options first, their priority counts from the start.
+async fn read_pair(
+    service: &Arc<Service>,
+    caller: &Caller,
+    asked: &Asked,
+    promise: Promise,
+    body: &mut Body,
+) -> Result<Draft, ApiError> {
+    service.check_room(caller, Priority::High, promise)?;
     let (mut files, mut options) = (PairFiles::default(), JobOptions::default());
     while let Some(part) = body.next().await? {
         match part {
             Part::Options(read) => options = read,
-            Part::File(part, name, bytes) => files.take(&part, name, bytes)?,
+            Part::File(part, name, bytes) => {
+                files.take(&part, name, bytes)?;
+            }
         }
     }
-    let mut draft = service.draft(caller, asked.draft_request(options, promise))?;
-    files.push_to(&mut body, &mut draft).await?;
-    service.metrics.phase("decode", body.decode_seconds(), None);
-    draft.submit(Kind::Pair).await
+    service.check_room(caller, options.priority, promise)?;
+    let mut draft = service.draft(caller.clone(), asked.draft_request(options, promise))?;
+    files.push_to(body, &mut draft).await?;
+    Ok(draft)
 }
 
 /// Submits a pair or a sequence as a job.
@@ -217,9 +238,32 @@ async fn submit(
     asked: &Asked,
     request: Request,
 ) -> Result<Response, ApiError> {
-    caller.may_write()?;
-    service.check_draining()?;
     let mut body = Body::of(service, request).await?;
+    let (draft, kind) = match read_job(service, &caller, asked, &mut body).await {
+        Ok(read) => read,
+        Err(error) => {
+            body.drain().await;
+            return Err(error);
+        }
+    };
+    let (job, new) = draft.submit(kind).await?;
+    service
+        .metrics
+        .phase("decode", body.decode_seconds(), Some(&job));
+    let mut response = accepted(&job, Prefer::default());
+    if !new {
+        *response.status_mut() = StatusCode::OK;
+    }
+    Ok(response)
+}
+
+async fn read_job(
+    service: &Arc<Service>,
+    caller: &Caller,
+    asked: &Asked,
+    body: &mut Body,
+) -> Result<(Draft, Kind), ApiError> {
+    service.check_room(caller, Priority::High, Promise::Durable)?;
     let mut files = PairFiles::default();
     let mut options = JobOptions::default();
     let mut frames: Option<Draft> = None;
@@ -244,27 +288,19 @@ async fn submit(
             Part::File(part, name, bytes) => files.take(&part, name, bytes)?,
         }
     }
-    let (job, new) = match frames {
+    match frames {
         Some(_) if !files.is_empty() => {
             let text = "send source and target, or frames, but not both";
-            return Err(ApiError::BadRequest(text.to_owned()));
+            Err(ApiError::BadRequest(text.to_owned()))
         }
-        Some(draft) => draft.submit(Kind::Sequence).await?,
+        Some(draft) => Ok((draft, Kind::Sequence)),
         None => {
             let request = asked.draft_request(options, Promise::Durable);
-            let mut draft = service.draft(caller, request)?;
-            files.push_to(&mut body, &mut draft).await?;
-            draft.submit(Kind::Pair).await?
+            let mut draft = service.draft(caller.clone(), request)?;
+            files.push_to(body, &mut draft).await?;
+            Ok((draft, Kind::Pair))
         }
-    };
-    service
-        .metrics
-        .phase("decode", body.decode_seconds(), Some(&job));
-    let mut response = accepted(&job, Prefer::default());
-    if !new {
-        *response.status_mut() = StatusCode::OK;
     }
-    Ok(response)
 }
 
 /// 202, with where to ask.

@@ -1,0 +1,216 @@
+//! The process is killed at any moment, again and again: every promise is kept, once.
+
+use std::collections::HashMap;
+use std::time::{Duration, Instant};
+
+use reqwest::StatusCode;
+use reqwest::multipart::{Form, Part};
+use serde_json::Value;
+
+use fnsf::formats::CloudFormat;
+
+use crate::clouds::{file, form, medium_pair, small_pair};
+use crate::server::{Folder, Server, ended};
+
+/// Kills, and jobs that are promised among them; `FNSF_KILLS` asks for more kills.
+const KILLS: usize = 25;
+/// Jobs for every kill.
+const JOBS_A_KILL: usize = 3;
+
+/// Retries are quick and snapshots frequent, so that kills fall into all of it.
+const CONFIG: &str =
+    "[queue]\nretry_delay_seconds = 1\nsnapshot_interval_ms = 50\nmax_crashes = 40\n";
+
+/// Numbers that look random and are the same every time (SplitMix64).
+struct Dice(u64);
+
+impl Dice {
+    fn below(&mut self, limit: u64) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut mixed = self.0;
+        mixed = (mixed ^ (mixed >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        (mixed ^ (mixed >> 31)) % limit
+    }
+}
+
+/// Small jobs of a few kinds, the same every time.
+fn options(job: usize) -> String {
+    let seed = job % 7;
+    match job % 5 {
+        0 => format!(r#"{{"seed": {seed}, "preset": "paper", "max_points": 2048}}"#),
+        _ => format!(r#"{{"seed": {seed}, "max_points": 512}}"#),
+    }
+}
+
+async fn submit(server: &Server, client: &reqwest::Client, job: usize) -> Option<String> {
+    let sent = client
+        .post(server.url("/v1/jobs"))
+        .header("idempotency-key", format!("job-{job}"))
+        .multipart(form(small_pair(), &options(job)))
+        .send()
+        .await
+        .ok()?;
+    if !matches!(sent.status(), StatusCode::ACCEPTED | StatusCode::OK) {
+        panic!("job {job} was refused: {:?}", sent.text().await);
+    }
+    // Acknowledged is what has arrived whole.
+    let view: Value = sent.json().await.ok()?;
+    Some(view["id"].as_str()?.to_owned())
+}
+
+async fn fetch(server: &Server, client: &reqwest::Client, id: &str) -> Vec<u8> {
+    let url = server.url(&format!("/v1/jobs/{id}/result"));
+    let answer = client.get(url).send().await.expect("an answer");
+    assert_eq!(answer.status(), StatusCode::OK, "{id}");
+    answer.bytes().await.expect("a body").to_vec()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn every_acknowledged_job_ends_once_with_the_undisturbed_result_however_often_it_is_killed() {
+    let asked = std::env::var("FNSF_KILLS")
+        .ok()
+        .and_then(|kills| kills.parse().ok());
+    let kills: usize = asked.unwrap_or(KILLS);
+    let jobs = kills * JOBS_A_KILL;
+    let mut dice = Dice(2026);
+    let folder = Folder::new();
+    let mut acknowledged: HashMap<usize, String> = HashMap::new();
+    let mut next = 0;
+    for _ in 0..kills {
+        let server = Server::start_in(&folder, CONFIG, &[]);
+        let client = reqwest::Client::new();
+        // While a few jobs are being sent, and for a while after, anything may be under way.
+        let batch = JOBS_A_KILL.min(jobs - next);
+        let life = Duration::from_millis(20 + dice.below(700));
+        // Acknowledgements are kept as they come, since the future is dropped by the kill.
+        let kept = std::sync::Mutex::new(Vec::new());
+        let sending = async {
+            for job in next..next + batch {
+                if let Some(id) = submit(&server, &client, job).await {
+                    kept.lock().expect("no panic holds it").push((job, id));
+                }
+            }
+            std::future::pending::<()>().await;
+        };
+        let _killed = tokio::time::timeout(life, sending).await;
+        server.kill();
+        for (job, id) in kept.into_inner().expect("no panic holds it") {
+            let known = acknowledged.insert(job, id.clone());
+            assert!(
+                known.is_none_or(|known| known == id),
+                "job {job} has two names"
+            );
+        }
+        next += batch;
+    }
+
+    let server = Server::start_in(&folder, CONFIG, &[]);
+    let client = reqwest::Client::new();
+    // What was never acknowledged is asked for again; what was has its name still.
+    for job in 0..jobs {
+        let id = submit(&server, &client, job).await.expect("it lives");
+        let known = acknowledged.insert(job, id.clone());
+        assert!(
+            known.is_none_or(|known| known == id),
+            "job {job} was lost or repeated"
+        );
+    }
+    let listed = list_all(&server, &client).await;
+    assert_eq!(listed, jobs, "there are jobs that nobody asked for");
+
+    let mut attempts = 0;
+    for job in 0..jobs {
+        let view = ended(&server, &acknowledged[&job]).await;
+        assert_eq!(view["state"], "succeeded", "{view}");
+        attempts += view["attempt"].as_u64().expect("a number");
+    }
+    let mut undisturbed: HashMap<String, Vec<u8>> = HashMap::new();
+    for job in 0..jobs {
+        let expected = undisturbed.entry(options(job)).or_default();
+        if expected.is_empty() {
+            let sent = client
+                .post(server.url("/v1/flow"))
+                .multipart(form(small_pair(), &options(job)))
+                .send()
+                .await
+                .expect("an answer");
+            assert_eq!(sent.status(), StatusCode::OK);
+            *expected = sent.bytes().await.expect("a body").to_vec();
+        }
+        let found = fetch(&server, &client, &acknowledged[&job]).await;
+        assert!(found == *expected, "job {job} is another flow");
+    }
+    println!("{kills} kills, {jobs} jobs, {attempts} attempts");
+}
+
+/// The number of durable jobs that the server knows.
+async fn list_all(server: &Server, client: &reqwest::Client) -> usize {
+    let (mut count, mut before) = (0, String::new());
+    loop {
+        let url = server.url(&format!("/v1/jobs?limit=500{before}"));
+        let page: Value = client
+            .get(url)
+            .send()
+            .await
+            .expect("an answer")
+            .json()
+            .await
+            .expect("JSON");
+        let jobs = page["jobs"].as_array().expect("jobs");
+        count += jobs.len();
+        match page["next"].as_str() {
+            Some(next) => before = format!("&before={next}"),
+            None => return count,
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_killed_job_goes_on_from_its_snapshot() {
+    let folder = Folder::new();
+    let server = Server::start_in(&folder, CONFIG, &[]);
+    let client = reqwest::Client::new();
+    let body = || {
+        let part = |cloud: usize| Part::bytes(file(CloudFormat::Npy, &medium_pair()[cloud]));
+        Form::new()
+            .part("source", part(0))
+            .part("target", part(1))
+            .text("options", r#"{"preset": "paper"}"#)
+    };
+    let sent = client
+        .post(server.url("/v1/jobs"))
+        .multipart(body())
+        .send()
+        .await;
+    let view: Value = sent.expect("an answer").json().await.expect("a job");
+    let id = view["id"].as_str().expect("a name").to_owned();
+    let began = Instant::now();
+    while server.metric("fnsf_snapshots_total") < 3.0 {
+        assert!(
+            began.elapsed() < Duration::from_secs(60),
+            "no snapshot: {}",
+            server.log()
+        );
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    server.kill();
+    let server = Server::start_in(&folder, CONFIG, &[]);
+    let view = ended(&server, &id).await;
+    assert_eq!(
+        (&view["state"], &view["attempt"]),
+        (&"succeeded".into(), &2.into())
+    );
+    assert!((server.metric("fnsf_jobs_resumed_total") - 1.0).abs() < f64::EPSILON);
+    assert!(server.log().contains("resumed"), "{}", server.log());
+    let whole = client
+        .post(server.url("/v1/flow"))
+        .multipart(body())
+        .send()
+        .await;
+    let whole = whole.expect("an answer").bytes().await.expect("a body");
+    assert!(
+        fetch(&server, &client, &id).await == whole,
+        "it is another flow"
+    );
+}
