@@ -161,6 +161,7 @@ async fn read(
     }
 }
 
+#[expect(clippy::needless_pass_by_value, reason = "it is for map_err")]
 fn broken(error: MultipartError) -> ApiError {
     ApiError::BadRequest(format!("the body is broken: {}", error.body_text()))
 }
