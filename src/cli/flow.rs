@@ -171,9 +171,14 @@ pub(super) fn print_report(report: &Report) -> Result<(), Failure> {
         seconds.query,
         seconds.network
     ))?;
+    let loss = report.best_loss.map(|loss| format!(", loss {loss:.4} m"));
     say(format_args!(
-        "  preset {}, seed {}: {} iterations ({}), loss {:.4} m",
-        report.preset, report.seed, report.iterations, report.stop_reason, report.best_loss
+        "  preset {}, seed {}: {} iterations ({}){}",
+        report.preset,
+        report.seed,
+        report.iterations,
+        report.stop_reason,
+        loss.unwrap_or_default()
     ))?;
     if let Some(motion) = report.ego_motion {
         let [x, y, z] = [motion[0][3], motion[1][3], motion[2][3]];
