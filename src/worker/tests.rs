@@ -38,7 +38,6 @@ impl Backend for Fragile {
         "fragile".to_owned()
     }
 
-    #[expect(clippy::panic, reason = "it is what the test is about")]
     fn transform(
         &self,
         source: &[Point],
