@@ -11,4 +11,5 @@ mod grpc;
 mod http;
 mod kills;
 mod load;
+mod readme;
 mod server;
