@@ -183,7 +183,13 @@ fn only_the_worker_sees_both_the_queue_and_the_engine() {
 #[test]
 fn each_protocol_has_one_room() {
     let http = uses_outside("api/", "api/http/", &["axum::"]);
-    let ports = ["api/admin.rs", "api/listener.rs", "api/mod.rs", "api/grpc/"];
+    let ports = [
+        "api/admin.rs",
+        "api/guard.rs",
+        "api/listener.rs",
+        "api/mod.rs",
+        "api/grpc/",
+    ];
     let stray: Vec<_> = http
         .iter()
         .filter(|line| !ports.iter().any(|port| line.starts_with(port)))

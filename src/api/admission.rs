@@ -49,6 +49,15 @@ impl Drop for Reservation {
     }
 }
 
+/// Who waits for a job.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Promise {
+    /// Somebody waits on the line: the job ends with the call.
+    WhileAwaited,
+    /// Nobody has to: the job outlives everything once it is accepted.
+    Durable,
+}
+
 /// Who asks for what.
 #[derive(Clone, Debug)]
 pub struct Asked<'a> {
@@ -58,8 +67,8 @@ pub struct Asked<'a> {
     pub priority: Priority,
     /// Nominal seconds of all its pairs.
     pub nominal_seconds: f64,
-    /// Whether somebody waits on the line.
-    pub awaited: bool,
+    /// Who waits.
+    pub promise: Promise,
 }
 
 impl Admission {
@@ -146,7 +155,7 @@ impl Admission {
         }
         let all = real(backlog.queued().seconds + *reserved + asked.nominal_seconds);
         let mut excess = all - self.limits.max_queue.as_secs_f64();
-        if asked.awaited {
+        if asked.promise == Promise::WhileAwaited {
             let ahead = backlog.ahead_of(asked.tenant, asked.priority, asked.nominal_seconds);
             let wait = real(ahead + *reserved) / devices;
             excess = excess.max((wait - self.limits.max_wait.as_secs_f64()) * devices);

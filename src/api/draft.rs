@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use tokio::sync::OwnedSemaphorePermit;
 
-use super::admission::{Asked, Reservation};
+use super::admission::{Asked, Promise, Reservation};
 use super::auth::Caller;
 use super::error::ApiError;
 use super::service::Service;
@@ -19,18 +19,9 @@ use crate::job::{Job, JobId, JobOptions, Kind};
 use crate::payload::StoredCloud;
 use crate::queue::{Idempotency, Submission, Submitted};
 
-/// Who waits for a job.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Promise {
-    /// Somebody waits on the line: the job ends with the call.
-    WhileAwaited,
-    /// Nobody has to: the job outlives everything once it is accepted.
-    Durable,
-}
-
 /// What is asked of a job before its clouds are there.
 #[derive(Clone, Debug)]
-pub struct Request {
+pub(super) struct Request {
     /// How the flow is found.
     pub options: JobOptions,
     /// Who waits.
@@ -43,8 +34,12 @@ pub struct Request {
     pub time_left: Option<Duration>,
 }
 
+/// When a request arrived.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Arrived(pub(super) Instant);
+
 /// A job that is being put together.
-pub struct Draft {
+pub(super) struct Draft {
     service: Arc<Service>,
     caller: Caller,
     request: Request,
@@ -57,11 +52,30 @@ pub struct Draft {
 }
 
 impl Draft {
-    pub(super) fn new(service: Arc<Service>, caller: Caller, request: Request) -> Self {
+    /// Begins a job whose clouds will follow.
+    ///
+    /// # Errors
+    /// [`ApiError::Forbidden`], [`ApiError::Draining`], [`ApiError::InvalidOptions`] or
+    /// [`ApiError::BadRequest`].
+    pub(super) fn begin(
+        service: &Arc<Service>,
+        caller: Caller,
+        request: Request,
+    ) -> Result<Self, ApiError> {
+        const MAX_KEY: usize = 255;
+        caller.may_write()?;
+        service.check_draining()?;
+        request.options.check()?;
+        if let Some(key) = &request.idempotency_key
+            && (key.is_empty() || key.len() > MAX_KEY)
+        {
+            let text = format!("an idempotency key has 1 to {MAX_KEY} bytes");
+            return Err(ApiError::BadRequest(text));
+        }
         let mut fingerprint = blake3::Hasher::new();
         fingerprint.update(request.options.to_json().as_bytes());
-        Self {
-            service,
+        Ok(Self {
+            service: Arc::clone(service),
             caller,
             request,
             id: JobId::fresh(),
@@ -70,11 +84,11 @@ impl Draft {
             nominal_seconds: 0.0,
             fingerprint,
             submitted: false,
-        }
+        })
     }
 
     /// Clouds so far.
-    pub fn frames(&self) -> u32 {
+    pub(super) fn frames(&self) -> u32 {
         self.frames
     }
 
@@ -82,7 +96,7 @@ impl Draft {
     ///
     /// # Errors
     /// [`ApiError`] where the pair cannot be solved here, or the store fails.
-    pub async fn push(&mut self, cloud: StoredCloud) -> Result<(), ApiError> {
+    pub(super) async fn push(&mut self, cloud: StoredCloud) -> Result<(), ApiError> {
         let service = Arc::clone(&self.service);
         service.admission.check_points(cloud.points.len())?;
         let limit = service.limits.max_frames;
@@ -126,7 +140,7 @@ impl Draft {
     ///
     /// # Errors
     /// [`ApiError`] where clouds are missing, nothing more is accepted, or the store fails.
-    pub async fn submit(mut self, kind: Kind) -> Result<(Arc<Job>, bool), ApiError> {
+    pub(super) async fn submit(mut self, kind: Kind) -> Result<(Arc<Job>, bool), ApiError> {
         match (kind, self.frames) {
             (Kind::Pair, 2) | (Kind::Sequence, 2..) => {}
             (Kind::Pair, _) => {
@@ -154,7 +168,7 @@ impl Draft {
             tenant: &self.caller.tenant,
             priority: self.request.options.priority,
             nominal_seconds: self.nominal_seconds,
-            awaited: self.request.promise == Promise::WhileAwaited,
+            promise: self.request.promise,
         })
     }
 

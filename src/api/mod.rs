@@ -12,6 +12,7 @@ mod service;
 
 mod admin;
 mod grpc;
+mod guard;
 mod http;
 mod listener;
 
@@ -27,5 +28,5 @@ use std::sync::Arc;
 /// Everything on the public port: HTTP and gRPC.
 pub fn public_router(service: &Arc<Service>) -> axum::Router {
     let calls = grpc::router(service).reset_fallback();
-    http::guarded(http::router(service).merge(calls), service)
+    guard::guarded(http::router(service).merge(calls), service)
 }

@@ -8,10 +8,9 @@ use std::time::Duration;
 use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 
-use super::admission::{Admission, Asked};
+use super::admission::{Admission, Asked, Promise};
 use super::auth::{Caller, Keys};
 use super::codec::AnswerFormat;
-use super::draft::{Draft, Promise, Request};
 use super::error::ApiError;
 use crate::blobs::{Blob, Blobs};
 use crate::job::{Job, JobId, Kind, Priority, Report, State};
@@ -176,27 +175,9 @@ impl Service {
                 tenant: &caller.tenant,
                 priority,
                 nominal_seconds: 0.0,
-                awaited: promise == Promise::WhileAwaited,
+                promise,
             })
             .map(drop)
-    }
-
-    /// Begins a job whose clouds will follow.
-    ///
-    /// # Errors
-    /// [`ApiError::Forbidden`], [`ApiError::Draining`] or [`ApiError::InvalidOptions`].
-    pub fn draft(self: &Arc<Self>, caller: Caller, request: Request) -> Result<Draft, ApiError> {
-        const MAX_KEY: usize = 255;
-        caller.may_write()?;
-        self.check_draining()?;
-        request.options.check()?;
-        if let Some(key) = &request.idempotency_key
-            && (key.is_empty() || key.len() > MAX_KEY)
-        {
-            let text = format!("an idempotency key has 1 to {MAX_KEY} bytes");
-            return Err(ApiError::BadRequest(text));
-        }
-        Ok(Draft::new(Arc::clone(self), caller, request))
     }
 
     /// The caller's job.

@@ -1,26 +1,21 @@
 //! The calls, but for the streamed sequence.
 
-use std::pin::Pin;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use tokio::sync::mpsc;
-use tokio_stream::Stream;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
 
+use super::call::{Answers, Call, no_begin};
 use super::chunks::{self, CloudBuilder};
 use super::proto::{self, scene_flow_server::SceneFlow};
 use super::{convert, sequence};
-use crate::api::auth::Caller;
-use crate::api::draft::{Promise, Request as DraftRequest, Room};
+use crate::api::admission::Promise;
+use crate::api::draft::{Draft, Room};
 use crate::api::error::ApiError;
-use crate::api::http::Arrived;
 use crate::api::service::{Answer, Service, Waited};
-use crate::job::{Job, JobId, JobOptions, Kind, Priority};
-
-/// A stream of answers.
-pub(super) type Answers<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+use crate::job::{Job, JobId, Kind, Priority};
 
 /// Messages that wait for a client that reads slowly.
 const AHEAD: usize = 4;
@@ -28,48 +23,6 @@ const AHEAD: usize = 4;
 /// The calls on a service.
 pub(super) struct Calls {
     service: Arc<Service>,
-}
-
-/// Who calls, and until when.
-#[derive(Clone)]
-pub(super) struct Call {
-    pub(super) caller: Caller,
-    pub(super) arrived: Instant,
-    time_left: Option<Duration>,
-}
-
-impl Call {
-    fn of<T>(request: &Request<T>) -> Result<Self, ApiError> {
-        let extensions = request.extensions();
-        let caller = extensions.get::<Caller>().cloned();
-        let arrived = extensions.get::<Arrived>().map(|arrived| arrived.0);
-        Ok(Self {
-            caller: caller.ok_or(ApiError::Unauthenticated)?,
-            arrived: arrived.unwrap_or_else(Instant::now),
-            time_left: convert::time_left(request.metadata()),
-        })
-    }
-
-    /// What is asked of a job of this call.
-    pub(super) fn draft_request(&self, options: JobOptions, promise: Promise) -> DraftRequest {
-        let spent = self.arrived.elapsed();
-        let awaited = promise == Promise::WhileAwaited;
-        DraftRequest {
-            options,
-            promise,
-            idempotency_key: None,
-            arrived: self.arrived,
-            time_left: self
-                .time_left
-                .filter(|_| awaited)
-                .map(|left| left.saturating_sub(spent)),
-        }
-    }
-}
-
-/// The first message of a stream has to begin it.
-pub(super) fn no_begin() -> ApiError {
-    ApiError::BadRequest("the first message is begin, and there is one of it".to_owned())
 }
 
 impl Calls {
@@ -105,7 +58,7 @@ impl Calls {
         self.service
             .check_room(&call.caller, options.priority, awaited)?;
         let request = call.draft_request(options, awaited);
-        let mut draft = self.service.draft(call.caller.clone(), request)?;
+        let mut draft = Draft::begin(&self.service, call.caller.clone(), request)?;
         let mut room = Room::default();
         let mut clouds = [CloudBuilder::default(), CloudBuilder::default()];
         while let Some(message) = chunks::next(&self.service, inbound).await? {
@@ -255,7 +208,7 @@ impl SceneFlow for Calls {
         let mut draft_request = call.draft_request(options, Promise::Durable);
         let key = begin.idempotency_key;
         draft_request.idempotency_key = (!key.is_empty()).then_some(key);
-        let mut draft = service.draft(call.caller.clone(), draft_request)?;
+        let mut draft = Draft::begin(service, call.caller.clone(), draft_request)?;
         let mut room = Room::default();
         let mut cloud: Option<CloudBuilder> = None;
         loop {

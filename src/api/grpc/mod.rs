@@ -2,6 +2,7 @@
 //!
 //! The only room that sees the protocol's types. Health and reflection are served beside it.
 
+mod call;
 mod calls;
 mod chunks;
 mod convert;

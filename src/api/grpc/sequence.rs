@@ -9,10 +9,11 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Status, Streaming};
 
-use super::calls::{Call, no_begin};
+use super::call::{Call, no_begin};
 use super::chunks::{self, CloudBuilder};
 use super::{convert, proto};
-use crate::api::draft::{Promise, Room};
+use crate::api::admission::Promise;
+use crate::api::draft::{Draft, Room};
 use crate::api::error::ApiError;
 use crate::api::service::{Awaited, Service, Waited};
 use crate::job::{JobId, JobOptions, Kind};
@@ -180,7 +181,7 @@ impl Reader {
         let request = self
             .call
             .draft_request(options.clone(), Promise::WhileAwaited);
-        let mut draft = self.service.draft(self.call.caller.clone(), request)?;
+        let mut draft = Draft::begin(&self.service, self.call.caller.clone(), request)?;
         draft.push(source).await?;
         draft.push(target).await?;
         let (job, _) = draft.submit(Kind::Pair).await?;

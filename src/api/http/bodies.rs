@@ -8,6 +8,7 @@ use axum::extract::{FromRequest, Request};
 use axum::http::header;
 use futures_util::stream::{self, Stream, StreamExt};
 use tokio::time::timeout;
+use utoipa::ToSchema;
 
 use crate::api::codec;
 use crate::api::draft::{Draft, Room};
@@ -19,6 +20,32 @@ use crate::payload::StoredCloud;
 
 /// The longest `options` part.
 const MAX_OPTIONS: usize = 64 << 10;
+
+/// The parts of a pair.
+#[derive(ToSchema)]
+#[expect(dead_code, reason = "it describes a body that is read part by part")]
+pub(super) struct PairBody {
+    /// The earlier sweep, in any format that fnsf reads; or an .npz with pc1 and pc2, and nothing
+    /// else.
+    #[schema(value_type = String, format = Binary)]
+    source: Vec<u8>,
+    /// The later sweep.
+    #[schema(value_type = Option<String>, format = Binary)]
+    target: Option<Vec<u8>>,
+    /// How the flow is found, as one JSON object.
+    options: Option<JobOptions>,
+}
+
+/// The parts of a sequence.
+#[derive(ToSchema)]
+#[expect(dead_code, reason = "it describes a body that is read part by part")]
+pub(super) struct SequenceBody {
+    /// How the flow is found, as one JSON object; before the frames.
+    options: Option<JobOptions>,
+    /// The sweeps in order, each a part named frame.
+    #[schema(value_type = Vec<String>, format = Binary)]
+    frame: Vec<Vec<u8>>,
+}
 
 /// A multipart body that is being read.
 pub(super) struct Body {

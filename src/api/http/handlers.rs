@@ -12,13 +12,13 @@ use utoipa::ToSchema;
 
 use super::answer;
 use super::bodies::{Body, PairFiles, Part};
-use super::guard::Arrived;
 use super::prefer::Prefer;
 use super::problem::Problem;
 use super::view::{self, JobView};
+use crate::api::admission::Promise;
 use crate::api::auth::Caller;
 use crate::api::codec::AnswerFormat;
-use crate::api::draft::{Draft, Promise, Request as DraftRequest};
+use crate::api::draft::{Arrived, Draft, Request as DraftRequest};
 use crate::api::error::ApiError;
 use crate::api::service::{Service, Waited};
 use crate::job::{Job, JobId, JobOptions, Kind, Priority, State as JobState};
@@ -76,7 +76,7 @@ impl Asked {
     post,
     path = "/v1/flow",
     tag = "flow",
-    request_body(content = super::openapi::PairBody, content_type = "multipart/form-data"),
+    request_body(content = super::bodies::PairBody, content_type = "multipart/form-data"),
     params(
         ("Accept" = Option<String>, Header, description = "The format of the flow; application/x-npz by default"),
         ("Prefer" = Option<String>, Header, description = "respond-async, wait=N"),
@@ -171,7 +171,11 @@ async fn read_pair(
         }
     }
     service.check_room(caller, options.priority, promise)?;
-    let mut draft = service.draft(caller.clone(), asked.draft_request(options, promise))?;
+    let mut draft = Draft::begin(
+        service,
+        caller.clone(),
+        asked.draft_request(options, promise),
+    )?;
     files.push_to(body, &mut draft).await?;
     Ok(draft)
 }
@@ -184,7 +188,7 @@ async fn read_pair(
     post,
     path = "/v1/jobs",
     tag = "jobs",
-    request_body(content = super::openapi::PairBody, content_type = "multipart/form-data"),
+    request_body(content = super::bodies::PairBody, content_type = "multipart/form-data"),
     params(("Idempotency-Key" = Option<String>, Header, description = "A repeated request with the same key finds the first one's job")),
     responses(
         (status = 202, description = "A new job; Location names it", body = JobView),
@@ -212,7 +216,7 @@ pub(super) async fn submit_job(
     post,
     path = "/v1/sequences",
     tag = "jobs",
-    request_body(content = super::openapi::SequenceBody, content_type = "multipart/form-data"),
+    request_body(content = super::bodies::SequenceBody, content_type = "multipart/form-data"),
     params(("Idempotency-Key" = Option<String>, Header, description = "A repeated request with the same key finds the first one's job")),
     responses(
         (status = 202, description = "A new job; Location names it", body = JobView),
@@ -221,14 +225,13 @@ pub(super) async fn submit_job(
     )
 )]
 pub(super) async fn submit_sequence(
-    State(service): State<Arc<Service>>,
-    Extension(caller): Extension<Caller>,
-    Extension(arrived): Extension<Arrived>,
+    service: State<Arc<Service>>,
+    caller: Extension<Caller>,
+    arrived: Extension<Arrived>,
     headers: HeaderMap,
     request: Request,
 ) -> Result<Response, ApiError> {
-    let asked = Asked::of(&headers, arrived)?;
-    submit(&service, caller, &asked, request).await
+    submit_job(service, caller, arrived, headers, request).await
 }
 
 /// Takes a body of source and target, or of frames, as a durable job.
@@ -279,7 +282,7 @@ async fn read_job(
                     Some(draft) => draft,
                     none => {
                         let request = asked.draft_request(options.clone(), Promise::Durable);
-                        none.insert(service.draft(caller.clone(), request)?)
+                        none.insert(Draft::begin(service, caller.clone(), request)?)
                     }
                 };
                 let place = format!("frame {}", draft.frames());
@@ -296,7 +299,7 @@ async fn read_job(
         Some(draft) => Ok((draft, Kind::Sequence)),
         None => {
             let request = asked.draft_request(options, Promise::Durable);
-            let mut draft = service.draft(caller.clone(), request)?;
+            let mut draft = Draft::begin(service, caller.clone(), request)?;
             files.push_to(body, &mut draft).await?;
             Ok((draft, Kind::Pair))
         }

@@ -5,7 +5,6 @@
 mod answer;
 mod bodies;
 mod events;
-mod guard;
 mod handlers;
 mod openapi;
 mod prefer;
@@ -19,8 +18,6 @@ use axum::extract::DefaultBodyLimit;
 use axum::routing::{get, post};
 
 use super::service::Service;
-
-pub(super) use guard::{Arrived, guarded};
 
 /// The routes of the HTTP door.
 pub(super) fn router(service: &Arc<Service>) -> Router {
@@ -40,7 +37,6 @@ pub(super) fn router(service: &Arc<Service>) -> Router {
         .route("/v1/jobs/{id}/result", get(answer::result))
         .merge(openapi::router())
         .method_not_allowed_fallback(problem::method)
-        .fallback(problem::no_route)
         // Bodies are counted as they come, against limits of the service's own.
         .layer(DefaultBodyLimit::disable())
         .with_state(Arc::clone(service))

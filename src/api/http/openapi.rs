@@ -4,38 +4,11 @@ use std::sync::Arc;
 
 use axum::Router;
 use utoipa::openapi::security::{Http, HttpAuthScheme, SecurityScheme};
-use utoipa::{Modify, OpenApi, ToSchema};
+use utoipa::{Modify, OpenApi};
 use utoipa_swagger_ui::SwaggerUi;
 
 use super::{answer, events, handlers};
 use crate::api::service::Service;
-use crate::job::JobOptions;
-
-/// The parts of a pair.
-#[derive(ToSchema)]
-#[expect(dead_code, reason = "it describes a body that is read part by part")]
-pub(super) struct PairBody {
-    /// The earlier sweep, in any format that fnsf reads; or an .npz with pc1 and pc2, and nothing
-    /// else.
-    #[schema(value_type = String, format = Binary)]
-    source: Vec<u8>,
-    /// The later sweep.
-    #[schema(value_type = Option<String>, format = Binary)]
-    target: Option<Vec<u8>>,
-    /// How the flow is found, as one JSON object.
-    options: Option<JobOptions>,
-}
-
-/// The parts of a sequence.
-#[derive(ToSchema)]
-#[expect(dead_code, reason = "it describes a body that is read part by part")]
-pub(super) struct SequenceBody {
-    /// How the flow is found, as one JSON object; before the frames.
-    options: Option<JobOptions>,
-    /// The sweeps in order, each a part named frame.
-    #[schema(value_type = Vec<String>, format = Binary)]
-    frame: Vec<Vec<u8>>,
-}
 
 struct Bearer;
 

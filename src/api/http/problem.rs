@@ -1,13 +1,11 @@
 //! Errors as RFC 9457 problems.
 
 use axum::Json;
-use axum::extract::Request;
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::guard;
 use crate::api::error::ApiError;
 use crate::job::JobError;
 
@@ -88,10 +86,6 @@ impl IntoResponse for ApiError {
         }
         response
     }
-}
-
-pub(super) async fn no_route(request: Request) -> Response {
-    guard::refused(&request, ApiError::NoRoute)
 }
 
 pub(super) async fn method() -> ApiError {

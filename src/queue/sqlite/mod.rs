@@ -3,6 +3,8 @@
 //! A promise is on disk before it is made (`synchronous = FULL`). One process at a time: a lock
 //! file sees to it, so that what ran when the last one died can be queued again at once.
 
+mod ends;
+mod leases;
 mod rows;
 mod schema;
 mod sweep;
@@ -248,14 +250,14 @@ impl Heart for SqliteHeart {
         let (id, attempt, options) = (self.id, self.attempt, self.options.clone());
         let progress = *locked(&self.latest);
         self.writer.write_later(move |connection, _| {
-            transitions::beat(connection, &options, id, attempt, progress)
+            leases::beat(connection, &options, id, attempt, progress)
         });
     }
 
     fn snapshot_kept(&self) {
         let (id, attempt) = (self.id, self.attempt);
         self.writer
-            .write_later(move |connection, _| transitions::snapshot_kept(connection, id, attempt));
+            .write_later(move |connection, _| leases::snapshot_kept(connection, id, attempt));
     }
 }
 
@@ -333,7 +335,7 @@ impl Queue for SqliteQueue {
     async fn cancel(&self, id: JobId) -> Result<Arc<Job>, QueueError> {
         let options = self.options.clone();
         let change = move |connection: &Connection, effects: &mut Effects| {
-            transitions::cancel(connection, effects, &options, id)
+            ends::cancel(connection, effects, &options, id)
         };
         self.writer.write(true, change).await
     }
@@ -341,7 +343,7 @@ impl Queue for SqliteQueue {
     async fn requeue(&self, id: JobId) -> Result<Arc<Job>, QueueError> {
         let options = self.options.clone();
         let change = move |connection: &Connection, effects: &mut Effects| {
-            transitions::requeue(connection, effects, &options, id)
+            ends::requeue(connection, effects, &options, id)
         };
         self.writer.write(true, change).await
     }
@@ -364,7 +366,7 @@ impl Queue for SqliteQueue {
             ready.as_mut().enable();
             let (options, name) = (self.options.clone(), Arc::clone(&worker));
             let claim = move |connection: &Connection, effects: &mut Effects| {
-                transitions::claim(connection, effects, &options, &name)
+                leases::claim(connection, effects, &options, &name)
             };
             if let Some(job) = self.writer.write(false, claim).await? {
                 return Ok(self.hold(job));
@@ -384,7 +386,7 @@ impl Queue for SqliteQueue {
             .is_some_and(|held| held.durable.load(Ordering::Relaxed));
         let options = self.options.clone();
         let change = move |connection: &Connection, effects: &mut Effects| {
-            transitions::finish(connection, effects, &options, id, attempt, outcome)
+            leases::finish(connection, effects, &options, id, attempt, outcome)
         };
         self.writer.write(durable, change).await
     }

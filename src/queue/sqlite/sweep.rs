@@ -4,8 +4,10 @@ use std::sync::Arc;
 
 use rusqlite::{Connection, OptionalExtension, params};
 
+use super::ends::{self, End};
+use super::leases;
 use super::rows::{self, COLUMNS};
-use super::transitions::{self, Effects, End};
+use super::transitions::Effects;
 use crate::clock::Timestamp;
 use crate::job::{Job, JobError, JobId, State};
 use crate::queue::{Event, QueueError, QueueOptions};
@@ -47,7 +49,7 @@ pub(super) fn sweep(
                     message: "the device gave no sign of life".to_owned(),
                     retryable: true,
                 };
-                transitions::fail(connection, effects, options, &job, error)?;
+                leases::fail(connection, effects, options, &job, error)?;
             }
             _ => forget(connection, effects, job.id)?,
         }
@@ -92,7 +94,7 @@ fn look_after_queued(
         error: Some(error),
         ..End::default()
     };
-    transitions::end(connection, effects, options, job, State::Expired, &how)?;
+    ends::end(connection, effects, options, job, State::Expired, &how)?;
     Ok(())
 }
 
@@ -129,7 +131,7 @@ pub(super) fn recover(
             .prepare_cached(sql)?
             .query_row([job.id.as_bytes()], |row| row.get(0))?;
         if job.cancel_requested {
-            transitions::end(
+            ends::end(
                 connection,
                 effects,
                 options,
@@ -148,9 +150,9 @@ pub(super) fn recover(
                 dead: true,
                 ..End::default()
             };
-            transitions::end(connection, effects, options, &job, State::Failed, &how)?;
+            ends::end(connection, effects, options, &job, State::Failed, &how)?;
         } else {
-            transitions::requeue_running(connection, effects, &job, std::time::Duration::ZERO)?;
+            leases::requeue_running(connection, effects, &job, std::time::Duration::ZERO)?;
         }
     }
     let sql = "SELECT id FROM jobs WHERE durable = 0 AND parent IS NULL AND state < 2";

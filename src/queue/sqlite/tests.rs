@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use rusqlite::params;
 use tokio::sync::mpsc;
 
-use super::{SqliteQueue, schema, sweep, transitions};
+use super::{SqliteQueue, leases, schema, sweep};
 use crate::queue::contract::{Stand, queue_contract};
 use crate::queue::{Event, Queue, QueueError, QueueOptions};
 
@@ -75,10 +75,10 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
     connection
         .execute_batch("COMMIT; ANALYZE")
         .expect("a commit");
-    let claim = plan(&connection, &transitions::claim_sql(), 3);
+    let claim = plan(&connection, &leases::claim_sql(), 3);
     assert!(claim.contains("jobs_ready"), "{claim}");
     for (sql, parameters) in [
-        (transitions::claim_sql(), 3),
+        (leases::claim_sql(), 3),
         (
             "SELECT max(virtual_finish) FROM jobs INDEXED BY jobs_tail WHERE state < 2 AND \
              kind = 0 AND tenant = ?1 AND priority = ?2"

@@ -12,18 +12,16 @@ use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use tower_http::catch_panic::CatchPanicLayer;
 
-use crate::api::error::{ApiError, Row};
-use crate::api::grpc;
-use crate::api::service::Service;
-
-/// When a request arrived.
-#[derive(Clone, Copy, Debug)]
-pub(in crate::api) struct Arrived(pub(in crate::api) Instant);
+use super::draft::Arrived;
+use super::error::{ApiError, Row};
+use super::grpc;
+use super::service::Service;
 
 /// Puts the guards before all routes of a router.
-pub(in crate::api) fn guarded(router: Router, service: &Arc<Service>) -> Router {
+pub(super) fn guarded(router: Router, service: &Arc<Service>) -> Router {
     let state = Arc::clone(service);
     router
+        .fallback(no_route)
         .layer(middleware::from_fn_with_state(
             Arc::clone(&state),
             check_key,
@@ -62,12 +60,16 @@ async fn check_key(
 }
 
 /// A refusal in the words of the door that the request came through.
-pub(super) fn refused(request: &Request, error: ApiError) -> Response {
+fn refused(request: &Request, error: ApiError) -> Response {
     if is_grpc(request) {
         grpc::status(&error).into_http::<axum::body::Body>()
     } else {
         error.into_response()
     }
+}
+
+async fn no_route(request: Request) -> Response {
+    refused(&request, ApiError::NoRoute)
 }
 
 /// Counts the answer, and the refusal where it is one.

@@ -1,0 +1,208 @@
+//! How jobs end, by themselves or because somebody asks, and how they are asked for again.
+
+use std::sync::Arc;
+
+use rusqlite::{Connection, params};
+
+use super::rows::{self, COLUMNS, state_code};
+use super::transitions::Effects;
+use crate::clock::Timestamp;
+use crate::job::{Job, JobError, JobId, Kind, State};
+use crate::queue::{Event, QueueError, QueueOptions};
+
+/// With what a job ends.
+#[derive(Debug, Default)]
+pub(super) struct End {
+    pub(super) stop_reason: Option<String>,
+    pub(super) report: Option<String>,
+    pub(super) error: Option<JobError>,
+    pub(super) dead: bool,
+}
+
+/// Ends a job that is queued or running, and its sequence with its last pair.
+pub(super) fn end(
+    connection: &Connection,
+    effects: &mut Effects,
+    options: &QueueOptions,
+    job: &Job,
+    state: State,
+    how: &End,
+) -> Result<State, QueueError> {
+    let now = Timestamp::now();
+    let kept = if job.durable {
+        options.retention
+    } else {
+        options.answered_retention
+    };
+    // A pair goes when its sequence goes.
+    let forget = job.parent.is_none().then(|| now.after(kept).as_millis());
+    let sql = format!(
+        "UPDATE jobs SET state = ?2, finished = ?3, due = ?4, stop_reason = ?5, report = ?6, \
+         error_code = ?7, error_message = ?8, error_retryable = ?9, dead = ?10, worker = NULL, \
+         delayed = 0 WHERE id = ?1 RETURNING {COLUMNS}"
+    );
+    let mut statement = connection.prepare_cached(&sql)?;
+    let error = how.error.as_ref();
+    let ended = Arc::new(statement.query_row(
+        params![
+            job.id.as_bytes(),
+            state_code(state),
+            now.as_millis(),
+            forget,
+            how.stop_reason,
+            how.report,
+            error.map(|error| error.code.as_str()),
+            error.map(|error| error.message.as_str()),
+            error.is_some_and(|error| error.retryable),
+            how.dead,
+        ],
+        rows::job,
+    )?);
+    if job.kind == Kind::Pair {
+        let place = if job.state == State::Running {
+            &mut effects.stopped
+        } else {
+            &mut effects.left
+        };
+        place.push(Arc::clone(&ended));
+    }
+    effects.changed.push(Arc::clone(&ended));
+    effects.events.push(Event::Ended(ended));
+    if let Some(parent) = job.parent {
+        let sql = format!(
+            "UPDATE jobs SET pairs_left = pairs_left - 1 WHERE id = ?1 RETURNING {COLUMNS}"
+        );
+        let mut statement = connection.prepare_cached(&sql)?;
+        let parent = statement.query_row([parent.as_bytes()], rows::job)?;
+        if parent.pairs_left == 0 {
+            end_sequence(connection, effects, options, &parent)?;
+        } else {
+            effects.changed.push(Arc::new(parent));
+        }
+    }
+    Ok(state)
+}
+
+/// Ends a sequence whose pairs have all ended: as its first pair that did not succeed.
+fn end_sequence(
+    connection: &Connection,
+    effects: &mut Effects,
+    options: &QueueOptions,
+    sequence: &Job,
+) -> Result<(), QueueError> {
+    let pairs = rows::pairs(connection, sequence.id)?;
+    let broken = pairs.iter().find(|pair| pair.state != State::Succeeded);
+    let (state, error) = match broken {
+        None => (State::Succeeded, None),
+        Some(_) if sequence.cancel_requested => (State::Cancelled, None),
+        Some(pair) => {
+            let error = pair.error.clone().map(|error| JobError {
+                message: format!("pair {}: {}", pair.place, error.message),
+                ..error
+            });
+            (pair.state, error)
+        }
+    };
+    let how = End {
+        dead: broken.is_some_and(|pair| pair.dead),
+        error,
+        ..End::default()
+    };
+    end(connection, effects, options, sequence, state, &how)?;
+    Ok(())
+}
+
+/// Asks for a job's end: at once where it waits, through its worker where it runs.
+pub(super) fn cancel(
+    connection: &Connection,
+    effects: &mut Effects,
+    options: &QueueOptions,
+    id: JobId,
+) -> Result<Arc<Job>, QueueError> {
+    let job = rows::get(connection, id)?;
+    if job.state.is_end() {
+        return Ok(Arc::new(job));
+    }
+    let sql = "UPDATE jobs SET cancel_requested = 1 WHERE id = ?1";
+    connection.prepare_cached(sql)?.execute([id.as_bytes()])?;
+    match job.kind {
+        Kind::Sequence => {
+            for pair in rows::pairs(connection, id)? {
+                if !pair.state.is_end() {
+                    cancel(connection, effects, options, pair.id)?;
+                }
+            }
+        }
+        Kind::Pair if job.state == State::Queued => {
+            end(
+                connection,
+                effects,
+                options,
+                &job,
+                State::Cancelled,
+                &End::default(),
+            )?;
+        }
+        Kind::Pair => effects.cancel.push(id),
+    }
+    let job = Arc::new(rows::get(connection, id)?);
+    effects.changed.push(Arc::clone(&job));
+    Ok(job)
+}
+
+/// Queues an ended job again; of a sequence, the pairs that did not succeed.
+pub(super) fn requeue(
+    connection: &Connection,
+    effects: &mut Effects,
+    options: &QueueOptions,
+    id: JobId,
+) -> Result<Arc<Job>, QueueError> {
+    let job = rows::get(connection, id)?;
+    if !job.state.is_end() {
+        return Err(QueueError::NotEnded(job.state));
+    }
+    let broken: Vec<Job> = match job.kind {
+        Kind::Pair => Vec::new(),
+        Kind::Sequence => rows::pairs(connection, id)?
+            .into_iter()
+            .filter(|pair| pair.state != State::Succeeded)
+            .collect(),
+    };
+    let expires = Timestamp::now().after(options.time_to_live).as_millis();
+    let sql = format!(
+        "UPDATE jobs SET state = 0, pairs_left = ?2, delayed = 0, failures = 0, crashes = 0, \
+         started = NULL, finished = NULL, deadline = NULL, expires = ?3, \
+         due = CASE WHEN kind = 0 THEN ?3 END, stop_reason = NULL, report = NULL, \
+         error_code = NULL, error_message = NULL, error_retryable = 0, dead = 0, \
+         cancel_requested = 0, iteration = NULL WHERE id = ?1 RETURNING {COLUMNS}"
+    );
+    let again = |id: JobId, left: usize| -> Result<Arc<Job>, QueueError> {
+        let mut statement = connection.prepare_cached(&sql)?;
+        let parameters = params![id.as_bytes(), left as i64, expires];
+        Ok(Arc::new(statement.query_row(parameters, rows::job)?))
+    };
+    let job = again(id, broken.len())?;
+    let mut queued = Vec::new();
+    for pair in &broken {
+        queued.push(again(pair.id, 0)?);
+    }
+    if job.kind == Kind::Pair {
+        if let Some(parent) = job.parent {
+            let sql = format!(
+                "UPDATE jobs SET pairs_left = pairs_left + 1, state = 0, finished = NULL, \
+                 due = NULL, error_code = NULL WHERE id = ?1 RETURNING {COLUMNS}"
+            );
+            let mut statement = connection.prepare_cached(&sql)?;
+            let parent = statement.query_row([parent.as_bytes()], rows::job)?;
+            effects.changed.push(Arc::new(parent));
+        }
+        queued.push(Arc::clone(&job));
+    }
+    for pair in queued {
+        effects.events.push(Event::Requeued(Arc::clone(&pair)));
+        effects.changed.push(Arc::clone(&pair));
+        effects.entered.push(pair);
+    }
+    effects.changed.push(Arc::clone(&job));
+    Ok(job)
+}

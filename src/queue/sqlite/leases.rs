@@ -1,0 +1,183 @@
+//! A job in a worker's hands: taken, kept by signs of life, put back or brought to its end.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use rusqlite::{Connection, OptionalExtension, params};
+
+use super::ends::{End, end};
+use super::rows::{self, COLUMNS};
+use super::transitions::Effects;
+use crate::clock::Timestamp;
+use crate::job::{Job, JobError, JobId, JobProgress, State};
+use crate::queue::{Committed, Event, Outcome, QueueError, QueueOptions};
+
+/// The statement that takes the next job; the test of the plan reads it too.
+pub(super) fn claim_sql() -> String {
+    format!(
+        "UPDATE jobs SET state = 1, attempt = attempt + 1, worker = ?1, due = ?2, \
+         started = coalesce(started, ?3) WHERE seq = (SELECT seq FROM jobs INDEXED BY jobs_ready \
+         WHERE state = 0 AND kind = 0 AND delayed = 0 \
+         ORDER BY priority DESC, virtual_start, seq LIMIT 1) RETURNING {COLUMNS}"
+    )
+}
+
+/// Takes the next job for `worker`.
+pub(super) fn claim(
+    connection: &Connection,
+    effects: &mut Effects,
+    options: &QueueOptions,
+    worker: &str,
+) -> Result<Option<Arc<Job>>, QueueError> {
+    let now = Timestamp::now();
+    let mut statement = connection.prepare_cached(&claim_sql())?;
+    let until = now.after(options.lease).as_millis();
+    let job = statement
+        .query_row(params![worker, until, now.as_millis()], rows::job)
+        .optional()?;
+    let Some(job) = job.map(Arc::new) else {
+        return Ok(None);
+    };
+    effects.left.push(Arc::clone(&job));
+    effects.started.push(Arc::clone(&job));
+    effects.changed.push(Arc::clone(&job));
+    if job.attempt == 1 {
+        effects.events.push(Event::Started(Arc::clone(&job)));
+    }
+    if let Some(parent) = job.parent {
+        let sql = format!(
+            "UPDATE jobs SET state = 1, started = coalesce(started, ?2) \
+             WHERE id = ?1 AND state = 0 RETURNING {COLUMNS}"
+        );
+        let mut statement = connection.prepare_cached(&sql)?;
+        let begun = statement
+            .query_row(params![parent.as_bytes(), now.as_millis()], rows::job)
+            .optional()?;
+        effects.changed.extend(begun.map(Arc::new));
+    }
+    Ok(Some(job))
+}
+
+/// Prolongs a lease and notes progress; nothing where the lease is lost.
+pub(super) fn beat(
+    connection: &Connection,
+    options: &QueueOptions,
+    id: JobId,
+    attempt: u32,
+    progress: Option<JobProgress>,
+) -> Result<(), QueueError> {
+    let sql = "UPDATE jobs SET due = ?3, iteration = coalesce(?4, iteration), \
+               max_iterations = coalesce(?5, max_iterations), loss = coalesce(?6, loss) \
+               WHERE id = ?1 AND attempt = ?2 AND state = 1";
+    connection.prepare_cached(sql)?.execute(params![
+        id.as_bytes(),
+        attempt,
+        Timestamp::now().after(options.lease).as_millis(),
+        progress.map(|progress| progress.iteration),
+        progress.map(|progress| progress.max_iterations),
+        progress.map(|progress| progress.loss),
+    ])?;
+    Ok(())
+}
+
+/// Forgets the crashes before a snapshot.
+pub(super) fn snapshot_kept(
+    connection: &Connection,
+    id: JobId,
+    attempt: u32,
+) -> Result<(), QueueError> {
+    let sql = "UPDATE jobs SET crashes = 0 WHERE id = ?1 AND attempt = ?2 AND state = 1";
+    connection
+        .prepare_cached(sql)?
+        .execute(params![id.as_bytes(), attempt])?;
+    Ok(())
+}
+
+/// Ends an attempt, if it is the one that holds the job.
+pub(super) fn finish(
+    connection: &Connection,
+    effects: &mut Effects,
+    options: &QueueOptions,
+    id: JobId,
+    attempt: u32,
+    outcome: Outcome,
+) -> Result<Committed, QueueError> {
+    let job = match rows::find(connection, id)? {
+        Some(job) if job.state == State::Running && job.attempt == attempt => job,
+        _ => return Ok(Committed::Fenced),
+    };
+    // What comes after its end was asked for is not wanted any more.
+    let outcome = if job.cancel_requested {
+        Outcome::Cancelled
+    } else {
+        outcome
+    };
+    let state = match outcome {
+        Outcome::Cancelled => {
+            let how = End::default();
+            end(connection, effects, options, &job, State::Cancelled, &how)?
+        }
+        Outcome::Succeeded {
+            stop_reason,
+            report,
+        } => {
+            let how = End {
+                stop_reason: Some(stop_reason),
+                report: Some(report),
+                ..End::default()
+            };
+            end(connection, effects, options, &job, State::Succeeded, &how)?
+        }
+        Outcome::Released => requeue_running(connection, effects, &job, Duration::ZERO)?,
+        Outcome::Failed(error) => fail(connection, effects, options, &job, error)?,
+    };
+    Ok(Committed::Yes(state))
+}
+
+/// One failure more: another attempt after a while, or the end.
+pub(super) fn fail(
+    connection: &Connection,
+    effects: &mut Effects,
+    options: &QueueOptions,
+    job: &Job,
+    error: JobError,
+) -> Result<State, QueueError> {
+    let sql = "UPDATE jobs SET failures = failures + 1 WHERE id = ?1 RETURNING failures";
+    let failures: u32 = connection
+        .prepare_cached(sql)?
+        .query_row([job.id.as_bytes()], |row| row.get(0))?;
+    if error.retryable && failures < options.max_attempts {
+        let doublings = (failures - 1).min(10);
+        let delay = options.retry_delay.saturating_mul(1 << doublings);
+        return requeue_running(connection, effects, job, delay);
+    }
+    let how = End {
+        dead: error.retryable,
+        error: Some(error),
+        ..End::default()
+    };
+    end(connection, effects, options, job, State::Failed, &how)
+}
+
+/// Puts a running job back where it was in the queue; its fence stays with the lost attempt.
+pub(super) fn requeue_running(
+    connection: &Connection,
+    effects: &mut Effects,
+    job: &Job,
+    delay: Duration,
+) -> Result<State, QueueError> {
+    let sql = format!(
+        "UPDATE jobs SET state = 0, worker = NULL, delayed = ?2, \
+         due = CASE WHEN ?2 THEN min(?3, expires) ELSE expires END \
+         WHERE id = ?1 RETURNING {COLUMNS}"
+    );
+    let until = Timestamp::now().after(delay).as_millis();
+    let mut statement = connection.prepare_cached(&sql)?;
+    let parameters = params![job.id.as_bytes(), !delay.is_zero(), until];
+    let queued = Arc::new(statement.query_row(parameters, rows::job)?);
+    effects.stopped.push(Arc::clone(&queued));
+    effects.entered.push(Arc::clone(&queued));
+    effects.changed.push(Arc::clone(&queued));
+    effects.events.push(Event::Requeued(queued));
+    Ok(State::Queued)
+}
