@@ -136,6 +136,7 @@ impl Worker {
             }
         };
         let began = Instant::now();
+        let max_iterations = work.options.max_iterations;
         let solved = self.device.solve(work).await;
         let took = began.elapsed();
         let _its_own_errors_are_logged = keeper.await;
@@ -149,7 +150,7 @@ impl Worker {
                     stop_reason = estimate.stop_reason.name(),
                     "solved"
                 );
-                let report = Report::new(&estimate, &options, device);
+                let report = Report::new(&estimate, &options, max_iterations, device);
                 Attempt::Solved(Box::new(report), StoredFlow::from(estimate))
             }
             Err(EngineError::Flow(FlowError::Cancelled)) => match lease.pulse.signal() {
@@ -339,6 +340,7 @@ impl Worker {
             (Ok(()), Ok(json)) => Outcome::Succeeded {
                 stop_reason: report.stop_reason.clone(),
                 report: json,
+                progress: report.progress(),
             },
             (Err(error), _) => {
                 tracing::error!(%error, job = %job.id, "a result was not kept");

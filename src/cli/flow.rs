@@ -119,7 +119,12 @@ impl Estimation {
         let estimate = flow::estimate(backend.as_ref(), &problem, &solver_options, terminal);
         terminal.finish();
         let estimate = estimate?;
-        let mut report = Report::new(&estimate, &options, backend.name());
+        let mut report = Report::new(
+            &estimate,
+            &options,
+            solver_options.max_iterations,
+            backend.name(),
+        );
         report.seconds.load = Some(load);
         report.seconds.total += load;
         report.peak_rss_bytes = peak_resident_bytes();

@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::options::JobOptions;
+use super::record::JobProgress;
 use crate::flow::Estimate;
 use crate::formats::matrix_rows;
 
@@ -14,6 +15,8 @@ pub struct Report {
     pub points: usize,
     /// Iterations done.
     pub iterations: usize,
+    /// Iterations at most.
+    pub max_iterations: usize,
     /// The iteration whose field is the result.
     pub best_iteration: usize,
     /// Its loss, metres; none where there was no time for an iteration.
@@ -53,11 +56,17 @@ pub struct PhaseSeconds {
 
 impl Report {
     /// The report on an estimate that `device` made with `options`.
-    pub fn new(estimate: &Estimate, options: &JobOptions, device: String) -> Self {
+    pub fn new(
+        estimate: &Estimate,
+        options: &JobOptions,
+        max_iterations: usize,
+        device: String,
+    ) -> Self {
         let seconds = estimate.seconds;
         Self {
             points: estimate.points,
             iterations: estimate.iterations,
+            max_iterations,
             best_iteration: estimate.best_iteration,
             best_loss: estimate.best_loss.is_finite().then_some(estimate.best_loss),
             stop_reason: estimate.stop_reason.name().to_owned(),
@@ -74,6 +83,18 @@ impl Report {
             },
             peak_rss_bytes: None,
         }
+    }
+}
+
+impl Report {
+    /// How far the optimization has come; none where there was no time for an iteration.
+    pub fn progress(&self) -> Option<JobProgress> {
+        let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
+        self.best_loss.map(|loss| JobProgress {
+            iteration: count(self.iterations),
+            max_iterations: count(self.max_iterations),
+            loss,
+        })
     }
 }
 
@@ -97,7 +118,7 @@ mod tests {
             seconds: crate::flow::PhaseSeconds::default(),
             distance_bytes: 0,
         };
-        let report = Report::new(&estimate, &JobOptions::default(), "cpu".to_owned());
+        let report = Report::new(&estimate, &JobOptions::default(), 150, "cpu".to_owned());
         let json = serde_json::to_string(&report).expect("JSON");
         assert_eq!(serde_json::from_str::<Report>(&json).ok(), Some(report));
     }

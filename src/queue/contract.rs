@@ -107,6 +107,11 @@ fn done() -> Outcome {
     Outcome::Succeeded {
         stop_reason: "converged".to_owned(),
         report: "{}".to_owned(),
+        progress: Some(JobProgress {
+            iteration: 9,
+            max_iterations: 150,
+            loss: 0.125,
+        }),
     }
 }
 

@@ -91,6 +91,8 @@ pub enum Outcome {
         stop_reason: String,
         /// What the solver reports, as JSON.
         report: String,
+        /// How far it has come, where there was an iteration.
+        progress: Option<Progress>,
     },
     /// It failed; a retryable failure is tried again while attempts are left.
     Failed(JobError),

@@ -327,13 +327,13 @@ async fn small_jobs_do_not_wait_behind_a_long_one_while_another_device_is_free()
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_number_of_series_does_not_grow_with_the_jobs() {
     /// `FNSF_FLOOD` asks for more.
-    const FLOOD: usize = 60;
+    const FLOOD: usize = 150;
     let asked = std::env::var("FNSF_FLOOD").ok();
     let flood = asked.and_then(|flood| flood.parse().ok()).unwrap_or(FLOOD);
     let server = Server::start(&[]);
     let client = reqwest::Client::new();
     let mut counts = Vec::new();
-    for jobs in [0, 20, flood] {
+    for jobs in [0, 100, flood] {
         let mut last = String::new();
         for _ in 0..jobs {
             last = submit(&server, &client, r#"{"max_points": 16}"#, "").await;

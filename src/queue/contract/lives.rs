@@ -19,6 +19,7 @@ pub(crate) async fn a_submitted_job_is_leased_once_and_ends_with_its_outcome(
     assert_eq!(committed, Committed::Yes(State::Succeeded));
     let ended = queue.job(&tenant("a"), job.id).await.expect("known");
     assert_eq!(ended.stop_reason.as_deref(), Some("converged"));
+    assert_eq!(ended.progress.map(|progress| progress.iteration), Some(9));
     assert!(ended.finished >= ended.started && ended.started.is_some());
     assert_eq!(finish(&queue, &lease.job, done()).await, Committed::Fenced);
     assert_eq!(queue.backlog().running().jobs, 0);

@@ -7,7 +7,7 @@ use rusqlite::{Connection, params};
 use super::rows::{self, COLUMNS, state_code};
 use super::transitions::Effects;
 use crate::clock::Timestamp;
-use crate::job::{Job, JobError, JobId, Kind, State};
+use crate::job::{Job, JobError, JobId, JobProgress, Kind, State};
 use crate::queue::{Event, QueueError, QueueOptions};
 
 /// With what a job ends.
@@ -15,6 +15,7 @@ use crate::queue::{Event, QueueError, QueueOptions};
 pub(super) struct End {
     pub(super) stop_reason: Option<String>,
     pub(super) report: Option<String>,
+    pub(super) progress: Option<JobProgress>,
     pub(super) error: Option<JobError>,
     pub(super) dead: bool,
 }
@@ -39,7 +40,9 @@ pub(super) fn end(
     let sql = format!(
         "UPDATE jobs SET state = ?2, finished = ?3, due = ?4, stop_reason = ?5, report = ?6, \
          error_code = ?7, error_message = ?8, error_retryable = ?9, dead = ?10, worker = NULL, \
-         delayed = 0 WHERE id = ?1 RETURNING {COLUMNS}"
+         delayed = 0, iteration = coalesce(?11, iteration), \
+         max_iterations = coalesce(?12, max_iterations), loss = coalesce(?13, loss) \
+         WHERE id = ?1 RETURNING {COLUMNS}"
     );
     let mut statement = connection.prepare_cached(&sql)?;
     let error = how.error.as_ref();
@@ -55,6 +58,9 @@ pub(super) fn end(
             error.map(|error| error.message.as_str()),
             error.is_some_and(|error| error.retryable),
             how.dead,
+            how.progress.map(|progress| progress.iteration),
+            how.progress.map(|progress| progress.max_iterations),
+            how.progress.map(|progress| progress.loss),
         ],
         rows::job,
     )?);

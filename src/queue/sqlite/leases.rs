@@ -120,10 +120,12 @@ pub(super) fn finish(
         Outcome::Succeeded {
             stop_reason,
             report,
+            progress,
         } => {
             let how = End {
                 stop_reason: Some(stop_reason),
                 report: Some(report),
+                progress,
                 ..End::default()
             };
             end(connection, effects, options, &job, State::Succeeded, &how)?
