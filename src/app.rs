@@ -248,6 +248,7 @@ fn service_limits(config: &LimitsConfig) -> ServiceLimits {
     ServiceLimits {
         max_upload_bytes: config.max_upload_mib << 20,
         max_uploads_bytes: config.max_uploads_mib << 20,
+        min_free_bytes: config.min_free_mib << 20,
         max_frames: config.max_frames,
         body_idle: Duration::from_secs(config.body_timeout_seconds),
         sequence_ahead: config.sequence_ahead,

@@ -19,6 +19,7 @@ use crate::job::JobId;
 /// Payloads, snapshots and results.
 #[derive(Clone, Debug)]
 pub struct Blobs {
+    folder: Arc<FilePath>,
     synced: Arc<LocalFileSystem>,
     quick: Arc<LocalFileSystem>,
 }
@@ -85,9 +86,16 @@ impl Blobs {
             Ok(LocalFileSystem::new_with_prefix(folder)?.with_automatic_cleanup(true))
         };
         Ok(Self {
+            folder: Arc::from(folder),
             synced: Arc::new(open()?.with_fsync(true)),
             quick: Arc::new(open()?),
         })
+    }
+
+    /// Bytes that can still be written; none where the system does not say.
+    pub fn free_bytes(&self) -> Option<u64> {
+        let filesystem = rustix::fs::statvfs(&*self.folder).ok()?;
+        Some(filesystem.f_bavail.saturating_mul(filesystem.f_frsize))
     }
 
     /// Writes a blob whole, over what was there.
@@ -187,6 +195,7 @@ mod tests {
     async fn blobs_come_back_and_go_with_their_job() {
         let folder = tempfile::tempdir().expect("a folder");
         let blobs = Blobs::open(folder.path()).expect("a store");
+        assert!(blobs.free_bytes().is_some_and(|bytes| bytes > 0));
         let (id, other) = (JobId::fresh(), JobId::fresh());
         let all = [
             Blob::Frame(0),

@@ -80,7 +80,8 @@ pub const PHASES: [&str; 7] = [
     "total",
 ];
 /// Why requests are refused.
-pub const REJECTIONS: [&str; 8] = [
+pub const REJECTIONS: [&str; 9] = [
+    "disk_full",
     "too_large",
     "too_many_points",
     "bad_input",

@@ -74,6 +74,9 @@ pub enum ApiError {
     /// The server has as much waiting as it may have.
     #[error("the server is full; try again in {} s", .0.as_secs())]
     ServerFull(Duration),
+    /// The disk is nearly full.
+    #[error("the server's disk is nearly full; fetch and forget results, or ask its operator")]
+    DiskFull,
     /// The server is about to stop.
     #[error("the server is about to stop; another one will answer")]
     Draining,
@@ -114,7 +117,7 @@ const fn row(
 }
 
 /// All that the doors ever say.
-const TABLE: [Row; 23] = [
+const TABLE: [Row; 24] = [
     row("bad_request", 400, 3, false, Some("bad_input")),
     row("invalid_options", 400, 3, false, Some("bad_input")),
     row("bad_input", 422, 3, false, Some("bad_input")),
@@ -136,6 +139,7 @@ const TABLE: [Row; 23] = [
     row("cancelled", 409, 1, false, None),
     row("tenant_limit", 429, 8, true, Some("tenant_limit")),
     row("server_full", 503, 14, true, Some("server_full")),
+    row("disk_full", 507, 14, true, Some("disk_full")),
     row("draining", 503, 14, true, Some("draining")),
     row("internal", 500, 13, true, None),
 ];
@@ -181,6 +185,7 @@ impl ApiError {
             Self::Cancelled(_) => "cancelled",
             Self::TenantLimit(_) => "tenant_limit",
             Self::ServerFull(_) => "server_full",
+            Self::DiskFull => "disk_full",
             Self::Draining => "draining",
             Self::Internal => "internal",
         }
@@ -196,6 +201,7 @@ impl ApiError {
         match self {
             Self::TenantLimit(after) | Self::ServerFull(after) => Some(*after),
             Self::Draining => Some(Duration::from_secs(5)),
+            Self::DiskFull => Some(Duration::from_secs(60)),
             _ => None,
         }
     }
@@ -298,6 +304,7 @@ mod tests {
             ApiError::Cancelled(id),
             ApiError::TenantLimit(second),
             ApiError::ServerFull(second),
+            ApiError::DiskFull,
             ApiError::Draining,
             ApiError::Internal,
         ];

@@ -25,6 +25,8 @@ pub struct ServiceLimits {
     pub max_upload_bytes: u64,
     /// Bytes of all bodies that are being received.
     pub max_uploads_bytes: u64,
+    /// Bytes that stay free on the disk: less, and nothing more is accepted.
+    pub min_free_bytes: u64,
     /// Frames of one sequence.
     pub max_frames: u32,
     /// Time without a byte of a body that is being received.
@@ -160,8 +162,8 @@ impl Service {
     /// read: under overload a refusal must cost little.
     ///
     /// # Errors
-    /// [`ApiError::Forbidden`], [`ApiError::Draining`], [`ApiError::TenantLimit`] or
-    /// [`ApiError::ServerFull`].
+    /// [`ApiError::Forbidden`], [`ApiError::Draining`], [`ApiError::DiskFull`],
+    /// [`ApiError::TenantLimit`] or [`ApiError::ServerFull`].
     pub fn check_room(
         &self,
         caller: &Caller,
@@ -170,6 +172,13 @@ impl Service {
     ) -> Result<(), ApiError> {
         caller.may_write()?;
         self.check_draining()?;
+        if self
+            .blobs
+            .free_bytes()
+            .is_some_and(|free| free < self.limits.min_free_bytes)
+        {
+            return Err(ApiError::DiskFull);
+        }
         self.admission
             .admit(&Asked {
                 tenant: &caller.tenant,

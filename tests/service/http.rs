@@ -455,6 +455,21 @@ async fn refusals_say_what_is_wrong_as_problems() {
 }
 
 #[tokio::test]
+async fn a_disk_that_is_nearly_full_takes_no_more_work() {
+    let server = Server::with_config("[limits]\nmin_free_mib = 1000000000000\n");
+    let answer = client()
+        .post(server.url("/v1/jobs"))
+        .multipart(form(small_pair(), "{}"));
+    let answer = answer.send().await.expect("an answer");
+    assert_eq!(answer.status(), StatusCode::INSUFFICIENT_STORAGE);
+    assert_eq!(answer.headers()["retry-after"], "60");
+    let listed = reqwest::get(server.url("/v1/jobs"))
+        .await
+        .expect("an answer");
+    assert_eq!(listed.status(), StatusCode::OK);
+}
+
+#[tokio::test]
 async fn the_documentation_names_every_route() {
     let server = Server::start(&[]);
     let document = reqwest::get(server.url("/openapi.json"))

@@ -181,8 +181,9 @@ impl SceneFlow for Calls {
         request: Request<Streaming<proto::EstimateSequenceRequest>>,
     ) -> Result<Response<Self::EstimateSequenceStream>, Status> {
         let call = Call::of(&request)?;
-        call.caller.may_write()?;
-        self.service.check_draining()?;
+        let awaited = Promise::WhileAwaited;
+        self.service
+            .check_room(&call.caller, Priority::High, awaited)?;
         let answers = sequence::run(Arc::clone(&self.service), call, request.into_inner());
         Ok(Response::new(Box::pin(answers)))
     }
