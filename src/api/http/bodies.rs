@@ -8,6 +8,8 @@ use axum::extract::{FromRequest, Request};
 use axum::http::header;
 use tokio::time::timeout;
 
+use super::metered::{Meter, metered};
+
 use crate::api::codec;
 use crate::api::draft::{Draft, Room};
 use crate::api::error::ApiError;
@@ -23,7 +25,9 @@ const MAX_OPTIONS: usize = 64 << 10;
 pub(super) struct Body {
     service: Arc<Service>,
     multipart: Multipart,
+    meter: Meter,
     room: Room,
+    has_options: bool,
     decode_seconds: f64,
 }
 
@@ -51,6 +55,7 @@ impl Body {
                 limit >> 20
             )));
         }
+        let (request, meter) = metered(request);
         let multipart = Multipart::from_request(request, &()).await.map_err(|_| {
             let text = "send multipart/form-data, as curl -F source=@a.pcd -F target=@b.pcd does";
             ApiError::UnsupportedMedia(text.to_owned())
@@ -58,27 +63,39 @@ impl Body {
         Ok(Self {
             service: Arc::clone(service),
             multipart,
+            meter,
             room: Room::default(),
+            has_options: false,
             decode_seconds: 0.0,
         })
     }
 
     /// The next part, whole.
     pub(super) async fn next(&mut self) -> Result<Option<Part>, ApiError> {
-        let idle = self.service.limits.body_idle;
-        let field = timeout(idle, self.multipart.next_field()).await;
-        let Some(field) = field.map_err(|_| ApiError::TooSlow)?.map_err(broken)? else {
+        let field = self.multipart.next_field();
+        let field = self.room.wait(&self.service, field).await?;
+        let Some(field) = field.map_err(broken)? else {
             return Ok(None);
+        };
+        self.meter.understood();
+        let mut reading = Reading {
+            service: &self.service,
+            room: &mut self.room,
+            meter: &self.meter,
         };
         let name = field.name().unwrap_or_default().to_owned();
         let file = field.file_name().map(str::to_owned);
         match name.as_str() {
+            "options" if self.has_options => {
+                Err(ApiError::BadRequest("options is there twice".to_owned()))
+            }
             "options" => {
-                let bytes = read(&self.service, &mut self.room, field, MAX_OPTIONS).await?;
+                self.has_options = true;
+                let bytes = reading.whole(field, MAX_OPTIONS).await?;
                 Ok(Some(Part::Options(JobOptions::from_json(&bytes)?)))
             }
             "source" | "target" | "frame" => {
-                let bytes = read(&self.service, &mut self.room, field, usize::MAX).await?;
+                let bytes = reading.whole(field, usize::MAX).await?;
                 Ok(Some(Part::File(name, file, bytes)))
             }
             other => Err(ApiError::BadRequest(format!(
@@ -122,6 +139,7 @@ impl Body {
             let mut bytes = 0;
             while let Ok(Some(mut field)) = self.multipart.next_field().await {
                 while let Ok(Some(piece)) = field.chunk().await {
+                    self.meter.understood();
                     bytes += piece.len();
                     if bytes > MOST {
                         return;
@@ -138,26 +156,31 @@ impl Body {
     }
 }
 
-/// Reads one part to its end, piece by piece.
-async fn read(
-    service: &Service,
-    room: &mut Room,
-    mut field: Field<'_>,
-    limit: usize,
-) -> Result<Vec<u8>, ApiError> {
-    let mut bytes = Vec::new();
-    loop {
-        let piece = timeout(service.limits.body_idle, field.chunk()).await;
-        let Some(piece) = piece.map_err(|_| ApiError::TooSlow)?.map_err(broken)? else {
-            return Ok(bytes);
-        };
-        room.take(service, piece.len())?;
-        if bytes.len() + piece.len() > limit {
-            return Err(ApiError::TooLarge(format!(
-                "a part has more than {limit} bytes"
-            )));
+/// What reading a part draws on.
+struct Reading<'a> {
+    service: &'a Service,
+    room: &'a mut Room,
+    meter: &'a Meter,
+}
+
+impl Reading<'_> {
+    /// Reads one part to its end, piece by piece.
+    async fn whole(&mut self, mut field: Field<'_>, limit: usize) -> Result<Vec<u8>, ApiError> {
+        let mut bytes = Vec::new();
+        loop {
+            let piece = self.room.wait(self.service, field.chunk()).await?;
+            let Some(piece) = piece.map_err(broken)? else {
+                return Ok(bytes);
+            };
+            self.meter.understood();
+            self.room.take(self.service, piece.len())?;
+            if bytes.len() + piece.len() > limit {
+                return Err(ApiError::TooLarge(format!(
+                    "a part has more than {limit} bytes"
+                )));
+            }
+            bytes.extend_from_slice(&piece);
         }
-        bytes.extend_from_slice(&piece);
     }
 }
 

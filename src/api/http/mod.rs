@@ -7,6 +7,8 @@ mod bodies;
 mod events;
 mod guard;
 mod handlers;
+mod metered;
+mod named;
 mod openapi;
 mod prefer;
 mod problem;
