@@ -1,8 +1,16 @@
 //! The service through its public doors: the real program, over real sockets, with real files.
 
+mod access;
+mod access_tls;
+mod attacks_connections;
+mod attacks_files;
+mod attacks_grpc;
+mod attacks_http2;
+mod attacks_requests;
 mod clouds;
 mod grpc;
 mod http;
 mod kills;
 mod load;
 mod server;
+mod wire;
