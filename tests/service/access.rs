@@ -141,7 +141,9 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
         (Method::GET, "/metrics", [404, 404, 404]),
     ];
     for (method, path) in &routes[..9] {
-        let told = expected.iter().any(|(known, at, _)| known == method && at == path);
+        let told = expected
+            .iter()
+            .any(|(known, at, _)| known == method && at == path);
         assert!(told, "{method} {path} is in no row");
     }
     for (method, path, statuses) in expected {
@@ -156,7 +158,9 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
     }
     // The admin port takes no keys: it shows no job, and listens on loopback.
     for open in ["/livez", "/readyz", "/metrics"] {
-        let answer = reqwest::get(server.admin_url(open)).await.expect("an answer");
+        let answer = reqwest::get(server.admin_url(open))
+            .await
+            .expect("an answer");
         assert_eq!(answer.status(), 200, "{open}");
         assert!(!answer.text().await.expect("text").contains(&id));
     }
@@ -212,7 +216,11 @@ async fn lists_and_keys_of_submissions_are_each_tenants_own() {
         let mut asked = Request::new(proto::ListJobsRequest::default());
         let shown = format!("Bearer {key}").parse().expect("plain text");
         asked.metadata_mut().insert("authorization", shown);
-        let listed = client(&server).await.list_jobs(asked).await.expect("a list");
+        let listed = client(&server)
+            .await
+            .list_jobs(asked)
+            .await
+            .expect("a list");
         let jobs = listed.into_inner().jobs;
         assert_eq!(jobs.len(), 1);
         assert_eq!(jobs[0].id, ids[own]);
@@ -233,7 +241,8 @@ fn showing<T>(message: T, shown: Option<&str>) -> Request<T> {
 async fn codes(server: &Server, id: &str, shown: Option<&str>) -> [Code; 9] {
     use proto::estimate_sequence_request as sequence;
     use proto::submit_job_request as submit;
-    let code = |result: Result<(), tonic::Status>| result.map_or_else(|error| error.code(), |()| Code::Ok);
+    let code =
+        |result: Result<(), tonic::Status>| result.map_or_else(|error| error.code(), |()| Code::Ok);
     let mut calls = client(server).await;
     let id = || id.to_owned();
     let options = || proto::Options {
@@ -248,25 +257,53 @@ async fn codes(server: &Server, id: &str, shown: Option<&str>) -> [Code; 9] {
             ground: Vec::new().into(),
         }
     };
-    let flow = calls.estimate_flow(showing(pair(small_pair(), options()), shown)).await;
-    let mut parts = vec![sequence::Part::Begin(sequence::Begin { options: Some(options()) })];
-    let mut jobs = vec![submit::Part::Begin(submit::Begin { options: Some(options()), ..submit::Begin::default() })];
+    let flow = calls
+        .estimate_flow(showing(pair(small_pair(), options()), shown))
+        .await;
+    let mut parts = vec![sequence::Part::Begin(sequence::Begin {
+        options: Some(options()),
+    })];
+    let mut jobs = vec![submit::Part::Begin(submit::Begin {
+        options: Some(options()),
+        ..submit::Begin::default()
+    })];
     for points in small_pair() {
         parts.push(sequence::Part::Sweep(sequence::Sweep::default()));
         parts.push(sequence::Part::Chunk(chunk(points)));
         jobs.push(submit::Part::Next(submit::NextCloud {}));
         jobs.push(submit::Part::Chunk(chunk(points)));
     }
-    let parts = parts.into_iter().map(|part| proto::EstimateSequenceRequest { part: Some(part) });
-    let jobs = jobs.into_iter().map(|part| proto::SubmitJobRequest { part: Some(part) });
-    let sequence = calls.estimate_sequence(showing(tokio_stream::iter(parts), shown)).await;
-    let submitted = calls.submit_job(showing(tokio_stream::iter(jobs), shown)).await;
-    let seen = calls.get_job(showing(proto::GetJobRequest { id: id() }, shown)).await;
-    let listed = calls.list_jobs(showing(proto::ListJobsRequest::default(), shown)).await;
-    let cancelled = calls.cancel_job(showing(proto::CancelJobRequest { id: id() }, shown)).await;
-    let requeued = calls.requeue_job(showing(proto::RequeueJobRequest { id: id() }, shown)).await;
-    let watched = calls.watch_job(showing(proto::WatchJobRequest { id: id() }, shown)).await;
-    let asked = proto::DownloadResultRequest { id: id(), first_row: 0 };
+    let parts = parts
+        .into_iter()
+        .map(|part| proto::EstimateSequenceRequest { part: Some(part) });
+    let jobs = jobs
+        .into_iter()
+        .map(|part| proto::SubmitJobRequest { part: Some(part) });
+    let sequence = calls
+        .estimate_sequence(showing(tokio_stream::iter(parts), shown))
+        .await;
+    let submitted = calls
+        .submit_job(showing(tokio_stream::iter(jobs), shown))
+        .await;
+    let seen = calls
+        .get_job(showing(proto::GetJobRequest { id: id() }, shown))
+        .await;
+    let listed = calls
+        .list_jobs(showing(proto::ListJobsRequest::default(), shown))
+        .await;
+    let cancelled = calls
+        .cancel_job(showing(proto::CancelJobRequest { id: id() }, shown))
+        .await;
+    let requeued = calls
+        .requeue_job(showing(proto::RequeueJobRequest { id: id() }, shown))
+        .await;
+    let watched = calls
+        .watch_job(showing(proto::WatchJobRequest { id: id() }, shown))
+        .await;
+    let asked = proto::DownloadResultRequest {
+        id: id(),
+        first_row: 0,
+    };
     let fetched = calls.download_result(showing(asked, shown)).await;
     [
         code(flow.map(drop)),
@@ -344,8 +381,14 @@ async fn health_is_open_and_reflection_and_unknown_calls_take_a_key() {
         assert_eq!(health, Code::Ok, "{shown:?}");
     }
     for (method, expected) in [
-        ("grpc.reflection.v1.ServerReflection/ServerReflectionInfo", Code::InvalidArgument),
-        ("grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo", Code::InvalidArgument),
+        (
+            "grpc.reflection.v1.ServerReflection/ServerReflectionInfo",
+            Code::InvalidArgument,
+        ),
+        (
+            "grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo",
+            Code::InvalidArgument,
+        ),
         ("fnsf.v1.SceneFlow/Nothing", Code::Unimplemented),
         ("fnsf.v1.Nothing/Nothing", Code::Unimplemented),
         ("nothing", Code::Unimplemented),
@@ -375,7 +418,11 @@ fn keys_that_are_weak_or_shared_and_open_doors_refuse_to_start() {
         (key("../a", WRITER), 70, "a tenant's name"),
         (key("", WRITER), 70, "a tenant's name"),
         (open.to_owned(), 2, "listen goes beyond loopback"),
-        ("listen = \"[::]:0\"\n".to_owned(), 2, "listen goes beyond loopback"),
+        (
+            "listen = \"[::]:0\"\n".to_owned(),
+            2,
+            "listen goes beyond loopback",
+        ),
     ] {
         let folder = Folder::new();
         let file = folder.path().join("fnsf.toml");
@@ -389,7 +436,10 @@ fn keys_that_are_weak_or_shared_and_open_doors_refuse_to_start() {
             .expect("it runs");
         let log = String::from_utf8_lossy(&ended.stderr);
         assert_eq!(ended.status.code(), Some(code), "{config}: {log}");
-        assert!(log.contains(said) && !log.contains(WRITER), "{config}: {log}");
+        assert!(
+            log.contains(said) && !log.contains(WRITER),
+            "{config}: {log}"
+        );
         assert!(ended.stdout.is_empty(), "{config}: it served");
     }
 }
@@ -398,7 +448,9 @@ fn keys_that_are_weak_or_shared_and_open_doors_refuse_to_start() {
 async fn a_server_without_keys_serves_everybody_on_loopback() {
     let server = Server::start(&[]);
     assert_eq!(ask(&server, &Method::POST, "/v1/jobs", None).await, 202);
-    let listed = reqwest::get(server.url("/v1/jobs")).await.expect("an answer");
+    let listed = reqwest::get(server.url("/v1/jobs"))
+        .await
+        .expect("an answer");
     let page: Value = listed.json().await.expect("a page");
     let id = page["jobs"][0]["id"].as_str().expect("a job");
     assert_eq!(ended(&server, id).await["state"], "succeeded");

@@ -19,7 +19,14 @@ const REQUEST: &[u8] = b"GET /v1/jobs HTTP/1.1\r\nhost: localhost\r\nconnection:
 /// Makes a certificate of localhost and its key; false where there is no `openssl`.
 fn certificate(folder: &Path) -> bool {
     let made = Command::new("openssl")
-        .args(["req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1"])
+        .args([
+            "req",
+            "-x509",
+            "-newkey",
+            "ec",
+            "-pkeyopt",
+            "ec_paramgen_curve:prime256v1",
+        ])
         .args(["-nodes", "-days", "2", "-subj", "/CN=localhost"])
         .args(["-addext", "subjectAltName=DNS:localhost"])
         .args(["-addext", "basicConstraints=critical,CA:FALSE"])
@@ -53,15 +60,22 @@ fn config(folder: &Folder) -> String {
 async fn secure(server: &Server, folder: &Folder, protocols: &[&str]) -> TlsStream<TcpStream> {
     let certificate = CertificateDer::from_pem_file(folder.path().join("certificate.pem"));
     let mut roots = rustls::RootCertStore::empty();
-    roots.add(certificate.expect("a certificate")).expect("a root");
+    roots
+        .add(certificate.expect("a certificate"))
+        .expect("a root");
     let provider = Arc::new(rustls::crypto::ring::default_provider());
     let mut config = rustls::ClientConfig::builder_with_provider(provider)
         .with_safe_default_protocol_versions()
         .expect("versions")
         .with_root_certificates(roots)
         .with_no_client_auth();
-    config.alpn_protocols = protocols.iter().map(|name| name.as_bytes().to_vec()).collect();
-    let stream = TcpStream::connect(&server.public).await.expect("a connection");
+    config.alpn_protocols = protocols
+        .iter()
+        .map(|name| name.as_bytes().to_vec())
+        .collect();
+    let stream = TcpStream::connect(&server.public)
+        .await
+        .expect("a connection");
     let name = ServerName::try_from("localhost").expect("a name");
     let connector = TlsConnector::from(Arc::new(config));
     connector.connect(name, stream).await.expect("a handshake")
@@ -113,7 +127,13 @@ fn a_certificate_that_cannot_be_used_refuses_to_start() {
     let file = path.join("fnsf.toml");
     std::fs::write(&file, config(&folder)).expect("a file");
     let ended = Command::new(env!("CARGO_BIN_EXE_fnsf"))
-        .args(["serve", "--listen", "127.0.0.1:0", "--admin-listen", "127.0.0.1:0"])
+        .args([
+            "serve",
+            "--listen",
+            "127.0.0.1:0",
+            "--admin-listen",
+            "127.0.0.1:0",
+        ])
         .arg("--data-dir")
         .arg(path.join("data"))
         .arg("--config")

@@ -139,17 +139,25 @@ async fn floods_of_pings_settings_and_small_data_cost_little() {
 
 #[tokio::test]
 async fn ten_thousand_headers_and_a_mebibyte_of_one_are_refused() {
-    let siege = Besieged::new("").await;
-    let many: String = (0..10_000).map(|number| format!("h{number}: 1\r\n")).collect();
+    let siege = Besieged::new("[limits]\nheader_timeout_seconds = 1\n").await;
+    let many: String = (0..10_000)
+        .map(|number| format!("h{number}: 1\r\n"))
+        .collect();
     let long = format!("long: {}\r\n", "a".repeat(1 << 20));
     for headers in [many, long] {
         let request = format!("GET /openapi.json HTTP/1.1\r\nhost: x\r\n{headers}\r\n");
         let answer = crate::wire::exchange(&siege.server, request.as_bytes());
-        assert!(matches!(crate::wire::status(&answer), Some(431) | None), "{answer}");
+        assert!(
+            matches!(crate::wire::status(&answer), Some(431) | None),
+            "{answer}"
+        );
     }
     let path = "a".repeat(1 << 20);
     let request = format!("GET /{path} HTTP/1.1\r\nhost: x\r\n\r\n");
     let answer = crate::wire::exchange(&siege.server, request.as_bytes());
-    assert!(matches!(crate::wire::status(&answer), Some(414 | 431) | None), "{answer}");
+    assert!(
+        matches!(crate::wire::status(&answer), Some(414 | 431) | None),
+        "{answer}"
+    );
     siege.stands().await;
 }

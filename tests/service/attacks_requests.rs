@@ -48,17 +48,29 @@ async fn a_name_that_is_no_jobs_is_not_found_whatever_it_holds() {
             let short = name.chars().take(60).collect::<String>();
             if status(&answer) == Some(400) {
                 // Not a request: the path has bytes that no path has.
-                assert!(!name.is_ascii() || name.contains(['{', '\'']), "{short}: {answer}");
+                assert!(
+                    !name.is_ascii() || name.contains(['{', '\'']),
+                    "{short}: {answer}"
+                );
                 continue;
             }
-            assert_eq!(status(&answer), Some(404), "{method} {short}{rest}: {answer}");
-            assert!(answer.contains("application/problem+json"), "{short}: {answer}");
+            assert_eq!(
+                status(&answer),
+                Some(404),
+                "{method} {short}{rest}: {answer}"
+            );
+            assert!(
+                answer.contains("application/problem+json"),
+                "{short}: {answer}"
+            );
             assert!(!answer.contains("set-cookie"), "{answer}");
         }
     }
     for query in ["?wait=-1", "?wait=x", "?nonsense=1", "?wait=1&wait=2"] {
         let url = format!("/v1/jobs/0192f0c1-7b7a-7000-8000-000000000000{query}");
-        let answer = reqwest::get(siege.server.url(&url)).await.expect("an answer");
+        let answer = reqwest::get(siege.server.url(&url))
+            .await
+            .expect("an answer");
         assert_eq!(answer.status(), StatusCode::BAD_REQUEST, "{query}");
     }
     for (query, expected) in [
@@ -80,7 +92,7 @@ async fn a_name_that_is_no_jobs_is_not_found_whatever_it_holds() {
 #[tokio::test]
 async fn options_that_are_deep_huge_doubled_or_wrong_are_refused_by_name() {
     let siege = Besieged::new("").await;
-    let deep = |open: &str| format!(r#"{{"ego": {}"#, open.repeat(20_000));
+    let deep = |open: &str| format!(r#"{{"ego": {}"#, open.repeat(10_000));
     let large = format!(r#"{{"device": "{}"}}"#, "a".repeat(100 << 10));
     for (options, expected) in [
         (deep("["), 400),
@@ -103,8 +115,14 @@ async fn options_that_are_deep_huge_doubled_or_wrong_are_refused_by_name() {
         (r#"{"range_m": NaN}"#.to_owned(), 400),
         (r#"{"deadline_ms": 18446744073709551615}"#.to_owned(), 400),
         (r#"{"deadline_ms": 0}"#.to_owned(), 400),
-        (r#"{"ego": [[1e308,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}"#.to_owned(), 400),
-        (r#"{"ego": [[0,0,0,0],[0,0,0,0],[0,0,0,0],[0,0,0,0]]}"#.to_owned(), 400),
+        (
+            r#"{"ego": [[1e308,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}"#.to_owned(),
+            400,
+        ),
+        (
+            r#"{"ego": [[0,0,0,0],[0,0,0,0],[0,0,0,0],[0,0,0,0]]}"#.to_owned(),
+            400,
+        ),
         (r#"{"preset": "\u0000"}"#.to_owned(), 400),
         (r#"{"iterations": 1000000000}"#.to_owned(), 400),
         (r#"{"layers": 1000000000}"#.to_owned(), 400),
@@ -121,7 +139,10 @@ async fn options_that_are_deep_huge_doubled_or_wrong_are_refused_by_name() {
         assert_eq!(answer.status(), expected, "{short}");
         if expected != 200 {
             let problem: Value = answer.json().await.expect("a problem");
-            assert!(!problem["detail"].as_str().unwrap_or_default().is_empty(), "{problem}");
+            assert!(
+                !problem["detail"].as_str().unwrap_or_default().is_empty(),
+                "{problem}"
+            );
         }
     }
     let twice = form(small_pair(), SMALL).text("options", SMALL);
@@ -132,7 +153,12 @@ async fn options_that_are_deep_huge_doubled_or_wrong_are_refused_by_name() {
         .await
         .expect("an answer");
     assert_eq!(answer.status(), StatusCode::BAD_REQUEST);
-    for prefer in ["wait=18446744073709551615", "wait=99999999999999999999", "wait=-1", "=;,=,"] {
+    for prefer in [
+        "wait=18446744073709551615",
+        "wait=99999999999999999999",
+        "wait=-1",
+        "=;,=,",
+    ] {
         let answer = reqwest::Client::new()
             .post(siege.server.url("/v1/flow"))
             .header("prefer", prefer)
@@ -154,7 +180,11 @@ async fn nothing_that_a_client_sends_forges_a_line_of_the_log() {
         let siege = Besieged::with("", &arguments).await;
         let bytes = file(CloudFormat::Npy, &small_pair()[0]);
         let named = |bytes: &[u8]| Part::bytes(bytes.to_vec()).file_name(hostile.clone());
-        let pair = |source: &[u8]| Form::new().part("source", named(source)).part("target", named(&bytes));
+        let pair = |source: &[u8]| {
+            Form::new()
+                .part("source", named(source))
+                .part("target", named(&bytes))
+        };
         for path in ["/v1/flow", "/v1/jobs"] {
             for body in [
                 pair(&bytes).text("options", SMALL),
@@ -168,26 +198,49 @@ async fn nothing_that_a_client_sends_forges_a_line_of_the_log() {
                 assert!(!sent.await.expect("an answer").status().is_server_error());
             }
         }
-        let [source, target] = small_pair().each_ref().map(|points| file(CloudFormat::Npy, points));
-        let body = multipart(&[("options", SMALL.as_bytes()), ("source", &source), ("target", &target)]);
-        for key in ["\"level\":\"ERROR\"", "a\u{1b}[31mb", "a\tb", "\u{e9}\u{202e}"] {
+        let [source, target] = small_pair()
+            .each_ref()
+            .map(|points| file(CloudFormat::Npy, points));
+        let body = multipart(&[
+            ("options", SMALL.as_bytes()),
+            ("source", &source),
+            ("target", &target),
+        ]);
+        for key in [
+            "\"level\":\"ERROR\"",
+            "a\u{1b}[31mb",
+            "a\tb",
+            "\u{e9}\u{202e}",
+        ] {
             let mut bytes = post(
                 "/v1/jobs?a=%0a%7b%22level%22",
-                &format!("idempotency-key: {key}\r\nconnection: close\r\ncontent-length: {}\r\n\r\n", body.len()),
+                &format!(
+                    "idempotency-key: {key}\r\nconnection: close\r\ncontent-length: {}\r\n\r\n",
+                    body.len()
+                ),
             )
             .into_bytes();
             bytes.extend(&body);
-            assert!(status(&exchange(&siege.server, &bytes)).is_some(), "{key:?}");
+            assert!(
+                status(&exchange(&siege.server, &bytes)).is_some(),
+                "{key:?}"
+            );
         }
         siege.stands().await;
         let log = siege.server.log();
         let whole = log.rsplit_once('\n').map_or("", |(whole, _)| whole);
         assert!(whole.lines().count() > 10, "nothing is logged");
         for line in whole.lines() {
-            assert!(!line.starts_with(FORGED) && !line.contains('\u{1b}'), "{line:?}");
+            assert!(
+                !line.starts_with(FORGED) && !line.contains('\u{1b}'),
+                "{line:?}"
+            );
             if format == "json" {
                 let entry: Value = serde_json::from_str(line).expect(line);
-                assert!(entry["level"].is_string() && entry["message"] != "forged", "{line}");
+                assert!(
+                    entry["level"].is_string() && entry["message"] != "forged",
+                    "{line}"
+                );
             }
         }
     }
@@ -222,7 +275,10 @@ async fn keys_are_never_logged_nor_printed() {
         .output()
         .expect("it runs");
     let said = String::from_utf8_lossy(&printed.stdout).into_owned();
-    assert!(printed.status.success() && said.contains("tenant = \"a\""), "{said}");
+    assert!(
+        printed.status.success() && said.contains("tenant = \"a\""),
+        "{said}"
+    );
     let all = said + &String::from_utf8_lossy(&printed.stderr);
     assert!(!all.contains("horse"), "{all}");
 }

@@ -1,7 +1,7 @@
 //! Bytes on the wire that no well-behaved client would send, and what a server must be afterwards.
 
 use std::io::{Read, Write};
-use std::net::{Shutdown, TcpStream};
+use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
 use reqwest::StatusCode;
@@ -71,12 +71,11 @@ pub(crate) fn connect(server: &Server) -> TcpStream {
     stream
 }
 
-/// Sends bytes, ends the sending side, and takes all that comes back until the server closes.
+/// Sends bytes and takes all that comes back until the server closes.
 pub(crate) fn exchange(server: &Server, bytes: &[u8]) -> String {
     let mut stream = connect(server);
     // A server that has refused already need not read the rest.
     let _refused_early = stream.write_all(bytes);
-    let _closed_early = stream.shutdown(Shutdown::Write);
     until_closed(stream)
 }
 
@@ -162,9 +161,7 @@ impl Frames {
         stream
             .write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n")
             .expect("sent");
-        stream
-            .write_all(&frame(SETTINGS, 0, 0, &[]))
-            .expect("sent");
+        stream.write_all(&frame(SETTINGS, 0, 0, &[])).expect("sent");
         Self { stream }
     }
 
