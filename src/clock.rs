@@ -13,7 +13,7 @@ impl Timestamp {
     /// This moment.
     pub fn now() -> Self {
         let since = SystemTime::now().duration_since(UNIX_EPOCH);
-        Self(since.map_or(0, |since| millis(since)))
+        Self(since.map_or(0, millis))
     }
 
     /// From milliseconds since 1970.

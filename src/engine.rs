@@ -61,9 +61,18 @@ pub enum EngineError {
 /// Opens a device's backend; called again after a panic.
 pub type Opener = Box<dyn Fn() -> Result<Box<dyn Backend>, BackendError> + Send>;
 
+/// What a device gives.
+#[derive(Debug)]
+pub struct Solved {
+    /// The flow.
+    pub estimate: Estimate,
+    /// What the device is, as reports show it.
+    pub device: String,
+}
+
 struct Command {
     work: Work,
-    reply: oneshot::Sender<Result<Estimate, EngineError>>,
+    reply: oneshot::Sender<Result<Solved, EngineError>>,
 }
 
 /// The way to a device's thread.
@@ -115,7 +124,7 @@ impl Device {
     ///
     /// # Errors
     /// [`EngineError`]; the device is ready for the next pair, or says otherwise in its health.
-    pub async fn solve(&self, work: Work) -> Result<Estimate, EngineError> {
+    pub async fn solve(&self, work: Work) -> Result<Solved, EngineError> {
         let gone = || EngineError::Broken("its thread has ended".to_owned());
         let (reply, answer) = oneshot::channel();
         let command = Command { work, reply };
@@ -221,7 +230,13 @@ fn work_until_panic(
         let solved = catch_unwind(AssertUnwindSafe(|| solve(backend, work)));
         busy.end();
         let (answer, panicked) = match solved {
-            Ok(answer) => (answer.map_err(EngineError::from), None),
+            Ok(answer) => {
+                let solved = answer.map(|estimate| Solved {
+                    estimate,
+                    device: backend.name(),
+                });
+                (solved.map_err(EngineError::from), None)
+            }
             Err(panic) => {
                 let message = message(panic.as_ref());
                 (Err(EngineError::Panicked(message)), Some(()))

@@ -143,7 +143,7 @@ impl Metrics {
             queue_seconds: seconds(),
             run_seconds: seconds(),
             phase_seconds: Family::new_with_constructor(seconds as fn() -> Seconds),
-            iterations: Histogram::new(ITERATIONS.into_iter()),
+            iterations: Histogram::new(ITERATIONS),
             stop_reason: Family::default(),
             queue_depth: Family::default(),
             queue_work_seconds: Float::default(),
@@ -158,7 +158,7 @@ impl Metrics {
             upload_bytes: Counter::default(),
             snapshots: Counter::default(),
             resumed: Counter::default(),
-            prediction_ratio: Histogram::new(RATIOS.into_iter()),
+            prediction_ratio: Histogram::new(RATIOS),
         };
         metrics.fill(devices);
         metrics.registered()

@@ -17,7 +17,7 @@ use self::job_watch::JobWatch;
 use crate::blobs::{Blob, BlobError, Blobs, Sync};
 use crate::clock::Timestamp;
 use crate::cost::CostModel;
-use crate::engine::{Device, EngineError, Work};
+use crate::engine::{Device, EngineError, Health, Solved, Work};
 use crate::flow::{Estimate, FlowError, Snapshot};
 use crate::job::{Job, JobError, JobOptions, Report};
 use crate::metrics::Metrics;
@@ -113,7 +113,7 @@ impl Worker {
         tokio::select! {
             biased;
             () = self.drain.stop.cancelled() => false,
-            ready = health.wait_for(|health| *health == crate::engine::Health::Ready) => ready.is_ok(),
+            ready = health.wait_for(|health| *health == Health::Ready) => ready.is_ok(),
         }
     }
 
@@ -139,7 +139,7 @@ impl Worker {
         let _its_own_errors_are_logged = keeper.await;
         let released = self.drain.release.is_cancelled();
         match solved {
-            Ok(estimate) => {
+            Ok(Solved { estimate, device }) => {
                 self.measure(job, &estimate, took);
                 tracing::info!(
                     seconds = took.as_secs_f64(),
@@ -147,7 +147,7 @@ impl Worker {
                     stop_reason = estimate.stop_reason.name(),
                     "solved"
                 );
-                let report = Report::new(&estimate, &options, self.device.name().to_owned());
+                let report = Report::new(&estimate, &options, device);
                 Attempt::Solved(Box::new(report), StoredFlow::from(estimate))
             }
             Err(EngineError::Flow(FlowError::Cancelled)) => match lease.pulse.signal() {

@@ -1,37 +1,56 @@
-//! `fnsf demo`: the main job on a fresh machine.
+//! `fnsf demo`: the main job on a fresh machine, through the service, over a real socket.
 
 use std::path::PathBuf;
 
 use anyhow::Context;
 use clap::Args;
+use serde_json::Value;
 
+use super::client::{Client, Part};
 use super::eval::print_score;
 use super::failure::Failure;
-use super::flow::{Estimation, Loading};
+use super::files;
+use super::flow::print_report;
 use super::output::say;
 use super::synth::labelled;
+use super::terminal::Terminal;
+use crate::app::App;
+use crate::config::Config;
 use crate::flow::simulate::{Street, StreetOptions};
-use crate::formats::FlowFile;
+use crate::flow::{Progress, Watch};
+use crate::formats::{FlowFile, Pair, read_flow, rigid_motion, write_pair_npz};
+use crate::job::{GroundChoice, JobOptions, Report};
+use crate::picture::{self, TopDown, TopDownOptions};
 use crate::text::grouped;
 
-/// Simulate a street, estimate its flow, print the error and draw it.
+/// Start the service, send it a simulated street, print the flow's error and draw it.
+///
+/// The service runs inside this command, on a free port, with its data in a temporary folder.
 #[derive(Debug, Args)]
 pub(super) struct Demo {
     /// A folder for the flow and the picture
     #[arg(short, long, value_name = "DIR", default_value = "demo")]
     output: PathBuf,
-    #[command(flatten)]
-    estimation: Estimation,
+    /// Another seed is another street
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    seed: u64,
+}
+
+/// A flow that has come back, and how it was found.
+struct Answer {
+    bytes: Vec<u8>,
+    flow: FlowFile,
+    report: Report,
 }
 
 impl Demo {
     pub(super) fn run(&self) -> Result<(), Failure> {
         let street = Street::new(&StreetOptions {
-            seed: self.estimation.seed,
+            seed: self.seed,
             ..StreetOptions::default()
-        })
-        .map_err(Failure::internal)?;
-        let mut pair = labelled(street.pair(0).map_err(Failure::internal)?);
+        });
+        let street = street.and_then(|street| street.pair(0));
+        let mut pair = labelled(street.map_err(Failure::internal)?);
         say(format_args!(
             "a simulated street: {} points, then {}, 0.1 s apart",
             grouped(pair.source.len()),
@@ -40,32 +59,126 @@ impl Demo {
         std::fs::create_dir_all(&self.output)
             .with_context(|| format!("cannot make {}", self.output.display()))
             .map_err(Failure::internal)?;
+        let truth = pair.truth.take().unwrap_or_default();
 
-        let loading = Loading::begin();
-        let estimation = self.estimation.clone().masking_ground();
-        let solved = estimation.solve(&pair, &loading)?;
-        solved.report.print()?;
-
+        let answer = self.through_the_service(&pair)?;
+        print_report(&answer.report)?;
         let flow = self.output.join("flow.npz");
         let picture = self.output.join("flow.png");
-        solved.write(&pair, &flow)?;
-        solved.draw(&pair, &picture)?;
+        files::write(&flow, |file| std::io::Write::write_all(file, &answer.bytes))?;
+        draw(&pair, &answer, &picture)?;
         say(format_args!(
             "  wrote {} and {}",
             flow.display(),
             picture.display()
         ))?;
-
         say(format_args!(
             "against the simulator's truth, ground left out:"
         ))?;
-        let truth = pair.truth.take().unwrap_or_default();
-        let estimate = solved.estimate;
-        let flow = FlowFile {
-            flow: estimate.flow,
-            valid: Some(estimate.valid),
-            dynamic: estimate.dynamic,
-        };
-        print_score(&flow, &truth, &pair)
+        print_score(&answer.flow, &truth, &pair)
     }
+
+    fn through_the_service(&self, pair: &Pair) -> Result<Answer, Failure> {
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .enable_all()
+            .build()
+            .map_err(Failure::internal)?;
+        let folder = std::env::temp_dir().join(format!("fnsf-demo-{}", std::process::id()));
+        let answered = runtime.block_on(self.ask(pair, folder.clone()));
+        let _left_to_the_system = std::fs::remove_dir_all(folder);
+        answered.map_err(Failure::internal)
+    }
+
+    /// Starts a server, sends the pair, follows its job, fetches its flow, and stops the server.
+    async fn ask(&self, pair: &Pair, data_dir: PathBuf) -> anyhow::Result<Answer> {
+        let any_port = std::net::SocketAddr::from(([127, 0, 0, 1], 0));
+        let app = App::start(Config {
+            listen: any_port,
+            admin_listen: any_port,
+            data_dir,
+            ..Config::default()
+        })
+        .await?;
+        app.ready().await?;
+        say(format_args!(
+            "the service runs at http://{}; POST /v1/jobs",
+            app.public_address()
+        ))
+        .map_err(|failure| anyhow::anyhow!("{failure}"))?;
+        let mut file = Vec::new();
+        write_pair_npz(pair, &mut file)?;
+        let options = JobOptions {
+            seed: self.seed,
+            ground: GroundChoice::Mask,
+            ..JobOptions::default()
+        };
+        let client = Client::new(app.public_address());
+        let options = options.to_json();
+        let parts = [
+            Part {
+                name: "options",
+                file: None,
+                bytes: options.as_bytes(),
+            },
+            Part {
+                name: "source",
+                file: Some("pair.npz"),
+                bytes: &file,
+            },
+        ];
+        let job = client.post("/v1/jobs", &parts).await?;
+        let link = |name: &str| job["links"][name].as_str().unwrap_or_default().to_owned();
+        let terminal = Terminal::new();
+        let mut last = Value::Null;
+        client
+            .follow(&link("events"), |event, data| match event {
+                "progress" => terminal.progress(progress(data)),
+                _ => last = data.clone(),
+            })
+            .await?;
+        terminal.finish();
+        if last["state"] != "succeeded" {
+            let why = last["error"]["message"]
+                .as_str()
+                .unwrap_or("without a word");
+            return Err(anyhow::anyhow!("the job ended as {}: {why}", last["state"]));
+        }
+        let bytes = client.get(&link("result")).await?.to_vec();
+        app.drain().await;
+        Ok(Answer {
+            flow: read_flow(&bytes, None)?,
+            report: serde_json::from_value(last["report"].take())?,
+            bytes,
+        })
+    }
+}
+
+fn progress(data: &Value) -> Progress {
+    let count = |key: &str| data[key].as_u64().unwrap_or(0) as usize;
+    Progress {
+        iteration: count("iteration"),
+        max_iterations: count("max_iterations"),
+        loss: data["loss"].as_f64().unwrap_or(0.0),
+    }
+}
+
+fn draw(pair: &Pair, answer: &Answer, path: &std::path::Path) -> Result<(), Failure> {
+    let ego = answer
+        .report
+        .ego_motion
+        .as_ref()
+        .map(rigid_motion)
+        .transpose();
+    let ego = ego.map_err(Failure::internal)?;
+    let all = vec![true; pair.source.len()];
+    let image = picture::top_down(
+        &TopDown {
+            source: &pair.source,
+            flow: &answer.flow.flow,
+            valid: answer.flow.valid.as_deref().unwrap_or(&all),
+            ego: ego.as_ref(),
+        },
+        &TopDownOptions::default(),
+    );
+    files::write(path, |file| picture::write_png(&image, file))
 }

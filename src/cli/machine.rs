@@ -2,24 +2,17 @@
 
 use crate::flow::backend::{Backend, BackendError};
 use crate::flow::cpu::CpuBackend;
+use crate::job::DeviceChoice;
 
-/// Where the work is done.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub(super) enum Device {
-    /// The fastest that is there: the CPU, in this version.
-    Auto,
-    /// The CPU's vector units, on all cores.
-    Cpu,
-}
-
-impl Device {
-    /// Opens the device; `threads` bounds the CPU's.
-    pub(super) fn open(self, threads: Option<usize>) -> Result<Box<dyn Backend>, BackendError> {
-        match self {
-            Self::Auto | Self::Cpu => {
-                let cores = std::thread::available_parallelism().map_or(1, usize::from);
-                Ok(Box::new(CpuBackend::new(Some(threads.unwrap_or(cores)))?))
-            }
+/// Opens a device; `threads` bounds the CPU's.
+pub(super) fn open_device(
+    device: DeviceChoice,
+    threads: Option<usize>,
+) -> Result<Box<dyn Backend>, BackendError> {
+    match device {
+        DeviceChoice::Auto | DeviceChoice::Cpu => {
+            let cores = std::thread::available_parallelism().map_or(1, usize::from);
+            Ok(Box::new(CpuBackend::new(Some(threads.unwrap_or(cores)))?))
         }
     }
 }

@@ -6,6 +6,7 @@
     reason = "printing is what a command line is for"
 )]
 
+mod client;
 mod failure;
 mod files;
 mod machine;

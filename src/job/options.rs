@@ -46,7 +46,9 @@ pub struct JobOptions {
 }
 
 /// A named set of solver options.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[derive(
+    Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema, clap::ValueEnum,
+)]
 #[serde(rename_all = "snake_case")]
 pub enum PresetChoice {
     /// Ours: robust and fast.

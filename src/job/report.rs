@@ -16,8 +16,8 @@ pub struct Report {
     pub iterations: usize,
     /// The iteration whose field is the result.
     pub best_iteration: usize,
-    /// Its loss, metres.
-    pub best_loss: f64,
+    /// Its loss, metres; none where there was no time for an iteration.
+    pub best_loss: Option<f64>,
     /// `converged`, `max_iterations` or `deadline`.
     pub stop_reason: String,
     /// Where it was done.
@@ -59,7 +59,7 @@ impl Report {
             points: estimate.points,
             iterations: estimate.iterations,
             best_iteration: estimate.best_iteration,
-            best_loss: estimate.best_loss,
+            best_loss: estimate.best_loss.is_finite().then_some(estimate.best_loss),
             stop_reason: estimate.stop_reason.name().to_owned(),
             device,
             preset: options.preset.preset().name().to_owned(),
@@ -74,5 +74,31 @@ impl Report {
             },
             peak_rss_bytes: None,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::StopReason;
+
+    #[test]
+    fn a_report_without_an_iteration_comes_back_from_its_json() {
+        let estimate = Estimate {
+            flow: Vec::new(),
+            valid: Vec::new(),
+            dynamic: None,
+            ego: None,
+            points: 3,
+            iterations: 0,
+            best_iteration: 0,
+            best_loss: f64::INFINITY,
+            stop_reason: StopReason::Deadline,
+            seconds: crate::flow::PhaseSeconds::default(),
+            distance_bytes: 0,
+        };
+        let report = Report::new(&estimate, &JobOptions::default(), "cpu".to_owned());
+        let json = serde_json::to_string(&report).expect("JSON");
+        assert_eq!(serde_json::from_str::<Report>(&json).ok(), Some(report));
     }
 }

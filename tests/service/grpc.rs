@@ -15,6 +15,10 @@ use crate::server::Server;
 /// The protocol's client, made from the proto alone.
 #[expect(unreachable_pub, reason = "generated code is public to its module")]
 #[expect(
+    clippy::allow_attributes_without_reason,
+    reason = "and does not say why"
+)]
+#[expect(
     unused_qualifications,
     reason = "generated code names everything in full"
 )]

@@ -1,5 +1,11 @@
 //! The service through its public doors: the real program, over real sockets, with real files.
 
+#![expect(
+    clippy::panic,
+    clippy::print_stderr,
+    reason = "helpers of tests fail loudly and say what they leave out"
+)]
+
 mod access;
 mod access_tls;
 mod attacks_connections;

@@ -93,10 +93,6 @@ impl Server {
         server
     }
 
-    pub(crate) fn folder(&self) -> Folder {
-        self.folder.clone()
-    }
-
     pub(crate) fn id(&self) -> u32 {
         self.child.id()
     }
@@ -104,11 +100,6 @@ impl Server {
     /// The URL of a path of the public port.
     pub(crate) fn url(&self, path: &str) -> String {
         format!("http://{}{path}", self.public)
-    }
-
-    /// The URL of a path of the admin port.
-    pub(crate) fn admin_url(&self, path: &str) -> String {
-        format!("http://{}{path}", self.admin)
     }
 
     pub(crate) fn log(&self) -> String {

@@ -20,6 +20,14 @@ pub(super) use status::{row_of, status};
 /// The messages and the service, generated from `proto/fnsf/v1/scene_flow.proto`.
 #[expect(unreachable_pub, reason = "generated code is public to its module")]
 #[expect(
+    clippy::allow_attributes,
+    reason = "generated code silences what it must"
+)]
+#[expect(
+    clippy::allow_attributes_without_reason,
+    reason = "and does not say why"
+)]
+#[expect(
     unused_qualifications,
     reason = "generated code names everything in full"
 )]

@@ -15,13 +15,13 @@ const DOMAIN: &str = "fnsf";
 const CODE_KEY: &str = "fnsf-code";
 
 /// The status of an error: `ErrorInfo` always, `RetryInfo` and a pushback where waiting helps.
-pub(in crate::api) fn status(error: ApiError) -> Status {
+pub(in crate::api) fn status(error: &ApiError) -> Status {
     let row = error.row();
     let mut about = HashMap::new();
     if let Some(job) = error.job() {
         about.insert("job_id".to_owned(), job.to_string());
     }
-    if let ApiError::JobFailed(_, failure) = &error {
+    if let ApiError::JobFailed(_, failure) = error {
         about.insert("job_error".to_owned(), failure.code.clone());
     }
     about.insert("retryable".to_owned(), row.retryable.to_string());
@@ -46,6 +46,6 @@ pub(in crate::api) fn row_of(headers: &axum::http::HeaderMap) -> Option<Row> {
 
 impl From<ApiError> for Status {
     fn from(error: ApiError) -> Self {
-        status(error)
+        status(&error)
     }
 }

@@ -184,6 +184,7 @@ impl Reading<'_> {
     }
 }
 
+#[expect(clippy::needless_pass_by_value, reason = "it is for map_err")]
 fn broken(error: MultipartError) -> ApiError {
     ApiError::BadRequest(format!("the body is broken: {}", error.body_text()))
 }

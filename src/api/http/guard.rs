@@ -64,7 +64,7 @@ async fn check_key(
 /// A refusal in the words of the door that the request came through.
 pub(super) fn refused(request: &Request, error: ApiError) -> Response {
     if is_grpc(request) {
-        grpc::status(error).into_http::<axum::body::Body>()
+        grpc::status(&error).into_http::<axum::body::Body>()
     } else {
         error.into_response()
     }
@@ -105,6 +105,7 @@ async fn count(State(service): State<Arc<Service>>, request: Request, next: Next
     response
 }
 
+#[expect(clippy::needless_pass_by_value, reason = "the layer hands it over")]
 fn panicked(panic: Box<dyn Any + Send + 'static>) -> Response {
     let text = panic.downcast_ref::<&str>().copied();
     let text = text.or_else(|| panic.downcast_ref::<String>().map(String::as_str));

@@ -92,7 +92,7 @@ fn look_after_queued(
         error: Some(error),
         ..End::default()
     };
-    transitions::end(connection, effects, options, job, State::Expired, how)?;
+    transitions::end(connection, effects, options, job, State::Expired, &how)?;
     Ok(())
 }
 
@@ -135,7 +135,7 @@ pub(super) fn recover(
                 options,
                 &job,
                 State::Cancelled,
-                End::default(),
+                &End::default(),
             )?;
         } else if crashes >= options.max_crashes {
             let error = JobError {
@@ -148,7 +148,7 @@ pub(super) fn recover(
                 dead: true,
                 ..End::default()
             };
-            transitions::end(connection, effects, options, &job, State::Failed, how)?;
+            transitions::end(connection, effects, options, &job, State::Failed, &how)?;
         } else {
             transitions::requeue_running(connection, effects, &job, std::time::Duration::ZERO)?;
         }

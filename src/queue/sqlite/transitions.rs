@@ -266,23 +266,17 @@ pub(super) fn finish(
         Some(job) if job.state == State::Running && job.attempt == attempt => job,
         _ => return Ok(Committed::Fenced),
     };
+    // What comes after its end was asked for is not wanted any more.
+    let outcome = if job.cancel_requested {
+        Outcome::Cancelled
+    } else {
+        outcome
+    };
     let state = match outcome {
-        _ if job.cancel_requested => end(
-            connection,
-            effects,
-            options,
-            &job,
-            State::Cancelled,
-            End::default(),
-        )?,
-        Outcome::Cancelled => end(
-            connection,
-            effects,
-            options,
-            &job,
-            State::Cancelled,
-            End::default(),
-        )?,
+        Outcome::Cancelled => {
+            let how = End::default();
+            end(connection, effects, options, &job, State::Cancelled, &how)?
+        }
         Outcome::Succeeded {
             stop_reason,
             report,
@@ -292,7 +286,7 @@ pub(super) fn finish(
                 report: Some(report),
                 ..End::default()
             };
-            end(connection, effects, options, &job, State::Succeeded, how)?
+            end(connection, effects, options, &job, State::Succeeded, &how)?
         }
         Outcome::Released => requeue_running(connection, effects, &job, Duration::ZERO)?,
         Outcome::Failed(error) => fail(connection, effects, options, &job, error)?,
@@ -322,7 +316,7 @@ pub(super) fn fail(
         error: Some(error),
         ..End::default()
     };
-    end(connection, effects, options, job, State::Failed, how)
+    end(connection, effects, options, job, State::Failed, &how)
 }
 
 /// Puts a running job back where it was in the queue; its fence stays with the lost attempt.
@@ -364,7 +358,7 @@ pub(super) fn end(
     options: &QueueOptions,
     job: &Job,
     state: State,
-    how: End,
+    how: &End,
 ) -> Result<State, QueueError> {
     let now = Timestamp::now();
     let kept = if job.durable {
@@ -446,7 +440,7 @@ fn end_sequence(
         error,
         ..End::default()
     };
-    end(connection, effects, options, sequence, state, how)?;
+    end(connection, effects, options, sequence, state, &how)?;
     Ok(())
 }
 
@@ -478,7 +472,7 @@ pub(super) fn cancel(
                 options,
                 &job,
                 State::Cancelled,
-                End::default(),
+                &End::default(),
             )?;
         }
         Kind::Pair => effects.cancel.push(id),

@@ -50,7 +50,7 @@ impl Writer {
         let (commands, inbox) = channel();
         let thread = thread::Builder::new().name("queue".to_owned());
         thread
-            .spawn(move || run(connection, &options, &shared, &inbox))
+            .spawn(move || run(&connection, &options, &shared, &inbox))
             .map_err(|error| QueueError::Store(error.to_string()))?;
         Ok(Self { commands })
     }
@@ -116,8 +116,13 @@ fn in_savepoint<T>(
     done
 }
 
-fn run(connection: Connection, options: &QueueOptions, shared: &Shared, inbox: &Receiver<Command>) {
-    let mut next_due = sweep::next_due(&connection).unwrap_or(None);
+fn run(
+    connection: &Connection,
+    options: &QueueOptions,
+    shared: &Shared,
+    inbox: &Receiver<Command>,
+) {
+    let mut next_due = sweep::next_due(connection).unwrap_or(None);
     loop {
         let now = Timestamp::now();
         let sleep = next_due
@@ -142,13 +147,13 @@ fn run(connection: Connection, options: &QueueOptions, shared: &Shared, inbox: &
         let mut replies = Vec::with_capacity(commands.len());
         let began = Instant::now();
         let done = transact(
-            &connection,
+            connection,
             commands,
             &mut effects,
             &mut replies,
             |effects| {
                 if sweeping {
-                    in_savepoint(&connection, || sweep::sweep(&connection, effects, options))?;
+                    in_savepoint(connection, || sweep::sweep(connection, effects, options))?;
                 }
                 Ok(())
             },
@@ -162,7 +167,7 @@ fn run(connection: Connection, options: &QueueOptions, shared: &Shared, inbox: &
         for reply in replies {
             reply(done.clone());
         }
-        match sweep::next_due(&connection) {
+        match sweep::next_due(connection) {
             Ok(due) => next_due = due,
             Err(error) => {
                 tracing::error!(%error, "the queue's store cannot be read");
