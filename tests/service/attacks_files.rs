@@ -326,7 +326,10 @@ async fn clouds_at_the_edge_of_sense_get_the_same_verdict_on_both_doors() {
             );
         }
         if name.contains("a million metres") {
-            let detail = http.as_ref().err().map(|problem| problem["detail"].to_string());
+            let detail = http
+                .as_ref()
+                .err()
+                .map(|problem| problem["detail"].to_string());
             let detail = detail.unwrap_or_default();
             assert!(detail.contains("more than 20000 m on an axis"), "{detail}");
         }

@@ -9,7 +9,6 @@ use axum::http::header;
 use tokio::time::timeout;
 
 use super::metered::{Meter, metered};
-
 use crate::api::codec;
 use crate::api::draft::{Draft, Room};
 use crate::api::error::ApiError;
