@@ -4,12 +4,13 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
+use fnsf::formats::CloudFormat;
+
 use crate::clouds::{file, small_pair};
 use crate::server::Server;
 use crate::wire::{
     Besieged, SMALL, connect, exchange, multipart, post, serves, status, until_closed,
 };
-use fnsf::formats::CloudFormat;
 
 /// Between two bytes of somebody who is slow on purpose.
 const DRIP: Duration = Duration::from_millis(50);
@@ -111,10 +112,14 @@ async fn a_body_that_stops_or_drips_is_refused_in_time() {
     let body = pair();
     let length = body.len();
     let head = post("/v1/flow", &format!("content-length: {length}\r\n\r\n"));
-    for sent in [0, 10, length / 2, length - 10] {
+    let lengths = [0, 10, length / 2, length - 10];
+    let stopped = lengths.map(|sent| {
         let mut stream = connect(&siege.server);
         stream.write_all(head.as_bytes()).expect("sent");
         stream.write_all(&body[..sent]).expect("sent");
+        stream
+    });
+    for (mut stream, sent) in stopped.into_iter().zip(lengths) {
         let mut answer = [0; 12];
         stream.read_exact(&mut answer).expect("an answer");
         assert_eq!(&answer, b"HTTP/1.1 408", "{sent} bytes");

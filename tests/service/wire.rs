@@ -56,6 +56,7 @@ impl Besieged {
 pub(crate) async fn serves(server: &Server) {
     let sent = reqwest::Client::new()
         .post(server.url("/v1/flow"))
+        .header("connection", "close")
         .multipart(form(small_pair(), SMALL))
         .send();
     let answer = sent.await.expect("an answer");
