@@ -141,6 +141,17 @@ impl App {
         })
     }
 
+    /// Checks what can be checked without starting anything.
+    ///
+    /// # Errors
+    /// Where values do not go together, or a key or a device cannot be used.
+    pub fn check(config: &Config) -> anyhow::Result<()> {
+        config.check()?;
+        openers(&config.devices)?;
+        keys(config)?;
+        Ok(())
+    }
+
     /// Where HTTP and gRPC are served.
     pub fn public_address(&self) -> SocketAddr {
         self.public

@@ -4,6 +4,8 @@
 //! store before the queue hears of it, and only the attempt that holds the job counts.
 
 mod job_watch;
+#[cfg(test)]
+mod tests;
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};

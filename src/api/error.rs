@@ -141,6 +141,15 @@ const TABLE: [Row; 23] = [
 ];
 
 impl Row {
+    /// Whose fault it is, as requests are counted.
+    pub fn class(&self) -> &'static str {
+        if self.http >= 500 {
+            "server_error"
+        } else {
+            "client_error"
+        }
+    }
+
     /// The row of a code.
     pub fn of(code: &str) -> Option<Self> {
         TABLE.into_iter().find(|row| row.code == code)

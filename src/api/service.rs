@@ -113,6 +113,15 @@ impl Service {
         self.keys.caller(authorization)
     }
 
+    /// Counts an error that comes after an answer has begun, where no guard sees it.
+    pub(super) fn count_late_error(&self, door: &'static str, error: &ApiError) {
+        let row = error.row();
+        self.metrics.request(door, row.class());
+        if let Some(reason) = row.rejection {
+            self.metrics.rejected(reason);
+        }
+    }
+
     /// Accepts nothing more.
     pub fn stop_accepting(&self) {
         self.draining.store(true, Ordering::Relaxed);

@@ -87,6 +87,7 @@ impl Serve {
             let text = config.to_toml().map_err(Failure::internal)?;
             return say(format_args!("{}", text.trim_end()));
         }
+        App::check(&config).map_err(Failure::usage)?;
         if self.check_config {
             return say(format_args!("the configuration is good"));
         }

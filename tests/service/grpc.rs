@@ -125,47 +125,46 @@ async fn a_sequence_is_answered_pair_by_pair_while_it_is_still_coming() {
     });
     send.send(message(begin)).await.expect("open");
     let sweep = async |number: usize| {
-        let name = format!("sweep {number}");
-        let points = &small_pair()[number % 2];
-        send.send(message(Part::Sweep(Sweep { name })))
-            .await
-            .expect("open");
-        send.send(message(Part::Chunk(chunk(points))))
-            .await
-            .expect("open");
+        let cloud = &small_pair()[number % 2];
+        let head = Sweep {
+            name: format!("sweep {number}"),
+            points: Some(cloud.len() as u64),
+        };
+        send.send(message(Part::Sweep(head))).await.expect("open");
+        for points in cloud.chunks(1000) {
+            send.send(message(Part::Chunk(chunk(points))))
+                .await
+                .expect("open");
+        }
     };
     let stream = tokio_stream::wrappers::ReceiverStream::new(sweeps);
-    for number in 0..3 {
-        sweep(number).await;
-    }
-    let answer = calls.estimate_sequence(stream).await.expect("an answer");
-    let mut answer = answer.into_inner();
-    // The third sweep has begun, so the first pair is complete although nothing has ended.
-    let mut pairs: Vec<(u32, String, String)> = Vec::new();
-    let mut rows = 0;
-    let mut sent = 3;
-    while let Some(message) = answer.next().await {
-        match message.expect("a message").part.expect("a part") {
-            Answer::Pair(pair) => {
-                assert!(matches!(pair.outcome, Some(Outcome::Header(_))), "{pair:?}");
-                pairs.push((pair.place, pair.source, pair.target));
-                if sent == 3 {
-                    sweep(sent).await;
-                    sent += 1;
-                } else if sent == 4 {
-                    sent += 1;
-                    let _end = send.clone();
+    let (answer, ()) = tokio::join!(calls.estimate_sequence(stream), async {
+        sweep(0).await;
+        sweep(1).await;
+    });
+    let mut answer = answer.expect("an answer").into_inner();
+    let mut next_pair = async |expected: u32| {
+        let mut rows = 0;
+        let cloud = &small_pair()[expected as usize % 2];
+        while rows < cloud.len() {
+            match answer.next().await.expect("more").expect("a message").part {
+                Some(Answer::Pair(pair)) => {
+                    assert!(matches!(pair.outcome, Some(Outcome::Header(_))), "{pair:?}");
+                    assert_eq!(pair.place, expected);
+                    assert_eq!(pair.source, format!("sweep {expected}"));
+                    assert_eq!(pair.target, format!("sweep {}", expected + 1));
                 }
+                Some(Answer::Chunk(piece)) => rows += piece.flow.len() / 12,
+                None => panic!("an empty message"),
             }
-            Answer::Chunk(piece) => rows += piece.flow.len() / 12,
         }
-        if pairs.len() == 2 && sent == 5 {
-            break;
-        }
-    }
-    assert_eq!(pairs[0], (0, "sweep 0".to_owned(), "sweep 1".to_owned()));
-    assert_eq!(pairs[1].0, 1);
-    assert!(rows >= small_pair()[0].len());
+    };
+    // Each flow comes before the next sweep is sent.
+    next_pair(0).await;
+    sweep(2).await;
+    next_pair(1).await;
+    drop(send);
+    assert!(answer.next().await.is_none());
 }
 
 #[tokio::test]

@@ -18,5 +18,6 @@ mod grpc;
 mod http;
 mod kills;
 mod load;
+mod readme;
 mod server;
 mod wire;

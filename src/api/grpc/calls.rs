@@ -215,6 +215,7 @@ impl SceneFlow for Calls {
             match sent {
                 Ok(()) => awaited.let_go(),
                 Err(error) => {
+                    service.count_late_error("grpc", &error);
                     let _gone_is_fine = answers.send(Err(error.into())).await;
                 }
             }

@@ -7,6 +7,7 @@ use crate::api::codec;
 use crate::api::draft::Room;
 use crate::api::error::ApiError;
 use crate::api::service::{Answer, Service};
+use crate::flow::Point;
 use crate::payload::{StoredCloud, points_from_le_bytes};
 
 /// Rows of one chunk of flow: below 1 MiB with its flags.
@@ -47,7 +48,7 @@ impl CloudBuilder {
         part: &str,
         chunk: &proto::Chunk,
     ) -> Result<(), ApiError> {
-        const POINT: usize = 12;
+        const POINT: usize = size_of::<Point>();
         let bytes = chunk.points.len();
         room.take(service, bytes + chunk.ground.len())?;
         if !bytes.is_multiple_of(POINT) {
@@ -66,6 +67,11 @@ impl CloudBuilder {
         self.ground
             .extend(chunk.ground.iter().map(|&flag| flag != 0));
         Ok(())
+    }
+
+    /// Points so far.
+    pub(super) fn points(&self) -> u64 {
+        (self.points.len() / size_of::<Point>()) as u64
     }
 
     /// The whole cloud, checked as a file's would be.

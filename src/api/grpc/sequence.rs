@@ -35,6 +35,33 @@ struct Sweep {
     cloud: StoredCloud,
 }
 
+/// A sweep that is arriving.
+struct Coming {
+    name: String,
+    /// How many points it will have, where its client says so.
+    points: Option<u64>,
+    cloud: CloudBuilder,
+}
+
+impl Coming {
+    fn finish(self) -> Result<Sweep, ApiError> {
+        let cloud = self.cloud.finish(&self.name)?;
+        if let Some(points) = self.points
+            && points != cloud.points.len() as u64
+        {
+            return Err(ApiError::BadInput(format!(
+                "{}: {points} points were announced and {} came",
+                self.name,
+                cloud.points.len()
+            )));
+        }
+        Ok(Sweep {
+            name: self.name,
+            cloud,
+        })
+    }
+}
+
 /// Starts both tasks.
 pub(super) fn run(
     service: Arc<Service>,
@@ -47,7 +74,7 @@ pub(super) fn run(
     tokio::spawn(async move { write(&writing.0, pairs, &writing.1).await });
     tokio::spawn(async move {
         let reader = Reader {
-            service,
+            service: Arc::clone(&service),
             call,
             inbound,
             pending,
@@ -55,6 +82,7 @@ pub(super) fn run(
             last: None,
         };
         if let Err(error) = reader.run().await {
+            service.count_late_error("grpc", &error);
             let _gone_is_fine = answers.send(Err(error.into())).await;
         }
     });
@@ -79,7 +107,7 @@ impl Reader {
             return Err(no_begin());
         };
         let options = convert::options(begin.options)?;
-        let mut current: Option<(String, CloudBuilder)> = None;
+        let mut current: Option<Coming> = None;
         loop {
             // A drive may pause for as long as it likes: only a dead connection ends it.
             let message = self.inbound.message().await;
@@ -87,42 +115,39 @@ impl Reader {
                 ApiError::BadRequest(format!("the stream is broken: {}", status.message()))
             })?;
             let ended = message.is_none();
-            match message.and_then(|message| message.part) {
+            let whole = match message.and_then(|message| message.part) {
                 Some(Part::Chunk(chunk)) => {
-                    let Some((name, cloud)) = &mut current else {
+                    let Some(coming) = &mut current else {
                         let text = "a chunk belongs to a sweep: send sweep first";
                         return Err(ApiError::BadRequest(text.to_owned()));
                     };
-                    cloud.take(&self.service, &mut room, name, &chunk)?;
+                    let cloud = &mut coming.cloud;
+                    cloud.take(&self.service, &mut room, &coming.name, &chunk)?;
+                    let all = coming.points.is_some_and(|points| cloud.points() >= points);
+                    if all { current.take() } else { None }
                 }
-                Some(Part::Sweep(sweep)) => {
-                    let next = (sweep.name, CloudBuilder::default());
-                    if let Some((name, cloud)) = current.replace(next) {
-                        self.take(name, cloud, &options).await?;
-                        room = Room::default();
-                    }
-                }
+                Some(Part::Sweep(sweep)) => current.replace(Coming {
+                    name: sweep.name,
+                    points: sweep.points,
+                    cloud: CloudBuilder::default(),
+                }),
                 Some(Part::Begin(_)) => return Err(no_begin()),
-                None if ended => {
-                    if let Some((name, cloud)) = current.take() {
-                        self.take(name, cloud, &options).await?;
-                    }
-                    return Ok(());
-                }
+                None if ended => current.take(),
                 None => return Err(ApiError::BadRequest("a message is empty".to_owned())),
+            };
+            if let Some(whole) = whole {
+                self.take(whole, &options).await?;
+                room = Room::default();
+            }
+            if ended {
+                return Ok(());
             }
         }
     }
 
     /// Takes a whole sweep, and submits its pair with the one before.
-    async fn take(
-        &mut self,
-        name: String,
-        cloud: CloudBuilder,
-        options: &JobOptions,
-    ) -> Result<(), ApiError> {
-        let cloud = cloud.finish(&name)?;
-        let sweep = Sweep { name, cloud };
+    async fn take(&mut self, coming: Coming, options: &JobOptions) -> Result<(), ApiError> {
+        let sweep = coming.finish()?;
         let Some(before) = self.last.take() else {
             self.last = Some(sweep);
             return Ok(());
@@ -201,6 +226,7 @@ async fn send(service: &Arc<Service>, pair: Pending, answers: &Answers) -> bool 
     };
     match answer {
         Err(error) => {
+            service.count_late_error("grpc", &error);
             let failed = header(Outcome::Error(convert::pair_error(&error)));
             answers.send(message(Part::Pair(failed))).await.is_ok()
         }

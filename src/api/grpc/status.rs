@@ -27,7 +27,9 @@ pub(in crate::api) fn status(error: &ApiError) -> Status {
     about.insert("retryable".to_owned(), row.retryable.to_string());
     let mut details = ErrorDetails::with_error_info(row.code, DOMAIN, about);
     let retry_after = error.retry_after();
-    details.set_retry_info(retry_after);
+    if retry_after.is_some() {
+        details.set_retry_info(retry_after);
+    }
     let code = Code::from_i32(row.grpc);
     let mut status = Status::with_error_details(code, error.to_string(), details);
     let metadata = status.metadata_mut();

@@ -6,9 +6,11 @@ use std::time::{Duration, Instant};
 use axum::extract::multipart::{Field, Multipart, MultipartError};
 use axum::extract::{FromRequest, Request};
 use axum::http::header;
+use futures_util::stream::{self, Stream, StreamExt};
 use tokio::time::timeout;
 
 use super::metered::{Meter, metered};
+use crate::api::auth::Caller;
 use crate::api::codec;
 use crate::api::draft::{Draft, Room};
 use crate::api::error::ApiError;
@@ -40,28 +42,21 @@ pub(super) enum Part {
 
 impl Body {
     /// Begins to read a request's body.
-    pub(super) async fn of(service: &Arc<Service>, request: Request) -> Result<Self, ApiError> {
-        if request.headers().contains_key(header::CONTENT_ENCODING) {
-            let text = "the body is compressed; send the files as they are";
-            return Err(ApiError::UnsupportedMedia(text.to_owned()));
-        }
-        let length = request.headers().get(header::CONTENT_LENGTH);
-        let length = length.and_then(|value| value.to_str().ok()?.parse::<u64>().ok());
-        let limit = service.limits.max_upload_bytes;
-        if length.is_some_and(|length| length > limit) {
-            return Err(ApiError::TooLarge(format!(
-                "the request's body has more than the {} MiB that this server takes",
-                limit >> 20
-            )));
+    pub(super) async fn of(
+        service: &Arc<Service>,
+        caller: &Caller,
+        request: Request,
+    ) -> Result<Self, ApiError> {
+        if let Err(error) = check_head(service, caller, &request) {
+            let body = request.into_body().into_data_stream();
+            drain(body.map(|piece| piece.map_or(0, |piece| piece.len()))).await;
+            return Err(error);
         }
         let (request, meter) = metered(request);
-        let multipart = Multipart::from_request(request, &()).await.map_err(|_| {
-            let text = "send multipart/form-data, as curl -F source=@a.pcd -F target=@b.pcd does";
-            ApiError::UnsupportedMedia(text.to_owned())
-        })?;
+        let multipart = Multipart::from_request(request, &()).await;
         Ok(Self {
             service: Arc::clone(service),
-            multipart,
+            multipart: multipart.map_err(|_| not_multipart())?,
             meter,
             room: Room::default(),
             has_options: false,
@@ -129,30 +124,74 @@ impl Body {
         Ok(done)
     }
 
-    /// Takes what is still coming and throws it away, so that the client, which is still sending,
-    /// gets to read its answer; a body that is too long for that is cut off.
-    pub(super) async fn drain(mut self) {
-        const LONGEST: Duration = Duration::from_secs(2);
-        const MOST: usize = 16 << 20;
-        let drained = async {
+    /// Takes what is still coming and throws it away.
+    pub(super) async fn drain(self) {
+        // A part is taken whole, however long it is: the time bounds it.
+        let meter = self.meter;
+        let pieces = stream::unfold(self.multipart, async |mut multipart| {
+            let mut field = multipart.next_field().await.ok()??;
             let mut bytes = 0;
-            while let Ok(Some(mut field)) = self.multipart.next_field().await {
-                while let Ok(Some(piece)) = field.chunk().await {
-                    self.meter.understood();
-                    bytes += piece.len();
-                    if bytes > MOST {
-                        return;
-                    }
-                }
+            while let Some(piece) = field.chunk().await.ok()? {
+                meter.understood();
+                bytes += piece.len();
             }
-        };
-        let _cut_off_is_fine = timeout(LONGEST, drained).await;
+            drop(field);
+            Some((bytes, multipart))
+        });
+        drain(pieces).await;
     }
 
     /// All that was spent on reading files.
     pub(super) fn decode_seconds(&self) -> f64 {
         self.decode_seconds
     }
+}
+
+/// What can be refused before a byte of the body is read.
+fn check_head(service: &Service, caller: &Caller, request: &Request) -> Result<(), ApiError> {
+    caller.may_write()?;
+    let headers = request.headers();
+    if headers.contains_key(header::CONTENT_ENCODING) {
+        let text = "the body is compressed; send the files as they are";
+        return Err(ApiError::UnsupportedMedia(text.to_owned()));
+    }
+    let media = headers.get(header::CONTENT_TYPE);
+    if !media.is_some_and(|media| media.as_bytes().starts_with(b"multipart/form-data")) {
+        return Err(not_multipart());
+    }
+    let length = headers.get(header::CONTENT_LENGTH);
+    let length = length.and_then(|value| value.to_str().ok()?.parse::<u64>().ok());
+    let limit = service.limits.max_upload_bytes;
+    if length.is_some_and(|length| length > limit) {
+        return Err(ApiError::TooLarge(format!(
+            "the request's body has more than the {} MiB that this server takes",
+            limit >> 20
+        )));
+    }
+    Ok(())
+}
+
+fn not_multipart() -> ApiError {
+    let text = "send multipart/form-data, as curl -F source=@a.pcd -F target=@b.pcd does";
+    ApiError::UnsupportedMedia(text.to_owned())
+}
+
+/// Takes what is still coming and throws it away, so that the client, which is still sending,
+/// gets to read its answer; a body that is too long for that is cut off.
+async fn drain(pieces: impl Stream<Item = usize>) {
+    const LONGEST: Duration = Duration::from_secs(2);
+    const MOST: usize = 16 << 20;
+    let mut pieces = std::pin::pin!(pieces);
+    let drained = async {
+        let mut bytes = 0;
+        while let Some(piece) = pieces.next().await {
+            bytes += piece;
+            if bytes > MOST {
+                return;
+            }
+        }
+    };
+    let _cut_off_is_fine = timeout(LONGEST, drained).await;
 }
 
 /// What reading a part draws on.

@@ -84,8 +84,7 @@ async fn count(State(service): State<Arc<Service>>, request: Request, next: Next
     let row = response.extensions().get::<Row>().copied();
     let row = row.or_else(|| grpc::row_of(response.headers()));
     let class = match row {
-        Some(row) if row.http >= 500 => "server_error",
-        Some(_) => "client_error",
+        Some(row) => row.class(),
         None if status.is_server_error() => "server_error",
         None if status.is_client_error() => "client_error",
         None => "ok",

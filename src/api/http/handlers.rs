@@ -140,8 +140,7 @@ async fn submit_pair(
     promise: Promise,
     request: Request,
 ) -> Result<(Arc<Job>, bool), ApiError> {
-    caller.may_write()?;
-    let mut body = Body::of(service, request).await?;
+    let mut body = Body::of(service, &caller, request).await?;
     match read_pair(service, &caller, asked, promise, &mut body).await {
         Ok(draft) => {
             service.metrics.phase("decode", body.decode_seconds(), None);
@@ -240,8 +239,7 @@ async fn submit(
     asked: &Asked,
     request: Request,
 ) -> Result<Response, ApiError> {
-    caller.may_write()?;
-    let mut body = Body::of(service, request).await?;
+    let mut body = Body::of(service, &caller, request).await?;
     let (draft, kind) = match read_job(service, &caller, asked, &mut body).await {
         Ok(read) => read,
         Err(error) => {

@@ -1,0 +1,296 @@
+#!/usr/bin/env python3
+"""Scene flow over gRPC, from the protocol file alone: one pair, or a drive as it happens.
+
+    fnsf_client.py pair a.pcd b.pcd -o flow.npz
+    fnsf_client.py sequence drive/*.pcd --interval 0.1
+
+As a library: Client.pair and Client.sequence take and give bytes and need no numpy.
+"""
+
+import argparse
+import importlib
+import os
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import grpc
+from clouds import BadFile, Cloud, mean_length, read_cloud, write_flow
+
+# 48 Ki points and their flags stay below the 1 MiB that the server takes in a message.
+CHUNK_POINTS = 48 * 1024
+REPOSITORY_PROTO = Path(__file__).resolve().parents[2] / "proto"
+PROTO = "fnsf/v1/scene_flow.proto"
+# Bad input, as the fnsf program says it.
+EXIT_BAD_INPUT, EXIT_FAILED = 65, 70
+
+
+def load_stubs(proto_root):
+    """Compiles the protocol into a temporary folder, so that no generated code is kept anywhere."""
+    from grpc_tools import protoc
+
+    if not (Path(proto_root) / PROTO).is_file():
+        raise BadFile(f"{proto_root}: no {PROTO} below it; say --proto DIR")
+    with tempfile.TemporaryDirectory() as folder:
+        command = ["protoc", f"-I{proto_root}", f"--python_out={folder}", f"--grpc_python_out={folder}", PROTO]
+        if protoc.main(command) != 0:
+            raise BadFile(f"{proto_root}/{PROTO} cannot be compiled")
+        sys.path.insert(0, folder)
+        try:
+            messages = importlib.import_module("fnsf.v1.scene_flow_pb2")
+            calls = importlib.import_module("fnsf.v1.scene_flow_pb2_grpc")
+        finally:
+            sys.path.remove(folder)
+    return messages, calls
+
+
+@dataclass(frozen=True)
+class Flow:
+    """A header, packed float32 displacements, and a byte a row: bit 0 valid, bit 1 dynamic."""
+
+    header: object
+    rows: bytes
+    flags: bytes
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two consecutive sweeps of a sequence: their flow, or why there is none."""
+
+    place: int
+    source: str
+    target: str
+    flow: Flow | None
+    error: object | None
+
+
+class Client:
+    """Calls of one server. `deadline` is in seconds and holds for a whole call."""
+
+    def __init__(self, server, api_key=None, tls=False, proto_root=REPOSITORY_PROTO):
+        self.messages, calls = load_stubs(proto_root)
+        self.channel = grpc.secure_channel(server, grpc.ssl_channel_credentials()) if tls else grpc.insecure_channel(server)
+        self.calls = calls.SceneFlowStub(self.channel)
+        self.metadata = [("authorization", f"Bearer {api_key}")] if api_key else []
+
+    def options(self, **named):
+        """Options of a request; names and values are the protocol's, enumerations in words."""
+        fields = {name: value for name, value in named.items() if value is not None}
+        for name in ("preset", "ground", "ego", "priority"):
+            if name in fields:
+                fields[name] = f"{name}_{fields[name]}".upper()
+        return self.messages.Options(**fields)
+
+    def _chunks(self, cloud):
+        for first in range(0, len(cloud), CHUNK_POINTS):
+            last = first + CHUNK_POINTS
+            yield self.messages.Chunk(points=cloud.points[12 * first : 12 * last], ground=cloud.ground[first:last])
+
+    def pair(self, source, target, options=None, deadline=None, on_progress=None):
+        """The flow from source to target. `on_progress` gets the protocol's Progress now and then."""
+        request = self.messages.EstimateFlowRequest
+
+        def requests():
+            yield request(begin=request.Begin(options=options, progress_ms=200 if on_progress else 0))
+            for name, cloud in ((self.messages.CLOUD_SOURCE, source), (self.messages.CLOUD_TARGET, target)):
+                for chunk in self._chunks(cloud):
+                    yield request(cloud=request.CloudChunk(cloud=name, chunk=chunk))
+
+        header, chunks = None, []
+        for answer in self.calls.EstimateFlow(requests(), timeout=deadline, metadata=self.metadata):
+            part = answer.WhichOneof("part")
+            if part == "progress" and on_progress:
+                on_progress(answer.progress)
+            elif part == "header":
+                header = answer.header
+            elif part == "chunk":
+                chunks.append(answer.chunk)
+        return _joined(header, chunks)
+
+    def sequence(self, sweeps, options=None, deadline=None):
+        """Yields a Pair for each two consecutive (name, Cloud) of `sweeps`, as soon as it is there.
+
+        `sweeps` is read from another thread, no faster than the server takes them.
+        """
+        request, broken = self.messages.EstimateSequenceRequest, []
+
+        def requests():
+            yield request(begin=request.Begin(options=options))
+            try:
+                for name, cloud in sweeps:
+                    yield request(sweep=request.Sweep(name=name))
+                    for chunk in self._chunks(cloud):
+                        yield request(chunk=chunk)
+            except Exception as error:
+                # gRPC would end the call without saying why.
+                broken.append(error)
+                raise
+
+        answers = self.calls.EstimateSequence(requests(), timeout=deadline, metadata=self.metadata)
+        try:
+            yield from self._pairs(answers)
+        except grpc.RpcError:
+            if broken:
+                raise broken[0] from None
+            raise
+
+    @staticmethod
+    def _pairs(answers):
+        pair, chunks, rows = None, [], 0
+        for answer in answers:
+            if answer.WhichOneof("part") == "pair":
+                pair, chunks, rows = answer.pair, [], 0
+            else:
+                chunks.append(answer.chunk)
+                rows += len(answer.chunk.flags)
+            if pair.WhichOneof("outcome") == "error":
+                yield Pair(pair.place, pair.source, pair.target, None, pair.error)
+            elif rows == pair.header.points:
+                yield Pair(pair.place, pair.source, pair.target, _joined(pair.header, chunks), None)
+
+
+def _joined(header, chunks):
+    return Flow(header, b"".join(chunk.flow for chunk in chunks), b"".join(chunk.flags for chunk in chunks))
+
+
+def describe(error):
+    """One line about a failed call: the server's own code where it says one, and when to come again."""
+    code, retry = None, ""
+    try:
+        from google.rpc.error_details_pb2 import ErrorInfo, RetryInfo
+        from grpc_status import rpc_status
+
+        status = rpc_status.from_call(error)
+        for detail in status.details if status else ():
+            info, pause = ErrorInfo(), RetryInfo()
+            if detail.Unpack(info):
+                code = info.reason
+            elif detail.Unpack(pause) and pause.HasField("retry_delay"):
+                retry = f" (try again in {pause.retry_delay.ToSeconds()} s)"
+    except ImportError:
+        # The code stands in the metadata too, for clients without the richer form.
+        code = dict(error.trailing_metadata() or ()).get("fnsf-code")
+    return f"{code or 'no answer'} [{error.code().name}]: {error.details()}{retry}"
+
+
+class Clock:
+    """Lines with the seconds since the start, from any thread."""
+
+    def __init__(self):
+        self.start, self.lock = time.monotonic(), threading.Lock()
+
+    def say(self, text):
+        with self.lock:
+            print(f"{time.monotonic() - self.start:8.3f} s  {text}", flush=True)
+
+
+def summary(flow):
+    header = flow.header
+    length, moving = mean_length(flow)
+    return (
+        f"{header.valid_points} of {header.points} points, mean {length:.3f} m, {moving:.1%} moving, "
+        f"{header.iterations} iterations, {header.stop_reason}, {header.seconds.total:.3f} s on {header.device}"
+    )
+
+
+def run_pair(client, options, arguments):
+    if not arguments.target and not arguments.source.endswith(".npz"):
+        raise BadFile(f"{arguments.source}: TARGET may be left out only where an .npz holds both sweeps")
+    source, target = read_cloud(arguments.source, "1"), read_cloud(arguments.target or arguments.source, "2")
+    clock = Clock()
+    clock.say(f"sending {len(source)} and {len(target)} points")
+    flow = client.pair(
+        source,
+        target,
+        options,
+        arguments.deadline,
+        lambda progress: clock.say(f"iteration {progress.iteration}, loss {progress.loss:.4f} m"),
+    )
+    clock.say(f"flow: {summary(flow)}")
+    write_flow(arguments.output, flow)
+    print(f"written to {arguments.output}")
+
+
+def run_sequence(client, options, arguments):
+    if len(arguments.frames) < 2:
+        raise BadFile("a sequence has two sweeps or more")
+    if arguments.output:
+        Path(arguments.output).mkdir(parents=True, exist_ok=True)
+    clock, sent, came = Clock(), 0, []
+
+    def sweeps():
+        nonlocal sent
+        for place, path in enumerate(arguments.frames):
+            due = clock.start + place * arguments.interval
+            time.sleep(max(0.0, due - time.monotonic()))
+            cloud = read_cloud(path)
+            yield Path(path).name, cloud
+            sent += 1
+            clock.say(f"sent   {Path(path).name}, {len(cloud)} points")
+
+    failed = 0
+    for pair in client.sequence(sweeps(), options, arguments.deadline):
+        name = f"flow {pair.place}: {pair.source} -> {pair.target}"
+        came.append(sent)
+        if pair.error:
+            failed += 1
+            clock.say(f"{name} failed: {pair.error.code}: {pair.error.message}")
+            continue
+        clock.say(f"{name}: {summary(pair.flow)}")
+        if arguments.output:
+            write_flow(Path(arguments.output) / f"flow_{pair.place:04}.npz", pair.flow)
+    frames = len(arguments.frames)
+    early = sum(place < frames for place in came)
+    print(f"{len(came)} of {frames - 1} flows came, {early} of them before the last sweep was sent, {failed} failed")
+    return failed == 0 and len(came) == frames - 1
+
+
+def arguments_of(argv):
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--server", default="127.0.0.1:8080", help="host and port [default: %(default)s]")
+    parser.add_argument("--api-key", default=os.environ.get("FNSF_API_KEY"), help="[default: FNSF_API_KEY of the environment]")
+    parser.add_argument("--tls", action="store_true", help="the server has a certificate that this machine trusts")
+    parser.add_argument("--proto", default=REPOSITORY_PROTO, metavar="DIR", help=f"what {PROTO} lies below")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    pair = commands.add_parser("pair", help="the flow of one pair")
+    pair.add_argument("source", help=".pcd, .npy, .npz or packed .f32")
+    pair.add_argument("target", nargs="?", help="may be left out where SOURCE is an .npz with pc1 and pc2")
+    pair.add_argument("-o", "--output", required=True, help=".npz, .npy or packed .f32")
+    pair.set_defaults(run=run_pair)
+    sequence = commands.add_parser("sequence", help="the flow of each two consecutive sweeps, as they come")
+    sequence.add_argument("frames", nargs="+", metavar="FRAME", help=".pcd, .npy, .npz or packed .f32, in order")
+    sequence.add_argument("-o", "--output", metavar="DIR", help="write every flow into this folder")
+    sequence.add_argument("--interval", type=float, default=0.0, metavar="SECONDS", help="between sweeps, as a sensor would")
+    sequence.set_defaults(run=run_sequence)
+    for command in (pair, sequence):
+        command.add_argument("--deadline", type=float, metavar="SECONDS", help="for the whole call; the best flow so far comes back")
+        command.add_argument("--preset", choices=["default", "paper"])
+        command.add_argument("--seed", type=int)
+        command.add_argument("--max-points", type=int)
+        command.add_argument("--range-m", type=float)
+        command.add_argument("--ground", choices=["keep", "mask"])
+        command.add_argument("--ego", choices=["off", "auto"])
+        command.add_argument("--priority", choices=["low", "normal", "high"])
+    return parser.parse_args(argv)
+
+
+def main(argv=None):
+    arguments = arguments_of(argv)
+    names = ("preset", "seed", "max_points", "range_m", "ground", "ego", "priority")
+    try:
+        client = Client(arguments.server, arguments.api_key, arguments.tls, arguments.proto)
+        options = client.options(**{name: getattr(arguments, name) for name in names})
+        return 0 if arguments.run(client, options, arguments) in (None, True) else EXIT_FAILED
+    except (BadFile, OSError) as error:
+        print(f"fnsf_client: {error}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    except grpc.RpcError as error:
+        print(f"fnsf_client: {describe(error)}", file=sys.stderr)
+        return EXIT_FAILED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,230 @@
+//! A worker on a real queue and store, with a device that misbehaves when it is told to.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Duration;
+
+use bytes::Bytes;
+use tokio::sync::mpsc;
+use tokio::time::timeout;
+
+use super::{Drain, Worker, WorkerOptions};
+use crate::blobs::{Blob, Blobs, Sync};
+use crate::cost::CostModel;
+use crate::engine::{Device, Health};
+use crate::flow::backend::{Backend, BackendError, Transform};
+use crate::flow::cpu::CpuBackend;
+use crate::flow::distance::DistanceOptions;
+use crate::flow::{Point, Watch};
+use crate::job::{Job, JobId, Kind, Priority, State, Tenant};
+use crate::metrics::Metrics;
+use crate::payload::{StoredCloud, StoredFlow};
+use crate::queue::{Queue, QueueOptions, SqliteQueue, Submission, Submitted};
+
+/// Long enough for a loaded machine; only a failure waits so long.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Points of the tests' pairs, and of no trial.
+const POINTS: usize = 900;
+
+/// The CPU, which panics over the tests' pairs while there are panics left.
+struct Fragile {
+    cpu: CpuBackend,
+    panics: Arc<AtomicU32>,
+}
+
+impl Backend for Fragile {
+    fn name(&self) -> String {
+        "fragile".to_owned()
+    }
+
+    fn transform(
+        &self,
+        source: &[Point],
+        target: &[Point],
+        options: &DistanceOptions,
+        watch: &dyn Watch,
+    ) -> Result<Box<dyn Transform>, BackendError> {
+        let ours = source.len() == POINTS;
+        let left = |panics: u32| panics.checked_sub(1).filter(|_| ours);
+        let broken = self
+            .panics
+            .fetch_update(Ordering::Relaxed, Ordering::Relaxed, left);
+        if broken.is_ok() {
+            panic!("the device has slipped");
+        }
+        self.cpu.transform(source, target, options, watch)
+    }
+}
+
+/// All that a worker needs, in a folder.
+struct Stand {
+    queue: Arc<dyn Queue>,
+    blobs: Blobs,
+    worker: Worker,
+    panics: Arc<AtomicU32>,
+    _folder: tempfile::TempDir,
+}
+
+async fn stand() -> Stand {
+    let folder = tempfile::tempdir().expect("a folder");
+    let options = QueueOptions {
+        retry_delay: Duration::from_millis(20),
+        ..QueueOptions::default()
+    };
+    let (events, _) = mpsc::unbounded_channel();
+    let queue = SqliteQueue::open(folder.path(), options, events).expect("a queue");
+    let queue: Arc<dyn Queue> = Arc::new(queue);
+    let blobs = Blobs::open(&folder.path().join("blobs")).expect("a store");
+    let panics = Arc::new(AtomicU32::new(0));
+    let shared = Arc::clone(&panics);
+    let open = move || {
+        let fragile = Fragile {
+            cpu: CpuBackend::new(Some(1))?,
+            panics: Arc::clone(&shared),
+        };
+        Ok(Box::new(fragile) as Box<dyn Backend>)
+    };
+    let device = Device::start("fragile", Box::new(open)).expect("a thread");
+    let mut health = device.health();
+    let ready = health.wait_for(|health| *health == Health::Ready);
+    timeout(PATIENCE, ready)
+        .await
+        .expect("in time")
+        .expect("a thread");
+    let worker = Worker {
+        queue: Arc::clone(&queue),
+        blobs: blobs.clone(),
+        device,
+        cost: Arc::new(CostModel::new()),
+        metrics: Arc::new(Metrics::new(&["fragile".to_owned()])),
+        options: WorkerOptions {
+            snapshot_interval: Duration::from_secs(1),
+        },
+        drain: Drain::default(),
+    };
+    Stand {
+        queue,
+        blobs,
+        worker,
+        panics,
+        _folder: folder,
+    }
+}
+
+/// A wall of points, and one a tenth of a metre on.
+fn clouds() -> [Vec<Point>; 2] {
+    let source: Vec<Point> = (0..900u16)
+        .map(|i| [8.0, f32::from(i % 30) * 0.2, f32::from(i / 30) * 0.2])
+        .collect();
+    let target = source.iter().map(|[x, y, z]| [x + 0.1, *y, *z]).collect();
+    [source, target]
+}
+
+impl Stand {
+    async fn submit(&self, frames: usize) -> Arc<Job> {
+        let id = JobId::fresh();
+        for (place, points) in (0..).zip(clouds().into_iter().take(frames)) {
+            let cloud = StoredCloud {
+                points,
+                ground: None,
+            };
+            let bytes = Bytes::from(cloud.to_bytes());
+            let put = self.blobs.put(id, Blob::Frame(place), bytes, Sync::No);
+            put.await.expect("written");
+        }
+        let submission = Submission {
+            id,
+            tenant: Tenant::default(),
+            kind: Kind::Pair,
+            pairs: 0,
+            priority: Priority::Normal,
+            cost_seconds: 0.1,
+            options: "{}".to_owned(),
+            deadline: None,
+            idempotency: None,
+            durable: true,
+        };
+        match self.queue.submit(submission).await.expect("accepted") {
+            Submitted::New(job) | Submitted::Known(job) => job,
+        }
+    }
+
+    async fn ended(&self, job: &Job) -> Arc<Job> {
+        let mut news = self.queue.watch(job.id).await.expect("known");
+        let ended = timeout(PATIENCE, news.wait_for(|job| job.state.is_end())).await;
+        Arc::clone(&ended.expect("in time").expect("followed"))
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_panic_costs_one_attempt_of_one_job_and_the_device_works_again() {
+    let stand = stand().await;
+    stand.panics.store(1, Ordering::Relaxed);
+    let (first, second) = (stand.submit(2).await, stand.submit(2).await);
+    tokio::spawn(stand.worker.clone().run());
+    let (first, second) = (stand.ended(&first).await, stand.ended(&second).await);
+    assert_eq!(
+        (first.state, second.state),
+        (State::Succeeded, State::Succeeded)
+    );
+    assert_eq!(first.attempt + second.attempt, 3);
+    for job in [first, second] {
+        let bytes = stand.blobs.get(job.id, Blob::Result(job.attempt)).await;
+        let flow = StoredFlow::from_bytes(&bytes.expect("stored")).expect("whole");
+        assert_eq!(flow.flow.len(), POINTS);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_job_that_panics_every_time_is_given_up_and_the_next_one_is_done() {
+    let stand = stand().await;
+    // Only pairs of this size panic, so that the trials between the attempts pass.
+    stand.panics.store(3, Ordering::Relaxed);
+    let poison = stand.submit(2).await;
+    tokio::spawn(stand.worker.clone().run());
+    let given_up = stand.ended(&poison).await;
+    assert_eq!((given_up.state, given_up.attempt), (State::Failed, 3));
+    assert!(given_up.dead);
+    let error = given_up.error.as_ref().expect("a reason");
+    assert_eq!(error.code, "panicked");
+    assert!(
+        error.message.contains("the device has slipped"),
+        "{}",
+        error.message
+    );
+    let next = stand.submit(2).await;
+    assert_eq!(stand.ended(&next).await.state, State::Succeeded);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_payload_that_is_gone_fails_its_job_and_no_other() {
+    let stand = stand().await;
+    tokio::spawn(stand.worker.clone().run());
+    let half = stand.submit(1).await;
+    let whole = stand.submit(2).await;
+    let half = stand.ended(&half).await;
+    assert_eq!(half.state, State::Failed);
+    assert_eq!(half.error.as_ref().expect("a reason").code, "store");
+    assert_eq!(stand.ended(&whole).await.state, State::Succeeded);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_worker_that_is_told_to_stop_finishes_what_it_has_and_takes_nothing_more() {
+    let stand = stand().await;
+    let running = tokio::spawn(stand.worker.clone().run());
+    let first = stand.submit(2).await;
+    stand.ended(&first).await;
+    stand.worker.drain.stop.cancel();
+    timeout(PATIENCE, running)
+        .await
+        .expect("in time")
+        .expect("no panic");
+    let second = stand.submit(2).await;
+    let left = stand
+        .queue
+        .job(&second.tenant, second.id)
+        .await
+        .expect("known");
+    assert_eq!(left.state, State::Queued);
+}
