@@ -409,18 +409,17 @@ fn keys_that_are_weak_or_shared_and_open_doors_refuse_to_start() {
     };
     let twice = key("a", WRITER) + &key("b", WRITER);
     let open = "listen = \"0.0.0.0:0\"\n";
-    for (config, code, said) in [
-        (key("a", ""), 70, "shorter than 16"),
-        (key("a", "fifteen-letters"), 70, "shorter than 16"),
-        ("api_key = \"\"\n".to_owned(), 70, "shorter than 16"),
-        (format!("{open}api_key = \"\"\n"), 70, "shorter than 16"),
-        (twice, 70, "given twice"),
-        (key("../a", WRITER), 70, "a tenant's name"),
-        (key("", WRITER), 70, "a tenant's name"),
-        (open.to_owned(), 2, "listen goes beyond loopback"),
+    for (config, said) in [
+        (key("a", ""), "shorter than 16"),
+        (key("a", "fifteen-letters"), "shorter than 16"),
+        ("api_key = \"\"\n".to_owned(), "shorter than 16"),
+        (format!("{open}api_key = \"\"\n"), "shorter than 16"),
+        (twice, "given twice"),
+        (key("../a", WRITER), "a tenant's name"),
+        (key("", WRITER), "a tenant's name"),
+        (open.to_owned(), "listen goes beyond loopback"),
         (
             "listen = \"[::]:0\"\n".to_owned(),
-            2,
             "listen goes beyond loopback",
         ),
     ] {
@@ -435,7 +434,7 @@ fn keys_that_are_weak_or_shared_and_open_doors_refuse_to_start() {
             .output()
             .expect("it runs");
         let log = String::from_utf8_lossy(&ended.stderr);
-        assert_eq!(ended.status.code(), Some(code), "{config}: {log}");
+        assert_eq!(ended.status.code(), Some(2), "{config}: {log}");
         assert!(
             log.contains(said) && !log.contains(WRITER),
             "{config}: {log}"
