@@ -97,7 +97,8 @@ pub struct LimitsConfig {
     pub max_connections: usize,
     /// Time for a request's headers, seconds.
     pub header_timeout_seconds: u64,
-    /// Time without a byte of a body that is being received, seconds.
+    /// Time without a byte of a body that is being received, seconds. By more than that no body may
+    /// lag behind 1 KiB a second.
     pub body_timeout_seconds: u64,
     /// Time that a client may leave an answer unread, seconds.
     pub write_timeout_seconds: u64,

@@ -208,11 +208,12 @@ impl Drop for Draft {
     }
 }
 
-/// Room for a body's bytes, given back when it is dropped.
+/// Room for a body's bytes, given back when it is dropped, and time for them to come.
 #[derive(Debug, Default)]
 pub(super) struct Room {
-    held: Vec<OwnedSemaphorePermit>,
+    held: Option<OwnedSemaphorePermit>,
     bytes: u64,
+    waited: Duration,
 }
 
 impl Room {
@@ -222,7 +223,7 @@ impl Room {
     /// [`ApiError::TooLarge`] where one request has too many, [`ApiError::ServerFull`] where all
     /// requests together have.
     pub(super) fn take(&mut self, service: &Service, bytes: usize) -> Result<(), ApiError> {
-        const UNIT: usize = 1 << 10;
+        const UNIT: u64 = 1 << 10;
         let limit = service.limits.max_upload_bytes;
         self.bytes += bytes as u64;
         if self.bytes > limit {
@@ -232,14 +233,40 @@ impl Room {
             )));
         }
         service.metrics.uploaded(bytes);
-        let units = u32::try_from(bytes.div_ceil(UNIT)).unwrap_or(u32::MAX);
+        // Whole units of all bytes so far: small pieces must not cost more than large ones.
+        let held = self
+            .held
+            .as_ref()
+            .map_or(0, OwnedSemaphorePermit::num_permits) as u64;
+        let units = self.bytes.div_ceil(UNIT).saturating_sub(held);
+        let units = u32::try_from(units).unwrap_or(u32::MAX);
         let room = Arc::clone(&service.room);
         let permit = room.try_acquire_many_owned(units);
         let permit = permit.map_err(|_| ApiError::ServerFull(Duration::from_secs(1)))?;
-        match self.held.last_mut() {
-            Some(last) => last.merge(permit),
-            None => self.held.push(permit),
+        match &mut self.held {
+            Some(held) => held.merge(permit),
+            none => *none = Some(permit),
         }
         Ok(())
+    }
+
+    /// Waits for more of a body: no longer than it may be silent, and in all no longer than the
+    /// slowest line that is served takes for what has come.
+    ///
+    /// # Errors
+    /// [`ApiError::TooSlow`].
+    pub(super) async fn wait<T>(
+        &mut self,
+        service: &Service,
+        more: impl Future<Output = T>,
+    ) -> Result<T, ApiError> {
+        const SLOWEST_BYTES_PER_SECOND: u64 = 1 << 10;
+        let idle = service.limits.body_idle;
+        let earned = Duration::from_secs(self.bytes / SLOWEST_BYTES_PER_SECOND);
+        let left = (idle + earned).saturating_sub(self.waited).min(idle);
+        let began = Instant::now();
+        let came = tokio::time::timeout(left, more).await;
+        self.waited += began.elapsed();
+        came.map_err(|_| ApiError::TooSlow)
     }
 }

@@ -3,6 +3,7 @@
 //! HTTP/1.1 and HTTP/2 (and so gRPC) on one socket, with every limit of both written down: the
 //! libraries' own defaults leave some of them open. It must not know routes.
 
+mod opening;
 mod stall;
 
 use std::net::SocketAddr;
@@ -24,6 +25,7 @@ use tokio::time::timeout;
 use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
 
+use self::opening::Opening;
 use self::stall::Stall;
 use crate::metrics::Metrics;
 
@@ -54,6 +56,8 @@ impl Default for ListenOptions {
 /// Headers of one request, bytes and number.
 const MAX_HEADER_BYTES: u32 = 16 << 10;
 const MAX_HEADERS: usize = 64;
+/// Bytes that an HTTP/1.1 connection keeps before it looks at them: its headers and then some.
+const MAX_BUFFER: usize = 64 << 10;
 /// Streams that a client may reset before the server has answered them, and errors of its own that
 /// make the server reset streams, before the connection is closed (CVE-2023-44487, CVE-2025-8671).
 const MAX_PENDING_RESETS: usize = 64;
@@ -206,7 +210,8 @@ where
         .http1()
         .timer(TokioTimer::new())
         .header_read_timeout(options.header_timeout)
-        .max_headers(MAX_HEADERS);
+        .max_headers(MAX_HEADERS)
+        .max_buf_size(MAX_BUFFER);
     builder
         .http2()
         .timer(TokioTimer::new())
@@ -219,6 +224,7 @@ where
         .keep_alive_interval(PING_INTERVAL)
         .keep_alive_timeout(PING_TIMEOUT);
     let service = TowerToHyperService::new(router);
+    let stream = Opening::new(stream, options.header_timeout);
     let connection = builder.serve_connection(TokioIo::new(stream), service);
     let mut connection = std::pin::pin!(connection);
     let ended = tokio::select! {

@@ -195,6 +195,10 @@ impl JobOptions {
     /// # Errors
     /// [`InvalidOptions`], which names the key and what it may be.
     pub fn from_json(text: &[u8]) -> Result<Self, InvalidOptions> {
+        // An array would be read as the values of an object without its keys.
+        if !text.trim_ascii_start().starts_with(b"{") {
+            return Err(InvalidOptions::Json("they are one JSON object".to_owned()));
+        }
         let options: Self = serde_json::from_slice(text)
             .map_err(|error| InvalidOptions::Json(error.to_string()))?;
         options.check()?;

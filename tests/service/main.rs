@@ -6,6 +6,13 @@
     reason = "helpers of tests fail loudly and say what they leave out"
 )]
 
+mod access;
+mod access_tls;
+mod attacks_connections;
+mod attacks_files;
+mod attacks_grpc;
+mod attacks_http2;
+mod attacks_requests;
 mod clouds;
 mod grpc;
 mod http;
@@ -13,3 +20,4 @@ mod kills;
 mod load;
 mod readme;
 mod server;
+mod wire;

@@ -46,7 +46,8 @@ impl Calls {
         let awaited = Promise::WhileAwaited;
         self.service
             .check_room(&call.caller, Priority::High, awaited)?;
-        let begin = match chunks::next(&self.service, inbound)
+        let mut room = Room::default();
+        let begin = match chunks::next(&self.service, &mut room, inbound)
             .await?
             .and_then(|m| m.part)
         {
@@ -59,9 +60,8 @@ impl Calls {
             .check_room(&call.caller, options.priority, awaited)?;
         let request = call.draft_request(options, awaited);
         let mut draft = Draft::begin(&self.service, call.caller.clone(), request)?;
-        let mut room = Room::default();
         let mut clouds = [CloudBuilder::default(), CloudBuilder::default()];
-        while let Some(message) = chunks::next(&self.service, inbound).await? {
+        while let Some(message) = chunks::next(&self.service, &mut room, inbound).await? {
             let Some(Part::Cloud(piece)) = message.part else {
                 return Err(no_begin());
             };
@@ -198,7 +198,8 @@ impl SceneFlow for Calls {
             .check_room(&call.caller, Priority::High, Promise::Durable)?;
         let mut inbound = request.into_inner();
         let service = &self.service;
-        let begin = match chunks::next(service, &mut inbound)
+        let mut room = Room::default();
+        let begin = match chunks::next(service, &mut room, &mut inbound)
             .await?
             .and_then(|m| m.part)
         {
@@ -210,10 +211,11 @@ impl SceneFlow for Calls {
         let key = begin.idempotency_key;
         draft_request.idempotency_key = (!key.is_empty()).then_some(key);
         let mut draft = Draft::begin(service, call.caller.clone(), draft_request)?;
-        let mut room = Room::default();
         let mut cloud: Option<CloudBuilder> = None;
         loop {
-            let part = chunks::next(service, &mut inbound).await?.map(|m| m.part);
+            let part = chunks::next(service, &mut room, &mut inbound)
+                .await?
+                .map(|m| m.part);
             let place = format!("cloud {}", draft.frames());
             match part {
                 Some(Some(Part::Chunk(chunk))) => match &mut cloud {

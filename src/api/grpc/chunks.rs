@@ -13,13 +13,13 @@ use crate::payload::{StoredCloud, points_from_le_bytes};
 /// Rows of one chunk of flow: below 1 MiB with its flags.
 const ROWS: usize = 80_000;
 
-/// The next message, within the time that a body may be silent.
+/// The next message, within the time that a body may take.
 pub(super) async fn next<T>(
     service: &Service,
+    room: &mut Room,
     inbound: &mut Streaming<T>,
 ) -> Result<Option<T>, ApiError> {
-    let message = tokio::time::timeout(service.limits.body_idle, inbound.message()).await;
-    match message.map_err(|_| ApiError::TooSlow)? {
+    match room.wait(service, inbound.message()).await? {
         Ok(message) => Ok(message),
         Err(status) if status.code() == tonic::Code::OutOfRange => {
             let text = "a message is larger than 1 MiB: send smaller chunks";

@@ -102,13 +102,13 @@ struct Reader {
 impl Reader {
     async fn run(mut self) -> Result<(), ApiError> {
         use proto::estimate_sequence_request::Part;
-        let first = chunks::next(&self.service, &mut self.inbound).await?;
+        let mut room = Room::default();
+        let first = chunks::next(&self.service, &mut room, &mut self.inbound).await?;
         let Some(Part::Begin(begin)) = first.and_then(|message| message.part) else {
             return Err(no_begin());
         };
         let options = convert::options(begin.options)?;
         let mut current: Option<Coming> = None;
-        let mut room = Room::default();
         loop {
             // A drive may pause for as long as it likes: only a dead connection ends it.
             let message = self.inbound.message().await;

@@ -3,11 +3,12 @@
 use std::sync::Arc;
 
 use axum::body::{Body, Bytes};
-use axum::extract::{Extension, Path, State};
+use axum::extract::{Extension, State};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use tokio_stream::wrappers::ReceiverStream;
 
+use super::named::Named;
 use super::problem::Problem;
 use crate::api::auth::Caller;
 use crate::api::codec::AnswerFormat;
@@ -79,11 +80,11 @@ fn entity_tag(job: &Job, format: AnswerFormat) -> String {
 pub(super) async fn result(
     State(service): State<Arc<Service>>,
     Extension(caller): Extension<Caller>,
-    Path(id): Path<String>,
+    Named(id): Named,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
     let text = |name: header::HeaderName| headers.get(name).and_then(|value| value.to_str().ok());
-    let job = service.job(&caller, id.parse()?).await?;
+    let job = service.job(&caller, id).await?;
     if job.kind == Kind::Sequence && job.state.is_end() {
         // An archive is no flow format: whatever is accepted besides names its entries' format.
         let entries = text(header::ACCEPT).filter(|accept| !accept.contains("application/zip"));

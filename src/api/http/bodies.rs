@@ -10,6 +10,8 @@ use futures_util::stream::{self, Stream, StreamExt};
 use tokio::time::timeout;
 use utoipa::ToSchema;
 
+use super::metered::{Meter, metered};
+use crate::api::auth::Caller;
 use crate::api::codec;
 use crate::api::draft::{Draft, Room};
 use crate::api::error::ApiError;
@@ -51,7 +53,9 @@ pub(super) struct SequenceBody {
 pub(super) struct Body {
     service: Arc<Service>,
     multipart: Multipart,
+    meter: Meter,
     room: Room,
+    has_options: bool,
     decode_seconds: f64,
 }
 
@@ -65,37 +69,54 @@ pub(super) enum Part {
 
 impl Body {
     /// Begins to read a request's body.
-    pub(super) async fn of(service: &Arc<Service>, request: Request) -> Result<Self, ApiError> {
-        if let Err(error) = check_head(service, &request) {
+    pub(super) async fn of(
+        service: &Arc<Service>,
+        caller: &Caller,
+        request: Request,
+    ) -> Result<Self, ApiError> {
+        if let Err(error) = check_head(service, caller, &request) {
             let body = request.into_body().into_data_stream();
             drain(body.map(|piece| piece.map_or(0, |piece| piece.len()))).await;
             return Err(error);
         }
+        let (request, meter) = metered(request);
         let multipart = Multipart::from_request(request, &()).await;
         Ok(Self {
             service: Arc::clone(service),
             multipart: multipart.map_err(|_| not_multipart())?,
+            meter,
             room: Room::default(),
+            has_options: false,
             decode_seconds: 0.0,
         })
     }
 
     /// The next part, whole.
     pub(super) async fn next(&mut self) -> Result<Option<Part>, ApiError> {
-        let idle = self.service.limits.body_idle;
-        let field = timeout(idle, self.multipart.next_field()).await;
-        let Some(field) = field.map_err(|_| ApiError::TooSlow)?.map_err(broken)? else {
+        let field = self.multipart.next_field();
+        let field = self.room.wait(&self.service, field).await?;
+        let Some(field) = field.map_err(broken)? else {
             return Ok(None);
+        };
+        self.meter.understood();
+        let mut reading = Reading {
+            service: &self.service,
+            room: &mut self.room,
+            meter: &self.meter,
         };
         let name = field.name().unwrap_or_default().to_owned();
         let file = field.file_name().map(str::to_owned);
         match name.as_str() {
+            "options" if self.has_options => {
+                Err(ApiError::BadRequest("options is there twice".to_owned()))
+            }
             "options" => {
-                let bytes = read(&self.service, &mut self.room, field, MAX_OPTIONS).await?;
+                self.has_options = true;
+                let bytes = reading.whole(field, MAX_OPTIONS).await?;
                 Ok(Some(Part::Options(JobOptions::from_json(&bytes)?)))
             }
             "source" | "target" | "frame" => {
-                let bytes = read(&self.service, &mut self.room, field, usize::MAX).await?;
+                let bytes = reading.whole(field, usize::MAX).await?;
                 Ok(Some(Part::File(name, file, bytes)))
             }
             other => Err(ApiError::BadRequest(format!(
@@ -133,10 +154,12 @@ impl Body {
     /// Takes what is still coming and throws it away.
     pub(super) async fn drain(self) {
         // A part is taken whole, however long it is: the time bounds it.
+        let meter = self.meter;
         let pieces = stream::unfold(self.multipart, async |mut multipart| {
             let mut field = multipart.next_field().await.ok()??;
             let mut bytes = 0;
             while let Some(piece) = field.chunk().await.ok()? {
+                meter.understood();
                 bytes += piece.len();
             }
             drop(field);
@@ -152,7 +175,8 @@ impl Body {
 }
 
 /// What can be refused before a byte of the body is read.
-fn check_head(service: &Service, request: &Request) -> Result<(), ApiError> {
+fn check_head(service: &Service, caller: &Caller, request: &Request) -> Result<(), ApiError> {
+    caller.may_write()?;
     let headers = request.headers();
     if headers.contains_key(header::CONTENT_ENCODING) {
         let text = "the body is compressed; send the files as they are";
@@ -197,26 +221,31 @@ async fn drain(pieces: impl Stream<Item = usize>) {
     let _cut_off_is_fine = timeout(LONGEST, drained).await;
 }
 
-/// Reads one part to its end, piece by piece.
-async fn read(
-    service: &Service,
-    room: &mut Room,
-    mut field: Field<'_>,
-    limit: usize,
-) -> Result<Vec<u8>, ApiError> {
-    let mut bytes = Vec::new();
-    loop {
-        let piece = timeout(service.limits.body_idle, field.chunk()).await;
-        let Some(piece) = piece.map_err(|_| ApiError::TooSlow)?.map_err(broken)? else {
-            return Ok(bytes);
-        };
-        room.take(service, piece.len())?;
-        if bytes.len() + piece.len() > limit {
-            return Err(ApiError::TooLarge(format!(
-                "a part has more than {limit} bytes"
-            )));
+/// What reading a part draws on.
+struct Reading<'a> {
+    service: &'a Service,
+    room: &'a mut Room,
+    meter: &'a Meter,
+}
+
+impl Reading<'_> {
+    /// Reads one part to its end, piece by piece.
+    async fn whole(&mut self, mut field: Field<'_>, limit: usize) -> Result<Vec<u8>, ApiError> {
+        let mut bytes = Vec::new();
+        loop {
+            let piece = self.room.wait(self.service, field.chunk()).await?;
+            let Some(piece) = piece.map_err(broken)? else {
+                return Ok(bytes);
+            };
+            self.meter.understood();
+            self.room.take(self.service, piece.len())?;
+            if bytes.len() + piece.len() > limit {
+                return Err(ApiError::TooLarge(format!(
+                    "a part has more than {limit} bytes"
+                )));
+            }
+            bytes.extend_from_slice(&piece);
         }
-        bytes.extend_from_slice(&piece);
     }
 }
 

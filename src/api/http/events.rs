@@ -4,12 +4,13 @@ use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::extract::{Extension, Path, State};
+use axum::extract::{Extension, State};
 use axum::response::sse::{Event, KeepAlive, Sse};
 use futures_util::Stream;
 use futures_util::stream;
 use tokio::sync::watch;
 
+use super::named::Named;
 use super::problem::Problem;
 use super::view::JobView;
 use crate::api::auth::Caller;
@@ -45,9 +46,9 @@ struct Told {
 pub(super) async fn follow_job(
     State(service): State<Arc<Service>>,
     Extension(caller): Extension<Caller>,
-    Path(id): Path<String>,
+    Named(id): Named,
 ) -> Result<Sse<impl Stream<Item = Result<Event, Infallible>>>, ApiError> {
-    let news = service.watch(&caller, id.parse()?).await?;
+    let news = service.watch(&caller, id).await?;
     let told = Told {
         service,
         news,

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Json;
-use axum::extract::{Extension, Path, Query, Request, State};
+use axum::extract::{Extension, Query, Request, State};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
@@ -12,6 +12,7 @@ use utoipa::ToSchema;
 
 use super::answer;
 use super::bodies::{Body, PairFiles, Part};
+use super::named::Named;
 use super::prefer::Prefer;
 use super::problem::Problem;
 use super::view::{self, JobView};
@@ -139,7 +140,7 @@ async fn submit_pair(
     promise: Promise,
     request: Request,
 ) -> Result<(Arc<Job>, bool), ApiError> {
-    let mut body = Body::of(service, request).await?;
+    let mut body = Body::of(service, &caller, request).await?;
     match read_pair(service, &caller, asked, promise, &mut body).await {
         Ok(draft) => {
             service.metrics.phase("decode", body.decode_seconds(), None);
@@ -241,7 +242,7 @@ async fn submit(
     asked: &Asked,
     request: Request,
 ) -> Result<Response, ApiError> {
-    let mut body = Body::of(service, request).await?;
+    let mut body = Body::of(service, &caller, request).await?;
     let (draft, kind) = match read_job(service, &caller, asked, &mut body).await {
         Ok(read) => read,
         Err(error) => {
@@ -345,11 +346,11 @@ pub(super) struct Look {
 pub(super) async fn get_job(
     State(service): State<Arc<Service>>,
     Extension(caller): Extension<Caller>,
-    Path(id): Path<String>,
+    Named(id): Named,
     look: Result<Query<Look>, axum::extract::rejection::QueryRejection>,
 ) -> Result<Json<JobView>, ApiError> {
     let Query(look) = look.map_err(|error| ApiError::BadRequest(error.body_text()))?;
-    let mut job = service.job(&caller, id.parse::<JobId>()?).await?;
+    let mut job = service.job(&caller, id).await?;
     if let Some(seconds) = look.wait
         && !job.state.is_end()
     {
@@ -429,9 +430,9 @@ pub(super) async fn list_jobs(
 pub(super) async fn cancel_job(
     State(service): State<Arc<Service>>,
     Extension(caller): Extension<Caller>,
-    Path(id): Path<String>,
+    Named(id): Named,
 ) -> Result<Json<JobView>, ApiError> {
-    let job = service.cancel(&caller, id.parse()?).await?;
+    let job = service.cancel(&caller, id).await?;
     Ok(Json(JobView::new(&job, &[])))
 }
 
@@ -449,8 +450,8 @@ pub(super) async fn cancel_job(
 pub(super) async fn requeue_job(
     State(service): State<Arc<Service>>,
     Extension(caller): Extension<Caller>,
-    Path(id): Path<String>,
+    Named(id): Named,
 ) -> Result<Json<JobView>, ApiError> {
-    let job = service.requeue(&caller, id.parse()?).await?;
+    let job = service.requeue(&caller, id).await?;
     Ok(Json(JobView::new(&job, &[])))
 }

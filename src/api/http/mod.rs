@@ -6,6 +6,8 @@ mod answer;
 mod bodies;
 mod events;
 mod handlers;
+mod metered;
+mod named;
 mod openapi;
 mod prefer;
 mod problem;

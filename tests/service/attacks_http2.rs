@@ -1,0 +1,163 @@
+//! Attacks on the framing of HTTP/2, written frame by frame.
+
+use std::time::Duration;
+
+use crate::wire::{
+    Besieged, CONTINUATION, DATA, END_HEADERS, END_STREAM, Frames, GOAWAY, HEADERS, PING,
+    RST_STREAM, SETTINGS, WINDOW_UPDATE, field, frame, head,
+};
+
+/// Streams of an attack: far more than any limit.
+const STREAMS: u32 = 5000;
+
+/// The last stream that may be looked at: the limit of 1,024, and what was under way.
+const LAST: u32 = 2 * 1200;
+
+/// The names of the streams of a client.
+fn streams(count: u32) -> impl Iterator<Item = u32> {
+    (0..count).map(|number| 2 * number + 1)
+}
+
+#[tokio::test]
+async fn the_settings_say_how_many_streams_and_headers_are_taken() {
+    let siege = Besieged::new("").await;
+    let mut frames = Frames::open(&siege.server);
+    let settings = frames.next().expect("settings");
+    assert_eq!((settings.kind, settings.flags), (SETTINGS, 0));
+    let value = |name: u16| {
+        let mut pairs = settings.payload.chunks_exact(6);
+        let found = pairs.find(|pair| pair[..2] == name.to_be_bytes())?;
+        Some(u32::from_be_bytes(found[2..].try_into().ok()?))
+    };
+    const MAX_CONCURRENT_STREAMS: u16 = 3;
+    const MAX_HEADER_LIST_SIZE: u16 = 6;
+    assert_eq!(value(MAX_CONCURRENT_STREAMS), Some(128));
+    assert_eq!(value(MAX_HEADER_LIST_SIZE), Some(16 << 10));
+}
+
+#[tokio::test]
+async fn streams_that_are_opened_and_reset_at_once_end_the_connection() {
+    let siege = Besieged::new("").await;
+    for method in ["GET", "POST"] {
+        let mut frames = Frames::open(&siege.server);
+        let mut bytes = Vec::new();
+        for stream in streams(STREAMS) {
+            let block = head(method, "/v1/flow");
+            bytes.extend(frame(HEADERS, END_HEADERS, stream, &block));
+            bytes.extend(frame(RST_STREAM, 0, stream, &8_u32.to_be_bytes()));
+        }
+        frames.send(bytes);
+        let (last, code) = frames.goaway();
+        const ENHANCE_YOUR_CALM: u32 = 11;
+        assert_eq!(code, ENHANCE_YOUR_CALM);
+        assert!(last < LAST, "{last}");
+    }
+    siege.stands().await;
+}
+
+#[tokio::test]
+async fn streams_that_make_the_server_reset_them_end_the_connection() {
+    let siege = Besieged::new("").await;
+    // Each makes the server reset the stream: a window that overflows, and more data than said.
+    let overflow = |stream| frame(WINDOW_UPDATE, 0, stream, &0x7fff_ffff_u32.to_be_bytes());
+    let lie = |stream| frame(DATA, END_STREAM, stream, &[0; 100]);
+    let errors: [&dyn Fn(u32) -> Vec<u8>; 2] = [&overflow, &lie];
+    for error in errors {
+        let mut frames = Frames::open(&siege.server);
+        let mut bytes = Vec::new();
+        for stream in streams(STREAMS) {
+            let mut block = head("POST", "/v1/flow");
+            block.extend(field("content-length", "1"));
+            bytes.extend(frame(HEADERS, END_HEADERS, stream, &block));
+            bytes.extend(error(stream));
+        }
+        frames.send(bytes);
+        let (last, code) = frames.goaway();
+        assert_ne!(code, 0);
+        assert!(last < LAST, "{last}");
+    }
+    siege.stands().await;
+}
+
+#[tokio::test]
+async fn headers_that_never_end_end_the_connection_or_the_request() {
+    let siege = Besieged::new("").await;
+    let block = head("GET", "/v1/jobs");
+    let pieces: [(&str, Vec<u8>); 3] = [
+        ("empty", Vec::new()),
+        ("small", field("a", "b")),
+        ("large", field("a", &"b".repeat(100)).repeat(150)),
+    ];
+    for (name, piece) in pieces {
+        let mut frames = Frames::open(&siege.server);
+        let mut bytes = frame(HEADERS, END_STREAM, 1, &block);
+        for _ in 0..10_000_usize.min((32 << 20) / (piece.len() + 9)) {
+            bytes.extend(frame(CONTINUATION, 0, 1, &piece));
+        }
+        bytes.extend(frame(CONTINUATION, END_HEADERS, 1, &[]));
+        frames.send(bytes);
+        // Refused, one way or another, and not answered with what was asked for.
+        let refused = std::iter::from_fn(|| frames.next()).find_map(|frame| match frame.kind {
+            GOAWAY | RST_STREAM => Some(true),
+            // ":status: 431" has no place in the static table; 200, 404 and the like do.
+            HEADERS => Some(!matches!(frame.payload[0], 0x88..=0x8e)),
+            _ => None,
+        });
+        assert_ne!(refused, Some(false), "{name}");
+        siege.has_not_grown();
+    }
+    siege.stands().await;
+}
+
+#[tokio::test]
+async fn floods_of_pings_settings_and_small_data_cost_little() {
+    let siege = Besieged::new("[limits]\nwrite_timeout_seconds = 1\n").await;
+    let open = frame(HEADERS, END_HEADERS, 1, &head("POST", "/v1/flow"));
+    let floods = [
+        (Vec::new(), frame(PING, 0, 0, &[0; 8])),
+        (Vec::new(), frame(SETTINGS, 0, 0, &[])),
+        (open.clone(), frame(DATA, 0, 1, &[])),
+        (open, frame(DATA, 0, 1, &[7])),
+    ];
+    let mut held = Vec::new();
+    for (first, flood) in floods {
+        let frames = Frames::open(&siege.server);
+        let mut bytes = first;
+        for _ in 0..200_000 {
+            bytes.extend(&flood);
+        }
+        // Nothing of what comes back is read.
+        frames.send(bytes);
+        frames.patience(Duration::from_secs(1));
+        held.push(frames);
+    }
+    siege.stands().await;
+    siege.has_not_grown();
+    drop(held);
+    siege.stands().await;
+}
+
+#[tokio::test]
+async fn ten_thousand_headers_and_a_mebibyte_of_one_are_refused() {
+    let siege = Besieged::new("[limits]\nheader_timeout_seconds = 1\n").await;
+    let many: String = (0..10_000)
+        .map(|number| format!("h{number}: 1\r\n"))
+        .collect();
+    let long = format!("long: {}\r\n", "a".repeat(1 << 20));
+    for headers in [many, long] {
+        let request = format!("GET /openapi.json HTTP/1.1\r\nhost: x\r\n{headers}\r\n");
+        let answer = crate::wire::exchange(&siege.server, request.as_bytes());
+        assert!(
+            matches!(crate::wire::status(&answer), Some(431) | None),
+            "{answer}"
+        );
+    }
+    let path = "a".repeat(1 << 20);
+    let request = format!("GET /{path} HTTP/1.1\r\nhost: x\r\n\r\n");
+    let answer = crate::wire::exchange(&siege.server, request.as_bytes());
+    assert!(
+        matches!(crate::wire::status(&answer), Some(414 | 431) | None),
+        "{answer}"
+    );
+    siege.stands().await;
+}

@@ -1,0 +1,244 @@
+//! Bytes on the wire that no well-behaved client would send, and what a server must be afterwards.
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::time::{Duration, Instant};
+
+use reqwest::StatusCode;
+
+use crate::clouds::{form, small_pair};
+use crate::server::{Folder, PATIENCE, Server};
+
+/// A request of a few hundredths of a second.
+pub(crate) const SMALL: &str = r#"{"max_points": 512}"#;
+
+/// What an attack may cost a server for good.
+const MAX_GROWTH: u64 = 64 << 20;
+
+/// A server under attack.
+pub(crate) struct Besieged {
+    pub(crate) server: Server,
+    resident: u64,
+}
+
+impl Besieged {
+    /// A server that has served already, so that what it keeps for work is there.
+    pub(crate) async fn new(config: &str) -> Self {
+        Self::with(config, &[]).await
+    }
+
+    /// The same with some more arguments.
+    pub(crate) async fn with(config: &str, arguments: &[&str]) -> Self {
+        let server = Server::start_in(&Folder::new(), config, arguments);
+        for _ in 0..3 {
+            serves(&server).await;
+        }
+        let resident = server.resident_bytes();
+        Self { server, resident }
+    }
+
+    /// Asserts that the attack has cost little memory, and that work is still done.
+    pub(crate) async fn stands(&self) {
+        self.has_not_grown();
+        serves(&self.server).await;
+        let log = self.server.log();
+        assert!(!log.contains("panicked"), "{log}");
+    }
+
+    pub(crate) fn has_not_grown(&self) {
+        let now = self.server.resident_bytes();
+        let grown = now.saturating_sub(self.resident);
+        assert!(grown < MAX_GROWTH, "it has grown by {} MiB", grown >> 20);
+    }
+}
+
+/// Asserts that a small pair is solved.
+pub(crate) async fn serves(server: &Server) {
+    let sent = reqwest::Client::new()
+        .post(server.url("/v1/flow"))
+        .header("connection", "close")
+        .multipart(form(small_pair(), SMALL))
+        .send();
+    let answer = sent.await.expect("an answer");
+    assert_eq!(answer.status(), StatusCode::OK, "{}", server.log());
+}
+
+/// A connection to the public port.
+pub(crate) fn connect(server: &Server) -> TcpStream {
+    let stream = TcpStream::connect(&server.public).expect("a connection");
+    stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
+    stream.set_write_timeout(Some(PATIENCE)).expect("a timeout");
+    stream.set_nodelay(true).expect("an option");
+    stream
+}
+
+/// Sends bytes and takes all that comes back until the server closes.
+pub(crate) fn exchange(server: &Server, bytes: &[u8]) -> String {
+    let mut stream = connect(server);
+    // A server that has refused already need not read the rest.
+    let _refused_early = stream.write_all(bytes);
+    until_closed(stream)
+}
+
+/// All that comes until the server closes the connection.
+pub(crate) fn until_closed(mut stream: TcpStream) -> String {
+    let began = Instant::now();
+    let mut all = Vec::new();
+    let mut piece = [0; 4096];
+    loop {
+        match stream.read(&mut piece) {
+            Ok(0) => break,
+            Ok(count) => all.extend_from_slice(&piece[..count]),
+            Err(error) if error.kind() == std::io::ErrorKind::ConnectionReset => break,
+            Err(error) => panic!("it was not closed: {error}"),
+        }
+        assert!(began.elapsed() < PATIENCE, "it goes on");
+    }
+    String::from_utf8_lossy(&all).into_owned()
+}
+
+/// The status of an HTTP/1.1 answer; nothing where there is none.
+pub(crate) fn status(answer: &str) -> Option<u16> {
+    answer
+        .strip_prefix("HTTP/1.1 ")
+        .or_else(|| answer.strip_prefix("HTTP/1.0 "))?
+        .get(..3)?
+        .parse()
+        .ok()
+}
+
+/// A multipart body of named parts, and its content type's boundary is `x`.
+pub(crate) fn multipart(parts: &[(&str, &[u8])]) -> Vec<u8> {
+    let mut body = Vec::new();
+    for (name, bytes) in parts {
+        let file = if *name == "options" {
+            ""
+        } else {
+            "; filename=\"a.npy\""
+        };
+        let head = format!("--x\r\ncontent-disposition: form-data; name=\"{name}\"{file}\r\n\r\n");
+        body.extend(head.as_bytes());
+        body.extend(*bytes);
+        body.extend(b"\r\n");
+    }
+    body.extend(b"--x--\r\n");
+    body
+}
+
+/// The head of a request with a multipart body, without the blank line.
+pub(crate) fn post(path: &str, headers: &str) -> String {
+    format!(
+        "POST {path} HTTP/1.1\r\nhost: x\r\ncontent-type: multipart/form-data; boundary=x\r\n\
+         {headers}"
+    )
+}
+
+/// An HTTP/2 connection that is written frame by frame.
+pub(crate) struct Frames {
+    stream: TcpStream,
+}
+
+/// A frame that has come.
+pub(crate) struct Frame {
+    pub(crate) kind: u8,
+    pub(crate) flags: u8,
+    pub(crate) payload: Vec<u8>,
+}
+
+pub(crate) const DATA: u8 = 0;
+pub(crate) const HEADERS: u8 = 1;
+pub(crate) const RST_STREAM: u8 = 3;
+pub(crate) const SETTINGS: u8 = 4;
+pub(crate) const PING: u8 = 6;
+pub(crate) const GOAWAY: u8 = 7;
+pub(crate) const WINDOW_UPDATE: u8 = 8;
+pub(crate) const CONTINUATION: u8 = 9;
+pub(crate) const END_STREAM: u8 = 1;
+pub(crate) const END_HEADERS: u8 = 4;
+
+impl Frames {
+    pub(crate) fn open(server: &Server) -> Self {
+        let mut stream = connect(server);
+        stream
+            .write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n")
+            .expect("sent");
+        stream.write_all(&frame(SETTINGS, 0, 0, &[])).expect("sent");
+        Self { stream }
+    }
+
+    /// Sends bytes from a thread of its own, since the server may answer before it has read them.
+    pub(crate) fn send(&self, bytes: Vec<u8>) {
+        let mut stream = self.stream.try_clone().expect("a handle");
+        std::thread::spawn(move || {
+            let _cut_off_is_fine = stream.write_all(&bytes);
+        });
+    }
+
+    /// The next frame; nothing where the connection is closed.
+    pub(crate) fn next(&mut self) -> Option<Frame> {
+        let mut head = [0; 9];
+        self.stream.read_exact(&mut head).ok()?;
+        let length = u32::from_be_bytes([0, head[0], head[1], head[2]]);
+        let mut payload = vec![0; length as usize];
+        self.stream.read_exact(&mut payload).ok()?;
+        Some(Frame {
+            kind: head[3],
+            flags: head[4],
+            payload,
+        })
+    }
+
+    /// The last stream and the error code of the GOAWAY that must come, now or before the end.
+    pub(crate) fn goaway(&mut self) -> (u32, u32) {
+        while let Some(frame) = self.next() {
+            if frame.kind == GOAWAY {
+                let word = |at: usize| {
+                    let bytes = frame.payload[at..at + 4].try_into();
+                    u32::from_be_bytes(bytes.expect("four bytes"))
+                };
+                return (word(0), word(4));
+            }
+        }
+        panic!("it was closed without a GOAWAY")
+    }
+
+    /// Shortens how long a read may take.
+    pub(crate) fn patience(&self, patience: Duration) {
+        let set = self.stream.set_read_timeout(Some(patience));
+        set.expect("a timeout");
+    }
+}
+
+/// A frame's bytes.
+pub(crate) fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
+    let length = u32::try_from(payload.len()).expect("a small frame");
+    let mut bytes = length.to_be_bytes()[1..].to_vec();
+    bytes.extend([kind, flags]);
+    bytes.extend(stream.to_be_bytes());
+    bytes.extend(payload);
+    bytes
+}
+
+/// A field of a header block, as a literal that is not indexed.
+pub(crate) fn field(name: &str, value: &str) -> Vec<u8> {
+    let mut bytes = vec![0];
+    for text in [name, value] {
+        bytes.push(u8::try_from(text.len()).expect("short"));
+        bytes.extend(text.as_bytes());
+    }
+    bytes
+}
+
+/// The header block of a request without a body of its own.
+pub(crate) fn head(method: &str, path: &str) -> Vec<u8> {
+    let fields = [
+        (":method", method),
+        (":scheme", "http"),
+        (":path", path),
+        (":authority", "x"),
+    ];
+    fields
+        .iter()
+        .flat_map(|(name, value)| field(name, value))
+        .collect()
+}
