@@ -15,7 +15,9 @@ use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot, watch};
 
 use crate::flow::backend::{Backend, BackendError};
-use crate::flow::{self, Estimate, FlowError, Options, Point, Problem, Snapshot, Watch};
+use crate::flow::{
+    self, Estimate, FlowError, Interrupt, Options, Point, Problem, Progress, Snapshot, Watch,
+};
 
 /// One pair for a device.
 pub struct Work {
@@ -115,6 +117,25 @@ impl Device {
         self.health.clone()
     }
 
+    /// What stands in the way of work; nothing where the device has passed its trial and, if it
+    /// works, has given a sign of life a moment ago.
+    pub fn obstacle(&self) -> Option<String> {
+        match &*self.health.borrow() {
+            Health::Starting => Some(format!("{} is being tried", self.name)),
+            Health::Broken(reason) => Some(format!("{}: {reason}", self.name)),
+            Health::Ready => {
+                let silence = self.busy.silence();
+                (silence > LONGEST_SILENCE).then(|| {
+                    format!(
+                        "{} gave no sign of life for {} s",
+                        self.name,
+                        silence.as_secs()
+                    )
+                })
+            }
+        }
+    }
+
     /// How long the device has worked in all.
     pub fn busy(&self) -> Duration {
         self.busy.total()
@@ -133,10 +154,15 @@ impl Device {
     }
 }
 
+/// Silence in the middle of work after which a device is not taken for ready.
+const LONGEST_SILENCE: Duration = Duration::from_secs(30);
+
 /// Time at work, the current piece of it included.
 #[derive(Debug)]
 struct Busy {
     epoch: Instant,
+    /// Microseconds after `epoch` of the latest sign of life.
+    alive: AtomicU64,
     before_micros: AtomicU64,
     /// Microseconds after `epoch` at which the current piece began, plus one; zero when idle.
     since: AtomicU64,
@@ -146,6 +172,7 @@ impl Default for Busy {
     fn default() -> Self {
         Self {
             epoch: Instant::now(),
+            alive: AtomicU64::new(0),
             before_micros: AtomicU64::new(0),
             since: AtomicU64::new(0),
         }
@@ -157,7 +184,21 @@ impl Busy {
         u64::try_from(self.epoch.elapsed().as_micros()).unwrap_or(u64::MAX - 1)
     }
 
+    fn sign_of_life(&self) {
+        self.alive.store(self.now(), Ordering::Relaxed);
+    }
+
+    /// How long nothing has been heard in the middle of work.
+    fn silence(&self) -> Duration {
+        if self.since.load(Ordering::Relaxed) == 0 {
+            return Duration::ZERO;
+        }
+        let heard = self.alive.load(Ordering::Relaxed);
+        Duration::from_micros(self.now().saturating_sub(heard))
+    }
+
     fn begin(&self) {
+        self.sign_of_life();
         self.since.store(self.now() + 1, Ordering::Relaxed);
     }
 
@@ -227,7 +268,7 @@ fn work_until_panic(
 ) -> Option<()> {
     while let Some(Command { work, reply }) = inbox.blocking_recv() {
         busy.begin();
-        let solved = catch_unwind(AssertUnwindSafe(|| solve(backend, work)));
+        let solved = catch_unwind(AssertUnwindSafe(|| solve(backend, work, busy)));
         busy.end();
         let (answer, panicked) = match solved {
             Ok(answer) => {
@@ -250,7 +291,44 @@ fn work_until_panic(
     None
 }
 
-fn solve(backend: &dyn Backend, work: Work) -> Result<Estimate, FlowError> {
+/// Passes everything on, and hears the signs of life.
+struct Heard<'a> {
+    watch: &'a dyn Watch,
+    busy: &'a Busy,
+}
+
+impl Watch for Heard<'_> {
+    fn seconds(&self) -> f64 {
+        self.watch.seconds()
+    }
+
+    fn seconds_left(&self) -> Option<f64> {
+        self.watch.seconds_left()
+    }
+
+    fn interrupt(&self) -> Option<Interrupt> {
+        self.busy.sign_of_life();
+        self.watch.interrupt()
+    }
+
+    fn progress(&self, progress: Progress) {
+        self.watch.progress(progress);
+    }
+
+    fn snapshot_due(&self) -> bool {
+        self.watch.snapshot_due()
+    }
+
+    fn snapshot(&self, snapshot: Snapshot) {
+        self.watch.snapshot(snapshot);
+    }
+}
+
+fn solve(backend: &dyn Backend, work: Work, busy: &Busy) -> Result<Estimate, FlowError> {
+    let watch = Heard {
+        watch: work.watch.as_ref(),
+        busy,
+    };
     let ground = work.ground.as_ref();
     let problem = Problem {
         source: &work.source,
@@ -258,20 +336,14 @@ fn solve(backend: &dyn Backend, work: Work) -> Result<Estimate, FlowError> {
         ground: ground.map(|[source, target]| [source.as_slice(), target.as_slice()]),
     };
     if let Some(snapshot) = work.snapshot {
-        match flow::resume(
-            backend,
-            &problem,
-            &work.options,
-            snapshot,
-            work.watch.as_ref(),
-        ) {
+        match flow::resume(backend, &problem, &work.options, snapshot, &watch) {
             Err(FlowError::Snapshot(error)) => {
                 tracing::warn!(%error, "a snapshot is of no use: the job starts afresh");
             }
             resumed => return resumed,
         }
     }
-    flow::estimate(backend, &problem, &work.options, work.watch.as_ref())
+    flow::estimate(backend, &problem, &work.options, &watch)
 }
 
 /// What a panic said.

@@ -14,7 +14,7 @@ use serde_json::json;
 use tokio::sync::watch;
 
 use crate::clock::Timestamp;
-use crate::engine::{Device, Health};
+use crate::engine::Device;
 use crate::metrics::Metrics;
 use crate::queue::Queue;
 
@@ -35,11 +35,7 @@ impl Readiness {
         }
         let mut reasons = Vec::new();
         for device in &self.devices {
-            match &*device.health().borrow() {
-                Health::Ready => return None,
-                Health::Starting => reasons.push(format!("{} is being tried", device.name())),
-                Health::Broken(why) => reasons.push(format!("{}: {why}", device.name())),
-            }
+            reasons.push(device.obstacle()?);
         }
         Some(reasons.join("; "))
     }

@@ -11,7 +11,7 @@ use tokio::sync::OwnedSemaphorePermit;
 use super::admission::{Asked, Promise, Reservation};
 use super::auth::Caller;
 use super::error::ApiError;
-use super::service::Service;
+use super::service::{Awaited, Service};
 use crate::blobs::{Blob, Sync};
 use crate::clock::Timestamp;
 use crate::cost::CostModel;
@@ -32,6 +32,16 @@ pub(super) struct Request {
     pub arrived: Instant,
     /// What is left of the call's own deadline, if it has one.
     pub time_left: Option<Duration>,
+}
+
+/// A job that was accepted.
+pub(super) struct Accepted {
+    /// The job.
+    pub(super) job: Arc<Job>,
+    /// Whether it is new: not one that an idempotency key has found.
+    pub(super) new: bool,
+    /// Cancels a new job that somebody waits for, unless it is let go.
+    pub(super) awaited: Option<Awaited>,
 }
 
 /// When a request arrived.
@@ -135,12 +145,14 @@ impl Draft {
         Ok(())
     }
 
-    /// Submits the job: a pair for two clouds and `kind` pair, else a sequence. The answer says
-    /// whether it is new.
+    /// Submits the job: a pair for two clouds and `kind` pair, else a sequence.
+    ///
+    /// A caller that goes away in the middle leaves nothing half done: the job is accepted with its
+    /// clouds, or neither is there; and what was only for that caller is cancelled.
     ///
     /// # Errors
     /// [`ApiError`] where clouds are missing, nothing more is accepted, or the store fails.
-    pub(super) async fn submit(mut self, kind: Kind) -> Result<(Arc<Job>, bool), ApiError> {
+    pub(super) async fn submit(self, kind: Kind) -> Result<Accepted, ApiError> {
         match (kind, self.frames) {
             (Kind::Pair, 2) | (Kind::Sequence, 2..) => {}
             (Kind::Pair, _) => {
@@ -151,14 +163,28 @@ impl Draft {
                 return Err(ApiError::BadRequest(text.to_owned()));
             }
         }
-        let _place = self.admit()?;
+        let place = self.admit()?;
+        let committed = tokio::spawn(self.commit(kind, place));
+        committed.await.map_err(ApiError::internal)?
+    }
+
+    async fn commit(mut self, kind: Kind, _place: Reservation) -> Result<Accepted, ApiError> {
         let submission = self.submission(kind);
         match self.service.queue.submit(submission).await? {
             Submitted::New(job) => {
                 self.submitted = true;
-                Ok((job, true))
+                let awaited = self.request.promise == Promise::WhileAwaited;
+                Ok(Accepted {
+                    awaited: awaited.then(|| self.service.cancel_when_dropped(job.id)),
+                    job,
+                    new: true,
+                })
             }
-            Submitted::Known(job) => Ok((job, false)),
+            Submitted::Known(job) => Ok(Accepted {
+                job,
+                new: false,
+                awaited: None,
+            }),
         }
     }
 

@@ -11,6 +11,7 @@ use axum::http::{HeaderValue, header};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use tower_http::catch_panic::CatchPanicLayer;
+use tracing::Instrument;
 
 use super::draft::Arrived;
 use super::error::{ApiError, Row};
@@ -77,7 +78,8 @@ async fn count(State(service): State<Arc<Service>>, request: Request, next: Next
     let door = if is_grpc(&request) { "grpc" } else { "http" };
     let (method, path) = (request.method().clone(), request.uri().path().to_owned());
     let began = Instant::now();
-    let mut response = next.run(request).await;
+    let span = tracing::info_span!("request", door, %method, path);
+    let mut response = next.run(request).instrument(span).await;
     response.headers_mut().insert(
         "x-content-type-options",
         HeaderValue::from_static("nosniff"),

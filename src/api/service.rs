@@ -45,6 +45,8 @@ pub struct Service {
     pub(super) limits: ServiceLimits,
     pub(super) room: Arc<Semaphore>,
     compute: Semaphore,
+    /// Cancelled when the server is about to stop: health says so, everything is still served.
+    pub(super) leaving: CancellationToken,
     draining: AtomicBool,
     /// Event streams and long polls end when this is cancelled.
     pub(super) closing: CancellationToken,
@@ -101,6 +103,7 @@ impl Service {
             limits: parts.limits,
             room: Arc::new(Semaphore::new(room.min(Semaphore::MAX_PERMITS))),
             compute: Semaphore::new(cores),
+            leaving: CancellationToken::new(),
             draining: AtomicBool::new(false),
             closing: CancellationToken::new(),
         }
@@ -121,6 +124,11 @@ impl Service {
         if let Some(reason) = row.rejection {
             self.metrics.rejected(reason);
         }
+    }
+
+    /// Says that the server is about to stop, and goes on as before.
+    pub fn leave(&self) {
+        self.leaving.cancel();
     }
 
     /// Accepts nothing more.

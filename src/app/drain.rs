@@ -20,6 +20,7 @@ impl App {
         let began = Instant::now();
         let deadline = began + Duration::from_secs(self.config.drain.deadline_seconds);
         self.draining.send_replace(true);
+        self.service.leave();
         tracing::info!("not ready any more");
         tokio::time::sleep(Duration::from_secs(self.config.drain.delay_seconds)).await;
 

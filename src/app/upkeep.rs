@@ -8,7 +8,7 @@ use tokio::task::JoinSet;
 use tokio::time::interval;
 
 use crate::blobs::Blobs;
-use crate::engine::{Device, Health};
+use crate::engine::Device;
 use crate::metrics::Metrics;
 use crate::queue::{Event, Queue};
 
@@ -58,8 +58,7 @@ async fn look(devices: Vec<Device>, metrics: Arc<Metrics>) {
             let busy = device.busy();
             let ratio = busy.saturating_sub(*before).as_secs_f64() / passed;
             *before = busy;
-            let ready = *device.health().borrow() == Health::Ready;
-            metrics.device(device.name(), ready, ratio.min(1.0));
+            metrics.device(device.name(), device.obstacle().is_none(), ratio.min(1.0));
         }
     }
 }

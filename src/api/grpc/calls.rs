@@ -12,7 +12,7 @@ use super::chunks::{self, CloudBuilder};
 use super::proto::{self, scene_flow_server::SceneFlow};
 use super::{convert, sequence};
 use crate::api::admission::Promise;
-use crate::api::draft::{Draft, Room};
+use crate::api::draft::{Accepted, Draft, Room};
 use crate::api::error::ApiError;
 use crate::api::service::{Answer, Service, Waited};
 use crate::job::{Job, JobId, Kind, Priority};
@@ -41,7 +41,7 @@ impl Calls {
         &self,
         call: &Call,
         inbound: &mut Streaming<proto::EstimateFlowRequest>,
-    ) -> Result<(Arc<Job>, Option<Duration>), ApiError> {
+    ) -> Result<(Accepted, Option<Duration>), ApiError> {
         use proto::estimate_flow_request::Part;
         let awaited = Promise::WhileAwaited;
         self.service
@@ -79,8 +79,8 @@ impl Calls {
         for (cloud, part) in clouds.into_iter().zip(["source", "target"]) {
             draft.push(cloud.finish(part)?).await?;
         }
-        let (job, _) = draft.submit(Kind::Pair).await?;
-        Ok((job, (pause > 0).then(|| Duration::from_millis(pause))))
+        let accepted = draft.submit(Kind::Pair).await?;
+        Ok((accepted, (pause > 0).then(|| Duration::from_millis(pause))))
     }
 }
 
@@ -155,8 +155,8 @@ impl SceneFlow for Calls {
         request: Request<Streaming<proto::EstimateFlowRequest>>,
     ) -> Result<Response<Self::EstimateFlowStream>, Status> {
         let call = Call::of(&request)?;
-        let (job, pause) = self.read_pair(&call, &mut request.into_inner()).await?;
-        let awaited = self.service.cancel_when_dropped(job.id);
+        let (accepted, pause) = self.read_pair(&call, &mut request.into_inner()).await?;
+        let Accepted { job, awaited, .. } = accepted;
         let (answers, stream) = mpsc::channel(AHEAD);
         let service = Arc::clone(&self.service);
         tokio::spawn(async move {
@@ -166,7 +166,11 @@ impl SceneFlow for Calls {
                 sent = send_flow(&service, job.id, pause, &answers) => sent,
             };
             match sent {
-                Ok(()) => awaited.let_go(),
+                Ok(()) => {
+                    if let Some(awaited) = awaited {
+                        awaited.let_go();
+                    }
+                }
                 Err(error) => {
                     service.count_late_error("grpc", &error);
                     let _gone_is_fine = answers.send(Err(error.into())).await;
@@ -242,8 +246,8 @@ impl SceneFlow for Calls {
         } else {
             Kind::Pair
         };
-        let (job, _) = draft.submit(kind).await?;
-        Ok(Response::new(convert::job(&job)))
+        let accepted = draft.submit(kind).await?;
+        Ok(Response::new(convert::job(&accepted.job)))
     }
 
     async fn get_job(

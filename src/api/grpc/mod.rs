@@ -12,7 +12,9 @@ mod status;
 use std::sync::Arc;
 
 use axum::Router;
+use tonic::server::NamedService;
 use tonic::service::Routes;
+use tonic_health::ServingStatus;
 
 use super::service::Service;
 
@@ -49,10 +51,18 @@ pub(super) fn router(service: &Arc<Service>) -> Router {
         .max_decoding_message_size(MAX_MESSAGE)
         .max_encoding_message_size(4 << 20);
     let (reporter, health) = tonic_health::server::health_reporter();
+    let leaving = service.leaving.clone();
     tokio::spawn(async move {
+        let own = <proto::scene_flow_server::SceneFlowServer<calls::Calls> as NamedService>::NAME;
         reporter
-            .set_serving::<proto::scene_flow_server::SceneFlowServer<calls::Calls>>()
+            .set_service_status(own, ServingStatus::Serving)
             .await;
+        leaving.cancelled().await;
+        for name in ["", own] {
+            reporter
+                .set_service_status(name, ServingStatus::NotServing)
+                .await;
+        }
     });
     let mut routes = Routes::builder();
     routes.add_service(calls).add_service(health);

@@ -13,10 +13,10 @@ use super::call::{Call, no_begin};
 use super::chunks::{self, CloudBuilder};
 use super::{convert, proto};
 use crate::api::admission::Promise;
-use crate::api::draft::{Draft, Room};
+use crate::api::draft::{Accepted, Draft, Room};
 use crate::api::error::ApiError;
-use crate::api::service::{Awaited, Service, Waited};
-use crate::job::{JobId, JobOptions, Kind};
+use crate::api::service::{Service, Waited};
+use crate::job::{JobOptions, Kind};
 use crate::payload::StoredCloud;
 
 type Answers = mpsc::Sender<Result<proto::EstimateSequenceResponse, Status>>;
@@ -27,7 +27,7 @@ struct Pending {
     source: String,
     target: String,
     /// Its job, or why it has none.
-    job: Result<(JobId, Awaited), ApiError>,
+    job: Result<Accepted, ApiError>,
 }
 
 /// A sweep that has arrived.
@@ -177,15 +177,14 @@ impl Reader {
         source: StoredCloud,
         target: StoredCloud,
         options: &JobOptions,
-    ) -> Result<(JobId, Awaited), ApiError> {
+    ) -> Result<Accepted, ApiError> {
         let request = self
             .call
             .draft_request(options.clone(), Promise::WhileAwaited);
         let mut draft = Draft::begin(&self.service, self.call.caller.clone(), request)?;
         draft.push(source).await?;
         draft.push(target).await?;
-        let (job, _) = draft.submit(Kind::Pair).await?;
-        Ok((job.id, self.service.cancel_when_dropped(job.id)))
+        draft.submit(Kind::Pair).await
     }
 }
 
@@ -216,9 +215,11 @@ async fn send(service: &Arc<Service>, pair: Pending, answers: &Answers) -> bool 
     };
     let answer = match pair.job {
         Err(error) => Err(error),
-        Ok((id, awaited)) => match service.wait(id, None).await {
+        Ok(accepted) => match service.wait(accepted.job.id, None).await {
             Ok(Waited::Ended(job)) => {
-                awaited.let_go();
+                if let Some(awaited) = accepted.awaited {
+                    awaited.let_go();
+                }
                 service.answer(&job).await
             }
             Ok(Waited::StillOpen(_)) => Err(ApiError::Draining),

@@ -19,7 +19,7 @@ use super::view::{self, JobView};
 use crate::api::admission::Promise;
 use crate::api::auth::Caller;
 use crate::api::codec::AnswerFormat;
-use crate::api::draft::{Arrived, Draft, Request as DraftRequest};
+use crate::api::draft::{Accepted, Arrived, Draft, Request as DraftRequest};
 use crate::api::error::ApiError;
 use crate::api::service::{Service, Waited};
 use crate::job::{Job, JobId, JobOptions, Kind, Priority, State as JobState};
@@ -109,12 +109,11 @@ pub(super) async fn estimate(
         } => Promise::Durable,
         _ => Promise::WhileAwaited,
     };
-    let (job, new) = submit_pair(&service, caller, &asked, promise, request).await?;
+    let Accepted { job, awaited, .. } =
+        submit_pair(&service, caller, &asked, promise, request).await?;
     if promise == Promise::Durable {
         return Ok(accepted(&job, asked.prefer));
     }
-    // Whoever finds somebody else's job by its key must not cancel it.
-    let awaited = new.then(|| service.cancel_when_dropped(job.id));
     let longest = asked.prefer.wait.filter(|_| asked.prefer.respond_async);
     let response = match service.wait(job.id, longest).await? {
         Waited::Ended(job) => {
@@ -139,7 +138,7 @@ async fn submit_pair(
     asked: &Asked,
     promise: Promise,
     request: Request,
-) -> Result<(Arc<Job>, bool), ApiError> {
+) -> Result<Accepted, ApiError> {
     let mut body = Body::of(service, &caller, request).await?;
     match read_pair(service, &caller, asked, promise, &mut body).await {
         Ok(draft) => {
@@ -250,7 +249,7 @@ async fn submit(
             return Err(error);
         }
     };
-    let (job, new) = draft.submit(kind).await?;
+    let Accepted { job, new, .. } = draft.submit(kind).await?;
     service
         .metrics
         .phase("decode", body.decode_seconds(), Some(&job));
