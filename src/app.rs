@@ -94,7 +94,7 @@ impl App {
             admission: Admission::new(
                 admission_limits(&config.limits),
                 Arc::clone(&queue),
-                cost,
+                Arc::clone(&cost),
                 devices.len(),
             ),
             metrics: Arc::clone(&metrics),
@@ -108,7 +108,7 @@ impl App {
             devices: devices.clone(),
             draining: drains,
         };
-        let admin = serve_admin(config.admin_listen, readiness, &metrics, &queue)?;
+        let admin = serve_admin(config.admin_listen, readiness, &metrics, &queue, &cost)?;
         let tls = match &config.tls {
             None => None,
             Some(tls) => Some(tls_acceptor(&tls.certificate, &tls.key)?),
@@ -270,12 +270,18 @@ fn serve_admin(
     readiness: Readiness,
     metrics: &Arc<Metrics>,
     queue: &Arc<dyn Queue>,
+    cost: &Arc<CostModel>,
 ) -> anyhow::Result<SocketAddr> {
     let listener = std::net::TcpListener::bind(address)
         .with_context(|| format!("cannot listen on {address}"))?;
     listener.set_nonblocking(true)?;
     let bound = listener.local_addr()?;
-    let router = admin_router(readiness, Arc::clone(metrics), Arc::clone(queue));
+    let router = admin_router(
+        readiness,
+        Arc::clone(metrics),
+        Arc::clone(queue),
+        Arc::clone(cost),
+    );
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()?;

@@ -3,7 +3,7 @@
 //! Written whole or not at all. What a promise rests on is on disk before the call returns; what
 //! dies with its caller does not wait for the disk. It must not know what the bytes mean.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::path::Path as FilePath;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -166,24 +166,23 @@ impl Blobs {
         Ok(())
     }
 
-    /// The jobs under whose names something lies that is older than `age`.
+    /// The jobs under whose names nothing lies that is younger than `age`.
     ///
     /// # Errors
     /// Where the store cannot be listed.
     pub async fn jobs_older_than(&self, age: Duration) -> Result<Vec<JobId>, BlobError> {
         let limit = SystemTime::now().checked_sub(age);
-        let mut found = BTreeSet::new();
+        let mut all_old: BTreeMap<JobId, bool> = BTreeMap::new();
         let mut blobs = self.quick.list(Some(&Path::from("jobs")));
         while let Some(meta) = blobs.try_next().await? {
             let old = limit.is_some_and(|limit| SystemTime::from(meta.last_modified) < limit);
             let name = meta.location.parts().nth(2);
-            if let Some(id) = name.and_then(|name| name.as_ref().parse().ok())
-                && old
-            {
-                found.insert(id);
+            if let Some(id) = name.and_then(|name| name.as_ref().parse().ok()) {
+                *all_old.entry(id).or_insert(true) &= old;
             }
         }
-        Ok(found.into_iter().collect())
+        let found = all_old.into_iter().filter(|(_, old)| *old);
+        Ok(found.map(|(id, _)| id).collect())
     }
 }
 

@@ -17,6 +17,9 @@ use crate::api::Role;
 /// `FNSF_SERVE_LIMITS__MAX_POINTS=200000`.
 const PREFIX: &str = "FNSF_SERVE_";
 
+/// What a drain needs at least: to put down what runs, and to close connections.
+const MIN_DRAIN_SECONDS: u64 = 4;
+
 /// All of it.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -296,8 +299,14 @@ impl Config {
         if self.devices.is_empty() {
             return refuse("devices is empty: name at least one, such as \"cpu\"");
         }
-        if self.drain.delay_seconds >= self.drain.deadline_seconds {
-            return refuse("drain.delay_seconds must be shorter than drain.deadline_seconds");
+        if self.drain.deadline_seconds < self.drain.delay_seconds + MIN_DRAIN_SECONDS {
+            return refuse(
+                "drain.deadline_seconds must be at least 4 s longer than drain.delay_seconds: \
+                 what runs has to be put down",
+            );
+        }
+        if self.limits.max_uploads_mib < self.limits.max_upload_mib {
+            return refuse("limits.max_uploads_mib must be no less than limits.max_upload_mib");
         }
         if self.queue.lease_seconds == 0 || self.queue.max_attempts == 0 {
             return refuse("queue.lease_seconds and queue.max_attempts must be at least 1");

@@ -429,8 +429,8 @@ impl Metrics {
         self.device_busy_ratio.get_or_create(&label).set(busy_ratio);
     }
 
-    /// Notes what waits and what runs.
-    pub fn backlog(&self, backlog: &crate::queue::Backlog, oldest: Duration) {
+    /// Notes what waits, what runs, and the seconds of this machine that what waits will take.
+    pub fn backlog(&self, backlog: &crate::queue::Backlog, work_seconds: f64, oldest: Duration) {
         for priority in Priority::ALL {
             let label = Urgency {
                 priority: priority.name(),
@@ -438,7 +438,7 @@ impl Metrics {
             let jobs = backlog.queued_at(priority).jobs;
             self.queue_depth.get_or_create(&label).set(jobs as i64);
         }
-        self.queue_work_seconds.set(backlog.queued().seconds);
+        self.queue_work_seconds.set(work_seconds);
         self.queue_oldest_seconds.set(oldest.as_secs_f64());
         self.running.set(backlog.running().jobs as i64);
     }

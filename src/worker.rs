@@ -80,10 +80,14 @@ impl Worker {
             if !self.device_is_ready().await {
                 break;
             }
+            let mut asking = self.queue.lease(self.device.name());
             let lease = tokio::select! {
                 biased;
-                () = self.drain.stop.cancelled() => break,
-                lease = self.queue.lease(self.device.name()) => lease,
+                () = self.drain.stop.cancelled() => {
+                    self.give_back(asking).await;
+                    break;
+                }
+                lease = &mut asking => lease,
             };
             match lease {
                 Ok(lease) => {
@@ -106,6 +110,16 @@ impl Worker {
         }
         if let Some(last) = committing {
             let _its_own_errors_are_logged = last.await;
+        }
+    }
+
+    /// Gives back a job that was about to be taken when the worker was told to stop.
+    async fn give_back(&self, asking: impl Future<Output = Result<Lease, QueueError>>) {
+        const MOMENT: Duration = Duration::from_millis(100);
+        if let Ok(Ok(lease)) = tokio::time::timeout(MOMENT, asking).await
+            && let Err(error) = self.finish(&lease.job, Outcome::Released).await
+        {
+            tracing::warn!(%error, job = %lease.job.id, "a job was not given back");
         }
     }
 
@@ -304,10 +318,10 @@ impl Worker {
         let outcome = match attempt {
             Attempt::Lost => return,
             Attempt::Ended(outcome) => outcome,
-            Attempt::Solved(report, flow) => self.store(job, &report, &flow).await,
+            Attempt::Solved(report, flow) => self.store(lease, &report, &flow).await,
         };
         let succeeded = matches!(outcome, Outcome::Succeeded { .. });
-        match self.queue.finish(job.id, job.attempt, outcome).await {
+        match self.finish(job, outcome).await {
             Ok(Committed::Yes(state)) => {
                 if succeeded {
                     self.metrics
@@ -329,13 +343,40 @@ impl Worker {
         }
     }
 
-    async fn store(&self, job: &Job, report: &Report, flow: &StoredFlow) -> Outcome {
+    /// Ends the attempt; tries again where the store fails, since the flow is already there and
+    /// the fence makes it safe.
+    async fn finish(&self, job: &Job, outcome: Outcome) -> Result<Committed, QueueError> {
+        const FIRST_PAUSE: Duration = Duration::from_millis(100);
+        const TRIES: u32 = 6;
+        let mut pause = FIRST_PAUSE;
+        for _ in 1..TRIES {
+            match self
+                .queue
+                .finish(job.id, job.attempt, outcome.clone())
+                .await
+            {
+                Err(QueueError::Store(error)) => {
+                    tracing::warn!(error, job = %job.id, "an outcome is not kept yet");
+                }
+                ended => return ended,
+            }
+            tokio::time::sleep(pause).await;
+            pause *= 2;
+        }
+        self.queue.finish(job.id, job.attempt, outcome).await
+    }
+
+    async fn store(&self, lease: &Lease, report: &Report, flow: &StoredFlow) -> Outcome {
+        let job = &lease.job;
         let bytes = Bytes::from(flow.to_bytes());
-        let sync = if job.durable { Sync::Yes } else { Sync::No };
-        let stored = self
-            .blobs
-            .put(job.id, Blob::Result(job.attempt), bytes, sync)
-            .await;
+        let promised = lease.pulse.is_durable();
+        let sync = if promised { Sync::Yes } else { Sync::No };
+        let blob = Blob::Result(job.attempt);
+        let mut stored = self.blobs.put(job.id, blob, bytes, sync).await;
+        if stored.is_ok() && !promised && lease.pulse.is_durable() {
+            // It was promised while it was being written.
+            stored = self.blobs.sync(job.id, blob).await;
+        }
         match (stored, serde_json::to_string(report)) {
             (Ok(()), Ok(json)) => Outcome::Succeeded {
                 stop_reason: report.stop_reason.clone(),

@@ -14,6 +14,7 @@ use serde_json::json;
 use tokio::sync::watch;
 
 use crate::clock::Timestamp;
+use crate::cost::CostModel;
 use crate::engine::Device;
 use crate::metrics::Metrics;
 use crate::queue::Queue;
@@ -46,10 +47,16 @@ struct Admin {
     readiness: Readiness,
     metrics: Arc<Metrics>,
     queue: Arc<dyn Queue>,
+    cost: Arc<CostModel>,
 }
 
 /// The routes of the admin port.
-pub fn admin_router(readiness: Readiness, metrics: Arc<Metrics>, queue: Arc<dyn Queue>) -> Router {
+pub fn admin_router(
+    readiness: Readiness,
+    metrics: Arc<Metrics>,
+    queue: Arc<dyn Queue>,
+    cost: Arc<CostModel>,
+) -> Router {
     Router::new()
         .route("/livez", get(|| async { Json(json!({ "alive": true })) }))
         .route("/readyz", get(ready))
@@ -58,6 +65,7 @@ pub fn admin_router(readiness: Readiness, metrics: Arc<Metrics>, queue: Arc<dyn 
             readiness,
             metrics,
             queue,
+            cost,
         })
 }
 
@@ -76,7 +84,9 @@ async fn expose(State(admin): State<Admin>, headers: HeaderMap) -> Response {
         Ok(Some(oldest)) => oldest.until(Timestamp::now()),
         Ok(None) | Err(_) => Duration::ZERO,
     };
-    admin.metrics.backlog(&admin.queue.backlog(), oldest);
+    let backlog = admin.queue.backlog();
+    let work_seconds = admin.cost.seconds(backlog.queued().seconds);
+    admin.metrics.backlog(&backlog, work_seconds, oldest);
     let accept = headers
         .get(header::ACCEPT)
         .and_then(|value| value.to_str().ok());

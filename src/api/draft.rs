@@ -30,7 +30,7 @@ pub(super) struct Request {
     pub idempotency_key: Option<String>,
     /// When it arrived: deadlines count from here.
     pub arrived: Instant,
-    /// What is left of the call's own deadline, if it has one.
+    /// The call's own deadline, from its arrival, if it has one.
     pub time_left: Option<Duration>,
 }
 
@@ -109,6 +109,7 @@ impl Draft {
     pub(super) async fn push(&mut self, cloud: StoredCloud) -> Result<(), ApiError> {
         let service = Arc::clone(&self.service);
         service.admission.check_points(cloud.points.len())?;
+        service.check_disk()?;
         let limit = service.limits.max_frames;
         if self.frames >= limit {
             return Err(ApiError::TooLarge(format!(
@@ -180,11 +181,16 @@ impl Draft {
                     new: true,
                 })
             }
-            Submitted::Known(job) => Ok(Accepted {
-                job,
-                new: false,
-                awaited: None,
-            }),
+            Submitted::Known(mut job) => {
+                if self.request.promise == Promise::Durable && !job.durable {
+                    job = self.service.make_durable(&job).await?;
+                }
+                Ok(Accepted {
+                    job,
+                    new: false,
+                    awaited: None,
+                })
+            }
         }
     }
 
@@ -203,8 +209,8 @@ impl Draft {
         let options = &self.request.options;
         let asked = options.deadline_ms.map(Duration::from_millis);
         let spent = self.request.arrived.elapsed();
+        let asked = asked.into_iter().chain(self.request.time_left).min();
         let left = asked.map(|asked| asked.saturating_sub(spent));
-        let left = left.into_iter().chain(self.request.time_left).min();
         let key = self.request.idempotency_key.clone();
         Submission {
             id: self.id,

@@ -230,7 +230,7 @@ impl From<QueueError> for ApiError {
         match error {
             QueueError::NotFound => Self::NotFound,
             QueueError::KeyReused(id) => Self::KeyReused(id),
-            QueueError::NotEnded(_) => Self::BadRequest(error.to_string()),
+            QueueError::NotOver(_) => Self::BadRequest(error.to_string()),
             QueueError::Closed => Self::Draining,
             QueueError::Store(_) => Self::internal(error),
         }

@@ -18,6 +18,9 @@ use crate::metrics::Metrics;
 use crate::payload::{StoredCloud, StoredFlow};
 use crate::queue::{Filter, Queue};
 
+/// Archives that are written at a time.
+const MAX_ARCHIVES: usize = 16;
+
 /// What a request may cost the doors.
 #[derive(Clone, Debug)]
 pub struct ServiceLimits {
@@ -45,6 +48,8 @@ pub struct Service {
     pub(super) limits: ServiceLimits,
     pub(super) room: Arc<Semaphore>,
     compute: Semaphore,
+    /// Archives that are being written: each holds a thread while its client reads.
+    pub(super) archives: Arc<Semaphore>,
     /// Cancelled when the server is about to stop: health says so, everything is still served.
     pub(super) leaving: CancellationToken,
     draining: AtomicBool,
@@ -103,6 +108,7 @@ impl Service {
             limits: parts.limits,
             room: Arc::new(Semaphore::new(room.min(Semaphore::MAX_PERMITS))),
             compute: Semaphore::new(cores),
+            archives: Arc::new(Semaphore::new(MAX_ARCHIVES)),
             leaving: CancellationToken::new(),
             draining: AtomicBool::new(false),
             closing: CancellationToken::new(),
@@ -166,6 +172,18 @@ impl Service {
         done.map_err(ApiError::internal)?
     }
 
+    /// Refuses more where the disk is nearly full.
+    ///
+    /// # Errors
+    /// [`ApiError::DiskFull`].
+    pub(super) fn check_disk(&self) -> Result<(), ApiError> {
+        let least = self.limits.min_free_bytes;
+        if self.blobs.free_bytes().is_some_and(|free| free < least) {
+            return Err(ApiError::DiskFull);
+        }
+        Ok(())
+    }
+
     /// Refuses a caller whose job would be refused however small it is, before its clouds are
     /// read: under overload a refusal must cost little.
     ///
@@ -180,13 +198,7 @@ impl Service {
     ) -> Result<(), ApiError> {
         caller.may_write()?;
         self.check_draining()?;
-        if self
-            .blobs
-            .free_bytes()
-            .is_some_and(|free| free < self.limits.min_free_bytes)
-        {
-            return Err(ApiError::DiskFull);
-        }
+        self.check_disk()?;
         self.admission
             .admit(&Asked {
                 tenant: &caller.tenant,
@@ -255,9 +267,8 @@ impl Service {
         caller.may_write()?;
         self.check_draining()?;
         let job = self.job(caller, id).await?;
-        if job.state == State::Succeeded {
-            let text = "the job has succeeded: there is nothing to do again";
-            return Err(ApiError::BadRequest(text.to_owned()));
+        if !job.durable {
+            self.make_durable(&job).await?;
         }
         Ok(self.queue.requeue(id).await?)
     }
@@ -304,7 +315,12 @@ impl Service {
         for place in 0..frames {
             self.blobs.sync(job.id, Blob::Frame(place)).await?;
         }
-        Ok(self.queue.make_durable(job.id).await?)
+        let job = self.queue.make_durable(job.id).await?;
+        // A result that came before the queue knew was not waited for.
+        match self.blobs.sync(job.id, Blob::Result(job.attempt)).await {
+            Err(error) if !error.is_missing() => Err(error.into()),
+            _ => Ok(job),
+        }
     }
 
     /// Ends a job when the guard is dropped: whoever waited for it is gone.
@@ -402,7 +418,7 @@ impl Drop for Awaited {
         if let Some(id) = self.id.take() {
             let service = Arc::clone(&self.service);
             tokio::spawn(async move {
-                if let Err(error) = service.queue.cancel(id).await {
+                if let Err(error) = service.queue.abandon(id).await {
                     tracing::warn!(%error, job = %id, "an abandoned job was not cancelled");
                 }
             });

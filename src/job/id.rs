@@ -41,7 +41,7 @@ impl Serialize for JobId {
 }
 
 /// Not a job's or a tenant's name.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidId {
     /// Not 8-4-4-4-12 hexadecimal digits.
     #[error("a job's name is a UUID, such as 0192f0c1-7b7a-7000-8000-000000000000")]

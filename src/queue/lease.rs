@@ -31,11 +31,20 @@ pub enum Signal {
 pub(super) struct Flags {
     cancel: AtomicBool,
     lost: AtomicBool,
+    durable: AtomicBool,
 }
 
 impl Flags {
     pub(super) fn cancel(&self) {
         self.cancel.store(true, Ordering::Relaxed);
+    }
+
+    pub(super) fn make_durable(&self) {
+        self.durable.store(true, Ordering::Relaxed);
+    }
+
+    pub(super) fn is_durable(&self) -> bool {
+        self.durable.load(Ordering::Relaxed)
     }
 
     pub(super) fn lose(&self) {
@@ -87,6 +96,11 @@ impl Pulse {
         } else {
             Signal::Continue
         }
+    }
+
+    /// Whether the job outlives its caller by now, whatever it was when it was leased.
+    pub fn is_durable(&self) -> bool {
+        self.flags.is_durable()
     }
 
     /// Says that a snapshot lies in store.

@@ -154,9 +154,9 @@ pub enum QueueError {
     /// The idempotency key was used for something else; it belongs to this job.
     #[error("the idempotency key was used with another payload, by job {0}")]
     KeyReused(JobId),
-    /// Only an ended job can be asked for again.
-    #[error("the job has not ended: it is {}", .0.name())]
-    NotEnded(State),
+    /// Only a job that has ended without success can be asked for again.
+    #[error("only a job that failed, expired or was cancelled is queued again: this one is {}", .0.name())]
+    NotOver(State),
     /// The store failed.
     #[error("the queue's store failed: {0}")]
     Store(String),
@@ -202,6 +202,9 @@ pub trait Queue: Send + Sync {
 
     /// Ends a job: at once if it is queued, within an iteration if it runs.
     async fn cancel(&self, id: JobId) -> Result<Arc<Job>, QueueError>;
+
+    /// Ends a job that somebody waited for and does not any more; one that was promised stays.
+    async fn abandon(&self, id: JobId) -> Result<(), QueueError>;
 
     /// Queues an ended job again, as if it had never been tried.
     async fn requeue(&self, id: JobId) -> Result<Arc<Job>, QueueError>;

@@ -21,6 +21,10 @@ impl Watchers {
 
     /// Follows `job`, which is what the store said a moment ago; what was pushed since is kept.
     pub(super) fn follow(&self, job: &Arc<Job>) -> watch::Receiver<Arc<Job>> {
+        if job.state.is_end() {
+            // Nothing more will come: its last state is all there is to see.
+            return watch::Sender::new(Arc::clone(job)).subscribe();
+        }
         let mut followed = self.lock();
         let sender = followed
             .entry(job.id)
@@ -40,7 +44,8 @@ impl Watchers {
         let mut followed = self.lock();
         if let Some(sender) = followed.get(&job.id) {
             sender.send_replace(Arc::clone(job));
-            if sender.receiver_count() == 0 {
+            // Those who follow still see the last state when its sender is gone.
+            if sender.receiver_count() == 0 || job.state.is_end() {
                 followed.remove(&job.id);
             }
         }

@@ -38,17 +38,13 @@ impl Call {
 
     /// What is asked of a job of this call.
     pub(super) fn draft_request(&self, options: JobOptions, promise: Promise) -> DraftRequest {
-        let spent = self.arrived.elapsed();
         let awaited = promise == Promise::WhileAwaited;
         DraftRequest {
             options,
             promise,
             idempotency_key: None,
             arrived: self.arrived,
-            time_left: self
-                .time_left
-                .filter(|_| awaited)
-                .map(|left| left.saturating_sub(spent)),
+            time_left: self.time_left.filter(|_| awaited),
         }
     }
 }

@@ -15,7 +15,7 @@ use crate::api::admission::Promise;
 use crate::api::draft::{Accepted, Draft, Room};
 use crate::api::error::ApiError;
 use crate::api::service::{Answer, Service, Waited};
-use crate::job::{Job, JobId, Kind, Priority};
+use crate::job::{InvalidId, Job, JobId, Kind, Priority};
 
 /// Messages that wait for a client that reads slowly.
 const AHEAD: usize = 4;
@@ -84,13 +84,18 @@ impl Calls {
     }
 }
 
-/// Sends progress until the job ends, then its flow.
+/// A page's name that is none.
+fn bad_page(error: InvalidId) -> ApiError {
+    ApiError::BadRequest(format!("page_token: {error}"))
+}
+
+/// Sends progress until the job ends, then its flow. False where its client went away before.
 async fn send_flow(
     service: &Arc<Service>,
     id: JobId,
     pause: Option<Duration>,
     answers: &mpsc::Sender<Result<proto::EstimateFlowResponse, Status>>,
-) -> Result<(), ApiError> {
+) -> Result<bool, ApiError> {
     use proto::estimate_flow_response::Part;
     let send = async |part: Part| {
         let message = proto::EstimateFlowResponse { part: Some(part) };
@@ -108,7 +113,7 @@ async fn send_flow(
                     sent = job.progress;
                     let progress = job.progress.map(convert::progress).unwrap_or_default();
                     if !send(Part::Progress(progress)).await {
-                        return Ok(());
+                        return Ok(false);
                     }
                 }
             }
@@ -116,14 +121,14 @@ async fn send_flow(
     };
     let answer = service.answer(&job).await?;
     if !send(Part::Header(convert::header(&answer))).await {
-        return Ok(());
+        return Ok(true);
     }
     for piece in chunks::pieces(&answer, 0) {
         if !send(Part::Chunk(piece)).await {
-            return Ok(());
+            return Ok(true);
         }
     }
-    Ok(())
+    Ok(true)
 }
 
 /// Sends a stored flow from a row on.
@@ -166,7 +171,8 @@ impl SceneFlow for Calls {
                 sent = send_flow(&service, job.id, pause, &answers) => sent,
             };
             match sent {
-                Ok(()) => {
+                Ok(false) => {}
+                Ok(true) => {
                     if let Some(awaited) = awaited {
                         awaited.let_go();
                     }
@@ -276,7 +282,7 @@ impl SceneFlow for Calls {
         };
         let before = match asked.page_token.as_str() {
             "" => None,
-            token => Some(token.parse::<JobId>().map_err(ApiError::from)?),
+            token => Some(token.parse::<JobId>().map_err(bad_page)?),
         };
         let jobs = self
             .service

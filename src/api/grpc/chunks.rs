@@ -64,6 +64,8 @@ impl CloudBuilder {
             )));
         }
         self.points.extend_from_slice(&chunk.points);
+        let points = self.points.len() / POINT;
+        service.admission.check_points(points)?;
         self.ground
             .extend(chunk.ground.iter().map(|&flag| flag != 0));
         Ok(())

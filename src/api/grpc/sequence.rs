@@ -30,6 +30,13 @@ struct Pending {
     job: Result<Accepted, ApiError>,
 }
 
+/// What the writer has to send, in order.
+enum Item {
+    Pair(Pending),
+    /// The stream ends here, and why.
+    Broken(ApiError),
+}
+
 /// A sweep that has arrived.
 struct Sweep {
     name: String,
@@ -75,16 +82,16 @@ pub(super) fn run(
     tokio::spawn(async move { write(&writing.0, pairs, &writing.1).await });
     tokio::spawn(async move {
         let reader = Reader {
-            service: Arc::clone(&service),
+            service,
             call,
             inbound,
-            pending,
+            pending: pending.clone(),
             place: 0,
             last: None,
         };
         if let Err(error) = reader.run().await {
-            service.count_late_error("grpc", &error);
-            let _gone_is_fine = answers.send(Err(error.into())).await;
+            // Behind the pairs that came before it: their flows are not lost.
+            let _gone_is_fine = pending.send(Item::Broken(error)).await;
         }
     });
     ReceiverStream::new(stream)
@@ -94,7 +101,7 @@ struct Reader {
     service: Arc<Service>,
     call: Call,
     inbound: Streaming<proto::EstimateSequenceRequest>,
-    pending: mpsc::Sender<Pending>,
+    pending: mpsc::Sender<Item>,
     place: u32,
     last: Option<Sweep>,
 }
@@ -111,7 +118,15 @@ impl Reader {
         let mut current: Option<Coming> = None;
         loop {
             // A drive may pause for as long as it likes: only a dead connection ends it.
-            let message = self.inbound.message().await;
+            let coming = current
+                .as_ref()
+                .is_some_and(|coming| coming.points.is_some());
+            let message = if coming {
+                // One that is known to be incomplete must come on.
+                room.wait(&self.service, self.inbound.message()).await?
+            } else {
+                self.inbound.message().await
+            };
             let message = message.map_err(|status| {
                 ApiError::BadRequest(format!("the stream is broken: {}", status.message()))
             })?;
@@ -161,12 +176,12 @@ impl Reader {
         let job = self
             .submit(before.cloud, sweep.cloud.clone(), options)
             .await;
-        place_in_line.send(Pending {
+        place_in_line.send(Item::Pair(Pending {
             place: self.place,
             source: names.0,
             target: names.1,
             job,
-        });
+        }));
         self.place += 1;
         self.last = Some(sweep);
         Ok(())
@@ -190,8 +205,16 @@ impl Reader {
 
 /// Sends every pair's flow, in order, as soon as it is there. What is still pending when the
 /// client goes away is dropped, and so cancelled.
-async fn write(service: &Arc<Service>, mut pairs: mpsc::Receiver<Pending>, answers: &Answers) {
-    while let Some(pair) = pairs.recv().await {
+async fn write(service: &Arc<Service>, mut items: mpsc::Receiver<Item>, answers: &Answers) {
+    while let Some(item) = items.recv().await {
+        let pair = match item {
+            Item::Pair(pair) => pair,
+            Item::Broken(error) => {
+                service.count_late_error("grpc", &error);
+                let _gone_is_fine = answers.send(Err(error.into())).await;
+                return;
+            }
+        };
         let sent = tokio::select! {
             () = answers.closed() => return,
             sent = send(service, pair, answers) => sent,

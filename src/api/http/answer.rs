@@ -1,6 +1,7 @@
 //! Flow on its way out: formats, ranges, entity tags, and a sequence's flows in one archive.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use axum::body::{Body, Bytes};
 use axum::extract::{Extension, State};
@@ -153,11 +154,18 @@ async fn archive(
         service.answer(sequence).await?;
     }
     let pairs = service.pairs(sequence).await?;
+    let turn = Arc::clone(&service.archives).try_acquire_owned();
+    let turn = turn.map_err(|_| ApiError::ServerFull(Duration::from_secs(1)))?;
     let (pieces, stream) = tokio::sync::mpsc::channel::<Result<Bytes, std::io::Error>>(4);
     let service = Arc::clone(service);
     let runtime = tokio::runtime::Handle::current();
     tokio::task::spawn_blocking(move || {
-        let mut zip = zip::ZipWriter::new_stream(Pipe(pieces.clone()));
+        let _turn = turn;
+        let pipe = Pipe {
+            pieces: pieces.clone(),
+            runtime: runtime.clone(),
+        };
+        let mut zip = zip::ZipWriter::new_stream(pipe);
         let plain = zip::write::SimpleFileOptions::default()
             .compression_method(zip::CompressionMethod::Stored);
         let mut write = || -> Result<(), Box<dyn std::error::Error>> {
@@ -174,7 +182,7 @@ async fn archive(
         let done = write().and_then(|()| Ok(zip.finish().map(drop)?));
         if let Err(error) = done {
             tracing::warn!(%error, "an archive was not finished");
-            let _gone_is_fine = pieces.blocking_send(Err(std::io::Error::other("not finished")));
+            let _gone_is_fine = pieces.try_send(Err(std::io::Error::other("not finished")));
         }
     });
     let mut response = Body::from_stream(ReceiverStream::new(stream)).into_response();
@@ -195,15 +203,23 @@ async fn archive(
     Ok(response)
 }
 
-/// Writes into a body that is being sent; held back where its reader is slow.
-struct Pipe(tokio::sync::mpsc::Sender<Result<Bytes, std::io::Error>>);
+/// Writes into a body that is being sent; held back where its reader is slow, and given up where
+/// it does not read at all.
+struct Pipe {
+    pieces: tokio::sync::mpsc::Sender<Result<Bytes, std::io::Error>>,
+    runtime: tokio::runtime::Handle,
+}
 
 impl std::io::Write for Pipe {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        const PATIENCE: Duration = Duration::from_secs(60);
         let piece = Bytes::copy_from_slice(bytes);
-        let sent = self.0.blocking_send(Ok(piece));
-        sent.map_err(|_| std::io::ErrorKind::BrokenPipe)?;
-        Ok(bytes.len())
+        let sending = async { tokio::time::timeout(PATIENCE, self.pieces.send(Ok(piece))).await };
+        match self.runtime.block_on(sending) {
+            Ok(Ok(())) => Ok(bytes.len()),
+            Ok(Err(_)) => Err(std::io::ErrorKind::BrokenPipe.into()),
+            Err(_) => Err(std::io::ErrorKind::TimedOut.into()),
+        }
     }
 
     fn flush(&mut self) -> std::io::Result<()> {

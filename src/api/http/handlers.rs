@@ -400,11 +400,8 @@ pub(super) async fn list_jobs(
     page: Result<Query<Page>, axum::extract::rejection::QueryRejection>,
 ) -> Result<Json<JobPage>, ApiError> {
     let Query(page) = page.map_err(|error| ApiError::BadRequest(error.body_text()))?;
-    let before = page
-        .before
-        .as_deref()
-        .map(str::parse::<JobId>)
-        .transpose()?;
+    let before = page.before.as_deref().map(str::parse::<JobId>).transpose();
+    let before = before.map_err(|error| ApiError::BadRequest(format!("before: {error}")))?;
     let limit = page.limit.unwrap_or(PAGE).clamp(1, 1000);
     let jobs = service.jobs(&caller, page.state, before, limit).await?;
     let full = jobs.len() == limit as usize;

@@ -42,7 +42,7 @@ pub(crate) async fn failures_are_retried_later_and_given_up_in_the_end(stand: &m
     assert!(!again.dead && again.state == State::Queued && again.error.is_none());
     assert_eq!(lease(&queue).await.job.attempt, 4);
     let running = queue.requeue(job.id).await;
-    assert_eq!(running, Err(QueueError::NotEnded(State::Running)));
+    assert_eq!(running, Err(QueueError::NotOver(State::Running)));
 }
 
 pub(crate) async fn an_error_of_the_input_is_not_retried(stand: &mut impl Stand) {
@@ -194,4 +194,84 @@ pub(crate) async fn ended_jobs_are_kept_for_a_while_and_then_forgotten(stand: &m
     assert_eq!(gone, Err(QueueError::NotFound));
     let known = queue.known(vec![job.id]).await.expect("an answer");
     assert_eq!(known, []);
+}
+
+pub(crate) async fn an_abandoned_job_ends_and_gives_up_its_key_unless_it_was_promised(
+    stand: &mut impl Stand,
+) {
+    let (queue, _events) = stand.open(QueueOptions::default());
+    let keyed = || Submission {
+        durable: false,
+        idempotency: Some(Idempotency {
+            key: "k".to_owned(),
+            fingerprint: [1; 32],
+        }),
+        ..submission("a")
+    };
+    let first = submit(&queue, keyed()).await;
+    queue.abandon(first.id).await.expect("known");
+    assert_eq!(state(&queue, &first).await, State::Cancelled);
+    // Its caller asks again with the same key: it is not told of the one that it let go.
+    let second = submit(&queue, keyed()).await;
+    assert_ne!(second.id, first.id);
+    queue.make_durable(second.id).await.expect("known");
+    queue.abandon(second.id).await.expect("known");
+    assert_eq!(state(&queue, &second).await, State::Queued);
+    queue.abandon(JobId::fresh()).await.expect("nothing to do");
+}
+
+pub(crate) async fn jobs_that_come_and_go_at_once_are_not_counted_any_more(stand: &mut impl Stand) {
+    let (queue, _events) = stand.open(QueueOptions::default());
+    for _ in 0..50 {
+        let (_, first, second) = tokio::join!(
+            async {
+                submit(&queue, submission("a")).await;
+                submit(&queue, submission("b")).await;
+            },
+            lease(&queue),
+            lease(&queue),
+        );
+        finish(&queue, &first.job, done()).await;
+        finish(&queue, &second.job, done()).await;
+    }
+    assert_eq!(queue.backlog().queued().jobs, 0);
+    assert_eq!(queue.backlog().running().jobs, 0);
+}
+
+pub(crate) async fn a_cancelled_job_whose_worker_is_silent_is_not_tried_again(
+    stand: &mut impl Stand,
+) {
+    let (queue, _events) = stand.open(quick());
+    let job = submit(&queue, submission("a")).await;
+    let silent = lease(&queue).await;
+    queue.cancel(job.id).await.expect("known");
+    reaches(&queue, &job, State::Cancelled).await;
+    nothing_is_ready(&queue).await;
+    let late = finish(&queue, &silent.job, done()).await;
+    assert_eq!(late, Committed::Fenced);
+}
+
+pub(crate) async fn a_job_that_is_asked_for_again_waits_for_its_turn(stand: &mut impl Stand) {
+    let (queue, _events) = stand.open(QueueOptions::default());
+    let old = submit(&queue, submission("a")).await;
+    queue.cancel(old.id).await.expect("known");
+    let mut waiting = Vec::new();
+    for _ in 0..3 {
+        waiting.push(submit(&queue, submission("a")).await.id);
+    }
+    queue.requeue(old.id).await.expect("it has ended");
+    waiting.push(old.id);
+    for id in waiting {
+        assert_eq!(lease(&queue).await.job.id, id);
+    }
+    let held = lease_of_a_success(&queue).await;
+    let refused = queue.requeue(held).await;
+    assert_eq!(refused, Err(QueueError::NotOver(State::Succeeded)));
+}
+
+async fn lease_of_a_success(queue: &Arc<dyn Queue>) -> JobId {
+    let job = submit(queue, submission("b")).await;
+    let held = lease(queue).await;
+    finish(queue, &held.job, done()).await;
+    job.id
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use rusqlite::{Connection, params};
 
 use super::rows::{self, COLUMNS, state_code};
-use super::transitions::Effects;
+use super::transitions::{Effects, virtual_start};
 use crate::clock::Timestamp;
 use crate::job::{Job, JobError, JobId, JobProgress, Kind, State};
 use crate::queue::{Event, QueueError, QueueOptions};
@@ -164,8 +164,8 @@ pub(super) fn requeue(
     id: JobId,
 ) -> Result<Arc<Job>, QueueError> {
     let job = rows::get(connection, id)?;
-    if !job.state.is_end() {
-        return Err(QueueError::NotEnded(job.state));
+    if !job.state.is_end() || job.state == State::Succeeded {
+        return Err(QueueError::NotOver(job.state));
     }
     let broken: Vec<Job> = match job.kind {
         Kind::Pair => Vec::new(),
@@ -180,11 +180,14 @@ pub(super) fn requeue(
          started = NULL, finished = NULL, deadline = NULL, expires = ?3, \
          due = CASE WHEN kind = 0 THEN ?3 END, stop_reason = NULL, report = NULL, \
          error_code = NULL, error_message = NULL, error_retryable = 0, dead = 0, \
-         cancel_requested = 0, iteration = NULL WHERE id = ?1 RETURNING {COLUMNS}"
+         cancel_requested = 0, iteration = NULL, virtual_start = ?4, virtual_finish = ?4 + cost \
+         WHERE id = ?1 RETURNING {COLUMNS}"
     );
+    // It takes its place behind what its tenant has waiting now, as a new one would.
     let again = |id: JobId, left: usize| -> Result<Arc<Job>, QueueError> {
+        let tag = virtual_start(connection, &job.tenant, job.priority)?;
         let mut statement = connection.prepare_cached(&sql)?;
-        let parameters = params![id.as_bytes(), left as i64, expires];
+        let parameters = params![id.as_bytes(), left as i64, expires, tag];
         Ok(Arc::new(statement.query_row(parameters, rows::job)?))
     };
     let job = again(id, broken.len())?;
@@ -195,8 +198,9 @@ pub(super) fn requeue(
     if job.kind == Kind::Pair {
         if let Some(parent) = job.parent {
             let sql = format!(
-                "UPDATE jobs SET pairs_left = pairs_left + 1, state = 0, finished = NULL, \
-                 due = NULL, error_code = NULL WHERE id = ?1 RETURNING {COLUMNS}"
+                "UPDATE jobs SET pairs_left = pairs_left + 1, finished = NULL, due = NULL, \
+                 state = CASE WHEN state = 1 THEN 1 ELSE 0 END, error_code = NULL, dead = 0, \
+                 cancel_requested = 0 WHERE id = ?1 RETURNING {COLUMNS}"
             );
             let mut statement = connection.prepare_cached(&sql)?;
             let parent = statement.query_row([parent.as_bytes()], rows::job)?;

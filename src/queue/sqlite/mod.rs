@@ -17,7 +17,7 @@ mod tests;
 use std::collections::HashMap;
 use std::fs::{File, TryLockError};
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -71,7 +71,6 @@ pub(in crate::queue) struct Shared {
 struct Running {
     attempt: u32,
     flags: Arc<Flags>,
-    durable: Arc<AtomicBool>,
 }
 
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -95,6 +94,10 @@ impl Shared {
         {
             let mut backlog = locked(&self.backlog);
             let mut running = locked(&self.running);
+            // A job may come and go in one commit: it is counted before it is taken off.
+            for job in &effects.entered {
+                backlog.entered(job);
+            }
             for job in &effects.left {
                 backlog.left(job);
             }
@@ -104,17 +107,18 @@ impl Shared {
                     held.flags.lose();
                 }
             }
-            for job in &effects.entered {
-                backlog.entered(job);
-            }
             for job in &effects.started {
                 backlog.started(job);
                 let held = Running {
                     attempt: job.attempt,
                     flags: Arc::default(),
-                    durable: Arc::new(AtomicBool::new(job.durable)),
                 };
                 running.insert(job.id, held);
+            }
+            for job in effects.changed.iter().filter(|job| job.durable) {
+                if let Some(held) = running.get(&job.id) {
+                    held.flags.make_durable();
+                }
             }
             for id in &effects.cancel {
                 if let Some(held) = running.get(id) {
@@ -274,11 +278,15 @@ impl Queue for SqliteQueue {
 
     async fn make_durable(&self, id: JobId) -> Result<Arc<Job>, QueueError> {
         if let Some(held) = locked(&self.shared.running).get(&id) {
-            held.durable.store(true, Ordering::Relaxed);
+            held.flags.make_durable();
         }
+        let retention = self.options.retention.as_millis() as i64;
         let change = move |connection: &Connection, effects: &mut Effects| {
-            let sql = "UPDATE jobs SET durable = 1 WHERE id = ?1 OR parent = ?1";
-            connection.prepare_cached(sql)?.execute([id.as_bytes()])?;
+            let sql = "UPDATE jobs SET durable = 1, due = CASE WHEN state > 1 AND parent IS NULL \
+                       THEN finished + ?2 ELSE due END WHERE id = ?1 OR parent = ?1";
+            connection
+                .prepare_cached(sql)?
+                .execute(params![id.as_bytes(), retention])?;
             let job = Arc::new(rows::get(connection, id)?);
             effects.changed.push(Arc::clone(&job));
             Ok(job)
@@ -340,6 +348,19 @@ impl Queue for SqliteQueue {
         self.writer.write(true, change).await
     }
 
+    async fn abandon(&self, id: JobId) -> Result<(), QueueError> {
+        let options = self.options.clone();
+        let change =
+            move |connection: &Connection, effects: &mut Effects| match rows::find(connection, id)?
+            {
+                Some(job) if !job.durable => {
+                    ends::cancel(connection, effects, &options, id).map(drop)
+                }
+                _ => Ok(()),
+            };
+        self.writer.write(false, change).await
+    }
+
     async fn requeue(&self, id: JobId) -> Result<Arc<Job>, QueueError> {
         let options = self.options.clone();
         let change = move |connection: &Connection, effects: &mut Effects| {
@@ -383,7 +404,7 @@ impl Queue for SqliteQueue {
     ) -> Result<Committed, QueueError> {
         let durable = locked(&self.shared.running)
             .get(&id)
-            .is_some_and(|held| held.durable.load(Ordering::Relaxed));
+            .is_some_and(|held| held.flags.is_durable());
         let options = self.options.clone();
         let change = move |connection: &Connection, effects: &mut Effects| {
             leases::finish(connection, effects, &options, id, attempt, outcome)

@@ -7,7 +7,7 @@ use rusqlite::{Connection, OptionalExtension, params};
 use super::ends::{self, End};
 use super::leases;
 use super::rows::{self, COLUMNS};
-use super::transitions::Effects;
+use super::transitions::{Effects, virtual_now};
 use crate::clock::Timestamp;
 use crate::job::{Job, JobError, JobId, State};
 use crate::queue::{Event, QueueError, QueueOptions};
@@ -42,6 +42,10 @@ pub(super) fn sweep(
     for job in due {
         match job.state {
             State::Queued => look_after_queued(connection, effects, options, &job, now)?,
+            State::Running if job.cancel_requested => {
+                let how = End::default();
+                ends::end(connection, effects, options, &job, State::Cancelled, &how)?;
+            }
             State::Running => {
                 effects.events.push(Event::LeaseExpired(job.id));
                 let error = JobError {
@@ -65,10 +69,16 @@ fn look_after_queued(
     job: &Job,
     now: Timestamp,
 ) -> Result<(), QueueError> {
-    let sql = "UPDATE jobs SET delayed = 0, due = expires WHERE id = ?1 AND expires > ?2";
-    let woken = connection
-        .prepare_cached(sql)?
-        .execute(params![job.id.as_bytes(), now.as_millis()])?;
+    // Its tag may be of a time when far more had been served: then it would wait for ever.
+    let sql = "UPDATE jobs SET delayed = 0, due = expires, \
+               virtual_start = min(virtual_start, ?3), virtual_finish = min(virtual_start, ?3) + cost \
+               WHERE id = ?1 AND expires > ?2";
+    let served = virtual_now(connection, job.priority)?.unwrap_or(0.0);
+    let woken = connection.prepare_cached(sql)?.execute(params![
+        job.id.as_bytes(),
+        now.as_millis(),
+        served
+    ])?;
     if woken > 0 {
         effects
             .changed

@@ -10,7 +10,7 @@ use rusqlite::{Connection, OptionalExtension, params};
 
 use super::rows::{self, COLUMNS, kind_code, priority_code};
 use crate::clock::Timestamp;
-use crate::job::{Job, JobId, Kind};
+use crate::job::{Job, JobId, Kind, Priority, State, Tenant};
 use crate::queue::{Event, QueueError, QueueOptions, Submission, Submitted};
 
 /// What follows a commit.
@@ -63,10 +63,17 @@ pub(super) fn submit(
             .optional()?;
         if let Some((id, fingerprint)) = known {
             let id = JobId::from_bytes(id);
-            if fingerprint != idempotency.fingerprint {
+            let known = rows::get(connection, id)?;
+            let gave_up = known.state.is_end() && known.state != State::Succeeded;
+            if gave_up && !known.durable {
+                // Its caller went away: asking again is what the key is for.
+                let sql = "UPDATE jobs SET idempotency_key = NULL WHERE id = ?1";
+                connection.prepare_cached(sql)?.execute([id.as_bytes()])?;
+            } else if fingerprint != idempotency.fingerprint {
                 return Err(QueueError::KeyReused(id));
+            } else {
+                return Ok(Submitted::Known(Arc::new(known)));
             }
-            return Ok(Submitted::Known(Arc::new(rows::get(connection, id)?)));
         }
     }
     let job = Arc::new(insert(connection, options, submission, None)?);
@@ -99,7 +106,7 @@ fn insert(
     let now = Timestamp::now();
     let is_pair = submission.kind == Kind::Pair;
     let virtual_start = if is_pair {
-        virtual_start(connection, submission)?
+        virtual_start(connection, &submission.tenant, submission.priority)?
     } else {
         0.0
     };
@@ -145,8 +152,28 @@ fn insert(
 /// Start-time fair queueing (Goyal et al. 1996): a job's tag is where its tenant's last waiting or
 /// running job ends, but never before what is being served now. Tags are seconds of predicted
 /// work, so tenants share devices by work, not by number of jobs.
-fn virtual_start(connection: &Connection, submission: &Submission) -> Result<f64, QueueError> {
-    let priority = priority_code(submission.priority);
+pub(super) fn virtual_start(
+    connection: &Connection,
+    tenant: &Tenant,
+    priority: Priority,
+) -> Result<f64, QueueError> {
+    let served = virtual_now(connection, priority)?;
+    let sql = "SELECT max(virtual_finish) FROM jobs INDEXED BY jobs_tail \
+               WHERE state < 2 AND kind = 0 AND tenant = ?1 AND priority = ?2";
+    let own: Option<f64> = connection
+        .prepare_cached(sql)?
+        .query_row(params![tenant.as_str(), priority_code(priority)], |row| {
+            row.get(0)
+        })?;
+    Ok(served.unwrap_or(0.0).max(own.unwrap_or(0.0)))
+}
+
+/// The tag that is being served at a priority; none where nothing runs and nothing is ready.
+pub(super) fn virtual_now(
+    connection: &Connection,
+    priority: Priority,
+) -> Result<Option<f64>, QueueError> {
+    let priority = priority_code(priority);
     let one = |sql: &str, parameters: &[&dyn rusqlite::ToSql]| -> Result<Option<f64>, QueueError> {
         let mut statement = connection.prepare_cached(sql)?;
         Ok(statement.query_row(parameters, |row| row.get(0))?)
@@ -164,10 +191,5 @@ fn virtual_start(connection: &Connection, submission: &Submission) -> Result<f64
             &[&priority],
         )?,
     };
-    let own = one(
-        "SELECT max(virtual_finish) FROM jobs INDEXED BY jobs_tail \
-         WHERE state < 2 AND kind = 0 AND tenant = ?1 AND priority = ?2",
-        &[&submission.tenant.as_str(), &priority],
-    )?;
-    Ok(served.unwrap_or(0.0).max(own.unwrap_or(0.0)))
+    Ok(served)
 }

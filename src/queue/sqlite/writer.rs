@@ -76,7 +76,8 @@ impl Writer {
         self.commands
             .send(command)
             .map_err(|_| QueueError::Closed)?;
-        answered.await.map_err(|_| QueueError::Closed)?
+        let lost = || QueueError::Store("the change was not written".to_owned());
+        answered.await.map_err(|_| lost())?
     }
 
     /// Makes a change that nobody waits for.
@@ -146,16 +147,25 @@ fn run(
         let mut effects = Effects::default();
         let mut replies = Vec::with_capacity(commands.len());
         let began = Instant::now();
+        let mut swept = true;
         let done = transact(
             connection,
             commands,
             &mut effects,
             &mut replies,
             |effects| {
-                if sweeping {
-                    in_savepoint(connection, || sweep::sweep(connection, effects, options))?;
+                if !sweeping {
+                    return;
                 }
-                Ok(())
+                let mut own = Effects::default();
+                match in_savepoint(connection, || sweep::sweep(connection, &mut own, options)) {
+                    Ok(()) => effects.merge(own),
+                    // What others asked for at the same time stands all the same.
+                    Err(error) => {
+                        tracing::error!(%error, "the queue cannot look after what is due");
+                        swept = false;
+                    }
+                }
             },
         );
         shared.commit_seconds(began.elapsed());
@@ -168,7 +178,10 @@ fn run(
             reply(done.clone());
         }
         match sweep::next_due(connection) {
-            Ok(due) => next_due = due,
+            Ok(due) => {
+                let later = Timestamp::now().after(MAX_SLEEP);
+                next_due = if swept { due } else { due.max(Some(later)) };
+            }
             Err(error) => {
                 tracing::error!(%error, "the queue's store cannot be read");
                 next_due = None;
@@ -183,7 +196,7 @@ fn transact(
     commands: Vec<Command>,
     effects: &mut Effects,
     replies: &mut Vec<Reply>,
-    sweep: impl FnOnce(&mut Effects) -> Result<(), QueueError>,
+    sweep: impl FnOnce(&mut Effects),
 ) -> Result<(), QueueError> {
     let durable = commands.iter().any(|command| command.durable);
     let level = if durable { "FULL" } else { "NORMAL" };
@@ -194,7 +207,7 @@ fn transact(
     for command in commands {
         replies.push((command.change)(connection, effects));
     }
-    sweep(effects)?;
+    sweep(effects);
     connection.prepare_cached("COMMIT")?.execute([])?;
     Ok(())
 }
