@@ -79,7 +79,7 @@ async fn a_name_that_is_no_jobs_is_not_found_whatever_it_holds() {
         ("?limit=4294967296", 400),
         ("?limit=-1", 400),
         ("?state=broken", 400),
-        ("?before=..%2f..", 404),
+        ("?before=..%2f..", 400),
         ("?offset=1", 400),
     ] {
         let url = siege.server.url(&format!("/v1/jobs{query}"));
