@@ -33,7 +33,7 @@ impl Calls {
     }
 
     async fn named(&self, call: &Call, id: &str) -> Result<Arc<Job>, ApiError> {
-        self.service.job(&call.caller, id.parse::<JobId>()?).await
+        self.service.job(&call.caller, named(id)?).await
     }
 
     /// Reads a pair and submits it.
@@ -82,6 +82,11 @@ impl Calls {
         let accepted = draft.submit(Kind::Pair).await?;
         Ok((accepted, (pause > 0).then(|| Duration::from_millis(pause))))
     }
+}
+
+/// The job of a name; what is no name is no job.
+fn named(id: &str) -> Result<JobId, ApiError> {
+    Ok(id.parse()?)
 }
 
 /// A page's name that is none.
@@ -301,11 +306,7 @@ impl SceneFlow for Calls {
         request: Request<proto::CancelJobRequest>,
     ) -> Result<Response<proto::Job>, Status> {
         let call = Call::of(&request)?;
-        let id = request
-            .get_ref()
-            .id
-            .parse::<JobId>()
-            .map_err(ApiError::from)?;
+        let id = named(&request.get_ref().id)?;
         let job = self.service.cancel(&call.caller, id).await?;
         Ok(Response::new(convert::job(&job)))
     }
@@ -315,11 +316,7 @@ impl SceneFlow for Calls {
         request: Request<proto::RequeueJobRequest>,
     ) -> Result<Response<proto::Job>, Status> {
         let call = Call::of(&request)?;
-        let id = request
-            .get_ref()
-            .id
-            .parse::<JobId>()
-            .map_err(ApiError::from)?;
+        let id = named(&request.get_ref().id)?;
         let job = self.service.requeue(&call.caller, id).await?;
         Ok(Response::new(convert::job(&job)))
     }
@@ -329,11 +326,7 @@ impl SceneFlow for Calls {
         request: Request<proto::WatchJobRequest>,
     ) -> Result<Response<Self::WatchJobStream>, Status> {
         let call = Call::of(&request)?;
-        let id = request
-            .get_ref()
-            .id
-            .parse::<JobId>()
-            .map_err(ApiError::from)?;
+        let id = named(&request.get_ref().id)?;
         let mut news = self.service.watch(&call.caller, id).await?;
         let closing = self.service.closing.clone();
         let (answers, stream) = mpsc::channel(AHEAD);

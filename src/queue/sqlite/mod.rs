@@ -64,7 +64,6 @@ pub(in crate::queue) struct Shared {
     running: Mutex<HashMap<JobId, Running>>,
     ready: Notify,
     events: mpsc::UnboundedSender<Event>,
-    commit_micros: AtomicU64,
 }
 
 /// A job that some worker holds.
@@ -85,7 +84,6 @@ impl Shared {
             running: Mutex::default(),
             ready: Notify::new(),
             events,
-            commit_micros: AtomicU64::new(0),
         }
     }
 
@@ -135,11 +133,6 @@ impl Shared {
         for event in effects.events {
             let _nobody_listens_is_fine = self.events.send(event);
         }
-    }
-
-    fn commit_seconds(&self, took: Duration) {
-        let micros = u64::try_from(took.as_micros()).unwrap_or(u64::MAX);
-        self.commit_micros.store(micros, Ordering::Relaxed);
     }
 }
 

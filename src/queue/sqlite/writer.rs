@@ -6,7 +6,7 @@
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use rusqlite::Connection;
 use tokio::sync::oneshot;
@@ -146,7 +146,6 @@ fn run(
         }
         let mut effects = Effects::default();
         let mut replies = Vec::with_capacity(commands.len());
-        let began = Instant::now();
         let mut swept = true;
         let done = transact(
             connection,
@@ -168,7 +167,6 @@ fn run(
                 }
             },
         );
-        shared.commit_seconds(began.elapsed());
         if done.is_ok() {
             shared.apply(effects);
         } else if !connection.is_autocommit() {
