@@ -32,10 +32,16 @@ pub trait Transform: Send {
 
     /// The rigid motion target_from_source that aligns `source` with the target; the motion so
     /// far where `watch` interrupts.
-    fn align(&self, source: &[Point], watch: &dyn Watch) -> RigidTransform;
+    ///
+    /// # Errors
+    /// [`BackendError`] where the device fails.
+    fn align(&self, source: &[Point], watch: &dyn Watch) -> Result<RigidTransform, BackendError>;
 
     /// The distance to the target at each of `points`, metres.
-    fn distances(&self, points: &[Point]) -> Vec<f32>;
+    ///
+    /// # Errors
+    /// [`BackendError`] where the device fails.
+    fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError>;
 
     /// A field at its start, to be fitted to `source`.
     ///
@@ -68,10 +74,16 @@ pub trait Trainer: Send {
     fn report(&self) -> Report;
 
     /// What the following iterations and the result depend on.
-    fn state(&self) -> TrainerState;
+    ///
+    /// # Errors
+    /// [`BackendError`] where the device fails.
+    fn state(&mut self) -> Result<TrainerState, BackendError>;
 
     /// Goes on from `state`, which a trainer of the same points and options had.
-    fn restore(&mut self, state: TrainerState);
+    ///
+    /// # Errors
+    /// [`BackendError`] where the device fails.
+    fn restore(&mut self, state: TrainerState) -> Result<(), BackendError>;
 
     /// Ends after `max_iterations` at the latest, and lets the step size fall accordingly.
     fn shorten(&mut self, max_iterations: usize);
@@ -117,6 +129,28 @@ pub enum BackendError {
     /// Threads could not be started.
     #[error("cannot start worker threads: {0}")]
     Threads(String),
+    /// No device answers to what was asked for.
+    #[error("no such device: {0}")]
+    NoDevice(String),
+    /// The device cannot do what the options ask for.
+    #[error("the device cannot do this: {0}")]
+    Unsupported(&'static str),
+    /// The pair does not fit on the device.
+    #[error("the pair needs {needed} bytes for its {what} on the device, which has {available}")]
+    Memory {
+        /// What does not fit.
+        what: &'static str,
+        /// Bytes needed.
+        needed: u64,
+        /// Bytes that the device has for it.
+        available: u64,
+    },
+    /// The device is gone: it must be opened again before it can do anything.
+    #[error("the device was lost: {0}")]
+    Lost(String),
+    /// The device refused a command: a defect of this program or of the driver.
+    #[error("the device failed: {0}")]
+    Device(String),
 }
 
 impl From<DistanceError> for BackendError {

@@ -106,23 +106,26 @@ pub(crate) fn prepare(
             Err(error) => Err(error.into()),
         }
     };
-    let aligned = |transform: Box<dyn Transform>, whole: bool| {
+    let aligned = |transform: Box<dyn Transform>, whole: bool| -> Result<_, FlowError> {
         let ego = match options.ego {
             Ego::Off => None,
             Ego::Given(target_from_source) => Some(target_from_source),
-            Ego::Auto if whole => Some(transform.align(&selection.source, &on_time)),
-            Ego::Auto => Some(transform.align(&thinned(&selection.source), &on_time)),
+            Ego::Auto if whole => Some(transform.align(&selection.source, &on_time)?),
+            Ego::Auto => Some(transform.align(&thinned(&selection.source), &on_time)?),
         };
-        Prepared {
+        Ok(Prepared {
             transform,
             ego,
             whole,
-        }
+        })
     };
     let points = selection.source.len() + selection.target.len();
     let ample = AMPLE_SECONDS_PER_POINT * points as f64;
     if watch.seconds_left().is_none_or(|left| left > ample) {
-        return Ok(transform(1.0, &on_time)?.map(|transform| aligned(transform, true)));
+        let transform = transform(1.0, &on_time)?;
+        return transform
+            .map(|transform| aligned(transform, true))
+            .transpose();
     }
     let began = watch.seconds();
     let Some(coarse) = transform(COARSE, &on_time)? else {
@@ -139,11 +142,11 @@ pub(crate) fn prepare(
             reserve: left * (1.0 - GIVEN_UP_SHARE),
         };
         match transform(coarser, &early)? {
-            Some(transform) => return Ok(Some(aligned(transform, coarser == 1.0))),
+            Some(transform) => return aligned(transform, coarser == 1.0).map(Some),
             None => break,
         }
     }
-    Ok(Some(aligned(coarse, false)))
+    aligned(coarse, false).map(Some)
 }
 
 /// At most [`ALIGNED`] of the points, evenly.

@@ -2,12 +2,14 @@
 //!
 //! Gauss-Newton on the distance transform with a redescending weight (Geman and McClure) whose
 //! scale shrinks from two metres to a cell, so that movers and occluded points lose their say. Needs
-//! no correspondences. Knows only the transform, never the target's points.
+//! no correspondences. Knows only samples of the transform, never the target's points.
+//! Whoever owns the transform samples it; the sums are in double precision here.
 
 use nalgebra::{Isometry3, Matrix6, Point3, Translation3, UnitQuaternion, Vector3, Vector6};
 use rayon::prelude::*;
 
-use super::distance::DistanceTransform;
+use super::backend::BackendError;
+use super::distance::Sample;
 use super::points::{Point, RigidTransform};
 use super::watch::Watch;
 
@@ -29,9 +31,19 @@ const STEP_TOLERANCE: f64 = 1e-5;
 /// Keeps the normal equations solvable where the scene leaves a direction free.
 const DAMPING: f64 = 1e-6;
 
-/// The motion target_from_source that aligns `source` with the transform's target; the motion so
-/// far where the watch interrupts.
-pub fn align(source: &[Point], distance: &DistanceTransform, watch: &dyn Watch) -> RigidTransform {
+/// The distance transform at each of the points.
+pub(crate) type Samples<'a> = dyn Fn(&[Point]) -> Result<Vec<Sample>, BackendError> + 'a;
+
+/// The motion target_from_source that aligns `source` with the target that `samples` measures the
+/// distance to; the motion so far where the watch interrupts.
+///
+/// # Errors
+/// Whatever `samples` fails with.
+pub(crate) fn align(
+    source: &[Point],
+    samples: &Samples,
+    watch: &dyn Watch,
+) -> Result<RigidTransform, BackendError> {
     let stride = source.len().div_ceil(SAMPLED).max(1);
     let points: Vec<Point3<f64>> = source
         .iter()
@@ -39,7 +51,7 @@ pub fn align(source: &[Point], distance: &DistanceTransform, watch: &dyn Watch) 
         .map(|p| Point3::from(p.map(f64::from)))
         .collect();
     let Some(center) = mean(&points) else {
-        return RigidTransform::identity();
+        return Ok(RigidTransform::identity());
     };
     let mut target_from_source = RigidTransform::identity();
     for step in 0..STEPS {
@@ -50,7 +62,9 @@ pub fn align(source: &[Point], distance: &DistanceTransform, watch: &dyn Watch) 
         let scale = FIRST_SCALE_M * (LAST_SCALE_M / FIRST_SCALE_M).powf(shrunk);
         let pivot = target_from_source * center;
         let moved: Vec<_> = points.iter().map(|p| target_from_source * p).collect();
-        let Some(update) = gauss_newton_step(&moved, pivot, distance, scale) else {
+        let single: Vec<Point> = moved.iter().map(|p| p.map(|c| c as f32).into()).collect();
+        let samples = samples(&single)?;
+        let Some(update) = gauss_newton_step(&moved, &samples, pivot, scale) else {
             break;
         };
         let translation = Vector3::new(update[0], update[1], update[2]);
@@ -61,7 +75,7 @@ pub fn align(source: &[Point], distance: &DistanceTransform, watch: &dyn Watch) 
             break;
         }
     }
-    target_from_source
+    Ok(target_from_source)
 }
 
 /// The middle of the points; none where there are none.
@@ -75,13 +89,14 @@ fn mean(points: &[Point3<f64>]) -> Option<Point3<f64>> {
 /// as well conditioned as near ones.
 fn gauss_newton_step(
     points: &[Point3<f64>],
+    samples: &[Sample],
     pivot: Point3<f64>,
-    distance: &DistanceTransform,
     scale: f64,
 ) -> Option<Vector6<f64>> {
     let sums: Vec<_> = points
         .par_chunks(POINTS_AT_ONCE)
-        .map(|points| normal_equations(points, pivot, distance, scale))
+        .zip(samples.par_chunks(POINTS_AT_ONCE))
+        .map(|(points, samples)| normal_equations(points, samples, pivot, scale))
         .collect();
     let mut normal = Matrix6::identity() * DAMPING;
     let mut gradient = Vector6::zeros();
@@ -95,14 +110,13 @@ fn gauss_newton_step(
 /// The points' share of the normal equations: matrix and gradient.
 fn normal_equations(
     points: &[Point3<f64>],
+    samples: &[Sample],
     pivot: Point3<f64>,
-    distance: &DistanceTransform,
     scale: f64,
 ) -> (Matrix6<f64>, Vector6<f64>) {
     let mut normal = Matrix6::zeros();
     let mut gradient = Vector6::zeros();
-    for moved in points {
-        let sample = distance.sample([moved.x as f32, moved.y as f32, moved.z as f32]);
+    for (moved, sample) in points.iter().zip(samples) {
         let residual = f64::from(sample.distance);
         let slope = Vector3::from(sample.gradient.map(f64::from));
         let turning = (moved - pivot).cross(&slope);
@@ -117,7 +131,7 @@ fn normal_equations(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::flow::distance::{DistanceOptions, Sites};
+    use crate::flow::distance::{DistanceOptions, DistanceTransform, Sites};
     use crate::flow::random::Random;
     use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
     use crate::flow::watch::Unwatched;
@@ -141,6 +155,16 @@ mod tests {
             ..DistanceOptions::default()
         };
         DistanceTransform::build(source, target, &options).expect("a street fits")
+    }
+
+    fn found(source: &[Point], transform: &DistanceTransform) -> RigidTransform {
+        let samples = |points: &[Point]| {
+            Ok(points
+                .iter()
+                .map(|&point| transform.sample(point))
+                .collect())
+        };
+        align(source, &samples, &Unwatched).expect("the samples do not fail")
     }
 
     fn street(seed: u64) -> SimulatedPair {
@@ -182,7 +206,7 @@ mod tests {
                 let source = moved(&pair.source, &before);
                 for sites in [Sites::Cells, Sites::Points] {
                     let transform = transform(&source, &pair.target, sites);
-                    let found = align(&source, &transform, &Unwatched);
+                    let found = found(&source, &transform);
                     let (meters, degrees) = gap(&found, &truth);
                     assert!(
                         meters < accuracy_m(sites) && degrees < ACCURACY_DEG,
@@ -198,7 +222,7 @@ mod tests {
         let target = street(5).target;
         for sites in [Sites::Cells, Sites::Points] {
             let transform = transform(&target, &target, sites);
-            let found = align(&target, &transform, &Unwatched);
+            let found = found(&target, &transform);
             let (meters, degrees) = gap(&found, &RigidTransform::identity());
             assert!(
                 meters < accuracy_m(sites) && degrees < ACCURACY_DEG,
@@ -224,7 +248,7 @@ mod tests {
         ];
         for (source, target) in scenes {
             let transform = transform(&source, &target, Sites::Cells);
-            let found = align(&source, &transform, &Unwatched);
+            let found = found(&source, &transform);
             assert!(
                 found.to_homogeneous().iter().all(|value| value.is_finite()),
                 "{found}"

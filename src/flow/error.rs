@@ -57,6 +57,7 @@ impl FlowError {
                     | DistanceError::Band { .. }
                     | DistanceError::Interrupted(_)
             ),
+            Self::Backend(BackendError::Unsupported(_) | BackendError::Memory { .. }) => true,
             Self::Cancelled | Self::Diverged { .. } | Self::Snapshot(_) | Self::Backend(_) => false,
         }
     }

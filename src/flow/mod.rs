@@ -36,7 +36,7 @@ mod watch;
 
 // What a point is pulled toward, and what moves it.
 pub mod distance;
-pub mod ego;
+mod ego;
 pub mod field;
 mod loss;
 
@@ -44,6 +44,8 @@ mod loss;
 pub mod backend;
 pub mod cpu;
 mod early_stop;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 mod optimizer;
 
 // How good a flow is, and streets to try it on.

@@ -227,7 +227,7 @@ impl Fit<'_> {
     /// Fits from the start, or from `state`.
     fn run(&self, state: Option<TrainerState>) -> Result<Fitted, FlowError> {
         let (prepared, watch) = (self.prepared, self.watch);
-        let mut options = self.with_margin();
+        let mut options = self.with_margin()?;
         let mut trainer = prepared.transform.start(self.aligned, &options)?;
         let mut cut = !prepared.whole;
         let pace = match watch.seconds_left() {
@@ -236,7 +236,7 @@ impl Fit<'_> {
         };
         let left = watch.seconds_left();
         if let Some(state) = state {
-            trainer.restore(state);
+            trainer.restore(state)?;
         } else if let (Some(pace), Some(left)) = (pace, left)
             && let Some(hurried) = pace.hurried(&options, prepared, self.aligned.len(), left)
         {
@@ -259,7 +259,7 @@ impl Fit<'_> {
             let (steps, early) = clock.next(done, STEPS_AT_ONCE);
             match trainer.advance(steps, &early)? {
                 Advance::Continues if !cut && watch.snapshot_due() => {
-                    watch.snapshot(Snapshot::new(self.selection, self.asked, trainer.state()));
+                    watch.snapshot(Snapshot::new(self.selection, self.asked, trainer.state()?));
                 }
                 Advance::Continues => {}
                 Advance::Converged | Advance::Exhausted if cut => break StopReason::Deadline,
@@ -283,10 +283,10 @@ impl Fit<'_> {
     }
 
     /// The options, with the margin that the pair asks for.
-    fn with_margin(&self) -> Options {
+    fn with_margin(&self) -> Result<Options, FlowError> {
         let mut options = self.asked.clone();
         if let (Some(share), Some(_)) = (options.loss.margin_quantile, &self.prepared.ego) {
-            let distances = self.prepared.transform.distances(self.aligned);
+            let distances = self.prepared.transform.distances(self.aligned)?;
             let ranges = self.aligned.iter().map(|&point| length(point).max(1.0));
             let slopes = distances
                 .iter()
@@ -295,7 +295,7 @@ impl Fit<'_> {
                 .collect();
             options.loss.margin_slope = options.loss.margin_slope.max(quantile(slopes, share));
         }
-        options
+        Ok(options)
     }
 }
 

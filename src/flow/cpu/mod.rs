@@ -100,15 +100,18 @@ impl Transform for CpuTransform {
         self.distance.bytes()
     }
 
-    fn align(&self, source: &[Point], watch: &dyn Watch) -> RigidTransform {
-        self.threads
-            .install(|| ego::align(source, &self.distance, watch))
+    fn align(&self, source: &[Point], watch: &dyn Watch) -> Result<RigidTransform, BackendError> {
+        let samples = |points: &[Point]| {
+            let sample = |&point: &Point| self.distance.sample(point);
+            Ok(points.par_iter().map(sample).collect())
+        };
+        self.threads.install(|| ego::align(source, &samples, watch))
     }
 
-    fn distances(&self, points: &[Point]) -> Vec<f32> {
+    fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError> {
         let sample = |&point: &Point| self.distance.sample(point).distance;
-        self.threads
-            .install(|| points.par_iter().map(sample).collect())
+        let sampled = || points.par_iter().map(sample).collect();
+        Ok(self.threads.install(sampled))
     }
 
     fn start(

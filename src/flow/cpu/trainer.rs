@@ -287,21 +287,22 @@ impl Trainer for CpuTrainer<'_> {
         }
     }
 
-    fn state(&self) -> TrainerState {
+    fn state(&mut self) -> Result<TrainerState, BackendError> {
         let rule = self.early_stop.as_ref();
-        TrainerState {
+        Ok(TrainerState {
             seen: rule.map(EarlyStop::seen).unwrap_or_default(),
             ..self.state.clone()
-        }
+        })
     }
 
-    fn restore(&mut self, state: TrainerState) {
+    fn restore(&mut self, state: TrainerState) -> Result<(), BackendError> {
         self.early_stop = self
             .options
             .early_stop
             .map(|options| EarlyStop::resumed(options, state.seen));
         transpose_middle_layers(&state.parameters, &mut self.transposed);
         self.state = state;
+        Ok(())
     }
 
     fn shorten(&mut self, max_iterations: usize) {

@@ -1,0 +1,11 @@
+//! The GPU backend: the solver's kernels in WGSL, on any card that wgpu reaches.
+//!
+//! Knows nothing of the CPU backend; no type of wgpu leaves this folder. One [`Gpu`] is one opened
+//! card: it is cheap to clone, every clone may fit a pair of its own from a thread of its own, and
+//! pairs that are fitted at the same time share the card's submissions.
+
+mod adapter;
+mod device;
+
+pub use adapter::{Adapter, AdapterKind, Selector, adapters, select};
+pub use device::{Gpu, GpuOptions};
