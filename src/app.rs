@@ -1,10 +1,12 @@
 //! The server: puts the parts together, starts them in order, and stops them in order.
 
 mod drain;
+mod pool;
+#[cfg(test)]
+mod tests;
 mod upkeep;
 
 use std::net::SocketAddr;
-use std::str::FromStr;
 use std::sync::Arc;
 use std::thread;
 use std::time::Duration;
@@ -14,6 +16,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::{JoinHandle, JoinSet};
 use tokio_util::sync::CancellationToken;
 
+use self::pool::Pool;
 use crate::api::{
     Admission, AdmissionLimits, Caller, Keys, ListenOptions, Listener, Parts, Readiness, Role,
     Service, ServiceLimits, admin_router, public_router, tls_acceptor,
@@ -22,8 +25,7 @@ use crate::blobs::Blobs;
 use crate::config::{Config, LimitsConfig, QueueConfig};
 use crate::cost::CostModel;
 use crate::engine::{Device, Health};
-use crate::flow::cpu::CpuBackend;
-use crate::job::Tenant;
+use crate::job::{DeviceKind, Tenant};
 use crate::metrics::Metrics;
 use crate::queue::{Queue, QueueOptions, SqliteQueue};
 use crate::worker::{Drain, Worker, WorkerOptions};
@@ -50,9 +52,19 @@ impl App {
     /// Where a port, the data folder, a key or a device cannot be used, with what to do about it.
     pub async fn start(config: Config) -> anyhow::Result<Self> {
         config.check()?;
-        let openers = openers(&config.devices)?;
-        let names: Vec<String> = openers.iter().map(|(name, _)| name.clone()).collect();
+        let pool = Pool::of(&config)?;
+        Self::start_on(pool, config).await
+    }
+
+    /// The same on devices that are chosen already.
+    async fn start_on(pool: Pool, config: Config) -> anyhow::Result<Self> {
+        let lanes = pool.lanes();
+        let names: Vec<_> = pool.devices.iter().map(|device| &device.name).collect();
         let metrics = Arc::new(Metrics::new(&names));
+        if pool.fell_back {
+            metrics.fell_back();
+            tracing::warn!("no GPU was found: the CPU does the work; fnsf doctor says why");
+        }
         let keys = keys(&config)?;
 
         let (events, heard) = mpsc::unbounded_channel();
@@ -63,25 +75,23 @@ impl App {
             .with_context(|| format!("cannot use {}", config.data_dir.display()))?;
 
         let mut devices = Vec::new();
-        for (name, threads) in openers {
-            let open = move || {
-                let backend = CpuBackend::new(Some(threads))?;
-                Ok(Box::new(backend) as Box<dyn crate::flow::backend::Backend>)
-            };
-            devices.push(Device::start(&name, Box::new(open))?);
+        for device in pool.devices {
+            devices.push(Device::start(device, &metrics)?);
         }
-        let cost = Arc::new(CostModel::new());
+        let cost = Arc::new(CostModel::new(lanes));
         let workers_drain = Drain::default();
         let mut workers = JoinSet::new();
-        for device in &devices {
+        for lane in devices.iter().flat_map(Device::lanes) {
+            let a_cpu_besides = lane.kind() == DeviceKind::Gpu && lanes.cpu > 0;
             let worker = Worker {
                 queue: Arc::clone(&queue),
                 blobs: blobs.clone(),
-                device: device.clone(),
+                lane,
                 cost: Arc::clone(&cost),
                 metrics: Arc::clone(&metrics),
                 options: WorkerOptions {
                     snapshot_interval: Duration::from_millis(config.queue.snapshot_interval_ms),
+                    roomier: a_cpu_besides.then_some(DeviceKind::Cpu),
                 },
                 drain: workers_drain.clone(),
             };
@@ -95,7 +105,6 @@ impl App {
                 admission_limits(&config.limits),
                 Arc::clone(&queue),
                 Arc::clone(&cost),
-                devices.len(),
             ),
             metrics: Arc::clone(&metrics),
             keys,
@@ -147,7 +156,7 @@ impl App {
     /// Where values do not go together, or a key or a device cannot be used.
     pub fn check(config: &Config) -> anyhow::Result<()> {
         config.check()?;
-        openers(&config.devices)?;
+        Pool::of(config)?;
         keys(config)?;
         Ok(())
     }
@@ -174,31 +183,45 @@ impl App {
                 .wait_for(|health| *health != Health::Starting)
                 .await?;
             match &*tried {
-                Health::Broken(reason) => reasons.push(format!("{}: {reason}", device.name())),
+                Health::Broken(reason) | Health::Gone(reason) => {
+                    reasons.push(format!("{}: {reason}", device.name()));
+                }
                 _ => return Ok(()),
             }
         }
         Err(anyhow!("no device can be used: {}", reasons.join("; ")))
     }
-}
 
-/// Devices by their names in metrics, with their threads.
-fn openers(devices: &[String]) -> anyhow::Result<Vec<(String, usize)>> {
-    let cores = thread::available_parallelism().map_or(1, usize::from);
-    let mut openers = Vec::new();
-    for (place, device) in devices.iter().enumerate() {
-        let threads = match device.split_once(':') {
-            None if device == "cpu" || device == "auto" => Some(cores),
-            Some(("cpu", threads)) => usize::from_str(threads).ok(),
-            _ => None,
-        };
-        let threads = threads.filter(|threads| (1..=256).contains(threads));
-        let threads = threads.ok_or_else(|| {
-            anyhow!("devices: {device:?} is none; known are \"cpu\" and \"cpu:THREADS\"")
-        })?;
-        openers.push((format!("cpu{place}"), threads));
+    /// Waits until a fresh process may do what this one cannot: until the last device of a kind has
+    /// worked, is lost, and does not come back. Says which.
+    pub async fn given_up(&self) -> String {
+        let mut healths: Vec<_> = self.devices.iter().map(Device::health).collect();
+        loop {
+            if let Some(reason) = self.last_of_its_kind_is_gone() {
+                return reason;
+            }
+            let changes = healths.iter_mut().map(|health| Box::pin(health.changed()));
+            let (changed, ..) = futures_util::future::select_all(changes).await;
+            if changed.is_err() {
+                return "a device's threads have ended".to_owned();
+            }
+        }
     }
-    Ok(openers)
+
+    fn last_of_its_kind_is_gone(&self) -> Option<String> {
+        DeviceKind::ALL.into_iter().find_map(|kind| {
+            let of_kind = || {
+                self.devices
+                    .iter()
+                    .filter(move |device| device.kind() == kind)
+            };
+            let works = of_kind().any(|device| *device.health().borrow() == Health::Ready);
+            of_kind().find_map(|device| match &*device.health().borrow() {
+                Health::Gone(reason) if !works => Some(format!("{}: {reason}", device.name())),
+                _ => None,
+            })
+        })
+    }
 }
 
 fn keys(config: &Config) -> anyhow::Result<Keys> {

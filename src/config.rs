@@ -20,6 +20,9 @@ const PREFIX: &str = "FNSF_SERVE_";
 /// What a drain needs at least: to put down what runs, and to close connections.
 const MIN_DRAIN_SECONDS: u64 = 4;
 
+/// Each lane is a thread, and has its share of the card's memory.
+const MAX_LANES: usize = 64;
+
 /// All of it.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -38,8 +41,15 @@ pub struct Config {
     pub keys: Vec<KeyConfig>,
     /// TLS on the public port.
     pub tls: Option<TlsConfig>,
-    /// What works: `cpu` is all cores, `cpu:4` is four threads. One worker each.
+    /// What works. `auto`: every GPU that is found, else the CPU; `cpu`: all cores; `cpu:4`: four
+    /// threads; `gpu`: every GPU; `gpu:CARD`: the one of that number, PCI id or part of a name.
     pub devices: Vec<String>,
+    /// Pairs that one GPU works on at the same time; by default what suits the card.
+    pub gpu_lanes: Option<usize>,
+    /// Memory of a GPU to take, MiB; by default what suits the card.
+    pub gpu_memory_mib: Option<u64>,
+    /// Take drivers that only compute on the CPU for GPUs: for tests.
+    pub software_gpu: bool,
     /// What is accepted.
     pub limits: LimitsConfig,
     /// How jobs are treated.
@@ -201,7 +211,10 @@ impl Default for Config {
             api_key: None,
             keys: Vec::new(),
             tls: None,
-            devices: vec!["cpu".to_owned()],
+            devices: vec!["auto".to_owned()],
+            gpu_lanes: None,
+            gpu_memory_mib: None,
+            software_gpu: false,
             limits: LimitsConfig {
                 max_points: 2_000_000,
                 max_pair_mib: 8192,
@@ -299,6 +312,15 @@ impl Config {
         if self.devices.is_empty() {
             return refuse("devices is empty: name at least one, such as \"cpu\"");
         }
+        if self
+            .gpu_lanes
+            .is_some_and(|lanes| !(1..=MAX_LANES).contains(&lanes))
+        {
+            return refuse("gpu_lanes must be 1 to 64");
+        }
+        if self.gpu_memory_mib == Some(0) {
+            return refuse("gpu_memory_mib must be at least 1");
+        }
         if self.drain.deadline_seconds < self.drain.delay_seconds + MIN_DRAIN_SECONDS {
             return refuse(
                 "drain.deadline_seconds must be at least 4 s longer than drain.delay_seconds: \
@@ -352,6 +374,8 @@ mod tests {
             ("listen = \"here\"", "listen"),
             ("listen = \"0.0.0.0:8080\"", "listen goes beyond loopback"),
             ("devices = []", "devices is empty"),
+            ("gpu_lanes = 0", "gpu_lanes"),
+            ("gpu_memory_mib = 0", "gpu_memory_mib"),
             (
                 "[[keys]]\ntenant = \"a\"\nrole = \"root\"\nkey = \"x\"",
                 "root",

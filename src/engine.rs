@@ -1,23 +1,41 @@
-//! A device and the one thread that owns it.
+//! A device, and the threads that work on it: its lanes.
 //!
-//! The thread takes one pair at a time and publishes the device's health. A panic costs the pair
-//! that it happened in: the device is opened again and must pass its trial. It must not know
-//! queues, stores or doors.
+//! Each lane takes one pair at a time; the device is opened once for all
+//! of them and has one health. A panic costs the pair that it happened in, a lost device the pairs
+//! that were on it: then it is opened again and must pass its trial. It must not know queues,
+//! stores or doors.
 
+mod busy;
+mod hold;
+mod lane;
 mod trial;
 
-use std::panic::{AssertUnwindSafe, catch_unwind};
+#[cfg(test)]
+pub(crate) mod cards;
+#[cfg(test)]
+mod tests;
+
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use tokio::sync::{mpsc, oneshot, watch};
 
+use self::busy::Busy;
+use self::hold::Hold;
+use self::lane::Command;
 use crate::flow::backend::{Backend, BackendError};
-use crate::flow::{
-    self, Estimate, FlowError, Interrupt, Options, Point, Problem, Progress, Snapshot, Watch,
-};
+use crate::flow::{Estimate, FlowError, Options, Point, Snapshot, Watch};
+use crate::job::DeviceKind;
+use crate::metrics::Metrics;
+
+/// Solves a small pair whose flow is known.
+///
+/// # Errors
+/// What is wrong with the device.
+pub fn try_out(backend: &dyn Backend) -> Result<(), String> {
+    trial::run(backend)
+}
 
 /// One pair for a device.
 pub struct Work {
@@ -42,8 +60,11 @@ pub enum Health {
     Starting,
     /// It has passed its trial.
     Ready,
-    /// It cannot be used.
+    /// It cannot be used; it is tried again.
     Broken(String),
+    /// It has worked and does not come back, however often it is opened. It is still tried, but
+    /// only a fresh process may help.
+    Gone(String),
 }
 
 /// Why a device gave no flow.
@@ -52,16 +73,64 @@ pub enum EngineError {
     /// The solver refused or failed.
     #[error(transparent)]
     Flow(#[from] FlowError),
-    /// The solver panicked; the device was opened again.
+    /// The solver panicked; the device is tried again.
     #[error("the solver panicked: {0}")]
     Panicked(String),
-    /// The device cannot be used.
+    /// The device went away under work; it is opened again.
+    #[error("the device was lost: {0}")]
+    Lost(String),
+    /// The device could not even begin.
     #[error("the device cannot be used: {0}")]
     Broken(String),
 }
 
-/// Opens a device's backend; called again after a panic.
-pub type Opener = Box<dyn Fn() -> Result<Box<dyn Backend>, BackendError> + Send>;
+/// A device that is open.
+pub trait Opened: Send + Sync {
+    /// A backend for one pair; those of several lanes work at the same time.
+    fn lane(&self) -> Arc<dyn Backend>;
+
+    /// Whether the device is gone, so that nothing that comes from it counts.
+    fn is_lost(&self) -> bool;
+}
+
+/// Opens a device; called again when it was lost.
+pub type Opener = Box<dyn Fn() -> Result<Box<dyn Opened>, BackendError> + Send + Sync>;
+
+/// How a device that cannot be opened is tried again.
+#[derive(Clone, Copy, Debug)]
+pub struct Reopening {
+    /// Before the second try; four times as long before each one after it.
+    pub first_pause: Duration,
+    /// No pause is longer.
+    pub longest_pause: Duration,
+    /// Tries without success after which a device that has worked is given up.
+    pub tries: u32,
+}
+
+impl Default for Reopening {
+    /// Six tries in about three quarters of a minute: longer than a driver takes to reset a card.
+    fn default() -> Self {
+        Self {
+            first_pause: Duration::from_millis(200),
+            longest_pause: Duration::from_secs(30),
+            tries: 6,
+        }
+    }
+}
+
+/// What a device is, before it is opened.
+pub struct DeviceOptions {
+    /// Its name in metrics and logs.
+    pub name: String,
+    /// What it is.
+    pub kind: DeviceKind,
+    /// Pairs that it works on at the same time.
+    pub lanes: usize,
+    /// How it is opened.
+    pub open: Opener,
+    /// How it is tried again.
+    pub reopening: Reopening,
+}
 
 /// What a device gives.
 #[derive(Debug)]
@@ -72,38 +141,60 @@ pub struct Solved {
     pub device: String,
 }
 
-struct Command {
-    work: Work,
-    reply: oneshot::Sender<Result<Solved, EngineError>>,
-}
-
-/// The way to a device's thread.
-#[derive(Clone, Debug)]
-pub struct Device {
-    name: Arc<str>,
+/// The way to one lane's thread.
+#[derive(Debug)]
+struct LaneEnd {
     commands: mpsc::Sender<Command>,
-    health: watch::Receiver<Health>,
     busy: Arc<Busy>,
 }
 
+/// The way to a device.
+#[derive(Clone, Debug)]
+pub struct Device {
+    name: Arc<str>,
+    kind: DeviceKind,
+    health: watch::Receiver<Health>,
+    lanes: Arc<[LaneEnd]>,
+}
+
+/// One of the pairs that a device can work on at a time.
+#[derive(Clone, Debug)]
+pub struct Lane {
+    device: Device,
+    place: usize,
+}
+
 impl Device {
-    /// Starts the thread that opens the device and owns it from then on.
+    /// Starts the lanes' threads; the first of them opens the device.
     ///
     /// # Errors
-    /// Where the thread cannot be started.
-    pub fn start(name: &str, open: Opener) -> std::io::Result<Self> {
-        let (commands, inbox) = mpsc::channel(1);
+    /// Where a thread cannot be started.
+    pub fn start(options: DeviceOptions, metrics: &Arc<Metrics>) -> std::io::Result<Self> {
         let (tell, health) = watch::channel(Health::Starting);
-        let busy = Arc::new(Busy::default());
-        let thread_busy = Arc::clone(&busy);
-        thread::Builder::new()
-            .name(format!("device {name}"))
-            .spawn(move || run(&open, inbox, &tell, &thread_busy))?;
+        let name: Arc<str> = Arc::from(options.name);
+        let hold = Arc::new(Hold::new(
+            Arc::clone(&name),
+            options.open,
+            options.reopening,
+            Arc::clone(metrics),
+            tell,
+        ));
+        let mut lanes = Vec::new();
+        for place in 0..options.lanes.max(1) {
+            let (commands, inbox) = mpsc::channel(1);
+            let busy = Arc::new(Busy::default());
+            let (lane_hold, lane_busy) = (Arc::clone(&hold), Arc::clone(&busy));
+            thread::Builder::new()
+                .name(format!("device {name} {place}"))
+                .spawn(move || lane::run(&lane_hold, inbox, &lane_busy))?;
+            lanes.push(LaneEnd { commands, busy });
+        }
+        metrics.device_lanes(&name, lanes.len());
         Ok(Self {
-            name: Arc::from(name),
-            commands,
+            name,
+            kind: options.kind,
             health,
-            busy,
+            lanes: lanes.into(),
         })
     }
 
@@ -112,19 +203,35 @@ impl Device {
         &self.name
     }
 
+    /// What the device is.
+    pub fn kind(&self) -> DeviceKind {
+        self.kind
+    }
+
     /// The device's health, now and as it changes.
     pub fn health(&self) -> watch::Receiver<Health> {
         self.health.clone()
     }
 
-    /// What stands in the way of work; nothing where the device has passed its trial and, if it
-    /// works, has given a sign of life a moment ago.
+    /// Its lanes, each for a worker of its own.
+    pub fn lanes(&self) -> impl ExactSizeIterator<Item = Lane> + '_ {
+        (0..self.lanes.len()).map(|place| Lane {
+            device: self.clone(),
+            place,
+        })
+    }
+
+    /// What stands in the way of work; nothing where the device has passed its trial and every
+    /// lane that works has given a sign of life a moment ago.
     pub fn obstacle(&self) -> Option<String> {
         match &*self.health.borrow() {
             Health::Starting => Some(format!("{} is being tried", self.name)),
-            Health::Broken(reason) => Some(format!("{}: {reason}", self.name)),
+            Health::Broken(reason) | Health::Gone(reason) => {
+                Some(format!("{}: {reason}", self.name))
+            }
             Health::Ready => {
-                let silence = self.busy.silence();
+                let silences = self.lanes.iter().map(|lane| lane.busy.silence());
+                let silence = silences.max().unwrap_or_default();
                 (silence > LONGEST_SILENCE).then(|| {
                     format!(
                         "{} gave no sign of life for {} s",
@@ -136,12 +243,24 @@ impl Device {
         }
     }
 
-    /// How long the device has worked in all.
+    /// How long its lanes have worked in all, together.
     pub fn busy(&self) -> Duration {
-        self.busy.total()
+        self.lanes.iter().map(|lane| lane.busy.total()).sum()
+    }
+}
+
+impl Lane {
+    /// The device that it is a lane of.
+    pub fn device(&self) -> &Device {
+        &self.device
     }
 
-    /// Estimates one pair's flow on the device.
+    /// What the device is.
+    pub fn kind(&self) -> DeviceKind {
+        self.device.kind
+    }
+
+    /// Estimates one pair's flow.
     ///
     /// # Errors
     /// [`EngineError`]; the device is ready for the next pair, or says otherwise in its health.
@@ -149,206 +268,11 @@ impl Device {
         let gone = || EngineError::Broken("its thread has ended".to_owned());
         let (reply, answer) = oneshot::channel();
         let command = Command { work, reply };
-        self.commands.send(command).await.map_err(|_| gone())?;
+        let commands = &self.device.lanes[self.place].commands;
+        commands.send(command).await.map_err(|_| gone())?;
         answer.await.map_err(|_| gone())?
     }
 }
 
 /// Silence in the middle of work after which a device is not taken for ready.
 const LONGEST_SILENCE: Duration = Duration::from_secs(30);
-
-/// Time at work, the current piece of it included.
-#[derive(Debug)]
-struct Busy {
-    epoch: Instant,
-    /// Microseconds after `epoch` of the latest sign of life.
-    alive: AtomicU64,
-    before_micros: AtomicU64,
-    /// Microseconds after `epoch` at which the current piece began, plus one; zero when idle.
-    since: AtomicU64,
-}
-
-impl Default for Busy {
-    fn default() -> Self {
-        Self {
-            epoch: Instant::now(),
-            alive: AtomicU64::new(0),
-            before_micros: AtomicU64::new(0),
-            since: AtomicU64::new(0),
-        }
-    }
-}
-
-impl Busy {
-    fn now(&self) -> u64 {
-        u64::try_from(self.epoch.elapsed().as_micros()).unwrap_or(u64::MAX - 1)
-    }
-
-    fn sign_of_life(&self) {
-        self.alive.store(self.now(), Ordering::Relaxed);
-    }
-
-    /// How long nothing has been heard in the middle of work.
-    fn silence(&self) -> Duration {
-        if self.since.load(Ordering::Relaxed) == 0 {
-            return Duration::ZERO;
-        }
-        let heard = self.alive.load(Ordering::Relaxed);
-        Duration::from_micros(self.now().saturating_sub(heard))
-    }
-
-    fn begin(&self) {
-        self.sign_of_life();
-        self.since.store(self.now() + 1, Ordering::Relaxed);
-    }
-
-    fn end(&self) {
-        let since = self.since.swap(0, Ordering::Relaxed);
-        let took = (self.now() + 1).saturating_sub(since);
-        self.before_micros.fetch_add(took, Ordering::Relaxed);
-    }
-
-    fn total(&self) -> Duration {
-        let before = self.before_micros.load(Ordering::Relaxed);
-        let current = match self.since.load(Ordering::Relaxed) {
-            0 => 0,
-            since => (self.now() + 1).saturating_sub(since),
-        };
-        Duration::from_micros(before + current)
-    }
-}
-
-/// The thread: opens, tries, works, and opens again after a panic.
-fn run(
-    open: &Opener,
-    mut inbox: mpsc::Receiver<Command>,
-    tell: &watch::Sender<Health>,
-    busy: &Busy,
-) {
-    const FIRST_PAUSE: Duration = Duration::from_millis(200);
-    const LONGEST_PAUSE: Duration = Duration::from_secs(30);
-    let mut pause = FIRST_PAUSE;
-    loop {
-        tell.send_replace(Health::Starting);
-        match open_and_try(open) {
-            Ok(backend) => {
-                pause = FIRST_PAUSE;
-                tell.send_replace(Health::Ready);
-                if work_until_panic(backend.as_ref(), &mut inbox, busy).is_none() {
-                    return;
-                }
-            }
-            Err(reason) => {
-                tracing::error!(%reason, "the device cannot be used");
-                tell.send_replace(Health::Broken(reason));
-                if inbox.is_closed() {
-                    return;
-                }
-                thread::sleep(pause);
-                pause = (pause * 2).min(LONGEST_PAUSE);
-            }
-        }
-    }
-}
-
-fn open_and_try(open: &Opener) -> Result<Box<dyn Backend>, String> {
-    let tried = catch_unwind(AssertUnwindSafe(|| {
-        let backend = open().map_err(|error| error.to_string())?;
-        trial::run(backend.as_ref())?;
-        Ok(backend)
-    }));
-    tried.unwrap_or_else(|panic| Err(message(panic.as_ref())))
-}
-
-/// Works until there is no more work, or until a panic.
-fn work_until_panic(
-    backend: &dyn Backend,
-    inbox: &mut mpsc::Receiver<Command>,
-    busy: &Busy,
-) -> Option<()> {
-    while let Some(Command { work, reply }) = inbox.blocking_recv() {
-        busy.begin();
-        let solved = catch_unwind(AssertUnwindSafe(|| solve(backend, work, busy)));
-        busy.end();
-        let (answer, panicked) = match solved {
-            Ok(answer) => {
-                let solved = answer.map(|estimate| Solved {
-                    estimate,
-                    device: backend.name(),
-                });
-                (solved.map_err(EngineError::from), None)
-            }
-            Err(panic) => {
-                let message = message(panic.as_ref());
-                (Err(EngineError::Panicked(message)), Some(()))
-            }
-        };
-        let _nobody_waits_is_fine = reply.send(answer);
-        if panicked.is_some() {
-            return panicked;
-        }
-    }
-    None
-}
-
-/// Passes everything on, and hears the signs of life.
-struct Heard<'a> {
-    watch: &'a dyn Watch,
-    busy: &'a Busy,
-}
-
-impl Watch for Heard<'_> {
-    fn seconds(&self) -> f64 {
-        self.watch.seconds()
-    }
-
-    fn seconds_left(&self) -> Option<f64> {
-        self.watch.seconds_left()
-    }
-
-    fn interrupt(&self) -> Option<Interrupt> {
-        self.busy.sign_of_life();
-        self.watch.interrupt()
-    }
-
-    fn progress(&self, progress: Progress) {
-        self.watch.progress(progress);
-    }
-
-    fn snapshot_due(&self) -> bool {
-        self.watch.snapshot_due()
-    }
-
-    fn snapshot(&self, snapshot: Snapshot) {
-        self.watch.snapshot(snapshot);
-    }
-}
-
-fn solve(backend: &dyn Backend, work: Work, busy: &Busy) -> Result<Estimate, FlowError> {
-    let watch = Heard {
-        watch: work.watch.as_ref(),
-        busy,
-    };
-    let ground = work.ground.as_ref();
-    let problem = Problem {
-        source: &work.source,
-        target: &work.target,
-        ground: ground.map(|[source, target]| [source.as_slice(), target.as_slice()]),
-    };
-    if let Some(snapshot) = work.snapshot {
-        match flow::resume(backend, &problem, &work.options, snapshot, &watch) {
-            Err(FlowError::Snapshot(error)) => {
-                tracing::warn!(%error, "a snapshot is of no use: the job starts afresh");
-            }
-            resumed => return resumed,
-        }
-    }
-    flow::estimate(backend, &problem, &work.options, &watch)
-}
-
-/// What a panic said.
-fn message(panic: &(dyn std::any::Any + Send)) -> String {
-    let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
-    let text = text.or_else(|| panic.downcast_ref::<String>().cloned());
-    text.unwrap_or_else(|| "without a word".to_owned())
-}

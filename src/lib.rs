@@ -45,3 +45,7 @@ pub mod telemetry;
 mod text;
 #[cfg(feature = "service")]
 pub mod worker;
+
+#[cfg(all(test, feature = "gpu"))]
+#[path = "../tests/common/gpu.rs"]
+mod gpu_in_tests;

@@ -3,6 +3,7 @@
 //! No label holds a job, a tenant or anything else that grows; every series exists from the start.
 
 mod exposition;
+mod vocabulary;
 
 use std::sync::atomic::AtomicU64;
 use std::time::Duration;
@@ -18,6 +19,9 @@ use prometheus_client::registry::{Registry, Unit};
 
 use crate::job::{Job, Priority, State};
 use crate::queue::Event;
+
+use self::vocabulary::STOP_REASONS;
+pub use self::vocabulary::{CLASSES, DOORS, PHASES, REJECTIONS};
 
 /// A gauge of a number that is not whole.
 type Float = Gauge<f64, AtomicU64>;
@@ -69,34 +73,6 @@ struct DoorAndClass {
     class: &'static str,
 }
 
-/// The phases of a job, in order: the paper's own, and what a service adds around them.
-pub const PHASES: [&str; 7] = [
-    "decode",
-    "precompute",
-    "query",
-    "network",
-    "readback",
-    "encode",
-    "total",
-];
-/// Why requests are refused.
-pub const REJECTIONS: [&str; 9] = [
-    "disk_full",
-    "too_large",
-    "too_many_points",
-    "bad_input",
-    "tenant_limit",
-    "server_full",
-    "draining",
-    "unauthorized",
-    "too_slow",
-];
-const STOP_REASONS: [&str; 3] = ["converged", "max_iterations", "deadline"];
-/// The doors that requests come through.
-pub const DOORS: [&str; 2] = ["http", "grpc"];
-/// How requests end: done, the caller's fault, the server's.
-pub const CLASSES: [&str; 3] = ["ok", "client_error", "server_error"];
-
 /// All metrics of one server.
 #[derive(Debug)]
 pub struct Metrics {
@@ -117,7 +93,9 @@ pub struct Metrics {
     running: Gauge,
     device_busy_ratio: Family<DeviceLabel, Float>,
     device_ready: Family<DeviceLabel, Gauge>,
-    device_lost: Counter,
+    device_lanes: Family<DeviceLabel, Gauge>,
+    device_lost: Family<DeviceLabel, Counter>,
+    device_fallback: Gauge,
     rejected: Family<Reason, Counter>,
     requests: Family<DoorAndClass, Counter>,
     connections: Gauge,
@@ -133,7 +111,7 @@ fn seconds() -> Seconds {
 
 impl Metrics {
     /// Every series at zero. `devices` are the names that `device` may have.
-    pub fn new(devices: &[String]) -> Self {
+    pub fn new(devices: &[impl AsRef<str>]) -> Self {
         let metrics = Self {
             registry: Registry::with_prefix("fnsf"),
             submitted: Counter::default(),
@@ -152,7 +130,9 @@ impl Metrics {
             running: Gauge::default(),
             device_busy_ratio: Family::default(),
             device_ready: Family::default(),
-            device_lost: Counter::default(),
+            device_lanes: Family::default(),
+            device_lost: Family::default(),
+            device_fallback: Gauge::default(),
             rejected: Family::default(),
             requests: Family::default(),
             connections: Gauge::default(),
@@ -166,7 +146,7 @@ impl Metrics {
     }
 
     /// Makes every series, so that their number never changes.
-    fn fill(&self, devices: &[String]) {
+    fn fill(&self, devices: &[impl AsRef<str>]) {
         for state in State::ALL.into_iter().filter(|state| state.is_end()) {
             drop(self.finished.get_or_create(&Outcome {
                 outcome: state.name(),
@@ -193,10 +173,12 @@ impl Metrics {
         }
         for device in devices {
             let label = DeviceLabel {
-                device: device.clone(),
+                device: device.as_ref().to_owned(),
             };
             drop(self.device_busy_ratio.get_or_create(&label));
             drop(self.device_ready.get_or_create(&label));
+            drop(self.device_lanes.get_or_create(&label));
+            drop(self.device_lost.get_or_create(&label));
         }
     }
 
@@ -273,7 +255,7 @@ impl Metrics {
         );
         registry.register(
             "device_busy_ratio",
-            "Share of the last seconds that a device worked",
+            "Share of its lanes' time that a device worked in the last seconds",
             self.device_busy_ratio.clone(),
         );
         registry.register(
@@ -282,9 +264,19 @@ impl Metrics {
             self.device_ready.clone(),
         );
         registry.register(
+            "device_lanes",
+            "Pairs that a device works on at the same time",
+            self.device_lanes.clone(),
+        );
+        registry.register(
             "device_lost",
             "Devices lost and opened again",
             self.device_lost.clone(),
+        );
+        registry.register(
+            "device_fallback",
+            "Whether the CPU works because no GPU was found, where one would have been taken",
+            self.device_fallback.clone(),
         );
         registry.register("rejected", "Requests refused", self.rejected.clone());
         registry.register("requests", "Requests answered", self.requests.clone());
@@ -414,8 +406,23 @@ impl Metrics {
     }
 
     /// Counts a lost device.
-    pub fn device_lost(&self) {
-        self.device_lost.inc();
+    pub fn device_lost(&self, name: &str) {
+        let device = name.to_owned();
+        self.device_lost
+            .get_or_create(&DeviceLabel { device })
+            .inc();
+    }
+
+    /// Notes how many pairs a device works on at the same time.
+    pub fn device_lanes(&self, name: &str, lanes: usize) {
+        let device = name.to_owned();
+        let series = self.device_lanes.get_or_create(&DeviceLabel { device });
+        series.set(i64::try_from(lanes).unwrap_or(i64::MAX));
+    }
+
+    /// Notes that the CPU works because no GPU was found.
+    pub fn fell_back(&self) {
+        self.device_fallback.set(1);
     }
 
     /// Notes a device's health and its share of time at work.

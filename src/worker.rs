@@ -1,6 +1,6 @@
 //! A worker: leases, runs, commits, acknowledges.
 //!
-//! One for each device. The only room that sees both the queue and the engine. The result is in
+//! One for each lane of a device. The only room that sees both the queue and the engine. The result is in
 //! store before the queue hears of it, and only the attempt that holds the job counts.
 
 mod job_watch;
@@ -19,9 +19,10 @@ use self::job_watch::JobWatch;
 use crate::blobs::{Blob, BlobError, Blobs, Sync};
 use crate::clock::Timestamp;
 use crate::cost::CostModel;
-use crate::engine::{Device, EngineError, Health, Solved, Work};
+use crate::engine::{EngineError, Health, Lane, Solved, Work};
+use crate::flow::backend::BackendError;
 use crate::flow::{Estimate, FlowError, Snapshot};
-use crate::job::{Job, JobError, JobOptions, Report};
+use crate::job::{DeviceKind, Job, JobError, JobOptions, Report};
 use crate::metrics::Metrics;
 use crate::payload::{Damaged, StoredCloud, StoredFlow};
 use crate::queue::{Committed, Lease, Outcome, Queue, QueueError, Signal};
@@ -31,6 +32,8 @@ use crate::queue::{Committed, Lease, Outcome, Queue, QueueError, Signal};
 pub struct WorkerOptions {
     /// Time between a running job's snapshots.
     pub snapshot_interval: Duration,
+    /// Where a job goes that does not fit on this device; none where there is no other kind.
+    pub roomier: Option<DeviceKind>,
 }
 
 /// How workers are told to stop.
@@ -50,7 +53,7 @@ pub struct Worker {
     /// Where payloads and results lie.
     pub blobs: Blobs,
     /// What does the work.
-    pub device: Device,
+    pub lane: Lane,
     /// What is learned about the time that work takes.
     pub cost: Arc<CostModel>,
     /// What is counted.
@@ -80,7 +83,9 @@ impl Worker {
             if !self.device_is_ready().await {
                 break;
             }
-            let mut asking = self.queue.lease(self.device.name());
+            let mut asking = self
+                .queue
+                .lease(self.lane.device().name(), self.lane.kind());
             let lease = tokio::select! {
                 biased;
                 () = self.drain.stop.cancelled() => {
@@ -125,7 +130,7 @@ impl Worker {
 
     /// Waits until the device can work; false where the worker is to stop.
     async fn device_is_ready(&self) -> bool {
-        let mut health = self.device.health();
+        let mut health = self.lane.device().health();
         tokio::select! {
             biased;
             () = self.drain.stop.cancelled() => false,
@@ -137,7 +142,7 @@ impl Worker {
     #[tracing::instrument(
         name = "attempt",
         skip_all,
-        fields(job = %lease.job.id, attempt = lease.job.attempt, device = self.device.name())
+        fields(job = %lease.job.id, attempt = lease.job.attempt, device = self.lane.device().name())
     )]
     async fn attempt(&self, lease: &Lease) -> Attempt {
         let job = &lease.job;
@@ -151,9 +156,13 @@ impl Worker {
         };
         let began = Instant::now();
         let max_iterations = work.options.max_iterations;
-        let solved = self.device.solve(work).await;
+        let solved = self.lane.solve(work).await;
         let took = began.elapsed();
         let _its_own_errors_are_logged = keeper.await;
+        if matches!(solved, Err(EngineError::Broken(_))) {
+            // The device's health says so in a moment.
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
         let released = self.drain.release.is_cancelled();
         match solved {
             Ok(Solved { estimate, device }) => {
@@ -173,20 +182,46 @@ impl Worker {
                 Signal::Continue if released => Attempt::Ended(Outcome::Released),
                 Signal::Continue => Attempt::Lost,
             },
-            Err(EngineError::Flow(error)) if error.is_input() => {
-                Attempt::failed("input_refused", &error, false)
-            }
-            Err(error) => {
-                tracing::error!(%error, "an attempt failed");
-                let code = match &error {
-                    EngineError::Flow(FlowError::Diverged { .. }) => "diverged",
-                    EngineError::Flow(_) | EngineError::Broken(_) => "device_failed",
-                    EngineError::Panicked(_) => "panicked",
-                };
-                if !matches!(error, EngineError::Flow(FlowError::Diverged { .. })) {
-                    self.metrics.device_lost();
+            Err(error) => self.failed(job, &error),
+        }
+    }
+
+    /// What becomes of a job that gave no flow.
+    fn failed(&self, job: &Job, error: &EngineError) -> Attempt {
+        match error {
+            EngineError::Flow(FlowError::Backend(BackendError::Memory { .. })) => {
+                match self.options.roomier.filter(|_| job.device.is_none()) {
+                    Some(kind) => {
+                        tracing::info!(%error, to = kind.name(), "it does not fit here: it moves");
+                        Attempt::Ended(Outcome::Moved(kind))
+                    }
+                    None => Attempt::failed("input_refused", error, false),
                 }
-                Attempt::failed(code, &error, true)
+            }
+            EngineError::Flow(flow) if flow.is_input() => {
+                Attempt::failed("input_refused", error, false)
+            }
+            EngineError::Broken(reason) => {
+                tracing::warn!(reason, "the device was not there: the job is given back");
+                Attempt::Ended(Outcome::Released)
+            }
+            EngineError::Lost(_) => {
+                tracing::warn!(%error, "the job is given back");
+                Attempt::Ended(Outcome::Crashed(failure("device_lost", error, true)))
+            }
+            EngineError::Flow(flow) => {
+                tracing::error!(%error, "an attempt failed");
+                let diverged = matches!(flow, FlowError::Diverged { .. });
+                let code = if diverged {
+                    "diverged"
+                } else {
+                    "device_failed"
+                };
+                Attempt::failed(code, error, true)
+            }
+            EngineError::Panicked(_) => {
+                tracing::error!(%error, "an attempt failed");
+                Attempt::failed("panicked", error, true)
             }
         }
     }
@@ -302,12 +337,13 @@ impl Worker {
         }
         let resumed = job.attempt > 1;
         let cut = estimate.stop_reason == crate::flow::StopReason::Deadline;
-        let predicted = self.cost.seconds(job.cost_seconds);
+        let predicted = self.cost.seconds_on(self.lane.kind(), job.cost_seconds);
         let ratio = took.as_secs_f64() / predicted.max(1e-6);
         self.metrics
             .solved(estimate.iterations, estimate.stop_reason.name(), ratio);
         if !resumed && !cut {
-            self.cost.learn(job.cost_seconds, took.as_secs_f64());
+            self.cost
+                .learn(self.lane.kind(), job.cost_seconds, took.as_secs_f64());
         }
     }
 

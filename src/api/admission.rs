@@ -8,9 +8,9 @@ use std::time::Duration;
 use super::error::ApiError;
 use crate::cost::CostModel;
 use crate::flow::{self, Price, Problem};
-use crate::job::{JobOptions, Priority, Tenant};
+use crate::job::{DeviceKind, JobOptions, Priority, Tenant};
 use crate::payload::StoredCloud;
-use crate::queue::Queue;
+use crate::queue::{Backlog, Queue};
 
 /// What is accepted at most.
 #[derive(Clone, Debug)]
@@ -32,7 +32,6 @@ pub struct Admission {
     limits: AdmissionLimits,
     queue: Arc<dyn Queue>,
     cost: Arc<CostModel>,
-    devices: usize,
     reserved: Arc<Mutex<f64>>,
 }
 
@@ -65,6 +64,8 @@ pub struct Asked<'a> {
     pub tenant: &'a Tenant,
     /// How urgent it is.
     pub priority: Priority,
+    /// The kind of device that it has to be done on; none where any will do.
+    pub device: Option<DeviceKind>,
     /// Nominal seconds of all its pairs.
     pub nominal_seconds: f64,
     /// Who waits.
@@ -72,18 +73,12 @@ pub struct Asked<'a> {
 }
 
 impl Admission {
-    /// A gate before `queue`, behind which `devices` work.
-    pub fn new(
-        limits: AdmissionLimits,
-        queue: Arc<dyn Queue>,
-        cost: Arc<CostModel>,
-        devices: usize,
-    ) -> Self {
+    /// A gate before `queue`, behind which the lanes of `cost` work.
+    pub fn new(limits: AdmissionLimits, queue: Arc<dyn Queue>, cost: Arc<CostModel>) -> Self {
         Self {
             limits,
             queue,
             cost,
-            devices: devices.max(1),
             reserved: Arc::default(),
         }
     }
@@ -100,6 +95,17 @@ impl Admission {
             )));
         }
         Ok(())
+    }
+
+    /// Refuses a job for a kind of device that is not here.
+    ///
+    /// # Errors
+    /// [`ApiError::NoDevice`].
+    pub fn check_device(&self, device: Option<DeviceKind>) -> Result<(), ApiError> {
+        match device {
+            Some(kind) if self.cost.lanes().of(kind) == 0 => Err(ApiError::NoDevice(kind)),
+            _ => Ok(()),
+        }
     }
 
     /// Prices a pair, and refuses what no device could do.
@@ -146,28 +152,42 @@ impl Admission {
         let backlog = self.queue.backlog();
         let mut reserved = self.reserved.lock().unwrap_or_else(PoisonError::into_inner);
         let real = |nominal: f64| self.cost.seconds(nominal);
-        let devices = self.devices as f64;
+        let lanes = self.cost.lanes().total().max(1) as f64;
 
         let own = real(backlog.queued_of(asked.tenant).seconds + asked.nominal_seconds);
         let tenant_excess = own - self.limits.max_tenant_queue.as_secs_f64();
         if tenant_excess > 0.0 {
-            return Err(ApiError::TenantLimit(retry_after(tenant_excess / devices)));
+            return Err(ApiError::TenantLimit(retry_after(tenant_excess / lanes)));
         }
         let all = real(backlog.queued().seconds + *reserved + asked.nominal_seconds);
         let mut excess = all - self.limits.max_queue.as_secs_f64();
         if asked.promise == Promise::WhileAwaited {
-            let ahead = backlog.ahead_of(asked.tenant, asked.priority, asked.nominal_seconds);
-            let wait = real(ahead + *reserved) / devices;
-            excess = excess.max((wait - self.limits.max_wait.as_secs_f64()) * devices);
+            let wait = self.wait(&backlog, asked, *reserved);
+            excess = excess.max((wait - self.limits.max_wait.as_secs_f64()) * lanes);
         }
         if excess > 0.0 {
-            return Err(ApiError::ServerFull(retry_after(excess / devices)));
+            return Err(ApiError::ServerFull(retry_after(excess / lanes)));
         }
         *reserved += asked.nominal_seconds;
         Ok(Reservation {
             seconds: asked.nominal_seconds,
             reserved: Arc::clone(&self.reserved),
         })
+    }
+}
+
+impl Admission {
+    /// Predicted seconds until a new job is started: all lanes share what any of them may do, and
+    /// one kind's own queue comes on top. A job that may go anywhere waits for the sooner kind.
+    fn wait(&self, backlog: &Backlog, asked: &Asked<'_>, reserved: f64) -> f64 {
+        let ahead =
+            |device| backlog.ahead_of(asked.tenant, asked.priority, asked.nominal_seconds, device);
+        let shared = ahead(None) + backlog.running().seconds + reserved;
+        let kinds = DeviceKind::ALL.into_iter().filter(|kind| {
+            self.cost.lanes().of(*kind) > 0 && asked.device.is_none_or(|asked| asked == *kind)
+        });
+        let own = kinds.map(|kind| ahead(Some(kind)) / self.cost.rate(kind));
+        shared / self.cost.total_rate() + own.reduce(f64::min).unwrap_or(0.0)
     }
 }
 

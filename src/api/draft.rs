@@ -65,8 +65,8 @@ impl Draft {
     /// Begins a job whose clouds will follow.
     ///
     /// # Errors
-    /// [`ApiError::Forbidden`], [`ApiError::Draining`], [`ApiError::InvalidOptions`] or
-    /// [`ApiError::BadRequest`].
+    /// [`ApiError::Forbidden`], [`ApiError::Draining`], [`ApiError::InvalidOptions`],
+    /// [`ApiError::NoDevice`] or [`ApiError::BadRequest`].
     pub(super) fn begin(
         service: &Arc<Service>,
         caller: Caller,
@@ -76,6 +76,9 @@ impl Draft {
         caller.may_write()?;
         service.check_draining()?;
         request.options.check()?;
+        service
+            .admission
+            .check_device(request.options.device.kind())?;
         if let Some(key) = &request.idempotency_key
             && (key.is_empty() || key.len() > MAX_KEY)
         {
@@ -199,6 +202,7 @@ impl Draft {
         self.service.admission.admit(&Asked {
             tenant: &self.caller.tenant,
             priority: self.request.options.priority,
+            device: self.request.options.device.kind(),
             nominal_seconds: self.nominal_seconds,
             promise: self.request.promise,
         })
@@ -218,6 +222,7 @@ impl Draft {
             kind,
             pairs,
             priority: options.priority,
+            device: options.device.kind(),
             cost_seconds: self.nominal_seconds / f64::from(pairs),
             options: options.to_json(),
             deadline: left.map(|left| Timestamp::now().after(left)),

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use crate::blobs::BlobError;
 use crate::formats::FormatError;
-use crate::job::{InvalidId, InvalidOptions, JobError, JobId};
+use crate::job::{DeviceKind, InvalidId, InvalidOptions, JobError, JobId};
 use crate::queue::QueueError;
 
 /// Why a request was refused, or its job gave no flow.
@@ -24,6 +24,9 @@ pub enum ApiError {
     /// More bytes, points or memory than is taken.
     #[error("{0}")]
     TooLarge(String),
+    /// This server has no device of the kind that the job is for.
+    #[error("this server has no {}: leave device out, or ask another server", .0.name())]
+    NoDevice(DeviceKind),
     /// The body came too slowly.
     #[error("the request's body came too slowly")]
     TooSlow,
@@ -117,11 +120,12 @@ const fn row(
 }
 
 /// All that the doors ever say.
-const TABLE: [Row; 24] = [
+const TABLE: [Row; 25] = [
     row("bad_request", 400, 3, false, Some("bad_input")),
     row("invalid_options", 400, 3, false, Some("bad_input")),
     row("bad_input", 422, 3, false, Some("bad_input")),
     row("too_large", 413, 3, false, Some("too_large")),
+    row("no_device", 422, 9, false, Some("no_device")),
     row("too_slow", 408, 4, true, Some("too_slow")),
     row("unauthenticated", 401, 16, false, Some("unauthorized")),
     row("forbidden", 403, 7, false, Some("unauthorized")),
@@ -168,6 +172,7 @@ impl ApiError {
             Self::InvalidOptions(_) => "invalid_options",
             Self::BadInput(_) => "bad_input",
             Self::TooLarge(_) => "too_large",
+            Self::NoDevice(_) => "no_device",
             Self::TooSlow => "too_slow",
             Self::Unauthenticated => "unauthenticated",
             Self::Forbidden => "forbidden",
@@ -287,6 +292,7 @@ mod tests {
             ApiError::InvalidOptions(text()),
             ApiError::BadInput(text()),
             ApiError::TooLarge(text()),
+            ApiError::NoDevice(DeviceKind::Gpu),
             ApiError::TooSlow,
             ApiError::Unauthenticated,
             ApiError::Forbidden,

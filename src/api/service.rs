@@ -13,7 +13,7 @@ use super::auth::{Caller, Keys};
 use super::codec::AnswerFormat;
 use super::error::ApiError;
 use crate::blobs::{Blob, Blobs};
-use crate::job::{Job, JobId, Kind, Priority, Report, State};
+use crate::job::{Job, JobId, JobOptions, Kind, Priority, Report, State};
 use crate::metrics::Metrics;
 use crate::payload::{StoredCloud, StoredFlow};
 use crate::queue::{Filter, Queue};
@@ -185,24 +185,28 @@ impl Service {
     }
 
     /// Refuses a caller whose job would be refused however small it is, before its clouds are
-    /// read: under overload a refusal must cost little.
+    /// read: under overload a refusal must cost little. Without its options it is taken for one of
+    /// the highest priority, for any device.
     ///
     /// # Errors
     /// [`ApiError::Forbidden`], [`ApiError::Draining`], [`ApiError::DiskFull`],
-    /// [`ApiError::TenantLimit`] or [`ApiError::ServerFull`].
+    /// [`ApiError::NoDevice`], [`ApiError::TenantLimit`] or [`ApiError::ServerFull`].
     pub fn check_room(
         &self,
         caller: &Caller,
-        priority: Priority,
+        options: Option<&JobOptions>,
         promise: Promise,
     ) -> Result<(), ApiError> {
         caller.may_write()?;
         self.check_draining()?;
         self.check_disk()?;
+        let device = options.and_then(|options| options.device.kind());
+        self.admission.check_device(device)?;
         self.admission
             .admit(&Asked {
                 tenant: &caller.tenant,
-                priority,
+                priority: options.map_or(Priority::High, |options| options.priority),
+                device,
                 nominal_seconds: 0.0,
                 promise,
             })

@@ -56,7 +56,8 @@ async fn look(devices: Vec<Device>, metrics: Arc<Metrics>) {
         then = Instant::now();
         for (device, before) in devices.iter().zip(&mut before) {
             let busy = device.busy();
-            let ratio = busy.saturating_sub(*before).as_secs_f64() / passed;
+            let lanes = device.lanes().len() as f64;
+            let ratio = busy.saturating_sub(*before).as_secs_f64() / passed / lanes;
             *before = busy;
             metrics.device(device.name(), device.obstacle().is_none(), ratio.min(1.0));
         }

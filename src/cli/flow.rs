@@ -5,12 +5,14 @@ use std::path::{Path, PathBuf};
 use anyhow::anyhow;
 use clap::Args;
 
+use super::device::{self, DeviceArgument};
 use super::failure::Failure;
 use super::files;
-use super::machine::{open_device, peak_resident_bytes};
+use super::machine::peak_resident_bytes;
 use super::output::say;
 use super::terminal::Terminal;
-use crate::flow::{self, Estimate, Problem, Watch};
+use crate::flow::backend::BackendError;
+use crate::flow::{self, Estimate, FlowError, Problem, Watch};
 use crate::formats::{FlowFormat, FlowTable, Pair, write_flow};
 use crate::job::{DeviceChoice, EgoChoice, GroundChoice, JobOptions, PresetChoice, Report};
 use crate::picture::{self, TopDown, TopDownOptions};
@@ -50,9 +52,10 @@ struct Estimation {
     /// default: ours, robust and fast; paper: FNSF as published
     #[arg(long, value_enum, default_value_t)]
     preset: PresetChoice,
-    /// Where the work is done
-    #[arg(long, value_enum, default_value_t)]
-    device: DeviceChoice,
+    /// Where the work is done: auto (a GPU, else the CPU), cpu, gpu, or gpu:CARD with a card's
+    /// number, PCI id or part of its name; fnsf doctor lists them
+    #[arg(long, value_name = "DEVICE", default_value_t)]
+    device: DeviceArgument,
     /// CPU threads; all cores by default. The result does not depend on it
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: Option<u16>,
@@ -97,7 +100,7 @@ impl Estimation {
             range_m: self.range_m,
             ground: self.ground,
             ego,
-            device: self.device,
+            device: self.device.choice,
             ..JobOptions::default()
         })
     }
@@ -106,8 +109,8 @@ impl Estimation {
     fn solve(&self, pair: &Pair, terminal: &Terminal) -> Result<(Estimate, Report), Failure> {
         let options = self.options()?;
         let load = terminal.seconds();
-        let backend = open_device(self.device, self.threads.map(usize::from));
-        let backend = backend.map_err(Failure::internal)?;
+        let threads = self.threads.map(usize::from);
+        let mut backend = device::open(&self.device, threads)?;
         let ground = pair.ground.as_ref();
         let problem = Problem {
             source: &pair.source,
@@ -116,7 +119,14 @@ impl Estimation {
         };
         let points = pair.source.len().max(pair.target.len());
         let solver_options = options.solver_options(points);
-        let estimate = flow::estimate(backend.as_ref(), &problem, &solver_options, terminal);
+        let mut estimate = flow::estimate(backend.as_ref(), &problem, &solver_options, terminal);
+        if let Err(FlowError::Backend(error @ BackendError::Memory { .. })) = &estimate
+            && self.device.choice == DeviceChoice::Auto
+        {
+            device::stand_in(error);
+            backend = device::cpu(threads)?;
+            estimate = flow::estimate(backend.as_ref(), &problem, &solver_options, terminal);
+        }
         terminal.finish();
         let estimate = estimate?;
         let mut report = Report::new(

@@ -1,22 +1,5 @@
 //! What this machine is and what the process takes of it.
 
-use crate::flow::backend::{Backend, BackendError};
-use crate::flow::cpu::CpuBackend;
-use crate::job::DeviceChoice;
-
-/// Opens a device; `threads` bounds the CPU's.
-pub(super) fn open_device(
-    device: DeviceChoice,
-    threads: Option<usize>,
-) -> Result<Box<dyn Backend>, BackendError> {
-    match device {
-        DeviceChoice::Auto | DeviceChoice::Cpu => {
-            let cores = std::thread::available_parallelism().map_or(1, usize::from);
-            Ok(Box::new(CpuBackend::new(Some(threads.unwrap_or(cores)))?))
-        }
-    }
-}
-
 /// The most memory that the process has held so far, bytes; none where the system does not say.
 pub(super) fn peak_resident_bytes() -> Option<u64> {
     kibibytes("/proc/self/status", "VmHWM:")

@@ -7,6 +7,7 @@
 )]
 
 mod client;
+mod device;
 mod failure;
 mod files;
 mod machine;

@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
 use clap::Args;
 use serde::Serialize;
 use tokio::signal::unix::{SignalKind, signal};
@@ -53,7 +53,8 @@ struct Flags {
     #[arg(long, value_name = "DIR")]
     #[serde(skip_serializing_if = "Option::is_none")]
     data_dir: Option<PathBuf>,
-    /// A device: cpu, or cpu:THREADS; give it again for more than one [default: cpu]
+    /// A device: auto (every GPU, else the CPU), cpu, cpu:THREADS, gpu or gpu:CARD; give it again
+    /// for more than one [default: auto]
     #[arg(long = "device", value_name = "DEVICE")]
     #[serde(skip_serializing_if = "Vec::is_empty")]
     devices: Vec<String>,
@@ -115,13 +116,23 @@ async fn serve(config: Config) -> Result<(), Failure> {
         .await
         .context("no device is ready")
         .map_err(Failure::internal)?;
+    let done = tokio::select! {
+        _ = terminate.recv() => {
+            tracing::info!("SIGTERM");
+            Ok(())
+        }
+        _ = interrupt.recv() => {
+            tracing::info!("SIGINT");
+            Ok(())
+        }
+        reason = app.given_up() => {
+            tracing::error!(reason, "a device does not come back: stopping, for a fresh process");
+            Err(Failure::internal(anyhow!("a device does not come back: {reason}")))
+        }
+    };
     tokio::select! {
-        _ = terminate.recv() => tracing::info!("SIGTERM"),
-        _ = interrupt.recv() => tracing::info!("SIGINT"),
-    }
-    tokio::select! {
-        () = app.drain() => Ok(()),
-        _ = terminate.recv() => Ok(()),
-        _ = interrupt.recv() => Ok(()),
+        () = app.drain() => done,
+        _ = terminate.recv() => done,
+        _ = interrupt.recv() => done,
     }
 }

@@ -3,6 +3,7 @@
 //! Every field has a default and unknown keys are refused. What the names mean to the solver is
 //! said here and nowhere else; the presets' values stay in `flow/options.rs`.
 
+use std::str::FromStr;
 use std::time::Duration;
 
 use serde::de::Error as _;
@@ -84,13 +85,60 @@ pub enum GroundChoice {
 /// Where the work is done.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
-#[derive(clap::ValueEnum)]
 pub enum DeviceChoice {
-    /// The fastest that is there: the CPU, in this version.
+    /// The fastest that is there: a GPU, or the CPU where there is none.
     #[default]
     Auto,
     /// The CPU's vector units.
     Cpu,
+    /// A GPU, and nothing else.
+    Gpu,
+}
+
+impl DeviceChoice {
+    /// The kind of device that it has to be; none where any will do.
+    pub fn kind(self) -> Option<DeviceKind> {
+        match self {
+            Self::Auto => None,
+            Self::Cpu => Some(DeviceKind::Cpu),
+            Self::Gpu => Some(DeviceKind::Gpu),
+        }
+    }
+}
+
+impl FromStr for DeviceChoice {
+    type Err = InvalidOptions;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        match text {
+            "auto" => Ok(Self::Auto),
+            "cpu" => Ok(Self::Cpu),
+            "gpu" => Ok(Self::Gpu),
+            _ => Err(InvalidOptions::Device(text.to_owned())),
+        }
+    }
+}
+
+/// What a device is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum DeviceKind {
+    /// The CPU's vector units.
+    Cpu,
+    /// A GPU.
+    Gpu,
+}
+
+impl DeviceKind {
+    /// All kinds.
+    pub const ALL: [Self; 2] = [Self::Cpu, Self::Gpu];
+
+    /// The name that requests and metrics use.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Cpu => "cpu",
+            Self::Gpu => "gpu",
+        }
+    }
 }
 
 /// How urgent a job is. Higher ones always go first; within one, tenants share fairly.
@@ -181,6 +229,9 @@ pub enum InvalidOptions {
     /// Too few points to fit anything to.
     #[error("options: max_points is {0}, at least {MIN_POINTS} are needed")]
     MaxPoints(u32),
+    /// No kind of device.
+    #[error("options: device is {0:?}, \"auto\", \"cpu\" and \"gpu\" are known")]
+    Device(String),
     /// Not a positive number of metres.
     #[error("options: range_m is {0}, a positive number of metres is needed")]
     Range(f32),
@@ -274,12 +325,26 @@ mod tests {
     }
 
     #[test]
+    fn a_device_is_read_alike_from_json_and_from_a_word() {
+        for choice in [DeviceChoice::Auto, DeviceChoice::Cpu, DeviceChoice::Gpu] {
+            let json = serde_json::to_string(&choice).expect("JSON");
+            assert_eq!(json.trim_matches('"').parse(), Ok(choice));
+        }
+        let refused = "tpu".parse::<DeviceChoice>().expect_err("a refusal");
+        assert!(refused.to_string().contains("device is \"tpu\""));
+    }
+
+    #[test]
     fn unknown_keys_and_senseless_values_are_refused_by_name() {
         for (text, said) in [
             (r#"{"sead":1}"#, "unknown field `sead`"),
             (
                 r#"{"preset":"best"}"#,
                 "unknown variant `best`, expected `default` or `paper`",
+            ),
+            (
+                r#"{"device":"gpu:0"}"#,
+                "unknown variant `gpu:0`, expected one of `auto`, `cpu`, `gpu`",
             ),
             (r#"{"max_points":2}"#, "max_points is 2"),
             (r#"{"range_m":-1}"#, "range_m is -1"),

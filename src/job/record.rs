@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::id::{JobId, Tenant};
-use super::options::Priority;
+use super::options::{DeviceKind, Priority};
 use crate::clock::Timestamp;
 
 /// Where a job is on its way. The last four are ends: nothing leaves them but by being asked for
@@ -108,6 +108,8 @@ pub struct Job {
     pub pairs_left: u32,
     /// How urgent it is.
     pub priority: Priority,
+    /// The kind of device that it has to be done on; none where any will do.
+    pub device: Option<DeviceKind>,
     /// Where it is on its way.
     pub state: State,
     /// Whether it outlives its caller: a job that was promised, not one that somebody waits for.

@@ -1,8 +1,8 @@
-//! What waits and what runs, by tenant and priority: what admission looks at.
+//! What waits and what runs, by tenant, priority and kind of device: what admission looks at.
 
 use std::collections::HashMap;
 
-use crate::job::{Job, Priority, Tenant};
+use crate::job::{DeviceKind, Job, Priority, Tenant};
 
 /// A number of jobs and the compute seconds predicted for them.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -29,10 +29,28 @@ impl Load {
     }
 }
 
+/// Where a job waits.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub(super) struct Place {
+    pub(super) tenant: Tenant,
+    pub(super) priority: Priority,
+    pub(super) device: Option<DeviceKind>,
+}
+
+impl Place {
+    fn of(job: &Job) -> Self {
+        Self {
+            tenant: job.tenant.clone(),
+            priority: job.priority,
+            device: job.device,
+        }
+    }
+}
+
 /// What waits and what runs at one moment.
 #[derive(Clone, Debug, Default)]
 pub struct Backlog {
-    queued: HashMap<(Tenant, Priority), Load>,
+    queued: HashMap<Place, Load>,
     running: Load,
 }
 
@@ -44,41 +62,45 @@ impl Backlog {
 
     /// All that waits at a priority.
     pub fn queued_at(&self, priority: Priority) -> Load {
-        self.sum(|_, at| at == priority)
+        self.sum(|place| place.priority == priority)
     }
 
     /// All that waits.
     pub fn queued(&self) -> Load {
-        self.sum(|_, _| true)
+        self.sum(|_| true)
     }
 
     /// What a tenant has waiting.
     pub fn queued_of(&self, tenant: &Tenant) -> Load {
-        self.sum(|of, _| of == tenant)
+        self.sum(|place| place.tenant == *tenant)
     }
 
-    /// Predicted compute seconds that go before a new job of `cost_seconds`: what is of higher
-    /// priority, and of its own priority what the other tenants' shares let pass.
-    pub fn ahead_of(&self, tenant: &Tenant, priority: Priority, cost_seconds: f64) -> f64 {
-        let higher = self.sum(|_, at| at > priority).seconds;
-        let of = |of: &Tenant| {
-            let load = self.queued.get(&(of.clone(), priority));
-            load.map_or(0.0, |load| load.seconds)
-        };
-        let own = of(tenant);
-        let others = self
-            .queued
-            .keys()
-            .filter(|(of, at)| *at == priority && of != tenant);
+    /// Predicted compute seconds of what waits for `device` (none: for any) and goes before a new
+    /// job of `cost_seconds`: what is of higher priority, and of its own priority what the other
+    /// tenants' shares let pass.
+    pub fn ahead_of(
+        &self,
+        tenant: &Tenant,
+        priority: Priority,
+        cost_seconds: f64,
+        device: Option<DeviceKind>,
+    ) -> f64 {
+        let higher = self.sum(|place| place.priority > priority && place.device == device);
+        let equals = |place: &&Place| place.priority == priority && place.device == device;
+        let own = self.sum(|place| place.priority == priority && place.tenant == *tenant);
+        let waiting = self.queued.iter().filter(|(place, _)| equals(place));
         // Each other tenant gets as much as this one until its own is done.
-        let passing: f64 = others
-            .map(|(other, _)| of(other).min(own + cost_seconds))
+        let equal: f64 = waiting
+            .map(|(place, load)| match place.tenant == *tenant {
+                true => load.seconds,
+                false => load.seconds.min(own.seconds + cost_seconds),
+            })
             .sum();
-        higher + own + passing + self.running.seconds
+        higher.seconds + equal
     }
 
-    fn sum(&self, take: impl Fn(&Tenant, Priority) -> bool) -> Load {
-        let taken = self.queued.iter().filter(|((of, at), _)| take(of, *at));
+    fn sum(&self, take: impl Fn(&Place) -> bool) -> Load {
+        let taken = self.queued.iter().filter(|(place, _)| take(place));
         taken.fold(Load::default(), |sum, (_, load)| Load {
             jobs: sum.jobs + load.jobs,
             seconds: sum.seconds + load.seconds,
@@ -86,16 +108,16 @@ impl Backlog {
     }
 
     pub(super) fn entered(&mut self, job: &Job) {
-        let place = (job.tenant.clone(), job.priority);
-        self.queued.entry(place).or_default().add(job.cost_seconds);
+        let load = self.queued.entry(Place::of(job)).or_default();
+        load.add(job.cost_seconds);
     }
 
-    pub(super) fn enter_many(&mut self, place: (Tenant, Priority), load: Load) {
+    pub(super) fn enter_many(&mut self, place: Place, load: Load) {
         self.queued.insert(place, load);
     }
 
     pub(super) fn left(&mut self, job: &Job) {
-        let place = (job.tenant.clone(), job.priority);
+        let place = Place::of(job);
         if let Some(load) = self.queued.get_mut(&place) {
             load.remove(job.cost_seconds);
             if load.jobs == 0 {

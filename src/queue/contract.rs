@@ -3,6 +3,7 @@
 //! `queue_contract!` makes a test of each for one implementation. An implementation gives
 //! [`Stand`]: a queue that can be opened, and opened again after its process "died".
 
+mod devices;
 mod failures;
 mod lives;
 
@@ -17,7 +18,7 @@ use super::{
     Submission, Submitted,
 };
 use crate::clock::Timestamp;
-use crate::job::{Job, JobError, JobId, JobProgress, Kind, Priority, State, Tenant};
+use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, State, Tenant};
 
 /// Long enough for a loaded machine; only a failure waits so long.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -54,6 +55,11 @@ macro_rules! queue_contract {
             ended_jobs_are_kept_for_a_while_and_then_forgotten,
             followers_see_every_state,
             lists_are_latest_first_in_pages_and_of_one_tenant,
+            a_job_goes_only_to_the_kind_of_device_that_it_needs,
+            jobs_that_wait_for_one_kind_hold_up_no_other,
+            a_job_that_moves_waits_for_the_other_kind_without_blame,
+            a_device_that_dies_under_a_job_again_and_again_ends_it,
+            jobs_for_a_kind_survive_a_crash,
         }
     };
     ($stand:expr; $($name:ident,)*) => {
@@ -65,6 +71,7 @@ macro_rules! queue_contract {
         )*
     };
 }
+pub(crate) use devices::*;
 pub(crate) use failures::*;
 pub(crate) use lives::*;
 pub(crate) use queue_contract;
@@ -80,6 +87,7 @@ pub(crate) fn submission(of: &str) -> Submission {
         kind: Kind::Pair,
         pairs: 0,
         priority: Priority::Normal,
+        device: None,
         cost_seconds: 1.0,
         options: "{}".to_owned(),
         deadline: None,
@@ -96,14 +104,22 @@ async fn submit(queue: &Arc<dyn Queue>, submission: Submission) -> Arc<Job> {
 }
 
 async fn lease(queue: &Arc<dyn Queue>) -> Lease {
-    timeout(PATIENCE, queue.lease("worker"))
+    lease_on(queue, DeviceKind::Cpu).await
+}
+
+async fn lease_on(queue: &Arc<dyn Queue>, kind: DeviceKind) -> Lease {
+    timeout(PATIENCE, queue.lease("worker", kind))
         .await
         .expect("a job is ready")
         .expect("a lease")
 }
 
 async fn nothing_is_ready(queue: &Arc<dyn Queue>) {
-    let soon = timeout(Duration::from_millis(50), queue.lease("worker")).await;
+    nothing_is_ready_for(queue, DeviceKind::Cpu).await;
+}
+
+async fn nothing_is_ready_for(queue: &Arc<dyn Queue>, kind: DeviceKind) {
+    let soon = timeout(Duration::from_millis(50), queue.lease("worker", kind)).await;
     assert!(soon.is_err(), "a job was ready");
 }
 

@@ -20,7 +20,7 @@ use async_trait::async_trait;
 use tokio::sync::watch;
 
 use crate::clock::Timestamp;
-use crate::job::{Job, JobError, JobId, JobProgress, Kind, Priority, State, Tenant};
+use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, State, Tenant};
 
 pub use backlog::{Backlog, Load};
 pub use lease::{Lease, Pulse, Signal};
@@ -39,6 +39,8 @@ pub struct Submission {
     pub pairs: u32,
     /// How urgent it is.
     pub priority: Priority,
+    /// The kind of device that it has to be done on; none where any will do.
+    pub device: Option<DeviceKind>,
     /// Predicted compute seconds, of each pair.
     pub cost_seconds: f64,
     /// The options, as JSON; opaque here.
@@ -100,6 +102,11 @@ pub enum Outcome {
     Cancelled,
     /// The worker had to let go through no fault of the job: it is queued again as it was.
     Released,
+    /// It does not suit this device: it is queued again as it was, for one of that kind.
+    Moved(DeviceKind),
+    /// The device died under it, perhaps by another job's fault: it is queued again, and given up
+    /// when that happens as often as the process may die.
+    Crashed(JobError),
 }
 
 /// What became of an outcome.
@@ -116,8 +123,8 @@ pub enum Committed {
 pub struct QueueOptions {
     /// Failures after which a job is given up.
     pub max_attempts: u32,
-    /// Deaths of the process in a job's run, without a new snapshot between them, after which it
-    /// is given up.
+    /// Deaths of the process or of a device in a job's run, without a new snapshot between them,
+    /// after which it is given up.
     pub max_crashes: u32,
     /// Silence after which a running job is given to somebody else.
     pub lease: Duration,
@@ -212,8 +219,9 @@ pub trait Queue: Send + Sync {
     /// Follows a job: its state and, while it runs, every iteration.
     async fn watch(&self, id: JobId) -> Result<watch::Receiver<Arc<Job>>, QueueError>;
 
-    /// Waits for the next job and takes it.
-    async fn lease(&self, worker: &str) -> Result<Lease, QueueError>;
+    /// Waits for the next job that a device of this kind may do, and takes it. What only the
+    /// other kind may do is passed by.
+    async fn lease(&self, worker: &str, kind: DeviceKind) -> Result<Lease, QueueError>;
 
     /// Ends an attempt. Only the latest attempt of a running job counts.
     async fn finish(

@@ -1,7 +1,7 @@
 //! A worker on a real queue and store, with a device that misbehaves when it is told to.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -10,13 +10,11 @@ use tokio::time::timeout;
 
 use super::{Drain, Worker, WorkerOptions};
 use crate::blobs::{Blob, Blobs, Sync};
-use crate::cost::CostModel;
+use crate::cost::{CostModel, Lanes};
+use crate::engine::cards::Switches;
 use crate::engine::{Device, Health};
-use crate::flow::backend::{Backend, BackendError, Transform};
-use crate::flow::cpu::CpuBackend;
-use crate::flow::distance::DistanceOptions;
-use crate::flow::{Point, Watch};
-use crate::job::{Job, JobId, Kind, Priority, State, Tenant};
+use crate::flow::Point;
+use crate::job::{DeviceKind, Job, JobId, Kind, Priority, State, Tenant};
 use crate::metrics::Metrics;
 use crate::payload::{StoredCloud, StoredFlow};
 use crate::queue::{Queue, QueueOptions, SqliteQueue, Submission, Submitted};
@@ -27,46 +25,20 @@ const PATIENCE: Duration = Duration::from_secs(30);
 /// Points of the tests' pairs, and of no trial.
 const POINTS: usize = 900;
 
-/// The CPU, which panics over the tests' pairs while there are panics left.
-struct Fragile {
-    cpu: CpuBackend,
-    panics: Arc<AtomicU32>,
-}
-
-impl Backend for Fragile {
-    fn name(&self) -> String {
-        "fragile".to_owned()
-    }
-
-    fn transform(
-        &self,
-        source: &[Point],
-        target: &[Point],
-        options: &DistanceOptions,
-        watch: &dyn Watch,
-    ) -> Result<Box<dyn Transform>, BackendError> {
-        let ours = source.len() == POINTS;
-        let left = |panics: u32| panics.checked_sub(1).filter(|_| ours);
-        let broken = self
-            .panics
-            .fetch_update(Ordering::Relaxed, Ordering::Relaxed, left);
-        if broken.is_ok() {
-            panic!("the device has slipped");
-        }
-        self.cpu.transform(source, target, options, watch)
-    }
-}
-
 /// All that a worker needs, in a folder.
 struct Stand {
     queue: Arc<dyn Queue>,
     blobs: Blobs,
     worker: Worker,
-    panics: Arc<AtomicU32>,
+    switches: Arc<Switches>,
     _folder: tempfile::TempDir,
 }
 
 async fn stand() -> Stand {
+    stand_with(None).await
+}
+
+async fn stand_with(roomier: Option<DeviceKind>) -> Stand {
     let folder = tempfile::tempdir().expect("a folder");
     let options = QueueOptions {
         retry_delay: Duration::from_millis(20),
@@ -76,16 +48,9 @@ async fn stand() -> Stand {
     let queue = SqliteQueue::open(folder.path(), options, events).expect("a queue");
     let queue: Arc<dyn Queue> = Arc::new(queue);
     let blobs = Blobs::open(&folder.path().join("blobs")).expect("a store");
-    let panics = Arc::new(AtomicU32::new(0));
-    let shared = Arc::clone(&panics);
-    let open = move || {
-        let fragile = Fragile {
-            cpu: CpuBackend::new(Some(1))?,
-            panics: Arc::clone(&shared),
-        };
-        Ok(Box::new(fragile) as Box<dyn Backend>)
-    };
-    let device = Device::start("fragile", Box::new(open)).expect("a thread");
+    let switches = Arc::new(Switches::default());
+    let metrics = Arc::new(Metrics::new(&["fragile"]));
+    let device = Device::start(switches.card("fragile", 1), &metrics).expect("a thread");
     let mut health = device.health();
     let ready = health.wait_for(|health| *health == Health::Ready);
     timeout(PATIENCE, ready)
@@ -95,11 +60,12 @@ async fn stand() -> Stand {
     let worker = Worker {
         queue: Arc::clone(&queue),
         blobs: blobs.clone(),
-        device,
-        cost: Arc::new(CostModel::new()),
-        metrics: Arc::new(Metrics::new(&["fragile".to_owned()])),
+        lane: device.lanes().next().expect("a lane"),
+        cost: Arc::new(CostModel::new(Lanes { cpu: 0, gpu: 1 })),
+        metrics,
         options: WorkerOptions {
             snapshot_interval: Duration::from_secs(1),
+            roomier,
         },
         drain: Drain::default(),
     };
@@ -107,7 +73,7 @@ async fn stand() -> Stand {
         queue,
         blobs,
         worker,
-        panics,
+        switches,
         _folder: folder,
     }
 }
@@ -139,6 +105,7 @@ impl Stand {
             kind: Kind::Pair,
             pairs: 0,
             priority: Priority::Normal,
+            device: None,
             cost_seconds: 0.1,
             options: "{}".to_owned(),
             deadline: None,
@@ -160,7 +127,7 @@ impl Stand {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_panic_costs_one_attempt_of_one_job_and_the_device_works_again() {
     let stand = stand().await;
-    stand.panics.store(1, Ordering::Relaxed);
+    stand.switches.panics.store(1, Ordering::Relaxed);
     let (first, second) = (stand.submit(2).await, stand.submit(2).await);
     tokio::spawn(stand.worker.clone().run());
     let (first, second) = (stand.ended(&first).await, stand.ended(&second).await);
@@ -180,7 +147,7 @@ async fn a_panic_costs_one_attempt_of_one_job_and_the_device_works_again() {
 async fn a_job_that_panics_every_time_is_given_up_and_the_next_one_is_done() {
     let stand = stand().await;
     // Only pairs of this size panic, so that the trials between the attempts pass.
-    stand.panics.store(3, Ordering::Relaxed);
+    stand.switches.panics.store(3, Ordering::Relaxed);
     let poison = stand.submit(2).await;
     tokio::spawn(stand.worker.clone().run());
     let given_up = stand.ended(&poison).await;
@@ -227,4 +194,46 @@ async fn a_worker_that_is_told_to_stop_finishes_what_it_has_and_takes_nothing_mo
         .await
         .expect("known");
     assert_eq!(left.state, State::Queued);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_lost_device_returns_the_job_to_the_queue_and_does_it_again() {
+    let stand = stand().await;
+    stand.switches.brake.store(true, Ordering::Relaxed);
+    let job = stand.submit(2).await;
+    tokio::spawn(stand.worker.clone().run());
+    stand.switches.until_at_the_brake(1).await;
+    stand.switches.destroy();
+    stand.switches.brake.store(false, Ordering::Relaxed);
+    let done = stand.ended(&job).await;
+    assert_eq!((done.state, done.attempt), (State::Succeeded, 2));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_pair_that_does_not_fit_moves_where_there_is_another_kind_and_fails_where_there_is_none()
+{
+    for roomier in [Some(DeviceKind::Cpu), None] {
+        let stand = stand_with(roomier).await;
+        stand.switches.room.store(POINTS - 1, Ordering::Relaxed);
+        let job = stand.submit(2).await;
+        tokio::spawn(stand.worker.clone().run());
+        if roomier.is_some() {
+            let mut news = stand.queue.watch(job.id).await.expect("known");
+            let moves = news.wait_for(|job| job.device == Some(DeviceKind::Cpu));
+            let moving = timeout(PATIENCE, moves).await.expect("in time");
+            drop(moving.expect("followed"));
+            let moved = timeout(PATIENCE, stand.queue.lease("cpu", DeviceKind::Cpu)).await;
+            let moved = moved.expect("in time").expect("a lease").job;
+            assert_eq!((moved.id, moved.attempt), (job.id, 2));
+        } else {
+            let refused = stand.ended(&job).await;
+            assert_eq!((refused.state, refused.attempt), (State::Failed, 1));
+            let error = refused.error.as_ref().expect("a reason");
+            assert_eq!(
+                (error.code.as_str(), error.retryable),
+                ("input_refused", false)
+            );
+            assert!(!refused.dead && error.message.contains("on the device"));
+        }
+    }
 }

@@ -21,7 +21,15 @@ fn synth_flow_and_eval_work_hand_in_hand_in_every_output_format() {
     let mut first = None;
     for format in ["npz", "npy", "feather", "ply", "pcd", "json"] {
         let out = format!("flow.{format}");
-        let done = fnsf(folder, &["flow", "street/pair_0000.npz", "-o", &out]);
+        let arguments = [
+            "flow",
+            "street/pair_0000.npz",
+            "--device",
+            "cpu",
+            "-o",
+            &out,
+        ];
+        let done = fnsf(folder, &arguments);
         assert_eq!(done.code, 0, "{}", done.stderr);
         assert!(
             done.stderr.is_empty(),

@@ -62,6 +62,8 @@ impl Server {
             .arg(folder.path().join("data"))
             .arg("--config")
             .arg(&file)
+            // The same bits wherever the tests run; a test that wants something else says so.
+            .env("FNSF_SERVE_DEVICES", "[\"cpu\"]")
             .args(arguments)
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())

@@ -15,7 +15,7 @@ use crate::api::admission::Promise;
 use crate::api::draft::{Accepted, Draft, Room};
 use crate::api::error::ApiError;
 use crate::api::service::{Answer, Service, Waited};
-use crate::job::{InvalidId, Job, JobId, Kind, Priority};
+use crate::job::{InvalidId, Job, JobId, Kind};
 
 /// Messages that wait for a client that reads slowly.
 const AHEAD: usize = 4;
@@ -44,8 +44,7 @@ impl Calls {
     ) -> Result<(Accepted, Option<Duration>), ApiError> {
         use proto::estimate_flow_request::Part;
         let awaited = Promise::WhileAwaited;
-        self.service
-            .check_room(&call.caller, Priority::High, awaited)?;
+        self.service.check_room(&call.caller, None, awaited)?;
         let mut room = Room::default();
         let begin = match chunks::next(&self.service, &mut room, inbound)
             .await?
@@ -57,7 +56,7 @@ impl Calls {
         let pause = u64::from(begin.progress_ms);
         let options = convert::options(begin.options)?;
         self.service
-            .check_room(&call.caller, options.priority, awaited)?;
+            .check_room(&call.caller, Some(&options), awaited)?;
         let request = call.draft_request(options, awaited);
         let mut draft = Draft::begin(&self.service, call.caller.clone(), request)?;
         let mut clouds = [CloudBuilder::default(), CloudBuilder::default()];
@@ -197,8 +196,7 @@ impl SceneFlow for Calls {
     ) -> Result<Response<Self::EstimateSequenceStream>, Status> {
         let call = Call::of(&request)?;
         let awaited = Promise::WhileAwaited;
-        self.service
-            .check_room(&call.caller, Priority::High, awaited)?;
+        self.service.check_room(&call.caller, None, awaited)?;
         let answers = sequence::run(Arc::clone(&self.service), call, request.into_inner());
         Ok(Response::new(Box::pin(answers)))
     }
@@ -210,7 +208,7 @@ impl SceneFlow for Calls {
         use proto::submit_job_request::Part;
         let call = Call::of(&request)?;
         self.service
-            .check_room(&call.caller, Priority::High, Promise::Durable)?;
+            .check_room(&call.caller, None, Promise::Durable)?;
         let mut inbound = request.into_inner();
         let service = &self.service;
         let mut room = Room::default();

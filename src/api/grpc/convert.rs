@@ -39,12 +39,8 @@ pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, Api
         Err(_) => return Err(unknown("priority", message.priority)),
     };
     let device = match message.device.as_str() {
-        "" | "auto" => DeviceChoice::Auto,
-        "cpu" => DeviceChoice::Cpu,
-        _ => {
-            let text = "options: device is \"auto\" or \"cpu\"";
-            return Err(ApiError::InvalidOptions(text.to_owned()));
-        }
+        "" => DeviceChoice::default(),
+        name => name.parse()?,
     };
     let options = JobOptions {
         preset,

@@ -22,7 +22,7 @@ use crate::api::codec::AnswerFormat;
 use crate::api::draft::{Accepted, Arrived, Draft, Request as DraftRequest};
 use crate::api::error::ApiError;
 use crate::api::service::{Service, Waited};
-use crate::job::{Job, JobId, JobOptions, Kind, Priority, State as JobState};
+use crate::job::{Job, JobId, JobOptions, Kind, State as JobState};
 
 /// The longest long poll.
 const MAX_POLL: Duration = Duration::from_secs(60);
@@ -160,7 +160,7 @@ async fn read_pair(
     promise: Promise,
     body: &mut Body,
 ) -> Result<Draft, ApiError> {
-    service.check_room(caller, Priority::High, promise)?;
+    service.check_room(caller, None, promise)?;
     let (mut files, mut options) = (PairFiles::default(), JobOptions::default());
     while let Some(part) = body.next().await? {
         match part {
@@ -170,7 +170,7 @@ async fn read_pair(
             }
         }
     }
-    service.check_room(caller, options.priority, promise)?;
+    service.check_room(caller, Some(&options), promise)?;
     let mut draft = Draft::begin(
         service,
         caller.clone(),
@@ -266,7 +266,7 @@ async fn read_job(
     asked: &Asked,
     body: &mut Body,
 ) -> Result<(Draft, Kind), ApiError> {
-    service.check_room(caller, Priority::High, Promise::Durable)?;
+    service.check_room(caller, None, Promise::Durable)?;
     let mut files = PairFiles::default();
     let mut options = JobOptions::default();
     let mut frames: Option<Draft> = None;

@@ -6,34 +6,57 @@ use std::time::Duration;
 use rusqlite::{Connection, OptionalExtension, params};
 
 use super::ends::{End, end};
-use super::rows::{self, COLUMNS};
+use super::rows::{self, COLUMNS, device_code};
 use super::transitions::Effects;
 use crate::clock::Timestamp;
-use crate::job::{Job, JobError, JobId, JobProgress, State};
+use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, State};
 use crate::queue::{Committed, Event, Outcome, QueueError, QueueOptions};
 
-/// The statement that takes the next job; the test of the plan reads it too.
-pub(super) fn claim_sql() -> String {
-    format!(
-        "UPDATE jobs SET state = 1, attempt = attempt + 1, worker = ?1, due = ?2, \
-         started = coalesce(started, ?3) WHERE seq = (SELECT seq FROM jobs INDEXED BY jobs_ready \
-         WHERE state = 0 AND kind = 0 AND delayed = 0 \
-         ORDER BY priority DESC, virtual_start, seq LIMIT 1) RETURNING {COLUMNS}"
-    )
+/// The statement that finds the first ready job of one need; the test of the plan reads it too.
+pub(super) const FIRST_READY: &str = "SELECT priority, virtual_start, seq FROM jobs \
+    INDEXED BY jobs_ready WHERE state = 0 AND kind = 0 AND delayed = 0 AND device = ?1 \
+    ORDER BY priority DESC, virtual_start, seq LIMIT 1";
+
+/// A ready job's place: the lesser goes first.
+type Place = (core::cmp::Reverse<i64>, f64, i64);
+
+/// The first job of two needs at most: one that any device may do, or one for this kind. Two
+/// lookups, so that a thousand jobs that wait for the other kind cost nothing.
+fn first_ready(connection: &Connection, kind: DeviceKind) -> Result<Option<i64>, QueueError> {
+    let mut statement = connection.prepare_cached(FIRST_READY)?;
+    let mut first: Option<Place> = None;
+    for need in [None, Some(kind)] {
+        let found: Option<Place> = statement
+            .query_row([device_code(need)], |row| {
+                Ok((core::cmp::Reverse(row.get(0)?), row.get(1)?, row.get(2)?))
+            })
+            .optional()?;
+        let earlier = |one: Place, other: Place| if other < one { other } else { one };
+        first = first.into_iter().chain(found).reduce(earlier);
+    }
+    Ok(first.map(|(_, _, seq)| seq))
 }
 
-/// Takes the next job for `worker`.
+/// Takes the next job for `worker`, whose device is of a kind.
 pub(super) fn claim(
     connection: &Connection,
     effects: &mut Effects,
     options: &QueueOptions,
     worker: &str,
+    kind: DeviceKind,
 ) -> Result<Option<Arc<Job>>, QueueError> {
+    let Some(seq) = first_ready(connection, kind)? else {
+        return Ok(None);
+    };
     let now = Timestamp::now();
-    let mut statement = connection.prepare_cached(&claim_sql())?;
+    let sql = format!(
+        "UPDATE jobs SET state = 1, attempt = attempt + 1, worker = ?1, due = ?2, \
+         started = coalesce(started, ?3) WHERE seq = ?4 RETURNING {COLUMNS}"
+    );
+    let mut statement = connection.prepare_cached(&sql)?;
     let until = now.after(options.lease).as_millis();
     let job = statement
-        .query_row(params![worker, until, now.as_millis()], rows::job)
+        .query_row(params![worker, until, now.as_millis(), seq], rows::job)
         .optional()?;
     let Some(job) = job.map(Arc::new) else {
         return Ok(None);
@@ -131,6 +154,15 @@ pub(super) fn finish(
             end(connection, effects, options, &job, State::Succeeded, &how)?
         }
         Outcome::Released => requeue_running(connection, effects, &job, Duration::ZERO)?,
+        Outcome::Moved(kind) => {
+            let sql = "UPDATE jobs SET device = ?2 WHERE id = ?1";
+            connection
+                .prepare_cached(sql)?
+                .execute(params![id.as_bytes(), device_code(Some(kind))])?;
+            let job = rows::get(connection, id)?;
+            requeue_running(connection, effects, &job, Duration::ZERO)?
+        }
+        Outcome::Crashed(error) => crash(connection, effects, options, &job, error)?,
         Outcome::Failed(error) => fail(connection, effects, options, &job, error)?,
     };
     Ok(Committed::Yes(state))
@@ -156,6 +188,29 @@ pub(super) fn fail(
     let how = End {
         dead: error.retryable,
         error: Some(error),
+        ..End::default()
+    };
+    end(connection, effects, options, job, State::Failed, &how)
+}
+
+/// One death in its run more: another attempt at once, or the end.
+pub(super) fn crash(
+    connection: &Connection,
+    effects: &mut Effects,
+    options: &QueueOptions,
+    job: &Job,
+    error: JobError,
+) -> Result<State, QueueError> {
+    let sql = "UPDATE jobs SET crashes = crashes + 1 WHERE id = ?1 RETURNING crashes";
+    let crashes: u32 = connection
+        .prepare_cached(sql)?
+        .query_row([job.id.as_bytes()], |row| row.get(0))?;
+    if crashes < options.max_crashes {
+        return requeue_running(connection, effects, job, Duration::ZERO);
+    }
+    let how = End {
+        error: Some(error),
+        dead: true,
         ..End::default()
     };
     end(connection, effects, options, job, State::Failed, &how)

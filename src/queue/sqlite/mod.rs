@@ -28,7 +28,7 @@ use tokio::sync::{Notify, mpsc, watch};
 use self::rows::{COLUMNS, state_code};
 use self::transitions::Effects;
 use self::writer::Writer;
-use super::backlog::{Backlog, Load};
+use super::backlog::{Backlog, Load, Place};
 use super::lease::{Flags, Heart, Lease, Pulse};
 use super::watchers::Watchers;
 use super::{
@@ -36,7 +36,7 @@ use super::{
     Submitted,
 };
 use crate::clock::Timestamp;
-use crate::job::{Job, JobId, Tenant};
+use crate::job::{DeviceKind, Job, JobId, Tenant};
 
 /// Connections that read.
 const READERS: usize = 2;
@@ -202,17 +202,21 @@ impl SqliteQueue {
 
 /// What waits, from the store itself.
 fn count_backlog(connection: &Connection) -> Result<Backlog, QueueError> {
-    let sql = "SELECT tenant, priority, count(*), sum(cost) FROM jobs \
-               WHERE state = 0 AND kind = 0 GROUP BY tenant, priority";
+    let sql = "SELECT tenant, priority, device, count(*), sum(cost) FROM jobs \
+               WHERE state = 0 AND kind = 0 GROUP BY tenant, priority, device";
     let mut backlog = Backlog::default();
     let mut statement = connection.prepare(sql)?;
     let mut rows = statement.query([])?;
     while let Some(row) = rows.next()? {
-        let place = (rows::tenant_at(row, 0)?, rows::priority_at(row, 1)?);
-        let jobs: u32 = row.get(2)?;
+        let place = Place {
+            tenant: rows::tenant_at(row, 0)?,
+            priority: rows::priority_at(row, 1)?,
+            device: rows::device_at(row, 2)?,
+        };
+        let jobs: u32 = row.get(3)?;
         let load = Load {
             jobs: u64::from(jobs),
-            seconds: row.get(3)?,
+            seconds: row.get(4)?,
         };
         backlog.enter_many(place, load);
     }
@@ -372,7 +376,7 @@ impl Queue for SqliteQueue {
         self.writer.write(false, change).await
     }
 
-    async fn lease(&self, worker: &str) -> Result<Lease, QueueError> {
+    async fn lease(&self, worker: &str, kind: DeviceKind) -> Result<Lease, QueueError> {
         let worker: Arc<str> = Arc::from(worker);
         loop {
             let ready = self.shared.ready.notified();
@@ -380,7 +384,7 @@ impl Queue for SqliteQueue {
             ready.as_mut().enable();
             let (options, name) = (self.options.clone(), Arc::clone(&worker));
             let claim = move |connection: &Connection, effects: &mut Effects| {
-                leases::claim(connection, effects, &options, &name)
+                leases::claim(connection, effects, &options, &name, kind)
             };
             if let Some(job) = self.writer.write(false, claim).await? {
                 return Ok(self.hold(job));

@@ -3,14 +3,14 @@
 use rusqlite::{Connection, OptionalExtension, Row};
 
 use crate::clock::Timestamp;
-use crate::job::{Job, JobError, JobId, JobProgress, Kind, Priority, State, Tenant};
+use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, State, Tenant};
 use crate::queue::QueueError;
 
 /// The columns that [`job`] reads, in its order.
 pub(super) const COLUMNS: &str = "id, tenant, kind, parent, place, pairs, pairs_left, priority, \
     state, durable, attempt, cost, options, created, started, finished, deadline, iteration, \
     max_iterations, loss, stop_reason, error_code, error_message, error_retryable, dead, \
-    cancel_requested, report";
+    cancel_requested, report, device";
 
 pub(super) fn state_code(state: State) -> i64 {
     match state {
@@ -29,6 +29,23 @@ pub(super) fn priority_code(priority: Priority) -> i64 {
         Priority::Normal => 1,
         Priority::High => 2,
     }
+}
+
+/// What a job's need is written as: a number of [`DEVICES`].
+pub(super) fn device_code(device: Option<DeviceKind>) -> i64 {
+    match device {
+        None => 0,
+        Some(DeviceKind::Cpu) => 1,
+        Some(DeviceKind::Gpu) => 2,
+    }
+}
+
+/// Every need, in the order of its codes.
+pub(super) const DEVICES: [Option<DeviceKind>; 3] =
+    [None, Some(DeviceKind::Cpu), Some(DeviceKind::Gpu)];
+
+pub(super) fn device_at(row: &Row<'_>, column: usize) -> rusqlite::Result<Option<DeviceKind>> {
+    from_code(row, column, &DEVICES)
 }
 
 pub(super) fn kind_code(kind: Kind) -> i64 {
@@ -104,6 +121,7 @@ pub(super) fn job(row: &Row<'_>) -> rusqlite::Result<Job> {
         dead: row.get(24)?,
         cancel_requested: row.get(25)?,
         report: row.get(26)?,
+        device: device_at(row, 27)?,
     })
 }
 

@@ -10,7 +10,7 @@ use rusqlite::{Connection, TransactionBehavior};
 use crate::queue::QueueError;
 
 /// What this program reads and writes; kept in `user_version`.
-pub(super) const VERSION: i64 = 1;
+pub(super) const VERSION: i64 = 2;
 
 /// `due` is when the sweeper looks at a row next: the end of a queued job's time or of its delay,
 /// of a running job's lease, of an ended job's retention.
@@ -25,6 +25,7 @@ CREATE TABLE jobs (
     pairs INTEGER NOT NULL,
     pairs_left INTEGER NOT NULL,
     priority INTEGER NOT NULL,
+    device INTEGER NOT NULL,
     state INTEGER NOT NULL,
     durable INTEGER NOT NULL,
     delayed INTEGER NOT NULL,
@@ -57,7 +58,7 @@ CREATE TABLE jobs (
 );
 CREATE UNIQUE INDEX jobs_id ON jobs (id);
 CREATE UNIQUE INDEX jobs_key ON jobs (tenant, idempotency_key) WHERE idempotency_key IS NOT NULL;
-CREATE INDEX jobs_ready ON jobs (priority DESC, virtual_start, seq)
+CREATE INDEX jobs_ready ON jobs (device, priority DESC, virtual_start, seq)
     WHERE state = 0 AND kind = 0 AND delayed = 0;
 CREATE INDEX jobs_running ON jobs (priority, virtual_start) WHERE state = 1 AND kind = 0;
 CREATE INDEX jobs_tail ON jobs (tenant, priority, virtual_finish) WHERE state < 2 AND kind = 0;
@@ -101,6 +102,12 @@ fn migrate(connection: &mut Connection) -> Result<(), QueueError> {
             transaction.pragma_update(None, "user_version", VERSION)?;
         }
         VERSION => {}
+        older if older < VERSION => {
+            return Err(QueueError::Store(format!(
+                "the queue's file has version {older} of a program that was never released, this \
+                 one knows {VERSION}: name another data_dir, or remove the file"
+            )));
+        }
         newer => {
             return Err(QueueError::Store(format!(
                 "the queue's file has version {newer}, this program knows {VERSION}: \

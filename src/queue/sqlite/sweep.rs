@@ -136,34 +136,17 @@ pub(super) fn recover(
         rows.collect::<rusqlite::Result<_>>()?
     };
     for job in running {
-        let sql = "UPDATE jobs SET crashes = crashes + 1 WHERE id = ?1 RETURNING crashes";
-        let crashes: u32 = connection
-            .prepare_cached(sql)?
-            .query_row([job.id.as_bytes()], |row| row.get(0))?;
         if job.cancel_requested {
-            ends::end(
-                connection,
-                effects,
-                options,
-                &job,
-                State::Cancelled,
-                &End::default(),
-            )?;
-        } else if crashes >= options.max_crashes {
-            let error = JobError {
-                code: "crashed".to_owned(),
-                message: format!("the process died {crashes} times while it worked on this job"),
-                retryable: true,
-            };
-            let how = End {
-                error: Some(error),
-                dead: true,
-                ..End::default()
-            };
-            ends::end(connection, effects, options, &job, State::Failed, &how)?;
-        } else {
-            leases::requeue_running(connection, effects, &job, std::time::Duration::ZERO)?;
+            let how = End::default();
+            ends::end(connection, effects, options, &job, State::Cancelled, &how)?;
+            continue;
         }
+        let error = JobError {
+            code: "crashed".to_owned(),
+            message: "the process died again and again while it worked on this job".to_owned(),
+            retryable: true,
+        };
+        leases::crash(connection, effects, options, &job, error)?;
     }
     let sql = "SELECT id FROM jobs WHERE durable = 0 AND parent IS NULL AND state < 2";
     let abandoned: Vec<[u8; 16]> = {

@@ -66,19 +66,25 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
                 "INSERT INTO jobs (id, tenant, kind, place, pairs, pairs_left, priority, state, \
                  durable, delayed, attempt, failures, crashes, cost, virtual_start, \
                  virtual_finish, options, created, expires, due, error_retryable, dead, \
-                 cancel_requested) VALUES (?1, 't', 0, 0, 0, 0, ?2, 0, 1, 0, 0, 0, 0, 1.0, ?1, \
-                 ?1 + 1, '{}', ?1, 9, 9, 0, 0, 0)",
-                params![row, row % 3],
+                 cancel_requested, device) VALUES (?1, 't', 0, 0, 0, 0, ?2, 0, 1, 0, 0, 0, 0, \
+                 1.0, ?1, ?1 + 1, '{}', ?1, 9, 9, 0, 0, 0, ?3)",
+                params![row, row % 3, row / 3 % 3],
             )
             .expect("a row");
     }
     connection
         .execute_batch("COMMIT; ANALYZE")
         .expect("a commit");
-    let claim = plan(&connection, &leases::claim_sql(), 3);
-    assert!(claim.contains("jobs_ready"), "{claim}");
+    let claim = plan(&connection, leases::FIRST_READY, 1);
+    assert!(claim.contains("jobs_ready (device=?)"), "{claim}");
     for (sql, parameters) in [
-        (leases::claim_sql(), 3),
+        (leases::FIRST_READY.to_owned(), 1),
+        (
+            "SELECT min(virtual_start) FROM jobs INDEXED BY jobs_ready WHERE state = 0 AND \
+             kind = 0 AND delayed = 0 AND device = ?1 AND priority = ?2"
+                .to_owned(),
+            2,
+        ),
         (
             "SELECT max(virtual_finish) FROM jobs INDEXED BY jobs_tail WHERE state < 2 AND \
              kind = 0 AND tenant = ?1 AND priority = ?2"

@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use rusqlite::{Connection, OptionalExtension, params};
 
-use super::rows::{self, COLUMNS, kind_code, priority_code};
+use super::rows::{self, COLUMNS, DEVICES, device_code, kind_code, priority_code};
 use crate::clock::Timestamp;
 use crate::job::{Job, JobId, Kind, Priority, State, Tenant};
 use crate::queue::{Event, QueueError, QueueOptions, Submission, Submitted};
@@ -115,11 +115,11 @@ fn insert(
         .unwrap_or_else(|| now.after(options.time_to_live));
     let pairs = if is_pair { 0 } else { submission.pairs };
     let sql = format!(
-        "INSERT INTO jobs (id, tenant, kind, parent, place, pairs, pairs_left, priority, state, \
-         durable, delayed, attempt, failures, crashes, cost, virtual_start, virtual_finish, \
+        "INSERT INTO jobs (id, tenant, kind, parent, place, pairs, pairs_left, priority, \
+         device, state, durable, delayed, attempt, failures, crashes, cost, virtual_start, virtual_finish, \
          options, idempotency_key, fingerprint, created, deadline, expires, due, error_retryable, \
-         dead, cancel_requested) VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?6, ?7, 0, ?8, 0, 0, 0, 0, ?9, \
-         ?10, ?11, ?12, ?13, ?14, ?15, ?16, ?17, ?18, 0, 0, 0) RETURNING {COLUMNS}"
+         dead, cancel_requested) VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?6, ?7, ?19, 0, ?8, 0, 0, 0, 0, \
+         ?9, ?10, ?11, ?12, ?13, ?14, ?15, ?16, ?17, ?18, 0, 0, 0) RETURNING {COLUMNS}"
     );
     let mut statement = connection.prepare_cached(&sql)?;
     let idempotency = submission.idempotency.as_ref();
@@ -143,6 +143,7 @@ fn insert(
             submission.deadline.map(Timestamp::as_millis),
             expires.as_millis(),
             is_pair.then_some(expires.as_millis()),
+            device_code(submission.device),
         ],
         rows::job,
     )?;
@@ -183,13 +184,17 @@ pub(super) fn virtual_now(
          WHERE state = 1 AND kind = 0 AND priority = ?1",
         &[&priority],
     )?;
-    let served = match served {
-        Some(served) => Some(served),
-        None => one(
+    if served.is_some() {
+        return Ok(served);
+    }
+    let mut first: Option<f64> = None;
+    for device in DEVICES {
+        let ready = one(
             "SELECT min(virtual_start) FROM jobs INDEXED BY jobs_ready \
-             WHERE state = 0 AND kind = 0 AND delayed = 0 AND priority = ?1",
-            &[&priority],
-        )?,
-    };
-    Ok(served)
+             WHERE state = 0 AND kind = 0 AND delayed = 0 AND device = ?1 AND priority = ?2",
+            &[&device_code(device), &priority],
+        )?;
+        first = first.into_iter().chain(ready).reduce(f64::min);
+    }
+    Ok(first)
 }

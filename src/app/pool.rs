@@ -1,0 +1,227 @@
+//! Which devices a server works on: the words of its configuration to devices that can be opened.
+//!
+//! It opens nothing itself, and must not know queues or doors.
+
+use std::str::FromStr;
+use std::sync::Arc;
+use std::thread;
+
+use anyhow::{anyhow, bail};
+
+use crate::config::Config;
+use crate::cost::Lanes;
+use crate::engine::{DeviceOptions, Opened, Opener, Reopening};
+use crate::flow::backend::{Backend, BackendError};
+use crate::flow::cpu::CpuBackend;
+use crate::flow::gpu::{self, Adapter, AdapterKind, Gpu, GpuOptions, Selector};
+use crate::job::DeviceKind;
+
+/// Pairs that share a card's submissions: small ones leave a large card idle otherwise.
+const GPU_LANES: usize = 8;
+
+/// The same where the card is software: its work takes the same cores anyway.
+const SOFTWARE_LANES: usize = 2;
+
+/// The devices of one server.
+pub(super) struct Pool {
+    pub(super) devices: Vec<DeviceOptions>,
+    /// Whether a GPU would have been taken and none was found.
+    pub(super) fell_back: bool,
+}
+
+impl Pool {
+    /// The devices that a configuration names, or those that are found where it leaves the choice.
+    ///
+    /// # Errors
+    /// Where a name is none, or what it names is not there.
+    pub(super) fn of(config: &Config) -> anyhow::Result<Self> {
+        let mut pool = Self {
+            devices: Vec::new(),
+            fell_back: false,
+        };
+        for named in &config.devices {
+            match named.as_str() {
+                "auto" => pool.add_the_best(config)?,
+                "cpu" => pool.add_cpu(None)?,
+                "gpu" => pool.add_every_gpu(config)?,
+                other => match other.split_once(':') {
+                    Some(("cpu", threads)) => pool.add_cpu(Some(threads))?,
+                    Some(("gpu", card)) if !card.is_empty() => {
+                        let Ok(selector) = Selector::from_str(card);
+                        pool.add_gpu(gpu::select(&selector, config.software_gpu)?, config);
+                    }
+                    _ => bail!(
+                        "devices: {other:?} is none; known are \"auto\", \"cpu\", \"cpu:THREADS\", \
+                         \"gpu\" and \"gpu:CARD\", where CARD is a number, a PCI id or a part of \
+                         a name that fnsf doctor shows"
+                    ),
+                },
+            }
+        }
+        Ok(pool)
+    }
+
+    /// How many pairs it works on at the same time.
+    pub(super) fn lanes(&self) -> Lanes {
+        let of = |kind| {
+            let devices = self.devices.iter().filter(|device| device.kind == kind);
+            devices.map(|device| device.lanes).sum()
+        };
+        Lanes {
+            cpu: of(DeviceKind::Cpu),
+            gpu: of(DeviceKind::Gpu),
+        }
+    }
+
+    fn add_the_best(&mut self, config: &Config) -> anyhow::Result<()> {
+        let cards = welcome(config);
+        if cards.is_empty() {
+            self.fell_back = true;
+            return self.add_cpu(None);
+        }
+        for card in cards {
+            self.add_gpu(card, config);
+        }
+        Ok(())
+    }
+
+    fn add_every_gpu(&mut self, config: &Config) -> anyhow::Result<()> {
+        let cards = welcome(config);
+        if cards.is_empty() {
+            // Says what there is instead.
+            gpu::select(&Selector::Any, config.software_gpu)
+                .map_err(|error| anyhow!("devices: {error}; fnsf doctor says how to mend it"))?;
+        }
+        for card in cards {
+            self.add_gpu(card, config);
+        }
+        Ok(())
+    }
+
+    fn add_cpu(&mut self, threads: Option<&str>) -> anyhow::Result<()> {
+        let cores = thread::available_parallelism().map_or(1, usize::from);
+        let threads = match threads {
+            None => Some(cores.min(256)),
+            Some(threads) => threads.parse().ok(),
+        };
+        let threads = threads.filter(|threads| (1..=256).contains(threads));
+        let threads = threads.ok_or_else(|| anyhow!("devices: \"cpu:THREADS\" takes 1 to 256"))?;
+        let open: Opener = Box::new(move || {
+            let backend = CpuBackend::new(Some(threads))?;
+            Ok(Box::new(Processor(Arc::new(backend))))
+        });
+        self.add(DeviceKind::Cpu, 1, open);
+        Ok(())
+    }
+
+    fn add_gpu(&mut self, card: Adapter, config: &Config) {
+        let lanes = config.gpu_lanes.unwrap_or(match card.kind {
+            AdapterKind::Software => SOFTWARE_LANES,
+            _ => GPU_LANES,
+        });
+        let options = GpuOptions {
+            lanes,
+            memory_bytes: config.gpu_memory_mib.map(|mib| mib << 20),
+        };
+        let open: Opener = Box::new(move || {
+            let opened = Gpu::open(&found_again(&card)?, &options)?;
+            Ok(Box::new(opened))
+        });
+        self.add(DeviceKind::Gpu, lanes, open);
+    }
+
+    fn add(&mut self, kind: DeviceKind, lanes: usize, open: Opener) {
+        let before = self.devices.iter().filter(|device| device.kind == kind);
+        self.devices.push(DeviceOptions {
+            name: format!("{}{}", kind.name(), before.count()),
+            kind,
+            lanes,
+            open,
+            reopening: Reopening::default(),
+        });
+    }
+}
+
+/// Every card that need not be asked for by name.
+fn welcome(config: &Config) -> Vec<Adapter> {
+    let mut cards = gpu::adapters();
+    cards.retain(|card| config.software_gpu || card.kind != AdapterKind::Software);
+    cards
+}
+
+/// The same card, asked for anew: what was known of it before it was lost may be stale.
+fn found_again(card: &Adapter) -> Result<Adapter, BackendError> {
+    let mut alike = gpu::adapters();
+    alike.retain(|other| other.name == card.name && other.pci_id == card.pci_id);
+    // Where the driver gives no place, twins are told apart by their number.
+    let twin = alike.iter().position(|other| other.index == card.index);
+    if alike.is_empty() {
+        return Err(BackendError::NoDevice(format!(
+            "{} does not answer any more",
+            card.name
+        )));
+    }
+    Ok(alike.swap_remove(twin.unwrap_or(0)))
+}
+
+/// Some threads of the processor.
+struct Processor(Arc<CpuBackend>);
+
+impl Opened for Processor {
+    fn lane(&self) -> Arc<dyn Backend> {
+        Arc::<CpuBackend>::clone(&self.0)
+    }
+
+    fn is_lost(&self) -> bool {
+        false
+    }
+}
+
+impl Opened for Gpu {
+    fn lane(&self) -> Arc<dyn Backend> {
+        Arc::new(self.clone())
+    }
+
+    fn is_lost(&self) -> bool {
+        Gpu::is_lost(self)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn pool(devices: &[&str]) -> anyhow::Result<Pool> {
+        Pool::of(&Config {
+            devices: devices.iter().map(|name| (*name).to_owned()).collect(),
+            ..Config::default()
+        })
+    }
+
+    #[test]
+    fn processors_are_numbered_and_have_a_lane_each() {
+        let pool = pool(&["cpu", "cpu:2"]).expect("devices");
+        let names: Vec<_> = pool.devices.iter().map(|device| &device.name).collect();
+        assert_eq!(names, ["cpu0", "cpu1"]);
+        assert_eq!(pool.lanes(), Lanes { cpu: 2, gpu: 0 });
+        assert!(!pool.fell_back);
+    }
+
+    #[test]
+    fn what_is_no_device_is_refused_with_what_is() {
+        for devices in [["tpu"], ["cpu:0"], ["cpu:many"], ["gpu:"], ["auto:1"]] {
+            let refused = pool(&devices).err().expect("a refusal").to_string();
+            assert!(refused.starts_with("devices: "), "{refused}");
+        }
+        let refused = pool(&["gpu:no card has this name"]).err();
+        let refused = refused.expect("a refusal").to_string();
+        assert!(refused.contains("no such device"), "{refused}");
+    }
+
+    #[test]
+    fn auto_always_finds_something_and_says_when_it_is_no_card() {
+        let pool = pool(&["auto"]).expect("a device");
+        let first = pool.devices.first().expect("a device");
+        assert_eq!(pool.fell_back, first.kind == DeviceKind::Cpu);
+    }
+}

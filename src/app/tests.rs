@@ -1,0 +1,260 @@
+//! Devices that fail, as a caller sees it: a whole server in this process, over HTTP, on cards that
+//! a test can destroy.
+
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use reqwest::multipart::{Form, Part};
+use serde_json::{Value, json};
+use tokio::time::timeout;
+
+use super::App;
+use super::pool::Pool;
+use crate::config::Config;
+use crate::engine::cards::Switches;
+use crate::engine::{DeviceOptions, Health, Opened, Reopening};
+use crate::flow::gpu::{self, Gpu, GpuOptions};
+use crate::flow::simulate::{Street, StreetOptions};
+use crate::formats::{Pair, write_pair_npz};
+use crate::gpu_in_tests;
+use crate::job::DeviceKind;
+
+/// Long enough for a loaded machine and a card of software; only a failure waits so long.
+const PATIENCE: Duration = Duration::from_secs(240);
+
+/// A server, and where its things lie.
+struct Stand {
+    app: App,
+    client: reqwest::Client,
+    _folder: tempfile::TempDir,
+}
+
+/// A server on some cards, and one thread of the CPU where it is wanted.
+async fn serve(cards: Vec<DeviceOptions>, cpu: bool) -> Stand {
+    let folder = tempfile::tempdir().expect("a folder");
+    let any_port = std::net::SocketAddr::from(([127, 0, 0, 1], 0));
+    let config = Config {
+        listen: any_port,
+        admin_listen: any_port,
+        data_dir: folder.path().to_owned(),
+        devices: vec!["cpu:1".to_owned()],
+        ..Config::default()
+    };
+    let mut pool = Pool::of(&config).expect("a CPU");
+    pool.devices.retain(|_| cpu);
+    pool.devices.extend(cards);
+    let app = App::start_on(pool, config).await.expect("a server");
+    for device in &app.devices {
+        let mut health = device.health();
+        let ready = timeout(PATIENCE, health.wait_for(|health| *health == Health::Ready)).await;
+        drop(ready.expect("in time").expect("threads live"));
+    }
+    Stand {
+        app,
+        client: reqwest::Client::new(),
+        _folder: folder,
+    }
+}
+
+impl Stand {
+    fn url(&self, path: &str) -> String {
+        format!("http://{}{path}", self.app.public_address())
+    }
+
+    async fn submit(&self, options: Value) -> String {
+        let street = Street::new(&StreetOptions {
+            beams: 16,
+            azimuth_steps: 300,
+            ..StreetOptions::default()
+        });
+        let street = street.and_then(|street| street.pair(0)).expect("a street");
+        let pair = Pair {
+            source: street.source,
+            target: street.target,
+            ..Pair::default()
+        };
+        let mut file = Vec::new();
+        write_pair_npz(&pair, &mut file).expect("written");
+        let form = Form::new()
+            .text("options", options.to_string())
+            .part("source", Part::bytes(file).file_name("pair.npz"));
+        let url = self.url("/v1/jobs");
+        let sent = self.client.post(url).multipart(form).send().await;
+        let job: Value = sent.expect("an answer").json().await.expect("a job");
+        job["id"]
+            .as_str()
+            .unwrap_or_else(|| panic!("{job}"))
+            .to_owned()
+    }
+
+    async fn job(&self, id: &str, wait: u32) -> Value {
+        let url = self.url(&format!("/v1/jobs/{id}?wait={wait}"));
+        let sent = self.client.get(url).send().await;
+        sent.expect("an answer").json().await.expect("a job")
+    }
+
+    /// The state that a job ends in, its attempts, and the device that did it.
+    async fn end(&self, id: &str) -> (String, u64, String) {
+        let ended = timeout(PATIENCE, async {
+            loop {
+                let job = self.job(id, 20).await;
+                if !matches!(job["state"].as_str(), Some("queued" | "running")) {
+                    return job;
+                }
+            }
+        });
+        let job = ended.await.expect("in time");
+        let device = job["report"]["device"].as_str().unwrap_or_default();
+        (
+            job["state"].as_str().unwrap_or_default().to_owned(),
+            job["attempt"].as_u64().unwrap_or_default(),
+            device.to_owned(),
+        )
+    }
+
+    async fn has_metric(&self, line: &str) -> bool {
+        let url = format!("http://{}/metrics", self.app.admin_address());
+        let page = self.client.get(url).send().await.expect("an answer");
+        let page = page.text().await.expect("text");
+        page.lines().any(|found| found == line)
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_card_that_dies_costs_its_jobs_one_attempt_and_the_others_nothing() {
+    let switches = Arc::new(Switches::default());
+    let stand = serve(vec![switches.card("gpu0", 2)], true).await;
+    switches.brake.store(true, Ordering::Relaxed);
+    let on_the_card = [
+        stand.submit(json!({"device": "gpu"})).await,
+        stand.submit(json!({"device": "gpu", "seed": 1})).await,
+    ];
+    let elsewhere = stand.submit(json!({"device": "cpu"})).await;
+    timeout(PATIENCE, switches.until_at_the_brake(2))
+        .await
+        .expect("in time");
+    switches.destroy();
+    switches.brake.store(false, Ordering::Relaxed);
+    for id in on_the_card {
+        let (state, attempts, device) = stand.end(&id).await;
+        assert_eq!((state.as_str(), attempts), ("succeeded", 2));
+        assert_eq!(device, "a card of the tests");
+    }
+    let (state, attempts, _) = stand.end(&elsewhere).await;
+    assert_eq!((state.as_str(), attempts), ("succeeded", 1));
+    assert!(
+        stand
+            .has_metric("fnsf_device_lost_total{device=\"gpu0\"} 1")
+            .await
+    );
+    assert!(
+        stand
+            .has_metric("fnsf_device_lost_total{device=\"cpu0\"} 0")
+            .await
+    );
+    assert!(
+        stand
+            .has_metric("fnsf_device_lanes{device=\"gpu0\"} 2")
+            .await
+    );
+    stand.app.drain().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_real_card_that_is_destroyed_in_the_middle_of_a_job_is_opened_again_and_does_it() {
+    let mut cards = gpu::adapters();
+    if !gpu_in_tests::is_there(cards.len()) {
+        return;
+    }
+    let adapter = cards.swap_remove(0);
+    let opened: Arc<Mutex<Vec<Gpu>>> = Arc::default();
+    let known = Arc::clone(&opened);
+    let card = DeviceOptions {
+        name: "gpu0".to_owned(),
+        kind: DeviceKind::Gpu,
+        lanes: 2,
+        open: Box::new(move || {
+            let options = GpuOptions {
+                lanes: 2,
+                ..GpuOptions::default()
+            };
+            let gpu = Gpu::open(&adapter, &options)?;
+            known.lock().expect("no panic holds it").push(gpu.clone());
+            Ok(Box::new(gpu) as Box<dyn Opened>)
+        }),
+        reopening: Reopening::default(),
+    };
+    let stand = serve(vec![card], true).await;
+    let id = stand
+        .submit(json!({"device": "gpu", "preset": "paper"}))
+        .await;
+    let elsewhere = stand.submit(json!({"device": "cpu"})).await;
+    let under_way = async {
+        while stand.job(&id, 0).await["progress"]["iteration"].as_u64() < Some(2) {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    };
+    timeout(PATIENCE, under_way).await.expect("in time");
+    // The test lets go of it, too: its memory is needed again.
+    let first = opened
+        .lock()
+        .expect("no panic holds it")
+        .pop()
+        .expect("it is open");
+    first.destroy();
+    drop(first);
+    let (state, attempts, device) = stand.end(&id).await;
+    assert_eq!((state.as_str(), attempts), ("succeeded", 2));
+    assert_ne!(device, "");
+    let (state, attempts, _) = stand.end(&elsewhere).await;
+    assert_eq!((state.as_str(), attempts), ("succeeded", 1));
+    assert!(
+        stand
+            .has_metric("fnsf_device_lost_total{device=\"gpu0\"} 1")
+            .await
+    );
+    stand.app.drain().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_pair_too_large_for_the_card_is_done_by_the_cpu_unless_its_caller_wants_the_card() {
+    let switches = Arc::new(Switches::default());
+    switches.room.store(10, Ordering::Relaxed);
+    let stand = serve(vec![switches.card("gpu0", 1)], true).await;
+    let anywhere = stand.submit(json!({})).await;
+    let (state, _, device) = stand.end(&anywhere).await;
+    assert_eq!(state, "succeeded");
+    assert_ne!(device, "a card of the tests");
+    let there = stand.submit(json!({"device": "gpu"})).await;
+    let (state, attempts, _) = stand.end(&there).await;
+    assert_eq!((state.as_str(), attempts), ("failed", 1));
+    let error = &stand.job(&there, 0).await["error"];
+    assert_eq!(error["code"], "input_refused", "{error}");
+    assert_eq!(error["retryable"], false);
+    stand.app.drain().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_server_gives_up_when_the_last_card_does_not_come_back_and_not_before() {
+    const A_MOMENT: Duration = Duration::from_millis(500);
+    let switches = [Arc::new(Switches::default()), Arc::new(Switches::default())];
+    let cards = vec![switches[0].card("gpu0", 1), switches[1].card("gpu1", 1)];
+    let stand = serve(cards, true).await;
+    for (place, switches) in switches.iter().enumerate() {
+        switches.refusals.store(u32::MAX, Ordering::Relaxed);
+        switches.destroy();
+        let job = stand.submit(json!({"device": "gpu"})).await;
+        let given_up = timeout(A_MOMENT, stand.app.given_up()).await;
+        if place == 0 {
+            assert!(given_up.is_err(), "there was another card");
+            assert_eq!(stand.end(&job).await.0, "succeeded");
+        } else {
+            let reason = timeout(PATIENCE, stand.app.given_up())
+                .await
+                .expect("in time");
+            assert!(reason.contains("the driver is away"), "{reason}");
+        }
+    }
+    stand.app.drain().await;
+}

@@ -1,0 +1,131 @@
+//! The device that the command line computes on: what `--device` may say, and how it is opened.
+
+use std::fmt;
+use std::str::FromStr;
+
+use anyhow::{Context, anyhow};
+
+use super::failure::Failure;
+use crate::flow::backend::{Backend, BackendError};
+use crate::flow::cpu::CpuBackend;
+use crate::flow::gpu::{self, Adapter, Gpu, GpuOptions, Selector};
+use crate::job::DeviceChoice;
+
+/// Takes drivers that only compute on the CPU for GPUs where it is 1: for tests.
+const SOFTWARE: &str = "FNSF_SOFTWARE_GPU";
+
+/// What `--device` says.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct DeviceArgument {
+    /// The kind of device, as a request names it.
+    pub(super) choice: DeviceChoice,
+    /// Which one of them.
+    card: Selector,
+}
+
+impl FromStr for DeviceArgument {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let wrong = || format!("{text:?} is none of auto, cpu, gpu and gpu:CARD");
+        let (kind, card) = match text.split_once(':') {
+            Some((kind, card)) if !card.is_empty() => (kind, Some(card)),
+            Some(_) => return Err(wrong()),
+            None => (text, None),
+        };
+        let choice: DeviceChoice = kind.parse().map_err(|_| wrong())?;
+        match card {
+            Some(_) if choice != DeviceChoice::Gpu => Err(wrong()),
+            _ => {
+                let Ok(card) = Selector::from_str(card.unwrap_or_default());
+                Ok(Self { choice, card })
+            }
+        }
+    }
+}
+
+impl fmt::Display for DeviceArgument {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.choice {
+            DeviceChoice::Auto => f.write_str("auto"),
+            DeviceChoice::Cpu => f.write_str("cpu"),
+            DeviceChoice::Gpu => write!(f, "{}", self.card),
+        }
+    }
+}
+
+/// Whether software is welcome where any GPU is.
+pub(super) fn software_is_welcome() -> bool {
+    std::env::var_os(SOFTWARE).is_some_and(|value| value == "1")
+}
+
+/// The card that `auto` takes.
+pub(super) fn best_card() -> Result<Adapter, BackendError> {
+    gpu::select(&Selector::Any, software_is_welcome())
+}
+
+/// Opens a device; `threads` bounds the CPU's. Says on stderr where the CPU stands in for a GPU.
+pub(super) fn open(
+    device: &DeviceArgument,
+    threads: Option<usize>,
+) -> Result<Box<dyn Backend>, Failure> {
+    match device.choice {
+        DeviceChoice::Cpu => cpu(threads),
+        DeviceChoice::Gpu => {
+            let opened =
+                gpu::select(&device.card, software_is_welcome()).and_then(|card| open_card(&card));
+            let opened = opened.with_context(|| format!("--device {device}"));
+            opened.map_err(|error| {
+                Failure::internal(anyhow!("{error:#}; fnsf doctor says how to mend it"))
+            })
+        }
+        DeviceChoice::Auto => match best_card().and_then(|card| open_card(&card)) {
+            Ok(opened) => Ok(opened),
+            Err(error) => {
+                stand_in(&error);
+                cpu(threads)
+            }
+        },
+    }
+}
+
+/// The CPU, on all cores where no number is given.
+pub(super) fn cpu(threads: Option<usize>) -> Result<Box<dyn Backend>, Failure> {
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let opened = CpuBackend::new(Some(threads.unwrap_or(cores)));
+    Ok(Box::new(opened.map_err(Failure::internal)?))
+}
+
+/// Says that the CPU does what a GPU would have done.
+pub(super) fn stand_in(error: &BackendError) {
+    eprintln!("fnsf: warning: the CPU does the work: {error}");
+}
+
+fn open_card(card: &Adapter) -> Result<Box<dyn Backend>, BackendError> {
+    Ok(Box::new(Gpu::open(card, &GpuOptions::default())?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_kind_is_named_alone_and_a_card_behind_it() {
+        for text in [
+            "auto",
+            "cpu",
+            "gpu",
+            "gpu:1",
+            "gpu:nvidia",
+            "gpu:0000:01:00.0",
+        ] {
+            let device: DeviceArgument = text.parse().expect(text);
+            assert_eq!(device.to_string(), text);
+        }
+        let by_place: DeviceArgument = "gpu:0000:01:00.0".parse().expect("a device");
+        assert_eq!(by_place.card, Selector::Named("0000:01:00.0".to_owned()));
+        for text in ["", "tpu", "cpu:0", "auto:0", "gpu:", ":0"] {
+            assert!(text.parse::<DeviceArgument>().is_err(), "{text}");
+        }
+    }
+}

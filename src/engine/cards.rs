@@ -1,0 +1,231 @@
+//! Test only: a card that computes on the CPU, and is lost, slips or refuses whenever a test wants.
+
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::Duration;
+
+use super::{DeviceOptions, Opened, Opener, Reopening};
+use crate::flow::backend::{Advance, Backend, BackendError, Report, Trainer, Transform};
+use crate::flow::cpu::CpuBackend;
+use crate::flow::distance::DistanceOptions;
+use crate::flow::{Options, Point, RigidTransform, TrainerState, Watch};
+use crate::job::DeviceKind;
+
+/// Points of the trial's pair: what a test asks for does not happen to it.
+const TRIAL_POINTS: usize = 4800;
+
+/// What a test does to its card.
+#[derive(Default)]
+pub(crate) struct Switches {
+    /// Openings so far.
+    pub(crate) openings: AtomicU32,
+    /// Openings that fail from now on.
+    pub(crate) refusals: AtomicU32,
+    /// Pairs that end in a panic from now on.
+    pub(crate) panics: AtomicU32,
+    /// Pairs with more points do not fit, unless it is zero.
+    pub(crate) room: AtomicUsize,
+    /// Pairs stop before their next iterations while it is on.
+    pub(crate) brake: AtomicBool,
+    /// Pairs that stand at the brake.
+    pub(crate) at_the_brake: AtomicUsize,
+    /// Of the card that was opened last.
+    lost: Mutex<Arc<AtomicBool>>,
+}
+
+impl Switches {
+    /// The card goes away, under work or not.
+    pub(crate) fn destroy(&self) {
+        self.lost
+            .lock()
+            .expect("no panic holds it")
+            .store(true, Ordering::Relaxed);
+    }
+
+    /// Waits until so many pairs are under way and stand still.
+    pub(crate) async fn until_at_the_brake(&self, pairs: usize) {
+        while self.at_the_brake.load(Ordering::Relaxed) != pairs {
+            tokio::time::sleep(Duration::from_millis(2)).await;
+        }
+    }
+
+    /// A GPU with so many lanes that does what the switches say, and is tried again at once.
+    pub(crate) fn card(self: &Arc<Self>, name: &str, lanes: usize) -> DeviceOptions {
+        DeviceOptions {
+            name: name.to_owned(),
+            kind: DeviceKind::Gpu,
+            lanes,
+            open: self.opener(),
+            reopening: Reopening {
+                first_pause: Duration::from_millis(2),
+                longest_pause: Duration::from_millis(10),
+                tries: 3,
+            },
+        }
+    }
+
+    fn opener(self: &Arc<Self>) -> Opener {
+        let switches = Arc::clone(self);
+        Box::new(move || {
+            if taken(&switches.refusals) {
+                return Err(BackendError::NoDevice("the driver is away".to_owned()));
+            }
+            switches.openings.fetch_add(1, Ordering::Relaxed);
+            let lost = Arc::new(AtomicBool::new(false));
+            *switches.lost.lock().expect("no panic holds it") = Arc::clone(&lost);
+            let switches = Arc::clone(&switches);
+            Ok(Box::new(Card { switches, lost }))
+        })
+    }
+}
+
+/// One less, where there was one.
+fn taken(count: &AtomicU32) -> bool {
+    let less = |count: u32| count.checked_sub(1);
+    count
+        .fetch_update(Ordering::Relaxed, Ordering::Relaxed, less)
+        .is_ok()
+}
+
+struct Card {
+    switches: Arc<Switches>,
+    lost: Arc<AtomicBool>,
+}
+
+impl Opened for Card {
+    fn lane(&self) -> Arc<dyn Backend> {
+        Arc::new(CardLane {
+            cpu: CpuBackend::new(Some(1)).expect("a thread"),
+            switches: Arc::clone(&self.switches),
+            lost: Arc::clone(&self.lost),
+        })
+    }
+
+    fn is_lost(&self) -> bool {
+        self.lost.load(Ordering::Relaxed)
+    }
+}
+
+struct CardLane {
+    cpu: CpuBackend,
+    switches: Arc<Switches>,
+    lost: Arc<AtomicBool>,
+}
+
+impl Backend for CardLane {
+    fn name(&self) -> String {
+        "a card of the tests".to_owned()
+    }
+
+    fn transform(
+        &self,
+        source: &[Point],
+        target: &[Point],
+        options: &DistanceOptions,
+        watch: &dyn Watch,
+    ) -> Result<Box<dyn Transform>, BackendError> {
+        let on_trial = source.len() == TRIAL_POINTS;
+        if !on_trial && taken(&self.switches.panics) {
+            panic!("the device has slipped");
+        }
+        let room = self.switches.room.load(Ordering::Relaxed);
+        if !on_trial && room > 0 && source.len() > room {
+            return Err(BackendError::Memory {
+                what: "points",
+                needed: source.len() as u64,
+                available: room as u64,
+            });
+        }
+        Ok(Box::new(CardTransform {
+            cpu: self.cpu.transform(source, target, options, watch)?,
+            switches: (!on_trial).then(|| Arc::clone(&self.switches)),
+            lost: Arc::clone(&self.lost),
+        }))
+    }
+}
+
+struct CardTransform {
+    cpu: Box<dyn Transform>,
+    switches: Option<Arc<Switches>>,
+    lost: Arc<AtomicBool>,
+}
+
+impl Transform for CardTransform {
+    fn bytes(&self) -> usize {
+        self.cpu.bytes()
+    }
+
+    fn align(&self, source: &[Point], watch: &dyn Watch) -> Result<RigidTransform, BackendError> {
+        self.cpu.align(source, watch)
+    }
+
+    fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError> {
+        self.cpu.distances(points)
+    }
+
+    fn start(
+        &self,
+        source: &[Point],
+        options: &Options,
+    ) -> Result<Box<dyn Trainer + '_>, BackendError> {
+        Ok(Box::new(CardTrainer {
+            cpu: self.cpu.start(source, options)?,
+            switches: self.switches.clone(),
+            lost: Arc::clone(&self.lost),
+        }))
+    }
+}
+
+struct CardTrainer<'a> {
+    cpu: Box<dyn Trainer + 'a>,
+    switches: Option<Arc<Switches>>,
+    lost: Arc<AtomicBool>,
+}
+
+impl CardTrainer<'_> {
+    fn brake(&self, switches: &Switches) {
+        let stands =
+            || switches.brake.load(Ordering::Relaxed) && !self.lost.load(Ordering::Relaxed);
+        if !stands() {
+            return;
+        }
+        switches.at_the_brake.fetch_add(1, Ordering::Relaxed);
+        while stands() {
+            thread::sleep(Duration::from_millis(1));
+        }
+        switches.at_the_brake.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+impl Trainer for CardTrainer<'_> {
+    fn advance(&mut self, steps: usize, watch: &dyn Watch) -> Result<Advance, BackendError> {
+        if let Some(switches) = &self.switches {
+            self.brake(switches);
+        }
+        if self.lost.load(Ordering::Relaxed) {
+            return Err(BackendError::Lost("it was destroyed".to_owned()));
+        }
+        self.cpu.advance(steps, watch)
+    }
+
+    fn evaluate(&mut self, points: &[Point]) -> Result<Vec<Point>, BackendError> {
+        self.cpu.evaluate(points)
+    }
+
+    fn report(&self) -> Report {
+        self.cpu.report()
+    }
+
+    fn state(&mut self) -> Result<TrainerState, BackendError> {
+        self.cpu.state()
+    }
+
+    fn restore(&mut self, state: TrainerState) -> Result<(), BackendError> {
+        self.cpu.restore(state)
+    }
+
+    fn shorten(&mut self, max_iterations: usize) {
+        self.cpu.shorten(max_iterations);
+    }
+}

@@ -1,0 +1,186 @@
+//! The hold that all lanes of a device have on it: opened once for all of them, tried, lost once,
+//! opened again with growing pauses, and in the end given up.
+//!
+//! The lane that comes first opens; the others wait for it. It must not know what lanes do.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use tokio::sync::watch;
+
+use super::lane::{Trust, message};
+use super::{Health, Opened, Opener, Reopening, trial};
+use crate::flow::backend::Backend;
+use crate::metrics::Metrics;
+
+/// A lane's share of the device, for one pair.
+pub(super) struct Held {
+    opening: u64,
+    pub(super) opened: Arc<dyn Opened>,
+    pub(super) backend: Arc<dyn Backend>,
+}
+
+/// What the lanes of one device share.
+pub(super) struct Hold {
+    name: Arc<str>,
+    open: Opener,
+    reopening: Reopening,
+    metrics: Arc<Metrics>,
+    tell: watch::Sender<Health>,
+    state: Mutex<State>,
+}
+
+struct State {
+    opened: Option<Arc<dyn Opened>>,
+    openings: u64,
+    /// Openings that failed since the last one that did not.
+    failures: u32,
+    pause: Duration,
+    next_try: Instant,
+}
+
+impl Hold {
+    pub(super) fn new(
+        name: Arc<str>,
+        open: Opener,
+        reopening: Reopening,
+        metrics: Arc<Metrics>,
+        tell: watch::Sender<Health>,
+    ) -> Self {
+        Self {
+            name,
+            open,
+            metrics,
+            tell,
+            state: Mutex::new(State {
+                opened: None,
+                openings: 0,
+                failures: 0,
+                pause: reopening.first_pause,
+                next_try: Instant::now(),
+            }),
+            reopening,
+        }
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The device is gone: it is counted once, whichever lane says so first.
+    pub(super) fn lose(&self, held: &Held, reason: &str) {
+        let mut state = self.state();
+        if state.openings == held.opening && state.opened.is_some() {
+            self.forget(&mut state, reason);
+        }
+    }
+
+    fn forget(&self, state: &mut State, reason: &str) {
+        state.opened = None;
+        state.next_try = Instant::now();
+        self.metrics.device_lost(&self.name);
+        tracing::error!(
+            device = &*self.name,
+            reason,
+            "the device was lost: it is opened again"
+        );
+        self.tell.send_replace(Health::Starting);
+    }
+
+    /// A lane's share of the device, while it is open.
+    pub(super) fn share(&self) -> Option<Held> {
+        let mut state = self.state();
+        let opened = state.opened.clone()?;
+        if opened.is_lost() {
+            self.forget(&mut state, "it went away while it had nothing to do");
+            return None;
+        }
+        Some(Held {
+            opening: state.openings,
+            backend: opened.lane(),
+            opened,
+        })
+    }
+
+    /// Comes back when the device is open, and has passed its trial again where trust in it is
+    /// shaken; opens it if nobody else does. False where `ended` says that the lane has no more
+    /// work.
+    pub(super) fn open(&self, trust: Trust, ended: &dyn Fn() -> bool) -> bool {
+        const LOOK: Duration = Duration::from_millis(100);
+        if trust == Trust::Shaken
+            && let Some(held) = self.share()
+            && let Err(reason) = passes(held.backend.as_ref())
+        {
+            self.lose(&held, &reason);
+        }
+        loop {
+            match self.opened() {
+                Ok(()) => return true,
+                Err(_) if ended() => return false,
+                Err(wait) => thread::sleep(wait.min(LOOK)),
+            }
+        }
+    }
+
+    /// Opens the device, where it is not; or says how long to wait before that.
+    fn opened(&self) -> Result<(), Duration> {
+        let mut state = self.state();
+        let now = Instant::now();
+        if state.opened.is_some() {
+            return Ok(());
+        }
+        if now < state.next_try {
+            return Err(state.next_try - now);
+        }
+        let reason = match self.opened_and_tried() {
+            Ok(opened) => {
+                state.opened = Some(opened);
+                state.openings += 1;
+                state.failures = 0;
+                state.pause = self.reopening.first_pause;
+                self.tell.send_replace(Health::Ready);
+                return Ok(());
+            }
+            Err(reason) => reason,
+        };
+        state.failures += 1;
+        let pause = state.pause;
+        state.next_try = Instant::now() + pause;
+        state.pause = (pause * 4).min(self.reopening.longest_pause);
+        tracing::error!(
+            device = &*self.name,
+            %reason,
+            tries = state.failures,
+            "the device cannot be used"
+        );
+        let worked = state.openings > 0;
+        let given_up = worked && state.failures >= self.reopening.tries;
+        let health = if given_up {
+            Health::Gone
+        } else {
+            Health::Broken
+        };
+        self.tell.send_replace(health(reason));
+        Err(pause)
+    }
+
+    fn opened_and_tried(&self) -> Result<Arc<dyn Opened>, String> {
+        let opening = catch_unwind(AssertUnwindSafe(|| {
+            let opened: Arc<dyn Opened> =
+                Arc::from((self.open)().map_err(|error| error.to_string())?);
+            let backend = opened.lane();
+            trial::run(backend.as_ref())?;
+            tracing::info!(device = &*self.name, is = backend.name(), "ready");
+            Ok(opened)
+        }));
+        opening.unwrap_or_else(|panic| Err(message(panic.as_ref())))
+    }
+}
+
+/// Whether a backend solves the trial's pair.
+fn passes(backend: &dyn Backend) -> Result<(), String> {
+    catch_unwind(AssertUnwindSafe(|| trial::run(backend)))
+        .unwrap_or_else(|panic| Err(message(panic.as_ref())))
+}

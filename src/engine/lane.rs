@@ -1,0 +1,167 @@
+//! One lane's thread: takes a pair at a time, and never lets a panic out.
+//!
+//! It must not know how a device is opened, only that it has to ask for it again.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+use tokio::sync::{mpsc, oneshot};
+
+use super::busy::Busy;
+use super::hold::{Held, Hold};
+use super::{EngineError, Solved, Work};
+use crate::flow::backend::{Backend, BackendError};
+use crate::flow::{self, Estimate, FlowError, Interrupt, Problem, Progress, Snapshot, Watch};
+
+/// A pair, and where its flow goes.
+pub(super) struct Command {
+    pub(super) work: Work,
+    pub(super) reply: oneshot::Sender<Result<Solved, EngineError>>,
+}
+
+/// Whether a lane trusts its device.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Trust {
+    /// As long as it is there.
+    Given,
+    /// Something broke: it must pass its trial again.
+    Shaken,
+}
+
+/// Works until nobody has work any more. Between two pairs it holds nothing of the device, so that
+/// a lost one gives its memory back before it is opened again.
+pub(super) fn run(hold: &Hold, mut inbox: mpsc::Receiver<Command>, busy: &Busy) {
+    let mut trust = Trust::Given;
+    while hold.open(trust, &|| inbox.is_closed()) {
+        let Some(Command { work, reply }) = inbox.blocking_recv() else {
+            return;
+        };
+        let answer = match hold.share() {
+            None => {
+                trust = Trust::Given;
+                Err(EngineError::Broken("it is being opened again".to_owned()))
+            }
+            Some(held) => {
+                busy.begin();
+                let solved = catch_unwind(AssertUnwindSafe(|| {
+                    solve(held.backend.as_ref(), work, busy)
+                }));
+                busy.end();
+                let answer;
+                (answer, trust) = judged(hold, &held, solved);
+                answer
+            }
+        };
+        let _nobody_waits_is_fine = reply.send(answer);
+    }
+}
+
+/// What an attempt says about the pair, and what about the device. Whatever comes from a device
+/// that is gone counts for nothing: it may be stale.
+fn judged(
+    hold: &Hold,
+    held: &Held,
+    solved: std::thread::Result<Result<Estimate, FlowError>>,
+) -> (Result<Solved, EngineError>, Trust) {
+    let (answer, trust) = match solved {
+        Ok(Ok(estimate)) => {
+            let device = held.backend.name();
+            (Ok(Solved { estimate, device }), Trust::Given)
+        }
+        Ok(Err(FlowError::Backend(BackendError::Lost(reason)))) => {
+            (Err(EngineError::Lost(reason)), Trust::Given)
+        }
+        Ok(Err(error)) => {
+            let trust = match error {
+                FlowError::Backend(BackendError::Device(_)) => Trust::Shaken,
+                _ => Trust::Given,
+            };
+            (Err(error.into()), trust)
+        }
+        Err(panic) => {
+            let message = message(panic.as_ref());
+            (Err(EngineError::Panicked(message)), Trust::Shaken)
+        }
+    };
+    match (answer, held.opened.is_lost()) {
+        (Err(EngineError::Lost(reason)), _) => {
+            hold.lose(held, &reason);
+            (Err(EngineError::Lost(reason)), trust)
+        }
+        // Nobody wants it any more, lost or not.
+        (Err(EngineError::Flow(FlowError::Cancelled)), true) => {
+            hold.lose(held, "it went away under work");
+            (Err(FlowError::Cancelled.into()), Trust::Given)
+        }
+        (answer, true) => {
+            let reason = match answer {
+                Ok(_) => "it went away under work".to_owned(),
+                Err(error) => error.to_string(),
+            };
+            hold.lose(held, &reason);
+            (Err(EngineError::Lost(reason)), Trust::Given)
+        }
+        (answer, false) => (answer, trust),
+    }
+}
+
+/// Passes everything on, and hears the signs of life.
+struct Heard<'a> {
+    watch: &'a dyn Watch,
+    busy: &'a Busy,
+}
+
+impl Watch for Heard<'_> {
+    fn seconds(&self) -> f64 {
+        self.watch.seconds()
+    }
+
+    fn seconds_left(&self) -> Option<f64> {
+        self.watch.seconds_left()
+    }
+
+    fn interrupt(&self) -> Option<Interrupt> {
+        self.busy.sign_of_life();
+        self.watch.interrupt()
+    }
+
+    fn progress(&self, progress: Progress) {
+        self.watch.progress(progress);
+    }
+
+    fn snapshot_due(&self) -> bool {
+        self.watch.snapshot_due()
+    }
+
+    fn snapshot(&self, snapshot: Snapshot) {
+        self.watch.snapshot(snapshot);
+    }
+}
+
+fn solve(backend: &dyn Backend, work: Work, busy: &Busy) -> Result<Estimate, FlowError> {
+    let watch = Heard {
+        watch: work.watch.as_ref(),
+        busy,
+    };
+    let ground = work.ground.as_ref();
+    let problem = Problem {
+        source: &work.source,
+        target: &work.target,
+        ground: ground.map(|[source, target]| [source.as_slice(), target.as_slice()]),
+    };
+    if let Some(snapshot) = work.snapshot {
+        match flow::resume(backend, &problem, &work.options, snapshot, &watch) {
+            Err(FlowError::Snapshot(error)) => {
+                tracing::warn!(%error, "a snapshot is of no use: the job starts afresh");
+            }
+            resumed => return resumed,
+        }
+    }
+    flow::estimate(backend, &problem, &work.options, &watch)
+}
+
+/// What a panic said.
+pub(super) fn message(panic: &(dyn std::any::Any + Send)) -> String {
+    let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
+    let text = text.or_else(|| panic.downcast_ref::<String>().cloned());
+    text.unwrap_or_else(|| "without a word".to_owned())
+}

@@ -1,0 +1,168 @@
+//! A device's health through losses, panics and refusals, with several lanes.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use tokio::time::timeout;
+
+use super::cards::Switches;
+use super::{Device, EngineError, Health, Lane, Work};
+use crate::flow::{Point, Preset, Unwatched};
+use crate::metrics::Metrics;
+
+/// Long enough for a loaded machine; only a failure waits so long.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+struct Stand {
+    switches: Arc<Switches>,
+    device: Device,
+    metrics: Arc<Metrics>,
+}
+
+fn stand(lanes: usize) -> Stand {
+    let switches = Arc::new(Switches::default());
+    let metrics = Arc::new(Metrics::new(&["gpu0"]));
+    let device = Device::start(switches.card("gpu0", lanes), &metrics).expect("threads");
+    Stand {
+        switches,
+        device,
+        metrics,
+    }
+}
+
+impl Stand {
+    async fn until(&self, wanted: impl Fn(&Health) -> bool) {
+        let mut health = self.device.health();
+        let reached = timeout(PATIENCE, health.wait_for(wanted)).await;
+        reached.expect("in time").expect("threads live");
+    }
+
+    async fn ready(&self) {
+        self.until(|health| *health == Health::Ready).await;
+    }
+
+    fn losses(&self) -> bool {
+        let page = self.metrics.expose(false);
+        page.contains("fnsf_device_lost_total{device=\"gpu0\"} 1")
+    }
+}
+
+/// A wall of points, and one a tenth of a metre on.
+fn work() -> Work {
+    let source: Vec<Point> = (0..900u16)
+        .map(|i| [8.0, f32::from(i % 30) * 0.2, f32::from(i / 30) * 0.2])
+        .collect();
+    Work {
+        target: source.iter().map(|[x, y, z]| [x + 0.1, *y, *z]).collect(),
+        source,
+        ground: None,
+        options: Preset::Default.options(None),
+        snapshot: None,
+        watch: Arc::new(Unwatched),
+    }
+}
+
+async fn solved(lane: &Lane) -> Result<(), EngineError> {
+    let solved = timeout(PATIENCE, lane.solve(work())).await;
+    solved.expect("in time").map(drop)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_loss_costs_every_lane_its_pair_and_the_device_is_opened_again_once() {
+    let stand = stand(3);
+    stand.ready().await;
+    stand.switches.brake.store(true, Ordering::Relaxed);
+    let lanes: Vec<_> = stand.device.lanes().collect();
+    let running = futures_util::future::join_all(lanes.iter().map(solved));
+    let destroyed = async {
+        stand.switches.until_at_the_brake(3).await;
+        stand.switches.destroy();
+        stand.switches.brake.store(false, Ordering::Relaxed);
+    };
+    let (ended, ()) = tokio::join!(running, destroyed);
+    for end in ended {
+        assert!(matches!(end, Err(EngineError::Lost(_))), "{end:?}");
+    }
+    stand.ready().await;
+    for lane in &lanes {
+        solved(lane).await.expect("it works again");
+    }
+    assert_eq!(stand.switches.openings.load(Ordering::Relaxed), 2);
+    assert!(stand.losses(), "{}", stand.metrics.expose(false));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_device_that_goes_while_idle_gives_the_next_pair_back_untouched() {
+    let stand = stand(1);
+    stand.ready().await;
+    let lane = stand.device.lanes().next().expect("a lane");
+    stand.switches.destroy();
+    let given_back = solved(&lane).await;
+    assert!(
+        matches!(given_back, Err(EngineError::Broken(_))),
+        "{given_back:?}"
+    );
+    stand.ready().await;
+    solved(&lane).await.expect("it works again");
+    assert!(stand.losses());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_panic_in_one_lane_is_not_felt_in_another() {
+    let stand = stand(2);
+    stand.ready().await;
+    stand.switches.brake.store(true, Ordering::Relaxed);
+    let lanes: Vec<_> = stand.device.lanes().collect();
+    let undisturbed = solved(&lanes[0]);
+    let panics = async {
+        stand.switches.until_at_the_brake(1).await;
+        stand.switches.panics.store(1, Ordering::Relaxed);
+        let panicked = solved(&lanes[1]).await;
+        stand.switches.brake.store(false, Ordering::Relaxed);
+        panicked
+    };
+    let (undisturbed, panicked) = tokio::join!(undisturbed, panics);
+    undisturbed.expect("it is not felt");
+    assert!(matches!(panicked, Err(EngineError::Panicked(_))));
+    solved(&lanes[1]).await.expect("it works again");
+    assert_eq!(stand.switches.openings.load(Ordering::Relaxed), 1);
+    assert!(!stand.losses());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_device_that_does_not_come_back_is_given_up_and_still_tried() {
+    let stand = stand(2);
+    stand.ready().await;
+    stand.switches.refusals.store(6, Ordering::Relaxed);
+    let lane = stand.device.lanes().next().expect("a lane");
+    stand.switches.destroy();
+    assert!(solved(&lane).await.is_err());
+    stand
+        .until(|health| matches!(health, Health::Gone(_)))
+        .await;
+    let obstacle = stand.device.obstacle().expect("an obstacle");
+    assert!(obstacle.contains("the driver is away"), "{obstacle}");
+    stand.ready().await;
+    solved(&lane).await.expect("it works again");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_device_that_never_worked_is_broken_and_not_given_up() {
+    let switches = Arc::new(Switches::default());
+    switches.refusals.store(5, Ordering::Relaxed);
+    let metrics = Arc::new(Metrics::new(&["gpu0"]));
+    let device = Device::start(switches.card("gpu0", 1), &metrics).expect("threads");
+    let mut health = device.health();
+    loop {
+        timeout(PATIENCE, health.changed())
+            .await
+            .expect("in time")
+            .expect("threads live");
+        match &*health.borrow_and_update() {
+            Health::Ready => break,
+            Health::Starting | Health::Broken(_) => {}
+            Health::Gone(reason) => panic!("it was given up: {reason}"),
+        }
+    }
+}
