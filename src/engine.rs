@@ -142,23 +142,23 @@ pub struct Solved {
 }
 
 /// The way to one lane's thread.
-#[derive(Debug)]
 struct LaneEnd {
     commands: mpsc::Sender<Command>,
     busy: Arc<Busy>,
 }
 
 /// The way to a device.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct Device {
     name: Arc<str>,
     kind: DeviceKind,
     health: watch::Receiver<Health>,
+    hold: Arc<Hold>,
     lanes: Arc<[LaneEnd]>,
 }
 
 /// One of the pairs that a device can work on at a time.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct Lane {
     device: Device,
     place: usize,
@@ -194,6 +194,7 @@ impl Device {
             name,
             kind: options.kind,
             health,
+            hold,
             lanes: lanes.into(),
         })
     }
@@ -243,6 +244,14 @@ impl Device {
         }
     }
 
+    /// Has a device opened again that went away while it had nothing to do; whoever works on it
+    /// finds out by itself.
+    pub fn look(&self) {
+        if self.hold.is_lost_in_silence() {
+            let _a_busy_lane_finds_out = self.lanes[0].commands.try_send(Command::Look);
+        }
+    }
+
     /// How long its lanes have worked in all, together.
     pub fn busy(&self) -> Duration {
         self.lanes.iter().map(|lane| lane.busy.total()).sum()
@@ -267,7 +276,7 @@ impl Lane {
     pub async fn solve(&self, work: Work) -> Result<Solved, EngineError> {
         let gone = || EngineError::Broken("its thread has ended".to_owned());
         let (reply, answer) = oneshot::channel();
-        let command = Command { work, reply };
+        let command = Command::Solve(Box::new(work), reply);
         let commands = &self.device.lanes[self.place].commands;
         commands.send(command).await.map_err(|_| gone())?;
         answer.await.map_err(|_| gone())?

@@ -134,6 +134,18 @@ fn nothing_but_the_cpu_backend_sees_the_cpu_backend() {
 }
 
 #[test]
+fn backends_never_see_each_other_and_no_type_of_wgpu_leaves_its_room() {
+    assert_eq!(uses("flow/cpu/", &["gpu::", "wgpu"]), [""; 0]);
+    assert_eq!(uses("flow/gpu/", &["cpu::", "CpuBackend"]), [""; 0]);
+    assert_eq!(uses_outside("", "flow/gpu/", &["wgpu"]), [""; 0]);
+    // Whoever chooses a device names the room; the rest sees the backends' traits.
+    let choose = ["app/pool.rs", "cli/device.rs", "cli/doctor/"];
+    let mut users = uses_outside("", "flow/", &["flow::gpu", "gpu::"]);
+    users.retain(|line| !choose.iter().any(|room| line.starts_with(room)));
+    assert_eq!(users, [""; 0]);
+}
+
+#[test]
 fn formats_and_pictures_know_no_solver_and_no_command_line() {
     let forbidden = [
         "crate::cli",

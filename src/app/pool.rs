@@ -48,7 +48,7 @@ impl Pool {
                     Some(("cpu", threads)) => pool.add_cpu(Some(threads))?,
                     Some(("gpu", card)) if !card.is_empty() => {
                         let Ok(selector) = Selector::from_str(card);
-                        pool.add_gpu(gpu::select(&selector, config.software_gpu)?, config);
+                        pool.add_gpu(chosen(&selector, config)?, config);
                     }
                     _ => bail!(
                         "devices: {other:?} is none; known are \"auto\", \"cpu\", \"cpu:THREADS\", \
@@ -89,8 +89,7 @@ impl Pool {
         let cards = welcome(config);
         if cards.is_empty() {
             // Says what there is instead.
-            gpu::select(&Selector::Any, config.software_gpu)
-                .map_err(|error| anyhow!("devices: {error}; fnsf doctor says how to mend it"))?;
+            chosen(&Selector::Any, config)?;
         }
         for card in cards {
             self.add_gpu(card, config);
@@ -140,6 +139,12 @@ impl Pool {
             reopening: Reopening::default(),
         });
     }
+}
+
+/// The card that is asked for.
+fn chosen(selector: &Selector, config: &Config) -> anyhow::Result<Adapter> {
+    let found = gpu::select(selector, config.software_gpu);
+    found.map_err(|error| anyhow!("devices: {error}; fnsf doctor says how to mend it"))
 }
 
 /// Every card that need not be asked for by name.

@@ -55,6 +55,7 @@ async fn look(devices: Vec<Device>, metrics: Arc<Metrics>) {
         let passed = then.elapsed().as_secs_f64().max(1e-3);
         then = Instant::now();
         for (device, before) in devices.iter().zip(&mut before) {
+            device.look();
             let busy = device.busy();
             let lanes = device.lanes().len() as f64;
             let ratio = busy.saturating_sub(*before).as_secs_f64() / passed / lanes;

@@ -1,5 +1,8 @@
 //! `fnsf doctor`: what this machine offers, what is missing, and how to mend it.
 
+mod cards;
+mod missing;
+
 use std::time::Instant;
 
 use clap::Args;
@@ -12,7 +15,7 @@ use crate::flow::cpu::{Isa, NetworkWorkload};
 /// Points of the measured cloud: tens of milliseconds at most.
 const POINTS: usize = 2048;
 
-/// Show devices and what they can do.
+/// Show devices and what they can do, what is missing, and how to mend it.
 #[derive(Debug, Args)]
 pub(super) struct Doctor {}
 
@@ -44,10 +47,7 @@ impl Doctor {
             ))?,
             None => say(format_args!("memory: this system does not say"))?,
         }
-        say(format_args!(
-            "gpu: none, this version computes on the CPU only"
-        ))?;
-        Ok(())
+        cards::report()
     }
 }
 

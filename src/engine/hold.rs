@@ -15,6 +15,8 @@ use super::{Health, Opened, Opener, Reopening, trial};
 use crate::flow::backend::Backend;
 use crate::metrics::Metrics;
 
+const WHILE_IDLE: &str = "it went away while it had nothing to do";
+
 /// A lane's share of the device, for one pair.
 pub(super) struct Held {
     opening: u64,
@@ -89,12 +91,21 @@ impl Hold {
         self.tell.send_replace(Health::Starting);
     }
 
+    /// Whether the device is gone and nobody has said so yet.
+    pub(super) fn is_lost_in_silence(&self) -> bool {
+        match self.state.try_lock() {
+            Ok(state) => state.opened.as_ref().is_some_and(|opened| opened.is_lost()),
+            // It is being opened.
+            Err(_) => false,
+        }
+    }
+
     /// A lane's share of the device, while it is open.
     pub(super) fn share(&self) -> Option<Held> {
         let mut state = self.state();
         let opened = state.opened.clone()?;
         if opened.is_lost() {
-            self.forget(&mut state, "it went away while it had nothing to do");
+            self.forget(&mut state, WHILE_IDLE);
             return None;
         }
         Some(Held {
@@ -128,8 +139,10 @@ impl Hold {
     fn opened(&self) -> Result<(), Duration> {
         let mut state = self.state();
         let now = Instant::now();
-        if state.opened.is_some() {
-            return Ok(());
+        match &state.opened {
+            Some(opened) if opened.is_lost() => self.forget(&mut state, WHILE_IDLE),
+            Some(_) => return Ok(()),
+            None => {}
         }
         if now < state.next_try {
             return Err(state.next_try - now);

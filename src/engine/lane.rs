@@ -12,10 +12,12 @@ use super::{EngineError, Solved, Work};
 use crate::flow::backend::{Backend, BackendError};
 use crate::flow::{self, Estimate, FlowError, Interrupt, Problem, Progress, Snapshot, Watch};
 
-/// A pair, and where its flow goes.
-pub(super) struct Command {
-    pub(super) work: Work,
-    pub(super) reply: oneshot::Sender<Result<Solved, EngineError>>,
+/// What a lane is told.
+pub(super) enum Command {
+    /// Solve a pair, and send its flow there.
+    Solve(Box<Work>, oneshot::Sender<Result<Solved, EngineError>>),
+    /// See whether the device is still there.
+    Look,
 }
 
 /// Whether a lane trusts its device.
@@ -32,8 +34,10 @@ pub(super) enum Trust {
 pub(super) fn run(hold: &Hold, mut inbox: mpsc::Receiver<Command>, busy: &Busy) {
     let mut trust = Trust::Given;
     while hold.open(trust, &|| inbox.is_closed()) {
-        let Some(Command { work, reply }) = inbox.blocking_recv() else {
-            return;
+        let (work, reply) = match inbox.blocking_recv() {
+            Some(Command::Solve(work, reply)) => (*work, reply),
+            Some(Command::Look) => continue,
+            None => return,
         };
         let answer = match hold.share() {
             None => {

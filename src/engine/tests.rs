@@ -109,6 +109,25 @@ async fn a_device_that_goes_while_idle_gives_the_next_pair_back_untouched() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_device_that_goes_while_idle_is_opened_again_when_somebody_looks() {
+    let stand = stand(2);
+    stand.ready().await;
+    stand.device.look();
+    stand.switches.destroy();
+    let mut health = stand.device.health();
+    health.mark_unchanged();
+    stand.device.look();
+    timeout(PATIENCE, health.changed())
+        .await
+        .expect("in time")
+        .expect("threads live");
+    stand.ready().await;
+    let lane = stand.device.lanes().next().expect("a lane");
+    solved(&lane).await.expect("it works again");
+    assert!(stand.losses());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_panic_in_one_lane_is_not_felt_in_another() {
     let stand = stand(2);
     stand.ready().await;

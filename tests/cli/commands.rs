@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+use fnsf::flow::gpu::{Adapter, AdapterKind, adapters};
+
 use super::program::{fnsf, json};
 
 /// A small simulated street in `folder/street`.
@@ -162,6 +164,7 @@ fn doctor_names_the_devices_and_help_teaches() {
     let doctor = fnsf(folder.path(), &["doctor"]);
     assert_eq!(doctor.code, 0);
     assert!(doctor.stdout.contains("portable"), "{}", doctor.stdout);
+    assert!(doctor.stdout.contains("\ngpu:"), "{}", doctor.stdout);
     for arguments in [
         &["--help"][..],
         &["flow", "--help"],
@@ -249,4 +252,27 @@ fn clouds_far_from_the_origin_align_as_near_ones_do() {
     );
     let turn = |report: &serde_json::Value| report["ego_motion"][1][0].as_f64().expect("a number");
     assert!((turn(&near) - turn(&far)).abs() < 1e-3, "{near} {far}");
+}
+
+#[test]
+fn auto_without_a_card_says_so_and_a_card_that_is_not_there_is_refused_with_advice() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder);
+    let flow = |device: &str| {
+        let arguments = ["flow", "street/pair_0000.npz", "--json", "--device", device];
+        fnsf(folder, &arguments)
+    };
+    let refused = flow("gpu:no card has this name");
+    assert_eq!((refused.code, refused.stdout.as_str()), (70, ""));
+    assert!(refused.stderr.contains("fnsf doctor"), "{}", refused.stderr);
+    assert_eq!(flow("tpu").code, 2);
+    assert_eq!(flow("cpu:1").code, 2);
+    let hardware = |card: &Adapter| card.kind != AdapterKind::Software;
+    let auto = flow("auto");
+    assert_eq!(auto.code, 0, "{}", auto.stderr);
+    if !adapters().iter().any(hardware) {
+        let warnings = auto.stderr.matches("warning: the CPU does the work");
+        assert_eq!(warnings.count(), 1, "{}", auto.stderr);
+    }
 }

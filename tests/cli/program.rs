@@ -15,6 +15,7 @@ pub(crate) fn fnsf(folder: &Path, arguments: &[&str]) -> Ended {
     let output = Command::new(env!("CARGO_BIN_EXE_fnsf"))
         .args(arguments)
         .current_dir(folder)
+        .env_remove("FNSF_SOFTWARE_GPU")
         .output()
         .expect("the program starts");
     Ended {

@@ -14,6 +14,9 @@ mod attacks_grpc;
 mod attacks_http2;
 mod attacks_requests;
 mod clouds;
+mod devices;
+#[path = "../common/gpu.rs"]
+mod gpu_rule;
 mod grpc;
 mod http;
 mod kills;

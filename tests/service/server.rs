@@ -167,7 +167,7 @@ impl Server {
         let page = plain_get(&self.admin, "/metrics").expect("metrics");
         let series = page.lines().filter(|line| {
             line.strip_prefix(name)
-                .is_some_and(|rest| rest.starts_with(['{', ' ']))
+                .is_some_and(|rest| rest.starts_with(['{', ' ']) || name.ends_with('}'))
         });
         series
             .filter_map(|line| line.rsplit(' ').next()?.parse::<f64>().ok())

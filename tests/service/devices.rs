@@ -1,0 +1,79 @@
+//! Which device does a job: refusals at both doors, and a server that works on a card.
+
+use fnsf::flow::gpu;
+use reqwest::StatusCode;
+use serde_json::Value;
+use tonic::Code;
+
+use crate::clouds::{form, small_pair};
+use crate::gpu_rule;
+use crate::grpc::{self, proto};
+use crate::server::{Server, ended};
+
+#[tokio::test]
+async fn a_job_for_a_kind_of_device_that_is_not_here_is_refused_at_both_doors() {
+    let server = Server::start(&[]);
+    for path in ["/v1/flow", "/v1/jobs"] {
+        let sent = reqwest::Client::new()
+            .post(server.url(path))
+            .multipart(form(small_pair(), r#"{"device": "gpu"}"#))
+            .send()
+            .await
+            .expect("an answer");
+        assert_eq!(sent.status(), StatusCode::UNPROCESSABLE_ENTITY, "{path}");
+        let problem: Value = sent.json().await.expect("a problem");
+        assert_eq!(problem["code"], "no_device", "{problem}");
+        assert_eq!(problem["retryable"], false);
+    }
+    let options = proto::Options {
+        device: "gpu".to_owned(),
+        ..proto::Options::default()
+    };
+    let mut calls = grpc::client(&server).await;
+    let refused = calls
+        .estimate_flow(grpc::pair(small_pair(), options))
+        .await
+        .expect_err("a refusal");
+    assert_eq!(refused.code(), Code::FailedPrecondition, "{refused}");
+    assert!(refused.message().contains("no gpu"), "{refused}");
+    assert!((server.metric("fnsf_rejected_total{reason=\"no_device\"}") - 3.0).abs() < 0.5);
+}
+
+#[tokio::test]
+async fn auto_without_a_card_works_on_the_cpu_and_says_so() {
+    let hardware = |card: &gpu::Adapter| card.kind != gpu::AdapterKind::Software;
+    if gpu::adapters().iter().any(hardware) {
+        return;
+    }
+    let server = Server::start(&["--device", "auto"]);
+    assert!((server.metric("fnsf_device_fallback") - 1.0).abs() < 0.5);
+    assert!(
+        server.log().contains("no GPU was found"),
+        "{}",
+        server.log()
+    );
+}
+
+#[tokio::test]
+async fn a_server_on_a_card_gives_it_the_jobs_that_ask_for_one() {
+    if !gpu_rule::is_there(gpu::adapters().len()) {
+        return;
+    }
+    let server = Server::start(&["--device", "gpu:0", "--device", "cpu:1"]);
+    assert!(server.metric("fnsf_device_lanes{device=\"gpu0\"}") >= 2.0);
+    assert!((server.metric("fnsf_device_fallback")).abs() < 0.5);
+    let mut devices = Vec::new();
+    for device in ["gpu", "cpu"] {
+        let options = format!(r#"{{"device": "{device}", "max_points": 2048}}"#);
+        let sent = reqwest::Client::new()
+            .post(server.url("/v1/jobs"))
+            .multipart(form(small_pair(), &options))
+            .send()
+            .await;
+        let job: Value = sent.expect("an answer").json().await.expect("a job");
+        let job = ended(&server, job["id"].as_str().expect("a name")).await;
+        assert_eq!(job["state"], "succeeded", "{job}");
+        devices.push(job["report"]["device"].as_str().expect("a name").to_owned());
+    }
+    assert_ne!(devices[0], devices[1]);
+}
