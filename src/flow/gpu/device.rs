@@ -67,7 +67,6 @@ impl Gpu {
     }
 
     /// The shared card.
-    #[cfg(test)]
     pub(super) fn card(&self) -> &Arc<Card> {
         &self.0
     }
@@ -188,7 +187,10 @@ impl Card {
             host,
             tick: (!clock.is_empty()).then_some(period * 1e-9),
             watchdog,
-            name: format!("{} ({}, {})", adapter.name, adapter.interface, adapter.driver),
+            name: format!(
+                "{} ({}, {})",
+                adapter.name, adapter.interface, adapter.driver
+            ),
             device,
             queue,
         })
@@ -350,7 +352,11 @@ impl Buffers {
             pulls: buffer("pulls", row_vectors, storage)?,
             partials: buffer("gradients", budget.chunk_bytes(), storage)?,
             lanes: buffer("lanes", records(size_of::<records::Lane>()), storage | to)?,
-            steps: buffer("steps", records(STEPS * size_of::<records::Step>()), storage | to)?,
+            steps: buffer(
+                "steps",
+                records(STEPS * size_of::<records::Step>()),
+                storage | to,
+            )?,
             statuses: buffer(
                 "statuses",
                 records(size_of::<records::Status>()),

@@ -11,6 +11,7 @@ mod memory;
 
 // The kernels, and what they share with the host.
 mod kernels;
+mod phases;
 mod plan;
 mod records;
 
@@ -18,9 +19,11 @@ mod records;
 mod batch;
 mod trainer;
 mod transform;
+mod workload;
 
 #[cfg(test)]
 mod tests;
 
 pub use adapter::{Adapter, AdapterKind, Selector, adapters, select};
 pub use device::{Gpu, GpuOptions};
+pub use workload::{KernelTime, arithmetic_peak, kernel_times};

@@ -117,7 +117,7 @@ impl<'a> GpuTrainer<'a> {
     }
 
     /// The lane's record, but for its place among those of a submission.
-    fn lane(&self) -> records::Lane {
+    pub(super) fn lane(&self) -> records::Lane {
         let options = &self.course.options;
         let (loss, rule) = (&options.loss, options.early_stop);
         records::Lane {

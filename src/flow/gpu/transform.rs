@@ -100,7 +100,8 @@ pub(super) fn build(
         own
     });
     let write = |place: u64, words: &[u8]| {
-        card.queue.write_buffer(&card.buffers.store, place * 4, words);
+        card.queue
+            .write_buffer(&card.buffers.store, place * 4, words);
     };
     write(places[0], bytemuck::cast_slice(&index.tables));
     write(places[1], bytemuck::cast_slice(&index.bricks));

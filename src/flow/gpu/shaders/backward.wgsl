@@ -15,9 +15,12 @@ var<immediate> part: Part;
 
 var<workgroup> outputs: array<vec4<f32>, 2048>;
 
-// `delta` where the feature is on.
-fn gated(delta: vec4<f32>, feature: vec4<f32>) -> vec4<f32> {
-    return select(vec4(0.0), delta, feature > vec4(0.0));
+// Keeps a quad of a row's derivatives, zero where the feature is off, and gives it back.
+fn gated(layer: u32, row: u32, column: u32, sum: vec4<f32>) -> vec4<f32> {
+    let place = (layer * part.rows + row) * QUADS + column;
+    let delta = select(vec4(0.0), sum, activations[place] > vec4(0.0));
+    deltas[place] = delta;
+    return delta;
 }
 
 @compute @workgroup_size(128)
@@ -35,52 +38,54 @@ fn backward(
     let first = local / 16u * 8u;
     let quad = local % 16u;
 
-    for (var side = 0u; side < 2u; side++) {
-        let column = quad + side * 16u;
-        let at = network + LAST + column;
-        let w0 = networks[at];
-        let w1 = networks[at + QUADS];
-        let w2 = networks[at + 2u * QUADS];
+    // Sums of the point's derivatives: its quad of the lower half, and of the upper.
+    var low: array<vec4<f32>, 8>;
+    var high: array<vec4<f32>, 8>;
+    {
+        let at = network + LAST + quad;
+        let x_low = networks[at];
+        let y_low = networks[at + QUADS];
+        let z_low = networks[at + 2u * QUADS];
+        let x_high = networks[at + 16u];
+        let y_high = networks[at + QUADS + 16u];
+        let z_high = networks[at + 2u * QUADS + 16u];
         for (var i = 0u; i < 8u; i++) {
             let pull = pulls[row + first + i];
-            let sum = fma(vec4(pull.x), w0, fma(vec4(pull.y), w1, pull.z * w2));
-            let place = (MIDDLE_LAYERS * part.rows + row + first + i) * QUADS + column;
-            let delta = gated(sum, activations[place]);
-            deltas[place] = delta;
-            outputs[(first + i) * QUADS + column] = delta;
+            low[i] = fma(vec4(pull.x), x_low, fma(vec4(pull.y), y_low, pull.z * z_low));
+            high[i] = fma(vec4(pull.x), x_high, fma(vec4(pull.y), y_high, pull.z * z_high));
         }
     }
 
     for (var done = 0u; done < MIDDLE_LAYERS; done++) {
-        let layer = MIDDLE_LAYERS - 1u - done;
-        let weights = network + TRANSPOSED * LAID_OUT + MIDDLE + layer * MIDDLE_STRIDE;
-        var sums: array<vec4<f32>, 16>;
+        let layer = MIDDLE_LAYERS - done;
+        let weights = network + TRANSPOSED * LAID_OUT + MIDDLE + (layer - 1u) * MIDDLE_STRIDE;
         workgroupBarrier();
-        let low = weights + quad / 8u * 1024u + quad % 8u;
-        let high = low + 2048u;
+        for (var i = 0u; i < 8u; i++) {
+            outputs[(first + i) * QUADS + quad] = gated(layer, row + first + i, quad, low[i]);
+            outputs[(first + i) * QUADS + quad + 16u] = gated(layer, row + first + i, quad + 16u, high[i]);
+            low[i] = vec4(0.0);
+            high[i] = vec4(0.0);
+        }
+        workgroupBarrier();
+        let at_low = weights + quad / 8u * 1024u + quad % 8u;
+        let at_high = at_low + 2048u;
         for (var n = 0u; n < QUADS; n++) {
             var d: array<vec4<f32>, 8>;
             for (var i = 0u; i < 8u; i++) {
                 d[i] = outputs[(first + i) * QUADS + n];
             }
             for (var j = 0u; j < 4u; j++) {
-                let w_low = networks[low + (n * 4u + j) * 8u];
-                let w_high = networks[high + (n * 4u + j) * 8u];
+                let w_low = networks[at_low + (n * 4u + j) * 8u];
+                let w_high = networks[at_high + (n * 4u + j) * 8u];
                 for (var i = 0u; i < 8u; i++) {
-                    sums[i * 2u] = fma(vec4(d[i][j]), w_low, sums[i * 2u]);
-                    sums[i * 2u + 1u] = fma(vec4(d[i][j]), w_high, sums[i * 2u + 1u]);
+                    low[i] = fma(vec4(d[i][j]), w_low, low[i]);
+                    high[i] = fma(vec4(d[i][j]), w_high, high[i]);
                 }
             }
         }
-        workgroupBarrier();
-        for (var i = 0u; i < 8u; i++) {
-            for (var side = 0u; side < 2u; side++) {
-                let column = quad + side * 16u;
-                let place = (layer * part.rows + row + first + i) * QUADS + column;
-                let delta = gated(sums[i * 2u + side], activations[place]);
-                deltas[place] = delta;
-                outputs[(first + i) * QUADS + column] = delta;
-            }
-        }
+    }
+    for (var i = 0u; i < 8u; i++) {
+        gated(0u, row + first + i, quad, low[i]);
+        gated(0u, row + first + i, quad + 16u, high[i]);
     }
 }

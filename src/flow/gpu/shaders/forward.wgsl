@@ -21,6 +21,14 @@ var<immediate> part: Part;
 
 var<workgroup> inputs: array<vec4<f32>, 2048>;
 
+// Keeps a quad of a point's features for the next layer, and for the backward pass.
+fn remember(layer: u32, row: u32, point: u32, column: u32, features: vec4<f32>) {
+    inputs[point * QUADS + column] = features;
+    if !EVALUATES {
+        activations[(layer * part.rows + row + point) * QUADS + column] = features;
+    }
+}
+
 @compute @workgroup_size(128)
 fn forward(
     @builtin(workgroup_id) group: vec3<u32>,
@@ -39,72 +47,66 @@ fn forward(
     let first = local / 16u * 8u;
     let quad = local % 16u;
 
-    var sums: array<vec4<f32>, 16>;
+    // Sums of the point's features: its quad of the lower half, and of the upper.
+    var low: array<vec4<f32>, 8>;
+    var high: array<vec4<f32>, 8>;
     let scale = lanes[work.lane].scale;
     let center = vec3(lanes[work.lane].center[0], lanes[work.lane].center[1], lanes[work.lane].center[2]);
-    for (var side = 0u; side < 2u; side++) {
-        let at = network + quad + side * 16u;
-        let w0 = networks[at];
-        let w1 = networks[at + QUADS];
-        let w2 = networks[at + 2u * QUADS];
-        let bias = networks[at + FIRST_BIAS];
+    {
+        let at = network + quad;
+        let x_low = networks[at];
+        let y_low = networks[at + QUADS];
+        let z_low = networks[at + 2u * QUADS];
+        let bias_low = networks[at + FIRST_BIAS];
+        let x_high = networks[at + 16u];
+        let y_high = networks[at + QUADS + 16u];
+        let z_high = networks[at + 2u * QUADS + 16u];
+        let bias_high = networks[at + FIRST_BIAS + 16u];
         for (var i = 0u; i < 8u; i++) {
             // Rows past the batch's end repeat its last point; their gradients are zero.
             let index = min(work.tile * TILE + first + i, step.count - 1u);
             let at = lanes[work.lane].points + (step.first + index) * 3u;
-            let x = (vec3(points[at], points[at + 1u], points[at + 2u]) - center) * scale;
-            let sum = fma(vec4(x.z), w2, fma(vec4(x.y), w1, fma(vec4(x.x), w0, bias)));
-            sums[i * 2u + side] = max(sum, vec4(0.0));
-        }
-    }
-    for (var i = 0u; i < 8u; i++) {
-        for (var side = 0u; side < 2u; side++) {
-            let h = sums[i * 2u + side];
-            let column = quad + side * 16u;
-            inputs[(first + i) * QUADS + column] = h;
-            if !EVALUATES {
-                activations[(row + first + i) * QUADS + column] = h;
-            }
+            let p = (vec3(points[at], points[at + 1u], points[at + 2u]) - center) * scale;
+            low[i] = fma(vec4(p.z), z_low, fma(vec4(p.y), y_low, fma(vec4(p.x), x_low, bias_low)));
+            high[i] = fma(vec4(p.z), z_high, fma(vec4(p.y), y_high, fma(vec4(p.x), x_high, bias_high)));
         }
     }
 
     for (var layer = 0u; layer < MIDDLE_LAYERS; layer++) {
+        // The features of this layer, for all; and the sums of the next one's begin.
         let weights = network + MIDDLE + layer * MIDDLE_STRIDE;
-        for (var side = 0u; side < 2u; side++) {
-            let bias = networks[weights + MIDDLE_BIAS + quad + side * 16u];
-            for (var i = 0u; i < 8u; i++) {
-                sums[i * 2u + side] = bias;
-            }
+        let bias_low = networks[weights + MIDDLE_BIAS + quad];
+        let bias_high = networks[weights + MIDDLE_BIAS + quad + 16u];
+        workgroupBarrier();
+        for (var i = 0u; i < 8u; i++) {
+            remember(layer, row, first + i, quad, max(low[i], vec4(0.0)));
+            remember(layer, row, first + i, quad + 16u, max(high[i], vec4(0.0)));
+            low[i] = bias_low;
+            high[i] = bias_high;
         }
         workgroupBarrier();
-        // Panels of 32 features: a quad of the lower half, and the same of the upper.
-        let low = weights + quad / 8u * 1024u + quad % 8u;
-        let high = low + 2048u;
+        // Panels of 32 features.
+        let at_low = weights + quad / 8u * 1024u + quad % 8u;
+        let at_high = at_low + 2048u;
         for (var k = 0u; k < QUADS; k++) {
             var h: array<vec4<f32>, 8>;
             for (var i = 0u; i < 8u; i++) {
                 h[i] = inputs[(first + i) * QUADS + k];
             }
             for (var j = 0u; j < 4u; j++) {
-                let w_low = networks[low + (k * 4u + j) * 8u];
-                let w_high = networks[high + (k * 4u + j) * 8u];
+                let w_low = networks[at_low + (k * 4u + j) * 8u];
+                let w_high = networks[at_high + (k * 4u + j) * 8u];
                 for (var i = 0u; i < 8u; i++) {
-                    sums[i * 2u] = fma(vec4(h[i][j]), w_low, sums[i * 2u]);
-                    sums[i * 2u + 1u] = fma(vec4(h[i][j]), w_high, sums[i * 2u + 1u]);
+                    low[i] = fma(vec4(h[i][j]), w_low, low[i]);
+                    high[i] = fma(vec4(h[i][j]), w_high, high[i]);
                 }
             }
         }
-        workgroupBarrier();
-        for (var i = 0u; i < 8u; i++) {
-            for (var side = 0u; side < 2u; side++) {
-                let h = max(sums[i * 2u + side], vec4(0.0));
-                let column = quad + side * 16u;
-                inputs[(first + i) * QUADS + column] = h;
-                if !EVALUATES {
-                    activations[((layer + 1u) * part.rows + row + first + i) * QUADS + column] = h;
-                }
-            }
-        }
+    }
+    workgroupBarrier();
+    for (var i = 0u; i < 8u; i++) {
+        remember(MIDDLE_LAYERS, row, first + i, quad, max(low[i], vec4(0.0)));
+        remember(MIDDLE_LAYERS, row, first + i, quad + 16u, max(high[i], vec4(0.0)));
     }
     workgroupBarrier();
 

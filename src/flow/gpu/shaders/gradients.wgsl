@@ -41,17 +41,21 @@ fn middle_layer(layer: u32, chunk: Chunk, place: u32, local: u32) {
     let output = local % 16u;
     let above = (layer * part.rows + chunk.first_row) * QUADS;
     let below = ((layer + 1u) * part.rows + chunk.first_row) * QUADS;
-    var sums: array<vec4<f32>, 16>;
+    // Four inputs of the lower half by a quad of outputs of either half, and of the upper half.
+    var low_low: array<vec4<f32>, 4>;
+    var low_high: array<vec4<f32>, 4>;
+    var high_low: array<vec4<f32>, 4>;
+    var high_high: array<vec4<f32>, 4>;
     for (var row = 0u; row < chunk.rows; row++) {
         let h_low = activations[above + row * QUADS + input];
         let h_high = activations[above + row * QUADS + input + 16u];
         let d_low = deltas[below + row * QUADS + output];
         let d_high = deltas[below + row * QUADS + output + 16u];
         for (var i = 0u; i < 4u; i++) {
-            sums[i * 2u] = fma(vec4(h_low[i]), d_low, sums[i * 2u]);
-            sums[i * 2u + 1u] = fma(vec4(h_low[i]), d_high, sums[i * 2u + 1u]);
-            sums[i * 2u + 8u] = fma(vec4(h_high[i]), d_low, sums[i * 2u + 8u]);
-            sums[i * 2u + 9u] = fma(vec4(h_high[i]), d_high, sums[i * 2u + 9u]);
+            low_low[i] = fma(vec4(h_low[i]), d_low, low_low[i]);
+            low_high[i] = fma(vec4(h_low[i]), d_high, low_high[i]);
+            high_low[i] = fma(vec4(h_high[i]), d_low, high_low[i]);
+            high_high[i] = fma(vec4(h_high[i]), d_high, high_high[i]);
         }
     }
     let weights = place + MIDDLE + layer * MIDDLE_STRIDE;
@@ -60,10 +64,10 @@ fn middle_layer(layer: u32, chunk: Chunk, place: u32, local: u32) {
     for (var i = 0u; i < 4u; i++) {
         let k_low = (input * 4u + i) * 8u;
         let k_high = k_low + 512u;
-        partials[low + k_low] = sums[i * 2u];
-        partials[high + k_low] = sums[i * 2u + 1u];
-        partials[low + k_high] = sums[i * 2u + 8u];
-        partials[high + k_high] = sums[i * 2u + 9u];
+        partials[low + k_low] = low_low[i];
+        partials[high + k_low] = low_high[i];
+        partials[low + k_high] = high_low[i];
+        partials[high + k_high] = high_high[i];
     }
     var bias = vec4(0.0);
     for (var row = local / QUADS; row < chunk.rows; row += GROUPS) {

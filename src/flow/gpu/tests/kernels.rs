@@ -17,7 +17,7 @@ use crate::flow::watch::Unwatched;
 const NETWORK_TOLERANCE: f64 = 2e-5;
 /// As above, and over the points; single-precision losses' signs may differ at kinks.
 const GRADIENT_TOLERANCE: f64 = 1e-4;
-/// Metres: a coordinate in cells has 24 bits, a corner's distance 16.
+/// Metres, and per metre: a coordinate in cells has 24 bits, a corner's distance 16.
 const SAMPLE_TOLERANCE_M: f32 = 2e-5;
 
 fn transform(source: &[Point], target: &[Point]) -> Option<GpuTransform> {
@@ -48,7 +48,7 @@ fn street() -> [Vec<Point>; 2] {
 fn bricks_have_the_bits_of_the_cpus() {
     let [source, target] = street();
     // The second has more bricks than a dispatch has groups along one dimension.
-    let sparse = scattered(1500, [300.0, 300.0, 20.0], 3);
+    let sparse = scattered(520, [300.0, 300.0, 20.0], 3);
     for (source, target) in [(source, target), (sparse.clone(), sparse)] {
         let Some(gpu) = transform(&source, &target) else {
             return;
@@ -91,7 +91,8 @@ fn samples_are_those_of_the_cpu_near_far_and_outside() {
         for (&point, seen) in points.iter().zip(&samples) {
             let expected = cpu.sample(point);
             let off = (seen.distance - expected.distance).abs();
-            assert!(off < SAMPLE_TOLERANCE_M, "{point:?}: {seen:?} {expected:?}");
+            let tolerance = SAMPLE_TOLERANCE_M * expected.distance.max(1.0);
+            assert!(off < tolerance, "{point:?}: {seen:?} {expected:?}");
             let slopes = seen.gradient.iter().zip(expected.gradient);
             let turned = slopes.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
             // On the border of two cells the slope may be either's.
@@ -131,7 +132,10 @@ fn the_network_is_the_references_at_awkward_row_counts() {
             for (&value, expected) in flow.iter().zip(expected) {
                 let error = (f64::from(value) - expected).abs();
                 let scale = expected.abs().max(1.0);
-                assert!(error < NETWORK_TOLERANCE * scale, "{rows}: {flow:?} {expected}");
+                assert!(
+                    error < NETWORK_TOLERANCE * scale,
+                    "{rows}: {flow:?} {expected}"
+                );
             }
         }
     }
@@ -175,7 +179,10 @@ fn every_gradient_is_the_references_at_awkward_row_counts() {
             // After one step from nothing the mean of the gradients is a tenth of the gradient.
             let mut state = after_one(&gpu, source, &options);
             let means = &mut state.moments[0];
-            means.as_mut_slice().iter_mut().for_each(|mean| *mean *= 10.0);
+            means
+                .as_mut_slice()
+                .iter_mut()
+                .for_each(|mean| *mean *= 10.0);
             let gradients = ReferenceNetwork::read(means).flat();
             let expected = expected.flat();
             let scale = expected.iter().fold(0.0f64, |most, g| most.max(g.abs()));

@@ -104,7 +104,10 @@ fn host_and_shaders_agree_on_the_network() {
         ("FIRST_BIAS", mlp::first_layer().bias),
         ("MIDDLE", middle.weights),
         ("MIDDLE_BIAS", middle.bias - middle.weights),
-        ("MIDDLE_STRIDE", mlp::middle_layer(1).weights - middle.weights),
+        (
+            "MIDDLE_STRIDE",
+            mlp::middle_layer(1).weights - middle.weights,
+        ),
         ("LAST", mlp::last_layer().weights),
         ("LAST_BIAS", mlp::last_layer().bias),
         ("LAID_OUT", mlp::LAID_OUT),

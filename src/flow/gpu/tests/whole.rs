@@ -109,7 +109,11 @@ fn the_stopping_rule_and_the_best_are_the_cpus_for_the_same_losses() {
     let mut rule = EarlyStop::new(options.early_stop.expect("the paper has one"));
     let stop = losses.iter().position(|&loss| rule.observe(loss));
     let stop = stop.expect("it stops before the end");
-    assert_eq!(stop + 1, losses.len(), "iterations after the stop were done");
+    assert_eq!(
+        stop + 1,
+        losses.len(),
+        "iterations after the stop were done"
+    );
     assert_eq!(report.iterations, losses.len());
     let candidates = &losses[..stop];
     let lowest = candidates.iter().copied().fold(f64::INFINITY, f64::min);
