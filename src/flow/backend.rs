@@ -145,6 +145,9 @@ pub enum BackendError {
         /// Bytes that the device has for it.
         available: u64,
     },
+    /// Other pairs have the memory that this one needs; later there will be room.
+    #[error("the memory of the device is taken by other pairs")]
+    Busy,
     /// The device is gone: it must be opened again before it can do anything.
     #[error("the device was lost: {0}")]
     Lost(String),

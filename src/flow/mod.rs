@@ -42,6 +42,7 @@ mod loss;
 
 // How the field is fitted, and on what.
 pub mod backend;
+mod course;
 pub mod cpu;
 mod early_stop;
 #[cfg(feature = "gpu")]

@@ -10,8 +10,8 @@ const EPSILON: f32 = 1e-8;
 /// The factors of one step, the same for every parameter.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct AdamStep {
-    step_size: f32,
-    square_correction: f32,
+    pub(crate) step_size: f32,
+    pub(crate) square_correction: f32,
 }
 
 impl AdamStep {

@@ -245,6 +245,8 @@ impl Fit<'_> {
             }
             cut = true;
             options = hurried;
+            // A device may have room for one only.
+            drop(trainer);
             trainer = prepared.transform.start(self.aligned, &options)?;
         }
         let precomputed = watch.seconds();

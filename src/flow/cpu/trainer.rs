@@ -12,12 +12,11 @@ use rayon::prelude::*;
 use super::CpuTransform;
 use super::tile::{TILE, Tile};
 use crate::flow::backend::{Advance, BackendError, Report, Trainer};
+use crate::flow::course::Course;
 use crate::flow::early_stop::EarlyStop;
-use crate::flow::field::mlp::{Conditioning, Parameters, transpose_middle_layers};
-use crate::flow::optimizer::AdamStep;
-use crate::flow::options::{Decay, Keep, Options, Start};
+use crate::flow::field::mlp::{Parameters, transpose_middle_layers};
+use crate::flow::options::Options;
 use crate::flow::points::Point;
-use crate::flow::random::Random;
 use crate::flow::snapshot::TrainerState;
 use crate::flow::watch::{Progress, Watch};
 
@@ -34,10 +33,7 @@ struct Chunk {
 /// The network, its optimizer and the distance that it is fitted to.
 pub(super) struct CpuTrainer<'a> {
     device: &'a CpuTransform,
-    options: Options,
-    conditioning: Conditioning,
-    /// Source points in the order in which batches take them.
-    points: Vec<Point>,
+    course: Course,
     /// Parameters, moments, the result so far, and what has been reached.
     state: TrainerState,
     transposed: Parameters,
@@ -50,23 +46,13 @@ pub(super) struct CpuTrainer<'a> {
 
 impl<'a> CpuTrainer<'a> {
     pub(super) fn new(device: &'a CpuTransform, source: &[Point], options: &Options) -> Self {
-        let mut random = Random::stream(options.seed, 0);
-        let mut parameters = Parameters::xavier(&mut random);
-        if options.start == Start::ZeroFlow {
-            parameters.clear_last_layer();
-        }
-        let mut points = source.to_vec();
-        if options.batch.is_some_and(|batch| batch < points.len()) {
-            random.shuffle(&mut points);
-        }
+        let (course, parameters) = Course::new(source, options);
         let mut transposed = Parameters::zeros();
         transpose_middle_layers(&parameters, &mut transposed);
         let threads = device.threads.current_num_threads();
         Self {
             device,
-            options: options.clone(),
-            conditioning: Conditioning::new(source, options.inputs),
-            points,
+            course,
             state: TrainerState::at_start(parameters),
             transposed,
             early_stop: options.early_stop.map(EarlyStop::new),
@@ -76,21 +62,10 @@ impl<'a> CpuTrainer<'a> {
         }
     }
 
-    /// The points of this iteration: one of equal parts, in turn.
-    fn batch(&self) -> Range<usize> {
-        let all = self.points.len();
-        let parts = self
-            .options
-            .batch
-            .map_or(1, |batch| all.div_ceil(batch.max(1)));
-        let part = self.state.iterations % parts;
-        part * all / parts..(part + 1) * all / parts
-    }
-
     /// One iteration: gradients, keep, step. Returns the loss and whether the stopping rule fired;
     /// nothing where the loss is not finite.
     fn iterate(&mut self, watch: &dyn Watch) -> Option<(f64, bool)> {
-        let batch = self.batch();
+        let batch = self.course.batch(self.state.iterations);
         let tiles = batch.len().div_ceil(TILE);
         let chunks = chunk_count(tiles);
         self.chunks
@@ -119,12 +94,12 @@ impl<'a> CpuTrainer<'a> {
 
     /// Forward, query, backward over `batch`, into the first `count` chunks.
     fn accumulate(&mut self, batch: Range<usize>, count: usize, watch: &dyn Watch) {
-        let points = &self.points[batch];
+        let points = &self.course.points[batch];
         let tiles = points.len().div_ceil(TILE);
         let weight = 1.0 / points.len() as f32;
-        let (device, loss) = (self.device, &self.options.loss);
+        let (device, loss) = (self.device, &self.course.options.loss);
         let (parameters, transposed) = (&self.state.parameters, &self.transposed);
-        let (conditioning, working_sets) = (&self.conditioning, &self.tiles);
+        let (conditioning, working_sets) = (&self.course.conditioning, &self.tiles);
         let chunks = &mut self.chunks[..count];
         let run = |(index, chunk): (usize, &mut Chunk)| {
             let mut tile = own_tile(working_sets);
@@ -159,18 +134,17 @@ impl<'a> CpuTrainer<'a> {
     /// which the stopping rule fires is not a candidate.
     fn keep(&mut self, loss: f64, stop: bool) {
         let state = &mut self.state;
+        let fresh = self.course.fresh(state.iterations);
         let iteration = state.iterations + 1;
-        match self.options.keep {
-            Keep::Best if loss <= state.best_loss && !stop => {
+        match fresh {
+            None if loss <= state.best_loss && !stop => {
                 state.best_loss = loss;
                 state.best_iteration = iteration;
                 let parameters = state.parameters.as_slice();
                 state.kept.as_mut_slice().copy_from_slice(parameters);
             }
-            Keep::Best => {}
-            Keep::Average { decay } => {
-                let ramp = state.iterations as f32 / (state.iterations as f32 + 10.0);
-                let fresh = 1.0 - decay.min(ramp);
+            None => {}
+            Some(fresh) => {
                 let kept = state.kept.as_mut_slice().iter_mut();
                 for (kept, parameter) in kept.zip(state.parameters.as_slice()) {
                     *kept += fresh * (parameter - *kept);
@@ -188,13 +162,7 @@ impl<'a> CpuTrainer<'a> {
 
     /// Adds the chunks' gradients in order and steps the parameters.
     fn step(&mut self, chunks: usize) {
-        let done = self.state.iterations as f64 / self.options.max_iterations as f64;
-        let share = match self.options.decay {
-            Decay::Constant => 1.0,
-            Decay::Cosine => 0.5 + 0.5 * (core::f64::consts::PI * done).cos(),
-        };
-        let rate = f64::from(self.options.learning_rate) * share;
-        let adam = AdamStep::new(self.state.iterations + 1, rate);
+        let adam = self.course.adam(self.state.iterations);
         let chunks = &self.chunks[..chunks];
         let [means, squares] = &mut self.state.moments;
         let parameters = self.state.parameters.as_mut_slice().par_chunks_mut(SLICE);
@@ -237,7 +205,7 @@ fn own_tile(tiles: &[Mutex<Tile>]) -> MutexGuard<'_, Tile> {
 impl Trainer for CpuTrainer<'_> {
     fn advance(&mut self, steps: usize, watch: &dyn Watch) -> Result<Advance, BackendError> {
         for step in 0..steps {
-            if self.state.iterations >= self.options.max_iterations {
+            if self.state.iterations >= self.course.options.max_iterations {
                 return Ok(Advance::Exhausted);
             }
             if let Some(interrupt) = watch.interrupt() {
@@ -251,7 +219,7 @@ impl Trainer for CpuTrainer<'_> {
             };
             watch.progress(Progress {
                 iteration: self.state.iterations,
-                max_iterations: self.options.max_iterations,
+                max_iterations: self.course.options.max_iterations,
                 loss,
             });
             if stop {
@@ -264,7 +232,7 @@ impl Trainer for CpuTrainer<'_> {
     fn evaluate(&mut self, points: &[Point]) -> Result<Vec<Point>, BackendError> {
         let mut flow = vec![[0.0; 3]; points.len()];
         let (device, kept) = (self.device, &self.state.kept);
-        let (conditioning, working_sets) = (&self.conditioning, &self.tiles);
+        let (conditioning, working_sets) = (&self.course.conditioning, &self.tiles);
         device.threads.install(|| {
             flow.par_chunks_mut(TILE)
                 .zip(points.par_chunks(TILE))
@@ -296,17 +264,15 @@ impl Trainer for CpuTrainer<'_> {
     }
 
     fn restore(&mut self, state: TrainerState) -> Result<(), BackendError> {
-        self.early_stop = self
-            .options
-            .early_stop
-            .map(|options| EarlyStop::resumed(options, state.seen));
+        let rule = self.course.options.early_stop;
+        self.early_stop = rule.map(|options| EarlyStop::resumed(options, state.seen));
         transpose_middle_layers(&state.parameters, &mut self.transposed);
         self.state = state;
         Ok(())
     }
 
     fn shorten(&mut self, max_iterations: usize) {
-        self.options.max_iterations = self.options.max_iterations.min(max_iterations);
+        self.course.shorten(max_iterations);
     }
 }
 

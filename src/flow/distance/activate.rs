@@ -121,6 +121,37 @@ impl Index {
         self.bricks[table as usize * VOLUME + within(brick)]
     }
 
+    /// Blocks that have a table, in the order of their tables: where each is, in blocks, and its
+    /// table.
+    pub(crate) fn tabled_blocks(&self) -> Vec<([usize; 3], usize)> {
+        let [_, ny, nz] = self.blocks;
+        let tables = self.tables.iter().enumerate();
+        let mut order: Vec<_> = tables
+            .filter(|&(_, &table)| table != ABSENT)
+            .map(|(block, &table)| {
+                let at = [block / (ny * nz), block / nz % ny, block % nz];
+                (at, table as usize)
+            })
+            .collect();
+        order.sort_unstable_by_key(|&(_, table)| table);
+        order
+    }
+
+    /// Where each active brick is, in bricks, in the order of their numbers.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn active_places(&self) -> Vec<[u32; 3]> {
+        let mut places = Vec::with_capacity(self.active);
+        for (block, table) in self.tabled_blocks() {
+            let bricks = &self.bricks[table * VOLUME..(table + 1) * VOLUME];
+            let active = (0..VOLUME as u32).filter(|&at| bricks[at as usize] != ABSENT);
+            places.extend(active.map(|at| {
+                let within = [at >> 6, at >> 3 & 7, at & 7];
+                core::array::from_fn(|axis| block[axis] as u32 * EDGE + within[axis])
+            }));
+        }
+        places
+    }
+
     pub(crate) fn bytes(&self) -> usize {
         (self.tables.len() + self.bricks.len()) * size_of::<u32>()
     }

@@ -101,6 +101,12 @@ impl Bricks {
         &self.grid
     }
 
+    /// 512 codes an active brick.
+    #[cfg(all(test, feature = "gpu"))]
+    pub(crate) fn codes(&self) -> &[u16] {
+        &self.codes
+    }
+
     /// Active bricks.
     pub fn active_bricks(&self) -> usize {
         self.index.active

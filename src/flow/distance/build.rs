@@ -29,7 +29,7 @@ pub(super) trait Gather {
 }
 
 /// Codes that one cell of distance is divided into: the band's radius takes nearly all 16 bits.
-pub(super) fn codes_per_cell(band: i32) -> f64 {
+pub(crate) fn codes_per_cell(band: i32) -> f64 {
     f64::from(BEYOND - 1) / f64::from(band)
 }
 
@@ -43,7 +43,7 @@ pub(super) fn band_codes<G: Gather>(
     let mut codes = vec![0u16; index.active * VOLUME];
     let mut rest = codes.as_mut_slice();
     let mut blocks = Vec::new();
-    for (block, table) in block_order(index) {
+    for (block, table) in index.tabled_blocks() {
         let bricks = &index.bricks[table * VOLUME..(table + 1) * VOLUME];
         let active = bricks.iter().filter(|&&b| b != ABSENT).count();
         let (own, others) = rest.split_at_mut(active * VOLUME);
@@ -58,23 +58,6 @@ pub(super) fn band_codes<G: Gather>(
             Ok(())
         })?;
     Ok(codes)
-}
-
-/// Blocks that have a table, in the order of their tables, with their coordinates.
-fn block_order(index: &Index) -> Vec<([usize; 3], usize)> {
-    let [_, ny, nz] = index.blocks;
-    let mut order: Vec<_> = index
-        .tables
-        .iter()
-        .enumerate()
-        .filter(|&(_, &table)| table != ABSENT)
-        .map(|(block, &table)| {
-            let at = [block / (ny * nz), block / nz % ny, block % nz];
-            (at, table as usize)
-        })
-        .collect();
-    order.sort_unstable_by_key(|&(_, table)| table);
-    order
 }
 
 /// Fills the active bricks of one block; `own` are their codes, in the order of their numbers.
@@ -107,7 +90,7 @@ fn fill_block(gather: &mut impl Gather, block: [usize; 3], bricks: &[u32], own: 
 
 /// Items with integer x and y, sorted by both, found by row.
 #[derive(Debug)]
-pub(super) struct Rows {
+pub(crate) struct Rows {
     /// First item of each x, one past the last at the end.
     starts: Vec<u32>,
     y: Vec<i32>,
@@ -142,6 +125,18 @@ impl Rows {
             let count = all[low..].partition_point(|&at| at < y.end);
             (count > 0).then_some((row, start + low..start + low + count))
         })
+    }
+
+    /// First item of each x, one past the last at the end.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn starts(&self) -> &[u32] {
+        &self.starts
+    }
+
+    /// Every item's y.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn all_y(&self) -> &[i32] {
+        &self.y
     }
 
     /// The y of an item.

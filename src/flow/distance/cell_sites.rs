@@ -15,22 +15,22 @@ const SIDE: i32 = EDGE as i32;
 
 /// Occupied columns, each with its squared distances along z.
 #[derive(Debug)]
-pub(super) struct CellSites {
+pub(crate) struct CellSites {
     band: i32,
     /// Columns by x and y; one with a gap wider than two bands is cut into several.
-    columns: Rows,
+    pub(crate) columns: Rows,
     /// The brick layer at which a column's distances begin, and its place in `squares`; one more
     /// at the end.
-    layers: Vec<(u32, u32)>,
+    pub(crate) layers: Vec<(u32, u32)>,
     /// Eight squared distances a layer, [`FAR`] beyond the band.
-    squares: Vec<[i16; 8]>,
+    pub(crate) squares: Vec<[i16; 8]>,
     /// The code of each square up to the band's, then [`BEYOND`].
-    codes: Vec<u16>,
+    pub(crate) codes: Vec<u16>,
 }
 
 impl CellSites {
     /// Transforms `cells` (sorted, unique) along z.
-    pub(super) fn new(cells: &[[u32; 3]], band: i32) -> Self {
+    pub(crate) fn new(cells: &[[u32; 3]], band: i32) -> Self {
         let near =
             |a: &[u32; 3], b: &[u32; 3]| a[..2] == b[..2] && b[2] - a[2] <= 2 * band as u32 + EDGE;
         let columns = || cells.chunk_by(near);

@@ -10,15 +10,15 @@ use crate::flow::Point;
 use crate::flow::watch::Watch;
 
 /// The plan of a transform.
-pub(super) struct Layout {
-    pub(super) grid: Grid,
+pub(crate) struct Layout {
+    pub(crate) grid: Grid,
     /// Occupied vertices, sorted, each once.
-    pub(super) cells: Vec<[u32; 3]>,
-    pub(super) index: Index,
+    pub(crate) cells: Vec<[u32; 3]>,
+    pub(crate) index: Index,
     /// The band's radius in cells.
-    pub(super) band: i32,
+    pub(crate) band: i32,
     /// At most the bytes of what the bricks are filled from.
-    pub(super) sites: usize,
+    pub(crate) sites: usize,
 }
 
 impl Layout {
@@ -26,7 +26,7 @@ impl Layout {
     ///
     /// # Errors
     /// Whatever the transform is refused for.
-    pub(super) fn plan(
+    pub(crate) fn plan(
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,

@@ -8,6 +8,8 @@ mod bricks;
 mod build;
 mod cell_sites;
 pub mod dense;
+#[cfg(feature = "gpu")]
+pub(crate) mod device;
 mod far;
 mod grid;
 mod layout;

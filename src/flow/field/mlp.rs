@@ -138,8 +138,8 @@ impl Parameters {
 /// Points' coordinates to network inputs.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Conditioning {
-    center: Point,
-    scale: f32,
+    pub(crate) center: Point,
+    pub(crate) scale: f32,
 }
 
 impl Conditioning {

@@ -4,8 +4,26 @@
 //! card: it is cheap to clone, every clone may fit a pair of its own from a thread of its own, and
 //! pairs that are fitted at the same time share the card's submissions.
 
+// The card.
 mod adapter;
 mod device;
+mod memory;
+
+// The kernels, and what they share with the host.
+mod kernels;
+mod phases;
+mod plan;
+mod records;
+
+// A pair on the card.
+mod batch;
+mod trainer;
+mod transform;
+mod workload;
+
+#[cfg(test)]
+mod tests;
 
 pub use adapter::{Adapter, AdapterKind, Selector, adapters, select};
 pub use device::{Gpu, GpuOptions};
+pub use workload::{KernelTime, arithmetic_peak, kernel_times};

@@ -5,6 +5,7 @@ use crate::flow::backend::{Backend, Transform};
 use crate::flow::cpu::{CpuBackend, Isa};
 use crate::flow::distance::{DistanceOptions, DistanceTransform};
 use crate::flow::options::Preset;
+use crate::flow::random::Random;
 use crate::flow::reference::ReferenceNetwork;
 use crate::flow::watch::Unwatched;
 use std::sync::Mutex;
@@ -160,27 +161,4 @@ fn the_best_field_has_the_lowest_loss_and_not_the_last() {
         report.best_iteration < 40,
         "the last iteration was the best: no overshoot"
     );
-}
-
-#[test]
-fn every_point_is_in_one_batch_of_each_round() {
-    let [source, target] = clouds(1500);
-    let mut options = Preset::Default.options(None);
-    options.batch = Some(400);
-    let backend = CpuBackend::new(Some(1)).expect("threads");
-    let distance = DistanceTransform::build(&source, &target, &options.distance);
-    let device = CpuTransform {
-        kernels: backend.kernels,
-        threads: backend.threads,
-        distance: distance.expect("small clouds"),
-    };
-    let mut trainer = CpuTrainer::new(&device, &source, &options);
-    let mut covered = vec![0; 1500];
-    for _ in 0..4 {
-        let batch = trainer.batch();
-        assert!(batch.len() <= 400, "{batch:?}");
-        batch.for_each(|point| covered[point] += 1);
-        trainer.iterate(&Unwatched);
-    }
-    assert!(covered.iter().all(|&count| count == 1));
 }

@@ -1,0 +1,237 @@
+//! A card: each kernel against the card's measured arithmetic peak, whole pairs of four sizes, and
+//! many small pairs at once.
+//!
+//! ```text
+//! cargo bench --bench gpu -- [CARD] [--points N,N,...] [--pairs N,N,...]
+//! ```
+//!
+//! `CARD` is an index, a PCI id or a part of the name; without it the first card that is no
+//! software. `benches/gpu.sh` runs it, the tests and the peer from prebuilt programs.
+#![expect(clippy::print_stdout, reason = "a benchmark prints its figures")]
+
+#[expect(dead_code, reason = "scenes are other benchmarks'")]
+mod common;
+
+use std::time::Instant;
+
+use common::median;
+use fnsf::flow::backend::Backend;
+use fnsf::flow::gpu::{Gpu, GpuOptions, Selector, arithmetic_peak, kernel_times, select};
+use fnsf::flow::simulate::{SimulatedPair, Street, StreetOptions};
+use fnsf::flow::{Estimate, Options, Preset, Problem, Watch, estimate};
+
+/// Runs of each pair, after one to warm up.
+const RUNS: u64 = 5;
+/// Rounds of each kernel.
+const ROUNDS: usize = 10;
+/// Points of the pairs that are fitted at once.
+const SMALL: usize = 8192;
+
+/// A clock for the numerics.
+struct Clock(Instant);
+
+impl Watch for Clock {
+    fn seconds(&self) -> f64 {
+        self.0.elapsed().as_secs_f64()
+    }
+}
+
+/// What the command line asks for.
+struct Asked {
+    card: Selector,
+    points: Vec<usize>,
+    pairs: Vec<usize>,
+}
+
+impl Asked {
+    fn read() -> Result<Self, String> {
+        let mut asked = Self {
+            card: Selector::Any,
+            points: vec![SMALL, 50_000, 90_000, 150_000],
+            pairs: vec![1, 8, 64],
+        };
+        let mut arguments = std::env::args().skip(1).filter(|word| word != "--bench");
+        while let Some(word) = arguments.next() {
+            let list = |words: Option<String>| -> Result<Vec<usize>, String> {
+                let words = words.ok_or("a list of numbers is missing")?;
+                let numbers: Result<_, core::num::ParseIntError> =
+                    words.split(',').map(str::parse).collect();
+                numbers.map_err(|e| format!("{words}: {e}"))
+            };
+            match word.as_str() {
+                "--points" => asked.points = list(arguments.next())?,
+                "--pairs" => asked.pairs = list(arguments.next())?,
+                card => asked.card = card.parse().map_err(|_| "no card")?,
+            }
+        }
+        Ok(asked)
+    }
+}
+
+/// A street whose sweeps have more points than any benchmark takes.
+fn street(seed: u64) -> Result<SimulatedPair, String> {
+    let options = StreetOptions {
+        seed,
+        beams: 128,
+        azimuth_steps: 2400,
+        ..StreetOptions::default()
+    };
+    let street = Street::new(&options).map_err(|e| e.to_string())?;
+    street.pair(0).map_err(|e| e.to_string())
+}
+
+fn solve(
+    backend: &dyn Backend,
+    pair: &SimulatedPair,
+    options: &Options,
+) -> Result<Estimate, String> {
+    let problem = Problem {
+        source: &pair.source,
+        target: &pair.target,
+        ground: None,
+    };
+    let clock = Clock(Instant::now());
+    estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())
+}
+
+/// Mean end-point error of the points that took part, metres.
+fn end_point_error(estimate: &Estimate, pair: &SimulatedPair) -> f64 {
+    let rows = estimate.flow.iter().zip(&pair.flow).zip(&estimate.valid);
+    let errors = rows.filter(|&(_, &valid)| valid).map(|((flow, truth), _)| {
+        let square: f32 = (0..3).map(|a| (flow[a] - truth[a]).powi(2)).sum();
+        f64::from(square.sqrt())
+    });
+    errors.sum::<f64>() / estimate.points as f64
+}
+
+fn kernels(gpu: &Gpu, pair: &SimulatedPair, sizes: &[usize]) -> Result<(), String> {
+    let peak = arithmetic_peak(gpu).map_err(|e| e.to_string())?;
+    println!("Arithmetic peak, measured: {:.2} TFLOP/s\n", peak / 1e12);
+    println!("| kernel | points | ms | TFLOP/s | of the peak |");
+    println!("|---|---|---|---|---|");
+    for &points in sizes {
+        let points = points.min(pair.source.len());
+        let source = &pair.source[..points];
+        let times = kernel_times(gpu, source, &pair.target, ROUNDS);
+        let times = match times {
+            Ok(times) => times,
+            Err(error) => {
+                println!("| all | {points} | {error} | | |");
+                continue;
+            }
+        };
+        for time in times {
+            let speed = time.operations / time.seconds;
+            let shares = if time.operations > 0.0 {
+                format!("{:.2} | {:.0}%", speed / 1e12, 100.0 * speed / peak)
+            } else {
+                "| ".to_owned()
+            };
+            println!(
+                "| {} | {points} | {:.3} | {shares} |",
+                time.name,
+                time.seconds * 1e3
+            );
+        }
+    }
+    println!();
+    Ok(())
+}
+
+fn pairs(gpu: &Gpu, pair: &SimulatedPair, sizes: &[usize]) -> Result<(), String> {
+    println!("| preset | points | iterations | precompute | query | network | total ms | EPE m |");
+    println!("|---|---|---|---|---|---|---|---|");
+    for &points in sizes {
+        for preset in Preset::ALL {
+            let mut runs = Vec::new();
+            for seed in 0..=RUNS {
+                let options = Options {
+                    seed,
+                    ..preset.options(Some(points))
+                };
+                let run = solve(gpu, pair, &options)?;
+                if seed > 0 {
+                    runs.push(run);
+                }
+            }
+            let of = |value: &dyn Fn(&Estimate) -> f64| median(runs.iter().map(value).collect());
+            println!(
+                "| {} | {} | {:.0} | {:.1} | {:.1} | {:.1} | {:.1} | {:.3} |",
+                preset.name(),
+                runs[0].points,
+                of(&|e| e.iterations as f64),
+                of(&|e| e.seconds.precompute * 1e3),
+                of(&|e| e.seconds.query * 1e3),
+                of(&|e| e.seconds.network * 1e3),
+                of(&|e| e.seconds.total * 1e3),
+                of(&|e| end_point_error(e, pair)),
+            );
+        }
+    }
+    println!();
+    Ok(())
+}
+
+/// Many pairs at once, one thread each, as the service's lanes work.
+fn batches(gpu: &Gpu, pair: &SimulatedPair, counts: &[usize]) -> Result<(), String> {
+    println!("| pairs of {SMALL} at once | seconds | pairs a second | of one at a time |");
+    println!("|---|---|---|---|");
+    let mut alone = None;
+    for &count in counts {
+        let count = count.min(gpu.lanes());
+        let rounds = 3;
+        let began = Instant::now();
+        std::thread::scope(|scope| {
+            let lanes: Vec<_> = (0..count as u64)
+                .map(|lane| {
+                    let gpu = gpu.clone();
+                    scope.spawn(move || {
+                        (0..rounds).try_for_each(|round| {
+                            let options = Options {
+                                seed: lane * rounds + round,
+                                ..Preset::Paper.options(Some(SMALL))
+                            };
+                            solve(&gpu, pair, &options).map(|_| ())
+                        })
+                    })
+                })
+                .collect();
+            lanes.into_iter().try_for_each(|lane| {
+                let panicked = |_| "a lane panicked".to_owned();
+                lane.join().map_err(panicked)?
+            })
+        })?;
+        let seconds = began.elapsed().as_secs_f64();
+        let rate = (count as u64 * rounds) as f64 / seconds;
+        let one = *alone.get_or_insert(rate);
+        println!("| {count} | {seconds:.2} | {rate:.1} | {:.1} |", rate / one);
+    }
+    println!();
+    Ok(())
+}
+
+fn main() -> Result<(), String> {
+    let asked = Asked::read()?;
+    let adapter = select(&asked.card, false).map_err(|e| e.to_string())?;
+    let lanes = asked.pairs.iter().copied().max().unwrap_or(1);
+    let options = GpuOptions {
+        lanes,
+        memory_bytes: None,
+    };
+    let gpu = Gpu::open(&adapter, &options).map_err(|e| e.to_string())?;
+    println!(
+        "{}; {} lanes, {} MiB taken",
+        gpu.name(),
+        gpu.lanes(),
+        gpu.memory_bytes() >> 20
+    );
+    let tiles = adapter.matrix_tiles.join(", ");
+    println!(
+        "matrix tiles: {}\n",
+        if tiles.is_empty() { "none" } else { &tiles }
+    );
+    let pair = street(1)?;
+    kernels(&gpu, &pair, &asked.points)?;
+    pairs(&gpu, &pair, &asked.points)?;
+    batches(&gpu, &pair, &asked.pairs)
+}

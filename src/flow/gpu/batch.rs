@@ -1,0 +1,287 @@
+//! Submissions: the next iterations of every pair that is being fitted, together.
+//!
+//! Small pairs leave a large card idle, so whoever wants iterations joins those who do at the same
+//! moment; one of them submits for all. Pairs stay independent: each has its own network, stopping
+//! rule and bits. Knows records and kernels, neither points nor options.
+
+use core::time::Duration;
+use std::collections::HashMap;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+
+use super::device::Card;
+use super::memory::{LEAST_CHUNKS, LEAST_ROWS};
+use super::phases::{Clock, Phase, Phases};
+use super::plan::{Cut, Plan, Wave};
+use super::records::{Lane, STEPS, Status, Step};
+use crate::flow::backend::BackendError;
+
+/// How long the one who submits waits for others that are about to join.
+const MOMENT: Duration = Duration::from_micros(300);
+
+/// The next iterations of one pair.
+#[derive(Clone, Debug)]
+pub(super) struct Request {
+    pub(super) lane: Lane,
+    pub(super) status: Status,
+    /// One for each iteration that is wanted, at most [`STEPS`]; fewer may be done.
+    pub(super) steps: Vec<Step>,
+    pub(super) cut: Cut,
+}
+
+/// What became of a request.
+#[derive(Clone, Debug)]
+pub(super) struct Done {
+    pub(super) status: Status,
+    /// The mean loss of each iteration that was done, metres.
+    pub(super) losses: Vec<f32>,
+    /// Seconds of the card that one iteration of the submission took, and the share of them that
+    /// went into distance queries; none where the card shows no clock.
+    pub(super) pace: Option<Pace>,
+}
+
+/// How fast a submission's iterations were.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Pace {
+    pub(super) iteration_seconds: f64,
+    pub(super) query_share: f64,
+    /// Pairs that shared the submission.
+    pub(super) pairs: usize,
+}
+
+/// Who wants iterations.
+#[derive(Default)]
+pub(super) struct Batch {
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct State {
+    /// Pairs that are being fitted.
+    members: usize,
+    next_ticket: u64,
+    waiting: Vec<(u64, Request)>,
+    done: HashMap<u64, Result<Done, BackendError>>,
+    /// Whether somebody submits at the moment.
+    submitting: bool,
+}
+
+impl Batch {
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// One more pair is being fitted.
+    pub(super) fn joined(&self) {
+        self.state().members += 1;
+    }
+
+    /// A pair is fitted, or given up.
+    pub(super) fn left(&self) {
+        self.state().members -= 1;
+        self.changed.notify_all();
+    }
+
+    /// Does the request's iterations, together with what others ask for meanwhile.
+    ///
+    /// # Errors
+    /// [`BackendError`] where the card fails.
+    pub(super) fn run(&self, card: &Card, request: Request) -> Result<Done, BackendError> {
+        let mut state = self.state();
+        let ticket = state.next_ticket;
+        state.next_ticket += 1;
+        state.waiting.push((ticket, request));
+        self.changed.notify_all();
+        loop {
+            if let Some(done) = state.done.remove(&ticket) {
+                return done;
+            }
+            if state.submitting {
+                state = self
+                    .changed
+                    .wait(state)
+                    .unwrap_or_else(PoisonError::into_inner);
+                continue;
+            }
+            state.submitting = true;
+            let incomplete = |state: &mut State| state.waiting.len() < state.members;
+            state = self
+                .changed
+                .wait_timeout_while(state, MOMENT, incomplete)
+                .unwrap_or_else(PoisonError::into_inner)
+                .0;
+            let taken = state.take(card);
+            drop(state);
+            let requests: Vec<_> = taken.iter().map(|(_, request)| request).collect();
+            let submitted = catch_unwind(AssertUnwindSafe(|| submit(card, &requests)));
+            let submitted = submitted.unwrap_or_else(|_| {
+                let reason = "the driver's bindings panicked".to_owned();
+                card.watchdog.lost(reason.clone());
+                Err(BackendError::Lost(reason))
+            });
+            state = self.state();
+            state.submitting = false;
+            match submitted {
+                Ok(all) => {
+                    let tickets = taken.iter().map(|(ticket, _)| *ticket);
+                    state.done.extend(tickets.zip(all.into_iter().map(Ok)));
+                }
+                Err(error) => {
+                    let text = error.to_string();
+                    for (other, _) in &taken {
+                        let lost = card.watchdog.check().err();
+                        let own = lost.unwrap_or_else(|| BackendError::Device(text.clone()));
+                        state.done.insert(*other, Err(own));
+                    }
+                }
+            }
+            self.changed.notify_all();
+        }
+    }
+}
+
+impl State {
+    /// Takes requests in the order of their arrival, as many as the card has room for.
+    fn take(&mut self, card: &Card) -> Vec<(u64, Request)> {
+        let mut chunks = 0;
+        let mut fitting = 0;
+        for (_, request) in &self.waiting {
+            chunks += request.cut.chunks as u64;
+            if fitting > 0 && (chunks > card.budget.chunks || fitting as u64 >= card.budget.lanes) {
+                break;
+            }
+            fitting += 1;
+        }
+        self.waiting.drain(..fitting).collect()
+    }
+}
+
+/// The most points that a batch may have: their gradients must fit into the least memory.
+pub(super) fn most_batch_points() -> usize {
+    LEAST_CHUNKS as usize * LEAST_ROWS as usize
+}
+
+/// Moments of a submission's clock: when its first iteration began, when that one's first query
+/// began and ended, and when it ended itself.
+const MOMENTS: u32 = 4;
+
+/// Does as many iterations of all requests as each of them wants.
+fn submit(card: &Card, requests: &[&Request]) -> Result<Vec<Done>, BackendError> {
+    card.watchdog.check()?;
+    let iterations = requests.iter().map(|request| request.steps.len());
+    let iterations = iterations.min().unwrap_or(0);
+    let cuts: Vec<_> = requests.iter().map(|request| request.cut).collect();
+    let plan = Plan::new(&cuts, card.budget.rows as usize);
+    write(card, requests);
+    let phases = Phases::bind(card, &plan, requests.len())?;
+    let clock = Clock::new(card, MOMENTS);
+
+    let mut encoder = card.encoder();
+    for step in 0..iterations {
+        let clock = clock.as_ref().filter(|_| step == 0);
+        iterate(&mut encoder, &phases, &plan, step, clock);
+    }
+    let status_bytes = (requests.len() * size_of::<Status>()) as u64;
+    let loss_bytes = (requests.len() * STEPS * size_of::<f32>()) as u64;
+    let bytes = status_bytes + loss_bytes + u64::from(MOMENTS) * 8;
+    let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
+    let results = card.empty(bytes, usage)?;
+    let (statuses, losses) = (&card.buffers.statuses, &card.buffers.losses);
+    encoder.copy_buffer_to_buffer(statuses, 0, &results, 0, status_bytes);
+    encoder.copy_buffer_to_buffer(losses, 0, &results, status_bytes, loss_bytes);
+    if let Some(clock) = &clock {
+        clock.resolve(&mut encoder, &results, status_bytes + loss_bytes);
+    }
+    let read = card.finish(encoder, &results, bytes)?;
+
+    let (statuses, rest) = read.split_at(status_bytes as usize);
+    let (losses, moments) = rest.split_at(loss_bytes as usize);
+    let first_wave = plan.waves[0].tiles as f64 / plan.tiles.len() as f64;
+    let pace = clock.map(|clock| {
+        let iteration = clock.seconds(moments, 0, 3);
+        let query = clock.seconds(moments, 1, 2) / first_wave;
+        Pace {
+            iteration_seconds: iteration,
+            query_share: (query / iteration.max(1e-12)).min(1.0),
+            pairs: requests.len(),
+        }
+    });
+    let statuses = statuses.chunks_exact(size_of::<Status>());
+    let losses = losses.chunks_exact(STEPS * size_of::<f32>());
+    let each = requests.iter().zip(statuses).zip(losses);
+    Ok(each
+        .map(|((request, status), losses)| {
+            let status: Status = bytemuck::pod_read_unaligned(status);
+            let done = (status.iterations - request.status.iterations) as usize;
+            let losses = losses.as_chunks::<4>().0.iter().take(done);
+            Done {
+                status,
+                losses: losses.map(|&bytes| f32::from_ne_bytes(bytes)).collect(),
+                pace,
+            }
+        })
+        .collect())
+}
+
+/// Writes what the kernels read of each request.
+pub(super) fn write(card: &Card, requests: &[&Request]) {
+    let (mut first_tile, mut first_chunk) = (0, 0);
+    let mut lanes = Vec::new();
+    let mut steps = vec![Step::default(); requests.len() * STEPS];
+    for (index, request) in requests.iter().enumerate() {
+        lanes.push(Lane {
+            first_tile: first_tile as u32,
+            tiles: request.cut.tiles as u32,
+            first_chunk: first_chunk as u32,
+            chunks: request.cut.chunks as u32,
+            ..request.lane
+        });
+        first_tile += request.cut.tiles;
+        first_chunk += request.cut.chunks;
+        steps[index * STEPS..][..request.steps.len()].copy_from_slice(&request.steps);
+    }
+    let statuses: Vec<_> = requests.iter().map(|request| request.status).collect();
+    let write = |buffer: &wgpu::Buffer, bytes: &[u8]| card.queue.write_buffer(buffer, 0, bytes);
+    write(&card.buffers.lanes, bytemuck::cast_slice(&lanes));
+    write(&card.buffers.steps, bytemuck::cast_slice(&steps));
+    write(&card.buffers.statuses, bytemuck::cast_slice(&statuses));
+}
+
+/// One iteration of all lanes. A timed one is done in passes, so that the card can tell them apart.
+fn iterate(
+    encoder: &mut wgpu::CommandEncoder,
+    phases: &Phases<'_>,
+    plan: &Plan,
+    step: usize,
+    clock: Option<&Clock>,
+) {
+    let (first, rest) = (&plan.waves[0], &plan.waves[1..]);
+    let mut pass = match clock {
+        None => {
+            let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
+            phases.dispatch(&mut pass, Phase::Forward, step, first);
+            phases.dispatch(&mut pass, Phase::Query, step, first);
+            pass
+        }
+        Some(clock) => {
+            let mut pass = clock.pass(encoder, Some(0), None);
+            phases.dispatch(&mut pass, Phase::Forward, step, first);
+            drop(pass);
+            let mut pass = clock.pass(encoder, Some(1), Some(2));
+            phases.dispatch(&mut pass, Phase::Query, step, first);
+            drop(pass);
+            clock.pass(encoder, None, Some(3))
+        }
+    };
+    phases.dispatch(&mut pass, Phase::Backward, step, first);
+    phases.dispatch(&mut pass, Phase::Gradients, step, first);
+    for wave in rest {
+        for phase in Phase::OF_A_WAVE {
+            phases.dispatch(&mut pass, phase, step, wave);
+        }
+    }
+    for phase in Phase::OF_THE_END {
+        phases.dispatch(&mut pass, phase, step, &Wave::default());
+    }
+}

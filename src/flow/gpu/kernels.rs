@@ -1,0 +1,85 @@
+//! The kernels: their sources and their pipelines. Knows neither what they compute nor on what.
+
+use super::device::Watchdog;
+use crate::flow::backend::BackendError;
+
+macro_rules! source {
+    ($($file:literal),+) => {
+        concat!($(include_str!(concat!("shaders/", $file, ".wgsl")), "\n"),+)
+    };
+}
+
+/// Each kernel's entry point and source.
+pub(super) const SOURCES: [(&str, &str); 10] = [
+    ("bricks", source!("bricks")),
+    ("sample_points", source!("common", "distance", "sample")),
+    ("forward", source!("common", "forward")),
+    ("query", source!("common", "distance", "query")),
+    ("backward", source!("common", "backward")),
+    ("gradients", source!("common", "gradients")),
+    ("judge", source!("common", "judge")),
+    ("step", source!("common", "step")),
+    ("transpose", source!("common", "transpose")),
+    ("multiply_adds", source!("multiply_adds")),
+];
+
+/// The pipelines of all kernels.
+#[derive(Debug)]
+pub(super) struct Kernels {
+    pub(super) bricks: wgpu::ComputePipeline,
+    pub(super) sample: wgpu::ComputePipeline,
+    pub(super) forward: wgpu::ComputePipeline,
+    /// [`Self::forward`] with the kept network, remembering nothing.
+    pub(super) evaluate: wgpu::ComputePipeline,
+    pub(super) query: wgpu::ComputePipeline,
+    pub(super) backward: wgpu::ComputePipeline,
+    pub(super) gradients: wgpu::ComputePipeline,
+    pub(super) judge: wgpu::ComputePipeline,
+    pub(super) step: wgpu::ComputePipeline,
+    pub(super) transpose: wgpu::ComputePipeline,
+    /// The device's arithmetic peak, for measurements.
+    pub(super) multiply_adds: wgpu::ComputePipeline,
+}
+
+impl Kernels {
+    /// Builds all pipelines.
+    ///
+    /// # Errors
+    /// [`BackendError::Device`] where the driver refuses one.
+    pub(super) fn new(device: &wgpu::Device, watchdog: &Watchdog) -> Result<Self, BackendError> {
+        let pipeline = |name: &str, constants: &[(&str, f64)]| {
+            let text = SOURCES.iter().find(|(entry, _)| *entry == name);
+            let (entry, text) = text.unwrap_or(&SOURCES[0]);
+            let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+                label: Some(entry),
+                source: wgpu::ShaderSource::Wgsl((*text).into()),
+            });
+            device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+                label: Some(entry),
+                layout: None,
+                module: &module,
+                entry_point: Some(entry),
+                compilation_options: wgpu::PipelineCompilationOptions {
+                    constants,
+                    zero_initialize_workgroup_memory: false,
+                },
+                cache: None,
+            })
+        };
+        let kernels = Self {
+            bricks: pipeline("bricks", &[]),
+            sample: pipeline("sample_points", &[]),
+            forward: pipeline("forward", &[]),
+            evaluate: pipeline("forward", &[("EVALUATES", 1.0)]),
+            query: pipeline("query", &[]),
+            backward: pipeline("backward", &[]),
+            gradients: pipeline("gradients", &[]),
+            judge: pipeline("judge", &[]),
+            step: pipeline("step", &[]),
+            transpose: pipeline("transpose", &[]),
+            multiply_adds: pipeline("multiply_adds", &[]),
+        };
+        watchdog.check()?;
+        Ok(kernels)
+    }
+}

@@ -1,0 +1,264 @@
+//! The card's memory: taken once, when it is opened, and given out in words.
+//!
+//! A pair is priced against it before it gets any. Knows no kernels.
+
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use super::adapter::AdapterKind;
+use super::records::{ARRAYS, TILE};
+use crate::flow::backend::BackendError;
+use crate::flow::field::mlp::{HIDDEN_LAYERS, LAID_OUT, WIDTH};
+use crate::flow::watch::{self, Watch};
+
+/// Bytes of a row's activations, or deltas, of all hidden layers.
+const ROW_BYTES: u64 = (HIDDEN_LAYERS * WIDTH * size_of::<f32>()) as u64;
+/// Bytes of one network, or of one chunk's gradients.
+const NETWORK_BYTES: u64 = (LAID_OUT * size_of::<f32>()) as u64;
+/// The fewest rows that are worth a dispatch, and the largest chunk of points.
+pub(super) const LEAST_ROWS: u64 = 8192;
+/// The most rows: more of them would be busy no longer at once on any card.
+const MOST_ROWS: u64 = 1 << 19;
+/// The fewest chunks: a lane's most.
+pub(super) const LEAST_CHUNKS: u64 = 128;
+/// Words of the store that a lane should find: a full sweep's transform and points.
+const LANE_STORE_BYTES: u64 = 96 << 20;
+
+/// What of the card's memory is for what.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Budget {
+    /// Pairs that may be fitted at the same time.
+    pub(super) lanes: u64,
+    /// Rows that go through the network at a time.
+    pub(super) rows: u64,
+    /// Chunks of gradients of one submission.
+    pub(super) chunks: u64,
+    /// Words of transforms and points.
+    pub(super) store_words: u64,
+}
+
+impl Budget {
+    /// Cuts `bytes` up, where a binding holds at most `binding` bytes.
+    ///
+    /// # Errors
+    /// [`BackendError::Memory`] where not even the least fits.
+    pub(super) fn new(lanes: usize, bytes: u64, binding: u64) -> Result<Self, BackendError> {
+        let lanes = (lanes as u64)
+            .min(binding / (ARRAYS as u64 * NETWORK_BYTES))
+            .max(1);
+        let networks = lanes * ARRAYS as u64 * NETWORK_BYTES;
+        let least = networks
+            + LANE_STORE_BYTES.min(binding)
+            + LEAST_CHUNKS * NETWORK_BYTES
+            + LEAST_ROWS * 2 * ROW_BYTES;
+        if bytes < least || binding < LEAST_ROWS * ROW_BYTES {
+            return Err(BackendError::Memory {
+                what: "kernels",
+                needed: least,
+                available: bytes,
+            });
+        }
+        // What is left over goes to the store, then to chunks, then to rows.
+        let mut left = bytes - least;
+        let mut more = |wished: u64, room: u64| {
+            let taken = wished.min(room).min(left);
+            left -= taken;
+            taken
+        };
+        let store = LANE_STORE_BYTES.min(binding);
+        let store = store + more((lanes - 1) * LANE_STORE_BYTES, binding - store);
+        let chunks = LEAST_CHUNKS * NETWORK_BYTES;
+        let chunks = chunks + more((lanes - 1) * 16 * NETWORK_BYTES, binding - chunks);
+        let rows = LEAST_ROWS * ROW_BYTES;
+        let wished = (MOST_ROWS.min(binding / ROW_BYTES) - LEAST_ROWS) * 2 * ROW_BYTES;
+        let rows = rows + more(wished, wished) / 2;
+        Ok(Self {
+            lanes,
+            rows: rows / ROW_BYTES / TILE as u64 * TILE as u64,
+            chunks: chunks / NETWORK_BYTES,
+            store_words: store / 4,
+        })
+    }
+
+    /// Bytes to take of a card where nobody says how many.
+    pub(super) fn usual(kind: AdapterKind, lanes: usize) -> u64 {
+        match kind {
+            AdapterKind::Discrete | AdapterKind::Virtual => (2 << 30) + lanes as u64 * (256 << 20),
+            AdapterKind::Integrated | AdapterKind::Other => 1 << 30,
+            AdapterKind::Software => 384 << 20,
+        }
+    }
+
+    pub(super) fn network_bytes(&self) -> u64 {
+        self.lanes * ARRAYS as u64 * NETWORK_BYTES
+    }
+
+    pub(super) fn row_bytes(&self) -> u64 {
+        self.rows * ROW_BYTES
+    }
+
+    pub(super) fn chunk_bytes(&self) -> u64 {
+        self.chunks * NETWORK_BYTES
+    }
+
+    /// All of it, bytes.
+    pub(super) fn bytes(&self) -> u64 {
+        self.network_bytes() + 2 * self.row_bytes() + self.chunk_bytes() + self.store_words * 4
+    }
+}
+
+/// How long somebody waits for others to give words back, at most.
+const PATIENCE: Duration = Duration::from_secs(20);
+/// How often who waits looks at its watch.
+const LOOK: Duration = Duration::from_millis(20);
+
+/// The store's words: who has which.
+#[derive(Debug)]
+pub(super) struct Words {
+    /// Free stretches: place and length, by place.
+    free: Mutex<Vec<(u64, u64)>>,
+    given_back: Condvar,
+    all: u64,
+}
+
+impl Words {
+    pub(super) fn new(words: u64) -> Self {
+        Self {
+            free: Mutex::new(vec![(0, words)]),
+            given_back: Condvar::new(),
+            all: words,
+        }
+    }
+
+    fn free(&self) -> MutexGuard<'_, Vec<(u64, u64)>> {
+        self.free.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The place of `count` words; waits a while for others to give theirs back.
+    ///
+    /// # Errors
+    /// [`BackendError::Memory`] where the store never has so many, [`BackendError::Busy`] where
+    /// others keep them, [`BackendError::Interrupted`] where the watch asks for the end.
+    pub(super) fn take(
+        &self,
+        what: &'static str,
+        count: u64,
+        watch: &dyn Watch,
+    ) -> Result<u64, BackendError> {
+        if count > self.all {
+            return Err(BackendError::Memory {
+                what,
+                needed: count * 4,
+                available: self.all * 4,
+            });
+        }
+        let mut free = self.free();
+        let mut waited = Duration::ZERO;
+        loop {
+            if let Some(stretch) = free.iter_mut().find(|(_, length)| *length >= count) {
+                let place = stretch.0;
+                *stretch = (place + count, stretch.1 - count);
+                free.retain(|&(_, length)| length > 0);
+                return Ok(place);
+            }
+            if waited >= PATIENCE {
+                return Err(BackendError::Busy);
+            }
+            watch::check(watch).map_err(BackendError::Interrupted)?;
+            free = self
+                .given_back
+                .wait_timeout(free, LOOK)
+                .unwrap_or_else(PoisonError::into_inner)
+                .0;
+            waited += LOOK;
+        }
+    }
+
+    /// Takes words back.
+    pub(super) fn give_back(&self, place: u64, count: u64) {
+        if count == 0 {
+            return;
+        }
+        let mut free = self.free();
+        free.push((place, count));
+        free.sort_unstable();
+        let mut joined: Vec<(u64, u64)> = Vec::with_capacity(free.len());
+        for &(place, length) in free.iter() {
+            match joined.last_mut() {
+                Some(last) if last.0 + last.1 == place => last.1 += length,
+                _ => joined.push((place, length)),
+            }
+        }
+        *free = joined;
+        self.given_back.notify_all();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::watch::{Interrupt, Unwatched};
+
+    #[test]
+    fn a_software_card_has_room_for_a_full_sweep() {
+        let bytes = Budget::usual(AdapterKind::Software, 2);
+        let budget = Budget::new(2, bytes, 128 << 20).expect("it fits");
+        assert!(budget.bytes() <= bytes, "{budget:?}");
+        assert!(budget.store_words * 4 >= 80 << 20, "{budget:?}");
+        assert!(budget.rows >= LEAST_ROWS && budget.chunks >= LEAST_CHUNKS);
+    }
+
+    #[test]
+    fn no_binding_is_larger_than_the_card_allows() {
+        for (bytes, binding) in [(384 << 20, 128 << 20), (40 << 30, u64::from(u32::MAX))] {
+            for lanes in [1, 8, 64] {
+                let budget = Budget::new(lanes, bytes, binding).expect("it fits");
+                for part in [
+                    budget.network_bytes(),
+                    budget.row_bytes(),
+                    budget.chunk_bytes(),
+                    budget.store_words * 4,
+                ] {
+                    assert!(part <= binding, "{budget:?}");
+                }
+                assert!(budget.bytes() <= bytes, "{budget:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_card_that_is_too_small_is_refused_with_what_it_would_take() {
+        let refused = Budget::new(1, 64 << 20, 128 << 20).expect_err("too small");
+        assert!(matches!(refused, BackendError::Memory { needed, .. } if needed > 64 << 20));
+    }
+
+    #[test]
+    fn words_given_back_can_be_taken_again_in_one_piece() {
+        let words = Words::new(100);
+        let take = |count| words.take("points", count, &Unwatched).expect("free");
+        let [a, b, c] = [take(30), take(30), take(40)];
+        words.give_back(a, 30);
+        words.give_back(c, 40);
+        words.give_back(b, 30);
+        assert_eq!(take(100), 0);
+    }
+
+    #[test]
+    fn what_never_fits_is_refused_at_once_and_what_is_taken_is_waited_for() {
+        struct Over;
+        impl Watch for Over {
+            fn interrupt(&self) -> Option<Interrupt> {
+                Some(Interrupt::Deadline)
+            }
+        }
+        let words = Words::new(100);
+        let refused = words.take("points", 101, &Unwatched);
+        assert!(matches!(
+            refused,
+            Err(BackendError::Memory { needed: 404, .. })
+        ));
+        words.take("points", 60, &Unwatched).expect("free");
+        let interrupted = words.take("points", 60, &Over);
+        assert!(matches!(interrupted, Err(BackendError::Interrupted(_))));
+    }
+}

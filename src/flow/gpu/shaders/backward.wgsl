@@ -1,0 +1,91 @@
+// The derivative of the loss by every hidden feature, over one tile of points a workgroup.
+//
+// In: pulls (the derivative by the flow, a row each), activations, transposed networks.
+// Out: deltas, [layer][row][128]: the derivative by each hidden layer's features, zero where ReLU
+// cut them off. Mirrors ReferenceNetwork::backward. Registers and memory as in forward.wgsl.
+
+var<immediate> part: Part;
+@group(0) @binding(0) var<storage, read> networks: array<vec4<f32>>;
+@group(0) @binding(1) var<storage, read> tiles: array<Tile>;
+@group(0) @binding(2) var<storage, read> statuses: array<Status>;
+@group(0) @binding(3) var<storage, read> pulls: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read> activations: array<vec4<f32>>;
+@group(0) @binding(5) var<storage, read> lanes: array<Lane>;
+@group(0) @binding(6) var<storage, read_write> deltas: array<vec4<f32>>;
+
+var<workgroup> outputs: array<vec4<f32>, 2048>;
+
+// Keeps a quad of a row's derivatives, zero where the feature is off, and gives it back.
+fn gated(layer: u32, row: u32, column: u32, sum: vec4<f32>) -> vec4<f32> {
+    let place = (layer * part.rows + row) * QUADS + column;
+    let delta = select(vec4(0.0), sum, activations[place] > vec4(0.0));
+    deltas[place] = delta;
+    return delta;
+}
+
+@compute @workgroup_size(128)
+fn backward(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let wave_tile = group.y * groups.x + group.x;
+    if wave_tile >= part.tiles { return; }
+    let work = tiles[part.first_tile + wave_tile];
+    if statuses[work.lane].state != RUNNING { return; }
+    let network = lanes[work.lane].network * ARRAYS * LAID_OUT;
+    let row = wave_tile * TILE;
+    let first = local / 16u * 8u;
+    let quad = local % 16u;
+
+    // Sums of the point's derivatives: its quad of the lower half, and of the upper.
+    var low: array<vec4<f32>, 8>;
+    var high: array<vec4<f32>, 8>;
+    {
+        let at = network + LAST + quad;
+        let x_low = networks[at];
+        let y_low = networks[at + QUADS];
+        let z_low = networks[at + 2u * QUADS];
+        let x_high = networks[at + 16u];
+        let y_high = networks[at + QUADS + 16u];
+        let z_high = networks[at + 2u * QUADS + 16u];
+        for (var i = 0u; i < 8u; i++) {
+            let pull = pulls[row + first + i];
+            low[i] = fma(vec4(pull.x), x_low, fma(vec4(pull.y), y_low, pull.z * z_low));
+            high[i] = fma(vec4(pull.x), x_high, fma(vec4(pull.y), y_high, pull.z * z_high));
+        }
+    }
+
+    for (var done = 0u; done < MIDDLE_LAYERS; done++) {
+        let layer = MIDDLE_LAYERS - done;
+        let weights = network + TRANSPOSED * LAID_OUT + MIDDLE + (layer - 1u) * MIDDLE_STRIDE;
+        workgroupBarrier();
+        for (var i = 0u; i < 8u; i++) {
+            outputs[(first + i) * QUADS + quad] = gated(layer, row + first + i, quad, low[i]);
+            outputs[(first + i) * QUADS + quad + 16u] = gated(layer, row + first + i, quad + 16u, high[i]);
+            low[i] = vec4(0.0);
+            high[i] = vec4(0.0);
+        }
+        workgroupBarrier();
+        let at_low = weights + quad / 8u * 1024u + quad % 8u;
+        let at_high = at_low + 2048u;
+        for (var n = 0u; n < QUADS; n++) {
+            var d: array<vec4<f32>, 8>;
+            for (var i = 0u; i < 8u; i++) {
+                d[i] = outputs[(first + i) * QUADS + n];
+            }
+            for (var j = 0u; j < 4u; j++) {
+                let w_low = networks[at_low + (n * 4u + j) * 8u];
+                let w_high = networks[at_high + (n * 4u + j) * 8u];
+                for (var i = 0u; i < 8u; i++) {
+                    low[i] = fma(vec4(d[i][j]), w_low, low[i]);
+                    high[i] = fma(vec4(d[i][j]), w_high, high[i]);
+                }
+            }
+        }
+    }
+    for (var i = 0u; i < 8u; i++) {
+        gated(0u, row + first + i, quad, low[i]);
+        gated(0u, row + first + i, quad + 16u, high[i]);
+    }
+}

@@ -1,0 +1,79 @@
+// Adds up an iteration's losses and decides: go on, converged, diverged; is it the best so far?
+//
+// One workgroup a lane. In: each tile's sum of losses. Out: the lane's status and the iteration's
+// mean loss. Mirrors EarlyStop::observe and what the CPU's trainer keeps: the iteration at which
+// the stopping rule fires is no candidate for the best.
+
+var<immediate> part: Part;
+@group(0) @binding(0) var<storage, read> lanes: array<Lane>;
+@group(0) @binding(1) var<storage, read> steps: array<Step>;
+@group(0) @binding(2) var<storage, read> tile_losses: array<f32>;
+@group(0) @binding(3) var<storage, read_write> statuses: array<Status>;
+@group(0) @binding(4) var<storage, read_write> losses: array<f32>;
+
+const THREADS = 256u;
+var<workgroup> sums: array<f32, THREADS>;
+
+@compute @workgroup_size(THREADS)
+fn judge(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let lane = group.x;
+    let first = lanes[lane].first_tile;
+    var sum = 0.0;
+    for (var tile = local; tile < lanes[lane].tiles; tile += THREADS) {
+        sum += tile_losses[first + tile];
+    }
+    sums[local] = sum;
+    for (var stride = THREADS / 2u; stride > 0u; stride /= 2u) {
+        workgroupBarrier();
+        if local < stride {
+            sums[local] += sums[local + stride];
+        }
+    }
+    if local > 0u { return; }
+    var status = statuses[lane];
+    status.applies = 0u;
+    status.improves = 0u;
+    if status.state == RUNNING {
+        let place = lane * STEPS + part.step;
+        let loss = sums[0] / f32(steps[place].count);
+        losses[place] = loss;
+        // No comparison with what is not a number or not finite holds.
+        if loss < 3.4e38 {
+            observe(&status, lane, place, loss);
+        } else {
+            status.state = DIVERGED;
+        }
+    }
+    statuses[lane] = status;
+}
+
+fn observe(status: ptr<function, Status>, lane: u32, place: u32, loss: f32) {
+    let patience = lanes[lane].patience;
+    if patience > 0u {
+        if (*status).seen == 1u && loss >= (*status).seen_best - lanes[lane].min_delta {
+            (*status).without_progress += 1u;
+        } else {
+            (*status).seen = 1u;
+            (*status).seen_best = loss;
+            (*status).without_progress = 0u;
+        }
+        if (*status).without_progress >= patience {
+            (*status).state = CONVERGED;
+        }
+    }
+    (*status).iterations += 1u;
+    (*status).applies = 1u;
+    if lanes[lane].average == 1u {
+        let before = select((*status).best_loss, loss, (*status).iterations == 1u);
+        (*status).best_loss = before + steps[place].fresh * (loss - before);
+        (*status).best_iteration = (*status).iterations;
+        (*status).improves = 1u;
+    } else if loss <= (*status).best_loss && (*status).state == RUNNING {
+        (*status).best_loss = loss;
+        (*status).best_iteration = (*status).iterations;
+        (*status).improves = 1u;
+    }
+}

@@ -1,0 +1,48 @@
+// Adds up the chunks' gradients, in order, keeps what is to be kept, and takes Adam's step.
+//
+// A vec4 of one lane's network an invocation. In: partial gradients, statuses. Out: the lane's
+// parameters, transposes, moments and kept parameters. Mirrors AdamStep::apply.
+
+var<immediate> part: Part;
+@group(0) @binding(0) var<storage, read> lanes: array<Lane>;
+@group(0) @binding(1) var<storage, read> steps: array<Step>;
+@group(0) @binding(2) var<storage, read> statuses: array<Status>;
+@group(0) @binding(3) var<storage, read> partials: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read_write> networks: array<vec4<f32>>;
+
+const EPSILON = vec4(1e-8);
+// 1 - beta: weights of the present in the means of the gradients and of their squares.
+const FRESH_MEAN = vec4(0.1);
+const FRESH_SQUARE = vec4(0.001);
+
+@compute @workgroup_size(128)
+fn step(
+    @builtin(global_invocation_id) id: vec3<u32>,
+    @builtin(workgroup_id) group: vec3<u32>,
+) {
+    let lane = group.y;
+    let place = id.x;
+    let status = statuses[lane];
+    if place >= LAID_OUT || status.applies == 0u { return; }
+    let now = steps[lane * STEPS + part.step];
+    var gradient = vec4(0.0);
+    let first = lanes[lane].first_chunk;
+    for (var chunk = 0u; chunk < lanes[lane].chunks; chunk++) {
+        gradient += partials[(first + chunk) * LAID_OUT + place];
+    }
+    let at = lanes[lane].network * ARRAYS * LAID_OUT + place;
+    let parameter = networks[at + PARAMETERS * LAID_OUT];
+    if status.improves == 1u {
+        let kept = networks[at + KEPT * LAID_OUT];
+        let fresh = select(1.0, now.fresh, lanes[lane].average == 1u);
+        networks[at + KEPT * LAID_OUT] = select(kept + fresh * (parameter - kept), parameter, vec4(fresh == 1.0));
+    }
+    let before = networks[at + MEANS * LAID_OUT];
+    let before_square = networks[at + SQUARES * LAID_OUT];
+    let mean = before + (gradient - before) * FRESH_MEAN;
+    let square = before_square + (gradient * gradient - before_square) * FRESH_SQUARE;
+    let stepped = parameter - now.step_size * mean / (sqrt(square) * now.square_correction + EPSILON);
+    networks[at + MEANS * LAID_OUT] = mean;
+    networks[at + SQUARES * LAID_OUT] = square;
+    networks[at + PARAMETERS * LAID_OUT] = stepped;
+}

@@ -1,0 +1,41 @@
+// The transposes of a lane's middle layers, which the backward pass reads. Mirrors
+// transpose_middle_layers: entry (output, input) of the one is entry (input, output) of the other,
+// both in panels of 32.
+//
+// A workgroup moves one square of 32 x 32 floats (x) of one lane (y), through workgroup memory, so
+// that both sides are read and written in whole lines.
+
+@group(0) @binding(0) var<storage, read> statuses: array<Status>;
+@group(0) @binding(1) var<storage, read> lanes: array<Lane>;
+@group(0) @binding(2) var<storage, read_write> networks: array<vec4<f32>>;
+
+// A float more a row, so that columns lie in different banks.
+const ROW = 33u;
+var<workgroup> square: array<f32, 1056>;
+
+@compute @workgroup_size(256)
+fn transpose(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let lane = group.y;
+    if statuses[lane].applies == 0u { return; }
+    let layer = group.x / 16u;
+    let from_panel = group.x / 4u % 4u;
+    let to_panel = group.x % 4u;
+    let weights = lanes[lane].network * ARRAYS * LAID_OUT + MIDDLE + layer * MIDDLE_STRIDE;
+    let input = local / 8u;
+    let quad = local % 8u;
+    let value = networks[weights + from_panel * 1024u + (to_panel * 32u + input) * 8u + quad];
+    for (var i = 0u; i < 4u; i++) {
+        square[input * ROW + quad * 4u + i] = value[i];
+    }
+    workgroupBarrier();
+    let output = local / 8u;
+    var turned: vec4<f32>;
+    for (var i = 0u; i < 4u; i++) {
+        turned[i] = square[(quad * 4u + i) * ROW + output];
+    }
+    let to = weights + TRANSPOSED * LAID_OUT;
+    networks[to + to_panel * 1024u + (from_panel * 32u + output) * 8u + quad] = turned;
+}

@@ -1,0 +1,59 @@
+//! The card against the double-precision reference and the CPU backend.
+//!
+//! Needs a card; a software one will do. Where there is none these tests say so and pass, unless
+//! FNSF_REQUIRE_GPU is set.
+
+mod failures;
+mod kernels;
+mod shaders;
+mod whole;
+
+use std::sync::OnceLock;
+
+use super::{Gpu, GpuOptions, Selector, select};
+use crate::flow::points::Point;
+use crate::flow::random::Random;
+
+/// Pairs that the shared card fits at the same time.
+const LANES: usize = 4;
+
+/// A card of this test's own; none where the machine has none.
+fn opened(options: &GpuOptions) -> Option<Gpu> {
+    match select(&Selector::Any, true) {
+        Ok(adapter) => Some(Gpu::open(&adapter, options).expect("the card opens")),
+        Err(error) => {
+            let required = std::env::var_os("FNSF_REQUIRE_GPU").is_some();
+            assert!(!required, "{error}");
+            #[expect(clippy::print_stderr, reason = "a test that tests nothing says so")]
+            {
+                eprintln!("not tested: {error}");
+            }
+            None
+        }
+    }
+}
+
+/// The card that tests share which do it no harm.
+fn shared() -> Option<&'static Gpu> {
+    static SHARED: OnceLock<Option<Gpu>> = OnceLock::new();
+    let options = GpuOptions {
+        lanes: LANES,
+        memory_bytes: None,
+    };
+    SHARED.get_or_init(|| opened(&options)).as_ref()
+}
+
+/// A wall and a box in front of it, and the same moved by a quarter of a metre.
+fn clouds(points: usize) -> [Vec<Point>; 2] {
+    let mut random = Random::new(5);
+    let mut across = |width: f64| random.uniform(-width, width) as f32;
+    let source: Vec<Point> = (0..points)
+        .map(|i| match i % 3 {
+            0 => [4.0, across(1.0), across(1.0)],
+            _ => [8.0, across(6.0), across(2.0)],
+        })
+        .collect();
+    let moved = |p: &Point| [p[0] + 0.1, p[1] + 0.2, p[2]];
+    let target = source.iter().map(moved).collect();
+    [source, target]
+}

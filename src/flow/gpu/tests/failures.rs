@@ -1,0 +1,160 @@
+//! What happens when a card cannot do what is asked of it, or goes away.
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use super::super::{Gpu, GpuOptions, Selector, select};
+use super::{clouds, opened, shared};
+use crate::flow::backend::{Advance, Backend, BackendError};
+use crate::flow::distance::{DistanceOptions, Metric, Sites};
+use crate::flow::options::Preset;
+use crate::flow::points::Point;
+use crate::flow::preprocess::Problem;
+use crate::flow::solver::estimate;
+use crate::flow::watch::{Progress, Unwatched, Watch};
+use crate::flow::{FlowError, Interrupt};
+
+/// Gives the card up after some iterations.
+struct Kill<'a>(&'a Gpu, AtomicUsize);
+
+impl Watch for Kill<'_> {
+    fn progress(&self, _: Progress) {
+        if self.1.fetch_add(1, Ordering::Relaxed) == 4 {
+            self.0.destroy();
+        }
+    }
+}
+
+#[test]
+fn a_card_lost_in_the_middle_of_a_run_fails_the_run_and_can_be_opened_again() {
+    let Some(gpu) = opened(&GpuOptions::default()) else {
+        return;
+    };
+    let [source, target] = clouds(500);
+    let problem = Problem {
+        source: &source,
+        target: &target,
+        ground: None,
+    };
+    let options = Preset::Default.options(None);
+    let killed = estimate(&gpu, &problem, &options, &Kill(&gpu, AtomicUsize::new(0)));
+    assert!(
+        matches!(killed, Err(FlowError::Backend(BackendError::Lost(_)))),
+        "{:?}",
+        killed.err()
+    );
+    assert!(gpu.is_lost());
+    let later = estimate(&gpu, &problem, &options, &Unwatched);
+    assert!(matches!(
+        later,
+        Err(FlowError::Backend(BackendError::Lost(_)))
+    ));
+    drop(gpu);
+    let again = opened(&GpuOptions::default()).expect("it was there before");
+    estimate(&again, &problem, &options, &Unwatched).expect("a flow");
+}
+
+#[test]
+fn a_pair_that_never_fits_is_refused_before_it_takes_anything() {
+    let Some(gpu) = shared() else {
+        return;
+    };
+    // Points 8 m apart in space: each of them activates hundreds of bricks of its own.
+    let cloud: Vec<Point> = (0..40u8)
+        .flat_map(|x| (0..40u8).map(move |y| [x, y]))
+        .flat_map(|[x, y]| (0..4u8).map(move |z| [x, y, z].map(|c| f32::from(c) * 8.0)))
+        .collect();
+    let refused = gpu.transform(&cloud, &cloud, &DistanceOptions::default(), &Unwatched);
+    match refused.err() {
+        Some(BackendError::Memory {
+            needed, available, ..
+        }) => assert!(needed > available),
+        // A large card has room for it.
+        None => assert!(gpu.memory_bytes() > 1 << 30),
+        Some(error) => panic!("{error}"),
+    }
+}
+
+#[test]
+fn what_only_the_cpu_computes_is_refused_by_name() {
+    let Some(gpu) = shared() else {
+        return;
+    };
+    let [source, target] = clouds(100);
+    for (metric, sites) in [
+        (Metric::Chamfer, Sites::Cells),
+        (Metric::Euclidean, Sites::Points),
+    ] {
+        let options = DistanceOptions {
+            metric,
+            sites,
+            ..DistanceOptions::default()
+        };
+        let refused = gpu.transform(&source, &target, &options, &Unwatched);
+        assert!(matches!(
+            refused.err(),
+            Some(BackendError::Unsupported(text)) if text.contains("CPU")
+        ));
+    }
+}
+
+#[test]
+fn more_pairs_than_lanes_are_told_to_come_back() {
+    let Some(gpu) = opened(&GpuOptions::default()) else {
+        return;
+    };
+    let [source, target] = clouds(100);
+    let options = Preset::Paper.options(None);
+    let transform = gpu
+        .transform(&source, &target, &options.distance, &Unwatched)
+        .expect("small clouds fit");
+    let first = transform.start(&source, &options).expect("a trainer");
+    let second = transform.start(&source, &options);
+    assert!(matches!(second.err(), Some(BackendError::Busy)));
+    drop(first);
+    transform.start(&source, &options).expect("a trainer");
+}
+
+#[test]
+fn a_run_that_diverges_says_so() {
+    let Some(gpu) = shared() else {
+        return;
+    };
+    let [source, target] = clouds(100);
+    let mut options = Preset::Paper.options(None);
+    options.learning_rate = f32::INFINITY;
+    let transform = gpu
+        .transform(&source, &target, &options.distance, &Unwatched)
+        .expect("small clouds fit");
+    let mut trainer = transform.start(&source, &options).expect("a trainer");
+    let ended = trainer.advance(5, &Unwatched).expect("an answer");
+    assert_eq!(ended, Advance::Diverged);
+}
+
+#[test]
+fn an_interrupted_run_stops_between_submissions() {
+    struct Now;
+    impl Watch for Now {
+        fn interrupt(&self) -> Option<Interrupt> {
+            Some(Interrupt::Cancelled)
+        }
+    }
+    let Some(gpu) = shared() else {
+        return;
+    };
+    let [source, target] = clouds(100);
+    let options = Preset::Paper.options(None);
+    let transform = gpu
+        .transform(&source, &target, &options.distance, &Unwatched)
+        .expect("small clouds fit");
+    let mut trainer = transform.start(&source, &options).expect("a trainer");
+    let ended = trainer.advance(5, &Now).expect("an answer");
+    assert_eq!(ended, Advance::Interrupted(Interrupt::Cancelled));
+    assert_eq!(trainer.report().iterations, 0);
+}
+
+#[test]
+fn a_card_that_is_not_there_is_named() {
+    let missing = select(&Selector::Named("no such card".to_owned()), true);
+    let text = missing.map(|_| ()).expect_err("there is none").to_string();
+    assert!(text.contains("gpu:no such card"), "{text}");
+}

@@ -1,0 +1,262 @@
+//! Each kernel against the double-precision reference, at awkward sizes.
+
+use super::{clouds, shared};
+use crate::flow::backend::{Backend, Transform};
+use crate::flow::distance::{Bricks, DistanceOptions, DistanceTransform};
+use crate::flow::field::mlp::{Conditioning, Parameters};
+use crate::flow::gpu::transform::{GpuTransform, build};
+use crate::flow::options::{Keep, Options, Preset};
+use crate::flow::points::Point;
+use crate::flow::random::Random;
+use crate::flow::reference::ReferenceNetwork;
+use crate::flow::simulate::{Street, StreetOptions};
+use crate::flow::snapshot::TrainerState;
+use crate::flow::watch::Unwatched;
+
+/// Single precision over sums of 128 terms, eight layers deep.
+const NETWORK_TOLERANCE: f64 = 2e-5;
+/// As above, and over the points; single-precision losses' signs may differ at kinks.
+const GRADIENT_TOLERANCE: f64 = 1e-4;
+/// Metres, and per metre: a coordinate in cells has 24 bits, a corner's distance 16.
+const SAMPLE_TOLERANCE_M: f32 = 2e-5;
+
+fn transform(source: &[Point], target: &[Point]) -> Option<GpuTransform> {
+    let card = shared()?.card();
+    let options = DistanceOptions::default();
+    let built = build(card, source, target, &options, &Unwatched);
+    Some(built.expect("small clouds fit"))
+}
+
+fn scattered(points: usize, spread: [f64; 3], seed: u64) -> Vec<Point> {
+    let mut random = Random::new(seed);
+    let mut point = || spread.map(|side| random.uniform(-side, side) as f32);
+    (0..points).map(|_| point()).collect()
+}
+
+fn street() -> [Vec<Point>; 2] {
+    let options = StreetOptions {
+        beams: 16,
+        azimuth_steps: 500,
+        ..StreetOptions::default()
+    };
+    let pair = Street::new(&options).and_then(|street| street.pair(0));
+    let pair = pair.expect("a small street");
+    [pair.source, pair.target]
+}
+
+#[test]
+fn bricks_have_the_bits_of_the_cpus() {
+    let [source, target] = street();
+    // The second has more bricks than a dispatch has groups along one dimension.
+    let sparse = scattered(520, [300.0, 300.0, 20.0], 3);
+    for (source, target) in [(source, target), (sparse.clone(), sparse)] {
+        let Some(gpu) = transform(&source, &target) else {
+            return;
+        };
+        let cpu = Bricks::build(&source, &target, &DistanceOptions::default());
+        let cpu = cpu.expect("small clouds fit");
+        assert_eq!(gpu.bytes(), cpu.bytes());
+        let mut encoder = gpu.card.encoder();
+        let bytes = cpu.codes().len() as u64 * 2;
+        let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
+        let copy = gpu.card.empty(bytes, usage).expect("memory");
+        let from = u64::from(gpu.record.codes) * 4;
+        encoder.copy_buffer_to_buffer(&gpu.card.buffers.store, from, &copy, 0, bytes);
+        let read = gpu.card.finish(encoder, &copy, bytes).expect("an answer");
+        let wrong = read
+            .as_chunks::<2>()
+            .0
+            .iter()
+            .zip(cpu.codes())
+            .filter(|&(&bytes, &code)| u16::from_le_bytes(bytes) != code);
+        assert_eq!(wrong.count(), 0, "of {} codes", cpu.codes().len());
+    }
+}
+
+#[test]
+fn samples_are_those_of_the_cpu_near_far_and_outside() {
+    let [source, target] = street();
+    let Some(gpu) = transform(&source, &target) else {
+        return;
+    };
+    let cpu = DistanceTransform::build(&source, &target, &DistanceOptions::default());
+    let cpu = cpu.expect("small clouds fit");
+    let mut points = scattered(20_000, [120.0, 120.0, 12.0], 4);
+    points.extend(&source);
+    points.extend([[1e6, 0.0, 0.0], [0.0, -1e6, 1e6]]);
+    for count in [0, 1, 63, 64, 65, points.len()] {
+        let samples = gpu.samples(&points[..count]).expect("an answer");
+        assert_eq!(samples.len(), count);
+        let mut kinks = 0;
+        for (&point, seen) in points.iter().zip(&samples) {
+            let expected = cpu.sample(point);
+            let off = (seen.distance - expected.distance).abs();
+            let tolerance = SAMPLE_TOLERANCE_M * expected.distance.max(1.0);
+            assert!(off < tolerance, "{point:?}: {seen:?} {expected:?}");
+            let slopes = seen.gradient.iter().zip(expected.gradient);
+            let turned = slopes.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            // On the border of two cells the slope may be either's.
+            kinks += usize::from(turned > 1e-2);
+        }
+        assert!(kinks <= count / 500, "{kinks} of {count} slopes differ");
+    }
+}
+
+/// The options of a run whose network is neither zero nor decayed.
+fn plain() -> Options {
+    let mut options = Preset::Paper.options(None);
+    options.early_stop = None;
+    options
+}
+
+fn network(options: &Options) -> ReferenceNetwork {
+    let mut random = Random::stream(options.seed, 0);
+    ReferenceNetwork::read(&Parameters::xavier(&mut random))
+}
+
+#[test]
+fn the_network_is_the_references_at_awkward_row_counts() {
+    let [source, target] = clouds(300);
+    let Some(gpu) = transform(&source, &target) else {
+        return;
+    };
+    let options = plain();
+    let mut trainer = gpu.start(&source, &options).expect("a trainer");
+    let reference = network(&options);
+    for rows in [0, 1, 7, 8, 63, 64, 65, 1000] {
+        let points = scattered(rows, [9.0, 6.0, 2.0], 11);
+        let flow = trainer.evaluate(&points).expect("an answer");
+        assert_eq!(flow.len(), rows);
+        for (point, flow) in points.iter().zip(&flow) {
+            let expected = reference.forward(point.map(f64::from));
+            for (&value, expected) in flow.iter().zip(expected) {
+                let error = (f64::from(value) - expected).abs();
+                let scale = expected.abs().max(1.0);
+                assert!(
+                    error < NETWORK_TOLERANCE * scale,
+                    "{rows}: {flow:?} {expected}"
+                );
+            }
+        }
+    }
+}
+
+/// The trainer's state after one iteration over the points.
+fn after_one(gpu: &GpuTransform, source: &[Point], options: &Options) -> TrainerState {
+    let mut trainer = gpu.start(source, options).expect("a trainer");
+    trainer.advance(1, &Unwatched).expect("an iteration");
+    trainer.state().expect("an answer")
+}
+
+#[test]
+fn every_gradient_is_the_references_at_awkward_row_counts() {
+    let [cloud, target] = clouds(9000);
+    for preset in Preset::ALL {
+        let mut options = Options {
+            loss: preset.options(None).loss,
+            inputs: preset.options(None).inputs,
+            ..plain()
+        };
+        options.keep = Keep::Best;
+        for rows in [3, 63, 64, 65, 600] {
+            let source = &cloud[..rows];
+            let Some(gpu) = transform(source, &target) else {
+                return;
+            };
+            let distance = DistanceTransform::build(source, &target, &options.distance);
+            let distance = distance.expect("small clouds fit");
+            let reference = network(&options);
+            let conditioning = Conditioning::new(source, options.inputs);
+            let mut expected = ReferenceNetwork::read(&Parameters::zeros());
+            for &point in source {
+                let input = conditioning.apply(point).map(f64::from);
+                let flow = reference.forward(input).map(|f| f as f32);
+                let deformed = core::array::from_fn(|a| point[a] + flow[a]);
+                let loss = options.loss.at(point, distance.sample(deformed), flow);
+                let pull = loss.gradient.map(|g| f64::from(g) / rows as f64);
+                reference.backward(input, pull, &mut expected);
+            }
+            // After one step from nothing the mean of the gradients is a tenth of the gradient.
+            let mut state = after_one(&gpu, source, &options);
+            let means = &mut state.moments[0];
+            means
+                .as_mut_slice()
+                .iter_mut()
+                .for_each(|mean| *mean *= 10.0);
+            let gradients = ReferenceNetwork::read(means).flat();
+            let expected = expected.flat();
+            let scale = expected.iter().fold(0.0f64, |most, g| most.max(g.abs()));
+            for (place, (gradient, expected)) in gradients.iter().zip(&expected).enumerate() {
+                let error = (gradient - expected).abs() / scale;
+                assert!(
+                    error < GRADIENT_TOLERANCE,
+                    "{preset:?}, {rows} rows, parameter {place}: {gradient} {expected}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn more_points_than_the_memory_holds_at_once_give_the_gradient_of_all() {
+    // The software card holds fewer rows than this at once; the mean over twice the same points is
+    // the mean over them.
+    let [cloud, target] = clouds(12_288);
+    let Some(gpu) = transform(&cloud, &target) else {
+        return;
+    };
+    let once = after_one(&gpu, &cloud, &plain());
+    let twice: Vec<_> = cloud.iter().chain(&cloud).copied().collect();
+    let twice = after_one(&gpu, &twice, &plain());
+    let [once, twice] = [once, twice].map(|state| ReferenceNetwork::read(&state.moments[0]).flat());
+    let scale = once.iter().fold(0.0f64, |most, g| most.max(g.abs()));
+    for (a, b) in once.iter().zip(&twice) {
+        assert!((a - b).abs() < GRADIENT_TOLERANCE * scale, "{a} {b}");
+    }
+}
+
+#[test]
+fn the_first_losses_are_those_of_the_method_in_double_precision() {
+    // As on the CPU: ten steps that each move every weight by 0.008.
+    const TOLERANCE: f64 = 2e-3;
+    const STEPS: i32 = 10;
+    let [source, target] = clouds(200);
+    let options = Preset::Paper.options(None);
+    let Some(gpu) = shared() else {
+        return;
+    };
+    let distance = DistanceTransform::build(&source, &target, &options.distance);
+    let distance = distance.expect("small clouds fit");
+    let mut reference = network(&options);
+    let zeros = vec![0.0; reference.flat().len()];
+    let mut moments = [zeros.clone(), zeros];
+    let mut expected = Vec::new();
+    for iteration in 1..=STEPS {
+        let mut gradients = ReferenceNetwork::read(&Parameters::zeros());
+        let mut loss = 0.0;
+        for point in &source {
+            let input = point.map(f64::from);
+            let flow = reference.forward(input);
+            let sample = distance.sample(core::array::from_fn(|a| (input[a] + flow[a]) as f32));
+            loss += f64::from(sample.distance) / source.len() as f64;
+            let pull = sample.gradient.map(|g| f64::from(g) / source.len() as f64);
+            reference.backward(input, pull, &mut gradients);
+        }
+        reference.adam_step(&gradients, &mut moments, iteration, 0.008);
+        expected.push(loss);
+    }
+    let transform = gpu
+        .transform(&source, &target, &options.distance, &Unwatched)
+        .expect("small clouds fit");
+    let losses = super::whole::Losses::default();
+    let mut trainer = transform.start(&source, &options).expect("a trainer");
+    trainer
+        .advance(STEPS as usize, &losses)
+        .expect("iterations");
+    let losses = losses.taken();
+    assert_eq!(losses.len(), expected.len());
+    for (loss, expected) in losses.iter().zip(&expected) {
+        let error = (loss - expected).abs() / expected;
+        assert!(error < TOLERANCE, "{losses:?} {expected:?}");
+    }
+}

@@ -1,0 +1,127 @@
+//! What can be said of the shaders without a card.
+
+use core::mem::offset_of;
+
+use naga::valid::{Capabilities, ValidationFlags, Validator};
+
+use super::super::kernels::SOURCES;
+use super::super::records;
+
+fn parsed(name: &str, source: &str) -> naga::Module {
+    naga::front::wgsl::parse_str(source)
+        .unwrap_or_else(|error| panic!("{name}: {}", error.emit_to_string(source)))
+}
+
+#[test]
+fn every_shader_is_valid_and_fits_the_smallest_workgroup_memory() {
+    const WORKGROUP_BYTES: u32 = 32 << 10;
+    for (name, source) in SOURCES {
+        let module = parsed(name, source);
+        let mut validator = Validator::new(ValidationFlags::all(), Capabilities::IMMEDIATES);
+        let info = validator
+            .validate(&module)
+            .unwrap_or_else(|error| panic!("{name}: {}", error.emit_to_string(source)));
+        let mut bytes = 0;
+        for (handle, variable) in module.global_variables.iter() {
+            if variable.space == naga::AddressSpace::WorkGroup
+                && !info.get_entry_point(0)[handle].is_empty()
+            {
+                bytes += module.types[variable.ty].inner.size(module.to_ctx());
+            }
+        }
+        assert!(bytes <= WORKGROUP_BYTES, "{name}: {bytes}");
+        assert_eq!(module.entry_points.len(), 1);
+        assert_eq!(module.entry_points[0].name, name);
+    }
+}
+
+/// Each record's fields as the shader places them: name and offset, and the record's size.
+fn layout(source: &str, record: &str) -> (Vec<(String, usize)>, usize) {
+    let module = parsed(record, source);
+    let found = module
+        .types
+        .iter()
+        .find(|(_, kind)| kind.name.as_deref() == Some(record));
+    let (_, kind) = found.unwrap_or_else(|| panic!("no {record}"));
+    let naga::TypeInner::Struct { members, span } = &kind.inner else {
+        panic!("{record} is no record")
+    };
+    let name = |member: &naga::StructMember| member.name.clone().unwrap_or_default();
+    let members = members.iter().map(|m| (name(m), m.offset as usize));
+    (members.collect(), *span as usize)
+}
+
+macro_rules! same_layout {
+    ($shader:literal, $record:ident: $($field:ident),+) => {
+        let source = SOURCES.iter().find(|(name, _)| *name == $shader).expect("a kernel").1;
+        let (fields, size) = layout(source, stringify!($record));
+        let ours = vec![$((stringify!($field).to_owned(), offset_of!(records::$record, $field))),+];
+        assert_eq!(fields, ours, stringify!($record));
+        assert_eq!(size, size_of::<records::$record>(), stringify!($record));
+    };
+}
+
+#[test]
+fn host_and_shaders_agree_on_every_record() {
+    same_layout!("query", Transform: origin_high, origin_low, inverse_cell, code_scale, vertices,
+        blocks, tables, bricks, codes, far, far_pitch, far_vertices);
+    same_layout!("query", Lane: transform, network, points, first_tile, tiles, first_chunk, chunks,
+        center, scale, margin, margin_slope, truncation, flow_penalty, average, patience, min_delta);
+    same_layout!("forward", Step: first, count, step_size, square_correction, fresh);
+    same_layout!("forward", Tile: lane, tile);
+    same_layout!("gradients", Chunk: lane, first_row, rows, first_point);
+    same_layout!("judge", Status: state, iterations, best_iteration, best_loss, seen, seen_best,
+        without_progress, applies, improves);
+    same_layout!("forward", Part: step, first_tile, first_chunk, tiles, rows);
+}
+
+#[test]
+fn host_and_brick_kernel_agree_on_every_record() {
+    let source = SOURCES[0].1;
+    assert_eq!(layout(source, "Plan").1, size_of::<records::BrickPlan>());
+    assert_eq!(layout(source, "Column").1, size_of::<records::Column>());
+}
+
+/// The value of a whole constant of a shader.
+fn constant(source: &str, name: &str) -> usize {
+    let line = source
+        .lines()
+        .find_map(|line| line.strip_prefix(&format!("const {name} = ")));
+    let value = line.unwrap_or_else(|| panic!("no {name}"));
+    value
+        .trim_end_matches("u;")
+        .parse()
+        .unwrap_or_else(|_| panic!("{name} = {value}"))
+}
+
+#[test]
+fn host_and_shaders_agree_on_the_network() {
+    use crate::flow::field::mlp;
+    let source = SOURCES.iter().find(|(name, _)| *name == "forward");
+    let source = source.expect("a kernel").1;
+    let middle = mlp::middle_layer(0);
+    for (name, floats) in [
+        ("FIRST_BIAS", mlp::first_layer().bias),
+        ("MIDDLE", middle.weights),
+        ("MIDDLE_BIAS", middle.bias - middle.weights),
+        (
+            "MIDDLE_STRIDE",
+            mlp::middle_layer(1).weights - middle.weights,
+        ),
+        ("LAST", mlp::last_layer().weights),
+        ("LAST_BIAS", mlp::last_layer().bias),
+        ("LAID_OUT", mlp::LAID_OUT),
+        ("QUADS", mlp::WIDTH),
+    ] {
+        assert_eq!(constant(source, name) * 4, floats, "{name}");
+    }
+    for (name, value) in [
+        ("WIDTH", mlp::WIDTH),
+        ("MIDDLE_LAYERS", mlp::MIDDLE_LAYERS),
+        ("TILE", records::TILE),
+        ("STEPS", records::STEPS),
+        ("ARRAYS", records::ARRAYS),
+    ] {
+        assert_eq!(constant(source, name), value, "{name}");
+    }
+}

@@ -1,0 +1,361 @@
+//! One optimization on the card. Knows what a pair wants; how pairs share the card is batch.rs's.
+
+use std::sync::Arc;
+
+use super::batch::{Done, Request, most_batch_points};
+use super::device::{Card, spread};
+use super::plan::Cut;
+use super::records::{self, ARRAYS, CONVERGED, DIVERGED, STEPS, Status, TILE};
+use super::transform::{GpuTransform, Stretch};
+use crate::flow::backend::{Advance, BackendError, Report, Trainer};
+use crate::flow::course::Course;
+use crate::flow::early_stop::Seen;
+use crate::flow::field::mlp::{LAID_OUT, Parameters, transpose_middle_layers};
+use crate::flow::options::Options;
+use crate::flow::points::Point;
+use crate::flow::snapshot::TrainerState;
+use crate::flow::watch::{Progress, Unwatched, Watch};
+
+/// Seconds that a submission should take: a look at the watch, and at the card's health.
+const SUBMISSION_SECONDS: f64 = 0.03;
+/// Iterations of a submission where the card shows no clock.
+const BLIND_STEPS: usize = 4;
+/// Points that are evaluated at a time.
+const EVALUATED: usize = 1 << 18;
+/// Bytes of one network.
+const NETWORK_BYTES: u64 = (LAID_OUT * size_of::<f32>()) as u64;
+
+/// The places of a lane's arrays; common.wgsl has the same.
+const PARAMETERS: u64 = 0;
+const TRANSPOSED: u64 = 1;
+const MEANS: u64 = 2;
+const SQUARES: u64 = 3;
+const KEPT: u64 = 4;
+
+/// One of the card's networks, as long as somebody fits it.
+struct Network {
+    card: Arc<Card>,
+    number: u32,
+}
+
+impl Network {
+    fn take(card: &Arc<Card>) -> Result<Self, BackendError> {
+        let number = card.take_network()?;
+        card.batch.joined();
+        Ok(Self {
+            card: Arc::clone(card),
+            number,
+        })
+    }
+
+    /// Where one of its arrays begins, bytes.
+    fn at(&self, array: u64) -> u64 {
+        (u64::from(self.number) * ARRAYS as u64 + array) * NETWORK_BYTES
+    }
+
+    fn write(&self, array: u64, parameters: &Parameters) {
+        let bytes = bytemuck::cast_slice(&parameters.as_slice()[..LAID_OUT]);
+        let queue = &self.card.queue;
+        queue.write_buffer(&self.card.buffers.networks, self.at(array), bytes);
+    }
+}
+
+impl Drop for Network {
+    fn drop(&mut self) {
+        self.card.batch.left();
+        self.card.give_network_back(self.number);
+    }
+}
+
+/// The network, its optimizer and the distance that it is fitted to.
+pub(super) struct GpuTrainer<'a> {
+    transform: &'a GpuTransform,
+    course: Course,
+    network: Network,
+    points: Stretch,
+    status: Status,
+    /// Iterations that the next submission should have.
+    stride: usize,
+    query_seconds: f64,
+}
+
+impl<'a> GpuTrainer<'a> {
+    pub(super) fn new(
+        transform: &'a GpuTransform,
+        source: &[Point],
+        options: &Options,
+    ) -> Result<Self, BackendError> {
+        let card = &transform.card;
+        let (course, parameters) = Course::new(source, options);
+        if course.largest_batch() > most_batch_points() {
+            return Err(BackendError::Memory {
+                what: "gradients",
+                needed: course.largest_batch() as u64,
+                available: most_batch_points() as u64,
+            });
+        }
+        let words = course.points.len() as u64 * 3;
+        let points = Stretch::take(card, "points", words, &Unwatched)?;
+        let at = u64::from(points.place) * 4;
+        let bytes = bytemuck::cast_slice(&course.points);
+        card.queue.write_buffer(&card.buffers.store, at, bytes);
+        let mut trainer = Self {
+            transform,
+            network: Network::take(card)?,
+            course,
+            points,
+            status: Status::default(),
+            stride: 1,
+            query_seconds: 0.0,
+        };
+        trainer.restore(TrainerState::at_start(parameters))?;
+        Ok(trainer)
+    }
+
+    fn card(&self) -> &Arc<Card> {
+        &self.transform.card
+    }
+
+    /// The lane's record, but for its place among those of a submission.
+    pub(super) fn lane(&self) -> records::Lane {
+        let options = &self.course.options;
+        let (loss, rule) = (&options.loss, options.early_stop);
+        records::Lane {
+            transform: self.transform.record,
+            network: self.network.number,
+            points: self.points.place,
+            center: self.course.conditioning.center,
+            scale: self.course.conditioning.scale,
+            margin: loss.margin_m,
+            margin_slope: loss.margin_slope,
+            truncation: loss.truncation_m.unwrap_or(f32::MAX),
+            flow_penalty: loss.flow_penalty,
+            average: self.course.fresh(0).is_some().into(),
+            patience: rule.map_or(0, |rule| rule.patience.max(1) as u32),
+            min_delta: rule.map_or(0.0, |rule| rule.min_delta_m as f32),
+            ..records::Lane::default()
+        }
+    }
+
+    /// The iteration after `done` others.
+    fn step(&self, done: usize) -> records::Step {
+        let batch = self.course.batch(done);
+        let adam = self.course.adam(done);
+        records::Step {
+            first: batch.start as u32,
+            count: batch.len() as u32,
+            step_size: adam.step_size,
+            square_correction: adam.square_correction,
+            fresh: self.course.fresh(done).unwrap_or(1.0),
+        }
+    }
+
+    /// Does up to `steps` iterations in one submission.
+    fn submit(&mut self, steps: usize) -> Result<Done, BackendError> {
+        let done = self.status.iterations as usize;
+        let request = Request {
+            lane: self.lane(),
+            status: self.status,
+            steps: (done..done + steps).map(|done| self.step(done)).collect(),
+            cut: Cut::new(self.course.largest_batch()),
+        };
+        let done = self.card().batch.run(self.card(), request)?;
+        self.status = done.status;
+        match done.pace {
+            Some(pace) => {
+                let own = pace.iteration_seconds * pace.query_share / pace.pairs as f64;
+                self.query_seconds += own * done.losses.len() as f64;
+                let fitting = SUBMISSION_SECONDS / pace.iteration_seconds.max(1e-6);
+                self.stride = (fitting as usize).clamp(1, STEPS);
+            }
+            None => self.stride = BLIND_STEPS,
+        }
+        Ok(done)
+    }
+
+    fn iterations(&self) -> usize {
+        self.status.iterations as usize
+    }
+}
+
+impl Trainer for GpuTrainer<'_> {
+    fn advance(&mut self, steps: usize, watch: &dyn Watch) -> Result<Advance, BackendError> {
+        let first = self.iterations();
+        let most = self.course.options.max_iterations;
+        loop {
+            let done = self.iterations() - first;
+            if self.iterations() >= most {
+                return Ok(Advance::Exhausted);
+            }
+            if done >= steps {
+                return Ok(Advance::Continues);
+            }
+            if let Some(interrupt) = watch.interrupt() {
+                return Ok(Advance::Interrupted(interrupt));
+            }
+            if done > 0 && watch.snapshot_due() {
+                return Ok(Advance::Continues);
+            }
+            let before = self.iterations();
+            let steps = self.stride.min(steps - done).min(most - before);
+            let submitted = self.submit(steps)?;
+            for (iteration, &loss) in (before + 1..).zip(&submitted.losses) {
+                watch.progress(Progress {
+                    iteration,
+                    max_iterations: most,
+                    loss: loss.into(),
+                });
+            }
+            match self.status.state {
+                CONVERGED => return Ok(Advance::Converged),
+                DIVERGED => return Ok(Advance::Diverged),
+                _ => {}
+            }
+        }
+    }
+
+    fn evaluate(&mut self, points: &[Point]) -> Result<Vec<Point>, BackendError> {
+        let mut flow = Vec::with_capacity(points.len());
+        for points in points.chunks(EVALUATED) {
+            flow.extend(self.evaluated(points)?);
+        }
+        Ok(flow)
+    }
+
+    fn report(&self) -> Report {
+        Report {
+            iterations: self.iterations(),
+            best_iteration: self.status.best_iteration as usize,
+            best_loss: widened(self.status.best_loss),
+            query_seconds: self.query_seconds,
+        }
+    }
+
+    fn state(&mut self) -> Result<TrainerState, BackendError> {
+        let card = self.card();
+        let bytes = ARRAYS as u64 * NETWORK_BYTES;
+        let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
+        let copy = card.empty(bytes, usage)?;
+        let mut encoder = card.encoder();
+        let from = self.network.at(PARAMETERS);
+        encoder.copy_buffer_to_buffer(&card.buffers.networks, from, &copy, 0, bytes);
+        let read = card.finish(encoder, &copy, bytes)?;
+        let array = |array: u64| {
+            let mut parameters = Parameters::zeros();
+            let from = (array * NETWORK_BYTES) as usize;
+            let bytes = &read[from..from + NETWORK_BYTES as usize];
+            bytemuck::cast_slice_mut::<f32, u8>(&mut parameters.as_mut_slice()[..LAID_OUT])
+                .copy_from_slice(bytes);
+            parameters
+        };
+        let status = &self.status;
+        Ok(TrainerState {
+            parameters: array(PARAMETERS),
+            moments: [array(MEANS), array(SQUARES)],
+            kept: array(KEPT),
+            seen: Seen {
+                best: (status.seen == 1).then_some(status.seen_best.into()),
+                without_progress: status.without_progress as usize,
+            },
+            iterations: status.iterations as usize,
+            best_iteration: status.best_iteration as usize,
+            best_loss: widened(status.best_loss),
+        })
+    }
+
+    fn restore(&mut self, state: TrainerState) -> Result<(), BackendError> {
+        let mut transposed = Parameters::zeros();
+        transpose_middle_layers(&state.parameters, &mut transposed);
+        let [means, squares] = &state.moments;
+        self.network.write(PARAMETERS, &state.parameters);
+        self.network.write(TRANSPOSED, &transposed);
+        self.network.write(MEANS, means);
+        self.network.write(SQUARES, squares);
+        self.network.write(KEPT, &state.kept);
+        self.status = Status {
+            iterations: state.iterations as u32,
+            best_iteration: state.best_iteration as u32,
+            best_loss: (state.best_loss as f32).min(f32::MAX),
+            seen: state.seen.best.is_some().into(),
+            seen_best: state.seen.best.unwrap_or_default() as f32,
+            without_progress: state.seen.without_progress as u32,
+            ..Status::default()
+        };
+        self.card().watchdog.check()
+    }
+
+    fn shorten(&mut self, max_iterations: usize) {
+        self.course.shorten(max_iterations);
+    }
+}
+
+impl GpuTrainer<'_> {
+    /// The kept network at these points, which fit into one dispatch.
+    fn evaluated(&self, points: &[Point]) -> Result<Vec<Point>, BackendError> {
+        let card = self.card();
+        let lane = records::Lane {
+            points: 0,
+            ..self.lane()
+        };
+        let step = records::Step {
+            count: points.len() as u32,
+            ..records::Step::default()
+        };
+        let tiles = Cut::new(points.len()).tiles;
+        let list: Vec<_> = (0..tiles as u32)
+            .map(|tile| records::Tile { lane: 0, tile })
+            .collect();
+        let places = card.filled(bytemuck::cast_slice(points))?;
+        let lane = card.filled(bytemuck::bytes_of(&lane))?;
+        let step = card.filled(bytemuck::bytes_of(&step))?;
+        let list = card.filled(bytemuck::cast_slice(&list))?;
+        let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC;
+        let flows = card.empty((tiles * TILE * 16) as u64, usage)?;
+        let pipeline = &card.kernels.evaluate;
+        let buffers = &card.buffers;
+        // An evaluation looks at no status and remembers no activations; the bindings are there.
+        let group = card.bound(
+            pipeline,
+            &[
+                &places,
+                &buffers.networks,
+                &lane,
+                &step,
+                &list,
+                &buffers.statuses,
+                &flows,
+                &buffers.activations,
+            ],
+        );
+        let mut encoder = card.encoder();
+        {
+            let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
+            pass.set_pipeline(pipeline);
+            pass.set_bind_group(0, &group, &[]);
+            let part = records::Part {
+                tiles: tiles as u32,
+                ..records::Part::default()
+            };
+            pass.set_immediates(0, bytemuck::bytes_of(&part));
+            let [x, y] = spread(tiles as u32);
+            pass.dispatch_workgroups(x, y, 1);
+        }
+        let read = card.finish(encoder, &flows, points.len() as u64 * 16)?;
+        let rows = read.as_chunks::<16>().0.iter();
+        Ok(rows
+            .map(|bytes| {
+                let [x, y, z, _]: [f32; 4] = bytemuck::pod_read_unaligned(bytes);
+                [x, y, z]
+            })
+            .collect())
+    }
+}
+
+/// The card's largest number stands for infinity.
+fn widened(loss: f32) -> f64 {
+    if loss == f32::MAX {
+        f64::INFINITY
+    } else {
+        loss.into()
+    }
+}
