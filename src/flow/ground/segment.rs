@@ -12,8 +12,10 @@ use nalgebra::{Matrix3, Vector3};
 const FINEST_M: f32 = 1.0;
 /// Corrections per level.
 const ROUNDS: usize = 3;
-/// A level's columns may lie this far from the coarser level's surface, metres a metre of its
-/// cells: how much the ground may bend.
+/// The coarsest level's columns may lie this far from the height around the vehicle, metres a
+/// metre of its cells: how much the sweep may be tilted.
+const TILT: f32 = 0.2;
+/// A finer level's from the coarser one's surface: how much the ground may bend.
 const BEND: f32 = 0.1;
 /// And this far besides, metres: a kerb.
 const STEP_M: f32 = 0.2;
@@ -77,9 +79,10 @@ pub fn segment(points: &[Point], options: &GroundOptions) -> GroundSegmentation 
 /// The surface under the columns, coarse to fine: each level keeps to what is near the last one's.
 fn fit(columns: &Columns) -> Surface {
     let mut surface = Surface::level(columns.half_m, TILE_M, around(columns));
+    let mut slope = TILT;
     loop {
         let step = surface.step_m();
-        let tolerance = BEND * step + STEP_M;
+        let tolerance = slope * step + STEP_M;
         let trust = |above: f32| {
             if above.abs() >= tolerance {
                 0.0
@@ -97,6 +100,7 @@ fn fit(columns: &Columns) -> Surface {
             break;
         }
         surface = surface.refined();
+        slope = BEND;
     }
     let all = columns.columns.iter().flat_map(|column| {
         let points = columns.points[column.rows.clone()].iter();
