@@ -4,6 +4,8 @@ use fnsf::flow::Point;
 use fnsf::flow::ground::{GroundOptions, GroundSegmentation, segment};
 use fnsf::flow::simulate::{Street, StreetOptions};
 
+use proptest::prelude::*;
+
 use super::scenes::real_pair;
 
 /// What is asked of precision and of recall.
@@ -229,5 +231,17 @@ fn the_simulated_lidars_height_is_found_to_2_cm() {
 fn the_same_sweep_gives_the_same_ground() {
     for sweep in streets(1) {
         assert_eq!(sweep.found(), sweep.found());
+    }
+}
+
+proptest! {
+    #[test]
+    fn any_finite_points_get_a_flag_each(
+        points in prop::collection::vec(prop::array::uniform3(prop::num::f32::NORMAL), 0..200),
+        near in prop::collection::vec(prop::array::uniform3(-20.0_f32..20.0), 0..200),
+    ) {
+        let points = [points, near].concat();
+        let found = segment(&points, &GroundOptions::default());
+        prop_assert_eq!(found.ground.len(), points.len());
     }
 }

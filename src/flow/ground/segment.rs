@@ -15,7 +15,7 @@ const ROUNDS: usize = 3;
 /// The coarsest level's columns may lie this far from the height around the vehicle, metres a
 /// metre of its cells: how much the sweep may be tilted.
 const TILT: f32 = 0.2;
-/// A finer level's from the coarser one's surface: how much the ground may bend.
+/// The same for a finer level and the coarser one's surface: how much the ground may bend.
 const BEND: f32 = 0.1;
 /// And this far besides, metres: a kerb.
 const STEP_M: f32 = 0.2;
@@ -35,6 +35,8 @@ const AROUND_M: f32 = 20.0;
 const LOW_QUANTILE: f32 = 0.15;
 /// The plane that the vehicle stands on is taken within this, metres.
 const STAND_M: f32 = 8.0;
+/// The tolerance of a point grows up to this range, metres.
+const GROWTH_M: f32 = 40.0;
 /// Flat columns within this say whether there is ground, metres.
 const EVIDENCE_M: f32 = 40.0;
 /// So many of them are needed, square metres.
@@ -65,7 +67,7 @@ pub fn segment(points: &[Point], options: &GroundOptions) -> GroundSegmentation 
         };
     }
     let is_ground = |point: &Point| {
-        let range = point[0].hypot(point[1]).min(EVIDENCE_M);
+        let range = point[0].hypot(point[1]).min(GROWTH_M);
         let tolerance = options.height_m + options.height_slope * range;
         let above = surface.above(point);
         columns.hold(point) && -options.depth_m < above && above < tolerance
@@ -84,10 +86,10 @@ fn fit(columns: &Columns) -> Surface {
         let step = surface.step_m();
         let tolerance = slope * step + STEP_M;
         let trust = |above: f32| {
-            if above.abs() >= tolerance {
-                0.0
-            } else {
+            if above.abs() < tolerance {
                 (-above.max(0.0) / (FADING * tolerance)).exp()
+            } else {
+                0.0
             }
         };
         let full = (step * step).min(FULL);
@@ -228,6 +230,50 @@ mod tests {
     #[test]
     fn a_wall_alone_has_no_ground() {
         assert!(!ground(&wall()).contains(&true));
+    }
+
+    #[test]
+    fn a_room_has_a_floor_and_its_walls_alone_have_none() {
+        // 8 m by 6 m by 2.6 m, seen from 1.1 m above the floor; rays spread evenly.
+        let shot = |i: usize| {
+            let up = i as f32 / 10_000.0 - 1.0;
+            let (sin, cos) = (i as f32 * 2.4).sin_cos();
+            let level = (1.0 - up * up).max(0.0).sqrt();
+            let ray = [level * cos, level * sin, up];
+            let [low, high] = [[-3.0, -2.5, -1.1], [5.0, 3.5, 1.5]];
+            let reach = |axis: usize| {
+                let wall: f32 = if ray[axis] > 0.0 {
+                    high[axis]
+                } else {
+                    low[axis]
+                };
+                if ray[axis] == 0.0 {
+                    f32::INFINITY
+                } else {
+                    wall / ray[axis]
+                }
+            };
+            let range = reach(0).min(reach(1)).min(reach(2));
+            ray.map(|value| value * range)
+        };
+        let room: Vec<Point> = (0..20_000).map(shot).collect();
+        let found = segment(&room, &GroundOptions::default());
+        let height = found.origin_height_m.expect("there is a floor");
+        assert!((height - 1.1).abs() < 0.02, "{height}");
+        for (point, flag) in room.iter().zip(&found.ground) {
+            let above = point[2] + 1.1;
+            assert!(
+                if above < 0.05 {
+                    *flag
+                } else {
+                    above < 0.2 || !flag
+                },
+                "{point:?}"
+            );
+        }
+        let is_wall = |point: &Point| point[2] > -0.9 && point[2] < 1.4;
+        let walls: Vec<Point> = room.into_iter().filter(is_wall).collect();
+        assert!(!ground(&walls).contains(&true));
     }
 
     #[test]
