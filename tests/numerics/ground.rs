@@ -209,9 +209,9 @@ fn mirror_images_below_the_ground_are_told_from_it() {
 
 #[test]
 fn a_sweep_whose_ground_was_taken_off_has_none() {
-    // The masks of the other two leave thousands of points on the ground, so they are not asked.
+    // The mask of kitti_0000 leaves 2,000 points on the ground, so that pair is not asked.
     let taken_off = |sweep: Labelled| sweep.kept(|row| !sweep.ground[row]);
-    let real = real_sweeps().into_iter().filter(|s| s.name == "av2_7fab");
+    let real = real_sweeps().into_iter().filter(|s| s.name != "kitti_0000");
     for sweep in streets(3).chain(real).map(taken_off) {
         let found = sweep.found();
         assert_eq!(found.origin_height_m, None, "{}", sweep.name);
