@@ -5,6 +5,7 @@
 
 mod accuracy;
 mod deadlines;
+mod ground;
 mod prices;
 mod resumption;
 mod scenes;
