@@ -45,6 +45,9 @@ pub struct Drain {
     pub release: CancellationToken,
 }
 
+/// Before a job is given back that the device could not begin: at once it would only come again.
+const A_MOMENT: Duration = Duration::from_millis(100);
+
 /// What a worker works with.
 #[derive(Clone)]
 pub struct Worker {
@@ -159,9 +162,12 @@ impl Worker {
         let solved = self.lane.solve(work).await;
         let took = began.elapsed();
         let _its_own_errors_are_logged = keeper.await;
-        if matches!(solved, Err(EngineError::Broken(_))) {
-            // The device's health says so in a moment.
-            tokio::time::sleep(Duration::from_millis(100)).await;
+        if let Err(
+            EngineError::Broken(_) | EngineError::Flow(FlowError::Backend(BackendError::Busy)),
+        ) = solved
+        {
+            // The device's health says so in a moment, or another lane is done.
+            tokio::time::sleep(A_MOMENT).await;
         }
         let released = self.drain.release.is_cancelled();
         match solved {
@@ -201,8 +207,8 @@ impl Worker {
             EngineError::Flow(flow) if flow.is_input() => {
                 Attempt::failed("input_refused", error, false)
             }
-            EngineError::Broken(reason) => {
-                tracing::warn!(reason, "the device was not there: the job is given back");
+            EngineError::Broken(_) | EngineError::Flow(FlowError::Backend(BackendError::Busy)) => {
+                tracing::info!(%error, "the job is given back");
                 Attempt::Ended(Outcome::Released)
             }
             EngineError::Lost(_) => {

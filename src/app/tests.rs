@@ -187,7 +187,7 @@ async fn a_real_card_that_is_destroyed_in_the_middle_of_a_job_is_opened_again_an
     };
     let stand = serve(vec![card], true).await;
     let id = stand
-        .submit(json!({"device": "gpu", "preset": "paper"}))
+        .submit(json!({"device": "gpu", "preset": "paper", "max_points": 1000}))
         .await;
     let elsewhere = stand.submit(json!({"device": "cpu"})).await;
     let under_way = async {
