@@ -21,7 +21,8 @@ pub(super) const LEAST_ROWS: u64 = 8192;
 const MOST_ROWS: u64 = 1 << 19;
 /// The fewest chunks: a lane's most.
 pub(super) const LEAST_CHUNKS: u64 = 128;
-/// Words of the store that a lane should find: a full sweep's transform and points.
+/// Bytes of the store that a lane should find: a full sweep's transform and points. Sweeps of 400 m
+/// take twice as much; where there is memory, a quarter of it is the store's.
 const LANE_STORE_BYTES: u64 = 96 << 20;
 
 /// What of the card's memory is for what.
@@ -66,7 +67,10 @@ impl Budget {
             taken
         };
         let store = LANE_STORE_BYTES.min(binding);
-        let store = store + more((lanes - 1) * LANE_STORE_BYTES, binding - store);
+        let wished = (lanes * LANE_STORE_BYTES)
+            .max(bytes / 4)
+            .saturating_sub(store);
+        let store = store + more(wished, binding - store);
         let chunks = LEAST_CHUNKS * NETWORK_BYTES;
         let chunks = chunks + more((lanes - 1) * 16 * NETWORK_BYTES, binding - chunks);
         let rows = LEAST_ROWS * ROW_BYTES;
@@ -198,6 +202,13 @@ impl Words {
 mod tests {
     use super::*;
     use crate::flow::watch::{Interrupt, Unwatched};
+
+    #[test]
+    fn a_small_card_of_its_own_holds_a_sweep_of_400_m() {
+        let bytes = Budget::usual(AdapterKind::Discrete, 1);
+        let budget = Budget::new(1, bytes, 4 << 30).expect("it fits");
+        assert!(budget.store_words * 4 > 200 << 20, "{budget:?}");
+    }
 
     #[test]
     fn a_software_card_has_room_for_a_full_sweep() {
