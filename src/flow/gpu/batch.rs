@@ -10,7 +10,6 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
 use super::device::Card;
-use super::memory::{LEAST_CHUNKS, LEAST_ROWS};
 use super::phases::{Clock, Phase, Phases};
 use super::plan::{Cut, Plan, Wave};
 use super::records::{Lane, STEPS, Status, Step};
@@ -155,11 +154,6 @@ impl State {
         }
         self.waiting.drain(..fitting).collect()
     }
-}
-
-/// The most points that a batch may have: their gradients must fit into the least memory.
-pub(super) fn most_batch_points() -> usize {
-    LEAST_CHUNKS as usize * LEAST_ROWS as usize
 }
 
 /// Moments of a submission's clock: when its first iteration began, when that one's first query

@@ -14,13 +14,13 @@ use crate::flow::watch::{self, Watch};
 /// Bytes of a row's activations, or deltas, of all hidden layers.
 const ROW_BYTES: u64 = (HIDDEN_LAYERS * WIDTH * size_of::<f32>()) as u64;
 /// Bytes of one network, or of one chunk's gradients.
-const NETWORK_BYTES: u64 = (LAID_OUT * size_of::<f32>()) as u64;
+pub(super) const NETWORK_BYTES: u64 = (LAID_OUT * size_of::<f32>()) as u64;
 /// The fewest rows that are worth a dispatch, and the largest chunk of points.
 pub(super) const LEAST_ROWS: u64 = 8192;
 /// The most rows: more of them would be busy no longer at once on any card.
 const MOST_ROWS: u64 = 1 << 19;
 /// The fewest chunks: a lane's most.
-pub(super) const LEAST_CHUNKS: u64 = 128;
+const LEAST_CHUNKS: u64 = 128;
 /// Bytes of the store that a lane should find: a full sweep's transform and points. Sweeps of 400 m
 /// take twice as much; where there is memory, a quarter of it is the store's.
 const LANE_STORE_BYTES: u64 = 96 << 20;

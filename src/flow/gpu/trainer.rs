@@ -2,8 +2,9 @@
 
 use std::sync::Arc;
 
-use super::batch::{Done, Request, most_batch_points};
+use super::batch::{Done, Request};
 use super::device::{Card, spread};
+use super::memory::NETWORK_BYTES;
 use super::plan::Cut;
 use super::records::{self, ARRAYS, CONVERGED, DIVERGED, STEPS, Status, TILE};
 use super::transform::{GpuTransform, Stretch};
@@ -22,9 +23,6 @@ const SUBMISSION_SECONDS: f64 = 0.03;
 const BLIND_STEPS: usize = 4;
 /// Points that are evaluated at a time.
 const EVALUATED: usize = 1 << 18;
-/// Bytes of one network.
-const NETWORK_BYTES: u64 = (LAID_OUT * size_of::<f32>()) as u64;
-
 /// The places of a lane's arrays; common.wgsl has the same.
 const PARAMETERS: u64 = 0;
 const TRANSPOSED: u64 = 1;
@@ -87,11 +85,12 @@ impl<'a> GpuTrainer<'a> {
     ) -> Result<Self, BackendError> {
         let card = &transform.card;
         let (course, parameters) = Course::new(source, options);
-        if course.largest_batch() > most_batch_points() {
+        let chunks = Cut::new(course.largest_batch()).chunks as u64;
+        if chunks > card.budget.chunks {
             return Err(BackendError::Memory {
                 what: "gradients",
-                needed: course.largest_batch() as u64,
-                available: most_batch_points() as u64,
+                needed: chunks * NETWORK_BYTES,
+                available: card.budget.chunk_bytes(),
             });
         }
         let words = course.points.len() as u64 * 3;
