@@ -2,8 +2,8 @@
 //!
 //! A pair is priced against it before it gets any. Knows no kernels.
 
+use core::time::Duration;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
 
 use super::adapter::AdapterKind;
 use super::records::{ARRAYS, TILE};
