@@ -20,7 +20,9 @@ fn sources() -> Vec<Source> {
         let relative = file.strip_prefix(&root).expect("found below the root");
         relative.to_string_lossy().replace('\\', "/")
     };
-    let is_test = |path: &str| path.ends_with("tests.rs") || path.contains("/contract");
+    let is_test = |path: &str| {
+        path.ends_with("tests.rs") || path.contains("/tests/") || path.contains("/contract")
+    };
     let read = |file: &PathBuf| {
         let text = fs::read_to_string(file).expect("a source file is readable");
         let product = text
