@@ -40,6 +40,9 @@ mod ego;
 pub mod field;
 mod loss;
 
+// What carries no motion of its own.
+pub mod ground;
+
 // How the field is fitted, and on what.
 pub mod backend;
 mod course;

@@ -5,6 +5,10 @@
 
 mod accuracy;
 mod deadlines;
+mod gpu;
+#[path = "../common/gpu.rs"]
+mod gpu_rule;
+mod ground;
 mod prices;
 mod resumption;
 mod scenes;

@@ -6,6 +6,7 @@
 
 use std::path::PathBuf;
 
+use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Metrics, Truth, evaluate};
 use fnsf::flow::simulate::{Street, StreetOptions};
@@ -48,6 +49,11 @@ pub(crate) fn street(options: &StreetOptions) -> Pair {
 /// The pair's flow without its ground, on two threads.
 pub(crate) fn solve(pair: &Pair, options: &Options) -> Estimate {
     let backend = CpuBackend::new(Some(2)).expect("threads");
+    solve_on(&backend, pair, options)
+}
+
+/// The pair's flow without its ground, on a device.
+pub(crate) fn solve_on(backend: &dyn Backend, pair: &Pair, options: &Options) -> Estimate {
     let ground = pair.ground.as_ref().expect("the pair has ground masks");
     let problem = Problem {
         source: &pair.source,
@@ -58,12 +64,16 @@ pub(crate) fn solve(pair: &Pair, options: &Options) -> Estimate {
         ground: Ground::Mask,
         ..options.clone()
     };
-    flow::estimate(&backend, &problem, &options, &Unwatched).expect("a flow")
+    flow::estimate(backend, &problem, &options, &Unwatched).expect("a flow")
 }
 
 /// The error of the pair's flow by `options`.
 pub(crate) fn score(pair: &Pair, options: &Options) -> Metrics {
-    let estimate = solve(pair, options);
+    scored(pair, &solve(pair, options))
+}
+
+/// The error of a flow of the pair.
+pub(crate) fn scored(pair: &Pair, estimate: &Estimate) -> Metrics {
     let known = pair.truth.as_ref().expect("the pair has truth");
     let ground = pair.ground.as_ref().expect("the pair has ground masks");
     let truth = Truth {

@@ -195,7 +195,7 @@ fn described(handle: wgpu::Adapter) -> Option<Adapter> {
         driver: format!("{} {}", info.driver, info.driver_info),
         interface,
         kind,
-        max_binding_bytes: limits.max_storage_buffer_binding_size.into(),
+        max_binding_bytes: limits.max_storage_buffer_binding_size,
         workgroup_bytes: limits.max_compute_workgroup_storage_size,
         matrix_tiles: handle
             .cooperative_matrix_properties()

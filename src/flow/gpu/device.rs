@@ -326,7 +326,9 @@ impl Buffers {
         let mut bytes = asked.unwrap_or_else(|| Budget::usual(adapter.kind, options.lanes));
         // Buffers are bound whole.
         let limits = device.limits();
-        let binding = u64::from(limits.max_storage_buffer_binding_size).min(limits.max_buffer_size);
+        let binding = limits
+            .max_storage_buffer_binding_size
+            .min(limits.max_buffer_size);
         loop {
             let budget = Budget::new(options.lanes, bytes, binding)?;
             match Self::allocate(device, &budget) {

@@ -1,7 +1,6 @@
 //! The card against the double-precision reference and the CPU backend.
 //!
-//! Needs a card; a software one will do. Where there is none these tests say so and pass, unless
-//! FNSF_REQUIRE_GPU is set.
+//! Needs a card; a software one will do.
 
 mod failures;
 mod kernels;
@@ -10,27 +9,19 @@ mod whole;
 
 use std::sync::OnceLock;
 
-use super::{Gpu, GpuOptions, Selector, select};
+use super::{Gpu, GpuOptions, adapters};
 use crate::flow::points::Point;
 use crate::flow::random::Random;
+use crate::gpu_in_tests;
 
 /// Pairs that the shared card fits at the same time.
 const LANES: usize = 4;
 
-/// A card of this test's own; none where the machine has none.
+/// A card of this test's own, the first that there is; none where the machine has none.
 fn opened(options: &GpuOptions) -> Option<Gpu> {
-    match select(&Selector::Any, true) {
-        Ok(adapter) => Some(Gpu::open(&adapter, options).expect("the card opens")),
-        Err(error) => {
-            let required = std::env::var_os("FNSF_REQUIRE_GPU").is_some();
-            assert!(!required, "{error}");
-            #[expect(clippy::print_stderr, reason = "a test that tests nothing says so")]
-            {
-                eprintln!("not tested: {error}");
-            }
-            None
-        }
-    }
+    let cards = adapters();
+    gpu_in_tests::is_there(cards.len())
+        .then(|| Gpu::open(&cards[0], options).expect("the card opens"))
 }
 
 /// The card that tests share which do it no harm.

@@ -1,0 +1,331 @@
+//! The method in one function: columns, a surface under them from coarse to fine, and its points.
+//!
+//! It must not know where the points came from: what it reads is x, y, z and nothing else.
+
+use super::columns::{Column, Columns, TILE_M};
+use super::options::GroundOptions;
+use super::surface::Surface;
+use crate::flow::Point;
+use nalgebra::{Matrix3, Vector3};
+
+/// Distance between nodes of the finest surface, metres.
+const FINEST_M: f32 = 1.0;
+/// Corrections per level.
+const ROUNDS: usize = 3;
+/// The coarsest level's columns may lie this far from the height around the vehicle, metres a
+/// metre of its cells: how much the sweep may be tilted.
+const TILT: f32 = 0.2;
+/// The same for a finer level and the coarser one's surface: how much the ground may bend.
+const BEND: f32 = 0.1;
+/// And this far besides, metres: a kerb.
+const STEP_M: f32 = 0.2;
+/// A column this share of the tolerance above the surface weighs 1/e of one on it: what is lower
+/// is nearer the ground.
+const FADING: f32 = 0.4;
+/// A node is held fully by this many columns.
+const FULL: f32 = 8.0;
+/// The last correction is by all points this near the surface, metres: their mean is the ground,
+/// where the lowest points are ground and noise.
+const MEAN_M: f32 = 0.15;
+/// And a node is held fully by this many of them.
+const FULL_POINTS: f32 = 4.0;
+/// The height of the ground around the vehicle is taken within this, metres.
+const AROUND_M: f32 = 20.0;
+/// At this quantile of the columns' lowest points: below walls and cars, above reflections.
+const LOW_QUANTILE: f32 = 0.15;
+/// The plane that the vehicle stands on is taken within this, metres.
+const STAND_M: f32 = 8.0;
+/// The tolerance of a point grows up to this range, metres.
+const GROWTH_M: f32 = 40.0;
+/// Flat columns within this say whether there is ground, metres.
+const EVIDENCE_M: f32 = 40.0;
+/// So many of them are needed, square metres.
+const EVIDENCE_COLUMNS: usize = 16;
+/// A column is flat if its lowest layer has this share of its low points.
+const FLAT: f32 = 0.7;
+
+/// The ground of one sweep.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct GroundSegmentation {
+    /// N flags for N points: whether the point lies on the ground.
+    pub ground: Vec<bool>,
+    /// Height of the frame's origin above the ground below it, metres: the lidar's height where
+    /// the origin is the lidar, near zero where it is on the road. None where there is no ground.
+    pub origin_height_m: Option<f32>,
+}
+
+/// Finds the ground of one sweep: N finite points, metres, x forward, y left, z up to within some
+/// degrees, the vehicle near the origin. The flags do not depend on the points' order. Points
+/// beyond 128 m along x or y are never ground.
+pub fn segment(points: &[Point], options: &GroundOptions) -> GroundSegmentation {
+    let columns = Columns::new(points);
+    let surface = fit(&columns);
+    if !has_ground(&columns, &surface, options) {
+        return GroundSegmentation {
+            ground: vec![false; points.len()],
+            origin_height_m: None,
+        };
+    }
+    let is_ground = |point: &Point| {
+        let range = point[0].hypot(point[1]).min(GROWTH_M);
+        let tolerance = options.height_m + options.height_slope * range;
+        let above = surface.above(point);
+        columns.hold(point) && -options.depth_m < above && above < tolerance
+    };
+    GroundSegmentation {
+        ground: points.iter().map(is_ground).collect(),
+        origin_height_m: Some(origin_height(&columns, &surface)),
+    }
+}
+
+/// The surface under the columns, coarse to fine: each level keeps to what is near the last one's.
+fn fit(columns: &Columns) -> Surface {
+    let mut surface = Surface::level(columns.half_m, TILE_M, around(columns));
+    let mut slope = TILT;
+    loop {
+        let step = surface.step_m();
+        let tolerance = slope * step + STEP_M;
+        let trust = |above: f32| {
+            if above.abs() < tolerance {
+                (-above.max(0.0) / (FADING * tolerance)).exp()
+            } else {
+                0.0
+            }
+        };
+        let full = (step * step).min(FULL);
+        for _ in 0..ROUNDS {
+            let lowest = columns.columns.iter();
+            let lowest = lowest.map(|column| (&column.low, column.weight()));
+            surface.pull(lowest, trust, full);
+        }
+        if step <= FINEST_M {
+            break;
+        }
+        surface = surface.refined();
+        slope = BEND;
+    }
+    let all = columns.columns.iter().flat_map(|column| {
+        let points = columns.points[column.rows.clone()].iter();
+        points.map(|point| (point, column.weight()))
+    });
+    let near = |above: f32| f32::from(u8::from(above.abs() < MEAN_M));
+    surface.pull(all, near, FULL_POINTS);
+    surface
+}
+
+/// About the height of the ground around the vehicle, metres; 0 where nothing is near.
+fn around(columns: &Columns) -> f32 {
+    let near = columns.columns.iter().map(|column| column.low);
+    let near = near.filter(|low| low[0].hypot(low[1]) < AROUND_M);
+    let mut heights: Vec<f32> = near.map(|low| low[2]).collect();
+    let index = (heights.len() as f32 * LOW_QUANTILE) as usize;
+    if index >= heights.len() {
+        return 0.0;
+    }
+    *heights.select_nth_unstable_by(index, f32::total_cmp).1
+}
+
+/// Whether enough of what was seen is flat and lies on the surface. Without ground the surface
+/// hangs under whatever is lowest: walls, and cars without wheels, which are not flat.
+fn has_ground(columns: &Columns, surface: &Surface, options: &GroundOptions) -> bool {
+    let near = columns.columns.iter();
+    let near = near.filter(|column| column.low[0].hypot(column.low[1]) < EVIDENCE_M);
+    let mut seen = 0_usize;
+    let mut flat = 0_usize;
+    for column in near {
+        seen += 1;
+        flat += usize::from(lies_flat(column, surface));
+    }
+    flat >= EVIDENCE_COLUMNS && flat as f32 >= options.min_share * seen as f32
+}
+
+/// Height of the origin above the plane through the ground around it, metres. The surface itself
+/// is a guess under the vehicle, where no ray falls.
+fn origin_height(columns: &Columns, surface: &Surface) -> f32 {
+    let near = columns.columns.iter().filter(|column| {
+        column.low[0].hypot(column.low[1]) < STAND_M && lies_flat(column, surface)
+    });
+    let mut normal = Matrix3::zeros();
+    let mut right = Vector3::zeros();
+    for column in near {
+        for point in &columns.points[column.rows.clone()] {
+            if surface.above(point).abs() < MEAN_M {
+                let [x, y, z] = point.map(f64::from);
+                let row = Vector3::new(x, y, 1.0);
+                normal += row * row.transpose();
+                right += row * z;
+            }
+        }
+    }
+    // Points on one side alone do not tell the height at the origin any better than the surface.
+    let solved = normal
+        .cholesky()
+        .map(|factors| factors.solve(&right)[2] as f32);
+    let height = solved.filter(|height| (height - surface.height_at(0.0, 0.0)).abs() < MEAN_M);
+    -height.unwrap_or_else(|| surface.height_at(0.0, 0.0))
+}
+
+fn lies_flat(column: &Column, surface: &Surface) -> bool {
+    column.flatness() > FLAT && surface.above(&column.low).abs() < MEAN_M
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const HEIGHT_M: f32 = 1.8;
+
+    /// 32 rings on level ground, seen from `HEIGHT_M` above it.
+    fn plain() -> Vec<Point> {
+        let ring = |beam: usize| HEIGHT_M / (2.0 + beam as f32 * 0.8).to_radians().tan();
+        let shot = |range: f32, step: usize| {
+            let (sin, cos) = (step as f32 * 0.5).to_radians().sin_cos();
+            [range * cos, range * sin, -HEIGHT_M]
+        };
+        (0..32)
+            .flat_map(|beam| (0..720).map(move |step| shot(ring(beam), step)))
+            .collect()
+    }
+
+    fn wall() -> Vec<Point> {
+        let at = |i: usize| {
+            [
+                8.0,
+                (i % 100) as f32 * 0.2 - 10.0,
+                (i / 100) as f32 * 0.1 - 1.7,
+            ]
+        };
+        (0..3000).map(at).collect()
+    }
+
+    fn ground(points: &[Point]) -> Vec<bool> {
+        let found = segment(points, &GroundOptions::default());
+        assert_eq!(found.ground.len(), points.len());
+        assert_eq!(
+            found.ground.contains(&true),
+            found.origin_height_m.is_some()
+        );
+        found.ground
+    }
+
+    #[test]
+    fn level_ground_is_ground_and_tells_the_lidars_height() {
+        let found = segment(&plain(), &GroundOptions::default());
+        assert!(found.ground.iter().all(|&flag| flag));
+        let height = found.origin_height_m.expect("there is ground");
+        assert!((height - HEIGHT_M).abs() < 1e-3, "{height}");
+    }
+
+    #[test]
+    fn things_on_the_ground_and_mirror_images_below_it_are_not_ground() {
+        let mut points = plain();
+        let first = points.len();
+        points.extend(wall().iter().filter(|point| point[2] > -1.6));
+        points.extend((0..40).map(|i| [5.0 + i as f32 * 0.4, -3.0, -HEIGHT_M - 1.5]));
+        let found = ground(&points);
+        assert!(found[..first].iter().all(|&flag| flag));
+        assert!(!found[first..].contains(&true));
+    }
+
+    #[test]
+    fn a_wall_alone_has_no_ground() {
+        assert!(!ground(&wall()).contains(&true));
+    }
+
+    #[test]
+    fn a_room_has_a_floor_and_its_walls_alone_have_none() {
+        // 8 m by 6 m by 2.6 m, seen from 1.1 m above the floor; rays spread evenly.
+        let shot = |i: usize| {
+            let up = i as f32 / 10_000.0 - 1.0;
+            let (sin, cos) = (i as f32 * 2.4).sin_cos();
+            let level = (1.0 - up * up).max(0.0).sqrt();
+            let ray = [level * cos, level * sin, up];
+            let [low, high] = [[-3.0, -2.5, -1.1], [5.0, 3.5, 1.5]];
+            let reach = |axis: usize| {
+                let wall: f32 = if ray[axis] > 0.0 {
+                    high[axis]
+                } else {
+                    low[axis]
+                };
+                if ray[axis] == 0.0 {
+                    f32::INFINITY
+                } else {
+                    wall / ray[axis]
+                }
+            };
+            let range = reach(0).min(reach(1)).min(reach(2));
+            ray.map(|value| value * range)
+        };
+        let room: Vec<Point> = (0..20_000).map(shot).collect();
+        let found = segment(&room, &GroundOptions::default());
+        let height = found.origin_height_m.expect("there is a floor");
+        assert!((height - 1.1).abs() < 0.02, "{height}");
+        for (point, flag) in room.iter().zip(&found.ground) {
+            let above = point[2] + 1.1;
+            assert!(
+                if above < 0.05 {
+                    *flag
+                } else {
+                    above < 0.2 || !flag
+                },
+                "{point:?}"
+            );
+        }
+        let is_wall = |point: &Point| point[2] > -0.9 && point[2] < 1.4;
+        let walls: Vec<Point> = room.into_iter().filter(is_wall).collect();
+        assert!(!ground(&walls).contains(&true));
+    }
+
+    #[test]
+    fn few_points_and_duplicates_are_no_ground() {
+        assert!(ground(&[]).is_empty());
+        assert!(!ground(&[[1.0, 2.0, -1.7]]).contains(&true));
+        assert!(!ground(&[[4.0, 0.0, -1.7], [0.0, 4.0, -1.7], [-4.0, 0.0, -1.7]]).contains(&true));
+        assert!(!ground(&vec![[3.0, 3.0, 0.0]; 5000]).contains(&true));
+    }
+
+    #[test]
+    fn every_point_twice_has_the_same_ground() {
+        let once: Vec<Point> = [plain(), wall()].concat();
+        let twice = once.repeat(2);
+        assert_eq!(ground(&twice)[..once.len()], ground(&once));
+    }
+
+    #[test]
+    fn the_order_of_the_points_does_not_matter() {
+        let points: Vec<Point> = [plain(), wall()].concat();
+        let backward: Vec<Point> = points.iter().rev().copied().collect();
+        let mut found = ground(&backward);
+        found.reverse();
+        assert_eq!(found, ground(&points));
+    }
+
+    #[test]
+    fn the_origin_may_lie_on_the_ground() {
+        let mut points = plain();
+        for point in &mut points {
+            point[2] += HEIGHT_M + 0.3;
+        }
+        let found = segment(&points, &GroundOptions::default());
+        let height = found.origin_height_m.expect("there is ground");
+        assert!((height + 0.3).abs() < 1e-3, "{height}");
+        assert!(found.ground.iter().all(|&flag| flag));
+    }
+
+    #[test]
+    fn huge_coordinates_are_not_ground_and_harm_nothing() {
+        let mut points = plain();
+        let first = points.len();
+        let huge = [f32::MAX, -f32::MAX, 1e30, -1e30];
+        for value in huge {
+            points.extend([[value, 0.0, -1.8], [0.0, value, -1.8], [6.0, 6.0, value]]);
+            points.push([value, value, value]);
+        }
+        let found = ground(&points);
+        assert!(found[..first].iter().all(|&flag| flag));
+        assert!(!found[first..].contains(&true));
+        for value in huge {
+            ground(&vec![[1.0, 2.0, value]; 50]);
+        }
+    }
+}

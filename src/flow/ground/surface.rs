@@ -1,0 +1,197 @@
+//! A height above every place: nodes on a square grid, bilinear between them.
+//!
+//! The surface is pulled toward samples and stays smooth where there are none: a screened Poisson
+//! equation for the correction, relaxed in place. It must not know what the samples are.
+
+use crate::flow::Point;
+
+/// How strongly a node's correction follows its four neighbors', against a full pull of 1.
+const STIFFNESS: f32 = 0.3;
+/// Rounds of Gauss-Seidel per correction. Coarser levels carry corrections far; this spreads them
+/// over the next few nodes.
+const ROUNDS: usize = 6;
+
+/// Heights over a square area.
+pub(super) struct Surface {
+    half_m: f32,
+    step_m: f32,
+    /// Nodes along a side, at least 2.
+    side: usize,
+    /// Row by row along x, metres.
+    heights: Vec<f32>,
+}
+
+impl Surface {
+    /// A level surface over |x|, |y| <= `half_m`, which is a multiple of `step_m`.
+    pub(super) fn level(half_m: f32, step_m: f32, height_m: f32) -> Self {
+        let side = (2.0 * half_m / step_m) as usize + 1;
+        Self {
+            half_m,
+            step_m,
+            side,
+            heights: vec![height_m; side * side],
+        }
+    }
+
+    /// The same surface on nodes twice as near.
+    pub(super) fn refined(&self) -> Self {
+        let mut fine = Self::level(self.half_m, self.step_m / 2.0, 0.0);
+        let place = |node: usize| node as f32 * fine.step_m - fine.half_m;
+        for row in 0..fine.side {
+            for column in 0..fine.side {
+                fine.heights[row * fine.side + column] = self.height_at(place(column), place(row));
+            }
+        }
+        fine
+    }
+
+    /// Distance between nodes, metres.
+    pub(super) fn step_m(&self) -> f32 {
+        self.step_m
+    }
+
+    /// Height at a place, metres; outside the area the border's.
+    pub(super) fn height_at(&self, x: f32, y: f32) -> f32 {
+        let [u, v] = self.position(x, y);
+        let [column, row] = [u, v].map(|position| (position as usize).min(self.side - 2));
+        let [along, across] = [u - column as f32, v - row as f32];
+        let node = row * self.side + column;
+        let between =
+            |node: usize| self.heights[node] * (1.0 - along) + self.heights[node + 1] * along;
+        between(node) * (1.0 - across) + between(node + self.side) * across
+    }
+
+    /// Height of a point above the surface, metres.
+    pub(super) fn above(&self, point: &Point) -> f32 {
+        point[2] - self.height_at(point[0], point[1])
+    }
+
+    /// Moves the surface toward samples, points with weights. `trust` makes a weight, 0 or more,
+    /// of a sample's height above the surface; a node whose samples weigh `full` goes all the way.
+    pub(super) fn pull<'a>(
+        &mut self,
+        samples: impl Iterator<Item = (&'a Point, f32)>,
+        trust: impl Fn(f32) -> f32,
+        full: f32,
+    ) {
+        // Per node: weight, and weighted height above the surface.
+        let mut pulls = vec![[0.0_f32; 2]; self.heights.len()];
+        for (point, weight) in samples {
+            let above = self.above(point);
+            let weight = weight * trust(above);
+            if weight > 0.0 {
+                let pull = &mut pulls[self.nearest(point)];
+                pull[0] += weight;
+                pull[1] += weight * above;
+            }
+        }
+        for pull in &mut pulls {
+            let [weight, sum] = *pull;
+            if weight > 0.0 {
+                let share = (weight / full).min(1.0);
+                *pull = [share, share * sum / weight];
+            }
+        }
+        for (height, correction) in self.heights.iter_mut().zip(relaxed(&pulls, self.side)) {
+            *height += correction;
+        }
+    }
+
+    fn nearest(&self, point: &Point) -> usize {
+        let [column, row] = self
+            .position(point[0], point[1])
+            .map(|position| position.round() as usize);
+        row * self.side + column
+    }
+
+    /// Steps from the first node along x and y, within the area.
+    fn position(&self, x: f32, y: f32) -> [f32; 2] {
+        let last = (self.side - 1) as f32;
+        [x, y].map(|value| ((value + self.half_m) / self.step_m).clamp(0.0, last))
+    }
+}
+
+/// Corrections that balance the pulls against smoothness, nearly.
+fn relaxed(pulls: &[[f32; 2]], side: usize) -> Vec<f32> {
+    // Border nodes have neighbors that mirror them: a ring of nodes that copy the nearest.
+    let padded = side + 2;
+    let mut corrections = vec![0.0_f32; padded * padded];
+    let shares: Vec<f32> = pulls
+        .iter()
+        .map(|[weight, _]| 1.0 / (weight + 4.0 * STIFFNESS))
+        .collect();
+    for _ in 0..ROUNDS {
+        for row in 0..side {
+            let first = (row + 1) * padded + 1;
+            for column in 0..side {
+                let (node, at) = (row * side + column, first + column);
+                let around = corrections[at - 1]
+                    + corrections[at + 1]
+                    + corrections[at - padded]
+                    + corrections[at + padded];
+                corrections[at] = (pulls[node][1] + STIFFNESS * around) * shares[node];
+            }
+            corrections[first - 1] = corrections[first];
+            corrections[first + side] = corrections[first + side - 1];
+        }
+        let rows = padded * padded - padded;
+        corrections.copy_within(padded..2 * padded, 0);
+        corrections.copy_within(rows - padded..rows, rows);
+    }
+    let inner = |row: usize| (row + 1) * padded + 1..(row + 1) * padded + 1 + side;
+    (0..side)
+        .flat_map(|row| corrections[inner(row)].iter().copied())
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ALL: fn(f32) -> f32 = |_| 1.0;
+
+    #[test]
+    fn a_refined_surface_has_the_same_heights() {
+        let mut surface = Surface::level(32.0, 16.0, -1.0);
+        for (node, height) in surface.heights.iter_mut().enumerate() {
+            *height = (node * 7 % 5) as f32;
+        }
+        let fine = surface.refined().refined();
+        for (x, y) in [(0.0, 0.0), (-31.0, 3.5), (13.2, 29.9), (32.0, -32.0)] {
+            assert!((fine.height_at(x, y) - surface.height_at(x, y)).abs() < 1e-5);
+        }
+    }
+
+    #[test]
+    fn outside_the_area_the_height_is_the_borders() {
+        let surface = Surface::level(32.0, 8.0, 0.7);
+        assert_eq!(surface.height_at(1e9, -40.0), 0.7);
+        assert_eq!(surface.above(&[0.0, 900.0, 1.7]), 1.0);
+    }
+
+    #[test]
+    fn samples_everywhere_are_met_and_holes_are_filled_from_around() {
+        let plane = |x: f32, y: f32| 0.05 * x - 0.02 * y + 1.0;
+        let grid = || (-32..=32).flat_map(|x| (-32..=32).map(move |y| (x as f32, y as f32)));
+        let samples: Vec<Point> = grid()
+            .filter(|(x, y)| x.hypot(*y) > 3.0)
+            .map(|(x, y)| [x, y, plane(x, y)])
+            .collect();
+        let mut surface = Surface::level(32.0, 4.0, 0.0);
+        for _ in 0..20 {
+            surface.pull(samples.iter().map(|point| (point, 1.0)), ALL, 8.0);
+        }
+        for (x, y) in [(0.0, 0.0), (10.0, -20.0), (-17.0, 4.0)] {
+            let error = surface.height_at(x, y) - plane(x, y);
+            assert!(error.abs() < 0.03, "{error} at {x}, {y}");
+        }
+    }
+
+    #[test]
+    fn samples_without_trust_pull_nothing() {
+        let mut surface = Surface::level(32.0, 32.0, 0.0);
+        let samples = [[0.0, 0.0, 5.0]];
+        surface.pull(samples.iter().map(|point| (point, 1.0)), |_| 0.0, 1.0);
+        assert!(surface.heights.iter().all(|&height| height == 0.0));
+    }
+}
