@@ -189,7 +189,10 @@ impl App {
                 _ => return Ok(()),
             }
         }
-        Err(anyhow!("no device can be used: {}", reasons.join("; ")))
+        Err(anyhow!(
+            "no device can be used: {}; fnsf doctor says more, --device cpu does without a GPU",
+            reasons.join("; ")
+        ))
     }
 
     /// Waits until a fresh process may do what this one cannot: until the last device of a kind has

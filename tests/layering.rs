@@ -20,7 +20,9 @@ fn sources() -> Vec<Source> {
         let relative = file.strip_prefix(&root).expect("found below the root");
         relative.to_string_lossy().replace('\\', "/")
     };
-    let is_test = |path: &str| path.ends_with("tests.rs") || path.contains("/contract");
+    let is_test = |path: &str| {
+        path.ends_with("tests.rs") || path.contains("/tests/") || path.contains("/contract")
+    };
     let read = |file: &PathBuf| {
         let text = fs::read_to_string(file).expect("a source file is readable");
         let product = text
@@ -112,12 +114,13 @@ fn the_numerics_have_no_clock_no_files_no_environment_no_async_and_print_nothing
         ".await",
         "tokio",
         "println!",
-        "static mut",
         "thread_local!",
-        "OnceLock",
-        "LazyLock",
     ];
     assert_eq!(uses("flow/", &forbidden), [""; 0]);
+    // A lock that is set once is no global, a `static` is.
+    let mut globals = uses("flow/", &["static "]);
+    globals.retain(|line| !line.contains("'static "));
+    assert_eq!(globals, [""; 0]);
 }
 
 #[test]

@@ -91,7 +91,7 @@ fn corpus() -> Vec<(&'static str, Vec<u8>)> {
 /// The most memory that `fnsf flow FILE FILE` takes, bytes, by the system's own count.
 fn peak_memory(folder: &Path, file: &str) -> Option<u64> {
     let mut child = Command::new(env!("CARGO_BIN_EXE_fnsf"))
-        .args(["flow", file, file, "-o", "out.npz"])
+        .args(["flow", file, file, "--device", "cpu", "-o", "out.npz"])
         .current_dir(folder)
         .stderr(Stdio::null())
         .spawn()
@@ -114,7 +114,8 @@ fn every_hostile_file_gets_one_line_exit_code_65_and_little_memory() {
     let folder = folder.path();
     for (name, bytes) in corpus() {
         std::fs::write(folder.join(name), bytes).expect("written");
-        let ended = fnsf(folder, &["flow", name, name, "-o", "out.npz"]);
+        let arguments = ["flow", name, name, "--device", "cpu", "-o", "out.npz"];
+        let ended = fnsf(folder, &arguments);
         assert_eq!(ended.code, 65, "{name}: {}", ended.stderr);
         assert_eq!(ended.stderr.lines().count(), 1, "{name}: {}", ended.stderr);
         assert!(

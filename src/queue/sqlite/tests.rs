@@ -118,16 +118,21 @@ fn a_second_process_is_refused_by_name() {
 }
 
 #[test]
-fn a_newer_file_is_refused_and_left_alone() {
-    let folder = Folder::new();
-    let path = folder.0.path().join("queue.sqlite3");
-    let connection = schema::open_writer(&path).expect("a file");
-    connection
-        .pragma_update(None, "user_version", schema::VERSION + 1)
-        .expect("a pragma");
-    drop(connection);
-    let error = schema::open_writer(&path).expect_err("a refusal");
-    assert!(matches!(error, QueueError::Store(text) if text.contains("run the newer program")));
+fn a_file_of_another_version_is_refused_with_what_to_do_and_left_alone() {
+    for (version, said) in [
+        (schema::VERSION + 1, "run the newer program"),
+        (schema::VERSION - 1, "name another data_dir"),
+    ] {
+        let folder = Folder::new();
+        let path = folder.0.path().join("queue.sqlite3");
+        let connection = schema::open_writer(&path).expect("a file");
+        connection
+            .pragma_update(None, "user_version", version)
+            .expect("a pragma");
+        drop(connection);
+        let error = schema::open_writer(&path).expect_err("a refusal");
+        assert!(matches!(error, QueueError::Store(text) if text.contains(said)));
+    }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
