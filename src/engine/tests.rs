@@ -153,16 +153,21 @@ async fn a_panic_in_one_lane_is_not_felt_in_another() {
 async fn a_device_that_does_not_come_back_is_given_up_and_still_tried() {
     let stand = stand(2);
     stand.ready().await;
-    stand.switches.refusals.store(6, Ordering::Relaxed);
+    stand.switches.refusals.store(1000, Ordering::Relaxed);
     let lane = stand.device.lanes().next().expect("a lane");
     stand.switches.destroy();
-    assert!(solved(&lane).await.is_err());
-    stand
-        .until(|health| matches!(health, Health::Gone(_)))
-        .await;
-    let obstacle = stand.device.obstacle().expect("an obstacle");
-    assert!(obstacle.contains("the driver is away"), "{obstacle}");
-    stand.ready().await;
+    // It is given back, or done in the end, by which lane is first to see the loss.
+    let given_back_or_done = solved(&lane);
+    let driver_comes_back = async {
+        stand
+            .until(|health| matches!(health, Health::Gone(_)))
+            .await;
+        let obstacle = stand.device.obstacle().expect("an obstacle");
+        assert!(obstacle.contains("the driver is away"), "{obstacle}");
+        stand.switches.refusals.store(0, Ordering::Relaxed);
+        stand.ready().await;
+    };
+    let (_either, ()) = tokio::join!(given_back_or_done, driver_comes_back);
     solved(&lane).await.expect("it works again");
 }
 
