@@ -5,6 +5,7 @@
 
 mod accuracy;
 mod deadlines;
+mod ego;
 mod ground;
 mod prices;
 mod resumption;
