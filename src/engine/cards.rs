@@ -143,6 +143,16 @@ impl Backend for CardLane {
             lost: Arc::clone(&self.lost),
         }))
     }
+
+    fn align(
+        &self,
+        source: &[Point],
+        target: &[Point],
+        prior: &RigidTransform,
+        watch: &dyn Watch,
+    ) -> RigidTransform {
+        self.cpu.align(source, target, prior, watch)
+    }
 }
 
 struct CardTransform {
@@ -154,10 +164,6 @@ struct CardTransform {
 impl Transform for CardTransform {
     fn bytes(&self) -> usize {
         self.cpu.bytes()
-    }
-
-    fn align(&self, source: &[Point], watch: &dyn Watch) -> Result<RigidTransform, BackendError> {
-        self.cpu.align(source, watch)
     }
 
     fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError> {

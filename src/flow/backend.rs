@@ -23,19 +23,23 @@ pub trait Backend: Send + Sync {
         options: &DistanceOptions,
         watch: &dyn Watch,
     ) -> Result<Box<dyn Transform>, BackendError>;
+
+    /// The rigid motion target_from_source, near `prior`, that aligns `source` with `target`; the
+    /// motion so far where `watch` interrupts. Always on the host's threads: it is the same
+    /// whatever the device.
+    fn align(
+        &self,
+        source: &[Point],
+        target: &[Point],
+        prior: &RigidTransform,
+        watch: &dyn Watch,
+    ) -> RigidTransform;
 }
 
 /// A target's distance transform on a device.
 pub trait Transform: Send {
     /// Bytes that it occupies.
     fn bytes(&self) -> usize;
-
-    /// The rigid motion target_from_source that aligns `source` with the target; the motion so
-    /// far where `watch` interrupts.
-    ///
-    /// # Errors
-    /// [`BackendError`] where the device fails.
-    fn align(&self, source: &[Point], watch: &dyn Watch) -> Result<RigidTransform, BackendError>;
 
     /// The distance to the target at each of `points`, metres.
     ///

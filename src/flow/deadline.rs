@@ -25,8 +25,8 @@ const FINER: [(f64, f64); 2] = [(1.0, 28.0), (2.0, 4.5)];
 const EXPECTED_SHARE: f64 = 0.4;
 /// Share of the time left after which a finer transform is given up.
 const GIVEN_UP_SHARE: f64 = 0.6;
-/// Points that are aligned on other cells than the options': a millimetre is not to be had there.
-const ALIGNED: usize = 4096;
+/// Points of each cloud that are aligned where time is short: a millimetre is not to be had then.
+const ALIGNED: usize = 8192;
 /// Points on which the network's speed is measured: about a millisecond, whole tiles.
 const MEASURED: usize = 1536;
 /// What an iteration costs a point, in evaluations: forward, twice that backward, and the query.
@@ -106,26 +106,30 @@ pub(crate) fn prepare(
             Err(error) => Err(error.into()),
         }
     };
-    let aligned = |transform: Box<dyn Transform>, whole: bool| -> Result<_, FlowError> {
-        let ego = match options.ego {
-            Ego::Off => None,
-            Ego::Given(target_from_source) => Some(target_from_source),
-            Ego::Auto if whole => Some(transform.align(&selection.source, &on_time)?),
-            Ego::Auto => Some(transform.align(&thinned(&selection.source), &on_time)?),
+    let aligned = |transform: Box<dyn Transform>, whole: bool| {
+        let standing = RigidTransform::identity();
+        let align =
+            |[source, target]: [&[Point]; 2]| backend.align(source, target, &standing, &on_time);
+        let ego = match (options.ego, &selection.surroundings) {
+            (Ego::Given(target_from_source), _) => Some(target_from_source),
+            (Ego::Auto, Some([source, target])) if whole => Some(align([source, target])),
+            (Ego::Auto, Some(clouds)) => {
+                let [source, target] = clouds.each_ref().map(|points| thinned(points));
+                Some(align([&source, &target]))
+            }
+            (Ego::Off, _) | (Ego::Auto, None) => None,
         };
-        Ok(Prepared {
+        Prepared {
             transform,
             ego,
             whole,
-        })
+        }
     };
     let points = selection.source.len() + selection.target.len();
     let ample = AMPLE_SECONDS_PER_POINT * points as f64;
     if watch.seconds_left().is_none_or(|left| left > ample) {
         let transform = transform(1.0, &on_time)?;
-        return transform
-            .map(|transform| aligned(transform, true))
-            .transpose();
+        return Ok(transform.map(|transform| aligned(transform, true)));
     }
     let began = watch.seconds();
     let Some(coarse) = transform(COARSE, &on_time)? else {
@@ -142,11 +146,11 @@ pub(crate) fn prepare(
             reserve: left * (1.0 - GIVEN_UP_SHARE),
         };
         match transform(coarser, &early)? {
-            Some(transform) => return aligned(transform, coarser == 1.0).map(Some),
+            Some(transform) => return Ok(Some(aligned(transform, coarser == 1.0))),
             None => break,
         }
     }
-    aligned(coarse, false).map(Some)
+    Ok(Some(aligned(coarse, false)))
 }
 
 /// At most [`ALIGNED`] of the points, evenly.

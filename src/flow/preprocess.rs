@@ -3,7 +3,7 @@
 //! Points that are left out keep their row in the result. Knows nothing of what comes after.
 
 use super::error::FlowError;
-use super::options::{Ground, Options};
+use super::options::{Ego, Ground, Options};
 use super::points::{MIN_POINTS, Point};
 use super::random::Random;
 
@@ -25,6 +25,9 @@ pub(crate) struct Selection {
     pub(crate) rows: Vec<usize>,
     pub(crate) source: Vec<Point>,
     pub(crate) target: Vec<Point>,
+    /// Source and target for the ego motion, where it is to be found: all that is finite and in
+    /// range, the ground too, which holds pitch, roll and height.
+    pub(crate) surroundings: Option<[Vec<Point>; 2]>,
 }
 
 /// Selects by `options`; refuses clouds of which too little is left.
@@ -57,8 +60,16 @@ pub(crate) fn select(problem: &Problem, options: &Options) -> Result<Selection, 
     Ok(Selection {
         source: rows.iter().map(|&row| problem.source[row]).collect(),
         target: target_rows.iter().map(|&row| problem.target[row]).collect(),
+        surroundings: (options.ego == Ego::Auto)
+            .then(|| [problem.source, problem.target].map(|points| in_range(points, options))),
         rows,
     })
+}
+
+/// All points that are finite and in range.
+fn in_range(points: &[Point], options: &Options) -> Vec<Point> {
+    let kept = points.iter().filter(|&&point| is_in_range(point, options));
+    kept.copied().collect()
 }
 
 /// The rows of `points` that are finite, in range and not masked.
@@ -77,15 +88,17 @@ fn kept(
             points: points.len(),
         });
     }
-    let range = options.range_m.unwrap_or(f32::INFINITY);
     Ok((0..points.len())
         .filter(|&row| {
-            let [x, y, z] = points[row];
-            let finite = x.is_finite() && y.is_finite() && z.is_finite();
-            let in_range = x.abs() <= range && y.abs() <= range;
-            finite && in_range && !ground.is_some_and(|ground| ground[row])
+            is_in_range(points[row], options) && !ground.is_some_and(|ground| ground[row])
         })
         .collect())
+}
+
+fn is_in_range([x, y, z]: Point, options: &Options) -> bool {
+    let range = options.range_m.unwrap_or(f32::INFINITY);
+    let finite = x.is_finite() && y.is_finite() && z.is_finite();
+    finite && x.abs() <= range && y.abs() <= range
 }
 
 #[cfg(test)]
@@ -119,6 +132,30 @@ mod tests {
         assert_eq!(rows(&options, &source, Some(&ground)), [0, 2, 5, 6]);
         options.ground = Ground::Mask;
         assert_eq!(rows(&options, &source, Some(&ground)), [0, 2, 5]);
+    }
+
+    #[test]
+    fn the_ego_motion_sees_the_ground_and_what_was_not_drawn() {
+        let mut source: Vec<Point> = (0..100).map(|i| [i as f32, 0.0, 0.0]).collect();
+        source.push([f32::NAN; 3]);
+        let ground: Vec<bool> = (0..source.len()).map(|i| i % 2 == 0).collect();
+        let problem = Problem {
+            source: &source,
+            target: &source,
+            ground: Some([&ground, &ground]),
+        };
+        let mut options = Preset::Default.options(Some(10));
+        options.ground = Ground::Mask;
+        options.range_m = Some(60.0);
+        let selection = select(&problem, &options).expect("enough points");
+        assert_eq!(selection.source.len(), 10);
+        assert_eq!(
+            selection.surroundings,
+            Some([(); 2].map(|()| source[..=60].to_vec()))
+        );
+        options.ego = Ego::Off;
+        let selection = select(&problem, &options).expect("enough points");
+        assert_eq!(selection.surroundings, None);
     }
 
     #[test]

@@ -8,7 +8,7 @@
 use super::distance::DistanceTransform;
 use super::error::FlowError;
 use super::field::mlp::{LAID_OUT, PARAMETERS};
-use super::options::{Ego, Options};
+use super::options::Options;
 use super::points::Point;
 use super::preprocess::{self, Problem};
 
@@ -16,8 +16,13 @@ use super::preprocess::{self, Problem};
 const PASSES: f64 = 3.0;
 /// An iteration's steps beside its points (gradients added, Adam, transposes), in points.
 const STEP_POINTS: f64 = 150.0;
-/// Multiply-adds that take as long as aligning: 30 steps over 16,384 points.
-const ALIGNING: f64 = 7e9;
+/// Multiply-adds that take as long as aligning whatever the number of points: nine coarse fits, and
+/// a fine one of 8,192 points.
+const ALIGNING: f64 = 4e9;
+/// Multiply-adds that take as long as thinning a point for that, and its share of the surfels.
+const THINNING: f64 = 2e4;
+/// Bytes that are held for a point while it is: itself, its voxel and its surfel, at most.
+const THINNING_BYTES: usize = 64;
 /// Multiply-adds that take as long as selecting and moving a point and its results.
 const POINT: f64 = 3e4;
 /// Sets of parameters that are held at once: of the network, its transposes, its optimizer, the
@@ -66,10 +71,11 @@ pub fn price(problem: &Problem, options: &Options) -> Result<Price, FlowError> {
     let batch = options.batch.unwrap_or(source_points).min(source_points) as f64;
     let iterations = options.expected_iterations() as f64;
     let passes = iterations * PASSES * (batch + STEP_POINTS) + source_points as f64;
-    let aligning = match options.ego {
-        Ego::Auto => ALIGNING,
-        Ego::Off | Ego::Given(_) => 0.0,
-    };
+    let aligned = selection
+        .surroundings
+        .map(|clouds| clouds.map(|points| points.len()));
+    let aligned = aligned.map(|[source, target]| source + target);
+    let aligning = aligned.map_or(0.0, |points| ALIGNING + points as f64 * THINNING);
     let points = (source_points + target_points) as f64 * POINT;
     Ok(Price {
         source_points,
@@ -79,6 +85,7 @@ pub fn price(problem: &Problem, options: &Options) -> Result<Price, FlowError> {
         bytes: transform.peak_bytes
             + PARAMETER_SETS * LAID_OUT * size_of::<f32>()
             + (POINT_COPIES * source_points + target_points) * size_of::<Point>()
+            + aligned.unwrap_or(0) * THINNING_BYTES
             + WORKING_SETS,
         multiply_adds: transform.multiply_adds + passes * PARAMETERS as f64 + aligning + points,
     })

@@ -215,8 +215,8 @@ impl Hash {
     }
 }
 
-/// What a snapshot belongs to: both clouds as they take part, and every option but the memory
-/// that the machine allows.
+/// What a snapshot belongs to: both clouds as they take part, in the fit and in the ego motion, and
+/// every option but the memory that the machine allows.
 fn identity(selection: &Selection, options: &Options) -> u64 {
     let mut options = options.clone();
     options.distance.max_bytes = 0;
@@ -230,6 +230,11 @@ fn identity(selection: &Selection, options: &Options) -> u64 {
     };
     cloud(&selection.source);
     cloud(&selection.target);
+    selection
+        .surroundings
+        .iter()
+        .flatten()
+        .for_each(|points| cloud(points));
     hash.0
 }
 

@@ -5,6 +5,7 @@
 
 mod accuracy;
 mod deadlines;
+mod ego;
 mod gpu;
 #[path = "../common/gpu.rs"]
 mod gpu_rule;

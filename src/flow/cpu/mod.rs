@@ -86,6 +86,17 @@ impl Backend for CpuBackend {
             distance,
         }))
     }
+
+    fn align(
+        &self,
+        source: &[Point],
+        target: &[Point],
+        prior: &RigidTransform,
+        watch: &dyn Watch,
+    ) -> RigidTransform {
+        let align = || ego::align(source, target, prior, watch);
+        self.threads.install(align)
+    }
 }
 
 /// A distance transform in memory, and what will fit a field to it.
@@ -98,14 +109,6 @@ struct CpuTransform {
 impl Transform for CpuTransform {
     fn bytes(&self) -> usize {
         self.distance.bytes()
-    }
-
-    fn align(&self, source: &[Point], watch: &dyn Watch) -> Result<RigidTransform, BackendError> {
-        let samples = |points: &[Point]| {
-            let sample = |&point: &Point| self.distance.sample(point);
-            Ok(points.par_iter().map(sample).collect())
-        };
-        self.threads.install(|| ego::align(source, &samples, watch))
     }
 
     fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError> {

@@ -11,7 +11,8 @@ use super::records::{self, STEPS};
 use super::transform;
 use crate::flow::backend::{Backend, BackendError, Transform};
 use crate::flow::distance::DistanceOptions;
-use crate::flow::points::Point;
+use crate::flow::ego;
+use crate::flow::points::{Point, RigidTransform};
 use crate::flow::watch::Watch;
 
 /// How a card is opened.
@@ -86,6 +87,17 @@ impl Backend for Gpu {
     ) -> Result<Box<dyn Transform>, BackendError> {
         let build = || transform::build(&self.0, source, target, options, watch);
         Ok(Box::new(self.0.host.install(build)?))
+    }
+
+    fn align(
+        &self,
+        source: &[Point],
+        target: &[Point],
+        prior: &RigidTransform,
+        watch: &dyn Watch,
+    ) -> RigidTransform {
+        let align = || ego::align(source, target, prior, watch);
+        self.0.host.install(align)
     }
 }
 

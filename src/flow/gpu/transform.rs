@@ -9,9 +9,8 @@ use super::trainer::GpuTrainer;
 use crate::flow::backend::{BackendError, Trainer, Transform};
 use crate::flow::distance::device::{ABSENT, CellSites, FarField, Index, Layout, codes_per_cell};
 use crate::flow::distance::{DistanceError, DistanceOptions, Metric, Sample, Sites};
-use crate::flow::ego;
 use crate::flow::options::Options;
-use crate::flow::points::{Point, RigidTransform};
+use crate::flow::points::Point;
 use crate::flow::watch::Watch;
 
 /// Words of a brick's 16-bit codes.
@@ -215,12 +214,6 @@ impl GpuTransform {
 impl Transform for GpuTransform {
     fn bytes(&self) -> usize {
         self.stretch.words as usize * 4
-    }
-
-    fn align(&self, source: &[Point], watch: &dyn Watch) -> Result<RigidTransform, BackendError> {
-        let samples = |points: &[Point]| self.samples(points);
-        let align = || ego::align(source, &samples, watch);
-        self.card.host.install(align)
     }
 
     fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError> {

@@ -1,0 +1,170 @@
+//! How far off the ego motion is, on real and simulated pairs, as rows for `docs/numerics.md`.
+//!
+//! Run with `FNSF_REAL_DATA` naming the folder of real pairs; without it only streets are tried.
+#![expect(clippy::print_stdout, reason = "the table is the program's purpose")]
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use fnsf::flow::backend::Backend;
+use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::simulate::{Street, StreetOptions};
+use fnsf::flow::{Point, RigidTransform, Unwatched};
+use fnsf::formats::read_pair;
+use nalgebra::{Isometry3, Point3, Vector3};
+
+/// Shifts and turns of both clouds together, which move every voxel's border: the thinning differs
+/// and the truth stays.
+const OFFSETS: usize = 8;
+/// Seeds of each kind of street.
+const SEEDS: u64 = 12;
+
+/// Two clouds and the motion between them.
+struct Case {
+    source: Vec<Point>,
+    target: Vec<Point>,
+    truth: RigidTransform,
+}
+
+impl Case {
+    fn backward(&self) -> Self {
+        Self {
+            source: self.target.clone(),
+            target: self.source.clone(),
+            truth: self.truth.inverse(),
+        }
+    }
+
+    /// In a frame that is moved against the sensor's.
+    fn seen_from(&self, offset: usize) -> Self {
+        let shift = Vector3::new(0.11, 0.07, 0.05) * offset as f64;
+        let frame = Isometry3::new(shift, Vector3::new(0.0, 0.0, 0.1 * offset as f64));
+        Self {
+            source: moved(&self.source, &frame),
+            target: moved(&self.target, &frame),
+            truth: frame * self.truth * frame.inverse(),
+        }
+    }
+
+    fn without(&self, ground: [&[bool]; 2]) -> Self {
+        let off = |points: &[Point], ground: &[bool]| {
+            let rows = points.iter().zip(ground).filter(|(_, ground)| !**ground);
+            rows.map(|(&point, _)| point).collect()
+        };
+        Self {
+            source: off(&self.source, ground[0]),
+            target: off(&self.target, ground[1]),
+            truth: self.truth,
+        }
+    }
+}
+
+fn main() -> anyhow::Result<()> {
+    println!("| pairs | points | motion | off, m | worst | off, degrees | worst | ms |");
+    println!("|---|---|---|---|---|---|---|---|");
+    let backend = CpuBackend::new(Some(1))?;
+    if let Some(folder) = std::env::var_os("FNSF_REAL_DATA").map(PathBuf::from) {
+        for name in ["av2_7fab", "kitti_0000", "small_gicp"] {
+            let pair = read_pair(&std::fs::read(folder.join(name).join("pair.npz"))?)?;
+            let ground = pair.ground.unwrap_or_default();
+            let all = Case {
+                source: pair.source,
+                target: pair.target,
+                truth: pair.ego.unwrap_or_default(),
+            };
+            let off = all.without([&ground.source, &ground.target]);
+            for (what, case) in [("", all), (", no ground", off)] {
+                let offsets = |case: &Case| (0..OFFSETS).map(|i| case.seen_from(i)).collect();
+                row(&format!("{name}{what}"), &backend, offsets(&case));
+                let back = case.backward();
+                row(&format!("{name}{what}, back"), &backend, offsets(&back));
+            }
+        }
+    }
+    for (beams, azimuth_steps) in [(16, 1800), (32, 1800), (64, 2000), (128, 1024)] {
+        for (speed, yaw_rate) in [(0.0, 0.0), (10.0, 0.25), (30.0, 0.7)] {
+            let case = |seed| {
+                let sign = if seed % 2 == 0 { 1.0 } else { -1.0 };
+                let pair = Street::new(&StreetOptions {
+                    seed,
+                    beams,
+                    azimuth_steps,
+                    speed_mps: Some(speed),
+                    yaw_rate_rps: Some(yaw_rate * sign),
+                    ..StreetOptions::default()
+                })?
+                .pair(0)?;
+                let all = Case {
+                    source: pair.source,
+                    target: pair.target,
+                    truth: pair.target_from_source,
+                };
+                let off = all.without([&pair.ground_source, &pair.ground_target]);
+                anyhow::Ok([all, off])
+            };
+            let cases = (0..SEEDS).map(case).collect::<Result<Vec<_>, _>>()?;
+            let (all, off): (Vec<_>, Vec<_>) = cases.into_iter().map(|[a, b]| (a, b)).unzip();
+            let name = format!("{beams} beams, {speed} m/s");
+            if speed == 30.0 {
+                let turned = all.iter().map(five_degrees).collect();
+                row(&format!("{name}, turned to 5 degrees"), &backend, turned);
+            }
+            row(&name, &backend, all);
+            row(&format!("{name}, no ground"), &backend, off);
+        }
+    }
+    Ok(())
+}
+
+/// The source turned, so that the yaw between the clouds is 5 degrees.
+fn five_degrees(case: &Case) -> Case {
+    let own = case.truth.rotation.scaled_axis().z;
+    let missing = 5_f64.to_radians() * own.signum() - own;
+    let turn = Isometry3::new(Vector3::zeros(), Vector3::new(0.0, 0.0, missing));
+    Case {
+        source: moved(&case.source, &turn.inverse()),
+        target: case.target.clone(),
+        truth: case.truth * turn,
+    }
+}
+
+fn moved(points: &[Point], motion: &RigidTransform) -> Vec<Point> {
+    let moved = points
+        .iter()
+        .map(|point| motion * Point3::from(point.map(f64::from)));
+    moved.map(|p| p.map(|c| c as f32).into()).collect()
+}
+
+/// One row: of several cases the middle error and the largest; the shortest time, since the
+/// machine may be shared.
+fn row(name: &str, backend: &CpuBackend, cases: Vec<Case>) {
+    let mut meters = Vec::new();
+    let mut degrees = Vec::new();
+    let mut times = Vec::new();
+    for case in &cases {
+        let start = Instant::now();
+        let prior = RigidTransform::identity();
+        let found = backend.align(&case.source, &case.target, &prior, &Unwatched);
+        times.push(start.elapsed().as_secs_f64() * 1e3);
+        let gap = case.truth.inv_mul(&found);
+        meters.push(gap.translation.vector.norm());
+        degrees.push(gap.rotation.angle().to_degrees());
+    }
+    for list in [&mut meters, &mut degrees, &mut times] {
+        list.sort_by(f64::total_cmp);
+    }
+    let middle = |list: &[f64]| list[list.len() / 2];
+    let worst = |list: &[f64]| list[list.len() - 1];
+    let truth = &cases[0].truth;
+    println!(
+        "| {name} | {} | {:.2} m, {:.1} degrees | {:.4} | {:.4} | {:.3} | {:.3} | {:.0} |",
+        cases[0].source.len(),
+        truth.translation.vector.norm(),
+        truth.rotation.angle().to_degrees(),
+        middle(&meters),
+        worst(&meters),
+        middle(&degrees),
+        worst(&degrees),
+        times[0]
+    );
+}

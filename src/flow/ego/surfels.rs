@@ -1,0 +1,213 @@
+//! Small flat pieces of a cloud's surfaces, and which of them lies nearest to a point.
+//!
+//! Points lie in square columns, sorted, so that the nine columns around a point are three runs in
+//! memory. A normal is that of a point's neighbors within a cell. It must not know of motions.
+
+use std::ops::Range;
+
+use nalgebra::{Matrix3, Vector3};
+use rayon::prelude::*;
+
+use super::thin::REACH;
+use crate::flow::Point;
+
+/// Points whose normals one thread takes at a time.
+const POINTS_AT_ONCE: usize = 256;
+/// Fewer neighbors than this, the point itself among them, make no surface.
+const NEIGHBORS: f64 = 4.0;
+/// A surface is flat where its spread along its second axis exceeds that along its normal by this
+/// share of the spread along its first. Less flat ones are branches and wires; with more asked for,
+/// walls seen by one ring are lost.
+const FLAT: f64 = 0.05;
+/// Spreads below this are none, square metres.
+const NO_SPREAD: f64 = 1e-12;
+
+/// A cloud's surfels.
+pub(super) struct Surfels {
+    cell_m: f32,
+    /// Columns that are not empty, by x, then y, and where their points begin; closed by one that
+    /// begins at the end.
+    columns: Vec<(u64, u32)>,
+    points: Vec<Point>,
+    /// One for each of `points`; none where there is no flat surface.
+    normals: Vec<Option<[f32; 3]>>,
+}
+
+/// A flat piece of surface.
+pub(super) struct Surfel {
+    /// A point on it, metres.
+    pub(super) point: Point,
+    /// Its unit normal, on either side.
+    pub(super) normal: [f32; 3],
+}
+
+impl Surfels {
+    /// Of evenly thinned points, voxels apart that are smaller than `cell_m`.
+    pub(super) fn new(points: &[Point], cell_m: f32) -> Self {
+        let keyed = points.iter().map(|&point| (column(point, cell_m), point));
+        let mut keyed: Vec<_> = keyed.collect();
+        // Stable: the order within a column is that of the points.
+        keyed.sort_by_key(|&(key, _)| key);
+        let mut columns: Vec<(u64, u32)> = Vec::new();
+        for (&(key, _), begin) in keyed.iter().zip(0..) {
+            if columns.last().is_none_or(|&(last, _)| last != key) {
+                columns.push((key, begin));
+            }
+        }
+        columns.push((u64::MAX, keyed.len() as u32));
+        let mut surfels = Self {
+            cell_m,
+            columns,
+            points: keyed.into_iter().map(|(_, point)| point).collect(),
+            normals: Vec::new(),
+        };
+        let normals = surfels.points.par_chunks(POINTS_AT_ONCE);
+        surfels.normals = normals
+            .flat_map_iter(|points| points.iter().map(|&point| surfels.normal_at(point)))
+            .collect();
+        surfels
+    }
+
+    /// The surfel whose point is nearest to `point`, less than `within_m` from it, which is at
+    /// most a cell; none where nothing or nothing flat is there.
+    pub(super) fn nearest(&self, point: Point, within_m: f32) -> Option<Surfel> {
+        let near = |c: &f32| (c / self.cell_m).abs() < REACH - 2.0;
+        if !point.iter().all(near) {
+            return None;
+        }
+        let mut nearest = None;
+        let mut least = within_m * within_m;
+        for row in self.around(point) {
+            for (other, i) in self.points[row.clone()].iter().zip(row) {
+                let square = square_distance(point, *other);
+                if square < least {
+                    least = square;
+                    nearest = Some(i);
+                }
+            }
+        }
+        let nearest = nearest?;
+        Some(Surfel {
+            point: self.points[nearest],
+            normal: self.normals[nearest]?,
+        })
+    }
+
+    /// The points of the columns around `point`: three runs.
+    fn around(&self, point: Point) -> [Range<usize>; 3] {
+        let middle = column(point, self.cell_m);
+        let (x, y) = (middle >> 32, middle & u64::from(u32::MAX));
+        let begin = |x: u64, y: u64| {
+            let first = self
+                .columns
+                .partition_point(|&(key, _)| key < (x << 32 | y));
+            self.columns[first].1 as usize
+        };
+        [x - 1, x, x + 1].map(|x| begin(x, y - 1)..begin(x, y + 2))
+    }
+
+    fn normal_at(&self, point: Point) -> Option<[f32; 3]> {
+        let mut count = 0.0;
+        let mut sum = Vector3::zeros();
+        let mut squares = Matrix3::zeros();
+        for other in self
+            .around(point)
+            .into_iter()
+            .flat_map(|row| &self.points[row])
+        {
+            if square_distance(point, *other) < self.cell_m * self.cell_m {
+                let away = Vector3::from_fn(|a, _| f64::from(other[a] - point[a]));
+                count += 1.0;
+                sum += away;
+                squares += away * away.transpose();
+            }
+        }
+        if count < NEIGHBORS {
+            return None;
+        }
+        let mean: Vector3<f64> = sum / count;
+        normal(&(squares / count - mean * mean.transpose()))
+    }
+}
+
+/// The column of a point within reach; one cell of room is left around all of them.
+fn column(point: Point, cell_m: f32) -> u64 {
+    let [x, y] = [point[0], point[1]].map(|c| ((c / cell_m).floor() + REACH + 1.0) as u64);
+    x << 32 | y
+}
+
+fn square_distance(a: Point, b: Point) -> f32 {
+    let [x, y, z] = [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+    x * x + y * y + z * z
+}
+
+/// The axis of least spread, in closed form; none where the spread is not that of a flat surface.
+fn normal(spread: &Matrix3<f64>) -> Option<[f32; 3]> {
+    let mean = spread.trace() / 3.0;
+    let rest = spread - Matrix3::identity() * mean;
+    let radius = (rest.norm_squared() / 6.0).sqrt();
+    if radius.is_nan() || radius < NO_SPREAD {
+        return None;
+    }
+    let half = (rest / radius).determinant() / 2.0;
+    let angle = half.clamp(-1.0, 1.0).acos() / 3.0;
+    let third = 2.0 * std::f64::consts::FRAC_PI_3;
+    let most = mean + 2.0 * radius * angle.cos();
+    let least = mean + 2.0 * radius * (angle + third).cos();
+    let middle = 3.0 * mean - most - least;
+    if middle - least < FLAT * most {
+        return None;
+    }
+    // The rows of what is left without the least spread are at right angles to its axis.
+    let across = spread - Matrix3::identity() * least;
+    let [a, b, c] = [0, 1, 2].map(|i| across.column(i).into_owned());
+    let candidates = [a.cross(&b), b.cross(&c), c.cross(&a)];
+    let longest = candidates
+        .into_iter()
+        .max_by(|a, b| a.norm_squared().total_cmp(&b.norm_squared()))?;
+    let normal = longest.try_normalize(0.0)?;
+    Some([normal.x as f32, normal.y as f32, normal.z as f32])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::random::Random;
+
+    #[test]
+    fn the_nearest_surfel_is_the_one_that_a_search_of_all_finds() {
+        let mut random = Random::new(2);
+        let mut point = || [0; 3].map(|_| random.uniform(-4.0, 4.0) as f32);
+        let cloud: Vec<Point> = (0..800).map(|_| point()).collect();
+        let surfels = Surfels::new(&cloud, 1.0);
+        for _ in 0..500 {
+            let asked = point();
+            let square = |other: &Point| square_distance(asked, *other);
+            let nearest = cloud.iter().map(square).fold(f32::INFINITY, f32::min);
+            if let Some(found) = surfels.nearest(asked, 1.0) {
+                assert_eq!(square(&found.point), nearest);
+            }
+        }
+        assert!(surfels.nearest([f32::NAN; 3], 1.0).is_none());
+        assert!(surfels.nearest([1e30, 0.0, 0.0], 1.0).is_none());
+    }
+
+    #[test]
+    fn planes_have_their_normal_and_lines_have_none() {
+        let slope = Vector3::new(0.3, -0.2, 1.0).normalize();
+        let on_plane = |i: usize| {
+            let [x, y] = [(i % 20) as f32 * 0.3 - 3.0, (i / 20) as f32 * 0.3 - 3.0];
+            [x, y, -0.3 * x + 0.2 * y]
+        };
+        let plane: Vec<Point> = (0..400).map(on_plane).collect();
+        let surfels = Surfels::new(&plane, 1.0);
+        for &point in &plane {
+            let normal = surfels.nearest(point, 1.0).expect("a plane is flat").normal;
+            let along = Vector3::from(normal.map(f64::from)).dot(&slope).abs();
+            assert!(along > 1.0 - 1e-6, "{normal:?}");
+        }
+        let line: Vec<Point> = (0..100).map(|i| [i as f32 * 0.3, 0.0, 0.0]).collect();
+        assert!(Surfels::new(&line, 1.0).normals.iter().all(Option::is_none));
+        assert!(Surfels::new(&[], 1.0).nearest([0.0; 3], 1.0).is_none());
+    }
+}

@@ -1,0 +1,77 @@
+//! Clouds made even: one point a voxel, so that near rings weigh no more than far walls.
+//!
+//! It must not know what the points are for.
+
+use crate::flow::Point;
+
+/// Voxels along an axis on each side of the origin; what is farther is left out.
+pub(super) const REACH: f32 = (1 << 20) as f32;
+
+/// The mean of each voxel's points, in the order of the voxels: x, then y, then z.
+pub(super) fn thinned(points: &[Point], voxel_m: f32) -> Vec<Point> {
+    let keyed = points.iter().zip(0_u32..);
+    let mut keyed: Vec<(u64, u32)> = keyed
+        .filter_map(|(&point, row)| Some((key(point, voxel_m)?, row)))
+        .collect();
+    keyed.sort_unstable();
+    let voxels = keyed.chunk_by(|(key, _), (next, _)| key == next);
+    voxels.map(|voxel| mean(points, voxel)).collect()
+}
+
+/// At most `most` of the points, evenly.
+pub(super) fn evenly(points: &[Point], most: usize) -> Vec<Point> {
+    let kept = points.len().min(most);
+    (0..kept).map(|i| points[i * points.len() / kept]).collect()
+}
+
+/// The voxel's number; none out of reach.
+fn key(point: Point, voxel_m: f32) -> Option<u64> {
+    let at = point.map(|c| (c / voxel_m).floor());
+    let [x, y, z] = at.map(|c| (c + REACH) as u64);
+    at.iter()
+        .all(|c| c.abs() < REACH)
+        .then_some(x << 42 | y << 21 | z)
+}
+
+fn mean(points: &[Point], voxel: &[(u64, u32)]) -> Point {
+    let mut sum = [0.0; 3];
+    for &(_, row) in voxel {
+        for (sum, c) in sum.iter_mut().zip(points[row as usize]) {
+            *sum += f64::from(c);
+        }
+    }
+    sum.map(|sum| (sum / voxel.len() as f64) as f32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_voxel_keeps_the_mean_of_its_points_whatever_their_order() {
+        let mut points = vec![[0.1, 0.1, 0.1], [-0.1, 0.1, 0.1], [0.3, 0.1, 0.1]];
+        let thin = thinned(&points, 0.5);
+        assert_eq!(thin, [[-0.1, 0.1, 0.1], [0.2, 0.1, 0.1]]);
+        points.swap(0, 1);
+        assert_eq!(thinned(&points, 0.5), thin);
+    }
+
+    #[test]
+    fn points_out_of_reach_and_what_is_no_number_are_left_out() {
+        let points = [
+            [f32::NAN, 0.0, 0.0],
+            [0.0, f32::INFINITY, 0.0],
+            [1e9, 0.0, 0.0],
+        ];
+        assert_eq!(thinned(&points, 0.5), [[0.0; 3]; 0]);
+        assert_eq!(evenly(&[], 5), [[0.0; 3]; 0]);
+    }
+
+    #[test]
+    fn some_of_the_points_are_spread_over_all_of_them() {
+        let points: Vec<Point> = (0..10).map(|i| [i as f32, 0.0, 0.0]).collect();
+        let kept: Vec<f32> = evenly(&points, 4).iter().map(|point| point[0]).collect();
+        assert_eq!(kept, [0.0, 2.0, 5.0, 7.0]);
+        assert_eq!(evenly(&points, 20), points);
+    }
+}
