@@ -271,7 +271,7 @@ def arguments_of(argv):
         command.add_argument("--seed", type=int)
         command.add_argument("--max-points", type=int)
         command.add_argument("--range-m", type=float)
-        command.add_argument("--ground", choices=["keep", "mask"])
+        command.add_argument("--ground", choices=["keep", "mask", "auto"])
         command.add_argument("--ego", choices=["off", "auto"])
         command.add_argument("--priority", choices=["low", "normal", "high"])
     return parser.parse_args(argv)

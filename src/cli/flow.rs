@@ -68,7 +68,8 @@ struct Estimation {
     /// Leave out points with |x| or |y| beyond R metres
     #[arg(long, value_name = "R", value_parser = positive)]
     range_m: Option<f32>,
-    /// Keep ground points, or leave out those that the pair's ground1 and ground2 name
+    /// Keep ground points, leave out those that the pair's ground1 and ground2 name (mask), or find
+    /// them and let them move with the vehicle's own motion (auto)
     #[arg(long, value_enum, default_value_t)]
     ground: GroundChoice,
     /// The vehicle's own motion: off, auto (estimate it first), or a file with the 4 x 4 matrix

@@ -180,6 +180,9 @@ pub enum Ground {
     Keep,
     /// Those that the problem's masks name are left out.
     Mask,
+    /// Those that [`super::ground::segment`] finds take no part, and move with the vehicle's own
+    /// motion where that is known and the points are not sampled; else they are left out.
+    Auto,
 }
 
 /// The vehicle's own motion, which carries every static point.

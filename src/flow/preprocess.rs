@@ -3,6 +3,7 @@
 //! Points that are left out keep their row in the result. Knows nothing of what comes after.
 
 use super::error::FlowError;
+use super::ground::{self, GroundOptions};
 use super::options::{Ego, Ground, Options};
 use super::points::{MIN_POINTS, Point};
 use super::random::Random;
@@ -25,6 +26,8 @@ pub(crate) struct Selection {
     pub(crate) rows: Vec<usize>,
     pub(crate) source: Vec<Point>,
     pub(crate) target: Vec<Point>,
+    /// Rows of the source that move with the ego motion without taking part: ground that was found.
+    pub(crate) carried: Vec<usize>,
     /// Source and target for the ego motion, where it is to be found: all that is finite and in
     /// range, the ground too, which holds pitch, roll and height.
     pub(crate) surroundings: Option<[Vec<Point>; 2]>,
@@ -32,13 +35,26 @@ pub(crate) struct Selection {
 
 /// Selects by `options`; refuses clouds of which too little is left.
 pub(crate) fn select(problem: &Problem, options: &Options) -> Result<Selection, FlowError> {
-    let masks = match (options.ground, problem.ground) {
-        (Ground::Keep, _) => [None, None],
-        (Ground::Mask, Some([source, target])) => [Some(source), Some(target)],
-        (Ground::Mask, None) => return Err(FlowError::NoGroundMask),
+    let found = match options.ground {
+        Ground::Auto => {
+            Some([problem.source, problem.target].map(|points| ground_of(points, options)))
+        }
+        Ground::Keep | Ground::Mask => None,
     };
-    let mut rows = kept("source", problem.source, masks[0], options)?;
-    let mut target_rows = kept("target", problem.target, masks[1], options)?;
+    let [source_mask, target_mask] = match (options.ground, problem.ground, &found) {
+        (Ground::Mask, None, _) => return Err(FlowError::NoGroundMask),
+        (Ground::Mask, Some([source, target]), _) => [Some(source), Some(target)],
+        (_, _, Some([source, target])) => [Some(source.as_slice()), Some(target.as_slice())],
+        (_, _, None) => [None, None],
+    };
+    let mut rows = kept("source", problem.source, source_mask, options)?;
+    let mut target_rows = kept("target", problem.target, target_mask, options)?;
+    let carried = match &found {
+        Some([ground, _]) if options.max_points.is_none() => {
+            (0..ground.len()).filter(|&row| ground[row]).collect()
+        }
+        _ => Vec::new(),
+    };
     if let Some(max_points) = options.max_points {
         // One permutation for both clouds, as the published code draws it; but each cloud is drawn
         // from all of its rows, which lie in the order of the scan.
@@ -63,7 +79,22 @@ pub(crate) fn select(problem: &Problem, options: &Options) -> Result<Selection, 
         surroundings: (options.ego == Ego::Auto)
             .then(|| [problem.source, problem.target].map(|points| in_range(points, options))),
         rows,
+        carried,
     })
+}
+
+/// Which of the points are ground, of those that are finite and in range.
+fn ground_of(points: &[Point], options: &Options) -> Vec<bool> {
+    let rows: Vec<usize> = (0..points.len())
+        .filter(|&row| is_in_range(points[row], options))
+        .collect();
+    let in_range: Vec<Point> = rows.iter().map(|&row| points[row]).collect();
+    let found = ground::segment(&in_range, &GroundOptions::default()).ground;
+    let mut ground = vec![false; points.len()];
+    for (row, found) in rows.into_iter().zip(found) {
+        ground[row] = found;
+    }
+    ground
 }
 
 /// All points that are finite and in range.

@@ -164,6 +164,14 @@ fn solve(
             dynamic[row] = square >= DYNAMIC_M * DYNAMIC_M;
         }
     }
+    if let (Some(motion), Some(dynamic)) = (&ego, &mut dynamic) {
+        for &row in &selection.carried {
+            let (from, to) = (problem.source[row], moved(motion, problem.source[row]));
+            flow[row] = core::array::from_fn(|a| to[a] - from[a]);
+            valid[row] = true;
+            dynamic[row] = false;
+        }
+    }
     let report = fitted.report;
     let precompute = fitted.precomputed - began;
     let total = watch.seconds() - began;
@@ -379,6 +387,37 @@ mod tests {
             estimate.points,
             estimate.valid.iter().filter(|&&v| v).count()
         );
+    }
+
+    #[test]
+    fn ground_that_is_found_moves_with_the_vehicle_and_takes_no_part() {
+        let pair = street();
+        let mut options = Preset::Default.options(None);
+        options.ground = Ground::Auto;
+        let estimate = solve(&pair, &options, &Unwatched).expect("a flow");
+        let ego = estimate.ego.expect("it is estimated");
+        assert!(estimate.valid.iter().all(|&valid| valid));
+        assert!(estimate.points < pair.source.len());
+        let found = crate::flow::ground::segment(&pair.source, &Default::default()).ground;
+        let dynamic = estimate.dynamic.expect("the ego motion is known");
+        for (row, point) in pair
+            .source
+            .iter()
+            .enumerate()
+            .filter(|&(row, _)| found[row])
+        {
+            let to = moved(&ego, *point);
+            let expected: Point = core::array::from_fn(|a| to[a] - point[a]);
+            assert_eq!(estimate.flow[row], expected, "row {row}");
+            assert!(!dynamic[row], "row {row}");
+        }
+        // Without the vehicle's motion, or sampled, it is left out.
+        for (ego, max_points) in [(Ego::Off, None), (Ego::Auto, Some(500))] {
+            options.ego = ego;
+            options.max_points = max_points;
+            let estimate = solve(&pair, &options, &Unwatched).expect("a flow");
+            assert!((0..found.len()).all(|row| !found[row] || !estimate.valid[row]));
+        }
     }
 
     #[test]

@@ -30,7 +30,8 @@ pub struct JobOptions {
     /// Leave out points with |x| or |y| beyond this, metres.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub range_m: Option<f32>,
-    /// Keep ground points, or leave out those that the pair's own masks name.
+    /// Keep ground points, leave out those that the pair's own masks name, or find them: then they
+    /// move with the vehicle's own motion.
     pub ground: GroundChoice,
     /// The vehicle's own motion: `off`, `auto` (estimate it first) or a 4 x 4 matrix
     /// target_from_source; by default what the preset does.
@@ -80,6 +81,8 @@ pub enum GroundChoice {
     Keep,
     /// Those that the pair's ground1 and ground2 name are left out.
     Mask,
+    /// Those that are found in the clouds move with the vehicle's own motion.
+    Auto,
 }
 
 /// Where the work is done.
@@ -296,6 +299,7 @@ impl JobOptions {
         options.ground = match self.ground {
             GroundChoice::Keep => Ground::Keep,
             GroundChoice::Mask => Ground::Mask,
+            GroundChoice::Auto => Ground::Auto,
         };
         match self.ego {
             None => {}

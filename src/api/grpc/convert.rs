@@ -30,6 +30,7 @@ pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, Api
     let ground = match proto::Ground::try_from(message.ground) {
         Ok(proto::Ground::Unspecified | proto::Ground::Keep) => GroundChoice::Keep,
         Ok(proto::Ground::Mask) => GroundChoice::Mask,
+        Ok(proto::Ground::Auto) => GroundChoice::Auto,
         Err(_) => return Err(unknown("ground", message.ground)),
     };
     let priority = match proto::Priority::try_from(message.priority) {
