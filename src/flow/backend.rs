@@ -47,7 +47,8 @@ pub trait Transform: Send {
     /// [`BackendError`] where the device fails.
     fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError>;
 
-    /// A field at its start, to be fitted to `source`.
+    /// A field at its start, to be fitted to `source`: at most as many points as the transform was
+    /// built for.
     ///
     /// # Errors
     /// [`BackendError`] where the device fails.
@@ -140,7 +141,7 @@ pub enum BackendError {
     #[error("the device cannot do this: {0}")]
     Unsupported(&'static str),
     /// The pair does not fit on the device.
-    #[error("the pair needs {needed} bytes for its {what} on the device, which has {available}")]
+    #[error("{needed} bytes are needed for the {what}, and the device has {available}")]
     Memory {
         /// What does not fit.
         what: &'static str,

@@ -29,6 +29,8 @@ const GIVEN_UP_SHARE: f64 = 0.6;
 const ALIGNED: usize = 8192;
 /// Points on which the network's speed is measured: about a millisecond, whole tiles.
 const MEASURED: usize = 1536;
+/// Less than this is what it takes to ask a device anything, seconds: then all points are measured.
+const LATENCY: f64 = 4e-4;
 /// What an iteration costs a point, in evaluations: forward, twice that backward, and the query.
 const ITERATION: f64 = 3.4;
 /// Where the step size falls, a run that is predicted to take this many times too long is begun
@@ -42,6 +44,9 @@ const SLACK: f64 = 0.006;
 const ROWS_AT_ONCE: usize = 9216;
 /// A run is shortened where less than this share of its iterations fits.
 const FITTING_SHARE: f64 = 0.95;
+/// Share of the time left that may pass without a look at the clock, on devices that do several
+/// iterations at once.
+const STEPS_SHARE: f64 = 0.05;
 /// Iterations between two such checks.
 const ITERATIONS_AT_ONCE: usize = 8;
 
@@ -175,11 +180,19 @@ impl Pace {
         points: &[Point],
         watch: &dyn Watch,
     ) -> Result<Self, FlowError> {
-        let measured = &points[..points.len().min(MEASURED)];
+        let mut measured = &points[..points.len().min(MEASURED)];
         trainer.evaluate(measured)?;
-        let began = watch.seconds();
-        trainer.evaluate(measured)?;
-        let point = (watch.seconds() - began) / measured.len() as f64;
+        let mut seconds = || -> Result<f64, FlowError> {
+            let began = watch.seconds();
+            trainer.evaluate(measured)?;
+            Ok(watch.seconds() - began)
+        };
+        let mut took = seconds()?;
+        if took < LATENCY {
+            measured = points;
+            took = seconds()?;
+        }
+        let point = took / measured.len() as f64;
         Ok(Self {
             point,
             evaluation: point * points.len() as f64 * EVALUATION + SLACK,
@@ -251,7 +264,17 @@ impl<'a> Loop<'a> {
             watch: self.watch,
             reserve,
         };
-        (if self.pace.is_some() { 1 } else { steps }, early)
+        let since = done - self.first;
+        let steps = match self.watch.seconds_left() {
+            Some(left) if self.pace.is_some() && since > 0 => {
+                let fitting = STEPS_SHARE * (left - reserve) / self.iteration(done).max(1e-9);
+                // As many as up to the next check of what fits.
+                (fitting as usize).clamp(1, ITERATIONS_AT_ONCE - since % ITERATIONS_AT_ONCE)
+            }
+            _ if self.pace.is_some() => 1,
+            _ => steps,
+        };
+        (steps, early)
     }
 
     /// Where the step size falls and the iterations up to the end do not fit: how many do.

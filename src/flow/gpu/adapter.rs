@@ -63,7 +63,8 @@ pub enum Selector {
     /// The first that is no software.
     #[default]
     Any,
-    /// The one with this [`Adapter::index`].
+    /// The one with this [`Adapter::index`]; where there is none, the first whose name has the
+    /// number in it.
     Index(usize),
     /// The one at this [`Adapter::pci_id`], or the first whose name has this in it, upper and
     /// lower case alike.
@@ -135,17 +136,21 @@ pub fn select(selector: &Selector, software: bool) -> Result<Adapter, BackendErr
                 .find(|adapter| software || adapter.kind != AdapterKind::Software)
                 .ok_or_else(|| no_such(hint))
         }
+        // A number may be a part of a name, such as 4090.
+        Selector::Index(index) if *index >= candidates.len() => candidates
+            .find(|adapter| is_named(adapter, &index.to_string()))
+            .ok_or_else(|| no_such("")),
         Selector::Index(index) => candidates.nth(*index).ok_or_else(|| no_such("")),
-        Selector::Named(name) => {
-            let name = name.to_lowercase();
-            candidates
-                .find(|adapter| {
-                    adapter.pci_id.to_lowercase() == name
-                        || adapter.name.to_lowercase().contains(&name)
-                })
-                .ok_or_else(|| no_such(""))
-        }
+        Selector::Named(name) => candidates
+            .find(|adapter| is_named(adapter, name))
+            .ok_or_else(|| no_such("")),
     }
+}
+
+/// Whether the card is at this PCI id or has this in its name.
+fn is_named(adapter: &Adapter, name: &str) -> bool {
+    let name = name.to_lowercase();
+    adapter.pci_id.to_lowercase() == name || adapter.name.to_lowercase().contains(&name)
 }
 
 fn described_shortly(adapter: &Adapter) -> String {

@@ -23,7 +23,7 @@ const MOMENT: Duration = Duration::from_micros(300);
 pub(super) struct Request {
     pub(super) lane: Lane,
     pub(super) status: Status,
-    /// One for each iteration that is wanted, at most [`STEPS`]; fewer may be done.
+    /// One for each iteration that is wanted, at most [`STEPS`].
     pub(super) steps: Vec<Step>,
     pub(super) cut: Cut,
 }
@@ -34,18 +34,18 @@ pub(super) struct Done {
     pub(super) status: Status,
     /// The mean loss of each iteration that was done, metres.
     pub(super) losses: Vec<f32>,
-    /// Seconds of the card that one iteration of the submission took, and the share of them that
-    /// went into distance queries; none where the card shows no clock.
+    /// How fast it went; none where the card shows no clock.
     pub(super) pace: Option<Pace>,
 }
 
-/// How fast a submission's iterations were.
+/// How fast a submission's first iteration was, by the card's clock.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Pace {
-    pub(super) iteration_seconds: f64,
-    pub(super) query_share: f64,
-    /// Pairs that shared the submission.
-    pub(super) pairs: usize,
+    /// Seconds of the iteration, of all pairs that shared it.
+    pub(super) iteration: f64,
+    /// Seconds of a tile, and those of them in the distance query.
+    pub(super) tile: f64,
+    pub(super) tile_query: f64,
 }
 
 /// Who wants iterations.
@@ -64,6 +64,8 @@ struct State {
     done: HashMap<u64, Result<Done, BackendError>>,
     /// Whether somebody submits at the moment.
     submitting: bool,
+    /// The latest submission's.
+    pace: Option<Pace>,
 }
 
 impl Batch {
@@ -74,6 +76,11 @@ impl Batch {
     /// One more pair is being fitted.
     pub(super) fn joined(&self) {
         self.state().members += 1;
+    }
+
+    /// How fast the card was last.
+    pub(super) fn pace(&self) -> Option<Pace> {
+        self.state().pace
     }
 
     /// A pair is fitted, or given up.
@@ -123,14 +130,16 @@ impl Batch {
             state.submitting = false;
             match submitted {
                 Ok(all) => {
+                    state.pace = all.first().and_then(|done| done.pace).or(state.pace);
                     let tickets = taken.iter().map(|(ticket, _)| *ticket);
                     state.done.extend(tickets.zip(all.into_iter().map(Ok)));
                 }
                 Err(error) => {
-                    let text = error.to_string();
                     for (other, _) in &taken {
-                        let lost = card.watchdog.check().err();
-                        let own = lost.unwrap_or_else(|| BackendError::Device(text.clone()));
+                        let own = card.watchdog.check().err().unwrap_or(match &error {
+                            BackendError::Busy => BackendError::Busy,
+                            error => BackendError::Device(error.to_string()),
+                        });
                         state.done.insert(*other, Err(own));
                     }
                 }
@@ -160,11 +169,11 @@ impl State {
 /// began and ended, and when it ended itself.
 const MOMENTS: u32 = 4;
 
-/// Does as many iterations of all requests as each of them wants.
+/// Does the iterations of all requests; who wants fewer than others rests meanwhile.
 fn submit(card: &Card, requests: &[&Request]) -> Result<Vec<Done>, BackendError> {
     card.watchdog.check()?;
     let iterations = requests.iter().map(|request| request.steps.len());
-    let iterations = iterations.min().unwrap_or(0);
+    let iterations = iterations.max().unwrap_or(0);
     let cuts: Vec<_> = requests.iter().map(|request| request.cut).collect();
     let plan = Plan::new(&cuts, card.budget.rows as usize);
     write(card, requests);
@@ -194,11 +203,12 @@ fn submit(card: &Card, requests: &[&Request]) -> Result<Vec<Done>, BackendError>
     let first_wave = plan.waves[0].tiles as f64 / plan.tiles.len() as f64;
     let pace = clock.map(|clock| {
         let iteration = clock.seconds(moments, 0, 3);
-        let query = clock.seconds(moments, 1, 2) / first_wave;
+        let query = (clock.seconds(moments, 1, 2) / first_wave).min(iteration);
+        let tiles = plan.tiles.len() as f64;
         Pace {
-            iteration_seconds: iteration,
-            query_share: (query / iteration.max(1e-12)).min(1.0),
-            pairs: requests.len(),
+            iteration,
+            tile: iteration / tiles,
+            tile_query: query / tiles,
         }
     });
     let statuses = statuses.chunks_exact(size_of::<Status>());
@@ -229,6 +239,7 @@ pub(super) fn write(card: &Card, requests: &[&Request]) {
             tiles: request.cut.tiles as u32,
             first_chunk: first_chunk as u32,
             chunks: request.cut.chunks as u32,
+            steps: request.steps.len() as u32,
             ..request.lane
         });
         first_tile += request.cut.tiles;

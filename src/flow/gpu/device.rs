@@ -3,7 +3,7 @@
 use core::time::Duration;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError, mpsc};
 
-use super::adapter::Adapter;
+use super::adapter::{Adapter, AdapterKind};
 use super::batch::Batch;
 use super::kernels::Kernels;
 use super::memory::{Budget, Words};
@@ -85,8 +85,8 @@ impl Backend for Gpu {
         options: &DistanceOptions,
         watch: &dyn Watch,
     ) -> Result<Box<dyn Transform>, BackendError> {
-        let build = || transform::build(&self.0, source, target, options, watch);
-        Ok(Box::new(self.0.host.install(build)?))
+        let built = transform::build(&self.0, source, target, options, watch)?;
+        Ok(Box::new(built))
     }
 
     fn align(
@@ -119,8 +119,10 @@ impl Watchdog {
     }
 }
 
-/// Silence after which a card counts as hung.
-const LONGEST_SILENCE: Duration = Duration::from_secs(60);
+/// Silence after which a card counts as hung: well within a job's lease.
+const LONGEST_SILENCE: Duration = Duration::from_secs(20);
+/// The same of software, which is no faster than the machine is idle.
+const SOFTWARE_SILENCE: Duration = Duration::from_secs(120);
 /// How often who waits for the card looks whether it is still there.
 const LOOK: Duration = Duration::from_millis(200);
 /// Groups along one dimension of a dispatch.
@@ -140,6 +142,7 @@ pub(super) struct Card {
     pub(super) tick: Option<f64>,
     pub(super) watchdog: Arc<Watchdog>,
     networks: Mutex<Vec<u32>>,
+    longest_silence: Duration,
     name: String,
 }
 
@@ -199,6 +202,10 @@ impl Card {
             host,
             tick: (!clock.is_empty()).then_some(period * 1e-9),
             watchdog,
+            longest_silence: match adapter.kind {
+                AdapterKind::Software => SOFTWARE_SILENCE,
+                _ => LONGEST_SILENCE,
+            },
             name: format!(
                 "{} ({}, {})",
                 adapter.name, adapter.interface, adapter.driver
@@ -225,7 +232,7 @@ impl Card {
     /// A buffer for a moment, filled with `contents` of whole words.
     ///
     /// # Errors
-    /// [`BackendError::Memory`] where the card has no room.
+    /// As [`Self::empty`].
     pub(super) fn filled(&self, contents: &[u8]) -> Result<wgpu::Buffer, BackendError> {
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST;
         let buffer = self.empty(contents.len() as u64, usage)?;
@@ -236,13 +243,18 @@ impl Card {
     /// A buffer for a moment.
     ///
     /// # Errors
-    /// [`BackendError::Memory`] where the card has no room.
+    /// [`BackendError::Busy`] where the card has no room now, [`BackendError::Memory`] where it
+    /// never has.
     pub(super) fn empty(
         &self,
         bytes: u64,
         usage: wgpu::BufferUsages,
     ) -> Result<wgpu::Buffer, BackendError> {
-        allocated(&self.device, "work", bytes.max(16), usage)
+        let limit = self.device.limits().max_buffer_size;
+        allocated(&self.device, "work", bytes.max(16), usage).map_err(|error| match error {
+            BackendError::Memory { needed, .. } if needed <= limit => BackendError::Busy,
+            error => error,
+        })
     }
 
     pub(super) fn bound(
@@ -299,14 +311,14 @@ impl Card {
                 Err(wgpu::PollError::Timeout) => waited += LOOK,
                 Err(error) => return Err(BackendError::Device(error.to_string())),
             }
-            if waited > LONGEST_SILENCE {
+            if waited > self.longest_silence {
                 let seconds = waited.as_secs();
                 self.watchdog.lost(format!("no answer for {seconds} s"));
             }
         }
         self.watchdog.check()?;
         // Whoever polls runs the callbacks: another thread may still be at it.
-        match answer.recv_timeout(LONGEST_SILENCE) {
+        match answer.recv_timeout(self.longest_silence) {
             Ok(Ok(())) => {}
             Ok(Err(error)) => {
                 self.watchdog.check()?;

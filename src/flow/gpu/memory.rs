@@ -19,8 +19,8 @@ pub(super) const NETWORK_BYTES: u64 = (LAID_OUT * size_of::<f32>()) as u64;
 pub(super) const LEAST_ROWS: u64 = 8192;
 /// The most rows: more of them would be busy no longer at once on any card.
 const MOST_ROWS: u64 = 1 << 19;
-/// The fewest chunks: a lane's most.
-const LEAST_CHUNKS: u64 = 128;
+/// The fewest chunks: those of a batch of two million points.
+const LEAST_CHUNKS: u64 = 256;
 /// Bytes of the store that a lane should find: a full sweep's transform and points. Sweeps of 400 m
 /// take twice as much; where there is memory, a quarter of it is the store's.
 const LANE_STORE_BYTES: u64 = 96 << 20;
@@ -52,7 +52,8 @@ impl Budget {
             + LANE_STORE_BYTES.min(binding)
             + LEAST_CHUNKS * NETWORK_BYTES
             + LEAST_ROWS * 2 * ROW_BYTES;
-        if bytes < least || binding < LEAST_ROWS * ROW_BYTES {
+        let largest = (LEAST_ROWS * ROW_BYTES).max(LEAST_CHUNKS * NETWORK_BYTES);
+        if bytes < least || binding < largest {
             return Err(BackendError::Memory {
                 what: "kernels",
                 needed: least,
@@ -111,7 +112,7 @@ impl Budget {
     }
 }
 
-/// How long somebody waits for others to give words back, at most.
+/// How long somebody waits without any words being given back, in all.
 const PATIENCE: Duration = Duration::from_secs(20);
 /// How often who waits looks at its watch.
 const LOOK: Duration = Duration::from_millis(20);
@@ -169,12 +170,14 @@ impl Words {
                 return Err(BackendError::Busy);
             }
             watch::check(watch).map_err(BackendError::Interrupted)?;
-            free = self
+            let (woken, timeout) = self
                 .given_back
                 .wait_timeout(free, LOOK)
-                .unwrap_or_else(PoisonError::into_inner)
-                .0;
-            waited += LOOK;
+                .unwrap_or_else(PoisonError::into_inner);
+            free = woken;
+            if timeout.timed_out() {
+                waited += LOOK;
+            }
         }
     }
 

@@ -44,7 +44,7 @@ impl<'a> Phases<'a> {
     /// Binds the kernels for a submission of `lanes` lanes.
     ///
     /// # Errors
-    /// [`BackendError::Memory`] where the card has no room for the plan.
+    /// [`BackendError::Busy`] where the card has no room for the plan now.
     pub(super) fn bind(card: &'a Card, plan: &Plan, lanes: usize) -> Result<Self, BackendError> {
         let tiles = &card.filled(bytemuck::cast_slice(&plan.tiles))?;
         let chunks = &card.filled(bytemuck::cast_slice(&plan.chunks))?;

@@ -49,6 +49,7 @@ pub(super) struct Lane {
     pub(super) average: u32,
     pub(super) patience: u32,
     pub(super) min_delta: f32,
+    pub(super) steps: u32,
 }
 
 /// One iteration of one lane.

@@ -7,7 +7,7 @@ use super::device::{Card, spread};
 use super::memory::NETWORK_BYTES;
 use super::plan::Cut;
 use super::records::{self, ARRAYS, CONVERGED, DIVERGED, STEPS, Status, TILE};
-use super::transform::{GpuTransform, Stretch};
+use super::transform::GpuTransform;
 use crate::flow::backend::{Advance, BackendError, Report, Trainer};
 use crate::flow::course::Course;
 use crate::flow::early_stop::Seen;
@@ -15,12 +15,14 @@ use crate::flow::field::mlp::{LAID_OUT, Parameters, transpose_middle_layers};
 use crate::flow::options::Options;
 use crate::flow::points::Point;
 use crate::flow::snapshot::TrainerState;
-use crate::flow::watch::{Progress, Unwatched, Watch};
+use crate::flow::watch::{Progress, Watch};
 
 /// Seconds that a submission should take: a look at the watch, and at the card's health.
 const SUBMISSION_SECONDS: f64 = 0.03;
 /// Iterations of a submission where the card shows no clock.
 const BLIND_STEPS: usize = 4;
+/// Iterations of a submission at most, where a stopping rule may end the run in any of them.
+const STOPPABLE_STEPS: usize = 16;
 /// Points that are evaluated at a time.
 const EVALUATED: usize = 1 << 18;
 /// The places of a lane's arrays; common.wgsl has the same.
@@ -70,10 +72,9 @@ pub(super) struct GpuTrainer<'a> {
     transform: &'a GpuTransform,
     course: Course,
     network: Network,
-    points: Stretch,
+    /// Their place in the store, words.
+    points: u32,
     status: Status,
-    /// Iterations that the next submission should have.
-    stride: usize,
     query_seconds: f64,
 }
 
@@ -93,9 +94,8 @@ impl<'a> GpuTrainer<'a> {
                 available: card.budget.chunk_bytes(),
             });
         }
-        let words = course.points.len() as u64 * 3;
-        let points = Stretch::take(card, "points", words, &Unwatched)?;
-        let at = u64::from(points.place) * 4;
+        let points = transform.room_for(course.points.len())?;
+        let at = u64::from(points) * 4;
         let bytes = bytemuck::cast_slice(&course.points);
         card.queue.write_buffer(&card.buffers.store, at, bytes);
         let mut trainer = Self {
@@ -104,7 +104,6 @@ impl<'a> GpuTrainer<'a> {
             course,
             points,
             status: Status::default(),
-            stride: 1,
             query_seconds: 0.0,
         };
         trainer.restore(TrainerState::at_start(parameters))?;
@@ -122,7 +121,7 @@ impl<'a> GpuTrainer<'a> {
         records::Lane {
             transform: self.transform.record,
             network: self.network.number,
-            points: self.points.place,
+            points: self.points,
             center: self.course.conditioning.center,
             scale: self.course.conditioning.scale,
             margin: loss.margin_m,
@@ -160,16 +159,30 @@ impl<'a> GpuTrainer<'a> {
         };
         let done = self.card().batch.run(self.card(), request)?;
         self.status = done.status;
-        match done.pace {
-            Some(pace) => {
-                let own = pace.iteration_seconds * pace.query_share / pace.pairs as f64;
-                self.query_seconds += own * done.losses.len() as f64;
-                let fitting = SUBMISSION_SECONDS / pace.iteration_seconds.max(1e-6);
-                self.stride = (fitting as usize).clamp(1, STEPS);
-            }
-            None => self.stride = BLIND_STEPS,
+        if let Some(pace) = done.pace {
+            let tiles = Cut::new(self.course.largest_batch()).tiles * done.losses.len();
+            self.query_seconds += pace.tile_query * tiles as f64;
         }
         Ok(done)
+    }
+
+    /// Iterations that a submission should have.
+    fn stride(&self) -> usize {
+        let seconds = self.card().batch.pace().map(|pace| {
+            let own = pace.tile * Cut::new(self.course.largest_batch()).tiles as f64;
+            own.max(pace.iteration)
+        });
+        // What follows a stop is dispatched in vain.
+        let most = match self.course.options.early_stop {
+            Some(_) => STOPPABLE_STEPS,
+            None => STEPS,
+        };
+        match seconds {
+            Some(seconds) => ((SUBMISSION_SECONDS / seconds.max(1e-6)) as usize).clamp(1, most),
+            // The first submission shows how fast the card is.
+            None if self.card().tick.is_some() => 1,
+            None => BLIND_STEPS,
+        }
     }
 
     fn iterations(&self) -> usize {
@@ -196,7 +209,7 @@ impl Trainer for GpuTrainer<'_> {
                 return Ok(Advance::Continues);
             }
             let before = self.iterations();
-            let steps = self.stride.min(steps - done).min(most - before);
+            let steps = self.stride().min(steps - done).min(most - before);
             let submitted = self.submit(steps)?;
             for (iteration, &loss) in (before + 1..).zip(&submitted.losses) {
                 watch.progress(Progress {

@@ -15,27 +15,23 @@ use crate::flow::watch::Watch;
 
 /// Words of a brick's 16-bit codes.
 const BRICK_WORDS: u64 = 256;
+/// Words of a point.
+const POINT_WORDS: u64 = 3;
 /// Points that are sampled at a time.
 const SAMPLED: usize = 1 << 20;
 /// Points that a workgroup of `sample.wgsl` samples.
 const SAMPLE_GROUP: usize = 64;
 
-/// Words of the store that are somebody's.
-pub(super) struct Stretch {
+/// Words of the store that are a transform's, and its source points' behind them.
+struct Stretch {
     card: Arc<Card>,
-    pub(super) place: u32,
+    place: u32,
     words: u64,
 }
 
 impl Stretch {
-    /// As many words for `what`.
-    pub(super) fn take(
-        card: &Arc<Card>,
-        what: &'static str,
-        words: u64,
-        watch: &dyn Watch,
-    ) -> Result<Self, BackendError> {
-        let place = card.words.take(what, words, watch)?;
+    fn take(card: &Arc<Card>, words: u64, watch: &dyn Watch) -> Result<Self, BackendError> {
+        let place = card.words.take("distance transform", words, watch)?;
         Ok(Self {
             card: Arc::clone(card),
             place: place as u32,
@@ -54,6 +50,8 @@ impl Drop for Stretch {
 pub(super) struct GpuTransform {
     pub(super) card: Arc<Card>,
     pub(super) record: records::Transform,
+    /// Words of the transform, before those of the points.
+    words: u64,
     stretch: Stretch,
 }
 
@@ -74,16 +72,18 @@ pub(super) fn build(
         let text = "distances to the points themselves are computed on the CPU alone";
         return Err(BackendError::Unsupported(text));
     }
+    // On the host's threads, which nobody may keep while he waits for the card.
+    let planned = card.host.install(|| {
+        let layout = Layout::plan(source, target, options, watch)?;
+        let band_m = f64::from(layout.band) * layout.grid.cell;
+        let far = FarField::build(&layout.grid, &layout.cells, band_m, watch)?;
+        let sites = CellSites::new(&layout.cells, layout.band);
+        Ok::<_, DistanceError>((layout, far, sites))
+    });
+    let (layout, far, sites) = planned?;
     let Layout {
-        grid,
-        cells,
-        index,
-        band,
-        ..
-    } = Layout::plan(source, target, options, watch)?;
-    let band_m = f64::from(band) * grid.cell;
-    let far = FarField::build(&grid, &cells, band_m, watch).map_err(DistanceError::from)?;
-    let sites = CellSites::new(&cells, band);
+        grid, index, band, ..
+    } = layout;
 
     let parts = [
         index.tables.len() as u64,
@@ -91,7 +91,9 @@ pub(super) fn build(
         index.active as u64 * BRICK_WORDS,
         far.distances.len() as u64,
     ];
-    let stretch = Stretch::take(card, "distance transform", parts.iter().sum(), watch)?;
+    let words = parts.iter().sum();
+    let points = source.len() as u64 * POINT_WORDS;
+    let stretch = Stretch::take(card, words + points, watch)?;
     let mut place = u64::from(stretch.place);
     let places = parts.map(|words| {
         let own = place;
@@ -125,6 +127,7 @@ pub(super) fn build(
     Ok(GpuTransform {
         card: Arc::clone(card),
         record,
+        words,
         stretch,
     })
 }
@@ -178,6 +181,20 @@ fn fill_bricks(
 }
 
 impl GpuTransform {
+    /// The place in the store of the points that are fitted, words: as many as the source that the
+    /// transform was built for.
+    pub(super) fn room_for(&self, points: usize) -> Result<u32, BackendError> {
+        let (needed, available) = (points as u64 * POINT_WORDS, self.stretch.words - self.words);
+        if needed > available {
+            return Err(BackendError::Memory {
+                what: "points",
+                needed: needed * 4,
+                available: available * 4,
+            });
+        }
+        Ok(self.stretch.place + self.words as u32)
+    }
+
     /// The transform at each of the points.
     pub(super) fn samples(&self, points: &[Point]) -> Result<Vec<Sample>, BackendError> {
         let mut samples = Vec::with_capacity(points.len());
@@ -213,7 +230,7 @@ impl GpuTransform {
 
 impl Transform for GpuTransform {
     fn bytes(&self) -> usize {
-        self.stretch.words as usize * 4
+        self.words as usize * 4
     }
 
     fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError> {

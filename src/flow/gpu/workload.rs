@@ -64,6 +64,8 @@ pub fn kernel_times(
         lane: Lane {
             tiles: cut.tiles as u32,
             chunks: cut.chunks as u32,
+            // The same iteration again and again is no progress.
+            patience: 0,
             ..trainer.lane()
         },
         status: Status::default(),

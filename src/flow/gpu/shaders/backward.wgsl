@@ -32,7 +32,7 @@ fn backward(
     let wave_tile = group.y * groups.x + group.x;
     if wave_tile >= part.tiles { return; }
     let work = tiles[part.first_tile + wave_tile];
-    if statuses[work.lane].state != RUNNING { return; }
+    if !iterates(statuses[work.lane], lanes[work.lane].steps, part.step) { return; }
     let network = lanes[work.lane].network * ARRAYS * LAID_OUT;
     let row = wave_tile * TILE;
     let first = local / 16u * 8u;

@@ -68,6 +68,8 @@ struct Lane {
     // The stopping rule; none where patience is 0.
     patience: u32,
     min_delta: f32,
+    // Iterations that it has in this submission.
+    steps: u32,
 }
 
 // One iteration of one lane.
@@ -110,6 +112,11 @@ struct Status {
     // Whether this iteration's gradients are to be applied, and whether it is the best so far.
     applies: u32,
     improves: u32,
+}
+
+// Whether a lane has this iteration.
+fn iterates(status: Status, lane_steps: u32, step: u32) -> bool {
+    return status.state == RUNNING && step < lane_steps;
 }
 
 const RUNNING = 0u;

@@ -38,7 +38,7 @@ fn forward(
     let wave_tile = group.y * groups.x + group.x;
     if wave_tile >= part.tiles { return; }
     let work = tiles[part.first_tile + wave_tile];
-    if !EVALUATES && statuses[work.lane].state != RUNNING { return; }
+    if !EVALUATES && !iterates(statuses[work.lane], lanes[work.lane].steps, part.step) { return; }
     let which = select(PARAMETERS, KEPT, EVALUATES);
     let network = (lanes[work.lane].network * ARRAYS + which) * LAID_OUT;
     let step = steps[work.lane * STEPS + part.step];

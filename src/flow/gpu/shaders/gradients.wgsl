@@ -26,7 +26,7 @@ fn gradients(
     @builtin(local_invocation_index) local: u32,
 ) {
     let chunk = chunks[part.first_chunk + group.x];
-    if statuses[chunk.lane].state != RUNNING { return; }
+    if !iterates(statuses[chunk.lane], lanes[chunk.lane].steps, part.step) { return; }
     let place = (part.first_chunk + group.x) * LAID_OUT;
     switch group.y {
         case 7u: { first_layer(chunk, place, local); }

@@ -36,7 +36,7 @@ fn judge(
     var status = statuses[lane];
     status.applies = 0u;
     status.improves = 0u;
-    if status.state == RUNNING {
+    if iterates(status, lanes[lane].steps, part.step) {
         let place = lane * STEPS + part.step;
         let loss = sums[0] / f32(steps[place].count);
         losses[place] = loss;

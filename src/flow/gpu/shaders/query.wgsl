@@ -26,7 +26,7 @@ fn query(
     let wave_tile = group.y * groups.x + group.x;
     if wave_tile >= part.tiles { return; }
     let work = tiles[part.first_tile + wave_tile];
-    if statuses[work.lane].state != RUNNING { return; }
+    if !iterates(statuses[work.lane], lanes[work.lane].steps, part.step) { return; }
     let step = steps[work.lane * STEPS + part.step];
     let row = wave_tile * TILE + local;
     let index = work.tile * TILE + local;

@@ -202,11 +202,11 @@ fn more_points_than_the_memory_holds_at_once_give_the_gradient_of_all() {
     // The software card holds fewer rows than this at once; the mean over twice the same points is
     // the mean over them.
     let [cloud, target] = clouds(12_288);
-    let Some(gpu) = transform(&cloud, &target) else {
+    let twice: Vec<_> = cloud.iter().chain(&cloud).copied().collect();
+    let Some(gpu) = transform(&twice, &target) else {
         return;
     };
     let once = after_one(&gpu, &cloud, &plain());
-    let twice: Vec<_> = cloud.iter().chain(&cloud).copied().collect();
     let twice = after_one(&gpu, &twice, &plain());
     let [once, twice] = [once, twice].map(|state| ReferenceNetwork::read(&state.moments[0]).flat());
     let scale = once.iter().fold(0.0f64, |most, g| most.max(g.abs()));

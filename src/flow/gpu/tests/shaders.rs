@@ -66,7 +66,7 @@ fn host_and_shaders_agree_on_every_record() {
     same_layout!("query", Transform: origin_high, origin_low, inverse_cell, code_scale, vertices,
         blocks, tables, bricks, codes, far, far_pitch, far_vertices);
     same_layout!("query", Lane: transform, network, points, first_tile, tiles, first_chunk, chunks,
-        center, scale, margin, margin_slope, truncation, flow_penalty, average, patience, min_delta);
+        center, scale, margin, margin_slope, truncation, flow_penalty, average, patience, min_delta, steps);
     same_layout!("forward", Step: first, count, step_size, square_correction, fresh);
     same_layout!("forward", Tile: lane, tile);
     same_layout!("gradients", Chunk: lane, first_row, rows, first_point);
