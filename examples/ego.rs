@@ -46,6 +46,11 @@ impl Case {
         }
     }
 
+    /// In every frame.
+    fn frames(&self) -> Vec<Self> {
+        (0..OFFSETS).map(|i| self.seen_from(i)).collect()
+    }
+
     fn without(&self, ground: [&[bool]; 2]) -> Self {
         let off = |points: &[Point], ground: &[bool]| {
             let rows = points.iter().zip(ground).filter(|(_, ground)| !**ground);
@@ -74,10 +79,9 @@ fn main() -> anyhow::Result<()> {
             };
             let off = all.without([&ground.source, &ground.target]);
             for (what, case) in [("", all), (", no ground", off)] {
-                let offsets = |case: &Case| (0..OFFSETS).map(|i| case.seen_from(i)).collect();
-                row(&format!("{name}{what}"), &backend, offsets(&case));
+                row(&format!("{name}{what}"), &backend, &case.frames());
                 let back = case.backward();
-                row(&format!("{name}{what}, back"), &backend, offsets(&back));
+                row(&format!("{name}{what}, back"), &backend, &back.frames());
             }
         }
     }
@@ -106,11 +110,11 @@ fn main() -> anyhow::Result<()> {
             let (all, off): (Vec<_>, Vec<_>) = cases.into_iter().map(|[a, b]| (a, b)).unzip();
             let name = format!("{beams} beams, {speed} m/s");
             if speed == 30.0 {
-                let turned = all.iter().map(five_degrees).collect();
-                row(&format!("{name}, turned to 5 degrees"), &backend, turned);
+                let turned: Vec<_> = all.iter().map(five_degrees).collect();
+                row(&format!("{name}, turned to 5 degrees"), &backend, &turned);
             }
-            row(&name, &backend, all);
-            row(&format!("{name}, no ground"), &backend, off);
+            row(&name, &backend, &all);
+            row(&format!("{name}, no ground"), &backend, &off);
         }
     }
     Ok(())
@@ -137,11 +141,11 @@ fn moved(points: &[Point], motion: &RigidTransform) -> Vec<Point> {
 
 /// One row: of several cases the middle error and the largest; the shortest time, since the
 /// machine may be shared.
-fn row(name: &str, backend: &CpuBackend, cases: Vec<Case>) {
+fn row(name: &str, backend: &CpuBackend, cases: &[Case]) {
     let mut meters = Vec::new();
     let mut degrees = Vec::new();
     let mut times = Vec::new();
-    for case in &cases {
+    for case in cases {
         let start = Instant::now();
         let prior = RigidTransform::identity();
         let found = backend.align(&case.source, &case.target, &prior, &Unwatched);
