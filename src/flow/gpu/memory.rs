@@ -224,7 +224,7 @@ mod tests {
 
     #[test]
     fn no_binding_is_larger_than_the_card_allows() {
-        for (bytes, binding) in [(384 << 20, 128 << 20), (40 << 30, u64::from(u32::MAX))] {
+        for (bytes, binding) in [(512 << 20, 128 << 20), (40 << 30, u64::from(u32::MAX))] {
             for lanes in [1, 8, 64] {
                 let budget = Budget::new(lanes, bytes, binding).expect("it fits");
                 for part in [

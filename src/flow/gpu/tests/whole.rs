@@ -70,7 +70,8 @@ fn the_card_finds_the_cpus_flow() {
     let pair = street(1);
     for preset in Preset::ALL {
         let mut options = preset.options(Some(1500));
-        options.max_iterations = 40;
+        // Ours to its end: half-way the runs are farther apart.
+        options.max_iterations = options.max_iterations.min(150);
         let [ours, theirs] = [gpu as &dyn Backend, &cpu].map(|device| {
             let estimate = solved(device, &pair, &options);
             let kept = |points: &[Point]| -> Vec<Point> {
@@ -85,6 +86,40 @@ fn the_card_finds_the_cpus_flow() {
         let error = (ours.1 - theirs.1).abs();
         assert!(error < ERROR_M, "{preset:?}: {} {}", ours.1, theirs.1);
         assert_eq!(ours.0.iterations, theirs.0.iterations, "{preset:?}");
+    }
+}
+
+#[test]
+fn a_run_in_batches_begins_as_on_the_cpu() {
+    // Relative, and metres: rounding alone, before it has grown.
+    const LOSS: f64 = 1e-4;
+    const FLOW_M: f32 = 1e-3;
+    const STEPS: usize = 12;
+    let Some(gpu) = shared() else {
+        return;
+    };
+    let cpu = CpuBackend::new(Some(2)).expect("threads");
+    let [source, target] = clouds(1500);
+    let options = batched();
+    let [ours, theirs] = [gpu as &dyn Backend, &cpu].map(|device| {
+        let transform = device
+            .transform(&source, &target, &options.distance, &Unwatched)
+            .expect("small clouds fit");
+        let losses = Losses::default();
+        let mut trainer = transform.start(&source, &options).expect("a trainer");
+        trainer.advance(STEPS, &losses).expect("iterations");
+        (
+            losses.taken(),
+            trainer.evaluate(&source).expect("an answer"),
+        )
+    });
+    assert_eq!(ours.0.len(), STEPS);
+    for (loss, expected) in ours.0.iter().zip(&theirs.0) {
+        let error = (loss - expected).abs() / expected;
+        assert!(error < LOSS, "{:?} {:?}", ours.0, theirs.0);
+    }
+    for (flow, expected) in ours.1.iter().flatten().zip(theirs.1.iter().flatten()) {
+        assert!((flow - expected).abs() < FLOW_M, "{flow} {expected}");
     }
 }
 
