@@ -112,7 +112,9 @@ impl HalfKernels {
         device: &wgpu::Device,
         sources: &[(&str, &str)],
     ) -> Result<Self, BackendError> {
-        let scope = device.push_error_scope(wgpu::ErrorFilter::Validation);
+        // A driver's refusal costs half precision, not the card.
+        let internal = device.push_error_scope(wgpu::ErrorFilter::Internal);
+        let invalid = device.push_error_scope(wgpu::ErrorFilter::Validation);
         let half = |name: &str| pipeline(device, sources, name, &[]);
         let kernels = Self {
             halve: half("halve"),
@@ -121,7 +123,9 @@ impl HalfKernels {
             gradients: half("gradients_half"),
             outer_gradients: pipeline(device, &SOURCES, "gradients", &[("OUTER", 1.0)]),
         };
-        match pollster::block_on(scope.pop()) {
+        let invalid = pollster::block_on(invalid.pop());
+        let internal = pollster::block_on(internal.pop());
+        match invalid.or(internal) {
             None => Ok(kernels),
             Some(error) => Err(BackendError::Device(error.to_string())),
         }

@@ -90,7 +90,8 @@ impl Tile {
 pub(super) struct Units {
     pub(super) tile: Tile,
     kernels: HalfKernels,
-    /// The middle layers' weights, see `halve.wgsl`.
+    /// The middle layers' weights, see `halve.wgsl`: 0.2 MB a lane beyond the card's budget, taken
+    /// when somebody first asks for half precision.
     halves: wgpu::Buffer,
 }
 
