@@ -16,9 +16,11 @@ use std::time::Instant;
 
 use common::median;
 use fnsf::flow::backend::Backend;
-use fnsf::flow::gpu::{Gpu, GpuOptions, Selector, arithmetic_peak, kernel_times, select};
+use fnsf::flow::gpu::{
+    Gpu, GpuOptions, KernelTime, Selector, arithmetic_peak, kernel_times, select,
+};
 use fnsf::flow::simulate::{SimulatedPair, Street, StreetOptions};
-use fnsf::flow::{Estimate, Options, Preset, Problem, Watch, estimate};
+use fnsf::flow::{Estimate, Options, Precision, Preset, Problem, Watch, estimate};
 
 /// Runs of each pair, after one to warm up.
 const RUNS: u64 = 5;
@@ -104,6 +106,18 @@ fn end_point_error(estimate: &Estimate, pair: &SimulatedPair) -> f64 {
     errors.sum::<f64>() / estimate.points as f64
 }
 
+/// One row of the table of kernels.
+fn kernel(precision: &str, points: usize, time: &KernelTime, peak: f64) {
+    let speed = time.operations / time.seconds;
+    let shares = if time.operations > 0.0 {
+        format!("{:.2} | {:.0}%", speed / 1e12, 100.0 * speed / peak)
+    } else {
+        "| ".to_owned()
+    };
+    let (name, ms) = (time.name, time.seconds * 1e3);
+    println!("| {name}, {precision} | {points} | {ms:.3} | {shares} |");
+}
+
 fn kernels(gpu: &Gpu, pair: &SimulatedPair, sizes: &[usize]) -> Result<(), String> {
     let peak = arithmetic_peak(gpu).map_err(|e| e.to_string())?;
     println!("Arithmetic peak, measured: {:.2} TFLOP/s\n", peak / 1e12);
@@ -112,26 +126,15 @@ fn kernels(gpu: &Gpu, pair: &SimulatedPair, sizes: &[usize]) -> Result<(), Strin
     for &points in sizes {
         let points = points.min(pair.source.len());
         let source = &pair.source[..points];
-        let times = kernel_times(gpu, source, &pair.target, ROUNDS);
-        let times = match times {
-            Ok(times) => times,
-            Err(error) => {
-                println!("| all | {points} | {error} | | |");
-                continue;
+        for precision in Precision::ALL {
+            let times = kernel_times(gpu, source, &pair.target, precision, ROUNDS);
+            let name = precision.name();
+            match times {
+                Ok(times) => times
+                    .iter()
+                    .for_each(|time| kernel(name, points, time, peak)),
+                Err(error) => println!("| all, {name} | {points} | {error} | | |"),
             }
-        };
-        for time in times {
-            let speed = time.operations / time.seconds;
-            let shares = if time.operations > 0.0 {
-                format!("{:.2} | {:.0}%", speed / 1e12, 100.0 * speed / peak)
-            } else {
-                "| ".to_owned()
-            };
-            println!(
-                "| {} | {points} | {:.3} | {shares} |",
-                time.name,
-                time.seconds * 1e3
-            );
         }
     }
     println!();

@@ -78,7 +78,7 @@ impl Draft {
         request.options.check()?;
         service
             .admission
-            .check_device(request.options.device.kind())?;
+            .check_device(request.options.device_kind())?;
         if let Some(key) = &request.idempotency_key
             && (key.is_empty() || key.len() > MAX_KEY)
         {
@@ -202,7 +202,7 @@ impl Draft {
         self.service.admission.admit(&Asked {
             tenant: &self.caller.tenant,
             priority: self.request.options.priority,
-            device: self.request.options.device.kind(),
+            device: self.request.options.device_kind(),
             nominal_seconds: self.nominal_seconds,
             promise: self.request.promise,
         })
@@ -222,7 +222,7 @@ impl Draft {
             kind,
             pairs,
             priority: options.priority,
-            device: options.device.kind(),
+            device: options.device_kind(),
             cost_seconds: self.nominal_seconds / f64::from(pairs),
             options: options.to_json(),
             deadline: left.map(|left| Timestamp::now().after(left)),

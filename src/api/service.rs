@@ -200,7 +200,7 @@ impl Service {
         caller.may_write()?;
         self.check_draining()?;
         self.check_disk()?;
-        let device = options.and_then(|options| options.device.kind());
+        let device = options.and_then(JobOptions::device_kind);
         self.admission.check_device(device)?;
         self.admission
             .admit(&Asked {

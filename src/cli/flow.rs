@@ -14,7 +14,9 @@ use super::terminal::Terminal;
 use crate::flow::backend::BackendError;
 use crate::flow::{self, Estimate, FlowError, Problem, Watch};
 use crate::formats::{FlowFormat, FlowTable, Pair, write_flow};
-use crate::job::{DeviceChoice, EgoChoice, GroundChoice, JobOptions, PresetChoice, Report};
+use crate::job::{
+    DeviceChoice, EgoChoice, GroundChoice, JobOptions, PrecisionChoice, PresetChoice, Report,
+};
 use crate::picture::{self, TopDown, TopDownOptions};
 use crate::text::grouped;
 
@@ -59,6 +61,10 @@ struct Estimation {
     /// CPU threads; all cores by default. The result does not depend on it
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: Option<u16>,
+    /// What the network's products are rounded to: f16 is for GPUs whose matrix units pass their
+    /// self-test, see fnsf doctor
+    #[arg(long, value_enum, default_value_t)]
+    precision: PrecisionChoice,
     /// The same seed gives the same bits
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
@@ -102,6 +108,7 @@ impl Estimation {
             ground: self.ground,
             ego,
             device: self.device.choice,
+            precision: self.precision,
             ..JobOptions::default()
         })
     }

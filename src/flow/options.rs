@@ -67,6 +67,8 @@ pub struct Options {
     pub early_stop: Option<EarlyStopOptions>,
     /// Iterations at most.
     pub max_iterations: usize,
+    /// What the network's products are rounded to.
+    pub precision: Precision,
 }
 
 impl Options {
@@ -102,6 +104,7 @@ impl Options {
                 min_delta_m: 1e-3,
             }),
             max_iterations: 5000,
+            precision: Precision::F32,
         }
     }
 
@@ -255,6 +258,32 @@ pub enum Keep {
         /// Weight of the past at each iteration; ramped up over the first iterations.
         decay: f32,
     },
+}
+
+/// What the factors of the network's products are rounded to while it is fitted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Precision {
+    /// Single precision throughout.
+    #[default]
+    F32,
+    /// Features, weights and derivatives of the layers from 128 to 128 features are rounded to
+    /// half precision before they are multiplied; sums, parameters, the optimizer, the other
+    /// layers, the loss and the evaluation of the result stay single. For cards whose matrix units
+    /// pass their self-test; every other device refuses it.
+    F16,
+}
+
+impl Precision {
+    /// All precisions.
+    pub const ALL: [Self; 2] = [Self::F32, Self::F16];
+
+    /// The name that the command line and the service use.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::F32 => "f32",
+            Self::F16 => "f16",
+        }
+    }
 }
 
 /// The stopping rule of the published code.

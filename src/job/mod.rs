@@ -9,8 +9,8 @@ mod report;
 
 pub use id::{InvalidId, JobId, Tenant};
 pub use options::{
-    DeviceChoice, DeviceKind, EgoChoice, GroundChoice, InvalidOptions, JobOptions, PresetChoice,
-    Priority,
+    DeviceChoice, DeviceKind, EgoChoice, GroundChoice, InvalidOptions, JobOptions, PrecisionChoice,
+    PresetChoice, Priority,
 };
 pub use record::{Job, JobError, JobProgress, Kind, State};
 pub use report::{PhaseSeconds, Report};

@@ -10,7 +10,7 @@ use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use utoipa::ToSchema;
 
-use crate::flow::{self, Ego, Ground, MIN_POINTS, Preset, RigidTransform};
+use crate::flow::{self, Ego, Ground, MIN_POINTS, Precision, Preset, RigidTransform};
 use crate::formats::{matrix_rows, rigid_motion};
 
 /// The longest deadline that may be asked for.
@@ -40,6 +40,8 @@ pub struct JobOptions {
     pub ego: Option<EgoChoice>,
     /// Where the work is done.
     pub device: DeviceChoice,
+    /// `f32`: single precision; `f16`: half, on a GPU whose matrix units pass their self-test.
+    pub precision: PrecisionChoice,
     /// Milliseconds from the request's arrival after which the best flow so far is wanted.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub deadline_ms: Option<u64>,
@@ -118,6 +120,31 @@ impl FromStr for DeviceChoice {
             "cpu" => Ok(Self::Cpu),
             "gpu" => Ok(Self::Gpu),
             _ => Err(InvalidOptions::Device(text.to_owned())),
+        }
+    }
+}
+
+/// What the factors of the network's products are rounded to.
+#[derive(
+    Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema, clap::ValueEnum,
+)]
+#[serde(rename_all = "snake_case")]
+pub enum PrecisionChoice {
+    /// Single precision.
+    #[default]
+    F32,
+    /// Half precision, on the matrix units of a GPU.
+    F16,
+}
+
+impl FromStr for PrecisionChoice {
+    type Err = InvalidOptions;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        match text {
+            "f32" => Ok(Self::F32),
+            "f16" => Ok(Self::F16),
+            _ => Err(InvalidOptions::Precision(text.to_owned())),
         }
     }
 }
@@ -235,6 +262,12 @@ pub enum InvalidOptions {
     /// No kind of device.
     #[error("options: device is {0:?}, \"auto\", \"cpu\" and \"gpu\" are known")]
     Device(String),
+    /// No precision.
+    #[error("options: precision is {0:?}, \"f32\" and \"f16\" are known")]
+    Precision(String),
+    /// Half precision of a device that has none.
+    #[error("options: precision is \"f16\", which the CPU does not compute in")]
+    HalfOnCpu,
     /// Not a positive number of metres.
     #[error("options: range_m is {0}, a positive number of metres is needed")]
     Range(f32),
@@ -284,7 +317,18 @@ impl JobOptions {
         {
             return Err(InvalidOptions::Deadline(millis));
         }
+        if self.precision == PrecisionChoice::F16 && self.device == DeviceChoice::Cpu {
+            return Err(InvalidOptions::HalfOnCpu);
+        }
         Ok(())
+    }
+
+    /// The kind of device that it has to be; none where any will do.
+    pub fn device_kind(&self) -> Option<DeviceKind> {
+        match self.precision {
+            PrecisionChoice::F32 => self.device.kind(),
+            PrecisionChoice::F16 => Some(DeviceKind::Gpu),
+        }
     }
 
     /// The solver's options for clouds of which the larger has `points` points.
@@ -307,6 +351,10 @@ impl JobOptions {
             Some(EgoChoice::Auto) => options.ego = Ego::Auto,
             Some(EgoChoice::Given(motion)) => options.ego = Ego::Given(motion),
         }
+        options.precision = match self.precision {
+            PrecisionChoice::F32 => Precision::F32,
+            PrecisionChoice::F16 => Precision::F16,
+        };
         options
     }
 }
@@ -326,6 +374,19 @@ mod tests {
             JobOptions::from_json(options.to_json().as_bytes()),
             Ok(options)
         );
+    }
+
+    #[test]
+    fn half_precision_asks_for_a_gpu() {
+        let options = |text: &str| JobOptions::from_json(text.as_bytes());
+        let half = options(r#"{"precision":"f16"}"#).expect("good options");
+        assert_eq!(half.device_kind(), Some(DeviceKind::Gpu));
+        assert_eq!(half.solver_options(1000).precision, Precision::F16);
+        let refused = options(r#"{"precision":"f16","device":"cpu"}"#);
+        assert_eq!(refused, Err(InvalidOptions::HalfOnCpu));
+        let single = options(r#"{"precision":"f32"}"#);
+        assert_eq!(single, Ok(JobOptions::default()));
+        assert_eq!(JobOptions::default().device_kind(), None);
     }
 
     #[test]

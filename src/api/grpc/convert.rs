@@ -10,7 +10,7 @@ use crate::api::service::Answer;
 use crate::formats::rigid_motion;
 use crate::job::{
     DeviceChoice, EgoChoice, GroundChoice, Job, JobError, JobOptions, JobProgress, Kind,
-    PresetChoice, Priority, State,
+    PrecisionChoice, PresetChoice, Priority, State,
 };
 
 fn unknown(field: &str, number: i32) -> ApiError {
@@ -43,6 +43,10 @@ pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, Api
         "" => DeviceChoice::default(),
         name => name.parse()?,
     };
+    let precision = match message.precision.as_str() {
+        "" => PrecisionChoice::default(),
+        name => name.parse()?,
+    };
     let options = JobOptions {
         preset,
         seed: message.seed,
@@ -51,6 +55,7 @@ pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, Api
         ground,
         ego: ego(message.ego, &message.ego_motion)?,
         device,
+        precision,
         deadline_ms: message.deadline_ms,
         priority,
     };
@@ -214,6 +219,7 @@ mod tests {
         assert!(refused(|o| o.preset = 9).contains("preset has no value 9"));
         assert!(refused(|o| o.priority = -1).contains("priority has no value -1"));
         assert!(refused(|o| o.device = "tpu".to_owned()).contains("device is"));
+        assert!(refused(|o| o.precision = "f8".to_owned()).contains("precision is"));
         assert!(refused(|o| o.ego_motion = vec![1.0; 3]).contains("16 numbers"));
         assert!(refused(|o| o.range_m = Some(f32::NAN)).contains("range_m"));
         assert!(refused(|o| o.max_points = Some(1)).contains("max_points is 1"));

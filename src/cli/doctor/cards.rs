@@ -73,11 +73,15 @@ fn tried(card: &Adapter) -> String {
     };
     let opening = opening.elapsed().as_secs_f64();
     let trial = Instant::now();
-    match try_out(&opened) {
+    let passed = match try_out(&opened) {
         Ok(()) => format!(
             "opened in {opening:.1} s, passed its trial in {:.2} s",
             trial.elapsed().as_secs_f64()
         ),
-        Err(reason) => format!("opened in {opening:.1} s, but {reason}"),
+        Err(reason) => return format!("opened in {opening:.1} s, but {reason}"),
+    };
+    match opened.matrix_units() {
+        Ok(tile) => format!("{passed}; precision f16 by {tile}"),
+        Err(reason) => format!("{passed}; no precision f16: {reason}"),
     }
 }

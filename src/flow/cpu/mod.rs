@@ -18,7 +18,7 @@ use rayon::prelude::*;
 use super::backend::{Backend, BackendError, Trainer, Transform};
 use super::distance::{DistanceOptions, DistanceTransform};
 use super::ego;
-use super::options::Options;
+use super::options::{Options, Precision};
 use super::points::{Point, RigidTransform};
 use super::watch::Watch;
 use kernels::Kernels;
@@ -122,6 +122,10 @@ impl Transform for CpuTransform {
         source: &[Point],
         options: &Options,
     ) -> Result<Box<dyn Trainer + '_>, BackendError> {
+        if options.precision == Precision::F16 {
+            let text = "the CPU computes in single precision alone";
+            return Err(BackendError::Unsupported(text));
+        }
         Ok(Box::new(trainer::CpuTrainer::new(self, source, options)))
     }
 }

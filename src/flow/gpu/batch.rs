@@ -9,11 +9,12 @@ use std::collections::HashMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
-use super::device::Card;
+use super::device::{Buffers, Card};
 use super::phases::{Clock, Phase, Phases};
 use super::plan::{Cut, Plan, Wave};
 use super::records::{Lane, STEPS, Status, Step};
 use crate::flow::backend::BackendError;
+use crate::flow::options::Precision;
 
 /// How long the one who submits waits for others that are about to join.
 const MOMENT: Duration = Duration::from_micros(300);
@@ -26,6 +27,8 @@ pub(super) struct Request {
     /// One for each iteration that is wanted, at most [`STEPS`].
     pub(super) steps: Vec<Step>,
     pub(super) cut: Cut,
+    /// Of everything in one submission: the kernels of one precision know no others.
+    pub(super) precision: Precision,
 }
 
 /// What became of a request.
@@ -150,18 +153,24 @@ impl Batch {
 }
 
 impl State {
-    /// Takes requests in the order of their arrival, as many as the card has room for.
+    /// Takes requests in the order of their arrival, as many of the first one's precision as the
+    /// card has room for. The others stay, one of them now the first.
     fn take(&mut self, card: &Card) -> Vec<(u64, Request)> {
+        let precision = self.waiting.first().map(|(_, request)| request.precision);
         let mut chunks = 0;
         let mut fitting = 0;
-        for (_, request) in &self.waiting {
-            chunks += request.cut.chunks as u64;
-            if fitting > 0 && (chunks > card.budget.chunks || fitting as u64 >= card.budget.lanes) {
-                break;
+        let mut full = false;
+        let taken = self.waiting.extract_if(.., |(_, request)| {
+            if full || Some(request.precision) != precision {
+                return false;
             }
-            fitting += 1;
-        }
-        self.waiting.drain(..fitting).collect()
+            chunks += request.cut.chunks as u64;
+            full =
+                fitting > 0 && (chunks > card.budget.chunks || fitting as u64 >= card.budget.lanes);
+            fitting += usize::from(!full);
+            !full
+        });
+        taken.collect()
     }
 }
 
@@ -176,8 +185,13 @@ fn submit(card: &Card, requests: &[&Request]) -> Result<Vec<Done>, BackendError>
     let iterations = iterations.max().unwrap_or(0);
     let cuts: Vec<_> = requests.iter().map(|request| request.cut).collect();
     let plan = Plan::new(&cuts, card.budget.rows as usize);
-    write(card, requests);
-    let phases = Phases::bind(card, &plan, requests.len())?;
+    write(card, &card.buffers, requests);
+    let precision = requests.first().map(|request| request.precision);
+    let units = match precision.unwrap_or_default() {
+        Precision::F32 => None,
+        Precision::F16 => Some(card.units()?),
+    };
+    let phases = Phases::bind(card, &card.buffers, &plan, requests.len(), units)?;
     let clock = Clock::new(card, MOMENTS);
 
     let mut encoder = card.encoder();
@@ -229,7 +243,7 @@ fn submit(card: &Card, requests: &[&Request]) -> Result<Vec<Done>, BackendError>
 }
 
 /// Writes what the kernels read of each request.
-pub(super) fn write(card: &Card, requests: &[&Request]) {
+pub(super) fn write(card: &Card, buffers: &Buffers, requests: &[&Request]) {
     let (mut first_tile, mut first_chunk) = (0, 0);
     let mut lanes = Vec::new();
     let mut steps = vec![Step::default(); requests.len() * STEPS];
@@ -248,9 +262,9 @@ pub(super) fn write(card: &Card, requests: &[&Request]) {
     }
     let statuses: Vec<_> = requests.iter().map(|request| request.status).collect();
     let write = |buffer: &wgpu::Buffer, bytes: &[u8]| card.queue.write_buffer(buffer, 0, bytes);
-    write(&card.buffers.lanes, bytemuck::cast_slice(&lanes));
-    write(&card.buffers.steps, bytemuck::cast_slice(&steps));
-    write(&card.buffers.statuses, bytemuck::cast_slice(&statuses));
+    write(&buffers.lanes, bytemuck::cast_slice(&lanes));
+    write(&buffers.steps, bytemuck::cast_slice(&steps));
+    write(&buffers.statuses, bytemuck::cast_slice(&statuses));
 }
 
 /// One iteration of all lanes. A timed one is done in passes, so that the card can tell them apart.
@@ -265,12 +279,14 @@ fn iterate(
     let mut pass = match clock {
         None => {
             let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
+            phases.dispatch(&mut pass, Phase::Halve, step, first);
             phases.dispatch(&mut pass, Phase::Forward, step, first);
             phases.dispatch(&mut pass, Phase::Query, step, first);
             pass
         }
         Some(clock) => {
             let mut pass = clock.pass(encoder, Some(0), None);
+            phases.dispatch(&mut pass, Phase::Halve, step, first);
             phases.dispatch(&mut pass, Phase::Forward, step, first);
             drop(pass);
             let mut pass = clock.pass(encoder, Some(1), Some(2));

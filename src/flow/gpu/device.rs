@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError, mpsc};
 use super::adapter::{Adapter, AdapterKind};
 use super::batch::Batch;
 use super::kernels::Kernels;
+use super::matrix::{self, Units};
 use super::memory::{Budget, Words};
 use super::records::{self, STEPS};
 use super::transform;
@@ -54,6 +55,18 @@ impl Gpu {
     /// Bytes of the card's memory that were taken.
     pub fn memory_bytes(&self) -> u64 {
         self.0.budget.bytes()
+    }
+
+    /// The tile that the card's matrix units multiply, such as `16x16x16 f16 -> f32`, where they pass
+    /// their self-test; the first call takes its time.
+    ///
+    /// # Errors
+    /// Why half precision is not to be had on this card.
+    pub fn matrix_units(&self) -> Result<String, String> {
+        let units = self.0.tested_units().as_ref();
+        units
+            .map(|units| units.tile.name().to_owned())
+            .map_err(Clone::clone)
     }
 
     /// Whether the card is gone and must be opened again.
@@ -141,6 +154,9 @@ pub(super) struct Card {
     /// Seconds of one tick of the card's clock; none where it shows none.
     pub(super) tick: Option<f64>,
     pub(super) watchdog: Arc<Watchdog>,
+    /// The tile of its matrix units, or why there are none to be used.
+    pub(super) tile: Result<matrix::Tile, String>,
+    units: OnceLock<Result<Units, String>>,
     networks: Mutex<Vec<u32>>,
     longest_silence: Duration,
     name: String,
@@ -166,9 +182,15 @@ impl Card {
     fn open(adapter: &Adapter, options: &GpuOptions) -> Result<Self, BackendError> {
         let handle = &adapter.handle;
         let clock = handle.features() & wgpu::Features::TIMESTAMP_QUERY;
+        let tile = matrix::Tile::offered(handle);
+        let (matrices, experiments) = match tile {
+            Ok(_) => matrix::asked_for(),
+            Err(_) => Default::default(),
+        };
         let opening = handle.request_device(&wgpu::DeviceDescriptor {
             label: Some("fnsf"),
-            required_features: wgpu::Features::IMMEDIATES | clock,
+            required_features: wgpu::Features::IMMEDIATES | clock | matrices,
+            experimental_features: experiments,
             required_limits: handle.limits(),
             memory_hints: wgpu::MemoryHints::MemoryUsage,
             ..wgpu::DeviceDescriptor::default()
@@ -206,6 +228,8 @@ impl Card {
                 AdapterKind::Software => SOFTWARE_SILENCE,
                 _ => LONGEST_SILENCE,
             },
+            tile,
+            units: OnceLock::new(),
             name: format!(
                 "{} ({}, {})",
                 adapter.name, adapter.interface, adapter.driver
@@ -213,6 +237,22 @@ impl Card {
             device,
             queue,
         })
+    }
+
+    /// The matrix units, or why there are none to be used; tested once.
+    fn tested_units(&self) -> &Result<Units, String> {
+        self.units
+            .get_or_init(|| Units::new(self, self.tile.clone()?))
+    }
+
+    /// The matrix units.
+    ///
+    /// # Errors
+    /// [`BackendError::Unsupported`] where there are none, or they failed their self-test.
+    pub(super) fn units(&self) -> Result<&Units, BackendError> {
+        let text = "half precision needs matrix units that pass their self-test";
+        let units = self.tested_units().as_ref();
+        units.map_err(|_| BackendError::Unsupported(text))
     }
 
     /// A free network's number.
@@ -338,6 +378,9 @@ pub(super) fn spread(groups: u32) -> [u32; 2] {
     [across, groups.div_ceil(across)]
 }
 
+/// Bytes of a row's flow, or pull.
+const ROW_VECTOR_BYTES: u64 = 16;
+
 impl Buffers {
     /// Takes what the budget says; half as much, and again, where nobody said how much and the card
     /// has less.
@@ -355,7 +398,7 @@ impl Buffers {
             .min(limits.max_buffer_size);
         loop {
             let budget = Budget::new(options.lanes, bytes, binding)?;
-            match Self::allocate(device, &budget) {
+            match Self::allocate(device, &budget, wgpu::BufferUsages::empty()) {
                 Ok(buffers) => return Ok((budget, buffers)),
                 Err(BackendError::Memory { .. }) if asked.is_none() => bytes /= 2,
                 Err(error) => return Err(error),
@@ -363,12 +406,25 @@ impl Buffers {
         }
     }
 
-    fn allocate(device: &wgpu::Device, budget: &Budget) -> Result<Self, BackendError> {
-        let storage = wgpu::BufferUsages::STORAGE;
+    /// Rows of a layer's activations.
+    pub(super) fn rows(&self) -> u64 {
+        self.flows.size() / ROW_VECTOR_BYTES
+    }
+
+    /// Takes what the budget says; every buffer can be used for `more`.
+    ///
+    /// # Errors
+    /// [`BackendError::Memory`] where the card has less.
+    pub(super) fn allocate(
+        device: &wgpu::Device,
+        budget: &Budget,
+        more: wgpu::BufferUsages,
+    ) -> Result<Self, BackendError> {
+        let storage = wgpu::BufferUsages::STORAGE | more;
         let (to, from) = (wgpu::BufferUsages::COPY_DST, wgpu::BufferUsages::COPY_SRC);
         let buffer = |what, bytes, usage| allocated(device, what, bytes, usage);
         let records = |bytes: usize| budget.lanes * bytes as u64;
-        let row_vectors = budget.rows * 16;
+        let row_vectors = budget.rows * ROW_VECTOR_BYTES;
         Ok(Self {
             store: buffer("store", budget.store_words * 4, storage | to | from)?,
             networks: buffer("networks", budget.network_bytes(), storage | to | from)?,
@@ -394,7 +450,7 @@ impl Buffers {
 }
 
 /// A new buffer.
-fn allocated(
+pub(super) fn allocated(
     device: &wgpu::Device,
     what: &'static str,
     bytes: u64,

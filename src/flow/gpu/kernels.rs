@@ -23,7 +23,31 @@ pub(super) const SOURCES: [(&str, &str); 10] = [
     ("multiply_adds", source!("multiply_adds")),
 ];
 
-/// The pipelines of all kernels.
+macro_rules! half_sources {
+    ($tile:literal) => {
+        [
+            ("halve", source!($tile, "common", "matrix", "halve")),
+            (
+                "forward_half",
+                source!($tile, "common", "matrix", "product", "forward_half"),
+            ),
+            (
+                "backward_half",
+                source!($tile, "common", "matrix", "product", "backward_half"),
+            ),
+            (
+                "gradients_half",
+                source!($tile, "common", "matrix", "gradients_half"),
+            ),
+        ]
+    };
+}
+
+/// The kernels of half precision, for matrix units whose tiles are 8 and 16 to a side.
+pub(super) const HALF_SOURCES: [[(&str, &str); 4]; 2] =
+    [half_sources!("tile8"), half_sources!("tile16")];
+
+/// The pipelines of all kernels but those of half precision.
 #[derive(Debug)]
 pub(super) struct Kernels {
     pub(super) bricks: wgpu::ComputePipeline,
@@ -47,25 +71,8 @@ impl Kernels {
     /// # Errors
     /// [`BackendError::Device`] where the driver refuses one.
     pub(super) fn new(device: &wgpu::Device, watchdog: &Watchdog) -> Result<Self, BackendError> {
-        let pipeline = |name: &str, constants: &[(&str, f64)]| {
-            let text = SOURCES.iter().find(|(entry, _)| *entry == name);
-            let (entry, text) = text.unwrap_or(&SOURCES[0]);
-            let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
-                label: Some(entry),
-                source: wgpu::ShaderSource::Wgsl((*text).into()),
-            });
-            device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
-                label: Some(entry),
-                layout: None,
-                module: &module,
-                entry_point: Some(entry),
-                compilation_options: wgpu::PipelineCompilationOptions {
-                    constants,
-                    zero_initialize_workgroup_memory: false,
-                },
-                cache: None,
-            })
-        };
+        let pipeline =
+            |name: &str, constants: &[(&str, f64)]| pipeline(device, &SOURCES, name, constants);
         let kernels = Self {
             bricks: pipeline("bricks", &[]),
             sample: pipeline("sample_points", &[]),
@@ -82,4 +89,71 @@ impl Kernels {
         watchdog.check()?;
         Ok(kernels)
     }
+}
+
+/// The pipelines of half precision.
+#[derive(Debug)]
+pub(super) struct HalfKernels {
+    pub(super) halve: wgpu::ComputePipeline,
+    pub(super) forward: wgpu::ComputePipeline,
+    pub(super) backward: wgpu::ComputePipeline,
+    /// The middle layers'.
+    pub(super) gradients: wgpu::ComputePipeline,
+    /// Those of the first layer and the last, in single precision.
+    pub(super) outer_gradients: wgpu::ComputePipeline,
+}
+
+impl HalfKernels {
+    /// Builds the pipelines from one of [`HALF_SOURCES`].
+    ///
+    /// # Errors
+    /// [`BackendError::Device`] where the driver refuses one.
+    pub(super) fn new(
+        device: &wgpu::Device,
+        sources: &[(&str, &str)],
+    ) -> Result<Self, BackendError> {
+        // A driver's refusal costs half precision, not the card.
+        let internal = device.push_error_scope(wgpu::ErrorFilter::Internal);
+        let invalid = device.push_error_scope(wgpu::ErrorFilter::Validation);
+        let half = |name: &str| pipeline(device, sources, name, &[]);
+        let kernels = Self {
+            halve: half("halve"),
+            forward: half("forward_half"),
+            backward: half("backward_half"),
+            gradients: half("gradients_half"),
+            outer_gradients: pipeline(device, &SOURCES, "gradients", &[("OUTER", 1.0)]),
+        };
+        let invalid = pollster::block_on(invalid.pop());
+        let internal = pollster::block_on(internal.pop());
+        match invalid.or(internal) {
+            None => Ok(kernels),
+            Some(error) => Err(BackendError::Device(error.to_string())),
+        }
+    }
+}
+
+/// The pipeline of the kernel of this name.
+fn pipeline(
+    device: &wgpu::Device,
+    sources: &[(&str, &str)],
+    name: &str,
+    constants: &[(&str, f64)],
+) -> wgpu::ComputePipeline {
+    let text = sources.iter().find(|(entry, _)| *entry == name);
+    let (entry, text) = text.unwrap_or(&sources[0]);
+    let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+        label: Some(entry),
+        source: wgpu::ShaderSource::Wgsl((*text).into()),
+    });
+    device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+        label: Some(entry),
+        layout: None,
+        module: &module,
+        entry_point: Some(entry),
+        compilation_options: wgpu::PipelineCompilationOptions {
+            constants,
+            zero_initialize_workgroup_memory: false,
+        },
+        cache: None,
+    })
 }

@@ -11,9 +11,11 @@ mod memory;
 
 // The kernels, and what they share with the host.
 mod kernels;
+mod matrix;
 mod phases;
 mod plan;
 mod records;
+mod self_test;
 
 // A pair on the card.
 mod batch;

@@ -1,7 +1,8 @@
 //! One iteration as the card does it: the kernels in their order, what each is bound to, and the
 //! card's own clock over them. Knows neither pairs nor stopping rules.
 
-use super::device::{Card, spread};
+use super::device::{Buffers, Card, spread};
+use super::matrix::{HalfPhases, Units};
 use super::plan::{Plan, Wave};
 use super::records::Part;
 use crate::flow::backend::BackendError;
@@ -10,14 +11,20 @@ use crate::flow::field::mlp::{LAID_OUT, MIDDLE_LAYERS};
 /// A kernel of an iteration.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Phase {
+    /// Of half precision alone: the weights that the others read, before the first wave.
+    Halve,
     Forward,
     Query,
     Backward,
     Gradients,
     Judge,
     Step,
+    /// Of single precision alone.
     Transpose,
 }
+
+/// A dispatch: its kernel, what that is bound to, and workgroups in two dimensions.
+pub(super) type Dispatch<'a> = (&'a wgpu::ComputePipeline, &'a wgpu::BindGroup, [u32; 2]);
 
 impl Phase {
     /// What is done for each wave of points, in order.
@@ -31,6 +38,8 @@ impl Phase {
 pub(super) struct Phases<'a> {
     card: &'a Card,
     lanes: u32,
+    /// Rows of a layer's activations.
+    rows: u32,
     forward: wgpu::BindGroup,
     query: wgpu::BindGroup,
     backward: wgpu::BindGroup,
@@ -38,19 +47,26 @@ pub(super) struct Phases<'a> {
     judge: wgpu::BindGroup,
     step: wgpu::BindGroup,
     transpose: wgpu::BindGroup,
+    half: Option<HalfPhases<'a>>,
 }
 
 impl<'a> Phases<'a> {
-    /// Binds the kernels for a submission of `lanes` lanes.
+    /// Binds the kernels for a submission of `lanes` lanes; with matrix units, in half precision.
     ///
     /// # Errors
     /// [`BackendError::Busy`] where the card has no room for the plan now.
-    pub(super) fn bind(card: &'a Card, plan: &Plan, lanes: usize) -> Result<Self, BackendError> {
+    pub(super) fn bind(
+        card: &'a Card,
+        buffers: &Buffers,
+        plan: &Plan,
+        lanes: usize,
+        units: Option<&'a Units>,
+    ) -> Result<Self, BackendError> {
         let tiles = &card.filled(bytemuck::cast_slice(&plan.tiles))?;
         let chunks = &card.filled(bytemuck::cast_slice(&plan.chunks))?;
         let storage = wgpu::BufferUsages::STORAGE;
         let tile_losses = &card.empty(plan.tiles.len() as u64 * 4, storage)?;
-        let super::device::Buffers {
+        let Buffers {
             store,
             networks,
             activations,
@@ -62,11 +78,13 @@ impl<'a> Phases<'a> {
             steps,
             statuses,
             losses,
-        } = &card.buffers;
+        } = buffers;
+        let half = units.map(|units| HalfPhases::bind(card, buffers, units, tiles, chunks));
         let kernels = &card.kernels;
         Ok(Self {
             card,
             lanes: lanes as u32,
+            rows: buffers.rows() as u32,
             forward: card.bound(
                 &kernels.forward,
                 &[
@@ -128,6 +146,7 @@ impl<'a> Phases<'a> {
                 &[records, steps, statuses, partials, networks],
             ),
             transpose: card.bound(&kernels.transpose, &[statuses, records, networks]),
+            half,
         })
     }
 
@@ -139,9 +158,32 @@ impl<'a> Phases<'a> {
         step: usize,
         wave: &Wave,
     ) {
+        let half = self.half.as_ref();
+        let half = half.and_then(|half| half.dispatches(phase, wave, self.lanes));
+        let own = || self.dispatches(phase, wave).into_iter().collect();
+        for (pipeline, group, [x, y]) in half.unwrap_or_else(own) {
+            pass.set_pipeline(pipeline);
+            pass.set_bind_group(0, group, &[]);
+            if !matches!(phase, Phase::Halve | Phase::Transpose) {
+                let part = Part {
+                    step: step as u32,
+                    first_tile: wave.first_tile as u32,
+                    first_chunk: wave.first_chunk as u32,
+                    tiles: wave.tiles as u32,
+                    rows: self.rows,
+                };
+                pass.set_immediates(0, bytemuck::bytes_of(&part));
+            }
+            pass.dispatch_workgroups(x, y, 1);
+        }
+    }
+
+    /// What is dispatched in single precision.
+    fn dispatches(&self, phase: Phase, wave: &Wave) -> Option<Dispatch<'_>> {
         let kernels = &self.card.kernels;
         let tiles = spread(wave.tiles as u32);
-        let (pipeline, group, [x, y]) = match phase {
+        Some(match phase {
+            Phase::Halve => return None,
             Phase::Forward => (&kernels.forward, &self.forward, tiles),
             Phase::Query => (&kernels.query, &self.query, tiles),
             Phase::Backward => (&kernels.backward, &self.backward, tiles),
@@ -159,20 +201,7 @@ impl<'a> Phases<'a> {
                 let squares = MIDDLE_LAYERS as u32 * SQUARES;
                 (&kernels.transpose, &self.transpose, [squares, self.lanes])
             }
-        };
-        pass.set_pipeline(pipeline);
-        pass.set_bind_group(0, group, &[]);
-        if phase != Phase::Transpose {
-            let part = Part {
-                step: step as u32,
-                first_tile: wave.first_tile as u32,
-                first_chunk: wave.first_chunk as u32,
-                tiles: wave.tiles as u32,
-                rows: self.card.budget.rows as u32,
-            };
-            pass.set_immediates(0, bytemuck::bytes_of(&part));
-        }
-        pass.dispatch_workgroups(x, y, 1);
+        })
     }
 }
 

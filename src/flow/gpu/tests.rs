@@ -3,6 +3,7 @@
 //! Needs a card; a software one will do.
 
 mod failures;
+mod half;
 mod kernels;
 mod shaders;
 mod whole;

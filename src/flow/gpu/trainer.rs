@@ -12,7 +12,7 @@ use crate::flow::backend::{Advance, BackendError, Report, Trainer};
 use crate::flow::course::Course;
 use crate::flow::early_stop::Seen;
 use crate::flow::field::mlp::{LAID_OUT, Parameters, transpose_middle_layers};
-use crate::flow::options::Options;
+use crate::flow::options::{Options, Precision};
 use crate::flow::points::Point;
 use crate::flow::snapshot::TrainerState;
 use crate::flow::watch::{Progress, Watch};
@@ -85,6 +85,9 @@ impl<'a> GpuTrainer<'a> {
         options: &Options,
     ) -> Result<Self, BackendError> {
         let card = &transform.card;
+        if options.precision == Precision::F16 {
+            card.units()?;
+        }
         let (course, parameters) = Course::new(source, options);
         let chunks = Cut::new(course.largest_batch()).chunks as u64;
         if chunks > card.budget.chunks {
@@ -156,6 +159,7 @@ impl<'a> GpuTrainer<'a> {
             status: self.status,
             steps: (done..done + steps).map(|done| self.step(done)).collect(),
             cut: Cut::new(self.course.largest_batch()),
+            precision: self.course.options.precision,
         };
         let done = self.card().batch.run(self.card(), request)?;
         self.status = done.status;

@@ -11,7 +11,7 @@ use crate::flow::backend::BackendError;
 use crate::flow::course::Course;
 use crate::flow::distance::DistanceOptions;
 use crate::flow::field::mlp::{MIDDLE_LAYERS, WIDTH};
-use crate::flow::options::Preset;
+use crate::flow::options::{Options, Precision, Preset};
 use crate::flow::points::Point;
 use crate::flow::watch::Unwatched;
 
@@ -31,7 +31,7 @@ pub struct KernelTime {
     pub operations: f64,
 }
 
-/// Times each kernel of an iteration over all of `source`, `rounds` times.
+/// Times each kernel of an iteration over all of `source` in one precision, `rounds` times.
 ///
 /// # Errors
 /// [`BackendError`] where the pair does not fit at once, or the card shows no clock.
@@ -39,6 +39,7 @@ pub fn kernel_times(
     gpu: &Gpu,
     source: &[Point],
     target: &[Point],
+    precision: Precision,
     rounds: usize,
 ) -> Result<Vec<KernelTime>, BackendError> {
     let card = gpu.card();
@@ -55,7 +56,10 @@ pub fn kernel_times(
         &DistanceOptions::default(),
         &Unwatched,
     )?;
-    let options = Preset::Paper.options(None);
+    let options = Options {
+        precision,
+        ..Preset::Paper.options(None)
+    };
     let (course, _) = Course::new(source, &options);
     // The trainer's network is at its start, and stays there: its rate is zero.
     let trainer = super::trainer::GpuTrainer::new(&built, source, &options)?;
@@ -77,9 +81,14 @@ pub fn kernel_times(
             fresh: 1.0,
         }],
         cut,
+        precision,
     };
-    write(card, &[&request]);
-    let phases = Phases::bind(card, &plan, 1)?;
+    write(card, &card.buffers, &[&request]);
+    let units = match precision {
+        Precision::F32 => None,
+        Precision::F16 => Some(card.units()?),
+    };
+    let phases = Phases::bind(card, &card.buffers, &plan, 1, units)?;
     let points = source.len() as f64;
     let kernels = [
         ("forward", Phase::Forward, points * FORWARD),
@@ -88,7 +97,10 @@ pub fn kernel_times(
         ("gradients", Phase::Gradients, points * FORWARD),
         ("judge", Phase::Judge, 0.0),
         ("step", Phase::Step, 0.0),
-        ("transpose", Phase::Transpose, 0.0),
+        match precision {
+            Precision::F32 => ("transpose", Phase::Transpose, 0.0),
+            Precision::F16 => ("halve", Phase::Halve, 0.0),
+        },
     ];
     let mut times = kernels.map(|(name, _, operations)| KernelTime {
         name,

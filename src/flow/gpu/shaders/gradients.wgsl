@@ -5,6 +5,9 @@
 // (x); chunks are added up, in order, by step.wgsl: no atomics, the same bits every time.
 // Mirrors ReferenceNetwork::backward.
 
+// Whether the matrix units do the middle layers, and these are the first (y: 0) and the last.
+override OUTER = false;
+
 var<immediate> part: Part;
 @group(0) @binding(0) var<storage, read> points: array<f32>;
 @group(0) @binding(1) var<storage, read> lanes: array<Lane>;
@@ -28,10 +31,11 @@ fn gradients(
     let chunk = chunks[part.first_chunk + group.x];
     if !iterates(statuses[chunk.lane], lanes[chunk.lane].steps, part.step) { return; }
     let place = (part.first_chunk + group.x) * LAID_OUT;
-    switch group.y {
+    let layer = group.y + select(0u, MIDDLE_LAYERS, OUTER);
+    switch layer {
         case 7u: { first_layer(chunk, place, local); }
         case 8u: { last_layer(chunk, place, local); }
-        default: { middle_layer(group.y, chunk, place, local); }
+        default: { middle_layer(layer, chunk, place, local); }
     }
 }
 

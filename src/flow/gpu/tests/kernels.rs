@@ -20,7 +20,7 @@ const GRADIENT_TOLERANCE: f64 = 1e-4;
 /// Metres, and per metre: a coordinate in cells has 24 bits, a corner's distance 16.
 const SAMPLE_TOLERANCE_M: f32 = 2e-5;
 
-fn transform(source: &[Point], target: &[Point]) -> Option<GpuTransform> {
+pub(super) fn transform(source: &[Point], target: &[Point]) -> Option<GpuTransform> {
     let card = shared()?.card();
     let options = DistanceOptions::default();
     let built = build(card, source, target, &options, &Unwatched);
@@ -103,13 +103,13 @@ fn samples_are_those_of_the_cpu_near_far_and_outside() {
 }
 
 /// The options of a run whose network is neither zero nor decayed.
-fn plain() -> Options {
+pub(super) fn plain() -> Options {
     let mut options = Preset::Paper.options(None);
     options.early_stop = None;
     options
 }
 
-fn network(options: &Options) -> ReferenceNetwork {
+pub(super) fn network(options: &Options) -> ReferenceNetwork {
     let mut random = Random::stream(options.seed, 0);
     ReferenceNetwork::read(&Parameters::xavier(&mut random))
 }
@@ -142,7 +142,7 @@ fn the_network_is_the_references_at_awkward_row_counts() {
 }
 
 /// The trainer's state after one iteration over the points.
-fn after_one(gpu: &GpuTransform, source: &[Point], options: &Options) -> TrainerState {
+pub(super) fn after_one(gpu: &GpuTransform, source: &[Point], options: &Options) -> TrainerState {
     let mut trainer = gpu.start(source, options).expect("a trainer");
     trainer.advance(1, &Unwatched).expect("an iteration");
     trainer.state().expect("an answer")

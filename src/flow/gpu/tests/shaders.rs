@@ -4,7 +4,7 @@ use core::mem::offset_of;
 
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 
-use super::super::kernels::SOURCES;
+use super::super::kernels::{HALF_SOURCES, SOURCES};
 use super::super::records;
 
 fn parsed(name: &str, source: &str) -> naga::Module {
@@ -15,9 +15,18 @@ fn parsed(name: &str, source: &str) -> naga::Module {
 #[test]
 fn every_shader_is_valid_and_fits_the_smallest_workgroup_memory() {
     const WORKGROUP_BYTES: u32 = 32 << 10;
-    for (name, source) in SOURCES {
+    let half = Capabilities::IMMEDIATES
+        | Capabilities::SHADER_FLOAT16
+        | Capabilities::SUBGROUP
+        | Capabilities::COOPERATIVE_MATRIX;
+    let single = SOURCES.map(|kernel| (kernel, Capabilities::IMMEDIATES));
+    let half = HALF_SOURCES
+        .as_flattened()
+        .iter()
+        .map(|&kernel| (kernel, half));
+    for ((name, source), capabilities) in single.into_iter().chain(half) {
         let module = parsed(name, source);
-        let mut validator = Validator::new(ValidationFlags::all(), Capabilities::IMMEDIATES);
+        let mut validator = Validator::new(ValidationFlags::all(), capabilities);
         let info = validator
             .validate(&module)
             .unwrap_or_else(|error| panic!("{name}: {}", error.emit_to_string(source)));
@@ -123,5 +132,10 @@ fn host_and_shaders_agree_on_the_network() {
         ("ARRAYS", records::ARRAYS),
     ] {
         assert_eq!(constant(source, name), value, "{name}");
+    }
+    for [_, forward, _, gradients] in HALF_SOURCES {
+        assert_eq!(constant(forward.1, "POINTS") * 2, records::TILE);
+        assert_eq!(constant(forward.1, "LAYER_HALVES"), mlp::WIDTH * mlp::WIDTH);
+        assert_eq!(constant(gradients.1, "PANEL"), mlp::PANEL);
     }
 }

@@ -30,7 +30,7 @@ impl Watch for Losses {
     }
 }
 
-fn street(seed: u64) -> SimulatedPair {
+pub(super) fn street(seed: u64) -> SimulatedPair {
     let options = StreetOptions {
         seed,
         beams: 16,
@@ -41,7 +41,7 @@ fn street(seed: u64) -> SimulatedPair {
     pair.expect("a small street")
 }
 
-fn solved(backend: &dyn Backend, pair: &SimulatedPair, options: &Options) -> Estimate {
+pub(super) fn solved(backend: &dyn Backend, pair: &SimulatedPair, options: &Options) -> Estimate {
     let problem = Problem {
         source: &pair.source,
         target: &pair.target,
@@ -50,7 +50,7 @@ fn solved(backend: &dyn Backend, pair: &SimulatedPair, options: &Options) -> Est
     estimate(backend, &problem, options, &Unwatched).expect("a flow")
 }
 
-fn end_point_error(flow: &[Point], truth: &[Point]) -> f64 {
+pub(super) fn end_point_error(flow: &[Point], truth: &[Point]) -> f64 {
     let errors = flow.iter().zip(truth).map(|(f, t)| {
         let square: f32 = (0..3).map(|a| (f[a] - t[a]).powi(2)).sum();
         f64::from(square.sqrt())

@@ -1,0 +1,205 @@
+//! Whether the kernels of half precision compute what those of single precision do, on a random
+//! network and random points: asked once a card, before anything relies on its matrix units.
+//!
+//! Cooperative matrices are experimental in wgpu, whose barriers do not say all that the Vulkan
+//! memory model asks for (gfx-rs/wgpu#8805): a driver may take advantage of it. Each kernel is run
+//! on the same inputs in both precisions, so that what differs is rounding alone. Knows no pair.
+
+use super::batch::{self, Request};
+use super::device::{Buffers, Card};
+use super::matrix::Units;
+use super::memory::Budget;
+use super::phases::{Phase, Phases};
+use super::plan::{Cut, Plan};
+use super::records::{Lane, Status, Step, TILE};
+use crate::flow::backend::BackendError;
+use crate::flow::field::mlp::{
+    HIDDEN_LAYERS, LAID_OUT, MIDDLE_LAYERS, Parameters, WIDTH, last_layer, middle_layer,
+    transpose_middle_layers,
+};
+use crate::flow::options::Precision;
+use crate::flow::random::Random;
+
+/// Points: enough for many workgroups at once, and no whole number of tiles.
+const POINTS: usize = 2000;
+/// The largest difference, in parts of the largest value of the layer. A factor that is rounded to
+/// a half is off by 2^-12 of itself on average; sums over 128 of them, seven layers deep, are off
+/// by a few times that in parts of the largest. A wrong tile is off by about one.
+const TOLERANCE: f32 = 0.01;
+
+/// Compares the kernels.
+///
+/// # Errors
+/// What differs, or why nothing could be compared.
+pub(super) fn run(card: &Card, units: &Units) -> Result<(), String> {
+    let [single, half] = computed(card, units).map_err(|error| error.to_string())?;
+    let layer = TILE * POINTS.div_ceil(TILE) * WIDTH;
+    for (name, single, half) in [
+        ("activations", &single.activations, &half.activations),
+        ("derivatives", &single.deltas, &half.deltas),
+    ] {
+        for number in 0..HIDDEN_LAYERS {
+            let span = number * layer..(number + 1) * layer;
+            let what = format!("the {name} of hidden layer {number}");
+            compare(&what, &single[span.clone()], &half[span])?;
+        }
+    }
+    compare("the flow", &single.flows, &half.flows)?;
+    let chunks = single.gradients.chunks_exact(LAID_OUT);
+    for (single, half) in chunks.zip(half.gradients.chunks_exact(LAID_OUT)) {
+        let starts = (0..MIDDLE_LAYERS).map(|number| middle_layer(number).weights);
+        let ends: Vec<_> = starts.chain([last_layer().weights, LAID_OUT]).collect();
+        let mut start = 0;
+        for (number, end) in ends.into_iter().enumerate() {
+            let what = format!("the gradient of layer {number}");
+            compare(&what, &single[start..end], &half[start..end])?;
+            start = end;
+        }
+    }
+    Ok(())
+}
+
+/// # Errors
+/// How far off the values are, where that is too far.
+fn compare(what: &str, single: &[f32], half: &[f32]) -> Result<(), String> {
+    let largest = single.iter().fold(0.0f32, |most, x| most.max(x.abs()));
+    let differences = single
+        .iter()
+        .zip(half)
+        .map(|(a, b)| (a - b).abs() / largest);
+    // What is not a number is larger than any.
+    let off = differences.fold(0.0, |most: f32, off| if off <= most { most } else { off });
+    if off <= TOLERANCE {
+        return Ok(());
+    }
+    Err(format!(
+        "its matrix units failed their self-test: {what} is off by {off:.3} of the largest"
+    ))
+}
+
+/// What the kernels of one precision make of the same inputs.
+struct Computed {
+    /// `[layer][row][128]`.
+    activations: Vec<f32>,
+    /// A quad a row.
+    flows: Vec<f32>,
+    /// `[layer][row][128]`.
+    deltas: Vec<f32>,
+    /// A network's worth a chunk.
+    gradients: Vec<f32>,
+}
+
+/// What both precisions compute, single first. Derivatives and gradients of both are made of the
+/// activations, and gradients of the derivatives, that single precision found.
+fn computed(card: &Card, units: &Units) -> Result<[Computed; 2], BackendError> {
+    let cut = Cut::new(POINTS);
+    let budget = Budget {
+        lanes: 1,
+        rows: (cut.tiles * TILE) as u64,
+        chunks: cut.chunks as u64,
+        store_words: 3 * POINTS as u64,
+    };
+    let more = wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST;
+    let buffers = Buffers::allocate(&card.device, &budget, more)?;
+    let plan = Plan::new(&[cut], cut.tiles * TILE);
+    fill(card, &buffers, cut);
+    let single = Phases::bind(card, &buffers, &plan, 1, None)?;
+    let half = Phases::bind(card, &buffers, &plan, 1, Some(units))?;
+
+    let row_bytes = budget.row_bytes();
+    let sizes = [
+        (&buffers.activations, row_bytes),
+        (&buffers.flows, budget.rows * 16),
+        (&buffers.deltas, row_bytes),
+        (&buffers.partials, budget.chunk_bytes()),
+    ];
+    let all: u64 = sizes.iter().map(|(_, bytes)| 2 * bytes).sum();
+    let results = card.empty(all, more)?;
+    let mut encoder = card.encoder();
+    let mut at = 0;
+    let mut spans = Vec::new();
+    let mut done = |phases: &Phases<'_>, todo: &[Phase], kept: &[usize]| {
+        {
+            let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
+            for &phase in todo {
+                phases.dispatch(&mut pass, phase, 0, &plan.waves[0]);
+            }
+        }
+        for &number in kept {
+            let (buffer, bytes) = sizes[number];
+            encoder.copy_buffer_to_buffer(buffer, 0, &results, at, bytes);
+            spans.push(at as usize..(at + bytes) as usize);
+            at += bytes;
+        }
+    };
+    done(&half, &[Phase::Halve, Phase::Forward], &[0, 1]);
+    done(&single, &[Phase::Forward], &[0, 1]);
+    done(&half, &[Phase::Backward], &[2]);
+    done(&single, &[Phase::Backward], &[2]);
+    done(&half, &[Phase::Gradients], &[3]);
+    done(&single, &[Phase::Gradients], &[3]);
+    let read = card.finish(encoder, &results, all)?;
+    let values = |number: usize| {
+        let quads = read[spans[number].clone()].as_chunks::<4>().0;
+        quads
+            .iter()
+            .map(|&bytes| f32::from_ne_bytes(bytes))
+            .collect()
+    };
+    let of = |[activations, flows, deltas, gradients]: [usize; 4]| Computed {
+        activations: values(activations),
+        flows: values(flows),
+        deltas: values(deltas),
+        gradients: values(gradients),
+    };
+    Ok([of([2, 3, 5, 7]), of([0, 1, 4, 6])])
+}
+
+/// Random points, pulls and a random network, biases too.
+fn fill(card: &Card, buffers: &Buffers, cut: Cut) {
+    let mut random = Random::new(1);
+    let mut parameters = Parameters::xavier(&mut random);
+    for number in 0..MIDDLE_LAYERS {
+        let at = middle_layer(number).bias;
+        for bias in &mut parameters.as_mut_slice()[at..at + WIDTH] {
+            *bias = random.uniform(-0.1, 0.1) as f32;
+        }
+    }
+    let mut transposed = Parameters::zeros();
+    transpose_middle_layers(&parameters, &mut transposed);
+    let mut across = |width: f64| random.uniform(-width, width) as f32;
+    let points: Vec<f32> = (0..3 * POINTS).map(|_| across(4.0)).collect();
+    let pulls: Vec<[f32; 4]> = (0..cut.tiles * TILE)
+        .map(|row| match row < POINTS {
+            true => [0; 4].map(|_| across(1.0 / POINTS as f64)),
+            false => [0.0; 4],
+        })
+        .collect();
+    let write = |buffer: &wgpu::Buffer, at: u64, floats: &[f32]| {
+        card.queue
+            .write_buffer(buffer, at * 4, bytemuck::cast_slice(floats));
+    };
+    let laid_out = LAID_OUT as u64;
+    write(&buffers.store, 0, &points);
+    write(&buffers.networks, 0, &parameters.as_slice()[..LAID_OUT]);
+    write(
+        &buffers.networks,
+        laid_out,
+        &transposed.as_slice()[..LAID_OUT],
+    );
+    write(&buffers.pulls, 0, bytemuck::cast_slice(&pulls));
+    let request = Request {
+        lane: Lane {
+            scale: 1.0,
+            ..Lane::default()
+        },
+        status: Status::default(),
+        steps: vec![Step {
+            count: POINTS as u32,
+            ..Step::default()
+        }],
+        cut,
+        precision: Precision::F16,
+    };
+    batch::write(card, buffers, &[&request]);
+}

@@ -1,0 +1,70 @@
+// The derivative of the loss by every hidden feature with the middle layers by the matrix units,
+// over half a tile of points a workgroup.
+//
+// In: pulls (the derivative by the flow, a row each), activations, networks, and the middle layers'
+// weights as halves. Out: deltas, [layer][row][128]: the derivative by each hidden layer's features,
+// zero where ReLU cut them off. Mirrors backward.wgsl but for the rounding of a middle layer's
+// derivatives and weights.
+//
+// Pulls are a batch's mean: its count is multiplied in before anything is rounded, lest halves
+// underflow, and divided out of what is kept. An invocation holds one feature of every point.
+
+var<immediate> part: Part;
+@group(0) @binding(0) var<storage, read> networks: array<f32>;
+@group(0) @binding(1) var<storage, read> tiles: array<Tile>;
+@group(0) @binding(2) var<storage, read> statuses: array<Status>;
+@group(0) @binding(3) var<storage, read> pulls: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read> activations: array<f32>;
+@group(0) @binding(5) var<storage, read> lanes: array<Lane>;
+@group(0) @binding(6) var<storage, read> steps: array<Step>;
+@group(0) @binding(7) var<storage, read> halves: array<f16>;
+@group(0) @binding(8) var<storage, read_write> deltas: array<f32>;
+
+// The right factor's tile: the same weights as forward, turned.
+fn right(weights: u32, summed: u32, column: u32) -> Right {
+    return coopLoad<Right>(&halves[weights + tile_place(column, summed)], BLOCK);
+}
+
+// Keeps a point's derivative, zero where the feature is off, for the layer before.
+fn keep(layer: u32, row: u32, point: u32, feature: u32, sum: f32, count: f32) {
+    let place = (layer * part.rows + row + point) * WIDTH + feature;
+    let delta = select(0.0, sum, activations[place] > 0.0);
+    inputs[point * INPUT_PITCH + feature] = halved(delta);
+    deltas[place] = delta / count;
+}
+
+@compute @workgroup_size(128)
+fn backward_half(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+    @builtin(subgroup_id) subgroup: u32,
+    @builtin(num_subgroups) subgroups: u32,
+) {
+    let wave_half = group.y * groups.x + group.x;
+    if wave_half >= part.tiles * 2u { return; }
+    let work = tiles[part.first_tile + wave_half / 2u];
+    if !iterates(statuses[work.lane], lanes[work.lane].steps, part.step) { return; }
+    let network = lanes[work.lane].network * ARRAYS * LAID_OUT * 4u;
+    let count = f32(steps[work.lane * STEPS + part.step].count);
+    let row = wave_half * POINTS;
+
+    {
+        let at = network + LAST * 4u + local;
+        let weights = vec3(networks[at], networks[at + WIDTH], networks[at + 2u * WIDTH]);
+        for (var point = 0u; point < POINTS; point++) {
+            let pull = pulls[row + point].xyz * count;
+            let sum = fma(pull.x, weights.x, fma(pull.y, weights.y, pull.z * weights.z));
+            keep(MIDDLE_LAYERS, row, point, local, sum, count);
+        }
+    }
+    for (var done = 0u; done < MIDDLE_LAYERS; done++) {
+        let layer = MIDDLE_LAYERS - 1u - done;
+        workgroupBarrier();
+        multiply((work.lane * MIDDLE_LAYERS + layer) * LAYER_HALVES, subgroup, subgroups);
+        workgroupBarrier();
+        for (var point = 0u; point < POINTS; point++) {
+            keep(layer, row, point, local, products[point * PRODUCT_PITCH + local], count);
+        }
+    }
+}

@@ -1,0 +1,40 @@
+// A middle layer's product by the matrix units, for the way forward and the way back: of all points'
+// features in `inputs` and a layer's weights in `halves`, into `products`. The kernel that it is
+// put before has `right`, which reads the weights as they are or turned.
+//
+// A matrix operation is a whole subgroup's, however large that is: subgroups take squares of two
+// by two tiles in turn.
+
+// Squares across the features, and in all.
+const SQUARES_ACROSS = WIDTH / (2u * SIDE);
+const SQUARE_COUNT = POINTS / (2u * SIDE) * SQUARES_ACROSS;
+
+var<workgroup> inputs: array<f16, 4352>;
+var<workgroup> products: array<f32, 4224>;
+
+fn multiply(weights: u32, subgroup: u32, subgroups: u32) {
+    for (var square = subgroup; square < SQUARE_COUNT; square += subgroups) {
+        let top = square / SQUARES_ACROSS * 2u * SIDE;
+        let left = square % SQUARES_ACROSS * 2u * SIDE;
+        var upper_left = Sums();
+        var upper_right = Sums();
+        var lower_left = Sums();
+        var lower_right = Sums();
+        for (var k = 0u; k < WIDTH; k += SIDE) {
+            let upper = coopLoadT<Left>(&inputs[top * INPUT_PITCH + k], INPUT_PITCH);
+            let lower = coopLoadT<Left>(&inputs[(top + SIDE) * INPUT_PITCH + k], INPUT_PITCH);
+            let first = right(weights, k, left);
+            let second = right(weights, k, left + SIDE);
+            upper_left = coopMultiplyAdd(upper, first, upper_left);
+            upper_right = coopMultiplyAdd(upper, second, upper_right);
+            lower_left = coopMultiplyAdd(lower, first, lower_left);
+            lower_right = coopMultiplyAdd(lower, second, lower_right);
+        }
+        let at = top * PRODUCT_PITCH + left;
+        let below = at + SIDE * PRODUCT_PITCH;
+        coopStoreT(upper_left, &products[at], PRODUCT_PITCH);
+        coopStoreT(upper_right, &products[at + SIDE], PRODUCT_PITCH);
+        coopStoreT(lower_left, &products[below], PRODUCT_PITCH);
+        coopStoreT(lower_right, &products[below + SIDE], PRODUCT_PITCH);
+    }
+}

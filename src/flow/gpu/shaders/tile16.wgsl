@@ -1,0 +1,11 @@
+// Matrix units that multiply 16 x 16 tiles of halves and add up in singles: NVIDIA's and others'.
+// Put before the kernels of half precision; tile8.wgsl is the other one.
+
+enable f16;
+enable wgpu_cooperative_matrix;
+
+// Rows and columns of a tile.
+const SIDE = 16u;
+alias Left = coop_mat16x16<f16, A>;
+alias Right = coop_mat16x16<f16, B>;
+alias Sums = coop_mat16x16<f32, C>;

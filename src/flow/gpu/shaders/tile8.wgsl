@@ -1,0 +1,11 @@
+// Matrix units that multiply 8 x 8 tiles of halves and add up in singles: lavapipe's.
+// Put before the kernels of half precision; tile16.wgsl is the other one.
+
+enable f16;
+enable wgpu_cooperative_matrix;
+
+// Rows and columns of a tile.
+const SIDE = 8u;
+alias Left = coop_mat8x8<f16, A>;
+alias Right = coop_mat8x8<f16, B>;
+alias Sums = coop_mat8x8<f32, C>;
