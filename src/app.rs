@@ -218,9 +218,9 @@ impl App {
                     .iter()
                     .filter(move |device| device.kind() == kind)
             };
-            let works = of_kind().any(|device| *device.health().borrow() == Health::Ready);
+            let may_work = of_kind().any(Device::may_work);
             of_kind().find_map(|device| match &*device.health().borrow() {
-                Health::Gone(reason) if !works => Some(format!("{}: {reason}", device.name())),
+                Health::Gone(reason) if !may_work => Some(format!("{}: {reason}", device.name())),
                 _ => None,
             })
         })

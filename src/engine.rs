@@ -214,6 +214,16 @@ impl Device {
         self.health.clone()
     }
 
+    /// Whether it works, or may without anybody's help: one that was lost a moment ago comes back
+    /// as a rule, one that never worked does not.
+    pub fn may_work(&self) -> bool {
+        match &*self.health.borrow() {
+            Health::Starting | Health::Ready => true,
+            Health::Broken(_) => self.hold.has_worked(),
+            Health::Gone(_) => false,
+        }
+    }
+
     /// Its lanes, each for a worker of its own.
     pub fn lanes(&self) -> impl ExactSizeIterator<Item = Lane> + '_ {
         (0..self.lanes.len()).map(|place| Lane {

@@ -4,6 +4,7 @@
 //! The lane that comes first opens; the others wait for it. It must not know what lanes do.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -31,6 +32,8 @@ pub(super) struct Hold {
     reopening: Reopening,
     metrics: Arc<Metrics>,
     tell: watch::Sender<Health>,
+    /// Whether it was ever open. Beside the state, which is locked as long as an opening takes.
+    worked: AtomicBool,
     state: Mutex<State>,
 }
 
@@ -56,6 +59,7 @@ impl Hold {
             open,
             metrics,
             tell,
+            worked: AtomicBool::new(false),
             state: Mutex::new(State {
                 opened: None,
                 openings: 0,
@@ -69,6 +73,11 @@ impl Hold {
 
     fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Whether the device has ever passed its trial.
+    pub(super) fn has_worked(&self) -> bool {
+        self.worked.load(Ordering::Relaxed)
     }
 
     /// The device is gone: it is counted once, whichever lane says so first.
@@ -153,6 +162,7 @@ impl Hold {
                 state.openings += 1;
                 state.failures = 0;
                 state.pause = self.reopening.first_pause;
+                self.worked.store(true, Ordering::Relaxed);
                 self.tell.send_replace(Health::Ready);
                 return Ok(());
             }
@@ -168,8 +178,7 @@ impl Hold {
             tries = state.failures,
             "the device cannot be used"
         );
-        let worked = state.openings > 0;
-        let given_up = worked && state.failures >= self.reopening.tries;
+        let given_up = self.has_worked() && state.failures >= self.reopening.tries;
         let health = if given_up {
             Health::Gone
         } else {
