@@ -34,7 +34,7 @@ use crate::metrics::Metrics;
 /// # Errors
 /// What is wrong with the device.
 pub fn try_out(backend: &dyn Backend) -> Result<(), String> {
-    trial::run(backend)
+    trial::run(backend).map_err(|error| error.to_string())
 }
 
 /// One pair for a device.

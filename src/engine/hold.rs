@@ -3,7 +3,6 @@
 //!
 //! The lane that comes first opens; the others wait for it. It must not know what lanes do.
 
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
@@ -11,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::watch;
 
-use super::lane::{Trust, message};
+use super::lane::Trust;
 use super::{Health, Opened, Opener, Reopening, trial};
 use crate::flow::backend::Backend;
 use crate::metrics::Metrics;
@@ -127,13 +126,17 @@ impl Hold {
     /// Comes back when the device is open, and has passed its trial again where trust in it is
     /// shaken; opens it if nobody else does. False where `ended` says that the lane has no more
     /// work.
+    ///
+    /// A trial that finds no room beside the pairs of other lanes says nothing about the device,
+    /// and losing it would cost them theirs: it is left alone.
     pub(super) fn open(&self, trust: Trust, ended: &dyn Fn() -> bool) -> bool {
         const LOOK: Duration = Duration::from_millis(100);
         if trust == Trust::Shaken
             && let Some(held) = self.share()
-            && let Err(reason) = passes(held.backend.as_ref())
+            && let Err(error) = trial::run(held.backend.as_ref())
+            && !error.is_lack_of_room()
         {
-            self.lose(&held, &reason);
+            self.lose(&held, &error.to_string());
         }
         loop {
             match self.opened() {
@@ -189,20 +192,8 @@ impl Hold {
     }
 
     fn opened_and_tried(&self) -> Result<Arc<dyn Opened>, String> {
-        let opening = catch_unwind(AssertUnwindSafe(|| {
-            let opened: Arc<dyn Opened> =
-                Arc::from((self.open)().map_err(|error| error.to_string())?);
-            let backend = opened.lane();
-            trial::run(backend.as_ref())?;
-            tracing::info!(device = &*self.name, is = backend.name(), "ready");
-            Ok(opened)
-        }));
-        opening.unwrap_or_else(|panic| Err(message(panic.as_ref())))
+        let opened = trial::opened(&self.open)?;
+        tracing::info!(device = &*self.name, is = opened.lane().name(), "ready");
+        Ok(opened)
     }
-}
-
-/// Whether a backend solves the trial's pair.
-fn passes(backend: &dyn Backend) -> Result<(), String> {
-    catch_unwind(AssertUnwindSafe(|| trial::run(backend)))
-        .unwrap_or_else(|panic| Err(message(panic.as_ref())))
 }

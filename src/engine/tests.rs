@@ -8,6 +8,7 @@ use tokio::time::timeout;
 
 use super::cards::Switches;
 use super::{Device, EngineError, Health, Lane, Work};
+use crate::flow::backend::BackendError;
 use crate::flow::{Point, Preset, Unwatched};
 use crate::metrics::Metrics;
 
@@ -147,6 +148,30 @@ async fn a_panic_in_one_lane_is_not_felt_in_another() {
     solved(&lanes[1]).await.expect("it works again");
     assert_eq!(stand.switches.openings.load(Ordering::Relaxed), 1);
     assert!(!stand.losses());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_trial_that_finds_no_room_beside_other_pairs_does_not_lose_the_device() {
+    for lack_of_room in [
+        BackendError::Busy,
+        BackendError::Memory {
+            what: "points",
+            needed: 2,
+            available: 1,
+        },
+    ] {
+        let stand = stand(1);
+        stand.ready().await;
+        let lane = stand.device.lanes().next().expect("a lane");
+        stand.switches.panics.store(1, Ordering::Relaxed);
+        stand.switches.fail_a_trial(lack_of_room);
+        let panicked = solved(&lane).await;
+        assert!(matches!(panicked, Err(EngineError::Panicked(_))));
+        solved(&lane).await.expect("it works again");
+        assert!(stand.switches.no_trial_fails(), "it was not tried");
+        assert_eq!(stand.switches.openings.load(Ordering::Relaxed), 1);
+        assert!(!stand.losses());
+    }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
