@@ -91,6 +91,9 @@ pub trait Opened: Send + Sync {
 
     /// Whether the device is gone, so that nothing that comes from it counts.
     fn is_lost(&self) -> bool;
+
+    /// Gives the device up, its memory included: whatever still runs on it fails as lost.
+    fn destroy(&self);
 }
 
 /// Opens a device; called again when it was lost.

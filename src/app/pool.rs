@@ -180,6 +180,9 @@ impl Opened for Processor {
     fn is_lost(&self) -> bool {
         false
     }
+
+    /// Its threads end with the last lane that uses them.
+    fn destroy(&self) {}
 }
 
 impl Opened for Gpu {
@@ -189,6 +192,10 @@ impl Opened for Gpu {
 
     fn is_lost(&self) -> bool {
         Gpu::is_lost(self)
+    }
+
+    fn destroy(&self) {
+        Gpu::destroy(self);
     }
 }
 

@@ -121,6 +121,10 @@ impl Opened for Card {
     fn is_lost(&self) -> bool {
         self.lost.load(Ordering::Relaxed)
     }
+
+    fn destroy(&self) {
+        self.lost.store(true, Ordering::Relaxed);
+    }
 }
 
 struct CardLane {

@@ -3,6 +3,7 @@
 //!
 //! The lane that comes first opens; the others wait for it. It must not know what lanes do.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
@@ -10,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::watch;
 
-use super::lane::Trust;
+use super::lane::{Trust, message};
 use super::{Health, Opened, Opener, Reopening, trial};
 use crate::flow::backend::Backend;
 use crate::metrics::Metrics;
@@ -38,6 +39,8 @@ pub(super) struct Hold {
 
 struct State {
     opened: Option<Arc<dyn Opened>>,
+    /// What was lost, until it is given up before the next opening.
+    lost: Option<Arc<dyn Opened>>,
     openings: u64,
     /// Openings that failed since the last one that did not.
     failures: u32,
@@ -61,6 +64,7 @@ impl Hold {
             worked: AtomicBool::new(false),
             state: Mutex::new(State {
                 opened: None,
+                lost: None,
                 openings: 0,
                 failures: 0,
                 pause: reopening.first_pause,
@@ -88,7 +92,7 @@ impl Hold {
     }
 
     fn forget(&self, state: &mut State, reason: &str) {
-        state.opened = None;
+        state.lost = state.opened.take();
         state.next_try = Instant::now();
         self.metrics.device_lost(&self.name);
         tracing::error!(
@@ -159,6 +163,9 @@ impl Hold {
         if now < state.next_try {
             return Err(state.next_try - now);
         }
+        if let Some(lost) = state.lost.take() {
+            self.give_up(lost);
+        }
         let reason = match self.opened_and_tried() {
             Ok(opened) => {
                 state.opened = Some(opened);
@@ -189,6 +196,17 @@ impl Hold {
         };
         self.tell.send_replace(health(reason));
         Err(pause)
+    }
+
+    /// Frees what a lost device holds, which is needed to open it again, even where other lanes
+    /// are still at work on it. Not while a lane has an answer to give: a dead driver may take its
+    /// time, or panic.
+    fn give_up(&self, lost: Arc<dyn Opened>) {
+        let freed = catch_unwind(AssertUnwindSafe(move || lost.destroy()));
+        if let Err(panic) = freed {
+            let panic = message(panic.as_ref());
+            tracing::warn!(device = &*self.name, panic, "the lost device was not freed");
+        }
     }
 
     fn opened_and_tried(&self) -> Result<Arc<dyn Opened>, String> {

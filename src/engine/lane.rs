@@ -29,8 +29,7 @@ pub(super) enum Trust {
     Shaken,
 }
 
-/// Works until nobody has work any more. Between two pairs it holds nothing of the device, so that
-/// a lost one gives its memory back before it is opened again.
+/// Works until nobody has work any more. Between two pairs it holds nothing of the device.
 pub(super) fn run(hold: &Hold, mut inbox: mpsc::Receiver<Command>, busy: &Busy) {
     let mut trust = Trust::Given;
     while hold.open(trust, &|| inbox.is_closed()) {

@@ -175,6 +175,30 @@ async fn a_trial_that_finds_no_room_beside_other_pairs_does_not_lose_the_device(
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_device_that_fails_its_trial_is_given_up_under_the_other_lanes_too() {
+    let stand = stand(2);
+    stand.ready().await;
+    stand.switches.brake.store(true, Ordering::Relaxed);
+    let lanes: Vec<_> = stand.device.lanes().collect();
+    // Nothing but the end of the card lets it go on.
+    let at_work = solved(&lanes[0]);
+    let slips = async {
+        stand.switches.until_at_the_brake(1).await;
+        stand.switches.panics.store(1, Ordering::Relaxed);
+        let error = BackendError::Device("it computes nonsense".to_owned());
+        stand.switches.fail_a_trial(error);
+        solved(&lanes[1]).await
+    };
+    let (at_work, slipped) = tokio::join!(at_work, slips);
+    assert!(matches!(slipped, Err(EngineError::Panicked(_))));
+    assert!(matches!(at_work, Err(EngineError::Lost(_))), "{at_work:?}");
+    stand.switches.brake.store(false, Ordering::Relaxed);
+    stand.ready().await;
+    assert_eq!(stand.switches.openings.load(Ordering::Relaxed), 2);
+    assert!(stand.losses());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_device_that_does_not_come_back_is_given_up_and_still_tried() {
     let stand = stand(2);
     stand.ready().await;
