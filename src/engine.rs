@@ -238,6 +238,9 @@ impl Device {
     /// What stands in the way of work; nothing where the device has passed its trial and every
     /// lane that works has given a sign of life a moment ago.
     pub fn obstacle(&self) -> Option<String> {
+        if self.lanes().all(|lane| lane.has_ended()) {
+            return Some(format!("{} has no thread any more", self.name));
+        }
         match &*self.health.borrow() {
             Health::Starting => Some(format!("{} is being tried", self.name)),
             Health::Broken(reason) | Health::Gone(reason) => {
@@ -280,6 +283,11 @@ impl Lane {
     /// What the device is.
     pub fn kind(&self) -> DeviceKind {
         self.device.kind
+    }
+
+    /// Whether its thread is gone, by a panic that it should have caught: it will never work again.
+    pub fn has_ended(&self) -> bool {
+        self.device.lanes[self.place].commands.is_closed()
     }
 
     /// Estimates one pair's flow.

@@ -24,6 +24,8 @@ pub(crate) struct Switches {
     pub(crate) refusals: AtomicU32,
     /// Pairs that end in a panic from now on.
     pub(crate) panics: AtomicU32,
+    /// Whether a lane that takes its share of the card panics.
+    pub(crate) tears: AtomicBool,
     /// What the next trials end in, the last one first.
     trials: Mutex<Vec<BackendError>>,
     /// Pairs with more points do not fit, unless it is zero.
@@ -111,6 +113,7 @@ struct Card {
 
 impl Opened for Card {
     fn lane(&self) -> Arc<dyn Backend> {
+        assert!(!self.switches.tears.load(Ordering::Relaxed), "it tears");
         Arc::new(CardLane {
             cpu: CpuBackend::new(Some(1)).expect("a thread"),
             switches: Arc::clone(&self.switches),

@@ -38,23 +38,30 @@ pub(super) fn run(hold: &Hold, mut inbox: mpsc::Receiver<Command>, busy: &Busy) 
             Some(Command::Look) => continue,
             None => return,
         };
-        let answer = match hold.share() {
-            None => {
-                trust = Trust::Given;
-                Err(EngineError::Broken("it is being opened again".to_owned()))
-            }
-            Some(held) => {
-                busy.begin();
-                let solved = catch_unwind(AssertUnwindSafe(|| {
-                    solve(held.backend.as_ref(), work, busy)
-                }));
-                busy.end();
-                let answer;
-                (answer, trust) = judged(hold, &held, solved);
-                answer
-            }
+        let Some(held) = hold.share() else {
+            trust = Trust::Given;
+            let answer = Err(EngineError::Broken("it is being opened again".to_owned()));
+            let _nobody_waits_is_fine = reply.send(answer);
+            continue;
         };
+        busy.begin();
+        let solved = catch_unwind(AssertUnwindSafe(|| {
+            solve(held.backend.as_ref(), work, busy)
+        }));
+        busy.end();
+        let answer;
+        (answer, trust) = judged(hold, &held, solved);
         let _nobody_waits_is_fine = reply.send(answer);
+        let_go(held);
+    }
+}
+
+/// Drops a lane's share of the device, after the answer: the last handle on a dead card may take
+/// its time, or panic.
+fn let_go(held: Held) {
+    if let Err(panic) = catch_unwind(AssertUnwindSafe(move || drop(held))) {
+        let panic = message(panic.as_ref());
+        tracing::warn!(panic, "a device that was let go of panicked");
     }
 }
 
