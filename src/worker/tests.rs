@@ -207,7 +207,8 @@ async fn a_worker_whose_lane_has_ended_gives_its_job_back_and_takes_nothing_more
         .expect("in time")
         .expect("no panic");
     let left = stand.queue.job(&job.tenant, job.id).await.expect("known");
-    assert_eq!((left.state, left.attempt), (State::Queued, 1));
+    assert_eq!(left.state, State::Queued);
+    assert!(left.attempt <= 1, "it was leased again");
     assert!(stand.worker.lane.device().obstacle().is_some());
 }
 
