@@ -63,7 +63,9 @@ impl App {
         let metrics = Arc::new(Metrics::new(&names));
         if pool.fell_back {
             metrics.fell_back();
-            tracing::warn!("no GPU was found: the CPU does the work; fnsf doctor says why");
+            tracing::warn!(
+                "no GPU was found that works: the CPU does the work; fnsf doctor says why"
+            );
         }
         let keys = keys(&config)?;
 
@@ -156,7 +158,7 @@ impl App {
     /// Where values do not go together, or a key or a device cannot be used.
     pub fn check(config: &Config) -> anyhow::Result<()> {
         config.check()?;
-        Pool::of(config)?;
+        Pool::unopened(config)?;
         keys(config)?;
         Ok(())
     }

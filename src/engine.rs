@@ -37,6 +37,14 @@ pub fn try_out(backend: &dyn Backend) -> Result<(), String> {
     trial::run(backend).map_err(|error| error.to_string())
 }
 
+/// Opens a device, tries it, and gives it up again.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn try_opening(open: &Opener) -> Result<(), String> {
+    trial::opened(open).map(|opened| opened.destroy())
+}
+
 /// One pair for a device.
 pub struct Work {
     /// N points, metres.
