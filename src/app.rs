@@ -23,7 +23,7 @@ use crate::api::{
 };
 use crate::blobs::Blobs;
 use crate::config::{Config, LimitsConfig, QueueConfig};
-use crate::cost::CostModel;
+use crate::cost::{CostModel, Lanes};
 use crate::engine::{Device, Health};
 use crate::job::{DeviceKind, Tenant};
 use crate::metrics::Metrics;
@@ -73,6 +73,7 @@ impl App {
         let queue = SqliteQueue::open(&config.data_dir, queue_options(&config.queue), events)
             .with_context(|| format!("cannot open the queue in {}", config.data_dir.display()))?;
         let queue: Arc<dyn Queue> = Arc::new(queue);
+        warn_of_stranded_jobs(queue.as_ref(), lanes);
         let blobs = Blobs::open(&config.data_dir.join("blobs"))
             .with_context(|| format!("cannot use {}", config.data_dir.display()))?;
 
@@ -226,6 +227,23 @@ impl App {
                 _ => None,
             })
         })
+    }
+}
+
+/// Jobs of an earlier start may wait for a kind of device that this one does not have: they would
+/// do so in silence until their time is over.
+fn warn_of_stranded_jobs(queue: &dyn Queue, lanes: Lanes) {
+    let backlog = queue.backlog();
+    for kind in DeviceKind::ALL {
+        let jobs = backlog.queued_only_for(kind).jobs;
+        if lanes.of(kind) == 0 && jobs > 0 {
+            tracing::warn!(
+                jobs,
+                needs = kind.name(),
+                "jobs wait for a kind of device that this server does not have: start it with one, \
+                 or cancel them"
+            );
+        }
     }
 }
 
