@@ -133,7 +133,7 @@ impl Hold {
     ///
     /// A trial that finds no room beside the pairs of other lanes says nothing about the device,
     /// and losing it would cost them theirs: it is left alone.
-    pub(super) fn open(&self, trust: Trust, ended: &dyn Fn() -> bool) -> bool {
+    pub(super) fn open(&self, trust: Trust, ended: &mut dyn FnMut() -> bool) -> bool {
         const LOOK: Duration = Duration::from_millis(100);
         if trust == Trust::Shaken
             && let Some(held) = self.share()

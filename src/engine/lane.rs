@@ -4,6 +4,7 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
+use tokio::sync::mpsc::error::TryRecvError;
 use tokio::sync::{mpsc, oneshot};
 
 use super::busy::Busy;
@@ -32,7 +33,7 @@ pub(super) enum Trust {
 /// Works until nobody has work any more. Between two pairs it holds nothing of the device.
 pub(super) fn run(hold: &Hold, mut inbox: mpsc::Receiver<Command>, busy: &Busy) {
     let mut trust = Trust::Given;
-    while hold.open(trust, &|| inbox.is_closed()) {
+    while hold.open(trust, &mut || turned_away(&mut inbox)) {
         let (work, reply) = match inbox.blocking_recv() {
             Some(Command::Solve(work, reply)) => (*work, reply),
             Some(Command::Look) => continue,
@@ -53,6 +54,22 @@ pub(super) fn run(hold: &Hold, mut inbox: mpsc::Receiver<Command>, busy: &Busy) 
         (answer, trust) = judged(hold, &held, solved);
         let _nobody_waits_is_fine = reply.send(answer);
         let_go(held);
+    }
+}
+
+/// Gives back what comes while the device cannot be opened: another one may do it meanwhile. Says
+/// whether nothing will come any more.
+fn turned_away(inbox: &mut mpsc::Receiver<Command>) -> bool {
+    loop {
+        match inbox.try_recv() {
+            Ok(Command::Solve(_, reply)) => {
+                let answer = Err(EngineError::Broken("it is being opened again".to_owned()));
+                let _nobody_waits_is_fine = reply.send(answer);
+            }
+            Ok(Command::Look) => {}
+            Err(TryRecvError::Empty) => return false,
+            Err(TryRecvError::Disconnected) => return true,
+        }
     }
 }
 

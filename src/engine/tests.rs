@@ -221,6 +221,24 @@ async fn a_device_that_does_not_come_back_is_given_up_and_still_tried() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_pair_that_comes_while_the_device_is_away_is_given_back() {
+    let stand = stand(1);
+    stand.ready().await;
+    stand.switches.refusals.store(u32::MAX, Ordering::Relaxed);
+    stand.switches.destroy();
+    stand.device.look();
+    stand
+        .until(|health| matches!(health, Health::Gone(_)))
+        .await;
+    let lane = stand.device.lanes().next().expect("a lane");
+    let given_back = solved(&lane).await;
+    assert!(
+        matches!(given_back, Err(EngineError::Broken(_))),
+        "{given_back:?}"
+    );
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_device_that_never_worked_is_broken_and_not_given_up() {
     let switches = Arc::new(Switches::default());
     switches.refusals.store(5, Ordering::Relaxed);
