@@ -23,7 +23,7 @@ use crate::api::{
 };
 use crate::blobs::Blobs;
 use crate::config::{Config, LimitsConfig, QueueConfig};
-use crate::cost::CostModel;
+use crate::cost::{CostModel, Lanes};
 use crate::engine::{Device, Health};
 use crate::job::{DeviceKind, Tenant};
 use crate::metrics::Metrics;
@@ -63,7 +63,9 @@ impl App {
         let metrics = Arc::new(Metrics::new(&names));
         if pool.fell_back {
             metrics.fell_back();
-            tracing::warn!("no GPU was found: the CPU does the work; fnsf doctor says why");
+            tracing::warn!(
+                "no GPU was found that works: the CPU does the work; fnsf doctor says why"
+            );
         }
         let keys = keys(&config)?;
 
@@ -71,6 +73,7 @@ impl App {
         let queue = SqliteQueue::open(&config.data_dir, queue_options(&config.queue), events)
             .with_context(|| format!("cannot open the queue in {}", config.data_dir.display()))?;
         let queue: Arc<dyn Queue> = Arc::new(queue);
+        warn_of_stranded_jobs(queue.as_ref(), lanes);
         let blobs = Blobs::open(&config.data_dir.join("blobs"))
             .with_context(|| format!("cannot use {}", config.data_dir.display()))?;
 
@@ -156,7 +159,7 @@ impl App {
     /// Where values do not go together, or a key or a device cannot be used.
     pub fn check(config: &Config) -> anyhow::Result<()> {
         config.check()?;
-        Pool::of(config)?;
+        Pool::unopened(config)?;
         keys(config)?;
         Ok(())
     }
@@ -218,12 +221,29 @@ impl App {
                     .iter()
                     .filter(move |device| device.kind() == kind)
             };
-            let works = of_kind().any(|device| *device.health().borrow() == Health::Ready);
+            let may_work = of_kind().any(Device::may_work);
             of_kind().find_map(|device| match &*device.health().borrow() {
-                Health::Gone(reason) if !works => Some(format!("{}: {reason}", device.name())),
+                Health::Gone(reason) if !may_work => Some(format!("{}: {reason}", device.name())),
                 _ => None,
             })
         })
+    }
+}
+
+/// Jobs of an earlier start may wait for a kind of device that this one does not have: they would
+/// do so in silence until their time is over.
+fn warn_of_stranded_jobs(queue: &dyn Queue, lanes: Lanes) {
+    let backlog = queue.backlog();
+    for kind in DeviceKind::ALL {
+        let jobs = backlog.queued_only_for(kind).jobs;
+        if lanes.of(kind) == 0 && jobs > 0 {
+            tracing::warn!(
+                jobs,
+                needs = kind.name(),
+                "jobs wait for a kind of device that this server does not have: start it with one, \
+                 or cancel them"
+            );
+        }
     }
 }
 

@@ -41,7 +41,7 @@ pub struct Config {
     pub keys: Vec<KeyConfig>,
     /// TLS on the public port.
     pub tls: Option<TlsConfig>,
-    /// What works. `auto`: every GPU that is found, else the CPU; `cpu`: all cores; `cpu:4`: four
+    /// What works. `auto`: every GPU that works, else the CPU; `cpu`: all cores; `cpu:4`: four
     /// threads; `gpu`: every GPU; `gpu:CARD`: the one of that number, PCI id or part of a name.
     pub devices: Vec<String>,
     /// Pairs that one GPU works on at the same time; by default what suits the card.

@@ -34,7 +34,15 @@ use crate::metrics::Metrics;
 /// # Errors
 /// What is wrong with the device.
 pub fn try_out(backend: &dyn Backend) -> Result<(), String> {
-    trial::run(backend)
+    trial::run(backend).map_err(|error| error.to_string())
+}
+
+/// Opens a device, tries it, and gives it up again.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn try_opening(open: &Opener) -> Result<(), String> {
+    trial::opened(open).map(|opened| opened.destroy())
 }
 
 /// One pair for a device.
@@ -91,6 +99,9 @@ pub trait Opened: Send + Sync {
 
     /// Whether the device is gone, so that nothing that comes from it counts.
     fn is_lost(&self) -> bool;
+
+    /// Gives the device up, its memory included: whatever still runs on it fails as lost.
+    fn destroy(&self);
 }
 
 /// Opens a device; called again when it was lost.
@@ -214,6 +225,16 @@ impl Device {
         self.health.clone()
     }
 
+    /// Whether it works, or may without anybody's help: one that was lost a moment ago comes back
+    /// as a rule, one that never worked does not.
+    pub fn may_work(&self) -> bool {
+        match &*self.health.borrow() {
+            Health::Starting | Health::Ready => true,
+            Health::Broken(_) => self.hold.has_worked(),
+            Health::Gone(_) => false,
+        }
+    }
+
     /// Its lanes, each for a worker of its own.
     pub fn lanes(&self) -> impl ExactSizeIterator<Item = Lane> + '_ {
         (0..self.lanes.len()).map(|place| Lane {
@@ -225,6 +246,9 @@ impl Device {
     /// What stands in the way of work; nothing where the device has passed its trial and every
     /// lane that works has given a sign of life a moment ago.
     pub fn obstacle(&self) -> Option<String> {
+        if self.lanes().all(|lane| lane.has_ended()) {
+            return Some(format!("{} has no thread any more", self.name));
+        }
         match &*self.health.borrow() {
             Health::Starting => Some(format!("{} is being tried", self.name)),
             Health::Broken(reason) | Health::Gone(reason) => {
@@ -267,6 +291,11 @@ impl Lane {
     /// What the device is.
     pub fn kind(&self) -> DeviceKind {
         self.device.kind
+    }
+
+    /// Whether its thread is gone, by a panic that it should have caught: it will never work again.
+    pub fn has_ended(&self) -> bool {
+        self.device.lanes[self.place].commands.is_closed()
     }
 
     /// Estimates one pair's flow.

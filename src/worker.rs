@@ -79,11 +79,20 @@ enum StoreError {
 }
 
 impl Worker {
-    /// Works until it is told to stop.
+    /// Works until it is told to stop, or its lane has ended.
     pub async fn run(self) {
         let mut committing: Option<JoinHandle<()>> = None;
         loop {
             if !self.device_is_ready().await {
+                break;
+            }
+            if self.lane.has_ended() {
+                // Whatever it leased, it could only give back.
+                let device = self.lane.device().name();
+                tracing::error!(
+                    device,
+                    "a lane's thread has ended: nothing works there any more"
+                );
                 break;
             }
             let mut asking = self

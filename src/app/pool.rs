@@ -1,6 +1,7 @@
 //! Which devices a server works on: the words of its configuration to devices that can be opened.
 //!
-//! It opens nothing itself, and must not know queues or doors.
+//! It opens nothing itself but to see whether a card that nobody named works, and must not know
+//! queues or doors.
 
 use std::str::FromStr;
 use std::sync::Arc;
@@ -10,7 +11,7 @@ use anyhow::{anyhow, bail};
 
 use crate::config::Config;
 use crate::cost::Lanes;
-use crate::engine::{DeviceOptions, Opened, Opener, Reopening};
+use crate::engine::{DeviceOptions, Opened, Opener, Reopening, try_opening};
 use crate::flow::backend::{Backend, BackendError};
 use crate::flow::cpu::CpuBackend;
 use crate::flow::gpu::{self, Adapter, AdapterKind, Gpu, GpuOptions, Selector};
@@ -22,26 +23,45 @@ const GPU_LANES: usize = 8;
 /// The same where the card is software: its work takes the same cores anyway.
 const SOFTWARE_LANES: usize = 2;
 
+/// Bytes of a card's networks, which lie in one binding, for each pair that shares it.
+const LANE_BINDING_BYTES: u64 = 2_329_920;
+
+/// Says whether what would be opened works.
+type Probe<'a> = &'a dyn Fn(&Opener) -> Result<(), String>;
+
 /// The devices of one server.
 pub(super) struct Pool {
     pub(super) devices: Vec<DeviceOptions>,
-    /// Whether a GPU would have been taken and none was found.
+    /// Whether a GPU would have been taken and none was found that works.
     pub(super) fell_back: bool,
 }
 
 impl Pool {
-    /// The devices that a configuration names, or those that are found where it leaves the choice.
+    /// The devices that a configuration names, or those that are found and work where it leaves
+    /// the choice: there each card is opened, tried and given up again.
     ///
     /// # Errors
     /// Where a name is none, or what it names is not there.
     pub(super) fn of(config: &Config) -> anyhow::Result<Self> {
+        Self::probed(config, &try_opening)
+    }
+
+    /// The same without opening anything: whatever is found is taken to work.
+    ///
+    /// # Errors
+    /// Where a name is none, or what it names is not there.
+    pub(super) fn unopened(config: &Config) -> anyhow::Result<Self> {
+        Self::probed(config, &|_| Ok(()))
+    }
+
+    fn probed(config: &Config, probe: Probe<'_>) -> anyhow::Result<Self> {
         let mut pool = Self {
             devices: Vec::new(),
             fell_back: false,
         };
         for named in &config.devices {
             match named.as_str() {
-                "auto" => pool.add_the_best(config)?,
+                "auto" => pool.add_the_best(config, probe)?,
                 "cpu" => pool.add_cpu(None)?,
                 "gpu" => pool.add_every_gpu(config)?,
                 other => match other.split_once(':') {
@@ -73,16 +93,26 @@ impl Pool {
         }
     }
 
-    fn add_the_best(&mut self, config: &Config) -> anyhow::Result<()> {
-        let cards = welcome(config);
-        if cards.is_empty() {
-            self.fell_back = true;
-            return self.add_cpu(None);
+    /// A card that does not work counts as none: nobody has asked for it, and a server that waits
+    /// for it would do nothing.
+    fn add_the_best(&mut self, config: &Config, probe: Probe<'_>) -> anyhow::Result<()> {
+        let mut found = false;
+        for card in welcome(config) {
+            let name = card.name.clone();
+            let (lanes, open) = card_opener(card, config);
+            match probe(&open) {
+                Ok(()) => {
+                    found = true;
+                    self.add(DeviceKind::Gpu, lanes, open);
+                }
+                Err(reason) => tracing::warn!(card = name, reason, "a GPU is left out"),
+            }
         }
-        for card in cards {
-            self.add_gpu(card, config);
+        if found {
+            return Ok(());
         }
-        Ok(())
+        self.fell_back = true;
+        self.add_cpu(None)
     }
 
     fn add_every_gpu(&mut self, config: &Config) -> anyhow::Result<()> {
@@ -114,18 +144,7 @@ impl Pool {
     }
 
     fn add_gpu(&mut self, card: Adapter, config: &Config) {
-        let lanes = config.gpu_lanes.unwrap_or(match card.kind {
-            AdapterKind::Software => SOFTWARE_LANES,
-            _ => GPU_LANES,
-        });
-        let options = GpuOptions {
-            lanes,
-            memory_bytes: config.gpu_memory_mib.map(|mib| mib << 20),
-        };
-        let open: Opener = Box::new(move || {
-            let opened = Gpu::open(&found_again(&card)?, &options)?;
-            Ok(Box::new(opened))
-        });
+        let (lanes, open) = card_opener(card, config);
         self.add(DeviceKind::Gpu, lanes, open);
     }
 
@@ -139,6 +158,39 @@ impl Pool {
             reopening: Reopening::default(),
         });
     }
+}
+
+/// How many pairs share a card, and how it is opened for them.
+fn card_opener(card: Adapter, config: &Config) -> (usize, Opener) {
+    let wanted = config.gpu_lanes.unwrap_or(match card.kind {
+        AdapterKind::Software => SOFTWARE_LANES,
+        _ => GPU_LANES,
+    });
+    let lanes = fitting_lanes(wanted, card.max_binding_bytes);
+    if lanes < wanted {
+        tracing::warn!(
+            card = card.name,
+            wanted,
+            lanes,
+            "no more pairs fit on the GPU"
+        );
+    }
+    let options = GpuOptions {
+        lanes,
+        memory_bytes: config.gpu_memory_mib.map(|mib| mib << 20),
+    };
+    let open: Opener = Box::new(move || {
+        let opened = Gpu::open(&found_again(&card)?, &options)?;
+        Ok(Box::new(opened))
+    });
+    (lanes, open)
+}
+
+/// As many of the lanes as the card has networks for: a pair without one would only be given back,
+/// again and again.
+fn fitting_lanes(wanted: usize, binding_bytes: u64) -> usize {
+    let networks = (binding_bytes / LANE_BINDING_BYTES).max(1);
+    usize::try_from(networks).map_or(wanted, |networks| wanted.min(networks))
 }
 
 /// The card that is asked for.
@@ -180,6 +232,9 @@ impl Opened for Processor {
     fn is_lost(&self) -> bool {
         false
     }
+
+    /// Its threads end with the last lane that uses them.
+    fn destroy(&self) {}
 }
 
 impl Opened for Gpu {
@@ -190,11 +245,18 @@ impl Opened for Gpu {
     fn is_lost(&self) -> bool {
         Gpu::is_lost(self)
     }
+
+    fn destroy(&self) {
+        Gpu::destroy(self);
+    }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::cell::Cell;
+
     use super::*;
+    use crate::gpu_in_tests;
 
     fn pool(devices: &[&str]) -> anyhow::Result<Pool> {
         Pool::of(&Config {
@@ -228,5 +290,50 @@ mod tests {
         let pool = pool(&["auto"]).expect("a device");
         let first = pool.devices.first().expect("a device");
         assert_eq!(pool.fell_back, first.kind == DeviceKind::Cpu);
+    }
+
+    #[test]
+    fn auto_leaves_out_cards_that_do_not_work_and_falls_back_to_the_cpu() {
+        let config = Config {
+            devices: vec!["auto".to_owned()],
+            software_gpu: true,
+            ..Config::default()
+        };
+        let probed = Cell::new(0);
+        let broken = |_: &Opener| {
+            probed.set(probed.get() + 1);
+            Err("it computes nonsense".to_owned())
+        };
+        let pool = Pool::probed(&config, &broken).expect("a CPU");
+        assert_eq!(probed.get(), welcome(&config).len());
+        let names: Vec<_> = pool.devices.iter().map(|device| &device.name).collect();
+        assert_eq!(names, ["cpu0"]);
+        assert!(pool.fell_back);
+    }
+
+    #[test]
+    fn no_more_pairs_share_a_card_than_it_has_networks_for() {
+        assert_eq!(fitting_lanes(64, 128 << 20), 57);
+        assert_eq!(fitting_lanes(8, 128 << 20), 8);
+        assert_eq!(fitting_lanes(64, u64::from(u32::MAX)), 64);
+        assert_eq!(fitting_lanes(8, 0), 1);
+    }
+
+    #[test]
+    fn a_card_that_is_opened_with_the_most_lanes_has_a_network_for_each() {
+        let cards = gpu::adapters();
+        if !gpu_in_tests::is_there(cards.len()) {
+            return;
+        }
+        let Some(card) = cards.into_iter().next() else {
+            return;
+        };
+        let lanes = fitting_lanes(64, card.max_binding_bytes);
+        let options = GpuOptions {
+            lanes,
+            memory_bytes: None,
+        };
+        let gpu = Gpu::open(&card, &options).expect("it opens");
+        assert_eq!(gpu.lanes(), lanes);
     }
 }

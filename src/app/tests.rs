@@ -258,3 +258,32 @@ async fn a_server_gives_up_when_the_last_card_does_not_come_back_and_not_before(
     }
     stand.app.drain().await;
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_server_does_not_give_up_while_another_card_is_being_opened_again() {
+    const A_MOMENT: Duration = Duration::from_millis(500);
+    let switches = [Arc::new(Switches::default()), Arc::new(Switches::default())];
+    let mut comes_back = switches[1].card("gpu1", 1);
+    // It has tries left as long as the test goes on.
+    comes_back.reopening.tries = u32::MAX;
+    let stand = serve(vec![switches[0].card("gpu0", 1), comes_back], true).await;
+    for (switches, device) in switches.iter().zip(stand.app.devices.iter().skip(1)) {
+        switches.refusals.store(u32::MAX, Ordering::Relaxed);
+        switches.destroy();
+        device.look();
+    }
+    let mut health = stand.app.devices[1].health();
+    let gone = health.wait_for(|health| matches!(health, Health::Gone(_)));
+    drop(
+        timeout(PATIENCE, gone)
+            .await
+            .expect("in time")
+            .expect("threads live"),
+    );
+    let given_up = timeout(A_MOMENT, stand.app.given_up()).await;
+    assert!(given_up.is_err(), "the other card still had tries left");
+    switches[1].refusals.store(0, Ordering::Relaxed);
+    let job = stand.submit(json!({"device": "gpu"})).await;
+    assert_eq!(stand.end(&job).await.0, "succeeded");
+    stand.app.drain().await;
+}

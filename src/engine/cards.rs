@@ -24,6 +24,10 @@ pub(crate) struct Switches {
     pub(crate) refusals: AtomicU32,
     /// Pairs that end in a panic from now on.
     pub(crate) panics: AtomicU32,
+    /// Whether a lane that takes its share of the card panics.
+    pub(crate) tears: AtomicBool,
+    /// What the next trials end in, the last one first.
+    trials: Mutex<Vec<BackendError>>,
     /// Pairs with more points do not fit, unless it is zero.
     pub(crate) room: AtomicUsize,
     /// Pairs stop before their next iterations while it is on.
@@ -41,6 +45,20 @@ impl Switches {
             .lock()
             .expect("no panic holds it")
             .store(true, Ordering::Relaxed);
+    }
+
+    /// The next trial ends in this.
+    pub(crate) fn fail_a_trial(&self, error: BackendError) {
+        self.trials.lock().expect("no panic holds it").push(error);
+    }
+
+    /// Whether every trial that was to fail has failed.
+    pub(crate) fn no_trial_fails(&self) -> bool {
+        self.trials.lock().expect("no panic holds it").is_empty()
+    }
+
+    fn trial_error(&self) -> Option<BackendError> {
+        self.trials.lock().expect("no panic holds it").pop()
     }
 
     /// Waits until so many pairs are under way and stand still.
@@ -95,6 +113,7 @@ struct Card {
 
 impl Opened for Card {
     fn lane(&self) -> Arc<dyn Backend> {
+        assert!(!self.switches.tears.load(Ordering::Relaxed), "it tears");
         Arc::new(CardLane {
             cpu: CpuBackend::new(Some(1)).expect("a thread"),
             switches: Arc::clone(&self.switches),
@@ -104,6 +123,10 @@ impl Opened for Card {
 
     fn is_lost(&self) -> bool {
         self.lost.load(Ordering::Relaxed)
+    }
+
+    fn destroy(&self) {
+        self.lost.store(true, Ordering::Relaxed);
     }
 }
 
@@ -128,6 +151,9 @@ impl Backend for CardLane {
         let on_trial = source.len() == TRIAL_POINTS;
         if !on_trial && taken(&self.switches.panics) {
             panic!("the device has slipped");
+        }
+        if on_trial && let Some(error) = self.switches.trial_error() {
+            return Err(error);
         }
         let room = self.switches.room.load(Ordering::Relaxed);
         if !on_trial && room > 0 && source.len() > room {

@@ -4,6 +4,7 @@
 //! The lane that comes first opens; the others wait for it. It must not know what lanes do.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -31,11 +32,15 @@ pub(super) struct Hold {
     reopening: Reopening,
     metrics: Arc<Metrics>,
     tell: watch::Sender<Health>,
+    /// Whether it was ever open. Beside the state, which is locked as long as an opening takes.
+    worked: AtomicBool,
     state: Mutex<State>,
 }
 
 struct State {
     opened: Option<Arc<dyn Opened>>,
+    /// What was lost, until it is given up before the next opening.
+    lost: Option<Arc<dyn Opened>>,
     openings: u64,
     /// Openings that failed since the last one that did not.
     failures: u32,
@@ -56,8 +61,10 @@ impl Hold {
             open,
             metrics,
             tell,
+            worked: AtomicBool::new(false),
             state: Mutex::new(State {
                 opened: None,
+                lost: None,
                 openings: 0,
                 failures: 0,
                 pause: reopening.first_pause,
@@ -71,6 +78,11 @@ impl Hold {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Whether the device has ever passed its trial.
+    pub(super) fn has_worked(&self) -> bool {
+        self.worked.load(Ordering::Relaxed)
+    }
+
     /// The device is gone: it is counted once, whichever lane says so first.
     pub(super) fn lose(&self, held: &Held, reason: &str) {
         let mut state = self.state();
@@ -80,7 +92,7 @@ impl Hold {
     }
 
     fn forget(&self, state: &mut State, reason: &str) {
-        state.opened = None;
+        state.lost = state.opened.take();
         state.next_try = Instant::now();
         self.metrics.device_lost(&self.name);
         tracing::error!(
@@ -118,13 +130,17 @@ impl Hold {
     /// Comes back when the device is open, and has passed its trial again where trust in it is
     /// shaken; opens it if nobody else does. False where `ended` says that the lane has no more
     /// work.
-    pub(super) fn open(&self, trust: Trust, ended: &dyn Fn() -> bool) -> bool {
+    ///
+    /// A trial that finds no room beside the pairs of other lanes says nothing about the device,
+    /// and losing it would cost them theirs: it is left alone.
+    pub(super) fn open(&self, trust: Trust, ended: &mut dyn FnMut() -> bool) -> bool {
         const LOOK: Duration = Duration::from_millis(100);
         if trust == Trust::Shaken
             && let Some(held) = self.share()
-            && let Err(reason) = passes(held.backend.as_ref())
+            && let Err(error) = trial::run(held.backend.as_ref())
+            && !error.is_lack_of_room()
         {
-            self.lose(&held, &reason);
+            self.lose(&held, &error.to_string());
         }
         loop {
             match self.opened() {
@@ -147,12 +163,16 @@ impl Hold {
         if now < state.next_try {
             return Err(state.next_try - now);
         }
+        if let Some(lost) = state.lost.take() {
+            self.give_up(lost);
+        }
         let reason = match self.opened_and_tried() {
             Ok(opened) => {
                 state.opened = Some(opened);
                 state.openings += 1;
                 state.failures = 0;
                 state.pause = self.reopening.first_pause;
+                self.worked.store(true, Ordering::Relaxed);
                 self.tell.send_replace(Health::Ready);
                 return Ok(());
             }
@@ -168,8 +188,7 @@ impl Hold {
             tries = state.failures,
             "the device cannot be used"
         );
-        let worked = state.openings > 0;
-        let given_up = worked && state.failures >= self.reopening.tries;
+        let given_up = self.has_worked() && state.failures >= self.reopening.tries;
         let health = if given_up {
             Health::Gone
         } else {
@@ -179,21 +198,20 @@ impl Hold {
         Err(pause)
     }
 
-    fn opened_and_tried(&self) -> Result<Arc<dyn Opened>, String> {
-        let opening = catch_unwind(AssertUnwindSafe(|| {
-            let opened: Arc<dyn Opened> =
-                Arc::from((self.open)().map_err(|error| error.to_string())?);
-            let backend = opened.lane();
-            trial::run(backend.as_ref())?;
-            tracing::info!(device = &*self.name, is = backend.name(), "ready");
-            Ok(opened)
-        }));
-        opening.unwrap_or_else(|panic| Err(message(panic.as_ref())))
+    /// Frees what a lost device holds, which is needed to open it again, even where other lanes
+    /// are still at work on it. Not while a lane has an answer to give: a dead driver may take its
+    /// time, or panic.
+    fn give_up(&self, lost: Arc<dyn Opened>) {
+        let freed = catch_unwind(AssertUnwindSafe(move || lost.destroy()));
+        if let Err(panic) = freed {
+            let panic = message(panic.as_ref());
+            tracing::warn!(device = &*self.name, panic, "the lost device was not freed");
+        }
     }
-}
 
-/// Whether a backend solves the trial's pair.
-fn passes(backend: &dyn Backend) -> Result<(), String> {
-    catch_unwind(AssertUnwindSafe(|| trial::run(backend)))
-        .unwrap_or_else(|panic| Err(message(panic.as_ref())))
+    fn opened_and_tried(&self) -> Result<Arc<dyn Opened>, String> {
+        let opened = trial::opened(&self.open)?;
+        tracing::info!(device = &*self.name, is = opened.lane().name(), "ready");
+        Ok(opened)
+    }
 }

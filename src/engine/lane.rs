@@ -4,6 +4,7 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
+use tokio::sync::mpsc::error::TryRecvError;
 use tokio::sync::{mpsc, oneshot};
 
 use super::busy::Busy;
@@ -29,33 +30,55 @@ pub(super) enum Trust {
     Shaken,
 }
 
-/// Works until nobody has work any more. Between two pairs it holds nothing of the device, so that
-/// a lost one gives its memory back before it is opened again.
+/// Works until nobody has work any more. Between two pairs it holds nothing of the device.
 pub(super) fn run(hold: &Hold, mut inbox: mpsc::Receiver<Command>, busy: &Busy) {
     let mut trust = Trust::Given;
-    while hold.open(trust, &|| inbox.is_closed()) {
+    while hold.open(trust, &mut || turned_away(&mut inbox)) {
         let (work, reply) = match inbox.blocking_recv() {
             Some(Command::Solve(work, reply)) => (*work, reply),
             Some(Command::Look) => continue,
             None => return,
         };
-        let answer = match hold.share() {
-            None => {
-                trust = Trust::Given;
-                Err(EngineError::Broken("it is being opened again".to_owned()))
-            }
-            Some(held) => {
-                busy.begin();
-                let solved = catch_unwind(AssertUnwindSafe(|| {
-                    solve(held.backend.as_ref(), work, busy)
-                }));
-                busy.end();
-                let answer;
-                (answer, trust) = judged(hold, &held, solved);
-                answer
-            }
+        let Some(held) = hold.share() else {
+            trust = Trust::Given;
+            let answer = Err(EngineError::Broken("it is being opened again".to_owned()));
+            let _nobody_waits_is_fine = reply.send(answer);
+            continue;
         };
+        busy.begin();
+        let solved = catch_unwind(AssertUnwindSafe(|| {
+            solve(held.backend.as_ref(), work, busy)
+        }));
+        busy.end();
+        let answer;
+        (answer, trust) = judged(hold, &held, solved);
         let _nobody_waits_is_fine = reply.send(answer);
+        let_go(held);
+    }
+}
+
+/// Gives back what comes while the device cannot be opened: another one may do it meanwhile. Says
+/// whether nothing will come any more.
+fn turned_away(inbox: &mut mpsc::Receiver<Command>) -> bool {
+    loop {
+        match inbox.try_recv() {
+            Ok(Command::Solve(_, reply)) => {
+                let answer = Err(EngineError::Broken("it is being opened again".to_owned()));
+                let _nobody_waits_is_fine = reply.send(answer);
+            }
+            Ok(Command::Look) => {}
+            Err(TryRecvError::Empty) => return false,
+            Err(TryRecvError::Disconnected) => return true,
+        }
+    }
+}
+
+/// Drops a lane's share of the device, after the answer: the last handle on a dead card may take
+/// its time, or panic.
+fn let_go(held: Held) {
+    if let Err(panic) = catch_unwind(AssertUnwindSafe(move || drop(held))) {
+        let panic = message(panic.as_ref());
+        tracing::warn!(panic, "a device that was let go of panicked");
     }
 }
 

@@ -8,6 +8,7 @@ use tokio::time::timeout;
 
 use super::cards::Switches;
 use super::{Device, EngineError, Health, Lane, Work};
+use crate::flow::backend::BackendError;
 use crate::flow::{Point, Preset, Unwatched};
 use crate::metrics::Metrics;
 
@@ -150,6 +151,54 @@ async fn a_panic_in_one_lane_is_not_felt_in_another() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_trial_that_finds_no_room_beside_other_pairs_does_not_lose_the_device() {
+    for lack_of_room in [
+        BackendError::Busy,
+        BackendError::Memory {
+            what: "points",
+            needed: 2,
+            available: 1,
+        },
+    ] {
+        let stand = stand(1);
+        stand.ready().await;
+        let lane = stand.device.lanes().next().expect("a lane");
+        stand.switches.panics.store(1, Ordering::Relaxed);
+        stand.switches.fail_a_trial(lack_of_room);
+        let panicked = solved(&lane).await;
+        assert!(matches!(panicked, Err(EngineError::Panicked(_))));
+        solved(&lane).await.expect("it works again");
+        assert!(stand.switches.no_trial_fails(), "it was not tried");
+        assert_eq!(stand.switches.openings.load(Ordering::Relaxed), 1);
+        assert!(!stand.losses());
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_device_that_fails_its_trial_is_given_up_under_the_other_lanes_too() {
+    let stand = stand(2);
+    stand.ready().await;
+    stand.switches.brake.store(true, Ordering::Relaxed);
+    let lanes: Vec<_> = stand.device.lanes().collect();
+    // Nothing but the end of the card lets it go on.
+    let at_work = solved(&lanes[0]);
+    let slips = async {
+        stand.switches.until_at_the_brake(1).await;
+        stand.switches.panics.store(1, Ordering::Relaxed);
+        let error = BackendError::Device("it computes nonsense".to_owned());
+        stand.switches.fail_a_trial(error);
+        solved(&lanes[1]).await
+    };
+    let (at_work, slipped) = tokio::join!(at_work, slips);
+    assert!(matches!(slipped, Err(EngineError::Panicked(_))));
+    assert!(matches!(at_work, Err(EngineError::Lost(_))), "{at_work:?}");
+    stand.switches.brake.store(false, Ordering::Relaxed);
+    stand.ready().await;
+    assert_eq!(stand.switches.openings.load(Ordering::Relaxed), 2);
+    assert!(stand.losses());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_device_that_does_not_come_back_is_given_up_and_still_tried() {
     let stand = stand(2);
     stand.ready().await;
@@ -169,6 +218,24 @@ async fn a_device_that_does_not_come_back_is_given_up_and_still_tried() {
     };
     let (_either, ()) = tokio::join!(given_back_or_done, driver_comes_back);
     solved(&lane).await.expect("it works again");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_pair_that_comes_while_the_device_is_away_is_given_back() {
+    let stand = stand(1);
+    stand.ready().await;
+    stand.switches.refusals.store(u32::MAX, Ordering::Relaxed);
+    stand.switches.destroy();
+    stand.device.look();
+    stand
+        .until(|health| matches!(health, Health::Gone(_)))
+        .await;
+    let lane = stand.device.lanes().next().expect("a lane");
+    let given_back = solved(&lane).await;
+    assert!(
+        matches!(given_back, Err(EngineError::Broken(_))),
+        "{given_back:?}"
+    );
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

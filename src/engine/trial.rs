@@ -1,7 +1,12 @@
 //! A small real pair that a device must solve before it is trusted with anybody's.
 
-use crate::flow::backend::Backend;
-use crate::flow::{self, Preset, Problem, Unwatched};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+
+use super::lane::message;
+use super::{Opened, Opener};
+use crate::flow::backend::{Backend, BackendError};
+use crate::flow::{self, FlowError, Preset, Problem, Unwatched};
 
 /// A wall and a post in front of it, moved by this, metres.
 const MOTION: [f32; 3] = [0.2, 0.1, 0.0];
@@ -13,8 +18,47 @@ const TOLERANCE: f32 = 0.11;
 /// Iterations of the trial: enough to go through every kernel more than once.
 const ITERATIONS: usize = 12;
 
+/// Why a trial was not passed.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum TrialError {
+    #[error("it failed its trial: {0}")]
+    Failed(#[from] FlowError),
+    #[error("it failed its trial: its flow is off by {0} m")]
+    Off(f32),
+    #[error("{0}")]
+    Panicked(String),
+}
+
+impl TrialError {
+    /// Whether there was only no room for the trial beside other pairs, which says nothing about
+    /// the device.
+    pub(super) fn is_lack_of_room(&self) -> bool {
+        matches!(
+            self,
+            Self::Failed(FlowError::Backend(
+                BackendError::Busy | BackendError::Memory { .. }
+            ))
+        )
+    }
+}
+
+/// Opens a device and tries it; a panic is one more way to fail.
+pub(super) fn opened(open: &Opener) -> Result<Arc<dyn Opened>, String> {
+    let opening = catch_unwind(AssertUnwindSafe(|| {
+        let opened = open().map_err(|error| error.to_string())?;
+        run(opened.lane().as_ref()).map_err(|error| error.to_string())?;
+        Ok(Arc::from(opened))
+    }));
+    opening.unwrap_or_else(|panic| Err(message(panic.as_ref())))
+}
+
 /// Solves the pair and compares.
-pub(super) fn run(backend: &dyn Backend) -> Result<(), String> {
+pub(super) fn run(backend: &dyn Backend) -> Result<(), TrialError> {
+    catch_unwind(AssertUnwindSafe(|| compared(backend)))
+        .unwrap_or_else(|panic| Err(TrialError::Panicked(message(panic.as_ref()))))
+}
+
+fn compared(backend: &dyn Backend) -> Result<(), TrialError> {
     let mut source = Vec::new();
     for row in 0..40u8 {
         for column in 0..40u8 {
@@ -35,8 +79,7 @@ pub(super) fn run(backend: &dyn Backend) -> Result<(), String> {
     };
     let mut options = Preset::Default.options(None);
     options.max_iterations = ITERATIONS;
-    let estimate = flow::estimate(backend, &problem, &options, &Unwatched)
-        .map_err(|error| format!("it failed its trial: {error}"))?;
+    let estimate = flow::estimate(backend, &problem, &options, &Unwatched)?;
     let mut error = 0.0;
     for flow in &estimate.flow {
         let square: f32 = (0..3).map(|axis| (flow[axis] - MOTION[axis]).powi(2)).sum();
@@ -45,7 +88,7 @@ pub(super) fn run(backend: &dyn Backend) -> Result<(), String> {
     if error.is_finite() && error < TOLERANCE {
         Ok(())
     } else {
-        Err(format!("it failed its trial: its flow is off by {error} m"))
+        Err(TrialError::Off(error))
     }
 }
 
@@ -57,6 +100,6 @@ mod tests {
     #[test]
     fn the_cpu_passes_its_trial() {
         let backend = CpuBackend::new(Some(1)).expect("threads");
-        assert_eq!(run(&backend), Ok(()));
+        run(&backend).expect("it passes");
     }
 }

@@ -70,6 +70,11 @@ impl Backlog {
         self.sum(|_| true)
     }
 
+    /// What waits for this kind of device and no other.
+    pub fn queued_only_for(&self, device: DeviceKind) -> Load {
+        self.sum(|place| place.device == Some(device))
+    }
+
     /// What a tenant has waiting.
     pub fn queued_of(&self, tenant: &Tenant) -> Load {
         self.sum(|place| place.tenant == *tenant)

@@ -197,6 +197,22 @@ async fn a_worker_that_is_told_to_stop_finishes_what_it_has_and_takes_nothing_mo
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_worker_whose_lane_has_ended_gives_its_job_back_and_takes_nothing_more() {
+    let stand = stand().await;
+    stand.switches.tears.store(true, Ordering::Relaxed);
+    let job = stand.submit(2).await;
+    let running = tokio::spawn(stand.worker.clone().run());
+    timeout(PATIENCE, running)
+        .await
+        .expect("in time")
+        .expect("no panic");
+    let left = stand.queue.job(&job.tenant, job.id).await.expect("known");
+    assert_eq!(left.state, State::Queued);
+    assert!(left.attempt <= 1, "it was leased again");
+    assert!(stand.worker.lane.device().obstacle().is_some());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_lost_device_returns_the_job_to_the_queue_and_does_it_again() {
     let stand = stand().await;
     stand.switches.brake.store(true, Ordering::Relaxed);

@@ -48,6 +48,8 @@ pub(crate) async fn jobs_that_wait_for_one_kind_hold_up_no_other(stand: &mut imp
         backlog.ahead_of(&tenant, Priority::Low, 1.0, kind)
     };
     assert_eq!(ahead(Some(DeviceKind::Gpu)), 20.0);
+    let only_for = |kind| queue.backlog().queued_only_for(kind).jobs;
+    assert_eq!(DeviceKind::ALL.map(only_for), [0, 20]);
     assert_eq!((ahead(Some(DeviceKind::Cpu)), ahead(None)), (0.0, 0.0));
 }
 
