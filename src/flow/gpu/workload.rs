@@ -58,6 +58,8 @@ pub fn kernel_times(
     )?;
     let options = Options {
         precision,
+        // The same iteration again and again is no progress, and no reason to stop.
+        early_stop: None,
         ..Preset::Paper.options(None)
     };
     let (course, _) = Course::new(source, &options);
@@ -68,8 +70,6 @@ pub fn kernel_times(
         lane: Lane {
             tiles: cut.tiles as u32,
             chunks: cut.chunks as u32,
-            // The same iteration again and again is no progress.
-            patience: 0,
             ..trainer.lane()
         },
         status: Status::default(),

@@ -42,7 +42,9 @@ fn gradients_half(
 ) {
     let layer = group.y;
     let chunk = chunks[part.first_chunk + group.x];
-    if !iterates(statuses[chunk.lane], lanes[chunk.lane].steps, part.step) { return; }
+    // Not by a function of its own: only so is it plain that all invocations go the same way.
+    if statuses[chunk.lane].state != RUNNING { return; }
+    if part.step >= lanes[chunk.lane].steps { return; }
     let count = f32(steps[chunk.lane * STEPS + part.step].count);
     let weights = ((part.first_chunk + group.x) * LAID_OUT + MIDDLE + layer * MIDDLE_STRIDE) * 4u;
     let feature = local % WIDTH;
