@@ -252,11 +252,11 @@ fn pairs_of_both_precisions_at_once_have_the_bits_they_have_alone() {
 fn a_sweep_larger_than_the_memory_holds_at_once_has_the_gradient_of_all() {
     const TOLERANCE: f64 = 1e-3;
     let [cloud, target] = clouds(12_288);
-    let (Some(_), Some(gpu)) = (with_units(), transform(&cloud, &target)) else {
+    let twice: Vec<_> = cloud.iter().chain(&cloud).copied().collect();
+    let (Some(_), Some(gpu)) = (with_units(), transform(&twice, &target)) else {
         return;
     };
     let once = after_one(&gpu, &cloud, &half(plain()));
-    let twice: Vec<_> = cloud.iter().chain(&cloud).copied().collect();
     let twice = after_one(&gpu, &twice, &half(plain()));
     let [once, twice] = [once, twice].map(|state| ReferenceNetwork::read(&state.moments[0]).flat());
     let scale = once.iter().fold(0.0f64, |most, g| most.max(g.abs()));
