@@ -88,7 +88,7 @@ def run_fnsf(args: argparse.Namespace, preset: str, seed: int) -> Run:
 def run_peer(args: argparse.Namespace, transform: str, seed: int) -> Run:
     """The peer, in the interpreter that runs this script."""
     command = [sys.executable, str(PEER), str(args.pair), "--transform", transform]
-    command += ["--device", PEER_DEVICES[args.device]]
+    command += ["--device", PEER_DEVICES[args.device.split(":")[0]]]
     report = run_json(command + problem_options(args, seed))
     return Run(
         seconds=report["seconds"]["total"],
@@ -167,7 +167,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--max-points", type=int, help="sample both clouds (default: off)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--threads", type=int, default=os.cpu_count())
-    parser.add_argument("--device", choices=tuple(PEER_DEVICES), default="cpu")
+    parser.add_argument("--device", default="cpu", help="cpu, gpu or gpu:CARD (default: cpu)")
     parser.add_argument(
         "--transforms", choices=("edt", "fastgeodis"), nargs="+", default=["edt", "fastgeodis"]
     )
