@@ -249,7 +249,7 @@ async fn a_pair_that_does_not_fit_moves_where_there_is_another_kind_and_fails_wh
                 (error.code.as_str(), error.retryable),
                 ("input_refused", false)
             );
-            assert!(!refused.dead && error.message.contains("on the device"));
+            assert!(!refused.dead && error.message.contains("the device has"));
         }
     }
 }

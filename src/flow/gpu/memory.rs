@@ -90,7 +90,7 @@ impl Budget {
         match kind {
             AdapterKind::Discrete | AdapterKind::Virtual => (2 << 30) + lanes as u64 * (256 << 20),
             AdapterKind::Integrated | AdapterKind::Other => 1 << 30,
-            AdapterKind::Software => 384 << 20,
+            AdapterKind::Software => (320 << 20) + lanes as u64 * (4 << 20),
         }
     }
 
