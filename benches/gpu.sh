@@ -31,7 +31,7 @@ build() {
   cargo bench --locked --bench gpu --no-run --message-format json | place bench gpu bench-gpu
   cargo test --locked --lib --no-run --message-format json | place lib fnsf test-lib
   cargo test --locked --test numerics --no-run --message-format json | place test numerics test-numerics
-  strip --strip-debug "$to"/fnsf "$to"/bench-gpu "$to"/test-lib "$to"/test-numerics
+  strip "$to"/fnsf "$to"/bench-gpu "$to"/test-lib "$to"/test-numerics
   echo "built into $to: $(du -sh "$to" | cut -f1)"
 }
 
