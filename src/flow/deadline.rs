@@ -29,8 +29,10 @@ const GIVEN_UP_SHARE: f64 = 0.6;
 const ALIGNED: usize = 8192;
 /// Points on which the network's speed is measured: about a millisecond, whole tiles.
 const MEASURED: usize = 1536;
-/// Less than this is what it takes to ask a device anything, seconds: then all points are measured.
+/// Less than this is what it takes to ask a device anything, seconds: then more points are measured.
 const LATENCY: f64 = 4e-4;
+/// As many.
+const MEASURED_WHERE_FAST: usize = 16 * MEASURED;
 /// What an iteration costs a point, in evaluations: forward, twice that backward, and the query.
 const ITERATION: f64 = 3.4;
 /// Where the step size falls, a run that is predicted to take this many times too long is begun
@@ -180,17 +182,18 @@ impl Pace {
         points: &[Point],
         watch: &dyn Watch,
     ) -> Result<Self, FlowError> {
-        let mut measured = &points[..points.len().min(MEASURED)];
-        trainer.evaluate(measured)?;
-        let mut seconds = || -> Result<f64, FlowError> {
+        let first = |count: usize| &points[..points.len().min(count)];
+        let mut seconds = |points: &[Point]| -> Result<f64, FlowError> {
             let began = watch.seconds();
-            trainer.evaluate(measured)?;
+            trainer.evaluate(points)?;
             Ok(watch.seconds() - began)
         };
-        let mut took = seconds()?;
+        let mut measured = first(MEASURED);
+        seconds(measured)?;
+        let mut took = seconds(measured)?;
         if took < LATENCY {
-            measured = points;
-            took = seconds()?;
+            measured = first(MEASURED_WHERE_FAST);
+            took = seconds(measured)?;
         }
         let point = took / measured.len() as f64;
         Ok(Self {
