@@ -1,11 +1,14 @@
 //! The oracle: the paper's formulas in plain double-precision loops. Slow, obvious, test-only.
 //!
 //! Every kernel is tested against it. It shares no code with what it checks but the layout of
-//! [`Parameters`].
+//! [`Parameters`], their start, and the distance transform, which has its own tests.
 
+use super::distance::DistanceTransform;
 use super::field::mlp::{
     MIDDLE_LAYERS, PANEL, Parameters, WIDTH, first_layer, last_layer, middle_layer, panel_index,
 };
+use super::points::Point;
+use super::random::Random;
 
 /// The network as dense matrices: `weights[layer][output][input]`, `biases[layer][output]`.
 pub(crate) struct ReferenceNetwork {
@@ -119,6 +122,36 @@ impl ReferenceNetwork {
             .copied()
             .collect()
     }
+}
+
+/// The mean distances that the published method sees in its first iterations over `source`, metres,
+/// from where `seed` starts it, with Adam at a constant `rate`.
+pub(crate) fn first_losses(
+    source: &[Point],
+    distance: &DistanceTransform,
+    seed: u64,
+    rate: f64,
+    iterations: i32,
+) -> Vec<f64> {
+    let mut network = ReferenceNetwork::read(&Parameters::xavier(&mut Random::stream(seed, 0)));
+    let zeros = vec![0.0; network.flat().len()];
+    let mut moments = [zeros.clone(), zeros];
+    let mut losses = Vec::new();
+    for iteration in 1..=iterations {
+        let mut gradients = ReferenceNetwork::read(&Parameters::zeros());
+        let mut loss = 0.0;
+        for point in source {
+            let input = point.map(f64::from);
+            let flow = network.forward(input);
+            let sample = distance.sample(core::array::from_fn(|a| (input[a] + flow[a]) as f32));
+            loss += f64::from(sample.distance) / source.len() as f64;
+            let pull = sample.gradient.map(|g| f64::from(g) / source.len() as f64);
+            network.backward(input, pull, &mut gradients);
+        }
+        network.adam_step(&gradients, &mut moments, iteration, rate);
+        losses.push(loss);
+    }
+    losses
 }
 
 fn matrix(rows: usize, columns: usize, entry: impl Fn(usize, usize) -> f64) -> Vec<Vec<f64>> {

@@ -6,7 +6,7 @@ use crate::flow::cpu::{CpuBackend, Isa};
 use crate::flow::distance::{DistanceOptions, DistanceTransform};
 use crate::flow::options::Preset;
 use crate::flow::random::Random;
-use crate::flow::reference::ReferenceNetwork;
+use crate::flow::reference::first_losses;
 use crate::flow::watch::Unwatched;
 use std::sync::Mutex;
 
@@ -75,29 +75,9 @@ fn the_first_losses_are_those_of_the_method_in_double_precision() {
     const STEPS: i32 = 10;
     let [source, target] = clouds(200);
     let options = Preset::Paper.options(None);
-    let mut network =
-        ReferenceNetwork::read(&Parameters::xavier(&mut Random::stream(options.seed, 0)));
     let distance = DistanceTransform::build(&source, &target, &DistanceOptions::default())
         .expect("small clouds");
-    let mut moments = [
-        vec![0.0; network.flat().len()],
-        vec![0.0; network.flat().len()],
-    ];
-    let mut expected = Vec::new();
-    for iteration in 1..=STEPS {
-        let mut gradients = ReferenceNetwork::read(&Parameters::zeros());
-        let mut loss = 0.0;
-        for point in &source {
-            let input = point.map(f64::from);
-            let flow = network.forward(input);
-            let sample = distance.sample(core::array::from_fn(|a| (input[a] + flow[a]) as f32));
-            loss += f64::from(sample.distance) / source.len() as f64;
-            let pull = sample.gradient.map(|g| f64::from(g) / source.len() as f64);
-            network.backward(input, pull, &mut gradients);
-        }
-        network.adam_step(&gradients, &mut moments, iteration, 0.008);
-        expected.push(loss);
-    }
+    let expected = first_losses(&source, &distance, options.seed, 0.008, STEPS);
     for isa in Isa::available() {
         let losses = Losses::default();
         let transform = transform(isa, 2, &source, &target, &options);

@@ -8,7 +8,7 @@ use crate::flow::gpu::transform::{GpuTransform, build};
 use crate::flow::options::{Keep, Options, Preset};
 use crate::flow::points::Point;
 use crate::flow::random::Random;
-use crate::flow::reference::ReferenceNetwork;
+use crate::flow::reference::{ReferenceNetwork, first_losses};
 use crate::flow::simulate::{Street, StreetOptions};
 use crate::flow::snapshot::TrainerState;
 use crate::flow::watch::Unwatched;
@@ -229,24 +229,7 @@ fn the_first_losses_are_those_of_the_method_in_double_precision() {
     };
     let distance = DistanceTransform::build(&source, &target, &options.distance);
     let distance = distance.expect("small clouds fit");
-    let mut reference = network(&options);
-    let zeros = vec![0.0; reference.flat().len()];
-    let mut moments = [zeros.clone(), zeros];
-    let mut expected = Vec::new();
-    for iteration in 1..=STEPS {
-        let mut gradients = ReferenceNetwork::read(&Parameters::zeros());
-        let mut loss = 0.0;
-        for point in &source {
-            let input = point.map(f64::from);
-            let flow = reference.forward(input);
-            let sample = distance.sample(core::array::from_fn(|a| (input[a] + flow[a]) as f32));
-            loss += f64::from(sample.distance) / source.len() as f64;
-            let pull = sample.gradient.map(|g| f64::from(g) / source.len() as f64);
-            reference.backward(input, pull, &mut gradients);
-        }
-        reference.adam_step(&gradients, &mut moments, iteration, RATE.into());
-        expected.push(loss);
-    }
+    let expected = first_losses(&source, &distance, options.seed, RATE.into(), STEPS);
     let transform = gpu
         .transform(&source, &target, &options.distance, &Unwatched)
         .expect("small clouds fit");
