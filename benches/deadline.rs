@@ -63,6 +63,7 @@ fn run(
         source: &pair.source,
         target: &pair.target,
         ground: Some([&ground.source, &ground.target]),
+        before: None,
     };
     let clock = Clock(Instant::now(), deadline);
     let estimate = estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())?;

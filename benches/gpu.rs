@@ -91,6 +91,7 @@ fn solve(
         source: &pair.source,
         target: &pair.target,
         ground: None,
+        before: None,
     };
     let clock = Clock(Instant::now());
     estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())

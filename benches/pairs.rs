@@ -38,6 +38,7 @@ fn main() -> Result<(), String> {
                     source: &scene.source,
                     target: &scene.target,
                     ground: None,
+                    before: None,
                 };
                 let mut runs = Vec::new();
                 for seed in 0..SEEDS {

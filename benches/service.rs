@@ -153,6 +153,7 @@ async fn run(path: &PathBuf) {
             source: &small[0],
             target: &small[1],
             ground: None,
+            before: None,
         };
         let flow = estimate(&backend, &problem, &options, &Unwatched).unwrap();
         library.push(began.elapsed().as_secs_f64());

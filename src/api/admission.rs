@@ -123,6 +123,7 @@ impl Admission {
             source: &source.points,
             target: &target.points,
             ground: ground.map(<[_; 2]>::from),
+            before: None,
         };
         let points = source.points.len().max(target.points.len());
         let price = flow::price(&problem, &options.solver_options(points)).map_err(|error| {

@@ -124,6 +124,7 @@ impl Estimation {
             source: &pair.source,
             target: &pair.target,
             ground: ground.map(|ground| [ground.source.as_slice(), ground.target.as_slice()]),
+            before: None,
         };
         let points = pair.source.len().max(pair.target.len());
         let solver_options = options.solver_options(points);

@@ -9,7 +9,7 @@ use super::{DeviceOptions, Opened, Opener, Reopening};
 use crate::flow::backend::{Advance, Backend, BackendError, Report, Trainer, Transform};
 use crate::flow::cpu::CpuBackend;
 use crate::flow::distance::DistanceOptions;
-use crate::flow::{Options, Point, RigidTransform, TrainerState, Watch};
+use crate::flow::{Network, Options, Point, RigidTransform, TrainerState, Watch};
 use crate::job::DeviceKind;
 
 /// Points of the trial's pair: what a test asks for does not happen to it.
@@ -168,6 +168,10 @@ impl Backend for CardLane {
             switches: (!on_trial).then(|| Arc::clone(&self.switches)),
             lost: Arc::clone(&self.lost),
         }))
+    }
+
+    fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {
+        self.cpu.evaluate(network, points)
     }
 
     fn align(

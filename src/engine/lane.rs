@@ -174,6 +174,7 @@ fn solve(backend: &dyn Backend, work: Work, busy: &Busy) -> Result<Estimate, Flo
         source: &work.source,
         target: &work.target,
         ground: ground.map(|[source, target]| [source.as_slice(), target.as_slice()]),
+        before: None,
     };
     if let Some(snapshot) = work.snapshot {
         match flow::resume(backend, &problem, &work.options, snapshot, &watch) {

@@ -76,6 +76,7 @@ fn compared(backend: &dyn Backend) -> Result<(), TrialError> {
         source: &source,
         target: &target,
         ground: None,
+        before: None,
     };
     let mut options = Preset::Default.options(None);
     options.max_iterations = ITERATIONS;

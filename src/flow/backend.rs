@@ -1,6 +1,7 @@
 //! The seam to a device: what the solver asks of whatever computes.
 
 use super::distance::{DistanceError, DistanceOptions};
+use super::field::Network;
 use super::options::Options;
 use super::points::{Point, RigidTransform};
 use super::snapshot::TrainerState;
@@ -34,6 +35,12 @@ pub trait Backend: Send + Sync {
         prior: &RigidTransform,
         watch: &dyn Watch,
     ) -> RigidTransform;
+
+    /// What `network` says at `points`: a displacement each, metres.
+    ///
+    /// # Errors
+    /// [`BackendError`] where the device fails.
+    fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError>;
 }
 
 /// A target's distance transform on a device.

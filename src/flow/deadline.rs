@@ -8,7 +8,7 @@
 use super::backend::{Backend, BackendError, Trainer, Transform};
 use super::error::FlowError;
 use super::options::{Decay, Ego, Hurry, Options};
-use super::points::{Point, RigidTransform};
+use super::points::{Point, RigidTransform, evenly};
 use super::preprocess::Selection;
 use super::snapshot::Snapshot;
 use super::watch::{Interrupt, Progress, Watch};
@@ -90,12 +90,13 @@ pub(crate) struct Prepared {
     pub(crate) whole: bool,
 }
 
-/// The finest transform that the time left holds, and the ego motion on it; none where the
-/// deadline leaves no time for any.
+/// The finest transform that the time left holds, and the ego motion, sought about `prior`; none
+/// where the deadline leaves no time for any.
 pub(crate) fn prepare(
     backend: &dyn Backend,
     selection: &Selection,
     options: &Options,
+    prior: &RigidTransform,
     watch: &dyn Watch,
 ) -> Result<Option<Prepared>, FlowError> {
     let on_time = Early {
@@ -114,14 +115,13 @@ pub(crate) fn prepare(
         }
     };
     let aligned = |transform: Box<dyn Transform>, whole: bool| {
-        let standing = RigidTransform::identity();
         let align =
-            |[source, target]: [&[Point]; 2]| backend.align(source, target, &standing, &on_time);
+            |[source, target]: [&[Point]; 2]| backend.align(source, target, prior, &on_time);
         let ego = match (options.ego, &selection.surroundings) {
             (Ego::Given(target_from_source), _) => Some(target_from_source),
             (Ego::Auto, Some([source, target])) if whole => Some(align([source, target])),
             (Ego::Auto, Some(clouds)) => {
-                let [source, target] = clouds.each_ref().map(|points| thinned(points));
+                let [source, target] = clouds.each_ref().map(|points| evenly(points, ALIGNED));
                 Some(align([&source, &target]))
             }
             (Ego::Off, _) | (Ego::Auto, None) => None,
@@ -158,12 +158,6 @@ pub(crate) fn prepare(
         }
     }
     Ok(Some(aligned(coarse, false)))
-}
-
-/// At most [`ALIGNED`] of the points, evenly.
-fn thinned(points: &[Point]) -> Vec<Point> {
-    let stride = points.len().div_ceil(ALIGNED).max(1);
-    points.iter().step_by(stride).copied().collect()
 }
 
 /// How fast the network is, and what of the time is spoken for.

@@ -21,22 +21,34 @@ impl LossOptions {
     /// The loss of `point` where it sees `sample` after the field moved it by `flow`.
     #[inline]
     pub(crate) fn at(&self, point: Point, sample: Sample, flow: Point) -> PointLoss {
-        let truncation = self.truncation_m.unwrap_or(f32::INFINITY);
-        let margin = self.margin_m.max(self.margin_slope * length(point));
+        let [margin, truncation] = self.bounds(point);
         let pulled = sample.distance > margin && sample.distance < truncation;
         let pull = if pulled { 1.0 } else { 0.0 };
-        let distance = sample.distance.max(margin).min(truncation);
+        let shrink = self.flow_penalty / length(flow).max(SMALL_FLOW_M);
+        PointLoss {
+            value: self.value(point, sample.distance, flow),
+            gradient: core::array::from_fn(|a| pull * sample.gradient[a] + shrink * flow[a]),
+        }
+    }
+
+    /// The loss of `point`, where the field moved it by `flow` to a place at `distance`.
+    #[inline]
+    pub(crate) fn value(&self, point: Point, distance: f32, flow: Point) -> f32 {
+        let [margin, truncation] = self.bounds(point);
         let length = length(flow);
         let penalized = if length > SMALL_FLOW_M {
             length - SMALL_FLOW_M / 2.0
         } else {
             length * length / (2.0 * SMALL_FLOW_M)
         };
-        let shrink = self.flow_penalty / length.max(SMALL_FLOW_M);
-        PointLoss {
-            value: distance + self.flow_penalty * penalized,
-            gradient: core::array::from_fn(|a| pull * sample.gradient[a] + shrink * flow[a]),
-        }
+        distance.max(margin).min(truncation) + self.flow_penalty * penalized
+    }
+
+    /// Between which distances `point` is pulled, metres.
+    #[inline]
+    fn bounds(&self, point: Point) -> [f32; 2] {
+        let margin = self.margin_m.max(self.margin_slope * length(point));
+        [margin, self.truncation_m.unwrap_or(f32::INFINITY)]
     }
 }
 

@@ -15,7 +15,7 @@
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let street = StreetOptions { beams: 16, azimuth_steps: 400, ..StreetOptions::default() };
 //! let pair = Street::new(&street)?.pair(0)?;
-//! let problem = Problem { source: &pair.source, target: &pair.target, ground: None };
+//! let problem = Problem { source: &pair.source, target: &pair.target, ground: None, before: None };
 //! let options = Preset::Default.options(None);
 //! let estimate = estimate(&CpuBackend::new(None)?, &problem, &options, &Unwatched)?;
 //! assert_eq!(estimate.flow.len(), pair.source.len());
@@ -30,6 +30,7 @@ mod options;
 mod points;
 mod preprocess;
 mod price;
+mod sealed;
 mod snapshot;
 mod solver;
 mod watch;
@@ -61,10 +62,12 @@ pub mod simulate;
 mod reference;
 
 pub use error::FlowError;
+pub use field::{Field, Network};
 pub use options::*;
 pub use points::{MIN_POINTS, Point, RigidTransform};
 pub use preprocess::Problem;
 pub use price::{Price, price};
+pub use sealed::SealError;
 pub use snapshot::{Snapshot, SnapshotError, TrainerState};
 pub use solver::{DYNAMIC_M, Estimate, PhaseSeconds, StopReason, estimate, resume};
 pub use watch::{Interrupt, Progress, Unwatched, Watch};

@@ -69,6 +69,9 @@ pub struct Options {
     pub max_iterations: usize,
     /// What the network's products are rounded to.
     pub precision: Precision,
+    /// How a field that starts as the one of the pair before is fitted; where none, every pair of a
+    /// sequence starts afresh.
+    pub warm_start: Option<WarmStart>,
 }
 
 impl Options {
@@ -105,6 +108,7 @@ impl Options {
             }),
             max_iterations: 5000,
             precision: Precision::F32,
+            warm_start: None,
         }
     }
 
@@ -114,6 +118,15 @@ impl Options {
         match self.early_stop {
             None => self.max_iterations,
             Some(_) => self.max_iterations.min(60),
+        }
+    }
+
+    /// These options for a fit that starts from the field of the pair before.
+    pub(crate) fn warmed(&self, warm_start: WarmStart) -> Self {
+        Self {
+            max_iterations: warm_start.max_iterations.min(self.max_iterations),
+            learning_rate: warm_start.learning_rate,
+            ..self.clone()
         }
     }
 
@@ -149,9 +162,22 @@ impl Options {
             keep: Keep::Average { decay: 0.9 },
             early_stop: None,
             max_iterations: 150,
+            warm_start: Some(WarmStart {
+                max_iterations: 75,
+                learning_rate: 0.004,
+            }),
             ..Self::published(max_points)
         }
     }
+}
+
+/// A fit that starts from the field of the pair before.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct WarmStart {
+    /// Iterations at most.
+    pub max_iterations: usize,
+    /// Adam's step size at the first iteration.
+    pub learning_rate: f32,
 }
 
 /// How a run that its deadline cuts short is fitted.

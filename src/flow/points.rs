@@ -6,5 +6,31 @@ pub type Point = [f32; 3];
 /// A rigid motion, column vectors, metres. Named `target_from_source` where it is stored.
 pub type RigidTransform = nalgebra::Isometry3<f64>;
 
+/// `point`, moved rigidly: computed in double precision.
+pub(crate) fn moved(motion: &RigidTransform, point: Point) -> Point {
+    let moved = motion * nalgebra::Point3::from(point.map(f64::from));
+    [moved.x as f32, moved.y as f32, moved.z as f32]
+}
+
+/// At most `most` of the points, evenly.
+pub(crate) fn evenly(points: &[Point], most: usize) -> Vec<Point> {
+    let kept = points.len().min(most);
+    (0..kept).map(|i| points[i * points.len() / kept]).collect()
+}
+
 /// Fewer points than this in a cloud determine no motion.
 pub const MIN_POINTS: usize = 3;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn some_of_the_points_are_spread_over_all_of_them() {
+        let points: Vec<Point> = (0..10).map(|i| [i as f32, 0.0, 0.0]).collect();
+        let kept: Vec<f32> = evenly(&points, 4).iter().map(|point| point[0]).collect();
+        assert_eq!(kept, [0.0, 2.0, 5.0, 7.0]);
+        assert_eq!(evenly(&points, 20), points);
+        assert_eq!(evenly(&[], 5), [[0.0; 3]; 0]);
+    }
+}

@@ -3,6 +3,7 @@
 //! Points that are left out keep their row in the result. Knows nothing of what comes after.
 
 use super::error::FlowError;
+use super::field::Field;
 use super::ground::{self, GroundOptions};
 use super::options::{Ego, Ground, Options};
 use super::points::{MIN_POINTS, Point};
@@ -17,6 +18,9 @@ pub struct Problem<'a> {
     pub target: &'a [Point],
     /// N and M flags: which points are ground. Needed by [`Ground::Mask`].
     pub ground: Option<[&'a [bool]; 2]>,
+    /// The motion of the pair before, from the sweep before the source to the source: where a fit
+    /// may start, and the vehicle's motion be sought. None for a pair on its own.
+    pub before: Option<&'a Field>,
 }
 
 /// The points that take part.
@@ -142,6 +146,7 @@ mod tests {
             source,
             target: source,
             ground: ground.map(|flags| [flags, flags]),
+            before: None,
         };
         select(&problem, options).expect("enough points").rows
     }
@@ -174,6 +179,7 @@ mod tests {
             source: &source,
             target: &source,
             ground: Some([&ground, &ground]),
+            before: None,
         };
         let mut options = Preset::Default.options(Some(10));
         options.ground = Ground::Mask;
@@ -215,6 +221,7 @@ mod tests {
             source: &source,
             target: &target,
             ground: None,
+            before: None,
         };
         let selection = select(&problem, &Preset::Default.options(Some(300))).expect("points");
         assert_eq!(selection.source.len(), 50);
@@ -229,6 +236,7 @@ mod tests {
             source: &[[0.0; 3]],
             target: &[[0.0; 3]],
             ground: None,
+            before: None,
         };
         let mut options = Preset::Default.options(None);
         let error = select(&problem, &options).expect_err("one point");

@@ -6,9 +6,11 @@
 use super::backend::{Advance, Backend, Report};
 use super::deadline::{self, Loop, Pace, Prepared};
 use super::error::FlowError;
+use super::field::mlp::Conditioning;
+use super::field::{Field, Network};
 use super::loss::length;
 use super::options::{Ego, Options};
-use super::points::{Point, RigidTransform};
+use super::points::{Point, RigidTransform, evenly, moved};
 use super::preprocess::{self, Problem, Selection};
 use super::snapshot::{Snapshot, TrainerState};
 use super::watch::{Interrupt, Watch};
@@ -16,11 +18,14 @@ use super::watch::{Interrupt, Watch};
 /// Iterations that a backend may do without coming back.
 const STEPS_AT_ONCE: usize = 64;
 
+/// Points on which a field of the pair before is judged.
+const JUDGED: usize = 4096;
+
 /// Residual motion of a frame from which a point counts as moving, metres (Argoverse 2).
 pub const DYNAMIC_M: f32 = 0.05;
 
 /// The motion of every point.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug)]
 pub struct Estimate {
     /// N displacements, metres over the gap between the sweeps, ego motion included; zero where
     /// `valid` is false.
@@ -46,6 +51,8 @@ pub struct Estimate {
     pub seconds: PhaseSeconds,
     /// Bytes of the distance transform.
     pub distance_bytes: usize,
+    /// The motion everywhere, not at the source's points alone.
+    pub field: Field,
 }
 
 /// Why an optimization ended.
@@ -121,9 +128,11 @@ fn solve(
     let began = watch.seconds();
     let selection = preprocess::select(problem, options)?;
     let state = snapshot
-        .map(|snapshot| snapshot.state_for(&selection, options))
+        .map(|snapshot| snapshot.state_for(&selection, options, problem.before))
         .transpose()?;
-    let prepared = deadline::prepare(backend, &selection, options, watch)?;
+    let prior = problem.before.and_then(|field| field.ego);
+    let prior = prior.unwrap_or_default();
+    let prepared = deadline::prepare(backend, &selection, options, &prior, watch)?;
     let ego = match (&prepared, options.ego) {
         (Some(prepared), _) => prepared.ego,
         (None, Ego::Given(target_from_source)) => Some(target_from_source),
@@ -143,6 +152,8 @@ fn solve(
     let fitted = match &prepared {
         None => Fitted::nothing(aligned.len(), watch),
         Some(prepared) => Fit {
+            backend,
+            before: problem.before,
             selection: &selection,
             aligned: &aligned,
             asked: options,
@@ -192,11 +203,17 @@ fn solve(
             total,
         },
         distance_bytes: prepared.map_or(0, |prepared| prepared.transform.bytes()),
+        field: Field {
+            ego,
+            network: fitted.network,
+        },
     })
 }
 
 /// One fit of a field to what is prepared.
 struct Fit<'a> {
+    backend: &'a dyn Backend,
+    before: Option<&'a Field>,
     selection: &'a Selection,
     /// The source, the ego motion taken out.
     aligned: &'a [Point],
@@ -208,6 +225,7 @@ struct Fit<'a> {
 /// A fitted field at the source's points.
 struct Fitted {
     residual: Vec<Point>,
+    network: Option<Network>,
     report: Report,
     stop_reason: StopReason,
     /// When the first iteration could begin.
@@ -219,6 +237,7 @@ impl Fitted {
     fn nothing(points: usize, watch: &dyn Watch) -> Self {
         Self {
             residual: vec![[0.0; 3]; points],
+            network: None,
             report: Report {
                 iterations: 0,
                 best_iteration: 0,
@@ -236,6 +255,7 @@ impl Fit<'_> {
     fn run(&self, state: Option<TrainerState>) -> Result<Fitted, FlowError> {
         let (prepared, watch) = (self.prepared, self.watch);
         let mut options = self.with_margin()?;
+        let warm = self.warm_start(&mut options)?;
         let mut trainer = prepared.transform.start(self.aligned, &options)?;
         let mut cut = !prepared.whole;
         let pace = match watch.seconds_left() {
@@ -256,6 +276,11 @@ impl Fit<'_> {
             // A device may have room for one only.
             drop(trainer);
             trainer = prepared.transform.start(self.aligned, &options)?;
+            if let Some(warm) = warm {
+                trainer.restore(warm)?;
+            }
+        } else if let Some(warm) = warm {
+            trainer.restore(warm)?;
         }
         let precomputed = watch.seconds();
         let clock = Loop::begin(watch, pace, trainer.report().iterations);
@@ -269,7 +294,13 @@ impl Fit<'_> {
             let (steps, early) = clock.next(done, STEPS_AT_ONCE);
             match trainer.advance(steps, &early)? {
                 Advance::Continues if !cut && watch.snapshot_due() => {
-                    watch.snapshot(Snapshot::new(self.selection, self.asked, trainer.state()?));
+                    let state = trainer.state()?;
+                    watch.snapshot(Snapshot::new(
+                        self.selection,
+                        self.asked,
+                        self.before,
+                        state,
+                    ));
                 }
                 Advance::Continues => {}
                 Advance::Converged | Advance::Exhausted if cut => break StopReason::Deadline,
@@ -284,12 +315,64 @@ impl Fit<'_> {
                 }
             }
         };
+        let residual = deadline::evaluate(trainer.as_mut(), self.aligned, watch)?;
+        let parameters = trainer.state()?.kept;
         Ok(Fitted {
-            residual: deadline::evaluate(trainer.as_mut(), self.aligned, watch)?,
+            residual,
+            network: Some(Network::new(parameters, self.aligned, options.inputs)),
             report: trainer.report(),
             stop_reason,
             precomputed,
         })
+    }
+
+    /// The state of a fit that starts from the field of the pair before, and its options; none
+    /// where there is no such field, or it explains this pair no better than that nothing moves.
+    fn warm_start(&self, options: &mut Options) -> Result<Option<TrainerState>, FlowError> {
+        let (Some(warm_start), Some(before)) = (options.warm_start, self.before) else {
+            return Ok(None);
+        };
+        let same_kind = before.ego.is_some() == self.prepared.ego.is_some();
+        let Some(network) = before.network.as_ref().filter(|_| same_kind) else {
+            return Ok(None);
+        };
+        let conditioning = Conditioning::new(self.aligned, options.inputs);
+        let motion = self.prepared.ego.unwrap_or_default();
+        let carried = Network {
+            parameters: network.carried(&motion, &conditioning),
+            conditioning,
+        };
+        let points = evenly(self.aligned, JUDGED);
+        let flows = self.backend.evaluate(&carried, &points)?;
+        let [carried_loss, still_loss] = [
+            self.mean_loss(options, &points, &flows)?,
+            self.mean_loss(options, &points, &vec![[0.0; 3]; points.len()])?,
+        ];
+        // Not the other way round: a loss that is no number starts afresh.
+        if carried_loss < still_loss {
+            *options = options.warmed(warm_start);
+            return Ok(Some(TrainerState::at_start(carried.parameters)));
+        }
+        Ok(None)
+    }
+
+    /// The mean loss of `points` moved by `flows`.
+    fn mean_loss(
+        &self,
+        options: &Options,
+        points: &[Point],
+        flows: &[Point],
+    ) -> Result<f64, FlowError> {
+        let pairs = || points.iter().zip(flows);
+        let moved = pairs().map(|(point, flow)| core::array::from_fn(|a| point[a] + flow[a]));
+        let distances = self
+            .prepared
+            .transform
+            .distances(&moved.collect::<Vec<_>>())?;
+        let losses = pairs().zip(distances).map(|((&point, &flow), distance)| {
+            f64::from(options.loss.value(point, distance, flow))
+        });
+        Ok(losses.sum::<f64>() / points.len() as f64)
     }
 
     /// The options, with the margin that the pair asks for.
@@ -316,12 +399,6 @@ fn quantile(mut values: Vec<f32>, share: f32) -> f32 {
     }
     let place = (share.clamp(0.0, 1.0) * (values.len() - 1) as f32) as usize;
     *values.select_nth_unstable_by(place, f32::total_cmp).1
-}
-
-/// `point`, moved rigidly.
-fn moved(motion: &RigidTransform, point: Point) -> Point {
-    let moved = motion * nalgebra::Point3::from(point.map(f64::from));
-    [moved.x as f32, moved.y as f32, moved.z as f32]
 }
 
 #[cfg(test)]
@@ -366,6 +443,7 @@ mod tests {
             source: &pair.source,
             target: &pair.target,
             ground: Some([&pair.ground_source, &pair.ground_target]),
+            before: None,
         };
         estimate(&backend, &problem, options, watch)
     }

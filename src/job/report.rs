@@ -117,6 +117,10 @@ mod tests {
             stop_reason: StopReason::Deadline,
             seconds: crate::flow::PhaseSeconds::default(),
             distance_bytes: 0,
+            field: crate::flow::Field {
+                ego: None,
+                network: None,
+            },
         };
         let report = Report::new(&estimate, &JobOptions::default(), 150, "cpu".to_owned());
         let json = serde_json::to_string(&report).expect("JSON");

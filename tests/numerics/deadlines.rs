@@ -52,6 +52,7 @@ fn run(pair: &Pair, preset: Preset, deadline: Option<f64>) -> Estimate {
         source: &pair.source,
         target: &pair.target,
         ground: None,
+        before: None,
     };
     let clock = Clock::with(deadline);
     estimate(&backend, &problem, &preset.options(None), &clock).expect("a flow")
@@ -110,6 +111,7 @@ fn a_cancellation_under_a_deadline_ends_the_precompute() {
         source: &pair.source,
         target: &pair.target,
         ground: None,
+        before: None,
     };
     let options = Preset::Default.options(None);
     let error = estimate(&backend, &problem, &options, &Cancelled).expect_err("cancelled");
@@ -138,6 +140,7 @@ fn the_watch_is_looked_at_all_along_before_the_first_iteration() {
         source: &pair.source,
         target: &pair.target,
         ground: None,
+        before: None,
     };
     estimate(&backend, &problem, &options, &looks).expect("a flow");
     assert!(looks.0.into_inner() > LOOKS);

@@ -24,6 +24,7 @@ fn found(pair: &Pair, ground: Ground, max_points: Option<usize>) -> RigidTransfo
         source: &pair.source,
         target: &pair.target,
         ground: Some([&masks.source, &masks.target]),
+        before: None,
     };
     let mut options = Preset::Default.options(max_points);
     options.ground = ground;

@@ -21,6 +21,7 @@ fn bytes_and_bricks_are_never_below_the_truth_and_not_far_above() {
             source: &pair.source,
             target: &pair.target,
             ground: Some([&ground.source, &ground.target]),
+            before: None,
         };
         for sites in [Sites::Cells, Sites::Points] {
             for max_points in [None, Some(5000)] {
@@ -50,6 +51,7 @@ fn work_grows_with_iterations_points_and_detail() {
         source: &pair.source,
         target: &pair.target,
         ground: None,
+        before: None,
     };
     let work = |options: &Options| price(&problem, options).expect("taken").multiply_adds;
     let base = Preset::Default.options(None);
@@ -94,6 +96,7 @@ fn what_the_estimate_refuses_has_no_price() {
             source,
             target: &cloud,
             ground,
+            before: None,
         };
         let refused = price(&problem, options).expect_err("refused");
         let truth = estimate(&backend, &problem, options, &Unwatched).expect_err("refused");
@@ -104,6 +107,7 @@ fn what_the_estimate_refuses_has_no_price() {
         source: &cloud,
         target: &cloud,
         ground: None,
+        before: None,
     };
     assert!(matches!(
         price(&problem, &tight),

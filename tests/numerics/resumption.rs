@@ -7,8 +7,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::simulate::StreetOptions;
 use fnsf::flow::{
-    Estimate, FlowError, Interrupt, Options, Preset, Problem, Progress, Snapshot, SnapshotError,
-    StopReason, Watch, estimate, resume,
+    Estimate, FlowError, Interrupt, Options, Preset, Problem, Progress, SealError, Snapshot,
+    SnapshotError, StopReason, Watch, estimate, resume,
 };
 use fnsf::formats::Pair;
 
@@ -75,6 +75,7 @@ fn run(
         source: &pair.source,
         target: &pair.target,
         ground: None,
+        before: None,
     };
     match snapshot {
         None => estimate(&backend, &problem, options, watch),
@@ -159,7 +160,7 @@ fn torn_and_altered_snapshots_are_refused() {
     let longer = [bytes.as_slice(), &[0]].concat();
     assert!(matches!(
         Snapshot::from_bytes(&longer),
-        Err(SnapshotError::Length { .. })
+        Err(SnapshotError::Sealed(SealError::Length { .. }))
     ));
     let places = (0..EDGE)
         .chain((EDGE..bytes.len()).step_by(STRIDE))

@@ -59,6 +59,7 @@ pub(crate) fn solve_on(backend: &dyn Backend, pair: &Pair, options: &Options) ->
         source: &pair.source,
         target: &pair.target,
         ground: Some([&ground.source, &ground.target]),
+        before: None,
     };
     let options = Options {
         ground: Ground::Mask,

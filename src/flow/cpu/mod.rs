@@ -1,5 +1,6 @@
 //! The CPU backend: vector kernels on all cores. Knows nothing of the GPU backend.
 
+mod evaluate;
 mod isa;
 mod kernels;
 mod lanes;
@@ -18,10 +19,12 @@ use rayon::prelude::*;
 use super::backend::{Backend, BackendError, Trainer, Transform};
 use super::distance::{DistanceOptions, DistanceTransform};
 use super::ego;
+use super::field::Network;
 use super::options::{Options, Precision};
 use super::points::{Point, RigidTransform};
 use super::watch::Watch;
 use kernels::Kernels;
+use tile::WorkingSets;
 
 /// The CPU, or a set of its threads.
 pub struct CpuBackend {
@@ -96,6 +99,16 @@ impl Backend for CpuBackend {
     ) -> RigidTransform {
         let align = || ego::align(source, target, prior, watch);
         self.threads.install(align)
+    }
+
+    fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {
+        Ok(evaluate::evaluate(
+            &self.kernels,
+            &self.threads,
+            &WorkingSets::new(&self.threads),
+            (&network.parameters, &network.conditioning),
+            points,
+        ))
     }
 }
 

@@ -1,6 +1,8 @@
-//! The working set of one thread: a tile of points with its activations and deltas.
+//! The working set of each thread: a tile of points with its activations and deltas.
 //!
 //! Knows where things lie; computes nothing.
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use crate::flow::field::mlp::{Aligned, HIDDEN_LAYERS, WIDTH};
 
@@ -53,5 +55,23 @@ impl Tile {
     /// Rows including the padding to whole register tiles.
     pub(super) fn padded_rows(&self) -> usize {
         self.rows.next_multiple_of(ROW_STEP)
+    }
+}
+
+/// One working set a thread.
+pub(super) struct WorkingSets(Vec<Mutex<Tile>>);
+
+impl WorkingSets {
+    pub(super) fn new(threads: &rayon::ThreadPool) -> Self {
+        let threads = threads.current_num_threads();
+        Self((0..threads).map(|_| Mutex::new(Tile::new())).collect())
+    }
+
+    /// The calling thread's.
+    pub(super) fn own(&self) -> MutexGuard<'_, Tile> {
+        let thread = rayon::current_thread_index().unwrap_or(0);
+        self.0[thread]
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -5,12 +5,12 @@
 //! gradients and chunks are added in order, so the bits do not depend on the threads.
 
 use core::ops::Range;
-use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use rayon::prelude::*;
 
 use super::CpuTransform;
-use super::tile::{TILE, Tile};
+use super::evaluate::evaluate;
+use super::tile::{TILE, WorkingSets};
 use crate::flow::backend::{Advance, BackendError, Report, Trainer};
 use crate::flow::course::Course;
 use crate::flow::early_stop::EarlyStop;
@@ -39,8 +39,7 @@ pub(super) struct CpuTrainer<'a> {
     transposed: Parameters,
     early_stop: Option<EarlyStop>,
     chunks: Vec<Chunk>,
-    /// One working set a thread.
-    tiles: Vec<Mutex<Tile>>,
+    working_sets: WorkingSets,
     query_seconds: f64,
 }
 
@@ -49,7 +48,6 @@ impl<'a> CpuTrainer<'a> {
         let (course, parameters) = Course::new(source, options);
         let mut transposed = Parameters::zeros();
         transpose_middle_layers(&parameters, &mut transposed);
-        let threads = device.threads.current_num_threads();
         Self {
             device,
             course,
@@ -57,7 +55,7 @@ impl<'a> CpuTrainer<'a> {
             transposed,
             early_stop: options.early_stop.map(EarlyStop::new),
             chunks: Vec::new(),
-            tiles: (0..threads).map(|_| Mutex::new(Tile::new())).collect(),
+            working_sets: WorkingSets::new(&device.threads),
             query_seconds: 0.0,
         }
     }
@@ -99,10 +97,10 @@ impl<'a> CpuTrainer<'a> {
         let weight = 1.0 / points.len() as f32;
         let (device, loss) = (self.device, &self.course.options.loss);
         let (parameters, transposed) = (&self.state.parameters, &self.transposed);
-        let (conditioning, working_sets) = (&self.course.conditioning, &self.tiles);
+        let (conditioning, working_sets) = (&self.course.conditioning, &self.working_sets);
         let chunks = &mut self.chunks[..count];
         let run = |(index, chunk): (usize, &mut Chunk)| {
-            let mut tile = own_tile(working_sets);
+            let mut tile = working_sets.own();
             chunk.gradients.as_mut_slice().fill(0.0);
             chunk.loss = 0.0;
             chunk.query_seconds = 0.0;
@@ -196,12 +194,6 @@ fn chunk_count(tiles: usize) -> usize {
     }
 }
 
-/// The calling thread's working set.
-fn own_tile(tiles: &[Mutex<Tile>]) -> MutexGuard<'_, Tile> {
-    let thread = rayon::current_thread_index().unwrap_or(0);
-    tiles[thread].lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 impl Trainer for CpuTrainer<'_> {
     fn advance(&mut self, steps: usize, watch: &dyn Watch) -> Result<Advance, BackendError> {
         for step in 0..steps {
@@ -230,20 +222,13 @@ impl Trainer for CpuTrainer<'_> {
     }
 
     fn evaluate(&mut self, points: &[Point]) -> Result<Vec<Point>, BackendError> {
-        let mut flow = vec![[0.0; 3]; points.len()];
-        let (device, kept) = (self.device, &self.state.kept);
-        let (conditioning, working_sets) = (&self.course.conditioning, &self.tiles);
-        device.threads.install(|| {
-            flow.par_chunks_mut(TILE)
-                .zip(points.par_chunks(TILE))
-                .for_each(|(flow, points)| {
-                    let mut tile = own_tile(working_sets);
-                    tile.load(points.iter().map(|&point| conditioning.apply(point)));
-                    device.kernels.forward(kept, &mut tile);
-                    flow.copy_from_slice(&tile.outputs[..points.len()]);
-                });
-        });
-        Ok(flow)
+        Ok(evaluate(
+            &self.device.kernels,
+            &self.device.threads,
+            &self.working_sets,
+            (&self.state.kept, &self.course.conditioning),
+            points,
+        ))
     }
 
     fn report(&self) -> Report {

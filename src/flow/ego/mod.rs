@@ -18,9 +18,9 @@ mod tests;
 
 use fit::{Fit, Schedule};
 use surfels::Surfels;
-use thin::{evenly, thinned};
+use thin::thinned;
 
-use super::points::{Point, RigidTransform};
+use super::points::{Point, RigidTransform, evenly};
 use super::watch::Watch;
 
 /// Side of the voxels that both clouds are thinned to, metres. With 0.4 m, 16 beams are 0.1

@@ -9,8 +9,8 @@ use rayon::prelude::*;
 
 use super::fit::{Fit, Schedule};
 use super::surfels::Surfels;
-use super::thin::{evenly, thinned};
-use crate::flow::points::{Point, RigidTransform};
+use super::thin::thinned;
+use crate::flow::points::{Point, RigidTransform, evenly};
 use crate::flow::watch::Watch;
 
 /// Side of the voxels that both clouds are thinned to, metres.

@@ -18,12 +18,6 @@ pub(super) fn thinned(points: &[Point], voxel_m: f32) -> Vec<Point> {
     voxels.map(|voxel| mean(points, voxel)).collect()
 }
 
-/// At most `most` of the points, evenly.
-pub(super) fn evenly(points: &[Point], most: usize) -> Vec<Point> {
-    let kept = points.len().min(most);
-    (0..kept).map(|i| points[i * points.len() / kept]).collect()
-}
-
 /// The voxel's number; none out of reach.
 fn key(point: Point, voxel_m: f32) -> Option<u64> {
     let at = point.map(|c| (c / voxel_m).floor());
@@ -64,14 +58,5 @@ mod tests {
             [1e9, 0.0, 0.0],
         ];
         assert_eq!(thinned(&points, 0.5), [[0.0; 3]; 0]);
-        assert_eq!(evenly(&[], 5), [[0.0; 3]; 0]);
-    }
-
-    #[test]
-    fn some_of_the_points_are_spread_over_all_of_them() {
-        let points: Vec<Point> = (0..10).map(|i| [i as f32, 0.0, 0.0]).collect();
-        let kept: Vec<f32> = evenly(&points, 4).iter().map(|point| point[0]).collect();
-        assert_eq!(kept, [0.0, 2.0, 5.0, 7.0]);
-        assert_eq!(evenly(&points, 20), points);
     }
 }

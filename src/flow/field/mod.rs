@@ -1,3 +1,46 @@
-//! What produces the flow: continuous fields fitted to one pair.
+//! What produces the flow: the continuous field fitted to one pair, to be asked anywhere.
 
 pub mod mlp;
+mod network;
+mod stored;
+
+pub use network::Network;
+
+use super::backend::{Backend, BackendError};
+use super::points::{Point, RigidTransform, moved};
+
+/// The motion of everything between two sweeps, at any point: where a point of the source is at the
+/// target's time, in the target's frame.
+#[derive(Clone, Debug)]
+pub struct Field {
+    /// The ego motion as target_from_source; none where the network explains it as well.
+    pub ego: Option<RigidTransform>,
+    /// What moves against the static world, over points whose ego motion is taken out; nothing does
+    /// where there is none.
+    pub network: Option<Network>,
+}
+
+impl Field {
+    /// Where `points` of the source's frame are in the target's if nothing moves of itself.
+    pub fn static_places(&self, points: &[Point]) -> Vec<Point> {
+        match &self.ego {
+            None => points.to_vec(),
+            Some(motion) => points.iter().map(|&point| moved(motion, point)).collect(),
+        }
+    }
+
+    /// How far what would be at `static_places` has moved of itself, metres.
+    ///
+    /// # Errors
+    /// [`BackendError`] where the device fails.
+    pub fn residual(
+        &self,
+        backend: &dyn Backend,
+        static_places: &[Point],
+    ) -> Result<Vec<Point>, BackendError> {
+        match &self.network {
+            None => Ok(vec![[0.0; 3]; static_places.len()]),
+            Some(network) => backend.evaluate(network, static_places),
+        }
+    }
+}

@@ -5,6 +5,7 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError, mpsc};
 
 use super::adapter::{Adapter, AdapterKind};
 use super::batch::Batch;
+use super::evaluate;
 use super::kernels::Kernels;
 use super::matrix::{self, Units};
 use super::memory::{Budget, Words};
@@ -13,6 +14,7 @@ use super::transform;
 use crate::flow::backend::{Backend, BackendError, Transform};
 use crate::flow::distance::DistanceOptions;
 use crate::flow::ego;
+use crate::flow::field::Network;
 use crate::flow::points::{Point, RigidTransform};
 use crate::flow::watch::Watch;
 
@@ -111,6 +113,10 @@ impl Backend for Gpu {
     ) -> RigidTransform {
         let align = || ego::align(source, target, prior, watch);
         self.0.host.install(align)
+    }
+
+    fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {
+        evaluate::network(&self.0, network, points)
     }
 }
 

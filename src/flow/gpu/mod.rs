@@ -19,6 +19,7 @@ mod self_test;
 
 // A pair on the card.
 mod batch;
+mod evaluate;
 mod trainer;
 mod transform;
 mod workload;

@@ -3,10 +3,11 @@
 use std::sync::Arc;
 
 use super::batch::{Done, Request};
-use super::device::{Card, spread};
+use super::device::Card;
+use super::evaluate;
 use super::memory::NETWORK_BYTES;
 use super::plan::Cut;
-use super::records::{self, ARRAYS, CONVERGED, DIVERGED, STEPS, Status, TILE};
+use super::records::{self, ARRAYS, CONVERGED, DIVERGED, STEPS, Status};
 use super::transform::GpuTransform;
 use crate::flow::backend::{Advance, BackendError, Report, Trainer};
 use crate::flow::course::Course;
@@ -23,14 +24,12 @@ const SUBMISSION_SECONDS: f64 = 0.03;
 const BLIND_STEPS: usize = 4;
 /// Iterations of a submission at most, where a stopping rule may end the run in any of them.
 const STOPPABLE_STEPS: usize = 16;
-/// Points that are evaluated at a time.
-const EVALUATED: usize = 1 << 18;
 /// The places of a lane's arrays; common.wgsl has the same.
 const PARAMETERS: u64 = 0;
 const TRANSPOSED: u64 = 1;
 const MEANS: u64 = 2;
 const SQUARES: u64 = 3;
-const KEPT: u64 = 4;
+pub(super) const KEPT: u64 = 4;
 
 /// One of the card's networks, as long as somebody fits it.
 struct Network {
@@ -231,11 +230,8 @@ impl Trainer for GpuTrainer<'_> {
     }
 
     fn evaluate(&mut self, points: &[Point]) -> Result<Vec<Point>, BackendError> {
-        let mut flow = Vec::with_capacity(points.len());
-        for points in points.chunks(EVALUATED) {
-            flow.extend(self.evaluated(points)?);
-        }
-        Ok(flow)
+        let networks = &self.card().buffers.networks;
+        evaluate::evaluate(self.card(), networks, &self.lane(), points)
     }
 
     fn report(&self) -> Report {
@@ -302,68 +298,6 @@ impl Trainer for GpuTrainer<'_> {
 
     fn shorten(&mut self, max_iterations: usize) {
         self.course.shorten(max_iterations);
-    }
-}
-
-impl GpuTrainer<'_> {
-    /// The kept network at these points, which fit into one dispatch.
-    fn evaluated(&self, points: &[Point]) -> Result<Vec<Point>, BackendError> {
-        let card = self.card();
-        let lane = records::Lane {
-            points: 0,
-            ..self.lane()
-        };
-        let step = records::Step {
-            count: points.len() as u32,
-            ..records::Step::default()
-        };
-        let tiles = Cut::new(points.len()).tiles;
-        let list: Vec<_> = (0..tiles as u32)
-            .map(|tile| records::Tile { lane: 0, tile })
-            .collect();
-        let places = card.filled(bytemuck::cast_slice(points))?;
-        let lane = card.filled(bytemuck::bytes_of(&lane))?;
-        let step = card.filled(bytemuck::bytes_of(&step))?;
-        let list = card.filled(bytemuck::cast_slice(&list))?;
-        let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC;
-        let flows = card.empty((tiles * TILE * 16) as u64, usage)?;
-        let pipeline = &card.kernels.evaluate;
-        let buffers = &card.buffers;
-        // An evaluation looks at no status and remembers no activations; the bindings are there.
-        let group = card.bound(
-            pipeline,
-            &[
-                &places,
-                &buffers.networks,
-                &lane,
-                &step,
-                &list,
-                &buffers.statuses,
-                &flows,
-                &buffers.activations,
-            ],
-        );
-        let mut encoder = card.encoder();
-        {
-            let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
-            pass.set_pipeline(pipeline);
-            pass.set_bind_group(0, &group, &[]);
-            let part = records::Part {
-                tiles: tiles as u32,
-                ..records::Part::default()
-            };
-            pass.set_immediates(0, bytemuck::bytes_of(&part));
-            let [x, y] = spread(tiles as u32);
-            pass.dispatch_workgroups(x, y, 1);
-        }
-        let read = card.finish(encoder, &flows, points.len() as u64 * 16)?;
-        let rows = read.as_chunks::<16>().0.iter();
-        Ok(rows
-            .map(|bytes| {
-                let [x, y, z, _]: [f32; 4] = bytemuck::pod_read_unaligned(bytes);
-                [x, y, z]
-            })
-            .collect())
     }
 }
 

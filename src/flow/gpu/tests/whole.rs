@@ -46,6 +46,7 @@ pub(super) fn solved(backend: &dyn Backend, pair: &SimulatedPair, options: &Opti
         source: &pair.source,
         target: &pair.target,
         ground: None,
+        before: None,
     };
     estimate(backend, &problem, options, &Unwatched).expect("a flow")
 }

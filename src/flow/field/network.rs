@@ -1,0 +1,121 @@
+//! A fitted network: its parameters and what it is fed. Knows no distances and computes no layers.
+
+use core::fmt;
+
+use nalgebra::Vector3;
+
+use super::mlp::{Conditioning, Parameters, WIDTH, first_layer, last_layer};
+use crate::flow::options::Inputs;
+use crate::flow::points::{Point, RigidTransform};
+
+/// The coordinate network of one pair: `g(p; theta)` at any point p, FNSF Section 3.
+#[derive(Clone)]
+pub struct Network {
+    pub(crate) parameters: Parameters,
+    pub(crate) conditioning: Conditioning,
+}
+
+impl Network {
+    /// The network that was fitted to `points` with `inputs`.
+    pub(crate) fn new(parameters: Parameters, points: &[Point], inputs: Inputs) -> Self {
+        Self {
+            parameters,
+            conditioning: Conditioning::new(points, inputs),
+        }
+    }
+
+    /// Parameters of the same field for a network that is fed by `conditioning`, once all that it
+    /// moves was itself moved by `motion`: `g'(p) = R g(motion^-1 p)`. Exact: both rotations and
+    /// the shift go into the outer layers.
+    pub(crate) fn carried(
+        &self,
+        motion: &RigidTransform,
+        conditioning: &Conditioning,
+    ) -> Parameters {
+        let rotation = motion.rotation.to_rotation_matrix().into_inner();
+        let vector = |point: Point| Vector3::from(point.map(f64::from));
+        let (own, new) = (&self.conditioning, conditioning);
+        // What the network was fed is (R^T (p - t) - center) * scale, and p is the new input over
+        // the new scale, about the new center.
+        let stretch = f64::from(own.scale) / f64::from(new.scale);
+        let shift = rotation.transpose() * (vector(new.center) - motion.translation.vector);
+        let shift = (shift - vector(own.center)) * f64::from(own.scale);
+        let mut carried = self.parameters.clone();
+        let (from, to) = (self.parameters.as_slice(), carried.as_mut_slice());
+        let layer = first_layer();
+        for feature in 0..WIDTH {
+            let weight = |input: usize| layer.weights + input * WIDTH + feature;
+            let weights = Vector3::from_fn(|input, _| f64::from(from[weight(input)]));
+            let turned = rotation * weights * stretch;
+            for input in 0..3 {
+                to[weight(input)] = turned[input] as f32;
+            }
+            to[layer.bias + feature] += weights.dot(&shift) as f32;
+        }
+        let layer = last_layer();
+        for feature in 0..=WIDTH {
+            // Behind the weights of all features stand the biases.
+            let place = |output: usize| match feature {
+                WIDTH => layer.bias + output,
+                _ => layer.weights + output * WIDTH + feature,
+            };
+            let flow = Vector3::from_fn(|output, _| f64::from(from[place(output)]));
+            let turned = rotation * flow;
+            for output in 0..3 {
+                to[place(output)] = turned[output] as f32;
+            }
+        }
+        carried
+    }
+}
+
+impl fmt::Debug for Network {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Network")
+            .field("conditioning", &self.conditioning)
+            .finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::backend::Backend;
+    use crate::flow::cpu::CpuBackend;
+    use crate::flow::points::moved;
+    use crate::flow::random::Random;
+
+    /// Metres: single precision of coordinates of 50 m and features of that size.
+    const ROUNDING_M: f32 = 2e-4;
+
+    #[test]
+    fn a_carried_network_is_the_same_field_seen_from_the_new_frame() {
+        let mut random = Random::new(5);
+        let mut points = || -> Vec<Point> {
+            let mut axis = |half: f64| random.uniform(-half, half) as f32;
+            (0..200)
+                .map(|_| [axis(50.0), axis(50.0), axis(3.0)])
+                .collect()
+        };
+        let (fitted, others) = (points(), points());
+        let scales = [10.0, 8.0].map(|scale_m| Inputs::Centered { scale_m });
+        let parameters = Parameters::xavier(&mut Random::new(9));
+        let network = Network::new(parameters, &fitted, scales[0]);
+        let motion = RigidTransform::new([1.5, -0.4, 0.1].into(), [0.01, -0.02, 0.3].into());
+        let seen: Vec<Point> = others.iter().map(|&point| moved(&motion, point)).collect();
+        let conditioning = Conditioning::new(&seen, scales[1]);
+        let carried = Network {
+            parameters: network.carried(&motion, &conditioning),
+            conditioning,
+        };
+        let backend = CpuBackend::new(Some(1)).expect("a thread");
+        let before = backend.evaluate(&network, &others).expect("flows");
+        let after = backend.evaluate(&carried, &seen).expect("flows");
+        for (before, after) in before.into_iter().zip(after) {
+            let turned = motion.rotation * Vector3::from(before.map(f64::from));
+            for axis in 0..3 {
+                assert!((turned[axis] as f32 - after[axis]).abs() < ROUNDING_M);
+            }
+        }
+    }
+}
