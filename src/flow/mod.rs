@@ -25,6 +25,7 @@
 
 // What goes in and comes out, and the loop between.
 mod deadline;
+mod dense;
 mod error;
 mod options;
 mod points;
@@ -61,6 +62,7 @@ pub mod simulate;
 #[cfg(test)]
 mod reference;
 
+pub use dense::DenseCloud;
 pub use error::FlowError;
 pub use field::{Field, Network};
 pub use options::*;
