@@ -32,6 +32,7 @@ mod points;
 mod preprocess;
 mod price;
 mod sealed;
+mod sequence;
 mod snapshot;
 mod solver;
 mod watch;
@@ -44,6 +45,9 @@ mod loss;
 
 // What carries no motion of its own.
 pub mod ground;
+
+// What becomes of a sequence.
+pub mod densify;
 
 // How the field is fitted, and on what.
 pub mod backend;
@@ -70,6 +74,7 @@ pub use points::{MIN_POINTS, Point, RigidTransform};
 pub use preprocess::Problem;
 pub use price::{Price, price};
 pub use sealed::SealError;
+pub use sequence::{Sequence, Sweep};
 pub use snapshot::{Snapshot, SnapshotError, TrainerState};
 pub use solver::{DYNAMIC_M, Estimate, PhaseSeconds, StopReason, estimate, resume};
 pub use watch::{Interrupt, Progress, Unwatched, Watch};

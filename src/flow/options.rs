@@ -163,8 +163,8 @@ impl Options {
             early_stop: None,
             max_iterations: 150,
             warm_start: Some(WarmStart {
-                max_iterations: 75,
-                learning_rate: 0.004,
+                max_iterations: 60,
+                learning_rate: 0.003,
             }),
             ..Self::published(max_points)
         }

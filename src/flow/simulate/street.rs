@@ -117,7 +117,7 @@ impl Street {
                 frames: self.frames,
             });
         }
-        let world_from_sensor = self.sensor_pose(index);
+        let world_from_sensor = self.sensor_pose(index as f64);
         let targets = self.targets(index, &world_from_sensor);
         let returns = self
             .lidar
@@ -168,10 +168,17 @@ impl Street {
     }
 
     fn flow_of(&self, frame: &Frame) -> Vec<Point> {
+        self.flow_to(frame, (frame.index + 1) as f64)
+    }
+
+    /// Flow of a frame's points to the instant `at`, in frames, N x 3 metres: where each is then, in
+    /// the sensor's frame of then, minus where it is in its own. Instants between frames and before
+    /// the frame have a flow too.
+    pub fn flow_to(&self, frame: &Frame, at: f64) -> Vec<Point> {
         let now = frame.world_from_sensor;
-        let next_from_world = self.sensor_pose(frame.index + 1).inverse();
+        let next_from_world = self.sensor_pose(at).inverse();
         let next_from_now = next_from_world * now;
-        let [now_seconds, next_seconds] = [frame.index, frame.index + 1].map(seconds);
+        let [now_seconds, next_seconds] = [frame.index as f64, at].map(seconds);
         let moving: Vec<RigidTransform> = self
             .movers
             .iter()
@@ -193,8 +200,8 @@ impl Street {
             .collect()
     }
 
-    fn sensor_pose(&self, index: usize) -> RigidTransform {
-        let x = self.terrain.advance(0.0, self.speed * seconds(index));
+    fn sensor_pose(&self, at: f64) -> RigidTransform {
+        let x = self.terrain.advance(0.0, self.speed * seconds(at));
         let place = self.terrain.place(x, -LANE_M);
         let world_from_ego = self
             .terrain
@@ -217,7 +224,7 @@ impl Street {
         });
         let objects = self.movers.iter().chain(&self.world.parked).zip(0..);
         let parts = objects.flat_map(|(object, number)| {
-            let pose = sensor_from_world * object.pose(&self.terrain, seconds(index));
+            let pose = sensor_from_world * object.pose(&self.terrain, seconds(index as f64));
             object.parts.iter().map(move |&(shape, center)| Target {
                 shape,
                 sensor_from_solid: pose * Translation3::from(center),
@@ -228,9 +235,9 @@ impl Street {
     }
 }
 
-/// Time of a frame, seconds.
-fn seconds(index: usize) -> f64 {
-    index as f64 * FRAME_SECONDS
+/// Time of an instant in frames, seconds.
+fn seconds(at: f64) -> f64 {
+    at * FRAME_SECONDS
 }
 
 /// How a transform moves a point, metres.
@@ -263,8 +270,8 @@ mod tests {
     /// Distance of a point of a sensor frame from the surface of an object, metres.
     fn distance(street: &Street, frame: usize, object: i32, point: Vector3<f64>) -> f64 {
         let body = street.object(object).unwrap();
-        let world = street.sensor_pose(frame) * Point3::from(point);
-        let local = body.pose(&street.terrain, seconds(frame)).inverse() * world;
+        let world = street.sensor_pose(frame as f64) * Point3::from(point);
+        let local = body.pose(&street.terrain, seconds(frame as f64)).inverse() * world;
         let parts = body.parts.iter();
         parts
             .map(|(shape, center)| shape.surface_distance(&(local.coords - center)))
@@ -413,7 +420,7 @@ mod tests {
             ..small(5)
         };
         let street = Street::new(&options).unwrap();
-        let step = street.sensor_pose(0).inv_mul(&street.sensor_pose(1));
+        let step = street.sensor_pose(0.0).inv_mul(&street.sensor_pose(1.0));
         let (_, _, yaw) = step.rotation.euler_angles();
         // The waves of the ground and the winding of the street change both a little.
         assert!((yaw - 0.01).abs() < 2e-3, "{yaw}");

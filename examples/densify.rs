@@ -1,0 +1,252 @@
+//! How well a sequence's sweeps fall together in one frame: the tables of `docs/numerics.md`.
+//!
+//! ```text
+//! cargo run --release --example densify [-- SWEEP...]
+//! ```
+//!
+//! On simulated streets: how far points are from their exact place, by their age, against what the
+//! ego motion alone leaves. On the sweeps that are named: how far points of other sweeps are from the
+//! surfaces of the middle one.
+#![expect(
+    clippy::print_stdout,
+    reason = "the tables are the answer of this program"
+)]
+
+use std::collections::BTreeMap;
+use std::time::Instant;
+
+use fnsf::flow::backend::Backend;
+use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::densify::{Later, Leg, Plan, densify};
+use fnsf::flow::distance::{DistanceOptions, Sites};
+use fnsf::flow::ground::{GroundOptions, segment};
+use fnsf::flow::simulate::{Frame, Street, StreetOptions};
+use fnsf::flow::{DenseCloud, Ego, Field, Ground, Point, Preset, Sequence, Sweep, Unwatched};
+use fnsf::formats::read_cloud;
+
+/// Sweeps of a simulated drive, and the one that all are carried into.
+const FRAMES: usize = 11;
+const INTO: usize = 5;
+
+type Fields = BTreeMap<Leg, Field>;
+
+/// Fits all legs of the plans, each chain from its beginning.
+fn fit(backend: &CpuBackend, sweeps: &[Sweep], plans: &[Plan]) -> anyhow::Result<Fields> {
+    let mut options = Preset::Default.options(None);
+    options.ground = Ground::Auto;
+    options.ego = Ego::Auto;
+    let mut fields = Fields::new();
+    for plan in plans {
+        let mut sequence = Sequence::new(backend, options.clone());
+        let mut last = None;
+        for leg in plan.legs() {
+            if fields.contains_key(&leg) {
+                continue;
+            }
+            if last != Some(leg.source) {
+                sequence = Sequence::new(backend, options.clone());
+                sequence.push(sweeps[leg.source].clone(), None, &Unwatched)?;
+            }
+            let estimate = sequence.push(sweeps[leg.target].clone(), None, &Unwatched)?;
+            last = Some(leg.target);
+            fields.extend(estimate.map(|estimate| (leg, estimate.field)));
+        }
+    }
+    Ok(fields)
+}
+
+fn carried(
+    backend: &CpuBackend,
+    sweeps: &[Sweep],
+    fields: &Fields,
+    plan: &Plan,
+) -> anyhow::Result<DenseCloud> {
+    Ok(densify(
+        backend,
+        plan,
+        sweeps,
+        |leg| fields.get(&leg),
+        &Unwatched,
+    )?)
+}
+
+/// The same fields without what moves against the static world.
+fn still(fields: &Fields) -> Fields {
+    let network = None;
+    fields
+        .iter()
+        .map(|(leg, field)| {
+            (
+                *leg,
+                Field {
+                    ego: field.ego,
+                    network: network.clone(),
+                },
+            )
+        })
+        .collect()
+}
+
+fn ground_found(points: Vec<Point>) -> Sweep {
+    let ground = Some(segment(&points, &GroundOptions::default()).ground);
+    Sweep { points, ground }
+}
+
+fn distance(a: Point, b: Point) -> f64 {
+    (0..3)
+        .map(|i| f64::from(a[i] - b[i]).powi(2))
+        .sum::<f64>()
+        .sqrt()
+}
+
+fn mean(values: impl Iterator<Item = f64>) -> f64 {
+    let (sum, count) = values.fold((0.0, 0.0), |(sum, count), value| (sum + value, count + 1.0));
+    sum / count
+}
+
+/// One row for each age: mean error of movers and of the rest, metres.
+fn simulated(backend: &CpuBackend, seed: u64, rows: &mut Vec<[f64; 12]>) -> anyhow::Result<()> {
+    let street = Street::new(&StreetOptions {
+        seed,
+        frames: FRAMES,
+        ..StreetOptions::default()
+    })?;
+    let frames = (0..FRAMES).map(|k| street.frame(k));
+    let frames: Vec<Frame> = frames.collect::<Result<_, _>>()?;
+    let sweeps: Vec<Sweep> = frames
+        .iter()
+        .map(|frame| ground_found(frame.points.clone()))
+        .collect();
+    let reverse = Plan::new(FRAMES, INTO as f64, Later::Reverse, 1)?;
+    let inverse = Plan::new(FRAMES, INTO as f64, Later::Inverse, 1)?;
+    let fields = fit(backend, &sweeps, &[reverse, inverse])?;
+    let clouds = [
+        carried(backend, &sweeps, &still(&fields), &reverse)?,
+        carried(backend, &sweeps, &fields, &reverse)?,
+        carried(backend, &sweeps, &fields, &inverse)?,
+    ];
+    let mut first = 0;
+    for frame in &frames {
+        let count = frame.points.len();
+        let age = INTO as f64 - frame.index as f64;
+        let to_into = street.flow_to(frame, INTO as f64);
+        let next = street.flow(frame.index)?;
+        let next_pose = street.frame((frame.index + 1) % FRAMES)?.world_from_sensor;
+        let step = next_pose.inv_mul(&frame.world_from_sensor);
+        let moves = |row: usize| {
+            let point = frame.points[row];
+            let moved = step * nalgebra::Point3::from(point.map(f64::from));
+            let there: Point = core::array::from_fn(|a| point[a] + next[row][a]);
+            frame.index + 1 < FRAMES
+                && distance([moved.x as f32, moved.y as f32, moved.z as f32], there) > 0.05
+        };
+        let moves: Vec<bool> = (0..count).map(moves).collect();
+        let mut row = [age, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
+        for (k, cloud) in clouds.iter().enumerate() {
+            let places: Vec<usize> = match first_of(cloud, frame.index) {
+                Some(at) => (at..at + count).collect(),
+                None => continue,
+            };
+            let error = |row: usize| {
+                let point = frame.points[row];
+                let truth = core::array::from_fn(|a| point[a] + to_into[row][a]);
+                distance(cloud.points[places[row]], truth)
+            };
+            row[1 + k] = mean((0..count).filter(|&r| moves[r]).map(error));
+            row[4 + k] = mean(
+                (0..count)
+                    .filter(|&r| !moves[r] && !frame.ground[r])
+                    .map(error),
+            );
+        }
+        row[10] = clouds[2].converged.iter().filter(|&&c| !c).count() as f64;
+        rows.push(row);
+        first += count;
+    }
+    anyhow::ensure!(first == clouds[0].points.len(), "no point is lost");
+    Ok(())
+}
+
+/// Where the points of a sweep begin in a cloud.
+fn first_of(cloud: &DenseCloud, frame: usize) -> Option<usize> {
+    cloud.frame.iter().position(|&f| f as usize == frame)
+}
+
+/// How far points of each age are from the surfaces of the middle sweep.
+fn real(backend: &CpuBackend, paths: &[String]) -> anyhow::Result<()> {
+    let read = |path: &String| anyhow::Ok(read_cloud(&std::fs::read(path)?, Some(path))?.points);
+    let sweeps = paths.iter().map(|path| read(path).map(ground_found));
+    let sweeps: Vec<Sweep> = sweeps.collect::<Result<_, _>>()?;
+    let into = sweeps.len() / 2;
+    let plan = Plan::new(sweeps.len(), into as f64, Later::Reverse, 1)?;
+    let began = Instant::now();
+    let fields = fit(backend, &sweeps, &[plan])?;
+    let fitted = began.elapsed().as_secs_f64();
+    let cloud = carried(backend, &sweeps, &fields, &plan)?;
+    let gathered = began.elapsed().as_secs_f64() - fitted;
+    println!(
+        "{} points of {} sweeps in sweep {into}: {fitted:.1} s for {} fits, {gathered:.1} s to carry them\n",
+        cloud.points.len(),
+        sweeps.len(),
+        fields.len()
+    );
+    let options = DistanceOptions {
+        sites: Sites::Points,
+        ..DistanceOptions::default()
+    };
+    let target = &sweeps[into].points;
+    let transform = backend.transform(&cloud.points, target, &options, &Unwatched)?;
+    let ego_alone = carried(backend, &sweeps, &still(&fields), &plan)?;
+    println!("| age | static points, m | moving points, m | by ego motion alone, m |");
+    println!("|---|---|---|---|");
+    for place in 0..sweeps.len() {
+        let of = |cloud: &DenseCloud, moving: bool, flags: &DenseCloud| {
+            let rows = (0..cloud.points.len()).filter(|&r| cloud.frame[r] as usize == place);
+            let rows = rows.filter(|&r| flags.dynamic[r] == moving);
+            rows.map(|r| cloud.points[r]).collect::<Vec<_>>()
+        };
+        let off = |points: Vec<Point>| -> anyhow::Result<f64> {
+            let distances = transform.distances(&points)?;
+            Ok(mean(distances.into_iter().map(|d| f64::from(d.min(2.0)))))
+        };
+        println!(
+            "| {} | {:.4} | {:.4} | {:.4} |",
+            into as i64 - place as i64,
+            off(of(&cloud, false, &cloud))?,
+            off(of(&cloud, true, &cloud))?,
+            off(of(&ego_alone, true, &cloud))?,
+        );
+    }
+    Ok(())
+}
+
+fn main() -> anyhow::Result<()> {
+    let backend = CpuBackend::new(None)?;
+    let paths: Vec<String> = std::env::args().skip(1).collect();
+    if !paths.is_empty() {
+        real(&backend, &paths)?;
+    }
+    let mut rows = Vec::new();
+    for seed in 0..4 {
+        simulated(&backend, seed, &mut rows)?;
+    }
+    println!(
+        "| age | movers: ego motion alone, m | reverse fields, m | inverse fields, m | static: ego motion alone, m | reverse, m | inverse, m |"
+    );
+    println!("|---|---|---|---|---|---|---|");
+    for place in 0..FRAMES {
+        let of_age: Vec<&[f64; 12]> = rows.iter().skip(place).step_by(FRAMES).collect();
+        let column = |k: usize| mean(of_age.iter().map(|row| row[k]));
+        println!(
+            "| {:+} | {:.3} | {:.3} | {:.3} | {:.4} | {:.4} | {:.4} |",
+            of_age[0][0],
+            column(1),
+            column(2),
+            column(3),
+            column(4),
+            column(5),
+            column(6)
+        );
+    }
+    Ok(())
+}

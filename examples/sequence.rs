@@ -1,0 +1,184 @@
+//! What a sequence's pairs cost, and how good they are, against the same pairs alone: rows for
+//! `docs/numerics.md`.
+//!
+//! ```text
+//! cargo run --release --example sequence [-- SWEEP...]
+//! ```
+//!
+//! Simulated streets with exact truth and, where sweeps are named, what is left of their distances.
+#![expect(
+    clippy::print_stdout,
+    reason = "the table is the answer of this program"
+)]
+
+use std::time::Instant;
+
+use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::simulate::{Street, StreetOptions};
+use fnsf::flow::{
+    Estimate, Ground, Options, Point, Preset, Problem, Sequence, Sweep, Unwatched, WarmStart,
+    estimate,
+};
+use fnsf::formats::read_cloud;
+
+/// Sweeps of a simulated drive.
+const FRAMES: usize = 8;
+
+/// A drive, and for each pair the true flow and which points move, where they are known.
+struct Drive {
+    name: String,
+    sweeps: Vec<Vec<Point>>,
+    truth: Vec<Truth>,
+}
+
+struct Truth {
+    flow: Vec<Point>,
+    dynamic: Vec<bool>,
+    ground: Vec<bool>,
+}
+
+/// What a drive's pairs come to: mean EPE off the ground, of movers and of the rest, seconds a pair.
+#[derive(Default)]
+struct Sums {
+    errors: [f64; 3],
+    counts: [f64; 3],
+    seconds: f64,
+    iterations: usize,
+    pairs: usize,
+    loss: f64,
+}
+
+impl Sums {
+    fn add(&mut self, estimate: &Estimate, truth: Option<&Truth>, seconds: f64) {
+        self.pairs += 1;
+        self.seconds += seconds;
+        self.iterations += estimate.iterations;
+        self.loss += estimate.best_loss;
+        let Some(truth) = truth else { return };
+        for (row, flow) in estimate.flow.iter().enumerate() {
+            if truth.ground[row] || !estimate.valid[row] {
+                continue;
+            }
+            let square: f64 = (0..3)
+                .map(|a| f64::from(flow[a] - truth.flow[row][a]).powi(2))
+                .sum();
+            let class = if truth.dynamic[row] { 1 } else { 2 };
+            for class in [0, class] {
+                self.errors[class] += square.sqrt();
+                self.counts[class] += 1.0;
+            }
+        }
+    }
+
+    fn print(&self, name: &str, variant: &str) {
+        let [all, movers, still] = [0, 1, 2].map(|c| self.errors[c] / self.counts[c]);
+        let pairs = self.pairs as f64;
+        println!(
+            "| {name} | {variant} | {all:.4} | {movers:.3} | {still:.4} | {:.4} | {:.0} | {:.3} |",
+            self.loss / pairs,
+            self.iterations as f64 / pairs,
+            self.seconds / pairs,
+        );
+    }
+}
+
+fn simulated(seed: u64) -> anyhow::Result<Drive> {
+    let street = Street::new(&StreetOptions {
+        seed,
+        frames: FRAMES,
+        ..StreetOptions::default()
+    })?;
+    let frames = (0..FRAMES).map(|k| street.frame(k));
+    let frames = frames.collect::<Result<Vec<_>, _>>()?;
+    let truth = (0..FRAMES - 1).map(|k| {
+        let pair = street.pair(k)?;
+        anyhow::Ok(Truth {
+            flow: pair.flow,
+            dynamic: pair.dynamic,
+            ground: pair.ground_source,
+        })
+    });
+    Ok(Drive {
+        name: format!("street {seed}"),
+        truth: truth.collect::<Result<_, _>>()?,
+        sweeps: frames.into_iter().map(|frame| frame.points).collect(),
+    })
+}
+
+fn alone(backend: &CpuBackend, drive: &Drive, options: &Options) -> anyhow::Result<Sums> {
+    let mut sums = Sums::default();
+    for (k, pair) in drive.sweeps.windows(2).enumerate() {
+        let problem = Problem {
+            source: &pair[0],
+            target: &pair[1],
+            ground: None,
+            before: None,
+        };
+        let began = Instant::now();
+        let estimate = estimate(backend, &problem, options, &Unwatched)?;
+        let seconds = began.elapsed().as_secs_f64();
+        // The first pair of a sequence is one alone: the others are compared.
+        if k > 0 {
+            sums.add(&estimate, drive.truth.get(k), seconds);
+        }
+    }
+    Ok(sums)
+}
+
+fn in_sequence(backend: &CpuBackend, drive: &Drive, options: &Options) -> anyhow::Result<Sums> {
+    let mut sums = Sums::default();
+    let mut sequence = Sequence::new(backend, options.clone());
+    for (k, points) in drive.sweeps.iter().enumerate() {
+        let sweep = Sweep {
+            points: points.clone(),
+            ground: None,
+        };
+        let began = Instant::now();
+        let estimate = sequence.push(sweep, None, &Unwatched)?;
+        let seconds = began.elapsed().as_secs_f64();
+        if let Some(estimate) = estimate
+            && k > 1
+        {
+            sums.add(&estimate, drive.truth.get(k - 1), seconds);
+        }
+    }
+    Ok(sums)
+}
+
+fn main() -> anyhow::Result<()> {
+    let mut drives = (0..4).map(simulated).collect::<Result<Vec<_>, _>>()?;
+    let paths: Vec<String> = std::env::args().skip(1).collect();
+    if !paths.is_empty() {
+        let read =
+            |path: &String| anyhow::Ok(read_cloud(&std::fs::read(path)?, Some(path))?.points);
+        drives.push(Drive {
+            name: "drive".to_owned(),
+            sweeps: paths.iter().map(read).collect::<Result<_, _>>()?,
+            truth: Vec::new(),
+        });
+    }
+    let backend = CpuBackend::new(None)?;
+    let mut options = Preset::Default.options(None);
+    options.ground = Ground::Auto;
+    println!("| drive | pairs | EPE | EPE moving | EPE still | loss | iterations | s |");
+    println!("|---|---|---|---|---|---|---|---|");
+    for drive in &drives {
+        alone(&backend, drive, &options)?.print(&drive.name, "alone");
+        for (max_iterations, learning_rate) in [
+            (40, 0.004),
+            (60, 0.003),
+            (75, 0.002),
+            (75, 0.004),
+            (150, 0.004),
+        ] {
+            let mut options = options.clone();
+            options.warm_start = Some(WarmStart {
+                max_iterations,
+                learning_rate,
+            });
+            let variant = format!("warm, {max_iterations} iterations from {learning_rate}");
+            in_sequence(&backend, drive, &options)?.print(&drive.name, &variant);
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,143 @@
+//! One dense cloud of a sequence: every sweep's points, carried into one frame by Euler integration.
+//!
+//! ```text
+//! sweep - static place: T x - y <- y + g(y) / substeps, again - next sweep's frame - ... - the frame
+//! ```
+//!
+//! The ego motion is taken out of every step and put back exactly, so that the static world does
+//! not drift; what the fields say is integrated only where it counts as motion. Ground never moves
+//! of itself. Knows no files, and not how the fields were fitted.
+
+mod carried;
+mod plan;
+
+#[cfg(test)]
+mod tests;
+
+pub use plan::{Later, Leg, Plan, PlanError};
+
+use carried::Carried;
+
+use super::backend::{Backend, BackendError};
+use super::dense::DenseCloud;
+use super::field::Field;
+use super::points::{Point, RigidTransform, moved};
+use super::sequence::Sweep;
+use super::watch::{self, Interrupt, Watch};
+
+/// Why there is no dense cloud.
+#[derive(Debug, thiserror::Error)]
+pub enum DensifyError {
+    /// The plan is for another number of sweeps.
+    #[error("{sweeps} sweeps, and a plan for {planned}")]
+    Sweeps {
+        /// Sweeps there.
+        sweeps: usize,
+        /// Sweeps planned for.
+        planned: usize,
+    },
+    /// A field of the plan is missing.
+    #[error("no field from sweep {} to sweep {}", .0.source, .0.target)]
+    NoField(Leg),
+    /// A sweep's mask has another length than the sweep.
+    #[error("sweep {0}: the ground mask has another number of rows than the sweep")]
+    Mask(usize),
+    /// The watch asked for the end; half of a dense cloud is none.
+    #[error("interrupted")]
+    Interrupted(Interrupt),
+    /// The device failed.
+    #[error(transparent)]
+    Backend(#[from] BackendError),
+}
+
+/// Carries the points of all `sweeps` as `plan` says, through the fields that `field` gives for each of
+/// [`Plan::legs`]. Points that are not finite are left out. A sweep's ground mask, where it has one,
+/// names points that never move of themselves.
+///
+/// # Errors
+/// [`DensifyError`] where sweeps or fields are missing, the watch interrupts or the device fails.
+pub fn densify<'a>(
+    backend: &dyn Backend,
+    plan: &Plan,
+    sweeps: &[Sweep],
+    field: impl Fn(Leg) -> Option<&'a Field>,
+    watch: &dyn Watch,
+) -> Result<DenseCloud, DensifyError> {
+    if sweeps.len() != plan.sweeps {
+        return Err(DensifyError::Sweeps {
+            sweeps: sweeps.len(),
+            planned: plan.sweeps,
+        });
+    }
+    let masked = |sweep: &Sweep| sweep.ground.as_ref().map_or(sweep.points.len(), Vec::len);
+    if let Some(place) = sweeps.iter().position(|s| masked(s) != s.points.len()) {
+        return Err(DensifyError::Mask(place));
+    }
+    let field = |source: usize, target: usize| {
+        let leg = Leg { source, target };
+        field(leg).ok_or(DensifyError::NoField(leg))
+    };
+    let checked = || watch::check(watch).map_err(DensifyError::Interrupted);
+
+    // Sweeps up to the anchor, forward.
+    let (anchor, substeps) = (plan.anchor, plan.substeps);
+    let mut earlier = Carried::default();
+    for place in 0..=anchor {
+        checked()?;
+        if place > 0 {
+            earlier.step(backend, field(place - 1, place)?, substeps)?;
+        }
+        earlier.take(place, &sweeps[place]);
+    }
+    // Sweeps behind it, back to the one before which the instant lies.
+    let first = if plan.fraction > 0.0 {
+        anchor + 1
+    } else {
+        anchor
+    };
+    let mut later = Carried::default();
+    for place in (first..plan.sweeps).rev() {
+        checked()?;
+        if place + 1 < plan.sweeps {
+            match plan.later {
+                Later::Reverse => later.step(backend, field(place + 1, place)?, substeps)?,
+                Later::Inverse => later.invert(backend, field(place, place + 1)?)?,
+            }
+        }
+        if place > anchor {
+            later.take(place, &sweeps[place]);
+        }
+    }
+    checked()?;
+    if plan.fraction > 0.0 {
+        let ahead = field(anchor, anchor + 1)?;
+        let step = ahead.ego.unwrap_or_default();
+        // The frame of the instant lies a share of the way, and of the turn, between the two sweeps'.
+        let instant = part_of(&step, plan.fraction);
+        earlier.part_step(backend, ahead, plan.fraction)?;
+        earlier.transform(&(instant * step.inverse()));
+        match plan.later {
+            Later::Reverse => {
+                let back = field(anchor + 1, anchor)?;
+                later.part_step(backend, back, 1.0 - plan.fraction)?;
+            }
+            Later::Inverse => {
+                later.invert(backend, ahead)?;
+                later.part_step(backend, ahead, plan.fraction)?;
+                later.transform(&step.inverse());
+            }
+        }
+        later.transform(&instant);
+    }
+    Ok(earlier.joined(later, plan.into()))
+}
+
+/// The part of a rigid motion that is done after `share` of its time.
+fn part_of(motion: &RigidTransform, share: f64) -> RigidTransform {
+    RigidTransform::identity().lerp_slerp(motion, share)
+}
+
+/// All points, moved rigidly.
+fn all_moved(motion: &RigidTransform, points: &[Point]) -> Vec<Point> {
+    points.iter().map(|&point| moved(motion, point)).collect()
+}

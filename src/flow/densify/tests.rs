@@ -1,0 +1,167 @@
+//! Fields whose flow is known everywhere: networks that say the same at every point.
+
+use super::*;
+use crate::flow::cpu::CpuBackend;
+use crate::flow::field::Network;
+use crate::flow::field::mlp::{Conditioning, Parameters, last_layer};
+use crate::flow::watch::Unwatched;
+
+/// Metres: single precision of coordinates of some metres.
+const ROUNDING_M: f32 = 1e-5;
+
+/// A field with the same flow everywhere.
+fn constant(ego: Option<RigidTransform>, flow: Point) -> Field {
+    let mut parameters = Parameters::zeros();
+    let bias = last_layer().bias;
+    parameters.as_mut_slice()[bias..bias + 3].copy_from_slice(&flow);
+    let conditioning = Conditioning {
+        center: [0.0; 3],
+        scale: 0.1,
+    };
+    Field {
+        ego,
+        network: Some(Network {
+            parameters,
+            conditioning,
+        }),
+    }
+}
+
+fn sweeps(count: usize) -> Vec<Sweep> {
+    (0..count)
+        .map(|place| Sweep {
+            points: vec![[place as f32, 0.0, 0.0], [f32::NAN; 3], [0.0, 1.0, 2.0]],
+            ground: Some(vec![false, false, true]),
+        })
+        .collect()
+}
+
+/// A vehicle that drives 1 m forward and turns a little at each step.
+fn drive() -> RigidTransform {
+    RigidTransform::new([-1.0, 0.0, 0.0].into(), [0.0, 0.0, 0.1].into())
+}
+
+fn dense(
+    plan: &Plan,
+    sweeps: &[Sweep],
+    ahead: &Field,
+    back: &Field,
+) -> Result<DenseCloud, DensifyError> {
+    let backend = CpuBackend::new(Some(1)).expect("a thread");
+    let of = |leg: Leg| Some(if leg.target > leg.source { ahead } else { back });
+    densify(&backend, plan, sweeps, of, &Unwatched)
+}
+
+/// Where a static point of sweep `frame` is seen at the instant `into`.
+fn expected(point: Point, frame: usize, into: f64) -> Point {
+    let anchor = into.floor();
+    let mut motion = part_of(&drive(), into - anchor);
+    let steps = anchor - frame as f64;
+    for _ in 0..steps.abs() as usize {
+        motion *= if steps < 0.0 {
+            drive().inverse()
+        } else {
+            drive()
+        };
+    }
+    moved(&motion, point)
+}
+
+fn assert_near(found: Point, expected: Point, of: &str) {
+    for axis in 0..3 {
+        let off = (found[axis] - expected[axis]).abs();
+        assert!(off < ROUNDING_M, "{of}: {found:?}, not {expected:?}");
+    }
+}
+
+#[test]
+fn the_static_world_lands_where_the_vehicle_sees_it_whatever_the_instant() {
+    let still = [drive(), drive().inverse()].map(|ego| Field {
+        ego: Some(ego),
+        network: None,
+    });
+    let [ahead, back] = &still;
+    let sweeps = sweeps(5);
+    for later in [Later::Reverse, Later::Inverse] {
+        for into in [0.0, 2.0, 2.25, 3.5, 4.0] {
+            let plan = Plan::new(5, into, later, 2).expect("a plan");
+            let cloud = dense(&plan, &sweeps, ahead, back).expect("a cloud");
+            assert_eq!(
+                cloud.points.len(),
+                10,
+                "points that are no numbers stay out"
+            );
+            for (row, &frame) in cloud.frame.iter().enumerate() {
+                let place = frame as usize;
+                let point = sweeps[place].points[if row % 2 == 0 { 0 } else { 2 }];
+                let expected = expected(point, place, into);
+                assert_near(cloud.points[row], expected, &format!("{later:?} {into}"));
+                assert_eq!(cloud.age[row], (into - f64::from(frame)) as f32);
+                assert!(!cloud.dynamic[row] && cloud.converged[row]);
+            }
+        }
+    }
+}
+
+#[test]
+fn what_moves_is_integrated_step_by_step_and_ground_is_not() {
+    // Seen from a vehicle that stands, so that the steps add up.
+    let standing = Some(RigidTransform::identity());
+    let (ahead, back) = (
+        constant(standing, [0.5, 0.0, 0.0]),
+        constant(standing, [-0.5, 0.0, 0.0]),
+    );
+    let sweeps = sweeps(4);
+    for later in [Later::Reverse, Later::Inverse] {
+        for (into, substeps) in [(2.0, 1), (2.0, 4), (1.5, 1)] {
+            let plan = Plan::new(4, into, later, substeps).expect("a plan");
+            let cloud = dense(&plan, &sweeps, &ahead, &back).expect("a cloud");
+            for (row, &frame) in cloud.frame.iter().enumerate() {
+                let age = (into - f64::from(frame)) as f32;
+                let is_ground = row % 2 == 1;
+                let point = sweeps[frame as usize].points[if is_ground { 2 } else { 0 }];
+                let drift = if is_ground { 0.0 } else { 0.5 * age };
+                let expected = [point[0] + drift, point[1], point[2]];
+                assert_near(cloud.points[row], expected, &format!("{later:?} {into}"));
+                assert_eq!(cloud.dynamic[row], drift != 0.0);
+            }
+        }
+    }
+}
+
+#[test]
+fn what_a_field_says_below_the_threshold_of_motion_moves_nothing() {
+    let standing = Some(RigidTransform::identity());
+    let noise = constant(standing, [0.02, 0.02, 0.0]);
+    let plan = Plan::new(3, 2.0, Later::Reverse, 1).expect("a plan");
+    let sweeps = sweeps(3);
+    let cloud = dense(&plan, &sweeps, &noise, &noise).expect("a cloud");
+    assert_eq!(cloud.points[0], sweeps[0].points[0]);
+    // Without an ego motion the field carries the static world, too.
+    let all = constant(None, [0.02, 0.02, 0.0]);
+    let cloud = dense(&plan, &sweeps, &all, &all).expect("a cloud");
+    assert_near(cloud.points[0], [0.04, 0.04, 0.0], "two steps");
+}
+
+#[test]
+fn missing_fields_and_sweeps_are_refused_by_name() {
+    let backend = CpuBackend::new(Some(1)).expect("a thread");
+    let plan = Plan::new(3, 1.0, Later::Reverse, 1).expect("a plan");
+    let run = |sweeps: &[Sweep]| densify(&backend, &plan, sweeps, |_| None, &Unwatched);
+    let leg = Leg {
+        source: 0,
+        target: 1,
+    };
+    assert!(matches!(run(&sweeps(3)), Err(DensifyError::NoField(found)) if found == leg));
+    let error = run(&sweeps(2)).expect_err("one is missing");
+    assert!(matches!(
+        error,
+        DensifyError::Sweeps {
+            sweeps: 2,
+            planned: 3
+        }
+    ));
+    let mut short = sweeps(3);
+    short[1].ground = Some(vec![true]);
+    assert!(matches!(run(&short), Err(DensifyError::Mask(1))));
+}
