@@ -25,6 +25,7 @@
 
 // What goes in and comes out, and the loop between.
 mod deadline;
+mod dense;
 mod error;
 mod options;
 mod points;
@@ -60,6 +61,7 @@ pub mod simulate;
 #[cfg(test)]
 mod reference;
 
+pub use dense::DenseCloud;
 pub use error::FlowError;
 pub use options::*;
 pub use points::{MIN_POINTS, Point, RigidTransform};
