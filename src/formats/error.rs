@@ -21,6 +21,8 @@ pub enum FileKind {
     Feather,
     /// JSON flow.
     Json,
+    /// LAS, or LAZ, its compressed form. Written only.
+    Las,
     /// KITTI: rows of four little-endian float32 (x, y, z, intensity).
     KittiBin,
     /// nuScenes: rows of five little-endian float32 (x, y, z, intensity, ring).
@@ -36,6 +38,7 @@ impl fmt::Display for FileKind {
             Self::Pcd => "pcd",
             Self::Feather => "feather",
             Self::Json => "json",
+            Self::Las => "las",
             Self::KittiBin => "kitti bin",
             Self::NuscenesBin => "nuscenes bin",
         })

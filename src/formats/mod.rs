@@ -9,6 +9,7 @@ mod lines;
 mod sniff;
 
 mod cloud;
+mod dense_file;
 mod flow_file;
 mod motion;
 mod pair;
@@ -16,6 +17,7 @@ mod pair;
 mod bin;
 mod feather;
 mod json;
+mod las;
 mod lzf;
 mod npy;
 mod npz;
@@ -24,6 +26,7 @@ mod ply;
 mod scalar;
 
 pub use cloud::{Cloud, CloudFormat, read_cloud, write_cloud};
+pub use dense_file::{DENSE_FORMATS, DenseFormat, write_dense};
 pub use error::{FileKind, FormatError};
 pub use flow_file::{FlowFile, FlowFormat, FlowTable, read_flow, write_flow};
 pub use limits::{MAX_COORDINATE_M, MAX_POINTS};

@@ -5,6 +5,8 @@
 #[cfg(test)]
 mod bombs;
 #[cfg(test)]
+mod dense;
+#[cfg(test)]
 mod hostile;
 #[cfg(test)]
 mod real_data;
