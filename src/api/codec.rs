@@ -77,29 +77,7 @@ impl AnswerFormat {
     /// # Errors
     /// [`ApiError::NotAcceptable`], which lists what there is.
     pub(super) fn accepted(accept: Option<&str>) -> Result<Self, ApiError> {
-        let Some(accept) = accept.filter(|accept| !accept.trim().is_empty()) else {
-            return Ok(ANSWER_FORMATS[0].0);
-        };
-        let mut best: Option<(f32, Self)> = None;
-        for wanted in accept.split(',') {
-            let mut parts = wanted.split(';').map(str::trim);
-            let media = parts.next().unwrap_or_default().to_ascii_lowercase();
-            let weight = parts.find_map(|part| part.strip_prefix("q="));
-            let weight: f32 = weight.map_or(1.0, |weight| weight.parse().unwrap_or(0.0));
-            let known = ANSWER_FORMATS.iter().find(|(_, known, _)| {
-                *known == media || media == "*/*" || media == "application/*"
-            });
-            if let Some((format, ..)) = known
-                && weight > 0.0
-                && best.is_none_or(|(most, _)| weight > most)
-            {
-                best = Some((weight, *format));
-            }
-        }
-        best.map(|(_, format)| format).ok_or_else(|| {
-            let known: Vec<&str> = ANSWER_FORMATS.iter().map(|(_, media, _)| *media).collect();
-            ApiError::NotAcceptable(format!("flow comes as {}", known.join(", ")))
-        })
+        accepted(accept, &ANSWER_FORMATS, "flow")
     }
 
     /// Some flow in this format. `points` are the source's where [`Self::needs_points`], and may be
@@ -140,6 +118,39 @@ impl AnswerFormat {
         }
         Ok(bytes)
     }
+}
+
+/// Of some formats with their media types, the one that an `Accept` header asks for, by its
+/// weights; the first where it does not mind. `what` it is that comes in them.
+///
+/// # Errors
+/// [`ApiError::NotAcceptable`], which lists what there is.
+pub(super) fn accepted<F: Copy>(
+    accept: Option<&str>,
+    formats: &[(F, &str, &str)],
+    what: &str,
+) -> Result<F, ApiError> {
+    let accept = accept.filter(|accept| !accept.trim().is_empty());
+    let mut best: Option<(f32, F)> = None;
+    for wanted in accept.unwrap_or("*/*").split(',') {
+        let mut parts = wanted.split(';').map(str::trim);
+        let media = parts.next().unwrap_or_default().to_ascii_lowercase();
+        let weight = parts.find_map(|part| part.strip_prefix("q="));
+        let weight: f32 = weight.map_or(1.0, |weight| weight.parse().unwrap_or(0.0));
+        let known = formats
+            .iter()
+            .find(|(_, known, _)| *known == media || media == "*/*" || media == "application/*");
+        if let Some((format, ..)) = known
+            && weight > 0.0
+            && best.is_none_or(|(most, _)| weight > most)
+        {
+            best = Some((weight, *format));
+        }
+    }
+    best.map(|(_, format)| format).ok_or_else(|| {
+        let known: Vec<&str> = formats.iter().map(|(_, media, _)| *media).collect();
+        ApiError::NotAcceptable(format!("{what} comes as {}", known.join(", ")))
+    })
 }
 
 /// The JSON form carries the report's fields beside the flow.

@@ -58,6 +58,9 @@ mod early_stop;
 pub mod gpu;
 mod optimizer;
 
+// What a camera sees of a cloud.
+pub mod depth;
+
 // How good a flow is, and streets to try it on.
 pub mod evaluate;
 mod random;

@@ -57,6 +57,9 @@ pub fn read_cloud(bytes: &[u8], name: Option<&str>) -> Result<Cloud, FormatError
             bin::read(bytes, kind).map(Cloud::from)
         }
         FileKind::Json => Err(FileKind::Json.unsupported("json holds flow here, not clouds")),
+        kind @ (FileKind::Las | FileKind::Png | FileKind::Camera | FileKind::Poses) => {
+            Err(kind.unsupported("no cloud is read from it"))
+        }
     }
 }
 

@@ -21,6 +21,14 @@ pub enum FileKind {
     Feather,
     /// JSON flow.
     Json,
+    /// LAS, or LAZ, its compressed form. Written only.
+    Las,
+    /// A picture; depth is read from those of 16 bits of gray.
+    Png,
+    /// A camera: our JSON, or KITTI's calibration text.
+    Camera,
+    /// Poses of a sequence: KITTI's text, or our JSON.
+    Poses,
     /// KITTI: rows of four little-endian float32 (x, y, z, intensity).
     KittiBin,
     /// nuScenes: rows of five little-endian float32 (x, y, z, intensity, ring).
@@ -36,6 +44,10 @@ impl fmt::Display for FileKind {
             Self::Pcd => "pcd",
             Self::Feather => "feather",
             Self::Json => "json",
+            Self::Las => "las",
+            Self::Png => "png",
+            Self::Camera => "camera",
+            Self::Poses => "poses",
             Self::KittiBin => "kitti bin",
             Self::NuscenesBin => "nuscenes bin",
         })
@@ -80,6 +92,9 @@ pub enum FormatError {
         /// What the file has instead.
         present: String,
     },
+    /// A camera that cannot be.
+    #[error(transparent)]
+    Camera(#[from] crate::flow::depth::CameraError),
     /// A matrix is no rigid motion.
     #[error("{0}")]
     Motion(&'static str),

@@ -299,6 +299,9 @@ pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatErr
         kind @ (FileKind::KittiBin | FileKind::NuscenesBin) => {
             return Err(kind.unsupported("it holds a cloud, not flow"));
         }
+        kind @ (FileKind::Las | FileKind::Png | FileKind::Camera | FileKind::Poses) => {
+            return Err(kind.unsupported("no flow is read from it"));
+        }
     };
     for (what, mask) in [("valid", &file.valid), ("dynamic", &file.dynamic)] {
         if let Some(mask) = mask {

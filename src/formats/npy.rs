@@ -350,6 +350,20 @@ pub(super) fn write_ids<W: Write>(out: &mut W, ids: &[i32]) -> Result<(), Format
     Ok(())
 }
 
+/// Writes N uint32, little endian.
+pub(super) fn write_counts<W: Write>(out: &mut W, counts: &[u32]) -> Result<(), FormatError> {
+    write_header(out, "<u4", &format!("({},)", counts.len()))?;
+    let bytes: Vec<u8> = counts.iter().flat_map(|n| n.to_le_bytes()).collect();
+    out.write_all(&bytes)?;
+    Ok(())
+}
+
+/// Writes N float32, little endian.
+pub(super) fn write_values<W: Write>(out: &mut W, values: &[f32]) -> Result<(), FormatError> {
+    write_header(out, "<f4", &format!("({},)", values.len()))?;
+    write_floats(out, values)
+}
+
 /// Writes a 4 x 4 float64 matrix.
 pub(super) fn write_matrix<W: Write>(
     out: &mut W,

@@ -5,7 +5,13 @@
 #[cfg(test)]
 mod bombs;
 #[cfg(test)]
+mod cameras;
+#[cfg(test)]
+mod dense;
+#[cfg(test)]
 mod hostile;
+#[cfg(test)]
+mod poses;
 #[cfg(test)]
 mod real_data;
 #[cfg(test)]

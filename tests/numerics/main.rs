@@ -5,6 +5,8 @@
 
 mod accuracy;
 mod deadlines;
+#[cfg(test)]
+mod depth;
 mod ego;
 mod gpu;
 #[path = "../common/gpu.rs"]

@@ -4,29 +4,20 @@
 //! the sweep does not depend on the number of threads. It must not know what moves.
 
 use super::options::StreetOptions;
-use super::shapes::{Hit, Shape};
+use super::scene::{FARTHEST_M, Scene, Target};
+use super::shapes::Hit;
 use super::terrain::Terrain;
 use crate::flow::random::Random;
 use crate::flow::{Point, RigidTransform};
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::Vector3;
 use rayon::prelude::*;
 use std::f64::consts::{PI, TAU};
 
 /// Returns from nearer or farther than this do not arrive, metres.
-const RANGES_M: [f64; 2] = [1.0, 120.0];
+const RANGES_M: [f64; 2] = [1.0, FARTHEST_M];
 /// Elevations of the top laser, of the middle of the fan, and of the bottom laser, degrees: one
 /// third of a degree apart above the middle, half a degree below, as the HDL-64E's are.
 const ELEVATIONS_DEG: [f64; 3] = [2.0, -8.5, -24.8];
-
-/// A solid as the sensor finds it.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Target {
-    pub(super) shape: Shape,
-    /// Pose of the solid, sensor_from_solid.
-    pub(super) sensor_from_solid: RigidTransform,
-    /// The object it belongs to, -1 for none.
-    pub(super) object: i32,
-}
 
 /// One return of a sweep.
 #[derive(Debug, Clone, Copy)]
@@ -45,24 +36,6 @@ pub(super) struct Lidar {
     dropout: f64,
     /// Sine and cosine of elevation and constant range error of each laser.
     lasers: Vec<([f64; 2], f64)>,
-}
-
-/// A target prepared for many rays from the sensor's origin.
-struct Prepared {
-    shape: Shape,
-    origin: Vector3<f64>,
-    solid_from_sensor: Matrix3<f64>,
-    object: i32,
-    nearest: f64,
-}
-
-/// What every ray of a sweep meets.
-struct Scene<'a> {
-    terrain: &'a Terrain,
-    world_from_sensor: &'a RigidTransform,
-    targets: Vec<Prepared>,
-    /// Per column: the targets it can meet, nearest first.
-    columns: Vec<Vec<u32>>,
 }
 
 impl Lidar {
@@ -143,7 +116,7 @@ impl Lidar {
         returns
     }
 
-    /// Sorts targets by distance and notes for each column which of them it can meet.
+    /// Notes for each column which of the targets it can meet.
     fn prepare<'a>(
         &self,
         terrain: &'a Terrain,
@@ -151,20 +124,8 @@ impl Lidar {
         targets: &[Target],
         phase: f64,
     ) -> Scene<'a> {
-        let reach = |target: &Target| {
-            let center = target.sensor_from_solid.translation.vector;
-            center.norm() - target.shape.bounding_radius()
-        };
-        let mut near: Vec<(f64, &Target)> = targets
-            .iter()
-            .map(|target| (reach(target), target))
-            .filter(|&(nearest, _)| nearest < RANGES_M[1])
-            .collect();
-        near.sort_by(|a, b| a.0.total_cmp(&b.0));
-
-        let mut columns = vec![Vec::new(); self.azimuth_steps];
         let step = TAU / self.azimuth_steps as f64;
-        for (index, (_, target)) in near.iter().enumerate() {
+        let spread = |target: &Target, meet: &mut dyn FnMut(usize)| {
             let center = target.sensor_from_solid.translation.vector;
             let [distance, radius] = [center.xy().norm(), target.shape.bounding_radius()];
             let half = if distance > radius {
@@ -177,53 +138,16 @@ impl Lidar {
             let last = ((azimuth + half) / step).ceil() as i64;
             let count = self.azimuth_steps as i64;
             for column in first..=last.min(first + count - 1) {
-                columns[column.rem_euclid(count) as usize].push(index as u32);
+                meet(column.rem_euclid(count) as usize);
             }
-        }
-        Scene {
+        };
+        Scene::new(
             terrain,
             world_from_sensor,
-            targets: near.into_iter().map(Prepared::new).collect(),
-            columns,
-        }
-    }
-}
-
-impl Prepared {
-    fn new((nearest, target): (f64, &Target)) -> Self {
-        let solid_from_sensor = target.sensor_from_solid.inverse();
-        Self {
-            shape: target.shape,
-            origin: solid_from_sensor.translation.vector,
-            solid_from_sensor: *solid_from_sensor.rotation.to_rotation_matrix().matrix(),
-            object: target.object,
-            nearest,
-        }
-    }
-}
-
-impl Scene<'_> {
-    /// The first thing on a ray: a solid with its object, or the ground with none.
-    fn first_hit(&self, column: usize, direction: &Vector3<f64>) -> Option<(Hit, Option<i32>)> {
-        let mut first: Option<(Hit, Option<i32>)> = None;
-        let mut limit = RANGES_M[1] + 1.0;
-        for &index in &self.columns[column] {
-            let target = &self.targets[index as usize];
-            if target.nearest > limit {
-                break;
-            }
-            let local = target.solid_from_sensor * direction;
-            if let Some(hit) = target.shape.hit(&target.origin, &local)
-                && hit.range < limit
-            {
-                limit = hit.range;
-                first = Some((hit, Some(target.object)));
-            }
-        }
-        let origin = self.world_from_sensor.translation.vector;
-        let world_direction = self.world_from_sensor.rotation * direction;
-        let ground = self.terrain.hit(&origin, &world_direction, limit);
-        ground.map(|hit| (hit, None)).or(first)
+            targets,
+            self.azimuth_steps,
+            spread,
+        )
     }
 }
 

@@ -6,9 +6,11 @@
 mod lidar;
 mod objects;
 mod options;
+mod scene;
 mod shapes;
 mod street;
 mod terrain;
+mod view;
 mod world;
 
 pub use objects::Kind;

@@ -3,11 +3,14 @@
 //! The truth belongs to the measured point, noise and all: it moves rigidly with what it was
 //! measured on, and the ego vehicle moves too. x2 = T x1 for a point of the static world.
 
-use super::lidar::{Lidar, Target};
+use super::lidar::Lidar;
 use super::objects::{Kind, LANE_M, Object, traffic};
 use super::options::{FRAME_SECONDS, StreetError, StreetOptions};
+use super::scene::Target;
 use super::terrain::Terrain;
+use super::view;
 use super::world::World;
+use crate::flow::depth::{Camera, DepthImage};
 use crate::flow::random::Random;
 use crate::flow::{Point, RigidTransform};
 use nalgebra::{Point3, Translation3, Vector3};
@@ -111,12 +114,7 @@ impl Street {
     /// # Errors
     /// A frame that the street does not have.
     pub fn frame(&self, index: usize) -> Result<Frame, StreetError> {
-        if index >= self.frames {
-            return Err(StreetError::NoSuchFrame {
-                frame: index,
-                frames: self.frames,
-            });
-        }
+        self.check_frame(index)?;
         let world_from_sensor = self.sensor_pose(index as f64);
         let targets = self.targets(index, &world_from_sensor);
         let returns = self
@@ -129,6 +127,24 @@ impl Street {
             ground: returns.iter().map(|hit| hit.is_ground).collect(),
             world_from_sensor,
         })
+    }
+
+    /// True depth of a frame through a camera beside the lidar, up to 120 m: the street as it is,
+    /// without noise and loss.
+    ///
+    /// # Errors
+    /// A frame that the street does not have.
+    pub fn depth(&self, index: usize, camera: &Camera) -> Result<DepthImage, StreetError> {
+        self.check_frame(index)?;
+        let world_from_camera =
+            self.sensor_pose(index as f64) * camera.camera_from_lidar().inverse();
+        let targets = self.targets(index, &world_from_camera);
+        Ok(view::depth(
+            camera,
+            &self.terrain,
+            &world_from_camera,
+            &targets,
+        ))
     }
 
     /// Flow of a frame's points to the next instant, N x 3 metres: where each is then, in the
@@ -165,6 +181,15 @@ impl Street {
             ground_target: target.ground,
             target_from_source,
         })
+    }
+
+    fn check_frame(&self, frame: usize) -> Result<(), StreetError> {
+        let frames = self.frames;
+        if frame < frames {
+            Ok(())
+        } else {
+            Err(StreetError::NoSuchFrame { frame, frames })
+        }
     }
 
     fn flow_of(&self, frame: &Frame) -> Vec<Point> {

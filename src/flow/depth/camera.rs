@@ -1,0 +1,258 @@
+//! A pinhole camera beside a lidar.
+//!
+//! Camera frame: x right, y down, z forward, metres. Whole pixel coordinates are the middles of
+//! pixels, counted from 0, as KITTI and OpenCV have it. It must not know depths.
+
+use crate::flow::{Point, RigidTransform};
+use nalgebra::{Point3, Vector3};
+
+/// Widest and tallest image, pixels.
+pub const MAX_SIDE_PX: u32 = 16_384;
+
+/// Most pixels of an image: their depths take four bytes each.
+const MAX_PIXELS: u64 = 1 << 26;
+
+/// Largest focal length and distance of the principal point, pixels.
+const MAX_FOCAL_PX: f64 = 1e6;
+
+/// Farthest that a camera may stand from its lidar, metres.
+const MAX_MOUNT_M: f64 = 1e3;
+
+/// Nearer than this to the camera nothing is seen, metres.
+pub(super) const NEAR_M: f64 = 0.1;
+
+/// How far a quaternion's length may be from 1.
+const UNIT_TOLERANCE: f64 = 1e-6;
+
+/// Why a camera was refused.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum CameraError {
+    /// A side is zero, or the image is too large.
+    #[error(
+        "an image of {width} x {height} pixels; each side must lie between 1 and {MAX_SIDE_PX}, and both together make at most {MAX_PIXELS}"
+    )]
+    Size {
+        /// Pixels per row.
+        width: u32,
+        /// Rows.
+        height: u32,
+    },
+    /// An intrinsic parameter is not a number, or no camera has it.
+    #[error("{name} of the camera is {value} pixels; {wanted}")]
+    Intrinsic {
+        /// `fx`, `fy`, `cx` or `cy`.
+        name: &'static str,
+        /// The value found, pixels.
+        value: f64,
+        /// What it should be.
+        wanted: &'static str,
+    },
+    /// A 3 x 3 matrix is not of the form fx 0 cx, 0 fy cy, 0 0 1.
+    #[error("the camera matrix is not fx 0 cx, 0 fy cy, 0 0 1: rectify skewed or scaled images")]
+    Matrix,
+    /// The pose is not finite, or far from any vehicle.
+    #[error("camera_from_lidar is not a rigid transform of finite numbers within {MAX_MOUNT_M} m")]
+    Pose,
+}
+
+/// Focal lengths and principal point, pixels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Intrinsics {
+    /// Focal length across columns.
+    pub fx: f64,
+    /// Focal length across rows.
+    pub fy: f64,
+    /// Column of the optical axis.
+    pub cx: f64,
+    /// Row of the optical axis.
+    pub cy: f64,
+}
+
+impl Intrinsics {
+    /// The parameters of a 3 x 3 camera matrix, row by row.
+    ///
+    /// # Errors
+    /// [`CameraError::Matrix`] where it has a skew or another last row.
+    pub fn from_matrix(rows: &[[f64; 3]; 3]) -> Result<Self, CameraError> {
+        let [[fx, skew, cx], [zero, fy, cy], last] = *rows;
+        if skew != 0.0 || zero != 0.0 || last != [0.0, 0.0, 1.0] {
+            return Err(CameraError::Matrix);
+        }
+        Ok(Self { fx, fy, cx, cy })
+    }
+}
+
+/// A camera: what it sees of the lidar's frame, and how large its image is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Camera {
+    intrinsics: Intrinsics,
+    camera_from_lidar: RigidTransform,
+    width: u32,
+    height: u32,
+}
+
+impl Camera {
+    /// A camera of `width` x `height` pixels. `camera_from_lidar` takes the frame that clouds are
+    /// in to the camera's: x right, y down, z forward.
+    ///
+    /// # Errors
+    /// [`CameraError`] for sizes, parameters and poses that no camera has.
+    pub fn new(
+        intrinsics: Intrinsics,
+        camera_from_lidar: RigidTransform,
+        [width, height]: [u32; 2],
+    ) -> Result<Self, CameraError> {
+        let sides = 1..=MAX_SIDE_PX;
+        let pixels = u64::from(width) * u64::from(height);
+        if !sides.contains(&width) || !sides.contains(&height) || pixels > MAX_PIXELS {
+            return Err(CameraError::Size { width, height });
+        }
+        let Intrinsics { fx, fy, cx, cy } = intrinsics;
+        for (name, value) in [("fx", fx), ("fy", fy)] {
+            if !(value > 0.0 && value <= MAX_FOCAL_PX) {
+                return Err(CameraError::Intrinsic {
+                    name,
+                    value,
+                    wanted: "it must be positive and at most 1e6",
+                });
+            }
+        }
+        for (name, value) in [("cx", cx), ("cy", cy)] {
+            // Not a number fails this too.
+            if !matches!(value.abs(), size if size <= MAX_FOCAL_PX) {
+                return Err(CameraError::Intrinsic {
+                    name,
+                    value,
+                    wanted: "it must lie within 1e6 of the image's corner",
+                });
+            }
+        }
+        let away = camera_from_lidar.translation.vector.norm();
+        let length = camera_from_lidar.rotation.quaternion().norm();
+        let is_unit = (length - 1.0).abs() <= UNIT_TOLERANCE;
+        if !away.is_finite() || away > MAX_MOUNT_M || !is_unit {
+            return Err(CameraError::Pose);
+        }
+        Ok(Self {
+            intrinsics,
+            camera_from_lidar,
+            width,
+            height,
+        })
+    }
+
+    /// Focal lengths and principal point.
+    pub fn intrinsics(&self) -> Intrinsics {
+        self.intrinsics
+    }
+
+    /// Where the lidar's points are for the camera.
+    pub fn camera_from_lidar(&self) -> &RigidTransform {
+        &self.camera_from_lidar
+    }
+
+    /// Pixels per row.
+    pub fn width(&self) -> u32 {
+        self.width
+    }
+
+    /// Rows.
+    pub fn height(&self) -> u32 {
+        self.height
+    }
+
+    /// Column, row and depth in metres of a point of the lidar's frame; none where it is not
+    /// finite, behind the camera, or outside the image.
+    pub fn pixel(&self, point: Point) -> Option<(usize, usize, f32)> {
+        let seen = self.camera_from_lidar * Point3::from(point.map(f64::from));
+        if !(seen.z >= NEAR_M && seen.z.is_finite()) {
+            return None;
+        }
+        let Intrinsics { fx, fy, cx, cy } = self.intrinsics;
+        let column = (fx * seen.x / seen.z + cx).round();
+        let row = (fy * seen.y / seen.z + cy).round();
+        let inside = |value: f64, side: u32| (0.0..f64::from(side)).contains(&value);
+        (inside(column, self.width) && inside(row, self.height)).then_some((
+            column as usize,
+            row as usize,
+            seen.z as f32,
+        ))
+    }
+
+    /// The ray through the middle of a pixel in the camera's frame, one metre deep.
+    pub fn ray(&self, column: u32, row: u32) -> Vector3<f64> {
+        let Intrinsics { fx, fy, cx, cy } = self.intrinsics;
+        let across = (f64::from(column) - cx) / fx;
+        Vector3::new(across, (f64::from(row) - cy) / fy, 1.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PLAIN: Intrinsics = Intrinsics {
+        fx: 100.0,
+        fy: 50.0,
+        cx: 20.0,
+        cy: 10.0,
+    };
+
+    fn camera() -> Camera {
+        Camera::new(PLAIN, RigidTransform::identity(), [40, 20]).unwrap()
+    }
+
+    #[test]
+    fn a_ray_leads_back_to_its_pixel() {
+        for (column, row) in [(0, 0), (39, 19), (20, 10), (7, 3)] {
+            let point = camera().ray(column, row) * 12.5;
+            let point = [point.x as f32, point.y as f32, point.z as f32];
+            let seen = camera().pixel(point).unwrap();
+            assert_eq!(seen, (column as usize, row as usize, 12.5));
+        }
+    }
+
+    #[test]
+    fn points_behind_outside_or_nowhere_are_not_seen() {
+        for point in [
+            [0.0, 0.0, -1.0],
+            [0.0, 0.0, 0.0],
+            [5.0, 0.0, 1.0],
+            [0.0, -9.0, 1.0],
+            [f32::NAN, 0.0, 1.0],
+            [0.0, 0.0, f32::INFINITY],
+        ] {
+            assert_eq!(camera().pixel(point), None, "{point:?}");
+        }
+    }
+
+    #[test]
+    fn what_is_no_camera_is_refused() {
+        let identity = RigidTransform::identity();
+        for size in [[0, 5], [5, 0], [MAX_SIDE_PX + 1, 5], [MAX_SIDE_PX; 2]] {
+            let refused = Camera::new(PLAIN, identity, size);
+            assert!(matches!(refused, Err(CameraError::Size { .. })), "{size:?}");
+        }
+        for value in [f64::NAN, f64::INFINITY, 0.0, -1.0] {
+            let fx = Intrinsics { fx: value, ..PLAIN };
+            assert!(Camera::new(fx, identity, [4, 4]).is_err(), "{value}");
+        }
+        let cy = Intrinsics {
+            cy: f64::NAN,
+            ..PLAIN
+        };
+        let refused = Camera::new(cy, identity, [4, 4]).unwrap_err().to_string();
+        assert!(refused.starts_with("cy of the camera"), "{refused}");
+        let far = RigidTransform::translation(f64::NAN, 0.0, 0.0);
+        assert_eq!(Camera::new(PLAIN, far, [4, 4]), Err(CameraError::Pose));
+    }
+
+    #[test]
+    fn a_skewed_camera_matrix_is_refused() {
+        let plain = [[100.0, 0.0, 20.0], [0.0, 50.0, 10.0], [0.0, 0.0, 1.0]];
+        assert_eq!(Intrinsics::from_matrix(&plain), Ok(PLAIN));
+        let mut skewed = plain;
+        skewed[0][1] = 1.0;
+        assert_eq!(Intrinsics::from_matrix(&skewed), Err(CameraError::Matrix));
+    }
+}

@@ -1,0 +1,89 @@
+//! A depth image, and a cloud projected into one.
+//!
+//! It must not know files or colors.
+
+use super::camera::Camera;
+use crate::flow::Point;
+
+/// Depths along the optical axis, not along rays.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DepthImage {
+    /// Pixels per row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// Depth of each pixel, metres, row by row from the top; 0 where nothing is known.
+    pub metres: Vec<f32>,
+}
+
+impl DepthImage {
+    /// An image of which nothing is known.
+    pub fn empty(width: u32, height: u32) -> Self {
+        Self {
+            width,
+            height,
+            metres: vec![0.0; width as usize * height as usize],
+        }
+    }
+
+    /// Pixels whose depth is known.
+    pub fn known(&self) -> usize {
+        self.metres.iter().filter(|&&metres| metres > 0.0).count()
+    }
+
+    /// Share of all pixels whose depth is known, 0 to 1.
+    pub fn density(&self) -> f64 {
+        self.known() as f64 / self.metres.len().max(1) as f64
+    }
+}
+
+/// What a camera sees of some points of its lidar's frame, metres: in every pixel the nearest of
+/// those that fall on it. Points that are not finite, behind the camera or outside its image are
+/// left out.
+pub fn project(points: &[Point], camera: &Camera) -> DepthImage {
+    let mut image = DepthImage::empty(camera.width(), camera.height());
+    let width = camera.width() as usize;
+    for &point in points {
+        let Some((column, row, depth)) = camera.pixel(point) else {
+            continue;
+        };
+        let nearest = &mut image.metres[row * width + column];
+        if *nearest == 0.0 || depth < *nearest {
+            *nearest = depth;
+        }
+    }
+    image
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::camera::Intrinsics;
+    use super::*;
+    use crate::flow::RigidTransform;
+
+    fn camera() -> Camera {
+        let intrinsics = Intrinsics {
+            fx: 10.0,
+            fy: 10.0,
+            cx: 2.0,
+            cy: 1.0,
+        };
+        Camera::new(intrinsics, RigidTransform::identity(), [5, 3]).unwrap()
+    }
+
+    #[test]
+    fn the_nearest_point_of_a_pixel_wins_in_any_order() {
+        let points = [[0.0, 0.0, 9.0], [0.0, 0.0, 4.0], [0.0, 0.0, 6.0]];
+        let image = project(&points, &camera());
+        assert_eq!(image.metres[5 + 2], 4.0);
+        assert_eq!((image.known(), image.density()), (1, 1.0 / 15.0));
+        let turned = points.iter().rev().copied().collect::<Vec<_>>();
+        assert_eq!(project(&turned, &camera()), image);
+    }
+
+    #[test]
+    fn what_is_not_in_view_leaves_no_depth() {
+        let points = [[0.0, 0.0, -4.0], [f32::NAN; 3], [90.0, 0.0, 4.0]];
+        assert_eq!(project(&points, &camera()), DepthImage::empty(5, 3));
+    }
+}

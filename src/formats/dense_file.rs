@@ -1,0 +1,162 @@
+//! A dense cloud out: one row per point, with the sweep that measured it, its age and its masks.
+//!
+//! It must not know how the sweeps were carried into one frame.
+
+use std::io::{Cursor, Write};
+
+use crate::flow::DenseCloud;
+
+use super::error::{FileKind, FormatError, shorten};
+use super::limits::{check_points, check_value};
+use super::npz::NpzWriter;
+use super::pair::check_count;
+use super::sniff::ending;
+use super::{las, npy, pcd, ply};
+
+/// The formats that a dense cloud is written in. All but LAS and LAZ read back as clouds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum DenseFormat {
+    /// `points` M x 3 float32, `frame` uint32, `age` float32, `dynamic` bool, `converged` bool.
+    Npz,
+    /// Binary little endian: x y z, `frame`, `age`, `dynamic`, `converged`.
+    Ply,
+    /// The same as binary PCD.
+    Pcd,
+    /// LAS 1.4 compressed: to the millimetre; the frame as point source, the age as an extra
+    /// dimension, bit 0 of the user data where dynamic, withheld where not converged.
+    Laz,
+    /// The same, not compressed.
+    Las,
+}
+
+/// Every format with its media type and its ending; the first is the default.
+pub const DENSE_FORMATS: [(DenseFormat, &str, &str); 5] = [
+    (DenseFormat::Npz, "application/x-npz", "npz"),
+    (DenseFormat::Ply, "application/x-ply", "ply"),
+    (DenseFormat::Pcd, "application/x-pcd", "pcd"),
+    (DenseFormat::Laz, "application/vnd.laszip", "laz"),
+    (DenseFormat::Las, "application/vnd.las", "las"),
+];
+
+impl DenseFormat {
+    /// The endings that [`DenseFormat::from_path`] knows.
+    pub const KNOWN: &'static str = ".npz, .ply, .pcd, .laz, .las";
+
+    /// The format that a file name's ending names.
+    ///
+    /// # Errors
+    /// `UnknownExtension`, which lists the endings that are known.
+    pub fn from_path(path: &std::path::Path) -> Result<Self, FormatError> {
+        let name = path
+            .file_name()
+            .map(|name| name.to_string_lossy())
+            .unwrap_or_default();
+        let wanted = ending(&name);
+        DENSE_FORMATS
+            .iter()
+            .find(|(_, _, known)| *known == wanted)
+            .map(|(format, ..)| *format)
+            .ok_or_else(|| FormatError::UnknownExtension {
+                name: shorten(&name),
+                known: Self::KNOWN,
+            })
+    }
+
+    fn kind(self) -> FileKind {
+        match self {
+            Self::Npz => FileKind::Npz,
+            Self::Ply => FileKind::Ply,
+            Self::Pcd => FileKind::Pcd,
+            Self::Laz | Self::Las => FileKind::Las,
+        }
+    }
+}
+
+/// Writes a dense cloud.
+///
+/// # Errors
+/// `RowCount` where its lists differ in length, `NotFinite` or `OutOfRange` for a place or an age
+/// that could not be read back, `Unsupported` where LAS cannot hold a frame's number, `Write` and
+/// `Encode` where writing fails.
+pub fn write_dense<W: Write>(
+    format: DenseFormat,
+    cloud: &DenseCloud,
+    out: &mut W,
+) -> Result<(), FormatError> {
+    let count = cloud.points.len();
+    check_count("frame", cloud.frame.len(), count)?;
+    check_count("age", cloud.age.len(), count)?;
+    check_count("dynamic", cloud.dynamic.len(), count)?;
+    check_count("converged", cloud.converged.len(), count)?;
+    let kind = format.kind();
+    check_points(kind, "points", &cloud.points)?;
+    for (row, &age) in cloud.age.iter().enumerate() {
+        check_value(kind, row, "age", f64::from(age))?;
+    }
+    match format {
+        DenseFormat::Npz => write_npz(cloud, out),
+        DenseFormat::Ply => write_ply(cloud, out),
+        DenseFormat::Pcd => write_pcd(cloud, out),
+        DenseFormat::Laz => las::write(cloud, true, out),
+        DenseFormat::Las => las::write(cloud, false, out),
+    }
+}
+
+fn write_npz<W: Write>(cloud: &DenseCloud, out: &mut W) -> Result<(), FormatError> {
+    let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
+    npz.points("points", &cloud.points)?;
+    npz.array("frame", |out| npy::write_counts(out, &cloud.frame))?;
+    npz.array("age", |out| npy::write_values(out, &cloud.age))?;
+    npz.mask("dynamic", &cloud.dynamic)?;
+    npz.mask("converged", &cloud.converged)?;
+    out.write_all(npz.finish()?.get_ref())?;
+    Ok(())
+}
+
+fn write_ply<W: Write>(cloud: &DenseCloud, out: &mut W) -> Result<(), FormatError> {
+    let properties = [
+        ("float", "x"),
+        ("float", "y"),
+        ("float", "z"),
+        ("uint", "frame"),
+        ("float", "age"),
+        ("uchar", "dynamic"),
+        ("uchar", "converged"),
+    ];
+    let comment = "age is in sweeps, positive where a point was measured before";
+    ply::write_header(out, cloud.points.len(), &[comment], &properties)?;
+    write_rows(cloud, out)
+}
+
+fn write_pcd<W: Write>(cloud: &DenseCloud, out: &mut W) -> Result<(), FormatError> {
+    let fields = [
+        ("x", 4, 'F'),
+        ("y", 4, 'F'),
+        ("z", 4, 'F'),
+        ("frame", 4, 'U'),
+        ("age", 4, 'F'),
+        ("dynamic", 1, 'U'),
+        ("converged", 1, 'U'),
+    ];
+    pcd::write_header(out, cloud.points.len(), &fields)?;
+    write_rows(cloud, out)
+}
+
+/// Rows of point, frame, age and masks, little endian.
+fn write_rows<W: Write>(cloud: &DenseCloud, out: &mut W) -> Result<(), FormatError> {
+    const FLUSH_AT: usize = 64 << 10;
+    let mut bytes = Vec::with_capacity(FLUSH_AT + 64);
+    for (row, point) in cloud.points.iter().enumerate() {
+        bytes.extend(point.iter().flat_map(|value| value.to_le_bytes()));
+        bytes.extend(cloud.frame[row].to_le_bytes());
+        bytes.extend(cloud.age[row].to_le_bytes());
+        bytes.push(u8::from(cloud.dynamic[row]));
+        bytes.push(u8::from(cloud.converged[row]));
+        if bytes.len() >= FLUSH_AT {
+            out.write_all(&bytes)?;
+            bytes.clear();
+        }
+    }
+    out.write_all(&bytes)?;
+    Ok(())
+}

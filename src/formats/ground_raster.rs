@@ -1,0 +1,132 @@
+//! Argoverse 2's ground-height raster of a city, and which points of a sweep it calls ground.
+//!
+//! It must not know scene flow.
+
+use nalgebra::Point3;
+
+use crate::flow::{Point, RigidTransform};
+
+use super::error::{FileKind, FormatError};
+use super::npy::Header;
+
+/// Points at most this far above the raster's height, or anywhere below it, are ground, metres.
+/// Argoverse 2's own threshold.
+const GROUND_M: f64 = 0.3;
+
+/// How far the similarity's rotation may be from orthonormal.
+const RIGID_TOLERANCE: f64 = 1e-6;
+
+/// Heights of a city's ground on a grid.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GroundRaster {
+    /// Metres in the city's frame, row by row; NaN where they are not known.
+    heights: Vec<f32>,
+    columns: usize,
+    raster_from_city: Similarity,
+}
+
+/// A cell's column and row are s (R x + t).
+#[derive(Debug, Clone, Copy, PartialEq, serde::Deserialize)]
+struct Similarity {
+    #[serde(rename = "R")]
+    rotation: [f64; 4],
+    #[serde(rename = "t")]
+    translation: [f64; 2],
+    #[serde(rename = "s")]
+    scale: f64,
+}
+
+impl GroundRaster {
+    /// Reads `*_ground_height_surface____*.npy` and `*___img_Sim2_city.json`.
+    ///
+    /// # Errors
+    /// `Malformed` and `Unsupported`, where the first is not a two-dimensional array of floats
+    /// whose bytes are there, or the second is not a similarity of the plane.
+    pub fn read(heights: &[u8], raster_from_city: &[u8]) -> Result<Self, FormatError> {
+        let kind = FileKind::Npy;
+        let mut rest = heights;
+        let header = Header::read(kind, &mut rest)?;
+        let Some((rows, columns)) = header.table().filter(|_| header.scalar.is_float()) else {
+            return Err(kind.unsupported(format!(
+                "a raster of heights is two-dimensional and of floats, not of shape {:?}",
+                header.shape
+            )));
+        };
+        let declared = header.data_len(kind)?;
+        if declared > rest.len() as u64 {
+            return Err(kind.malformed(format!(
+                "a raster of {rows} x {columns} needs {declared} bytes where {} are left",
+                rest.len()
+            )));
+        }
+        let mut cells = vec![f32::NAN; rows * columns];
+        let order = header.order;
+        let fortran = header.fortran;
+        header
+            .scalar
+            .each(order, rows * columns, kind, &mut rest, |index, height| {
+                let at = if fortran {
+                    index % rows * columns + index / rows
+                } else {
+                    index
+                };
+                cells[at] = height as f32;
+                Ok(())
+            })?;
+        Ok(Self {
+            heights: cells,
+            columns,
+            raster_from_city: Similarity::read(raster_from_city)?,
+        })
+    }
+
+    /// Which points of a sweep are ground: at most 0.3 m from the raster's height, or below it.
+    /// Points past the raster's edge, or where it has no height, are not. `city_from_frame` is the
+    /// sweep's pose in the city. N rows in, N rows out.
+    pub fn ground(&self, points: &[Point], city_from_frame: &RigidTransform) -> Vec<bool> {
+        let is_ground = |point: &Point| {
+            let place = city_from_frame * Point3::from(point.map(f64::from));
+            self.height(place.x, place.y)
+                .is_some_and(|height| place.z - height <= GROUND_M)
+        };
+        points.iter().map(is_ground).collect()
+    }
+
+    /// Height of the ground at a place of the city, metres.
+    fn height(&self, x: f64, y: f64) -> Option<f64> {
+        // Cells are found by cutting the fraction off, as Argoverse 2's own tools do.
+        let [column, row] = self.raster_from_city.cell(x, y).map(f64::trunc);
+        if !(column >= 0.0 && column < self.columns as f64 && row >= 0.0) {
+            return None;
+        }
+        let index = (row as usize).checked_mul(self.columns)? + column as usize;
+        let height = f64::from(*self.heights.get(index)?);
+        (!height.is_nan()).then_some(height)
+    }
+}
+
+impl Similarity {
+    fn read(bytes: &[u8]) -> Result<Self, FormatError> {
+        let kind = FileKind::Json;
+        let read: Self =
+            serde_json::from_slice(bytes).map_err(|error| kind.malformed(error.to_string()))?;
+        let [a, b, c, d] = read.rotation;
+        let departure = [a * a + c * c - 1.0, b * b + d * d - 1.0, a * b + c * d];
+        let is_rotation = departure.iter().all(|value| value.abs() <= RIGID_TOLERANCE);
+        let numbers = read.translation.into_iter().chain([read.scale]);
+        if !is_rotation || read.scale <= 0.0 || numbers.into_iter().any(|n| !n.is_finite()) {
+            return Err(kind.malformed("R, t and s are no similarity of the plane"));
+        }
+        Ok(read)
+    }
+
+    /// Column and row, with their fractions.
+    fn cell(&self, x: f64, y: f64) -> [f64; 2] {
+        let [a, b, c, d] = self.rotation;
+        let [right, down] = self.translation;
+        [
+            (a * x + b * y + right) * self.scale,
+            (c * x + d * y + down) * self.scale,
+        ]
+    }
+}

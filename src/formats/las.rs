@@ -1,0 +1,104 @@
+//! LAS and LAZ, what surveyors exchange: written only.
+//!
+//! Version 1.4, point format 0, and the age as one extra dimension. It must not know what the
+//! points show.
+
+use std::io::{Cursor, Write};
+
+use las::point::Format;
+use las::{Builder, Point, Transform, Vector, Version, Vlr, Writer};
+
+use crate::flow::DenseCloud;
+
+use super::error::{FileKind, FormatError};
+
+const KIND: FileKind = FileKind::Las;
+
+/// Steps of a coordinate, metres, from the frame's origin: 32 bits of them reach 2,147 km.
+const SCALE_M: f64 = 0.001;
+
+/// Bit of the user data that says that a point moved by itself.
+const DYNAMIC: u8 = 1;
+
+/// Bytes of a float32 extra dimension.
+const AGE_BYTES: u16 = 4;
+
+/// Writes M points, compressed or not, with the same bytes for the same cloud.
+///
+/// # Errors
+/// `Unsupported` for frames past 65,535, `Encode` and `Write` where writing fails.
+pub(super) fn write<W: Write>(
+    cloud: &DenseCloud,
+    compressed: bool,
+    out: &mut W,
+) -> Result<(), FormatError> {
+    let encode = |error| KIND.encode(error);
+    let mut builder = Builder::from(Version::new(1, 4));
+    let step = Transform {
+        scale: SCALE_M,
+        offset: 0.0,
+    };
+    builder.transforms = Vector {
+        x: step,
+        y: step,
+        z: step,
+    };
+    builder.point_format = Format {
+        extra_bytes: AGE_BYTES,
+        is_compressed: compressed,
+        ..Format::default()
+    };
+    builder.system_identifier = "EXTRACTION".to_owned();
+    builder.generating_software = "fnsf".to_owned();
+    builder.vlrs.push(age_record());
+    let header = builder.into_header().map_err(encode)?;
+    let mut writer = Writer::new(Cursor::new(Vec::new()), header).map_err(encode)?;
+    for (row, point) in cloud.points.iter().enumerate() {
+        let [x, y, z] = point.map(f64::from);
+        let frame = cloud.frame[row];
+        let point_source_id = u16::try_from(frame).map_err(|_| {
+            KIND.unsupported(format!(
+                "it numbers {} sweeps at most, row {row} has frame {frame}; write npz, ply or pcd",
+                u32::from(u16::MAX) + 1
+            ))
+        })?;
+        let point = Point {
+            x,
+            y,
+            z,
+            return_number: 1,
+            number_of_returns: 1,
+            user_data: if cloud.dynamic[row] { DYNAMIC } else { 0 },
+            // LAS's own way to say that a point should not be used.
+            is_withheld: !cloud.converged[row],
+            point_source_id,
+            extra_bytes: cloud.age[row].to_le_bytes().to_vec(),
+            ..Point::default()
+        };
+        writer.write_point(point).map_err(encode)?;
+    }
+    out.write_all(writer.into_inner().map_err(encode)?.get_ref())?;
+    Ok(())
+}
+
+/// The record that names and types the extra bytes of every point.
+fn age_record() -> Vlr {
+    const EXTRA_BYTES_RECORD: u16 = 4;
+    const DESCRIPTOR_BYTES: usize = 192;
+    const FLOAT: u8 = 9;
+    const TYPE_AT: usize = 2;
+    const NAME_AT: usize = 4;
+    const DESCRIPTION_AT: usize = 160;
+    const NAME: &[u8] = b"age";
+    const DESCRIPTION: &[u8] = b"sweeps since it was measured";
+    let mut data = vec![0; DESCRIPTOR_BYTES];
+    data[TYPE_AT] = FLOAT;
+    data[NAME_AT..][..NAME.len()].copy_from_slice(NAME);
+    data[DESCRIPTION_AT..][..DESCRIPTION.len()].copy_from_slice(DESCRIPTION);
+    Vlr {
+        user_id: "LASF_Spec".to_owned(),
+        record_id: EXTRA_BYTES_RECORD,
+        description: "extra dimensions".to_owned(),
+        data,
+    }
+}

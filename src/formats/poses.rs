@@ -1,0 +1,162 @@
+//! Where each sweep of a sequence was taken: KITTI's text, our JSON, Argoverse 2's table.
+//!
+//! A pose is `world_from_frame`; between two sweeps lies
+//! `world_from_target.inv_mul(&world_from_source)`. It must not know whose poses they are.
+
+use std::collections::HashMap;
+
+use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+
+use crate::flow::RigidTransform;
+
+use super::camera::with_last_row;
+use super::error::{FileKind, FormatError, shorten};
+use super::feather::{self, Table};
+use super::motion::rigid_motion;
+
+const KIND: FileKind = FileKind::Poses;
+
+/// Most poses of one file of text or JSON.
+const MAX_POSES: usize = 1_000_000;
+
+/// How far a stored quaternion's length may be from 1: float32 ones are within 1e-6.
+const UNIT_TOLERANCE: f64 = 1e-3;
+
+/// Argoverse 2's columns of a rotation and a place, metres.
+const AV2_COLUMNS: [&str; 7] = ["qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"];
+
+/// Reads `world_from_frame` of every sweep, in the order of `frames`, their file names without
+/// folder; recognized by content.
+///
+/// - KITTI's odometry text: 12 numbers a line, the first three rows of a matrix. Its own poses are
+///   those of camera 0; see [`super::read_camera0_from_lidar`].
+/// - JSON: an array of 4 x 4 matrices, row by row.
+/// - Argoverse 2's `city_SE3_egovehicle.feather`: the rows whose `timestamp_ns` are the frames'
+///   names, compared in float64, which tells 64 ns apart.
+///
+/// Text and JSON have a pose for every frame, in order; or poses for a whole drive, of which each
+/// frame whose name is a number takes the one of that number, counted from 0.
+///
+/// # Errors
+/// `Malformed` names the line, `RowCount` a wrong number of poses, `Missing` a frame without
+/// one, `Motion` what is not rigid, `TooLarge` more than a million poses.
+pub fn read_poses(bytes: &[u8], frames: &[&str]) -> Result<Vec<RigidTransform>, FormatError> {
+    if bytes.starts_with(feather::MAGIC) {
+        return read_av2(bytes, frames);
+    }
+    let poses = match bytes.trim_ascii_start().first() {
+        Some(b'[') => serde_json::from_slice(bytes)
+            .map_err(|error| KIND.malformed(format!("not an array of 4 x 4 matrices: {error}")))?,
+        _ => read_text(bytes)?,
+    };
+    let chosen: Option<Vec<&[[f64; 4]; 4]>> = if poses.len() == frames.len() {
+        Some(poses.iter().collect())
+    } else {
+        let pose = |frame: &&str| poses.get(stem(frame).parse::<usize>().ok()?);
+        frames.iter().map(pose).collect()
+    };
+    let Some(chosen) = chosen else {
+        return Err(FormatError::RowCount {
+            what: "the file of poses".to_owned(),
+            found: poses.len(),
+            expected: frames.len(),
+        });
+    };
+    let pose = |(frame, rows): (&&str, &[[f64; 4]; 4])| {
+        rigid_motion(rows).map_err(|_| {
+            KIND.malformed(format!(
+                "the pose of {} is no rigid transform of finite numbers",
+                shorten(frame)
+            ))
+        })
+    };
+    frames.iter().zip(chosen).map(pose).collect()
+}
+
+/// A file's name without folder and ending.
+fn stem(frame: &str) -> &str {
+    let file = frame.rsplit(['/', '\\']).next().unwrap_or(frame);
+    file.split_once('.').map_or(file, |(stem, _)| stem)
+}
+
+fn read_text(bytes: &[u8]) -> Result<Vec<[[f64; 4]; 4]>, FormatError> {
+    let text = std::str::from_utf8(bytes).map_err(|_| {
+        KIND.malformed("neither 12 numbers a line, nor JSON, nor Argoverse 2's feather")
+    })?;
+    let mut poses = Vec::new();
+    for (index, line) in text.lines().enumerate() {
+        if line.trim().is_empty() {
+            continue;
+        }
+        if poses.len() == MAX_POSES {
+            return Err(KIND.too_large(format!("more than {MAX_POSES} poses")));
+        }
+        let wrong = || KIND.malformed(format!("line {} is not 12 numbers", index + 1));
+        let mut words = line.split_ascii_whitespace();
+        let mut numbers = [0.0; 12];
+        for number in &mut numbers {
+            let word = words.next().ok_or_else(wrong)?;
+            *number = word.parse().map_err(|_| wrong())?;
+        }
+        if words.next().is_some() {
+            return Err(wrong());
+        }
+        poses.push(with_last_row(&numbers));
+    }
+    Ok(poses)
+}
+
+fn read_av2(bytes: &[u8], frames: &[&str]) -> Result<Vec<RigidTransform>, FormatError> {
+    let table = Table::open(bytes)?;
+    let time = |frame: &&str| {
+        // Nanoseconds as the table hands them out.
+        let time = stem(frame).parse::<i64>().map(|time| time as f64);
+        time.map_err(|_| {
+            FileKind::Feather.unsupported(format!(
+                "poses are found by time stamp, and the sweep {} is not named by one",
+                shorten(frame)
+            ))
+        })
+    };
+    let times: Vec<f64> = frames.iter().map(time).collect::<Result<_, _>>()?;
+    let mut found: HashMap<u64, Option<usize>> =
+        times.iter().map(|time| (time.to_bits(), None)).collect();
+    table.each("timestamp_ns", |row, stamp| {
+        if let Some(found) = found.get_mut(&stamp.to_bits()) {
+            found.get_or_insert(row);
+        }
+        Ok(())
+    })?;
+    let mut values: HashMap<usize, [f64; 7]> = found
+        .values()
+        .flatten()
+        .map(|&row| (row, [0.0; 7]))
+        .collect();
+    for (column, name) in AV2_COLUMNS.into_iter().enumerate() {
+        table.each(name, |row, value| {
+            if let Some(values) = values.get_mut(&row) {
+                values[column] = value;
+            }
+            Ok(())
+        })?;
+    }
+    let pose = |(frame, time): (&&str, &f64)| {
+        let row = found.get(&time.to_bits()).copied().flatten();
+        let Some(values) = row.and_then(|row| values.get(&row)) else {
+            let present = [format!("{} poses of other times", table.rows())];
+            let what = format!("a pose at the time of {}", shorten(frame));
+            return Err(FileKind::Feather.missing(what, &present));
+        };
+        let [w, x, y, z, place @ ..] = *values;
+        let rotation = Quaternion::new(w, x, y, z);
+        let is_unit = (rotation.norm() - 1.0).abs() <= UNIT_TOLERANCE;
+        if !is_unit || place.iter().any(|metres| !metres.is_finite()) {
+            return Err(FormatError::Motion("a pose is not a rigid transform"));
+        }
+        Ok(RigidTransform::from_parts(
+            Translation3::from(place),
+            UnitQuaternion::from_quaternion(rotation),
+        ))
+    };
+    frames.iter().zip(&times).map(pose).collect()
+}

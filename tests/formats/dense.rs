@@ -1,0 +1,153 @@
+//! Dense clouds: written in every format, read back as clouds and row by row.
+
+use std::io::Cursor;
+use std::path::Path;
+
+use fnsf::flow::DenseCloud;
+use fnsf::formats::{DENSE_FORMATS, DenseFormat, FormatError, read_cloud, write_dense};
+
+use crate::samples::{pattern, points};
+
+/// LAS rounds to whole millimetres: half of one, and float32's share of 60 m.
+const LAS_STEP_M: f64 = 0.0005 + 5e-6;
+
+fn dense(count: usize) -> DenseCloud {
+    DenseCloud {
+        points: points(count),
+        frame: (0..count as u32).map(|row| row % 7).collect(),
+        age: (0..count).map(|row| 3.0 - (row % 7) as f32).collect(),
+        dynamic: pattern(count, 3),
+        converged: pattern(count, 5).into_iter().map(|flag| !flag).collect(),
+    }
+}
+
+fn file(format: DenseFormat, cloud: &DenseCloud) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    write_dense(format, cloud, &mut bytes).unwrap();
+    bytes
+}
+
+#[test]
+fn a_dense_cloud_reads_back_as_a_cloud() {
+    let dense = dense(1000);
+    for format in [DenseFormat::Npz, DenseFormat::Ply, DenseFormat::Pcd] {
+        let cloud = read_cloud(&file(format, &dense), None).unwrap();
+        assert_eq!(cloud.points, dense.points, "{format:?}");
+        let empty = file(format, &DenseCloud::default());
+        assert_eq!(read_cloud(&empty, None).unwrap().points.len(), 0);
+    }
+}
+
+/// Ply and pcd share their rows: 12 bytes of place, 4 of frame, 4 of age, a byte a mask.
+#[test]
+fn ply_and_pcd_rows_hold_frame_age_and_masks() {
+    const STRIDE: usize = 22;
+    let dense = dense(50);
+    let ply = file(DenseFormat::Ply, &dense);
+    let pcd = file(DenseFormat::Pcd, &dense);
+    let rows = &ply[ply.len() - 50 * STRIDE..];
+    assert!(pcd.ends_with(rows));
+    for (row, bytes) in rows.chunks_exact(STRIDE).enumerate() {
+        assert_eq!(bytes[12..16], dense.frame[row].to_le_bytes());
+        assert_eq!(bytes[16..20], dense.age[row].to_le_bytes());
+        let masks = [dense.dynamic[row], dense.converged[row]].map(u8::from);
+        assert_eq!(bytes[20..], masks);
+    }
+    let header = String::from_utf8_lossy(&ply[..ply.len() - rows.len()]).into_owned();
+    assert!(header.contains("property uint frame\nproperty float age\nproperty uchar dynamic"));
+    let header = String::from_utf8_lossy(&pcd[..pcd.len() - rows.len()]).into_owned();
+    assert!(header.contains("FIELDS x y z frame age dynamic converged\nSIZE 4 4 4 4 4 1 1\n"));
+}
+
+#[test]
+fn npz_arrays_have_the_types_that_they_are_documented_with() {
+    let bytes = file(DenseFormat::Npz, &dense(9));
+    let mut archive = zip::ZipArchive::new(Cursor::new(bytes)).unwrap();
+    for (name, descr, shape) in [
+        ("points", "<f4", "(9, 3)"),
+        ("frame", "<u4", "(9,)"),
+        ("age", "<f4", "(9,)"),
+        ("dynamic", "|b1", "(9,)"),
+        ("converged", "|b1", "(9,)"),
+    ] {
+        let mut array = Vec::new();
+        let mut member = archive.by_name(&format!("{name}.npy")).unwrap();
+        std::io::copy(&mut member, &mut array).unwrap();
+        let header = String::from_utf8_lossy(&array[10..74]).into_owned();
+        assert!(header.contains(descr) && header.contains(shape), "{header}");
+    }
+}
+
+#[test]
+fn las_and_laz_come_back_through_another_reader() {
+    let dense = dense(2000);
+    for format in [DenseFormat::Laz, DenseFormat::Las] {
+        let mut reader = las::Reader::new(Cursor::new(file(format, &dense))).unwrap();
+        assert_eq!(reader.header().number_of_points(), 2000);
+        let extra = &reader.header().vlrs()[0];
+        assert_eq!(
+            (extra.record_id, &extra.data[..8]),
+            (4, &b"\0\0\x09\0age\0"[..])
+        );
+        let read = reader.read_all().unwrap();
+        for (row, point) in read.points().enumerate() {
+            let point = point.unwrap();
+            let found = [point.x, point.y, point.z];
+            for (found, written) in found.into_iter().zip(dense.points[row]) {
+                assert!((found - f64::from(written)).abs() <= LAS_STEP_M, "{row}");
+            }
+            assert_eq!(u32::from(point.point_source_id), dense.frame[row]);
+            assert_eq!(point.extra_bytes, dense.age[row].to_le_bytes());
+            assert_eq!(point.user_data == 1, dense.dynamic[row]);
+            assert_eq!(point.is_withheld, !dense.converged[row]);
+        }
+    }
+    let laz = file(DenseFormat::Laz, &dense);
+    assert_eq!(laz, file(DenseFormat::Laz, &dense), "the same bytes again");
+    assert!(laz.len() < file(DenseFormat::Las, &dense).len());
+    file(DenseFormat::Laz, &DenseCloud::default());
+}
+
+#[test]
+fn a_frame_past_sixteen_bits_is_refused_in_las_alone() {
+    let mut dense = dense(3);
+    dense.frame[1] = 65_536;
+    let error = write_dense(DenseFormat::Laz, &dense, &mut Vec::new()).unwrap_err();
+    let text = error.to_string();
+    assert!(text.contains("row 1 has frame 65536; write npz"), "{text}");
+    file(DenseFormat::Npz, &dense);
+}
+
+#[test]
+fn a_dense_cloud_that_no_reader_would_take_is_refused() {
+    for (format, ..) in DENSE_FORMATS {
+        let mut short = dense(4);
+        short.converged.pop();
+        let error = write_dense(format, &short, &mut Vec::new()).unwrap_err();
+        assert!(matches!(error, FormatError::RowCount { .. }), "{error}");
+        let mut lost = dense(4);
+        lost.points[2][1] = f32::NAN;
+        let error = write_dense(format, &lost, &mut Vec::new()).unwrap_err();
+        assert!(
+            matches!(error, FormatError::NotFinite { row: 2, .. }),
+            "{error}"
+        );
+        let mut ageless = dense(4);
+        ageless.age[3] = f32::INFINITY;
+        assert!(write_dense(format, &ageless, &mut Vec::new()).is_err());
+    }
+}
+
+#[test]
+fn dense_formats_are_named_by_ending() {
+    for (format, _, ending) in DENSE_FORMATS {
+        let name = format!("out/dense.{}", ending.to_uppercase());
+        assert_eq!(DenseFormat::from_path(Path::new(&name)).unwrap(), format);
+        assert!(DenseFormat::KNOWN.contains(&format!(".{ending}")));
+    }
+    let error = DenseFormat::from_path(Path::new("dense.e57")).unwrap_err();
+    assert!(
+        error.to_string().contains("end it in one of .npz"),
+        "{error}"
+    );
+}
