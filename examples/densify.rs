@@ -21,7 +21,7 @@ use fnsf::flow::densify::{Later, Leg, Plan, densify};
 use fnsf::flow::distance::{DistanceOptions, Sites};
 use fnsf::flow::ground::{GroundOptions, segment};
 use fnsf::flow::simulate::{Frame, Street, StreetOptions};
-use fnsf::flow::{DenseCloud, Ego, Field, Ground, Point, Preset, Sequence, Sweep, Unwatched};
+use fnsf::flow::{DenseCloud, Field, Point, Preset, Sequence, Sweep, Unwatched};
 use fnsf::formats::read_cloud;
 
 /// Sweeps of a simulated drive, and the one that all are carried into.
@@ -32,22 +32,21 @@ type Fields = BTreeMap<Leg, Field>;
 
 /// Fits all legs of the plans, each chain from its beginning.
 fn fit(backend: &CpuBackend, sweeps: &[Sweep], plans: &[Plan]) -> anyhow::Result<Fields> {
-    let mut options = Preset::Default.options(None);
-    options.ground = Ground::Auto;
-    options.ego = Ego::Auto;
+    let options = Preset::Default.options(None);
     let mut fields = Fields::new();
     for plan in plans {
-        let mut sequence = Sequence::new(backend, options.clone());
+        let mut sequence = Sequence::default();
         let mut last = None;
         for leg in plan.legs() {
             if fields.contains_key(&leg) {
                 continue;
             }
             if last != Some(leg.source) {
-                sequence = Sequence::new(backend, options.clone());
-                sequence.push(sweeps[leg.source].clone(), None, &Unwatched)?;
+                sequence = Sequence::default();
+                sequence.push(backend, sweeps[leg.source].clone(), &options, &Unwatched)?;
             }
-            let estimate = sequence.push(sweeps[leg.target].clone(), None, &Unwatched)?;
+            let estimate =
+                sequence.push(backend, sweeps[leg.target].clone(), &options, &Unwatched)?;
             last = Some(leg.target);
             fields.extend(estimate.map(|estimate| (leg, estimate.field)));
         }
