@@ -175,9 +175,20 @@ mod tests {
         let ground = [false, false, false, false, false, false, true];
         let mut options = Preset::Default.options(None);
         options.range_m = Some(51.2);
+        options.ground = Ground::Keep;
         assert_eq!(rows(&options, &source, Some(&ground)), [0, 2, 5, 6]);
-        options.ground = Ground::Mask;
-        assert_eq!(rows(&options, &source, Some(&ground)), [0, 2, 5]);
+        for leaves_out in [Ground::Mask, Ground::Auto] {
+            options.ground = leaves_out;
+            assert_eq!(rows(&options, &source, Some(&ground)), [0, 2, 5]);
+        }
+    }
+
+    #[test]
+    fn clouds_of_nothing_but_ground_keep_it() {
+        let source: Vec<Point> = (0..9).map(|i| [i as f32, 0.0, 0.0]).collect();
+        let options = Preset::Default.options(None);
+        assert_eq!(options.ground, Ground::Auto);
+        assert_eq!(rows(&options, &source, Some(&[true; 9])).len(), 9);
     }
 
     #[test]
