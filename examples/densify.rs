@@ -21,7 +21,7 @@ use fnsf::flow::densify::{Later, Leg, Plan, densify};
 use fnsf::flow::distance::{DistanceOptions, Sites};
 use fnsf::flow::ground::{GroundOptions, segment};
 use fnsf::flow::simulate::{Frame, Street, StreetOptions};
-use fnsf::flow::{DenseCloud, Field, Point, Preset, Sequence, Sweep, Unwatched};
+use fnsf::flow::{DenseCloud, Field, Point, Preset, Residual, Sequence, Sweep, Unwatched};
 use fnsf::formats::read_cloud;
 
 /// Sweeps of a simulated drive, and the one that all are carried into.
@@ -71,19 +71,12 @@ fn carried(
 
 /// The same fields without what moves against the static world.
 fn still(fields: &Fields) -> Fields {
-    let network = None;
-    fields
-        .iter()
-        .map(|(leg, field)| {
-            (
-                *leg,
-                Field {
-                    ego: field.ego,
-                    network: network.clone(),
-                },
-            )
-        })
-        .collect()
+    let still = |field: &Field| Field {
+        ego: field.ego,
+        residual: Residual::Still,
+    };
+    let fields = fields.iter();
+    fields.map(|(leg, field)| (*leg, still(field))).collect()
 }
 
 fn ground_found(points: Vec<Point>) -> Sweep {

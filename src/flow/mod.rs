@@ -71,7 +71,7 @@ mod reference;
 
 pub use dense::DenseCloud;
 pub use error::FlowError;
-pub use field::{Field, Network};
+pub use field::{Field, Network, Residual};
 pub use options::*;
 pub use points::{MIN_POINTS, Point, RigidTransform};
 pub use preprocess::Problem;

@@ -1,4 +1,4 @@
-//! Numbers as bytes that can be trusted: a magic, a version, a body of a known length, a checksum.
+//! Numbers as bytes that can be trusted: a magic, a version, a body, a checksum.
 //!
 //! ```text
 //! magic 8 | version u32 | body | FNV-1a of all before it, u64
@@ -18,8 +18,8 @@ pub(crate) const PARAMETERS_BYTES: usize = LAID_OUT * size_of::<f32>();
 pub(crate) struct Seal {
     pub(crate) magic: [u8; 8],
     pub(crate) version: u32,
-    /// Bytes of the body.
-    pub(crate) body: usize,
+    /// Bytes of the body, where there are always as many.
+    pub(crate) body: Option<usize>,
 }
 
 /// Why bytes were refused.
@@ -44,7 +44,7 @@ pub enum SealError {
         /// Bytes expected.
         expected: usize,
     },
-    /// The checksum is wrong, or a number is none.
+    /// The checksum is wrong, bytes are missing or left over, or a number is none.
     #[error("the bytes are damaged")]
     Damaged,
 }
@@ -52,7 +52,7 @@ pub enum SealError {
 impl Seal {
     /// Bytes with this seal, to be filled and [closed](Self::close).
     pub(crate) fn begin(&self) -> Vec<u8> {
-        let mut bytes = Vec::with_capacity(HEADER + self.body + size_of::<u64>());
+        let mut bytes = Vec::new();
         bytes.extend(self.magic);
         bytes.extend(self.version.to_le_bytes());
         bytes
@@ -60,7 +60,6 @@ impl Seal {
 
     /// The bytes with their checksum.
     pub(crate) fn close(&self, mut bytes: Vec<u8>) -> Vec<u8> {
-        debug_assert_eq!(bytes.len(), HEADER + self.body, "the body's length");
         let checksum = Hash::default().of(&bytes);
         bytes.extend(checksum.to_le_bytes());
         bytes
@@ -82,17 +81,21 @@ impl Seal {
                 expected: self.version,
             });
         }
-        let expected = HEADER + self.body + size_of::<u64>();
-        if bytes.len() != expected {
+        let whole = |body: usize| HEADER + body + size_of::<u64>();
+        if let Some(expected) = self.body.map(whole)
+            && bytes.len() != expected
+        {
             return Err(SealError::Length {
                 bytes: bytes.len(),
                 expected,
             });
         }
-        let (sound, checksum) = bytes.split_at(expected - size_of::<u64>());
-        if checksum != Hash::default().of(sound).to_le_bytes() {
+        let (sound, checksum) = bytes.split_last_chunk().ok_or(SealError::Damaged)?;
+        if *checksum != Hash::default().of(sound).to_le_bytes() {
             return Err(SealError::Damaged);
         }
+        // The checksum holds, so that what was read of the header is sound, too.
+        rest.0 = sound.get(HEADER..).ok_or(SealError::Damaged)?;
         Ok(rest)
     }
 }
@@ -107,6 +110,15 @@ impl Body<'_> {
         Ok(*taken)
     }
 
+    /// That all has been read.
+    pub(crate) fn end(&self) -> Result<(), SealError> {
+        if self.0.is_empty() {
+            Ok(())
+        } else {
+            Err(SealError::Damaged)
+        }
+    }
+
     pub(crate) fn number(&mut self) -> Result<u64, SealError> {
         self.take().map(u64::from_le_bytes)
     }
@@ -119,7 +131,23 @@ impl Body<'_> {
         usize::try_from(self.number()?).map_err(|_| SealError::Damaged)
     }
 
+    pub(crate) fn single(&mut self) -> Result<f32, SealError> {
+        self.take().map(f32::from_le_bytes)
+    }
+
+    /// How many things of `bytes` each follow: never more than there are bytes for.
+    pub(crate) fn count_of(&mut self, bytes: usize) -> Result<usize, SealError> {
+        let count = self.count()?;
+        match count.checked_mul(bytes) {
+            Some(needed) if needed <= self.0.len() => Ok(count),
+            _ => Err(SealError::Damaged),
+        }
+    }
+
     pub(crate) fn parameters(&mut self) -> Result<Parameters, SealError> {
+        if self.0.len() < PARAMETERS_BYTES {
+            return Err(SealError::Damaged);
+        }
         let mut parameters = Parameters::zeros();
         for value in parameters.as_mut_slice() {
             *value = f32::from_le_bytes(self.take()?);

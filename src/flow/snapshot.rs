@@ -16,13 +16,13 @@ use super::points::Point;
 use super::preprocess::Selection;
 use super::sealed::{Hash, PARAMETERS_BYTES, Seal, SealError, put_parameters};
 
-/// Parameters, two moments, the kept parameters.
-const ARRAYS: usize = 4;
 const SEAL: Seal = Seal {
     magic: *b"FNSFSNAP",
     version: 2,
-    body: 8 + 8 + 8 + 8 + 1 + 8 + 8 + ARRAYS * PARAMETERS_BYTES,
+    body: Some(8 + 8 + 8 + 8 + 1 + 8 + 8 + ARRAYS * PARAMETERS_BYTES),
 };
+/// Parameters, two moments, the kept parameters.
+const ARRAYS: usize = 4;
 
 /// What the iterations that follow depend on, besides points and options.
 #[derive(Clone)]
@@ -141,6 +141,7 @@ impl Snapshot {
             best_iteration,
             best_loss,
         };
+        body.end()?;
         Ok(Self { identity, state })
     }
 }

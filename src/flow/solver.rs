@@ -7,7 +7,7 @@ use super::backend::{Advance, Backend, Report};
 use super::deadline::{self, Loop, Pace, Prepared};
 use super::error::FlowError;
 use super::field::mlp::Conditioning;
-use super::field::{Field, Network};
+use super::field::{Field, Network, Residual};
 use super::loss::length;
 use super::options::{Ego, Options};
 use super::points::{Point, RigidTransform, evenly, moved};
@@ -206,7 +206,7 @@ fn solve(
         distance_bytes: prepared.map_or(0, |prepared| prepared.transform.bytes()),
         field: Field {
             ego,
-            network: fitted.network,
+            residual: fitted.field,
         },
     })
 }
@@ -226,7 +226,7 @@ struct Fit<'a> {
 /// A fitted field at the source's points.
 struct Fitted {
     residual: Vec<Point>,
-    network: Option<Network>,
+    field: Residual,
     report: Report,
     stop_reason: StopReason,
     /// When the first iteration could begin.
@@ -238,7 +238,7 @@ impl Fitted {
     fn nothing(points: usize, watch: &dyn Watch) -> Self {
         Self {
             residual: vec![[0.0; 3]; points],
-            network: None,
+            field: Residual::Still,
             report: Report {
                 iterations: 0,
                 best_iteration: 0,
@@ -320,7 +320,7 @@ impl Fit<'_> {
         let parameters = trainer.state()?.kept;
         Ok(Fitted {
             residual,
-            network: Some(Network::new(parameters, self.aligned, options.inputs)),
+            field: Residual::Network(Network::new(parameters, self.aligned, options.inputs)),
             report: trainer.report(),
             stop_reason,
             precomputed,
@@ -333,10 +333,12 @@ impl Fit<'_> {
         let (Some(warm_start), Some(before)) = (options.warm_start, self.before) else {
             return Ok(None);
         };
-        let same_kind = before.ego.is_some() == self.prepared.ego.is_some();
-        let Some(network) = before.network.as_ref().filter(|_| same_kind) else {
+        let Residual::Network(network) = &before.residual else {
             return Ok(None);
         };
+        if before.ego.is_some() != self.prepared.ego.is_some() {
+            return Ok(None);
+        }
         let conditioning = Conditioning::new(self.aligned, options.inputs);
         let motion = self.prepared.ego.unwrap_or_default();
         let carried = Network {

@@ -119,7 +119,7 @@ mod tests {
             distance_bytes: 0,
             field: crate::flow::Field {
                 ego: None,
-                network: None,
+                residual: crate::flow::Residual::Still,
             },
         };
         let report = Report::new(&estimate, &JobOptions::default(), 150, "cpu".to_owned());

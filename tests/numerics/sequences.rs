@@ -6,8 +6,8 @@ use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::densify::{Later, Leg, Plan, densify};
 use fnsf::flow::simulate::{Frame, Street, StreetOptions};
 use fnsf::flow::{
-    DenseCloud, Ego, Estimate, Field, Options, Point, Preset, Problem, Sequence, Sweep, Unwatched,
-    estimate,
+    DenseCloud, Ego, Estimate, Field, Options, Point, Preset, Problem, Residual, Sequence, Sweep,
+    Unwatched, estimate,
 };
 
 /// Sweeps of the drive, and the one that all are carried into.
@@ -181,7 +181,7 @@ fn movers_are_carried_to_half_of_what_ego_motion_alone_leaves_and_the_static_wor
                 leg,
                 Field {
                     ego: field.ego,
-                    network: None,
+                    residual: Residual::Still,
                 },
             )
         })

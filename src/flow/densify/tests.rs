@@ -2,8 +2,8 @@
 
 use super::*;
 use crate::flow::cpu::CpuBackend;
-use crate::flow::field::Network;
 use crate::flow::field::mlp::{Conditioning, Parameters, last_layer};
+use crate::flow::field::{Network, Residual};
 use crate::flow::watch::Unwatched;
 
 /// Metres: single precision of coordinates of some metres.
@@ -20,7 +20,7 @@ fn constant(ego: Option<RigidTransform>, flow: Point) -> Field {
     };
     Field {
         ego,
-        network: Some(Network {
+        residual: Residual::Network(Network {
             parameters,
             conditioning,
         }),
@@ -78,7 +78,7 @@ fn assert_near(found: Point, expected: Point, of: &str) {
 fn the_static_world_lands_where_the_vehicle_sees_it_whatever_the_instant() {
     let still = [drive(), drive().inverse()].map(|ego| Field {
         ego: Some(ego),
-        network: None,
+        residual: Residual::Still,
     });
     let [ahead, back] = &still;
     let sweeps = sweeps(5);

@@ -13,11 +13,19 @@ use super::points::{Point, RigidTransform, moved};
 /// target's time, in the target's frame.
 #[derive(Clone, Debug)]
 pub struct Field {
-    /// The ego motion as target_from_source; none where the network explains it as well.
+    /// The ego motion as target_from_source; none where the residual explains it as well.
     pub ego: Option<RigidTransform>,
-    /// What moves against the static world, over points whose ego motion is taken out; nothing does
-    /// where there is none.
-    pub network: Option<Network>,
+    /// What moves against the static world.
+    pub residual: Residual,
+}
+
+/// What moves of itself, over points whose ego motion is taken out.
+#[derive(Clone, Debug)]
+pub enum Residual {
+    /// Nothing.
+    Still,
+    /// What a network says.
+    Network(Network),
 }
 
 impl Field {
@@ -38,9 +46,9 @@ impl Field {
         backend: &dyn Backend,
         static_places: &[Point],
     ) -> Result<Vec<Point>, BackendError> {
-        match &self.network {
-            None => Ok(vec![[0.0; 3]; static_places.len()]),
-            Some(network) => backend.evaluate(network, static_places),
+        match &self.residual {
+            Residual::Still => Ok(vec![[0.0; 3]; static_places.len()]),
+            Residual::Network(network) => backend.evaluate(network, static_places),
         }
     }
 }
