@@ -1,7 +1,8 @@
 //! The seam to a device: what the solver asks of whatever computes.
 
 use super::distance::{DistanceError, DistanceOptions};
-use super::options::Options;
+use super::label::Labelled;
+use super::options::{LabelOptions, Options};
 use super::points::{Point, RigidTransform};
 use super::snapshot::TrainerState;
 use super::watch::{Interrupt, Watch};
@@ -34,6 +35,16 @@ pub trait Backend: Send + Sync {
         prior: &RigidTransform,
         watch: &dyn Watch,
     ) -> RigidTransform;
+
+    /// What moves from `source`, the ego motion taken out, to `target`; what has been found so far
+    /// where `watch` interrupts. Always on the host's threads, too.
+    fn movers(
+        &self,
+        source: &[Point],
+        target: &[Point],
+        options: &LabelOptions,
+        watch: &dyn Watch,
+    ) -> Labelled;
 }
 
 /// A target's distance transform on a device.

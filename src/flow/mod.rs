@@ -38,6 +38,7 @@ mod watch;
 pub mod distance;
 mod ego;
 pub mod field;
+mod label;
 mod loss;
 
 // What carries no motion of its own.
@@ -61,6 +62,7 @@ pub mod simulate;
 mod reference;
 
 pub use error::FlowError;
+pub use label::{Labelled, Motions};
 pub use options::*;
 pub use points::{MIN_POINTS, Point, RigidTransform};
 pub use preprocess::Problem;

@@ -8,3 +8,9 @@ pub type RigidTransform = nalgebra::Isometry3<f64>;
 
 /// Fewer points than this in a cloud determine no motion.
 pub const MIN_POINTS: usize = 3;
+
+/// `point`, moved rigidly.
+pub(crate) fn moved(motion: &RigidTransform, point: Point) -> Point {
+    let moved = motion * nalgebra::Point3::from(point.map(f64::from));
+    [moved.x as f32, moved.y as f32, moved.z as f32]
+}

@@ -3,12 +3,13 @@
 //! FNSF Section 3: `theta* = argmin mean_p D(p + g(p; theta))`. Sees only the backend's traits.
 //! What becomes of it under a deadline is in `deadline.rs`.
 
-use super::backend::{Advance, Backend, Report};
+use super::backend::{Advance, Backend, BackendError, Report};
 use super::deadline::{self, Loop, Pace, Prepared};
 use super::error::FlowError;
+use super::label::Labelled;
 use super::loss::length;
-use super::options::{Ego, Options};
-use super::points::{Point, RigidTransform};
+use super::options::{Options, Precision};
+use super::points::{Point, RigidTransform, moved};
 use super::preprocess::{self, Problem, Selection};
 use super::snapshot::{Snapshot, TrainerState};
 use super::watch::{Interrupt, Watch};
@@ -34,7 +35,7 @@ pub struct Estimate {
     pub ego: Option<RigidTransform>,
     /// Points that took part.
     pub points: usize,
-    /// Iterations done.
+    /// Iterations done; clusters looked at where movers are found object by object.
     pub iterations: usize,
     /// The iteration whose field is the result.
     pub best_iteration: usize,
@@ -123,11 +124,13 @@ fn solve(
     let state = snapshot
         .map(|snapshot| snapshot.state_for(&selection, options))
         .transpose()?;
-    let prepared = deadline::prepare(backend, &selection, options, watch)?;
-    let ego = match (&prepared, options.ego) {
-        (Some(prepared), _) => prepared.ego,
-        (None, Ego::Given(target_from_source)) => Some(target_from_source),
-        (None, _) => None,
+    let prepared = match &options.label {
+        None => deadline::prepare(backend, &selection, options, watch)?,
+        Some(_) => None,
+    };
+    let ego = match &prepared {
+        Some(prepared) => prepared.ego,
+        None => deadline::ego_alone(backend, &selection, options, watch),
     };
     let aligned = match &ego {
         None => selection.source.clone(),
@@ -140,9 +143,18 @@ fn solve(
     if watch.interrupt() == Some(Interrupt::Cancelled) {
         return Err(FlowError::Cancelled);
     }
-    let fitted = match &prepared {
-        None => Fitted::nothing(aligned.len(), watch),
-        Some(prepared) => Fit {
+    let fitted = match (&options.label, &prepared) {
+        (Some(_), _) if options.precision != Precision::F32 => {
+            let text = "movers are found in single precision alone";
+            return Err(BackendError::Unsupported(text).into());
+        }
+        (Some(label), _) => {
+            let precomputed = watch.seconds();
+            let labelled = backend.movers(&aligned, &selection.target, label, watch);
+            Fitted::of_movers(&labelled, &aligned, precomputed)?
+        }
+        (None, None) => Fitted::nothing(aligned.len(), watch),
+        (None, Some(prepared)) => Fit {
             selection: &selection,
             aligned: &aligned,
             asked: options,
@@ -228,6 +240,33 @@ impl Fitted {
             stop_reason: StopReason::Deadline,
             precomputed: watch.seconds(),
         }
+    }
+}
+
+impl Fitted {
+    /// The motion of every point of `aligned` that moves with an object.
+    fn of_movers(
+        labelled: &Labelled,
+        aligned: &[Point],
+        precomputed: f64,
+    ) -> Result<Self, FlowError> {
+        if labelled.interrupted == Some(Interrupt::Cancelled) {
+            return Err(FlowError::Cancelled);
+        }
+        Ok(Self {
+            residual: labelled.motions.residual_at(aligned),
+            report: Report {
+                iterations: labelled.clusters,
+                best_iteration: labelled.clusters,
+                best_loss: labelled.cost_m,
+                query_seconds: 0.0,
+            },
+            stop_reason: match labelled.interrupted {
+                Some(_) => StopReason::Deadline,
+                None => StopReason::MaxIterations,
+            },
+            precomputed,
+        })
     }
 }
 
@@ -318,17 +357,11 @@ fn quantile(mut values: Vec<f32>, share: f32) -> f32 {
     *values.select_nth_unstable_by(place, f32::total_cmp).1
 }
 
-/// `point`, moved rigidly.
-fn moved(motion: &RigidTransform, point: Point) -> Point {
-    let moved = motion * nalgebra::Point3::from(point.map(f64::from));
-    [moved.x as f32, moved.y as f32, moved.z as f32]
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::flow::cpu::CpuBackend;
-    use crate::flow::options::{Ground, Preset};
+    use crate::flow::options::{Ego, Ground, Preset};
     use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
     use crate::flow::watch::{Progress, Unwatched};
     use std::sync::atomic::{AtomicUsize, Ordering};
@@ -423,7 +456,7 @@ mod tests {
     #[test]
     fn a_deadline_gives_the_best_flow_so_far_and_a_cancellation_gives_none() {
         let pair = street();
-        for preset in Preset::ALL {
+        for preset in Preset::FITTED {
             let options = preset.options(None);
             let deadline = After(3, Interrupt::Deadline, AtomicUsize::new(0));
             let estimate = solve(&pair, &options, &deadline).expect("a flow");

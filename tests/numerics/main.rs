@@ -10,6 +10,7 @@ mod gpu;
 #[path = "../common/gpu.rs"]
 mod gpu_rule;
 mod ground;
+mod labels;
 mod prices;
 mod resumption;
 mod scenes;

@@ -18,7 +18,8 @@ use rayon::prelude::*;
 use super::backend::{Backend, BackendError, Trainer, Transform};
 use super::distance::{DistanceOptions, DistanceTransform};
 use super::ego;
-use super::options::{Options, Precision};
+use super::label::{self, Labelled};
+use super::options::{LabelOptions, Options, Precision};
 use super::points::{Point, RigidTransform};
 use super::watch::Watch;
 use kernels::Kernels;
@@ -96,6 +97,17 @@ impl Backend for CpuBackend {
     ) -> RigidTransform {
         let align = || ego::align(source, target, prior, watch);
         self.threads.install(align)
+    }
+
+    fn movers(
+        &self,
+        source: &[Point],
+        target: &[Point],
+        options: &LabelOptions,
+        watch: &dyn Watch,
+    ) -> Labelled {
+        let find = || label::label(source, target, options, watch);
+        self.threads.install(find)
     }
 }
 

@@ -13,6 +13,8 @@ use super::transform;
 use crate::flow::backend::{Backend, BackendError, Transform};
 use crate::flow::distance::DistanceOptions;
 use crate::flow::ego;
+use crate::flow::label::{self, Labelled};
+use crate::flow::options::LabelOptions;
 use crate::flow::points::{Point, RigidTransform};
 use crate::flow::watch::Watch;
 
@@ -111,6 +113,17 @@ impl Backend for Gpu {
     ) -> RigidTransform {
         let align = || ego::align(source, target, prior, watch);
         self.0.host.install(align)
+    }
+
+    fn movers(
+        &self,
+        source: &[Point],
+        target: &[Point],
+        options: &LabelOptions,
+        watch: &dyn Watch,
+    ) -> Labelled {
+        let find = || label::label(source, target, options, watch);
+        self.0.host.install(find)
     }
 }
 
