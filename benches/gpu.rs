@@ -146,7 +146,7 @@ fn pairs(gpu: &Gpu, pair: &SimulatedPair, sizes: &[usize]) -> Result<(), String>
     println!("| preset | points | iterations | precompute | query | network | total ms | EPE m |");
     println!("|---|---|---|---|---|---|---|---|");
     for &points in sizes {
-        for preset in Preset::ALL {
+        for preset in Preset::FITTED {
             let mut runs = Vec::new();
             for seed in 0..=RUNS {
                 let options = Options {

@@ -19,7 +19,8 @@ use crate::job::{
 /// How the flow is found.
 #[derive(Clone, Debug, Args)]
 pub(super) struct Estimation {
-    /// default: ours, robust and fast; paper: FNSF as published
+    /// default: ours, robust and fast; paper: FNSF as published; label: movers found object by
+    /// object, everything else still
     #[arg(long, value_enum, default_value_t)]
     preset: PresetChoice,
     /// Where the work is done: auto (a GPU, else the CPU), cpu, gpu, or gpu:CARD with a card's

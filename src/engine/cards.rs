@@ -9,7 +9,9 @@ use super::{DeviceOptions, Opened, Opener, Reopening};
 use crate::flow::backend::{Advance, Backend, BackendError, Report, Trainer, Transform};
 use crate::flow::cpu::CpuBackend;
 use crate::flow::distance::DistanceOptions;
-use crate::flow::{Network, Options, Point, RigidTransform, TrainerState, Watch};
+use crate::flow::{
+    LabelOptions, Labelled, Network, Options, Point, RigidTransform, TrainerState, Watch,
+};
 use crate::job::DeviceKind;
 
 /// Points of the trial's pair: what a test asks for does not happen to it.
@@ -182,6 +184,16 @@ impl Backend for CardLane {
         watch: &dyn Watch,
     ) -> RigidTransform {
         self.cpu.align(source, target, prior, watch)
+    }
+
+    fn movers(
+        &self,
+        source: &[Point],
+        target: &[Point],
+        options: &LabelOptions,
+        watch: &dyn Watch,
+    ) -> Labelled {
+        self.cpu.movers(source, target, options, watch)
     }
 }
 

@@ -2,7 +2,8 @@
 
 use super::distance::{DistanceError, DistanceOptions};
 use super::field::Network;
-use super::options::Options;
+use super::label::Labelled;
+use super::options::{LabelOptions, Options};
 use super::points::{Point, RigidTransform};
 use super::snapshot::TrainerState;
 use super::watch::{Interrupt, Watch};
@@ -41,6 +42,16 @@ pub trait Backend: Send + Sync {
     /// # Errors
     /// [`BackendError`] where the device fails.
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError>;
+
+    /// What moves from `source`, the ego motion taken out, to `target`; what has been found so far
+    /// where `watch` interrupts. Always on the host's threads, too.
+    fn movers(
+        &self,
+        source: &[Point],
+        target: &[Point],
+        options: &LabelOptions,
+        watch: &dyn Watch,
+    ) -> Labelled;
 }
 
 /// A target's distance transform on a device.

@@ -27,6 +27,9 @@ const EXPECTED_SHARE: f64 = 0.4;
 const GIVEN_UP_SHARE: f64 = 0.6;
 /// Points of each cloud that are aligned where time is short: a millimetre is not to be had then.
 const ALIGNED: usize = 8192;
+/// Time left from which all points are aligned where nothing else shows how fast the machine is,
+/// seconds a point: four times what a slow core takes.
+const ALIGNMENT_SECONDS_PER_POINT: f64 = 2e-6;
 /// Points on which the network's speed is measured: about a millisecond, whole tiles.
 const MEASURED: usize = 1536;
 /// Less than this is what it takes to ask a device anything, seconds: then more points are measured.
@@ -114,23 +117,10 @@ pub(crate) fn prepare(
             Err(error) => Err(error.into()),
         }
     };
-    let aligned = |transform: Box<dyn Transform>, whole: bool| {
-        let align =
-            |[source, target]: [&[Point]; 2]| backend.align(source, target, prior, &on_time);
-        let ego = match (options.ego, &selection.surroundings) {
-            (Ego::Given(target_from_source), _) => Some(target_from_source),
-            (Ego::Auto, Some([source, target])) if whole => Some(align([source, target])),
-            (Ego::Auto, Some(clouds)) => {
-                let [source, target] = clouds.each_ref().map(|points| evenly(points, ALIGNED));
-                Some(align([&source, &target]))
-            }
-            (Ego::Off, _) | (Ego::Auto, None) => None,
-        };
-        Prepared {
-            transform,
-            ego,
-            whole,
-        }
+    let aligned = |transform: Box<dyn Transform>, whole: bool| Prepared {
+        transform,
+        ego: ego(backend, selection, options, prior, whole, &on_time),
+        whole,
     };
     let points = selection.source.len() + selection.target.len();
     let ample = AMPLE_SECONDS_PER_POINT * points as f64;
@@ -158,6 +148,52 @@ pub(crate) fn prepare(
         }
     }
     Ok(Some(aligned(coarse, false)))
+}
+
+/// The ego motion where there is no transform: given, or, where nothing but it is needed, found from
+/// as many points as the time left holds.
+pub(crate) fn ego_alone(
+    backend: &dyn Backend,
+    selection: &Selection,
+    options: &Options,
+    prior: &RigidTransform,
+    watch: &dyn Watch,
+) -> Option<RigidTransform> {
+    if options.label.is_none() {
+        return match options.ego {
+            Ego::Given(target_from_source) => Some(target_from_source),
+            Ego::Auto | Ego::Off => None,
+        };
+    }
+    let points: usize = selection.surroundings.iter().flatten().map(Vec::len).sum();
+    let ample = ALIGNMENT_SECONDS_PER_POINT * points as f64;
+    let whole = watch.seconds_left().is_none_or(|left| left > ample);
+    let on_time = Early {
+        watch,
+        reserve: 0.0,
+    };
+    ego(backend, selection, options, prior, whole, &on_time)
+}
+
+/// The ego motion that the options ask for, from the whole clouds or some of their points.
+fn ego(
+    backend: &dyn Backend,
+    selection: &Selection,
+    options: &Options,
+    prior: &RigidTransform,
+    whole: bool,
+    watch: &dyn Watch,
+) -> Option<RigidTransform> {
+    let align = |[source, target]: [&[Point]; 2]| backend.align(source, target, prior, watch);
+    match (options.ego, &selection.surroundings) {
+        (Ego::Given(target_from_source), _) => Some(target_from_source),
+        (Ego::Auto, Some([source, target])) if whole => Some(align([source, target])),
+        (Ego::Auto, Some(clouds)) => {
+            let [source, target] = clouds.each_ref().map(|points| evenly(points, ALIGNED));
+            Some(align([&source, &target]))
+        }
+        (Ego::Off, _) | (Ego::Auto, None) => None,
+    }
 }
 
 /// How fast the network is, and what of the time is spoken for.

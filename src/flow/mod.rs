@@ -35,12 +35,14 @@ mod sealed;
 mod sequence;
 mod snapshot;
 mod solver;
+mod warm_start;
 mod watch;
 
 // What a point is pulled toward, and what moves it.
 pub mod distance;
 mod ego;
 pub mod field;
+mod label;
 mod loss;
 
 // What carries no motion of its own.
@@ -72,6 +74,7 @@ mod reference;
 pub use dense::DenseCloud;
 pub use error::FlowError;
 pub use field::{Field, Network, Residual};
+pub use label::{Labelled, Motions};
 pub use options::*;
 pub use points::{MIN_POINTS, Point, RigidTransform};
 pub use preprocess::Problem;

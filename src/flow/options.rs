@@ -10,17 +10,22 @@ pub enum Preset {
     Default,
     /// The published method with the published code's settings.
     Paper,
+    /// Movers found object by object, everything else still: for labels.
+    Label,
 }
 
 impl Preset {
     /// All presets.
-    pub const ALL: [Self; 2] = [Self::Default, Self::Paper];
+    pub const ALL: [Self; 3] = [Self::Default, Self::Paper, Self::Label];
+    /// Those that fit a field, iteration by iteration, and can be put down and taken up again.
+    pub const FITTED: [Self; 2] = [Self::Default, Self::Paper];
 
     /// The name that the command line and the service use.
     pub fn name(self) -> &'static str {
         match self {
             Self::Default => "default",
             Self::Paper => "paper",
+            Self::Label => "label",
         }
     }
 
@@ -30,6 +35,7 @@ impl Preset {
         match self {
             Self::Default => Options::stochastic(max_points),
             Self::Paper => Options::published(max_points),
+            Self::Label => Options::labelled(max_points),
         }
     }
 }
@@ -72,6 +78,9 @@ pub struct Options {
     /// How a field that starts as the one of the pair before is fitted; where none, every pair of a
     /// sequence starts afresh.
     pub warm_start: Option<WarmStart>,
+    /// Where given, movers are found object by object, and no field is fitted: of the options above
+    /// those from `distance` on have no say.
+    pub label: Option<LabelOptions>,
 }
 
 impl Options {
@@ -109,6 +118,7 @@ impl Options {
             max_iterations: 5000,
             precision: Precision::F32,
             warm_start: None,
+            label: None,
         }
     }
 
@@ -181,6 +191,18 @@ pub struct WarmStart {
     pub learning_rate: f32,
 }
 
+impl Options {
+    /// Movers object by object. Ground would tie objects together: it is found and left out.
+    fn labelled(max_points: Option<usize>) -> Self {
+        Self {
+            ground: Ground::Auto,
+            label: Some(LabelOptions::default()),
+            warm_start: None,
+            ..Self::stochastic(max_points)
+        }
+    }
+}
+
 /// How a run that its deadline cuts short is fitted.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Hurry {
@@ -199,6 +221,95 @@ impl Hurry {
             batches: [768, 2048],
             iterations: 150,
             least_iterations: if ego { 40 } else { 10 },
+        }
+    }
+}
+
+/// How movers are found, cluster by cluster; `docs/numerics.md` shows what the choices change.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LabelOptions {
+    /// Points within this are of one cluster, metres.
+    pub cluster_radius_m: f32,
+    /// Points within the radius, itself among them, that make a point a cluster's core.
+    pub cluster_points: usize,
+    /// Both clouds are thinned to one point a voxel of this side, metres.
+    pub thinned_m: f32,
+    /// Normals are those of the points within this of each other, metres, and metres more for each
+    /// metre of range.
+    pub normal_m: [f32; 2],
+    /// What a metre of height counts when matches are sought.
+    pub height_weight: f32,
+    /// Matches are sought within this, metres.
+    pub match_m: f32,
+    /// A target point within this of a static source point belongs to it, metres.
+    pub taken_m: f32,
+    /// What a metre across a match's normal counts.
+    pub leak: f32,
+    /// Distances count no further than this, metres.
+    pub truncation_m: f32,
+    /// Motions are sought up to this along x and y, metres a sweep.
+    pub reach_m: f32,
+    /// Side of the bins in which shifts are counted, metres.
+    pub bin_m: f32,
+    /// Starts from which a motion is fitted, besides none.
+    pub starts: usize,
+    /// Cost of a metre of motion, metres, where starts are compared.
+    pub way_penalty: f32,
+    /// No motion is sought where a cluster lies this near to the target without one, metres.
+    pub needed_m: f32,
+    /// Shorter motions are none, metres.
+    pub least_motion_m: f32,
+    /// A motion must lay the cluster's points this much nearer to the target, metres.
+    pub gain_m: f32,
+    /// Share of the cost without motion that may be left.
+    pub kept_cost: f32,
+    /// The fall of the cost times the cluster's thinned points must be this, metres.
+    pub evidence_m: f32,
+    /// And this more for each metre of motion: the farther, the more there is to be mistaken for.
+    pub evidence_slope: f32,
+    /// A moved cluster must lie this near to the target, metres.
+    pub left_m: f32,
+    /// Mean square of the normals along a motion from which a cluster's surfaces hold it.
+    pub least_hold: f32,
+    /// A piece beside a mover goes with it where this share of its cost is left.
+    pub beside_cost: f32,
+    /// Points of a mover are not of it where its motion leaves them farther from the target than
+    /// none by this, metres.
+    pub worse_m: f32,
+    /// A cluster of as many thinned points that is flatter than `flat_m` metres is ground.
+    pub flat_points: usize,
+    /// See `flat_points`.
+    pub flat_m: f32,
+}
+
+impl Default for LabelOptions {
+    fn default() -> Self {
+        Self {
+            cluster_radius_m: 0.5,
+            cluster_points: 4,
+            thinned_m: 0.1,
+            normal_m: [0.15, 0.01],
+            height_weight: 0.4,
+            match_m: 0.7,
+            taken_m: 0.15,
+            leak: 0.2,
+            truncation_m: 0.3,
+            reach_m: 3.5,
+            bin_m: 0.15,
+            starts: 6,
+            way_penalty: 0.05,
+            needed_m: 0.03,
+            least_motion_m: 0.05,
+            gain_m: 0.015,
+            kept_cost: 0.65,
+            evidence_m: 1.0,
+            evidence_slope: 3.0,
+            left_m: 0.15,
+            least_hold: 0.1,
+            beside_cost: 0.7,
+            worse_m: 0.05,
+            flat_points: 30,
+            flat_m: 0.2,
         }
     }
 }

@@ -5,7 +5,7 @@
 //! multiply-adds that take as long on a CPU. Knows no device and no time: a rate turns work into
 //! seconds.
 
-use super::distance::DistanceTransform;
+use super::distance::{DistanceTransform, TransformPrice};
 use super::error::FlowError;
 use super::field::mlp::{LAID_OUT, PARAMETERS};
 use super::options::Options;
@@ -23,6 +23,10 @@ const ALIGNING: f64 = 4e9;
 const THINNING: f64 = 2e4;
 /// Bytes that are held for a point while it is: itself, its voxel and its surfel, at most.
 const THINNING_BYTES: usize = 64;
+/// Multiply-adds that take as long as a point's share of the search for movers, and the bytes that
+/// are held for it: its cell, its thinned copies, three indices by place, its normal.
+const LABELLING: f64 = 4e5;
+const LABELLING_BYTES: usize = 384;
 /// Multiply-adds that take as long as selecting and moving a point and its results.
 const POINT: f64 = 3e4;
 /// Sets of parameters that are held at once: of the network, its transposes, its optimizer, the
@@ -65,12 +69,22 @@ impl Price {
 pub fn price(problem: &Problem, options: &Options) -> Result<Price, FlowError> {
     let selection = preprocess::select(problem, options)?;
     let (source_points, target_points) = (selection.source.len(), selection.target.len());
-    let transform =
-        DistanceTransform::price(&selection.source, &selection.target, &options.distance)
-            .map_err(|error| FlowError::Backend(error.into()))?;
+    let clouds = [&selection.source, &selection.target];
+    let transform = match options.label {
+        None => DistanceTransform::price(clouds[0], clouds[1], &options.distance)
+            .map_err(|error| FlowError::Backend(error.into()))?,
+        Some(_) => TransformPrice::default(),
+    };
     let batch = options.batch.unwrap_or(source_points).min(source_points) as f64;
     let iterations = options.expected_iterations() as f64;
-    let passes = iterations * PASSES * (batch + STEP_POINTS) + source_points as f64;
+    let passes = match options.label {
+        None => iterations * PASSES * (batch + STEP_POINTS) + source_points as f64,
+        Some(_) => 0.0,
+    };
+    let labelled = options
+        .label
+        .as_ref()
+        .map_or(0, |_| source_points + target_points);
     let aligned = selection
         .surroundings
         .map(|clouds| clouds.map(|points| points.len()));
@@ -86,7 +100,12 @@ pub fn price(problem: &Problem, options: &Options) -> Result<Price, FlowError> {
             + PARAMETER_SETS * LAID_OUT * size_of::<f32>()
             + (POINT_COPIES * source_points + target_points) * size_of::<Point>()
             + aligned.unwrap_or(0) * THINNING_BYTES
+            + labelled * LABELLING_BYTES
             + WORKING_SETS,
-        multiply_adds: transform.multiply_adds + passes * PARAMETERS as f64 + aligning + points,
+        multiply_adds: transform.multiply_adds
+            + passes * PARAMETERS as f64
+            + labelled as f64 * LABELLING
+            + aligning
+            + points,
     })
 }

@@ -3,23 +3,21 @@
 //! FNSF Section 3: `theta* = argmin mean_p D(p + g(p; theta))`. Sees only the backend's traits.
 //! What becomes of it under a deadline is in `deadline.rs`.
 
-use super::backend::{Advance, Backend, Report};
+use super::backend::{Advance, Backend, BackendError, Report};
 use super::deadline::{self, Loop, Pace, Prepared};
 use super::error::FlowError;
-use super::field::mlp::Conditioning;
 use super::field::{Field, Network, Residual};
+use super::label::Labelled;
 use super::loss::length;
-use super::options::{Ego, Options};
-use super::points::{Point, RigidTransform, evenly, moved};
+use super::options::{Ego, Options, Precision};
+use super::points::{Point, RigidTransform, moved};
 use super::preprocess::{self, Problem, Selection};
 use super::snapshot::{Snapshot, TrainerState};
+use super::warm_start::warm_start;
 use super::watch::{Interrupt, Watch};
 
 /// Iterations that a backend may do without coming back.
 const STEPS_AT_ONCE: usize = 64;
-
-/// Points on which a field of the pair before is judged.
-const JUDGED: usize = 4096;
 
 /// Residual motion of a frame from which a point counts as moving, metres (Argoverse 2).
 pub const DYNAMIC_M: f32 = 0.05;
@@ -39,7 +37,7 @@ pub struct Estimate {
     pub ego: Option<RigidTransform>,
     /// Points that took part.
     pub points: usize,
-    /// Iterations done.
+    /// Iterations done; clusters looked at where movers are found object by object.
     pub iterations: usize,
     /// The iteration whose field is the result.
     pub best_iteration: usize,
@@ -127,16 +125,19 @@ fn solve(
 ) -> Result<Estimate, FlowError> {
     let began = watch.seconds();
     let selection = preprocess::select(problem, options)?;
+    // Without a warm start pairs are independent: of each other, and of the order they are done in.
+    let before = problem.before.filter(|_| options.warm_start.is_some());
+    let prior = before.and_then(|field| field.ego).unwrap_or_default();
     let state = snapshot
-        .map(|snapshot| snapshot.state_for(&selection, options, problem.before))
+        .map(|snapshot| snapshot.state_for(&selection, options, before))
         .transpose()?;
-    let prior = problem.before.and_then(|field| field.ego);
-    let prior = prior.unwrap_or_default();
-    let prepared = deadline::prepare(backend, &selection, options, &prior, watch)?;
-    let ego = match (&prepared, options.ego) {
-        (Some(prepared), _) => prepared.ego,
-        (None, Ego::Given(target_from_source)) => Some(target_from_source),
-        (None, _) => None,
+    let prepared = match &options.label {
+        None => deadline::prepare(backend, &selection, options, &prior, watch)?,
+        Some(_) => None,
+    };
+    let ego = match &prepared {
+        Some(prepared) => prepared.ego,
+        None => deadline::ego_alone(backend, &selection, options, &prior, watch),
     };
     let aligned = match &ego {
         None => selection.source.clone(),
@@ -149,11 +150,20 @@ fn solve(
     if watch.interrupt() == Some(Interrupt::Cancelled) {
         return Err(FlowError::Cancelled);
     }
-    let fitted = match &prepared {
-        None => Fitted::nothing(aligned.len(), watch),
-        Some(prepared) => Fit {
+    let fitted = match (&options.label, &prepared) {
+        (Some(_), _) if options.precision != Precision::F32 => {
+            let text = "movers are found in single precision alone";
+            return Err(BackendError::Unsupported(text).into());
+        }
+        (Some(label), _) => {
+            let precomputed = watch.seconds();
+            let labelled = backend.movers(&aligned, &selection.target, label, watch);
+            Fitted::of_movers(labelled, &aligned, precomputed)?
+        }
+        (None, None) => Fitted::nothing(aligned.len(), watch),
+        (None, Some(prepared)) => Fit {
             backend,
-            before: problem.before,
+            before,
             selection: &selection,
             aligned: &aligned,
             asked: options,
@@ -251,12 +261,46 @@ impl Fitted {
     }
 }
 
+impl Fitted {
+    /// The motion of every point of `aligned` that moves with an object.
+    fn of_movers(
+        labelled: Labelled,
+        aligned: &[Point],
+        precomputed: f64,
+    ) -> Result<Self, FlowError> {
+        if labelled.interrupted == Some(Interrupt::Cancelled) {
+            return Err(FlowError::Cancelled);
+        }
+        Ok(Self {
+            residual: labelled.motions.residual_at(aligned),
+            field: Residual::Objects(labelled.motions.into()),
+            report: Report {
+                iterations: labelled.clusters,
+                best_iteration: labelled.clusters,
+                best_loss: labelled.cost_m,
+                query_seconds: 0.0,
+            },
+            stop_reason: match labelled.interrupted {
+                Some(_) => StopReason::Deadline,
+                None => StopReason::MaxIterations,
+            },
+            precomputed,
+        })
+    }
+}
+
 impl Fit<'_> {
     /// Fits from the start, or from `state`.
     fn run(&self, state: Option<TrainerState>) -> Result<Fitted, FlowError> {
         let (prepared, watch) = (self.prepared, self.watch);
         let mut options = self.with_margin()?;
-        let warm = self.warm_start(&mut options)?;
+        let warm = warm_start(
+            self.backend,
+            prepared,
+            self.aligned,
+            self.before,
+            &mut options,
+        )?;
         let mut trainer = prepared.transform.start(self.aligned, &options)?;
         let mut cut = !prepared.whole;
         let pace = match watch.seconds_left() {
@@ -327,57 +371,6 @@ impl Fit<'_> {
         })
     }
 
-    /// The state of a fit that starts from the field of the pair before, and its options; none
-    /// where there is no such field, or it explains this pair no better than that nothing moves.
-    fn warm_start(&self, options: &mut Options) -> Result<Option<TrainerState>, FlowError> {
-        let (Some(warm_start), Some(before)) = (options.warm_start, self.before) else {
-            return Ok(None);
-        };
-        let Residual::Network(network) = &before.residual else {
-            return Ok(None);
-        };
-        if before.ego.is_some() != self.prepared.ego.is_some() {
-            return Ok(None);
-        }
-        let conditioning = Conditioning::new(self.aligned, options.inputs);
-        let motion = self.prepared.ego.unwrap_or_default();
-        let carried = Network {
-            parameters: network.carried(&motion, &conditioning),
-            conditioning,
-        };
-        let points = evenly(self.aligned, JUDGED);
-        let flows = self.backend.evaluate(&carried, &points)?;
-        let [carried_loss, still_loss] = [
-            self.mean_loss(options, &points, &flows)?,
-            self.mean_loss(options, &points, &vec![[0.0; 3]; points.len()])?,
-        ];
-        // Not the other way round: a loss that is no number starts afresh.
-        if carried_loss < still_loss {
-            *options = options.warmed(warm_start);
-            return Ok(Some(TrainerState::at_start(carried.parameters)));
-        }
-        Ok(None)
-    }
-
-    /// The mean loss of `points` moved by `flows`.
-    fn mean_loss(
-        &self,
-        options: &Options,
-        points: &[Point],
-        flows: &[Point],
-    ) -> Result<f64, FlowError> {
-        let pairs = || points.iter().zip(flows);
-        let moved = pairs().map(|(point, flow)| core::array::from_fn(|a| point[a] + flow[a]));
-        let distances = self
-            .prepared
-            .transform
-            .distances(&moved.collect::<Vec<_>>())?;
-        let losses = pairs().zip(distances).map(|((&point, &flow), distance)| {
-            f64::from(options.loss.value(point, distance, flow))
-        });
-        Ok(losses.sum::<f64>() / points.len() as f64)
-    }
-
     /// The options, with the margin that the pair asks for.
     fn with_margin(&self) -> Result<Options, FlowError> {
         let mut options = self.asked.clone();
@@ -405,152 +398,4 @@ fn quantile(mut values: Vec<f32>, share: f32) -> f32 {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::flow::cpu::CpuBackend;
-    use crate::flow::options::{Ground, Preset};
-    use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
-    use crate::flow::watch::{Progress, Unwatched};
-    use std::sync::atomic::{AtomicUsize, Ordering};
-
-    /// Interrupts after a number of iterations.
-    struct After(usize, Interrupt, AtomicUsize);
-
-    impl Watch for After {
-        fn interrupt(&self) -> Option<Interrupt> {
-            (self.2.load(Ordering::Relaxed) >= self.0).then_some(self.1)
-        }
-        fn progress(&self, progress: Progress) {
-            self.2.store(progress.iteration, Ordering::Relaxed);
-        }
-    }
-
-    fn street() -> SimulatedPair {
-        let options = StreetOptions {
-            beams: 16,
-            azimuth_steps: 500,
-            ..StreetOptions::default()
-        };
-        Street::new(&options)
-            .and_then(|street| street.pair(0))
-            .expect("a small street")
-    }
-
-    fn solve(
-        pair: &SimulatedPair,
-        options: &Options,
-        watch: &dyn Watch,
-    ) -> Result<Estimate, FlowError> {
-        let backend = CpuBackend::new(Some(2)).expect("threads");
-        let problem = Problem {
-            source: &pair.source,
-            target: &pair.target,
-            ground: Some([&pair.ground_source, &pair.ground_target]),
-            before: None,
-        };
-        estimate(&backend, &problem, options, watch)
-    }
-
-    #[test]
-    fn points_left_out_keep_their_row_with_zero_flow() {
-        let pair = street();
-        let mut options = Preset::Default.options(None);
-        options.ground = Ground::Mask;
-        options.range_m = Some(30.0);
-        let estimate = solve(&pair, &options, &Unwatched).expect("a flow");
-        assert_eq!(estimate.flow.len(), pair.source.len());
-        for (row, point) in pair.source.iter().enumerate() {
-            let kept = !pair.ground_source[row] && point[0].abs() <= 30.0 && point[1].abs() <= 30.0;
-            assert_eq!(estimate.valid[row], kept, "row {row}");
-            assert!(kept || estimate.flow[row] == [0.0; 3], "row {row}");
-        }
-        assert_eq!(
-            estimate.points,
-            estimate.valid.iter().filter(|&&v| v).count()
-        );
-    }
-
-    #[test]
-    fn ground_that_is_found_moves_with_the_vehicle_and_takes_no_part() {
-        let pair = street();
-        let mut options = Preset::Default.options(None);
-        let solve = |options: &Options| {
-            let backend = CpuBackend::new(Some(2)).expect("threads");
-            let problem = Problem {
-                source: &pair.source,
-                target: &pair.target,
-                ground: None,
-                before: None,
-            };
-            estimate(&backend, &problem, options, &Unwatched).expect("a flow")
-        };
-        let estimate = solve(&options);
-        let ego = estimate.ego.expect("it is estimated");
-        assert!(estimate.valid.iter().all(|&valid| valid));
-        assert!(estimate.points < pair.source.len());
-        let found = crate::flow::ground::segment(&pair.source, &Default::default()).ground;
-        let dynamic = estimate.dynamic.expect("the ego motion is known");
-        for (row, point) in pair
-            .source
-            .iter()
-            .enumerate()
-            .filter(|&(row, _)| found[row])
-        {
-            let to = moved(&ego, *point);
-            let expected: Point = core::array::from_fn(|a| to[a] - point[a]);
-            assert_eq!(estimate.flow[row], expected, "row {row}");
-            assert!(!dynamic[row], "row {row}");
-        }
-        // Without the vehicle's motion, or sampled, it is left out.
-        for (ego, max_points) in [(Ego::Off, None), (Ego::Auto, Some(500))] {
-            options.ego = ego;
-            options.max_points = max_points;
-            let estimate = solve(&options);
-            assert!((0..found.len()).all(|row| !found[row] || !estimate.valid[row]));
-        }
-    }
-
-    #[test]
-    fn a_deadline_gives_the_best_flow_so_far_and_a_cancellation_gives_none() {
-        let pair = street();
-        for preset in Preset::ALL {
-            let options = preset.options(None);
-            let deadline = After(3, Interrupt::Deadline, AtomicUsize::new(0));
-            let estimate = solve(&pair, &options, &deadline).expect("a flow");
-            assert_eq!(estimate.stop_reason, StopReason::Deadline);
-            assert_eq!(estimate.iterations, 3);
-            assert!(estimate.flow.iter().flatten().all(|f| f.is_finite()));
-            let cancel = After(3, Interrupt::Cancelled, AtomicUsize::new(0));
-            let error = solve(&pair, &options, &cancel).expect_err("cancelled");
-            assert!(matches!(error, FlowError::Cancelled));
-        }
-    }
-
-    #[test]
-    fn a_deadline_before_the_first_iteration_still_gives_a_flow() {
-        let now = After(0, Interrupt::Deadline, AtomicUsize::new(0));
-        let estimate = solve(&street(), &Preset::Default.options(None), &now).expect("a flow");
-        assert_eq!(estimate.iterations, 0);
-        assert!(estimate.flow.iter().flatten().all(|f| f.is_finite()));
-    }
-
-    #[test]
-    fn a_given_ego_motion_is_taken_as_it_is_and_marks_what_moves_against_it() {
-        let pair = street();
-        let mut options = Preset::Default.options(None);
-        options.ego = Ego::Given(pair.target_from_source);
-        options.max_iterations = 0;
-        let estimate = solve(&pair, &options, &Unwatched).expect("a flow");
-        assert_eq!(estimate.ego, Some(pair.target_from_source));
-        assert!(
-            estimate
-                .dynamic
-                .is_some_and(|dynamic| dynamic.iter().all(|&moves| !moves))
-        );
-        for (row, &point) in pair.source.iter().enumerate() {
-            let to = moved(&pair.target_from_source, point);
-            let expected: Point = core::array::from_fn(|a| to[a] - point[a]);
-            assert_eq!(estimate.flow[row], expected);
-        }
-    }
-}
+mod tests;

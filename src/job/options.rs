@@ -20,7 +20,8 @@ const MAX_DEADLINE: Duration = Duration::from_secs(24 * 60 * 60);
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct JobOptions {
-    /// `default`: ours, robust and fast; `paper`: FNSF as published.
+    /// `default`: ours, robust and fast; `paper`: FNSF as published; `label`: movers found object by
+    /// object, everything else still, ground found and left out.
     pub preset: PresetChoice,
     /// The same seed gives the same bits.
     pub seed: u64,
@@ -61,6 +62,8 @@ pub enum PresetChoice {
     Default,
     /// FNSF as published.
     Paper,
+    /// Ours, for labels: movers found object by object, everything else still.
+    Label,
 }
 
 impl PresetChoice {
@@ -69,6 +72,7 @@ impl PresetChoice {
         match self {
             Self::Default => Preset::Default,
             Self::Paper => Preset::Paper,
+            Self::Label => Preset::Label,
         }
     }
 }
@@ -404,7 +408,7 @@ mod tests {
             (r#"{"sead":1}"#, "unknown field `sead`"),
             (
                 r#"{"preset":"best"}"#,
-                "unknown variant `best`, expected `default` or `paper`",
+                "unknown variant `best`, expected one of `default`, `paper`, `label`",
             ),
             (
                 r#"{"device":"gpu:0"}"#,
@@ -428,5 +432,20 @@ mod tests {
                 .to_string();
             assert!(error.contains(said), "{text}: {error}");
         }
+    }
+
+    #[test]
+    fn presets_say_what_becomes_of_ground_where_nothing_else_does() {
+        let ground = |text: &str| {
+            let options: JobOptions = serde_json::from_str(text).expect("sound options");
+            options.solver_options(1000).ground
+        };
+        assert_eq!(ground(r#"{"preset":"label"}"#), Ground::Auto);
+        assert_eq!(
+            ground(r#"{"preset":"label","ground":"mask"}"#),
+            Ground::Mask
+        );
+        assert_eq!(ground("{}"), Ground::Auto);
+        assert_eq!(ground(r#"{"preset":"paper"}"#), Ground::Keep);
     }
 }

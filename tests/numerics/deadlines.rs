@@ -70,7 +70,9 @@ fn whatever_the_deadline_every_row_has_a_finite_flow() {
                 estimate.flow.iter().flatten().all(|f| f.is_finite()),
                 "{preset:?} {deadline}"
             );
-            if deadline <= 1e-3 {
+            // The search for movers looks at the watch less often: it is done earlier by this clock.
+            let short = if preset == Preset::Label { 1e-5 } else { 1e-3 };
+            if deadline <= short {
                 assert_eq!(estimate.stop_reason, StopReason::Deadline, "{deadline}");
             }
         }

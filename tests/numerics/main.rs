@@ -11,6 +11,7 @@ mod gpu;
 #[path = "../common/gpu.rs"]
 mod gpu_rule;
 mod ground;
+mod labels;
 mod prices;
 mod resumption;
 mod scenes;

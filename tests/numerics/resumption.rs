@@ -96,7 +96,7 @@ fn put_down(pair: &Pair, options: &Options, from: Option<Snapshot>, after: usize
 #[test]
 fn a_run_that_was_put_down_ends_with_the_bits_of_one_that_was_not() {
     let pair = small_street();
-    for preset in Preset::ALL {
+    for preset in Preset::FITTED {
         let mut options = preset.options(None);
         options.batch = options.batch.map(|_| 700);
         let undisturbed = run(&pair, &options, 2, None, &Onward).expect("a flow");

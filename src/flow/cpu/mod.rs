@@ -20,7 +20,8 @@ use super::backend::{Backend, BackendError, Trainer, Transform};
 use super::distance::{DistanceOptions, DistanceTransform};
 use super::ego;
 use super::field::Network;
-use super::options::{Options, Precision};
+use super::label::{self, Labelled};
+use super::options::{LabelOptions, Options, Precision};
 use super::points::{Point, RigidTransform};
 use super::watch::Watch;
 use kernels::Kernels;
@@ -109,6 +110,17 @@ impl Backend for CpuBackend {
             (&network.parameters, &network.conditioning),
             points,
         ))
+    }
+
+    fn movers(
+        &self,
+        source: &[Point],
+        target: &[Point],
+        options: &LabelOptions,
+        watch: &dyn Watch,
+    ) -> Labelled {
+        let find = || label::label(source, target, options, watch);
+        self.threads.install(find)
     }
 }
 

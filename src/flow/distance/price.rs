@@ -21,7 +21,7 @@ const FAR_VERTEX: f64 = 2.7e3;
 const DENSE_CELL: f64 = 5e3;
 
 /// What a distance transform will take.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TransformPrice {
     /// Active bricks; none of a dense transform.
     pub bricks: usize,

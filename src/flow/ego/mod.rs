@@ -18,6 +18,7 @@ mod tests;
 
 use fit::{Fit, Schedule};
 use surfels::Surfels;
+pub(super) use surfels::normal;
 use thin::thinned;
 
 use super::points::{Point, RigidTransform, evenly};

@@ -142,7 +142,7 @@ fn square_distance(a: Point, b: Point) -> f32 {
 }
 
 /// The axis of least spread, in closed form; none where the spread is not that of a flat surface.
-fn normal(spread: &Matrix3<f64>) -> Option<[f32; 3]> {
+pub(in crate::flow) fn normal(spread: &Matrix3<f64>) -> Option<[f32; 3]> {
     let mean = spread.trace() / 3.0;
     let rest = spread - Matrix3::identity() * mean;
     let radius = (rest.norm_squared() / 6.0).sqrt();

@@ -6,7 +6,10 @@ mod stored;
 
 pub use network::Network;
 
+use std::sync::Arc;
+
 use super::backend::{Backend, BackendError};
+use super::label::Motions;
 use super::points::{Point, RigidTransform, moved};
 
 /// The motion of everything between two sweeps, at any point: where a point of the source is at the
@@ -26,6 +29,8 @@ pub enum Residual {
     Still,
     /// What a network says.
     Network(Network),
+    /// Objects do, each rigidly.
+    Objects(Arc<Motions>),
 }
 
 impl Field {
@@ -49,6 +54,7 @@ impl Field {
         match &self.residual {
             Residual::Still => Ok(vec![[0.0; 3]; static_places.len()]),
             Residual::Network(network) => backend.evaluate(network, static_places),
+            Residual::Objects(motions) => Ok(motions.residual_at(static_places)),
         }
     }
 }

@@ -3,14 +3,18 @@
 //! ```text
 //! ego: has one u8, rotation i j k w, translation x y z: f64 each
 //!   | residual u8: 0 still | 1 network: center x y z, scale, parameters: f32 each
+//!   | 2 objects: as `label/stored.rs` says
 //! ```
 //!
 //! Sealed as `sealed.rs` says; an ego motion that is not there is that of a vehicle that stands.
 
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 
+use std::sync::Arc;
+
 use super::mlp::Conditioning;
 use super::{Field, Network, Residual};
+use crate::flow::label::Motions;
 use crate::flow::points::RigidTransform;
 use crate::flow::sealed::{Body, Seal, SealError, put_parameters};
 
@@ -21,6 +25,7 @@ const SEAL: Seal = Seal {
 };
 const STILL: u8 = 0;
 const NETWORK: u8 = 1;
+const OBJECTS: u8 = 2;
 /// How far from one a rotation's length may be: what doubles leave of it.
 const UNIT: f64 = 1e-9;
 
@@ -44,6 +49,10 @@ impl Field {
                 }
                 put_parameters(&mut bytes, &network.parameters);
             }
+            Residual::Objects(motions) => {
+                bytes.push(OBJECTS);
+                motions.put(&mut bytes);
+            }
         }
         SEAL.close(bytes)
     }
@@ -65,6 +74,7 @@ impl Field {
                 },
                 parameters: body.parameters()?,
             }),
+            OBJECTS => Residual::Objects(Arc::new(Motions::take(&mut body)?)),
             _ => return Err(SealError::Damaged),
         };
         body.end()?;

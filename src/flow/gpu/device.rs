@@ -15,6 +15,8 @@ use crate::flow::backend::{Backend, BackendError, Transform};
 use crate::flow::distance::DistanceOptions;
 use crate::flow::ego;
 use crate::flow::field::Network;
+use crate::flow::label::{self, Labelled};
+use crate::flow::options::LabelOptions;
 use crate::flow::points::{Point, RigidTransform};
 use crate::flow::watch::Watch;
 
@@ -117,6 +119,17 @@ impl Backend for Gpu {
 
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {
         evaluate::network(&self.0, network, points)
+    }
+
+    fn movers(
+        &self,
+        source: &[Point],
+        target: &[Point],
+        options: &LabelOptions,
+        watch: &dyn Watch,
+    ) -> Labelled {
+        let find = || label::label(source, target, options, watch);
+        self.0.host.install(find)
     }
 }
 

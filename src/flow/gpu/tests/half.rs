@@ -202,7 +202,7 @@ fn whole_runs_in_half_precision_find_the_flow_of_single_precision() {
         return;
     };
     let pair = street(1);
-    for preset in Preset::ALL {
+    for preset in Preset::FITTED {
         let mut options = preset.options(Some(1500));
         options.max_iterations = 40;
         let [single, half] = [options.clone(), half(options)].map(|options| {

@@ -69,7 +69,7 @@ fn the_card_finds_the_cpus_flow() {
     };
     let cpu = CpuBackend::new(Some(2)).expect("threads");
     let pair = street(1);
-    for preset in Preset::ALL {
+    for preset in Preset::FITTED {
         let mut options = preset.options(Some(1500));
         // Ours to its end: half-way the runs are farther apart.
         options.max_iterations = options.max_iterations.min(150);

@@ -1,0 +1,263 @@
+//! The table of `docs/numerics.md` on movers: presets, and what each piece of `label` changes, on
+//! labelled pairs and on simulated streets.
+//!
+//! ```text
+//! FNSF_REAL_DATA=... cargo run --release --example label -- [--only NAME] [--seeds N]
+//! ```
+//!
+//! Points off the ground by the pairs' own masks, the ego motion estimated. `av2_7fab`, `kitti_0000` and `small_gicp`
+//! below `FNSF_REAL_DATA`, where it is set, then the mean of six streets of 64 and of 32 beams. Where
+//! a preset draws anything: the median over the seeds.
+#![expect(
+    clippy::print_stdout,
+    reason = "the table is the answer of this program"
+)]
+
+use std::time::Instant;
+
+use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::evaluate::{Truth, evaluate};
+use fnsf::flow::simulate::{Street, StreetOptions};
+use fnsf::flow::{self, Ground, LabelOptions, Options, Point, Preset, Problem, Watch};
+use fnsf::formats::read_pair;
+
+/// The labelled pairs, by folder.
+const PAIRS: [&str; 3] = ["av2_7fab", "kitti_0000", "small_gicp"];
+/// Streets by their number of beams, and how many of each.
+const BEAMS: [usize; 2] = [64, 32];
+const STREETS: u64 = 6;
+
+/// A clock for the numerics.
+struct Clock(Instant);
+
+impl Watch for Clock {
+    fn seconds(&self) -> f64 {
+        self.0.elapsed().as_secs_f64()
+    }
+}
+
+/// A preset with a change.
+struct Variant {
+    name: &'static str,
+    preset: Preset,
+    change: fn(&mut LabelOptions),
+}
+
+const fn label(name: &'static str, change: fn(&mut LabelOptions)) -> Variant {
+    Variant {
+        name,
+        preset: Preset::Label,
+        change,
+    }
+}
+
+const fn preset(name: &'static str, preset: Preset) -> Variant {
+    Variant {
+        name,
+        preset,
+        change: |_| {},
+    }
+}
+
+const VARIANTS: &[Variant] = &[
+    preset("paper", Preset::Paper),
+    preset("default", Preset::Default),
+    preset("label", Preset::Label),
+    // More than any cluster has.
+    label("ego motion alone", |o| o.evidence_m = f32::INFINITY),
+    label("no starts but none", |o| o.starts = 0),
+    label("starts compared without the way", |o| o.way_penalty = 0.0),
+    label("distances to points, no normals", |o| o.normal_m = [0.0; 2]),
+    label("distances to planes alone", |o| o.leak = 0.0),
+    label("heights count in full", |o| o.height_weight = 1.0),
+    label("nothing is taken by what stands still", |o| o.taken_m = 0.0),
+    label("no evidence asked for", |o| {
+        o.evidence_m = 0.0;
+        o.evidence_slope = 0.0;
+    }),
+    label("evidence whatever the way", |o| {
+        o.evidence_m = 3.0;
+        o.evidence_slope = 0.0;
+    }),
+    label("walls may slide", |o| o.least_hold = 0.0),
+    label("moved clusters may lie anywhere", |o| {
+        o.left_m = f32::INFINITY;
+    }),
+    label("any part of the cost may be left", |o| o.kept_cost = 1.0),
+    label("flat clusters may move", |o| o.flat_m = 0.0),
+    label("no gate at all", |o| {
+        o.evidence_m = 0.0;
+        o.evidence_slope = 0.0;
+        o.least_hold = 0.0;
+        o.left_m = f32::INFINITY;
+        o.kept_cost = 1.0;
+        o.flat_m = 0.0;
+        o.gain_m = 0.0;
+    }),
+    label("pieces go by themselves", |o| o.beside_cost = 0.0),
+    label("clusters move whole", |o| o.worse_m = f32::INFINITY),
+    label("clusters of 0.35 m", |o| o.cluster_radius_m = 0.35),
+    label("clusters of 0.7 m", |o| o.cluster_radius_m = 0.7),
+    label("thinned to 0.2 m", |o| o.thinned_m = 0.2),
+    label("matches within 0.5 m", |o| o.match_m = 0.5),
+    label("matches within 1 m", |o| o.match_m = 1.0),
+];
+
+/// A pair with what is true of it.
+struct Known {
+    name: String,
+    source: Vec<Point>,
+    target: Vec<Point>,
+    ground: [Vec<bool>; 2],
+    flow: Vec<Point>,
+    valid: Vec<bool>,
+    dynamic: Option<Vec<bool>>,
+}
+
+fn real_pairs() -> Result<Vec<Known>, String> {
+    let Some(folder) = std::env::var_os("FNSF_REAL_DATA") else {
+        return Ok(Vec::new());
+    };
+    let read = |name: &str| {
+        let path = std::path::Path::new(&folder).join(name).join("pair.npz");
+        let bytes = std::fs::read(&path).map_err(|e| format!("{}: {e}", path.display()))?;
+        let pair = read_pair(&bytes).map_err(|e| format!("{}: {e}", path.display()))?;
+        let truth = pair.truth.ok_or("the pair has no truth")?;
+        let ground = pair.ground.ok_or("the pair has no ground masks")?;
+        Ok(Known {
+            name: name.to_owned(),
+            source: pair.source,
+            target: pair.target,
+            ground: [ground.source, ground.target],
+            flow: truth.flow,
+            valid: truth.valid,
+            dynamic: truth.dynamic,
+        })
+    };
+    PAIRS.iter().map(|name| read(name)).collect()
+}
+
+fn streets(beams: usize) -> Result<Vec<Known>, String> {
+    let street = |seed| {
+        let options = StreetOptions {
+            seed,
+            beams,
+            ..StreetOptions::default()
+        };
+        let pair = Street::new(&options).and_then(|street| street.pair(0));
+        let pair = pair.map_err(|e| e.to_string())?;
+        Ok(Known {
+            name: format!("{STREETS} streets, {beams} beams"),
+            valid: vec![true; pair.source.len()],
+            source: pair.source,
+            target: pair.target,
+            ground: [pair.ground_source, pair.ground_target],
+            flow: pair.flow,
+            dynamic: Some(pair.dynamic),
+        })
+    };
+    (0..STREETS).map(street).collect()
+}
+
+/// EPE, that of movers, that of what stands still, three-way EPE where all movers are foreground,
+/// seconds.
+type Row = [f64; 5];
+
+fn run(backend: &CpuBackend, pair: &Known, options: &Options) -> Result<Row, String> {
+    let problem = Problem {
+        source: &pair.source,
+        target: &pair.target,
+        ground: Some([&pair.ground[0], &pair.ground[1]]),
+        before: None,
+    };
+    let clock = Clock(Instant::now());
+    let estimate = flow::estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())?;
+    let dynamic = pair.dynamic.as_deref();
+    let truth = Truth {
+        dynamic,
+        foreground: dynamic,
+        ground: Some(&pair.ground[0]),
+        source: Some(&pair.source),
+        ..Truth::new(&pair.flow, &pair.valid)
+    };
+    let metrics = evaluate(&estimate.flow, &estimate.valid, &truth).map_err(|e| e.to_string())?;
+    let close = |part: fn(&flow::evaluate::ThreeWay) -> Option<f64>| {
+        metrics
+            .three_way
+            .as_ref()
+            .and_then(part)
+            .unwrap_or(f64::NAN)
+    };
+    Ok([
+        metrics.epe,
+        metrics.epe_dynamic.unwrap_or(f64::NAN),
+        metrics.epe_static.unwrap_or(f64::NAN),
+        close(|three_way| three_way.foreground_dynamic.epe),
+        estimate.seconds.total,
+    ])
+}
+
+/// The middle of each column.
+fn median(rows: &[Row]) -> Row {
+    core::array::from_fn(|column| {
+        let mut values: Vec<f64> = rows.iter().map(|row| row[column]).collect();
+        values.sort_by(f64::total_cmp);
+        values[values.len() / 2]
+    })
+}
+
+fn mean(rows: &[Row]) -> Row {
+    let count = rows.len() as f64;
+    core::array::from_fn(|column| rows.iter().map(|row| row[column]).sum::<f64>() / count)
+}
+
+fn main() -> Result<(), String> {
+    let mut only = String::new();
+    let mut seeds = 1;
+    let mut arguments = std::env::args().skip(1);
+    while let Some(argument) = arguments.next() {
+        let value = arguments
+            .next()
+            .ok_or(format!("{argument} needs a value"))?;
+        match argument.as_str() {
+            "--only" => only = value,
+            "--seeds" => seeds = value.parse::<u64>().map_err(|e| e.to_string())?.max(1),
+            other => return Err(format!("{other} is not known")),
+        }
+    }
+    let mut groups: Vec<Vec<Known>> = real_pairs()?.into_iter().map(|pair| vec![pair]).collect();
+    for beams in BEAMS {
+        groups.push(streets(beams)?);
+    }
+    let backend = CpuBackend::new(None).map_err(|e| e.to_string())?;
+    println!("| variant | pair | EPE | EPE moving | EPE static | EPE moving, close | s |");
+    println!("|---|---|---|---|---|---|---|");
+    for variant in VARIANTS {
+        if !only.is_empty() && variant.name != only {
+            continue;
+        }
+        let mut options = variant.preset.options(None);
+        options.ground = Ground::Mask;
+        if let Some(label) = &mut options.label {
+            (variant.change)(label);
+        }
+        let draws = if options.label.is_some() { 1 } else { seeds };
+        for group in &groups {
+            let mut rows = Vec::new();
+            for pair in group {
+                let mut of_seeds = Vec::new();
+                for seed in 0..draws {
+                    options.seed = seed;
+                    of_seeds.push(run(&backend, pair, &options)?);
+                }
+                rows.push(median(&of_seeds));
+            }
+            let [epe, moving, still, close, seconds] = mean(&rows);
+            let (variant, pair) = (variant.name, &group[0].name);
+            println!(
+                "| {variant} | {pair} | {epe:.4} | {moving:.3} | {still:.4} | {close:.3} | {seconds:.2} |"
+            );
+        }
+    }
+    Ok(())
+}

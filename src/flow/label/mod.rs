@@ -1,0 +1,172 @@
+//! Movers found, the static world kept still: rigid motions, cluster by cluster.
+//!
+//! ```text
+//! source, ego motion out - cluster ─┐                 ┌ vote - starts
+//! target ───────────────── scene ───┴─ each cluster: ─┤ rigid - the motion of least cost
+//!                                                     └ gate - needed, or none
+//!                          spread: pieces beside a mover, points that are not of it - Motions
+//! ```
+//!
+//! After ICP-Flow (Lin et al. 2024): clusters, shifts by votes, rigid fits; the cost both ways, the
+//! gate and what is taken are ours. No field, no distance transform, no random choice: the same bits
+//! whatever the number of threads. It must not know devices, backends or where an ego motion is from.
+
+// What is looked at, and what moves.
+mod cluster;
+mod motion;
+mod motions;
+mod near;
+mod scene;
+mod stored;
+
+// How a motion is found, kept and shared.
+mod gate;
+mod rigid;
+mod spread;
+mod vote;
+
+#[cfg(test)]
+mod tests;
+
+pub use motions::Motions;
+
+use rayon::prelude::*;
+
+use super::options::LabelOptions;
+use super::points::Point;
+use super::watch::{Interrupt, Progress, Watch};
+use cluster::NOISE;
+use rigid::{Found, Mover};
+use scene::Scene;
+use vote::Ballot;
+
+/// Clusters between two looks at the watch.
+const CLUSTERS_AT_ONCE: usize = 32;
+/// What the scene takes, in times of the clustering: 2 to 4.
+const SCENE: f64 = 5.0;
+/// What is left to do once clusters have been searched, in times of the scene.
+const REST: f64 = 0.5;
+
+/// The movers of a pair.
+#[derive(Debug)]
+pub struct Labelled {
+    /// How they move.
+    pub motions: Motions,
+    /// Clusters that were looked at.
+    pub clusters: usize,
+    /// How far their points lie from the target in the end, metres: the mean over the clusters.
+    pub cost_m: f64,
+    /// Why not all clusters were looked at.
+    pub interrupted: Option<Interrupt>,
+}
+
+impl Labelled {
+    /// Nothing was looked at.
+    fn nothing(interrupted: Interrupt) -> Self {
+        Self {
+            motions: Motions::none(),
+            clusters: 0,
+            cost_m: f64::INFINITY,
+            interrupted: Some(interrupted),
+        }
+    }
+}
+
+/// Finds what moves from `source`, the ego motion taken out, to `target`: metres, ground left out,
+/// every number finite. Large clusters come first; those that the watch leaves no time for stand
+/// still.
+pub(crate) fn label(
+    source: &[Point],
+    target: &[Point],
+    options: &LabelOptions,
+    watch: &dyn Watch,
+) -> Labelled {
+    let late = |needed: f64| {
+        let late = watch.seconds_left().is_some_and(|left| left < needed);
+        watch.interrupt().or(late.then_some(Interrupt::Deadline))
+    };
+    if let Some(interrupt) = late(0.0) {
+        return Labelled::nothing(interrupt);
+    }
+    let began = watch.seconds();
+    let labels = cluster::clusters(source, options.cluster_radius_m, options.cluster_points);
+    let clustering = watch.seconds() - began;
+    if let Some(interrupt) = late(clustering * SCENE) {
+        return Labelled::nothing(interrupt);
+    }
+    let began = watch.seconds();
+    let scene = Scene::new(source, &labels, target, options);
+    let ballot = Ballot::new(&scene);
+    let rest = (watch.seconds() - began) * REST;
+
+    let mut order: Vec<u32> = (0..scene.members.len() as u32).collect();
+    order.sort_by_key(|&cluster| std::cmp::Reverse(scene.members[cluster as usize].len()));
+    let mut needed: Vec<Option<Found>> = vec![None; order.len()];
+    let (mut clusters, mut sum_m) = (0, 0.0);
+    let mut interrupted = None;
+    for some in order.chunks(CLUSTERS_AT_ONCE) {
+        interrupted = late(rest);
+        if interrupted.is_some() {
+            break;
+        }
+        let found: Vec<(Option<Found>, f32)> = some
+            .par_iter()
+            .map(|&cluster| needed_motion(&scene, &ballot, cluster))
+            .collect();
+        for (&cluster, (found, cost_m)) in some.iter().zip(found) {
+            needed[cluster as usize] = found;
+            sum_m += f64::from(cost_m);
+        }
+        clusters += some.len();
+        watch.progress(Progress {
+            iteration: clusters,
+            max_iterations: order.len(),
+            loss: sum_m / clusters as f64,
+        });
+    }
+    Labelled {
+        motions: motions(&scene, &needed),
+        clusters,
+        cost_m: sum_m / clusters.max(1) as f64,
+        interrupted,
+    }
+}
+
+/// The motion of a cluster, where it needs one, and what the cluster costs in the end, metres.
+fn needed_motion(scene: &Scene<'_>, ballot: &Ballot, cluster: u32) -> (Option<Found>, f32) {
+    let members = &scene.members[cluster as usize];
+    if members.len() < scene.options.cluster_points {
+        return (None, 0.0);
+    }
+    let mover = Mover::new(scene, cluster);
+    let still = mover.standing_still();
+    let points: Vec<Point> = members
+        .iter()
+        .map(|&row| scene.source[row as usize])
+        .collect();
+    let found = mover.search(ballot, still);
+    match found.filter(|found| gate::is_needed(found, &points, scene.options)) {
+        Some(found) => (Some(found), found.cost.there_m),
+        None => (None, still.there_m),
+    }
+}
+
+/// The motions, and which of the source's points have them.
+fn motions(scene: &Scene<'_>, needed: &[Option<Found>]) -> Motions {
+    let mut numbers = vec![NOISE; needed.len()];
+    let mut motions = Vec::new();
+    for (number, found) in numbers.iter_mut().zip(needed) {
+        if let Some(found) = found {
+            *number = motions.len() as u32;
+            motions.push(found.motion);
+        }
+    }
+    if motions.is_empty() {
+        return Motions::none();
+    }
+    let owners: Vec<u32> = spread::movers_of(scene, needed)
+        .into_iter()
+        .map(|owner| numbers.get(owner as usize).copied().unwrap_or(NOISE))
+        .collect();
+    Motions::new(motions, &scene.source, &owners)
+}

@@ -1,0 +1,221 @@
+//! Which points of a cloud lie near a place.
+//!
+//! Points lie in square columns that a small table finds, by height within each: nine columns are
+//! looked at for one place. It must not know of motions or clusters.
+
+use std::ops::Range;
+
+use crate::flow::Point;
+
+/// Columns along an axis on each side of the origin; what is farther is found nowhere.
+const REACH: f32 = (1 << 30) as f32;
+/// No column has this key.
+const NO_COLUMN: u64 = u64::MAX;
+
+/// A cloud by place.
+#[derive(Debug)]
+pub(super) struct Near {
+    column_m: f32,
+    /// Open addressing: the key of a column and where its points are.
+    table: Vec<(u64, Range<u32>)>,
+    /// By column, then by height.
+    points: Vec<Point>,
+    /// The row that each of `points` had.
+    rows: Vec<u32>,
+}
+
+impl Near {
+    /// Of `points`, to be asked for places within `column_m` metres.
+    pub(super) fn new(points: &[Point], column_m: f32) -> Self {
+        let keyed = points.iter().zip(0_u32..);
+        let mut keyed: Vec<(u64, f32, u32)> = keyed
+            .map(|(&point, row)| (key(place(point, column_m)), point[2], row))
+            .collect();
+        keyed.sort_unstable_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)).then(a.2.cmp(&b.2)));
+        let columns = keyed.chunk_by(|a, b| a.0 == b.0).count();
+        let mut table = vec![(NO_COLUMN, 0..0); (columns * 2 + 1).next_power_of_two()];
+        let mut begin = 0;
+        for column in keyed.chunk_by(|a, b| a.0 == b.0) {
+            let end = begin + column.len() as u32;
+            let mut slot = hash(column[0].0) as usize & (table.len() - 1);
+            while table[slot].0 != NO_COLUMN {
+                slot = (slot + 1) & (table.len() - 1);
+            }
+            table[slot] = (column[0].0, begin..end);
+            begin = end;
+        }
+        Self {
+            column_m,
+            table,
+            points: keyed
+                .iter()
+                .map(|&(_, _, row)| points[row as usize])
+                .collect(),
+            rows: keyed.iter().map(|&(_, _, row)| row).collect(),
+        }
+    }
+
+    /// All points, in their own order.
+    pub(super) fn in_order(&self) -> Vec<Point> {
+        let mut points = vec![[0.0; 3]; self.points.len()];
+        for (&row, &point) in self.rows.iter().zip(&self.points) {
+            points[row as usize] = point;
+        }
+        points
+    }
+
+    /// Calls `see` with the row and the point of everything in the columns around `center` that is
+    /// no more than a column's side higher or lower.
+    #[inline]
+    pub(super) fn around(&self, center: Point, mut see: impl FnMut(u32, Point)) {
+        let [x, y] = place(center, self.column_m);
+        for dx in -1..=1 {
+            for dy in -1..=1 {
+                let Range { start, end } = self.column(key([x + dx, y + dy]));
+                let column = &self.points[start..end];
+                let low = column.partition_point(|point| point[2] < center[2] - self.column_m);
+                for (&point, &row) in column[low..].iter().zip(&self.rows[start + low..end]) {
+                    if point[2] > center[2] + self.column_m {
+                        break;
+                    }
+                    see(row, point);
+                }
+            }
+        }
+    }
+
+    /// Calls `see` with every point of the columns that touch the square of `half_m` around
+    /// `center`, no more than `height_m` higher or lower.
+    pub(super) fn square_around(
+        &self,
+        center: Point,
+        half_m: f32,
+        height_m: f32,
+        mut see: impl FnMut(Point),
+    ) {
+        let corner = |side: f32| place([center[0] + side, center[1] + side, 0.0], self.column_m);
+        let ([left, low], [right, high]) = (corner(-half_m), corner(half_m));
+        for x in left..=right {
+            for y in low..=high {
+                let column = &self.points[self.column(key([x, y]))];
+                let begin = column.partition_point(|point| point[2] < center[2] - height_m);
+                for &point in &column[begin..] {
+                    if point[2] > center[2] + height_m {
+                        break;
+                    }
+                    see(point);
+                }
+            }
+        }
+    }
+
+    /// The row and the squared distance of the nearest point that `allowed` lets through and that
+    /// lies less than `within_m` (a column's side at most) from `center`; the lowest row of equals.
+    #[inline]
+    pub(super) fn nearest(
+        &self,
+        center: Point,
+        within_m: f32,
+        allowed: impl Fn(u32) -> bool,
+    ) -> Option<(u32, f32)> {
+        let mut best = None;
+        let mut least = within_m * within_m;
+        self.around(center, |row, point| {
+            let square = square_distance(center, point);
+            if (square < least || (square == least && best.is_some_and(|(other, _)| row < other)))
+                && allowed(row)
+            {
+                least = square;
+                best = Some((row, square));
+            }
+        });
+        best
+    }
+
+    fn column(&self, key: u64) -> Range<usize> {
+        let mut slot = hash(key) as usize & (self.table.len() - 1);
+        loop {
+            let (found, Range { start, end }) = &self.table[slot];
+            if *found == key {
+                return *start as usize..*end as usize;
+            }
+            if *found == NO_COLUMN {
+                return 0..0;
+            }
+            slot = (slot + 1) & (self.table.len() - 1);
+        }
+    }
+}
+
+/// The column that a point lies in.
+fn place(point: Point, column_m: f32) -> [i32; 2] {
+    [point[0], point[1]].map(|c| (c / column_m).floor().clamp(-REACH, REACH) as i32)
+}
+
+fn key([x, y]: [i32; 2]) -> u64 {
+    u64::from(x.cast_unsigned()) << 32 | u64::from(y.cast_unsigned())
+}
+
+/// Fibonacci hashing: the high bits are mixed best.
+fn hash(key: u64) -> u64 {
+    key.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 29
+}
+
+/// Squared distance, square metres.
+#[inline]
+pub(super) fn square_distance(a: Point, b: Point) -> f32 {
+    let [x, y, z] = [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+    x * x + y * y + z * z
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::random::Random;
+
+    #[test]
+    fn the_nearest_point_is_the_one_that_a_search_of_all_finds() {
+        let mut random = Random::new(2);
+        let mut point = || [0; 3].map(|_| random.uniform(-3.0, 3.0) as f32);
+        let cloud: Vec<Point> = (0..700).map(|_| point()).collect();
+        let near = Near::new(&cloud, 0.7);
+        for _ in 0..500 {
+            let asked = point();
+            let allowed = |row: u32| !row.is_multiple_of(3);
+            let all = cloud.iter().zip(0..).filter(|&(_, row)| allowed(row));
+            let least = all.map(|(&other, row)| (square_distance(asked, other), row));
+            let least = least.min_by(|a, b| a.0.total_cmp(&b.0));
+            let expected = least.filter(|&(square, _)| square < 0.49);
+            let found = near.nearest(asked, 0.7, allowed);
+            assert_eq!(found, expected.map(|(square, row)| (row, square)));
+        }
+    }
+
+    #[test]
+    fn a_square_holds_what_a_search_of_all_finds_in_it() {
+        let mut random = Random::new(3);
+        let mut point = || [0; 3].map(|_| random.uniform(-3.0, 3.0) as f32);
+        let cloud: Vec<Point> = (0..700).map(|_| point()).collect();
+        let near = Near::new(&cloud, 0.4);
+        let asked = point();
+        let inside = |other: &Point, half_m: f32| {
+            (0..2).all(|a| (other[a] - asked[a]).abs() <= half_m)
+                && (other[2] - asked[2]).abs() <= 0.5
+        };
+        let mut seen = 0;
+        near.square_around(asked, 1.5, 0.5, |other| {
+            assert!(inside(&other, 1.5 + 0.4), "{other:?}");
+            seen += usize::from(inside(&other, 1.5));
+        });
+        let expected = cloud.iter().filter(|other| inside(other, 1.5)).count();
+        assert_eq!(seen, expected);
+    }
+
+    #[test]
+    fn nothing_is_near_in_an_empty_cloud_and_far_from_every_point() {
+        assert_eq!(Near::new(&[], 0.5).nearest([0.0; 3], 0.5, |_| true), None);
+        let near = Near::new(&[[1e30, -1e30, 0.0]], 0.5);
+        assert_eq!(near.nearest([0.0; 3], 0.5, |_| true), None);
+        assert_eq!(near.nearest([f32::NAN; 3], 0.5, |_| true), None);
+    }
+}

@@ -1,0 +1,245 @@
+//! Both clouds as the search for movers sees them: thinned, with normals, and with what is taken.
+//!
+//! A target point that lies on a source point of something that plainly stands still belongs to it,
+//! and nothing else can have moved there. Heights count less than what lies level: a lidar's rings
+//! are far apart, its samples along a ring are not. It must not know how motions are found.
+
+use nalgebra::{Matrix3, Vector3};
+use rayon::prelude::*;
+
+use super::cluster::NOISE;
+use super::motion::Motion;
+use super::near::{Near, square_distance};
+use crate::flow::Point;
+use crate::flow::ego;
+use crate::flow::options::LabelOptions;
+
+/// Fewer points than this have no normal.
+const NEIGHBORS: f64 = 4.0;
+/// Share of a cluster that must lie on the target for it to stand still plainly.
+const PLAIN: f32 = 0.9;
+
+/// The clouds.
+pub(super) struct Scene<'a> {
+    pub(super) options: &'a LabelOptions,
+    /// Source points, ego motion taken out, one a voxel, and the cluster of each.
+    pub(super) source: Vec<Point>,
+    pub(super) labels: Vec<u32>,
+    /// Target points, one a voxel, and their unit normals; zero where there is no flat surface.
+    pub(super) target: Vec<Point>,
+    normals: Vec<Point>,
+    /// By place, heights shrunk.
+    near_source: Near,
+    near_target: Near,
+    /// Of each target point, the cluster that it is taken by.
+    taken: Vec<u32>,
+    /// Of each cluster, the rows of `source`.
+    pub(super) members: Vec<Vec<u32>>,
+}
+
+impl<'a> Scene<'a> {
+    /// `labels` are the clusters of `source`.
+    pub(super) fn new(
+        source: &[Point],
+        labels: &[u32],
+        target: &[Point],
+        options: &'a LabelOptions,
+    ) -> Self {
+        let (kept, kept_target) = rayon::join(
+            || one_a_voxel(source, options.thinned_m),
+            || one_a_voxel(target, options.thinned_m),
+        );
+        let labels: Vec<u32> = kept.iter().map(|&row| labels[row as usize]).collect();
+        let source: Vec<Point> = kept.iter().map(|&row| source[row as usize]).collect();
+        let target: Vec<Point> = kept_target
+            .iter()
+            .map(|&row| target[row as usize])
+            .collect();
+        let low = |points: &[Point]| -> Vec<Point> {
+            points.iter().map(|&p| lowered(p, options)).collect()
+        };
+        let (low_source, low_target) = (low(&source), low(&target));
+        let (near_source, near_target) = rayon::join(
+            || Near::new(&low_source, options.match_m),
+            || Near::new(&low_target, options.match_m),
+        );
+        let upright = Near::new(&target, options.match_m);
+        let normals = target
+            .par_iter()
+            .map(|&point| normal(&upright, point, options));
+        let normals = normals.collect();
+        let clusters = labels.iter().filter(|&&label| label != NOISE).max();
+        let mut members = vec![Vec::new(); clusters.map_or(0, |&last| last as usize + 1)];
+        for (&label, row) in labels.iter().zip(0..) {
+            if label != NOISE {
+                members[label as usize].push(row);
+            }
+        }
+        let within = options.taken_m;
+        let on_target: Vec<bool> = low_source
+            .par_iter()
+            .map(|&point| near_target.nearest(point, within, |_| true).is_some())
+            .collect();
+        let still: Vec<bool> = members
+            .iter()
+            .map(|rows: &Vec<u32>| {
+                let on = rows.iter().filter(|&&row| on_target[row as usize]).count();
+                on as f32 >= PLAIN * rows.len() as f32
+            })
+            .collect();
+        let taken = low_target.par_iter().map(|&point| {
+            let owner = near_source.nearest(point, within, |_| true);
+            let cluster = owner.map_or(NOISE, |(row, _)| labels[row as usize]);
+            if cluster != NOISE && still[cluster as usize] {
+                cluster
+            } else {
+                NOISE
+            }
+        });
+        let taken = taken.collect();
+        Self {
+            options,
+            source,
+            labels,
+            target,
+            normals,
+            near_source,
+            near_target,
+            taken,
+            members,
+        }
+    }
+
+    /// The target point nearest to a place that `cluster` may have moved to, within the match.
+    #[inline]
+    pub(super) fn match_of(&self, place: Point, cluster: u32) -> Option<u32> {
+        let allowed = |row: u32| {
+            let owner = self.taken[row as usize];
+            owner == NOISE || owner == cluster
+        };
+        let place = lowered(place, self.options);
+        let found = self
+            .near_target
+            .nearest(place, self.options.match_m, allowed);
+        found.map(|(row, _)| row)
+    }
+
+    /// The source point of `cluster` nearest to a place, within the match.
+    #[inline]
+    pub(super) fn origin_of(&self, place: Point, cluster: u32) -> Option<u32> {
+        let place = lowered(place, self.options);
+        let of_it = |row: u32| self.labels[row as usize] == cluster;
+        let found = self.near_source.nearest(place, self.options.match_m, of_it);
+        found.map(|(row, _)| row)
+    }
+
+    /// Calls `see` with every source point about within the match of a place.
+    pub(super) fn source_around(&self, place: Point, mut see: impl FnMut(u32)) {
+        self.near_source
+            .around(lowered(place, self.options), |row, _| see(row));
+    }
+
+    /// How far a place lies from whatever target point is free, metres, truncated.
+    pub(super) fn plain_distance(&self, place: Point) -> f32 {
+        let target = self.match_of(place, NOISE);
+        target.map_or(self.options.truncation_m, |target| {
+            self.distance(place, target)
+        })
+    }
+
+    /// The target points that lie within the match of the moved `rows` and may be of `cluster`, one
+    /// a voxel of `apart_m`.
+    pub(super) fn touched(
+        &self,
+        rows: &[u32],
+        cluster: u32,
+        motion: &Motion,
+        apart_m: f32,
+    ) -> Vec<u32> {
+        let within = self.options.match_m * self.options.match_m;
+        let mut found = Vec::new();
+        for &row in rows {
+            let place = lowered(motion.apply(self.source[row as usize]), self.options);
+            self.near_target.around(place, |row, point| {
+                let owner = self.taken[row as usize];
+                if (owner == NOISE || owner == cluster) && square_distance(place, point) < within {
+                    found.push(row);
+                }
+            });
+        }
+        found.sort_unstable();
+        found.dedup();
+        let points: Vec<Point> = found.iter().map(|&row| self.target[row as usize]).collect();
+        let kept = one_a_voxel(&points, apart_m);
+        kept.into_iter().map(|i| found[i as usize]).collect()
+    }
+
+    /// The unit normal of a target point; zero where there is no flat surface.
+    #[inline]
+    pub(super) fn normal(&self, row: u32) -> Point {
+        self.normals[row as usize]
+    }
+
+    /// How far a place lies from a target point, metres: along its normal, and a little of what
+    /// lies across, or plainly where it has none. At most the truncation.
+    #[inline]
+    pub(super) fn distance(&self, place: Point, row: u32) -> f32 {
+        let (target, normal) = (self.target[row as usize], self.normals[row as usize]);
+        let [x, y, z]: Point = core::array::from_fn(|a| target[a] - place[a]);
+        let height = z * self.options.height_weight;
+        let plain = x * x + y * y + height * height;
+        let square = if normal == [0.0; 3] {
+            plain
+        } else {
+            let along = normal[0] * x + normal[1] * y + normal[2] * z;
+            along * along + self.options.leak * self.options.leak * plain
+        };
+        square.sqrt().min(self.options.truncation_m)
+    }
+}
+
+/// Heights shrunk.
+#[inline]
+fn lowered([x, y, z]: Point, options: &LabelOptions) -> Point {
+    [x, y, z * options.height_weight]
+}
+
+/// The first row of each voxel, in the order of the rows.
+pub(super) fn one_a_voxel(points: &[Point], side_m: f32) -> Vec<u32> {
+    let voxel = |point: &Point| point.map(|c| (c / side_m).floor() as i32);
+    let mut keyed: Vec<([i32; 3], u32)> = points.iter().map(voxel).zip(0..).collect();
+    keyed.sort_unstable();
+    keyed.dedup_by_key(|&mut (voxel, _)| voxel);
+    let mut rows: Vec<u32> = keyed.into_iter().map(|(_, row)| row).collect();
+    rows.sort_unstable();
+    rows
+}
+
+/// At most `most` of the rows, evenly.
+pub(super) fn evenly(rows: &[u32], most: usize) -> Vec<u32> {
+    let kept = rows.len().min(most);
+    (0..kept).map(|i| rows[i * rows.len() / kept]).collect()
+}
+
+/// The normal of the surface around a point; zero where it is not flat.
+fn normal(near: &Near, point: Point, options: &LabelOptions) -> Point {
+    let range = point[0].hypot(point[1]);
+    let [base, slope] = options.normal_m;
+    let radius = (base + slope * range).min(options.match_m);
+    let mut count = 0.0;
+    let mut sum = Vector3::<f64>::zeros();
+    let mut squares = Matrix3::<f64>::zeros();
+    near.around(point, |_, other| {
+        if square_distance(point, other) < radius * radius {
+            let away = Vector3::from_fn(|a, _| f64::from(other[a] - point[a]));
+            count += 1.0;
+            sum += away;
+            squares += away * away.transpose();
+        }
+    });
+    if count < NEIGHBORS {
+        return [0.0; 3];
+    }
+    let mean: Vector3<f64> = sum / count;
+    ego::normal(&(squares / count - mean * mean.transpose())).unwrap_or([0.0; 3])
+}

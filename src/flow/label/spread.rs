@@ -1,0 +1,125 @@
+//! Who moves with whom: pieces and stray points beside a mover that its motion explains, and points
+//! of a mover that it does not.
+//!
+//! A far car falls into pieces too small to say anything alone; a ring of ground that was not found
+//! hangs on to a near one. It must not know how motions are found.
+
+use rayon::prelude::*;
+
+use super::cluster::NOISE;
+use super::motion::Motion;
+use super::rigid::{Found, Mover};
+use super::scene::{Scene, evenly};
+use crate::flow::Point;
+
+/// Points of a piece that look for movers beside it.
+const LOOKING: usize = 64;
+/// An own motion must be this much better than that of a larger mover beside it, metres.
+const BETTER_M: f32 = 0.05;
+/// Points of a mover within this vote on whether they are of it, metres.
+const VOTE_M: f32 = 0.3;
+
+/// Of each thinned source point the cluster whose motion it has; [`NOISE`] where it stands still.
+pub(super) fn movers_of(scene: &Scene<'_>, needed: &[Option<Found>]) -> Vec<u32> {
+    let clusters: Vec<u32> = (0..needed.len() as u32)
+        .into_par_iter()
+        .map(|cluster| leader(scene, needed, cluster))
+        .collect();
+    (0..scene.source.len() as u32)
+        .into_par_iter()
+        .map(|row| match scene.labels[row as usize] {
+            NOISE => leader_of_stray(scene, needed, row),
+            label => {
+                let leader = clusters[label as usize];
+                match needed.get(leader as usize).and_then(Option::as_ref) {
+                    Some(found) if is_of(scene, row, &found.motion) => leader,
+                    _ => NOISE,
+                }
+            }
+        })
+        .collect()
+}
+
+/// The cluster whose motion a cluster has: its own, that of a larger mover beside it, or none.
+fn leader(scene: &Scene<'_>, needed: &[Option<Found>], cluster: u32) -> u32 {
+    let members = &scene.members[cluster as usize];
+    let own = needed[cluster as usize].as_ref();
+    let size = |cluster: u32| scene.members[cluster as usize].len();
+    let mut beside: Vec<u32> = Vec::new();
+    for row in evenly(members, LOOKING) {
+        scene.source_around(scene.source[row as usize], |other| {
+            let label = scene.labels[other as usize];
+            if label != NOISE && label != cluster && needed[label as usize].is_some() {
+                beside.push(label);
+            }
+        });
+    }
+    beside.sort_unstable();
+    beside.dedup();
+    beside.retain(|&label| size(label) > size(cluster));
+    if beside.is_empty() {
+        return if own.is_some() { cluster } else { NOISE };
+    }
+    let mover = Mover::new(scene, cluster);
+    let still = mover.standing_still().sum_m();
+    let mut best = match own {
+        Some(found) => (found.cost.sum_m() + BETTER_M, cluster),
+        None => (still * scene.options.beside_cost, NOISE),
+    };
+    for label in beside {
+        if let Some(found) = &needed[label as usize] {
+            let cost = mover.cost(&found.motion).sum_m();
+            if cost < best.0 {
+                best = (cost, label);
+            }
+        }
+    }
+    best.1
+}
+
+/// The mover whose motion a point of no cluster has, if any.
+fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Found>], row: u32) -> u32 {
+    let place = scene.source[row as usize];
+    let mut beside: Vec<u32> = Vec::new();
+    scene.source_around(place, |other| {
+        let label = scene.labels[other as usize];
+        if label != NOISE && needed[label as usize].is_some() {
+            beside.push(label);
+        }
+    });
+    beside.sort_unstable();
+    beside.dedup();
+    let distance = |place: Point| scene.plain_distance(place);
+    let mut best = (distance(place) * scene.options.beside_cost, NOISE);
+    for label in beside {
+        if let Some(found) = &needed[label as usize] {
+            let moved = distance(found.motion.apply(place));
+            if moved < best.0 {
+                best = (moved, label);
+            }
+        }
+    }
+    best.1
+}
+
+/// Whether the points around one of a mover's are explained by its motion no worse than by none.
+fn is_of(scene: &Scene<'_>, row: u32, motion: &Motion) -> bool {
+    let label = scene.labels[row as usize];
+    let center = scene.source[row as usize];
+    let (mut worse, mut count) = (0.0, 0.0_f32);
+    scene.source_around(center, |other| {
+        let place = scene.source[other as usize];
+        let near = (0..3).map(|a| (place[a] - center[a]).powi(2)).sum::<f32>();
+        if scene.labels[other as usize] == label && near < VOTE_M * VOTE_M {
+            let distance = |place: Point| {
+                let target = scene.match_of(place, label);
+                target.map_or(scene.options.truncation_m, |target| {
+                    scene.distance(place, target)
+                })
+            };
+            worse += distance(motion.apply(place)) - distance(place);
+            count += 1.0;
+        }
+    });
+    worse <= scene.options.worse_m * count
+}
