@@ -310,8 +310,9 @@ impl Metrics {
         match event {
             Event::Submitted(job) => self.count_submitted(job),
             Event::Started(job) => {
-                if let Some(started) = job.started {
-                    observe(&self.queue_seconds, job.created.until(started), job);
+                // A sequence has started with its first pair, which is counted.
+                if let (Some(ready), Some(started), 0) = (job.ready, job.started, job.pairs) {
+                    observe(&self.queue_seconds, ready.until(started), job);
                 }
             }
             Event::Requeued(_) => {

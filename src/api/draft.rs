@@ -17,7 +17,7 @@ use crate::clock::Timestamp;
 use crate::cost::CostModel;
 use crate::job::{Job, JobId, JobOptions, Kind};
 use crate::payload::StoredCloud;
-use crate::queue::{Idempotency, Submission, Submitted};
+use crate::queue::{Idempotency, PairOf, Submission, Submitted};
 
 /// What is asked of a job before its clouds are there.
 #[derive(Clone, Debug)]
@@ -32,6 +32,15 @@ pub(super) struct Request {
     pub arrived: Instant,
     /// The call's own deadline, from its arrival, if it has one.
     pub time_left: Option<Duration>,
+    /// Its place in a chain of pairs that come one by one, where it is of one.
+    pub link: Option<Link>,
+}
+
+/// A pair's place in a chain.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Link {
+    /// The pair before, where there is one.
+    pub after: Option<JobId>,
 }
 
 /// A job that was accepted.
@@ -208,8 +217,23 @@ impl Draft {
         })
     }
 
+    /// The pairs of a sequence, in the order of their turns.
+    fn pairs(&self) -> Vec<PairOf> {
+        let goes_on = self.request.options.goes_on();
+        let forward = (0..self.frames - 1).map(|place| PairOf {
+            place,
+            backward: false,
+            follows: goes_on && place > 0,
+        });
+        forward.collect()
+    }
+
     fn submission(&self, kind: Kind) -> Submission {
-        let pairs = self.frames - 1;
+        let pairs: Vec<PairOf> = match kind {
+            Kind::Pair => Vec::new(),
+            Kind::Sequence => self.pairs(),
+        };
+        let link = self.request.link;
         let options = &self.request.options;
         let asked = options.deadline_ms.map(Duration::from_millis);
         let spent = self.request.arrived.elapsed();
@@ -220,10 +244,13 @@ impl Draft {
             id: self.id,
             tenant: self.caller.tenant.clone(),
             kind,
+            cost_seconds: self.nominal_seconds / pairs.len().max(1) as f64,
             pairs,
+            closing_seconds: None,
+            after: link.and_then(|link| link.after),
+            followed: link.is_some(),
             priority: options.priority,
             device: options.device_kind(),
-            cost_seconds: self.nominal_seconds / f64::from(pairs),
             options: options.to_json(),
             deadline: left.map(|left| Timestamp::now().after(left)),
             idempotency: key.map(|key| Idempotency {

@@ -221,14 +221,18 @@ impl Service {
         Ok(self.queue.job(&caller.tenant, id).await?)
     }
 
-    /// The pairs of the caller's sequence.
+    /// The pairs of the caller's sequence that go forward in time, in order.
     ///
     /// # Errors
     /// Where the store fails.
     pub async fn pairs(&self, job: &Job) -> Result<Vec<Arc<Job>>, ApiError> {
         match job.kind {
             Kind::Pair => Ok(Vec::new()),
-            Kind::Sequence => Ok(self.queue.pairs(job.id).await?),
+            Kind::Sequence => {
+                let mut pairs = self.queue.pairs(job.id).await?;
+                pairs.retain(|pair| !pair.backward);
+                Ok(pairs)
+            }
         }
     }
 
@@ -315,16 +319,22 @@ impl Service {
     /// # Errors
     /// Where the store fails.
     pub async fn make_durable(&self, job: &Job) -> Result<Arc<Job>, ApiError> {
-        let frames = job.pairs.max(1) + 1;
+        let frames = match job.kind {
+            Kind::Pair => 2,
+            Kind::Sequence => 1 + self.pairs(job).await?.len() as u32,
+        };
         for place in 0..frames {
             self.blobs.sync(job.id, Blob::Frame(place)).await?;
         }
         let job = self.queue.make_durable(job.id).await?;
         // A result that came before the queue knew was not waited for.
-        match self.blobs.sync(job.id, Blob::Result(job.attempt)).await {
-            Err(error) if !error.is_missing() => Err(error.into()),
-            _ => Ok(job),
+        for blob in [Blob::Result(job.attempt), Blob::Field(job.attempt)] {
+            match self.blobs.sync(job.id, blob).await {
+                Err(error) if !error.is_missing() => return Err(error.into()),
+                _ => {}
+            }
         }
+        Ok(job)
     }
 
     /// Ends a job when the guard is dropped: whoever waited for it is gone.
@@ -378,8 +388,8 @@ impl Service {
         let began = std::time::Instant::now();
         let points = if format.needs_points() {
             let job = &answer.job;
-            let (owner, place) = job.parent.map_or((job.id, 0), |parent| (parent, job.place));
-            let bytes = self.blobs.get(owner, Blob::Frame(place)).await?;
+            let (owner, [source, _]) = job.sweeps();
+            let bytes = self.blobs.get(owner, Blob::Frame(source)).await?;
             StoredCloud::from_bytes(&bytes)
                 .map_err(ApiError::internal)?
                 .points

@@ -331,6 +331,12 @@ impl JobOptions {
         }
     }
 
+    /// Whether the pairs of a sequence go on from each other: each needs the one before then.
+    pub fn goes_on(&self) -> bool {
+        let options = self.solver_options(usize::MAX);
+        options.warm_start.is_some() || options.ego == Ego::Auto
+    }
+
     /// The solver's options for clouds of which the larger has `points` points.
     pub fn solver_options(&self, points: usize) -> flow::Options {
         let drawn = self.max_points.map(|points| points as usize);

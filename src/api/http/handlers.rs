@@ -63,6 +63,7 @@ impl Asked {
             idempotency_key: self.key.clone(),
             arrived: self.arrived.0,
             time_left: self.prefer.wait.filter(|_| wait_is_deadline),
+            link: None,
         }
     }
 }
