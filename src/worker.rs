@@ -3,6 +3,7 @@
 //! One for each lane of a device. The only room that sees both the queue and the engine. The result is in
 //! store before the queue hears of it, and only the attempt that holds the job counts.
 
+mod dense;
 mod inputs;
 mod job_watch;
 #[cfg(test)]
@@ -18,12 +19,12 @@ use tokio_util::sync::CancellationToken;
 use self::inputs::StoreError;
 use crate::blobs::{Blob, BlobError, Blobs, Sync};
 use crate::cost::CostModel;
-use crate::engine::{EngineError, Health, Lane, Solved, Work};
+use crate::engine::{Densification, EngineError, Health, Lane, Solved, Work};
 use crate::flow::backend::BackendError;
 use crate::flow::{Estimate, Field, FlowError};
-use crate::job::{DeviceKind, Job, JobError, JobProgress, Report};
+use crate::job::{DeviceKind, Job, JobError, JobProgress, Kind, Report};
 use crate::metrics::Metrics;
-use crate::payload::StoredFlow;
+use crate::payload::{StoredDense, StoredFlow};
 use crate::queue::{Committed, Lease, Outcome, Queue, QueueError, Signal};
 
 /// How a worker treats jobs.
@@ -96,7 +97,10 @@ impl Worker {
             };
             match lease {
                 Ok(lease) => {
-                    let attempt = self.attempt(&lease).await;
+                    let attempt = match lease.job.kind {
+                        Kind::Pair => self.attempt(&lease).await,
+                        Kind::Sequence => self.densify(&lease).await,
+                    };
                     if let Some(before) = committing.take() {
                         let _its_own_errors_are_logged = before.await;
                     }
@@ -138,7 +142,7 @@ impl Worker {
         }
     }
 
-    /// Runs one attempt; says how it ended, unless somebody else has the job now.
+    /// Runs one attempt at a pair; says how it ended, unless somebody else has the job now.
     #[tracing::instrument(
         name = "attempt",
         skip_all,
@@ -176,13 +180,14 @@ impl Worker {
                 );
                 let report = Report::new(&estimate, &options, max_iterations, device);
                 // Whoever comes after it goes on from its field.
-                let field = job.followed.then(|| estimate.field.clone());
+                let wanted = job.followed || options.densify.is_some();
+                let field = wanted.then(|| estimate.field.clone());
                 Attempt::Done(Box::new(Done {
                     stop_reason: Some(report.stop_reason.clone()),
                     progress: report.progress(),
                     report: serde_json::to_string(&report),
                     field,
-                    result: StoredFlow::from(estimate),
+                    result: Found::Flow(StoredFlow::from(estimate)),
                 }))
             }
             Err(EngineError::Flow(FlowError::Cancelled)) => self.interrupted(lease),
@@ -364,8 +369,23 @@ impl Worker {
 }
 
 /// What an attempt has found.
+enum Found {
+    Flow(StoredFlow),
+    Cloud(StoredDense),
+}
+
+impl Found {
+    fn to_bytes(&self) -> Vec<u8> {
+        match self {
+            Self::Flow(flow) => flow.to_bytes(),
+            Self::Cloud(cloud) => cloud.to_bytes(),
+        }
+    }
+}
+
+/// What is kept of an attempt.
 struct Done {
-    result: StoredFlow,
+    result: Found,
     /// For those who go on from it.
     field: Option<Field>,
     report: serde_json::Result<String>,

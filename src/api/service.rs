@@ -50,6 +50,8 @@ pub struct Service {
     compute: Semaphore,
     /// Archives that are being written: each holds a thread while its client reads.
     pub(super) archives: Arc<Semaphore>,
+    /// Dense clouds that are being read and encoded.
+    pub(super) clouds: Semaphore,
     /// Cancelled when the server is about to stop: health says so, everything is still served.
     pub(super) leaving: CancellationToken,
     draining: AtomicBool,
@@ -109,6 +111,7 @@ impl Service {
             room: Arc::new(Semaphore::new(room.min(Semaphore::MAX_PERMITS))),
             compute: Semaphore::new(cores),
             archives: Arc::new(Semaphore::new(MAX_ARCHIVES)),
+            clouds: Semaphore::new(1),
             leaving: CancellationToken::new(),
             draining: AtomicBool::new(false),
             closing: CancellationToken::new(),
@@ -345,23 +348,31 @@ impl Service {
         }
     }
 
+    /// Refuses a job that has not succeeded.
+    ///
+    /// # Errors
+    /// [`ApiError::NotEnded`], or how it ended instead.
+    pub(super) fn check_success(job: &Job) -> Result<(), ApiError> {
+        match job.state {
+            State::Succeeded => Ok(()),
+            State::Queued | State::Running => Err(ApiError::NotEnded(job.id)),
+            State::Cancelled => Err(ApiError::Cancelled(job.id)),
+            State::Expired => Err(ApiError::Expired(job.id)),
+            State::Failed => {
+                let error = job.error.clone();
+                Err(error.map_or(ApiError::Internal, |error| {
+                    ApiError::JobFailed(job.id, error)
+                }))
+            }
+        }
+    }
+
     /// The flow of a pair that has succeeded.
     ///
     /// # Errors
     /// [`ApiError::NotEnded`], or how it ended instead.
     pub async fn answer(&self, job: &Arc<Job>) -> Result<Answer, ApiError> {
-        match job.state {
-            State::Succeeded => {}
-            State::Queued | State::Running => return Err(ApiError::NotEnded(job.id)),
-            State::Cancelled => return Err(ApiError::Cancelled(job.id)),
-            State::Expired => return Err(ApiError::Expired(job.id)),
-            State::Failed => {
-                let error = job.error.clone();
-                return Err(error.map_or(ApiError::Internal, |error| {
-                    ApiError::JobFailed(job.id, error)
-                }));
-            }
-        }
+        Self::check_success(job)?;
         if job.kind == Kind::Sequence {
             let text = "a sequence's flow is in its pairs; see links.pairs";
             return Err(ApiError::BadRequest(text.to_owned()));

@@ -27,6 +27,10 @@ pub(super) enum StoreError {
     Damaged(#[from] Damaged),
     #[error("a field cannot be read: {0}")]
     Field(#[from] SealError),
+    #[error("reading it failed: {0}")]
+    Task(#[from] tokio::task::JoinError),
+    #[error("its pairs are not those of its plan")]
+    NoPlan,
     #[error("its options cannot be read: {0}")]
     Options(#[from] crate::job::InvalidOptions),
     #[error(transparent)]

@@ -118,6 +118,7 @@ impl Reader {
             return Err(no_begin());
         };
         let options = convert::options(begin.options)?;
+        options.check_for_pairs()?;
         let mut current: Option<Coming> = None;
         loop {
             // A drive may pause for as long as it likes: only a dead connection ends it.
