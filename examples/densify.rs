@@ -21,7 +21,7 @@ use fnsf::flow::densify::{Later, Leg, Plan, densify};
 use fnsf::flow::distance::{DistanceOptions, Sites};
 use fnsf::flow::ground::{GroundOptions, segment};
 use fnsf::flow::simulate::{Frame, Street, StreetOptions};
-use fnsf::flow::{DenseCloud, Ego, Field, Ground, Point, Preset, Sequence, Sweep, Unwatched};
+use fnsf::flow::{DenseCloud, Field, Point, Preset, Sequence, Sweep, Unwatched};
 use fnsf::formats::read_cloud;
 
 /// Sweeps of a simulated drive, and the one that all are carried into.
@@ -32,22 +32,21 @@ type Fields = BTreeMap<Leg, Field>;
 
 /// Fits all legs of the plans, each chain from its beginning.
 fn fit(backend: &CpuBackend, sweeps: &[Sweep], plans: &[Plan]) -> anyhow::Result<Fields> {
-    let mut options = Preset::Default.options(None);
-    options.ground = Ground::Auto;
-    options.ego = Ego::Auto;
+    let options = Preset::Default.options(None);
     let mut fields = Fields::new();
     for plan in plans {
-        let mut sequence = Sequence::new(backend, options.clone());
+        let mut sequence = Sequence::default();
         let mut last = None;
         for leg in plan.legs() {
             if fields.contains_key(&leg) {
                 continue;
             }
             if last != Some(leg.source) {
-                sequence = Sequence::new(backend, options.clone());
-                sequence.push(sweeps[leg.source].clone(), None, &Unwatched)?;
+                sequence = Sequence::default();
+                sequence.push(backend, sweeps[leg.source].clone(), &options, &Unwatched)?;
             }
-            let estimate = sequence.push(sweeps[leg.target].clone(), None, &Unwatched)?;
+            let estimate =
+                sequence.push(backend, sweeps[leg.target].clone(), &options, &Unwatched)?;
             last = Some(leg.target);
             fields.extend(estimate.map(|estimate| (leg, estimate.field)));
         }
@@ -105,7 +104,7 @@ fn mean(values: impl Iterator<Item = f64>) -> f64 {
 }
 
 /// One row for each age: mean error of movers and of the rest, metres.
-fn simulated(backend: &CpuBackend, seed: u64, rows: &mut Vec<[f64; 12]>) -> anyhow::Result<()> {
+fn simulated(backend: &CpuBackend, seed: u64, rows: &mut Vec<[f64; 7]>) -> anyhow::Result<()> {
     let street = Street::new(&StreetOptions {
         seed,
         frames: FRAMES,
@@ -131,17 +130,16 @@ fn simulated(backend: &CpuBackend, seed: u64, rows: &mut Vec<[f64; 12]>) -> anyh
         let age = INTO as f64 - frame.index as f64;
         let to_into = street.flow_to(frame, INTO as f64);
         let next = street.flow(frame.index)?;
-        let next_pose = street.frame((frame.index + 1) % FRAMES)?.world_from_sensor;
+        let next_pose = street.pose((frame.index + 1) as f64);
         let step = next_pose.inv_mul(&frame.world_from_sensor);
         let moves = |row: usize| {
             let point = frame.points[row];
             let moved = step * nalgebra::Point3::from(point.map(f64::from));
             let there: Point = core::array::from_fn(|a| point[a] + next[row][a]);
-            frame.index + 1 < FRAMES
-                && distance([moved.x as f32, moved.y as f32, moved.z as f32], there) > 0.05
+            distance([moved.x as f32, moved.y as f32, moved.z as f32], there) > 0.05
         };
         let moves: Vec<bool> = (0..count).map(moves).collect();
-        let mut row = [age, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
+        let mut row = [age, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
         for (k, cloud) in clouds.iter().enumerate() {
             let places: Vec<usize> = match first_of(cloud, frame.index) {
                 Some(at) => (at..at + count).collect(),
@@ -159,7 +157,6 @@ fn simulated(backend: &CpuBackend, seed: u64, rows: &mut Vec<[f64; 12]>) -> anyh
                     .map(error),
             );
         }
-        row[10] = clouds[2].converged.iter().filter(|&&c| !c).count() as f64;
         rows.push(row);
         first += count;
     }
@@ -197,26 +194,41 @@ fn real(backend: &CpuBackend, paths: &[String]) -> anyhow::Result<()> {
     let target = &sweeps[into].points;
     let transform = backend.transform(&cloud.points, target, &options, &Unwatched)?;
     let ego_alone = carried(backend, &sweeps, &still(&fields), &plan)?;
-    println!("| age | static points, m | moving points, m | by ego motion alone, m |");
-    println!("|---|---|---|---|");
-    for place in 0..sweeps.len() {
-        let of = |cloud: &DenseCloud, moving: bool, flags: &DenseCloud| {
-            let rows = (0..cloud.points.len()).filter(|&r| cloud.frame[r] as usize == place);
-            let rows = rows.filter(|&r| flags.dynamic[r] == moving);
-            rows.map(|r| cloud.points[r]).collect::<Vec<_>>()
-        };
-        let off = |points: Vec<Point>| -> anyhow::Result<f64> {
-            let distances = transform.distances(&points)?;
-            Ok(mean(distances.into_iter().map(|d| f64::from(d.min(2.0)))))
-        };
+    let distances = transform.distances(&cloud.points)?;
+    let alone = transform.distances(&ego_alone.points)?;
+    println!(
+        "| age | static: median, m | mean to 0.5 m | mean | moving: mean, m | by ego motion alone, m |"
+    );
+    println!("|---|---|---|---|---|---|");
+    let rows = |moving: bool, of: &dyn Fn(usize) -> bool| -> Vec<usize> {
+        (0..cloud.points.len())
+            .filter(|&row| cloud.dynamic[row] == moving && of(cloud.frame[row] as usize))
+            .collect()
+    };
+    let print = |name: String, of: &dyn Fn(usize) -> bool| {
+        let mut still: Vec<f32> = rows(false, of).iter().map(|&row| distances[row]).collect();
+        still.sort_by(f32::total_cmp);
+        let all = |most: f32| mean(still.iter().map(|&d| f64::from(d.min(most))));
+        let movers = rows(true, of);
+        let moving = |from: &[f32]| mean(movers.iter().map(|&row| f64::from(from[row])));
         println!(
-            "| {} | {:.4} | {:.4} | {:.4} |",
-            into as i64 - place as i64,
-            off(of(&cloud, false, &cloud))?,
-            off(of(&cloud, true, &cloud))?,
-            off(of(&ego_alone, true, &cloud))?,
+            "| {name} | {:.4} | {:.4} | {:.4} | {:.4} | {:.4} |",
+            still[still.len() / 2],
+            all(0.5),
+            all(f32::INFINITY),
+            moving(&distances),
+            moving(&alone),
         );
+    };
+    for place in 0..sweeps.len() {
+        print(format!("{:+}", into as i64 - place as i64), &|frame| {
+            frame == place
+        });
     }
+    print("both neighbors".to_owned(), &|frame| {
+        frame.abs_diff(into) == 1
+    });
+    print("all but its own".to_owned(), &|frame| frame != into);
     Ok(())
 }
 
@@ -235,7 +247,7 @@ fn main() -> anyhow::Result<()> {
     );
     println!("|---|---|---|---|---|---|---|");
     for place in 0..FRAMES {
-        let of_age: Vec<&[f64; 12]> = rows.iter().skip(place).step_by(FRAMES).collect();
+        let of_age: Vec<&[f64; 7]> = rows.iter().skip(place).step_by(FRAMES).collect();
         let column = |k: usize| mean(of_age.iter().map(|row| row[k]));
         println!(
             "| {:+} | {:.3} | {:.3} | {:.3} | {:.4} | {:.4} | {:.4} |",

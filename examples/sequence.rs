@@ -16,8 +16,7 @@ use std::time::Instant;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::flow::{
-    Estimate, Ground, Options, Point, Preset, Problem, Sequence, Sweep, Unwatched, WarmStart,
-    estimate,
+    Estimate, Options, Point, Preset, Problem, Sequence, Sweep, Unwatched, WarmStart, estimate,
 };
 use fnsf::formats::read_cloud;
 
@@ -127,14 +126,14 @@ fn alone(backend: &CpuBackend, drive: &Drive, options: &Options) -> anyhow::Resu
 
 fn in_sequence(backend: &CpuBackend, drive: &Drive, options: &Options) -> anyhow::Result<Sums> {
     let mut sums = Sums::default();
-    let mut sequence = Sequence::new(backend, options.clone());
+    let mut sequence = Sequence::default();
     for (k, points) in drive.sweeps.iter().enumerate() {
         let sweep = Sweep {
             points: points.clone(),
             ground: None,
         };
         let began = Instant::now();
-        let estimate = sequence.push(sweep, None, &Unwatched)?;
+        let estimate = sequence.push(backend, sweep, options, &Unwatched)?;
         let seconds = began.elapsed().as_secs_f64();
         if let Some(estimate) = estimate
             && k > 1
@@ -158,8 +157,7 @@ fn main() -> anyhow::Result<()> {
         });
     }
     let backend = CpuBackend::new(None)?;
-    let mut options = Preset::Default.options(None);
-    options.ground = Ground::Auto;
+    let options = Preset::Default.options(None);
     println!("| drive | pairs | EPE | EPE moving | EPE still | loss | iterations | s |");
     println!("|---|---|---|---|---|---|---|---|");
     for drive in &drives {

@@ -19,7 +19,7 @@ use crate::config::Config;
 use crate::flow::simulate::{Street, StreetOptions};
 use crate::flow::{Progress, Watch};
 use crate::formats::{FlowFile, Pair, read_flow, rigid_motion, write_pair_npz};
-use crate::job::{GroundChoice, JobOptions, Report};
+use crate::job::{JobOptions, Report};
 use crate::picture::{self, TopDown, TopDownOptions};
 use crate::text::grouped;
 
@@ -106,10 +106,15 @@ impl Demo {
         ))
         .map_err(|failure| anyhow::anyhow!("{failure}"))?;
         let mut file = Vec::new();
-        write_pair_npz(pair, &mut file)?;
+        // The clouds alone, as a sensor gives them.
+        let sent = Pair {
+            source: pair.source.clone(),
+            target: pair.target.clone(),
+            ..Pair::default()
+        };
+        write_pair_npz(&sent, &mut file)?;
         let options = JobOptions {
             seed: self.seed,
-            ground: GroundChoice::Mask,
             ..JobOptions::default()
         };
         let client = Client::new(app.public_address());

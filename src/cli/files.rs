@@ -7,8 +7,9 @@ use std::path::Path;
 use anyhow::{Context, anyhow};
 
 use super::failure::Failure;
+use crate::flow::depth::Camera;
 use crate::flow::{Point, RigidTransform};
-use crate::formats::{self, FileKind, FlowFile, FormatError, Pair, PairTruth};
+use crate::formats::{self, FileKind, FlowFile, FormatError, GroundRaster, Pair, PairTruth};
 
 /// The largest file that is read, bytes.
 const MAX_FILE: u64 = 4 << 30;
@@ -118,6 +119,30 @@ pub(super) fn read_motion(path: &Path) -> Result<RigidTransform, Failure> {
     motion
         .with_context(|| path.display().to_string())
         .map_err(Failure::bad_input)
+}
+
+/// Argoverse 2's raster of ground heights, and its place, which lies beside it.
+pub(super) fn read_ground_raster(path: &Path) -> Result<GroundRaster, Failure> {
+    const PLACE: &str = "___img_Sim2_city.json";
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let log = name.split("_ground_height_surface").next();
+    let place = folder.join(format!("{}{PLACE}", log.unwrap_or_default()));
+    GroundRaster::read(&read_bytes(path)?, &read_bytes(&place)?)
+        .with_context(|| path.display().to_string())
+        .map_err(Failure::bad_input)
+}
+
+/// A camera: one file, or KITTI's two, `calib_cam_to_cam.txt` with `calib_velo_to_cam.txt` beside it.
+pub(super) fn read_camera(path: &Path) -> Result<Camera, Failure> {
+    let beside = path.with_file_name("calib_velo_to_cam.txt");
+    let is_first = path
+        .file_name()
+        .is_some_and(|name| name == "calib_cam_to_cam.txt");
+    let second = is_first.then(|| read_bytes(&beside)).transpose()?;
+    read(path, |bytes, _| {
+        formats::read_camera(bytes, second.as_deref())
+    })
 }
 
 /// Refuses, before any work, a file whose folder is not there.

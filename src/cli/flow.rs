@@ -1,161 +1,58 @@
-//! `fnsf flow`: one pair, here and now.
+//! `fnsf flow`: pairs of sweeps, here and now.
 
 use std::path::{Path, PathBuf};
 
 use anyhow::anyhow;
 use clap::Args;
 
-use super::device::{self, DeviceArgument};
+use super::estimation::{Estimation, check_sequence};
 use super::failure::Failure;
 use super::files;
 use super::machine::peak_resident_bytes;
 use super::output::say;
 use super::terminal::Terminal;
-use crate::flow::backend::BackendError;
-use crate::flow::{self, Estimate, FlowError, Problem, Watch};
-use crate::formats::{FlowFormat, FlowTable, Pair, write_flow};
-use crate::job::{
-    DeviceChoice, EgoChoice, GroundChoice, JobOptions, PrecisionChoice, PresetChoice, Report,
-};
+use crate::flow::Watch;
+use crate::flow::{Estimate, Point, Sequence, Sweep};
+use crate::formats::{FlowFormat, FlowTable, write_flow};
+use crate::job::Report;
 use crate::picture::{self, TopDown, TopDownOptions};
 use crate::text::grouped;
 
-/// Estimate the motion of every point between two sweeps.
+/// Estimate the motion of every point between two sweeps, or of a sequence's pairs.
 ///
 /// Reads npz, npy, ply, pcd, KITTI bin, nuScenes pcd.bin and Argoverse 2 feather, recognized by
 /// content. The flow has one row per source point: where the point is in the target's frame, less
-/// where it was in the source's, in metres.
+/// where it was in the source's, in metres. Of a sequence every pair starts from the one before,
+/// and its flow is written as soon as it is there.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
     fnsf flow a.feather b.feather -o flow.npz\n  \
     fnsf flow pair.npz --ground mask --range-m 51.2 -o flow.ply --picture flow.png\n  \
-    fnsf flow a.pcd b.pcd --preset paper --max-points 8192 --json")]
+    fnsf flow a.pcd b.pcd --preset paper --max-points 8192 --json\n  \
+    fnsf flow sweeps/*.pcd -o flows/flow.npz        flows/flow_0000.npz, flow_0001.npz, ...")]
 pub(super) struct Flow {
-    /// The earlier sweep; or an .npz with both, as arrays pc1 and pc2
-    source: PathBuf,
-    /// The later sweep
-    target: Option<PathBuf>,
-    /// Where the flow goes: .npz, .npy, .feather, .ply, .pcd or .json
+    /// Two sweeps or more, in order; or one .npz with two, as arrays pc1 and pc2
+    #[arg(required = true, value_name = "SWEEP")]
+    sweeps: Vec<PathBuf>,
+    /// Where the flow goes: .npz, .npy, .feather, .ply, .pcd or .json. The flows of more than two
+    /// sweeps are numbered: flow.npz becomes flow_0000.npz, flow_0001.npz, ...
     #[arg(short, long, value_name = "OUT")]
     output: Option<PathBuf>,
-    /// Draw the flow from above, colored by direction
+    /// Draw the flow from above, colored by direction; numbered likewise
     #[arg(long, value_name = "OUT.png")]
     picture: Option<PathBuf>,
-    /// Print one JSON object on stdout
+    /// Print one JSON object for each pair on stdout
     #[arg(long)]
     json: bool,
     #[command(flatten)]
     estimation: Estimation,
 }
 
-/// How the flow is found.
-#[derive(Clone, Debug, Args)]
-struct Estimation {
-    /// default: ours, robust and fast; paper: FNSF as published
-    #[arg(long, value_enum, default_value_t)]
-    preset: PresetChoice,
-    /// Where the work is done: auto (a GPU, else the CPU), cpu, gpu, or gpu:CARD with a card's
-    /// number, PCI id or part of its name; fnsf doctor lists them
-    #[arg(long, value_name = "DEVICE", default_value_t)]
-    device: DeviceArgument,
-    /// CPU threads; all cores by default. The result does not depend on it
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
-    threads: Option<u16>,
-    /// What the network's products are rounded to: f16 is for GPUs whose matrix units pass their
-    /// self-test, see fnsf doctor
-    #[arg(long, value_enum, default_value_t)]
-    precision: PrecisionChoice,
-    /// The same seed gives the same bits
-    #[arg(long, value_name = "N", default_value_t = 0)]
-    seed: u64,
-    /// Draw this many points from each cloud and leave out the rest
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(3..))]
-    max_points: Option<u32>,
-    /// Leave out points with |x| or |y| beyond R metres
-    #[arg(long, value_name = "R", value_parser = positive)]
-    range_m: Option<f32>,
-    /// Keep ground points, leave out those that the pair's ground1 and ground2 name (mask), or find
-    /// them and let them move with the vehicle's own motion (auto)
-    #[arg(long, value_enum, default_value_t)]
-    ground: GroundChoice,
-    /// The vehicle's own motion: off, auto (estimate it first), or a file with the 4 x 4 matrix
-    /// target_from_source; by default what the preset does
-    #[arg(long, value_name = "off|auto|FILE")]
-    ego: Option<String>,
-}
-
-fn positive(text: &str) -> Result<f32, String> {
-    match text.parse::<f32>() {
-        Ok(value) if value.is_finite() && value > 0.0 => Ok(value),
-        _ => Err("a positive number of metres is needed".to_owned()),
-    }
-}
-
-impl Estimation {
-    /// The same options that a request has.
-    fn options(&self) -> Result<JobOptions, Failure> {
-        let ego = match self.ego.as_deref() {
-            None => None,
-            Some("off") => Some(EgoChoice::Off),
-            Some("auto") => Some(EgoChoice::Auto),
-            Some(file) => Some(EgoChoice::Given(files::read_motion(Path::new(file))?)),
-        };
-        Ok(JobOptions {
-            preset: self.preset,
-            seed: self.seed,
-            max_points: self.max_points,
-            range_m: self.range_m,
-            ground: self.ground,
-            ego,
-            device: self.device.choice,
-            precision: self.precision,
-            ..JobOptions::default()
-        })
-    }
-
-    /// Estimates the pair's flow; `terminal` was started before the first file was read.
-    fn solve(&self, pair: &Pair, terminal: &Terminal) -> Result<(Estimate, Report), Failure> {
-        let options = self.options()?;
-        let load = terminal.seconds();
-        let threads = self.threads.map(usize::from);
-        let mut backend = device::open(&self.device, threads)?;
-        let ground = pair.ground.as_ref();
-        let problem = Problem {
-            source: &pair.source,
-            target: &pair.target,
-            ground: ground.map(|ground| [ground.source.as_slice(), ground.target.as_slice()]),
-            before: None,
-        };
-        let points = pair.source.len().max(pair.target.len());
-        let solver_options = options.solver_options(points);
-        let mut estimate = flow::estimate(backend.as_ref(), &problem, &solver_options, terminal);
-        if let Err(FlowError::Backend(error @ BackendError::Memory { .. })) = &estimate
-            && self.device.choice == DeviceChoice::Auto
-        {
-            device::stand_in(error);
-            backend = device::cpu(threads)?;
-            estimate = flow::estimate(backend.as_ref(), &problem, &solver_options, terminal);
-        }
-        terminal.finish();
-        let estimate = estimate?;
-        let mut report = Report::new(
-            &estimate,
-            &options,
-            solver_options.max_iterations,
-            backend.name(),
-        );
-        report.seconds.load = Some(load);
-        report.seconds.total += load;
-        report.peak_rss_bytes = peak_resident_bytes();
-        Ok((estimate, report))
-    }
-}
-
 /// Writes the flow in the format that the name asks for.
-fn write(estimate: &Estimate, pair: &Pair, path: &Path) -> Result<(), Failure> {
+fn write(estimate: &Estimate, source: &[Point], path: &Path) -> Result<(), Failure> {
     let format = FlowFormat::from_path(path).map_err(Failure::usage)?;
     let table = FlowTable {
-        source: &pair.source,
+        source,
         flow: &estimate.flow,
         valid: &estimate.valid,
         dynamic: estimate.dynamic.as_deref(),
@@ -165,10 +62,10 @@ fn write(estimate: &Estimate, pair: &Pair, path: &Path) -> Result<(), Failure> {
 }
 
 /// Draws the flow from above.
-fn draw(estimate: &Estimate, pair: &Pair, path: &Path) -> Result<(), Failure> {
+fn draw(estimate: &Estimate, source: &[Point], path: &Path) -> Result<(), Failure> {
     let image = picture::top_down(
         &TopDown {
-            source: &pair.source,
+            source,
             flow: &estimate.flow,
             valid: &estimate.valid,
             ego: estimate.ego.as_ref(),
@@ -213,8 +110,90 @@ pub(super) fn print_report(report: &Report) -> Result<(), Failure> {
     Ok(())
 }
 
+/// `path` with the pair's number before its ending, where there are several.
+fn numbered(path: &Path, pair: usize, pairs: usize) -> PathBuf {
+    if pairs < 2 {
+        return path.to_owned();
+    }
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    let ending = path.extension().unwrap_or_default().to_string_lossy();
+    path.with_file_name(format!("{stem}_{pair:04}.{ending}"))
+}
+
+/// Sweeps to be read one after the other, or those of one file.
+enum Sweeps<'a> {
+    Files(&'a [PathBuf]),
+    Pair(Box<[Sweep; 2]>),
+}
+
+impl Sweeps<'_> {
+    fn count(&self) -> usize {
+        match self {
+            Self::Files(files) => files.len(),
+            Self::Pair(pair) => pair.len(),
+        }
+    }
+}
+
 impl Flow {
     pub(super) fn run(&self) -> Result<(), Failure> {
+        self.check_outputs()?;
+        let terminal = Terminal::new();
+        let options = self.estimation.options()?;
+        let sweeps = match self.sweeps.as_slice() {
+            [pair] => {
+                let pair = files::read_pair(pair)?;
+                let (source, target) = match pair.ground {
+                    Some(ground) => (Some(ground.source), Some(ground.target)),
+                    None => (None, None),
+                };
+                let sweep = |points, ground| Sweep { points, ground };
+                Sweeps::Pair(Box::new([
+                    sweep(pair.source, source),
+                    sweep(pair.target, target),
+                ]))
+            }
+            files => {
+                check_sequence(&options, files.len())?;
+                Sweeps::Files(files)
+            }
+        };
+        let surroundings = self.estimation.surroundings(&self.sweeps)?;
+        let mut device = self.estimation.open()?;
+        let (mut sequence, mut last) = (Sequence::default(), None::<Vec<Point>>);
+        let count = sweeps.count();
+        for place in 0..count {
+            let began = terminal.seconds();
+            let sweep = match &sweeps {
+                Sweeps::Pair(pair) => pair[place].clone(),
+                Sweeps::Files(files) => surroundings.sweep(place, &files[place])?,
+            };
+            let load = terminal.seconds() - began;
+            let points = sweep.points.clone();
+            let larger = points.len().max(last.as_ref().map_or(0, Vec::len));
+            let pair = [place.saturating_sub(1), place];
+            let solver_options = surroundings.options(&options, larger, pair);
+            let estimate = device.push(&mut sequence, sweep, &solver_options, &terminal)?;
+            terminal.finish();
+            if let (Some(estimate), Some(source)) = (estimate, &last) {
+                let mut report = Report::new(
+                    &estimate,
+                    &options,
+                    solver_options.max_iterations,
+                    device.backend.name(),
+                );
+                report.seconds.load = Some(load);
+                report.seconds.total += load;
+                report.peak_rss_bytes = peak_resident_bytes();
+                self.put(&estimate, &report, source, [pair[0], count - 1])?;
+            }
+            last = Some(points);
+        }
+        Ok(())
+    }
+
+    /// Refuses, before any work, what could not be written at its end.
+    fn check_outputs(&self) -> Result<(), Failure> {
         if self.output.is_none() && self.picture.is_none() && !self.json {
             return Err(Failure::usage(anyhow!(
                 "nothing to do: give -o OUT, --picture OUT.png or --json"
@@ -230,30 +209,35 @@ impl Flow {
             }
             files::check_writable(picture)?;
         }
-        let terminal = Terminal::new();
-        let pair = match &self.target {
-            None => files::read_pair(&self.source)?,
-            Some(target) => Pair {
-                source: files::read_cloud(&self.source)?,
-                target: files::read_cloud(target)?,
-                ..Pair::default()
-            },
-        };
-        let (estimate, report) = self.estimation.solve(&pair, &terminal)?;
-        if let Some(path) = &self.output {
-            write(&estimate, &pair, path)?;
+        Ok(())
+    }
+
+    /// Writes, draws and prints what became of a pair, which is one of `pairs`.
+    fn put(
+        &self,
+        estimate: &Estimate,
+        report: &Report,
+        source: &[Point],
+        [pair, pairs]: [usize; 2],
+    ) -> Result<(), Failure> {
+        let place = |path: &PathBuf| numbered(path, pair, pairs);
+        let (output, picture) = (
+            self.output.as_ref().map(place),
+            self.picture.as_ref().map(place),
+        );
+        if let Some(path) = &output {
+            write(estimate, source, path)?;
         }
-        if let Some(path) = &self.picture {
-            draw(&estimate, &pair, path)?;
+        if let Some(path) = &picture {
+            draw(estimate, source, path)?;
         }
         if self.json {
-            let json = serde_json::to_string(&report).map_err(Failure::internal)?;
-            say(format_args!("{json}"))?;
-        } else {
-            print_report(&report)?;
-            for path in self.output.iter().chain(&self.picture) {
-                say(format_args!("  wrote {}", path.display()))?;
-            }
+            let json = serde_json::to_string(report).map_err(Failure::internal)?;
+            return say(format_args!("{json}"));
+        }
+        print_report(report)?;
+        for path in output.iter().chain(&picture) {
+            say(format_args!("  wrote {}", path.display()))?;
         }
         Ok(())
     }

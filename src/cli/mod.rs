@@ -7,7 +7,9 @@
 )]
 
 mod client;
+mod densify;
 mod device;
+mod estimation;
 mod failure;
 mod files;
 mod machine;
@@ -32,7 +34,8 @@ use clap::{Parser, Subcommand};
     fnsf demo                                  a simulated street, its flow, its error, a picture\n  \
     fnsf serve                                 HTTP and gRPC on 127.0.0.1:8080\n  \
     fnsf flow a.pcd b.pcd -o flow.npz          two sweeps, any format\n  \
-    fnsf flow a.pcd b.pcd --picture flow.png   the same, to look at")]
+    fnsf flow a.pcd b.pcd --picture flow.png   the same, to look at\n  \
+    fnsf densify *.pcd --into 5 -o dense.laz   a drive's sweeps as one dense cloud")]
 pub struct Arguments {
     #[command(subcommand)]
     command: Command,
@@ -43,6 +46,7 @@ enum Command {
     Demo(demo::Demo),
     Serve(Box<serve::Serve>),
     Flow(flow::Flow),
+    Densify(densify::Densify),
     Eval(eval::Eval),
     Synth(synth::Synth),
     Doctor(doctor::Doctor),
@@ -55,6 +59,7 @@ pub fn run(arguments: Arguments) -> ExitCode {
         Command::Demo(command) => command.run(),
         Command::Serve(command) => command.run(),
         Command::Flow(command) => command.run(),
+        Command::Densify(command) => command.run(),
         Command::Eval(command) => command.run(),
         Command::Synth(command) => command.run(),
         Command::Doctor(command) => command.run(),

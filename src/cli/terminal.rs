@@ -15,7 +15,7 @@ pub(super) struct Terminal {
 impl Terminal {
     pub(super) fn new() -> Self {
         let style = ProgressStyle::with_template(
-            "{spinner} {msg}  {wide_bar:.cyan/blue} {pos} of at most {len}  {elapsed}",
+            "{spinner} {prefix}{msg}  {wide_bar:.cyan/blue} {pos} of at most {len}  {elapsed}",
         )
         .unwrap_or_else(|_| ProgressStyle::default_bar());
         // Hidden by itself where stderr is not a terminal.
@@ -27,6 +27,11 @@ impl Terminal {
             began: Instant::now(),
             bar,
         }
+    }
+
+    /// Names the part of the work that begins, and shows the bar again.
+    pub(super) fn part(&self, name: &str) {
+        self.bar.set_prefix(format!("{name}, "));
     }
 
     /// Takes the bar away.

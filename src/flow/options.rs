@@ -146,6 +146,7 @@ impl Options {
     /// Ours; `docs/numerics.md` shows what each of these choices changes.
     fn stochastic(max_points: Option<usize>) -> Self {
         Self {
+            ground: Ground::Auto,
             ego: Ego::Auto,
             loss: LossOptions {
                 margin_m: 0.1,
@@ -209,8 +210,10 @@ pub enum Ground {
     Keep,
     /// Those that the problem's masks name are left out.
     Mask,
-    /// Those that [`super::ground::segment`] finds take no part, and move with the vehicle's own
-    /// motion where that is known and the points are not sampled; else they are left out.
+    /// Those that the problem's masks name or, where it has none, that
+    /// [`super::ground::segment`] finds take no part, and move with the vehicle's own
+    /// motion where that is known and the points are not sampled; else they are left out. Where
+    /// too little stands on it, it is kept.
     Auto,
 }
 

@@ -16,7 +16,8 @@ pub struct Problem<'a> {
     pub source: &'a [Point],
     /// M points of the later sweep, metres, in its sensor's frame.
     pub target: &'a [Point],
-    /// N and M flags: which points are ground. Needed by [`Ground::Mask`].
+    /// N and M flags: which points are ground. Needed by [`Ground::Mask`]; [`Ground::Auto`] finds
+    /// them where they are not given.
     pub ground: Option<[&'a [bool]; 2]>,
     /// The motion of the pair before, from the sweep before the source to the source: where a fit
     /// may start, and the vehicle's motion be sought. None for a pair on its own.
@@ -39,11 +40,12 @@ pub(crate) struct Selection {
 
 /// Selects by `options`; refuses clouds of which too little is left.
 pub(crate) fn select(problem: &Problem, options: &Options) -> Result<Selection, FlowError> {
-    let found = match options.ground {
-        Ground::Auto => {
+    let mut found = match (options.ground, problem.ground) {
+        (Ground::Auto, Some(known)) => Some(known.map(<[bool]>::to_vec)),
+        (Ground::Auto, None) => {
             Some([problem.source, problem.target].map(|points| ground_of(points, options)))
         }
-        Ground::Keep | Ground::Mask => None,
+        (Ground::Keep | Ground::Mask, _) => None,
     };
     let [source_mask, target_mask] = match (options.ground, problem.ground, &found) {
         (Ground::Mask, None, _) => return Err(FlowError::NoGroundMask),
@@ -53,9 +55,17 @@ pub(crate) fn select(problem: &Problem, options: &Options) -> Result<Selection, 
     };
     let mut rows = kept("source", problem.source, source_mask, options)?;
     let mut target_rows = kept("target", problem.target, target_mask, options)?;
+    if found.is_some() && rows.len().min(target_rows.len()) < MIN_POINTS {
+        // Nothing but ground: it is what there is to fit.
+        found = None;
+        rows = kept("source", problem.source, None, options)?;
+        target_rows = kept("target", problem.target, None, options)?;
+    }
     let carried = match &found {
         Some([ground, _]) if options.max_points.is_none() => {
-            (0..ground.len()).filter(|&row| ground[row]).collect()
+            let rows = 0..ground.len();
+            rows.filter(|&row| ground[row] && is_in_range(problem.source[row], options))
+                .collect()
         }
         _ => Vec::new(),
     };
@@ -88,7 +98,7 @@ pub(crate) fn select(problem: &Problem, options: &Options) -> Result<Selection, 
 }
 
 /// Which of the points are ground, of those that are finite and in range.
-fn ground_of(points: &[Point], options: &Options) -> Vec<bool> {
+pub(crate) fn ground_of(points: &[Point], options: &Options) -> Vec<bool> {
     let rows: Vec<usize> = (0..points.len())
         .filter(|&row| is_in_range(points[row], options))
         .collect();
@@ -165,9 +175,20 @@ mod tests {
         let ground = [false, false, false, false, false, false, true];
         let mut options = Preset::Default.options(None);
         options.range_m = Some(51.2);
+        options.ground = Ground::Keep;
         assert_eq!(rows(&options, &source, Some(&ground)), [0, 2, 5, 6]);
-        options.ground = Ground::Mask;
-        assert_eq!(rows(&options, &source, Some(&ground)), [0, 2, 5]);
+        for leaves_out in [Ground::Mask, Ground::Auto] {
+            options.ground = leaves_out;
+            assert_eq!(rows(&options, &source, Some(&ground)), [0, 2, 5]);
+        }
+    }
+
+    #[test]
+    fn clouds_of_nothing_but_ground_keep_it() {
+        let source: Vec<Point> = (0..9).map(|i| [i as f32, 0.0, 0.0]).collect();
+        let options = Preset::Default.options(None);
+        assert_eq!(options.ground, Ground::Auto);
+        assert_eq!(rows(&options, &source, Some(&[true; 9])).len(), 9);
     }
 
     #[test]

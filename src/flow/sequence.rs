@@ -7,9 +7,9 @@
 use super::backend::Backend;
 use super::error::FlowError;
 use super::field::Field;
-use super::options::{Ego, Options};
-use super::points::{Point, RigidTransform};
-use super::preprocess::Problem;
+use super::options::{Ground, Options};
+use super::points::Point;
+use super::preprocess::{Problem, ground_of};
 use super::solver::{Estimate, estimate};
 use super::watch::Watch;
 
@@ -23,55 +23,44 @@ pub struct Sweep {
 }
 
 /// The pairs of a sequence, one after the other.
-pub struct Sequence<'a> {
-    backend: &'a dyn Backend,
-    options: Options,
+#[derive(Clone, Debug, Default)]
+pub struct Sequence {
     last: Option<Sweep>,
     before: Option<Field>,
 }
 
-impl<'a> Sequence<'a> {
-    /// A sequence whose pairs are estimated by `options`.
-    pub fn new(backend: &'a dyn Backend, options: Options) -> Self {
-        Self {
-            backend,
-            options,
-            last: None,
-            before: None,
-        }
-    }
-
-    /// Takes the next sweep, and gives the motion from the one before to it; nothing for the first.
-    /// Where the vehicle's motion target_from_source is known, `ego` says it.
+impl Sequence {
+    /// Takes the next sweep, and gives the motion from the one before to it by `options`; nothing for
+    /// the first. Options may change from sweep to sweep: where the vehicle's motion is known,
+    /// [`super::Ego::Given`] says it.
     ///
     /// # Errors
-    /// As [`estimate`]; the sequence goes on afresh with this sweep.
+    /// As [`estimate`]; the sequence is left as it was, and the sweep may be pushed again.
     pub fn push(
         &mut self,
-        sweep: Sweep,
-        ego: Option<RigidTransform>,
+        backend: &dyn Backend,
+        mut sweep: Sweep,
+        options: &Options,
         watch: &dyn Watch,
     ) -> Result<Option<Estimate>, FlowError> {
-        let before = self.before.take();
-        let Some(last) = self.last.replace(sweep) else {
-            return Ok(None);
-        };
-        let Some(sweep) = &self.last else {
-            return Ok(None);
-        };
-        let mut options = self.options.clone();
-        if let Some(motion) = ego {
-            options.ego = Ego::Given(motion);
+        if options.ground == Ground::Auto && sweep.ground.is_none() {
+            // Once for both of its pairs.
+            sweep.ground = Some(ground_of(&sweep.points, options));
         }
+        let Some(last) = &self.last else {
+            self.last = Some(sweep);
+            return Ok(None);
+        };
         let ground = last.ground.as_deref().zip(sweep.ground.as_deref());
         let problem = Problem {
             source: &last.points,
             target: &sweep.points,
             ground: ground.map(|(source, target)| [source, target]),
-            before: before.as_ref(),
+            before: self.before.as_ref(),
         };
-        let estimate = estimate(self.backend, &problem, &options, watch)?;
+        let estimate = estimate(backend, &problem, options, watch)?;
         self.before = Some(estimate.field.clone());
+        self.last = Some(sweep);
         Ok(Some(estimate))
     }
 }

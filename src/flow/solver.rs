@@ -175,12 +175,13 @@ fn solve(
             dynamic[row] = square >= DYNAMIC_M * DYNAMIC_M;
         }
     }
-    if let (Some(motion), Some(dynamic)) = (&ego, &mut dynamic) {
+    // Where there was no time for an ego motion they stand still, as everything else does.
+    if options.ego != Ego::Off {
+        let motion = ego.unwrap_or_default();
         for &row in &selection.carried {
-            let (from, to) = (problem.source[row], moved(motion, problem.source[row]));
+            let (from, to) = (problem.source[row], moved(&motion, problem.source[row]));
             flow[row] = core::array::from_fn(|a| to[a] - from[a]);
             valid[row] = true;
-            dynamic[row] = false;
         }
     }
     let report = fitted.report;
@@ -471,8 +472,17 @@ mod tests {
     fn ground_that_is_found_moves_with_the_vehicle_and_takes_no_part() {
         let pair = street();
         let mut options = Preset::Default.options(None);
-        options.ground = Ground::Auto;
-        let estimate = solve(&pair, &options, &Unwatched).expect("a flow");
+        let solve = |options: &Options| {
+            let backend = CpuBackend::new(Some(2)).expect("threads");
+            let problem = Problem {
+                source: &pair.source,
+                target: &pair.target,
+                ground: None,
+                before: None,
+            };
+            estimate(&backend, &problem, options, &Unwatched).expect("a flow")
+        };
+        let estimate = solve(&options);
         let ego = estimate.ego.expect("it is estimated");
         assert!(estimate.valid.iter().all(|&valid| valid));
         assert!(estimate.points < pair.source.len());
@@ -493,7 +503,7 @@ mod tests {
         for (ego, max_points) in [(Ego::Off, None), (Ego::Auto, Some(500))] {
             options.ego = ego;
             options.max_points = max_points;
-            let estimate = solve(&pair, &options, &Unwatched).expect("a flow");
+            let estimate = solve(&options);
             assert!((0..found.len()).all(|row| !found[row] || !estimate.valid[row]));
         }
     }

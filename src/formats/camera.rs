@@ -39,7 +39,7 @@ struct Written {
 ///
 /// # Errors
 /// `Malformed`, `Unsupported` and `Missing` name the line or key, `TooLarge` a file past 64 KiB,
-/// `Motion` a pose that is not rigid, `Camera` what no camera has.
+/// `Camera` what no camera has.
 pub fn read_camera(bytes: &[u8], velo_to_cam: Option<&[u8]>) -> Result<Camera, FormatError> {
     if bytes.len() <= MAX_FILE && bytes.trim_ascii_start().starts_with(b"{") {
         if velo_to_cam.is_some() {
@@ -49,7 +49,7 @@ pub fn read_camera(bytes: &[u8], velo_to_cam: Option<&[u8]>) -> Result<Camera, F
             serde_json::from_slice(bytes).map_err(|error| KIND.malformed(error.to_string()))?;
         return Ok(Camera::new(
             Intrinsics::from_matrix(&written.k)?,
-            rigid_motion(&written.camera_from_lidar)?,
+            rigid("camera_from_lidar", &written.camera_from_lidar)?,
             [written.width, written.height],
         )?);
     }
@@ -168,16 +168,17 @@ impl<'a> Calibration<'a> {
                     "a second file goes with calib_cam_to_cam.txt, and the first is not that",
                 ));
             }
-            (false, None) => rigid_motion(
-                &self.rows("the lidar's pose", &["Tr_velo_to_cam", "Tr_velo_cam", "Tr"])?,
-            )?,
+            (false, None) => {
+                let keys = ["Tr_velo_to_cam", "Tr_velo_cam", "Tr"];
+                rigid("the lidar's pose", &self.rows("the lidar's pose", &keys)?)?
+            }
         };
         let rotation = self.numbers::<9>(&["R0_rect", "R_rect_00", "R_rect"])?;
         let Some(rotation) = rotation else {
             // The odometry benchmark's pose is that of the rectified camera.
             return Ok(unrectified_from_lidar);
         };
-        let rectified = rigid_motion(&pose_rows(&rotation, &[0.0; 3]))?;
+        let rectified = rigid("the rectification", &pose_rows(&rotation, &[0.0; 3]))?;
         Ok(rectified * unrectified_from_lidar)
     }
 
@@ -186,7 +187,7 @@ impl<'a> Calibration<'a> {
         let lacks = || KIND.malformed("calib_velo_to_cam.txt has no R and T");
         let rotation = self.numbers::<9>(&["R"])?.ok_or_else(lacks)?;
         let translation = self.numbers::<3>(&["T"])?.ok_or_else(lacks)?;
-        rigid_motion(&pose_rows(&rotation, &translation))
+        rigid("R with T", &pose_rows(&rotation, &translation))
     }
 }
 
@@ -198,6 +199,12 @@ pub(super) fn with_last_row(numbers: &[f64; 12]) -> [[f64; 4]; 4] {
         rows[index / 4][index % 4] = number;
     }
     rows
+}
+
+/// The rigid transform that a matrix is, refused by the name that it has in the file.
+fn rigid(what: &str, rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError> {
+    let refuse = |_| KIND.malformed(format!("{what} is not a rigid transform"));
+    rigid_motion(rows).map_err(refuse)
 }
 
 fn pose_rows(rotation: &[f64; 9], translation: &[f64; 3]) -> [[f64; 4]; 4] {

@@ -52,6 +52,8 @@ pub fn rigid_motion(rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError>
     }
     let rotation =
         UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
+    // Of a rounded matrix its length is not quite 1, and it would scale what it turns.
+    let rotation = UnitQuaternion::new_normalize(rotation.into_inner());
     let translation = Translation3::new(rows[0][3], rows[1][3], rows[2][3]);
     Ok(RigidTransform::from_parts(translation, rotation))
 }
@@ -79,6 +81,15 @@ mod tests {
                 .max()
                 < 1e-12
         );
+    }
+
+    #[test]
+    fn a_matrix_printed_with_few_digits_is_still_a_rotation() {
+        let text = "0.866 -0.5 0 1  0.5 0.866 0 2  0 0 1 3  0 0 0 1";
+        let read = read_motion(text.as_bytes()).expect("rounded to a thousandth");
+        assert!((read.rotation.quaternion().norm() - 1.0).abs() < 1e-15);
+        let turned = read.rotation * nalgebra::Vector3::x();
+        assert!((turned.norm() - 1.0).abs() < 1e-15);
     }
 
     #[test]

@@ -32,9 +32,10 @@ pub struct JobOptions {
     /// Leave out points with |x| or |y| beyond this, metres.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub range_m: Option<f32>,
-    /// Keep ground points, leave out those that the pair's own masks name, or find them: then they
-    /// move with the vehicle's own motion.
-    pub ground: GroundChoice,
+    /// `keep` ground points, leave out those that the pair's own masks name (`mask`), or find them
+    /// (`auto`): then they move with the vehicle's own motion; by default what the preset does.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ground: Option<GroundChoice>,
     /// The vehicle's own motion: `off`, `auto` (estimate it first) or a 4 x 4 matrix
     /// target_from_source; by default what the preset does.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -78,13 +79,10 @@ impl PresetChoice {
 }
 
 /// What becomes of ground points.
-#[derive(
-    Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema, clap::ValueEnum,
-)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema, clap::ValueEnum)]
 #[serde(rename_all = "snake_case")]
 pub enum GroundChoice {
     /// They are points like any other.
-    #[default]
     Keep,
     /// Those that the pair's ground1 and ground2 name are left out.
     Mask,
@@ -371,11 +369,12 @@ impl JobOptions {
             .options(drawn.filter(|&drawn| drawn < points));
         options.seed = self.seed;
         options.range_m = self.range_m;
-        options.ground = match self.ground {
-            GroundChoice::Keep => Ground::Keep,
-            GroundChoice::Mask => Ground::Mask,
-            GroundChoice::Auto => Ground::Auto,
-        };
+        match self.ground {
+            None => {}
+            Some(GroundChoice::Keep) => options.ground = Ground::Keep,
+            Some(GroundChoice::Mask) => options.ground = Ground::Mask,
+            Some(GroundChoice::Auto) => options.ground = Ground::Auto,
+        }
         match self.ego {
             None => {}
             Some(EgoChoice::Off) => options.ego = Ego::Off,

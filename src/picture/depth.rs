@@ -107,7 +107,7 @@ fn draw_panel(image: &mut Image, depth: &DepthImage, top: i32, farthest_m: f32) 
     let size = [depth.width as i32, depth.height as i32];
     image.bar([0, top], size, UNKNOWN, 1.0);
     let mut dots: Vec<(f32, usize)> = depth.metres.iter().copied().zip(0..).collect();
-    dots.retain(|(metres, _)| *metres > 0.0);
+    dots.retain(|(metres, _)| *metres > 0.0 && depth.width > 0);
     dots.sort_by(|left, right| right.0.total_cmp(&left.0));
     for (metres, index) in dots {
         let [column, row] = [index as i32 % size[0], index as i32 / size[0]];

@@ -111,7 +111,7 @@ fn a_calibration_that_lacks_something_says_what() {
     let text = refusal(OBJECT.replace("0 1 0.005", "0 2 0.005").as_bytes(), None);
     assert!(text.contains("the camera matrix is not"), "{text}");
     let text = refusal(OBJECT.replace("R0_rect: 1", "R0_rect: 2").as_bytes(), None);
-    assert!(text.contains("not a rigid transform"), "{text}");
+    assert!(text.contains("the rectification is not a rigid"), "{text}");
     let raw = CAM_TO_CAM.replace("1.224e+03", "1224.5");
     let text = refusal(raw.as_bytes(), Some(VELO_TO_CAM.as_bytes()));
     assert!(text.contains("S_rect_02 is not a size in pixels"), "{text}");
@@ -132,7 +132,11 @@ fn a_camera_in_json_is_refused_by_what_is_wrong_with_it() {
         ("[[700, 0,", "[[-700, 0,", "fx of the camera is -700"),
         ("[[700, 0,", "[[700, 1,", "the camera matrix is not"),
         ("[1, 0, 0, -0.295]", "[1, 0, 0, 1e9]", "within 1000 m"),
-        ("[[0, -1, 0,", "[[0, -2, 0,", "not a rigid transform"),
+        (
+            "[[0, -1, 0,",
+            "[[0, -2, 0,",
+            "camera_from_lidar is not a rigid",
+        ),
     ] {
         let text = refusal(JSON.replace(from, to).as_bytes(), None);
         assert!(text.contains(wanted), "{text}");

@@ -3,6 +3,8 @@
 use fnsf::flow::RigidTransform;
 use fnsf::formats::{FormatError, GroundRaster, matrix_rows, read_poses};
 
+use proptest::prelude::*;
+
 use crate::samples::npy;
 
 /// A rotation goes through a quaternion and back in float64.
@@ -197,5 +199,23 @@ fn a_raster_of_another_shape_or_without_its_bytes_is_refused() {
         "{}",
     ] {
         assert!(refused(&heights, similarity).starts_with("malformed json"));
+    }
+}
+
+proptest! {
+    #[test]
+    fn broken_poses_and_rasters_never_panic(at in 0_usize..4096, byte: u8, keep in 0_usize..4096) {
+        let times = [1, 2, 3];
+        let table = av2(&times, &times.map(|index| pose(index as usize)));
+        let (heights, similarity) = raster();
+        let json = format!("[{:?}]", matrix_rows(&pose(1))).into_bytes();
+        for mut file in [text(3).into_bytes(), json, table, heights.clone()] {
+            let at = at % file.len();
+            file[at] = byte;
+            file.truncate(keep % (file.len() + 1));
+            let _ = read_poses(&file, &["1", "2", "3"]);
+            let _ = GroundRaster::read(&file, similarity.as_bytes());
+            let _ = GroundRaster::read(&heights, &file);
+        }
     }
 }

@@ -3,7 +3,9 @@
 use std::path::PathBuf;
 
 use fnsf::flow::Point;
-use fnsf::formats::{Pair, is_pair, read_av2_labels, read_cloud, read_flow, read_pair};
+use fnsf::formats::{
+    GroundRaster, Pair, is_pair, read_av2_labels, read_cloud, read_flow, read_pair, read_poses,
+};
 
 /// Sweeps are float16 on disk and float32 in `pair.npz`: the same numbers, exactly.
 const SAME: f32 = 0.0;
@@ -150,4 +152,44 @@ fn a_pair_reads_as_a_flow_file() {
     assert!(flow.valid == Some(truth.valid));
     let labels = real("av2_7fab/flow_labels.feather").unwrap();
     assert_eq!(read_flow(&labels, None).unwrap().flow.len(), 99_229);
+}
+
+const AV2_SWEEPS: [&str; 2] = ["315966265259836000.feather", "315966265360032000.feather"];
+
+fn av2_poses() -> Option<Vec<fnsf::flow::RigidTransform>> {
+    let bytes = real("av2_7fab/city_SE3_egovehicle.feather")?;
+    Some(read_poses(&bytes, &AV2_SWEEPS).unwrap())
+}
+
+#[test]
+fn av2_poses_are_the_pairs_ego_motion() {
+    /// City coordinates of kilometres in float64, and a matrix printed from a quaternion.
+    const SAME_EGO: f64 = 1e-6;
+    let (Some(pair), Some(poses)) = (real_pair("av2_7fab"), av2_poses()) else {
+        return;
+    };
+    let motion = poses[1].inv_mul(&poses[0]);
+    let difference = motion.to_homogeneous() - pair.ego.unwrap().to_homogeneous();
+    assert!(difference.abs().max() < SAME_EGO, "{difference}");
+}
+
+#[test]
+fn the_av2_raster_calls_ground_what_the_pair_does() {
+    let (Some(pair), Some(poses)) = (real_pair("av2_7fab"), av2_poses()) else {
+        return;
+    };
+    let scene = "av2_7fab/7fab2350-7eaf-3b7e-a39d-6937a4c1bede";
+    let heights = real(&format!("{scene}_ground_height_surface____PIT.npy")).unwrap();
+    let similarity = real(&format!("{scene}___img_Sim2_city.json")).unwrap();
+    let raster = GroundRaster::read(&heights, &similarity).unwrap();
+    let ground = pair.ground.unwrap();
+    let clouds = [
+        (&pair.source, &ground.source),
+        (&pair.target, &ground.target),
+    ];
+    for ((points, truth), pose) in clouds.into_iter().zip(&poses) {
+        let found = raster.ground(points, pose);
+        assert!(count(truth) > 17_000);
+        assert!(found == *truth);
+    }
 }

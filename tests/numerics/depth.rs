@@ -22,7 +22,7 @@ fn camera() -> Camera {
     let turn = Matrix3::new(0.0, -1.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0, 0.0);
     let turn = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(turn));
     let mount = RigidTransform::from_parts([0.06, -0.08, -0.27].into(), turn);
-    Camera::new(intrinsics, mount, [621, 187]).unwrap()
+    Camera::new(intrinsics, mount, [621, 187]).expect("a camera")
 }
 
 fn street(frames: usize) -> Street {
@@ -34,14 +34,14 @@ fn street(frames: usize) -> Street {
         dropout: 0.0,
         ..StreetOptions::default()
     };
-    Street::new(&options).unwrap()
+    Street::new(&options).expect("a street")
 }
 
 /// The static points of every frame, in the frame of one of them.
 fn static_world(street: &Street, into: usize) -> Vec<Point> {
-    let target = street.frame(into).unwrap();
+    let target = street.frame(into).expect("a frame");
     let carried = |index: usize| {
-        let frame = street.frame(index).unwrap();
+        let frame = street.frame(index).expect("a frame");
         let motion = target.world_from_sensor.inv_mul(&frame.world_from_sensor);
         let keep = move |object: i32| index == into || object < 0;
         let rows = frame.points.into_iter().zip(frame.object);
@@ -55,7 +55,7 @@ fn static_world(street: &Street, into: usize) -> Vec<Point> {
 }
 
 fn errors(image: &DepthImage, truth: &DepthImage) -> fnsf::flow::depth::DepthErrors {
-    image.errors(truth).unwrap()
+    image.errors(truth).expect("of the same size")
 }
 
 #[test]

@@ -5,7 +5,6 @@
 
 mod accuracy;
 mod deadlines;
-#[cfg(test)]
 mod depth;
 mod ego;
 mod gpu;
@@ -15,3 +14,4 @@ mod ground;
 mod prices;
 mod resumption;
 mod scenes;
+mod sequences;

@@ -28,9 +28,10 @@ pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, Api
         Err(_) => return Err(unknown("preset", message.preset)),
     };
     let ground = match proto::Ground::try_from(message.ground) {
-        Ok(proto::Ground::Unspecified | proto::Ground::Keep) => GroundChoice::Keep,
-        Ok(proto::Ground::Mask) => GroundChoice::Mask,
-        Ok(proto::Ground::Auto) => GroundChoice::Auto,
+        Ok(proto::Ground::Unspecified) => None,
+        Ok(proto::Ground::Keep) => Some(GroundChoice::Keep),
+        Ok(proto::Ground::Mask) => Some(GroundChoice::Mask),
+        Ok(proto::Ground::Auto) => Some(GroundChoice::Auto),
         Err(_) => return Err(unknown("ground", message.ground)),
     };
     let priority = match proto::Priority::try_from(message.priority) {

@@ -79,9 +79,8 @@ impl Carried {
             if field.ego.is_some() && residual != [0.0; 3] {
                 self.dynamic[row] = true;
             }
-            for axis in 0..3 {
-                self.points[row][axis] += share * residual[axis];
-            }
+            let place = self.points[row];
+            self.points[row] = core::array::from_fn(|a| place[a] + share * residual[a]);
         }
         Ok(())
     }

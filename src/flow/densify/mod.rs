@@ -82,12 +82,12 @@ pub fn densify<'a>(
     // Sweeps up to the anchor, forward.
     let (anchor, substeps) = (plan.anchor, plan.substeps);
     let mut earlier = Carried::default();
-    for place in 0..=anchor {
+    for (place, sweep) in sweeps[..=anchor].iter().enumerate() {
         checked()?;
         if place > 0 {
             earlier.step(backend, field(place - 1, place)?, substeps)?;
         }
-        earlier.take(place, &sweeps[place]);
+        earlier.take(place, sweep);
     }
     // Sweeps behind it, back to the one before which the instant lies.
     let first = if plan.fraction > 0.0 {

@@ -14,7 +14,7 @@ pub struct Occlusion {
     pub reach_px: usize,
     /// A neighbor hides a pixel only where it is nearer by this part of the pixel's depth.
     pub nearer: f32,
-    /// Of the four quadrants around a pixel, how many must hold one that is nearer.
+    /// Of the four quadrants around a pixel, how many must hold one that is nearer, 1 to 4.
     pub quadrants: u32,
 }
 
@@ -39,7 +39,7 @@ impl Occlusion {
 impl DepthImage {
     /// The image without the pixels that are hidden.
     pub fn without_hidden(&self, occlusion: &Occlusion) -> DepthImage {
-        let width = self.width as usize;
+        let width = (self.width as usize).max(1);
         let metres = (0..self.metres.len()).into_par_iter().map(|index| {
             let depth = self.metres[index];
             let place = [index % width, index / width];
@@ -60,9 +60,13 @@ impl DepthImage {
     /// Number of quadrants around a pixel with a depth that is nearer than its own.
     fn nearer_quadrants(&self, [column, row]: [usize; 2], depth: f32, of: &Occlusion) -> u32 {
         let limit = depth * (1.0 - of.nearer);
-        let [width, height] = [self.width as usize, self.height as usize];
-        let columns = column.saturating_sub(of.reach_px)..width.min(column + of.reach_px + 1);
-        let rows = row.saturating_sub(of.reach_px)..height.min(row + of.reach_px + 1);
+        let width = (self.width as usize).max(1);
+        let height = self.metres.len() / width;
+        let around = |middle: usize, side: usize| {
+            let end = middle.saturating_add(of.reach_px).saturating_add(1);
+            middle.saturating_sub(of.reach_px)..side.min(end)
+        };
+        let [columns, rows] = [around(column, width), around(row, height)];
         let mut found = [false; 4];
         for y in rows {
             for x in columns.clone() {

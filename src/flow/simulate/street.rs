@@ -115,7 +115,7 @@ impl Street {
     /// A frame that the street does not have.
     pub fn frame(&self, index: usize) -> Result<Frame, StreetError> {
         self.check_frame(index)?;
-        let world_from_sensor = self.sensor_pose(index as f64);
+        let world_from_sensor = self.pose(index as f64);
         let targets = self.targets(index, &world_from_sensor);
         let returns = self
             .lidar
@@ -136,8 +136,7 @@ impl Street {
     /// A frame that the street does not have.
     pub fn depth(&self, index: usize, camera: &Camera) -> Result<DepthImage, StreetError> {
         self.check_frame(index)?;
-        let world_from_camera =
-            self.sensor_pose(index as f64) * camera.camera_from_lidar().inverse();
+        let world_from_camera = self.pose(index as f64) * camera.camera_from_lidar().inverse();
         let targets = self.targets(index, &world_from_camera);
         Ok(view::depth(
             camera,
@@ -201,7 +200,7 @@ impl Street {
     /// the frame have a flow too.
     pub fn flow_to(&self, frame: &Frame, at: f64) -> Vec<Point> {
         let now = frame.world_from_sensor;
-        let next_from_world = self.sensor_pose(at).inverse();
+        let next_from_world = self.pose(at).inverse();
         let next_from_now = next_from_world * now;
         let [now_seconds, next_seconds] = [frame.index as f64, at].map(seconds);
         let moving: Vec<RigidTransform> = self
@@ -225,7 +224,8 @@ impl Street {
             .collect()
     }
 
-    fn sensor_pose(&self, at: f64) -> RigidTransform {
+    /// Pose of the sensor at an instant, in frames: `world_from_sensor`.
+    pub fn pose(&self, at: f64) -> RigidTransform {
         let x = self.terrain.advance(0.0, self.speed * seconds(at));
         let place = self.terrain.place(x, -LANE_M);
         let world_from_ego = self
@@ -295,7 +295,7 @@ mod tests {
     /// Distance of a point of a sensor frame from the surface of an object, metres.
     fn distance(street: &Street, frame: usize, object: i32, point: Vector3<f64>) -> f64 {
         let body = street.object(object).unwrap();
-        let world = street.sensor_pose(frame as f64) * Point3::from(point);
+        let world = street.pose(frame as f64) * Point3::from(point);
         let local = body.pose(&street.terrain, seconds(frame as f64)).inverse() * world;
         let parts = body.parts.iter();
         parts
@@ -445,7 +445,7 @@ mod tests {
             ..small(5)
         };
         let street = Street::new(&options).unwrap();
-        let step = street.sensor_pose(0.0).inv_mul(&street.sensor_pose(1.0));
+        let step = street.pose(0.0).inv_mul(&street.pose(1.0));
         let (_, _, yaw) = step.rotation.euler_angles();
         // The waves of the ground and the winding of the street change both a little.
         assert!((yaw - 0.01).abs() < 2e-3, "{yaw}");

@@ -1,0 +1,103 @@
+//! Depth of a simulated street from one sweep and from many, as rows for `docs/numerics.md`.
+//!
+//! Static points of other sweeps are carried by the true poses: what is measured is the projection
+//! and its filter, not the flow. With an argument, the picture goes to that file.
+#![expect(clippy::print_stdout, reason = "the table is the program's purpose")]
+
+use fnsf::flow::depth::{Camera, Intrinsics, Occlusion, project};
+use fnsf::flow::simulate::{Street, StreetOptions};
+use fnsf::flow::{Point, RigidTransform};
+use fnsf::picture::{DepthPanel, depth_panels, write_png};
+use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion};
+
+const SWEEPS: [usize; 4] = [1, 3, 10, 20];
+const SEEDS: u64 = 4;
+/// Of these a picture is drawn.
+const SHOWN: usize = 10;
+
+fn main() -> anyhow::Result<()> {
+    let camera = camera()?;
+    println!("| sweeps | filter | pixels | mean error, m | RMSE, m | within 5 % |");
+    println!("|---|---|---|---|---|---|");
+    let mut pictures = Vec::new();
+    for sweeps in SWEEPS {
+        for filtered in [false, true] {
+            let mut sums = [0.0; 4];
+            for seed in 0..SEEDS {
+                let street = Street::new(&StreetOptions {
+                    seed,
+                    // One more, so that all that is carried is known to stand still.
+                    frames: sweeps + 1,
+                    ..StreetOptions::default()
+                })?;
+                let into = sweeps / 2;
+                let truth = street.depth(into, &camera)?;
+                let mut image = project(&static_world(&street, into)?, &camera);
+                if filtered {
+                    image = image.without_hidden(&Occlusion::of(&camera));
+                }
+                let errors = image.errors(&truth)?;
+                let row = [
+                    image.density(),
+                    errors.mean_m,
+                    errors.rmse_m,
+                    errors.within_5_percent,
+                ];
+                for (sum, value) in sums.iter_mut().zip(row) {
+                    *sum += value / SEEDS as f64;
+                }
+                if seed == 0 && sweeps == SHOWN && filtered {
+                    let one = project(&street.frame(into)?.points, &camera);
+                    let all = project(&static_world(&street, into)?, &camera);
+                    pictures = vec![one, all, image, truth];
+                }
+            }
+            let [density, mean, rmse, within] = sums;
+            let filter = if filtered { "on" } else { "off" };
+            println!(
+                "| {sweeps} | {filter} | {:.1} % | {mean:.2} | {rmse:.2} | {:.1} % |",
+                100.0 * density,
+                100.0 * within
+            );
+        }
+    }
+    if let Some(path) = std::env::args_os().nth(1) {
+        let panel = |(title, image)| DepthPanel { title, image };
+        let titles = ["1 sweep", "10 sweeps", "10 sweeps, filtered", "truth"];
+        let panels: Vec<DepthPanel<'_>> = titles.into_iter().zip(&pictures).map(panel).collect();
+        write_png(&depth_panels(&panels), std::fs::File::create(path)?)?;
+    }
+    Ok(())
+}
+
+/// A camera like KITTI's: 1242 x 375 pixels, 6 cm beside, 8 cm below and 27 cm before the lidar.
+fn camera() -> anyhow::Result<Camera> {
+    let intrinsics = Intrinsics {
+        fx: 721.5,
+        fy: 721.5,
+        cx: 609.6,
+        cy: 172.9,
+    };
+    let turn = Matrix3::new(0.0, -1.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0, 0.0);
+    let turn = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(turn));
+    let mount = RigidTransform::from_parts([0.06, -0.08, -0.27].into(), turn);
+    Ok(Camera::new(intrinsics, mount, [1242, 375])?)
+}
+
+/// One sweep, and of all others the points of what stands still, in its frame.
+fn static_world(street: &Street, into: usize) -> anyhow::Result<Vec<Point>> {
+    let target = street.frame(into)?;
+    let mut points = Vec::new();
+    for index in 0..street.frames() - 1 {
+        let frame = street.frame(index)?;
+        let motion = target.world_from_sensor.inv_mul(&frame.world_from_sensor);
+        let dynamic = street.pair(index)?.dynamic;
+        for (point, dynamic) in frame.points.iter().zip(dynamic) {
+            if index == into || !dynamic {
+                let there = motion * Point3::from(point.map(f64::from));
+                points.push([there.x as f32, there.y as f32, there.z as f32]);
+            }
+        }
+    }
+    Ok(points)
+}

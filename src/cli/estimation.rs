@@ -1,0 +1,204 @@
+//! How flow is found, as arguments: what `flow` and `densify` share. Knows no outputs.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, anyhow};
+use clap::Args;
+
+use super::device::{self, DeviceArgument};
+use super::failure::Failure;
+use super::files;
+use super::terminal::Terminal;
+use crate::flow::backend::{Backend, BackendError};
+use crate::flow::{self, Ego, Estimate, FlowError, RigidTransform, Sequence, Sweep};
+use crate::formats;
+use crate::job::{
+    DeviceChoice, EgoChoice, GroundChoice, JobOptions, PrecisionChoice, PresetChoice,
+};
+
+/// How the flow is found.
+#[derive(Clone, Debug, Args)]
+pub(super) struct Estimation {
+    /// default: ours, robust and fast; paper: FNSF as published
+    #[arg(long, value_enum, default_value_t)]
+    preset: PresetChoice,
+    /// Where the work is done: auto (a GPU, else the CPU), cpu, gpu, or gpu:CARD with a card's
+    /// number, PCI id or part of its name; fnsf doctor lists them
+    #[arg(long, value_name = "DEVICE", default_value_t)]
+    device: DeviceArgument,
+    /// CPU threads; all cores by default. The result does not depend on it
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
+    threads: Option<u16>,
+    /// What the network's products are rounded to: f16 is for GPUs whose matrix units pass their
+    /// self-test, see fnsf doctor
+    #[arg(long, value_enum, default_value_t)]
+    precision: PrecisionChoice,
+    /// The same seed gives the same bits
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    seed: u64,
+    /// Draw this many points from each cloud and leave out the rest
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(3..))]
+    max_points: Option<u32>,
+    /// Leave out points with |x| or |y| beyond R metres
+    #[arg(long, value_name = "R", value_parser = positive)]
+    range_m: Option<f32>,
+    /// Ground points: keep them, leave out those that the pair's ground1 and ground2 name (mask), or
+    /// let them move with the vehicle's own motion (auto): those of the masks or, without masks,
+    /// those that are found; by default what the preset does
+    #[arg(long, value_enum)]
+    ground: Option<GroundChoice>,
+    /// The vehicle's own motion: off, auto (estimate it first), or a file with the 4 x 4 matrix
+    /// target_from_source; by default what the preset does
+    #[arg(long, value_name = "off|auto|FILE")]
+    ego: Option<String>,
+    /// The pose of every sweep: KITTI's text (12 numbers a line), a JSON array of 4 x 4 matrices, or
+    /// Argoverse 2's city_SE3_egovehicle.feather
+    #[arg(long, value_name = "FILE", conflicts_with = "ego")]
+    poses: Option<PathBuf>,
+    /// Argoverse 2's raster of ground heights, with its ...Sim2_city.json beside it and --poses:
+    /// says which points are ground
+    #[arg(
+        long,
+        value_name = "RASTER.npy",
+        requires = "poses",
+        conflicts_with = "ground"
+    )]
+    ground_raster: Option<PathBuf>,
+}
+
+fn positive(text: &str) -> Result<f32, String> {
+    match text.parse::<f32>() {
+        Ok(value) if value.is_finite() && value > 0.0 => Ok(value),
+        _ => Err("a positive number of metres is needed".to_owned()),
+    }
+}
+
+impl Estimation {
+    /// The same options that a request has.
+    pub(super) fn options(&self) -> Result<JobOptions, Failure> {
+        let ego = match self.ego.as_deref() {
+            None => None,
+            Some("off") => Some(EgoChoice::Off),
+            Some("auto") => Some(EgoChoice::Auto),
+            Some(file) => Some(EgoChoice::Given(files::read_motion(Path::new(file))?)),
+        };
+        let raster = self.ground_raster.as_ref();
+        Ok(JobOptions {
+            preset: self.preset,
+            seed: self.seed,
+            max_points: self.max_points,
+            range_m: self.range_m,
+            ground: self.ground.or(raster.map(|_| GroundChoice::Auto)),
+            ego,
+            device: self.device.choice,
+            precision: self.precision,
+            ..JobOptions::default()
+        })
+    }
+
+    /// What is known of the sweeps beside their points.
+    pub(super) fn surroundings(&self, paths: &[PathBuf]) -> Result<Surroundings, Failure> {
+        let poses = match &self.poses {
+            None => None,
+            Some(file) => {
+                let names: Vec<_> = paths
+                    .iter()
+                    .map(|path| path.file_name().unwrap_or_default().to_string_lossy())
+                    .collect();
+                let names: Vec<&str> = names.iter().map(AsRef::as_ref).collect();
+                let poses = formats::read_poses(&files::read_bytes(file)?, &names);
+                let poses = poses.with_context(|| file.display().to_string());
+                Some(poses.map_err(Failure::bad_input)?)
+            }
+        };
+        let raster = self.ground_raster.as_deref().map(files::read_ground_raster);
+        Ok(Surroundings {
+            poses,
+            raster: raster.transpose()?,
+        })
+    }
+
+    /// The device that does the work.
+    pub(super) fn open(&self) -> Result<Device<'_>, Failure> {
+        let threads = self.threads.map(usize::from);
+        Ok(Device {
+            asked: self,
+            backend: device::open(&self.device, threads)?,
+        })
+    }
+}
+
+/// A device, and what stands in for it.
+pub(super) struct Device<'a> {
+    asked: &'a Estimation,
+    pub(super) backend: Box<dyn Backend>,
+}
+
+impl Device<'_> {
+    /// The next pair of a sequence; on the CPU from where the memory of a device that was not asked
+    /// for by name does not do.
+    pub(super) fn push(
+        &mut self,
+        sequence: &mut Sequence,
+        sweep: Sweep,
+        options: &flow::Options,
+        terminal: &Terminal,
+    ) -> Result<Option<Estimate>, Failure> {
+        let pushed = sequence.push(self.backend.as_ref(), sweep.clone(), options, terminal);
+        match pushed {
+            Err(FlowError::Backend(error @ BackendError::Memory { .. }))
+                if self.asked.device.choice == DeviceChoice::Auto =>
+            {
+                device::stand_in(&error);
+                self.backend = device::cpu(self.asked.threads.map(usize::from))?;
+                Ok(sequence.push(self.backend.as_ref(), sweep, options, terminal)?)
+            }
+            pushed => Ok(pushed?),
+        }
+    }
+}
+
+/// What is known of a sequence's sweeps beside their points.
+pub(super) struct Surroundings {
+    poses: Option<Vec<RigidTransform>>,
+    raster: Option<formats::GroundRaster>,
+}
+
+impl Surroundings {
+    /// The solver's options for the pair of two sweeps, of which the larger has `points` points.
+    pub(super) fn options(
+        &self,
+        options: &JobOptions,
+        points: usize,
+        [source, target]: [usize; 2],
+    ) -> flow::Options {
+        let mut options = options.solver_options(points);
+        if let Some(poses) = &self.poses {
+            options.ego = Ego::Given(poses[target].inv_mul(&poses[source]));
+        }
+        options
+    }
+
+    /// Reads a sweep; its ground, too, where a raster says which points are.
+    pub(super) fn sweep(&self, place: usize, path: &Path) -> Result<Sweep, Failure> {
+        let points = files::read_cloud(path)?;
+        let ground = self.raster.as_ref().zip(self.poses.as_ref());
+        let ground = ground.map(|(raster, poses)| raster.ground(&points, &poses[place]));
+        Ok(Sweep { points, ground })
+    }
+}
+
+/// Refuses options that only a pair in one file, or only one pair, can have.
+pub(super) fn check_sequence(options: &JobOptions, sweeps: usize) -> Result<(), Failure> {
+    if options.ground == Some(GroundChoice::Mask) {
+        return Err(Failure::usage(anyhow!(
+            "--ground mask needs masks, which only an .npz pair has: try --ground auto"
+        )));
+    }
+    if sweeps > 2 && matches!(options.ego, Some(EgoChoice::Given(_))) {
+        return Err(Failure::usage(anyhow!(
+            "--ego FILE is the motion of one pair: give --poses for a sequence"
+        )));
+    }
+    Ok(())
+}

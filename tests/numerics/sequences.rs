@@ -1,0 +1,212 @@
+//! Sequences: each pair starts from the one before, and all sweeps fall together in one frame.
+
+use std::collections::BTreeMap;
+
+use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::densify::{Later, Leg, Plan, densify};
+use fnsf::flow::simulate::{Frame, Street, StreetOptions};
+use fnsf::flow::{
+    DenseCloud, Ego, Estimate, Field, Options, Point, Preset, Problem, Sequence, Sweep, Unwatched,
+    estimate,
+};
+
+/// Sweeps of the drive, and the one that all are carried into.
+const FRAMES: usize = 11;
+const INTO: usize = 5;
+/// Residual motion of a step from which a point moves, metres.
+const MOVING_M: f64 = 0.05;
+
+fn drive(frames: usize) -> Street {
+    let options = StreetOptions {
+        frames,
+        beams: 32,
+        azimuth_steps: 1000,
+        ..StreetOptions::default()
+    };
+    Street::new(&options).expect("a street")
+}
+
+fn sweep(points: Vec<Point>) -> Sweep {
+    Sweep {
+        points,
+        ground: None,
+    }
+}
+
+fn backend() -> CpuBackend {
+    CpuBackend::new(Some(2)).expect("threads")
+}
+
+fn in_sequence(sweeps: &[Vec<Point>], options: &Options) -> Vec<Estimate> {
+    let (backend, mut sequence) = (backend(), Sequence::default());
+    let pushed = sweeps.iter().map(|points| {
+        sequence
+            .push(&backend, sweep(points.clone()), options, &Unwatched)
+            .expect("a pair")
+    });
+    pushed.collect::<Vec<_>>().into_iter().flatten().collect()
+}
+
+fn distance(a: Point, b: Point) -> f64 {
+    let square = |axis: usize| f64::from(a[axis] - b[axis]).powi(2);
+    (0..3).map(square).sum::<f64>().sqrt()
+}
+
+fn mean(values: impl Iterator<Item = f64>) -> f64 {
+    let (sum, count) = values.fold((0.0, 0.0), |(sum, count), x| (sum + x, count + 1.0));
+    sum / count
+}
+
+#[test]
+fn a_pair_of_a_sequence_takes_fewer_iterations_than_alone_and_is_no_worse() {
+    /// Between one start and another, EPE varies by a fifth.
+    const NO_WORSE: f64 = 1.2;
+    let street = drive(5);
+    let pairs: Vec<_> = (0..4).map(|k| street.pair(k).expect("a pair")).collect();
+    let sweeps: Vec<_> = (0..5)
+        .map(|k| street.frame(k).expect("a frame").points)
+        .collect();
+    let options = Preset::Default.options(None);
+    let together = in_sequence(&sweeps, &options);
+    let backend = backend();
+    let epe = |estimate: &Estimate, k: usize| {
+        let rows = (0..estimate.flow.len()).filter(|&row| !pairs[k].ground_source[row]);
+        mean(rows.map(|row| distance(estimate.flow[row], pairs[k].flow[row])))
+    };
+    let mut sums = [0.0; 2];
+    for (k, pair) in pairs.iter().enumerate() {
+        let problem = Problem {
+            source: &pair.source,
+            target: &pair.target,
+            ground: None,
+            before: None,
+        };
+        let alone = estimate(&backend, &problem, &options, &Unwatched).expect("a flow");
+        if k == 0 {
+            assert_eq!(alone.flow, together[0].flow, "the first has none before it");
+        } else {
+            assert!(
+                together[k].iterations * 2 <= alone.iterations,
+                "pair {k}: {} iterations",
+                together[k].iterations
+            );
+            sums[0] += epe(&alone, k);
+            sums[1] += epe(&together[k], k);
+        }
+    }
+    assert!(sums[1] <= sums[0] * NO_WORSE, "alone, together: {sums:?}");
+}
+
+#[test]
+fn a_field_that_does_not_explain_the_next_pair_is_not_started_from() {
+    let points = drive(1).frame(0).expect("a frame").points;
+    let shifted: Vec<Point> = points.iter().map(|[x, y, z]| [x + 0.8, *y, *z]).collect();
+    let mut options = Preset::Default.options(None);
+    // The field itself has to explain that everything moves, and then that nothing does.
+    options.ego = Ego::Off;
+    let estimates = in_sequence(&[points, shifted.clone(), shifted], &options);
+    let iterations: Vec<_> = estimates.iter().map(|e| e.iterations).collect();
+    assert_eq!(iterations, [options.max_iterations; 2]);
+}
+
+/// Fits the plan's legs, each chain from its beginning.
+fn fields(sweeps: &[Vec<Point>], plan: &Plan) -> BTreeMap<Leg, Field> {
+    let (backend, options) = (backend(), Preset::Default.options(None));
+    let (mut sequence, mut last) = (Sequence::default(), None);
+    let mut fields = BTreeMap::new();
+    for leg in plan.legs() {
+        let push = |sequence: &mut Sequence, place: usize| {
+            let sweep = sweep(sweeps[place].clone());
+            let pushed = sequence.push(&backend, sweep, &options, &Unwatched);
+            pushed.expect("a pair")
+        };
+        if last != Some(leg.source) {
+            sequence = Sequence::default();
+            push(&mut sequence, leg.source);
+        }
+        let estimate = push(&mut sequence, leg.target).expect("the second of two");
+        fields.insert(leg, estimate.field);
+        last = Some(leg.target);
+    }
+    fields
+}
+
+/// Mean errors of a sweep's movers and of its static points off the ground, carried to another.
+fn errors(street: &Street, frame: &Frame, cloud: &DenseCloud) -> [f64; 2] {
+    let first = cloud
+        .frame
+        .iter()
+        .position(|&place| place as usize == frame.index)
+        .expect("the sweep is there");
+    let truth = street.flow_to(frame, INTO as f64);
+    let (next, still) = (
+        street.flow_to(frame, (frame.index + 1) as f64),
+        street
+            .pose((frame.index + 1) as f64)
+            .inv_mul(&frame.world_from_sensor),
+    );
+    let moves = |row: usize| {
+        let point = frame.points[row];
+        let rigid = still * nalgebra::Point3::from(point.map(f64::from));
+        let rigid = [rigid.x as f32, rigid.y as f32, rigid.z as f32];
+        let there = core::array::from_fn(|a| point[a] + next[row][a]);
+        distance(rigid, there) >= MOVING_M
+    };
+    let error = |row: &usize| {
+        let there = core::array::from_fn(|a| frame.points[*row][a] + truth[*row][a]);
+        distance(cloud.points[first + row], there)
+    };
+    let rows: Vec<usize> = (0..frame.points.len())
+        .filter(|&r| !frame.ground[r])
+        .collect();
+    let (movers, rest): (Vec<usize>, Vec<usize>) = rows.into_iter().partition(|&r| moves(r));
+    [movers, rest].map(|rows| mean(rows.iter().map(error)))
+}
+
+#[test]
+fn movers_are_carried_to_half_of_what_ego_motion_alone_leaves_and_the_static_world_stays() {
+    /// Metres that the static world may be off after five steps, by estimated ego motion.
+    const STATIC_M: f64 = 0.06;
+    let street = drive(FRAMES);
+    let frames: Vec<_> = (0..FRAMES)
+        .map(|k| street.frame(k).expect("a frame"))
+        .collect();
+    let sweeps: Vec<_> = frames.iter().map(|frame| frame.points.clone()).collect();
+    let plan = Plan::new(FRAMES, INTO as f64, Later::Reverse, 1).expect("a plan");
+    let fields = fields(&sweeps, &plan);
+    let still: BTreeMap<Leg, Field> = fields
+        .iter()
+        .map(|(&leg, field)| {
+            (
+                leg,
+                Field {
+                    ego: field.ego,
+                    network: None,
+                },
+            )
+        })
+        .collect();
+    let sweeps: Vec<Sweep> = frames
+        .iter()
+        .map(|frame| Sweep {
+            points: frame.points.clone(),
+            ground: Some(frame.ground.clone()),
+        })
+        .collect();
+    let carried = |fields: &BTreeMap<Leg, Field>| {
+        let field = |leg: Leg| fields.get(&leg);
+        densify(&backend(), &plan, &sweeps, field, &Unwatched).expect("a cloud")
+    };
+    let (alone, ours) = (carried(&still), carried(&fields));
+    let oldest = [0, FRAMES - 1];
+    let sums = |cloud: &DenseCloud| {
+        let errors = oldest.map(|k| errors(&street, &frames[k], cloud));
+        [0, 1].map(|class| mean(errors.iter().map(|error| error[class])))
+    };
+    let ([left, _], [movers, static_world]) = (sums(&alone), sums(&ours));
+    assert!(
+        movers <= 0.5 * left,
+        "movers {movers} m, by ego motion alone {left} m"
+    );
+    assert!(static_world <= STATIC_M, "static {static_world} m");
+}
