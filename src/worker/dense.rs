@@ -129,7 +129,7 @@ fn sweep(cloud: StoredCloud, ground: Ground) -> Sweep {
     let ground = match ground {
         Ground::Keep => None,
         Ground::Mask => cloud.ground,
-        Ground::Auto => Some(ground_of(&cloud)),
+        Ground::Auto => Some(cloud.ground.clone().unwrap_or_else(|| ground_of(&cloud))),
     };
     Sweep {
         points: cloud.points,
