@@ -334,6 +334,10 @@ impl Metrics {
 
     fn count_ended(&self, job: &Job) {
         if job.pairs > 0 {
+            // It ends as its pairs have, which are counted, unless it was given up by itself.
+            if job.dead && job.ready.is_some() {
+                self.dead_letters.inc();
+            }
             return;
         }
         let outcome = Outcome {

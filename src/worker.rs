@@ -332,10 +332,16 @@ impl Worker {
     /// Puts what an attempt has found in store, the field before the success that others wait for.
     async fn store(&self, lease: &Lease, done: Done) -> Outcome {
         let job = &lease.job;
-        let mut blobs = vec![(Blob::Result(job.attempt), done.result.to_bytes())];
-        if let Some(field) = &done.field {
-            blobs.push((Blob::Field(job.attempt), field.to_bytes()));
-        }
+        let (result, field) = (done.result, done.field);
+        let packing = tokio::task::spawn_blocking(move || {
+            (result.to_bytes(), field.map(|field| field.to_bytes()))
+        });
+        let (result, field) = match packing.await {
+            Ok(packed) => packed,
+            Err(error) => return Outcome::Failed(failure("store", &error, true)),
+        };
+        let mut blobs = vec![(Blob::Result(job.attempt), result)];
+        blobs.extend(field.map(|field| (Blob::Field(job.attempt), field)));
         let writing = blobs
             .into_iter()
             .map(|(blob, bytes)| self.put(lease, blob, bytes));

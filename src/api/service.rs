@@ -18,7 +18,7 @@ use crate::metrics::Metrics;
 use crate::payload::{StoredCloud, StoredFlow};
 use crate::queue::{Filter, Queue};
 
-/// Archives that are written at a time.
+/// Archives and clouds that are sent at a time.
 const MAX_ARCHIVES: usize = 16;
 
 /// What a request may cost the doors.
@@ -48,7 +48,8 @@ pub struct Service {
     pub(super) limits: ServiceLimits,
     pub(super) room: Arc<Semaphore>,
     compute: Semaphore,
-    /// Archives that are being written: each holds a thread while its client reads.
+    /// Archives and clouds that are being sent: each holds a thread, or memory, while its client
+    /// reads.
     pub(super) archives: Arc<Semaphore>,
     /// Dense clouds that are being read and encoded.
     pub(super) clouds: Semaphore,

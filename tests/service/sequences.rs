@@ -211,6 +211,8 @@ async fn a_sequence_has_the_same_bits_through_every_door_and_in_the_library() {
     use proto::download_result_response::Part;
     let server = Server::start(&[]);
     let expected = flows(FLOWS);
+    let alone = chained(&backend(), FLOWS, &[1, 2]);
+    assert!(alone[0].1 != expected[1], "nothing goes on from anything");
     let id = submit(&server, FLOWS).await;
     let job = ended(&server, &id).await;
     assert_eq!(job["state"], "succeeded", "{job}");

@@ -359,10 +359,16 @@ impl SceneFlow for Calls {
         let (answers, stream) = mpsc::channel(AHEAD);
         if dense::is_dense(&job) {
             let header = convert::dense_header(job.id, &self.service.dense_report(&job)?);
+            // It is held as long as its client reads.
+            let turn = Arc::clone(&self.service.archives).try_acquire_owned();
+            let turn = turn.map_err(|_| ApiError::ServerFull(Duration::from_secs(1)))?;
             let cloud = self.service.dense_cloud(&job).await?;
             let pieces = chunks::dense_pieces(cloud, first).map(Part::DenseChunk);
             let parts = std::iter::once(Part::DenseHeader(header)).chain(pieces);
-            tokio::spawn(send_result(parts, answers));
+            tokio::spawn(async move {
+                let _turn = turn;
+                send_result(parts, answers).await;
+            });
         } else {
             let answer = self.service.answer(&job).await?;
             let header = Part::Header(convert::header(&answer));

@@ -127,8 +127,8 @@ pub(crate) async fn a_chain_goes_on_behind_a_member_that_fails_is_cancelled_or_e
     let failing = submit(&queue, after(&cancelled)).await;
     let last = submit(&queue, after(&failing)).await;
     let held = lease(&queue).await;
-    reaches(&queue, &expiring, State::Expired).await;
     nothing_is_ready(&queue).await;
+    reaches(&queue, &expiring, State::Expired).await;
     queue.cancel(cancelled.id).await.expect("known");
     let retried = lease(&queue).await;
     assert_eq!(retried.job.id, failing.id);

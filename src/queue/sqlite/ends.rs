@@ -104,7 +104,8 @@ fn close_sequence(
     let broken = pairs.iter().find(|pair| pair.state != State::Succeeded);
     let (state, error) = match broken {
         None if turns::closes(connection, sequence.id)? => {
-            return turns::ready_to_close(connection, effects, options, sequence);
+            turns::ready_to_close(connection, effects, options, sequence)?;
+            return Ok(());
         }
         None => (State::Succeeded, None),
         Some(_) if sequence.cancel_requested => (State::Cancelled, None),
@@ -202,13 +203,14 @@ pub(super) fn requeue(
         let parameters = params![job.id.as_bytes(), left as i64, expires, tag, ready];
         Ok(Arc::new(statement.query_row(parameters, rows::job)?))
     };
-    let job = again(&job, broken.len())?;
+    let mut job = again(&job, broken.len())?;
     let mut queued = Vec::new();
     for pair in &broken {
         queued.push(again(pair, 0)?);
     }
     if job.kind == Kind::Sequence && broken.is_empty() {
-        turns::ready_to_close(connection, effects, options, &job)?;
+        job = turns::ready_to_close(connection, effects, options, &job)?;
+        effects.events.push(Event::Requeued(Arc::clone(&job)));
     }
     if job.kind == Kind::Pair {
         if let Some(parent) = job.parent {

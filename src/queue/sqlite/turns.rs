@@ -128,7 +128,7 @@ pub(super) fn ready_to_close(
     effects: &mut Effects,
     options: &QueueOptions,
     sequence: &Job,
-) -> Result<(), QueueError> {
+) -> Result<Arc<Job>, QueueError> {
     let tag = virtual_start(connection, &sequence.tenant, sequence.priority)?;
     let now = Timestamp::now();
     // What its deadline could cut short is done: from here on it waits for a device as others do.
@@ -141,8 +141,8 @@ pub(super) fn ready_to_close(
     let parameters = params![sequence.id.as_bytes(), now.as_millis(), expires, tag];
     let sequence = Arc::new(statement.query_row(parameters, rows::job)?);
     effects.entered.push(Arc::clone(&sequence));
-    effects.changed.push(sequence);
-    Ok(())
+    effects.changed.push(Arc::clone(&sequence));
+    Ok(sequence)
 }
 
 /// Whether something is left to do for a sequence when its pairs are done.
