@@ -124,15 +124,14 @@ mod tests {
         };
         let backend = CpuBackend::new(Some(2)).expect("threads");
         let fitted = estimate(&backend, &problem, &options, &Unwatched).expect("a flow");
-        let network = fitted.field.network.expect("a network");
-        let whole = backend.evaluate(&network, &source).expect("a flow");
+        let whole = fitted.field.residual(&backend, &source).expect("a flow");
         for piece in [1, 97, 256, 1000] {
             let pieces = InPieces {
                 backend: &backend,
                 watch: &Unwatched,
                 piece,
             };
-            let found = pieces.evaluate(&network, &source).expect("a flow");
+            let found = fitted.field.residual(&pieces, &source).expect("a flow");
             assert_eq!(found, whole, "{piece}");
         }
     }
