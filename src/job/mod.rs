@@ -2,13 +2,12 @@
 //!
 //! The vocabulary that the doors, the queue and the workers share; it must not know any of them.
 
-mod densify;
 mod id;
 mod options;
 mod record;
 mod report;
+mod sequence;
 
-pub use densify::{Densify, LaterChoice};
 pub use id::{InvalidId, JobId, Tenant};
 pub use options::{
     DeviceChoice, DeviceKind, EgoChoice, GroundChoice, InvalidOptions, JobOptions, PrecisionChoice,
@@ -16,3 +15,4 @@ pub use options::{
 };
 pub use record::{Job, JobError, JobProgress, Kind, State};
 pub use report::{DenseReport, PhaseSeconds, Report};
+pub use sequence::{Densify, LaterChoice};

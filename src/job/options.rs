@@ -10,7 +10,7 @@ use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use utoipa::ToSchema;
 
-use super::densify::Densify;
+use super::sequence::Densify;
 use crate::flow::densify::PlanError;
 use crate::flow::{self, Ego, Ground, MIN_POINTS, Precision, Preset, RigidTransform};
 use crate::formats::{matrix_rows, rigid_motion};
@@ -343,23 +343,6 @@ impl JobOptions {
         }
     }
 
-    /// Refuses what only a sequence can have.
-    ///
-    /// # Errors
-    /// [`InvalidOptions::NoSequence`].
-    pub fn check_for_pairs(&self) -> Result<(), InvalidOptions> {
-        match self.densify {
-            None => Ok(()),
-            Some(_) => Err(InvalidOptions::NoSequence),
-        }
-    }
-
-    /// Whether the pairs of a sequence go on from each other: each needs the one before then.
-    pub fn goes_on(&self) -> bool {
-        let options = self.solver_options(usize::MAX);
-        options.warm_start.is_some() || options.ego == Ego::Auto
-    }
-
     /// The solver's options for clouds of which the larger has `points` points.
     pub fn solver_options(&self, points: usize) -> flow::Options {
         let drawn = self.max_points.map(|points| points as usize);
@@ -404,18 +387,6 @@ mod tests {
             JobOptions::from_json(options.to_json().as_bytes()),
             Ok(options)
         );
-    }
-
-    #[test]
-    fn pairs_of_a_sequence_go_on_from_each_other_where_their_result_depends_on_it() {
-        for (text, goes_on) in [
-            ("{}", true),
-            (r#"{"preset":"paper"}"#, false),
-            (r#"{"preset":"paper","ego":"auto"}"#, true),
-        ] {
-            let options = JobOptions::from_json(text.as_bytes()).expect("good options");
-            assert_eq!(options.goes_on(), goes_on, "{text}");
-        }
     }
 
     #[test]

@@ -1,9 +1,11 @@
-//! How a request asks for one dense cloud of a sequence. It must not know how one is made.
+//! What options mean to a sequence: whether its pairs go on from each other, and the dense cloud that
+//! may be asked for. It must not know how one is made.
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::options::InvalidOptions;
+use super::options::{InvalidOptions, JobOptions};
+use crate::flow::Ego;
 use crate::flow::densify::{Later, Plan, PlanError};
 
 /// All sweeps of a sequence, carried into one frame.
@@ -56,5 +58,41 @@ impl Densify {
         // Long enough for the frame, so that only the rest can be wrong.
         let frames = (self.into.ceil() as usize).saturating_add(2);
         self.plan(frames).map(drop).map_err(InvalidOptions::Densify)
+    }
+}
+
+impl JobOptions {
+    /// Refuses what only a sequence can have.
+    ///
+    /// # Errors
+    /// [`InvalidOptions::NoSequence`].
+    pub fn check_for_pairs(&self) -> Result<(), InvalidOptions> {
+        match self.densify {
+            None => Ok(()),
+            Some(_) => Err(InvalidOptions::NoSequence),
+        }
+    }
+
+    /// Whether the pairs of a sequence go on from each other: each needs the one before then.
+    pub fn goes_on(&self) -> bool {
+        let options = self.solver_options(usize::MAX);
+        options.warm_start.is_some() || options.ego == Ego::Auto
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pairs_of_a_sequence_go_on_from_each_other_where_their_result_depends_on_it() {
+        for (text, goes_on) in [
+            ("{}", true),
+            (r#"{"preset":"paper"}"#, false),
+            (r#"{"preset":"paper","ego":"auto"}"#, true),
+        ] {
+            let options = JobOptions::from_json(text.as_bytes()).expect("good options");
+            assert_eq!(options.goes_on(), goes_on, "{text}");
+        }
     }
 }
