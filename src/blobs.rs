@@ -40,8 +40,11 @@ pub enum Blob {
     Frame(u32),
     /// The latest snapshot of its optimization.
     Snapshot,
-    /// The flow that one attempt has found.
+    /// The flow, or the cloud, that one attempt has found.
     Result(u32),
+    /// The field that one attempt has fitted, for those who go on from it. By attempt, so that one
+    /// that is late cannot change what others have read.
+    Field(u32),
 }
 
 /// Why a blob could not be read or written.
@@ -68,6 +71,7 @@ fn path(id: JobId, blob: Blob) -> Path {
         Blob::Frame(place) => format!("{folder}/frame-{place}"),
         Blob::Snapshot => format!("{folder}/snapshot"),
         Blob::Result(attempt) => format!("{folder}/result-{attempt}"),
+        Blob::Field(attempt) => format!("{folder}/field-{attempt}"),
     })
 }
 
@@ -201,6 +205,7 @@ mod tests {
             Blob::Frame(1),
             Blob::Snapshot,
             Blob::Result(3),
+            Blob::Field(3),
         ];
         for (sync, blob) in [Sync::Yes, Sync::No].into_iter().cycle().zip(all) {
             for id in [id, other] {

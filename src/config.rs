@@ -90,7 +90,7 @@ pub struct TlsConfig {
 pub struct LimitsConfig {
     /// Points of one cloud.
     pub max_points: usize,
-    /// Memory of one pair on a device, MiB.
+    /// Memory of one pair on a device, or of one dense cloud, MiB.
     pub max_pair_mib: usize,
     /// Body of one request, MiB.
     pub max_upload_mib: u64,

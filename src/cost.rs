@@ -6,6 +6,7 @@
 use std::sync::{Mutex, PoisonError};
 
 use crate::flow::Price;
+use crate::flow::field::mlp::PARAMETERS;
 use crate::job::DeviceKind;
 
 /// Multiply-adds of a nominal second: two cores with wide vector units.
@@ -65,6 +66,11 @@ impl CostModel {
     /// Nominal seconds of some work.
     pub fn nominal(price: &Price) -> f64 {
         price.seconds(NOMINAL_RATE)
+    }
+
+    /// Nominal seconds of asking a field about a point, so many times.
+    pub fn asking(points: f64) -> f64 {
+        points * PARAMETERS as f64 / NOMINAL_RATE
     }
 
     /// The seconds that work of `nominal` seconds takes in a lane of that kind, by what was

@@ -6,6 +6,7 @@
 //! stores or doors.
 
 mod busy;
+mod dense;
 mod hold;
 mod lane;
 mod trial;
@@ -22,10 +23,12 @@ use std::time::Duration;
 use tokio::sync::{mpsc, oneshot, watch};
 
 use self::busy::Busy;
+pub use self::dense::Densification;
 use self::hold::Hold;
-use self::lane::Command;
+use self::lane::{Asked, Command};
 use crate::flow::backend::{Backend, BackendError};
-use crate::flow::{Estimate, FlowError, Options, Point, Snapshot, Watch};
+use crate::flow::densify::DensifyError;
+use crate::flow::{DenseCloud, Estimate, Field, FlowError, Options, Point, Snapshot, Watch};
 use crate::job::DeviceKind;
 use crate::metrics::Metrics;
 
@@ -53,6 +56,8 @@ pub struct Work {
     pub target: Vec<Point>,
     /// N and M flags: which points are ground, where that is known.
     pub ground: Option<[Vec<bool>; 2]>,
+    /// The field of the pair before, where it is one of a chain.
+    pub before: Option<Field>,
     /// How the flow is found.
     pub options: Options,
     /// Where an earlier attempt was put down.
@@ -81,6 +86,9 @@ pub enum EngineError {
     /// The solver refused or failed.
     #[error(transparent)]
     Flow(#[from] FlowError),
+    /// The sweeps and fields do not make a cloud.
+    #[error(transparent)]
+    Densify(DensifyError),
     /// The solver panicked; the device is tried again.
     #[error("the solver panicked: {0}")]
     Panicked(String),
@@ -145,9 +153,9 @@ pub struct DeviceOptions {
 
 /// What a device gives.
 #[derive(Debug)]
-pub struct Solved {
-    /// The flow.
-    pub estimate: Estimate,
+pub struct Solved<T> {
+    /// The flow, or the cloud.
+    pub found: T,
     /// What the device is, as reports show it.
     pub device: String,
 }
@@ -302,10 +310,27 @@ impl Lane {
     ///
     /// # Errors
     /// [`EngineError`]; the device is ready for the next pair, or says otherwise in its health.
-    pub async fn solve(&self, work: Work) -> Result<Solved, EngineError> {
+    pub async fn solve(&self, work: Work) -> Result<Solved<Estimate>, EngineError> {
+        self.run(move |backend, busy| Ok(lane::solve(backend, work, busy)?))
+            .await
+    }
+
+    /// Carries a sequence's sweeps into one frame.
+    ///
+    /// # Errors
+    /// As [`Lane::solve`].
+    pub async fn densify(&self, work: Densification) -> Result<Solved<DenseCloud>, EngineError> {
+        self.run(move |backend, busy| dense::densify(backend, &work, busy))
+            .await
+    }
+
+    async fn run<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&dyn Backend, &Busy) -> Result<T, EngineError> + Send + 'static,
+    ) -> Result<Solved<T>, EngineError> {
         let gone = || EngineError::Broken("its thread has ended".to_owned());
         let (reply, answer) = oneshot::channel();
-        let command = Command::Solve(Box::new(work), reply);
+        let command = Command::Do(Box::new(Asked { work, reply }));
         let commands = &self.device.lanes[self.place].commands;
         commands.send(command).await.map_err(|_| gone())?;
         answer.await.map_err(|_| gone())?

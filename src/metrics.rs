@@ -310,8 +310,9 @@ impl Metrics {
         match event {
             Event::Submitted(job) => self.count_submitted(job),
             Event::Started(job) => {
-                if let Some(started) = job.started {
-                    observe(&self.queue_seconds, job.created.until(started), job);
+                // A sequence has started with its first pair, which is counted.
+                if let (Some(ready), Some(started), 0) = (job.ready, job.started, job.pairs) {
+                    observe(&self.queue_seconds, ready.until(started), job);
                 }
             }
             Event::Requeued(_) => {
@@ -333,6 +334,10 @@ impl Metrics {
 
     fn count_ended(&self, job: &Job) {
         if job.pairs > 0 {
+            // It ends as its pairs have, which are counted, unless it was given up by itself.
+            if job.dead && job.ready.is_some() {
+                self.dead_letters.inc();
+            }
             return;
         }
         let outcome = Outcome {

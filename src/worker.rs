@@ -3,6 +3,8 @@
 //! One for each lane of a device. The only room that sees both the queue and the engine. The result is in
 //! store before the queue hears of it, and only the attempt that holds the job counts.
 
+mod dense;
+mod inputs;
 mod job_watch;
 #[cfg(test)]
 mod tests;
@@ -11,20 +13,18 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
-use self::job_watch::JobWatch;
+use self::inputs::StoreError;
 use crate::blobs::{Blob, BlobError, Blobs, Sync};
-use crate::clock::Timestamp;
 use crate::cost::CostModel;
-use crate::engine::{EngineError, Health, Lane, Solved, Work};
+use crate::engine::{Densification, EngineError, Health, Lane, Solved, Work};
 use crate::flow::backend::BackendError;
-use crate::flow::{Estimate, FlowError, Snapshot};
-use crate::job::{DeviceKind, Job, JobError, JobOptions, Report};
+use crate::flow::{Estimate, Field, FlowError};
+use crate::job::{DeviceKind, Job, JobError, JobProgress, Kind, Report};
 use crate::metrics::Metrics;
-use crate::payload::{Damaged, StoredCloud, StoredFlow};
+use crate::payload::{StoredDense, StoredFlow};
 use crate::queue::{Committed, Lease, Outcome, Queue, QueueError, Signal};
 
 /// How a worker treats jobs.
@@ -67,17 +67,6 @@ pub struct Worker {
     pub drain: Drain,
 }
 
-/// Why a job could not be taken from the store, or put back.
-#[derive(Debug, thiserror::Error)]
-enum StoreError {
-    #[error(transparent)]
-    Blob(#[from] BlobError),
-    #[error(transparent)]
-    Damaged(#[from] Damaged),
-    #[error("its options cannot be read: {0}")]
-    Options(#[from] crate::job::InvalidOptions),
-}
-
 impl Worker {
     /// Works until it is told to stop, or its lane has ended.
     pub async fn run(self) {
@@ -108,7 +97,10 @@ impl Worker {
             };
             match lease {
                 Ok(lease) => {
-                    let attempt = self.attempt(&lease).await;
+                    let attempt = match lease.job.kind {
+                        Kind::Pair => self.attempt(&lease).await,
+                        Kind::Sequence => self.densify(&lease).await,
+                    };
                     if let Some(before) = committing.take() {
                         let _its_own_errors_are_logged = before.await;
                     }
@@ -150,7 +142,7 @@ impl Worker {
         }
     }
 
-    /// Runs one attempt; says how it ended, unless somebody else has the job now.
+    /// Runs one attempt at a pair; says how it ended, unless somebody else has the job now.
     #[tracing::instrument(
         name = "attempt",
         skip_all,
@@ -160,11 +152,7 @@ impl Worker {
         let job = &lease.job;
         let (work, keeper, options) = match self.prepare(lease).await {
             Ok(prepared) => prepared,
-            Err(error) => {
-                tracing::error!(%error, "the payload cannot be read");
-                let retryable = matches!(error, StoreError::Blob(_));
-                return Attempt::failed("store", &error, retryable);
-            }
+            Err(error) => return unreadable(&error),
         };
         let began = Instant::now();
         let max_iterations = work.options.max_iterations;
@@ -178,9 +166,11 @@ impl Worker {
             // The device's health says so in a moment, or another lane is done.
             tokio::time::sleep(A_MOMENT).await;
         }
-        let released = self.drain.release.is_cancelled();
         match solved {
-            Ok(Solved { estimate, device }) => {
+            Ok(Solved {
+                found: estimate,
+                device,
+            }) => {
                 self.measure(job, &estimate, took);
                 tracing::info!(
                     seconds = took.as_secs_f64(),
@@ -189,15 +179,30 @@ impl Worker {
                     "solved"
                 );
                 let report = Report::new(&estimate, &options, max_iterations, device);
-                Attempt::Solved(Box::new(report), StoredFlow::from(estimate))
+                // Whoever comes after it goes on from its field.
+                let wanted = job.followed || options.densify.is_some();
+                let field = wanted.then(|| estimate.field.clone());
+                Attempt::Done(Box::new(Done {
+                    stop_reason: Some(report.stop_reason.clone()),
+                    progress: report.progress(),
+                    report: serde_json::to_string(&report),
+                    field,
+                    result: Found::Flow(StoredFlow::from(estimate)),
+                }))
             }
-            Err(EngineError::Flow(FlowError::Cancelled)) => match lease.pulse.signal() {
-                Signal::Cancel => Attempt::Ended(Outcome::Cancelled),
-                Signal::Lost => Attempt::Lost,
-                Signal::Continue if released => Attempt::Ended(Outcome::Released),
-                Signal::Continue => Attempt::Lost,
-            },
+            Err(EngineError::Flow(FlowError::Cancelled)) => self.interrupted(lease),
             Err(error) => self.failed(job, &error),
+        }
+    }
+
+    /// What becomes of a job whose watch asked for its end.
+    fn interrupted(&self, lease: &Lease) -> Attempt {
+        match lease.pulse.signal() {
+            Signal::Cancel => Attempt::Ended(Outcome::Cancelled),
+            Signal::Continue if self.drain.release.is_cancelled() => {
+                Attempt::Ended(Outcome::Released)
+            }
+            Signal::Lost | Signal::Continue => Attempt::Lost,
         }
     }
 
@@ -238,106 +243,11 @@ impl Worker {
                 tracing::error!(%error, "an attempt failed");
                 Attempt::failed("panicked", error, true)
             }
-        }
-    }
-
-    /// Reads what the job needs, and starts the task that keeps its snapshots.
-    async fn prepare(
-        &self,
-        lease: &Lease,
-    ) -> Result<(Work, JoinHandle<()>, JobOptions), StoreError> {
-        let job = &lease.job;
-        let options = JobOptions::from_json(job.options.as_bytes())?;
-        let (owner, first) = match job.parent {
-            Some(sequence) => (sequence, job.place),
-            None => (job.id, 0),
-        };
-        let (source, target) = tokio::try_join!(
-            self.blobs.get(owner, Blob::Frame(first)),
-            self.blobs.get(owner, Blob::Frame(first + 1)),
-        )?;
-        let snapshot = self.earlier_snapshot(job).await;
-        let source = StoredCloud::from_bytes(&source)?;
-        let target = StoredCloud::from_bytes(&target)?;
-        let points = source.points.len().max(target.points.len());
-        let (snapshots, kept) = mpsc::channel(1);
-        let deadline = job.deadline.map(|deadline| {
-            // What comes after the flow takes its time too.
-            let left = Timestamp::now().until(deadline);
-            Instant::now() + left.saturating_sub(self.after_solving(job, points))
-        });
-        let watch = JobWatch::new(
-            lease.pulse.clone(),
-            deadline,
-            self.options.snapshot_interval,
-            self.drain.release.clone(),
-            snapshots,
-        );
-        let work = Work {
-            options: options.solver_options(points),
-            ground: source.ground.zip(target.ground).map(<[_; 2]>::from),
-            source: source.points,
-            target: target.points,
-            snapshot,
-            watch: Arc::new(watch),
-        };
-        Ok((work, self.keep_snapshots(lease, kept), options))
-    }
-
-    /// Time for the result to reach its caller.
-    fn after_solving(&self, job: &Job, points: usize) -> Duration {
-        const FOR_THE_DISK: Duration = Duration::from_millis(30);
-        const FOR_THE_CALLER: Duration = Duration::from_millis(8);
-        let disk = if job.durable {
-            FOR_THE_DISK
-        } else {
-            Duration::ZERO
-        };
-        FOR_THE_CALLER + disk + Duration::from_nanos(150 * points as u64)
-    }
-
-    /// Where an earlier attempt was put down, if it was.
-    async fn earlier_snapshot(&self, job: &Job) -> Option<Snapshot> {
-        if job.attempt == 1 {
-            return None;
-        }
-        let bytes = match self.blobs.get(job.id, Blob::Snapshot).await {
-            Ok(bytes) => bytes,
-            Err(error) if error.is_missing() => return None,
-            Err(error) => {
-                tracing::warn!(%error, "a snapshot cannot be read: the job starts afresh");
-                return None;
-            }
-        };
-        match Snapshot::from_bytes(&bytes) {
-            Ok(snapshot) => {
-                tracing::info!(iteration = snapshot.iterations(), "resumed");
-                self.metrics.resumed();
-                Some(snapshot)
-            }
-            Err(error) => {
-                tracing::warn!(%error, "a snapshot is damaged: the job starts afresh");
-                None
+            EngineError::Densify(_) => {
+                tracing::error!(%error, "an attempt failed");
+                Attempt::failed("store", error, false)
             }
         }
-    }
-
-    /// Writes every snapshot that comes, until the optimization ends.
-    fn keep_snapshots(&self, lease: &Lease, mut kept: mpsc::Receiver<Snapshot>) -> JoinHandle<()> {
-        let (blobs, metrics) = (self.blobs.clone(), Arc::clone(&self.metrics));
-        let (id, pulse) = (lease.job.id, lease.pulse.clone());
-        tokio::spawn(async move {
-            while let Some(snapshot) = kept.recv().await {
-                let bytes = Bytes::from(snapshot.to_bytes());
-                match blobs.put(id, Blob::Snapshot, bytes, Sync::No).await {
-                    Ok(()) => {
-                        metrics.snapshot_kept();
-                        pulse.snapshot_kept();
-                    }
-                    Err(error) => tracing::warn!(%error, "a snapshot was not kept"),
-                }
-            }
-        })
     }
 
     fn measure(&self, job: &Job, estimate: &Estimate, took: Duration) {
@@ -369,7 +279,7 @@ impl Worker {
         let outcome = match attempt {
             Attempt::Lost => return,
             Attempt::Ended(outcome) => outcome,
-            Attempt::Solved(report, flow) => self.store(lease, &report, &flow).await,
+            Attempt::Done(done) => self.store(lease, *done).await,
         };
         let succeeded = matches!(outcome, Outcome::Succeeded { .. });
         match self.finish(job, outcome).await {
@@ -386,8 +296,10 @@ impl Worker {
             }
             Ok(Committed::Fenced) => {
                 tracing::warn!(job = %job.id, attempt = job.attempt, "a late result was thrown away");
-                if let Err(error) = self.blobs.remove(job.id, Blob::Result(job.attempt)).await {
-                    tracing::warn!(%error, job = %job.id, "a late result was not removed");
+                for blob in [Blob::Result(job.attempt), Blob::Field(job.attempt)] {
+                    if let Err(error) = self.blobs.remove(job.id, blob).await {
+                        tracing::warn!(%error, job = %job.id, "a late result was not removed");
+                    }
                 }
             }
             Err(error) => tracing::error!(%error, job = %job.id, "an outcome was not kept"),
@@ -417,22 +329,28 @@ impl Worker {
         self.queue.finish(job.id, job.attempt, outcome).await
     }
 
-    async fn store(&self, lease: &Lease, report: &Report, flow: &StoredFlow) -> Outcome {
+    /// Puts what an attempt has found in store, the field before the success that others wait for.
+    async fn store(&self, lease: &Lease, done: Done) -> Outcome {
         let job = &lease.job;
-        let bytes = Bytes::from(flow.to_bytes());
-        let promised = lease.pulse.is_durable();
-        let sync = if promised { Sync::Yes } else { Sync::No };
-        let blob = Blob::Result(job.attempt);
-        let mut stored = self.blobs.put(job.id, blob, bytes, sync).await;
-        if stored.is_ok() && !promised && lease.pulse.is_durable() {
-            // It was promised while it was being written.
-            stored = self.blobs.sync(job.id, blob).await;
-        }
-        match (stored, serde_json::to_string(report)) {
-            (Ok(()), Ok(json)) => Outcome::Succeeded {
-                stop_reason: report.stop_reason.clone(),
-                report: json,
-                progress: report.progress(),
+        let (result, field) = (done.result, done.field);
+        let packing = tokio::task::spawn_blocking(move || {
+            (result.to_bytes(), field.map(|field| field.to_bytes()))
+        });
+        let (result, field) = match packing.await {
+            Ok(packed) => packed,
+            Err(error) => return Outcome::Failed(failure("store", &error, true)),
+        };
+        let mut blobs = vec![(Blob::Result(job.attempt), result)];
+        blobs.extend(field.map(|field| (Blob::Field(job.attempt), field)));
+        let writing = blobs
+            .into_iter()
+            .map(|(blob, bytes)| self.put(lease, blob, bytes));
+        let stored = futures_util::future::try_join_all(writing).await;
+        match (stored, done.report) {
+            (Ok(_), Ok(report)) => Outcome::Succeeded {
+                stop_reason: done.stop_reason,
+                report,
+                progress: done.progress,
             },
             (Err(error), _) => {
                 tracing::error!(%error, job = %job.id, "a result was not kept");
@@ -441,12 +359,50 @@ impl Worker {
             (_, Err(error)) => Outcome::Failed(failure("store", &error, true)),
         }
     }
+
+    /// Writes a blob of an attempt; what was promised is on disk then.
+    async fn put(&self, lease: &Lease, blob: Blob, bytes: Vec<u8>) -> Result<(), BlobError> {
+        let id = lease.job.id;
+        let promised = lease.pulse.is_durable();
+        let sync = if promised { Sync::Yes } else { Sync::No };
+        self.blobs.put(id, blob, Bytes::from(bytes), sync).await?;
+        if !promised && lease.pulse.is_durable() {
+            // It was promised while it was being written.
+            self.blobs.sync(id, blob).await?;
+        }
+        Ok(())
+    }
+}
+
+/// What an attempt has found.
+enum Found {
+    Flow(StoredFlow),
+    Cloud(StoredDense),
+}
+
+impl Found {
+    fn to_bytes(&self) -> Vec<u8> {
+        match self {
+            Self::Flow(flow) => flow.to_bytes(),
+            Self::Cloud(cloud) => cloud.to_bytes(),
+        }
+    }
+}
+
+/// What is kept of an attempt.
+struct Done {
+    result: Found,
+    /// For those who go on from it.
+    field: Option<Field>,
+    report: serde_json::Result<String>,
+    stop_reason: Option<String>,
+    progress: Option<JobProgress>,
 }
 
 /// How an attempt ended.
 enum Attempt {
-    /// With a flow that is to be stored.
-    Solved(Box<Report>, StoredFlow),
+    /// With something that is to be stored.
+    Done(Box<Done>),
     /// Without one.
     Ended(Outcome),
     /// Somebody else has the job now.
@@ -465,4 +421,14 @@ fn failure(code: &str, error: &dyn std::error::Error, retryable: bool) -> JobErr
         message: error.to_string(),
         retryable,
     }
+}
+
+/// What becomes of a job whose payload cannot be read.
+fn unreadable(error: &StoreError) -> Attempt {
+    tracing::error!(%error, "the payload cannot be read");
+    Attempt::failed(
+        "store",
+        error,
+        matches!(error, StoreError::Blob(_) | StoreError::Queue(_)),
+    )
 }

@@ -17,7 +17,7 @@ use crate::queue::{Backlog, Queue};
 pub struct AdmissionLimits {
     /// Points of one cloud.
     pub max_points: usize,
-    /// Memory that one pair may take on a device, bytes.
+    /// Memory that one pair, or one dense cloud, may take on a device, bytes.
     pub max_pair_bytes: usize,
     /// Predicted wait of somebody who waits on the line.
     pub max_wait: Duration,
@@ -108,7 +108,13 @@ impl Admission {
         }
     }
 
-    /// Prices a pair, and refuses what no device could do.
+    /// Memory that one pair, or one dense cloud, may take.
+    pub(super) fn max_pair_bytes(&self) -> usize {
+        self.limits.max_pair_bytes
+    }
+
+    /// Prices a pair, and refuses what no device could do. One that `goes_on` from the pair before
+    /// takes as many iterations as that allows.
     ///
     /// # Errors
     /// [`ApiError::BadInput`] or [`ApiError::TooLarge`], with what the solver says.
@@ -117,6 +123,7 @@ impl Admission {
         source: &StoredCloud,
         target: &StoredCloud,
         options: &JobOptions,
+        goes_on: bool,
     ) -> Result<Price, ApiError> {
         let ground = source.ground.as_deref().zip(target.ground.as_deref());
         let problem = Problem {
@@ -126,7 +133,11 @@ impl Admission {
             before: None,
         };
         let points = source.points.len().max(target.points.len());
-        let price = flow::price(&problem, &options.solver_options(points)).map_err(|error| {
+        let mut options = options.solver_options(points);
+        if let Some(warm_start) = options.warm_start.filter(|_| goes_on) {
+            options.max_iterations = warm_start.max_iterations.min(options.max_iterations);
+        }
+        let price = flow::price(&problem, &options).map_err(|error| {
             if error.is_input() {
                 ApiError::BadInput(error.to_string())
             } else {

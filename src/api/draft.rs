@@ -10,6 +10,7 @@ use tokio::sync::OwnedSemaphorePermit;
 
 use super::admission::{Asked, Promise, Reservation};
 use super::auth::Caller;
+use super::dense::Closing;
 use super::error::ApiError;
 use super::service::{Awaited, Service};
 use crate::blobs::{Blob, Sync};
@@ -17,7 +18,7 @@ use crate::clock::Timestamp;
 use crate::cost::CostModel;
 use crate::job::{Job, JobId, JobOptions, Kind};
 use crate::payload::StoredCloud;
-use crate::queue::{Idempotency, Submission, Submitted};
+use crate::queue::{Idempotency, PairOf, Submission, Submitted};
 
 /// What is asked of a job before its clouds are there.
 #[derive(Clone, Debug)]
@@ -32,6 +33,15 @@ pub(super) struct Request {
     pub arrived: Instant,
     /// The call's own deadline, from its arrival, if it has one.
     pub time_left: Option<Duration>,
+    /// Its place in a chain of pairs that come one by one, where it is of one.
+    pub link: Option<Link>,
+}
+
+/// A pair's place in a chain.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Link {
+    /// The pair before, where there is one.
+    pub after: Option<JobId>,
 }
 
 /// A job that was accepted.
@@ -55,6 +65,8 @@ pub(super) struct Draft {
     request: Request,
     id: JobId,
     frames: u32,
+    /// Points of each cloud.
+    points: Vec<usize>,
     last: Option<Arc<StoredCloud>>,
     nominal_seconds: f64,
     fingerprint: blake3::Hasher,
@@ -93,6 +105,7 @@ impl Draft {
             request,
             id: JobId::fresh(),
             frames: 0,
+            points: Vec::new(),
             last: None,
             nominal_seconds: 0.0,
             fingerprint,
@@ -119,15 +132,23 @@ impl Draft {
                 "a sequence has more than the {limit} frames that this server takes"
             )));
         }
+        self.points.push(cloud.points.len());
+        if self.request.options.densify.is_some() {
+            service.admission.check_dense(&self.points)?;
+        }
         let cloud = Arc::new(cloud);
         let before = self.last.replace(Arc::clone(&cloud));
         let options = self.request.options.clone();
+        let after = self.request.link.and_then(|link| link.after);
+        let goes_on = options.goes_on() && (self.frames > 1 || after.is_some());
         let work = {
             let service = Arc::clone(&service);
             move || -> Result<(f64, Vec<u8>), ApiError> {
                 let mut nominal = 0.0;
                 if let Some(before) = before {
-                    let price = service.admission.price(&before, &cloud, &options)?;
+                    let price = service
+                        .admission
+                        .price(&before, &cloud, &options, goes_on)?;
                     nominal = CostModel::nominal(&price);
                 }
                 Ok((nominal, cloud.to_bytes()))
@@ -157,6 +178,9 @@ impl Draft {
     /// # Errors
     /// [`ApiError`] where clouds are missing, nothing more is accepted, or the store fails.
     pub(super) async fn submit(self, kind: Kind) -> Result<Accepted, ApiError> {
+        if kind == Kind::Pair {
+            self.request.options.check_for_pairs()?;
+        }
         match (kind, self.frames) {
             (Kind::Pair, 2) | (Kind::Sequence, 2..) => {}
             (Kind::Pair, _) => {
@@ -167,13 +191,17 @@ impl Draft {
                 return Err(ApiError::BadRequest(text.to_owned()));
             }
         }
-        let place = self.admit()?;
-        let committed = tokio::spawn(self.commit(kind, place));
+        let submission = self.submission(kind)?;
+        let place = self.admit(&submission)?;
+        let committed = tokio::spawn(self.commit(submission, place));
         committed.await.map_err(ApiError::internal)?
     }
 
-    async fn commit(mut self, kind: Kind, _place: Reservation) -> Result<Accepted, ApiError> {
-        let submission = self.submission(kind);
+    async fn commit(
+        mut self,
+        submission: Submission,
+        _place: Reservation,
+    ) -> Result<Accepted, ApiError> {
         match self.service.queue.submit(submission).await? {
             Submitted::New(job) => {
                 self.submitted = true;
@@ -197,33 +225,61 @@ impl Draft {
         }
     }
 
-    fn admit(&self) -> Result<Reservation, ApiError> {
+    fn admit(&self, submission: &Submission) -> Result<Reservation, ApiError> {
         self.service.check_draining()?;
+        let pairs = submission.pairs.len().max(1) as f64;
+        let closing = submission.closing_seconds.unwrap_or(0.0);
         self.service.admission.admit(&Asked {
             tenant: &self.caller.tenant,
             priority: self.request.options.priority,
             device: self.request.options.device_kind(),
-            nominal_seconds: self.nominal_seconds,
+            nominal_seconds: submission.cost_seconds * pairs + closing,
             promise: self.request.promise,
         })
     }
 
-    fn submission(&self, kind: Kind) -> Submission {
-        let pairs = self.frames - 1;
+    /// The pairs of a sequence that go forward, in the order of their turns.
+    fn pairs(&self) -> Vec<PairOf> {
+        let goes_on = self.request.options.goes_on();
+        let forward = (0..self.frames - 1).map(|place| PairOf {
+            place,
+            backward: false,
+            follows: goes_on && place > 0,
+        });
+        forward.collect()
+    }
+
+    fn submission(&self, kind: Kind) -> Result<Submission, ApiError> {
+        let mut pairs: Vec<PairOf> = match kind {
+            Kind::Pair => Vec::new(),
+            Kind::Sequence => self.pairs(),
+        };
+        let cost_seconds = self.nominal_seconds / pairs.len().max(1) as f64;
+        let mut closing_seconds = None;
+        if let Some(densify) = &self.request.options.densify {
+            let goes_on = self.request.options.goes_on();
+            let closing = Closing::of(densify, &self.points, goes_on)?;
+            pairs.extend(closing.back);
+            closing_seconds = Some(closing.nominal_seconds);
+        }
+        let link = self.request.link;
         let options = &self.request.options;
         let asked = options.deadline_ms.map(Duration::from_millis);
         let spent = self.request.arrived.elapsed();
         let asked = asked.into_iter().chain(self.request.time_left).min();
         let left = asked.map(|asked| asked.saturating_sub(spent));
         let key = self.request.idempotency_key.clone();
-        Submission {
+        Ok(Submission {
             id: self.id,
             tenant: self.caller.tenant.clone(),
             kind,
+            cost_seconds,
             pairs,
+            closing_seconds,
+            after: link.and_then(|link| link.after),
+            followed: link.is_some(),
             priority: options.priority,
             device: options.device_kind(),
-            cost_seconds: self.nominal_seconds / f64::from(pairs),
             options: options.to_json(),
             deadline: left.map(|left| Timestamp::now().after(left)),
             idempotency: key.map(|key| Idempotency {
@@ -231,7 +287,7 @@ impl Draft {
                 fingerprint: *self.fingerprint.finalize().as_bytes(),
             }),
             durable: self.request.promise == Promise::Durable,
-        }
+        })
     }
 }
 

@@ -6,6 +6,7 @@
 mod admission;
 mod auth;
 mod codec;
+mod dense;
 mod draft;
 mod error;
 mod service;

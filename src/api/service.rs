@@ -18,7 +18,7 @@ use crate::metrics::Metrics;
 use crate::payload::{StoredCloud, StoredFlow};
 use crate::queue::{Filter, Queue};
 
-/// Archives that are written at a time.
+/// Archives and clouds that are sent at a time.
 const MAX_ARCHIVES: usize = 16;
 
 /// What a request may cost the doors.
@@ -48,8 +48,11 @@ pub struct Service {
     pub(super) limits: ServiceLimits,
     pub(super) room: Arc<Semaphore>,
     compute: Semaphore,
-    /// Archives that are being written: each holds a thread while its client reads.
+    /// Archives and clouds that are being sent: each holds a thread, or memory, while its client
+    /// reads.
     pub(super) archives: Arc<Semaphore>,
+    /// Dense clouds that are being read and encoded.
+    pub(super) clouds: Semaphore,
     /// Cancelled when the server is about to stop: health says so, everything is still served.
     pub(super) leaving: CancellationToken,
     draining: AtomicBool,
@@ -109,6 +112,7 @@ impl Service {
             room: Arc::new(Semaphore::new(room.min(Semaphore::MAX_PERMITS))),
             compute: Semaphore::new(cores),
             archives: Arc::new(Semaphore::new(MAX_ARCHIVES)),
+            clouds: Semaphore::new(1),
             leaving: CancellationToken::new(),
             draining: AtomicBool::new(false),
             closing: CancellationToken::new(),
@@ -221,14 +225,18 @@ impl Service {
         Ok(self.queue.job(&caller.tenant, id).await?)
     }
 
-    /// The pairs of the caller's sequence.
+    /// The pairs of the caller's sequence that go forward in time, in order.
     ///
     /// # Errors
     /// Where the store fails.
     pub async fn pairs(&self, job: &Job) -> Result<Vec<Arc<Job>>, ApiError> {
         match job.kind {
             Kind::Pair => Ok(Vec::new()),
-            Kind::Sequence => Ok(self.queue.pairs(job.id).await?),
+            Kind::Sequence => {
+                let mut pairs = self.queue.pairs(job.id).await?;
+                pairs.retain(|pair| !pair.backward);
+                Ok(pairs)
+            }
         }
     }
 
@@ -315,16 +323,22 @@ impl Service {
     /// # Errors
     /// Where the store fails.
     pub async fn make_durable(&self, job: &Job) -> Result<Arc<Job>, ApiError> {
-        let frames = job.pairs.max(1) + 1;
+        let frames = match job.kind {
+            Kind::Pair => 2,
+            Kind::Sequence => 1 + self.pairs(job).await?.len() as u32,
+        };
         for place in 0..frames {
             self.blobs.sync(job.id, Blob::Frame(place)).await?;
         }
         let job = self.queue.make_durable(job.id).await?;
         // A result that came before the queue knew was not waited for.
-        match self.blobs.sync(job.id, Blob::Result(job.attempt)).await {
-            Err(error) if !error.is_missing() => Err(error.into()),
-            _ => Ok(job),
+        for blob in [Blob::Result(job.attempt), Blob::Field(job.attempt)] {
+            match self.blobs.sync(job.id, blob).await {
+                Err(error) if !error.is_missing() => return Err(error.into()),
+                _ => {}
+            }
         }
+        Ok(job)
     }
 
     /// Ends a job when the guard is dropped: whoever waited for it is gone.
@@ -335,23 +349,31 @@ impl Service {
         }
     }
 
+    /// Refuses a job that has not succeeded.
+    ///
+    /// # Errors
+    /// [`ApiError::NotEnded`], or how it ended instead.
+    pub(super) fn check_success(job: &Job) -> Result<(), ApiError> {
+        match job.state {
+            State::Succeeded => Ok(()),
+            State::Queued | State::Running => Err(ApiError::NotEnded(job.id)),
+            State::Cancelled => Err(ApiError::Cancelled(job.id)),
+            State::Expired => Err(ApiError::Expired(job.id)),
+            State::Failed => {
+                let error = job.error.clone();
+                Err(error.map_or(ApiError::Internal, |error| {
+                    ApiError::JobFailed(job.id, error)
+                }))
+            }
+        }
+    }
+
     /// The flow of a pair that has succeeded.
     ///
     /// # Errors
     /// [`ApiError::NotEnded`], or how it ended instead.
     pub async fn answer(&self, job: &Arc<Job>) -> Result<Answer, ApiError> {
-        match job.state {
-            State::Succeeded => {}
-            State::Queued | State::Running => return Err(ApiError::NotEnded(job.id)),
-            State::Cancelled => return Err(ApiError::Cancelled(job.id)),
-            State::Expired => return Err(ApiError::Expired(job.id)),
-            State::Failed => {
-                let error = job.error.clone();
-                return Err(error.map_or(ApiError::Internal, |error| {
-                    ApiError::JobFailed(job.id, error)
-                }));
-            }
-        }
+        Self::check_success(job)?;
         if job.kind == Kind::Sequence {
             let text = "a sequence's flow is in its pairs; see links.pairs";
             return Err(ApiError::BadRequest(text.to_owned()));
@@ -378,8 +400,8 @@ impl Service {
         let began = std::time::Instant::now();
         let points = if format.needs_points() {
             let job = &answer.job;
-            let (owner, place) = job.parent.map_or((job.id, 0), |parent| (parent, job.place));
-            let bytes = self.blobs.get(owner, Blob::Frame(place)).await?;
+            let (owner, [source, _]) = job.sweeps();
+            let bytes = self.blobs.get(owner, Blob::Frame(source)).await?;
             StoredCloud::from_bytes(&bytes)
                 .map_err(ApiError::internal)?
                 .points

@@ -15,10 +15,45 @@ use crate::flow::{self, Estimate, FlowError, Interrupt, Problem, Progress, Snaps
 
 /// What a lane is told.
 pub(super) enum Command {
-    /// Solve a pair, and send its flow there.
-    Solve(Box<Work>, oneshot::Sender<Result<Solved, EngineError>>),
+    /// Do something, and tell whoever waits for it.
+    Do(Box<dyn Task>),
     /// See whether the device is still there.
     Look,
+}
+
+/// Something for a device.
+pub(super) trait Task: Send {
+    /// Does it, and answers.
+    fn run(self: Box<Self>, hold: &Hold, held: &Held, busy: &Busy) -> Trust;
+    /// Gives it back: another device may do it meanwhile.
+    fn turn_away(self: Box<Self>);
+}
+
+/// Work, and where its answer goes.
+pub(super) struct Asked<W, T> {
+    pub(super) work: W,
+    pub(super) reply: oneshot::Sender<Result<Solved<T>, EngineError>>,
+}
+
+impl<W, T> Task for Asked<W, T>
+where
+    W: FnOnce(&dyn Backend, &Busy) -> Result<T, EngineError> + Send,
+    T: Send,
+{
+    fn run(self: Box<Self>, hold: &Hold, held: &Held, busy: &Busy) -> Trust {
+        let Self { work, reply } = *self;
+        busy.begin();
+        let done = catch_unwind(AssertUnwindSafe(|| work(held.backend.as_ref(), busy)));
+        busy.end();
+        let (answer, trust) = judged(hold, held, done);
+        let _nobody_waits_is_fine = reply.send(answer);
+        trust
+    }
+
+    fn turn_away(self: Box<Self>) {
+        let answer = Err(EngineError::Broken("it is being opened again".to_owned()));
+        let _nobody_waits_is_fine = self.reply.send(answer);
+    }
 }
 
 /// Whether a lane trusts its device.
@@ -34,25 +69,17 @@ pub(super) enum Trust {
 pub(super) fn run(hold: &Hold, mut inbox: mpsc::Receiver<Command>, busy: &Busy) {
     let mut trust = Trust::Given;
     while hold.open(trust, &mut || turned_away(&mut inbox)) {
-        let (work, reply) = match inbox.blocking_recv() {
-            Some(Command::Solve(work, reply)) => (*work, reply),
+        let task = match inbox.blocking_recv() {
+            Some(Command::Do(task)) => task,
             Some(Command::Look) => continue,
             None => return,
         };
         let Some(held) = hold.share() else {
             trust = Trust::Given;
-            let answer = Err(EngineError::Broken("it is being opened again".to_owned()));
-            let _nobody_waits_is_fine = reply.send(answer);
+            task.turn_away();
             continue;
         };
-        busy.begin();
-        let solved = catch_unwind(AssertUnwindSafe(|| {
-            solve(held.backend.as_ref(), work, busy)
-        }));
-        busy.end();
-        let answer;
-        (answer, trust) = judged(hold, &held, solved);
-        let _nobody_waits_is_fine = reply.send(answer);
+        trust = task.run(hold, &held, busy);
         let_go(held);
     }
 }
@@ -62,10 +89,7 @@ pub(super) fn run(hold: &Hold, mut inbox: mpsc::Receiver<Command>, busy: &Busy) 
 fn turned_away(inbox: &mut mpsc::Receiver<Command>) -> bool {
     loop {
         match inbox.try_recv() {
-            Ok(Command::Solve(_, reply)) => {
-                let answer = Err(EngineError::Broken("it is being opened again".to_owned()));
-                let _nobody_waits_is_fine = reply.send(answer);
-            }
+            Ok(Command::Do(task)) => task.turn_away(),
             Ok(Command::Look) => {}
             Err(TryRecvError::Empty) => return false,
             Err(TryRecvError::Disconnected) => return true,
@@ -84,25 +108,25 @@ fn let_go(held: Held) {
 
 /// What an attempt says about the pair, and what about the device. Whatever comes from a device
 /// that is gone counts for nothing: it may be stale.
-fn judged(
+fn judged<T>(
     hold: &Hold,
     held: &Held,
-    solved: std::thread::Result<Result<Estimate, FlowError>>,
-) -> (Result<Solved, EngineError>, Trust) {
-    let (answer, trust) = match solved {
-        Ok(Ok(estimate)) => {
+    done: std::thread::Result<Result<T, EngineError>>,
+) -> (Result<Solved<T>, EngineError>, Trust) {
+    let (answer, trust) = match done {
+        Ok(Ok(found)) => {
             let device = held.backend.name();
-            (Ok(Solved { estimate, device }), Trust::Given)
+            (Ok(Solved { found, device }), Trust::Given)
         }
-        Ok(Err(FlowError::Backend(BackendError::Lost(reason)))) => {
+        Ok(Err(EngineError::Flow(FlowError::Backend(BackendError::Lost(reason))))) => {
             (Err(EngineError::Lost(reason)), Trust::Given)
         }
         Ok(Err(error)) => {
             let trust = match error {
-                FlowError::Backend(BackendError::Device(_)) => Trust::Shaken,
+                EngineError::Flow(FlowError::Backend(BackendError::Device(_))) => Trust::Shaken,
                 _ => Trust::Given,
             };
-            (Err(error.into()), trust)
+            (Err(error), trust)
         }
         Err(panic) => {
             let message = message(panic.as_ref());
@@ -132,9 +156,9 @@ fn judged(
 }
 
 /// Passes everything on, and hears the signs of life.
-struct Heard<'a> {
-    watch: &'a dyn Watch,
-    busy: &'a Busy,
+pub(super) struct Heard<'a> {
+    pub(super) watch: &'a dyn Watch,
+    pub(super) busy: &'a Busy,
 }
 
 impl Watch for Heard<'_> {
@@ -164,7 +188,8 @@ impl Watch for Heard<'_> {
     }
 }
 
-fn solve(backend: &dyn Backend, work: Work, busy: &Busy) -> Result<Estimate, FlowError> {
+/// Estimates one pair's flow, from its snapshot where that is of use.
+pub(super) fn solve(backend: &dyn Backend, work: Work, busy: &Busy) -> Result<Estimate, FlowError> {
     let watch = Heard {
         watch: work.watch.as_ref(),
         busy,
@@ -174,7 +199,7 @@ fn solve(backend: &dyn Backend, work: Work, busy: &Busy) -> Result<Estimate, Flo
         source: &work.source,
         target: &work.target,
         ground: ground.map(|[source, target]| [source.as_slice(), target.as_slice()]),
-        before: None,
+        before: work.before.as_ref(),
     };
     if let Some(snapshot) = work.snapshot {
         match flow::resume(backend, &problem, &work.options, snapshot, &watch) {

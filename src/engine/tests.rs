@@ -58,6 +58,7 @@ fn work() -> Work {
         target: source.iter().map(|[x, y, z]| [x + 0.1, *y, *z]).collect(),
         source,
         ground: None,
+        before: None,
         options: Preset::Default.options(None),
         snapshot: None,
         watch: Arc::new(Unwatched),

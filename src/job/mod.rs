@@ -6,6 +6,7 @@ mod id;
 mod options;
 mod record;
 mod report;
+mod sequence;
 
 pub use id::{InvalidId, JobId, Tenant};
 pub use options::{
@@ -13,4 +14,5 @@ pub use options::{
     PresetChoice, Priority,
 };
 pub use record::{Job, JobError, JobProgress, Kind, State};
-pub use report::{PhaseSeconds, Report};
+pub use report::{DenseReport, PhaseSeconds, Report};
+pub use sequence::{Densify, LaterChoice};

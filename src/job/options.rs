@@ -10,6 +10,8 @@ use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use utoipa::ToSchema;
 
+use super::sequence::Densify;
+use crate::flow::densify::PlanError;
 use crate::flow::{self, Ego, Ground, MIN_POINTS, Precision, Preset, RigidTransform};
 use crate::formats::{matrix_rows, rigid_motion};
 
@@ -49,6 +51,9 @@ pub struct JobOptions {
     pub deadline_ms: Option<u64>,
     /// Jobs of a higher priority are started first.
     pub priority: Priority,
+    /// One dense cloud of a sequence besides its flows.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub densify: Option<Densify>,
 }
 
 /// A named set of solver options.
@@ -276,6 +281,15 @@ pub enum InvalidOptions {
     /// No time at all, or more than a day.
     #[error("options: deadline_ms is {0}, 1 to {max} are possible", max = MAX_DEADLINE.as_millis())]
     Deadline(u64),
+    /// No frame of any sequence.
+    #[error("options: densify.into is {0}, a frame counted from 0 is needed")]
+    Into(f64),
+    /// The sequence cannot be carried into that frame.
+    #[error("options: densify: {0}")]
+    Densify(PlanError),
+    /// Not a sequence that is submitted whole.
+    #[error("options: densify is for sequences that are submitted as jobs")]
+    NoSequence,
 }
 
 impl JobOptions {
@@ -322,7 +336,7 @@ impl JobOptions {
         if self.precision == PrecisionChoice::F16 && self.device == DeviceChoice::Cpu {
             return Err(InvalidOptions::HalfOnCpu);
         }
-        Ok(())
+        self.densify.as_ref().map_or(Ok(()), Densify::check)
     }
 
     /// The kind of device that it has to be; none where any will do.
@@ -370,7 +384,7 @@ mod tests {
     fn an_empty_object_is_the_default_and_every_option_comes_back() {
         assert_eq!(JobOptions::from_json(b"{}"), Ok(JobOptions::default()));
         let text = br#"{"preset":"paper","seed":7,"max_points":8192,"range_m":51.2,"ground":"mask",
-            "ego":[[1,0,0,2],[0,1,0,0],[0,0,1,0],[0,0,0,1]],"device":"cpu","deadline_ms":300,"priority":"high"}"#;
+            "ego":[[1,0,0,2],[0,1,0,0],[0,0,1,0],[0,0,0,1]],"device":"cpu","deadline_ms":300,"priority":"high","densify":{"into":1.5}}"#;
         let options = JobOptions::from_json(text).expect("good options");
         assert_eq!(options.preset, PresetChoice::Paper);
         assert_eq!(
@@ -421,6 +435,20 @@ mod tests {
             (
                 r#"{"ego":[[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}"#,
                 "not a rigid",
+            ),
+            (r#"{"densify":{}}"#, "missing field `into`"),
+            (
+                r#"{"densify":{"into":1,"steps":2}}"#,
+                "unknown field `steps`",
+            ),
+            (r#"{"densify":{"into":-0.5}}"#, "densify.into is -0.5"),
+            (
+                r#"{"densify":{"into":1,"substeps":65}}"#,
+                "densify: 65 substeps: 1 to 64 are possible",
+            ),
+            (
+                r#"{"densify":{"into":1,"later":"never"}}"#,
+                "unknown variant `never`",
             ),
             (r#"{"seed":-1}"#, "invalid value"),
             (r#"{"seed":1,"seed":2}"#, "duplicate field"),

@@ -100,12 +100,21 @@ pub struct Job {
     pub kind: Kind,
     /// The sequence that it is a pair of.
     pub parent: Option<JobId>,
-    /// Its place in that sequence, from 0.
+    /// The earlier of its two sweeps in that sequence, from 0.
     pub place: u32,
-    /// Pairs of a sequence; 0 for a pair.
+    /// Whether it goes back in time, from the later sweep to the earlier one.
+    pub backward: bool,
+    /// Pairs of a sequence, those that go back in time included; 0 for a pair.
     pub pairs: u32,
     /// Pairs of a sequence that have not ended yet.
     pub pairs_left: u32,
+    /// The job that has to end before it is started.
+    pub after: Option<JobId>,
+    /// Whether another job may come after it, and use what it leaves behind.
+    pub followed: bool,
+    /// Since when nothing but a device is missing; none while it comes after a job that has not
+    /// ended, and for a sequence until it has something of its own to do.
+    pub ready: Option<Timestamp>,
     /// How urgent it is.
     pub priority: Priority,
     /// The kind of device that it has to be done on; none where any will do.
@@ -140,4 +149,15 @@ pub struct Job {
     pub cancel_requested: bool,
     /// What the solver reports, as JSON.
     pub report: Option<String>,
+}
+
+impl Job {
+    /// Under whose name a pair's sweeps lie, and which of them are source and target.
+    pub fn sweeps(&self) -> (JobId, [u32; 2]) {
+        let owner = self.parent.unwrap_or(self.id);
+        match self.backward {
+            false => (owner, [self.place, self.place + 1]),
+            true => (owner, [self.place + 1, self.place]),
+        }
+    }
 }

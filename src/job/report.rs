@@ -98,6 +98,23 @@ impl Report {
     }
 }
 
+/// How a dense cloud was made.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct DenseReport {
+    /// Points of all sweeps together.
+    pub points: usize,
+    /// Sweeps that were carried.
+    pub frames: usize,
+    /// The frame that they were carried into, in sweeps from 0.
+    pub into: f64,
+    /// Parts that each step was cut into.
+    pub substeps: u32,
+    /// Where it was done.
+    pub device: String,
+    /// Wall-clock seconds of carrying, fits left out.
+    pub seconds: f64,
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -6,6 +6,7 @@
 mod devices;
 mod failures;
 mod lives;
+mod turns;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -14,8 +15,8 @@ use tokio::sync::mpsc;
 use tokio::time::timeout;
 
 use super::{
-    Committed, Event, Filter, Idempotency, Lease, Outcome, Queue, QueueError, QueueOptions, Signal,
-    Submission, Submitted,
+    Committed, Event, Filter, Idempotency, Lease, Outcome, PairOf, Queue, QueueError, QueueOptions,
+    Signal, Submission, Submitted,
 };
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, State, Tenant};
@@ -60,6 +61,17 @@ macro_rules! queue_contract {
             a_job_that_moves_waits_for_the_other_kind_without_blame,
             a_device_that_dies_under_a_job_again_and_again_ends_it,
             jobs_for_a_kind_survive_a_crash,
+            a_job_is_leased_only_when_the_one_that_it_comes_after_has_ended,
+            a_job_that_comes_after_one_that_has_ended_or_is_unknown_waits_for_nothing,
+            a_job_that_waits_for_another_is_queued_but_nobody_is_late_with_it,
+            a_chain_goes_on_behind_a_member_that_fails_is_cancelled_or_expires,
+            a_chain_is_cancelled_whole_and_asked_for_again_in_its_order,
+            a_chain_survives_a_crash_in_its_order,
+            chains_go_side_by_side_and_leave_other_tenants_their_share,
+            what_others_come_after_is_kept_until_they_have_ended,
+            a_sequence_with_something_left_to_do_is_leased_when_its_pairs_have_succeeded,
+            what_is_left_of_a_sequence_survives_crashes_and_is_retried_cancelled_and_asked_for_again,
+            a_pair_that_fails_back_in_time_is_named_and_nothing_is_left_to_do,
         }
     };
     ($stand:expr; $($name:ident,)*) => {
@@ -75,6 +87,7 @@ pub(crate) use devices::*;
 pub(crate) use failures::*;
 pub(crate) use lives::*;
 pub(crate) use queue_contract;
+pub(crate) use turns::*;
 
 fn tenant(name: &str) -> Tenant {
     name.parse().expect("a good name")
@@ -85,7 +98,10 @@ pub(crate) fn submission(of: &str) -> Submission {
         id: JobId::fresh(),
         tenant: tenant(of),
         kind: Kind::Pair,
-        pairs: 0,
+        pairs: Vec::new(),
+        closing_seconds: None,
+        after: None,
+        followed: false,
         priority: Priority::Normal,
         device: None,
         cost_seconds: 1.0,
@@ -125,7 +141,7 @@ async fn nothing_is_ready_for(queue: &Arc<dyn Queue>, kind: DeviceKind) {
 
 fn done() -> Outcome {
     Outcome::Succeeded {
-        stop_reason: "converged".to_owned(),
+        stop_reason: Some("converged".to_owned()),
         report: "{}".to_owned(),
         progress: Some(JobProgress {
             iteration: 9,
@@ -172,7 +188,15 @@ fn quick() -> QueueOptions {
 fn sequence(pairs: u32) -> Submission {
     Submission {
         kind: Kind::Sequence,
-        pairs,
+        pairs: (0..pairs).map(|place| forward(place, false)).collect(),
         ..submission("a")
+    }
+}
+
+fn forward(place: u32, follows: bool) -> PairOf {
+    PairOf {
+        place,
+        backward: false,
+        follows,
     }
 }

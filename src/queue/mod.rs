@@ -1,7 +1,8 @@
 //! The durable queue: jobs in, leases out, every promise kept.
 //!
 //! It moves jobs and never looks inside a payload or at options; it must not know doors, workers
-//! or solvers. [`Queue`] is the contract and `contract.rs` its tests; [`SqliteQueue`] keeps it on
+//! or solvers. What it knows of a sequence is that some pairs wait for others, and that something
+//! may be left to do when all are done. [`Queue`] is the contract and `contract.rs` its tests; [`SqliteQueue`] keeps it on
 //! one machine.
 
 mod backlog;
@@ -35,8 +36,15 @@ pub struct Submission {
     pub tenant: Tenant,
     /// A pair or a sequence.
     pub kind: Kind,
-    /// Pairs of a sequence; ignored for a pair.
-    pub pairs: u32,
+    /// The pairs of a sequence, in the order of their turns; none for a pair.
+    pub pairs: Vec<PairOf>,
+    /// Predicted compute seconds of what is left to do for a sequence when all of its pairs have
+    /// succeeded; none where they are all of it.
+    pub closing_seconds: Option<f64>,
+    /// The job that has to end, however it does, before this one is started.
+    pub after: Option<JobId>,
+    /// Whether another job may come after this one, and use what it leaves behind.
+    pub followed: bool,
     /// How urgent it is.
     pub priority: Priority,
     /// The kind of device that it has to be done on; none where any will do.
@@ -51,6 +59,17 @@ pub struct Submission {
     pub idempotency: Option<Idempotency>,
     /// Whether it must outlive this process from now on. Without it, it ends with the process.
     pub durable: bool,
+}
+
+/// A pair of a sequence that is submitted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PairOf {
+    /// The earlier of its two sweeps.
+    pub place: u32,
+    /// Whether it goes back in time, from the later sweep to the earlier one.
+    pub backward: bool,
+    /// Whether it comes after the one before it in the list.
+    pub follows: bool,
 }
 
 /// What makes a repeated submission recognizable.
@@ -89,8 +108,8 @@ pub struct Filter {
 pub enum Outcome {
     /// The result lies in store under this attempt.
     Succeeded {
-        /// Why the optimization stopped.
-        stop_reason: String,
+        /// Why the optimization stopped, where there was one.
+        stop_reason: Option<String>,
         /// What the solver reports, as JSON.
         report: String,
         /// How far it has come, where there was an iteration.
@@ -192,7 +211,8 @@ pub enum Event {
 /// The queue's contract. Whatever is answered has happened, and is on disk if the job is durable.
 #[async_trait]
 pub trait Queue: Send + Sync {
-    /// Accepts a job, and for a sequence all of its pairs.
+    /// Accepts a job, and for a sequence all of its pairs. A job that comes after another one is
+    /// queued, but nobody gets it before that one has ended.
     async fn submit(&self, submission: Submission) -> Result<Submitted, QueueError>;
 
     /// Makes a job outlive this process.
@@ -201,7 +221,7 @@ pub trait Queue: Send + Sync {
     /// One tenant's job; other tenants' jobs are not found.
     async fn job(&self, tenant: &Tenant, id: JobId) -> Result<Arc<Job>, QueueError>;
 
-    /// The pairs of a sequence, in order.
+    /// The pairs of a sequence, in the order of their turns.
     async fn pairs(&self, id: JobId) -> Result<Vec<Arc<Job>>, QueueError>;
 
     /// Jobs, latest first; pairs of sequences are not listed by themselves.
@@ -234,7 +254,7 @@ pub trait Queue: Send + Sync {
     /// What waits and what runs.
     fn backlog(&self) -> Backlog;
 
-    /// When the oldest queued job was accepted.
+    /// Since when the job that has waited longest for a device could have been started.
     async fn oldest_queued(&self) -> Result<Option<Timestamp>, QueueError>;
 
     /// Which of some names belong to jobs.

@@ -110,3 +110,23 @@ impl Watch for JobWatch {
         }
     }
 }
+
+/// Looks in while sweeps are carried into one frame: there is nothing to put down half-way, so that
+/// a worker that is to stop lets go at once.
+pub(super) struct DenseWatch {
+    pulse: Pulse,
+    release: CancellationToken,
+}
+
+impl DenseWatch {
+    pub(super) fn new(pulse: Pulse, release: CancellationToken) -> Self {
+        Self { pulse, release }
+    }
+}
+
+impl Watch for DenseWatch {
+    fn interrupt(&self) -> Option<Interrupt> {
+        let gone = self.pulse.beat(None) != Signal::Continue;
+        (gone || self.release.is_cancelled()).then_some(Interrupt::Cancelled)
+    }
+}

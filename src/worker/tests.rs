@@ -13,7 +13,7 @@ use crate::blobs::{Blob, Blobs, Sync};
 use crate::cost::{CostModel, Lanes};
 use crate::engine::cards::Switches;
 use crate::engine::{Device, Health};
-use crate::flow::Point;
+use crate::flow::{Field, Point};
 use crate::job::{DeviceKind, Job, JobId, Kind, Priority, State, Tenant};
 use crate::metrics::Metrics;
 use crate::payload::{StoredCloud, StoredFlow};
@@ -89,6 +89,11 @@ fn clouds() -> [Vec<Point>; 2] {
 
 impl Stand {
     async fn submit(&self, frames: usize) -> Arc<Job> {
+        self.submit_after(frames, None).await
+    }
+
+    /// A pair of a chain.
+    async fn submit_after(&self, frames: usize, after: Option<JobId>) -> Arc<Job> {
         let id = JobId::fresh();
         for (place, points) in (0..).zip(clouds().into_iter().take(frames)) {
             let cloud = StoredCloud {
@@ -103,7 +108,10 @@ impl Stand {
             id,
             tenant: Tenant::default(),
             kind: Kind::Pair,
-            pairs: 0,
+            pairs: Vec::new(),
+            closing_seconds: None,
+            after,
+            followed: true,
             priority: Priority::Normal,
             device: None,
             cost_seconds: 0.1,
@@ -174,6 +182,36 @@ async fn a_payload_that_is_gone_fails_its_job_and_no_other() {
     assert_eq!(half.state, State::Failed);
     assert_eq!(half.error.as_ref().expect("a reason").code, "store");
     assert_eq!(stand.ended(&whole).await.state, State::Succeeded);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_pair_leaves_its_field_and_starts_afresh_where_the_one_before_has_left_none() {
+    let stand = stand().await;
+    tokio::spawn(stand.worker.clone().run());
+    let alone = stand.submit(2).await;
+    let half = stand.submit_after(1, Some(alone.id)).await;
+    let afresh = stand.submit_after(2, Some(half.id)).await;
+    let unknown = stand.submit_after(2, Some(JobId::fresh())).await;
+    let mut flows = Vec::new();
+    for (job, state) in [
+        (alone, State::Succeeded),
+        (half, State::Failed),
+        (afresh, State::Succeeded),
+        (unknown, State::Succeeded),
+    ] {
+        let job = stand.ended(&job).await;
+        assert_eq!(job.state, state);
+        if state == State::Succeeded {
+            let field = stand.blobs.get(job.id, Blob::Field(job.attempt)).await;
+            Field::from_bytes(&field.expect("stored")).expect("whole");
+            let bytes = stand.blobs.get(job.id, Blob::Result(job.attempt)).await;
+            flows.push(StoredFlow::from_bytes(&bytes.expect("stored")).expect("whole"));
+        }
+    }
+    let [alone, afresh, unknown] = &flows[..] else {
+        panic!("{} flows", flows.len());
+    };
+    assert!(afresh.flow == alone.flow && unknown.flow == alone.flow);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

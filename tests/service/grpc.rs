@@ -36,7 +36,7 @@ pub(crate) async fn client(server: &Server) -> SceneFlowClient<Channel> {
     SceneFlowClient::new(endpoint.connect().await.expect("a connection"))
 }
 
-fn chunk(points: &[Point]) -> proto::Chunk {
+pub(crate) fn chunk(points: &[Point]) -> proto::Chunk {
     let values = points.as_flattened().iter();
     let bytes: Vec<u8> = values.flat_map(|value| value.to_le_bytes()).collect();
     proto::Chunk {

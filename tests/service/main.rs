@@ -22,5 +22,6 @@ mod http;
 mod kills;
 mod load;
 mod readme;
+mod sequences;
 mod server;
 mod wire;

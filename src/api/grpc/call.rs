@@ -45,6 +45,7 @@ impl Call {
             idempotency_key: None,
             arrived: self.arrived,
             time_left: self.time_left.filter(|_| awaited),
+            link: None,
         }
     }
 }

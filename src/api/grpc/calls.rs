@@ -12,9 +12,10 @@ use super::chunks::{self, CloudBuilder};
 use super::proto::{self, scene_flow_server::SceneFlow};
 use super::{convert, sequence};
 use crate::api::admission::Promise;
+use crate::api::dense;
 use crate::api::draft::{Accepted, Draft, Room};
 use crate::api::error::ApiError;
-use crate::api::service::{Answer, Service, Waited};
+use crate::api::service::{Service, Waited};
 use crate::job::{InvalidId, Job, JobId, Kind};
 
 /// Messages that wait for a client that reads slowly.
@@ -55,6 +56,7 @@ impl Calls {
         };
         let pause = u64::from(begin.progress_ms);
         let options = convert::options(begin.options)?;
+        options.check_for_pairs().map_err(ApiError::from)?;
         self.service
             .check_room(&call.caller, Some(&options), awaited)?;
         let request = call.draft_request(options, awaited);
@@ -135,16 +137,12 @@ async fn send_flow(
     Ok(true)
 }
 
-/// Sends a stored flow from a row on.
+/// Sends a result's parts, one by one.
 async fn send_result(
-    answer: Answer,
-    first: usize,
+    parts: impl Iterator<Item = proto::download_result_response::Part>,
     answers: mpsc::Sender<Result<proto::DownloadResultResponse, Status>>,
 ) {
-    use proto::download_result_response::Part;
-    let header = Part::Header(convert::header(&answer));
-    let pieces = chunks::pieces(&answer, first).map(Part::Chunk);
-    for part in std::iter::once(header).chain(pieces) {
+    for part in parts {
         let message = proto::DownloadResultResponse { part: Some(part) };
         if answers.send(Ok(message)).await.is_err() {
             return;
@@ -220,6 +218,7 @@ impl SceneFlow for Calls {
             _ => return Err(no_begin().into()),
         };
         let options = convert::options(begin.options)?;
+        let dense = options.densify.is_some();
         let mut draft_request = call.draft_request(options, Promise::Durable);
         let key = begin.idempotency_key;
         draft_request.idempotency_key = (!key.is_empty()).then_some(key);
@@ -250,7 +249,7 @@ impl SceneFlow for Calls {
                 Some(_) => return Err(no_begin().into()),
             }
         }
-        let kind = if draft.frames() > 2 {
+        let kind = if draft.frames() > 2 || dense {
             Kind::Sequence
         } else {
             Kind::Pair
@@ -352,13 +351,30 @@ impl SceneFlow for Calls {
         &self,
         request: Request<proto::DownloadResultRequest>,
     ) -> Result<Response<Self::DownloadResultStream>, Status> {
+        use proto::download_result_response::Part;
         let call = Call::of(&request)?;
         let asked = request.into_inner();
         let job = self.named(&call, &asked.id).await?;
-        let answer = self.service.answer(&job).await?;
         let first = usize::try_from(asked.first_row).unwrap_or(usize::MAX);
         let (answers, stream) = mpsc::channel(AHEAD);
-        tokio::spawn(send_result(answer, first, answers));
+        if dense::is_dense(&job) {
+            let header = convert::dense_header(job.id, &self.service.dense_report(&job)?);
+            // It is held as long as its client reads.
+            let turn = Arc::clone(&self.service.archives).try_acquire_owned();
+            let turn = turn.map_err(|_| ApiError::ServerFull(Duration::from_secs(1)))?;
+            let cloud = self.service.dense_cloud(&job).await?;
+            let pieces = chunks::dense_pieces(cloud, first).map(Part::DenseChunk);
+            let parts = std::iter::once(Part::DenseHeader(header)).chain(pieces);
+            tokio::spawn(async move {
+                let _turn = turn;
+                send_result(parts, answers).await;
+            });
+        } else {
+            let answer = self.service.answer(&job).await?;
+            let header = Part::Header(convert::header(&answer));
+            let pieces = chunks::pieces(&answer, first).map(Part::Chunk);
+            tokio::spawn(send_result(std::iter::once(header).chain(pieces), answers));
+        }
         Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
     }
 }

@@ -1,5 +1,7 @@
 //! Clouds out of chunks, and flow into them.
 
+use std::sync::Arc;
+
 use tonic::Streaming;
 
 use super::proto;
@@ -7,7 +9,7 @@ use crate::api::codec;
 use crate::api::draft::Room;
 use crate::api::error::ApiError;
 use crate::api::service::{Answer, Service};
-use crate::flow::Point;
+use crate::flow::{DenseCloud, Point};
 use crate::payload::{StoredCloud, points_from_le_bytes};
 
 /// Rows of one chunk of flow: below 1 MiB with its flags.
@@ -94,9 +96,43 @@ impl CloudBuilder {
     }
 }
 
+/// Rows of one chunk of a dense cloud: below 1 MiB with all of its columns.
+const DENSE_ROWS: usize = 45_000;
+
+/// A dense cloud's rows from `first` on, in pieces.
+pub(super) fn dense_pieces(
+    cloud: Arc<DenseCloud>,
+    first: usize,
+) -> impl Iterator<Item = proto::DenseChunk> {
+    let rows = cloud.points.len();
+    (first.min(rows)..rows)
+        .step_by(DENSE_ROWS)
+        .map(move |from| {
+            let piece = from..(from + DENSE_ROWS).min(rows);
+            let points = cloud.points[piece.clone()].as_flattened().iter();
+            let points: Vec<u8> = points.flat_map(|value| value.to_le_bytes()).collect();
+            let frame = cloud.frame[piece.clone()].iter();
+            let frame: Vec<u8> = frame.flat_map(|frame| frame.to_le_bytes()).collect();
+            let age = cloud.age[piece.clone()].iter();
+            let age: Vec<u8> = age.flat_map(|age| age.to_le_bytes()).collect();
+            let flags: Vec<u8> = piece
+                .map(|row| u8::from(cloud.dynamic[row]) | u8::from(cloud.converged[row]) << 1)
+                .collect();
+            proto::DenseChunk {
+                points: points.into(),
+                frame: frame.into(),
+                age: age.into(),
+                flags: flags.into(),
+            }
+        })
+}
+
 /// A flow's rows from `first` on, in pieces.
-pub(super) fn pieces(answer: &Answer, first: usize) -> impl Iterator<Item = proto::FlowChunk> {
-    let flow = std::sync::Arc::clone(&answer.flow);
+pub(super) fn pieces(
+    answer: &Answer,
+    first: usize,
+) -> impl Iterator<Item = proto::FlowChunk> + use<> {
+    let flow = Arc::clone(&answer.flow);
     let rows = flow.flow.len();
     (first.min(rows)..rows).step_by(ROWS).map(move |from| {
         let to = (from + ROWS).min(rows);

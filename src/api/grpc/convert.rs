@@ -9,8 +9,8 @@ use crate::api::error::ApiError;
 use crate::api::service::Answer;
 use crate::formats::rigid_motion;
 use crate::job::{
-    DeviceChoice, EgoChoice, GroundChoice, Job, JobError, JobOptions, JobProgress, Kind,
-    PrecisionChoice, PresetChoice, Priority, State,
+    DenseReport, Densify, DeviceChoice, EgoChoice, GroundChoice, Job, JobError, JobId, JobOptions,
+    JobProgress, Kind, LaterChoice, PrecisionChoice, PresetChoice, Priority, State,
 };
 
 fn unknown(field: &str, number: i32) -> ApiError {
@@ -60,9 +60,23 @@ pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, Api
         precision,
         deadline_ms: message.deadline_ms,
         priority,
+        densify: message.densify.map(densify).transpose()?,
     };
     options.check()?;
     Ok(options)
+}
+
+fn densify(message: proto::Densify) -> Result<Densify, ApiError> {
+    let later = match proto::Later::try_from(message.later) {
+        Ok(proto::Later::Unspecified | proto::Later::Reverse) => LaterChoice::Reverse,
+        Ok(proto::Later::Inverse) => LaterChoice::Inverse,
+        Err(_) => return Err(unknown("densify.later", message.later)),
+    };
+    Ok(Densify {
+        into: message.into,
+        substeps: message.substeps.unwrap_or(1),
+        later,
+    })
 }
 
 fn ego(named: i32, motion: &[f64]) -> Result<Option<EgoChoice>, ApiError> {
@@ -188,6 +202,19 @@ pub(super) fn header(answer: &Answer) -> proto::FlowHeader {
     }
 }
 
+/// What is known about a dense cloud before its rows.
+pub(super) fn dense_header(job: JobId, report: &DenseReport) -> proto::DenseHeader {
+    proto::DenseHeader {
+        job_id: job.to_string(),
+        points: report.points as u64,
+        frames: u32::try_from(report.frames).unwrap_or(u32::MAX),
+        into: report.into,
+        substeps: report.substeps,
+        device: report.device.clone(),
+        seconds: report.seconds,
+    }
+}
+
 /// The call's own deadline, from `grpc-timeout`: at most eight digits and a unit.
 pub(super) fn time_left(metadata: &MetadataMap) -> Option<Duration> {
     let text = metadata.get("grpc-timeout")?.to_str().ok()?;
@@ -223,6 +250,13 @@ mod tests {
         assert!(refused(|o| o.device = "tpu".to_owned()).contains("device is"));
         assert!(refused(|o| o.precision = "f8".to_owned()).contains("precision is"));
         assert!(refused(|o| o.ego_motion = vec![1.0; 3]).contains("16 numbers"));
+        let nowhere = |o: &mut proto::Options| {
+            o.densify = Some(proto::Densify {
+                into: f64::NAN,
+                ..proto::Densify::default()
+            });
+        };
+        assert!(refused(nowhere).contains("densify.into is NaN"));
         assert!(refused(|o| o.range_m = Some(f32::NAN)).contains("range_m"));
         assert!(refused(|o| o.max_points = Some(1)).contains("max_points is 1"));
         assert_eq!(

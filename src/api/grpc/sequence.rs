@@ -13,10 +13,10 @@ use super::call::{Call, no_begin};
 use super::chunks::{self, CloudBuilder};
 use super::{convert, proto};
 use crate::api::admission::Promise;
-use crate::api::draft::{Accepted, Draft, Room};
+use crate::api::draft::{Accepted, Draft, Link, Room};
 use crate::api::error::ApiError;
 use crate::api::service::{Service, Waited};
-use crate::job::{JobOptions, Kind};
+use crate::job::{JobId, JobOptions, Kind};
 use crate::payload::StoredCloud;
 
 type Answers = mpsc::Sender<Result<proto::EstimateSequenceResponse, Status>>;
@@ -88,6 +88,7 @@ pub(super) fn run(
             pending: pending.clone(),
             place: 0,
             last: None,
+            before: None,
         };
         if let Err(error) = reader.run().await {
             // Behind the pairs that came before it: their flows are not lost.
@@ -104,6 +105,8 @@ struct Reader {
     pending: mpsc::Sender<Item>,
     place: u32,
     last: Option<Sweep>,
+    /// The job of the pair before, from whose field the next one goes on.
+    before: Option<JobId>,
 }
 
 impl Reader {
@@ -115,6 +118,7 @@ impl Reader {
             return Err(no_begin());
         };
         let options = convert::options(begin.options)?;
+        options.check_for_pairs()?;
         let mut current: Option<Coming> = None;
         loop {
             // A drive may pause for as long as it likes: only a dead connection ends it.
@@ -176,6 +180,7 @@ impl Reader {
         let job = self
             .submit(before.cloud, sweep.cloud.clone(), options)
             .await;
+        self.before = job.as_ref().ok().map(|accepted| accepted.job.id);
         place_in_line.send(Item::Pair(Pending {
             place: self.place,
             source: names.0,
@@ -193,9 +198,11 @@ impl Reader {
         target: StoredCloud,
         options: &JobOptions,
     ) -> Result<Accepted, ApiError> {
-        let request = self
+        let mut request = self
             .call
             .draft_request(options.clone(), Promise::WhileAwaited);
+        let after = self.before;
+        request.link = options.goes_on().then_some(Link { after });
         let mut draft = Draft::begin(&self.service, self.call.caller.clone(), request)?;
         draft.push(source).await?;
         draft.push(target).await?;

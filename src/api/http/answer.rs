@@ -1,4 +1,4 @@
-//! Flow on its way out: formats, ranges, entity tags, and a sequence's flows in one archive.
+//! Results on their way out: formats, ranges, entity tags, and a sequence's flows in one archive.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -13,9 +13,11 @@ use super::named::Named;
 use super::problem::Problem;
 use crate::api::auth::Caller;
 use crate::api::codec::AnswerFormat;
+use crate::api::dense;
 use crate::api::error::ApiError;
 use crate::api::service::{Answer, Service};
-use crate::job::{Job, Kind, State as JobState};
+use crate::formats::{DENSE_FORMATS, DenseFormat};
+use crate::job::{DenseReport, Job, Kind, State as JobState};
 
 /// A pair's flow, whole.
 pub(super) async fn flow(
@@ -25,41 +27,117 @@ pub(super) async fn flow(
 ) -> Result<Response, ApiError> {
     let bytes = service.encode(answer, format).await?;
     let mut response = Body::from(bytes).into_response();
-    describe(&mut response, answer, format);
+    Head::of_flow(answer, format).describe(&mut response);
     Ok(response)
 }
 
-/// The headers that every answer with a flow carries.
-fn describe(response: &mut Response, answer: &Answer, format: AnswerFormat) {
-    let report = &answer.report;
-    let headers = response.headers_mut();
-    let mut set = |name: &'static str, value: String| {
-        if let Ok(value) = HeaderValue::from_str(&value) {
-            headers.insert(name, value);
-        }
-    };
-    set("content-type", format.media_type().to_owned());
-    set("fnsf-job-id", answer.job.id.to_string());
-    set("fnsf-stop-reason", report.stop_reason.clone());
-    set("fnsf-iterations", report.iterations.to_string());
-    set("fnsf-seconds", format!("{:.6}", report.seconds.total));
-    set("etag", entity_tag(&answer.job, format));
-    set("accept-ranges", "bytes".to_owned());
-    set("vary", "accept".to_owned());
-    let name = format!(
-        "attachment; filename=\"{}.{}\"",
-        answer.job.id,
-        format.ending()
-    );
-    set("content-disposition", name);
+/// What is known about a result before its bytes.
+struct Head {
+    job: Arc<Job>,
+    media_type: &'static str,
+    ending: &'static str,
+    own: Vec<(&'static str, String)>,
 }
 
-/// A result never changes once it is there; another attempt or format is another entity.
-fn entity_tag(job: &Job, format: AnswerFormat) -> String {
-    format!("\"{}-{}-{}\"", job.id, job.attempt, format.ending())
+impl Head {
+    fn of_flow(answer: &Answer, format: AnswerFormat) -> Self {
+        let report = &answer.report;
+        Self {
+            job: Arc::clone(&answer.job),
+            media_type: format.media_type(),
+            ending: format.ending(),
+            own: vec![
+                ("fnsf-stop-reason", report.stop_reason.clone()),
+                ("fnsf-iterations", report.iterations.to_string()),
+                ("fnsf-seconds", format!("{:.6}", report.seconds.total)),
+            ],
+        }
+    }
+
+    fn of_cloud(job: &Arc<Job>, report: &DenseReport, format: DenseFormat) -> Self {
+        let known = DENSE_FORMATS.iter().find(|(known, ..)| *known == format);
+        let (_, media_type, ending) = *known.unwrap_or(&DENSE_FORMATS[0]);
+        Self {
+            job: Arc::clone(job),
+            media_type,
+            ending,
+            own: vec![("fnsf-seconds", format!("{:.6}", report.seconds))],
+        }
+    }
+
+    /// A result never changes once it is there; another attempt or format is another entity.
+    fn entity_tag(&self) -> String {
+        format!("\"{}-{}-{}\"", self.job.id, self.job.attempt, self.ending)
+    }
+
+    /// The headers that every answer with a result carries.
+    fn describe(&self, response: &mut Response) {
+        let headers = response.headers_mut();
+        let mut set = |name: &'static str, value: String| {
+            if let Ok(value) = HeaderValue::from_str(&value) {
+                headers.insert(name, value);
+            }
+        };
+        set("content-type", self.media_type.to_owned());
+        set("fnsf-job-id", self.job.id.to_string());
+        set("etag", self.entity_tag());
+        set("accept-ranges", "bytes".to_owned());
+        set("vary", "accept".to_owned());
+        let name = format!("attachment; filename=\"{}.{}\"", self.job.id, self.ending);
+        set("content-disposition", name);
+        for (name, value) in &self.own {
+            set(name, value.clone());
+        }
+    }
+
+    /// The answer to a request with `headers`: all of the bytes, a part, or none where the caller
+    /// has them.
+    async fn answer(
+        &self,
+        headers: &HeaderMap,
+        bytes: impl Future<Output = Result<Vec<u8>, ApiError>>,
+    ) -> Result<Response, ApiError> {
+        let text =
+            |name: header::HeaderName| headers.get(name).and_then(|value| value.to_str().ok());
+        let tag = self.entity_tag();
+        let matches = |tags: &str| {
+            tags.split(',')
+                .any(|one| one.trim() == tag || one.trim() == "*")
+        };
+        let mut response = if text(header::IF_NONE_MATCH).is_some_and(matches) {
+            StatusCode::NOT_MODIFIED.into_response()
+        } else {
+            let bytes = Bytes::from(bytes.await?);
+            let fresh = text(header::IF_RANGE).is_none_or(|known| known == tag);
+            part(bytes, text(header::RANGE).filter(|_| fresh))?
+        };
+        self.describe(&mut response);
+        Ok(response)
+    }
+}
+
+/// All bytes of a result, or those of a range.
+fn part(bytes: Bytes, range: Option<&str>) -> Result<Response, ApiError> {
+    let length = bytes.len() as u64;
+    match range.and_then(|range| parse_range(range, length)) {
+        None => Ok(Body::from(bytes).into_response()),
+        Some(None) => Err(ApiError::Range(length)),
+        Some(Some((first, last))) => {
+            let part = bytes.slice(first as usize..=last as usize);
+            let mut response = (StatusCode::PARTIAL_CONTENT, Body::from(part)).into_response();
+            let range = format!("bytes {first}-{last}/{length}");
+            if let Ok(range) = HeaderValue::from_str(&range) {
+                response.headers_mut().insert(header::CONTENT_RANGE, range);
+            }
+            Ok(response)
+        }
+    }
 }
 
 /// Fetches a job's flow; of a sequence, a zip archive with one flow a pair.
+///
+/// Of a sequence with `densify`, one cloud: npz, ply, pcd, laz or las, as Accept says; and the archive
+/// where that names application/zip.
 #[utoipa::path(
     get,
     path = "/v1/jobs/{id}/result",
@@ -67,11 +145,11 @@ fn entity_tag(job: &Job, format: AnswerFormat) -> String {
     params(
         ("id" = String, Path, description = "The job's name"),
         ("Accept" = Option<String>, Header, description = "The format of the flow; application/x-npz by default"),
-        ("Range" = Option<String>, Header, description = "bytes=FROM-TO, for a pair"),
+        ("Range" = Option<String>, Header, description = "bytes=FROM-TO, for anything but an archive"),
         ("If-None-Match" = Option<String>, Header, description = "The entity tag of a copy that is there already"),
     ),
     responses(
-        (status = 200, description = "The flow", content_type = "application/x-npz"),
+        (status = 200, description = "The flow, or the dense cloud", content_type = "application/x-npz"),
         (status = 206, description = "A part of it"),
         (status = 304, description = "The copy is still good"),
         (status = 409, description = "The job has not ended, or was cancelled", body = Problem, content_type = "application/problem+json"),
@@ -86,41 +164,24 @@ pub(super) async fn result(
 ) -> Result<Response, ApiError> {
     let text = |name: header::HeaderName| headers.get(name).and_then(|value| value.to_str().ok());
     let job = service.job(&caller, id).await?;
+    let accept = text(header::ACCEPT);
+    let wants_archive = accept.is_some_and(|accept| accept.contains("application/zip"));
+    if dense::is_dense(&job) && !wants_archive {
+        let format = dense::accepted(accept)?;
+        let head = Head::of_cloud(&job, &service.dense_report(&job)?, format);
+        return head
+            .answer(&headers, service.encode_dense(&job, format))
+            .await;
+    }
     if job.kind == Kind::Sequence && job.state.is_end() {
         // An archive is no flow format: whatever is accepted besides names its entries' format.
-        let entries = text(header::ACCEPT).filter(|accept| !accept.contains("application/zip"));
+        let entries = accept.filter(|_| !wants_archive);
         return archive(&service, &job, AnswerFormat::accepted(entries)?).await;
     }
-    let format = AnswerFormat::accepted(text(header::ACCEPT))?;
+    let format = AnswerFormat::accepted(accept)?;
     let answer = service.answer(&job).await?;
-    let tag = entity_tag(&job, format);
-    let matches = |tags: &str| {
-        tags.split(',')
-            .any(|one| one.trim() == tag || one.trim() == "*")
-    };
-    if text(header::IF_NONE_MATCH).is_some_and(matches) {
-        let mut response = StatusCode::NOT_MODIFIED.into_response();
-        describe(&mut response, &answer, format);
-        return Ok(response);
-    }
-    let bytes = Bytes::from(service.encode(&answer, format).await?);
-    let fresh = text(header::IF_RANGE).is_none_or(|known| known == tag);
-    let range = text(header::RANGE).filter(|_| fresh);
-    let mut response = match range.and_then(|range| parse_range(range, bytes.len() as u64)) {
-        None => Body::from(bytes).into_response(),
-        Some(None) => return Err(ApiError::Range(bytes.len() as u64)),
-        Some(Some((first, last))) => {
-            let part = bytes.slice(first as usize..=last as usize);
-            let mut response = (StatusCode::PARTIAL_CONTENT, Body::from(part)).into_response();
-            let range = format!("bytes {first}-{last}/{}", bytes.len());
-            if let Ok(range) = HeaderValue::from_str(&range) {
-                response.headers_mut().insert(header::CONTENT_RANGE, range);
-            }
-            response
-        }
-    };
-    describe(&mut response, &answer, format);
-    Ok(response)
+    let head = Head::of_flow(&answer, format);
+    head.answer(&headers, service.encode(&answer, format)).await
 }
 
 /// The first and last byte of a single range; nothing where the header is to be ignored, and

@@ -63,6 +63,7 @@ impl Asked {
             idempotency_key: self.key.clone(),
             arrived: self.arrived.0,
             time_left: self.prefer.wait.filter(|_| wait_is_deadline),
+            link: None,
         }
     }
 }
@@ -170,6 +171,7 @@ async fn read_pair(
             }
         }
     }
+    options.check_for_pairs()?;
     service.check_room(caller, Some(&options), promise)?;
     let mut draft = Draft::begin(
         service,
@@ -211,7 +213,8 @@ pub(super) async fn submit_job(
 /// Submits a sequence: frames in order, the flow of each consecutive pair out.
 ///
 /// `options` comes before the frames. Its result is a zip archive with one flow a pair; each pair
-/// is a job of its own, whose flow can be fetched as soon as it has succeeded.
+/// is a job of its own, whose flow can be fetched as soon as it has succeeded. With `densify` its
+/// result is one cloud: the points of all frames, carried into one of them.
 #[utoipa::path(
     post,
     path = "/v1/sequences",
@@ -298,6 +301,7 @@ async fn read_job(
         }
         Some(draft) => Ok((draft, Kind::Sequence)),
         None => {
+            options.check_for_pairs()?;
             let request = asked.draft_request(options, Promise::Durable);
             let mut draft = Draft::begin(service, caller.clone(), request)?;
             files.push_to(body, &mut draft).await?;

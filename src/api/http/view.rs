@@ -32,8 +32,8 @@ pub(super) struct JobView {
     /// The options that it was submitted with.
     #[schema(value_type = Object)]
     options: Option<Box<RawValue>>,
-    /// How the flow was found.
-    #[schema(value_type = Option<crate::job::Report>)]
+    /// How the flow was found; of a sequence with `densify`, how its cloud was made.
+    #[schema(value_type = Option<Reported>)]
     report: Option<Box<RawValue>>,
     /// The pairs of a sequence, in order.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -41,14 +41,23 @@ pub(super) struct JobView {
     links: Links,
 }
 
+/// What a report is.
+#[derive(Serialize, ToSchema)]
+#[serde(untagged)]
+#[expect(dead_code, reason = "it describes what is kept as JSON")]
+enum Reported {
+    Flow(Box<crate::job::Report>),
+    Cloud(crate::job::DenseReport),
+}
+
 /// How far a sequence has come.
 #[derive(Debug, Serialize, ToSchema)]
 struct PairsView {
-    /// All of them.
+    /// All of them, those that `densify` has fitted backward in time included.
     total: u32,
     /// Those that have ended.
     ended: u32,
-    /// Each one's job, in order, where a single job is shown.
+    /// The consecutive pairs' jobs, in order, where a single job is shown.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     jobs: Vec<PairView>,
 }

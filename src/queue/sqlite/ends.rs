@@ -5,7 +5,8 @@ use std::sync::Arc;
 use rusqlite::{Connection, params};
 
 use super::rows::{self, COLUMNS, state_code};
-use super::transitions::{Effects, virtual_start};
+use super::transitions::Effects;
+use super::turns;
 use crate::clock::Timestamp;
 use crate::job::{Job, JobError, JobId, JobProgress, Kind, State};
 use crate::queue::{Event, QueueError, QueueOptions};
@@ -64,7 +65,8 @@ pub(super) fn end(
         ],
         rows::job,
     )?);
-    if job.kind == Kind::Pair {
+    // A sequence counts only while it has something of its own to do.
+    if job.kind == Kind::Pair || job.ready.is_some() {
         let place = if job.state == State::Running {
             &mut effects.stopped
         } else {
@@ -74,6 +76,7 @@ pub(super) fn end(
     }
     effects.changed.push(Arc::clone(&ended));
     effects.events.push(Event::Ended(ended));
+    turns::release_followers(connection, effects, job)?;
     if let Some(parent) = job.parent {
         let sql = format!(
             "UPDATE jobs SET pairs_left = pairs_left - 1 WHERE id = ?1 RETURNING {COLUMNS}"
@@ -81,7 +84,7 @@ pub(super) fn end(
         let mut statement = connection.prepare_cached(&sql)?;
         let parent = statement.query_row([parent.as_bytes()], rows::job)?;
         if parent.pairs_left == 0 {
-            end_sequence(connection, effects, options, &parent)?;
+            close_sequence(connection, effects, options, &parent)?;
         } else {
             effects.changed.push(Arc::new(parent));
         }
@@ -89,8 +92,9 @@ pub(super) fn end(
     Ok(state)
 }
 
-/// Ends a sequence whose pairs have all ended: as its first pair that did not succeed.
-fn end_sequence(
+/// Closes a sequence whose pairs have all ended: as its first pair that did not succeed, or, where
+/// all have, with what is left to do.
+fn close_sequence(
     connection: &Connection,
     effects: &mut Effects,
     options: &QueueOptions,
@@ -99,11 +103,16 @@ fn end_sequence(
     let pairs = rows::pairs(connection, sequence.id)?;
     let broken = pairs.iter().find(|pair| pair.state != State::Succeeded);
     let (state, error) = match broken {
+        None if turns::closes(connection, sequence.id)? => {
+            turns::ready_to_close(connection, effects, options, sequence)?;
+            return Ok(());
+        }
         None => (State::Succeeded, None),
         Some(_) if sequence.cancel_requested => (State::Cancelled, None),
         Some(pair) => {
+            let back = if pair.backward { ", back in time" } else { "" };
             let error = pair.error.clone().map(|error| JobError {
-                message: format!("pair {}: {}", pair.place, error.message),
+                message: format!("pair {}{back}: {}", pair.place, error.message),
                 ..error
             });
             (pair.state, error)
@@ -131,15 +140,16 @@ pub(super) fn cancel(
     }
     let sql = "UPDATE jobs SET cancel_requested = 1 WHERE id = ?1";
     connection.prepare_cached(sql)?.execute([id.as_bytes()])?;
-    match job.kind {
-        Kind::Sequence => {
+    match job.state {
+        // Until then it goes on in its pairs.
+        _ if job.pairs_left > 0 => {
             for pair in rows::pairs(connection, id)? {
                 if !pair.state.is_end() {
                     cancel(connection, effects, options, pair.id)?;
                 }
             }
         }
-        Kind::Pair if job.state == State::Queued => {
+        State::Queued => {
             end(
                 connection,
                 effects,
@@ -149,14 +159,15 @@ pub(super) fn cancel(
                 &End::default(),
             )?;
         }
-        Kind::Pair => effects.cancel.push(id),
+        _ => effects.cancel.push(id),
     }
     let job = Arc::new(rows::get(connection, id)?);
     effects.changed.push(Arc::clone(&job));
     Ok(job)
 }
 
-/// Queues an ended job again; of a sequence, the pairs that did not succeed.
+/// Queues an ended job again; of a sequence, the pairs that did not succeed, and what was left to do
+/// behind them.
 pub(super) fn requeue(
     connection: &Connection,
     effects: &mut Effects,
@@ -180,25 +191,31 @@ pub(super) fn requeue(
          started = NULL, finished = NULL, deadline = NULL, expires = ?3, \
          due = CASE WHEN kind = 0 THEN ?3 END, stop_reason = NULL, report = NULL, \
          error_code = NULL, error_message = NULL, error_retryable = 0, dead = 0, \
-         cancel_requested = 0, iteration = NULL, virtual_start = ?4, virtual_finish = ?4 + cost \
-         WHERE id = ?1 RETURNING {COLUMNS}"
+         cancel_requested = 0, iteration = NULL, virtual_start = ?4, virtual_finish = ?4 + cost, \
+         ready = ?5 WHERE id = ?1 RETURNING {COLUMNS}"
     );
     // It takes its place behind what its tenant has waiting now, as a new one would.
-    let again = |id: JobId, left: usize| -> Result<Arc<Job>, QueueError> {
-        let tag = virtual_start(connection, &job.tenant, job.priority)?;
+    let again = |job: &Job, left: usize| -> Result<Arc<Job>, QueueError> {
+        let tag = turns::virtual_start(connection, &job.tenant, job.priority)?;
         let mut statement = connection.prepare_cached(&sql)?;
-        let parameters = params![id.as_bytes(), left as i64, expires, tag];
+        let is_ready = job.kind == Kind::Pair && !turns::is_held_back(connection, job.after)?;
+        let ready = is_ready.then(|| Timestamp::now().as_millis());
+        let parameters = params![job.id.as_bytes(), left as i64, expires, tag, ready];
         Ok(Arc::new(statement.query_row(parameters, rows::job)?))
     };
-    let job = again(id, broken.len())?;
+    let mut job = again(&job, broken.len())?;
     let mut queued = Vec::new();
     for pair in &broken {
-        queued.push(again(pair.id, 0)?);
+        queued.push(again(pair, 0)?);
+    }
+    if job.kind == Kind::Sequence && broken.is_empty() {
+        job = turns::ready_to_close(connection, effects, options, &job)?;
+        effects.events.push(Event::Requeued(Arc::clone(&job)));
     }
     if job.kind == Kind::Pair {
         if let Some(parent) = job.parent {
             let sql = format!(
-                "UPDATE jobs SET pairs_left = pairs_left + 1, finished = NULL, due = NULL, \
+                "UPDATE jobs SET pairs_left = pairs_left + 1, finished = NULL, due = NULL, ready = NULL, \
                  state = CASE WHEN state = 1 THEN 1 ELSE 0 END, error_code = NULL, dead = 0, \
                  cancel_requested = 0 WHERE id = ?1 RETURNING {COLUMNS}"
             );

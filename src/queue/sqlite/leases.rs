@@ -14,7 +14,7 @@ use crate::queue::{Committed, Event, Outcome, QueueError, QueueOptions};
 
 /// The statement that finds the first ready job of one need; the test of the plan reads it too.
 pub(super) const FIRST_READY: &str = "SELECT priority, virtual_start, seq FROM jobs \
-    INDEXED BY jobs_ready WHERE state = 0 AND kind = 0 AND delayed = 0 AND device = ?1 \
+    INDEXED BY jobs_ready WHERE state = 0 AND ready IS NOT NULL AND delayed = 0 AND device = ?1 \
     ORDER BY priority DESC, virtual_start, seq LIMIT 1";
 
 /// A ready job's place: the lesser goes first.
@@ -146,7 +146,7 @@ pub(super) fn finish(
             progress,
         } => {
             let how = End {
-                stop_reason: Some(stop_reason),
+                stop_reason,
                 report: Some(report),
                 progress,
                 ..End::default()

@@ -9,6 +9,7 @@ mod rows;
 mod schema;
 mod sweep;
 mod transitions;
+mod turns;
 mod writer;
 
 #[cfg(test)]
@@ -203,7 +204,8 @@ impl SqliteQueue {
 /// What waits, from the store itself.
 fn count_backlog(connection: &Connection) -> Result<Backlog, QueueError> {
     let sql = "SELECT tenant, priority, device, count(*), sum(cost) FROM jobs \
-               WHERE state = 0 AND kind = 0 GROUP BY tenant, priority, device";
+               WHERE state = 0 AND (kind = 0 OR ready IS NOT NULL) \
+               GROUP BY tenant, priority, device";
     let mut backlog = Backlog::default();
     let mut statement = connection.prepare(sql)?;
     let mut rows = statement.query([])?;

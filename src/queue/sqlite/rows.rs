@@ -10,7 +10,7 @@ use crate::queue::QueueError;
 pub(super) const COLUMNS: &str = "id, tenant, kind, parent, place, pairs, pairs_left, priority, \
     state, durable, attempt, cost, options, created, started, finished, deadline, iteration, \
     max_iterations, loss, stop_reason, error_code, error_message, error_retryable, dead, \
-    cancel_requested, report, device";
+    cancel_requested, report, device, backward, after, followed, ready";
 
 pub(super) fn state_code(state: State) -> i64 {
     match state {
@@ -83,6 +83,7 @@ pub(super) fn job(row: &Row<'_>) -> rusqlite::Result<Job> {
     let iteration: Option<u32> = row.get(17)?;
     let code: Option<String> = row.get(21)?;
     let parent: Option<[u8; 16]> = row.get(3)?;
+    let after: Option<[u8; 16]> = row.get(29)?;
     Ok(Job {
         id: JobId::from_bytes(row.get(0)?),
         tenant: tenant_at(row, 1)?,
@@ -122,6 +123,10 @@ pub(super) fn job(row: &Row<'_>) -> rusqlite::Result<Job> {
         cancel_requested: row.get(25)?,
         report: row.get(26)?,
         device: device_at(row, 27)?,
+        backward: row.get(28)?,
+        after: after.map(JobId::from_bytes),
+        followed: row.get(30)?,
+        ready: moment(31)?,
     })
 }
 
@@ -137,11 +142,10 @@ pub(super) fn get(connection: &Connection, id: JobId) -> Result<Job, QueueError>
     find(connection, id)?.ok_or(QueueError::NotFound)
 }
 
-/// The pairs of a sequence, in order.
+/// The pairs of a sequence, in the order of their turns.
 pub(super) fn pairs(connection: &Connection, parent: JobId) -> Result<Vec<Job>, QueueError> {
-    let sql = format!(
-        "SELECT {COLUMNS} FROM jobs INDEXED BY jobs_parent WHERE parent = ?1 ORDER BY place"
-    );
+    let sql =
+        format!("SELECT {COLUMNS} FROM jobs INDEXED BY jobs_parent WHERE parent = ?1 ORDER BY seq");
     let mut statement = connection.prepare_cached(&sql)?;
     let rows = statement.query_map([parent.as_bytes()], job)?;
     Ok(rows.collect::<rusqlite::Result<_>>()?)

@@ -10,10 +10,12 @@ use rusqlite::{Connection, TransactionBehavior};
 use crate::queue::QueueError;
 
 /// What this program reads and writes; kept in `user_version`.
-pub(super) const VERSION: i64 = 2;
+pub(super) const VERSION: i64 = 3;
 
 /// `due` is when the sweeper looks at a row next: the end of a queued job's time or of its delay,
-/// of a running job's lease, of an ended job's retention.
+/// of a running job's lease, of an ended job's retention. `ready` is since when a job could be
+/// leased: null while it comes after one that has not ended, and for a sequence until all of its
+/// pairs have succeeded and something is left to do.
 const TABLE: &str = "
 CREATE TABLE jobs (
     seq INTEGER PRIMARY KEY,
@@ -22,6 +24,10 @@ CREATE TABLE jobs (
     kind INTEGER NOT NULL,
     parent BLOB,
     place INTEGER NOT NULL,
+    backward INTEGER NOT NULL,
+    after BLOB,
+    followed INTEGER NOT NULL,
+    ready INTEGER,
     pairs INTEGER NOT NULL,
     pairs_left INTEGER NOT NULL,
     priority INTEGER NOT NULL,
@@ -33,6 +39,7 @@ CREATE TABLE jobs (
     failures INTEGER NOT NULL,
     crashes INTEGER NOT NULL,
     cost REAL NOT NULL,
+    closes INTEGER NOT NULL,
     virtual_start REAL NOT NULL,
     virtual_finish REAL NOT NULL,
     options TEXT NOT NULL,
@@ -59,14 +66,15 @@ CREATE TABLE jobs (
 CREATE UNIQUE INDEX jobs_id ON jobs (id);
 CREATE UNIQUE INDEX jobs_key ON jobs (tenant, idempotency_key) WHERE idempotency_key IS NOT NULL;
 CREATE INDEX jobs_ready ON jobs (device, priority DESC, virtual_start, seq)
-    WHERE state = 0 AND kind = 0 AND delayed = 0;
-CREATE INDEX jobs_running ON jobs (priority, virtual_start) WHERE state = 1 AND kind = 0;
+    WHERE state = 0 AND ready IS NOT NULL AND delayed = 0;
+CREATE INDEX jobs_running ON jobs (priority, virtual_start) WHERE state = 1 AND ready IS NOT NULL;
 CREATE INDEX jobs_tail ON jobs (tenant, priority, virtual_finish) WHERE state < 2 AND kind = 0;
 CREATE INDEX jobs_due ON jobs (due) WHERE due IS NOT NULL;
-CREATE INDEX jobs_age ON jobs (created) WHERE state = 0;
+CREATE INDEX jobs_after ON jobs (after) WHERE after IS NOT NULL AND state < 2;
+CREATE INDEX jobs_age ON jobs (ready) WHERE state = 0 AND ready IS NOT NULL;
 CREATE INDEX jobs_list ON jobs (tenant, id) WHERE parent IS NULL;
 CREATE INDEX jobs_list_by_state ON jobs (tenant, state, id) WHERE parent IS NULL;
-CREATE INDEX jobs_parent ON jobs (parent, place) WHERE parent IS NOT NULL;
+CREATE INDEX jobs_parent ON jobs (parent) WHERE parent IS NOT NULL;
 ";
 
 /// Opens the connection that writes.

@@ -7,7 +7,8 @@ use rusqlite::{Connection, OptionalExtension, params};
 use super::ends::{self, End};
 use super::leases;
 use super::rows::{self, COLUMNS};
-use super::transitions::{Effects, virtual_now};
+use super::transitions::Effects;
+use super::turns;
 use crate::clock::Timestamp;
 use crate::job::{Job, JobError, JobId, State};
 use crate::queue::{Event, QueueError, QueueOptions};
@@ -55,7 +56,7 @@ pub(super) fn sweep(
                 };
                 leases::fail(connection, effects, options, &job, error)?;
             }
-            _ => forget(connection, effects, job.id)?,
+            _ => forget_or_keep(connection, effects, options, &job)?,
         }
     }
     Ok(())
@@ -73,7 +74,7 @@ fn look_after_queued(
     let sql = "UPDATE jobs SET delayed = 0, due = expires, \
                virtual_start = min(virtual_start, ?3), virtual_finish = min(virtual_start, ?3) + cost \
                WHERE id = ?1 AND expires > ?2";
-    let served = virtual_now(connection, job.priority)?.unwrap_or(0.0);
+    let served = turns::virtual_now(connection, job.priority)?.unwrap_or(0.0);
     let woken = connection.prepare_cached(sql)?.execute(params![
         job.id.as_bytes(),
         now.as_millis(),
@@ -108,6 +109,25 @@ fn look_after_queued(
     Ok(())
 }
 
+/// Removes an ended job whose time is over, unless another one that comes after it may still use
+/// what it leaves behind.
+fn forget_or_keep(
+    connection: &Connection,
+    effects: &mut Effects,
+    options: &QueueOptions,
+    job: &Job,
+) -> Result<(), QueueError> {
+    if turns::followers(connection, job.id)?.is_empty() {
+        return forget(connection, effects, job.id);
+    }
+    let sql = "UPDATE jobs SET due = ?2 WHERE id = ?1";
+    let later = Timestamp::now().after(options.answered_retention);
+    connection
+        .prepare_cached(sql)?
+        .execute(params![job.id.as_bytes(), later.as_millis()])?;
+    Ok(())
+}
+
 /// Removes an ended job and its pairs.
 fn forget(connection: &Connection, effects: &mut Effects, id: JobId) -> Result<(), QueueError> {
     for pair in rows::pairs(connection, id)? {
@@ -128,8 +148,9 @@ pub(super) fn recover(
     effects: &mut Effects,
     options: &QueueOptions,
 ) -> Result<(), QueueError> {
-    let sql =
-        format!("SELECT {COLUMNS} FROM jobs INDEXED BY jobs_running WHERE state = 1 AND kind = 0");
+    let sql = format!(
+        "SELECT {COLUMNS} FROM jobs INDEXED BY jobs_running WHERE state = 1 AND ready IS NOT NULL"
+    );
     let running: Vec<Job> = {
         let mut statement = connection.prepare_cached(&sql)?;
         let rows = statement.query_map([], rows::job)?;
@@ -155,18 +176,20 @@ pub(super) fn recover(
         rows.collect::<rusqlite::Result<_>>()?
     };
     for id in abandoned {
-        forget(connection, effects, JobId::from_bytes(id))?;
+        let id = JobId::from_bytes(id);
+        turns::release_followers(connection, effects, &rows::get(connection, id)?)?;
+        forget(connection, effects, id)?;
     }
     Ok(())
 }
 
-/// When the oldest queued job was accepted.
+/// Since when the job that has waited longest for a device could have been leased.
 pub(super) fn oldest_queued(connection: &Connection) -> Result<Option<Timestamp>, QueueError> {
-    let sql =
-        "SELECT created FROM jobs INDEXED BY jobs_age WHERE state = 0 ORDER BY created LIMIT 1";
-    let created: Option<i64> = connection
+    let sql = "SELECT ready FROM jobs INDEXED BY jobs_age \
+               WHERE state = 0 AND ready IS NOT NULL ORDER BY ready LIMIT 1";
+    let ready: Option<i64> = connection
         .prepare_cached(sql)?
         .query_row([], |row| row.get(0))
         .optional()?;
-    Ok(created.map(Timestamp::from_millis))
+    Ok(ready.map(Timestamp::from_millis))
 }

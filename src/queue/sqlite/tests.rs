@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use rusqlite::params;
 use tokio::sync::mpsc;
 
-use super::{SqliteQueue, leases, schema, sweep};
+use super::{SqliteQueue, leases, schema, sweep, turns};
 use crate::queue::contract::{Stand, queue_contract};
 use crate::queue::{Event, Queue, QueueError, QueueOptions};
 
@@ -66,8 +66,9 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
                 "INSERT INTO jobs (id, tenant, kind, place, pairs, pairs_left, priority, state, \
                  durable, delayed, attempt, failures, crashes, cost, virtual_start, \
                  virtual_finish, options, created, expires, due, error_retryable, dead, \
-                 cancel_requested, device) VALUES (?1, 't', 0, 0, 0, 0, ?2, 0, 1, 0, 0, 0, 0, \
-                 1.0, ?1, ?1 + 1, '{}', ?1, 9, 9, 0, 0, 0, ?3)",
+                 cancel_requested, device, backward, after, followed, ready, closes) \
+                 VALUES (?1, 't', 0, 0, 0, 0, ?2, 0, 1, 0, 0, 0, 0, \
+                 1.0, ?1, ?1 + 1, '{}', ?1, 9, 9, 0, 0, 0, ?3, 0, ?1, 0, ?1, 0)",
                 params![row, row % 3, row / 3 % 3],
             )
             .expect("a row");
@@ -79,9 +80,16 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
     assert!(claim.contains("jobs_ready (device=?)"), "{claim}");
     for (sql, parameters) in [
         (leases::FIRST_READY.to_owned(), 1),
+        (turns::FOLLOWERS.to_owned(), 1),
+        (
+            "SELECT ready FROM jobs INDEXED BY jobs_age WHERE state = 0 AND ready IS NOT NULL \
+             ORDER BY ready LIMIT 1"
+                .to_owned(),
+            0,
+        ),
         (
             "SELECT min(virtual_start) FROM jobs INDEXED BY jobs_ready WHERE state = 0 AND \
-             kind = 0 AND delayed = 0 AND device = ?1 AND priority = ?2"
+             ready IS NOT NULL AND delayed = 0 AND device = ?1 AND priority = ?2"
                 .to_owned(),
             2,
         ),

@@ -1,17 +1,18 @@
 //! How jobs come in, and what follows a commit.
 //!
 //! Every change of a job's state is a few statements inside the writer's transaction: here, in
-//! `leases.rs` and in `ends.rs`. What must follow it (news, counts, wake-ups) is gathered in
+//! `turns.rs`, in `leases.rs` and in `ends.rs`. What must follow it (news, counts, wake-ups) is gathered in
 //! [`Effects`]; nothing is told before it is stored.
 
 use std::sync::Arc;
 
 use rusqlite::{Connection, OptionalExtension, params};
 
-use super::rows::{self, COLUMNS, DEVICES, device_code, kind_code, priority_code};
+use super::rows::{self, COLUMNS, device_code, kind_code, priority_code};
+use super::turns;
 use crate::clock::Timestamp;
-use crate::job::{Job, JobId, Kind, Priority, State, Tenant};
-use crate::queue::{Event, QueueError, QueueOptions, Submission, Submitted};
+use crate::job::{Job, JobId, Kind, State};
+use crate::queue::{Event, PairOf, QueueError, QueueOptions, Submission, Submitted};
 
 /// What follows a commit.
 #[derive(Debug, Default)]
@@ -80,14 +81,21 @@ pub(super) fn submit(
     match submission.kind {
         Kind::Pair => effects.entered.push(Arc::clone(&job)),
         Kind::Sequence => {
-            for place in 0..submission.pairs {
+            let mut before = None;
+            for (turn, of) in submission.pairs.iter().enumerate() {
+                let next = submission.pairs.get(turn + 1);
                 let pair = Submission {
                     id: JobId::fresh(),
                     kind: Kind::Pair,
+                    pairs: Vec::new(),
+                    closing_seconds: None,
+                    after: before.filter(|_| of.follows),
+                    followed: next.is_some_and(|next| next.follows),
                     idempotency: None,
                     ..submission.clone()
                 };
-                let pair = Arc::new(insert(connection, options, &pair, Some((job.id, place)))?);
+                let pair = Arc::new(insert(connection, options, &pair, Some((job.id, of)))?);
+                before = Some(pair.id);
                 effects.events.push(Event::Submitted(Arc::clone(&pair)));
                 effects.entered.push(pair);
             }
@@ -101,25 +109,31 @@ fn insert(
     connection: &Connection,
     options: &QueueOptions,
     submission: &Submission,
-    place: Option<(JobId, u32)>,
+    place: Option<(JobId, &PairOf)>,
 ) -> Result<Job, QueueError> {
     let now = Timestamp::now();
     let is_pair = submission.kind == Kind::Pair;
     let virtual_start = if is_pair {
-        virtual_start(connection, &submission.tenant, submission.priority)?
+        turns::virtual_start(connection, &submission.tenant, submission.priority)?
     } else {
         0.0
     };
     let expires = submission
         .deadline
         .unwrap_or_else(|| now.after(options.time_to_live));
-    let pairs = if is_pair { 0 } else { submission.pairs };
+    let cost = match submission.kind {
+        Kind::Pair => submission.cost_seconds,
+        Kind::Sequence => submission.closing_seconds.unwrap_or(0.0),
+    };
+    let is_ready = is_pair && !turns::is_held_back(connection, submission.after)?;
     let sql = format!(
         "INSERT INTO jobs (id, tenant, kind, parent, place, pairs, pairs_left, priority, \
          device, state, durable, delayed, attempt, failures, crashes, cost, virtual_start, virtual_finish, \
          options, idempotency_key, fingerprint, created, deadline, expires, due, error_retryable, \
-         dead, cancel_requested) VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?6, ?7, ?19, 0, ?8, 0, 0, 0, 0, \
-         ?9, ?10, ?11, ?12, ?13, ?14, ?15, ?16, ?17, ?18, 0, 0, 0) RETURNING {COLUMNS}"
+         dead, cancel_requested, backward, after, followed, ready, closes) \
+         VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?6, ?7, ?19, 0, ?8, 0, 0, 0, 0, \
+         ?9, ?10, ?11, ?12, ?13, ?14, ?15, ?16, ?17, ?18, 0, 0, 0, ?20, ?21, ?22, ?23, ?24) \
+         RETURNING {COLUMNS}"
     );
     let mut statement = connection.prepare_cached(&sql)?;
     let idempotency = submission.idempotency.as_ref();
@@ -129,13 +143,13 @@ fn insert(
             submission.tenant.as_str(),
             kind_code(submission.kind),
             place.map(|(parent, _)| *parent.as_bytes()),
-            place.map_or(0, |(_, place)| place),
-            pairs,
+            place.map_or(0, |(_, of)| of.place),
+            submission.pairs.len() as i64,
             priority_code(submission.priority),
             submission.durable,
-            submission.cost_seconds,
+            cost,
             virtual_start,
-            virtual_start + submission.cost_seconds,
+            virtual_start + cost,
             submission.options,
             idempotency.map(|idempotency| idempotency.key.as_str()),
             idempotency.map(|idempotency| idempotency.fingerprint.as_slice()),
@@ -144,57 +158,13 @@ fn insert(
             expires.as_millis(),
             is_pair.then_some(expires.as_millis()),
             device_code(submission.device),
+            place.is_some_and(|(_, of)| of.backward),
+            submission.after.map(|after| *after.as_bytes()),
+            submission.followed,
+            is_ready.then_some(now.as_millis()),
+            submission.closing_seconds.is_some(),
         ],
         rows::job,
     )?;
     Ok(job)
-}
-
-/// Start-time fair queueing (Goyal et al. 1996): a job's tag is where its tenant's last waiting or
-/// running job ends, but never before what is being served now. Tags are seconds of predicted
-/// work, so tenants share devices by work, not by number of jobs.
-pub(super) fn virtual_start(
-    connection: &Connection,
-    tenant: &Tenant,
-    priority: Priority,
-) -> Result<f64, QueueError> {
-    let served = virtual_now(connection, priority)?;
-    let sql = "SELECT max(virtual_finish) FROM jobs INDEXED BY jobs_tail \
-               WHERE state < 2 AND kind = 0 AND tenant = ?1 AND priority = ?2";
-    let own: Option<f64> = connection
-        .prepare_cached(sql)?
-        .query_row(params![tenant.as_str(), priority_code(priority)], |row| {
-            row.get(0)
-        })?;
-    Ok(served.unwrap_or(0.0).max(own.unwrap_or(0.0)))
-}
-
-/// The tag that is being served at a priority; none where nothing runs and nothing is ready.
-pub(super) fn virtual_now(
-    connection: &Connection,
-    priority: Priority,
-) -> Result<Option<f64>, QueueError> {
-    let priority = priority_code(priority);
-    let one = |sql: &str, parameters: &[&dyn rusqlite::ToSql]| -> Result<Option<f64>, QueueError> {
-        let mut statement = connection.prepare_cached(sql)?;
-        Ok(statement.query_row(parameters, |row| row.get(0))?)
-    };
-    let served = one(
-        "SELECT max(virtual_start) FROM jobs INDEXED BY jobs_running \
-         WHERE state = 1 AND kind = 0 AND priority = ?1",
-        &[&priority],
-    )?;
-    if served.is_some() {
-        return Ok(served);
-    }
-    let mut first: Option<f64> = None;
-    for device in DEVICES {
-        let ready = one(
-            "SELECT min(virtual_start) FROM jobs INDEXED BY jobs_ready \
-             WHERE state = 0 AND kind = 0 AND delayed = 0 AND device = ?1 AND priority = ?2",
-            &[&device_code(device), &priority],
-        )?;
-        first = first.into_iter().chain(ready).reduce(f64::min);
-    }
-    Ok(first)
 }

@@ -1,0 +1,153 @@
+//! A sequence's dense cloud: what it takes before it is accepted, and the cloud once it is there.
+//!
+//! It must not know HTTP's or gRPC's types, nor how points are carried.
+
+use std::sync::Arc;
+
+use super::admission::Admission;
+use super::codec;
+use super::error::ApiError;
+use super::service::Service;
+use crate::blobs::Blob;
+use crate::cost::CostModel;
+use crate::flow::DenseCloud;
+use crate::flow::densify::Plan;
+use crate::formats::{DENSE_FORMATS, DenseFormat, write_dense};
+use crate::job::{DenseReport, Densify, InvalidOptions, Job, JobOptions, Kind, LaterChoice};
+use crate::payload::StoredDense;
+use crate::queue::PairOf;
+
+/// Bytes that are held for a point while it is carried and written, at most: itself in its sweep and
+/// in the cloud, its masks, where it was before a step, and the cloud's bytes.
+const POINT_BYTES: usize = 160;
+
+/// Bytes that are held for a field: read, and unpacked.
+const FIELD_BYTES: usize = 1 << 20;
+
+/// How often an inverse asks its field about a point, usually.
+const CORRECTIONS: f64 = 5.0;
+
+/// What a dense cloud asks for besides the pairs that go forward.
+pub(super) struct Closing {
+    /// The pairs that go back in time, in the order of their turns.
+    pub(super) back: Vec<PairOf>,
+    /// Nominal seconds of carrying all points.
+    pub(super) nominal_seconds: f64,
+}
+
+impl Closing {
+    /// What a sequence whose sweeps have `points` points asks for.
+    pub(super) fn of(asked: &Densify, points: &[usize], goes_on: bool) -> Result<Self, ApiError> {
+        let plan = asked.plan(points.len()).map_err(InvalidOptions::Densify)?;
+        let back = plan
+            .legs()
+            .into_iter()
+            .filter(|leg| leg.source > leg.target);
+        let back = back.enumerate().map(|(turn, leg)| PairOf {
+            place: leg.target as u32,
+            backward: true,
+            follows: goes_on && turn > 0,
+        });
+        Ok(Self {
+            back: back.collect(),
+            nominal_seconds: CostModel::asking(questions(asked, &plan, points)),
+        })
+    }
+}
+
+/// How often fields are asked about a point until all are in the frame.
+fn questions(asked: &Densify, plan: &Plan, points: &[usize]) -> f64 {
+    let of_sweep = |(place, &points): (usize, &usize)| {
+        let steps = (plan.into() - place as f64).abs().ceil();
+        let inverted = asked.later == LaterChoice::Inverse && place as f64 > plan.into();
+        let each = if inverted {
+            CORRECTIONS
+        } else {
+            f64::from(asked.substeps)
+        };
+        points as f64 * steps * each
+    };
+    points.iter().enumerate().map(of_sweep).sum()
+}
+
+impl Admission {
+    /// Refuses sweeps that cannot be carried into one frame here.
+    ///
+    /// # Errors
+    /// [`ApiError::TooLarge`].
+    pub(super) fn check_dense(&self, points: &[usize]) -> Result<(), ApiError> {
+        let needed = points.iter().sum::<usize>() * POINT_BYTES + points.len() * FIELD_BYTES;
+        let limit = self.max_pair_bytes();
+        if needed > limit {
+            return Err(ApiError::TooLarge(format!(
+                "the dense cloud of {} sweeps needs {} MiB, {} are allowed: send fewer or smaller ones",
+                points.len(),
+                needed >> 20,
+                limit >> 20
+            )));
+        }
+        Ok(())
+    }
+}
+
+/// Whether a job's result is a dense cloud.
+pub(super) fn is_dense(job: &Job) -> bool {
+    let options = || JobOptions::from_json(job.options.as_bytes()).ok();
+    job.kind == Kind::Sequence && options().is_some_and(|options| options.densify.is_some())
+}
+
+/// The format of dense clouds that an `Accept` header asks for; npz where it does not mind.
+///
+/// # Errors
+/// [`ApiError::NotAcceptable`], which lists what there is.
+pub(super) fn accepted(accept: Option<&str>) -> Result<DenseFormat, ApiError> {
+    codec::accepted(accept, &DENSE_FORMATS, "a dense cloud")
+}
+
+impl Service {
+    /// How a sequence's dense cloud was made, where it is there.
+    ///
+    /// # Errors
+    /// [`ApiError::NotEnded`], or how the sequence ended instead.
+    pub(super) fn dense_report(&self, job: &Job) -> Result<DenseReport, ApiError> {
+        Self::check_success(job)?;
+        let report = job.report.as_deref().unwrap_or_default();
+        serde_json::from_str(report).map_err(ApiError::internal)
+    }
+
+    /// A sequence's dense cloud.
+    ///
+    /// # Errors
+    /// As for [`Service::dense_report`], or where the store fails.
+    pub(super) async fn dense_cloud(&self, job: &Job) -> Result<Arc<DenseCloud>, ApiError> {
+        Self::check_success(job)?;
+        let bytes = self.blobs.get(job.id, Blob::Result(job.attempt)).await?;
+        let read = move || StoredDense::from_bytes(&bytes).map_err(ApiError::internal);
+        let StoredDense(cloud) = self.compute(read).await?;
+        Ok(Arc::new(cloud))
+    }
+
+    /// A sequence's dense cloud in a format.
+    ///
+    /// # Errors
+    /// As for [`Service::dense_cloud`].
+    pub(super) async fn encode_dense(
+        &self,
+        job: &Job,
+        format: DenseFormat,
+    ) -> Result<Vec<u8>, ApiError> {
+        // One at a time: a cloud is as large as all of its sweeps.
+        let _turn = self.clouds.acquire().await.map_err(ApiError::internal)?;
+        let began = std::time::Instant::now();
+        let cloud = self.dense_cloud(job).await?;
+        let encode = move || {
+            let mut bytes = Vec::new();
+            write_dense(format, &cloud, &mut bytes).map_err(ApiError::internal)?;
+            Ok(bytes)
+        };
+        let encoded = self.compute(encode).await?;
+        self.metrics
+            .phase("encode", began.elapsed().as_secs_f64(), Some(job));
+        Ok(encoded)
+    }
+}

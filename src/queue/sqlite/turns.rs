@@ -1,0 +1,153 @@
+//! Whose turn it is: tags that share devices fairly, and jobs that come after others.
+//!
+//! A job that comes after another one has its place among its tenant's jobs from the beginning, so
+//! that later ones go behind it, and its tag when it becomes ready: that is when it arrives. It
+//! must not know how jobs end.
+
+use std::sync::Arc;
+
+use rusqlite::{Connection, OptionalExtension, params};
+
+use super::rows::{self, COLUMNS, DEVICES, device_code, priority_code};
+use super::transitions::Effects;
+use crate::clock::Timestamp;
+use crate::job::{Job, JobId, Priority, Tenant};
+use crate::queue::{QueueError, QueueOptions};
+
+/// Start-time fair queueing (Goyal et al. 1996): a job's tag is where its tenant's last waiting or
+/// running job ends, but never before what is being served now. Tags are seconds of predicted
+/// work, so tenants share devices by work, not by number of jobs.
+pub(super) fn virtual_start(
+    connection: &Connection,
+    tenant: &Tenant,
+    priority: Priority,
+) -> Result<f64, QueueError> {
+    let served = virtual_now(connection, priority)?;
+    let sql = "SELECT max(virtual_finish) FROM jobs INDEXED BY jobs_tail \
+               WHERE state < 2 AND kind = 0 AND tenant = ?1 AND priority = ?2";
+    let own: Option<f64> = connection
+        .prepare_cached(sql)?
+        .query_row(params![tenant.as_str(), priority_code(priority)], |row| {
+            row.get(0)
+        })?;
+    Ok(served.unwrap_or(0.0).max(own.unwrap_or(0.0)))
+}
+
+/// The tag that is being served at a priority; none where nothing runs and nothing is ready.
+pub(super) fn virtual_now(
+    connection: &Connection,
+    priority: Priority,
+) -> Result<Option<f64>, QueueError> {
+    let priority = priority_code(priority);
+    let one = |sql: &str, parameters: &[&dyn rusqlite::ToSql]| -> Result<Option<f64>, QueueError> {
+        let mut statement = connection.prepare_cached(sql)?;
+        Ok(statement.query_row(parameters, |row| row.get(0))?)
+    };
+    let served = one(
+        "SELECT max(virtual_start) FROM jobs INDEXED BY jobs_running \
+         WHERE state = 1 AND ready IS NOT NULL AND priority = ?1",
+        &[&priority],
+    )?;
+    if served.is_some() {
+        return Ok(served);
+    }
+    let mut first: Option<f64> = None;
+    for device in DEVICES {
+        let ready = one(
+            "SELECT min(virtual_start) FROM jobs INDEXED BY jobs_ready \
+             WHERE state = 0 AND ready IS NOT NULL AND delayed = 0 AND device = ?1 \
+             AND priority = ?2",
+            &[&device_code(device), &priority],
+        )?;
+        first = first.into_iter().chain(ready).reduce(f64::min);
+    }
+    Ok(first)
+}
+
+/// Whether a job that comes after that one has to wait.
+pub(super) fn is_held_back(
+    connection: &Connection,
+    after: Option<JobId>,
+) -> Result<bool, QueueError> {
+    let Some(after) = after else {
+        return Ok(false);
+    };
+    let sql = "SELECT 1 FROM jobs INDEXED BY jobs_id WHERE id = ?1 AND state < 2";
+    let mut statement = connection.prepare_cached(sql)?;
+    let open = statement
+        .query_row([after.as_bytes()], |_| Ok(()))
+        .optional()?;
+    Ok(open.is_some())
+}
+
+/// The statement that finds those who come after a job; the test of the plan reads it too.
+pub(super) const FOLLOWERS: &str = "SELECT id FROM jobs INDEXED BY jobs_after \
+    WHERE after = ?1 AND after IS NOT NULL AND state < 2";
+
+/// Those who come after a job and have not ended.
+pub(super) fn followers(connection: &Connection, id: JobId) -> Result<Vec<JobId>, QueueError> {
+    let mut statement = connection.prepare_cached(FOLLOWERS)?;
+    let rows = statement.query_map([id.as_bytes()], |row| row.get(0))?;
+    let ids: Vec<[u8; 16]> = rows.collect::<rusqlite::Result<_>>()?;
+    Ok(ids.into_iter().map(JobId::from_bytes).collect())
+}
+
+/// Readies those who come after a job that has ended, or is about to be forgotten. They take over
+/// its tag where that is later than what is served: a chain has its share and no more.
+pub(super) fn release_followers(
+    connection: &Connection,
+    effects: &mut Effects,
+    job: &Job,
+) -> Result<(), QueueError> {
+    let followers = followers(connection, job.id)?;
+    if followers.is_empty() {
+        return Ok(());
+    }
+    let sql = "SELECT virtual_finish FROM jobs INDEXED BY jobs_id WHERE id = ?1";
+    let finish: f64 = connection
+        .prepare_cached(sql)?
+        .query_row([job.id.as_bytes()], |row| row.get(0))?;
+    let sql = format!(
+        "UPDATE jobs SET ready = ?2, virtual_start = ?3, virtual_finish = ?3 + cost \
+         WHERE id = ?1 AND state = 0 AND ready IS NULL RETURNING {COLUMNS}"
+    );
+    for follower in followers {
+        let served = virtual_now(connection, job.priority)?.unwrap_or(0.0);
+        let now = Timestamp::now().as_millis();
+        let parameters = params![follower.as_bytes(), now, served.max(finish)];
+        let mut statement = connection.prepare_cached(&sql)?;
+        let ready = statement.query_row(parameters, rows::job).optional()?;
+        effects.changed.extend(ready.map(Arc::new));
+    }
+    Ok(())
+}
+
+/// Queues a sequence whose pairs have all succeeded, for what is left to do.
+pub(super) fn ready_to_close(
+    connection: &Connection,
+    effects: &mut Effects,
+    options: &QueueOptions,
+    sequence: &Job,
+) -> Result<Arc<Job>, QueueError> {
+    let tag = virtual_start(connection, &sequence.tenant, sequence.priority)?;
+    let now = Timestamp::now();
+    // What its deadline could cut short is done: from here on it waits for a device as others do.
+    let expires = now.after(options.time_to_live).as_millis();
+    let sql = format!(
+        "UPDATE jobs SET state = 0, ready = ?2, expires = ?3, due = ?3, virtual_start = ?4, \
+         virtual_finish = ?4 + cost WHERE id = ?1 RETURNING {COLUMNS}"
+    );
+    let mut statement = connection.prepare_cached(&sql)?;
+    let parameters = params![sequence.id.as_bytes(), now.as_millis(), expires, tag];
+    let sequence = Arc::new(statement.query_row(parameters, rows::job)?);
+    effects.entered.push(Arc::clone(&sequence));
+    effects.changed.push(Arc::clone(&sequence));
+    Ok(sequence)
+}
+
+/// Whether something is left to do for a sequence when its pairs are done.
+pub(super) fn closes(connection: &Connection, id: JobId) -> Result<bool, QueueError> {
+    let sql = "SELECT closes FROM jobs INDEXED BY jobs_id WHERE id = ?1";
+    let mut statement = connection.prepare_cached(sql)?;
+    Ok(statement.query_row([id.as_bytes()], |row| row.get(0))?)
+}

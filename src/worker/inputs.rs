@@ -1,0 +1,176 @@
+//! What a pair needs, from the store: its clouds, the field before, and where it was put down.
+//!
+//! It must not know what becomes of the flow.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
+
+use super::Worker;
+use super::job_watch::JobWatch;
+use crate::blobs::{Blob, BlobError, Sync};
+use crate::clock::Timestamp;
+use crate::flow::{Ego, Field, SealError, Snapshot};
+use crate::job::{Job, JobOptions, State};
+use crate::payload::{Damaged, StoredCloud};
+use crate::queue::{Lease, QueueError};
+
+/// Why a job could not be taken from the store, or put back.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum StoreError {
+    #[error(transparent)]
+    Blob(#[from] BlobError),
+    #[error(transparent)]
+    Damaged(#[from] Damaged),
+    #[error("a field cannot be read: {0}")]
+    Field(#[from] SealError),
+    #[error("reading it failed: {0}")]
+    Task(#[from] tokio::task::JoinError),
+    #[error("its pairs are not those of its plan")]
+    NoPlan,
+    #[error("its options cannot be read: {0}")]
+    Options(#[from] crate::job::InvalidOptions),
+    #[error(transparent)]
+    Queue(#[from] QueueError),
+}
+
+impl Worker {
+    /// Reads what the job needs, and starts the task that keeps its snapshots.
+    pub(super) async fn prepare(
+        &self,
+        lease: &Lease,
+    ) -> Result<(super::Work, JoinHandle<()>, JobOptions), StoreError> {
+        let job = &lease.job;
+        let options = JobOptions::from_json(job.options.as_bytes())?;
+        let (owner, [source, target]) = job.sweeps();
+        let (source, target, before) = tokio::try_join!(
+            async { Ok(self.blobs.get(owner, Blob::Frame(source)).await?) },
+            async { Ok(self.blobs.get(owner, Blob::Frame(target)).await?) },
+            self.field_before(job),
+        )?;
+        let snapshot = self.earlier_snapshot(job).await;
+        let source = StoredCloud::from_bytes(&source)?;
+        let target = StoredCloud::from_bytes(&target)?;
+        let points = source.points.len().max(target.points.len());
+        let (snapshots, kept) = mpsc::channel(1);
+        let deadline = job.deadline.map(|deadline| {
+            // What comes after the flow takes its time too.
+            let left = Timestamp::now().until(deadline);
+            Instant::now() + left.saturating_sub(self.after_solving(job, points))
+        });
+        let watch = JobWatch::new(
+            lease.pulse.clone(),
+            deadline,
+            self.options.snapshot_interval,
+            self.drain.release.clone(),
+            snapshots,
+        );
+        let mut solver = options.solver_options(points);
+        if job.backward
+            && let Ego::Given(target_from_source) = &mut solver.ego
+        {
+            // The motion that is known is from the earlier sweep to the later one.
+            *target_from_source = target_from_source.inverse();
+        }
+        let work = super::Work {
+            options: solver,
+            before,
+            ground: source.ground.zip(target.ground).map(<[_; 2]>::from),
+            source: source.points,
+            target: target.points,
+            snapshot,
+            watch: Arc::new(watch),
+        };
+        Ok((work, self.keep_snapshots(lease, kept), options))
+    }
+
+    /// Time for the result to reach its caller.
+    fn after_solving(&self, job: &Job, points: usize) -> Duration {
+        const FOR_THE_DISK: Duration = Duration::from_millis(30);
+        const FOR_THE_CALLER: Duration = Duration::from_millis(8);
+        let disk = if job.durable {
+            FOR_THE_DISK
+        } else {
+            Duration::ZERO
+        };
+        FOR_THE_CALLER + disk + Duration::from_nanos(150 * points as u64)
+    }
+
+    /// The field of the job that this one comes after, if that has succeeded: as it was read once it
+    /// will be read again, since no other attempt of that job can follow. Where there is none the
+    /// pair starts afresh.
+    async fn field_before(&self, job: &Job) -> Result<Option<Field>, StoreError> {
+        let Some(after) = job.after else {
+            return Ok(None);
+        };
+        let before = match self.queue.job(&job.tenant, after).await {
+            Ok(before) => before,
+            Err(QueueError::NotFound) => return Ok(None),
+            Err(error) => return Err(error.into()),
+        };
+        if before.state != State::Succeeded {
+            return Ok(None);
+        }
+        match self.field(&before).await {
+            Ok(field) => Ok(Some(field)),
+            Err(StoreError::Blob(error)) if !error.is_missing() => Err(error.into()),
+            Err(error) => {
+                tracing::warn!(%error, %after, "no field to go on from: the pair starts afresh");
+                Ok(None)
+            }
+        }
+    }
+
+    /// The field that a pair which has succeeded has left.
+    pub(super) async fn field(&self, job: &Job) -> Result<Field, StoreError> {
+        let bytes = self.blobs.get(job.id, Blob::Field(job.attempt)).await?;
+        Ok(Field::from_bytes(&bytes)?)
+    }
+
+    /// Where an earlier attempt was put down, if it was.
+    async fn earlier_snapshot(&self, job: &Job) -> Option<Snapshot> {
+        if job.attempt == 1 {
+            return None;
+        }
+        let bytes = match self.blobs.get(job.id, Blob::Snapshot).await {
+            Ok(bytes) => bytes,
+            Err(error) if error.is_missing() => return None,
+            Err(error) => {
+                tracing::warn!(%error, "a snapshot cannot be read: the job starts afresh");
+                return None;
+            }
+        };
+        match Snapshot::from_bytes(&bytes) {
+            Ok(snapshot) => {
+                tracing::info!(iteration = snapshot.iterations(), "resumed");
+                self.metrics.resumed();
+                Some(snapshot)
+            }
+            Err(error) => {
+                tracing::warn!(%error, "a snapshot is damaged: the job starts afresh");
+                None
+            }
+        }
+    }
+
+    /// Writes every snapshot that comes, until the optimization ends.
+    fn keep_snapshots(&self, lease: &Lease, mut kept: mpsc::Receiver<Snapshot>) -> JoinHandle<()> {
+        let (blobs, metrics) = (self.blobs.clone(), Arc::clone(&self.metrics));
+        let (id, pulse) = (lease.job.id, lease.pulse.clone());
+        tokio::spawn(async move {
+            while let Some(snapshot) = kept.recv().await {
+                let bytes = Bytes::from(snapshot.to_bytes());
+                match blobs.put(id, Blob::Snapshot, bytes, Sync::No).await {
+                    Ok(()) => {
+                        metrics.snapshot_kept();
+                        pulse.snapshot_kept();
+                    }
+                    Err(error) => tracing::warn!(%error, "a snapshot was not kept"),
+                }
+            }
+        })
+    }
+}
