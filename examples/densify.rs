@@ -1,7 +1,7 @@
 //! How well a sequence's sweeps fall together in one frame: the tables of `docs/numerics.md`.
 //!
 //! ```text
-//! cargo run --release --example densify [-- SWEEP...]
+//! [FNSF_PRESET=label] cargo run --release --example densify [-- SWEEP...]
 //! ```
 //!
 //! On simulated streets: how far points are from their exact place, by their age, against what the
@@ -30,24 +30,26 @@ const INTO: usize = 5;
 
 type Fields = BTreeMap<Leg, Field>;
 
+/// The preset that the environment names; `label` where it names none.
+fn preset() -> anyhow::Result<Preset> {
+    let name = std::env::var("FNSF_PRESET").unwrap_or_else(|_| "label".to_owned());
+    let found = Preset::ALL.into_iter().find(|preset| preset.name() == name);
+    found.ok_or_else(|| anyhow::anyhow!("no preset {name}"))
+}
+
 /// Fits all legs of the plans, each chain from its beginning.
 fn fit(backend: &CpuBackend, sweeps: &[Sweep], plans: &[Plan]) -> anyhow::Result<Fields> {
-    let options = Preset::Default.options(None);
+    let options = preset()?.options(None);
     let mut fields = Fields::new();
-    for plan in plans {
+    for chain in plans.iter().flat_map(Plan::chains) {
         let mut sequence = Sequence::default();
-        let mut last = None;
-        for leg in plan.legs() {
-            if fields.contains_key(&leg) {
-                continue;
+        for (number, leg) in chain.into_iter().enumerate() {
+            let mut push =
+                |place: usize| sequence.push(backend, sweeps[place].clone(), &options, &Unwatched);
+            if number == 0 {
+                push(leg.source)?;
             }
-            if last != Some(leg.source) {
-                sequence = Sequence::default();
-                sequence.push(backend, sweeps[leg.source].clone(), &options, &Unwatched)?;
-            }
-            let estimate =
-                sequence.push(backend, sweeps[leg.target].clone(), &options, &Unwatched)?;
-            last = Some(leg.target);
+            let estimate = push(leg.target)?;
             fields.extend(estimate.map(|estimate| (leg, estimate.field)));
         }
     }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use anyhow::anyhow;
-use clap::{Args, ValueEnum};
+use clap::Args;
 use serde::Serialize;
 
 use super::estimation::{Estimation, check_sequence};
@@ -12,11 +12,11 @@ use super::failure::Failure;
 use super::files;
 use super::output::say;
 use super::terminal::Terminal;
-use crate::flow::densify::{DensifyError, Later, Leg, Plan, densify};
+use crate::flow::densify::{DensifyError, Leg, densify};
 use crate::flow::depth::{Camera, DepthImage, Occlusion, project};
-use crate::flow::ground::{GroundOptions, segment};
-use crate::flow::{DenseCloud, Field, Ground, Sequence, Sweep, Watch};
+use crate::flow::{DenseCloud, Field, Sequence, Sweep, Watch};
 use crate::formats::{DenseFormat, write_dense, write_depth_png};
+use crate::job::{self, LaterChoice};
 use crate::picture::{self, DepthPanel};
 use crate::text::grouped;
 
@@ -42,7 +42,7 @@ pub(super) struct Densify {
     output: Option<PathBuf>,
     /// Parts that each step from sweep to sweep is cut into
     #[arg(long, value_name = "N", default_value_t = 1)]
-    substeps: usize,
+    substeps: u32,
     /// How sweeps after the frame are carried back: through fields fitted backward in time, or
     /// through the inverses of the forward ones
     #[arg(long, value_enum, default_value_t)]
@@ -61,16 +61,6 @@ pub(super) struct Densify {
     json: bool,
     #[command(flatten)]
     estimation: Estimation,
-}
-
-/// How sweeps after the frame are carried back.
-#[derive(Clone, Copy, Debug, Default, ValueEnum)]
-enum LaterChoice {
-    /// Fields fitted backward in time.
-    #[default]
-    Reverse,
-    /// Inverses of the forward fields.
-    Inverse,
 }
 
 /// What is said of a dense cloud.
@@ -102,48 +92,44 @@ struct Seconds {
 impl Densify {
     pub(super) fn run(&self) -> Result<(), Failure> {
         self.check_outputs()?;
-        let later = match self.later {
-            LaterChoice::Reverse => Later::Reverse,
-            LaterChoice::Inverse => Later::Inverse,
+        let asked = job::Densify {
+            into: self.into,
+            substeps: self.substeps,
+            later: self.later,
         };
-        let plan = Plan::new(self.sweeps.len(), self.into, later, self.substeps);
-        let plan = plan.map_err(Failure::usage)?;
+        let plan = asked.plan(self.sweeps.len()).map_err(Failure::usage)?;
         let camera = self.camera.as_deref().map(files::read_camera).transpose()?;
         let options = self.estimation.options()?;
         check_sequence(&options, usize::MAX)?;
         let terminal = Terminal::new();
         let surroundings = self.estimation.surroundings(&self.sweeps)?;
         let mut device = self.estimation.open()?;
-        let finds_ground = options.solver_options(0).ground == Ground::Auto;
+        let solver_options = options.solver_options(usize::MAX);
         let read = |(place, path): (usize, &PathBuf)| {
-            let mut sweep = surroundings.sweep(place, path)?;
-            if finds_ground && sweep.ground.is_none() {
-                sweep.ground = Some(segment(&sweep.points, &GroundOptions::default()).ground);
-            }
-            Ok(sweep)
+            Ok(surroundings.sweep(place, path)?.prepared(&solver_options))
         };
         let sweeps = self.sweeps.iter().enumerate().map(read);
         let sweeps: Vec<Sweep> = sweeps.collect::<Result<_, Failure>>()?;
 
         let began = terminal.seconds();
         let mut fields: BTreeMap<Leg, Field> = BTreeMap::new();
-        let (mut sequence, mut last) = (Sequence::default(), None);
-        let legs = plan.legs();
-        for (done, &leg) in legs.iter().enumerate() {
-            let Leg { source, target } = leg;
-            terminal.part(&format!("pair {} of {}", done + 1, legs.len()));
-            let larger = sweeps[source].points.len().max(sweeps[target].points.len());
-            let solver_options = surroundings.options(&options, larger, [source, target]);
-            let mut push = |sequence: &mut Sequence, place: usize| {
-                device.push(sequence, sweeps[place].clone(), &solver_options, &terminal)
-            };
-            if last != Some(source) {
-                sequence = Sequence::default();
-                push(&mut sequence, source)?;
+        let fits = plan.legs().len();
+        for chain in plan.chains() {
+            let mut sequence = Sequence::default();
+            for (number, leg) in chain.into_iter().enumerate() {
+                let Leg { source, target } = leg;
+                terminal.part(&format!("pair {} of {fits}", fields.len() + 1));
+                let larger = sweeps[source].points.len().max(sweeps[target].points.len());
+                let solver_options = surroundings.options(&options, larger, [source, target]);
+                let mut push = |place: usize| {
+                    let sweep = sweeps[place].clone();
+                    device.push(&mut sequence, sweep, &solver_options, &terminal)
+                };
+                if number == 0 {
+                    push(source)?;
+                }
+                fields.extend(push(target)?.map(|estimate| (leg, estimate.field)));
             }
-            let estimate = push(&mut sequence, target)?;
-            fields.extend(estimate.map(|estimate| (leg, estimate.field)));
-            last = Some(target);
         }
         let fitted = terminal.seconds();
         terminal.part("carrying");

@@ -11,7 +11,9 @@ use crate::flow::backend::{Backend, BackendError, Transform};
 use crate::flow::densify::{self, DensifyError, Leg, Plan};
 use crate::flow::distance::DistanceOptions;
 use crate::flow::field::Network;
-use crate::flow::{DenseCloud, Field, FlowError, Point, RigidTransform, Sweep, Watch};
+use crate::flow::{
+    DenseCloud, Field, FlowError, LabelOptions, Labelled, Point, RigidTransform, Sweep, Watch,
+};
 
 /// Points between two signs of life: a tenth of a second of two cores.
 const PIECE: usize = 1 << 17;
@@ -86,6 +88,16 @@ impl Backend for InPieces<'_> {
         watch: &dyn Watch,
     ) -> RigidTransform {
         self.backend.align(source, target, prior, watch)
+    }
+
+    fn movers(
+        &self,
+        source: &[Point],
+        target: &[Point],
+        options: &LabelOptions,
+        watch: &dyn Watch,
+    ) -> Labelled {
+        self.backend.movers(source, target, options, watch)
     }
 
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {

@@ -22,6 +22,21 @@ pub struct Sweep {
     pub ground: Option<Vec<bool>>,
 }
 
+impl Sweep {
+    /// The sweep as `options` take it: its ground found where it is wanted and not known, and
+    /// forgotten where it is kept.
+    #[must_use]
+    pub fn prepared(mut self, options: &Options) -> Self {
+        match options.ground {
+            Ground::Keep => self.ground = None,
+            Ground::Mask => {}
+            Ground::Auto if self.ground.is_some() => {}
+            Ground::Auto => self.ground = Some(ground_of(&self.points, options)),
+        }
+        self
+    }
+}
+
 /// The pairs of a sequence, one after the other.
 #[derive(Clone, Debug, Default)]
 pub struct Sequence {
@@ -39,14 +54,12 @@ impl Sequence {
     pub fn push(
         &mut self,
         backend: &dyn Backend,
-        mut sweep: Sweep,
+        sweep: Sweep,
         options: &Options,
         watch: &dyn Watch,
     ) -> Result<Option<Estimate>, FlowError> {
-        if options.ground == Ground::Auto && sweep.ground.is_none() {
-            // Once for both of its pairs.
-            sweep.ground = Some(ground_of(&sweep.points, options));
-        }
+        // Once for both of its pairs.
+        let sweep = sweep.prepared(options);
         let Some(last) = &self.last else {
             self.last = Some(sweep);
             return Ok(None);

@@ -5,7 +5,6 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::options::{InvalidOptions, JobOptions};
-use crate::flow::Ego;
 use crate::flow::densify::{Later, Plan, PlanError};
 
 /// All sweeps of a sequence, carried into one frame.
@@ -23,7 +22,9 @@ pub struct Densify {
 }
 
 /// How sweeps after the frame are carried into it.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[derive(
+    Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema, clap::ValueEnum,
+)]
 #[serde(rename_all = "snake_case")]
 pub enum LaterChoice {
     /// Through fields that are fitted backward in time.
@@ -75,8 +76,7 @@ impl JobOptions {
 
     /// Whether the pairs of a sequence go on from each other: each needs the one before then.
     pub fn goes_on(&self) -> bool {
-        let options = self.solver_options(usize::MAX);
-        options.warm_start.is_some() || options.ego == Ego::Auto
+        self.solver_options(usize::MAX).warm_start.is_some()
     }
 }
 
@@ -89,7 +89,8 @@ mod tests {
         for (text, goes_on) in [
             ("{}", true),
             (r#"{"preset":"paper"}"#, false),
-            (r#"{"preset":"paper","ego":"auto"}"#, true),
+            (r#"{"preset":"paper","ego":"auto"}"#, false),
+            (r#"{"preset":"label"}"#, false),
         ] {
             let options = JobOptions::from_json(text.as_bytes()).expect("good options");
             assert_eq!(options.goes_on(), goes_on, "{text}");

@@ -12,10 +12,9 @@ use super::job_watch::DenseWatch;
 use super::{Attempt, Densification, Done, EngineError, Found, Solved, Worker, unreadable};
 use crate::blobs::Blob;
 use crate::flow::densify::Plan;
-use crate::flow::ground::{GroundOptions, segment};
-use crate::flow::{FlowError, Ground, Sweep, Watch};
+use crate::flow::{FlowError, Sweep, Watch};
 use crate::job::{DenseReport, Densify, Job, JobOptions};
-use crate::payload::{StoredCloud, StoredDense};
+use crate::payload::{Damaged, StoredCloud, StoredDense};
 use crate::queue::Lease;
 
 /// Why there is nothing to carry.
@@ -95,12 +94,17 @@ impl Worker {
             None => Ok(()),
             Some(_) => Err(Unprepared::Interrupted),
         };
-        let ground = options.solver_options(usize::MAX).ground;
+        let solver_options = Arc::new(options.solver_options(usize::MAX));
         let mut sweeps = Vec::with_capacity(frames);
         for place in (0u32..).take(frames) {
             go_on()?;
             let bytes = self.blobs.get(job.id, Blob::Frame(place)).await?;
-            let read = move || StoredCloud::from_bytes(&bytes).map(|cloud| sweep(cloud, ground));
+            let solver_options = Arc::clone(&solver_options);
+            let read = move || {
+                let StoredCloud { points, ground } = StoredCloud::from_bytes(&bytes)?;
+                let sweep = Sweep { points, ground }.prepared(&solver_options);
+                Ok::<_, Damaged>(sweep)
+            };
             let read = tokio::task::spawn_blocking(read).await;
             sweeps.push(read??);
         }
@@ -122,30 +126,4 @@ impl Worker {
         };
         Ok((work, asked))
     }
-}
-
-/// A sweep with what of it never moves of itself, where that is known or to be found.
-fn sweep(cloud: StoredCloud, ground: Ground) -> Sweep {
-    let ground = match ground {
-        Ground::Keep => None,
-        Ground::Mask => cloud.ground,
-        Ground::Auto => Some(cloud.ground.clone().unwrap_or_else(|| ground_of(&cloud))),
-    };
-    Sweep {
-        points: cloud.points,
-        ground,
-    }
-}
-
-/// Ground is found among the points that are finite; the others are left out anyway.
-fn ground_of(cloud: &StoredCloud) -> Vec<bool> {
-    let is_finite = |row: &usize| cloud.points[*row].iter().all(|value| value.is_finite());
-    let rows: Vec<usize> = (0..cloud.points.len()).filter(is_finite).collect();
-    let points: Vec<_> = rows.iter().map(|&row| cloud.points[row]).collect();
-    let mut ground = vec![false; cloud.points.len()];
-    let found = segment(&points, &GroundOptions::default()).ground;
-    for (row, found) in rows.into_iter().zip(found) {
-        ground[row] = found;
-    }
-    ground
 }

@@ -87,9 +87,13 @@ impl Plan {
         self.anchor as f64 + self.fraction
     }
 
-    /// The fits that are needed, in an order in which each follows its neighbor: forward in time
-    /// first, then backward from the end.
+    /// All fits that are needed.
     pub fn legs(&self) -> Vec<Leg> {
+        self.chains().concat()
+    }
+
+    /// The fits that are needed, as two sequences: forward in time, and backward from the end.
+    pub fn chains(&self) -> [Vec<Leg>; 2] {
         let last = self.sweeps - 1;
         // The sweep that those of before are carried to, and the one from which those of after are.
         let before = if self.fraction > 0.0 {
@@ -113,7 +117,7 @@ impl Plan {
             source: target + 1,
             target,
         });
-        ahead.chain(back).collect()
+        [ahead.collect(), back.collect()]
     }
 }
 
