@@ -155,7 +155,6 @@ impl Worker {
             Err(error) => return unreadable(&error),
         };
         let began = Instant::now();
-        let max_iterations = work.options.max_iterations;
         let solved = self.lane.solve(work).await;
         let took = began.elapsed();
         let _its_own_errors_are_logged = keeper.await;
@@ -178,7 +177,7 @@ impl Worker {
                     stop_reason = estimate.stop_reason.name(),
                     "solved"
                 );
-                let report = Report::new(&estimate, &options, max_iterations, device);
+                let report = Report::new(&estimate, &options, device);
                 // Whoever comes after it goes on from its field.
                 let wanted = job.followed || options.densify.is_some();
                 let field = wanted.then(|| estimate.field.clone());

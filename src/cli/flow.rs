@@ -176,12 +176,7 @@ impl Flow {
             let estimate = device.push(&mut sequence, sweep, &solver_options, &terminal)?;
             terminal.finish();
             if let (Some(estimate), Some(source)) = (estimate, &last) {
-                let mut report = Report::new(
-                    &estimate,
-                    &options,
-                    solver_options.max_iterations,
-                    device.backend.name(),
-                );
+                let mut report = Report::new(&estimate, &options, device.backend.name());
                 report.seconds.load = Some(load);
                 report.seconds.total += load;
                 report.peak_rss_bytes = peak_resident_bytes();

@@ -37,6 +37,9 @@ pub struct Estimate {
     pub ego: Option<RigidTransform>,
     /// Points that took part.
     pub points: usize,
+    /// Iterations at most, of the run as it was in the end; all clusters where movers are found
+    /// object by object.
+    pub max_iterations: usize,
     /// Iterations done; clusters looked at where movers are found object by object.
     pub iterations: usize,
     /// The iteration whose field is the result.
@@ -203,6 +206,7 @@ fn solve(
         dynamic,
         ego,
         points: selection.rows.len(),
+        max_iterations: fitted.max_iterations,
         iterations: report.iterations,
         best_iteration: report.best_iteration,
         best_loss: report.best_loss,
@@ -238,6 +242,7 @@ struct Fitted {
     residual: Vec<Point>,
     field: Residual,
     report: Report,
+    max_iterations: usize,
     stop_reason: StopReason,
     /// When the first iteration could begin.
     precomputed: f64,
@@ -249,6 +254,7 @@ impl Fitted {
         Self {
             residual: vec![[0.0; 3]; points],
             field: Residual::Still,
+            max_iterations: 0,
             report: Report {
                 iterations: 0,
                 best_iteration: 0,
@@ -274,6 +280,7 @@ impl Fitted {
         Ok(Self {
             residual: labelled.motions.residual_at(aligned),
             field: Residual::Objects(labelled.motions.into()),
+            max_iterations: labelled.all_clusters,
             report: Report {
                 iterations: labelled.clusters,
                 best_iteration: labelled.clusters,
@@ -364,6 +371,7 @@ impl Fit<'_> {
         let parameters = trainer.state()?.kept;
         Ok(Fitted {
             residual,
+            max_iterations: options.max_iterations,
             field: Residual::Network(Network::new(parameters, self.aligned, options.inputs)),
             report: trainer.report(),
             stop_reason,

@@ -56,17 +56,12 @@ pub struct PhaseSeconds {
 
 impl Report {
     /// The report on an estimate that `device` made with `options`.
-    pub fn new(
-        estimate: &Estimate,
-        options: &JobOptions,
-        max_iterations: usize,
-        device: String,
-    ) -> Self {
+    pub fn new(estimate: &Estimate, options: &JobOptions, device: String) -> Self {
         let seconds = estimate.seconds;
         Self {
             points: estimate.points,
             iterations: estimate.iterations,
-            max_iterations,
+            max_iterations: estimate.max_iterations,
             best_iteration: estimate.best_iteration,
             best_loss: estimate.best_loss.is_finite().then_some(estimate.best_loss),
             stop_reason: estimate.stop_reason.name().to_owned(),
@@ -128,6 +123,7 @@ mod tests {
             dynamic: None,
             ego: None,
             points: 3,
+            max_iterations: 0,
             iterations: 0,
             best_iteration: 0,
             best_loss: f64::INFINITY,
@@ -139,7 +135,7 @@ mod tests {
                 residual: crate::flow::Residual::Still,
             },
         };
-        let report = Report::new(&estimate, &JobOptions::default(), 150, "cpu".to_owned());
+        let report = Report::new(&estimate, &JobOptions::default(), "cpu".to_owned());
         let json = serde_json::to_string(&report).expect("JSON");
         assert_eq!(serde_json::from_str::<Report>(&json).ok(), Some(report));
     }

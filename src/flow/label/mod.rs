@@ -54,6 +54,8 @@ pub struct Labelled {
     pub motions: Motions,
     /// Clusters that were looked at.
     pub clusters: usize,
+    /// Clusters that there are.
+    pub all_clusters: usize,
     /// How far their points lie from the target in the end, metres: the mean over the clusters.
     pub cost_m: f64,
     /// Why not all clusters were looked at.
@@ -66,6 +68,7 @@ impl Labelled {
         Self {
             motions: Motions::none(),
             clusters: 0,
+            all_clusters: 0,
             cost_m: f64::INFINITY,
             interrupted: Some(interrupted),
         }
@@ -127,6 +130,7 @@ pub(crate) fn label(
     Labelled {
         motions: motions(&scene, &needed),
         clusters,
+        all_clusters: order.len(),
         cost_m: sum_m / clusters.max(1) as f64,
         interrupted,
     }
