@@ -180,6 +180,9 @@ impl Draft {
     pub(super) async fn submit(self, kind: Kind) -> Result<Accepted, ApiError> {
         if kind == Kind::Pair {
             self.request.options.check_for_pairs()?;
+        } else {
+            let options = &self.request.options;
+            options.check_for_sequence(self.frames as usize)?;
         }
         match (kind, self.frames) {
             (Kind::Pair, 2) | (Kind::Sequence, 2..) => {}

@@ -14,7 +14,7 @@ use super::output::say;
 use super::terminal::Terminal;
 use crate::flow::densify::{DensifyError, Leg, densify};
 use crate::flow::depth::{Camera, DepthImage, Occlusion, project};
-use crate::flow::{DenseCloud, Field, Sequence, Sweep, Watch};
+use crate::flow::{DenseCloud, Field, Point, Sequence, Sweep, Watch};
 use crate::formats::{DenseFormat, write_dense, write_depth_png};
 use crate::job::{self, LaterChoice};
 use crate::picture::{self, DepthPanel};
@@ -100,13 +100,16 @@ impl Densify {
         let plan = asked.plan(self.sweeps.len()).map_err(Failure::usage)?;
         let camera = self.camera.as_deref().map(files::read_camera).transpose()?;
         let options = self.estimation.options()?;
-        check_sequence(&options, usize::MAX)?;
+        check_sequence(&options, self.sweeps.len())?;
         let terminal = Terminal::new();
         let surroundings = self.estimation.surroundings(&self.sweeps)?;
         let mut device = self.estimation.open()?;
         let solver_options = options.solver_options(usize::MAX);
         let read = |(place, path): (usize, &PathBuf)| {
-            Ok(surroundings.sweep(place, path)?.prepared(&solver_options))
+            Ok(surroundings
+                .sweep(place, path)?
+                .prepared(&solver_options)
+                .cropped(&solver_options))
         };
         let sweeps = self.sweeps.iter().enumerate().map(read);
         let sweeps: Vec<Sweep> = sweeps.collect::<Result<_, Failure>>()?;
@@ -146,10 +149,9 @@ impl Densify {
             let format = DenseFormat::from_path(path).map_err(Failure::usage)?;
             files::write(path, |file| write_dense(format, &cloud, file))?;
         }
-        let own = &sweeps[(self.into.round() as usize).min(sweeps.len() - 1)];
         let density = match &camera {
             None => None,
-            Some(camera) => Some(self.put_depth(camera, own, &cloud)?),
+            Some(camera) => Some(self.put_depth(camera, &cloud)?),
         };
         let count = |flags: &[bool], which: bool| flags.iter().filter(|&&f| f == which).count();
         self.say(&Report {
@@ -186,15 +188,14 @@ impl Densify {
     }
 
     /// Writes the depth image; the densities of the own sweep's and of all points'.
-    fn put_depth(
-        &self,
-        camera: &Camera,
-        own: &Sweep,
-        cloud: &DenseCloud,
-    ) -> Result<[f64; 2], Failure> {
-        let sparse = project(&own.points, camera);
-        let trusted = (0..cloud.points.len()).filter(|&row| cloud.converged[row]);
-        let trusted: Vec<_> = trusted.map(|row| cloud.points[row]).collect();
+    fn put_depth(&self, camera: &Camera, cloud: &DenseCloud) -> Result<[f64; 2], Failure> {
+        let rows = |kept: &dyn Fn(usize) -> bool| -> Vec<Point> {
+            let rows = (0..cloud.points.len()).filter(|&row| kept(row));
+            rows.map(|row| cloud.points[row]).collect()
+        };
+        let nearest = self.into.round() as u32;
+        let sparse = project(&rows(&|row| cloud.frame[row] == nearest), camera);
+        let trusted = rows(&|row| cloud.converged[row]);
         let occlusion = Occlusion::of(camera);
         let dense: DepthImage = project(&trusted, camera).without_hidden(&occlusion);
         if let Some(path) = &self.depth {

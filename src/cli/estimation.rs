@@ -99,6 +99,11 @@ impl Estimation {
 
     /// What is known of the sweeps beside their points.
     pub(super) fn surroundings(&self, paths: &[PathBuf]) -> Result<Surroundings, Failure> {
+        if paths.len() < 2 && self.poses.is_some() {
+            return Err(Failure::usage(anyhow!(
+                "--poses is for sweeps in files of their own: a pair in one file takes --ego FILE"
+            )));
+        }
         let poses = match &self.poses {
             None => None,
             Some(file) => {
@@ -196,7 +201,7 @@ pub(super) fn check_sequence(options: &JobOptions, sweeps: usize) -> Result<(), 
             "--ground mask needs masks, which only an .npz pair has: try --ground auto"
         )));
     }
-    if sweeps > 2 && matches!(options.ego, Some(EgoChoice::Given(_))) {
+    if options.check_for_sequence(sweeps).is_err() {
         return Err(Failure::usage(anyhow!(
             "--ego FILE is the motion of one pair: give --poses for a sequence"
         )));

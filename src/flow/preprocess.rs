@@ -140,7 +140,7 @@ fn kept(
         .collect())
 }
 
-fn is_in_range([x, y, z]: Point, options: &Options) -> bool {
+pub(crate) fn is_in_range([x, y, z]: Point, options: &Options) -> bool {
     let range = options.range_m.unwrap_or(f32::INFINITY);
     let finite = x.is_finite() && y.is_finite() && z.is_finite();
     finite && x.abs() <= range && y.abs() <= range

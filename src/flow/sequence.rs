@@ -9,7 +9,7 @@ use super::error::FlowError;
 use super::field::Field;
 use super::options::{Ground, Options};
 use super::points::Point;
-use super::preprocess::{Problem, ground_of};
+use super::preprocess::{Problem, ground_of, is_in_range};
 use super::solver::{Estimate, estimate};
 use super::watch::Watch;
 
@@ -34,6 +34,22 @@ impl Sweep {
             Ground::Auto => self.ground = Some(ground_of(&self.points, options)),
         }
         self
+    }
+}
+
+impl Sweep {
+    /// The points alone that `options` let take part in a dense cloud: those in range.
+    #[must_use]
+    pub fn cropped(self, options: &Options) -> Self {
+        let rows: Vec<usize> = (0..self.points.len())
+            .filter(|&row| is_in_range(self.points[row], options))
+            .collect();
+        Self {
+            points: rows.iter().map(|&row| self.points[row]).collect(),
+            ground: self
+                .ground
+                .map(|ground| rows.iter().map(|&row| ground[row]).collect()),
+        }
     }
 }
 

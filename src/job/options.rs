@@ -23,7 +23,7 @@ const MAX_DEADLINE: Duration = Duration::from_secs(24 * 60 * 60);
 #[serde(deny_unknown_fields, default)]
 pub struct JobOptions {
     /// `default`: ours, robust and fast; `paper`: FNSF as published; `label`: movers found object by
-    /// object, everything else still, ground found and left out.
+    /// object, everything else still.
     pub preset: PresetChoice,
     /// The same seed gives the same bits.
     pub seed: u64,
@@ -33,8 +33,9 @@ pub struct JobOptions {
     /// Leave out points with |x| or |y| beyond this, metres.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub range_m: Option<f32>,
-    /// `keep` ground points, leave out those that the pair's own masks name (`mask`), or find them
-    /// (`auto`): then they move with the vehicle's own motion; by default what the preset does.
+    /// `keep` ground points, leave out those that the clouds' own masks name (`mask`), or let them
+    /// move with the vehicle's own motion (`auto`): those of the masks or, without masks, those that
+    /// are found; by default what the preset does.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ground: Option<GroundChoice>,
     /// The vehicle's own motion: `off`, `auto` (estimate it first) or a 4 x 4 matrix
@@ -90,7 +91,7 @@ pub enum GroundChoice {
     Keep,
     /// Those that the pair's ground1 and ground2 name are left out.
     Mask,
-    /// Those that are found in the clouds move with the vehicle's own motion.
+    /// Those of the masks, or without masks those that are found, move with the vehicle.
     Auto,
 }
 
@@ -287,6 +288,9 @@ pub enum InvalidOptions {
     /// The sequence cannot be carried into that frame.
     #[error("options: densify: {0}")]
     Densify(PlanError),
+    /// One ego motion for all pairs of a sequence.
+    #[error("options: a given ego is the motion of one pair, not of a sequence's: leave it out")]
+    OneMotion,
     /// Not a sequence that is submitted whole.
     #[error("options: densify is for sequences that are submitted as jobs")]
     NoSequence,

@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::options::{InvalidOptions, JobOptions};
+use super::options::{EgoChoice, InvalidOptions, JobOptions};
 use crate::flow::densify::{Later, Plan, PlanError};
 
 /// All sweeps of a sequence, carried into one frame.
@@ -71,6 +71,17 @@ impl JobOptions {
         match self.densify {
             None => Ok(()),
             Some(_) => Err(InvalidOptions::NoSequence),
+        }
+    }
+
+    /// Refuses what a sequence of `frames` frames cannot have: one motion for several pairs.
+    ///
+    /// # Errors
+    /// [`InvalidOptions::OneMotion`].
+    pub fn check_for_sequence(&self, frames: usize) -> Result<(), InvalidOptions> {
+        match self.ego {
+            Some(EgoChoice::Given(_)) if frames > 2 => Err(InvalidOptions::OneMotion),
+            _ => Ok(()),
         }
     }
 

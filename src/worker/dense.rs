@@ -103,7 +103,7 @@ impl Worker {
             let read = move || {
                 let StoredCloud { points, ground } = StoredCloud::from_bytes(&bytes)?;
                 let sweep = Sweep { points, ground }.prepared(&solver_options);
-                Ok::<_, Damaged>(sweep)
+                Ok::<_, Damaged>(sweep.cropped(&solver_options))
             };
             let read = tokio::task::spawn_blocking(read).await;
             sweeps.push(read??);

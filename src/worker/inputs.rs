@@ -13,7 +13,7 @@ use super::Worker;
 use super::job_watch::JobWatch;
 use crate::blobs::{Blob, BlobError, Sync};
 use crate::clock::Timestamp;
-use crate::flow::{Ego, Field, SealError, Snapshot};
+use crate::flow::{Ego, Field, SealError, Snapshot, Sweep};
 use crate::job::{Job, JobOptions, State};
 use crate::payload::{Damaged, StoredCloud};
 use crate::queue::{Lease, QueueError};
@@ -75,8 +75,18 @@ impl Worker {
             // The motion that is known is from the earlier sweep to the later one.
             *target_from_source = target_from_source.inverse();
         }
+        let [source, target] = [source, target].map(|StoredCloud { points, ground }| {
+            let is_known = ground.is_some();
+            (Sweep { points, ground }, is_known)
+        });
+        // As a sequence does: where one sweep alone has its mask, the other's ground is found.
+        let prepared = |sweep: Sweep, other: bool| match sweep.ground {
+            None if other => sweep.prepared(&solver),
+            _ => sweep,
+        };
+        let (source, target) = (prepared(source.0, target.1), prepared(target.0, source.1));
         let work = super::Work {
-            options: solver,
+            options: solver.clone(),
             before,
             ground: source.ground.zip(target.ground).map(<[_; 2]>::from),
             source: source.points,

@@ -119,6 +119,7 @@ impl Reader {
         };
         let options = convert::options(begin.options)?;
         options.check_for_pairs()?;
+        options.check_for_sequence(usize::MAX)?;
         let mut current: Option<Coming> = None;
         loop {
             // A drive may pause for as long as it likes: only a dead connection ends it.

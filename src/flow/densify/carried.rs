@@ -1,18 +1,24 @@
 //! Points on their way from their own sweeps' frames to another. Knows fields, and no sequences.
 
-use super::all_moved;
-use crate::flow::backend::{Backend, BackendError};
+use super::{DensifyError, all_moved};
+use crate::flow::backend::Backend;
 use crate::flow::dense::DenseCloud;
 use crate::flow::field::Field;
 use crate::flow::loss::length;
 use crate::flow::points::{Point, RigidTransform};
 use crate::flow::sequence::Sweep;
 use crate::flow::solver::DYNAMIC_M;
+use crate::flow::watch::{self, Watch};
 
 /// An inverse has settled where its last correction is shorter than this, metres.
 const SETTLED_M: f32 = 0.01;
 /// Corrections of an inverse at most.
 const CORRECTIONS: usize = 20;
+
+/// Places farther than this from the frame's origin are none, metres.
+const FARTHEST_M: f32 = 1e6;
+/// Points between two looks at the watch: a tenth of a second of two cores.
+const PIECE: usize = 1 << 17;
 
 /// Points of several sweeps, all in one frame.
 #[derive(Default)]
@@ -29,7 +35,7 @@ impl Carried {
     /// Takes the finite points of the sweep whose frame this is.
     pub(super) fn take(&mut self, place: usize, sweep: &Sweep) {
         for (row, point) in sweep.points.iter().enumerate() {
-            if point.iter().all(|value| value.is_finite()) {
+            if is_place(*point) {
                 self.points.push(*point);
                 self.ground
                     .push(sweep.ground.as_ref().is_some_and(|ground| ground[row]));
@@ -43,13 +49,13 @@ impl Carried {
     /// Euler's step from the field's source frame to its target's, in parts.
     pub(super) fn step(
         &mut self,
-        backend: &dyn Backend,
+        by: By<'_>,
         field: &Field,
         substeps: usize,
-    ) -> Result<(), BackendError> {
+    ) -> Result<(), DensifyError> {
         self.points = field.static_places(&self.points);
         for _ in 0..substeps {
-            self.drift(backend, field, 1.0 / substeps as f32)?;
+            self.drift(by, field, 1.0 / substeps as f32)?;
         }
         Ok(())
     }
@@ -57,59 +63,58 @@ impl Carried {
     /// A step that ends after `share` of the time, still in the target's frame.
     pub(super) fn part_step(
         &mut self,
-        backend: &dyn Backend,
+        by: By<'_>,
         field: &Field,
         share: f64,
-    ) -> Result<(), BackendError> {
+    ) -> Result<(), DensifyError> {
         self.points = field.static_places(&self.points);
-        self.drift(backend, field, share as f32)
+        self.drift(by, field, share as f32)
     }
 
     /// Moves what moves of itself by `share` of what the field says where it is now.
-    fn drift(
-        &mut self,
-        backend: &dyn Backend,
-        field: &Field,
-        share: f32,
-    ) -> Result<(), BackendError> {
+    fn drift(&mut self, by: By<'_>, field: &Field, share: f32) -> Result<(), DensifyError> {
         let rows = self.movable();
         let places: Vec<Point> = rows.iter().map(|&row| self.points[row]).collect();
-        let residual = motion(backend, field, &places)?;
+        let residual = by.motion(field, &places)?;
         for (row, residual) in rows.into_iter().zip(residual) {
             if field.ego.is_some() && residual != [0.0; 3] {
                 self.dynamic[row] = true;
             }
             let place = self.points[row];
-            self.points[row] = core::array::from_fn(|a| place[a] + share * residual[a]);
+            let moved = core::array::from_fn(|a| place[a] + share * residual[a]);
+            if is_place(moved) {
+                self.points[row] = moved;
+            } else {
+                self.converged[row] = false;
+            }
         }
         Ok(())
     }
 
     /// From the field's target frame back to its source's: the fixed point of `z = y - g(z)` for
     /// each place y, where z is its static place.
-    pub(super) fn invert(
-        &mut self,
-        backend: &dyn Backend,
-        field: &Field,
-    ) -> Result<(), BackendError> {
+    pub(super) fn invert(&mut self, by: By<'_>, field: &Field) -> Result<(), DensifyError> {
         let mut rows = self.movable();
         let ends = self.points.clone();
         for _ in 0..CORRECTIONS {
             let places: Vec<Point> = rows.iter().map(|&row| self.points[row]).collect();
-            let residual = motion(backend, field, &places)?;
+            let residual = by.motion(field, &places)?;
             let mut unsettled = Vec::new();
             for (&row, residual) in rows.iter().zip(residual) {
                 let place: Point = core::array::from_fn(|a| ends[row][a] - residual[a]);
                 let correction = core::array::from_fn(|a| place[a] - self.points[row][a]);
                 self.points[row] = place;
-                if length(correction) >= SETTLED_M {
+                // Not the other way round: what is no number has not settled.
+                if !(length(correction) < SETTLED_M && is_place(place)) {
                     unsettled.push(row);
                 }
             }
             rows = unsettled;
         }
+        // What did not settle is left where it would be if it stood.
         for row in rows {
             self.converged[row] = false;
+            self.points[row] = ends[row];
         }
         if field.ego.is_some() {
             for (row, end) in ends.iter().enumerate() {
@@ -154,21 +159,35 @@ impl Carried {
     }
 }
 
-/// What the field moves at the static places, metres: nothing where that is less than counts as
-/// motion, so that the static world stands still. Without an ego motion the field moves that too,
-/// and all of it counts.
-fn motion(
-    backend: &dyn Backend,
-    field: &Field,
-    places: &[Point],
-) -> Result<Vec<Point>, BackendError> {
-    let mut residual = field.residual(backend, places)?;
-    if field.ego.is_some() {
-        for motion in &mut residual {
-            if length(*motion) < DYNAMIC_M {
-                *motion = [0.0; 3];
+/// What computes, and who looks in on it.
+#[derive(Clone, Copy)]
+pub(super) struct By<'a> {
+    pub(super) backend: &'a dyn Backend,
+    pub(super) watch: &'a dyn Watch,
+}
+
+impl By<'_> {
+    /// What the field moves at the static places, metres: nothing where that is less than counts as
+    /// motion, so that the static world stands still. Without an ego motion the field moves that too,
+    /// and all of it counts. Looks at the watch between pieces.
+    fn motion(self, field: &Field, places: &[Point]) -> Result<Vec<Point>, DensifyError> {
+        let mut residual = Vec::with_capacity(places.len());
+        for piece in places.chunks(PIECE) {
+            watch::check(self.watch).map_err(DensifyError::Interrupted)?;
+            residual.extend(field.residual(self.backend, piece)?);
+        }
+        if field.ego.is_some() {
+            for motion in &mut residual {
+                if length(*motion) < DYNAMIC_M {
+                    *motion = [0.0; 3];
+                }
             }
         }
+        Ok(residual)
     }
-    Ok(residual)
+}
+
+/// Whether a lidar could have measured something there.
+fn is_place(point: Point) -> bool {
+    point.iter().all(|value| value.abs() < FARTHEST_M)
 }

@@ -16,7 +16,7 @@ mod tests;
 
 pub use plan::{Later, Leg, Plan, PlanError};
 
-use carried::Carried;
+use carried::{By, Carried};
 
 use super::backend::{Backend, BackendError};
 use super::dense::DenseCloud;
@@ -51,7 +51,7 @@ pub enum DensifyError {
 }
 
 /// Carries the points of all `sweeps` as `plan` says, through the fields that `field` gives for each of
-/// [`Plan::legs`]. Points that are not finite are left out. A sweep's ground mask, where it has one,
+/// [`Plan::legs`]. Points that are not finite, or 1,000 km away, are left out. A sweep's ground mask, where it has one,
 /// names points that never move of themselves.
 ///
 /// # Errors
@@ -77,6 +77,7 @@ pub fn densify<'a>(
         let leg = Leg { source, target };
         field(leg).ok_or(DensifyError::NoField(leg))
     };
+    let by = By { backend, watch };
     let checked = || watch::check(watch).map_err(DensifyError::Interrupted);
 
     // Sweeps up to the anchor, forward.
@@ -85,7 +86,7 @@ pub fn densify<'a>(
     for (place, sweep) in sweeps[..=anchor].iter().enumerate() {
         checked()?;
         if place > 0 {
-            earlier.step(backend, field(place - 1, place)?, substeps)?;
+            earlier.step(by, field(place - 1, place)?, substeps)?;
         }
         earlier.take(place, sweep);
     }
@@ -100,8 +101,8 @@ pub fn densify<'a>(
         checked()?;
         if place + 1 < plan.sweeps {
             match plan.later {
-                Later::Reverse => later.step(backend, field(place + 1, place)?, substeps)?,
-                Later::Inverse => later.invert(backend, field(place, place + 1)?)?,
+                Later::Reverse => later.step(by, field(place + 1, place)?, substeps)?,
+                Later::Inverse => later.invert(by, field(place, place + 1)?)?,
             }
         }
         if place > anchor {
@@ -114,16 +115,16 @@ pub fn densify<'a>(
         let step = ahead.ego.unwrap_or_default();
         // The frame of the instant lies a share of the way, and of the turn, between the two sweeps'.
         let instant = part_of(&step, plan.fraction);
-        earlier.part_step(backend, ahead, plan.fraction)?;
+        earlier.part_step(by, ahead, plan.fraction)?;
         earlier.transform(&(instant * step.inverse()));
         match plan.later {
             Later::Reverse => {
                 let back = field(anchor + 1, anchor)?;
-                later.part_step(backend, back, 1.0 - plan.fraction)?;
+                later.part_step(by, back, 1.0 - plan.fraction)?;
             }
             Later::Inverse => {
-                later.invert(backend, ahead)?;
-                later.part_step(backend, ahead, plan.fraction)?;
+                later.invert(by, ahead)?;
+                later.part_step(by, ahead, plan.fraction)?;
                 later.transform(&step.inverse());
             }
         }

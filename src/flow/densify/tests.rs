@@ -144,6 +144,25 @@ fn what_a_field_says_below_the_threshold_of_motion_moves_nothing() {
 }
 
 #[test]
+fn what_a_field_sends_out_of_the_world_stays_and_says_so() {
+    let standing = Some(RigidTransform::identity());
+    for flow in [[f32::NAN, 0.0, 0.0], [2e6, 0.0, 0.0]] {
+        let wild = constant(standing, flow);
+        for later in [Later::Reverse, Later::Inverse] {
+            let plan = Plan::new(3, 1.0, later, 1).expect("a plan");
+            let sweeps = sweeps(3);
+            let cloud = dense(&plan, &sweeps, &wild, &wild).expect("a cloud");
+            for (row, &frame) in cloud.frame.iter().enumerate() {
+                let is_ground = row % 2 == 1;
+                let point = sweeps[frame as usize].points[if is_ground { 2 } else { 0 }];
+                assert_eq!(cloud.points[row], point, "{later:?}");
+                assert_eq!(cloud.converged[row], is_ground || frame == 1, "{later:?}");
+            }
+        }
+    }
+}
+
+#[test]
 fn missing_fields_and_sweeps_are_refused_by_name() {
     let backend = CpuBackend::new(Some(1)).expect("a thread");
     let plan = Plan::new(3, 1.0, Later::Reverse, 1).expect("a plan");

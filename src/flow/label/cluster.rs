@@ -142,6 +142,8 @@ impl<'a> Cells<'a> {
         let mut keyed: Vec<(u64, u32)> = points
             .iter()
             .zip(0..)
+            // What is out of reach belongs to nothing.
+            .filter(|(point, _)| point.iter().all(|c| (c / side_m).abs() < REACH))
             .map(|(&point, row)| (key(point, side_m), row))
             .collect();
         keyed.par_sort_unstable();
@@ -185,12 +187,13 @@ impl<'a> Cells<'a> {
                 && other <= row + 4
             {
                 let end = self.columns[at + 1].1;
-                for cell in begin..end {
-                    let height = self.cells[cell as usize].0 & ((1 << HEIGHT) - 1);
-                    if height + 2 >= z && height <= z + 2 {
-                        found.push(cell as usize);
-                    }
-                }
+                let begin = begin as usize;
+                let cells = &self.cells[begin..end as usize];
+                let height = |key: u64| key & ((1 << HEIGHT) - 1);
+                let low = cells.partition_point(|&(key, _)| height(key) + 2 < z);
+                let near = cells[low..].iter();
+                let near = near.take_while(|&&(key, _)| height(key) <= z + 2).count();
+                found.extend(begin + low..begin + low + near);
                 at += 1;
             }
         }
@@ -300,6 +303,17 @@ mod tests {
                 assert!(found[i] == NOISE || beside.contains(&found[i]), "{i}");
             }
         }
+    }
+
+    #[test]
+    fn a_pole_of_many_cells_and_points_out_of_reach_take_no_longer_than_others() {
+        // A column of 200,000 cells: looked through for each of them they would be 4e10.
+        let mut points: Vec<Point> = (0..200_000).map(|i| [1.0, 2.0, i as f32 * 0.3]).collect();
+        // And as many points in what would be the last cell.
+        points.extend((0..200_000).map(|i| [9e5, 9e5, i as f32 * 0.5]));
+        let found = clusters(&points, 0.5, 2);
+        assert!(found[..200_000].iter().all(|&label| label == 0));
+        assert!(found[200_000..].iter().all(|&label| label == NOISE));
     }
 
     #[test]

@@ -3,6 +3,8 @@
 //! A place moves with the source point nearest to it: with its mover, or not at all. It must not
 //! know how movers were found.
 
+use rayon::prelude::*;
+
 use super::cluster::NOISE;
 use super::motion::Motion;
 use super::near::Near;
@@ -60,7 +62,10 @@ impl Motions {
     /// explains: metres, in the target's frame, at places in the source's frame with the ego motion
     /// taken out. They need not be the source's own.
     pub fn residual_at(&self, places: &[Point]) -> Vec<Point> {
-        places.iter().map(|&place| self.residual(place)).collect()
+        places
+            .par_iter()
+            .map(|&place| self.residual(place))
+            .collect()
     }
 
     fn residual(&self, place: Point) -> Point {

@@ -9,8 +9,6 @@ use crate::flow::Point;
 
 /// Columns along an axis on each side of the origin; what is farther is found nowhere.
 const REACH: f32 = (1 << 30) as f32;
-/// No column has this key.
-const NO_COLUMN: u64 = u64::MAX;
 
 /// A cloud by place.
 #[derive(Debug)]
@@ -33,12 +31,12 @@ impl Near {
             .collect();
         keyed.sort_unstable_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)).then(a.2.cmp(&b.2)));
         let columns = keyed.chunk_by(|a, b| a.0 == b.0).count();
-        let mut table = vec![(NO_COLUMN, 0..0); (columns * 2 + 1).next_power_of_two()];
+        let mut table = vec![(0, 0..0); (columns * 2 + 1).next_power_of_two()];
         let mut begin = 0;
         for column in keyed.chunk_by(|a, b| a.0 == b.0) {
             let end = begin + column.len() as u32;
             let mut slot = hash(column[0].0) as usize & (table.len() - 1);
-            while table[slot].0 != NO_COLUMN {
+            while !table[slot].1.is_empty() {
                 slot = (slot + 1) & (table.len() - 1);
             }
             table[slot] = (column[0].0, begin..end);
@@ -136,11 +134,12 @@ impl Near {
         let mut slot = hash(key) as usize & (self.table.len() - 1);
         loop {
             let (found, Range { start, end }) = &self.table[slot];
+            // No column is empty: this place is vacant.
+            if start == end {
+                return 0..0;
+            }
             if *found == key {
                 return *start as usize..*end as usize;
-            }
-            if *found == NO_COLUMN {
-                return 0..0;
             }
             slot = (slot + 1) & (self.table.len() - 1);
         }

@@ -49,9 +49,9 @@ impl Ballot {
                 self.half as f32 * self.bin_m,
                 self.within_m,
                 |other| {
-                    let [x, y] =
-                        [0, 1].map(|a| ((other[a] - point[a]) / self.bin_m).round() as i32);
-                    if x.abs() <= self.half && y.abs() <= self.half {
+                    let shift = [0, 1].map(|a| ((other[a] - point[a]) / self.bin_m).round());
+                    if shift.iter().all(|bins| bins.abs() <= self.half as f32) {
+                        let [x, y] = shift.map(|bins| bins as i32);
                         let bin = ((y + self.half) * side + x + self.half) as usize;
                         // A point has one vote for a shift, however dense the target.
                         if last[bin] != voter {

@@ -1,0 +1,174 @@
+//! Sequences and dense clouds from the command line.
+
+use std::path::Path;
+
+use fnsf::formats::{read_cloud, read_depth_png, read_flow};
+
+use super::program::{fnsf, json};
+
+const SWEEPS: [&str; 4] = [
+    "street/frame_0000.pcd",
+    "street/frame_0001.pcd",
+    "street/frame_0002.pcd",
+    "street/frame_0003.pcd",
+];
+const CAMERA: &str = r#"{"width": 310, "height": 94, "k": [[180, 0, 155], [0, 180, 47], [0, 0, 1]],
+    "camera_from_lidar": [[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]}"#;
+
+fn street(folder: &Path) {
+    let ended = fnsf(
+        folder,
+        &["synth", "-o", "street", "--beams", "16", "--frames", "4"],
+    );
+    assert_eq!(ended.code, 0, "{}", ended.stderr);
+}
+
+#[test]
+fn the_flows_of_a_sequence_are_numbered_and_the_first_is_that_of_its_pair_alone() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder);
+    let of = |sweeps: &[&str], out: &str| {
+        let options = ["--device", "cpu", "-o", out];
+        let arguments = [&["flow"], sweeps, &options].concat();
+        let done = fnsf(folder, &arguments);
+        assert_eq!(done.code, 0, "{}", done.stderr);
+    };
+    of(&SWEEPS, "all.npz");
+    of(&SWEEPS[..2], "first.npz");
+    let read = |name: &str| {
+        let bytes = std::fs::read(folder.join(name)).expect("written");
+        read_flow(&bytes, Some(name)).expect("a flow").flow
+    };
+    assert_eq!(read("all_0000.npz"), read("first.npz"));
+    for (k, sweep) in SWEEPS[..3].iter().enumerate() {
+        let bytes = std::fs::read(folder.join(sweep)).expect("written");
+        let points = read_cloud(&bytes, Some(sweep)).expect("a cloud").points;
+        assert_eq!(read(&format!("all_{k:04}.npz")).len(), points.len());
+    }
+    assert!(!folder.join("all_0003.npz").exists());
+}
+
+#[test]
+fn a_dense_cloud_has_every_point_and_shows_more_than_one_sweep_through_a_camera() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder);
+    std::fs::write(folder.join("camera.json"), CAMERA).expect("written");
+    for (into, preset, out) in [
+        ("2", "default", "dense.ply"),
+        ("1.5", "label", "dense.npz"),
+        ("0", "label", "dense.pcd"),
+    ] {
+        let options = [
+            "--into",
+            into,
+            "--preset",
+            preset,
+            "--device",
+            "cpu",
+            "-o",
+            out,
+            "--camera",
+            "camera.json",
+            "--depth",
+            "depth.png",
+            "--picture",
+            "look.png",
+            "--json",
+        ];
+        let report = json(folder, &[&["densify"], &SWEEPS[..], &options].concat());
+        let bytes = std::fs::read(folder.join(out)).expect("written");
+        let points = read_cloud(&bytes, Some(out)).expect("a cloud").points;
+        assert_eq!(report["points"], points.len());
+        let all: usize = SWEEPS
+            .iter()
+            .map(|sweep| {
+                let bytes = std::fs::read(folder.join(sweep)).expect("written");
+                read_cloud(&bytes, Some(sweep))
+                    .expect("a cloud")
+                    .points
+                    .len()
+            })
+            .sum();
+        assert_eq!(points.len(), all);
+        let [sparse, dense] = [0, 1].map(|k| report["depth_density"][k].as_f64().expect("a share"));
+        assert!(dense > 2.0 * sparse, "{sparse} {dense}");
+        let depth = std::fs::read(folder.join("depth.png")).expect("written");
+        let depth = read_depth_png(&depth).expect("KITTI's png");
+        assert!((depth.density() - dense).abs() < 1e-9);
+    }
+    let cropped = [
+        "--into",
+        "1",
+        "--range-m",
+        "20",
+        "--device",
+        "cpu",
+        "-o",
+        "near.ply",
+    ];
+    let done = fnsf(folder, &[&["densify"], &SWEEPS[..], &cropped].concat());
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    let bytes = std::fs::read(folder.join("near.ply")).expect("written");
+    let points = read_cloud(&bytes, Some("near.ply"))
+        .expect("a cloud")
+        .points;
+    // What was in range of its own sweep, carried two metres at most.
+    assert!(
+        points
+            .iter()
+            .all(|[x, y, _]| x.abs() < 25.0 && y.abs() < 25.0)
+    );
+}
+
+#[test]
+fn what_no_sequence_can_be_asked_is_refused_with_advice() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder);
+    let poses = "1 0 0 0 0 1 0 0 0 0 1 0\n";
+    std::fs::write(folder.join("poses.txt"), poses).expect("written");
+    let ego = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n";
+    std::fs::write(folder.join("ego.txt"), ego).expect("written");
+    let [a, b, c, _] = SWEEPS;
+    let refused: [(&[&str], i32, &str); 6] = [
+        (
+            &["densify", a, b, "--into", "2", "-o", "x.ply"],
+            2,
+            "0 to 1",
+        ),
+        (&["densify", a, b, "--into", "0", "-o", "x.obj"], 2, ".laz"),
+        (
+            &["flow", a, b, c, "--ego", "ego.txt", "--json"],
+            2,
+            "--poses",
+        ),
+        (&["flow", a, b, c, "--ground", "mask", "--json"], 2, "auto"),
+        (
+            &[
+                "flow",
+                "street/pair_0000.npz",
+                "--poses",
+                "poses.txt",
+                "--json",
+            ],
+            2,
+            "--ego FILE",
+        ),
+        (
+            &["flow", a, b, c, "--poses", "poses.txt", "--json"],
+            65,
+            "poses",
+        ),
+    ];
+    for (arguments, code, advice) in refused {
+        let ended = fnsf(folder, arguments);
+        assert_eq!(ended.code, code, "{arguments:?}: {}", ended.stderr);
+        assert!(
+            ended.stderr.contains(advice),
+            "{arguments:?}: {}",
+            ended.stderr
+        );
+    }
+}
