@@ -18,15 +18,21 @@ use std::time::Instant;
 use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::densify::{Later, Leg, Plan, densify};
+use fnsf::flow::depth::{Camera, Intrinsics, Occlusion, project};
 use fnsf::flow::distance::{DistanceOptions, Sites};
 use fnsf::flow::ground::{GroundOptions, segment};
 use fnsf::flow::simulate::{Frame, Street, StreetOptions};
-use fnsf::flow::{DenseCloud, Field, Point, Preset, Residual, Sequence, Sweep, Unwatched};
+use fnsf::flow::{
+    DenseCloud, Field, Point, Preset, Residual, RigidTransform, Sequence, Sweep, Unwatched,
+};
 use fnsf::formats::read_cloud;
 
 /// Sweeps of a simulated drive, and the one that all are carried into.
 const FRAMES: usize = 11;
 const INTO: usize = 5;
+
+/// Simulated drives.
+const STREETS: u64 = 4;
 
 type Fields = BTreeMap<Leg, Field>;
 
@@ -99,7 +105,12 @@ fn mean(values: impl Iterator<Item = f64>) -> f64 {
 }
 
 /// One row for each age: mean error of movers and of the rest, metres.
-fn simulated(backend: &CpuBackend, seed: u64, rows: &mut Vec<[f64; 7]>) -> anyhow::Result<()> {
+fn simulated(
+    backend: &CpuBackend,
+    seed: u64,
+    rows: &mut Vec<[f64; 7]>,
+    depths: &mut [[f64; 4]; 3],
+) -> anyhow::Result<()> {
     let street = Street::new(&StreetOptions {
         seed,
         frames: FRAMES,
@@ -156,7 +167,41 @@ fn simulated(backend: &CpuBackend, seed: u64, rows: &mut Vec<[f64; 7]>) -> anyho
         first += count;
     }
     anyhow::ensure!(first == clouds[0].points.len(), "no point is lost");
+    let (camera, truth) = (camera()?, street.depth(INTO, &camera()?)?);
+    let own = project(&sweeps[INTO].points, &camera);
+    let seen = [&clouds[0], &clouds[1]].map(|cloud| project(&cloud.points, &camera));
+    for (sum, image) in depths.iter_mut().zip([&own, &seen[0], &seen[1]]) {
+        let image = image.without_hidden(&Occlusion::of(&camera));
+        let errors = image.errors(&truth)?;
+        let row = [
+            image.density(),
+            errors.mean_m,
+            errors.rmse_m,
+            errors.within_5_percent,
+        ];
+        for (sum, value) in sum.iter_mut().zip(row) {
+            *sum += value / STREETS as f64;
+        }
+    }
     Ok(())
+}
+
+/// A camera like KITTI's: 1242 x 375 pixels, 6 cm beside, 8 cm below and 27 cm before the lidar.
+fn camera() -> anyhow::Result<Camera> {
+    let intrinsics = Intrinsics {
+        fx: 721.5,
+        fy: 721.5,
+        cx: 609.6,
+        cy: 172.9,
+    };
+    // The lidar's x, y, z are the camera's z, -x, -y.
+    let axes = nalgebra::Matrix3::new(0.0, -1.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0, 0.0);
+    let rotation = nalgebra::Rotation3::from_matrix_unchecked(axes);
+    let camera_from_lidar = RigidTransform::from_parts(
+        [0.06, -0.08, -0.27].into(),
+        nalgebra::UnitQuaternion::from_rotation_matrix(&rotation),
+    );
+    Ok(Camera::new(intrinsics, camera_from_lidar, [1242, 375])?)
 }
 
 /// Where the points of a sweep begin in a cloud.
@@ -233,9 +278,20 @@ fn main() -> anyhow::Result<()> {
     if !paths.is_empty() {
         real(&backend, &paths)?;
     }
-    let mut rows = Vec::new();
-    for seed in 0..4 {
-        simulated(&backend, seed, &mut rows)?;
+    let (mut rows, mut depths) = (Vec::new(), [[0.0; 4]; 3]);
+    for seed in 0..STREETS {
+        simulated(&backend, seed, &mut rows, &mut depths)?;
+    }
+    println!("| depth of | pixels | mean error, m | RMSE, m | within 5 % |");
+    println!("|---|---|---|---|---|");
+    let names = [
+        "its own sweep",
+        "all, by ego motion alone",
+        "all, by the fields",
+    ];
+    for (name, [density, mean, rmse, within]) in names.into_iter().zip(depths) {
+        let [density, within] = [density, within].map(|share| 100.0 * share);
+        println!("| {name} | {density:.1} % | {mean:.2} | {rmse:.2} | {within:.1} % |");
     }
     println!(
         "| age | movers: ego motion alone, m | reverse fields, m | inverse fields, m | static: ego motion alone, m | reverse, m | inverse, m |"
