@@ -6,7 +6,8 @@ use super::{LANES, clouds, shared};
 use crate::flow::backend::Backend;
 use crate::flow::cpu::CpuBackend;
 use crate::flow::early_stop::EarlyStop;
-use crate::flow::options::{Options, Preset};
+use crate::flow::field::Field;
+use crate::flow::options::{Ground, Options, Preset};
 use crate::flow::points::Point;
 use crate::flow::preprocess::Problem;
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
@@ -87,6 +88,33 @@ fn the_card_finds_the_cpus_flow() {
         let error = (ours.1 - theirs.1).abs();
         assert!(error < ERROR_M, "{preset:?}: {} {}", ours.1, theirs.1);
         assert_eq!(ours.0.iterations, theirs.0.iterations, "{preset:?}");
+    }
+}
+
+#[test]
+fn a_field_that_was_kept_says_on_the_card_what_its_run_said_and_on_the_cpu_about_that() {
+    // Metres: single precision through nine layers, summed in another order.
+    const ROUNDING_M: f32 = 1e-3;
+    let Some(gpu) = shared() else {
+        return;
+    };
+    let pair = street(2);
+    let mut options = Preset::Default.options(None);
+    options.max_iterations = 8;
+    options.ground = Ground::Keep;
+    let estimate = solved(gpu, &pair, &options);
+    let field = Field::from_bytes(&estimate.field.to_bytes()).expect("sound bytes");
+    let places = field.static_places(&pair.source);
+    let there = field.residual(gpu, &places).expect("flows");
+    for (row, (residual, place)) in there.iter().zip(&places).enumerate() {
+        let from = pair.source[row];
+        let flow: Point = core::array::from_fn(|a| (place[a] - from[a]) + residual[a]);
+        assert_eq!(flow, estimate.flow[row], "row {row}");
+    }
+    let cpu = CpuBackend::new(Some(2)).expect("threads");
+    let here = field.residual(&cpu, &places).expect("flows");
+    for (there, here) in there.iter().zip(&here) {
+        assert!((0..3).all(|a| (there[a] - here[a]).abs() < ROUNDING_M));
     }
 }
 
