@@ -18,10 +18,11 @@ use crate::payload::StoredDense;
 use crate::queue::PairOf;
 
 /// Bytes that are held for a point while it is carried and written, at most: itself in its sweep and
-/// in the cloud, its masks, where it was before a step, and the cloud's bytes.
-const POINT_BYTES: usize = 160;
+/// in the cloud, its masks, where it was before a step, the cloud's bytes, and its share of a field
+/// of objects: itself in it, read and unpacked.
+const POINT_BYTES: usize = 240;
 
-/// Bytes that are held for a field: read, and unpacked.
+/// Bytes that are held for a field of a network: read, and unpacked.
 const FIELD_BYTES: usize = 1 << 20;
 
 /// How often an inverse asks its field about a point, usually.

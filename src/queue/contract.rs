@@ -67,6 +67,7 @@ macro_rules! queue_contract {
             a_chain_goes_on_behind_a_member_that_fails_is_cancelled_or_expires,
             a_chain_is_cancelled_whole_and_asked_for_again_in_its_order,
             a_chain_survives_a_crash_in_its_order,
+            what_is_left_of_a_sequence_counts_in_its_tenants_share,
             chains_go_side_by_side_and_leave_other_tenants_their_share,
             what_others_come_after_is_kept_until_they_have_ended,
             a_sequence_with_something_left_to_do_is_leased_when_its_pairs_have_succeeded,

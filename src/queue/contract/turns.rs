@@ -266,6 +266,29 @@ pub(crate) async fn a_sequence_with_something_left_to_do_is_leased_when_its_pair
     assert_eq!(ends, 1);
 }
 
+pub(crate) async fn what_is_left_of_a_sequence_counts_in_its_tenants_share(stand: &mut impl Stand) {
+    let (queue, _events) = stand.open(QueueOptions::default());
+    let job = submit(&queue, closing()).await;
+    for _ in 0..4 {
+        finish_next(&queue).await;
+    }
+    // Five seconds of it wait: as much as five pairs.
+    let own = Submission {
+        tenant: job.tenant.clone(),
+        ..submission("a")
+    };
+    let own = submit(&queue, own).await;
+    for _ in 0..4 {
+        submit(&queue, submission("b")).await;
+    }
+    let mut order = Vec::new();
+    for _ in 0..6 {
+        order.push(finish_next(&queue).await.id);
+    }
+    assert_eq!(order.last(), Some(&own.id));
+    assert!(order.contains(&job.id));
+}
+
 pub(crate) async fn what_is_left_of_a_sequence_survives_crashes_and_is_retried_cancelled_and_asked_for_again(
     stand: &mut impl Stand,
 ) {

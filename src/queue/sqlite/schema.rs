@@ -68,7 +68,8 @@ CREATE UNIQUE INDEX jobs_key ON jobs (tenant, idempotency_key) WHERE idempotency
 CREATE INDEX jobs_ready ON jobs (device, priority DESC, virtual_start, seq)
     WHERE state = 0 AND ready IS NOT NULL AND delayed = 0;
 CREATE INDEX jobs_running ON jobs (priority, virtual_start) WHERE state = 1 AND ready IS NOT NULL;
-CREATE INDEX jobs_tail ON jobs (tenant, priority, virtual_finish) WHERE state < 2 AND kind = 0;
+CREATE INDEX jobs_tail ON jobs (tenant, priority, virtual_finish)
+    WHERE state < 2 AND (kind = 0 OR ready IS NOT NULL);
 CREATE INDEX jobs_due ON jobs (due) WHERE due IS NOT NULL;
 CREATE INDEX jobs_after ON jobs (after) WHERE after IS NOT NULL AND state < 2;
 CREATE INDEX jobs_age ON jobs (ready) WHERE state = 0 AND ready IS NOT NULL;

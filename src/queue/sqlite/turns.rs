@@ -24,7 +24,8 @@ pub(super) fn virtual_start(
 ) -> Result<f64, QueueError> {
     let served = virtual_now(connection, priority)?;
     let sql = "SELECT max(virtual_finish) FROM jobs INDEXED BY jobs_tail \
-               WHERE state < 2 AND kind = 0 AND tenant = ?1 AND priority = ?2";
+               WHERE state < 2 AND (kind = 0 OR ready IS NOT NULL) AND tenant = ?1 \
+               AND priority = ?2";
     let own: Option<f64> = connection
         .prepare_cached(sql)?
         .query_row(params![tenant.as_str(), priority_code(priority)], |row| {
