@@ -15,7 +15,7 @@ use super::terminal::Terminal;
 use crate::flow::densify::{DensifyError, Leg, densify};
 use crate::flow::depth::{Camera, DepthImage, Occlusion, project};
 use crate::flow::{DenseCloud, Field, Point, Sequence, Sweep, Watch};
-use crate::formats::{DenseFormat, write_dense, write_depth_png};
+use crate::formats::{DenseFormat, FormatError, write_dense, write_depth_png};
 use crate::job::{self, LaterChoice};
 use crate::picture::{self, DepthPanel};
 use crate::text::grouped;
@@ -199,9 +199,15 @@ impl Densify {
         let occlusion = Occlusion::of(camera);
         let dense: DepthImage = project(&trusted, camera).without_hidden(&occlusion);
         if let Some(path) = &self.depth {
+            let mut dropped = 0;
             files::write(path, |file| {
-                write_depth_png(&dense, file).map(|_dropped| ())
+                dropped = write_depth_png(&dense, file)?;
+                Ok::<_, FormatError>(())
             })?;
+            if dropped > 0 {
+                let count = grouped(dropped);
+                eprintln!("fnsf: warning: {count} pixels are farther than a depth image can say");
+            }
         }
         if let Some(path) = &self.picture {
             let panel = |title, image| DepthPanel { title, image };
