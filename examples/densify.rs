@@ -12,20 +12,22 @@
     reason = "the tables are the answer of this program"
 )]
 
+#[path = "common/camera.rs"]
+mod look;
+
 use std::collections::BTreeMap;
 use std::time::Instant;
 
 use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::densify::{Later, Leg, Plan, densify};
-use fnsf::flow::depth::{Camera, Intrinsics, Occlusion, project};
+use fnsf::flow::depth::{Occlusion, project};
 use fnsf::flow::distance::{DistanceOptions, Sites};
 use fnsf::flow::ground::{GroundOptions, segment};
 use fnsf::flow::simulate::{Frame, Street, StreetOptions};
-use fnsf::flow::{
-    DenseCloud, Field, Point, Preset, Residual, RigidTransform, Sequence, Sweep, Unwatched,
-};
+use fnsf::flow::{DenseCloud, Field, Point, Preset, Residual, Sequence, Sweep, Unwatched};
 use fnsf::formats::read_cloud;
+use look::camera;
 
 /// Sweeps of a simulated drive, and the one that all are carried into.
 const FRAMES: usize = 11;
@@ -167,7 +169,8 @@ fn simulated(
         first += count;
     }
     anyhow::ensure!(first == clouds[0].points.len(), "no point is lost");
-    let (camera, truth) = (camera()?, street.depth(INTO, &camera()?)?);
+    let camera = camera()?;
+    let truth = street.depth(INTO, &camera)?;
     let own = project(&sweeps[INTO].points, &camera);
     let seen = [&clouds[0], &clouds[1]].map(|cloud| project(&cloud.points, &camera));
     for (sum, image) in depths.iter_mut().zip([&own, &seen[0], &seen[1]]) {
@@ -184,24 +187,6 @@ fn simulated(
         }
     }
     Ok(())
-}
-
-/// A camera like KITTI's: 1242 x 375 pixels, 6 cm beside, 8 cm below and 27 cm before the lidar.
-fn camera() -> anyhow::Result<Camera> {
-    let intrinsics = Intrinsics {
-        fx: 721.5,
-        fy: 721.5,
-        cx: 609.6,
-        cy: 172.9,
-    };
-    // The lidar's x, y, z are the camera's z, -x, -y.
-    let axes = nalgebra::Matrix3::new(0.0, -1.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0, 0.0);
-    let rotation = nalgebra::Rotation3::from_matrix_unchecked(axes);
-    let camera_from_lidar = RigidTransform::from_parts(
-        [0.06, -0.08, -0.27].into(),
-        nalgebra::UnitQuaternion::from_rotation_matrix(&rotation),
-    );
-    Ok(Camera::new(intrinsics, camera_from_lidar, [1242, 375])?)
 }
 
 /// Where the points of a sweep begin in a cloud.

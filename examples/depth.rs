@@ -4,11 +4,15 @@
 //! and its filter, not the flow. With an argument, the picture goes to that file.
 #![expect(clippy::print_stdout, reason = "the table is the program's purpose")]
 
-use fnsf::flow::depth::{Camera, Intrinsics, Occlusion, project};
+#[path = "common/camera.rs"]
+mod look;
+
+use fnsf::flow::Point;
+use fnsf::flow::depth::{Occlusion, project};
 use fnsf::flow::simulate::{Street, StreetOptions};
-use fnsf::flow::{Point, RigidTransform};
 use fnsf::picture::{DepthPanel, depth_panels, write_png};
-use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion};
+use look::camera;
+use nalgebra::Point3;
 
 const SWEEPS: [usize; 4] = [1, 3, 10, 20];
 const SEEDS: u64 = 4;
@@ -68,20 +72,6 @@ fn main() -> anyhow::Result<()> {
         write_png(&depth_panels(&panels), std::fs::File::create(path)?)?;
     }
     Ok(())
-}
-
-/// A camera like KITTI's: 1242 x 375 pixels, 6 cm beside, 8 cm below and 27 cm before the lidar.
-fn camera() -> anyhow::Result<Camera> {
-    let intrinsics = Intrinsics {
-        fx: 721.5,
-        fy: 721.5,
-        cx: 609.6,
-        cy: 172.9,
-    };
-    let turn = Matrix3::new(0.0, -1.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0, 0.0);
-    let turn = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(turn));
-    let mount = RigidTransform::from_parts([0.06, -0.08, -0.27].into(), turn);
-    Ok(Camera::new(intrinsics, mount, [1242, 375])?)
 }
 
 /// One sweep, and of all others the points of what stands still, in its frame.

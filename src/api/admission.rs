@@ -135,7 +135,7 @@ impl Admission {
         let points = source.points.len().max(target.points.len());
         let mut options = options.solver_options(points);
         if let Some(warm_start) = options.warm_start.filter(|_| goes_on) {
-            options.max_iterations = warm_start.max_iterations.min(options.max_iterations);
+            options = options.warmed(warm_start);
         }
         let price = flow::price(&problem, &options).map_err(|error| {
             if error.is_input() {

@@ -18,6 +18,11 @@ pub(crate) fn evenly(points: &[Point], most: usize) -> Vec<Point> {
     (0..kept).map(|i| points[i * points.len() / kept]).collect()
 }
 
+/// All points, moved rigidly.
+pub(crate) fn all_moved(motion: &RigidTransform, points: &[Point]) -> Vec<Point> {
+    points.iter().map(|&point| moved(motion, point)).collect()
+}
+
 /// Fewer points than this in a cloud determine no motion.
 pub const MIN_POINTS: usize = 3;
 

@@ -35,9 +35,7 @@ impl Sweep {
         }
         self
     }
-}
 
-impl Sweep {
     /// The points alone that `options` let take part in a dense cloud: those in range.
     #[must_use]
     pub fn cropped(self, options: &Options) -> Self {

@@ -10,7 +10,7 @@ use super::field::{Field, Network, Residual};
 use super::label::Labelled;
 use super::loss::length;
 use super::options::{Ego, Options, Precision};
-use super::points::{Point, RigidTransform, moved};
+use super::points::{Point, RigidTransform, all_moved, moved};
 use super::preprocess::{self, Problem, Selection};
 use super::snapshot::{Snapshot, TrainerState};
 use super::warm_start::warm_start;
@@ -144,11 +144,7 @@ fn solve(
     };
     let aligned = match &ego {
         None => selection.source.clone(),
-        Some(motion) => selection
-            .source
-            .iter()
-            .map(|&point| moved(motion, point))
-            .collect(),
+        Some(motion) => all_moved(motion, &selection.source),
     };
     if watch.interrupt() == Some(Interrupt::Cancelled) {
         return Err(FlowError::Cancelled);
@@ -265,9 +261,7 @@ impl Fitted {
             precomputed: watch.seconds(),
         }
     }
-}
 
-impl Fitted {
     /// The motion of every point of `aligned` that moves with an object.
     fn of_movers(
         labelled: Labelled,

@@ -1,11 +1,11 @@
 //! Points on their way from their own sweeps' frames to another. Knows fields, and no sequences.
 
-use super::{DensifyError, all_moved};
+use super::DensifyError;
 use crate::flow::backend::Backend;
 use crate::flow::dense::DenseCloud;
 use crate::flow::field::Field;
 use crate::flow::loss::length;
-use crate::flow::points::{Point, RigidTransform};
+use crate::flow::points::{Point, RigidTransform, all_moved};
 use crate::flow::sequence::Sweep;
 use crate::flow::solver::DYNAMIC_M;
 use crate::flow::watch::{self, Watch};

@@ -21,7 +21,7 @@ use carried::{By, Carried};
 use super::backend::{Backend, BackendError};
 use super::dense::DenseCloud;
 use super::field::Field;
-use super::points::{Point, RigidTransform, moved};
+use super::points::RigidTransform;
 use super::sequence::Sweep;
 use super::watch::{self, Interrupt, Watch};
 
@@ -136,9 +136,4 @@ pub fn densify<'a>(
 /// The part of a rigid motion that is done after `share` of its time.
 fn part_of(motion: &RigidTransform, share: f64) -> RigidTransform {
     RigidTransform::identity().lerp_slerp(motion, share)
-}
-
-/// All points, moved rigidly.
-fn all_moved(motion: &RigidTransform, points: &[Point]) -> Vec<Point> {
-    points.iter().map(|&point| moved(motion, point)).collect()
 }

@@ -4,6 +4,7 @@ use super::*;
 use crate::flow::cpu::CpuBackend;
 use crate::flow::field::mlp::{Conditioning, Parameters, last_layer};
 use crate::flow::field::{Network, Residual};
+use crate::flow::points::{Point, moved};
 use crate::flow::watch::Unwatched;
 
 /// Metres: single precision of coordinates of some metres.

@@ -10,7 +10,7 @@ use std::sync::Arc;
 
 use super::backend::{Backend, BackendError};
 use super::label::Motions;
-use super::points::{Point, RigidTransform, moved};
+use super::points::{Point, RigidTransform, all_moved};
 
 /// The motion of everything between two sweeps, at any point: where a point of the source is at the
 /// target's time, in the target's frame.
@@ -38,7 +38,7 @@ impl Field {
     pub fn static_places(&self, points: &[Point]) -> Vec<Point> {
         match &self.ego {
             None => points.to_vec(),
-            Some(motion) => points.iter().map(|&point| moved(motion, point)).collect(),
+            Some(motion) => all_moved(motion, points),
         }
     }
 

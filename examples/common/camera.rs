@@ -1,0 +1,19 @@
+//! The camera that the examples look through.
+
+use fnsf::flow::RigidTransform;
+use fnsf::flow::depth::{Camera, Intrinsics};
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
+
+/// A camera like KITTI's: 1242 x 375 pixels, 6 cm beside, 8 cm below and 27 cm before the lidar.
+pub(crate) fn camera() -> anyhow::Result<Camera> {
+    let intrinsics = Intrinsics {
+        fx: 721.5,
+        fy: 721.5,
+        cx: 609.6,
+        cy: 172.9,
+    };
+    let turn = Matrix3::new(0.0, -1.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0, 0.0);
+    let turn = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(turn));
+    let mount = RigidTransform::from_parts([0.06, -0.08, -0.27].into(), turn);
+    Ok(Camera::new(intrinsics, mount, [1242, 375])?)
+}
