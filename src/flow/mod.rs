@@ -45,6 +45,10 @@ pub mod field;
 mod label;
 mod loss;
 
+// What is said of a sweep's points besides.
+mod bounds;
+mod objects;
+
 // What carries no motion of its own.
 pub mod ground;
 
@@ -71,10 +75,12 @@ pub mod simulate;
 #[cfg(test)]
 mod reference;
 
+pub use bounds::Bounds;
 pub use dense::DenseCloud;
 pub use error::FlowError;
 pub use field::{Field, Network, Residual};
-pub use label::{Labelled, Motions};
+pub use label::{Evidence, Labelled, Motions, Parts, SURE_M, confidence_of_ground};
+pub use objects::{Cluster, Objects};
 pub use options::*;
 pub use points::{MIN_POINTS, Point, RigidTransform};
 pub use preprocess::Problem;

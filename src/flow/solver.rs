@@ -7,8 +7,9 @@ use super::backend::{Advance, Backend, BackendError, Report};
 use super::deadline::{self, Loop, Pace, Prepared};
 use super::error::FlowError;
 use super::field::{Field, Network, Residual};
-use super::label::Labelled;
+use super::label::{Labelled, confidence_of_ground};
 use super::loss::length;
+use super::objects::Objects;
 use super::options::{Ego, Options, Precision};
 use super::points::{Point, RigidTransform, all_moved, moved};
 use super::preprocess::{self, Problem, Selection};
@@ -33,6 +34,9 @@ pub struct Estimate {
     /// N flags, where the ego motion is known: which points move at least [`DYNAMIC_M`] against
     /// the static world.
     pub dynamic: Option<Vec<bool>>,
+    /// What the points are parts of and how sure their motion is, where movers are found object by
+    /// object.
+    pub objects: Option<Objects>,
     /// The ego motion as target_from_source, where it was given or estimated.
     pub ego: Option<RigidTransform>,
     /// Points that took part.
@@ -149,6 +153,7 @@ fn solve(
     if watch.interrupt() == Some(Interrupt::Cancelled) {
         return Err(FlowError::Cancelled);
     }
+    let mut objects = None;
     let fitted = match (&options.label, &prepared) {
         (Some(_), _) if options.precision != Precision::F32 => {
             let text = "movers are found in single precision alone";
@@ -157,6 +162,13 @@ fn solve(
         (Some(label), _) => {
             let precomputed = watch.seconds();
             let labelled = backend.movers(&aligned, &selection.target, label, watch);
+            objects = Some(Objects::new(
+                problem.source.len(),
+                &selection.rows,
+                &selection.source,
+                &labelled,
+                &ego.unwrap_or_default(),
+            ));
             Fitted::of_movers(labelled, &aligned, precomputed)?
         }
         (None, None) => Fitted::nothing(aligned.len(), watch),
@@ -191,6 +203,9 @@ fn solve(
             let (from, to) = (problem.source[row], moved(&motion, problem.source[row]));
             flow[row] = core::array::from_fn(|a| to[a] - from[a]);
             valid[row] = true;
+            if let Some(objects) = &mut objects {
+                objects.confidence[row] = confidence_of_ground(to[0].hypot(to[1]));
+            }
         }
     }
     let report = fitted.report;
@@ -200,6 +215,7 @@ fn solve(
         flow,
         valid,
         dynamic,
+        objects,
         ego,
         points: selection.rows.len(),
         max_iterations: fitted.max_iterations,

@@ -121,6 +121,7 @@ mod tests {
             flow: Vec::new(),
             valid: Vec::new(),
             dynamic: None,
+            objects: None,
             ego: None,
             points: 3,
             max_iterations: 0,

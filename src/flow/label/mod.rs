@@ -25,10 +25,18 @@ mod rigid;
 mod spread;
 mod vote;
 
+// What is said of it.
+mod confidence;
+mod evidence;
+mod parts;
+
 #[cfg(test)]
 mod tests;
 
+pub use confidence::{SURE_M, confidence_of_ground};
+pub use evidence::Evidence;
 pub use motions::Motions;
+pub use parts::Parts;
 
 use rayon::prelude::*;
 
@@ -36,7 +44,8 @@ use super::options::LabelOptions;
 use super::points::Point;
 use super::watch::{Interrupt, Progress, Watch};
 use cluster::NOISE;
-use rigid::{Found, Mover};
+use evidence::{Findings, Searched};
+use rigid::Mover;
 use scene::Scene;
 use vote::Ballot;
 
@@ -52,6 +61,10 @@ const REST: f64 = 0.5;
 pub struct Labelled {
     /// How they move.
     pub motions: Motions,
+    /// Which cluster each source point is of.
+    pub parts: Parts,
+    /// N: what is known of each source point's motion.
+    pub evidence: Vec<Evidence>,
     /// Clusters that were looked at.
     pub clusters: usize,
     /// Clusters that there are.
@@ -67,6 +80,8 @@ impl Labelled {
     fn nothing(interrupted: Interrupt) -> Self {
         Self {
             motions: Motions::none(),
+            parts: Parts::default(),
+            evidence: Vec::new(),
             clusters: 0,
             all_clusters: 0,
             cost_m: f64::INFINITY,
@@ -104,7 +119,7 @@ pub(crate) fn label(
 
     let mut order: Vec<u32> = (0..scene.members.len() as u32).collect();
     order.sort_by_key(|&cluster| std::cmp::Reverse(scene.members[cluster as usize].len()));
-    let mut needed: Vec<Option<Found>> = vec![None; order.len()];
+    let mut searched = vec![Searched::not(options); order.len()];
     let (mut clusters, mut sum_m) = (0, 0.0);
     let mut interrupted = None;
     for some in order.chunks(CLUSTERS_AT_ONCE) {
@@ -112,13 +127,13 @@ pub(crate) fn label(
         if interrupted.is_some() {
             break;
         }
-        let found: Vec<(Option<Found>, f32)> = some
+        let found: Vec<Searched> = some
             .par_iter()
-            .map(|&cluster| needed_motion(&scene, &ballot, cluster))
+            .map(|&cluster| search(&scene, &ballot, cluster))
             .collect();
-        for (&cluster, (found, cost_m)) in some.iter().zip(found) {
-            needed[cluster as usize] = found;
-            sum_m += f64::from(cost_m);
+        for (&cluster, found) in some.iter().zip(found) {
+            searched[cluster as usize] = found;
+            sum_m += f64::from(found.cost().there_m);
         }
         clusters += some.len();
         watch.progress(Progress {
@@ -127,8 +142,31 @@ pub(crate) fn label(
             loss: sum_m / clusters as f64,
         });
     }
+    let needed: Vec<_> = searched.iter().map(Searched::found).collect();
+    let spread = spread::spread(&scene, &needed);
+    let movers: Vec<u32> = (0..)
+        .zip(&needed)
+        .filter_map(|(cluster, found)| found.map(|_| cluster))
+        .collect();
+    let mut numbers = vec![NOISE; needed.len()];
+    for (number, &cluster) in (0..).zip(&movers) {
+        numbers[cluster as usize] = number;
+    }
+    let number = |cluster: &u32| numbers.get(*cluster as usize).copied().unwrap_or(NOISE);
+    let owners: Vec<u32> = spread.owners.iter().map(number).collect();
+    let motions = needed.iter().flatten().map(|found| found.motion);
+    let motions = Motions::new(motions.collect(), &scene.source, &owners);
+    let findings = Findings {
+        scene: &scene,
+        searched: &searched,
+        spread: &spread,
+        motions: &motions,
+        movers: &movers,
+    };
     Labelled {
-        motions: motions(&scene, &needed),
+        evidence: evidence::evidence(&findings, source, &labels),
+        parts: Parts::new(source, &labels, &spread.leaders, &motions),
+        motions,
         clusters,
         all_clusters: order.len(),
         cost_m: sum_m / clusters.max(1) as f64,
@@ -136,41 +174,27 @@ pub(crate) fn label(
     }
 }
 
-/// The motion of a cluster, where it needs one, and what the cluster costs in the end, metres.
-fn needed_motion(scene: &Scene<'_>, ballot: &Ballot, cluster: u32) -> (Option<Found>, f32) {
+/// Looks for the motion of a cluster.
+fn search(scene: &Scene<'_>, ballot: &Ballot, cluster: u32) -> Searched {
     let members = &scene.members[cluster as usize];
-    if members.len() < scene.options.cluster_points {
-        return (None, 0.0);
-    }
     let mover = Mover::new(scene, cluster);
     let still = mover.standing_still();
+    if members.len() < scene.options.cluster_points {
+        return Searched {
+            still,
+            best: None,
+            needed: false,
+        };
+    }
     let points: Vec<Point> = members
         .iter()
         .map(|&row| scene.source[row as usize])
         .collect();
-    let found = mover.search(ballot, still);
-    match found.filter(|found| gate::is_needed(found, &points, scene.options)) {
-        Some(found) => (Some(found), found.cost.there_m),
-        None => (None, still.there_m),
+    let best = mover.search(ballot, still);
+    let needed = best.is_some_and(|found| gate::is_needed(&found, &points, scene.options));
+    Searched {
+        still,
+        best,
+        needed,
     }
-}
-
-/// The motions, and which of the source's points have them.
-fn motions(scene: &Scene<'_>, needed: &[Option<Found>]) -> Motions {
-    let mut numbers = vec![NOISE; needed.len()];
-    let mut motions = Vec::new();
-    for (number, found) in numbers.iter_mut().zip(needed) {
-        if let Some(found) = found {
-            *number = motions.len() as u32;
-            motions.push(found.motion);
-        }
-    }
-    if motions.is_empty() {
-        return Motions::none();
-    }
-    let owners: Vec<u32> = spread::movers_of(scene, needed)
-        .into_iter()
-        .map(|owner| numbers.get(owner as usize).copied().unwrap_or(NOISE))
-        .collect();
-    Motions::new(motions, &scene.source, &owners)
 }

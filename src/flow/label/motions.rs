@@ -69,14 +69,42 @@ impl Motions {
     }
 
     fn residual(&self, place: Point) -> Point {
+        match self.owner(place) {
+            NOISE => [0.0; 3],
+            owner => self.displacement(owner, place),
+        }
+    }
+
+    /// Which of the motions a place has; [`NOISE`] where it stands still.
+    fn owner(&self, place: Point) -> u32 {
         let Some((row, square)) = self.moving.nearest(place, REACH_M, |_| true) else {
-            return [0.0; 3];
+            return NOISE;
         };
         let stands = self.standing.nearest(place, square.sqrt(), |_| true);
-        if stands.is_some() {
-            return [0.0; 3];
+        match stands {
+            Some(_) => NOISE,
+            None => self.owners[row as usize],
         }
-        self.motions[self.owners[row as usize] as usize].displacement(place)
+    }
+
+    /// [`Self::owner`] of every place.
+    pub(super) fn owners_at(&self, places: &[Point]) -> Vec<u32> {
+        places.par_iter().map(|&place| self.owner(place)).collect()
+    }
+
+    /// Motions that there are.
+    pub(super) fn count(&self) -> usize {
+        self.motions.len()
+    }
+
+    /// How far the motion of this number moves a place, metres, as [`Self::residual_at`] says it.
+    pub(crate) fn displacement(&self, motion: u32, place: Point) -> Point {
+        self.motions[motion as usize].displacement(place)
+    }
+
+    /// Radians that the motion of this number turns about the vertical, counterclockwise.
+    pub(crate) fn turn(&self, motion: u32) -> f32 {
+        self.motions[motion as usize].turn
     }
 }
 

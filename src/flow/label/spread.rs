@@ -19,25 +19,34 @@ const BETTER_M: f32 = 0.05;
 /// Points of a mover within this vote on whether they are of it, metres.
 const VOTE_M: f32 = 0.3;
 
-/// Of each thinned source point the cluster whose motion it has; [`NOISE`] where it stands still.
-pub(super) fn movers_of(scene: &Scene<'_>, needed: &[Option<Found>]) -> Vec<u32> {
-    let clusters: Vec<u32> = (0..needed.len() as u32)
+/// Whose motion everything has; [`NOISE`] where it stands still.
+pub(super) struct Spread {
+    /// Of each cluster, the cluster whose motion it has.
+    pub(super) leaders: Vec<u32>,
+    /// Of each thinned source point likewise.
+    pub(super) owners: Vec<u32>,
+}
+
+/// Shares the motions out.
+pub(super) fn spread(scene: &Scene<'_>, needed: &[Option<Found>]) -> Spread {
+    let leaders: Vec<u32> = (0..needed.len() as u32)
         .into_par_iter()
         .map(|cluster| leader(scene, needed, cluster))
         .collect();
-    (0..scene.source.len() as u32)
+    let owners = (0..scene.source.len() as u32)
         .into_par_iter()
         .map(|row| match scene.labels[row as usize] {
             NOISE => leader_of_stray(scene, needed, row),
             label => {
-                let leader = clusters[label as usize];
+                let leader = leaders[label as usize];
                 match needed.get(leader as usize).and_then(Option::as_ref) {
                     Some(found) if is_of(scene, row, &found.motion) => leader,
                     _ => NOISE,
                 }
             }
         })
-        .collect()
+        .collect();
+    Spread { leaders, owners }
 }
 
 /// The cluster whose motion a cluster has: its own, that of a larger mover beside it, or none.

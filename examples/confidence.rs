@@ -1,0 +1,360 @@
+//! Confidence: fits its weights, and shows how far they can be believed.
+//!
+//! ```text
+//! FNSF_REAL_DATA=... cargo run --release --example confidence -- [DIAGRAM.svg]
+//! ```
+//!
+//! Fitted to streets 0 to 11 of 64 and of 32 beams and to the labelled pairs below `FNSF_REAL_DATA`,
+//! where it is set; judged on streets 100 to 109 too, which nothing was fitted to, and on each labelled pair by weights that
+//! were fitted without it. Points off the ground by the pairs' own masks, the ego motion estimated.
+#![expect(
+    clippy::print_stdout,
+    reason = "the tables are the answer of this program"
+)]
+
+use fnsf::flow::backend::Backend;
+use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::simulate::{Street, StreetOptions};
+use fnsf::flow::{Evidence, LabelOptions, Point, RigidTransform, SURE_M, Unwatched};
+use fnsf::formats::read_pair;
+use nalgebra::{DMatrix, DVector, Point3};
+
+const PAIRS: [&str; 3] = ["av2_7fab", "kitti_0000", "small_gicp"];
+const BEAMS: [usize; 2] = [64, 32];
+/// Streets that it is fitted to, of each number of beams.
+const STREETS: u64 = 12;
+const BINS: usize = 10;
+
+/// A point of a pair, and how far off its motion is.
+struct Judged {
+    kind: usize,
+    features: Vec<f64>,
+    error_m: f64,
+}
+
+/// What moves, what stands, ground.
+const KINDS: [&str; 3] = ["MOVING", "STANDING", "GROUND"];
+
+struct Scene {
+    name: String,
+    /// What it counts in a fit.
+    weight: f64,
+    points: Vec<Judged>,
+}
+
+struct Known {
+    name: String,
+    source: Vec<Point>,
+    target: Vec<Point>,
+    ground: [Vec<bool>; 2],
+    flow: Vec<Point>,
+    valid: Vec<bool>,
+    weight: f64,
+}
+
+fn real(name: &str, folder: &std::ffi::OsStr) -> Result<Known, String> {
+    let path = std::path::Path::new(folder).join(name).join("pair.npz");
+    let bytes = std::fs::read(&path).map_err(|e| format!("{}: {e}", path.display()))?;
+    let pair = read_pair(&bytes).map_err(|e| format!("{}: {e}", path.display()))?;
+    let truth = pair.truth.ok_or("the pair has no truth")?;
+    let ground = pair.ground.ok_or("the pair has no ground masks")?;
+    Ok(Known {
+        name: name.to_owned(),
+        source: pair.source,
+        target: pair.target,
+        ground: [ground.source, ground.target],
+        flow: truth.flow,
+        valid: truth.valid,
+        weight: 1.0,
+    })
+}
+
+fn street(seed: u64, beams: usize) -> Result<Known, String> {
+    let options = StreetOptions {
+        seed,
+        beams,
+        ..StreetOptions::default()
+    };
+    let pair = Street::new(&options).and_then(|street| street.pair(0));
+    let pair = pair.map_err(|e| e.to_string())?;
+    Ok(Known {
+        name: format!("street {seed}, {beams} beams"),
+        valid: vec![true; pair.source.len()],
+        source: pair.source,
+        target: pair.target,
+        ground: [pair.ground_source, pair.ground_target],
+        flow: pair.flow,
+        weight: PAIRS.len() as f64 / (STREETS as usize * BEAMS.len()) as f64,
+    })
+}
+
+fn moved(motion: &RigidTransform, point: Point) -> Point {
+    let moved = motion * Point3::from(point.map(f64::from));
+    moved.map(|c| c as f32).into()
+}
+
+fn judged(backend: &dyn Backend, known: Known) -> Scene {
+    let ego = backend.align(
+        &known.source,
+        &known.target,
+        &RigidTransform::identity(),
+        &Unwatched,
+    );
+    let off_ground = |points: &[Point], ground: &[bool]| -> Vec<usize> {
+        (0..points.len())
+            .filter(|&row| !ground[row] && points[row].iter().all(|c| c.is_finite()))
+            .collect()
+    };
+    let rows = off_ground(&known.source, &known.ground[0]);
+    let target: Vec<Point> = off_ground(&known.target, &known.ground[1])
+        .into_iter()
+        .map(|row| known.target[row])
+        .collect();
+    let aligned: Vec<Point> = rows
+        .iter()
+        .map(|&row| moved(&ego, known.source[row]))
+        .collect();
+    let labelled = backend.movers(&aligned, &target, &LabelOptions::default(), &Unwatched);
+    let residual = labelled.motions.residual_at(&aligned);
+    let error = |row: usize, at: Point| {
+        let square = |a: usize| (known.source[row][a] + known.flow[row][a] - at[a]).powi(2);
+        f64::from((square(0) + square(1) + square(2)).sqrt())
+    };
+    let mut points = Vec::new();
+    for (i, &row) in rows
+        .iter()
+        .enumerate()
+        .filter(|&(_, &row)| known.valid[row])
+    {
+        let at = core::array::from_fn(|a| aligned[i][a] + residual[i][a]);
+        let evidence: &Evidence = &labelled.evidence[i];
+        points.push(Judged {
+            kind: usize::from(!evidence.moves),
+            features: evidence.features().into_iter().map(f64::from).collect(),
+            error_m: error(row, at),
+        });
+    }
+    for row in (0..known.source.len()).filter(|&row| known.ground[0][row] && known.valid[row]) {
+        let at = moved(&ego, known.source[row]);
+        if at.iter().all(|c| c.is_finite()) {
+            let range = (1.0 + at[0].hypot(at[1]) / 10.0).ln();
+            points.push(Judged {
+                kind: 2,
+                features: vec![1.0, f64::from(range)],
+                error_m: error(row, at),
+            });
+        }
+    }
+    Scene {
+        name: known.name,
+        weight: known.weight,
+        points,
+    }
+}
+
+/// Newton's method on the penalized likelihood. The points of a scene count alike, all streets together
+/// as much as three labelled pairs.
+fn fitted(scenes: &[&Scene], kind: usize) -> Vec<f64> {
+    const PENALTY: f64 = 1e-3;
+    const STEPS: usize = 30;
+    let count = scenes
+        .iter()
+        .flat_map(|s| &s.points)
+        .find(|p| p.kind == kind)
+        .map_or(0, |p| p.features.len());
+    let mut weights = DVector::<f64>::zeros(count);
+    for _ in 0..STEPS {
+        let mut normal = DMatrix::<f64>::identity(count, count) * PENALTY;
+        let mut gradient = -&weights * PENALTY;
+        for scene in scenes {
+            let of_kind = || scene.points.iter().filter(|p| p.kind == kind);
+            let share = scene.weight / of_kind().count().max(1) as f64;
+            for point in of_kind() {
+                let features = DVector::from_column_slice(&point.features);
+                let chance = 1.0 / (1.0 + (-weights.dot(&features)).exp());
+                let right = f64::from(u8::from(point.error_m < f64::from(SURE_M)));
+                gradient.axpy(share * (right - chance), &features, 1.0);
+                normal.ger(share * chance * (1.0 - chance), &features, &features, 1.0);
+            }
+        }
+        let Some(cholesky) = normal.cholesky() else {
+            break;
+        };
+        weights += cholesky.solve(&gradient);
+    }
+    weights.iter().copied().collect()
+}
+
+fn confidence(weights: &[Vec<f64>], point: &Judged) -> f64 {
+    let sum: f64 = weights[point.kind]
+        .iter()
+        .zip(&point.features)
+        .map(|(w, f)| w * f)
+        .sum();
+    1.0 / (1.0 + (-sum).exp())
+}
+
+/// How confidence and what is right of it go together, of points off the ground.
+struct Reliability {
+    points: usize,
+    /// EPE of the more confident half and of the rest, metres; the same of halves by the error itself,
+    /// which nothing can beat.
+    halves_m: [f64; 2],
+    best_m: [f64; 2],
+    /// Of each bin that is not empty: share of the points, mean confidence, share that is right.
+    bins: Vec<[f64; 3]>,
+}
+
+impl Reliability {
+    fn new(scenes: &[&Scene], weights: &[Vec<f64>]) -> Self {
+        let off_ground = scenes.iter().flat_map(|scene| &scene.points);
+        let off_ground = off_ground.filter(|point| KINDS[point.kind] != "GROUND");
+        let mut points: Vec<(f64, f64)> = off_ground
+            .map(|point| (confidence(weights, point), point.error_m))
+            .collect();
+        let half = points.len() / 2;
+        let halves = |points: &[(f64, f64)]| {
+            let mean = |part: &[(f64, f64)]| {
+                part.iter().map(|point| point.1).sum::<f64>() / part.len().max(1) as f64
+            };
+            [mean(&points[..half]), mean(&points[half..])]
+        };
+        points.sort_by(|a, b| a.1.total_cmp(&b.1));
+        let best_m = halves(&points);
+        points.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let halves_m = halves(&points);
+        let all = points.len() as f64;
+        let bin_of = |confidence: f64| ((confidence * BINS as f64) as usize).min(BINS - 1);
+        let bins = (0..BINS).filter_map(|bin| {
+            let within: Vec<_> = points
+                .iter()
+                .filter(|point| bin_of(point.0) == bin)
+                .collect();
+            let count = within.len() as f64;
+            let said = within.iter().map(|point| point.0).sum::<f64>() / count;
+            let right = within
+                .iter()
+                .filter(|point| point.1 < f64::from(SURE_M))
+                .count();
+            (count > 0.0).then_some([count / all, said, right as f64 / count])
+        });
+        Self {
+            points: points.len(),
+            halves_m,
+            best_m,
+            bins: bins.collect(),
+        }
+    }
+
+    /// The expected calibration error.
+    fn error(&self) -> f64 {
+        let off = |[share, said, right]: &[f64; 3]| share * (said - right).abs();
+        self.bins.iter().map(off).sum()
+    }
+
+    fn print(&self, name: &str) {
+        let ([sure, rest], [best, worst]) = (self.halves_m, self.best_m);
+        println!(
+            "| {name} | {} | {sure:.4} | {rest:.4} | {:.2} | {:.2} | {:.3} |",
+            self.points,
+            sure / rest,
+            best / worst,
+            self.error()
+        );
+    }
+}
+
+/// Reliability diagrams side by side: what was said along, what was right up, areas by points.
+fn diagram(shown: &[(&str, &Reliability)]) -> String {
+    const SIDE: f64 = 240.0;
+    const MARGIN: f64 = 46.0;
+    let step = SIDE + MARGIN * 1.4;
+    let (width, height) = (MARGIN + step * shown.len() as f64, SIDE + MARGIN * 2.0);
+    let mut svg = format!(
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width:.0} {height:.0}\" \
+         font-family=\"sans-serif\" font-size=\"12\">\n\
+         <rect width=\"100%\" height=\"100%\" fill=\"#fff\"/>\n"
+    );
+    for (place, (name, reliability)) in shown.iter().enumerate() {
+        let (left, top) = (MARGIN + step * place as f64, MARGIN);
+        let at = |said: f64, right: f64| (left + said * SIDE, top + (1.0 - right) * SIDE);
+        let ((x0, y0), (x1, y1)) = (at(0.0, 0.0), at(1.0, 1.0));
+        svg += &format!(
+            "<rect x=\"{x0:.1}\" y=\"{y1:.1}\" width=\"{SIDE}\" height=\"{SIDE}\" fill=\"none\" stroke=\"#888\"/>\n\
+             <line x1=\"{x0:.1}\" y1=\"{y0:.1}\" x2=\"{x1:.1}\" y2=\"{y1:.1}\" stroke=\"#bbb\" stroke-dasharray=\"4 4\"/>\n\
+             <text x=\"{x0:.1}\" y=\"{:.1}\">{name}: calibration error {:.3}</text>\n\
+             <text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">confidence</text>\n\
+             <text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">1</text>\n\
+             <text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">0</text>\n",
+            y1 - 10.0,
+            reliability.error(),
+            (x0 + x1) / 2.0,
+            y0 + 18.0,
+            x0 - 5.0,
+            y1 + 4.0,
+            x0 - 5.0,
+            y0 + 4.0,
+        );
+        let line: Vec<String> = reliability
+            .bins
+            .iter()
+            .map(|&[_, said, right]| at(said, right))
+            .map(|(x, y)| format!("{x:.1},{y:.1}"))
+            .collect();
+        svg += &format!(
+            "<polyline points=\"{}\" fill=\"none\" stroke=\"#1f77b4\"/>\n",
+            line.join(" ")
+        );
+        for &[share, said, right] in &reliability.bins {
+            let ((x, y), radius) = (at(said, right), 2.0 + 12.0 * share.sqrt());
+            svg += &format!(
+                "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"{radius:.1}\" fill=\"#1f77b4\" fill-opacity=\"0.6\"/>\n"
+            );
+        }
+    }
+    svg + "</svg>\n"
+}
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let backend = CpuBackend::new(None)?;
+    let mut pairs = Vec::new();
+    if let Some(folder) = std::env::var_os("FNSF_REAL_DATA") {
+        for name in PAIRS {
+            pairs.push(judged(&backend, real(name, &folder)?));
+        }
+    }
+    let streets = |seeds: std::ops::Range<u64>| -> Result<Vec<Scene>, String> {
+        let each = seeds.flat_map(|seed| BEAMS.map(|beams| street(seed, beams)));
+        each.map(|known| Ok(judged(&backend, known?))).collect()
+    };
+    let known = streets(0..STREETS)?;
+    let fresh = streets(100..110)?;
+    let all: Vec<&Scene> = known.iter().chain(&pairs).collect();
+    let fitted = |scenes: &[&Scene]| -> Vec<Vec<f64>> {
+        (0..KINDS.len()).map(|kind| fitted(scenes, kind)).collect()
+    };
+    let weights = fitted(&all);
+    for (kind, weights) in KINDS.iter().zip(&weights) {
+        println!("{kind}: {weights:.3?}");
+    }
+    println!("\n| scenes | points | sure half | rest | ratio | best ratio | calibration error |");
+    println!("|---|---|---|---|---|---|---|");
+    let of_known = Reliability::new(&known.iter().collect::<Vec<_>>(), &weights);
+    of_known.print("fitted streets");
+    let of_fresh = Reliability::new(&fresh.iter().collect::<Vec<_>>(), &weights);
+    of_fresh.print("fresh streets");
+    let mut shown = vec![("fresh streets".to_owned(), of_fresh)];
+    for pair in &pairs {
+        Reliability::new(&[pair], &weights).print(&pair.name);
+        let others = all.iter().copied().filter(|other| other.name != pair.name);
+        let others = fitted(&others.collect::<Vec<_>>());
+        let left_out = Reliability::new(&[pair], &others);
+        left_out.print(&format!("{}, left out of the fit", pair.name));
+        shown.push((pair.name.clone(), left_out));
+    }
+    if let Some(path) = std::env::args_os().nth(1) {
+        let shown: Vec<_> = shown.iter().map(|(name, of)| (name.as_str(), of)).collect();
+        std::fs::write(path, diagram(&shown))?;
+    }
+    Ok(())
+}
