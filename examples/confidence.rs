@@ -14,6 +14,7 @@
 
 use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::evaluate::{Calibration, Reliability};
 use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::flow::{Evidence, LabelOptions, Point, RigidTransform, SURE_M, Unwatched};
 use fnsf::formats::read_pair;
@@ -23,7 +24,6 @@ const PAIRS: [&str; 3] = ["av2_7fab", "kitti_0000", "small_gicp"];
 const BEAMS: [usize; 2] = [64, 32];
 /// Streets that it is fitted to, of each number of beams.
 const STREETS: u64 = 12;
-const BINS: usize = 10;
 
 /// A point of a pair, and how far off its motion is.
 struct Judged {
@@ -194,78 +194,52 @@ fn confidence(weights: &[Vec<f64>], point: &Judged) -> f64 {
     1.0 / (1.0 + (-sum).exp())
 }
 
-/// How confidence and what is right of it go together, of points off the ground.
-struct Reliability {
-    points: usize,
-    /// EPE of the more confident half and of the rest, metres; the same of halves by the error itself,
-    /// which nothing can beat.
-    halves_m: [f64; 2],
-    best_m: [f64; 2],
-    /// Of each bin that is not empty: share of the points, mean confidence, share that is right.
-    bins: Vec<[f64; 3]>,
+/// What was said of some scenes' points off the ground, and what was right.
+struct Told {
+    calibration: Calibration,
+    /// EPE of the half with the least errors over that of the rest, which no confidence can beat.
+    best: f64,
 }
 
-impl Reliability {
-    fn new(scenes: &[&Scene], weights: &[Vec<f64>]) -> Self {
+impl Told {
+    fn new(scenes: &[&Scene], weights: &[Vec<f64>]) -> Result<Self, &'static str> {
         let off_ground = scenes.iter().flat_map(|scene| &scene.points);
-        let off_ground = off_ground.filter(|point| KINDS[point.kind] != "GROUND");
-        let mut points: Vec<(f64, f64)> = off_ground
-            .map(|point| (confidence(weights, point), point.error_m))
-            .collect();
-        let half = points.len() / 2;
-        let halves = |points: &[(f64, f64)]| {
-            let mean = |part: &[(f64, f64)]| {
-                part.iter().map(|point| point.1).sum::<f64>() / part.len().max(1) as f64
-            };
-            [mean(&points[..half]), mean(&points[half..])]
+        let off_ground = || {
+            off_ground
+                .clone()
+                .filter(|point| KINDS[point.kind] != "GROUND")
         };
-        points.sort_by(|a, b| a.1.total_cmp(&b.1));
-        let best_m = halves(&points);
-        points.sort_by(|a, b| b.0.total_cmp(&a.0));
-        let halves_m = halves(&points);
-        let all = points.len() as f64;
-        let bin_of = |confidence: f64| ((confidence * BINS as f64) as usize).min(BINS - 1);
-        let bins = (0..BINS).filter_map(|bin| {
-            let within: Vec<_> = points
-                .iter()
-                .filter(|point| bin_of(point.0) == bin)
-                .collect();
-            let count = within.len() as f64;
-            let said = within.iter().map(|point| point.0).sum::<f64>() / count;
-            let right = within
-                .iter()
-                .filter(|point| point.1 < f64::from(SURE_M))
-                .count();
-            (count > 0.0).then_some([count / all, said, right as f64 / count])
-        });
-        Self {
-            points: points.len(),
-            halves_m,
-            best_m,
-            bins: bins.collect(),
+        let mut reliability = Reliability::default();
+        for point in off_ground() {
+            reliability.add(confidence(weights, point), point.error_m);
         }
-    }
-
-    /// The expected calibration error.
-    fn error(&self) -> f64 {
-        let off = |[share, said, right]: &[f64; 3]| share * (said - right).abs();
-        self.bins.iter().map(off).sum()
+        let mut errors: Vec<f64> = off_ground().map(|point| point.error_m).collect();
+        errors.sort_by(f64::total_cmp);
+        let (least, rest) = errors.split_at(errors.len() / 2);
+        Ok(Self {
+            calibration: reliability.finish().ok_or("no points")?,
+            best: least.iter().sum::<f64>() / rest.iter().sum::<f64>(),
+        })
     }
 
     fn print(&self, name: &str) {
-        let ([sure, rest], [best, worst]) = (self.halves_m, self.best_m);
+        let Calibration {
+            points,
+            error,
+            sure_half_epe,
+            rest_epe,
+            ..
+        } = self.calibration;
         println!(
-            "| {name} | {} | {sure:.4} | {rest:.4} | {:.2} | {:.2} | {:.3} |",
-            self.points,
-            sure / rest,
-            best / worst,
-            self.error()
+            "| {name} | {points} | {sure_half_epe:.4} | {rest_epe:.4} | {:.2} | {:.2} | {error:.3} |",
+            sure_half_epe / rest_epe,
+            self.best,
         );
     }
 }
 
 /// Reliability diagrams side by side: what was said along, what was right up, areas by points.
-fn diagram(shown: &[(&str, &Reliability)]) -> String {
+fn diagram(shown: &[(String, Told)]) -> String {
     const SIDE: f64 = 240.0;
     const MARGIN: f64 = 46.0;
     let step = SIDE + MARGIN * 1.4;
@@ -275,7 +249,8 @@ fn diagram(shown: &[(&str, &Reliability)]) -> String {
          font-family=\"sans-serif\" font-size=\"12\">\n\
          <rect width=\"100%\" height=\"100%\" fill=\"#fff\"/>\n"
     );
-    for (place, (name, reliability)) in shown.iter().enumerate() {
+    for (place, (name, told)) in shown.iter().enumerate() {
+        let Calibration { error, bins, .. } = &told.calibration;
         let (left, top) = (MARGIN + step * place as f64, MARGIN);
         let at = |said: f64, right: f64| (left + said * SIDE, top + (1.0 - right) * SIDE);
         let ((x0, y0), (x1, y1)) = (at(0.0, 0.0), at(1.0, 1.0));
@@ -287,7 +262,7 @@ fn diagram(shown: &[(&str, &Reliability)]) -> String {
              <text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">1</text>\n\
              <text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">0</text>\n",
             y1 - 10.0,
-            reliability.error(),
+            error,
             (x0 + x1) / 2.0,
             y0 + 18.0,
             x0 - 5.0,
@@ -295,18 +270,18 @@ fn diagram(shown: &[(&str, &Reliability)]) -> String {
             x0 - 5.0,
             y0 + 4.0,
         );
-        let line: Vec<String> = reliability
-            .bins
+        let line: Vec<String> = bins
             .iter()
-            .map(|&[_, said, right]| at(said, right))
+            .map(|bin| at(bin.confidence, bin.right))
             .map(|(x, y)| format!("{x:.1},{y:.1}"))
             .collect();
         svg += &format!(
             "<polyline points=\"{}\" fill=\"none\" stroke=\"#1f77b4\"/>\n",
             line.join(" ")
         );
-        for &[share, said, right] in &reliability.bins {
-            let ((x, y), radius) = (at(said, right), 2.0 + 12.0 * share.sqrt());
+        for bin in bins {
+            let (x, y) = at(bin.confidence, bin.right);
+            let radius = 2.0 + 12.0 * bin.share.sqrt();
             svg += &format!(
                 "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"{radius:.1}\" fill=\"#1f77b4\" fill-opacity=\"0.6\"/>\n"
             );
@@ -339,21 +314,30 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     }
     println!("\n| scenes | points | sure half | rest | ratio | best ratio | calibration error |");
     println!("|---|---|---|---|---|---|---|");
-    let of_known = Reliability::new(&known.iter().collect::<Vec<_>>(), &weights);
-    of_known.print("fitted streets");
-    let of_fresh = Reliability::new(&fresh.iter().collect::<Vec<_>>(), &weights);
-    of_fresh.print("fresh streets");
-    let mut shown = vec![("fresh streets".to_owned(), of_fresh)];
+    let told = |name: &str, scenes: &[&Scene], weights: &[Vec<f64>]| {
+        let told = Told::new(scenes, weights)?;
+        told.print(name);
+        Ok::<_, &'static str>((name.to_owned(), told))
+    };
+    told(
+        "fitted streets",
+        &known.iter().collect::<Vec<_>>(),
+        &weights,
+    )?;
+    let mut shown = vec![told(
+        "fresh streets",
+        &fresh.iter().collect::<Vec<_>>(),
+        &weights,
+    )?];
     for pair in &pairs {
-        Reliability::new(&[pair], &weights).print(&pair.name);
+        told(&pair.name, &[pair], &weights)?;
         let others = all.iter().copied().filter(|other| other.name != pair.name);
         let others = fitted(&others.collect::<Vec<_>>());
-        let left_out = Reliability::new(&[pair], &others);
-        left_out.print(&format!("{}, left out of the fit", pair.name));
+        let name = format!("{}, left out of the fit", pair.name);
+        let (_, left_out) = told(&name, &[pair], &others)?;
         shown.push((pair.name.clone(), left_out));
     }
     if let Some(path) = std::env::args_os().nth(1) {
-        let shown: Vec<_> = shown.iter().map(|(name, of)| (name.as_str(), of)).collect();
         std::fs::write(path, diagram(&shown))?;
     }
     Ok(())

@@ -3,11 +3,11 @@
 //! Little endian; counts are checked against the bytes present, and a sum over all of them tells a
 //! torn file. It must not know where the bytes are kept.
 
-use crate::flow::{DenseCloud, Estimate, Point, RigidTransform};
+use crate::flow::{Bounds, Cluster, DenseCloud, Estimate, Objects, Point, RigidTransform};
 use crate::formats::{matrix_rows, rigid_motion};
 
 const CLOUD: &[u8; 8] = b"fnsfcld1";
-const FLOW: &[u8; 8] = b"fnsfflw1";
+const FLOW: &[u8; 8] = b"fnsfflw2";
 const DENSE: &[u8; 8] = b"fnsfdns1";
 
 /// Bytes of the sum at the end.
@@ -36,6 +36,8 @@ pub struct StoredFlow {
     pub valid: Vec<bool>,
     /// N flags: which points move by themselves, where that is known.
     pub dynamic: Option<Vec<bool>>,
+    /// What the points are parts of and how sure their motion is, where that is known.
+    pub objects: Option<Objects>,
     /// The ego motion target_from_source, where it is known.
     pub ego: Option<RigidTransform>,
 }
@@ -67,10 +69,11 @@ impl StoredCloud {
 impl StoredFlow {
     /// The flow as bytes.
     pub fn to_bytes(&self) -> Vec<u8> {
-        let mut out = Writer::new(FLOW, self.flow.len(), 14 * self.flow.len());
+        let mut out = Writer::new(FLOW, self.flow.len(), 22 * self.flow.len());
         out.points(&self.flow);
         out.flags(Some(&self.valid));
         out.flags(self.dynamic.as_deref());
+        out.objects(self.objects.as_ref());
         out.motion(self.ego.as_ref());
         out.finish()
     }
@@ -87,6 +90,7 @@ impl StoredFlow {
             flow,
             valid,
             dynamic: reader.flags()?,
+            objects: reader.objects()?,
             ego: reader.motion()?,
         };
         reader.finish()?;
@@ -138,6 +142,7 @@ impl From<Estimate> for StoredFlow {
             flow: estimate.flow,
             valid: estimate.valid,
             dynamic: estimate.dynamic,
+            objects: estimate.objects,
             ego: estimate.ego,
         }
     }
@@ -170,6 +175,25 @@ impl Writer {
 
     fn words(&mut self, words: impl Iterator<Item = u32>) {
         self.0.extend(words.flat_map(u32::to_le_bytes));
+    }
+
+    fn objects(&mut self, objects: Option<&Objects>) {
+        self.0.push(u8::from(objects.is_some()));
+        let Some(objects) = objects else {
+            return;
+        };
+        self.words(objects.cluster.iter().map(|id| id.cast_unsigned()));
+        self.words(objects.confidence.iter().map(|chance| chance.to_bits()));
+        self.0.extend((objects.clusters.len() as u64).to_le_bytes());
+        for cluster in &objects.clusters {
+            self.words([cluster.points, u32::from(cluster.dynamic)].into_iter());
+            let (bounds, velocity) = (&cluster.bounds, &cluster.velocity);
+            let values = [&bounds.center, &bounds.size, velocity]
+                .into_iter()
+                .flatten();
+            let values = values.chain([&bounds.yaw, &cluster.yaw_rate, &cluster.confidence]);
+            self.words(values.map(|value| value.to_bits()));
+        }
     }
 
     fn motion(&mut self, motion: Option<&RigidTransform>) {
@@ -243,6 +267,46 @@ impl<'a> Reader<'a> {
         Ok(words.iter().map(|word| u32::from_le_bytes(*word)))
     }
 
+    fn objects(&mut self) -> Result<Option<Objects>, Damaged> {
+        const WORDS: usize = 14;
+        let [there] = self.array()?;
+        if there == 0 {
+            return Ok(None);
+        }
+        let cluster = self.words()?.map(u32::cast_signed).collect();
+        let confidence = self.words()?.map(f32::from_bits).collect();
+        let count = u64::from_le_bytes(self.array()?);
+        let bytes = usize::try_from(count).ok();
+        let bytes = bytes.and_then(|count| count.checked_mul(4 * WORDS));
+        let described = self.take(bytes.ok_or(Damaged("too many clusters"))?)?;
+        let (described, _) = described.as_chunks::<{ 4 * WORDS }>();
+        let clusters = described.iter().map(|described| {
+            let word = |at: usize| {
+                let bytes = core::array::from_fn(|byte| described[4 * at + byte]);
+                u32::from_le_bytes(bytes)
+            };
+            let value = |at: usize| f32::from_bits(word(at));
+            let point = |at: usize| [value(at), value(at + 1), value(at + 2)];
+            Cluster {
+                points: word(0),
+                dynamic: word(1) != 0,
+                bounds: Bounds {
+                    center: point(2),
+                    size: point(5),
+                    yaw: value(11),
+                },
+                velocity: point(8),
+                yaw_rate: value(12),
+                confidence: value(13),
+            }
+        });
+        Ok(Some(Objects {
+            cluster,
+            confidence,
+            clusters: clusters.collect(),
+        }))
+    }
+
     fn motion(&mut self) -> Result<Option<RigidTransform>, Damaged> {
         let [there] = self.array()?;
         if there == 0 {
@@ -288,6 +352,22 @@ mod tests {
             flow: vec![[1.0, -2.0, 0.5], [0.0; 3]],
             valid: vec![true, false],
             dynamic: Some(vec![false, true]),
+            objects: Some(Objects {
+                cluster: vec![0, Objects::NONE],
+                confidence: vec![0.875, 0.0],
+                clusters: vec![Cluster {
+                    points: 1,
+                    dynamic: true,
+                    bounds: Bounds {
+                        center: [1.0, 2.0, 3.0],
+                        size: [4.0, 5.0, 6.0],
+                        yaw: 7.0,
+                    },
+                    velocity: [8.0, 9.0, 10.0],
+                    yaw_rate: 11.0,
+                    confidence: 0.5,
+                }],
+            }),
             ego: Some(RigidTransform::new(
                 [1.0, 2.0, 3.0].into(),
                 [0.0, 0.0, 0.1].into(),
@@ -305,8 +385,8 @@ mod tests {
         let stored = flow();
         let back = StoredFlow::from_bytes(&stored.to_bytes()).expect("good bytes");
         assert_eq!(
-            (back.flow, back.valid, back.dynamic),
-            (stored.flow, stored.valid, stored.dynamic)
+            (back.flow, back.valid, back.dynamic, back.objects),
+            (stored.flow, stored.valid, stored.dynamic, stored.objects)
         );
         let [one, other] =
             [back.ego, stored.ego].map(|ego| ego.expect("a motion").to_homogeneous());

@@ -109,6 +109,7 @@ impl AnswerFormat {
             flow: &flow.flow,
             valid: &flow.valid,
             dynamic: flow.dynamic.as_deref(),
+            objects: flow.objects.as_ref(),
             ego: flow.ego.as_ref(),
         };
         let mut bytes = Vec::new();

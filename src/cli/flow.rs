@@ -56,6 +56,7 @@ fn write(estimate: &Estimate, source: &[Point], path: &Path) -> Result<(), Failu
         flow: &estimate.flow,
         valid: &estimate.valid,
         dynamic: estimate.dynamic.as_deref(),
+        objects: estimate.objects.as_ref(),
         ego: estimate.ego.as_ref(),
     };
     files::write(path, |file| write_flow(format, &table, file))

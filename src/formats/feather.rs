@@ -7,7 +7,7 @@
 use std::io::{Read, Write};
 use std::sync::Arc;
 
-use arrow_array::{ArrayRef, BooleanArray, Float32Array, RecordBatch};
+use arrow_array::{ArrayRef, BooleanArray, Float32Array, Int32Array, RecordBatch};
 use arrow_ipc::writer::{FileWriter, IpcWriteOptions};
 use arrow_ipc::{CompressionType, Endianness, Message, Precision, Type};
 
@@ -157,6 +157,26 @@ impl<'a> Table<'a> {
             column.name == name
                 && matches!(column.stored, Stored::Number(scalar) if scalar.is_float())
         })
+    }
+
+    /// A column of numbers, each checked and made what it is by `check`. `None` where it is not there.
+    pub(super) fn column<T>(
+        &self,
+        name: &str,
+        check: impl Fn(usize, f64) -> Result<T, FormatError>,
+    ) -> Result<Option<Vec<T>>, FormatError> {
+        if !self.has(name) {
+            return Ok(None);
+        }
+        let mut column = Vec::new();
+        self.each(name, |row, value| {
+            if column.is_empty() {
+                column.reserve_exact(self.rows);
+            }
+            column.push(check(row, value)?);
+            Ok(())
+        })?;
+        Ok(Some(column))
     }
 
     /// Hands every value of a column to `take` (row, value); a bit is 0 or 1.
@@ -332,6 +352,7 @@ fn layout(field: &arrow_ipc::Field<'_>) -> Option<(Stored, usize)> {
 pub(super) enum Values<'a> {
     Floats(Box<dyn Iterator<Item = f32> + 'a>),
     Flags(&'a [bool]),
+    Ids(&'a [i32]),
 }
 
 /// Writes one record batch, LZ4-compressed as Argoverse 2 does.
@@ -344,6 +365,7 @@ pub(super) fn write<W: Write>(
         let array: ArrayRef = match values {
             Values::Floats(values) => Arc::new(Float32Array::from_iter_values(values)),
             Values::Flags(flags) => Arc::new(BooleanArray::from(flags.to_vec())),
+            Values::Ids(ids) => Arc::new(Int32Array::from(ids.to_vec())),
         };
         (name, array)
     };

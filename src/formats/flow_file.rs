@@ -1,23 +1,26 @@
-//! Flow out and back in: one row per source point, in the source's order, in any format.
+//! Flow in any format: one row per source point, in the source's order.
 //!
 //! It must not know how the flow was found.
 
+mod objects;
+mod read;
+
+pub(super) use objects::Described;
+pub use read::{FlowFile, read_flow};
+
 use std::io::{Cursor, Write};
 
-use crate::flow::{Point, RigidTransform};
+use crate::flow::{Objects, Point, RigidTransform};
 use crate::picture::{INVALID_COLOR, color, full_scale, shown_motion};
 
-use super::cloud::read_columns;
 use super::error::{FileKind, FormatError, shorten};
-use super::feather::{self, FLOW_COLUMNS, Table, Values};
-use super::limits::{check_flag, check_points, check_value};
+use super::feather::{self, FLOW_COLUMNS, Values};
+use super::limits::check_points;
 use super::motion::matrix_rows;
-use super::npz::{Npz, NpzWriter};
-use super::pair::{check_count, flags};
-use super::pcd::{self, Pcd};
-use super::ply::{self, Ply};
-use super::sniff::{ending, recognize};
-use super::{json, npy};
+use super::npz::NpzWriter;
+use super::pair::check_count;
+use super::sniff::ending;
+use super::{json, npy, pcd, ply};
 
 /// Property names of a displacement in PLY and PCD.
 const FLOW_AXES: [&str; 3] = ["flow_x", "flow_y", "flow_z"];
@@ -33,36 +36,32 @@ pub struct FlowTable<'a> {
     pub valid: &'a [bool],
     /// Whether the point moves by itself, where that is known.
     pub dynamic: Option<&'a [bool]>,
+    /// What the points are parts of and how sure their motion is, where that is known.
+    pub objects: Option<&'a Objects>,
     /// The ego motion `target_from_source`, where it is known.
     pub ego: Option<&'a RigidTransform>,
-}
-
-/// A flow read back.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct FlowFile {
-    /// N displacements, metres.
-    pub flow: Vec<Point>,
-    /// Whether each row has a flow, where the file says so.
-    pub valid: Option<Vec<bool>>,
-    /// Whether each point moves by itself, where the file says so.
-    pub dynamic: Option<Vec<bool>>,
 }
 
 /// The formats that flow is written in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum FlowFormat {
-    /// `flow` N x 3 float32, `valid` bool, `dynamic` bool and `ego` 4 x 4 float64 where known.
+    /// `flow` N x 3 float32, `valid` bool, `dynamic` bool and `ego` 4 x 4 float64 where known;
+    /// `cluster` int32, `confidence` float32 and the clusters themselves, K rows each, as
+    /// `clusters_points` uint32, `clusters_dynamic` bool, `clusters_box` K x 7 float32 (center,
+    /// length, width, height, yaw), `clusters_velocity` K x 3, `clusters_yaw_rate` and
+    /// `clusters_confidence` float32.
     Npz,
     /// The displacements alone, N x 3 float32.
     Npy,
-    /// Argoverse 2's columns and `is_valid`, `is_dynamic`. Float32, so that nothing is lost;
+    /// Argoverse 2's columns and `is_valid`, `is_dynamic`, `cluster`, `confidence`. Float32, so that nothing is lost;
     /// float16, which Argoverse 2 accepts too, would round 1 m to half a millimetre.
     Feather,
-    /// Points with `flow_x`, `flow_y`, `flow_z`, `valid`, `dynamic`, and color by direction.
+    /// Points with `flow_x`, `flow_y`, `flow_z`, `valid`, `dynamic`, `cluster`, `confidence`, and color
+    /// by direction.
     Ply,
     /// The same, color packed into `rgb`.
     Pcd,
-    /// An object with `flow`, `valid`, `dynamic`, `ego`.
+    /// An object with `flow`, `valid`, `dynamic`, `ego`, `cluster`, `confidence`, `clusters`.
     Json,
 }
 
@@ -139,6 +138,10 @@ pub fn write_flow<W: Write>(
     if let Some(dynamic) = table.dynamic {
         check_count("dynamic", dynamic.len(), count)?;
     }
+    if let Some(objects) = table.objects {
+        check_count("cluster", objects.cluster.len(), count)?;
+        check_count("confidence", objects.confidence.len(), count)?;
+    }
     check_points(format.kind(), "flow", table.flow)?;
     match format {
         FlowFormat::Npz => write_npz(table, out),
@@ -146,10 +149,7 @@ pub fn write_flow<W: Write>(
         FlowFormat::Feather => write_feather(table, out),
         FlowFormat::Ply => write_ply(table, out),
         FlowFormat::Pcd => write_pcd(table, out),
-        FlowFormat::Json => {
-            let ego = table.ego.map(matrix_rows);
-            json::write(out, table.flow, table.valid, table.dynamic, ego)
-        }
+        FlowFormat::Json => json::write(table, out),
     }
 }
 
@@ -162,6 +162,9 @@ fn write_npz<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatE
     }
     if let Some(ego) = table.ego {
         npz.matrix("ego", &matrix_rows(ego))?;
+    }
+    if let Some(found) = table.objects {
+        objects::put(found, &mut npz)?;
     }
     out.write_all(npz.finish()?.get_ref())?;
     Ok(())
@@ -176,6 +179,11 @@ fn write_feather<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), For
     columns.push(("is_valid", Values::Flags(table.valid)));
     if let Some(dynamic) = table.dynamic {
         columns.push(("is_dynamic", Values::Flags(dynamic)));
+    }
+    if let Some(objects) = table.objects {
+        columns.push(("cluster", Values::Ids(&objects.cluster)));
+        let confidence = objects.confidence.iter().copied();
+        columns.push(("confidence", Values::Floats(Box::new(confidence))));
     }
     feather::write(out, columns)
 }
@@ -201,6 +209,9 @@ fn write_ply<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatE
     if table.dynamic.is_some() {
         properties.push(("uchar", "dynamic"));
     }
+    if table.objects.is_some() {
+        properties.extend([("int", "cluster"), ("float", "confidence")]);
+    }
     properties.extend(["red", "green", "blue"].map(|channel| ("uchar", channel)));
     let comment = "flow is the displacement over the pair, metres, ego motion included";
     ply::write_header(out, table.source.len(), &[comment], &properties)?;
@@ -215,6 +226,9 @@ fn write_pcd<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatE
     fields.push(("valid", 1, 'U'));
     if table.dynamic.is_some() {
         fields.push(("dynamic", 1, 'U'));
+    }
+    if table.objects.is_some() {
+        fields.extend([("cluster", 4, 'I'), ("confidence", 4, 'F')]);
     }
     fields.push(("rgb", 4, 'F'));
     pcd::write_header(out, table.source.len(), &fields)?;
@@ -238,6 +252,10 @@ fn write_rows<W: Write>(
         }
         bytes.push(u8::from(table.valid[row]));
         bytes.extend(table.dynamic.map(|dynamic| u8::from(dynamic[row])));
+        if let Some(objects) = table.objects {
+            bytes.extend(objects.cluster[row].to_le_bytes());
+            bytes.extend(objects.confidence[row].to_le_bytes());
+        }
         push_color(color, &mut bytes);
         if bytes.len() >= FLUSH_AT {
             out.write_all(&bytes)?;
@@ -246,119 +264,4 @@ fn write_rows<W: Write>(
     }
     out.write_all(&bytes)?;
     Ok(())
-}
-
-/// Reads back a flow in any of the formats that [`write_flow`] writes, recognized by content; also
-/// a pair's `.npz` with `flow` and Argoverse 2's `.feather`.
-///
-/// # Errors
-/// As for a cloud, and `RowCount` where masks and flow disagree.
-pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatError> {
-    let file = match recognize(bytes, name)? {
-        FileKind::Npy => FlowFile {
-            flow: npy::read_file(bytes)?,
-            ..FlowFile::default()
-        },
-        FileKind::Npz => {
-            let mut npz = Npz::open(bytes)?;
-            let flow = npz.points("flow")?;
-            FlowFile {
-                flow,
-                valid: npz.mask("valid")?,
-                dynamic: npz.mask("dynamic")?,
-            }
-        }
-        FileKind::Feather => {
-            let table = Table::open(bytes)?;
-            FlowFile {
-                flow: read_columns(&table, FLOW_COLUMNS)?,
-                valid: flags(&table, &["is_valid", "valid"])?,
-                dynamic: flags(&table, &["is_dynamic", "dynamic"])?,
-            }
-        }
-        kind @ FileKind::Ply => {
-            let ply = Ply::open(bytes)?;
-            let has = |name| ply.property(name).is_some();
-            Rows::new(kind, has("valid"), has("dynamic"))
-                .read(|wanted, take| ply.each(wanted, take))?
-        }
-        kind @ FileKind::Pcd => {
-            let pcd = Pcd::open(bytes)?;
-            let has = |name| pcd.field(name).is_some();
-            Rows::new(kind, has("valid"), has("dynamic"))
-                .read(|wanted, take| pcd.each(wanted, take))?
-        }
-        FileKind::Json => {
-            let (flow, valid, dynamic) = json::read(bytes)?;
-            FlowFile {
-                flow,
-                valid,
-                dynamic,
-            }
-        }
-        kind @ (FileKind::KittiBin | FileKind::NuscenesBin) => {
-            return Err(kind.unsupported("it holds a cloud, not flow"));
-        }
-        kind @ (FileKind::Las | FileKind::Png | FileKind::Camera | FileKind::Poses) => {
-            return Err(kind.unsupported("no flow is read from it"));
-        }
-    };
-    for (what, mask) in [("valid", &file.valid), ("dynamic", &file.dynamic)] {
-        if let Some(mask) = mask {
-            check_count(what, mask.len(), file.flow.len())?;
-        }
-    }
-    Ok(file)
-}
-
-/// Gathers flow and masks from the rows of a PLY or PCD file.
-struct Rows {
-    kind: FileKind,
-    wanted: Vec<&'static str>,
-    file: FlowFile,
-}
-
-/// What takes a row of wanted values.
-type TakeRow<'a> = &'a mut dyn FnMut(usize, &[f64]) -> Result<(), FormatError>;
-
-impl Rows {
-    fn new(kind: FileKind, valid: bool, dynamic: bool) -> Self {
-        let mut wanted = FLOW_AXES.to_vec();
-        wanted.extend(valid.then_some("valid"));
-        wanted.extend(dynamic.then_some("dynamic"));
-        let file = FlowFile {
-            flow: Vec::new(),
-            valid: valid.then(Vec::new),
-            dynamic: dynamic.then(Vec::new),
-        };
-        Self { kind, wanted, file }
-    }
-
-    fn read(
-        self,
-        each: impl FnOnce(&[&str], TakeRow<'_>) -> Result<(), FormatError>,
-    ) -> Result<FlowFile, FormatError> {
-        let Self {
-            kind,
-            wanted,
-            mut file,
-        } = self;
-        each(&wanted, &mut |row, values| {
-            let mut flow = [0.0; 3];
-            for ((component, &value), axis) in flow.iter_mut().zip(values).zip(FLOW_AXES) {
-                *component = check_value(kind, row, axis, value)?;
-            }
-            file.flow.push(flow);
-            let mut masks = values.iter().skip(3);
-            for (mask, name) in [(&mut file.valid, "valid"), (&mut file.dynamic, "dynamic")] {
-                if let Some(mask) = mask
-                    && let Some(&value) = masks.next()
-                {
-                    mask.push(check_flag(kind, row, name, value)?);
-                }
-            }
-            Ok(())
-        })?;
-        Ok(file)
-    }
 }

@@ -1,4 +1,5 @@
-//! Flow as one JSON object: `flow` [[x, y, z], ...], `valid`, and `dynamic` and `ego` if known.
+//! Flow as one JSON object: `flow` [[x, y, z], ...], `valid`, and `dynamic`, `ego`, `cluster`,
+//! `confidence` and `clusters` if known.
 //!
 //! Keys of others are stepped over, so that an answer of the service can be read back. It must
 //! not know what else such an answer carries.
@@ -8,7 +9,9 @@ use std::io::Write;
 use crate::flow::Point;
 
 use super::error::{FileKind, FormatError};
-use super::limits::check_value;
+use super::flow_file::{Described, FlowFile, FlowTable};
+use super::limits::{check_chance, check_value};
+use super::motion::matrix_rows;
 
 const KIND: FileKind = FileKind::Json;
 
@@ -20,6 +23,12 @@ struct Written<'a> {
     dynamic: Option<&'a [bool]>,
     /// Row by row; null where it is not known.
     ego: Option<[[f64; 4]; 4]>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    cluster: Option<&'a [i32]>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    confidence: Option<&'a [f32]>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    clusters: Option<Vec<Described>>,
 }
 
 #[derive(serde::Deserialize)]
@@ -27,12 +36,11 @@ struct Read {
     flow: Vec<[f64; 3]>,
     valid: Option<Vec<bool>>,
     dynamic: Option<Vec<bool>>,
+    cluster: Option<Vec<i32>>,
+    confidence: Option<Vec<f64>>,
 }
 
-/// Flow and its masks, as read.
-pub(super) type Parts = (Vec<Point>, Option<Vec<bool>>, Option<Vec<bool>>);
-
-pub(super) fn read(bytes: &[u8]) -> Result<Parts, FormatError> {
+pub(super) fn read(bytes: &[u8]) -> Result<FlowFile, FormatError> {
     let read: Read =
         serde_json::from_slice(bytes).map_err(|error| KIND.malformed(error.to_string()))?;
     let mut flow = Vec::with_capacity(read.flow.len());
@@ -43,23 +51,32 @@ pub(super) fn read(bytes: &[u8]) -> Result<Parts, FormatError> {
             check_value(KIND, row, "flow.z", z)?,
         ]);
     }
-    Ok((flow, read.valid, read.dynamic))
+    let chances = |chances: Vec<f64>| {
+        let rows = chances.into_iter().enumerate();
+        let checked = rows.map(|(row, chance)| check_chance(KIND, row, "confidence", chance));
+        checked.collect::<Result<Vec<f32>, _>>()
+    };
+    Ok(FlowFile {
+        flow,
+        valid: read.valid,
+        dynamic: read.dynamic,
+        cluster: read.cluster,
+        confidence: read.confidence.map(chances).transpose()?,
+    })
 }
 
-pub(super) fn write<W: Write>(
-    out: &mut W,
-    flow: &[Point],
-    valid: &[bool],
-    dynamic: Option<&[bool]>,
-    ego: Option<[[f64; 4]; 4]>,
-) -> Result<(), FormatError> {
+pub(super) fn write<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatError> {
+    let objects = table.objects;
     serde_json::to_writer(
         &mut *out,
         &Written {
-            flow,
-            valid,
-            dynamic,
-            ego,
+            flow: table.flow,
+            valid: table.valid,
+            dynamic: table.dynamic,
+            ego: table.ego.map(matrix_rows),
+            cluster: objects.map(|objects| objects.cluster.as_slice()),
+            confidence: objects.map(|objects| objects.confidence.as_slice()),
+            clusters: objects.map(|objects| objects.clusters.iter().map(Described::from).collect()),
         },
     )
     .map_err(|error| FormatError::Write(error.into()))?;

@@ -99,6 +99,36 @@ pub(super) fn check_flag(
     Ok(value != 0.0)
 }
 
+/// The number of a cluster: whole, and in 32 bits.
+pub(super) fn check_id(
+    kind: FileKind,
+    row: usize,
+    column: &str,
+    value: f64,
+) -> Result<i32, FormatError> {
+    if value.fract() != 0.0 || value.abs() > f64::from(i32::MAX) {
+        return Err(kind.malformed(format!(
+            "row {row}: {column} is {value}, a whole number of 32 bits is needed"
+        )));
+    }
+    Ok(value as i32)
+}
+
+/// A chance, 0 to 1.
+pub(super) fn check_chance(
+    kind: FileKind,
+    row: usize,
+    column: &str,
+    value: f64,
+) -> Result<f32, FormatError> {
+    if !(0.0..=1.0).contains(&value) {
+        return Err(kind.malformed(format!(
+            "row {row}: {column} is {value}, a number from 0 to 1 is needed"
+        )));
+    }
+    Ok(value as f32)
+}
+
 /// Refuses displacements or coordinates that no reader would take back.
 pub(super) fn check_points(
     kind: FileKind,

@@ -7,7 +7,7 @@ use std::io::{Read, Write};
 use crate::flow::Point;
 
 use super::error::{FileKind, FormatError, shorten};
-use super::limits::{MAX_COORDINATE_M, check_flag, check_rows, check_value};
+use super::limits::{MAX_COORDINATE_M, check_rows, check_value};
 use super::scalar::{ByteOrder, Scalar, write_floats};
 
 pub(super) const MAGIC: &[u8] = b"\x93NUMPY";
@@ -235,13 +235,13 @@ pub(super) fn read_points<R: Read + ?Sized>(
     Ok(points)
 }
 
-/// A mask or a column of N numbers, each tested by `is_true`.
-pub(super) fn read_mask<R: Read + ?Sized>(
+/// A column of N numbers, each checked and made what it is by `check`.
+pub(super) fn read_column<R: Read + ?Sized, T>(
     place: Place<'_>,
     header: &Header,
     reader: &mut R,
-    is_true: impl Fn(f64) -> bool,
-) -> Result<Vec<bool>, FormatError> {
+    check: impl Fn(usize, f64) -> Result<T, FormatError>,
+) -> Result<Vec<T>, FormatError> {
     let rows = match header.shape[..] {
         [rows] | [rows, 1] => check_rows(place.kind, rows as u64)?,
         _ => {
@@ -252,15 +252,14 @@ pub(super) fn read_mask<R: Read + ?Sized>(
             )));
         }
     };
-    let mut mask = vec![false; rows];
+    let mut column = Vec::with_capacity(rows);
     header
         .scalar
         .each(header.order, rows, place.kind, reader, |row, value| {
-            check_flag(place.kind, row, place.array, value)?;
-            mask[row] = is_true(value);
+            column.push(check(row, value)?);
             Ok(())
         })?;
-    Ok(mask)
+    Ok(column)
 }
 
 /// A 4 x 4 matrix of floats, row by row.
@@ -329,9 +328,7 @@ pub(super) fn write_header<W: Write>(
 
 /// Writes N x 3 float32, little endian.
 pub(super) fn write_points<W: Write>(out: &mut W, points: &[Point]) -> Result<(), FormatError> {
-    write_header(out, "<f4", &format!("({}, 3)", points.len()))?;
-    write_floats(out, points.as_flattened())?;
-    Ok(())
+    write_rows(out, points)
 }
 
 /// Writes N booleans.
@@ -362,6 +359,15 @@ pub(super) fn write_counts<W: Write>(out: &mut W, counts: &[u32]) -> Result<(), 
 pub(super) fn write_values<W: Write>(out: &mut W, values: &[f32]) -> Result<(), FormatError> {
     write_header(out, "<f4", &format!("({},)", values.len()))?;
     write_floats(out, values)
+}
+
+/// Writes N x C float32, little endian.
+pub(super) fn write_rows<W: Write, const C: usize>(
+    out: &mut W,
+    rows: &[[f32; C]],
+) -> Result<(), FormatError> {
+    write_header(out, "<f4", &format!("({}, {C})", rows.len()))?;
+    write_floats(out, rows.as_flattened())
 }
 
 /// Writes a 4 x 4 float64 matrix.

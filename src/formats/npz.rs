@@ -11,7 +11,7 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 use crate::flow::Point;
 
 use super::error::{FileKind, FormatError, shorten};
-use super::limits::unfold_limit;
+use super::limits::{check_flag, unfold_limit};
 use super::npy::{self, Header, Place};
 
 const KIND: FileKind = FileKind::Npz;
@@ -86,15 +86,15 @@ impl<'a> Npz<'a> {
 
     /// N booleans: nonzero is true. `None` where there is no such array.
     pub(super) fn mask(&mut self, name: &str) -> Result<Option<Vec<bool>>, FormatError> {
-        self.column(name, |value| value != 0.0)
+        self.column(name, |row, value| check_flag(KIND, row, name, value))
     }
 
-    /// N numbers, each tested by `is_true`. `None` where there is no such array.
-    pub(super) fn column(
+    /// N numbers, each checked and made what it is by `check`. `None` where there is no such array.
+    pub(super) fn column<T>(
         &mut self,
         name: &str,
-        is_true: impl Fn(f64) -> bool,
-    ) -> Result<Option<Vec<bool>>, FormatError> {
+        check: impl Fn(usize, f64) -> Result<T, FormatError>,
+    ) -> Result<Option<Vec<T>>, FormatError> {
         if !self.has(name) {
             return Ok(None);
         }
@@ -103,7 +103,7 @@ impl<'a> Npz<'a> {
             array: name,
         };
         self.with(name, |header, data| {
-            npy::read_mask(place, &header, data, is_true)
+            npy::read_column(place, &header, data, check)
         })
         .map(Some)
     }

@@ -122,9 +122,9 @@ fn read_truth(npz: &mut Npz<'_>, count: usize) -> Result<Option<PairTruth>, Form
     if let Some(dynamic) = &dynamic {
         check_count("dynamic", dynamic.len(), count)?;
     }
-    let foreground = match npz.column("box_id", |id| id >= 0.0)? {
+    let foreground = match npz.column("box_id", on_object)? {
         None => npz.mask("classes")?,
-        on_object => on_object,
+        foreground => foreground,
     };
     if let Some(foreground) = &foreground {
         check_count("box_id or classes", foreground.len(), count)?;
@@ -135,6 +135,12 @@ fn read_truth(npz: &mut Npz<'_>, count: usize) -> Result<Option<PairTruth>, Form
         dynamic,
         foreground,
     }))
+}
+
+/// Whether a `box_id` is that of an object.
+fn on_object(row: usize, id: f64) -> Result<bool, FormatError> {
+    check_flag(KIND, row, "box_id", id)?;
+    Ok(id >= 0.0)
 }
 
 pub(super) fn check_count(what: &str, found: usize, expected: usize) -> Result<(), FormatError> {
@@ -229,13 +235,7 @@ pub(super) fn flags(table: &Table<'_>, names: &[&str]) -> Result<Option<Vec<bool
     let Some(name) = names.iter().find(|name| table.has(name)) else {
         return Ok(None);
     };
-    let mut mask = Vec::new();
-    table.each(name, |row, value| {
-        if mask.is_empty() {
-            mask.reserve_exact(table.rows());
-        }
-        mask.push(check_flag(FileKind::Feather, row, name, value)?);
-        Ok(())
-    })?;
-    Ok(Some(mask))
+    table.column(name, |row, value| {
+        check_flag(FileKind::Feather, row, name, value)
+    })
 }

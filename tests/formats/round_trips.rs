@@ -8,7 +8,7 @@ use fnsf::formats::{
 
 use crate::samples::{
     CLOUD_FORMATS, FLOW_FORMATS, cloud_file, feather, floats, flow_file, lzf_literals, npy, npz,
-    pair, pair_file, points,
+    objects, pair, pair_file, points,
 };
 
 /// A rotation goes through a quaternion and back in float64.
@@ -75,11 +75,63 @@ fn a_flow_comes_back_from_every_format() {
         assert_eq!(read.flow, truth.flow, "{format:?}");
         if format == FlowFormat::Npy {
             assert_eq!((read.valid, read.dynamic), (None, None));
+            assert_eq!((read.cluster, read.confidence), (None, None));
         } else {
+            let objects = objects(500);
+            assert_eq!(read.cluster, Some(objects.cluster), "{format:?}");
+            assert_eq!(read.confidence, Some(objects.confidence), "{format:?}");
             assert_eq!(read.valid.as_ref(), Some(&truth.valid), "{format:?}");
             assert_eq!(read.dynamic, truth.dynamic, "{format:?}");
         }
     }
+}
+
+#[test]
+fn json_and_npz_hold_the_clusters_themselves() {
+    let pair = pair(50);
+    let json: serde_json::Value =
+        serde_json::from_slice(&flow_file(FlowFormat::Json, &pair)).unwrap();
+    assert_eq!(
+        json["clusters"][0],
+        serde_json::json!({
+            "points": 16, "dynamic": true, "center": [1.0, 2.0, 3.0], "size": [4.0, 2.0, 1.5],
+            "yaw": 0.5, "velocity": [0.5, -0.25, 0.0], "yaw_rate": 0.125, "confidence": 0.75,
+        })
+    );
+    assert_eq!(json["clusters"].as_array().map(Vec::len), Some(2));
+
+    let bytes = flow_file(FlowFormat::Npz, &pair);
+    let mut archive = zip::ZipArchive::new(std::io::Cursor::new(bytes)).unwrap();
+    let mut array = |name: &str| {
+        let mut bytes = Vec::new();
+        let mut member = archive.by_name(&format!("{name}.npy")).unwrap();
+        std::io::Read::read_to_end(&mut member, &mut bytes).unwrap();
+        bytes
+    };
+    let boxes = array("clusters_box");
+    assert!(String::from_utf8_lossy(&boxes).contains("'shape': (2, 7)"));
+    let row = [1.0, 2.0, 3.0, 4.0, 2.0, 1.5, 0.5];
+    assert!(boxes.ends_with(&floats(&[row, row].concat())));
+    assert!(array("clusters_velocity").ends_with(&floats(&[0.5, -0.25, 0.0, 0.0, 0.0, 0.0])));
+    assert!(array("clusters_points").ends_with(&[16, 0, 0, 0, 16, 0, 0, 0]));
+    assert!(array("clusters_dynamic").ends_with(&[1, 0]));
+    assert!(array("clusters_yaw_rate").ends_with(&floats(&[0.125; 2])));
+    assert!(array("clusters_confidence").ends_with(&floats(&[0.75; 2])));
+}
+
+#[test]
+fn senseless_clusters_and_chances_are_refused_by_name() {
+    let read = |key: &str| {
+        let text = format!(r#"{{"flow":[[0,0,0]],{key}}}"#);
+        read_flow(text.as_bytes(), None).unwrap_err().to_string()
+    };
+    assert!(read(r#""confidence":[1.5]"#).contains("confidence is 1.5"));
+    assert!(read(r#""cluster":[0,1]"#).contains("cluster"));
+    let flow = npy("'<f4'", false, "(1, 3)", &floats(&[0.0; 3]));
+    let half = npy("'<f4'", false, "(1,)", &floats(&[0.5]));
+    let file = npz(&[("flow", &flow), ("cluster", &half)]);
+    let error = read_flow(&file, None).unwrap_err().to_string();
+    assert!(error.contains("cluster is 0.5"), "{error}");
 }
 
 #[test]
@@ -108,7 +160,9 @@ fn a_feather_flow_reads_with_arrows_own_reader() {
             "flow_ty_m",
             "flow_tz_m",
             "is_valid",
-            "is_dynamic"
+            "is_dynamic",
+            "cluster",
+            "confidence"
         ]
     );
     assert_eq!(

@@ -1,6 +1,6 @@
 //! Small files of every format, made by hand or by our own writers.
 
-use fnsf::flow::{Point, RigidTransform};
+use fnsf::flow::{Bounds, Cluster, Objects, Point, RigidTransform};
 use fnsf::formats::{
     CloudFormat, FlowFormat, FlowTable, Ground, Pair, PairTruth, write_cloud, write_flow,
     write_pair_npz,
@@ -86,13 +86,41 @@ pub(crate) fn pair_file(pair: &Pair) -> Vec<u8> {
     bytes
 }
 
+/// Two clusters, one of which moves; every third row is of none.
+pub(crate) fn objects(count: usize) -> Objects {
+    let cluster = Cluster {
+        points: count as u32 / 3,
+        dynamic: true,
+        bounds: Bounds {
+            center: [1.0, 2.0, 3.0],
+            size: [4.0, 2.0, 1.5],
+            yaw: 0.5,
+        },
+        velocity: [0.5, -0.25, 0.0],
+        yaw_rate: 0.125,
+        confidence: 0.75,
+    };
+    let still = Cluster {
+        dynamic: false,
+        velocity: [0.0; 3],
+        ..cluster
+    };
+    Objects {
+        cluster: (0..count as i32).map(|row| row % 3 - 1).collect(),
+        confidence: (0..count).map(|row| (row % 5) as f32 / 4.0).collect(),
+        clusters: vec![cluster, still],
+    }
+}
+
 pub(crate) fn flow_file(format: FlowFormat, pair: &Pair) -> Vec<u8> {
     let truth = pair.truth.as_ref().unwrap();
+    let objects = objects(pair.source.len());
     let table = FlowTable {
         source: &pair.source,
         flow: &truth.flow,
         valid: &truth.valid,
         dynamic: truth.dynamic.as_deref(),
+        objects: Some(&objects),
         ego: pair.ego.as_ref(),
     };
     let mut bytes = Vec::new();

@@ -12,8 +12,8 @@ use crate::api::service::{Answer, Service};
 use crate::flow::{DenseCloud, Point};
 use crate::payload::{StoredCloud, points_from_le_bytes};
 
-/// Rows of one chunk of flow: below 1 MiB with its flags.
-const ROWS: usize = 80_000;
+/// Rows of one chunk of flow: below 1 MiB with all of its columns.
+const ROWS: usize = 45_000;
 
 /// The next message, within the time that a body may take.
 pub(super) async fn next<T>(
@@ -144,9 +144,18 @@ pub(super) fn pieces(
                 u8::from(flow.valid[row]) | u8::from(dynamic) << 1
             })
             .collect();
+        let (mut cluster, mut confidence) = (Vec::new(), Vec::new());
+        if let Some(objects) = &flow.objects {
+            let ids = objects.cluster[from..to].iter();
+            cluster.extend(ids.flat_map(|id| id.to_le_bytes()));
+            let chances = objects.confidence[from..to].iter();
+            confidence.extend(chances.flat_map(|chance| chance.to_le_bytes()));
+        }
         proto::FlowChunk {
             flow: bytes.into(),
             flags: flags.into(),
+            cluster: cluster.into(),
+            confidence: confidence.into(),
         }
     })
 }

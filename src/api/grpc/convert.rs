@@ -7,6 +7,7 @@ use tonic::metadata::MetadataMap;
 use super::proto;
 use crate::api::error::ApiError;
 use crate::api::service::Answer;
+use crate::flow::Cluster;
 use crate::formats::rigid_motion;
 use crate::job::{
     DenseReport, Densify, DeviceChoice, EgoChoice, GroundChoice, Job, JobError, JobId, JobOptions,
@@ -199,6 +200,23 @@ pub(super) fn header(answer: &Answer) -> proto::FlowHeader {
             network: seconds.network,
             total: seconds.total,
         }),
+        clusters: match &answer.flow.objects {
+            None => Vec::new(),
+            Some(objects) => objects.clusters.iter().map(cluster).collect(),
+        },
+    }
+}
+
+fn cluster(cluster: &Cluster) -> proto::Cluster {
+    proto::Cluster {
+        points: cluster.points,
+        dynamic: cluster.dynamic,
+        center: cluster.bounds.center.to_vec(),
+        size: cluster.bounds.size.to_vec(),
+        yaw: cluster.bounds.yaw,
+        velocity: cluster.velocity.to_vec(),
+        yaw_rate: cluster.yaw_rate,
+        confidence: cluster.confidence,
     }
 }
 

@@ -7,11 +7,13 @@
 mod argoverse;
 mod buckets;
 mod metrics;
+mod reliability;
 mod three_way;
 mod truth;
 
 pub use argoverse::{Argoverse2, Argoverse2Pool, evaluate_argoverse2};
 pub use buckets::{Bucket, BucketNormalized, BucketReport, ClassError, UNCLASSIFIED};
 pub use metrics::{Metrics, Pool, evaluate};
+pub use reliability::{Calibration, CalibrationBin, Reliability};
 pub use three_way::{Part, ThreeWay};
 pub use truth::{CLOSE_HALF_WIDTH_M, EvaluateError, Truth};

@@ -1,0 +1,155 @@
+//! Flow back in, in any format that it is written in. It must not know how the flow was found.
+
+use super::FLOW_AXES;
+use crate::flow::Point;
+use crate::formats::cloud::read_columns;
+use crate::formats::error::{FileKind, FormatError};
+use crate::formats::feather::{FLOW_COLUMNS, Table};
+use crate::formats::limits::{check_chance, check_flag, check_id, check_value};
+use crate::formats::npz::Npz;
+use crate::formats::pair::{check_count, flags};
+use crate::formats::pcd::Pcd;
+use crate::formats::ply::Ply;
+use crate::formats::sniff::recognize;
+use crate::formats::{json, npy};
+
+/// A flow read back, and whatever the file says of its N rows besides.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct FlowFile {
+    /// N displacements, metres.
+    pub flow: Vec<Point>,
+    /// Whether each row has a flow.
+    pub valid: Option<Vec<bool>>,
+    /// Whether each point moves by itself.
+    pub dynamic: Option<Vec<bool>>,
+    /// The cluster of each point; negative where it is of none.
+    pub cluster: Option<Vec<i32>>,
+    /// The chance that each row's flow is right, 0 to 1.
+    pub confidence: Option<Vec<f32>>,
+}
+
+/// Reads back a flow in any of the formats that [`super::write_flow`] writes, recognized by content;
+/// also a pair's `.npz` with `flow` and Argoverse 2's `.feather`.
+///
+/// # Errors
+/// As for a cloud, and `RowCount` where masks and flow disagree.
+pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatError> {
+    let file = match recognize(bytes, name)? {
+        FileKind::Npy => FlowFile {
+            flow: npy::read_file(bytes)?,
+            ..FlowFile::default()
+        },
+        kind @ FileKind::Npz => {
+            let mut npz = Npz::open(bytes)?;
+            FlowFile {
+                flow: npz.points("flow")?,
+                valid: npz.mask("valid")?,
+                dynamic: npz.mask("dynamic")?,
+                cluster: npz.column("cluster", |row, id| check_id(kind, row, "cluster", id))?,
+                confidence: npz.column("confidence", |row, chance| {
+                    check_chance(kind, row, "confidence", chance)
+                })?,
+            }
+        }
+        kind @ FileKind::Feather => {
+            let table = Table::open(bytes)?;
+            FlowFile {
+                flow: read_columns(&table, FLOW_COLUMNS)?,
+                valid: flags(&table, &["is_valid", "valid"])?,
+                dynamic: flags(&table, &["is_dynamic", "dynamic"])?,
+                cluster: table.column("cluster", |row, id| check_id(kind, row, "cluster", id))?,
+                confidence: table.column("confidence", |row, chance| {
+                    check_chance(kind, row, "confidence", chance)
+                })?,
+            }
+        }
+        kind @ FileKind::Ply => {
+            let ply = Ply::open(bytes)?;
+            let has = |name: &str| ply.property(name).is_some();
+            Rows::new(kind, has).read(|wanted, take| ply.each(wanted, take))?
+        }
+        kind @ FileKind::Pcd => {
+            let pcd = Pcd::open(bytes)?;
+            let has = |name: &str| pcd.field(name).is_some();
+            Rows::new(kind, has).read(|wanted, take| pcd.each(wanted, take))?
+        }
+        FileKind::Json => json::read(bytes)?,
+        kind @ (FileKind::KittiBin | FileKind::NuscenesBin) => {
+            return Err(kind.unsupported("it holds a cloud, not flow"));
+        }
+        kind @ (FileKind::Las | FileKind::Png | FileKind::Camera | FileKind::Poses) => {
+            return Err(kind.unsupported("no flow is read from it"));
+        }
+    };
+    let count = file.flow.len();
+    for (what, rows) in [
+        ("valid", file.valid.as_ref().map(Vec::len)),
+        ("dynamic", file.dynamic.as_ref().map(Vec::len)),
+        ("cluster", file.cluster.as_ref().map(Vec::len)),
+        ("confidence", file.confidence.as_ref().map(Vec::len)),
+    ] {
+        check_count(what, rows.unwrap_or(count), count)?;
+    }
+    Ok(file)
+}
+
+/// Gathers flow and what goes with it from the rows of a PLY or PCD file.
+struct Rows {
+    kind: FileKind,
+    wanted: Vec<&'static str>,
+    file: FlowFile,
+}
+
+/// What takes a row of wanted values.
+type TakeRow<'a> = &'a mut dyn FnMut(usize, &[f64]) -> Result<(), FormatError>;
+
+impl Rows {
+    /// Of a file that has the columns which `has` says.
+    fn new(kind: FileKind, has: impl Fn(&str) -> bool) -> Self {
+        let mut wanted = FLOW_AXES.to_vec();
+        let columns = ["valid", "dynamic", "cluster", "confidence"];
+        wanted.extend(columns.into_iter().filter(|column| has(column)));
+        let file = FlowFile {
+            flow: Vec::new(),
+            valid: has("valid").then(Vec::new),
+            dynamic: has("dynamic").then(Vec::new),
+            cluster: has("cluster").then(Vec::new),
+            confidence: has("confidence").then(Vec::new),
+        };
+        Self { kind, wanted, file }
+    }
+
+    fn read(
+        self,
+        each: impl FnOnce(&[&str], TakeRow<'_>) -> Result<(), FormatError>,
+    ) -> Result<FlowFile, FormatError> {
+        let Self {
+            kind,
+            wanted,
+            mut file,
+        } = self;
+        each(&wanted, &mut |row, values| {
+            let mut flow = [0.0; 3];
+            for ((component, &value), axis) in flow.iter_mut().zip(values).zip(FLOW_AXES) {
+                *component = check_value(kind, row, axis, value)?;
+            }
+            file.flow.push(flow);
+            let mut rest = values.iter().skip(3);
+            let mut next = || rest.next().copied().unwrap_or_default();
+            if let Some(valid) = &mut file.valid {
+                valid.push(check_flag(kind, row, "valid", next())?);
+            }
+            if let Some(dynamic) = &mut file.dynamic {
+                dynamic.push(check_flag(kind, row, "dynamic", next())?);
+            }
+            if let Some(cluster) = &mut file.cluster {
+                cluster.push(check_id(kind, row, "cluster", next())?);
+            }
+            if let Some(confidence) = &mut file.confidence {
+                confidence.push(check_chance(kind, row, "confidence", next())?);
+            }
+            Ok(())
+        })?;
+        Ok(file)
+    }
+}
