@@ -48,6 +48,7 @@ pub(super) fn labelled(simulated: SimulatedPair) -> Pair {
             valid: vec![true; points],
             dynamic: Some(simulated.dynamic),
             foreground: Some(simulated.foreground),
+            category: None,
         }),
         ground: Some(Ground {
             source: simulated.ground_source,

@@ -114,6 +114,21 @@ pub(super) fn check_id(
     Ok(value as i32)
 }
 
+/// The number of a category: whole, 0 to 255.
+pub(super) fn check_category(
+    kind: FileKind,
+    row: usize,
+    column: &str,
+    value: f64,
+) -> Result<u8, FormatError> {
+    if value.fract() != 0.0 || !(0.0..=255.0).contains(&value) {
+        return Err(kind.malformed(format!(
+            "row {row}: {column} is {value}, a category from 0 to 255 is needed"
+        )));
+    }
+    Ok(value as u8)
+}
+
 /// A chance, 0 to 1.
 pub(super) fn check_chance(
     kind: FileKind,

@@ -9,7 +9,7 @@ use crate::flow::{Point, RigidTransform};
 use super::cloud::read_columns;
 use super::error::{FileKind, FormatError};
 use super::feather::{FLOW_COLUMNS, Table};
-use super::limits::{check_flag, check_points};
+use super::limits::{check_category, check_flag, check_points};
 use super::motion::{matrix_rows, rigid_motion};
 use super::npy;
 use super::npz::{Npz, NpzWriter};
@@ -43,6 +43,8 @@ pub struct PairTruth {
     pub dynamic: Option<Vec<bool>>,
     /// Whether the point lies on a labelled object.
     pub foreground: Option<Vec<bool>>,
+    /// Argoverse 2's category of the point, 0 where it is of none.
+    pub category: Option<Vec<u8>>,
 }
 
 /// Which points of either sweep lie on the ground.
@@ -122,19 +124,29 @@ fn read_truth(npz: &mut Npz<'_>, count: usize) -> Result<Option<PairTruth>, Form
     if let Some(dynamic) = &dynamic {
         check_count("dynamic", dynamic.len(), count)?;
     }
-    let foreground = match npz.column("box_id", on_object)? {
-        None => npz.mask("classes")?,
-        foreground => foreground,
-    };
-    if let Some(foreground) = &foreground {
-        check_count("box_id or classes", foreground.len(), count)?;
+    let category = npz.column("classes", |row, value| {
+        check_category(KIND, row, "classes", value)
+    })?;
+    if let Some(category) = &category {
+        check_count("classes", category.len(), count)?;
     }
+    let foreground = npz.column("box_id", on_object)?;
+    if let Some(foreground) = &foreground {
+        check_count("box_id", foreground.len(), count)?;
+    }
+    let foreground = foreground.or_else(|| category.as_deref().map(of_some_category));
     Ok(Some(PairTruth {
         flow,
         valid,
         dynamic,
         foreground,
+        category,
     }))
+}
+
+/// Which points are of any category.
+fn of_some_category(category: &[u8]) -> Vec<bool> {
+    category.iter().map(|&category| category != 0).collect()
 }
 
 /// Whether a `box_id` is that of an object.
@@ -156,7 +168,7 @@ pub(super) fn check_count(what: &str, found: usize, expected: usize) -> Result<(
 }
 
 /// Writes a pair with the array names that [`read_pair`] reads; `foreground` becomes `box_id`
-/// 0 on objects and -1 off them.
+/// 0 on objects and -1 off them, `category` becomes `classes`.
 ///
 /// # Errors
 /// `RowCount` where the pair's parts disagree, `NotFinite` for values that could not be read
@@ -186,6 +198,11 @@ pub fn write_pair_npz<W: Write>(pair: &Pair, out: &mut W) -> Result<(), FormatEr
                 .map(|&on| if on { 0 } else { -1 })
                 .collect();
             npz.array("box_id", |out| npy::write_ids(out, &ids))?;
+        }
+        if let Some(category) = &truth.category {
+            check_count("category", category.len(), count)?;
+            let ids: Vec<i32> = category.iter().map(|&category| category.into()).collect();
+            npz.array("classes", |out| npy::write_ids(out, &ids))?;
         }
     }
     if let Some(ground) = &pair.ground {
@@ -218,13 +235,22 @@ pub fn read_av2_labels(bytes: &[u8]) -> Result<Av2Labels, FormatError> {
     };
     let valid = flags(&table, &["is_valid", "valid"])?.unwrap_or_else(|| vec![true; flow.len()]);
     let dynamic = flags(&table, &["dynamic", "is_dynamic"])?;
-    let foreground = flags(&table, &["classes", "classes_0"])?;
+    let categories = |name: &str| {
+        table.column(name, |row, value| {
+            check_category(FileKind::Feather, row, name, value)
+        })
+    };
+    let category = match categories("classes")? {
+        None => categories("classes_0")?,
+        category => category,
+    };
     Ok(Av2Labels {
         truth: PairTruth {
             flow,
             valid,
             dynamic,
-            foreground,
+            foreground: category.as_deref().map(of_some_category),
+            category,
         },
         ground,
     })

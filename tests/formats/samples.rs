@@ -60,6 +60,7 @@ pub(crate) fn pair(count: usize) -> Pair {
         valid: pattern(count, 2),
         dynamic: Some(pattern(count, 3)),
         foreground: Some(pattern(count, 4)),
+        category: Some((0..count).map(|row| (row % 31) as u8).collect()),
     };
     let ground = Ground {
         source: pattern(count, 5),

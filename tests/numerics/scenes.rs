@@ -35,6 +35,7 @@ pub(crate) fn street(options: &StreetOptions) -> Pair {
             flow: simulated.flow,
             dynamic: Some(simulated.dynamic),
             foreground: Some(simulated.foreground),
+            category: None,
         }),
         ground: Some(fnsf::formats::Ground {
             source: simulated.ground_source,

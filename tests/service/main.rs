@@ -21,6 +21,7 @@ mod grpc;
 mod http;
 mod kills;
 mod load;
+mod objects;
 mod readme;
 mod sequences;
 mod server;

@@ -6,6 +6,7 @@
 
 mod argoverse;
 mod buckets;
+mod classes;
 mod metrics;
 mod reliability;
 mod three_way;
@@ -13,6 +14,7 @@ mod truth;
 
 pub use argoverse::{Argoverse2, Argoverse2Pool, evaluate_argoverse2};
 pub use buckets::{Bucket, BucketNormalized, BucketReport, ClassError, UNCLASSIFIED};
+pub use classes::{CLASSES, class_of_category, class_of_foreground};
 pub use metrics::{Metrics, Pool, evaluate};
 pub use reliability::{Calibration, CalibrationBin, Reliability};
 pub use three_way::{Part, ThreeWay};

@@ -1,0 +1,90 @@
+//! The classes that bucket-normalized EPE tells apart: Argoverse 2's categories, gathered.
+//!
+//! Categories are numbered as in `flow_labels.feather`: 0 is no object, the others follow the
+//! alphabet of the data set's 30. Signs, cones and barrels are left out by the benchmark because of
+//! odd labels; animals are in none of its classes.
+
+use super::buckets::UNCLASSIFIED;
+
+/// The benchmark's classes, and one for objects of which no more is known.
+pub const CLASSES: [&str; 6] = [
+    "BACKGROUND",
+    "CAR",
+    "OTHER_VEHICLES",
+    "PEDESTRIAN",
+    "WHEELED_VRU",
+    "OBJECT",
+];
+
+/// The class of a category, a place in [`CLASSES`]; [`UNCLASSIFIED`] where it is left out.
+pub fn class_of_category(category: u8) -> u8 {
+    match category {
+        0 => 0,
+        // REGULAR_VEHICLE.
+        19 => 1,
+        // ARTICULATED_BUS, BOX_TRUCK, BUS, LARGE_VEHICLE, RAILED_VEHICLE, SCHOOL_BUS, TRUCK,
+        // TRUCK_CAB, VEHICULAR_TRAILER.
+        2 | 6 | 7 | 11 | 18 | 20 | 25 | 26 | 27 => 2,
+        // OFFICIAL_SIGNALER, PEDESTRIAN, STROLLER, WHEELCHAIR.
+        16 | 17 | 23 | 28 => 3,
+        // BICYCLE, BICYCLIST, MOTORCYCLE, MOTORCYCLIST, WHEELED_DEVICE, WHEELED_RIDER.
+        3 | 4 | 14 | 15 | 29 | 30 => 4,
+        _ => UNCLASSIFIED,
+    }
+}
+
+/// The class of a point of which no more is known than whether it lies on an object.
+pub fn class_of_foreground(foreground: bool) -> u8 {
+    if foreground { 5 } else { 0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Argoverse 2's categories in their order, and the class that the benchmark puts them in.
+    const CATEGORIES: [(&str, Option<&str>); 31] = [
+        ("NONE", Some("BACKGROUND")),
+        ("ANIMAL", None),
+        ("ARTICULATED_BUS", Some("OTHER_VEHICLES")),
+        ("BICYCLE", Some("WHEELED_VRU")),
+        ("BICYCLIST", Some("WHEELED_VRU")),
+        ("BOLLARD", None),
+        ("BOX_TRUCK", Some("OTHER_VEHICLES")),
+        ("BUS", Some("OTHER_VEHICLES")),
+        ("CONSTRUCTION_BARREL", None),
+        ("CONSTRUCTION_CONE", None),
+        ("DOG", None),
+        ("LARGE_VEHICLE", Some("OTHER_VEHICLES")),
+        ("MESSAGE_BOARD_TRAILER", None),
+        ("MOBILE_PEDESTRIAN_CROSSING_SIGN", None),
+        ("MOTORCYCLE", Some("WHEELED_VRU")),
+        ("MOTORCYCLIST", Some("WHEELED_VRU")),
+        ("OFFICIAL_SIGNALER", Some("PEDESTRIAN")),
+        ("PEDESTRIAN", Some("PEDESTRIAN")),
+        ("RAILED_VEHICLE", Some("OTHER_VEHICLES")),
+        ("REGULAR_VEHICLE", Some("CAR")),
+        ("SCHOOL_BUS", Some("OTHER_VEHICLES")),
+        ("SIGN", None),
+        ("STOP_SIGN", None),
+        ("STROLLER", Some("PEDESTRIAN")),
+        ("TRAFFIC_LIGHT_TRAILER", None),
+        ("TRUCK", Some("OTHER_VEHICLES")),
+        ("TRUCK_CAB", Some("OTHER_VEHICLES")),
+        ("VEHICULAR_TRAILER", Some("OTHER_VEHICLES")),
+        ("WHEELCHAIR", Some("PEDESTRIAN")),
+        ("WHEELED_DEVICE", Some("WHEELED_VRU")),
+        ("WHEELED_RIDER", Some("WHEELED_VRU")),
+    ];
+
+    #[test]
+    fn every_category_is_of_the_class_that_the_benchmark_puts_it_in() {
+        let names = CATEGORIES.iter().skip(1).map(|(name, _)| name);
+        assert!(names.is_sorted());
+        for (category, (name, class)) in (0..).zip(CATEGORIES) {
+            let found = CLASSES.get(usize::from(class_of_category(category)));
+            assert_eq!(found.copied(), class, "{name}");
+        }
+        assert_eq!(class_of_category(31), UNCLASSIFIED);
+    }
+}

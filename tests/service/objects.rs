@@ -1,0 +1,108 @@
+//! Clusters and confidence through both doors, in every format that has room for them.
+
+use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::{Objects, Preset, Problem, Unwatched, estimate};
+use fnsf::formats::read_flow;
+use tokio_stream::StreamExt;
+
+use crate::clouds::{form, medium_pair};
+use crate::grpc::{client, pair, proto};
+use crate::server::Server;
+
+/// What the library finds on its own.
+fn expected() -> Objects {
+    let [source, target] = medium_pair();
+    let problem = Problem {
+        source,
+        target,
+        ground: None,
+        before: None,
+    };
+    let backend = CpuBackend::new(Some(2)).expect("threads");
+    let options = Preset::Label.options(None);
+    let estimate = estimate(&backend, &problem, &options, &Unwatched).expect("a flow");
+    estimate.objects.expect("objects")
+}
+
+#[tokio::test]
+async fn clusters_and_confidence_are_the_librarys_in_every_format_and_over_grpc() {
+    let server = Server::start(&[]);
+    let expected = expected();
+    assert!(expected.clusters.iter().any(|cluster| cluster.dynamic));
+    for media in [
+        "application/x-npz",
+        "application/vnd.apache.arrow.file",
+        "application/x-ply",
+        "application/x-pcd",
+        "application/json",
+    ] {
+        let answer = reqwest::Client::new()
+            .post(server.url("/v1/flow"))
+            .header("accept", media)
+            .multipart(form(medium_pair(), r#"{"preset":"label"}"#))
+            .send()
+            .await
+            .expect("an answer");
+        let bytes = answer.bytes().await.expect("a body");
+        let read = read_flow(&bytes, None).expect(media);
+        assert_eq!(read.cluster.as_ref(), Some(&expected.cluster), "{media}");
+        assert_eq!(
+            read.confidence.as_ref(),
+            Some(&expected.confidence),
+            "{media}"
+        );
+        if media == "application/json" {
+            let json: serde_json::Value = serde_json::from_slice(&bytes).expect("JSON");
+            let clusters = json["clusters"].as_array().expect("clusters");
+            assert_eq!(clusters.len(), expected.clusters.len());
+            for (found, cluster) in clusters.iter().zip(&expected.clusters) {
+                assert_eq!(found["points"], cluster.points);
+                assert_eq!(found["dynamic"], cluster.dynamic);
+                assert_eq!(found["velocity"], serde_json::json!(cluster.velocity));
+            }
+        }
+    }
+
+    let options = proto::Options {
+        preset: proto::Preset::Label.into(),
+        ..proto::Options::default()
+    };
+    let answer = client(&server)
+        .await
+        .estimate_flow(pair(medium_pair(), options))
+        .await;
+    let mut answer = answer.expect("an answer").into_inner();
+    let (mut clusters, mut cluster, mut confidence) = (Vec::new(), Vec::new(), Vec::new());
+    while let Some(message) = answer.next().await {
+        use proto::estimate_flow_response::Part;
+        match message.expect("a message").part.expect("a part") {
+            Part::Progress(_) => {}
+            Part::Header(header) => clusters = header.clusters,
+            Part::Chunk(piece) => {
+                let (ids, _) = piece.cluster.as_chunks::<4>();
+                cluster.extend(ids.iter().map(|id| i32::from_le_bytes(*id)));
+                let (chances, _) = piece.confidence.as_chunks::<4>();
+                confidence.extend(chances.iter().map(|chance| f32::from_le_bytes(*chance)));
+            }
+        }
+    }
+    assert_eq!(
+        (cluster, confidence),
+        (expected.cluster, expected.confidence)
+    );
+    assert_eq!(clusters.len(), expected.clusters.len());
+    for (found, cluster) in clusters.iter().zip(&expected.clusters) {
+        assert_eq!(
+            (found.points, found.dynamic),
+            (cluster.points, cluster.dynamic)
+        );
+        assert_eq!(found.center, cluster.bounds.center);
+        assert_eq!(found.size, cluster.bounds.size);
+        assert_eq!(found.velocity, cluster.velocity);
+        let scalars = [found.yaw, found.yaw_rate, found.confidence];
+        assert_eq!(
+            scalars,
+            [cluster.bounds.yaw, cluster.yaw_rate, cluster.confidence]
+        );
+    }
+}
