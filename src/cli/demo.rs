@@ -182,6 +182,7 @@ fn draw(pair: &Pair, answer: &Answer, path: &std::path::Path) -> Result<(), Fail
             flow: &answer.flow.flow,
             valid: answer.flow.valid.as_deref().unwrap_or(&all),
             ego: ego.as_ref(),
+            clusters: answer.flow.clusters.as_deref().unwrap_or_default(),
         },
         &TopDownOptions::default(),
     );

@@ -70,6 +70,10 @@ fn draw(estimate: &Estimate, source: &[Point], path: &Path) -> Result<(), Failur
             flow: &estimate.flow,
             valid: &estimate.valid,
             ego: estimate.ego.as_ref(),
+            clusters: estimate
+                .objects
+                .as_ref()
+                .map_or(&[], |objects| objects.clusters.as_slice()),
         },
         &TopDownOptions::default(),
     );

@@ -47,8 +47,8 @@ pub struct FlowTable<'a> {
 pub enum FlowFormat {
     /// `flow` N x 3 float32, `valid` bool, `dynamic` bool and `ego` 4 x 4 float64 where known;
     /// `cluster` int32, `confidence` float32 and the clusters themselves, K rows each, as
-    /// `clusters_points` uint32, `clusters_dynamic` bool, `clusters_box` K x 7 float32 (center,
-    /// length, width, height, yaw), `clusters_velocity` K x 3, `clusters_yaw_rate` and
+    /// `clusters_points` uint32, `clusters_dynamic` bool, `clusters_center`, `clusters_size` (length,
+    /// width, height) and `clusters_velocity` K x 3 float32, `clusters_yaw`, `clusters_yaw_rate` and
     /// `clusters_confidence` float32.
     Npz,
     /// The displacements alone, N x 3 float32.

@@ -6,7 +6,7 @@
 
 use std::io::Write;
 
-use crate::flow::Point;
+use crate::flow::{Cluster, Point};
 
 use super::error::{FileKind, FormatError};
 use super::flow_file::{Described, FlowFile, FlowTable};
@@ -38,6 +38,7 @@ struct Read {
     dynamic: Option<Vec<bool>>,
     cluster: Option<Vec<i32>>,
     confidence: Option<Vec<f64>>,
+    clusters: Option<Vec<Described>>,
 }
 
 pub(super) fn read(bytes: &[u8]) -> Result<FlowFile, FormatError> {
@@ -62,6 +63,9 @@ pub(super) fn read(bytes: &[u8]) -> Result<FlowFile, FormatError> {
         dynamic: read.dynamic,
         cluster: read.cluster,
         confidence: read.confidence.map(chances).transpose()?,
+        clusters: read
+            .clusters
+            .map(|clusters| clusters.into_iter().map(Cluster::from).collect()),
     })
 }
 

@@ -328,7 +328,8 @@ pub(super) fn write_header<W: Write>(
 
 /// Writes N x 3 float32, little endian.
 pub(super) fn write_points<W: Write>(out: &mut W, points: &[Point]) -> Result<(), FormatError> {
-    write_rows(out, points)
+    write_header(out, "<f4", &format!("({}, 3)", points.len()))?;
+    write_floats(out, points.as_flattened())
 }
 
 /// Writes N booleans.
@@ -359,15 +360,6 @@ pub(super) fn write_counts<W: Write>(out: &mut W, counts: &[u32]) -> Result<(), 
 pub(super) fn write_values<W: Write>(out: &mut W, values: &[f32]) -> Result<(), FormatError> {
     write_header(out, "<f4", &format!("({},)", values.len()))?;
     write_floats(out, values)
-}
-
-/// Writes N x C float32, little endian.
-pub(super) fn write_rows<W: Write, const C: usize>(
-    out: &mut W,
-    rows: &[[f32; C]],
-) -> Result<(), FormatError> {
-    write_header(out, "<f4", &format!("({}, {C})", rows.len()))?;
-    write_floats(out, rows.as_flattened())
 }
 
 /// Writes a 4 x 4 float64 matrix.

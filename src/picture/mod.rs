@@ -5,6 +5,7 @@
 mod motion;
 mod wheel;
 
+mod boxes;
 mod canvas;
 mod depth;
 mod font;

@@ -3,9 +3,10 @@
 //! What stands still stays in the background, what moves lies on top of it. It must not know
 //! files.
 
-use crate::flow::{Point, RigidTransform};
+use crate::flow::{Cluster, Point, RigidTransform};
 use crate::text::grouped;
 
+use super::boxes;
 use super::canvas::{Align, Image, Rgb, TextStyle};
 use super::motion::{full_scale, shown_motion};
 use super::wheel::color;
@@ -45,6 +46,8 @@ pub struct TopDown<'a> {
     /// The ego motion `target_from_source`. Where it is given, motion relative to the world is
     /// shown, else the flow as it is; the title says which.
     pub ego: Option<&'a RigidTransform>,
+    /// Clusters, where they are known: those that move are outlined.
+    pub clusters: &'a [Cluster],
 }
 
 /// How it is drawn.
@@ -130,6 +133,12 @@ pub fn top_down(scene: &TopDown<'_>, options: &TopDownOptions) -> Image {
     draw_rings(&mut image, view);
     let moving = draw_points(&mut image, view, scene, &motion, scale_m);
     draw_vehicle(&mut image, view);
+    boxes::draw(
+        &mut image,
+        scene.clusters,
+        |point| view.pixel(point),
+        view.side / 1000.0,
+    );
     draw_title(&mut image, view, scene, moving);
     draw_legend(&mut image, view, scale_m, options.interval_s);
     draw_scale_bar(&mut image, view);
@@ -260,6 +269,14 @@ fn draw_title(image: &mut Image, view: View, scene: &TopDown<'_>, moving: usize)
         None => format!("{points} points"),
     };
     image.text([margin, margin + 18 * dot], &counts, small);
+    let boxes = scene.clusters.iter().filter(|cluster| cluster.dynamic);
+    if let boxes @ 1.. = boxes.count() {
+        let text = format!(
+            "{} boxes that move, and their way in 10 sweeps",
+            grouped(boxes)
+        );
+        image.text([margin, margin + 25 * dot], &text, small);
+    }
 }
 
 /// The color wheel, turned as the picture is: up is forward.
@@ -334,6 +351,7 @@ mod tests {
                 flow,
                 valid,
                 ego: None,
+                clusters: &[],
             },
             &SMALL,
         )
@@ -391,6 +409,7 @@ mod tests {
             flow: &[[0.0; 3]; 2],
             valid: &[true],
             ego: None,
+            clusters: &[],
         };
         assert_eq!(top_down(&scene, &options).width(), 256);
     }

@@ -1,13 +1,15 @@
-//! Clusters as arrays and as JSON. It must not know how they were found.
+//! Clusters as arrays and as JSON, out and back in. It must not know how they were found.
 
 use std::io::{Seek, Write};
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
-use crate::flow::{Cluster, Objects, Point};
-use crate::formats::error::FormatError;
+use crate::flow::{Bounds, Cluster, Objects, Point};
+use crate::formats::error::{FileKind, FormatError};
+use crate::formats::limits::{check_chance, check_flag, check_id, check_value};
 use crate::formats::npy;
-use crate::formats::npz::NpzWriter;
+use crate::formats::npz::{Npz, NpzWriter};
+use crate::formats::pair::check_count;
 
 /// Writes what [`super::FlowFormat::Npz`] lists.
 pub(super) fn put<W: Write + Seek>(
@@ -25,24 +27,74 @@ pub(super) fn put<W: Write + Seek>(
     npz.array("clusters_points", |out| npy::write_counts(out, &points))?;
     let dynamic: Vec<bool> = clusters.iter().map(|cluster| cluster.dynamic).collect();
     npz.mask("clusters_dynamic", &dynamic)?;
-    let boxes = clusters.iter().map(|Cluster { bounds, .. }| {
-        let ([x, y, z], [length, width, height]) = (bounds.center, bounds.size);
-        [x, y, z, length, width, height, bounds.yaw]
-    });
-    let boxes: Vec<[f32; 7]> = boxes.collect();
-    npz.array("clusters_box", |out| npy::write_rows(out, &boxes))?;
-    let velocities: Vec<Point> = clusters.iter().map(|cluster| cluster.velocity).collect();
-    npz.points("clusters_velocity", &velocities)?;
+    let mut points = |name: &str, point: fn(&Cluster) -> Point| {
+        let points: Vec<Point> = clusters.iter().map(point).collect();
+        npz.points(name, &points)
+    };
+    points("clusters_center", |cluster| cluster.bounds.center)?;
+    points("clusters_size", |cluster| cluster.bounds.size)?;
+    points("clusters_velocity", |cluster| cluster.velocity)?;
     let mut values = |name: &str, value: fn(&Cluster) -> f32| {
         let values: Vec<f32> = clusters.iter().map(value).collect();
         npz.array(name, |out| npy::write_values(out, &values))
     };
+    values("clusters_yaw", |cluster| cluster.bounds.yaw)?;
     values("clusters_yaw_rate", |cluster| cluster.yaw_rate)?;
     values("clusters_confidence", |cluster| cluster.confidence)
 }
 
-/// A cluster in JSON.
-#[derive(Serialize)]
+/// Reads back the clusters that [`put`] wrote. `None` where there are none.
+pub(super) fn take(npz: &mut Npz<'_>) -> Result<Option<Vec<Cluster>>, FormatError> {
+    const KIND: FileKind = FileKind::Npz;
+    let Some(counts) = npz.column("clusters_points", |row, value| {
+        check_id(KIND, row, "clusters_points", value)
+    })?
+    else {
+        return Ok(None);
+    };
+    let count = counts.len();
+    let dynamic = npz.column("clusters_dynamic", |row, value| {
+        check_flag(KIND, row, "clusters_dynamic", value)
+    })?;
+    let dynamic = dynamic.unwrap_or_default();
+    check_count("clusters_dynamic", dynamic.len(), count)?;
+    let mut points = |name: &str| {
+        let points = npz.points(name)?;
+        check_count(name, points.len(), count)?;
+        Ok::<_, FormatError>(points)
+    };
+    let [centers, sizes, velocities] = [
+        points("clusters_center")?,
+        points("clusters_size")?,
+        points("clusters_velocity")?,
+    ];
+    let mut values =
+        |name: &str, check: fn(FileKind, usize, &str, f64) -> Result<f32, FormatError>| {
+            let values = npz.column(name, |row, value| check(KIND, row, name, value))?;
+            let values = values.unwrap_or_default();
+            check_count(name, values.len(), count)?;
+            Ok::<_, FormatError>(values)
+        };
+    let yaws = values("clusters_yaw", check_value)?;
+    let yaw_rates = values("clusters_yaw_rate", check_value)?;
+    let confidence = values("clusters_confidence", check_chance)?;
+    let clusters = (0..count).map(|row| Cluster {
+        points: counts[row].unsigned_abs(),
+        dynamic: dynamic[row],
+        bounds: Bounds {
+            center: centers[row],
+            size: sizes[row],
+            yaw: yaws[row],
+        },
+        velocity: velocities[row],
+        yaw_rate: yaw_rates[row],
+        confidence: confidence[row],
+    });
+    Ok(Some(clusters.collect()))
+}
+
+/// A cluster in JSON, which has no other numbers than finite ones.
+#[derive(Serialize, Deserialize)]
 pub(in crate::formats) struct Described {
     points: u32,
     dynamic: bool,
@@ -65,6 +117,23 @@ impl From<&Cluster> for Described {
             velocity: cluster.velocity,
             yaw_rate: cluster.yaw_rate,
             confidence: cluster.confidence,
+        }
+    }
+}
+
+impl From<Described> for Cluster {
+    fn from(described: Described) -> Self {
+        Self {
+            points: described.points,
+            dynamic: described.dynamic,
+            bounds: Bounds {
+                center: described.center,
+                size: described.size,
+                yaw: described.yaw,
+            },
+            velocity: described.velocity,
+            yaw_rate: described.yaw_rate,
+            confidence: described.confidence,
         }
     }
 }

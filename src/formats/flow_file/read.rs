@@ -1,7 +1,7 @@
 //! Flow back in, in any format that it is written in. It must not know how the flow was found.
 
-use super::FLOW_AXES;
-use crate::flow::Point;
+use super::{FLOW_AXES, objects};
+use crate::flow::{Cluster, Point};
 use crate::formats::cloud::read_columns;
 use crate::formats::error::{FileKind, FormatError};
 use crate::formats::feather::{FLOW_COLUMNS, Table};
@@ -26,6 +26,8 @@ pub struct FlowFile {
     pub cluster: Option<Vec<i32>>,
     /// The chance that each row's flow is right, 0 to 1.
     pub confidence: Option<Vec<f32>>,
+    /// The clusters themselves; npz and JSON alone hold them.
+    pub clusters: Option<Vec<Cluster>>,
 }
 
 /// Reads back a flow in any of the formats that [`super::write_flow`] writes, recognized by content;
@@ -49,6 +51,7 @@ pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatErr
                 confidence: npz.column("confidence", |row, chance| {
                     check_chance(kind, row, "confidence", chance)
                 })?,
+                clusters: objects::take(&mut npz)?,
             }
         }
         kind @ FileKind::Feather => {
@@ -61,6 +64,7 @@ pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatErr
                 confidence: table.column("confidence", |row, chance| {
                     check_chance(kind, row, "confidence", chance)
                 })?,
+                clusters: None,
             }
         }
         kind @ FileKind::Ply => {
@@ -115,6 +119,7 @@ impl Rows {
             dynamic: has("dynamic").then(Vec::new),
             cluster: has("cluster").then(Vec::new),
             confidence: has("confidence").then(Vec::new),
+            clusters: None,
         };
         Self { kind, wanted, file }
     }
