@@ -46,7 +46,7 @@ fn line(image: &mut Image, [x0, y0]: [f32; 2], [x1, y1]: [f32; 2], width: f32) {
     /// Longer lines than any image is wide say nothing.
     const LONGEST: f32 = 1e4;
     let length = (x1 - x0).hypot(y1 - y0);
-    if !(length < LONGEST) {
+    if !length.is_finite() || length > LONGEST {
         return;
     }
     let steps = length.ceil().max(1.0);
