@@ -1,6 +1,8 @@
 //! The program through its public door: real files, real processes, exit codes.
 
 mod commands;
+#[path = "../common/gpu.rs"]
+mod gpu_rule;
 mod hostile;
 mod program;
 mod sequences;

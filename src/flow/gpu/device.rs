@@ -95,6 +95,10 @@ impl Backend for Gpu {
         self.0.name.clone()
     }
 
+    fn host(&self) -> String {
+        format!("cpu ({} threads)", self.0.host.current_num_threads())
+    }
+
     fn transform(
         &self,
         source: &[Point],
