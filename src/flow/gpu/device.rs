@@ -117,8 +117,9 @@ impl Backend for Gpu {
         prior: &RigidTransform,
         watch: &dyn Watch,
     ) -> RigidTransform {
-        let align = || ego::align(source, target, prior, watch);
-        self.0.host.install(align)
+        self.0
+            .host
+            .install(|| ego::align(source, target, prior, watch))
     }
 
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {
@@ -132,8 +133,9 @@ impl Backend for Gpu {
         options: &LabelOptions,
         watch: &dyn Watch,
     ) -> Labelled {
-        let find = || label::label(source, target, options, watch);
-        self.0.host.install(find)
+        self.0
+            .host
+            .install(|| label::label(source, target, options, watch))
     }
 }
 
