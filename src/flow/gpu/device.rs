@@ -67,10 +67,8 @@ impl Gpu {
     /// # Errors
     /// Why half precision is not to be had on this card.
     pub fn matrix_units(&self) -> Result<String, String> {
-        let units = self.0.tested_units().as_ref();
-        units
-            .map(|units| units.tile.name().to_owned())
-            .map_err(Clone::clone)
+        let units = self.0.tested_units().as_ref().map_err(Clone::clone)?;
+        Ok(units.tile.name().to_owned())
     }
 
     /// Whether the card is gone and must be opened again.
@@ -117,9 +115,8 @@ impl Backend for Gpu {
         prior: &RigidTransform,
         watch: &dyn Watch,
     ) -> RigidTransform {
-        self.0
-            .host
-            .install(|| ego::align(source, target, prior, watch))
+        let align = || ego::align(source, target, prior, watch);
+        self.0.host.install(align)
     }
 
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {
@@ -133,9 +130,8 @@ impl Backend for Gpu {
         options: &LabelOptions,
         watch: &dyn Watch,
     ) -> Labelled {
-        self.0
-            .host
-            .install(|| label::label(source, target, options, watch))
+        let find = || label::label(source, target, options, watch);
+        self.0.host.install(find)
     }
 }
 
