@@ -1,4 +1,4 @@
-//! Whole pairs: both presets at several sizes, on all cores.
+//! Whole pairs: every preset at several sizes, on all cores.
 //!
 //! ```text
 //! FNSF_REAL_DATA=... cargo bench --bench pairs

@@ -86,7 +86,14 @@ async fn http(
 
 fn messages(clouds: &[Vec<Point>; 2]) -> Vec<proto::EstimateFlowRequest> {
     use proto::estimate_flow_request::{Begin, CloudChunk, Part};
-    let mut parts = vec![Part::Begin(Begin::default())];
+    let options = proto::Options {
+        preset: proto::Preset::Neural.into(),
+        ..proto::Options::default()
+    };
+    let mut parts = vec![Part::Begin(Begin {
+        options: Some(options),
+        ..Begin::default()
+    })];
     for (points, cloud) in clouds
         .iter()
         .zip([proto::Cloud::Source, proto::Cloud::Target])
@@ -144,7 +151,7 @@ async fn run(path: &PathBuf) {
     let mut calls = proto::scene_flow_client::SceneFlowClient::new(channel);
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let backend = CpuBackend::new(Some(threads)).unwrap();
-    let options = Preset::Default.options(None);
+    let options = Preset::Neural.options(None);
 
     let (mut library, mut over_http, mut over_grpc) = (Vec::new(), Vec::new(), Vec::new());
     for _ in 0..ROUNDS {
@@ -158,7 +165,11 @@ async fn run(path: &PathBuf) {
         let flow = estimate(&backend, &problem, &options, &Unwatched).unwrap();
         library.push(began.elapsed().as_secs_f64());
         assert_eq!(flow.flow.len(), POINTS);
-        over_http.push(http(&client, &url, &small, "{}".to_owned()).await.0);
+        over_http.push(
+            http(&client, &url, &small, r#"{"preset": "neural"}"#.to_owned())
+                .await
+                .0,
+        );
         let messages = messages(&small);
         let began = Instant::now();
         let answer = calls
@@ -169,7 +180,7 @@ async fn run(path: &PathBuf) {
         over_grpc.push(began.elapsed().as_secs_f64());
         assert!(parts.len() >= 2 && parts.iter().all(Result::is_ok));
     }
-    println!("{POINTS} points, default preset, {ROUNDS} rounds, {threads} threads; medians");
+    println!("{POINTS} points, preset neural, {ROUNDS} rounds, {threads} threads; medians");
     println!("| | ms | over the library's of the same round, ms |\n|---|---|---|");
     println!("| library | {:.1} | |", median(&mut library.clone()) * 1e3);
     for (name, mut values) in [("HTTP", over_http), ("gRPC", over_grpc)] {
@@ -192,7 +203,7 @@ async fn run(path: &PathBuf) {
     for deadline in DEADLINES {
         let (mut took, mut errors, mut ends) = (Vec::new(), Vec::new(), Vec::new());
         for _ in 0..ANSWERS {
-            let options = format!("{{\"deadline_ms\": {deadline}}}");
+            let options = format!(r#"{{"preset": "neural", "deadline_ms": {deadline}}}"#);
             let clouds = [source.clone(), target.clone()];
             let (seconds, reason, bytes) = http(&client, &url, &clouds, options).await;
             took.push(seconds * 1e3);

@@ -1,4 +1,4 @@
-//! The table of `docs/numerics.md`: what each choice of the `default` preset changes, by
+//! The table of `docs/numerics.md`: what each choice of the `neural` preset changes, by
 //! experiment on pairs with ground truth.
 //!
 //! ```text
@@ -50,7 +50,7 @@ const fn paper(name: &'static str, change: fn(&mut Options)) -> Variant {
 const fn ours(name: &'static str, change: fn(&mut Options)) -> Variant {
     Variant {
         name,
-        preset: Preset::Default,
+        preset: Preset::Neural,
         change,
     }
 }
@@ -96,59 +96,59 @@ const VARIANTS: &[Variant] = &[
             o.max_iterations = 150;
         },
     ),
-    ours("default", |_| {}),
-    ours("default, ego motion alone", |o| o.max_iterations = 0),
-    ours("default, no ego motion", |o| o.ego = Ego::Off),
-    ours("default, no margin", no_margin),
-    ours("default, margin 0.1 m at every range", |o| {
+    ours("neural", |_| {}),
+    ours("neural, ego motion alone", |o| o.max_iterations = 0),
+    ours("neural, no ego motion", |o| o.ego = Ego::Off),
+    ours("neural, no margin", no_margin),
+    ours("neural, margin 0.1 m at every range", |o| {
         o.loss.margin_quantile = None;
     }),
-    ours("default, margin from 70% of the points", |o| {
+    ours("neural, margin from 70% of the points", |o| {
         o.loss.margin_quantile = Some(0.7);
     }),
-    ours("default, margin from 80% of the points", |o| {
+    ours("neural, margin from 80% of the points", |o| {
         o.loss.margin_quantile = Some(0.8);
     }),
-    ours("default, no flow penalty", |o| o.loss.flow_penalty = 0.0),
-    ours("default, no margin, no flow penalty", |o| {
+    ours("neural, no flow penalty", |o| o.loss.flow_penalty = 0.0),
+    ours("neural, no margin, no flow penalty", |o| {
         no_margin(o);
         o.loss.flow_penalty = 0.0;
     }),
-    ours("default, flow penalty 0.01", |o| o.loss.flow_penalty = 0.01),
-    ours("default, flow penalty 0.05", |o| o.loss.flow_penalty = 0.05),
-    ours("default, no truncation", |o| o.loss.truncation_m = None),
-    ours("default, truncation 0.5 m", |o| {
+    ours("neural, flow penalty 0.01", |o| o.loss.flow_penalty = 0.01),
+    ours("neural, flow penalty 0.05", |o| o.loss.flow_penalty = 0.05),
+    ours("neural, no truncation", |o| o.loss.truncation_m = None),
+    ours("neural, truncation 0.5 m", |o| {
         o.loss.truncation_m = Some(0.5);
     }),
-    ours("default, truncation 2 m", |o| {
+    ours("neural, truncation 2 m", |o| {
         o.loss.truncation_m = Some(2.0);
     }),
-    ours("default, raw inputs", |o| o.inputs = Inputs::Raw),
-    ours("default, centered / 5 m", |o| {
+    ours("neural, raw inputs", |o| o.inputs = Inputs::Raw),
+    ours("neural, centered / 5 m", |o| {
         o.inputs = Inputs::Centered { scale_m: 5.0 };
     }),
-    ours("default, centered / 20 m", |o| {
+    ours("neural, centered / 20 m", |o| {
         o.inputs = Inputs::Centered { scale_m: 20.0 };
     }),
-    ours("default, centered / 50 m", |o| {
+    ours("neural, centered / 50 m", |o| {
         o.inputs = Inputs::Centered { scale_m: 50.0 };
     }),
-    ours("default, Xavier start", |o| o.start = Start::Xavier),
-    ours("default, exact points", |o| {
+    ours("neural, Xavier start", |o| o.start = Start::Xavier),
+    ours("neural, exact points", |o| {
         o.distance.sites = Sites::Points;
     }),
-    ours("default, step size 0.008", |o| o.learning_rate = 0.008),
-    ours("default, constant step size", |o| o.decay = Decay::Constant),
-    ours("default, best batch instead of average", |o| {
+    ours("neural, step size 0.008", |o| o.learning_rate = 0.008),
+    ours("neural, constant step size", |o| o.decay = Decay::Constant),
+    ours("neural, best batch instead of average", |o| {
         o.keep = Keep::Best;
     }),
-    ours("default, batches of 1,024", |o| o.batch = Some(1024)),
-    ours("default, batches of 4,096", |o| o.batch = Some(4096)),
-    ours("default, all points each iteration", |o| o.batch = None),
-    ours("default, 75 iterations", |o| o.max_iterations = 75),
-    ours("default, 300 iterations", |o| o.max_iterations = 300),
-    ours("default, 600 iterations", |o| o.max_iterations = 600),
-    ours("default, 1,024 a batch, 300 iterations", |o| {
+    ours("neural, batches of 1,024", |o| o.batch = Some(1024)),
+    ours("neural, batches of 4,096", |o| o.batch = Some(4096)),
+    ours("neural, all points each iteration", |o| o.batch = None),
+    ours("neural, 75 iterations", |o| o.max_iterations = 75),
+    ours("neural, 300 iterations", |o| o.max_iterations = 300),
+    ours("neural, 600 iterations", |o| o.max_iterations = 600),
+    ours("neural, 1,024 a batch, 300 iterations", |o| {
         o.batch = Some(1024);
         o.max_iterations = 300;
     }),

@@ -61,7 +61,7 @@ const fn preset(name: &'static str, preset: Preset) -> Variant {
 
 const VARIANTS: &[Variant] = &[
     preset("paper", Preset::Paper),
-    preset("default", Preset::Default),
+    preset("neural", Preset::Neural),
     preset("label", Preset::Label),
     // More than any cluster has.
     label("ego motion alone", |o| o.evidence_m = f32::INFINITY),

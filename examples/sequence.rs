@@ -157,7 +157,7 @@ fn main() -> anyhow::Result<()> {
         });
     }
     let backend = CpuBackend::new(None)?;
-    let options = Preset::Default.options(None);
+    let options = Preset::Neural.options(None);
     println!("| drive | pairs | EPE | EPE moving | EPE still | loss | iterations | s |");
     println!("|---|---|---|---|---|---|---|---|");
     for drive in &drives {

@@ -23,12 +23,12 @@ use std::time::Duration;
 use tokio::sync::{mpsc, oneshot, watch};
 
 use self::busy::Busy;
-pub use self::dense::Densification;
+pub use self::dense::{Densification, Densified};
 use self::hold::Hold;
 use self::lane::{Asked, Command};
 use crate::flow::backend::{Backend, BackendError};
 use crate::flow::densify::DensifyError;
-use crate::flow::{DenseCloud, Estimate, Field, FlowError, Options, Point, Snapshot, Watch};
+use crate::flow::{Estimate, Field, FlowError, Options, Point, Snapshot, Watch};
 use crate::job::DeviceKind;
 use crate::metrics::Metrics;
 
@@ -149,15 +149,6 @@ pub struct DeviceOptions {
     pub open: Opener,
     /// How it is tried again.
     pub reopening: Reopening,
-}
-
-/// What a device gives.
-#[derive(Debug)]
-pub struct Solved<T> {
-    /// The flow, or the cloud.
-    pub found: T,
-    /// What the device is, as reports show it.
-    pub device: String,
 }
 
 /// The way to one lane's thread.
@@ -310,7 +301,7 @@ impl Lane {
     ///
     /// # Errors
     /// [`EngineError`]; the device is ready for the next pair, or says otherwise in its health.
-    pub async fn solve(&self, work: Work) -> Result<Solved<Estimate>, EngineError> {
+    pub async fn solve(&self, work: Work) -> Result<Estimate, EngineError> {
         self.run(move |backend, busy| Ok(lane::solve(backend, work, busy)?))
             .await
     }
@@ -319,7 +310,7 @@ impl Lane {
     ///
     /// # Errors
     /// As [`Lane::solve`].
-    pub async fn densify(&self, work: Densification) -> Result<Solved<DenseCloud>, EngineError> {
+    pub async fn densify(&self, work: Densification) -> Result<Densified, EngineError> {
         self.run(move |backend, busy| dense::densify(backend, &work, busy))
             .await
     }
@@ -327,7 +318,7 @@ impl Lane {
     async fn run<T: Send + 'static>(
         &self,
         work: impl FnOnce(&dyn Backend, &Busy) -> Result<T, EngineError> + Send + 'static,
-    ) -> Result<Solved<T>, EngineError> {
+    ) -> Result<T, EngineError> {
         let gone = || EngineError::Broken("its thread has ended".to_owned());
         let (reply, answer) = oneshot::channel();
         let command = Command::Do(Box::new(Asked { work, reply }));

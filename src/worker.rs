@@ -19,7 +19,7 @@ use tokio_util::sync::CancellationToken;
 use self::inputs::StoreError;
 use crate::blobs::{Blob, BlobError, Blobs, Sync};
 use crate::cost::CostModel;
-use crate::engine::{Densification, EngineError, Health, Lane, Solved, Work};
+use crate::engine::{Densification, Densified, EngineError, Health, Lane, Work};
 use crate::flow::backend::BackendError;
 use crate::flow::{Estimate, Field, FlowError};
 use crate::job::{DeviceKind, Job, JobError, JobProgress, Kind, Report};
@@ -166,10 +166,7 @@ impl Worker {
             tokio::time::sleep(A_MOMENT).await;
         }
         match solved {
-            Ok(Solved {
-                found: estimate,
-                device,
-            }) => {
+            Ok(estimate) => {
                 self.measure(job, &estimate, took);
                 tracing::info!(
                     seconds = took.as_secs_f64(),
@@ -177,7 +174,7 @@ impl Worker {
                     stop_reason = estimate.stop_reason.name(),
                     "solved"
                 );
-                let report = Report::new(&estimate, &options, device);
+                let report = Report::new(&estimate, &options);
                 // Whoever comes after it goes on from its field.
                 let wanted = job.followed || options.densify.is_some();
                 let field = wanted.then(|| estimate.field.clone());

@@ -17,7 +17,7 @@ from pathlib import Path
 from statistics import median
 
 PEER = Path(__file__).with_name("peer.py")
-FNSF_PRESETS = ("paper", "default")
+FNSF_PRESETS = ("paper", "neural")
 PEER_DEVICES = {"cpu": "cpu", "gpu": "cuda"}
 
 

@@ -267,7 +267,7 @@ def arguments_of(argv):
     sequence.set_defaults(run=run_sequence)
     for command in (pair, sequence):
         command.add_argument("--deadline", type=float, metavar="SECONDS", help="for the whole call; the best flow so far comes back")
-        command.add_argument("--preset", choices=["default", "paper", "label"])
+        command.add_argument("--preset", choices=["default", "label", "neural", "paper"])
         command.add_argument("--seed", type=int)
         command.add_argument("--max-points", type=int)
         command.add_argument("--range-m", type=float)

@@ -127,10 +127,16 @@ async fn a_card_that_dies_costs_its_jobs_one_attempt_and_the_others_nothing() {
     let stand = serve(vec![switches.card("gpu0", 2)], true).await;
     switches.brake.store(true, Ordering::Relaxed);
     let on_the_card = [
-        stand.submit(json!({"device": "gpu"})).await,
-        stand.submit(json!({"device": "gpu", "seed": 1})).await,
+        stand
+            .submit(json!({"device": "gpu", "preset": "neural"}))
+            .await,
+        stand
+            .submit(json!({"device": "gpu", "preset": "neural", "seed": 1}))
+            .await,
     ];
-    let elsewhere = stand.submit(json!({"device": "cpu"})).await;
+    let elsewhere = stand
+        .submit(json!({"device": "cpu", "preset": "neural"}))
+        .await;
     timeout(PATIENCE, switches.until_at_the_brake(2))
         .await
         .expect("in time");
@@ -189,7 +195,9 @@ async fn a_real_card_that_is_destroyed_in_the_middle_of_a_job_is_opened_again_an
     let id = stand
         .submit(json!({"device": "gpu", "preset": "paper", "max_points": 1000}))
         .await;
-    let elsewhere = stand.submit(json!({"device": "cpu"})).await;
+    let elsewhere = stand
+        .submit(json!({"device": "cpu", "preset": "neural"}))
+        .await;
     let under_way = async {
         while stand.job(&id, 0).await["progress"]["iteration"].as_u64() < Some(2) {
             tokio::time::sleep(Duration::from_millis(1)).await;
@@ -222,11 +230,13 @@ async fn a_pair_too_large_for_the_card_is_done_by_the_cpu_unless_its_caller_want
     let switches = Arc::new(Switches::default());
     switches.room.store(10, Ordering::Relaxed);
     let stand = serve(vec![switches.card("gpu0", 1)], true).await;
-    let anywhere = stand.submit(json!({})).await;
+    let anywhere = stand.submit(json!({"preset": "neural"})).await;
     let (state, _, device) = stand.end(&anywhere).await;
     assert_eq!(state, "succeeded");
     assert_ne!(device, "a card of the tests");
-    let there = stand.submit(json!({"device": "gpu"})).await;
+    let there = stand
+        .submit(json!({"device": "gpu", "preset": "neural"}))
+        .await;
     let (state, attempts, _) = stand.end(&there).await;
     assert_eq!((state.as_str(), attempts), ("failed", 1));
     let error = &stand.job(&there, 0).await["error"];
@@ -244,7 +254,9 @@ async fn a_server_gives_up_when_the_last_card_does_not_come_back_and_not_before(
     for (place, switches) in switches.iter().enumerate() {
         switches.refusals.store(u32::MAX, Ordering::Relaxed);
         switches.destroy();
-        let job = stand.submit(json!({"device": "gpu"})).await;
+        let job = stand
+            .submit(json!({"device": "gpu", "preset": "neural"}))
+            .await;
         let given_up = timeout(A_MOMENT, stand.app.given_up()).await;
         if place == 0 {
             assert!(given_up.is_err(), "there was another card");
@@ -283,7 +295,9 @@ async fn a_server_does_not_give_up_while_another_card_is_being_opened_again() {
     let given_up = timeout(A_MOMENT, stand.app.given_up()).await;
     assert!(given_up.is_err(), "the other card still had tries left");
     switches[1].refusals.store(0, Ordering::Relaxed);
-    let job = stand.submit(json!({"device": "gpu"})).await;
+    let job = stand
+        .submit(json!({"device": "gpu", "preset": "neural"}))
+        .await;
     assert_eq!(stand.end(&job).await.0, "succeeded");
     stand.app.drain().await;
 }

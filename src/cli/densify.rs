@@ -12,7 +12,7 @@ use super::failure::Failure;
 use super::files;
 use super::output::say;
 use super::terminal::Terminal;
-use crate::flow::densify::{DensifyError, Leg, densify};
+use crate::flow::densify::{DensifyError, Leg, carrier, densify};
 use crate::flow::depth::{Camera, DepthImage, Occlusion, project};
 use crate::flow::{DenseCloud, Field, Point, Sequence, Sweep, Watch};
 use crate::formats::{DenseFormat, FormatError, write_dense, write_depth_png};
@@ -161,7 +161,7 @@ impl Densify {
             dynamic: count(&cloud.dynamic, true),
             unconverged: count(&cloud.converged, false),
             fits: fields.len(),
-            device: device.backend.name(),
+            device: carrier(device.backend.as_ref(), fields.values()),
             depth_density: density,
             seconds: Seconds {
                 fit: fitted - began,

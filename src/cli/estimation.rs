@@ -10,7 +10,7 @@ use super::failure::Failure;
 use super::files;
 use super::terminal::Terminal;
 use crate::flow::backend::{Backend, BackendError};
-use crate::flow::{self, Ego, Estimate, FlowError, RigidTransform, Sequence, Sweep};
+use crate::flow::{self, Ego, Estimate, FlowError, Preset, RigidTransform, Sequence, Sweep};
 use crate::formats;
 use crate::job::{
     DeviceChoice, EgoChoice, GroundChoice, JobOptions, PrecisionChoice, PresetChoice,
@@ -19,25 +19,27 @@ use crate::job::{
 /// How the flow is found.
 #[derive(Clone, Debug, Args)]
 pub(super) struct Estimation {
-    /// default: ours, robust and fast; paper: FNSF as published; label: movers found object by
-    /// object, everything else still
+    /// default: movers found object by object, everything else still; label: default, for labels;
+    /// neural: a neural field, robust and fast to fit; paper: FNSF as published
     #[arg(long, value_enum, default_value_t)]
     preset: PresetChoice,
-    /// Where the work is done: auto (a GPU, else the CPU), cpu, gpu, or gpu:CARD with a card's
-    /// number, PCI id or part of its name; fnsf doctor lists them
+    /// Where neural and paper are fitted: auto (a GPU, else the CPU), cpu, gpu, or gpu:CARD with a
+    /// card's number, PCI id or part of its name; fnsf doctor lists them. default and label compute
+    /// on the CPU whatever the device
     #[arg(long, value_name = "DEVICE", default_value_t)]
     device: DeviceArgument,
     /// CPU threads; all cores by default. The result does not depend on it
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: Option<u16>,
-    /// What the network's products are rounded to: f16 is for GPUs whose matrix units pass their
-    /// self-test, see fnsf doctor
+    /// What the network's products are rounded to: f16 is for neural and paper on GPUs whose matrix
+    /// units pass their self-test, see fnsf doctor
     #[arg(long, value_enum, default_value_t)]
     precision: PrecisionChoice,
     /// The same seed gives the same bits
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
-    /// Draw this many points from each cloud and leave out the rest
+    /// Draw this many points and give the others no flow. neural and paper draw from each cloud and
+    /// leave out the rest; default and label look at all points all the same
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(3..))]
     max_points: Option<u32>,
     /// Leave out points with |x| or |y| beyond R metres
@@ -84,7 +86,7 @@ impl Estimation {
             Some(file) => Some(EgoChoice::Given(files::read_motion(Path::new(file))?)),
         };
         let raster = self.ground_raster.as_ref();
-        Ok(JobOptions {
+        let options = JobOptions {
             preset: self.preset,
             seed: self.seed,
             max_points: self.max_points,
@@ -94,7 +96,9 @@ impl Estimation {
             device: self.device.choice,
             precision: self.precision,
             ..JobOptions::default()
-        })
+        };
+        options.check().map_err(Failure::usage)?;
+        Ok(options)
     }
 
     /// What is known of the sweeps beside their points.
@@ -124,12 +128,18 @@ impl Estimation {
         })
     }
 
-    /// The device that does the work.
+    /// The device that does the work. What fits no field is the host's work: no card is opened for
+    /// it that nobody asked for.
     pub(super) fn open(&self) -> Result<Device<'_>, Failure> {
         let threads = self.threads.map(usize::from);
+        let fits = Preset::FITTED.contains(&self.preset.preset());
+        let backend = match self.device.choice {
+            DeviceChoice::Auto if !fits => device::cpu(threads)?,
+            _ => device::open(&self.device, threads)?,
+        };
         Ok(Device {
             asked: self,
-            backend: device::open(&self.device, threads)?,
+            backend,
         })
     }
 }

@@ -11,8 +11,7 @@ use super::files;
 use super::machine::peak_resident_bytes;
 use super::output::say;
 use super::terminal::Terminal;
-use crate::flow::Watch;
-use crate::flow::{Estimate, Point, Sequence, Sweep};
+use crate::flow::{Estimate, Point, Preset, Sequence, Sweep, Watch};
 use crate::formats::{FlowFormat, FlowTable, write_flow};
 use crate::job::Report;
 use crate::picture::{self, TopDown, TopDownOptions};
@@ -22,8 +21,8 @@ use crate::text::grouped;
 ///
 /// Reads npz, npy, ply, pcd, KITTI bin, nuScenes pcd.bin and Argoverse 2 feather, recognized by
 /// content. The flow has one row per source point: where the point is in the target's frame, less
-/// where it was in the source's, in metres. Of a sequence every pair starts from the one before,
-/// and its flow is written as soon as it is there.
+/// where it was in the source's, in metres. Of a sequence every flow is written as soon as it
+/// is there; with neural each pair starts from the one before.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
     fnsf flow a.feather b.feather -o flow.npz\n  \
@@ -97,9 +96,13 @@ pub(super) fn print_report(report: &Report) -> Result<(), Failure> {
         seconds.query,
         seconds.network
     ))?;
+    let fits = Preset::FITTED
+        .iter()
+        .any(|preset| preset.name() == report.preset);
+    let unit = if fits { "iterations" } else { "clusters" };
     let loss = report.best_loss.map(|loss| format!(", loss {loss:.4} m"));
     say(format_args!(
-        "  preset {}, seed {}: {} iterations ({}){}",
+        "  preset {}, seed {}: {} {unit} ({}){}",
         report.preset,
         report.seed,
         report.iterations,
@@ -181,7 +184,7 @@ impl Flow {
             let estimate = device.push(&mut sequence, sweep, &solver_options, &terminal)?;
             terminal.finish();
             if let (Some(estimate), Some(source)) = (estimate, &last) {
-                let mut report = Report::new(&estimate, &options, device.backend.name());
+                let mut report = Report::new(&estimate, &options);
                 report.seconds.load = Some(load);
                 report.seconds.total += load;
                 report.peak_rss_bytes = peak_resident_bytes();

@@ -143,6 +143,10 @@ impl Backend for CardLane {
         "a card of the tests".to_owned()
     }
 
+    fn host(&self) -> String {
+        self.cpu.host()
+    }
+
     fn transform(
         &self,
         source: &[Point],

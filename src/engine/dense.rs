@@ -22,24 +22,34 @@ pub struct Densification {
     pub watch: Arc<dyn Watch + Send + Sync>,
 }
 
+/// A dense cloud, and what carried its points, as reports show it.
+#[derive(Debug)]
+pub struct Densified {
+    /// The points of all sweeps.
+    pub cloud: DenseCloud,
+    /// The device, or the host's threads.
+    pub device: String,
+}
+
 /// Carries the sweeps. Half of a dense cloud is none: an interrupt of any kind ends it without.
 pub(super) fn densify(
     backend: &dyn Backend,
     work: &Densification,
     busy: &Busy,
-) -> Result<DenseCloud, EngineError> {
+) -> Result<Densified, EngineError> {
     let watch = Heard {
         watch: work.watch.as_ref(),
         busy,
     };
     let field = |leg| work.fields.get(&leg);
-    densify::densify(backend, &work.plan, &work.sweeps, field, &watch).map_err(
-        |error| match error {
-            DensifyError::Interrupted(_) | DensifyError::Backend(BackendError::Interrupted(_)) => {
-                FlowError::Cancelled.into()
-            }
-            DensifyError::Backend(error) => FlowError::Backend(error).into(),
-            error => EngineError::Densify(error),
-        },
-    )
+    let cloud = densify::densify(backend, &work.plan, &work.sweeps, field, &watch);
+    let cloud = cloud.map_err(|error| match error {
+        DensifyError::Interrupted(_) | DensifyError::Backend(BackendError::Interrupted(_)) => {
+            FlowError::Cancelled.into()
+        }
+        DensifyError::Backend(error) => FlowError::Backend(error).into(),
+        error => EngineError::Densify(error),
+    })?;
+    let device = densify::carrier(backend, work.fields.values());
+    Ok(Densified { cloud, device })
 }

@@ -9,7 +9,7 @@ use tokio::sync::{mpsc, oneshot};
 
 use super::busy::Busy;
 use super::hold::{Held, Hold};
-use super::{EngineError, Solved, Work};
+use super::{EngineError, Work};
 use crate::flow::backend::{Backend, BackendError};
 use crate::flow::{self, Estimate, FlowError, Interrupt, Problem, Progress, Snapshot, Watch};
 
@@ -32,7 +32,7 @@ pub(super) trait Task: Send {
 /// Work, and where its answer goes.
 pub(super) struct Asked<W, T> {
     pub(super) work: W,
-    pub(super) reply: oneshot::Sender<Result<Solved<T>, EngineError>>,
+    pub(super) reply: oneshot::Sender<Result<T, EngineError>>,
 }
 
 impl<W, T> Task for Asked<W, T>
@@ -112,12 +112,9 @@ fn judged<T>(
     hold: &Hold,
     held: &Held,
     done: std::thread::Result<Result<T, EngineError>>,
-) -> (Result<Solved<T>, EngineError>, Trust) {
+) -> (Result<T, EngineError>, Trust) {
     let (answer, trust) = match done {
-        Ok(Ok(found)) => {
-            let device = held.backend.name();
-            (Ok(Solved { found, device }), Trust::Given)
-        }
+        Ok(Ok(found)) => (Ok(found), Trust::Given),
         Ok(Err(EngineError::Flow(FlowError::Backend(BackendError::Lost(reason))))) => {
             (Err(EngineError::Lost(reason)), Trust::Given)
         }

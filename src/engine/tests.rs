@@ -74,7 +74,7 @@ fn work() -> Work {
         source,
         ground: None,
         before: None,
-        options: Preset::Default.options(None),
+        options: Preset::Neural.options(None),
         snapshot: None,
         watch: Arc::new(Unwatched),
     }

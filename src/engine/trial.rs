@@ -78,7 +78,7 @@ fn compared(backend: &dyn Backend) -> Result<(), TrialError> {
         ground: None,
         before: None,
     };
-    let mut options = Preset::Default.options(None);
+    let mut options = Preset::Neural.options(None);
     options.max_iterations = ITERATIONS;
     let estimate = flow::estimate(backend, &problem, &options, &Unwatched)?;
     let mut error = 0.0;

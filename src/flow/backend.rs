@@ -13,6 +13,9 @@ pub trait Backend: Send + Sync {
     /// The device's name, as reports show it.
     fn name(&self) -> String;
 
+    /// The host's threads, as reports show them: they align and find movers whatever the device.
+    fn host(&self) -> String;
+
     /// Builds the distance transform of `target` over a grid that covers both clouds; looks at
     /// `watch` between its pieces.
     ///

@@ -97,7 +97,7 @@ mod tests {
 
     #[test]
     fn every_point_is_in_one_batch_of_each_round() {
-        let mut options = Preset::Default.options(None);
+        let mut options = Preset::Neural.options(None);
         options.batch = Some(400);
         let (course, _) = Course::new(&[[0.0; 3]; 1501], &options);
         let mut covered = vec![0; 1501];

@@ -94,6 +94,15 @@ impl Objects {
         objects.clusters = described.collect();
         objects
     }
+
+    /// Nothing is sure of rows that have no flow.
+    pub(crate) fn sure_of(&mut self, valid: &[bool]) {
+        for (confidence, &valid) in self.confidence.iter_mut().zip(valid) {
+            if !valid {
+                *confidence = 0.0;
+            }
+        }
+    }
 }
 
 #[cfg(test)]
@@ -122,7 +131,7 @@ mod tests {
             before: None,
         };
         let backend = CpuBackend::new(None).expect("threads");
-        let options = Preset::Label.options(None);
+        let options = Preset::Default.options(None);
         let estimate = estimate(&backend, &problem, &options, &Unwatched).expect("a flow");
         let objects = estimate.objects.expect("objects");
         let dynamic = estimate.dynamic.expect("the ego motion is known");

@@ -6,36 +6,40 @@ use super::points::RigidTransform;
 /// A named set of options.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Preset {
-    /// Ours: robust rigid alignment, then a short stochastic fit of what is left.
+    /// Ours: robust rigid alignment, then movers found object by object, everything else still.
     Default,
+    /// As default, for labels.
+    Label,
+    /// Ours with a neural field: robust rigid alignment, then a short stochastic fit of what is left.
+    Neural,
     /// The published method with the published code's settings.
     Paper,
-    /// Movers found object by object, everything else still: for labels.
-    Label,
 }
 
 impl Preset {
     /// All presets.
-    pub const ALL: [Self; 3] = [Self::Default, Self::Paper, Self::Label];
-    /// Those that fit a field, iteration by iteration, and can be put down and taken up again.
-    pub const FITTED: [Self; 2] = [Self::Default, Self::Paper];
+    pub const ALL: [Self; 4] = [Self::Default, Self::Label, Self::Neural, Self::Paper];
+    /// Those that fit a neural field, iteration by iteration: on a card where there is one, and they
+    /// can be put down and taken up again.
+    pub const FITTED: [Self; 2] = [Self::Neural, Self::Paper];
 
     /// The name that the command line and the service use.
     pub fn name(self) -> &'static str {
         match self {
             Self::Default => "default",
-            Self::Paper => "paper",
             Self::Label => "label",
+            Self::Neural => "neural",
+            Self::Paper => "paper",
         }
     }
 
-    /// The preset's options. With `max_points` the clouds are sampled first, and `paper` takes
-    /// the published settings for sampled clouds instead of those for full ones.
+    /// The preset's options. With `max_points` the presets that fit a field sample the clouds first,
+    /// and `paper` takes the published settings for sampled clouds instead of those for full ones.
     pub fn options(self, max_points: Option<usize>) -> Options {
         match self {
-            Self::Default => Options::stochastic(max_points),
+            Self::Default | Self::Label => Options::labelled(max_points),
+            Self::Neural => Options::stochastic(max_points),
             Self::Paper => Options::published(max_points),
-            Self::Label => Options::labelled(max_points),
         }
     }
 }
@@ -45,7 +49,9 @@ impl Preset {
 pub struct Options {
     /// Drives every random choice: the same seed gives the same bits.
     pub seed: u64,
-    /// Points drawn from what range and ground leave of each cloud; all of them where none.
+    /// Points drawn from what range and ground leave of each cloud; all of them where none. A field is
+    /// fitted to the drawn points alone. Movers are found in all points, and those of the source that
+    /// were drawn get a flow.
     pub max_points: Option<usize>,
     /// Points with `|x|` or `|y|` beyond this are left out, metres.
     pub range_m: Option<f32>,

@@ -1,4 +1,4 @@
-//! Which rows of the two clouds take part: finite, in range, off the ground, sampled.
+//! Which rows of the two clouds take part: finite, in range, off the ground; and which are drawn.
 //!
 //! Points that are left out keep their row in the result. Knows nothing of what comes after.
 
@@ -31,6 +31,8 @@ pub(crate) struct Selection {
     pub(crate) rows: Vec<usize>,
     pub(crate) source: Vec<Point>,
     pub(crate) target: Vec<Point>,
+    /// Places in `rows` that get a flow: all, but where movers are found and some points are drawn.
+    pub(crate) answered: Vec<usize>,
     /// Rows of the source that move with the ego motion without taking part: ground that was found.
     pub(crate) carried: Vec<usize>,
     /// Source and target for the ego motion, where it is to be found: all that is finite and in
@@ -69,14 +71,24 @@ pub(crate) fn select(problem: &Problem, options: &Options) -> Result<Selection, 
         }
         _ => Vec::new(),
     };
+    let mut answered: Vec<usize> = (0..rows.len()).collect();
     if let Some(max_points) = options.max_points {
         // One permutation for both clouds, as the published code draws it; but each cloud is drawn
         // from all of its rows, which lie in the order of the scan.
         let mut order: Vec<usize> = (0..rows.len().max(target_rows.len())).collect();
         Random::stream(options.seed, 1).shuffle(&mut order);
-        for rows in [&mut rows, &mut target_rows] {
-            let drawn = order.iter().filter_map(|&i| rows.get(i).copied());
-            *rows = drawn.take(max_points).collect();
+        let drawn = |count: usize| -> Vec<usize> {
+            let places = order.iter().copied().filter(|&place| place < count);
+            places.take(max_points).collect()
+        };
+        if options.label.is_some() {
+            // Few points have no clusters: objects are found in all of them.
+            answered = drawn(rows.len());
+        } else {
+            for rows in [&mut rows, &mut target_rows] {
+                *rows = drawn(rows.len()).iter().map(|&place| rows[place]).collect();
+            }
+            answered.truncate(rows.len());
         }
     }
     for (cloud, rows) in [("source", &rows), ("target", &target_rows)] {
@@ -93,6 +105,7 @@ pub(crate) fn select(problem: &Problem, options: &Options) -> Result<Selection, 
         surroundings: (options.ego == Ego::Auto)
             .then(|| [problem.source, problem.target].map(|points| in_range(points, options))),
         rows,
+        answered,
         carried,
     })
 }
@@ -173,7 +186,7 @@ mod tests {
             [6.0, 6.0, 0.0],
         ];
         let ground = [false, false, false, false, false, false, true];
-        let mut options = Preset::Default.options(None);
+        let mut options = Preset::Neural.options(None);
         options.range_m = Some(51.2);
         options.ground = Ground::Keep;
         assert_eq!(rows(&options, &source, Some(&ground)), [0, 2, 5, 6]);
@@ -186,7 +199,7 @@ mod tests {
     #[test]
     fn clouds_of_nothing_but_ground_keep_it() {
         let source: Vec<Point> = (0..9).map(|i| [i as f32, 0.0, 0.0]).collect();
-        let options = Preset::Default.options(None);
+        let options = Preset::Neural.options(None);
         assert_eq!(options.ground, Ground::Auto);
         assert_eq!(rows(&options, &source, Some(&[true; 9])).len(), 9);
     }
@@ -202,7 +215,7 @@ mod tests {
             ground: Some([&ground, &ground]),
             before: None,
         };
-        let mut options = Preset::Default.options(Some(10));
+        let mut options = Preset::Neural.options(Some(10));
         options.ground = Ground::Mask;
         options.range_m = Some(60.0);
         let selection = select(&problem, &options).expect("enough points");
@@ -231,6 +244,29 @@ mod tests {
     }
 
     #[test]
+    fn objects_are_looked_for_in_all_rows_and_those_that_a_field_would_be_fitted_to_are_answered() {
+        let source: Vec<Point> = (0..100).map(|i| [i as f32, 0.0, 0.0]).collect();
+        let mut fitted = Preset::Neural.options(Some(40));
+        let mut objects = Preset::Default.options(Some(40));
+        (fitted.ground, objects.ground) = (Ground::Keep, Ground::Keep);
+        let problem = Problem {
+            source: &source,
+            target: &source,
+            ground: None,
+            before: None,
+        };
+        let fitted = select(&problem, &fitted).expect("enough points");
+        let objects = select(&problem, &objects).expect("enough points");
+        assert_eq!((objects.rows.len(), objects.target.len()), (100, 100));
+        let answered = |selection: &Selection| -> Vec<usize> {
+            let places = selection.answered.iter();
+            places.map(|&place| selection.rows[place]).collect()
+        };
+        assert_eq!(answered(&objects), answered(&fitted));
+        assert_eq!(answered(&fitted), fitted.rows);
+    }
+
+    #[test]
     fn each_cloud_is_sampled_from_all_of_its_rows() {
         let line = |count: usize| {
             (0..count)
@@ -244,7 +280,7 @@ mod tests {
             ground: None,
             before: None,
         };
-        let selection = select(&problem, &Preset::Default.options(Some(300))).expect("points");
+        let selection = select(&problem, &Preset::Neural.options(Some(300))).expect("points");
         assert_eq!(selection.source.len(), 50);
         assert_eq!(selection.target.len(), 300);
         let last = selection.target.iter().map(|p| p[0]).fold(0.0, f32::max);
@@ -259,7 +295,7 @@ mod tests {
             ground: None,
             before: None,
         };
-        let mut options = Preset::Default.options(None);
+        let mut options = Preset::Neural.options(None);
         let error = select(&problem, &options).expect_err("one point");
         assert!(matches!(
             error,

@@ -1,8 +1,9 @@
 //! A sequence: sweeps in, the motion of each consecutive pair out.
 //!
 //! Keeps the last sweep and the last pair's field, whatever the length. Each fit starts from the
-//! field before it, carried into the new frame, where that explains the new pair (`solver.rs` says
-//! how it is judged); the vehicle's motion is sought about the one before. Knows no files.
+//! field before it, carried into the new frame, where the options have a warm start and that explains
+//! the new pair (`warm_start.rs` says how it is judged); the vehicle's motion is sought about the one
+//! before then. Knows no files.
 
 use super::backend::Backend;
 use super::error::FlowError;

@@ -29,7 +29,7 @@ pub struct Estimate {
     /// N displacements, metres over the gap between the sweeps, ego motion included; zero where
     /// `valid` is false.
     pub flow: Vec<Point>,
-    /// N flags: which points took part.
+    /// N flags: which points have a flow.
     pub valid: Vec<bool>,
     /// N flags, where the ego motion is known: which points move at least [`DYNAMIC_M`] against
     /// the static world.
@@ -39,7 +39,7 @@ pub struct Estimate {
     pub objects: Option<Objects>,
     /// The ego motion as target_from_source, where it was given or estimated.
     pub ego: Option<RigidTransform>,
-    /// Points that took part.
+    /// Points that took part and have a flow.
     pub points: usize,
     /// Iterations at most, of the run as it was in the end; all clusters where movers are found
     /// object by object.
@@ -52,6 +52,9 @@ pub struct Estimate {
     pub best_loss: f64,
     /// Why it ended.
     pub stop_reason: StopReason,
+    /// What found it, as reports show it: the device that fitted a field, or the host's threads
+    /// where movers are found object by object.
+    pub device: String,
     /// What it took.
     pub seconds: PhaseSeconds,
     /// Bytes of the distance transform.
@@ -89,7 +92,8 @@ pub struct PhaseSeconds {
     pub precompute: f64,
     /// Distance queries.
     pub query: f64,
-    /// Network, optimizer and the final evaluation.
+    /// Network, optimizer and the final evaluation; the search, where movers are found object by
+    /// object.
     pub network: f64,
     /// All of it.
     pub total: f64,
@@ -156,7 +160,7 @@ fn solve(
     let mut objects = None;
     let fitted = match (&options.label, &prepared) {
         (Some(_), _) if options.precision != Precision::F32 => {
-            let text = "movers are found in single precision alone";
+            let text = "objects are found in single precision alone: take preset neural";
             return Err(BackendError::Unsupported(text).into());
         }
         (Some(label), _) => {
@@ -187,7 +191,8 @@ fn solve(
     let mut flow = vec![[0.0; 3]; problem.source.len()];
     let mut valid = vec![false; problem.source.len()];
     let mut dynamic = ego.map(|_| vec![false; problem.source.len()]);
-    for (i, &row) in selection.rows.iter().enumerate() {
+    for &i in &selection.answered {
+        let row = selection.rows[i];
         let (from, to, residual) = (selection.source[i], aligned[i], fitted.residual[i]);
         flow[row] = core::array::from_fn(|a| (to[a] - from[a]) + residual[a]);
         valid[row] = true;
@@ -208,6 +213,9 @@ fn solve(
             }
         }
     }
+    if let Some(objects) = &mut objects {
+        objects.sure_of(&valid);
+    }
     let report = fitted.report;
     let precompute = fitted.precomputed - began;
     let total = watch.seconds() - began;
@@ -217,12 +225,16 @@ fn solve(
         dynamic,
         objects,
         ego,
-        points: selection.rows.len(),
+        points: selection.answered.len(),
         max_iterations: fitted.max_iterations,
         iterations: report.iterations,
         best_iteration: report.best_iteration,
         best_loss: report.best_loss,
         stop_reason: fitted.stop_reason,
+        device: match &options.label {
+            None => backend.name(),
+            Some(_) => backend.host(),
+        },
         seconds: PhaseSeconds {
             precompute,
             query: report.query_seconds,

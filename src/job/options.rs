@@ -10,6 +10,7 @@ use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use utoipa::ToSchema;
 
+use super::device::{DeviceChoice, DeviceKind};
 use super::sequence::Densify;
 use crate::flow::densify::PlanError;
 use crate::flow::{self, Ego, Ground, MIN_POINTS, Precision, Preset, RigidTransform};
@@ -22,12 +23,13 @@ const MAX_DEADLINE: Duration = Duration::from_secs(24 * 60 * 60);
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct JobOptions {
-    /// `default`: ours, robust and fast; `paper`: FNSF as published; `label`: movers found object by
-    /// object, everything else still.
+    /// `default`: movers found object by object, everything else still; `label`: `default`, for labels;
+    /// `neural`: a neural field, robust and fast to fit; `paper`: FNSF as published.
     pub preset: PresetChoice,
     /// The same seed gives the same bits.
     pub seed: u64,
-    /// Draw this many points from each cloud and leave out the rest.
+    /// Draw this many points and give the others no flow. `neural` and `paper` draw from each cloud and
+    /// leave out the rest; `default` and `label` look at all points all the same.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_points: Option<u32>,
     /// Leave out points with |x| or |y| beyond this, metres.
@@ -43,9 +45,11 @@ pub struct JobOptions {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<Object>)]
     pub ego: Option<EgoChoice>,
-    /// Where the work is done.
+    /// Where the work is done. A GPU is for `neural` and `paper`; `default` and `label` compute on the
+    /// host's processor whatever the device.
     pub device: DeviceChoice,
-    /// `f32`: single precision; `f16`: half, on a GPU whose matrix units pass their self-test.
+    /// `f32`: single precision; `f16`: half, for `neural` and `paper` on a GPU whose matrix units pass
+    /// their self-test.
     pub precision: PrecisionChoice,
     /// Milliseconds from the request's arrival after which the best flow so far is wanted.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -63,13 +67,15 @@ pub struct JobOptions {
 )]
 #[serde(rename_all = "snake_case")]
 pub enum PresetChoice {
-    /// Ours: robust and fast.
+    /// Ours: movers found object by object, everything else still.
     #[default]
     Default,
+    /// As default, for labels.
+    Label,
+    /// Ours with a neural field: robust and fast to fit.
+    Neural,
     /// FNSF as published.
     Paper,
-    /// Ours, for labels: movers found object by object, everything else still.
-    Label,
 }
 
 impl PresetChoice {
@@ -77,8 +83,9 @@ impl PresetChoice {
     pub fn preset(self) -> Preset {
         match self {
             Self::Default => Preset::Default,
-            Self::Paper => Preset::Paper,
             Self::Label => Preset::Label,
+            Self::Neural => Preset::Neural,
+            Self::Paper => Preset::Paper,
         }
     }
 }
@@ -93,43 +100,6 @@ pub enum GroundChoice {
     Mask,
     /// Those of the masks, or without masks those that are found, move with the vehicle.
     Auto,
-}
-
-/// Where the work is done.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum DeviceChoice {
-    /// The fastest that is there: a GPU, or the CPU where there is none.
-    #[default]
-    Auto,
-    /// The CPU's vector units.
-    Cpu,
-    /// A GPU, and nothing else.
-    Gpu,
-}
-
-impl DeviceChoice {
-    /// The kind of device that it has to be; none where any will do.
-    pub fn kind(self) -> Option<DeviceKind> {
-        match self {
-            Self::Auto => None,
-            Self::Cpu => Some(DeviceKind::Cpu),
-            Self::Gpu => Some(DeviceKind::Gpu),
-        }
-    }
-}
-
-impl FromStr for DeviceChoice {
-    type Err = InvalidOptions;
-
-    fn from_str(text: &str) -> Result<Self, Self::Err> {
-        match text {
-            "auto" => Ok(Self::Auto),
-            "cpu" => Ok(Self::Cpu),
-            "gpu" => Ok(Self::Gpu),
-            _ => Err(InvalidOptions::Device(text.to_owned())),
-        }
-    }
 }
 
 /// What the factors of the network's products are rounded to.
@@ -153,28 +123,6 @@ impl FromStr for PrecisionChoice {
             "f32" => Ok(Self::F32),
             "f16" => Ok(Self::F16),
             _ => Err(InvalidOptions::Precision(text.to_owned())),
-        }
-    }
-}
-
-/// What a device is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum DeviceKind {
-    /// The CPU's vector units.
-    Cpu,
-    /// A GPU.
-    Gpu,
-}
-
-impl DeviceKind {
-    /// All kinds.
-    pub const ALL: [Self; 2] = [Self::Cpu, Self::Gpu];
-
-    /// The name that requests and metrics use.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Cpu => "cpu",
-            Self::Gpu => "gpu",
         }
     }
 }
@@ -276,6 +224,9 @@ pub enum InvalidOptions {
     /// Half precision of a device that has none.
     #[error("options: precision is \"f16\", which the CPU does not compute in")]
     HalfOnCpu,
+    /// Half precision of what fits no field.
+    #[error("options: precision is \"f16\", which {0} does not compute in: take preset neural")]
+    HalfWithoutField(&'static str),
     /// Not a positive number of metres.
     #[error("options: range_m is {0}, a positive number of metres is needed")]
     Range(f32),
@@ -340,6 +291,10 @@ impl JobOptions {
         if self.precision == PrecisionChoice::F16 && self.device == DeviceChoice::Cpu {
             return Err(InvalidOptions::HalfOnCpu);
         }
+        let preset = self.preset.preset();
+        if self.precision == PrecisionChoice::F16 && !Preset::FITTED.contains(&preset) {
+            return Err(InvalidOptions::HalfWithoutField(preset.name()));
+        }
         self.densify.as_ref().map_or(Ok(()), Densify::check)
     }
 
@@ -400,24 +355,27 @@ mod tests {
     #[test]
     fn half_precision_asks_for_a_gpu() {
         let options = |text: &str| JobOptions::from_json(text.as_bytes());
-        let half = options(r#"{"precision":"f16"}"#).expect("good options");
+        let half = options(r#"{"preset":"neural","precision":"f16"}"#).expect("good options");
         assert_eq!(half.device_kind(), Some(DeviceKind::Gpu));
         assert_eq!(half.solver_options(1000).precision, Precision::F16);
         let refused = options(r#"{"precision":"f16","device":"cpu"}"#);
         assert_eq!(refused, Err(InvalidOptions::HalfOnCpu));
+        for (preset, fits) in [
+            ("default", false),
+            ("label", false),
+            ("neural", true),
+            ("paper", true),
+        ] {
+            let asked = options(&format!(r#"{{"preset":"{preset}","precision":"f16"}}"#));
+            let refused = asked.err();
+            assert_eq!(
+                refused,
+                (!fits).then_some(InvalidOptions::HalfWithoutField(preset))
+            );
+        }
         let single = options(r#"{"precision":"f32"}"#);
         assert_eq!(single, Ok(JobOptions::default()));
         assert_eq!(JobOptions::default().device_kind(), None);
-    }
-
-    #[test]
-    fn a_device_is_read_alike_from_json_and_from_a_word() {
-        for choice in [DeviceChoice::Auto, DeviceChoice::Cpu, DeviceChoice::Gpu] {
-            let json = serde_json::to_string(&choice).expect("JSON");
-            assert_eq!(json.trim_matches('"').parse(), Ok(choice));
-        }
-        let refused = "tpu".parse::<DeviceChoice>().expect_err("a refusal");
-        assert!(refused.to_string().contains("device is \"tpu\""));
     }
 
     #[test]
@@ -426,7 +384,7 @@ mod tests {
             (r#"{"sead":1}"#, "unknown field `sead`"),
             (
                 r#"{"preset":"best"}"#,
-                "unknown variant `best`, expected one of `default`, `paper`, `label`",
+                "unknown variant `best`, expected one of `default`, `label`, `neural`, `paper`",
             ),
             (
                 r#"{"device":"gpu:0"}"#,

@@ -3,8 +3,9 @@
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+use super::device::DeviceKind;
 use super::id::{JobId, Tenant};
-use super::options::{DeviceKind, Priority};
+use super::options::Priority;
 use crate::clock::Timestamp;
 
 /// Where a job is on its way. The last four are ends: nothing leaves them but by being asked for

@@ -11,11 +11,11 @@ use crate::formats::matrix_rows;
 /// How a flow was found.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Report {
-    /// Points that took part.
+    /// Points that took part and have a flow.
     pub points: usize,
-    /// Iterations done.
+    /// Iterations done; of `default` and `label` clusters looked at.
     pub iterations: usize,
-    /// Iterations at most.
+    /// Iterations at most; of `default` and `label` all clusters.
     pub max_iterations: usize,
     /// The iteration whose field is the result.
     pub best_iteration: usize,
@@ -23,7 +23,8 @@ pub struct Report {
     pub best_loss: Option<f64>,
     /// `converged`, `max_iterations` or `deadline`.
     pub stop_reason: String,
-    /// Where it was done.
+    /// What did it: the device that fitted a field, or the host's threads, which find objects
+    /// whatever the device.
     pub device: String,
     /// The preset's name.
     pub preset: String,
@@ -48,15 +49,15 @@ pub struct PhaseSeconds {
     pub precompute: f64,
     /// Distance queries.
     pub query: f64,
-    /// Network, optimizer and the final evaluation.
+    /// Network, optimizer and the final evaluation; of `default` and `label` the search for movers.
     pub network: f64,
     /// All of it.
     pub total: f64,
 }
 
 impl Report {
-    /// The report on an estimate that `device` made with `options`.
-    pub fn new(estimate: &Estimate, options: &JobOptions, device: String) -> Self {
+    /// The report on an estimate that was made with `options`.
+    pub fn new(estimate: &Estimate, options: &JobOptions) -> Self {
         let seconds = estimate.seconds;
         Self {
             points: estimate.points,
@@ -65,7 +66,7 @@ impl Report {
             best_iteration: estimate.best_iteration,
             best_loss: estimate.best_loss.is_finite().then_some(estimate.best_loss),
             stop_reason: estimate.stop_reason.name().to_owned(),
-            device,
+            device: estimate.device.clone(),
             preset: options.preset.preset().name().to_owned(),
             seed: options.seed,
             ego_motion: estimate.ego.as_ref().map(matrix_rows),
@@ -104,7 +105,7 @@ pub struct DenseReport {
     pub into: f64,
     /// Parts that each step was cut into.
     pub substeps: u32,
-    /// Where it was done.
+    /// What carried the points: the device that asked fields, or the host's threads for objects.
     pub device: String,
     /// Wall-clock seconds of carrying, fits left out.
     pub seconds: f64,
@@ -129,6 +130,7 @@ mod tests {
             best_iteration: 0,
             best_loss: f64::INFINITY,
             stop_reason: StopReason::Deadline,
+            device: "cpu".to_owned(),
             seconds: crate::flow::PhaseSeconds::default(),
             distance_bytes: 0,
             field: crate::flow::Field {
@@ -136,7 +138,7 @@ mod tests {
                 residual: crate::flow::Residual::Still,
             },
         };
-        let report = Report::new(&estimate, &JobOptions::default(), "cpu".to_owned());
+        let report = Report::new(&estimate, &JobOptions::default());
         let json = serde_json::to_string(&report).expect("JSON");
         assert_eq!(serde_json::from_str::<Report>(&json).ok(), Some(report));
     }

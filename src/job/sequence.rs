@@ -98,7 +98,8 @@ mod tests {
     #[test]
     fn pairs_of_a_sequence_go_on_from_each_other_where_their_result_depends_on_it() {
         for (text, goes_on) in [
-            ("{}", true),
+            ("{}", false),
+            (r#"{"preset":"neural"}"#, true),
             (r#"{"preset":"paper"}"#, false),
             (r#"{"preset":"paper","ego":"auto"}"#, false),
             (r#"{"preset":"label"}"#, false),

@@ -9,7 +9,7 @@ use std::time::Instant;
 
 use super::inputs::StoreError;
 use super::job_watch::DenseWatch;
-use super::{Attempt, Densification, Done, EngineError, Found, Solved, Worker, unreadable};
+use super::{Attempt, Densification, Densified, Done, EngineError, Found, Worker, unreadable};
 use crate::blobs::Blob;
 use crate::flow::densify::Plan;
 use crate::flow::{FlowError, Sweep, Watch};
@@ -49,10 +49,7 @@ impl Worker {
         };
         let (began, frames) = (Instant::now(), work.sweeps.len());
         match self.lane.densify(work).await {
-            Ok(Solved {
-                found: cloud,
-                device,
-            }) => {
+            Ok(Densified { cloud, device }) => {
                 let report = DenseReport {
                     points: cloud.points.len(),
                     frames,

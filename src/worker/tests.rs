@@ -115,7 +115,7 @@ impl Stand {
             priority: Priority::Normal,
             device: None,
             cost_seconds: 0.1,
-            options: "{}".to_owned(),
+            options: r#"{"preset": "neural"}"#.to_owned(),
             deadline: None,
             idempotency: None,
             durable: true,

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use fnsf::flow::gpu::{Adapter, AdapterKind, adapters};
 
+use super::gpu_rule;
 use super::program::{fnsf, json};
 
 /// A small simulated street in `folder/street`.
@@ -102,10 +103,12 @@ fn the_number_of_threads_does_not_change_the_file() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     street(folder);
-    let flow = |threads: &str, out: &str| {
+    let flow = |preset: &str, threads: &str, out: &str| {
         let arguments = [
             "flow",
             "street/pair_0000.npz",
+            "--preset",
+            preset,
             "--threads",
             threads,
             "-o",
@@ -114,7 +117,10 @@ fn the_number_of_threads_does_not_change_the_file() {
         assert_eq!(fnsf(folder, &arguments).code, 0);
         std::fs::read(folder.join(out)).expect("the flow was written")
     };
-    assert_eq!(flow("1", "one.npy"), flow("3", "three.npy"));
+    for preset in ["default", "neural"] {
+        let [one, three] = [("1", "one.npy"), ("3", "three.npy")];
+        assert_eq!(flow(preset, one.0, one.1), flow(preset, three.0, three.1));
+    }
 }
 
 #[test]
@@ -260,8 +266,10 @@ fn auto_without_a_card_says_so_and_a_card_that_is_not_there_is_refused_with_advi
     let folder = folder.path();
     street(folder);
     let flow = |device: &str| {
-        let arguments = ["flow", "street/pair_0000.npz", "--json", "--device", device];
-        fnsf(folder, &arguments)
+        let pair = "street/pair_0000.npz";
+        let preset = ["--preset", "neural"];
+        let arguments = [&["flow", pair, "--json", "--device", device], &preset[..]];
+        fnsf(folder, &arguments.concat())
     };
     let refused = flow("gpu:no card has this name");
     assert_eq!((refused.code, refused.stdout.as_str()), (70, ""));
@@ -274,5 +282,40 @@ fn auto_without_a_card_says_so_and_a_card_that_is_not_there_is_refused_with_advi
     if !adapters().iter().any(hardware) {
         let warnings = auto.stderr.matches("warning: the CPU does the work");
         assert_eq!(warnings.count(), 1, "{}", auto.stderr);
+    }
+}
+
+#[test]
+fn objects_are_found_by_the_host_whatever_the_device_and_the_report_says_so() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder);
+    let pair = "street/pair_0000.npz";
+    let flow = |device: &str| fnsf(folder, &["flow", pair, "--json", "--device", device]);
+    let auto = flow("auto");
+    assert_eq!((auto.code, auto.stderr.as_str()), (0, ""));
+    let mut reports = vec![auto.stdout];
+    if gpu_rule::is_there(adapters().len()) {
+        reports.push(flow("gpu:0").stdout);
+    }
+    for report in reports {
+        let report: serde_json::Value = serde_json::from_str(&report).expect("JSON");
+        let device = report["device"].as_str().expect("a name");
+        assert!(device.starts_with("cpu ("), "{report}");
+    }
+}
+
+#[test]
+fn half_precision_of_what_fits_no_field_is_refused_before_any_work() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder);
+    let pair = "street/pair_0000.npz";
+    for preset in ["default", "label"] {
+        let asked = ["--preset", preset, "--precision", "f16", "--json"];
+        let refused = fnsf(folder, &[&["flow", pair][..], &asked].concat());
+        assert_eq!((refused.code, refused.stdout.as_str()), (2, ""));
+        let said = &refused.stderr;
+        assert!(said.contains("take preset neural"), "{said}");
     }
 }

@@ -2,7 +2,7 @@
 
 use super::program::{fnsf, json};
 
-/// Two pairs of a street, and their flows by the preset that finds objects.
+/// Two pairs of a street, and their flows.
 fn two_flows(folder: &std::path::Path) {
     let made = fnsf(
         folder,
@@ -11,7 +11,7 @@ fn two_flows(folder: &std::path::Path) {
     assert_eq!(made.code, 0, "{}", made.stderr);
     for (out, pair) in [("a.npz", "pair_0000"), ("b.feather", "pair_0001")] {
         let pair = format!("street/{pair}.npz");
-        let arguments = ["flow", &pair, "--preset", "label", "-o", out];
+        let arguments = ["flow", &pair, "-o", out];
         let done = fnsf(folder, &arguments);
         assert_eq!(done.code, 0, "{}", done.stderr);
     }

@@ -8,6 +8,9 @@ use super::program::fnsf;
 /// The most memory that a refused file may take, bytes.
 const MEMORY: u64 = 100 << 20;
 
+/// Three points that are too far apart for a distance transform.
+const FAR: &str = "three far points.npy";
+
 /// An array in numpy's format, as its header and data.
 fn npy(descr: &str, shape: &str, data: &[u8]) -> Vec<u8> {
     let header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}\n");
@@ -66,10 +69,7 @@ fn corpus() -> Vec<(&'static str, Vec<u8>)> {
         ("no points.npy", points(&[])),
         ("one point.npy", points(&[[1.0, 2.0, 3.0]])),
         ("two far points.npy", points(&[[0.0; 3], [1e6, 0.0, 0.0]])),
-        (
-            "three far points.npy",
-            points(&[[0.0; 3], [1e6, 0.0, 0.0], [-1e6, 5.0, 5.0]]),
-        ),
+        (FAR, points(&[[0.0; 3], [1e6, 0.0, 0.0], [-1e6, 5.0, 5.0]])),
         ("huge count.ply", ply("4000000000", "0 0 0\n")),
         ("negative count.ply", ply("-5", "0 0 0\n")),
         ("short.ply", ply("3", "0 0 0\n1 1 1\n")),
@@ -88,10 +88,18 @@ fn corpus() -> Vec<(&'static str, Vec<u8>)> {
     ]
 }
 
-/// The most memory that `fnsf flow FILE FILE` takes, bytes, by the system's own count.
-fn peak_memory(folder: &Path, file: &str) -> Option<u64> {
+/// `fnsf flow FILE FILE` with a preset.
+fn flow<'a>(file: &'a str, preset: &'a str) -> [&'a str; 9] {
+    let [device, out] = ["cpu", "out.npz"];
+    [
+        "flow", file, file, "--preset", preset, "--device", device, "-o", out,
+    ]
+}
+
+/// The most memory that it takes, bytes, by the system's own count.
+fn peak_memory(folder: &Path, arguments: &[&str]) -> Option<u64> {
     let mut child = Command::new(env!("CARGO_BIN_EXE_fnsf"))
-        .args(["flow", file, file, "--device", "cpu", "-o", "out.npz"])
+        .args(arguments)
         .current_dir(folder)
         .stderr(Stdio::null())
         .spawn()
@@ -112,10 +120,21 @@ fn peak_memory(folder: &Path, file: &str) -> Option<u64> {
 fn every_hostile_file_gets_one_line_exit_code_65_and_little_memory() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    for (name, bytes) in corpus() {
+    let corpus = corpus();
+    let presets = ["neural", "default"].into_iter();
+    for (preset, (name, bytes)) in presets.flat_map(|p| corpus.iter().map(move |file| (p, file))) {
         std::fs::write(folder.join(name), bytes).expect("written");
-        let arguments = ["flow", name, name, "--device", "cpu", "-o", "out.npz"];
+        let arguments = flow(name, preset);
         let ended = fnsf(folder, &arguments);
+        if let Some(peak) = peak_memory(folder, &arguments) {
+            assert!(peak < MEMORY, "{name}: {peak} bytes");
+        }
+        if (*name, preset) == (FAR, "default") {
+            // Objects need no transform, and their extent no memory.
+            assert_eq!(ended.code, 0, "{name}: {}", ended.stderr);
+            std::fs::remove_file(folder.join("out.npz")).expect("it was written");
+            continue;
+        }
         assert_eq!(ended.code, 65, "{name}: {}", ended.stderr);
         assert_eq!(ended.stderr.lines().count(), 1, "{name}: {}", ended.stderr);
         assert!(
@@ -125,9 +144,6 @@ fn every_hostile_file_gets_one_line_exit_code_65_and_little_memory() {
         );
         assert!(ended.stdout.is_empty(), "{name}: {}", ended.stdout);
         assert!(!folder.join("out.npz").exists(), "{name} left a file");
-        if let Some(peak) = peak_memory(folder, name) {
-            assert!(peak < MEMORY, "{name}: {peak} bytes");
-        }
     }
 }
 
@@ -144,10 +160,7 @@ fn the_far_points_are_refused_for_their_extent() {
     let folder = tempfile::tempdir().expect("a folder");
     let cloud = points(&[[0.0; 3], [5e5, 0.0, 0.0], [-4e5, 5.0, 5.0], [0.0, 0.0, 5.0]]);
     std::fs::write(folder.path().join("far.npy"), cloud).expect("written");
-    let ended = fnsf(
-        folder.path(),
-        &["flow", "far.npy", "far.npy", "-o", "out.npz"],
-    );
+    let ended = fnsf(folder.path(), &flow("far.npy", "neural"));
     assert_eq!(ended.code, 65);
     assert!(ended.stderr.contains("900000"), "{}", ended.stderr);
     assert!(ended.stderr.contains("range"), "{}", ended.stderr);

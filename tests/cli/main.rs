@@ -2,6 +2,8 @@
 
 mod commands;
 mod evaluation;
+#[path = "../common/gpu.rs"]
+mod gpu_rule;
 mod hostile;
 mod program;
 mod sequences;

@@ -29,7 +29,7 @@ fn the_flows_of_a_sequence_are_numbered_and_the_first_is_that_of_its_pair_alone(
     let folder = folder.path();
     street(folder);
     let of = |sweeps: &[&str], out: &str| {
-        let options = ["--device", "cpu", "-o", out];
+        let options = ["--preset", "neural", "--device", "cpu", "-o", out];
         let arguments = [&["flow"], sweeps, &options].concat();
         let done = fnsf(folder, &arguments);
         assert_eq!(done.code, 0, "{}", done.stderr);
@@ -56,8 +56,8 @@ fn a_dense_cloud_has_every_point_and_shows_more_than_one_sweep_through_a_camera(
     street(folder);
     std::fs::write(folder.join("camera.json"), CAMERA).expect("written");
     for (into, preset, out) in [
-        ("2", "default", "dense.ply"),
-        ("1.5", "label", "dense.npz"),
+        ("2", "neural", "dense.ply"),
+        ("1.5", "default", "dense.npz"),
         ("0", "label", "dense.pcd"),
     ] {
         let options = [

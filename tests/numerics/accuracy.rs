@@ -29,11 +29,11 @@ fn the_published_method_reaches_its_published_error_on_argoverse_2() {
 }
 
 #[test]
-fn the_default_is_no_worse_than_the_published_method_and_no_seed_strays() {
+fn neural_is_no_worse_than_the_published_method_and_no_seed_strays() {
     const STRAY: f64 = 1.5;
     for name in ["av2_7fab", "kitti_0000", "small_gicp"] {
         let Some(pair) = real_pair(name) else { return };
-        let [ours, worst] = median_and_worst(&pair, &Preset::Default.options(None), 5);
+        let [ours, worst] = median_and_worst(&pair, &Preset::Neural.options(None), 5);
         let published = score(&pair, &Preset::Paper.options(None)).epe;
         assert!(ours <= published, "{name}: {ours} against {published}");
         assert!(
@@ -44,7 +44,7 @@ fn the_default_is_no_worse_than_the_published_method_and_no_seed_strays() {
 }
 
 #[test]
-fn the_default_beats_standing_still_and_the_published_method_on_a_simulated_street() {
+fn neural_beats_standing_still_and_the_published_method_on_a_simulated_street() {
     let pair = street(&small_street());
     let still = {
         let mut options = Preset::Paper.options(None);
@@ -52,7 +52,7 @@ fn the_default_beats_standing_still_and_the_published_method_on_a_simulated_stre
         options.max_iterations = 0;
         score(&pair, &options).epe
     };
-    let ours = score(&pair, &Preset::Default.options(None)).epe;
+    let ours = score(&pair, &Preset::Neural.options(None)).epe;
     let published = score(&pair, &Preset::Paper.options(None)).epe;
     assert!(ours < 0.5 * still, "ours {ours}, no flow {still}");
     assert!(ours <= published, "ours {ours}, published {published}");

@@ -71,7 +71,8 @@ fn whatever_the_deadline_every_row_has_a_finite_flow() {
                 "{preset:?} {deadline}"
             );
             // The search for movers looks at the watch less often: it is done earlier by this clock.
-            let short = if preset == Preset::Label { 1e-5 } else { 1e-3 };
+            let fits = Preset::FITTED.contains(&preset);
+            let short = if fits { 1e-3 } else { 1e-5 };
             if deadline <= short {
                 assert_eq!(estimate.stop_reason, StopReason::Deadline, "{deadline}");
             }
@@ -115,7 +116,7 @@ fn a_cancellation_under_a_deadline_ends_the_precompute() {
         ground: None,
         before: None,
     };
-    let options = Preset::Default.options(None);
+    let options = Preset::Neural.options(None);
     let error = estimate(&backend, &problem, &options, &Cancelled).expect_err("cancelled");
     assert!(matches!(error, FlowError::Cancelled), "{error}");
 }
@@ -133,7 +134,7 @@ fn the_watch_is_looked_at_all_along_before_the_first_iteration() {
     }
     // Pieces of some milliseconds each, of 0.1 s.
     const LOOKS: u64 = 100;
-    let mut options = Preset::Default.options(None);
+    let mut options = Preset::Neural.options(None);
     options.max_iterations = 0;
     let looks = Looks::default();
     let pair = street(&StreetOptions::default());

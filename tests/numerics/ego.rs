@@ -26,7 +26,7 @@ fn found(pair: &Pair, ground: Ground, max_points: Option<usize>) -> RigidTransfo
         ground: Some([&masks.source, &masks.target]),
         before: None,
     };
-    let mut options = Preset::Default.options(max_points);
+    let mut options = Preset::Neural.options(max_points);
     options.ground = ground;
     options.max_iterations = 0;
     let backend = CpuBackend::new(Some(2)).expect("threads");

@@ -19,7 +19,7 @@ fn a_card_gives_the_cpus_error_on_argoverse_2_and_twice_the_same_bits() {
         return;
     }
     let gpu = Gpu::open(&cards[0], &GpuOptions::default()).expect("the card opens");
-    let mut options = Preset::Default.options(Some(8192));
+    let mut options = Preset::Neural.options(Some(8192));
     options.range_m = Some(51.2);
     let card = solve_on(&gpu, &pair, &options);
     let ours = scored(&pair, &card).epe;
@@ -33,7 +33,7 @@ fn a_card_gives_the_cpus_error_on_argoverse_2_and_twice_the_same_bits() {
     let near = least - DIFFERENCE_M..most + DIFFERENCE_M;
     assert!(near.contains(&ours), "{ours} {cpus:?}");
     // The bits are asked for on fewer points: a software card takes its time.
-    let mut fewer = Preset::Default.options(Some(1024));
+    let mut fewer = Preset::Neural.options(Some(1024));
     fewer.max_iterations = 40;
     let [first, second] = [(), ()].map(|()| solve_on(&gpu, &pair, &fewer).flow);
     assert!(first == second);

@@ -15,7 +15,7 @@ fn movers_are_found_and_the_static_world_stands_still_on_real_pairs() {
         ("small_gicp", 0.0935, 0.0),
     ] {
         let Some(pair) = real_pair(name) else { return };
-        let metrics = score(&pair, &Preset::Label.options(None));
+        let metrics = score(&pair, &Preset::Default.options(None));
         assert!(metrics.epe <= epe_m, "{name}: {}", metrics.epe);
         let moving = metrics.epe_dynamic.unwrap_or(0.0);
         assert!(moving <= moving_m, "{name}: {moving} of what moves");
@@ -30,7 +30,7 @@ fn movers_of_a_street_are_found_and_its_houses_kept_still_unlike_by_the_publishe
         azimuth_steps: 1000,
         ..StreetOptions::default()
     });
-    let [label, paper] = [Preset::Label, Preset::Paper].map(|p| score(&pair, &p.options(None)));
+    let [label, paper] = [Preset::Default, Preset::Paper].map(|p| score(&pair, &p.options(None)));
     let [moving, published] = [label, paper].map(|m| m.epe_dynamic.expect("something moves"));
     assert!(moving <= published / 2.0, "{moving} against {published}");
     let [still, published] = [label, paper].map(|m| m.epe_static.expect("something stands"));
@@ -44,7 +44,7 @@ fn what_is_dynamic_is_what_an_object_moves() {
         azimuth_steps: 800,
         ..StreetOptions::default()
     });
-    let estimate = solve(&pair, &Preset::Label.options(None));
+    let estimate = solve(&pair, &Preset::Default.options(None));
     assert_eq!(estimate.stop_reason, StopReason::MaxIterations);
     assert_eq!(estimate.distance_bytes, 0);
     let dynamic = estimate.dynamic.expect("the ego motion is estimated");
@@ -67,9 +67,47 @@ fn ground_is_found_where_none_is_named_and_few_points_are_no_trouble() {
     };
     let backend = fnsf::flow::cpu::CpuBackend::new(Some(2)).expect("threads");
     for max_points in [None, Some(3000), Some(3)] {
-        let options = Preset::Label.options(max_points);
+        let options = Preset::Default.options(max_points);
         assert_eq!(options.ground, Ground::Auto);
         let estimate = estimate(&backend, &problem, &options, &Unwatched).expect("a flow");
         assert!(estimate.flow.iter().flatten().all(|f| f.is_finite()));
+    }
+}
+
+#[test]
+fn points_that_are_drawn_have_the_flow_that_they_have_among_all_and_the_others_none() {
+    const DRAWN: usize = 1000;
+    let pair = street(&StreetOptions {
+        beams: 32,
+        azimuth_steps: 800,
+        ..StreetOptions::default()
+    });
+    for preset in [Preset::Default, Preset::Label] {
+        let all = solve(&pair, &preset.options(None));
+        let mut chosen = Vec::new();
+        for seed in [0, 1] {
+            let mut options = preset.options(Some(DRAWN));
+            options.seed = seed;
+            let drawn = solve(&pair, &options);
+            assert_eq!((drawn.points, drawn.ego), (DRAWN, all.ego));
+            assert_eq!(drawn.iterations, all.iterations, "clusters");
+            assert_eq!(drawn.best_loss.to_bits(), all.best_loss.to_bits());
+            let valid = drawn.valid.iter().filter(|&&valid| valid).count();
+            assert_eq!(valid, DRAWN, "{preset:?}");
+            let [moves, may_move] = [&drawn, &all].map(|e| e.dynamic.as_ref().expect("an ego"));
+            for row in 0..pair.source.len() {
+                if drawn.valid[row] {
+                    let bits = |flow: [f32; 3]| flow.map(f32::to_bits);
+                    assert_eq!(bits(drawn.flow[row]), bits(all.flow[row]), "row {row}");
+                    assert_eq!(moves[row], may_move[row], "row {row}");
+                } else {
+                    assert_eq!(drawn.flow[row], [0.0; 3], "row {row}");
+                    assert!(!moves[row], "row {row}");
+                }
+            }
+            assert!(moves.contains(&true), "nothing that moves was drawn");
+            chosen.push(drawn.valid);
+        }
+        assert_ne!(chosen[0], chosen[1], "the seed draws");
     }
 }

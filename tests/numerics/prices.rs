@@ -25,7 +25,7 @@ fn bytes_and_bricks_are_never_below_the_truth_and_not_far_above() {
         };
         for sites in [Sites::Cells, Sites::Points] {
             for max_points in [None, Some(5000)] {
-                let mut options = Preset::Default.options(max_points);
+                let mut options = Preset::Neural.options(max_points);
                 options.ground = Ground::Mask;
                 options.distance.sites = sites;
                 options.max_iterations = 0;
@@ -54,7 +54,7 @@ fn work_grows_with_iterations_points_and_detail() {
         before: None,
     };
     let work = |options: &Options| price(&problem, options).expect("taken").multiply_adds;
-    let base = Preset::Default.options(None);
+    let base = Preset::Neural.options(None);
     let change = |change: fn(&mut Options)| {
         let mut options = base.clone();
         change(&mut options);
@@ -75,7 +75,7 @@ fn what_the_estimate_refuses_has_no_price() {
     let wide = [[0.0; 3], [1e6, 0.0, 0.0], [0.0, 1.0, 0.5]];
     let flags = [false; 2];
     let backend = CpuBackend::new(Some(1)).expect("threads");
-    let mut options = Preset::Default.options(None);
+    let mut options = Preset::Neural.options(None);
     options.max_iterations = 0;
     let mut masked = options.clone();
     masked.ground = Ground::Mask;
@@ -115,4 +115,25 @@ fn what_the_estimate_refuses_has_no_price() {
             DistanceError::Memory { .. }
         )))
     ));
+}
+
+#[test]
+fn a_search_for_objects_is_priced_by_all_points_whatever_is_drawn() {
+    let pair = street(&StreetOptions {
+        azimuth_steps: 400,
+        ..StreetOptions::default()
+    });
+    let problem = Problem {
+        source: &pair.source,
+        target: &pair.target,
+        ground: None,
+        before: None,
+    };
+    for preset in [Preset::Default, Preset::Label] {
+        let of = |max_points| price(&problem, &preset.options(max_points)).expect("taken");
+        assert_eq!(of(Some(100)), of(None));
+        assert_eq!(of(None).transform_bytes, 0);
+    }
+    let fitted = price(&problem, &Preset::Neural.options(Some(100))).expect("taken");
+    assert_eq!(fitted.source_points, 100);
 }

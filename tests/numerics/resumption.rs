@@ -133,7 +133,7 @@ fn taking_snapshots_changes_nothing() {
         }
     }
     let pair = small_street();
-    let mut options = Preset::Default.options(None);
+    let mut options = Preset::Neural.options(None);
     options.max_iterations = 12;
     let always = Always::default();
     let watched = run(&pair, &options, 2, None, &always).expect("a flow");
@@ -149,7 +149,7 @@ fn torn_and_altered_snapshots_are_refused() {
     const EDGE: usize = 128;
     const STRIDE: usize = 9973;
     let pair = small_street();
-    let options = Preset::Default.options(None);
+    let options = Preset::Neural.options(None);
     let bytes = put_down(&pair, &options, None, 1).to_bytes();
     for length in 0..bytes.len() {
         assert!(
@@ -179,7 +179,7 @@ fn torn_and_altered_snapshots_are_refused() {
 #[test]
 fn a_foreign_snapshot_is_refused() {
     let pair = small_street();
-    let options = Preset::Default.options(None);
+    let options = Preset::Neural.options(None);
     let snapshot = put_down(&pair, &options, None, 2);
     let mut other_seed = options.clone();
     other_seed.seed = 1;
@@ -190,7 +190,7 @@ fn a_foreign_snapshot_is_refused() {
     let foreign = [
         (&pair, other_seed),
         (&pair, longer),
-        (&pair, Preset::Default.options(Some(500))),
+        (&pair, Preset::Neural.options(Some(500))),
         (&pair, Preset::Paper.options(None)),
         (&other_pair, options),
     ];

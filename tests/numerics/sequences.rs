@@ -66,7 +66,7 @@ fn a_pair_of_a_sequence_takes_fewer_iterations_than_alone_and_is_no_worse() {
     let sweeps: Vec<_> = (0..5)
         .map(|k| street.frame(k).expect("a frame").points)
         .collect();
-    let options = Preset::Default.options(None);
+    let options = Preset::Neural.options(None);
     let together = in_sequence(&sweeps, &options);
     let backend = backend();
     let epe = |estimate: &Estimate, k: usize| {
@@ -101,7 +101,7 @@ fn a_pair_of_a_sequence_takes_fewer_iterations_than_alone_and_is_no_worse() {
 fn a_field_that_does_not_explain_the_next_pair_is_not_started_from() {
     let points = drive(1).frame(0).expect("a frame").points;
     let shifted: Vec<Point> = points.iter().map(|[x, y, z]| [x + 0.8, *y, *z]).collect();
-    let mut options = Preset::Default.options(None);
+    let mut options = Preset::Neural.options(None);
     // The field itself has to explain that everything moves, and then that nothing does.
     options.ego = Ego::Off;
     let estimates = in_sequence(&[points, shifted.clone(), shifted], &options);
@@ -181,7 +181,7 @@ fn movers_are_carried_to_half_of_what_ego_motion_alone_leaves_and_the_static_wor
         })
         .collect();
     let oldest = [0, FRAMES - 1];
-    for preset in [Preset::Default, Preset::Label] {
+    for preset in [Preset::Neural, Preset::Label] {
         let fields = fields(&sweeps, &plan, preset);
         let still: BTreeMap<Leg, Field> = fields
             .iter()

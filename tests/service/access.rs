@@ -246,6 +246,7 @@ async fn codes(server: &Server, id: &str, shown: Option<&str>) -> [Code; 9] {
     let mut calls = client(server).await;
     let id = || id.to_owned();
     let options = || proto::Options {
+        preset: proto::Preset::Neural.into(),
         max_points: Some(512),
         ..proto::Options::default()
     };

@@ -40,6 +40,35 @@ async fn a_job_for_a_kind_of_device_that_is_not_here_is_refused_at_both_doors() 
 }
 
 #[tokio::test]
+async fn half_precision_of_what_fits_no_field_is_refused_at_both_doors_and_names_neural() {
+    let server = Server::start(&[]);
+    let sent = reqwest::Client::new()
+        .post(server.url("/v1/flow"))
+        .multipart(form(small_pair(), r#"{"precision": "f16"}"#))
+        .send()
+        .await
+        .expect("an answer");
+    assert_eq!(sent.status(), StatusCode::BAD_REQUEST);
+    let problem: Value = sent.json().await.expect("a problem");
+    let detail = problem["detail"].as_str().unwrap_or_default();
+    assert!(detail.contains("take preset neural"), "{problem}");
+    let options = proto::Options {
+        precision: "f16".to_owned(),
+        ..proto::Options::default()
+    };
+    let mut calls = grpc::client(&server).await;
+    let refused = calls
+        .estimate_flow(grpc::pair(small_pair(), options))
+        .await
+        .expect_err("a refusal");
+    assert_eq!(refused.code(), Code::InvalidArgument, "{refused}");
+    assert!(
+        refused.message().contains("take preset neural"),
+        "{refused}"
+    );
+}
+
+#[tokio::test]
 async fn auto_without_a_card_works_on_the_cpu_and_says_so() {
     let hardware = |card: &gpu::Adapter| card.kind != gpu::AdapterKind::Software;
     if gpu::adapters().iter().any(hardware) {
@@ -63,8 +92,9 @@ async fn a_server_on_a_card_gives_it_the_jobs_that_ask_for_one() {
     assert!(server.metric("fnsf_device_lanes{device=\"gpu0\"}") >= 2.0);
     assert!((server.metric("fnsf_device_fallback")).abs() < 0.5);
     let mut devices = Vec::new();
-    for device in ["gpu", "cpu"] {
-        let options = format!(r#"{{"device": "{device}", "max_points": 2048}}"#);
+    for (preset, device) in [("neural", "gpu"), ("neural", "cpu"), ("default", "gpu")] {
+        let options =
+            format!(r#"{{"preset": "{preset}", "device": "{device}", "max_points": 2048}}"#);
         let sent = reqwest::Client::new()
             .post(server.url("/v1/jobs"))
             .multipart(form(small_pair(), &options))
@@ -76,4 +106,6 @@ async fn a_server_on_a_card_gives_it_the_jobs_that_ask_for_one() {
         devices.push(job["report"]["device"].as_str().expect("a name").to_owned());
     }
     assert_ne!(devices[0], devices[1]);
+    // Objects are found by the host, and the report does not say otherwise.
+    assert!(devices[2].starts_with("cpu ("), "{devices:?}");
 }

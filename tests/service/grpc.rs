@@ -75,9 +75,11 @@ async fn a_pair_gives_the_bits_that_http_gives() {
     use proto::estimate_flow_response::Part;
     let server = Server::start(&[]);
     let mut calls = client(&server).await;
-    let answer = calls
-        .estimate_flow(pair(small_pair(), proto::Options::default()))
-        .await;
+    let options = proto::Options {
+        preset: proto::Preset::Neural.into(),
+        ..proto::Options::default()
+    };
+    let answer = calls.estimate_flow(pair(small_pair(), options)).await;
     let mut answer = answer.expect("an answer").into_inner();
     let (mut header, mut flow, mut flags, mut progress) = (None, Vec::new(), Vec::new(), 0);
     while let Some(message) = answer.next().await {
@@ -97,7 +99,7 @@ async fn a_pair_gives_the_bits_that_http_gives() {
     assert!(progress > 0, "no progress was told");
     let http = reqwest::Client::new()
         .post(server.url("/v1/flow"))
-        .multipart(form(small_pair(), "{}"))
+        .multipart(form(small_pair(), r#"{"preset": "neural"}"#))
         .send()
         .await
         .expect("an answer");

@@ -39,7 +39,8 @@ fn options(job: usize) -> String {
     let seed = job % 7;
     match job % 5 {
         0 => format!(r#"{{"seed": {seed}, "preset": "paper", "max_points": 2048}}"#),
-        _ => format!(r#"{{"seed": {seed}, "max_points": 512}}"#),
+        1 => format!(r#"{{"seed": {seed}, "max_points": 512}}"#),
+        _ => format!(r#"{{"seed": {seed}, "preset": "neural", "max_points": 512}}"#),
     }
 }
 

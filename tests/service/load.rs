@@ -13,7 +13,7 @@ use crate::clouds::{form, medium_pair, small_pair};
 use crate::server::{Folder, Server, ended, plain_get};
 
 /// A job of a few hundredths of a second.
-const SMALL: &str = r#"{"max_points": 512}"#;
+const SMALL: &str = r#"{"preset": "neural", "max_points": 512}"#;
 
 async fn submit(server: &Server, client: &reqwest::Client, options: &str, key: &str) -> String {
     let mut request = client.post(server.url("/v1/jobs"));
@@ -336,7 +336,13 @@ async fn the_number_of_series_does_not_grow_with_the_jobs() {
     let mut asked_for = 0;
     for jobs in [0, 100, flood] {
         for _ in asked_for..jobs {
-            submit(&server, &client, r#"{"max_points": 16}"#, "").await;
+            submit(
+                &server,
+                &client,
+                r#"{"preset": "neural", "max_points": 16}"#,
+                "",
+            )
+            .await;
         }
         asked_for = jobs;
         let began = Instant::now();

@@ -19,7 +19,7 @@ fn expected() -> Objects {
         before: None,
     };
     let backend = CpuBackend::new(Some(2)).expect("threads");
-    let options = Preset::Label.options(None);
+    let options = Preset::Default.options(None);
     let estimate = estimate(&backend, &problem, &options, &Unwatched).expect("a flow");
     estimate.objects.expect("objects")
 }
@@ -39,7 +39,7 @@ async fn clusters_and_confidence_are_the_librarys_in_every_format_and_over_grpc(
         let answer = reqwest::Client::new()
             .post(server.url("/v1/flow"))
             .header("accept", media)
-            .multipart(form(medium_pair(), r#"{"preset":"label"}"#))
+            .multipart(form(medium_pair(), "{}"))
             .send()
             .await
             .expect("an answer");
@@ -63,13 +63,9 @@ async fn clusters_and_confidence_are_the_librarys_in_every_format_and_over_grpc(
         }
     }
 
-    let options = proto::Options {
-        preset: proto::Preset::Label.into(),
-        ..proto::Options::default()
-    };
     let answer = client(&server)
         .await
-        .estimate_flow(pair(medium_pair(), options))
+        .estimate_flow(pair(medium_pair(), proto::Options::default()))
         .await;
     let mut answer = answer.expect("an answer").into_inner();
     let (mut clusters, mut cluster, mut confidence) = (Vec::new(), Vec::new(), Vec::new());

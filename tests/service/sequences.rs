@@ -24,8 +24,9 @@ use crate::grpc::{chunk, client, pair, proto};
 use crate::server::{Folder, PATIENCE, Server, ended};
 
 /// Few points, so that a pair takes a moment; the dense cloud has all of them.
-const FLOWS: &str = r#"{"max_points": 1024, "ground": "auto"}"#;
-const DENSE: &str = r#"{"max_points": 1024, "ground": "auto", "densify": {"into": 1.5}}"#;
+const FLOWS: &str = r#"{"preset": "neural", "max_points": 1024, "ground": "auto"}"#;
+const DENSE: &str =
+    r#"{"preset": "neural", "max_points": 1024, "ground": "auto", "densify": {"into": 1.5}}"#;
 
 /// The sweeps of a short simulated drive.
 fn frames() -> &'static [Vec<Point>] {
@@ -178,6 +179,7 @@ async fn streamed(server: &Server) -> Vec<Vec<Point>> {
 
 fn grpc_options(densify: Option<proto::Densify>) -> proto::Options {
     proto::Options {
+        preset: proto::Preset::Neural.into(),
         max_points: Some(1024),
         ground: proto::Ground::Auto.into(),
         densify,
@@ -319,8 +321,8 @@ async fn a_sequence_that_is_killed_in_its_pairs_and_while_it_is_carried_ends_wit
     const CONFIG: &str =
         "[queue]\nretry_delay_seconds = 1\nsnapshot_interval_ms = 50\nmax_crashes = 40\n";
     // So many steps that carrying takes seconds.
-    const LONG: &str =
-        r#"{"max_points": 1024, "ground": "auto", "densify": {"into": 0, "substeps": 64}}"#;
+    const LONG: &str = r#"{"preset": "neural", "max_points": 1024, "ground": "auto",
+        "densify": {"into": 0, "substeps": 64}}"#;
     let folder = Folder::new();
     let mut server = Server::start_in(&folder, CONFIG, &[]);
     let id = submit(&server, LONG).await;
@@ -400,7 +402,7 @@ async fn a_dense_cloud_that_cannot_be_made_is_refused_with_clear_words_and_costs
         ),
         (r#"{"into": 1}"#, &many, 413, "the dense cloud of"),
     ] {
-        let options = format!(r#"{{"max_points": 512, "densify": {densify}}}"#);
+        let options = format!(r#"{{"preset": "neural", "max_points": 512, "densify": {densify}}}"#);
         let (found, problem) = post(&server, "/v1/sequences", body(&options, frames)).await;
         let detail = problem["detail"].as_str().unwrap_or_default();
         assert_eq!(found.as_u16(), status, "{problem}");

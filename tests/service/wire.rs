@@ -10,7 +10,7 @@ use crate::clouds::{form, small_pair};
 use crate::server::{Folder, PATIENCE, Server};
 
 /// A request of a few hundredths of a second.
-pub(crate) const SMALL: &str = r#"{"max_points": 512}"#;
+pub(crate) const SMALL: &str = r#"{"preset": "neural", "max_points": 512}"#;
 
 /// What an attack may cost a server for good.
 const MAX_GROWTH: u64 = 64 << 20;

@@ -25,8 +25,9 @@ pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, Api
     };
     let preset = match proto::Preset::try_from(message.preset) {
         Ok(proto::Preset::Unspecified | proto::Preset::Default) => PresetChoice::Default,
-        Ok(proto::Preset::Paper) => PresetChoice::Paper,
         Ok(proto::Preset::Label) => PresetChoice::Label,
+        Ok(proto::Preset::Neural) => PresetChoice::Neural,
+        Ok(proto::Preset::Paper) => PresetChoice::Paper,
         Err(_) => return Err(unknown("preset", message.preset)),
     };
     let ground = match proto::Ground::try_from(message.ground) {

@@ -27,6 +27,9 @@ pub(super) fn report() -> Result<(), Failure> {
     if taken.is_none() {
         say(format_args!("  auto takes the CPU"))?;
     }
+    say(format_args!(
+        "  a card is for presets neural and paper; default and label compute on the CPU whatever the device"
+    ))?;
     let hardware = |card: &&Adapter| card.kind != AdapterKind::Software;
     let found = Found::here(cards.iter().filter(hardware).count(), cards.len());
     for advice in found.advice() {

@@ -73,6 +73,10 @@ impl Backend for CpuBackend {
         )
     }
 
+    fn host(&self) -> String {
+        self.name()
+    }
+
     fn transform(
         &self,
         source: &[Point],

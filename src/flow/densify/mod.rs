@@ -20,7 +20,7 @@ use carried::{By, Carried};
 
 use super::backend::{Backend, BackendError};
 use super::dense::DenseCloud;
-use super::field::Field;
+use super::field::{Field, Residual};
 use super::points::RigidTransform;
 use super::sequence::Sweep;
 use super::watch::{self, Interrupt, Watch};
@@ -131,6 +131,17 @@ pub fn densify<'a>(
         later.transform(&instant);
     }
     Ok(earlier.joined(later, plan.into()))
+}
+
+/// What carries points through `fields`, as reports show it: the device where one of them is a network,
+/// else the host's threads.
+pub fn carrier<'a>(backend: &dyn Backend, fields: impl IntoIterator<Item = &'a Field>) -> String {
+    let is_network = |field: &Field| matches!(field.residual, Residual::Network(_));
+    if fields.into_iter().any(is_network) {
+        backend.name()
+    } else {
+        backend.host()
+    }
 }
 
 /// The part of a rigid motion that is done after `share` of its time.

@@ -67,10 +67,8 @@ impl Gpu {
     /// # Errors
     /// Why half precision is not to be had on this card.
     pub fn matrix_units(&self) -> Result<String, String> {
-        let units = self.0.tested_units().as_ref();
-        units
-            .map(|units| units.tile.name().to_owned())
-            .map_err(Clone::clone)
+        let units = self.0.tested_units().as_ref().map_err(Clone::clone)?;
+        Ok(units.tile.name().to_owned())
     }
 
     /// Whether the card is gone and must be opened again.
@@ -93,6 +91,10 @@ impl Gpu {
 impl Backend for Gpu {
     fn name(&self) -> String {
         self.0.name.clone()
+    }
+
+    fn host(&self) -> String {
+        format!("cpu ({} threads)", self.0.host.current_num_threads())
     }
 
     fn transform(

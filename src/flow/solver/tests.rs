@@ -48,7 +48,7 @@ fn solve(
 #[test]
 fn points_left_out_keep_their_row_with_zero_flow() {
     let pair = street();
-    let mut options = Preset::Default.options(None);
+    let mut options = Preset::Neural.options(None);
     options.ground = Ground::Mask;
     options.range_m = Some(30.0);
     let estimate = solve(&pair, &options, &Unwatched).expect("a flow");
@@ -67,7 +67,7 @@ fn points_left_out_keep_their_row_with_zero_flow() {
 #[test]
 fn ground_that_is_found_moves_with_the_vehicle_and_takes_no_part() {
     let pair = street();
-    let mut options = Preset::Default.options(None);
+    let mut options = Preset::Neural.options(None);
     let solve = |options: &Options| {
         let backend = CpuBackend::new(Some(2)).expect("threads");
         let problem = Problem {
@@ -123,7 +123,7 @@ fn a_deadline_gives_the_best_flow_so_far_and_a_cancellation_gives_none() {
 #[test]
 fn a_deadline_before_the_first_iteration_still_gives_a_flow() {
     let now = After(0, Interrupt::Deadline, AtomicUsize::new(0));
-    let estimate = solve(&street(), &Preset::Default.options(None), &now).expect("a flow");
+    let estimate = solve(&street(), &Preset::Neural.options(None), &now).expect("a flow");
     assert_eq!(estimate.iterations, 0);
     assert!(estimate.flow.iter().flatten().all(|f| f.is_finite()));
 }
@@ -131,7 +131,7 @@ fn a_deadline_before_the_first_iteration_still_gives_a_flow() {
 #[test]
 fn a_given_ego_motion_is_taken_as_it_is_and_marks_what_moves_against_it() {
     let pair = street();
-    let mut options = Preset::Default.options(None);
+    let mut options = Preset::Neural.options(None);
     options.ego = Ego::Given(pair.target_from_source);
     options.max_iterations = 0;
     let estimate = solve(&pair, &options, &Unwatched).expect("a flow");

@@ -108,7 +108,7 @@ fn the_number_of_threads_does_not_change_a_bit() {
 
 #[test]
 fn seeds_give_different_fields() {
-    let mut options = Preset::Default.options(None);
+    let mut options = Preset::Neural.options(None);
     let first = fitted(Isa::Portable, 1, &options, 3);
     options.seed = 1;
     assert_ne!(first, fitted(Isa::Portable, 1, &options, 3));
@@ -116,7 +116,7 @@ fn seeds_give_different_fields() {
 
 #[test]
 fn a_zero_start_is_no_flow() {
-    let options = Preset::Default.options(None);
+    let options = Preset::Neural.options(None);
     let (_, flow) = fitted(Isa::available()[0], 1, &options, 0);
     assert!(flow.iter().flatten().all(|&f| f == 0.0));
 }

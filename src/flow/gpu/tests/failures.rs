@@ -36,7 +36,7 @@ fn a_card_lost_in_the_middle_of_a_run_fails_the_run_and_can_be_opened_again() {
         ground: None,
         before: None,
     };
-    let options = Preset::Default.options(None);
+    let options = Preset::Neural.options(None);
     let killed = estimate(&gpu, &problem, &options, &Kill(&gpu, AtomicUsize::new(0)));
     assert!(
         matches!(killed, Err(FlowError::Backend(BackendError::Lost(_)))),

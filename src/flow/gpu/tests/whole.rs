@@ -99,7 +99,7 @@ fn a_field_that_was_kept_says_on_the_card_what_its_run_said_and_on_the_cpu_about
         return;
     };
     let pair = street(2);
-    let mut options = Preset::Default.options(None);
+    let mut options = Preset::Neural.options(None);
     options.max_iterations = 8;
     options.ground = Ground::Keep;
     let estimate = solved(gpu, &pair, &options);
@@ -198,7 +198,7 @@ fn fitted(device: &dyn Backend, points: usize, options: &Options, steps: usize) 
 }
 
 fn batched() -> Options {
-    let mut options = Preset::Default.options(None);
+    let mut options = Preset::Neural.options(None);
     options.batch = Some(300);
     options
 }
