@@ -47,6 +47,7 @@ impl Closing {
         let back = back.enumerate().map(|(turn, leg)| PairOf {
             place: leg.target as u32,
             backward: true,
+            sees: [leg.target as u32, leg.source as u32 + 1],
             follows: goes_on && turn > 0,
         });
         Ok(Self {

@@ -247,6 +247,7 @@ impl Draft {
         let forward = (0..self.frames - 1).map(|place| PairOf {
             place,
             backward: false,
+            sees: [place, place + 2],
             follows: goes_on && place > 0,
         });
         forward.collect()
@@ -276,6 +277,7 @@ impl Draft {
             id: self.id,
             tenant: self.caller.tenant.clone(),
             kind,
+            pair: PairOf::ALONE,
             cost_seconds,
             pairs,
             closing_seconds,

@@ -105,6 +105,8 @@ pub struct Job {
     pub place: u32,
     /// Whether it goes back in time, from the later sweep to the earlier one.
     pub backward: bool,
+    /// The sweeps that it is found from: the first, and the one after the last.
+    pub sees: [u32; 2],
     /// Pairs of a sequence, those that go back in time included; 0 for a pair.
     pub pairs: u32,
     /// Pairs of a sequence that have not ended yet.

@@ -52,6 +52,7 @@ macro_rules! queue_contract {
             a_cancelled_job_whose_worker_is_silent_is_not_tried_again,
             a_job_that_is_asked_for_again_waits_for_its_turn,
             a_sequence_ends_with_its_last_pair,
+            a_pair_says_which_sweeps_it_is_of_and_found_from,
             a_sequence_is_cancelled_with_its_pairs_and_can_be_asked_for_again,
             ended_jobs_are_kept_for_a_while_and_then_forgotten,
             followers_see_every_state,
@@ -99,6 +100,7 @@ pub(crate) fn submission(of: &str) -> Submission {
         id: JobId::fresh(),
         tenant: tenant(of),
         kind: Kind::Pair,
+        pair: PairOf::ALONE,
         pairs: Vec::new(),
         closing_seconds: None,
         after: None,
@@ -198,6 +200,7 @@ fn forward(place: u32, follows: bool) -> PairOf {
     PairOf {
         place,
         backward: false,
+        sees: [place, place + 2],
         follows,
     }
 }

@@ -36,6 +36,8 @@ pub struct Submission {
     pub tenant: Tenant,
     /// A pair or a sequence.
     pub kind: Kind,
+    /// Which of its sweeps a pair is of; of no meaning for a sequence.
+    pub pair: PairOf,
     /// The pairs of a sequence, in the order of their turns; none for a pair.
     pub pairs: Vec<PairOf>,
     /// Predicted compute seconds of what is left to do for a sequence when all of its pairs have
@@ -61,15 +63,27 @@ pub struct Submission {
     pub durable: bool,
 }
 
-/// A pair of a sequence that is submitted.
+/// What a pair is of the sweeps that lie under its name, or its sequence's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PairOf {
     /// The earlier of its two sweeps.
     pub place: u32,
     /// Whether it goes back in time, from the later sweep to the earlier one.
     pub backward: bool,
+    /// The sweeps that it is found from, its own among them: the first, and the one after the last.
+    pub sees: [u32; 2],
     /// Whether it comes after the one before it in the list.
     pub follows: bool,
+}
+
+impl PairOf {
+    /// Two sweeps, and nothing else.
+    pub const ALONE: Self = Self {
+        place: 0,
+        backward: false,
+        sees: [0, 2],
+        follows: false,
+    };
 }
 
 /// What makes a repeated submission recognizable.

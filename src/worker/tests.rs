@@ -17,7 +17,7 @@ use crate::flow::{Field, Point};
 use crate::job::{DeviceKind, Job, JobId, Kind, Priority, State, Tenant};
 use crate::metrics::Metrics;
 use crate::payload::{StoredCloud, StoredFlow};
-use crate::queue::{Queue, QueueOptions, SqliteQueue, Submission, Submitted};
+use crate::queue::{PairOf, Queue, QueueOptions, SqliteQueue, Submission, Submitted};
 
 /// Long enough for a loaded machine; only a failure waits so long.
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -108,6 +108,7 @@ impl Stand {
             id,
             tenant: Tenant::default(),
             kind: Kind::Pair,
+            pair: PairOf::ALONE,
             pairs: Vec::new(),
             closing_seconds: None,
             after,

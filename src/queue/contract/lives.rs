@@ -146,6 +146,34 @@ pub(crate) async fn a_sequence_ends_with_its_last_pair(stand: &mut impl Stand) {
     assert_eq!(queue.list(filter).await.expect("a list").len(), 1);
 }
 
+pub(crate) async fn a_pair_says_which_sweeps_it_is_of_and_found_from(stand: &mut impl Stand) {
+    let (queue, _events) = stand.open(QueueOptions::default());
+    let amid = PairOf {
+        place: 2,
+        sees: [0, 5],
+        ..PairOf::ALONE
+    };
+    let alone = Submission {
+        pair: amid,
+        ..submission("a")
+    };
+    submit(&queue, alone).await;
+    let held = lease(&queue).await;
+    assert_eq!((held.job.place, held.job.sees), (2, [0, 5]));
+    assert_eq!(held.job.sweeps(), (held.job.id, [2, 3]));
+    let of_sequence = Submission {
+        pairs: vec![PairOf {
+            backward: true,
+            ..amid
+        }],
+        ..sequence(0)
+    };
+    let job = submit(&queue, of_sequence).await;
+    let held = lease(&queue).await;
+    assert_eq!((held.job.place, held.job.sees), (2, [0, 5]));
+    assert_eq!(held.job.sweeps(), (job.id, [3, 2]));
+}
+
 pub(crate) async fn a_sequence_is_cancelled_with_its_pairs_and_can_be_asked_for_again(
     stand: &mut impl Stand,
 ) {

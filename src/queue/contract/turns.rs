@@ -22,6 +22,7 @@ fn closing() -> Submission {
     let back = |place, follows| PairOf {
         place,
         backward: true,
+        sees: [place, place + 2],
         follows,
     };
     Submission {

@@ -10,7 +10,7 @@ use rusqlite::{Connection, TransactionBehavior};
 use crate::queue::QueueError;
 
 /// What this program reads and writes; kept in `user_version`.
-pub(super) const VERSION: i64 = 3;
+pub(super) const VERSION: i64 = 4;
 
 /// `due` is when the sweeper looks at a row next: the end of a queued job's time or of its delay,
 /// of a running job's lease, of an ended job's retention. `ready` is since when a job could be
@@ -25,6 +25,8 @@ CREATE TABLE jobs (
     parent BLOB,
     place INTEGER NOT NULL,
     backward INTEGER NOT NULL,
+    sees_from INTEGER NOT NULL,
+    sees_to INTEGER NOT NULL,
     after BLOB,
     followed INTEGER NOT NULL,
     ready INTEGER,

@@ -12,7 +12,7 @@ use super::rows::{self, COLUMNS, device_code, kind_code, priority_code};
 use super::turns;
 use crate::clock::Timestamp;
 use crate::job::{Job, JobId, Kind, State};
-use crate::queue::{Event, PairOf, QueueError, QueueOptions, Submission, Submitted};
+use crate::queue::{Event, QueueError, QueueOptions, Submission, Submitted};
 
 /// What follows a commit.
 #[derive(Debug, Default)]
@@ -87,6 +87,7 @@ pub(super) fn submit(
                 let pair = Submission {
                     id: JobId::fresh(),
                     kind: Kind::Pair,
+                    pair: *of,
                     pairs: Vec::new(),
                     closing_seconds: None,
                     after: before.filter(|_| of.follows),
@@ -94,7 +95,7 @@ pub(super) fn submit(
                     idempotency: None,
                     ..submission.clone()
                 };
-                let pair = Arc::new(insert(connection, options, &pair, Some((job.id, of)))?);
+                let pair = Arc::new(insert(connection, options, &pair, Some(job.id))?);
                 before = Some(pair.id);
                 effects.events.push(Event::Submitted(Arc::clone(&pair)));
                 effects.entered.push(pair);
@@ -109,7 +110,7 @@ fn insert(
     connection: &Connection,
     options: &QueueOptions,
     submission: &Submission,
-    place: Option<(JobId, &PairOf)>,
+    parent: Option<JobId>,
 ) -> Result<Job, QueueError> {
     let now = Timestamp::now();
     let is_pair = submission.kind == Kind::Pair;
@@ -130,9 +131,9 @@ fn insert(
         "INSERT INTO jobs (id, tenant, kind, parent, place, pairs, pairs_left, priority, \
          device, state, durable, delayed, attempt, failures, crashes, cost, virtual_start, virtual_finish, \
          options, idempotency_key, fingerprint, created, deadline, expires, due, error_retryable, \
-         dead, cancel_requested, backward, after, followed, ready, closes) \
+         dead, cancel_requested, backward, after, followed, ready, closes, sees_from, sees_to) \
          VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?6, ?7, ?19, 0, ?8, 0, 0, 0, 0, \
-         ?9, ?10, ?11, ?12, ?13, ?14, ?15, ?16, ?17, ?18, 0, 0, 0, ?20, ?21, ?22, ?23, ?24) \
+         ?9, ?10, ?11, ?12, ?13, ?14, ?15, ?16, ?17, ?18, 0, 0, 0, ?20, ?21, ?22, ?23, ?24, ?25, ?26) \
          RETURNING {COLUMNS}"
     );
     let mut statement = connection.prepare_cached(&sql)?;
@@ -142,8 +143,8 @@ fn insert(
             submission.id.as_bytes(),
             submission.tenant.as_str(),
             kind_code(submission.kind),
-            place.map(|(parent, _)| *parent.as_bytes()),
-            place.map_or(0, |(_, of)| of.place),
+            parent.map(|parent| *parent.as_bytes()),
+            submission.pair.place,
             submission.pairs.len() as i64,
             priority_code(submission.priority),
             submission.durable,
@@ -158,11 +159,13 @@ fn insert(
             expires.as_millis(),
             is_pair.then_some(expires.as_millis()),
             device_code(submission.device),
-            place.is_some_and(|(_, of)| of.backward),
+            submission.pair.backward,
             submission.after.map(|after| *after.as_bytes()),
             submission.followed,
             is_ready.then_some(now.as_millis()),
             submission.closing_seconds.is_some(),
+            submission.pair.sees[0],
+            submission.pair.sees[1],
         ],
         rows::job,
     )?;
