@@ -131,6 +131,7 @@ impl Admission {
             target: &target.points,
             ground: ground.map(<[_; 2]>::from),
             before: None,
+            around: &[],
         };
         let points = source.points.len().max(target.points.len());
         let mut options = options.solver_options(points);

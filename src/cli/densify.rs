@@ -1,6 +1,6 @@
 //! `fnsf densify`: a sequence's sweeps as one dense cloud, and as a dense depth image.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::path::PathBuf;
 
 use anyhow::anyhow;
@@ -14,7 +14,7 @@ use super::output::say;
 use super::terminal::Terminal;
 use crate::flow::densify::{DensifyError, Leg, densify};
 use crate::flow::depth::{Camera, DepthImage, Occlusion, project};
-use crate::flow::{DenseCloud, Field, Point, Sequence, Sweep, Watch};
+use crate::flow::{DenseCloud, Estimate, Field, Point, Sequence, Sweep, Watch};
 use crate::formats::{DenseFormat, FormatError, write_dense, write_depth_png};
 use crate::job::{self, LaterChoice};
 use crate::picture::{self, DepthPanel};
@@ -118,7 +118,7 @@ impl Densify {
         let mut fields: BTreeMap<Leg, Field> = BTreeMap::new();
         let fits = plan.legs().len();
         for chain in plan.chains() {
-            let mut sequence = Sequence::default();
+            let (mut sequence, mut waiting) = (Sequence::default(), VecDeque::new());
             for (number, leg) in chain.into_iter().enumerate() {
                 let Leg { source, target } = leg;
                 terminal.part(&format!("pair {} of {fits}", fields.len() + 1));
@@ -131,8 +131,11 @@ impl Densify {
                 if number == 0 {
                     push(source)?;
                 }
-                fields.extend(push(target)?.map(|estimate| (leg, estimate.field)));
+                waiting.push_back(leg);
+                fields.extend(of_legs(push(target)?, &mut waiting));
             }
+            let rest = device.finish(&mut sequence, &terminal)?;
+            fields.extend(of_legs(rest, &mut waiting));
         }
         let fitted = terminal.seconds();
         terminal.part("carrying");
@@ -256,4 +259,12 @@ impl Densify {
         }
         Ok(())
     }
+}
+
+/// The fields of the legs that have waited longest.
+fn of_legs(estimates: Vec<Estimate>, waiting: &mut VecDeque<Leg>) -> Vec<(Leg, Field)> {
+    let legs = waiting.drain(..estimates.len());
+    legs.zip(estimates)
+        .map(|(leg, estimate)| (leg, estimate.field))
+        .collect()
 }

@@ -200,6 +200,7 @@ pub(super) fn solve(backend: &dyn Backend, work: Work, busy: &Busy) -> Result<Es
         target: &work.target,
         ground: ground.map(|[source, target]| [source.as_slice(), target.as_slice()]),
         before: work.before.as_ref(),
+        around: &[],
     };
     if let Some(snapshot) = work.snapshot {
         match flow::resume(backend, &problem, &work.options, snapshot, &watch) {

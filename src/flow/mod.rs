@@ -15,7 +15,7 @@
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let street = StreetOptions { beams: 16, azimuth_steps: 400, ..StreetOptions::default() };
 //! let pair = Street::new(&street)?.pair(0)?;
-//! let problem = Problem { source: &pair.source, target: &pair.target, ground: None, before: None };
+//! let problem = Problem { source: &pair.source, target: &pair.target, ground: None, before: None, around: &[] };
 //! let options = Preset::Default.options(None);
 //! let estimate = estimate(&CpuBackend::new(None)?, &problem, &options, &Unwatched)?;
 //! assert_eq!(estimate.flow.len(), pair.source.len());
@@ -24,6 +24,7 @@
 //! ```
 
 // What goes in and comes out, and the loop between.
+mod around;
 mod deadline;
 mod dense;
 mod error;
@@ -71,6 +72,7 @@ pub mod simulate;
 #[cfg(test)]
 mod reference;
 
+pub use around::{AlignedSweep, Around};
 pub use dense::DenseCloud;
 pub use error::FlowError;
 pub use field::{Field, Network, Residual};
@@ -80,7 +82,7 @@ pub use points::{MIN_POINTS, Point, RigidTransform};
 pub use preprocess::Problem;
 pub use price::{Price, price};
 pub use sealed::SealError;
-pub use sequence::{Sequence, Sweep};
+pub use sequence::{Sequence, Sweep, window};
 pub use snapshot::{Snapshot, SnapshotError, TrainerState};
 pub use solver::{DYNAMIC_M, Estimate, PhaseSeconds, StopReason, estimate, resume};
 pub use watch::{Interrupt, Progress, Unwatched, Watch};

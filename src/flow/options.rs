@@ -122,6 +122,11 @@ impl Options {
         }
     }
 
+    /// Sweeps that an estimate looks at where a sequence has them: the pair's two, or more.
+    pub fn frames(&self) -> usize {
+        self.label.as_ref().map_or(2, |label| label.frames.max(2))
+    }
+
     /// Iterations that a run usually takes: all of them where no rule stops it; the published rule
     /// stops after 36 to 115.
     pub fn expected_iterations(&self) -> usize {
@@ -280,6 +285,18 @@ pub struct LabelOptions {
     pub flat_points: usize,
     /// See `flat_points`.
     pub flat_m: f32,
+    /// Sweeps that are looked at in all: the pair's two, and others of its sequence where there are.
+    pub frames: usize,
+    /// X
+    pub around_weight: f32,
+    /// X
+    pub around_power: f32,
+    /// X
+    pub confirmed_cost: f32,
+    /// X
+    pub confirmed_m: f32,
+    /// X
+    pub x: u32,
 }
 
 impl Default for LabelOptions {
@@ -310,6 +327,12 @@ impl Default for LabelOptions {
             worse_m: 0.05,
             flat_points: 30,
             flat_m: 0.2,
+            frames: 2,
+            around_weight: 1.0,
+            around_power: 2.0,
+            confirmed_cost: 0.5,
+            confirmed_m: 0.1,
+            x: 0,
         }
     }
 }

@@ -10,15 +10,42 @@ use crate::flow::options::LabelOptions;
 
 /// Whether `found`, the best motion of a cluster with these `points`, is needed.
 pub(super) fn is_needed(found: &Found, points: &[Point], options: &LabelOptions) -> bool {
-    let [still, moved] = [found.still, found.cost].map(|cost| cost.sum_m());
-    let gain = still - moved;
-    found.motion.length_m() >= options.least_motion_m
-        && found.still.there_m - found.cost.there_m >= options.gain_m
-        && moved <= options.kept_cost * still
+    let [mut still, mut moved] = [found.still, found.cost].map(|cost| cost.sum_m());
+    let around = found.around;
+    let mut weight = 1.0;
+    if options.x & 16 != 0 {
+        // mean
+        still = (still + around.still_m) / (1.0 + around.weight);
+        moved = (moved + around.moved_m) / (1.0 + around.weight);
+        if options.x & 32 != 0 {
+            weight = 1.0 + around.weight;
+        }
+    }
+    let confirmed = around.weight > 0.0
+        && around.moved_m <= options.confirmed_cost * around.still_m
+        && around.still_m - around.moved_m >= options.confirmed_m * around.weight;
+    let asked = if options.x & 128 != 0 && confirmed { 0.5 } else { 1.0 };
+    if options.x & (1 << 20) != 0 && points.len() > 60 {
+        let mut c = [0.0; 3];
+        for p in points {
+            for a in 0..3 {
+                c[a] += p[a] / points.len() as f32;
+            }
+        }
+        eprintln!("n {} c {:.1} {:.1} {:.1} shift {:.2} {:.2} hold {:.2} still {:.3} {:.3} moved {:.3} {:.3} around w {:.2} still {:.3} moved {:.3}", points.len(), c[0], c[1], c[2], found.motion.shift_m[0], found.motion.shift_m[1], found.hold, found.still.there_m, found.still.back_m, found.cost.there_m, found.cost.back_m, around.weight, around.still_m/around.weight.max(1e-9), around.moved_m/around.weight.max(1e-9));
+    }
+    let gain = (still - moved) * weight;
+    let refuted = around.weight > 0.0 && around.moved_m > around.still_m;
+    let loose = options.x & 4096 != 0 && confirmed;
+    (options.x & 8192 == 0 || !refuted)
+        && found.motion.length_m() >= options.least_motion_m
+        && (found.still.there_m - found.cost.there_m >= options.gain_m
+            || options.x & 512 != 0 && confirmed)
+        && (moved <= options.kept_cost * still || loose)
         && gain * points.len() as f32
-            >= options.evidence_m + options.evidence_slope * found.motion.length_m()
-        && found.cost.there_m <= options.left_m
-        && found.hold >= options.least_hold
+            >= (options.evidence_m + options.evidence_slope * found.motion.length_m()) * asked
+        && (found.cost.there_m <= options.left_m || loose)
+        && (found.hold >= options.least_hold || options.x & 64 != 0 && confirmed)
         && !is_flat(points, options)
 }
 
@@ -37,7 +64,7 @@ fn is_flat(points: &[Point], options: &LabelOptions) -> bool {
 mod tests {
     use super::*;
     use crate::flow::label::motion::Motion;
-    use crate::flow::label::rigid::Cost;
+    use crate::flow::label::rigid::{Cost, Evidence};
 
     /// A motion that is needed whatever is asked.
     fn plain() -> Found {
@@ -47,6 +74,7 @@ mod tests {
             cost: cost(0.03, 0.03),
             still: cost(0.25, 0.2),
             hold: 0.4,
+            around: Evidence::default(),
         }
     }
 

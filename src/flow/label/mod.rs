@@ -13,6 +13,7 @@
 
 // What is looked at, and what moves.
 mod cluster;
+mod moment;
 mod motion;
 mod motions;
 mod near;
@@ -32,12 +33,14 @@ pub use motions::Motions;
 
 use rayon::prelude::*;
 
+use super::around::AlignedSweep;
 use super::options::LabelOptions;
 use super::points::Point;
 use super::watch::{Interrupt, Progress, Watch};
 use cluster::NOISE;
 use rigid::{Found, Mover};
-use scene::Scene;
+use moment::Moment;
+use scene::{Scene, Thinned};
 use vote::Ballot;
 
 /// Clusters between two looks at the watch.
@@ -81,6 +84,7 @@ impl Labelled {
 pub(crate) fn label(
     source: &[Point],
     target: &[Point],
+    around: &[AlignedSweep],
     options: &LabelOptions,
     watch: &dyn Watch,
 ) -> Labelled {
@@ -98,12 +102,17 @@ pub(crate) fn label(
         return Labelled::nothing(interrupt);
     }
     let began = watch.seconds();
-    let scene = Scene::new(source, &labels, target, options);
+    let thinned = Thinned::new(source, &labels, options);
+    let scene = Scene::new(&thinned, target, options);
     let ballot = Ballot::new(&scene);
+    let around: Vec<Moment<'_>> = around
+        .par_iter()
+        .map(|sweep| Moment::new(&thinned, sweep, options))
+        .collect();
     let rest = (watch.seconds() - began) * REST;
 
-    let mut order: Vec<u32> = (0..scene.members.len() as u32).collect();
-    order.sort_by_key(|&cluster| std::cmp::Reverse(scene.members[cluster as usize].len()));
+    let mut order: Vec<u32> = (0..scene.source.members.len() as u32).collect();
+    order.sort_by_key(|&cluster| std::cmp::Reverse(scene.source.members[cluster as usize].len()));
     let mut needed: Vec<Option<Found>> = vec![None; order.len()];
     let (mut clusters, mut sum_m) = (0, 0.0);
     let mut interrupted = None;
@@ -114,7 +123,7 @@ pub(crate) fn label(
         }
         let found: Vec<(Option<Found>, f32)> = some
             .par_iter()
-            .map(|&cluster| needed_motion(&scene, &ballot, cluster))
+            .map(|&cluster| needed_motion(&scene, &around, &ballot, cluster))
             .collect();
         for (&cluster, (found, cost_m)) in some.iter().zip(found) {
             needed[cluster as usize] = found;
@@ -128,7 +137,7 @@ pub(crate) fn label(
         });
     }
     Labelled {
-        motions: motions(&scene, &needed),
+        motions: motions(&scene, &around, &needed),
         clusters,
         all_clusters: order.len(),
         cost_m: sum_m / clusters.max(1) as f64,
@@ -137,16 +146,21 @@ pub(crate) fn label(
 }
 
 /// The motion of a cluster, where it needs one, and what the cluster costs in the end, metres.
-fn needed_motion(scene: &Scene<'_>, ballot: &Ballot, cluster: u32) -> (Option<Found>, f32) {
-    let members = &scene.members[cluster as usize];
+fn needed_motion(
+    scene: &Scene<'_>,
+    around: &[Moment<'_>],
+    ballot: &Ballot,
+    cluster: u32,
+) -> (Option<Found>, f32) {
+    let members = &scene.source.members[cluster as usize];
     if members.len() < scene.options.cluster_points {
         return (None, 0.0);
     }
-    let mover = Mover::new(scene, cluster);
+    let mover = Mover::new(scene, around, cluster);
     let still = mover.standing_still();
     let points: Vec<Point> = members
         .iter()
-        .map(|&row| scene.source[row as usize])
+        .map(|&row| scene.source.points[row as usize])
         .collect();
     let found = mover.search(ballot, still);
     match found.filter(|found| gate::is_needed(found, &points, scene.options)) {
@@ -156,7 +170,7 @@ fn needed_motion(scene: &Scene<'_>, ballot: &Ballot, cluster: u32) -> (Option<Fo
 }
 
 /// The motions, and which of the source's points have them.
-fn motions(scene: &Scene<'_>, needed: &[Option<Found>]) -> Motions {
+fn motions(scene: &Scene<'_>, around: &[Moment<'_>], needed: &[Option<Found>]) -> Motions {
     let mut numbers = vec![NOISE; needed.len()];
     let mut motions = Vec::new();
     for (number, found) in numbers.iter_mut().zip(needed) {
@@ -168,9 +182,9 @@ fn motions(scene: &Scene<'_>, needed: &[Option<Found>]) -> Motions {
     if motions.is_empty() {
         return Motions::none();
     }
-    let owners: Vec<u32> = spread::movers_of(scene, needed)
+    let owners: Vec<u32> = spread::movers_of(scene, around, needed)
         .into_iter()
         .map(|owner| numbers.get(owner as usize).copied().unwrap_or(NOISE))
         .collect();
-    Motions::new(motions, &scene.source, &owners)
+    Motions::new(motions, &scene.source.points, &owners)
 }
