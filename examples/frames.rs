@@ -2,8 +2,12 @@
 //! the sequence around them.
 //!
 //! ```text
-//! FNSF_REAL_DATA=... cargo run --release --example frames -- [--seeds FROM..TO]
+//! FNSF_REAL_DATA=... cargo run --release --example frames -- [--streets FROM..TO]
 //! ```
+//!
+//! Points off the ground by the sweeps' own masks, the ego motion estimated. `kitti_0000` below
+//! `FNSF_REAL_DATA`, where it is set, whose later sweeps have their ground found; then the mean of
+//! streets of 64 and of 32 beams, of five sweeps: the first pair, and the one in the middle.
 #![expect(
     clippy::print_stdout,
     reason = "the table is the answer of this program"
@@ -17,6 +21,26 @@ use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::flow::{self, Around, Ground, LabelOptions, Point, Preset, Problem, Sweep, Watch};
 use fnsf::formats::{read_cloud, read_pair};
 
+/// Streets by their number of beams and by the first sweep of the pair, and which.
+const BEAMS: [usize; 2] = [64, 32];
+const PAIRS: [usize; 2] = [0, 2];
+const STREETS: [u64; 2] = [0, 6];
+
+/// A change of the options that see five sweeps.
+type Change = fn(&mut LabelOptions);
+
+const VARIANTS: [(&str, Change); 5] = [
+    ("two sweeps", |o| o.frames = 2),
+    ("three sweeps", |o| o.frames = 3),
+    ("five sweeps", |_| {}),
+    ("what slides is never confirmed", |o| o.confirmed_cost = 0.0),
+    ("confirmed by less", |o| {
+        o.confirmed_cost = 0.7;
+        o.confirmed_m = 0.05;
+    }),
+];
+
+/// A clock for the numerics.
 struct Clock(Instant);
 
 impl Watch for Clock {
@@ -133,9 +157,6 @@ fn run(backend: &CpuBackend, known: &Known, label: &LabelOptions) -> Result<Row,
         ..Truth::new(&known.flow, &known.valid)
     };
     let metrics = evaluate(&found.flow, &found.valid, &truth).map_err(|e| e.to_string())?;
-    if std::env::var_os("DIAG").is_some() {
-        diag(known, &found);
-    }
     Ok([
         metrics.epe,
         metrics.epe_dynamic.unwrap_or(f64::NAN),
@@ -144,67 +165,51 @@ fn run(backend: &CpuBackend, known: &Known, label: &LabelOptions) -> Result<Row,
     ])
 }
 
-fn diag(known: &Known, found: &flow::Estimate) {
-    let g = known.pair[0].ground.as_ref().unwrap();
-    let len = |v: Point| v.iter().map(|x| x * x).sum::<f32>().sqrt();
-    let dyn_found = found.dynamic.as_ref().unwrap();
-    let mut s = [(0.0f32, 0usize); 5];
-    let mut n = 0;
-    let mut cells: std::collections::BTreeMap<[i32; 2], (usize, Point)> = Default::default();
-    for i in 0..known.flow.len() {
-        if g[i] || !known.valid[i] { continue; }
-        let e = len(core::array::from_fn(|a| found.flow[i][a] - known.flow[i][a]));
-        let c = match (known.dynamic[i], dyn_found[i]) {
-            (true, false) => 0,
-            (true, true) if e > 0.15 => 1,
-            (true, true) => 2,
-            (false, true) => 3,
-            (false, false) => 4,
-        };
-        if c == 0 && std::env::var_os("CELLS").is_some() { let p = known.pair[0].points[i]; let k = [0,1].map(|a| (p[a] / 3.0).floor() as i32); cells.entry(k).or_insert((0, known.flow[i])).0 += 1; }
-        n += usize::from(known.dynamic[i]);
-        s[c].0 += e; s[c].1 += 1;
-    }
-    for (k, (n, f)) in cells { if n > 40 { println!("   missed cell {} {}: {n} {f:?}", k[0] * 3, k[1] * 3); } }
-    let n = n as f32;
-    println!("   missed {:.4} ({}) wrong {:.4} ({}) imprecise {:.4} ({}) | false {:.1} m ({}) static {:.1} m ({}) of {n}", s[0].0/n, s[0].1, s[1].0/n, s[1].1, s[2].0/n, s[2].1, s[3].0, s[3].1, s[4].0, s[4].1);
-}
-
 fn mean(rows: &[Row]) -> Row {
     let count = rows.len() as f64;
     core::array::from_fn(|column| rows.iter().map(|row| row[column]).sum::<f64>() / count)
 }
 
+/// The streets that are asked for, first and one after the last.
+fn seeds() -> Result<[u64; 2], String> {
+    let mut arguments = std::env::args().skip(1);
+    match (arguments.next().as_deref(), arguments.next()) {
+        (None, _) => Ok(STREETS),
+        (Some("--streets"), Some(range)) => {
+            let (from, to) = range.split_once("..").ok_or("streets are FROM..TO")?;
+            let number = |text: &str| text.parse().map_err(|e| format!("{text}: {e}"));
+            Ok([number(from)?, number(to)?])
+        }
+        _ => Err("there is only --streets FROM..TO".to_owned()),
+    }
+}
+
 fn main() -> Result<(), String> {
-    let args: Vec<String> = std::env::args().skip(1).collect();
-    let (from, to) = (args[0].parse::<u64>().unwrap(), args[1].parse::<u64>().unwrap());
+    let [from, to] = seeds()?;
     let mut groups = vec![kitti()?];
-    for beams in [64, 32] {
-        for first in [0, 2] {
+    for beams in BEAMS {
+        for first in PAIRS {
             let streets = (from..to).map(|seed| street(beams, seed, first));
             groups.push(streets.collect::<Result<_, _>>()?);
         }
     }
+    groups.retain(|group| !group.is_empty());
     let backend = CpuBackend::new(None).map_err(|e| e.to_string())?;
-    for spec in &args[2..] {
-        let f: Vec<f32> = spec.split(':').map(|x| x.parse().unwrap()).collect();
-        let mut label = LabelOptions::default();
-        label.frames = f[0] as usize;
-        label.x = f[1] as u32;
-        if f.len() > 2 { label.around_power = f[2]; }
-        if f.len() > 3 { label.around_weight = f[3]; }
-        if f.len() > 4 { label.confirmed_cost = f[4]; }
-        if f.len() > 5 { label.confirmed_m = f[5]; }
-        let mut line = format!("{spec:>12} |");
+    println!("| variant | pairs | EPE | EPE moving | EPE static | s |");
+    println!("|---|---|---|---|---|---|");
+    for (variant, change) in VARIANTS {
+        let mut label = LabelOptions {
+            frames: 5,
+            ..LabelOptions::default()
+        };
+        change(&mut label);
         for group in &groups {
-            let rows: Vec<Row> = group.iter().map(|k| run(&backend, k, &label)).collect::<Result<_, _>>()?;
-            if std::env::var_os("EACH").is_some() {
-                for r in &rows { println!("      {} {:.3} {:.4}", group[0].name, r[1], r[2]); }
-            }
-            let [_, moving, still, seconds] = mean(&rows);
-            line += &format!(" {moving:.4} {still:.4} {seconds:.1} |");
+            let rows = group.iter().map(|known| run(&backend, known, &label));
+            let rows: Vec<Row> = rows.collect::<Result<_, _>>()?;
+            let [epe, moving, still, seconds] = mean(&rows);
+            let name = &group[0].name;
+            println!("| {variant} | {name} | {epe:.4} | {moving:.4} | {still:.4} | {seconds:.2} |");
         }
-        println!("{line}");
     }
     Ok(())
 }

@@ -10,7 +10,8 @@ use crate::flow::backend::{Advance, Backend, BackendError, Report, Trainer, Tran
 use crate::flow::cpu::CpuBackend;
 use crate::flow::distance::DistanceOptions;
 use crate::flow::{
-    AlignedSweep, LabelOptions, Labelled, Network, Options, Point, RigidTransform, TrainerState, Watch,
+    AlignedSweep, LabelOptions, Labelled, Network, Options, Point, RigidTransform, TrainerState,
+    Watch,
 };
 use crate::job::DeviceKind;
 

@@ -197,11 +197,15 @@ pub struct WarmStart {
 }
 
 impl Options {
-    /// Movers object by object. Ground would tie objects together: it is found and left out.
+    /// Movers object by object, in five sweeps of a sequence. Ground would tie objects together: it is
+    /// found and left out.
     fn labelled(max_points: Option<usize>) -> Self {
         Self {
             ground: Ground::Auto,
-            label: Some(LabelOptions::default()),
+            label: Some(LabelOptions {
+                frames: 5,
+                ..LabelOptions::default()
+            }),
             warm_start: None,
             ..Self::stochastic(max_points)
         }
@@ -287,16 +291,11 @@ pub struct LabelOptions {
     pub flat_m: f32,
     /// Sweeps that are looked at in all: the pair's two, and others of its sequence where there are.
     pub frames: usize,
-    /// X
-    pub around_weight: f32,
-    /// X
-    pub around_power: f32,
-    /// X
+    /// The sweeps around say plainly that a cluster moves where its motion leaves this share of its
+    /// cost in them,
     pub confirmed_cost: f32,
-    /// X
+    /// and lays it this much nearer to them, metres there and back.
     pub confirmed_m: f32,
-    /// X
-    pub x: u32,
 }
 
 impl Default for LabelOptions {
@@ -328,11 +327,8 @@ impl Default for LabelOptions {
             flat_points: 30,
             flat_m: 0.2,
             frames: 2,
-            around_weight: 1.0,
-            around_power: 2.0,
             confirmed_cost: 0.5,
             confirmed_m: 0.1,
-            x: 0,
         }
     }
 }

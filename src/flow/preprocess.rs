@@ -109,7 +109,12 @@ pub(crate) fn off_ground(sweep: &Around, options: &Options) -> Result<Vec<Point>
         _ => None,
     };
     let known = sweep.ground.filter(|_| options.ground != Ground::Keep);
-    let mut rows = kept("sweep around", sweep.points, found.as_deref().or(known), options)?;
+    let mut rows = kept(
+        "sweep around",
+        sweep.points,
+        found.as_deref().or(known),
+        options,
+    )?;
     if let Some(max_points) = options.max_points {
         Random::stream(options.seed, 1).shuffle(&mut rows);
         rows.truncate(max_points);

@@ -4,49 +4,33 @@
 //! A sparse static surface can always be laid a little better on the other sweep's samples, and what
 //! only one sweep saw lies best on something else. It must not know how motions are found.
 
-use super::rigid::Found;
+use super::rigid::{Evidence, Found};
 use crate::flow::Point;
 use crate::flow::options::LabelOptions;
 
 /// Whether `found`, the best motion of a cluster with these `points`, is needed.
 pub(super) fn is_needed(found: &Found, points: &[Point], options: &LabelOptions) -> bool {
-    let [mut still, mut moved] = [found.still, found.cost].map(|cost| cost.sum_m());
-    let around = found.around;
-    let mut weight = 1.0;
-    if options.x & 16 != 0 {
-        // mean
-        still = (still + around.still_m) / (1.0 + around.weight);
-        moved = (moved + around.moved_m) / (1.0 + around.weight);
-        if options.x & 32 != 0 {
-            weight = 1.0 + around.weight;
-        }
-    }
-    let confirmed = around.weight > 0.0
-        && around.moved_m <= options.confirmed_cost * around.still_m
-        && around.still_m - around.moved_m >= options.confirmed_m * around.weight;
-    let asked = if options.x & 128 != 0 && confirmed { 0.5 } else { 1.0 };
-    if options.x & (1 << 20) != 0 && points.len() > 60 {
-        let mut c = [0.0; 3];
-        for p in points {
-            for a in 0..3 {
-                c[a] += p[a] / points.len() as f32;
-            }
-        }
-        eprintln!("n {} c {:.1} {:.1} {:.1} shift {:.2} {:.2} hold {:.2} still {:.3} {:.3} moved {:.3} {:.3} around w {:.2} still {:.3} moved {:.3}", points.len(), c[0], c[1], c[2], found.motion.shift_m[0], found.motion.shift_m[1], found.hold, found.still.there_m, found.still.back_m, found.cost.there_m, found.cost.back_m, around.weight, around.still_m/around.weight.max(1e-9), around.moved_m/around.weight.max(1e-9));
-    }
-    let gain = (still - moved) * weight;
-    let refuted = around.weight > 0.0 && around.moved_m > around.still_m;
-    let loose = options.x & 4096 != 0 && confirmed;
-    (options.x & 8192 == 0 || !refuted)
-        && found.motion.length_m() >= options.least_motion_m
-        && (found.still.there_m - found.cost.there_m >= options.gain_m
-            || options.x & 512 != 0 && confirmed)
-        && (moved <= options.kept_cost * still || loose)
+    let around = &found.around;
+    let sweeps = 1.0 + around.weight;
+    let still = (found.still.sum_m() + around.still_m) / sweeps;
+    let moved = (found.cost.sum_m() + around.moved_m) / sweeps;
+    let gain = (still - moved) * sweeps;
+    found.motion.length_m() >= options.least_motion_m
+        && found.still.there_m - found.cost.there_m >= options.gain_m
+        && moved <= options.kept_cost * still
         && gain * points.len() as f32
-            >= (options.evidence_m + options.evidence_slope * found.motion.length_m()) * asked
-        && (found.cost.there_m <= options.left_m || loose)
-        && (found.hold >= options.least_hold || options.x & 64 != 0 && confirmed)
+            >= options.evidence_m + options.evidence_slope * found.motion.length_m()
+        && found.cost.there_m <= options.left_m
+        && (found.hold >= options.least_hold || is_confirmed(around, options))
         && !is_flat(points, options)
+}
+
+/// Whether the sweeps around say plainly that a cluster moves, even one that its surfaces do not hold:
+/// a wall that seems to slide lies where it was in all of them, a bus has driven on.
+fn is_confirmed(around: &Evidence, options: &LabelOptions) -> bool {
+    around.moved_m <= options.confirmed_cost * around.still_m
+        && around.still_m - around.moved_m >= options.confirmed_m * around.weight
+        && around.weight > 0.0
 }
 
 /// Whether the points, many of them, lie at one height: a ring on ground that was not found.
@@ -64,7 +48,7 @@ fn is_flat(points: &[Point], options: &LabelOptions) -> bool {
 mod tests {
     use super::*;
     use crate::flow::label::motion::Motion;
-    use crate::flow::label::rigid::{Cost, Evidence};
+    use crate::flow::label::rigid::Cost;
 
     /// A motion that is needed whatever is asked.
     fn plain() -> Found {
@@ -108,6 +92,26 @@ mod tests {
     #[test]
     fn a_wall_that_slides_in_its_plane_does_not_move() {
         assert!(!needed(|found| found.hold = 0.02));
+    }
+
+    #[test]
+    fn a_bus_that_all_sweeps_see_driving_moves_though_nothing_holds_it() {
+        let around = |still_m, moved_m| Evidence {
+            weight: 1.5,
+            still_m: still_m * 1.5,
+            moved_m: moved_m * 1.5,
+        };
+        let slides = |around| {
+            needed(|found| {
+                found.hold = 0.02;
+                found.around = around;
+            })
+        };
+        assert!(slides(around(0.4, 0.05)));
+        assert!(!slides(around(0.1, 0.05)));
+        assert!(!slides(around(0.4, 0.25)));
+        // And what held was none where the others say that it stands.
+        assert!(!needed(|found| found.around = around(0.05, 0.5)));
     }
 
     #[test]

@@ -21,6 +21,7 @@ mod scene;
 mod stored;
 
 // How a motion is found, kept and shared.
+mod fit;
 mod gate;
 mod rigid;
 mod spread;
@@ -38,8 +39,8 @@ use super::options::LabelOptions;
 use super::points::Point;
 use super::watch::{Interrupt, Progress, Watch};
 use cluster::NOISE;
-use rigid::{Found, Mover};
 use moment::Moment;
+use rigid::{Found, Mover};
 use scene::{Scene, Thinned};
 use vote::Ballot;
 

@@ -23,11 +23,12 @@ impl<'a> Moment<'a> {
         sweep: &AlignedSweep,
         options: &'a LabelOptions,
     ) -> Self {
+        // A sweep is trusted the less the longer ago a velocity must have been what it is.
         let away = f32::from(sweep.at).abs().max(1.0);
         Self {
             scene: Scene::new(source, &sweep.points, options),
             at: sweep.at,
-            weight: options.around_weight / away.powf(options.around_power),
+            weight: 1.0 / (away * away),
         }
     }
 

@@ -41,7 +41,10 @@ impl Motion {
             let [x, y] = shift_m;
             shift_m = if times > 0 {
                 let (sin, cos) = self.turn.sin_cos();
-                [cos * x - sin * y + self.shift_m[0], sin * x + cos * y + self.shift_m[1]]
+                [
+                    cos * x - sin * y + self.shift_m[0],
+                    sin * x + cos * y + self.shift_m[1],
+                ]
             } else {
                 let (sin, cos) = self.turn.sin_cos();
                 let [x, y] = [x - self.shift_m[0], y - self.shift_m[1]];

@@ -6,8 +6,6 @@
 //! last steps try shifts, since the cost has edges that no derivative sees. It must not know whether
 //! the motion is needed.
 
-use nalgebra::{Matrix3, Vector3};
-
 use super::moment::Moment;
 use super::motion::Motion;
 use super::scene::{Scene, evenly};
@@ -20,23 +18,13 @@ const FITTED: usize = 100;
 const JUDGED: usize = 200;
 /// Steps of the fit from each start, and of the last one.
 const STEPS: [usize; 2] = [10, 20];
-/// Steps after which the target points around a cluster are looked for again.
-const STEPS_BETWEEN_LOOKS: usize = 4;
-/// Scale of the weight (Geman and McClure) in the first half of the steps and after, metres.
-const SCALES_M: [f32; 2] = [0.2, 0.1];
 /// Shifts that are tried in the end, metres, each up to [`TRIES`] times.
 const SHIFTS_M: [f32; 3] = [0.1, 0.05, 0.025];
 const TRIES: usize = 4;
-/// Pulls toward no shift, and toward no turn, in parts of the weight.
-const DAMPING: [f64; 2] = [1e-3, 0.05];
 /// Points from which a cluster is turned, too.
 const TURNED: usize = 40;
-/// Less weight than this in all moves nothing.
-const LEAST_WEIGHT: f64 = 1e-6;
 /// What a point without a normal holds along every direction: as much as normals all around do.
 const HOLD_OF_A_POINT: f32 = 1.0 / 3.0;
-/// A step shorter than this is the last, metres.
-const SHORT_STEP_M: f64 = 1e-3;
 
 /// What a motion costs, metres: the moved cluster to the target, and back.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -77,9 +65,9 @@ pub(super) struct Evidence {
 
 /// One cluster, to be moved.
 pub(super) struct Mover<'a> {
-    scene: &'a Scene<'a>,
+    pub(super) scene: &'a Scene<'a>,
     around: &'a [Moment<'a>],
-    cluster: u32,
+    pub(super) cluster: u32,
     rows: Vec<u32>,
 }
 
@@ -106,19 +94,15 @@ impl<'a> Mover<'a> {
         let count = members.len() as f32;
         let mut center = [0.0; 2];
         for &row in members {
-            for (center, c) in center.iter_mut().zip(self.scene.source.points[row as usize]) {
+            for (center, c) in center
+                .iter_mut()
+                .zip(self.scene.source.points[row as usize])
+            {
                 *center += c / count;
             }
         }
         let standing = Motion::still(center);
-        let x = options.x;
-        let stands = still.there_m < options.needed_m
-            && (x & 256 == 0
-                || self.around.iter().all(|m| {
-                    self.cost_in(&m.scene, &standing).there_m
-                        < options.needed_m * f32::from(m.at).abs()
-                }));
-        if stands {
+        if still.there_m < options.needed_m {
             return None;
         }
         let points = |rows: &[u32]| -> Vec<Point> {
@@ -130,19 +114,25 @@ impl<'a> Mover<'a> {
         let few = evenly(members, FITTED);
         let mut best: Option<(Motion, Cost, f32)> = None;
         for shift in shifts.into_iter().chain([[0.0; 2]]) {
-            let motion = self.fitted(&few, &standing.shifted(shift), false, STEPS[0], x & 1 != 0);
+            let motion = self.fitted(&[], &few, &standing.shifted(shift), false, STEPS[0]);
             let cost = self.cost(&motion);
-            let around_m = if x & 2 != 0 { self.around_m(&motion) } else { 0.0 };
-            let value = self.value(&motion, cost) + around_m;
+            let way_m = options.way_penalty * motion.length_m();
+            let value = cost.sum_m() + way_m + self.around_m(&motion);
             if best.is_none_or(|(_, _, least)| value < least) {
                 best = Some((motion, cost, value));
             }
         }
         let (start, cost, _) = best?;
-        if x & 512 == 0 && still.there_m - cost.there_m < options.gain_m {
+        if still.there_m - cost.there_m < options.gain_m {
             return None;
         }
-        let motion = self.fitted(&self.rows, &start, members.len() >= TURNED, STEPS[1], x & 4 != 0);
+        let motion = self.fitted(
+            self.around,
+            &self.rows,
+            &start,
+            members.len() >= TURNED,
+            STEPS[1],
+        );
         let (motion, cost) = self.tried(motion);
         Some(Found {
             motion,
@@ -155,11 +145,9 @@ impl<'a> Mover<'a> {
 
     /// The motion of least cost among those a few shifts away, and its cost.
     fn tried(&self, start: Motion) -> (Motion, Cost) {
-        let joint = self.scene.options.x & 8 != 0;
-        let around_m = |motion: &Motion| if joint { self.around_m(motion) } else { 0.0 };
         let cost = self.cost(&start);
         let mut best = (start, cost);
-        let mut least = cost.sum_m() + around_m(&start);
+        let mut least = cost.sum_m() + self.around_m(&start);
         for shift_m in SHIFTS_M {
             for _ in 0..TRIES {
                 let center = best.0;
@@ -171,7 +159,7 @@ impl<'a> Mover<'a> {
                 ];
                 for motion in around.map(|shift| center.shifted(shift)) {
                     let cost = self.cost(&motion);
-                    let sum_m = cost.sum_m() + around_m(&motion);
+                    let sum_m = cost.sum_m() + self.around_m(&motion);
                     if sum_m < least {
                         least = sum_m;
                         best = (motion, cost);
@@ -185,17 +173,12 @@ impl<'a> Mover<'a> {
         best
     }
 
-    /// The cost, and a little for the way.
-    fn value(&self, motion: &Motion, cost: Cost) -> f32 {
-        cost.sum_m() + self.scene.options.way_penalty * motion.length_m()
-    }
-
     /// What a motion costs.
     pub(super) fn cost(&self, motion: &Motion) -> Cost {
         self.cost_in(self.scene, motion)
     }
 
-    /// What the sweeps around say of a motion, and of standing still.
+    /// What those sweeps around that see the cluster, moved or not, say of a motion.
     fn evidence(&self, motion: &Motion) -> Evidence {
         let mut all = Evidence::default();
         let still = Motion::still(motion.center);
@@ -203,9 +186,6 @@ impl<'a> Mover<'a> {
             let [moved, still] =
                 [moment.by_then(motion), still].map(|m| self.cost_in(&moment.scene, &m));
             let least = moved.there_m.min(still.there_m);
-            if self.scene.options.x & (1 << 21) != 0 {
-                eprintln!("  at {} still {:.3} {:.3} moved {:.3} {:.3}", moment.at, still.there_m, still.back_m, moved.there_m, moved.back_m);
-            }
             if least <= self.scene.options.left_m {
                 all.weight += moment.weight;
                 all.moved_m += moment.weight * moved.sum_m();
@@ -215,7 +195,7 @@ impl<'a> Mover<'a> {
         all
     }
 
-    /// The weighted cost of a motion in the sweeps around.
+    /// What a motion costs in the sweeps around: the weighted sum.
     pub(super) fn around_m(&self, motion: &Motion) -> f32 {
         let costs = self.around.iter().map(|moment| {
             moment.weight * self.cost_in(&moment.scene, &moment.by_then(motion)).sum_m()
@@ -223,6 +203,7 @@ impl<'a> Mover<'a> {
         costs.sum()
     }
 
+    /// What a motion that leads into the sweep of `scene` costs there.
     fn cost_in(&self, scene: &Scene<'_>, motion: &Motion) -> Cost {
         let options = scene.options;
         let mean = |sum: f32, count: usize| sum / count.max(1) as f32;
@@ -283,142 +264,5 @@ impl<'a> Mover<'a> {
         target.map_or(scene.options.truncation_m, |target| {
             scene.distance(moved, target)
         })
-    }
-
-    /// Gauss-Newton from `start`.
-    fn fitted(&self, rows: &[u32], start: &Motion, turned: bool, steps: usize, joint: bool) -> Motion {
-        let mut motion = *start;
-        let mut views = vec![(self.scene, 1, 1.0)];
-        if joint {
-            let around = self.around.iter();
-            views.extend(around.map(|moment| (&moment.scene, moment.at, moment.weight)));
-        }
-        let mut touched = vec![Vec::new(); views.len()];
-        for step in 0..steps {
-            let mut sums = Sums::new(SCALES_M[usize::from(step >= steps / 2)]);
-            for (&(scene, at, weight), touched) in views.iter().zip(&mut touched) {
-                let by_then = motion.repeated(at);
-                if step % STEPS_BETWEEN_LOOKS == 0 {
-                    let all =
-                        scene.touched(rows, self.cluster, &by_then, scene.options.thinned_m);
-                    *touched = evenly(&all, rows.len());
-                }
-                sums.look(&motion, &by_then, at, weight);
-                for &row in rows {
-                    let moved = by_then.apply(scene.source.points[row as usize]);
-                    if let Some(target) = scene.match_of(moved, self.cluster) {
-                        sums.add(scene, moved, target);
-                    }
-                }
-                for &target in touched.iter() {
-                    let place = by_then.undo(scene.target[target as usize]);
-                    if let Some(origin) = scene.origin_of(place, self.cluster) {
-                        let moved = by_then.apply(scene.source.points[origin as usize]);
-                        sums.add(scene, moved, target);
-                    }
-                }
-            }
-            let Some([x, y, turn]) = sums.step(turned) else {
-                break;
-            };
-            motion = motion.shifted([x as f32, y as f32]);
-            motion.turn += turn as f32;
-            if step > steps / 2 && x.hypot(y) < SHORT_STEP_M {
-                break;
-            }
-        }
-        motion
-    }
-}
-
-/// The normal equations of a shift and a turn.
-struct Sums {
-    pivot: [f32; 2],
-    /// Gaps that the motion is repeated over, what a turn adds to the shift by then, and what the
-    /// sweep counts.
-    gaps: f32,
-    swing: [f32; 2],
-    share: f32,
-    square_scale: f32,
-    normal: Matrix3<f64>,
-    gradient: Vector3<f64>,
-    weight: f64,
-}
-
-impl Sums {
-    fn new(scale_m: f32) -> Self {
-        Self {
-            pivot: [0.0; 2],
-            gaps: 1.0,
-            swing: [0.0; 2],
-            share: 1.0,
-            square_scale: scale_m * scale_m,
-            normal: Matrix3::zeros(),
-            gradient: Vector3::zeros(),
-            weight: 0.0,
-        }
-    }
-
-    /// What is added from now on is of a sweep `at` gaps after the source, by when `motion` has
-    /// become `by_then`.
-    fn look(&mut self, motion: &Motion, by_then: &Motion, at: i8, share: f32) {
-        self.pivot = [0, 1].map(|a| by_then.center[a] + by_then.shift_m[a]);
-        self.gaps = f32::from(at);
-        let swing = self.gaps * (self.gaps - 1.0) / 2.0;
-        self.swing = [-swing * motion.shift_m[1], swing * motion.shift_m[0]];
-        self.share = share;
-    }
-
-    fn add(&mut self, scene: &Scene<'_>, moved: Point, target: u32) {
-        let distance = scene.distance(moved, target);
-        let weight = self.square_scale / (self.square_scale + distance * distance);
-        let weight = f64::from(weight * weight * self.share);
-        let to = scene.target[target as usize];
-        let away: Point = core::array::from_fn(|a| to[a] - moved[a]);
-        let k = self.gaps;
-        let [rx, ry] = [0, 1].map(|a| k * (moved[a] - self.pivot[a]));
-        // What a turn moves: the lever's end, and the pivot itself.
-        let [tx, ty] = [self.swing[0] - ry, self.swing[1] + rx];
-        let normal = scene.normal(target);
-        let leak = if normal == [0.0; 3] {
-            1.0
-        } else {
-            scene.options.leak
-        };
-        let along = normal[0] * away[0] + normal[1] * away[1] + normal[2] * away[2];
-        let rows = [
-            (
-                [k * normal[0], k * normal[1], normal[0] * tx + normal[1] * ty],
-                along,
-            ),
-            ([leak * k, 0.0, leak * tx], leak * away[0]),
-            ([0.0, leak * k, leak * ty], leak * away[1]),
-        ];
-        for (jacobian, residual) in rows {
-            let jacobian = Vector3::from(jacobian.map(f64::from));
-            self.normal += jacobian * jacobian.transpose() * weight;
-            self.gradient += jacobian * (weight * f64::from(residual));
-        }
-        self.weight += weight;
-    }
-
-    /// The shift and the turn that follow; none where nothing was matched.
-    fn step(mut self, turned: bool) -> Option<[f64; 3]> {
-        if self.weight < LEAST_WEIGHT {
-            return None;
-        }
-        let [shift, turn] = DAMPING;
-        for (axis, damping) in [shift, shift, turn].into_iter().enumerate() {
-            self.normal[(axis, axis)] += damping * self.weight;
-        }
-        if !turned {
-            for axis in 0..2 {
-                self.normal[(axis, 2)] = 0.0;
-                self.normal[(2, axis)] = 0.0;
-            }
-            self.gradient[2] = 0.0;
-        }
-        let step = self.normal.cholesky()?.solve(&self.gradient);
-        Some(step.into())
     }
 }

@@ -21,7 +21,11 @@ const BETTER_M: f32 = 0.05;
 const VOTE_M: f32 = 0.3;
 
 /// Of each thinned source point the cluster whose motion it has; [`NOISE`] where it stands still.
-pub(super) fn movers_of(scene: &Scene<'_>, around: &[Moment<'_>], needed: &[Option<Found>]) -> Vec<u32> {
+pub(super) fn movers_of(
+    scene: &Scene<'_>,
+    around: &[Moment<'_>],
+    needed: &[Option<Found>],
+) -> Vec<u32> {
     let clusters: Vec<u32> = (0..needed.len() as u32)
         .into_par_iter()
         .map(|cluster| leader(scene, around, needed, cluster))
@@ -62,16 +66,15 @@ fn leader(scene: &Scene<'_>, around: &[Moment<'_>], needed: &[Option<Found>], cl
         return if own.is_some() { cluster } else { NOISE };
     }
     let mover = Mover::new(scene, around, cluster);
-    let joint = scene.options.x & 2048 != 0;
-    let around_m = |motion: &Motion| if joint { mover.around_m(motion) } else { 0.0 };
-    let still = mover.standing_still().sum_m() + around_m(&Motion::still([0.0; 2]));
+    let cost = |motion: &Motion| mover.cost(motion).sum_m() + mover.around_m(motion);
+    let still = cost(&Motion::still([0.0; 2]));
     let mut best = match own {
-        Some(found) => (found.cost.sum_m() + around_m(&found.motion) + BETTER_M, cluster),
+        Some(found) => (cost(&found.motion) + BETTER_M, cluster),
         None => (still * scene.options.beside_cost, NOISE),
     };
     for label in beside {
         if let Some(found) = &needed[label as usize] {
-            let cost = mover.cost(&found.motion).sum_m() + around_m(&found.motion);
+            let cost = cost(&found.motion);
             if cost < best.0 {
                 best = (cost, label);
             }
