@@ -96,7 +96,7 @@ mod tests {
 
     #[test]
     fn a_bus_that_all_sweeps_see_driving_moves_though_nothing_holds_it() {
-        let around = |still_m, moved_m| Evidence {
+        let around = |still_m: f32, moved_m: f32| Evidence {
             weight: 1.5,
             still_m: still_m * 1.5,
             moved_m: moved_m * 1.5,
