@@ -125,8 +125,7 @@ impl Densify {
                 let larger = sweeps[source].points.len().max(sweeps[target].points.len());
                 let solver_options = surroundings.options(&options, larger, [source, target]);
                 let mut push = |place: usize| {
-                    let sweep = sweeps[place].clone();
-                    device.push(&mut sequence, sweep, &solver_options, &terminal)
+                    device.push(&mut sequence, &sweeps[place], &solver_options, &terminal)
                 };
                 if number == 0 {
                     push(source)?;

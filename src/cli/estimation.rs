@@ -146,7 +146,7 @@ impl Device<'_> {
     pub(super) fn push(
         &mut self,
         sequence: &mut Sequence,
-        sweep: Sweep,
+        sweep: &Sweep,
         options: &flow::Options,
         terminal: &Terminal,
     ) -> Result<Vec<Estimate>, Failure> {

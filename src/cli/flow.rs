@@ -23,8 +23,8 @@ use crate::text::grouped;
 ///
 /// Reads npz, npy, ply, pcd, KITTI bin, nuScenes pcd.bin and Argoverse 2 feather, recognized by
 /// content. The flow has one row per source point: where the point is in the target's frame, less
-/// where it was in the source's, in metres. Of a sequence every pair starts from the one before,
-/// and its flow is written as soon as it is there.
+/// where it was in the source's, in metres. Of a sequence every pair starts from the one before, or,
+/// with the preset label, sees five sweeps around it; its flow is written as soon as it is there.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
     fnsf flow a.feather b.feather -o flow.npz\n  \
@@ -192,7 +192,7 @@ impl Flow {
                     load,
                 });
             }
-            let mut estimates = device.push(&mut sequence, sweep, &solver_options, &terminal)?;
+            let mut estimates = device.push(&mut sequence, &sweep, &solver_options, &terminal)?;
             if place + 1 == count {
                 estimates.extend(device.finish(&mut sequence, &terminal)?);
             }
