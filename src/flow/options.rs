@@ -292,7 +292,7 @@ pub struct LabelOptions {
     /// Sweeps that are looked at in all: the pair's two, and others of its sequence where there are.
     pub frames: usize,
     /// The sweeps around say plainly that a cluster moves where its motion leaves this share of its
-    /// cost in them,
+    /// cost in them and in the nearest,
     pub confirmed_cost: f32,
     /// and lays it this much nearer to them, metres there and back.
     pub confirmed_m: f32,

@@ -26,11 +26,16 @@ pub(super) fn is_needed(found: &Found, points: &[Point], options: &LabelOptions)
 }
 
 /// Whether the sweeps around say plainly that a cluster moves, even one that its surfaces do not hold:
-/// a wall that seems to slide lies where it was in all of them, a bus has driven on.
+/// a wall that seems to slide lies where it was in all of them, a bus has driven on. The nearest must
+/// say so itself: far ones see a wall slide on onto what lies behind.
 fn is_confirmed(around: &Evidence, options: &LabelOptions) -> bool {
-    around.moved_m <= options.confirmed_cost * around.still_m
-        && around.still_m - around.moved_m >= options.confirmed_m * around.weight
-        && around.weight > 0.0
+    let is_plain = |[still_m, moved_m]: [f32; 2], weight: f32| {
+        moved_m <= options.confirmed_cost * still_m
+            && still_m - moved_m >= options.confirmed_m * weight
+    };
+    around.weight > 0.0
+        && is_plain(around.nearest_m, 1.0)
+        && is_plain([around.still_m, around.moved_m], around.weight)
 }
 
 /// Whether the points, many of them, lie at one height: a ring on ground that was not found.
@@ -100,6 +105,7 @@ mod tests {
             weight: 1.5,
             still_m: still_m * 1.5,
             moved_m: moved_m * 1.5,
+            nearest_m: [still_m, moved_m],
         };
         let slides = |around| {
             needed(|found| {
@@ -110,6 +116,11 @@ mod tests {
         assert!(slides(around(0.4, 0.05)));
         assert!(!slides(around(0.1, 0.05)));
         assert!(!slides(around(0.4, 0.25)));
+        let far = Evidence {
+            nearest_m: [0.05; 2],
+            ..around(0.4, 0.05)
+        };
+        assert!(!slides(far));
         // And what held was none where the others say that it stands.
         assert!(!needed(|found| found.around = around(0.05, 0.5)));
     }

@@ -61,6 +61,8 @@ pub(super) struct Evidence {
     /// Weighted costs, metres.
     pub(super) still_m: f32,
     pub(super) moved_m: f32,
+    /// Costs in the sweep nearest in time, standing still and moved, metres.
+    pub(super) nearest_m: [f32; 2],
 }
 
 /// One cluster, to be moved.
@@ -182,9 +184,12 @@ impl<'a> Mover<'a> {
     fn evidence(&self, motion: &Motion) -> Evidence {
         let mut all = Evidence::default();
         let still = Motion::still(motion.center);
-        for moment in self.around {
+        for (place, moment) in self.around.iter().enumerate() {
             let [moved, still] =
                 [moment.by_then(motion), still].map(|m| self.cost_in(&moment.scene, &m));
+            if place == 0 {
+                all.nearest_m = [still, moved].map(Cost::sum_m);
+            }
             let least = moved.there_m.min(still.there_m);
             if least <= self.scene.options.left_m {
                 all.weight += moment.weight;
