@@ -64,6 +64,7 @@ fn run(
         target: &pair.target,
         ground: Some([&ground.source, &ground.target]),
         before: None,
+        around: &[],
     };
     let clock = Clock(Instant::now(), deadline);
     let estimate = estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())?;

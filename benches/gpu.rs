@@ -92,6 +92,7 @@ fn solve(
         target: &pair.target,
         ground: None,
         before: None,
+        around: &[],
     };
     let clock = Clock(Instant::now());
     estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())

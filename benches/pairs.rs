@@ -39,6 +39,7 @@ fn main() -> Result<(), String> {
                     target: &scene.target,
                     ground: None,
                     before: None,
+                    around: &[],
                 };
                 let mut runs = Vec::new();
                 for seed in 0..SEEDS {

@@ -161,6 +161,7 @@ async fn run(path: &PathBuf) {
             target: &small[1],
             ground: None,
             before: None,
+            around: &[],
         };
         let flow = estimate(&backend, &problem, &options, &Unwatched).unwrap();
         library.push(began.elapsed().as_secs_f64());

@@ -175,6 +175,7 @@ fn run(backend: &CpuBackend, pair: &Pair, options: &Options) -> Result<Run, Stri
         target: &pair.target,
         ground: ground.map(|g| [g.source.as_slice(), g.target.as_slice()]),
         before: None,
+        around: &[],
     };
     let clock = Clock(Instant::now());
     let estimate = flow::estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())?;

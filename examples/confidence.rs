@@ -114,7 +114,7 @@ fn judged(backend: &dyn Backend, known: Known) -> Scene {
         .iter()
         .map(|&row| moved(&ego, known.source[row]))
         .collect();
-    let labelled = backend.movers(&aligned, &target, &LabelOptions::default(), &Unwatched);
+    let labelled = backend.movers(&aligned, &target, &[], &LabelOptions::default(), &Unwatched);
     let residual = labelled.motions.residual_at(&aligned);
     let error = |row: usize, at: Point| {
         let square = |a: usize| (known.source[row][a] + known.flow[row][a] - at[a]).powi(2);

@@ -51,15 +51,19 @@ fn fit(backend: &CpuBackend, sweeps: &[Sweep], plans: &[Plan]) -> anyhow::Result
     let mut fields = Fields::new();
     for chain in plans.iter().flat_map(Plan::chains) {
         let mut sequence = Sequence::default();
+        let (mut legs, mut found) = (Vec::new(), Vec::new());
         for (number, leg) in chain.into_iter().enumerate() {
             let mut push =
                 |place: usize| sequence.push(backend, sweeps[place].clone(), &options, &Unwatched);
             if number == 0 {
                 push(leg.source)?;
             }
-            let estimate = push(leg.target)?;
-            fields.extend(estimate.map(|estimate| (leg, estimate.field)));
+            found.extend(push(leg.target)?);
+            legs.push(leg);
         }
+        found.extend(sequence.finish(backend, &Unwatched)?);
+        let found = found.into_iter().map(|estimate| estimate.field);
+        fields.extend(legs.into_iter().zip(found));
     }
     Ok(fields)
 }

@@ -169,6 +169,7 @@ fn run(backend: &CpuBackend, pair: &Known, options: &Options) -> Result<Row, Str
         target: &pair.target,
         ground: Some([&pair.ground[0], &pair.ground[1]]),
         before: None,
+        around: &[],
     };
     let clock = Clock(Instant::now());
     let estimate = flow::estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())?;

@@ -112,6 +112,7 @@ fn alone(backend: &CpuBackend, drive: &Drive, options: &Options) -> anyhow::Resu
             target: &pair[1],
             ground: None,
             before: None,
+            around: &[],
         };
         let began = Instant::now();
         let estimate = estimate(backend, &problem, options, &Unwatched)?;
@@ -133,12 +134,12 @@ fn in_sequence(backend: &CpuBackend, drive: &Drive, options: &Options) -> anyhow
             ground: None,
         };
         let began = Instant::now();
-        let estimate = sequence.push(backend, sweep, options, &Unwatched)?;
+        let estimates = sequence.push(backend, sweep, options, &Unwatched)?;
         let seconds = began.elapsed().as_secs_f64();
-        if let Some(estimate) = estimate
+        if let [estimate] = estimates.as_slice()
             && k > 1
         {
-            sums.add(&estimate, drive.truth.get(k - 1), seconds);
+            sums.add(estimate, drive.truth.get(k - 1), seconds);
         }
     }
     Ok(sums)

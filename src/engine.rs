@@ -28,7 +28,7 @@ use self::hold::Hold;
 use self::lane::{Asked, Command};
 use crate::flow::backend::{Backend, BackendError};
 use crate::flow::densify::DensifyError;
-use crate::flow::{Estimate, Field, FlowError, Options, Point, Snapshot, Watch};
+use crate::flow::{Estimate, Field, FlowError, Options, Point, Snapshot, Sweep, Watch};
 use crate::job::DeviceKind;
 use crate::metrics::Metrics;
 
@@ -58,6 +58,8 @@ pub struct Work {
     pub ground: Option<[Vec<bool>; 2]>,
     /// The field of the pair before, where it is one of a chain.
     pub before: Option<Field>,
+    /// Other sweeps of its sequence, and when each was taken: in gaps of the pair after the source.
+    pub around: Vec<(Sweep, i8)>,
     /// How the flow is found.
     pub options: Options,
     /// Where an earlier attempt was put down.

@@ -131,6 +131,7 @@ impl Admission {
             target: &target.points,
             ground: ground.map(<[_; 2]>::from),
             before: None,
+            around: &[],
         };
         let points = source.points.len().max(target.points.len());
         let mut options = options.solver_options(points);
@@ -144,6 +145,15 @@ impl Admission {
                 ApiError::internal(error)
             }
         })?;
+        self.check_bytes(&price)?;
+        Ok(price)
+    }
+
+    /// Refuses what needs more memory than a pair may take.
+    ///
+    /// # Errors
+    /// [`ApiError::TooLarge`].
+    pub(super) fn check_bytes(&self, price: &Price) -> Result<(), ApiError> {
         let limit = self.limits.max_pair_bytes;
         if price.bytes > limit {
             return Err(ApiError::TooLarge(format!(
@@ -152,7 +162,7 @@ impl Admission {
                 limit >> 20
             )));
         }
-        Ok(price)
+        Ok(())
     }
 
     /// Keeps a place for a job, or says when to come back. Asked for no seconds it costs nothing

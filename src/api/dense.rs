@@ -2,16 +2,18 @@
 //!
 //! It must not know HTTP's or gRPC's types, nor how points are carried.
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use super::admission::Admission;
 use super::codec;
+use super::draft::seen;
 use super::error::ApiError;
 use super::service::Service;
 use crate::blobs::Blob;
 use crate::cost::CostModel;
-use crate::flow::DenseCloud;
 use crate::flow::densify::Plan;
+use crate::flow::{DenseCloud, window};
 use crate::formats::{DENSE_FORMATS, DenseFormat, write_dense};
 use crate::job::{DenseReport, Densify, InvalidOptions, Job, JobOptions, Kind, LaterChoice};
 use crate::payload::StoredDense;
@@ -38,7 +40,12 @@ pub(super) struct Closing {
 
 impl Closing {
     /// What a sequence whose sweeps have `points` points asks for.
-    pub(super) fn of(asked: &Densify, points: &[usize], goes_on: bool) -> Result<Self, ApiError> {
+    pub(super) fn of(
+        asked: &Densify,
+        points: &[usize],
+        goes_on: bool,
+        frames: usize,
+    ) -> Result<Self, ApiError> {
         let plan = asked.plan(points.len()).map_err(InvalidOptions::Densify)?;
         let back = plan
             .legs()
@@ -47,7 +54,7 @@ impl Closing {
         let back = back.enumerate().map(|(turn, leg)| PairOf {
             place: leg.target as u32,
             backward: true,
-            sees: [leg.target as u32, leg.source as u32 + 1],
+            sees: seen(window_back(leg.target, points.len(), frames)),
             follows: goes_on && turn > 0,
         });
         Ok(Self {
@@ -55,6 +62,13 @@ impl Closing {
             nominal_seconds: CostModel::asking(questions(asked, &plan, points)),
         })
     }
+}
+
+/// The sweeps that the pair from sweep `place + 1` back to `place` is found from: its window in the
+/// sequence that runs backward.
+fn window_back(place: usize, sweeps: usize, frames: usize) -> Range<usize> {
+    let Range { start, end } = window(sweeps - 2 - place, sweeps, frames);
+    sweeps - end..sweeps - start
 }
 
 /// How often fields are asked about a point until all are in the frame.

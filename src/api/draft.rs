@@ -2,6 +2,7 @@
 //!
 //! Nothing is promised before [`Draft::submit`]; a draft that is dropped leaves nothing behind.
 
+use std::ops::Range;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -16,6 +17,7 @@ use super::service::{Awaited, Service};
 use crate::blobs::{Blob, Sync};
 use crate::clock::Timestamp;
 use crate::cost::CostModel;
+use crate::flow::{self, Price, window};
 use crate::job::{Job, JobId, JobOptions, Kind};
 use crate::payload::StoredCloud;
 use crate::queue::{Idempotency, PairOf, Submission, Submitted};
@@ -35,6 +37,8 @@ pub(super) struct Request {
     pub time_left: Option<Duration>,
     /// Its place in a chain of pairs that come one by one, where it is of one.
     pub link: Option<Link>,
+    /// Which of the clouds that come a pair is of, where it is not the first two.
+    pub pair: PairOf,
 }
 
 /// A pair's place in a chain.
@@ -42,6 +46,11 @@ pub(super) struct Request {
 pub(super) struct Link {
     /// The pair before, where there is one.
     pub after: Option<JobId>,
+}
+
+/// A range of sweeps as the queue keeps it.
+pub(super) fn seen(sweeps: Range<usize>) -> [u32; 2] {
+    [sweeps.start, sweeps.end].map(|place| u32::try_from(place).unwrap_or(u32::MAX))
 }
 
 /// A job that was accepted.
@@ -68,7 +77,8 @@ pub(super) struct Draft {
     /// Points of each cloud.
     points: Vec<usize>,
     last: Option<Arc<StoredCloud>>,
-    nominal_seconds: f64,
+    /// What each two clouds that follow each other cost alone, where they are a pair.
+    prices: Vec<Option<Price>>,
     fingerprint: blake3::Hasher,
     submitted: bool,
 }
@@ -107,7 +117,7 @@ impl Draft {
             frames: 0,
             points: Vec::new(),
             last: None,
-            nominal_seconds: 0.0,
+            prices: Vec::new(),
             fingerprint,
             submitted: false,
         })
@@ -141,21 +151,22 @@ impl Draft {
         let options = self.request.options.clone();
         let after = self.request.link.and_then(|link| link.after);
         let goes_on = options.goes_on() && (self.frames > 1 || after.is_some());
+        let pair = self.request.pair;
+        let is_pair = pair == PairOf::ALONE || self.frames == pair.place + 1;
         let work = {
             let service = Arc::clone(&service);
-            move || -> Result<(f64, Vec<u8>), ApiError> {
-                let mut nominal = 0.0;
-                if let Some(before) = before {
-                    let price = service
-                        .admission
-                        .price(&before, &cloud, &options, goes_on)?;
-                    nominal = CostModel::nominal(&price);
-                }
-                Ok((nominal, cloud.to_bytes()))
+            move || -> Result<(Option<Price>, Vec<u8>), ApiError> {
+                let price = before.filter(|_| is_pair).map(|before| {
+                    let admission = &service.admission;
+                    admission.price(&before, &cloud, &options, goes_on)
+                });
+                Ok((price.transpose()?, cloud.to_bytes()))
             }
         };
-        let (nominal, bytes) = service.compute(work).await?;
-        self.nominal_seconds += nominal;
+        let (price, bytes) = service.compute(work).await?;
+        if self.frames > 0 {
+            self.prices.push(price);
+        }
         self.fingerprint.update(&bytes);
         let sync = match self.request.promise {
             Promise::Durable => Sync::Yes,
@@ -185,7 +196,8 @@ impl Draft {
             options.check_for_sequence(self.frames as usize)?;
         }
         match (kind, self.frames) {
-            (Kind::Pair, 2) | (Kind::Sequence, 2..) => {}
+            (Kind::Pair, clouds) if clouds == self.request.pair.sees[1] => {}
+            (Kind::Sequence, 2..) => {}
             (Kind::Pair, _) => {
                 return Err(ApiError::BadRequest("a pair is two clouds".to_owned()));
             }
@@ -243,14 +255,39 @@ impl Draft {
 
     /// The pairs of a sequence that go forward, in the order of their turns.
     fn pairs(&self) -> Vec<PairOf> {
-        let goes_on = self.request.options.goes_on();
+        let options = &self.request.options;
+        let (goes_on, frames) = (options.goes_on(), options.frames());
         let forward = (0..self.frames - 1).map(|place| PairOf {
             place,
             backward: false,
-            sees: [place, place + 2],
+            sees: seen(window(place as usize, self.frames as usize, frames)),
             follows: goes_on && place > 0,
         });
         forward.collect()
+    }
+
+    /// Nominal seconds of some pairs that go forward, with all that they see.
+    ///
+    /// # Errors
+    /// [`ApiError::TooLarge`] where one needs more memory than a pair may take.
+    fn nominal_seconds(&self, pairs: &[PairOf]) -> Result<f64, ApiError> {
+        let mut seconds = 0.0;
+        for pair in pairs {
+            let Some(Some(price)) = self.prices.get(pair.place as usize) else {
+                continue;
+            };
+            let around = (pair.sees[0]..pair.sees[1])
+                .filter(|&place| place != pair.place && place != pair.place + 1)
+                .map(|place| flow::price_around(self.points[place as usize]));
+            let price = around.fold(*price, |price, around| Price {
+                bytes: price.bytes + around.bytes,
+                multiply_adds: price.multiply_adds + around.multiply_adds,
+                ..price
+            });
+            self.service.admission.check_bytes(&price)?;
+            seconds += CostModel::nominal(&price);
+        }
+        Ok(seconds)
     }
 
     fn submission(&self, kind: Kind) -> Result<Submission, ApiError> {
@@ -258,11 +295,16 @@ impl Draft {
             Kind::Pair => Vec::new(),
             Kind::Sequence => self.pairs(),
         };
-        let cost_seconds = self.nominal_seconds / pairs.len().max(1) as f64;
+        let nominal = match kind {
+            Kind::Pair => self.nominal_seconds(&[self.request.pair])?,
+            Kind::Sequence => self.nominal_seconds(&pairs)?,
+        };
+        let cost_seconds = nominal / pairs.len().max(1) as f64;
         let mut closing_seconds = None;
         if let Some(densify) = &self.request.options.densify {
-            let goes_on = self.request.options.goes_on();
-            let closing = Closing::of(densify, &self.points, goes_on)?;
+            let options = &self.request.options;
+            let (goes_on, frames) = (options.goes_on(), options.frames());
+            let closing = Closing::of(densify, &self.points, goes_on, frames)?;
             pairs.extend(closing.back);
             closing_seconds = Some(closing.nominal_seconds);
         }
@@ -277,7 +319,7 @@ impl Draft {
             id: self.id,
             tenant: self.caller.tenant.clone(),
             kind,
-            pair: PairOf::ALONE,
+            pair: self.request.pair,
             cost_seconds,
             pairs,
             closing_seconds,

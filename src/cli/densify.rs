@@ -1,6 +1,6 @@
 //! `fnsf densify`: a sequence's sweeps as one dense cloud, and as a dense depth image.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::path::PathBuf;
 
 use anyhow::anyhow;
@@ -14,7 +14,7 @@ use super::output::say;
 use super::terminal::Terminal;
 use crate::flow::densify::{DensifyError, Leg, carrier, densify};
 use crate::flow::depth::{Camera, DepthImage, Occlusion, project};
-use crate::flow::{DenseCloud, Field, Point, Sequence, Sweep, Watch};
+use crate::flow::{DenseCloud, Estimate, Field, Point, Sequence, Sweep, Watch};
 use crate::formats::{DenseFormat, FormatError, write_dense, write_depth_png};
 use crate::job::{self, LaterChoice};
 use crate::picture::{self, DepthPanel};
@@ -118,20 +118,23 @@ impl Densify {
         let mut fields: BTreeMap<Leg, Field> = BTreeMap::new();
         let fits = plan.legs().len();
         for chain in plan.chains() {
-            let mut sequence = Sequence::default();
-            for (number, leg) in chain.into_iter().enumerate() {
-                let Leg { source, target } = leg;
+            let (mut sequence, mut waiting) = (Sequence::default(), VecDeque::from(chain));
+            let mut last = None;
+            for place in way(&waiting, sweeps.len()) {
                 terminal.part(&format!("pair {} of {fits}", fields.len() + 1));
-                let larger = sweeps[source].points.len().max(sweeps[target].points.len());
-                let solver_options = surroundings.options(&options, larger, [source, target]);
-                let mut push = |place: usize| {
-                    let sweep = sweeps[place].clone();
-                    device.push(&mut sequence, sweep, &solver_options, &terminal)
-                };
-                if number == 0 {
-                    push(source)?;
+                let before = last.replace(place).unwrap_or(place);
+                let larger = sweeps[before].points.len().max(sweeps[place].points.len());
+                let solver_options = surroundings.options(&options, larger, [before, place]);
+                let found =
+                    device.push(&mut sequence, &sweeps[place], &solver_options, &terminal)?;
+                fields.extend(of_legs(found, &mut waiting));
+                if waiting.is_empty() {
+                    break;
                 }
-                fields.extend(push(target)?.map(|estimate| (leg, estimate.field)));
+            }
+            if !waiting.is_empty() {
+                let rest = device.finish(&mut sequence, &terminal)?;
+                fields.extend(of_legs(rest, &mut waiting));
             }
         }
         let fitted = terminal.seconds();
@@ -256,4 +259,22 @@ impl Densify {
         }
         Ok(())
     }
+}
+
+/// The sweeps that a chain of legs leads through, of `sweeps`, and those beyond its end, which its
+/// last pairs may see.
+fn way(chain: &VecDeque<Leg>, sweeps: usize) -> Vec<usize> {
+    match chain.front() {
+        None => Vec::new(),
+        Some(leg) if leg.source < leg.target => (leg.source..sweeps).collect(),
+        Some(leg) => (0..=leg.source).rev().collect(),
+    }
+}
+
+/// The fields of the legs that have waited longest.
+fn of_legs(estimates: Vec<Estimate>, waiting: &mut VecDeque<Leg>) -> Vec<(Leg, Field)> {
+    let legs = waiting.drain(..estimates.len().min(waiting.len()));
+    legs.zip(estimates)
+        .map(|(leg, estimate)| (leg, estimate.field))
+        .collect()
 }

@@ -151,25 +151,40 @@ pub(super) struct Device<'a> {
 }
 
 impl Device<'_> {
-    /// The next pair of a sequence; on the CPU from where the memory of a device that was not asked
-    /// for by name does not do.
+    /// The pairs of a sequence that the next sweep completes; on the CPU from where the memory of a
+    /// device that was not asked for by name does not do.
     pub(super) fn push(
         &mut self,
         sequence: &mut Sequence,
-        sweep: Sweep,
+        sweep: &Sweep,
         options: &flow::Options,
         terminal: &Terminal,
-    ) -> Result<Option<Estimate>, Failure> {
-        let pushed = sequence.push(self.backend.as_ref(), sweep.clone(), options, terminal);
-        match pushed {
+    ) -> Result<Vec<Estimate>, Failure> {
+        self.tried(|backend| sequence.push(backend, sweep.clone(), options, terminal))
+    }
+
+    /// The pairs of a sequence that waited for sweeps to come; likewise.
+    pub(super) fn finish(
+        &mut self,
+        sequence: &mut Sequence,
+        terminal: &Terminal,
+    ) -> Result<Vec<Estimate>, Failure> {
+        self.tried(|backend| sequence.finish(backend, terminal))
+    }
+
+    fn tried(
+        &mut self,
+        mut work: impl FnMut(&dyn Backend) -> Result<Vec<Estimate>, FlowError>,
+    ) -> Result<Vec<Estimate>, Failure> {
+        match work(self.backend.as_ref()) {
             Err(FlowError::Backend(error @ BackendError::Memory { .. }))
                 if self.asked.device.choice == DeviceChoice::Auto =>
             {
                 device::stand_in(&error);
                 self.backend = device::cpu(self.asked.threads.map(usize::from))?;
-                Ok(sequence.push(self.backend.as_ref(), sweep, options, terminal)?)
+                Ok(work(self.backend.as_ref())?)
             }
-            pushed => Ok(pushed?),
+            done => Ok(done?),
         }
     }
 }

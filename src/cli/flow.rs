@@ -1,5 +1,6 @@
 //! `fnsf flow`: pairs of sweeps, here and now.
 
+use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 
 use anyhow::anyhow;
@@ -22,7 +23,7 @@ use crate::text::grouped;
 /// Reads npz, npy, ply, pcd, KITTI bin, nuScenes pcd.bin and Argoverse 2 feather, recognized by
 /// content. The flow has one row per source point: where the point is in the target's frame, less
 /// where it was in the source's, in metres. Of a sequence every flow is written as soon as it
-/// is there; with neural each pair starts from the one before.
+/// is there; with neural each pair starts from the one before, with label each sees the sweeps around it.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
     fnsf flow a.feather b.feather -o flow.npz\n  \
@@ -45,6 +46,14 @@ pub(super) struct Flow {
     json: bool,
     #[command(flatten)]
     estimation: Estimation,
+}
+
+/// A pair whose flow is still to come.
+struct Waiting {
+    pair: usize,
+    source: Vec<Point>,
+    /// Seconds that its target took to read.
+    load: f64,
 }
 
 /// Writes the flow in the format that the name asks for.
@@ -168,7 +177,10 @@ impl Flow {
         };
         let surroundings = self.estimation.surroundings(&self.sweeps)?;
         let mut device = self.estimation.open()?;
-        let (mut sequence, mut last) = (Sequence::default(), None::<Vec<Point>>);
+        let mut sequence = Sequence::default();
+        // What is known of the pairs that wait for sweeps to come, and of the last sweep.
+        let mut waiting: VecDeque<Waiting> = VecDeque::new();
+        let mut last = None::<Vec<Point>>;
         let count = sweeps.count();
         for place in 0..count {
             let began = terminal.seconds();
@@ -181,16 +193,25 @@ impl Flow {
             let larger = points.len().max(last.as_ref().map_or(0, Vec::len));
             let pair = [place.saturating_sub(1), place];
             let solver_options = surroundings.options(&options, larger, pair);
-            let estimate = device.push(&mut sequence, sweep, &solver_options, &terminal)?;
-            terminal.finish();
-            if let (Some(estimate), Some(source)) = (estimate, &last) {
-                let mut report = Report::new(&estimate, &options);
-                report.seconds.load = Some(load);
-                report.seconds.total += load;
-                report.peak_rss_bytes = peak_resident_bytes();
-                self.put(&estimate, &report, source, [pair[0], count - 1])?;
+            if let Some(source) = last.replace(points) {
+                waiting.push_back(Waiting {
+                    pair: pair[0],
+                    source,
+                    load,
+                });
             }
-            last = Some(points);
+            let mut estimates = device.push(&mut sequence, &sweep, &solver_options, &terminal)?;
+            if place + 1 == count {
+                estimates.extend(device.finish(&mut sequence, &terminal)?);
+            }
+            terminal.finish();
+            for (estimate, pair) in estimates.iter().zip(waiting.drain(..estimates.len())) {
+                let mut report = Report::new(estimate, &options);
+                report.seconds.load = Some(pair.load);
+                report.seconds.total += pair.load;
+                report.peak_rss_bytes = peak_resident_bytes();
+                self.put(estimate, &report, &pair.source, [pair.pair, count - 1])?;
+            }
         }
         Ok(())
     }

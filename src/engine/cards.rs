@@ -10,7 +10,8 @@ use crate::flow::backend::{Advance, Backend, BackendError, Report, Trainer, Tran
 use crate::flow::cpu::CpuBackend;
 use crate::flow::distance::DistanceOptions;
 use crate::flow::{
-    LabelOptions, Labelled, Network, Options, Point, RigidTransform, TrainerState, Watch,
+    AlignedSweep, LabelOptions, Labelled, Network, Options, Point, RigidTransform, TrainerState,
+    Watch,
 };
 use crate::job::DeviceKind;
 
@@ -194,10 +195,11 @@ impl Backend for CardLane {
         &self,
         source: &[Point],
         target: &[Point],
+        around: &[AlignedSweep],
         options: &LabelOptions,
         watch: &dyn Watch,
     ) -> Labelled {
-        self.cpu.movers(source, target, options, watch)
+        self.cpu.movers(source, target, around, options, watch)
     }
 }
 

@@ -11,7 +11,9 @@ use super::busy::Busy;
 use super::hold::{Held, Hold};
 use super::{EngineError, Work};
 use crate::flow::backend::{Backend, BackendError};
-use crate::flow::{self, Estimate, FlowError, Interrupt, Problem, Progress, Snapshot, Watch};
+use crate::flow::{
+    self, Around, Estimate, FlowError, Interrupt, Problem, Progress, Snapshot, Sweep, Watch,
+};
 
 /// What a lane is told.
 pub(super) enum Command {
@@ -192,11 +194,21 @@ pub(super) fn solve(backend: &dyn Backend, work: Work, busy: &Busy) -> Result<Es
         busy,
     };
     let ground = work.ground.as_ref();
+    let around = work.around.iter().map(|(Sweep { points, ground }, at)| {
+        let ground = ground.as_deref();
+        Around {
+            points,
+            ground,
+            at: *at,
+        }
+    });
+    let around: Vec<Around<'_>> = around.collect();
     let problem = Problem {
         source: &work.source,
         target: &work.target,
         ground: ground.map(|[source, target]| [source.as_slice(), target.as_slice()]),
         before: work.before.as_ref(),
+        around: &around,
     };
     if let Some(snapshot) = work.snapshot {
         match flow::resume(backend, &problem, &work.options, snapshot, &watch) {

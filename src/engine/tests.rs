@@ -74,6 +74,7 @@ fn work() -> Work {
         source,
         ground: None,
         before: None,
+        around: Vec::new(),
         options: Preset::Neural.options(None),
         snapshot: None,
         watch: Arc::new(Unwatched),

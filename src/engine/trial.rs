@@ -77,6 +77,7 @@ fn compared(backend: &dyn Backend) -> Result<(), TrialError> {
         target: &target,
         ground: None,
         before: None,
+        around: &[],
     };
     let mut options = Preset::Neural.options(None);
     options.max_iterations = ITERATIONS;

@@ -1,5 +1,6 @@
 //! The seam to a device: what the solver asks of whatever computes.
 
+use super::around::AlignedSweep;
 use super::distance::{DistanceError, DistanceOptions};
 use super::field::Network;
 use super::label::Labelled;
@@ -46,12 +47,13 @@ pub trait Backend: Send + Sync {
     /// [`BackendError`] where the device fails.
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError>;
 
-    /// What moves from `source`, the ego motion taken out, to `target`; what has been found so far
-    /// where `watch` interrupts. Always on the host's threads, too.
+    /// What moves from `source`, the ego motion taken out, to `target`, as the sweeps `around` bear
+    /// out; what has been found so far where `watch` interrupts. Always on the host's threads, too.
     fn movers(
         &self,
         source: &[Point],
         target: &[Point],
+        around: &[AlignedSweep],
         options: &LabelOptions,
         watch: &dyn Watch,
     ) -> Labelled;

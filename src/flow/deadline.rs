@@ -30,6 +30,9 @@ const ALIGNED: usize = 8192;
 /// Time left from which all points are aligned where nothing else shows how fast the machine is,
 /// seconds a point: four times what a slow core takes.
 const ALIGNMENT_SECONDS_PER_POINT: f64 = 2e-6;
+/// Time left from which a sweep around the pair is looked at, seconds a point of it and the target:
+/// it is the first to be done without.
+const AROUND_SECONDS_PER_POINT: f64 = 2e-5;
 /// Points on which the network's speed is measured: about a millisecond, whole tiles.
 const MEASURED: usize = 1536;
 /// Less than this is what it takes to ask a device anything, seconds: then more points are measured.
@@ -173,6 +176,12 @@ pub(crate) fn ego_alone(
         reserve: 0.0,
     };
     ego(backend, selection, options, prior, whole, &on_time)
+}
+
+/// Whether the time left holds a sweep around the pair: `points` to be aligned, and to be searched.
+pub(crate) fn has_time_around(points: usize, watch: &dyn Watch) -> bool {
+    let needed = AROUND_SECONDS_PER_POINT * points as f64;
+    watch.interrupt().is_none() && watch.seconds_left().is_none_or(|left| left > needed)
 }
 
 /// The ego motion that the options ask for, from the whole clouds or some of their points.

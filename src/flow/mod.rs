@@ -15,7 +15,7 @@
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let street = StreetOptions { beams: 16, azimuth_steps: 400, ..StreetOptions::default() };
 //! let pair = Street::new(&street)?.pair(0)?;
-//! let problem = Problem { source: &pair.source, target: &pair.target, ground: None, before: None };
+//! let problem = Problem { source: &pair.source, target: &pair.target, ground: None, before: None, around: &[] };
 //! let options = Preset::Default.options(None);
 //! let estimate = estimate(&CpuBackend::new(None)?, &problem, &options, &Unwatched)?;
 //! assert_eq!(estimate.flow.len(), pair.source.len());
@@ -24,6 +24,7 @@
 //! ```
 
 // What goes in and comes out, and the loop between.
+mod around;
 mod deadline;
 mod dense;
 mod error;
@@ -75,6 +76,7 @@ pub mod simulate;
 #[cfg(test)]
 mod reference;
 
+pub use around::{AlignedSweep, Around};
 pub use bounds::Bounds;
 pub use dense::DenseCloud;
 pub use error::FlowError;
@@ -84,9 +86,9 @@ pub use objects::{Cluster, Objects};
 pub use options::*;
 pub use points::{MIN_POINTS, Point, RigidTransform};
 pub use preprocess::Problem;
-pub use price::{Price, price};
+pub use price::{AroundPrice, Price, price, price_around};
 pub use sealed::SealError;
-pub use sequence::{Sequence, Sweep};
+pub use sequence::{Sequence, Sweep, is_whole, window};
 pub use snapshot::{Snapshot, SnapshotError, TrainerState};
 pub use solver::{DYNAMIC_M, Estimate, PhaseSeconds, StopReason, estimate, resume};
 pub use watch::{Interrupt, Progress, Unwatched, Watch};

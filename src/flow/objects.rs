@@ -129,6 +129,7 @@ mod tests {
             target: &pair.target,
             ground: None,
             before: None,
+            around: &[],
         };
         let backend = CpuBackend::new(None).expect("threads");
         let options = Preset::Default.options(None);

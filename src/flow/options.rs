@@ -8,7 +8,7 @@ use super::points::RigidTransform;
 pub enum Preset {
     /// Ours: robust rigid alignment, then movers found object by object, everything else still.
     Default,
-    /// As default, for labels.
+    /// As default, and where a pair is one of a sequence it sees up to five sweeps around it.
     Label,
     /// Ours with a neural field: robust rigid alignment, then a short stochastic fit of what is left.
     Neural,
@@ -37,7 +37,8 @@ impl Preset {
     /// and `paper` takes the published settings for sampled clouds instead of those for full ones.
     pub fn options(self, max_points: Option<usize>) -> Options {
         match self {
-            Self::Default | Self::Label => Options::labelled(max_points),
+            Self::Default => Options::labelled(max_points, 2),
+            Self::Label => Options::labelled(max_points, 5),
             Self::Neural => Options::stochastic(max_points),
             Self::Paper => Options::published(max_points),
         }
@@ -128,6 +129,11 @@ impl Options {
         }
     }
 
+    /// Sweeps that an estimate looks at where a sequence has them: the pair's two, or more.
+    pub fn frames(&self) -> usize {
+        self.label.as_ref().map_or(2, |label| label.frames.max(2))
+    }
+
     /// Iterations that a run usually takes: all of them where no rule stops it; the published rule
     /// stops after 36 to 115.
     pub fn expected_iterations(&self) -> usize {
@@ -198,11 +204,15 @@ pub struct WarmStart {
 }
 
 impl Options {
-    /// Movers object by object. Ground would tie objects together: it is found and left out.
-    fn labelled(max_points: Option<usize>) -> Self {
+    /// Movers object by object, in `frames` sweeps of a sequence. Ground would tie objects together: it
+    /// is found and left out.
+    fn labelled(max_points: Option<usize>, frames: usize) -> Self {
         Self {
             ground: Ground::Auto,
-            label: Some(LabelOptions::default()),
+            label: Some(LabelOptions {
+                frames,
+                ..LabelOptions::default()
+            }),
             warm_start: None,
             ..Self::stochastic(max_points)
         }
@@ -286,6 +296,13 @@ pub struct LabelOptions {
     pub flat_points: usize,
     /// See `flat_points`.
     pub flat_m: f32,
+    /// Sweeps that are looked at in all: the pair's two, and others of its sequence where there are.
+    pub frames: usize,
+    /// The sweeps around say plainly that a cluster moves where its motion leaves this share of its
+    /// cost in them and in the nearest,
+    pub confirmed_cost: f32,
+    /// and lays it this much nearer to them, metres there and back.
+    pub confirmed_m: f32,
 }
 
 impl Default for LabelOptions {
@@ -316,6 +333,9 @@ impl Default for LabelOptions {
             worse_m: 0.05,
             flat_points: 30,
             flat_m: 0.2,
+            frames: 2,
+            confirmed_cost: 0.5,
+            confirmed_m: 0.1,
         }
     }
 }

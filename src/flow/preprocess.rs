@@ -2,6 +2,7 @@
 //!
 //! Points that are left out keep their row in the result. Knows nothing of what comes after.
 
+use super::around::Around;
 use super::error::FlowError;
 use super::field::Field;
 use super::ground::{self, GroundOptions};
@@ -22,6 +23,9 @@ pub struct Problem<'a> {
     /// The motion of the pair before, from the sweep before the source to the source: where a fit
     /// may start, and the vehicle's motion be sought. None for a pair on its own.
     pub before: Option<&'a Field>,
+    /// Other sweeps of the sequence, in any order; none for a pair on its own. Looked at where
+    /// [`super::LabelOptions::frames`] asks for more than the pair.
+    pub around: &'a [Around<'a>],
 }
 
 /// The points that take part.
@@ -110,6 +114,23 @@ pub(crate) fn select(problem: &Problem, options: &Options) -> Result<Selection, 
     })
 }
 
+/// The points of a sweep around a pair that `options` let take part.
+pub(crate) fn off_ground(sweep: &Around, options: &Options) -> Result<Vec<Point>, FlowError> {
+    let found = match (options.ground, sweep.ground) {
+        (Ground::Auto, None) => Some(ground_of(sweep.points, options)),
+        (Ground::Mask, None) => return Err(FlowError::NoGroundMask),
+        _ => None,
+    };
+    let known = sweep.ground.filter(|_| options.ground != Ground::Keep);
+    let rows = kept(
+        "sweep around",
+        sweep.points,
+        found.as_deref().or(known),
+        options,
+    )?;
+    Ok(rows.into_iter().map(|row| sweep.points[row]).collect())
+}
+
 /// Which of the points are ground, of those that are finite and in range.
 pub(crate) fn ground_of(points: &[Point], options: &Options) -> Vec<bool> {
     let rows: Vec<usize> = (0..points.len())
@@ -125,7 +146,7 @@ pub(crate) fn ground_of(points: &[Point], options: &Options) -> Vec<bool> {
 }
 
 /// All points that are finite and in range.
-fn in_range(points: &[Point], options: &Options) -> Vec<Point> {
+pub(crate) fn in_range(points: &[Point], options: &Options) -> Vec<Point> {
     let kept = points.iter().filter(|&&point| is_in_range(point, options));
     kept.copied().collect()
 }
@@ -170,6 +191,7 @@ mod tests {
             target: source,
             ground: ground.map(|flags| [flags, flags]),
             before: None,
+            around: &[],
         };
         select(&problem, options).expect("enough points").rows
     }
@@ -214,6 +236,7 @@ mod tests {
             target: &source,
             ground: Some([&ground, &ground]),
             before: None,
+            around: &[],
         };
         let mut options = Preset::Neural.options(Some(10));
         options.ground = Ground::Mask;
@@ -254,6 +277,7 @@ mod tests {
             target: &source,
             ground: None,
             before: None,
+            around: &[],
         };
         let fitted = select(&problem, &fitted).expect("enough points");
         let objects = select(&problem, &objects).expect("enough points");
@@ -279,6 +303,7 @@ mod tests {
             target: &target,
             ground: None,
             before: None,
+            around: &[],
         };
         let selection = select(&problem, &Preset::Neural.options(Some(300))).expect("points");
         assert_eq!(selection.source.len(), 50);
@@ -294,6 +319,7 @@ mod tests {
             target: &[[0.0; 3]],
             ground: None,
             before: None,
+            around: &[],
         };
         let mut options = Preset::Neural.options(None);
         let error = select(&problem, &options).expect_err("one point");

@@ -26,7 +26,7 @@ const THINNING_BYTES: usize = 64;
 /// Multiply-adds that take as long as a point's share of the search for movers, and the bytes that
 /// are held for it: its cell, its thinned copies, three indices by place, its normal.
 const LABELLING: f64 = 4e5;
-const LABELLING_BYTES: usize = 384;
+const LABELLING_BYTES: usize = 448;
 /// Multiply-adds that take as long as selecting and moving a point and its results.
 const POINT: f64 = 3e4;
 /// Sets of parameters that are held at once: of the network, its transposes, its optimizer, the
@@ -61,6 +61,23 @@ impl Price {
     }
 }
 
+/// What one more sweep around a pair adds to its price.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct AroundPrice {
+    /// At most the bytes that are held for it.
+    pub bytes: usize,
+    /// Work, as [`Price::multiply_adds`].
+    pub multiply_adds: f64,
+}
+
+/// Prices a sweep of so many points around a pair.
+pub fn price_around(points: usize) -> AroundPrice {
+    AroundPrice {
+        bytes: points * (2 * size_of::<Point>() + THINNING_BYTES + LABELLING_BYTES),
+        multiply_adds: ALIGNING + points as f64 * (THINNING + LABELLING + POINT),
+    }
+}
+
 /// Prices the estimate of `problem` by `options`, with as many iterations as
 /// [`Options::expected_iterations`].
 ///
@@ -91,6 +108,12 @@ pub fn price(problem: &Problem, options: &Options) -> Result<Price, FlowError> {
     let aligned = aligned.map(|[source, target]| source + target);
     let aligning = aligned.map_or(0.0, |points| ALIGNING + points as f64 * THINNING);
     let points = (source_points + target_points) as f64 * POINT;
+    let seen = options.frames() - 2;
+    let around = problem.around.iter().take(seen);
+    let around = around.map(|sweep| price_around(sweep.points.len()));
+    let (around_bytes, around_work) = around.fold((0, 0.0), |(bytes, work), around| {
+        (bytes + around.bytes, work + around.multiply_adds)
+    });
     Ok(Price {
         source_points,
         target_points,
@@ -101,10 +124,12 @@ pub fn price(problem: &Problem, options: &Options) -> Result<Price, FlowError> {
             + (POINT_COPIES * source_points + target_points) * size_of::<Point>()
             + aligned.unwrap_or(0) * THINNING_BYTES
             + labelled * LABELLING_BYTES
+            + around_bytes
             + WORKING_SETS,
         multiply_adds: transform.multiply_adds
             + passes * PARAMETERS as f64
             + labelled as f64 * LABELLING
+            + around_work
             + aligning
             + points,
     })

@@ -1,10 +1,14 @@
 //! A sequence: sweeps in, the motion of each consecutive pair out.
 //!
-//! Keeps the last sweep and the last pair's field, whatever the length. Each fit starts from the
+//! Keeps the sweeps of a window and the last pair's field, whatever the length. Each fit starts from the
 //! field before it, carried into the new frame, where the options have a warm start and that explains
 //! the new pair (`warm_start.rs` says how it is judged); the vehicle's motion is sought about the one
 //! before then. Knows no files.
 
+use std::collections::VecDeque;
+use std::ops::Range;
+
+use super::around::Around;
 use super::backend::Backend;
 use super::error::FlowError;
 use super::field::Field;
@@ -52,17 +56,56 @@ impl Sweep {
     }
 }
 
+/// Which of `sweeps` sweeps the pair of sweep `pair` and the next is estimated from, where it may
+/// see `frames`: as many consecutive ones as there are, the pair among them, as centered as the ends
+/// of the sequence allow; the sweep that one side has more is before the pair.
+pub fn window(pair: usize, sweeps: usize, frames: usize) -> Range<usize> {
+    let frames = frames.max(2).min(sweeps);
+    let first = pair.saturating_sub(before_pair(frames));
+    let first = first.min(sweeps - frames);
+    first..first + frames
+}
+
+/// Whether no sweep to come after the first `sweeps` changes the window of a pair.
+pub fn is_whole(pair: usize, sweeps: usize, frames: usize) -> bool {
+    let frames = frames.max(2);
+    pair.saturating_sub(before_pair(frames)) + frames <= sweeps
+}
+
+/// Sweeps of a centered window before its pair.
+fn before_pair(frames: usize) -> usize {
+    (frames - 1) / 2
+}
+
+/// A sweep, and the options of the pair that it is the target of.
+#[derive(Clone, Debug)]
+struct Held {
+    sweep: Sweep,
+    options: Options,
+}
+
 /// The pairs of a sequence, one after the other.
+///
+/// Where options ask for more sweeps than the pair's own ([`Options::frames`]), a pair is estimated
+/// from its [`window`], by nothing but the sweeps in it: it has to wait for the last of them, and at
+/// most as many sweeps are held as the window has.
 #[derive(Clone, Debug, Default)]
 pub struct Sequence {
-    last: Option<Sweep>,
+    /// The sweeps that pairs to come may see.
+    held: VecDeque<Held>,
+    /// Sweeps that there have been.
+    count: usize,
+    /// The pair that is next.
+    next: usize,
+    /// Sweeps of a window: the most that any options asked for.
+    frames: usize,
     before: Option<Field>,
 }
 
 impl Sequence {
-    /// Takes the next sweep, and gives the motion from the one before to it by `options`; nothing for
-    /// the first. Options may change from sweep to sweep: where the vehicle's motion is known,
-    /// [`super::Ego::Given`] says it.
+    /// Takes the next sweep, and gives the motion of every pair whose sweeps are now all there, in
+    /// order. `options` are those of the pair that ends in the sweep, and may change from sweep to
+    /// sweep: where the vehicle's motion is known, [`super::Ego::Given`] says it.
     ///
     /// # Errors
     /// As [`estimate`]; the sequence is left as it was, and the sweep may be pushed again.
@@ -72,23 +115,129 @@ impl Sequence {
         sweep: Sweep,
         options: &Options,
         watch: &dyn Watch,
-    ) -> Result<Option<Estimate>, FlowError> {
-        // Once for both of its pairs.
+    ) -> Result<Vec<Estimate>, FlowError> {
+        // Once for all that see it.
         let sweep = sweep.prepared(options);
-        let Some(last) = &self.last else {
-            self.last = Some(sweep);
-            return Ok(None);
-        };
-        let ground = last.ground.as_deref().zip(sweep.ground.as_deref());
+        let was = (self.next, self.frames, self.before.clone());
+        self.frames = self.frames.max(options.frames());
+        self.held.push_back(Held {
+            sweep,
+            options: options.clone(),
+        });
+        self.count += 1;
+        let pushed = self.estimates(backend, is_whole, watch);
+        if pushed.is_err() {
+            self.held.pop_back();
+            self.count -= 1;
+            (self.next, self.frames, self.before) = was;
+        } else {
+            self.forget();
+        }
+        pushed
+    }
+
+    /// Gives the motion of the pairs that were waiting for sweeps to come: there are none.
+    ///
+    /// # Errors
+    /// As [`estimate`]; the sequence is left as it was, and may be finished again.
+    pub fn finish(
+        &mut self,
+        backend: &dyn Backend,
+        watch: &dyn Watch,
+    ) -> Result<Vec<Estimate>, FlowError> {
+        let was = (self.next, self.before.clone());
+        let finished = self.estimates(backend, |_, _, _| true, watch);
+        if finished.is_err() {
+            (self.next, self.before) = was;
+        }
+        finished
+    }
+
+    /// The next pairs, as long as `is_ready` says so of a pair, the sweeps so far and its frames.
+    fn estimates(
+        &mut self,
+        backend: &dyn Backend,
+        is_ready: impl Fn(usize, usize, usize) -> bool,
+        watch: &dyn Watch,
+    ) -> Result<Vec<Estimate>, FlowError> {
+        let mut estimates = Vec::new();
+        while self.next + 1 < self.count {
+            let frames = self.at(self.next + 1).options.frames();
+            if !is_ready(self.next, self.count, frames) {
+                break;
+            }
+            let estimate = self.estimate(backend, self.next, frames, watch)?;
+            self.before = Some(estimate.field.clone());
+            self.next += 1;
+            estimates.push(estimate);
+        }
+        Ok(estimates)
+    }
+
+    /// The motion of a pair, from the sweeps of its window.
+    fn estimate(
+        &self,
+        backend: &dyn Backend,
+        pair: usize,
+        frames: usize,
+        watch: &dyn Watch,
+    ) -> Result<Estimate, FlowError> {
+        let (source, target) = (&self.at(pair).sweep, self.at(pair + 1));
+        let ground = source.ground.as_deref();
+        let ground = ground.zip(target.sweep.ground.as_deref());
+        let others = window(pair, self.count, frames);
+        let others = others.filter(|&place| place != pair && place != pair + 1);
+        let around: Vec<Around> = others
+            .filter_map(|place| {
+                let Sweep { points, ground } = &self.at(place).sweep;
+                let ground = ground.as_deref();
+                // Farther sweeps than that are of no use.
+                let at = i8::try_from(place as i64 - pair as i64).ok()?;
+                Some(Around { points, ground, at })
+            })
+            .collect();
         let problem = Problem {
-            source: &last.points,
-            target: &sweep.points,
+            source: &source.points,
+            target: &target.sweep.points,
             ground: ground.map(|(source, target)| [source, target]),
             before: self.before.as_ref(),
+            around: &around,
         };
-        let estimate = estimate(backend, &problem, options, watch)?;
-        self.before = Some(estimate.field.clone());
-        self.last = Some(sweep);
-        Ok(Some(estimate))
+        estimate(backend, &problem, &target.options, watch)
+    }
+
+    fn at(&self, place: usize) -> &Held {
+        &self.held[place + self.held.len() - self.count]
+    }
+
+    /// Lets go of the sweeps that no pair to come may see.
+    fn forget(&mut self) {
+        let sweeps = self.count.max(self.next + 2);
+        let first = window(self.next, sweeps, self.frames).start;
+        while self.count - self.held.len() < first {
+            self.held.pop_front();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_window_holds_its_pair_and_is_as_centered_as_the_ends_allow() {
+        let five: Vec<_> = (0..8).map(|pair| window(pair, 9, 5)).collect();
+        let expected = [0..5, 0..5, 0..5, 1..6, 2..7, 3..8, 4..9, 4..9];
+        assert_eq!(five, expected);
+        assert_eq!([window(0, 9, 3), window(4, 9, 3)], [0..3, 3..6]);
+        assert_eq!([window(1, 3, 5), window(1, 4, 5)], [0..3, 0..4]);
+        for pair in 0..8 {
+            assert_eq!(window(pair, 9, 2), pair..pair + 2);
+            for frames in 0..12 {
+                let window = window(pair, 9, frames);
+                assert!(window.contains(&pair) && window.contains(&(pair + 1)));
+                assert_eq!(window.len(), frames.clamp(2, 9));
+            }
+        }
     }
 }

@@ -3,6 +3,7 @@
 //! FNSF Section 3: `theta* = argmin mean_p D(p + g(p; theta))`. Sees only the backend's traits.
 //! What becomes of it under a deadline is in `deadline.rs`.
 
+use super::around;
 use super::backend::{Advance, Backend, BackendError, Report};
 use super::deadline::{self, Loop, Pace, Prepared};
 use super::error::FlowError;
@@ -164,8 +165,12 @@ fn solve(
             return Err(BackendError::Unsupported(text).into());
         }
         (Some(label), _) => {
+            let around = match &ego {
+                Some(ego) => around::aligned(backend, problem, options, ego, label.frames, watch)?,
+                None => Vec::new(),
+            };
             let precomputed = watch.seconds();
-            let labelled = backend.movers(&aligned, &selection.target, label, watch);
+            let labelled = backend.movers(&aligned, &selection.target, &around, label, watch);
             objects = Some(Objects::new(
                 problem.source.len(),
                 &selection.rows,

@@ -85,6 +85,11 @@ impl JobOptions {
         }
     }
 
+    /// Sweeps of a sequence that a pair is found from, where there are as many.
+    pub fn frames(&self) -> usize {
+        self.solver_options(usize::MAX).frames()
+    }
+
     /// Whether the pairs of a sequence go on from each other: each needs the one before then.
     pub fn goes_on(&self) -> bool {
         self.solver_options(usize::MAX).warm_start.is_some()

@@ -51,6 +51,7 @@ impl Worker {
             async { Ok(self.blobs.get(owner, Blob::Frame(target)).await?) },
             self.field_before(job),
         )?;
+        let around = self.around(job).await?;
         let snapshot = self.earlier_snapshot(job).await;
         let source = StoredCloud::from_bytes(&source)?;
         let target = StoredCloud::from_bytes(&target)?;
@@ -88,6 +89,7 @@ impl Worker {
         let work = super::Work {
             options: solver.clone(),
             before,
+            around,
             ground: source.ground.zip(target.ground).map(<[_; 2]>::from),
             source: source.points,
             target: target.points,
@@ -95,6 +97,24 @@ impl Worker {
             watch: Arc::new(watch),
         };
         Ok((work, self.keep_snapshots(lease, kept), options))
+    }
+
+    /// The other sweeps that a pair is found from, and when each was taken: in gaps of the pair after
+    /// its source, by the pair's own direction.
+    async fn around(&self, job: &Job) -> Result<Vec<(Sweep, i8)>, StoreError> {
+        let (owner, pair) = job.sweeps();
+        let [first, end] = job.sees;
+        let mut around = Vec::new();
+        for place in (first..end).filter(|place| !pair.contains(place)) {
+            let gaps = i64::from(place) - i64::from(pair[0]);
+            let at = if job.backward { -gaps } else { gaps };
+            // Farther sweeps than that are of no use.
+            let Ok(at) = i8::try_from(at) else { continue };
+            let bytes = self.blobs.get(owner, Blob::Frame(place)).await?;
+            let StoredCloud { points, ground } = StoredCloud::from_bytes(&bytes)?;
+            around.push((Sweep { points, ground }, at));
+        }
+        Ok(around)
     }
 
     /// Time for the result to reach its caller.

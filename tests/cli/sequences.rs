@@ -50,6 +50,29 @@ fn the_flows_of_a_sequence_are_numbered_and_the_first_is_that_of_its_pair_alone(
 }
 
 #[test]
+fn flows_that_wait_for_sweeps_to_come_are_numbered_and_reported_like_any() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder);
+    let options = [
+        "--device", "cpu", "--preset", "label", "--json", "-o", "all.npz",
+    ];
+    let done = fnsf(folder, &[&["flow"], &SWEEPS[..], &options].concat());
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    assert_eq!(done.stdout.lines().count(), 3);
+    for (k, sweep) in SWEEPS[..3].iter().enumerate() {
+        let bytes = std::fs::read(folder.join(sweep)).expect("written");
+        let points = read_cloud(&bytes, Some(sweep)).expect("a cloud").points;
+        let name = format!("all_{k:04}.npz");
+        let bytes = std::fs::read(folder.join(&name)).expect("written");
+        assert_eq!(
+            read_flow(&bytes, Some(&name)).expect("a flow").flow.len(),
+            points.len()
+        );
+    }
+}
+
+#[test]
 fn a_dense_cloud_has_every_point_and_shows_more_than_one_sweep_through_a_camera() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();

@@ -53,6 +53,7 @@ fn run(pair: &Pair, preset: Preset, deadline: Option<f64>) -> Estimate {
         target: &pair.target,
         ground: None,
         before: None,
+        around: &[],
     };
     let clock = Clock::with(deadline);
     estimate(&backend, &problem, &preset.options(None), &clock).expect("a flow")
@@ -115,6 +116,7 @@ fn a_cancellation_under_a_deadline_ends_the_precompute() {
         target: &pair.target,
         ground: None,
         before: None,
+        around: &[],
     };
     let options = Preset::Neural.options(None);
     let error = estimate(&backend, &problem, &options, &Cancelled).expect_err("cancelled");
@@ -144,6 +146,7 @@ fn the_watch_is_looked_at_all_along_before_the_first_iteration() {
         target: &pair.target,
         ground: None,
         before: None,
+        around: &[],
     };
     estimate(&backend, &problem, &options, &looks).expect("a flow");
     assert!(looks.0.into_inner() > LOOKS);

@@ -25,6 +25,7 @@ fn found(pair: &Pair, ground: Ground, max_points: Option<usize>) -> RigidTransfo
         target: &pair.target,
         ground: Some([&masks.source, &masks.target]),
         before: None,
+        around: &[],
     };
     let mut options = Preset::Neural.options(max_points);
     options.ground = ground;

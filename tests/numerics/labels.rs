@@ -64,6 +64,7 @@ fn ground_is_found_where_none_is_named_and_few_points_are_no_trouble() {
         target: &pair.target,
         ground: None,
         before: None,
+        around: &[],
     };
     let backend = fnsf::flow::cpu::CpuBackend::new(Some(2)).expect("threads");
     for max_points in [None, Some(3000), Some(3)] {

@@ -7,6 +7,7 @@ mod accuracy;
 mod deadlines;
 mod depth;
 mod ego;
+mod frames;
 mod gpu;
 #[path = "../common/gpu.rs"]
 mod gpu_rule;

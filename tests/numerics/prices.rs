@@ -22,6 +22,7 @@ fn bytes_and_bricks_are_never_below_the_truth_and_not_far_above() {
             target: &pair.target,
             ground: Some([&ground.source, &ground.target]),
             before: None,
+            around: &[],
         };
         for sites in [Sites::Cells, Sites::Points] {
             for max_points in [None, Some(5000)] {
@@ -52,6 +53,7 @@ fn work_grows_with_iterations_points_and_detail() {
         target: &pair.target,
         ground: None,
         before: None,
+        around: &[],
     };
     let work = |options: &Options| price(&problem, options).expect("taken").multiply_adds;
     let base = Preset::Neural.options(None);
@@ -97,6 +99,7 @@ fn what_the_estimate_refuses_has_no_price() {
             target: &cloud,
             ground,
             before: None,
+            around: &[],
         };
         let refused = price(&problem, options).expect_err("refused");
         let truth = estimate(&backend, &problem, options, &Unwatched).expect_err("refused");
@@ -108,6 +111,7 @@ fn what_the_estimate_refuses_has_no_price() {
         target: &cloud,
         ground: None,
         before: None,
+        around: &[],
     };
     assert!(matches!(
         price(&problem, &tight),
@@ -128,6 +132,7 @@ fn a_search_for_objects_is_priced_by_all_points_whatever_is_drawn() {
         target: &pair.target,
         ground: None,
         before: None,
+        around: &[],
     };
     for preset in [Preset::Default, Preset::Label] {
         let of = |max_points| price(&problem, &preset.options(max_points)).expect("taken");

@@ -76,6 +76,7 @@ fn run(
         target: &pair.target,
         ground: None,
         before: None,
+        around: &[],
     };
     match snapshot {
         None => estimate(&backend, &problem, options, watch),

@@ -61,6 +61,7 @@ pub(crate) fn solve_on(backend: &dyn Backend, pair: &Pair, options: &Options) ->
         target: &pair.target,
         ground: Some([&ground.source, &ground.target]),
         before: None,
+        around: &[],
     };
     let options = Options {
         ground: Ground::Mask,

@@ -44,7 +44,9 @@ fn in_sequence(sweeps: &[Vec<Point>], options: &Options) -> Vec<Estimate> {
             .push(&backend, sweep(points.clone()), options, &Unwatched)
             .expect("a pair")
     });
-    pushed.collect::<Vec<_>>().into_iter().flatten().collect()
+    let mut estimates: Vec<Estimate> = pushed.flatten().collect();
+    estimates.extend(sequence.finish(&backend, &Unwatched).expect("the rest"));
+    estimates
 }
 
 fn distance(a: Point, b: Point) -> f64 {
@@ -80,6 +82,7 @@ fn a_pair_of_a_sequence_takes_fewer_iterations_than_alone_and_is_no_worse() {
             target: &pair.target,
             ground: None,
             before: None,
+            around: &[],
         };
         let alone = estimate(&backend, &problem, &options, &Unwatched).expect("a flow");
         if k == 0 {
@@ -115,6 +118,7 @@ fn fields(sweeps: &[Vec<Point>], plan: &Plan, preset: Preset) -> BTreeMap<Leg, F
     let mut fields = BTreeMap::new();
     for chain in plan.chains() {
         let mut sequence = Sequence::default();
+        let (mut legs, mut estimates) = (Vec::new(), Vec::new());
         for (number, leg) in chain.into_iter().enumerate() {
             let mut push = |place: usize| {
                 let sweep = sweep(sweeps[place].clone());
@@ -124,9 +128,13 @@ fn fields(sweeps: &[Vec<Point>], plan: &Plan, preset: Preset) -> BTreeMap<Leg, F
             if number == 0 {
                 push(leg.source);
             }
-            let estimate = push(leg.target).expect("the second of two");
-            fields.insert(leg, estimate.field);
+            estimates.extend(push(leg.target));
+            legs.push(leg);
         }
+        estimates.extend(sequence.finish(&backend, &Unwatched).expect("the rest"));
+        assert_eq!(legs.len(), estimates.len());
+        let found = estimates.into_iter().map(|estimate| estimate.field);
+        fields.extend(legs.into_iter().zip(found));
     }
     fields
 }

@@ -52,6 +52,7 @@ async fn a_pair_comes_back_as_the_librarys_flow_in_every_format() {
         target: &pair[1],
         ground: None,
         before: None,
+        around: &[],
     };
     let backend = CpuBackend::new(Some(2)).expect("threads");
     let options = Preset::Default.options(None);

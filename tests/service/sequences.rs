@@ -59,10 +59,11 @@ fn chained(backend: &CpuBackend, options: &str, places: &[usize]) -> Vec<(Field,
             ground: None,
         };
         let solver = options.solver_options(sweep.points.len());
-        let estimate = sequence.push(backend, sweep, &solver, &Unwatched);
-        found.extend(estimate.expect("a flow").map(|e| (e.field, e.flow)));
+        let estimates = sequence.push(backend, sweep, &solver, &Unwatched);
+        found.extend(estimates.expect("a flow"));
     }
-    found
+    found.extend(sequence.finish(backend, &Unwatched).expect("the rest"));
+    found.into_iter().map(|e| (e.field, e.flow)).collect()
 }
 
 /// The flows of the library's own sequence.

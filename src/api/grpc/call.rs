@@ -12,6 +12,7 @@ use crate::api::auth::Caller;
 use crate::api::draft::{Arrived, Request as DraftRequest};
 use crate::api::error::ApiError;
 use crate::job::JobOptions;
+use crate::queue::PairOf;
 
 /// A stream of answers.
 pub(super) type Answers<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
@@ -46,6 +47,7 @@ impl Call {
             arrived: self.arrived,
             time_left: self.time_left.filter(|_| awaited),
             link: None,
+            pair: PairOf::ALONE,
         }
     }
 }

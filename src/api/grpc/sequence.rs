@@ -3,6 +3,7 @@
 //! Two tasks and a bounded channel between them: the reader waits when the channel is full, so
 //! that memory stays bounded and the client feels it.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 
 use tokio::sync::mpsc;
@@ -13,11 +14,13 @@ use super::call::{Call, no_begin};
 use super::chunks::{self, CloudBuilder};
 use super::{convert, proto};
 use crate::api::admission::Promise;
-use crate::api::draft::{Accepted, Draft, Link, Room};
+use crate::api::draft::{Accepted, Draft, Link, Room, seen};
 use crate::api::error::ApiError;
 use crate::api::service::{Service, Waited};
+use crate::flow::{is_whole, window};
 use crate::job::{JobId, JobOptions, Kind};
 use crate::payload::StoredCloud;
+use crate::queue::PairOf;
 
 type Answers = mpsc::Sender<Result<proto::EstimateSequenceResponse, Status>>;
 
@@ -87,7 +90,8 @@ pub(super) fn run(
             inbound,
             pending: pending.clone(),
             place: 0,
-            last: None,
+            count: 0,
+            held: VecDeque::new(),
             before: None,
         };
         if let Err(error) = reader.run().await {
@@ -103,8 +107,11 @@ struct Reader {
     call: Call,
     inbound: Streaming<proto::EstimateSequenceRequest>,
     pending: mpsc::Sender<Item>,
-    place: u32,
-    last: Option<Sweep>,
+    /// The pair that is next.
+    place: usize,
+    /// Sweeps that there have been, and the last of them: those that pairs to come may see.
+    count: usize,
+    held: VecDeque<Sweep>,
     /// The job of the pair before, from whose field the next one goes on.
     before: Option<JobId>,
 }
@@ -161,52 +168,67 @@ impl Reader {
                 room = Room::default();
             }
             if ended {
+                while self.place + 1 < self.count {
+                    self.submit_next(&options).await;
+                }
                 return Ok(());
             }
         }
     }
 
-    /// Takes a whole sweep, and submits its pair with the one before.
+    /// Takes a whole sweep, and submits the pairs that no sweep to come says anything about.
     async fn take(&mut self, coming: Coming, options: &JobOptions) -> Result<(), ApiError> {
-        let sweep = coming.finish()?;
-        let Some(before) = self.last.take() else {
-            self.last = Some(sweep);
-            return Ok(());
+        self.held.push_back(coming.finish()?);
+        self.count += 1;
+        let frames = options.frames();
+        while self.place + 1 < self.count && is_whole(self.place, self.count, frames) {
+            self.submit_next(options).await;
+        }
+        let first = window(self.place, self.count.max(self.place + 2), frames).start;
+        while self.count - self.held.len() < first {
+            self.held.pop_front();
+        }
+        Ok(())
+    }
+
+    /// Submits the next pair, with the sweeps of its window.
+    async fn submit_next(&mut self, options: &JobOptions) {
+        let place = self.place;
+        self.place += 1;
+        let Ok(place_in_line) = self.pending.clone().reserve_owned().await else {
+            return;
         };
-        let place = self.pending.reserve().await;
-        let Ok(place_in_line) = place else {
-            return Ok(());
-        };
-        let names = (before.name, sweep.name.clone());
-        let job = self
-            .submit(before.cloud, sweep.cloud.clone(), options)
-            .await;
+        let first_held = self.count - self.held.len();
+        let name = |place: usize| self.held[place - first_held].name.clone();
+        let names = (name(place), name(place + 1));
+        let job = self.submit(place, options).await;
         self.before = job.as_ref().ok().map(|accepted| accepted.job.id);
-        place_in_line.send(Item::Pair(Pending {
-            place: self.place,
+        let _sender = place_in_line.send(Item::Pair(Pending {
+            place: u32::try_from(place).unwrap_or(u32::MAX),
             source: names.0,
             target: names.1,
             job,
         }));
-        self.place += 1;
-        self.last = Some(sweep);
-        Ok(())
     }
 
-    async fn submit(
-        &self,
-        source: StoredCloud,
-        target: StoredCloud,
-        options: &JobOptions,
-    ) -> Result<Accepted, ApiError> {
+    async fn submit(&self, place: usize, options: &JobOptions) -> Result<Accepted, ApiError> {
         let mut request = self
             .call
             .draft_request(options.clone(), Promise::WhileAwaited);
         let after = self.before;
         request.link = options.goes_on().then_some(Link { after });
+        let sees = window(place, self.count, options.frames());
+        request.pair = PairOf {
+            place: u32::try_from(place - sees.start).unwrap_or(u32::MAX),
+            sees: seen(0..sees.len()),
+            ..PairOf::ALONE
+        };
         let mut draft = Draft::begin(&self.service, self.call.caller.clone(), request)?;
-        draft.push(source).await?;
-        draft.push(target).await?;
+        let first_held = self.count - self.held.len();
+        for place in sees {
+            let cloud = self.held[place - first_held].cloud.clone();
+            draft.push(cloud).await?;
+        }
         draft.submit(Kind::Pair).await
     }
 }

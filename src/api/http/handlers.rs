@@ -23,6 +23,7 @@ use crate::api::draft::{Accepted, Arrived, Draft, Request as DraftRequest};
 use crate::api::error::ApiError;
 use crate::api::service::{Service, Waited};
 use crate::job::{Job, JobId, JobOptions, Kind, State as JobState};
+use crate::queue::PairOf;
 
 /// The longest long poll.
 const MAX_POLL: Duration = Duration::from_secs(60);
@@ -64,6 +65,7 @@ impl Asked {
             arrived: self.arrived.0,
             time_left: self.prefer.wait.filter(|_| wait_is_deadline),
             link: None,
+            pair: PairOf::ALONE,
         }
     }
 }

@@ -16,6 +16,7 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
+use super::around::AlignedSweep;
 use super::backend::{Backend, BackendError, Trainer, Transform};
 use super::distance::{DistanceOptions, DistanceTransform};
 use super::ego;
@@ -120,10 +121,11 @@ impl Backend for CpuBackend {
         &self,
         source: &[Point],
         target: &[Point],
+        around: &[AlignedSweep],
         options: &LabelOptions,
         watch: &dyn Watch,
     ) -> Labelled {
-        let find = || label::label(source, target, options, watch);
+        let find = || label::label(source, target, around, options, watch);
         self.threads.install(find)
     }
 }

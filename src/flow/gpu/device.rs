@@ -11,6 +11,7 @@ use super::matrix::{self, Units};
 use super::memory::{Budget, Words};
 use super::records::{self, STEPS};
 use super::transform;
+use crate::flow::around::AlignedSweep;
 use crate::flow::backend::{Backend, BackendError, Transform};
 use crate::flow::distance::DistanceOptions;
 use crate::flow::ego;
@@ -127,10 +128,11 @@ impl Backend for Gpu {
         &self,
         source: &[Point],
         target: &[Point],
+        around: &[AlignedSweep],
         options: &LabelOptions,
         watch: &dyn Watch,
     ) -> Labelled {
-        let find = || label::label(source, target, options, watch);
+        let find = || label::label(source, target, around, options, watch);
         self.0.host.install(find)
     }
 }

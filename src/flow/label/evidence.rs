@@ -93,8 +93,8 @@ pub(super) fn evidence(findings: &Findings<'_>, source: &[Point], labels: &[u32]
         movers,
     } = *findings;
     let owners = motions.owners_at(source);
-    let mut moving = vec![0_usize; scene.members.len()];
-    for (&label, &owner) in scene.labels.iter().zip(&spread.owners) {
+    let mut moving = vec![0_usize; scene.source.members.len()];
+    for (&label, &owner) in scene.source.labels.iter().zip(&spread.owners) {
         if label != NOISE && owner != NOISE {
             moving[label as usize] += 1;
         }
@@ -114,7 +114,7 @@ pub(super) fn evidence(findings: &Findings<'_>, source: &[Point], labels: &[u32]
         let target = scene.match_of(at, cluster);
         let truncation = scene.options.truncation_m;
         let off_m = target.map_or(truncation, |target| scene.distance(at, target));
-        let members = |label: u32| scene.members.get(label as usize).map_or(0, Vec::len);
+        let members = |label: u32| scene.source.members.get(label as usize).map_or(0, Vec::len);
         let share = moving.get(label as usize).map_or(1.0, |&moving| {
             let share = moving as f32 / members(label).max(1) as f32;
             if moves { share } else { 1.0 - share }

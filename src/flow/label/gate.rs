@@ -4,22 +4,38 @@
 //! A sparse static surface can always be laid a little better on the other sweep's samples, and what
 //! only one sweep saw lies best on something else. It must not know how motions are found.
 
-use super::rigid::Found;
+use super::rigid::{Evidence, Found};
 use crate::flow::Point;
 use crate::flow::options::LabelOptions;
 
 /// Whether `found`, the best motion of a cluster with these `points`, is needed.
 pub(super) fn is_needed(found: &Found, points: &[Point], options: &LabelOptions) -> bool {
-    let [still, moved] = [found.still, found.cost].map(|cost| cost.sum_m());
-    let gain = still - moved;
+    let around = &found.around;
+    let sweeps = 1.0 + around.weight;
+    let still = (found.still.sum_m() + around.still_m) / sweeps;
+    let moved = (found.cost.sum_m() + around.moved_m) / sweeps;
+    let gain = (still - moved) * sweeps;
     found.motion.length_m() >= options.least_motion_m
         && found.still.there_m - found.cost.there_m >= options.gain_m
         && moved <= options.kept_cost * still
         && gain * points.len() as f32
             >= options.evidence_m + options.evidence_slope * found.motion.length_m()
         && found.cost.there_m <= options.left_m
-        && found.hold >= options.least_hold
+        && (found.hold >= options.least_hold || is_confirmed(around, options))
         && !is_flat(points, options)
+}
+
+/// Whether the sweeps around say plainly that a cluster moves, even one that its surfaces do not hold:
+/// a wall that seems to slide lies where it was in all of them, a bus has driven on. The nearest must
+/// say so itself: far ones see a wall slide on onto what lies behind.
+fn is_confirmed(around: &Evidence, options: &LabelOptions) -> bool {
+    let is_plain = |[still_m, moved_m]: [f32; 2], weight: f32| {
+        moved_m <= options.confirmed_cost * still_m
+            && still_m - moved_m >= options.confirmed_m * weight
+    };
+    around.weight > 0.0
+        && is_plain(around.nearest_m, 1.0)
+        && is_plain([around.still_m, around.moved_m], around.weight)
 }
 
 /// Whether the points, many of them, lie at one height: a ring on ground that was not found.
@@ -47,6 +63,7 @@ mod tests {
             cost: cost(0.03, 0.03),
             still: cost(0.25, 0.2),
             hold: 0.4,
+            around: Evidence::default(),
         }
     }
 
@@ -80,6 +97,32 @@ mod tests {
     #[test]
     fn a_wall_that_slides_in_its_plane_does_not_move() {
         assert!(!needed(|found| found.hold = 0.02));
+    }
+
+    #[test]
+    fn a_bus_that_all_sweeps_see_driving_moves_though_nothing_holds_it() {
+        let around = |still_m: f32, moved_m: f32| Evidence {
+            weight: 1.5,
+            still_m: still_m * 1.5,
+            moved_m: moved_m * 1.5,
+            nearest_m: [still_m, moved_m],
+        };
+        let slides = |around| {
+            needed(|found| {
+                found.hold = 0.02;
+                found.around = around;
+            })
+        };
+        assert!(slides(around(0.4, 0.05)));
+        assert!(!slides(around(0.1, 0.05)));
+        assert!(!slides(around(0.4, 0.25)));
+        let far = Evidence {
+            nearest_m: [0.05; 2],
+            ..around(0.4, 0.05)
+        };
+        assert!(!slides(far));
+        // And what held was none where the others say that it stands.
+        assert!(!needed(|found| found.around = around(0.05, 0.5)));
     }
 
     #[test]

@@ -13,6 +13,7 @@
 
 // What is looked at, and what moves.
 mod cluster;
+mod moment;
 mod motion;
 mod motions;
 mod near;
@@ -20,6 +21,7 @@ mod scene;
 mod stored;
 
 // How a motion is found, kept and shared.
+mod fit;
 mod gate;
 mod rigid;
 mod spread;
@@ -40,13 +42,15 @@ pub use parts::Parts;
 
 use rayon::prelude::*;
 
+use super::around::AlignedSweep;
 use super::options::LabelOptions;
 use super::points::Point;
 use super::watch::{Interrupt, Progress, Watch};
 use cluster::NOISE;
 use evidence::{Findings, Searched};
+use moment::Moment;
 use rigid::Mover;
-use scene::Scene;
+use scene::{Scene, Thinned};
 use vote::Ballot;
 
 /// Clusters between two looks at the watch.
@@ -96,6 +100,7 @@ impl Labelled {
 pub(crate) fn label(
     source: &[Point],
     target: &[Point],
+    around: &[AlignedSweep],
     options: &LabelOptions,
     watch: &dyn Watch,
 ) -> Labelled {
@@ -113,12 +118,17 @@ pub(crate) fn label(
         return Labelled::nothing(interrupt);
     }
     let began = watch.seconds();
-    let scene = Scene::new(source, &labels, target, options);
+    let thinned = Thinned::new(source, &labels, options);
+    let scene = Scene::new(&thinned, target, options);
     let ballot = Ballot::new(&scene);
+    let around: Vec<Moment<'_>> = around
+        .par_iter()
+        .map(|sweep| Moment::new(&thinned, sweep, options))
+        .collect();
     let rest = (watch.seconds() - began) * REST;
 
-    let mut order: Vec<u32> = (0..scene.members.len() as u32).collect();
-    order.sort_by_key(|&cluster| std::cmp::Reverse(scene.members[cluster as usize].len()));
+    let mut order: Vec<u32> = (0..thinned.members.len() as u32).collect();
+    order.sort_by_key(|&cluster| std::cmp::Reverse(thinned.members[cluster as usize].len()));
     let mut searched = vec![Searched::not(options); order.len()];
     let (mut clusters, mut sum_m) = (0, 0.0);
     let mut interrupted = None;
@@ -129,7 +139,7 @@ pub(crate) fn label(
         }
         let found: Vec<Searched> = some
             .par_iter()
-            .map(|&cluster| search(&scene, &ballot, cluster))
+            .map(|&cluster| search(&scene, &around, &ballot, cluster))
             .collect();
         for (&cluster, found) in some.iter().zip(found) {
             searched[cluster as usize] = found;
@@ -143,7 +153,7 @@ pub(crate) fn label(
         });
     }
     let needed: Vec<_> = searched.iter().map(Searched::found).collect();
-    let spread = spread::spread(&scene, &needed);
+    let spread = spread::spread(&scene, &around, &needed);
     let movers: Vec<u32> = (0..)
         .zip(&needed)
         .filter_map(|(cluster, found)| found.map(|_| cluster))
@@ -155,7 +165,7 @@ pub(crate) fn label(
     let number = |cluster: &u32| numbers.get(*cluster as usize).copied().unwrap_or(NOISE);
     let owners: Vec<u32> = spread.owners.iter().map(number).collect();
     let motions = needed.iter().flatten().map(|found| found.motion);
-    let motions = Motions::new(motions.collect(), &scene.source, &owners);
+    let motions = Motions::new(motions.collect(), &thinned.points, &owners);
     let findings = Findings {
         scene: &scene,
         searched: &searched,
@@ -175,9 +185,9 @@ pub(crate) fn label(
 }
 
 /// Looks for the motion of a cluster.
-fn search(scene: &Scene<'_>, ballot: &Ballot, cluster: u32) -> Searched {
-    let members = &scene.members[cluster as usize];
-    let mover = Mover::new(scene, cluster);
+fn search(scene: &Scene<'_>, around: &[Moment<'_>], ballot: &Ballot, cluster: u32) -> Searched {
+    let members = &scene.source.members[cluster as usize];
+    let mover = Mover::new(scene, around, cluster);
     let still = mover.standing_still();
     if members.len() < scene.options.cluster_points {
         return Searched {
@@ -188,7 +198,7 @@ fn search(scene: &Scene<'_>, ballot: &Ballot, cluster: u32) -> Searched {
     }
     let points: Vec<Point> = members
         .iter()
-        .map(|&row| scene.source[row as usize])
+        .map(|&row| scene.source.points[row as usize])
         .collect();
     let best = mover.search(ballot, still);
     let needed = best.is_some_and(|found| gate::is_needed(&found, &points, scene.options));

@@ -34,6 +34,30 @@ impl Motion {
         }
     }
 
+    /// This motion `times` over, or undone as often where that is negative.
+    pub(super) fn repeated(&self, times: i8) -> Self {
+        let mut shift_m = [0.0; 2];
+        for _ in 0..times.unsigned_abs() {
+            let [x, y] = shift_m;
+            shift_m = if times > 0 {
+                let (sin, cos) = self.turn.sin_cos();
+                [
+                    cos * x - sin * y + self.shift_m[0],
+                    sin * x + cos * y + self.shift_m[1],
+                ]
+            } else {
+                let (sin, cos) = self.turn.sin_cos();
+                let [x, y] = [x - self.shift_m[0], y - self.shift_m[1]];
+                [cos * x + sin * y, cos * y - sin * x]
+            };
+        }
+        Self {
+            shift_m,
+            turn: self.turn * f32::from(times),
+            center: self.center,
+        }
+    }
+
     /// Where a point comes to lie.
     #[inline]
     pub(super) fn apply(&self, [x, y, z]: Point) -> Point {

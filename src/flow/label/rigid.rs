@@ -6,8 +6,7 @@
 //! last steps try shifts, since the cost has edges that no derivative sees. It must not know whether
 //! the motion is needed.
 
-use nalgebra::{Matrix3, Vector3};
-
+use super::moment::Moment;
 use super::motion::Motion;
 use super::scene::{Scene, evenly};
 use super::vote::Ballot;
@@ -19,23 +18,13 @@ const FITTED: usize = 100;
 const JUDGED: usize = 200;
 /// Steps of the fit from each start, and of the last one.
 const STEPS: [usize; 2] = [10, 20];
-/// Steps after which the target points around a cluster are looked for again.
-const STEPS_BETWEEN_LOOKS: usize = 4;
-/// Scale of the weight (Geman and McClure) in the first half of the steps and after, metres.
-const SCALES_M: [f32; 2] = [0.2, 0.1];
 /// Shifts that are tried in the end, metres, each up to [`TRIES`] times.
 const SHIFTS_M: [f32; 3] = [0.1, 0.05, 0.025];
 const TRIES: usize = 4;
-/// Pulls toward no shift, and toward no turn, in parts of the weight.
-const DAMPING: [f64; 2] = [1e-3, 0.05];
 /// Points from which a cluster is turned, too.
 const TURNED: usize = 40;
-/// Less weight than this in all moves nothing.
-const LEAST_WEIGHT: f64 = 1e-6;
 /// What a point without a normal holds along every direction: as much as normals all around do.
 const HOLD_OF_A_POINT: f32 = 1.0 / 3.0;
-/// A step shorter than this is the last, metres.
-const SHORT_STEP_M: f64 = 1e-3;
 
 /// What a motion costs, metres: the moved cluster to the target, and back.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -60,21 +49,37 @@ pub(super) struct Found {
     pub(super) still: Cost,
     /// How well the cluster's surfaces hold it along the motion, 0 to 1.
     pub(super) hold: f32,
+    /// What the sweeps around say.
+    pub(super) around: Evidence,
+}
+
+/// What the sweeps around that see a cluster, moved or standing still, say of its motion.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Evidence {
+    /// What they count in all, in times of the target.
+    pub(super) weight: f32,
+    /// Weighted costs, metres.
+    pub(super) still_m: f32,
+    pub(super) moved_m: f32,
+    /// Costs in the sweep nearest in time, standing still and moved, metres.
+    pub(super) nearest_m: [f32; 2],
 }
 
 /// One cluster, to be moved.
 pub(super) struct Mover<'a> {
-    scene: &'a Scene<'a>,
-    cluster: u32,
+    pub(super) scene: &'a Scene<'a>,
+    around: &'a [Moment<'a>],
+    pub(super) cluster: u32,
     rows: Vec<u32>,
 }
 
 impl<'a> Mover<'a> {
-    pub(super) fn new(scene: &'a Scene<'a>, cluster: u32) -> Self {
+    pub(super) fn new(scene: &'a Scene<'a>, around: &'a [Moment<'a>], cluster: u32) -> Self {
         Self {
             scene,
+            around,
             cluster,
-            rows: evenly(&scene.members[cluster as usize], JUDGED),
+            rows: evenly(&scene.source.members[cluster as usize], JUDGED),
         }
     }
 
@@ -87,11 +92,14 @@ impl<'a> Mover<'a> {
     /// needed, or nearly as little as any.
     pub(super) fn search(&self, ballot: &Ballot, still: Cost) -> Option<Found> {
         let options = self.scene.options;
-        let members = &self.scene.members[self.cluster as usize];
+        let members = &self.scene.source.members[self.cluster as usize];
         let count = members.len() as f32;
         let mut center = [0.0; 2];
         for &row in members {
-            for (center, c) in center.iter_mut().zip(self.scene.source[row as usize]) {
+            for (center, c) in center
+                .iter_mut()
+                .zip(self.scene.source.points[row as usize])
+            {
                 *center += c / count;
             }
         }
@@ -101,40 +109,47 @@ impl<'a> Mover<'a> {
         }
         let points = |rows: &[u32]| -> Vec<Point> {
             rows.iter()
-                .map(|&row| self.scene.source[row as usize])
+                .map(|&row| self.scene.source.points[row as usize])
                 .collect()
         };
         let shifts = ballot.peaks(&points(&evenly(members, VOTERS)), options.starts);
         let few = evenly(members, FITTED);
-        let mut best: Option<(Motion, Cost)> = None;
+        let mut best: Option<(Motion, Cost, f32)> = None;
         for shift in shifts.into_iter().chain([[0.0; 2]]) {
-            let motion = self.fitted(&few, &standing.shifted(shift), false, STEPS[0]);
+            let motion = self.fitted(&[], &few, &standing.shifted(shift), false, STEPS[0]);
             let cost = self.cost(&motion);
-            let value = |(motion, cost): &(Motion, Cost)| self.value(motion, *cost);
-            if best
-                .as_ref()
-                .is_none_or(|best| value(&(motion, cost)) < value(best))
-            {
-                best = Some((motion, cost));
+            let way_m = options.way_penalty * motion.length_m();
+            let value = cost.sum_m() + way_m + self.around_m(&motion);
+            if best.is_none_or(|(_, _, least)| value < least) {
+                best = Some((motion, cost, value));
             }
         }
-        let (start, cost) = best?;
+        let (start, cost, _) = best?;
         if still.there_m - cost.there_m < options.gain_m {
             return None;
         }
-        let motion = self.fitted(&self.rows, &start, members.len() >= TURNED, STEPS[1]);
+        let motion = self.fitted(
+            self.around,
+            &self.rows,
+            &start,
+            members.len() >= TURNED,
+            STEPS[1],
+        );
         let (motion, cost) = self.tried(motion);
         Some(Found {
             motion,
             cost,
             still,
             hold: self.hold(&motion),
+            around: self.evidence(&motion),
         })
     }
 
     /// The motion of least cost among those a few shifts away, and its cost.
     fn tried(&self, start: Motion) -> (Motion, Cost) {
-        let mut best = (start, self.cost(&start));
+        let cost = self.cost(&start);
+        let mut best = (start, cost);
+        let mut least = cost.sum_m() + self.around_m(&start);
         for shift_m in SHIFTS_M {
             for _ in 0..TRIES {
                 let center = best.0;
@@ -146,7 +161,9 @@ impl<'a> Mover<'a> {
                 ];
                 for motion in around.map(|shift| center.shifted(shift)) {
                     let cost = self.cost(&motion);
-                    if cost.sum_m() < best.1.sum_m() {
+                    let sum_m = cost.sum_m() + self.around_m(&motion);
+                    if sum_m < least {
+                        least = sum_m;
                         best = (motion, cost);
                     }
                 }
@@ -158,30 +175,56 @@ impl<'a> Mover<'a> {
         best
     }
 
-    /// The cost, and a little for the way.
-    fn value(&self, motion: &Motion, cost: Cost) -> f32 {
-        cost.sum_m() + self.scene.options.way_penalty * motion.length_m()
-    }
-
     /// What a motion costs.
     pub(super) fn cost(&self, motion: &Motion) -> Cost {
-        let options = self.scene.options;
+        self.cost_in(self.scene, motion)
+    }
+
+    /// What those sweeps around that see the cluster, moved or not, say of a motion.
+    fn evidence(&self, motion: &Motion) -> Evidence {
+        let mut all = Evidence::default();
+        let still = Motion::still(motion.center);
+        for (place, moment) in self.around.iter().enumerate() {
+            let [moved, still] =
+                [moment.by_then(motion), still].map(|m| self.cost_in(&moment.scene, &m));
+            if place == 0 {
+                all.nearest_m = [still, moved].map(Cost::sum_m);
+            }
+            let least = moved.there_m.min(still.there_m);
+            if least <= self.scene.options.left_m {
+                all.weight += moment.weight;
+                all.moved_m += moment.weight * moved.sum_m();
+                all.still_m += moment.weight * still.sum_m();
+            }
+        }
+        all
+    }
+
+    /// What a motion costs in the sweeps around: the weighted sum.
+    pub(super) fn around_m(&self, motion: &Motion) -> f32 {
+        let costs = self.around.iter().map(|moment| {
+            moment.weight * self.cost_in(&moment.scene, &moment.by_then(motion)).sum_m()
+        });
+        costs.sum()
+    }
+
+    /// What a motion that leads into the sweep of `scene` costs there.
+    fn cost_in(&self, scene: &Scene<'_>, motion: &Motion) -> Cost {
+        let options = scene.options;
         let mean = |sum: f32, count: usize| sum / count.max(1) as f32;
         let there: f32 = self
             .rows
             .iter()
-            .map(|&row| self.distance(row, motion))
+            .map(|&row| self.distance(scene, row, motion))
             .sum();
-        let touched = self
-            .scene
-            .touched(&self.rows, self.cluster, motion, options.thinned_m);
+        let touched = scene.touched(&self.rows, self.cluster, motion, options.thinned_m);
         let touched = evenly(&touched, JUDGED);
         let back = touched.iter().map(|&row| {
-            let place = motion.undo(self.scene.target[row as usize]);
-            let origin = self.scene.origin_of(place, self.cluster);
+            let place = motion.undo(scene.target[row as usize]);
+            let origin = scene.origin_of(place, self.cluster);
             origin.map_or(options.truncation_m, |origin| {
-                let moved = motion.apply(self.scene.source[origin as usize]);
-                self.scene.distance(moved, row)
+                let moved = motion.apply(scene.source.points[origin as usize]);
+                scene.distance(moved, row)
             })
         });
         let back_m = if touched.is_empty() {
@@ -204,7 +247,7 @@ impl<'a> Mover<'a> {
         let mut sum = 0.0;
         let mut count = 0.0;
         for &row in &self.rows {
-            let moved = motion.apply(self.scene.source[row as usize]);
+            let moved = motion.apply(self.scene.source.points[row as usize]);
             if let Some(target) = self.scene.match_of(moved, self.cluster) {
                 let normal = self.scene.normal(target);
                 let along = normal[0] * x + normal[1] * y;
@@ -220,117 +263,11 @@ impl<'a> Mover<'a> {
     }
 
     /// How far a source point, moved, lies from the target, metres, truncated.
-    pub(super) fn distance(&self, row: u32, motion: &Motion) -> f32 {
-        let moved = motion.apply(self.scene.source[row as usize]);
-        let target = self.scene.match_of(moved, self.cluster);
-        target.map_or(self.scene.options.truncation_m, |target| {
-            self.scene.distance(moved, target)
+    fn distance(&self, scene: &Scene<'_>, row: u32, motion: &Motion) -> f32 {
+        let moved = motion.apply(scene.source.points[row as usize]);
+        let target = scene.match_of(moved, self.cluster);
+        target.map_or(scene.options.truncation_m, |target| {
+            scene.distance(moved, target)
         })
-    }
-
-    /// Gauss-Newton from `start`.
-    fn fitted(&self, rows: &[u32], start: &Motion, turned: bool, steps: usize) -> Motion {
-        let scene = self.scene;
-        let mut motion = *start;
-        let mut touched = Vec::new();
-        for step in 0..steps {
-            if step % STEPS_BETWEEN_LOOKS == 0 {
-                let all = scene.touched(rows, self.cluster, &motion, scene.options.thinned_m);
-                touched = evenly(&all, rows.len());
-            }
-            let mut sums = Sums::new(&motion, SCALES_M[usize::from(step >= steps / 2)]);
-            for &row in rows {
-                let moved = motion.apply(scene.source[row as usize]);
-                if let Some(target) = scene.match_of(moved, self.cluster) {
-                    sums.add(scene, moved, target);
-                }
-            }
-            for &target in &touched {
-                let place = motion.undo(scene.target[target as usize]);
-                if let Some(origin) = scene.origin_of(place, self.cluster) {
-                    sums.add(scene, motion.apply(scene.source[origin as usize]), target);
-                }
-            }
-            let Some([x, y, turn]) = sums.step(turned) else {
-                break;
-            };
-            motion = motion.shifted([x as f32, y as f32]);
-            motion.turn += turn as f32;
-            if step > steps / 2 && x.hypot(y) < SHORT_STEP_M {
-                break;
-            }
-        }
-        motion
-    }
-}
-
-/// The normal equations of a shift and a turn.
-struct Sums {
-    pivot: [f32; 2],
-    square_scale: f32,
-    normal: Matrix3<f64>,
-    gradient: Vector3<f64>,
-    weight: f64,
-}
-
-impl Sums {
-    fn new(motion: &Motion, scale_m: f32) -> Self {
-        Self {
-            pivot: [0, 1].map(|a| motion.center[a] + motion.shift_m[a]),
-            square_scale: scale_m * scale_m,
-            normal: Matrix3::zeros(),
-            gradient: Vector3::zeros(),
-            weight: 0.0,
-        }
-    }
-
-    fn add(&mut self, scene: &Scene<'_>, moved: Point, target: u32) {
-        let distance = scene.distance(moved, target);
-        let weight = self.square_scale / (self.square_scale + distance * distance);
-        let weight = f64::from(weight * weight);
-        let to = scene.target[target as usize];
-        let away: Point = core::array::from_fn(|a| to[a] - moved[a]);
-        let [rx, ry] = [0, 1].map(|a| moved[a] - self.pivot[a]);
-        let normal = scene.normal(target);
-        let leak = if normal == [0.0; 3] {
-            1.0
-        } else {
-            scene.options.leak
-        };
-        let along = normal[0] * away[0] + normal[1] * away[1] + normal[2] * away[2];
-        let rows = [
-            (
-                [normal[0], normal[1], normal[1] * rx - normal[0] * ry],
-                along,
-            ),
-            ([leak, 0.0, -leak * ry], leak * away[0]),
-            ([0.0, leak, leak * rx], leak * away[1]),
-        ];
-        for (jacobian, residual) in rows {
-            let jacobian = Vector3::from(jacobian.map(f64::from));
-            self.normal += jacobian * jacobian.transpose() * weight;
-            self.gradient += jacobian * (weight * f64::from(residual));
-        }
-        self.weight += weight;
-    }
-
-    /// The shift and the turn that follow; none where nothing was matched.
-    fn step(mut self, turned: bool) -> Option<[f64; 3]> {
-        if self.weight < LEAST_WEIGHT {
-            return None;
-        }
-        let [shift, turn] = DAMPING;
-        for (axis, damping) in [shift, shift, turn].into_iter().enumerate() {
-            self.normal[(axis, axis)] += damping * self.weight;
-        }
-        if !turned {
-            for axis in 0..2 {
-                self.normal[(axis, 2)] = 0.0;
-                self.normal[(2, axis)] = 0.0;
-            }
-            self.gradient[2] = 0.0;
-        }
-        let step = self.normal.cholesky()?.solve(&self.gradient);
-        Some(step.into())
     }
 }

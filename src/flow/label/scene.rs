@@ -19,55 +19,25 @@ const NEIGHBORS: f64 = 4.0;
 /// Share of a cluster that must lie on the target for it to stand still plainly.
 const PLAIN: f32 = 0.9;
 
-/// The clouds.
-pub(super) struct Scene<'a> {
-    pub(super) options: &'a LabelOptions,
-    /// Source points, ego motion taken out, one a voxel, and the cluster of each.
-    pub(super) source: Vec<Point>,
+/// What moves: the source, the ego motion taken out, thinned.
+pub(super) struct Thinned {
+    /// One point a voxel, and the cluster of each.
+    pub(super) points: Vec<Point>,
     pub(super) labels: Vec<u32>,
-    /// Target points, one a voxel, and their unit normals; zero where there is no flat surface.
-    pub(super) target: Vec<Point>,
-    normals: Vec<Point>,
-    /// By place, heights shrunk.
-    near_source: Near,
-    near_target: Near,
-    /// Of each target point, the cluster that it is taken by.
-    taken: Vec<u32>,
-    /// Of each cluster, the rows of `source`.
+    /// Of each cluster, the rows of `points`.
     pub(super) members: Vec<Vec<u32>>,
+    /// By place, heights shrunk.
+    low: Vec<Point>,
+    near: Near,
 }
 
-impl<'a> Scene<'a> {
+impl Thinned {
     /// `labels` are the clusters of `source`.
-    pub(super) fn new(
-        source: &[Point],
-        labels: &[u32],
-        target: &[Point],
-        options: &'a LabelOptions,
-    ) -> Self {
-        let (kept, kept_target) = rayon::join(
-            || one_a_voxel(source, options.thinned_m),
-            || one_a_voxel(target, options.thinned_m),
-        );
+    pub(super) fn new(source: &[Point], labels: &[u32], options: &LabelOptions) -> Self {
+        let kept = one_a_voxel(source, options.thinned_m);
         let labels: Vec<u32> = kept.iter().map(|&row| labels[row as usize]).collect();
-        let source: Vec<Point> = kept.iter().map(|&row| source[row as usize]).collect();
-        let target: Vec<Point> = kept_target
-            .iter()
-            .map(|&row| target[row as usize])
-            .collect();
-        let low = |points: &[Point]| -> Vec<Point> {
-            points.iter().map(|&p| lowered(p, options)).collect()
-        };
-        let (low_source, low_target) = (low(&source), low(&target));
-        let (near_source, near_target) = rayon::join(
-            || Near::new(&low_source, options.match_m),
-            || Near::new(&low_target, options.match_m),
-        );
-        let upright = Near::new(&target, options.match_m);
-        let normals = target
-            .par_iter()
-            .map(|&point| normal(&upright, point, options));
-        let normals = normals.collect();
+        let points: Vec<Point> = kept.iter().map(|&row| source[row as usize]).collect();
+        let low: Vec<Point> = points.iter().map(|&p| lowered(p, options)).collect();
         let clusters = labels.iter().filter(|&&label| label != NOISE).max();
         let mut members = vec![Vec::new(); clusters.map_or(0, |&last| last as usize + 1)];
         for (&label, row) in labels.iter().zip(0..) {
@@ -75,12 +45,51 @@ impl<'a> Scene<'a> {
                 members[label as usize].push(row);
             }
         }
+        Self {
+            near: Near::new(&low, options.match_m),
+            points,
+            labels,
+            members,
+            low,
+        }
+    }
+}
+
+/// The clouds.
+pub(super) struct Scene<'a> {
+    pub(super) options: &'a LabelOptions,
+    pub(super) source: &'a Thinned,
+    /// Target points, one a voxel, and their unit normals; zero where there is no flat surface.
+    pub(super) target: Vec<Point>,
+    normals: Vec<Point>,
+    /// By place, heights shrunk.
+    near_target: Near,
+    /// Of each target point, the cluster that it is taken by.
+    taken: Vec<u32>,
+}
+
+impl<'a> Scene<'a> {
+    /// Of `source` and `target`.
+    pub(super) fn new(source: &'a Thinned, target: &[Point], options: &'a LabelOptions) -> Self {
+        let target: Vec<Point> = one_a_voxel(target, options.thinned_m)
+            .into_iter()
+            .map(|row| target[row as usize])
+            .collect();
+        let low_target: Vec<Point> = target.iter().map(|&p| lowered(p, options)).collect();
+        let near_target = Near::new(&low_target, options.match_m);
+        let upright = Near::new(&target, options.match_m);
+        let normals = target
+            .par_iter()
+            .map(|&point| normal(&upright, point, options));
+        let normals = normals.collect();
         let within = options.taken_m;
-        let on_target: Vec<bool> = low_source
+        let on_target: Vec<bool> = source
+            .low
             .par_iter()
             .map(|&point| near_target.nearest(point, within, |_| true).is_some())
             .collect();
-        let still: Vec<bool> = members
+        let still: Vec<bool> = source
+            .members
             .iter()
             .map(|rows: &Vec<u32>| {
                 let on = rows.iter().filter(|&&row| on_target[row as usize]).count();
@@ -88,8 +97,8 @@ impl<'a> Scene<'a> {
             })
             .collect();
         let taken = low_target.par_iter().map(|&point| {
-            let owner = near_source.nearest(point, within, |_| true);
-            let cluster = owner.map_or(NOISE, |(row, _)| labels[row as usize]);
+            let owner = source.near.nearest(point, within, |_| true);
+            let cluster = owner.map_or(NOISE, |(row, _)| source.labels[row as usize]);
             if cluster != NOISE && still[cluster as usize] {
                 cluster
             } else {
@@ -100,13 +109,10 @@ impl<'a> Scene<'a> {
         Self {
             options,
             source,
-            labels,
             target,
             normals,
-            near_source,
             near_target,
             taken,
-            members,
         }
     }
 
@@ -128,14 +134,15 @@ impl<'a> Scene<'a> {
     #[inline]
     pub(super) fn origin_of(&self, place: Point, cluster: u32) -> Option<u32> {
         let place = lowered(place, self.options);
-        let of_it = |row: u32| self.labels[row as usize] == cluster;
-        let found = self.near_source.nearest(place, self.options.match_m, of_it);
+        let of_it = |row: u32| self.source.labels[row as usize] == cluster;
+        let found = self.source.near.nearest(place, self.options.match_m, of_it);
         found.map(|(row, _)| row)
     }
 
     /// Calls `see` with every source point about within the match of a place.
     pub(super) fn source_around(&self, place: Point, mut see: impl FnMut(u32)) {
-        self.near_source
+        self.source
+            .near
             .around(lowered(place, self.options), |row, _| see(row));
     }
 
@@ -159,7 +166,7 @@ impl<'a> Scene<'a> {
         let within = self.options.match_m * self.options.match_m;
         let mut found = Vec::new();
         for &row in rows {
-            let place = lowered(motion.apply(self.source[row as usize]), self.options);
+            let place = lowered(motion.apply(self.source.points[row as usize]), self.options);
             self.near_target.around(place, |row, point| {
                 let owner = self.taken[row as usize];
                 if (owner == NOISE || owner == cluster) && square_distance(place, point) < within {

@@ -7,6 +7,7 @@
 use rayon::prelude::*;
 
 use super::cluster::NOISE;
+use super::moment::Moment;
 use super::motion::Motion;
 use super::rigid::{Found, Mover};
 use super::scene::{Scene, evenly};
@@ -28,14 +29,14 @@ pub(super) struct Spread {
 }
 
 /// Shares the motions out.
-pub(super) fn spread(scene: &Scene<'_>, needed: &[Option<Found>]) -> Spread {
+pub(super) fn spread(scene: &Scene<'_>, around: &[Moment<'_>], needed: &[Option<Found>]) -> Spread {
     let leaders: Vec<u32> = (0..needed.len() as u32)
         .into_par_iter()
-        .map(|cluster| leader(scene, needed, cluster))
+        .map(|cluster| leader(scene, around, needed, cluster))
         .collect();
-    let owners = (0..scene.source.len() as u32)
+    let owners = (0..scene.source.points.len() as u32)
         .into_par_iter()
-        .map(|row| match scene.labels[row as usize] {
+        .map(|row| match scene.source.labels[row as usize] {
             NOISE => leader_of_stray(scene, needed, row),
             label => {
                 let leader = leaders[label as usize];
@@ -50,14 +51,14 @@ pub(super) fn spread(scene: &Scene<'_>, needed: &[Option<Found>]) -> Spread {
 }
 
 /// The cluster whose motion a cluster has: its own, that of a larger mover beside it, or none.
-fn leader(scene: &Scene<'_>, needed: &[Option<Found>], cluster: u32) -> u32 {
-    let members = &scene.members[cluster as usize];
+fn leader(scene: &Scene<'_>, around: &[Moment<'_>], needed: &[Option<Found>], cluster: u32) -> u32 {
+    let members = &scene.source.members[cluster as usize];
     let own = needed[cluster as usize].as_ref();
-    let size = |cluster: u32| scene.members[cluster as usize].len();
+    let size = |cluster: u32| scene.source.members[cluster as usize].len();
     let mut beside: Vec<u32> = Vec::new();
     for row in evenly(members, LOOKING) {
-        scene.source_around(scene.source[row as usize], |other| {
-            let label = scene.labels[other as usize];
+        scene.source_around(scene.source.points[row as usize], |other| {
+            let label = scene.source.labels[other as usize];
             if label != NOISE && label != cluster && needed[label as usize].is_some() {
                 beside.push(label);
             }
@@ -69,15 +70,16 @@ fn leader(scene: &Scene<'_>, needed: &[Option<Found>], cluster: u32) -> u32 {
     if beside.is_empty() {
         return if own.is_some() { cluster } else { NOISE };
     }
-    let mover = Mover::new(scene, cluster);
-    let still = mover.standing_still().sum_m();
+    let mover = Mover::new(scene, around, cluster);
+    let cost = |motion: &Motion| mover.cost(motion).sum_m() + mover.around_m(motion);
+    let still = cost(&Motion::still([0.0; 2]));
     let mut best = match own {
-        Some(found) => (found.cost.sum_m() + BETTER_M, cluster),
+        Some(found) => (cost(&found.motion) + BETTER_M, cluster),
         None => (still * scene.options.beside_cost, NOISE),
     };
     for label in beside {
         if let Some(found) = &needed[label as usize] {
-            let cost = mover.cost(&found.motion).sum_m();
+            let cost = cost(&found.motion);
             if cost < best.0 {
                 best = (cost, label);
             }
@@ -88,10 +90,10 @@ fn leader(scene: &Scene<'_>, needed: &[Option<Found>], cluster: u32) -> u32 {
 
 /// The mover whose motion a point of no cluster has, if any.
 fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Found>], row: u32) -> u32 {
-    let place = scene.source[row as usize];
+    let place = scene.source.points[row as usize];
     let mut beside: Vec<u32> = Vec::new();
     scene.source_around(place, |other| {
-        let label = scene.labels[other as usize];
+        let label = scene.source.labels[other as usize];
         if label != NOISE && needed[label as usize].is_some() {
             beside.push(label);
         }
@@ -113,13 +115,13 @@ fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Found>], row: u32) -> u32
 
 /// Whether the points around one of a mover's are explained by its motion no worse than by none.
 fn is_of(scene: &Scene<'_>, row: u32, motion: &Motion) -> bool {
-    let label = scene.labels[row as usize];
-    let center = scene.source[row as usize];
+    let label = scene.source.labels[row as usize];
+    let center = scene.source.points[row as usize];
     let (mut worse, mut count) = (0.0, 0.0_f32);
     scene.source_around(center, |other| {
-        let place = scene.source[other as usize];
+        let place = scene.source.points[other as usize];
         let near = (0..3).map(|a| (place[a] - center[a]).powi(2)).sum::<f32>();
-        if scene.labels[other as usize] == label && near < VOTE_M * VOTE_M {
+        if scene.source.labels[other as usize] == label && near < VOTE_M * VOTE_M {
             let distance = |place: Point| {
                 let target = scene.match_of(place, label);
                 target.map_or(scene.options.truncation_m, |target| {

@@ -38,7 +38,7 @@ fn wall(random: &mut Random, [from, to]: [f64; 2]) -> Vec<Point> {
 }
 
 fn found(source: &[Point], target: &[Point]) -> Labelled {
-    label(source, target, &LabelOptions::default(), &Unwatched)
+    label(source, target, &[], &LabelOptions::default(), &Unwatched)
 }
 
 #[test]
@@ -180,13 +180,13 @@ fn an_interrupt_keeps_what_was_found_until_then() {
     let mut last = 0;
     for looks in [0, 2, 3, 4] {
         let watch = After(looks, Interrupt::Deadline, AtomicUsize::new(0));
-        let labelled = label(&source, &target, &options, &watch);
+        let labelled = label(&source, &target, &[], &options, &watch);
         assert_eq!(labelled.interrupted, Some(Interrupt::Deadline));
         assert!(labelled.clusters >= last && labelled.clusters < whole);
         last = labelled.clusters;
     }
     assert!(last > 0);
     let watch = After(3, Interrupt::Cancelled, AtomicUsize::new(0));
-    let labelled = label(&source, &target, &options, &watch);
+    let labelled = label(&source, &target, &[], &options, &watch);
     assert_eq!(labelled.interrupted, Some(Interrupt::Cancelled));
 }

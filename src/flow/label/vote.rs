@@ -99,6 +99,7 @@ impl Ballot {
 mod tests {
     use super::*;
     use crate::flow::label::cluster::NOISE;
+    use crate::flow::label::scene::Thinned;
     use crate::flow::random::Random;
 
     #[test]
@@ -112,7 +113,8 @@ mod tests {
             .iter()
             .map(|&[x, y, z]| [x + shift[0], y + shift[1], z]);
         let target: Vec<Point> = moved.collect();
-        let scene = Scene::new(&source, &[NOISE; 80], &target, &options);
+        let thinned = Thinned::new(&source, &[NOISE; 80], &options);
+        let scene = Scene::new(&thinned, &target, &options);
         let peaks = Ballot::new(&scene).peaks(&source, 4);
         assert_eq!(peaks.len(), 4);
         let [x, y] = [0, 1].map(|a| (peaks[0][a] - shift[a]).abs());
@@ -128,7 +130,8 @@ mod tests {
     #[test]
     fn points_without_a_target_have_no_peaks() {
         let options = LabelOptions::default();
-        let scene = Scene::new(&[[0.0; 3]], &[NOISE], &[[50.0; 3]], &options);
+        let thinned = Thinned::new(&[[0.0; 3]], &[NOISE], &options);
+        let scene = Scene::new(&thinned, &[[50.0; 3]], &options);
         assert!(Ballot::new(&scene).peaks(&[[0.0; 3]], 4).is_empty());
     }
 }

@@ -41,6 +41,7 @@ fn solve(
         target: &pair.target,
         ground: Some([&pair.ground_source, &pair.ground_target]),
         before: None,
+        around: &[],
     };
     estimate(&backend, &problem, options, watch)
 }
@@ -75,6 +76,7 @@ fn ground_that_is_found_moves_with_the_vehicle_and_takes_no_part() {
             target: &pair.target,
             ground: None,
             before: None,
+            around: &[],
         };
         estimate(&backend, &problem, options, &Unwatched).expect("a flow")
     };

@@ -35,6 +35,7 @@ fn a_card_lost_in_the_middle_of_a_run_fails_the_run_and_can_be_opened_again() {
         target: &target,
         ground: None,
         before: None,
+        around: &[],
     };
     let options = Preset::Neural.options(None);
     let killed = estimate(&gpu, &problem, &options, &Kill(&gpu, AtomicUsize::new(0)));

@@ -48,6 +48,7 @@ pub(super) fn solved(backend: &dyn Backend, pair: &SimulatedPair, options: &Opti
         target: &pair.target,
         ground: None,
         before: None,
+        around: &[],
     };
     estimate(backend, &problem, options, &Unwatched).expect("a flow")
 }

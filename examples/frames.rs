@@ -1,0 +1,215 @@
+//! The table of `docs/numerics.md` on several frames: movers found in two sweeps, and with others of
+//! the sequence around them.
+//!
+//! ```text
+//! FNSF_REAL_DATA=... cargo run --release --example frames -- [--streets FROM..TO]
+//! ```
+//!
+//! Points off the ground by the sweeps' own masks, the ego motion estimated. `kitti_0000` below
+//! `FNSF_REAL_DATA`, where it is set, whose later sweeps have their ground found; then the mean of
+//! streets of 64 and of 32 beams, of five sweeps: the first pair, and the one in the middle.
+#![expect(
+    clippy::print_stdout,
+    reason = "the table is the answer of this program"
+)]
+
+use std::time::Instant;
+
+use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::evaluate::{Truth, evaluate};
+use fnsf::flow::simulate::{Street, StreetOptions};
+use fnsf::flow::{self, Around, Ground, LabelOptions, Point, Preset, Problem, Sweep, Watch};
+use fnsf::formats::{read_cloud, read_pair};
+
+/// Streets by their number of beams and by the first sweep of the pair, and which.
+const BEAMS: [usize; 2] = [64, 32];
+const PAIRS: [usize; 2] = [0, 2];
+const STREETS: [u64; 2] = [0, 6];
+
+/// A change of the options that see five sweeps.
+type Change = fn(&mut LabelOptions);
+
+const VARIANTS: [(&str, Change); 5] = [
+    ("two sweeps", |o| o.frames = 2),
+    ("three sweeps", |o| o.frames = 3),
+    ("five sweeps", |_| {}),
+    ("what slides is never confirmed", |o| o.confirmed_cost = 0.0),
+    ("confirmed by less", |o| {
+        o.confirmed_cost = 0.7;
+        o.confirmed_m = 0.05;
+    }),
+];
+
+/// A clock for the numerics.
+struct Clock(Instant);
+
+impl Watch for Clock {
+    fn seconds(&self) -> f64 {
+        self.0.elapsed().as_secs_f64()
+    }
+}
+
+/// A pair with what is true of it, and the sweeps around it.
+struct Known {
+    name: String,
+    pair: [Sweep; 2],
+    around: Vec<(i8, Sweep)>,
+    flow: Vec<Point>,
+    valid: Vec<bool>,
+    dynamic: Vec<bool>,
+}
+
+fn kitti() -> Result<Vec<Known>, String> {
+    let Some(folder) = std::env::var_os("FNSF_REAL_DATA") else {
+        return Ok(Vec::new());
+    };
+    let folder = std::path::Path::new(&folder).join("kitti_0000");
+    let read = |name: &str| std::fs::read(folder.join(name)).map_err(|e| format!("{name}: {e}"));
+    let pair = read_pair(&read("pair.npz")?).map_err(|e| e.to_string())?;
+    let truth = pair.truth.ok_or("the pair has no truth")?;
+    let ground = pair.ground.ok_or("the pair has no ground masks")?;
+    let options = Preset::Label.options(None);
+    let later = |at: i8| {
+        let name = format!("{at:010}.pcd");
+        let cloud = read_cloud(&read(&name)?, Some(&name)).map_err(|e| e.to_string())?;
+        let sweep = Sweep {
+            points: cloud.points,
+            ground: None,
+        };
+        Ok((at, sweep.prepared(&options)))
+    };
+    let sweep = |points, ground| Sweep {
+        points,
+        ground: Some(ground),
+    };
+    Ok(vec![Known {
+        name: "kitti_0000".to_owned(),
+        pair: [
+            sweep(pair.source, ground.source),
+            sweep(pair.target, ground.target),
+        ],
+        around: (2..5).map(later).collect::<Result<_, String>>()?,
+        flow: truth.flow,
+        valid: truth.valid,
+        dynamic: truth.dynamic.ok_or("the pair does not say what moves")?,
+    }])
+}
+
+fn street(beams: usize, seed: u64, first: usize) -> Result<Known, String> {
+    let options = StreetOptions {
+        seed,
+        beams,
+        frames: 5,
+        ..StreetOptions::default()
+    };
+    let street = Street::new(&options).map_err(|e| e.to_string())?;
+    let sweep = |frame| {
+        let frame = street.frame(frame).map_err(|e| e.to_string())?;
+        Ok::<_, String>(Sweep {
+            points: frame.points,
+            ground: Some(frame.ground),
+        })
+    };
+    let truth = street.pair(first).map_err(|e| e.to_string())?;
+    let around = (0..5).filter(|&frame| frame != first && frame != first + 1);
+    let around = around.map(|frame| Ok((frame as i8 - first as i8, sweep(frame)?)));
+    Ok(Known {
+        name: format!("streets, {beams} beams, pair {first}"),
+        pair: [sweep(first)?, sweep(first + 1)?],
+        around: around.collect::<Result<_, String>>()?,
+        valid: vec![true; truth.source.len()],
+        flow: truth.flow,
+        dynamic: truth.dynamic,
+    })
+}
+
+/// EPE, that of movers, that of what stands still, seconds.
+type Row = [f64; 4];
+
+fn run(backend: &CpuBackend, known: &Known, label: &LabelOptions) -> Result<Row, String> {
+    let mut options = Preset::Label.options(None);
+    options.ground = Ground::Mask;
+    options.label = Some(label.clone());
+    let [source, target] = &known.pair;
+    let ground = source.ground.as_deref().zip(target.ground.as_deref());
+    let around: Vec<Around> = known
+        .around
+        .iter()
+        .map(|(at, sweep)| Around {
+            points: &sweep.points,
+            ground: sweep.ground.as_deref(),
+            at: *at,
+        })
+        .collect();
+    let problem = Problem {
+        source: &source.points,
+        target: &target.points,
+        ground: ground.map(|(source, target)| [source, target]),
+        before: None,
+        around: &around,
+    };
+    let clock = Clock(Instant::now());
+    let found = flow::estimate(backend, &problem, &options, &clock).map_err(|e| e.to_string())?;
+    let truth = Truth {
+        dynamic: Some(&known.dynamic),
+        ground: source.ground.as_deref(),
+        source: Some(&source.points),
+        ..Truth::new(&known.flow, &known.valid)
+    };
+    let metrics = evaluate(&found.flow, &found.valid, &truth).map_err(|e| e.to_string())?;
+    Ok([
+        metrics.epe,
+        metrics.epe_dynamic.unwrap_or(f64::NAN),
+        metrics.epe_static.unwrap_or(f64::NAN),
+        found.seconds.total,
+    ])
+}
+
+fn mean(rows: &[Row]) -> Row {
+    let count = rows.len() as f64;
+    core::array::from_fn(|column| rows.iter().map(|row| row[column]).sum::<f64>() / count)
+}
+
+/// The streets that are asked for, first and one after the last.
+fn seeds() -> Result<[u64; 2], String> {
+    let mut arguments = std::env::args().skip(1);
+    match (arguments.next().as_deref(), arguments.next()) {
+        (None, _) => Ok(STREETS),
+        (Some("--streets"), Some(range)) => {
+            let (from, to) = range.split_once("..").ok_or("streets are FROM..TO")?;
+            let number = |text: &str| text.parse().map_err(|e| format!("{text}: {e}"));
+            Ok([number(from)?, number(to)?])
+        }
+        _ => Err("there is only --streets FROM..TO".to_owned()),
+    }
+}
+
+fn main() -> Result<(), String> {
+    let [from, to] = seeds()?;
+    let mut groups = vec![kitti()?];
+    for beams in BEAMS {
+        for first in PAIRS {
+            let streets = (from..to).map(|seed| street(beams, seed, first));
+            groups.push(streets.collect::<Result<_, _>>()?);
+        }
+    }
+    groups.retain(|group| !group.is_empty());
+    let backend = CpuBackend::new(None).map_err(|e| e.to_string())?;
+    println!("| variant | pairs | EPE | EPE moving | EPE static | s |");
+    println!("|---|---|---|---|---|---|");
+    for (variant, change) in VARIANTS {
+        let mut label = LabelOptions {
+            frames: 5,
+            ..LabelOptions::default()
+        };
+        change(&mut label);
+        for group in &groups {
+            let rows = group.iter().map(|known| run(&backend, known, &label));
+            let rows: Vec<Row> = rows.collect::<Result<_, _>>()?;
+            let [epe, moving, still, seconds] = mean(&rows);
+            let name = &group[0].name;
+            println!("| {variant} | {name} | {epe:.4} | {moving:.4} | {still:.4} | {seconds:.2} |");
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,205 @@
+//! Pairs that see the sweeps around them. Bounds are what is asked of it; `examples/frames.rs` has the
+//! figures.
+
+use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::evaluate::Metrics;
+use fnsf::flow::simulate::{Street, StreetOptions};
+use fnsf::flow::{
+    Around, Estimate, Ground, Options, Preset, Problem, Sequence, Sweep, Unwatched, Watch,
+    estimate, window,
+};
+use fnsf::formats::{Pair, PairTruth, read_cloud};
+
+use super::scenes::{real_pair, scored};
+
+/// Preset `label` that sees so many sweeps.
+fn seeing(frames: usize) -> Options {
+    let mut options = Preset::Label.options(None);
+    if let Some(label) = &mut options.label {
+        label.frames = frames;
+    }
+    options
+}
+
+/// Pair `pair` of `sweeps`, with all others around it.
+fn alone(sweeps: &[Sweep], pair: usize, options: &Options, watch: &dyn Watch) -> Estimate {
+    let backend = CpuBackend::new(Some(2)).expect("threads");
+    let others = (0..sweeps.len()).filter(|&place| place != pair && place != pair + 1);
+    let others = others.map(|place| Around {
+        points: &sweeps[place].points,
+        ground: sweeps[place].ground.as_deref(),
+        at: place as i8 - pair as i8,
+    });
+    let around: Vec<Around> = others.collect();
+    let [source, target] = [pair, pair + 1].map(|place| &sweeps[place]);
+    let ground = source.ground.as_deref().zip(target.ground.as_deref());
+    let problem = Problem {
+        source: &source.points,
+        target: &target.points,
+        ground: ground.map(<[_; 2]>::from),
+        before: None,
+        around: &around,
+    };
+    estimate(&backend, &problem, options, watch).expect("a flow")
+}
+
+fn drive(seed: u64, frames: usize, beams: usize) -> (Street, Vec<Sweep>) {
+    let options = StreetOptions {
+        seed,
+        frames,
+        beams,
+        azimuth_steps: 1000,
+        ..StreetOptions::default()
+    };
+    let street = Street::new(&options).expect("a street");
+    let sweep = |place| {
+        let frame = street.frame(place).expect("a frame");
+        Sweep {
+            points: frame.points,
+            ground: Some(frame.ground),
+        }
+    };
+    let sweeps = (0..frames).map(sweep).collect();
+    (street, sweeps)
+}
+
+fn known(street: &Street, pair: usize) -> Pair {
+    let pair = street.pair(pair).expect("a pair");
+    Pair {
+        truth: Some(PairTruth {
+            valid: vec![true; pair.source.len()],
+            flow: pair.flow,
+            dynamic: Some(pair.dynamic),
+            category: None,
+            foreground: Some(pair.foreground),
+        }),
+        ground: Some(fnsf::formats::Ground {
+            source: pair.ground_source,
+            target: pair.ground_target,
+        }),
+        ego: Some(pair.target_from_source),
+        source: pair.source,
+        target: pair.target,
+    }
+}
+
+fn moving(metrics: &Metrics) -> f64 {
+    metrics.epe_dynamic.expect("something moves")
+}
+
+fn still(metrics: &Metrics) -> f64 {
+    metrics.epe_static.expect("something stands")
+}
+
+#[test]
+fn five_sweeps_beat_two_on_streets_for_what_moves_and_not_at_the_cost_of_what_stands() {
+    /// On full streets they leave a third to a half.
+    const LEFT: f64 = 0.7;
+    let (mut two, mut five) = ([0.0; 2], [0.0; 2]);
+    for seed in 0..3 {
+        let (street, sweeps) = drive(seed, 5, 32);
+        for pair in [0, 2] {
+            let known = known(&street, pair);
+            for (sums, frames) in [(&mut two, 2), (&mut five, 5)] {
+                let options = seeing(frames);
+                let metrics = scored(&known, &alone(&sweeps, pair, &options, &Unwatched));
+                sums[0] += moving(&metrics);
+                sums[1] += still(&metrics);
+            }
+        }
+    }
+    assert!(five[0] <= two[0] * LEFT, "moving: {five:?}, {two:?}");
+    assert!(five[1] <= two[1] * 1.05, "still: {five:?}, {two:?}");
+}
+
+#[test]
+fn five_sweeps_beat_two_on_a_real_drive() {
+    const NAME: &str = "kitti_0000";
+    let Some(pair) = real_pair(NAME) else { return };
+    let folder = std::env::var_os("FNSF_REAL_DATA").expect("the pair was read from there");
+    let folder = std::path::PathBuf::from(folder).join(NAME);
+    let ground = pair.ground.clone().expect("the pair has ground masks");
+    let sweep = |points, ground| Sweep { points, ground };
+    let mut sweeps = vec![
+        sweep(pair.source.clone(), Some(ground.source)),
+        sweep(pair.target.clone(), Some(ground.target)),
+    ];
+    for place in 2..5 {
+        let name = format!("{place:010}.pcd");
+        let bytes = std::fs::read(folder.join(&name)).expect("the drive has the sweep");
+        let cloud = read_cloud(&bytes, Some(&name)).expect("the sweep is sound");
+        let options = seeing(5);
+        sweeps.push(sweep(cloud.points, None).prepared(&options));
+    }
+    let [two, five] = [2, 5].map(|frames| {
+        let options = Options {
+            ground: Ground::Mask,
+            ..seeing(frames)
+        };
+        scored(&pair, &alone(&sweeps, 0, &options, &Unwatched))
+    });
+    let bounds = [moving(&two) - 0.001, still(&two) + 0.0001];
+    assert!(moving(&five) <= bounds[0], "{five:?}, {two:?}");
+    assert!(still(&five) <= bounds[1], "{five:?}, {two:?}");
+}
+
+#[test]
+fn without_sweeps_around_or_where_two_are_asked_for_a_pair_is_what_it_is_alone() {
+    let (_, sweeps) = drive(4, 4, 16);
+    let pair = alone(&sweeps[1..3], 0, &seeing(2), &Unwatched);
+    assert_eq!(
+        pair.flow,
+        alone(&sweeps[1..3], 0, &seeing(5), &Unwatched).flow
+    );
+    assert_eq!(pair.flow, alone(&sweeps, 1, &seeing(2), &Unwatched).flow);
+    assert_ne!(pair.flow, alone(&sweeps, 1, &seeing(4), &Unwatched).flow);
+    let other = Preset::Paper.options(Some(500));
+    let paper = alone(&sweeps[1..3], 0, &other, &Unwatched);
+    assert_eq!(paper.flow, alone(&sweeps, 1, &other, &Unwatched).flow);
+}
+
+#[test]
+fn where_time_is_short_the_sweeps_around_are_done_without_first() {
+    /// So many seconds are left, always.
+    struct Left(f64);
+    impl Watch for Left {
+        fn seconds_left(&self) -> Option<f64> {
+            Some(self.0)
+        }
+    }
+    let (_, sweeps) = drive(4, 5, 16);
+    let pair = alone(&sweeps[2..4], 0, &seeing(2), &Unwatched);
+    let whole = alone(&sweeps, 2, &seeing(5), &Unwatched);
+    // A fifth of a second is enough for the ego motion of so few points.
+    assert_eq!(pair.flow, alone(&sweeps, 2, &seeing(5), &Left(0.2)).flow);
+    assert_eq!(whole.flow, alone(&sweeps, 2, &seeing(5), &Left(60.0)).flow);
+    assert_ne!(whole.flow, pair.flow);
+}
+
+#[test]
+fn a_pair_of_a_sequence_has_the_bits_of_its_window_alone_and_comes_as_soon_as_that_is_whole() {
+    const SWEEPS: usize = 7;
+    let (_, sweeps) = drive(5, SWEEPS, 16);
+    for (frames, delays) in [(2, [0, 1, 1, 1, 1, 1, 1]), (5, [0, 0, 0, 0, 3, 1, 1])] {
+        let (options, backend) = (seeing(frames), CpuBackend::new(Some(2)).expect("threads"));
+        let mut sequence = Sequence::default();
+        let mut estimates = Vec::new();
+        for (sweep, count) in sweeps.iter().zip(delays) {
+            let pushed = sequence.push(&backend, sweep.clone(), &options, &Unwatched);
+            let pushed = pushed.expect("flows");
+            assert_eq!(pushed.len(), count);
+            estimates.extend(pushed);
+        }
+        estimates.extend(sequence.finish(&backend, &Unwatched).expect("the rest"));
+        assert_eq!(estimates.len(), SWEEPS - 1);
+        for (pair, estimate) in estimates.iter().enumerate() {
+            let seen = window(pair, SWEEPS, frames);
+            let first = seen.start;
+            let other = alone(&sweeps[seen], pair - first, &options, &Unwatched);
+            assert_eq!(estimate.flow, other.flow, "pair {pair} of {frames} frames");
+            assert_eq!(estimate.field.to_bytes(), other.field.to_bytes());
+        }
+        let rest = sequence.finish(&backend, &Unwatched).expect("nothing");
+        assert!(rest.is_empty());
+    }
+}
