@@ -34,9 +34,9 @@ const VARIANTS: [(&str, Change); 5] = [
     ("three sweeps", |o| o.frames = 3),
     ("five sweeps", |_| {}),
     ("what slides is never confirmed", |o| o.confirmed_cost = 0.0),
-    ("confirmed by less", |o| {
-        o.confirmed_cost = 0.7;
-        o.confirmed_m = 0.05;
+    ("confirmed by more", |o| {
+        o.confirmed_cost = 0.5;
+        o.confirmed_m = 0.1;
     }),
 ];
 

@@ -334,8 +334,8 @@ impl Default for LabelOptions {
             flat_points: 30,
             flat_m: 0.2,
             frames: 2,
-            confirmed_cost: 0.5,
-            confirmed_m: 0.1,
+            confirmed_cost: 0.7,
+            confirmed_m: 0.05,
         }
     }
 }

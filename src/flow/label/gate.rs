@@ -114,8 +114,8 @@ mod tests {
             })
         };
         assert!(slides(around(0.4, 0.05)));
-        assert!(!slides(around(0.1, 0.05)));
-        assert!(!slides(around(0.4, 0.25)));
+        assert!(!slides(around(0.08, 0.05)));
+        assert!(!slides(around(0.4, 0.3)));
         let far = Evidence {
             nearest_m: [0.05; 2],
             ..around(0.4, 0.05)
