@@ -25,4 +25,5 @@ mod objects;
 mod readme;
 mod sequences;
 mod server;
+mod windows;
 mod wire;

@@ -101,7 +101,7 @@ fn dense(options: &str) -> DenseCloud {
     densify(&backend, &plan, &sweeps, field, &Unwatched).expect("a cloud")
 }
 
-fn body(options: &str, frames: &[Vec<Point>]) -> Form {
+pub(crate) fn body(options: &str, frames: &[Vec<Point>]) -> Form {
     let form = Form::new().text("options", options.to_owned());
     frames.iter().fold(form, |form, points| {
         let part = Part::bytes(file(CloudFormat::Npy, points)).file_name("f.npy");
@@ -109,7 +109,7 @@ fn body(options: &str, frames: &[Vec<Point>]) -> Form {
     })
 }
 
-async fn post(server: &Server, path: &str, form: Form) -> (StatusCode, Value) {
+pub(crate) async fn post(server: &Server, path: &str, form: Form) -> (StatusCode, Value) {
     let request = reqwest::Client::new()
         .post(server.url(path))
         .multipart(form);
@@ -123,7 +123,11 @@ async fn submit(server: &Server, options: &str) -> String {
     job["id"].as_str().expect("a name").to_owned()
 }
 
-async fn get(server: &Server, path: &str, headers: &[(&str, &str)]) -> reqwest::Response {
+pub(crate) async fn get(
+    server: &Server,
+    path: &str,
+    headers: &[(&str, &str)],
+) -> reqwest::Response {
     let mut request = reqwest::Client::new().get(server.url(path));
     for (name, value) in headers {
         request = request.header(*name, *value);
@@ -132,7 +136,7 @@ async fn get(server: &Server, path: &str, headers: &[(&str, &str)]) -> reqwest::
 }
 
 /// The flows of a sequence's pairs, each by itself.
-async fn pair_flows(server: &Server, job: &Value) -> Vec<Vec<Point>> {
+pub(crate) async fn pair_flows(server: &Server, job: &Value) -> Vec<Vec<Point>> {
     let mut flows = Vec::new();
     for pair in job["pairs"]["jobs"].as_array().expect("pairs") {
         let link = pair["result"].as_str().expect("a link");

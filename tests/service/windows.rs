@@ -1,0 +1,140 @@
+//! Pairs that see the sweeps around them: the same bits through every door, in the library and on the
+//! command line, whichever comes first and wherever the sequence ends.
+
+use std::process::Command;
+use std::sync::OnceLock;
+
+use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::simulate::{Street, StreetOptions};
+use fnsf::flow::{Point, Preset, Sequence, Sweep, Unwatched};
+use fnsf::formats::CloudFormat;
+use fnsf::payload::points_from_le_bytes;
+use tokio_stream::StreamExt;
+
+use crate::clouds::file;
+use crate::grpc::{chunk, client, proto};
+use crate::sequences::{body, get, pair_flows, post};
+use crate::server::{Server, ended};
+
+/// More than a window has, so that one slides.
+const SWEEPS: usize = 7;
+
+fn sweeps() -> &'static [Vec<Point>] {
+    static SWEEPS_OF_A_DRIVE: OnceLock<Vec<Vec<Point>>> = OnceLock::new();
+    SWEEPS_OF_A_DRIVE.get_or_init(|| {
+        let options = StreetOptions {
+            beams: 16,
+            azimuth_steps: 400,
+            frames: SWEEPS,
+            ..StreetOptions::default()
+        };
+        let street = Street::new(&options).expect("a street");
+        let frame = |place| street.frame(place).expect("a frame").points;
+        (0..SWEEPS).map(frame).collect()
+    })
+}
+
+/// The flows of the library's own sequence.
+fn flows(preset: Preset) -> Vec<Vec<Point>> {
+    let backend = CpuBackend::new(Some(2)).expect("threads");
+    let (options, mut sequence) = (preset.options(None), Sequence::default());
+    let mut found = Vec::new();
+    for points in sweeps() {
+        let sweep = Sweep {
+            points: points.clone(),
+            ground: None,
+        };
+        let pushed = sequence.push(&backend, sweep, &options, &Unwatched);
+        found.extend(pushed.expect("a flow"));
+    }
+    found.extend(sequence.finish(&backend, &Unwatched).expect("the rest"));
+    found.into_iter().map(|estimate| estimate.flow).collect()
+}
+
+/// The flows of a stream, with the names of each pair's sweeps.
+async fn streamed(server: &Server) -> Vec<([String; 2], Vec<Point>)> {
+    use proto::estimate_sequence_request::{Begin, Part, Sweep};
+    use proto::estimate_sequence_response::Part as Answer;
+    let mut parts = vec![Part::Begin(Begin {
+        options: Some(proto::Options {
+            preset: proto::Preset::Label.into(),
+            ..proto::Options::default()
+        }),
+    })];
+    for (place, points) in sweeps().iter().enumerate() {
+        parts.push(Part::Sweep(Sweep {
+            name: place.to_string(),
+            points: None,
+        }));
+        parts.push(Part::Chunk(chunk(points)));
+    }
+    let message = |part| proto::EstimateSequenceRequest { part: Some(part) };
+    let stream = tokio_stream::iter(parts.into_iter().map(message));
+    let answer = client(server).await.estimate_sequence(stream).await;
+    let mut answer = answer.expect("an answer").into_inner();
+    let mut flows: Vec<([String; 2], Vec<Point>)> = Vec::new();
+    while let Some(message) = answer.next().await {
+        match message.expect("a message").part.expect("a part") {
+            Answer::Pair(pair) => flows.push(([pair.source, pair.target], Vec::new())),
+            Answer::Chunk(piece) => {
+                let (_, flow) = flows.last_mut().expect("a pair before its rows");
+                flow.extend(points_from_le_bytes(&piece.flow));
+            }
+        }
+    }
+    flows
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn pairs_that_see_the_sweeps_around_them_have_the_same_bits_through_every_door() {
+    let server = Server::start(&[]);
+    let expected = flows(Preset::Label);
+    assert_eq!(expected.len(), SWEEPS - 1);
+    assert!(expected != flows(Preset::Default), "nothing is seen around");
+
+    let form = body(r#"{"preset": "label"}"#, sweeps());
+    let (_, job) = post(&server, "/v1/sequences", form).await;
+    let job = ended(&server, job["id"].as_str().expect("a name")).await;
+    assert_eq!(job["state"], "succeeded", "{job}");
+    assert!(pair_flows(&server, &job).await == expected, "over HTTP");
+
+    let streamed = streamed(&server).await;
+    for (place, (names, _)) in streamed.iter().enumerate() {
+        assert_eq!(*names, [place.to_string(), (place + 1).to_string()]);
+    }
+    let streamed: Vec<Vec<Point>> = streamed.into_iter().map(|(_, flow)| flow).collect();
+    assert!(streamed == expected, "as a stream");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_dense_cloud_whose_pairs_see_the_sweeps_around_them_is_the_command_lines() {
+    let server = Server::start(&[]);
+    for into in ["2", "4.5"] {
+        let options = format!(r#"{{"preset": "label", "densify": {{"into": {into}}}}}"#);
+        let (_, job) = post(&server, "/v1/sequences", body(&options, sweeps())).await;
+        let id = job["id"].as_str().expect("a name").to_owned();
+        let job = ended(&server, &id).await;
+        assert_eq!(job["state"], "succeeded", "{job}");
+        let path = format!("/v1/jobs/{id}/result");
+        let answer = get(&server, &path, &[("accept", "application/x-ply")]).await;
+        let over_http = answer.bytes().await.expect("a body");
+
+        let folder = tempfile::tempdir().expect("a folder");
+        let names: Vec<String> = (0..SWEEPS).map(|place| format!("{place}.npy")).collect();
+        for (name, points) in names.iter().zip(sweeps()) {
+            let bytes = file(CloudFormat::Npy, points);
+            std::fs::write(folder.path().join(name), bytes).expect("written");
+        }
+        let done = Command::new(env!("CARGO_BIN_EXE_fnsf"))
+            .current_dir(folder.path())
+            .arg("densify")
+            .args(&names)
+            .args(["--into", into, "--preset", "label", "--device", "cpu"])
+            .args(["-o", "dense.ply"])
+            .output();
+        let done = done.expect("the program starts");
+        assert!(done.status.success(), "{done:?}");
+        let bytes = std::fs::read(folder.path().join("dense.ply")).expect("written");
+        assert!(bytes == over_http, "into {into}");
+    }
+}
