@@ -19,8 +19,9 @@ use crate::job::{
 /// How the flow is found.
 #[derive(Clone, Debug, Args)]
 pub(super) struct Estimation {
-    /// default: movers found object by object, everything else still; label: default, for labels;
-    /// neural: a neural field, robust and fast to fit; paper: FNSF as published
+    /// default: movers found object by object, everything else still; label: default, and a pair of
+    /// a sequence sees up to five sweeps around it; neural: a neural field, robust and fast to fit;
+    /// paper: FNSF as published
     #[arg(long, value_enum, default_value_t)]
     preset: PresetChoice,
     /// Where neural and paper are fitted: auto (a GPU, else the CPU), cpu, gpu, or gpu:CARD with a

@@ -23,8 +23,9 @@ const MAX_DEADLINE: Duration = Duration::from_secs(24 * 60 * 60);
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct JobOptions {
-    /// `default`: movers found object by object, everything else still; `label`: `default`, for labels;
-    /// `neural`: a neural field, robust and fast to fit; `paper`: FNSF as published.
+    /// `default`: movers found object by object, everything else still; `label`: `default`, and a pair of
+    /// a sequence sees up to five sweeps around it; `neural`: a neural field, robust and fast to fit;
+    /// `paper`: FNSF as published.
     pub preset: PresetChoice,
     /// The same seed gives the same bits.
     pub seed: u64,
@@ -70,7 +71,7 @@ pub enum PresetChoice {
     /// Ours: movers found object by object, everything else still.
     #[default]
     Default,
-    /// As default, for labels.
+    /// As default, and a pair of a sequence sees the sweeps around it.
     Label,
     /// Ours with a neural field: robust and fast to fit.
     Neural,
