@@ -27,7 +27,7 @@ pub(super) fn is_needed(found: &Found, points: &[Point], options: &LabelOptions)
 
 /// Whether the sweeps around say plainly that a cluster moves, even one that its surfaces do not hold:
 /// a wall that seems to slide lies where it was in all of them, a bus has driven on. The nearest must
-/// say so itself: far ones see a wall slide on onto what lies behind.
+/// say so itself: a wall may slide, by then, onto what lies behind it.
 fn is_confirmed(around: &Evidence, options: &LabelOptions) -> bool {
     let is_plain = |[still_m, moved_m]: [f32; 2], weight: f32| {
         moved_m <= options.confirmed_cost * still_m
