@@ -12,7 +12,7 @@ use super::files;
 use super::machine::peak_resident_bytes;
 use super::output::say;
 use super::terminal::Terminal;
-use crate::flow::{Estimate, Point, Preset, Sequence, Sweep, Watch};
+use crate::flow::{Estimate, Point, Sequence, Sweep, Watch};
 use crate::formats::{FlowFormat, FlowTable, write_flow};
 use crate::job::Report;
 use crate::picture::{self, TopDown, TopDownOptions};
@@ -98,26 +98,31 @@ pub(super) fn print_report(report: &Report) -> Result<(), Failure> {
         report.device
     ))?;
     let load = seconds.load.map(|load| format!("load {load:.2} s, "));
-    say(format_args!(
-        "  {}precompute {:.2} s, query {:.2} s, network {:.2} s",
-        load.unwrap_or_default(),
-        seconds.precompute,
-        seconds.query,
-        seconds.network
-    ))?;
-    let fits = Preset::FITTED
-        .iter()
-        .any(|preset| preset.name() == report.preset);
-    let unit = if fits { "iterations" } else { "clusters" };
+    let (load, precompute) = (load.unwrap_or_default(), seconds.precompute);
     let loss = report.best_loss.map(|loss| format!(", loss {loss:.4} m"));
-    say(format_args!(
-        "  preset {}, seed {}: {} {unit} ({}){}",
-        report.preset,
-        report.seed,
-        report.iterations,
-        report.stop_reason,
-        loss.unwrap_or_default()
-    ))?;
+    let (preset, reason, loss) = (
+        &report.preset,
+        &report.stop_reason,
+        loss.unwrap_or_default(),
+    );
+    if let Some(moving) = report.moving {
+        let (movers, clusters) = (seconds.network, report.iterations);
+        say(format_args!(
+            "  {load}precompute {precompute:.2} s, movers {movers:.2} s"
+        ))?;
+        say(format_args!(
+            "  preset {preset}: {clusters} clusters, {moving} move ({reason}){loss}"
+        ))?;
+    } else {
+        let (query, network) = (seconds.query, seconds.network);
+        let (seed, iterations) = (report.seed, report.iterations);
+        say(format_args!(
+            "  {load}precompute {precompute:.2} s, query {query:.2} s, network {network:.2} s"
+        ))?;
+        say(format_args!(
+            "  preset {preset}, seed {seed}: {iterations} iterations ({reason}){loss}"
+        ))?;
+    }
     if let Some(motion) = report.ego_motion {
         let [x, y, z] = [motion[0][3], motion[1][3], motion[2][3]];
         say(format_args!(

@@ -32,6 +32,9 @@ pub struct Report {
     pub seed: u64,
     /// target_from_source, row by row, where it is known.
     pub ego_motion: Option<[[f64; 4]; 4]>,
+    /// Clusters that move by themselves, where objects are told apart.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub moving: Option<usize>,
     /// Wall-clock seconds by phase.
     pub seconds: PhaseSeconds,
     /// The most memory that the process has held, where one process did one pair.
@@ -70,6 +73,10 @@ impl Report {
             preset: options.preset.preset().name().to_owned(),
             seed: options.seed,
             ego_motion: estimate.ego.as_ref().map(matrix_rows),
+            moving: estimate.objects.as_ref().map(|objects| {
+                let clusters = objects.clusters.iter();
+                clusters.filter(|cluster| cluster.dynamic).count()
+            }),
             seconds: PhaseSeconds {
                 load: None,
                 precompute: seconds.precompute,
