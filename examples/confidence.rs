@@ -94,7 +94,7 @@ fn moved(motion: &RigidTransform, point: Point) -> Point {
 }
 
 fn judged(backend: &dyn Backend, known: Known) -> Scene {
-    let ego = backend.align(
+    let ego = backend.host().align(
         &known.source,
         &known.target,
         &RigidTransform::identity(),
@@ -114,7 +114,10 @@ fn judged(backend: &dyn Backend, known: Known) -> Scene {
         .iter()
         .map(|&row| moved(&ego, known.source[row]))
         .collect();
-    let labelled = backend.movers(&aligned, &target, &[], &LabelOptions::default(), &Unwatched);
+    let labelled =
+        backend
+            .host()
+            .movers(&aligned, &target, &[], &LabelOptions::default(), &Unwatched);
     let residual = labelled.motions.residual_at(&aligned);
     let error = |row: usize, at: Point| {
         let square = |a: usize| (known.source[row][a] + known.flow[row][a] - at[a]).powi(2);

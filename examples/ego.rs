@@ -148,7 +148,9 @@ fn row(name: &str, backend: &CpuBackend, cases: &[Case]) {
     for case in cases {
         let start = Instant::now();
         let prior = RigidTransform::identity();
-        let found = backend.align(&case.source, &case.target, &prior, &Unwatched);
+        let found = backend
+            .host()
+            .align(&case.source, &case.target, &prior, &Unwatched);
         times.push(start.elapsed().as_secs_f64() * 1e3);
         let gap = case.truth.inv_mul(&found);
         meters.push(gap.translation.vector.norm());

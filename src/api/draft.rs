@@ -137,7 +137,7 @@ impl Draft {
         service.admission.check_points(cloud.points.len())?;
         service.check_disk()?;
         let limit = service.limits.max_frames;
-        if self.frames >= limit {
+        if self.frames >= limit && self.request.pair == PairOf::ALONE {
             return Err(ApiError::TooLarge(format!(
                 "a sequence has more than the {limit} frames that this server takes"
             )));

@@ -132,7 +132,7 @@ impl Densify {
                     break;
                 }
             }
-            if !waiting.is_empty() {
+            while !waiting.is_empty() {
                 let rest = device.finish(&mut sequence, &terminal)?;
                 fields.extend(of_legs(rest, &mut waiting));
             }

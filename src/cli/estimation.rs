@@ -20,7 +20,7 @@ use crate::job::{
 #[derive(Clone, Debug, Args)]
 pub(super) struct Estimation {
     /// default: movers found object by object, everything else still; label: default, and a pair of
-    /// a sequence sees up to five sweeps around it; neural: a neural field, robust and fast to fit;
+    /// a sequence is found from up to five sweeps, its own among them; neural: a neural field, robust and fast to fit;
     /// paper: FNSF as published
     #[arg(long, value_enum, default_value_t)]
     preset: PresetChoice,

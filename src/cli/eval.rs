@@ -19,6 +19,7 @@ use crate::formats::{FlowFile, Pair, PairTruth};
 /// End-point errors are in metres over the gap between the sweeps. Of several flows each has a row,
 /// and the last row is that of all their points together.
 #[derive(Debug, Args)]
+#[command(override_usage = "fnsf eval FLOW... --truth TRUTH... [OPTIONS]")]
 #[command(after_help = "Examples:\n  \
     fnsf eval flow.npz --truth pair.npz\n  \
     fnsf eval flow.feather --truth flow_labels.feather --source sweep.feather --json\n  \
@@ -71,7 +72,7 @@ impl Eval {
             .iter()
             .map(|path| path.display().to_string())
             .collect();
-        let width = names.iter().map(String::len).max().unwrap_or_default();
+        let width = names.iter().map(String::len).fold("flow".len(), usize::max);
         if flows > 1 && !self.json {
             Report::print_heading(width)?;
         }

@@ -205,17 +205,24 @@ impl Flow {
                     load,
                 });
             }
-            let mut estimates = device.push(&mut sequence, &sweep, &solver_options, &terminal)?;
-            if place + 1 == count {
-                estimates.extend(device.finish(&mut sequence, &terminal)?);
-            }
-            terminal.finish();
-            for (estimate, pair) in estimates.iter().zip(waiting.drain(..estimates.len())) {
-                let mut report = Report::new(estimate, &options);
-                report.seconds.load = Some(pair.load);
-                report.seconds.total += pair.load;
-                report.peak_rss_bytes = peak_resident_bytes();
-                self.put(estimate, &report, &pair.source, [pair.pair, count - 1])?;
+            let mut found = device.push(&mut sequence, &sweep, &solver_options, &terminal)?;
+            // What is there is written before the next pair, which may fail, is tried.
+            loop {
+                terminal.finish();
+                for (estimate, pair) in found.iter().zip(waiting.drain(..found.len())) {
+                    let mut report = Report::new(estimate, &options);
+                    report.seconds.load = Some(pair.load);
+                    report.seconds.total += pair.load;
+                    report.peak_rss_bytes = peak_resident_bytes();
+                    self.put(estimate, &report, &pair.source, [pair.pair, count - 1])?;
+                }
+                if place + 1 < count {
+                    break;
+                }
+                found = device.finish(&mut sequence, &terminal)?;
+                if found.is_empty() {
+                    break;
+                }
             }
         }
         Ok(())

@@ -9,10 +9,7 @@ use super::{DeviceOptions, Opened, Opener, Reopening};
 use crate::flow::backend::{Advance, Backend, BackendError, Report, Trainer, Transform};
 use crate::flow::cpu::CpuBackend;
 use crate::flow::distance::DistanceOptions;
-use crate::flow::{
-    AlignedSweep, LabelOptions, Labelled, Network, Options, Point, RigidTransform, TrainerState,
-    Watch,
-};
+use crate::flow::{Host, Network, Options, Point, TrainerState, Watch};
 use crate::job::DeviceKind;
 
 /// Points of the trial's pair: what a test asks for does not happen to it.
@@ -144,7 +141,7 @@ impl Backend for CardLane {
         "a card of the tests".to_owned()
     }
 
-    fn host(&self) -> String {
+    fn host(&self) -> &Host {
         self.cpu.host()
     }
 
@@ -179,27 +176,6 @@ impl Backend for CardLane {
 
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {
         self.cpu.evaluate(network, points)
-    }
-
-    fn align(
-        &self,
-        source: &[Point],
-        target: &[Point],
-        prior: &RigidTransform,
-        watch: &dyn Watch,
-    ) -> RigidTransform {
-        self.cpu.align(source, target, prior, watch)
-    }
-
-    fn movers(
-        &self,
-        source: &[Point],
-        target: &[Point],
-        around: &[AlignedSweep],
-        options: &LabelOptions,
-        watch: &dyn Watch,
-    ) -> Labelled {
-        self.cpu.movers(source, target, around, options, watch)
     }
 }
 

@@ -32,6 +32,15 @@ pub struct AlignedSweep {
     pub at: i8,
 }
 
+/// The sweeps around the pair of `problem` that `frames` sweeps in all leave room for: the nearest in
+/// time first, the earlier of two as near.
+pub(crate) fn nearest<'a>(problem: &Problem<'a>, frames: usize) -> Vec<&'a Around<'a>> {
+    let mut order: Vec<&Around> = problem.around.iter().collect();
+    order.sort_by_key(|sweep| ((2 * i16::from(sweep.at) - 1).abs(), sweep.at));
+    order.truncate(frames.saturating_sub(2));
+    order
+}
+
 /// The sweeps of `problem` around the pair that `frames` sweeps in all leave room for and that there
 /// is time for: the nearest in time first, the earlier of two as near.
 pub(crate) fn aligned(
@@ -42,25 +51,23 @@ pub(crate) fn aligned(
     frames: usize,
     watch: &dyn Watch,
 ) -> Result<Vec<AlignedSweep>, FlowError> {
-    let mut order: Vec<&Around> = problem.around.iter().collect();
-    order.sort_by_key(|sweep| ((2 * i16::from(sweep.at) - 1).abs(), sweep.at));
-    order.truncate(frames.saturating_sub(2));
+    let order = nearest(problem, frames);
     if order.is_empty() {
         return Ok(Vec::new());
     }
     let target = preprocess::in_range(problem.target, options);
     let mut found = Vec::with_capacity(order.len());
     for sweep in order {
-        let points = preprocess::off_ground(sweep, options)?;
         let surroundings = preprocess::in_range(sweep.points, options);
         if !deadline::has_time_around(surroundings.len() + target.len(), watch) {
             break;
         }
+        let points = preprocess::off_ground(sweep, options)?;
         // E^(1 - at): the target's own frame is at 1.
         let gaps = 1 - i32::from(sweep.at);
         let step = if gaps < 0 { ego.inverse() } else { *ego };
         let prior = (0..gaps.unsigned_abs()).fold(RigidTransform::identity(), |all, _| step * all);
-        let motion = backend.align(&surroundings, &target, &prior, watch);
+        let motion = backend.host().align(&surroundings, &target, &prior, watch);
         found.push(AlignedSweep {
             points: all_moved(&motion, &points),
             at: sweep.at,

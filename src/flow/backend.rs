@@ -1,11 +1,10 @@
 //! The seam to a device: what the solver asks of whatever computes.
 
-use super::around::AlignedSweep;
 use super::distance::{DistanceError, DistanceOptions};
 use super::field::Network;
-use super::label::Labelled;
-use super::options::{LabelOptions, Options};
-use super::points::{Point, RigidTransform};
+use super::host::Host;
+use super::options::Options;
+use super::points::Point;
 use super::snapshot::TrainerState;
 use super::watch::{Interrupt, Watch};
 
@@ -14,8 +13,8 @@ pub trait Backend: Send + Sync {
     /// The device's name, as reports show it.
     fn name(&self) -> String;
 
-    /// The host's threads, as reports show them: they align and find movers whatever the device.
-    fn host(&self) -> String;
+    /// The host's threads: they align and find movers whatever the device.
+    fn host(&self) -> &Host;
 
     /// Builds the distance transform of `target` over a grid that covers both clouds; looks at
     /// `watch` between its pieces.
@@ -30,33 +29,11 @@ pub trait Backend: Send + Sync {
         watch: &dyn Watch,
     ) -> Result<Box<dyn Transform>, BackendError>;
 
-    /// The rigid motion target_from_source, near `prior`, that aligns `source` with `target`; the
-    /// motion so far where `watch` interrupts. Always on the host's threads: it is the same
-    /// whatever the device.
-    fn align(
-        &self,
-        source: &[Point],
-        target: &[Point],
-        prior: &RigidTransform,
-        watch: &dyn Watch,
-    ) -> RigidTransform;
-
     /// What `network` says at `points`: a displacement each, metres.
     ///
     /// # Errors
     /// [`BackendError`] where the device fails.
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError>;
-
-    /// What moves from `source`, the ego motion taken out, to `target`, as the sweeps `around` bear
-    /// out; what has been found so far where `watch` interrupts. Always on the host's threads, too.
-    fn movers(
-        &self,
-        source: &[Point],
-        target: &[Point],
-        around: &[AlignedSweep],
-        options: &LabelOptions,
-        watch: &dyn Watch,
-    ) -> Labelled;
 }
 
 /// A target's distance transform on a device.

@@ -3,9 +3,12 @@
 //! One side of the rectangle of least area around a set of points lies on an edge of its convex hull
 //! (Freeman and Shapira 1975). It must not know what the points are of.
 
-use std::f32::consts::{FRAC_PI_2, PI};
+use std::f32::consts::{FRAC_PI_2, PI, TAU};
 
 use super::points::Point;
+
+/// Edges of a hull that are tried, at most.
+const MOST_EDGES: usize = 256;
 
 /// A box that stands upright.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -24,7 +27,9 @@ impl Bounds {
     pub(crate) fn around(points: &[Point], way: Option<[f32; 2]>) -> Self {
         let level: Vec<[f64; 2]> = points.iter().map(|p| [p[0], p[1]].map(f64::from)).collect();
         let hull = hull(level);
-        let edges = (0..hull.len()).map(|i| {
+        // Around so many corners nearly every direction is as good as any.
+        let apart = hull.len().div_ceil(MOST_EDGES).max(1);
+        let edges = (0..hull.len()).step_by(apart).map(|i| {
             let ([a, b], [c, d]) = (hull[i], hull[(i + 1) % hull.len()]);
             (d - b).atan2(c - a)
         });
@@ -39,6 +44,13 @@ impl Bounds {
         let step = if way.is_some() { FRAC_PI_2 } else { PI };
         let yaw = found.yaw as f32;
         let yaw = yaw + ((wanted - yaw) / step).round() * step;
+        let yaw = if yaw > PI {
+            yaw - TAU
+        } else if yaw <= -PI {
+            yaw + TAU
+        } else {
+            yaw
+        };
         let found = Rectangle::along(f64::from(yaw), &hull);
         let heights = || points.iter().map(|point| point[2]);
         let (low, high) = (
@@ -158,9 +170,26 @@ mod tests {
         let backward = Bounds::around(&car(0.4), Some([-1.0, -0.35]));
         assert!(close(backward.yaw, 0.4 - PI, TURN), "{backward:?}");
         assert!(backward.size[0] > backward.size[1]);
+        for yaw in [0.15, -0.15] {
+            let bounds = Bounds::around(&car(yaw), Some([-1.0, 0.0]));
+            let expected = yaw as f32 - PI * (yaw as f32).signum();
+            assert!(close(bounds.yaw, expected, TURN), "{bounds:?}");
+        }
         let sideways = Bounds::around(&car(0.4), Some([-0.35, 1.0]));
         assert!(close(sideways.yaw, 0.4 + FRAC_PI_2, TURN), "{sideways:?}");
         assert!(sideways.size[0] < sideways.size[1]);
+    }
+
+    #[test]
+    fn a_ring_of_any_number_of_points_has_the_box_of_a_circle() {
+        const ROUND: f32 = 1e-3;
+        let point = |i: u32| {
+            let (sin, cos) = (f64::from(i) * 1e-5 * std::f64::consts::TAU).sin_cos();
+            [3.0 * cos, 3.0 * sin, 0.0].map(|c| c as f32)
+        };
+        let ring: Vec<Point> = (0..100_000).map(point).collect();
+        let [length, width, _] = Bounds::around(&ring, None).size;
+        assert!(close(length, 6.0, ROUND) && close(width, 6.0, ROUND));
     }
 
     #[test]

@@ -193,7 +193,8 @@ fn ego(
     whole: bool,
     watch: &dyn Watch,
 ) -> Option<RigidTransform> {
-    let align = |[source, target]: [&[Point]; 2]| backend.align(source, target, prior, watch);
+    let align =
+        |[source, target]: [&[Point]; 2]| backend.host().align(source, target, prior, watch);
     match (options.ego, &selection.surroundings) {
         (Ego::Given(target_from_source), _) => Some(target_from_source),
         (Ego::Auto, Some([source, target])) if whole => Some(align([source, target])),

@@ -63,6 +63,7 @@ pub mod cpu;
 mod early_stop;
 #[cfg(feature = "gpu")]
 pub mod gpu;
+mod host;
 mod optimizer;
 
 // What a camera sees of a cloud.
@@ -81,6 +82,7 @@ pub use bounds::Bounds;
 pub use dense::DenseCloud;
 pub use error::FlowError;
 pub use field::{Field, Network, Residual};
+pub use host::Host;
 pub use label::{Evidence, Labelled, Motions, Parts, SURE_M, confidence_of_ground};
 pub use objects::{Cluster, Objects};
 pub use options::*;

@@ -8,7 +8,7 @@ use super::points::RigidTransform;
 pub enum Preset {
     /// Ours: robust rigid alignment, then movers found object by object, everything else still.
     Default,
-    /// As default, and where a pair is one of a sequence it sees up to five sweeps around it.
+    /// As default, and a pair of a sequence is found from up to five sweeps, its own among them.
     Label,
     /// Ours with a neural field: robust rigid alignment, then a short stochastic fit of what is left.
     Neural,
@@ -131,7 +131,10 @@ impl Options {
 
     /// Sweeps that an estimate looks at where a sequence has them: the pair's two, or more.
     pub fn frames(&self) -> usize {
-        self.label.as_ref().map_or(2, |label| label.frames.max(2))
+        match &self.label {
+            Some(label) if self.ego != Ego::Off => label.frames.max(2),
+            _ => 2,
+        }
     }
 
     /// Iterations that a run usually takes: all of them where no rule stops it; the published rule

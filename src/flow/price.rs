@@ -5,6 +5,7 @@
 //! multiply-adds that take as long on a CPU. Knows no device and no time: a rate turns work into
 //! seconds.
 
+use super::around;
 use super::distance::{DistanceTransform, TransformPrice};
 use super::error::FlowError;
 use super::field::mlp::{LAID_OUT, PARAMETERS};
@@ -108,8 +109,7 @@ pub fn price(problem: &Problem, options: &Options) -> Result<Price, FlowError> {
     let aligned = aligned.map(|[source, target]| source + target);
     let aligning = aligned.map_or(0.0, |points| ALIGNING + points as f64 * THINNING);
     let points = (source_points + target_points) as f64 * POINT;
-    let seen = options.frames() - 2;
-    let around = problem.around.iter().take(seen);
+    let around = around::nearest(problem, options.frames()).into_iter();
     let around = around.map(|sweep| price_around(sweep.points.len()));
     let (around_bytes, around_work) = around.fold((0, 0.0), |(bytes, work), around| {
         (bytes + around.bytes, work + around.multiply_adds)

@@ -86,9 +86,9 @@ struct Held {
 
 /// The pairs of a sequence, one after the other.
 ///
-/// Where options ask for more sweeps than the pair's own ([`Options::frames`]), a pair is estimated
-/// from its [`window`], by nothing but the sweeps in it: it has to wait for the last of them, and at
-/// most as many sweeps are held as the window has.
+/// Where the first sweep's options ask for more sweeps than the pair's own ([`Options::frames`]), a
+/// pair is estimated from its [`window`], by nothing but the sweeps in it: it has to wait for the last
+/// of them, and at most as many sweeps are held as the window has.
 #[derive(Clone, Debug, Default)]
 pub struct Sequence {
     /// The sweeps that pairs to come may see.
@@ -97,7 +97,7 @@ pub struct Sequence {
     count: usize,
     /// The pair that is next.
     next: usize,
-    /// Sweeps of a window: the most that any options asked for.
+    /// Sweeps of a window.
     frames: usize,
     before: Option<Field>,
 }
@@ -105,10 +105,12 @@ pub struct Sequence {
 impl Sequence {
     /// Takes the next sweep, and gives the motion of every pair whose sweeps are now all there, in
     /// order. `options` are those of the pair that ends in the sweep, and may change from sweep to
-    /// sweep: where the vehicle's motion is known, [`super::Ego::Given`] says it.
+    /// sweep, but for how many sweeps a pair sees: where the vehicle's motion is known,
+    /// [`super::Ego::Given`] says it.
     ///
     /// # Errors
-    /// As [`estimate`]; the sequence is left as it was, and the sweep may be pushed again.
+    /// As [`estimate`], of the first pair that is not there yet; the sequence is left as it was, and the
+    /// sweep may be pushed again. A pair behind one that is given is tried again with the next sweep.
     pub fn push(
         &mut self,
         backend: &dyn Backend,
@@ -118,8 +120,9 @@ impl Sequence {
     ) -> Result<Vec<Estimate>, FlowError> {
         // Once for all that see it.
         let sweep = sweep.prepared(options);
-        let was = (self.next, self.frames, self.before.clone());
-        self.frames = self.frames.max(options.frames());
+        if self.count == 0 {
+            self.frames = options.frames();
+        }
         self.held.push_back(Held {
             sweep,
             options: options.clone(),
@@ -129,31 +132,28 @@ impl Sequence {
         if pushed.is_err() {
             self.held.pop_back();
             self.count -= 1;
-            (self.next, self.frames, self.before) = was;
         } else {
             self.forget();
         }
         pushed
     }
 
-    /// Gives the motion of the pairs that were waiting for sweeps to come: there are none.
+    /// Gives the motion of the pairs that were waiting for sweeps to come, as there are none: to be
+    /// asked until nothing more is given.
     ///
     /// # Errors
-    /// As [`estimate`]; the sequence is left as it was, and may be finished again.
+    /// As [`estimate`], of the first pair that is not there yet; the sequence is left as it was, and may
+    /// be finished again.
     pub fn finish(
         &mut self,
         backend: &dyn Backend,
         watch: &dyn Watch,
     ) -> Result<Vec<Estimate>, FlowError> {
-        let was = (self.next, self.before.clone());
-        let finished = self.estimates(backend, |_, _, _| true, watch);
-        if finished.is_err() {
-            (self.next, self.before) = was;
-        }
-        finished
+        self.estimates(backend, |_, _, _| true, watch)
     }
 
-    /// The next pairs, as long as `is_ready` says so of a pair, the sweeps so far and its frames.
+    /// The next pairs, as long as `is_ready` says so of a pair, the sweeps so far and those of a window,
+    /// and none of them fails.
     fn estimates(
         &mut self,
         backend: &dyn Backend,
@@ -162,11 +162,14 @@ impl Sequence {
     ) -> Result<Vec<Estimate>, FlowError> {
         let mut estimates = Vec::new();
         while self.next + 1 < self.count {
-            let frames = self.at(self.next + 1).options.frames();
-            if !is_ready(self.next, self.count, frames) {
+            if !is_ready(self.next, self.count, self.frames) {
                 break;
             }
-            let estimate = self.estimate(backend, self.next, frames, watch)?;
+            let estimate = match self.estimate(backend, self.next, watch) {
+                Ok(estimate) => estimate,
+                Err(error) if estimates.is_empty() => return Err(error),
+                Err(_) => break,
+            };
             self.before = Some(estimate.field.clone());
             self.next += 1;
             estimates.push(estimate);
@@ -179,13 +182,12 @@ impl Sequence {
         &self,
         backend: &dyn Backend,
         pair: usize,
-        frames: usize,
         watch: &dyn Watch,
     ) -> Result<Estimate, FlowError> {
         let (source, target) = (&self.at(pair).sweep, self.at(pair + 1));
         let ground = source.ground.as_deref();
         let ground = ground.zip(target.sweep.ground.as_deref());
-        let others = window(pair, self.count, frames);
+        let others = window(pair, self.count, self.frames);
         let others = others.filter(|&place| place != pair && place != pair + 1);
         let around: Vec<Around> = others
             .filter_map(|place| {

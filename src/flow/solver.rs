@@ -170,15 +170,20 @@ fn solve(
                 None => Vec::new(),
             };
             let precomputed = watch.seconds();
-            let labelled = backend.movers(&aligned, &selection.target, &around, label, watch);
-            objects = Some(Objects::new(
-                problem.source.len(),
-                &selection.rows,
-                &selection.source,
-                &labelled,
-                &ego.unwrap_or_default(),
-            ));
-            Fitted::of_movers(labelled, &aligned, precomputed)?
+            let target = &selection.target;
+            let labelled = backend
+                .host()
+                .movers(&aligned, target, &around, label, watch);
+            backend.host().threads().install(|| {
+                objects = Some(Objects::new(
+                    problem.source.len(),
+                    &selection.rows,
+                    &selection.source,
+                    &labelled,
+                    &ego.unwrap_or_default(),
+                ));
+                Fitted::of_movers(labelled, &aligned, precomputed)
+            })?
         }
         (None, None) => Fitted::nothing(aligned.len(), watch),
         (None, Some(prepared)) => Fit {
@@ -238,7 +243,7 @@ fn solve(
         stop_reason: fitted.stop_reason,
         device: match &options.label {
             None => backend.name(),
-            Some(_) => backend.host(),
+            Some(_) => backend.host().name().to_owned(),
         },
         seconds: PhaseSeconds {
             precompute,

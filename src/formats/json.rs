@@ -63,10 +63,14 @@ pub(super) fn read(bytes: &[u8]) -> Result<FlowFile, FormatError> {
         dynamic: read.dynamic,
         cluster: read.cluster,
         confidence: read.confidence.map(chances).transpose()?,
-        clusters: read
-            .clusters
-            .map(|clusters| clusters.into_iter().map(Cluster::from).collect()),
+        clusters: read.clusters.map(clusters).transpose()?,
     })
+}
+
+fn clusters(described: Vec<Described>) -> Result<Vec<Cluster>, FormatError> {
+    let clusters = described.into_iter().enumerate();
+    let checked = clusters.map(|(row, described)| described.checked(KIND, row));
+    checked.collect()
 }
 
 pub(super) fn write<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatError> {

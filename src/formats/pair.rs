@@ -72,7 +72,7 @@ pub fn is_pair(bytes: &[u8]) -> bool {
 
 /// Reads an `.npz` with `pc1` (N x 3), `pc2` (M x 3) and, where they are there, `flow` (N x 3),
 /// `valid` and `dynamic` (N), `ground1` (N), `ground2` (M), `ego_SE3` (4 x 4) and `box_id` (N,
-/// negative off every object) or `classes` (N, 0 off every object).
+/// negative off every object) or `classes` (N, 0 off every object), and `category` (N, Argoverse 2's).
 ///
 /// # Errors
 /// As for a cloud, and `RowCount` where arrays disagree, `Unsupported` where `ego_SE3` is not
@@ -124,17 +124,19 @@ fn read_truth(npz: &mut Npz<'_>, count: usize) -> Result<Option<PairTruth>, Form
     if let Some(dynamic) = &dynamic {
         check_count("dynamic", dynamic.len(), count)?;
     }
-    let category = npz.column("classes", |row, value| {
-        check_category(KIND, row, "classes", value)
+    let foreground = match npz.column("box_id", on_object)? {
+        None => npz.mask("classes")?,
+        foreground => foreground,
+    };
+    if let Some(foreground) = &foreground {
+        check_count("box_id or classes", foreground.len(), count)?;
+    }
+    let category = npz.column("category", |row, value| {
+        check_category(KIND, row, "category", value)
     })?;
     if let Some(category) = &category {
-        check_count("classes", category.len(), count)?;
+        check_count("category", category.len(), count)?;
     }
-    let foreground = npz.column("box_id", on_object)?;
-    if let Some(foreground) = &foreground {
-        check_count("box_id", foreground.len(), count)?;
-    }
-    let foreground = foreground.or_else(|| category.as_deref().map(of_some_category));
     Ok(Some(PairTruth {
         flow,
         valid,
@@ -168,7 +170,7 @@ pub(super) fn check_count(what: &str, found: usize, expected: usize) -> Result<(
 }
 
 /// Writes a pair with the array names that [`read_pair`] reads; `foreground` becomes `box_id`
-/// 0 on objects and -1 off them, `category` becomes `classes`.
+/// 0 on objects and -1 off them.
 ///
 /// # Errors
 /// `RowCount` where the pair's parts disagree, `NotFinite` for values that could not be read
@@ -202,7 +204,7 @@ pub fn write_pair_npz<W: Write>(pair: &Pair, out: &mut W) -> Result<(), FormatEr
         if let Some(category) = &truth.category {
             check_count("category", category.len(), count)?;
             let ids: Vec<i32> = category.iter().map(|&category| category.into()).collect();
-            npz.array("classes", |out| npy::write_ids(out, &ids))?;
+            npz.array("category", |out| npy::write_ids(out, &ids))?;
         }
     }
     if let Some(ground) = &pair.ground {

@@ -24,7 +24,7 @@ const MAX_DEADLINE: Duration = Duration::from_secs(24 * 60 * 60);
 #[serde(deny_unknown_fields, default)]
 pub struct JobOptions {
     /// `default`: movers found object by object, everything else still; `label`: `default`, and a pair of
-    /// a sequence sees up to five sweeps around it; `neural`: a neural field, robust and fast to fit;
+    /// a sequence is found from up to five sweeps; `neural`: a neural field, robust and fast to fit;
     /// `paper`: FNSF as published.
     pub preset: PresetChoice,
     /// The same seed gives the same bits.

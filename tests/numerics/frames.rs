@@ -5,8 +5,8 @@ use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::Metrics;
 use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::flow::{
-    Around, Estimate, Ground, Options, Preset, Problem, Sequence, Sweep, Unwatched, Watch,
-    estimate, window,
+    Around, Estimate, FlowError, Ground, Options, Preset, Problem, Sequence, Sweep, Unwatched,
+    Watch, estimate, window,
 };
 use fnsf::formats::{Pair, PairTruth, read_cloud};
 
@@ -89,6 +89,37 @@ fn moving(metrics: &Metrics) -> f64 {
 
 fn still(metrics: &Metrics) -> f64 {
     metrics.epe_static.expect("something stands")
+}
+
+#[test]
+fn a_pair_that_fails_costs_no_other_that_was_there_before_it() {
+    let (_, mut sweeps) = drive(0, 5, 16);
+    sweeps[3] = Sweep::default();
+    let backend = CpuBackend::new(Some(2)).expect("threads");
+    let (options, mut sequence) = (seeing(5), Sequence::default());
+    let mut found = Vec::new();
+    for sweep in sweeps {
+        let pushed = sequence.push(&backend, sweep, &options, &Unwatched);
+        found.extend(pushed.expect("those before the empty sweep"));
+    }
+    assert_eq!(found.len(), 2);
+    for _ in 0..2 {
+        let rest = sequence.finish(&backend, &Unwatched);
+        assert!(matches!(rest, Err(FlowError::TooFewPoints { .. })));
+    }
+}
+
+#[test]
+fn how_many_sweeps_a_pair_sees_is_fixed_by_the_first_one() {
+    let (_, sweeps) = drive(0, 6, 16);
+    let backend = CpuBackend::new(Some(2)).expect("threads");
+    let mut sequence = Sequence::default();
+    let mut found = 0;
+    for (sweep, frames) in sweeps.into_iter().zip([2, 2, 2, 5, 5, 3]) {
+        let pushed = sequence.push(&backend, sweep, &seeing(frames), &Unwatched);
+        found += pushed.expect("flows").len();
+    }
+    assert_eq!(found, 5);
 }
 
 #[test]

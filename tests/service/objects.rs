@@ -63,12 +63,14 @@ async fn clusters_and_confidence_are_the_librarys_in_every_format_and_over_grpc(
         .await;
     let mut answer = answer.expect("an answer").into_inner();
     let (mut clusters, mut cluster, mut confidence) = (Vec::new(), Vec::new(), Vec::new());
+    let mut count = 0;
     while let Some(message) = answer.next().await {
         use proto::estimate_flow_response::Part;
         match message.expect("a message").part.expect("a part") {
             Part::Progress(_) => {}
-            Part::Header(header) => clusters = header.clusters,
+            Part::Header(header) => count = header.clusters,
             Part::Chunk(piece) => {
+                clusters.extend(piece.clusters);
                 let (ids, _) = piece.cluster.as_chunks::<4>();
                 cluster.extend(ids.iter().map(|id| i32::from_le_bytes(*id)));
                 let (chances, _) = piece.confidence.as_chunks::<4>();
@@ -81,6 +83,7 @@ async fn clusters_and_confidence_are_the_librarys_in_every_format_and_over_grpc(
         (expected.cluster, expected.confidence)
     );
     assert_eq!(clusters.len(), expected.clusters.len());
+    assert_eq!(count as usize, clusters.len());
     for (found, cluster) in clusters.iter().zip(&expected.clusters) {
         assert_eq!(
             (found.points, found.dynamic),

@@ -35,11 +35,11 @@ fn sweeps() -> &'static [Vec<Point>] {
 }
 
 /// The flows of the library's own sequence.
-fn flows(preset: Preset) -> Vec<Vec<Point>> {
+fn flows(preset: Preset, sweeps: &[Vec<Point>]) -> Vec<Vec<Point>> {
     let backend = CpuBackend::new(Some(2)).expect("threads");
     let (options, mut sequence) = (preset.options(None), Sequence::default());
     let mut found = Vec::new();
-    for points in sweeps() {
+    for points in sweeps {
         let sweep = Sweep {
             points: points.clone(),
             ground: None,
@@ -51,8 +51,12 @@ fn flows(preset: Preset) -> Vec<Vec<Point>> {
     found.into_iter().map(|estimate| estimate.flow).collect()
 }
 
-/// The flows of a stream, with the names of each pair's sweeps.
-async fn streamed(server: &Server) -> Vec<([String; 2], Vec<Point>)> {
+/// The flows of a stream, with the names of each pair's sweeps; and what it broke with, where
+/// `broken` bytes come in the place of a sweep after the first four.
+async fn streamed(
+    server: &Server,
+    broken: Option<&'static [u8]>,
+) -> (Vec<([String; 2], Vec<Point>)>, Option<tonic::Code>) {
     use proto::estimate_sequence_request::{Begin, Part, Sweep};
     use proto::estimate_sequence_response::Part as Answer;
     let mut parts = vec![Part::Begin(Begin {
@@ -66,7 +70,13 @@ async fn streamed(server: &Server) -> Vec<([String; 2], Vec<Point>)> {
             name: place.to_string(),
             points: None,
         }));
-        parts.push(Part::Chunk(chunk(points)));
+        match broken.filter(|_| place == 4) {
+            None => parts.push(Part::Chunk(chunk(points))),
+            Some(bytes) => parts.push(Part::Chunk(proto::Chunk {
+                points: bytes.into(),
+                ground: Vec::new().into(),
+            })),
+        }
     }
     let message = |part| proto::EstimateSequenceRequest { part: Some(part) };
     let stream = tokio_stream::iter(parts.into_iter().map(message));
@@ -74,7 +84,11 @@ async fn streamed(server: &Server) -> Vec<([String; 2], Vec<Point>)> {
     let mut answer = answer.expect("an answer").into_inner();
     let mut flows: Vec<([String; 2], Vec<Point>)> = Vec::new();
     while let Some(message) = answer.next().await {
-        match message.expect("a message").part.expect("a part") {
+        let message = match message {
+            Ok(message) => message,
+            Err(status) => return (flows, Some(status.code())),
+        };
+        match message.part.expect("a part") {
             Answer::Pair(pair) => flows.push(([pair.source, pair.target], Vec::new())),
             Answer::Chunk(piece) => {
                 let (_, flow) = flows.last_mut().expect("a pair before its rows");
@@ -82,15 +96,27 @@ async fn streamed(server: &Server) -> Vec<([String; 2], Vec<Point>)> {
             }
         }
     }
-    flows
+    (flows, None)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stream_that_breaks_still_gives_the_pairs_of_the_sweeps_before() {
+    let server = Server::start(&[]);
+    let (found, broken) = streamed(&server, Some(b"not a multiple of 12")).await;
+    assert_eq!(broken, Some(tonic::Code::InvalidArgument));
+    let found: Vec<Vec<Point>> = found.into_iter().map(|(_, flow)| flow).collect();
+    assert!(found == flows(Preset::Label, &sweeps()[..4]));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn pairs_that_see_the_sweeps_around_them_have_the_same_bits_through_every_door() {
     let server = Server::start(&[]);
-    let expected = flows(Preset::Label);
+    let expected = flows(Preset::Label, sweeps());
     assert_eq!(expected.len(), SWEEPS - 1);
-    assert!(expected != flows(Preset::Default), "nothing is seen around");
+    assert!(
+        expected != flows(Preset::Default, sweeps()),
+        "nothing is seen around"
+    );
 
     let form = body(r#"{"preset": "label"}"#, sweeps());
     let (_, job) = post(&server, "/v1/sequences", form).await;
@@ -98,7 +124,8 @@ async fn pairs_that_see_the_sweeps_around_them_have_the_same_bits_through_every_
     assert_eq!(job["state"], "succeeded", "{job}");
     assert!(pair_flows(&server, &job).await == expected, "over HTTP");
 
-    let streamed = streamed(&server).await;
+    let (streamed, broken) = streamed(&server, None).await;
+    assert_eq!(broken, None);
     for (place, (names, _)) in streamed.iter().enumerate() {
         assert_eq!(*names, [place.to_string(), (place + 1).to_string()]);
     }

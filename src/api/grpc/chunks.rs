@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use tonic::Streaming;
 
-use super::proto;
+use super::{convert, proto};
 use crate::api::codec;
 use crate::api::draft::Room;
 use crate::api::error::ApiError;
@@ -144,8 +144,12 @@ pub(super) fn pieces(
                 u8::from(flow.valid[row]) | u8::from(dynamic) << 1
             })
             .collect();
-        let (mut cluster, mut confidence) = (Vec::new(), Vec::new());
+        let (mut cluster, mut confidence, mut clusters) = (Vec::new(), Vec::new(), Vec::new());
         if let Some(objects) = &flow.objects {
+            // By the rows alone: who takes up a flow in the middle has those that came before.
+            let part = |row: usize| objects.clusters.len() * row / rows;
+            let described = &objects.clusters[part(from)..part(to)];
+            clusters.extend(described.iter().map(convert::cluster));
             let ids = objects.cluster[from..to].iter();
             cluster.extend(ids.flat_map(|id| id.to_le_bytes()));
             let chances = objects.confidence[from..to].iter();
@@ -156,6 +160,7 @@ pub(super) fn pieces(
             flags: flags.into(),
             cluster: cluster.into(),
             confidence: confidence.into(),
+            clusters,
         }
     })
 }

@@ -201,14 +201,16 @@ pub(super) fn header(answer: &Answer) -> proto::FlowHeader {
             network: seconds.network,
             total: seconds.total,
         }),
-        clusters: match &answer.flow.objects {
-            None => Vec::new(),
-            Some(objects) => objects.clusters.iter().map(cluster).collect(),
-        },
+        clusters: answer
+            .flow
+            .objects
+            .as_ref()
+            .map_or(0, |objects| count(objects.clusters.len())),
     }
 }
 
-fn cluster(cluster: &Cluster) -> proto::Cluster {
+/// A cluster as a message.
+pub(super) fn cluster(cluster: &Cluster) -> proto::Cluster {
     proto::Cluster {
         points: cluster.points,
         dynamic: cluster.dynamic,

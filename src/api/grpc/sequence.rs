@@ -84,7 +84,7 @@ pub(super) fn run(
     let writing = (Arc::clone(&service), answers.clone());
     tokio::spawn(async move { write(&writing.0, pairs, &writing.1).await });
     tokio::spawn(async move {
-        let reader = Reader {
+        let mut reader = Reader {
             service,
             call,
             inbound,
@@ -93,9 +93,11 @@ pub(super) fn run(
             count: 0,
             held: VecDeque::new(),
             before: None,
+            options: JobOptions::default(),
         };
         if let Err(error) = reader.run().await {
             // Behind the pairs that came before it: their flows are not lost.
+            reader.submit_rest().await;
             let _gone_is_fine = pending.send(Item::Broken(error)).await;
         }
     });
@@ -114,10 +116,11 @@ struct Reader {
     held: VecDeque<Sweep>,
     /// The job of the pair before, from whose field the next one goes on.
     before: Option<JobId>,
+    options: JobOptions,
 }
 
 impl Reader {
-    async fn run(mut self) -> Result<(), ApiError> {
+    async fn run(&mut self) -> Result<(), ApiError> {
         use proto::estimate_sequence_request::Part;
         let mut room = Room::default();
         let first = chunks::next(&self.service, &mut room, &mut self.inbound).await?;
@@ -127,6 +130,7 @@ impl Reader {
         let options = convert::options(begin.options)?;
         options.check_for_pairs()?;
         options.check_for_sequence(usize::MAX)?;
+        self.options = options;
         let mut current: Option<Coming> = None;
         loop {
             // A drive may pause for as long as it likes: only a dead connection ends it.
@@ -164,25 +168,23 @@ impl Reader {
                 None => return Err(ApiError::BadRequest("a message is empty".to_owned())),
             };
             if let Some(whole) = whole {
-                self.take(whole, &options).await?;
+                self.take(whole).await?;
                 room = Room::default();
             }
             if ended {
-                while self.place + 1 < self.count {
-                    self.submit_next(&options).await;
-                }
+                self.submit_rest().await;
                 return Ok(());
             }
         }
     }
 
     /// Takes a whole sweep, and submits the pairs that no sweep to come says anything about.
-    async fn take(&mut self, coming: Coming, options: &JobOptions) -> Result<(), ApiError> {
+    async fn take(&mut self, coming: Coming) -> Result<(), ApiError> {
         self.held.push_back(coming.finish()?);
         self.count += 1;
-        let frames = options.frames();
+        let frames = self.options.frames();
         while self.place + 1 < self.count && is_whole(self.place, self.count, frames) {
-            self.submit_next(options).await;
+            self.submit_next().await;
         }
         let first = window(self.place, self.count.max(self.place + 2), frames).start;
         while self.count - self.held.len() < first {
@@ -191,8 +193,15 @@ impl Reader {
         Ok(())
     }
 
+    /// Submits the pairs that waited for sweeps to come: there are none.
+    async fn submit_rest(&mut self) {
+        while self.place + 1 < self.count {
+            self.submit_next().await;
+        }
+    }
+
     /// Submits the next pair, with the sweeps of its window.
-    async fn submit_next(&mut self, options: &JobOptions) {
+    async fn submit_next(&mut self) {
         let place = self.place;
         self.place += 1;
         let Ok(place_in_line) = self.pending.clone().reserve_owned().await else {
@@ -201,7 +210,7 @@ impl Reader {
         let first_held = self.count - self.held.len();
         let name = |place: usize| self.held[place - first_held].name.clone();
         let names = (name(place), name(place + 1));
-        let job = self.submit(place, options).await;
+        let job = self.submit(place).await;
         self.before = job.as_ref().ok().map(|accepted| accepted.job.id);
         let _sender = place_in_line.send(Item::Pair(Pending {
             place: u32::try_from(place).unwrap_or(u32::MAX),
@@ -211,7 +220,8 @@ impl Reader {
         }));
     }
 
-    async fn submit(&self, place: usize, options: &JobOptions) -> Result<Accepted, ApiError> {
+    async fn submit(&self, place: usize) -> Result<Accepted, ApiError> {
+        let options = &self.options;
         let mut request = self
             .call
             .draft_request(options.clone(), Promise::WhileAwaited);

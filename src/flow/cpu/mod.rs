@@ -16,23 +16,20 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use super::around::AlignedSweep;
 use super::backend::{Backend, BackendError, Trainer, Transform};
 use super::distance::{DistanceOptions, DistanceTransform};
-use super::ego;
 use super::field::Network;
-use super::label::{self, Labelled};
-use super::options::{LabelOptions, Options, Precision};
-use super::points::{Point, RigidTransform};
+use super::host::Host;
+use super::options::{Options, Precision};
+use super::points::Point;
 use super::watch::Watch;
 use kernels::Kernels;
 use tile::WorkingSets;
 
 /// The CPU, or a set of its threads.
 pub struct CpuBackend {
-    isa: Isa,
     kernels: Kernels,
-    threads: Arc<rayon::ThreadPool>,
+    host: Host,
 }
 
 impl CpuBackend {
@@ -52,30 +49,20 @@ impl CpuBackend {
     /// # Panics
     /// Where the machine lacks the instruction set.
     pub fn with_isa(isa: Isa, threads: Option<usize>) -> Result<Self, BackendError> {
-        let threads = rayon::ThreadPoolBuilder::new()
-            .num_threads(threads.unwrap_or(0))
-            .thread_name(|i| format!("fnsf-cpu-{i}"))
-            .build()
-            .map_err(|error| BackendError::Threads(error.to_string()))?;
         Ok(Self {
-            isa,
             kernels: Kernels::new(isa),
-            threads: Arc::new(threads),
+            host: Host::new(threads, isa)?,
         })
     }
 }
 
 impl Backend for CpuBackend {
     fn name(&self) -> String {
-        format!(
-            "cpu ({}, {} threads)",
-            self.isa.name(),
-            self.threads.current_num_threads()
-        )
+        self.host.name().to_owned()
     }
 
-    fn host(&self) -> String {
-        self.name()
+    fn host(&self) -> &Host {
+        &self.host
     }
 
     fn transform(
@@ -85,10 +72,10 @@ impl Backend for CpuBackend {
         options: &DistanceOptions,
         watch: &dyn Watch,
     ) -> Result<Box<dyn Transform>, BackendError> {
-        let distance = self
-            .threads
-            .install(|| DistanceTransform::build_watched(source, target, options, watch))?;
-        let (kernels, threads) = (self.kernels, Arc::clone(&self.threads));
+        let threads = self.host.threads();
+        let distance =
+            threads.install(|| DistanceTransform::build_watched(source, target, options, watch))?;
+        let (kernels, threads) = (self.kernels, Arc::clone(threads));
         Ok(Box::new(CpuTransform {
             kernels,
             threads,
@@ -96,37 +83,14 @@ impl Backend for CpuBackend {
         }))
     }
 
-    fn align(
-        &self,
-        source: &[Point],
-        target: &[Point],
-        prior: &RigidTransform,
-        watch: &dyn Watch,
-    ) -> RigidTransform {
-        let align = || ego::align(source, target, prior, watch);
-        self.threads.install(align)
-    }
-
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {
         Ok(evaluate::evaluate(
             &self.kernels,
-            &self.threads,
-            &WorkingSets::new(&self.threads),
+            self.host.threads(),
+            &WorkingSets::new(self.host.threads()),
             (&network.parameters, &network.conditioning),
             points,
         ))
-    }
-
-    fn movers(
-        &self,
-        source: &[Point],
-        target: &[Point],
-        around: &[AlignedSweep],
-        options: &LabelOptions,
-        watch: &dyn Watch,
-    ) -> Labelled {
-        let find = || label::label(source, target, around, options, watch);
-        self.threads.install(find)
     }
 }
 

@@ -140,7 +140,7 @@ pub fn carrier<'a>(backend: &dyn Backend, fields: impl IntoIterator<Item = &'a F
     if fields.into_iter().any(is_network) {
         backend.name()
     } else {
-        backend.host()
+        backend.host().name().to_owned()
     }
 }
 

@@ -11,14 +11,12 @@ use super::matrix::{self, Units};
 use super::memory::{Budget, Words};
 use super::records::{self, STEPS};
 use super::transform;
-use crate::flow::around::AlignedSweep;
 use crate::flow::backend::{Backend, BackendError, Transform};
+use crate::flow::cpu::Isa;
 use crate::flow::distance::DistanceOptions;
-use crate::flow::ego;
 use crate::flow::field::Network;
-use crate::flow::label::{self, Labelled};
-use crate::flow::options::LabelOptions;
-use crate::flow::points::{Point, RigidTransform};
+use crate::flow::host::Host;
+use crate::flow::points::Point;
 use crate::flow::watch::Watch;
 
 /// How a card is opened.
@@ -94,8 +92,8 @@ impl Backend for Gpu {
         self.0.name.clone()
     }
 
-    fn host(&self) -> String {
-        format!("cpu ({} threads)", self.0.host.current_num_threads())
+    fn host(&self) -> &Host {
+        &self.0.host
     }
 
     fn transform(
@@ -109,31 +107,8 @@ impl Backend for Gpu {
         Ok(Box::new(built))
     }
 
-    fn align(
-        &self,
-        source: &[Point],
-        target: &[Point],
-        prior: &RigidTransform,
-        watch: &dyn Watch,
-    ) -> RigidTransform {
-        let align = || ego::align(source, target, prior, watch);
-        self.0.host.install(align)
-    }
-
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {
         evaluate::network(&self.0, network, points)
-    }
-
-    fn movers(
-        &self,
-        source: &[Point],
-        target: &[Point],
-        around: &[AlignedSweep],
-        options: &LabelOptions,
-        watch: &dyn Watch,
-    ) -> Labelled {
-        let find = || label::label(source, target, around, options, watch);
-        self.0.host.install(find)
     }
 }
 
@@ -173,7 +148,7 @@ pub(super) struct Card {
     pub(super) budget: Budget,
     pub(super) words: Words,
     pub(super) batch: Batch,
-    pub(super) host: rayon::ThreadPool,
+    pub(super) host: Host,
     /// Seconds of one tick of the card's clock; none where it shows none.
     pub(super) tick: Option<f64>,
     pub(super) watchdog: Arc<Watchdog>,
@@ -231,10 +206,7 @@ impl Card {
 
         let kernels = Kernels::new(&device, &watchdog)?;
         let (budget, buffers) = Buffers::take(&device, adapter, options)?;
-        let host = rayon::ThreadPoolBuilder::new()
-            .thread_name(|i| format!("fnsf-host-{i}"))
-            .build()
-            .map_err(|error| BackendError::Threads(error.to_string()))?;
+        let host = Host::new(None, Isa::available()[0])?;
         let period = f64::from(queue.get_timestamp_period());
         watchdog.check()?;
         Ok(Self {

@@ -73,7 +73,7 @@ pub(super) fn build(
         return Err(BackendError::Unsupported(text));
     }
     // On the host's threads, which nobody may keep while he waits for the card.
-    let planned = card.host.install(|| {
+    let planned = card.host.threads().install(|| {
         let layout = Layout::plan(source, target, options, watch)?;
         let band_m = f64::from(layout.band) * layout.grid.cell;
         let far = FarField::build(&layout.grid, &layout.cells, band_m, watch)?;

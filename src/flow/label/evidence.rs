@@ -81,6 +81,8 @@ pub(super) struct Findings<'a> {
     pub(super) motions: &'a Motions,
     /// Of each motion, the cluster that it was found of.
     pub(super) movers: &'a [u32],
+    /// Of each source point, which of the motions it has; [`NOISE`] where it stands still.
+    pub(super) owners: &'a [u32],
 }
 
 /// Of every point of `source`, which had `labels` before anything was known of motions.
@@ -91,15 +93,15 @@ pub(super) fn evidence(findings: &Findings<'_>, source: &[Point], labels: &[u32]
         spread,
         motions,
         movers,
+        owners,
     } = *findings;
-    let owners = motions.owners_at(source);
     let mut moving = vec![0_usize; scene.source.members.len()];
     for (&label, &owner) in scene.source.labels.iter().zip(&spread.owners) {
         if label != NOISE && owner != NOISE {
             moving[label as usize] += 1;
         }
     }
-    let rows = source.par_iter().zip(labels).zip(&owners);
+    let rows = source.par_iter().zip(labels).zip(owners);
     rows.map(|((&place, &label), &owner)| {
         let moves = owner != NOISE;
         let (cluster, at) = if moves {

@@ -166,16 +166,18 @@ pub(crate) fn label(
     let owners: Vec<u32> = spread.owners.iter().map(number).collect();
     let motions = needed.iter().flatten().map(|found| found.motion);
     let motions = Motions::new(motions.collect(), &thinned.points, &owners);
+    let owners = motions.owners_at(source);
     let findings = Findings {
         scene: &scene,
         searched: &searched,
         spread: &spread,
         motions: &motions,
         movers: &movers,
+        owners: &owners,
     };
     Labelled {
         evidence: evidence::evidence(&findings, source, &labels),
-        parts: Parts::new(source, &labels, &spread.leaders, &motions),
+        parts: Parts::new(&labels, &spread.leaders, &owners, movers.len()),
         motions,
         clusters,
         all_clusters: order.len(),

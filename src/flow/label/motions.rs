@@ -92,11 +92,6 @@ impl Motions {
         places.par_iter().map(|&place| self.owner(place)).collect()
     }
 
-    /// Motions that there are.
-    pub(super) fn count(&self) -> usize {
-        self.motions.len()
-    }
-
     /// How far the motion of this number moves a place, metres, as [`Self::residual_at`] says it.
     pub(crate) fn displacement(&self, motion: u32, place: Point) -> Point {
         self.motions[motion as usize].displacement(place)

@@ -4,8 +4,6 @@
 //! It must not know how movers were found.
 
 use super::cluster::NOISE;
-use super::motions::Motions;
-use crate::flow::Point;
 
 /// The clusters of a source, those with the most points first.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -20,17 +18,17 @@ impl Parts {
     /// Of no cluster.
     pub const NONE: u32 = NOISE;
 
-    /// Of `source`, whose points had `labels` before anything was known of motions. `leaders` says of
-    /// each label whose motion it has, [`NOISE`] where none.
+    /// Of a source whose points had `labels` before anything was known of motions. `leaders` says of
+    /// each label whose motion it has, `owners` of each point which of the `count` motions; [`NOISE`]
+    /// where none.
     ///
     /// What was cut off a mover is of no cluster: it is not known what it is a part of.
-    pub(super) fn new(source: &[Point], labels: &[u32], leaders: &[u32], moved: &Motions) -> Self {
-        let owners = moved.owners_at(source);
-        let groups = moved.count() + leaders.len();
-        let of = labels.iter().zip(&owners).map(|(&label, &owner)| {
+    pub(super) fn new(labels: &[u32], leaders: &[u32], owners: &[u32], count: usize) -> Self {
+        let groups = count + leaders.len();
+        let of = labels.iter().zip(owners).map(|(&label, &owner)| {
             let stands = |label: u32| leaders.get(label as usize) == Some(&NOISE);
             match owner {
-                NOISE if stands(label) => moved.count() as u32 + label,
+                NOISE if stands(label) => count as u32 + label,
                 owner => owner,
             }
         });
@@ -51,7 +49,7 @@ impl Parts {
             of: of.into_iter().map(number).collect(),
             motions: order
                 .into_iter()
-                .map(|group| Some(group).filter(|&group| (group as usize) < moved.count()))
+                .map(|group| Some(group).filter(|&group| (group as usize) < count))
                 .collect(),
         }
     }
@@ -60,7 +58,9 @@ impl Parts {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::flow::Point;
     use crate::flow::label::motion::Motion;
+    use crate::flow::label::motions::Motions;
 
     #[test]
     fn a_piece_is_of_the_mover_that_it_goes_with_and_what_stands_keeps_its_cluster() {
@@ -71,8 +71,8 @@ mod tests {
             .to_vec();
         let labels = [0, 0, 1, 2, 2, 2, 2, NOISE, 0];
         let owners = [0, 0, 0, NOISE, NOISE, NOISE, NOISE, NOISE, NOISE];
-        let moved = Motions::new(vec![motion], &source, &owners);
-        let parts = Parts::new(&source, &labels, &[0, 0, NOISE], &moved);
+        let owners = Motions::new(vec![motion], &source, &owners).owners_at(&source);
+        let parts = Parts::new(&labels, &[0, 0, NOISE], &owners, 1);
         const NONE: u32 = Parts::NONE;
         assert_eq!(parts.of, [1, 1, 1, 0, 0, 0, 0, NONE, NONE]);
         assert_eq!(parts.motions, [None, Some(0)]);
@@ -80,7 +80,7 @@ mod tests {
 
     #[test]
     fn nothing_has_no_clusters() {
-        let none = Parts::new(&[[0.0; 3]], &[NOISE], &[], &Motions::none());
+        let none = Parts::new(&[NOISE], &[], &[NOISE], 0);
         assert_eq!(none.of, [Parts::NONE]);
         assert!(none.motions.is_empty());
     }

@@ -47,7 +47,9 @@ pub(super) fn put<W: Write + Seek>(
 pub(super) fn take(npz: &mut Npz<'_>) -> Result<Option<Vec<Cluster>>, FormatError> {
     const KIND: FileKind = FileKind::Npz;
     let Some(counts) = npz.column("clusters_points", |row, value| {
-        check_id(KIND, row, "clusters_points", value)
+        let points = check_id(KIND, row, "clusters_points", value)?;
+        let negative = || KIND.malformed(format!("clusters_points has {points} in row {row}"));
+        u32::try_from(points).map_err(|_| negative())
     })?
     else {
         return Ok(None);
@@ -79,7 +81,7 @@ pub(super) fn take(npz: &mut Npz<'_>) -> Result<Option<Vec<Cluster>>, FormatErro
     let yaw_rates = values("clusters_yaw_rate", check_value)?;
     let confidence = values("clusters_confidence", check_chance)?;
     let clusters = (0..count).map(|row| Cluster {
-        points: counts[row].unsigned_abs(),
+        points: counts[row],
         dynamic: dynamic[row],
         bounds: Bounds {
             center: centers[row],
@@ -121,19 +123,30 @@ impl From<&Cluster> for Described {
     }
 }
 
-impl From<Described> for Cluster {
-    fn from(described: Described) -> Self {
-        Self {
-            points: described.points,
-            dynamic: described.dynamic,
-            bounds: Bounds {
-                center: described.center,
-                size: described.size,
-                yaw: described.yaw,
-            },
-            velocity: described.velocity,
-            yaw_rate: described.yaw_rate,
-            confidence: described.confidence,
+impl Described {
+    /// The cluster, if its numbers can be those of one.
+    pub(in crate::formats) fn checked(
+        self,
+        kind: FileKind,
+        row: usize,
+    ) -> Result<Cluster, FormatError> {
+        let vectors = [self.center, self.size, self.velocity];
+        let values = vectors.iter().flatten().chain([&self.yaw, &self.yaw_rate]);
+        for &value in values {
+            check_value(kind, row, "clusters", f64::from(value))?;
         }
+        check_chance(kind, row, "clusters.confidence", f64::from(self.confidence))?;
+        Ok(Cluster {
+            points: self.points,
+            dynamic: self.dynamic,
+            bounds: Bounds {
+                center: self.center,
+                size: self.size,
+                yaw: self.yaw,
+            },
+            velocity: self.velocity,
+            yaw_rate: self.yaw_rate,
+            confidence: self.confidence,
+        })
     }
 }

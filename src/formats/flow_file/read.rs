@@ -94,6 +94,14 @@ pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatErr
     ] {
         check_count(what, rows.unwrap_or(count), count)?;
     }
+    if let (Some(cluster), Some(clusters)) = (&file.cluster, &file.clusters)
+        && let Some(id) = cluster
+            .iter()
+            .find(|&&id| id >= 0 && id as usize >= clusters.len())
+    {
+        let (kind, known) = (recognize(bytes, name)?, clusters.len());
+        return Err(kind.malformed(format!("cluster is {id} where there are {known} clusters")));
+    }
     Ok(file)
 }
 
