@@ -262,7 +262,9 @@ impl Worker {
         let ratio = took.as_secs_f64() / predicted.max(1e-6);
         self.metrics
             .solved(estimate.iterations, estimate.stop_reason.name(), ratio);
-        if !resumed && !cut {
+        // What the host did in a card's lane says nothing about the card.
+        let elsewhere = estimate.objects.is_some() && self.lane.kind() != DeviceKind::Cpu;
+        if !resumed && !cut && !elsewhere {
             self.cost
                 .learn(self.lane.kind(), job.cost_seconds, took.as_secs_f64());
         }

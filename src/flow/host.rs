@@ -5,7 +5,6 @@ use std::sync::Arc;
 
 use super::around::AlignedSweep;
 use super::backend::BackendError;
-use super::cpu::Isa;
 use super::ego;
 use super::label::{self, Labelled};
 use super::options::LabelOptions;
@@ -20,11 +19,12 @@ pub struct Host {
 }
 
 impl Host {
-    /// So many threads, or as many as there are cores, that compute with an instruction set.
+    /// So many threads, or as many as there are cores; `known` for the instruction set of what
+    /// computes on them besides, where there is one.
     ///
     /// # Errors
     /// [`BackendError::Threads`] where the operating system gives none.
-    pub(crate) fn new(threads: Option<usize>, isa: Isa) -> Result<Self, BackendError> {
+    pub(crate) fn new(threads: Option<usize>, known: Option<&str>) -> Result<Self, BackendError> {
         let threads = rayon::ThreadPoolBuilder::new()
             .num_threads(threads.unwrap_or(0))
             .thread_name(|i| format!("fnsf-cpu-{i}"))
@@ -32,7 +32,10 @@ impl Host {
             .map_err(|error| BackendError::Threads(error.to_string()))?;
         let count = threads.current_num_threads();
         Ok(Self {
-            name: format!("cpu ({}, {count} threads)", isa.name()),
+            name: match known {
+                Some(isa) => format!("cpu ({isa}, {count} threads)"),
+                None => format!("cpu ({count} threads)"),
+            },
             threads: Arc::new(threads),
         })
     }

@@ -51,7 +51,7 @@ impl CpuBackend {
     pub fn with_isa(isa: Isa, threads: Option<usize>) -> Result<Self, BackendError> {
         Ok(Self {
             kernels: Kernels::new(isa),
-            host: Host::new(threads, isa)?,
+            host: Host::new(threads, Some(isa.name()))?,
         })
     }
 }

@@ -12,7 +12,6 @@ use super::memory::{Budget, Words};
 use super::records::{self, STEPS};
 use super::transform;
 use crate::flow::backend::{Backend, BackendError, Transform};
-use crate::flow::cpu::Isa;
 use crate::flow::distance::DistanceOptions;
 use crate::flow::field::Network;
 use crate::flow::host::Host;
@@ -206,7 +205,7 @@ impl Card {
 
         let kernels = Kernels::new(&device, &watchdog)?;
         let (budget, buffers) = Buffers::take(&device, adapter, options)?;
-        let host = Host::new(None, Isa::available()[0])?;
+        let host = Host::new(None, None)?;
         let period = f64::from(queue.get_timestamp_period());
         watchdog.check()?;
         Ok(Self {
