@@ -132,7 +132,11 @@ impl Draft {
     ///
     /// # Errors
     /// [`ApiError`] where the pair cannot be solved here, or the store fails.
-    pub(super) async fn push(&mut self, cloud: StoredCloud) -> Result<(), ApiError> {
+    pub(super) async fn push(
+        &mut self,
+        cloud: impl Into<Arc<StoredCloud>>,
+    ) -> Result<(), ApiError> {
+        let cloud = cloud.into();
         let service = Arc::clone(&self.service);
         service.admission.check_points(cloud.points.len())?;
         service.check_disk()?;
@@ -146,7 +150,6 @@ impl Draft {
         if self.request.options.densify.is_some() {
             service.admission.check_dense(&self.points)?;
         }
-        let cloud = Arc::new(cloud);
         let before = self.last.replace(Arc::clone(&cloud));
         let options = self.request.options.clone();
         let after = self.request.link.and_then(|link| link.after);

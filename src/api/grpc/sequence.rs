@@ -40,10 +40,11 @@ enum Item {
     Broken(ApiError),
 }
 
-/// A sweep that has arrived.
+/// A sweep that has arrived, and the room that it takes until no pair sees it any more.
 struct Sweep {
     name: String,
-    cloud: StoredCloud,
+    cloud: Arc<StoredCloud>,
+    _room: Room,
 }
 
 /// A sweep that is arriving.
@@ -55,7 +56,7 @@ struct Coming {
 }
 
 impl Coming {
-    fn finish(self) -> Result<Sweep, ApiError> {
+    fn finish(self, room: Room) -> Result<Sweep, ApiError> {
         let cloud = self.cloud.finish(&self.name)?;
         if let Some(points) = self.points
             && points != cloud.points.len() as u64
@@ -68,7 +69,8 @@ impl Coming {
         }
         Ok(Sweep {
             name: self.name,
-            cloud,
+            cloud: Arc::new(cloud),
+            _room: room,
         })
     }
 }
@@ -168,8 +170,7 @@ impl Reader {
                 None => return Err(ApiError::BadRequest("a message is empty".to_owned())),
             };
             if let Some(whole) = whole {
-                self.take(whole).await?;
-                room = Room::default();
+                self.take(whole, std::mem::take(&mut room)).await?;
             }
             if ended {
                 self.submit_rest().await;
@@ -179,8 +180,8 @@ impl Reader {
     }
 
     /// Takes a whole sweep, and submits the pairs that no sweep to come says anything about.
-    async fn take(&mut self, coming: Coming) -> Result<(), ApiError> {
-        self.held.push_back(coming.finish()?);
+    async fn take(&mut self, coming: Coming, room: Room) -> Result<(), ApiError> {
+        self.held.push_back(coming.finish(room)?);
         self.count += 1;
         let frames = self.options.frames();
         while self.place + 1 < self.count && is_whole(self.place, self.count, frames) {
@@ -236,7 +237,7 @@ impl Reader {
         let mut draft = Draft::begin(&self.service, self.call.caller.clone(), request)?;
         let first_held = self.count - self.held.len();
         for place in sees {
-            let cloud = self.held[place - first_held].cloud.clone();
+            let cloud = Arc::clone(&self.held[place - first_held].cloud);
             draft.push(cloud).await?;
         }
         draft.submit(Kind::Pair).await
