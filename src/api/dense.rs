@@ -7,7 +7,6 @@ use std::sync::Arc;
 
 use super::admission::Admission;
 use super::codec;
-use super::draft::seen;
 use super::error::ApiError;
 use super::service::Service;
 use crate::blobs::Blob;
@@ -54,7 +53,7 @@ impl Closing {
         let back = back.enumerate().map(|(turn, leg)| PairOf {
             place: leg.target as u32,
             backward: true,
-            sees: seen(window_back(leg.target, points.len(), frames)),
+            sees: PairOf::seen(window_back(leg.target, points.len(), frames)),
             follows: goes_on && turn > 0,
         });
         Ok(Self {

@@ -2,7 +2,6 @@
 //!
 //! Nothing is promised before [`Draft::submit`]; a draft that is dropped leaves nothing behind.
 
-use std::ops::Range;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -46,11 +45,6 @@ pub(super) struct Request {
 pub(super) struct Link {
     /// The pair before, where there is one.
     pub after: Option<JobId>,
-}
-
-/// A range of sweeps as the queue keeps it.
-pub(super) fn seen(sweeps: Range<usize>) -> [u32; 2] {
-    [sweeps.start, sweeps.end].map(|place| u32::try_from(place).unwrap_or(u32::MAX))
 }
 
 /// A job that was accepted.
@@ -263,7 +257,7 @@ impl Draft {
         let forward = (0..self.frames - 1).map(|place| PairOf {
             place,
             backward: false,
-            sees: seen(window(place as usize, self.frames as usize, frames)),
+            sees: PairOf::seen(window(place as usize, self.frames as usize, frames)),
             follows: goes_on && place > 0,
         });
         forward.collect()

@@ -6,8 +6,7 @@ use rayon::prelude::*;
 
 use super::bounds::Bounds;
 use super::label::{Labelled, Parts};
-use super::points::{Point, RigidTransform, moved};
-use super::solver::DYNAMIC_M;
+use super::points::{DYNAMIC_M, Point, RigidTransform, moved};
 
 /// The clusters of a sweep of N rows.
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -6,6 +6,9 @@ pub type Point = [f32; 3];
 /// A rigid motion, column vectors, metres. Named `target_from_source` where it is stored.
 pub type RigidTransform = nalgebra::Isometry3<f64>;
 
+/// Residual motion of a frame from which a point counts as moving, metres (Argoverse 2).
+pub const DYNAMIC_M: f32 = 0.05;
+
 /// `point`, moved rigidly: computed in double precision.
 pub(crate) fn moved(motion: &RigidTransform, point: Point) -> Point {
     let moved = motion * nalgebra::Point3::from(point.map(f64::from));

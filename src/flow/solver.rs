@@ -12,7 +12,7 @@ use super::label::{Labelled, confidence_of_ground};
 use super::loss::length;
 use super::objects::Objects;
 use super::options::{Ego, Options, Precision};
-use super::points::{Point, RigidTransform, all_moved, moved};
+use super::points::{DYNAMIC_M, Point, RigidTransform, all_moved, moved};
 use super::preprocess::{self, Problem, Selection};
 use super::snapshot::{Snapshot, TrainerState};
 use super::warm_start::warm_start;
@@ -20,9 +20,6 @@ use super::watch::{Interrupt, Watch};
 
 /// Iterations that a backend may do without coming back.
 const STEPS_AT_ONCE: usize = 64;
-
-/// Residual motion of a frame from which a point counts as moving, metres (Argoverse 2).
-pub const DYNAMIC_M: f32 = 0.05;
 
 /// The motion of every point.
 #[derive(Clone, Debug)]

@@ -2,10 +2,10 @@
 //!
 //! It must not know how the flow was found.
 
+mod json;
 mod objects;
 mod read;
 
-pub(super) use objects::Described;
 pub use read::{FlowFile, read_flow};
 
 use std::io::{Cursor, Write};
@@ -20,7 +20,7 @@ use super::motion::matrix_rows;
 use super::npz::NpzWriter;
 use super::pair::check_count;
 use super::sniff::ending;
-use super::{json, npy, pcd, ply};
+use super::{npy, pcd, ply};
 
 /// Property names of a displacement in PLY and PCD.
 const FLOW_AXES: [&str; 3] = ["flow_x", "flow_y", "flow_z"];

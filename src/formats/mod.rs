@@ -20,7 +20,6 @@ mod poses;
 
 mod bin;
 mod feather;
-mod json;
 mod las;
 mod lzf;
 mod npy;

@@ -14,6 +14,7 @@ mod sqlite;
 #[cfg(test)]
 mod contract;
 
+use std::ops::Range;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -84,6 +85,11 @@ impl PairOf {
         sees: [0, 2],
         follows: false,
     };
+
+    /// Some of a sequence's sweeps, as [`PairOf::sees`] has them.
+    pub fn seen(sweeps: Range<usize>) -> [u32; 2] {
+        [sweeps.start, sweeps.end].map(|place| u32::try_from(place).unwrap_or(u32::MAX))
+    }
 }
 
 /// What makes a repeated submission recognizable.

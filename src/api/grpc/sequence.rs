@@ -14,7 +14,7 @@ use super::call::{Call, no_begin};
 use super::chunks::{self, CloudBuilder};
 use super::{convert, proto};
 use crate::api::admission::Promise;
-use crate::api::draft::{Accepted, Draft, Link, Room, seen};
+use crate::api::draft::{Accepted, Draft, Link, Room};
 use crate::api::error::ApiError;
 use crate::api::service::{Service, Waited};
 use crate::flow::{is_whole, window};
@@ -231,7 +231,7 @@ impl Reader {
         let sees = window(place, self.count, options.frames());
         request.pair = PairOf {
             place: u32::try_from(place - sees.start).unwrap_or(u32::MAX),
-            sees: seen(0..sees.len()),
+            sees: PairOf::seen(0..sees.len()),
             ..PairOf::ALONE
         };
         let mut draft = Draft::begin(&self.service, self.call.caller.clone(), request)?;

@@ -5,9 +5,8 @@ use crate::flow::backend::Backend;
 use crate::flow::dense::DenseCloud;
 use crate::flow::field::Field;
 use crate::flow::loss::length;
-use crate::flow::points::{Point, RigidTransform, all_moved};
+use crate::flow::points::{DYNAMIC_M, Point, RigidTransform, all_moved};
 use crate::flow::sequence::Sweep;
-use crate::flow::solver::DYNAMIC_M;
 use crate::flow::watch::{self, Watch};
 
 /// An inverse has settled where its last correction is shorter than this, metres.

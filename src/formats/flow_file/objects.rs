@@ -97,7 +97,7 @@ pub(super) fn take(npz: &mut Npz<'_>) -> Result<Option<Vec<Cluster>>, FormatErro
 
 /// A cluster in JSON, which has no other numbers than finite ones.
 #[derive(Serialize, Deserialize)]
-pub(in crate::formats) struct Described {
+pub(super) struct Described {
     points: u32,
     dynamic: bool,
     center: Point,
@@ -125,11 +125,7 @@ impl From<&Cluster> for Described {
 
 impl Described {
     /// The cluster, if its numbers can be those of one.
-    pub(in crate::formats) fn checked(
-        self,
-        kind: FileKind,
-        row: usize,
-    ) -> Result<Cluster, FormatError> {
+    pub(super) fn checked(self, kind: FileKind, row: usize) -> Result<Cluster, FormatError> {
         let vectors = [self.center, self.size, self.velocity];
         let values = vectors.iter().flatten().chain([&self.yaw, &self.yaw_rate]);
         for &value in values {

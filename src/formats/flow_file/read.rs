@@ -1,17 +1,17 @@
 //! Flow back in, in any format that it is written in. It must not know how the flow was found.
 
-use super::{FLOW_AXES, objects};
+use super::{FLOW_AXES, json, objects};
 use crate::flow::{Cluster, Point};
 use crate::formats::cloud::read_columns;
 use crate::formats::error::{FileKind, FormatError};
 use crate::formats::feather::{FLOW_COLUMNS, Table};
 use crate::formats::limits::{check_chance, check_flag, check_id, check_value};
+use crate::formats::npy;
 use crate::formats::npz::Npz;
 use crate::formats::pair::{check_count, flags};
 use crate::formats::pcd::Pcd;
 use crate::formats::ply::Ply;
 use crate::formats::sniff::recognize;
-use crate::formats::{json, npy};
 
 /// A flow read back, and whatever the file says of its N rows besides.
 #[derive(Clone, Debug, Default, PartialEq)]

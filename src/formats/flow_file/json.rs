@@ -8,10 +8,11 @@ use std::io::Write;
 
 use crate::flow::{Cluster, Point};
 
-use super::error::{FileKind, FormatError};
-use super::flow_file::{Described, FlowFile, FlowTable};
-use super::limits::{check_chance, check_value};
-use super::motion::matrix_rows;
+use super::objects::Described;
+use super::{FlowFile, FlowTable};
+use crate::formats::error::{FileKind, FormatError};
+use crate::formats::limits::{check_chance, check_value};
+use crate::formats::motion::matrix_rows;
 
 const KIND: FileKind = FileKind::Json;
 
