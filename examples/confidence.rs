@@ -5,7 +5,7 @@
 //! ```
 //!
 //! Fitted to streets 0 to 11 of 64 and of 32 beams and to the labelled pairs below `FNSF_REAL_DATA`,
-//! where it is set; judged on streets 100 to 109 too, which nothing was fitted to, and on each labelled pair by weights that
+//! where it is set; judged on streets 100 to 109 and 400 to 409 too, which nothing was fitted to, and on each labelled pair by weights that
 //! were fitted without it. Points off the ground by the pairs' own masks, the ego motion estimated.
 #![expect(
     clippy::print_stdout,
@@ -307,6 +307,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     };
     let known = streets(0..STREETS)?;
     let fresh = streets(100..110)?;
+    let more = streets(400..410)?;
     let all: Vec<&Scene> = known.iter().chain(&pairs).collect();
     let fitted = |scenes: &[&Scene]| -> Vec<Vec<f64>> {
         (0..KINDS.len()).map(|kind| fitted(scenes, kind)).collect()
@@ -328,10 +329,15 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         &weights,
     )?;
     let mut shown = vec![told(
-        "fresh streets",
+        "streets 100 to 109",
         &fresh.iter().collect::<Vec<_>>(),
         &weights,
     )?];
+    told(
+        "streets 400 to 409",
+        &more.iter().collect::<Vec<_>>(),
+        &weights,
+    )?;
     for pair in &pairs {
         told(&pair.name, &[pair], &weights)?;
         let others = all.iter().copied().filter(|other| other.name != pair.name);

@@ -9,15 +9,15 @@ use super::evidence::Evidence;
 pub const SURE_M: f32 = 0.05;
 
 /// What is weighed.
-const FEATURES: usize = 9;
+const FEATURES: usize = 12;
 
 /// Weights of what moves, in the order of [`Evidence::features`].
 const MOVING: [f32; FEATURES] = [
-    3.793, 0.380, 0.026, 0.278, -5.480, -3.828, -4.729, 0.000, -1.148,
+    6.376, 0.044, -0.223, 0.298, -5.671, -3.329, -12.499, 0.000, 2.653, 3.513, -1.754, -5.687,
 ];
 /// Weights of what stands still.
 const STANDING: [f32; FEATURES] = [
-    7.244, -2.275, -0.304, -0.688, -0.214, -1.235, 3.022, 0.179, -1.546,
+    5.298, -2.067, -0.212, -0.713, -0.652, -0.672, 4.173, 0.390, -1.675, -1.145, 1.135, 0.450,
 ];
 /// Weights of ground, which moves with the vehicle: none, and by [`range`].
 const GROUND: [f32; 2] = [6.902, -2.957];
@@ -25,10 +25,14 @@ const GROUND: [f32; 2] = [6.902, -2.957];
 impl Evidence {
     /// What is weighed, each of the order of one: 1, range, residual, whether nothing is there, the
     /// cluster's cost there and back, how few points it has, what a refused motion would have
-    /// gained, and how much of the cluster does otherwise.
+    /// gained, how much of the cluster does otherwise, and its size: cars are neither as small as
+    /// posts nor as large as walls.
     pub fn features(&self) -> [f32; FEATURES] {
         /// Metres that are one.
         const DISTANCE_M: f32 = 0.1;
+        /// Cars are lower, what is higher is as good as a house.
+        const HEIGHT_M: f32 = 3.0;
+        let length = (1.0 + self.extent_m[0]).ln();
         [
             1.0,
             range(self.range_m),
@@ -39,6 +43,9 @@ impl Evidence {
             1.0 / (self.points.max(1) as f32).sqrt(),
             self.refused_m / DISTANCE_M,
             1.0 - self.together,
+            length,
+            length * length,
+            self.extent_m[1].min(HEIGHT_M) / HEIGHT_M,
         ]
     }
 

@@ -70,6 +70,9 @@ pub struct Evidence {
     pub refused_m: f32,
     /// Share of its cluster that does as it does.
     pub together: f32,
+    /// How long and how high its cluster is, metres: level, the longer side along the axes. Zero where
+    /// it is of none.
+    pub extent_m: [f32; 2],
 }
 
 /// What was found out about a pair's clusters.
@@ -101,6 +104,12 @@ pub(super) fn evidence(findings: &Findings<'_>, source: &[Point], labels: &[u32]
             moving[label as usize] += 1;
         }
     }
+    let extents: Vec<[f32; 2]> = scene
+        .source
+        .members
+        .par_iter()
+        .map(|rows| extent(rows.iter().map(|&row| scene.source.points[row as usize])))
+        .collect();
     let rows = source.par_iter().zip(labels).zip(owners);
     rows.map(|((&place, &label), &owner)| {
         let moves = owner != NOISE;
@@ -137,7 +146,20 @@ pub(super) fn evidence(findings: &Findings<'_>, source: &[Point], labels: &[u32]
                 (found.still.sum_m() - found.cost.sum_m()).max(0.0)
             }),
             together: share,
+            extent_m: extents.get(cluster as usize).copied().unwrap_or_default(),
         }
     })
     .collect()
+}
+
+/// How long and how high some points reach, metres.
+fn extent(points: impl Iterator<Item = Point>) -> [f32; 2] {
+    let mut ends = [[f32::INFINITY, f32::NEG_INFINITY]; 3];
+    for point in points {
+        for ([low, high], value) in ends.iter_mut().zip(point) {
+            (*low, *high) = (low.min(value), high.max(value));
+        }
+    }
+    let [x, y, z] = ends.map(|[low, high]| (high - low).max(0.0));
+    [x.max(y), z]
 }
