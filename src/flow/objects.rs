@@ -66,10 +66,7 @@ impl Objects {
         }
         let described = motions.par_iter().zip(&members).map(|(&motion, members)| {
             let points: Vec<Point> = members.iter().map(|&i| points[i]).collect();
-            let sure: f32 = members
-                .iter()
-                .map(|&i| labelled.evidence[i].confidence())
-                .sum();
+            let sure: f32 = members.iter().map(|&i| objects.confidence[rows[i]]).sum();
             let mut cluster = Cluster {
                 points: points.len() as u32,
                 confidence: sure / points.len().max(1) as f32,

@@ -307,7 +307,7 @@ impl Fitted {
             return Err(FlowError::Cancelled);
         }
         Ok(Self {
-            residual: labelled.motions.residual_at(aligned),
+            residual: labelled.residual_of(aligned),
             field: Residual::Objects(labelled.motions.into()),
             max_iterations: labelled.all_clusters,
             report: Report {

@@ -110,6 +110,7 @@ pub(super) fn evidence(findings: &Findings<'_>, source: &[Point], labels: &[u32]
         .par_iter()
         .map(|rows| extent(rows.iter().map(|&row| scene.source.points[row as usize])))
         .collect();
+    let unknown = Searched::not(scene.options);
     let rows = source.par_iter().zip(labels).zip(owners);
     rows.map(|((&place, &label), &owner)| {
         let moves = owner != NOISE;
@@ -130,7 +131,6 @@ pub(super) fn evidence(findings: &Findings<'_>, source: &[Point], labels: &[u32]
             let share = moving as f32 / members(label).max(1) as f32;
             if moves { share } else { 1.0 - share }
         });
-        let unknown = Searched::not(scene.options);
         let known = searched.get(cluster as usize).unwrap_or(&unknown);
         let cost = if moves { known.cost() } else { known.still };
         let refused = known.best.filter(|_| !known.needed && !moves);

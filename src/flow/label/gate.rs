@@ -4,7 +4,7 @@
 //! A sparse static surface can always be laid a little better on the other sweep's samples, and what
 //! only one sweep saw lies best on something else. It must not know how motions are found.
 
-use super::rigid::{Evidence, Found};
+use super::rigid::{Found, Witnesses};
 use crate::flow::Point;
 use crate::flow::options::LabelOptions;
 
@@ -28,7 +28,7 @@ pub(super) fn is_needed(found: &Found, points: &[Point], options: &LabelOptions)
 /// Whether the sweeps around say plainly that a cluster moves, even one that its surfaces do not hold:
 /// a wall that seems to slide lies where it was in all of them, a bus has driven on. The nearest must
 /// say so itself: a wall may slide, by then, onto what lies behind it.
-fn is_confirmed(around: &Evidence, options: &LabelOptions) -> bool {
+fn is_confirmed(around: &Witnesses, options: &LabelOptions) -> bool {
     let is_plain = |[still_m, moved_m]: [f32; 2], weight: f32| {
         moved_m <= options.confirmed_cost * still_m
             && still_m - moved_m >= options.confirmed_m * weight
@@ -63,7 +63,7 @@ mod tests {
             cost: cost(0.03, 0.03),
             still: cost(0.25, 0.2),
             hold: 0.4,
-            around: Evidence::default(),
+            around: Witnesses::default(),
         }
     }
 
@@ -101,7 +101,7 @@ mod tests {
 
     #[test]
     fn a_bus_that_all_sweeps_see_driving_moves_though_nothing_holds_it() {
-        let around = |still_m: f32, moved_m: f32| Evidence {
+        let around = |still_m: f32, moved_m: f32| Witnesses {
             weight: 1.5,
             still_m: still_m * 1.5,
             moved_m: moved_m * 1.5,
@@ -116,7 +116,7 @@ mod tests {
         assert!(slides(around(0.4, 0.05)));
         assert!(!slides(around(0.08, 0.05)));
         assert!(!slides(around(0.4, 0.3)));
-        let far = Evidence {
+        let far = Witnesses {
             nearest_m: [0.05; 2],
             ..around(0.4, 0.05)
         };

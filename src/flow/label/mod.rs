@@ -80,6 +80,21 @@ pub struct Labelled {
 }
 
 impl Labelled {
+    /// How far each of the `source` points that it is of moves, metres, the ego motion left out: as
+    /// [`Motions::residual_at`] says it, without looking for their objects again.
+    pub(crate) fn residual_of(&self, source: &[Point]) -> Vec<Point> {
+        let motion = |place: usize| {
+            let cluster = *self.parts.of.get(place)?;
+            *self.parts.motions.get(cluster as usize)?
+        };
+        let places = source.iter().enumerate();
+        let residual = places.map(|(place, &point)| match motion(place) {
+            None => [0.0; 3],
+            Some(motion) => self.motions.displacement(motion, point),
+        });
+        residual.collect()
+    }
+
     /// Nothing was looked at.
     fn nothing(interrupted: Interrupt) -> Self {
         Self {

@@ -50,12 +50,12 @@ pub(super) struct Found {
     /// How well the cluster's surfaces hold it along the motion, 0 to 1.
     pub(super) hold: f32,
     /// What the sweeps around say.
-    pub(super) around: Evidence,
+    pub(super) around: Witnesses,
 }
 
 /// What the sweeps around that see a cluster, moved or standing still, say of its motion.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Evidence {
+pub(super) struct Witnesses {
     /// What they count in all, in times of the target.
     pub(super) weight: f32,
     /// Weighted costs, metres.
@@ -141,7 +141,7 @@ impl<'a> Mover<'a> {
             cost,
             still,
             hold: self.hold(&motion),
-            around: self.evidence(&motion),
+            around: self.witnesses(&motion),
         })
     }
 
@@ -181,8 +181,8 @@ impl<'a> Mover<'a> {
     }
 
     /// What those sweeps around that see the cluster, moved or not, say of a motion.
-    fn evidence(&self, motion: &Motion) -> Evidence {
-        let mut all = Evidence::default();
+    fn witnesses(&self, motion: &Motion) -> Witnesses {
+        let mut all = Witnesses::default();
         let still = Motion::still(motion.center);
         for (place, moment) in self.around.iter().enumerate() {
             let [moved, still] =

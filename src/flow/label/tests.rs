@@ -50,7 +50,9 @@ fn a_car_moves_and_the_wall_beside_it_stands_still() {
     let source = [car(&mut random, [5.0, 0.0]), street].concat();
     let street = wall(&mut random, [-15.0, 15.0]);
     let target = [car(&mut random, [6.1, 0.1]), street].concat();
-    let residual = found(&source, &target).motions.residual_at(&source);
+    let labelled = found(&source, &target);
+    let residual = labelled.motions.residual_at(&source);
+    assert_eq!(labelled.residual_of(&source), residual);
     for (residual, point) in residual.iter().zip(&source) {
         if point[1] > 5.0 {
             assert_eq!(*residual, [0.0; 3]);
