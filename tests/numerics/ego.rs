@@ -11,9 +11,11 @@ use super::scenes::{real_pair, street};
 /// What is asked of it.
 const TRANSLATION_M: f64 = 0.02;
 const ROTATION_DEGREES: f64 = 0.1;
-/// Half of small_gicp's points lie within 3.6 m of who carried the lidar: 0.3 degrees are 2 cm
-/// there, and its pose is itself from a registration.
-const HANDHELD_DEGREES: f64 = 0.3;
+/// What it does on sweeps of 64 beams.
+const DRIVEN: [f64; 2] = [0.012, 0.04];
+/// Half of small_gicp's points lie within 3.6 m of who carried the lidar, and its pose is itself from
+/// a registration. Seen: 0.10 to 0.14 degrees.
+const HANDHELD: [f64; 2] = [TRANSLATION_M, 0.17];
 /// Two rings of 16 beams rarely see the same wall. Seen: up to 0.11 degrees.
 const SPARSE_DEGREES: f64 = 0.15;
 
@@ -60,9 +62,9 @@ fn reversed(pair: Pair) -> Pair {
 #[test]
 fn the_ego_motion_of_a_real_pair_is_found_without_any_pose_in_both_directions() {
     for name in ["av2_7fab", "kitti_0000", "small_gicp"] {
-        let most_degrees = match name {
-            "small_gicp" => HANDHELD_DEGREES,
-            _ => ROTATION_DEGREES,
+        let [most_m, most_degrees] = match name {
+            "small_gicp" => HANDHELD,
+            _ => DRIVEN,
         };
         let Some(pair) = real_pair(name) else { return };
         let Some(again) = real_pair(name) else { return };
@@ -70,7 +72,7 @@ fn the_ego_motion_of_a_real_pair_is_found_without_any_pose_in_both_directions() 
             let truth = pair.ego.expect("the pair has it");
             let [metres, degrees] = gap(&found(&pair, Ground::Keep, None), &truth);
             assert!(
-                metres < TRANSLATION_M && degrees < most_degrees,
+                metres < most_m && degrees < most_degrees,
                 "{name} {what}: {metres} m, {degrees} degrees"
             );
         }

@@ -1,27 +1,35 @@
-//! Gauss-Newton on the distances of points to the planes of the surfels nearest to them.
+//! Gauss-Newton on the distances of surfels to the surfels nearest to them (generalized ICP, Segal
+//! et al., 2009).
 //!
-//! The weight (Geman and McClure) and the reach of a match shrink on the way, so that movers and
-//! what only one sweep saw lose their say. Directions that the matches leave free are not moved
-//! along. It must not know where a fit starts, or why.
+//! A surfel is thin along its normal and wide across it, and so a match is as sure of a direction
+//! as both surfels are: two that face one another measure along their normal, and two that do not
+//! hardly measure. The weight (Geman and McClure) and the reach of a match shrink on the way, so
+//! that movers and what only one sweep saw lose their say. Directions that the matches leave free
+//! are not moved along. It must not know where a fit starts, or why.
 
 use nalgebra::{
-    Isometry3, Matrix6, Point3, SymmetricEigen, Translation3, UnitQuaternion, Vector3, Vector6,
+    Isometry3, Matrix3, Matrix6, Point3, SymmetricEigen, Translation3, UnitQuaternion, Vector3,
+    Vector6,
 };
 use rayon::prelude::*;
 
-use super::surfels::Surfels;
+use super::surfels::{Flat, Surfel, Surfels};
 use crate::flow::points::{Point, RigidTransform};
 use crate::flow::watch::Watch;
 
-/// Points whose sums one thread takes at a time; sums are added in the points' order.
-const POINTS_AT_ONCE: usize = 256;
+/// Surfels whose sums one thread takes at a time; sums are added in the surfels' order.
+const AT_ONCE: usize = 256;
 /// Reach and scale shrink over this share of the steps.
 const SHRINKING: f64 = 0.5;
+/// Variance of a perfect plane along its normal, that across being 1, and how much of a surfel's
+/// thickness is added to it: normals are 2 degrees uncertain at best, and more on what is thick.
+const THIN: f64 = 1e-3;
+const THICKNESS: f64 = 0.1;
 /// A step shorter than this, metres at the points' spread, is the last.
 const SHORT_STEP_M: f64 = 2e-4;
-/// A direction is free where it moves the points along their normals by less than this share,
-/// squared, of its length: normals are 3 degrees uncertain. Some streets are held by 1%.
-const FREE: f64 = 3e-3;
+/// A direction is free where the matches hold it by less than this share of all that they hold.
+/// Some streets are held by 1%.
+const FREE: f64 = 3e-4;
 /// The least spread of points that turns are measured by, metres.
 const LEAST_SPREAD_M: f64 = 1e-3;
 
@@ -49,11 +57,11 @@ impl Schedule {
     }
 }
 
-/// Points, and the surfels that they are fitted to.
+/// Surfels, and those that they are fitted to.
 pub(super) struct Fit<'a> {
-    points: &'a [Point],
-    surfels: &'a Surfels,
-    /// The points' middle, about which turns are taken, and their root-mean-square distance from
+    source: &'a [Surfel],
+    target: &'a Surfels,
+    /// The source's middle, about which turns are taken, and its root-mean-square distance from
     /// it, which makes turns and shifts comparable.
     center: Point3<f64>,
     spread_m: f64,
@@ -64,18 +72,21 @@ struct Sums {
     normal: Matrix6<f64>,
     gradient: Vector6<f64>,
     weight: f64,
+    /// How much they hold of shifts, in all directions together.
+    held: f64,
 }
 
 impl<'a> Fit<'a> {
-    pub(super) fn new(points: &'a [Point], surfels: &'a Surfels) -> Self {
-        let count = points.len().max(1) as f64;
-        let sum: Vector3<f64> = points.iter().map(|&point| double(point).coords).sum();
+    pub(super) fn new(source: &'a [Surfel], target: &'a Surfels) -> Self {
+        let count = source.len().max(1) as f64;
+        let points = source.iter().map(|surfel| double(surfel.point));
+        let sum: Vector3<f64> = points.clone().map(|point| point.coords).sum();
         let center = Point3::from(sum / count);
-        let square = |&point: &Point| (double(point) - center).norm_squared();
-        let spread_m = (points.iter().map(square).sum::<f64>() / count).sqrt();
+        let squares = points.map(|point| (point - center).norm_squared());
+        let spread_m = (squares.sum::<f64>() / count).sqrt();
         Self {
-            points,
-            surfels,
+            source,
+            target,
             center,
             spread_m: spread_m.max(LEAST_SPREAD_M),
         }
@@ -106,51 +117,73 @@ impl<'a> Fit<'a> {
         motion
     }
 
-    /// How well a motion fits, 0 to 1: the share of the points that lie on surfels, by weight.
+    /// How well a motion fits, 0 to 1: the share of the surfels that lie on others, by weight.
     pub(super) fn score(&self, motion: &RigidTransform, schedule: &Schedule) -> f64 {
         let (within_m, scale_m, _) = schedule.at(schedule.steps);
-        self.sums(motion, within_m, scale_m).weight / self.points.len().max(1) as f64
+        self.sums(motion, within_m, scale_m).weight / self.source.len().max(1) as f64
     }
 
     fn sums(&self, motion: &RigidTransform, within_m: f32, scale_m: f64) -> Sums {
-        let chunks = self.points.par_chunks(POINTS_AT_ONCE);
+        let chunks = self.source.par_chunks(AT_ONCE);
         let sums: Vec<Sums> = chunks
-            .map(|points| self.sums_of(points, motion, within_m, scale_m))
+            .map(|surfels| self.sums_of(surfels, motion, within_m, scale_m))
             .collect();
         let mut all = Sums::default();
         for sums in sums {
             all.normal += sums.normal;
             all.gradient += sums.gradient;
             all.weight += sums.weight;
+            all.held += sums.held;
         }
         all
     }
 
     fn sums_of(
         &self,
-        points: &[Point],
+        surfels: &[Surfel],
         motion: &RigidTransform,
         within_m: f32,
         scale_m: f64,
     ) -> Sums {
         let pivot = motion * self.center;
+        let rotation = motion.rotation.to_rotation_matrix();
         let mut sums = Sums::default();
-        for &point in points {
-            let moved = motion * double(point);
+        for surfel in surfels {
+            let moved = motion * double(surfel.point);
             let single = moved.map(|c| c as f32).into();
-            let Some(surfel) = self.surfels.nearest(single, within_m) else {
+            let Some(nearest) = self.target.nearest(single, within_m) else {
                 continue;
             };
-            let normal = Vector3::from(surfel.normal.map(f64::from));
-            let residual = normal.dot(&(moved - double(surfel.point)));
+            let (source, target) = (normal(&surfel.flat), normal(&nearest.flat));
+            let spread =
+                spread(&surfel.flat, &(rotation * source)) + spread(&nearest.flat, &target);
+            let Some(inverse) = spread.try_inverse() else {
+                continue;
+            };
+            // Two perfect planes that face one another count as what they are along their normal
+            // and not at all across it.
+            let information = inverse * (2.0 * THIN) - Matrix3::identity() * THIN;
+            let residual = moved - double(nearest.point);
+            let pull = information * residual;
             let square = scale_m * scale_m;
-            let weight = (square / (square + residual * residual)).powi(2);
-            let turning = (moved - pivot).cross(&normal) / self.spread_m;
-            let [x, y, z] = normal.into();
-            let jacobian = Vector6::new(x, y, z, turning.x, turning.y, turning.z);
-            sums.normal += jacobian * jacobian.transpose() * weight;
-            sums.gradient += jacobian * (weight * residual);
+            let weight = (square / (square + residual.dot(&pull))).powi(2);
+            let turning = (moved - pivot).cross_matrix() / -self.spread_m;
+            let across = information * turning;
+            let mut normal = Matrix6::zeros();
+            normal.fixed_view_mut::<3, 3>(0, 0).copy_from(&information);
+            normal.fixed_view_mut::<3, 3>(0, 3).copy_from(&across);
+            normal
+                .fixed_view_mut::<3, 3>(3, 0)
+                .copy_from(&across.transpose());
+            normal
+                .fixed_view_mut::<3, 3>(3, 3)
+                .copy_from(&(turning.transpose() * across));
+            let [x, y, z] = pull.into();
+            let [a, b, c] = (turning.transpose() * pull).into();
+            sums.normal += normal * weight;
+            sums.gradient += Vector6::new(x, y, z, a, b, c) * weight;
             sums.weight += weight;
+            sums.held += information.trace() * weight;
         }
         sums
     }
@@ -162,6 +195,7 @@ impl Default for Sums {
             normal: Matrix6::zeros(),
             gradient: Vector6::zeros(),
             weight: 0.0,
+            held: 0.0,
         }
     }
 }
@@ -176,12 +210,22 @@ impl Sums {
         } = self.normal.symmetric_eigen();
         let mut update = Vector6::zeros();
         for (axis, &held) in eigenvectors.column_iter().zip(&eigenvalues) {
-            if held > FREE * self.weight.max(1.0) {
+            if held > FREE * self.held.max(THIN) {
                 update -= axis * (axis.dot(&self.gradient) / held);
             }
         }
         update
     }
+}
+
+/// The covariance of a surfel with that normal: 1 across, thin along.
+fn spread(flat: &Flat, normal: &Vector3<f64>) -> Matrix3<f64> {
+    let along = THIN + THICKNESS * f64::from(flat.thickness);
+    Matrix3::identity() - normal * normal.transpose() * (1.0 - along.min(1.0))
+}
+
+fn normal(flat: &Flat) -> Vector3<f64> {
+    Vector3::from(flat.normal.map(f64::from))
 }
 
 fn double(point: Point) -> Point3<f64> {

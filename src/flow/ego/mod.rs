@@ -4,7 +4,7 @@
 //! two clouds - thinned - search: nine starts on coarse surfels - refinement on fine ones - motion
 //! ```
 //!
-//! Point to plane on evenly thinned clouds, robustly weighted, from a prior. Needs the ground, which
+//! Plane to plane on evenly thinned clouds, robustly weighted, from a prior. Needs the ground, which
 //! alone holds pitch, roll and height. It must not know of fields, flows or distance transforms.
 
 // What the target is made of, how a motion is fitted to it, and from where.
@@ -17,26 +17,25 @@ mod thin;
 mod tests;
 
 use fit::{Fit, Schedule};
-use surfels::Surfels;
-pub(super) use surfels::normal;
+pub(super) use surfels::flat;
+use surfels::{Columns, Surfels};
 use thin::thinned;
 
-use super::points::{Point, RigidTransform, evenly};
+use super::points::{Point, RigidTransform};
 use super::watch::Watch;
 
-/// Side of the voxels that both clouds are thinned to, metres. With 0.4 m, 16 beams are 0.1
-/// degrees worse; 0.2 m is no better and takes half as long again.
-const VOXEL_M: f32 = 0.3;
+/// Side of the voxels that both clouds are thinned to, metres.
+const VOXEL_M: f32 = 0.25;
 /// Normals are taken, and matches are sought, within this, metres: wide enough for two rings of
 /// 64 beams.
-const CELL_M: f32 = 1.0;
+const CELL_M: f32 = 0.8;
 /// Source points that are looked at: enough for millimetres.
 const REFINED: usize = 8192;
 /// How the motion is refined: from where the search ends, down to the noise of a lidar.
 const REFINEMENT: Schedule = Schedule {
     steps: 12,
-    within_m: [1.0, 0.5],
-    scale_m: [0.3, 0.1],
+    within_m: [0.8, 0.5],
+    scale_m: [0.3, 0.2],
 };
 
 /// The motion target_from_source that aligns `source` with `target`, sought around `prior`; the
@@ -55,6 +54,7 @@ pub(crate) fn align(
     if watch.interrupt().is_some() {
         return found;
     }
-    let surfels = Surfels::new(&target, CELL_M);
-    Fit::new(&evenly(&source, REFINED), &surfels).run(&found, &REFINEMENT, watch)
+    let surfels = Surfels::new(Columns::new(&target, CELL_M));
+    let source = Columns::new(&source, CELL_M).some_surfels(REFINED);
+    Fit::new(&source, &surfels).run(&found, &REFINEMENT, watch)
 }

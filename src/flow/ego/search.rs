@@ -8,9 +8,9 @@ use nalgebra::{Isometry3, Vector3};
 use rayon::prelude::*;
 
 use super::fit::{Fit, Schedule};
-use super::surfels::Surfels;
+use super::surfels::{Columns, Surfels};
 use super::thin::thinned;
-use crate::flow::points::{Point, RigidTransform, evenly};
+use crate::flow::points::{Point, RigidTransform};
 use crate::flow::watch::Watch;
 
 /// Side of the voxels that both clouds are thinned to, metres.
@@ -40,9 +40,10 @@ pub(super) fn search(
     prior: &RigidTransform,
     watch: &dyn Watch,
 ) -> RigidTransform {
-    let surfels = Surfels::new(&thinned(target, VOXEL_M), CELL_M);
-    let points = evenly(&thinned(source, VOXEL_M), TRIED);
-    let fit = Fit::new(&points, &surfels);
+    let columns = |points: &[Point]| Columns::new(&thinned(points, VOXEL_M), CELL_M);
+    let surfels = Surfels::new(columns(target));
+    let source = columns(source).some_surfels(TRIED);
+    let fit = Fit::new(&source, &surfels);
     let tried: Vec<(RigidTransform, f64)> = starts(prior)
         .into_par_iter()
         .map(|start| {

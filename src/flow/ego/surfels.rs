@@ -1,7 +1,7 @@
 //! Small flat pieces of a cloud's surfaces, and which of them lies nearest to a point.
 //!
 //! Points lie in square columns, sorted, so that the nine columns around a point are three runs in
-//! memory. A normal is that of a point's neighbors within a cell. It must not know of motions.
+//! memory. A surfel is made of a point's neighbors within a cell. It must not know of motions.
 
 use std::ops::Range;
 
@@ -9,7 +9,7 @@ use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 
 use super::thin::REACH;
-use crate::flow::Point;
+use crate::flow::points::{Point, evenly};
 
 /// Points whose normals one thread takes at a time.
 const POINTS_AT_ONCE: usize = 256;
@@ -22,27 +22,43 @@ const FLAT: f64 = 0.05;
 /// Spreads below this are none, square metres.
 const NO_SPREAD: f64 = 1e-12;
 
-/// A cloud's surfels.
-pub(super) struct Surfels {
+/// A flat piece of surface.
+#[derive(Clone, Copy)]
+pub(super) struct Surfel {
+    /// A point on it, metres.
+    pub(super) point: Point,
+    /// How it lies.
+    pub(super) flat: Flat,
+}
+
+/// The plane through points that lie nearly on one.
+#[derive(Clone, Copy)]
+pub(in crate::flow) struct Flat {
+    /// Unit length, on either side.
+    pub(in crate::flow) normal: [f32; 3],
+    /// The points' spread along the normal over that along their second axis, as variances: 0 for
+    /// a plane, 1 for a rod or a ball.
+    pub(super) thickness: f32,
+}
+
+/// A cloud by place: evenly thinned points, voxels apart that are smaller than a cell.
+pub(super) struct Columns {
     cell_m: f32,
     /// Columns that are not empty, by x, then y, and where their points begin; closed by one that
     /// begins at the end.
     columns: Vec<(u64, u32)>,
     points: Vec<Point>,
-    /// One for each of `points`; none where there is no flat surface.
-    normals: Vec<Option<[f32; 3]>>,
 }
 
-/// A flat piece of surface.
-pub(super) struct Surfel {
-    /// A point on it, metres.
-    pub(super) point: Point,
-    /// Its unit normal, on either side.
-    pub(super) normal: [f32; 3],
+/// A cloud's surfels.
+pub(super) struct Surfels {
+    columns: Columns,
+    /// One for each of the columns' points; none where there is no flat surface.
+    flats: Vec<Option<Flat>>,
 }
 
-impl Surfels {
-    /// Of evenly thinned points, voxels apart that are smaller than `cell_m`.
+impl Columns {
+    /// Normals will be taken, and points will be sought, within `cell_m` metres.
     pub(super) fn new(points: &[Point], cell_m: f32) -> Self {
         let keyed = points.iter().map(|&point| (column(point, cell_m), point));
         let mut keyed: Vec<_> = keyed.collect();
@@ -55,42 +71,27 @@ impl Surfels {
             }
         }
         columns.push((u64::MAX, keyed.len() as u32));
-        let mut surfels = Self {
+        Self {
             cell_m,
             columns,
             points: keyed.into_iter().map(|(_, point)| point).collect(),
-            normals: Vec::new(),
-        };
-        let normals = surfels.points.par_chunks(POINTS_AT_ONCE);
-        surfels.normals = normals
-            .flat_map_iter(|points| points.iter().map(|&point| surfels.normal_at(point)))
-            .collect();
-        surfels
+        }
     }
 
-    /// The surfel whose point is nearest to `point`, less than `within_m` from it, which is at
-    /// most a cell; none where nothing or nothing flat is there.
-    pub(super) fn nearest(&self, point: Point, within_m: f32) -> Option<Surfel> {
-        let near = |c: &f32| (c / self.cell_m).abs() < REACH - 2.0;
-        if !point.iter().all(near) {
-            return None;
-        }
-        let mut nearest = None;
-        let mut least = within_m * within_m;
-        for row in self.around(point) {
-            for (other, i) in self.points[row.clone()].iter().zip(row) {
-                let square = square_distance(point, *other);
-                if square < least {
-                    least = square;
-                    nearest = Some(i);
-                }
-            }
-        }
-        let nearest = nearest?;
-        Some(Surfel {
-            point: self.points[nearest],
-            normal: self.normals[nearest]?,
-        })
+    /// At most `most` of the points, evenly, as surfels; those that lie on no flat surface are left
+    /// out.
+    pub(super) fn some_surfels(&self, most: usize) -> Vec<Surfel> {
+        let points = evenly(&self.points, most);
+        let flats = self.flats(&points);
+        let surfels = points.into_iter().zip(flats);
+        let surfels = surfels.filter_map(|(point, flat)| Some(Surfel { point, flat: flat? }));
+        surfels.collect()
+    }
+
+    fn flats(&self, points: &[Point]) -> Vec<Option<Flat>> {
+        let chunks = points.par_chunks(POINTS_AT_ONCE);
+        let flats = chunks.flat_map_iter(|points| points.iter().map(|&point| self.flat_at(point)));
+        flats.collect()
     }
 
     /// The points of the columns around `point`: three runs.
@@ -106,7 +107,7 @@ impl Surfels {
         [x - 1, x, x + 1].map(|x| begin(x, y - 1)..begin(x, y + 2))
     }
 
-    fn normal_at(&self, point: Point) -> Option<[f32; 3]> {
+    fn flat_at(&self, point: Point) -> Option<Flat> {
         let mut count = 0.0;
         let mut sum = Vector3::zeros();
         let mut squares = Matrix3::zeros();
@@ -126,7 +127,41 @@ impl Surfels {
             return None;
         }
         let mean: Vector3<f64> = sum / count;
-        normal(&(squares / count - mean * mean.transpose()))
+        flat(&(squares / count - mean * mean.transpose()))
+    }
+}
+
+impl Surfels {
+    /// All of a cloud's.
+    pub(super) fn new(columns: Columns) -> Self {
+        let flats = columns.flats(&columns.points);
+        Self { columns, flats }
+    }
+
+    /// The surfel whose point is nearest to `point`, less than `within_m` from it, which is at
+    /// most a cell; none where nothing or nothing flat is there.
+    pub(super) fn nearest(&self, point: Point, within_m: f32) -> Option<Surfel> {
+        let near = |c: &f32| (c / self.columns.cell_m).abs() < REACH - 2.0;
+        if !point.iter().all(near) {
+            return None;
+        }
+        let points = &self.columns.points;
+        let mut nearest = None;
+        let mut least = within_m * within_m;
+        for row in self.columns.around(point) {
+            for (other, i) in points[row.clone()].iter().zip(row) {
+                let square = square_distance(point, *other);
+                if square < least {
+                    least = square;
+                    nearest = Some(i);
+                }
+            }
+        }
+        let nearest = nearest?;
+        Some(Surfel {
+            point: points[nearest],
+            flat: self.flats[nearest]?,
+        })
     }
 }
 
@@ -141,8 +176,8 @@ fn square_distance(a: Point, b: Point) -> f32 {
     x * x + y * y + z * z
 }
 
-/// The axis of least spread, in closed form; none where the spread is not that of a flat surface.
-pub(in crate::flow) fn normal(spread: &Matrix3<f64>) -> Option<[f32; 3]> {
+/// The plane of points by their covariance, in closed form; none where they do not lie on one.
+pub(in crate::flow) fn flat(spread: &Matrix3<f64>) -> Option<Flat> {
     let mean = spread.trace() / 3.0;
     let rest = spread - Matrix3::identity() * mean;
     let radius = (rest.norm_squared() / 6.0).sqrt();
@@ -166,7 +201,10 @@ pub(in crate::flow) fn normal(spread: &Matrix3<f64>) -> Option<[f32; 3]> {
         .into_iter()
         .max_by(|a, b| a.norm_squared().total_cmp(&b.norm_squared()))?;
     let normal = longest.try_normalize(0.0)?;
-    Some([normal.x as f32, normal.y as f32, normal.z as f32])
+    Some(Flat {
+        normal: [normal.x as f32, normal.y as f32, normal.z as f32],
+        thickness: (least / middle).max(0.0) as f32,
+    })
 }
 
 #[cfg(test)]
@@ -179,7 +217,7 @@ mod tests {
         let mut random = Random::new(2);
         let mut point = || [0; 3].map(|_| random.uniform(-4.0, 4.0) as f32);
         let cloud: Vec<Point> = (0..800).map(|_| point()).collect();
-        let surfels = Surfels::new(&cloud, 1.0);
+        let surfels = Surfels::new(Columns::new(&cloud, 1.0));
         for _ in 0..500 {
             let asked = point();
             let square = |other: &Point| square_distance(asked, *other);
@@ -200,14 +238,16 @@ mod tests {
             [x, y, -0.3 * x + 0.2 * y]
         };
         let plane: Vec<Point> = (0..400).map(on_plane).collect();
-        let surfels = Surfels::new(&plane, 1.0);
+        let surfels = Surfels::new(Columns::new(&plane, 1.0));
         for &point in &plane {
-            let normal = surfels.nearest(point, 1.0).expect("a plane is flat").normal;
+            let Flat { normal, thickness } = surfels.nearest(point, 1.0).expect("flat").flat;
             let along = Vector3::from(normal.map(f64::from)).dot(&slope).abs();
             assert!(along > 1.0 - 1e-6, "{normal:?}");
+            assert!(thickness < 1e-6, "{thickness}");
         }
         let line: Vec<Point> = (0..100).map(|i| [i as f32 * 0.3, 0.0, 0.0]).collect();
-        assert!(Surfels::new(&line, 1.0).normals.iter().all(Option::is_none));
-        assert!(Surfels::new(&[], 1.0).nearest([0.0; 3], 1.0).is_none());
+        assert!(Columns::new(&line, 1.0).some_surfels(100).is_empty());
+        let nothing = Surfels::new(Columns::new(&[], 1.0));
+        assert!(nothing.nearest([0.0; 3], 1.0).is_none());
     }
 }

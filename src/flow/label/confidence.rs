@@ -13,14 +13,14 @@ const FEATURES: usize = 12;
 
 /// Weights of what moves, in the order of [`Evidence::features`].
 const MOVING: [f32; FEATURES] = [
-    6.376, 0.044, -0.223, 0.298, -5.671, -3.329, -12.499, 0.000, 2.653, 3.513, -1.754, -5.687,
+    5.085, 0.733, -0.430, -0.541, -4.237, -3.862, -10.712, 0.000, 7.349, 1.135, -0.474, -2.904,
 ];
 /// Weights of what stands still.
 const STANDING: [f32; FEATURES] = [
-    5.298, -2.067, -0.212, -0.713, -0.652, -0.672, 4.173, 0.390, -1.675, -1.145, 1.135, 0.450,
+    3.424, -0.592, -0.215, -0.881, -0.514, 0.114, 2.486, -0.226, -2.535, 0.063, 0.768, 1.647,
 ];
 /// Weights of ground, which moves with the vehicle: none, and by [`range`].
-const GROUND: [f32; 2] = [6.902, -2.957];
+const GROUND: [f32; 2] = [6.152, -1.253];
 
 impl Evidence {
     /// What is weighed, each of the order of one: 1, range, residual, whether nothing is there, the

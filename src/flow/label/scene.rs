@@ -248,5 +248,6 @@ fn normal(near: &Near, point: Point, options: &LabelOptions) -> Point {
         return [0.0; 3];
     }
     let mean: Vector3<f64> = sum / count;
-    ego::normal(&(squares / count - mean * mean.transpose())).unwrap_or([0.0; 3])
+    let flat = ego::flat(&(squares / count - mean * mean.transpose()));
+    flat.map_or([0.0; 3], |flat| flat.normal)
 }
