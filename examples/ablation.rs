@@ -12,25 +12,17 @@
     reason = "the table is the answer of this program"
 )]
 
-use std::time::Instant;
+#[path = "common/clock.rs"]
+mod clock;
 
+use clock::Clock;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::distance::{Metric, Sites};
 use fnsf::flow::evaluate::{Truth, evaluate};
 use fnsf::flow::{
     self, Decay, EarlyStopOptions, Ego, Ground, Inputs, Keep, Options, Preset, Problem, Start,
-    Watch,
 };
 use fnsf::formats::{Pair, read_pair};
-
-/// A clock for the numerics.
-struct Clock(Instant);
-
-impl Watch for Clock {
-    fn seconds(&self) -> f64 {
-        self.0.elapsed().as_secs_f64()
-    }
-}
 
 /// A named change to a preset.
 struct Variant {
@@ -177,7 +169,7 @@ fn run(backend: &CpuBackend, pair: &Pair, options: &Options) -> Result<Run, Stri
         before: None,
         around: &[],
     };
-    let clock = Clock(Instant::now());
+    let clock = Clock::start();
     let estimate = flow::estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())?;
     let known = pair.truth.as_ref().ok_or("the pair has no truth")?;
     let truth = Truth {

@@ -12,15 +12,17 @@
     reason = "the tables are the answer of this program"
 )]
 
+#[path = "common/known.rs"]
+#[expect(dead_code, reason = "what moves is said by the evidence here")]
+mod known;
+
 use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Calibration, Reliability};
-use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::flow::{Evidence, LabelOptions, Point, RigidTransform, SURE_M, Unwatched};
-use fnsf::formats::read_pair;
+use known::{Known, PAIRS, real_pairs, street};
 use nalgebra::{DMatrix, DVector, Point3};
 
-const PAIRS: [&str; 3] = ["av2_7fab", "kitti_0000", "small_gicp"];
 const BEAMS: [usize; 2] = [64, 32];
 /// Streets that it is fitted to, of each number of beams.
 const STREETS: u64 = 12;
@@ -42,58 +44,13 @@ struct Scene {
     points: Vec<Judged>,
 }
 
-struct Known {
-    name: String,
-    source: Vec<Point>,
-    target: Vec<Point>,
-    ground: [Vec<bool>; 2],
-    flow: Vec<Point>,
-    valid: Vec<bool>,
-    weight: f64,
-}
-
-fn real(name: &str, folder: &std::ffi::OsStr) -> Result<Known, String> {
-    let path = std::path::Path::new(folder).join(name).join("pair.npz");
-    let bytes = std::fs::read(&path).map_err(|e| format!("{}: {e}", path.display()))?;
-    let pair = read_pair(&bytes).map_err(|e| format!("{}: {e}", path.display()))?;
-    let truth = pair.truth.ok_or("the pair has no truth")?;
-    let ground = pair.ground.ok_or("the pair has no ground masks")?;
-    Ok(Known {
-        name: name.to_owned(),
-        source: pair.source,
-        target: pair.target,
-        ground: [ground.source, ground.target],
-        flow: truth.flow,
-        valid: truth.valid,
-        weight: 1.0,
-    })
-}
-
-fn street(seed: u64, beams: usize) -> Result<Known, String> {
-    let options = StreetOptions {
-        seed,
-        beams,
-        ..StreetOptions::default()
-    };
-    let pair = Street::new(&options).and_then(|street| street.pair(0));
-    let pair = pair.map_err(|e| e.to_string())?;
-    Ok(Known {
-        name: format!("street {seed}, {beams} beams"),
-        valid: vec![true; pair.source.len()],
-        source: pair.source,
-        target: pair.target,
-        ground: [pair.ground_source, pair.ground_target],
-        flow: pair.flow,
-        weight: PAIRS.len() as f64 / (STREETS as usize * BEAMS.len()) as f64,
-    })
-}
-
 fn moved(motion: &RigidTransform, point: Point) -> Point {
     let moved = motion * Point3::from(point.map(f64::from));
     moved.map(|c| c as f32).into()
 }
 
-fn judged(backend: &dyn Backend, known: Known) -> Scene {
+/// A pair's points by what is found of them; `weight` is what it counts in a fit.
+fn judged(backend: &dyn Backend, known: Known, weight: f64) -> Scene {
     let ego = backend.host().align(
         &known.source,
         &known.target,
@@ -150,7 +107,7 @@ fn judged(backend: &dyn Backend, known: Known) -> Scene {
     }
     Scene {
         name: known.name,
-        weight: known.weight,
+        weight,
         points,
     }
 }
@@ -295,15 +252,13 @@ fn diagram(shown: &[(String, Told)]) -> String {
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let backend = CpuBackend::new(None)?;
-    let mut pairs = Vec::new();
-    if let Some(folder) = std::env::var_os("FNSF_REAL_DATA") {
-        for name in PAIRS {
-            pairs.push(judged(&backend, real(name, &folder)?));
-        }
-    }
+    let pairs = real_pairs()?.into_iter();
+    let pairs: Vec<Scene> = pairs.map(|pair| judged(&backend, pair, 1.0)).collect();
+    let weight = PAIRS.len() as f64 / (STREETS as usize * BEAMS.len()) as f64;
     let streets = |seeds: std::ops::Range<u64>| -> Result<Vec<Scene>, String> {
         let each = seeds.flat_map(|seed| BEAMS.map(|beams| street(seed, beams)));
-        each.map(|known| Ok(judged(&backend, known?))).collect()
+        each.map(|known| Ok(judged(&backend, known?, weight)))
+            .collect()
     };
     let known = streets(0..STREETS)?;
     let fresh = streets(100..110)?;

@@ -13,12 +13,14 @@
     reason = "the table is the answer of this program"
 )]
 
-use std::time::Instant;
+#[path = "common/clock.rs"]
+mod clock;
 
+use clock::Clock;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Truth, evaluate};
 use fnsf::flow::simulate::{Street, StreetOptions};
-use fnsf::flow::{self, Around, Ground, LabelOptions, Point, Preset, Problem, Sweep, Watch};
+use fnsf::flow::{self, Around, Ground, LabelOptions, Point, Preset, Problem, Sweep};
 use fnsf::formats::{read_cloud, read_pair};
 
 /// Streets by their number of beams and by the first sweep of the pair, and which.
@@ -39,15 +41,6 @@ const VARIANTS: [(&str, Change); 5] = [
         o.confirmed_m = 0.1;
     }),
 ];
-
-/// A clock for the numerics.
-struct Clock(Instant);
-
-impl Watch for Clock {
-    fn seconds(&self) -> f64 {
-        self.0.elapsed().as_secs_f64()
-    }
-}
 
 /// A pair with what is true of it, and the sweeps around it.
 struct Known {
@@ -148,7 +141,7 @@ fn run(backend: &CpuBackend, known: &Known, label: &LabelOptions) -> Result<Row,
         before: None,
         around: &around,
     };
-    let clock = Clock(Instant::now());
+    let clock = Clock::start();
     let found = flow::estimate(backend, &problem, &options, &clock).map_err(|e| e.to_string())?;
     let truth = Truth {
         dynamic: Some(&known.dynamic),

@@ -13,28 +13,20 @@
     reason = "the table is the answer of this program"
 )]
 
-use std::time::Instant;
+#[path = "common/clock.rs"]
+mod clock;
+#[path = "common/known.rs"]
+mod known;
 
+use clock::Clock;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Truth, evaluate};
-use fnsf::flow::simulate::{Street, StreetOptions};
-use fnsf::flow::{self, Ground, LabelOptions, Options, Point, Preset, Problem, Watch};
-use fnsf::formats::read_pair;
+use fnsf::flow::{self, Ground, LabelOptions, Options, Preset, Problem};
+use known::{Known, real_pairs, street};
 
-/// The labelled pairs, by folder.
-const PAIRS: [&str; 3] = ["av2_7fab", "kitti_0000", "small_gicp"];
 /// Streets by their number of beams, and how many of each.
 const BEAMS: [usize; 2] = [64, 32];
 const STREETS: u64 = 10;
-
-/// A clock for the numerics.
-struct Clock(Instant);
-
-impl Watch for Clock {
-    fn seconds(&self) -> f64 {
-        self.0.elapsed().as_secs_f64()
-    }
-}
 
 /// A preset with a change.
 struct Variant {
@@ -103,62 +95,6 @@ const VARIANTS: &[Variant] = &[
     label("matches within 1 m", |o| o.match_m = 1.0),
 ];
 
-/// A pair with what is true of it.
-struct Known {
-    name: String,
-    source: Vec<Point>,
-    target: Vec<Point>,
-    ground: [Vec<bool>; 2],
-    flow: Vec<Point>,
-    valid: Vec<bool>,
-    dynamic: Option<Vec<bool>>,
-}
-
-fn real_pairs() -> Result<Vec<Known>, String> {
-    let Some(folder) = std::env::var_os("FNSF_REAL_DATA") else {
-        return Ok(Vec::new());
-    };
-    let read = |name: &str| {
-        let path = std::path::Path::new(&folder).join(name).join("pair.npz");
-        let bytes = std::fs::read(&path).map_err(|e| format!("{}: {e}", path.display()))?;
-        let pair = read_pair(&bytes).map_err(|e| format!("{}: {e}", path.display()))?;
-        let truth = pair.truth.ok_or("the pair has no truth")?;
-        let ground = pair.ground.ok_or("the pair has no ground masks")?;
-        Ok(Known {
-            name: name.to_owned(),
-            source: pair.source,
-            target: pair.target,
-            ground: [ground.source, ground.target],
-            flow: truth.flow,
-            valid: truth.valid,
-            dynamic: truth.dynamic,
-        })
-    };
-    PAIRS.iter().map(|name| read(name)).collect()
-}
-
-fn streets(beams: usize) -> Result<Vec<Known>, String> {
-    let street = |seed| {
-        let options = StreetOptions {
-            seed,
-            beams,
-            ..StreetOptions::default()
-        };
-        let pair = Street::new(&options).and_then(|street| street.pair(0));
-        let pair = pair.map_err(|e| e.to_string())?;
-        Ok(Known {
-            name: format!("{STREETS} streets, {beams} beams"),
-            valid: vec![true; pair.source.len()],
-            source: pair.source,
-            target: pair.target,
-            ground: [pair.ground_source, pair.ground_target],
-            flow: pair.flow,
-            dynamic: Some(pair.dynamic),
-        })
-    };
-    (0..STREETS).map(street).collect()
-}
-
 /// EPE, that of movers, that of what stands still, three-way EPE where all movers are foreground,
 /// seconds.
 type Row = [f64; 5];
@@ -171,7 +107,7 @@ fn run(backend: &CpuBackend, pair: &Known, options: &Options) -> Result<Row, Str
         before: None,
         around: &[],
     };
-    let clock = Clock(Instant::now());
+    let clock = Clock::start();
     let estimate = flow::estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())?;
     let dynamic = pair.dynamic.as_deref();
     let truth = Truth {
@@ -226,9 +162,13 @@ fn main() -> Result<(), String> {
             other => return Err(format!("{other} is not known")),
         }
     }
-    let mut groups: Vec<Vec<Known>> = real_pairs()?.into_iter().map(|pair| vec![pair]).collect();
+    let pairs = real_pairs()?.into_iter();
+    let mut groups: Vec<(String, Vec<Known>)> =
+        pairs.map(|pair| (pair.name.clone(), vec![pair])).collect();
     for beams in BEAMS {
-        groups.push(streets(beams)?);
+        let streets = (0..STREETS).map(|seed| street(seed, beams));
+        let streets = streets.collect::<Result<_, _>>()?;
+        groups.push((format!("{STREETS} streets, {beams} beams"), streets));
     }
     let backend = CpuBackend::new(None).map_err(|e| e.to_string())?;
     println!("| variant | pair | EPE | EPE moving | EPE static | EPE moving, close | s |");
@@ -243,7 +183,7 @@ fn main() -> Result<(), String> {
             (variant.change)(label);
         }
         let draws = if options.label.is_some() { 1 } else { seeds };
-        for group in &groups {
+        for (name, group) in &groups {
             let mut rows = Vec::new();
             for pair in group {
                 let mut of_seeds = Vec::new();
@@ -254,9 +194,9 @@ fn main() -> Result<(), String> {
                 rows.push(median(&of_seeds));
             }
             let [epe, moving, still, close, seconds] = mean(&rows);
-            let (variant, pair) = (variant.name, &group[0].name);
+            let variant = variant.name;
             println!(
-                "| {variant} | {pair} | {epe:.4} | {moving:.3} | {still:.4} | {close:.3} | {seconds:.2} |"
+                "| {variant} | {name} | {epe:.4} | {moving:.3} | {still:.4} | {close:.3} | {seconds:.2} |"
             );
         }
     }

@@ -189,8 +189,8 @@ impl Options {
             early_stop: None,
             max_iterations: 150,
             warm_start: Some(WarmStart {
-                max_iterations: 60,
-                learning_rate: 0.003,
+                max_iterations: 75,
+                learning_rate: 0.004,
             }),
             ..Self::published(max_points)
         }
@@ -315,7 +315,7 @@ impl Default for LabelOptions {
             cluster_points: 4,
             thinned_m: 0.1,
             normal_m: [0.15, 0.01],
-            height_weight: 0.4,
+            height_weight: 0.7,
             match_m: 0.7,
             taken_m: 0.15,
             leak: 0.2,

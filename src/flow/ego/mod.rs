@@ -35,7 +35,7 @@ const REFINED: usize = 8192;
 const REFINEMENT: Schedule = Schedule {
     steps: 12,
     within_m: [0.8, 0.5],
-    scale_m: [0.3, 0.2],
+    scale_m: [0.3, 0.1],
 };
 
 /// The motion target_from_source that aligns `source` with `target`, sought around `prior`; the

@@ -13,14 +13,14 @@ const FEATURES: usize = 12;
 
 /// Weights of what moves, in the order of [`Evidence::features`].
 const MOVING: [f32; FEATURES] = [
-    5.085, 0.733, -0.430, -0.541, -4.237, -3.862, -10.712, 0.000, 7.349, 1.135, -0.474, -2.904,
+    5.821, 0.547, -0.393, 0.360, -4.070, -3.458, -11.344, 0.000, 10.401, 0.437, -0.194, -3.588,
 ];
 /// Weights of what stands still.
 const STANDING: [f32; FEATURES] = [
-    3.424, -0.592, -0.215, -0.881, -0.514, 0.114, 2.486, -0.226, -2.535, 0.063, 0.768, 1.647,
+    3.000, -0.322, -0.074, -0.302, -1.028, 1.094, 1.410, -0.361, -2.533, 0.689, 0.538, 1.287,
 ];
 /// Weights of ground, which moves with the vehicle: none, and by [`range`].
-const GROUND: [f32; 2] = [6.152, -1.253];
+const GROUND: [f32; 2] = [5.792, -0.522];
 
 impl Evidence {
     /// What is weighed, each of the order of one: 1, range, residual, whether nothing is there, the
