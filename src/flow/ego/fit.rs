@@ -27,8 +27,9 @@ const THIN: f64 = 1e-3;
 const THICKNESS: f64 = 0.1;
 /// A step shorter than this, metres at the points' spread, is the last.
 const SHORT_STEP_M: f64 = 2e-4;
-/// A direction is free where the matches hold it by less than this share of all that they hold.
-/// Some streets are held by 1%.
+/// A direction is free where the matches hold it by less than this share of what they hold of all
+/// shifts together, or of what one match of two planes does: normals are 1.4 degrees uncertain
+/// together. Some streets are held by 1%.
 const FREE: f64 = 3e-4;
 /// The least spread of points that turns are measured by, metres.
 const LEAST_SPREAD_M: f64 = 1e-3;
@@ -71,7 +72,6 @@ pub(super) struct Fit<'a> {
 struct Sums {
     normal: Matrix6<f64>,
     gradient: Vector6<f64>,
-    weight: f64,
     /// How much they hold of shifts, in all directions together.
     held: f64,
 }
@@ -117,10 +117,11 @@ impl<'a> Fit<'a> {
         motion
     }
 
-    /// How well a motion fits, 0 to 1: the share of the surfels that lie on others, by weight.
+    /// How well a motion fits, 0 to 1: what its matches hold of shifts, a surfel; 1 where all lie on
+    /// perfect planes that they face.
     pub(super) fn score(&self, motion: &RigidTransform, schedule: &Schedule) -> f64 {
         let (within_m, scale_m, _) = schedule.at(schedule.steps);
-        self.sums(motion, within_m, scale_m).weight / self.source.len().max(1) as f64
+        self.sums(motion, within_m, scale_m).held / self.source.len().max(1) as f64
     }
 
     fn sums(&self, motion: &RigidTransform, within_m: f32, scale_m: f64) -> Sums {
@@ -132,7 +133,6 @@ impl<'a> Fit<'a> {
         for sums in sums {
             all.normal += sums.normal;
             all.gradient += sums.gradient;
-            all.weight += sums.weight;
             all.held += sums.held;
         }
         all
@@ -155,9 +155,8 @@ impl<'a> Fit<'a> {
                 continue;
             };
             let (source, target) = (normal(&surfel.flat), normal(&nearest.flat));
-            let spread =
-                spread(&surfel.flat, &(rotation * source)) + spread(&nearest.flat, &target);
-            let Some(inverse) = spread.try_inverse() else {
+            let source = covariance(&surfel.flat, &(rotation * source));
+            let Some(inverse) = (source + covariance(&nearest.flat, &target)).try_inverse() else {
                 continue;
             };
             // Two perfect planes that face one another count as what they are along their normal
@@ -169,20 +168,19 @@ impl<'a> Fit<'a> {
             let weight = (square / (square + residual.dot(&pull))).powi(2);
             let turning = (moved - pivot).cross_matrix() / -self.spread_m;
             let across = information * turning;
-            let mut normal = Matrix6::zeros();
-            normal.fixed_view_mut::<3, 3>(0, 0).copy_from(&information);
-            normal.fixed_view_mut::<3, 3>(0, 3).copy_from(&across);
-            normal
+            let mut block = Matrix6::zeros();
+            block.fixed_view_mut::<3, 3>(0, 0).copy_from(&information);
+            block.fixed_view_mut::<3, 3>(0, 3).copy_from(&across);
+            block
                 .fixed_view_mut::<3, 3>(3, 0)
                 .copy_from(&across.transpose());
-            normal
+            block
                 .fixed_view_mut::<3, 3>(3, 3)
                 .copy_from(&(turning.transpose() * across));
             let [x, y, z] = pull.into();
             let [a, b, c] = (turning.transpose() * pull).into();
-            sums.normal += normal * weight;
+            sums.normal += block * weight;
             sums.gradient += Vector6::new(x, y, z, a, b, c) * weight;
-            sums.weight += weight;
             sums.held += information.trace() * weight;
         }
         sums
@@ -194,7 +192,6 @@ impl Default for Sums {
         Self {
             normal: Matrix6::zeros(),
             gradient: Vector6::zeros(),
-            weight: 0.0,
             held: 0.0,
         }
     }
@@ -209,9 +206,9 @@ impl Sums {
             eigenvectors,
         } = self.normal.symmetric_eigen();
         let mut update = Vector6::zeros();
-        for (axis, &held) in eigenvectors.column_iter().zip(&eigenvalues) {
-            if held > FREE * self.held.max(THIN) {
-                update -= axis * (axis.dot(&self.gradient) / held);
+        for (axis, &hold) in eigenvectors.column_iter().zip(&eigenvalues) {
+            if hold > FREE * self.held.max(1.0) {
+                update -= axis * (axis.dot(&self.gradient) / hold);
             }
         }
         update
@@ -219,9 +216,9 @@ impl Sums {
 }
 
 /// The covariance of a surfel with that normal: 1 across, thin along.
-fn spread(flat: &Flat, normal: &Vector3<f64>) -> Matrix3<f64> {
+fn covariance(flat: &Flat, normal: &Vector3<f64>) -> Matrix3<f64> {
     let along = THIN + THICKNESS * f64::from(flat.thickness);
-    Matrix3::identity() - normal * normal.transpose() * (1.0 - along.min(1.0))
+    Matrix3::identity() - normal * normal.transpose() * (1.0 - along)
 }
 
 fn normal(flat: &Flat) -> Vector3<f64> {

@@ -7,7 +7,7 @@
 //! Plane to plane on evenly thinned clouds, robustly weighted, from a prior. Needs the ground, which
 //! alone holds pitch, roll and height. It must not know of fields, flows or distance transforms.
 
-// What the target is made of, how a motion is fitted to it, and from where.
+// What the clouds are made of, how a motion is fitted to them, and from where.
 mod fit;
 mod search;
 mod surfels;

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use super::thin::REACH;
 use crate::flow::points::{Point, evenly};
 
-/// Points whose normals one thread takes at a time.
+/// Points whose surfels one thread makes at a time.
 const POINTS_AT_ONCE: usize = 256;
 /// Fewer neighbors than this, the point itself among them, make no surface.
 const NEIGHBORS: f64 = 4.0;
@@ -37,7 +37,7 @@ pub(in crate::flow) struct Flat {
     /// Unit length, on either side.
     pub(in crate::flow) normal: [f32; 3],
     /// The points' spread along the normal over that along their second axis, as variances: 0 for
-    /// a plane, 1 for a rod or a ball.
+    /// a plane.
     pub(super) thickness: f32,
 }
 
