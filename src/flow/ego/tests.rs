@@ -87,9 +87,14 @@ fn drives_and_turns_of_streets_with_movers_are_found_from_rest() {
 }
 
 #[test]
-fn three_metres_and_five_degrees_are_found_from_rest_and_more_from_a_prior() {
+fn five_metres_and_eight_degrees_are_found_from_rest_and_more_from_a_prior() {
     let pair = street(1, None, None);
-    for truth in [yaw([3.0, 0.0, 0.0], 5.0), yaw([-3.0, 0.1, 0.02], -5.0)] {
+    for truth in [
+        yaw([3.0, 0.0, 0.0], 5.0),
+        yaw([-3.0, 0.1, 0.02], -5.0),
+        yaw([5.0, 0.5, 0.1], 8.0),
+        yaw([3.0, 0.3, 0.06], -12.0),
+    ] {
         let source = moved(&pair.source, &(truth.inverse() * pair.target_from_source));
         assert_near(&found(&source, &pair.target), &truth, "from rest");
     }
