@@ -45,7 +45,7 @@ impl Mover<'_> {
             for (&(scene, at, weight), touched) in views.iter().zip(&mut touched) {
                 let by_then = motion.repeated(at);
                 if step % STEPS_BETWEEN_LOOKS == 0 {
-                    let all = scene.touched(rows, self.cluster, &by_then, scene.options.thinned_m);
+                    let all = scene.touched(rows, self.cluster, &by_then);
                     *touched = evenly(&all, rows.len());
                 }
                 sums.look(&motion, &by_then, at, weight);

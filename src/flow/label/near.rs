@@ -62,20 +62,23 @@ impl Near {
         points
     }
 
-    /// Calls `see` with the row and the point of everything in the columns around `center` that is
-    /// no more than a column's side higher or lower.
+    /// Calls `see` with the row and the point of everything that lies less than `within_m` (a column's
+    /// side at most) from `center`.
     #[inline]
-    pub(super) fn around(&self, center: Point, mut see: impl FnMut(u32, Point)) {
-        let [x, y] = place(center, self.column_m);
-        for dx in -1..=1 {
-            for dy in -1..=1 {
-                let Range { start, end } = self.column(key([x + dx, y + dy]));
-                let column = &self.points[start..end];
-                let low = column.partition_point(|point| point[2] < center[2] - self.column_m);
-                for (&point, &row) in column[low..].iter().zip(&self.rows[start + low..end]) {
-                    if point[2] > center[2] + self.column_m {
-                        break;
-                    }
+    pub(super) fn around(&self, center: Point, within_m: f32, mut see: impl FnMut(u32, Point)) {
+        let neighbors = Neighbors::of(center, self.column_m);
+        for offset in OFFSETS {
+            if neighbors.square_gap(offset) > within_m * within_m {
+                continue;
+            }
+            let Range { start, end } = self.column(neighbors.key(offset));
+            let column = &self.points[start..end];
+            let low = column.partition_point(|point| point[2] < center[2] - within_m);
+            for (&point, &row) in column[low..].iter().zip(&self.rows[start + low..end]) {
+                if point[2] > center[2] + within_m {
+                    break;
+                }
+                if square_distance(center, point) < within_m * within_m {
                     see(row, point);
                 }
             }
@@ -116,17 +119,34 @@ impl Near {
         within_m: f32,
         allowed: impl Fn(u32) -> bool,
     ) -> Option<(u32, f32)> {
-        let mut best = None;
+        let neighbors = Neighbors::of(center, self.column_m);
+        let mut best: Option<(u32, f32)> = None;
         let mut least = within_m * within_m;
-        self.around(center, |row, point| {
-            let square = square_distance(center, point);
-            if (square < least || (square == least && best.is_some_and(|(other, _)| row < other)))
-                && allowed(row)
-            {
-                least = square;
-                best = Some((row, square));
+        // The own column first, and in each what is nearest in height: the rest is soon too far.
+        for offset in OFFSETS {
+            if neighbors.square_gap(offset) > least {
+                continue;
             }
-        });
+            let Range { start, end } = self.column(neighbors.key(offset));
+            let column = &self.points[start..end];
+            let level = column.partition_point(|point| point[2] < center[2]);
+            let mut may_go_on = |place: usize| {
+                let point = column[place];
+                let height = point[2] - center[2];
+                let square = square_distance(center, point);
+                let row = self.rows[start + place];
+                let is_lower = |(other, _): (u32, f32)| row < other;
+                if (square < least || (square == least && best.is_some_and(is_lower)))
+                    && allowed(row)
+                {
+                    least = square;
+                    best = Some((row, square));
+                }
+                height * height <= least
+            };
+            let _above = (level..column.len()).all(&mut may_go_on);
+            let _below = (0..level).rev().all(&mut may_go_on);
+        }
         best
     }
 
@@ -143,6 +163,59 @@ impl Near {
             }
             slot = (slot + 1) & (self.table.len() - 1);
         }
+    }
+}
+
+/// A column and those around it, the own one first.
+const OFFSETS: [[i32; 2]; 9] = [
+    [0, 0],
+    [-1, 0],
+    [0, -1],
+    [0, 1],
+    [1, 0],
+    [-1, -1],
+    [-1, 1],
+    [1, -1],
+    [1, 1],
+];
+
+/// The columns around a place, and how far off they begin.
+struct Neighbors {
+    place: [i32; 2],
+    /// Along each axis to the column before and to the one after, square metres; a little less than
+    /// that, since columns are told apart in single precision.
+    square_gaps: [[f32; 2]; 2],
+}
+
+impl Neighbors {
+    #[inline]
+    fn of(center: Point, column_m: f32) -> Self {
+        let gaps = |c: f32| {
+            let columns = c / column_m;
+            let before_m = (columns - columns.floor()) * column_m;
+            let slack_m = 4.0 * f32::EPSILON * (c.abs() + column_m);
+            [before_m, column_m - before_m].map(|gap_m| (gap_m - slack_m).max(0.0).powi(2))
+        };
+        Self {
+            place: place(center, column_m),
+            square_gaps: [gaps(center[0]), gaps(center[1])],
+        }
+    }
+
+    /// How far off the column at `offset` begins at least, square metres.
+    #[inline]
+    fn square_gap(&self, offset: [i32; 2]) -> f32 {
+        let gap = |axis: usize| match offset[axis] {
+            0 => 0.0,
+            step => self.square_gaps[axis][usize::from(step > 0)],
+        };
+        gap(0) + gap(1)
+    }
+
+    #[inline]
+    fn key(&self, [dx, dy]: [i32; 2]) -> u64 {
+        let [x, y] = self.place;
+        key([x + dx, y + dy])
     }
 }
 

@@ -16,6 +16,8 @@ use crate::flow::Point;
 const VOTERS: usize = 64;
 const FITTED: usize = 100;
 const JUDGED: usize = 200;
+/// Starts that a motion is fitted from, besides none: those that cost the least as they are.
+const PROMISING: usize = 2;
 /// Steps of the fit from each start, and of the last one.
 const STEPS: [usize; 2] = [10, 20];
 /// Shifts that are tried in the end, metres, each up to [`TRIES`] times.
@@ -112,14 +114,24 @@ impl<'a> Mover<'a> {
                 .map(|&row| self.scene.source.points[row as usize])
                 .collect()
         };
+        let value = |motion: &Motion, cost: Cost| {
+            let way_m = options.way_penalty * motion.length_m();
+            cost.sum_m() + way_m + self.around_m(motion)
+        };
         let shifts = ballot.peaks(&points(&evenly(members, VOTERS)), options.starts);
+        let starts = shifts.into_iter().map(|shift| {
+            let start = standing.shifted(shift);
+            (value(&start, self.cost(&start)), start)
+        });
+        let mut starts: Vec<(f32, Motion)> = starts.collect();
+        starts.sort_by(|a, b| a.0.total_cmp(&b.0));
+        starts.truncate(PROMISING);
         let few = evenly(members, FITTED);
         let mut best: Option<(Motion, Cost, f32)> = None;
-        for shift in shifts.into_iter().chain([[0.0; 2]]) {
-            let motion = self.fitted(&[], &few, &standing.shifted(shift), false, STEPS[0]);
+        for (_, start) in starts.into_iter().chain([(0.0, standing)]) {
+            let motion = self.fitted(&[], &few, &start, false, STEPS[0]);
             let cost = self.cost(&motion);
-            let way_m = options.way_penalty * motion.length_m();
-            let value = cost.sum_m() + way_m + self.around_m(&motion);
+            let value = value(&motion, cost);
             if best.is_none_or(|(_, _, least)| value < least) {
                 best = Some((motion, cost, value));
             }
@@ -217,7 +229,7 @@ impl<'a> Mover<'a> {
             .iter()
             .map(|&row| self.distance(scene, row, motion))
             .sum();
-        let touched = scene.touched(&self.rows, self.cluster, motion, options.thinned_m);
+        let touched = scene.touched(&self.rows, self.cluster, motion);
         let touched = evenly(&touched, JUDGED);
         let back = touched.iter().map(|&row| {
             let place = motion.undo(scene.target[row as usize]);

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use super::cluster::NOISE;
 use super::motion::Motion;
-use super::near::{Near, square_distance};
+use super::near::Near;
 use crate::flow::Point;
 use crate::flow::ego;
 use crate::flow::options::LabelOptions;
@@ -139,11 +139,11 @@ impl<'a> Scene<'a> {
         found.map(|(row, _)| row)
     }
 
-    /// Calls `see` with every source point about within the match of a place.
+    /// Calls `see` with every source point within the match of a place.
     pub(super) fn source_around(&self, place: Point, mut see: impl FnMut(u32)) {
-        self.source
-            .near
-            .around(lowered(place, self.options), |row, _| see(row));
+        let place = lowered(place, self.options);
+        let within_m = self.options.match_m;
+        self.source.near.around(place, within_m, |row, _| see(row));
     }
 
     /// How far a place lies from whatever target point is free, metres, truncated.
@@ -154,31 +154,24 @@ impl<'a> Scene<'a> {
         })
     }
 
-    /// The target points that lie within the match of the moved `rows` and may be of `cluster`, one
-    /// a voxel of `apart_m`.
-    pub(super) fn touched(
-        &self,
-        rows: &[u32],
-        cluster: u32,
-        motion: &Motion,
-        apart_m: f32,
-    ) -> Vec<u32> {
-        let within = self.options.match_m * self.options.match_m;
-        let mut found = Vec::new();
+    /// The target points that lie within the match of the moved `rows` and may be of `cluster`, in
+    /// their order.
+    pub(super) fn touched(&self, rows: &[u32], cluster: u32, motion: &Motion) -> Vec<u32> {
+        let within_m = self.options.match_m;
+        let mut touched = vec![0_u64; self.target.len().div_ceil(64)];
         for &row in rows {
             let place = lowered(motion.apply(self.source.points[row as usize]), self.options);
-            self.near_target.around(place, |row, point| {
+            self.near_target.around(place, within_m, |row, _| {
                 let owner = self.taken[row as usize];
-                if (owner == NOISE || owner == cluster) && square_distance(place, point) < within {
-                    found.push(row);
+                if owner == NOISE || owner == cluster {
+                    touched[row as usize / 64] |= 1 << (row % 64);
                 }
             });
         }
-        found.sort_unstable();
-        found.dedup();
-        let points: Vec<Point> = found.iter().map(|&row| self.target[row as usize]).collect();
-        let kept = one_a_voxel(&points, apart_m);
-        kept.into_iter().map(|i| found[i as usize]).collect()
+        let words = touched.iter().zip((0..).step_by(64));
+        words
+            .flat_map(|(&word, first)| ones(word).map(move |bit| first + bit))
+            .collect()
     }
 
     /// The unit normal of a target point; zero where there is no flat surface.
@@ -203,6 +196,14 @@ impl<'a> Scene<'a> {
         };
         square.sqrt().min(self.options.truncation_m)
     }
+}
+
+/// The bits that are set in a word, the lowest first.
+fn ones(word: u64) -> impl Iterator<Item = u32> {
+    let without_lowest = |&left: &u64| Some(left & left.wrapping_sub(1));
+    std::iter::successors(Some(word), without_lowest)
+        .take_while(|&left| left != 0)
+        .map(u64::trailing_zeros)
 }
 
 /// Heights shrunk.
@@ -236,13 +237,11 @@ fn normal(near: &Near, point: Point, options: &LabelOptions) -> Point {
     let mut count = 0.0;
     let mut sum = Vector3::<f64>::zeros();
     let mut squares = Matrix3::<f64>::zeros();
-    near.around(point, |_, other| {
-        if square_distance(point, other) < radius * radius {
-            let away = Vector3::from_fn(|a, _| f64::from(other[a] - point[a]));
-            count += 1.0;
-            sum += away;
-            squares += away * away.transpose();
-        }
+    near.around(point, radius, |_, other| {
+        let away = Vector3::from_fn(|a, _| f64::from(other[a] - point[a]));
+        count += 1.0;
+        sum += away;
+        squares += away * away.transpose();
     });
     if count < NEIGHBORS {
         return [0.0; 3];
