@@ -19,7 +19,7 @@ mod known;
 use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Calibration, Reliability};
-use fnsf::flow::{Evidence, LabelOptions, Point, RigidTransform, SURE_M, Unwatched};
+use fnsf::flow::{Clouds, Evidence, LabelOptions, Point, RigidTransform, SURE_M, Unwatched};
 use known::{Known, PAIRS, real_pairs, street};
 use nalgebra::{DMatrix, DVector, Point3};
 
@@ -71,10 +71,15 @@ fn judged(backend: &dyn Backend, known: Known, weight: f64) -> Scene {
         .iter()
         .map(|&row| moved(&ego, known.source[row]))
         .collect();
-    let labelled =
-        backend
-            .host()
-            .movers(&aligned, &target, &[], &LabelOptions::default(), &Unwatched);
+    let clouds = Clouds {
+        source: &aligned,
+        target: &target,
+        around: &[],
+        sweeps: [&known.source, &known.target],
+        target_from_source: ego,
+    };
+    let options = LabelOptions::default();
+    let labelled = backend.host().movers(&clouds, &options, &Unwatched);
     let residual = labelled.motions.residual_at(&aligned);
     let error = |row: usize, at: Point| {
         let square = |a: usize| (known.source[row][a] + known.flow[row][a] - at[a]).powi(2);

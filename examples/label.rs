@@ -58,6 +58,7 @@ const VARIANTS: &[Variant] = &[
     // More than any cluster has.
     label("ego motion alone", |o| o.evidence_m = f32::INFINITY),
     label("no starts but none", |o| o.starts = 0),
+    label("starts whatever none leaves", |o| o.near_m = 0.0),
     label("starts compared without the way", |o| o.way_penalty = 0.0),
     label("distances to points, no normals", |o| o.normal_m = [0.0; 2]),
     label("distances to planes alone", |o| o.leak = 0.0),
@@ -71,6 +72,10 @@ const VARIANTS: &[Variant] = &[
         o.evidence_m = 3.0;
         o.evidence_slope = 0.0;
     }),
+    label("what is seen to have gone needs hold, too", |o| {
+        o.gone = f32::INFINITY;
+    }),
+    label("what is seen to have stayed may move", |o| o.stayed = 0.0),
     label("walls may slide", |o| o.least_hold = 0.0),
     label("moved clusters may lie anywhere", |o| {
         o.left_m = f32::INFINITY;

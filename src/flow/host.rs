@@ -3,10 +3,9 @@
 
 use std::sync::Arc;
 
-use super::around::AlignedSweep;
 use super::backend::BackendError;
 use super::ego;
-use super::label::{self, Labelled};
+use super::label::{self, Clouds, Labelled};
 use super::options::LabelOptions;
 use super::points::{Point, RigidTransform};
 use super::watch::Watch;
@@ -63,17 +62,14 @@ impl Host {
         self.threads.install(align)
     }
 
-    /// What moves from `source`, the ego motion taken out, to `target`, as the sweeps `around` bear
-    /// out; what has been found so far where `watch` interrupts.
+    /// What moves in `clouds`; what has been found so far where `watch` interrupts.
     pub fn movers(
         &self,
-        source: &[Point],
-        target: &[Point],
-        around: &[AlignedSweep],
+        clouds: &Clouds<'_>,
         options: &LabelOptions,
         watch: &dyn Watch,
     ) -> Labelled {
-        let find = || label::label(source, target, around, options, watch);
+        let find = || label::label(clouds, options, watch);
         self.threads.install(find)
     }
 }

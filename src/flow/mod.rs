@@ -83,7 +83,7 @@ pub use dense::DenseCloud;
 pub use error::FlowError;
 pub use field::{Field, Network, Residual};
 pub use host::Host;
-pub use label::{Evidence, Labelled, Motions, Parts, SURE_M, confidence_of_ground};
+pub use label::{Clouds, Evidence, Labelled, Motions, Parts, SURE_M, confidence_of_ground};
 pub use objects::{Cluster, Objects};
 pub use options::*;
 pub use points::{DYNAMIC_M, MIN_POINTS, Point, RigidTransform};

@@ -270,8 +270,10 @@ pub struct LabelOptions {
     pub reach_m: f32,
     /// Side of the bins in which shifts are counted, metres.
     pub bin_m: f32,
-    /// Starts from which a motion is fitted, besides none.
+    /// Starts that are looked at, besides none.
     pub starts: usize,
+    /// None are where a motion fitted from none lays the cluster this near to the target, metres.
+    pub near_m: f32,
     /// Cost of a metre of motion, metres, where starts are compared.
     pub way_penalty: f32,
     /// No motion is sought where a cluster lies this near to the target without one, metres.
@@ -290,6 +292,11 @@ pub struct LabelOptions {
     pub left_m: f32,
     /// Mean square of the normals along a motion from which a cluster's surfaces hold it.
     pub least_hold: f32,
+    /// Share of its places, where it was and where it is, that the other sweep saw through from which a
+    /// cluster moves though its surfaces do not hold it.
+    pub gone: f32,
+    /// Both shares together up to which a motion that rays would tell is none.
+    pub stayed: f32,
     /// A piece beside a mover goes with it where this share of its cost is left.
     pub beside_cost: f32,
     /// Points of a mover are not of it where its motion leaves them farther from the target than
@@ -304,8 +311,10 @@ pub struct LabelOptions {
     /// The sweeps around say plainly that a cluster moves where its motion leaves this share of its
     /// cost in them and in the nearest,
     pub confirmed_cost: f32,
-    /// and lays it this much nearer to them, metres there and back.
+    /// and lays it this much nearer to them, metres there and back,
     pub confirmed_m: f32,
+    /// and both shares of `gone` are together this much.
+    pub noticed: f32,
 }
 
 impl Default for LabelOptions {
@@ -323,6 +332,7 @@ impl Default for LabelOptions {
             reach_m: 3.5,
             bin_m: 0.15,
             starts: 6,
+            near_m: 0.05,
             way_penalty: 0.05,
             needed_m: 0.03,
             least_motion_m: 0.05,
@@ -332,6 +342,8 @@ impl Default for LabelOptions {
             evidence_slope: 3.0,
             left_m: 0.15,
             least_hold: 0.1,
+            gone: 0.15,
+            stayed: 0.2,
             beside_cost: 0.7,
             worse_m: 0.05,
             flat_points: 30,
@@ -339,6 +351,7 @@ impl Default for LabelOptions {
             frames: 2,
             confirmed_cost: 0.7,
             confirmed_m: 0.05,
+            noticed: 0.03,
         }
     }
 }

@@ -8,7 +8,7 @@ use super::backend::{Advance, Backend, BackendError, Report};
 use super::deadline::{self, Loop, Pace, Prepared};
 use super::error::FlowError;
 use super::field::{Field, Network, Residual};
-use super::label::{Labelled, confidence_of_ground};
+use super::label::{Clouds, Labelled, confidence_of_ground};
 use super::loss::length;
 use super::objects::Objects;
 use super::options::{Ego, Options, Precision};
@@ -167,10 +167,14 @@ fn solve(
                 None => Vec::new(),
             };
             let precomputed = watch.seconds();
-            let target = &selection.target;
-            let labelled = backend
-                .host()
-                .movers(&aligned, target, &around, label, watch);
+            let clouds = Clouds {
+                source: &aligned,
+                target: &selection.target,
+                around: &around,
+                sweeps: [problem.source, problem.target],
+                target_from_source: ego.unwrap_or_default(),
+            };
+            let labelled = backend.host().movers(&clouds, label, watch);
             backend.host().threads().install(|| {
                 objects = Some(Objects::new(
                     problem.source.len(),

@@ -13,11 +13,11 @@ const FEATURES: usize = 12;
 
 /// Weights of what moves, in the order of [`Evidence::features`].
 const MOVING: [f32; FEATURES] = [
-    5.821, 0.547, -0.393, 0.360, -4.070, -3.458, -11.344, 0.000, 10.401, 0.437, -0.194, -3.588,
+    6.089, 0.708, -0.378, 0.340, -4.721, -3.411, -11.723, 0.000, 9.901, 0.619, -0.194, -4.112,
 ];
 /// Weights of what stands still.
 const STANDING: [f32; FEATURES] = [
-    3.000, -0.322, -0.074, -0.302, -1.028, 1.094, 1.410, -0.361, -2.533, 0.689, 0.538, 1.287,
+    3.005, -0.345, -0.082, -0.225, -1.028, 1.109, 1.389, -0.378, -2.540, 0.713, 0.526, 1.313,
 ];
 /// Weights of ground, which moves with the vehicle: none, and by [`range`].
 const GROUND: [f32; 2] = [5.792, -0.522];

@@ -5,11 +5,18 @@
 //! only one sweep saw lies best on something else. It must not know how motions are found.
 
 use super::rigid::{Found, Witnesses};
+use super::sight::{SeenThrough, Sights};
 use crate::flow::Point;
 use crate::flow::options::LabelOptions;
 
-/// Whether `found`, the best motion of a cluster with these `points`, is needed.
-pub(super) fn is_needed(found: &Found, points: &[Point], options: &LabelOptions) -> bool {
+/// Whether `found`, the best motion of a cluster with these `points`, is needed, by what was `seen`
+/// through before and after it.
+pub(super) fn is_needed(
+    found: &Found,
+    points: &[Point],
+    seen: SeenThrough,
+    options: &LabelOptions,
+) -> bool {
     let around = &found.around;
     let sweeps = 1.0 + around.weight;
     let still = (found.still.sum_m() + around.still_m) / sweeps;
@@ -21,14 +28,18 @@ pub(super) fn is_needed(found: &Found, points: &[Point], options: &LabelOptions)
         && gain * points.len() as f32
             >= options.evidence_m + options.evidence_slope * found.motion.length_m()
         && found.cost.there_m <= options.left_m
-        && (found.hold >= options.least_hold || is_confirmed(around, options))
+        && (found.hold >= options.least_hold
+            || has_gone(seen, options)
+            || is_confirmed(around, seen, options))
+        && !has_stayed(found, points, seen, options)
         && !is_flat(points, options)
 }
 
 /// Whether the sweeps around say plainly that a cluster moves, even one that its surfaces do not hold:
 /// a wall that seems to slide lies where it was in all of them, a bus has driven on. The nearest must
-/// say so itself: a wall may slide, by then, onto what lies behind it.
-fn is_confirmed(around: &Witnesses, options: &LabelOptions) -> bool {
+/// say so itself: a wall may slide, by then, onto what lies behind it. And something of it must have
+/// been seen to leave or to come, as far as rays tell.
+fn is_confirmed(around: &Witnesses, seen: SeenThrough, options: &LabelOptions) -> bool {
     let is_plain = |[still_m, moved_m]: [f32; 2], weight: f32| {
         moved_m <= options.confirmed_cost * still_m
             && still_m - moved_m >= options.confirmed_m * weight
@@ -36,6 +47,21 @@ fn is_confirmed(around: &Witnesses, options: &LabelOptions) -> bool {
     around.weight > 0.0
         && is_plain(around.nearest_m, 1.0)
         && is_plain([around.still_m, around.moved_m], around.weight)
+        && seen.both().is_none_or(|both| both >= options.noticed)
+}
+
+/// Whether a cluster was seen to leave and to come, even one that its surfaces do not hold: the flat
+/// side of what drives past.
+fn has_gone(seen: SeenThrough, options: &LabelOptions) -> bool {
+    let is_seen = |share: Option<f32>| share.is_some_and(|share| share >= options.gone);
+    is_seen(seen.left) && is_seen(seen.came)
+}
+
+/// Whether a cluster was seen neither to leave nor to come, though its motion is so long that it would
+/// have been: what is hidden in one of the sweeps may lie on anything in the other.
+fn has_stayed(found: &Found, points: &[Point], seen: SeenThrough, options: &LabelOptions) -> bool {
+    seen.both().is_some_and(|both| both < options.stayed)
+        && Sights::tells(found.motion.length_m(), points[0])
 }
 
 /// Whether the points, many of them, lie at one height: a ring on ground that was not found.
@@ -73,10 +99,28 @@ mod tests {
         (0..count).map(point).collect()
     }
 
+    /// Nobody looked.
+    const UNSEEN: SeenThrough = SeenThrough {
+        left: None,
+        came: None,
+    };
+
     fn needed(change: impl Fn(&mut Found)) -> bool {
+        needed_as_seen(UNSEEN, change)
+    }
+
+    fn needed_as_seen(seen: SeenThrough, change: impl Fn(&mut Found)) -> bool {
         let mut found = plain();
         change(&mut found);
-        is_needed(&found, &points(60), &LabelOptions::default())
+        is_needed(&found, &points(60), seen, &LabelOptions::default())
+    }
+
+    /// The shares that were seen through.
+    fn seen(left: f32, came: f32) -> SeenThrough {
+        SeenThrough {
+            left: Some(left),
+            came: Some(came),
+        }
     }
 
     #[test]
@@ -97,6 +141,29 @@ mod tests {
     #[test]
     fn a_wall_that_slides_in_its_plane_does_not_move() {
         assert!(!needed(|found| found.hold = 0.02));
+    }
+
+    #[test]
+    fn a_flat_side_that_is_seen_to_leave_and_to_come_moves_though_nothing_holds_it() {
+        let slides = |seen| needed_as_seen(seen, |found| found.hold = 0.02);
+        assert!(slides(seen(0.2, 0.2)));
+        assert!(!slides(seen(0.4, 0.0)));
+        assert!(!slides(seen(0.0, 0.4)));
+        assert!(!slides(UNSEEN));
+    }
+
+    #[test]
+    fn what_is_seen_neither_to_leave_nor_to_come_does_not_move_far() {
+        let is_needed = |seen, shift| {
+            let far = |found: &mut Found| found.motion = found.motion.shifted([shift, 0.0]);
+            needed_as_seen(seen, far)
+        };
+        assert!(!is_needed(seen(0.05, 0.05), 0.0));
+        // What drives away hides where it comes to lie, what draws near where it was.
+        assert!(is_needed(seen(0.9, 0.0), 0.0));
+        assert!(is_needed(seen(0.0, 0.9), 0.0));
+        // Rays do not tell a short way.
+        assert!(is_needed(seen(0.05, 0.05), -0.5));
     }
 
     #[test]
@@ -121,6 +188,11 @@ mod tests {
             ..around(0.4, 0.05)
         };
         assert!(!slides(far));
+        // Nor one of which nothing leaves its place.
+        assert!(!needed_as_seen(seen(0.01, 0.01), |found| {
+            (found.hold, found.around) = (0.02, around(0.4, 0.05));
+            found.motion = found.motion.shifted([-0.5, 0.0]);
+        }));
         // And what held was none where the others say that it stands.
         assert!(!needed(|found| found.around = around(0.05, 0.5)));
     }
@@ -129,15 +201,20 @@ mod tests {
     fn the_farther_a_motion_the_more_points_it_takes() {
         let options = LabelOptions::default();
         let mut found = plain();
-        assert!(is_needed(&found, &points(12), &options));
+        assert!(is_needed(&found, &points(12), UNSEEN, &options));
         found.motion = found.motion.shifted([2.2, 0.0]);
-        assert!(!is_needed(&found, &points(12), &options));
-        assert!(is_needed(&found, &points(40), &options));
+        assert!(!is_needed(&found, &points(12), UNSEEN, &options));
+        assert!(is_needed(&found, &points(40), UNSEEN, &options));
     }
 
     #[test]
     fn a_ring_on_the_ground_does_not_move() {
         let flat: Vec<Point> = points(60).iter().map(|&[x, y, _]| [x, y, -1.7]).collect();
-        assert!(!is_needed(&plain(), &flat, &LabelOptions::default()));
+        assert!(!is_needed(
+            &plain(),
+            &flat,
+            UNSEEN,
+            &LabelOptions::default()
+        ));
     }
 }

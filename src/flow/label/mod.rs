@@ -3,7 +3,7 @@
 //! ```text
 //! source, ego motion out - cluster ─┐                 ┌ vote - starts
 //! target ───────────────── scene ───┴─ each cluster: ─┤ rigid - the motion of least cost
-//!                                                     └ gate - needed, or none
+//! both sweeps, whole ───── sight ──────────────────── └ gate - needed, or none
 //!                          spread: pieces beside a mover, points that are not of it - Motions
 //! ```
 //!
@@ -24,6 +24,7 @@ mod stored;
 mod fit;
 mod gate;
 mod rigid;
+mod sight;
 mod spread;
 mod vote;
 
@@ -44,13 +45,14 @@ use rayon::prelude::*;
 
 use super::around::AlignedSweep;
 use super::options::LabelOptions;
-use super::points::Point;
+use super::points::{Point, RigidTransform};
 use super::watch::{Interrupt, Progress, Watch};
 use cluster::NOISE;
 use evidence::{Findings, Searched};
 use moment::Moment;
 use rigid::Mover;
 use scene::{Scene, Thinned};
+use sight::Sights;
 use vote::Ballot;
 
 /// Clusters between two looks at the watch.
@@ -59,6 +61,23 @@ const CLUSTERS_AT_ONCE: usize = 32;
 const SCENE: f64 = 5.0;
 /// What is left to do once clusters have been searched, in times of the scene.
 const REST: f64 = 0.5;
+
+/// What movers are sought in: metres.
+#[derive(Clone, Copy, Debug)]
+pub struct Clouds<'a> {
+    /// Points off the ground in the target's frame, every number finite: the source's, the ego motion
+    /// taken out, and the target's.
+    pub source: &'a [Point],
+    /// See `source`.
+    pub target: &'a [Point],
+    /// Other sweeps of the sequence.
+    pub around: &'a [AlignedSweep],
+    /// The source and the target as they came, ground, points out of range and all, each in its own
+    /// frame: what was seen through on the way to them.
+    pub sweeps: [&'a [Point]; 2],
+    /// The ego motion.
+    pub target_from_source: RigidTransform,
+}
 
 /// The movers of a pair.
 #[derive(Debug)]
@@ -109,16 +128,10 @@ impl Labelled {
     }
 }
 
-/// Finds what moves from `source`, the ego motion taken out, to `target`: metres, ground left out,
-/// every number finite. Large clusters come first; those that the watch leaves no time for stand
-/// still.
-pub(crate) fn label(
-    source: &[Point],
-    target: &[Point],
-    around: &[AlignedSweep],
-    options: &LabelOptions,
-    watch: &dyn Watch,
-) -> Labelled {
+/// Finds what moves in `clouds`. Large clusters come first; those that the watch leaves no time for
+/// stand still.
+pub(crate) fn label(clouds: &Clouds<'_>, options: &LabelOptions, watch: &dyn Watch) -> Labelled {
+    let Clouds { source, target, .. } = *clouds;
     let late = |needed: f64| {
         let late = watch.seconds_left().is_some_and(|left| left < needed);
         watch.interrupt().or(late.then_some(Interrupt::Deadline))
@@ -135,8 +148,10 @@ pub(crate) fn label(
     let began = watch.seconds();
     let thinned = Thinned::new(source, &labels, options);
     let scene = Scene::new(&thinned, target, options);
+    let sights = Sights::new(clouds.sweeps, &clouds.target_from_source);
     let ballot = Ballot::new(&scene);
-    let around: Vec<Moment<'_>> = around
+    let around: Vec<Moment<'_>> = clouds
+        .around
         .par_iter()
         .map(|sweep| Moment::new(&thinned, sweep, options))
         .collect();
@@ -154,7 +169,7 @@ pub(crate) fn label(
         }
         let found: Vec<Searched> = some
             .par_iter()
-            .map(|&cluster| search(&scene, &around, &ballot, cluster))
+            .map(|&cluster| search(&scene, &around, &sights, &ballot, cluster))
             .collect();
         for (&cluster, found) in some.iter().zip(found) {
             searched[cluster as usize] = found;
@@ -202,7 +217,13 @@ pub(crate) fn label(
 }
 
 /// Looks for the motion of a cluster.
-fn search(scene: &Scene<'_>, around: &[Moment<'_>], ballot: &Ballot, cluster: u32) -> Searched {
+fn search(
+    scene: &Scene<'_>,
+    around: &[Moment<'_>],
+    sights: &Sights,
+    ballot: &Ballot,
+    cluster: u32,
+) -> Searched {
     let members = &scene.source.members[cluster as usize];
     let mover = Mover::new(scene, around, cluster);
     let still = mover.standing_still();
@@ -218,7 +239,10 @@ fn search(scene: &Scene<'_>, around: &[Moment<'_>], ballot: &Ballot, cluster: u3
         .map(|&row| scene.source.points[row as usize])
         .collect();
     let best = mover.search(ballot, still);
-    let needed = best.is_some_and(|found| gate::is_needed(&found, &points, scene.options));
+    let needed = best.is_some_and(|found| {
+        let seen = sights.of(&points, &mover.matched(&found.motion));
+        gate::is_needed(&found, &points, seen, scene.options)
+    });
     Searched {
         still,
         best,

@@ -109,34 +109,33 @@ impl<'a> Mover<'a> {
         if still.there_m < options.needed_m {
             return None;
         }
-        let points = |rows: &[u32]| -> Vec<Point> {
-            rows.iter()
-                .map(|&row| self.scene.source.points[row as usize])
-                .collect()
-        };
-        let value = |motion: &Motion, cost: Cost| {
-            let way_m = options.way_penalty * motion.length_m();
-            cost.sum_m() + way_m + self.around_m(motion)
-        };
-        let shifts = ballot.peaks(&points(&evenly(members, VOTERS)), options.starts);
-        let starts = shifts.into_iter().map(|shift| {
-            let start = standing.shifted(shift);
-            (value(&start, self.cost(&start)), start)
-        });
-        let mut starts: Vec<(f32, Motion)> = starts.collect();
-        starts.sort_by(|a, b| a.0.total_cmp(&b.0));
-        starts.truncate(PROMISING);
         let few = evenly(members, FITTED);
-        let mut best: Option<(Motion, Cost, f32)> = None;
-        for (_, start) in starts.into_iter().chain([(0.0, standing)]) {
-            let motion = self.fitted(&[], &few, &start, false, STEPS[0]);
+        let way_m = |motion: &Motion| options.way_penalty * motion.length_m();
+        let from = |start: &Motion| {
+            let motion = self.fitted(&[], &few, start, false, STEPS[0]);
             let cost = self.cost(&motion);
-            let value = value(&motion, cost);
-            if best.is_none_or(|(_, _, least)| value < least) {
-                best = Some((motion, cost, value));
+            let value = cost.sum_m() + way_m(&motion) + self.around_m(&motion);
+            (value, motion, cost)
+        };
+        let mut best = from(&standing);
+        if best.2.there_m >= options.near_m {
+            let place = |row: u32| self.scene.source.points[row as usize];
+            let voters: Vec<Point> = evenly(members, VOTERS).into_iter().map(place).collect();
+            let shifts = ballot.peaks(&voters, options.starts);
+            let starts = shifts.into_iter().map(|shift| {
+                let start = standing.shifted(shift);
+                (self.cost(&start).sum_m() + way_m(&start), start)
+            });
+            let mut starts: Vec<(f32, Motion)> = starts.collect();
+            starts.sort_by(|a, b| a.0.total_cmp(&b.0));
+            for (_, start) in starts.iter().take(PROMISING) {
+                let other = from(start);
+                if other.0 < best.0 {
+                    best = other;
+                }
             }
         }
-        let (start, cost, _) = best?;
+        let (_, start, cost) = best;
         if still.there_m - cost.there_m < options.gain_m {
             return None;
         }
@@ -272,6 +271,16 @@ impl<'a> Mover<'a> {
             }
         }
         sum / f32::max(count, 1.0)
+    }
+
+    /// The target points that the cluster lies on once moved: one for each point that has one.
+    pub(super) fn matched(&self, motion: &Motion) -> Vec<Point> {
+        let target = |&row: &u32| {
+            let moved = motion.apply(self.scene.source.points[row as usize]);
+            let target = self.scene.match_of(moved, self.cluster)?;
+            Some(self.scene.target[target as usize])
+        };
+        self.rows.iter().filter_map(target).collect()
     }
 
     /// How far a source point, moved, lies from the target, metres, truncated.

@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use nalgebra::Point3;
 
-use super::{Labelled, label};
+use super::{Clouds, Labelled, label};
 use crate::flow::options::LabelOptions;
 use crate::flow::points::{Point, RigidTransform};
 use crate::flow::random::Random;
@@ -37,8 +37,23 @@ fn wall(random: &mut Random, [from, to]: [f64; 2]) -> Vec<Point> {
     (0..count).map(|_| point()).collect()
 }
 
+/// Two sweeps from the same place.
+fn clouds<'a>(source: &'a [Point], target: &'a [Point]) -> Clouds<'a> {
+    Clouds {
+        source,
+        target,
+        around: &[],
+        sweeps: [source, target],
+        target_from_source: RigidTransform::identity(),
+    }
+}
+
 fn found(source: &[Point], target: &[Point]) -> Labelled {
-    label(source, target, &[], &LabelOptions::default(), &Unwatched)
+    label(
+        &clouds(source, target),
+        &LabelOptions::default(),
+        &Unwatched,
+    )
 }
 
 #[test]
@@ -70,6 +85,33 @@ fn a_wall_whose_hidden_part_shifts_does_not_move() {
     let target = wall(&mut random, [3.0, 7.0]);
     let residual = found(&source, &target).motions.residual_at(&source);
     assert!(residual.iter().all(|&residual| residual == [0.0; 3]));
+}
+
+/// A wall far behind [`wall`], but for what the part `from..to` of that hides of it.
+fn wall_behind(random: &mut Random, [from, to]: [f64; 2]) -> Vec<Point> {
+    let mut points = Vec::new();
+    for _ in 0..60_000 {
+        let [x, z] = [random.uniform(-30.0, 30.0), random.uniform(-3.0, 4.0)];
+        let is_hidden = (from..to).contains(&(x / 3.0)) && (-1.2..1.5).contains(&(z / 3.0));
+        if !is_hidden {
+            points.push([x as f32, 3.0 * WALL_Y_M as f32, z as f32]);
+        }
+    }
+    points
+}
+
+#[test]
+fn a_flat_side_moves_that_uncovers_what_is_behind_it() {
+    // Its ends alone say how far.
+    const TOLERANCE_M: f32 = 0.15;
+    let mut random = Random::new(2);
+    let mut sweep = |part| [wall(&mut random, part), wall_behind(&mut random, part)].concat();
+    let [source, target] = [sweep([2.0, 4.0]), sweep([2.6, 4.6])];
+    let residual = found(&source, &target).motions.residual_at(&source);
+    for (residual, point) in residual.iter().zip(&source) {
+        let moves = if point[1] < 10.0 { 0.6 } else { 0.0 };
+        assert!((residual[0] - moves).abs() < TOLERANCE_M, "{residual:?}");
+    }
 }
 
 #[test]
@@ -182,13 +224,13 @@ fn an_interrupt_keeps_what_was_found_until_then() {
     let mut last = 0;
     for looks in [0, 2, 3, 4] {
         let watch = After(looks, Interrupt::Deadline, AtomicUsize::new(0));
-        let labelled = label(&source, &target, &[], &options, &watch);
+        let labelled = label(&clouds(&source, &target), &options, &watch);
         assert_eq!(labelled.interrupted, Some(Interrupt::Deadline));
         assert!(labelled.clusters >= last && labelled.clusters < whole);
         last = labelled.clusters;
     }
     assert!(last > 0);
     let watch = After(3, Interrupt::Cancelled, AtomicUsize::new(0));
-    let labelled = label(&source, &target, &[], &options, &watch);
+    let labelled = label(&clouds(&source, &target), &options, &watch);
     assert_eq!(labelled.interrupted, Some(Interrupt::Cancelled));
 }
