@@ -43,6 +43,7 @@ mod watch;
 pub mod distance;
 mod ego;
 pub mod field;
+mod flat;
 mod label;
 mod loss;
 

@@ -13,7 +13,8 @@ use nalgebra::{
 };
 use rayon::prelude::*;
 
-use super::surfels::{Flat, Surfel, Surfels};
+use super::surfels::{Surfel, Surfels};
+use crate::flow::flat::Flat;
 use crate::flow::points::{Point, RigidTransform};
 use crate::flow::watch::Watch;
 

@@ -17,7 +17,6 @@ mod thin;
 mod tests;
 
 use fit::{Fit, Schedule};
-pub(super) use surfels::flat;
 use surfels::{Columns, Surfels};
 use thin::thinned;
 

@@ -5,22 +5,14 @@
 
 use std::ops::Range;
 
-use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 
 use super::thin::REACH;
+use crate::flow::flat::{Flat, Neighborhood};
 use crate::flow::points::{Point, evenly};
 
 /// Points whose surfels one thread makes at a time.
 const POINTS_AT_ONCE: usize = 256;
-/// Fewer neighbors than this, the point itself among them, make no surface.
-const NEIGHBORS: f64 = 4.0;
-/// A surface is flat where its spread along its second axis exceeds that along its normal by this
-/// share of the spread along its first. Less flat ones are branches and wires; with more asked for,
-/// walls seen by one ring are lost.
-const FLAT: f64 = 0.05;
-/// Spreads below this are none, square metres.
-const NO_SPREAD: f64 = 1e-12;
 
 /// A flat piece of surface.
 #[derive(Clone, Copy)]
@@ -29,16 +21,6 @@ pub(super) struct Surfel {
     pub(super) point: Point,
     /// How it lies.
     pub(super) flat: Flat,
-}
-
-/// The plane through points that lie nearly on one.
-#[derive(Clone, Copy)]
-pub(in crate::flow) struct Flat {
-    /// Unit length, on either side.
-    pub(in crate::flow) normal: [f32; 3],
-    /// The points' spread along the normal over that along their second axis, as variances: 0 for
-    /// a plane.
-    pub(super) thickness: f32,
 }
 
 /// A cloud by place: evenly thinned points, voxels apart that are smaller than a cell.
@@ -108,26 +90,15 @@ impl Columns {
     }
 
     fn flat_at(&self, point: Point) -> Option<Flat> {
-        let mut count = 0.0;
-        let mut sum = Vector3::zeros();
-        let mut squares = Matrix3::zeros();
-        for other in self
-            .around(point)
-            .into_iter()
-            .flat_map(|row| &self.points[row])
-        {
-            if square_distance(point, *other) < self.cell_m * self.cell_m {
-                let away = Vector3::from_fn(|a, _| f64::from(other[a] - point[a]));
-                count += 1.0;
-                sum += away;
-                squares += away * away.transpose();
+        let mut neighborhood = Neighborhood::of(point);
+        for row in self.around(point) {
+            for &other in &self.points[row] {
+                if square_distance(point, other) < self.cell_m * self.cell_m {
+                    neighborhood.add(other);
+                }
             }
         }
-        if count < NEIGHBORS {
-            return None;
-        }
-        let mean: Vector3<f64> = sum / count;
-        flat(&(squares / count - mean * mean.transpose()))
+        neighborhood.flat()
     }
 }
 
@@ -176,39 +147,10 @@ fn square_distance(a: Point, b: Point) -> f32 {
     x * x + y * y + z * z
 }
 
-/// The plane of points by their covariance, in closed form; none where they do not lie on one.
-pub(in crate::flow) fn flat(spread: &Matrix3<f64>) -> Option<Flat> {
-    let mean = spread.trace() / 3.0;
-    let rest = spread - Matrix3::identity() * mean;
-    let radius = (rest.norm_squared() / 6.0).sqrt();
-    if radius.is_nan() || radius < NO_SPREAD {
-        return None;
-    }
-    let half = (rest / radius).determinant() / 2.0;
-    let angle = half.clamp(-1.0, 1.0).acos() / 3.0;
-    let third = 2.0 * std::f64::consts::FRAC_PI_3;
-    let most = mean + 2.0 * radius * angle.cos();
-    let least = mean + 2.0 * radius * (angle + third).cos();
-    let middle = 3.0 * mean - most - least;
-    if middle - least < FLAT * most {
-        return None;
-    }
-    // The rows of what is left without the least spread are at right angles to its axis.
-    let across = spread - Matrix3::identity() * least;
-    let [a, b, c] = [0, 1, 2].map(|i| across.column(i).into_owned());
-    let candidates = [a.cross(&b), b.cross(&c), c.cross(&a)];
-    let longest = candidates
-        .into_iter()
-        .max_by(|a, b| a.norm_squared().total_cmp(&b.norm_squared()))?;
-    let normal = longest.try_normalize(0.0)?;
-    Some(Flat {
-        normal: [normal.x as f32, normal.y as f32, normal.z as f32],
-        thickness: (least / middle).max(0.0) as f32,
-    })
-}
-
 #[cfg(test)]
 mod tests {
+    use nalgebra::Vector3;
+
     use super::*;
     use crate::flow::random::Random;
 

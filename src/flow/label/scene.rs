@@ -4,18 +4,15 @@
 //! and nothing else can have moved there. Heights count less than what lies level: a lidar's rings
 //! are far apart, its samples along a ring are not. It must not know how motions are found.
 
-use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 
 use super::cluster::NOISE;
 use super::motion::Motion;
 use super::near::Near;
 use crate::flow::Point;
-use crate::flow::ego;
+use crate::flow::flat::Neighborhood;
 use crate::flow::options::LabelOptions;
 
-/// Fewer points than this have no normal.
-const NEIGHBORS: f64 = 4.0;
 /// Share of a cluster that must lie on the target for it to stand still plainly.
 const PLAIN: f32 = 0.9;
 
@@ -234,19 +231,8 @@ fn normal(near: &Near, point: Point, options: &LabelOptions) -> Point {
     let range = point[0].hypot(point[1]);
     let [base, slope] = options.normal_m;
     let radius = (base + slope * range).min(options.match_m);
-    let mut count = 0.0;
-    let mut sum = Vector3::<f64>::zeros();
-    let mut squares = Matrix3::<f64>::zeros();
-    near.around(point, radius, |_, other| {
-        let away = Vector3::from_fn(|a, _| f64::from(other[a] - point[a]));
-        count += 1.0;
-        sum += away;
-        squares += away * away.transpose();
-    });
-    if count < NEIGHBORS {
-        return [0.0; 3];
-    }
-    let mean: Vector3<f64> = sum / count;
-    let flat = ego::flat(&(squares / count - mean * mean.transpose()));
+    let mut neighborhood = Neighborhood::of(point);
+    near.around(point, radius, |_, other| neighborhood.add(other));
+    let flat = neighborhood.flat();
     flat.map_or([0.0; 3], |flat| flat.normal)
 }
