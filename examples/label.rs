@@ -86,6 +86,7 @@ const VARIANTS: &[Variant] = &[
         o.evidence_m = 0.0;
         o.evidence_slope = 0.0;
         o.least_hold = 0.0;
+        o.stayed = 0.0;
         o.left_m = f32::INFINITY;
         o.kept_cost = 1.0;
         o.flat_m = 0.0;

@@ -272,7 +272,7 @@ pub struct LabelOptions {
     pub bin_m: f32,
     /// Starts that are looked at, besides none.
     pub starts: usize,
-    /// None are where a motion fitted from none lays the cluster this near to the target, metres.
+    /// Those are not looked at where a fit from none lays the cluster this near to the target, metres.
     pub near_m: f32,
     /// Cost of a metre of motion, metres, where starts are compared.
     pub way_penalty: f32,
@@ -292,10 +292,10 @@ pub struct LabelOptions {
     pub left_m: f32,
     /// Mean square of the normals along a motion from which a cluster's surfaces hold it.
     pub least_hold: f32,
-    /// Share of its places, where it was and where it is, that the other sweep saw through from which a
-    /// cluster moves though its surfaces do not hold it.
+    /// Share that the other sweep saw through, of the places that a cluster leaves and of those that it
+    /// comes to each, from which it moves though its surfaces do not hold it.
     pub gone: f32,
-    /// Both shares together up to which a motion that rays would tell is none.
+    /// Sum of these shares below which it does not move, whatever else speaks for it.
     pub stayed: f32,
     /// A piece beside a mover goes with it where this share of its cost is left.
     pub beside_cost: f32,
@@ -311,10 +311,8 @@ pub struct LabelOptions {
     /// The sweeps around say plainly that a cluster moves where its motion leaves this share of its
     /// cost in them and in the nearest,
     pub confirmed_cost: f32,
-    /// and lays it this much nearer to them, metres there and back,
+    /// and lays it this much nearer to them, metres there and back.
     pub confirmed_m: f32,
-    /// and both shares of `gone` are together this much.
-    pub noticed: f32,
 }
 
 impl Default for LabelOptions {
@@ -342,8 +340,8 @@ impl Default for LabelOptions {
             evidence_slope: 3.0,
             left_m: 0.15,
             least_hold: 0.1,
-            gone: 0.15,
-            stayed: 0.2,
+            gone: 0.7,
+            stayed: 0.3,
             beside_cost: 0.7,
             worse_m: 0.05,
             flat_points: 30,
@@ -351,7 +349,6 @@ impl Default for LabelOptions {
             frames: 2,
             confirmed_cost: 0.7,
             confirmed_m: 0.05,
-            noticed: 0.03,
         }
     }
 }

@@ -13,11 +13,11 @@ const FEATURES: usize = 12;
 
 /// Weights of what moves, in the order of [`Evidence::features`].
 const MOVING: [f32; FEATURES] = [
-    6.089, 0.708, -0.378, 0.340, -4.721, -3.411, -11.723, 0.000, 9.901, 0.619, -0.194, -4.112,
+    6.090, 0.710, -0.379, 0.340, -4.731, -3.398, -11.741, 0.000, 9.903, 0.619, -0.195, -4.113,
 ];
 /// Weights of what stands still.
 const STANDING: [f32; FEATURES] = [
-    3.005, -0.345, -0.082, -0.225, -1.028, 1.109, 1.389, -0.378, -2.540, 0.713, 0.526, 1.313,
+    3.015, -0.347, -0.085, -0.186, -1.031, 1.102, 1.412, -0.402, -2.539, 0.708, 0.529, 1.307,
 ];
 /// Weights of ground, which moves with the vehicle: none, and by [`range`].
 const GROUND: [f32; 2] = [5.792, -0.522];

@@ -5,16 +5,16 @@
 //! only one sweep saw lies best on something else. It must not know how motions are found.
 
 use super::rigid::{Found, Witnesses};
-use super::sight::{SeenThrough, Sights};
+use super::sight::SeenThrough;
 use crate::flow::Point;
 use crate::flow::options::LabelOptions;
 
-/// Whether `found`, the best motion of a cluster with these `points`, is needed, by what was `seen`
-/// through before and after it.
+/// Whether `found`, the best motion of a cluster with these `points`, is needed; `seen` says what was
+/// seen through before and after it.
 pub(super) fn is_needed(
     found: &Found,
     points: &[Point],
-    seen: SeenThrough,
+    seen: impl Fn() -> SeenThrough,
     options: &LabelOptions,
 ) -> bool {
     let around = &found.around;
@@ -28,18 +28,21 @@ pub(super) fn is_needed(
         && gain * points.len() as f32
             >= options.evidence_m + options.evidence_slope * found.motion.length_m()
         && found.cost.there_m <= options.left_m
-        && (found.hold >= options.least_hold
-            || has_gone(seen, options)
-            || is_confirmed(around, seen, options))
-        && !has_stayed(found, points, seen, options)
         && !is_flat(points, options)
+        && {
+            let seen = seen();
+            let stayed = has_stayed(seen, options);
+            !(stayed && seen.far)
+                && (found.hold >= options.least_hold
+                    || has_gone(seen, options)
+                    || is_confirmed(around, options) && !stayed)
+        }
 }
 
 /// Whether the sweeps around say plainly that a cluster moves, even one that its surfaces do not hold:
 /// a wall that seems to slide lies where it was in all of them, a bus has driven on. The nearest must
-/// say so itself: a wall may slide, by then, onto what lies behind it. And something of it must have
-/// been seen to leave or to come, as far as rays tell.
-fn is_confirmed(around: &Witnesses, seen: SeenThrough, options: &LabelOptions) -> bool {
+/// say so itself: a wall may slide, by then, onto what lies behind it.
+fn is_confirmed(around: &Witnesses, options: &LabelOptions) -> bool {
     let is_plain = |[still_m, moved_m]: [f32; 2], weight: f32| {
         moved_m <= options.confirmed_cost * still_m
             && still_m - moved_m >= options.confirmed_m * weight
@@ -47,7 +50,6 @@ fn is_confirmed(around: &Witnesses, seen: SeenThrough, options: &LabelOptions) -
     around.weight > 0.0
         && is_plain(around.nearest_m, 1.0)
         && is_plain([around.still_m, around.moved_m], around.weight)
-        && seen.both().is_none_or(|both| both >= options.noticed)
 }
 
 /// Whether a cluster was seen to leave and to come, even one that its surfaces do not hold: the flat
@@ -57,11 +59,11 @@ fn has_gone(seen: SeenThrough, options: &LabelOptions) -> bool {
     is_seen(seen.left) && is_seen(seen.came)
 }
 
-/// Whether a cluster was seen neither to leave nor to come, though its motion is so long that it would
-/// have been: what is hidden in one of the sweeps may lie on anything in the other.
-fn has_stayed(found: &Found, points: &[Point], seen: SeenThrough, options: &LabelOptions) -> bool {
-    seen.both().is_some_and(|both| both < options.stayed)
-        && Sights::tells(found.motion.length_m(), points[0])
+/// Whether a cluster was seen neither to leave nor to come: what is hidden in one of the sweeps may lie
+/// on anything in the other. Of a short way rays tell too little to stop what its surfaces hold.
+fn has_stayed(seen: SeenThrough, options: &LabelOptions) -> bool {
+    let both = seen.left.zip(seen.came);
+    both.is_some_and(|(left, came)| left + came < options.stayed)
 }
 
 /// Whether the points, many of them, lie at one height: a ring on ground that was not found.
@@ -103,6 +105,7 @@ mod tests {
     const UNSEEN: SeenThrough = SeenThrough {
         left: None,
         came: None,
+        far: true,
     };
 
     fn needed(change: impl Fn(&mut Found)) -> bool {
@@ -112,7 +115,7 @@ mod tests {
     fn needed_as_seen(seen: SeenThrough, change: impl Fn(&mut Found)) -> bool {
         let mut found = plain();
         change(&mut found);
-        is_needed(&found, &points(60), seen, &LabelOptions::default())
+        is_needed(&found, &points(60), || seen, &LabelOptions::default())
     }
 
     /// The shares that were seen through.
@@ -120,6 +123,7 @@ mod tests {
         SeenThrough {
             left: Some(left),
             came: Some(came),
+            far: true,
         }
     }
 
@@ -146,24 +150,25 @@ mod tests {
     #[test]
     fn a_flat_side_that_is_seen_to_leave_and_to_come_moves_though_nothing_holds_it() {
         let slides = |seen| needed_as_seen(seen, |found| found.hold = 0.02);
-        assert!(slides(seen(0.2, 0.2)));
-        assert!(!slides(seen(0.4, 0.0)));
-        assert!(!slides(seen(0.0, 0.4)));
+        assert!(slides(seen(0.8, 0.8)));
+        assert!(!slides(seen(0.9, 0.2)));
+        assert!(!slides(seen(0.2, 0.9)));
         assert!(!slides(UNSEEN));
     }
 
     #[test]
     fn what_is_seen_neither_to_leave_nor_to_come_does_not_move_far() {
-        let is_needed = |seen, shift| {
-            let far = |found: &mut Found| found.motion = found.motion.shifted([shift, 0.0]);
-            needed_as_seen(seen, far)
-        };
-        assert!(!is_needed(seen(0.05, 0.05), 0.0));
+        let is_needed = |seen| needed_as_seen(seen, |_| {});
+        assert!(!is_needed(seen(0.1, 0.1)));
         // What drives away hides where it comes to lie, what draws near where it was.
-        assert!(is_needed(seen(0.9, 0.0), 0.0));
-        assert!(is_needed(seen(0.0, 0.9), 0.0));
+        assert!(is_needed(seen(0.9, 0.0)));
+        assert!(is_needed(seen(0.0, 0.9)));
         // Rays do not tell a short way.
-        assert!(is_needed(seen(0.05, 0.05), -0.5));
+        let near = SeenThrough {
+            far: false,
+            ..seen(0.1, 0.1)
+        };
+        assert!(is_needed(near));
     }
 
     #[test]
@@ -188,11 +193,17 @@ mod tests {
             ..around(0.4, 0.05)
         };
         assert!(!slides(far));
-        // Nor one of which nothing leaves its place.
-        assert!(!needed_as_seen(seen(0.01, 0.01), |found| {
-            (found.hold, found.around) = (0.02, around(0.4, 0.05));
-            found.motion = found.motion.shifted([-0.5, 0.0]);
-        }));
+        // Nor one that is seen to stay, however short the way.
+        let stays = |far| {
+            let seen = SeenThrough {
+                far,
+                ..seen(0.1, 0.1)
+            };
+            needed_as_seen(seen, |found| {
+                (found.hold, found.around) = (0.02, around(0.4, 0.05));
+            })
+        };
+        assert!(!stays(true) && !stays(false));
         // And what held was none where the others say that it stands.
         assert!(!needed(|found| found.around = around(0.05, 0.5)));
     }
@@ -201,10 +212,10 @@ mod tests {
     fn the_farther_a_motion_the_more_points_it_takes() {
         let options = LabelOptions::default();
         let mut found = plain();
-        assert!(is_needed(&found, &points(12), UNSEEN, &options));
+        assert!(is_needed(&found, &points(12), || UNSEEN, &options));
         found.motion = found.motion.shifted([2.2, 0.0]);
-        assert!(!is_needed(&found, &points(12), UNSEEN, &options));
-        assert!(is_needed(&found, &points(40), UNSEEN, &options));
+        assert!(!is_needed(&found, &points(12), || UNSEEN, &options));
+        assert!(is_needed(&found, &points(40), || UNSEEN, &options));
     }
 
     #[test]
@@ -213,7 +224,7 @@ mod tests {
         assert!(!is_needed(
             &plain(),
             &flat,
-            UNSEEN,
+            || UNSEEN,
             &LabelOptions::default()
         ));
     }

@@ -73,9 +73,9 @@ pub struct Clouds<'a> {
     /// Other sweeps of the sequence.
     pub around: &'a [AlignedSweep],
     /// The source and the target as they came, ground, points out of range and all, each in its own
-    /// frame: what was seen through on the way to them.
+    /// frame, whose origin is the sensor or about it: what was seen through on the way to them.
     pub sweeps: [&'a [Point]; 2],
-    /// The ego motion.
+    /// The ego motion; none where it is not known.
     pub target_from_source: RigidTransform,
 }
 
@@ -240,7 +240,14 @@ fn search(
         .collect();
     let best = mover.search(ballot, still);
     let needed = best.is_some_and(|found| {
-        let seen = sights.of(&points, &mover.matched(&found.motion));
+        let seen = || {
+            let motion = &found.motion;
+            let [x, y] = motion.center;
+            let clear_m = sight::passed_m(x.hypot(y));
+            let vacated = mover.vacated(motion, clear_m);
+            let far = motion.length_m() >= 2.0 * clear_m;
+            sights.of(&vacated, &mover.occupied(motion, clear_m), far)
+        };
         gate::is_needed(&found, &points, seen, scene.options)
     });
     Searched {

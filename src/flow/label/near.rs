@@ -1,7 +1,7 @@
 //! Which points of a cloud lie near a place.
 //!
-//! Points lie in square columns that a small table finds, by height within each: nine columns are
-//! looked at for one place. It must not know of motions or clusters.
+//! Points lie in square columns that a small table finds, by height within each: at most nine columns
+//! are looked at for one place. It must not know of motions or clusters.
 
 use std::ops::Range;
 
@@ -260,6 +260,41 @@ mod tests {
             let expected = least.filter(|&(square, _)| square < 0.49);
             let found = near.nearest(asked, 0.7, allowed);
             assert_eq!(found, expected.map(|(square, row)| (row, square)));
+        }
+    }
+
+    #[test]
+    fn on_a_lattice_far_out_the_nearest_is_the_lowest_row_of_equals_and_nothing_near_is_left_out() {
+        // Borders of columns go through the points, and single precision is half a millimetre.
+        let lattice = |i: u16| {
+            let [x, y, z] = [i % 12, i / 12 % 12, i / 144].map(f32::from);
+            [4000.0 + x * 0.25, -4000.0 + y * 0.25, z * 0.25]
+        };
+        let cloud: Vec<Point> = (0..720).map(lattice).collect();
+        let near = Near::new(&cloud, 0.5);
+        let mut random = Random::new(5);
+        for _ in 0..500 {
+            let mut side = |low: f64, high: f64| (random.uniform(low, high) * 8.0).round() / 8.0;
+            let asked = [
+                side(3999.5, 4003.5),
+                side(-4000.5, -3996.5),
+                side(-0.5, 1.5),
+            ];
+            let asked = asked.map(|c| c as f32);
+            for within_m in [0.2, 0.5_f32] {
+                let square = |&point: &Point| square_distance(asked, point);
+                let inside = |&(square, _): &(f32, u32)| square < within_m * within_m;
+                let all = cloud.iter().map(square).zip(0..).filter(inside);
+                let mut all: Vec<(f32, u32)> = all.collect();
+                let mut around = Vec::new();
+                near.around(asked, within_m, |row, _| around.push(row));
+                around.sort_unstable();
+                let rows: Vec<u32> = all.iter().map(|&(_, row)| row).collect();
+                assert_eq!(around, rows);
+                all.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+                let first = all.first().map(|&(square, row)| (row, square));
+                assert_eq!(near.nearest(asked, within_m, |_| true), first);
+            }
         }
     }
 

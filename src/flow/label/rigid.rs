@@ -8,6 +8,7 @@
 
 use super::moment::Moment;
 use super::motion::Motion;
+use super::near::square_distance;
 use super::scene::{Scene, evenly};
 use super::vote::Ballot;
 use crate::flow::Point;
@@ -257,30 +258,54 @@ impl<'a> Mover<'a> {
         let [x, y] = motion.shift_m.map(|c| c / length);
         let mut sum = 0.0;
         let mut count = 0.0;
-        for &row in &self.rows {
-            let moved = motion.apply(self.scene.source.points[row as usize]);
-            if let Some(target) = self.scene.match_of(moved, self.cluster) {
-                let normal = self.scene.normal(target);
-                let along = normal[0] * x + normal[1] * y;
-                sum += if normal == [0.0; 3] {
-                    HOLD_OF_A_POINT
-                } else {
-                    along * along
-                };
-                count += 1.0;
-            }
+        for target in self.matches(motion) {
+            let normal = self.scene.normal(target);
+            let along = normal[0] * x + normal[1] * y;
+            sum += if normal == [0.0; 3] {
+                HOLD_OF_A_POINT
+            } else {
+                along * along
+            };
+            count += 1.0;
         }
         sum / f32::max(count, 1.0)
     }
 
-    /// The target points that the cluster lies on once moved: one for each point that has one.
-    pub(super) fn matched(&self, motion: &Motion) -> Vec<Point> {
-        let target = |&row: &u32| {
+    /// Where the cluster was and is not after a motion: its places that none of it comes within
+    /// `clear_m` metres of.
+    pub(super) fn vacated(&self, motion: &Motion, clear_m: f32) -> Vec<Point> {
+        let places = self.rows.iter();
+        let places = places.map(|&row| self.scene.source.points[row as usize]);
+        places
+            .filter(|&place| self.is_clear(motion.undo(place), clear_m))
+            .collect()
+    }
+
+    /// Where it is after a motion and was not: the target points that it lies on then that none of it
+    /// was within `clear_m` metres of.
+    pub(super) fn occupied(&self, motion: &Motion, clear_m: f32) -> Vec<Point> {
+        let places = self.matches(motion);
+        let places = places.map(|target| self.scene.target[target as usize]);
+        places
+            .filter(|&place| self.is_clear(place, clear_m))
+            .collect()
+    }
+
+    /// Whether no point of the cluster, standing, lies within `clear_m` metres of a place.
+    fn is_clear(&self, place: Point, clear_m: f32) -> bool {
+        let nearest = self.scene.origin_of(place, self.cluster);
+        nearest.is_none_or(|row| {
+            let point = self.scene.source.points[row as usize];
+            square_distance(place, point) > clear_m * clear_m
+        })
+    }
+
+    /// The target points that the cluster lies on once moved, one for each of its points that has one.
+    fn matches(&self, motion: &Motion) -> impl Iterator<Item = u32> {
+        self.rows.iter().filter_map(|&row| {
             let moved = motion.apply(self.scene.source.points[row as usize]);
-            let target = self.scene.match_of(moved, self.cluster)?;
-            Some(self.scene.target[target as usize])
-        };
-        self.rows.iter().filter_map(target).collect()
+            self.scene.match_of(moved, self.cluster)
+        })
     }
 
     /// How far a source point, moved, lies from the target, metres, truncated.

@@ -236,3 +236,46 @@ fn normal(near: &Near, point: Point, options: &LabelOptions) -> Point {
     let flat = neighborhood.flat();
     flat.map_or([0.0; 3], |flat| flat.normal)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::near::square_distance;
+    use super::*;
+
+    #[test]
+    fn every_bit_of_a_word_is_named_once_in_order() {
+        assert_eq!(ones(0).count(), 0);
+        assert_eq!(ones(1 | 1 << 5 | 1 << 63).collect::<Vec<_>>(), [0, 5, 63]);
+        assert!(ones(u64::MAX).eq(0..64));
+    }
+
+    #[test]
+    fn what_a_cluster_touches_is_what_a_search_of_all_finds() {
+        let options = LabelOptions::default();
+        // Three words of target points, the last one not full.
+        let target: Vec<Point> = (0..150_u8)
+            .map(|i| [f32::from(i) * 0.2, 1.0, 0.0])
+            .collect();
+        let source = [[7.0, 1.2, 0.0], [19.0, 1.0, 0.1], [29.7, 0.8, 0.0]];
+        let thinned = Thinned::new(&source, &[0; 3], &options);
+        let scene = Scene::new(&thinned, &target, &options);
+        let motion = Motion::still([0.0; 2]).shifted([0.5, 0.0]);
+        let near = |point: &Point| {
+            source.iter().any(|&place| {
+                let away = square_distance(
+                    lowered(motion.apply(place), &options),
+                    lowered(*point, &options),
+                );
+                away < options.match_m * options.match_m
+            })
+        };
+        let expected: Vec<Point> = target.iter().copied().filter(near).collect();
+        let touched = scene.touched(&[0, 1, 2], 0, &motion);
+        let touched: Vec<Point> = touched
+            .iter()
+            .map(|&row| scene.target[row as usize])
+            .collect();
+        assert!(touched.len() > 9);
+        assert_eq!(touched, expected);
+    }
+}

@@ -19,31 +19,30 @@ const ELEVATIONS: usize = 180;
 /// A ray has passed a place where it ends this much farther out, metres, and metres more for each
 /// metre of range.
 const PASSED_M: [f32; 2] = [0.2, 0.01];
-/// Share of the places that there must be rays to.
+/// Rays that end nearer than this, metres, hit what carries the sensor, or nothing.
+const NEAREST_M: f32 = 0.5;
+/// Fewer places with rays to them say nothing, nor do they where there are none to this share.
+const PLACES: f32 = 5.0;
 const SEEN: f32 = 0.5;
 
-/// What both sweeps of a pair saw through, at places in the target's frame.
+/// What both sweeps of a pair saw through, at places in the target's frame. Where the origin of a
+/// sweep's frame is not about where its rays began, as in a map's frame, no ray is seen to pass.
 pub(super) struct Sights {
     source: Rays,
     target: Rays,
     source_from_target: RigidTransform,
 }
 
-/// Shares of the places of a cluster that were seen through; none where there are hardly any rays to
-/// them.
+/// What was seen through of the places that a cluster leaves and of those that it comes to: shares;
+/// none where there are hardly any such places, or rays to them.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct SeenThrough {
-    /// Where it was, in the target: it has left.
+    /// Of what it leaves, in the target.
     pub(super) left: Option<f32>,
-    /// Where it is if it moved, in the source: it has come.
+    /// Of what it comes to, in the source.
     pub(super) came: Option<f32>,
-}
-
-impl SeenThrough {
-    /// Both shares together; none where one is not known.
-    pub(super) fn both(self) -> Option<f32> {
-        self.left.zip(self.came).map(|(left, came)| left + came)
-    }
+    /// Whether it goes so far that rays would tell.
+    pub(super) far: bool,
 }
 
 impl Sights {
@@ -60,25 +59,14 @@ impl Sights {
         }
     }
 
-    /// What was seen through of the places where a cluster `was`, and of those where it `is` after a
-    /// motion.
-    pub(super) fn of(&self, was: &[Point], is: &[Point]) -> SeenThrough {
+    /// What was seen through of the places that a cluster leaves and of those that it comes to.
+    pub(super) fn of(&self, vacated: &[Point], occupied: &[Point], far: bool) -> SeenThrough {
         let before = |&place: &Point| self.source.passed(moved(&self.source_from_target, place));
         SeenThrough {
-            left: share(was.iter().map(|&place| self.passed(place))),
-            came: share(is.iter().map(before)),
+            left: share(vacated.iter().map(|&place| self.target.passed(place))),
+            came: share(occupied.iter().map(before)),
+            far,
         }
-    }
-
-    /// Whether the target saw through a place; none where it did not look there.
-    pub(super) fn passed(&self, place: Point) -> Option<bool> {
-        self.target.passed(place)
-    }
-
-    /// Whether a motion of this length, metres, leads from rays that end at a place to rays that have
-    /// passed it.
-    pub(super) fn tells(length_m: f32, place: Point) -> bool {
-        length_m >= 2.0 * passed_m(direction(place).1)
     }
 }
 
@@ -94,7 +82,9 @@ impl Rays {
         let mut shortest_m = vec![f32::INFINITY; AZIMUTHS * ELEVATIONS];
         for &point in points {
             let (angle, range_m) = direction(point);
-            shortest_m[angle] = range_m.min(shortest_m[angle]);
+            if range_m >= NEAREST_M {
+                shortest_m[angle] = range_m.min(shortest_m[angle]);
+            }
         }
         Self { shortest_m }
     }
@@ -103,14 +93,13 @@ impl Rays {
     fn passed(&self, place: Point) -> Option<bool> {
         let (angle, range_m) = direction(place);
         let end_m = self.shortest_m[angle];
-        end_m
-            .is_finite()
-            .then(|| end_m > range_m + passed_m(range_m))
+        let is_known = end_m.is_finite() && range_m.is_finite();
+        is_known.then(|| end_m > range_m + passed_m(range_m))
     }
 }
 
-/// How much farther than a place a ray ends that passed it, metres.
-fn passed_m(range_m: f32) -> f32 {
+/// How much farther than a place at this range, metres, a ray ends that passed it, metres.
+pub(super) fn passed_m(range_m: f32) -> f32 {
     let [base, slope] = PASSED_M;
     base + slope * range_m
 }
@@ -132,7 +121,7 @@ fn share(places: impl Iterator<Item = Option<bool>>) -> Option<f32> {
         known += f32::from(place.is_some());
         passed += f32::from(place == Some(true));
     }
-    (known > 0.0 && known >= SEEN * all).then(|| passed / known)
+    (known >= PLACES && known >= SEEN * all).then(|| passed / known)
 }
 
 #[cfg(test)]
@@ -158,36 +147,41 @@ mod tests {
     fn a_pole_has_left_where_the_wall_behind_is_seen_and_come_where_it_was() {
         let sweeps = [sweep(0.0), sweep(1.0)];
         let sights = Sights::new([&sweeps[0], &sweeps[1]], &RigidTransform::identity());
-        let pole = |y| (0..5_i8).map(|i| [10.0, y, f32::from(i) * 0.1]).collect();
-        let [was, is]: [Vec<Point>; 2] = [pole(0.0), pole(1.0)];
-        let seen = sights.of(&was, &is);
+        let at = |x, y| (0..6_i8).map(|i| [x, y, f32::from(i) * 0.1]).collect();
+        let [was, is]: [Vec<Point>; 2] = [at(10.0, 0.0), at(10.0, 1.0)];
+        let seen = sights.of(&was, &is, true);
         assert_eq!((seen.left, seen.came), (Some(1.0), Some(1.0)));
         // What stands is not seen through, nor what the pole hides.
-        let hidden: Vec<Point> = (0..5_i8).map(|i| [20.0, 2.0, f32::from(i) * 0.1]).collect();
-        let seen = sights.of(&is, &was);
+        let seen = sights.of(&is, &was, true);
         assert_eq!((seen.left, seen.came), (Some(0.0), Some(0.0)));
-        assert_eq!(sights.of(&hidden, &[]).left, Some(0.0));
-        assert_eq!(sights.of(&hidden, &[]).came, None);
-        // Nobody looked up, and what is not a number is nowhere.
-        assert_eq!(sights.of(&[[f32::NAN; 3]], &is).left, None);
-        assert_eq!(sights.of(&[[1.0, 0.0, 8.0]], &is).left, None);
+        let hidden: Vec<Point> = at(20.0, 2.0);
+        assert_eq!(sights.of(&hidden, &[], true).left, Some(0.0));
     }
 
     #[test]
-    fn every_direction_has_its_solid_angle() {
-        let ends = [-1.0_f32, -0.0, 0.0, 1.0];
-        let mut angles = Vec::new();
-        for x in ends {
-            for y in ends {
-                for z in ends {
-                    angles.push(direction([x, y, z]).0);
-                }
-            }
-        }
-        assert!(angles.iter().all(|&angle| angle < AZIMUTHS * ELEVATIONS));
-        // A little to the left and up of straight ahead, and above.
+    fn where_nobody_looked_or_few_places_are_nothing_is_known() {
+        let sweep = [sweep(0.0), vec![[0.0; 3], [f32::NAN; 3], [0.1, 0.0, 0.0]]].concat();
+        // Straight down behind, where what is not a number would lie.
+        let below = [vec![[-0.01, -1e-9, -2.0]], sweep.clone()].concat();
+        let sights = Sights::new([&below, &below], &RigidTransform::identity());
+        let seen = |place: Point, count| sights.of(&vec![place; count], &[], true);
+        assert_eq!(seen([10.0, 5.0, 0.0], 6).left, Some(1.0));
+        assert_eq!(seen([10.0, 5.0, 0.0], 4).left, None);
+        assert_eq!(seen([1.0, 0.0, 8.0], 6).left, None);
+        assert_eq!(seen([f32::NAN; 3], 6).left, None);
+        assert_eq!(seen([f32::INFINITY, 0.0, 0.0], 6).left, None);
+        assert_eq!(seen([10.0, 5.0, 0.0], 6).came, None);
+        // What ends at the sensor hides nothing.
+        assert_eq!(seen([5.0, 0.0, 0.0], 6).left, Some(1.0));
+    }
+
+    #[test]
+    fn neighboring_directions_share_an_angle_or_lie_side_by_side() {
+        // A little to the left and up of straight ahead, behind on both sides of the seam, above.
         let (ahead, above) = (direction([2.0, 0.01, 0.01]), direction([0.0, 0.0, 2.0]));
         assert_eq!(ahead.0, AZIMUTHS / 2 * ELEVATIONS + ELEVATIONS / 2);
         assert_eq!(above.0 % ELEVATIONS, ELEVATIONS - 1);
+        let [left, right] = [0.01, -0.01].map(|y| direction([-2.0, y, 0.01]).0 / ELEVATIONS);
+        assert_eq!((left, right), (AZIMUTHS - 1, 0));
     }
 }

@@ -106,11 +106,15 @@ fn a_flat_side_moves_that_uncovers_what_is_behind_it() {
     const TOLERANCE_M: f32 = 0.15;
     let mut random = Random::new(2);
     let mut sweep = |part| [wall(&mut random, part), wall_behind(&mut random, part)].concat();
-    let [source, target] = [sweep([2.0, 4.0]), sweep([2.6, 4.6])];
-    let residual = found(&source, &target).motions.residual_at(&source);
-    for (residual, point) in residual.iter().zip(&source) {
-        let moves = if point[1] < 10.0 { 0.6 } else { 0.0 };
-        assert!((residual[0] - moves).abs() < TOLERANCE_M, "{residual:?}");
+    // A cyclist, and a van.
+    for ([from, to], way) in [([2.0, 4.0], 0.6), ([2.0, 6.0], 1.0)] {
+        let [source, target] = [sweep([from, to]), sweep([from + way, to + way])];
+        let residual = found(&source, &target).motions.residual_at(&source);
+        for (residual, point) in residual.iter().zip(&source) {
+            let moves = if point[1] < 10.0 { way as f32 } else { 0.0 };
+            let off_m = (residual[0] - moves).hypot(residual[1]);
+            assert!(off_m < TOLERANCE_M, "{residual:?}, {way}");
+        }
     }
 }
 
