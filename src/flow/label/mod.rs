@@ -2,8 +2,8 @@
 //!
 //! ```text
 //! source, ego motion out - cluster ─┐                 ┌ vote - starts
-//! target ───────────────── scene ───┴─ each cluster: ─┤ rigid - the motion of least cost
-//! both sweeps, whole ───── sight ──────────────────── └ gate - needed, or none
+//! target ───────────────── scene ───┼─ each cluster: ─┤ rigid - the motion of least cost
+//! both sweeps, whole ───── sight ───┘                 └ gate - needed, or none
 //!                          spread: pieces beside a mover, points that are not of it - Motions
 //! ```
 //!
