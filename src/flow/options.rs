@@ -295,7 +295,8 @@ pub struct LabelOptions {
     /// Share that the other sweep saw through, of the places that a cluster leaves and of those that it
     /// comes to each, from which it moves though its surfaces do not hold it.
     pub gone: f32,
-    /// Sum of these shares below which it does not move, whatever else speaks for it.
+    /// Sum of these shares below which it does not move far, nor at all where only the sweeps around speak
+    /// for it.
     pub stayed: f32,
     /// A piece beside a mover goes with it where this share of its cost is left.
     pub beside_cost: f32,

@@ -15,6 +15,13 @@ pub(crate) fn moved(motion: &RigidTransform, point: Point) -> Point {
     [moved.x as f32, moved.y as f32, moved.z as f32]
 }
 
+/// Squared distance, square metres.
+#[inline]
+pub(crate) fn square_distance(a: Point, b: Point) -> f32 {
+    let [x, y, z] = [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+    x * x + y * y + z * z
+}
+
 /// At most `most` of the points, evenly.
 pub(crate) fn evenly(points: &[Point], most: usize) -> Vec<Point> {
     let kept = points.len().min(most);

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use super::thin::REACH;
 use crate::flow::flat::{Flat, Neighborhood};
-use crate::flow::points::{Point, evenly};
+use crate::flow::points::{Point, evenly, square_distance};
 
 /// Points whose surfels one thread makes at a time.
 const POINTS_AT_ONCE: usize = 256;
@@ -140,11 +140,6 @@ impl Surfels {
 fn column(point: Point, cell_m: f32) -> u64 {
     let [x, y] = [point[0], point[1]].map(|c| ((c / cell_m).floor() + REACH + 1.0) as u64);
     x << 32 | y
-}
-
-fn square_distance(a: Point, b: Point) -> f32 {
-    let [x, y, z] = [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
-    x * x + y * y + z * z
 }
 
 #[cfg(test)]

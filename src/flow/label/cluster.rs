@@ -6,9 +6,8 @@
 
 use rayon::prelude::*;
 
-use super::near::square_distance;
 use super::scene::one_a_voxel;
-use crate::flow::Point;
+use crate::flow::points::{Point, square_distance};
 
 /// More cores of a cell than this are thinned, to one a voxel of a share of the radius.
 const FULL: usize = 64;

@@ -5,9 +5,9 @@
 
 use std::ops::Range;
 
-use crate::flow::Point;
+use crate::flow::points::{Point, square_distance};
 
-/// Columns along an axis on each side of the origin; what is farther is found nowhere.
+/// Columns along an axis on each side of the origin; what is farther shares the outermost.
 const REACH: f32 = (1 << 30) as f32;
 
 /// A cloud by place.
@@ -231,13 +231,6 @@ fn key([x, y]: [i32; 2]) -> u64 {
 /// Fibonacci hashing: the high bits are mixed best.
 fn hash(key: u64) -> u64 {
     key.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 29
-}
-
-/// Squared distance, square metres.
-#[inline]
-pub(super) fn square_distance(a: Point, b: Point) -> f32 {
-    let [x, y, z] = [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
-    x * x + y * y + z * z
 }
 
 #[cfg(test)]

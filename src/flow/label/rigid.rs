@@ -8,10 +8,9 @@
 
 use super::moment::Moment;
 use super::motion::Motion;
-use super::near::square_distance;
 use super::scene::{Scene, evenly};
 use super::vote::Ballot;
-use crate::flow::Point;
+use crate::flow::points::{Point, square_distance};
 
 /// Points of a cluster that vote, that a start is fitted with, and that costs are taken of.
 const VOTERS: usize = 64;

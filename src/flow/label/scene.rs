@@ -239,8 +239,8 @@ fn normal(near: &Near, point: Point, options: &LabelOptions) -> Point {
 
 #[cfg(test)]
 mod tests {
-    use super::super::near::square_distance;
     use super::*;
+    use crate::flow::points::square_distance;
 
     #[test]
     fn every_bit_of_a_word_is_named_once_in_order() {
