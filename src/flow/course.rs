@@ -55,7 +55,6 @@ impl Course {
     }
 
     /// Points of the largest batch.
-    #[cfg(feature = "gpu")]
     pub(crate) fn largest_batch(&self) -> usize {
         self.points.len().div_ceil(self.parts())
     }

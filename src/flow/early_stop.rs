@@ -16,7 +16,7 @@ pub(crate) struct EarlyStop {
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Seen {
     /// The lowest loss that counted as progress, metres.
-    pub(crate) best: Option<f64>,
+    pub(crate) best: Option<f32>,
     /// Iterations since.
     pub(crate) without_progress: usize,
 }
@@ -38,12 +38,12 @@ impl EarlyStop {
     }
 
     /// Takes the next loss, metres; true where the optimization should end.
-    pub(crate) fn observe(&mut self, loss: f64) -> bool {
+    pub(crate) fn observe(&mut self, loss: f32) -> bool {
         if loss.is_nan() {
             return true;
         }
         match self.seen.best {
-            Some(best) if loss >= best - self.options.min_delta_m => {
+            Some(best) if loss >= best - self.options.min_delta_m as f32 => {
                 self.seen.without_progress += 1;
             }
             _ => {
@@ -61,7 +61,7 @@ impl EarlyStop {
 mod tests {
     use super::*;
 
-    fn stops_at(patience: usize, losses: &[f64]) -> Option<usize> {
+    fn stops_at(patience: usize, losses: &[f32]) -> Option<usize> {
         let mut rule = EarlyStop::new(EarlyStopOptions {
             patience,
             min_delta_m: 1e-3,
@@ -81,6 +81,6 @@ mod tests {
 
     #[test]
     fn a_loss_that_is_not_a_number_ends_it() {
-        assert_eq!(stops_at(5, &[1.0, f64::NAN]), Some(1));
+        assert_eq!(stops_at(5, &[1.0, f32::NAN]), Some(1));
     }
 }

@@ -1,8 +1,8 @@
 //! An optimization put down, to be taken up again with the same bits: its state, as bytes.
 //!
 //! ```text
-//! identity u64 | iterations u64 | best iteration u64 | best loss f64
-//!   | stopping rule: has best u8, best f64, without progress u64
+//! identity u64 | iterations u64 | best iteration u64 | best loss f32
+//!   | stopping rule: has best u8, best f32, without progress u64
 //!   | parameters, means, squares, kept: f32 each
 //! ```
 //!
@@ -18,8 +18,8 @@ use super::sealed::{Hash, PARAMETERS_BYTES, Seal, SealError, put_parameters};
 
 const SEAL: Seal = Seal {
     magic: *b"FNSFSNAP",
-    version: 2,
-    body: Some(8 + 8 + 8 + 8 + 1 + 8 + 8 + ARRAYS * PARAMETERS_BYTES),
+    version: 3,
+    body: Some(8 + 8 + 8 + 4 + 1 + 4 + 8 + ARRAYS * PARAMETERS_BYTES),
 };
 /// Parameters, two moments, the kept parameters.
 const ARRAYS: usize = 4;
@@ -36,7 +36,7 @@ pub struct TrainerState {
     pub(crate) seen: Seen,
     pub(crate) iterations: usize,
     pub(crate) best_iteration: usize,
-    pub(crate) best_loss: f64,
+    pub(crate) best_loss: f32,
 }
 
 impl TrainerState {
@@ -49,13 +49,14 @@ impl TrainerState {
             seen: Seen::default(),
             iterations: 0,
             best_iteration: 0,
-            best_loss: f64::INFINITY,
+            best_loss: f32::INFINITY,
         }
     }
 }
 
-/// An optimization between two iterations. Resumed with the same problem, options and kind of
-/// device it ends with the bits of one that was never put down, whatever the number of threads.
+/// An optimization between two iterations. Resumed with the same problem and options it ends with the
+/// bits of one that was never put down, whatever the number of threads, and on any device that
+/// rounds as the first one does.
 #[derive(Clone)]
 pub struct Snapshot {
     identity: u64,
@@ -125,9 +126,9 @@ impl Snapshot {
         let identity = body.number()?;
         let iterations = body.count()?;
         let best_iteration = body.count()?;
-        let best_loss = body.float()?;
+        let best_loss = f32::from_le_bytes(body.take()?);
         let [has_best] = body.take()?;
-        let best = body.float()?;
+        let best = f32::from_le_bytes(body.take()?);
         let seen = Seen {
             best: (has_best != 0).then_some(best),
             without_progress: body.count()?,

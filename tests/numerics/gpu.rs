@@ -8,9 +8,7 @@ use super::gpu_rule;
 use super::scenes::{real_pair, scored, solve_on};
 
 #[test]
-fn a_card_gives_the_cpus_error_on_argoverse_2_and_twice_the_same_bits() {
-    // Beyond what rounding makes of the CPU's own instruction sets for this seed, metres.
-    const DIFFERENCE_M: f64 = 0.002;
+fn a_card_gives_the_cpus_flow_on_argoverse_2_bit_by_bit() {
     let Some(pair) = real_pair("av2_7fab") else {
         return;
     };
@@ -22,17 +20,17 @@ fn a_card_gives_the_cpus_error_on_argoverse_2_and_twice_the_same_bits() {
     let mut options = Preset::Neural.options(Some(8192));
     options.range_m = Some(51.2);
     let card = solve_on(&gpu, &pair, &options);
-    let ours = scored(&pair, &card).epe;
+    // Some cards round a product before they add to it, as the portable kernels do, others do not,
+    // as the others do.
     let cpus = Isa::available().into_iter().map(|isa| {
         let cpu = CpuBackend::with_isa(isa, Some(2)).expect("threads");
-        scored(&pair, &solve_on(&cpu, &pair, &options)).epe
+        solve_on(&cpu, &pair, &options)
     });
-    let cpus: Vec<f64> = cpus.collect();
-    let least = cpus.iter().copied().fold(f64::INFINITY, f64::min);
-    let most = cpus.iter().copied().fold(0.0, f64::max);
-    let near = least - DIFFERENCE_M..most + DIFFERENCE_M;
-    assert!(near.contains(&ours), "{ours} {cpus:?}");
-    // The bits are asked for on fewer points: a software card takes its time.
+    let cpus: Vec<_> = cpus.collect();
+    let errors: Vec<_> = cpus.iter().map(|cpu| scored(&pair, cpu).epe).collect();
+    let same = cpus.iter().any(|cpu| cpu.flow == card.flow);
+    assert!(same, "{} {errors:?}", scored(&pair, &card).epe);
+    // Twice the same bits, on fewer points: a software card takes its time.
     let mut fewer = Preset::Neural.options(Some(1024));
     fewer.max_iterations = 40;
     let [first, second] = [(), ()].map(|()| solve_on(&gpu, &pair, &fewer).flow);

@@ -27,8 +27,6 @@ pub(super) unsafe trait Lanes: Copy {
     unsafe fn relu(self) -> Self;
     /// `self` where `gate > 0`, else zero.
     unsafe fn where_positive(self, gate: Self) -> Self;
-    /// The sum of all lanes, in a fixed order.
-    unsafe fn sum(self) -> f32;
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -85,11 +83,6 @@ mod x86 {
                 Self(_mm512_maskz_mov_ps(mask, self.0))
             }
         }
-        #[inline(always)]
-        unsafe fn sum(self) -> f32 {
-            // SAFETY: the caller has avx512f.
-            unsafe { _mm512_reduce_add_ps(self.0) }
-        }
     }
 
     /// An AVX register, with FMA.
@@ -138,13 +131,6 @@ mod x86 {
                 Self(_mm256_and_ps(mask, self.0))
             }
         }
-        #[inline(always)]
-        unsafe fn sum(self) -> f32 {
-            let mut lanes = [0.0; 8];
-            // SAFETY: the caller has avx2; `lanes` holds 8 floats.
-            unsafe { self.store(lanes.as_mut_ptr()) };
-            lanes.iter().sum()
-        }
     }
 }
 
@@ -189,9 +175,5 @@ unsafe impl Lanes for F32x4 {
         Self(core::array::from_fn(|i| {
             if gate.0[i] > 0.0 { self.0[i] } else { 0.0 }
         }))
-    }
-    #[inline(always)]
-    unsafe fn sum(self) -> f32 {
-        (self.0[0] + self.0[1]) + (self.0[2] + self.0[3])
     }
 }

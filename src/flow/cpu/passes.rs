@@ -1,7 +1,8 @@
 //! The network's two passes over one tile, written once over [`Lanes`].
 //!
 //! Register tiles of `ROWS` points by `VECTORS` registers; every operand is read in the order in
-//! which it lies in memory. Knows nothing of instruction sets, distances, losses or threads.
+//! which it lies in memory. Every sum is taken in the order in which the shaders of `flow/gpu` take
+//! it. Knows nothing of instruction sets, distances, losses or threads.
 #![expect(
     unsafe_code,
     reason = "register-tiled loops over raw rows, compiled per instruction set"
@@ -16,6 +17,10 @@ use super::tile::{ROW_STEP, STRIDE, TILE, Tile};
 use crate::flow::field::mlp::{
     MIDDLE_LAYERS, PANEL, Parameters, WIDTH, first_layer, last_layer, middle_layer,
 };
+use crate::flow::sums::halved;
+
+/// Sums of the last layer that are taken side by side, whatever the width of a register.
+const SIDE_BY_SIDE: usize = 16;
 
 /// A matrix in memory: where it starts and the floats from a row, and from a step of the summed
 /// index, to the next.
@@ -83,6 +88,7 @@ pub(super) unsafe fn forward<L: Lanes, const ROWS: usize, const VECTORS: usize>(
 ) {
     const {
         assert!(ROW_STEP.is_multiple_of(ROWS) && PANEL.is_multiple_of(VECTORS * L::COUNT));
+        assert!(SIDE_BY_SIDE.is_multiple_of(L::COUNT));
     }
     let rows = tile.padded_rows();
     let weights = parameters.as_slice().as_ptr();
@@ -131,13 +137,17 @@ pub(super) unsafe fn forward<L: Lanes, const ROWS: usize, const VECTORS: usize>(
         let from = activations.add(MIDDLE_LAYERS * TILE * STRIDE);
         for row in 0..tile.rows {
             for output in 0..3 {
-                let mut acc = L::splat(0.0);
-                for column in (0..WIDTH).step_by(L::COUNT) {
-                    let h = L::load(from.add(row * STRIDE + column));
-                    let w = L::load(weights.add(at.weights + output * WIDTH + column));
-                    acc = h.mul_add(w, acc);
+                let mut sums = [0.0; SIDE_BY_SIDE];
+                for first in (0..SIDE_BY_SIDE).step_by(L::COUNT) {
+                    let mut acc = L::splat(0.0);
+                    for column in (first..WIDTH).step_by(SIDE_BY_SIDE) {
+                        let h = L::load(from.add(row * STRIDE + column));
+                        let w = L::load(weights.add(at.weights + output * WIDTH + column));
+                        acc = h.mul_add(w, acc);
+                    }
+                    acc.store(sums.as_mut_ptr().add(first));
                 }
-                tile.outputs[row][output] = acc.sum() + *weights.add(at.bias + output);
+                tile.outputs[row][output] = halved(sums) + *weights.add(at.bias + output);
             }
         }
     }

@@ -1,8 +1,7 @@
 //! One optimization on the CPU: forward, query, backward over tiles on all threads, then Adam.
 //! Knows neither deadlines nor files: a watch says when to come back.
 //!
-//! An iteration's points are cut into chunks by their number alone; each chunk sums its own
-//! gradients and chunks are added in order, so the bits do not depend on the threads.
+//! Sums are taken as `sums.rs` says, so that the bits do not depend on the threads.
 
 use core::ops::Range;
 
@@ -18,16 +17,26 @@ use crate::flow::field::mlp::{Parameters, transpose_middle_layers};
 use crate::flow::options::Options;
 use crate::flow::points::Point;
 use crate::flow::snapshot::TrainerState;
+use crate::flow::sums::{self, Chunks};
 use crate::flow::watch::{Progress, Watch};
 
 /// Floats that one thread reduces and steps at a time.
 const SLICE: usize = 4096;
 
+/// Chunks that are held at once: what is added of them is held in the first.
+const HELD: usize = 32;
+
 /// What one chunk adds up over its tiles.
 struct Chunk {
     gradients: Parameters,
-    loss: f64,
     query_seconds: f64,
+}
+
+/// A chunk that is to be computed: its points, and where their losses go.
+struct Due<'a> {
+    chunk: &'a mut Chunk,
+    points: &'a [Point],
+    losses: &'a mut [f32],
 }
 
 /// The network, its optimizer and the distance that it is fitted to.
@@ -39,6 +48,8 @@ pub(super) struct CpuTrainer<'a> {
     transposed: Parameters,
     early_stop: Option<EarlyStop>,
     chunks: Vec<Chunk>,
+    /// Of an iteration's points.
+    losses: Vec<f32>,
     working_sets: WorkingSets,
     query_seconds: f64,
 }
@@ -55,6 +66,7 @@ impl<'a> CpuTrainer<'a> {
             transposed,
             early_stop: options.early_stop.map(EarlyStop::new),
             chunks: Vec::new(),
+            losses: Vec::new(),
             working_sets: WorkingSets::new(&device.threads),
             query_seconds: 0.0,
         }
@@ -62,21 +74,10 @@ impl<'a> CpuTrainer<'a> {
 
     /// One iteration: gradients, keep, step. Returns the loss and whether the stopping rule fired;
     /// nothing where the loss is not finite.
-    fn iterate(&mut self, watch: &dyn Watch) -> Option<(f64, bool)> {
+    fn iterate(&mut self, watch: &dyn Watch) -> Option<(f32, bool)> {
         let batch = self.course.batch(self.state.iterations);
-        let tiles = batch.len().div_ceil(TILE);
-        let chunks = chunk_count(tiles);
-        self.chunks
-            .resize_with(chunks.max(self.chunks.len()), || Chunk {
-                gradients: Parameters::zeros(),
-                loss: 0.0,
-                query_seconds: 0.0,
-            });
-        self.accumulate(batch.clone(), chunks, watch);
-        let done = &self.chunks[..chunks];
-        let loss = done.iter().map(|c| c.loss).sum::<f64>() / batch.len() as f64;
-        let threads = self.device.threads.current_num_threads().min(chunks) as f64;
-        self.query_seconds += done.iter().map(|c| c.query_seconds).sum::<f64>() / threads;
+        let held = self.accumulate(batch, watch);
+        let loss = sums::mean(&self.losses);
         if !loss.is_finite() {
             return None;
         }
@@ -85,52 +86,111 @@ impl<'a> CpuTrainer<'a> {
             .as_mut()
             .is_some_and(|rule| rule.observe(loss));
         self.keep(loss, stop);
-        self.step(chunks);
+        self.step(held);
         self.state.iterations += 1;
         Some((loss, stop))
     }
 
-    /// Forward, query, backward over `batch`, into the first `count` chunks.
-    fn accumulate(&mut self, batch: Range<usize>, count: usize, watch: &dyn Watch) {
-        let points = &self.course.points[batch];
-        let tiles = points.len().div_ceil(TILE);
+    /// Forward, query, backward over `batch`. Returns how many chunks hold its gradients.
+    fn accumulate(&mut self, batch: Range<usize>, watch: &dyn Watch) -> usize {
+        let cut = Chunks::new(self.course.largest_batch());
+        self.losses.resize(batch.len(), 0.0);
+        let mut next = 0;
+        let mut held = 0;
+        while next < cut.count {
+            if held == HELD {
+                self.add_to_the_first();
+                held = 1;
+            }
+            let now = (HELD - held).min(cut.count - next);
+            self.compute(&batch, &cut, next..next + now, held, watch);
+            next += now;
+            held += now;
+        }
+        held
+    }
+
+    /// Forward, query, backward over some chunks of `batch`, to be held from `first` on.
+    fn compute(
+        &mut self,
+        batch: &Range<usize>,
+        cut: &Chunks,
+        some: Range<usize>,
+        first: usize,
+        watch: &dyn Watch,
+    ) {
+        let threads = self.device.threads.current_num_threads().min(some.len()) as f64;
+        let held = first + some.len();
+        let empty = || Chunk {
+            gradients: Parameters::zeros(),
+            query_seconds: 0.0,
+        };
+        self.chunks.resize_with(held.max(self.chunks.len()), empty);
+        let points = &self.course.points[batch.clone()];
+        let within =
+            |range: Range<usize>| range.start.min(points.len())..range.end.min(points.len());
+        let mut due = Vec::with_capacity(some.len());
+        let mut losses = &mut self.losses[within(cut.points(some.start)).start..];
+        for (number, chunk) in some.zip(&mut self.chunks[first..held]) {
+            let own = within(cut.points(number));
+            let (losses_here, rest) = core::mem::take(&mut losses).split_at_mut(own.len());
+            losses = rest;
+            due.push(Due {
+                chunk,
+                points: &points[own],
+                losses: losses_here,
+            });
+        }
         let weight = 1.0 / points.len() as f32;
         let (device, loss) = (self.device, &self.course.options.loss);
         let (parameters, transposed) = (&self.state.parameters, &self.transposed);
         let (conditioning, working_sets) = (&self.course.conditioning, &self.working_sets);
-        let chunks = &mut self.chunks[..count];
-        let run = |(index, chunk): (usize, &mut Chunk)| {
+        let run = |due: Due<'_>| {
             let mut tile = working_sets.own();
-            chunk.gradients.as_mut_slice().fill(0.0);
-            chunk.loss = 0.0;
-            chunk.query_seconds = 0.0;
-            let first = index * tiles / count * TILE;
-            let last = ((index + 1) * tiles / count * TILE).min(points.len());
-            for points in points[first..last].chunks(TILE) {
+            let Chunk {
+                gradients,
+                query_seconds,
+            } = due.chunk;
+            gradients.as_mut_slice().fill(0.0);
+            *query_seconds = 0.0;
+            for (points, losses) in due.points.chunks(TILE).zip(due.losses.chunks_mut(TILE)) {
                 tile.load(points.iter().map(|&point| conditioning.apply(point)));
                 device.kernels.forward(parameters, &mut tile);
                 let began = watch.seconds();
-                for (row, point) in points.iter().enumerate() {
+                for (row, (point, seen)) in points.iter().zip(losses).enumerate() {
                     let flow = tile.outputs[row];
                     let deformed = core::array::from_fn(|a| point[a] + flow[a]);
                     let loss = loss.at(*point, device.distance.sample(deformed), flow);
-                    chunk.loss += f64::from(loss.value);
+                    *seen = loss.value;
                     tile.output_gradients[row] = loss.gradient.map(|g| g * weight);
                 }
-                chunk.query_seconds += watch.seconds() - began;
-                device
-                    .kernels
-                    .backward(parameters, transposed, &mut tile, &mut chunk.gradients);
+                *query_seconds += watch.seconds() - began;
+                let kernels = &device.kernels;
+                kernels.backward(parameters, transposed, &mut tile, gradients);
             }
         };
-        device
-            .threads
-            .install(|| chunks.par_iter_mut().enumerate().for_each(run));
+        device.threads.install(|| due.into_par_iter().for_each(run));
+        let chunks = &self.chunks[first..held];
+        let query: f64 = chunks.iter().map(|chunk| chunk.query_seconds).sum();
+        self.query_seconds += query / threads;
+    }
+
+    /// Adds the gradients of all that are held to those of the first, in order.
+    fn add_to_the_first(&mut self) {
+        let [first, others @ ..] = self.chunks.as_mut_slice() else {
+            return;
+        };
+        let slices = first.gradients.as_mut_slice().par_chunks_mut(SLICE);
+        self.device.threads.install(|| {
+            slices.enumerate().for_each(|(slice, sums)| {
+                add_slices(sums, others, slice);
+            });
+        });
     }
 
     /// Takes the current parameters into the result. As in the published code, the iteration at
     /// which the stopping rule fires is not a candidate.
-    fn keep(&mut self, loss: f64, stop: bool) {
+    fn keep(&mut self, loss: f32, stop: bool) {
         let state = &mut self.state;
         let fresh = self.course.fresh(state.iterations);
         let iteration = state.iterations + 1;
@@ -145,23 +205,27 @@ impl<'a> CpuTrainer<'a> {
             Some(fresh) => {
                 let kept = state.kept.as_mut_slice().iter_mut();
                 for (kept, parameter) in kept.zip(state.parameters.as_slice()) {
-                    *kept += fresh * (parameter - *kept);
+                    *kept = if fresh < 1.0 {
+                        *kept + fresh * (parameter - *kept)
+                    } else {
+                        *parameter
+                    };
                 }
                 let before = if iteration == 1 {
                     loss
                 } else {
                     state.best_loss
                 };
-                state.best_loss = before + f64::from(fresh) * (loss - before);
+                state.best_loss = before + fresh * (loss - before);
                 state.best_iteration = iteration;
             }
         }
     }
 
     /// Adds the chunks' gradients in order and steps the parameters.
-    fn step(&mut self, chunks: usize) {
+    fn step(&mut self, held: usize) {
         let adam = self.course.adam(self.state.iterations);
-        let chunks = &self.chunks[..chunks];
+        let chunks = &self.chunks[..held];
         let [means, squares] = &mut self.state.moments;
         let parameters = self.state.parameters.as_mut_slice().par_chunks_mut(SLICE);
         let means = means.as_mut_slice().par_chunks_mut(SLICE);
@@ -169,28 +233,23 @@ impl<'a> CpuTrainer<'a> {
         let slices = parameters.zip(means).zip(squares).enumerate();
         self.device.threads.install(|| {
             slices.for_each(|(slice, ((parameters, means), squares))| {
-                let mut sum = [0.0f32; SLICE];
-                let sum = &mut sum[..parameters.len()];
-                for chunk in chunks {
-                    let gradients = &chunk.gradients.as_slice()[slice * SLICE..];
-                    for (sum, gradient) in sum.iter_mut().zip(gradients) {
-                        *sum += gradient;
-                    }
-                }
-                adam.apply(sum, parameters, [means, squares]);
+                let mut sums = [0.0f32; SLICE];
+                let sums = &mut sums[..parameters.len()];
+                add_slices(sums, chunks, slice);
+                adam.apply(sums, parameters, [means, squares]);
             });
         });
         transpose_middle_layers(&self.state.parameters, &mut self.transposed);
     }
 }
 
-/// Chunks that `tiles` tiles are cut into: enough for many cores, few enough that adding their
-/// gradients stays small beside computing them.
-fn chunk_count(tiles: usize) -> usize {
-    if tiles < 88 {
-        (tiles / 4).clamp(1, 8)
-    } else {
-        (tiles / 11).min(32)
+/// Adds one slice of each chunk's gradients to `sums`, in order.
+fn add_slices(sums: &mut [f32], chunks: &[Chunk], slice: usize) {
+    for chunk in chunks {
+        let gradients = &chunk.gradients.as_slice()[slice * SLICE..];
+        for (sum, gradient) in sums.iter_mut().zip(gradients) {
+            *sum += gradient;
+        }
     }
 }
 
@@ -212,7 +271,7 @@ impl Trainer for CpuTrainer<'_> {
             watch.progress(Progress {
                 iteration: self.state.iterations,
                 max_iterations: self.course.options.max_iterations,
-                loss,
+                loss: loss.into(),
             });
             if stop {
                 return Ok(Advance::Converged);
@@ -235,7 +294,7 @@ impl Trainer for CpuTrainer<'_> {
         Report {
             iterations: self.state.iterations,
             best_iteration: self.state.best_iteration,
-            best_loss: self.state.best_loss,
+            best_loss: self.state.best_loss.into(),
             query_seconds: self.query_seconds,
         }
     }

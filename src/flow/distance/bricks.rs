@@ -9,7 +9,7 @@ use super::activate::{ABSENT, Index, VOLUME, within};
 use super::build::{self, BEYOND};
 use super::cell_sites::{CellGather, CellSites};
 use super::far::FarField;
-use super::grid::{Grid, trilinear};
+use super::grid::{Grid, Lattice, trilinear};
 use super::layout::Layout;
 use super::options::{DistanceError, DistanceOptions, Sites};
 use super::point_sites::{PointGather, PointSites};
@@ -20,7 +20,7 @@ use crate::flow::watch::{Unwatched, Watch};
 #[derive(Debug)]
 pub struct Bricks {
     grid: Grid,
-    inverse_cell: f32,
+    lattice: Lattice,
     /// Metres of one code.
     scale: f32,
     index: Index,
@@ -73,7 +73,7 @@ impl Bricks {
             }
         };
         Ok(Self {
-            inverse_cell: (1.0 / grid.cell) as f32,
+            lattice: Lattice::new(&grid),
             scale: (options.cell_m / build::codes_per_cell(band)) as f32,
             grid,
             index,
@@ -85,14 +85,16 @@ impl Bricks {
     /// Trilinear distance and gradient at `point`, see [`Sample`].
     #[inline]
     pub fn sample(&self, point: Point) -> Sample {
-        let cell = self.grid.locate(point);
+        let cell = self.lattice.locate(point);
         let (distance, slope) = match self.corners(cell.corner) {
             Some(corners) => trilinear(corners, cell.fraction),
             None => self.far.sample(cell.corner, cell.fraction),
         };
         Sample {
             distance,
-            gradient: core::array::from_fn(|a| slope[a] * self.inverse_cell * cell.inside[a]),
+            gradient: core::array::from_fn(|a| {
+                slope[a] * self.lattice.inverse_cell * cell.inside[a]
+            }),
         }
     }
 

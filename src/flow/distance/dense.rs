@@ -8,7 +8,7 @@
 use core::f32::consts::SQRT_2;
 
 use super::Sample;
-use super::grid::{Grid, trilinear};
+use super::grid::{Grid, Lattice, trilinear};
 use super::options::{DistanceError, DistanceOptions};
 use crate::flow::Point;
 use crate::flow::watch::{self, Interrupt, Unwatched, Watch};
@@ -20,6 +20,7 @@ const SQRT_3: f32 = 1.732_050_8;
 #[derive(Debug)]
 pub struct DenseChamfer {
     grid: Grid,
+    lattice: Lattice,
     distances: Vec<f32>,
 }
 
@@ -61,7 +62,11 @@ impl DenseChamfer {
         for distance in &mut distances {
             *distance *= grid.cell as f32;
         }
-        Ok(Self { grid, distances })
+        Ok(Self {
+            lattice: Lattice::new(&grid),
+            grid,
+            distances,
+        })
     }
 
     /// The grid of the transform, refused where it would not fit.
@@ -88,14 +93,14 @@ impl DenseChamfer {
     /// Trilinear distance and gradient at `point`, see [`Sample`].
     #[inline]
     pub fn sample(&self, point: Point) -> Sample {
-        let cell = self.grid.locate(point);
+        let cell = self.lattice.locate(point);
         let corners = core::array::from_fn(|i| {
             let i = i as u32;
             let [x, y, z] = cell.corner;
             self.at([x + (i >> 2), y + (i >> 1 & 1), z + (i & 1)])
         });
         let (distance, slope) = trilinear(corners, cell.fraction);
-        let inverse = (1.0 / self.grid.cell) as f32;
+        let inverse = self.lattice.inverse_cell;
         let gradient = core::array::from_fn(|a| slope[a] * inverse * cell.inside[a]);
         Sample { distance, gradient }
     }

@@ -80,6 +80,29 @@ impl Grid {
                 .clamp(0.0, (self.vertices[axis] - 1) as f64) as u32
         })
     }
+}
+
+/// A grid as it is sampled, in single precision on every device.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Lattice {
+    /// The first vertex, metres, as a sum of two floats an axis.
+    pub(crate) origin_high: Point,
+    pub(crate) origin_low: Point,
+    pub(crate) inverse_cell: f32,
+    /// Vertices along each axis.
+    pub(crate) vertices: [u32; 3],
+}
+
+impl Lattice {
+    pub(crate) fn new(grid: &Grid) -> Self {
+        let high = grid.origin.map(|x| x as f32);
+        Self {
+            origin_high: high,
+            origin_low: core::array::from_fn(|a| (grid.origin[a] - f64::from(high[a])) as f32),
+            inverse_cell: (1.0 / grid.cell) as f32,
+            vertices: grid.vertices.map(|n| n as u32),
+        }
+    }
 
     /// Where `point` lies between the vertices; outside points are moved to the border.
     #[inline]
@@ -89,14 +112,18 @@ impl Grid {
             fraction: [0.0; 3],
             inside: [1.0; 3],
         };
-        for (axis, at) in self.in_cells(point).into_iter().enumerate() {
-            let clipped = at.clamp(0.0, (self.vertices[axis] - 1) as f64);
+        let in_cells = |axis: usize| {
+            let from_origin = (point[axis] - self.origin_high[axis]) - self.origin_low[axis];
+            from_origin * self.inverse_cell
+        };
+        for (axis, at) in [0, 1, 2].map(in_cells).into_iter().enumerate() {
+            let clipped = at.clamp(0.0, (self.vertices[axis] - 1) as f32);
             if clipped != at {
                 cell.inside[axis] = 0.0;
             }
-            let corner = (clipped as u32).min(self.vertices[axis] as u32 - 2);
+            let corner = (clipped as u32).min(self.vertices[axis] - 2);
             cell.corner[axis] = corner;
-            cell.fraction[axis] = (clipped - f64::from(corner)) as f32;
+            cell.fraction[axis] = clipped - corner as f32;
         }
         cell
     }

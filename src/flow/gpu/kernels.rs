@@ -12,13 +12,19 @@ macro_rules! source {
 /// Each kernel's entry point and source.
 pub(super) const SOURCES: [(&str, &str); 10] = [
     ("bricks", source!("bricks")),
-    ("sample_points", source!("common", "distance", "sample")),
+    (
+        "sample_points",
+        source!("common", "arithmetic", "distance", "sample"),
+    ),
     ("forward", source!("common", "forward")),
-    ("query", source!("common", "distance", "query")),
+    (
+        "query",
+        source!("common", "arithmetic", "distance", "query"),
+    ),
     ("backward", source!("common", "backward")),
     ("gradients", source!("common", "gradients")),
-    ("judge", source!("common", "judge")),
-    ("step", source!("common", "step")),
+    ("judge", source!("common", "arithmetic", "judge")),
+    ("step", source!("common", "arithmetic", "step")),
     ("transpose", source!("common", "transpose")),
     ("multiply_adds", source!("multiply_adds")),
 ];

@@ -171,6 +171,7 @@ impl<'a> Phases<'a> {
                     first_chunk: wave.first_chunk as u32,
                     tiles: wave.tiles as u32,
                     rows: self.rows,
+                    nothing: 0,
                 };
                 pass.set_immediates(0, bytemuck::bytes_of(&part));
             }

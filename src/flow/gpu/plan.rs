@@ -1,37 +1,37 @@
 //! How a submission's points are cut up: tiles for the network, chunks for the gradients, waves
-//! for the memory. By a batch's size alone, so that a pair's bits depend neither on the memory nor
+//! for the memory; chunks as `sums.rs` says. By a batch's size alone, so that a pair's bits depend neither on the memory nor
 //! on which pairs share the submission. Knows no card.
 
 use super::memory::LEAST_ROWS;
 use super::records::{Chunk, TILE, Tile};
+use crate::flow::sums::{Chunks, MOST_POINTS, STRETCH};
 
-/// Tiles of a chunk of a small batch, and the most chunks of a batch of usual size.
-const CHUNK_TILES: usize = 8;
-const USUAL_CHUNKS: usize = 64;
-/// The most tiles of a chunk: it must fit into the least memory.
-const MOST_CHUNK_TILES: usize = LEAST_ROWS as usize / TILE;
+/// A chunk is a whole number of tiles, and fits into the least memory.
+const _: () = assert!(STRETCH.is_multiple_of(TILE) && MOST_POINTS <= LEAST_ROWS as usize);
 
 /// Tiles and chunks of a batch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Cut {
     pub(super) tiles: usize,
     pub(super) chunks: usize,
+    of_points: Chunks,
 }
 
 impl Cut {
     /// Cuts a batch of at most `points` points.
     pub(super) fn new(points: usize) -> Self {
-        let tiles = points.div_ceil(TILE).max(1);
-        let usual = (tiles / CHUNK_TILES).clamp(1, USUAL_CHUNKS);
+        let of_points = Chunks::new(points);
         Self {
-            tiles,
-            chunks: usual.max(tiles.div_ceil(MOST_CHUNK_TILES)),
+            tiles: points.div_ceil(TILE).max(1),
+            chunks: of_points.count,
+            of_points,
         }
     }
 
-    /// First tile of a chunk, and of the one after the last.
-    fn first_tile(&self, chunk: usize) -> usize {
-        chunk * self.tiles / self.chunks
+    /// The tiles of a chunk.
+    fn tiles_of(&self, chunk: usize) -> core::ops::Range<usize> {
+        let points = self.of_points.points(chunk);
+        points.start / TILE..(points.end / TILE).min(self.tiles)
     }
 }
 
@@ -59,7 +59,7 @@ impl Plan {
         let mut wave = Wave::default();
         for (lane, cut) in (0..).zip(cuts) {
             for chunk in 0..cut.chunks {
-                let tiles = cut.first_tile(chunk)..cut.first_tile(chunk + 1);
+                let tiles = cut.tiles_of(chunk);
                 if (wave.tiles + tiles.len()) * TILE > rows && wave.tiles > 0 {
                     plan.waves.push(wave);
                     wave = Wave {

@@ -58,6 +58,7 @@ pub(super) struct Lane {
 pub(super) struct Step {
     pub(super) first: u32,
     pub(super) count: u32,
+    pub(super) weight: f32,
     pub(super) step_size: f32,
     pub(super) square_correction: f32,
     pub(super) fresh: f32,
@@ -110,6 +111,8 @@ pub(super) struct Part {
     pub(super) first_chunk: u32,
     pub(super) tiles: u32,
     pub(super) rows: u32,
+    /// Zero, which no compiler of a kernel knows.
+    pub(super) nothing: u32,
 }
 
 /// How a transform's bricks are filled: `Plan` of `shaders/bricks.wgsl`.

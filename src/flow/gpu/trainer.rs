@@ -144,6 +144,7 @@ impl<'a> GpuTrainer<'a> {
         records::Step {
             first: batch.start as u32,
             count: batch.len() as u32,
+            weight: 1.0 / batch.len() as f32,
             step_size: adam.step_size,
             square_correction: adam.square_correction,
             fresh: self.course.fresh(done).unwrap_or(1.0),
@@ -238,7 +239,7 @@ impl Trainer for GpuTrainer<'_> {
         Report {
             iterations: self.iterations(),
             best_iteration: self.status.best_iteration as usize,
-            best_loss: widened(self.status.best_loss),
+            best_loss: widened(self.status.best_loss).into(),
             query_seconds: self.query_seconds,
         }
     }
@@ -266,7 +267,7 @@ impl Trainer for GpuTrainer<'_> {
             moments: [array(MEANS), array(SQUARES)],
             kept: array(KEPT),
             seen: Seen {
-                best: (status.seen == 1).then_some(status.seen_best.into()),
+                best: (status.seen == 1).then_some(status.seen_best),
                 without_progress: status.without_progress as usize,
             },
             iterations: status.iterations as usize,
@@ -287,9 +288,9 @@ impl Trainer for GpuTrainer<'_> {
         self.status = Status {
             iterations: state.iterations as u32,
             best_iteration: state.best_iteration as u32,
-            best_loss: (state.best_loss as f32).min(f32::MAX),
+            best_loss: state.best_loss.min(f32::MAX),
             seen: state.seen.best.is_some().into(),
-            seen_best: state.seen.best.unwrap_or_default() as f32,
+            seen_best: state.seen.best.unwrap_or_default(),
             without_progress: state.seen.without_progress as u32,
             ..Status::default()
         };
@@ -302,10 +303,10 @@ impl Trainer for GpuTrainer<'_> {
 }
 
 /// The card's largest number stands for infinity.
-fn widened(loss: f32) -> f64 {
+fn widened(loss: f32) -> f32 {
     if loss == f32::MAX {
-        f64::INFINITY
+        f32::INFINITY
     } else {
-        loss.into()
+        loss
     }
 }

@@ -7,7 +7,9 @@ use super::device::{Card, spread};
 use super::records;
 use super::trainer::GpuTrainer;
 use crate::flow::backend::{BackendError, Trainer, Transform};
-use crate::flow::distance::device::{ABSENT, CellSites, FarField, Index, Layout, codes_per_cell};
+use crate::flow::distance::device::{
+    ABSENT, CellSites, FarField, Index, Lattice, Layout, codes_per_cell,
+};
 use crate::flow::distance::{DistanceError, DistanceOptions, Metric, Sample, Sites};
 use crate::flow::options::Options;
 use crate::flow::points::Point;
@@ -109,13 +111,13 @@ pub(super) fn build(
     write(places[3], bytemuck::cast_slice(&far.distances));
     fill_bricks(card, &index, &sites, band, places[2] as u32)?;
 
-    let high = grid.origin.map(|x| x as f32);
+    let lattice = Lattice::new(&grid);
     let record = records::Transform {
-        origin_high: high,
-        origin_low: core::array::from_fn(|a| (grid.origin[a] - f64::from(high[a])) as f32),
-        inverse_cell: (1.0 / grid.cell) as f32,
+        origin_high: lattice.origin_high,
+        origin_low: lattice.origin_low,
+        inverse_cell: lattice.inverse_cell,
         code_scale: (grid.cell / codes_per_cell(band)) as f32,
-        vertices: grid.vertices.map(|n| n as u32),
+        vertices: lattice.vertices,
         blocks: index.blocks.map(|n| n as u32),
         tables: places[0] as u32,
         bricks: places[1] as u32,
@@ -212,6 +214,7 @@ impl GpuTransform {
                 let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
                 pass.set_pipeline(pipeline);
                 pass.set_bind_group(0, &group, &[]);
+                pass.set_immediates(0, bytemuck::bytes_of(&records::Part::default()));
                 let [x, y] = spread(points.len().div_ceil(SAMPLE_GROUP) as u32);
                 pass.dispatch_workgroups(x, y, 1);
             }

@@ -76,6 +76,7 @@ pub fn kernel_times(
         steps: vec![Step {
             first: 0,
             count: source.len() as u32,
+            weight: 1.0 / source.len() as f32,
             step_size: 0.0,
             square_correction: adam.square_correction,
             fresh: 1.0,

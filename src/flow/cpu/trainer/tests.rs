@@ -7,6 +7,7 @@ use crate::flow::distance::{DistanceOptions, DistanceTransform};
 use crate::flow::options::Preset;
 use crate::flow::random::Random;
 use crate::flow::reference::first_losses;
+use crate::flow::sums::MOST_POINTS;
 use crate::flow::watch::Unwatched;
 use std::sync::Mutex;
 
@@ -103,6 +104,57 @@ fn the_number_of_threads_does_not_change_a_bit() {
             [1, 2, 5].map(|threads| fitted(Isa::available()[0], threads, &options, 12));
         assert_eq!(one, two, "{preset:?}");
         assert_eq!(one, five, "{preset:?}");
+    }
+}
+
+#[test]
+fn registers_of_any_width_give_the_same_bits_where_they_fuse() {
+    let fusing = Isa::available().into_iter();
+    let fusing: Vec<Isa> = fusing.filter(|&isa| isa != Isa::Portable).collect();
+    for preset in Preset::FITTED {
+        let options = preset.options(None);
+        let all: Vec<_> = fusing
+            .iter()
+            .map(|&isa| fitted(isa, 2, &options, 30))
+            .collect();
+        assert!(all.iter().all(|one| *one == all[0]), "{preset:?}");
+    }
+}
+
+#[test]
+fn more_chunks_than_are_held_at_once_are_each_added_up_once() {
+    // Of the largest: single precision over 8,000 points, one after the other.
+    const TOLERANCE: f64 = 1e-4;
+    let points = 33 * MOST_POINTS;
+    let chunks = Chunks::new(points).count;
+    assert!(chunks > HELD);
+    let [source, target] = clouds(points);
+    let mut options = Preset::Paper.options(None);
+    options.early_stop = None;
+    let transform = transform(Isa::available()[0], 2, &source, &target, &options);
+    let mut trainer = transform.start(&source, &options).expect("a trainer");
+    trainer
+        .advance(1, &Unwatched)
+        .expect("the cpu does not fail");
+    // After one step from nothing the mean of the gradients is a tenth of the gradient: the sum of
+    // the chunks', each of which a trainer of its points alone finds but for the batch's weight.
+    let whole = trainer.state().expect("the cpu does not fail").moments[0].clone();
+    let mut sums = vec![0.0f64; whole.as_slice().len()];
+    for chunk in 0..chunks {
+        let own = Chunks::new(points).points(chunk);
+        let own = &source[own.start..own.end.min(points)];
+        let mut part = transform.start(own, &options).expect("a trainer");
+        part.advance(1, &Unwatched).expect("the cpu does not fail");
+        let state = part.state().expect("the cpu does not fail");
+        let share = own.len() as f64 / points as f64;
+        for (sum, mean) in sums.iter_mut().zip(state.moments[0].as_slice()) {
+            *sum += f64::from(*mean) * share;
+        }
+    }
+    let scale = sums.iter().fold(0.0f64, |most, sum| most.max(sum.abs()));
+    for (mean, expected) in whole.as_slice().iter().zip(&sums) {
+        let off = (f64::from(*mean) - expected).abs() / scale;
+        assert!(off < TOLERANCE, "{off}");
     }
 }
 

@@ -77,6 +77,8 @@ struct Step {
     // The batch's points among the lane's.
     first: u32,
     count: u32,
+    // One by the count.
+    weight: f32,
     // Adam's factors.
     step_size: f32,
     square_correction: f32,
@@ -134,6 +136,8 @@ struct Part {
     tiles: u32,
     // Rows of a layer's activations.
     rows: u32,
+    // Zero, which no compiler knows.
+    nothing: u32,
 }
 
 // Steps that a submission may have.

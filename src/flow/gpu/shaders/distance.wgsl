@@ -15,14 +15,16 @@ struct Sample {
 fn trilinear(corners: array<f32, 8>, fraction: vec3<f32>) -> vec4<f32> {
     let low = vec4(corners[0], corners[2], corners[4], corners[6]);
     let slope_z = vec4(corners[1], corners[3], corners[5], corners[7]) - low;
-    let along_z = low + slope_z * fraction.z;
+    let along_z = low + rounded4(slope_z * fraction.z);
     let slope_y = along_z.yw - along_z.xz;
-    let along_y = along_z.xz + slope_y * fraction.y;
+    let along_y = along_z.xz + rounded2(slope_y * fraction.y);
     let dx = along_y.y - along_y.x;
-    let dy = mix(slope_y.x, slope_y.y, fraction.x);
-    let along_yz = mix(slope_z.xz, slope_z.yw, fraction.yy);
-    let dz = mix(along_yz.x, along_yz.y, fraction.x);
-    return vec4(dx, dy, dz, along_y.x + dx * fraction.x);
+    let along_yz = slope_z.xz + rounded2((slope_z.yw - slope_z.xz) * fraction.y);
+    // Of y, z and the value itself, along x.
+    let begin = vec3(slope_y.x, along_yz.x, along_y.x);
+    let slope = vec3(slope_y.y - slope_y.x, along_yz.y - along_yz.x, dx);
+    let along_x = begin + rounded3(slope * fraction.x);
+    return vec4(dx, along_x);
 }
 
 // Metres at a place in the coarse far field, and the derivative by fine cells.
@@ -62,7 +64,7 @@ fn sample(transform: ptr<function, Transform>, point: vec3<f32>) -> Sample {
     let high = vec3((*transform).origin_high[0], (*transform).origin_high[1], (*transform).origin_high[2]);
     let low = vec3((*transform).origin_low[0], (*transform).origin_low[1], (*transform).origin_low[2]);
     let count = vec3((*transform).vertices[0], (*transform).vertices[1], (*transform).vertices[2]);
-    let at = ((point - high) - low) * (*transform).inverse_cell;
+    let at = rounded3(((point - high) - low) * (*transform).inverse_cell);
     let clipped = clamp(at, vec3(0.0), vec3<f32>(count - 1u));
     let inside = select(vec3(0.0), vec3((*transform).inverse_cell), clipped == at);
     let corner = min(vec3<u32>(clipped), count - 2u);
@@ -80,7 +82,7 @@ fn sample(transform: ptr<function, Transform>, point: vec3<f32>) -> Sample {
     } else {
         var corners: array<f32, 8>;
         for (var i = 0u; i < 8u; i++) {
-            corners[i] = f32(codes[i]) * (*transform).code_scale;
+            corners[i] = rounded(f32(codes[i]) * (*transform).code_scale);
             if codes[i] == BEYOND {
                 let vertex = corner + vec3(i >> 2u, (i >> 1u) & 1u, i & 1u);
                 corners[i] = far_sample(transform, vertex, vec3(0.0)).w;
@@ -88,5 +90,5 @@ fn sample(transform: ptr<function, Transform>, point: vec3<f32>) -> Sample {
         }
         value = trilinear(corners, fraction);
     }
-    return Sample(value.w, value.xyz * inside);
+    return Sample(value.w, rounded3(value.xyz * inside));
 }

@@ -21,9 +21,14 @@ var<immediate> part: Part;
 
 var<workgroup> inputs: array<vec4<f32>, 2048>;
 
+// Where a quad of a point's features lies: points side by side in different banks.
+fn place(point: u32, column: u32) -> u32 {
+    return point * QUADS + (column ^ (point % 8u));
+}
+
 // Keeps a quad of a point's features for the next layer, and for the backward pass.
 fn remember(layer: u32, row: u32, point: u32, column: u32, features: vec4<f32>) {
-    inputs[point * QUADS + column] = features;
+    inputs[place(point, column)] = features;
     if !EVALUATES {
         activations[(layer * part.rows + row + point) * QUADS + column] = features;
     }
@@ -91,7 +96,7 @@ fn forward(
         for (var k = 0u; k < QUADS; k++) {
             var h: array<vec4<f32>, 8>;
             for (var i = 0u; i < 8u; i++) {
-                h[i] = inputs[(first + i) * QUADS + k];
+                h[i] = inputs[place(first + i, k)];
             }
             for (var j = 0u; j < 4u; j++) {
                 let w_low = networks[at_low + (k * 4u + j) * 8u];
@@ -110,21 +115,33 @@ fn forward(
     }
     workgroupBarrier();
 
+    // Sixteen sums side by side, four quads of them: two invocations a point, the first of which
+    // takes the first quad and the third, as they are added up.
+    let point = local / 2u;
+    var sums: array<vec4<f32>, 3>;
+    for (var output = 0u; output < 3u; output++) {
+        let at = network + LAST + output * QUADS;
+        var lower = vec4(0.0);
+        var upper = vec4(0.0);
+        for (var k = local % 2u; k < QUADS; k += 4u) {
+            lower = fma(inputs[place(point, k)], networks[at + k], lower);
+            upper = fma(inputs[place(point, k + 2u)], networks[at + k + 2u], upper);
+        }
+        sums[output] = lower + upper;
+    }
+    workgroupBarrier();
+    for (var output = 0u; output < 3u; output++) {
+        inputs[local * 3u + output] = sums[output];
+    }
+    workgroupBarrier();
     if local < TILE {
         let bias = networks[network + LAST_BIAS];
-        var x = vec4(0.0);
-        var y = vec4(0.0);
-        var z = vec4(0.0);
-        for (var i = 0u; i < QUADS; i++) {
-            // Each invocation begins elsewhere, so that no two read the same bank of memory.
-            let k = (i + local) % QUADS;
-            let h = inputs[local * QUADS + k];
-            let at = network + LAST + k;
-            x = fma(h, networks[at], x);
-            y = fma(h, networks[at + QUADS], y);
-            z = fma(h, networks[at + 2u * QUADS], z);
+        var flow = vec4(0.0);
+        for (var output = 0u; output < 3u; output++) {
+            let four = inputs[local * 6u + output] + inputs[local * 6u + 3u + output];
+            let two = four.xy + four.zw;
+            flow[output] = (two.x + two.y) + bias[output];
         }
-        let one = vec4(1.0);
-        flows[row + local] = vec4(bias.x + dot(x, one), bias.y + dot(y, one), bias.z + dot(z, one), 0.0);
+        flows[row + local] = flow;
     }
 }

@@ -2,7 +2,8 @@
 //
 // In: activations, deltas, pulls, points. Out: one network's worth of partial gradients a chunk.
 // A workgroup does one layer (y: seven middle ones, then the first, then the last) of one chunk
-// (x); chunks are added up, in order, by step.wgsl: no atomics, the same bits every time.
+// (x), rows one after the other; chunks are added up, in order, by step.wgsl: no atomics, and the
+// bits of the CPU, which takes its sums in the same order.
 // Mirrors ReferenceNetwork::backward.
 
 // Whether the matrix units do the middle layers, and these are the first (y: 0) and the last.
@@ -19,9 +20,8 @@ var<immediate> part: Part;
 @group(0) @binding(7) var<storage, read> pulls: array<vec4<f32>>;
 @group(0) @binding(8) var<storage, read_write> partials: array<vec4<f32>>;
 
-// Rows that are added up side by side where a layer has one quad an invocation.
-const GROUPS = 8u;
-var<workgroup> groups: array<vec4<f32>, 256>;
+// Rows that are read at a time where an invocation has one sum.
+const ROWS = 8u;
 
 @compute @workgroup_size(256)
 fn gradients(
@@ -50,6 +50,8 @@ fn middle_layer(layer: u32, chunk: Chunk, place: u32, local: u32) {
     var low_high: array<vec4<f32>, 4>;
     var high_low: array<vec4<f32>, 4>;
     var high_high: array<vec4<f32>, 4>;
+    var bias_low = vec4(0.0);
+    var bias_high = vec4(0.0);
     for (var row = 0u; row < chunk.rows; row++) {
         let h_low = activations[above + row * QUADS + input];
         let h_high = activations[above + row * QUADS + input + 16u];
@@ -60,6 +62,10 @@ fn middle_layer(layer: u32, chunk: Chunk, place: u32, local: u32) {
             low_high[i] = fma(vec4(h_low[i]), d_high, low_high[i]);
             high_low[i] = fma(vec4(h_high[i]), d_low, high_low[i]);
             high_high[i] = fma(vec4(h_high[i]), d_high, high_high[i]);
+        }
+        if input == 0u {
+            bias_low += d_low;
+            bias_high += d_high;
         }
     }
     let weights = place + MIDDLE + layer * MIDDLE_STRIDE;
@@ -73,71 +79,65 @@ fn middle_layer(layer: u32, chunk: Chunk, place: u32, local: u32) {
         partials[low + k_high] = high_low[i];
         partials[high + k_high] = high_high[i];
     }
-    var bias = vec4(0.0);
-    for (var row = local / QUADS; row < chunk.rows; row += GROUPS) {
-        bias += deltas[below + row * QUADS + local % QUADS];
-    }
-    store(weights + MIDDLE_BIAS, bias, local);
-}
-
-// Adds up what the groups have for each quad, in order, and keeps it from `at` on.
-fn store(at: u32, own: vec4<f32>, local: u32) {
-    workgroupBarrier();
-    groups[local] = own;
-    workgroupBarrier();
-    if local < QUADS {
-        var sum = groups[local];
-        for (var group = 1u; group < GROUPS; group++) {
-            sum += groups[group * QUADS + local];
-        }
-        partials[at + local] = sum;
+    if input == 0u {
+        partials[weights + MIDDLE_BIAS + output] = bias_low;
+        partials[weights + MIDDLE_BIAS + output + 16u] = bias_high;
     }
 }
 
+// A sum an invocation: of delta times x, y, z or one, for a quad of features.
 fn first_layer(chunk: Chunk, place: u32, local: u32) {
+    let which = local / QUADS;
+    let quad = local % QUADS;
+    if which > 3u { return; }
     let step = steps[chunk.lane * STEPS + part.step];
     let batch = lanes[chunk.lane].points + step.first * 3u;
     let scale = lanes[chunk.lane].scale;
-    let center = vec3(lanes[chunk.lane].center[0], lanes[chunk.lane].center[1], lanes[chunk.lane].center[2]);
-    var sums: array<vec4<f32>, 4>;
-    for (var row = local / QUADS; row < chunk.rows; row += GROUPS) {
-        let at = batch + min(chunk.first_point + row, step.count - 1u) * 3u;
-        let x = (vec3(points[at], points[at + 1u], points[at + 2u]) - center) * scale;
-        let delta = deltas[(chunk.first_row + row) * QUADS + local % QUADS];
-        sums[0] = fma(vec4(x.x), delta, sums[0]);
-        sums[1] = fma(vec4(x.y), delta, sums[1]);
-        sums[2] = fma(vec4(x.z), delta, sums[2]);
-        sums[3] += delta;
+    let axis = min(which, 2u);
+    let center = lanes[chunk.lane].center[axis];
+    var sum = vec4(0.0);
+    for (var row = 0u; row < chunk.rows; row += ROWS) {
+        var factors: array<f32, ROWS>;
+        var some: array<vec4<f32>, ROWS>;
+        for (var i = 0u; i < ROWS; i++) {
+            let point = min(chunk.first_point + row + i, step.count - 1u);
+            let x = (points[batch + point * 3u + axis] - center) * scale;
+            factors[i] = select(x, 1.0, which == 3u);
+            some[i] = deltas[(chunk.first_row + row + i) * QUADS + quad];
+        }
+        for (var i = 0u; i < ROWS; i++) {
+            sum = fma(vec4(factors[i]), some[i], sum);
+        }
     }
-    for (var i = 0u; i < 4u; i++) {
-        store(place + i * QUADS, sums[i], local);
-    }
+    partials[place + which * QUADS + quad] = sum;
 }
 
+// A sum an invocation: of a pull's x, y or z times a quad of features, or of the pulls themselves.
 fn last_layer(chunk: Chunk, place: u32, local: u32) {
-    var sums: array<vec4<f32>, 3>;
-    var bias = vec4(0.0);
-    for (var row = local / QUADS; row < chunk.rows; row += GROUPS) {
-        let pull = pulls[chunk.first_row + row];
-        let at = (MIDDLE_LAYERS * part.rows + chunk.first_row + row) * QUADS + local % QUADS;
-        let h = activations[at];
-        for (var i = 0u; i < 3u; i++) {
-            sums[i] = fma(vec4(pull[i]), h, sums[i]);
+    let which = local / QUADS;
+    let quad = local % QUADS;
+    if which > 3u { return; }
+    let above = (MIDDLE_LAYERS * part.rows + chunk.first_row) * QUADS + quad;
+    var sum = vec4(0.0);
+    for (var row = 0u; row < chunk.rows; row += ROWS) {
+        var some: array<vec4<f32>, ROWS>;
+        var features: array<vec4<f32>, ROWS>;
+        for (var i = 0u; i < ROWS; i++) {
+            some[i] = pulls[chunk.first_row + row + i];
+            features[i] = activations[above + (row + i) * QUADS];
         }
-        bias += vec4(pull.xyz, 0.0);
-    }
-    for (var i = 0u; i < 3u; i++) {
-        store(place + LAST + i * QUADS, sums[i], local);
-    }
-    // Every quad has the same bias: the first's is kept, in the network's last vec4.
-    workgroupBarrier();
-    groups[local] = bias;
-    workgroupBarrier();
-    if local == 0u {
-        var sum = groups[0];
-        for (var group = 1u; group < GROUPS; group++) {
-            sum += groups[group * QUADS];
+        for (var i = 0u; i < ROWS; i++) {
+            if which == 3u {
+                sum += vec4(some[i].xyz, 0.0);
+            } else {
+                sum = fma(vec4(some[i][which]), features[i], sum);
+            }
         }
+    }
+    if which < 3u {
+        partials[place + LAST + which * QUADS + quad] = sum;
+    } else if quad == 0u {
+        // The network's last vec4.
         partials[place + LAST_BIAS] = sum;
     }
 }

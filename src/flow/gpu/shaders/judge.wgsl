@@ -38,7 +38,7 @@ fn judge(
     status.improves = 0u;
     if iterates(status, lanes[lane].steps, part.step) {
         let place = lane * STEPS + part.step;
-        let loss = sums[0] / f32(steps[place].count);
+        let loss = rounded(sums[0] * steps[place].weight);
         losses[place] = loss;
         // No comparison with what is not a number or not finite holds.
         if loss < 3.4e38 {
@@ -68,7 +68,7 @@ fn observe(status: ptr<function, Status>, lane: u32, place: u32, loss: f32) {
     (*status).applies = 1u;
     if lanes[lane].average == 1u {
         let before = select((*status).best_loss, loss, (*status).iterations == 1u);
-        (*status).best_loss = before + steps[place].fresh * (loss - before);
+        (*status).best_loss = before + rounded(steps[place].fresh * (loss - before));
         (*status).best_iteration = (*status).iterations;
         (*status).improves = 1u;
     } else if loss <= (*status).best_loss && (*status).state == RUNNING {

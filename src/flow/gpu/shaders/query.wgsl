@@ -39,16 +39,18 @@ fn query(
         var transform = lanes[work.lane].transform;
         let seen = sample(&transform, point + flow);
         let truncation = lanes[work.lane].truncation;
-        let margin = max(lanes[work.lane].margin, lanes[work.lane].margin_slope * length(point));
+        let margin = max(lanes[work.lane].margin, lanes[work.lane].margin_slope * long(point));
         let penalty = lanes[work.lane].flow_penalty;
-        let long = length(flow);
+        let flow_m = long(flow);
         if seen.distance > margin && seen.distance < truncation {
             pull = seen.gradient;
         }
-        pull += penalty / max(long, SMALL_FLOW) * flow;
-        pull /= f32(step.count);
-        let penalized = select(long * long / (2.0 * SMALL_FLOW), long - SMALL_FLOW / 2.0, long > SMALL_FLOW);
-        loss = min(max(seen.distance, margin), truncation) + penalty * penalized;
+        let shrink = quotient(vec4(penalty), vec4(max(flow_m, SMALL_FLOW))).x;
+        pull = (pull + rounded3(shrink * flow)) * step.weight;
+        let square = vec4(rounded(flow_m * flow_m));
+        let short = quotient(square, vec4(2.0 * SMALL_FLOW)).x;
+        let penalized = select(short, flow_m - SMALL_FLOW / 2.0, flow_m > SMALL_FLOW);
+        loss = min(max(seen.distance, margin), truncation) + rounded(penalty * penalized);
     }
     pulls[row] = vec4(pull, 0.0);
     losses[local] = loss;

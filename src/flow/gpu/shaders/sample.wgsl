@@ -3,6 +3,7 @@
 // In: points, metres, three floats each. Out: a vec4 each, metres a metre and metres.
 // Mirrors Bricks::sample.
 
+var<immediate> part: Part;
 @group(0) @binding(1) var<storage, read> points: array<f32>;
 @group(0) @binding(2) var<storage, read> transforms: array<Transform>;
 @group(0) @binding(3) var<storage, read_write> samples: array<vec4<f32>>;

@@ -35,13 +35,15 @@ fn step(
     if status.improves == 1u {
         let kept = networks[at + KEPT * LAID_OUT];
         let fresh = select(1.0, now.fresh, lanes[lane].average == 1u);
-        networks[at + KEPT * LAID_OUT] = select(kept + fresh * (parameter - kept), parameter, vec4(fresh == 1.0));
+        networks[at + KEPT * LAID_OUT] = select(kept + rounded4(fresh * (parameter - kept)), parameter, vec4(fresh == 1.0));
     }
     let before = networks[at + MEANS * LAID_OUT];
     let before_square = networks[at + SQUARES * LAID_OUT];
-    let mean = before + (gradient - before) * FRESH_MEAN;
-    let square = before_square + (gradient * gradient - before_square) * FRESH_SQUARE;
-    let stepped = parameter - now.step_size * mean / (sqrt(square) * now.square_correction + EPSILON);
+    let mean = before + rounded4((gradient - before) * FRESH_MEAN);
+    let square = before_square
+        + rounded4((rounded4(gradient * gradient) - before_square) * FRESH_SQUARE);
+    let scale = rounded4(root(square) * now.square_correction) + EPSILON;
+    let stepped = parameter - quotient(rounded4(now.step_size * mean), scale);
     networks[at + MEANS * LAID_OUT] = mean;
     networks[at + SQUARES * LAID_OUT] = square;
     networks[at + PARAMETERS * LAID_OUT] = stepped;

@@ -17,8 +17,6 @@ use crate::flow::watch::Unwatched;
 const NETWORK_TOLERANCE: f64 = 2e-5;
 /// As above, and over the points; single-precision losses' signs may differ at kinks.
 const GRADIENT_TOLERANCE: f64 = 1e-4;
-/// Metres, and per metre: a coordinate in cells has 24 bits, a corner's distance 16.
-const SAMPLE_TOLERANCE_M: f32 = 2e-5;
 
 pub(super) fn transform(source: &[Point], target: &[Point]) -> Option<GpuTransform> {
     let card = shared()?.card();
@@ -74,7 +72,7 @@ fn bricks_have_the_bits_of_the_cpus() {
 }
 
 #[test]
-fn samples_are_those_of_the_cpu_near_far_and_outside() {
+fn samples_have_the_bits_of_the_cpus_near_far_and_outside() {
     let [source, target] = street();
     let Some(gpu) = transform(&source, &target) else {
         return;
@@ -87,18 +85,9 @@ fn samples_are_those_of_the_cpu_near_far_and_outside() {
     for count in [0, 1, 63, 64, 65, points.len()] {
         let samples = gpu.samples(&points[..count]).expect("an answer");
         assert_eq!(samples.len(), count);
-        let mut kinks = 0;
         for (&point, seen) in points.iter().zip(&samples) {
-            let expected = cpu.sample(point);
-            let off = (seen.distance - expected.distance).abs();
-            let tolerance = SAMPLE_TOLERANCE_M * expected.distance.max(1.0);
-            assert!(off < tolerance, "{point:?}: {seen:?} {expected:?}");
-            let slopes = seen.gradient.iter().zip(expected.gradient);
-            let turned = slopes.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-            // On the border of two cells the slope may be either's.
-            kinks += usize::from(turned > 1e-2);
+            assert_eq!(*seen, cpu.sample(point), "{point:?}");
         }
-        assert!(kinks <= count / 500, "{kinks} of {count} slopes differ");
     }
 }
 
