@@ -413,6 +413,12 @@ impl Attempt {
     }
 }
 
+/// Whether a job may be what kills devices. What was beside it when one died is done alone from then
+/// on, so that only the guilty one is there when it happens again.
+fn is_suspect(job: &Job) -> bool {
+    job.crashes > 0
+}
+
 fn failure(code: &str, error: &dyn std::error::Error, retryable: bool) -> JobError {
     JobError {
         code: code.to_owned(),

@@ -30,6 +30,8 @@ pub(crate) struct Switches {
     trials: Mutex<Vec<BackendError>>,
     /// Pairs with more points do not fit, unless it is zero.
     pub(crate) room: AtomicUsize,
+    /// Pairs with so many points take the card with them, unless it is zero.
+    pub(crate) deadly: AtomicUsize,
     /// Pairs stop before their next iterations while it is on.
     pub(crate) brake: AtomicBool,
     /// Pairs that stand at the brake.
@@ -167,7 +169,9 @@ impl Backend for CardLane {
                 available: room as u64,
             });
         }
+        let deadly = self.switches.deadly.load(Ordering::Relaxed);
         Ok(Box::new(CardTransform {
+            kills: !on_trial && deadly == source.len(),
             cpu: self.cpu.transform(source, target, options, watch)?,
             switches: (!on_trial).then(|| Arc::clone(&self.switches)),
             lost: Arc::clone(&self.lost),
@@ -180,6 +184,7 @@ impl Backend for CardLane {
 }
 
 struct CardTransform {
+    kills: bool,
     cpu: Box<dyn Transform>,
     switches: Option<Arc<Switches>>,
     lost: Arc<AtomicBool>,
@@ -200,6 +205,7 @@ impl Transform for CardTransform {
         options: &Options,
     ) -> Result<Box<dyn Trainer + '_>, BackendError> {
         Ok(Box::new(CardTrainer {
+            kills: self.kills,
             cpu: self.cpu.start(source, options)?,
             switches: self.switches.clone(),
             lost: Arc::clone(&self.lost),
@@ -208,6 +214,7 @@ impl Transform for CardTransform {
 }
 
 struct CardTrainer<'a> {
+    kills: bool,
     cpu: Box<dyn Trainer + 'a>,
     switches: Option<Arc<Switches>>,
     lost: Arc<AtomicBool>,
@@ -232,6 +239,9 @@ impl Trainer for CardTrainer<'_> {
     fn advance(&mut self, steps: usize, watch: &dyn Watch) -> Result<Advance, BackendError> {
         if let Some(switches) = &self.switches {
             self.brake(switches);
+        }
+        if self.kills {
+            self.lost.store(true, Ordering::Relaxed);
         }
         if self.lost.load(Ordering::Relaxed) {
             return Err(BackendError::Lost("it was destroyed".to_owned()));

@@ -128,6 +128,8 @@ pub struct Job {
     pub durable: bool,
     /// How often it was started; the fence token of the latest start.
     pub attempt: u32,
+    /// How often what it ran on died under it, process or device, since its latest snapshot.
+    pub crashes: u32,
     /// Predicted compute seconds.
     pub cost_seconds: f64,
     /// The options, as JSON.

@@ -120,6 +120,7 @@ impl Worker {
             sweeps,
             fields,
             watch,
+            alone: super::is_suspect(job),
         };
         Ok((work, asked))
     }

@@ -95,6 +95,7 @@ impl Worker {
             target: target.points,
             snapshot,
             watch: Arc::new(watch),
+            alone: super::is_suspect(job),
         };
         Ok((work, self.keep_snapshots(lease, kept), options))
     }

@@ -35,10 +35,10 @@ struct Stand {
 }
 
 async fn stand() -> Stand {
-    stand_with(None).await
+    stand_with(1, None).await
 }
 
-async fn stand_with(roomier: Option<DeviceKind>) -> Stand {
+async fn stand_with(lanes: usize, roomier: Option<DeviceKind>) -> Stand {
     let folder = tempfile::tempdir().expect("a folder");
     let options = QueueOptions {
         retry_delay: Duration::from_millis(20),
@@ -50,7 +50,7 @@ async fn stand_with(roomier: Option<DeviceKind>) -> Stand {
     let blobs = Blobs::open(&folder.path().join("blobs")).expect("a store");
     let switches = Arc::new(Switches::default());
     let metrics = Arc::new(Metrics::new(&["fragile"]));
-    let device = Device::start(switches.card("fragile", 1), &metrics).expect("a thread");
+    let device = Device::start(switches.card("fragile", lanes), &metrics).expect("a thread");
     let mut health = device.health();
     let ready = health.wait_for(|health| *health == Health::Ready);
     timeout(PATIENCE, ready)
@@ -94,8 +94,17 @@ impl Stand {
 
     /// A pair of a chain.
     async fn submit_after(&self, frames: usize, after: Option<JobId>) -> Arc<Job> {
+        self.submit_clouds(clouds().into_iter().take(frames), after)
+            .await
+    }
+
+    async fn submit_clouds(
+        &self,
+        clouds: impl Iterator<Item = Vec<Point>>,
+        after: Option<JobId>,
+    ) -> Arc<Job> {
         let id = JobId::fresh();
-        for (place, points) in (0..).zip(clouds().into_iter().take(frames)) {
+        for (place, points) in (0..).zip(clouds) {
             let cloud = StoredCloud {
                 points,
                 ground: None,
@@ -268,7 +277,7 @@ async fn a_lost_device_returns_the_job_to_the_queue_and_does_it_again() {
 async fn a_pair_that_does_not_fit_moves_where_there_is_another_kind_and_fails_where_there_is_none()
 {
     for roomier in [Some(DeviceKind::Cpu), None] {
-        let stand = stand_with(roomier).await;
+        let stand = stand_with(1, roomier).await;
         stand.switches.room.store(POINTS - 1, Ordering::Relaxed);
         let job = stand.submit(2).await;
         tokio::spawn(stand.worker.clone().run());
@@ -290,5 +299,39 @@ async fn a_pair_that_does_not_fit_moves_where_there_is_another_kind_and_fails_wh
             );
             assert!(!refused.dead && error.message.contains("the device has"));
         }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_pair_that_kills_every_device_is_given_up_and_nothing_beside_it_is() {
+    const LANES: usize = 3;
+    const DEADLY: usize = POINTS - 30;
+    let stand = stand_with(LANES, None).await;
+    stand.switches.deadly.store(DEADLY, Ordering::Relaxed);
+    // All begin together, so that the first death takes those beside it along.
+    stand.switches.brake.store(true, Ordering::Relaxed);
+    let fewer = clouds().map(|cloud| cloud[..DEADLY].to_vec());
+    let guilty = stand.submit_clouds(fewer.into_iter(), None).await;
+    let mut innocent = Vec::new();
+    for _ in 0..2 * LANES {
+        innocent.push(stand.submit(2).await);
+    }
+    for lane in stand.worker.lane.device().lanes() {
+        let worker = Worker {
+            lane,
+            ..stand.worker.clone()
+        };
+        tokio::spawn(worker.run());
+    }
+    stand.switches.until_at_the_brake(LANES).await;
+    stand.switches.brake.store(false, Ordering::Relaxed);
+    let given_up = stand.ended(&guilty).await;
+    assert_eq!((given_up.state, given_up.dead), (State::Failed, true));
+    let error = given_up.error.as_ref().expect("a reason");
+    assert_eq!(error.code, "device_lost");
+    for job in &innocent {
+        let done = stand.ended(job).await;
+        assert_eq!(done.state, State::Succeeded, "{:?}", done.error);
+        assert!(done.attempt <= 2, "{} attempts", done.attempt);
     }
 }

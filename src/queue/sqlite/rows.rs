@@ -10,7 +10,8 @@ use crate::queue::QueueError;
 pub(super) const COLUMNS: &str = "id, tenant, kind, parent, place, pairs, pairs_left, priority, \
     state, durable, attempt, cost, options, created, started, finished, deadline, iteration, \
     max_iterations, loss, stop_reason, error_code, error_message, error_retryable, dead, \
-    cancel_requested, report, device, backward, after, followed, ready, sees_from, sees_to";
+    cancel_requested, report, device, backward, after, followed, ready, sees_from, sees_to, \
+    crashes";
 
 pub(super) fn state_code(state: State) -> i64 {
     match state {
@@ -128,6 +129,7 @@ pub(super) fn job(row: &Row<'_>) -> rusqlite::Result<Job> {
         followed: row.get(30)?,
         ready: moment(31)?,
         sees: [row.get(32)?, row.get(33)?],
+        crashes: row.get(34)?,
     })
 }
 
