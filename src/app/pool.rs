@@ -3,6 +3,7 @@
 //! It opens nothing itself but to see whether a card that nobody named works, and must not know
 //! queues or doors.
 
+use std::collections::HashSet;
 use std::str::FromStr;
 use std::sync::Arc;
 use std::thread;
@@ -22,9 +23,6 @@ const GPU_LANES: usize = 8;
 
 /// The same where the card is software: its work takes the same cores anyway.
 const SOFTWARE_LANES: usize = 2;
-
-/// Bytes of a card's networks, which lie in one binding, for each pair that shares it.
-const LANE_BINDING_BYTES: u64 = 2_329_920;
 
 /// Says whether what would be opened works.
 type Probe<'a> = &'a dyn Fn(&Opener) -> Result<(), String>;
@@ -189,7 +187,7 @@ fn card_opener(card: Adapter, config: &Config) -> (usize, Opener) {
 /// As many of the lanes as the card has networks for: a pair without one would only be given back,
 /// again and again.
 fn fitting_lanes(wanted: usize, binding_bytes: u64) -> usize {
-    let networks = (binding_bytes / LANE_BINDING_BYTES).max(1);
+    let networks = (binding_bytes / gpu::LANE_NETWORK_BYTES).max(1);
     usize::try_from(networks).map_or(wanted, |networks| wanted.min(networks))
 }
 
@@ -203,6 +201,25 @@ fn chosen(selector: &Selector, config: &Config) -> anyhow::Result<Adapter> {
 fn welcome(config: &Config) -> Vec<Adapter> {
     let mut cards = gpu::adapters();
     cards.retain(|card| config.software_gpu || card.kind != AdapterKind::Software);
+    once_each(cards)
+}
+
+/// The cards without those that another driver has answered for already: both would take the
+/// memory of the same card.
+fn once_each(mut cards: Vec<Adapter>) -> Vec<Adapter> {
+    let mut places = HashSet::new();
+    cards.retain(|card| {
+        let is_new = card.pci_id.is_empty() || places.insert(card.pci_id.clone());
+        if !is_new {
+            tracing::info!(
+                card = card.name,
+                place = card.pci_id,
+                driver = card.driver,
+                "left out: another driver answers for the same card"
+            );
+        }
+        is_new
+    });
     cards
 }
 
@@ -317,6 +334,28 @@ mod tests {
         assert_eq!(fitting_lanes(8, 128 << 20), 8);
         assert_eq!(fitting_lanes(64, u64::from(u32::MAX)), 64);
         assert_eq!(fitting_lanes(8, 0), 1);
+    }
+
+    #[test]
+    fn a_card_that_two_drivers_answer_for_is_taken_once() {
+        let cards = gpu::adapters();
+        if !gpu_in_tests::is_there(cards.len()) {
+            return;
+        }
+        let Some(card) = cards.into_iter().next() else {
+            return;
+        };
+        let at = |place: &str| {
+            let mut card = card.clone();
+            place.clone_into(&mut card.pci_id);
+            card
+        };
+        let cards = ["0000:01:00.0", "0000:02:00.0", "0000:01:00.0", "", ""].map(at);
+        let kept: Vec<_> = once_each(cards.into())
+            .into_iter()
+            .map(|card| card.pci_id)
+            .collect();
+        assert_eq!(kept, ["0000:01:00.0", "0000:02:00.0", "", ""]);
     }
 
     #[test]

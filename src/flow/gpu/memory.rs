@@ -1,20 +1,16 @@
-//! The card's memory: taken once, when it is opened, and given out in words.
-//!
-//! A pair is priced against it before it gets any. Knows no kernels.
-
-use core::time::Duration;
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+//! The card's memory: taken once, when it is opened, and cut up by what it is for. Knows no kernels.
 
 use super::adapter::AdapterKind;
 use super::records::{ARRAYS, TILE};
 use crate::flow::backend::BackendError;
 use crate::flow::field::mlp::{HIDDEN_LAYERS, LAID_OUT, WIDTH};
-use crate::flow::watch::{self, Watch};
 
 /// Bytes of a row's activations, or deltas, of all hidden layers.
 const ROW_BYTES: u64 = (HIDDEN_LAYERS * WIDTH * size_of::<f32>()) as u64;
 /// Bytes of one network, or of one chunk's gradients.
 pub(super) const NETWORK_BYTES: u64 = (LAID_OUT * size_of::<f32>()) as u64;
+/// Bytes of a lane's arrays: those of all lanes lie in one binding.
+pub const LANE_NETWORK_BYTES: u64 = ARRAYS as u64 * NETWORK_BYTES;
 /// The fewest rows that are worth a dispatch, and the largest chunk of points.
 pub(super) const LEAST_ROWS: u64 = 8192;
 /// The most rows: more of them would be busy no longer at once on any card.
@@ -44,10 +40,8 @@ impl Budget {
     /// # Errors
     /// [`BackendError::Memory`] where not even the least fits.
     pub(super) fn new(lanes: usize, bytes: u64, binding: u64) -> Result<Self, BackendError> {
-        let lanes = (lanes as u64)
-            .min(binding / (ARRAYS as u64 * NETWORK_BYTES))
-            .max(1);
-        let networks = lanes * ARRAYS as u64 * NETWORK_BYTES;
+        let lanes = (lanes as u64).min(binding / LANE_NETWORK_BYTES).max(1);
+        let networks = lanes * LANE_NETWORK_BYTES;
         let least = networks
             + LANE_STORE_BYTES.min(binding)
             + LEAST_CHUNKS * NETWORK_BYTES
@@ -95,7 +89,7 @@ impl Budget {
     }
 
     pub(super) fn network_bytes(&self) -> u64 {
-        self.lanes * ARRAYS as u64 * NETWORK_BYTES
+        self.lanes * LANE_NETWORK_BYTES
     }
 
     pub(super) fn row_bytes(&self) -> u64 {
@@ -112,99 +106,9 @@ impl Budget {
     }
 }
 
-/// How long somebody waits without any words being given back, in all.
-const PATIENCE: Duration = Duration::from_secs(20);
-/// How often who waits looks at its watch.
-const LOOK: Duration = Duration::from_millis(20);
-
-/// The store's words: who has which.
-#[derive(Debug)]
-pub(super) struct Words {
-    /// Free stretches: place and length, by place.
-    free: Mutex<Vec<(u64, u64)>>,
-    given_back: Condvar,
-    all: u64,
-}
-
-impl Words {
-    pub(super) fn new(words: u64) -> Self {
-        Self {
-            free: Mutex::new(vec![(0, words)]),
-            given_back: Condvar::new(),
-            all: words,
-        }
-    }
-
-    fn free(&self) -> MutexGuard<'_, Vec<(u64, u64)>> {
-        self.free.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// The place of `count` words; waits a while for others to give theirs back.
-    ///
-    /// # Errors
-    /// [`BackendError::Memory`] where the store never has so many, [`BackendError::Busy`] where
-    /// others keep them, [`BackendError::Interrupted`] where the watch asks for the end.
-    pub(super) fn take(
-        &self,
-        what: &'static str,
-        count: u64,
-        watch: &dyn Watch,
-    ) -> Result<u64, BackendError> {
-        if count > self.all {
-            return Err(BackendError::Memory {
-                what,
-                needed: count * 4,
-                available: self.all * 4,
-            });
-        }
-        let mut free = self.free();
-        let mut waited = Duration::ZERO;
-        loop {
-            if let Some(stretch) = free.iter_mut().find(|(_, length)| *length >= count) {
-                let place = stretch.0;
-                *stretch = (place + count, stretch.1 - count);
-                free.retain(|&(_, length)| length > 0);
-                return Ok(place);
-            }
-            if waited >= PATIENCE {
-                return Err(BackendError::Busy);
-            }
-            watch::check(watch).map_err(BackendError::Interrupted)?;
-            let (woken, timeout) = self
-                .given_back
-                .wait_timeout(free, LOOK)
-                .unwrap_or_else(PoisonError::into_inner);
-            free = woken;
-            if timeout.timed_out() {
-                waited += LOOK;
-            }
-        }
-    }
-
-    /// Takes words back.
-    pub(super) fn give_back(&self, place: u64, count: u64) {
-        if count == 0 {
-            return;
-        }
-        let mut free = self.free();
-        free.push((place, count));
-        free.sort_unstable();
-        let mut joined: Vec<(u64, u64)> = Vec::with_capacity(free.len());
-        for &(place, length) in free.iter() {
-            match joined.last_mut() {
-                Some(last) if last.0 + last.1 == place => last.1 += length,
-                _ => joined.push((place, length)),
-            }
-        }
-        *free = joined;
-        self.given_back.notify_all();
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::flow::watch::{Interrupt, Unwatched};
 
     #[test]
     fn a_small_card_of_its_own_holds_a_sweep_of_400_m() {
@@ -244,35 +148,5 @@ mod tests {
     fn a_card_that_is_too_small_is_refused_with_what_it_would_take() {
         let refused = Budget::new(1, 64 << 20, 128 << 20).expect_err("too small");
         assert!(matches!(refused, BackendError::Memory { needed, .. } if needed > 64 << 20));
-    }
-
-    #[test]
-    fn words_given_back_can_be_taken_again_in_one_piece() {
-        let words = Words::new(100);
-        let take = |count| words.take("points", count, &Unwatched).expect("free");
-        let [a, b, c] = [take(30), take(30), take(40)];
-        words.give_back(a, 30);
-        words.give_back(c, 40);
-        words.give_back(b, 30);
-        assert_eq!(take(100), 0);
-    }
-
-    #[test]
-    fn what_never_fits_is_refused_at_once_and_what_is_taken_is_waited_for() {
-        struct Over;
-        impl Watch for Over {
-            fn interrupt(&self) -> Option<Interrupt> {
-                Some(Interrupt::Deadline)
-            }
-        }
-        let words = Words::new(100);
-        let refused = words.take("points", 101, &Unwatched);
-        assert!(matches!(
-            refused,
-            Err(BackendError::Memory { needed: 404, .. })
-        ));
-        words.take("points", 60, &Unwatched).expect("free");
-        let interrupted = words.take("points", 60, &Over);
-        assert!(matches!(interrupted, Err(BackendError::Interrupted(_))));
     }
 }

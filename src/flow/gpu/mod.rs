@@ -8,6 +8,7 @@
 mod adapter;
 mod device;
 mod memory;
+mod words;
 
 // The kernels, and what they share with the host.
 mod kernels;
@@ -29,4 +30,5 @@ mod tests;
 
 pub use adapter::{Adapter, AdapterKind, Selector, adapters, select};
 pub use device::{Gpu, GpuOptions};
+pub use memory::LANE_NETWORK_BYTES;
 pub use workload::{KernelTime, arithmetic_peak, kernel_times};
