@@ -55,6 +55,7 @@ pub(crate) fn aligned(
     if order.is_empty() {
         return Ok(Vec::new());
     }
+    let find_ground = |sweeps: &[&[Point]]| backend.host().ground(sweeps);
     let target = preprocess::in_range(problem.target, options);
     let mut found = Vec::with_capacity(order.len());
     for sweep in order {
@@ -62,7 +63,7 @@ pub(crate) fn aligned(
         if !deadline::has_time_around(surroundings.len() + target.len(), watch) {
             break;
         }
-        let points = preprocess::off_ground(sweep, options)?;
+        let points = preprocess::off_ground(sweep, options, &find_ground)?;
         // E^(1 - at): the target's own frame is at 1.
         let gaps = 1 - i32::from(sweep.at);
         let step = if gaps < 0 { ego.inverse() } else { *ego };

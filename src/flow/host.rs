@@ -1,20 +1,32 @@
-//! The host's threads, and what is done on them whatever the device: alignment, and the search for
-//! movers. It must not know what a device is.
+//! The host's threads, and what is done on them whatever the device: ground, alignment, and the
+//! search for movers. What is found of a sweep by itself is found once, as long as it is remembered.
+//! It must not know what a device is.
 
 use std::sync::Arc;
 
+use rayon::prelude::*;
+
 use super::backend::BackendError;
 use super::ego;
+use super::ground::{self, GroundOptions};
 use super::label::{self, Clouds, Labelled};
 use super::options::LabelOptions;
 use super::points::{Point, RigidTransform};
+use super::recall::Recall;
 use super::watch::Watch;
 
 /// A set of the host's threads.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct Host {
     name: String,
     threads: Arc<rayon::ThreadPool>,
+    recall: Arc<Recall>,
+}
+
+impl core::fmt::Debug for Host {
+    fn fmt(&self, formatter: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        formatter.write_str(&self.name)
+    }
 }
 
 impl Host {
@@ -36,6 +48,7 @@ impl Host {
                 None => format!("cpu ({count} threads)"),
             },
             threads: Arc::new(threads),
+            recall: Arc::default(),
         })
     }
 
@@ -58,8 +71,19 @@ impl Host {
         prior: &RigidTransform,
         watch: &dyn Watch,
     ) -> RigidTransform {
-        let align = || ego::align(source, target, prior, watch);
-        self.threads.install(align)
+        let known = [source, target].map(|points| self.recall.of(points));
+        self.threads.install(|| {
+            let (source, target) = rayon::join(|| known[0].surface(), || known[1].surface());
+            ego::align(source, target, prior, watch)
+        })
+    }
+
+    /// Which points of each sweep are ground; all of them are finite and in range.
+    pub(crate) fn ground(&self, sweeps: &[&[Point]]) -> Vec<Vec<bool>> {
+        let find = |points: &[Point]| ground::segment(points, &GroundOptions::default()).ground;
+        let known: Vec<_> = sweeps.iter().map(|points| self.recall.of(points)).collect();
+        let found = known.par_iter().map(|known| known.ground(find).clone());
+        self.threads.install(|| found.collect())
     }
 
     /// What moves in `clouds`; what has been found so far where `watch` interrupts.

@@ -66,6 +66,7 @@ mod early_stop;
 pub mod gpu;
 mod host;
 mod optimizer;
+mod recall;
 mod sums;
 
 // What a camera sees of a cloud.

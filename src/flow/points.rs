@@ -22,10 +22,10 @@ pub(crate) fn square_distance(a: Point, b: Point) -> f32 {
     x * x + y * y + z * z
 }
 
-/// At most `most` of the points, evenly.
-pub(crate) fn evenly(points: &[Point], most: usize) -> Vec<Point> {
-    let kept = points.len().min(most);
-    (0..kept).map(|i| points[i * points.len() / kept]).collect()
+/// At most `most` of the points, or of anything else, evenly.
+pub(crate) fn evenly<T: Copy>(all: &[T], most: usize) -> Vec<T> {
+    let kept = all.len().min(most);
+    (0..kept).map(|i| all[i * all.len() / kept]).collect()
 }
 
 /// All points, moved rigidly.
@@ -46,6 +46,6 @@ mod tests {
         let kept: Vec<f32> = evenly(&points, 4).iter().map(|point| point[0]).collect();
         assert_eq!(kept, [0.0, 2.0, 5.0, 7.0]);
         assert_eq!(evenly(&points, 20), points);
-        assert_eq!(evenly(&[], 5), [[0.0; 3]; 0]);
+        assert_eq!(evenly::<Point>(&[], 5), [[0.0; 3]; 0]);
     }
 }

@@ -44,13 +44,24 @@ pub(crate) struct Selection {
     pub(crate) surroundings: Option<[Vec<Point>; 2]>,
 }
 
+/// Which points of sweeps are ground, all of them finite and in range.
+pub(crate) type FindGround<'a> = &'a dyn Fn(&[&[Point]]) -> Vec<Vec<bool>>;
+
+/// Finds the ground on this thread, and remembers nothing.
+pub(crate) fn find_ground(sweeps: &[&[Point]]) -> Vec<Vec<bool>> {
+    let segmented = |points: &&[Point]| ground::segment(points, &GroundOptions::default()).ground;
+    sweeps.iter().map(segmented).collect()
+}
+
 /// Selects by `options`; refuses clouds of which too little is left.
-pub(crate) fn select(problem: &Problem, options: &Options) -> Result<Selection, FlowError> {
+pub(crate) fn select(
+    problem: &Problem,
+    options: &Options,
+    find: FindGround<'_>,
+) -> Result<Selection, FlowError> {
     let mut found = match (options.ground, problem.ground) {
         (Ground::Auto, Some(known)) => Some(known.map(<[bool]>::to_vec)),
-        (Ground::Auto, None) => {
-            Some([problem.source, problem.target].map(|points| ground_of(points, options)))
-        }
+        (Ground::Auto, None) => Some(ground_of([problem.source, problem.target], options, find)),
         (Ground::Keep | Ground::Mask, _) => None,
     };
     let [source_mask, target_mask] = match (options.ground, problem.ground, &found) {
@@ -115,9 +126,16 @@ pub(crate) fn select(problem: &Problem, options: &Options) -> Result<Selection, 
 }
 
 /// The points of a sweep around a pair that `options` let take part.
-pub(crate) fn off_ground(sweep: &Around, options: &Options) -> Result<Vec<Point>, FlowError> {
+pub(crate) fn off_ground(
+    sweep: &Around,
+    options: &Options,
+    find: FindGround<'_>,
+) -> Result<Vec<Point>, FlowError> {
     let found = match (options.ground, sweep.ground) {
-        (Ground::Auto, None) => Some(ground_of(sweep.points, options)),
+        (Ground::Auto, None) => {
+            let [found] = ground_of([sweep.points], options, find);
+            Some(found)
+        }
         (Ground::Mask, None) => return Err(FlowError::NoGroundMask),
         _ => None,
     };
@@ -131,18 +149,20 @@ pub(crate) fn off_ground(sweep: &Around, options: &Options) -> Result<Vec<Point>
     Ok(rows.into_iter().map(|row| sweep.points[row]).collect())
 }
 
-/// Which of the points are ground, of those that are finite and in range.
-pub(crate) fn ground_of(points: &[Point], options: &Options) -> Vec<bool> {
-    let rows: Vec<usize> = (0..points.len())
-        .filter(|&row| is_in_range(points[row], options))
-        .collect();
-    let in_range: Vec<Point> = rows.iter().map(|&row| points[row]).collect();
-    let found = ground::segment(&in_range, &GroundOptions::default()).ground;
-    let mut ground = vec![false; points.len()];
-    for (row, found) in rows.into_iter().zip(found) {
-        ground[row] = found;
-    }
-    ground
+/// Which points of each sweep are ground, of those that are finite and in range.
+pub(crate) fn ground_of<const SWEEPS: usize>(
+    sweeps: [&[Point]; SWEEPS],
+    options: &Options,
+    find: FindGround<'_>,
+) -> [Vec<bool>; SWEEPS] {
+    let in_range = sweeps.map(|points| in_range(points, options));
+    let found = find(&in_range.each_ref().map(Vec::as_slice));
+    let mut found = found.into_iter();
+    sweeps.map(|points| {
+        let mut found = found.next().unwrap_or_default().into_iter();
+        let is_ground = |&point: &Point| is_in_range(point, options) && found.next() == Some(true);
+        points.iter().map(is_ground).collect()
+    })
 }
 
 /// All points that are finite and in range.
@@ -193,7 +213,9 @@ mod tests {
             before: None,
             around: &[],
         };
-        select(&problem, options).expect("enough points").rows
+        select(&problem, options, &find_ground)
+            .expect("enough points")
+            .rows
     }
 
     #[test]
@@ -241,14 +263,14 @@ mod tests {
         let mut options = Preset::Neural.options(Some(10));
         options.ground = Ground::Mask;
         options.range_m = Some(60.0);
-        let selection = select(&problem, &options).expect("enough points");
+        let selection = select(&problem, &options, &find_ground).expect("enough points");
         assert_eq!(selection.source.len(), 10);
         assert_eq!(
             selection.surroundings,
             Some([(); 2].map(|()| source[..=60].to_vec()))
         );
         options.ego = Ego::Off;
-        let selection = select(&problem, &options).expect("enough points");
+        let selection = select(&problem, &options, &find_ground).expect("enough points");
         assert_eq!(selection.surroundings, None);
     }
 
@@ -279,8 +301,8 @@ mod tests {
             before: None,
             around: &[],
         };
-        let fitted = select(&problem, &fitted).expect("enough points");
-        let objects = select(&problem, &objects).expect("enough points");
+        let fitted = select(&problem, &fitted, &find_ground).expect("enough points");
+        let objects = select(&problem, &objects, &find_ground).expect("enough points");
         assert_eq!((objects.rows.len(), objects.target.len()), (100, 100));
         let answered = |selection: &Selection| -> Vec<usize> {
             let places = selection.answered.iter();
@@ -305,7 +327,8 @@ mod tests {
             before: None,
             around: &[],
         };
-        let selection = select(&problem, &Preset::Neural.options(Some(300))).expect("points");
+        let selection =
+            select(&problem, &Preset::Neural.options(Some(300)), &find_ground).expect("points");
         assert_eq!(selection.source.len(), 50);
         assert_eq!(selection.target.len(), 300);
         let last = selection.target.iter().map(|p| p[0]).fold(0.0, f32::max);
@@ -322,7 +345,7 @@ mod tests {
             around: &[],
         };
         let mut options = Preset::Neural.options(None);
-        let error = select(&problem, &options).expect_err("one point");
+        let error = select(&problem, &options, &find_ground).expect_err("one point");
         assert!(matches!(
             error,
             FlowError::TooFewPoints {
@@ -331,7 +354,7 @@ mod tests {
             }
         ));
         options.ground = Ground::Mask;
-        let error = select(&problem, &options).expect_err("no mask");
+        let error = select(&problem, &options, &find_ground).expect_err("no mask");
         assert!(matches!(error, FlowError::NoGroundMask));
     }
 }

@@ -85,7 +85,7 @@ pub fn price_around(points: usize) -> AroundPrice {
 /// # Errors
 /// [`FlowError`] where [`super::estimate`] would refuse the input.
 pub fn price(problem: &Problem, options: &Options) -> Result<Price, FlowError> {
-    let selection = preprocess::select(problem, options)?;
+    let selection = preprocess::select(problem, options, &preprocess::find_ground)?;
     let (source_points, target_points) = (selection.source.len(), selection.target.len());
     let clouds = [&selection.source, &selection.target];
     let transform = match options.label {

@@ -14,7 +14,7 @@ use super::error::FlowError;
 use super::field::Field;
 use super::options::{Ground, Options};
 use super::points::Point;
-use super::preprocess::{Problem, ground_of, is_in_range};
+use super::preprocess::{FindGround, Problem, find_ground, ground_of, is_in_range};
 use super::solver::{Estimate, estimate};
 use super::watch::Watch;
 
@@ -31,12 +31,19 @@ impl Sweep {
     /// The sweep as `options` take it: its ground found where it is wanted and not known, and
     /// forgotten where it is kept.
     #[must_use]
-    pub fn prepared(mut self, options: &Options) -> Self {
+    pub fn prepared(self, options: &Options) -> Self {
+        self.prepared_by(options, &find_ground)
+    }
+
+    fn prepared_by(mut self, options: &Options, find: FindGround<'_>) -> Self {
         match options.ground {
             Ground::Keep => self.ground = None,
             Ground::Mask => {}
             Ground::Auto if self.ground.is_some() => {}
-            Ground::Auto => self.ground = Some(ground_of(&self.points, options)),
+            Ground::Auto => {
+                let [found] = ground_of([&self.points], options, find);
+                self.ground = Some(found);
+            }
         }
         self
     }
@@ -119,7 +126,8 @@ impl Sequence {
         watch: &dyn Watch,
     ) -> Result<Vec<Estimate>, FlowError> {
         // Once for all that see it.
-        let sweep = sweep.prepared(options);
+        let find = |sweeps: &[&[Point]]| backend.host().ground(sweeps);
+        let sweep = sweep.prepared_by(options, &find);
         if self.count == 0 {
             self.frames = options.frames();
         }

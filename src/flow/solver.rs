@@ -133,7 +133,8 @@ fn solve(
     watch: &dyn Watch,
 ) -> Result<Estimate, FlowError> {
     let began = watch.seconds();
-    let selection = preprocess::select(problem, options)?;
+    let find_ground = |sweeps: &[&[Point]]| backend.host().ground(sweeps);
+    let selection = preprocess::select(problem, options, &find_ground)?;
     // Without a warm start pairs are independent: of each other, and of the order they are done in.
     let before = problem.before.filter(|_| options.warm_start.is_some());
     let prior = before.and_then(|field| field.ego).unwrap_or_default();

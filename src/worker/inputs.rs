@@ -81,11 +81,17 @@ impl Worker {
             (Sweep { points, ground }, is_known)
         });
         // As a sequence does: where one sweep alone has its mask, the other's ground is found.
-        let prepared = |sweep: Sweep, other: bool| match sweep.ground {
-            None if other => sweep.prepared(&solver),
-            _ => sweep,
+        let prepared = async |sweep: Sweep, other: bool| match sweep.ground {
+            None if other => {
+                let solver = solver.clone();
+                tokio::task::spawn_blocking(move || sweep.prepared(&solver)).await
+            }
+            _ => Ok(sweep),
         };
-        let (source, target) = (prepared(source.0, target.1), prepared(target.0, source.1));
+        let (source, target) = (
+            prepared(source.0, target.1).await?,
+            prepared(target.0, source.1).await?,
+        );
         let work = super::Work {
             options: solver.clone(),
             before,

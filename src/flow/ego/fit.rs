@@ -13,7 +13,7 @@ use nalgebra::{
 };
 use rayon::prelude::*;
 
-use super::surfels::{Surfel, Surfels};
+use super::surfels::{AllSurfels, Surfel};
 use crate::flow::flat::Flat;
 use crate::flow::points::{Point, RigidTransform};
 use crate::flow::watch::Watch;
@@ -62,7 +62,7 @@ impl Schedule {
 /// Surfels, and those that they are fitted to.
 pub(super) struct Fit<'a> {
     source: &'a [Surfel],
-    target: &'a Surfels,
+    target: AllSurfels<'a>,
     /// The source's middle, about which turns are taken, and its root-mean-square distance from
     /// it, which makes turns and shifts comparable.
     center: Point3<f64>,
@@ -78,7 +78,7 @@ struct Sums {
 }
 
 impl<'a> Fit<'a> {
-    pub(super) fn new(source: &'a [Surfel], target: &'a Surfels) -> Self {
+    pub(super) fn new(source: &'a [Surfel], target: AllSurfels<'a>) -> Self {
         let count = source.len().max(1) as f64;
         let points = source.iter().map(|surfel| double(surfel.point));
         let sum: Vector3<f64> = points.clone().map(|point| point.coords).sum();

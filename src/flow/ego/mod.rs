@@ -37,23 +37,39 @@ const REFINEMENT: Schedule = Schedule {
     scale_m: [0.3, 0.1],
 };
 
+/// A cloud as it is aligned, as source or as target: what alignments need of it alone.
+pub(crate) struct Surface {
+    coarse: Surfels,
+    fine: Surfels,
+}
+
+impl Surface {
+    /// The surface of a cloud, ground and all.
+    pub(crate) fn new(points: &[Point]) -> Self {
+        let thin = thinned(points, VOXEL_M);
+        Self {
+            coarse: search::coarse(&thin),
+            fine: Surfels::new(Columns::new(&thin, CELL_M)),
+        }
+    }
+}
+
 /// The motion target_from_source that aligns `source` with `target`, sought around `prior`; the
 /// motion so far where the watch interrupts. Where the clouds leave a direction free, it stays as
 /// in `prior`; so does all of it where they have nothing in common.
 ///
 /// The same bits whatever the number of threads.
 pub(crate) fn align(
-    source: &[Point],
-    target: &[Point],
+    source: &Surface,
+    target: &Surface,
     prior: &RigidTransform,
     watch: &dyn Watch,
 ) -> RigidTransform {
-    let (source, target) = rayon::join(|| thinned(source, VOXEL_M), || thinned(target, VOXEL_M));
-    let found = search::search(&source, &target, prior, watch);
+    let found = search::search(&source.coarse, &target.coarse, prior, watch);
     if watch.interrupt().is_some() {
         return found;
     }
-    let surfels = Surfels::new(Columns::new(&target, CELL_M));
-    let source = Columns::new(&source, CELL_M).some_surfels(REFINED);
-    Fit::new(&source, &surfels).run(&found, &REFINEMENT, watch)
+    let target = target.fine.all();
+    let source = source.fine.some(REFINED);
+    Fit::new(&source, target).run(&found, &REFINEMENT, watch)
 }

@@ -33,17 +33,20 @@ const TURNS_DEG: [f64; 3] = [0.0, 4.0, -4.0];
 /// are equal, and the prior is the likeliest.
 const BETTER: f64 = 0.01;
 
+/// What a thinned cloud's surfels are for this search.
+pub(super) fn coarse(points: &[Point]) -> Surfels {
+    Surfels::new(Columns::new(&thinned(points, VOXEL_M), CELL_M))
+}
+
 /// The motion near `prior` that fits best, to some centimetres; `prior` where none does.
 pub(super) fn search(
-    source: &[Point],
-    target: &[Point],
+    source: &Surfels,
+    target: &Surfels,
     prior: &RigidTransform,
     watch: &dyn Watch,
 ) -> RigidTransform {
-    let columns = |points: &[Point]| Columns::new(&thinned(points, VOXEL_M), CELL_M);
-    let surfels = Surfels::new(columns(target));
-    let source = columns(source).some_surfels(TRIED);
-    let fit = Fit::new(&source, &surfels);
+    let source = source.some(TRIED);
+    let fit = Fit::new(&source, target.all());
     let tried: Vec<(RigidTransform, f64)> = starts(prior)
         .into_par_iter()
         .map(|start| {

@@ -4,6 +4,7 @@
 //! memory. A surfel is made of a point's neighbors within a cell. It must not know of motions.
 
 use std::ops::Range;
+use std::sync::OnceLock;
 
 use rayon::prelude::*;
 
@@ -32,11 +33,18 @@ pub(super) struct Columns {
     points: Vec<Point>,
 }
 
-/// A cloud's surfels.
+/// A cloud's surfels, as far as they have been asked for.
 pub(super) struct Surfels {
     columns: Columns,
+    flats: OnceLock<Vec<Option<Flat>>>,
+}
+
+/// All of a cloud's surfels.
+#[derive(Clone, Copy)]
+pub(super) struct AllSurfels<'a> {
+    columns: &'a Columns,
     /// One for each of the columns' points; none where there is no flat surface.
-    flats: Vec<Option<Flat>>,
+    flats: &'a [Option<Flat>],
 }
 
 impl Columns {
@@ -58,16 +66,6 @@ impl Columns {
             columns,
             points: keyed.into_iter().map(|(_, point)| point).collect(),
         }
-    }
-
-    /// At most `most` of the points, evenly, as surfels; those that lie on no flat surface are left
-    /// out.
-    pub(super) fn some_surfels(&self, most: usize) -> Vec<Surfel> {
-        let points = evenly(&self.points, most);
-        let flats = self.flats(&points);
-        let surfels = points.into_iter().zip(flats);
-        let surfels = surfels.filter_map(|(point, flat)| Some(Surfel { point, flat: flat? }));
-        surfels.collect()
     }
 
     fn flats(&self, points: &[Point]) -> Vec<Option<Flat>> {
@@ -103,12 +101,42 @@ impl Columns {
 }
 
 impl Surfels {
-    /// All of a cloud's.
+    /// Those of a cloud.
     pub(super) fn new(columns: Columns) -> Self {
-        let flats = columns.flats(&columns.points);
-        Self { columns, flats }
+        Self {
+            columns,
+            flats: OnceLock::new(),
+        }
     }
 
+    /// All of them.
+    pub(super) fn all(&self) -> AllSurfels<'_> {
+        let columns = &self.columns;
+        // Not inside of the lock: who waits for a thread here may be given work that needs it too.
+        let flats = match self.flats.get() {
+            Some(flats) => flats,
+            None => {
+                let found = columns.flats(&columns.points);
+                self.flats.get_or_init(|| found)
+            }
+        };
+        AllSurfels { columns, flats }
+    }
+
+    /// Those of at most `most` of the points, evenly; points that lie on no flat surface have none.
+    pub(super) fn some(&self, most: usize) -> Vec<Surfel> {
+        let points = evenly(&self.columns.points, most);
+        let flats = match self.flats.get() {
+            Some(flats) => evenly(flats, most),
+            None => self.columns.flats(&points),
+        };
+        let surfels = points.into_iter().zip(flats);
+        let surfels = surfels.filter_map(|(point, flat)| Some(Surfel { point, flat: flat? }));
+        surfels.collect()
+    }
+}
+
+impl AllSurfels<'_> {
     /// The surfel whose point is nearest to `point`, less than `within_m` from it, which is at
     /// most a cell; none where nothing or nothing flat is there.
     pub(super) fn nearest(&self, point: Point, within_m: f32) -> Option<Surfel> {
@@ -155,6 +183,7 @@ mod tests {
         let mut point = || [0; 3].map(|_| random.uniform(-4.0, 4.0) as f32);
         let cloud: Vec<Point> = (0..800).map(|_| point()).collect();
         let surfels = Surfels::new(Columns::new(&cloud, 1.0));
+        let surfels = surfels.all();
         for _ in 0..500 {
             let asked = point();
             let square = |other: &Point| square_distance(asked, *other);
@@ -176,6 +205,7 @@ mod tests {
         };
         let plane: Vec<Point> = (0..400).map(on_plane).collect();
         let surfels = Surfels::new(Columns::new(&plane, 1.0));
+        let surfels = surfels.all();
         for &point in &plane {
             let Flat { normal, thickness } = surfels.nearest(point, 1.0).expect("flat").flat;
             let along = Vector3::from(normal.map(f64::from)).dot(&slope).abs();
@@ -183,8 +213,26 @@ mod tests {
             assert!(thickness < 1e-6, "{thickness}");
         }
         let line: Vec<Point> = (0..100).map(|i| [i as f32 * 0.3, 0.0, 0.0]).collect();
-        assert!(Columns::new(&line, 1.0).some_surfels(100).is_empty());
+        let line = Surfels::new(Columns::new(&line, 1.0));
+        assert!(line.some(100).is_empty());
         let nothing = Surfels::new(Columns::new(&[], 1.0));
-        assert!(nothing.nearest([0.0; 3], 1.0).is_none());
+        assert!(nothing.all().nearest([0.0; 3], 1.0).is_none());
+    }
+
+    #[test]
+    fn some_surfels_are_the_same_whether_all_have_been_asked_for_or_not() {
+        let mut random = Random::new(3);
+        let mut point = || [4.0, 4.0, 0.1].map(|side| random.uniform(-side, side) as f32);
+        let cloud: Vec<Point> = (0..900).map(|_| point()).collect();
+        let surfels = Surfels::new(Columns::new(&cloud, 1.0));
+        let bits = |some: Vec<Surfel>| -> Vec<_> {
+            let some = some.into_iter();
+            some.map(|Surfel { point, flat }| (point, flat.normal, flat.thickness))
+                .collect()
+        };
+        let before = bits(surfels.some(200));
+        surfels.all();
+        assert!(before.len() > 100);
+        assert_eq!(bits(surfels.some(200)), before);
     }
 }

@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use nalgebra::{Isometry3, Point3, Vector3};
 
-use super::align;
+use super::{Surface, align};
 use crate::flow::points::{Point, RigidTransform};
 use crate::flow::random::Random;
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
@@ -14,8 +14,17 @@ use crate::flow::watch::{Interrupt, Unwatched, Watch};
 const ACCURACY_M: f64 = 0.02;
 const ACCURACY_DEG: f64 = 0.1;
 
+fn aligned(
+    source: &[Point],
+    target: &[Point],
+    prior: &RigidTransform,
+    watch: &dyn Watch,
+) -> RigidTransform {
+    align(&Surface::new(source), &Surface::new(target), prior, watch)
+}
+
 fn found(source: &[Point], target: &[Point]) -> RigidTransform {
-    align(source, target, &RigidTransform::identity(), &Unwatched)
+    aligned(source, target, &RigidTransform::identity(), &Unwatched)
 }
 
 fn street(seed: u64, speed_mps: Option<f64>, yaw_rate_rps: Option<f64>) -> SimulatedPair {
@@ -101,7 +110,7 @@ fn five_metres_and_eight_degrees_are_found_from_rest_and_more_from_a_prior() {
     let truth = yaw([12.0, 7.0, 0.5], 60.0);
     let prior = yaw([10.0, 7.0, 0.5], 57.0);
     let source = moved(&pair.source, &(truth.inverse() * pair.target_from_source));
-    let found = align(&source, &pair.target, &prior, &Unwatched);
+    let found = aligned(&source, &pair.target, &prior, &Unwatched);
     assert_near(&found, &truth, "from a prior");
 }
 
@@ -135,7 +144,7 @@ fn what_a_scene_leaves_free_stays_as_in_the_prior() {
     let (source, target) = (tunnel(0.0), tunnel(0.4));
     for along in [0.0, 1.3] {
         let prior = yaw([along, 0.0, 0.0], 0.0);
-        let found = align(&source, &target, &prior, &Unwatched);
+        let found = aligned(&source, &target, &prior, &Unwatched);
         assert_near(&found, &yaw([along, -0.4, 0.0], 0.0), "a tunnel");
     }
     let [x, y, z] = axes;
@@ -184,7 +193,7 @@ fn clouds_that_have_nothing_in_common_keep_the_prior() {
     let here = street(2, None, None).source;
     let far = moved(&here, &yaw([500.0, 0.0, 0.0], 0.0));
     let prior = yaw([1.0, 2.0, 0.0], 3.0);
-    assert_eq!(align(&here, &far, &prior, &Unwatched), prior);
+    assert_eq!(aligned(&here, &far, &prior, &Unwatched), prior);
 }
 
 #[test]
@@ -213,7 +222,7 @@ fn an_interrupt_at_any_moment_gives_a_finite_motion() {
     let prior = RigidTransform::identity();
     for looks in [0, 1, 40, 110, 120] {
         let watch = After(looks, AtomicUsize::new(0));
-        let found = align(&pair.source, &pair.target, &prior, &watch);
+        let found = aligned(&pair.source, &pair.target, &prior, &watch);
         assert!(gap(&found, &pair.target_from_source).0 < 20.0, "{looks}");
     }
 }

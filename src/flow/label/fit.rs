@@ -8,8 +8,9 @@ use nalgebra::{Matrix3, Vector3};
 use super::moment::Moment;
 use super::motion::Motion;
 use super::rigid::Mover;
-use super::scene::{Scene, evenly};
+use super::scene::Scene;
 use crate::flow::Point;
+use crate::flow::points::evenly;
 
 /// Steps after which the target points around a cluster are looked for again.
 const STEPS_BETWEEN_LOOKS: usize = 4;

@@ -8,9 +8,9 @@
 
 use super::moment::Moment;
 use super::motion::Motion;
-use super::scene::{Scene, evenly};
+use super::scene::Scene;
 use super::vote::Ballot;
-use crate::flow::points::{Point, square_distance};
+use crate::flow::points::{Point, evenly, square_distance};
 
 /// Points of a cluster that vote, that a start is fitted with, and that costs are taken of.
 const VOTERS: usize = 64;

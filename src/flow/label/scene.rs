@@ -220,12 +220,6 @@ pub(super) fn one_a_voxel(points: &[Point], side_m: f32) -> Vec<u32> {
     rows
 }
 
-/// At most `most` of the rows, evenly.
-pub(super) fn evenly(rows: &[u32], most: usize) -> Vec<u32> {
-    let kept = rows.len().min(most);
-    (0..kept).map(|i| rows[i * rows.len() / kept]).collect()
-}
-
 /// The normal of the surface around a point; zero where it is not flat.
 fn normal(near: &Near, point: Point, options: &LabelOptions) -> Point {
     let range = point[0].hypot(point[1]);

@@ -10,8 +10,9 @@ use super::cluster::NOISE;
 use super::moment::Moment;
 use super::motion::Motion;
 use super::rigid::{Found, Mover};
-use super::scene::{Scene, evenly};
+use super::scene::Scene;
 use crate::flow::Point;
+use crate::flow::points::evenly;
 
 /// Points of a piece that look for movers beside it.
 const LOOKING: usize = 64;
