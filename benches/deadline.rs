@@ -7,6 +7,7 @@
 
 use std::time::Instant;
 
+use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Truth, evaluate};
 use fnsf::flow::{Ground, Interrupt, Options, Preset, Problem, Watch, estimate};
@@ -66,6 +67,7 @@ fn run(
         before: None,
         around: &[],
     };
+    backend.host().forget();
     let clock = Clock(Instant::now(), deadline);
     let estimate = estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())?;
     let milliseconds = clock.seconds() * 1e3;

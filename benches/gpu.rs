@@ -94,6 +94,7 @@ fn solve(
         before: None,
         around: &[],
     };
+    backend.host().forget();
     let clock = Clock(Instant::now());
     estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())
 }

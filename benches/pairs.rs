@@ -47,6 +47,7 @@ fn main() -> Result<(), String> {
                         seed,
                         ..preset.options(max_points)
                     };
+                    backend.host().forget();
                     let clock = Clock(Instant::now());
                     let run = estimate(&backend, &problem, &options, &clock);
                     runs.push(run.map_err(|e| e.to_string())?);

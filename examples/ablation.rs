@@ -16,6 +16,7 @@
 mod clock;
 
 use clock::Clock;
+use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::distance::{Metric, Sites};
 use fnsf::flow::evaluate::{Truth, evaluate};
@@ -170,6 +171,7 @@ fn run(backend: &CpuBackend, pair: &Pair, options: &Options) -> Result<Run, Stri
         around: &[],
     };
     let clock = Clock::start();
+    backend.host().forget();
     let estimate = flow::estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())?;
     let known = pair.truth.as_ref().ok_or("the pair has no truth")?;
     let truth = Truth {

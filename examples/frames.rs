@@ -17,6 +17,7 @@
 mod clock;
 
 use clock::Clock;
+use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Truth, evaluate};
 use fnsf::flow::simulate::{Street, StreetOptions};
@@ -142,6 +143,7 @@ fn run(backend: &CpuBackend, known: &Known, label: &LabelOptions) -> Result<Row,
         around: &around,
     };
     let clock = Clock::start();
+    backend.host().forget();
     let found = flow::estimate(backend, &problem, &options, &clock).map_err(|e| e.to_string())?;
     let truth = Truth {
         dynamic: Some(&known.dynamic),

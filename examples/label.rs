@@ -19,6 +19,7 @@ mod clock;
 mod known;
 
 use clock::Clock;
+use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Truth, evaluate};
 use fnsf::flow::{self, Ground, LabelOptions, Options, Preset, Problem};
@@ -114,6 +115,7 @@ fn run(backend: &CpuBackend, pair: &Known, options: &Options) -> Result<Row, Str
         around: &[],
     };
     let clock = Clock::start();
+    backend.host().forget();
     let estimate = flow::estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())?;
     let dynamic = pair.dynamic.as_deref();
     let truth = Truth {

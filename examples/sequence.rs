@@ -13,6 +13,7 @@
 
 use std::time::Instant;
 
+use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::flow::{
@@ -114,6 +115,7 @@ fn alone(backend: &CpuBackend, drive: &Drive, options: &Options) -> anyhow::Resu
             before: None,
             around: &[],
         };
+        backend.host().forget();
         let began = Instant::now();
         let estimate = estimate(backend, &problem, options, &Unwatched)?;
         let seconds = began.elapsed().as_secs_f64();
@@ -128,6 +130,7 @@ fn alone(backend: &CpuBackend, drive: &Drive, options: &Options) -> anyhow::Resu
 fn in_sequence(backend: &CpuBackend, drive: &Drive, options: &Options) -> anyhow::Result<Sums> {
     let mut sums = Sums::default();
     let mut sequence = Sequence::default();
+    backend.host().forget();
     for (k, points) in drive.sweeps.iter().enumerate() {
         let sweep = Sweep {
             points: points.clone(),

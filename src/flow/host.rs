@@ -57,6 +57,11 @@ impl Host {
         &self.name
     }
 
+    /// Forgets what it has found of sweeps, as a measurement wants it that does the same twice.
+    pub fn forget(&self) {
+        self.recall.forget();
+    }
+
     /// The threads themselves.
     pub(crate) fn threads(&self) -> &Arc<rayon::ThreadPool> {
         &self.threads
@@ -95,5 +100,37 @@ impl Host {
     ) -> Labelled {
         let find = || label::label(clouds, options, watch);
         self.threads.install(find)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::simulate::{Street, StreetOptions};
+    use crate::flow::watch::Unwatched;
+
+    #[test]
+    fn what_is_remembered_of_sweeps_does_not_change_a_bit() {
+        let options = StreetOptions {
+            frames: 3,
+            azimuth_steps: 500,
+            ..StreetOptions::default()
+        };
+        let street = Street::new(&options).expect("a street");
+        let sweeps = [0, 1, 2].map(|k| street.frame(k).expect("a sweep").points);
+        let prior = RigidTransform::identity();
+        let aligned = |host: &Host, source: usize, target: usize| {
+            host.align(&sweeps[source], &sweeps[target], &prior, &Unwatched)
+        };
+        let host = Host::new(Some(2), None).expect("threads");
+        for (source, target) in [(0, 1), (1, 2), (2, 0), (1, 0), (0, 1)] {
+            let fresh = Host::new(Some(1), None).expect("threads");
+            assert_eq!(
+                aligned(&host, source, target),
+                aligned(&fresh, source, target)
+            );
+            let sweeps = [sweeps[source].as_slice(), &sweeps[target]];
+            assert_eq!(host.ground(&sweeps), fresh.ground(&sweeps));
+        }
     }
 }

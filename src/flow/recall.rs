@@ -6,7 +6,7 @@
 //! would be found again. It must not know what is found.
 
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 use super::ego::Surface;
 use super::points::Point;
@@ -49,9 +49,18 @@ fn found<T>(lock: &OnceLock<T>, find: impl FnOnce() -> T) -> &T {
 pub(crate) struct Recall(Mutex<VecDeque<Arc<Known>>>);
 
 impl Recall {
+    /// Forgets all sweeps.
+    pub(crate) fn forget(&self) {
+        self.sweeps().clear();
+    }
+
+    fn sweeps(&self) -> MutexGuard<'_, VecDeque<Arc<Known>>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     /// What is known of the sweep of these points.
     pub(crate) fn of(&self, points: &[Point]) -> Arc<Known> {
-        let mut sweeps = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut sweeps = self.sweeps();
         let known = match sweeps.iter().position(|known| known.points == points) {
             Some(place) => sweeps.remove(place),
             None => None,
@@ -109,8 +118,7 @@ mod tests {
     #[test]
     fn what_was_not_seen_for_long_is_forgotten_and_what_is_too_large_is_not_kept() {
         let held = |recall: &Recall| -> usize {
-            let sweeps = recall.0.lock().expect("no panic");
-            sweeps.iter().map(|known| known.points.len()).sum()
+            recall.sweeps().iter().map(|known| known.points.len()).sum()
         };
         let recall = Recall::default();
         let asked = |x: f32| {
@@ -129,5 +137,7 @@ mod tests {
         let before = held(&recall);
         recall.of(&sweep(POINTS + 1, 0.0));
         assert_eq!(held(&recall), before);
+        recall.forget();
+        assert_eq!(held(&recall), 0);
     }
 }
