@@ -16,7 +16,7 @@ use super::service::{Awaited, Service};
 use crate::blobs::{Blob, Sync};
 use crate::clock::Timestamp;
 use crate::cost::CostModel;
-use crate::flow::{self, Price, window};
+use crate::flow::{self, Ground, Price, Sweep, window};
 use crate::job::{Job, JobId, JobOptions, Kind};
 use crate::payload::StoredCloud;
 use crate::queue::{Idempotency, PairOf, Submission, Submitted};
@@ -77,6 +77,17 @@ pub(super) struct Draft {
     submitted: bool,
 }
 
+/// The cloud, with the ground that its pairs would find.
+fn with_ground(cloud: Arc<StoredCloud>, options: &JobOptions) -> Arc<StoredCloud> {
+    let options = options.solver_options(cloud.points.len());
+    if cloud.ground.is_some() || options.ground != Ground::Auto {
+        return cloud;
+    }
+    let StoredCloud { points, ground } = Arc::unwrap_or_clone(cloud);
+    let Sweep { points, ground } = Sweep { points, ground }.prepared(&options);
+    Arc::new(StoredCloud { points, ground })
+}
+
 impl Draft {
     /// Begins a job whose clouds will follow.
     ///
@@ -122,14 +133,16 @@ impl Draft {
         self.frames
     }
 
-    /// Takes the next cloud, prices it with the one before, and puts it in store.
+    /// Takes the next cloud, finds its ground where that is wanted and not known, prices it with the
+    /// one before, and puts it in store. Gives it back as it lies there: every attempt at every pair
+    /// that sees it is spared the search.
     ///
     /// # Errors
     /// [`ApiError`] where the pair cannot be solved here, or the store fails.
     pub(super) async fn push(
         &mut self,
         cloud: impl Into<Arc<StoredCloud>>,
-    ) -> Result<(), ApiError> {
+    ) -> Result<Arc<StoredCloud>, ApiError> {
         let cloud = cloud.into();
         let service = Arc::clone(&self.service);
         service.admission.check_points(cloud.points.len())?;
@@ -144,7 +157,7 @@ impl Draft {
         if self.request.options.densify.is_some() {
             service.admission.check_dense(&self.points)?;
         }
-        let before = self.last.replace(Arc::clone(&cloud));
+        let before = self.last.take();
         let options = self.request.options.clone();
         let after = self.request.link.and_then(|link| link.after);
         let goes_on = options.goes_on() && (self.frames > 1 || after.is_some());
@@ -152,15 +165,17 @@ impl Draft {
         let is_pair = pair == PairOf::ALONE || self.frames == pair.place + 1;
         let work = {
             let service = Arc::clone(&service);
-            move || -> Result<(Option<Price>, Vec<u8>), ApiError> {
+            move || {
+                let cloud = with_ground(cloud, &options);
                 let price = before.filter(|_| is_pair).map(|before| {
                     let admission = &service.admission;
                     admission.price(&before, &cloud, &options, goes_on)
                 });
-                Ok((price.transpose()?, cloud.to_bytes()))
+                Ok((price.transpose()?, cloud.to_bytes(), cloud))
             }
         };
-        let (price, bytes) = service.compute(work).await?;
+        let (price, bytes, cloud) = service.compute(work).await?;
+        self.last = Some(Arc::clone(&cloud));
         if self.frames > 0 {
             self.prices.push(price);
         }
@@ -175,7 +190,7 @@ impl Draft {
             .put(self.id, blob, Bytes::from(bytes), sync)
             .await?;
         self.frames += 1;
-        Ok(())
+        Ok(cloud)
     }
 
     /// Submits the job: a pair for two clouds and `kind` pair, else a sequence.
@@ -405,5 +420,41 @@ impl Room {
         let came = tokio::time::timeout(left, more).await;
         self.waited += began.elapsed();
         came.map_err(|_| ApiError::TooSlow)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::simulate::{Street, StreetOptions};
+
+    #[test]
+    fn ground_is_found_where_it_is_wanted_and_not_known() {
+        let street = StreetOptions {
+            azimuth_steps: 300,
+            ..StreetOptions::default()
+        };
+        let sweep = Street::new(&street).and_then(|street| street.frame(0));
+        let points = sweep.expect("a sweep").points;
+        let options = |json: &str| JobOptions::from_json(json.as_bytes()).expect("good options");
+        let stored = |ground: Option<Vec<bool>>, json: &str| {
+            let points = points.clone();
+            let cloud = Arc::new(StoredCloud { points, ground });
+            with_ground(cloud, &options(json)).ground.clone()
+        };
+        let mask = vec![true; points.len()];
+        for json in ["{}", r#"{"ground": "keep"}"#, r#"{"ground": "mask"}"#] {
+            assert_eq!(
+                stored(Some(mask.clone()), json),
+                Some(mask.clone()),
+                "{json}"
+            );
+            let found = stored(None, json);
+            assert_eq!(found.is_some(), json == "{}", "{json}");
+        }
+        let near = stored(None, r#"{"range_m": 15}"#).expect("found");
+        let all = stored(None, "{}").expect("found");
+        let ground = |mask: &[bool]| mask.iter().filter(|&&ground| ground).count();
+        assert!(0 < ground(&near) && ground(&near) < ground(&all));
     }
 }

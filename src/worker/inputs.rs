@@ -76,24 +76,8 @@ impl Worker {
             // The motion that is known is from the earlier sweep to the later one.
             *target_from_source = target_from_source.inverse();
         }
-        let [source, target] = [source, target].map(|StoredCloud { points, ground }| {
-            let is_known = ground.is_some();
-            (Sweep { points, ground }, is_known)
-        });
-        // As a sequence does: where one sweep alone has its mask, the other's ground is found.
-        let prepared = async |sweep: Sweep, other: bool| match sweep.ground {
-            None if other => {
-                let solver = solver.clone();
-                tokio::task::spawn_blocking(move || sweep.prepared(&solver)).await
-            }
-            _ => Ok(sweep),
-        };
-        let (source, target) = (
-            prepared(source.0, target.1).await?,
-            prepared(target.0, source.1).await?,
-        );
         let work = super::Work {
-            options: solver.clone(),
+            options: solver,
             before,
             around,
             ground: source.ground.zip(target.ground).map(<[_; 2]>::from),

@@ -221,7 +221,7 @@ impl Reader {
         }));
     }
 
-    async fn submit(&self, place: usize) -> Result<Accepted, ApiError> {
+    async fn submit(&mut self, place: usize) -> Result<Accepted, ApiError> {
         let options = &self.options;
         let mut request = self
             .call
@@ -237,8 +237,8 @@ impl Reader {
         let mut draft = Draft::begin(&self.service, self.call.caller.clone(), request)?;
         let first_held = self.count - self.held.len();
         for place in sees {
-            let cloud = Arc::clone(&self.held[place - first_held].cloud);
-            draft.push(cloud).await?;
+            let cloud = &mut self.held[place - first_held].cloud;
+            *cloud = draft.push(Arc::clone(cloud)).await?;
         }
         draft.submit(Kind::Pair).await
     }
