@@ -136,18 +136,22 @@ pub(super) unsafe fn forward<L: Lanes, const ROWS: usize, const VECTORS: usize>(
         let at = last_layer();
         let from = activations.add(MIDDLE_LAYERS * TILE * STRIDE);
         for row in 0..tile.rows {
-            for output in 0..3 {
-                let mut sums = [0.0; SIDE_BY_SIDE];
-                for first in (0..SIDE_BY_SIDE).step_by(L::COUNT) {
-                    let mut acc = L::splat(0.0);
-                    for column in (first..WIDTH).step_by(SIDE_BY_SIDE) {
-                        let h = L::load(from.add(row * STRIDE + column));
+            let mut sums = [[0.0; SIDE_BY_SIDE]; 3];
+            for first in (0..SIDE_BY_SIDE).step_by(L::COUNT) {
+                let mut acc = [L::splat(0.0); 3];
+                for column in (first..WIDTH).step_by(SIDE_BY_SIDE) {
+                    let h = L::load(from.add(row * STRIDE + column));
+                    for output in 0..3 {
                         let w = L::load(weights.add(at.weights + output * WIDTH + column));
-                        acc = h.mul_add(w, acc);
+                        acc[output] = h.mul_add(w, acc[output]);
                     }
-                    acc.store(sums.as_mut_ptr().add(first));
                 }
-                tile.outputs[row][output] = halved(sums) + *weights.add(at.bias + output);
+                for output in 0..3 {
+                    acc[output].store(sums[output].as_mut_ptr().add(first));
+                }
+            }
+            for output in 0..3 {
+                tile.outputs[row][output] = halved(sums[output]) + *weights.add(at.bias + output);
             }
         }
     }
