@@ -28,7 +28,7 @@ use crate::engine::{Device, Health};
 use crate::job::{DeviceKind, Tenant};
 use crate::metrics::Metrics;
 use crate::queue::{Queue, QueueOptions, SqliteQueue};
-use crate::worker::{Drain, Worker, WorkerOptions};
+use crate::worker::{Company, Drain, Worker, WorkerOptions};
 
 /// A server that runs.
 pub struct App {
@@ -83,6 +83,7 @@ impl App {
         }
         let cost = Arc::new(CostModel::new(lanes));
         let workers_drain = Drain::default();
+        let company = Arc::new(Company::default());
         let mut workers = JoinSet::new();
         for lane in devices.iter().flat_map(Device::lanes) {
             let a_cpu_besides = lane.kind() == DeviceKind::Gpu && lanes.cpu > 0;
@@ -97,6 +98,7 @@ impl App {
                     roomier: a_cpu_besides.then_some(DeviceKind::Cpu),
                 },
                 drain: workers_drain.clone(),
+                company: Arc::clone(&company),
             };
             workers.spawn(worker.run());
         }

@@ -2,8 +2,8 @@
 //!
 //! Each lane takes one pair at a time; the device is opened once for all
 //! of them and has one health. A panic costs the pair that it happened in, a lost device the pairs
-//! that were on it: then it is opened again and must pass its trial. A pair may ask to be alone on
-//! the device, so that it is clear who did it. It must not know queues, stores or doors.
+//! that were on it: then it is opened again and must pass its trial. It must not know queues,
+//! stores or doors.
 
 mod busy;
 mod dense;
@@ -66,8 +66,6 @@ pub struct Work {
     pub snapshot: Option<Snapshot>,
     /// Looks in on the optimization.
     pub watch: Arc<dyn Watch + Send + Sync>,
-    /// Whether nothing else may be on the device meanwhile.
-    pub alone: bool,
 }
 
 /// What a device can do now.
@@ -306,10 +304,8 @@ impl Lane {
     /// # Errors
     /// [`EngineError`]; the device is ready for the next pair, or says otherwise in its health.
     pub async fn solve(&self, work: Work) -> Result<Estimate, EngineError> {
-        self.run(work.alone, move |backend, busy| {
-            Ok(lane::solve(backend, work, busy)?)
-        })
-        .await
+        self.run(move |backend, busy| Ok(lane::solve(backend, work, busy)?))
+            .await
     }
 
     /// Carries a sequence's sweeps into one frame.
@@ -317,20 +313,17 @@ impl Lane {
     /// # Errors
     /// As [`Lane::solve`].
     pub async fn densify(&self, work: Densification) -> Result<Densified, EngineError> {
-        self.run(work.alone, move |backend, busy| {
-            dense::densify(backend, &work, busy)
-        })
-        .await
+        self.run(move |backend, busy| dense::densify(backend, &work, busy))
+            .await
     }
 
     async fn run<T: Send + 'static>(
         &self,
-        alone: bool,
         work: impl FnOnce(&dyn Backend, &Busy) -> Result<T, EngineError> + Send + 'static,
     ) -> Result<T, EngineError> {
         let gone = || EngineError::Broken("its thread has ended".to_owned());
         let (reply, answer) = oneshot::channel();
-        let command = Command::Do(Box::new(Asked { alone, work, reply }));
+        let command = Command::Do(Box::new(Asked { work, reply }));
         let commands = &self.device.lanes[self.place].commands;
         commands.send(command).await.map_err(|_| gone())?;
         answer.await.map_err(|_| gone())?

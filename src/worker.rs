@@ -3,6 +3,7 @@
 //! One for each lane of a device. The only room that sees both the queue and the engine. The result is in
 //! store before the queue hears of it, and only the attempt that holds the job counts.
 
+mod company;
 mod dense;
 mod inputs;
 mod job_watch;
@@ -16,8 +17,11 @@ use bytes::Bytes;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
+pub use self::company::Company;
+use self::company::Inside;
 use self::inputs::StoreError;
 use crate::blobs::{Blob, BlobError, Blobs, Sync};
+use crate::clock::Timestamp;
 use crate::cost::CostModel;
 use crate::engine::{Densification, Densified, EngineError, Health, Lane, Work};
 use crate::flow::backend::BackendError;
@@ -48,6 +52,13 @@ pub struct Drain {
 /// Before a job is given back that the device could not begin: at once it would only come again.
 const A_MOMENT: Duration = Duration::from_millis(100);
 
+/// How long a job waits to be alone at most: who does not come back from a device must not stop all
+/// others.
+const PATIENCE_ALONE: Duration = Duration::from_secs(30);
+
+/// How often a job that waits looks up, and gives a sign of life.
+const LOOK: Duration = Duration::from_millis(200);
+
 /// What a worker works with.
 #[derive(Clone)]
 pub struct Worker {
@@ -65,6 +76,8 @@ pub struct Worker {
     pub options: WorkerOptions,
     /// How it is told to stop.
     pub drain: Drain,
+    /// All workers of the process, this one among them.
+    pub company: Arc<Company>,
 }
 
 impl Worker {
@@ -84,6 +97,11 @@ impl Worker {
                 );
                 break;
             }
+            let mut inside = tokio::select! {
+                biased;
+                () = self.drain.stop.cancelled() => break,
+                inside = self.company.enter() => inside,
+            };
             let mut asking = self
                 .queue
                 .lease(self.lane.device().name(), self.lane.kind());
@@ -94,13 +112,19 @@ impl Worker {
                     break;
                 }
                 lease = &mut asking => lease,
+                () = inside.is_to_leave() => {
+                    self.give_back(asking).await;
+                    continue;
+                }
             };
             match lease {
                 Ok(lease) => {
-                    let attempt = match lease.job.kind {
-                        Kind::Pair => self.attempt(&lease).await,
-                        Kind::Sequence => self.densify(&lease).await,
+                    let attempt = match (self.apart(&lease, &mut inside).await, lease.job.kind) {
+                        (Some(ended), _) => ended,
+                        (None, Kind::Pair) => self.attempt(&lease).await,
+                        (None, Kind::Sequence) => self.densify(&lease).await,
                     };
+                    drop(inside);
                     if let Some(before) = committing.take() {
                         let _its_own_errors_are_logged = before.await;
                     }
@@ -122,7 +146,40 @@ impl Worker {
         }
     }
 
-    /// Gives back a job that was about to be taken when the worker was told to stop.
+    /// Lets a job be alone that may be what kills devices or the process, so that only the guilty one
+    /// is there when it happens again. Says how it ended where it cannot begin now.
+    async fn apart(&self, lease: &Lease, inside: &mut Inside) -> Option<Attempt> {
+        if !is_suspect(&lease.job) {
+            return None;
+        }
+        if !inside.close() {
+            // Another one is, or will be: this one must not be there.
+            return Some(Attempt::Ended(Outcome::Released));
+        }
+        let began = Instant::now();
+        while tokio::time::timeout(LOOK, inside.is_alone()).await.is_err() {
+            let gone = lease.pulse.beat(None) != Signal::Continue;
+            if gone || self.drain.release.is_cancelled() {
+                return Some(self.interrupted(lease));
+            }
+            let left = |deadline: Timestamp| Timestamp::now().until(deadline);
+            if lease
+                .job
+                .deadline
+                .is_some_and(|deadline| left(deadline).is_zero())
+            {
+                return Some(Attempt::Ended(Outcome::Released));
+            }
+            if began.elapsed() > PATIENCE_ALONE {
+                tracing::warn!(job = %lease.job.id, "it could not be alone: it is done beside others");
+                inside.open();
+                break;
+            }
+        }
+        None
+    }
+
+    /// Gives back a job that was about to be taken when the worker was told to stop or to leave.
     async fn give_back(&self, asking: impl Future<Output = Result<Lease, QueueError>>) {
         const MOMENT: Duration = Duration::from_millis(100);
         if let Ok(Ok(lease)) = tokio::time::timeout(MOMENT, asking).await
@@ -413,10 +470,10 @@ impl Attempt {
     }
 }
 
-/// Whether a job may be what kills devices. What was beside it when one died is done alone from then
-/// on, so that only the guilty one is there when it happens again.
+/// Whether a job may be what kills devices or processes: it was there more than once when one died.
+/// Once says nothing, since processes are killed for many reasons.
 fn is_suspect(job: &Job) -> bool {
-    job.crashes > 0
+    job.crashes > 1
 }
 
 fn failure(code: &str, error: &dyn std::error::Error, retryable: bool) -> JobError {

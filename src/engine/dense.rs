@@ -20,8 +20,6 @@ pub struct Densification {
     pub fields: HashMap<Leg, Field>,
     /// Looks in on it.
     pub watch: Arc<dyn Watch + Send + Sync>,
-    /// Whether nothing else may be on the device meanwhile.
-    pub alone: bool,
 }
 
 /// A dense cloud, and what carried its points, as reports show it.

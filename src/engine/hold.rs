@@ -5,7 +5,7 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -35,14 +35,6 @@ pub(super) struct Hold {
     /// Whether it was ever open. Beside the state, which is locked as long as an opening takes.
     worked: AtomicBool,
     state: Mutex<State>,
-    /// Read by every pair that is on the device, written by one that is alone on it.
-    pairs: RwLock<()>,
-}
-
-/// As long as it is held, others are on the device or none is, as was asked.
-pub(super) enum Company<'a> {
-    Others(#[expect(dead_code, reason = "held, not looked at")] RwLockReadGuard<'a, ()>),
-    None(#[expect(dead_code, reason = "held, not looked at")] RwLockWriteGuard<'a, ()>),
 }
 
 struct State {
@@ -79,16 +71,6 @@ impl Hold {
                 next_try: Instant::now(),
             }),
             reopening,
-            pairs: RwLock::new(()),
-        }
-    }
-
-    /// Waits until a pair may be on the device: until nobody is who wants to be alone or, where it
-    /// wants that itself, until nobody is at all. Who waits to be alone lets nobody pass.
-    pub(super) fn company(&self, alone: bool) -> Company<'_> {
-        match alone {
-            true => Company::None(self.pairs.write().unwrap_or_else(PoisonError::into_inner)),
-            false => Company::Others(self.pairs.read().unwrap_or_else(PoisonError::into_inner)),
         }
     }
 

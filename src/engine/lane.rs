@@ -29,13 +29,10 @@ pub(super) trait Task: Send {
     fn run(self: Box<Self>, hold: &Hold, held: &Held, busy: &Busy) -> Trust;
     /// Gives it back: another device may do it meanwhile.
     fn turn_away(self: Box<Self>);
-    /// Whether nothing else may be on the device meanwhile.
-    fn alone(&self) -> bool;
 }
 
 /// Work, and where its answer goes.
 pub(super) struct Asked<W, T> {
-    pub(super) alone: bool,
     pub(super) work: W,
     pub(super) reply: oneshot::Sender<Result<T, EngineError>>,
 }
@@ -46,7 +43,7 @@ where
     T: Send,
 {
     fn run(self: Box<Self>, hold: &Hold, held: &Held, busy: &Busy) -> Trust {
-        let Self { work, reply, .. } = *self;
+        let Self { work, reply } = *self;
         busy.begin();
         let done = catch_unwind(AssertUnwindSafe(|| work(held.backend.as_ref(), busy)));
         busy.end();
@@ -58,10 +55,6 @@ where
     fn turn_away(self: Box<Self>) {
         let answer = Err(EngineError::Broken("it is being opened again".to_owned()));
         let _nobody_waits_is_fine = self.reply.send(answer);
-    }
-
-    fn alone(&self) -> bool {
-        self.alone
     }
 }
 
@@ -83,7 +76,6 @@ pub(super) fn run(hold: &Hold, mut inbox: mpsc::Receiver<Command>, busy: &Busy) 
             Some(Command::Look) => continue,
             None => return,
         };
-        let _company = hold.company(task.alone());
         let Some(held) = hold.share() else {
             trust = Trust::Given;
             task.turn_away();

@@ -78,17 +78,7 @@ fn work() -> Work {
         options: Preset::Neural.options(None),
         snapshot: None,
         watch: Arc::new(Unwatched),
-        alone: false,
     }
-}
-
-async fn solved_alone(lane: &Lane) -> Result<(), EngineError> {
-    let alone = Work {
-        alone: true,
-        ..work()
-    };
-    let solved = timeout(PATIENCE, lane.solve(alone)).await;
-    solved.expect("in time").map(drop)
 }
 
 async fn solved(lane: &Lane) -> Result<(), EngineError> {
@@ -118,34 +108,6 @@ async fn a_loss_costs_every_lane_its_pair_and_the_device_is_opened_again_once() 
     }
     assert_eq!(stand.switches.openings.load(Ordering::Relaxed), 2);
     assert!(stand.losses(), "{}", stand.metrics.expose(false));
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_pair_that_is_to_be_alone_waits_for_the_others_and_they_for_it() {
-    /// Long enough for a pair to come to the brake, if it could.
-    const A_WHILE: Duration = Duration::from_millis(100);
-    let stand = stand(3);
-    stand.ready().await;
-    let lanes: Vec<_> = stand.device.lanes().collect();
-    for first_is_alone in [false, true] {
-        stand.switches.brake.store(true, Ordering::Relaxed);
-        let [first, second] = [first_is_alone, !first_is_alone];
-        let pair = async |lane: &Lane, alone: bool| match alone {
-            true => solved_alone(lane).await,
-            false => solved(lane).await,
-        };
-        let later = async {
-            stand.switches.until_at_the_brake(1).await;
-            tokio::join!(pair(&lanes[1], second), async {
-                tokio::time::sleep(A_WHILE).await;
-                let under_way = stand.switches.at_the_brake.load(Ordering::Relaxed);
-                assert_eq!(under_way, 1, "both were on the device");
-                stand.switches.brake.store(false, Ordering::Relaxed);
-            })
-        };
-        let (first, (second, ())) = tokio::join!(pair(&lanes[0], first), later);
-        first.and(second).expect("both are done");
-    }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

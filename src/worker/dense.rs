@@ -120,7 +120,6 @@ impl Worker {
             sweeps,
             fields,
             watch,
-            alone: super::is_suspect(job),
         };
         Ok((work, asked))
     }

@@ -85,7 +85,6 @@ impl Worker {
             target: target.points,
             snapshot,
             watch: Arc::new(watch),
-            alone: super::is_suspect(job),
         };
         Ok((work, self.keep_snapshots(lease, kept), options))
     }
