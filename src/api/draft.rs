@@ -166,20 +166,22 @@ impl Draft {
         let work = {
             let service = Arc::clone(&service);
             move || {
+                // As it came: what is found of it is no part of what was asked.
+                let asked = blake3::hash(&cloud.to_bytes());
                 let cloud = with_ground(cloud, &options);
                 let price = before.filter(|_| is_pair).map(|before| {
                     let admission = &service.admission;
                     admission.price(&before, &cloud, &options, goes_on)
                 });
-                Ok((price.transpose()?, cloud.to_bytes(), cloud))
+                Ok((price.transpose()?, asked, cloud.to_bytes(), cloud))
             }
         };
-        let (price, bytes, cloud) = service.compute(work).await?;
+        let (price, asked, bytes, cloud) = service.compute(work).await?;
         self.last = Some(Arc::clone(&cloud));
         if self.frames > 0 {
             self.prices.push(price);
         }
-        self.fingerprint.update(&bytes);
+        self.fingerprint.update(asked.as_bytes());
         let sync = match self.request.promise {
             Promise::Durable => Sync::Yes,
             Promise::WhileAwaited => Sync::No,

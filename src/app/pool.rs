@@ -95,12 +95,17 @@ impl Pool {
     /// for it would do nothing.
     fn add_the_best(&mut self, config: &Config, probe: Probe<'_>) -> anyhow::Result<()> {
         let mut found = false;
+        let mut taken = Taken::default();
         for card in welcome(config) {
-            let name = card.name.clone();
+            if taken.has(&card) {
+                continue;
+            }
+            let (name, place) = (card.name.clone(), card.pci_id.clone());
             let (lanes, open) = card_opener(card, config);
             match probe(&open) {
                 Ok(()) => {
                     found = true;
+                    taken.take(place);
                     self.add(DeviceKind::Gpu, lanes, open);
                 }
                 Err(reason) => tracing::warn!(card = name, reason, "a GPU is left out"),
@@ -119,8 +124,12 @@ impl Pool {
             // Says what there is instead.
             chosen(&Selector::Any, config)?;
         }
+        let mut taken = Taken::default();
         for card in cards {
-            self.add_gpu(card, config);
+            if !taken.has(&card) {
+                taken.take(card.pci_id.clone());
+                self.add_gpu(card, config);
+            }
         }
         Ok(())
     }
@@ -201,16 +210,19 @@ fn chosen(selector: &Selector, config: &Config) -> anyhow::Result<Adapter> {
 fn welcome(config: &Config) -> Vec<Adapter> {
     let mut cards = gpu::adapters();
     cards.retain(|card| config.software_gpu || card.kind != AdapterKind::Software);
-    once_each(cards)
+    cards
 }
 
-/// The cards without those that another driver has answered for already: both would take the
-/// memory of the same card.
-fn once_each(mut cards: Vec<Adapter>) -> Vec<Adapter> {
-    let mut places = HashSet::new();
-    cards.retain(|card| {
-        let is_new = card.pci_id.is_empty() || places.insert(card.pci_id.clone());
-        if !is_new {
+/// Where cards are that have been taken: a second driver that answers for one would take the memory
+/// of the same card.
+#[derive(Default)]
+struct Taken(HashSet<String>);
+
+impl Taken {
+    /// Whether another driver has this card already.
+    fn has(&self, card: &Adapter) -> bool {
+        let has = self.0.contains(&card.pci_id);
+        if has {
             tracing::info!(
                 card = card.name,
                 place = card.pci_id,
@@ -218,9 +230,15 @@ fn once_each(mut cards: Vec<Adapter>) -> Vec<Adapter> {
                 "left out: another driver answers for the same card"
             );
         }
-        is_new
-    });
-    cards
+        has
+    }
+
+    fn take(&mut self, place: String) {
+        // Where the driver gives no place, every card is its own.
+        if !place.is_empty() {
+            self.0.insert(place);
+        }
+    }
 }
 
 /// The same card, asked for anew: what was known of it before it was lost may be stale.
@@ -351,10 +369,14 @@ mod tests {
             card
         };
         let cards = ["0000:01:00.0", "0000:02:00.0", "0000:01:00.0", "", ""].map(at);
-        let kept: Vec<_> = once_each(cards.into())
-            .into_iter()
-            .map(|card| card.pci_id)
-            .collect();
+        let mut taken = Taken::default();
+        let mut kept = Vec::new();
+        for card in cards {
+            if !taken.has(&card) {
+                taken.take(card.pci_id.clone());
+                kept.push(card.pci_id);
+            }
+        }
         assert_eq!(kept, ["0000:01:00.0", "0000:02:00.0", "", ""]);
     }
 

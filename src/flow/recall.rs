@@ -2,7 +2,7 @@
 //!
 //! A sweep of a sequence is the target of a pair, the source of the next one and, where pairs see
 //! more than their own, around others: its ground and its surface are found once. Sweeps are told
-//! by all their points, so that nothing is mistaken for something else and the bits are those that
+//! by the bits of all their points, so that nothing is mistaken for something else and the bits are those that
 //! would be found again. It must not know what is found.
 
 use std::collections::VecDeque;
@@ -11,8 +11,11 @@ use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use super::ego::Surface;
 use super::points::Point;
 
-/// The points of all sweeps that are remembered: some twenty full sweeps, 60 MB with their surfaces.
+/// The points of all sweeps that are remembered: some twenty full sweeps, mostly 60 MB with their
+/// surfaces, and 230 MB where no two points share a voxel.
 const POINTS: usize = 2 << 20;
+/// The most sweeps: looking through them takes no time beside finding anything.
+const SWEEPS: usize = 64;
 
 /// What is known of a sweep.
 pub(crate) struct Known {
@@ -44,6 +47,11 @@ fn found<T>(lock: &OnceLock<T>, find: impl FnOnce() -> T) -> &T {
     lock.get_or_init(|| new)
 }
 
+/// Whether two clouds have the same bits.
+fn same(a: &[Point], b: &[Point]) -> bool {
+    bytemuck::cast_slice::<Point, u8>(a) == bytemuck::cast_slice::<Point, u8>(b)
+}
+
 /// The sweeps that were seen last.
 #[derive(Default)]
 pub(crate) struct Recall(Mutex<VecDeque<Arc<Known>>>);
@@ -61,7 +69,7 @@ impl Recall {
     /// What is known of the sweep of these points.
     pub(crate) fn of(&self, points: &[Point]) -> Arc<Known> {
         let mut sweeps = self.sweeps();
-        let known = match sweeps.iter().position(|known| known.points == points) {
+        let known = match sweeps.iter().position(|known| same(&known.points, points)) {
             Some(place) => sweeps.remove(place),
             None => None,
         };
@@ -76,6 +84,7 @@ impl Recall {
             return known;
         }
         sweeps.push_front(Arc::clone(&known));
+        sweeps.truncate(SWEEPS);
         let mut held = 0;
         sweeps.retain(|known| {
             held += known.points.len();
@@ -107,7 +116,7 @@ mod tests {
             [true; 100]
         );
         let mut other = sweep(100, 1.0);
-        other[99][2] = 1e-9;
+        other[99][2] = -0.0;
         for other in [other, sweep(99, 1.0), sweep(100, 2.0)] {
             let ground = recall.of(&other);
             let ground = ground.ground(|points| vec![false; points.len()]);
@@ -139,5 +148,9 @@ mod tests {
         assert_eq!(held(&recall), before);
         recall.forget();
         assert_eq!(held(&recall), 0);
+        for few in 0..=SWEEPS as u16 {
+            recall.of(&sweep(3, few.into()));
+        }
+        assert_eq!(recall.sweeps().len(), SWEEPS);
     }
 }

@@ -11,7 +11,7 @@ const ROW_BYTES: u64 = (HIDDEN_LAYERS * WIDTH * size_of::<f32>()) as u64;
 pub(super) const NETWORK_BYTES: u64 = (LAID_OUT * size_of::<f32>()) as u64;
 /// Bytes of a lane's arrays: those of all lanes lie in one binding.
 pub const LANE_NETWORK_BYTES: u64 = ARRAYS as u64 * NETWORK_BYTES;
-/// The fewest rows that are worth a dispatch, and the largest chunk of points.
+/// The fewest rows that are worth a dispatch: no chunk has more points.
 pub(super) const LEAST_ROWS: u64 = 8192;
 /// The most rows: more of them would be busy no longer at once on any card.
 const MOST_ROWS: u64 = 1 << 19;

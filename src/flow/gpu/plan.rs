@@ -1,6 +1,6 @@
 //! How a submission's points are cut up: tiles for the network, chunks for the gradients, waves
-//! for the memory; chunks as `sums.rs` says. By a batch's size alone, so that a pair's bits depend neither on the memory nor
-//! on which pairs share the submission. Knows no card.
+//! for the memory; chunks as `sums.rs` says. By a batch's size alone, so that a pair's bits depend
+//! neither on the memory nor on which pairs share the submission. Knows no card.
 
 use super::memory::LEAST_ROWS;
 use super::records::{Chunk, TILE, Tile};

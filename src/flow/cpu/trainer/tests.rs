@@ -109,6 +109,7 @@ fn the_number_of_threads_does_not_change_a_bit() {
 
 #[test]
 fn registers_of_any_width_give_the_same_bits_where_they_fuse() {
+    // Says something where the machine has both sets, as one with AVX-512 does.
     let fusing = Isa::available().into_iter();
     let fusing: Vec<Isa> = fusing.filter(|&isa| isa != Isa::Portable).collect();
     for preset in Preset::FITTED {

@@ -1,4 +1,4 @@
-// Single operations as IEEE 754 and the CPU round them, whatever a driver would rather make of them.
+// Single operations as IEEE 754 and the CPU round them, or as near to that as a driver lets them be.
 //
 // A driver may fuse a product with the sum that it goes into, and may round quotients and roots
 // carelessly; either sends the bits of an optimization elsewhere. Where a product is meant to be
@@ -28,20 +28,29 @@ fn fuses() -> bool {
     return fma(slightly_more_than_one, slightly_more_than_one, -square) != 0.0;
 }
 
-// A quotient; where the card can tell what it is short of, that is added.
+// A quotient. Where fma rounds once it tells what a quotient is short of, and what a reciprocal is:
+// twice, since the first correction may itself be careless.
 fn quotient(dividend: vec4<f32>, divisor: vec4<f32>) -> vec4<f32> {
-    let about = rounded4(dividend / divisor);
+    var about = rounded4(dividend / divisor);
     if !fuses() { return about; }
-    let short = fma(-about, divisor, dividend);
-    return rounded4(fma(short, 1.0 / divisor, about));
+    var reciprocal = rounded4(1.0 / divisor);
+    reciprocal = fma(reciprocal, fma(-divisor, reciprocal, vec4(1.0)), reciprocal);
+    for (var i = 0u; i < 2u; i++) {
+        about = fma(fma(-about, divisor, dividend), reciprocal, about);
+    }
+    return rounded4(about);
 }
 
 // A root, likewise; that of zero is exact.
 fn root(square: vec4<f32>) -> vec4<f32> {
-    let about = rounded4(sqrt(square));
-    if !fuses() { return about; }
-    let short = fma(-about, about, square);
-    return select(rounded4(fma(short, 0.5 / about, about)), about, short == vec4(0.0));
+    let first = rounded4(sqrt(square));
+    if !fuses() { return first; }
+    let half = 0.5 / first;
+    var about = first;
+    for (var i = 0u; i < 2u; i++) {
+        about = fma(fma(-about, about, square), half, about);
+    }
+    return select(rounded4(about), first, square == vec4(0.0));
 }
 
 // The Euclidean length.

@@ -3,7 +3,8 @@
 //
 // In: points, networks, and the middle layers' weights as halves. Out: a flow a row, metres, and
 // the activations of the eight hidden layers, [layer][row][128]. Mirrors forward.wgsl but for the
-// rounding of a middle layer's inputs and weights; sums, the first layer and the last are single.
+// rounding of a middle layer's inputs and weights and the order of sums; sums, the first layer and
+// the last are single.
 //
 // An invocation holds one feature of every point, but for the products and the last layer.
 // Activations stay single in memory, so that every other kernel is the same for both precisions;

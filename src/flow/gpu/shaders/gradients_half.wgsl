@@ -3,7 +3,8 @@
 //
 // In: activations, deltas. Out: the middle layers' part of one network's worth of partial gradients
 // a chunk. A workgroup does one layer (y) of one chunk (x). Mirrors gradients.wgsl, which does the
-// first layer and the last, but for the rounding of both factors; sums and biases are single.
+// first layer and the last, but for the rounding of both factors and the order of sums; sums and
+// biases are single.
 //
 // A subgroup holds two by four tiles of the product; where there are fewer subgroups than such
 // pieces the rows are gone through again. Deltas are multiplied by the batch's count before they
