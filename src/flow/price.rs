@@ -24,7 +24,7 @@ const ALIGNING: f64 = 4e9;
 const THINNING: f64 = 2e4;
 /// Bytes that are held for a point while it is: itself and a copy that is remembered, its voxel and
 /// its surfels, at most.
-const THINNING_BYTES: usize = 112;
+const THINNING_BYTES: usize = 96;
 /// Multiply-adds that take as long as a point's share of the search for movers, and the bytes that
 /// are held for it: its cell, its thinned copies, three indices by place, its normal.
 const LABELLING: f64 = 4e5;
