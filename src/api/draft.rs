@@ -167,13 +167,18 @@ impl Draft {
             let service = Arc::clone(&service);
             move || {
                 // As it came: what is found of it is no part of what was asked.
-                let asked = blake3::hash(&cloud.to_bytes());
+                let mut bytes = cloud.to_bytes();
+                let asked = blake3::hash(&bytes);
+                let known = cloud.ground.is_some();
                 let cloud = with_ground(cloud, &options);
+                if cloud.ground.is_some() != known {
+                    bytes = cloud.to_bytes();
+                }
                 let price = before.filter(|_| is_pair).map(|before| {
                     let admission = &service.admission;
                     admission.price(&before, &cloud, &options, goes_on)
                 });
-                Ok((price.transpose()?, asked, cloud.to_bytes(), cloud))
+                Ok((price.transpose()?, asked, bytes, cloud))
             }
         };
         let (price, asked, bytes, cloud) = service.compute(work).await?;

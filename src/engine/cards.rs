@@ -169,9 +169,7 @@ impl Backend for CardLane {
                 available: room as u64,
             });
         }
-        let deadly = self.switches.deadly.load(Ordering::Relaxed);
         Ok(Box::new(CardTransform {
-            kills: !on_trial && deadly == source.len(),
             cpu: self.cpu.transform(source, target, options, watch)?,
             switches: (!on_trial).then(|| Arc::clone(&self.switches)),
             lost: Arc::clone(&self.lost),
@@ -184,7 +182,6 @@ impl Backend for CardLane {
 }
 
 struct CardTransform {
-    kills: bool,
     cpu: Box<dyn Transform>,
     switches: Option<Arc<Switches>>,
     lost: Arc<AtomicBool>,
@@ -205,7 +202,10 @@ impl Transform for CardTransform {
         options: &Options,
     ) -> Result<Box<dyn Trainer + '_>, BackendError> {
         Ok(Box::new(CardTrainer {
-            kills: self.kills,
+            kills: self
+                .switches
+                .as_ref()
+                .is_some_and(|switches| switches.deadly.load(Ordering::Relaxed) == source.len()),
             cpu: self.cpu.start(source, options)?,
             switches: self.switches.clone(),
             lost: Arc::clone(&self.lost),

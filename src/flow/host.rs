@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use super::backend::BackendError;
 use super::ego;
-use super::ground::{self, GroundOptions};
+use super::ground;
 use super::label::{self, Clouds, Labelled};
 use super::options::LabelOptions;
 use super::points::{Point, RigidTransform};
@@ -85,9 +85,10 @@ impl Host {
 
     /// Which points of each sweep are ground; all of them are finite and in range.
     pub(crate) fn ground(&self, sweeps: &[&[Point]]) -> Vec<Vec<bool>> {
-        let find = |points: &[Point]| ground::segment(points, &GroundOptions::default()).ground;
         let known: Vec<_> = sweeps.iter().map(|points| self.recall.of(points)).collect();
-        let found = known.par_iter().map(|known| known.ground(find).clone());
+        let found = known
+            .par_iter()
+            .map(|known| known.ground(ground::mask).clone());
         self.threads.install(|| found.collect())
     }
 

@@ -65,6 +65,7 @@ mod early_stop;
 #[cfg(feature = "gpu")]
 pub mod gpu;
 mod host;
+mod once;
 mod optimizer;
 mod recall;
 mod sums;

@@ -5,7 +5,7 @@
 use super::around::Around;
 use super::error::FlowError;
 use super::field::Field;
-use super::ground::{self, GroundOptions};
+use super::ground;
 use super::options::{Ego, Ground, Options};
 use super::points::{MIN_POINTS, Point};
 use super::random::Random;
@@ -49,8 +49,7 @@ pub(crate) type FindGround<'a> = &'a dyn Fn(&[&[Point]]) -> Vec<Vec<bool>>;
 
 /// Finds the ground on this thread, and remembers nothing.
 pub(crate) fn find_ground(sweeps: &[&[Point]]) -> Vec<Vec<bool>> {
-    let segmented = |points: &&[Point]| ground::segment(points, &GroundOptions::default()).ground;
-    sweeps.iter().map(segmented).collect()
+    sweeps.iter().map(|points| ground::mask(points)).collect()
 }
 
 /// Selects by `options`; refuses clouds of which too little is left.

@@ -2,13 +2,14 @@
 //!
 //! A sweep of a sequence is the target of a pair, the source of the next one and, where pairs see
 //! more than their own, around others: its ground and its surface are found once. Sweeps are told
-//! by the bits of all their points, so that nothing is mistaken for something else and the bits are those that
-//! would be found again. It must not know what is found.
+//! by the bits of all their points, so that nothing is mistaken for something else and the bits are
+//! those that would be found again. It must not know pairs.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 use super::ego::Surface;
+use super::once::found;
 use super::points::Point;
 
 /// The points of all sweeps that are remembered: some twenty full sweeps, mostly 60 MB with their
@@ -35,16 +36,6 @@ impl Known {
     pub(crate) fn surface(&self) -> &Surface {
         found(&self.surface, || Surface::new(&self.points))
     }
-}
-
-/// What a lock holds, found first where it holds nothing. Not inside of the lock: who waits for a
-/// thread there may be given work that needs the same.
-fn found<T>(lock: &OnceLock<T>, find: impl FnOnce() -> T) -> &T {
-    if let Some(found) = lock.get() {
-        return found;
-    }
-    let new = find();
-    lock.get_or_init(|| new)
 }
 
 /// Whether two clouds have the same bits.

@@ -10,6 +10,7 @@ use rayon::prelude::*;
 
 use super::thin::REACH;
 use crate::flow::flat::{Flat, Neighborhood};
+use crate::flow::once::found;
 use crate::flow::points::{Point, evenly, square_distance};
 
 /// Points whose surfels one thread makes at a time.
@@ -112,14 +113,7 @@ impl Surfels {
     /// All of them.
     pub(super) fn all(&self) -> AllSurfels<'_> {
         let columns = &self.columns;
-        // Not inside of the lock: who waits for a thread here may be given work that needs it too.
-        let flats = match self.flats.get() {
-            Some(flats) => flats,
-            None => {
-                let found = columns.flats(&columns.points);
-                self.flats.get_or_init(|| found)
-            }
-        };
+        let flats = found(&self.flats, || columns.flats(&columns.points));
         AllSurfels { columns, flats }
     }
 

@@ -164,7 +164,7 @@ impl State {
             if full || Some(request.precision) != precision {
                 return false;
             }
-            chunks += request.cut.chunks as u64;
+            chunks += request.cut.chunks.count as u64;
             full =
                 fitting > 0 && (chunks > card.budget.chunks || fitting as u64 >= card.budget.lanes);
             fitting += usize::from(!full);
@@ -252,12 +252,12 @@ pub(super) fn write(card: &Card, buffers: &Buffers, requests: &[&Request]) {
             first_tile: first_tile as u32,
             tiles: request.cut.tiles as u32,
             first_chunk: first_chunk as u32,
-            chunks: request.cut.chunks as u32,
+            chunks: request.cut.chunks.count as u32,
             steps: request.steps.len() as u32,
             ..request.lane
         });
         first_tile += request.cut.tiles;
-        first_chunk += request.cut.chunks;
+        first_chunk += request.cut.chunks.count;
         steps[index * STEPS..][..request.steps.len()].copy_from_slice(&request.steps);
     }
     let statuses: Vec<_> = requests.iter().map(|request| request.status).collect();

@@ -13,24 +13,21 @@ const _: () = assert!(STRETCH.is_multiple_of(TILE) && MOST_POINTS <= LEAST_ROWS 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Cut {
     pub(super) tiles: usize,
-    pub(super) chunks: usize,
-    of_points: Chunks,
+    pub(super) chunks: Chunks,
 }
 
 impl Cut {
     /// Cuts a batch of at most `points` points.
     pub(super) fn new(points: usize) -> Self {
-        let of_points = Chunks::new(points);
         Self {
             tiles: points.div_ceil(TILE).max(1),
-            chunks: of_points.count,
-            of_points,
+            chunks: Chunks::new(points),
         }
     }
 
     /// The tiles of a chunk.
     fn tiles_of(&self, chunk: usize) -> core::ops::Range<usize> {
-        let points = self.of_points.points(chunk);
+        let points = self.chunks.points(chunk);
         points.start / TILE..(points.end / TILE).min(self.tiles)
     }
 }
@@ -58,7 +55,7 @@ impl Plan {
         let mut plan = Self::default();
         let mut wave = Wave::default();
         for (lane, cut) in (0..).zip(cuts) {
-            for chunk in 0..cut.chunks {
+            for chunk in 0..cut.chunks.count {
                 let tiles = cut.tiles_of(chunk);
                 if (wave.tiles + tiles.len()) * TILE > rows && wave.tiles > 0 {
                     plan.waves.push(wave);
@@ -99,7 +96,7 @@ mod tests {
                 let cut = Cut::new(points);
                 let plan = Plan::new(&[cut, Cut::new(100)], rows);
                 assert_eq!(plan.tiles.len(), cut.tiles + 2);
-                assert_eq!(plan.chunks.len(), cut.chunks + 1);
+                assert_eq!(plan.chunks.len(), cut.chunks.count + 1);
                 let (mut tile, mut chunk) = (0, 0);
                 for wave in &plan.waves {
                     assert_eq!([wave.first_tile, wave.first_chunk], [tile, chunk]);

@@ -96,7 +96,7 @@ fn computed(card: &Card, units: &Units) -> Result<[Computed; 2], BackendError> {
     let budget = Budget {
         lanes: 1,
         rows: (cut.tiles * TILE) as u64,
-        chunks: cut.chunks as u64,
+        chunks: cut.chunks.count as u64,
         store_words: 3 * POINTS as u64,
     };
     let more = wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST;

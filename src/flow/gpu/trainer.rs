@@ -88,7 +88,7 @@ impl<'a> GpuTrainer<'a> {
             card.units()?;
         }
         let (course, parameters) = Course::new(source, options);
-        let chunks = Cut::new(course.largest_batch()).chunks as u64;
+        let chunks = Cut::new(course.largest_batch()).chunks.count as u64;
         if chunks > card.budget.chunks {
             return Err(BackendError::Memory {
                 what: "gradients",

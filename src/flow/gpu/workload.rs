@@ -69,7 +69,7 @@ pub fn kernel_times(
     let request = Request {
         lane: Lane {
             tiles: cut.tiles as u32,
-            chunks: cut.chunks as u32,
+            chunks: cut.chunks.count as u32,
             ..trainer.lane()
         },
         status: Status::default(),

@@ -17,3 +17,10 @@ mod surface;
 
 pub use options::GroundOptions;
 pub use segment::{GroundSegmentation, segment};
+
+use super::Point;
+
+/// Which of the points are ground, by the usual options; all of them are finite and in range.
+pub(crate) fn mask(points: &[Point]) -> Vec<bool> {
+    segment(points, &GroundOptions::default()).ground
+}
