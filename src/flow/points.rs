@@ -22,6 +22,20 @@ pub(crate) fn square_distance(a: Point, b: Point) -> f32 {
     x * x + y * y + z * z
 }
 
+/// The largest whole number that is not above `value`: what [`f32::floor`] gives, but for the sign of
+/// zero, which calls a function where processors are not known to have an instruction for it.
+#[inline]
+pub(crate) fn floor(value: f32) -> f32 {
+    /// From here on all numbers are whole.
+    const WHOLE: f32 = (1 << 23) as f32;
+    if value.abs() < WHOLE {
+        let toward_zero = value as i32 as f32;
+        toward_zero - f32::from(toward_zero > value)
+    } else {
+        value
+    }
+}
+
 /// At most `most` of the points, or of anything else, evenly.
 pub(crate) fn evenly<T: Copy>(all: &[T], most: usize) -> Vec<T> {
     let kept = all.len().min(most);
@@ -39,6 +53,28 @@ pub const MIN_POINTS: usize = 3;
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_floor_is_that_of_the_library() {
+        let values = [
+            0.0,
+            0.5,
+            1.0,
+            2.999_999_8,
+            8_388_607.5,
+            8_388_608.0,
+            3e9,
+            1e30,
+            f32::INFINITY,
+        ];
+        for value in values
+            .into_iter()
+            .flat_map(|value| [value, -value, value + 0.25, -value - 0.25])
+        {
+            assert_eq!(floor(value), value.floor(), "{value}");
+        }
+        assert!(floor(f32::NAN).is_nan());
+    }
 
     #[test]
     fn some_of_the_points_are_spread_over_all_of_them() {

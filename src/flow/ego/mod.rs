@@ -1,7 +1,7 @@
 //! Ego motion: the rigid motion that carries most source points onto the target.
 //!
 //! ```text
-//! two clouds - thinned - search: nine starts on coarse surfels - refinement on fine ones - motion
+//! two clouds - thinned - search: up to nine starts on coarse surfels - refinement on fine ones - motion
 //! ```
 //!
 //! Plane to plane on evenly thinned clouds, robustly weighted, from a prior. Needs the ground, which

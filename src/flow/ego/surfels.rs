@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use super::thin::REACH;
 use crate::flow::flat::{Flat, Neighborhood};
 use crate::flow::once::found;
-use crate::flow::points::{Point, evenly, square_distance};
+use crate::flow::points::{Point, evenly, floor, square_distance};
 
 /// Points whose surfels one thread makes at a time.
 const POINTS_AT_ONCE: usize = 256;
@@ -160,7 +160,7 @@ impl AllSurfels<'_> {
 
 /// The column of a point within reach; one cell of room is left around all of them.
 fn column(point: Point, cell_m: f32) -> u64 {
-    let [x, y] = [point[0], point[1]].map(|c| ((c / cell_m).floor() + REACH + 1.0) as u64);
+    let [x, y] = [point[0], point[1]].map(|c| (floor(c / cell_m) + REACH + 1.0) as u64);
     x << 32 | y
 }
 

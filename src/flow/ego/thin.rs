@@ -2,7 +2,7 @@
 //!
 //! It must not know what the points are for.
 
-use crate::flow::Point;
+use crate::flow::points::{Point, floor};
 
 /// Voxels along an axis on each side of the origin; what is farther is left out.
 pub(super) const REACH: f32 = (1 << 20) as f32;
@@ -20,7 +20,7 @@ pub(super) fn thinned(points: &[Point], voxel_m: f32) -> Vec<Point> {
 
 /// The voxel's number; none out of reach.
 fn key(point: Point, voxel_m: f32) -> Option<u64> {
-    let at = point.map(|c| (c / voxel_m).floor());
+    let at = point.map(|c| floor(c / voxel_m));
     let [x, y, z] = at.map(|c| (c + REACH) as u64);
     at.iter()
         .all(|c| c.abs() < REACH)

@@ -7,7 +7,7 @@
 use rayon::prelude::*;
 
 use super::scene::one_a_voxel;
-use crate::flow::points::{Point, square_distance};
+use crate::flow::points::{Point, floor, square_distance};
 
 /// More cores of a cell than this are thinned, to one a voxel of a share of the radius.
 const FULL: usize = 64;
@@ -220,7 +220,7 @@ impl<'a> Cells<'a> {
 }
 
 fn key(point: Point, side_m: f32) -> u64 {
-    let at = |c: f32| ((c / side_m).floor().clamp(-REACH, REACH) + REACH + 4.0) as u64;
+    let at = |c: f32| (floor(c / side_m).clamp(-REACH, REACH) + REACH + 4.0) as u64;
     at(point[0]) << (2 * HEIGHT) | at(point[1]) << HEIGHT | at(point[2])
 }
 

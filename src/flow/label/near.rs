@@ -5,7 +5,7 @@
 
 use std::ops::Range;
 
-use crate::flow::points::{Point, square_distance};
+use crate::flow::points::{Point, floor, square_distance};
 
 /// Columns along an axis on each side of the origin; what is farther shares the outermost.
 const REACH: f32 = (1 << 30) as f32;
@@ -192,7 +192,7 @@ impl Neighbors {
     fn of(center: Point, column_m: f32) -> Self {
         let gaps = |c: f32| {
             let columns = c / column_m;
-            let before_m = (columns - columns.floor()) * column_m;
+            let before_m = (columns - floor(columns)) * column_m;
             let slack_m = 4.0 * f32::EPSILON * (c.abs() + column_m);
             [before_m, column_m - before_m].map(|gap_m| (gap_m - slack_m).max(0.0).powi(2))
         };
@@ -221,7 +221,7 @@ impl Neighbors {
 
 /// The column that a point lies in.
 fn place(point: Point, column_m: f32) -> [i32; 2] {
-    [point[0], point[1]].map(|c| (c / column_m).floor().clamp(-REACH, REACH) as i32)
+    [point[0], point[1]].map(|c| floor(c / column_m).clamp(-REACH, REACH) as i32)
 }
 
 fn key([x, y]: [i32; 2]) -> u64 {

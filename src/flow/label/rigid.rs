@@ -310,9 +310,6 @@ impl<'a> Mover<'a> {
     /// How far a source point, moved, lies from the target, metres, truncated.
     fn distance(&self, scene: &Scene<'_>, row: u32, motion: &Motion) -> f32 {
         let moved = motion.apply(scene.source.points[row as usize]);
-        let target = scene.match_of(moved, self.cluster);
-        target.map_or(scene.options.truncation_m, |target| {
-            scene.distance(moved, target)
-        })
+        scene.distance_of(moved, self.cluster)
     }
 }

@@ -12,6 +12,7 @@ use super::near::Near;
 use crate::flow::Point;
 use crate::flow::flat::Neighborhood;
 use crate::flow::options::LabelOptions;
+use crate::flow::points::floor;
 
 /// Share of a cluster that must lie on the target for it to stand still plainly.
 const PLAIN: f32 = 0.9;
@@ -136,16 +137,17 @@ impl<'a> Scene<'a> {
         found.map(|(row, _)| row)
     }
 
-    /// Calls `see` with every source point within the match of a place.
-    pub(super) fn source_around(&self, place: Point, mut see: impl FnMut(u32)) {
+    /// Calls `see` with every source point within `within_m` metres of a place, at most the match,
+    /// heights shrunk.
+    pub(super) fn source_around(&self, place: Point, within_m: f32, mut see: impl FnMut(u32)) {
         let place = lowered(place, self.options);
-        let within_m = self.options.match_m;
         self.source.near.around(place, within_m, |row, _| see(row));
     }
 
-    /// How far a place lies from whatever target point is free, metres, truncated.
-    pub(super) fn plain_distance(&self, place: Point) -> f32 {
-        let target = self.match_of(place, NOISE);
+    /// How far a place that `cluster` may have moved to lies from the target, metres, truncated; for
+    /// [`NOISE`], from whatever of it is free.
+    pub(super) fn distance_of(&self, place: Point, cluster: u32) -> f32 {
+        let target = self.match_of(place, cluster);
         target.map_or(self.options.truncation_m, |target| {
             self.distance(place, target)
         })
@@ -211,7 +213,7 @@ fn lowered([x, y, z]: Point, options: &LabelOptions) -> Point {
 
 /// The first row of each voxel, in the order of the rows.
 pub(super) fn one_a_voxel(points: &[Point], side_m: f32) -> Vec<u32> {
-    let voxel = |point: &Point| point.map(|c| (c / side_m).floor() as i32);
+    let voxel = |point: &Point| point.map(|c| floor(c / side_m) as i32);
     let mut keyed: Vec<([i32; 3], u32)> = points.iter().map(voxel).zip(0..).collect();
     keyed.sort_unstable();
     keyed.dedup_by_key(|&mut (voxel, _)| voxel);

@@ -11,7 +11,6 @@ use super::moment::Moment;
 use super::motion::Motion;
 use super::rigid::{Found, Mover};
 use super::scene::Scene;
-use crate::flow::Point;
 use crate::flow::points::evenly;
 
 /// Points of a piece that look for movers beside it.
@@ -35,6 +34,18 @@ pub(super) fn spread(scene: &Scene<'_>, around: &[Moment<'_>], needed: &[Option<
         .into_par_iter()
         .map(|cluster| leader(scene, around, needed, cluster))
         .collect();
+    // How much worse its cluster's motion is than none, of each point; metres.
+    let points = scene.source.labels.par_iter().zip(&scene.source.points);
+    let worse_m: Vec<f32> = points
+        .map(|(&label, &place)| {
+            let leader = leaders.get(label as usize).copied().unwrap_or(NOISE);
+            let found = needed.get(leader as usize).and_then(Option::as_ref);
+            found.map_or(0.0, |found| {
+                let moved = found.motion.apply(place);
+                scene.distance_of(moved, label) - scene.distance_of(place, label)
+            })
+        })
+        .collect();
     let owners = (0..scene.source.points.len() as u32)
         .into_par_iter()
         .map(|row| match scene.source.labels[row as usize] {
@@ -42,7 +53,7 @@ pub(super) fn spread(scene: &Scene<'_>, around: &[Moment<'_>], needed: &[Option<
             label => {
                 let leader = leaders[label as usize];
                 match needed.get(leader as usize).and_then(Option::as_ref) {
-                    Some(found) if is_of(scene, row, &found.motion) => leader,
+                    Some(_) if is_of(scene, row, &worse_m) => leader,
                     _ => NOISE,
                 }
             }
@@ -58,7 +69,8 @@ fn leader(scene: &Scene<'_>, around: &[Moment<'_>], needed: &[Option<Found>], cl
     let size = |cluster: u32| scene.source.members[cluster as usize].len();
     let mut beside: Vec<u32> = Vec::new();
     for row in evenly(members, LOOKING) {
-        scene.source_around(scene.source.points[row as usize], |other| {
+        let place = scene.source.points[row as usize];
+        scene.source_around(place, scene.options.match_m, |other| {
             let label = scene.source.labels[other as usize];
             if label != NOISE && label != cluster && needed[label as usize].is_some() {
                 beside.push(label);
@@ -93,7 +105,7 @@ fn leader(scene: &Scene<'_>, around: &[Moment<'_>], needed: &[Option<Found>], cl
 fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Found>], row: u32) -> u32 {
     let place = scene.source.points[row as usize];
     let mut beside: Vec<u32> = Vec::new();
-    scene.source_around(place, |other| {
+    scene.source_around(place, scene.options.match_m, |other| {
         let label = scene.source.labels[other as usize];
         if label != NOISE && needed[label as usize].is_some() {
             beside.push(label);
@@ -101,11 +113,13 @@ fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Found>], row: u32) -> u32
     });
     beside.sort_unstable();
     beside.dedup();
-    let distance = |place: Point| scene.plain_distance(place);
-    let mut best = (distance(place) * scene.options.beside_cost, NOISE);
+    let mut best = (
+        scene.distance_of(place, NOISE) * scene.options.beside_cost,
+        NOISE,
+    );
     for label in beside {
         if let Some(found) = &needed[label as usize] {
-            let moved = distance(found.motion.apply(place));
+            let moved = scene.distance_of(found.motion.apply(place), NOISE);
             if moved < best.0 {
                 best = (moved, label);
             }
@@ -114,22 +128,17 @@ fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Found>], row: u32) -> u32
     best.1
 }
 
-/// Whether the points around one of a mover's are explained by its motion no worse than by none.
-fn is_of(scene: &Scene<'_>, row: u32, motion: &Motion) -> bool {
+/// Whether the points around one of a mover's are explained by its motion no worse than by none, given
+/// how much worse each is.
+fn is_of(scene: &Scene<'_>, row: u32, worse_m: &[f32]) -> bool {
     let label = scene.source.labels[row as usize];
     let center = scene.source.points[row as usize];
     let (mut worse, mut count) = (0.0, 0.0_f32);
-    scene.source_around(center, |other| {
+    scene.source_around(center, VOTE_M, |other| {
         let place = scene.source.points[other as usize];
         let near = (0..3).map(|a| (place[a] - center[a]).powi(2)).sum::<f32>();
         if scene.source.labels[other as usize] == label && near < VOTE_M * VOTE_M {
-            let distance = |place: Point| {
-                let target = scene.match_of(place, label);
-                target.map_or(scene.options.truncation_m, |target| {
-                    scene.distance(place, target)
-                })
-            };
-            worse += distance(motion.apply(place)) - distance(place);
+            worse += worse_m[other as usize];
             count += 1.0;
         }
     });
