@@ -16,6 +16,8 @@ use crate::flow::points::{Point, evenly, square_distance};
 const VOTERS: usize = 64;
 const FITTED: usize = 100;
 const JUDGED: usize = 200;
+/// Points between two looks at whether a cost is too high to matter.
+const JUDGED_AT_ONCE: usize = 16;
 /// Starts that a motion is fitted from, besides none: those that cost the least as they are.
 const PROMISING: usize = 2;
 /// Steps of the fit from each start, and of the last one.
@@ -67,6 +69,48 @@ pub(super) struct Witnesses {
     pub(super) nearest_m: [f32; 2],
 }
 
+/// The best of the motions that were considered.
+struct Judged {
+    motion: Motion,
+    cost: Cost,
+    /// What it is compared by: its cost, here and in the sweeps around, and what else counts, metres.
+    value_m: f32,
+}
+
+impl Judged {
+    /// Worse than any motion.
+    fn none() -> Self {
+        Self {
+            motion: Motion::still([0.0; 2]),
+            cost: Cost {
+                there_m: f32::INFINITY,
+                back_m: f32::INFINITY,
+            },
+            value_m: f32::INFINITY,
+        }
+    }
+
+    /// Takes a motion of `mover` that costs less, `more_m` of it added.
+    fn consider(&mut self, mover: &Mover<'_>, motion: Motion, more_m: impl Fn(&Motion) -> f32) {
+        let more_m = more_m(&motion);
+        let Some(cost) = mover.cost_below(&motion, more_m, self.value_m) else {
+            return;
+        };
+        let here_m = cost.sum_m() + more_m;
+        if here_m >= self.value_m {
+            return;
+        }
+        let value_m = here_m + mover.around_m(&motion);
+        if value_m < self.value_m {
+            *self = Self {
+                motion,
+                cost,
+                value_m,
+            };
+        }
+    }
+}
+
 /// One cluster, to be moved.
 pub(super) struct Mover<'a> {
     pub(super) scene: &'a Scene<'a>,
@@ -111,42 +155,39 @@ impl<'a> Mover<'a> {
         }
         let few = evenly(members, FITTED);
         let way_m = |motion: &Motion| options.way_penalty * motion.length_m();
-        let from = |start: &Motion| {
-            let motion = self.fitted(&[], &few, start, false, STEPS[0]);
-            let cost = self.cost(&motion);
-            let value = cost.sum_m() + way_m(&motion) + self.around_m(&motion);
-            (value, motion, cost)
-        };
-        let mut best = from(&standing);
-        if best.2.there_m >= options.near_m {
+        let from = |start: &Motion| self.fitted(&[], &few, start, false, STEPS[0]);
+        let mut best = Judged::none();
+        best.consider(self, from(&standing), way_m);
+        if best.cost.there_m >= options.near_m {
             let place = |row: u32| self.scene.source.points[row as usize];
             let voters: Vec<Point> = evenly(members, VOTERS).into_iter().map(place).collect();
             let shifts = ballot.peaks(&voters, options.starts);
-            let starts = shifts.into_iter().map(|shift| {
-                let start = standing.shifted(shift);
-                (self.cost(&start).sum_m() + way_m(&start), start)
-            });
-            let mut starts: Vec<(f32, Motion)> = starts.collect();
-            starts.sort_by(|a, b| a.0.total_cmp(&b.0));
-            for (_, start) in starts.iter().take(PROMISING) {
-                let other = from(start);
-                if other.0 < best.0 {
-                    best = other;
+            let mut promising: Vec<(f32, Motion)> = Vec::new();
+            for start in shifts.into_iter().map(|shift| standing.shifted(shift)) {
+                let least = promising.get(PROMISING - 1);
+                let least_m = least.map_or(f32::INFINITY, |&(value_m, _)| value_m);
+                if let Some(cost) = self.cost_below(&start, way_m(&start), least_m) {
+                    let value_m = cost.sum_m() + way_m(&start);
+                    let place = promising.partition_point(|&(other_m, _)| other_m <= value_m);
+                    promising.insert(place, (value_m, start));
+                    promising.truncate(PROMISING);
                 }
             }
+            for (_, start) in &promising {
+                best.consider(self, from(start), way_m);
+            }
         }
-        let (_, start, cost) = best;
-        if still.there_m - cost.there_m < options.gain_m {
+        if still.there_m - best.cost.there_m < options.gain_m {
             return None;
         }
         let motion = self.fitted(
             self.around,
             &self.rows,
-            &start,
+            &best.motion,
             members.len() >= TURNED,
             STEPS[1],
         );
-        let (motion, cost) = self.tried(motion);
+        let Judged { motion, cost, .. } = self.tried(motion);
         Some(Found {
             motion,
             cost,
@@ -156,14 +197,14 @@ impl<'a> Mover<'a> {
         })
     }
 
-    /// The motion of least cost among those a few shifts away, and its cost.
-    fn tried(&self, start: Motion) -> (Motion, Cost) {
-        let cost = self.cost(&start);
-        let mut best = (start, cost);
-        let mut least = cost.sum_m() + self.around_m(&start);
+    /// The motion of least cost among those a few shifts away.
+    fn tried(&self, start: Motion) -> Judged {
+        let no_matter = |_: &Motion| 0.0;
+        let mut best = Judged::none();
+        best.consider(self, start, no_matter);
         for shift_m in SHIFTS_M {
             for _ in 0..TRIES {
-                let center = best.0;
+                let center = best.motion;
                 let around = [
                     [shift_m, 0.0],
                     [-shift_m, 0.0],
@@ -171,14 +212,9 @@ impl<'a> Mover<'a> {
                     [0.0, -shift_m],
                 ];
                 for motion in around.map(|shift| center.shifted(shift)) {
-                    let cost = self.cost(&motion);
-                    let sum_m = cost.sum_m() + self.around_m(&motion);
-                    if sum_m < least {
-                        least = sum_m;
-                        best = (motion, cost);
-                    }
+                    best.consider(self, motion, no_matter);
                 }
-                if best.0 == center {
+                if best.motion == center {
                     break;
                 }
             }
@@ -189,6 +225,25 @@ impl<'a> Mover<'a> {
     /// What a motion costs.
     pub(super) fn cost(&self, motion: &Motion) -> Cost {
         self.cost_in(self.scene, motion)
+    }
+
+    /// What a motion costs; none where that and `more_m` are plainly no less than `least_m`, metres: half
+    /// of the cost shows that of most motions, and some of the points that half.
+    fn cost_below(&self, motion: &Motion, more_m: f32, least_m: f32) -> Option<Cost> {
+        let count = self.rows.len().max(1) as f32;
+        let mut sum = 0.0;
+        for rows in self.rows.chunks(JUDGED_AT_ONCE) {
+            for &row in rows {
+                sum += self.distance(self.scene, row, motion);
+            }
+            if sum / count + more_m >= least_m {
+                return None;
+            }
+        }
+        Some(Cost {
+            there_m: sum / count,
+            back_m: self.back_m(self.scene, motion),
+        })
     }
 
     /// What those sweeps around that see the cluster, moved or not, say of a motion.
@@ -221,31 +276,31 @@ impl<'a> Mover<'a> {
 
     /// What a motion that leads into the sweep of `scene` costs there.
     fn cost_in(&self, scene: &Scene<'_>, motion: &Motion) -> Cost {
-        let options = scene.options;
-        let mean = |sum: f32, count: usize| sum / count.max(1) as f32;
-        let there: f32 = self
-            .rows
-            .iter()
-            .map(|&row| self.distance(scene, row, motion))
-            .sum();
+        let distances = self.rows.iter();
+        let distances = distances.map(|&row| self.distance(scene, row, motion));
+        Cost {
+            there_m: distances.sum::<f32>() / self.rows.len().max(1) as f32,
+            back_m: self.back_m(scene, motion),
+        }
+    }
+
+    /// How far the sweep of `scene` lies from the moved cluster where that touches it, metres.
+    fn back_m(&self, scene: &Scene<'_>, motion: &Motion) -> f32 {
+        let truncation_m = scene.options.truncation_m;
         let touched = scene.touched(&self.rows, self.cluster, motion);
         let touched = evenly(&touched, JUDGED);
         let back = touched.iter().map(|&row| {
             let place = motion.undo(scene.target[row as usize]);
             let origin = scene.origin_of(place, self.cluster);
-            origin.map_or(options.truncation_m, |origin| {
+            origin.map_or(truncation_m, |origin| {
                 let moved = motion.apply(scene.source.points[origin as usize]);
                 scene.distance(moved, row)
             })
         });
-        let back_m = if touched.is_empty() {
-            options.truncation_m
+        if touched.is_empty() {
+            truncation_m
         } else {
-            mean(back.sum(), touched.len())
-        };
-        Cost {
-            there_m: mean(there, self.rows.len()),
-            back_m,
+            back.sum::<f32>() / touched.len() as f32
         }
     }
 
