@@ -85,6 +85,42 @@ impl Near {
         }
     }
 
+    /// Calls `see` with the row of everything that lies less than `within_m` (a column's side at most)
+    /// from `center` and was not yet `seen`.
+    pub(super) fn around_unseen(
+        &self,
+        center: Point,
+        within_m: f32,
+        seen: &mut Seen,
+        mut see: impl FnMut(u32),
+    ) {
+        let neighbors = Neighbors::of(center, self.column_m);
+        for offset in OFFSETS {
+            if neighbors.square_gap(offset) > within_m * within_m {
+                continue;
+            }
+            let Range { start, end } = self.column(neighbors.key(offset));
+            let column = &self.points[start..end];
+            let mut place = start + column.partition_point(|point| point[2] < center[2] - within_m);
+            while let Some(unseen) = seen.next_unseen(place..end) {
+                let point = self.points[unseen];
+                if point[2] > center[2] + within_m {
+                    break;
+                }
+                if square_distance(center, point) < within_m * within_m {
+                    seen.add(unseen);
+                    see(self.rows[unseen]);
+                }
+                place = unseen + 1;
+            }
+        }
+    }
+
+    /// None of the points.
+    pub(super) fn unseen(&self) -> Seen {
+        Seen(vec![0; self.points.len().div_ceil(64)])
+    }
+
     /// Calls `see` with every point of the columns that touch the square of `half_m` around
     /// `center`, no more than `height_m` higher or lower.
     pub(super) fn square_around(
@@ -163,6 +199,31 @@ impl Near {
             }
             slot = (slot + 1) & (self.table.len() - 1);
         }
+    }
+}
+
+/// Which of the points of a [`Near`] have been seen, in its order, a bit each.
+pub(super) struct Seen(Vec<u64>);
+
+impl Seen {
+    #[inline]
+    fn add(&mut self, place: usize) {
+        self.0[place / 64] |= 1 << (place % 64);
+    }
+
+    /// The first of some places that has not been seen.
+    #[inline]
+    fn next_unseen(&self, places: Range<usize>) -> Option<usize> {
+        let Range { mut start, end } = places;
+        while start < end {
+            let left = !self.0[start / 64] >> (start % 64);
+            if left != 0 {
+                let first = start + left.trailing_zeros() as usize;
+                return (first < end).then_some(first);
+            }
+            start = (start / 64 + 1) * 64;
+        }
+        None
     }
 }
 
@@ -289,6 +350,25 @@ mod tests {
                 assert_eq!(near.nearest(asked, within_m, |_| true), first);
             }
         }
+    }
+
+    #[test]
+    fn what_lies_near_several_places_is_seen_once_and_nothing_of_it_is_left_out() {
+        let mut random = Random::new(6);
+        let mut point = || [0; 3].map(|_| random.uniform(-3.0, 3.0) as f32);
+        let cloud: Vec<Point> = (0..3000).map(|_| point()).collect();
+        let near = Near::new(&cloud, 0.7);
+        let places: Vec<Point> = (0..40).map(|_| point()).collect();
+        let (mut seen, mut rows) = (near.unseen(), Vec::new());
+        for &place in &places {
+            near.around_unseen(place, 0.7, &mut seen, |row| rows.push(row));
+        }
+        rows.sort_unstable();
+        let is_near = |point: &Point| places.iter().any(|&p| square_distance(p, *point) < 0.49);
+        let expected = cloud.iter().zip(0..).filter(|(point, _)| is_near(point));
+        let expected: Vec<u32> = expected.map(|(_, row)| row).collect();
+        assert!(expected.len() > 500);
+        assert_eq!(rows, expected);
     }
 
     #[test]

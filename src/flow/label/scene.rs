@@ -157,15 +157,17 @@ impl<'a> Scene<'a> {
     /// their order.
     pub(super) fn touched(&self, rows: &[u32], cluster: u32, motion: &Motion) -> Vec<u32> {
         let within_m = self.options.match_m;
+        let mut seen = self.near_target.unseen();
         let mut touched = vec![0_u64; self.target.len().div_ceil(64)];
         for &row in rows {
             let place = lowered(motion.apply(self.source.points[row as usize]), self.options);
-            self.near_target.around(place, within_m, |row, _| {
-                let owner = self.taken[row as usize];
-                if owner == NOISE || owner == cluster {
-                    touched[row as usize / 64] |= 1 << (row % 64);
-                }
-            });
+            self.near_target
+                .around_unseen(place, within_m, &mut seen, |row| {
+                    let owner = self.taken[row as usize];
+                    if owner == NOISE || owner == cluster {
+                        touched[row as usize / 64] |= 1 << (row % 64);
+                    }
+                });
         }
         let words = touched.iter().zip((0..).step_by(64));
         words
