@@ -66,15 +66,9 @@ impl Near {
     /// side at most) from `center`.
     #[inline]
     pub(super) fn around(&self, center: Point, within_m: f32, mut see: impl FnMut(u32, Point)) {
-        let neighbors = Neighbors::of(center, self.column_m);
-        for offset in OFFSETS {
-            if neighbors.square_gap(offset) > within_m * within_m {
-                continue;
-            }
-            let Range { start, end } = self.column(neighbors.key(offset));
-            let column = &self.points[start..end];
-            let low = column.partition_point(|point| point[2] < center[2] - within_m);
-            for (&point, &row) in column[low..].iter().zip(&self.rows[start + low..end]) {
+        self.columns_around(center, within_m, |places| {
+            let rows = self.rows[places.clone()].iter();
+            for (&point, &row) in self.points[places].iter().zip(rows) {
                 if point[2] > center[2] + within_m {
                     break;
                 }
@@ -82,11 +76,10 @@ impl Near {
                     see(row, point);
                 }
             }
-        }
+        });
     }
 
-    /// Calls `see` with the row of everything that lies less than `within_m` (a column's side at most)
-    /// from `center` and was not yet `seen`.
+    /// Calls `see` with the row of everything that [`Self::around`] gives and that was not yet `seen`.
     pub(super) fn around_unseen(
         &self,
         center: Point,
@@ -94,15 +87,8 @@ impl Near {
         seen: &mut Seen,
         mut see: impl FnMut(u32),
     ) {
-        let neighbors = Neighbors::of(center, self.column_m);
-        for offset in OFFSETS {
-            if neighbors.square_gap(offset) > within_m * within_m {
-                continue;
-            }
-            let Range { start, end } = self.column(neighbors.key(offset));
-            let column = &self.points[start..end];
-            let mut place = start + column.partition_point(|point| point[2] < center[2] - within_m);
-            while let Some(unseen) = seen.next_unseen(place..end) {
+        self.columns_around(center, within_m, |mut places| {
+            while let Some(unseen) = seen.next_unseen(places.clone()) {
                 let point = self.points[unseen];
                 if point[2] > center[2] + within_m {
                     break;
@@ -111,8 +97,24 @@ impl Near {
                     seen.add(unseen);
                     see(self.rows[unseen]);
                 }
-                place = unseen + 1;
+                places.start = unseen + 1;
             }
+        });
+    }
+
+    /// Calls `see` with where the points of each column are that may come within `within_m` of
+    /// `center`, from the lowest that may.
+    #[inline]
+    fn columns_around(&self, center: Point, within_m: f32, mut see: impl FnMut(Range<usize>)) {
+        let neighbors = Neighbors::of(center, self.column_m);
+        for offset in OFFSETS {
+            if neighbors.square_gap(offset) > within_m * within_m {
+                continue;
+            }
+            let Range { start, end } = self.column(neighbors.key(offset));
+            let column = &self.points[start..end];
+            let low = column.partition_point(|point| point[2] < center[2] - within_m);
+            see(start + low..end);
         }
     }
 

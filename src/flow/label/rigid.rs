@@ -90,9 +90,8 @@ impl Judged {
         }
     }
 
-    /// Takes a motion of `mover` that costs less, `more_m` of it added.
-    fn consider(&mut self, mover: &Mover<'_>, motion: Motion, more_m: impl Fn(&Motion) -> f32) {
-        let more_m = more_m(&motion);
+    /// Takes a motion of `mover` that costs less, `more_m` metres added.
+    fn consider(&mut self, mover: &Mover<'_>, motion: Motion, more_m: f32) {
         let Some(cost) = mover.cost_below(&motion, more_m, self.value_m) else {
             return;
         };
@@ -155,10 +154,13 @@ impl<'a> Mover<'a> {
         }
         let few = evenly(members, FITTED);
         let way_m = |motion: &Motion| options.way_penalty * motion.length_m();
-        let from = |start: &Motion| self.fitted(&[], &few, start, false, STEPS[0]);
         let mut best = Judged::none();
-        best.consider(self, from(&standing), way_m);
-        if best.cost.there_m >= options.near_m {
+        let mut fit_from = |start: &Motion| {
+            let motion = self.fitted(&[], &few, start, false, STEPS[0]);
+            best.consider(self, motion, way_m(&motion));
+            best.cost.there_m
+        };
+        if fit_from(&standing) >= options.near_m {
             let place = |row: u32| self.scene.source.points[row as usize];
             let voters: Vec<Point> = evenly(members, VOTERS).into_iter().map(place).collect();
             let shifts = ballot.peaks(&voters, options.starts);
@@ -174,7 +176,7 @@ impl<'a> Mover<'a> {
                 }
             }
             for (_, start) in &promising {
-                best.consider(self, from(start), way_m);
+                fit_from(start);
             }
         }
         if still.there_m - best.cost.there_m < options.gain_m {
@@ -199,9 +201,8 @@ impl<'a> Mover<'a> {
 
     /// The motion of least cost among those a few shifts away.
     fn tried(&self, start: Motion) -> Judged {
-        let no_matter = |_: &Motion| 0.0;
         let mut best = Judged::none();
-        best.consider(self, start, no_matter);
+        best.consider(self, start, 0.0);
         for shift_m in SHIFTS_M {
             for _ in 0..TRIES {
                 let center = best.motion;
@@ -212,7 +213,7 @@ impl<'a> Mover<'a> {
                     [0.0, -shift_m],
                 ];
                 for motion in around.map(|shift| center.shifted(shift)) {
-                    best.consider(self, motion, no_matter);
+                    best.consider(self, motion, 0.0);
                 }
                 if best.motion == center {
                     break;
