@@ -2,6 +2,7 @@
 
 mod drain;
 mod pool;
+mod process;
 #[cfg(test)]
 mod tests;
 mod upkeep;
@@ -21,13 +22,14 @@ use crate::api::{
     Admission, AdmissionLimits, Caller, Keys, ListenOptions, Listener, Parts, Readiness, Role,
     Service, ServiceLimits, admin_router, public_router, tls_acceptor,
 };
-use crate::blobs::Blobs;
 use crate::config::{Config, LimitsConfig, QueueConfig};
 use crate::cost::{CostModel, Lanes};
 use crate::engine::{Device, Health};
+use crate::health::{Heartbeat, StoreHealth};
 use crate::job::{DeviceKind, Tenant};
 use crate::metrics::Metrics;
 use crate::queue::{Queue, QueueOptions, SqliteQueue};
+use crate::storage::Blobs;
 use crate::worker::{Company, Drain, Worker, WorkerOptions};
 
 /// A server that runs.
@@ -40,6 +42,7 @@ pub struct App {
     workers: JoinSet<()>,
     workers_drain: Drain,
     draining: watch::Sender<bool>,
+    queue: Arc<dyn Queue>,
     listener: JoinHandle<()>,
     stop_listening: CancellationToken,
     upkeep: JoinSet<()>,
@@ -68,14 +71,19 @@ impl App {
             );
         }
         let keys = keys(&config)?;
+        process::keep_files_private();
+        process::survive_file_limits();
+        let files = process::raise_open_files();
 
         let (events, heard) = mpsc::unbounded_channel();
+        let blobs = Blobs::open(&config.data_dir.join("blobs"))
+            .with_context(|| format!("cannot use {}", config.data_dir.display()))?;
+        check_queue_is_there(&config, &blobs)?;
         let queue = SqliteQueue::open(&config.data_dir, queue_options(&config.queue), events)
             .with_context(|| format!("cannot open the queue in {}", config.data_dir.display()))?;
         let queue: Arc<dyn Queue> = Arc::new(queue);
         warn_of_stranded_jobs(queue.as_ref(), lanes);
-        let blobs = Blobs::open(&config.data_dir.join("blobs"))
-            .with_context(|| format!("cannot use {}", config.data_dir.display()))?;
+        let store_health = Arc::new(StoreHealth::default());
 
         let mut devices = Vec::new();
         for device in pool.devices {
@@ -99,10 +107,12 @@ impl App {
                 },
                 drain: workers_drain.clone(),
                 company: Arc::clone(&company),
+                store_health: Arc::clone(&store_health),
             };
             workers.spawn(worker.run());
         }
 
+        let keys_are_open = keys.is_open();
         let service = Arc::new(Service::new(Parts {
             queue: Arc::clone(&queue),
             blobs: blobs.clone(),
@@ -115,28 +125,45 @@ impl App {
             keys,
             limits: service_limits(&config.limits),
         }));
-        let upkeep = upkeep::start(&queue, &blobs, &metrics, &devices, heard);
-
-        let (draining, drains) = watch::channel(false);
-        let readiness = Readiness {
-            devices: devices.clone(),
-            draining: drains,
-        };
-        let admin = serve_admin(config.admin_listen, readiness, &metrics, &queue, &cost)?;
+        let runtime = Arc::new(Heartbeat::default());
+        let upkeep = upkeep::start(
+            &queue,
+            &blobs,
+            &metrics,
+            &devices,
+            heard,
+            (&store_health, &runtime),
+        );
         let tls = match &config.tls {
             None => None,
             Some(tls) => Some(tls_acceptor(&tls.certificate, &tls.key)?),
         };
-        let listener = Listener::bind(
-            config.listen,
-            tls,
-            listen_options(&config.limits),
-            Arc::clone(&metrics),
-        );
+        let mut options = listen_options(&config.limits);
+        options.needs_key = !keys_are_open;
+        if let Some(most) = files.filter(|&most| most < options.max_connections) {
+            tracing::warn!(
+                connections = most,
+                "fewer connections than max_connections: the system allows no more open files \
+                 (ulimit -n)"
+            );
+            options.max_connections = most.max(1);
+        }
+        let listener = Listener::bind(config.listen, tls, options, Some(Arc::clone(&metrics)));
         let listener = listener
             .await
             .with_context(|| format!("cannot listen on {}", config.listen))?;
         let public = listener.address()?;
+        let (draining, drains) = watch::channel(false);
+        let readiness = Readiness {
+            devices: devices.clone(),
+            draining: drains,
+            store: store_health,
+            loops: vec![
+                ("the runtime", runtime),
+                ("the public port", listener.heartbeat()),
+            ],
+        };
+        let admin = serve_admin(config.admin_listen, readiness, &metrics, &queue, &cost)?;
         let stop_listening = CancellationToken::new();
         let router = public_router(&service);
         let listener = tokio::spawn(listener.serve(router, stop_listening.clone()));
@@ -149,6 +176,7 @@ impl App {
             workers,
             workers_drain,
             draining,
+            queue,
             listener,
             stop_listening,
             upkeep,
@@ -201,35 +229,57 @@ impl App {
     }
 
     /// Waits until a fresh process may do what this one cannot: until the last device of a kind has
-    /// worked, is lost, and does not come back. Says which.
-    pub async fn given_up(&self) -> String {
-        let mut healths: Vec<_> = self.devices.iter().map(Device::health).collect();
-        loop {
-            if let Some(reason) = self.last_of_its_kind_is_gone() {
-                return reason;
-            }
-            let changes = healths.iter_mut().map(|health| Box::pin(health.changed()));
-            let (changed, ..) = futures_util::future::select_all(changes).await;
-            if changed.is_err() {
-                return "a device's threads have ended".to_owned();
-            }
+    /// worked, is lost, and does not come back, or until the queue or the public port has ended.
+    /// Says which.
+    pub async fn given_up(&mut self) -> String {
+        let (queue, listener) = (Arc::clone(&self.queue), &mut self.listener);
+        let devices = devices_given_up(&self.devices);
+        tokio::select! {
+            reason = devices => reason,
+            () = queue.ended() => "the queue's thread has ended".to_owned(),
+            _ = listener => "the public port has closed".to_owned(),
         }
     }
+}
 
-    fn last_of_its_kind_is_gone(&self) -> Option<String> {
-        DeviceKind::ALL.into_iter().find_map(|kind| {
-            let of_kind = || {
-                self.devices
-                    .iter()
-                    .filter(move |device| device.kind() == kind)
-            };
-            let may_work = of_kind().any(Device::may_work);
-            of_kind().find_map(|device| match &*device.health().borrow() {
-                Health::Gone(reason) if !may_work => Some(format!("{}: {reason}", device.name())),
-                _ => None,
-            })
-        })
+/// Waits until the last device of a kind has worked, is lost, and does not come back.
+async fn devices_given_up(devices: &[Device]) -> String {
+    let mut healths: Vec<_> = devices.iter().map(Device::health).collect();
+    loop {
+        if let Some(reason) = last_of_its_kind_is_gone(devices) {
+            return reason;
+        }
+        let changes = healths.iter_mut().map(|health| Box::pin(health.changed()));
+        let (changed, ..) = futures_util::future::select_all(changes).await;
+        if changed.is_err() {
+            return "a device's threads have ended".to_owned();
+        }
     }
+}
+
+fn last_of_its_kind_is_gone(devices: &[Device]) -> Option<String> {
+    DeviceKind::ALL.into_iter().find_map(|kind| {
+        let of_kind = || devices.iter().filter(move |device| device.kind() == kind);
+        let may_work = of_kind().any(Device::may_work);
+        of_kind().find_map(|device| match &*device.health().borrow() {
+            Health::Gone(reason) if !may_work => Some(format!("{}: {reason}", device.name())),
+            _ => None,
+        })
+    })
+}
+
+/// Refuses to make a new queue where payloads of an older one lie: its file was lost or moved, and
+/// all that it promised would be taken for rubbish.
+fn check_queue_is_there(config: &Config, blobs: &Blobs) -> anyhow::Result<()> {
+    let file = config.data_dir.join("queue.sqlite3");
+    if file.exists() || blobs.is_empty()? {
+        return Ok(());
+    }
+    Err(anyhow!(
+        "{} is missing, but payloads of its jobs lie in {}: put it back, or name another data_dir",
+        file.display(),
+        config.data_dir.join("blobs").display()
+    ))
 }
 
 /// Jobs of an earlier start may wait for a kind of device that this one does not have: they would
@@ -296,7 +346,9 @@ fn service_limits(config: &LimitsConfig) -> ServiceLimits {
     ServiceLimits {
         max_upload_bytes: config.max_upload_mib << 20,
         max_uploads_bytes: config.max_uploads_mib << 20,
+        max_answers_bytes: config.max_answers_mib << 20,
         min_free_bytes: config.min_free_mib << 20,
+        min_free_inodes: config.min_free_inodes,
         max_frames: config.max_frames,
         body_idle: Duration::from_secs(config.body_timeout_seconds),
         sequence_ahead: config.sequence_ahead,
@@ -320,10 +372,9 @@ fn serve_admin(
     queue: &Arc<dyn Queue>,
     cost: &Arc<CostModel>,
 ) -> anyhow::Result<SocketAddr> {
-    let listener = std::net::TcpListener::bind(address)
+    let socket = std::net::TcpListener::bind(address)
         .with_context(|| format!("cannot listen on {address}"))?;
-    listener.set_nonblocking(true)?;
-    let bound = listener.local_addr()?;
+    let bound = socket.local_addr()?;
     let router = admin_router(
         readiness,
         Arc::clone(metrics),
@@ -335,8 +386,10 @@ fn serve_admin(
         .build()?;
     let serve = move || {
         let served = runtime.block_on(async move {
-            let listener = tokio::net::TcpListener::from_std(listener)?;
-            axum::serve(listener, router).await
+            let options = ListenOptions::of_admin();
+            let listener = Listener::on(socket, options, None, Arc::default())?;
+            listener.serve(router, CancellationToken::new()).await;
+            std::io::Result::Ok(())
         });
         if let Err(error) = served {
             tracing::error!(%error, "the admin port has closed");

@@ -96,8 +96,12 @@ pub struct LimitsConfig {
     pub max_upload_mib: u64,
     /// All bodies that are being received, MiB.
     pub max_uploads_mib: u64,
+    /// All answers that are being made and sent, MiB.
+    pub max_answers_mib: u64,
     /// Room that stays free on the disk, MiB; with less, nothing more is accepted.
     pub min_free_mib: u64,
+    /// Files that can still be made on the disk (free inodes); with fewer, nothing more is accepted.
+    pub min_free_inodes: u64,
     /// Frames of one sequence.
     pub max_frames: u32,
     /// Predicted wait of a call that is answered with its flow, seconds.
@@ -220,7 +224,9 @@ impl Default for Config {
                 max_pair_mib: 8192,
                 max_upload_mib: 1024,
                 max_uploads_mib: 2048,
+                max_answers_mib: 1024,
                 min_free_mib: 1024,
+                min_free_inodes: 10_000,
                 max_frames: 1000,
                 max_wait_seconds: 30,
                 max_queue_seconds: 7 * DAY,

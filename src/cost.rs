@@ -12,8 +12,16 @@ use crate::job::DeviceKind;
 /// Multiply-adds of a nominal second: two cores with wide vector units.
 const NOMINAL_RATE: f64 = 2e11;
 
-/// Weight of a new measurement.
+/// Nominal seconds of any job, however small: it is written, leased, read and committed.
+const EACH: f64 = 0.005;
+
+/// Weight of a new measurement of a job of [`WHOLE`] nominal seconds or more; a smaller one has less,
+/// so that what is learned is learned of work and not of jobs.
 const FRESH: f64 = 0.1;
+const WHOLE: f64 = 0.1;
+
+/// A job of fewer nominal seconds says nothing of what work takes.
+const LEAST: f64 = 0.02;
 
 /// How many times slower or faster than nominal a machine is taken for.
 const RANGE: (f64, f64) = (1e-3, 1e3);
@@ -65,7 +73,7 @@ impl CostModel {
 
     /// Nominal seconds of some work.
     pub fn nominal(price: &Price) -> f64 {
-        price.seconds(NOMINAL_RATE)
+        EACH + price.seconds(NOMINAL_RATE)
     }
 
     /// Nominal seconds of asking a field about a point, so many times.
@@ -104,7 +112,7 @@ impl CostModel {
     /// Learns that work of `nominal` seconds took `measured` in a lane of that kind.
     pub fn learn(&self, kind: DeviceKind, nominal: f64, measured: f64) {
         let ratio = (measured / nominal).clamp(RANGE.0, RANGE.1);
-        if !ratio.is_finite() {
+        if !ratio.is_finite() || nominal < LEAST {
             return;
         }
         let mut log_factors = self
@@ -113,7 +121,8 @@ impl CostModel {
             .unwrap_or_else(PoisonError::into_inner);
         let fresh = ratio.ln();
         let log_factor = &mut log_factors[kind as usize];
-        *log_factor = Some(log_factor.map_or(fresh, |old| old + FRESH * (fresh - old)));
+        let weight = FRESH * (nominal / WHOLE).min(1.0);
+        *log_factor = Some(log_factor.map_or(fresh, |old| old + weight * (fresh - old)));
     }
 }
 
@@ -132,10 +141,14 @@ mod tests {
             learn(1.0, 0.5);
         }
         assert!((model.seconds(2.0) - 1.0).abs() < 1e-3);
+        // Tiny jobs take what jobs take, whatever their work is.
+        for _ in 0..1000 {
+            learn(0.01, 0.2);
+        }
         for (nominal, measured) in [(0.0, 0.0), (1.0, f64::NAN), (0.0, 1.0)] {
             learn(nominal, measured);
         }
-        assert!(model.seconds(2.0).is_finite() && model.seconds(2.0) < 100.0);
+        assert!((model.seconds(2.0) - 1.0).abs() < 1e-3);
     }
 
     #[test]

@@ -16,8 +16,6 @@ pub mod api;
 #[cfg(feature = "service")]
 pub mod app;
 #[cfg(feature = "service")]
-pub mod blobs;
-#[cfg(feature = "service")]
 pub mod cli;
 #[cfg(feature = "service")]
 pub mod clock;
@@ -30,6 +28,8 @@ pub mod engine;
 #[cfg(feature = "service")]
 pub mod formats;
 #[cfg(feature = "service")]
+pub mod health;
+#[cfg(feature = "service")]
 pub mod job;
 #[cfg(feature = "service")]
 pub mod metrics;
@@ -39,6 +39,8 @@ pub mod payload;
 pub mod picture;
 #[cfg(feature = "service")]
 pub mod queue;
+#[cfg(feature = "service")]
+pub mod storage;
 #[cfg(feature = "service")]
 pub mod telemetry;
 #[cfg(feature = "service")]

@@ -20,16 +20,18 @@ use tokio_util::sync::CancellationToken;
 pub use self::company::Company;
 use self::company::Inside;
 use self::inputs::StoreError;
-use crate::blobs::{Blob, BlobError, Blobs, Sync};
 use crate::clock::Timestamp;
 use crate::cost::CostModel;
 use crate::engine::{Densification, Densified, EngineError, Health, Lane, Work};
 use crate::flow::backend::BackendError;
-use crate::flow::{Estimate, Field, FlowError};
+use crate::flow::{Estimate, Field, FlowError, Point};
+use crate::formats::MAX_COORDINATE_M;
+use crate::health::StoreHealth;
 use crate::job::{DeviceKind, Job, JobError, JobProgress, Kind, Report};
 use crate::metrics::Metrics;
 use crate::payload::{StoredDense, StoredFlow};
 use crate::queue::{Committed, Lease, Outcome, Queue, QueueError, Signal};
+use crate::storage::{Blob, BlobError, Blobs, Fault, Sync};
 
 /// How a worker treats jobs.
 #[derive(Clone, Debug)]
@@ -78,6 +80,8 @@ pub struct Worker {
     pub drain: Drain,
     /// All workers of the process, this one among them.
     pub company: Arc<Company>,
+    /// Whether the store works: while it does not, no job is taken.
+    pub store_health: Arc<StoreHealth>,
 }
 
 impl Worker {
@@ -96,6 +100,11 @@ impl Worker {
                     "a lane's thread has ended: nothing works there any more"
                 );
                 break;
+            }
+            tokio::select! {
+                biased;
+                () = self.drain.stop.cancelled() => break,
+                () = self.store_health.until_it_works() => {}
             }
             let mut inside = tokio::select! {
                 biased;
@@ -135,10 +144,7 @@ impl Worker {
                     }));
                 }
                 Err(QueueError::Closed) => break,
-                Err(error) => {
-                    tracing::error!(%error, "no job can be leased");
-                    tokio::time::sleep(Duration::from_millis(500)).await;
-                }
+                Err(error) => self.store_health.failed(&error),
             }
         }
         if let Some(last) = committing {
@@ -183,7 +189,7 @@ impl Worker {
     async fn give_back(&self, asking: impl Future<Output = Result<Lease, QueueError>>) {
         const MOMENT: Duration = Duration::from_millis(100);
         if let Ok(Ok(lease)) = tokio::time::timeout(MOMENT, asking).await
-            && let Err(error) = self.finish(&lease.job, Outcome::Released).await
+            && let Err(error) = self.finish(&lease, Outcome::Released).await
         {
             tracing::warn!(%error, job = %lease.job.id, "a job was not given back");
         }
@@ -209,7 +215,7 @@ impl Worker {
         let job = &lease.job;
         let (work, keeper, options) = match self.prepare(lease).await {
             Ok(prepared) => prepared,
-            Err(error) => return unreadable(&error),
+            Err(error) => return self.unreadable(&error),
         };
         let began = Instant::now();
         let solved = self.lane.solve(work).await;
@@ -231,6 +237,9 @@ impl Worker {
                     stop_reason = estimate.stop_reason.name(),
                     "solved"
                 );
+                if let Some(error) = out_of_range(&estimate.flow) {
+                    return Attempt::Ended(Outcome::Failed(error));
+                }
                 let report = Report::new(&estimate, &options);
                 // Whoever comes after it goes on from its field.
                 let wanted = job.followed || options.densify.is_some();
@@ -337,7 +346,7 @@ impl Worker {
             Attempt::Done(done) => self.store(lease, *done).await,
         };
         let succeeded = matches!(outcome, Outcome::Succeeded { .. });
-        match self.finish(job, outcome).await {
+        match self.finish(lease, outcome).await {
             Ok(Committed::Yes(state)) => {
                 if succeeded {
                     self.metrics
@@ -361,27 +370,28 @@ impl Worker {
         }
     }
 
-    /// Ends the attempt; tries again where the store fails, since the flow is already there and
-    /// the fence makes it safe.
-    async fn finish(&self, job: &Job, outcome: Outcome) -> Result<Committed, QueueError> {
+    /// Ends the attempt; tries again for as long as the store fails, since the flow is already there
+    /// and the fence makes it safe.
+    async fn finish(&self, lease: &Lease, outcome: Outcome) -> Result<Committed, QueueError> {
         const FIRST_PAUSE: Duration = Duration::from_millis(100);
-        const TRIES: u32 = 6;
+        const LONGEST_PAUSE: Duration = Duration::from_secs(5);
+        let job = &lease.job;
         let mut pause = FIRST_PAUSE;
-        for _ in 1..TRIES {
-            match self
-                .queue
-                .finish(job.id, job.attempt, outcome.clone())
-                .await
-            {
-                Err(QueueError::Store(error)) => {
-                    tracing::warn!(error, job = %job.id, "an outcome is not kept yet");
-                }
+        loop {
+            let ended = self.queue.finish(job.id, job.attempt, outcome.clone());
+            let error = match ended.await {
+                Err(error) if error.is_of_the_machine() => error,
                 ended => return ended,
+            };
+            tracing::warn!(%error, job = %job.id, "an outcome is not kept yet");
+            self.store_health.failed(&error);
+            tokio::select! {
+                () = self.drain.release.cancelled() => return Err(error),
+                () = tokio::time::sleep(pause) => {}
             }
-            tokio::time::sleep(pause).await;
-            pause *= 2;
+            lease.pulse.beat(None);
+            pause = (pause * 2).min(LONGEST_PAUSE);
         }
-        self.queue.finish(job.id, job.attempt, outcome).await
     }
 
     /// Puts what an attempt has found in store, the field before the success that others wait for.
@@ -409,7 +419,9 @@ impl Worker {
             },
             (Err(error), _) => {
                 tracing::error!(%error, job = %job.id, "a result was not kept");
-                Outcome::Failed(failure("store", &error, true))
+                // Writing is the machine's part: it is done again when that works.
+                self.store_health.failed(&error);
+                Outcome::Released
             }
             (_, Err(error)) => Outcome::Failed(failure("store", &error, true)),
         }
@@ -484,12 +496,36 @@ fn failure(code: &str, error: &dyn std::error::Error, retryable: bool) -> JobErr
     }
 }
 
-/// What becomes of a job whose payload cannot be read.
-fn unreadable(error: &StoreError) -> Attempt {
-    tracing::error!(%error, "the payload cannot be read");
-    Attempt::failed(
-        "store",
-        error,
-        matches!(error, StoreError::Blob(_) | StoreError::Queue(_)),
-    )
+/// Why a flow cannot be a result: no reader would take back what is so long.
+fn out_of_range(flow: &[Point]) -> Option<JobError> {
+    let is_fine = |value: &f32| f64::from(value.abs()) <= MAX_COORDINATE_M;
+    let row = flow.iter().position(|row| !row.iter().all(is_fine))?;
+    Some(JobError {
+        code: "input_refused".to_owned(),
+        message: format!(
+            "the flow of row {row} is {:?}, not three displacements within {MAX_COORDINATE_M} m: \
+             are the clouds and the given ego in metres?",
+            flow[row]
+        ),
+        retryable: false,
+    })
+}
+
+impl Worker {
+    /// What becomes of a job whose payload cannot be read: it waits for the machine, or fails where
+    /// what it needs is not there or damaged.
+    fn unreadable(&self, error: &StoreError) -> Attempt {
+        tracing::error!(%error, "the payload cannot be read");
+        let of_the_machine = match error {
+            StoreError::Blob(error) => error.fault() != Fault::Missing,
+            StoreError::Queue(error) => error.is_of_the_machine(),
+            _ => false,
+        };
+        if of_the_machine {
+            self.store_health.failed(error);
+            return Attempt::Ended(Outcome::Released);
+        }
+        let may_come_back = matches!(error, StoreError::Blob(_) | StoreError::Queue(_));
+        Attempt::failed("store", error, may_come_back)
+    }
 }

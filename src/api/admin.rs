@@ -16,23 +16,44 @@ use tokio::sync::watch;
 use crate::clock::Timestamp;
 use crate::cost::CostModel;
 use crate::engine::Device;
+use crate::health::{Heartbeat, StoreHealth};
 use crate::metrics::Metrics;
 use crate::queue::Queue;
 
-/// What readiness depends on.
+/// What liveness and readiness depend on.
 #[derive(Clone)]
 pub struct Readiness {
     /// The devices; one that is ready is enough.
     pub devices: Vec<Device>,
     /// Whether the server is about to stop.
     pub draining: watch::Receiver<bool>,
+    /// Whether the store can be written.
+    pub store: Arc<StoreHealth>,
+    /// Loops that have to go on, by name.
+    pub loops: Vec<(&'static str, Arc<Heartbeat>)>,
 }
 
+/// Silence of a loop after which it is taken for stuck. A machine that is busy is not so slow.
+const STUCK: Duration = Duration::from_secs(10);
+
 impl Readiness {
+    /// The loop that does not go on, so that only a fresh process will.
+    fn stuck(&self) -> Option<String> {
+        let stuck = self.loops.iter().find(|(_, beat)| beat.age() > STUCK)?;
+        let seconds = stuck.1.age().as_secs();
+        Some(format!("{} has not moved for {seconds} s", stuck.0))
+    }
+
     /// Why the server is not ready; nothing where it is.
     pub fn obstacle(&self) -> Option<String> {
         if *self.draining.borrow() {
             return Some("the server is about to stop".to_owned());
+        }
+        if let Some(stuck) = self.stuck() {
+            return Some(stuck);
+        }
+        if let Some(trouble) = self.store.trouble() {
+            return Some(format!("the store does not work: {trouble}"));
         }
         let mut reasons = Vec::new();
         for device in &self.devices {
@@ -58,7 +79,7 @@ pub fn admin_router(
     cost: Arc<CostModel>,
 ) -> Router {
     Router::new()
-        .route("/livez", get(|| async { Json(json!({ "alive": true })) }))
+        .route("/livez", get(alive))
         .route("/readyz", get(ready))
         .route("/metrics", get(expose))
         .with_state(Admin {
@@ -67,6 +88,16 @@ pub fn admin_router(
             queue,
             cost,
         })
+}
+
+async fn alive(State(admin): State<Admin>) -> Response {
+    match admin.readiness.stuck() {
+        None => Json(json!({ "alive": true })).into_response(),
+        Some(reason) => {
+            let body = Json(json!({ "alive": false, "reason": reason }));
+            (StatusCode::SERVICE_UNAVAILABLE, body).into_response()
+        }
+    }
 }
 
 async fn ready(State(admin): State<Admin>) -> Response {

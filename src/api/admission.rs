@@ -83,6 +83,11 @@ impl Admission {
         }
     }
 
+    /// Points that one cloud may have.
+    pub fn max_points(&self) -> usize {
+        self.limits.max_points
+    }
+
     /// Refuses a cloud with too many points.
     ///
     /// # Errors

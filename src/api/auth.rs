@@ -51,6 +51,12 @@ pub enum InvalidKey {
     /// It could be guessed.
     #[error("the key of tenant {0} is shorter than {MIN_KEY} characters")]
     Short(Tenant),
+    /// No header could carry it as it is.
+    #[error(
+        "the key of tenant {0} has white space or characters other than printable ASCII: no header \
+         carries it"
+    )]
+    Unsendable(Tenant),
     /// Two tenants cannot share one.
     #[error("the key of tenant {0} is given twice")]
     Twice(Tenant),
@@ -66,10 +72,13 @@ impl Keys {
     /// Takes one more key.
     ///
     /// # Errors
-    /// [`InvalidKey`] where it is too short or known already.
+    /// [`InvalidKey`] where it is too short, cannot be sent or is known already.
     pub fn add(&mut self, key: &str, caller: Caller) -> Result<(), InvalidKey> {
         if key.len() < MIN_KEY {
             return Err(InvalidKey::Short(caller.tenant));
+        }
+        if !key.bytes().all(|byte| byte.is_ascii_graphic()) {
+            return Err(InvalidKey::Unsendable(caller.tenant));
         }
         let hash = *blake3::hash(key.as_bytes()).as_bytes();
         if self.known.iter().any(|(known, _)| *known == hash) {
@@ -77,6 +86,13 @@ impl Keys {
         }
         self.known.push((hash, caller));
         Ok(())
+    }
+
+    /// Whether there are keys of more than one tenant.
+    pub fn has_several_tenants(&self) -> bool {
+        let mut tenants = self.known.iter().map(|(_, caller)| &caller.tenant);
+        let first = tenants.next();
+        tenants.any(|tenant| Some(tenant) != first)
     }
 
     /// Whether anybody may do anything.
@@ -128,6 +144,10 @@ mod tests {
         assert!(keys.caller(None).is_ok());
         let short = keys.add("", caller("a", Role::Write));
         assert!(matches!(short, Err(InvalidKey::Short(_))));
+        for unsendable in ["0123456789abcdef ", "                ", "0123456789abcdeé"] {
+            let refused = keys.add(unsendable, caller("a", Role::Write));
+            assert!(matches!(refused, Err(InvalidKey::Unsendable(_))));
+        }
         keys.add("0123456789abcdef", caller("a", Role::Write))
             .expect("a key");
         keys.add("fedcba9876543210", caller("b", Role::Read))

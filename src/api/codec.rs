@@ -168,7 +168,7 @@ fn with_report(json: &[u8], report: &Report, job: &str) -> Result<Vec<u8>, ApiEr
     Ok(bytes)
 }
 
-/// One cloud of any format.
+/// One cloud of any format, of at most `most` points.
 ///
 /// # Errors
 /// [`ApiError::BadInput`] or [`ApiError::TooLarge`], which name the part and what is wrong in it.
@@ -176,20 +176,27 @@ pub(super) fn read_cloud(
     part: &str,
     bytes: &[u8],
     name: Option<&str>,
+    most: usize,
 ) -> Result<StoredCloud, ApiError> {
-    let cloud = formats::read_cloud(bytes, name).map_err(|error| in_part(part, error))?;
+    let cloud =
+        formats::read_cloud_within(bytes, name, most).map_err(|error| in_part(part, error))?;
     Ok(StoredCloud {
         points: cloud.points,
         ground: None,
     })
 }
 
-/// Two clouds of one `.npz`, with their ground masks where they are there.
+/// Two clouds of one `.npz`, of at most `most` points each, with their ground masks where they are
+/// there.
 ///
 /// # Errors
 /// As for [`read_cloud`].
-pub(super) fn read_pair(part: &str, bytes: &[u8]) -> Result<[StoredCloud; 2], ApiError> {
-    let pair = formats::read_pair(bytes).map_err(|error| in_part(part, error))?;
+pub(super) fn read_pair(
+    part: &str,
+    bytes: &[u8],
+    most: usize,
+) -> Result<[StoredCloud; 2], ApiError> {
+    let pair = formats::read_pair_within(bytes, most).map_err(|error| in_part(part, error))?;
     let (source, target) = match pair.ground {
         Some(ground) => (Some(ground.source), Some(ground.target)),
         None => (None, None),

@@ -5,11 +5,13 @@
 use std::ops::Range;
 use std::sync::Arc;
 
+use bytes::Bytes;
+
 use super::admission::Admission;
+use super::answers::AnswerRoom;
 use super::codec;
 use super::error::ApiError;
-use super::service::Service;
-use crate::blobs::Blob;
+use super::service::{Service, lost_or};
 use crate::cost::CostModel;
 use crate::flow::densify::Plan;
 use crate::flow::{DenseCloud, window};
@@ -17,6 +19,7 @@ use crate::formats::{DENSE_FORMATS, DenseFormat, write_dense};
 use crate::job::{DenseReport, Densify, InvalidOptions, Job, JobOptions, Kind, LaterChoice};
 use crate::payload::StoredDense;
 use crate::queue::PairOf;
+use crate::storage::Blob;
 
 /// Bytes that are held for a point while it is carried and written, at most: itself in its sweep and
 /// in the cloud, its masks, where it was before a step, the cloud's bytes, and its share of a field
@@ -130,19 +133,25 @@ impl Service {
         serde_json::from_str(report).map_err(ApiError::internal)
     }
 
-    /// A sequence's dense cloud.
+    /// A sequence's dense cloud, and the room that it takes.
     ///
     /// # Errors
-    /// As for [`Service::dense_report`], or where the store fails.
-    pub(super) async fn dense_cloud(&self, job: &Job) -> Result<Arc<DenseCloud>, ApiError> {
+    /// As for [`Service::dense_report`] and [`Service::room_for_result`].
+    pub(super) async fn dense_cloud(
+        &self,
+        job: &Job,
+    ) -> Result<(Arc<DenseCloud>, AnswerRoom), ApiError> {
         Self::check_success(job)?;
-        let bytes = self.blobs.get(job.id, Blob::Result(job.attempt)).await?;
+        let room = self.room_for_result(job).await?;
+        let bytes = self.blobs.get(job.id, Blob::Result(job.attempt)).await;
+        let bytes = bytes.map_err(|error| lost_or(job.id, error))?;
         let read = move || StoredDense::from_bytes(&bytes).map_err(ApiError::internal);
         let StoredDense(cloud) = self.compute(read).await?;
-        Ok(Arc::new(cloud))
+        Ok((Arc::new(cloud), room))
     }
 
-    /// A sequence's dense cloud in a format.
+    /// A sequence's dense cloud in a format; as it was made for the last who asked, where it still
+    /// is.
     ///
     /// # Errors
     /// As for [`Service::dense_cloud`].
@@ -150,17 +159,24 @@ impl Service {
         &self,
         job: &Job,
         format: DenseFormat,
-    ) -> Result<Vec<u8>, ApiError> {
+    ) -> Result<Bytes, ApiError> {
+        let known = DENSE_FORMATS.iter().find(|(known, ..)| *known == format);
+        let (.., ending) = *known.unwrap_or(&DENSE_FORMATS[0]);
+        let name = (job.id, job.attempt, ending);
         // One at a time: a cloud is as large as all of its sweeps.
         let _turn = self.clouds.acquire().await.map_err(ApiError::internal)?;
+        if let Some(made) = self.answers.made(&name) {
+            return Ok(made);
+        }
         let began = std::time::Instant::now();
-        let cloud = self.dense_cloud(job).await?;
+        let (cloud, room) = self.dense_cloud(job).await?;
         let encode = move || {
             let mut bytes = Vec::new();
             write_dense(format, &cloud, &mut bytes).map_err(ApiError::internal)?;
             Ok(bytes)
         };
-        let encoded = self.compute(encode).await?;
+        let encoded = room.hold(self.compute(encode).await?);
+        self.answers.keep(name, &encoded);
         self.metrics
             .phase("encode", began.elapsed().as_secs_f64(), Some(job));
         Ok(encoded)

@@ -5,21 +5,20 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bytes::Bytes;
-use tokio::sync::OwnedSemaphorePermit;
-
 use super::admission::{Asked, Promise, Reservation};
 use super::auth::Caller;
 use super::dense::Closing;
 use super::error::ApiError;
-use super::service::{Awaited, Service};
-use crate::blobs::{Blob, Sync};
+use super::service::{MakeDurable, Service};
+use super::waiters::Awaited;
 use crate::clock::Timestamp;
 use crate::cost::CostModel;
 use crate::flow::{self, Ground, Price, Sweep, window};
 use crate::job::{Job, JobId, JobOptions, Kind};
 use crate::payload::StoredCloud;
 use crate::queue::{Idempotency, PairOf, Submission, Submitted};
+use crate::storage::{Blob, Sync};
+use bytes::Bytes;
 
 /// What is asked of a job before its clouds are there.
 #[derive(Clone, Debug)]
@@ -236,27 +235,36 @@ impl Draft {
         submission: Submission,
         _place: Reservation,
     ) -> Result<Accepted, ApiError> {
-        match self.service.queue.submit(submission).await? {
-            Submitted::New(job) => {
-                self.submitted = true;
-                let awaited = self.request.promise == Promise::WhileAwaited;
-                Ok(Accepted {
-                    awaited: awaited.then(|| self.service.cancel_when_dropped(job.id)),
-                    job,
-                    new: true,
-                })
-            }
-            Submitted::Known(mut job) => {
-                if self.request.promise == Promise::Durable && !job.durable {
-                    job = self.service.make_durable(&job).await?;
+        // A job that is found may be given up at the same moment: then its key is free again.
+        const TRIES: u32 = 5;
+        let durable = self.request.promise == Promise::Durable;
+        for _ in 0..TRIES {
+            let (mut job, new) = match self.service.queue.submit(submission.clone()).await? {
+                Submitted::New(job) => {
+                    self.submitted = true;
+                    (job, true)
                 }
-                Ok(Accepted {
-                    job,
-                    new: false,
-                    awaited: None,
-                })
+                Submitted::Known(job) => (job, false),
+            };
+            let mut awaited = None;
+            if durable && !job.durable {
+                job = match self.service.make_durable(&job).await {
+                    Err(MakeDurable::GivenUp) => continue,
+                    Err(MakeDurable::Failed(error)) => return Err(error),
+                    Ok(job) => job,
+                };
+            } else if !durable && !job.durable && !job.state.is_end() {
+                match self.service.wait_for(job.id) {
+                    Ok(waits) => awaited = Some(waits),
+                    Err(ending) => {
+                        ending.is_over().await;
+                        continue;
+                    }
+                }
             }
+            return Ok(Accepted { job, new, awaited });
         }
+        Err(ApiError::ServerFull(Duration::from_secs(1)))
     }
 
     fn admit(&self, submission: &Submission) -> Result<Reservation, ApiError> {
@@ -309,6 +317,16 @@ impl Draft {
         Ok(seconds)
     }
 
+    /// Of what was asked: options, clouds, and whether they are a pair or a sequence.
+    fn fingerprint(&self, kind: Kind) -> [u8; 32] {
+        let mut fingerprint = self.fingerprint.clone();
+        fingerprint.update(match kind {
+            Kind::Pair => b"pair".as_slice(),
+            Kind::Sequence => b"sequence".as_slice(),
+        });
+        *fingerprint.finalize().as_bytes()
+    }
+
     fn submission(&self, kind: Kind) -> Result<Submission, ApiError> {
         let mut pairs: Vec<PairOf> = match kind {
             Kind::Pair => Vec::new(),
@@ -350,7 +368,7 @@ impl Draft {
             deadline: left.map(|left| Timestamp::now().after(left)),
             idempotency: key.map(|key| Idempotency {
                 key,
-                fingerprint: *self.fingerprint.finalize().as_bytes(),
+                fingerprint: self.fingerprint(kind),
             }),
             durable: self.request.promise == Promise::Durable,
         })
@@ -364,69 +382,6 @@ impl Drop for Draft {
         }
         let (service, id) = (Arc::clone(&self.service), self.id);
         tokio::spawn(async move { service.forget_blobs(id).await });
-    }
-}
-
-/// Room for a body's bytes, given back when it is dropped, and time for them to come.
-#[derive(Debug, Default)]
-pub(super) struct Room {
-    held: Option<OwnedSemaphorePermit>,
-    bytes: u64,
-    waited: Duration,
-}
-
-impl Room {
-    /// Takes room for `bytes` more.
-    ///
-    /// # Errors
-    /// [`ApiError::TooLarge`] where one request has too many, [`ApiError::ServerFull`] where all
-    /// requests together have.
-    pub(super) fn take(&mut self, service: &Service, bytes: usize) -> Result<(), ApiError> {
-        const UNIT: u64 = 1 << 10;
-        let limit = service.limits.max_upload_bytes;
-        self.bytes += bytes as u64;
-        if self.bytes > limit {
-            return Err(ApiError::TooLarge(format!(
-                "the request's body has more than the {} MiB that this server takes",
-                limit >> 20
-            )));
-        }
-        service.metrics.uploaded(bytes);
-        // Whole units of all bytes so far: small pieces must not cost more than large ones.
-        let held = self
-            .held
-            .as_ref()
-            .map_or(0, OwnedSemaphorePermit::num_permits) as u64;
-        let units = self.bytes.div_ceil(UNIT).saturating_sub(held);
-        let units = u32::try_from(units).unwrap_or(u32::MAX);
-        let room = Arc::clone(&service.room);
-        let permit = room.try_acquire_many_owned(units);
-        let permit = permit.map_err(|_| ApiError::ServerFull(Duration::from_secs(1)))?;
-        match &mut self.held {
-            Some(held) => held.merge(permit),
-            none => *none = Some(permit),
-        }
-        Ok(())
-    }
-
-    /// Waits for more of a body: no longer than it may be silent, and in all no longer than the
-    /// slowest line that is served takes for what has come.
-    ///
-    /// # Errors
-    /// [`ApiError::TooSlow`].
-    pub(super) async fn wait<T>(
-        &mut self,
-        service: &Service,
-        more: impl Future<Output = T>,
-    ) -> Result<T, ApiError> {
-        const SLOWEST_BYTES_PER_SECOND: u64 = 1 << 10;
-        let idle = service.limits.body_idle;
-        let earned = Duration::from_secs(self.bytes / SLOWEST_BYTES_PER_SECOND);
-        let left = (idle + earned).saturating_sub(self.waited).min(idle);
-        let began = Instant::now();
-        let came = tokio::time::timeout(left, more).await;
-        self.waited += began.elapsed();
-        came.map_err(|_| ApiError::TooSlow)
     }
 }
 

@@ -4,10 +4,10 @@
 
 use std::time::Duration;
 
-use crate::blobs::BlobError;
 use crate::formats::FormatError;
 use crate::job::{DeviceKind, InvalidId, InvalidOptions, JobError, JobId};
 use crate::queue::QueueError;
+use crate::storage::{BlobError, Fault};
 
 /// Why a request was refused, or its job gave no flow.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -80,6 +80,12 @@ pub enum ApiError {
     /// The disk is nearly full.
     #[error("the server's disk is nearly full; fetch and forget results, or ask its operator")]
     DiskFull,
+    /// The server's store does not work at the moment; the log says why.
+    #[error("the server's store does not work at the moment; try again")]
+    StoreUnavailable,
+    /// The job's result, or what it was found from, lies no more where it was put.
+    #[error("the job's result is lost; POST its requeue to find it again")]
+    ResultLost(JobId),
     /// The server is about to stop.
     #[error("the server is about to stop; another one will answer")]
     Draining,
@@ -120,7 +126,7 @@ const fn row(
 }
 
 /// All that the doors ever say.
-const TABLE: [Row; 25] = [
+const TABLE: [Row; 27] = [
     row("bad_request", 400, 3, false, Some("bad_input")),
     row("invalid_options", 400, 3, false, Some("bad_input")),
     row("bad_input", 422, 3, false, Some("bad_input")),
@@ -144,6 +150,14 @@ const TABLE: [Row; 25] = [
     row("tenant_limit", 429, 8, true, Some("tenant_limit")),
     row("server_full", 503, 14, true, Some("server_full")),
     row("disk_full", 507, 14, true, Some("disk_full")),
+    row(
+        "store_unavailable",
+        503,
+        14,
+        true,
+        Some("store_unavailable"),
+    ),
+    row("result_lost", 410, 15, false, None),
     row("draining", 503, 14, true, Some("draining")),
     row("internal", 500, 13, true, None),
 ];
@@ -191,6 +205,8 @@ impl ApiError {
             Self::TenantLimit(_) => "tenant_limit",
             Self::ServerFull(_) => "server_full",
             Self::DiskFull => "disk_full",
+            Self::StoreUnavailable => "store_unavailable",
+            Self::ResultLost(_) => "result_lost",
             Self::Draining => "draining",
             Self::Internal => "internal",
         }
@@ -205,7 +221,7 @@ impl ApiError {
     pub fn retry_after(&self) -> Option<Duration> {
         match self {
             Self::TenantLimit(after) | Self::ServerFull(after) => Some(*after),
-            Self::Draining => Some(Duration::from_secs(5)),
+            Self::Draining | Self::StoreUnavailable => Some(Duration::from_secs(5)),
             Self::DiskFull => Some(Duration::from_secs(60)),
             _ => None,
         }
@@ -218,7 +234,8 @@ impl ApiError {
             | Self::NotEnded(id)
             | Self::JobFailed(id, _)
             | Self::Expired(id)
-            | Self::Cancelled(id) => Some(*id),
+            | Self::Cancelled(id)
+            | Self::ResultLost(id) => Some(*id),
             _ => None,
         }
     }
@@ -227,6 +244,16 @@ impl ApiError {
     pub fn internal(error: impl std::fmt::Display) -> Self {
         tracing::error!(%error, "a request broke");
         Self::Internal
+    }
+
+    fn store(error: impl std::fmt::Display) -> Self {
+        tracing::error!(%error, "the store failed under a request");
+        Self::StoreUnavailable
+    }
+
+    fn full(error: impl std::fmt::Display) -> Self {
+        tracing::error!(%error, "the disk is full");
+        Self::DiskFull
     }
 }
 
@@ -237,14 +264,20 @@ impl From<QueueError> for ApiError {
             QueueError::KeyReused(id) => Self::KeyReused(id),
             QueueError::NotOver(_) => Self::BadRequest(error.to_string()),
             QueueError::Closed => Self::Draining,
-            QueueError::Store(_) => Self::internal(error),
+            QueueError::GivenUp => Self::internal(error),
+            QueueError::Store(_) => Self::store(error),
+            QueueError::Full(_) => Self::full(error),
         }
     }
 }
 
 impl From<BlobError> for ApiError {
     fn from(error: BlobError) -> Self {
-        Self::internal(error)
+        match error.fault() {
+            Fault::Full => Self::full(error),
+            Fault::Machine => Self::store(error),
+            Fault::Missing => Self::internal(error),
+        }
     }
 }
 
@@ -311,6 +344,8 @@ mod tests {
             ApiError::TenantLimit(second),
             ApiError::ServerFull(second),
             ApiError::DiskFull,
+            ApiError::StoreUnavailable,
+            ApiError::ResultLost(id),
             ApiError::Draining,
             ApiError::Internal,
         ];

@@ -16,6 +16,7 @@ use tracing::Instrument;
 use super::draft::Arrived;
 use super::error::{ApiError, Row};
 use super::grpc;
+use super::listener::Connection;
 use super::service::Service;
 
 /// Puts the guards before all routes of a router.
@@ -52,6 +53,9 @@ async fn check_key(
     let shown = request.headers().get(header::AUTHORIZATION);
     match service.caller(shown.and_then(|value| value.to_str().ok())) {
         Ok(caller) => {
+            if let Some(connection) = request.extensions().get::<Arc<Connection>>() {
+                connection.is_known(&caller.tenant);
+            }
             request.extensions_mut().insert(caller);
         }
         Err(_) if is_open(request.uri().path()) => {}

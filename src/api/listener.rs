@@ -1,45 +1,85 @@
-//! The public port: who may connect, how long they may take, and how it all ends.
+//! A port: who may connect, how long they may take, and how it all ends.
 //!
 //! HTTP/1.1 and HTTP/2 (and so gRPC) on one socket, with every limit of both written down: the
-//! libraries' own defaults leave some of them open. It must not know routes.
+//! libraries' own defaults leave some of them open. The public port and the admin port are such.
+//! It must not know routes.
 
+mod bodies;
+mod connections;
 mod opening;
 mod stall;
 
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use axum::Router;
+use axum::body::Body;
+use hyper::Request;
+use hyper::body::Incoming;
+use hyper::service::service_fn;
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto::Builder;
-use hyper_util::service::TowerToHyperService;
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::Semaphore;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::JoinSet;
-use tokio::time::timeout;
+use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
+use tower::ServiceExt;
 
+use self::bodies::{AnswerBody, RequestBody};
+pub(super) use self::connections::Connection;
+use self::connections::{Connections, Entry, Patience, Verdict};
 use self::opening::Opening;
 use self::stall::Stall;
+use crate::health::{HEARTBEAT, Heartbeat};
 use crate::metrics::Metrics;
 
 /// What a connection may cost.
 #[derive(Clone, Debug)]
 pub struct ListenOptions {
-    /// Open connections; more are closed at once.
+    /// Open connections. Past it, one that is needed less makes room, or the new one is closed.
     pub max_connections: usize,
-    /// Time for a request's headers, and for a TLS handshake.
+    /// Time for a request's headers, for a TLS handshake, and between two requests.
     pub header_timeout: Duration,
     /// Time that a client may leave an answer unread.
     pub write_timeout: Duration,
     /// Requests at a time on one HTTP/2 connection.
     pub max_streams: u32,
+    /// Whether a connection has to show a good key: else it ends after two header timeouts.
+    pub needs_key: bool,
+}
+
+impl ListenOptions {
+    /// Those of the admin port: small questions, no keys.
+    pub fn of_admin() -> Self {
+        Self {
+            max_connections: 64,
+            header_timeout: Duration::from_secs(5),
+            write_timeout: Duration::from_secs(10),
+            max_streams: 8,
+            needs_key: false,
+        }
+    }
+
+    fn patience(&self) -> Patience {
+        Patience {
+            idle: self.header_timeout,
+            unknown: self.needs_key.then_some(self.header_timeout * 2),
+            unread: self.write_timeout,
+        }
+    }
+
+    /// How often a connection is looked at.
+    fn look(&self) -> Duration {
+        let shortest = self.header_timeout.min(self.write_timeout) / 4;
+        shortest.clamp(Duration::from_millis(50), Duration::from_secs(1))
+    }
 }
 
 impl Default for ListenOptions {
@@ -49,6 +89,7 @@ impl Default for ListenOptions {
             header_timeout: Duration::from_secs(15),
             write_timeout: Duration::from_secs(60),
             max_streams: 128,
+            needs_key: false,
         }
     }
 }
@@ -68,12 +109,16 @@ const CONNECTION_WINDOW: u32 = 16 << 20;
 const PING_INTERVAL: Duration = Duration::from_secs(30);
 const PING_TIMEOUT: Duration = Duration::from_secs(10);
 
+/// Time that a connection which has to make room may take for that.
+const EVICTION: Duration = Duration::from_millis(200);
+
 /// A bound port.
 pub struct Listener {
     listener: TcpListener,
     tls: Option<TlsAcceptor>,
     options: ListenOptions,
-    metrics: Arc<Metrics>,
+    metrics: Option<Arc<Metrics>>,
+    heartbeat: Arc<Heartbeat>,
 }
 
 /// Why TLS cannot be offered.
@@ -115,7 +160,7 @@ pub fn tls_acceptor(certificate: &Path, key: &Path) -> Result<TlsAcceptor, TlsEr
 }
 
 impl Listener {
-    /// Binds `address`.
+    /// Binds `address`. Connections are counted in `metrics`, where they are given.
     ///
     /// # Errors
     /// Where the address is taken or not ours.
@@ -123,13 +168,34 @@ impl Listener {
         address: SocketAddr,
         tls: Option<TlsAcceptor>,
         options: ListenOptions,
-        metrics: Arc<Metrics>,
+        metrics: Option<Arc<Metrics>>,
     ) -> std::io::Result<Self> {
         Ok(Self {
             listener: TcpListener::bind(address).await?,
             tls,
             options,
             metrics,
+            heartbeat: Arc::default(),
+        })
+    }
+
+    /// Serves from a socket that is bound already; to be called where it will be served.
+    ///
+    /// # Errors
+    /// Where the socket cannot be waited for.
+    pub fn on(
+        socket: std::net::TcpListener,
+        options: ListenOptions,
+        metrics: Option<Arc<Metrics>>,
+        heartbeat: Arc<Heartbeat>,
+    ) -> std::io::Result<Self> {
+        socket.set_nonblocking(true)?;
+        Ok(Self {
+            listener: TcpListener::from_std(socket)?,
+            tls: None,
+            options,
+            metrics,
+            heartbeat,
         })
     }
 
@@ -141,42 +207,71 @@ impl Listener {
         self.listener.local_addr()
     }
 
+    /// The sign of life of the loop that accepts.
+    pub fn heartbeat(&self) -> Arc<Heartbeat> {
+        Arc::clone(&self.heartbeat)
+    }
+
     /// Serves until `stop`, then lets every connection finish what it is answering.
     pub async fn serve(self, router: Router, stop: CancellationToken) {
         const PAUSE: Duration = Duration::from_millis(50);
         let room = Arc::new(Semaphore::new(self.options.max_connections));
+        let table = Arc::new(Connections::default());
         let mut connections = JoinSet::new();
+        let mut beats = interval(HEARTBEAT);
         loop {
+            self.heartbeat.beat();
             let accepted = tokio::select! {
                 biased;
                 () = stop.cancelled() => break,
                 Some(_) = connections.join_next() => continue,
                 accepted = self.listener.accept() => accepted,
+                _ = beats.tick() => continue,
             };
-            let stream = match accepted {
-                Ok((stream, _)) => stream,
+            let (stream, address) = match accepted {
+                Ok((stream, address)) => (stream, address.ip()),
                 Err(error) => {
                     // Out of file descriptors, mostly: those that are open will be closed.
                     tracing::warn!(%error, "a connection was not accepted");
-                    tokio::time::sleep(PAUSE).await;
+                    sleep(PAUSE).await;
                     continue;
                 }
             };
-            let Ok(permit) = Arc::clone(&room).try_acquire_owned() else {
+            let Some(permit) = room_for(&room, &table, address).await else {
                 tracing::debug!("too many connections");
                 continue;
             };
+            let entry = table.enter(address);
             let (router, stop) = (router.clone(), stop.clone());
             let (tls, options) = (self.tls.clone(), self.options.clone());
-            let open = self.metrics.connection();
+            let open = self.metrics.as_ref().map(|metrics| metrics.connection());
             connections.spawn(async move {
-                converse(stream, tls, &options, router, stop).await;
-                drop((permit, open));
+                tokio::select! {
+                    () = entry.connection.evicted() => tracing::debug!("a connection made room"),
+                    () = converse(stream, tls, &options, router, stop, &entry) => {}
+                }
+                drop((entry, permit, open));
             });
         }
         drop(self.listener);
         while connections.join_next().await.is_some() {}
     }
+}
+
+/// A place for one more connection; one that is needed less may have to make it.
+async fn room_for(
+    room: &Arc<Semaphore>,
+    table: &Connections,
+    address: IpAddr,
+) -> Option<OwnedSemaphorePermit> {
+    if let Ok(permit) = Arc::clone(room).try_acquire_owned() {
+        return Some(permit);
+    }
+    if !table.make_room(address) {
+        return None;
+    }
+    let made = timeout(EVICTION, Arc::clone(room).acquire_owned()).await;
+    made.ok()?.ok()
 }
 
 async fn converse(
@@ -185,6 +280,7 @@ async fn converse(
     options: &ListenOptions,
     router: Router,
     stop: CancellationToken,
+    entry: &Entry,
 ) {
     if let Err(error) = stream.set_nodelay(true) {
         tracing::debug!(%error, "a connection was lost");
@@ -192,17 +288,22 @@ async fn converse(
     }
     let stream = Stall::new(stream, options.write_timeout);
     match tls {
-        None => answer(stream, options, router, stop).await,
+        None => answer(stream, options, router, stop, entry).await,
         Some(tls) => match timeout(options.header_timeout, tls.accept(stream)).await {
-            Ok(Ok(stream)) => answer(stream, options, router, stop).await,
+            Ok(Ok(stream)) => answer(stream, options, router, stop, entry).await,
             Ok(Err(error)) => tracing::debug!(%error, "a handshake failed"),
             Err(_) => tracing::debug!("a handshake took too long"),
         },
     }
 }
 
-async fn answer<S>(stream: S, options: &ListenOptions, router: Router, stop: CancellationToken)
-where
+async fn answer<S>(
+    stream: S,
+    options: &ListenOptions,
+    router: Router,
+    stop: CancellationToken,
+    entry: &Entry,
+) where
     S: AsyncRead + AsyncWrite + Unpin + Send + 'static,
 {
     let mut builder = Builder::new(TokioExecutor::new());
@@ -223,18 +324,49 @@ where
         .initial_connection_window_size(CONNECTION_WINDOW)
         .keep_alive_interval(PING_INTERVAL)
         .keep_alive_timeout(PING_TIMEOUT);
-    let service = TowerToHyperService::new(router);
+    let peer = Arc::clone(&entry.connection);
+    let service = service_fn(move |request: Request<Incoming>| {
+        let open = peer.begin();
+        let mut request = request.map(|body| Body::new(RequestBody::new(body)));
+        request.extensions_mut().insert(Arc::clone(&peer));
+        let answering = router.clone().oneshot(request);
+        async move {
+            let response = answering.await;
+            response.map(|response| response.map(|body| AnswerBody::new(body, open)))
+        }
+    });
     let stream = Opening::new(stream, options.header_timeout);
     let connection = builder.serve_connection(TokioIo::new(stream), service);
     let mut connection = std::pin::pin!(connection);
-    let ended = tokio::select! {
-        ended = connection.as_mut() => ended,
-        () = stop.cancelled() => {
-            connection.as_mut().graceful_shutdown();
-            connection.await
+    let patience = options.patience();
+    let mut looks = interval(options.look());
+    looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    // Once it is asked to close, it may still send what is on its way.
+    let mut closing: Option<Instant> = None;
+    loop {
+        tokio::select! {
+            ended = connection.as_mut() => {
+                if let Err(error) = ended {
+                    tracing::debug!(%error, "a connection ended early");
+                }
+                return;
+            }
+            () = stop.cancelled(), if closing.is_none() => {
+                connection.as_mut().graceful_shutdown();
+                closing = Some(Instant::now());
+            }
+            _ = looks.tick() => match (entry.connection.verdict(&patience), closing) {
+                (Verdict::Close, None) => {
+                    connection.as_mut().graceful_shutdown();
+                    closing = Some(Instant::now());
+                }
+                (Verdict::Close, Some(since)) if since.elapsed() > patience.unread => return,
+                (Verdict::End, _) => {
+                    tracing::debug!("a connection was ended: it does not read, or shows no key");
+                    return;
+                }
+                _ => {}
+            },
         }
-    };
-    if let Err(error) = ended {
-        tracing::debug!(%error, "a connection ended early");
     }
 }

@@ -4,12 +4,15 @@
 //! sees the protocol's.
 
 mod admission;
+mod answers;
 mod auth;
 mod codec;
 mod dense;
 mod draft;
 mod error;
 mod service;
+mod uploads;
+mod waiters;
 
 mod admin;
 mod grpc;

@@ -5,21 +5,29 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use bytes::Bytes;
 use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 
 use super::admission::{Admission, Asked, Promise};
+use super::answers::{AnswerRoom, Answers};
 use super::auth::{Caller, Keys};
 use super::codec::AnswerFormat;
+use super::dense::is_dense;
 use super::error::ApiError;
-use crate::blobs::{Blob, Blobs};
+use super::uploads::{UploadLimits, Uploads};
+use super::waiters::{Awaited, Ending, Waiters};
 use crate::job::{Job, JobId, JobOptions, Kind, Priority, Report, State};
 use crate::metrics::Metrics;
 use crate::payload::{StoredCloud, StoredFlow};
-use crate::queue::{Filter, Queue};
+use crate::queue::{Filter, Queue, QueueError};
+use crate::storage::{Blob, BlobError, Blobs, FreeSpace};
 
 /// Archives and clouds that are sent at a time.
 const MAX_ARCHIVES: usize = 16;
+
+/// How long an answer waits for room that others hold.
+const ANSWER_PATIENCE: Duration = Duration::from_secs(5);
 
 /// What a request may cost the doors.
 #[derive(Clone, Debug)]
@@ -28,8 +36,12 @@ pub struct ServiceLimits {
     pub max_upload_bytes: u64,
     /// Bytes of all bodies that are being received.
     pub max_uploads_bytes: u64,
+    /// Bytes of all answers that are being made and sent.
+    pub max_answers_bytes: u64,
     /// Bytes that stay free on the disk: less, and nothing more is accepted.
     pub min_free_bytes: u64,
+    /// Files that can still be made on the disk: fewer, and nothing more is accepted.
+    pub min_free_inodes: u64,
     /// Frames of one sequence.
     pub max_frames: u32,
     /// Time without a byte of a body that is being received.
@@ -46,8 +58,12 @@ pub struct Service {
     pub(super) metrics: Arc<Metrics>,
     pub(super) keys: Keys,
     pub(super) limits: ServiceLimits,
-    pub(super) room: Arc<Semaphore>,
+    pub(super) uploads: Arc<Uploads>,
+    pub(super) answers: Answers,
+    waiters: Arc<Waiters>,
     compute: Semaphore,
+    /// Answers that are being encoded, apart from what comes in.
+    encoding: Semaphore,
     /// Archives and clouds that are being sent: each holds a thread, or memory, while its client
     /// reads.
     pub(super) archives: Arc<Semaphore>,
@@ -85,6 +101,23 @@ pub struct Answer {
     pub report: Report,
     /// The flow itself.
     pub flow: Arc<StoredFlow>,
+    /// The room that it takes.
+    pub(super) room: Arc<AnswerRoom>,
+}
+
+/// Why a job was not made durable.
+#[derive(Debug)]
+pub(super) enum MakeDurable {
+    /// Whoever waited for it has gone, and it with them.
+    GivenUp,
+    /// The store failed.
+    Failed(ApiError),
+}
+
+impl<E: Into<ApiError>> From<E> for MakeDurable {
+    fn from(error: E) -> Self {
+        Self::Failed(error.into())
+    }
 }
 
 /// What a wait has come to.
@@ -99,18 +132,33 @@ pub enum Waited {
 impl Service {
     /// A service of its parts.
     pub fn new(parts: Parts) -> Self {
-        const UNIT: u64 = 1 << 10;
-        let room = usize::try_from(parts.limits.max_uploads_bytes / UNIT).unwrap_or(usize::MAX);
+        let limits = &parts.limits;
+        let all = limits.max_uploads_bytes;
+        // One tenant of several leaves the others half.
+        let tenant = if parts.keys.has_several_tenants() {
+            (all / 2).max(limits.max_upload_bytes.min(all))
+        } else {
+            all
+        };
+        let uploads = UploadLimits {
+            body: limits.max_upload_bytes,
+            all,
+            tenant,
+            idle: limits.body_idle,
+        };
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         Self {
             queue: parts.queue,
             blobs: parts.blobs,
             admission: parts.admission,
+            uploads: Arc::new(Uploads::new(uploads, Arc::clone(&parts.metrics))),
+            answers: Answers::new(limits.max_answers_bytes, ANSWER_PATIENCE),
+            waiters: Arc::default(),
             metrics: parts.metrics,
             keys: parts.keys,
             limits: parts.limits,
-            room: Arc::new(Semaphore::new(room.min(Semaphore::MAX_PERMITS))),
             compute: Semaphore::new(cores),
+            encoding: Semaphore::new(cores),
             archives: Arc::new(Semaphore::new(MAX_ARCHIVES)),
             clouds: Semaphore::new(1),
             leaving: CancellationToken::new(),
@@ -176,13 +224,19 @@ impl Service {
         done.map_err(ApiError::internal)?
     }
 
-    /// Refuses more where the disk is nearly full.
+    /// Refuses more where the disk is nearly full, of bytes or of files.
     ///
     /// # Errors
     /// [`ApiError::DiskFull`].
     pub(super) fn check_disk(&self) -> Result<(), ApiError> {
-        let least = self.limits.min_free_bytes;
-        if self.blobs.free_bytes().is_some_and(|free| free < least) {
+        let limits = &self.limits;
+        let is_full = |free: FreeSpace| {
+            let no_files = free
+                .inodes
+                .is_some_and(|free| free < limits.min_free_inodes);
+            free.bytes < limits.min_free_bytes || no_files
+        };
+        if self.blobs.free_space().is_some_and(is_full) {
             return Err(ApiError::DiskFull);
         }
         Ok(())
@@ -270,19 +324,45 @@ impl Service {
         Ok(self.queue.cancel(id).await?)
     }
 
-    /// Queues the caller's job again.
+    /// Queues the caller's job again: one that has ended without success, or whose result is lost.
+    /// It has to be admitted as a new one would.
     ///
     /// # Errors
-    /// [`ApiError::Forbidden`], [`ApiError::NotFound`], or a refusal where it has not ended or
-    /// has succeeded.
+    /// [`ApiError::Forbidden`], [`ApiError::NotFound`], the refusals of a full server, or a refusal
+    /// where it has not ended or its result is there.
     pub async fn requeue(&self, caller: &Caller, id: JobId) -> Result<Arc<Job>, ApiError> {
         caller.may_write()?;
         self.check_draining()?;
         let job = self.job(caller, id).await?;
+        self.check_disk()?;
+        let pairs = self.queue.pairs(id).await?;
+        let undone = pairs.iter().filter(|pair| pair.state != State::Succeeded);
+        let of_pairs: f64 = undone.map(|pair| pair.cost_seconds).sum();
+        let _place = self.admission.admit(&Asked {
+            tenant: &caller.tenant,
+            priority: job.priority,
+            device: job.device,
+            nominal_seconds: job.cost_seconds + of_pairs,
+            promise: Promise::Durable,
+        })?;
+        let lost = self.result_is_lost(&job).await?;
         if !job.durable {
-            self.make_durable(&job).await?;
+            self.sync_frames(&job).await?;
         }
-        Ok(self.queue.requeue(id).await?)
+        Ok(self.queue.requeue(id, lost).await?)
+    }
+
+    /// Whether a job has succeeded and its result lies no more where it was put.
+    async fn result_is_lost(&self, job: &Job) -> Result<bool, ApiError> {
+        let has_result = job.kind == Kind::Pair || is_dense(job);
+        if job.state != State::Succeeded || !has_result {
+            return Ok(false);
+        }
+        match self.blobs.size(job.id, Blob::Result(job.attempt)).await {
+            Ok(_) => Ok(false),
+            Err(error) if error.is_missing() => Ok(true),
+            Err(error) => Err(error.into()),
+        }
     }
 
     /// Follows the caller's job.
@@ -318,19 +398,29 @@ impl Service {
         Ok(Waited::StillOpen(job))
     }
 
+    /// Puts all clouds that a job is found from on the disk.
+    async fn sync_frames(&self, job: &Job) -> Result<(), ApiError> {
+        let frames = match job.kind {
+            Kind::Pair => job.sees[0]..job.sees[1],
+            Kind::Sequence => 0..1 + self.pairs(job).await?.len() as u32,
+        };
+        let (owner, _) = job.sweeps();
+        for place in frames {
+            self.blobs.sync(owner, Blob::Frame(place)).await?;
+        }
+        Ok(())
+    }
+
     /// Makes a job that somebody waited for outlive its caller.
     ///
     /// # Errors
-    /// Where the store fails.
-    pub async fn make_durable(&self, job: &Job) -> Result<Arc<Job>, ApiError> {
-        let frames = match job.kind {
-            Kind::Pair => 2,
-            Kind::Sequence => 1 + self.pairs(job).await?.len() as u32,
+    /// Where it is being given up, or the store fails.
+    pub(super) async fn make_durable(&self, job: &Job) -> Result<Arc<Job>, MakeDurable> {
+        self.sync_frames(job).await?;
+        let job = match self.queue.make_durable(job.id).await {
+            Err(QueueError::GivenUp) => return Err(MakeDurable::GivenUp),
+            made => made?,
         };
-        for place in 0..frames {
-            self.blobs.sync(job.id, Blob::Frame(place)).await?;
-        }
-        let job = self.queue.make_durable(job.id).await?;
         // A result that came before the queue knew was not waited for.
         for blob in [Blob::Result(job.attempt), Blob::Field(job.attempt)] {
             match self.blobs.sync(job.id, blob).await {
@@ -341,12 +431,12 @@ impl Service {
         Ok(job)
     }
 
-    /// Ends a job when the guard is dropped: whoever waited for it is gone.
-    pub fn cancel_when_dropped(self: &Arc<Self>, id: JobId) -> Awaited {
-        Awaited {
-            service: Arc::clone(self),
-            id: Some(id),
-        }
+    /// One more waits for a job on the line: it ends when all who do have gone.
+    ///
+    /// # Errors
+    /// Where it is being ended, for all who did have gone.
+    pub(super) fn wait_for(&self, id: JobId) -> Result<Awaited, Ending> {
+        self.waiters.wait(&self.queue, id)
     }
 
     /// Refuses a job that has not succeeded.
@@ -368,53 +458,100 @@ impl Service {
         }
     }
 
-    /// The flow of a pair that has succeeded.
+    /// Room to read, unpack and encode a job's result.
+    ///
+    /// # Errors
+    /// [`ApiError::ServerFull`], [`ApiError::ResultLost`], or where the store fails.
+    pub(super) async fn room_for_result(&self, job: &Job) -> Result<AnswerRoom, ApiError> {
+        /// Of the stored bytes, at most: read, unpacked, and in the longest format.
+        const FACTOR: usize = 6;
+        let blob = Blob::Result(job.attempt);
+        let size = self.blobs.size(job.id, blob).await;
+        let size = size.map_err(|error| lost_or(job.id, error))?;
+        self.answers.room(size.saturating_mul(FACTOR)).await
+    }
+
+    /// How a pair's flow was found.
     ///
     /// # Errors
     /// [`ApiError::NotEnded`], or how it ended instead.
-    pub async fn answer(&self, job: &Arc<Job>) -> Result<Answer, ApiError> {
+    pub(super) fn report(job: &Job) -> Result<Report, ApiError> {
         Self::check_success(job)?;
         if job.kind == Kind::Sequence {
             let text = "a sequence's flow is in its pairs; see links.pairs";
             return Err(ApiError::BadRequest(text.to_owned()));
         }
-        let bytes = self.blobs.get(job.id, Blob::Result(job.attempt)).await?;
-        let flow = StoredFlow::from_bytes(&bytes).map_err(ApiError::internal)?;
         let report = job.report.as_deref().unwrap_or_default();
+        serde_json::from_str(report).map_err(ApiError::internal)
+    }
+
+    /// The flow of a pair that has succeeded.
+    ///
+    /// # Errors
+    /// As for [`Service::report`] and [`Service::room_for_result`].
+    pub async fn answer(&self, job: &Arc<Job>) -> Result<Answer, ApiError> {
+        let report = Self::report(job)?;
+        let mut room = self.room_for_result(job).await?;
+        let blob = Blob::Result(job.attempt);
+        let bytes = self.blobs.get(job.id, blob).await;
+        let bytes = bytes.map_err(|error| lost_or(job.id, error))?;
+        let flow = StoredFlow::from_bytes(&bytes).map_err(ApiError::internal)?;
+        room.shrink(2 * bytes.len());
         Ok(Answer {
             job: Arc::clone(job),
-            report: serde_json::from_str(report).map_err(ApiError::internal)?,
+            report,
             flow: Arc::new(flow),
+            room: Arc::new(room),
         })
     }
 
-    /// A flow in a format.
+    /// The flow of a pair that has succeeded, in a format; as it was made for the last who asked,
+    /// where it still is.
     ///
     /// # Errors
-    /// Where the store fails.
-    pub(super) async fn encode(
+    /// As for [`Service::answer`].
+    pub(super) async fn encoded(
         &self,
-        answer: &Answer,
+        job: &Arc<Job>,
         format: AnswerFormat,
-    ) -> Result<Vec<u8>, ApiError> {
+    ) -> Result<Bytes, ApiError> {
+        let report = Self::report(job)?;
+        let name = (job.id, job.attempt, format.ending());
+        if let Some(made) = self.answers.made(&name) {
+            return Ok(made);
+        }
         let began = std::time::Instant::now();
+        let room = self.room_for_result(job).await?;
+        let _turn = self.encoding.acquire().await.map_err(ApiError::internal)?;
+        if let Some(made) = self.answers.made(&name) {
+            return Ok(made);
+        }
+        let bytes = self.blobs.get(job.id, Blob::Result(job.attempt)).await;
+        let bytes = bytes.map_err(|error| lost_or(job.id, error))?;
         let points = if format.needs_points() {
-            let job = &answer.job;
             let (owner, [source, _]) = job.sweeps();
-            let bytes = self.blobs.get(owner, Blob::Frame(source)).await?;
-            StoredCloud::from_bytes(&bytes)
-                .map_err(ApiError::internal)?
-                .points
+            let cloud = self.blobs.get(owner, Blob::Frame(source)).await;
+            Some(cloud.map_err(|error| lost_or(job.id, error))?)
         } else {
-            Vec::new()
+            None
         };
-        let (flow, report) = (Arc::clone(&answer.flow), answer.report.clone());
-        let name = answer.job.id.to_string();
-        let encoded = self
-            .compute(move || format.encode(&flow, &points, &report, &name))
-            .await?;
+        let id = job.id.to_string();
+        let encode = move || {
+            let flow = StoredFlow::from_bytes(&bytes).map_err(ApiError::internal)?;
+            let cloud = points
+                .map(|bytes| StoredCloud::from_bytes(&bytes))
+                .transpose();
+            let points = cloud
+                .map_err(ApiError::internal)?
+                .unwrap_or_default()
+                .points;
+            format.encode(&flow, &points, &report, &id)
+        };
+        let done = tokio::task::spawn_blocking(encode).await;
+        let encoded = room.hold(done.map_err(ApiError::internal)??);
+        self.answers.keep(name, &encoded);
         self.metrics
-            .phase("encode", began.elapsed().as_secs_f64(), Some(&answer.job));
+            .phase("encode", began.elapsed().as_secs_f64(), Some(job));
         Ok(encoded)
     }
 
@@ -426,28 +563,12 @@ impl Service {
     }
 }
 
-/// A job that somebody waits for on the line.
-pub struct Awaited {
-    service: Arc<Service>,
-    id: Option<JobId>,
-}
-
-impl Awaited {
-    /// The job has ended, or goes on by itself.
-    pub fn let_go(mut self) {
-        self.id = None;
-    }
-}
-
-impl Drop for Awaited {
-    fn drop(&mut self) {
-        if let Some(id) = self.id.take() {
-            let service = Arc::clone(&self.service);
-            tokio::spawn(async move {
-                if let Err(error) = service.queue.abandon(id).await {
-                    tracing::warn!(%error, job = %id, "an abandoned job was not cancelled");
-                }
-            });
-        }
+/// What an error of reading a result is: lost, where it is not there.
+pub(super) fn lost_or(id: JobId, error: BlobError) -> ApiError {
+    if error.is_missing() {
+        tracing::error!(%error, job = %id, "a result is lost");
+        ApiError::ResultLost(id)
+    } else {
+        error.into()
     }
 }

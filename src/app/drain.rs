@@ -40,7 +40,8 @@ impl App {
         self.service.close_streams();
         self.stop_listening.cancel();
         let closing = deadline.min(Instant::now() + TO_CLOSE);
-        if timeout_at(closing, &mut self.listener).await.is_err() {
+        // One that has ended by itself must not be asked again.
+        if !self.listener.is_finished() && timeout_at(closing, &mut self.listener).await.is_err() {
             tracing::debug!("some connections were still open");
             self.listener.abort();
         }

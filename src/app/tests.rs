@@ -250,7 +250,7 @@ async fn a_server_gives_up_when_the_last_card_does_not_come_back_and_not_before(
     const A_MOMENT: Duration = Duration::from_millis(500);
     let switches = [Arc::new(Switches::default()), Arc::new(Switches::default())];
     let cards = vec![switches[0].card("gpu0", 1), switches[1].card("gpu1", 1)];
-    let stand = serve(cards, true).await;
+    let mut stand = serve(cards, true).await;
     for (place, switches) in switches.iter().enumerate() {
         switches.refusals.store(u32::MAX, Ordering::Relaxed);
         switches.destroy();
@@ -278,7 +278,7 @@ async fn a_server_does_not_give_up_while_another_card_is_being_opened_again() {
     let mut comes_back = switches[1].card("gpu1", 1);
     // It has tries left as long as the test goes on.
     comes_back.reopening.tries = u32::MAX;
-    let stand = serve(vec![switches[0].card("gpu0", 1), comes_back], true).await;
+    let mut stand = serve(vec![switches[0].card("gpu0", 1), comes_back], true).await;
     for (switches, device) in switches.iter().zip(stand.app.devices.iter().skip(1)) {
         switches.refusals.store(u32::MAX, Ordering::Relaxed);
         switches.destroy();

@@ -1,16 +1,17 @@
-//! What goes on beside the jobs: counting, cleaning, and looking at the devices.
+//! What goes on beside the jobs: counting, cleaning, and looking at the devices and the store.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
-use tokio::time::interval;
+use tokio::time::{interval, interval_at};
 
-use crate::blobs::Blobs;
 use crate::engine::Device;
+use crate::health::{HEARTBEAT, Heartbeat, StoreHealth};
 use crate::metrics::Metrics;
 use crate::queue::{Event, Queue};
+use crate::storage::Blobs;
 
 /// How often the devices are looked at; their busy ratio is of so long.
 const LOOK: Duration = Duration::from_secs(2);
@@ -19,6 +20,18 @@ const LOOK: Duration = Duration::from_secs(2);
 /// written before its job.
 const ORPHANS: Duration = Duration::from_secs(3600);
 
+/// Orphans that one round removes: a crash leaves a few. Where there are more, it is the queue that
+/// has lost something.
+const MOST_ORPHANS: usize = 1000;
+
+/// How often the store is probed while it works.
+const PROBE: Duration = Duration::from_secs(5);
+
+/// How soon it is probed again when it has failed: later each time, and sooner again only when it has
+/// worked for a while.
+const FIRST_PROBE: Duration = Duration::from_secs(1);
+const LAST_PROBE: Duration = Duration::from_secs(30);
+
 /// Starts it all.
 pub(super) fn start(
     queue: &Arc<dyn Queue>,
@@ -26,8 +39,12 @@ pub(super) fn start(
     metrics: &Arc<Metrics>,
     devices: &[Device],
     heard: mpsc::UnboundedReceiver<Event>,
+    health: (&Arc<StoreHealth>, &Arc<Heartbeat>),
 ) -> JoinSet<()> {
+    let (store, heartbeat) = (Arc::clone(health.0), Arc::clone(health.1));
     let mut tasks = JoinSet::new();
+    tasks.spawn(beat(heartbeat));
+    tasks.spawn(probe(Arc::clone(queue), blobs.clone(), store));
     tasks.spawn(listen(blobs.clone(), Arc::clone(metrics), heard));
     tasks.spawn(look(devices.to_vec(), Arc::clone(metrics)));
     tasks.spawn(clean(Arc::clone(queue), blobs.clone()));
@@ -43,6 +60,48 @@ async fn listen(blobs: Blobs, metrics: Arc<Metrics>, mut heard: mpsc::UnboundedR
         {
             tracing::warn!(%error, job = %id, "a forgotten job left something behind");
         }
+    }
+}
+
+/// Says that the runtime goes on.
+async fn beat(heartbeat: Arc<Heartbeat>) {
+    let mut ticks = interval(HEARTBEAT);
+    loop {
+        ticks.tick().await;
+        heartbeat.beat();
+    }
+}
+
+/// Probes the store for as long as the server runs.
+async fn probe(queue: Arc<dyn Queue>, blobs: Blobs, store: Arc<StoreHealth>) {
+    let mut pause = FIRST_PROBE;
+    let mut worked_since = Instant::now();
+    loop {
+        let both = async {
+            blobs.probe().await.map_err(|error| error.to_string())?;
+            queue.probe().await.map_err(|error| error.to_string())
+        };
+        let before = store.trouble();
+        match both.await {
+            Ok(()) => {
+                if before.is_some() {
+                    worked_since = Instant::now();
+                }
+                store.works();
+            }
+            Err(error) => store.failed(&error),
+        }
+        if store.trouble().is_none() {
+            tokio::select! {
+                () = tokio::time::sleep(PROBE) => continue,
+                () = store.until_it_fails() => {}
+            }
+        }
+        if worked_since.elapsed() > LAST_PROBE {
+            pause = FIRST_PROBE;
+        }
+        tokio::time::sleep(pause).await;
+        pause = (pause * 2).min(LAST_PROBE);
     }
 }
 
@@ -67,9 +126,14 @@ async fn look(devices: Vec<Device>, metrics: Arc<Metrics>) {
 
 /// Removes payloads whose job was never accepted: their upload was cut off by a crash.
 async fn clean(queue: Arc<dyn Queue>, blobs: Blobs) {
-    let mut ticks = interval(ORPHANS);
+    let mut ticks = interval_at(tokio::time::Instant::now() + ORPHANS, ORPHANS);
     loop {
         ticks.tick().await;
+        match blobs.remove_cut_off(ORPHANS).await {
+            Ok(0) => {}
+            Ok(files) => tracing::info!(files, "what writes that were cut off had left is removed"),
+            Err(error) => tracing::warn!(%error, "payloads cannot be listed"),
+        }
         let found = match blobs.jobs_older_than(ORPHANS).await {
             Ok(found) => found,
             Err(error) => {
@@ -77,15 +141,30 @@ async fn clean(queue: Arc<dyn Queue>, blobs: Blobs) {
                 continue;
             }
         };
+        let mut orphans = Vec::new();
         for ids in found.chunks(256) {
             let Ok(known) = queue.known(ids.to_vec()).await else {
                 continue;
             };
-            for id in ids.iter().filter(|id| !known.contains(id)) {
-                if let Err(error) = blobs.remove_job(*id).await {
-                    tracing::warn!(%error, job = %id, "an orphan was not removed");
-                }
+            orphans.extend(ids.iter().copied().filter(|id| !known.contains(id)));
+        }
+        if orphans.len() > MOST_ORPHANS {
+            tracing::error!(
+                orphans = orphans.len(),
+                "the queue knows nothing of all these payloads: has it lost them? They are kept"
+            );
+            continue;
+        }
+        for id in &orphans {
+            if let Err(error) = blobs.remove_job(*id).await {
+                tracing::warn!(%error, job = %id, "an orphan was not removed");
             }
+        }
+        if !orphans.is_empty() {
+            tracing::info!(
+                jobs = orphans.len(),
+                "payloads whose jobs were never accepted are removed"
+            );
         }
     }
 }

@@ -106,7 +106,7 @@ async fn serve(config: Config) -> Result<(), Failure> {
     // Before anything is promised, so that no signal is missed.
     let mut terminate = signal(SignalKind::terminate()).map_err(Failure::internal)?;
     let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::internal)?;
-    let app = App::start(config).await.map_err(Failure::internal)?;
+    let mut app = App::start(config).await.map_err(Failure::internal)?;
     say(format_args!(
         "fnsf serves HTTP and gRPC on {}, health and metrics on {}",
         app.public_address(),
@@ -126,8 +126,8 @@ async fn serve(config: Config) -> Result<(), Failure> {
             Ok(())
         }
         reason = app.given_up() => {
-            tracing::error!(reason, "a device does not come back: stopping, for a fresh process");
-            Err(Failure::internal(anyhow!("a device does not come back: {reason}")))
+            tracing::error!(reason, "this process cannot go on: stopping, for a fresh one");
+            Err(Failure::internal(anyhow!("this process cannot go on: {reason}")))
         }
     };
     tokio::select! {

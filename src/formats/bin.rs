@@ -8,7 +8,7 @@ use std::io::Write;
 use crate::flow::Point;
 
 use super::error::{FileKind, FormatError};
-use super::limits::{check_rows, check_value};
+use super::limits::{check_rows, check_value, check_within};
 use super::scalar::write_floats;
 
 /// No lidar sees this far, metres; a misread column soon does.
@@ -78,8 +78,8 @@ fn float(bytes: &[u8]) -> f32 {
         .map_or(f32::NAN, |raw| f32::from_le_bytes(*raw))
 }
 
-/// Reads all rows of a file of a known width.
-pub(super) fn read(bytes: &[u8], kind: FileKind) -> Result<Vec<Point>, FormatError> {
+/// Reads all rows, at most `most`, of a file of a known width.
+pub(super) fn read(bytes: &[u8], kind: FileKind, most: usize) -> Result<Vec<Point>, FormatError> {
     let row_len = width(kind) * 4;
     if !bytes.len().is_multiple_of(row_len) {
         return Err(kind.malformed(format!(
@@ -87,7 +87,8 @@ pub(super) fn read(bytes: &[u8], kind: FileKind) -> Result<Vec<Point>, FormatErr
             bytes.len()
         )));
     }
-    check_rows(kind, (bytes.len() / row_len) as u64)?;
+    let rows = check_rows(kind, (bytes.len() / row_len) as u64)?;
+    check_within(kind, rows, most)?;
     let point = |(row, raw): (usize, &[u8])| {
         let axis = |axis: usize, name: &str| {
             check_value(kind, row, name, f64::from(float(&raw[axis * 4..])))

@@ -8,7 +8,7 @@ use crate::flow::Point;
 
 use super::error::{FileKind, FormatError, shorten};
 use super::feather::{self, Table, Values};
-use super::limits::{MAX_COORDINATE_M, check_value};
+use super::limits::{MAX_COORDINATE_M, MAX_POINTS, check_value, check_within};
 use super::npz::Npz;
 use super::pcd::{self, Pcd};
 use super::ply::{self, Ply};
@@ -47,14 +47,27 @@ impl From<Vec<Point>> for Cloud {
 /// Every variant of [`FormatError`] except those of writing. Values that are not finite are
 /// refused by row and column, but for PCD's rows of three NaN; so is |coordinate| > 1e6 m.
 pub fn read_cloud(bytes: &[u8], name: Option<&str>) -> Result<Cloud, FormatError> {
+    read_cloud_within(bytes, name, MAX_POINTS)
+}
+
+/// The same of at most `most` points: a file that declares more is refused before memory is taken
+/// for them.
+///
+/// # Errors
+/// As for [`read_cloud`].
+pub fn read_cloud_within(
+    bytes: &[u8],
+    name: Option<&str>,
+    most: usize,
+) -> Result<Cloud, FormatError> {
     match recognize(bytes, name)? {
-        FileKind::Npy => npy::read_file(bytes).map(Cloud::from),
-        FileKind::Npz => read_npz(bytes).map(Cloud::from),
-        FileKind::Ply => read_ply(bytes).map(Cloud::from),
-        FileKind::Pcd => read_pcd(bytes),
-        FileKind::Feather => read_feather(bytes).map(Cloud::from),
+        FileKind::Npy => npy::read_file(bytes, most).map(Cloud::from),
+        FileKind::Npz => read_npz(bytes, most).map(Cloud::from),
+        FileKind::Ply => read_ply(bytes, most).map(Cloud::from),
+        FileKind::Pcd => read_pcd(bytes, most),
+        FileKind::Feather => read_feather(bytes, most).map(Cloud::from),
         kind @ (FileKind::KittiBin | FileKind::NuscenesBin) => {
-            bin::read(bytes, kind).map(Cloud::from)
+            bin::read(bytes, kind, most).map(Cloud::from)
         }
         FileKind::Json => Err(FileKind::Json.unsupported("json holds flow here, not clouds")),
         kind @ (FileKind::Las | FileKind::Png | FileKind::Camera | FileKind::Poses) => {
@@ -63,8 +76,8 @@ pub fn read_cloud(bytes: &[u8], name: Option<&str>) -> Result<Cloud, FormatError
     }
 }
 
-fn read_npz(bytes: &[u8]) -> Result<Vec<Point>, FormatError> {
-    let mut npz = Npz::open(bytes)?;
+fn read_npz(bytes: &[u8], most: usize) -> Result<Vec<Point>, FormatError> {
+    let mut npz = Npz::open_within(bytes, most)?;
     if npz.has("pc1") && npz.has("pc2") {
         return Err(FormatError::Ambiguous(
             "an npz with pc1 and pc2 is a pair, not one cloud".to_owned(),
@@ -107,9 +120,10 @@ fn read_npz(bytes: &[u8]) -> Result<Vec<Point>, FormatError> {
     }
 }
 
-fn read_ply(bytes: &[u8]) -> Result<Vec<Point>, FormatError> {
+fn read_ply(bytes: &[u8], most: usize) -> Result<Vec<Point>, FormatError> {
     let kind = FileKind::Ply;
     let ply = Ply::open(bytes)?;
+    check_within(kind, ply.rows()?, most)?;
     refuse_integers(kind, |axis| ply.property(axis))?;
     let mut points = Vec::new();
     ply.each(&AXES, |row, values| {
@@ -123,9 +137,10 @@ fn read_ply(bytes: &[u8]) -> Result<Vec<Point>, FormatError> {
     Ok(points)
 }
 
-fn read_pcd(bytes: &[u8]) -> Result<Cloud, FormatError> {
+fn read_pcd(bytes: &[u8], most: usize) -> Result<Cloud, FormatError> {
     let kind = FileKind::Pcd;
     let pcd = Pcd::open(bytes)?;
+    check_within(kind, pcd.rows(), most)?;
     refuse_integers(kind, |axis| pcd.field(axis))?;
     let mut cloud = Cloud::default();
     pcd.each(&AXES, |row, values| {
@@ -143,8 +158,10 @@ fn read_pcd(bytes: &[u8]) -> Result<Cloud, FormatError> {
     Ok(cloud)
 }
 
-fn read_feather(bytes: &[u8]) -> Result<Vec<Point>, FormatError> {
-    read_columns(&Table::open(bytes)?, AXES)
+fn read_feather(bytes: &[u8], most: usize) -> Result<Vec<Point>, FormatError> {
+    let table = Table::open(bytes)?;
+    check_within(FileKind::Feather, table.rows(), most)?;
+    read_columns(&table, AXES)
 }
 
 /// Three float columns of a feather table as points or displacements, in metres.

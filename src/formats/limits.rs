@@ -39,6 +39,14 @@ pub(super) fn check_rows(kind: FileKind, rows: u64) -> Result<usize, FormatError
     }
 }
 
+/// Refuses more rows than a caller takes, before anything is allocated for them.
+pub(super) fn check_within(kind: FileKind, rows: usize, most: usize) -> Result<(), FormatError> {
+    if rows > most {
+        return Err(kind.too_large(format!("{rows} points are declared, {most} are taken")));
+    }
+    Ok(())
+}
+
 /// Refuses a table of `rows` rows of `stride` bytes that `present` bytes cannot hold.
 pub(super) fn check_size(
     kind: FileKind,

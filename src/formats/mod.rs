@@ -29,16 +29,17 @@ mod ply;
 mod scalar;
 
 pub use camera::{KITTI_SIZE_PX, read_camera, read_camera0_from_lidar};
-pub use cloud::{Cloud, CloudFormat, read_cloud, write_cloud};
+pub use cloud::{Cloud, CloudFormat, read_cloud, read_cloud_within, write_cloud};
 pub use dense_file::{DENSE_FORMATS, DenseFormat, write_dense};
 pub use depth_png::{read_depth_png, write_depth_png};
 pub use error::{FileKind, FormatError};
 pub use flow_file::{FlowFile, FlowFormat, FlowTable, read_flow, write_flow};
 pub use ground_raster::GroundRaster;
 pub use limits::{MAX_COORDINATE_M, MAX_POINTS};
-pub use motion::{matrix_rows, read_motion, rigid_motion};
+pub use motion::{ego_motion, matrix_rows, read_motion, rigid_motion};
 pub use pair::{
-    Av2Labels, Ground, Pair, PairTruth, is_pair, read_av2_labels, read_pair, write_pair_npz,
+    Av2Labels, Ground, Pair, PairTruth, is_pair, read_av2_labels, read_pair, read_pair_within,
+    write_pair_npz,
 };
 pub use poses::read_poses;
 pub use sniff::recognize;

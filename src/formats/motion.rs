@@ -7,6 +7,7 @@ use nalgebra::{Matrix3, Matrix4, Rotation3, Translation3, UnitQuaternion};
 use crate::flow::RigidTransform;
 
 use super::error::FormatError;
+use super::limits::MAX_COORDINATE_M;
 
 /// How far a stored rotation may be from orthonormal: float32 matrices are within 1e-6 of it,
 /// and a scale or a shear that would move a point 100 m away by a decimetre is not.
@@ -29,9 +30,22 @@ pub fn read_motion(bytes: &[u8]) -> Result<RigidTransform, FormatError> {
     let Some(numbers) = numbers.ok().filter(|numbers| numbers.len() == 16) else {
         return Err(FormatError::Motion("16 numbers as text are needed"));
     };
-    rigid_motion(&core::array::from_fn(|row| {
+    ego_motion(&core::array::from_fn(|row| {
         core::array::from_fn(|column| numbers[4 * row + column])
     }))
+}
+
+/// The rigid motion between two sweeps that a 4 x 4 matrix is: as [`rigid_motion`], and short enough
+/// that coordinates moved by it can be written. Poses in a city's frame have no such bound.
+///
+/// # Errors
+/// [`FormatError::Motion`] where it is no rigid motion, or longer than [`MAX_COORDINATE_M`].
+pub fn ego_motion(rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError> {
+    let motion = rigid_motion(rows)?;
+    if motion.translation.vector.amax() > MAX_COORDINATE_M {
+        return Err(FormatError::Motion("the motion is longer than 1e6 m"));
+    }
+    Ok(motion)
 }
 
 /// The rigid transform that a 4 x 4 matrix is, refused if it scales, shears or mirrors.
@@ -98,7 +112,8 @@ mod tests {
         let mirrored = "-1 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1";
         let short = "1 0 0 0";
         let wild = "nan 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1";
-        for text in [scaled, mirrored, short, wild, "", "\u{fffd}"] {
+        let far = "1 0 0 1e7  0 1 0 0  0 0 1 0  0 0 0 1";
+        for text in [scaled, mirrored, short, wild, far, "", "\u{fffd}"] {
             assert!(read_motion(text.as_bytes()).is_err(), "{text}");
         }
     }

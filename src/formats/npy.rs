@@ -7,7 +7,7 @@ use std::io::{Read, Write};
 use crate::flow::Point;
 
 use super::error::{FileKind, FormatError, shorten};
-use super::limits::{MAX_COORDINATE_M, check_rows, check_value};
+use super::limits::{MAX_COORDINATE_M, check_rows, check_value, check_within};
 use super::scalar::{ByteOrder, Scalar, write_floats};
 
 pub(super) const MAGIC: &[u8] = b"\x93NUMPY";
@@ -85,6 +85,11 @@ impl Header {
                 bytes.checked_mul(side as u64)
             })
             .ok_or_else(|| kind.too_large(format!("an array of shape {:?}", self.shape)))
+    }
+
+    /// The first side: what is read of it is allocated by this.
+    pub(super) fn rows(&self) -> usize {
+        self.shape.first().copied().unwrap_or(0)
     }
 
     /// Rows and columns, for an array of two dimensions.
@@ -290,8 +295,8 @@ pub(super) fn read_matrix<R: Read + ?Sized>(
     Ok(matrix)
 }
 
-/// Reads a whole `.npy` file of N x k floats, k >= 3.
-pub(super) fn read_file(bytes: &[u8]) -> Result<Vec<Point>, FormatError> {
+/// Reads a whole `.npy` file of N x k floats, k >= 3, with at most `most` rows.
+pub(super) fn read_file(bytes: &[u8], most: usize) -> Result<Vec<Point>, FormatError> {
     let kind = FileKind::Npy;
     let mut rest = bytes;
     let header = Header::read(kind, &mut rest)?;
@@ -303,6 +308,7 @@ pub(super) fn read_file(bytes: &[u8]) -> Result<Vec<Point>, FormatError> {
             rest.len()
         )));
     }
+    check_within(kind, header.rows(), most)?;
     read_points(Place { kind, array: "" }, &header, &mut rest)
 }
 

@@ -11,7 +11,7 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 use crate::flow::Point;
 
 use super::error::{FileKind, FormatError, shorten};
-use super::limits::{check_flag, unfold_limit};
+use super::limits::{MAX_POINTS, check_flag, check_within, unfold_limit};
 use super::npy::{self, Header, Place};
 
 const KIND: FileKind = FileKind::Npz;
@@ -27,11 +27,18 @@ pub(super) struct Npz<'a> {
     archive: ZipArchive<Cursor<&'a [u8]>>,
     /// Bytes that the arrays still to be read may unfold to.
     budget: Cell<u64>,
+    /// Rows that an array may have.
+    most: usize,
 }
 
 impl<'a> Npz<'a> {
     /// Reads the directory. Nothing is unfolded.
     pub(super) fn open(bytes: &'a [u8]) -> Result<Self, FormatError> {
+        Self::open_within(bytes, MAX_POINTS)
+    }
+
+    /// The same; arrays with more than `most` rows are refused.
+    pub(super) fn open_within(bytes: &'a [u8], most: usize) -> Result<Self, FormatError> {
         let entries = bytes
             .windows(4)
             .filter(|window| window == DIRECTORY_ENTRY)
@@ -43,6 +50,7 @@ impl<'a> Npz<'a> {
         Ok(Self {
             archive,
             budget: Cell::new(unfold_limit(bytes.len())),
+            most,
         })
     }
 
@@ -81,7 +89,11 @@ impl<'a> Npz<'a> {
             kind: KIND,
             array: name,
         };
-        self.with(name, |header, data| npy::read_points(place, &header, data))
+        let most = self.most;
+        self.with(name, |header, data| {
+            check_within(KIND, header.rows(), most)?;
+            npy::read_points(place, &header, data)
+        })
     }
 
     /// N booleans: nonzero is true. `None` where there is no such array.
@@ -102,7 +114,9 @@ impl<'a> Npz<'a> {
             kind: KIND,
             array: name,
         };
+        let most = self.most;
         self.with(name, |header, data| {
+            check_within(KIND, header.rows(), most)?;
             npy::read_column(place, &header, data, check)
         })
         .map(Some)

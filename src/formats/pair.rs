@@ -9,8 +9,8 @@ use crate::flow::{Point, RigidTransform};
 use super::cloud::read_columns;
 use super::error::{FileKind, FormatError};
 use super::feather::{FLOW_COLUMNS, Table};
-use super::limits::{check_category, check_flag, check_points};
-use super::motion::{matrix_rows, rigid_motion};
+use super::limits::{MAX_POINTS, check_category, check_flag, check_points};
+use super::motion::{ego_motion, matrix_rows};
 use super::npy;
 use super::npz::{Npz, NpzWriter};
 use super::sniff::is_zip;
@@ -78,12 +78,21 @@ pub fn is_pair(bytes: &[u8]) -> bool {
 /// As for a cloud, and `RowCount` where arrays disagree, `Unsupported` where `ego_SE3` is not
 /// rigid or one of the two ground masks is missing.
 pub fn read_pair(bytes: &[u8]) -> Result<Pair, FormatError> {
+    read_pair_within(bytes, MAX_POINTS)
+}
+
+/// The same of at most `most` points a cloud: a file that declares more is refused before memory is
+/// taken for them.
+///
+/// # Errors
+/// As for [`read_pair`].
+pub fn read_pair_within(bytes: &[u8], most: usize) -> Result<Pair, FormatError> {
     if !is_zip(bytes) {
         return Err(FormatError::Unrecognized(
             "a pair is an npz with pc1 and pc2".to_owned(),
         ));
     }
-    let mut npz = Npz::open(bytes)?;
+    let mut npz = Npz::open_within(bytes, most)?;
     let source = npz.points("pc1")?;
     let target = npz.points("pc2")?;
     let truth = read_truth(&mut npz, source.len())?;
@@ -101,7 +110,7 @@ pub fn read_pair(bytes: &[u8]) -> Result<Pair, FormatError> {
     };
     let ego = npz
         .matrix("ego_SE3")?
-        .map(|rows| rigid_motion(&rows))
+        .map(|rows| ego_motion(&rows))
         .transpose()?;
     Ok(Pair {
         source,

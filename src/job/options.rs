@@ -14,7 +14,7 @@ use super::device::{DeviceChoice, DeviceKind};
 use super::sequence::Densify;
 use crate::flow::densify::PlanError;
 use crate::flow::{self, Ego, Ground, MIN_POINTS, Precision, Preset, RigidTransform};
-use crate::formats::{matrix_rows, rigid_motion};
+use crate::formats::{ego_motion, matrix_rows};
 
 /// The longest deadline that may be asked for.
 const MAX_DEADLINE: Duration = Duration::from_secs(24 * 60 * 60);
@@ -198,9 +198,7 @@ impl<'de> Deserialize<'de> for EgoChoice {
             rows @ serde_json::Value::Array(_) => {
                 let rows: [[f64; 4]; 4] =
                     serde_json::from_value(rows).map_err(|_| D::Error::custom(wanted))?;
-                rigid_motion(&rows)
-                    .map(Self::Given)
-                    .map_err(D::Error::custom)
+                ego_motion(&rows).map(Self::Given).map_err(D::Error::custom)
             }
             _ => Err(D::Error::custom(wanted)),
         }
@@ -398,6 +396,10 @@ mod tests {
             (
                 r#"{"ego":[[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}"#,
                 "not a rigid",
+            ),
+            (
+                r#"{"ego":[[1,0,0,1e300],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}"#,
+                "longer than 1e6 m",
             ),
             (r#"{"densify":{}}"#, "missing field `into`"),
             (

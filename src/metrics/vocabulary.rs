@@ -11,9 +11,10 @@ pub const PHASES: [&str; 7] = [
     "total",
 ];
 /// Why requests are refused.
-pub const REJECTIONS: [&str; 10] = [
+pub const REJECTIONS: [&str; 11] = [
     "no_device",
     "disk_full",
+    "store_unavailable",
     "too_large",
     "too_many_points",
     "bad_input",

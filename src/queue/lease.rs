@@ -1,7 +1,8 @@
 //! A worker's hold on a job, and the sign of life that keeps it.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
 
 use super::Progress;
 use crate::job::Job;
@@ -26,12 +27,25 @@ pub enum Signal {
     Lost,
 }
 
-/// What the queue tells a worker without being asked.
-#[derive(Debug, Default)]
+/// What the queue tells a worker without being asked, and when it heard of it last.
+#[derive(Debug)]
 pub(super) struct Flags {
     cancel: AtomicBool,
     lost: AtomicBool,
     durable: AtomicBool,
+    /// By a clock that nobody sets.
+    last_beat: Mutex<Instant>,
+}
+
+impl Default for Flags {
+    fn default() -> Self {
+        Self {
+            cancel: AtomicBool::default(),
+            lost: AtomicBool::default(),
+            durable: AtomicBool::default(),
+            last_beat: Mutex::new(Instant::now()),
+        }
+    }
 }
 
 impl Flags {
@@ -49,6 +63,23 @@ impl Flags {
 
     pub(super) fn lose(&self) {
         self.lost.store(true, Ordering::Relaxed);
+    }
+
+    /// The worker is alive.
+    pub(super) fn beat(&self) {
+        let mut last = self
+            .last_beat
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        *last = Instant::now();
+    }
+
+    /// When the worker was last alive.
+    pub(super) fn last_beat(&self) -> Instant {
+        *self
+            .last_beat
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -83,6 +114,7 @@ impl Pulse {
 
     /// A sign of life; says what to do.
     pub fn beat(&self, progress: Option<Progress>) -> Signal {
+        self.flags.beat();
         self.heart.beat(progress);
         self.signal()
     }

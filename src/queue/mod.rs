@@ -203,12 +203,25 @@ pub enum QueueError {
     /// Only a job that has ended without success can be asked for again.
     #[error("only a job that failed, expired or was cancelled is queued again: this one is {}", .0.name())]
     NotOver(State),
-    /// The store failed.
+    /// Its end was asked for before it was promised to anybody: it is as good as gone.
+    #[error("the job is being cancelled")]
+    GivenUp,
+    /// The store failed: the machine's fault, never a job's.
     #[error("the queue's store failed: {0}")]
     Store(String),
+    /// The store cannot grow: the disk is full.
+    #[error("the queue's store is full: {0}")]
+    Full(String),
     /// The queue is closed.
     #[error("the queue is closed")]
     Closed,
+}
+
+impl QueueError {
+    /// Whether the machine is at fault, so that the same may succeed later.
+    pub fn is_of_the_machine(&self) -> bool {
+        matches!(self, Self::Store(_) | Self::Full(_))
+    }
 }
 
 /// Something that happened in the queue, for metrics and for whoever cleans up.
@@ -231,11 +244,13 @@ pub enum Event {
 /// The queue's contract. Whatever is answered has happened, and is on disk if the job is durable.
 #[async_trait]
 pub trait Queue: Send + Sync {
-    /// Accepts a job, and for a sequence all of its pairs. A job that comes after another one is
+    /// Accepts a job, and for a sequence all of its pairs. A key that was used before finds that job,
+    /// unless that one was never promised and was given up: then the key is free again. A job that comes after another one is
     /// queued, but nobody gets it before that one has ended.
     async fn submit(&self, submission: Submission) -> Result<Submitted, QueueError>;
 
-    /// Makes a job outlive this process.
+    /// Makes a job outlive this process; refused as [`QueueError::GivenUp`] where its end was asked
+    /// for before.
     async fn make_durable(&self, id: JobId) -> Result<Arc<Job>, QueueError>;
 
     /// One tenant's job; other tenants' jobs are not found.
@@ -253,8 +268,9 @@ pub trait Queue: Send + Sync {
     /// Ends a job that somebody waited for and does not any more; one that was promised stays.
     async fn abandon(&self, id: JobId) -> Result<(), QueueError>;
 
-    /// Queues an ended job again, as if it had never been tried.
-    async fn requeue(&self, id: JobId) -> Result<Arc<Job>, QueueError>;
+    /// Queues an ended job again, as if it had never been tried; from now on it outlives the process.
+    /// One that has succeeded only where its result is `lost`.
+    async fn requeue(&self, id: JobId, lost: bool) -> Result<Arc<Job>, QueueError>;
 
     /// Follows a job: its state and, while it runs, every iteration.
     async fn watch(&self, id: JobId) -> Result<watch::Receiver<Arc<Job>>, QueueError>;
@@ -276,6 +292,12 @@ pub trait Queue: Send + Sync {
 
     /// Since when the job that has waited longest for a device could have been started.
     async fn oldest_queued(&self) -> Result<Option<Timestamp>, QueueError>;
+
+    /// Goes the way of a submission and back, and writes to the disk: whether the store can be used.
+    async fn probe(&self) -> Result<(), QueueError>;
+
+    /// Returns when nothing can be written any more, whatever happens: a fresh process is needed.
+    async fn ended(&self);
 
     /// Which of some names belong to jobs.
     async fn known(&self, ids: Vec<JobId>) -> Result<Vec<JobId>, QueueError>;

@@ -9,13 +9,13 @@ use std::time::Instant;
 
 use super::inputs::StoreError;
 use super::job_watch::DenseWatch;
-use super::{Attempt, Densification, Densified, Done, EngineError, Found, Worker, unreadable};
-use crate::blobs::Blob;
+use super::{Attempt, Densification, Densified, Done, EngineError, Found, Worker};
 use crate::flow::densify::Plan;
 use crate::flow::{FlowError, Sweep, Watch};
 use crate::job::{DenseReport, Densify, Job, JobOptions};
 use crate::payload::{Damaged, StoredCloud, StoredDense};
 use crate::queue::Lease;
+use crate::storage::Blob;
 
 /// Why there is nothing to carry.
 enum Unprepared {
@@ -45,7 +45,7 @@ impl Worker {
         let (work, asked) = match self.prepare_sweeps(&lease.job, watch).await {
             Ok(prepared) => prepared,
             Err(Unprepared::Interrupted) => return self.interrupted(lease),
-            Err(Unprepared::Store(error)) => return unreadable(&error),
+            Err(Unprepared::Store(error)) => return self.unreadable(&error),
         };
         let (began, frames) = (Instant::now(), work.sweeps.len());
         match self.lane.densify(work).await {

@@ -11,12 +11,12 @@ use tokio::task::JoinHandle;
 
 use super::Worker;
 use super::job_watch::JobWatch;
-use crate::blobs::{Blob, BlobError, Sync};
 use crate::clock::Timestamp;
 use crate::flow::{Ego, Field, SealError, Snapshot, Sweep};
 use crate::job::{Job, JobOptions, State};
 use crate::payload::{Damaged, StoredCloud};
 use crate::queue::{Lease, QueueError};
+use crate::storage::{Blob, BlobError, Sync};
 
 /// Why a job could not be taken from the store, or put back.
 #[derive(Debug, thiserror::Error)]
@@ -179,6 +179,7 @@ impl Worker {
     /// Writes every snapshot that comes, until the optimization ends.
     fn keep_snapshots(&self, lease: &Lease, mut kept: mpsc::Receiver<Snapshot>) -> JoinHandle<()> {
         let (blobs, metrics) = (self.blobs.clone(), Arc::clone(&self.metrics));
+        let store_health = Arc::clone(&self.store_health);
         let (id, pulse) = (lease.job.id, lease.pulse.clone());
         tokio::spawn(async move {
             while let Some(snapshot) = kept.recv().await {
@@ -188,7 +189,10 @@ impl Worker {
                         metrics.snapshot_kept();
                         pulse.snapshot_kept();
                     }
-                    Err(error) => tracing::warn!(%error, "a snapshot was not kept"),
+                    Err(error) => {
+                        tracing::warn!(%error, "a snapshot was not kept");
+                        store_health.failed(&error);
+                    }
                 }
             }
         })

@@ -9,7 +9,6 @@ use tokio::sync::mpsc;
 use tokio::time::timeout;
 
 use super::{Drain, Worker, WorkerOptions};
-use crate::blobs::{Blob, Blobs, Sync};
 use crate::cost::{CostModel, Lanes};
 use crate::engine::cards::Switches;
 use crate::engine::{Device, Health};
@@ -18,6 +17,7 @@ use crate::job::{DeviceKind, Job, JobError, JobId, Kind, Priority, State, Tenant
 use crate::metrics::Metrics;
 use crate::payload::{StoredCloud, StoredFlow};
 use crate::queue::{Outcome, PairOf, Queue, QueueOptions, SqliteQueue, Submission, Submitted};
+use crate::storage::{Blob, Blobs, Sync};
 
 /// Long enough for a loaded machine; only a failure waits so long.
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -69,6 +69,7 @@ async fn stand_with(lanes: usize, roomier: Option<DeviceKind>) -> Stand {
         },
         drain: Drain::default(),
         company: Arc::default(),
+        store_health: Arc::default(),
     };
     Stand {
         queue,

@@ -13,7 +13,7 @@ use super::proto::{self, scene_flow_server::SceneFlow};
 use super::{convert, sequence};
 use crate::api::admission::Promise;
 use crate::api::dense;
-use crate::api::draft::{Accepted, Draft, Room};
+use crate::api::draft::{Accepted, Draft};
 use crate::api::error::ApiError;
 use crate::api::service::{Service, Waited};
 use crate::job::{InvalidId, Job, JobId, Kind};
@@ -46,11 +46,8 @@ impl Calls {
         use proto::estimate_flow_request::Part;
         let awaited = Promise::WhileAwaited;
         self.service.check_room(&call.caller, None, awaited)?;
-        let mut room = Room::default();
-        let begin = match chunks::next(&self.service, &mut room, inbound)
-            .await?
-            .and_then(|m| m.part)
-        {
+        let mut room = self.service.uploads.room(&call.caller.tenant);
+        let begin = match chunks::next(&mut room, inbound).await?.and_then(|m| m.part) {
             Some(Part::Begin(begin)) => begin,
             _ => return Err(no_begin()),
         };
@@ -62,7 +59,7 @@ impl Calls {
         let request = call.draft_request(options, awaited);
         let mut draft = Draft::begin(&self.service, call.caller.clone(), request)?;
         let mut clouds = [CloudBuilder::default(), CloudBuilder::default()];
-        while let Some(message) = chunks::next(&self.service, &mut room, inbound).await? {
+        while let Some(message) = chunks::next(&mut room, inbound).await? {
             let Some(Part::Cloud(piece)) = message.part else {
                 return Err(no_begin());
             };
@@ -209,8 +206,8 @@ impl SceneFlow for Calls {
             .check_room(&call.caller, None, Promise::Durable)?;
         let mut inbound = request.into_inner();
         let service = &self.service;
-        let mut room = Room::default();
-        let begin = match chunks::next(service, &mut room, &mut inbound)
+        let mut room = service.uploads.room(&call.caller.tenant);
+        let begin = match chunks::next(&mut room, &mut inbound)
             .await?
             .and_then(|m| m.part)
         {
@@ -225,9 +222,7 @@ impl SceneFlow for Calls {
         let mut draft = Draft::begin(service, call.caller.clone(), draft_request)?;
         let mut cloud: Option<CloudBuilder> = None;
         loop {
-            let part = chunks::next(service, &mut room, &mut inbound)
-                .await?
-                .map(|m| m.part);
+            let part = chunks::next(&mut room, &mut inbound).await?.map(|m| m.part);
             let place = format!("cloud {}", draft.frames());
             match part {
                 Some(Some(Part::Chunk(chunk))) => match &mut cloud {
@@ -240,7 +235,7 @@ impl SceneFlow for Calls {
                 Some(Some(Part::Next(_))) | None => {
                     if let Some(cloud) = cloud.replace(CloudBuilder::default()) {
                         draft.push(cloud.finish(&place)?).await?;
-                        room = Room::default();
+                        drop(room.next());
                     }
                     if part.is_none() {
                         break;
@@ -362,11 +357,11 @@ impl SceneFlow for Calls {
             // It is held as long as its client reads.
             let turn = Arc::clone(&self.service.archives).try_acquire_owned();
             let turn = turn.map_err(|_| ApiError::ServerFull(Duration::from_secs(1)))?;
-            let cloud = self.service.dense_cloud(&job).await?;
+            let (cloud, room) = self.service.dense_cloud(&job).await?;
             let pieces = chunks::dense_pieces(cloud, first).map(Part::DenseChunk);
             let parts = std::iter::once(Part::DenseHeader(header)).chain(pieces);
             tokio::spawn(async move {
-                let _turn = turn;
+                let _while_it_is_read = (turn, room);
                 send_result(parts, answers).await;
             });
         } else {

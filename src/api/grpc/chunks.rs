@@ -6,9 +6,9 @@ use tonic::Streaming;
 
 use super::{convert, proto};
 use crate::api::codec;
-use crate::api::draft::Room;
 use crate::api::error::ApiError;
 use crate::api::service::{Answer, Service};
+use crate::api::uploads::Room;
 use crate::flow::{DenseCloud, Point};
 use crate::payload::{StoredCloud, points_from_le_bytes};
 
@@ -17,11 +17,10 @@ const ROWS: usize = 45_000;
 
 /// The next message, within the time that a body may take.
 pub(super) async fn next<T>(
-    service: &Service,
     room: &mut Room,
     inbound: &mut Streaming<T>,
 ) -> Result<Option<T>, ApiError> {
-    match room.wait(service, inbound.message()).await? {
+    match room.wait(inbound.message()).await? {
         Ok(message) => Ok(message),
         Err(status) if status.code() == tonic::Code::OutOfRange => {
             let text = "a message is larger than 1 MiB: send smaller chunks";
@@ -52,7 +51,7 @@ impl CloudBuilder {
     ) -> Result<(), ApiError> {
         const POINT: usize = size_of::<Point>();
         let bytes = chunk.points.len();
-        room.take(service, bytes + chunk.ground.len())?;
+        room.take(bytes + chunk.ground.len())?;
         if !bytes.is_multiple_of(POINT) {
             return Err(ApiError::BadInput(format!(
                 "{part}: a chunk has {bytes} bytes of points, not a multiple of {POINT}"
@@ -132,9 +131,11 @@ pub(super) fn pieces(
     answer: &Answer,
     first: usize,
 ) -> impl Iterator<Item = proto::FlowChunk> + use<> {
-    let flow = Arc::clone(&answer.flow);
+    let (flow, room) = (Arc::clone(&answer.flow), Arc::clone(&answer.room));
     let rows = flow.flow.len();
     (first.min(rows)..rows).step_by(ROWS).map(move |from| {
+        // It is held as long as there are pieces to come.
+        let _room = &room;
         let to = (from + ROWS).min(rows);
         let values = flow.flow[from..to].as_flattened().iter();
         let bytes: Vec<u8> = values.flat_map(|value| value.to_le_bytes()).collect();

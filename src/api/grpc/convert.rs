@@ -8,7 +8,7 @@ use super::proto;
 use crate::api::error::ApiError;
 use crate::api::service::Answer;
 use crate::flow::Cluster;
-use crate::formats::rigid_motion;
+use crate::formats::ego_motion;
 use crate::job::{
     DenseReport, Densify, DeviceChoice, EgoChoice, GroundChoice, Job, JobError, JobId, JobOptions,
     JobProgress, Kind, LaterChoice, PrecisionChoice, PresetChoice, Priority, State,
@@ -91,7 +91,7 @@ fn ego(named: i32, motion: &[f64]) -> Result<Option<EgoChoice>, ApiError> {
         (proto::Ego::Unspecified, 16) => {
             let rows =
                 core::array::from_fn(|row| core::array::from_fn(|column| motion[4 * row + column]));
-            let motion = rigid_motion(&rows).map_err(|error| invalid(&error.to_string()))?;
+            let motion = ego_motion(&rows).map_err(|error| invalid(&error.to_string()))?;
             Ok(Some(EgoChoice::Given(motion)))
         }
         (proto::Ego::Unspecified, _) => Err(invalid("ego_motion has 16 numbers, row by row")),

@@ -14,9 +14,10 @@ use super::call::{Call, no_begin};
 use super::chunks::{self, CloudBuilder};
 use super::{convert, proto};
 use crate::api::admission::Promise;
-use crate::api::draft::{Accepted, Draft, Link, Room};
+use crate::api::draft::{Accepted, Draft, Link};
 use crate::api::error::ApiError;
 use crate::api::service::{Service, Waited};
+use crate::api::uploads::Room;
 use crate::flow::{is_whole, window};
 use crate::job::{JobId, JobOptions, Kind};
 use crate::payload::StoredCloud;
@@ -124,8 +125,8 @@ struct Reader {
 impl Reader {
     async fn run(&mut self) -> Result<(), ApiError> {
         use proto::estimate_sequence_request::Part;
-        let mut room = Room::default();
-        let first = chunks::next(&self.service, &mut room, &mut self.inbound).await?;
+        let mut room = self.service.uploads.room(&self.call.caller.tenant);
+        let first = chunks::next(&mut room, &mut self.inbound).await?;
         let Some(Part::Begin(begin)) = first.and_then(|message| message.part) else {
             return Err(no_begin());
         };
@@ -135,15 +136,15 @@ impl Reader {
         self.options = options;
         let mut current: Option<Coming> = None;
         loop {
-            // A drive may pause for as long as it likes: only a dead connection ends it.
+            // A drive may pause for as long as nobody needs the room that it holds.
             let coming = current
                 .as_ref()
                 .is_some_and(|coming| coming.points.is_some());
             let message = if coming {
                 // One that is known to be incomplete must come on.
-                room.wait(&self.service, self.inbound.message()).await?
+                room.wait(self.inbound.message()).await?
             } else {
-                self.inbound.message().await
+                room.pause(self.inbound.message()).await?
             };
             let message = message.map_err(|status| {
                 ApiError::BadRequest(format!("the stream is broken: {}", status.message()))
@@ -170,7 +171,7 @@ impl Reader {
                 None => return Err(ApiError::BadRequest("a message is empty".to_owned())),
             };
             if let Some(whole) = whole {
-                self.take(whole, std::mem::take(&mut room)).await?;
+                self.take(whole, room.next()).await?;
             }
             if ended {
                 self.submit_rest().await;

@@ -15,19 +15,20 @@ use crate::api::auth::Caller;
 use crate::api::codec::AnswerFormat;
 use crate::api::dense;
 use crate::api::error::ApiError;
-use crate::api::service::{Answer, Service};
+use crate::api::service::Service;
 use crate::formats::{DENSE_FORMATS, DenseFormat};
 use crate::job::{DenseReport, Job, Kind, State as JobState};
 
 /// A pair's flow, whole.
 pub(super) async fn flow(
     service: &Arc<Service>,
-    answer: &Answer,
+    job: &Arc<Job>,
     format: AnswerFormat,
 ) -> Result<Response, ApiError> {
-    let bytes = service.encode(answer, format).await?;
+    let head = Head::of_flow(job, format)?;
+    let bytes = service.encoded(job, format).await?;
     let mut response = Body::from(bytes).into_response();
-    Head::of_flow(answer, format).describe(&mut response);
+    head.describe(&mut response);
     Ok(response)
 }
 
@@ -40,10 +41,10 @@ struct Head {
 }
 
 impl Head {
-    fn of_flow(answer: &Answer, format: AnswerFormat) -> Self {
-        let report = &answer.report;
-        Self {
-            job: Arc::clone(&answer.job),
+    fn of_flow(job: &Arc<Job>, format: AnswerFormat) -> Result<Self, ApiError> {
+        let report = Service::report(job)?;
+        Ok(Self {
+            job: Arc::clone(job),
             media_type: format.media_type(),
             ending: format.ending(),
             own: vec![
@@ -51,7 +52,7 @@ impl Head {
                 ("fnsf-iterations", report.iterations.to_string()),
                 ("fnsf-seconds", format!("{:.6}", report.seconds.total)),
             ],
-        }
+        })
     }
 
     fn of_cloud(job: &Arc<Job>, report: &DenseReport, format: DenseFormat) -> Self {
@@ -95,19 +96,22 @@ impl Head {
     async fn answer(
         &self,
         headers: &HeaderMap,
-        bytes: impl Future<Output = Result<Vec<u8>, ApiError>>,
+        bytes: impl Future<Output = Result<Bytes, ApiError>>,
     ) -> Result<Response, ApiError> {
         let text =
             |name: header::HeaderName| headers.get(name).and_then(|value| value.to_str().ok());
         let tag = self.entity_tag();
+        // Compared weakly, as RFC 9110 (13.1.2) asks for: a proxy may have marked it.
         let matches = |tags: &str| {
-            tags.split(',')
-                .any(|one| one.trim() == tag || one.trim() == "*")
+            tags.split(',').map(str::trim).any(|one| {
+                let one = one.strip_prefix("W/").unwrap_or(one);
+                one == tag || one == "*"
+            })
         };
         let mut response = if text(header::IF_NONE_MATCH).is_some_and(matches) {
             StatusCode::NOT_MODIFIED.into_response()
         } else {
-            let bytes = Bytes::from(bytes.await?);
+            let bytes = bytes.await?;
             let fresh = text(header::IF_RANGE).is_none_or(|known| known == tag);
             part(bytes, text(header::RANGE).filter(|_| fresh))?
         };
@@ -174,14 +178,22 @@ pub(super) async fn result(
             .await;
     }
     if job.kind == Kind::Sequence && job.state.is_end() {
-        // An archive is no flow format: whatever is accepted besides names its entries' format.
-        let entries = accept.filter(|_| !wants_archive);
-        return archive(&service, &job, AnswerFormat::accepted(entries)?).await;
+        return archive(&service, &job, entries_format(accept)?).await;
     }
     let format = AnswerFormat::accepted(accept)?;
-    let answer = service.answer(&job).await?;
-    let head = Head::of_flow(&answer, format);
-    head.answer(&headers, service.encode(&answer, format)).await
+    let head = Head::of_flow(&job, format)?;
+    head.answer(&headers, service.encoded(&job, format)).await
+}
+
+/// The format of an archive's flows: an archive is no flow format, and whatever is accepted besides
+/// names that of its entries.
+fn entries_format(accept: Option<&str>) -> Result<AnswerFormat, ApiError> {
+    let others = accept.unwrap_or_default().split(',').filter(|one| {
+        let media = one.split(';').next().unwrap_or_default().trim();
+        !media.eq_ignore_ascii_case("application/zip")
+    });
+    let others: Vec<&str> = others.collect();
+    AnswerFormat::accepted(Some(&others.join(",")))
 }
 
 /// The first and last byte of a single range; nothing where the header is to be ignored, and
@@ -212,7 +224,7 @@ async fn archive(
     format: AnswerFormat,
 ) -> Result<Response, ApiError> {
     if sequence.state != JobState::Succeeded {
-        service.answer(sequence).await?;
+        Service::report(sequence)?;
     }
     let pairs = service.pairs(sequence).await?;
     let turn = Arc::clone(&service.archives).try_acquire_owned();
@@ -231,10 +243,7 @@ async fn archive(
             .compression_method(zip::CompressionMethod::Stored);
         let mut write = || -> Result<(), Box<dyn std::error::Error>> {
             for pair in &pairs {
-                let bytes = runtime.block_on(async {
-                    let answer = service.answer(pair).await?;
-                    service.encode(&answer, format).await
-                })?;
+                let bytes = runtime.block_on(service.encoded(pair, format))?;
                 zip.start_file(format!("{:06}.{}", pair.place, format.ending()), plain)?;
                 std::io::Write::write_all(&mut zip, &bytes)?;
             }

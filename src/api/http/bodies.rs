@@ -6,16 +6,18 @@ use std::time::{Duration, Instant};
 use axum::extract::multipart::{Field, Multipart, MultipartError};
 use axum::extract::{FromRequest, Request};
 use axum::http::header;
-use futures_util::stream::{self, Stream, StreamExt};
+use futures_util::stream::{self, Stream, StreamExt, TryStreamExt};
+use tokio::task::coop::consume_budget;
 use tokio::time::timeout;
 use utoipa::ToSchema;
 
 use super::metered::{Meter, metered};
 use crate::api::auth::Caller;
 use crate::api::codec;
-use crate::api::draft::{Draft, Room};
+use crate::api::draft::Draft;
 use crate::api::error::ApiError;
 use crate::api::service::Service;
+use crate::api::uploads::Room;
 use crate::formats;
 use crate::job::JobOptions;
 use crate::payload::StoredCloud;
@@ -76,7 +78,7 @@ impl Body {
     ) -> Result<Self, ApiError> {
         if let Err(error) = check_head(service, caller, &request) {
             let body = request.into_body().into_data_stream();
-            drain(body.map(|piece| piece.map_or(0, |piece| piece.len()))).await;
+            drain(body.map_ok(|piece| piece.len())).await;
             return Err(error);
         }
         let (request, meter) = metered(request);
@@ -85,7 +87,7 @@ impl Body {
             service: Arc::clone(service),
             multipart: multipart.map_err(|_| not_multipart())?,
             meter,
-            room: Room::default(),
+            room: service.uploads.room(&caller.tenant),
             has_options: false,
             decode_seconds: 0.0,
         })
@@ -94,13 +96,12 @@ impl Body {
     /// The next part, whole.
     pub(super) async fn next(&mut self) -> Result<Option<Part>, ApiError> {
         let field = self.multipart.next_field();
-        let field = self.room.wait(&self.service, field).await?;
+        let field = self.room.wait(field).await?;
         let Some(field) = field.map_err(broken)? else {
             return Ok(None);
         };
         self.meter.understood();
         let mut reading = Reading {
-            service: &self.service,
             room: &mut self.room,
             meter: &self.meter,
         };
@@ -132,13 +133,16 @@ impl Body {
         name: Option<String>,
         bytes: Vec<u8>,
     ) -> Result<StoredCloud, ApiError> {
-        let read = move || codec::read_cloud(&part, &bytes, name.as_deref());
+        let most = self.service.admission.max_points();
+        let read = move || codec::read_cloud(&part, &bytes, name.as_deref(), most);
         self.timed(read).await
     }
 
     /// Reads a file that holds both clouds.
     pub(super) async fn pair(&mut self, bytes: Vec<u8>) -> Result<[StoredCloud; 2], ApiError> {
-        self.timed(move || codec::read_pair("source", &bytes)).await
+        let most = self.service.admission.max_points();
+        self.timed(move || codec::read_pair("source", &bytes, most))
+            .await
     }
 
     async fn timed<T: Send + 'static>(
@@ -155,15 +159,17 @@ impl Body {
     pub(super) async fn drain(self) {
         // A part is taken whole, however long it is: the time bounds it.
         let meter = self.meter;
-        let pieces = stream::unfold(self.multipart, async |mut multipart| {
-            let mut field = multipart.next_field().await.ok()??;
+        let pieces = stream::try_unfold(self.multipart, async |mut multipart| {
+            let Some(mut field) = multipart.next_field().await? else {
+                return Ok::<_, MultipartError>(None);
+            };
             let mut bytes = 0;
-            while let Some(piece) = field.chunk().await.ok()? {
+            while let Some(piece) = field.chunk().await? {
                 meter.understood();
                 bytes += piece.len();
             }
             drop(field);
-            Some((bytes, multipart))
+            Ok(Some((bytes, multipart)))
         });
         drain(pieces).await;
     }
@@ -204,14 +210,17 @@ fn not_multipart() -> ApiError {
 }
 
 /// Takes what is still coming and throws it away, so that the client, which is still sending,
-/// gets to read its answer; a body that is too long for that is cut off.
-async fn drain(pieces: impl Stream<Item = usize>) {
+/// gets to read its answer; a body that is too long for that is cut off, and one that breaks has
+/// ended.
+async fn drain<E>(pieces: impl Stream<Item = Result<usize, E>>) {
     const LONGEST: Duration = Duration::from_secs(2);
     const MOST: usize = 16 << 20;
     let mut pieces = std::pin::pin!(pieces);
     let drained = async {
         let mut bytes = 0;
-        while let Some(piece) = pieces.next().await {
+        while let Some(Ok(piece)) = pieces.next().await {
+            // A piece that is there at once must not keep the time from passing.
+            consume_budget().await;
             bytes += piece;
             if bytes > MOST {
                 return;
@@ -223,7 +232,6 @@ async fn drain(pieces: impl Stream<Item = usize>) {
 
 /// What reading a part draws on.
 struct Reading<'a> {
-    service: &'a Service,
     room: &'a mut Room,
     meter: &'a Meter,
 }
@@ -233,16 +241,20 @@ impl Reading<'_> {
     async fn whole(&mut self, mut field: Field<'_>, limit: usize) -> Result<Vec<u8>, ApiError> {
         let mut bytes = Vec::new();
         loop {
-            let piece = self.room.wait(self.service, field.chunk()).await?;
+            let piece = self.room.wait(field.chunk()).await?;
             let Some(piece) = piece.map_err(broken)? else {
                 return Ok(bytes);
             };
             self.meter.understood();
-            self.room.take(self.service, piece.len())?;
+            self.room.take(piece.len())?;
             if bytes.len() + piece.len() > limit {
                 return Err(ApiError::TooLarge(format!(
                     "a part has more than {limit} bytes"
                 )));
+            }
+            if bytes.capacity() - bytes.len() < piece.len() {
+                // Doubled, a large file would take twice its size.
+                bytes.reserve_exact(piece.len().max(bytes.len() / 4));
             }
             bytes.extend_from_slice(&piece);
         }

@@ -21,7 +21,7 @@ use crate::api::auth::Caller;
 use crate::api::codec::AnswerFormat;
 use crate::api::draft::{Accepted, Arrived, Draft, Request as DraftRequest};
 use crate::api::error::ApiError;
-use crate::api::service::{Service, Waited};
+use crate::api::service::{MakeDurable, Service, Waited};
 use crate::job::{Job, JobId, JobOptions, Kind, State as JobState};
 use crate::queue::PairOf;
 
@@ -119,14 +119,12 @@ pub(super) async fn estimate(
     }
     let longest = asked.prefer.wait.filter(|_| asked.prefer.respond_async);
     let response = match service.wait(job.id, longest).await? {
-        Waited::Ended(job) => {
-            let answer = service.answer(&job).await?;
-            answer::flow(&service, &answer, format).await
-        }
-        Waited::StillOpen(job) if longest.is_some() => {
-            let job = service.make_durable(&job).await?;
-            Ok(accepted(&job, asked.prefer))
-        }
+        Waited::Ended(job) => answer::flow(&service, &job, format).await,
+        Waited::StillOpen(job) if longest.is_some() => match service.make_durable(&job).await {
+            Ok(job) => Ok(accepted(&job, asked.prefer)),
+            Err(MakeDurable::GivenUp) => Err(ApiError::Cancelled(job.id)),
+            Err(MakeDurable::Failed(error)) => return Err(error),
+        },
         Waited::StillOpen(_) => return Err(ApiError::Draining),
     };
     if let Some(awaited) = awaited {

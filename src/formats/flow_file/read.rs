@@ -5,7 +5,7 @@ use crate::flow::{Cluster, Point};
 use crate::formats::cloud::read_columns;
 use crate::formats::error::{FileKind, FormatError};
 use crate::formats::feather::{FLOW_COLUMNS, Table};
-use crate::formats::limits::{check_chance, check_flag, check_id, check_value};
+use crate::formats::limits::{MAX_POINTS, check_chance, check_flag, check_id, check_value};
 use crate::formats::npy;
 use crate::formats::npz::Npz;
 use crate::formats::pair::{check_count, flags};
@@ -38,7 +38,7 @@ pub struct FlowFile {
 pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatError> {
     let file = match recognize(bytes, name)? {
         FileKind::Npy => FlowFile {
-            flow: npy::read_file(bytes)?,
+            flow: npy::read_file(bytes, MAX_POINTS)?,
             ..FlowFile::default()
         },
         kind @ FileKind::Npz => {

@@ -38,10 +38,10 @@ pub(crate) async fn failures_are_retried_later_and_given_up_in_the_end(stand: &m
         dead.error.as_ref().map(|error| error.code.as_str()),
         Some("broken")
     );
-    let again = queue.requeue(job.id).await.expect("it has ended");
+    let again = queue.requeue(job.id, false).await.expect("it has ended");
     assert!(!again.dead && again.state == State::Queued && again.error.is_none());
     assert_eq!(lease(&queue).await.job.attempt, 4);
-    let running = queue.requeue(job.id).await;
+    let running = queue.requeue(job.id, false).await;
     assert_eq!(running, Err(QueueError::NotOver(State::Running)));
 }
 
@@ -259,13 +259,13 @@ pub(crate) async fn a_job_that_is_asked_for_again_waits_for_its_turn(stand: &mut
     for _ in 0..3 {
         waiting.push(submit(&queue, submission("a")).await.id);
     }
-    queue.requeue(old.id).await.expect("it has ended");
+    queue.requeue(old.id, false).await.expect("it has ended");
     waiting.push(old.id);
     for id in waiting {
         assert_eq!(lease(&queue).await.job.id, id);
     }
     let held = lease_of_a_success(&queue).await;
-    let refused = queue.requeue(held).await;
+    let refused = queue.requeue(held, false).await;
     assert_eq!(refused, Err(QueueError::NotOver(State::Succeeded)));
 }
 

@@ -188,7 +188,7 @@ pub(crate) async fn a_sequence_is_cancelled_with_its_pairs_and_can_be_asked_for_
     reaches(&queue, &job, State::Cancelled).await;
     nothing_is_ready(&queue).await;
 
-    let again = queue.requeue(job.id).await.expect("it has ended");
+    let again = queue.requeue(job.id, false).await.expect("it has ended");
     assert_eq!((again.state, again.pairs_left), (State::Queued, 2));
     for _ in 0..2 {
         let held = lease(&queue).await;

@@ -155,7 +155,7 @@ pub(crate) async fn a_chain_is_cancelled_whole_and_asked_for_again_in_its_order(
     reaches(&queue, &job, State::Cancelled).await;
     nothing_is_ready(&queue).await;
     assert_eq!(queue.backlog().queued().jobs, 0);
-    queue.requeue(job.id).await.expect("it has ended");
+    queue.requeue(job.id, false).await.expect("it has ended");
     assert_eq!(queue.backlog().queued().jobs, 3);
     for place in 1..4 {
         let held = lease(&queue).await;
@@ -311,13 +311,13 @@ pub(crate) async fn what_is_left_of_a_sequence_survives_crashes_and_is_retried_c
     assert_eq!(held.pulse.signal(), Signal::Cancel);
     finish(&queue, &held.job, Outcome::Cancelled).await;
     reaches(&queue, &job, State::Cancelled).await;
-    let again = queue.requeue(job.id).await.expect("it has ended");
+    let again = queue.requeue(job.id, false).await.expect("it has ended");
     assert_eq!((again.state, again.pairs_left), (State::Queued, 0));
     assert_eq!(queue.backlog().queued().jobs, 1);
     let cancelled = queue.cancel(job.id).await.expect("known");
     assert_eq!(cancelled.state, State::Cancelled);
     assert_eq!(queue.backlog().queued().jobs, 0);
-    queue.requeue(job.id).await.expect("it has ended");
+    queue.requeue(job.id, false).await.expect("it has ended");
     let held = lease(&queue).await;
     assert_eq!(held.job.id, job.id);
     finish(&queue, &held.job, failure(false)).await;
@@ -342,7 +342,7 @@ pub(crate) async fn a_pair_that_fails_back_in_time_is_named_and_nothing_is_left_
     assert_eq!(error.message, "pair 1, back in time: it broke");
     nothing_is_ready(&queue).await;
     // Asked for again, it does what was missing, and then the rest.
-    queue.requeue(job.id).await.expect("it has ended");
+    queue.requeue(job.id, false).await.expect("it has ended");
     assert!(finish_next(&queue).await.backward);
     assert_eq!(finish_next(&queue).await.id, job.id);
     reaches(&queue, &job, State::Succeeded).await;

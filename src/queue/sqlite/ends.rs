@@ -167,15 +167,16 @@ pub(super) fn cancel(
 }
 
 /// Queues an ended job again; of a sequence, the pairs that did not succeed, and what was left to do
-/// behind them.
+/// behind them. One that has succeeded only where its result is `lost`.
 pub(super) fn requeue(
     connection: &Connection,
     effects: &mut Effects,
     options: &QueueOptions,
     id: JobId,
+    lost: bool,
 ) -> Result<Arc<Job>, QueueError> {
     let job = rows::get(connection, id)?;
-    if !job.state.is_end() || job.state == State::Succeeded {
+    if !job.state.is_end() || (job.state == State::Succeeded && !lost) {
         return Err(QueueError::NotOver(job.state));
     }
     let broken: Vec<Job> = match job.kind {
@@ -187,7 +188,7 @@ pub(super) fn requeue(
     };
     let expires = Timestamp::now().after(options.time_to_live).as_millis();
     let sql = format!(
-        "UPDATE jobs SET state = 0, pairs_left = ?2, delayed = 0, failures = 0, crashes = 0, \
+        "UPDATE jobs SET state = 0, durable = 1, pairs_left = ?2, delayed = 0, failures = 0, crashes = 0, \
          started = NULL, finished = NULL, deadline = NULL, expires = ?3, \
          due = CASE WHEN kind = 0 THEN ?3 END, stop_reason = NULL, report = NULL, \
          error_code = NULL, error_message = NULL, error_retryable = 0, dead = 0, \

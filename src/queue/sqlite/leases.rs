@@ -103,6 +103,19 @@ pub(super) fn beat(
     Ok(())
 }
 
+/// Prolongs the lease of a job whose worker is alive.
+pub(super) fn prolong(
+    connection: &Connection,
+    id: JobId,
+    left: Duration,
+) -> Result<(), QueueError> {
+    let until = Timestamp::now().after(left).as_millis();
+    connection
+        .prepare_cached("UPDATE jobs SET due = ?2 WHERE id = ?1 AND state = 1")?
+        .execute(params![id.as_bytes(), until])?;
+    Ok(())
+}
+
 /// Forgets the crashes before a snapshot.
 pub(super) fn snapshot_kept(
     connection: &Connection,

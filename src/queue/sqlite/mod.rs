@@ -18,13 +18,14 @@ mod tests;
 use std::collections::HashMap;
 use std::fs::{File, TryLockError};
 use std::path::Path;
-use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use async_trait::async_trait;
 use rusqlite::{Connection, params};
 use tokio::sync::{Notify, mpsc, watch};
+use tokio_util::sync::CancellationToken;
 
 use self::rows::{COLUMNS, state_code};
 use self::transitions::Effects;
@@ -65,6 +66,8 @@ pub(in crate::queue) struct Shared {
     running: Mutex<HashMap<JobId, Running>>,
     ready: Notify,
     events: mpsc::UnboundedSender<Event>,
+    /// Cancelled when the writing thread has ended.
+    ended: CancellationToken,
 }
 
 /// A job that some worker holds.
@@ -85,6 +88,22 @@ impl Shared {
             running: Mutex::default(),
             ready: Notify::new(),
             events,
+            ended: CancellationToken::new(),
+        }
+    }
+
+    /// What is left at `now` of the lease of a job whose worker is alive. The lease on disk is by the
+    /// wall clock, which may be set, and says only when to look.
+    fn lease_left(&self, id: JobId, lease: Duration, now: Instant) -> Option<Duration> {
+        let last_beat = locked(&self.running).get(&id)?.flags.last_beat();
+        let left = lease.checked_sub(now.saturating_duration_since(last_beat))?;
+        (!left.is_zero()).then_some(left)
+    }
+
+    /// Takes all workers for alive: this process itself was not running, and they could not say so.
+    fn all_are_alive(&self) {
+        for held in locked(&self.running).values() {
+            held.flags.beat();
         }
     }
 
@@ -232,7 +251,7 @@ struct SqliteHeart {
     writer: Writer,
     shared: Arc<Shared>,
     options: QueueOptions,
-    last: AtomicI64,
+    last: Mutex<Instant>,
     latest: Mutex<Option<Progress>>,
 }
 
@@ -244,12 +263,13 @@ impl Heart for SqliteHeart {
                 .watchers
                 .progress(self.id, self.attempt, progress);
         }
-        let now = Timestamp::now().as_millis();
-        let pause = BEAT.min(self.options.lease / 4).as_millis() as i64;
-        if now - self.last.load(Ordering::Relaxed) < pause {
-            return;
+        {
+            let mut last = locked(&self.last);
+            if last.elapsed() < BEAT.min(self.options.lease / 4) {
+                return;
+            }
+            *last = Instant::now();
         }
-        self.last.store(now, Ordering::Relaxed);
         let (id, attempt, options) = (self.id, self.attempt, self.options.clone());
         let progress = *locked(&self.latest);
         self.writer.write_later(move |connection, _| {
@@ -281,6 +301,10 @@ impl Queue for SqliteQueue {
         }
         let retention = self.options.retention.as_millis() as i64;
         let change = move |connection: &Connection, effects: &mut Effects| {
+            let job = rows::get(connection, id)?;
+            if !job.durable && job.cancel_requested {
+                return Err(QueueError::GivenUp);
+            }
             let sql = "UPDATE jobs SET durable = 1, due = CASE WHEN state > 1 AND parent IS NULL \
                        THEN finished + ?2 ELSE due END WHERE id = ?1 OR parent = ?1";
             connection
@@ -360,10 +384,10 @@ impl Queue for SqliteQueue {
         self.writer.write(false, change).await
     }
 
-    async fn requeue(&self, id: JobId) -> Result<Arc<Job>, QueueError> {
+    async fn requeue(&self, id: JobId, lost: bool) -> Result<Arc<Job>, QueueError> {
         let options = self.options.clone();
         let change = move |connection: &Connection, effects: &mut Effects| {
-            ends::requeue(connection, effects, &options, id)
+            ends::requeue(connection, effects, &options, id, lost)
         };
         self.writer.write(true, change).await
     }
@@ -419,6 +443,20 @@ impl Queue for SqliteQueue {
         self.read(sweep::oldest_queued).await
     }
 
+    async fn probe(&self) -> Result<(), QueueError> {
+        let options = self.options.clone();
+        self.writer
+            .write(true, move |connection, _| {
+                transitions::probe(connection, &options)
+            })
+            .await?;
+        self.oldest_queued().await.map(drop)
+    }
+
+    async fn ended(&self) {
+        self.shared.ended.cancelled().await;
+    }
+
     async fn known(&self, ids: Vec<JobId>) -> Result<Vec<JobId>, QueueError> {
         let query = move |connection: &Connection| {
             let mut known = Vec::new();
@@ -451,7 +489,7 @@ impl SqliteQueue {
             writer: self.writer.clone(),
             shared: Arc::clone(&self.shared),
             options: self.options.clone(),
-            last: AtomicI64::new(Timestamp::now().as_millis()),
+            last: Mutex::new(Instant::now()),
             latest: Mutex::default(),
         };
         Lease {

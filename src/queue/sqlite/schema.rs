@@ -8,6 +8,7 @@ use std::time::Duration;
 use rusqlite::{Connection, TransactionBehavior};
 
 use crate::queue::QueueError;
+use crate::storage::Fault;
 
 /// What this program reads and writes; kept in `user_version`.
 pub(super) const VERSION: i64 = 4;
@@ -116,7 +117,7 @@ fn migrate(connection: &mut Connection) -> Result<(), QueueError> {
         older if older < VERSION => {
             return Err(QueueError::Store(format!(
                 "the queue's file has version {older} of a program that was never released, this \
-                 one knows {VERSION}: name another data_dir, or remove the file"
+                 one knows {VERSION}: name another data_dir"
             )));
         }
         newer => {
@@ -132,6 +133,9 @@ fn migrate(connection: &mut Connection) -> Result<(), QueueError> {
 
 impl From<rusqlite::Error> for QueueError {
     fn from(error: rusqlite::Error) -> Self {
-        Self::Store(error.to_string())
+        match Fault::of_sqlite(&error) {
+            Fault::Full => Self::Full(error.to_string()),
+            Fault::Missing | Fault::Machine => Self::Store(error.to_string()),
+        }
     }
 }

@@ -1,6 +1,7 @@
 //! What happens without being asked: times that run out, and the recovery after a crash.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use rusqlite::{Connection, OptionalExtension, params};
 
@@ -25,11 +26,13 @@ pub(super) fn next_due(connection: &Connection) -> Result<Option<Timestamp>, Que
     Ok(due.map(Timestamp::from_millis))
 }
 
-/// Looks after every row whose time has come.
+/// Looks after every row whose time has come. `lease_left` says of a running job what is left of its
+/// lease by its worker's signs of life.
 pub(super) fn sweep(
     connection: &Connection,
     effects: &mut Effects,
     options: &QueueOptions,
+    lease_left: impl Fn(JobId) -> Option<Duration>,
 ) -> Result<(), QueueError> {
     let now = Timestamp::now();
     let sql = format!(
@@ -41,8 +44,10 @@ pub(super) fn sweep(
         rows.collect::<rusqlite::Result<_>>()?
     };
     for job in due {
+        let left = lease_left(job.id);
         match job.state {
             State::Queued => look_after_queued(connection, effects, options, &job, now)?,
+            State::Running if let Some(left) = left => leases::prolong(connection, job.id, left)?,
             State::Running if job.cancel_requested => {
                 let how = End::default();
                 ends::end(connection, effects, options, &job, State::Cancelled, &how)?;

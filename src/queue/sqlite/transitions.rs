@@ -11,8 +11,8 @@ use rusqlite::{Connection, OptionalExtension, params};
 use super::rows::{self, COLUMNS, device_code, kind_code, priority_code};
 use super::turns;
 use crate::clock::Timestamp;
-use crate::job::{Job, JobId, Kind, State};
-use crate::queue::{Event, QueueError, QueueOptions, Submission, Submitted};
+use crate::job::{Job, JobId, Kind, Priority, State, Tenant};
+use crate::queue::{Event, PairOf, QueueError, QueueOptions, Submission, Submitted};
 
 /// What follows a commit.
 #[derive(Debug, Default)]
@@ -65,8 +65,8 @@ pub(super) fn submit(
         if let Some((id, fingerprint)) = known {
             let id = JobId::from_bytes(id);
             let known = rows::get(connection, id)?;
-            let gave_up = known.state.is_end() && known.state != State::Succeeded;
-            if gave_up && !known.durable {
+            let failed = known.state.is_end() && known.state != State::Succeeded;
+            if (failed || known.cancel_requested) && !known.durable {
                 // Its caller went away: asking again is what the key is for.
                 let sql = "UPDATE jobs SET idempotency_key = NULL WHERE id = ?1";
                 connection.prepare_cached(sql)?.execute([id.as_bytes()])?;
@@ -104,6 +104,33 @@ pub(super) fn submit(
     }
     effects.events.push(Event::Submitted(Arc::clone(&job)));
     Ok(Submitted::New(job))
+}
+
+/// Accepts a job and takes it back, and writes a page: what a submission needs of the store.
+pub(super) fn probe(connection: &Connection, options: &QueueOptions) -> Result<(), QueueError> {
+    let submission = Submission {
+        id: JobId::fresh(),
+        tenant: Tenant::default(),
+        kind: Kind::Pair,
+        pair: PairOf::ALONE,
+        pairs: Vec::new(),
+        closing_seconds: None,
+        after: None,
+        followed: false,
+        priority: Priority::Normal,
+        device: None,
+        cost_seconds: 0.0,
+        options: String::new(),
+        deadline: None,
+        idempotency: None,
+        durable: true,
+    };
+    let job = insert(connection, options, &submission, None)?;
+    let sql = "DELETE FROM jobs WHERE id = ?1";
+    connection
+        .prepare_cached(sql)?
+        .execute([job.id.as_bytes()])?;
+    Ok(())
 }
 
 fn insert(

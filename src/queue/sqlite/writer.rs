@@ -6,7 +6,7 @@
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rusqlite::Connection;
 use tokio::sync::oneshot;
@@ -49,8 +49,12 @@ impl Writer {
     ) -> Result<Self, QueueError> {
         let (commands, inbox) = channel();
         let thread = thread::Builder::new().name("queue".to_owned());
+        let ended = shared.ended.clone();
         thread
-            .spawn(move || run(&connection, &options, &shared, &inbox))
+            .spawn(move || {
+                let _even_by_a_panic = ended.drop_guard();
+                run(&connection, &options, &shared, &inbox);
+            })
             .map_err(|error| QueueError::Store(error.to_string()))?;
         Ok(Self { commands })
     }
@@ -124,6 +128,7 @@ fn run(
     inbox: &Receiver<Command>,
 ) {
     let mut next_due = sweep::next_due(connection).unwrap_or(None);
+    let mut awake = Instant::now();
     loop {
         let now = Timestamp::now();
         let sleep = next_due
@@ -140,13 +145,20 @@ fn run(
         {
             commands.push(command);
         }
+        // Whoever is late by half a lease was not running, and nor were the workers.
+        let was_away = awake.elapsed() > MAX_SLEEP + options.lease / 2;
+        awake = Instant::now();
+        if was_away {
+            shared.all_are_alive();
+        }
         let sweeping = next_due.is_some_and(|due| due <= Timestamp::now());
         if commands.is_empty() && !sweeping {
             continue;
         }
         let mut effects = Effects::default();
         let mut replies = Vec::with_capacity(commands.len());
-        let mut swept = true;
+        let mut swept = false;
+        let lease_left = |id| shared.lease_left(id, options.lease, awake);
         let done = transact(
             connection,
             commands,
@@ -154,15 +166,19 @@ fn run(
             &mut replies,
             |effects| {
                 if !sweeping {
+                    swept = true;
                     return;
                 }
                 let mut own = Effects::default();
-                match in_savepoint(connection, || sweep::sweep(connection, &mut own, options)) {
-                    Ok(()) => effects.merge(own),
+                let sweep = || sweep::sweep(connection, &mut own, options, lease_left);
+                match in_savepoint(connection, sweep) {
+                    Ok(()) => {
+                        swept = true;
+                        effects.merge(own);
+                    }
                     // What others asked for at the same time stands all the same.
                     Err(error) => {
                         tracing::error!(%error, "the queue cannot look after what is due");
-                        swept = false;
                     }
                 }
             },
@@ -175,16 +191,16 @@ fn run(
         for reply in replies {
             reply(done.clone());
         }
-        match sweep::next_due(connection) {
-            Ok(due) => {
-                let later = Timestamp::now().after(MAX_SLEEP);
-                next_due = if swept { due } else { due.max(Some(later)) };
-            }
+        // A store that fails is not asked again at once.
+        let later = Some(Timestamp::now().after(MAX_SLEEP));
+        next_due = match sweep::next_due(connection) {
+            Ok(due) if swept && done.is_ok() => due,
+            Ok(due) => due.max(later),
             Err(error) => {
                 tracing::error!(%error, "the queue's store cannot be read");
-                next_due = None;
+                later
             }
-        }
+        };
     }
 }
 

@@ -1,0 +1,183 @@
+//! Bodies as the port hands them on: what comes in ends at its first error and lets others run,
+//! what goes out is cut into pieces whose taking is watched.
+
+use std::pin::Pin;
+use std::task::{Context, Poll, ready};
+use std::time::Instant;
+
+use axum::BoxError;
+use axum::body::Body as AnyBody;
+use bytes::Bytes;
+use hyper::body::{Body, Frame, SizeHint};
+use tokio::task::coop::poll_proceed;
+
+use super::connections::OpenRequest;
+
+/// The largest piece of an answer: all that is held for a stream that is not read.
+const PIECE: usize = 64 << 10;
+
+/// A request's body that cannot keep its reader busy for ever.
+///
+/// After an error comes the end, whatever the source says: HTTP/2 repeats an error at every poll.
+/// Each frame costs the task of its budget, so that a source that is always ready cannot keep
+/// timers and other tasks from running.
+pub(super) struct RequestBody<B> {
+    body: B,
+    ended: bool,
+}
+
+impl<B> RequestBody<B> {
+    pub(super) fn new(body: B) -> Self {
+        Self { body, ended: false }
+    }
+}
+
+impl<B: Body<Data = Bytes> + Unpin> Body for RequestBody<B> {
+    type Data = Bytes;
+    type Error = B::Error;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, B::Error>>> {
+        if self.ended {
+            return Poll::Ready(None);
+        }
+        let budget = ready!(poll_proceed(context));
+        let frame = ready!(Pin::new(&mut self.body).poll_frame(context));
+        budget.made_progress();
+        self.ended = !matches!(frame, Some(Ok(_)));
+        Poll::Ready(frame)
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.ended || self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}
+
+/// An answer's body in pieces; its request is open until it is dropped.
+pub(super) struct AnswerBody {
+    body: AnyBody,
+    rest: Bytes,
+    request: OpenRequest,
+}
+
+impl AnswerBody {
+    pub(super) fn new(body: AnyBody, request: OpenRequest) -> Self {
+        Self {
+            body,
+            rest: Bytes::new(),
+            request,
+        }
+    }
+}
+
+impl Body for AnswerBody {
+    type Data = Bytes;
+    type Error = BoxError;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, BoxError>>> {
+        // Asked for more, the connection has taken what it was given.
+        self.request.handed(None);
+        let budget = ready!(poll_proceed(context));
+        if self.rest.is_empty() {
+            let frame = match ready!(Pin::new(&mut self.body).poll_frame(context)) {
+                None => return Poll::Ready(None),
+                Some(Err(error)) => return Poll::Ready(Some(Err(error.into()))),
+                Some(Ok(frame)) => frame,
+            };
+            match frame.into_data() {
+                Ok(data) => self.rest = data,
+                Err(trailers) => return Poll::Ready(Some(Ok(trailers))),
+            }
+        }
+        budget.made_progress();
+        let length = self.rest.len().min(PIECE);
+        let piece = self.rest.split_to(length);
+        self.request.handed(Some(Instant::now()));
+        Poll::Ready(Some(Ok(Frame::data(piece))))
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.rest.is_empty() && self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        let (rest, hint) = (self.rest.len() as u64, self.body.size_hint());
+        let mut all = SizeHint::new();
+        if let Some(upper) = hint.upper() {
+            all.set_upper(upper + rest);
+        }
+        all.set_lower(hint.lower() + rest);
+        all
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::convert::Infallible;
+    use std::net::IpAddr;
+    use std::sync::Arc;
+    use std::time::Duration;
+
+    use http_body_util::BodyExt;
+    use tokio::time::timeout;
+
+    use super::super::connections::Connections;
+    use super::*;
+
+    /// A source that says the same for ever, and is always ready.
+    struct ForEver<E>(Result<Bytes, E>);
+
+    impl<E: Clone + Unpin> Body for ForEver<E> {
+        type Data = Bytes;
+        type Error = E;
+
+        fn poll_frame(
+            self: Pin<&mut Self>,
+            _: &mut Context<'_>,
+        ) -> Poll<Option<Result<Frame<Bytes>, E>>> {
+            Poll::Ready(Some(self.0.clone().map(Frame::data)))
+        }
+    }
+
+    #[tokio::test]
+    async fn a_body_ends_after_its_first_error_and_a_ready_one_lets_timers_run() {
+        let mut broken = RequestBody::new(ForEver(Err("reset")));
+        assert!(broken.frame().await.expect("the error").is_err());
+        assert!(broken.frame().await.is_none() && broken.is_end_stream());
+        let mut endless = RequestBody::new(ForEver(Ok::<_, Infallible>(Bytes::new())));
+        let reading = async { while endless.frame().await.is_some() {} };
+        // On one thread: without a budget this would never come back.
+        let read = timeout(Duration::from_millis(20), reading).await;
+        assert!(read.is_err());
+    }
+
+    #[tokio::test]
+    async fn an_answer_comes_in_pieces_and_says_its_length() {
+        let bytes: Vec<u8> = (0..3 * PIECE + 5).map(|at| (at % 251) as u8).collect();
+        let connections = Arc::new(Connections::default());
+        let entry = connections.enter(IpAddr::from([127, 0, 0, 1]));
+        let body = AnyBody::from(bytes.clone());
+        let mut answer = AnswerBody::new(body, entry.connection.begin());
+        let mut read = Vec::new();
+        loop {
+            let left = (bytes.len() - read.len()) as u64;
+            assert_eq!(answer.size_hint().exact(), Some(left));
+            let Some(frame) = answer.frame().await else {
+                break;
+            };
+            let piece = frame.expect("no error").into_data().expect("data");
+            assert!(piece.len() <= PIECE);
+            read.extend_from_slice(&piece);
+        }
+        assert!(read == bytes && answer.is_end_stream());
+    }
+}

@@ -1,0 +1,120 @@
+//! What liveness and readiness look at besides the devices: loops that go on, and a store that
+//! can be written. It must not know what a loop does or where the store lies.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use tokio::sync::watch;
+
+/// How often a loop gives a sign of life.
+pub const HEARTBEAT: Duration = Duration::from_secs(1);
+
+/// A loop's sign of life.
+#[derive(Debug)]
+pub struct Heartbeat {
+    began: Instant,
+    last: AtomicU64,
+}
+
+impl Default for Heartbeat {
+    fn default() -> Self {
+        Self {
+            began: Instant::now(),
+            last: AtomicU64::new(0),
+        }
+    }
+}
+
+impl Heartbeat {
+    fn millis(&self) -> u64 {
+        u64::try_from(self.began.elapsed().as_millis()).unwrap_or(u64::MAX)
+    }
+
+    /// The loop goes on.
+    pub fn beat(&self) {
+        self.last.store(self.millis(), Ordering::Relaxed);
+    }
+
+    /// Time since the last sign of life.
+    pub fn age(&self) -> Duration {
+        let last = self.last.load(Ordering::Relaxed);
+        Duration::from_millis(self.millis().saturating_sub(last))
+    }
+}
+
+/// Whether the store can be read and written: told by whoever finds that it cannot, and found out
+/// again by a probe. While it cannot, no job is taken, so that none pays for the machine.
+#[derive(Debug)]
+pub struct StoreHealth {
+    trouble: watch::Sender<Option<String>>,
+}
+
+impl Default for StoreHealth {
+    fn default() -> Self {
+        Self {
+            trouble: watch::Sender::new(None),
+        }
+    }
+}
+
+impl StoreHealth {
+    /// The store has failed, through no fault of a job.
+    pub fn failed(&self, error: &dyn std::fmt::Display) {
+        let new = self.trouble.send_replace(Some(error.to_string())).is_none();
+        if new {
+            tracing::error!(%error, "the store has failed: no job is taken until it works again");
+        }
+    }
+
+    /// A probe has written and read.
+    pub fn works(&self) {
+        if self.trouble.send_replace(None).is_some() {
+            tracing::info!("the store works again");
+        }
+    }
+
+    /// What is wrong, if anything is.
+    pub fn trouble(&self) -> Option<String> {
+        self.trouble.borrow().clone()
+    }
+
+    /// Returns when nothing is wrong.
+    pub async fn until_it_works(&self) {
+        let mut trouble = self.trouble.subscribe();
+        let _the_sender_is_here = trouble.wait_for(Option::is_none).await;
+    }
+
+    /// Returns when something is wrong.
+    pub async fn until_it_fails(&self) {
+        let mut trouble = self.trouble.subscribe();
+        let _the_sender_is_here = trouble.wait_for(Option::is_some).await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn who_waits_for_the_store_goes_on_when_it_works() {
+        let store = StoreHealth::default();
+        store.until_it_works().await;
+        store.failed(&"no space");
+        assert_eq!(store.trouble().as_deref(), Some("no space"));
+        store.until_it_fails().await;
+        let waiting = tokio::time::timeout(Duration::from_millis(20), store.until_it_works());
+        assert!(waiting.await.is_err());
+        store.works();
+        store.until_it_works().await;
+        assert_eq!(store.trouble(), None);
+    }
+
+    #[test]
+    fn a_loop_that_goes_on_is_young() {
+        let heartbeat = Heartbeat::default();
+        std::thread::sleep(Duration::from_millis(30));
+        assert!(heartbeat.age() >= Duration::from_millis(30));
+        heartbeat.beat();
+        assert!(heartbeat.age() < Duration::from_millis(30));
+    }
+}

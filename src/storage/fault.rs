@@ -1,0 +1,89 @@
+//! Every error of the operating system, classified once: the job's, or the machine's.
+//!
+//! What is the machine's costs a job nothing: it waits until the machine has recovered.
+
+use std::error::Error;
+use std::io;
+
+/// Whose fault an error is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Fault {
+    /// What was asked for is not there: trying again will not bring it back.
+    Missing,
+    /// Nothing more can be written: no bytes, inodes or quota are left, or files may not grow.
+    Full,
+    /// Anything else: descriptors, permissions, a device that fails, memory.
+    Machine,
+}
+
+impl Fault {
+    /// Of an error of the operating system.
+    pub fn of_io(error: &io::Error) -> Self {
+        use io::ErrorKind::{FileTooLarge, NotFound, QuotaExceeded, StorageFull};
+        match error.kind() {
+            NotFound => Self::Missing,
+            StorageFull | QuotaExceeded | FileTooLarge => Self::Full,
+            _ => Self::Machine,
+        }
+    }
+
+    /// Of an error of the embedded database.
+    pub fn of_sqlite(error: &rusqlite::Error) -> Self {
+        match error.sqlite_error_code() {
+            Some(rusqlite::ErrorCode::DiskFull) => Self::Full,
+            _ => Self::Machine,
+        }
+    }
+
+    /// Of an error with one of the operating system among its causes; of the machine where there
+    /// is none.
+    pub fn of(error: &(dyn Error + 'static)) -> Self {
+        let mut cause = Some(error);
+        while let Some(error) = cause {
+            if let Some(error) = error.downcast_ref::<io::Error>() {
+                return Self::of_io(error);
+            }
+            cause = error.source();
+        }
+        Self::Machine
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn errors_of_the_system_are_the_machines_unless_something_is_missing() {
+        const ENOENT: i32 = 2;
+        const EIO: i32 = 5;
+        const EACCES: i32 = 13;
+        const EMFILE: i32 = 24;
+        const EFBIG: i32 = 27;
+        const ENOSPC: i32 = 28;
+        const EROFS: i32 = 30;
+        const EDQUOT: i32 = 122;
+        for (code, fault) in [
+            (ENOENT, Fault::Missing),
+            (EIO, Fault::Machine),
+            (EACCES, Fault::Machine),
+            (EMFILE, Fault::Machine),
+            (EFBIG, Fault::Full),
+            (ENOSPC, Fault::Full),
+            (EROFS, Fault::Machine),
+            (EDQUOT, Fault::Full),
+        ] {
+            let error = io::Error::from_raw_os_error(code);
+            assert_eq!(Fault::of_io(&error), fault, "{error}");
+            let wrapped = object_store::Error::Generic {
+                store: "files",
+                source: Box::new(error),
+            };
+            assert_eq!(Fault::of(&wrapped), fault, "{wrapped}");
+        }
+        let full = rusqlite::ffi::Error::new(rusqlite::ffi::SQLITE_FULL);
+        let error = rusqlite::Error::SqliteFailure(full, None);
+        assert_eq!(Fault::of_sqlite(&error), Fault::Full);
+        assert_eq!(Fault::of(&std::fmt::Error), Fault::Machine);
+    }
+}
