@@ -19,8 +19,8 @@ use tokio_util::sync::CancellationToken;
 
 use self::pool::Pool;
 use crate::api::{
-    Admission, AdmissionLimits, Caller, Keys, ListenOptions, Listener, Parts, Readiness, Role,
-    Service, ServiceLimits, admin_router, public_router, tls_acceptor,
+    Admission, AdmissionLimits, Caller, Hosts, Keys, ListenOptions, Listener, Parts, Readiness,
+    Role, Service, ServiceLimits, admin_router, public_router, tls_acceptor,
 };
 use crate::config::{Config, LimitsConfig, QueueConfig};
 use crate::cost::{CostModel, Lanes};
@@ -123,6 +123,13 @@ impl App {
             ),
             metrics: Arc::clone(&metrics),
             keys,
+            hosts: Hosts(
+                config
+                    .listen
+                    .ip()
+                    .is_loopback()
+                    .then(|| config.allowed_hosts.clone()),
+            ),
             limits: service_limits(&config.limits),
         }));
         let runtime = Arc::new(Heartbeat::default());

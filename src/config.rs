@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 
 use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
+use serde::de::Visitor;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::api::Role;
@@ -16,6 +17,9 @@ use crate::api::Role;
 /// What environment variables begin with; `__` goes one level down:
 /// `FNSF_SERVE_LIMITS__MAX_POINTS=200000`.
 const PREFIX: &str = "FNSF_SERVE_";
+
+/// The variable of the one key, after the prefix.
+const API_KEY: &str = "API_KEY";
 
 /// What a drain needs at least: to put down what runs, and to close connections.
 const MIN_DRAIN_SECONDS: u64 = 4;
@@ -35,6 +39,9 @@ pub struct Config {
     pub data_dir: PathBuf,
     /// Listen beyond loopback although no key is needed.
     pub open_to_everybody: bool,
+    /// Names besides localhost under which a server on loopback without keys may be called, such as
+    /// that of a proxy before it. Others are pages of other sites that a browser was made to call.
+    pub allowed_hosts: Vec<String>,
     /// One key, of the default tenant, that may do everything.
     pub api_key: Option<Secret>,
     /// Keys with tenants and roles.
@@ -200,7 +207,59 @@ impl Serialize for Secret {
 
 impl<'de> Deserialize<'de> for Secret {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        String::deserialize(deserializer).map(Self)
+        deserializer.deserialize_any(SecretVisitor)
+    }
+}
+
+/// Reads text, and says of anything else no more than that it is none.
+struct SecretVisitor;
+
+/// A value that is no text, without saying it.
+fn no_text<E: serde::de::Error>() -> E {
+    E::custom("a key is text: put it in quotes")
+}
+
+impl<'de> Visitor<'de> for SecretVisitor {
+    type Value = Secret;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("text")
+    }
+
+    fn visit_str<E: serde::de::Error>(self, text: &str) -> Result<Secret, E> {
+        Ok(Secret(text.to_owned()))
+    }
+
+    fn visit_bool<E: serde::de::Error>(self, _: bool) -> Result<Secret, E> {
+        Err(no_text())
+    }
+
+    fn visit_i64<E: serde::de::Error>(self, _: i64) -> Result<Secret, E> {
+        Err(no_text())
+    }
+
+    fn visit_u64<E: serde::de::Error>(self, _: u64) -> Result<Secret, E> {
+        Err(no_text())
+    }
+
+    fn visit_i128<E: serde::de::Error>(self, _: i128) -> Result<Secret, E> {
+        Err(no_text())
+    }
+
+    fn visit_u128<E: serde::de::Error>(self, _: u128) -> Result<Secret, E> {
+        Err(no_text())
+    }
+
+    fn visit_f64<E: serde::de::Error>(self, _: f64) -> Result<Secret, E> {
+        Err(no_text())
+    }
+
+    fn visit_char<E: serde::de::Error>(self, one: char) -> Result<Secret, E> {
+        Ok(Secret(one.into()))
+    }
+
+    fn visit_some<D: Deserializer<'de>>(self, inner: D) -> Result<Secret, D::Error> {
+        inner.deserialize_any(self)
     }
 }
 
@@ -212,6 +271,7 @@ impl Default for Config {
             admin_listen: SocketAddr::from(([127, 0, 0, 1], 9090)),
             data_dir: PathBuf::from("fnsf-data"),
             open_to_everybody: false,
+            allowed_hosts: Vec::new(),
             api_key: None,
             keys: Vec::new(),
             tls: None,
@@ -291,10 +351,28 @@ impl Config {
                 path: path.display().to_string(),
                 reason: error.to_string(),
             })?;
+            // Its own message would show the line, and there may be a key in it.
+            let _table: toml::Table = toml::from_str(&text).map_err(|error| {
+                let before = error.span().map_or(0, |span| span.start).min(text.len());
+                let line = 1 + text.as_bytes()[..before]
+                    .iter()
+                    .filter(|&&b| b == b'\n')
+                    .count();
+                ConfigError::File {
+                    path: path.display().to_string(),
+                    reason: format!("line {line}: {}", error.message()),
+                }
+            })?;
             figment = figment.merge(Toml::string(&text));
         }
+        let mut variables = Env::prefixed(PREFIX).split("__");
+        if let Ok(key) = std::env::var(format!("{PREFIX}{API_KEY}")) {
+            // As it is: digits are no number here.
+            figment = figment.merge(Serialized::default("api_key", key));
+            variables = variables.ignore(&["api_key"]);
+        }
         let config: Self = figment
-            .merge(Env::prefixed(PREFIX).split("__"))
+            .merge(variables)
             .merge(Serialized::defaults(flags))
             .extract()
             .map_err(|error| ConfigError::Value(Box::new(error)))?;
@@ -327,19 +405,112 @@ impl Config {
         if self.gpu_memory_mib == Some(0) {
             return refuse("gpu_memory_mib must be at least 1");
         }
-        if self.drain.deadline_seconds < self.drain.delay_seconds + MIN_DRAIN_SECONDS {
+        if self.drain.deadline_seconds < self.drain.delay_seconds.saturating_add(MIN_DRAIN_SECONDS)
+        {
             return refuse(
                 "drain.deadline_seconds must be at least 4 s longer than drain.delay_seconds: \
                  what runs has to be put down",
             );
         }
+        for (key, value, least, most) in self.ranges() {
+            if !(least..=most).contains(&value) {
+                return refuse(&format!("{key} is {value}, {least} to {most} are possible"));
+            }
+        }
         if self.limits.max_uploads_mib < self.limits.max_upload_mib {
             return refuse("limits.max_uploads_mib must be no less than limits.max_upload_mib");
         }
-        if self.queue.lease_seconds == 0 || self.queue.max_attempts == 0 {
-            return refuse("queue.lease_seconds and queue.max_attempts must be at least 1");
-        }
         Ok(())
+    }
+
+    /// Every number with the least and the most that it may be: past these, units wrap around and
+    /// timers end.
+    fn ranges(&self) -> [(&'static str, u64, u64, u64); 24] {
+        const YEARS: u64 = 100 * 365 * 24 * 3600;
+        const MIB: u64 = 1 << 30;
+        let Self {
+            limits,
+            queue,
+            drain,
+            ..
+        } = self;
+        let count = |count: usize| count as u64;
+        [
+            ("limits.max_points", count(limits.max_points), 1, 50_000_000),
+            ("limits.max_pair_mib", count(limits.max_pair_mib), 1, MIB),
+            ("limits.max_upload_mib", limits.max_upload_mib, 1, MIB),
+            ("limits.max_uploads_mib", limits.max_uploads_mib, 1, MIB),
+            ("limits.max_answers_mib", limits.max_answers_mib, 1, MIB),
+            ("limits.min_free_mib", limits.min_free_mib, 0, MIB),
+            ("limits.min_free_inodes", limits.min_free_inodes, 0, 1 << 40),
+            ("limits.max_frames", limits.max_frames.into(), 2, 1 << 20),
+            ("limits.max_wait_seconds", limits.max_wait_seconds, 0, YEARS),
+            (
+                "limits.max_queue_seconds",
+                limits.max_queue_seconds,
+                0,
+                YEARS,
+            ),
+            (
+                "limits.max_tenant_queue_seconds",
+                limits.max_tenant_queue_seconds,
+                0,
+                YEARS,
+            ),
+            (
+                "limits.max_connections",
+                count(limits.max_connections),
+                1,
+                1 << 20,
+            ),
+            (
+                "limits.header_timeout_seconds",
+                limits.header_timeout_seconds,
+                1,
+                3600,
+            ),
+            (
+                "limits.body_timeout_seconds",
+                limits.body_timeout_seconds,
+                1,
+                3600,
+            ),
+            (
+                "limits.write_timeout_seconds",
+                limits.write_timeout_seconds,
+                1,
+                3600,
+            ),
+            (
+                "limits.sequence_ahead",
+                count(limits.sequence_ahead),
+                1,
+                1000,
+            ),
+            ("queue.max_attempts", queue.max_attempts.into(), 1, 1000),
+            ("queue.max_crashes", queue.max_crashes.into(), 1, 1000),
+            ("queue.lease_seconds", queue.lease_seconds, 1, YEARS),
+            (
+                "queue.retry_delay_seconds",
+                queue.retry_delay_seconds,
+                0,
+                YEARS,
+            ),
+            (
+                "queue.time_to_live_seconds",
+                queue.time_to_live_seconds,
+                1,
+                YEARS,
+            ),
+            ("queue.retention_seconds", queue.retention_seconds, 0, YEARS),
+            (
+                "queue.answered_retention_seconds",
+                queue.answered_retention_seconds,
+                0,
+                YEARS,
+            ),
+            ("drain.deadline_seconds", drain.deadline_seconds, 0, YEARS),
+        ]
     }
 
     /// The configuration as TOML, secrets left out.
@@ -383,6 +554,33 @@ mod tests {
             ("gpu_lanes = 0", "gpu_lanes"),
             ("gpu_memory_mib = 0", "gpu_memory_mib"),
             (
+                "[limits]\nmax_upload_mib = 17592186044416",
+                "1 to 1073741824",
+            ),
+            ("[limits]\nmin_free_mib = 17592186044416", "min_free_mib"),
+            (
+                "[limits]\nmax_connections = 9223372036854775807",
+                "max_connections",
+            ),
+            (
+                "[limits]\nheader_timeout_seconds = 9223372036854775807",
+                "header_timeout",
+            ),
+            (
+                "[limits]\nsequence_ahead = 9223372036854775807",
+                "sequence_ahead",
+            ),
+            ("[limits]\nmax_connections = 0", "max_connections"),
+            (
+                "[drain]\ndeadline_seconds = 9223372036854775807",
+                "drain.deadline",
+            ),
+            (
+                "[drain]\ndelay_seconds = 18446744073709551615",
+                "delay_seconds",
+            ),
+            ("[queue]\nlease_seconds = 0", "lease_seconds"),
+            (
                 "[[keys]]\ntenant = \"a\"\nrole = \"root\"\nkey = \"x\"",
                 "root",
             ),
@@ -392,6 +590,23 @@ mod tests {
         }
         let missing = Config::load(Some(Path::new("/nonexistent")), &Nothing {});
         assert!(missing.is_err());
+    }
+
+    #[test]
+    fn a_key_that_is_wrong_is_not_shown() {
+        for text in [
+            "api_key = 12345678901234567890",
+            "api_key = 1234567890123456",
+            "api_key = 1234567890123.456",
+            "api_key = [\"1234567890123456\"]",
+            "api_key = \"1234567890123456\" x",
+            "api_key = 1234567890123456x",
+            "[[keys]]\ntenant = \"a\"\nrole = \"read\"\nkey = 1234567890123456",
+        ] {
+            let error = load(text).expect_err(text);
+            let said = format!("{error} {error:?}");
+            assert!(!said.contains("1234567890"), "{text}: {said}");
+        }
     }
 
     #[test]

@@ -36,6 +36,12 @@ pub enum ApiError {
     /// The key may not do this.
     #[error("this key may only read")]
     Forbidden,
+    /// A page of another site has made a browser call a server without keys.
+    #[error(
+        "this server has no keys and is for this machine alone: call it as localhost, without a \
+         foreign Origin, or name the host in its configuration (allowed_hosts)"
+    )]
+    ForeignSite,
     /// No such job, or it is somebody else's.
     #[error("no job has this name")]
     NotFound,
@@ -126,7 +132,7 @@ const fn row(
 }
 
 /// All that the doors ever say.
-const TABLE: [Row; 27] = [
+const TABLE: [Row; 28] = [
     row("bad_request", 400, 3, false, Some("bad_input")),
     row("invalid_options", 400, 3, false, Some("bad_input")),
     row("bad_input", 422, 3, false, Some("bad_input")),
@@ -135,6 +141,7 @@ const TABLE: [Row; 27] = [
     row("too_slow", 408, 4, true, Some("too_slow")),
     row("unauthenticated", 401, 16, false, Some("unauthorized")),
     row("forbidden", 403, 7, false, Some("unauthorized")),
+    row("foreign_site", 403, 7, false, Some("unauthorized")),
     row("not_found", 404, 5, false, None),
     row("no_route", 404, 12, false, None),
     row("method_not_allowed", 405, 12, false, None),
@@ -190,6 +197,7 @@ impl ApiError {
             Self::TooSlow => "too_slow",
             Self::Unauthenticated => "unauthenticated",
             Self::Forbidden => "forbidden",
+            Self::ForeignSite => "foreign_site",
             Self::NotFound => "not_found",
             Self::NoRoute => "no_route",
             Self::Method => "method_not_allowed",
@@ -329,6 +337,7 @@ mod tests {
             ApiError::TooSlow,
             ApiError::Unauthenticated,
             ApiError::Forbidden,
+            ApiError::ForeignSite,
             ApiError::NotFound,
             ApiError::NoRoute,
             ApiError::Method,

@@ -17,6 +17,7 @@ use super::draft::Arrived;
 use super::error::{ApiError, Row};
 use super::grpc;
 use super::listener::Connection;
+use super::origin;
 use super::service::Service;
 
 /// Puts the guards before all routes of a router.
@@ -50,6 +51,13 @@ async fn check_key(
     next: Next,
 ) -> Response {
     request.extensions_mut().insert(Arrived(Instant::now()));
+    let mut sent = origin::check_host_is_one(&request);
+    if service.keys.is_open() {
+        sent = sent.and_then(|()| origin::check(&service.hosts, &request));
+    }
+    if let Err(error) = sent {
+        return refused(&request, error);
+    }
     let shown = request.headers().get(header::AUTHORIZATION);
     match service.caller(shown.and_then(|value| value.to_str().ok())) {
         Ok(caller) => {

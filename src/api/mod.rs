@@ -19,12 +19,14 @@ mod grpc;
 mod guard;
 mod http;
 mod listener;
+mod origin;
 
 pub use admin::{Readiness, admin_router};
 pub use admission::{Admission, AdmissionLimits};
 pub use auth::{Caller, InvalidKey, Keys, MIN_KEY, Role};
 pub use error::ApiError;
 pub use listener::{ListenOptions, Listener, TlsError, tls_acceptor};
+pub use origin::Hosts;
 pub use service::{Parts, Service, ServiceLimits};
 
 use std::sync::Arc;

@@ -15,6 +15,7 @@ use super::auth::{Caller, Keys};
 use super::codec::AnswerFormat;
 use super::dense::is_dense;
 use super::error::ApiError;
+use super::origin::Hosts;
 use super::uploads::{UploadLimits, Uploads};
 use super::waiters::{Awaited, Ending, Waiters};
 use crate::job::{Job, JobId, JobOptions, Kind, Priority, Report, State};
@@ -57,6 +58,7 @@ pub struct Service {
     pub(super) admission: Admission,
     pub(super) metrics: Arc<Metrics>,
     pub(super) keys: Keys,
+    pub(super) hosts: Hosts,
     pub(super) limits: ServiceLimits,
     pub(super) uploads: Arc<Uploads>,
     pub(super) answers: Answers,
@@ -88,6 +90,8 @@ pub struct Parts {
     pub metrics: Arc<Metrics>,
     /// Who may call.
     pub keys: Keys,
+    /// Under which names it may be called where there are no keys.
+    pub hosts: Hosts,
     /// What a request may cost.
     pub limits: ServiceLimits,
 }
@@ -156,6 +160,7 @@ impl Service {
             waiters: Arc::default(),
             metrics: parts.metrics,
             keys: parts.keys,
+            hosts: parts.hosts,
             limits: parts.limits,
             compute: Semaphore::new(cores),
             encoding: Semaphore::new(cores),

@@ -83,9 +83,9 @@ impl Demo {
             .enable_all()
             .build()
             .map_err(Failure::internal)?;
-        let folder = std::env::temp_dir().join(format!("fnsf-demo-{}", std::process::id()));
-        let answered = runtime.block_on(self.ask(pair, folder.clone()));
-        let _left_to_the_system = std::fs::remove_dir_all(folder);
+        // It goes when this returns.
+        let folder = tempfile::tempdir().map_err(Failure::internal)?;
+        let answered = runtime.block_on(self.ask(pair, folder.path().to_owned()));
         answered.map_err(Failure::internal)
     }
 

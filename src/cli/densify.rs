@@ -184,10 +184,9 @@ impl Densify {
         if let Some(output) = &self.output {
             DenseFormat::from_path(output).map_err(Failure::usage)?;
         }
-        for path in outputs.into_iter().flatten() {
-            files::check_writable(path)?;
-        }
-        Ok(())
+        let known = self.estimation.files();
+        let inputs = self.sweeps.iter().chain(&known).chain(&self.camera);
+        files::check_outputs(outputs.into_iter().flatten(), inputs)
     }
 
     /// Writes the depth image; the densities of the own sweep's and of all points'.

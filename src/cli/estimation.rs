@@ -102,6 +102,16 @@ impl Estimation {
         Ok(options)
     }
 
+    /// The files that the options name.
+    pub(super) fn files(&self) -> Vec<PathBuf> {
+        let ego = self
+            .ego
+            .as_deref()
+            .filter(|ego| !["off", "auto"].contains(ego));
+        let named = [&self.poses, &self.ground_raster].into_iter().flatten();
+        named.cloned().chain(ego.map(PathBuf::from)).collect()
+    }
+
     /// What is known of the sweeps beside their points.
     pub(super) fn surroundings(&self, paths: &[PathBuf]) -> Result<Surroundings, Failure> {
         if paths.len() < 2 && self.poses.is_some() {

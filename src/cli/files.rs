@@ -1,12 +1,15 @@
 //! Files on disk to values and back, with errors that name the file.
 
+use std::collections::{HashMap, HashSet};
 use std::fs::{self, File};
 use std::io::{BufWriter, Read, Write};
-use std::path::Path;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 
 use super::failure::Failure;
+use super::unfinished::Unfinished;
 use crate::flow::depth::Camera;
 use crate::flow::{Point, RigidTransform};
 use crate::formats::{self, FileKind, FlowFile, FormatError, GroundRaster, Pair, PairTruth};
@@ -145,14 +148,47 @@ pub(super) fn read_camera(path: &Path) -> Result<Camera, Failure> {
     })
 }
 
-/// Refuses, before any work, a file whose folder is not there.
-pub(super) fn check_writable(path: &Path) -> Result<(), Failure> {
-    let folder = path
-        .parent()
-        .filter(|folder| !folder.as_os_str().is_empty());
-    if folder.is_some_and(|folder| !folder.is_dir()) {
-        let message = format!("cannot write {}: its folder is not there", path.display());
-        return Err(Failure::internal(anyhow!(message)));
+/// Refuses, before any work, outputs that cannot be written, and those that are the same file as an
+/// input or as another output.
+pub(super) fn check_outputs<'a>(
+    outputs: impl IntoIterator<Item = &'a PathBuf>,
+    inputs: impl IntoIterator<Item = &'a PathBuf>,
+) -> Result<(), Failure> {
+    let identity = |path: &Path| {
+        let about = fs::metadata(path).ok().filter(fs::Metadata::is_file)?;
+        Some((about.dev(), about.ino()))
+    };
+    let mut taken: HashMap<(u64, u64), &Path> = HashMap::new();
+    taken.extend(
+        inputs
+            .into_iter()
+            .filter_map(|path| Some((identity(path)?, path.as_path()))),
+    );
+    let mut names: HashSet<&Path> = HashSet::new();
+    for path in outputs {
+        let folder = path
+            .parent()
+            .filter(|folder| !folder.as_os_str().is_empty());
+        if folder.is_some_and(|folder| !folder.is_dir()) {
+            let message = format!("cannot write {}: its folder is not there", path.display());
+            return Err(Failure::internal(anyhow!(message)));
+        }
+        let same = identity(path).and_then(|identity| taken.insert(identity, path));
+        if let Some(same) = same {
+            let message = format!(
+                "{} would be written over {}: give another name",
+                path.display(),
+                same.display()
+            );
+            return Err(Failure::usage(anyhow!(message)));
+        }
+        if !names.insert(path) {
+            let message = format!(
+                "{} would be written twice: give another name",
+                path.display()
+            );
+            return Err(Failure::usage(anyhow!(message)));
+        }
     }
     Ok(())
 }
@@ -170,16 +206,11 @@ pub(super) fn write<E: std::error::Error + Send + Sync + 'static>(
             writer(&mut file)?;
             return Ok(file.flush()?);
         }
-        let unfinished = place.with_added_extension(format!("{}.part", std::process::id()));
-        let mut file = BufWriter::new(File::create_new(&unfinished)?);
-        let done = writer(&mut file)
-            .map_err(anyhow::Error::from)
-            .and_then(|()| Ok(file.flush()?))
-            .and_then(|()| Ok(fs::rename(&unfinished, &place)?));
-        if done.is_err() {
-            let _ = fs::remove_file(&unfinished);
-        }
-        done
+        let (unfinished, file) = Unfinished::beside(&place)?;
+        let mut file = BufWriter::new(file);
+        writer(&mut file)?;
+        file.flush()?;
+        Ok(unfinished.rename(&place)?)
     };
     written()
         .with_context(|| format!("cannot write {}", path.display()))

@@ -237,15 +237,19 @@ impl Flow {
         }
         if let Some(output) = &self.output {
             FlowFormat::from_path(output).map_err(Failure::usage)?;
-            files::check_writable(output)?;
         }
         if let Some(picture) = &self.picture {
             if picture.extension().is_none_or(|ending| ending != "png") {
                 return Err(Failure::usage(anyhow!("a picture's name ends in .png")));
             }
-            files::check_writable(picture)?;
         }
-        Ok(())
+        let pairs = self.sweeps.len().saturating_sub(1).max(1);
+        let named = [&self.output, &self.picture].into_iter().flatten();
+        let outputs: Vec<PathBuf> = named
+            .flat_map(|path| (0..pairs).map(|pair| numbered(path, pair, pairs)))
+            .collect();
+        let known = self.estimation.files();
+        files::check_outputs(&outputs, self.sweeps.iter().chain(&known))
     }
 
     /// Writes, draws and prints what became of a pair, which is one of `pairs`.

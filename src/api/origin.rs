@@ -1,0 +1,118 @@
+//! Pages of other sites: without keys a browser on the same machine could be made to call this
+//! server for them.
+//!
+//! A form may be posted anywhere, and a name that is made to point at 127.0.0.1 (DNS rebinding)
+//! makes a foreign page one of ours. A browser says where a call comes from (`Origin`) and under
+//! which name it was sent (`Host`); other clients say what they like, and lose nothing by it.
+
+use axum::extract::Request;
+use axum::http::uri::Authority;
+use axum::http::{HeaderMap, Version, header};
+
+use super::error::ApiError;
+
+/// Under which names a server without keys may be asked, besides those of the machine itself; none
+/// where any will do, since it is open to a network anyhow.
+#[derive(Clone, Debug, Default)]
+pub struct Hosts(pub Option<Vec<String>>);
+
+/// Refuses a request that does not say one host (RFC 9112, 3.2).
+///
+/// # Errors
+/// [`ApiError::BadRequest`].
+pub(super) fn check_host_is_one(request: &Request) -> Result<(), ApiError> {
+    let hosts = request.headers().get_all(header::HOST).iter().count();
+    let is_needed = request.version() == Version::HTTP_11;
+    if hosts > 1 || (is_needed && hosts == 0) {
+        let text = "a request names one host: send one Host header";
+        return Err(ApiError::BadRequest(text.to_owned()));
+    }
+    Ok(())
+}
+
+/// Refuses a call that a page of another site has made.
+///
+/// # Errors
+/// [`ApiError::ForeignSite`].
+pub(super) fn check(hosts: &Hosts, request: &Request) -> Result<(), ApiError> {
+    let host = match request.uri().authority() {
+        Some(authority) => Some(authority.clone()),
+        None => header_host(request.headers()),
+    };
+    if let Some(known) = &hosts.0
+        && host.as_ref().is_some_and(|host| !is_known(host, known))
+    {
+        return Err(ApiError::ForeignSite);
+    }
+    let Some(origin) = request.headers().get(header::ORIGIN) else {
+        return Ok(());
+    };
+    let of_origin = origin.to_str().ok().and_then(|origin| {
+        let (_, authority) = origin.split_once("://")?;
+        authority.parse::<Authority>().ok()
+    });
+    if of_origin.is_some() && of_origin == host {
+        Ok(())
+    } else {
+        Err(ApiError::ForeignSite)
+    }
+}
+
+/// The host that a header names; one that is no host is nobody's name.
+fn header_host(headers: &HeaderMap) -> Option<Authority> {
+    let value = headers.get(header::HOST)?;
+    let parsed = value.to_str().ok().and_then(|text| text.parse().ok());
+    Some(parsed.unwrap_or_else(|| Authority::from_static("unreadable")))
+}
+
+fn is_known(host: &Authority, known: &[String]) -> bool {
+    let name = host.host().trim_end_matches('.');
+    let address = name.trim_start_matches('[').trim_end_matches(']');
+    let is_loopback = address
+        .parse::<std::net::IpAddr>()
+        .is_ok_and(|address| address.is_loopback());
+    is_loopback
+        || name.eq_ignore_ascii_case("localhost")
+        || name.to_ascii_lowercase().ends_with(".localhost")
+        || known.iter().any(|known| known.eq_ignore_ascii_case(name))
+}
+
+#[cfg(test)]
+mod tests {
+    use axum::body::Body;
+
+    use super::*;
+
+    fn refused(hosts: &Hosts, host: &str, origin: Option<&str>) -> bool {
+        let mut request = Request::get("/v1/jobs").header("host", host);
+        if let Some(origin) = origin {
+            request = request.header("origin", origin);
+        }
+        let request = request.body(Body::empty()).expect("a request");
+        check(hosts, &request).is_err()
+    }
+
+    #[test]
+    fn pages_of_other_sites_are_refused_and_everybody_else_is_not() {
+        let own = Hosts(Some(vec!["flow.example".to_owned()]));
+        for (host, origin, is_refused) in [
+            ("localhost:8080", None, false),
+            ("127.0.0.1:8080", None, false),
+            ("[::1]:8080", None, false),
+            ("LOCALHOST.", None, false),
+            ("flow.example", None, false),
+            ("rebound.example:8080", None, true),
+            ("127.0.0.1.example", None, true),
+            ("not a host", None, true),
+            ("localhost:8080", Some("http://localhost:8080"), false),
+            ("localhost:8080", Some("http://localhost:3000"), true),
+            ("localhost:8080", Some("https://site.example"), true),
+            ("localhost:8080", Some("null"), true),
+        ] {
+            assert_eq!(refused(&own, host, origin), is_refused, "{host} {origin:?}");
+        }
+        let any = Hosts(None);
+        assert!(!refused(&any, "rebound.example", None));
+        assert!(refused(&any, "a.example", Some("http://b.example")));
+    }
+}
