@@ -427,7 +427,7 @@ impl Config {
     /// timers end.
     fn ranges(&self) -> [(&'static str, u64, u64, u64); 24] {
         const YEARS: u64 = 100 * 365 * 24 * 3600;
-        const MIB: u64 = 1 << 30;
+        const MIB: u64 = 1 << 43;
         let Self {
             limits,
             queue,
@@ -555,7 +555,7 @@ mod tests {
             ("gpu_memory_mib = 0", "gpu_memory_mib"),
             (
                 "[limits]\nmax_upload_mib = 17592186044416",
-                "1 to 1073741824",
+                "1 to 8796093022208",
             ),
             ("[limits]\nmin_free_mib = 17592186044416", "min_free_mib"),
             (

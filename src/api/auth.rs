@@ -53,8 +53,8 @@ pub enum InvalidKey {
     Short(Tenant),
     /// No header could carry it as it is.
     #[error(
-        "the key of tenant {0} has white space or characters other than printable ASCII: no header \
-         carries it"
+        "the key of tenant {0} has white space around it, or characters other than printable ASCII: \
+         no header carries it"
     )]
     Unsendable(Tenant),
     /// Two tenants cannot share one.
@@ -77,7 +77,8 @@ impl Keys {
         if key.len() < MIN_KEY {
             return Err(InvalidKey::Short(caller.tenant));
         }
-        if !key.bytes().all(|byte| byte.is_ascii_graphic()) {
+        // What a header carries as it is: white space around a value is no part of it.
+        if key.trim() != key || !key.bytes().all(|byte| matches!(byte, b' '..=b'~')) {
             return Err(InvalidKey::Unsendable(caller.tenant));
         }
         let hash = *blake3::hash(key.as_bytes()).as_bytes();

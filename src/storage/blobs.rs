@@ -135,7 +135,7 @@ impl Blobs {
     /// Where any of it fails.
     pub async fn probe(&self) -> Result<(), BlobError> {
         const BYTES: usize = 1 << 20;
-        let path = Path::from("probe");
+        let path = Path::from("jobs/probe");
         let bytes = Bytes::from(vec![7; BYTES]);
         self.synced.put(&path, bytes.clone().into()).await?;
         let read = self.quick.get(&path).await?.bytes().await?;
@@ -220,12 +220,15 @@ impl Blobs {
         .await
     }
 
-    /// Whether anything lies here.
+    /// Whether nothing of any job lies here.
     ///
     /// # Errors
     /// Where the folder cannot be listed.
     pub fn is_empty(&self) -> Result<bool, BlobError> {
-        Ok(entries(&self.folder.join("jobs"))?.is_empty())
+        // A probe that was cut off is a file; jobs lie in folders.
+        Ok(!entries(&self.folder.join("jobs"))?
+            .iter()
+            .any(|path| path.is_dir()))
     }
 
     /// The jobs under whose names nothing lies that is younger than `age`, whole or cut off.

@@ -179,3 +179,83 @@ fn an_output_that_cannot_be_written_is_an_internal_failure_and_leaves_nothing() 
     assert_eq!(ended.code, 70, "{}", ended.stderr);
     assert_eq!(ended.stderr.lines().count(), 1);
 }
+
+/// A folder with two sweeps and their pair.
+fn street() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().expect("a folder");
+    let made = fnsf(folder.path(), &["synth", "-o", ".", "--frames", "3"]);
+    assert_eq!(made.code, 0, "{}", made.stderr);
+    folder
+}
+
+#[test]
+fn an_output_that_is_an_input_is_refused_before_any_work() {
+    let folder = street();
+    let path = folder.path();
+    std::fs::hard_link(path.join("pair_0000.npz"), path.join("same.npz")).expect("linked");
+    std::fs::copy(path.join("frame_0001.pcd"), path.join("s_0000.pcd")).expect("copied");
+    let ego = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1";
+    std::fs::write(path.join("ego.npz"), ego).expect("written");
+    let all = |folder: &Path| -> Vec<(std::ffi::OsString, Vec<u8>)> {
+        let entries = std::fs::read_dir(folder).expect("a list");
+        let mut files: Vec<_> = entries
+            .map(|entry| {
+                let entry = entry.expect("an entry");
+                (
+                    entry.file_name(),
+                    std::fs::read(entry.path()).expect("bytes"),
+                )
+            })
+            .collect();
+        files.sort();
+        files
+    };
+    let before = all(path);
+    let sweeps = ["frame_0000.pcd", "s_0000.pcd", "frame_0002.pcd"];
+    let [first, second, third] = sweeps;
+    for arguments in [
+        &["flow", "pair_0000.npz", "-o", "pair_0000.npz"][..],
+        &["flow", "pair_0000.npz", "-o", "same.npz"],
+        &["flow", "pair_0000.npz", "-o", "./pair_0000.npz"],
+        &["flow", first, second, third, "-o", "s.pcd"],
+        &["flow", first, third, "--ego", "ego.npz", "-o", "ego.npz"],
+        &["flow", first, third, "-o", "a.pcd", "--picture", "a.pcd"],
+        &[
+            "densify",
+            first,
+            second,
+            third,
+            "--into",
+            "1",
+            "-o",
+            "s_0000.pcd",
+        ],
+    ] {
+        let refused = fnsf(path, arguments);
+        assert_eq!(refused.code, 2, "{arguments:?}: {}", refused.stderr);
+    }
+    assert!(all(path) == before);
+}
+
+#[test]
+fn nothing_unfinished_is_left_behind_or_in_the_way() {
+    let folder = street();
+    let path = folder.path();
+    // What another run has left, whatever number the next one has.
+    for id in 1..70_000 {
+        if id % 1000 == 1 {
+            std::fs::write(path.join(format!("flow.npz.{id}.part")), "").expect("written");
+        }
+    }
+    let left = std::fs::read_dir(path).expect("a list").count();
+    let done = fnsf(path, &["flow", "pair_0000.npz", "-o", "flow.npz"]);
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    assert_eq!(std::fs::read_dir(path).expect("a list").count(), left + 1);
+    let mode = {
+        use std::os::unix::fs::PermissionsExt;
+        let about = std::fs::metadata(path.join("flow.npz")).expect("it is there");
+        let plain = std::fs::metadata(path.join("pair_0000.npz")).expect("it is there");
+        (about.permissions().mode(), plain.permissions().mode())
+    };
+    assert_eq!(mode.0, mode.1);
+}

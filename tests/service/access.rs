@@ -347,7 +347,7 @@ async fn plain_call(server: &Server, method: &str, shown: Option<&str>) -> Code 
         .await
         .expect("HTTP/2");
     let driving = tokio::spawn(connection);
-    let mut request = http::Request::post(format!("http://x/{method}"))
+    let mut request = http::Request::post(format!("http://localhost/{method}"))
         .header("content-type", "application/grpc")
         .header("te", "trailers");
     if let Some(shown) = shown {

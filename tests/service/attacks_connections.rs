@@ -72,13 +72,13 @@ fn until_connections(server: &Server, most: f64) {
 #[tokio::test]
 async fn a_connection_that_is_silent_or_stalls_in_its_headers_is_closed() {
     let siege = Besieged::new("[limits]\nheader_timeout_seconds = 1\n").await;
-    let answered = "GET /openapi.json HTTP/1.1\r\nhost: x\r\n\r\n";
+    let answered = "GET /openapi.json HTTP/1.1\r\nhost: localhost\r\n\r\n";
     let beginnings = [
         "",
         "P",
         "PRI * HTTP/2.0\r\n\r\nSM",
         "GET /openapi.js",
-        "GET /openapi.json HTTP/1.1\r\nhost: x\r\n",
+        "GET /openapi.json HTTP/1.1\r\nhost: localhost\r\n",
         answered,
     ];
     let began = Instant::now();
@@ -135,7 +135,7 @@ async fn a_body_that_stops_or_drips_is_refused_in_time() {
 async fn a_client_that_does_not_read_is_given_up() {
     let siege = Besieged::new("[limits]\nwrite_timeout_seconds = 1\n").await;
     until_connections(&siege.server, 0.0);
-    let request = b"GET /openapi.json HTTP/1.1\r\nhost: x\r\n\r\n".repeat(10_000);
+    let request = b"GET /openapi.json HTTP/1.1\r\nhost: localhost\r\n\r\n".repeat(10_000);
     let mut stream = connect(&siege.server);
     let mut sender = stream.try_clone().expect("a handle");
     let sending = std::thread::spawn(move || {
@@ -214,7 +214,7 @@ async fn connections_past_the_limit_are_closed_and_silent_ones_make_room() {
 async fn five_thousand_quick_connections_leave_nothing_behind() {
     const ANSWERED_EVERY: usize = 10;
     let siege = Besieged::new("").await;
-    let request = b"GET /v1/jobs HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n";
+    let request = b"GET /v1/jobs HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n";
     for number in 0..5000_usize {
         let mut stream = connect(&siege.server);
         match number % 3 {
@@ -261,7 +261,7 @@ async fn lengths_that_lie_are_refused_or_end_with_the_connection() {
 #[tokio::test]
 async fn a_request_is_never_smuggled_in_anothers_body() {
     let siege = Besieged::new("[limits]\nheader_timeout_seconds = 1\n").await;
-    let hidden = "GET /openapi.json HTTP/1.1\r\nhost: x\r\n\r\n";
+    let hidden = "GET /openapi.json HTTP/1.1\r\nhost: localhost\r\n\r\n";
     let both = format!(
         "content-length: {}\r\ntransfer-encoding: chunked",
         5 + hidden.len()
@@ -330,4 +330,31 @@ async fn compressed_bodies_are_refused_before_they_are_read() {
         assert_eq!(status(&answer), Some(415), "{answer}");
     }
     serves(&siege.server).await;
+}
+
+#[tokio::test]
+async fn the_admin_port_answers_whatever_hangs_on_it() {
+    let server = Server::start(&[]);
+    let half = |bytes: &[u8]| {
+        let stream = TcpStream::connect(&server.admin).expect("a connection");
+        let mut one = stream.try_clone().expect("a handle");
+        one.write_all(bytes).expect("sent");
+        stream.set_read_timeout(Some(GIVEN_UP)).expect("a timeout");
+        stream
+    };
+    let mut held = Vec::new();
+    for number in 0..300 {
+        held.push(half(match number % 3 {
+            0 => b"",
+            1 => b"GET /livez HTTP/1.1\r\nhost:",
+            _ => b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n",
+        }));
+    }
+    for path in ["/livez", "/readyz", "/metrics"] {
+        let answer = crate::server::plain_get(&server.admin, path).expect("an answer");
+        assert_eq!(status(&answer), Some(200), "{path}");
+    }
+    for stream in held {
+        until_closed(stream);
+    }
 }

@@ -378,3 +378,43 @@ async fn clouds_at_the_edge_of_sense_get_the_same_verdict_on_both_doors() {
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
     siege.stands().await;
 }
+
+#[tokio::test]
+async fn a_file_with_more_points_than_the_server_takes_is_refused_before_it_is_unfolded() {
+    // Within what files may hold, and within what a file of its length may unfold to.
+    const POINTS: usize = 5_000_000;
+    let siege = Besieged::new("").await;
+    let noise: Vec<u8> = (0..4 << 20_u32)
+        .map(|at: u32| (at.wrapping_mul(2_654_435_761) >> 24) as u8)
+        .collect();
+    let array = npy("'<f2'", &format!("({POINTS}, 3)"), &vec![0; 6 * POINTS]);
+    let padding = npy("'|u1'", &format!("({},)", noise.len()), &noise);
+    let file = zip(&[
+        ("pc1.npy", &array),
+        ("pc2.npy", &array),
+        ("pad.npy", &padding),
+    ]);
+    let sent = reqwest::Client::new()
+        .post(siege.server.url("/v1/flow"))
+        .multipart(Form::new().part("source", Part::bytes(file).file_name("pair.npz")))
+        .send();
+    let said: Value = sent.await.expect("an answer").json().await.expect("JSON");
+    assert_eq!(said["code"], "too_large", "{said}");
+    assert!(
+        said["detail"]
+            .as_str()
+            .is_some_and(|text| text.contains("2000000 are taken")),
+        "{said}"
+    );
+    let peak = std::fs::read_to_string(format!("/proc/{}/status", siege.server.id()));
+    let peak = peak.expect("it runs on Linux");
+    let line = peak.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+    let kibibytes = line.and_then(|line| line.trim().strip_suffix("kB")?.trim().parse().ok());
+    let before = siege.server.resident_bytes() >> 10;
+    // Its own bytes a few times over, and not its points.
+    assert!(
+        kibibytes.is_some_and(|peak: u64| peak < before + (40 << 10)),
+        "{kibibytes:?} KiB at most, {before} now"
+    );
+    siege.stands().await;
+}

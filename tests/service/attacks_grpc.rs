@@ -36,7 +36,7 @@ async fn raw(server: &Server, method: &str, bytes: &[u8], ends: bool) -> Option<
         .await
         .expect("HTTP/2");
     let driving = tokio::spawn(connection);
-    let request = http::Request::post(format!("http://x/{method}"))
+    let request = http::Request::post(format!("http://localhost/{method}"))
         .header("content-type", "application/grpc")
         .header("te", "trailers")
         .body(())

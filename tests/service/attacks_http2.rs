@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use crate::clouds::{form, medium_pair};
+use crate::server::{PATIENCE, Server, ended};
 use crate::wire::{
     Besieged, CONTINUATION, DATA, END_HEADERS, END_STREAM, Frames, GOAWAY, HEADERS, PING,
     RST_STREAM, SETTINGS, WINDOW_UPDATE, field, frame, head,
@@ -145,7 +147,7 @@ async fn ten_thousand_headers_and_a_mebibyte_of_one_are_refused() {
         .collect();
     let long = format!("long: {}\r\n", "a".repeat(1 << 20));
     for headers in [many, long] {
-        let request = format!("GET /openapi.json HTTP/1.1\r\nhost: x\r\n{headers}\r\n");
+        let request = format!("GET /openapi.json HTTP/1.1\r\nhost: localhost\r\n{headers}\r\n");
         let answer = crate::wire::exchange(&siege.server, request.as_bytes());
         assert!(
             matches!(crate::wire::status(&answer), Some(431) | None),
@@ -153,11 +155,153 @@ async fn ten_thousand_headers_and_a_mebibyte_of_one_are_refused() {
         );
     }
     let path = "a".repeat(1 << 20);
-    let request = format!("GET /{path} HTTP/1.1\r\nhost: x\r\n\r\n");
+    let request = format!("GET /{path} HTTP/1.1\r\nhost: localhost\r\n\r\n");
     let answer = crate::wire::exchange(&siege.server, request.as_bytes());
     assert!(
         matches!(crate::wire::status(&answer), Some(414 | 431) | None),
         "{answer}"
     );
     siege.stands().await;
+}
+
+#[tokio::test]
+async fn requests_that_are_refused_by_their_head_and_hang_up_keep_nothing_busy() {
+    const AWAY: [&str; 5] = ["closes", "resets", "sends and resets", "goes", "resets all"];
+    let mut siege = Besieged::new("").await;
+    let heads: [&[(&str, &str)]; 3] = [
+        &[("content-type", "a/b")],
+        &[
+            ("content-type", "multipart/form-data; boundary=x"),
+            ("content-encoding", "gzip"),
+        ],
+        &[
+            ("content-type", "multipart/form-data; boundary=x"),
+            ("content-length", "99999999999"),
+        ],
+    ];
+    for fields in heads {
+        for away in AWAY {
+            // One for each thread of the runtime, and one more.
+            for _ in 0..3 {
+                let frames = Frames::open(&siege.server);
+                let mut block = head("POST", "/v1/flow");
+                for (name, value) in fields {
+                    block.extend(field(name, value));
+                }
+                let mut bytes = frame(HEADERS, END_HEADERS, 1, &block);
+                let reset = frame(RST_STREAM, 0, 1, &8_u32.to_be_bytes());
+                match away {
+                    "resets" => bytes.extend(reset),
+                    "sends and resets" => {
+                        bytes.extend(frame(DATA, 0, 1, &[7; 100]));
+                        bytes.extend(reset);
+                    }
+                    "goes" => bytes.extend(frame(GOAWAY, 0, 0, &[0; 8])),
+                    _ => {}
+                }
+                frames.send(bytes);
+                // It is being refused when the client goes.
+                std::thread::sleep(Duration::from_millis(20));
+                frames.hang_up(away == "resets all");
+            }
+        }
+    }
+    tokio::time::timeout(PATIENCE, siege.stands())
+        .await
+        .expect("it still answers");
+    std::thread::sleep(Duration::from_secs(1));
+    let before = siege.server.processor_seconds();
+    std::thread::sleep(Duration::from_secs(1));
+    let busy = siege.server.processor_seconds() - before;
+    assert!(busy < 0.5, "it is busy with nobody: {busy} s of a second");
+    siege.server.signal("TERM");
+    assert!(siege.server.wait(PATIENCE).is_some(), "SIGTERM ends it");
+}
+
+#[tokio::test]
+async fn answers_that_nobody_reads_are_bounded_and_given_up() {
+    let config = "[limits]\nwrite_timeout_seconds = 2\nmax_answers_mib = 64\n";
+    let siege = Besieged::new(config).await;
+    let client = reqwest::Client::new();
+    let sent = client
+        .post(siege.server.url("/v1/jobs"))
+        .multipart(form(medium_pair(), "{}"))
+        .send()
+        .await
+        .expect("an answer");
+    let job: serde_json::Value = sent.json().await.expect("a job");
+    let id = job["id"].as_str().expect("a name").to_owned();
+    assert_eq!(ended(&siege.server, &id).await["state"], "succeeded");
+    const INITIAL_WINDOW_SIZE: u16 = 4;
+    let mut window = INITIAL_WINDOW_SIZE.to_be_bytes().to_vec();
+    window.extend(0_u32.to_be_bytes());
+    let held: Vec<Frames> = (0..4)
+        .map(|_| {
+            let frames = Frames::open(&siege.server);
+            let mut bytes = frame(SETTINGS, 0, 0, &window);
+            for stream in streams(60) {
+                let mut block = head("GET", &format!("/v1/jobs/{id}/result"));
+                block.extend(field("accept", "application/json"));
+                bytes.extend(frame(HEADERS, END_HEADERS | END_STREAM, stream, &block));
+            }
+            frames.send(bytes);
+            frames
+        })
+        .collect();
+    let answering: Vec<_> = held.into_iter().map(Frames::answer_pings).collect();
+    // 240 answers of some megabytes: all together they may not take a tenth of that.
+    let began = std::time::Instant::now();
+    while began.elapsed() < Duration::from_secs(2) {
+        let grown = siege.grown();
+        assert!(grown < 300 << 20, "{} MiB", grown >> 20);
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    for connection in answering {
+        // Each ends because the server closes it, although pings are answered.
+        connection.join().expect("no panic");
+    }
+    // And what they held is free again.
+    let url = siege.server.url(&format!("/v1/jobs/{id}/result"));
+    let answer = client.get(url).send().await.expect("an answer");
+    assert_eq!(answer.status(), 200);
+    siege.stands().await;
+}
+
+#[tokio::test]
+async fn connections_that_only_answer_pings_make_room() {
+    let keys = "api_key = \"0123456789abcdef\"\n";
+    let config = format!("{keys}[limits]\nmax_connections = 16\nheader_timeout_seconds = 2\n");
+    let server = Server::with_config(&config);
+    let idle: Vec<_> = (0..16)
+        .map(|_| Frames::open(&server).answer_pings())
+        .collect();
+    let list = || {
+        let sent = reqwest::Client::new()
+            .get(server.url("/v1/jobs"))
+            .bearer_auth("0123456789abcdef");
+        sent.timeout(PATIENCE).send()
+    };
+    // At once: whoever shows a key goes before those who show nothing.
+    assert_eq!(list().await.expect("an answer").status(), 200);
+    for connection in idle {
+        connection.join().expect("no panic");
+    }
+    assert_eq!(list().await.expect("an answer").status(), 200);
+}
+
+#[tokio::test]
+async fn a_call_without_a_key_does_not_keep_a_connection() {
+    let keys = "api_key = \"0123456789abcdef\"\n";
+    let config = format!("{keys}[limits]\nheader_timeout_seconds = 1\n");
+    let server = Server::with_config(&config);
+    let frames = Frames::open(&server);
+    // Health may be watched by anybody, for ever.
+    let mut block = head("POST", "/grpc.health.v1.Health/Watch");
+    block.extend(field("content-type", "application/grpc"));
+    block.extend(field("te", "trailers"));
+    let mut bytes = frame(HEADERS, END_HEADERS, 1, &block);
+    bytes.extend(frame(DATA, END_STREAM, 1, &[0; 5]));
+    frames.send(bytes);
+    let ended = frames.answer_pings().join().expect("no panic");
+    assert!(ended >= Duration::from_secs(1), "{ended:?}");
 }

@@ -42,7 +42,7 @@ async fn a_name_that_is_no_jobs_is_not_found_whatever_it_holds() {
             ("GET", "/result"),
         ] {
             let name = name.replace(' ', "%20");
-            let head = "host: x\r\nconnection: close\r\n\r\n";
+            let head = "host: localhost\r\nconnection: close\r\n\r\n";
             let request = format!("{method} /v1/jobs/{name}{rest} HTTP/1.1\r\n{head}");
             let answer = exchange(&siege.server, request.as_bytes());
             let short = name.chars().take(60).collect::<String>();

@@ -394,7 +394,7 @@ async fn refusals_say_what_is_wrong_as_problems() {
         ),
         (both(cloud(), noise()), 422, "target: unrecognized file"),
         (both(cloud(), few), 422, "at least 3 are needed"),
-        (both(cloud(), many), 413, "this server takes 20000"),
+        (both(cloud(), many), 413, "20000 are taken"),
         (both(big, cloud()), 413, "4 MiB"),
         (
             both(cloud(), cloud()).text("options", "{\"sead\":1}"),

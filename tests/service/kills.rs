@@ -215,3 +215,29 @@ async fn a_killed_job_goes_on_from_its_snapshot() {
         "it is another flow"
     );
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_process_that_is_paused_for_longer_than_a_lease_keeps_its_jobs() {
+    let server = Server::with_config("[queue]\nlease_seconds = 2\nmax_attempts = 1\n");
+    let client = reqwest::Client::new();
+    let sent = client
+        .post(server.url("/v1/jobs"))
+        .multipart(form(
+            medium_pair(),
+            r#"{"preset": "paper", "max_points": 8192}"#,
+        ))
+        .send()
+        .await
+        .expect("an answer");
+    let job: Value = sent.json().await.expect("a job");
+    let id = job["id"].as_str().expect("a name");
+    server.until("it runs", || server.metric("fnsf_jobs_running") > 0.0);
+    for _ in 0..2 {
+        server.signal("STOP");
+        tokio::time::sleep(Duration::from_secs(4)).await;
+        server.signal("CONT");
+        tokio::time::sleep(Duration::from_millis(300)).await;
+    }
+    assert_eq!(ended(&server, id).await["state"], "succeeded");
+    assert_eq!(server.metric("fnsf_leases_expired_total"), 0.0);
+}

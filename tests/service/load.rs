@@ -369,3 +369,45 @@ async fn the_number_of_series_does_not_grow_with_the_jobs() {
     assert!(counts.iter().all(|count| *count == counts[0]), "{counts:?}");
     assert!(counts[0] > 100);
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_is_asked_for_again_is_admitted_as_what_is_new() {
+    let config = "[limits]\nmax_queue_seconds = 20\nmax_tenant_queue_seconds = 20\n";
+    let server = Server::with_config(config);
+    let client = reqwest::Client::new();
+    let mut ids = Vec::new();
+    // Filled and cancelled again and again: more than there is room for.
+    for _ in 0..3 {
+        let mut refused = false;
+        while !refused {
+            let sent = client
+                .post(server.url("/v1/jobs"))
+                .multipart(form(medium_pair(), r#"{"preset": "paper"}"#))
+                .send();
+            let answer = sent.await.expect("an answer");
+            refused = !answer.status().is_success();
+            if !refused {
+                let job: Value = answer.json().await.expect("a job");
+                ids.push(job["id"].as_str().expect("a name").to_owned());
+            }
+        }
+        for id in &ids {
+            let url = server.url(&format!("/v1/jobs/{id}"));
+            client.delete(url).send().await.expect("an answer");
+        }
+        for id in &ids {
+            ended(&server, id).await;
+        }
+    }
+    let mut refused = 0;
+    for id in &ids {
+        let url = server.url(&format!("/v1/jobs/{id}/requeue"));
+        let answer = client.post(url).send().await.expect("an answer");
+        if answer.status() == StatusCode::TOO_MANY_REQUESTS {
+            assert!(answer.headers().contains_key("retry-after"));
+            refused += 1;
+        }
+    }
+    assert!(refused > 0, "all {} are queued again", ids.len());
+    assert!(server.metric("fnsf_queue_work_seconds") <= 20.5);
+}

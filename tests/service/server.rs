@@ -48,9 +48,22 @@ impl Server {
 
     /// A server on what another one left behind.
     pub(crate) fn start_in(folder: &Folder, config: &str, arguments: &[&str]) -> Self {
+        let program = Command::new(env!("CARGO_BIN_EXE_fnsf"));
+        Self::start_as(program, folder, config, arguments)
+    }
+
+    /// A fresh server that a shell starts after some commands, such as `ulimit -n 100`.
+    pub(crate) fn start_after(commands: &str, config: &str) -> Self {
+        let mut shell = Command::new("sh");
+        let program = env!("CARGO_BIN_EXE_fnsf");
+        shell.args(["-c", &format!("{commands}; exec \"$0\" \"$@\""), program]);
+        Self::start_as(shell, &Folder::new(), config, &[])
+    }
+
+    fn start_as(mut program: Command, folder: &Folder, config: &str, arguments: &[&str]) -> Self {
         let file: PathBuf = folder.path().join("fnsf.toml");
         std::fs::write(&file, config).expect("a file");
-        let mut child = Command::new(env!("CARGO_BIN_EXE_fnsf"))
+        let mut child = program
             .args([
                 "serve",
                 "--listen",
@@ -108,16 +121,37 @@ impl Server {
         self.log.lock().expect("no panic holds it").clone()
     }
 
-    fn until_ready(&self) {
+    pub(crate) fn until_ready(&self) {
+        self.until("it is ready", || self.is_ready());
+    }
+
+    /// Waits for something; only a failure waits long.
+    pub(crate) fn until(&self, what: &str, is_so: impl Fn() -> bool) {
         let began = Instant::now();
-        while !self.is_ready() {
+        while !is_so() {
+            let log = self.log();
             assert!(
                 began.elapsed() < PATIENCE,
-                "it is not ready: {}",
-                self.log()
+                "it is not so that {what}: {log}"
             );
-            thread::sleep(Duration::from_millis(10));
+            thread::sleep(Duration::from_millis(20));
         }
+    }
+
+    /// Where it keeps its things.
+    pub(crate) fn data(&self) -> PathBuf {
+        self.folder.path().join("data")
+    }
+
+    /// Processor time that it has used, seconds.
+    pub(crate) fn processor_seconds(&self) -> f64 {
+        let about =
+            std::fs::read_to_string(format!("/proc/{}/stat", self.id())).expect("it runs on Linux");
+        // The fields after the program's name in brackets: user and system time are 14 and 15.
+        let fields = about.rsplit(')').next().unwrap_or_default();
+        let ticks = fields.split_whitespace().skip(11).take(2);
+        let ticks = ticks.filter_map(|ticks| ticks.parse::<f64>().ok());
+        ticks.sum::<f64>() / 100.0
     }
 
     /// Whether the admin port says that it is ready.
@@ -201,7 +235,7 @@ pub(crate) fn plain_get(address: &str, path: &str) -> Option<String> {
     use std::io::Write;
     let mut stream = std::net::TcpStream::connect(address).ok()?;
     stream.set_read_timeout(Some(PATIENCE)).ok()?;
-    let request = format!("GET {path} HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n");
+    let request = format!("GET {path} HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n");
     stream.write_all(request.as_bytes()).ok()?;
     let mut answer = String::new();
     stream.read_to_string(&mut answer).ok()?;

@@ -45,9 +45,13 @@ impl Besieged {
         assert!(!log.contains("panicked"), "{log}");
     }
 
+    /// Memory that it holds more than before the attack, bytes.
+    pub(crate) fn grown(&self) -> u64 {
+        self.server.resident_bytes().saturating_sub(self.resident)
+    }
+
     pub(crate) fn has_not_grown(&self) {
-        let now = self.server.resident_bytes();
-        let grown = now.saturating_sub(self.resident);
+        let grown = self.grown();
         assert!(grown < MAX_GROWTH, "it has grown by {} MiB", grown >> 20);
     }
 }
@@ -128,7 +132,7 @@ pub(crate) fn multipart(parts: &[(&str, &[u8])]) -> Vec<u8> {
 /// The head of a request with a multipart body, without the blank line.
 pub(crate) fn post(path: &str, headers: &str) -> String {
     format!(
-        "POST {path} HTTP/1.1\r\nhost: x\r\ncontent-type: multipart/form-data; boundary=x\r\n\
+        "POST {path} HTTP/1.1\r\nhost: localhost\r\ncontent-type: multipart/form-data; boundary=x\r\n\
          {headers}"
     )
 }
@@ -202,6 +206,36 @@ impl Frames {
         panic!("it was closed without a GOAWAY")
     }
 
+    /// Answers pings and nothing else, from a thread of its own, until the server closes the
+    /// connection; says how long that took.
+    pub(crate) fn answer_pings(mut self) -> std::thread::JoinHandle<Duration> {
+        const ACK: u8 = 1;
+        std::thread::spawn(move || {
+            let began = Instant::now();
+            while let Some(frame) = self.next() {
+                assert!(began.elapsed() < PATIENCE, "it is kept open");
+                let answer = match (frame.kind, frame.flags & ACK) {
+                    (PING, 0) => self::frame(PING, ACK, 0, &frame.payload),
+                    (SETTINGS, 0) => self::frame(SETTINGS, ACK, 0, &[]),
+                    _ => continue,
+                };
+                if self.stream.write_all(&answer).is_err() {
+                    break;
+                }
+            }
+            assert!(began.elapsed() < PATIENCE, "it is kept open");
+            began.elapsed()
+        })
+    }
+
+    /// Closes the connection; by a reset, where one is asked for.
+    pub(crate) fn hang_up(self, by_reset: bool) {
+        if !by_reset {
+            // Else what is unread makes the system reset instead of close.
+            let _gone_is_fine = self.stream.shutdown(std::net::Shutdown::Both);
+        }
+    }
+
     /// Shortens how long a read may take.
     pub(crate) fn patience(&self, patience: Duration) {
         let set = self.stream.set_read_timeout(Some(patience));
@@ -235,7 +269,7 @@ pub(crate) fn head(method: &str, path: &str) -> Vec<u8> {
         (":method", method),
         (":scheme", "http"),
         (":path", path),
-        (":authority", "x"),
+        (":authority", "localhost"),
     ];
     fields
         .iter()
