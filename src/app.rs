@@ -26,7 +26,7 @@ use crate::config::{Config, LimitsConfig, QueueConfig};
 use crate::cost::{CostModel, Lanes};
 use crate::engine::{Device, Health};
 use crate::health::{Heartbeat, StoreHealth};
-use crate::job::{DeviceKind, Tenant};
+use crate::job::{DeviceKind, Priority, Tenant};
 use crate::metrics::Metrics;
 use crate::queue::{Queue, QueueOptions, SqliteQueue};
 use crate::storage::Blobs;
@@ -312,6 +312,7 @@ fn keys(config: &Config) -> anyhow::Result<Keys> {
         let caller = Caller {
             tenant: Tenant::default(),
             role: Role::Write,
+            max_priority: Priority::High,
         };
         keys.add(key.reveal(), caller).context("api_key")?;
     }
@@ -320,6 +321,7 @@ fn keys(config: &Config) -> anyhow::Result<Keys> {
         let caller = Caller {
             tenant,
             role: key.role,
+            max_priority: key.max_priority,
         };
         keys.add(key.key.reveal(), caller).context("keys")?;
     }

@@ -13,6 +13,7 @@ use serde::de::Visitor;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::api::Role;
+use crate::job::Priority;
 
 /// What environment variables begin with; `__` goes one level down:
 /// `FNSF_SERVE_LIMITS__MAX_POINTS=200000`.
@@ -79,6 +80,13 @@ pub struct KeyConfig {
     pub role: Role,
     /// The key itself, 16 characters or more.
     pub key: Secret,
+    /// How urgent its jobs may be: low, normal or high. High goes before all others of any tenant.
+    #[serde(default = "high")]
+    pub max_priority: Priority,
+}
+
+fn high() -> Priority {
+    Priority::High
 }
 
 /// TLS.
@@ -290,7 +298,7 @@ impl Default for Config {
                 max_frames: 1000,
                 max_wait_seconds: 30,
                 max_queue_seconds: 7 * DAY,
-                max_tenant_queue_seconds: 7 * DAY,
+                max_tenant_queue_seconds: 7 * DAY / 2,
                 max_connections: 1024,
                 header_timeout_seconds: 15,
                 body_timeout_seconds: 30,
@@ -576,7 +584,7 @@ mod tests {
                 "drain.deadline",
             ),
             (
-                "[drain]\ndelay_seconds = 18446744073709551615",
+                "[drain]\ndelay_seconds = 9223372036854775807",
                 "delay_seconds",
             ),
             ("[queue]\nlease_seconds = 0", "lease_seconds"),

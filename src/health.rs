@@ -35,6 +35,15 @@ impl Heartbeat {
         self.last.store(self.millis(), Ordering::Relaxed);
     }
 
+    /// As if the last sign of life were so old.
+    #[cfg(test)]
+    pub(crate) fn silent_for(silence: Duration) -> Self {
+        Self {
+            began: Instant::now() - silence,
+            last: AtomicU64::new(0),
+        }
+    }
+
     /// Time since the last sign of life.
     pub fn age(&self) -> Duration {
         let last = self.last.load(Ordering::Relaxed);

@@ -96,6 +96,7 @@ pub struct Metrics {
     device_lanes: Family<DeviceLabel, Gauge>,
     device_lost: Family<DeviceLabel, Counter>,
     device_fallback: Gauge,
+    store_ready: Gauge,
     rejected: Family<Reason, Counter>,
     requests: Family<DoorAndClass, Counter>,
     connections: Gauge,
@@ -133,6 +134,7 @@ impl Metrics {
             device_lanes: Family::default(),
             device_lost: Family::default(),
             device_fallback: Gauge::default(),
+            store_ready: Gauge::default(),
             rejected: Family::default(),
             requests: Family::default(),
             connections: Gauge::default(),
@@ -278,6 +280,11 @@ impl Metrics {
             "Whether the CPU works because no GPU was found, where one would have been taken",
             self.device_fallback.clone(),
         );
+        registry.register(
+            "store_ready",
+            "Whether the queue and the payloads could be written at the last look",
+            self.store_ready.clone(),
+        );
         registry.register("rejected", "Requests refused", self.rejected.clone());
         registry.register("requests", "Requests answered", self.requests.clone());
         registry.register("connections", "Open connections", self.connections.clone());
@@ -387,6 +394,11 @@ impl Metrics {
         self.requests
             .get_or_create(&DoorAndClass { door, class })
             .inc();
+    }
+
+    /// Says whether the store can be written.
+    pub fn store(&self, ready: bool) {
+        self.store_ready.set(i64::from(ready));
     }
 
     /// Counts bytes of request bodies.

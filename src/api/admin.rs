@@ -133,3 +133,27 @@ async fn expose(State(admin): State<Admin>, headers: HeaderMap) -> Response {
     )
         .into_response()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_server_is_not_ready_while_a_loop_is_stuck_or_the_store_fails() {
+        let (_draining, drains) = watch::channel(false);
+        let silence = STUCK + Duration::from_secs(1);
+        let heartbeat = Arc::new(Heartbeat::silent_for(silence));
+        let readiness = Readiness {
+            devices: Vec::new(),
+            draining: drains,
+            store: Arc::default(),
+            loops: vec![("the runtime", Arc::clone(&heartbeat))],
+        };
+        let stuck = readiness.stuck().expect("it is stuck");
+        assert!(stuck.contains("the runtime") && readiness.obstacle() == Some(stuck));
+        heartbeat.beat();
+        readiness.store.failed(&"no space left");
+        let trouble = readiness.obstacle().expect("the store does not work");
+        assert!(trouble.contains("no space left") && readiness.stuck().is_none());
+    }
+}

@@ -7,7 +7,7 @@ use constant_time_eq::constant_time_eq_32;
 use serde::{Deserialize, Serialize};
 
 use super::error::ApiError;
-use crate::job::Tenant;
+use crate::job::{Priority, Tenant};
 
 /// What a key may do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -26,9 +26,23 @@ pub struct Caller {
     pub tenant: Tenant,
     /// What may be done.
     pub role: Role,
+    /// How urgent its jobs may be.
+    pub max_priority: Priority,
 }
 
 impl Caller {
+    /// Refuses jobs that are more urgent than this key's may be.
+    ///
+    /// # Errors
+    /// [`ApiError::Priority`].
+    pub fn may_ask_for(&self, priority: Priority) -> Result<(), ApiError> {
+        if priority <= self.max_priority {
+            Ok(())
+        } else {
+            Err(ApiError::Priority(self.max_priority))
+        }
+    }
+
     /// Refuses callers that may only read.
     ///
     /// # Errors
@@ -110,6 +124,7 @@ impl Keys {
             return Ok(Caller {
                 tenant: Tenant::default(),
                 role: Role::Write,
+                max_priority: Priority::High,
             });
         }
         let shown = authorization.and_then(|value| {
@@ -136,6 +151,7 @@ mod tests {
         Caller {
             tenant: tenant.parse().expect("a good name"),
             role,
+            max_priority: Priority::Normal,
         }
     }
 
@@ -158,6 +174,9 @@ mod tests {
         let found = keys.caller(Some("Bearer fedcba9876543210")).expect("known");
         assert_eq!(found, caller("b", Role::Read));
         assert_eq!(found.may_write(), Err(ApiError::Forbidden));
+        assert_eq!(found.may_ask_for(Priority::Normal), Ok(()));
+        let refused = Err(ApiError::Priority(Priority::Normal));
+        assert_eq!(found.may_ask_for(Priority::High), refused);
         for wrong in [
             None,
             Some(""),

@@ -102,6 +102,7 @@ impl Draft {
         caller.may_write()?;
         service.check_draining()?;
         request.options.check()?;
+        caller.may_ask_for(request.options.priority)?;
         service
             .admission
             .check_device(request.options.device_kind())?;

@@ -5,7 +5,7 @@
 use std::time::Duration;
 
 use crate::formats::FormatError;
-use crate::job::{DeviceKind, InvalidId, InvalidOptions, JobError, JobId};
+use crate::job::{DeviceKind, InvalidId, InvalidOptions, JobError, JobId, Priority};
 use crate::queue::QueueError;
 use crate::storage::{BlobError, Fault};
 
@@ -36,6 +36,9 @@ pub enum ApiError {
     /// The key may not do this.
     #[error("this key may only read")]
     Forbidden,
+    /// The key may not ask for so urgent a job.
+    #[error("this key's jobs may be of priority {} at most", .0.name())]
+    Priority(Priority),
     /// A page of another site has made a browser call a server without keys.
     #[error(
         "this server has no keys and is for this machine alone: call it as localhost, without a \
@@ -74,6 +77,9 @@ pub enum ApiError {
     /// Its deadline passed before a device was free.
     #[error("the deadline passed before a device was free")]
     Expired(JobId),
+    /// Its deadline passed before a device was free, and that stays so.
+    #[error("the job has expired: POST its requeue to have it done after all")]
+    HasExpired(JobId),
     /// Somebody cancelled it.
     #[error("the job was cancelled")]
     Cancelled(JobId),
@@ -131,8 +137,12 @@ const fn row(
     }
 }
 
+/// The longest text of an error that a door says, bytes: gRPC has it in a header, and a client that
+/// gets more than its limit sees no reason at all.
+const LONGEST_TEXT: usize = 1024;
+
 /// All that the doors ever say.
-const TABLE: [Row; 28] = [
+const TABLE: [Row; 30] = [
     row("bad_request", 400, 3, false, Some("bad_input")),
     row("invalid_options", 400, 3, false, Some("bad_input")),
     row("bad_input", 422, 3, false, Some("bad_input")),
@@ -141,6 +151,7 @@ const TABLE: [Row; 28] = [
     row("too_slow", 408, 4, true, Some("too_slow")),
     row("unauthenticated", 401, 16, false, Some("unauthorized")),
     row("forbidden", 403, 7, false, Some("unauthorized")),
+    row("priority", 403, 7, false, Some("unauthorized")),
     row("foreign_site", 403, 7, false, Some("unauthorized")),
     row("not_found", 404, 5, false, None),
     row("no_route", 404, 12, false, None),
@@ -153,6 +164,7 @@ const TABLE: [Row; 28] = [
     row("job_failed", 500, 10, true, None),
     row("job_refused", 422, 9, false, None),
     row("deadline_in_queue", 504, 4, true, None),
+    row("expired", 409, 9, false, None),
     row("cancelled", 409, 1, false, None),
     row("tenant_limit", 429, 8, true, Some("tenant_limit")),
     row("server_full", 503, 14, true, Some("server_full")),
@@ -197,6 +209,7 @@ impl ApiError {
             Self::TooSlow => "too_slow",
             Self::Unauthenticated => "unauthenticated",
             Self::Forbidden => "forbidden",
+            Self::Priority(_) => "priority",
             Self::ForeignSite => "foreign_site",
             Self::NotFound => "not_found",
             Self::NoRoute => "no_route",
@@ -209,6 +222,7 @@ impl ApiError {
             Self::JobFailed(_, error) if error.retryable => "job_failed",
             Self::JobFailed(..) => "job_refused",
             Self::Expired(_) => "deadline_in_queue",
+            Self::HasExpired(_) => "expired",
             Self::Cancelled(_) => "cancelled",
             Self::TenantLimit(_) => "tenant_limit",
             Self::ServerFull(_) => "server_full",
@@ -223,6 +237,16 @@ impl ApiError {
     /// The error's row of the table.
     pub fn row(&self) -> Row {
         Row::of(self.code()).expect("every code has a row; a test goes through all of them")
+    }
+
+    /// What is wrong, in words, and not more of them than any client takes.
+    pub fn text(&self) -> String {
+        let mut text = self.to_string();
+        if text.len() > LONGEST_TEXT {
+            text.truncate(text.floor_char_boundary(LONGEST_TEXT));
+            text.push_str(" ...");
+        }
+        text
     }
 
     /// When the same request may succeed, where that is known.
@@ -242,6 +266,7 @@ impl ApiError {
             | Self::NotEnded(id)
             | Self::JobFailed(id, _)
             | Self::Expired(id)
+            | Self::HasExpired(id)
             | Self::Cancelled(id)
             | Self::ResultLost(id) => Some(*id),
             _ => None,
@@ -337,6 +362,7 @@ mod tests {
             ApiError::TooSlow,
             ApiError::Unauthenticated,
             ApiError::Forbidden,
+            ApiError::Priority(Priority::Normal),
             ApiError::ForeignSite,
             ApiError::NotFound,
             ApiError::NoRoute,
@@ -349,6 +375,7 @@ mod tests {
             ApiError::JobFailed(id, error(true)),
             ApiError::JobFailed(id, error(false)),
             ApiError::Expired(id),
+            ApiError::HasExpired(id),
             ApiError::Cancelled(id),
             ApiError::TenantLimit(second),
             ApiError::ServerFull(second),

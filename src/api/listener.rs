@@ -32,7 +32,8 @@ use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
 use tower::ServiceExt;
 
-use self::bodies::{AnswerBody, RequestBody};
+use self::bodies::AnswerBody;
+pub(super) use self::bodies::RequestBody;
 pub(super) use self::connections::Connection;
 use self::connections::{Connections, Entry, Patience, Verdict};
 use self::opening::Opening;

@@ -20,6 +20,8 @@ mod guard;
 mod http;
 mod listener;
 mod origin;
+#[cfg(test)]
+mod tests;
 
 pub use admin::{Readiness, admin_router};
 pub use admission::{Admission, AdmissionLimits};

@@ -301,3 +301,18 @@ async fn a_server_does_not_give_up_while_another_card_is_being_opened_again() {
     assert_eq!(stand.end(&job).await.0, "succeeded");
     stand.app.drain().await;
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_server_whose_port_has_closed_is_given_up() {
+    let mut stand = serve(Vec::new(), true).await;
+    assert!(
+        timeout(Duration::from_millis(100), stand.app.given_up())
+            .await
+            .is_err()
+    );
+    stand.app.stop_listening.cancel();
+    let reason = timeout(PATIENCE, stand.app.given_up()).await;
+    assert_eq!(reason.expect("in time"), "the public port has closed");
+    // And stops as any other does.
+    stand.app.drain().await;
+}

@@ -44,7 +44,12 @@ pub(super) fn start(
     let (store, heartbeat) = (Arc::clone(health.0), Arc::clone(health.1));
     let mut tasks = JoinSet::new();
     tasks.spawn(beat(heartbeat));
-    tasks.spawn(probe(Arc::clone(queue), blobs.clone(), store));
+    tasks.spawn(probe(
+        Arc::clone(queue),
+        blobs.clone(),
+        store,
+        Arc::clone(metrics),
+    ));
     tasks.spawn(listen(blobs.clone(), Arc::clone(metrics), heard));
     tasks.spawn(look(devices.to_vec(), Arc::clone(metrics)));
     tasks.spawn(clean(Arc::clone(queue), blobs.clone()));
@@ -73,7 +78,12 @@ async fn beat(heartbeat: Arc<Heartbeat>) {
 }
 
 /// Probes the store for as long as the server runs.
-async fn probe(queue: Arc<dyn Queue>, blobs: Blobs, store: Arc<StoreHealth>) {
+async fn probe(
+    queue: Arc<dyn Queue>,
+    blobs: Blobs,
+    store: Arc<StoreHealth>,
+    metrics: Arc<Metrics>,
+) {
     let mut pause = FIRST_PROBE;
     let mut worked_since = Instant::now();
     loop {
@@ -91,10 +101,11 @@ async fn probe(queue: Arc<dyn Queue>, blobs: Blobs, store: Arc<StoreHealth>) {
             }
             Err(error) => store.failed(&error),
         }
+        metrics.store(store.trouble().is_none());
         if store.trouble().is_none() {
             tokio::select! {
                 () = tokio::time::sleep(PROBE) => continue,
-                () = store.until_it_fails() => {}
+                () = store.until_it_fails() => metrics.store(false),
             }
         }
         if worked_since.elapsed() > LAST_PROBE {

@@ -401,7 +401,8 @@ pub struct LossOptions {
 /// What the network is fed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Inputs {
-    /// Coordinates as they come, metres.
+    /// Coordinates as they come, metres; about the cloud's mean where that lies far from the origin,
+    /// as in no sensor's frame.
     Raw,
     /// Coordinates about the cloud's mean, divided by `scale_m`.
     Centered {

@@ -261,6 +261,38 @@ fn clouds_far_from_the_origin_align_as_near_ones_do() {
 }
 
 #[test]
+fn a_field_that_is_fitted_far_from_the_origin_is_that_of_the_same_cloud_at_home() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder);
+    let pcd = std::fs::read(folder.join("street/frame_0000.pcd")).expect("written");
+    let cloud = fnsf::formats::read_cloud(&pcd, None)
+        .expect("a cloud")
+        .points;
+    // Twice the same cloud: nothing moves. Single precision resolves 8 mm at 100 km.
+    for x in [0.0, 1e3, 1e5] {
+        let points: Vec<_> = cloud.iter().map(|p| [p[0] + x, p[1], p[2]]).collect();
+        let mut file = Vec::new();
+        fnsf::formats::write_cloud(fnsf::formats::CloudFormat::Npy, &points, &mut file)
+            .expect("memory takes all");
+        for name in ["a.npy", "b.npy"] {
+            std::fs::write(folder.join(name), &file).expect("written");
+        }
+        let arguments = "flow a.npy b.npy --preset paper --max-points 2048 -o flow.npy --json";
+        json(folder, &arguments.split(' ').collect::<Vec<_>>());
+        let flow = std::fs::read(folder.join("flow.npy")).expect("written");
+        let flow = fnsf::formats::read_flow(&flow, Some("flow.npy"))
+            .expect("a flow")
+            .flow;
+        let longest = flow
+            .iter()
+            .flatten()
+            .fold(0.0_f32, |most, x| most.max(x.abs()));
+        assert!(longest < 0.3, "{x} m: {longest} m");
+    }
+}
+
+#[test]
 fn auto_without_a_card_says_so_and_a_card_that_is_not_there_is_refused_with_advice() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();

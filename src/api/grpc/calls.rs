@@ -16,7 +16,7 @@ use crate::api::dense;
 use crate::api::draft::{Accepted, Draft};
 use crate::api::error::ApiError;
 use crate::api::service::{Service, Waited};
-use crate::job::{InvalidId, Job, JobId, Kind};
+use crate::job::{InvalidId, Job, JobId, Kind, State};
 
 /// Messages that wait for a client that reads slowly.
 const AHEAD: usize = 4;
@@ -350,6 +350,9 @@ impl SceneFlow for Calls {
         let call = Call::of(&request)?;
         let asked = request.into_inner();
         let job = self.named(&call, &asked.id).await?;
+        if job.state == State::Expired {
+            return Err(ApiError::HasExpired(job.id).into());
+        }
         let first = usize::try_from(asked.first_row).unwrap_or(usize::MAX);
         let (answers, stream) = mpsc::channel(AHEAD);
         if dense::is_dense(&job) {

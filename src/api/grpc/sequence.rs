@@ -25,6 +25,9 @@ use crate::queue::PairOf;
 
 type Answers = mpsc::Sender<Result<proto::EstimateSequenceResponse, Status>>;
 
+/// The longest name of a sweep, bytes: it comes back with every pair, and in errors.
+const MAX_NAME: usize = 255;
+
 /// A pair that is being worked on.
 struct Pending {
     place: u32,
@@ -160,6 +163,10 @@ impl Reader {
                     cloud.take(&self.service, &mut room, &coming.name, &chunk)?;
                     let all = coming.points.is_some_and(|points| cloud.points() >= points);
                     if all { current.take() } else { None }
+                }
+                Some(Part::Sweep(sweep)) if sweep.name.len() > MAX_NAME => {
+                    let text = format!("the name of a sweep has more than {MAX_NAME} bytes");
+                    return Err(ApiError::BadRequest(text));
                 }
                 Some(Part::Sweep(sweep)) => current.replace(Coming {
                     name: sweep.name,

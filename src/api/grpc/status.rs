@@ -31,7 +31,7 @@ pub(in crate::api) fn status(error: &ApiError) -> Status {
         details.set_retry_info(retry_after);
     }
     let code = Code::from_i32(row.grpc);
-    let mut status = Status::with_error_details(code, error.to_string(), details);
+    let mut status = Status::with_error_details(code, error.text(), details);
     let metadata = status.metadata_mut();
     metadata.insert(CODE_KEY, MetadataValue::from_static(row.code));
     if let Some(after) = retry_after {

@@ -168,6 +168,9 @@ pub(super) async fn result(
 ) -> Result<Response, ApiError> {
     let text = |name: header::HeaderName| headers.get(name).and_then(|value| value.to_str().ok());
     let job = service.job(&caller, id).await?;
+    if job.state == JobState::Expired {
+        return Err(ApiError::HasExpired(id));
+    }
     let accept = text(header::ACCEPT);
     let wants_archive = accept.is_some_and(|accept| accept.contains("application/zip"));
     if dense::is_dense(&job) && !wants_archive {

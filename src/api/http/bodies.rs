@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use axum::extract::multipart::{Field, Multipart, MultipartError};
 use axum::extract::{FromRequest, Request};
-use axum::http::header;
+use axum::http::{HeaderValue, header};
 use futures_util::stream::{self, Stream, StreamExt, TryStreamExt};
 use tokio::task::coop::consume_budget;
 use tokio::time::timeout;
@@ -21,6 +21,9 @@ use crate::api::uploads::Room;
 use crate::formats;
 use crate::job::JobOptions;
 use crate::payload::StoredCloud;
+
+/// What a body has to be.
+const MULTIPART: &[u8] = b"multipart/form-data";
 
 /// The longest `options` part.
 const MAX_OPTIONS: usize = 64 << 10;
@@ -189,7 +192,11 @@ fn check_head(service: &Service, caller: &Caller, request: &Request) -> Result<(
         return Err(ApiError::UnsupportedMedia(text.to_owned()));
     }
     let media = headers.get(header::CONTENT_TYPE);
-    if !media.is_some_and(|media| media.as_bytes().starts_with(b"multipart/form-data")) {
+    let is_form = |media: &HeaderValue| {
+        let kind = media.as_bytes().get(..MULTIPART.len());
+        kind.is_some_and(|kind| kind.eq_ignore_ascii_case(MULTIPART))
+    };
+    if !media.is_some_and(is_form) {
         return Err(not_multipart());
     }
     let length = headers.get(header::CONTENT_LENGTH);

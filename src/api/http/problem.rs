@@ -43,7 +43,7 @@ impl From<ApiError> for Problem {
             r#type: format!("urn:fnsf:problem:{}", row.code),
             title: status.canonical_reason().unwrap_or("Error"),
             status: row.http,
-            detail: error.to_string(),
+            detail: error.text(),
             code: row.code,
             retryable: row.retryable,
             retry_after_seconds: error.retry_after().map(|after| after.as_secs()),

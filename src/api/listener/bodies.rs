@@ -21,13 +21,13 @@ const PIECE: usize = 64 << 10;
 /// After an error comes the end, whatever the source says: HTTP/2 repeats an error at every poll.
 /// Each frame costs the task of its budget, so that a source that is always ready cannot keep
 /// timers and other tasks from running.
-pub(super) struct RequestBody<B> {
+pub(in crate::api) struct RequestBody<B> {
     body: B,
     ended: bool,
 }
 
 impl<B> RequestBody<B> {
-    pub(super) fn new(body: B) -> Self {
+    pub(in crate::api) fn new(body: B) -> Self {
         Self { body, ended: false }
     }
 }
@@ -132,21 +132,7 @@ mod tests {
 
     use super::super::connections::Connections;
     use super::*;
-
-    /// A source that says the same for ever, and is always ready.
-    struct ForEver<E>(Result<Bytes, E>);
-
-    impl<E: Clone + Unpin> Body for ForEver<E> {
-        type Data = Bytes;
-        type Error = E;
-
-        fn poll_frame(
-            self: Pin<&mut Self>,
-            _: &mut Context<'_>,
-        ) -> Poll<Option<Result<Frame<Bytes>, E>>> {
-            Poll::Ready(Some(self.0.clone().map(Frame::data)))
-        }
-    }
+    use crate::api::tests::ForEver;
 
     #[tokio::test]
     async fn a_body_ends_after_its_first_error_and_a_ready_one_lets_timers_run() {

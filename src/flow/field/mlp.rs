@@ -135,6 +135,11 @@ impl Parameters {
     }
 }
 
+/// How far a cloud's mean may lie from the origin, along an axis, for coordinates to be taken as they
+/// are, metres. In a sensor's frame it is tens of metres; from a kilometre away the network's first
+/// flows are metres, and no step is small enough to take them back.
+const FAR_MEAN_M: f32 = 200.0;
+
 /// Points' coordinates to network inputs.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Conditioning {
@@ -144,21 +149,23 @@ pub(crate) struct Conditioning {
 
 impl Conditioning {
     pub(crate) fn new(points: &[Point], inputs: Inputs) -> Self {
+        let mean = |axis: usize| {
+            let sum: f64 = points.iter().map(|point| f64::from(point[axis])).sum();
+            (sum / points.len().max(1) as f64) as f32
+        };
+        let mean = [mean(0), mean(1), mean(2)];
         match inputs {
-            Inputs::Raw => Self {
-                center: [0.0; 3],
-                scale: 1.0,
-            },
-            Inputs::Centered { scale_m } => {
-                let mean = |axis: usize| {
-                    let sum: f64 = points.iter().map(|point| f64::from(point[axis])).sum();
-                    (sum / points.len().max(1) as f64) as f32
-                };
+            Inputs::Raw => {
+                let is_far = mean.iter().any(|axis| axis.abs() > FAR_MEAN_M);
                 Self {
-                    center: [mean(0), mean(1), mean(2)],
-                    scale: 1.0 / scale_m,
+                    center: if is_far { mean } else { [0.0; 3] },
+                    scale: 1.0,
                 }
             }
+            Inputs::Centered { scale_m } => Self {
+                center: mean,
+                scale: 1.0 / scale_m,
+            },
         }
     }
 

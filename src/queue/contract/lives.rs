@@ -263,3 +263,81 @@ pub(crate) async fn lists_are_latest_first_in_pages_and_of_one_tenant(stand: &mu
     assert_eq!(page(Some(State::Cancelled), None, 9).await, [ids[1]]);
     assert_eq!(page(Some(State::Queued), None, 9).await.len(), 4);
 }
+
+pub(crate) async fn a_job_that_was_given_up_frees_its_key_at_once_and_is_promised_to_nobody(
+    stand: &mut impl Stand,
+) {
+    let (queue, _) = stand.open(QueueOptions::default());
+    let with_key = || Submission {
+        durable: false,
+        idempotency: Some(Idempotency {
+            key: "key".to_owned(),
+            fingerprint: [7; 32],
+        }),
+        ..submission("a")
+    };
+    let first = submit(&queue, with_key()).await;
+    let held = lease(&queue).await;
+    // Its worker has not heard of it yet: it still runs.
+    queue.abandon(first.id).await.expect("known");
+    assert_eq!(state(&queue, &first).await, State::Running);
+    let promised = queue.make_durable(first.id).await;
+    assert_eq!(promised.err(), Some(QueueError::GivenUp));
+    let second = submit(&queue, with_key()).await;
+    assert_ne!(second.id, first.id);
+    assert_eq!(
+        finish(&queue, &held.job, done()).await,
+        Committed::Yes(State::Cancelled)
+    );
+    let promised = queue.make_durable(first.id).await;
+    assert_eq!(promised.err(), Some(QueueError::GivenUp));
+    match queue.submit(with_key()).await.expect("accepted") {
+        Submitted::Known(job) => assert_eq!(job.id, second.id),
+        Submitted::New(job) => panic!("{} is new", job.id),
+    }
+    let promised = queue
+        .make_durable(second.id)
+        .await
+        .expect("nobody has given it up");
+    assert!(promised.durable);
+}
+
+pub(crate) async fn a_job_whose_result_is_lost_can_be_asked_for_again(stand: &mut impl Stand) {
+    let (queue, _) = stand.open(QueueOptions::default());
+    let job = submit(
+        &queue,
+        Submission {
+            durable: false,
+            ..submission("a")
+        },
+    )
+    .await;
+    let held = lease(&queue).await;
+    finish(&queue, &held.job, done()).await;
+    let refused = queue.requeue(job.id, false).await;
+    assert!(matches!(
+        refused,
+        Err(QueueError::NotOver(State::Succeeded))
+    ));
+    let again = queue.requeue(job.id, true).await.expect("it is lost");
+    assert!(again.durable && again.state == State::Queued);
+    let held = lease(&queue).await;
+    assert_eq!((held.job.id, held.job.attempt), (job.id, 2));
+    let done = finish(&queue, &held.job, done()).await;
+    assert_eq!(done, Committed::Yes(State::Succeeded));
+}
+
+pub(crate) async fn a_probe_leaves_nothing(stand: &mut impl Stand) {
+    let (queue, mut heard) = stand.open(QueueOptions::default());
+    queue.probe().await.expect("it can be written");
+    nothing_is_ready(&queue).await;
+    assert_eq!(queue.backlog().queued().jobs, 0);
+    let listed = queue.list(Filter {
+        tenant: Tenant::default(),
+        state: None,
+        before: None,
+        limit: 10,
+    });
+    assert!(listed.await.expect("a list").is_empty());
+    assert!(heard.try_recv().is_err());
+}

@@ -7,8 +7,9 @@ use rusqlite::params;
 use tokio::sync::mpsc;
 
 use super::{SqliteQueue, leases, schema, sweep, turns};
-use crate::queue::contract::{Stand, queue_contract};
-use crate::queue::{Event, Queue, QueueError, QueueOptions};
+use crate::job::DeviceKind;
+use crate::queue::contract::{Stand, queue_contract, submission};
+use crate::queue::{Event, Queue, QueueError, QueueOptions, Signal};
 
 /// A folder in which one queue after the other is opened.
 struct Folder(tempfile::TempDir);
@@ -153,7 +154,7 @@ async fn submissions_at_the_same_time_share_commits_and_all_stand() {
     for _ in 0..JOBS {
         let queue = Arc::clone(&queue);
         submissions.spawn(async move {
-            let submission = crate::queue::contract::submission("a");
+            let submission = submission("a");
             queue.submit(submission).await
         });
     }
@@ -164,4 +165,60 @@ async fn submissions_at_the_same_time_share_commits_and_all_stand() {
     drop(queue);
     let (queue, _events) = folder.open(QueueOptions::default());
     assert_eq!(queue.backlog().queued().jobs, JOBS as u64);
+}
+
+#[tokio::test]
+async fn a_lease_ends_by_signs_of_life_and_not_by_the_clock() {
+    let mut folder = Folder::new();
+    let options = QueueOptions {
+        lease: Duration::from_secs(3),
+        ..QueueOptions::default()
+    };
+    let (queue, mut heard) = folder.open(options);
+    queue.submit(submission("a")).await.expect("accepted");
+    let held = queue
+        .lease("worker", DeviceKind::Cpu)
+        .await
+        .expect("a lease");
+    // As if the clock had been set a day forward, again and again.
+    let path = folder.0.path().join("queue.sqlite3");
+    let clock = schema::open_writer(&path).expect("the file");
+    for _ in 0..4 {
+        clock
+            .execute("UPDATE jobs SET due = 1 WHERE state = 1", [])
+            .expect("set");
+        tokio::time::sleep(Duration::from_millis(600)).await;
+        assert_eq!(held.pulse.beat(None), Signal::Continue);
+    }
+    let due: i64 = clock
+        .query_row("SELECT due FROM jobs", [], |row| row.get(0))
+        .expect("a row");
+    assert!(due > 1, "it was looked at");
+    // Silence ends it all the same.
+    let silent = async {
+        while held.pulse.signal() != Signal::Lost {
+            tokio::time::sleep(Duration::from_millis(20)).await
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(20), silent)
+        .await
+        .expect("in time");
+    let mut expired = 0;
+    while let Ok(event) = heard.try_recv() {
+        expired += usize::from(matches!(event, Event::LeaseExpired(_)));
+    }
+    assert_eq!(expired, 1);
+}
+
+#[tokio::test]
+async fn a_queue_says_when_its_thread_has_ended() {
+    let (events, _heard) = mpsc::unbounded_channel();
+    let folder = Folder::new();
+    let queue = SqliteQueue::open(folder.0.path(), QueueOptions::default(), events);
+    let queue = queue.expect("a queue");
+    let ended = queue.shared.ended.clone();
+    assert!(!ended.is_cancelled());
+    drop(queue);
+    let ended = tokio::time::timeout(Duration::from_secs(20), ended.cancelled());
+    ended.await.expect("in time");
 }

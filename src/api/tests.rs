@@ -1,0 +1,159 @@
+//! Every reader of a body or stream, driven by sources that never end.
+
+use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::mpsc::channel;
+use std::task::{Context, Poll};
+use std::thread;
+use std::time::Duration;
+
+use axum::body::Body as AnyBody;
+use axum::extract::Request;
+use bytes::Bytes;
+use http_body_util::BodyExt;
+use hyper::body::{Body, Frame};
+use tokio::sync::mpsc;
+use tower::ServiceExt;
+
+use super::listener::RequestBody;
+use super::{
+    Admission, AdmissionLimits, Hosts, Keys, Parts, Service, ServiceLimits, public_router,
+};
+use crate::cost::{CostModel, Lanes};
+use crate::metrics::Metrics;
+use crate::queue::{Queue, QueueOptions, SqliteQueue};
+use crate::storage::Blobs;
+
+/// Until a reader that keeps its thread for itself is taken for one that spins.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// What a body or stream may be silent for; nothing here is.
+const A_MOMENT: Duration = Duration::from_millis(300);
+
+/// A source that says the same for ever, and is always ready.
+pub(super) struct ForEver<E>(pub(super) Result<Bytes, E>);
+
+impl<E: Clone + Unpin> Body for ForEver<E> {
+    type Data = Bytes;
+    type Error = E;
+
+    fn poll_frame(
+        self: Pin<&mut Self>,
+        _: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, E>>> {
+        Poll::Ready(Some(self.0.clone().map(Frame::data)))
+    }
+}
+
+fn service(folder: &std::path::Path) -> Arc<Service> {
+    let (events, _) = mpsc::unbounded_channel();
+    let queue = SqliteQueue::open(folder, QueueOptions::default(), events).expect("a queue");
+    let queue: Arc<dyn Queue> = Arc::new(queue);
+    let cost = Arc::new(CostModel::new(Lanes { cpu: 1, gpu: 0 }));
+    let long = Duration::from_secs(3600);
+    let limits = AdmissionLimits {
+        max_points: 1000,
+        max_pair_bytes: 1 << 30,
+        max_wait: long,
+        max_queue: long,
+        max_tenant_queue: long,
+    };
+    Arc::new(Service::new(Parts {
+        admission: Admission::new(limits, Arc::clone(&queue), cost),
+        queue,
+        blobs: Blobs::open(&folder.join("blobs")).expect("a store"),
+        metrics: Arc::new(Metrics::new(&["cpu"])),
+        keys: Keys::default(),
+        hosts: Hosts(None),
+        limits: ServiceLimits {
+            max_upload_bytes: 1 << 20,
+            max_uploads_bytes: 1 << 20,
+            max_answers_bytes: 1 << 20,
+            min_free_bytes: 0,
+            min_free_inodes: 0,
+            max_frames: 10,
+            body_idle: A_MOMENT,
+            sequence_ahead: 1,
+        },
+    }))
+}
+
+/// A source as it is, and as the port hands it on.
+fn sources(port: bool) -> Vec<(&'static str, AnyBody)> {
+    let piece = |bytes: &'static [u8]| ForEver(Ok::<_, &'static str>(Bytes::from_static(bytes)));
+    let broken = || ForEver(Err::<Bytes, _>("reset"));
+    if !port {
+        // The rest are always ready, and so the port's to slow down.
+        return vec![("errors", AnyBody::new(broken()))];
+    }
+    vec![
+        ("errors", AnyBody::new(RequestBody::new(broken()))),
+        ("nothing", AnyBody::new(RequestBody::new(piece(b"")))),
+        ("zeros", AnyBody::new(RequestBody::new(piece(&[0; 5])))),
+        (
+            "a boundary",
+            AnyBody::new(RequestBody::new(piece(b"--x\r\n"))),
+        ),
+        ("text", AnyBody::new(RequestBody::new(piece(&[b'y'; 4096])))),
+    ]
+}
+
+/// One request; says whether its answer came.
+async fn asked(service: &Arc<Service>, path: &str, media: &str, body: AnyBody) -> bool {
+    let request = Request::post(path)
+        .version(axum::http::Version::HTTP_2)
+        .header("content-type", media)
+        .header("te", "trailers")
+        .body(body)
+        .expect("a request");
+    let answered = async {
+        let answer = public_router(service).oneshot(request).await;
+        let Ok(answer) = answer;
+        answer.into_body().collect().await.is_ok()
+    };
+    // On one thread: who spins keeps the time from passing, and is found by the thread outside.
+    tokio::time::timeout(A_MOMENT * 10, answered).await.is_ok()
+}
+
+#[test]
+fn no_reader_of_a_body_or_stream_keeps_its_thread_for_itself() {
+    const FORM: &str = "multipart/form-data; boundary=x";
+    let routes = [
+        ("/v1/flow", FORM),
+        ("/v1/jobs", FORM),
+        ("/v1/sequences", FORM),
+        ("/v1/flow", "a/b"),
+        ("/v1/jobs", "a/b"),
+        ("/v1/sequences", "a/b"),
+        ("/nowhere", "a/b"),
+        ("/fnsf.v1.SceneFlow/EstimateFlow", "application/grpc"),
+        ("/fnsf.v1.SceneFlow/EstimateSequence", "application/grpc"),
+        ("/fnsf.v1.SceneFlow/SubmitJob", "application/grpc"),
+        ("/fnsf.v1.SceneFlow/GetJob", "application/grpc"),
+        ("/grpc.health.v1.Health/Check", "application/grpc"),
+    ];
+    for (path, media) in routes {
+        for port in [false, true] {
+            for (source, body) in sources(port) {
+                let (done, heard) = channel();
+                thread::spawn(move || {
+                    let folder = tempfile::tempdir().expect("a folder");
+                    let runtime = tokio::runtime::Builder::new_current_thread()
+                        .enable_all()
+                        .build()
+                        .expect("a runtime");
+                    let answered = runtime.block_on(async {
+                        let service = service(folder.path());
+                        asked(&service, path, media, body).await
+                    });
+                    runtime.shutdown_background();
+                    let _who_waits_may_have_gone = done.send(answered);
+                });
+                let answered = heard.recv_timeout(PATIENCE);
+                let answered = answered.unwrap_or_else(|_| panic!("{path} spins on {source}"));
+                // A stream of messages may go on for ever; an error is the end of anything.
+                assert!(answered || source != "errors", "{path} does not end");
+            }
+        }
+    }
+}
