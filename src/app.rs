@@ -30,7 +30,7 @@ use crate::job::{DeviceKind, Priority, Tenant};
 use crate::metrics::Metrics;
 use crate::queue::{Queue, QueueOptions, SqliteQueue};
 use crate::storage::Blobs;
-use crate::worker::{Company, Drain, Worker, WorkerOptions};
+use crate::worker::{Company, Drain, StoreProbe, Worker, WorkerOptions};
 
 /// A server that runs.
 pub struct App {
@@ -79,11 +79,18 @@ impl App {
         let blobs = Blobs::open(&config.data_dir.join("blobs"))
             .with_context(|| format!("cannot use {}", config.data_dir.display()))?;
         check_queue_is_there(&config, &blobs)?;
+        let may_be_new = blobs.is_empty()?;
         let queue = SqliteQueue::open(&config.data_dir, queue_options(&config.queue), events)
             .with_context(|| format!("cannot open the queue in {}", config.data_dir.display()))?;
         let queue: Arc<dyn Queue> = Arc::new(queue);
+        check_identity(queue.as_ref(), &blobs, may_be_new, &config).await?;
         warn_of_stranded_jobs(queue.as_ref(), lanes);
         let store_health = Arc::new(StoreHealth::default());
+        let store = Arc::new(StoreProbe::new(
+            Arc::clone(&queue),
+            blobs.clone(),
+            Arc::clone(&store_health),
+        ));
 
         let mut devices = Vec::new();
         for device in pool.devices {
@@ -107,7 +114,7 @@ impl App {
                 },
                 drain: workers_drain.clone(),
                 company: Arc::clone(&company),
-                store_health: Arc::clone(&store_health),
+                store: Arc::clone(&store),
             };
             workers.spawn(worker.run());
         }
@@ -139,7 +146,7 @@ impl App {
             &metrics,
             &devices,
             heard,
-            (&store_health, &runtime),
+            (&store, &runtime),
         );
         let tls = match &config.tls {
             None => None,
@@ -287,6 +294,28 @@ fn check_queue_is_there(config: &Config, blobs: &Blobs) -> anyhow::Result<()> {
         file.display(),
         config.data_dir.join("blobs").display()
     ))
+}
+
+/// Refuses payloads that are not the queue's: those of another one, or an empty folder where a volume
+/// should be. A queue and a store that are both new are made for each other.
+async fn check_identity(
+    queue: &dyn Queue,
+    blobs: &Blobs,
+    may_be_new: bool,
+    config: &Config,
+) -> anyhow::Result<()> {
+    let folder = config.data_dir.join("blobs");
+    let found = blobs.identity();
+    let found = found.with_context(|| format!("cannot use {}", folder.display()))?;
+    match found {
+        Some(identity) if identity == queue.identity() => Ok(()),
+        None if may_be_new && queue.is_empty().await? => Ok(blobs.set_identity(queue.identity())?),
+        _ => Err(anyhow!(
+            "the payloads in {} are not those of the queue's jobs: is their volume mounted? put them \
+             back, or name another data_dir",
+            folder.display()
+        )),
+    }
 }
 
 /// Jobs of an earlier start may wait for a kind of device that this one does not have: they would

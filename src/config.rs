@@ -8,6 +8,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use figment::Figment;
+use figment::error::Kind;
 use figment::providers::{Env, Format, Serialized, Toml};
 use serde::de::Visitor;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -341,7 +342,7 @@ pub enum ConfigError {
     },
     /// A key is unknown, or a value is not what it should be.
     #[error("{0}")]
-    Value(Box<figment::Error>),
+    Value(String),
     /// Values that do not go together.
     #[error("{0}")]
     Together(String),
@@ -371,7 +372,7 @@ impl Config {
                     reason: format!("line {line}: {}", error.message()),
                 }
             })?;
-            figment = figment.merge(Toml::string(&text));
+            figment = figment.merge(Toml::file_exact(path));
         }
         let mut variables = Env::prefixed(PREFIX).split("__");
         if let Ok(key) = std::env::var(format!("{PREFIX}{API_KEY}")) {
@@ -383,7 +384,7 @@ impl Config {
             .merge(variables)
             .merge(Serialized::defaults(flags))
             .extract()
-            .map_err(|error| ConfigError::Value(Box::new(error)))?;
+            .map_err(|error| ConfigError::Value(wrong_values(error)))?;
         config.check()?;
         Ok(config)
     }
@@ -526,8 +527,37 @@ impl Config {
     /// # Errors
     /// Where a value has no TOML form.
     pub fn to_toml(&self) -> Result<String, ConfigError> {
-        toml::to_string_pretty(self).map_err(|error| ConfigError::Together(error.to_string()))
+        let mut shown = self.clone();
+        // It may hold a password.
+        if let Some(endpoint) = &mut shown.otlp_endpoint
+            && let Some((scheme, rest)) = endpoint.split_once("://")
+            && let Some((_, host)) = rest.rsplit_once('@')
+        {
+            *endpoint = format!("{scheme}://***@{host}");
+        }
+        toml::to_string_pretty(&shown).map_err(|error| ConfigError::Together(error.to_string()))
     }
+}
+
+/// What is wrong, key by key. What was found in a key's place is never said: it may be the key.
+fn wrong_values(error: figment::Error) -> String {
+    const SECRET: [&str; 3] = ["api_key", "keys", "tls"];
+    let said = error.into_iter().map(|mut error| {
+        let is_secret = error.path.first();
+        if !is_secret.is_some_and(|first| SECRET.contains(&first.as_str())) {
+            return error.to_string();
+        }
+        let needed = match &error.kind {
+            Kind::InvalidType(_, needed) | Kind::InvalidValue(_, needed) => needed.clone(),
+            Kind::UnknownVariant(_, known) => format!("one of {}", known.join(", ")),
+            _ => return error.to_string(),
+        };
+        let path = error.path.join(".");
+        let source = error.metadata.take();
+        let source = source.map_or(String::new(), |source| format!(", in {}", source.name));
+        format!("{path} is something else than {needed}{source}")
+    });
+    said.collect::<Vec<_>>().join("; ")
 }
 
 #[cfg(test)]
@@ -610,6 +640,10 @@ mod tests {
             "api_key = \"1234567890123456\" x",
             "api_key = 1234567890123456x",
             "[[keys]]\ntenant = \"a\"\nrole = \"read\"\nkey = 1234567890123456",
+            "[[keys]]\ntenant = \"a\"\nrole = \"1234567890123456\"\nkey = \"read\"",
+            "keys = \"1234567890123456\"",
+            "keys = [\"1234567890123456\"]",
+            "tls = \"1234567890123456\"",
         ] {
             let error = load(text).expect_err(text);
             let said = format!("{error} {error:?}");
@@ -619,10 +653,13 @@ mod tests {
 
     #[test]
     fn secrets_are_read_and_never_shown() {
-        let config = load("api_key = \"a very long secret\"").expect("a configuration");
+        let config = "api_key = \"a very long secret\"\notlp_endpoint = \"http://a:secret@b:1\"";
+        let config = load(config).expect("a configuration");
         let key = config.api_key.clone().expect("a key");
         assert_eq!(key.reveal(), "a very long secret");
-        let shown = format!("{config:?}{}", config.to_toml().expect("TOML"));
+        let shown = config.to_toml().expect("TOML");
+        let debug = format!("{:?} {:?}", config.api_key, config.keys);
+        let shown = format!("{debug}{shown}");
         assert!(
             !shown.contains("secret") && shown.contains("***"),
             "{shown}"

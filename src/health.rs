@@ -56,12 +56,14 @@ impl Heartbeat {
 #[derive(Debug)]
 pub struct StoreHealth {
     trouble: watch::Sender<Option<String>>,
+    needed: AtomicU64,
 }
 
 impl Default for StoreHealth {
     fn default() -> Self {
         Self {
             trouble: watch::Sender::new(None),
+            needed: AtomicU64::new(0),
         }
     }
 }
@@ -75,8 +77,19 @@ impl StoreHealth {
         }
     }
 
+    /// There was no room for so many bytes: without it the store does not work again.
+    pub fn needs(&self, bytes: u64) {
+        self.needed.fetch_max(bytes, Ordering::Relaxed);
+    }
+
+    /// Bytes that there has to be room for.
+    pub fn needed(&self) -> u64 {
+        self.needed.load(Ordering::Relaxed)
+    }
+
     /// A probe has written and read.
     pub fn works(&self) {
+        self.needed.store(0, Ordering::Relaxed);
         if self.trouble.send_replace(None).is_some() {
             tracing::info!("the store works again");
         }

@@ -7,6 +7,7 @@ mod company;
 mod dense;
 mod inputs;
 mod job_watch;
+mod probe;
 #[cfg(test)]
 mod tests;
 
@@ -20,13 +21,13 @@ use tokio_util::sync::CancellationToken;
 pub use self::company::Company;
 use self::company::Inside;
 use self::inputs::StoreError;
+pub use self::probe::StoreProbe;
 use crate::clock::Timestamp;
 use crate::cost::CostModel;
 use crate::engine::{Densification, Densified, EngineError, Health, Lane, Work};
 use crate::flow::backend::BackendError;
 use crate::flow::{Estimate, Field, FlowError, Point};
 use crate::formats::MAX_COORDINATE_M;
-use crate::health::StoreHealth;
 use crate::job::{DeviceKind, Job, JobError, JobProgress, Kind, Report};
 use crate::metrics::Metrics;
 use crate::payload::{StoredDense, StoredFlow};
@@ -81,7 +82,7 @@ pub struct Worker {
     /// All workers of the process, this one among them.
     pub company: Arc<Company>,
     /// Whether the store works: while it does not, no job is taken.
-    pub store_health: Arc<StoreHealth>,
+    pub store: Arc<StoreProbe>,
 }
 
 impl Worker {
@@ -104,7 +105,7 @@ impl Worker {
             tokio::select! {
                 biased;
                 () = self.drain.stop.cancelled() => break,
-                () = self.store_health.until_it_works() => {}
+                () = self.store.health().until_it_works() => {}
             }
             let mut inside = tokio::select! {
                 biased;
@@ -135,16 +136,16 @@ impl Worker {
                     };
                     drop(inside);
                     if let Some(before) = committing.take() {
-                        let _its_own_errors_are_logged = before.await;
+                        let _its_own_errors_are_logged = alive(&lease, before).await;
                     }
                     // The device goes on with the next job while this result reaches the disk.
                     let worker = self.clone();
                     committing = Some(tokio::spawn(async move {
-                        worker.commit(&lease, attempt).await;
+                        alive(&lease, worker.commit(&lease, attempt)).await;
                     }));
                 }
                 Err(QueueError::Closed) => break,
-                Err(error) => self.store_health.failed(&error),
+                Err(error) => self.store.health().failed(&error),
             }
         }
         if let Some(last) = committing {
@@ -213,9 +214,9 @@ impl Worker {
     )]
     async fn attempt(&self, lease: &Lease) -> Attempt {
         let job = &lease.job;
-        let (work, keeper, options) = match self.prepare(lease).await {
+        let (work, keeper, options) = match alive(lease, self.prepare(lease)).await {
             Ok(prepared) => prepared,
-            Err(error) => return self.unreadable(&error),
+            Err(error) => return Attempt::Ended(alive(lease, self.unreadable(&error)).await),
         };
         let began = Instant::now();
         let solved = self.lane.solve(work).await;
@@ -384,7 +385,7 @@ impl Worker {
                 ended => return ended,
             };
             tracing::warn!(%error, job = %job.id, "an outcome is not kept yet");
-            self.store_health.failed(&error);
+            self.store.health().failed(&error);
             tokio::select! {
                 () = self.drain.release.cancelled() => return Err(error),
                 () = tokio::time::sleep(pause) => {}
@@ -405,6 +406,7 @@ impl Worker {
             Ok(packed) => packed,
             Err(error) => return Outcome::Failed(failure("store", &error, true)),
         };
+        let size = result.len() + field.as_ref().map_or(0, Vec::len);
         let mut blobs = vec![(Blob::Result(job.attempt), result)];
         blobs.extend(field.map(|field| (Blob::Field(job.attempt), field)));
         let writing = blobs
@@ -419,9 +421,7 @@ impl Worker {
             },
             (Err(error), _) => {
                 tracing::error!(%error, job = %job.id, "a result was not kept");
-                // Writing is the machine's part: it is done again when that works.
-                self.store_health.failed(&error);
-                Outcome::Released
+                self.store_failed(error.fault(), size as u64, &error).await
             }
             (_, Err(error)) => Outcome::Failed(failure("store", &error, true)),
         }
@@ -512,20 +512,50 @@ fn out_of_range(flow: &[Point]) -> Option<JobError> {
 }
 
 impl Worker {
-    /// What becomes of a job whose payload cannot be read: it waits for the machine, or fails where
-    /// what it needs is not there or damaged.
-    fn unreadable(&self, error: &StoreError) -> Attempt {
+    /// What becomes of a job whose payload cannot be read.
+    async fn unreadable(&self, error: &StoreError) -> Outcome {
         tracing::error!(%error, "the payload cannot be read");
-        let of_the_machine = match error {
-            StoreError::Blob(error) => error.fault() != Fault::Missing,
-            StoreError::Queue(error) => error.is_of_the_machine(),
-            _ => false,
+        let fault = match error {
+            StoreError::Blob(error) => error.fault(),
+            StoreError::Queue(error) if error.is_of_the_machine() => Fault::Machine,
+            _ => return Outcome::Failed(failure("store", error, false)),
         };
-        if of_the_machine {
-            self.store_health.failed(error);
-            return Attempt::Ended(Outcome::Released);
+        self.store_failed(fault, 0, error).await
+    }
+
+    /// What becomes of a job that the store has failed: it waits for the machine without blame where
+    /// the store fails everybody, and goes behind the others where it fails this one alone.
+    async fn store_failed(
+        &self,
+        fault: Fault,
+        needed: u64,
+        error: &(dyn std::error::Error + core::marker::Sync),
+    ) -> Outcome {
+        if fault == Fault::Full {
+            self.store.health().needs(needed);
         }
-        let may_come_back = matches!(error, StoreError::Blob(_) | StoreError::Queue(_));
-        Attempt::failed("store", error, may_come_back)
+        if !self.store.ask().await {
+            return Outcome::Released;
+        }
+        let error = failure("store", error, true);
+        match fault {
+            Fault::Missing => Outcome::Failed(error),
+            Fault::Full | Fault::Machine => Outcome::Delayed(error),
+        }
+    }
+}
+
+/// Gives signs of life for a job while it is in the store's hands and not a device's: the lease is
+/// there to notice a device that hangs.
+async fn alive<T>(lease: &Lease, work: impl Future<Output = T>) -> T {
+    let mut work = std::pin::pin!(work);
+    let mut ticks = tokio::time::interval(LOOK);
+    loop {
+        tokio::select! {
+            done = &mut work => return done,
+            _ = ticks.tick() => {
+                lease.pulse.beat(None);
+            }
+        }
     }
 }

@@ -1,16 +1,21 @@
 //! Room for the answers that are being made and sent, and the last ones that were made.
 //!
-//! A client may read as slowly as its connection is allowed to; until it has, its answer is held.
+//! A client may read as slowly as it likes while nobody else needs the room that its answer takes;
+//! then whoever takes theirs most slowly has to go, and can come back with a range.
 
-use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::collections::{HashMap, VecDeque};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::time::{Duration, Instant};
 
+use axum::body::Body;
 use bytes::Bytes;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::sync::CancellationToken;
 
 use super::error::ApiError;
-use crate::job::JobId;
+use crate::job::{JobId, Tenant};
 
 /// The unit in which room is counted, bytes.
 const UNIT: usize = 1 << 10;
@@ -19,22 +24,75 @@ const UNIT: usize = 1 << 10;
 /// the same result.
 const KEPT: usize = 4;
 
+/// An answer that is younger than this is not ended for others, however slowly it is taken.
+const GRACE: Duration = Duration::from_secs(10);
+
+/// How often whoever waits for room looks again.
+const LOOK: Duration = Duration::from_millis(100);
+
+/// What is handed to a connection at a time, bytes.
+const PIECE: usize = 64 << 10;
+
 /// Which answer: the job, its attempt, and the format's ending.
 pub(super) type Name = (JobId, u32, &'static str);
+
+/// How much all answers may take, and for how long one waits.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct AnswerLimits {
+    /// Bytes of all answers together.
+    pub(super) all: u64,
+    /// Whether there are several tenants: then one may take half of it.
+    pub(super) shared: bool,
+    /// How long an answer waits for room.
+    pub(super) patience: Duration,
+    /// Time after which one that has to make room may be ended.
+    pub(super) grace: Duration,
+}
+
+impl AnswerLimits {
+    pub(super) fn new(all: u64, shared: bool) -> Self {
+        Self {
+            all,
+            shared,
+            patience: Duration::from_secs(5),
+            grace: GRACE,
+        }
+    }
+}
 
 /// Room for all answers.
 pub(super) struct Answers {
     units: usize,
-    patience: Duration,
+    limits: AnswerLimits,
     free: Arc<Semaphore>,
-    kept: Mutex<VecDeque<(Name, Bytes)>>,
+    held: Arc<Mutex<HashMap<Tenant, usize>>>,
+    rooms: Mutex<Vec<Weak<Taking>>>,
+    kept: Mutex<VecDeque<(Name, Encoded)>>,
 }
 
 /// Room for one answer, given back when it is dropped.
-#[derive(Debug)]
-pub(super) struct AnswerRoom(OwnedSemaphorePermit);
+pub(super) struct AnswerRoom {
+    permit: OwnedSemaphorePermit,
+    tenant: Tenant,
+    held: Arc<Mutex<HashMap<Tenant, usize>>>,
+    taking: Arc<Taking>,
+}
 
-/// Bytes and the room that they take, as long as any of them is held.
+/// How an answer is taken by its reader.
+pub(super) struct Taking {
+    tenant: Tenant,
+    since: Instant,
+    bytes: AtomicU64,
+    evicted: CancellationToken,
+}
+
+/// An answer in its format, and the room that it takes as long as any of it is held.
+#[derive(Clone)]
+pub(super) struct Encoded {
+    bytes: Bytes,
+    taking: Arc<Taking>,
+}
+
 struct Held {
     bytes: Vec<u8>,
     _room: AnswerRoom,
@@ -46,117 +104,331 @@ impl AsRef<[u8]> for Held {
     }
 }
 
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 impl Answers {
-    /// Room of `bytes`; an answer waits for others to be taken, but not longer than `patience`.
-    pub(super) fn new(bytes: u64, patience: Duration) -> Self {
-        let units = usize::try_from(bytes).unwrap_or(usize::MAX) / UNIT;
-        let units = units.clamp(1, u32::MAX as usize);
+    pub(super) fn new(limits: AnswerLimits) -> Self {
+        let units = usize::try_from(limits.all).unwrap_or(usize::MAX) / UNIT;
+        let units = units.clamp(2, u32::MAX as usize);
         Self {
             units,
-            patience,
+            limits,
             free: Arc::new(Semaphore::new(units)),
+            held: Arc::default(),
+            rooms: Mutex::default(),
             kept: Mutex::default(),
         }
     }
 
-    fn kept(&self) -> MutexGuard<'_, VecDeque<(Name, Bytes)>> {
-        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
+    /// Units that one tenant may have.
+    fn share(&self) -> usize {
+        if self.limits.shared {
+            self.units / 2
+        } else {
+            self.units
+        }
     }
 
-    /// Room for an answer that takes `bytes` while it is made; one that takes more than all has to
-    /// be alone.
+    /// Room for a tenant's answer that takes `bytes` while it is made; one that takes more than all
+    /// there may be has to be alone.
     ///
     /// # Errors
-    /// [`ApiError::ServerFull`] where others are not read in time.
-    pub(super) async fn room(&self, bytes: usize) -> Result<AnswerRoom, ApiError> {
-        let units = bytes.div_ceil(UNIT).clamp(1, self.units) as u32;
-        if let Ok(permit) = Arc::clone(&self.free).try_acquire_many_owned(units) {
-            return Ok(AnswerRoom(permit));
+    /// [`ApiError::ServerFull`] where others are not taken in time.
+    pub(super) async fn room(&self, tenant: &Tenant, bytes: usize) -> Result<AnswerRoom, ApiError> {
+        let units = bytes.div_ceil(UNIT).clamp(1, self.share());
+        let until = Instant::now() + self.limits.patience;
+        loop {
+            if let Some(room) = self.try_room(tenant, units) {
+                return Ok(room);
+            }
+            locked(&self.kept).clear();
+            if let Some(room) = self.try_room(tenant, units) {
+                return Ok(room);
+            }
+            let own = locked(&self.held).get(tenant).copied().unwrap_or(0);
+            let own_share = own + units > self.share();
+            self.end_the_slowest(own_share.then_some(tenant));
+            if Instant::now() >= until {
+                return Err(ApiError::ServerFull(Duration::from_secs(5)));
+            }
+            tokio::time::sleep(LOOK.min(self.limits.patience)).await;
         }
-        self.kept().clear();
-        let free = Arc::clone(&self.free).acquire_many_owned(units);
-        match tokio::time::timeout(self.patience, free).await {
-            Ok(Ok(permit)) => Ok(AnswerRoom(permit)),
-            _ => Err(ApiError::ServerFull(Duration::from_secs(5))),
+    }
+
+    fn try_room(&self, tenant: &Tenant, units: usize) -> Option<AnswerRoom> {
+        let mut held = locked(&self.held);
+        let own = held.get(tenant).copied().unwrap_or(0);
+        if own + units > self.share() {
+            return None;
+        }
+        let free = Arc::clone(&self.free);
+        let permit = free.try_acquire_many_owned(units as u32).ok()?;
+        *held.entry(tenant.clone()).or_default() += units;
+        let taking = Arc::new(Taking {
+            tenant: tenant.clone(),
+            since: Instant::now(),
+            bytes: AtomicU64::new(0),
+            evicted: CancellationToken::new(),
+        });
+        let mut rooms = locked(&self.rooms);
+        rooms.retain(|room| room.strong_count() > 0);
+        rooms.push(Arc::downgrade(&taking));
+        Some(AnswerRoom {
+            permit,
+            tenant: tenant.clone(),
+            held: Arc::clone(&self.held),
+            taking,
+        })
+    }
+
+    /// Ends the answer that is taken most slowly, of one tenant or of whoever holds most.
+    fn end_the_slowest(&self, of: Option<&Tenant>) {
+        let most = {
+            let held = locked(&self.held);
+            held.iter()
+                .max_by_key(|(_, units)| **units)
+                .map(|(tenant, _)| tenant.clone())
+        };
+        let Some(tenant) = of.cloned().or(most) else {
+            return;
+        };
+        let rooms: Vec<Arc<Taking>> = locked(&self.rooms)
+            .iter()
+            .filter_map(Weak::upgrade)
+            .collect();
+        let slow = rooms.iter().filter(|one| {
+            one.tenant == tenant
+                && one.since.elapsed() >= self.limits.grace
+                && !one.evicted.is_cancelled()
+        });
+        if let Some(slowest) = slow.min_by(|one, other| one.rate().total_cmp(&other.rate())) {
+            slowest.evicted.cancel();
         }
     }
 
     /// An answer that was made before.
-    pub(super) fn made(&self, name: &Name) -> Option<Bytes> {
-        let kept = self.kept();
+    pub(super) fn made(&self, name: &Name) -> Option<Encoded> {
+        let kept = locked(&self.kept);
         let found = kept.iter().find(|(known, _)| known == name);
-        found.map(|(_, bytes)| bytes.clone())
+        let usable = found.filter(|(_, made)| !made.taking.evicted.is_cancelled());
+        usable.map(|(_, made)| made.clone())
     }
 
     /// Keeps an answer for whoever asks for it next, in place of the oldest.
-    pub(super) fn keep(&self, name: Name, bytes: &Bytes) {
+    pub(super) fn keep(&self, name: Name, made: &Encoded) {
         let most = self.units / KEPT * UNIT;
-        if bytes.len() > most {
+        if made.bytes.len() > most {
             return;
         }
-        let mut kept = self.kept();
+        let mut kept = locked(&self.kept);
         kept.retain(|(known, _)| *known != name);
-        kept.push_back((name, bytes.clone()));
-        let mut all: usize = kept.iter().map(|(_, bytes)| bytes.len()).sum();
+        kept.push_back((name, made.clone()));
+        let mut all: usize = kept.iter().map(|(_, made)| made.bytes.len()).sum();
         while all > most
             && let Some((_, oldest)) = kept.pop_front()
         {
-            all -= oldest.len();
+            all -= oldest.bytes.len();
         }
     }
 }
 
+impl Taking {
+    /// Bytes a second that its reader has taken so far.
+    fn rate(&self) -> f64 {
+        let taken = self.bytes.load(Ordering::Relaxed) as f64;
+        taken / self.since.elapsed().as_secs_f64().max(1e-3)
+    }
+
+    /// So many bytes were taken.
+    pub(super) fn took(&self, bytes: usize) {
+        self.bytes.fetch_add(bytes as u64, Ordering::Relaxed);
+    }
+
+    /// Returns when it has to make room.
+    pub(super) async fn evicted(&self) {
+        self.evicted.cancelled().await;
+    }
+}
+
 impl AnswerRoom {
+    /// How its answer is taken.
+    pub(super) fn taking(&self) -> &Arc<Taking> {
+        &self.taking
+    }
+
     /// Gives back what an answer of `bytes` does not need.
     pub(super) fn shrink(&mut self, bytes: usize) {
         let needed = bytes.div_ceil(UNIT).max(1);
-        let spare = self.0.num_permits().saturating_sub(needed);
-        drop(self.0.split(spare));
+        let spare = self.permit.num_permits().saturating_sub(needed);
+        if spare > 0 {
+            drop(self.permit.split(spare));
+            self.give_back(spare);
+        }
+    }
+
+    fn give_back(&self, units: usize) {
+        let mut held = locked(&self.held);
+        if let Some(own) = held.get_mut(&self.tenant) {
+            *own = own.saturating_sub(units);
+            if *own == 0 {
+                held.remove(&self.tenant);
+            }
+        }
     }
 
     /// The bytes of an answer, which keep their room as long as any part of them is held.
-    pub(super) fn hold(mut self, bytes: Vec<u8>) -> Bytes {
+    pub(super) fn hold(mut self, bytes: Vec<u8>) -> Encoded {
         self.shrink(bytes.len());
-        Bytes::from_owner(Held { bytes, _room: self })
+        let taking = Arc::clone(&self.taking);
+        Encoded {
+            bytes: Bytes::from_owner(Held { bytes, _room: self }),
+            taking,
+        }
+    }
+}
+
+impl Drop for AnswerRoom {
+    fn drop(&mut self) {
+        self.give_back(self.permit.num_permits());
+    }
+}
+
+impl Encoded {
+    /// Its bytes.
+    pub(super) fn len(&self) -> usize {
+        self.bytes.len()
+    }
+
+    /// Its bytes, for whoever writes them on piece by piece.
+    pub(super) fn bytes(&self) -> &Bytes {
+        &self.bytes
+    }
+
+    /// A part of it.
+    pub(super) fn slice(&self, range: std::ops::Range<usize>) -> Self {
+        Self {
+            bytes: self.bytes.slice(range),
+            taking: Arc::clone(&self.taking),
+        }
+    }
+
+    /// A body that hands it on in pieces, and lets go of all of it when it has to make room.
+    pub(super) fn into_body(mut self) -> Body {
+        if self.bytes.len() <= PIECE {
+            return Body::from(self.bytes);
+        }
+        let (pieces, stream) = mpsc::channel::<Result<Bytes, std::io::Error>>(1);
+        tokio::spawn(async move {
+            while !self.bytes.is_empty() {
+                let piece = self.bytes.split_to(self.bytes.len().min(PIECE));
+                // A copy: what waits in the connection must not keep the whole.
+                let (length, piece) = (piece.len(), Bytes::copy_from_slice(&piece));
+                tokio::select! {
+                    sent = pieces.send(Ok(piece)) => match sent {
+                        Ok(()) => self.taking.took(length),
+                        Err(_) => return,
+                    },
+                    () = self.taking.evicted() => {
+                        tracing::info!("an answer that was taken slowly has made room for others");
+                        drop(self);
+                        let end = Err(std::io::ErrorKind::TimedOut.into());
+                        let _gone_is_fine = pieces.send(end).await;
+                        return;
+                    }
+                }
+            }
+        });
+        Body::from_stream(ReceiverStream::new(stream))
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use http_body_util::BodyExt;
+
     use super::*;
+
+    const KIB: usize = 1 << 10;
+
+    fn answers(shared: bool, grace: Duration) -> Answers {
+        Answers::new(AnswerLimits {
+            all: 1 << 20,
+            shared,
+            patience: Duration::from_millis(300),
+            grace,
+        })
+    }
+
+    fn tenant(name: &str) -> Tenant {
+        name.parse().expect("a good name")
+    }
 
     #[tokio::test]
     async fn answers_that_are_not_read_keep_the_next_one_out_until_they_are() {
-        let answers = Answers::new(1 << 20, Duration::from_millis(50));
-        let room = answers.room(1 << 20).await.expect("room");
-        let held = room.hold(vec![0; 600 << 10]);
+        let answers = answers(false, Duration::from_secs(3600));
+        let a = tenant("a");
+        let room = answers.room(&a, 1 << 20).await.expect("room");
+        let held = room.hold(vec![0; 600 * KIB]);
         let part = held.slice(5..10);
         drop(held);
-        let refused = answers.room(600 << 10).await;
+        let refused = answers.room(&a, 600 * KIB).await;
         assert!(matches!(refused, Err(ApiError::ServerFull(_))));
-        let small = answers.room(400 << 10).await.expect("what was spare");
+        let small = answers.room(&a, 400 * KIB).await.expect("what was spare");
         drop((part, small));
         // One that is larger than all is alone, and not refused for ever.
-        answers.room(1 << 30).await.expect("room");
+        drop(answers.room(&a, 1 << 30).await.expect("room"));
+        assert!(locked(&answers.held).is_empty());
+    }
+
+    #[tokio::test]
+    async fn the_slowest_reader_makes_room_and_the_whole_answer_with_it() {
+        let answers = answers(false, Duration::ZERO);
+        let a = tenant("a");
+        let made = |room: AnswerRoom| room.hold(vec![7; 400 * KIB]).into_body();
+        let mut slow = made(answers.room(&a, 400 * KIB).await.expect("room"));
+        let mut quick = made(answers.room(&a, 400 * KIB).await.expect("room"));
+        for _ in 0..5 {
+            quick.frame().await.expect("a piece").expect("no error");
+        }
+        slow.frame().await.expect("a piece").expect("no error");
+        let third = answers.room(&a, 400 * KIB).await.expect("room");
+        let rest = slow.collect().await;
+        assert!(rest.is_err(), "it was ended");
+        let rest = quick.collect().await.expect("it was not");
+        assert_eq!(rest.to_bytes().len(), 400 * KIB - 5 * PIECE);
+        drop(third);
+    }
+
+    #[tokio::test]
+    async fn a_tenant_cannot_take_all_room() {
+        let answers = answers(true, Duration::from_secs(3600));
+        let (a, b) = (tenant("a"), tenant("b"));
+        let held = answers.room(&a, 1 << 20).await.expect("half of it");
+        let refused = answers.room(&a, KIB).await;
+        assert!(matches!(refused, Err(ApiError::ServerFull(_))));
+        drop(answers.room(&b, 500 * KIB).await.expect("the other half"));
+        drop(held);
+        assert!(locked(&answers.held).is_empty());
     }
 
     #[tokio::test]
     async fn answers_are_kept_for_the_next_range_unless_room_is_needed() {
-        let answers = Answers::new(1 << 20, Duration::from_millis(50));
+        let answers = answers(false, GRACE);
+        let a = tenant("a");
         let name = |attempt| (JobId::fresh(), attempt, "npz");
         let [first, second, third, large] = [1, 2, 3, 4].map(name);
         for name in [first, second, third] {
-            let room = answers.room(100 << 10).await.expect("room");
-            answers.keep(name, &room.hold(vec![0; 100 << 10]));
+            let room = answers.room(&a, 100 * KIB).await.expect("room");
+            answers.keep(name, &room.hold(vec![0; 100 * KIB]));
         }
         assert!(answers.made(&first).is_none());
-        assert_eq!(
-            answers.made(&third).map(|bytes| bytes.len()),
-            Some(100 << 10)
-        );
-        let room = answers.room(1 << 20).await.expect("room");
+        let made = answers.made(&third).map(|made| made.len());
+        assert_eq!(made, Some(100 * KIB));
+        let room = answers.room(&a, 1 << 20).await.expect("room");
         assert!(answers.made(&third).is_none());
-        answers.keep(large, &room.hold(vec![0; 300 << 10]));
+        answers.keep(large, &room.hold(vec![0; 300 * KIB]));
         assert!(answers.made(&large).is_none());
     }
 }

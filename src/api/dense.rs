@@ -5,10 +5,8 @@
 use std::ops::Range;
 use std::sync::Arc;
 
-use bytes::Bytes;
-
 use super::admission::Admission;
-use super::answers::AnswerRoom;
+use super::answers::{AnswerRoom, Encoded};
 use super::codec;
 use super::error::ApiError;
 use super::service::{Service, lost_or};
@@ -159,7 +157,7 @@ impl Service {
         &self,
         job: &Job,
         format: DenseFormat,
-    ) -> Result<Bytes, ApiError> {
+    ) -> Result<Encoded, ApiError> {
         let known = DENSE_FORMATS.iter().find(|(known, ..)| *known == format);
         let (.., ending) = *known.unwrap_or(&DENSE_FORMATS[0]);
         let name = (job.id, job.attempt, ending);

@@ -30,6 +30,9 @@ pub enum ApiError {
     /// The body came too slowly.
     #[error("the request's body came too slowly")]
     TooSlow,
+    /// An answer was taken so slowly that it had to make room for others.
+    #[error("the answer was taken too slowly, and others needed its room: fetch the rest of it")]
+    TakenTooSlowly,
     /// No key, or one that is not known.
     #[error("a valid key is needed: send Authorization: Bearer KEY")]
     Unauthenticated,
@@ -142,13 +145,14 @@ const fn row(
 const LONGEST_TEXT: usize = 1024;
 
 /// All that the doors ever say.
-const TABLE: [Row; 30] = [
+const TABLE: [Row; 31] = [
     row("bad_request", 400, 3, false, Some("bad_input")),
     row("invalid_options", 400, 3, false, Some("bad_input")),
     row("bad_input", 422, 3, false, Some("bad_input")),
     row("too_large", 413, 3, false, Some("too_large")),
     row("no_device", 422, 9, false, Some("no_device")),
     row("too_slow", 408, 4, true, Some("too_slow")),
+    row("taken_too_slowly", 503, 14, true, Some("too_slow")),
     row("unauthenticated", 401, 16, false, Some("unauthorized")),
     row("forbidden", 403, 7, false, Some("unauthorized")),
     row("priority", 403, 7, false, Some("unauthorized")),
@@ -207,6 +211,7 @@ impl ApiError {
             Self::TooLarge(_) => "too_large",
             Self::NoDevice(_) => "no_device",
             Self::TooSlow => "too_slow",
+            Self::TakenTooSlowly => "taken_too_slowly",
             Self::Unauthenticated => "unauthenticated",
             Self::Forbidden => "forbidden",
             Self::Priority(_) => "priority",
@@ -360,6 +365,7 @@ mod tests {
             ApiError::TooLarge(text()),
             ApiError::NoDevice(DeviceKind::Gpu),
             ApiError::TooSlow,
+            ApiError::TakenTooSlowly,
             ApiError::Unauthenticated,
             ApiError::Forbidden,
             ApiError::Priority(Priority::Normal),

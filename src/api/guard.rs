@@ -3,7 +3,7 @@
 
 use std::any::Any;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::extract::{Request, State};
@@ -61,8 +61,11 @@ async fn check_key(
     let shown = request.headers().get(header::AUTHORIZATION);
     match service.caller(shown.and_then(|value| value.to_str().ok())) {
         Ok(caller) => {
-            if let Some(connection) = request.extensions().get::<Arc<Connection>>() {
-                connection.is_known(&caller.tenant);
+            let several = service.keys.has_several_tenants();
+            if let Some(connection) = request.extensions().get::<Arc<Connection>>()
+                && !connection.is_known(&caller.tenant, several)
+            {
+                return refused(&request, ApiError::TenantLimit(Duration::from_secs(1)));
             }
             request.extensions_mut().insert(caller);
         }

@@ -9,7 +9,7 @@ mod connections;
 mod opening;
 mod stall;
 
-use std::net::{IpAddr, SocketAddr};
+use std::net::SocketAddr;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -52,6 +52,9 @@ pub struct ListenOptions {
     pub write_timeout: Duration,
     /// Requests at a time on one HTTP/2 connection.
     pub max_streams: u32,
+    /// Bytes of all answers that are handed over and not taken, but for results, which have room of
+    /// their own.
+    pub max_answer_bytes: usize,
     /// Whether a connection has to show a good key: else it ends after two header timeouts.
     pub needs_key: bool,
 }
@@ -64,6 +67,7 @@ impl ListenOptions {
             header_timeout: Duration::from_secs(5),
             write_timeout: Duration::from_secs(10),
             max_streams: 8,
+            max_answer_bytes: 16 << 20,
             needs_key: false,
         }
     }
@@ -90,6 +94,7 @@ impl Default for ListenOptions {
             header_timeout: Duration::from_secs(15),
             write_timeout: Duration::from_secs(60),
             max_streams: 128,
+            max_answer_bytes: 256 << 20,
             needs_key: false,
         }
     }
@@ -109,6 +114,15 @@ const STREAM_WINDOW: u32 = 4 << 20;
 const CONNECTION_WINDOW: u32 = 16 << 20;
 const PING_INTERVAL: Duration = Duration::from_secs(30);
 const PING_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// Marks an answer whose body has room of its own.
+#[derive(Clone, Copy)]
+pub(super) struct HasRoom;
+
+/// Marks an answer that holds little and may wait for its reader: a stream whose client works on
+/// each message before it takes the next one.
+#[derive(Clone, Copy)]
+pub(super) struct MayWait;
 
 /// Time that a connection which has to make room may take for that.
 const EVICTION: Duration = Duration::from_millis(200);
@@ -217,7 +231,8 @@ impl Listener {
     pub async fn serve(self, router: Router, stop: CancellationToken) {
         const PAUSE: Duration = Duration::from_millis(50);
         let room = Arc::new(Semaphore::new(self.options.max_connections));
-        let table = Arc::new(Connections::default());
+        let table = Arc::new(Connections::new(self.options.max_connections));
+        let answers = Arc::new(Semaphore::new(self.options.max_answer_bytes));
         let mut connections = JoinSet::new();
         let mut beats = interval(HEARTBEAT);
         loop {
@@ -229,8 +244,8 @@ impl Listener {
                 accepted = self.listener.accept() => accepted,
                 _ = beats.tick() => continue,
             };
-            let (stream, address) = match accepted {
-                Ok((stream, address)) => (stream, address.ip()),
+            let stream = match accepted {
+                Ok((stream, _)) => stream,
                 Err(error) => {
                     // Out of file descriptors, mostly: those that are open will be closed.
                     tracing::warn!(%error, "a connection was not accepted");
@@ -238,18 +253,19 @@ impl Listener {
                     continue;
                 }
             };
-            let Some(permit) = room_for(&room, &table, address).await else {
+            let Some(permit) = room_for(&room, &table).await else {
                 tracing::debug!("too many connections");
                 continue;
             };
-            let entry = table.enter(address);
+            let entry = table.enter();
             let (router, stop) = (router.clone(), stop.clone());
             let (tls, options) = (self.tls.clone(), self.options.clone());
+            let answers = Arc::clone(&answers);
             let open = self.metrics.as_ref().map(|metrics| metrics.connection());
             connections.spawn(async move {
                 tokio::select! {
                     () = entry.connection.evicted() => tracing::debug!("a connection made room"),
-                    () = converse(stream, tls, &options, router, stop, &entry) => {}
+                    () = converse(stream, tls, &options, (router, answers), stop, &entry) => {}
                 }
                 drop((entry, permit, open));
             });
@@ -260,15 +276,11 @@ impl Listener {
 }
 
 /// A place for one more connection; one that is needed less may have to make it.
-async fn room_for(
-    room: &Arc<Semaphore>,
-    table: &Connections,
-    address: IpAddr,
-) -> Option<OwnedSemaphorePermit> {
+async fn room_for(room: &Arc<Semaphore>, table: &Connections) -> Option<OwnedSemaphorePermit> {
     if let Ok(permit) = Arc::clone(room).try_acquire_owned() {
         return Some(permit);
     }
-    if !table.make_room(address) {
+    if !table.make_room() {
         return None;
     }
     let made = timeout(EVICTION, Arc::clone(room).acquire_owned()).await;
@@ -279,7 +291,7 @@ async fn converse(
     stream: TcpStream,
     tls: Option<TlsAcceptor>,
     options: &ListenOptions,
-    router: Router,
+    served: Served,
     stop: CancellationToken,
     entry: &Entry,
 ) {
@@ -289,19 +301,22 @@ async fn converse(
     }
     let stream = Stall::new(stream, options.write_timeout);
     match tls {
-        None => answer(stream, options, router, stop, entry).await,
+        None => answer(stream, options, served, stop, entry).await,
         Some(tls) => match timeout(options.header_timeout, tls.accept(stream)).await {
-            Ok(Ok(stream)) => answer(stream, options, router, stop, entry).await,
+            Ok(Ok(stream)) => answer(stream, options, served, stop, entry).await,
             Ok(Err(error)) => tracing::debug!(%error, "a handshake failed"),
             Err(_) => tracing::debug!("a handshake took too long"),
         },
     }
 }
 
+/// What answers, and the room that answers have.
+type Served = (Router, Arc<Semaphore>);
+
 async fn answer<S>(
     stream: S,
     options: &ListenOptions,
-    router: Router,
+    (router, answers): Served,
     stop: CancellationToken,
     entry: &Entry,
 ) where
@@ -331,9 +346,17 @@ async fn answer<S>(
         let mut request = request.map(|body| Body::new(RequestBody::new(body)));
         request.extensions_mut().insert(Arc::clone(&peer));
         let answering = router.clone().oneshot(request);
+        let answers = Arc::clone(&answers);
         async move {
             let response = answering.await;
-            response.map(|response| response.map(|body| AnswerBody::new(body, open)))
+            response.map(|response| {
+                let has_room = response.extensions().get::<HasRoom>().is_some();
+                let room = (!has_room).then_some(answers);
+                if response.extensions().get::<MayWait>().is_some() {
+                    open.may_wait();
+                }
+                response.map(|body| AnswerBody::new(body, open, room))
+            })
         }
     });
     let stream = Opening::new(stream, options.header_timeout);

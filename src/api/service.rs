@@ -5,12 +5,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use bytes::Bytes;
 use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 
 use super::admission::{Admission, Asked, Promise};
-use super::answers::{AnswerRoom, Answers};
+use super::answers::{AnswerLimits, AnswerRoom, Answers, Encoded};
 use super::auth::{Caller, Keys};
 use super::codec::AnswerFormat;
 use super::dense::is_dense;
@@ -26,9 +25,6 @@ use crate::storage::{Blob, BlobError, Blobs, FreeSpace};
 
 /// Archives and clouds that are sent at a time.
 const MAX_ARCHIVES: usize = 16;
-
-/// How long an answer waits for room that others hold.
-const ANSWER_PATIENCE: Duration = Duration::from_secs(5);
 
 /// What a request may cost the doors.
 #[derive(Clone, Debug)]
@@ -97,7 +93,7 @@ pub struct Parts {
 }
 
 /// A flow that can be sent.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct Answer {
     /// Its job.
     pub job: Arc<Job>,
@@ -139,7 +135,8 @@ impl Service {
         let limits = &parts.limits;
         let all = limits.max_uploads_bytes;
         // One tenant of several leaves the others half.
-        let tenant = if parts.keys.has_several_tenants() {
+        let several = parts.keys.has_several_tenants();
+        let tenant = if several {
             (all / 2).max(limits.max_upload_bytes.min(all))
         } else {
             all
@@ -156,7 +153,7 @@ impl Service {
             blobs: parts.blobs,
             admission: parts.admission,
             uploads: Arc::new(Uploads::new(uploads, Arc::clone(&parts.metrics))),
-            answers: Answers::new(limits.max_answers_bytes, ANSWER_PATIENCE),
+            answers: Answers::new(AnswerLimits::new(limits.max_answers_bytes, several)),
             waiters: Arc::default(),
             metrics: parts.metrics,
             keys: parts.keys,
@@ -473,7 +470,9 @@ impl Service {
         let blob = Blob::Result(job.attempt);
         let size = self.blobs.size(job.id, blob).await;
         let size = size.map_err(|error| lost_or(job.id, error))?;
-        self.answers.room(size.saturating_mul(FACTOR)).await
+        self.answers
+            .room(&job.tenant, size.saturating_mul(FACTOR))
+            .await
     }
 
     /// How a pair's flow was found.
@@ -519,7 +518,7 @@ impl Service {
         &self,
         job: &Arc<Job>,
         format: AnswerFormat,
-    ) -> Result<Bytes, ApiError> {
+    ) -> Result<Encoded, ApiError> {
         let report = Self::report(job)?;
         let name = (job.id, job.attempt, format.ending());
         if let Some(made) = self.answers.made(&name) {

@@ -46,6 +46,7 @@ pub(super) struct Uploads {
 }
 
 struct Paused {
+    tenant: Tenant,
     since: Instant,
     end: CancellationToken,
 }
@@ -78,31 +79,19 @@ impl Uploads {
         }
     }
 
-    /// Waits for more of a stream for as long as it likes, unless others need the room that it
-    /// holds: then whoever has paused longest has to go, once it has paused for longer than a body
-    /// may be silent.
-    ///
-    /// # Errors
-    /// [`ApiError::TooSlow`].
-    pub(super) async fn pause<T>(&self, more: impl Future<Output = T>) -> Result<T, ApiError> {
-        let end = CancellationToken::new();
-        locked(&self.paused).push(Paused {
-            since: Instant::now(),
-            end: end.clone(),
-        });
-        let _over = Over(self, &end);
-        tokio::select! {
-            biased;
-            came = more => Ok(came),
-            () = end.cancelled() => Err(ApiError::TooSlow),
-        }
-    }
-
-    /// Ends the longest pause, if it is long enough.
-    fn end_a_pause(&self) {
+    /// Ends the longest pause, if it is long enough: of one tenant, or of whoever holds most.
+    fn end_a_pause(&self, of: Option<&Tenant>) {
+        let most = || {
+            let held = locked(&self.held);
+            let most = held.iter().max_by_key(|(_, units)| **units);
+            most.map(|(tenant, _)| tenant.clone())
+        };
+        let Some(tenant) = of.cloned().or_else(most) else {
+            return;
+        };
         let mut paused = locked(&self.paused);
-        let first = (0..paused.len()).min_by_key(|&place| paused[place].since);
-        if let Some(place) = first
+        let own = (0..paused.len()).filter(|&place| paused[place].tenant == tenant);
+        if let Some(place) = own.min_by_key(|&place| paused[place].since)
             && paused[place].since.elapsed() >= self.limits.idle
         {
             paused.swap_remove(place).end.cancel();
@@ -164,13 +153,15 @@ impl Room {
             let mut held = locked(&self.uploads.held);
             let of_tenant = held.entry(self.tenant.clone()).or_default();
             if (*of_tenant + more) * UNIT > limits.tenant {
+                drop(held);
+                self.uploads.end_a_pause(Some(&self.tenant));
                 return Err(full());
             }
             let free = Arc::clone(&self.uploads.free);
             let permit = free.try_acquire_many_owned(u32::try_from(more).unwrap_or(u32::MAX));
             let Ok(permit) = permit else {
                 drop(held);
-                self.uploads.end_a_pause();
+                self.uploads.end_a_pause(None);
                 return Err(full());
             };
             *of_tenant += more;
@@ -203,12 +194,37 @@ impl Room {
         came.map_err(|_| ApiError::TooSlow)
     }
 
-    /// Waits for more of a stream that may pause; see [`Uploads::pause`].
+    /// Bytes that it holds.
+    pub(super) fn bytes(&self) -> u64 {
+        self.units() * UNIT
+    }
+
+    /// Waits for more of a stream for as long as it likes, unless others need the room that it
+    /// holds, `besides` this one's bytes: then the tenant's longest pause has to end, once it is
+    /// longer than a body may be silent. Who holds nothing is in nobody's way.
     ///
     /// # Errors
     /// [`ApiError::TooSlow`].
-    pub(super) async fn pause<T>(&self, more: impl Future<Output = T>) -> Result<T, ApiError> {
-        self.uploads.pause(more).await
+    pub(super) async fn pause<T>(
+        &self,
+        besides: u64,
+        more: impl Future<Output = T>,
+    ) -> Result<T, ApiError> {
+        if besides + self.bytes() == 0 {
+            return Ok(more.await);
+        }
+        let end = CancellationToken::new();
+        locked(&self.uploads.paused).push(Paused {
+            tenant: self.tenant.clone(),
+            since: Instant::now(),
+            end: end.clone(),
+        });
+        let _over = Over(&self.uploads, &end);
+        tokio::select! {
+            biased;
+            came = more => Ok(came),
+            () = end.cancelled() => Err(ApiError::TooSlow),
+        }
     }
 }
 
@@ -288,9 +304,12 @@ mod tests {
             room.take(1 << 20).expect("room");
         }
         let [first, second] = rooms;
+        // One that holds nothing is in nobody's way, however long it is silent.
+        let empty = uploads.room(&tenant("a"));
         let pausing = |room: Room| {
-            tokio::spawn(async move { room.pause(std::future::pending::<()>()).await })
+            tokio::spawn(async move { room.pause(0, std::future::pending::<()>()).await })
         };
+        let empty = pausing(empty);
         let first = pausing(first);
         tokio::time::sleep(IDLE / 4).await;
         let second = pausing(second);
@@ -303,6 +322,18 @@ mod tests {
         assert_eq!(first.await.expect("no panic"), Err(ApiError::TooSlow));
         let mut third = uploads.room(&tenant("c"));
         third.take(1).expect("room");
-        assert!(!second.is_finished());
+        assert!(!second.is_finished() && !empty.is_finished());
+    }
+
+    #[tokio::test]
+    async fn a_tenant_that_is_alone_does_not_keep_itself_out() {
+        let uploads = uploads();
+        let mut room = uploads.room(&tenant("a"));
+        room.take(1 << 20).expect("room");
+        let paused = tokio::spawn(async move { room.pause(0, std::future::pending::<()>()).await });
+        tokio::time::sleep(IDLE * 2).await;
+        assert!(uploads.room(&tenant("a")).take(1).is_err());
+        assert_eq!(paused.await.expect("no panic"), Err(ApiError::TooSlow));
+        uploads.room(&tenant("a")).take(1).expect("room");
     }
 }

@@ -8,10 +8,11 @@ use tokio::task::JoinSet;
 use tokio::time::{interval, interval_at};
 
 use crate::engine::Device;
-use crate::health::{HEARTBEAT, Heartbeat, StoreHealth};
+use crate::health::{HEARTBEAT, Heartbeat};
 use crate::metrics::Metrics;
 use crate::queue::{Event, Queue};
 use crate::storage::Blobs;
+use crate::worker::StoreProbe;
 
 /// How often the devices are looked at; their busy ratio is of so long.
 const LOOK: Duration = Duration::from_secs(2);
@@ -25,7 +26,7 @@ const ORPHANS: Duration = Duration::from_secs(3600);
 const MOST_ORPHANS: usize = 1000;
 
 /// How often the store is probed while it works.
-const PROBE: Duration = Duration::from_secs(5);
+const PROBE: Duration = Duration::from_secs(10);
 
 /// How soon it is probed again when it has failed: later each time, and sooner again only when it has
 /// worked for a while.
@@ -39,17 +40,12 @@ pub(super) fn start(
     metrics: &Arc<Metrics>,
     devices: &[Device],
     heard: mpsc::UnboundedReceiver<Event>,
-    health: (&Arc<StoreHealth>, &Arc<Heartbeat>),
+    health: (&Arc<StoreProbe>, &Arc<Heartbeat>),
 ) -> JoinSet<()> {
     let (store, heartbeat) = (Arc::clone(health.0), Arc::clone(health.1));
     let mut tasks = JoinSet::new();
     tasks.spawn(beat(heartbeat));
-    tasks.spawn(probe(
-        Arc::clone(queue),
-        blobs.clone(),
-        store,
-        Arc::clone(metrics),
-    ));
+    tasks.spawn(probe(store, Arc::clone(metrics)));
     tasks.spawn(listen(blobs.clone(), Arc::clone(metrics), heard));
     tasks.spawn(look(devices.to_vec(), Arc::clone(metrics)));
     tasks.spawn(clean(Arc::clone(queue), blobs.clone()));
@@ -78,34 +74,24 @@ async fn beat(heartbeat: Arc<Heartbeat>) {
 }
 
 /// Probes the store for as long as the server runs.
-async fn probe(
-    queue: Arc<dyn Queue>,
-    blobs: Blobs,
-    store: Arc<StoreHealth>,
-    metrics: Arc<Metrics>,
-) {
+async fn probe(store: Arc<StoreProbe>, metrics: Arc<Metrics>) {
     let mut pause = FIRST_PROBE;
     let mut worked_since = Instant::now();
+    let mut worked = true;
     loop {
-        let both = async {
-            blobs.probe().await.map_err(|error| error.to_string())?;
-            queue.probe().await.map_err(|error| error.to_string())
-        };
-        let before = store.trouble();
-        match both.await {
-            Ok(()) => {
-                if before.is_some() {
-                    worked_since = Instant::now();
-                }
-                store.works();
-            }
-            Err(error) => store.failed(&error),
+        let works = store.ask().await;
+        metrics.store(works);
+        if works && !worked {
+            worked_since = Instant::now();
         }
-        metrics.store(store.trouble().is_none());
-        if store.trouble().is_none() {
+        worked = works;
+        if works {
             tokio::select! {
                 () = tokio::time::sleep(PROBE) => continue,
-                () = store.until_it_fails() => metrics.store(false),
+                () = store.health().until_it_fails() => {
+                    metrics.store(false);
+                    worked = false;
+                }
             }
         }
         if worked_since.elapsed() > LAST_PROBE {

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 use serde_json::Value;
+use tokio::signal::unix::{SignalKind, signal};
 
 use super::client::{Client, Part};
 use super::eval::print_score;
@@ -85,7 +86,17 @@ impl Demo {
             .map_err(Failure::internal)?;
         // It goes when this returns.
         let folder = tempfile::tempdir().map_err(Failure::internal)?;
-        let answered = runtime.block_on(self.ask(pair, folder.path().to_owned()));
+        let answered = runtime.block_on(async {
+            let mut terminate = signal(SignalKind::terminate())?;
+            let mut hangup = signal(SignalKind::hangup())?;
+            tokio::select! {
+                answered = self.ask(pair, folder.path().to_owned()) => answered,
+                _ = tokio::signal::ctrl_c() => Err(anyhow::anyhow!("interrupted")),
+                _ = terminate.recv() => Err(anyhow::anyhow!("terminated")),
+                _ = hangup.recv() => Err(anyhow::anyhow!("hung up")),
+            }
+        });
+        runtime.shutdown_timeout(std::time::Duration::from_secs(1));
         answered.map_err(Failure::internal)
     }
 

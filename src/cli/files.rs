@@ -7,6 +7,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
+use rustix::fs::{Access, access};
 
 use super::failure::Failure;
 use super::unfinished::Unfinished;
@@ -164,14 +165,20 @@ pub(super) fn check_outputs<'a>(
             .into_iter()
             .filter_map(|path| Some((identity(path)?, path.as_path()))),
     );
-    let mut names: HashSet<&Path> = HashSet::new();
+    let mut places: HashSet<PathBuf> = HashSet::new();
     for path in outputs {
-        let folder = path
-            .parent()
-            .filter(|folder| !folder.as_os_str().is_empty());
-        if folder.is_some_and(|folder| !folder.is_dir()) {
-            let message = format!("cannot write {}: its folder is not there", path.display());
-            return Err(Failure::internal(anyhow!(message)));
+        let refuse = |why: &str| {
+            let message = format!("cannot write {}: {why}", path.display());
+            Err(Failure::internal(anyhow!(message)))
+        };
+        let Some(place) = place_of(path) else {
+            return refuse("its folder is not there");
+        };
+        if place.is_dir() {
+            return refuse("it is a folder");
+        }
+        if !place.exists() && access(place.parent().unwrap_or(&place), Access::WRITE_OK).is_err() {
+            return refuse("nothing can be written to its folder");
         }
         let same = identity(path).and_then(|identity| taken.insert(identity, path));
         if let Some(same) = same {
@@ -182,7 +189,7 @@ pub(super) fn check_outputs<'a>(
             );
             return Err(Failure::usage(anyhow!(message)));
         }
-        if !names.insert(path) {
+        if !places.insert(place) {
             let message = format!(
                 "{} would be written twice: give another name",
                 path.display()
@@ -193,6 +200,31 @@ pub(super) fn check_outputs<'a>(
     Ok(())
 }
 
+/// Where a file is or will be, whatever the links and dots on the way; nothing where its folder is
+/// not there.
+fn place_of(path: &Path) -> Option<PathBuf> {
+    const LINKS: usize = 40;
+    let mut path = path.to_owned();
+    for _ in 0..LINKS {
+        if let Ok(place) = fs::canonicalize(&path) {
+            return Some(place);
+        }
+        let folder = path.parent()?;
+        let folder = if folder.as_os_str().is_empty() {
+            Path::new(".")
+        } else {
+            folder
+        };
+        let place = fs::canonicalize(folder).ok()?.join(path.file_name()?);
+        // A link to what is not there yet says where it will be.
+        match fs::read_link(&place) {
+            Ok(target) => path = place.parent()?.join(target),
+            Err(_) => return Some(place),
+        }
+    }
+    None
+}
+
 /// Writes a file through `writer`; a failed write leaves no half file under the name. Links are
 /// followed, and what is no regular file (a pipe, a device) is written in place.
 pub(super) fn write<E: std::error::Error + Send + Sync + 'static>(
@@ -200,7 +232,7 @@ pub(super) fn write<E: std::error::Error + Send + Sync + 'static>(
     writer: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
 ) -> Result<(), Failure> {
     let written = || -> anyhow::Result<()> {
-        let place = fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+        let place = place_of(path).context("its folder is not there")?;
         if place.exists() && !place.is_file() {
             let mut file = BufWriter::new(File::create(&place)?);
             writer(&mut file)?;

@@ -2,6 +2,7 @@
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use anyhow::{Context, anyhow};
 use clap::Args;
@@ -13,6 +14,9 @@ use super::output::say;
 use crate::app::App;
 use crate::config::{Config, LogFormat};
 use crate::telemetry::Telemetry;
+
+/// Time that threads have to end when everything else has.
+const TO_LET_GO: Duration = Duration::from_secs(1);
 
 /// Serve scene flow over HTTP and gRPC.
 ///
@@ -96,7 +100,10 @@ impl Serve {
             .enable_all()
             .build()
             .map_err(Failure::internal)?;
-        runtime.block_on(serve(config))
+        let served = runtime.block_on(serve(config));
+        // A thread that hangs in a disk's hands must not keep the process.
+        runtime.shutdown_timeout(TO_LET_GO);
+        served
     }
 }
 

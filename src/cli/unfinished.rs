@@ -27,8 +27,10 @@ impl Unfinished {
         let folder = place.parent().unwrap_or(Path::new("."));
         let name = place.file_name().unwrap_or_default();
         let mut names = written();
+        // A name may be as long as a name can be.
+        let begins: String = name.to_string_lossy().chars().take(40).collect();
         let made: NamedTempFile = tempfile::Builder::new()
-            .prefix(&format!("{}.", name.to_string_lossy()))
+            .prefix(&format!("{begins}."))
             .suffix(".part")
             // As any file is made: what the user's mask leaves of it.
             .permissions(Permissions::from_mode(0o666))
@@ -46,6 +48,17 @@ impl Unfinished {
     }
 }
 
+/// The signal of a file that may not grow any more; its number on Linux, macOS and the BSDs.
+const SIGXFSZ: i32 = 25;
+
+/// Whether a signal was ignored when the program was started; not known but on Linux.
+fn is_ignored(kind: SignalKind) -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    let mask = mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
+    mask.is_some_and(|mask| mask >> (kind.as_raw_value() - 1) & 1 == 1)
+}
+
 /// From here on a signal that ends the program takes unfinished files with it.
 fn remove_on_signals() {
     static ONCE: Once = Once::new();
@@ -55,14 +68,27 @@ fn remove_on_signals() {
                 .enable_all()
                 .build()?;
             runtime.block_on(async {
-                let mut interrupt = signal(SignalKind::interrupt())?;
-                let mut terminate = signal(SignalKind::terminate())?;
-                let mut hangup = signal(SignalKind::hangup())?;
-                let number = tokio::select! {
-                    _ = interrupt.recv() => SignalKind::interrupt(),
-                    _ = terminate.recv() => SignalKind::terminate(),
-                    _ = hangup.recv() => SignalKind::hangup(),
-                };
+                // A file that may not grow is an error of a write, not the end of the program.
+                drop(signal(SignalKind::from_raw(SIGXFSZ))?);
+                let ends = [
+                    SignalKind::interrupt(),
+                    SignalKind::terminate(),
+                    SignalKind::hangup(),
+                ];
+                // What nohup and shells have told it to ignore stays ignored.
+                let ends = ends.into_iter().filter(|kind| !is_ignored(*kind));
+                let mut coming = Vec::new();
+                for kind in ends {
+                    let mut one = signal(kind)?;
+                    coming.push(Box::pin(async move {
+                        one.recv().await;
+                        kind
+                    }));
+                }
+                if coming.is_empty() {
+                    return Ok(());
+                }
+                let (number, ..) = futures_util::future::select_all(coming).await;
                 // Nothing is written between this and the end.
                 for path in written().iter() {
                     let _gone_is_fine = std::fs::remove_file(path);

@@ -141,6 +141,9 @@ pub enum Outcome {
     Cancelled,
     /// The worker had to let go through no fault of the job: it is queued again as it was.
     Released,
+    /// The store works, and fails for this job all the same: it is queued again for later, behind the
+    /// others, and given up after some of that.
+    Delayed(JobError),
     /// It does not suit this device: it is queued again as it was, for one of that kind.
     Moved(DeviceKind),
     /// The device died under it, perhaps by another job's fault: it is queued again, and given up
@@ -295,6 +298,12 @@ pub trait Queue: Send + Sync {
 
     /// Goes the way of a submission and back, and writes to the disk: whether the store can be used.
     async fn probe(&self) -> Result<(), QueueError>;
+
+    /// Whether there is no job at all.
+    async fn is_empty(&self) -> Result<bool, QueueError>;
+
+    /// A number that says which queue this is; payloads of another one are not its own.
+    fn identity(&self) -> i32;
 
     /// Returns when nothing can be written any more, whatever happens: a fresh process is needed.
     async fn ended(&self);

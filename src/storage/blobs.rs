@@ -3,8 +3,9 @@
 //! Written whole or not at all. What a promise rests on is on disk before the call returns; what
 //! dies with its caller does not wait for the disk. It must not know what the bytes mean.
 
-use std::fs;
-use std::io;
+use std::fs::{self, Permissions};
+use std::io::{self, Write};
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path as FilePath, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -86,6 +87,9 @@ pub struct FreeSpace {
     pub inodes: Option<u64>,
 }
 
+/// The file that says which store this is.
+const IDENTITY: &str = "identity";
+
 /// A job's folder. Names begin with their time, so siblings are of about one minute.
 fn folder(id: JobId) -> String {
     let name = id.to_string();
@@ -109,6 +113,8 @@ impl Blobs {
     /// Where the folder cannot be used.
     pub fn open(folder: &FilePath) -> Result<Self, BlobError> {
         fs::create_dir_all(folder)?;
+        // Also where an earlier version made it for everybody.
+        fs::set_permissions(folder, Permissions::from_mode(0o700))?;
         let open = || -> Result<LocalFileSystem, BlobError> {
             Ok(LocalFileSystem::new_with_prefix(folder)?.with_automatic_cleanup(true))
         };
@@ -128,22 +134,64 @@ impl Blobs {
         })
     }
 
-    /// Writes something of some size, waits for the disk, reads it back and removes it: what a job
-    /// does with its result.
+    /// The number that was written here when the store was made; none where there is none.
+    ///
+    /// # Errors
+    /// Where it cannot be read.
+    pub fn identity(&self) -> io::Result<Option<i32>> {
+        match fs::read_to_string(self.folder.join(IDENTITY)) {
+            Ok(text) => match text.trim().parse() {
+                Ok(identity) => Ok(Some(identity)),
+                Err(_) => Err(io::ErrorKind::InvalidData.into()),
+            },
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Writes the number that says which store this is.
+    ///
+    /// # Errors
+    /// Where it cannot be written.
+    pub fn set_identity(&self, identity: i32) -> io::Result<()> {
+        let mut file = fs::File::create(self.folder.join(IDENTITY))?;
+        writeln!(file, "{identity}")?;
+        file.sync_all()
+    }
+
+    /// Writes, waits for the disk, reads back and removes a file, and looks whether this is still the
+    /// store of that `identity` and has room for `needed` bytes: what a job needs of it.
     ///
     /// # Errors
     /// Where any of it fails.
-    pub async fn probe(&self) -> Result<(), BlobError> {
-        const BYTES: usize = 1 << 20;
-        let path = Path::from("jobs/probe");
-        let bytes = Bytes::from(vec![7; BYTES]);
-        self.synced.put(&path, bytes.clone().into()).await?;
-        let read = self.quick.get(&path).await?.bytes().await?;
-        self.quick.delete(&path).await?;
-        if read != bytes {
-            return Err(io::Error::from(io::ErrorKind::InvalidData).into());
-        }
-        Ok(())
+    pub async fn probe(&self, identity: i32, needed: u64) -> Result<(), BlobError> {
+        const BYTES: usize = 64 << 10;
+        const ROOM: u64 = 4 << 20;
+        let (store, path) = (self.clone(), self.folder.join("jobs/probe"));
+        in_background(move || {
+            // A volume that is not mounted is an empty folder that can be written.
+            if store.identity()? != Some(identity) {
+                return Err(io::Error::other(
+                    "the payloads are not there: is their volume mounted?",
+                ));
+            }
+            fs::create_dir_all(store.folder.join("jobs"))?;
+            let bytes = vec![7; BYTES];
+            let mut file = fs::File::create(&path)?;
+            file.write_all(&bytes)?;
+            file.sync_data()?;
+            let read = fs::read(&path)?;
+            fs::remove_file(&path)?;
+            if read != bytes {
+                return Err(io::ErrorKind::InvalidData.into());
+            }
+            let least = ROOM.max(needed.saturating_mul(2));
+            match store.free_space() {
+                Some(free) if free.bytes < least => Err(io::ErrorKind::StorageFull.into()),
+                _ => Ok(()),
+            }
+        })
+        .await
     }
 
     /// Writes a blob whole, over what was there.
@@ -337,7 +385,12 @@ mod tests {
         let blobs = Blobs::open(folder.path()).expect("a store");
         assert!(blobs.free_space().is_some_and(|free| free.bytes > 0));
         assert!(blobs.is_empty().expect("a list"));
-        blobs.probe().await.expect("it can be written");
+        assert!(blobs.probe(7, 0).await.is_err(), "it is no store yet");
+        blobs.set_identity(7).expect("written");
+        blobs.probe(7, 0).await.expect("it can be written");
+        assert!(blobs.probe(8, 0).await.is_err(), "it is another store");
+        let full = blobs.probe(7, u64::MAX).await.expect_err("too much");
+        assert_eq!(full.fault(), Fault::Full);
         assert!(blobs.is_empty().expect("a list"));
         let (id, other) = (JobId::fresh(), JobId::fresh());
         let all = [

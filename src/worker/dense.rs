@@ -9,7 +9,7 @@ use std::time::Instant;
 
 use super::inputs::StoreError;
 use super::job_watch::DenseWatch;
-use super::{Attempt, Densification, Densified, Done, EngineError, Found, Worker};
+use super::{Attempt, Densification, Densified, Done, EngineError, Found, Worker, alive};
 use crate::flow::densify::Plan;
 use crate::flow::{FlowError, Sweep, Watch};
 use crate::job::{DenseReport, Densify, Job, JobOptions};
@@ -42,10 +42,13 @@ impl Worker {
             lease.pulse.clone(),
             self.drain.release.clone(),
         ));
-        let (work, asked) = match self.prepare_sweeps(&lease.job, watch).await {
+        let preparing = self.prepare_sweeps(&lease.job, watch);
+        let (work, asked) = match alive(lease, preparing).await {
             Ok(prepared) => prepared,
             Err(Unprepared::Interrupted) => return self.interrupted(lease),
-            Err(Unprepared::Store(error)) => return self.unreadable(&error),
+            Err(Unprepared::Store(error)) => {
+                return Attempt::Ended(alive(lease, self.unreadable(&error)).await);
+            }
         };
         let (began, frames) = (Instant::now(), work.sweeps.len());
         match self.lane.densify(work).await {

@@ -179,7 +179,7 @@ impl Worker {
     /// Writes every snapshot that comes, until the optimization ends.
     fn keep_snapshots(&self, lease: &Lease, mut kept: mpsc::Receiver<Snapshot>) -> JoinHandle<()> {
         let (blobs, metrics) = (self.blobs.clone(), Arc::clone(&self.metrics));
-        let store_health = Arc::clone(&self.store_health);
+        let store_health = Arc::clone(self.store.health());
         let (id, pulse) = (lease.job.id, lease.pulse.clone());
         tokio::spawn(async move {
             while let Some(snapshot) = kept.recv().await {

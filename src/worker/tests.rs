@@ -48,6 +48,7 @@ async fn stand_with(lanes: usize, roomier: Option<DeviceKind>) -> Stand {
     let queue = SqliteQueue::open(folder.path(), options, events).expect("a queue");
     let queue: Arc<dyn Queue> = Arc::new(queue);
     let blobs = Blobs::open(&folder.path().join("blobs")).expect("a store");
+    blobs.set_identity(queue.identity()).expect("written");
     let switches = Arc::new(Switches::default());
     let metrics = Arc::new(Metrics::new(&["fragile"]));
     let device = Device::start(switches.card("fragile", lanes), &metrics).expect("a thread");
@@ -69,7 +70,11 @@ async fn stand_with(lanes: usize, roomier: Option<DeviceKind>) -> Stand {
         },
         drain: Drain::default(),
         company: Arc::default(),
-        store_health: Arc::default(),
+        store: Arc::new(crate::worker::StoreProbe::new(
+            Arc::clone(&queue),
+            blobs.clone(),
+            Arc::default(),
+        )),
     };
     Stand {
         queue,

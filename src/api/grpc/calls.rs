@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use prost::Message as _;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
@@ -12,9 +13,11 @@ use super::chunks::{self, CloudBuilder};
 use super::proto::{self, scene_flow_server::SceneFlow};
 use super::{convert, sequence};
 use crate::api::admission::Promise;
+use crate::api::answers::Taking;
 use crate::api::dense;
 use crate::api::draft::{Accepted, Draft};
 use crate::api::error::ApiError;
+use crate::api::listener::MayWait;
 use crate::api::service::{Service, Waited};
 use crate::job::{InvalidId, Job, JobId, Kind, State};
 
@@ -123,26 +126,42 @@ async fn send_flow(
         }
     };
     let answer = service.answer(&job).await?;
-    if !send(Part::Header(convert::header(&answer))).await {
-        return Ok(true);
-    }
-    for piece in chunks::pieces(&answer, 0) {
-        if !send(Part::Chunk(piece)).await {
-            return Ok(true);
+    let sending = async {
+        if !send(Part::Header(convert::header(&answer))).await {
+            return;
         }
+        for piece in chunks::pieces(&answer, 0) {
+            let length = piece.flow.len();
+            if !send(Part::Chunk(piece)).await {
+                return;
+            }
+            answer.room.taking().took(length);
+        }
+    };
+    tokio::select! {
+        () = sending => Ok(true),
+        () = answer.room.taking().evicted() => Err(ApiError::TakenTooSlowly),
     }
-    Ok(true)
 }
 
-/// Sends a result's parts, one by one.
+/// Sends a result's parts, one by one, until they have to make room for others.
 async fn send_result(
     parts: impl Iterator<Item = proto::download_result_response::Part>,
     answers: mpsc::Sender<Result<proto::DownloadResultResponse, Status>>,
+    taking: Arc<Taking>,
 ) {
     for part in parts {
         let message = proto::DownloadResultResponse { part: Some(part) };
-        if answers.send(Ok(message)).await.is_err() {
-            return;
+        let length = message.encoded_len();
+        tokio::select! {
+            sent = answers.send(Ok(message)) => match sent {
+                Ok(()) => taking.took(length),
+                Err(_) => return,
+            },
+            () = taking.evicted() => {
+                let _gone_is_fine = answers.try_send(Err(ApiError::TakenTooSlowly.into()));
+                return;
+            }
         }
     }
 }
@@ -193,7 +212,9 @@ impl SceneFlow for Calls {
         let awaited = Promise::WhileAwaited;
         self.service.check_room(&call.caller, None, awaited)?;
         let answers = sequence::run(Arc::clone(&self.service), call, request.into_inner());
-        Ok(Response::new(Box::pin(answers)))
+        let mut response: Response<Self::EstimateSequenceStream> = Response::new(Box::pin(answers));
+        response.extensions_mut().insert(MayWait);
+        Ok(response)
     }
 
     async fn submit_job(
@@ -363,15 +384,19 @@ impl SceneFlow for Calls {
             let (cloud, room) = self.service.dense_cloud(&job).await?;
             let pieces = chunks::dense_pieces(cloud, first).map(Part::DenseChunk);
             let parts = std::iter::once(Part::DenseHeader(header)).chain(pieces);
+            let taking = Arc::clone(room.taking());
             tokio::spawn(async move {
                 let _while_it_is_read = (turn, room);
-                send_result(parts, answers).await;
+                send_result(parts, answers, taking).await;
             });
         } else {
             let answer = self.service.answer(&job).await?;
             let header = Part::Header(convert::header(&answer));
             let pieces = chunks::pieces(&answer, first).map(Part::Chunk);
-            tokio::spawn(send_result(std::iter::once(header).chain(pieces), answers));
+            let parts = std::iter::once(header).chain(pieces);
+            let taking = Arc::clone(answer.room.taking());
+            drop(answer);
+            tokio::spawn(send_result(parts, answers, taking));
         }
         Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
     }

@@ -48,7 +48,7 @@ enum Item {
 struct Sweep {
     name: String,
     cloud: Arc<StoredCloud>,
-    _room: Room,
+    room: Room,
 }
 
 /// A sweep that is arriving.
@@ -74,7 +74,7 @@ impl Coming {
         Ok(Sweep {
             name: self.name,
             cloud: Arc::new(cloud),
-            _room: room,
+            room,
         })
     }
 }
@@ -147,7 +147,8 @@ impl Reader {
                 // One that is known to be incomplete must come on.
                 room.wait(self.inbound.message()).await?
             } else {
-                room.pause(self.inbound.message()).await?
+                let held: u64 = self.held.iter().map(|sweep| sweep.room.bytes()).sum();
+                room.pause(held, self.inbound.message()).await?
             };
             let message = message.map_err(|status| {
                 ApiError::BadRequest(format!("the stream is broken: {}", status.message()))
@@ -310,9 +311,19 @@ async fn send(service: &Arc<Service>, pair: Pending, answers: &Answers) -> bool 
                 return false;
             }
             for piece in chunks::pieces(&answer, 0) {
-                if answers.send(message(Part::Chunk(piece))).await.is_err() {
-                    return false;
+                let length = piece.flow.len();
+                tokio::select! {
+                    sent = answers.send(message(Part::Chunk(piece))) => if sent.is_err() {
+                        return false;
+                    },
+                    () = answer.room.taking().evicted() => {
+                        let error = ApiError::TakenTooSlowly;
+                        service.count_late_error("grpc", &error);
+                        let _gone_is_fine = answers.try_send(Err(error.into()));
+                        return false;
+                    }
                 }
+                answer.room.taking().took(length);
             }
             true
         }

@@ -11,10 +11,12 @@ use tokio_stream::wrappers::ReceiverStream;
 
 use super::named::Named;
 use super::problem::Problem;
+use crate::api::answers::Encoded;
 use crate::api::auth::Caller;
 use crate::api::codec::AnswerFormat;
 use crate::api::dense;
 use crate::api::error::ApiError;
+use crate::api::listener::HasRoom;
 use crate::api::service::Service;
 use crate::formats::{DENSE_FORMATS, DenseFormat};
 use crate::job::{DenseReport, Job, Kind, State as JobState};
@@ -26,8 +28,8 @@ pub(super) async fn flow(
     format: AnswerFormat,
 ) -> Result<Response, ApiError> {
     let head = Head::of_flow(job, format)?;
-    let bytes = service.encoded(job, format).await?;
-    let mut response = Body::from(bytes).into_response();
+    let encoded = service.encoded(job, format).await?;
+    let mut response = whole(encoded);
     head.describe(&mut response);
     Ok(response)
 }
@@ -96,7 +98,7 @@ impl Head {
     async fn answer(
         &self,
         headers: &HeaderMap,
-        bytes: impl Future<Output = Result<Bytes, ApiError>>,
+        encoded: impl Future<Output = Result<Encoded, ApiError>>,
     ) -> Result<Response, ApiError> {
         let text =
             |name: header::HeaderName| headers.get(name).and_then(|value| value.to_str().ok());
@@ -111,24 +113,35 @@ impl Head {
         let mut response = if text(header::IF_NONE_MATCH).is_some_and(matches) {
             StatusCode::NOT_MODIFIED.into_response()
         } else {
-            let bytes = bytes.await?;
+            let encoded = encoded.await?;
             let fresh = text(header::IF_RANGE).is_none_or(|known| known == tag);
-            part(bytes, text(header::RANGE).filter(|_| fresh))?
+            part(encoded, text(header::RANGE).filter(|_| fresh))?
         };
         self.describe(&mut response);
         Ok(response)
     }
 }
 
+/// All bytes of an answer, with their number.
+fn whole(encoded: Encoded) -> Response {
+    let length = HeaderValue::from(encoded.len());
+    let mut response = encoded.into_body().into_response();
+    response
+        .headers_mut()
+        .insert(header::CONTENT_LENGTH, length);
+    response.extensions_mut().insert(HasRoom);
+    response
+}
+
 /// All bytes of a result, or those of a range.
-fn part(bytes: Bytes, range: Option<&str>) -> Result<Response, ApiError> {
-    let length = bytes.len() as u64;
+fn part(encoded: Encoded, range: Option<&str>) -> Result<Response, ApiError> {
+    let length = encoded.len() as u64;
     match range.and_then(|range| parse_range(range, length)) {
-        None => Ok(Body::from(bytes).into_response()),
+        None => Ok(whole(encoded)),
         Some(None) => Err(ApiError::Range(length)),
         Some(Some((first, last))) => {
-            let part = bytes.slice(first as usize..=last as usize);
-            let mut response = (StatusCode::PARTIAL_CONTENT, Body::from(part)).into_response();
+            let mut response = whole(encoded.slice(first as usize..last as usize + 1));
+            *response.status_mut() = StatusCode::PARTIAL_CONTENT;
             let range = format!("bytes {first}-{last}/{length}");
             if let Ok(range) = HeaderValue::from_str(&range) {
                 response.headers_mut().insert(header::CONTENT_RANGE, range);
@@ -232,7 +245,7 @@ async fn archive(
     let pairs = service.pairs(sequence).await?;
     let turn = Arc::clone(&service.archives).try_acquire_owned();
     let turn = turn.map_err(|_| ApiError::ServerFull(Duration::from_secs(1)))?;
-    let (pieces, stream) = tokio::sync::mpsc::channel::<Result<Bytes, std::io::Error>>(4);
+    let (pieces, stream) = tokio::sync::mpsc::channel::<Result<Bytes, std::io::Error>>(1);
     let service = Arc::clone(service);
     let runtime = tokio::runtime::Handle::current();
     tokio::task::spawn_blocking(move || {
@@ -246,9 +259,9 @@ async fn archive(
             .compression_method(zip::CompressionMethod::Stored);
         let mut write = || -> Result<(), Box<dyn std::error::Error>> {
             for pair in &pairs {
-                let bytes = runtime.block_on(service.encoded(pair, format))?;
+                let encoded = runtime.block_on(service.encoded(pair, format))?;
                 zip.start_file(format!("{:06}.{}", pair.place, format.ending()), plain)?;
-                std::io::Write::write_all(&mut zip, &bytes)?;
+                std::io::Write::write_all(&mut zip, encoded.bytes())?;
             }
             Ok(())
         };
@@ -285,11 +298,14 @@ struct Pipe {
 
 impl std::io::Write for Pipe {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        const PATIENCE: Duration = Duration::from_secs(60);
-        let piece = Bytes::copy_from_slice(bytes);
+        // For whoever takes nothing at all; the connection's own patience is shorter.
+        const PATIENCE: Duration = Duration::from_secs(3600);
+        const PIECE: usize = 64 << 10;
+        let length = bytes.len().min(PIECE);
+        let piece = Bytes::copy_from_slice(&bytes[..length]);
         let sending = async { tokio::time::timeout(PATIENCE, self.pieces.send(Ok(piece))).await };
         match self.runtime.block_on(sending) {
-            Ok(Ok(())) => Ok(bytes.len()),
+            Ok(Ok(())) => Ok(length),
             Ok(Err(_)) => Err(std::io::ErrorKind::BrokenPipe.into()),
             Err(_) => Err(std::io::ErrorKind::TimedOut.into()),
         }

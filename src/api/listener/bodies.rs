@@ -2,6 +2,7 @@
 //! what goes out is cut into pieces whose taking is watched.
 
 use std::pin::Pin;
+use std::sync::Arc;
 use std::task::{Context, Poll, ready};
 use std::time::Instant;
 
@@ -9,6 +10,7 @@ use axum::BoxError;
 use axum::body::Body as AnyBody;
 use bytes::Bytes;
 use hyper::body::{Body, Frame, SizeHint};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::coop::poll_proceed;
 
 use super::connections::OpenRequest;
@@ -60,19 +62,41 @@ impl<B: Body<Data = Bytes> + Unpin> Body for RequestBody<B> {
 }
 
 /// An answer's body in pieces; its request is open until it is dropped.
+///
+/// What a body gives at once and its reader has not taken yet is held, and takes room of the port's
+/// until it is; where there is none the answer ends.
 pub(super) struct AnswerBody {
     body: AnyBody,
     rest: Bytes,
+    room: Option<Arc<Semaphore>>,
+    held: Option<OwnedSemaphorePermit>,
     request: OpenRequest,
 }
 
 impl AnswerBody {
-    pub(super) fn new(body: AnyBody, request: OpenRequest) -> Self {
+    /// `room` in bytes; none where the body has its own, and may wait for its reader.
+    pub(super) fn new(body: AnyBody, request: OpenRequest, room: Option<Arc<Semaphore>>) -> Self {
         Self {
             body,
             rest: Bytes::new(),
+            room,
+            held: None,
             request,
         }
+    }
+
+    /// Takes room for what was given, and gives back that of what was given before.
+    fn hold(&mut self) -> Result<(), BoxError> {
+        self.held = None;
+        if self.rest.len() <= PIECE {
+            return Ok(());
+        }
+        if let Some(room) = &self.room {
+            let bytes = u32::try_from(self.rest.len()).unwrap_or(u32::MAX);
+            let held = Arc::clone(room).try_acquire_many_owned(bytes);
+            self.held = Some(held.map_err(|_| "too many answers are not read")?);
+        }
+        Ok(())
     }
 }
 
@@ -94,13 +118,22 @@ impl Body for AnswerBody {
                 Some(Ok(frame)) => frame,
             };
             match frame.into_data() {
-                Ok(data) => self.rest = data,
+                Ok(data) => {
+                    self.rest = data;
+                    if let Err(error) = self.hold() {
+                        self.rest = Bytes::new();
+                        return Poll::Ready(Some(Err(error)));
+                    }
+                }
                 Err(trailers) => return Poll::Ready(Some(Ok(trailers))),
             }
         }
         budget.made_progress();
         let length = self.rest.len().min(PIECE);
         let piece = self.rest.split_to(length);
+        if self.rest.is_empty() {
+            self.held = None;
+        }
         self.request.handed(Some(Instant::now()));
         Poll::Ready(Some(Ok(Frame::data(piece))))
     }
@@ -123,8 +156,6 @@ impl Body for AnswerBody {
 #[cfg(test)]
 mod tests {
     use std::convert::Infallible;
-    use std::net::IpAddr;
-    use std::sync::Arc;
     use std::time::Duration;
 
     use http_body_util::BodyExt;
@@ -149,10 +180,12 @@ mod tests {
     #[tokio::test]
     async fn an_answer_comes_in_pieces_and_says_its_length() {
         let bytes: Vec<u8> = (0..3 * PIECE + 5).map(|at| (at % 251) as u8).collect();
-        let connections = Arc::new(Connections::default());
-        let entry = connections.enter(IpAddr::from([127, 0, 0, 1]));
+        let connections = Arc::new(Connections::new(1));
+        let entry = connections.enter();
         let body = AnyBody::from(bytes.clone());
-        let mut answer = AnswerBody::new(body, entry.connection.begin());
+        let room = Arc::new(Semaphore::new(bytes.len() + 10));
+        let full = Some(Arc::clone(&room));
+        let mut answer = AnswerBody::new(body, entry.connection.begin(), full.clone());
         let mut read = Vec::new();
         loop {
             let left = (bytes.len() - read.len()) as u64;
@@ -163,7 +196,15 @@ mod tests {
             let piece = frame.expect("no error").into_data().expect("data");
             assert!(piece.len() <= PIECE);
             read.extend_from_slice(&piece);
+            if read.len() < bytes.len() {
+                // Another one of that size does not fit beside it.
+                let body = AnyBody::from(bytes.clone());
+                let request = entry.connection.begin();
+                let mut other = AnswerBody::new(body, request, full.clone());
+                assert!(other.frame().await.expect("an end").is_err());
+            }
         }
+        assert_eq!(room.available_permits(), bytes.len() + 10);
         assert!(read == bytes && answer.is_end_stream());
     }
 }

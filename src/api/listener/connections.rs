@@ -4,9 +4,8 @@
 //! that answers pings is never silent. So every connection is looked at for what it asks and takes.
 
 use std::collections::HashMap;
-use std::net::IpAddr;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
 use tokio_util::sync::CancellationToken;
@@ -14,8 +13,8 @@ use tokio_util::sync::CancellationToken;
 use crate::job::Tenant;
 
 /// The open connections of one port.
-#[derive(Default)]
 pub(super) struct Connections {
+    most: usize,
     open: Mutex<HashMap<u64, Arc<Connection>>>,
     next: AtomicU64,
 }
@@ -23,7 +22,7 @@ pub(super) struct Connections {
 /// One open connection. Requests carry it as an extension.
 pub(in crate::api) struct Connection {
     opened: Instant,
-    address: IpAddr,
+    connections: Weak<Connections>,
     state: Mutex<State>,
     /// Cancelled when it has to make room.
     evicted: CancellationToken,
@@ -37,6 +36,8 @@ struct State {
     next: u64,
     /// Since when there is none.
     idle_since: Instant,
+    /// When a piece of any answer was taken last.
+    taken: Instant,
 }
 
 /// How long a connection may be without what it is for.
@@ -46,7 +47,7 @@ pub(super) struct Patience {
     pub(super) idle: Duration,
     /// Without a good key; none where no key is needed.
     pub(super) unknown: Option<Duration>,
-    /// Without taking the next piece of an answer.
+    /// Without taking a piece of any answer.
     pub(super) unread: Duration,
 }
 
@@ -71,6 +72,7 @@ pub(super) struct Entry {
 pub(super) struct OpenRequest {
     connection: Arc<Connection>,
     number: u64,
+    may_wait: AtomicBool,
 }
 
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -78,16 +80,26 @@ fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Connections {
-    pub(super) fn enter(self: &Arc<Self>, address: IpAddr) -> Entry {
+    /// No connection yet, of so many at most.
+    pub(super) fn new(most: usize) -> Self {
+        Self {
+            most,
+            open: Mutex::default(),
+            next: AtomicU64::new(0),
+        }
+    }
+
+    pub(super) fn enter(self: &Arc<Self>) -> Entry {
         let now = Instant::now();
         let connection = Arc::new(Connection {
             opened: now,
-            address,
+            connections: Arc::downgrade(self),
             state: Mutex::new(State {
                 tenant: None,
                 requests: HashMap::new(),
                 next: 0,
                 idle_since: now,
+                taken: now,
             }),
             evicted: CancellationToken::new(),
         });
@@ -100,30 +112,18 @@ impl Connections {
         }
     }
 
-    /// Ends the connection that is needed least, so that one from `address` has room: one that has
-    /// shown no key, else one without a request, else one of whoever holds more than half of all.
-    /// The oldest of several. False where there is none.
-    pub(super) fn make_room(&self, address: IpAddr) -> bool {
+    /// Ends the connection that is needed least, so that another one has room: one that has shown no
+    /// key, else one without a request; the oldest of several. One that works for somebody is never
+    /// ended for one that has shown nothing yet. False where there is none.
+    pub(super) fn make_room(&self) -> bool {
         let mut open = locked(&self.open);
-        let all = open.len();
-        let mut held: HashMap<Holder, usize> = HashMap::new();
-        for connection in open.values() {
-            *held.entry(connection.holder()).or_default() += 1;
-        }
-        let newcomer = Holder::Address(address);
         let rank = |connection: &Connection| {
-            let holder = connection.holder();
             let state = locked(&connection.state);
-            if state.tenant.is_none() && state.requests.is_empty() {
-                Some(0)
-            } else if state.tenant.is_none() {
-                Some(1)
-            } else if state.requests.is_empty() {
-                Some(2)
-            } else if held[&holder] * 2 > all && holder != newcomer {
-                Some(3)
-            } else {
-                None
+            match (&state.tenant, state.requests.is_empty()) {
+                (None, true) => Some(0),
+                (None, false) => Some(1),
+                (Some(_), true) => Some(2),
+                (Some(_), false) => None,
             }
         };
         let least = open
@@ -138,26 +138,27 @@ impl Connections {
         }
         true
     }
-}
 
-/// Who holds a connection: the tenant whose key it has shown, else the address it came from.
-#[derive(PartialEq, Eq, Hash)]
-enum Holder {
-    Tenant(Tenant),
-    Address(IpAddr),
+    /// Connections on which a tenant is being answered.
+    fn busy_of(&self, tenant: &Tenant) -> usize {
+        let open = locked(&self.open);
+        let is_busy = |connection: &&Arc<Connection>| {
+            let state = locked(&connection.state);
+            state.tenant.as_ref() == Some(tenant) && !state.requests.is_empty()
+        };
+        open.values().filter(is_busy).count()
+    }
 }
 
 impl Connection {
-    fn holder(&self) -> Holder {
-        match &locked(&self.state).tenant {
-            Some(tenant) if *tenant != Tenant::default() => Holder::Tenant(tenant.clone()),
-            _ => Holder::Address(self.address),
-        }
-    }
-
-    /// A good key was shown, or none is needed.
-    pub(in crate::api) fn is_known(&self, tenant: &Tenant) {
+    /// A good key was shown, or none is needed. Says whether its tenant may have one more connection
+    /// at work: of several tenants one may have half of all.
+    pub(in crate::api) fn is_known(&self, tenant: &Tenant, several: bool) -> bool {
         locked(&self.state).tenant = Some(tenant.clone());
+        let Some(connections) = self.connections.upgrade().filter(|_| several) else {
+            return true;
+        };
+        connections.busy_of(tenant) <= connections.most.div_ceil(2)
     }
 
     /// Returns when it has to make room.
@@ -174,14 +175,17 @@ impl Connection {
         OpenRequest {
             connection: Arc::clone(self),
             number,
+            may_wait: AtomicBool::new(false),
         }
     }
 
     /// What is to be done with it now.
     pub(super) fn verdict(&self, patience: &Patience) -> Verdict {
         let state = locked(&self.state);
+        // One stream that its reader has paused does not end those beside it.
         let mut handed = state.requests.values().flatten();
-        if handed.any(|at| at.elapsed() >= patience.unread) {
+        let waits = handed.any(|at| at.elapsed() >= patience.unread);
+        if waits && state.taken.elapsed() >= patience.unread {
             return Verdict::End;
         }
         let unknown = patience.unknown.filter(|_| state.tenant.is_none());
@@ -200,8 +204,14 @@ impl Drop for Entry {
 }
 
 impl OpenRequest {
+    /// Its answer may be left unread.
+    pub(super) fn may_wait(&self) {
+        self.may_wait.store(true, Ordering::Relaxed);
+    }
+
     /// A piece of the answer was handed over, or (none) the piece before has been taken.
     pub(super) fn handed(&self, at: Option<Instant>) {
+        let at = at.filter(|_| !self.may_wait.load(Ordering::Relaxed));
         if let Some(request) = locked(&self.connection.state)
             .requests
             .get_mut(&self.number)
@@ -230,14 +240,10 @@ mod tests {
         unread: LONG,
     };
 
-    fn address(last: u8) -> IpAddr {
-        IpAddr::from([127, 0, 0, last])
-    }
-
     #[test]
     fn a_connection_ends_when_it_is_idle_unknown_or_does_not_read() {
-        let connections = Arc::new(Connections::default());
-        let entry = connections.enter(address(1));
+        let connections = Arc::new(Connections::new(4));
+        let entry = connections.enter();
         let connection = &entry.connection;
         let never = Duration::ZERO;
         let idle = Patience {
@@ -256,7 +262,7 @@ mod tests {
         assert_eq!(connection.verdict(&idle), Verdict::Close);
         assert_eq!(connection.verdict(&unknown), Verdict::End);
         let request = connection.begin();
-        connection.is_known(&Tenant::default());
+        assert!(connection.is_known(&Tenant::default(), false));
         for patience in [idle, unknown, unread] {
             assert_eq!(connection.verdict(&patience), Verdict::Keep);
         }
@@ -264,30 +270,60 @@ mod tests {
         assert_eq!(connection.verdict(&unread), Verdict::End);
         request.handed(None);
         assert_eq!(connection.verdict(&unread), Verdict::Keep);
-        drop(request);
+        // Beside a stream that is taken, one that is not may wait.
+        let short = Patience {
+            unread: Duration::from_millis(100),
+            ..PATIENCE
+        };
+        let stalled = connection.begin();
+        stalled.handed(Some(Instant::now()));
+        for _ in 0..4 {
+            std::thread::sleep(Duration::from_millis(40));
+            request.handed(Some(Instant::now()));
+            request.handed(None);
+            assert_eq!(connection.verdict(&short), Verdict::Keep);
+        }
+        std::thread::sleep(Duration::from_millis(120));
+        assert_eq!(connection.verdict(&short), Verdict::End);
+        drop((request, stalled));
         assert_eq!(connection.verdict(&idle), Verdict::Close);
     }
 
     #[test]
-    fn whoever_is_needed_least_makes_room_and_who_works_alone_does_not() {
-        let connections = Arc::new(Connections::default());
+    fn whoever_is_needed_least_makes_room_and_who_works_does_not() {
+        let connections = Arc::new(Connections::new(4));
         let tenant = |name: &str| name.parse::<Tenant>().expect("a good name");
-        let enter = |last| connections.enter(address(last));
-        let [greedy, also_greedy, modest] = [1, 2, 3].map(enter);
-        for entry in [&greedy, &also_greedy] {
-            entry.connection.is_known(&tenant("greedy"));
+        let [works, idle] = [connections.enter(), connections.enter()];
+        let _request = works.connection.begin();
+        for entry in [&works, &idle] {
+            assert!(entry.connection.is_known(&tenant("a"), true));
         }
-        modest.connection.is_known(&tenant("modest"));
-        let _requests = [&greedy, &also_greedy, &modest].map(|entry| entry.connection.begin());
-        let (unknown, idle) = (enter(4), enter(5));
-        idle.connection.is_known(&tenant("idle"));
+        let [waits, unknown] = [connections.enter(), connections.enter()];
+        let _request_of_nobody = waits.connection.begin();
         let is_evicted = |entry: &Entry| entry.connection.evicted.is_cancelled();
-        for gone in [&unknown, &idle, &greedy] {
+        for gone in [&unknown, &waits, &idle] {
             assert!(!is_evicted(gone));
-            assert!(connections.make_room(address(9)));
+            assert!(connections.make_room());
             assert!(is_evicted(gone));
         }
-        assert!(!connections.make_room(address(9)));
-        assert!(!is_evicted(&also_greedy) && !is_evicted(&modest));
+        assert!(!connections.make_room());
+        assert!(!is_evicted(&works));
+    }
+
+    #[test]
+    fn one_of_several_tenants_has_half_of_the_connections_at_work() {
+        let connections = Arc::new(Connections::new(4));
+        let tenant = |name: &str| name.parse::<Tenant>().expect("a good name");
+        let mut held = Vec::new();
+        let mut asks = |name: &str, several: bool| {
+            let entry = connections.enter();
+            let request = entry.connection.begin();
+            let may = entry.connection.is_known(&tenant(name), several);
+            held.push((entry, request));
+            may
+        };
+        assert!(asks("a", true) && asks("a", true));
+        assert!(!asks("a", true) && asks("a", false));
+        assert!(asks("b", true));
     }
 }

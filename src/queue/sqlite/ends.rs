@@ -188,7 +188,7 @@ pub(super) fn requeue(
     };
     let expires = Timestamp::now().after(options.time_to_live).as_millis();
     let sql = format!(
-        "UPDATE jobs SET state = 0, durable = 1, pairs_left = ?2, delayed = 0, failures = 0, crashes = 0, \
+        "UPDATE jobs SET state = 0, durable = 1, pairs_left = ?2, delayed = 0, failures = 0, crashes = 0, delays = 0, \
          started = NULL, finished = NULL, deadline = NULL, expires = ?3, \
          due = CASE WHEN kind = 0 THEN ?3 END, stop_reason = NULL, report = NULL, \
          error_code = NULL, error_message = NULL, error_retryable = 0, dead = 0, \

@@ -17,6 +17,11 @@ pub(super) const FIRST_READY: &str = "SELECT priority, virtual_start, seq FROM j
     INDEXED BY jobs_ready WHERE state = 0 AND ready IS NOT NULL AND delayed = 0 AND device = ?1 \
     ORDER BY priority DESC, virtual_start, seq LIMIT 1";
 
+/// How often a store may fail for one job alone, and how long that one waits: half an hour in all.
+const MAX_DELAYS: u32 = 13;
+const FIRST_DELAY: Duration = Duration::from_millis(500);
+const LONGEST_DELAY: Duration = Duration::from_secs(300);
+
 /// A ready job's place: the lesser goes first.
 type Place = (core::cmp::Reverse<i64>, f64, i64);
 
@@ -175,6 +180,7 @@ pub(super) fn finish(
             let job = rows::get(connection, id)?;
             requeue_running(connection, effects, &job, Duration::ZERO)?
         }
+        Outcome::Delayed(error) => delay(connection, effects, options, &job, error)?,
         Outcome::Crashed(error) => crash(connection, effects, options, &job, error)?,
         Outcome::Failed(error) => fail(connection, effects, options, &job, error)?,
     };
@@ -201,6 +207,31 @@ pub(super) fn fail(
     let how = End {
         dead: error.retryable,
         error: Some(error),
+        ..End::default()
+    };
+    end(connection, effects, options, job, State::Failed, &how)
+}
+
+/// The store has failed for this job alone: it goes behind the others for a while, longer each time,
+/// and is given up in the end.
+fn delay(
+    connection: &Connection,
+    effects: &mut Effects,
+    options: &QueueOptions,
+    job: &Job,
+    error: JobError,
+) -> Result<State, QueueError> {
+    let sql = "UPDATE jobs SET delays = delays + 1 WHERE id = ?1 RETURNING delays";
+    let delays: u32 = connection
+        .prepare_cached(sql)?
+        .query_row([job.id.as_bytes()], |row| row.get(0))?;
+    if delays < MAX_DELAYS {
+        let longer = FIRST_DELAY.max(options.retry_delay) * (1 << delays.min(12));
+        return requeue_running(connection, effects, job, longer.min(LONGEST_DELAY));
+    }
+    let how = End {
+        error: Some(error),
+        dead: true,
         ..End::default()
     };
     end(connection, effects, options, job, State::Failed, &how)

@@ -17,7 +17,8 @@ mod tests;
 
 use std::collections::HashMap;
 use std::fs::{File, TryLockError};
-use std::path::Path;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -56,7 +57,28 @@ pub struct SqliteQueue {
     next_reader: AtomicU64,
     shared: Arc<Shared>,
     options: QueueOptions,
+    identity: i32,
+    files: Files,
     _lock: File,
+}
+
+/// The queue's files by name, and which they were when it was opened.
+struct Files([(PathBuf, (u64, u64)); 2]);
+
+impl Files {
+    fn of(paths: [PathBuf; 2]) -> std::io::Result<Self> {
+        let [one, other] = paths;
+        let which = |path: &Path| std::fs::metadata(path).map(|about| (about.dev(), about.ino()));
+        let (first, second) = (which(&one)?, which(&other)?);
+        Ok(Self([(one, first), (other, second)]))
+    }
+
+    /// Whether the names are still those of the same files: what is written to others is lost.
+    fn are_there(&self) -> bool {
+        self.0.iter().all(|(path, was)| {
+            std::fs::metadata(path).is_ok_and(|about| (about.dev(), about.ino()) == *was)
+        })
+    }
 }
 
 /// What the writing thread tells everybody else.
@@ -172,7 +194,10 @@ impl SqliteQueue {
             QueueError::Store(format!("cannot use {}: {error}", folder.display()))
         };
         std::fs::create_dir_all(folder).map_err(store)?;
-        let lock = File::create(folder.join("queue.lock")).map_err(store)?;
+        let lock_path = folder.join("queue.lock");
+        let mut options_of_lock = File::options();
+        let lock = options_of_lock.write(true).create(true).truncate(false);
+        let lock = lock.open(&lock_path).map_err(store)?;
         match lock.try_lock() {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => {
@@ -185,6 +210,7 @@ impl SqliteQueue {
         }
         let path = folder.join("queue.sqlite3");
         let connection = schema::open_writer(&path)?;
+        let identity = connection.pragma_query_value(None, "application_id", |row| row.get(0))?;
         let shared = Arc::new(Shared::new(events));
         let mut effects = Effects::default();
         connection.execute_batch("BEGIN IMMEDIATE")?;
@@ -203,6 +229,8 @@ impl SqliteQueue {
             writer: Writer::start(connection, options.clone(), Arc::clone(&shared))?,
             shared,
             options,
+            identity,
+            files: Files::of([path, lock_path]).map_err(store)?,
             _lock: lock,
         })
     }
@@ -444,6 +472,10 @@ impl Queue for SqliteQueue {
     }
 
     async fn probe(&self) -> Result<(), QueueError> {
+        if !self.files.are_there() {
+            let gone = "its files were removed or replaced while it was open".to_owned();
+            return Err(QueueError::Store(gone));
+        }
         let options = self.options.clone();
         self.writer
             .write(true, move |connection, _| {
@@ -451,6 +483,17 @@ impl Queue for SqliteQueue {
             })
             .await?;
         self.oldest_queued().await.map(drop)
+    }
+
+    async fn is_empty(&self) -> Result<bool, QueueError> {
+        let sql = "SELECT NOT EXISTS (SELECT 1 FROM jobs)";
+        let query =
+            move |connection: &Connection| Ok(connection.query_row(sql, [], |row| row.get(0))?);
+        self.read(query).await
+    }
+
+    fn identity(&self) -> i32 {
+        self.identity
     }
 
     async fn ended(&self) {

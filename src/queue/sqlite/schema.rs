@@ -11,7 +11,7 @@ use crate::queue::QueueError;
 use crate::storage::Fault;
 
 /// What this program reads and writes; kept in `user_version`.
-pub(super) const VERSION: i64 = 4;
+pub(super) const VERSION: i64 = 5;
 
 /// `due` is when the sweeper looks at a row next: the end of a queued job's time or of its delay,
 /// of a running job's lease, of an ended job's retention. `ready` is since when a job could be
@@ -41,6 +41,7 @@ CREATE TABLE jobs (
     attempt INTEGER NOT NULL,
     failures INTEGER NOT NULL,
     crashes INTEGER NOT NULL,
+    delays INTEGER NOT NULL,
     cost REAL NOT NULL,
     closes INTEGER NOT NULL,
     virtual_start REAL NOT NULL,
@@ -105,12 +106,20 @@ fn open(path: &std::path::Path) -> Result<Connection, QueueError> {
     Ok(connection)
 }
 
+/// A number that no other queue has, most likely: payloads lie elsewhere, and say whose they are.
+fn identity() -> i32 {
+    let bytes = *crate::job::JobId::fresh().as_bytes();
+    // The last bytes of a name are random; zero is what a file without an identity has.
+    i32::from_le_bytes([bytes[12], bytes[13], bytes[14], bytes[15] | 1])
+}
+
 fn migrate(connection: &mut Connection) -> Result<(), QueueError> {
     let transaction = connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
     let found: i64 = transaction.pragma_query_value(None, "user_version", |row| row.get(0))?;
     match found {
         0 => {
             transaction.execute_batch(TABLE)?;
+            transaction.pragma_update(None, "application_id", identity())?;
             transaction.pragma_update(None, "user_version", VERSION)?;
         }
         VERSION => {}

@@ -156,10 +156,10 @@ fn insert(
     let is_ready = is_pair && !turns::is_held_back(connection, submission.after)?;
     let sql = format!(
         "INSERT INTO jobs (id, tenant, kind, parent, place, pairs, pairs_left, priority, \
-         device, state, durable, delayed, attempt, failures, crashes, cost, virtual_start, virtual_finish, \
+         device, state, durable, delayed, attempt, failures, crashes, delays, cost, virtual_start, virtual_finish, \
          options, idempotency_key, fingerprint, created, deadline, expires, due, error_retryable, \
          dead, cancel_requested, backward, after, followed, ready, closes, sees_from, sees_to) \
-         VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?6, ?7, ?19, 0, ?8, 0, 0, 0, 0, \
+         VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?6, ?7, ?19, 0, ?8, 0, 0, 0, 0, 0, \
          ?9, ?10, ?11, ?12, ?13, ?14, ?15, ?16, ?17, ?18, 0, 0, 0, ?20, ?21, ?22, ?23, ?24, ?25, ?26) \
          RETURNING {COLUMNS}"
     );
