@@ -86,6 +86,9 @@ impl App {
         check_identity(queue.as_ref(), &blobs, may_be_new, &config).await?;
         warn_of_stranded_jobs(queue.as_ref(), lanes);
         let store_health = Arc::new(StoreHealth::default());
+        if let Some(free) = blobs.free_space() {
+            store_health.has_free(free);
+        }
         let store = Arc::new(StoreProbe::new(
             Arc::clone(&queue),
             blobs.clone(),
@@ -137,6 +140,7 @@ impl App {
                     .is_loopback()
                     .then(|| config.allowed_hosts.clone()),
             ),
+            store_health: Arc::clone(&store_health),
             limits: service_limits(&config.limits),
         }));
         let runtime = Arc::new(Heartbeat::default());

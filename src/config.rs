@@ -620,7 +620,7 @@ mod tests {
             ("[queue]\nlease_seconds = 0", "lease_seconds"),
             (
                 "[[keys]]\ntenant = \"a\"\nrole = \"root\"\nkey = \"x\"",
-                "root",
+                "one of read, write",
             ),
         ] {
             let error = load(text).expect_err(text).to_string();

@@ -2,9 +2,12 @@
 //! can be written. It must not know what a loop does or where the store lies.
 
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use tokio::sync::watch;
+
+use crate::storage::FreeSpace;
 
 /// How often a loop gives a sign of life.
 pub const HEARTBEAT: Duration = Duration::from_secs(1);
@@ -56,6 +59,8 @@ impl Heartbeat {
 #[derive(Debug)]
 pub struct StoreHealth {
     trouble: watch::Sender<Option<String>>,
+    /// What could still be written, and when that was looked at.
+    free: Mutex<Option<(Instant, FreeSpace)>>,
     needed: AtomicU64,
 }
 
@@ -63,6 +68,7 @@ impl Default for StoreHealth {
     fn default() -> Self {
         Self {
             trouble: watch::Sender::new(None),
+            free: Mutex::default(),
             needed: AtomicU64::new(0),
         }
     }
@@ -93,6 +99,17 @@ impl StoreHealth {
         if self.trouble.send_replace(None).is_some() {
             tracing::info!("the store works again");
         }
+    }
+
+    /// So much can still be written.
+    pub fn has_free(&self, free: FreeSpace) {
+        *self.free.lock().unwrap_or_else(PoisonError::into_inner) = Some((Instant::now(), free));
+    }
+
+    /// What could still be written at the last look, and its age; none before the first.
+    pub fn free(&self) -> Option<(Duration, FreeSpace)> {
+        let free = *self.free.lock().unwrap_or_else(PoisonError::into_inner);
+        free.map(|(looked, free)| (looked.elapsed(), free))
     }
 
     /// What is wrong, if anything is.

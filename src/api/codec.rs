@@ -168,6 +168,22 @@ fn with_report(json: &[u8], report: &Report, job: &str) -> Result<Vec<u8>, ApiEr
     Ok(bytes)
 }
 
+/// Bytes that the clouds of a file take when they are read: a point, and a mask of it.
+///
+/// # Errors
+/// [`ApiError::BadInput`] or [`ApiError::TooLarge`], which name the part and what is wrong in it.
+pub(super) fn unfolded_bytes(
+    part: &str,
+    bytes: &[u8],
+    name: Option<&str>,
+    most: usize,
+) -> Result<u64, ApiError> {
+    const ROW: u64 = size_of::<crate::flow::Point>() as u64 + 1;
+    let rows = formats::declared_rows(bytes, name).map_err(|error| in_part(part, error))?;
+    // Of several arrays in one file no more are read than two clouds and their masks.
+    Ok(rows.min(4 * most) as u64 * ROW)
+}
+
 /// One cloud of any format, of at most `most` points.
 ///
 /// # Errors

@@ -10,6 +10,7 @@ use super::auth::Caller;
 use super::dense::Closing;
 use super::error::ApiError;
 use super::service::{MakeDurable, Service};
+use super::uploads::Room;
 use super::waiters::Awaited;
 use crate::clock::Timestamp;
 use crate::cost::CostModel;
@@ -69,7 +70,8 @@ pub(super) struct Draft {
     frames: u32,
     /// Points of each cloud.
     points: Vec<usize>,
-    last: Option<Arc<StoredCloud>>,
+    /// The last cloud, and the room that it takes until the next one is there.
+    last: Option<(Arc<StoredCloud>, Option<Room>)>,
     /// What each two clouds that follow each other cost alone, where they are a pair.
     prices: Vec<Option<Price>>,
     fingerprint: blake3::Hasher,
@@ -142,6 +144,7 @@ impl Draft {
     pub(super) async fn push(
         &mut self,
         cloud: impl Into<Arc<StoredCloud>>,
+        room: Option<Room>,
     ) -> Result<Arc<StoredCloud>, ApiError> {
         let cloud = cloud.into();
         let service = Arc::clone(&self.service);
@@ -157,7 +160,7 @@ impl Draft {
         if self.request.options.densify.is_some() {
             service.admission.check_dense(&self.points)?;
         }
-        let before = self.last.take();
+        let (before, _room_before) = self.last.take().unzip();
         let options = self.request.options.clone();
         let after = self.request.link.and_then(|link| link.after);
         let goes_on = options.goes_on() && (self.frames > 1 || after.is_some());
@@ -182,7 +185,7 @@ impl Draft {
             }
         };
         let (price, asked, bytes, cloud) = service.compute(work).await?;
-        self.last = Some(Arc::clone(&cloud));
+        self.last = Some((Arc::clone(&cloud), room));
         if self.frames > 0 {
             self.prices.push(price);
         }

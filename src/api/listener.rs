@@ -16,9 +16,9 @@ use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::body::Body;
-use hyper::Request;
 use hyper::body::Incoming;
 use hyper::service::service_fn;
+use hyper::{Method, Request, Uri};
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto::Builder;
 use rustls::pki_types::pem::PemObject;
@@ -310,6 +310,15 @@ async fn converse(
     }
 }
 
+/// Whether a request only looks on at a job or at health: event streams, long polls and the like,
+/// which their clients take up again where they were cut off.
+fn looks_on(method: &Method, uri: &Uri) -> bool {
+    let (path, query) = (uri.path(), uri.query().unwrap_or_default());
+    let polls = query.split('&').any(|one| one.starts_with("wait="));
+    let reads = method == Method::GET && (polls || path.ends_with("/events"));
+    reads || path.ends_with("/WatchJob") || path.ends_with("Health/Watch")
+}
+
 /// What answers, and the room that answers have.
 type Served = (Router, Arc<Semaphore>);
 
@@ -342,7 +351,7 @@ async fn answer<S>(
         .keep_alive_timeout(PING_TIMEOUT);
     let peer = Arc::clone(&entry.connection);
     let service = service_fn(move |request: Request<Incoming>| {
-        let open = peer.begin();
+        let open = peer.begin(looks_on(request.method(), request.uri()));
         let mut request = request.map(|body| Body::new(RequestBody::new(body)));
         request.extensions_mut().insert(Arc::clone(&peer));
         let answering = router.clone().oneshot(request);

@@ -17,6 +17,7 @@ use super::error::ApiError;
 use super::origin::Hosts;
 use super::uploads::{UploadLimits, Uploads};
 use super::waiters::{Awaited, Ending, Waiters};
+use crate::health::StoreHealth;
 use crate::job::{Job, JobId, JobOptions, Kind, Priority, Report, State};
 use crate::metrics::Metrics;
 use crate::payload::{StoredCloud, StoredFlow};
@@ -25,6 +26,9 @@ use crate::storage::{Blob, BlobError, Blobs, FreeSpace};
 
 /// Archives and clouds that are sent at a time.
 const MAX_ARCHIVES: usize = 16;
+
+/// Nobody has seen the disk for so long: it hangs.
+const OLD: Duration = Duration::from_secs(15);
 
 /// What a request may cost the doors.
 #[derive(Clone, Debug)]
@@ -55,6 +59,7 @@ pub struct Service {
     pub(super) metrics: Arc<Metrics>,
     pub(super) keys: Keys,
     pub(super) hosts: Hosts,
+    store_health: Arc<StoreHealth>,
     pub(super) limits: ServiceLimits,
     pub(super) uploads: Arc<Uploads>,
     pub(super) answers: Answers,
@@ -88,6 +93,8 @@ pub struct Parts {
     pub keys: Keys,
     /// Under which names it may be called where there are no keys.
     pub hosts: Hosts,
+    /// Whether the store works, and what can still be written.
+    pub store_health: Arc<StoreHealth>,
     /// What a request may cost.
     pub limits: ServiceLimits,
 }
@@ -158,6 +165,7 @@ impl Service {
             metrics: parts.metrics,
             keys: parts.keys,
             hosts: parts.hosts,
+            store_health: parts.store_health,
             limits: parts.limits,
             compute: Semaphore::new(cores),
             encoding: Semaphore::new(cores),
@@ -226,10 +234,10 @@ impl Service {
         done.map_err(ApiError::internal)?
     }
 
-    /// Refuses more where the disk is nearly full, of bytes or of files.
+    /// Refuses more where the disk is nearly full, of bytes or of files, or does not answer.
     ///
     /// # Errors
-    /// [`ApiError::DiskFull`].
+    /// [`ApiError::DiskFull`] or [`ApiError::StoreUnavailable`].
     pub(super) fn check_disk(&self) -> Result<(), ApiError> {
         let limits = &self.limits;
         let is_full = |free: FreeSpace| {
@@ -238,10 +246,12 @@ impl Service {
                 .is_some_and(|free| free < limits.min_free_inodes);
             free.bytes < limits.min_free_bytes || no_files
         };
-        if self.blobs.free_space().is_some_and(is_full) {
-            return Err(ApiError::DiskFull);
+        match self.store_health.free() {
+            _ if self.store_health.trouble().is_some() => Err(ApiError::StoreUnavailable),
+            Some((age, _)) if age > OLD => Err(ApiError::StoreUnavailable),
+            Some((_, free)) if is_full(free) => Err(ApiError::DiskFull),
+            _ => Ok(()),
         }
-        Ok(())
     }
 
     /// Refuses a caller whose job would be refused however small it is, before its clouds are

@@ -65,6 +65,7 @@ fn service(folder: &std::path::Path) -> Arc<Service> {
         metrics: Arc::new(Metrics::new(&["cpu"])),
         keys: Keys::default(),
         hosts: Hosts(None),
+        store_health: Arc::default(),
         limits: ServiceLimits {
             max_upload_bytes: 1 << 20,
             max_uploads_bytes: 1 << 20,

@@ -74,23 +74,21 @@ impl Uploads {
             tenant: tenant.clone(),
             held: None,
             bytes: 0,
-            began: Instant::now(),
+            began: None,
             credit: self.limits.idle,
         }
     }
 
     /// Ends the longest pause, if it is long enough: of one tenant, or of whoever holds most.
     fn end_a_pause(&self, of: Option<&Tenant>) {
-        let most = || {
-            let held = locked(&self.held);
-            let most = held.iter().max_by_key(|(_, units)| **units);
-            most.map(|(tenant, _)| tenant.clone())
-        };
-        let Some(tenant) = of.cloned().or_else(most) else {
-            return;
+        let held = locked(&self.held).clone();
+        let most = held.values().max().copied();
+        let may_end = |tenant: &Tenant| match of {
+            Some(of) => tenant == of,
+            None => held.get(tenant).copied() == most,
         };
         let mut paused = locked(&self.paused);
-        let own = (0..paused.len()).filter(|&place| paused[place].tenant == tenant);
+        let own = (0..paused.len()).filter(|&place| may_end(&paused[place].tenant));
         if let Some(place) = own.min_by_key(|&place| paused[place].since)
             && paused[place].since.elapsed() >= self.limits.idle
         {
@@ -117,7 +115,8 @@ pub(super) struct Room {
     tenant: Tenant,
     held: Option<OwnedSemaphorePermit>,
     bytes: u64,
-    began: Instant,
+    /// When its first byte came.
+    began: Option<Instant>,
     /// Time that it may still be silent; bytes earn more, up to what it began with.
     credit: Duration,
 }
@@ -127,6 +126,11 @@ impl Room {
     pub(super) fn next(&mut self) -> Self {
         let next = self.uploads.room(&self.tenant);
         std::mem::replace(self, next)
+    }
+
+    /// Room beside this one, of the same tenant.
+    pub(super) fn another(&self) -> Self {
+        self.uploads.room(&self.tenant)
     }
 
     /// Takes room for `bytes` more.
@@ -144,10 +148,20 @@ impl Room {
             )));
         }
         self.uploads.metrics.uploaded(bytes);
+        self.began.get_or_insert_with(Instant::now);
         let earned = Duration::from_secs_f64(bytes as f64 / LEAST_BYTES_PER_SECOND);
         self.credit = (self.credit + earned).min(limits.idle);
-        // Whole units of all bytes so far: small pieces must not cost more than large ones.
-        let more = self.bytes.div_ceil(UNIT).saturating_sub(self.units());
+        self.hold(self.bytes)
+    }
+
+    /// Takes room until it holds `bytes`: of a body so far, or of what it is unfolded to.
+    ///
+    /// # Errors
+    /// [`ApiError::ServerFull`].
+    pub(super) fn hold(&mut self, bytes: u64) -> Result<(), ApiError> {
+        let limits = self.uploads.limits;
+        // Whole units of all bytes: small pieces must not cost more than large ones.
+        let more = bytes.div_ceil(UNIT).saturating_sub(self.units());
         let full = || ApiError::ServerFull(Duration::from_secs(1));
         {
             let mut held = locked(&self.uploads.held);
@@ -185,9 +199,8 @@ impl Room {
     /// # Errors
     /// [`ApiError::TooSlow`].
     pub(super) async fn wait<T>(&mut self, more: impl Future<Output = T>) -> Result<T, ApiError> {
-        let left = LONGEST
-            .saturating_sub(self.began.elapsed())
-            .min(self.credit);
+        let lasted = self.began.map_or(Duration::ZERO, |began| began.elapsed());
+        let left = LONGEST.saturating_sub(lasted).min(self.credit);
         let began = Instant::now();
         let came = tokio::time::timeout(left, more).await;
         self.credit = self.credit.saturating_sub(began.elapsed());

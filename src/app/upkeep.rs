@@ -45,6 +45,7 @@ pub(super) fn start(
     let (store, heartbeat) = (Arc::clone(health.0), Arc::clone(health.1));
     let mut tasks = JoinSet::new();
     tasks.spawn(beat(heartbeat));
+    tasks.spawn(watch_space(blobs.clone(), Arc::clone(&store)));
     tasks.spawn(probe(store, Arc::clone(metrics)));
     tasks.spawn(listen(blobs.clone(), Arc::clone(metrics), heard));
     tasks.spawn(look(devices.to_vec(), Arc::clone(metrics)));
@@ -70,6 +71,18 @@ async fn beat(heartbeat: Arc<Heartbeat>) {
     loop {
         ticks.tick().await;
         heartbeat.beat();
+    }
+}
+
+/// Looks again and again what can still be written; a disk that hangs is waited for.
+async fn watch_space(blobs: Blobs, store: Arc<StoreProbe>) {
+    let mut ticks = interval(HEARTBEAT);
+    loop {
+        ticks.tick().await;
+        let blobs = blobs.clone();
+        if let Ok(Some(free)) = tokio::task::spawn_blocking(move || blobs.free_space()).await {
+            store.health().has_free(free);
+        }
     }
 }
 

@@ -76,6 +76,30 @@ pub fn read_cloud_within(
     }
 }
 
+/// The rows that a file declares, of all its clouds and masks together: what it takes to read it.
+/// Nothing is unfolded for it.
+///
+/// # Errors
+/// As for [`read_cloud`], where a header cannot be read.
+pub fn declared_rows(bytes: &[u8], name: Option<&str>) -> Result<usize, FormatError> {
+    match recognize(bytes, name)? {
+        FileKind::Npy => npy::declared_rows(bytes),
+        FileKind::Npz => {
+            let mut npz = Npz::open(bytes)?;
+            let rows = npz
+                .names()
+                .into_iter()
+                .filter_map(|name| npz.header(&name).ok());
+            Ok(rows.fold(0_usize, |sum, header| sum.saturating_add(header.rows())))
+        }
+        FileKind::Ply => Ply::open(bytes)?.rows(),
+        FileKind::Pcd => Ok(Pcd::open(bytes)?.rows()),
+        FileKind::Feather => Ok(Table::open(bytes)?.rows()),
+        // Of floats as they are there is no more than bytes.
+        _ => Ok(bytes.len() / size_of::<Point>()),
+    }
+}
+
 fn read_npz(bytes: &[u8], most: usize) -> Result<Vec<Point>, FormatError> {
     let mut npz = Npz::open_within(bytes, most)?;
     if npz.has("pc1") && npz.has("pc2") {

@@ -29,7 +29,7 @@ mod ply;
 mod scalar;
 
 pub use camera::{KITTI_SIZE_PX, read_camera, read_camera0_from_lidar};
-pub use cloud::{Cloud, CloudFormat, read_cloud, read_cloud_within, write_cloud};
+pub use cloud::{Cloud, CloudFormat, declared_rows, read_cloud, read_cloud_within, write_cloud};
 pub use dense_file::{DENSE_FORMATS, DenseFormat, write_dense};
 pub use depth_png::{read_depth_png, write_depth_png};
 pub use error::{FileKind, FormatError};

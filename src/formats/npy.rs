@@ -295,6 +295,11 @@ pub(super) fn read_matrix<R: Read + ?Sized>(
     Ok(matrix)
 }
 
+/// Rows that a `.npy` file declares.
+pub(super) fn declared_rows(bytes: &[u8]) -> Result<usize, FormatError> {
+    Ok(Header::read(FileKind::Npy, &mut &bytes[..])?.rows())
+}
+
 /// Reads a whole `.npy` file of N x k floats, k >= 3, with at most `most` rows.
 pub(super) fn read_file(bytes: &[u8], most: usize) -> Result<Vec<Point>, FormatError> {
     let kind = FileKind::Npy;

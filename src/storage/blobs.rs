@@ -125,7 +125,8 @@ impl Blobs {
         })
     }
 
-    /// What can still be written; none where the system does not say.
+    /// What can still be written; none where the system does not say. It may wait for a disk that
+    /// hangs: not to be called where requests are answered.
     pub fn free_space(&self) -> Option<FreeSpace> {
         let filesystem = rustix::fs::statvfs(&*self.folder).ok()?;
         Some(FreeSpace {

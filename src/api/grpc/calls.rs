@@ -78,7 +78,7 @@ impl Calls {
             cloud.take(&self.service, &mut room, part, &chunk)?;
         }
         for (cloud, part) in clouds.into_iter().zip(["source", "target"]) {
-            draft.push(cloud.finish(part)?).await?;
+            draft.push(cloud.finish(part)?, None).await?;
         }
         let accepted = draft.submit(Kind::Pair).await?;
         Ok((accepted, (pause > 0).then(|| Duration::from_millis(pause))))
@@ -255,8 +255,7 @@ impl SceneFlow for Calls {
                 },
                 Some(Some(Part::Next(_))) | None => {
                     if let Some(cloud) = cloud.replace(CloudBuilder::default()) {
-                        draft.push(cloud.finish(&place)?).await?;
-                        drop(room.next());
+                        draft.push(cloud.finish(&place)?, Some(room.next())).await?;
                     }
                     if part.is_none() {
                         break;

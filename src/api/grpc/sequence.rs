@@ -247,7 +247,7 @@ impl Reader {
         let first_held = self.count - self.held.len();
         for place in sees {
             let cloud = &mut self.held[place - first_held].cloud;
-            *cloud = draft.push(Arc::clone(cloud)).await?;
+            *cloud = draft.push(Arc::clone(cloud), None).await?;
         }
         draft.submit(Kind::Pair).await
     }

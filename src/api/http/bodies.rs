@@ -135,17 +135,44 @@ impl Body {
         part: String,
         name: Option<String>,
         bytes: Vec<u8>,
-    ) -> Result<StoredCloud, ApiError> {
+    ) -> Result<(StoredCloud, Room), ApiError> {
         let most = self.service.admission.max_points();
+        let (room, part, bytes, name) = self.room_for(part, bytes, name, most).await?;
         let read = move || codec::read_cloud(&part, &bytes, name.as_deref(), most);
-        self.timed(read).await
+        Ok((self.timed(read).await?, room))
+    }
+
+    /// Takes room for what a file unfolds to, before it does: a small one may hold a large cloud.
+    async fn room_for(
+        &mut self,
+        part: String,
+        bytes: Vec<u8>,
+        name: Option<String>,
+        most: usize,
+    ) -> Result<(Room, String, Vec<u8>, Option<String>), ApiError> {
+        let price = move || {
+            let unfolded = codec::unfolded_bytes(&part, &bytes, name.as_deref(), most)?;
+            Ok((unfolded, part, bytes, name))
+        };
+        let (unfolded, part, bytes, name) = self.timed(price).await?;
+        let mut room = self.room.another();
+        room.hold(unfolded)?;
+        Ok((room, part, bytes, name))
     }
 
     /// Reads a file that holds both clouds.
-    pub(super) async fn pair(&mut self, bytes: Vec<u8>) -> Result<[StoredCloud; 2], ApiError> {
+    pub(super) async fn pair(
+        &mut self,
+        bytes: Vec<u8>,
+    ) -> Result<([StoredCloud; 2], Room), ApiError> {
         let most = self.service.admission.max_points();
-        self.timed(move || codec::read_pair("source", &bytes, most))
-            .await
+        let (room, part, bytes, _) = self
+            .room_for("source".to_owned(), bytes, None, most)
+            .await?;
+        let clouds = self
+            .timed(move || codec::read_pair(&part, &bytes, most))
+            .await?;
+        Ok((clouds, room))
     }
 
     async fn timed<T: Send + 'static>(
@@ -315,17 +342,20 @@ impl PairFiles {
             ))
         };
         let (name, bytes) = self.source.ok_or_else(|| missing("source"))?;
-        let clouds = match self.target {
-            Some((target_name, target)) => [
-                body.cloud("source".to_owned(), name, bytes).await?,
-                body.cloud("target".to_owned(), target_name, target).await?,
-            ],
-            None if formats::is_pair(&bytes) => body.pair(bytes).await?,
-            None => return Err(missing("target")),
+        let Some((target_name, target)) = self.target else {
+            if !formats::is_pair(&bytes) {
+                return Err(missing("target"));
+            }
+            let ([source, target], _room) = body.pair(bytes).await?;
+            draft.push(source, None).await?;
+            draft.push(target, None).await?;
+            return Ok(());
         };
-        for cloud in clouds {
-            draft.push(cloud).await?;
-        }
+        // One after the other: a request does not hold one file's cloud while it waits with another.
+        let (source, room) = body.cloud("source".to_owned(), name, bytes).await?;
+        draft.push(source, Some(room)).await?;
+        let (target, room) = body.cloud("target".to_owned(), target_name, target).await?;
+        draft.push(target, Some(room)).await?;
         Ok(())
     }
 }

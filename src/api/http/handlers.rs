@@ -289,7 +289,8 @@ async fn read_job(
                     }
                 };
                 let place = format!("frame {}", draft.frames());
-                draft.push(body.cloud(place, name, bytes).await?).await?;
+                let (cloud, room) = body.cloud(place, name, bytes).await?;
+                draft.push(cloud, Some(room)).await?;
             }
             Part::File(part, name, bytes) => files.take(&part, name, bytes)?,
         }

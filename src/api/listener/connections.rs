@@ -31,13 +31,21 @@ pub(in crate::api) struct Connection {
 struct State {
     /// Whose key it has shown.
     tenant: Option<Tenant>,
-    /// Requests that are being answered, and when a piece of each one's answer was handed over.
-    requests: HashMap<u64, Option<Instant>>,
+    /// Requests that are being answered.
+    requests: HashMap<u64, Open>,
     next: u64,
     /// Since when there is none.
     idle_since: Instant,
     /// When a piece of any answer was taken last.
     taken: Instant,
+}
+
+/// A request that is being answered.
+struct Open {
+    /// When a piece of its answer was handed over that has not been taken yet.
+    handed: Option<Instant>,
+    /// Whether it only looks on, and its client can come back for it at any time.
+    looks_on: bool,
 }
 
 /// How long a connection may be without what it is for.
@@ -113,8 +121,9 @@ impl Connections {
     }
 
     /// Ends the connection that is needed least, so that another one has room: one that has shown no
-    /// key, else one without a request; the oldest of several. One that works for somebody is never
-    /// ended for one that has shown nothing yet. False where there is none.
+    /// key, else one without a request, else one that only looks on; the oldest of several. One that
+    /// works for somebody is never ended for one that has shown nothing yet. False where there is
+    /// none.
     pub(super) fn make_room(&self) -> bool {
         let mut open = locked(&self.open);
         let rank = |connection: &Connection| {
@@ -123,6 +132,7 @@ impl Connections {
                 (None, true) => Some(0),
                 (None, false) => Some(1),
                 (Some(_), true) => Some(2),
+                (Some(_), false) if state.requests.values().all(|open| open.looks_on) => Some(3),
                 (Some(_), false) => None,
             }
         };
@@ -166,12 +176,16 @@ impl Connection {
         self.evicted.cancelled().await;
     }
 
-    /// A request begins; it ends when the guard is dropped.
-    pub(super) fn begin(self: &Arc<Self>) -> OpenRequest {
+    /// A request begins, which may only look on at a job; it ends when the guard is dropped.
+    pub(super) fn begin(self: &Arc<Self>, looks_on: bool) -> OpenRequest {
         let mut state = locked(&self.state);
         let number = state.next;
         state.next += 1;
-        state.requests.insert(number, None);
+        let open = Open {
+            handed: None,
+            looks_on,
+        };
+        state.requests.insert(number, open);
         OpenRequest {
             connection: Arc::clone(self),
             number,
@@ -183,7 +197,7 @@ impl Connection {
     pub(super) fn verdict(&self, patience: &Patience) -> Verdict {
         let state = locked(&self.state);
         // One stream that its reader has paused does not end those beside it.
-        let mut handed = state.requests.values().flatten();
+        let mut handed = state.requests.values().filter_map(|open| open.handed);
         let waits = handed.any(|at| at.elapsed() >= patience.unread);
         if waits && state.taken.elapsed() >= patience.unread {
             return Verdict::End;
@@ -212,11 +226,13 @@ impl OpenRequest {
     /// A piece of the answer was handed over, or (none) the piece before has been taken.
     pub(super) fn handed(&self, at: Option<Instant>) {
         let at = at.filter(|_| !self.may_wait.load(Ordering::Relaxed));
-        if let Some(request) = locked(&self.connection.state)
-            .requests
-            .get_mut(&self.number)
-        {
-            *request = at;
+        let mut state = locked(&self.connection.state);
+        let Some(request) = state.requests.get_mut(&self.number) else {
+            return;
+        };
+        let before = std::mem::replace(&mut request.handed, at);
+        if before.is_some() && at.is_none() {
+            state.taken = Instant::now();
         }
     }
 }
@@ -261,7 +277,7 @@ mod tests {
         assert_eq!(connection.verdict(&PATIENCE), Verdict::Keep);
         assert_eq!(connection.verdict(&idle), Verdict::Close);
         assert_eq!(connection.verdict(&unknown), Verdict::End);
-        let request = connection.begin();
+        let request = connection.begin(false);
         assert!(connection.is_known(&Tenant::default(), false));
         for patience in [idle, unknown, unread] {
             assert_eq!(connection.verdict(&patience), Verdict::Keep);
@@ -275,7 +291,7 @@ mod tests {
             unread: Duration::from_millis(100),
             ..PATIENCE
         };
-        let stalled = connection.begin();
+        let stalled = connection.begin(false);
         stalled.handed(Some(Instant::now()));
         for _ in 0..4 {
             std::thread::sleep(Duration::from_millis(40));
@@ -294,14 +310,17 @@ mod tests {
         let connections = Arc::new(Connections::new(4));
         let tenant = |name: &str| name.parse::<Tenant>().expect("a good name");
         let [works, idle] = [connections.enter(), connections.enter()];
-        let _request = works.connection.begin();
+        let _request = works.connection.begin(false);
         for entry in [&works, &idle] {
             assert!(entry.connection.is_known(&tenant("a"), true));
         }
+        let follows = connections.enter();
+        assert!(follows.connection.is_known(&tenant("a"), true));
+        let _events = follows.connection.begin(true);
         let [waits, unknown] = [connections.enter(), connections.enter()];
-        let _request_of_nobody = waits.connection.begin();
+        let _request_of_nobody = waits.connection.begin(false);
         let is_evicted = |entry: &Entry| entry.connection.evicted.is_cancelled();
-        for gone in [&unknown, &waits, &idle] {
+        for gone in [&unknown, &waits, &idle, &follows] {
             assert!(!is_evicted(gone));
             assert!(connections.make_room());
             assert!(is_evicted(gone));
@@ -317,7 +336,7 @@ mod tests {
         let mut held = Vec::new();
         let mut asks = |name: &str, several: bool| {
             let entry = connections.enter();
-            let request = entry.connection.begin();
+            let request = entry.connection.begin(false);
             let may = entry.connection.is_known(&tenant(name), several);
             held.push((entry, request));
             may

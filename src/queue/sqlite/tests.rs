@@ -65,11 +65,11 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
         connection
             .execute(
                 "INSERT INTO jobs (id, tenant, kind, place, pairs, pairs_left, priority, state, \
-                 durable, delayed, attempt, failures, crashes, cost, virtual_start, \
+                 durable, delayed, attempt, failures, crashes, delays, cost, virtual_start, \
                  virtual_finish, options, created, expires, due, error_retryable, dead, \
                  cancel_requested, device, backward, after, followed, ready, closes, \
                  sees_from, sees_to) \
-                 VALUES (?1, 't', 0, 0, 0, 0, ?2, 0, 1, 0, 0, 0, 0, \
+                 VALUES (?1, 't', 0, 0, 0, 0, ?2, 0, 1, 0, 0, 0, 0, 0, \
                  1.0, ?1, ?1 + 1, '{}', ?1, 9, 9, 0, 0, 0, ?3, 0, ?1, 0, ?1, 0, 0, 2)",
                 params![row, row % 3, row / 3 % 3],
             )

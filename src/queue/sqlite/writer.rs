@@ -204,6 +204,16 @@ fn run(
     }
 }
 
+/// Refuses to go on where the transaction is gone: SQLite takes all of it back when a statement meets
+/// a fault of the disk or of memory, and what came next would stand alone.
+fn check_transaction(connection: &Connection) -> Result<(), QueueError> {
+    if connection.is_autocommit() {
+        let gone = "a fault has taken the transaction back".to_owned();
+        return Err(QueueError::Store(gone));
+    }
+    Ok(())
+}
+
 /// One transaction over all commands.
 fn transact(
     connection: &Connection,
@@ -220,8 +230,55 @@ fn transact(
     connection.prepare_cached("BEGIN IMMEDIATE")?.execute([])?;
     for command in commands {
         replies.push((command.change)(connection, effects));
+        check_transaction(connection)?;
     }
     sweep(effects);
+    check_transaction(connection)?;
     connection.prepare_cached("COMMIT")?.execute([])?;
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nothing_of_a_batch_stands_whose_transaction_is_gone() {
+        let connection = Connection::open_in_memory().expect("a database");
+        connection
+            .execute_batch("CREATE TABLE t (x)")
+            .expect("a table");
+        let insert = |connection: &Connection, _: &mut Effects| -> Reply {
+            let done = in_savepoint(connection, || {
+                Ok(connection.execute("INSERT INTO t VALUES (1)", [])?)
+            });
+            Box::new(move |committed| assert!(committed.and(done.map(drop)).is_err()))
+        };
+        // What SQLite does by itself when it meets a fault of the disk.
+        let fault = |connection: &Connection, _: &mut Effects| -> Reply {
+            connection.execute_batch("ROLLBACK").expect("a transaction");
+            Box::new(|committed| assert!(committed.is_err()))
+        };
+        let changes: [Change; 3] = [Box::new(insert), Box::new(fault), Box::new(insert)];
+        let commands = changes.map(|change| Command {
+            durable: false,
+            change,
+        });
+        let mut replies = Vec::new();
+        let done = transact(
+            &connection,
+            commands.into(),
+            &mut Effects::default(),
+            &mut replies,
+            |_| {},
+        );
+        assert!(done.is_err() && replies.len() == 2);
+        for reply in replies {
+            reply(done.clone());
+        }
+        let rows: i64 = connection
+            .query_row("SELECT count(*) FROM t", [], |row| row.get(0))
+            .expect("a number");
+        assert_eq!(rows, 0);
+    }
 }
