@@ -3,15 +3,18 @@
 //!
 //! It must not know what its values do; each part of the server has options of its own.
 
-use std::fmt;
+mod ranges;
+mod secret;
+
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use figment::Figment;
-use figment::error::Kind;
 use figment::providers::{Env, Format, Serialized, Toml};
-use serde::de::Visitor;
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde::{Deserialize, Serialize};
+
+pub use self::secret::Secret;
+use self::secret::wrong_values;
 
 use crate::api::Role;
 use crate::job::Priority;
@@ -191,87 +194,6 @@ pub enum LogFormat {
     Json,
 }
 
-/// Text that is never shown.
-#[derive(Clone)]
-pub struct Secret(String);
-
-impl Secret {
-    /// The text itself.
-    pub fn reveal(&self) -> &str {
-        &self.0
-    }
-}
-
-impl fmt::Debug for Secret {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("***")
-    }
-}
-
-impl Serialize for Secret {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str("***")
-    }
-}
-
-impl<'de> Deserialize<'de> for Secret {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        deserializer.deserialize_any(SecretVisitor)
-    }
-}
-
-/// Reads text, and says of anything else no more than that it is none.
-struct SecretVisitor;
-
-/// A value that is no text, without saying it.
-fn no_text<E: serde::de::Error>() -> E {
-    E::custom("a key is text: put it in quotes")
-}
-
-impl<'de> Visitor<'de> for SecretVisitor {
-    type Value = Secret;
-
-    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("text")
-    }
-
-    fn visit_str<E: serde::de::Error>(self, text: &str) -> Result<Secret, E> {
-        Ok(Secret(text.to_owned()))
-    }
-
-    fn visit_bool<E: serde::de::Error>(self, _: bool) -> Result<Secret, E> {
-        Err(no_text())
-    }
-
-    fn visit_i64<E: serde::de::Error>(self, _: i64) -> Result<Secret, E> {
-        Err(no_text())
-    }
-
-    fn visit_u64<E: serde::de::Error>(self, _: u64) -> Result<Secret, E> {
-        Err(no_text())
-    }
-
-    fn visit_i128<E: serde::de::Error>(self, _: i128) -> Result<Secret, E> {
-        Err(no_text())
-    }
-
-    fn visit_u128<E: serde::de::Error>(self, _: u128) -> Result<Secret, E> {
-        Err(no_text())
-    }
-
-    fn visit_f64<E: serde::de::Error>(self, _: f64) -> Result<Secret, E> {
-        Err(no_text())
-    }
-
-    fn visit_char<E: serde::de::Error>(self, one: char) -> Result<Secret, E> {
-        Ok(Secret(one.into()))
-    }
-
-    fn visit_some<D: Deserializer<'de>>(self, inner: D) -> Result<Secret, D::Error> {
-        inner.deserialize_any(self)
-    }
-}
-
 impl Default for Config {
     fn default() -> Self {
         const DAY: u64 = 24 * 60 * 60;
@@ -432,96 +354,6 @@ impl Config {
         Ok(())
     }
 
-    /// Every number with the least and the most that it may be: past these, units wrap around and
-    /// timers end.
-    fn ranges(&self) -> [(&'static str, u64, u64, u64); 24] {
-        const YEARS: u64 = 100 * 365 * 24 * 3600;
-        const MIB: u64 = 1 << 43;
-        let Self {
-            limits,
-            queue,
-            drain,
-            ..
-        } = self;
-        let count = |count: usize| count as u64;
-        [
-            ("limits.max_points", count(limits.max_points), 1, 50_000_000),
-            ("limits.max_pair_mib", count(limits.max_pair_mib), 1, MIB),
-            ("limits.max_upload_mib", limits.max_upload_mib, 1, MIB),
-            ("limits.max_uploads_mib", limits.max_uploads_mib, 1, MIB),
-            ("limits.max_answers_mib", limits.max_answers_mib, 1, MIB),
-            ("limits.min_free_mib", limits.min_free_mib, 0, MIB),
-            ("limits.min_free_inodes", limits.min_free_inodes, 0, 1 << 40),
-            ("limits.max_frames", limits.max_frames.into(), 2, 1 << 20),
-            ("limits.max_wait_seconds", limits.max_wait_seconds, 0, YEARS),
-            (
-                "limits.max_queue_seconds",
-                limits.max_queue_seconds,
-                0,
-                YEARS,
-            ),
-            (
-                "limits.max_tenant_queue_seconds",
-                limits.max_tenant_queue_seconds,
-                0,
-                YEARS,
-            ),
-            (
-                "limits.max_connections",
-                count(limits.max_connections),
-                1,
-                1 << 20,
-            ),
-            (
-                "limits.header_timeout_seconds",
-                limits.header_timeout_seconds,
-                1,
-                3600,
-            ),
-            (
-                "limits.body_timeout_seconds",
-                limits.body_timeout_seconds,
-                1,
-                3600,
-            ),
-            (
-                "limits.write_timeout_seconds",
-                limits.write_timeout_seconds,
-                1,
-                3600,
-            ),
-            (
-                "limits.sequence_ahead",
-                count(limits.sequence_ahead),
-                1,
-                1000,
-            ),
-            ("queue.max_attempts", queue.max_attempts.into(), 1, 1000),
-            ("queue.max_crashes", queue.max_crashes.into(), 1, 1000),
-            ("queue.lease_seconds", queue.lease_seconds, 1, YEARS),
-            (
-                "queue.retry_delay_seconds",
-                queue.retry_delay_seconds,
-                0,
-                YEARS,
-            ),
-            (
-                "queue.time_to_live_seconds",
-                queue.time_to_live_seconds,
-                1,
-                YEARS,
-            ),
-            ("queue.retention_seconds", queue.retention_seconds, 0, YEARS),
-            (
-                "queue.answered_retention_seconds",
-                queue.answered_retention_seconds,
-                0,
-                YEARS,
-            ),
-            ("drain.deadline_seconds", drain.deadline_seconds, 0, YEARS),
-        ]
-    }
-
     /// The configuration as TOML, secrets left out.
     ///
     /// # Errors
@@ -537,27 +369,6 @@ impl Config {
         }
         toml::to_string_pretty(&shown).map_err(|error| ConfigError::Together(error.to_string()))
     }
-}
-
-/// What is wrong, key by key. What was found in a key's place is never said: it may be the key.
-fn wrong_values(error: figment::Error) -> String {
-    const SECRET: [&str; 3] = ["api_key", "keys", "tls"];
-    let said = error.into_iter().map(|mut error| {
-        let is_secret = error.path.first();
-        if !is_secret.is_some_and(|first| SECRET.contains(&first.as_str())) {
-            return error.to_string();
-        }
-        let needed = match &error.kind {
-            Kind::InvalidType(_, needed) | Kind::InvalidValue(_, needed) => needed.clone(),
-            Kind::UnknownVariant(_, known) => format!("one of {}", known.join(", ")),
-            _ => return error.to_string(),
-        };
-        let path = error.path.join(".");
-        let source = error.metadata.take();
-        let source = source.map_or(String::new(), |source| format!(", in {}", source.name));
-        format!("{path} is something else than {needed}{source}")
-    });
-    said.collect::<Vec<_>>().join("; ")
 }
 
 #[cfg(test)]

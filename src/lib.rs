@@ -26,6 +26,8 @@ pub mod cost;
 #[cfg(feature = "service")]
 pub mod engine;
 #[cfg(feature = "service")]
+pub mod fault;
+#[cfg(feature = "service")]
 pub mod formats;
 #[cfg(feature = "service")]
 pub mod health;

@@ -3,6 +3,7 @@
 //! One for each lane of a device. The only room that sees both the queue and the engine. The result is in
 //! store before the queue hears of it, and only the attempt that holds the job counts.
 
+mod commit;
 mod company;
 mod dense;
 mod inputs;
@@ -14,13 +15,11 @@ mod tests;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bytes::Bytes;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
 pub use self::company::Company;
 use self::company::Inside;
-use self::inputs::StoreError;
 pub use self::probe::StoreProbe;
 use crate::clock::Timestamp;
 use crate::cost::CostModel;
@@ -31,8 +30,8 @@ use crate::formats::MAX_COORDINATE_M;
 use crate::job::{DeviceKind, Job, JobError, JobProgress, Kind, Report};
 use crate::metrics::Metrics;
 use crate::payload::{StoredDense, StoredFlow};
-use crate::queue::{Committed, Lease, Outcome, Queue, QueueError, Signal};
-use crate::storage::{Blob, BlobError, Blobs, Fault, Sync};
+use crate::queue::{Lease, Outcome, Queue, QueueError, Signal};
+use crate::storage::Blobs;
 
 /// How a worker treats jobs.
 #[derive(Clone, Debug)]
@@ -336,109 +335,6 @@ impl Worker {
                 .learn(self.lane.kind(), job.cost_seconds, took.as_secs_f64());
         }
     }
-
-    /// Puts the result in store, then ends the attempt in the queue.
-    async fn commit(&self, lease: &Lease, attempt: Attempt) {
-        let job = &lease.job;
-        let began = Instant::now();
-        let outcome = match attempt {
-            Attempt::Lost => return,
-            Attempt::Ended(outcome) => outcome,
-            Attempt::Done(done) => self.store(lease, *done).await,
-        };
-        let succeeded = matches!(outcome, Outcome::Succeeded { .. });
-        match self.finish(lease, outcome).await {
-            Ok(Committed::Yes(state)) => {
-                if succeeded {
-                    self.metrics
-                        .phase("readback", began.elapsed().as_secs_f64(), Some(job));
-                }
-                if state.is_end()
-                    && let Err(error) = self.blobs.remove(job.id, Blob::Snapshot).await
-                {
-                    tracing::warn!(%error, job = %job.id, "a snapshot was not removed");
-                }
-            }
-            Ok(Committed::Fenced) => {
-                tracing::warn!(job = %job.id, attempt = job.attempt, "a late result was thrown away");
-                for blob in [Blob::Result(job.attempt), Blob::Field(job.attempt)] {
-                    if let Err(error) = self.blobs.remove(job.id, blob).await {
-                        tracing::warn!(%error, job = %job.id, "a late result was not removed");
-                    }
-                }
-            }
-            Err(error) => tracing::error!(%error, job = %job.id, "an outcome was not kept"),
-        }
-    }
-
-    /// Ends the attempt; tries again for as long as the store fails, since the flow is already there
-    /// and the fence makes it safe.
-    async fn finish(&self, lease: &Lease, outcome: Outcome) -> Result<Committed, QueueError> {
-        const FIRST_PAUSE: Duration = Duration::from_millis(100);
-        const LONGEST_PAUSE: Duration = Duration::from_secs(5);
-        let job = &lease.job;
-        let mut pause = FIRST_PAUSE;
-        loop {
-            let ended = self.queue.finish(job.id, job.attempt, outcome.clone());
-            let error = match ended.await {
-                Err(error) if error.is_of_the_machine() => error,
-                ended => return ended,
-            };
-            tracing::warn!(%error, job = %job.id, "an outcome is not kept yet");
-            self.store.health().failed(&error);
-            tokio::select! {
-                () = self.drain.release.cancelled() => return Err(error),
-                () = tokio::time::sleep(pause) => {}
-            }
-            lease.pulse.beat(None);
-            pause = (pause * 2).min(LONGEST_PAUSE);
-        }
-    }
-
-    /// Puts what an attempt has found in store, the field before the success that others wait for.
-    async fn store(&self, lease: &Lease, done: Done) -> Outcome {
-        let job = &lease.job;
-        let (result, field) = (done.result, done.field);
-        let packing = tokio::task::spawn_blocking(move || {
-            (result.to_bytes(), field.map(|field| field.to_bytes()))
-        });
-        let (result, field) = match packing.await {
-            Ok(packed) => packed,
-            Err(error) => return Outcome::Failed(failure("store", &error, true)),
-        };
-        let size = result.len() + field.as_ref().map_or(0, Vec::len);
-        let mut blobs = vec![(Blob::Result(job.attempt), result)];
-        blobs.extend(field.map(|field| (Blob::Field(job.attempt), field)));
-        let writing = blobs
-            .into_iter()
-            .map(|(blob, bytes)| self.put(lease, blob, bytes));
-        let stored = futures_util::future::try_join_all(writing).await;
-        match (stored, done.report) {
-            (Ok(_), Ok(report)) => Outcome::Succeeded {
-                stop_reason: done.stop_reason,
-                report,
-                progress: done.progress,
-            },
-            (Err(error), _) => {
-                tracing::error!(%error, job = %job.id, "a result was not kept");
-                self.store_failed(error.fault(), size as u64, &error).await
-            }
-            (_, Err(error)) => Outcome::Failed(failure("store", &error, true)),
-        }
-    }
-
-    /// Writes a blob of an attempt; what was promised is on disk then.
-    async fn put(&self, lease: &Lease, blob: Blob, bytes: Vec<u8>) -> Result<(), BlobError> {
-        let id = lease.job.id;
-        let promised = lease.pulse.is_durable();
-        let sync = if promised { Sync::Yes } else { Sync::No };
-        self.blobs.put(id, blob, Bytes::from(bytes), sync).await?;
-        if !promised && lease.pulse.is_durable() {
-            // It was promised while it was being written.
-            self.blobs.sync(id, blob).await?;
-        }
-        Ok(())
-    }
 }
 
 /// What an attempt has found.
@@ -509,40 +405,6 @@ fn out_of_range(flow: &[Point]) -> Option<JobError> {
         ),
         retryable: false,
     })
-}
-
-impl Worker {
-    /// What becomes of a job whose payload cannot be read.
-    async fn unreadable(&self, error: &StoreError) -> Outcome {
-        tracing::error!(%error, "the payload cannot be read");
-        let fault = match error {
-            StoreError::Blob(error) => error.fault(),
-            StoreError::Queue(error) if error.is_of_the_machine() => Fault::Machine,
-            _ => return Outcome::Failed(failure("store", error, false)),
-        };
-        self.store_failed(fault, 0, error).await
-    }
-
-    /// What becomes of a job that the store has failed: it waits for the machine without blame where
-    /// the store fails everybody, and goes behind the others where it fails this one alone.
-    async fn store_failed(
-        &self,
-        fault: Fault,
-        needed: u64,
-        error: &(dyn std::error::Error + core::marker::Sync),
-    ) -> Outcome {
-        if fault == Fault::Full {
-            self.store.health().needs(needed);
-        }
-        if !self.store.ask().await {
-            return Outcome::Released;
-        }
-        let error = failure("store", error, true);
-        match fault {
-            Fault::Missing => Outcome::Failed(error),
-            Fault::Full | Fault::Machine => Outcome::Delayed(error),
-        }
-    }
 }
 
 /// Gives signs of life for a job while it is in the store's hands and not a device's: the lease is

@@ -8,7 +8,6 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
-use axum::body::Body;
 use bytes::Bytes;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio_stream::wrappers::ReceiverStream;
@@ -314,11 +313,8 @@ impl Encoded {
         }
     }
 
-    /// A body that hands it on in pieces, and lets go of all of it when it has to make room.
-    pub(super) fn into_body(mut self) -> Body {
-        if self.bytes.len() <= PIECE {
-            return Body::from(self.bytes);
-        }
+    /// All of it in pieces, as they are taken; it lets go of all of it when it has to make room.
+    pub(super) fn into_pieces(mut self) -> ReceiverStream<Result<Bytes, std::io::Error>> {
         let (pieces, stream) = mpsc::channel::<Result<Bytes, std::io::Error>>(1);
         tokio::spawn(async move {
             while !self.bytes.is_empty() {
@@ -340,13 +336,13 @@ impl Encoded {
                 }
             }
         });
-        Body::from_stream(ReceiverStream::new(stream))
+        ReceiverStream::new(stream)
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use http_body_util::BodyExt;
+    use futures_util::StreamExt;
 
     use super::*;
 
@@ -386,18 +382,19 @@ mod tests {
     async fn the_slowest_reader_makes_room_and_the_whole_answer_with_it() {
         let answers = answers(false, Duration::ZERO);
         let a = tenant("a");
-        let made = |room: AnswerRoom| room.hold(vec![7; 400 * KIB]).into_body();
+        let made = |room: AnswerRoom| room.hold(vec![7; 400 * KIB]).into_pieces();
         let mut slow = made(answers.room(&a, 400 * KIB).await.expect("room"));
         let mut quick = made(answers.room(&a, 400 * KIB).await.expect("room"));
         for _ in 0..5 {
-            quick.frame().await.expect("a piece").expect("no error");
+            quick.next().await.expect("a piece").expect("no error");
         }
-        slow.frame().await.expect("a piece").expect("no error");
+        slow.next().await.expect("a piece").expect("no error");
         let third = answers.room(&a, 400 * KIB).await.expect("room");
-        let rest = slow.collect().await;
-        assert!(rest.is_err(), "it was ended");
-        let rest = quick.collect().await.expect("it was not");
-        assert_eq!(rest.to_bytes().len(), 400 * KIB - 5 * PIECE);
+        let rest: Vec<_> = slow.collect().await;
+        assert!(rest.last().is_some_and(Result::is_err), "it was ended");
+        let rest: Vec<_> = quick.collect().await;
+        let lengths = rest.into_iter().map(|piece| piece.expect("no error").len());
+        assert_eq!(lengths.sum::<usize>(), 400 * KIB - 5 * PIECE);
         drop(third);
     }
 

@@ -4,10 +4,11 @@
 
 use std::time::Duration;
 
+use crate::fault::Fault;
 use crate::formats::FormatError;
 use crate::job::{DeviceKind, InvalidId, InvalidOptions, JobError, JobId, Priority};
 use crate::queue::QueueError;
-use crate::storage::{BlobError, Fault};
+use crate::storage::BlobError;
 
 /// Why a request was refused, or its job gave no flow.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]

@@ -244,8 +244,8 @@ impl Listener {
                 accepted = self.listener.accept() => accepted,
                 _ = beats.tick() => continue,
             };
-            let stream = match accepted {
-                Ok((stream, _)) => stream,
+            let (stream, address) = match accepted {
+                Ok((stream, address)) => (stream, address.ip()),
                 Err(error) => {
                     // Out of file descriptors, mostly: those that are open will be closed.
                     tracing::warn!(%error, "a connection was not accepted");
@@ -257,7 +257,7 @@ impl Listener {
                 tracing::debug!("too many connections");
                 continue;
             };
-            let entry = table.enter();
+            let entry = table.enter(address);
             let (router, stop) = (router.clone(), stop.clone());
             let (tls, options) = (self.tls.clone(), self.options.clone());
             let answers = Arc::clone(&answers);

@@ -10,6 +10,7 @@ mod codec;
 mod dense;
 mod draft;
 mod error;
+mod results;
 mod service;
 mod uploads;
 mod waiters;

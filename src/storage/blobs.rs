@@ -15,7 +15,7 @@ use object_store::ObjectStoreExt;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
 
-use super::Fault;
+use crate::fault::Fault;
 use crate::job::JobId;
 
 /// Payloads, snapshots and results.

@@ -1,7 +1,5 @@
-//! Where payloads, snapshots and results lie, and whose fault it is when they cannot.
+//! Where payloads, snapshots and results lie.
 
 mod blobs;
-mod fault;
 
 pub use blobs::{Blob, BlobError, Blobs, FreeSpace, Sync};
-pub use fault::Fault;

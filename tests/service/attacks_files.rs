@@ -418,3 +418,37 @@ async fn a_file_with_more_points_than_the_server_takes_is_refused_before_it_is_u
     );
     siege.stands().await;
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn small_files_that_unfold_to_large_clouds_share_the_room_of_uploads() {
+    const POINTS: usize = 2_000_000;
+    let siege = Besieged::new("[limits]\nmax_uploads_mib = 64\nmax_upload_mib = 64\n").await;
+    let array = npy("'<f2'", &format!("({POINTS}, 3)"), &vec![0; 6 * POINTS]);
+    let file = zip(&[("points.npy", &array)]);
+    assert!(file.len() < 1 << 20, "{}", file.len());
+    let client = reqwest::Client::new();
+    let mut sent = tokio::task::JoinSet::new();
+    for _ in 0..40 {
+        let part = || Part::bytes(file.clone()).file_name("cloud.npz");
+        let form = Form::new()
+            .text("options", r#"{"ground": "keep", "ego": "off"}"#)
+            .part("source", part())
+            .part("target", part());
+        let request = client.post(siege.server.url("/v1/jobs")).multipart(form);
+        sent.spawn(async move { request.send().await.expect("an answer").status() });
+    }
+    while let Some(status) = sent.join_next().await {
+        let status = status.expect("no panic");
+        // Accepted, refused for what it holds, or told to come again: never broken.
+        assert!(status != 500, "{status}");
+    }
+    let about = std::fs::read_to_string(format!("/proc/{}/status", siege.server.id()));
+    let about = about.expect("it runs on Linux");
+    let peak = about.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+    let peak = peak.and_then(|line| line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok());
+    // Two clouds of 26 MB at a time, what one of them is read from, and its bytes for the store.
+    assert!(
+        peak.is_some_and(|kibibytes| kibibytes < 500 << 10),
+        "{peak:?} KiB"
+    );
+}

@@ -8,7 +8,7 @@ use fnsf::flow::Point;
 use reqwest::StatusCode;
 use serde_json::Value;
 
-use crate::clouds::{form, small_pair};
+use crate::clouds::{form, medium_pair, small_pair};
 use crate::server::{Folder, Server, ended, plain_get};
 use crate::wire::SMALL;
 
@@ -209,4 +209,79 @@ async fn what_a_server_keeps_is_for_its_user_alone() {
         let about = std::fs::metadata(server.data().join(name)).expect("it is there");
         assert_eq!(about.permissions().mode() & 0o077, 0, "{name}");
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_payload_that_cannot_be_read_keeps_nobody_else_waiting() {
+    let server = Server::start(&[]);
+    // Something to do first, so that what comes is still in line.
+    let sent = reqwest::Client::new()
+        .post(server.url("/v1/jobs"))
+        .multipart(form(medium_pair(), r#"{"preset": "paper"}"#))
+        .send();
+    assert!(sent.await.expect("an answer").status().is_success());
+    let broken = submit(&server).await.expect("accepted");
+    let others = submit_some(&server).await;
+    // A folder where a file was: an error of the system, whoever runs the tests.
+    let folder = server
+        .data()
+        .join("blobs/jobs")
+        .join(&broken[..8])
+        .join(&broken);
+    let (file, aside) = (folder.join("frame-0"), folder.join("aside"));
+    std::fs::rename(&file, &aside).expect("renamed");
+    std::fs::create_dir(&file).expect("made");
+    all_succeed(&server, others).await;
+    let url = server.url(&format!("/v1/jobs/{broken}"));
+    let job: Value = reqwest::get(url)
+        .await
+        .expect("an answer")
+        .json()
+        .await
+        .expect("a job");
+    assert!(
+        matches!(job["state"].as_str(), Some("queued" | "running")),
+        "{job}"
+    );
+    assert!(server.is_ready(), "one file is not the store");
+    std::fs::remove_dir(&file).expect("removed");
+    std::fs::rename(&aside, &file).expect("renamed");
+    all_succeed(&server, vec![broken]).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn payloads_whose_volume_is_not_there_are_waited_for() {
+    let folder = Folder::new();
+    let server = Server::start_in(&folder, CONFIG, &[]);
+    let ids = submit_some(&server).await;
+    let blobs = server.data().join("blobs");
+    let aside = server.data().join("aside");
+    std::fs::rename(&blobs, &aside).expect("renamed");
+    std::fs::create_dir(&blobs).expect("made");
+    server.until("it is not ready", || !server.is_ready());
+    tokio::time::sleep(Duration::from_secs(3)).await;
+    // Nor does a start take an empty folder for the payloads of these jobs.
+    let folder = server.kill();
+    let started = std::process::Command::new(env!("CARGO_BIN_EXE_fnsf"))
+        .args(["serve", "--device", "cpu", "--data-dir"])
+        .arg(folder.path().join("data"))
+        .args(["--listen", "127.0.0.1:0", "--admin-listen", "127.0.0.1:0"])
+        .output()
+        .expect("it runs");
+    assert_eq!(started.status.code(), Some(70));
+    let said = String::from_utf8_lossy(&started.stderr);
+    assert!(said.contains("is their volume mounted?"), "{said}");
+    std::fs::remove_dir_all(&blobs).expect("removed");
+    std::fs::rename(&aside, &blobs).expect("renamed");
+    let server = Server::start_in(&folder, CONFIG, &[]);
+    all_succeed(&server, ids).await;
+}
+
+#[tokio::test]
+async fn a_queue_whose_file_is_removed_is_not_ready() {
+    let server = Server::start(&[]);
+    std::fs::remove_file(server.data().join("queue.lock")).expect("removed");
+    server.until("it is not ready", || !server.is_ready());
+    let said = plain_get(&server.admin, "/readyz").expect("an answer");
+    assert!(said.contains("removed or replaced"), "{said}");
 }

@@ -6,7 +6,7 @@ use tonic::metadata::MetadataMap;
 
 use super::proto;
 use crate::api::error::ApiError;
-use crate::api::service::Answer;
+use crate::api::results::Answer;
 use crate::flow::Cluster;
 use crate::formats::ego_motion;
 use crate::job::{

@@ -125,7 +125,7 @@ impl Head {
 /// All bytes of an answer, with their number.
 fn whole(encoded: Encoded) -> Response {
     let length = HeaderValue::from(encoded.len());
-    let mut response = encoded.into_body().into_response();
+    let mut response = Body::from_stream(encoded.into_pieces()).into_response();
     response
         .headers_mut()
         .insert(header::CONTENT_LENGTH, length);

@@ -181,7 +181,7 @@ mod tests {
     async fn an_answer_comes_in_pieces_and_says_its_length() {
         let bytes: Vec<u8> = (0..3 * PIECE + 5).map(|at| (at % 251) as u8).collect();
         let connections = Arc::new(Connections::new(1));
-        let entry = connections.enter();
+        let entry = connections.enter(std::net::IpAddr::from([127, 0, 0, 1]));
         let body = AnyBody::from(bytes.clone());
         let room = Arc::new(Semaphore::new(bytes.len() + 10));
         let full = Some(Arc::clone(&room));

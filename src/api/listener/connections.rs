@@ -3,7 +3,9 @@
 //! The limits of a socket do not see HTTP/2: a stream without a window writes nothing, and a client
 //! that answers pings is never silent. So every connection is looked at for what it asks and takes.
 
+use std::cmp::Reverse;
 use std::collections::HashMap;
+use std::net::IpAddr;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{Duration, Instant};
@@ -11,6 +13,9 @@ use std::time::{Duration, Instant};
 use tokio_util::sync::CancellationToken;
 
 use crate::job::Tenant;
+
+/// The rank from which on a connection has shown a key.
+const KNOWN: u8 = 2;
 
 /// The open connections of one port.
 pub(super) struct Connections {
@@ -22,6 +27,7 @@ pub(super) struct Connections {
 /// One open connection. Requests carry it as an extension.
 pub(in crate::api) struct Connection {
     opened: Instant,
+    address: IpAddr,
     connections: Weak<Connections>,
     state: Mutex<State>,
     /// Cancelled when it has to make room.
@@ -97,10 +103,11 @@ impl Connections {
         }
     }
 
-    pub(super) fn enter(self: &Arc<Self>) -> Entry {
+    pub(super) fn enter(self: &Arc<Self>, address: IpAddr) -> Entry {
         let now = Instant::now();
         let connection = Arc::new(Connection {
             opened: now,
+            address,
             connections: Arc::downgrade(self),
             state: Mutex::new(State {
                 tenant: None,
@@ -121,7 +128,7 @@ impl Connections {
     }
 
     /// Ends the connection that is needed least, so that another one has room: one that has shown no
-    /// key, else one without a request, else one that only looks on; the oldest of several. One that
+    /// key, else one without a request, else one that only looks on; the longest idle of several. One that
     /// works for somebody is never ended for one that has shown nothing yet. False where there is
     /// none.
     pub(super) fn make_room(&self) -> bool {
@@ -131,15 +138,26 @@ impl Connections {
             match (&state.tenant, state.requests.is_empty()) {
                 (None, true) => Some(0),
                 (None, false) => Some(1),
-                (Some(_), true) => Some(2),
-                (Some(_), false) if state.requests.values().all(|open| open.looks_on) => Some(3),
+                (Some(_), true) => Some(KNOWN),
+                (Some(_), false) if state.requests.values().all(|open| open.looks_on) => {
+                    Some(KNOWN + 1)
+                }
                 (Some(_), false) => None,
             }
         };
-        let least = open
+        let ranked: Vec<_> = open
             .iter()
-            .filter_map(|(number, one)| Some((rank(one)?, one.opened, *number)))
-            .min();
+            .filter_map(|(number, one)| Some((rank(one)?, one.address, one.idle_since(), *number)))
+            .collect();
+        // Of those without a key, one of whoever has most: who knocks quickly keeps nobody else out.
+        let mut held: HashMap<IpAddr, usize> = HashMap::new();
+        for (_, address, ..) in ranked.iter().filter(|(rank, ..)| *rank < KNOWN) {
+            *held.entry(*address).or_default() += 1;
+        }
+        let least = ranked.into_iter().min_by_key(|(rank, address, since, _)| {
+            let unknown = held.get(address).copied().filter(|_| *rank < KNOWN);
+            (*rank, Reverse(unknown), *since)
+        });
         let Some((.., number)) = least else {
             return false;
         };
@@ -169,6 +187,11 @@ impl Connection {
             return true;
         };
         connections.busy_of(tenant) <= connections.most.div_ceil(2)
+    }
+
+    /// Since when it has no request.
+    fn idle_since(&self) -> Instant {
+        locked(&self.state).idle_since
     }
 
     /// Returns when it has to make room.
@@ -203,8 +226,14 @@ impl Connection {
             return Verdict::End;
         }
         let unknown = patience.unknown.filter(|_| state.tenant.is_none());
-        if unknown.is_some_and(|longest| self.opened.elapsed() >= longest) {
-            return Verdict::End;
+        if let Some(longest) = unknown {
+            // It may end what it asks, and not ask for ever.
+            let age = self.opened.elapsed();
+            if age >= longest * 2 {
+                return Verdict::End;
+            } else if age >= longest && state.requests.is_empty() {
+                return Verdict::Close;
+            }
         }
         let idle = state.requests.is_empty() && state.idle_since.elapsed() >= patience.idle;
         if idle { Verdict::Close } else { Verdict::Keep }
@@ -256,10 +285,26 @@ mod tests {
         unread: LONG,
     };
 
+    fn address(last: u8) -> IpAddr {
+        IpAddr::from([127, 0, 0, last])
+    }
+
+    #[test]
+    fn who_knocks_quickly_keeps_nobody_else_out() {
+        let connections = Arc::new(Connections::new(4));
+        let modest = connections.enter(address(1));
+        let quick: Vec<_> = (0..3).map(|_| connections.enter(address(2))).collect();
+        for gone in &quick[..2] {
+            assert!(connections.make_room());
+            assert!(gone.connection.evicted.is_cancelled());
+        }
+        assert!(!modest.connection.evicted.is_cancelled());
+    }
+
     #[test]
     fn a_connection_ends_when_it_is_idle_unknown_or_does_not_read() {
         let connections = Arc::new(Connections::new(4));
-        let entry = connections.enter();
+        let entry = connections.enter(address(1));
         let connection = &entry.connection;
         let never = Duration::ZERO;
         let idle = Patience {
@@ -309,15 +354,15 @@ mod tests {
     fn whoever_is_needed_least_makes_room_and_who_works_does_not() {
         let connections = Arc::new(Connections::new(4));
         let tenant = |name: &str| name.parse::<Tenant>().expect("a good name");
-        let [works, idle] = [connections.enter(), connections.enter()];
+        let [works, idle] = [connections.enter(address(1)), connections.enter(address(1))];
         let _request = works.connection.begin(false);
         for entry in [&works, &idle] {
             assert!(entry.connection.is_known(&tenant("a"), true));
         }
-        let follows = connections.enter();
+        let follows = connections.enter(address(1));
         assert!(follows.connection.is_known(&tenant("a"), true));
         let _events = follows.connection.begin(true);
-        let [waits, unknown] = [connections.enter(), connections.enter()];
+        let [waits, unknown] = [connections.enter(address(1)), connections.enter(address(1))];
         let _request_of_nobody = waits.connection.begin(false);
         let is_evicted = |entry: &Entry| entry.connection.evicted.is_cancelled();
         for gone in [&unknown, &waits, &idle, &follows] {
@@ -335,7 +380,7 @@ mod tests {
         let tenant = |name: &str| name.parse::<Tenant>().expect("a good name");
         let mut held = Vec::new();
         let mut asks = |name: &str, several: bool| {
-            let entry = connections.enter();
+            let entry = connections.enter(address(1));
             let request = entry.connection.begin(false);
             let may = entry.connection.is_known(&tenant(name), several);
             held.push((entry, request));

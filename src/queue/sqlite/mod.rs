@@ -4,6 +4,8 @@
 //! file sees to it, so that what ran when the last one died can be queued again at once.
 
 mod ends;
+mod files;
+mod heart;
 mod leases;
 mod rows;
 mod schema;
@@ -17,8 +19,7 @@ mod tests;
 
 use std::collections::HashMap;
 use std::fs::{File, TryLockError};
-use std::os::unix::fs::MetadataExt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -28,6 +29,8 @@ use rusqlite::{Connection, params};
 use tokio::sync::{Notify, mpsc, watch};
 use tokio_util::sync::CancellationToken;
 
+use self::files::Files;
+use self::heart::SqliteHeart;
 use self::rows::{COLUMNS, state_code};
 use self::transitions::Effects;
 use self::writer::Writer;
@@ -35,8 +38,7 @@ use super::backlog::{Backlog, Load, Place};
 use super::lease::{Flags, Heart, Lease, Pulse};
 use super::watchers::Watchers;
 use super::{
-    Committed, Event, Filter, Outcome, Progress, Queue, QueueError, QueueOptions, Submission,
-    Submitted,
+    Committed, Event, Filter, Outcome, Queue, QueueError, QueueOptions, Submission, Submitted,
 };
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobId, Tenant};
@@ -46,9 +48,6 @@ const READERS: usize = 2;
 
 /// The most rows that one list gives.
 const MAX_LISTED: u32 = 1000;
-
-/// A lease is prolonged on disk this often at most.
-const BEAT: Duration = Duration::from_secs(1);
 
 /// The embedded queue.
 pub struct SqliteQueue {
@@ -60,25 +59,6 @@ pub struct SqliteQueue {
     identity: i32,
     files: Files,
     _lock: File,
-}
-
-/// The queue's files by name, and which they were when it was opened.
-struct Files([(PathBuf, (u64, u64)); 2]);
-
-impl Files {
-    fn of(paths: [PathBuf; 2]) -> std::io::Result<Self> {
-        let [one, other] = paths;
-        let which = |path: &Path| std::fs::metadata(path).map(|about| (about.dev(), about.ino()));
-        let (first, second) = (which(&one)?, which(&other)?);
-        Ok(Self([(one, first), (other, second)]))
-    }
-
-    /// Whether the names are still those of the same files: what is written to others is lost.
-    fn are_there(&self) -> bool {
-        self.0.iter().all(|(path, was)| {
-            std::fs::metadata(path).is_ok_and(|about| (about.dev(), about.ino()) == *was)
-        })
-    }
 }
 
 /// What the writing thread tells everybody else.
@@ -270,46 +250,6 @@ fn count_backlog(connection: &Connection) -> Result<Backlog, QueueError> {
         backlog.enter_many(place, load);
     }
     Ok(backlog)
-}
-
-/// A lease's way to the writer: every beat to those who follow, one a second to the disk.
-struct SqliteHeart {
-    id: JobId,
-    attempt: u32,
-    writer: Writer,
-    shared: Arc<Shared>,
-    options: QueueOptions,
-    last: Mutex<Instant>,
-    latest: Mutex<Option<Progress>>,
-}
-
-impl Heart for SqliteHeart {
-    fn beat(&self, progress: Option<Progress>) {
-        if let Some(progress) = progress {
-            *locked(&self.latest) = Some(progress);
-            self.shared
-                .watchers
-                .progress(self.id, self.attempt, progress);
-        }
-        {
-            let mut last = locked(&self.last);
-            if last.elapsed() < BEAT.min(self.options.lease / 4) {
-                return;
-            }
-            *last = Instant::now();
-        }
-        let (id, attempt, options) = (self.id, self.attempt, self.options.clone());
-        let progress = *locked(&self.latest);
-        self.writer.write_later(move |connection, _| {
-            leases::beat(connection, &options, id, attempt, progress)
-        });
-    }
-
-    fn snapshot_kept(&self) {
-        let (id, attempt) = (self.id, self.attempt);
-        self.writer
-            .write_later(move |connection, _| leases::snapshot_kept(connection, id, attempt));
-    }
 }
 
 #[async_trait]

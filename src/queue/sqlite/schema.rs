@@ -8,7 +8,6 @@ use std::time::Duration;
 use rusqlite::{Connection, TransactionBehavior};
 
 use crate::queue::QueueError;
-use crate::storage::Fault;
 
 /// What this program reads and writes; kept in `user_version`.
 pub(super) const VERSION: i64 = 5;
@@ -142,9 +141,10 @@ fn migrate(connection: &mut Connection) -> Result<(), QueueError> {
 
 impl From<rusqlite::Error> for QueueError {
     fn from(error: rusqlite::Error) -> Self {
-        match Fault::of_sqlite(&error) {
-            Fault::Full => Self::Full(error.to_string()),
-            Fault::Missing | Fault::Machine => Self::Store(error.to_string()),
+        // Whatever a database's store fails in is the machine's fault.
+        match error.sqlite_error_code() {
+            Some(rusqlite::ErrorCode::DiskFull) => Self::Full(error.to_string()),
+            _ => Self::Store(error.to_string()),
         }
     }
 }

@@ -27,14 +27,6 @@ impl Fault {
         }
     }
 
-    /// Of an error of the embedded database.
-    pub fn of_sqlite(error: &rusqlite::Error) -> Self {
-        match error.sqlite_error_code() {
-            Some(rusqlite::ErrorCode::DiskFull) => Self::Full,
-            _ => Self::Machine,
-        }
-    }
-
     /// Of an error with one of the operating system among its causes; of the machine where there
     /// is none.
     pub fn of(error: &(dyn Error + 'static)) -> Self {
@@ -52,6 +44,10 @@ impl Fault {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[derive(Debug, thiserror::Error)]
+    #[error("a store failed")]
+    struct Wrapped(#[source] io::Error);
 
     #[test]
     fn errors_of_the_system_are_the_machines_unless_something_is_missing() {
@@ -75,15 +71,9 @@ mod tests {
         ] {
             let error = io::Error::from_raw_os_error(code);
             assert_eq!(Fault::of_io(&error), fault, "{error}");
-            let wrapped = object_store::Error::Generic {
-                store: "files",
-                source: Box::new(error),
-            };
+            let wrapped = Wrapped(error);
             assert_eq!(Fault::of(&wrapped), fault, "{wrapped}");
         }
-        let full = rusqlite::ffi::Error::new(rusqlite::ffi::SQLITE_FULL);
-        let error = rusqlite::Error::SqliteFailure(full, None);
-        assert_eq!(Fault::of_sqlite(&error), Fault::Full);
         assert_eq!(Fault::of(&std::fmt::Error), Fault::Machine);
     }
 }

@@ -1,0 +1,151 @@
+//! A pair's flow once it is there: read, encoded, and the room that this takes.
+//!
+//! It must not know HTTP's or gRPC's types.
+
+use std::sync::Arc;
+
+use super::answers::{AnswerRoom, Encoded};
+use super::codec::AnswerFormat;
+use super::dense::is_dense;
+use super::error::ApiError;
+use super::service::Service;
+use crate::job::{Job, JobId, Kind, Report, State};
+use crate::payload::{StoredCloud, StoredFlow};
+use crate::storage::{Blob, BlobError};
+
+/// A flow that can be sent.
+#[derive(Clone)]
+pub struct Answer {
+    /// Its job.
+    pub job: Arc<Job>,
+    /// How it was found.
+    pub report: Report,
+    /// The flow itself.
+    pub flow: Arc<StoredFlow>,
+    /// The room that it takes.
+    pub(super) room: Arc<AnswerRoom>,
+}
+
+impl Service {
+    /// Whether a job has succeeded and its result lies no more where it was put.
+    pub(super) async fn result_is_lost(&self, job: &Job) -> Result<bool, ApiError> {
+        let has_result = job.kind == Kind::Pair || is_dense(job);
+        if job.state != State::Succeeded || !has_result {
+            return Ok(false);
+        }
+        match self.blobs.size(job.id, Blob::Result(job.attempt)).await {
+            Ok(_) => Ok(false),
+            Err(error) if error.is_missing() => Ok(true),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    /// Room to read, unpack and encode a job's result.
+    ///
+    /// # Errors
+    /// [`ApiError::ServerFull`], [`ApiError::ResultLost`], or where the store fails.
+    pub(super) async fn room_for_result(&self, job: &Job) -> Result<AnswerRoom, ApiError> {
+        /// Of the stored bytes, at most: read, unpacked, and in the longest format.
+        const FACTOR: usize = 6;
+        let blob = Blob::Result(job.attempt);
+        let size = self.blobs.size(job.id, blob).await;
+        let size = size.map_err(|error| lost_or(job.id, error))?;
+        self.answers
+            .room(&job.tenant, size.saturating_mul(FACTOR))
+            .await
+    }
+
+    /// How a pair's flow was found.
+    ///
+    /// # Errors
+    /// [`ApiError::NotEnded`], or how it ended instead.
+    pub(super) fn report(job: &Job) -> Result<Report, ApiError> {
+        Self::check_success(job)?;
+        if job.kind == Kind::Sequence {
+            let text = "a sequence's flow is in its pairs; see links.pairs";
+            return Err(ApiError::BadRequest(text.to_owned()));
+        }
+        let report = job.report.as_deref().unwrap_or_default();
+        serde_json::from_str(report).map_err(ApiError::internal)
+    }
+
+    /// The flow of a pair that has succeeded.
+    ///
+    /// # Errors
+    /// As for [`Service::report`] and [`Service::room_for_result`].
+    pub async fn answer(&self, job: &Arc<Job>) -> Result<Answer, ApiError> {
+        let report = Self::report(job)?;
+        let mut room = self.room_for_result(job).await?;
+        let blob = Blob::Result(job.attempt);
+        let bytes = self.blobs.get(job.id, blob).await;
+        let bytes = bytes.map_err(|error| lost_or(job.id, error))?;
+        let flow = StoredFlow::from_bytes(&bytes).map_err(ApiError::internal)?;
+        room.shrink(2 * bytes.len());
+        Ok(Answer {
+            job: Arc::clone(job),
+            report,
+            flow: Arc::new(flow),
+            room: Arc::new(room),
+        })
+    }
+
+    /// The flow of a pair that has succeeded, in a format; as it was made for the last who asked,
+    /// where it still is.
+    ///
+    /// # Errors
+    /// As for [`Service::answer`].
+    pub(super) async fn encoded(
+        &self,
+        job: &Arc<Job>,
+        format: AnswerFormat,
+    ) -> Result<Encoded, ApiError> {
+        let report = Self::report(job)?;
+        let name = (job.id, job.attempt, format.ending());
+        if let Some(made) = self.answers.made(&name) {
+            return Ok(made);
+        }
+        let began = std::time::Instant::now();
+        let room = self.room_for_result(job).await?;
+        let _turn = self.encoding.acquire().await.map_err(ApiError::internal)?;
+        if let Some(made) = self.answers.made(&name) {
+            return Ok(made);
+        }
+        let bytes = self.blobs.get(job.id, Blob::Result(job.attempt)).await;
+        let bytes = bytes.map_err(|error| lost_or(job.id, error))?;
+        let points = if format.needs_points() {
+            let (owner, [source, _]) = job.sweeps();
+            let cloud = self.blobs.get(owner, Blob::Frame(source)).await;
+            Some(cloud.map_err(|error| lost_or(job.id, error))?)
+        } else {
+            None
+        };
+        let id = job.id.to_string();
+        let encode = move || {
+            let flow = StoredFlow::from_bytes(&bytes).map_err(ApiError::internal)?;
+            let cloud = points
+                .map(|bytes| StoredCloud::from_bytes(&bytes))
+                .transpose();
+            let points = cloud
+                .map_err(ApiError::internal)?
+                .unwrap_or_default()
+                .points;
+            format.encode(&flow, &points, &report, &id)
+        };
+        let done = tokio::task::spawn_blocking(encode).await;
+        let encoded = room.hold(done.map_err(ApiError::internal)??);
+        self.answers.keep(name, &encoded);
+        self.metrics
+            .phase("encode", began.elapsed().as_secs_f64(), Some(job));
+        Ok(encoded)
+    }
+}
+
+/// What an error of reading a result is: lost, where it is not there.
+pub(super) fn lost_or(id: JobId, error: BlobError) -> ApiError {
+    if error.is_missing() {
+        tracing::error!(%error, job = %id, "a result is lost");
+        ApiError::ResultLost(id)
+    } else {
+        error.into()
+    }
+}
