@@ -238,10 +238,10 @@ impl Flow {
         if let Some(output) = &self.output {
             FlowFormat::from_path(output).map_err(Failure::usage)?;
         }
-        if let Some(picture) = &self.picture {
-            if picture.extension().is_none_or(|ending| ending != "png") {
-                return Err(Failure::usage(anyhow!("a picture's name ends in .png")));
-            }
+        if let Some(picture) = &self.picture
+            && picture.extension().is_none_or(|ending| ending != "png")
+        {
+            return Err(Failure::usage(anyhow!("a picture's name ends in .png")));
         }
         let pairs = self.sweeps.len().saturating_sub(1).max(1);
         let named = [&self.output, &self.picture].into_iter().flatten();

@@ -35,7 +35,7 @@ use self::rows::{COLUMNS, state_code};
 use self::transitions::Effects;
 use self::writer::Writer;
 use super::backlog::{Backlog, Load, Place};
-use super::lease::{Flags, Heart, Lease, Pulse};
+use super::lease::{Flags, Lease, Pulse};
 use super::watchers::Watchers;
 use super::{
     Committed, Event, Filter, Outcome, Queue, QueueError, QueueOptions, Submission, Submitted,

@@ -199,7 +199,7 @@ async fn a_lease_ends_by_signs_of_life_and_not_by_the_clock() {
     // Silence ends it all the same.
     let silent = async {
         while held.pulse.signal() != Signal::Lost {
-            tokio::time::sleep(Duration::from_millis(20)).await
+            tokio::time::sleep(Duration::from_millis(20)).await;
         }
     };
     tokio::time::timeout(Duration::from_secs(20), silent)
