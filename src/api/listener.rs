@@ -109,9 +109,10 @@ const MAX_BUFFER: usize = 64 << 10;
 /// make the server reset streams, before the connection is closed (CVE-2023-44487, CVE-2025-8671).
 const MAX_PENDING_RESETS: usize = 64;
 const MAX_ERROR_RESETS: usize = 1024;
-/// Bytes under way, so that a distant client's upload is not held back by the round trip.
-const STREAM_WINDOW: u32 = 4 << 20;
-const CONNECTION_WINDOW: u32 = 16 << 20;
+/// Bytes under way, so that a distant client's upload is not held back by the round trip; and no more
+/// of them than all connections together may have while their readers wait.
+const STREAM_WINDOW: u32 = 1 << 20;
+const CONNECTION_WINDOW: u32 = 2 << 20;
 const PING_INTERVAL: Duration = Duration::from_secs(30);
 const PING_TIMEOUT: Duration = Duration::from_secs(10);
 

@@ -12,6 +12,7 @@ mod draft;
 mod error;
 mod results;
 mod service;
+mod turns;
 mod uploads;
 mod waiters;
 

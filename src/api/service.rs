@@ -13,6 +13,7 @@ use super::answers::{AnswerLimits, Answers};
 use super::auth::{Caller, Keys};
 use super::error::ApiError;
 use super::origin::Hosts;
+use super::turns::Turns;
 use super::uploads::{UploadLimits, Uploads};
 use super::waiters::{Awaited, Ending, Waiters};
 use crate::health::StoreHealth;
@@ -66,7 +67,7 @@ pub struct Service {
     pub(super) encoding: Semaphore,
     /// Archives and clouds that are being sent: each holds a thread, or memory, while its client
     /// reads.
-    pub(super) archives: Arc<Semaphore>,
+    pub(super) archives: Arc<Turns>,
     /// Dense clouds that are being read and encoded.
     pub(super) clouds: Semaphore,
     /// Cancelled when the server is about to stop: health says so, everything is still served.
@@ -153,7 +154,7 @@ impl Service {
             limits: parts.limits,
             compute: Semaphore::new(cores),
             encoding: Semaphore::new(cores),
-            archives: Arc::new(Semaphore::new(MAX_ARCHIVES)),
+            archives: Arc::new(Turns::new(MAX_ARCHIVES, several)),
             clouds: Semaphore::new(1),
             leaving: CancellationToken::new(),
             draining: AtomicBool::new(false),

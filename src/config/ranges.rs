@@ -82,11 +82,11 @@ impl Config {
                 1,
                 YEARS,
             ),
-            ("queue.retention_seconds", queue.retention_seconds, 0, YEARS),
+            ("queue.retention_seconds", queue.retention_seconds, 1, YEARS),
             (
                 "queue.answered_retention_seconds",
                 queue.answered_retention_seconds,
-                0,
+                1,
                 YEARS,
             ),
             ("drain.deadline_seconds", drain.deadline_seconds, 0, YEARS),

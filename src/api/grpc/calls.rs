@@ -378,8 +378,7 @@ impl SceneFlow for Calls {
         if dense::is_dense(&job) {
             let header = convert::dense_header(job.id, &self.service.dense_report(&job)?);
             // It is held as long as its client reads.
-            let turn = Arc::clone(&self.service.archives).try_acquire_owned();
-            let turn = turn.map_err(|_| ApiError::ServerFull(Duration::from_secs(1)))?;
+            let turn = self.service.archives.take(&job.tenant)?;
             let (cloud, room) = self.service.dense_cloud(&job).await?;
             let pieces = chunks::dense_pieces(cloud, first).map(Part::DenseChunk);
             let parts = std::iter::once(Part::DenseHeader(header)).chain(pieces);

@@ -243,8 +243,7 @@ async fn archive(
         Service::report(sequence)?;
     }
     let pairs = service.pairs(sequence).await?;
-    let turn = Arc::clone(&service.archives).try_acquire_owned();
-    let turn = turn.map_err(|_| ApiError::ServerFull(Duration::from_secs(1)))?;
+    let turn = service.archives.take(&sequence.tenant)?;
     let (pieces, stream) = tokio::sync::mpsc::channel::<Result<Bytes, std::io::Error>>(1);
     let service = Arc::clone(service);
     let runtime = tokio::runtime::Handle::current();
