@@ -18,8 +18,9 @@ use crate::flow::{self, Ground, Price, Sweep, window};
 use crate::job::{Job, JobId, JobOptions, Kind};
 use crate::payload::StoredCloud;
 use crate::queue::{Idempotency, PairOf, Submission, Submitted};
-use crate::storage::{Blob, Sync};
+use crate::storage::{Blob, BlobError, Sync};
 use bytes::Bytes;
+use tokio::task::JoinHandle;
 
 /// What is asked of a job before its clouds are there.
 #[derive(Clone, Debug)]
@@ -75,6 +76,8 @@ pub(super) struct Draft {
     /// What each two clouds that follow each other cost alone, where they are a pair.
     prices: Vec<Option<Price>>,
     fingerprint: blake3::Hasher,
+    /// A cloud that is on its way into store.
+    writing: Option<JoinHandle<Result<(), BlobError>>>,
     submitted: bool,
 }
 
@@ -126,6 +129,7 @@ impl Draft {
             last: None,
             prices: Vec::new(),
             fingerprint,
+            writing: None,
             submitted: false,
         })
     }
@@ -195,10 +199,13 @@ impl Draft {
             Promise::WhileAwaited => Sync::No,
         };
         let blob = Blob::Frame(self.frames);
-        service
-            .blobs
-            .put(self.id, blob, Bytes::from(bytes), sync)
-            .await?;
+        // Whoever goes away in the middle leaves a write that ends; what it has written goes then.
+        let (blobs, id) = (service.blobs.clone(), self.id);
+        let writing = async move { blobs.put(id, blob, Bytes::from(bytes), sync).await };
+        let writing = self.writing.insert(tokio::spawn(writing));
+        let written = writing.await.map_err(ApiError::internal);
+        self.writing = None;
+        written??;
         self.frames += 1;
         Ok(cloud)
     }
@@ -381,11 +388,17 @@ impl Draft {
 
 impl Drop for Draft {
     fn drop(&mut self) {
-        if self.submitted || self.frames == 0 {
+        let writing = self.writing.take();
+        if self.submitted || (self.frames == 0 && writing.is_none()) {
             return;
         }
         let (service, id) = (Arc::clone(&self.service), self.id);
-        tokio::spawn(async move { service.forget_blobs(id).await });
+        tokio::spawn(async move {
+            if let Some(writing) = writing {
+                let _however_it_ends = writing.await;
+            }
+            service.forget_blobs(id).await;
+        });
     }
 }
 

@@ -23,6 +23,8 @@ use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto::Builder;
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+#[cfg(target_os = "linux")]
+use socket2::SockRef;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
@@ -109,6 +111,11 @@ const MAX_BUFFER: usize = 64 << 10;
 /// make the server reset streams, before the connection is closed (CVE-2023-44487, CVE-2025-8671).
 const MAX_PENDING_RESETS: usize = 64;
 const MAX_ERROR_RESETS: usize = 1024;
+/// Bytes that the system may hold unsent before it says that it takes more: with megabytes, a slow
+/// line would look like one that takes nothing.
+#[cfg(target_os = "linux")]
+const UNSENT: u32 = 128 << 10;
+
 /// Bytes under way, so that a distant client's upload is not held back by the round trip; and no more
 /// of them than all connections together may have while their readers wait.
 const STREAM_WINDOW: u32 = 1 << 20;
@@ -299,6 +306,10 @@ async fn converse(
     if let Err(error) = stream.set_nodelay(true) {
         tracing::debug!(%error, "a connection was lost");
         return;
+    }
+    #[cfg(target_os = "linux")]
+    if let Err(error) = SockRef::from(&stream).set_tcp_notsent_lowat(UNSENT) {
+        tracing::debug!(%error, "the system tells late of what is read");
     }
     let stream = Stall::new(stream, options.write_timeout);
     match tls {

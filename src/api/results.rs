@@ -72,7 +72,7 @@ impl Service {
     /// The flow of a pair that has succeeded.
     ///
     /// # Errors
-    /// As for [`Service::report`] and [`Service::room_for_result`].
+    /// How the job ended instead of with a flow, a full server, a lost result, or a store that fails.
     pub async fn answer(&self, job: &Arc<Job>) -> Result<Answer, ApiError> {
         let report = Self::report(job)?;
         let mut room = self.room_for_result(job).await?;

@@ -46,6 +46,7 @@ impl App {
             self.listener.abort();
         }
         self.upkeep.shutdown().await;
+        self.queue.stopped();
         tracing::info!(seconds = began.elapsed().as_secs_f64(), "stopped");
     }
 }

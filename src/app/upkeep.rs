@@ -21,8 +21,8 @@ const LOOK: Duration = Duration::from_secs(2);
 /// written before its job.
 const ORPHANS: Duration = Duration::from_secs(3600);
 
-/// Orphans that one round removes: a crash leaves a few. Where there are more, it is the queue that
-/// has lost something.
+/// Orphans that one round removes, the oldest first: a crash leaves a few. Where there are far more,
+/// somebody has time to look before all are gone.
 const MOST_ORPHANS: usize = 1000;
 
 /// How often the store is probed while it works.
@@ -159,11 +159,12 @@ async fn clean(queue: Arc<dyn Queue>, blobs: Blobs) {
             orphans.extend(ids.iter().copied().filter(|id| !known.contains(id)));
         }
         if orphans.len() > MOST_ORPHANS {
-            tracing::error!(
-                orphans = orphans.len(),
-                "the queue knows nothing of all these payloads: has it lost them? They are kept"
+            tracing::warn!(
+                jobs = orphans.len(),
+                "the queue knows nothing of many payloads: they are removed bit by bit"
             );
-            continue;
+            orphans.sort_unstable();
+            orphans.truncate(MOST_ORPHANS);
         }
         for id in &orphans {
             if let Err(error) = blobs.remove_job(*id).await {

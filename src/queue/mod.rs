@@ -302,6 +302,9 @@ pub trait Queue: Send + Sync {
     /// Whether there is no job at all.
     async fn is_empty(&self) -> Result<bool, QueueError>;
 
+    /// The process is about to end in order: what it could not give back has not died under it.
+    fn stopped(&self);
+
     /// A number that says which queue this is; payloads of another one are not its own.
     fn identity(&self) -> i32;
 

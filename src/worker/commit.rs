@@ -100,6 +100,10 @@ impl Worker {
             },
             (Err(error), _) => {
                 tracing::error!(%error, job = %job.id, "a result was not kept");
+                // The next attempt writes its own.
+                for blob in [Blob::Result(job.attempt), Blob::Field(job.attempt)] {
+                    let _none_may_be_there = self.blobs.remove(job.id, blob).await;
+                }
                 self.store_failed(error.fault(), size as u64, &error).await
             }
             (_, Err(error)) => Outcome::Failed(failure("store", &error, true)),

@@ -1,5 +1,7 @@
-//! Whether the queue's files are still those that it has open.
+//! The queue's files besides the database: whether they are still those that it has open, and how the
+//! last process ended.
 
+use std::fs::File;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
@@ -20,4 +22,18 @@ impl Files {
             std::fs::metadata(path).is_ok_and(|about| (about.dev(), about.ino()) == *was)
         })
     }
+}
+
+/// The file that says by its name whether the last process that had the queue ended in order. It is
+/// made when there is room and only renamed later.
+pub(super) const RUNNING: &str = "queue.running";
+pub(super) const STOPPED: &str = "queue.stopped";
+
+/// Renames that file; says whether it had that name. Where it has none it gets the new one.
+pub(super) fn run_mark(folder: &Path, from: &str, to: &str) -> bool {
+    let renamed = std::fs::rename(folder.join(from), folder.join(to)).is_ok();
+    if !renamed && let Err(error) = File::create(folder.join(to)) {
+        tracing::debug!(%error, "a mark was not made");
+    }
+    renamed
 }

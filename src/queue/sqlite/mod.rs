@@ -19,7 +19,7 @@ mod tests;
 
 use std::collections::HashMap;
 use std::fs::{File, TryLockError};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -29,7 +29,7 @@ use rusqlite::{Connection, params};
 use tokio::sync::{Notify, mpsc, watch};
 use tokio_util::sync::CancellationToken;
 
-use self::files::Files;
+use self::files::{Files, RUNNING, STOPPED, run_mark};
 use self::heart::SqliteHeart;
 use self::rows::{COLUMNS, state_code};
 use self::transitions::Effects;
@@ -57,6 +57,7 @@ pub struct SqliteQueue {
     shared: Arc<Shared>,
     options: QueueOptions,
     identity: i32,
+    folder: PathBuf,
     files: Files,
     _lock: File,
 }
@@ -194,7 +195,8 @@ impl SqliteQueue {
         let shared = Arc::new(Shared::new(events));
         let mut effects = Effects::default();
         connection.execute_batch("BEGIN IMMEDIATE")?;
-        sweep::recover(&connection, &mut effects, &options)?;
+        let orderly = run_mark(folder, STOPPED, RUNNING);
+        sweep::recover(&connection, &mut effects, &options, orderly)?;
         connection.execute_batch("COMMIT")?;
         // Counted below from the store itself.
         effects.entered.clear();
@@ -210,6 +212,7 @@ impl SqliteQueue {
             shared,
             options,
             identity,
+            folder: folder.to_owned(),
             files: Files::of([path, lock_path]).map_err(store)?,
             _lock: lock,
         })
@@ -430,6 +433,12 @@ impl Queue for SqliteQueue {
         let query =
             move |connection: &Connection| Ok(connection.query_row(sql, [], |row| row.get(0))?);
         self.read(query).await
+    }
+
+    fn stopped(&self) {
+        if !run_mark(&self.folder, RUNNING, STOPPED) {
+            tracing::warn!("the next start will take this end for a crash");
+        }
     }
 
     fn identity(&self) -> i32 {

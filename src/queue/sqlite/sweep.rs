@@ -147,11 +147,13 @@ fn forget(connection: &Connection, effects: &mut Effects, id: JobId) -> Result<(
 }
 
 /// After a crash or a stop: what ran is queued again at once, since nobody else can hold it; what
-/// somebody waited for on a connection that is gone is forgotten.
+/// somebody waited for on a connection that is gone is forgotten. After a stop that was `orderly` no
+/// job is blamed.
 pub(super) fn recover(
     connection: &Connection,
     effects: &mut Effects,
     options: &QueueOptions,
+    orderly: bool,
 ) -> Result<(), QueueError> {
     let sql = format!(
         "SELECT {COLUMNS} FROM jobs INDEXED BY jobs_running WHERE state = 1 AND ready IS NOT NULL"
@@ -165,6 +167,11 @@ pub(super) fn recover(
         if job.cancel_requested {
             let how = End::default();
             ends::end(connection, effects, options, &job, State::Cancelled, &how)?;
+            continue;
+        }
+        if orderly {
+            // It could not be given back, and has killed nobody.
+            leases::requeue_running(connection, effects, &job, Duration::ZERO)?;
             continue;
         }
         let error = JobError {

@@ -7,7 +7,7 @@ use rusqlite::params;
 use tokio::sync::mpsc;
 
 use super::{SqliteQueue, leases, schema, sweep, turns};
-use crate::job::DeviceKind;
+use crate::job::{DeviceKind, State};
 use crate::queue::contract::{Stand, queue_contract, submission};
 use crate::queue::{Event, Queue, QueueError, QueueOptions, Signal};
 
@@ -210,6 +210,38 @@ async fn a_lease_ends_by_signs_of_life_and_not_by_the_clock() {
         expired += usize::from(matches!(event, Event::LeaseExpired(_)));
     }
     assert_eq!(expired, 1);
+}
+
+#[tokio::test]
+async fn a_job_that_an_orderly_stop_could_not_give_back_is_not_blamed() {
+    let options = QueueOptions {
+        max_crashes: 1,
+        ..QueueOptions::default()
+    };
+    let mut folder = Folder::new();
+    let (mut queue, _heard) = folder.open(options.clone());
+    let job = submission("a");
+    let (id, tenant) = (job.id, job.tenant.clone());
+    queue.submit(job).await.expect("accepted");
+    for _ in 0..3 {
+        let held = queue
+            .lease("worker", DeviceKind::Cpu)
+            .await
+            .expect("a lease");
+        assert_eq!(held.job.id, id);
+        queue.stopped();
+        drop((held, queue));
+        (queue, _) = folder.open(options.clone());
+    }
+    // A death is one.
+    let held = queue
+        .lease("worker", DeviceKind::Cpu)
+        .await
+        .expect("a lease");
+    drop((held, queue));
+    let (queue, _heard) = folder.open(options);
+    let job = queue.job(&tenant, id).await.expect("known");
+    assert_eq!(job.state, State::Failed);
 }
 
 #[tokio::test]
