@@ -149,7 +149,7 @@ impl Service {
         let bytes = self.blobs.get(job.id, Blob::Result(job.attempt)).await;
         let bytes = bytes.map_err(|error| lost_or(job.id, error))?;
         let read = move || StoredDense::from_bytes(&bytes).map_err(ApiError::internal);
-        let StoredDense(cloud) = self.compute(read).await?;
+        let StoredDense(cloud) = self.compute(&job.tenant, read).await?;
         Ok(cloud)
     }
 
@@ -183,7 +183,7 @@ impl Service {
             write_dense(format, &cloud, &mut bytes).map_err(ApiError::internal)?;
             Ok(bytes)
         };
-        let encoded = room.hold(self.compute(encode).await?);
+        let encoded = room.hold(self.compute(&job.tenant, encode).await?);
         self.answers.keep(name, &encoded);
         self.metrics
             .phase("encode", began.elapsed().as_secs_f64(), Some(job));

@@ -188,7 +188,7 @@ impl Draft {
                 Ok((price.transpose()?, asked, bytes, cloud))
             }
         };
-        let (price, asked, bytes, cloud) = service.compute(work).await?;
+        let (price, asked, bytes, cloud) = service.compute(&self.caller.tenant, work).await?;
         self.last = Some((Arc::clone(&cloud), room));
         if self.frames > 0 {
             self.prices.push(price);

@@ -106,7 +106,7 @@ impl Service {
         }
         let began = std::time::Instant::now();
         let room = self.room_for_result(job).await?;
-        let _turn = self.encoding.acquire().await.map_err(ApiError::internal)?;
+        let _turn = self.encoding.wait(&job.tenant).await;
         if let Some(made) = self.answers.made(&name) {
             return Ok(made);
         }

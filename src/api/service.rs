@@ -13,11 +13,11 @@ use super::answers::{AnswerLimits, Answers};
 use super::auth::{Caller, Keys};
 use super::error::ApiError;
 use super::origin::Hosts;
-use super::turns::Turns;
+use super::turns::{Line, Turns};
 use super::uploads::{UploadLimits, Uploads};
 use super::waiters::{Awaited, Ending, Waiters};
 use crate::health::StoreHealth;
-use crate::job::{Job, JobId, JobOptions, Kind, Priority, State};
+use crate::job::{Job, JobId, JobOptions, Kind, Priority, State, Tenant};
 use crate::metrics::Metrics;
 use crate::queue::{Filter, Queue, QueueError};
 use crate::storage::{Blob, Blobs, FreeSpace};
@@ -62,9 +62,9 @@ pub struct Service {
     pub(super) uploads: Arc<Uploads>,
     pub(super) answers: Answers,
     waiters: Arc<Waiters>,
-    compute: Semaphore,
+    compute: Line,
     /// Answers that are being encoded, apart from what comes in.
-    pub(super) encoding: Semaphore,
+    pub(super) encoding: Line,
     /// Archives and clouds that are being sent: each holds a thread, or memory, while its client
     /// reads.
     pub(super) archives: Arc<Turns>,
@@ -152,8 +152,8 @@ impl Service {
             hosts: parts.hosts,
             store_health: parts.store_health,
             limits: parts.limits,
-            compute: Semaphore::new(cores),
-            encoding: Semaphore::new(cores),
+            compute: Line::new(cores),
+            encoding: Line::new(cores),
             archives: Arc::new(Turns::new(MAX_ARCHIVES, several)),
             clouds: Semaphore::new(1),
             leaving: CancellationToken::new(),
@@ -206,15 +206,17 @@ impl Service {
         }
     }
 
-    /// Runs something that takes a core for a while, beside the requests, a few at a time.
+    /// Runs something that takes a core for a while, beside the requests, a few at a time and in
+    /// fair turns of the tenants.
     ///
     /// # Errors
     /// Its own, and [`ApiError::Internal`] where it panics.
     pub async fn compute<T: Send + 'static>(
         &self,
+        tenant: &Tenant,
         work: impl FnOnce() -> Result<T, ApiError> + Send + 'static,
     ) -> Result<T, ApiError> {
-        let _turn = self.compute.acquire().await.map_err(ApiError::internal)?;
+        let _turn = self.compute.wait(tenant).await;
         let done = tokio::task::spawn_blocking(work).await;
         done.map_err(ApiError::internal)?
     }

@@ -1,13 +1,51 @@
-//! Turns at something of which there are few: one of several tenants has half of them.
+//! Turns at something of which there are few, shared by tenants.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::Duration;
+
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::error::ApiError;
 use crate::job::Tenant;
 
-/// Turns of all tenants.
+/// Turns that are waited for, in line: each tenant has only a few of its own in that line, so that
+/// nobody waits for all that another one has asked for.
+pub(super) struct Line {
+    each: usize,
+    all: Arc<Semaphore>,
+    own: Mutex<HashMap<Tenant, Weak<Semaphore>>>,
+}
+
+impl Line {
+    /// So many turns at a time.
+    pub(super) fn new(turns: usize) -> Self {
+        Self {
+            each: turns,
+            all: Arc::new(Semaphore::new(turns)),
+            own: Mutex::default(),
+        }
+    }
+
+    /// Waits for a turn of a tenant; it lasts until what is given is dropped.
+    pub(super) async fn wait(&self, tenant: &Tenant) -> Option<[OwnedSemaphorePermit; 2]> {
+        let own = {
+            let mut own = self.own.lock().unwrap_or_else(PoisonError::into_inner);
+            own.retain(|_, line| line.strong_count() > 0);
+            let known = own.get(tenant).and_then(Weak::upgrade);
+            known.unwrap_or_else(|| {
+                let line = Arc::new(Semaphore::new(self.each));
+                own.insert(tenant.clone(), Arc::downgrade(&line));
+                line
+            })
+        };
+        let own = own.acquire_owned().await.ok()?;
+        let all = Arc::clone(&self.all).acquire_owned().await.ok()?;
+        Some([own, all])
+    }
+}
+
+/// Turns that are taken or refused: one of several tenants has half of them.
 pub(super) struct Turns {
     most: usize,
     share: usize,
@@ -68,6 +106,28 @@ impl Drop for Turn {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[tokio::test]
+    async fn nobody_waits_for_all_that_another_tenant_has_asked_for() {
+        let tenant = |name: &str| name.parse::<Tenant>().expect("a good name");
+        let line = Arc::new(Line::new(1));
+        let first = line.wait(&tenant("many")).await;
+        let done = Arc::new(Mutex::new(Vec::new()));
+        let mut waiting = tokio::task::JoinSet::new();
+        for name in ["many", "many", "many", "few", "many"] {
+            let (line, done) = (Arc::clone(&line), Arc::clone(&done));
+            waiting.spawn(async move {
+                let _turn = line.wait(&tenant(name)).await;
+                done.lock().expect("no panic").push(name);
+            });
+            tokio::task::yield_now().await;
+        }
+        drop(first);
+        while waiting.join_next().await.is_some() {}
+        let done = done.lock().expect("no panic").clone();
+        let place = done.iter().position(|name| *name == "few");
+        assert!(place.is_some_and(|place| place <= 1), "{done:?}");
+    }
 
     #[test]
     fn one_of_several_tenants_leaves_the_others_half() {

@@ -128,6 +128,11 @@ impl Room {
         std::mem::replace(self, next)
     }
 
+    /// Whose it is.
+    pub(super) fn tenant(&self) -> &Tenant {
+        &self.tenant
+    }
+
     /// Room beside this one, of the same tenant.
     pub(super) fn another(&self) -> Self {
         self.uploads.room(&self.tenant)

@@ -180,7 +180,7 @@ impl Body {
         read: impl FnOnce() -> Result<T, ApiError> + Send + 'static,
     ) -> Result<T, ApiError> {
         let began = Instant::now();
-        let done = self.service.compute(read).await?;
+        let done = self.service.compute(self.room.tenant(), read).await?;
         self.decode_seconds += began.elapsed().as_secs_f64();
         Ok(done)
     }
