@@ -318,9 +318,9 @@ impl Encoded {
         let (pieces, stream) = mpsc::channel::<Result<Bytes, std::io::Error>>(1);
         tokio::spawn(async move {
             while !self.bytes.is_empty() {
-                let piece = self.bytes.split_to(self.bytes.len().min(PIECE));
                 // A copy: what waits in the connection must not keep the whole.
-                let (length, piece) = (piece.len(), Bytes::copy_from_slice(&piece));
+                let length = self.bytes.len().min(PIECE);
+                let piece = Bytes::copy_from_slice(&self.bytes.split_to(length));
                 tokio::select! {
                     sent = pieces.send(Ok(piece)) => match sent {
                         Ok(()) => self.taking.took(length),
