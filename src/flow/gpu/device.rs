@@ -134,8 +134,10 @@ impl Watchdog {
 const LONGEST_SILENCE: Duration = Duration::from_secs(20);
 /// The same of software, which is no faster than the machine is idle.
 const SOFTWARE_SILENCE: Duration = Duration::from_secs(120);
-/// How often who waits for the card looks whether it is still there.
-const LOOK: Duration = Duration::from_millis(200);
+/// How often who waits for the card looks whether it is still there. Seldom: a wait that times out
+/// while another thread sees the queue end trips an assertion of wgpu 30 (gfx-rs/wgpu#9958), which
+/// costs the card.
+const LOOK: Duration = Duration::from_secs(2);
 /// Groups along one dimension of a dispatch.
 const MOST_GROUPS: u32 = 65_535;
 
