@@ -222,7 +222,7 @@ async fn a_payload_that_cannot_be_read_keeps_nobody_else_waiting() {
     assert!(sent.await.expect("an answer").status().is_success());
     let broken = submit(&server).await.expect("accepted");
     let others = submit_some(&server).await;
-    // A folder where a file was: an error of the system, whoever runs the tests.
+    // A link to itself where a file was: an error of the system, whoever runs the tests.
     let folder = server
         .data()
         .join("blobs/jobs")
@@ -230,7 +230,7 @@ async fn a_payload_that_cannot_be_read_keeps_nobody_else_waiting() {
         .join(&broken);
     let (file, aside) = (folder.join("frame-0"), folder.join("aside"));
     std::fs::rename(&file, &aside).expect("renamed");
-    std::fs::create_dir(&file).expect("made");
+    std::os::unix::fs::symlink(&file, &file).expect("linked");
     all_succeed(&server, others).await;
     let url = server.url(&format!("/v1/jobs/{broken}"));
     let job: Value = reqwest::get(url)
@@ -244,7 +244,7 @@ async fn a_payload_that_cannot_be_read_keeps_nobody_else_waiting() {
         "{job}"
     );
     assert!(server.is_ready(), "one file is not the store");
-    std::fs::remove_dir(&file).expect("removed");
+    std::fs::remove_file(&file).expect("removed");
     std::fs::rename(&aside, &file).expect("renamed");
     all_succeed(&server, vec![broken]).await;
 }
