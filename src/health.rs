@@ -54,8 +54,8 @@ impl Heartbeat {
     }
 }
 
-/// Whether the store can be read and written: told by whoever finds that it cannot, and found out
-/// again by a probe. While it cannot, no job is taken, so that none pays for the machine.
+/// Whether the store can be read and written. Users of the store report failures; the probe reports
+/// recovery. Workers lease no job while the store fails.
 #[derive(Debug)]
 pub struct StoreHealth {
     trouble: watch::Sender<Option<String>>,

@@ -199,7 +199,8 @@ impl Draft {
             Promise::WhileAwaited => Sync::No,
         };
         let blob = Blob::Frame(self.frames);
-        // Whoever goes away in the middle leaves a write that ends; what it has written goes then.
+        // The write runs in its own task: when the client disconnects, the write completes first and
+        // the draft's files are removed after it.
         let (blobs, id) = (service.blobs.clone(), self.id);
         let writing = async move { blobs.put(id, blob, Bytes::from(bytes), sync).await };
         let writing = self.writing.insert(tokio::spawn(writing));

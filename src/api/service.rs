@@ -100,7 +100,7 @@ pub struct Parts {
 /// Why a job was not made durable.
 #[derive(Debug)]
 pub(super) enum MakeDurable {
-    /// Whoever waited for it has gone, and it with them.
+    /// Its last waiter has disconnected, and the job is being cancelled.
     GivenUp,
     /// The store failed.
     Failed(ApiError),

@@ -33,7 +33,7 @@ pub(super) struct Flags {
     cancel: AtomicBool,
     lost: AtomicBool,
     durable: AtomicBool,
-    /// By a clock that nobody sets.
+    /// On the monotonic clock.
     last_beat: Mutex<Instant>,
 }
 

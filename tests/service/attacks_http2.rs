@@ -281,7 +281,7 @@ async fn connections_that_only_answer_pings_make_room() {
             .bearer_auth("0123456789abcdef");
         sent.timeout(PATIENCE).send()
     };
-    // At once: whoever shows a key goes before those who show nothing.
+    // At once: connections without a key make room for a new one.
     assert_eq!(list().await.expect("an answer").status(), 200);
     for connection in idle {
         connection.join().expect("no panic");

@@ -45,7 +45,7 @@ async fn all_succeed(server: &Server, ids: Vec<String>) {
     assert_eq!(server.metric("fnsf_dead_letters_total"), 0.0);
 }
 
-/// Puts a file where a folder was, which fails whoever runs the tests, root too.
+/// Puts a file where a folder was. Writes below it fail for every user, root too.
 fn break_folder(folder: &Path) -> impl Fn() + use<> {
     let (folder, aside) = (folder.to_owned(), folder.with_extension("aside"));
     std::fs::rename(&folder, &aside).expect("renamed");
@@ -222,7 +222,7 @@ async fn a_payload_that_cannot_be_read_keeps_nobody_else_waiting() {
     assert!(sent.await.expect("an answer").status().is_success());
     let broken = submit(&server).await.expect("accepted");
     let others = submit_some(&server).await;
-    // A link to itself where a file was: an error of the system, whoever runs the tests.
+    // A link to itself where a file was: reading it fails for every user, root too.
     let folder = server
         .data()
         .join("blobs/jobs")

@@ -297,7 +297,7 @@ struct Pipe {
 
 impl std::io::Write for Pipe {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        // For whoever takes nothing at all; the connection's own patience is shorter.
+        // An upper bound: the connection ends a client that reads nothing sooner than that.
         const PATIENCE: Duration = Duration::from_secs(3600);
         const PIECE: usize = 64 << 10;
         let length = bytes.len().min(PIECE);

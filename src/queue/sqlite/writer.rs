@@ -145,7 +145,7 @@ fn run(
         {
             commands.push(command);
         }
-        // Whoever is late by half a lease was not running, and nor were the workers.
+        // A delay of half a lease means that the process was paused, and its workers with it.
         let was_away = awake.elapsed() > MAX_SLEEP + options.lease / 2;
         awake = Instant::now();
         if was_away {
