@@ -429,7 +429,7 @@ fn serve_admin(
     let serve = move || {
         let served = runtime.block_on(async move {
             let options = ListenOptions::of_admin();
-            let listener = Listener::on(socket, options, None, Arc::default())?;
+            let listener = Listener::on(socket, options)?;
             listener.serve(router, CancellationToken::new()).await;
             std::io::Result::Ok(())
         });

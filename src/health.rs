@@ -56,22 +56,12 @@ impl Heartbeat {
 
 /// Whether the store can be read and written. Users of the store report failures; the probe reports
 /// recovery. Workers lease no job while the store fails.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct StoreHealth {
     trouble: watch::Sender<Option<String>>,
     /// What could still be written, and when that was looked at.
     free: Mutex<Option<(Instant, FreeSpace)>>,
     needed: AtomicU64,
-}
-
-impl Default for StoreHealth {
-    fn default() -> Self {
-        Self {
-            trouble: watch::Sender::new(None),
-            free: Mutex::default(),
-            needed: AtomicU64::new(0),
-        }
-    }
 }
 
 impl StoreHealth {

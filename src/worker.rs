@@ -189,7 +189,7 @@ impl Worker {
     async fn give_back(&self, asking: impl Future<Output = Result<Lease, QueueError>>) {
         const MOMENT: Duration = Duration::from_millis(100);
         if let Ok(Ok(lease)) = tokio::time::timeout(MOMENT, asking).await
-            && let Err(error) = self.finish(&lease, Outcome::Released).await
+            && let Err(error) = alive(&lease, self.finish(&lease, Outcome::Released)).await
         {
             tracing::warn!(%error, job = %lease.job.id, "a job was not given back");
         }

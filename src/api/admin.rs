@@ -91,23 +91,22 @@ pub fn admin_router(
 }
 
 async fn alive(State(admin): State<Admin>) -> Response {
-    match admin.readiness.stuck() {
-        None => Json(json!({ "alive": true })).into_response(),
+    verdict("alive", admin.readiness.stuck())
+}
+
+/// 200, or 503 with what stands against it.
+fn verdict(word: &str, obstacle: Option<String>) -> Response {
+    match obstacle {
+        None => Json(json!({ word: true })).into_response(),
         Some(reason) => {
-            let body = Json(json!({ "alive": false, "reason": reason }));
+            let body = Json(json!({ word: false, "reason": reason }));
             (StatusCode::SERVICE_UNAVAILABLE, body).into_response()
         }
     }
 }
 
 async fn ready(State(admin): State<Admin>) -> Response {
-    match admin.readiness.obstacle() {
-        None => Json(json!({ "ready": true })).into_response(),
-        Some(reason) => {
-            let body = Json(json!({ "ready": false, "reason": reason }));
-            (StatusCode::SERVICE_UNAVAILABLE, body).into_response()
-        }
-    }
+    verdict("ready", admin.readiness.obstacle())
 }
 
 async fn expose(State(admin): State<Admin>, headers: HeaderMap) -> Response {

@@ -9,7 +9,6 @@ use super::admission::Admission;
 use super::answers::{AnswerRoom, Encoded};
 use super::codec;
 use super::error::ApiError;
-use super::results::lost_or;
 use super::service::Service;
 use crate::cost::CostModel;
 use crate::flow::densify::Plan;
@@ -18,7 +17,6 @@ use crate::formats::{DENSE_FORMATS, DenseFormat, write_dense};
 use crate::job::{DenseReport, Densify, InvalidOptions, Job, JobOptions, Kind, LaterChoice};
 use crate::payload::StoredDense;
 use crate::queue::PairOf;
-use crate::storage::Blob;
 
 /// Bytes that are held for a point while it is carried and written, at most: itself in its sweep and
 /// in the cloud, its masks, where it was before a step, the cloud's bytes, and its share of a field
@@ -146,8 +144,7 @@ impl Service {
     }
 
     async fn read_dense(&self, job: &Job) -> Result<DenseCloud, ApiError> {
-        let bytes = self.blobs.get(job.id, Blob::Result(job.attempt)).await;
-        let bytes = bytes.map_err(|error| lost_or(job.id, error))?;
+        let bytes = self.result_bytes(job).await?;
         let read = move || StoredDense::from_bytes(&bytes).map_err(ApiError::internal);
         let StoredDense(cloud) = self.compute(&job.tenant, read).await?;
         Ok(cloud)

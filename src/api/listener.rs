@@ -206,19 +206,14 @@ impl Listener {
     ///
     /// # Errors
     /// Where the socket cannot be waited for.
-    pub fn on(
-        socket: std::net::TcpListener,
-        options: ListenOptions,
-        metrics: Option<Arc<Metrics>>,
-        heartbeat: Arc<Heartbeat>,
-    ) -> std::io::Result<Self> {
+    pub fn on(socket: std::net::TcpListener, options: ListenOptions) -> std::io::Result<Self> {
         socket.set_nonblocking(true)?;
         Ok(Self {
             listener: TcpListener::from_std(socket)?,
             tls: None,
             options,
-            metrics,
-            heartbeat,
+            metrics: None,
+            heartbeat: Arc::default(),
         })
     }
 

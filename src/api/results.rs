@@ -4,6 +4,8 @@
 
 use std::sync::Arc;
 
+use bytes::Bytes;
+
 use super::answers::{AnswerRoom, Encoded};
 use super::codec::AnswerFormat;
 use super::dense::is_dense;
@@ -55,6 +57,15 @@ impl Service {
             .await
     }
 
+    /// A job's result as it lies in store.
+    ///
+    /// # Errors
+    /// [`ApiError::ResultLost`], or where the store fails.
+    pub(super) async fn result_bytes(&self, job: &Job) -> Result<Bytes, ApiError> {
+        let bytes = self.blobs.get(job.id, Blob::Result(job.attempt)).await;
+        bytes.map_err(|error| lost_or(job.id, error))
+    }
+
     /// How a pair's flow was found.
     ///
     /// # Errors
@@ -76,9 +87,7 @@ impl Service {
     pub async fn answer(&self, job: &Arc<Job>) -> Result<Answer, ApiError> {
         let report = Self::report(job)?;
         let mut room = self.room_for_result(job).await?;
-        let blob = Blob::Result(job.attempt);
-        let bytes = self.blobs.get(job.id, blob).await;
-        let bytes = bytes.map_err(|error| lost_or(job.id, error))?;
+        let bytes = self.result_bytes(job).await?;
         let flow = StoredFlow::from_bytes(&bytes).map_err(ApiError::internal)?;
         room.shrink(2 * bytes.len());
         Ok(Answer {
@@ -110,8 +119,7 @@ impl Service {
         if let Some(made) = self.answers.made(&name) {
             return Ok(made);
         }
-        let bytes = self.blobs.get(job.id, Blob::Result(job.attempt)).await;
-        let bytes = bytes.map_err(|error| lost_or(job.id, error))?;
+        let bytes = self.result_bytes(job).await?;
         let points = if format.needs_points() {
             let (owner, [source, _]) = job.sweeps();
             let cloud = self.blobs.get(owner, Blob::Frame(source)).await;
@@ -141,7 +149,7 @@ impl Service {
 }
 
 /// What an error of reading a result is: lost, where it is not there.
-pub(super) fn lost_or(id: JobId, error: BlobError) -> ApiError {
+fn lost_or(id: JobId, error: BlobError) -> ApiError {
     if error.is_missing() {
         tracing::error!(%error, job = %id, "a result is lost");
         ApiError::ResultLost(id)

@@ -1,7 +1,8 @@
 //! Who waits for which job: the last one to go away ends it.
 //!
-//! A key finds the job of a call whose line was lost, so that several may wait for one. Whoever
-//! comes while the job is being ended asks again when it is over, and gets a job of their own.
+//! An idempotency key finds the job of a call whose connection was lost, so several calls may wait
+//! for one job. The job is cancelled when the last of them disconnects. A call that arrives during the
+//! cancellation waits for its end and submits a new job.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -64,18 +65,15 @@ impl Waiters {
         })
     }
 
-    /// One less waits; says whether nobody does any more.
-    fn leave(&self, id: JobId) -> bool {
+    /// One less waits, and the job goes on.
+    fn leave(&self, id: JobId) {
         let mut waiting = self.lock();
-        let Some(Waiting::For(count)) = waiting.get_mut(&id) else {
-            return false;
-        };
-        *count -= 1;
-        let last = *count == 0;
-        if last {
-            waiting.remove(&id);
+        if let Some(Waiting::For(count)) = waiting.get_mut(&id) {
+            *count -= 1;
+            if *count == 0 {
+                waiting.remove(&id);
+            }
         }
-        last
     }
 
     /// One less waits, and the job is ended if that was the last.

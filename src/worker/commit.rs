@@ -8,6 +8,7 @@ use bytes::Bytes;
 use super::inputs::StoreError;
 use super::{Attempt, Done, Worker, failure};
 use crate::fault::Fault;
+use crate::job::Job;
 use crate::queue::{Committed, Lease, Outcome, QueueError};
 use crate::storage::{Blob, BlobError, Sync};
 
@@ -36,11 +37,7 @@ impl Worker {
             }
             Ok(Committed::Fenced) => {
                 tracing::warn!(job = %job.id, attempt = job.attempt, "a late result was thrown away");
-                for blob in [Blob::Result(job.attempt), Blob::Field(job.attempt)] {
-                    if let Err(error) = self.blobs.remove(job.id, blob).await {
-                        tracing::warn!(%error, job = %job.id, "a late result was not removed");
-                    }
-                }
+                self.remove_attempt(job).await;
             }
             Err(error) => tracing::error!(%error, job = %job.id, "an outcome was not kept"),
         }
@@ -69,7 +66,6 @@ impl Worker {
                 () = self.drain.release.cancelled() => return Err(error),
                 () = tokio::time::sleep(pause) => {}
             }
-            lease.pulse.beat(None);
             pause = (pause * 2).min(LONGEST_PAUSE);
         }
     }
@@ -101,12 +97,19 @@ impl Worker {
             (Err(error), _) => {
                 tracing::error!(%error, job = %job.id, "a result was not kept");
                 // The next attempt writes its own.
-                for blob in [Blob::Result(job.attempt), Blob::Field(job.attempt)] {
-                    let _none_may_be_there = self.blobs.remove(job.id, blob).await;
-                }
+                self.remove_attempt(job).await;
                 self.store_failed(error.fault(), size as u64, &error).await
             }
             (_, Err(error)) => Outcome::Failed(failure("store", &error, true)),
+        }
+    }
+
+    /// Removes what an attempt has written.
+    async fn remove_attempt(&self, job: &Job) {
+        for blob in [Blob::Result(job.attempt), Blob::Field(job.attempt)] {
+            if let Err(error) = self.blobs.remove(job.id, blob).await {
+                tracing::warn!(%error, job = %job.id, "a result that is not wanted was not removed");
+            }
         }
     }
 

@@ -7,7 +7,6 @@ use axum::extract::multipart::{Field, Multipart, MultipartError};
 use axum::extract::{FromRequest, Request};
 use axum::http::{HeaderValue, header};
 use futures_util::stream::{self, Stream, StreamExt, TryStreamExt};
-use tokio::task::coop::consume_budget;
 use tokio::time::timeout;
 use utoipa::ToSchema;
 
@@ -137,27 +136,14 @@ impl Body {
         bytes: Vec<u8>,
     ) -> Result<(StoredCloud, Room), ApiError> {
         let most = self.service.admission.max_points();
-        let (room, part, bytes, name) = self.room_for(part, bytes, name, most).await?;
-        let read = move || codec::read_cloud(&part, &bytes, name.as_deref(), most);
-        Ok((self.timed(read).await?, room))
-    }
-
-    /// Takes room for what a file unfolds to, before it does: a small one may hold a large cloud.
-    async fn room_for(
-        &mut self,
-        part: String,
-        bytes: Vec<u8>,
-        name: Option<String>,
-        most: usize,
-    ) -> Result<(Room, String, Vec<u8>, Option<String>), ApiError> {
-        let price = move || {
-            let unfolded = codec::unfolded_bytes(&part, &bytes, name.as_deref(), most)?;
-            Ok((unfolded, part, bytes, name))
-        };
-        let (unfolded, part, bytes, name) = self.timed(price).await?;
         let mut room = self.room.another();
-        room.hold(unfolded)?;
-        Ok((room, part, bytes, name))
+        self.timed(move || {
+            // A small file may unfold to a large cloud.
+            room.hold(codec::unfolded_bytes(&part, &bytes, name.as_deref(), most)?)?;
+            let cloud = codec::read_cloud(&part, &bytes, name.as_deref(), most)?;
+            Ok((cloud, room))
+        })
+        .await
     }
 
     /// Reads a file that holds both clouds.
@@ -165,14 +151,14 @@ impl Body {
         &mut self,
         bytes: Vec<u8>,
     ) -> Result<([StoredCloud; 2], Room), ApiError> {
+        const PART: &str = "source";
         let most = self.service.admission.max_points();
-        let (room, part, bytes, _) = self
-            .room_for("source".to_owned(), bytes, None, most)
-            .await?;
-        let clouds = self
-            .timed(move || codec::read_pair(&part, &bytes, most))
-            .await?;
-        Ok((clouds, room))
+        let mut room = self.room.another();
+        self.timed(move || {
+            room.hold(codec::unfolded_bytes(PART, &bytes, None, most)?)?;
+            Ok((codec::read_pair(PART, &bytes, most)?, room))
+        })
+        .await
     }
 
     async fn timed<T: Send + 'static>(
@@ -253,8 +239,6 @@ async fn drain<E>(pieces: impl Stream<Item = Result<usize, E>>) {
     let drained = async {
         let mut bytes = 0;
         while let Some(Ok(piece)) = pieces.next().await {
-            // A piece that is there at once must not keep the time from passing.
-            consume_budget().await;
             bytes += piece;
             if bytes > MOST {
                 return;

@@ -195,10 +195,7 @@ pub(super) fn fail(
     job: &Job,
     error: JobError,
 ) -> Result<State, QueueError> {
-    let sql = "UPDATE jobs SET failures = failures + 1 WHERE id = ?1 RETURNING failures";
-    let failures: u32 = connection
-        .prepare_cached(sql)?
-        .query_row([job.id.as_bytes()], |row| row.get(0))?;
+    let failures = count(connection, job, "failures")?;
     if error.retryable && failures < options.max_attempts {
         let doublings = (failures - 1).min(10);
         let delay = options.retry_delay.saturating_mul(1 << doublings);
@@ -221,20 +218,13 @@ fn delay(
     job: &Job,
     error: JobError,
 ) -> Result<State, QueueError> {
-    let sql = "UPDATE jobs SET delays = delays + 1 WHERE id = ?1 RETURNING delays";
-    let delays: u32 = connection
-        .prepare_cached(sql)?
-        .query_row([job.id.as_bytes()], |row| row.get(0))?;
+    let delays = count(connection, job, "delays")?;
     if delays < MAX_DELAYS {
-        let longer = FIRST_DELAY.max(options.retry_delay) * (1 << delays.min(12));
-        return requeue_running(connection, effects, job, longer.min(LONGEST_DELAY));
+        let first = FIRST_DELAY.max(options.retry_delay);
+        let longer = first.saturating_mul(1 << delays.min(12)).min(LONGEST_DELAY);
+        return requeue_running(connection, effects, job, longer);
     }
-    let how = End {
-        error: Some(error),
-        dead: true,
-        ..End::default()
-    };
-    end(connection, effects, options, job, State::Failed, &how)
+    give_up(connection, effects, options, job, error)
 }
 
 /// One death in its run more: another attempt at once, or the end.
@@ -245,13 +235,29 @@ pub(super) fn crash(
     job: &Job,
     error: JobError,
 ) -> Result<State, QueueError> {
-    let sql = "UPDATE jobs SET crashes = crashes + 1 WHERE id = ?1 RETURNING crashes";
-    let crashes: u32 = connection
-        .prepare_cached(sql)?
-        .query_row([job.id.as_bytes()], |row| row.get(0))?;
+    let crashes = count(connection, job, "crashes")?;
     if crashes < options.max_crashes {
         return requeue_running(connection, effects, job, Duration::ZERO);
     }
+    give_up(connection, effects, options, job, error)
+}
+
+/// Adds one to a job's counter, which is a column of its row.
+fn count(connection: &Connection, job: &Job, counter: &str) -> Result<u32, QueueError> {
+    let sql =
+        format!("UPDATE jobs SET {counter} = {counter} + 1 WHERE id = ?1 RETURNING {counter}");
+    let mut statement = connection.prepare_cached(&sql)?;
+    Ok(statement.query_row([job.id.as_bytes()], |row| row.get(0))?)
+}
+
+/// Ends a job as a dead letter.
+fn give_up(
+    connection: &Connection,
+    effects: &mut Effects,
+    options: &QueueOptions,
+    job: &Job,
+    error: JobError,
+) -> Result<State, QueueError> {
     let how = End {
         error: Some(error),
         dead: true,
