@@ -160,9 +160,7 @@ impl Service {
         job: &Job,
         format: DenseFormat,
     ) -> Result<Encoded, ApiError> {
-        let known = DENSE_FORMATS.iter().find(|(known, ..)| *known == format);
-        let (.., ending) = *known.unwrap_or(&DENSE_FORMATS[0]);
-        let name = (job.id, job.attempt, ending);
+        let name = (job.id, job.attempt, format.ending());
         // One at a time: a cloud is as large as all of its sweeps.
         if let Some(made) = self.answers.made(&name) {
             return Ok(made);

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::extract::{Request, State};
-use axum::http::{HeaderValue, header};
+use axum::http::{HeaderValue, Method, header};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use tower_http::catch_panic::CatchPanicLayer;
@@ -16,7 +16,7 @@ use tracing::Instrument;
 use super::draft::Arrived;
 use super::error::{ApiError, Row};
 use super::grpc;
-use super::listener::Connection;
+use super::listener::Asking;
 use super::origin;
 use super::service::Service;
 
@@ -40,6 +40,14 @@ fn is_open(path: &str) -> bool {
         || path.starts_with("/grpc.health.v1.Health/")
 }
 
+/// Whether a request only observes a job or health: its client asks again where it is cut off.
+fn observes(request: &Request) -> bool {
+    let (path, query) = (request.uri().path(), request.uri().query());
+    let polls = query.is_some_and(|query| query.split('&').any(|one| one.starts_with("wait=")));
+    let reads = request.method() == Method::GET && (polls || path.ends_with("/events"));
+    reads || path.ends_with("/WatchJob") || path.ends_with("Health/Watch")
+}
+
 fn is_grpc(request: &Request) -> bool {
     let media = request.headers().get(header::CONTENT_TYPE);
     media.is_some_and(|media| media.as_bytes().starts_with(b"application/grpc"))
@@ -51,6 +59,11 @@ async fn check_key(
     next: Next,
 ) -> Response {
     request.extensions_mut().insert(Arrived(Instant::now()));
+    if observes(&request)
+        && let Some(asking) = request.extensions().get::<Asking>()
+    {
+        asking.observes();
+    }
     let mut sent = origin::check_host_is_one(&request);
     if service.keys.is_open() {
         sent = sent.and_then(|()| origin::check(&service.hosts, &request));
@@ -62,8 +75,8 @@ async fn check_key(
     match service.caller(shown.and_then(|value| value.to_str().ok())) {
         Ok(caller) => {
             let several = service.keys.has_several_tenants();
-            if let Some(connection) = request.extensions().get::<Arc<Connection>>()
-                && !connection.is_known(&caller.tenant, several)
+            if let Some(asking) = request.extensions().get::<Asking>()
+                && !asking.is_known(&caller.tenant, several)
             {
                 return refused(&request, ApiError::TenantLimit(Duration::from_secs(1)));
             }

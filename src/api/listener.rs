@@ -16,9 +16,9 @@ use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::body::Body;
+use hyper::Request;
 use hyper::body::Incoming;
 use hyper::service::service_fn;
-use hyper::{Method, Request, Uri};
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto::Builder;
 use rustls::pki_types::pem::PemObject;
@@ -36,7 +36,7 @@ use tower::ServiceExt;
 
 use self::bodies::AnswerBody;
 pub(super) use self::bodies::RequestBody;
-pub(super) use self::connections::Connection;
+pub(super) use self::connections::Asking;
 use self::connections::{Connections, Entry, Patience, Verdict};
 use self::opening::Opening;
 use self::stall::Stall;
@@ -126,11 +126,6 @@ const PING_TIMEOUT: Duration = Duration::from_secs(10);
 /// Marks an answer whose body has room of its own.
 #[derive(Clone, Copy)]
 pub(super) struct HasRoom;
-
-/// Marks an answer that holds little and may wait for its reader: a stream whose client works on
-/// each message before it takes the next one.
-#[derive(Clone, Copy)]
-pub(super) struct MayWait;
 
 /// Time that a connection which has to make room may take for that.
 const EVICTION: Duration = Duration::from_millis(200);
@@ -317,15 +312,6 @@ async fn converse(
     }
 }
 
-/// Whether a request only looks on at a job or at health: event streams, long polls and the like,
-/// which their clients take up again where they were cut off.
-fn looks_on(method: &Method, uri: &Uri) -> bool {
-    let (path, query) = (uri.path(), uri.query().unwrap_or_default());
-    let polls = query.split('&').any(|one| one.starts_with("wait="));
-    let reads = method == Method::GET && (polls || path.ends_with("/events"));
-    reads || path.ends_with("/WatchJob") || path.ends_with("Health/Watch")
-}
-
 /// What answers, and the room that answers have.
 type Served = (Router, Arc<Semaphore>);
 
@@ -358,9 +344,9 @@ async fn answer<S>(
         .keep_alive_timeout(PING_TIMEOUT);
     let peer = Arc::clone(&entry.connection);
     let service = service_fn(move |request: Request<Incoming>| {
-        let open = peer.begin(looks_on(request.method(), request.uri()));
+        let open = peer.begin();
         let mut request = request.map(|body| Body::new(RequestBody::new(body)));
-        request.extensions_mut().insert(Arc::clone(&peer));
+        request.extensions_mut().insert(open.asking());
         let answering = router.clone().oneshot(request);
         let answers = Arc::clone(&answers);
         async move {
@@ -368,9 +354,6 @@ async fn answer<S>(
             response.map(|response| {
                 let has_room = response.extensions().get::<HasRoom>().is_some();
                 let room = (!has_room).then_some(answers);
-                if response.extensions().get::<MayWait>().is_some() {
-                    open.may_wait();
-                }
                 response.map(|body| AnswerBody::new(body, open, room))
             })
         }

@@ -42,6 +42,21 @@ impl DenseFormat {
     /// The endings that [`DenseFormat::from_path`] knows.
     pub const KNOWN: &'static str = ".npz, .ply, .pcd, .laz, .las";
 
+    fn entry(self) -> &'static (Self, &'static str, &'static str) {
+        let found = DENSE_FORMATS.iter().find(|(format, ..)| *format == self);
+        found.unwrap_or(&DENSE_FORMATS[0])
+    }
+
+    /// Its media type.
+    pub fn media_type(self) -> &'static str {
+        self.entry().1
+    }
+
+    /// The ending of a file in it.
+    pub fn ending(self) -> &'static str {
+        self.entry().2
+    }
+
     /// The format that a file name's ending names.
     ///
     /// # Errors

@@ -17,7 +17,7 @@ use crate::api::answers::Taking;
 use crate::api::dense;
 use crate::api::draft::{Accepted, Draft};
 use crate::api::error::ApiError;
-use crate::api::listener::MayWait;
+use crate::api::listener::Asking;
 use crate::api::service::{Service, Waited};
 use crate::job::{InvalidId, Job, JobId, Kind, State};
 
@@ -211,10 +211,11 @@ impl SceneFlow for Calls {
         let call = Call::of(&request)?;
         let awaited = Promise::WhileAwaited;
         self.service.check_room(&call.caller, None, awaited)?;
+        if let Some(asking) = request.extensions().get::<Asking>() {
+            asking.may_wait();
+        }
         let answers = sequence::run(Arc::clone(&self.service), call, request.into_inner());
-        let mut response: Response<Self::EstimateSequenceStream> = Response::new(Box::pin(answers));
-        response.extensions_mut().insert(MayWait);
-        Ok(response)
+        Ok(Response::new(Box::pin(answers)))
     }
 
     async fn submit_job(

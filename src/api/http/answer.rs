@@ -18,7 +18,7 @@ use crate::api::dense;
 use crate::api::error::ApiError;
 use crate::api::listener::HasRoom;
 use crate::api::service::Service;
-use crate::formats::{DENSE_FORMATS, DenseFormat};
+use crate::formats::DenseFormat;
 use crate::job::{DenseReport, Job, Kind, State as JobState};
 
 /// A pair's flow, whole.
@@ -58,12 +58,10 @@ impl Head {
     }
 
     fn of_cloud(job: &Arc<Job>, report: &DenseReport, format: DenseFormat) -> Self {
-        let known = DENSE_FORMATS.iter().find(|(known, ..)| *known == format);
-        let (_, media_type, ending) = *known.unwrap_or(&DENSE_FORMATS[0]);
         Self {
             job: Arc::clone(job),
-            media_type,
-            ending,
+            media_type: format.media_type(),
+            ending: format.ending(),
             own: vec![("fnsf-seconds", format!("{:.6}", report.seconds))],
         }
     }

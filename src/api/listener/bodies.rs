@@ -185,7 +185,7 @@ mod tests {
         let body = AnyBody::from(bytes.clone());
         let room = Arc::new(Semaphore::new(bytes.len() + 10));
         let full = Some(Arc::clone(&room));
-        let mut answer = AnswerBody::new(body, entry.connection.begin(false), full.clone());
+        let mut answer = AnswerBody::new(body, entry.connection.begin(), full.clone());
         let mut read = Vec::new();
         loop {
             let left = (bytes.len() - read.len()) as u64;
@@ -199,7 +199,7 @@ mod tests {
             if read.len() < bytes.len() {
                 // Another one of that size does not fit beside it.
                 let body = AnyBody::from(bytes.clone());
-                let request = entry.connection.begin(false);
+                let request = entry.connection.begin();
                 let mut other = AnswerBody::new(body, request, full.clone());
                 assert!(other.frame().await.expect("an end").is_err());
             }

@@ -6,7 +6,7 @@
 use std::cmp::Reverse;
 use std::collections::HashMap;
 use std::net::IpAddr;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
@@ -24,8 +24,8 @@ pub(super) struct Connections {
     next: AtomicU64,
 }
 
-/// One open connection. Requests carry it as an extension.
-pub(in crate::api) struct Connection {
+/// One open connection.
+pub(super) struct Connection {
     opened: Instant,
     address: IpAddr,
     connections: Weak<Connections>,
@@ -47,11 +47,21 @@ struct State {
 }
 
 /// A request that is being answered.
+#[derive(Default)]
 struct Open {
     /// When a piece of its answer was handed over that has not been taken yet.
     handed: Option<Instant>,
-    /// Whether it only looks on, and its client can come back for it at any time.
-    looks_on: bool,
+    /// Whether it only observes: its client can ask again at any time.
+    observes: bool,
+    /// Whether its client may leave the answer unread.
+    may_wait: bool,
+}
+
+/// A request, for those who answer it: a request extension.
+#[derive(Clone)]
+pub(in crate::api) struct Asking {
+    connection: Arc<Connection>,
+    number: u64,
 }
 
 /// How long a connection may be without what it is for.
@@ -83,11 +93,7 @@ pub(super) struct Entry {
 }
 
 /// A request that is being answered, until it is dropped.
-pub(super) struct OpenRequest {
-    connection: Arc<Connection>,
-    number: u64,
-    may_wait: AtomicBool,
-}
+pub(super) struct OpenRequest(Asking);
 
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
@@ -127,10 +133,9 @@ impl Connections {
         }
     }
 
-    /// Ends the connection that is needed least, so that another one has room: one that has shown no
-    /// key, else one without a request, else one that only looks on; the longest idle of several. One that
-    /// works for somebody is never ended for one that has shown nothing yet. False where there is
-    /// none.
+    /// Evicts one connection so that a new one has room. Candidates in order: without a key, without
+    /// a request, with observing requests alone. Of several it takes the longest idle. It never evicts
+    /// a connection with other requests of a known tenant. False without a candidate.
     pub(super) fn make_room(&self) -> bool {
         let mut open = locked(&self.open);
         let rank = |connection: &Connection| {
@@ -139,7 +144,7 @@ impl Connections {
                 (None, true) => Some(0),
                 (None, false) => Some(1),
                 (Some(_), true) => Some(KNOWN),
-                (Some(_), false) if state.requests.values().all(|open| open.looks_on) => {
+                (Some(_), false) if state.requests.values().all(|open| open.observes) => {
                     Some(KNOWN + 1)
                 }
                 (Some(_), false) => None,
@@ -149,7 +154,7 @@ impl Connections {
             .iter()
             .filter_map(|(number, one)| Some((rank(one)?, one.address, one.idle_since(), *number)))
             .collect();
-        // Of those without a key, one of whoever has most: who knocks quickly keeps nobody else out.
+        // Of those without a key, one of the address that has most: a flood evicts itself.
         let mut held: HashMap<IpAddr, usize> = HashMap::new();
         for (_, address, ..) in ranked.iter().filter(|(rank, ..)| *rank < KNOWN) {
             *held.entry(*address).or_default() += 1;
@@ -167,26 +172,30 @@ impl Connections {
         true
     }
 
-    /// Connections on which a tenant is being answered.
-    fn busy_of(&self, tenant: &Tenant) -> usize {
+    /// Whether a tenant is being answered on more than half of all connections.
+    fn is_crowded_by(&self, tenant: &Tenant) -> bool {
+        let half = self.most.div_ceil(2);
         let open = locked(&self.open);
+        if open.len() <= half {
+            return false;
+        }
         let is_busy = |connection: &&Arc<Connection>| {
             let state = locked(&connection.state);
             state.tenant.as_ref() == Some(tenant) && !state.requests.is_empty()
         };
-        open.values().filter(is_busy).count()
+        open.values().filter(is_busy).count() > half
     }
 }
 
 impl Connection {
     /// A good key was shown, or none is needed. Says whether its tenant may have one more connection
     /// at work: of several tenants one may have half of all.
-    pub(in crate::api) fn is_known(&self, tenant: &Tenant, several: bool) -> bool {
+    fn is_known(&self, tenant: &Tenant, several: bool) -> bool {
         locked(&self.state).tenant = Some(tenant.clone());
         let Some(connections) = self.connections.upgrade().filter(|_| several) else {
             return true;
         };
-        connections.busy_of(tenant) <= connections.most.div_ceil(2)
+        !connections.is_crowded_by(tenant)
     }
 
     /// Since when it has no request.
@@ -199,21 +208,16 @@ impl Connection {
         self.evicted.cancelled().await;
     }
 
-    /// A request begins, which may only look on at a job; it ends when the guard is dropped.
-    pub(super) fn begin(self: &Arc<Self>, looks_on: bool) -> OpenRequest {
+    /// A request begins; it ends when the guard is dropped.
+    pub(super) fn begin(self: &Arc<Self>) -> OpenRequest {
         let mut state = locked(&self.state);
         let number = state.next;
         state.next += 1;
-        let open = Open {
-            handed: None,
-            looks_on,
-        };
-        state.requests.insert(number, open);
-        OpenRequest {
+        state.requests.insert(number, Open::default());
+        OpenRequest(Asking {
             connection: Arc::clone(self),
             number,
-            may_wait: AtomicBool::new(false),
-        }
+        })
     }
 
     /// What is to be done with it now.
@@ -240,36 +244,64 @@ impl Connection {
     }
 }
 
-impl Drop for Entry {
-    fn drop(&mut self) {
-        locked(&self.connections.open).remove(&self.number);
+impl Asking {
+    fn update(&self, change: impl FnOnce(&mut Open)) {
+        if let Some(open) = locked(&self.connection.state)
+            .requests
+            .get_mut(&self.number)
+        {
+            change(open);
+        }
+    }
+
+    /// Its caller has shown a good key, or none is needed. Says whether the tenant may have one more
+    /// connection at work: of `several` tenants one may have half of all.
+    pub(in crate::api) fn is_known(&self, tenant: &Tenant, several: bool) -> bool {
+        self.connection.is_known(tenant, several)
+    }
+
+    /// It only observes a job or health: event streams, long polls and the like. Its connection may
+    /// have to make room, and its client asks again.
+    pub(in crate::api) fn observes(&self) {
+        self.update(|open| open.observes = true);
+    }
+
+    /// Its answer holds little and may be left unread: a stream whose client works on each message
+    /// before it takes the next one.
+    pub(in crate::api) fn may_wait(&self) {
+        self.update(|open| open.may_wait = true);
     }
 }
 
 impl OpenRequest {
-    /// Its answer may be left unread.
-    pub(super) fn may_wait(&self) {
-        self.may_wait.store(true, Ordering::Relaxed);
+    /// What those who answer it see of it.
+    pub(super) fn asking(&self) -> Asking {
+        self.0.clone()
     }
 
     /// A piece of the answer was handed over, or (none) the piece before has been taken.
     pub(super) fn handed(&self, at: Option<Instant>) {
-        let at = at.filter(|_| !self.may_wait.load(Ordering::Relaxed));
-        let mut state = locked(&self.connection.state);
-        let Some(request) = state.requests.get_mut(&self.number) else {
+        let mut state = locked(&self.0.connection.state);
+        let Some(request) = state.requests.get_mut(&self.0.number) else {
             return;
         };
-        let before = std::mem::replace(&mut request.handed, at);
+        let before = std::mem::replace(&mut request.handed, at.filter(|_| !request.may_wait));
         if before.is_some() && at.is_none() {
             state.taken = Instant::now();
         }
     }
 }
 
+impl Drop for Entry {
+    fn drop(&mut self) {
+        locked(&self.connections.open).remove(&self.number);
+    }
+}
+
 impl Drop for OpenRequest {
     fn drop(&mut self) {
-        let mut state = locked(&self.connection.state);
-        state.requests.remove(&self.number);
+        let mut state = locked(&self.0.connection.state);
+        state.requests.remove(&self.0.number);
         state.idle_since = Instant::now();
     }
 }
@@ -322,7 +354,7 @@ mod tests {
         assert_eq!(connection.verdict(&PATIENCE), Verdict::Keep);
         assert_eq!(connection.verdict(&idle), Verdict::Close);
         assert_eq!(connection.verdict(&unknown), Verdict::End);
-        let request = connection.begin(false);
+        let request = connection.begin();
         assert!(connection.is_known(&Tenant::default(), false));
         for patience in [idle, unknown, unread] {
             assert_eq!(connection.verdict(&patience), Verdict::Keep);
@@ -336,7 +368,7 @@ mod tests {
             unread: Duration::from_millis(100),
             ..PATIENCE
         };
-        let stalled = connection.begin(false);
+        let stalled = connection.begin();
         stalled.handed(Some(Instant::now()));
         for _ in 0..4 {
             std::thread::sleep(Duration::from_millis(40));
@@ -355,15 +387,16 @@ mod tests {
         let connections = Arc::new(Connections::new(4));
         let tenant = |name: &str| name.parse::<Tenant>().expect("a good name");
         let [works, idle] = [connections.enter(address(1)), connections.enter(address(1))];
-        let _request = works.connection.begin(false);
+        let _request = works.connection.begin();
         for entry in [&works, &idle] {
             assert!(entry.connection.is_known(&tenant("a"), true));
         }
         let follows = connections.enter(address(1));
         assert!(follows.connection.is_known(&tenant("a"), true));
-        let _events = follows.connection.begin(true);
+        let events = follows.connection.begin();
+        events.asking().observes();
         let [waits, unknown] = [connections.enter(address(1)), connections.enter(address(1))];
-        let _request_of_nobody = waits.connection.begin(false);
+        let _request_of_nobody = waits.connection.begin();
         let is_evicted = |entry: &Entry| entry.connection.evicted.is_cancelled();
         for gone in [&unknown, &waits, &idle, &follows] {
             assert!(!is_evicted(gone));
@@ -381,7 +414,7 @@ mod tests {
         let mut held = Vec::new();
         let mut asks = |name: &str, several: bool| {
             let entry = connections.enter(address(1));
-            let request = entry.connection.begin(false);
+            let request = entry.connection.begin();
             let may = entry.connection.is_known(&tenant(name), several);
             held.push((entry, request));
             may
