@@ -7,9 +7,9 @@
 
 use std::time::Instant;
 
-use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Truth, evaluate};
+use fnsf::flow::field::Backend;
 use fnsf::flow::{Ground, Interrupt, Options, Preset, Problem, Watch, estimate};
 use fnsf::formats::{Pair, read_pair};
 

@@ -15,7 +15,7 @@ mod common;
 use std::time::Instant;
 
 use common::median;
-use fnsf::flow::backend::Backend;
+use fnsf::flow::field::Backend;
 use fnsf::flow::gpu::{
     Gpu, GpuOptions, KernelTime, Selector, arithmetic_peak, kernel_times, select,
 };

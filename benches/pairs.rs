@@ -10,8 +10,8 @@ mod common;
 use std::time::Instant;
 
 use common::{median, scenes};
-use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::field::Backend;
 use fnsf::flow::{Options, Preset, Problem, Watch, estimate};
 
 const SEEDS: u64 = 3;

@@ -16,10 +16,10 @@
 mod clock;
 
 use clock::Clock;
-use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::distance::{Metric, Sites};
 use fnsf::flow::evaluate::{Truth, evaluate};
+use fnsf::flow::field::Backend;
 use fnsf::flow::{
     self, Decay, EarlyStopOptions, Ego, Ground, Inputs, Keep, Options, Preset, Problem, Start,
 };

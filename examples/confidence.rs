@@ -16,9 +16,9 @@
 #[expect(dead_code, reason = "what moves is said by the evidence here")]
 mod known;
 
-use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Calibration, Reliability};
+use fnsf::flow::field::Backend;
 use fnsf::flow::{Clouds, Evidence, LabelOptions, Point, RigidTransform, SURE_M, Unwatched};
 use known::{Known, PAIRS, real_pairs, street};
 use nalgebra::{DMatrix, DVector, Point3};

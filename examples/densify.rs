@@ -18,11 +18,11 @@ mod look;
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::densify::{Later, Leg, Plan, densify};
 use fnsf::flow::depth::{Occlusion, project};
 use fnsf::flow::distance::{DistanceOptions, Sites};
+use fnsf::flow::field::Backend;
 use fnsf::flow::ground::{GroundOptions, segment};
 use fnsf::flow::simulate::{Frame, Street, StreetOptions};
 use fnsf::flow::{DenseCloud, Field, Point, Preset, Residual, Sequence, Sweep, Unwatched};

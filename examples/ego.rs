@@ -6,8 +6,8 @@
 use std::path::PathBuf;
 use std::time::Instant;
 
-use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::field::Backend;
 use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::flow::{Point, RigidTransform, Unwatched};
 use fnsf::formats::read_pair;

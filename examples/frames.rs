@@ -17,9 +17,9 @@
 mod clock;
 
 use clock::Clock;
-use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Truth, evaluate};
+use fnsf::flow::field::Backend;
 use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::flow::{self, Around, Ground, LabelOptions, Point, Preset, Problem, Sweep};
 use fnsf::formats::{read_cloud, read_pair};

@@ -19,9 +19,9 @@ mod clock;
 mod known;
 
 use clock::Clock;
-use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Truth, evaluate};
+use fnsf::flow::field::Backend;
 use fnsf::flow::{self, Ground, LabelOptions, Options, Preset, Problem};
 use known::{Known, real_pairs, street};
 

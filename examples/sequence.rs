@@ -13,8 +13,8 @@
 
 use std::time::Instant;
 
-use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::field::Backend;
 use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::flow::{
     Estimate, Options, Point, Preset, Problem, Sequence, Sweep, Unwatched, WarmStart, estimate,

@@ -6,7 +6,7 @@
 use std::sync::{Mutex, PoisonError};
 
 use crate::flow::Price;
-use crate::flow::field::mlp::PARAMETERS;
+use crate::flow::field::PARAMETERS;
 use crate::job::DeviceKind;
 
 /// Multiply-adds of a nominal second: two cores with wide vector units.

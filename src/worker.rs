@@ -24,7 +24,7 @@ pub use self::probe::StoreProbe;
 use crate::clock::Timestamp;
 use crate::cost::CostModel;
 use crate::engine::{Densification, Densified, EngineError, Health, Lane, Work};
-use crate::flow::backend::BackendError;
+use crate::flow::field::BackendError;
 use crate::flow::{Estimate, Field, FlowError, Point};
 use crate::formats::MAX_COORDINATE_M;
 use crate::job::{DeviceKind, Job, JobError, JobProgress, Kind, Report};

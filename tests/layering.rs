@@ -129,7 +129,10 @@ fn the_numerics_have_no_clock_no_files_no_environment_no_async_and_print_nothing
 #[test]
 fn the_solver_sees_only_the_backends_traits() {
     assert_eq!(
-        uses("flow/solver.rs", &["cpu::", "gpu::", "distance::", "mlp"]),
+        uses(
+            "flow/estimate/run.rs",
+            &["cpu::", "gpu::", "distance::", "mlp"]
+        ),
         [""; 0]
     );
 }
@@ -247,7 +250,7 @@ fn only_the_command_line_prints() {
 #[test]
 fn unsafe_code_stays_in_the_vector_kernels_but_for_one_word_to_the_driver() {
     let mut users = uses_outside("", "flow/cpu/", &["unsafe "]);
-    users.retain(|line| !line.starts_with("flow/gpu/matrix.rs: let experiments = "));
+    users.retain(|line| !line.starts_with("flow/gpu/half.rs: let experiments = "));
     assert_eq!(users, [""; 0]);
 }
 

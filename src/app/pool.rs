@@ -13,9 +13,10 @@ use anyhow::{anyhow, bail};
 use crate::config::Config;
 use crate::cost::Lanes;
 use crate::engine::{DeviceOptions, Opened, Opener, Reopening, try_opening};
-use crate::flow::backend::{Backend, BackendError};
 use crate::flow::cpu::CpuBackend;
-use crate::flow::gpu::{self, Adapter, AdapterKind, Gpu, GpuOptions, Selector};
+use crate::flow::field::{Backend, BackendError};
+use crate::flow::gpu;
+use crate::flow::gpu::{Adapter, AdapterKind, Gpu, GpuOptions, Selector};
 use crate::job::DeviceKind;
 
 /// Pairs that share a card's submissions: small ones leave a large card idle otherwise.

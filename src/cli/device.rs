@@ -6,9 +6,10 @@ use std::str::FromStr;
 use anyhow::{Context, anyhow};
 
 use super::failure::Failure;
-use crate::flow::backend::{Backend, BackendError};
 use crate::flow::cpu::CpuBackend;
-use crate::flow::gpu::{self, Adapter, Gpu, GpuOptions, Selector};
+use crate::flow::field::{Backend, BackendError};
+use crate::flow::gpu;
+use crate::flow::gpu::{Adapter, Gpu, GpuOptions, Selector};
 use crate::job::DeviceChoice;
 
 /// Takes drivers that only compute on the CPU for GPUs where it is 1: for tests.

@@ -9,7 +9,7 @@ use super::device::{self, DeviceArgument};
 use super::failure::Failure;
 use super::files;
 use super::terminal::Terminal;
-use crate::flow::backend::{Backend, BackendError};
+use crate::flow::field::{Backend, BackendError};
 use crate::flow::{self, Ego, Estimate, FlowError, Preset, RigidTransform, Sequence, Sweep};
 use crate::formats;
 use crate::job::{

@@ -6,9 +6,9 @@ use std::thread;
 use std::time::Duration;
 
 use super::{DeviceOptions, Opened, Opener, Reopening};
-use crate::flow::backend::{Advance, Backend, BackendError, Report, Trainer, Transform};
 use crate::flow::cpu::CpuBackend;
 use crate::flow::distance::DistanceOptions;
+use crate::flow::field::{Advance, Backend, BackendError, Report, Trainer, Transform};
 use crate::flow::{Host, Network, Options, Point, TrainerState, Watch};
 use crate::job::DeviceKind;
 

@@ -6,8 +6,9 @@ use std::sync::Arc;
 use super::EngineError;
 use super::busy::Busy;
 use super::lane::Heard;
-use crate::flow::backend::{Backend, BackendError};
-use crate::flow::densify::{self, DensifyError, Leg, Plan};
+use crate::flow::densify;
+use crate::flow::densify::{DensifyError, Leg, Plan};
+use crate::flow::field::{Backend, BackendError};
 use crate::flow::{DenseCloud, Field, FlowError, Sweep, Watch};
 
 /// Sweeps to be carried into one frame.

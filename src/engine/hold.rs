@@ -13,7 +13,7 @@ use tokio::sync::watch;
 
 use super::lane::{Trust, message};
 use super::{Health, Opened, Opener, Reopening, trial};
-use crate::flow::backend::Backend;
+use crate::flow::field::Backend;
 use crate::metrics::Metrics;
 
 const WHILE_IDLE: &str = "it went away while it had nothing to do";

@@ -10,7 +10,7 @@ use tokio::sync::{mpsc, oneshot};
 use super::busy::Busy;
 use super::hold::{Held, Hold};
 use super::{EngineError, Work};
-use crate::flow::backend::{Backend, BackendError};
+use crate::flow::field::{Backend, BackendError};
 use crate::flow::{
     self, Around, Estimate, FlowError, Interrupt, Problem, Progress, Snapshot, Sweep, Watch,
 };

@@ -8,7 +8,7 @@ use tokio::time::timeout;
 
 use super::cards::Switches;
 use super::{Device, EngineError, Health, Lane, Work};
-use crate::flow::backend::BackendError;
+use crate::flow::field::BackendError;
 use crate::flow::{Point, Preset, Unwatched};
 use crate::metrics::Metrics;
 

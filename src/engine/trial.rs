@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use super::lane::message;
 use super::{Opened, Opener};
-use crate::flow::backend::{Backend, BackendError};
+use crate::flow::field::{Backend, BackendError};
 use crate::flow::{self, FlowError, Preset, Problem, Unwatched};
 
 /// A wall and a post in front of it, moved by this, metres.

@@ -1,9 +1,8 @@
 //! Why an estimate was refused or failed.
 
-use super::backend::BackendError;
+use super::data::MIN_POINTS;
 use super::distance::DistanceError;
-use super::points::MIN_POINTS;
-use super::snapshot::SnapshotError;
+use super::field::{BackendError, SnapshotError};
 
 /// Why an estimate was refused or failed.
 #[derive(Debug, thiserror::Error)]

@@ -1,7 +1,7 @@
 //! The numerics: scene flow of a pair of point clouds by run-time optimization.
 //!
 //! ```text
-//! Problem - preprocess - backend.transform - align - start - loop { advance } - evaluate - Estimate
+//! Problem - select - registration - objects or field - Estimate
 //! ```
 //!
 //! No async, no input or output, no clock, no environment, no globals. Deadlines, cancellation and
@@ -23,78 +23,52 @@
 //! # }
 //! ```
 
-// What goes in and comes out, and the loop between.
-mod around;
-mod deadline;
-mod dense;
+// The estimate of a pair and of a sequence, and its cost.
+mod cost;
 mod error;
+mod estimate;
+mod motion;
 mod options;
-mod points;
-mod preprocess;
-mod price;
-mod sealed;
+mod select;
 mod sequence;
-mod snapshot;
-mod solver;
-mod warm_start;
-mod watch;
 
-// What a point is pulled toward, and what moves it.
-pub mod distance;
-mod ego;
-pub mod field;
-mod flat;
-mod label;
-mod loss;
+// Data and searches in space that all rooms share.
+mod data;
+mod host;
+mod spatial;
 
-// What is said of a sweep's points besides.
-mod bounds;
-mod objects;
-
-// What carries no motion of its own.
+// Ground and ego motion.
 pub mod ground;
+mod registration;
 
-// What becomes of a sequence.
-pub mod densify;
-
-// How the field is fitted, and on what.
-pub mod backend;
-mod course;
+// The two methods: objects, and a neural field on a device.
 pub mod cpu;
-mod early_stop;
+pub mod distance;
+pub mod field;
 #[cfg(feature = "gpu")]
 pub mod gpu;
-mod host;
-mod once;
-mod optimizer;
-mod recall;
-mod sums;
+mod objects;
 
-// What a camera sees of a cloud.
+// Results of a sequence, depth images, metrics and simulated data.
+pub mod densify;
 pub mod depth;
-
-// How good a flow is, and streets to try it on.
 pub mod evaluate;
-mod random;
 pub mod simulate;
 
-#[cfg(test)]
-mod reference;
-
-pub use around::{AlignedSweep, Around};
-pub use bounds::Bounds;
-pub use dense::DenseCloud;
+pub use cost::{AroundPrice, Price, price, price_around};
+pub use data::{
+    Bounds, DYNAMIC_M, DenseCloud, Interrupt, MIN_POINTS, Point, Progress, RigidTransform,
+    SealError, Unwatched, Watch,
+};
 pub use error::FlowError;
-pub use field::{Field, Network, Residual};
+pub use estimate::{Estimate, PhaseSeconds, StopReason, estimate, resume};
+pub use field::{Network, Snapshot, SnapshotError, TrainerState};
 pub use host::Host;
-pub use label::{Clouds, Evidence, Labelled, Motions, Parts, SURE_M, confidence_of_ground};
-pub use objects::{Cluster, Objects};
+pub use motion::{Field, Residual};
+pub use objects::{
+    Clouds, Cluster, Evidence, Labelled, Motions, Objects, Parts, SURE_M, confidence_of_ground,
+};
 pub use options::*;
-pub use points::{DYNAMIC_M, MIN_POINTS, Point, RigidTransform};
-pub use preprocess::Problem;
-pub use price::{AroundPrice, Price, price, price_around};
-pub use sealed::SealError;
+pub use registration::{AlignedSweep, Around};
+pub use select::Problem;
 pub use sequence::{Sequence, Sweep, is_whole, window};
-pub use snapshot::{Snapshot, SnapshotError, TrainerState};
-pub use solver::{Estimate, PhaseSeconds, StopReason, estimate, resume};
-pub use watch::{Interrupt, Progress, Unwatched, Watch};

@@ -1,7 +1,7 @@
 //! Every hyper-parameter and its default: the presets are here and nowhere else.
 
+use super::data::RigidTransform;
 use super::distance::DistanceOptions;
-use super::points::RigidTransform;
 
 /// A named set of options.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

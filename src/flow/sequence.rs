@@ -8,15 +8,14 @@
 use std::collections::VecDeque;
 use std::ops::Range;
 
-use super::around::Around;
-use super::backend::Backend;
+use super::data::{Point, Watch};
 use super::error::FlowError;
-use super::field::Field;
+use super::estimate::{Estimate, estimate};
+use super::field::Backend;
+use super::motion::Field;
 use super::options::{Ground, Options};
-use super::points::Point;
-use super::preprocess::{FindGround, Problem, find_ground, ground_of, is_in_range};
-use super::solver::{Estimate, estimate};
-use super::watch::Watch;
+use super::registration::Around;
+use super::select::{FindGround, Problem, find_ground, ground_of, is_in_range};
 
 /// One sweep of a sequence.
 #[derive(Clone, Debug, Default, PartialEq)]

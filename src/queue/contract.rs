@@ -88,11 +88,11 @@ macro_rules! queue_contract {
         )*
     };
 }
-pub(crate) use devices::*;
-pub(crate) use failures::*;
-pub(crate) use lives::*;
+pub(crate) use super::contract::devices::*;
+pub(crate) use super::contract::failures::*;
+pub(crate) use super::contract::lives::*;
+pub(crate) use super::contract::turns::*;
 pub(crate) use queue_contract;
-pub(crate) use turns::*;
 
 fn tenant(name: &str) -> Tenant {
     name.parse().expect("a good name")

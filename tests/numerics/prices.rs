@@ -1,8 +1,10 @@
 //! What an estimate is priced at, against what it takes.
 
+use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::distance::{DistanceError, Metric, Sites};
+use fnsf::flow::field::BackendError;
 use fnsf::flow::simulate::StreetOptions;
-use fnsf::flow::{FlowError, Unwatched, backend::BackendError, cpu::CpuBackend};
+use fnsf::flow::{FlowError, Unwatched};
 use fnsf::flow::{Ground, Options, Preset, Problem, estimate, price};
 
 use super::scenes::{real_pair, solve, street};

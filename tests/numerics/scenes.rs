@@ -6,9 +6,9 @@
 
 use std::path::PathBuf;
 
-use fnsf::flow::backend::Backend;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Metrics, Truth, evaluate};
+use fnsf::flow::field::Backend;
 use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::flow::{self, Estimate, Ground, Options, Problem, Unwatched};
 use fnsf::formats::{Pair, PairTruth, read_pair};

@@ -8,7 +8,8 @@ use crate::cli::device::{best_card, software_is_welcome};
 use crate::cli::failure::Failure;
 use crate::cli::output::say;
 use crate::engine::try_out;
-use crate::flow::gpu::{self, Adapter, AdapterKind, Gpu, GpuOptions};
+use crate::flow::gpu;
+use crate::flow::gpu::{Adapter, AdapterKind, Gpu, GpuOptions};
 
 /// Says everything about GPUs.
 pub(super) fn report() -> Result<(), Failure> {

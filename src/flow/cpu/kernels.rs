@@ -9,12 +9,12 @@
 )]
 
 use super::isa::Isa;
-use super::lanes::F32x4;
+use super::mlp_kernels::{backward, forward};
+use super::simd::F32x4;
 #[cfg(target_arch = "x86_64")]
-use super::lanes::{F32x8, F32x16};
-use super::passes::{backward, forward};
+use super::simd::{F32x8, F32x16};
 use super::tile::Tile;
-use crate::flow::field::mlp::Parameters;
+use crate::flow::field::Parameters;
 
 type Forward = unsafe fn(&Parameters, &mut Tile);
 type Backward = unsafe fn(&Parameters, &Parameters, &mut Tile, &mut Parameters);
@@ -108,9 +108,9 @@ unsafe fn backward_portable(p: &Parameters, t: &Parameters, tile: &mut Tile, g: 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::flow::field::mlp::{MIDDLE_LAYERS, WIDTH, middle_layer, transpose_middle_layers};
-    use crate::flow::random::Random;
-    use crate::flow::reference::ReferenceNetwork;
+    use crate::flow::data::Random;
+    use crate::flow::field::ReferenceNetwork;
+    use crate::flow::field::{MIDDLE_LAYERS, WIDTH, middle_layer, transpose_middle_layers};
 
     /// Single precision over sums of 128 and of 96 terms, eight layers deep.
     const TOLERANCE: f64 = 2e-5;

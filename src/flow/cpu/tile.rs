@@ -4,7 +4,7 @@
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use crate::flow::field::mlp::{Aligned, HIDDEN_LAYERS, WIDTH};
+use crate::flow::field::{Aligned, HIDDEN_LAYERS, WIDTH};
 
 /// Points in one tile: eight rows of activations of 96 points fill half of a 1 MiB cache.
 pub(crate) const TILE: usize = 96;

@@ -7,18 +7,15 @@ use core::ops::Range;
 
 use rayon::prelude::*;
 
-use super::CpuTransform;
-use super::evaluate::evaluate;
+use super::backend::CpuTransform;
+use super::inference::evaluate;
 use super::tile::{TILE, WorkingSets};
-use crate::flow::backend::{Advance, BackendError, Report, Trainer};
-use crate::flow::course::Course;
-use crate::flow::early_stop::EarlyStop;
-use crate::flow::field::mlp::{Parameters, transpose_middle_layers};
+use crate::flow::data::{Point, Progress, Watch};
+use crate::flow::field::{
+    Advance, BackendError, Chunks, Course, EarlyStop, Parameters, Report, Trainer, TrainerState,
+    reduction, transpose_middle_layers,
+};
 use crate::flow::options::Options;
-use crate::flow::points::Point;
-use crate::flow::snapshot::TrainerState;
-use crate::flow::sums::{self, Chunks};
-use crate::flow::watch::{Progress, Watch};
 
 /// Floats that one thread reduces and steps at a time.
 const SLICE: usize = 4096;
@@ -77,7 +74,7 @@ impl<'a> CpuTrainer<'a> {
     fn iterate(&mut self, watch: &dyn Watch) -> Option<(f32, bool)> {
         let batch = self.course.batch(self.state.iterations);
         let held = self.accumulate(batch, watch);
-        let loss = sums::mean(&self.losses);
+        let loss = reduction::mean(&self.losses);
         if !loss.is_finite() {
             return None;
         }

@@ -1,11 +1,15 @@
 //! Fields whose flow is known everywhere: networks that say the same at every point.
 
+use super::accumulate::part_of;
 use super::*;
 use crate::flow::cpu::CpuBackend;
-use crate::flow::field::mlp::{Conditioning, Parameters, last_layer};
-use crate::flow::field::{Network, Residual};
-use crate::flow::points::{Point, moved};
-use crate::flow::watch::Unwatched;
+use crate::flow::data::DenseCloud;
+use crate::flow::data::RigidTransform;
+use crate::flow::data::{Point, Unwatched, moved};
+use crate::flow::field::{Conditioning, Network, Parameters, last_layer};
+use crate::flow::motion::Field;
+use crate::flow::motion::Residual;
+use crate::flow::sequence::Sweep;
 
 /// Metres: single precision of coordinates of some metres.
 const ROUNDING_M: f32 = 1e-5;

@@ -3,7 +3,7 @@
 //! Camera frame: x right, y down, z forward, metres. Whole pixel coordinates are the middles of
 //! pixels, counted from 0, as KITTI and OpenCV have it. It must not know depths.
 
-use crate::flow::{Point, RigidTransform};
+use crate::flow::data::{Point, RigidTransform};
 use nalgebra::{Point3, Vector3};
 
 /// Widest and tallest image, pixels.

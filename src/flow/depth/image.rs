@@ -3,7 +3,7 @@
 //! It must not know files or colors.
 
 use super::camera::Camera;
-use crate::flow::Point;
+use crate::flow::data::Point;
 
 /// Depths along the optical axis, not along rays.
 #[derive(Debug, Clone, PartialEq)]
@@ -57,9 +57,9 @@ pub fn project(points: &[Point], camera: &Camera) -> DepthImage {
 
 #[cfg(test)]
 mod tests {
-    use super::super::camera::Intrinsics;
     use super::*;
-    use crate::flow::RigidTransform;
+    use crate::flow::data::RigidTransform;
+    use crate::flow::depth::camera::Intrinsics;
 
     fn camera() -> Camera {
         let intrinsics = Intrinsics {

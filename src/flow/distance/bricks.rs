@@ -4,17 +4,17 @@
 //! with 16-bit distances; beyond the band a coarse far field goes on, so that a lost point is still
 //! pulled home. Deterministic whatever the number of threads. FNSF Section 3.2, eq. 4 and 5.
 
-use super::Sample;
-use super::activate::{ABSENT, Index, VOLUME, within};
-use super::build::{self, BEYOND};
-use super::cell_sites::{CellGather, CellSites};
-use super::far::FarField;
+use super::brick_index::{ABSENT, Index, VOLUME, within};
+use super::coarse_field::FarField;
+use super::fill;
+use super::fill::BEYOND;
 use super::grid::{Grid, Lattice, trilinear};
-use super::layout::Layout;
 use super::options::{DistanceError, DistanceOptions, Sites};
-use super::point_sites::{PointGather, PointSites};
-use crate::flow::Point;
-use crate::flow::watch::{Unwatched, Watch};
+use super::plan::Layout;
+use super::point_distance::{PointGather, PointSites};
+use super::transform::Sample;
+use super::vertex_distance::{CellGather, CellSites};
+use crate::flow::data::{Point, Unwatched, Watch};
 
 /// The transform: distances at the vertices of active bricks, and a far field.
 #[derive(Debug)]
@@ -65,16 +65,16 @@ impl Bricks {
         let codes = match options.sites {
             Sites::Cells => {
                 let sites = CellSites::new(&cells, band);
-                build::band_codes(&index, || CellGather::new(&sites), watch)?
+                fill::band_codes(&index, || CellGather::new(&sites), watch)?
             }
             Sites::Points => {
                 let sites = PointSites::new(&grid, target, band);
-                build::band_codes(&index, || PointGather::new(&sites), watch)?
+                fill::band_codes(&index, || PointGather::new(&sites), watch)?
             }
         };
         Ok(Self {
             lattice: Lattice::new(&grid),
-            scale: (options.cell_m / build::codes_per_cell(band)) as f32,
+            scale: (options.cell_m / fill::codes_per_cell(band)) as f32,
             grid,
             index,
             codes,

@@ -3,7 +3,7 @@
 //! one cell on every side.
 
 use super::options::DistanceError;
-use crate::flow::Point;
+use crate::flow::data::Point;
 
 /// A lattice of vertices, `cell` metres apart.
 #[derive(Clone, Debug, PartialEq)]

@@ -1,99 +1,39 @@
 //! What a deformed point is pulled toward: the distance to the target cloud, anywhere in space.
 //!
-//! [`Bricks`] is the product's transform; [`dense`] is the published code's, for comparison.
+//! [`Bricks`] is the product's transform; [`DenseChamfer`] is the published code's, for comparison.
 //! FNSF Section 3.2. Knows nothing of networks or losses.
 
-mod activate;
+mod brick_index;
 mod bricks;
-mod build;
-mod cell_sites;
-pub mod dense;
-#[cfg(feature = "gpu")]
-pub(crate) mod device;
-mod far;
+mod chamfer;
+mod coarse_field;
+mod cost;
+mod fill;
 mod grid;
-mod layout;
 mod options;
-mod point_sites;
-mod price;
+mod plan;
+mod point_distance;
 #[cfg(test)]
 mod tests;
+mod transform;
+mod vertex_distance;
 
 pub use bricks::Bricks;
-pub use dense::DenseChamfer;
+pub use chamfer::DenseChamfer;
+pub use cost::TransformPrice;
 pub use grid::Grid;
 pub use options::{DistanceError, DistanceOptions, Metric, Sites};
-pub use price::TransformPrice;
+pub use transform::{DistanceTransform, Sample};
 
-use crate::flow::Point;
-use crate::flow::watch::{Unwatched, Watch};
-
-/// The distance at a point and how it changes with the point.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Sample {
-    /// Metres to the target.
-    pub distance: f32,
-    /// Derivative of `distance` by x, y and z; zero along an axis on which the point lies outside
-    /// the grid.
-    pub gradient: Point,
-}
-
-/// A distance transform of the target, as the options asked for it.
-#[derive(Debug)]
-pub enum DistanceTransform {
-    /// Exact Euclidean, narrow band with a far field.
-    Bricks(Bricks),
-    /// The published code's chamfer metric on a dense grid.
-    Chamfer(DenseChamfer),
-}
-
-impl DistanceTransform {
-    /// Transforms `target` over a grid that covers both clouds.
-    ///
-    /// # Errors
-    /// [`DistanceError`] where the options make no sense or the clouds span too much space.
-    pub fn build(
-        source: &[Point],
-        target: &[Point],
-        options: &DistanceOptions,
-    ) -> Result<Self, DistanceError> {
-        Self::build_watched(source, target, options, &Unwatched)
-    }
-
-    /// As [`Self::build`]; looks at `watch` between pieces of some milliseconds.
-    ///
-    /// # Errors
-    /// As [`Self::build`], and [`DistanceError::Interrupted`].
-    pub fn build_watched(
-        source: &[Point],
-        target: &[Point],
-        options: &DistanceOptions,
-        watch: &dyn Watch,
-    ) -> Result<Self, DistanceError> {
-        Ok(match options.metric {
-            Metric::Euclidean => {
-                Self::Bricks(Bricks::build_watched(source, target, options, watch)?)
-            }
-            Metric::Chamfer => {
-                Self::Chamfer(DenseChamfer::build_watched(source, target, options, watch)?)
-            }
-        })
-    }
-
-    /// Trilinear distance and gradient at `point`.
-    #[inline]
-    pub fn sample(&self, point: Point) -> Sample {
-        match self {
-            Self::Bricks(bricks) => bricks.sample(point),
-            Self::Chamfer(dense) => dense.sample(point),
-        }
-    }
-
-    /// Bytes that the transform occupies.
-    pub fn bytes(&self) -> usize {
-        match self {
-            Self::Bricks(bricks) => bricks.bytes(),
-            Self::Chamfer(dense) => dense.bytes(),
-        }
-    }
-}
+#[cfg(feature = "gpu")]
+pub(crate) use brick_index::{ABSENT, Index};
+#[cfg(feature = "gpu")]
+pub(crate) use coarse_field::FarField;
+#[cfg(feature = "gpu")]
+pub(crate) use fill::codes_per_cell;
+#[cfg(feature = "gpu")]
+pub(crate) use grid::Lattice;
+#[cfg(feature = "gpu")]
+pub(crate) use plan::Layout;
+#[cfg(feature = "gpu")]
+pub(crate) use vertex_distance::CellSites;

@@ -1,6 +1,6 @@
 //! The distance transform's options and errors; checked before anything is allocated.
 
-use crate::flow::watch::Interrupt;
+use crate::flow::data::Interrupt;
 
 /// How distance is measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -133,9 +133,10 @@ impl From<Interrupt> for DistanceError {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::flow::Point;
-    use crate::flow::distance::{Bricks, DistanceTransform};
-    use crate::flow::random::Random;
+    use crate::flow::data::Point;
+    use crate::flow::data::Random;
+    use crate::flow::distance::bricks::Bricks;
+    use crate::flow::distance::transform::DistanceTransform;
 
     fn boxed(count: usize, size: [f64; 3]) -> Vec<Point> {
         let mut random = Random::new(1);

@@ -3,8 +3,9 @@
 use proptest::prelude::*;
 
 use super::*;
-use crate::flow::random::Random;
-use crate::flow::reference;
+use crate::flow::data::Point;
+use crate::flow::data::Random;
+use crate::flow::field::reference;
 
 /// Single precision: sums of a few terms of at most 100 m.
 const SINGLE: f64 = 1e-4;
@@ -119,7 +120,7 @@ fn check_every_vertex(name: &str, bricks: &Bricks, target: &[Point], band: f64, 
         let exact = reference::nearest_distance(at, sites);
         let value = f64::from(bricks.at_vertex(vertex)) / cell;
         let place = format!("{name}, band {band}, {vertex:?}: {value} for {exact}");
-        if bricks.code(vertex) != build::BEYOND {
+        if bricks.code(vertex) != fill::BEYOND {
             assert!(exact <= band + tolerance, "{place}");
             assert!((value - exact).abs() <= tolerance, "{place}");
         } else {

@@ -6,7 +6,7 @@
 
 use super::three_way::{ThreeWay, ThreeWaySums};
 use super::truth::{EvaluateError, Mean, Truth, double, end_point_error, norm};
-use crate::flow::Point;
+use crate::flow::data::Point;
 
 /// Time between sweeps, seconds: the fourth component of every flow.
 const SWEEP_SECONDS: f64 = 0.1;

@@ -5,7 +5,7 @@
 //! the official code takes it in the first sweep's frame of each sequence.
 
 use super::truth::{EvaluateError, Mean, Truth, double, end_point_error, is_close, norm};
-use crate::flow::{Point, RigidTransform};
+use crate::flow::data::{Point, RigidTransform};
 use nalgebra::Point3;
 
 /// The class of points that belong to none and are left out.

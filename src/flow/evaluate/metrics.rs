@@ -5,7 +5,7 @@
 
 use super::three_way::{ThreeWay, ThreeWaySums};
 use super::truth::{EvaluateError, Mean, Truth, dot, double, end_point_error, is_close, norm};
-use crate::flow::Point;
+use crate::flow::data::Point;
 
 /// Keeps the relative error of a zero true flow finite, metres (official code).
 const LENGTH_FLOOR: f64 = 1e-20;

@@ -5,7 +5,8 @@
 //! how confidence was made.
 
 use super::truth::{EvaluateError, Truth, double, end_point_error};
-use crate::flow::{Point, SURE_M};
+use crate::flow::data::Point;
+use crate::flow::objects::SURE_M;
 
 /// Bins of the diagram.
 const BINS: usize = 10;

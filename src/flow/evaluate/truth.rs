@@ -3,7 +3,7 @@
 //! One rule for every metric: a row counts where the truth is valid, the point is not ground, the
 //! estimate covers it and both flows are finite. It must not know any metric.
 
-use crate::flow::{Point, RigidTransform};
+use crate::flow::data::{Point, RigidTransform};
 
 /// Half the width of the square around the sensor that "close" means, metres (Argoverse 2).
 pub const CLOSE_HALF_WIDTH_M: f32 = 35.0;

@@ -5,9 +5,8 @@
 
 use bytemuck::{Pod, Zeroable};
 
+use crate::flow::data::{Point, Random};
 use crate::flow::options::Inputs;
-use crate::flow::points::Point;
-use crate::flow::random::Random;
 
 /// Features of every hidden layer.
 pub const WIDTH: usize = 128;

@@ -1,60 +1,40 @@
 //! What produces the flow: the continuous field fitted to one pair, to be asked anywhere.
 
+mod adam;
+mod backend;
+pub(crate) mod budget;
+mod codec;
+mod early_stopping;
+mod loss;
 pub mod mlp;
 mod network;
-mod stored;
+pub(crate) mod reduction;
+#[cfg(test)]
+pub(crate) mod reference;
+mod schedule;
+mod snapshot;
+mod warm_start;
 
+pub use backend::{Advance, Backend, BackendError, Report, Trainer, Transform};
+pub use mlp::{HIDDEN_LAYERS, MIDDLE_LAYERS, PARAMETERS, WIDTH};
 pub use network::Network;
+pub use snapshot::{Snapshot, SnapshotError, TrainerState};
 
-use std::sync::Arc;
-
-use super::backend::{Backend, BackendError};
-use super::label::Motions;
-use super::points::{Point, RigidTransform, all_moved};
-
-/// The motion of everything between two sweeps, at any point: where a point of the source is at the
-/// target's time, in the target's frame.
-#[derive(Clone, Debug)]
-pub struct Field {
-    /// The ego motion as target_from_source; none where the residual explains it as well.
-    pub ego: Option<RigidTransform>,
-    /// What moves against the static world.
-    pub residual: Residual,
-}
-
-/// What moves of itself, over points whose ego motion is taken out.
-#[derive(Clone, Debug)]
-pub enum Residual {
-    /// Nothing.
-    Still,
-    /// What a network says.
-    Network(Network),
-    /// Objects do, each rigidly.
-    Objects(Arc<Motions>),
-}
-
-impl Field {
-    /// Where `points` of the source's frame are in the target's if nothing moves of itself.
-    pub fn static_places(&self, points: &[Point]) -> Vec<Point> {
-        match &self.ego {
-            None => points.to_vec(),
-            Some(motion) => all_moved(motion, points),
-        }
-    }
-
-    /// How far what would be at `static_places` has moved of itself, metres.
-    ///
-    /// # Errors
-    /// [`BackendError`] where the device fails.
-    pub fn residual(
-        &self,
-        backend: &dyn Backend,
-        static_places: &[Point],
-    ) -> Result<Vec<Point>, BackendError> {
-        match &self.residual {
-            Residual::Still => Ok(vec![[0.0; 3]; static_places.len()]),
-            Residual::Network(network) => backend.evaluate(network, static_places),
-            Residual::Objects(motions) => Ok(motions.residual_at(static_places)),
-        }
-    }
-}
+pub(crate) use budget::{Loop, Pace, Prepared};
+pub(crate) use early_stopping::EarlyStop;
+#[cfg(feature = "gpu")]
+pub(crate) use early_stopping::Seen;
+pub(crate) use loss::length;
+pub(crate) use mlp::{
+    Aligned, Conditioning, LAID_OUT, PANEL, Parameters, first_layer, last_layer, middle_layer,
+    transpose_middle_layers,
+};
+#[cfg(any(feature = "gpu", test))]
+pub(crate) use reduction::MOST_POINTS;
+#[cfg(feature = "gpu")]
+pub(crate) use reduction::STRETCH;
+pub(crate) use reduction::{Chunks, halved};
+#[cfg(test)]
+pub(crate) use reference::{ReferenceNetwork, first_losses};
+pub(crate) use schedule::Course;
+pub(crate) use warm_start::warm_start;

@@ -5,8 +5,8 @@ use core::fmt;
 use nalgebra::Vector3;
 
 use super::mlp::{Conditioning, Parameters, WIDTH, first_layer, last_layer};
+use crate::flow::data::{Point, RigidTransform};
 use crate::flow::options::Inputs;
-use crate::flow::points::{Point, RigidTransform};
 
 /// The coordinate network of one pair: `g(p; theta)` at any point p, FNSF Section 3.
 #[derive(Clone)]
@@ -80,10 +80,10 @@ impl fmt::Debug for Network {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::flow::backend::Backend;
     use crate::flow::cpu::CpuBackend;
-    use crate::flow::points::moved;
-    use crate::flow::random::Random;
+    use crate::flow::data::Random;
+    use crate::flow::data::moved;
+    use crate::flow::field::backend::Backend;
 
     /// Metres: single precision of coordinates of 50 m and features of that size.
     const ROUNDING_M: f32 = 2e-4;

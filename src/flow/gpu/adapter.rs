@@ -3,7 +3,7 @@
 use core::fmt;
 use core::str::FromStr;
 
-use crate::flow::backend::BackendError;
+use crate::flow::field::BackendError;
 
 /// What kind of device an adapter is, fastest first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]

@@ -1,9 +1,8 @@
 //! The card's memory: taken once, when it is opened, and cut up by what it is for. Knows no kernels.
 
 use super::adapter::AdapterKind;
-use super::records::{ARRAYS, TILE};
-use crate::flow::backend::BackendError;
-use crate::flow::field::mlp::{HIDDEN_LAYERS, LAID_OUT, WIDTH};
+use super::layout::{ARRAYS, TILE};
+use crate::flow::field::{BackendError, HIDDEN_LAYERS, LAID_OUT, WIDTH};
 
 /// Bytes of a row's activations, or deltas, of all hidden layers.
 const ROW_BYTES: u64 = (HIDDEN_LAYERS * WIDTH * size_of::<f32>()) as u64;

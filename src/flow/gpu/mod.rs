@@ -4,31 +4,25 @@
 //! card: it is cheap to clone, every clone may fit a pair of its own from a thread of its own, and
 //! pairs that are fitted at the same time share the card's submissions.
 
-// The card.
 mod adapter;
-mod device;
+mod allocator;
+mod backend;
+mod batcher;
+mod distance;
+mod half;
+mod inference;
+mod iteration;
+mod layout;
 mod memory;
-mod words;
-
-// The kernels, and what they share with the host.
-mod kernels;
-mod matrix;
-mod phases;
-mod plan;
-mod records;
+mod pipelines;
+mod profile;
 mod self_test;
-
-// A pair on the card.
-mod batch;
-mod evaluate;
-mod trainer;
-mod transform;
-mod workload;
-
 #[cfg(test)]
 mod tests;
+mod tiling;
+mod trainer;
 
 pub use adapter::{Adapter, AdapterKind, Selector, adapters, select};
-pub use device::{Gpu, GpuOptions};
+pub use backend::{Gpu, GpuOptions};
 pub use memory::LANE_NETWORK_BYTES;
-pub use workload::{KernelTime, arithmetic_peak, kernel_times};
+pub use profile::{KernelTime, arithmetic_peak, kernel_times};

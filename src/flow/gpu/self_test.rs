@@ -5,20 +5,20 @@
 //! memory model asks for (gfx-rs/wgpu#8805): a driver may take advantage of it. Each kernel is run
 //! on the same inputs in both precisions, so that what differs is rounding alone. Knows no pair.
 
-use super::batch::{self, Request};
-use super::device::{Buffers, Card};
-use super::matrix::Units;
+use super::backend::{Buffers, Card};
+use super::batcher;
+use super::batcher::Request;
+use super::half::Units;
+use super::iteration::{Phase, Phases};
+use super::layout::{Lane, Status, Step, TILE};
 use super::memory::Budget;
-use super::phases::{Phase, Phases};
-use super::plan::{Cut, Plan};
-use super::records::{Lane, Status, Step, TILE};
-use crate::flow::backend::BackendError;
-use crate::flow::field::mlp::{
-    HIDDEN_LAYERS, LAID_OUT, MIDDLE_LAYERS, Parameters, WIDTH, last_layer, middle_layer,
-    transpose_middle_layers,
+use super::tiling::{Cut, Plan};
+use crate::flow::data::Random;
+use crate::flow::field::{
+    BackendError, HIDDEN_LAYERS, LAID_OUT, MIDDLE_LAYERS, Parameters, WIDTH, last_layer,
+    middle_layer, transpose_middle_layers,
 };
 use crate::flow::options::Precision;
-use crate::flow::random::Random;
 
 /// Points: enough for many workgroups at once, and no whole number of tiles.
 const POINTS: usize = 2000;
@@ -201,5 +201,5 @@ fn fill(card: &Card, buffers: &Buffers, cut: Cut) {
         cut,
         precision: Precision::F16,
     };
-    batch::write(card, buffers, &[&request]);
+    batcher::write(card, buffers, &[&request]);
 }

@@ -2,21 +2,19 @@
 
 use std::sync::Arc;
 
-use super::batch::{Done, Request};
-use super::device::Card;
-use super::evaluate;
+use super::backend::Card;
+use super::batcher::{Done, Request};
+use super::distance::GpuTransform;
+use super::layout::{ARRAYS, CONVERGED, DIVERGED, STEPS, Status};
 use super::memory::NETWORK_BYTES;
-use super::plan::Cut;
-use super::records::{self, ARRAYS, CONVERGED, DIVERGED, STEPS, Status};
-use super::transform::GpuTransform;
-use crate::flow::backend::{Advance, BackendError, Report, Trainer};
-use crate::flow::course::Course;
-use crate::flow::early_stop::Seen;
-use crate::flow::field::mlp::{LAID_OUT, Parameters, transpose_middle_layers};
+use super::tiling::Cut;
+use super::{inference, layout};
+use crate::flow::data::{Point, Progress, Watch};
+use crate::flow::field::{
+    Advance, BackendError, Course, LAID_OUT, Parameters, Report, Seen, Trainer, TrainerState,
+    transpose_middle_layers,
+};
 use crate::flow::options::{Options, Precision};
-use crate::flow::points::Point;
-use crate::flow::snapshot::TrainerState;
-use crate::flow::watch::{Progress, Watch};
 
 /// Seconds that a submission should take: a look at the watch, and at the card's health.
 const SUBMISSION_SECONDS: f64 = 0.03;
@@ -117,10 +115,10 @@ impl<'a> GpuTrainer<'a> {
     }
 
     /// The lane's record, but for its place among those of a submission.
-    pub(super) fn lane(&self) -> records::Lane {
+    pub(super) fn lane(&self) -> layout::Lane {
         let options = &self.course.options;
         let (loss, rule) = (&options.loss, options.early_stop);
-        records::Lane {
+        layout::Lane {
             transform: self.transform.record,
             network: self.network.number,
             points: self.points,
@@ -133,15 +131,15 @@ impl<'a> GpuTrainer<'a> {
             average: self.course.fresh(0).is_some().into(),
             patience: rule.map_or(0, |rule| rule.patience.max(1) as u32),
             min_delta: rule.map_or(0.0, |rule| rule.min_delta_m as f32),
-            ..records::Lane::default()
+            ..layout::Lane::default()
         }
     }
 
     /// The iteration after `done` others.
-    fn step(&self, done: usize) -> records::Step {
+    fn step(&self, done: usize) -> layout::Step {
         let batch = self.course.batch(done);
         let adam = self.course.adam(done);
-        records::Step {
+        layout::Step {
             first: batch.start as u32,
             count: batch.len() as u32,
             weight: 1.0 / batch.len() as f32,
@@ -232,7 +230,7 @@ impl Trainer for GpuTrainer<'_> {
 
     fn evaluate(&mut self, points: &[Point]) -> Result<Vec<Point>, BackendError> {
         let networks = &self.card().buffers.networks;
-        evaluate::evaluate(self.card(), networks, &self.lane(), points)
+        inference::evaluate(self.card(), networks, &self.lane(), points)
     }
 
     fn report(&self) -> Report {

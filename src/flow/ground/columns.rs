@@ -5,7 +5,7 @@
 
 use std::ops::Range;
 
-use crate::flow::Point;
+use crate::flow::data::Point;
 
 /// Side of a column, metres.
 const SIDE_M: f32 = 1.0;

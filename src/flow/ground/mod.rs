@@ -9,8 +9,8 @@
 //! simulation filter, with the flatness test of Patchwork in place of its forces), and points near
 //! it are ground. It must not know of rings, sensors, labels or the other sweep.
 
-// What a sweep says about the ground, what is fitted to it, and the answer.
 mod columns;
+mod mask;
 mod options;
 mod segment;
 mod surface;
@@ -18,9 +18,4 @@ mod surface;
 pub use options::GroundOptions;
 pub use segment::{GroundSegmentation, segment};
 
-use super::Point;
-
-/// Which of the points are ground, by the usual options; all of them are finite and in range.
-pub(crate) fn mask(points: &[Point]) -> Vec<bool> {
-    segment(points, &GroundOptions::default()).ground
-}
+pub(crate) use mask::mask;

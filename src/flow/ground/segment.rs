@@ -5,7 +5,7 @@
 use super::columns::{Column, Columns, TILE_M};
 use super::options::GroundOptions;
 use super::surface::Surface;
-use crate::flow::Point;
+use crate::flow::data::Point;
 use nalgebra::{Matrix3, Vector3};
 
 /// Distance between nodes of the finest surface, metres.

@@ -3,7 +3,7 @@
 //! The surface is pulled toward samples and stays smooth where there are none: a screened Poisson
 //! equation for the correction, relaxed in place. It must not know what the samples are.
 
-use crate::flow::Point;
+use crate::flow::data::Point;
 
 /// How strongly a node's correction follows its four neighbors', against a full pull of 1.
 const STIFFNESS: f32 = 0.3;

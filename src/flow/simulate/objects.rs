@@ -4,8 +4,7 @@
 
 use super::shapes::Shape;
 use super::terrain::Terrain;
-use crate::flow::RigidTransform;
-use crate::flow::random::Random;
+use crate::flow::data::{Random, RigidTransform};
 use nalgebra::Vector3;
 use std::f64::consts::{FRAC_PI_2, PI};
 

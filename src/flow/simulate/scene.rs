@@ -5,7 +5,7 @@
 
 use super::shapes::{Hit, Shape};
 use super::terrain::Terrain;
-use crate::flow::RigidTransform;
+use crate::flow::data::RigidTransform;
 use nalgebra::{Matrix3, Vector3};
 
 /// Returns from farther than this do not arrive, metres.

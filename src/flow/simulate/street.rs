@@ -10,9 +10,8 @@ use super::scene::Target;
 use super::terrain::Terrain;
 use super::view;
 use super::world::World;
+use crate::flow::data::{Point, Random, RigidTransform};
 use crate::flow::depth::{Camera, DepthImage};
-use crate::flow::random::Random;
-use crate::flow::{Point, RigidTransform};
 use nalgebra::{Point3, Translation3, Vector3};
 
 /// The sensor stands this high above the ground, metres.

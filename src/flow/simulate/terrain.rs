@@ -5,8 +5,7 @@
 //! crossing itself. Places are also given as x and lateral offset, metres to the left of it.
 
 use super::shapes::Hit;
-use crate::flow::RigidTransform;
-use crate::flow::random::Random;
+use crate::flow::data::{Random, RigidTransform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 
 /// From the center line to the kerb, metres.

@@ -4,7 +4,7 @@
 
 use super::scene::{FARTHEST_M, Scene, Target};
 use super::terrain::Terrain;
-use crate::flow::RigidTransform;
+use crate::flow::data::RigidTransform;
 use crate::flow::depth::{Camera, DepthImage};
 use rayon::prelude::*;
 
@@ -60,10 +60,10 @@ pub(super) fn depth(
 
 #[cfg(test)]
 mod tests {
-    use super::super::shapes::Shape;
     use super::*;
+    use crate::flow::data::Random;
     use crate::flow::depth::Intrinsics;
-    use crate::flow::random::Random;
+    use crate::flow::simulate::shapes::Shape;
 
     /// A wide camera that looks along the street's x, a little downward.
     fn camera() -> (Camera, RigidTransform) {

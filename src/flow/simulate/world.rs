@@ -5,8 +5,7 @@
 use super::objects::{Object, Path};
 use super::shapes::Shape;
 use super::terrain::Terrain;
-use crate::flow::RigidTransform;
-use crate::flow::random::Random;
+use crate::flow::data::{Random, RigidTransform};
 use nalgebra::{Translation3, UnitQuaternion};
 
 /// From the center line to the line of houses, metres.

@@ -1,14 +1,12 @@
 //! The trainer against the method in double precision, and what must not change its bits.
 
 use super::*;
-use crate::flow::backend::{Backend, Transform};
-use crate::flow::cpu::{CpuBackend, Isa};
+use crate::flow::cpu::backend::CpuBackend;
+use crate::flow::cpu::isa::Isa;
+use crate::flow::data::{Random, Unwatched};
 use crate::flow::distance::{DistanceOptions, DistanceTransform};
+use crate::flow::field::{Backend, MOST_POINTS, Transform, first_losses};
 use crate::flow::options::Preset;
-use crate::flow::random::Random;
-use crate::flow::reference::first_losses;
-use crate::flow::sums::MOST_POINTS;
-use crate::flow::watch::Unwatched;
 use std::sync::Mutex;
 
 /// Collects the losses.

@@ -2,16 +2,16 @@
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use super::super::{Gpu, GpuOptions, Selector, select};
 use super::{clouds, opened, shared};
-use crate::flow::backend::{Advance, Backend, BackendError};
+use crate::flow::data::{Interrupt, Point, Progress, Unwatched, Watch};
 use crate::flow::distance::{DistanceOptions, Metric, Sites};
+use crate::flow::error::FlowError;
+use crate::flow::estimate::estimate;
+use crate::flow::field::{Advance, Backend, BackendError};
+use crate::flow::gpu::adapter::{Selector, select};
+use crate::flow::gpu::backend::{Gpu, GpuOptions};
 use crate::flow::options::Preset;
-use crate::flow::points::Point;
-use crate::flow::preprocess::Problem;
-use crate::flow::solver::estimate;
-use crate::flow::watch::{Progress, Unwatched, Watch};
-use crate::flow::{FlowError, Interrupt};
+use crate::flow::select::Problem;
 
 /// Gives the card up after some iterations.
 struct Kill<'a>(&'a Gpu, AtomicUsize);

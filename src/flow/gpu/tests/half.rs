@@ -5,15 +5,13 @@
 use super::kernels::{after_one, network, plain, transform};
 use super::whole::{Losses, end_point_error, solved, street};
 use super::{clouds, shared};
-use crate::flow::backend::{Backend, BackendError};
 use crate::flow::cpu::CpuBackend;
+use crate::flow::data::Unwatched;
 use crate::flow::distance::DistanceTransform;
-use crate::flow::field::mlp::Parameters;
-use crate::flow::gpu::Gpu;
-use crate::flow::gpu::matrix::Units;
+use crate::flow::field::{Backend, BackendError, Parameters, ReferenceNetwork};
+use crate::flow::gpu::backend::Gpu;
+use crate::flow::gpu::half::Units;
 use crate::flow::options::{Options, Precision, Preset};
-use crate::flow::reference::ReferenceNetwork;
-use crate::flow::watch::Unwatched;
 
 /// The shared card, where its matrix units can be used.
 fn with_units() -> Option<&'static Gpu> {

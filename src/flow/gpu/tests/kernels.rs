@@ -1,17 +1,14 @@
 //! Each kernel against the double-precision reference, at awkward sizes.
 
 use super::{clouds, shared};
-use crate::flow::backend::{Backend, Transform};
+use crate::flow::data::{Point, Random, Unwatched};
 use crate::flow::distance::{Bricks, DistanceOptions, DistanceTransform};
-use crate::flow::field::mlp::{Conditioning, Parameters};
-use crate::flow::gpu::transform::{GpuTransform, build};
+use crate::flow::field::{
+    Backend, Conditioning, Parameters, ReferenceNetwork, TrainerState, Transform, first_losses,
+};
+use crate::flow::gpu::distance::{GpuTransform, build};
 use crate::flow::options::{Keep, Options, Preset};
-use crate::flow::points::Point;
-use crate::flow::random::Random;
-use crate::flow::reference::{ReferenceNetwork, first_losses};
 use crate::flow::simulate::{Street, StreetOptions};
-use crate::flow::snapshot::TrainerState;
-use crate::flow::watch::Unwatched;
 
 /// Single precision over sums of 128 terms, eight layers deep.
 const NETWORK_TOLERANCE: f64 = 2e-5;

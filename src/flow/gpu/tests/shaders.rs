@@ -4,8 +4,8 @@ use core::mem::offset_of;
 
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 
-use super::super::kernels::{HALF_SOURCES, SOURCES};
-use super::super::records;
+use crate::flow::gpu::layout;
+use crate::flow::gpu::pipelines::{HALF_SOURCES, SOURCES};
 
 fn parsed(name: &str, source: &str) -> naga::Module {
     naga::front::wgsl::parse_str(source)
@@ -64,9 +64,9 @@ macro_rules! same_layout {
     ($shader:literal, $record:ident: $($field:ident),+) => {
         let source = SOURCES.iter().find(|(name, _)| *name == $shader).expect("a kernel").1;
         let (fields, size) = layout(source, stringify!($record));
-        let ours = vec![$((stringify!($field).to_owned(), offset_of!(records::$record, $field))),+];
+        let ours = vec![$((stringify!($field).to_owned(), offset_of!(layout::$record, $field))),+];
         assert_eq!(fields, ours, stringify!($record));
-        assert_eq!(size, size_of::<records::$record>(), stringify!($record));
+        assert_eq!(size, size_of::<layout::$record>(), stringify!($record));
     };
 }
 
@@ -87,8 +87,8 @@ fn host_and_shaders_agree_on_every_record() {
 #[test]
 fn host_and_brick_kernel_agree_on_every_record() {
     let source = SOURCES[0].1;
-    assert_eq!(layout(source, "Plan").1, size_of::<records::BrickPlan>());
-    assert_eq!(layout(source, "Column").1, size_of::<records::Column>());
+    assert_eq!(layout(source, "Plan").1, size_of::<layout::BrickPlan>());
+    assert_eq!(layout(source, "Column").1, size_of::<layout::Column>());
 }
 
 /// The value of a whole constant of a shader.
@@ -127,14 +127,14 @@ fn host_and_shaders_agree_on_the_network() {
     for (name, value) in [
         ("WIDTH", mlp::WIDTH),
         ("MIDDLE_LAYERS", mlp::MIDDLE_LAYERS),
-        ("TILE", records::TILE),
-        ("STEPS", records::STEPS),
-        ("ARRAYS", records::ARRAYS),
+        ("TILE", layout::TILE),
+        ("STEPS", layout::STEPS),
+        ("ARRAYS", layout::ARRAYS),
     ] {
         assert_eq!(constant(source, name), value, "{name}");
     }
     for [_, forward, _, gradients] in HALF_SOURCES {
-        assert_eq!(constant(forward.1, "POINTS") * 2, records::TILE);
+        assert_eq!(constant(forward.1, "POINTS") * 2, layout::TILE);
         assert_eq!(constant(forward.1, "LAYER_HALVES"), mlp::WIDTH * mlp::WIDTH);
         assert_eq!(constant(gradients.1, "PANEL"), mlp::PANEL);
     }

@@ -3,16 +3,14 @@
 use std::sync::Mutex;
 
 use super::{LANES, clouds, shared};
-use crate::flow::backend::Backend;
 use crate::flow::cpu::{CpuBackend, Isa};
-use crate::flow::early_stop::EarlyStop;
-use crate::flow::field::Field;
+use crate::flow::data::{Point, Progress, Unwatched, Watch};
+use crate::flow::estimate::{Estimate, estimate};
+use crate::flow::field::{Backend, EarlyStop};
+use crate::flow::motion::Field;
 use crate::flow::options::{Ground, Options, Preset};
-use crate::flow::points::Point;
-use crate::flow::preprocess::Problem;
+use crate::flow::select::Problem;
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
-use crate::flow::solver::{Estimate, estimate};
-use crate::flow::watch::{Progress, Unwatched, Watch};
 
 /// Collects the losses.
 #[derive(Default)]

@@ -1,0 +1,326 @@
+//! The network's two passes over one tile, written once over [`Lanes`].
+//!
+//! Register tiles of `ROWS` points by `VECTORS` registers; every operand is read in the order in
+//! which it lies in memory. Every sum is taken in the order in which the shaders of `flow/gpu` take
+//! it. Knows nothing of instruction sets, distances, losses or threads.
+#![expect(
+    unsafe_code,
+    reason = "register-tiled loops over raw rows, compiled per instruction set"
+)]
+#![expect(
+    clippy::needless_range_loop,
+    reason = "registers are named by row and vector, as in the formulas"
+)]
+
+use super::simd::Lanes;
+use super::tile::{ROW_STEP, STRIDE, TILE, Tile};
+use crate::flow::field::{
+    MIDDLE_LAYERS, PANEL, Parameters, WIDTH, first_layer, halved, last_layer, middle_layer,
+};
+
+/// Sums of the last layer that are taken side by side, whatever the width of a register.
+const SIDE_BY_SIDE: usize = 16;
+
+/// A matrix in memory: where it starts and the floats from a row, and from a step of the summed
+/// index, to the next.
+#[derive(Clone, Copy)]
+struct Strided {
+    at: *const f32,
+    row: usize,
+    step: usize,
+}
+
+/// `acc[r][..] += sum_k a[r][k] * b[k][..]`: `ROWS` x `VECTORS` registers.
+///
+/// # Safety
+/// `a` has `ROWS` rows and `depth` steps, `b` has `depth` rows of `VECTORS` registers, `b_step`
+/// floats apart.
+#[inline(always)]
+unsafe fn multiply<L: Lanes, const ROWS: usize, const VECTORS: usize>(
+    acc: &mut [[L; VECTORS]; ROWS],
+    depth: usize,
+    a: Strided,
+    b: *const f32,
+    b_step: usize,
+) {
+    // SAFETY: as the caller promises.
+    unsafe {
+        let mut a_at = a.at;
+        let mut b_at = b;
+        for _ in 0..depth {
+            let mut row = [L::splat(0.0); VECTORS];
+            for v in 0..VECTORS {
+                row[v] = L::load(b_at.add(v * L::COUNT));
+            }
+            for r in 0..ROWS {
+                let scale = L::splat(*a_at.add(r * a.row));
+                for v in 0..VECTORS {
+                    acc[r][v] = scale.mul_add(row[v], acc[r][v]);
+                }
+            }
+            a_at = a_at.add(a.step);
+            b_at = b_at.add(b_step);
+        }
+    }
+}
+
+/// Calls `body` with the first column of each register group of a 128-feature row, and the offset
+/// of that column's panel.
+#[inline(always)]
+fn for_columns<L: Lanes, const VECTORS: usize>(mut body: impl FnMut(usize, usize)) {
+    let group = VECTORS * L::COUNT;
+    let mut column = 0;
+    while column < WIDTH {
+        body(column, column / PANEL * WIDTH * PANEL + column % PANEL);
+        column += group;
+    }
+}
+
+/// `outputs = g(inputs)`, layer by layer.
+///
+/// # Safety
+/// The caller has the instruction set of `L`.
+#[inline(always)]
+pub(super) unsafe fn forward<L: Lanes, const ROWS: usize, const VECTORS: usize>(
+    parameters: &Parameters,
+    tile: &mut Tile,
+) {
+    const {
+        assert!(ROW_STEP.is_multiple_of(ROWS) && PANEL.is_multiple_of(VECTORS * L::COUNT));
+        assert!(SIDE_BY_SIDE.is_multiple_of(L::COUNT));
+    }
+    let rows = tile.padded_rows();
+    let weights = parameters.as_slice().as_ptr();
+    let activations = tile.activations.as_mut_slice().as_mut_ptr();
+    // SAFETY: every offset stays within the layouts that `Parameters` and `Tile` define.
+    unsafe {
+        let at = first_layer();
+        for column in (0..WIDTH).step_by(L::COUNT) {
+            let w: [L; 3] =
+                core::array::from_fn(|i| L::load(weights.add(at.weights + i * WIDTH + column)));
+            let bias = L::load(weights.add(at.bias + column));
+            for row in 0..rows {
+                let x = tile.inputs[row];
+                let sum = L::splat(x[0]).mul_add(w[0], bias);
+                let sum = L::splat(x[1]).mul_add(w[1], sum);
+                let sum = L::splat(x[2]).mul_add(w[2], sum);
+                sum.relu().store(activations.add(row * STRIDE + column));
+            }
+        }
+        for layer in 0..MIDDLE_LAYERS {
+            let at = middle_layer(layer);
+            let from = activations.add(layer * TILE * STRIDE);
+            let to = activations.add((layer + 1) * TILE * STRIDE);
+            for_columns::<L, VECTORS>(|column, panel| {
+                for row in (0..rows).step_by(ROWS) {
+                    let bias: [L; VECTORS] = core::array::from_fn(|v| {
+                        L::load(weights.add(at.bias + column + v * L::COUNT))
+                    });
+                    let mut acc = [bias; ROWS];
+                    let a = Strided {
+                        at: from.add(row * STRIDE),
+                        row: STRIDE,
+                        step: 1,
+                    };
+                    multiply(&mut acc, WIDTH, a, weights.add(at.weights + panel), PANEL);
+                    for r in 0..ROWS {
+                        for v in 0..VECTORS {
+                            let out = to.add((row + r) * STRIDE + column + v * L::COUNT);
+                            acc[r][v].relu().store(out);
+                        }
+                    }
+                }
+            });
+        }
+        let at = last_layer();
+        let from = activations.add(MIDDLE_LAYERS * TILE * STRIDE);
+        for row in 0..tile.rows {
+            let mut sums = [[0.0; SIDE_BY_SIDE]; 3];
+            for first in (0..SIDE_BY_SIDE).step_by(L::COUNT) {
+                let mut acc = [L::splat(0.0); 3];
+                for column in (first..WIDTH).step_by(SIDE_BY_SIDE) {
+                    let h = L::load(from.add(row * STRIDE + column));
+                    for output in 0..3 {
+                        let w = L::load(weights.add(at.weights + output * WIDTH + column));
+                        acc[output] = h.mul_add(w, acc[output]);
+                    }
+                }
+                for output in 0..3 {
+                    acc[output].store(sums[output].as_mut_ptr().add(first));
+                }
+            }
+            for output in 0..3 {
+                tile.outputs[row][output] = halved(sums[output]) + *weights.add(at.bias + output);
+            }
+        }
+    }
+}
+
+/// Adds the derivatives of `output_gradients . g(inputs)` by every parameter to `gradients`. `TAIL`
+/// divides the rest of 128 inputs after the last whole group of `ROWS`.
+///
+/// # Safety
+/// The caller has the instruction set of `L`.
+#[inline(always)]
+pub(super) unsafe fn backward<
+    L: Lanes,
+    const ROWS: usize,
+    const TAIL: usize,
+    const VECTORS: usize,
+>(
+    parameters: &Parameters,
+    transposed: &Parameters,
+    tile: &mut Tile,
+    gradients: &mut Parameters,
+) {
+    const {
+        assert!(ROW_STEP.is_multiple_of(ROWS) && PANEL.is_multiple_of(VECTORS * L::COUNT));
+        assert!((WIDTH % ROWS).is_multiple_of(TAIL));
+    }
+    let rows = tile.padded_rows();
+    let weights = parameters.as_slice().as_ptr();
+    let transposes = transposed.as_slice().as_ptr();
+    let grads = gradients.as_mut_slice().as_mut_ptr();
+    let activations = tile.activations.as_slice().as_ptr();
+    let [first, second] = &mut tile.deltas;
+    let mut delta = first.as_mut_slice().as_mut_ptr();
+    let mut next_delta = second.as_mut_slice().as_mut_ptr();
+    // SAFETY: every offset stays within the layouts that `Parameters` and `Tile` define.
+    unsafe {
+        let at = last_layer();
+        let h = activations.add(MIDDLE_LAYERS * TILE * STRIDE);
+        for column in (0..WIDTH).step_by(L::COUNT) {
+            let w: [L; 3] =
+                core::array::from_fn(|o| L::load(weights.add(at.weights + o * WIDTH + column)));
+            let mut dw: [L; 3] =
+                core::array::from_fn(|o| L::load(grads.add(at.weights + o * WIDTH + column)));
+            for row in 0..rows {
+                let g = tile.output_gradients[row].map(|g| L::splat(g));
+                let h = L::load(h.add(row * STRIDE + column));
+                for o in 0..3 {
+                    dw[o] = g[o].mul_add(h, dw[o]);
+                }
+                let d = g[0].mul_add(w[0], g[1].mul_add(w[1], g[2].mul_add(w[2], L::splat(0.0))));
+                d.where_positive(h).store(delta.add(row * STRIDE + column));
+            }
+            for o in 0..3 {
+                dw[o].store(grads.add(at.weights + o * WIDTH + column));
+            }
+        }
+        for gradient in &tile.output_gradients[..tile.rows] {
+            for o in 0..3 {
+                *grads.add(at.bias + o) += gradient[o];
+            }
+        }
+
+        for layer in (0..MIDDLE_LAYERS).rev() {
+            let at = middle_layer(layer);
+            let h = activations.add(layer * TILE * STRIDE);
+            add_column_sums::<L>(delta, rows, grads.add(at.bias));
+            for_columns::<L, VECTORS>(|column, panel| {
+                let b = delta.cast_const().add(column);
+                let to = grads.add(at.weights + panel);
+                let mut k = 0;
+                while k + ROWS <= WIDTH {
+                    weight_gradient::<L, ROWS, VECTORS>(h.add(k), rows, b, to.add(k * PANEL));
+                    k += ROWS;
+                }
+                while k < WIDTH {
+                    weight_gradient::<L, TAIL, VECTORS>(h.add(k), rows, b, to.add(k * PANEL));
+                    k += TAIL;
+                }
+            });
+            for_columns::<L, VECTORS>(|column, panel| {
+                for row in (0..rows).step_by(ROWS) {
+                    let mut acc = [[L::splat(0.0); VECTORS]; ROWS];
+                    let a = Strided {
+                        at: delta.add(row * STRIDE),
+                        row: STRIDE,
+                        step: 1,
+                    };
+                    multiply(
+                        &mut acc,
+                        WIDTH,
+                        a,
+                        transposes.add(at.weights + panel),
+                        PANEL,
+                    );
+                    for r in 0..ROWS {
+                        for v in 0..VECTORS {
+                            let place = (row + r) * STRIDE + column + v * L::COUNT;
+                            let gate = L::load(h.add(place));
+                            acc[r][v].where_positive(gate).store(next_delta.add(place));
+                        }
+                    }
+                }
+            });
+            core::mem::swap(&mut delta, &mut next_delta);
+        }
+
+        let at = first_layer();
+        add_column_sums::<L>(delta, rows, grads.add(at.bias));
+        for column in (0..WIDTH).step_by(L::COUNT) {
+            let mut dw: [L; 3] =
+                core::array::from_fn(|i| L::load(grads.add(at.weights + i * WIDTH + column)));
+            for row in 0..rows {
+                let d = L::load(delta.add(row * STRIDE + column));
+                for i in 0..3 {
+                    dw[i] = L::splat(tile.inputs[row][i]).mul_add(d, dw[i]);
+                }
+            }
+            for i in 0..3 {
+                dw[i].store(grads.add(at.weights + i * WIDTH + column));
+            }
+        }
+    }
+}
+
+/// `to[0..128] += sum of rows`.
+#[inline(always)]
+unsafe fn add_column_sums<L: Lanes>(from: *const f32, rows: usize, to: *mut f32) {
+    for column in (0..WIDTH).step_by(L::COUNT) {
+        // SAFETY: `from` holds `rows` rows and `to` holds 128 floats.
+        unsafe {
+            let mut sum = L::load(to.add(column));
+            for row in 0..rows {
+                sum = sum.add(L::load(from.add(row * STRIDE + column)));
+            }
+            sum.store(to.add(column));
+        }
+    }
+}
+
+/// Adds `sum_p h[p][k] * d[p][n]` to `ROWS` inputs k by one register group of outputs n.
+#[inline(always)]
+unsafe fn weight_gradient<L: Lanes, const ROWS: usize, const VECTORS: usize>(
+    h: *const f32,
+    points: usize,
+    d: *const f32,
+    to: *mut f32,
+) {
+    // SAFETY: `h` and `d` hold `points` rows, `to` holds `ROWS` rows of a panel.
+    unsafe {
+        let mut acc = [[L::splat(0.0); VECTORS]; ROWS];
+        for r in 0..ROWS {
+            for v in 0..VECTORS {
+                acc[r][v] = L::load(to.add(r * PANEL + v * L::COUNT));
+            }
+        }
+        multiply(
+            &mut acc,
+            points,
+            Strided {
+                at: h,
+                row: 1,
+                step: STRIDE,
+            },
+            d,
+            STRIDE,
+        );
+        for r in 0..ROWS {
+            for v in 0..VECTORS {
+                acc[r][v].store(to.add(r * PANEL + v * L::COUNT));
+            }
+        }
+    }
+}

@@ -1,0 +1,133 @@
+//! Measured amounts of work: the network's kernels, and the machine's multiply-add peak.
+//!
+//! Runs work and says how many floating-point operations it was; whoever holds a clock divides.
+//! Benchmarks and `fnsf doctor` do.
+#![expect(
+    unsafe_code,
+    reason = "the peak is measured with the same registers as the kernels"
+)]
+
+use super::isa::Isa;
+use super::kernels::Kernels;
+use super::simd::{F32x4, Lanes};
+#[cfg(target_arch = "x86_64")]
+use super::simd::{F32x8, F32x16};
+use super::tile::{TILE, Tile};
+use crate::flow::data::{Point, Random};
+use crate::flow::field::{MIDDLE_LAYERS, Parameters, WIDTH, transpose_middle_layers};
+
+/// Multiplications and additions of one point's forward pass.
+const FORWARD: usize = 2 * (3 * WIDTH + MIDDLE_LAYERS * WIDTH * WIDTH + 3 * WIDTH);
+/// Of its backward pass: as many for the weights, and for the inputs of all layers but the first.
+const BACKWARD: usize = 2 * FORWARD - 2 * 3 * WIDTH;
+
+/// The kernels of one instruction set over a cloud, on the calling thread.
+pub struct NetworkWorkload {
+    kernels: Kernels,
+    parameters: Parameters,
+    transposed: Parameters,
+    gradients: Parameters,
+    tile: Tile,
+    points: Vec<Point>,
+}
+
+impl NetworkWorkload {
+    /// A network and `points` points.
+    ///
+    /// # Panics
+    /// Where the machine lacks the instruction set.
+    pub fn new(isa: Isa, points: usize) -> Self {
+        let mut random = Random::new(1);
+        let parameters = Parameters::xavier(&mut random);
+        let mut transposed = Parameters::zeros();
+        transpose_middle_layers(&parameters, &mut transposed);
+        let mut point = || core::array::from_fn(|_| random.uniform(-1.0, 1.0) as f32);
+        Self {
+            kernels: Kernels::new(isa),
+            points: (0..points).map(|_| point()).collect(),
+            parameters,
+            transposed,
+            gradients: Parameters::zeros(),
+            tile: Tile::new(),
+        }
+    }
+
+    /// Forward over all points; returns the floating-point operations.
+    pub fn forward(&mut self) -> f64 {
+        for points in self.points.chunks(TILE) {
+            self.tile.load(points.iter().copied());
+            self.kernels.forward(&self.parameters, &mut self.tile);
+        }
+        (self.points.len() * FORWARD) as f64
+    }
+
+    /// Forward and backward over all points; returns the floating-point operations.
+    pub fn forward_and_backward(&mut self) -> f64 {
+        for points in self.points.chunks(TILE) {
+            self.tile.load(points.iter().copied());
+            self.kernels.forward(&self.parameters, &mut self.tile);
+            self.tile.output_gradients[..points.len()].fill([0.1, -0.2, 0.3]);
+            self.kernels.backward(
+                &self.parameters,
+                &self.transposed,
+                &mut self.tile,
+                &mut self.gradients,
+            );
+        }
+        (self.points.len() * (FORWARD + BACKWARD)) as f64
+    }
+}
+
+/// Runs `rounds` rounds of independent multiply-adds in registers; returns the floating-point
+/// operations. Nothing can be faster on one thread.
+///
+/// # Panics
+/// Where the machine lacks the instruction set.
+pub fn multiply_add_peak(isa: Isa, rounds: usize) -> f64 {
+    assert!(Isa::available().contains(&isa), "{isa:?} is not available");
+    // SAFETY: the instruction set is there.
+    unsafe {
+        match isa {
+            #[cfg(target_arch = "x86_64")]
+            Isa::Avx512 => peak_avx512(rounds),
+            #[cfg(target_arch = "x86_64")]
+            Isa::Avx2 => peak_avx2(rounds),
+            _ => peak::<F32x4>(rounds),
+        }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f")]
+unsafe fn peak_avx512(rounds: usize) -> f64 {
+    // SAFETY: avx512f is on.
+    unsafe { peak::<F32x16>(rounds) }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+unsafe fn peak_avx2(rounds: usize) -> f64 {
+    // SAFETY: avx2 and fma are on.
+    unsafe { peak::<F32x8>(rounds) }
+}
+
+#[inline(always)]
+unsafe fn peak<L: Lanes>(rounds: usize) -> f64 {
+    const CHAINS: usize = 12;
+    // SAFETY: the caller has the instruction set.
+    unsafe {
+        let factor = L::splat(core::hint::black_box(0.999));
+        let addend = L::splat(core::hint::black_box(0.001));
+        let mut chains = [factor; CHAINS];
+        for _ in 0..rounds {
+            for chain in &mut chains {
+                *chain = chain.mul_add(factor, addend);
+            }
+        }
+        let sum = chains.into_iter().fold(addend, |sum, chain| sum.add(chain));
+        let mut kept = [0.0; 16];
+        sum.store(kept.as_mut_ptr());
+        core::hint::black_box(kept);
+    }
+    (rounds * CHAINS * L::COUNT * 2) as f64
+}

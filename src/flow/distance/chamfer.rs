@@ -1,0 +1,201 @@
+//! The published code's transform: a chamfer path metric on a dense grid, for comparison.
+//!
+//! Six raster sweeps, each cell taking the least of the 3x3 cells of the plane before it plus the
+//! step's length. In closed form, per occupied vertex, with `a >= b >= c` the sorted offsets:
+//! `a + (sqrt 2 - 1) b + (sqrt 3 - sqrt 2) c` cells: up to 12.8% longer than the Euclidean
+//! distance. Takes 4 bytes for every cell of the scene, so it is for small grids.
+
+use core::f32::consts::SQRT_2;
+
+use super::grid::{Grid, Lattice, trilinear};
+use super::options::{DistanceError, DistanceOptions};
+use super::transform::Sample;
+use crate::flow::data::{Interrupt, Point, Unwatched, Watch, control};
+
+/// Length of the diagonal of a cell.
+const SQRT_3: f32 = 1.732_050_8;
+
+/// The transform: metres at every vertex of the grid.
+#[derive(Debug)]
+pub struct DenseChamfer {
+    grid: Grid,
+    lattice: Lattice,
+    distances: Vec<f32>,
+}
+
+impl DenseChamfer {
+    /// Transforms `target` over a grid that covers both clouds.
+    ///
+    /// # Errors
+    /// [`DistanceError`] as [`super::Bricks::build`].
+    pub fn build(
+        source: &[Point],
+        target: &[Point],
+        options: &DistanceOptions,
+    ) -> Result<Self, DistanceError> {
+        Self::build_watched(source, target, options, &Unwatched)
+    }
+
+    /// As [`Self::build`]; looks at `watch` between planes.
+    ///
+    /// # Errors
+    /// As [`Self::build`], and [`DistanceError::Interrupted`].
+    pub fn build_watched(
+        source: &[Point],
+        target: &[Point],
+        options: &DistanceOptions,
+        watch: &dyn Watch,
+    ) -> Result<Self, DistanceError> {
+        let grid = Self::plan(source, target, options)?;
+        let [nx, ny, nz] = grid.vertices;
+        let mut distances = vec![f32::INFINITY; nx * ny * nz];
+        for &point in target {
+            let [x, y, z] = grid.nearest_vertex(point).map(|v| v as usize);
+            distances[(x * ny + y) * nz + z] = 0.0;
+        }
+        let strides = [ny * nz, nz, 1];
+        for axis in 0..3 {
+            sweep(&mut distances, grid.vertices, strides, axis, false, watch)?;
+            sweep(&mut distances, grid.vertices, strides, axis, true, watch)?;
+        }
+        for distance in &mut distances {
+            *distance *= grid.cell as f32;
+        }
+        Ok(Self {
+            lattice: Lattice::new(&grid),
+            grid,
+            distances,
+        })
+    }
+
+    /// The grid of the transform, refused where it would not fit.
+    pub(super) fn plan(
+        source: &[Point],
+        target: &[Point],
+        options: &DistanceOptions,
+    ) -> Result<Grid, DistanceError> {
+        options.check()?;
+        let grid = Grid::covering(source, target, options.cell_m)?;
+        let bytes = grid
+            .vertices
+            .iter()
+            .try_fold(size_of::<f32>(), |n, &v| n.checked_mul(v));
+        let needed = bytes.unwrap_or(usize::MAX);
+        // No allocation can be larger than isize::MAX, whatever is allowed.
+        let limit = options.max_bytes.min(isize::MAX as usize);
+        if needed > limit {
+            return Err(DistanceError::Memory { needed, limit });
+        }
+        Ok(grid)
+    }
+
+    /// Trilinear distance and gradient at `point`, see [`Sample`].
+    #[inline]
+    pub fn sample(&self, point: Point) -> Sample {
+        let cell = self.lattice.locate(point);
+        let corners = core::array::from_fn(|i| {
+            let i = i as u32;
+            let [x, y, z] = cell.corner;
+            self.at([x + (i >> 2), y + (i >> 1 & 1), z + (i & 1)])
+        });
+        let (distance, slope) = trilinear(corners, cell.fraction);
+        let inverse = self.lattice.inverse_cell;
+        let gradient = core::array::from_fn(|a| slope[a] * inverse * cell.inside[a]);
+        Sample { distance, gradient }
+    }
+
+    /// The grid's geometry.
+    pub fn grid(&self) -> &Grid {
+        &self.grid
+    }
+
+    /// Bytes that the transform occupies.
+    pub fn bytes(&self) -> usize {
+        self.distances.len() * size_of::<f32>()
+    }
+
+    pub(super) fn at(&self, vertex: [u32; 3]) -> f32 {
+        let [x, y, z] = vertex.map(|v| v as usize);
+        let [_, ny, nz] = self.grid.vertices;
+        self.distances[(x * ny + y) * nz + z]
+    }
+}
+
+/// One pass along `axis`: every cell takes the least of itself and the 3x3 cells of the plane
+/// before it, one, sqrt 2 or sqrt 3 cells away.
+fn sweep(
+    distances: &mut [f32],
+    counts: [usize; 3],
+    strides: [usize; 3],
+    axis: usize,
+    back: bool,
+    watch: &dyn Watch,
+) -> Result<(), Interrupt> {
+    // z last wherever it can be: neighbors in memory are then neighbors in the plane.
+    let (a, b) = [(1, 2), (0, 2), (0, 1)][axis];
+    let planes = Planes {
+        rows: counts[a],
+        columns: counts[b],
+        row_stride: strides[a],
+        column_stride: strides[b],
+    };
+    let mut before = planes.empty();
+    let mut current = planes.empty();
+    for step in 0..counts[axis] {
+        control::check(watch)?;
+        let plane = if back { counts[axis] - 1 - step } else { step };
+        planes.lower(
+            &mut distances[plane * strides[axis]..],
+            &before,
+            &mut current,
+        );
+        core::mem::swap(&mut before, &mut current);
+    }
+    Ok(())
+}
+
+/// The planes across a sweep: their size and where their cells lie.
+struct Planes {
+    rows: usize,
+    columns: usize,
+    row_stride: usize,
+    column_stride: usize,
+}
+
+impl Planes {
+    /// A copy of a plane, with a border of one cell that is infinitely far.
+    fn empty(&self) -> Vec<f32> {
+        vec![f32::INFINITY; (self.rows + 2) * (self.columns + 2)]
+    }
+
+    /// Lowers the cells of one plane by the plane `before`, and copies them to `current`.
+    fn lower(&self, cells: &mut [f32], before: &[f32], current: &mut [f32]) {
+        let width = self.columns + 2;
+        let rows = current.chunks_exact_mut(width).skip(1).take(self.rows);
+        for (row, current) in rows.enumerate() {
+            let near: [&[f32]; 3] =
+                core::array::from_fn(|i| &before[(row + i) * width..(row + i + 1) * width]);
+            let own = row * self.row_stride;
+            let current = &mut current[1..=self.columns];
+            for (column, current) in current.iter_mut().enumerate() {
+                *current = cells[own + column * self.column_stride];
+            }
+            lower_row(current, near);
+            for (column, current) in current.iter().enumerate() {
+                cells[own + column * self.column_stride] = *current;
+            }
+        }
+    }
+}
+
+/// Lowers a row by the three rows of the plane before it, which have one cell more at both ends.
+fn lower_row(row: &mut [f32], near: [&[f32]; 3]) {
+    let lower = |a: f32, b: f32| if b < a { b } else { a };
+    let [above, middle, below] = near.map(|row| row.windows(3));
+    for (own, ((above, middle), below)) in row.iter_mut().zip(above.zip(middle).zip(below)) {
+        let straight = middle[1] + 1.0;
+        let edge = lower(lower(above[1], below[1]), lower(middle[0], middle[2])) + SQRT_2;
+        let corner = lower(lower(above[0], above[2]), lower(below[0], below[2])) + SQRT_3;
+        *own = lower(*own, lower(straight, lower(edge, corner)));
+    }
+}

@@ -1,0 +1,65 @@
+//! What a transform in bricks will occupy and cost, known before any distance is taken.
+
+use super::brick_index::{BRICK_BYTES, Index};
+use super::coarse_field::FarField;
+use super::grid::Grid;
+use super::options::{DistanceError, DistanceOptions, Sites};
+use super::point_distance::PointSites;
+use super::vertex_distance::CellSites;
+use crate::flow::data::{Point, Watch};
+
+/// The plan of a transform.
+pub(crate) struct Layout {
+    pub(crate) grid: Grid,
+    /// Occupied vertices, sorted, each once.
+    pub(crate) cells: Vec<[u32; 3]>,
+    pub(crate) index: Index,
+    /// The band's radius in cells.
+    pub(crate) band: i32,
+    /// At most the bytes of what the bricks are filled from.
+    pub(crate) sites: usize,
+}
+
+impl Layout {
+    /// Plans the transform of `target` over a grid that covers both clouds.
+    ///
+    /// # Errors
+    /// Whatever the transform is refused for.
+    pub(crate) fn plan(
+        source: &[Point],
+        target: &[Point],
+        options: &DistanceOptions,
+        watch: &dyn Watch,
+    ) -> Result<Self, DistanceError> {
+        options.check()?;
+        let grid = Grid::covering(source, target, options.cell_m)?;
+        let mut cells: Vec<_> = target.iter().map(|&p| grid.nearest_vertex(p)).collect();
+        // One comparison instead of three, half of them mispredicted.
+        cells.sort_unstable_by_key(|&cell| {
+            let [x, y, z] = cell.map(u128::from);
+            x << 64 | y << 32 | z
+        });
+        cells.dedup();
+        let band = options.band_cells();
+        let index = Index::activate(&grid, &cells, band, options.max_bytes, watch)?;
+        let sites = match options.sites {
+            Sites::Cells => CellSites::bytes(cells.len(), band),
+            Sites::Points => PointSites::bytes(target.len()),
+        };
+        let bytes =
+            index.bytes() + index.active * BRICK_BYTES + FarField::bytes_over(&grid) + sites;
+        if bytes > options.max_bytes {
+            return Err(DistanceError::Memory {
+                needed: bytes,
+                limit: options.max_bytes,
+            });
+        }
+        Ok(Self {
+            grid,
+            cells,
+            index,
+            band,
+            sites,
+        })
+    }
+}

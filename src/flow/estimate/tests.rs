@@ -1,0 +1,158 @@
+//! What comes out of an estimate, whatever goes in.
+
+use super::*;
+use crate::flow::cpu::CpuBackend;
+use crate::flow::data::Interrupt;
+use crate::flow::data::Point;
+use crate::flow::data::Watch;
+use crate::flow::data::moved;
+use crate::flow::data::{Progress, Unwatched};
+use crate::flow::error::FlowError;
+use crate::flow::options::Options;
+use crate::flow::options::{Ego, Ground, Preset};
+use crate::flow::select::Problem;
+use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// Interrupts after a number of iterations.
+struct After(usize, Interrupt, AtomicUsize);
+
+impl Watch for After {
+    fn interrupt(&self) -> Option<Interrupt> {
+        (self.2.load(Ordering::Relaxed) >= self.0).then_some(self.1)
+    }
+    fn progress(&self, progress: Progress) {
+        self.2.store(progress.iteration, Ordering::Relaxed);
+    }
+}
+
+fn street() -> SimulatedPair {
+    let options = StreetOptions {
+        beams: 16,
+        azimuth_steps: 500,
+        ..StreetOptions::default()
+    };
+    Street::new(&options)
+        .and_then(|street| street.pair(0))
+        .expect("a small street")
+}
+
+fn solve(
+    pair: &SimulatedPair,
+    options: &Options,
+    watch: &dyn Watch,
+) -> Result<Estimate, FlowError> {
+    let backend = CpuBackend::new(Some(2)).expect("threads");
+    let problem = Problem {
+        source: &pair.source,
+        target: &pair.target,
+        ground: Some([&pair.ground_source, &pair.ground_target]),
+        before: None,
+        around: &[],
+    };
+    estimate(&backend, &problem, options, watch)
+}
+
+#[test]
+fn points_left_out_keep_their_row_with_zero_flow() {
+    let pair = street();
+    let mut options = Preset::Neural.options(None);
+    options.ground = Ground::Mask;
+    options.range_m = Some(30.0);
+    let estimate = solve(&pair, &options, &Unwatched).expect("a flow");
+    assert_eq!(estimate.flow.len(), pair.source.len());
+    for (row, point) in pair.source.iter().enumerate() {
+        let kept = !pair.ground_source[row] && point[0].abs() <= 30.0 && point[1].abs() <= 30.0;
+        assert_eq!(estimate.valid[row], kept, "row {row}");
+        assert!(kept || estimate.flow[row] == [0.0; 3], "row {row}");
+    }
+    assert_eq!(
+        estimate.points,
+        estimate.valid.iter().filter(|&&v| v).count()
+    );
+}
+
+#[test]
+fn ground_that_is_found_moves_with_the_vehicle_and_takes_no_part() {
+    let pair = street();
+    let mut options = Preset::Neural.options(None);
+    let solve = |options: &Options| {
+        let backend = CpuBackend::new(Some(2)).expect("threads");
+        let problem = Problem {
+            source: &pair.source,
+            target: &pair.target,
+            ground: None,
+            before: None,
+            around: &[],
+        };
+        estimate(&backend, &problem, options, &Unwatched).expect("a flow")
+    };
+    let estimate = solve(&options);
+    let ego = estimate.ego.expect("it is estimated");
+    assert!(estimate.valid.iter().all(|&valid| valid));
+    assert!(estimate.points < pair.source.len());
+    let found = crate::flow::ground::segment(&pair.source, &Default::default()).ground;
+    let dynamic = estimate.dynamic.expect("the ego motion is known");
+    for (row, point) in pair
+        .source
+        .iter()
+        .enumerate()
+        .filter(|&(row, _)| found[row])
+    {
+        let to = moved(&ego, *point);
+        let expected: Point = core::array::from_fn(|a| to[a] - point[a]);
+        assert_eq!(estimate.flow[row], expected, "row {row}");
+        assert!(!dynamic[row], "row {row}");
+    }
+    // Without the vehicle's motion, or sampled, it is left out.
+    for (ego, max_points) in [(Ego::Off, None), (Ego::Auto, Some(500))] {
+        options.ego = ego;
+        options.max_points = max_points;
+        let estimate = solve(&options);
+        assert!((0..found.len()).all(|row| !found[row] || !estimate.valid[row]));
+    }
+}
+
+#[test]
+fn a_deadline_gives_the_best_flow_so_far_and_a_cancellation_gives_none() {
+    let pair = street();
+    for preset in Preset::FITTED {
+        let options = preset.options(None);
+        let deadline = After(3, Interrupt::Deadline, AtomicUsize::new(0));
+        let estimate = solve(&pair, &options, &deadline).expect("a flow");
+        assert_eq!(estimate.stop_reason, StopReason::Deadline);
+        assert_eq!(estimate.iterations, 3);
+        assert!(estimate.flow.iter().flatten().all(|f| f.is_finite()));
+        let cancel = After(3, Interrupt::Cancelled, AtomicUsize::new(0));
+        let error = solve(&pair, &options, &cancel).expect_err("cancelled");
+        assert!(matches!(error, FlowError::Cancelled));
+    }
+}
+
+#[test]
+fn a_deadline_before_the_first_iteration_still_gives_a_flow() {
+    let now = After(0, Interrupt::Deadline, AtomicUsize::new(0));
+    let estimate = solve(&street(), &Preset::Neural.options(None), &now).expect("a flow");
+    assert_eq!(estimate.iterations, 0);
+    assert!(estimate.flow.iter().flatten().all(|f| f.is_finite()));
+}
+
+#[test]
+fn a_given_ego_motion_is_taken_as_it_is_and_marks_what_moves_against_it() {
+    let pair = street();
+    let mut options = Preset::Neural.options(None);
+    options.ego = Ego::Given(pair.target_from_source);
+    options.max_iterations = 0;
+    let estimate = solve(&pair, &options, &Unwatched).expect("a flow");
+    assert_eq!(estimate.ego, Some(pair.target_from_source));
+    assert!(
+        estimate
+            .dynamic
+            .is_some_and(|dynamic| dynamic.iter().all(|&moves| !moves))
+    );
+    for (row, &point) in pair.source.iter().enumerate() {
+        let to = moved(&pair.target_from_source, point);
+        let expected: Point = core::array::from_fn(|a| to[a] - point[a]);
+        assert_eq!(estimate.flow[row], expected);
+    }
+}

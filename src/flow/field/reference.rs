@@ -1,0 +1,206 @@
+//! The oracle: the paper's formulas in plain double-precision loops. Slow, obvious, test-only.
+//!
+//! Every kernel is tested against it. It shares no code with what it checks but the layout of
+//! [`Parameters`], their start, and the distance transform, which has its own tests.
+
+use super::mlp::{
+    MIDDLE_LAYERS, PANEL, Parameters, WIDTH, first_layer, last_layer, middle_layer, panel_index,
+};
+use crate::flow::data::{Point, Random};
+use crate::flow::distance::DistanceTransform;
+
+/// The network as dense matrices: `weights[layer][output][input]`, `biases[layer][output]`.
+pub(crate) struct ReferenceNetwork {
+    pub(crate) weights: Vec<Vec<Vec<f64>>>,
+    pub(crate) biases: Vec<Vec<f64>>,
+}
+
+impl ReferenceNetwork {
+    /// Reads the laid-out parameters, or gradients, one by one.
+    pub(crate) fn read(parameters: &Parameters) -> Self {
+        assert_eq!(PANEL, 32, "the layout below is written for panels of 32");
+        let floats = parameters.as_slice();
+        let at = |place: usize| f64::from(floats[place]);
+        let mut weights = Vec::new();
+        let mut biases = Vec::new();
+        let first = first_layer();
+        weights.push(matrix(WIDTH, 3, |o, i| at(first.weights + i * WIDTH + o)));
+        biases.push((0..WIDTH).map(|o| at(first.bias + o)).collect());
+        for layer in 0..MIDDLE_LAYERS {
+            let place = middle_layer(layer);
+            weights.push(matrix(WIDTH, WIDTH, |o, i| {
+                at(place.weights + panel_index(i, o))
+            }));
+            biases.push((0..WIDTH).map(|o| at(place.bias + o)).collect());
+        }
+        let last = last_layer();
+        weights.push(matrix(3, WIDTH, |o, i| at(last.weights + o * WIDTH + i)));
+        biases.push((0..3).map(|o| at(last.bias + o)).collect());
+        Self { weights, biases }
+    }
+
+    /// Activations of every layer, the input first and the output last.
+    fn activations(&self, input: [f64; 3]) -> Vec<Vec<f64>> {
+        let mut layers = vec![input.to_vec()];
+        for (number, (weights, biases)) in self.weights.iter().zip(&self.biases).enumerate() {
+            let from = &layers[number];
+            let linear = weights
+                .iter()
+                .zip(biases)
+                .map(|(row, bias)| bias + row.iter().zip(from).map(|(w, h)| w * h).sum::<f64>());
+            let last = number + 1 == self.weights.len();
+            layers.push(linear.map(|x| if last { x } else { x.max(0.0) }).collect());
+        }
+        layers
+    }
+
+    /// `g(input)`.
+    pub(crate) fn forward(&self, input: [f64; 3]) -> [f64; 3] {
+        let output = self.activations(input).pop().expect("a network has layers");
+        [output[0], output[1], output[2]]
+    }
+
+    /// Adds to `gradients` the derivative of `output_gradient . g(input)` by every parameter.
+    pub(crate) fn backward(
+        &self,
+        input: [f64; 3],
+        output_gradient: [f64; 3],
+        gradients: &mut Self,
+    ) {
+        let layers = self.activations(input);
+        let mut delta = output_gradient.to_vec();
+        for number in (0..self.weights.len()).rev() {
+            for (output, d) in delta.iter().enumerate() {
+                gradients.biases[number][output] += d;
+                for (i, h) in layers[number].iter().enumerate() {
+                    gradients.weights[number][output][i] += d * h;
+                }
+            }
+            delta = (0..layers[number].len())
+                .map(|i| {
+                    let back: f64 = delta
+                        .iter()
+                        .zip(&self.weights[number])
+                        .map(|(d, row)| d * row[i])
+                        .sum();
+                    if number == 0 || layers[number][i] > 0.0 {
+                        back
+                    } else {
+                        0.0
+                    }
+                })
+                .collect();
+        }
+    }
+
+    /// Adam's step (Kingma and Ba 2015) number `iteration`, from 1.
+    pub(crate) fn adam_step(
+        &mut self,
+        gradients: &Self,
+        moments: &mut [Vec<f64>; 2],
+        iteration: i32,
+        learning_rate: f64,
+    ) {
+        let [means, squares] = moments;
+        let weights = self.weights.iter_mut().flatten().flatten();
+        let values = weights.chain(self.biases.iter_mut().flatten());
+        for (i, (value, g)) in values.zip(gradients.flat()).enumerate() {
+            means[i] = 0.9 * means[i] + 0.1 * g;
+            squares[i] = 0.999 * squares[i] + 0.001 * g * g;
+            let mean = means[i] / (1.0 - 0.9f64.powi(iteration));
+            let square = squares[i] / (1.0 - 0.999f64.powi(iteration));
+            *value -= learning_rate * mean / (square.sqrt() + 1e-8);
+        }
+    }
+
+    /// All weights and biases in one row.
+    pub(crate) fn flat(&self) -> Vec<f64> {
+        let weights = self.weights.iter().flatten().flatten();
+        weights
+            .chain(self.biases.iter().flatten())
+            .copied()
+            .collect()
+    }
+}
+
+/// The mean distances that the published method sees in its first iterations over `source`, metres,
+/// from where `seed` starts it, with Adam at a constant `rate`.
+pub(crate) fn first_losses(
+    source: &[Point],
+    distance: &DistanceTransform,
+    seed: u64,
+    rate: f64,
+    iterations: i32,
+) -> Vec<f64> {
+    let mut network = ReferenceNetwork::read(&Parameters::xavier(&mut Random::stream(seed, 0)));
+    let zeros = vec![0.0; network.flat().len()];
+    let mut moments = [zeros.clone(), zeros];
+    let mut losses = Vec::new();
+    for iteration in 1..=iterations {
+        let mut gradients = ReferenceNetwork::read(&Parameters::zeros());
+        let mut loss = 0.0;
+        for point in source {
+            let input = point.map(f64::from);
+            let flow = network.forward(input);
+            let sample = distance.sample(core::array::from_fn(|a| (input[a] + flow[a]) as f32));
+            loss += f64::from(sample.distance) / source.len() as f64;
+            let pull = sample.gradient.map(|g| f64::from(g) / source.len() as f64);
+            network.backward(input, pull, &mut gradients);
+        }
+        network.adam_step(&gradients, &mut moments, iteration, rate);
+        losses.push(loss);
+    }
+    losses
+}
+
+fn matrix(rows: usize, columns: usize, entry: impl Fn(usize, usize) -> f64) -> Vec<Vec<f64>> {
+    (0..rows)
+        .map(|r| (0..columns).map(|c| entry(r, c)).collect())
+        .collect()
+}
+
+/// Euclidean distance from `at` to the nearest of `sites`.
+pub(crate) fn nearest_distance(at: [f64; 3], sites: &[[f64; 3]]) -> f64 {
+    let mut nearest = f64::INFINITY;
+    for site in sites {
+        let square: f64 = (0..3).map(|a| (at[a] - site[a]).powi(2)).sum();
+        nearest = nearest.min(square.sqrt());
+    }
+    nearest
+}
+
+/// Length of the shortest path of straight and diagonal steps from `at` to one of `sites`.
+pub(crate) fn nearest_chamfer(at: [f64; 3], sites: &[[f64; 3]]) -> f64 {
+    let mut nearest = f64::INFINITY;
+    for site in sites {
+        let mut gaps = [0, 1, 2].map(|a| (at[a] - site[a]).abs());
+        gaps.sort_by(f64::total_cmp);
+        let [c, b, a] = gaps;
+        let root = f64::sqrt;
+        nearest = nearest.min(a + (root(2.0) - 1.0) * b + (root(3.0) - root(2.0)) * c);
+    }
+    nearest
+}
+
+/// Trilinear value and gradient at `at`, in cells, of values known at whole places.
+pub(crate) fn trilinear(at: [f64; 3], value: impl Fn([u32; 3]) -> f64) -> (f64, [f64; 3]) {
+    let (mut sum, mut gradient) = (0.0, [0.0; 3]);
+    let fraction = at.map(|c| c - c.floor());
+    for corner in 0..8u32 {
+        let bits = [corner >> 2, corner >> 1 & 1, corner & 1];
+        let vertex = [0, 1, 2].map(|a| at[a].floor() as u32 + bits[a]);
+        let weight = [0, 1, 2].map(|a| {
+            if bits[a] == 1 {
+                fraction[a]
+            } else {
+                1.0 - fraction[a]
+            }
+        });
+        sum += weight.iter().product::<f64>() * value(vertex);
+        for axis in 0..3 {
+            let others: f64 = (0..3).filter(|&a| a != axis).map(|a| weight[a]).product();
+            gradient[axis] += (f64::from(bits[axis]) * 2.0 - 1.0) * others * value(vertex);
+        }
+    }
+    (sum, gradient)
+}

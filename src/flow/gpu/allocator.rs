@@ -1,0 +1,202 @@
+//! The words of the card's store, given out to pairs for their transforms and points.
+//!
+//! A pair is priced against the store before it gets any, and gets them in its turn. Knows no kernels.
+
+use core::time::Duration;
+use std::collections::VecDeque;
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+
+use crate::flow::data::{Watch, control};
+use crate::flow::field::BackendError;
+
+/// How long somebody waits without any words being given back, in all.
+const PATIENCE: Duration = Duration::from_secs(20);
+/// How often who waits looks at its watch.
+const LOOK: Duration = Duration::from_millis(20);
+
+/// The store's words: who has which, and who waits for some.
+#[derive(Debug)]
+pub(super) struct Words {
+    store: Mutex<Store>,
+    /// Words were given back, or somebody has left the line.
+    moved: Condvar,
+    all: u64,
+}
+
+#[derive(Debug)]
+struct Store {
+    /// Free stretches: place and length, by place.
+    free: Vec<(u64, u64)>,
+    /// Who waits, the longest first. Nobody is served before those who came before him: else many
+    /// small pairs would keep a large one out for ever.
+    line: VecDeque<u64>,
+    /// Who comes next.
+    next: u64,
+}
+
+impl Store {
+    /// The place of `count` free words, which are no longer.
+    fn taken(&mut self, count: u64) -> Option<u64> {
+        let stretch = self.free.iter_mut().find(|(_, length)| *length >= count)?;
+        let place = stretch.0;
+        *stretch = (place + count, stretch.1 - count);
+        self.free.retain(|&(_, length)| length > 0);
+        Some(place)
+    }
+}
+
+impl Words {
+    pub(super) fn new(words: u64) -> Self {
+        Self {
+            store: Mutex::new(Store {
+                free: vec![(0, words)],
+                line: VecDeque::new(),
+                next: 0,
+            }),
+            moved: Condvar::new(),
+            all: words,
+        }
+    }
+
+    fn store(&self) -> MutexGuard<'_, Store> {
+        self.store.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The place of `count` words; waits a while for others to give theirs back.
+    ///
+    /// # Errors
+    /// [`BackendError::Memory`] where the store never has so many, [`BackendError::Busy`] where
+    /// others keep them, [`BackendError::Interrupted`] where the watch asks for the end.
+    pub(super) fn take(
+        &self,
+        what: &'static str,
+        count: u64,
+        watch: &dyn Watch,
+    ) -> Result<u64, BackendError> {
+        if count > self.all {
+            return Err(BackendError::Memory {
+                what,
+                needed: count * 4,
+                available: self.all * 4,
+            });
+        }
+        let mut store = self.store();
+        let own = store.next;
+        store.next += 1;
+        store.line.push_back(own);
+        let mut waited = Duration::ZERO;
+        let place = loop {
+            if store.line.front() == Some(&own)
+                && let Some(place) = store.taken(count)
+            {
+                break Ok(place);
+            }
+            if waited >= PATIENCE {
+                break Err(BackendError::Busy);
+            }
+            if let Err(interrupt) = control::check(watch) {
+                break Err(BackendError::Interrupted(interrupt));
+            }
+            let (woken, timeout) = self
+                .moved
+                .wait_timeout(store, LOOK)
+                .unwrap_or_else(PoisonError::into_inner);
+            store = woken;
+            if timeout.timed_out() {
+                waited += LOOK;
+            }
+        };
+        store.line.retain(|&other| other != own);
+        self.moved.notify_all();
+        place
+    }
+
+    /// Takes words back.
+    pub(super) fn give_back(&self, place: u64, count: u64) {
+        if count == 0 {
+            return;
+        }
+        let mut store = self.store();
+        store.free.push((place, count));
+        store.free.sort_unstable();
+        let mut joined: Vec<(u64, u64)> = Vec::with_capacity(store.free.len());
+        for &(place, length) in &store.free {
+            match joined.last_mut() {
+                Some(last) if last.0 + last.1 == place => last.1 += length,
+                _ => joined.push((place, length)),
+            }
+        }
+        store.free = joined;
+        self.moved.notify_all();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicBool, Ordering};
+
+    use super::*;
+    use crate::flow::data::{Interrupt, Unwatched};
+
+    /// Ends at the first look.
+    struct Over;
+
+    impl Watch for Over {
+        fn interrupt(&self) -> Option<Interrupt> {
+            Some(Interrupt::Deadline)
+        }
+    }
+
+    #[test]
+    fn words_given_back_can_be_taken_again_in_one_piece() {
+        let words = Words::new(100);
+        let take = |count| words.take("points", count, &Unwatched).expect("free");
+        let [a, b, c] = [take(30), take(30), take(40)];
+        words.give_back(a, 30);
+        words.give_back(c, 40);
+        words.give_back(b, 30);
+        assert_eq!(take(100), 0);
+    }
+
+    #[test]
+    fn what_never_fits_is_refused_at_once_and_what_is_taken_is_waited_for() {
+        let words = Words::new(100);
+        let refused = words.take("points", 101, &Unwatched);
+        assert!(matches!(
+            refused,
+            Err(BackendError::Memory { needed: 404, .. })
+        ));
+        words.take("points", 60, &Unwatched).expect("free");
+        let interrupted = words.take("points", 60, &Over);
+        assert!(matches!(interrupted, Err(BackendError::Interrupted(_))));
+    }
+
+    #[test]
+    fn who_asks_for_little_does_not_pass_who_waits_for_much() {
+        /// Says that somebody has looked at it.
+        #[derive(Default)]
+        struct Waits(AtomicBool);
+        impl Watch for Waits {
+            fn interrupt(&self) -> Option<Interrupt> {
+                self.0.store(true, Ordering::Relaxed);
+                None
+            }
+        }
+        let (words, waits) = (Words::new(100), Waits::default());
+        let taken = words.take("points", 60, &Unwatched).expect("free");
+        std::thread::scope(|scope| {
+            let large = scope.spawn(|| words.take("points", 80, &waits));
+            while !waits.0.load(Ordering::Relaxed) {
+                std::thread::yield_now();
+            }
+            // 40 are free.
+            let small = words.take("points", 10, &Over);
+            assert!(matches!(small, Err(BackendError::Interrupted(_))));
+            words.give_back(taken, 60);
+            let place = large.join().expect("no panic").expect("its turn");
+            assert_eq!(place, 0);
+        });
+        // Who has left the line keeps nobody out.
+        assert_eq!(words.take("points", 20, &Unwatched).expect("free"), 80);
+    }
+}

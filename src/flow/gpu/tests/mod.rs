@@ -1,0 +1,52 @@
+//! The card against the double-precision reference and the CPU backend.
+//!
+//! Needs a card; a software one will do.
+
+mod failures;
+mod half;
+mod kernels;
+mod shaders;
+mod whole;
+
+use std::sync::OnceLock;
+
+use super::adapter::adapters;
+use super::backend::{Gpu, GpuOptions};
+use crate::flow::data::{Point, Random};
+use crate::gpu_in_tests;
+
+/// Pairs that the shared card fits at the same time.
+const LANES: usize = 4;
+
+/// A card of this test's own, the first that there is; none where the machine has none.
+fn opened(options: &GpuOptions) -> Option<Gpu> {
+    let cards = adapters();
+    gpu_in_tests::is_there(cards.len())
+        .then(|| Gpu::open(&cards[0], options).expect("the card opens"))
+}
+
+/// The card that tests share which do it no harm.
+fn shared() -> Option<&'static Gpu> {
+    static SHARED: OnceLock<Option<Gpu>> = OnceLock::new();
+    let options = GpuOptions {
+        lanes: LANES,
+        memory_bytes: None,
+    };
+    SHARED.get_or_init(|| opened(&options)).as_ref()
+}
+
+/// A wall and a box in front of it, and the same moved by a quarter of a metre. Not on a face of
+/// the grid's cells, where rounding decides which side's slope is seen.
+fn clouds(points: usize) -> [Vec<Point>; 2] {
+    let mut random = Random::new(5);
+    let mut across = |width: f64| random.uniform(-width, width) as f32;
+    let source: Vec<Point> = (0..points)
+        .map(|i| match i % 3 {
+            0 => [4.03, across(1.0), across(1.0)],
+            _ => [8.07, across(6.0), across(2.0)],
+        })
+        .collect();
+    let moved = |p: &Point| [p[0] + 0.1, p[1] + 0.2, p[2]];
+    let target = source.iter().map(moved).collect();
+    [source, target]
+}

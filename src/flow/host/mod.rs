@@ -1,0 +1,6 @@
+//! TODO doc
+
+mod pool;
+mod sweep_cache;
+
+pub use pool::Host;

@@ -1,0 +1,147 @@
+//! What has been found out about sweeps, each by itself, for the pairs that see them next.
+//!
+//! A sweep of a sequence is the target of a pair, the source of the next one and, where pairs see
+//! more than their own, around others: its ground and its surface are found once. Sweeps are told
+//! by the bits of all their points, so that nothing is mistaken for something else and the bits are
+//! those that would be found again. It must not know pairs.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+
+use crate::flow::data::Point;
+use crate::flow::data::get_or_compute;
+use crate::flow::registration::Surface;
+
+/// The points of all sweeps that are remembered: some twenty full sweeps, mostly 60 MB with their
+/// surfaces, and 230 MB where no two points share a voxel.
+const POINTS: usize = 2 << 20;
+/// The most sweeps: looking through them takes no time beside finding anything.
+const SWEEPS: usize = 64;
+
+/// What is known of a sweep.
+pub(crate) struct Known {
+    /// What takes part of it: finite and in range.
+    points: Vec<Point>,
+    ground: OnceLock<Vec<bool>>,
+    surface: OnceLock<Surface>,
+}
+
+impl Known {
+    /// Which of the points are ground; `find` says so where it is not known yet.
+    pub(crate) fn ground(&self, find: impl FnOnce(&[Point]) -> Vec<bool>) -> &Vec<bool> {
+        get_or_compute(&self.ground, || find(&self.points))
+    }
+
+    /// What alignments need of it.
+    pub(crate) fn surface(&self) -> &Surface {
+        get_or_compute(&self.surface, || Surface::new(&self.points))
+    }
+}
+
+/// Whether two clouds have the same bits.
+fn same(a: &[Point], b: &[Point]) -> bool {
+    bytemuck::cast_slice::<Point, u8>(a) == bytemuck::cast_slice::<Point, u8>(b)
+}
+
+/// The sweeps that were seen last.
+#[derive(Default)]
+pub(crate) struct Recall(Mutex<VecDeque<Arc<Known>>>);
+
+impl Recall {
+    /// Forgets all sweeps.
+    pub(crate) fn forget(&self) {
+        self.sweeps().clear();
+    }
+
+    fn sweeps(&self) -> MutexGuard<'_, VecDeque<Arc<Known>>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// What is known of the sweep of these points.
+    pub(crate) fn of(&self, points: &[Point]) -> Arc<Known> {
+        let mut sweeps = self.sweeps();
+        let known = match sweeps.iter().position(|known| same(&known.points, points)) {
+            Some(place) => sweeps.remove(place),
+            None => None,
+        };
+        let known = known.unwrap_or_else(|| {
+            Arc::new(Known {
+                points: points.to_vec(),
+                ground: OnceLock::new(),
+                surface: OnceLock::new(),
+            })
+        });
+        if points.len() > POINTS {
+            return known;
+        }
+        sweeps.push_front(Arc::clone(&known));
+        sweeps.truncate(SWEEPS);
+        let mut held = 0;
+        sweeps.retain(|known| {
+            held += known.points.len();
+            held <= POINTS
+        });
+        known
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sweep(points: usize, x: f32) -> Vec<Point> {
+        (0..points).map(|i| [x, i as f32, 0.0]).collect()
+    }
+
+    #[test]
+    fn a_sweep_is_known_again_by_its_points_and_by_nothing_else() {
+        let recall = Recall::default();
+        let first = recall.of(&sweep(100, 1.0));
+        assert_eq!(
+            first.ground(|points| vec![true; points.len()])[..],
+            [true; 100]
+        );
+        let again = recall.of(&sweep(100, 1.0));
+        assert_eq!(
+            again.ground(|_| unreachable!("it is known"))[..],
+            [true; 100]
+        );
+        let mut other = sweep(100, 1.0);
+        other[99][2] = -0.0;
+        for other in [other, sweep(99, 1.0), sweep(100, 2.0)] {
+            let ground = recall.of(&other);
+            let ground = ground.ground(|points| vec![false; points.len()]);
+            assert_eq!(*ground, vec![false; other.len()]);
+        }
+    }
+
+    #[test]
+    fn what_was_not_seen_for_long_is_forgotten_and_what_is_too_large_is_not_kept() {
+        let held = |recall: &Recall| -> usize {
+            recall.sweeps().iter().map(|known| known.points.len()).sum()
+        };
+        let recall = Recall::default();
+        let asked = |x: f32| {
+            let known = recall.of(&sweep(POINTS / 4, x));
+            let mut was_known = true;
+            known.ground(|points| {
+                was_known = false;
+                vec![false; points.len()]
+            });
+            was_known
+        };
+        assert_eq!([1.0, 2.0, 3.0, 4.0].map(asked), [false; 4]);
+        // The first is seen once more, so that the second has to go.
+        assert_eq!([1.0, 5.0, 1.0, 2.0].map(asked), [true, false, true, false]);
+        assert!(held(&recall) <= POINTS);
+        let before = held(&recall);
+        recall.of(&sweep(POINTS + 1, 0.0));
+        assert_eq!(held(&recall), before);
+        recall.forget();
+        assert_eq!(held(&recall), 0);
+        for few in 0..=SWEEPS as u16 {
+            recall.of(&sweep(3, few.into()));
+        }
+        assert_eq!(recall.sweeps().len(), SWEEPS);
+    }
+}

@@ -1,0 +1,231 @@
+//! Whether a motion is needed: whether a cluster's points say that it moved, or could as well have
+//! been sampled elsewhere.
+//!
+//! A sparse static surface can always be laid a little better on the other sweep's samples, and what
+//! only one sweep saw lies best on something else. It must not know how motions are found.
+
+use super::free_space::SeenThrough;
+use super::hypothesis::{Found, Witnesses};
+use crate::flow::data::Point;
+use crate::flow::options::LabelOptions;
+
+/// Whether `found`, the best motion of a cluster with these `points`, is needed; `seen` says what was
+/// seen through before and after it.
+pub(super) fn is_needed(
+    found: &Found,
+    points: &[Point],
+    seen: impl Fn() -> SeenThrough,
+    options: &LabelOptions,
+) -> bool {
+    let around = &found.around;
+    let sweeps = 1.0 + around.weight;
+    let still = (found.still.sum_m() + around.still_m) / sweeps;
+    let moved = (found.cost.sum_m() + around.moved_m) / sweeps;
+    let gain = (still - moved) * sweeps;
+    found.motion.length_m() >= options.least_motion_m
+        && found.still.there_m - found.cost.there_m >= options.gain_m
+        && moved <= options.kept_cost * still
+        && gain * points.len() as f32
+            >= options.evidence_m + options.evidence_slope * found.motion.length_m()
+        && found.cost.there_m <= options.left_m
+        && !is_flat(points, options)
+        && {
+            let seen = seen();
+            let stayed = has_stayed(seen, options);
+            !(stayed && seen.far)
+                && (found.hold >= options.least_hold
+                    || has_gone(seen, options)
+                    || is_confirmed(around, options) && !stayed)
+        }
+}
+
+/// Whether the sweeps around say plainly that a cluster moves, even one that its surfaces do not hold:
+/// a wall that seems to slide lies where it was in all of them, a bus has driven on. The nearest must
+/// say so itself: a wall may slide, by then, onto what lies behind it.
+fn is_confirmed(around: &Witnesses, options: &LabelOptions) -> bool {
+    let is_plain = |[still_m, moved_m]: [f32; 2], weight: f32| {
+        moved_m <= options.confirmed_cost * still_m
+            && still_m - moved_m >= options.confirmed_m * weight
+    };
+    around.weight > 0.0
+        && is_plain(around.nearest_m, 1.0)
+        && is_plain([around.still_m, around.moved_m], around.weight)
+}
+
+/// Whether a cluster was seen to leave and to come, even one that its surfaces do not hold: the flat
+/// side of what drives past.
+fn has_gone(seen: SeenThrough, options: &LabelOptions) -> bool {
+    let is_seen = |share: Option<f32>| share.is_some_and(|share| share >= options.gone);
+    is_seen(seen.left) && is_seen(seen.came)
+}
+
+/// Whether a cluster was seen neither to leave nor to come: what is hidden in one of the sweeps may lie
+/// on anything in the other. Of a short way rays tell too little to stop what its surfaces hold.
+fn has_stayed(seen: SeenThrough, options: &LabelOptions) -> bool {
+    let both = seen.left.zip(seen.came);
+    both.is_some_and(|(left, came)| left + came < options.stayed)
+}
+
+/// Whether the points, many of them, lie at one height: a ring on ground that was not found.
+fn is_flat(points: &[Point], options: &LabelOptions) -> bool {
+    if points.len() < options.flat_points {
+        return false;
+    }
+    let mut heights: Vec<f32> = points.iter().map(|point| point[2]).collect();
+    heights.sort_unstable_by(f32::total_cmp);
+    let at = |share: f32| heights[(share * (heights.len() - 1) as f32) as usize];
+    at(0.95) - at(0.05) < options.flat_m
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::objects::hypothesis::Cost;
+    use crate::flow::objects::planar_motion::Motion;
+
+    /// A motion that is needed whatever is asked.
+    fn plain() -> Found {
+        let cost = |there_m, back_m| Cost { there_m, back_m };
+        Found {
+            motion: Motion::still([0.0; 2]).shifted([0.8, 0.0]),
+            cost: cost(0.03, 0.03),
+            still: cost(0.25, 0.2),
+            hold: 0.4,
+            around: Witnesses::default(),
+        }
+    }
+
+    /// So many points on a slope.
+    fn points(count: u8) -> Vec<Point> {
+        let point = |i| [f32::from(i) * 0.1, 0.0, f32::from(i) * 0.05];
+        (0..count).map(point).collect()
+    }
+
+    /// Nobody looked.
+    const UNSEEN: SeenThrough = SeenThrough {
+        left: None,
+        came: None,
+        far: true,
+    };
+
+    fn needed(change: impl Fn(&mut Found)) -> bool {
+        needed_as_seen(UNSEEN, change)
+    }
+
+    fn needed_as_seen(seen: SeenThrough, change: impl Fn(&mut Found)) -> bool {
+        let mut found = plain();
+        change(&mut found);
+        is_needed(&found, &points(60), || seen, &LabelOptions::default())
+    }
+
+    /// The shares that were seen through.
+    fn seen(left: f32, came: f32) -> SeenThrough {
+        SeenThrough {
+            left: Some(left),
+            came: Some(came),
+            far: true,
+        }
+    }
+
+    #[test]
+    fn a_motion_that_explains_a_cluster_is_needed() {
+        assert!(needed(|_| {}));
+    }
+
+    #[test]
+    fn motions_that_are_short_gain_little_or_leave_much_are_not() {
+        assert!(!needed(
+            |found| found.motion = Motion::still([0.0; 2]).shifted([0.02, 0.0])
+        ));
+        assert!(!needed(|found| found.still.there_m = 0.04));
+        assert!(!needed(|found| found.cost.there_m = 0.2));
+        assert!(!needed(|found| found.cost.back_m = 0.3));
+    }
+
+    #[test]
+    fn a_wall_that_slides_in_its_plane_does_not_move() {
+        assert!(!needed(|found| found.hold = 0.02));
+    }
+
+    #[test]
+    fn a_flat_side_that_is_seen_to_leave_and_to_come_moves_though_nothing_holds_it() {
+        let slides = |seen| needed_as_seen(seen, |found| found.hold = 0.02);
+        assert!(slides(seen(0.8, 0.8)));
+        assert!(!slides(seen(0.9, 0.2)));
+        assert!(!slides(seen(0.2, 0.9)));
+        assert!(!slides(UNSEEN));
+    }
+
+    #[test]
+    fn what_is_seen_neither_to_leave_nor_to_come_does_not_move_far() {
+        let is_needed = |seen| needed_as_seen(seen, |_| {});
+        assert!(!is_needed(seen(0.1, 0.1)));
+        // What drives away hides where it comes to lie, what draws near where it was.
+        assert!(is_needed(seen(0.9, 0.0)));
+        assert!(is_needed(seen(0.0, 0.9)));
+        // Rays do not tell a short way.
+        let near = SeenThrough {
+            far: false,
+            ..seen(0.1, 0.1)
+        };
+        assert!(is_needed(near));
+    }
+
+    #[test]
+    fn a_bus_that_all_sweeps_see_driving_moves_though_nothing_holds_it() {
+        let around = |still_m: f32, moved_m: f32| Witnesses {
+            weight: 1.5,
+            still_m: still_m * 1.5,
+            moved_m: moved_m * 1.5,
+            nearest_m: [still_m, moved_m],
+        };
+        let slides = |around| {
+            needed(|found| {
+                found.hold = 0.02;
+                found.around = around;
+            })
+        };
+        assert!(slides(around(0.4, 0.05)));
+        assert!(!slides(around(0.08, 0.05)));
+        assert!(!slides(around(0.4, 0.3)));
+        let far = Witnesses {
+            nearest_m: [0.05; 2],
+            ..around(0.4, 0.05)
+        };
+        assert!(!slides(far));
+        // Nor one that is seen to stay, however short the way.
+        let stays = |far| {
+            let seen = SeenThrough {
+                far,
+                ..seen(0.1, 0.1)
+            };
+            needed_as_seen(seen, |found| {
+                (found.hold, found.around) = (0.02, around(0.4, 0.05));
+            })
+        };
+        assert!(!stays(true) && !stays(false));
+        // And what held was none where the others say that it stands.
+        assert!(!needed(|found| found.around = around(0.05, 0.5)));
+    }
+
+    #[test]
+    fn the_farther_a_motion_the_more_points_it_takes() {
+        let options = LabelOptions::default();
+        let mut found = plain();
+        assert!(is_needed(&found, &points(12), || UNSEEN, &options));
+        found.motion = found.motion.shifted([2.2, 0.0]);
+        assert!(!is_needed(&found, &points(12), || UNSEEN, &options));
+        assert!(is_needed(&found, &points(40), || UNSEEN, &options));
+    }
+
+    #[test]
+    fn a_ring_on_the_ground_does_not_move() {
+        let flat: Vec<Point> = points(60).iter().map(|&[x, y, _]| [x, y, -1.7]).collect();
+        assert!(!is_needed(
+            &plain(),
+            &flat,
+            || UNSEEN,
+            &LabelOptions::default()
+        ));
+    }
+}

@@ -1,0 +1,146 @@
+//! Who moves with whom: pieces and stray points beside a mover that its motion explains, and points
+//! of a mover that it does not.
+//!
+//! A far car falls into pieces too small to say anything alone; a ring of ground that was not found
+//! hangs on to a near one. It must not know how motions are found.
+
+use rayon::prelude::*;
+
+use super::hypothesis::{Found, Mover};
+use super::neighbor_view::Moment;
+use super::planar_motion::Motion;
+use super::scene::Scene;
+use crate::flow::data::evenly;
+use crate::flow::spatial::NOISE;
+
+/// Points of a piece that look for movers beside it.
+const LOOKING: usize = 64;
+/// An own motion must be this much better than that of a larger mover beside it, metres.
+const BETTER_M: f32 = 0.05;
+/// Points of a mover within this vote on whether they are of it, metres.
+const VOTE_M: f32 = 0.3;
+
+/// Whose motion everything has; [`NOISE`] where it stands still.
+pub(super) struct Spread {
+    /// Of each cluster, the cluster whose motion it has.
+    pub(super) leaders: Vec<u32>,
+    /// Of each thinned source point likewise.
+    pub(super) owners: Vec<u32>,
+}
+
+/// Shares the motions out.
+pub(super) fn spread(scene: &Scene<'_>, around: &[Moment<'_>], needed: &[Option<Found>]) -> Spread {
+    let leaders: Vec<u32> = (0..needed.len() as u32)
+        .into_par_iter()
+        .map(|cluster| leader(scene, around, needed, cluster))
+        .collect();
+    // How much worse its cluster's motion is than none, of each point; metres.
+    let points = scene.source.labels.par_iter().zip(&scene.source.points);
+    let worse_m: Vec<f32> = points
+        .map(|(&label, &place)| {
+            let leader = leaders.get(label as usize).copied().unwrap_or(NOISE);
+            let found = needed.get(leader as usize).and_then(Option::as_ref);
+            found.map_or(0.0, |found| {
+                let moved = found.motion.apply(place);
+                scene.distance_of(moved, label) - scene.distance_of(place, label)
+            })
+        })
+        .collect();
+    let owners = (0..scene.source.points.len() as u32)
+        .into_par_iter()
+        .map(|row| match scene.source.labels[row as usize] {
+            NOISE => leader_of_stray(scene, needed, row),
+            label => {
+                let leader = leaders[label as usize];
+                match needed.get(leader as usize).and_then(Option::as_ref) {
+                    Some(_) if is_of(scene, row, &worse_m) => leader,
+                    _ => NOISE,
+                }
+            }
+        })
+        .collect();
+    Spread { leaders, owners }
+}
+
+/// The cluster whose motion a cluster has: its own, that of a larger mover beside it, or none.
+fn leader(scene: &Scene<'_>, around: &[Moment<'_>], needed: &[Option<Found>], cluster: u32) -> u32 {
+    let members = &scene.source.members[cluster as usize];
+    let own = needed[cluster as usize].as_ref();
+    let size = |cluster: u32| scene.source.members[cluster as usize].len();
+    let mut beside: Vec<u32> = Vec::new();
+    for row in evenly(members, LOOKING) {
+        let place = scene.source.points[row as usize];
+        scene.source_around(place, scene.options.match_m, |other| {
+            let label = scene.source.labels[other as usize];
+            if label != NOISE && label != cluster && needed[label as usize].is_some() {
+                beside.push(label);
+            }
+        });
+    }
+    beside.sort_unstable();
+    beside.dedup();
+    beside.retain(|&label| size(label) > size(cluster));
+    if beside.is_empty() {
+        return if own.is_some() { cluster } else { NOISE };
+    }
+    let mover = Mover::new(scene, around, cluster);
+    let cost = |motion: &Motion| mover.cost(motion).sum_m() + mover.around_m(motion);
+    let still = cost(&Motion::still([0.0; 2]));
+    let mut best = match own {
+        Some(found) => (cost(&found.motion) + BETTER_M, cluster),
+        None => (still * scene.options.beside_cost, NOISE),
+    };
+    for label in beside {
+        if let Some(found) = &needed[label as usize] {
+            let cost = cost(&found.motion);
+            if cost < best.0 {
+                best = (cost, label);
+            }
+        }
+    }
+    best.1
+}
+
+/// The mover whose motion a point of no cluster has, if any.
+fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Found>], row: u32) -> u32 {
+    let place = scene.source.points[row as usize];
+    let mut beside: Vec<u32> = Vec::new();
+    scene.source_around(place, scene.options.match_m, |other| {
+        let label = scene.source.labels[other as usize];
+        if label != NOISE && needed[label as usize].is_some() {
+            beside.push(label);
+        }
+    });
+    beside.sort_unstable();
+    beside.dedup();
+    let mut best = (
+        scene.distance_of(place, NOISE) * scene.options.beside_cost,
+        NOISE,
+    );
+    for label in beside {
+        if let Some(found) = &needed[label as usize] {
+            let moved = scene.distance_of(found.motion.apply(place), NOISE);
+            if moved < best.0 {
+                best = (moved, label);
+            }
+        }
+    }
+    best.1
+}
+
+/// Whether the points around one of a mover's are explained by its motion no worse than by none, given
+/// how much worse each is.
+fn is_of(scene: &Scene<'_>, row: u32, worse_m: &[f32]) -> bool {
+    let label = scene.source.labels[row as usize];
+    let center = scene.source.points[row as usize];
+    let (mut worse, mut count) = (0.0, 0.0_f32);
+    scene.source_around(center, VOTE_M, |other| {
+        let place = scene.source.points[other as usize];
+        let near = (0..3).map(|a| (place[a] - center[a]).powi(2)).sum::<f32>();
+        if scene.source.labels[other as usize] == label && near < VOTE_M * VOTE_M {
+            worse += worse_m[other as usize];
+            count += 1.0;
+        }
+    });
+    worse <= scene.options.worse_m * count
+}

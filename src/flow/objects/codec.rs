@@ -1,0 +1,76 @@
+//! Motions as bytes. Knows no fields and no files.
+//!
+//! ```text
+//! motions u64 | each: shift x y, turn, center x y: f32
+//!   | moving points u64 | each: x y z f32, its motion u32 | standing points u64 | each: x y z f32
+//! ```
+
+use super::motion_field::Motions;
+use super::planar_motion::Motion;
+use crate::flow::data::{Body, Point, SealError};
+use crate::flow::spatial::NOISE;
+
+const MOTION_BYTES: usize = 5 * size_of::<f32>();
+const POINT_BYTES: usize = 3 * size_of::<f32>();
+
+impl Motions {
+    /// Appends the motions.
+    pub(crate) fn put(&self, bytes: &mut Vec<u8>) {
+        let (motions, moving, standing) = self.parts();
+        let count = |bytes: &mut Vec<u8>, count: usize| bytes.extend((count as u64).to_le_bytes());
+        let floats = |bytes: &mut Vec<u8>, values: &[f32]| {
+            bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+        };
+        count(bytes, motions.len());
+        for motion in motions {
+            let ([x, y], [a, b]) = (motion.shift_m, motion.center);
+            floats(bytes, &[x, y, motion.turn, a, b]);
+        }
+        count(bytes, moving.len());
+        for (point, owner) in moving {
+            floats(bytes, &point);
+            bytes.extend(owner.to_le_bytes());
+        }
+        count(bytes, standing.len());
+        for point in standing {
+            floats(bytes, &point);
+        }
+    }
+
+    /// Reads what [`Self::put`] wrote.
+    ///
+    /// # Errors
+    /// [`SealError::Damaged`] where bytes are missing or name what is not there.
+    pub(crate) fn take(body: &mut Body<'_>) -> Result<Self, SealError> {
+        let count = body.count_of(MOTION_BYTES)?;
+        let mut motions = Vec::with_capacity(count);
+        for _ in 0..count {
+            motions.push(Motion {
+                shift_m: [finite(body)?, finite(body)?],
+                turn: finite(body)?,
+                center: [finite(body)?, finite(body)?],
+            });
+        }
+        let count = body.count_of(POINT_BYTES + size_of::<u32>())?;
+        let mut points: Vec<Point> = Vec::with_capacity(count);
+        let mut owners = Vec::with_capacity(count);
+        for _ in 0..count {
+            points.push([finite(body)?, finite(body)?, finite(body)?]);
+            let owner = u32::from_le_bytes(body.take()?);
+            if owner as usize >= motions.len() {
+                return Err(SealError::Damaged);
+            }
+            owners.push(owner);
+        }
+        for _ in 0..body.count_of(POINT_BYTES)? {
+            points.push([finite(body)?, finite(body)?, finite(body)?]);
+            owners.push(NOISE);
+        }
+        Ok(Self::new(motions, &points, &owners))
+    }
+}
+
+fn finite(body: &mut Body<'_>) -> Result<f32, SealError> {
+    let value = body.single()?;
+    value.is_finite().then_some(value).ok_or(SealError::Damaged)
+}

@@ -1,0 +1,173 @@
+//! The fit of a motion: Gauss-Newton on the distances to planes with a little of what lies across.
+//!
+//! In a sweep that is `k` gaps after the source a motion has been done `k` times, so that an error of
+//! it shows `k` times as large. It must not know which fit is the best.
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::hypothesis::Mover;
+use super::neighbor_view::Moment;
+use super::planar_motion::Motion;
+use super::scene::Scene;
+use crate::flow::data::{Point, evenly};
+
+/// Steps after which the target points around a cluster are looked for again.
+const STEPS_BETWEEN_LOOKS: usize = 4;
+/// Scale of the weight (Geman and McClure) in the first half of the steps and after, metres.
+const SCALES_M: [f32; 2] = [0.2, 0.1];
+/// Pulls toward no shift, and toward no turn, in parts of the weight.
+const DAMPING: [f64; 2] = [1e-3, 0.05];
+/// Less weight than this in all moves nothing.
+const LEAST_WEIGHT: f64 = 1e-6;
+/// A step shorter than this is the last, metres.
+const SHORT_STEP_M: f64 = 1e-3;
+
+impl Mover<'_> {
+    /// Gauss-Newton from `start`, in the target and the sweeps `around`.
+    pub(super) fn fitted(
+        &self,
+        around: &[Moment<'_>],
+        rows: &[u32],
+        start: &Motion,
+        turned: bool,
+        steps: usize,
+    ) -> Motion {
+        let mut motion = *start;
+        let mut views = vec![(self.scene, 1, 1.0)];
+        views.extend(
+            around
+                .iter()
+                .map(|moment| (&moment.scene, moment.at, moment.weight)),
+        );
+        let mut touched = vec![Vec::new(); views.len()];
+        for step in 0..steps {
+            let mut sums = Sums::new(SCALES_M[usize::from(step >= steps / 2)]);
+            for (&(scene, at, weight), touched) in views.iter().zip(&mut touched) {
+                let by_then = motion.repeated(at);
+                if step % STEPS_BETWEEN_LOOKS == 0 {
+                    let all = scene.touched(rows, self.cluster, &by_then);
+                    *touched = evenly(&all, rows.len());
+                }
+                sums.look(&motion, &by_then, at, weight);
+                for &row in rows {
+                    let moved = by_then.apply(scene.source.points[row as usize]);
+                    if let Some(target) = scene.match_of(moved, self.cluster) {
+                        sums.add(scene, moved, target);
+                    }
+                }
+                for &target in touched.iter() {
+                    let place = by_then.undo(scene.target[target as usize]);
+                    if let Some(origin) = scene.origin_of(place, self.cluster) {
+                        let moved = by_then.apply(scene.source.points[origin as usize]);
+                        sums.add(scene, moved, target);
+                    }
+                }
+            }
+            let Some([x, y, turn]) = sums.step(turned) else {
+                break;
+            };
+            motion = motion.shifted([x as f32, y as f32]);
+            motion.turn += turn as f32;
+            if step > steps / 2 && x.hypot(y) < SHORT_STEP_M {
+                break;
+            }
+        }
+        motion
+    }
+}
+
+/// The normal equations of a shift and a turn.
+struct Sums {
+    pivot: [f32; 2],
+    /// Gaps that the motion is repeated over, what a turn adds to the shift by then, and what the
+    /// sweep counts.
+    gaps: f32,
+    swing: [f32; 2],
+    share: f32,
+    square_scale: f32,
+    normal: Matrix3<f64>,
+    gradient: Vector3<f64>,
+    weight: f64,
+}
+
+impl Sums {
+    fn new(scale_m: f32) -> Self {
+        Self {
+            pivot: [0.0; 2],
+            gaps: 1.0,
+            swing: [0.0; 2],
+            share: 1.0,
+            square_scale: scale_m * scale_m,
+            normal: Matrix3::zeros(),
+            gradient: Vector3::zeros(),
+            weight: 0.0,
+        }
+    }
+
+    /// What is added from now on is of a sweep `at` gaps after the source, by when `motion` has
+    /// become `by_then`.
+    fn look(&mut self, motion: &Motion, by_then: &Motion, at: i8, share: f32) {
+        self.pivot = [0, 1].map(|a| by_then.center[a] + by_then.shift_m[a]);
+        self.gaps = f32::from(at);
+        let swing = self.gaps * (self.gaps - 1.0) / 2.0;
+        self.swing = [-swing * motion.shift_m[1], swing * motion.shift_m[0]];
+        self.share = share;
+    }
+
+    fn add(&mut self, scene: &Scene<'_>, moved: Point, target: u32) {
+        let distance = scene.distance(moved, target);
+        let weight = self.square_scale / (self.square_scale + distance * distance);
+        let weight = f64::from(weight * weight * self.share);
+        let to = scene.target[target as usize];
+        let away: Point = core::array::from_fn(|a| to[a] - moved[a]);
+        let k = self.gaps;
+        let [rx, ry] = [0, 1].map(|a| k * (moved[a] - self.pivot[a]));
+        // What a turn moves: the lever's end, and the pivot itself.
+        let [tx, ty] = [self.swing[0] - ry, self.swing[1] + rx];
+        let normal = scene.normal(target);
+        let leak = if normal == [0.0; 3] {
+            1.0
+        } else {
+            scene.options.leak
+        };
+        let along = normal[0] * away[0] + normal[1] * away[1] + normal[2] * away[2];
+        let rows = [
+            (
+                [
+                    k * normal[0],
+                    k * normal[1],
+                    normal[0] * tx + normal[1] * ty,
+                ],
+                along,
+            ),
+            ([leak * k, 0.0, leak * tx], leak * away[0]),
+            ([0.0, leak * k, leak * ty], leak * away[1]),
+        ];
+        for (jacobian, residual) in rows {
+            let jacobian = Vector3::from(jacobian.map(f64::from));
+            self.normal += jacobian * jacobian.transpose() * weight;
+            self.gradient += jacobian * (weight * f64::from(residual));
+        }
+        self.weight += weight;
+    }
+
+    /// The shift and the turn that follow; none where nothing was matched.
+    fn step(mut self, turned: bool) -> Option<[f64; 3]> {
+        if self.weight < LEAST_WEIGHT {
+            return None;
+        }
+        let [shift, turn] = DAMPING;
+        for (axis, damping) in [shift, shift, turn].into_iter().enumerate() {
+            self.normal[(axis, axis)] += damping * self.weight;
+        }
+        if !turned {
+            for axis in 0..2 {
+                self.normal[(axis, 2)] = 0.0;
+                self.normal[(2, axis)] = 0.0;
+            }
+            self.gradient[2] = 0.0;
+        }
+        let step = self.normal.cholesky()?.solve(&self.gradient);
+        Some(step.into())
+    }
+}

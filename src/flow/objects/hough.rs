@@ -1,0 +1,138 @@
+//! Where a cluster may have moved to: the displacements that most of its points agree on.
+//!
+//! Every pair of a source point and a target point at its height votes for the shift between them
+//! (ICP-Flow, Lin et al. 2024). It must not know how good a start is in the end.
+
+use super::scene::Scene;
+use crate::flow::data::Point;
+use crate::flow::options::LabelOptions;
+use crate::flow::spatial::Near;
+use crate::flow::spatial::voxel_first;
+
+/// Points within this height of each other vote, in bins.
+const LEVEL_BINS: f32 = 1.5;
+/// Bins between two peaks.
+const PEAKS_APART: i32 = 2;
+
+/// The cloud that is voted with.
+pub(super) struct Ballot {
+    near: Near,
+    bin_m: f32,
+    /// Bins on each side of none.
+    half: i32,
+    /// Difference in height up to which points vote, metres.
+    within_m: f32,
+}
+
+impl Ballot {
+    /// Over the target of `scene`.
+    pub(super) fn new(scene: &Scene<'_>) -> Self {
+        let LabelOptions { bin_m, reach_m, .. } = *scene.options;
+        let kept = voxel_first(&scene.target, bin_m);
+        let points: Vec<Point> = kept.iter().map(|&row| scene.target[row as usize]).collect();
+        Self {
+            near: Near::new(&points, reach_m / 3.0),
+            bin_m,
+            half: (reach_m / bin_m) as i32,
+            within_m: bin_m * LEVEL_BINS,
+        }
+    }
+
+    /// At most `most` shifts along x and y, metres, the one with the most votes first; shorter
+    /// ones before longer ones with as many.
+    pub(super) fn peaks(&self, points: &[Point], most: usize) -> Vec<[f32; 2]> {
+        let side = 2 * self.half + 1;
+        let mut votes = vec![0_u32; (side * side) as usize];
+        let mut last = vec![u32::MAX; votes.len()];
+        for (&point, voter) in points.iter().zip(0..) {
+            self.near.square_around(
+                point,
+                self.half as f32 * self.bin_m,
+                self.within_m,
+                |other| {
+                    let shift = [0, 1].map(|a| ((other[a] - point[a]) / self.bin_m).round());
+                    if shift.iter().all(|bins| bins.abs() <= self.half as f32) {
+                        let [x, y] = shift.map(|bins| bins as i32);
+                        let bin = ((y + self.half) * side + x + self.half) as usize;
+                        // A point has one vote for a shift, however dense the target.
+                        if last[bin] != voter {
+                            last[bin] = voter;
+                            votes[bin] += 1;
+                        }
+                    }
+                },
+            );
+        }
+        let at = |x: i32, y: i32| {
+            let inside = x.abs() <= self.half && y.abs() <= self.half;
+            if inside {
+                votes[((y + self.half) * side + x + self.half) as usize]
+            } else {
+                0
+            }
+        };
+        let mut all = Vec::new();
+        for y in -self.half..=self.half {
+            for x in -self.half..=self.half {
+                let beside = at(x - 1, y) + at(x + 1, y) + at(x, y - 1) + at(x, y + 1);
+                let smooth = 2 * at(x, y) + beside;
+                if smooth > 0 {
+                    all.push((std::cmp::Reverse(smooth), x * x + y * y, x, y));
+                }
+            }
+        }
+        all.sort_unstable();
+        let mut peaks: Vec<[i32; 2]> = Vec::new();
+        for (_, _, x, y) in all {
+            let apart = |&[a, b]: &[i32; 2]| (a - x).abs().max((b - y).abs()) > PEAKS_APART;
+            if peaks.len() < most && peaks.iter().all(apart) {
+                peaks.push([x, y]);
+            }
+        }
+        let peaks = peaks.into_iter();
+        peaks
+            .map(|peak| peak.map(|bins| bins as f32 * self.bin_m))
+            .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::data::Random;
+    use crate::flow::objects::scene::Thinned;
+    use crate::flow::spatial::NOISE;
+
+    #[test]
+    fn the_first_peak_is_the_shift_of_the_points_and_the_others_lie_apart() {
+        let options = LabelOptions::default();
+        let mut random = Random::new(4);
+        let mut point = || [4.0, 1.8, 1.5].map(|side| random.uniform(0.0, side) as f32);
+        let source: Vec<Point> = (0..80).map(|_| point()).collect();
+        let shift = [1.95, -0.6];
+        let moved = source
+            .iter()
+            .map(|&[x, y, z]| [x + shift[0], y + shift[1], z]);
+        let target: Vec<Point> = moved.collect();
+        let thinned = Thinned::new(&source, &[NOISE; 80], &options);
+        let scene = Scene::new(&thinned, &target, &options);
+        let peaks = Ballot::new(&scene).peaks(&source, 4);
+        assert_eq!(peaks.len(), 4);
+        let [x, y] = [0, 1].map(|a| (peaks[0][a] - shift[a]).abs());
+        assert!(x <= options.bin_m && y <= options.bin_m, "{peaks:?}");
+        for (i, a) in peaks.iter().enumerate() {
+            for b in &peaks[..i] {
+                let apart = (a[0] - b[0]).abs().max((a[1] - b[1]).abs());
+                assert!(apart > options.bin_m * 2.0, "{peaks:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn points_without_a_target_have_no_peaks() {
+        let options = LabelOptions::default();
+        let thinned = Thinned::new(&[[0.0; 3]], &[NOISE], &options);
+        let scene = Scene::new(&thinned, &[[50.0; 3]], &options);
+        assert!(Ballot::new(&scene).peaks(&[[0.0; 3]], 4).is_empty());
+    }
+}

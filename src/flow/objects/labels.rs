@@ -1,0 +1,87 @@
+//! Which cluster each source point is of in the end: a mover with the pieces that move with it, or
+//! something that stands still.
+//!
+//! It must not know how movers were found.
+
+use crate::flow::spatial::NOISE;
+
+/// The clusters of a source, those with the most points first.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Parts {
+    /// N places in `motions`: the cluster of each source point; [`Parts::NONE`] where it is of none.
+    pub of: Vec<u32>,
+    /// K clusters: which of the motions each has; none where it stands still.
+    pub motions: Vec<Option<u32>>,
+}
+
+impl Parts {
+    /// Of no cluster.
+    pub const NONE: u32 = NOISE;
+
+    /// Of a source whose points had `labels` before anything was known of motions. `leaders` says of
+    /// each label whose motion it has, `owners` of each point which of the `count` motions; [`NOISE`]
+    /// where none.
+    ///
+    /// What was cut off a mover is of no cluster: it is not known what it is a part of.
+    pub(super) fn new(labels: &[u32], leaders: &[u32], owners: &[u32], count: usize) -> Self {
+        let groups = count + leaders.len();
+        let of = labels.iter().zip(owners).map(|(&label, &owner)| {
+            let stands = |label: u32| leaders.get(label as usize) == Some(&NOISE);
+            match owner {
+                NOISE if stands(label) => count as u32 + label,
+                owner => owner,
+            }
+        });
+        let of: Vec<u32> = of.collect();
+        let mut points = vec![0_usize; groups];
+        for &group in of.iter().filter(|&&group| group != NOISE) {
+            points[group as usize] += 1;
+        }
+        let mut order: Vec<u32> = (0..groups as u32).collect();
+        order.retain(|&group| points[group as usize] > 0);
+        order.sort_by_key(|&group| std::cmp::Reverse(points[group as usize]));
+        let mut numbers = vec![NOISE; groups];
+        for (number, &group) in (0..).zip(&order) {
+            numbers[group as usize] = number;
+        }
+        let number = |group: u32| numbers.get(group as usize).copied().unwrap_or(NOISE);
+        Self {
+            of: of.into_iter().map(number).collect(),
+            motions: order
+                .into_iter()
+                .map(|group| Some(group).filter(|&group| (group as usize) < count))
+                .collect(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::data::Point;
+    use crate::flow::objects::motion_field::Motions;
+    use crate::flow::objects::planar_motion::Motion;
+
+    #[test]
+    fn a_piece_is_of_the_mover_that_it_goes_with_and_what_stands_keeps_its_cluster() {
+        let motion = Motion::still([0.0; 2]).shifted([1.0, 0.0]);
+        // A car in two pieces, a wall, a stray point, and a point cut off the car.
+        let source: Vec<Point> = [0.0, 0.2, 1.0, 9.0, 9.2, 9.4, 9.6, 30.0, 3.0]
+            .map(|x| [x, 0.0, 0.0])
+            .to_vec();
+        let labels = [0, 0, 1, 2, 2, 2, 2, NOISE, 0];
+        let owners = [0, 0, 0, NOISE, NOISE, NOISE, NOISE, NOISE, NOISE];
+        let owners = Motions::new(vec![motion], &source, &owners).owners_at(&source);
+        let parts = Parts::new(&labels, &[0, 0, NOISE], &owners, 1);
+        const NONE: u32 = Parts::NONE;
+        assert_eq!(parts.of, [1, 1, 1, 0, 0, 0, 0, NONE, NONE]);
+        assert_eq!(parts.motions, [None, Some(0)]);
+    }
+
+    #[test]
+    fn nothing_has_no_clusters() {
+        let none = Parts::new(&[NOISE], &[], &[NOISE], 0);
+        assert_eq!(none.of, [Parts::NONE]);
+        assert!(none.motions.is_empty());
+    }
+}

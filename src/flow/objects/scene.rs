@@ -1,0 +1,265 @@
+//! Both clouds as the search for movers sees them: thinned, with normals, and with what is taken.
+//!
+//! A target point that lies on a source point of something that plainly stands still belongs to it,
+//! and nothing else can have moved there. Heights count less than what lies level: a lidar's rings
+//! are far apart, its samples along a ring are not. It must not know how motions are found.
+
+use rayon::prelude::*;
+
+use super::planar_motion::Motion;
+use crate::flow::data::Point;
+use crate::flow::options::LabelOptions;
+use crate::flow::spatial::{NOISE, Near, Neighborhood, voxel_first};
+
+/// Share of a cluster that must lie on the target for it to stand still plainly.
+const PLAIN: f32 = 0.9;
+
+/// What moves: the source, the ego motion taken out, thinned.
+pub(super) struct Thinned {
+    /// One point a voxel, and the cluster of each.
+    pub(super) points: Vec<Point>,
+    pub(super) labels: Vec<u32>,
+    /// Of each cluster, the rows of `points`.
+    pub(super) members: Vec<Vec<u32>>,
+    /// By place, heights shrunk.
+    low: Vec<Point>,
+    near: Near,
+}
+
+impl Thinned {
+    /// `labels` are the clusters of `source`.
+    pub(super) fn new(source: &[Point], labels: &[u32], options: &LabelOptions) -> Self {
+        let kept = voxel_first(source, options.thinned_m);
+        let labels: Vec<u32> = kept.iter().map(|&row| labels[row as usize]).collect();
+        let points: Vec<Point> = kept.iter().map(|&row| source[row as usize]).collect();
+        let low: Vec<Point> = points.iter().map(|&p| lowered(p, options)).collect();
+        let clusters = labels.iter().filter(|&&label| label != NOISE).max();
+        let mut members = vec![Vec::new(); clusters.map_or(0, |&last| last as usize + 1)];
+        for (&label, row) in labels.iter().zip(0..) {
+            if label != NOISE {
+                members[label as usize].push(row);
+            }
+        }
+        Self {
+            near: Near::new(&low, options.match_m),
+            points,
+            labels,
+            members,
+            low,
+        }
+    }
+}
+
+/// The clouds.
+pub(super) struct Scene<'a> {
+    pub(super) options: &'a LabelOptions,
+    pub(super) source: &'a Thinned,
+    /// Target points, one a voxel, and their unit normals; zero where there is no flat surface.
+    pub(super) target: Vec<Point>,
+    normals: Vec<Point>,
+    /// By place, heights shrunk.
+    near_target: Near,
+    /// Of each target point, the cluster that it is taken by.
+    taken: Vec<u32>,
+}
+
+impl<'a> Scene<'a> {
+    /// Of `source` and `target`.
+    pub(super) fn new(source: &'a Thinned, target: &[Point], options: &'a LabelOptions) -> Self {
+        let target: Vec<Point> = voxel_first(target, options.thinned_m)
+            .into_iter()
+            .map(|row| target[row as usize])
+            .collect();
+        let low_target: Vec<Point> = target.iter().map(|&p| lowered(p, options)).collect();
+        let near_target = Near::new(&low_target, options.match_m);
+        let upright = Near::new(&target, options.match_m);
+        let normals = target
+            .par_iter()
+            .map(|&point| normal(&upright, point, options));
+        let normals = normals.collect();
+        let within = options.taken_m;
+        let on_target: Vec<bool> = source
+            .low
+            .par_iter()
+            .map(|&point| near_target.nearest(point, within, |_| true).is_some())
+            .collect();
+        let still: Vec<bool> = source
+            .members
+            .iter()
+            .map(|rows: &Vec<u32>| {
+                let on = rows.iter().filter(|&&row| on_target[row as usize]).count();
+                on as f32 >= PLAIN * rows.len() as f32
+            })
+            .collect();
+        let taken = low_target.par_iter().map(|&point| {
+            let owner = source.near.nearest(point, within, |_| true);
+            let cluster = owner.map_or(NOISE, |(row, _)| source.labels[row as usize]);
+            if cluster != NOISE && still[cluster as usize] {
+                cluster
+            } else {
+                NOISE
+            }
+        });
+        let taken = taken.collect();
+        Self {
+            options,
+            source,
+            target,
+            normals,
+            near_target,
+            taken,
+        }
+    }
+
+    /// The target point nearest to a place that `cluster` may have moved to, within the match.
+    #[inline]
+    pub(super) fn match_of(&self, place: Point, cluster: u32) -> Option<u32> {
+        let allowed = |row: u32| {
+            let owner = self.taken[row as usize];
+            owner == NOISE || owner == cluster
+        };
+        let place = lowered(place, self.options);
+        let found = self
+            .near_target
+            .nearest(place, self.options.match_m, allowed);
+        found.map(|(row, _)| row)
+    }
+
+    /// The source point of `cluster` nearest to a place, within the match.
+    #[inline]
+    pub(super) fn origin_of(&self, place: Point, cluster: u32) -> Option<u32> {
+        let place = lowered(place, self.options);
+        let of_it = |row: u32| self.source.labels[row as usize] == cluster;
+        let found = self.source.near.nearest(place, self.options.match_m, of_it);
+        found.map(|(row, _)| row)
+    }
+
+    /// Calls `see` with every source point within `within_m` metres of a place, at most the match,
+    /// heights shrunk.
+    pub(super) fn source_around(&self, place: Point, within_m: f32, mut see: impl FnMut(u32)) {
+        let place = lowered(place, self.options);
+        self.source.near.around(place, within_m, |row, _| see(row));
+    }
+
+    /// How far a place that `cluster` may have moved to lies from the target, metres, truncated; for
+    /// [`NOISE`], from whatever of it is free.
+    pub(super) fn distance_of(&self, place: Point, cluster: u32) -> f32 {
+        let target = self.match_of(place, cluster);
+        target.map_or(self.options.truncation_m, |target| {
+            self.distance(place, target)
+        })
+    }
+
+    /// The target points that lie within the match of the moved `rows` and may be of `cluster`, in
+    /// their order.
+    pub(super) fn touched(&self, rows: &[u32], cluster: u32, motion: &Motion) -> Vec<u32> {
+        let within_m = self.options.match_m;
+        let mut seen = self.near_target.unseen();
+        let mut touched = vec![0_u64; self.target.len().div_ceil(64)];
+        for &row in rows {
+            let place = lowered(motion.apply(self.source.points[row as usize]), self.options);
+            self.near_target
+                .around_unseen(place, within_m, &mut seen, |row| {
+                    let owner = self.taken[row as usize];
+                    if owner == NOISE || owner == cluster {
+                        touched[row as usize / 64] |= 1 << (row % 64);
+                    }
+                });
+        }
+        let words = touched.iter().zip((0..).step_by(64));
+        words
+            .flat_map(|(&word, first)| ones(word).map(move |bit| first + bit))
+            .collect()
+    }
+
+    /// The unit normal of a target point; zero where there is no flat surface.
+    #[inline]
+    pub(super) fn normal(&self, row: u32) -> Point {
+        self.normals[row as usize]
+    }
+
+    /// How far a place lies from a target point, metres: along its normal, and a little of what
+    /// lies across, or plainly where it has none. At most the truncation.
+    #[inline]
+    pub(super) fn distance(&self, place: Point, row: u32) -> f32 {
+        let (target, normal) = (self.target[row as usize], self.normals[row as usize]);
+        let [x, y, z]: Point = core::array::from_fn(|a| target[a] - place[a]);
+        let height = z * self.options.height_weight;
+        let plain = x * x + y * y + height * height;
+        let square = if normal == [0.0; 3] {
+            plain
+        } else {
+            let along = normal[0] * x + normal[1] * y + normal[2] * z;
+            along * along + self.options.leak * self.options.leak * plain
+        };
+        square.sqrt().min(self.options.truncation_m)
+    }
+}
+
+/// The bits that are set in a word, the lowest first.
+fn ones(word: u64) -> impl Iterator<Item = u32> {
+    let without_lowest = |&left: &u64| Some(left & left.wrapping_sub(1));
+    std::iter::successors(Some(word), without_lowest)
+        .take_while(|&left| left != 0)
+        .map(u64::trailing_zeros)
+}
+
+/// Heights shrunk.
+#[inline]
+fn lowered([x, y, z]: Point, options: &LabelOptions) -> Point {
+    [x, y, z * options.height_weight]
+}
+
+/// The normal of the surface around a point; zero where it is not flat.
+fn normal(near: &Near, point: Point, options: &LabelOptions) -> Point {
+    let range = point[0].hypot(point[1]);
+    let [base, slope] = options.normal_m;
+    let radius = (base + slope * range).min(options.match_m);
+    let mut neighborhood = Neighborhood::of(point);
+    near.around(point, radius, |_, other| neighborhood.add(other));
+    let flat = neighborhood.flat();
+    flat.map_or([0.0; 3], |flat| flat.normal)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::data::square_distance;
+
+    #[test]
+    fn every_bit_of_a_word_is_named_once_in_order() {
+        assert_eq!(ones(0).count(), 0);
+        assert_eq!(ones(1 | 1 << 5 | 1 << 63).collect::<Vec<_>>(), [0, 5, 63]);
+        assert!(ones(u64::MAX).eq(0..64));
+    }
+
+    #[test]
+    fn what_a_cluster_touches_is_what_a_search_of_all_finds() {
+        let options = LabelOptions::default();
+        // Three words of target points, the last one not full.
+        let target: Vec<Point> = (0..150_u8)
+            .map(|i| [f32::from(i) * 0.2, 1.0, 0.0])
+            .collect();
+        let source = [[7.0, 1.2, 0.0], [19.0, 1.0, 0.1], [29.7, 0.8, 0.0]];
+        let thinned = Thinned::new(&source, &[0; 3], &options);
+        let scene = Scene::new(&thinned, &target, &options);
+        let motion = Motion::still([0.0; 2]).shifted([0.5, 0.0]);
+        let near = |point: &Point| {
+            source.iter().any(|&place| {
+                let away = square_distance(
+                    lowered(motion.apply(place), &options),
+                    lowered(*point, &options),
+                );
+                away < options.match_m * options.match_m
+            })
+        };
+        let expected: Vec<Point> = target.iter().copied().filter(near).collect();
+        let touched = scene.touched(&[0, 1, 2], 0, &motion);
+        let touched: Vec<Point> = touched
+            .iter()
+            .map(|&row| scene.target[row as usize])
+            .collect();
+        assert!(touched.len() > 9);
+        assert_eq!(touched, expected);
+    }
+}

@@ -1,0 +1,403 @@
+//! Which points of a cloud lie near a place.
+//!
+//! Points lie in square columns that a small table finds, by height within each: at most nine columns
+//! are looked at for one place. It must not know of motions or clusters.
+
+use std::ops::Range;
+
+use crate::flow::data::{Point, floor, square_distance};
+
+/// Columns along an axis on each side of the origin; what is farther shares the outermost.
+const REACH: f32 = (1 << 30) as f32;
+
+/// A cloud by place.
+#[derive(Debug)]
+pub(crate) struct Near {
+    column_m: f32,
+    /// Open addressing: the key of a column and where its points are.
+    table: Vec<(u64, Range<u32>)>,
+    /// By column, then by height.
+    points: Vec<Point>,
+    /// The row that each of `points` had.
+    rows: Vec<u32>,
+}
+
+impl Near {
+    /// Of `points`, to be asked for places within `column_m` metres.
+    pub(crate) fn new(points: &[Point], column_m: f32) -> Self {
+        let keyed = points.iter().zip(0_u32..);
+        let mut keyed: Vec<(u64, f32, u32)> = keyed
+            .map(|(&point, row)| (key(place(point, column_m)), point[2], row))
+            .collect();
+        keyed.sort_unstable_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)).then(a.2.cmp(&b.2)));
+        let columns = keyed.chunk_by(|a, b| a.0 == b.0).count();
+        let mut table = vec![(0, 0..0); (columns * 2 + 1).next_power_of_two()];
+        let mut begin = 0;
+        for column in keyed.chunk_by(|a, b| a.0 == b.0) {
+            let end = begin + column.len() as u32;
+            let mut slot = hash(column[0].0) as usize & (table.len() - 1);
+            while !table[slot].1.is_empty() {
+                slot = (slot + 1) & (table.len() - 1);
+            }
+            table[slot] = (column[0].0, begin..end);
+            begin = end;
+        }
+        Self {
+            column_m,
+            table,
+            points: keyed
+                .iter()
+                .map(|&(_, _, row)| points[row as usize])
+                .collect(),
+            rows: keyed.iter().map(|&(_, _, row)| row).collect(),
+        }
+    }
+
+    /// All points, in their own order.
+    pub(crate) fn in_order(&self) -> Vec<Point> {
+        let mut points = vec![[0.0; 3]; self.points.len()];
+        for (&row, &point) in self.rows.iter().zip(&self.points) {
+            points[row as usize] = point;
+        }
+        points
+    }
+
+    /// Calls `see` with the row and the point of everything that lies less than `within_m` (a column's
+    /// side at most) from `center`.
+    #[inline]
+    pub(crate) fn around(&self, center: Point, within_m: f32, mut see: impl FnMut(u32, Point)) {
+        self.columns_around(center, within_m, |places| {
+            let rows = self.rows[places.clone()].iter();
+            for (&point, &row) in self.points[places].iter().zip(rows) {
+                if point[2] > center[2] + within_m {
+                    break;
+                }
+                if square_distance(center, point) < within_m * within_m {
+                    see(row, point);
+                }
+            }
+        });
+    }
+
+    /// Calls `see` with the row of everything that [`Self::around`] gives and that was not yet `seen`.
+    pub(crate) fn around_unseen(
+        &self,
+        center: Point,
+        within_m: f32,
+        seen: &mut Seen,
+        mut see: impl FnMut(u32),
+    ) {
+        self.columns_around(center, within_m, |mut places| {
+            while let Some(unseen) = seen.next_unseen(places.clone()) {
+                let point = self.points[unseen];
+                if point[2] > center[2] + within_m {
+                    break;
+                }
+                if square_distance(center, point) < within_m * within_m {
+                    seen.add(unseen);
+                    see(self.rows[unseen]);
+                }
+                places.start = unseen + 1;
+            }
+        });
+    }
+
+    /// Calls `see` with where the points of each column are that may come within `within_m` of
+    /// `center`, from the lowest that may.
+    #[inline]
+    fn columns_around(&self, center: Point, within_m: f32, mut see: impl FnMut(Range<usize>)) {
+        let neighbors = Neighbors::of(center, self.column_m);
+        for offset in OFFSETS {
+            if neighbors.square_gap(offset) > within_m * within_m {
+                continue;
+            }
+            let Range { start, end } = self.column(neighbors.key(offset));
+            let column = &self.points[start..end];
+            let low = column.partition_point(|point| point[2] < center[2] - within_m);
+            see(start + low..end);
+        }
+    }
+
+    /// None of the points.
+    pub(crate) fn unseen(&self) -> Seen {
+        Seen(vec![0; self.points.len().div_ceil(64)])
+    }
+
+    /// Calls `see` with every point of the columns that touch the square of `half_m` around
+    /// `center`, no more than `height_m` higher or lower.
+    pub(crate) fn square_around(
+        &self,
+        center: Point,
+        half_m: f32,
+        height_m: f32,
+        mut see: impl FnMut(Point),
+    ) {
+        let corner = |side: f32| place([center[0] + side, center[1] + side, 0.0], self.column_m);
+        let ([left, low], [right, high]) = (corner(-half_m), corner(half_m));
+        for x in left..=right {
+            for y in low..=high {
+                let column = &self.points[self.column(key([x, y]))];
+                let begin = column.partition_point(|point| point[2] < center[2] - height_m);
+                for &point in &column[begin..] {
+                    if point[2] > center[2] + height_m {
+                        break;
+                    }
+                    see(point);
+                }
+            }
+        }
+    }
+
+    /// The row and the squared distance of the nearest point that `allowed` lets through and that
+    /// lies less than `within_m` (a column's side at most) from `center`; the lowest row of equals.
+    #[inline]
+    pub(crate) fn nearest(
+        &self,
+        center: Point,
+        within_m: f32,
+        allowed: impl Fn(u32) -> bool,
+    ) -> Option<(u32, f32)> {
+        let neighbors = Neighbors::of(center, self.column_m);
+        let mut best: Option<(u32, f32)> = None;
+        let mut least = within_m * within_m;
+        // The own column first, and in each what is nearest in height: the rest is soon too far.
+        for offset in OFFSETS {
+            if neighbors.square_gap(offset) > least {
+                continue;
+            }
+            let Range { start, end } = self.column(neighbors.key(offset));
+            let column = &self.points[start..end];
+            let level = column.partition_point(|point| point[2] < center[2]);
+            let mut may_go_on = |place: usize| {
+                let point = column[place];
+                let height = point[2] - center[2];
+                let square = square_distance(center, point);
+                let row = self.rows[start + place];
+                let is_lower = |(other, _): (u32, f32)| row < other;
+                if (square < least || (square == least && best.is_some_and(is_lower)))
+                    && allowed(row)
+                {
+                    least = square;
+                    best = Some((row, square));
+                }
+                height * height <= least
+            };
+            let _above = (level..column.len()).all(&mut may_go_on);
+            let _below = (0..level).rev().all(&mut may_go_on);
+        }
+        best
+    }
+
+    fn column(&self, key: u64) -> Range<usize> {
+        let mut slot = hash(key) as usize & (self.table.len() - 1);
+        loop {
+            let (found, Range { start, end }) = &self.table[slot];
+            // No column is empty: this place is vacant.
+            if start == end {
+                return 0..0;
+            }
+            if *found == key {
+                return *start as usize..*end as usize;
+            }
+            slot = (slot + 1) & (self.table.len() - 1);
+        }
+    }
+}
+
+/// Which of the points of a [`Near`] have been seen, in its order, a bit each.
+pub(crate) struct Seen(Vec<u64>);
+
+impl Seen {
+    #[inline]
+    fn add(&mut self, place: usize) {
+        self.0[place / 64] |= 1 << (place % 64);
+    }
+
+    /// The first of some places that has not been seen.
+    #[inline]
+    fn next_unseen(&self, places: Range<usize>) -> Option<usize> {
+        let Range { mut start, end } = places;
+        while start < end {
+            let left = !self.0[start / 64] >> (start % 64);
+            if left != 0 {
+                let first = start + left.trailing_zeros() as usize;
+                return (first < end).then_some(first);
+            }
+            start = (start / 64 + 1) * 64;
+        }
+        None
+    }
+}
+
+/// A column and those around it, the own one first.
+const OFFSETS: [[i32; 2]; 9] = [
+    [0, 0],
+    [-1, 0],
+    [0, -1],
+    [0, 1],
+    [1, 0],
+    [-1, -1],
+    [-1, 1],
+    [1, -1],
+    [1, 1],
+];
+
+/// The columns around a place, and how far off they begin.
+struct Neighbors {
+    place: [i32; 2],
+    /// Along each axis to the column before and to the one after, square metres; a little less than
+    /// that, since columns are told apart in single precision.
+    square_gaps: [[f32; 2]; 2],
+}
+
+impl Neighbors {
+    #[inline]
+    fn of(center: Point, column_m: f32) -> Self {
+        let gaps = |c: f32| {
+            let columns = c / column_m;
+            let before_m = (columns - floor(columns)) * column_m;
+            let slack_m = 4.0 * f32::EPSILON * (c.abs() + column_m);
+            [before_m, column_m - before_m].map(|gap_m| (gap_m - slack_m).max(0.0).powi(2))
+        };
+        Self {
+            place: place(center, column_m),
+            square_gaps: [gaps(center[0]), gaps(center[1])],
+        }
+    }
+
+    /// How far off the column at `offset` begins at least, square metres.
+    #[inline]
+    fn square_gap(&self, offset: [i32; 2]) -> f32 {
+        let gap = |axis: usize| match offset[axis] {
+            0 => 0.0,
+            step => self.square_gaps[axis][usize::from(step > 0)],
+        };
+        gap(0) + gap(1)
+    }
+
+    #[inline]
+    fn key(&self, [dx, dy]: [i32; 2]) -> u64 {
+        let [x, y] = self.place;
+        key([x + dx, y + dy])
+    }
+}
+
+/// The column that a point lies in.
+fn place(point: Point, column_m: f32) -> [i32; 2] {
+    [point[0], point[1]].map(|c| floor(c / column_m).clamp(-REACH, REACH) as i32)
+}
+
+fn key([x, y]: [i32; 2]) -> u64 {
+    u64::from(x.cast_unsigned()) << 32 | u64::from(y.cast_unsigned())
+}
+
+/// Fibonacci hashing: the high bits are mixed best.
+fn hash(key: u64) -> u64 {
+    key.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 29
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::data::Random;
+
+    #[test]
+    fn the_nearest_point_is_the_one_that_a_search_of_all_finds() {
+        let mut random = Random::new(2);
+        let mut point = || [0; 3].map(|_| random.uniform(-3.0, 3.0) as f32);
+        let cloud: Vec<Point> = (0..700).map(|_| point()).collect();
+        let near = Near::new(&cloud, 0.7);
+        for _ in 0..500 {
+            let asked = point();
+            let allowed = |row: u32| !row.is_multiple_of(3);
+            let all = cloud.iter().zip(0..).filter(|&(_, row)| allowed(row));
+            let least = all.map(|(&other, row)| (square_distance(asked, other), row));
+            let least = least.min_by(|a, b| a.0.total_cmp(&b.0));
+            let expected = least.filter(|&(square, _)| square < 0.49);
+            let found = near.nearest(asked, 0.7, allowed);
+            assert_eq!(found, expected.map(|(square, row)| (row, square)));
+        }
+    }
+
+    #[test]
+    fn on_a_lattice_far_out_the_nearest_is_the_lowest_row_of_equals_and_nothing_near_is_left_out() {
+        // Borders of columns go through the points, and single precision is half a millimetre.
+        let lattice = |i: u16| {
+            let [x, y, z] = [i % 12, i / 12 % 12, i / 144].map(f32::from);
+            [4000.0 + x * 0.25, -4000.0 + y * 0.25, z * 0.25]
+        };
+        let cloud: Vec<Point> = (0..720).map(lattice).collect();
+        let near = Near::new(&cloud, 0.5);
+        let mut random = Random::new(5);
+        for _ in 0..500 {
+            let mut side = |low: f64, high: f64| (random.uniform(low, high) * 8.0).round() / 8.0;
+            let asked = [
+                side(3999.5, 4003.5),
+                side(-4000.5, -3996.5),
+                side(-0.5, 1.5),
+            ];
+            let asked = asked.map(|c| c as f32);
+            for within_m in [0.2, 0.5_f32] {
+                let square = |&point: &Point| square_distance(asked, point);
+                let inside = |&(square, _): &(f32, u32)| square < within_m * within_m;
+                let all = cloud.iter().map(square).zip(0..).filter(inside);
+                let mut all: Vec<(f32, u32)> = all.collect();
+                let mut around = Vec::new();
+                near.around(asked, within_m, |row, _| around.push(row));
+                around.sort_unstable();
+                let rows: Vec<u32> = all.iter().map(|&(_, row)| row).collect();
+                assert_eq!(around, rows);
+                all.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+                let first = all.first().map(|&(square, row)| (row, square));
+                assert_eq!(near.nearest(asked, within_m, |_| true), first);
+            }
+        }
+    }
+
+    #[test]
+    fn what_lies_near_several_places_is_seen_once_and_nothing_of_it_is_left_out() {
+        let mut random = Random::new(6);
+        let mut point = || [0; 3].map(|_| random.uniform(-3.0, 3.0) as f32);
+        let cloud: Vec<Point> = (0..3000).map(|_| point()).collect();
+        let near = Near::new(&cloud, 0.7);
+        let places: Vec<Point> = (0..40).map(|_| point()).collect();
+        let (mut seen, mut rows) = (near.unseen(), Vec::new());
+        for &place in &places {
+            near.around_unseen(place, 0.7, &mut seen, |row| rows.push(row));
+        }
+        rows.sort_unstable();
+        let is_near = |point: &Point| places.iter().any(|&p| square_distance(p, *point) < 0.49);
+        let expected = cloud.iter().zip(0..).filter(|(point, _)| is_near(point));
+        let expected: Vec<u32> = expected.map(|(_, row)| row).collect();
+        assert!(expected.len() > 500);
+        assert_eq!(rows, expected);
+    }
+
+    #[test]
+    fn a_square_holds_what_a_search_of_all_finds_in_it() {
+        let mut random = Random::new(3);
+        let mut point = || [0; 3].map(|_| random.uniform(-3.0, 3.0) as f32);
+        let cloud: Vec<Point> = (0..700).map(|_| point()).collect();
+        let near = Near::new(&cloud, 0.4);
+        let asked = point();
+        let inside = |other: &Point, half_m: f32| {
+            (0..2).all(|a| (other[a] - asked[a]).abs() <= half_m)
+                && (other[2] - asked[2]).abs() <= 0.5
+        };
+        let mut seen = 0;
+        near.square_around(asked, 1.5, 0.5, |other| {
+            assert!(inside(&other, 1.5 + 0.4), "{other:?}");
+            seen += usize::from(inside(&other, 1.5));
+        });
+        let expected = cloud.iter().filter(|other| inside(other, 1.5)).count();
+        assert_eq!(seen, expected);
+    }
+
+    #[test]
+    fn nothing_is_near_in_an_empty_cloud_and_far_from_every_point() {
+        assert_eq!(Near::new(&[], 0.5).nearest([0.0; 3], 0.5, |_| true), None);
+        let near = Near::new(&[[1e30, -1e30, 0.0]], 0.5);
+        assert_eq!(near.nearest([0.0; 3], 0.5, |_| true), None);
+        assert_eq!(near.nearest([f32::NAN; 3], 0.5, |_| true), None);
+    }
+}

@@ -1,0 +1,11 @@
+//! TODO doc
+
+mod column_index;
+pub(crate) mod dbscan;
+mod plane;
+mod voxel;
+
+pub(crate) use column_index::Near;
+pub(crate) use dbscan::NOISE;
+pub(crate) use plane::{Flat, Neighborhood};
+pub(crate) use voxel::{REACH, voxel_first, voxel_mean};
