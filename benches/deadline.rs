@@ -10,7 +10,7 @@ use std::time::Instant;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Truth, evaluate};
 use fnsf::flow::field::Backend;
-use fnsf::flow::{Ground, Interrupt, Options, Preset, Problem, Watch, estimate};
+use fnsf::flow::{Control, Ground, Interrupt, Options, Preset, Problem, estimate};
 use fnsf::formats::{Pair, read_pair};
 
 const SEEDS: u64 = 5;
@@ -30,7 +30,7 @@ const DEADLINES_MS: [Option<u32>; 10] = [
 /// A clock with a deadline, seconds after it began.
 struct Clock(Instant, Option<f64>);
 
-impl Watch for Clock {
+impl Control for Clock {
     fn seconds(&self) -> f64 {
         self.0.elapsed().as_secs_f64()
     }

@@ -20,7 +20,7 @@ use fnsf::flow::gpu::{
     Gpu, GpuOptions, KernelTime, Selector, arithmetic_peak, kernel_times, select,
 };
 use fnsf::flow::simulate::{SimulatedPair, Street, StreetOptions};
-use fnsf::flow::{Estimate, Options, Precision, Preset, Problem, Watch, estimate};
+use fnsf::flow::{Control, Estimate, Options, Precision, Preset, Problem, estimate};
 
 /// Runs of each pair, after one to warm up.
 const RUNS: u64 = 5;
@@ -32,7 +32,7 @@ const SMALL: usize = 8192;
 /// A clock for the numerics.
 struct Clock(Instant);
 
-impl Watch for Clock {
+impl Control for Clock {
     fn seconds(&self) -> f64 {
         self.0.elapsed().as_secs_f64()
     }

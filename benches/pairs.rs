@@ -12,14 +12,14 @@ use std::time::Instant;
 use common::{median, scenes};
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::field::Backend;
-use fnsf::flow::{Options, Preset, Problem, Watch, estimate};
+use fnsf::flow::{Control, Options, Preset, Problem, estimate};
 
 const SEEDS: u64 = 3;
 
 /// A clock for the numerics.
 struct Clock(Instant);
 
-impl Watch for Clock {
+impl Control for Clock {
     fn seconds(&self) -> f64 {
         self.0.elapsed().as_secs_f64()
     }

@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 use fnsf::app::App;
 use fnsf::config::Config;
 use fnsf::flow::cpu::CpuBackend;
-use fnsf::flow::{Point, Preset, Problem, Unwatched, estimate};
+use fnsf::flow::{Point, Preset, Problem, Uncontrolled, estimate};
 use fnsf::formats::{CloudFormat, read_flow, read_pair, write_cloud};
 use reqwest::multipart::{Form, Part};
 use tokio_stream::StreamExt;
@@ -173,7 +173,7 @@ async fn run(path: &PathBuf) {
             before: None,
             around: &[],
         };
-        let flow = estimate(&backend, &problem, &options, &Unwatched).unwrap();
+        let flow = estimate(&backend, &problem, &options, &Uncontrolled).unwrap();
         library.push(began.elapsed().as_secs_f64());
         assert_eq!(flow.flow.len(), POINTS);
         over_http.push(

@@ -21,7 +21,8 @@ use fnsf::flow::distance::{Metric, Sites};
 use fnsf::flow::evaluate::{Truth, evaluate};
 use fnsf::flow::field::Backend;
 use fnsf::flow::{
-    self, Decay, EarlyStopOptions, Ego, Ground, Inputs, Keep, Options, Preset, Problem, Start,
+    self, EarlyStopOptions, Ego, Ground, InputNormalization, Keep, LearningRateSchedule, Options,
+    Preset, Problem, Start,
 };
 use fnsf::formats::{Pair, read_pair};
 
@@ -67,7 +68,7 @@ const VARIANTS: &[Variant] = &[
         o.max_iterations = 400;
     }),
     paper("paper, centered inputs / 20 m", |o| {
-        o.inputs = Inputs::Centered { scale_m: 20.0 };
+        o.inputs = InputNormalization::Centered { scale_m: 20.0 };
     }),
     paper("paper, zero start", |o| o.start = Start::ZeroFlow),
     paper("paper, truncation 2 m", |o| {
@@ -76,15 +77,15 @@ const VARIANTS: &[Variant] = &[
     paper("paper, ego motion first", |o| o.ego = Ego::Auto),
     paper("paper, ego motion first, centered, zero start", |o| {
         o.ego = Ego::Auto;
-        o.inputs = Inputs::Centered { scale_m: 20.0 };
+        o.inputs = InputNormalization::Centered { scale_m: 20.0 };
         o.start = Start::ZeroFlow;
     }),
     paper(
         "paper, batches of 2,048, cosine, average, 150 iterations",
         |o| {
             o.batch = Some(2048);
-            o.decay = Decay::Cosine;
-            o.keep = Keep::Average { decay: 0.9 };
+            o.decay = LearningRateSchedule::Cosine;
+            o.keep = ResultChoice::Average { decay: 0.9 };
             o.early_stop = None;
             o.max_iterations = 150;
         },
@@ -116,24 +117,26 @@ const VARIANTS: &[Variant] = &[
     ours("neural, truncation 2 m", |o| {
         o.loss.truncation_m = Some(2.0);
     }),
-    ours("neural, raw inputs", |o| o.inputs = Inputs::Raw),
+    ours("neural, raw inputs", |o| o.inputs = InputNormalization::Raw),
     ours("neural, centered / 5 m", |o| {
-        o.inputs = Inputs::Centered { scale_m: 5.0 };
+        o.inputs = InputNormalization::Centered { scale_m: 5.0 };
     }),
     ours("neural, centered / 20 m", |o| {
-        o.inputs = Inputs::Centered { scale_m: 20.0 };
+        o.inputs = InputNormalization::Centered { scale_m: 20.0 };
     }),
     ours("neural, centered / 50 m", |o| {
-        o.inputs = Inputs::Centered { scale_m: 50.0 };
+        o.inputs = InputNormalization::Centered { scale_m: 50.0 };
     }),
     ours("neural, Xavier start", |o| o.start = Start::Xavier),
     ours("neural, exact points", |o| {
         o.distance.sites = Sites::Points;
     }),
     ours("neural, step size 0.008", |o| o.learning_rate = 0.008),
-    ours("neural, constant step size", |o| o.decay = Decay::Constant),
+    ours("neural, constant step size", |o| {
+        o.decay = LearningRateSchedule::Constant
+    }),
     ours("neural, best batch instead of average", |o| {
-        o.keep = Keep::Best;
+        o.keep = ResultChoice::Best;
     }),
     ours("neural, batches of 1,024", |o| o.batch = Some(1024)),
     ours("neural, batches of 4,096", |o| o.batch = Some(4096)),

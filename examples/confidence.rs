@@ -19,7 +19,9 @@ mod known;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Calibration, Reliability};
 use fnsf::flow::field::Backend;
-use fnsf::flow::{Clouds, Evidence, LabelOptions, Point, RigidTransform, SURE_M, Unwatched};
+use fnsf::flow::{
+    ConfidenceFeatures, ObjectOptions, Point, RigidTransform, SURE_M, SearchClouds, Uncontrolled,
+};
 use known::{Known, PAIRS, real_pairs, street};
 use nalgebra::{DMatrix, DVector, Point3};
 
@@ -55,7 +57,7 @@ fn judged(backend: &dyn Backend, known: Known, weight: f64) -> Scene {
         &known.source,
         &known.target,
         &RigidTransform::identity(),
-        &Unwatched,
+        &Uncontrolled,
     );
     let off_ground = |points: &[Point], ground: &[bool]| -> Vec<usize> {
         (0..points.len())
@@ -71,15 +73,17 @@ fn judged(backend: &dyn Backend, known: Known, weight: f64) -> Scene {
         .iter()
         .map(|&row| moved(&ego, known.source[row]))
         .collect();
-    let clouds = Clouds {
+    let clouds = SearchClouds {
         source: &aligned,
         target: &target,
         around: &[],
         sweeps: [&known.source, &known.target],
         target_from_source: ego,
     };
-    let options = LabelOptions::default();
-    let labelled = backend.host().movers(&clouds, &options, &Unwatched);
+    let options = ObjectOptions::default();
+    let labelled = backend
+        .host()
+        .find_objects(&clouds, &options, &Uncontrolled);
     let residual = labelled.motions.residual_at(&aligned);
     let error = |row: usize, at: Point| {
         let square = |a: usize| (known.source[row][a] + known.flow[row][a] - at[a]).powi(2);
@@ -92,7 +96,7 @@ fn judged(backend: &dyn Backend, known: Known, weight: f64) -> Scene {
         .filter(|&(_, &row)| known.valid[row])
     {
         let at = core::array::from_fn(|a| aligned[i][a] + residual[i][a]);
-        let evidence: &Evidence = &labelled.evidence[i];
+        let evidence: &ConfidenceFeatures = &labelled.evidence[i];
         points.push(Judged {
             kind: usize::from(!evidence.moves),
             features: evidence.features().into_iter().map(f64::from).collect(),

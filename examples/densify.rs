@@ -19,13 +19,13 @@ use std::collections::BTreeMap;
 use std::time::Instant;
 
 use fnsf::flow::cpu::CpuBackend;
-use fnsf::flow::densify::{Later, Leg, Plan, densify};
+use fnsf::flow::densify::{FlowEdge, LaterSweeps, Plan, densify};
 use fnsf::flow::depth::{Occlusion, project};
 use fnsf::flow::distance::{DistanceOptions, Sites};
 use fnsf::flow::field::Backend;
 use fnsf::flow::ground::{GroundOptions, segment};
 use fnsf::flow::simulate::{Frame, Street, StreetOptions};
-use fnsf::flow::{DenseCloud, Field, Point, Preset, Residual, Sequence, Sweep, Unwatched};
+use fnsf::flow::{DenseCloud, MotionField, Point, Preset, Residual, Sequence, Sweep, Uncontrolled};
 use fnsf::formats::read_cloud;
 use look::camera;
 
@@ -36,7 +36,7 @@ const INTO: usize = 5;
 /// Simulated drives.
 const STREETS: u64 = 4;
 
-type Fields = BTreeMap<Leg, Field>;
+type Fields = BTreeMap<FlowEdge, MotionField>;
 
 /// The preset that the environment names; `label` where it names none.
 fn preset() -> anyhow::Result<Preset> {
@@ -51,19 +51,20 @@ fn fit(backend: &CpuBackend, sweeps: &[Sweep], plans: &[Plan]) -> anyhow::Result
     let mut fields = Fields::new();
     for chain in plans.iter().flat_map(Plan::chains) {
         let mut sequence = Sequence::default();
-        let (mut legs, mut found) = (Vec::new(), Vec::new());
-        for (number, leg) in chain.into_iter().enumerate() {
-            let mut push =
-                |place: usize| sequence.push(backend, sweeps[place].clone(), &options, &Unwatched);
+        let (mut edges, mut found) = (Vec::new(), Vec::new());
+        for (number, edge) in chain.into_iter().enumerate() {
+            let mut push = |place: usize| {
+                sequence.push(backend, sweeps[place].clone(), &options, &Uncontrolled)
+            };
             if number == 0 {
-                push(leg.source)?;
+                push(edge.source)?;
             }
-            found.extend(push(leg.target)?);
-            legs.push(leg);
+            found.extend(push(edge.target)?);
+            edges.push(edge);
         }
-        found.extend(sequence.finish(backend, &Unwatched)?);
+        found.extend(sequence.finish(backend, &Uncontrolled)?);
         let found = found.into_iter().map(|estimate| estimate.field);
-        fields.extend(legs.into_iter().zip(found));
+        fields.extend(edges.into_iter().zip(found));
     }
     Ok(fields)
 }
@@ -78,19 +79,19 @@ fn carried(
         backend,
         plan,
         sweeps,
-        |leg| fields.get(&leg),
-        &Unwatched,
+        |edge| fields.get(&edge),
+        &Uncontrolled,
     )?)
 }
 
 /// The same fields without what moves against the static world.
 fn still(fields: &Fields) -> Fields {
-    let still = |field: &Field| Field {
+    let still = |field: &MotionField| MotionField {
         ego: field.ego,
         residual: Residual::Still,
     };
     let fields = fields.iter();
-    fields.map(|(leg, field)| (*leg, still(field))).collect()
+    fields.map(|(edge, field)| (*edge, still(field))).collect()
 }
 
 fn ground_found(points: Vec<Point>) -> Sweep {
@@ -128,8 +129,8 @@ fn simulated(
         .iter()
         .map(|frame| ground_found(frame.points.clone()))
         .collect();
-    let reverse = Plan::new(FRAMES, INTO as f64, Later::Reverse, 1)?;
-    let inverse = Plan::new(FRAMES, INTO as f64, Later::Inverse, 1)?;
+    let reverse = Plan::new(FRAMES, INTO as f64, LaterSweeps::Reverse, 1)?;
+    let inverse = Plan::new(FRAMES, INTO as f64, LaterSweeps::Inverse, 1)?;
     let fields = fit(backend, &sweeps, &[reverse, inverse])?;
     let clouds = [
         carried(backend, &sweeps, &still(&fields), &reverse)?,
@@ -204,7 +205,7 @@ fn real(backend: &CpuBackend, paths: &[String]) -> anyhow::Result<()> {
     let sweeps = paths.iter().map(|path| read(path).map(ground_found));
     let sweeps: Vec<Sweep> = sweeps.collect::<Result<_, _>>()?;
     let into = sweeps.len() / 2;
-    let plan = Plan::new(sweeps.len(), into as f64, Later::Reverse, 1)?;
+    let plan = Plan::new(sweeps.len(), into as f64, LaterSweeps::Reverse, 1)?;
     let began = Instant::now();
     let fields = fit(backend, &sweeps, &[plan])?;
     let fitted = began.elapsed().as_secs_f64();
@@ -221,7 +222,7 @@ fn real(backend: &CpuBackend, paths: &[String]) -> anyhow::Result<()> {
         ..DistanceOptions::default()
     };
     let target = &sweeps[into].points;
-    let transform = backend.transform(&cloud.points, target, &options, &Unwatched)?;
+    let transform = backend.transform(&cloud.points, target, &options, &Uncontrolled)?;
     let ego_alone = carried(backend, &sweeps, &still(&fields), &plan)?;
     let distances = transform.distances(&cloud.points)?;
     let alone = transform.distances(&ego_alone.points)?;

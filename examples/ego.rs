@@ -9,7 +9,7 @@ use std::time::Instant;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::field::Backend;
 use fnsf::flow::simulate::{Street, StreetOptions};
-use fnsf::flow::{Point, RigidTransform, Unwatched};
+use fnsf::flow::{Point, RigidTransform, Uncontrolled};
 use fnsf::formats::read_pair;
 use nalgebra::{Isometry3, Point3, Vector3};
 
@@ -151,7 +151,7 @@ fn row(name: &str, backend: &CpuBackend, cases: &[Case]) {
         let prior = RigidTransform::identity();
         let found = backend
             .host()
-            .align(&case.source, &case.target, &prior, &Unwatched);
+            .align(&case.source, &case.target, &prior, &Uncontrolled);
         times.push(start.elapsed().as_secs_f64() * 1e3);
         let gap = case.truth.inv_mul(&found);
         meters.push(gap.translation.vector.norm());

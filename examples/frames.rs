@@ -21,7 +21,7 @@ use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Truth, evaluate};
 use fnsf::flow::field::Backend;
 use fnsf::flow::simulate::{Street, StreetOptions};
-use fnsf::flow::{self, Around, Ground, LabelOptions, Point, Preset, Problem, Sweep};
+use fnsf::flow::{self, Ground, NeighborSweep, ObjectOptions, Point, Preset, Problem, Sweep};
 use fnsf::formats::{read_cloud, read_pair};
 
 /// Streets by their number of beams and by the first sweep of the pair, and which.
@@ -30,16 +30,18 @@ const PAIRS: [usize; 2] = [0, 2];
 const STREETS: [u64; 2] = [0, 6];
 
 /// A change of the options that see five sweeps.
-type Change = fn(&mut LabelOptions);
+type Change = fn(&mut ObjectOptions);
 
 const VARIANTS: [(&str, Change); 5] = [
     ("two sweeps", |o| o.frames = 2),
     ("three sweeps", |o| o.frames = 3),
     ("five sweeps", |_| {}),
-    ("what slides is never confirmed", |o| o.confirmed_cost = 0.0),
+    ("what slides is never confirmed", |o| {
+        o.neighbor_cost_ratio = 0.0
+    }),
     ("confirmed by more", |o| {
-        o.confirmed_cost = 0.5;
-        o.confirmed_m = 0.1;
+        o.neighbor_cost_ratio = 0.5;
+        o.neighbor_gain_m = 0.1;
     }),
 ];
 
@@ -120,16 +122,16 @@ fn street(beams: usize, seed: u64, first: usize) -> Result<Known, String> {
 /// EPE, that of movers, that of what stands still, seconds.
 type Row = [f64; 4];
 
-fn run(backend: &CpuBackend, known: &Known, label: &LabelOptions) -> Result<Row, String> {
+fn run(backend: &CpuBackend, known: &Known, label: &ObjectOptions) -> Result<Row, String> {
     let mut options = Preset::Label.options(None);
     options.ground = Ground::Mask;
     options.label = Some(label.clone());
     let [source, target] = &known.pair;
     let ground = source.ground.as_deref().zip(target.ground.as_deref());
-    let around: Vec<Around> = known
+    let around: Vec<NeighborSweep> = known
         .around
         .iter()
-        .map(|(at, sweep)| Around {
+        .map(|(at, sweep)| NeighborSweep {
             points: &sweep.points,
             ground: sweep.ground.as_deref(),
             at: *at,
@@ -193,9 +195,9 @@ fn main() -> Result<(), String> {
     println!("| variant | pairs | EPE | EPE moving | EPE static | s |");
     println!("|---|---|---|---|---|---|");
     for (variant, change) in VARIANTS {
-        let mut label = LabelOptions {
+        let mut label = ObjectOptions {
             frames: 5,
-            ..LabelOptions::default()
+            ..ObjectOptions::default()
         };
         change(&mut label);
         for group in &groups {

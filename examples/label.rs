@@ -22,7 +22,7 @@ use clock::Clock;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Truth, evaluate};
 use fnsf::flow::field::Backend;
-use fnsf::flow::{self, Ground, LabelOptions, Options, Preset, Problem};
+use fnsf::flow::{self, Ground, ObjectOptions, Options, Preset, Problem};
 use known::{Known, real_pairs, street};
 
 /// Streets by their number of beams, and how many of each.
@@ -33,10 +33,10 @@ const STREETS: u64 = 10;
 struct Variant {
     name: &'static str,
     preset: Preset,
-    change: fn(&mut LabelOptions),
+    change: fn(&mut ObjectOptions),
 }
 
-const fn label(name: &'static str, change: fn(&mut LabelOptions)) -> Variant {
+const fn find_objects(name: &'static str, change: fn(&mut ObjectOptions)) -> Variant {
     Variant {
         name,
         preset: Preset::Label,
@@ -57,47 +57,55 @@ const VARIANTS: &[Variant] = &[
     preset("neural", Preset::Neural),
     preset("label", Preset::Label),
     // More than any cluster has.
-    label("ego motion alone", |o| o.evidence_m = f32::INFINITY),
-    label("no starts but none", |o| o.starts = 0),
-    label("starts whatever none leaves", |o| o.near_m = 0.0),
-    label("starts compared without the way", |o| o.way_penalty = 0.0),
+    label("ego motion alone", |o| o.min_evidence_m = f32::INFINITY),
+    label("no starts but none", |o| o.initial_guesses = 0),
+    label("starts whatever none leaves", |o| o.close_fit_m = 0.0),
+    label("starts compared without the way", |o| {
+        o.displacement_penalty = 0.0
+    }),
     label("distances to points, no normals", |o| o.normal_m = [0.0; 2]),
-    label("distances to planes alone", |o| o.leak = 0.0),
+    label("distances to planes alone", |o| o.tangential_weight = 0.0),
     label("heights count in full", |o| o.height_weight = 1.0),
-    label("nothing is taken by what stands still", |o| o.taken_m = 0.0),
+    label("nothing is taken by what stands still", |o| {
+        o.static_match_m = 0.0
+    }),
     label("no evidence asked for", |o| {
-        o.evidence_m = 0.0;
-        o.evidence_slope = 0.0;
+        o.min_evidence_m = 0.0;
+        o.min_evidence_slope = 0.0;
     }),
     label("evidence whatever the way", |o| {
-        o.evidence_m = 3.0;
-        o.evidence_slope = 0.0;
+        o.min_evidence_m = 3.0;
+        o.min_evidence_slope = 0.0;
     }),
     label("what is seen to have gone needs hold, too", |o| {
-        o.gone = f32::INFINITY;
+        o.min_free_space = f32::INFINITY;
     }),
-    label("what is seen to have stayed may move", |o| o.stayed = 0.0),
-    label("walls may slide", |o| o.least_hold = 0.0),
+    label("what is seen to have stayed may move", |o| {
+        o.min_free_space_far = 0.0
+    }),
+    label("walls may slide", |o| o.min_observability = 0.0),
     label("moved clusters may lie anywhere", |o| {
-        o.left_m = f32::INFINITY;
+        o.max_residual_m = f32::INFINITY;
     }),
-    label("any part of the cost may be left", |o| o.kept_cost = 1.0),
-    label("flat clusters may move", |o| o.flat_m = 0.0),
+    label("any part of the cost may be left", |o| {
+        o.max_cost_ratio = 1.0
+    }),
+    label("flat clusters may move", |o| o.ground_thickness_m = 0.0),
     label("no gate at all", |o| {
-        o.evidence_m = 0.0;
-        o.evidence_slope = 0.0;
-        o.least_hold = 0.0;
-        o.stayed = 0.0;
-        o.left_m = f32::INFINITY;
-        o.kept_cost = 1.0;
-        o.flat_m = 0.0;
-        o.gain_m = 0.0;
+        o.min_evidence_m = 0.0;
+        o.min_evidence_slope = 0.0;
+        o.min_observability = 0.0;
+        o.min_free_space_far = 0.0;
+        o.max_residual_m = f32::INFINITY;
+        o.max_cost_ratio = 1.0;
+        o.ground_thickness_m = 0.0;
+        o.min_gain_m = 0.0;
     }),
-    label("pieces go by themselves", |o| o.beside_cost = 0.0),
-    label("clusters move whole", |o| o.worse_m = f32::INFINITY),
+    label("pieces go by themselves", |o| o.adjacent_cost_ratio = 0.0),
+    label("clusters move whole", |o| o.point_reject_m = f32::INFINITY),
     label("clusters of 0.35 m", |o| o.cluster_radius_m = 0.35),
     label("clusters of 0.7 m", |o| o.cluster_radius_m = 0.7),
-    label("thinned to 0.2 m", |o| o.thinned_m = 0.2),
+    label("thinned to 0.2 m", |o| o.voxel_m = 0.2),
     label("matches within 0.5 m", |o| o.match_m = 0.5),
     label("matches within 1 m", |o| o.match_m = 1.0),
 ];

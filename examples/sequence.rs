@@ -17,7 +17,7 @@ use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::field::Backend;
 use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::flow::{
-    Estimate, Options, Point, Preset, Problem, Sequence, Sweep, Unwatched, WarmStart, estimate,
+    Estimate, Options, Point, Preset, Problem, Sequence, Sweep, Uncontrolled, WarmStart, estimate,
 };
 use fnsf::formats::read_cloud;
 
@@ -117,7 +117,7 @@ fn alone(backend: &CpuBackend, drive: &Drive, options: &Options) -> anyhow::Resu
         };
         backend.host().forget();
         let began = Instant::now();
-        let estimate = estimate(backend, &problem, options, &Unwatched)?;
+        let estimate = estimate(backend, &problem, options, &Uncontrolled)?;
         let seconds = began.elapsed().as_secs_f64();
         // The first pair of a sequence is one alone: the others are compared.
         if k > 0 {
@@ -137,7 +137,7 @@ fn in_sequence(backend: &CpuBackend, drive: &Drive, options: &Options) -> anyhow
             ground: None,
         };
         let began = Instant::now();
-        let estimates = sequence.push(backend, sweep, options, &Unwatched)?;
+        let estimates = sequence.push(backend, sweep, options, &Uncontrolled)?;
         let seconds = began.elapsed().as_secs_f64();
         if let [estimate] = estimates.as_slice()
             && k > 1

@@ -5,7 +5,7 @@
 
 use std::sync::{Mutex, PoisonError};
 
-use crate::flow::Price;
+use crate::flow::Cost;
 use crate::flow::field::PARAMETERS;
 use crate::job::DeviceKind;
 
@@ -72,7 +72,7 @@ impl CostModel {
     }
 
     /// Nominal seconds of some work.
-    pub fn nominal(price: &Price) -> f64 {
+    pub fn nominal(price: &Cost) -> f64 {
         EACH + price.seconds(NOMINAL_RATE)
     }
 

@@ -28,7 +28,7 @@ use self::hold::Hold;
 use self::lane::{Asked, Command};
 use crate::flow::densify::DensifyError;
 use crate::flow::field::{Backend, BackendError};
-use crate::flow::{Estimate, Field, FlowError, Options, Point, Snapshot, Sweep, Watch};
+use crate::flow::{Control, Estimate, FlowError, MotionField, Options, Point, Snapshot, Sweep};
 use crate::job::DeviceKind;
 use crate::metrics::Metrics;
 
@@ -57,7 +57,7 @@ pub struct Work {
     /// N and M flags: which points are ground, where that is known.
     pub ground: Option<[Vec<bool>; 2]>,
     /// The field of the pair before, where it is one of a chain.
-    pub before: Option<Field>,
+    pub before: Option<MotionField>,
     /// Other sweeps of its sequence, and when each was taken: in gaps of the pair after the source.
     pub around: Vec<(Sweep, i8)>,
     /// How the flow is found.
@@ -65,7 +65,7 @@ pub struct Work {
     /// Where an earlier attempt was put down.
     pub snapshot: Option<Snapshot>,
     /// Looks in on the optimization.
-    pub watch: Arc<dyn Watch + Send + Sync>,
+    pub control: Arc<dyn Control + Send + Sync>,
 }
 
 /// What a device can do now.

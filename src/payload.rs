@@ -3,7 +3,7 @@
 //! Little endian; counts are checked against the bytes present, and a sum over all of them tells a
 //! torn file. It must not know where the bytes are kept.
 
-use crate::flow::{Bounds, Cluster, DenseCloud, Estimate, Objects, Point, RigidTransform};
+use crate::flow::{Cluster, DenseCloud, Estimate, Objects, OrientedBox, Point, RigidTransform};
 use crate::formats::{matrix_rows, rigid_motion};
 
 const CLOUD: &[u8; 8] = b"fnsfcld1";
@@ -290,7 +290,7 @@ impl<'a> Reader<'a> {
             Cluster {
                 points: word(0),
                 dynamic: word(1) != 0,
-                bounds: Bounds {
+                bounds: OrientedBox {
                     center: point(2),
                     size: point(5),
                     yaw: value(11),
@@ -358,7 +358,7 @@ mod tests {
                 clusters: vec![Cluster {
                     points: 1,
                     dynamic: true,
-                    bounds: Bounds {
+                    bounds: OrientedBox {
                         center: [1.0, 2.0, 3.0],
                         size: [4.0, 5.0, 6.0],
                         yaw: 7.0,

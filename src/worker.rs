@@ -25,7 +25,7 @@ use crate::clock::Timestamp;
 use crate::cost::CostModel;
 use crate::engine::{Densification, Densified, EngineError, Health, Lane, Work};
 use crate::flow::field::BackendError;
-use crate::flow::{Estimate, Field, FlowError, Point};
+use crate::flow::{Estimate, FlowError, MotionField, Point};
 use crate::formats::MAX_COORDINATE_M;
 use crate::job::{DeviceKind, Job, JobError, JobProgress, Kind, Report};
 use crate::metrics::Metrics;
@@ -356,7 +356,7 @@ impl Found {
 struct Done {
     result: Found,
     /// For those who go on from it.
-    field: Option<Field>,
+    field: Option<MotionField>,
     report: serde_json::Result<String>,
     stop_reason: Option<String>,
     progress: Option<JobProgress>,

@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use fnsf::flow::Watch;
+use fnsf::flow::Control;
 
 /// Seconds since it was made.
 pub(crate) struct Clock(Instant);
@@ -13,7 +13,7 @@ impl Clock {
     }
 }
 
-impl Watch for Clock {
+impl Control for Clock {
     fn seconds(&self) -> f64 {
         self.0.elapsed().as_secs_f64()
     }

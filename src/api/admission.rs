@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use super::error::ApiError;
 use crate::cost::CostModel;
-use crate::flow::{self, Price, Problem};
+use crate::flow::{self, Cost, Problem};
 use crate::job::{DeviceKind, JobOptions, Priority, Tenant};
 use crate::payload::StoredCloud;
 use crate::queue::{Backlog, Queue};
@@ -129,7 +129,7 @@ impl Admission {
         target: &StoredCloud,
         options: &JobOptions,
         goes_on: bool,
-    ) -> Result<Price, ApiError> {
+    ) -> Result<Cost, ApiError> {
         let ground = source.ground.as_deref().zip(target.ground.as_deref());
         let problem = Problem {
             source: &source.points,
@@ -158,7 +158,7 @@ impl Admission {
     ///
     /// # Errors
     /// [`ApiError::TooLarge`].
-    pub(super) fn check_bytes(&self, price: &Price) -> Result<(), ApiError> {
+    pub(super) fn check_bytes(&self, price: &Cost) -> Result<(), ApiError> {
         let limit = self.limits.max_pair_bytes;
         if price.bytes > limit {
             return Err(ApiError::TooLarge(format!(

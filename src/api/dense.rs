@@ -47,13 +47,13 @@ impl Closing {
     ) -> Result<Self, ApiError> {
         let plan = asked.plan(points.len()).map_err(InvalidOptions::Densify)?;
         let back = plan
-            .legs()
+            .edges()
             .into_iter()
-            .filter(|leg| leg.source > leg.target);
-        let back = back.enumerate().map(|(turn, leg)| PairOf {
-            place: leg.target as u32,
+            .filter(|edge| edge.source > edge.target);
+        let back = back.enumerate().map(|(turn, edge)| PairOf {
+            place: edge.target as u32,
             backward: true,
-            sees: PairOf::seen(window_back(leg.target, points.len(), frames)),
+            sees: PairOf::seen(window_back(edge.target, points.len(), frames)),
             follows: goes_on && turn > 0,
         });
         Ok(Self {

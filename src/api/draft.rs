@@ -14,7 +14,7 @@ use super::uploads::Room;
 use super::waiters::Awaited;
 use crate::clock::Timestamp;
 use crate::cost::CostModel;
-use crate::flow::{self, Ground, Price, Sweep, window};
+use crate::flow::{self, Cost, Ground, Sweep, window};
 use crate::job::{Job, JobId, JobOptions, Kind};
 use crate::payload::StoredCloud;
 use crate::queue::{Idempotency, PairOf, Submission, Submitted};
@@ -74,7 +74,7 @@ pub(super) struct Draft {
     /// The last cloud, and the room that it takes until the next one is there.
     last: Option<(Arc<StoredCloud>, Option<Room>)>,
     /// What each two clouds that follow each other cost alone, where they are a pair.
-    prices: Vec<Option<Price>>,
+    prices: Vec<Option<Cost>>,
     fingerprint: blake3::Hasher,
     /// A cloud that is on its way into store.
     writing: Option<JoinHandle<Result<(), BlobError>>>,
@@ -317,8 +317,8 @@ impl Draft {
             };
             let around = (pair.sees[0]..pair.sees[1])
                 .filter(|&place| place != pair.place && place != pair.place + 1)
-                .map(|place| flow::price_around(self.points[place as usize]));
-            let price = around.fold(*price, |price, around| Price {
+                .map(|place| flow::neighbor_cost(self.points[place as usize]));
+            let price = around.fold(*price, |price, around| Cost {
                 bytes: price.bytes + around.bytes,
                 multiply_adds: price.multiply_adds + around.multiply_adds,
                 ..price

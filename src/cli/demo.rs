@@ -18,7 +18,7 @@ use super::terminal::Terminal;
 use crate::app::App;
 use crate::config::Config;
 use crate::flow::simulate::{Street, StreetOptions};
-use crate::flow::{Progress, Watch};
+use crate::flow::{Control, Progress};
 use crate::formats::{FlowFile, Pair, read_flow, rigid_motion, write_pair_npz};
 use crate::job::{JobOptions, Report};
 use crate::picture::{self, TopDown, TopDownOptions};

@@ -12,9 +12,9 @@ use super::failure::Failure;
 use super::files;
 use super::output::say;
 use super::terminal::Terminal;
-use crate::flow::densify::{DensifyError, Leg, carrier, densify};
+use crate::flow::densify::{DensifyError, FlowEdge, carrier, densify};
 use crate::flow::depth::{Camera, DepthImage, Occlusion, project};
-use crate::flow::{DenseCloud, Estimate, Field, Point, Sequence, Sweep, Watch};
+use crate::flow::{Control, DenseCloud, Estimate, MotionField, Point, Sequence, Sweep};
 use crate::formats::{DenseFormat, FormatError, write_dense, write_depth_png};
 use crate::job::{self, LaterChoice};
 use crate::picture::{self, DepthPanel};
@@ -115,8 +115,8 @@ impl Densify {
         let sweeps: Vec<Sweep> = sweeps.collect::<Result<_, Failure>>()?;
 
         let began = terminal.seconds();
-        let mut fields: BTreeMap<Leg, Field> = BTreeMap::new();
-        let fits = plan.legs().len();
+        let mut fields: BTreeMap<FlowEdge, MotionField> = BTreeMap::new();
+        let fits = plan.edges().len();
         for chain in plan.chains() {
             let (mut sequence, mut waiting) = (Sequence::default(), VecDeque::from(chain));
             let mut last = None;
@@ -127,19 +127,19 @@ impl Densify {
                 let solver_options = surroundings.options(&options, larger, [before, place]);
                 let found =
                     device.push(&mut sequence, &sweeps[place], &solver_options, &terminal)?;
-                fields.extend(of_legs(found, &mut waiting));
+                fields.extend(fields_of_edges(found, &mut waiting));
                 if waiting.is_empty() {
                     break;
                 }
             }
             while !waiting.is_empty() {
                 let rest = device.finish(&mut sequence, &terminal)?;
-                fields.extend(of_legs(rest, &mut waiting));
+                fields.extend(fields_of_edges(rest, &mut waiting));
             }
         }
         let fitted = terminal.seconds();
         terminal.part("carrying");
-        let field = |leg: Leg| fields.get(&leg);
+        let field = |edge: FlowEdge| fields.get(&edge);
         let cloud = densify(device.backend.as_ref(), &plan, &sweeps, field, &terminal);
         let cloud = cloud.map_err(|error| match error {
             DensifyError::Backend(error) => Failure::from(crate::flow::FlowError::from(error)),
@@ -260,20 +260,24 @@ impl Densify {
     }
 }
 
-/// The sweeps that a chain of legs leads through, of `sweeps`, and those beyond its end, which its
+/// The sweeps that a chain of edges leads through, of `sweeps`, and those beyond its end, which its
 /// last pairs may see.
-fn way(chain: &VecDeque<Leg>, sweeps: usize) -> Vec<usize> {
+fn way(chain: &VecDeque<FlowEdge>, sweeps: usize) -> Vec<usize> {
     match chain.front() {
         None => Vec::new(),
-        Some(leg) if leg.source < leg.target => (leg.source..sweeps).collect(),
-        Some(leg) => (0..=leg.source).rev().collect(),
+        Some(edge) if edge.source < edge.target => (edge.source..sweeps).collect(),
+        Some(edge) => (0..=edge.source).rev().collect(),
     }
 }
 
-/// The fields of the legs that have waited longest.
-fn of_legs(estimates: Vec<Estimate>, waiting: &mut VecDeque<Leg>) -> Vec<(Leg, Field)> {
-    let legs = waiting.drain(..estimates.len().min(waiting.len()));
-    legs.zip(estimates)
-        .map(|(leg, estimate)| (leg, estimate.field))
+/// The fields of the edges that have waited longest.
+fn fields_of_edges(
+    estimates: Vec<Estimate>,
+    waiting: &mut VecDeque<FlowEdge>,
+) -> Vec<(FlowEdge, MotionField)> {
+    let edges = waiting.drain(..estimates.len().min(waiting.len()));
+    edges
+        .zip(estimates)
+        .map(|(edge, estimate)| (edge, estimate.field))
         .collect()
 }

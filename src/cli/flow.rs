@@ -12,7 +12,7 @@ use super::files;
 use super::machine::peak_resident_bytes;
 use super::output::say;
 use super::terminal::Terminal;
-use crate::flow::{Estimate, Point, Sequence, Sweep, Watch};
+use crate::flow::{Control, Estimate, Point, Sequence, Sweep};
 use crate::formats::{FlowFormat, FlowTable, write_flow};
 use crate::job::Report;
 use crate::picture::{self, TopDown, TopDownOptions};

@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
-use crate::flow::{Progress, Watch};
+use crate::flow::{Control, Progress};
 
 /// Keeps time; shows iterations and loss where stderr is a terminal.
 pub(super) struct Terminal {
@@ -40,7 +40,7 @@ impl Terminal {
     }
 }
 
-impl Watch for Terminal {
+impl Control for Terminal {
     fn seconds(&self) -> f64 {
         self.began.elapsed().as_secs_f64()
     }

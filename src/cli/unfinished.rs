@@ -63,7 +63,7 @@ fn is_ignored(kind: SignalKind) -> bool {
 fn remove_on_signals() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {
-        let watch = || -> std::io::Result<()> {
+        let control = || -> std::io::Result<()> {
             let runtime = tokio::runtime::Builder::new_current_thread()
                 .enable_all()
                 .build()?;
@@ -99,6 +99,6 @@ fn remove_on_signals() {
         // Without it a signal leaves a file behind, and nothing worse.
         let _without = std::thread::Builder::new()
             .name("signals".to_owned())
-            .spawn(move || watch().unwrap_or_default());
+            .spawn(move || control().unwrap_or_default());
     });
 }

@@ -8,8 +8,8 @@ use std::time::Duration;
 use super::{DeviceOptions, Opened, Opener, Reopening};
 use crate::flow::cpu::CpuBackend;
 use crate::flow::distance::DistanceOptions;
-use crate::flow::field::{Advance, Backend, BackendError, Report, Trainer, Transform};
-use crate::flow::{Host, Network, Options, Point, TrainerState, Watch};
+use crate::flow::field::{Advance, Backend, BackendError, FitReport, Trainer, Transform};
+use crate::flow::{Control, Host, Network, Options, Point, TrainerState};
 use crate::job::DeviceKind;
 
 /// Points of the trial's pair: what a test asks for does not happen to it.
@@ -152,7 +152,7 @@ impl Backend for CardLane {
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) -> Result<Box<dyn Transform>, BackendError> {
         let on_trial = source.len() == TRIAL_POINTS;
         if !on_trial && taken(&self.switches.panics) {
@@ -170,7 +170,7 @@ impl Backend for CardLane {
             });
         }
         Ok(Box::new(CardTransform {
-            cpu: self.cpu.transform(source, target, options, watch)?,
+            cpu: self.cpu.transform(source, target, options, control)?,
             switches: (!on_trial).then(|| Arc::clone(&self.switches)),
             lost: Arc::clone(&self.lost),
         }))
@@ -236,7 +236,7 @@ impl CardTrainer<'_> {
 }
 
 impl Trainer for CardTrainer<'_> {
-    fn advance(&mut self, steps: usize, watch: &dyn Watch) -> Result<Advance, BackendError> {
+    fn advance(&mut self, steps: usize, control: &dyn Control) -> Result<Advance, BackendError> {
         if let Some(switches) = &self.switches {
             self.brake(switches);
         }
@@ -246,14 +246,14 @@ impl Trainer for CardTrainer<'_> {
         if self.lost.load(Ordering::Relaxed) {
             return Err(BackendError::Lost("it was destroyed".to_owned()));
         }
-        self.cpu.advance(steps, watch)
+        self.cpu.advance(steps, control)
     }
 
     fn evaluate(&mut self, points: &[Point]) -> Result<Vec<Point>, BackendError> {
         self.cpu.evaluate(points)
     }
 
-    fn report(&self) -> Report {
+    fn report(&self) -> FitReport {
         self.cpu.report()
     }
 

@@ -7,9 +7,9 @@ use super::EngineError;
 use super::busy::Busy;
 use super::lane::Heard;
 use crate::flow::densify;
-use crate::flow::densify::{DensifyError, Leg, Plan};
+use crate::flow::densify::{DensifyError, FlowEdge, Plan};
 use crate::flow::field::{Backend, BackendError};
-use crate::flow::{DenseCloud, Field, FlowError, Sweep, Watch};
+use crate::flow::{Control, DenseCloud, FlowError, MotionField, Sweep};
 
 /// Sweeps to be carried into one frame.
 pub struct Densification {
@@ -17,10 +17,10 @@ pub struct Densification {
     pub plan: Plan,
     /// All sweeps, in order.
     pub sweeps: Vec<Sweep>,
-    /// A field for each leg of the plan.
-    pub fields: HashMap<Leg, Field>,
+    /// A field for each edge of the plan.
+    pub fields: HashMap<FlowEdge, MotionField>,
     /// Looks in on it.
-    pub watch: Arc<dyn Watch + Send + Sync>,
+    pub control: Arc<dyn Control + Send + Sync>,
 }
 
 /// A dense cloud, and what carried its points, as reports show it.
@@ -38,12 +38,12 @@ pub(super) fn densify(
     work: &Densification,
     busy: &Busy,
 ) -> Result<Densified, EngineError> {
-    let watch = Heard {
-        watch: work.watch.as_ref(),
+    let control = Heard {
+        control: work.control.as_ref(),
         busy,
     };
-    let field = |leg| work.fields.get(&leg);
-    let cloud = densify::densify(backend, &work.plan, &work.sweeps, field, &watch);
+    let field = |edge| work.fields.get(&edge);
+    let cloud = densify::densify(backend, &work.plan, &work.sweeps, field, &control);
     let cloud = cloud.map_err(|error| match error {
         DensifyError::Interrupted(_) | DensifyError::Backend(BackendError::Interrupted(_)) => {
             FlowError::Cancelled.into()

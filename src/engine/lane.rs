@@ -12,7 +12,8 @@ use super::hold::{Held, Hold};
 use super::{EngineError, Work};
 use crate::flow::field::{Backend, BackendError};
 use crate::flow::{
-    self, Around, Estimate, FlowError, Interrupt, Problem, Progress, Snapshot, Sweep, Watch,
+    self, Control, Estimate, FlowError, Interrupt, NeighborSweep, Problem, Progress, Snapshot,
+    Sweep,
 };
 
 /// What a lane is told.
@@ -156,53 +157,53 @@ fn judged<T>(
 
 /// Passes everything on, and hears the signs of life.
 pub(super) struct Heard<'a> {
-    pub(super) watch: &'a dyn Watch,
+    pub(super) control: &'a dyn Control,
     pub(super) busy: &'a Busy,
 }
 
-impl Watch for Heard<'_> {
+impl Control for Heard<'_> {
     fn seconds(&self) -> f64 {
-        self.watch.seconds()
+        self.control.seconds()
     }
 
     fn seconds_left(&self) -> Option<f64> {
-        self.watch.seconds_left()
+        self.control.seconds_left()
     }
 
     fn interrupt(&self) -> Option<Interrupt> {
         self.busy.sign_of_life();
-        self.watch.interrupt()
+        self.control.interrupt()
     }
 
     fn progress(&self, progress: Progress) {
-        self.watch.progress(progress);
+        self.control.progress(progress);
     }
 
     fn snapshot_due(&self) -> bool {
-        self.watch.snapshot_due()
+        self.control.snapshot_due()
     }
 
     fn snapshot(&self, snapshot: Snapshot) {
-        self.watch.snapshot(snapshot);
+        self.control.snapshot(snapshot);
     }
 }
 
 /// Estimates one pair's flow, from its snapshot where that is of use.
 pub(super) fn solve(backend: &dyn Backend, work: Work, busy: &Busy) -> Result<Estimate, FlowError> {
-    let watch = Heard {
-        watch: work.watch.as_ref(),
+    let control = Heard {
+        control: work.control.as_ref(),
         busy,
     };
     let ground = work.ground.as_ref();
     let around = work.around.iter().map(|(Sweep { points, ground }, at)| {
         let ground = ground.as_deref();
-        Around {
+        NeighborSweep {
             points,
             ground,
             at: *at,
         }
     });
-    let around: Vec<Around<'_>> = around.collect();
+    let around: Vec<NeighborSweep<'_>> = around.collect();
     let problem = Problem {
         source: &work.source,
         target: &work.target,
@@ -211,14 +212,14 @@ pub(super) fn solve(backend: &dyn Backend, work: Work, busy: &Busy) -> Result<Es
         around: &around,
     };
     if let Some(snapshot) = work.snapshot {
-        match flow::resume(backend, &problem, &work.options, snapshot, &watch) {
+        match flow::resume(backend, &problem, &work.options, snapshot, &control) {
             Err(FlowError::Snapshot(error)) => {
                 tracing::warn!(%error, "a snapshot is of no use: the job starts afresh");
             }
             resumed => return resumed,
         }
     }
-    flow::estimate(backend, &problem, &work.options, &watch)
+    flow::estimate(backend, &problem, &work.options, &control)
 }
 
 /// What a panic said.

@@ -9,7 +9,7 @@ use tokio::time::timeout;
 use super::cards::Switches;
 use super::{Device, EngineError, Health, Lane, Work};
 use crate::flow::field::BackendError;
-use crate::flow::{Point, Preset, Unwatched};
+use crate::flow::{Point, Preset, Uncontrolled};
 use crate::metrics::Metrics;
 
 /// Long enough for a loaded machine; only a failure waits so long.
@@ -77,7 +77,7 @@ fn work() -> Work {
         around: Vec::new(),
         options: Preset::Neural.options(None),
         snapshot: None,
-        watch: Arc::new(Unwatched),
+        control: Arc::new(Uncontrolled),
     }
 }
 

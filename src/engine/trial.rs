@@ -6,7 +6,7 @@ use std::sync::Arc;
 use super::lane::message;
 use super::{Opened, Opener};
 use crate::flow::field::{Backend, BackendError};
-use crate::flow::{self, FlowError, Preset, Problem, Unwatched};
+use crate::flow::{self, FlowError, Preset, Problem, Uncontrolled};
 
 /// A wall and a post in front of it, moved by this, metres.
 const MOTION: [f32; 3] = [0.2, 0.1, 0.0];
@@ -81,7 +81,7 @@ fn compared(backend: &dyn Backend) -> Result<(), TrialError> {
     };
     let mut options = Preset::Neural.options(None);
     options.max_iterations = ITERATIONS;
-    let estimate = flow::estimate(backend, &problem, &options, &Unwatched)?;
+    let estimate = flow::estimate(backend, &problem, &options, &Uncontrolled)?;
     let mut error = 0.0;
     for flow in &estimate.flow {
         let square: f32 = (0..3).map(|axis| (flow[axis] - MOTION[axis]).powi(2)).sum();

@@ -42,7 +42,7 @@ const WORKING_SETS: usize = 16 << 20;
 
 /// What an estimate will take.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Price {
+pub struct Cost {
     /// Source points that take part.
     pub source_points: usize,
     /// Target points that take part.
@@ -57,7 +57,7 @@ pub struct Price {
     pub multiply_adds: f64,
 }
 
-impl Price {
+impl Cost {
     /// Seconds on a device that does `rate` multiply-adds a second.
     pub fn seconds(&self, rate: f64) -> f64 {
         self.multiply_adds / rate
@@ -66,16 +66,16 @@ impl Price {
 
 /// What one more sweep around a pair adds to its price.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct AroundPrice {
+pub struct NeighborCost {
     /// At most the bytes that are held for it.
     pub bytes: usize,
-    /// Work, as [`Price::multiply_adds`].
+    /// Work, as [`Cost::multiply_adds`].
     pub multiply_adds: f64,
 }
 
 /// Prices a sweep of so many points around a pair.
-pub fn price_around(points: usize) -> AroundPrice {
-    AroundPrice {
+pub fn neighbor_cost(points: usize) -> NeighborCost {
+    NeighborCost {
         bytes: points * (2 * size_of::<Point>() + THINNING_BYTES + LABELLING_BYTES),
         multiply_adds: ALIGNING + points as f64 * (THINNING + LABELLING + POINT),
     }
@@ -86,7 +86,7 @@ pub fn price_around(points: usize) -> AroundPrice {
 ///
 /// # Errors
 /// [`FlowError`] where [`super::estimate()`] would refuse the input.
-pub fn price(problem: &Problem, options: &Options) -> Result<Price, FlowError> {
+pub fn price(problem: &Problem, options: &Options) -> Result<Cost, FlowError> {
     let selection = select::select(problem, options, &select::find_ground)?;
     let (source_points, target_points) = (selection.source.len(), selection.target.len());
     let clouds = [&selection.source, &selection.target];
@@ -106,17 +106,17 @@ pub fn price(problem: &Problem, options: &Options) -> Result<Price, FlowError> {
         .as_ref()
         .map_or(0, |_| source_points + target_points);
     let aligned = selection
-        .surroundings
+        .registration_clouds
         .map(|clouds| clouds.map(|points| points.len()));
     let aligned = aligned.map(|[source, target]| source + target);
     let aligning = aligned.map_or(0.0, |points| ALIGNING + points as f64 * THINNING);
     let points = (source_points + target_points) as f64 * POINT;
     let around = neighbors::nearest(problem, options.frames()).into_iter();
-    let around = around.map(|sweep| price_around(sweep.points.len()));
+    let around = around.map(|sweep| neighbor_cost(sweep.points.len()));
     let (around_bytes, around_work) = around.fold((0, 0.0), |(bytes, work), around| {
         (bytes + around.bytes, work + around.multiply_adds)
     });
-    Ok(Price {
+    Ok(Cost {
         source_points,
         target_points,
         bricks: transform.bricks,

@@ -5,7 +5,7 @@
 //! ```
 //!
 //! No async, no input or output, no clock, no environment, no globals. Deadlines, cancellation and
-//! time come in through a [`Watch`].
+//! time come in through a [`Control`].
 //!
 //! ```
 //! use fnsf::flow::cpu::CpuBackend;
@@ -55,20 +55,21 @@ pub mod depth;
 pub mod evaluate;
 pub mod simulate;
 
-pub use cost::{AroundPrice, Price, price, price_around};
+pub use cost::{Cost, NeighborCost, neighbor_cost, price};
 pub use data::{
-    Bounds, DYNAMIC_M, DenseCloud, Interrupt, MIN_POINTS, Point, Progress, RigidTransform,
-    SealError, Unwatched, Watch,
+    Control, DYNAMIC_M, DenseCloud, EnvelopeError, Interrupt, MIN_POINTS, OrientedBox, Point,
+    Progress, RigidTransform, Uncontrolled,
 };
 pub use error::FlowError;
 pub use estimate::{Estimate, PhaseSeconds, StopReason, estimate, resume};
 pub use field::{Network, Snapshot, SnapshotError, TrainerState};
 pub use host::Host;
-pub use motion::{Field, Residual};
+pub use motion::{MotionField, Residual};
 pub use objects::{
-    Clouds, Cluster, Evidence, Labelled, Motions, Objects, Parts, SURE_M, confidence_of_ground,
+    Cluster, ClusterLabels, ConfidenceFeatures, ObjectMotions, ObjectSearch, Objects, SURE_M,
+    SearchClouds, confidence_of_ground,
 };
 pub use options::*;
-pub use registration::{AlignedSweep, Around};
+pub use registration::{AlignedSweep, NeighborSweep};
 pub use select::Problem;
 pub use sequence::{Sequence, Sweep, is_whole, window};

@@ -3,14 +3,14 @@
 use super::field::Network;
 use std::sync::Arc;
 
-use super::data::{Point, RigidTransform, all_moved};
+use super::data::{Point, RigidTransform, transform_points};
 use super::field::{Backend, BackendError};
-use super::objects::Motions;
+use super::objects::ObjectMotions;
 
 /// The motion of everything between two sweeps, at any point: where a point of the source is at the
 /// target's time, in the target's frame.
 #[derive(Clone, Debug)]
-pub struct Field {
+pub struct MotionField {
     /// The ego motion as target_from_source; none where the residual explains it as well.
     pub ego: Option<RigidTransform>,
     /// What moves against the static world.
@@ -25,15 +25,15 @@ pub enum Residual {
     /// What a network says.
     Network(Network),
     /// Objects do, each rigidly.
-    Objects(Arc<Motions>),
+    Objects(Arc<ObjectMotions>),
 }
 
-impl Field {
+impl MotionField {
     /// Where `points` of the source's frame are in the target's if nothing moves of itself.
     pub fn static_places(&self, points: &[Point]) -> Vec<Point> {
         match &self.ego {
             None => points.to_vec(),
-            Some(motion) => all_moved(motion, points),
+            Some(motion) => transform_points(motion, points),
         }
     }
 

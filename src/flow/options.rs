@@ -65,17 +65,17 @@ pub struct Options {
     /// What is minimized.
     pub loss: LossOptions,
     /// What the network is fed.
-    pub inputs: Inputs,
+    pub inputs: InputNormalization,
     /// Where the network starts.
     pub start: Start,
     /// Adam's step size at the first iteration.
     pub learning_rate: f32,
     /// How the step size falls.
-    pub decay: Decay,
+    pub decay: LearningRateSchedule,
     /// Points that an iteration looks at; all of them where none.
     pub batch: Option<usize>,
     /// Which of the fields on the way is the result.
-    pub keep: Keep,
+    pub keep: ResultChoice,
     /// When to stop before `max_iterations`.
     pub early_stop: Option<EarlyStopOptions>,
     /// Iterations at most.
@@ -87,7 +87,7 @@ pub struct Options {
     pub warm_start: Option<WarmStart>,
     /// Where given, movers are found object by object, and no field is fitted: of the options above
     /// those from `distance` on have no say.
-    pub label: Option<LabelOptions>,
+    pub label: Option<ObjectOptions>,
 }
 
 impl Options {
@@ -112,12 +112,12 @@ impl Options {
                 truncation_m: None,
                 flow_penalty: 0.0,
             },
-            inputs: Inputs::Raw,
+            inputs: InputNormalization::Raw,
             start: Start::Xavier,
             learning_rate,
-            decay: Decay::Constant,
+            decay: LearningRateSchedule::Constant,
             batch: None,
-            keep: Keep::Best,
+            keep: ResultChoice::Best,
             early_stop: Some(EarlyStopOptions {
                 patience,
                 min_delta_m: 1e-3,
@@ -157,11 +157,11 @@ impl Options {
 
     /// These options for a run that its deadline cuts short: batches, and a step size that falls to
     /// zero within `iterations`.
-    pub(crate) fn hurried(&self, batch: usize, iterations: usize) -> Self {
+    pub(crate) fn under_deadline(&self, batch: usize, iterations: usize) -> Self {
         Self {
-            decay: Decay::Cosine,
+            decay: LearningRateSchedule::Cosine,
             batch: Some(batch),
-            keep: Keep::Average { decay: 0.9 },
+            keep: ResultChoice::Average { decay: 0.9 },
             early_stop: None,
             max_iterations: iterations,
             ..self.clone()
@@ -180,12 +180,12 @@ impl Options {
                 truncation_m: Some(1.0),
                 flow_penalty: 0.02,
             },
-            inputs: Inputs::Centered { scale_m: 10.0 },
+            inputs: InputNormalization::Centered { scale_m: 10.0 },
             start: Start::ZeroFlow,
             learning_rate: 0.004,
-            decay: Decay::Cosine,
+            decay: LearningRateSchedule::Cosine,
             batch: Some(2048),
-            keep: Keep::Average { decay: 0.9 },
+            keep: ResultChoice::Average { decay: 0.9 },
             early_stop: None,
             max_iterations: 150,
             warm_start: Some(WarmStart {
@@ -212,9 +212,9 @@ impl Options {
     fn labelled(max_points: Option<usize>, frames: usize) -> Self {
         Self {
             ground: Ground::Auto,
-            label: Some(LabelOptions {
+            label: Some(ObjectOptions {
                 frames,
-                ..LabelOptions::default()
+                ..ObjectOptions::default()
             }),
             warm_start: None,
             ..Self::stochastic(max_points)
@@ -224,7 +224,7 @@ impl Options {
 
 /// How a run that its deadline cuts short is fitted.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Hurry {
+pub(crate) struct DeadlineLimits {
     /// Points an iteration looks at, least and most. Half of the fewest is no cheaper on two cores.
     pub(crate) batches: [usize; 2],
     /// Iterations that are worth smaller batches; with the largest batches, more are done.
@@ -233,7 +233,7 @@ pub(crate) struct Hurry {
     pub(crate) least_iterations: usize,
 }
 
-impl Hurry {
+impl DeadlineLimits {
     /// With or without an ego motion to fall back to.
     pub(crate) fn new(ego: bool) -> Self {
         Self {
@@ -246,13 +246,13 @@ impl Hurry {
 
 /// How movers are found, cluster by cluster; `docs/numerics.md` shows what the choices change.
 #[derive(Clone, Debug, PartialEq)]
-pub struct LabelOptions {
+pub struct ObjectOptions {
     /// Points within this are of one cluster, metres.
     pub cluster_radius_m: f32,
     /// Points within the radius, itself among them, that make a point a cluster's core.
-    pub cluster_points: usize,
+    pub cluster_min_points: usize,
     /// Both clouds are thinned to one point a voxel of this side, metres.
-    pub thinned_m: f32,
+    pub voxel_m: f32,
     /// Normals are those of the points within this of each other, metres, and metres more for each
     /// metre of range.
     pub normal_m: [f32; 2],
@@ -261,95 +261,95 @@ pub struct LabelOptions {
     /// Matches are sought within this, metres.
     pub match_m: f32,
     /// A target point within this of a static source point belongs to it, metres.
-    pub taken_m: f32,
+    pub static_match_m: f32,
     /// What a metre across a match's normal counts.
-    pub leak: f32,
+    pub tangential_weight: f32,
     /// Distances count no further than this, metres.
     pub truncation_m: f32,
     /// Motions are sought up to this along x and y, metres a sweep.
-    pub reach_m: f32,
+    pub max_displacement_m: f32,
     /// Side of the bins in which shifts are counted, metres.
     pub bin_m: f32,
     /// Starts that are looked at, besides none.
-    pub starts: usize,
+    pub initial_guesses: usize,
     /// Those are not looked at where a fit from none lays the cluster this near to the target, metres.
-    pub near_m: f32,
+    pub close_fit_m: f32,
     /// Cost of a metre of motion, metres, where starts are compared.
-    pub way_penalty: f32,
+    pub displacement_penalty: f32,
     /// No motion is sought where a cluster lies this near to the target without one, metres.
-    pub needed_m: f32,
+    pub static_fit_m: f32,
     /// Shorter motions are none, metres.
-    pub least_motion_m: f32,
+    pub min_motion_m: f32,
     /// A motion must lay the cluster's points this much nearer to the target, metres.
-    pub gain_m: f32,
+    pub min_gain_m: f32,
     /// Share of the cost without motion that may be left.
-    pub kept_cost: f32,
+    pub max_cost_ratio: f32,
     /// The fall of the cost times the cluster's thinned points must be this, metres.
-    pub evidence_m: f32,
+    pub min_evidence_m: f32,
     /// And this more for each metre of motion: the farther, the more there is to be mistaken for.
-    pub evidence_slope: f32,
+    pub min_evidence_slope: f32,
     /// A moved cluster must lie this near to the target, metres.
-    pub left_m: f32,
+    pub max_residual_m: f32,
     /// Mean square of the normals along a motion from which a cluster's surfaces hold it.
-    pub least_hold: f32,
+    pub min_observability: f32,
     /// Share that the other sweep saw through, of the places that a cluster leaves and of those that it
     /// comes to each, from which it moves though its surfaces do not hold it.
-    pub gone: f32,
+    pub min_free_space: f32,
     /// Sum of these shares below which it does not move far, nor at all where only the sweeps around speak
     /// for it.
-    pub stayed: f32,
+    pub min_free_space_far: f32,
     /// A piece beside a mover goes with it where this share of its cost is left.
-    pub beside_cost: f32,
+    pub adjacent_cost_ratio: f32,
     /// Points of a mover are not of it where its motion leaves them farther from the target than
     /// none by this, metres.
-    pub worse_m: f32,
-    /// A cluster of as many thinned points that is flatter than `flat_m` metres is ground.
-    pub flat_points: usize,
-    /// See `flat_points`.
-    pub flat_m: f32,
+    pub point_reject_m: f32,
+    /// A cluster of as many thinned points that is flatter than `ground_thickness_m` metres is ground.
+    pub ground_min_points: usize,
+    /// See `ground_min_points`.
+    pub ground_thickness_m: f32,
     /// Sweeps that are looked at in all: the pair's two, and others of its sequence where there are.
     pub frames: usize,
     /// The sweeps around say plainly that a cluster moves where its motion leaves this share of its
     /// cost in them and in the nearest,
-    pub confirmed_cost: f32,
+    pub neighbor_cost_ratio: f32,
     /// and lays it this much nearer to them, metres there and back.
-    pub confirmed_m: f32,
+    pub neighbor_gain_m: f32,
 }
 
-impl Default for LabelOptions {
+impl Default for ObjectOptions {
     fn default() -> Self {
         Self {
             cluster_radius_m: 0.5,
-            cluster_points: 4,
-            thinned_m: 0.1,
+            cluster_min_points: 4,
+            voxel_m: 0.1,
             normal_m: [0.15, 0.01],
             height_weight: 0.7,
             match_m: 0.7,
-            taken_m: 0.15,
-            leak: 0.2,
+            static_match_m: 0.15,
+            tangential_weight: 0.2,
             truncation_m: 0.3,
-            reach_m: 3.5,
+            max_displacement_m: 3.5,
             bin_m: 0.15,
-            starts: 6,
-            near_m: 0.05,
-            way_penalty: 0.05,
-            needed_m: 0.03,
-            least_motion_m: 0.05,
-            gain_m: 0.015,
-            kept_cost: 0.65,
-            evidence_m: 1.0,
-            evidence_slope: 3.0,
-            left_m: 0.15,
-            least_hold: 0.1,
-            gone: 0.7,
-            stayed: 0.3,
-            beside_cost: 0.7,
-            worse_m: 0.05,
-            flat_points: 30,
-            flat_m: 0.2,
+            initial_guesses: 6,
+            close_fit_m: 0.05,
+            displacement_penalty: 0.05,
+            static_fit_m: 0.03,
+            min_motion_m: 0.05,
+            min_gain_m: 0.015,
+            max_cost_ratio: 0.65,
+            min_evidence_m: 1.0,
+            min_evidence_slope: 3.0,
+            max_residual_m: 0.15,
+            min_observability: 0.1,
+            min_free_space: 0.7,
+            min_free_space_far: 0.3,
+            adjacent_cost_ratio: 0.7,
+            point_reject_m: 0.05,
+            ground_min_points: 30,
+            ground_thickness_m: 0.2,
             frames: 2,
-            confirmed_cost: 0.7,
-            confirmed_m: 0.05,
+            neighbor_cost_ratio: 0.7,
+            neighbor_gain_m: 0.05,
         }
     }
 }
@@ -400,7 +400,7 @@ pub struct LossOptions {
 
 /// What the network is fed.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Inputs {
+pub enum InputNormalization {
     /// Coordinates as they come, metres; about the cloud's mean where that lies far from the origin,
     /// as in no sensor's frame.
     Raw,
@@ -422,7 +422,7 @@ pub enum Start {
 
 /// How the step size falls.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Decay {
+pub enum LearningRateSchedule {
     /// It does not.
     Constant,
     /// Along half a cosine, to zero at `max_iterations`.
@@ -431,7 +431,7 @@ pub enum Decay {
 
 /// Which of the fields on the way is the result.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Keep {
+pub enum ResultChoice {
     /// The one with the lowest loss.
     Best,
     /// The running average of the parameters.

@@ -5,9 +5,9 @@
 use super::data::{MIN_POINTS, Point, Random};
 use super::error::FlowError;
 use super::ground;
-use super::motion::Field;
+use super::motion::MotionField;
 use super::options::{Ego, Ground, Options};
-use super::registration::Around;
+use super::registration::NeighborSweep;
 
 /// Two clouds, as they came.
 #[derive(Clone, Copy, Debug)]
@@ -21,10 +21,10 @@ pub struct Problem<'a> {
     pub ground: Option<[&'a [bool]; 2]>,
     /// The motion of the pair before, from the sweep before the source to the source: where a fit
     /// may start, and the vehicle's motion be sought. None for a pair on its own.
-    pub before: Option<&'a Field>,
+    pub before: Option<&'a MotionField>,
     /// Other sweeps of the sequence, in any order; none for a pair on its own. Looked at where
-    /// [`super::LabelOptions::frames`] asks for more than the pair.
-    pub around: &'a [Around<'a>],
+    /// [`super::ObjectOptions::frames`] asks for more than the pair.
+    pub around: &'a [NeighborSweep<'a>],
 }
 
 /// The points that take part.
@@ -35,12 +35,12 @@ pub(crate) struct Selection {
     pub(crate) source: Vec<Point>,
     pub(crate) target: Vec<Point>,
     /// Places in `rows` that get a flow: all, but where movers are found and some points are drawn.
-    pub(crate) answered: Vec<usize>,
+    pub(crate) output_rows: Vec<usize>,
     /// Rows of the source that move with the ego motion without taking part: ground that was found.
-    pub(crate) carried: Vec<usize>,
+    pub(crate) ego_only_rows: Vec<usize>,
     /// Source and target for the ego motion, where it is to be found: all that is finite and in
     /// range, the ground too, which holds pitch, roll and height.
-    pub(crate) surroundings: Option<[Vec<Point>; 2]>,
+    pub(crate) registration_clouds: Option<[Vec<Point>; 2]>,
 }
 
 /// Which points of sweeps are ground, all of them finite and in range.
@@ -76,7 +76,7 @@ pub(crate) fn select(
         rows = kept("source", problem.source, None, options)?;
         target_rows = kept("target", problem.target, None, options)?;
     }
-    let carried = match &found {
+    let ego_only_rows = match &found {
         Some([ground, _]) if options.max_points.is_none() => {
             let rows = 0..ground.len();
             rows.filter(|&row| ground[row] && is_in_range(problem.source[row], options))
@@ -84,7 +84,7 @@ pub(crate) fn select(
         }
         _ => Vec::new(),
     };
-    let mut answered: Vec<usize> = (0..rows.len()).collect();
+    let mut output_rows: Vec<usize> = (0..rows.len()).collect();
     if let Some(max_points) = options.max_points {
         // One permutation for both clouds, as the published code draws it; but each cloud is drawn
         // from all of its rows, which lie in the order of the scan.
@@ -96,12 +96,12 @@ pub(crate) fn select(
         };
         if options.label.is_some() {
             // Few points have no clusters: objects are found in all of them.
-            answered = drawn(rows.len());
+            output_rows = drawn(rows.len());
         } else {
             for rows in [&mut rows, &mut target_rows] {
                 *rows = drawn(rows.len()).iter().map(|&place| rows[place]).collect();
             }
-            answered.truncate(rows.len());
+            output_rows.truncate(rows.len());
         }
     }
     for (cloud, rows) in [("source", &rows), ("target", &target_rows)] {
@@ -115,17 +115,17 @@ pub(crate) fn select(
     Ok(Selection {
         source: rows.iter().map(|&row| problem.source[row]).collect(),
         target: target_rows.iter().map(|&row| problem.target[row]).collect(),
-        surroundings: (options.ego == Ego::Auto)
+        registration_clouds: (options.ego == Ego::Auto)
             .then(|| [problem.source, problem.target].map(|points| in_range(points, options))),
         rows,
-        answered,
-        carried,
+        output_rows,
+        ego_only_rows,
     })
 }
 
 /// The points of a sweep around a pair that `options` let take part.
 pub(crate) fn off_ground(
-    sweep: &Around,
+    sweep: &NeighborSweep,
     options: &Options,
     find: FindGround<'_>,
 ) -> Result<Vec<Point>, FlowError> {
@@ -264,12 +264,12 @@ mod tests {
         let selection = select(&problem, &options, &find_ground).expect("enough points");
         assert_eq!(selection.source.len(), 10);
         assert_eq!(
-            selection.surroundings,
+            selection.registration_clouds,
             Some([(); 2].map(|()| source[..=60].to_vec()))
         );
         options.ego = Ego::Off;
         let selection = select(&problem, &options, &find_ground).expect("enough points");
-        assert_eq!(selection.surroundings, None);
+        assert_eq!(selection.registration_clouds, None);
     }
 
     #[test]
@@ -302,12 +302,12 @@ mod tests {
         let fitted = select(&problem, &fitted, &find_ground).expect("enough points");
         let objects = select(&problem, &objects, &find_ground).expect("enough points");
         assert_eq!((objects.rows.len(), objects.target.len()), (100, 100));
-        let answered = |selection: &Selection| -> Vec<usize> {
-            let places = selection.answered.iter();
+        let output_rows = |selection: &Selection| -> Vec<usize> {
+            let places = selection.output_rows.iter();
             places.map(|&place| selection.rows[place]).collect()
         };
-        assert_eq!(answered(&objects), answered(&fitted));
-        assert_eq!(answered(&fitted), fitted.rows);
+        assert_eq!(output_rows(&objects), output_rows(&fitted));
+        assert_eq!(output_rows(&fitted), fitted.rows);
     }
 
     #[test]

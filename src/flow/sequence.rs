@@ -8,13 +8,13 @@
 use std::collections::VecDeque;
 use std::ops::Range;
 
-use super::data::{Point, Watch};
+use super::data::{Control, Point};
 use super::error::FlowError;
 use super::estimate::{Estimate, estimate};
 use super::field::Backend;
-use super::motion::Field;
+use super::motion::MotionField;
 use super::options::{Ground, Options};
-use super::registration::Around;
+use super::registration::NeighborSweep;
 use super::select::{FindGround, Problem, find_ground, ground_of, is_in_range};
 
 /// One sweep of a sequence.
@@ -105,7 +105,7 @@ pub struct Sequence {
     next: usize,
     /// Sweeps of a window.
     frames: usize,
-    before: Option<Field>,
+    before: Option<MotionField>,
 }
 
 impl Sequence {
@@ -122,7 +122,7 @@ impl Sequence {
         backend: &dyn Backend,
         sweep: Sweep,
         options: &Options,
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) -> Result<Vec<Estimate>, FlowError> {
         // Once for all that see it.
         let find = |sweeps: &[&[Point]]| backend.host().ground(sweeps);
@@ -135,7 +135,7 @@ impl Sequence {
             options: options.clone(),
         });
         self.count += 1;
-        let pushed = self.estimates(backend, is_whole, watch);
+        let pushed = self.estimates(backend, is_whole, control);
         if pushed.is_err() {
             self.held.pop_back();
             self.count -= 1;
@@ -154,9 +154,9 @@ impl Sequence {
     pub fn finish(
         &mut self,
         backend: &dyn Backend,
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) -> Result<Vec<Estimate>, FlowError> {
-        self.estimates(backend, |_, _, _| true, watch)
+        self.estimates(backend, |_, _, _| true, control)
     }
 
     /// The next pairs, as long as `is_ready` says so of a pair, the sweeps so far and those of a window,
@@ -165,14 +165,14 @@ impl Sequence {
         &mut self,
         backend: &dyn Backend,
         is_ready: impl Fn(usize, usize, usize) -> bool,
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) -> Result<Vec<Estimate>, FlowError> {
         let mut estimates = Vec::new();
         while self.next + 1 < self.count {
             if !is_ready(self.next, self.count, self.frames) {
                 break;
             }
-            let estimate = match self.estimate(backend, self.next, watch) {
+            let estimate = match self.estimate(backend, self.next, control) {
                 Ok(estimate) => estimate,
                 Err(error) if estimates.is_empty() => return Err(error),
                 Err(_) => break,
@@ -189,20 +189,20 @@ impl Sequence {
         &self,
         backend: &dyn Backend,
         pair: usize,
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) -> Result<Estimate, FlowError> {
         let (source, target) = (&self.at(pair).sweep, self.at(pair + 1));
         let ground = source.ground.as_deref();
         let ground = ground.zip(target.sweep.ground.as_deref());
         let others = window(pair, self.count, self.frames);
         let others = others.filter(|&place| place != pair && place != pair + 1);
-        let around: Vec<Around> = others
+        let around: Vec<NeighborSweep> = others
             .filter_map(|place| {
                 let Sweep { points, ground } = &self.at(place).sweep;
                 let ground = ground.as_deref();
                 // Farther sweeps than that are of no use.
                 let at = i8::try_from(place as i64 - pair as i64).ok()?;
-                Some(Around { points, ground, at })
+                Some(NeighborSweep { points, ground, at })
             })
             .collect();
         let problem = Problem {
@@ -212,7 +212,7 @@ impl Sequence {
             before: self.before.as_ref(),
             around: &around,
         };
-        estimate(backend, &problem, &target.options, watch)
+        estimate(backend, &problem, &target.options, control)
     }
 
     fn at(&self, place: usize) -> &Held {

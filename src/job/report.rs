@@ -140,7 +140,7 @@ mod tests {
             device: "cpu".to_owned(),
             seconds: crate::flow::PhaseSeconds::default(),
             distance_bytes: 0,
-            field: crate::flow::Field {
+            field: crate::flow::MotionField {
                 ego: None,
                 residual: crate::flow::Residual::Still,
             },

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::options::{EgoChoice, InvalidOptions, JobOptions};
-use crate::flow::densify::{Later, Plan, PlanError};
+use crate::flow::densify::{LaterSweeps, Plan, PlanError};
 
 /// All sweeps of a sequence, carried into one frame.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
@@ -45,8 +45,8 @@ impl Densify {
     /// [`PlanError`] where they cannot.
     pub fn plan(&self, frames: usize) -> Result<Plan, PlanError> {
         let later = match self.later {
-            LaterChoice::Reverse => Later::Reverse,
-            LaterChoice::Inverse => Later::Inverse,
+            LaterChoice::Reverse => LaterSweeps::Reverse,
+            LaterChoice::Inverse => LaterSweeps::Inverse,
         };
         Plan::new(frames, self.into, later, self.substeps as usize)
     }

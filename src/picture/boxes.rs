@@ -3,7 +3,7 @@
 //! It must not know how clusters were found.
 
 use super::canvas::{Image, Rgb};
-use crate::flow::{Bounds, Cluster, Point};
+use crate::flow::{Cluster, OrientedBox, Point};
 
 const OUTLINE: Rgb = [255, 214, 102];
 /// Sweeps that a line shows the way in: a second of a common lidar.
@@ -31,7 +31,7 @@ pub(super) fn draw(
 }
 
 /// The corners of a box, from above.
-fn corners(bounds: &Bounds) -> [Point; 4] {
+fn corners(bounds: &OrientedBox) -> [Point; 4] {
     let [x, y, z] = bounds.center;
     let [length, width, _] = bounds.size.map(|side| side / 2.0 + MARGIN_M);
     let (sin, cos) = bounds.yaw.sin_cos();
@@ -64,7 +64,7 @@ mod tests {
     fn drawn(dynamic: bool, velocity: Point) -> Image {
         let cluster = Cluster {
             dynamic,
-            bounds: Bounds {
+            bounds: OrientedBox {
                 center: [50.0, 50.0, 0.0],
                 size: [20.0, 10.0, 1.0],
                 yaw: std::f32::consts::FRAC_PI_2,

@@ -8,10 +8,10 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use super::inputs::StoreError;
-use super::job_watch::DenseWatch;
+use super::job_watch::DenseControl;
 use super::{Attempt, Densification, Densified, Done, EngineError, Found, Worker, alive};
 use crate::flow::densify::Plan;
-use crate::flow::{FlowError, Sweep, Watch};
+use crate::flow::{Control, FlowError, Sweep};
 use crate::job::{DenseReport, Densify, Job, JobOptions};
 use crate::payload::{Damaged, StoredCloud, StoredDense};
 use crate::queue::Lease;
@@ -38,11 +38,11 @@ impl Worker {
         fields(job = %lease.job.id, attempt = lease.job.attempt, device = self.lane.device().name())
     )]
     pub(super) async fn densify(&self, lease: &Lease) -> Attempt {
-        let watch = Arc::new(DenseWatch::new(
+        let control = Arc::new(DenseControl::new(
             lease.pulse.clone(),
             self.drain.release.clone(),
         ));
-        let preparing = self.prepare_sweeps(&lease.job, watch);
+        let preparing = self.prepare_sweeps(&lease.job, control);
         let (work, asked) = match alive(lease, preparing).await {
             Ok(prepared) => prepared,
             Err(Unprepared::Interrupted) => return self.interrupted(lease),
@@ -83,14 +83,14 @@ impl Worker {
     async fn prepare_sweeps(
         &self,
         job: &Job,
-        watch: Arc<DenseWatch>,
+        control: Arc<DenseControl>,
     ) -> Result<(Densification, Densify), Unprepared> {
         let options = JobOptions::from_json(job.options.as_bytes())?;
         let asked = options.densify.ok_or(StoreError::NoPlan)?;
         let pairs = self.queue.pairs(job.id).await?;
         let frames = 1 + pairs.iter().filter(|pair| !pair.backward).count();
         let plan: Plan = asked.plan(frames).map_err(|_| StoreError::NoPlan)?;
-        let go_on = || match watch.interrupt() {
+        let go_on = || match control.interrupt() {
             None => Ok(()),
             Some(_) => Err(Unprepared::Interrupted),
         };
@@ -109,20 +109,20 @@ impl Worker {
             sweeps.push(read??);
         }
         let mut fields = HashMap::new();
-        for leg in plan.legs() {
+        for edge in plan.edges() {
             go_on()?;
-            let of_leg = |pair: &&Arc<Job>| {
+            let of_edge = |pair: &&Arc<Job>| {
                 let (_, [source, target]) = pair.sweeps();
-                (source as usize, target as usize) == (leg.source, leg.target)
+                (source as usize, target as usize) == (edge.source, edge.target)
             };
-            let pair = pairs.iter().find(of_leg).ok_or(StoreError::NoPlan)?;
-            fields.insert(leg, self.field(pair).await?);
+            let pair = pairs.iter().find(of_edge).ok_or(StoreError::NoPlan)?;
+            fields.insert(edge, self.field(pair).await?);
         }
         let work = Densification {
             plan,
             sweeps,
             fields,
-            watch,
+            control,
         };
         Ok((work, asked))
     }

@@ -10,9 +10,9 @@ use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
 use super::Worker;
-use super::job_watch::JobWatch;
+use super::job_watch::JobControl;
 use crate::clock::Timestamp;
-use crate::flow::{Ego, Field, SealError, Snapshot, Sweep};
+use crate::flow::{Ego, EnvelopeError, MotionField, Snapshot, Sweep};
 use crate::job::{Job, JobOptions, State};
 use crate::payload::{Damaged, StoredCloud};
 use crate::queue::{Lease, QueueError};
@@ -26,7 +26,7 @@ pub(super) enum StoreError {
     #[error(transparent)]
     Damaged(#[from] Damaged),
     #[error("a field cannot be read: {0}")]
-    Field(#[from] SealError),
+    MotionField(#[from] EnvelopeError),
     #[error("reading it failed: {0}")]
     Task(#[from] tokio::task::JoinError),
     #[error("its pairs are not those of its plan")]
@@ -62,7 +62,7 @@ impl Worker {
             let left = Timestamp::now().until(deadline);
             Instant::now() + left.saturating_sub(self.after_solving(job, points))
         });
-        let watch = JobWatch::new(
+        let control = JobControl::new(
             lease.pulse.clone(),
             deadline,
             self.options.snapshot_interval,
@@ -84,7 +84,7 @@ impl Worker {
             source: source.points,
             target: target.points,
             snapshot,
-            watch: Arc::new(watch),
+            control: Arc::new(control),
         };
         Ok((work, self.keep_snapshots(lease, kept), options))
     }
@@ -122,7 +122,7 @@ impl Worker {
     /// The field of the job that this one comes after, if that has succeeded: as it was read once it
     /// will be read again, since no other attempt of that job can follow. Where there is none the
     /// pair starts afresh.
-    async fn field_before(&self, job: &Job) -> Result<Option<Field>, StoreError> {
+    async fn field_before(&self, job: &Job) -> Result<Option<MotionField>, StoreError> {
         let Some(after) = job.after else {
             return Ok(None);
         };
@@ -145,9 +145,9 @@ impl Worker {
     }
 
     /// The field that a pair which has succeeded has left.
-    pub(super) async fn field(&self, job: &Job) -> Result<Field, StoreError> {
+    pub(super) async fn field(&self, job: &Job) -> Result<MotionField, StoreError> {
         let bytes = self.blobs.get(job.id, Blob::Field(job.attempt)).await?;
-        Ok(Field::from_bytes(&bytes)?)
+        Ok(MotionField::from_bytes(&bytes)?)
     }
 
     /// Where an earlier attempt was put down, if it was.

@@ -10,12 +10,12 @@ use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
-use crate::flow::{Interrupt, Progress, Snapshot, Watch};
+use crate::flow::{Control, Interrupt, Progress, Snapshot};
 use crate::job::JobProgress;
 use crate::queue::{Pulse, Signal};
 
 /// Looks in for one attempt.
-pub(super) struct JobWatch {
+pub(super) struct JobControl {
     began: Instant,
     pulse: Pulse,
     deadline: Option<Instant>,
@@ -26,7 +26,7 @@ pub(super) struct JobWatch {
     snapshots: mpsc::Sender<Snapshot>,
 }
 
-impl JobWatch {
+impl JobControl {
     pub(super) fn new(
         pulse: Pulse,
         deadline: Option<Instant>,
@@ -48,7 +48,7 @@ impl JobWatch {
     }
 }
 
-impl Watch for JobWatch {
+impl Control for JobControl {
     fn seconds(&self) -> f64 {
         self.began.elapsed().as_secs_f64()
     }
@@ -113,18 +113,18 @@ impl Watch for JobWatch {
 
 /// Looks in while sweeps are carried into one frame: there is nothing to put down half-way, so that
 /// a worker that is to stop lets go at once.
-pub(super) struct DenseWatch {
+pub(super) struct DenseControl {
     pulse: Pulse,
     release: CancellationToken,
 }
 
-impl DenseWatch {
+impl DenseControl {
     pub(super) fn new(pulse: Pulse, release: CancellationToken) -> Self {
         Self { pulse, release }
     }
 }
 
-impl Watch for DenseWatch {
+impl Control for DenseControl {
     fn interrupt(&self) -> Option<Interrupt> {
         let gone = self.pulse.beat(None) != Signal::Continue;
         (gone || self.release.is_cancelled()).then_some(Interrupt::Cancelled)

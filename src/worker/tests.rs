@@ -12,7 +12,7 @@ use super::{Drain, Worker, WorkerOptions};
 use crate::cost::{CostModel, Lanes};
 use crate::engine::cards::Switches;
 use crate::engine::{Device, Health};
-use crate::flow::{Field, Point};
+use crate::flow::{MotionField, Point};
 use crate::job::{DeviceKind, Job, JobError, JobId, Kind, Priority, State, Tenant};
 use crate::metrics::Metrics;
 use crate::payload::{StoredCloud, StoredFlow};
@@ -220,7 +220,7 @@ async fn a_pair_leaves_its_field_and_starts_afresh_where_the_one_before_has_left
         assert_eq!(job.state, state);
         if state == State::Succeeded {
             let field = stand.blobs.get(job.id, Blob::Field(job.attempt)).await;
-            Field::from_bytes(&field.expect("stored")).expect("whole");
+            MotionField::from_bytes(&field.expect("stored")).expect("whole");
             let bytes = stand.blobs.get(job.id, Blob::Result(job.attempt)).await;
             flows.push(StoredFlow::from_bytes(&bytes.expect("stored")).expect("whole"));
         }

@@ -1,6 +1,6 @@
 //! Small files of every format, made by hand or by our own writers.
 
-use fnsf::flow::{Bounds, Cluster, Objects, Point, RigidTransform};
+use fnsf::flow::{Cluster, Objects, OrientedBox, Point, RigidTransform};
 use fnsf::formats::{
     CloudFormat, FlowFormat, FlowTable, Ground, Pair, PairTruth, write_cloud, write_flow,
     write_pair_npz,
@@ -92,7 +92,7 @@ pub(crate) fn objects(count: usize) -> Objects {
     let cluster = Cluster {
         points: count as u32 / 3,
         dynamic: true,
-        bounds: Bounds {
+        bounds: OrientedBox {
             center: [1.0, 2.0, 3.0],
             size: [4.0, 2.0, 1.5],
             yaw: 0.5,

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::simulate::StreetOptions;
-use fnsf::flow::{Estimate, FlowError, Interrupt, Preset, Problem, StopReason, Watch, estimate};
+use fnsf::flow::{Control, Estimate, FlowError, Interrupt, Preset, Problem, StopReason, estimate};
 use fnsf::formats::Pair;
 
 use super::scenes::street;
@@ -25,7 +25,7 @@ impl Clock {
     }
 }
 
-impl Watch for Clock {
+impl Control for Clock {
     fn seconds(&self) -> f64 {
         self.looks.fetch_add(1, Ordering::Relaxed) as f64 * 1e-6
     }
@@ -101,7 +101,7 @@ fn a_deadline_that_suffices_changes_no_bit() {
 fn a_cancellation_under_a_deadline_ends_the_precompute() {
     /// Cancelled from the first look on.
     struct Cancelled;
-    impl Watch for Cancelled {
+    impl Control for Cancelled {
         fn seconds_left(&self) -> Option<f64> {
             Some(0.1)
         }
@@ -128,7 +128,7 @@ fn the_watch_is_looked_at_all_along_before_the_first_iteration() {
     /// Counts the looks before the first iteration.
     #[derive(Default)]
     struct Looks(AtomicU64);
-    impl Watch for Looks {
+    impl Control for Looks {
         fn interrupt(&self) -> Option<Interrupt> {
             self.0.fetch_add(1, Ordering::Relaxed);
             None

@@ -3,7 +3,7 @@
 
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::simulate::StreetOptions;
-use fnsf::flow::{Ground, Preset, Problem, RigidTransform, Unwatched, estimate};
+use fnsf::flow::{Ground, Preset, Problem, RigidTransform, Uncontrolled, estimate};
 use fnsf::formats::Pair;
 
 use super::scenes::{real_pair, street};
@@ -33,7 +33,7 @@ fn found(pair: &Pair, ground: Ground, max_points: Option<usize>) -> RigidTransfo
     options.ground = ground;
     options.max_iterations = 0;
     let backend = CpuBackend::new(Some(2)).expect("threads");
-    let estimate = estimate(&backend, &problem, &options, &Unwatched).expect("a flow");
+    let estimate = estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
     estimate.ego.expect("it was asked for")
 }
 

@@ -5,8 +5,8 @@ use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::Metrics;
 use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::flow::{
-    Around, Estimate, FlowError, Ground, Options, Preset, Problem, Sequence, Sweep, Unwatched,
-    Watch, estimate, window,
+    Control, Estimate, FlowError, Ground, NeighborSweep, Options, Preset, Problem, Sequence, Sweep,
+    Uncontrolled, estimate, window,
 };
 use fnsf::formats::{Pair, PairTruth, read_cloud};
 
@@ -22,15 +22,15 @@ fn seeing(frames: usize) -> Options {
 }
 
 /// Pair `pair` of `sweeps`, with all others around it.
-fn alone(sweeps: &[Sweep], pair: usize, options: &Options, watch: &dyn Watch) -> Estimate {
+fn alone(sweeps: &[Sweep], pair: usize, options: &Options, control: &dyn Control) -> Estimate {
     let backend = CpuBackend::new(Some(2)).expect("threads");
     let others = (0..sweeps.len()).filter(|&place| place != pair && place != pair + 1);
-    let others = others.map(|place| Around {
+    let others = others.map(|place| NeighborSweep {
         points: &sweeps[place].points,
         ground: sweeps[place].ground.as_deref(),
         at: place as i8 - pair as i8,
     });
-    let around: Vec<Around> = others.collect();
+    let around: Vec<NeighborSweep> = others.collect();
     let [source, target] = [pair, pair + 1].map(|place| &sweeps[place]);
     let ground = source.ground.as_deref().zip(target.ground.as_deref());
     let problem = Problem {
@@ -40,7 +40,7 @@ fn alone(sweeps: &[Sweep], pair: usize, options: &Options, watch: &dyn Watch) ->
         before: None,
         around: &around,
     };
-    estimate(&backend, &problem, options, watch).expect("a flow")
+    estimate(&backend, &problem, options, control).expect("a flow")
 }
 
 fn drive(seed: u64, frames: usize, beams: usize) -> (Street, Vec<Sweep>) {
@@ -99,12 +99,12 @@ fn a_pair_that_fails_costs_no_other_that_was_there_before_it() {
     let (options, mut sequence) = (seeing(5), Sequence::default());
     let mut found = Vec::new();
     for sweep in sweeps {
-        let pushed = sequence.push(&backend, sweep, &options, &Unwatched);
+        let pushed = sequence.push(&backend, sweep, &options, &Uncontrolled);
         found.extend(pushed.expect("those before the empty sweep"));
     }
     assert_eq!(found.len(), 2);
     for _ in 0..2 {
-        let rest = sequence.finish(&backend, &Unwatched);
+        let rest = sequence.finish(&backend, &Uncontrolled);
         assert!(matches!(rest, Err(FlowError::TooFewPoints { .. })));
     }
 }
@@ -116,7 +116,7 @@ fn how_many_sweeps_a_pair_sees_is_fixed_by_the_first_one() {
     let mut sequence = Sequence::default();
     let mut found = 0;
     for (sweep, frames) in sweeps.into_iter().zip([2, 2, 2, 5, 5, 3]) {
-        let pushed = sequence.push(&backend, sweep, &seeing(frames), &Unwatched);
+        let pushed = sequence.push(&backend, sweep, &seeing(frames), &Uncontrolled);
         found += pushed.expect("flows").len();
     }
     assert_eq!(found, 5);
@@ -137,7 +137,7 @@ fn five_sweeps_beat_two_on_streets_for_what_moves_and_not_at_the_cost_of_what_st
             let known = known(&street, pair);
             for (sums, frames) in [(&mut two, 2), (&mut five, 5)] {
                 let options = seeing(frames);
-                let metrics = scored(&known, &alone(&sweeps, pair, &options, &Unwatched));
+                let metrics = scored(&known, &alone(&sweeps, pair, &options, &Uncontrolled));
                 sums[0] += moving(&metrics);
                 sums[1] += still(&metrics);
             }
@@ -172,7 +172,7 @@ fn five_sweeps_beat_two_on_a_real_drive() {
             ground: Ground::Mask,
             ..seeing(frames)
         };
-        scored(&pair, &alone(&sweeps, 0, &options, &Unwatched))
+        scored(&pair, &alone(&sweeps, 0, &options, &Uncontrolled))
     });
     let bounds = [moving(&two) - 0.001, still(&two) + 0.0001];
     assert!(moving(&five) <= bounds[0], "{five:?}, {two:?}");
@@ -182,30 +182,30 @@ fn five_sweeps_beat_two_on_a_real_drive() {
 #[test]
 fn without_sweeps_around_or_where_two_are_asked_for_a_pair_is_what_it_is_alone() {
     let (_, sweeps) = drive(4, 4, 16);
-    let pair = alone(&sweeps[1..3], 0, &seeing(2), &Unwatched);
+    let pair = alone(&sweeps[1..3], 0, &seeing(2), &Uncontrolled);
     assert_eq!(
         pair.flow,
-        alone(&sweeps[1..3], 0, &seeing(5), &Unwatched).flow
+        alone(&sweeps[1..3], 0, &seeing(5), &Uncontrolled).flow
     );
-    assert_eq!(pair.flow, alone(&sweeps, 1, &seeing(2), &Unwatched).flow);
-    assert_ne!(pair.flow, alone(&sweeps, 1, &seeing(4), &Unwatched).flow);
+    assert_eq!(pair.flow, alone(&sweeps, 1, &seeing(2), &Uncontrolled).flow);
+    assert_ne!(pair.flow, alone(&sweeps, 1, &seeing(4), &Uncontrolled).flow);
     let other = Preset::Paper.options(Some(500));
-    let paper = alone(&sweeps[1..3], 0, &other, &Unwatched);
-    assert_eq!(paper.flow, alone(&sweeps, 1, &other, &Unwatched).flow);
+    let paper = alone(&sweeps[1..3], 0, &other, &Uncontrolled);
+    assert_eq!(paper.flow, alone(&sweeps, 1, &other, &Uncontrolled).flow);
 }
 
 #[test]
 fn where_time_is_short_the_sweeps_around_are_done_without_first() {
     /// So many seconds are left, always.
     struct Left(f64);
-    impl Watch for Left {
+    impl Control for Left {
         fn seconds_left(&self) -> Option<f64> {
             Some(self.0)
         }
     }
     let (_, sweeps) = drive(4, 5, 16);
-    let pair = alone(&sweeps[2..4], 0, &seeing(2), &Unwatched);
-    let whole = alone(&sweeps, 2, &seeing(5), &Unwatched);
+    let pair = alone(&sweeps[2..4], 0, &seeing(2), &Uncontrolled);
+    let whole = alone(&sweeps, 2, &seeing(5), &Uncontrolled);
     // A fifth of a second is enough for the ego motion of so few points.
     assert_eq!(pair.flow, alone(&sweeps, 2, &seeing(5), &Left(0.2)).flow);
     assert_eq!(whole.flow, alone(&sweeps, 2, &seeing(5), &Left(60.0)).flow);
@@ -221,21 +221,21 @@ fn a_pair_of_a_sequence_has_the_bits_of_its_window_alone_and_comes_as_soon_as_th
         let mut sequence = Sequence::default();
         let mut estimates = Vec::new();
         for (sweep, count) in sweeps.iter().zip(delays) {
-            let pushed = sequence.push(&backend, sweep.clone(), &options, &Unwatched);
+            let pushed = sequence.push(&backend, sweep.clone(), &options, &Uncontrolled);
             let pushed = pushed.expect("flows");
             assert_eq!(pushed.len(), count);
             estimates.extend(pushed);
         }
-        estimates.extend(sequence.finish(&backend, &Unwatched).expect("the rest"));
+        estimates.extend(sequence.finish(&backend, &Uncontrolled).expect("the rest"));
         assert_eq!(estimates.len(), SWEEPS - 1);
         for (pair, estimate) in estimates.iter().enumerate() {
             let seen = window(pair, SWEEPS, frames);
             let first = seen.start;
-            let other = alone(&sweeps[seen], pair - first, &options, &Unwatched);
+            let other = alone(&sweeps[seen], pair - first, &options, &Uncontrolled);
             assert_eq!(estimate.flow, other.flow, "pair {pair} of {frames} frames");
             assert_eq!(estimate.field.to_bytes(), other.field.to_bytes());
         }
-        let rest = sequence.finish(&backend, &Unwatched).expect("nothing");
+        let rest = sequence.finish(&backend, &Uncontrolled).expect("nothing");
         assert!(rest.is_empty());
     }
 }

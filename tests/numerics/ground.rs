@@ -14,13 +14,13 @@ const ENOUGH: f64 = 0.95;
 const WITHIN_M: f32 = 35.0;
 
 /// A sweep and which of its points are ground.
-struct Labelled {
+struct ObjectSearch {
     name: String,
     points: Vec<Point>,
     ground: Vec<bool>,
 }
 
-impl Labelled {
+impl ObjectSearch {
     fn moved(&self, change: impl Fn(Point) -> Point) -> Self {
         Self {
             name: self.name.clone(),
@@ -65,11 +65,11 @@ impl Labelled {
     }
 }
 
-fn street(options: &StreetOptions) -> Labelled {
+fn street(options: &StreetOptions) -> ObjectSearch {
     let frame = Street::new(options)
         .and_then(|street| street.frame(0))
         .expect("a street");
-    Labelled {
+    ObjectSearch {
         name: format!("{} beams, seed {}", options.beams, options.seed),
         points: frame.points,
         ground: frame.ground,
@@ -77,7 +77,7 @@ fn street(options: &StreetOptions) -> Labelled {
 }
 
 /// Streets of 16 to 128 beams.
-fn streets(seeds: u64) -> impl Iterator<Item = Labelled> {
+fn streets(seeds: u64) -> impl Iterator<Item = ObjectSearch> {
     (0..seeds).flat_map(|seed| {
         [16, 32, 64, 128].map(|beams| {
             street(&StreetOptions {
@@ -91,7 +91,7 @@ fn streets(seeds: u64) -> impl Iterator<Item = Labelled> {
 }
 
 /// Both sweeps of the real pairs that have ground labels; none where there is no real data.
-fn real_sweeps() -> Vec<Labelled> {
+fn real_sweeps() -> Vec<ObjectSearch> {
     let mut sweeps = Vec::new();
     for name in ["av2_7fab", "kitti_0000", "small_gicp"] {
         let Some(pair) = real_pair(name) else { break };
@@ -99,7 +99,7 @@ fn real_sweeps() -> Vec<Labelled> {
         let both = [(pair.source, ground.source), (pair.target, ground.target)];
         for (points, ground) in both {
             let name = name.to_owned();
-            sweeps.push(Labelled {
+            sweeps.push(ObjectSearch {
                 name,
                 points,
                 ground,
@@ -210,7 +210,7 @@ fn mirror_images_below_the_ground_are_told_from_it() {
 #[test]
 fn a_sweep_whose_ground_was_taken_off_has_none() {
     // The mask of kitti_0000 leaves 2,000 points on the ground, so that pair is not asked.
-    let taken_off = |sweep: Labelled| sweep.kept(|row| !sweep.ground[row]);
+    let taken_off = |sweep: ObjectSearch| sweep.kept(|row| !sweep.ground[row]);
     let real = real_sweeps().into_iter().filter(|s| s.name != "kitti_0000");
     for sweep in streets(3).chain(real).map(taken_off) {
         let found = sweep.found();

@@ -2,7 +2,7 @@
 //! is asked of it; `examples/label.rs` has the figures.
 
 use fnsf::flow::simulate::StreetOptions;
-use fnsf::flow::{Ground, Preset, Problem, StopReason, Unwatched, estimate};
+use fnsf::flow::{Ground, Preset, Problem, StopReason, Uncontrolled, estimate};
 
 use super::scenes::{real_pair, score, solve, street};
 
@@ -70,7 +70,7 @@ fn ground_is_found_where_none_is_named_and_few_points_are_no_trouble() {
     for max_points in [None, Some(3000), Some(3)] {
         let options = Preset::Default.options(max_points);
         assert_eq!(options.ground, Ground::Auto);
-        let estimate = estimate(&backend, &problem, &options, &Unwatched).expect("a flow");
+        let estimate = estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
         assert!(estimate.flow.iter().flatten().all(|f| f.is_finite()));
     }
 }

@@ -4,7 +4,7 @@ use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::distance::{DistanceError, Metric, Sites};
 use fnsf::flow::field::BackendError;
 use fnsf::flow::simulate::StreetOptions;
-use fnsf::flow::{FlowError, Unwatched};
+use fnsf::flow::{FlowError, Uncontrolled};
 use fnsf::flow::{Ground, Options, Preset, Problem, estimate, price};
 
 use super::scenes::{real_pair, solve, street};
@@ -104,7 +104,7 @@ fn what_the_estimate_refuses_has_no_price() {
             around: &[],
         };
         let refused = price(&problem, options).expect_err("refused");
-        let truth = estimate(&backend, &problem, options, &Unwatched).expect_err("refused");
+        let truth = estimate(&backend, &problem, options, &Uncontrolled).expect_err("refused");
         assert_eq!(refused.to_string(), truth.to_string());
         assert!(refused.is_input());
     }

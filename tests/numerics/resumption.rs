@@ -7,8 +7,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::simulate::StreetOptions;
 use fnsf::flow::{
-    Estimate, FlowError, Interrupt, Options, Preset, Problem, Progress, SealError, Snapshot,
-    SnapshotError, StopReason, Watch, estimate, resume,
+    Control, EnvelopeError, Estimate, FlowError, Interrupt, Options, Preset, Problem, Progress,
+    Snapshot, SnapshotError, StopReason, estimate, resume,
 };
 use fnsf::formats::Pair;
 
@@ -35,7 +35,7 @@ impl PutDown {
     }
 }
 
-impl Watch for PutDown {
+impl Control for PutDown {
     fn interrupt(&self) -> Option<Interrupt> {
         self.taken().is_some().then_some(Interrupt::Cancelled)
     }
@@ -53,7 +53,7 @@ impl Watch for PutDown {
 /// Lets a run go on to its end.
 struct Onward;
 
-impl Watch for Onward {}
+impl Control for Onward {}
 
 fn small_street() -> Pair {
     street(&StreetOptions {
@@ -68,7 +68,7 @@ fn run(
     options: &Options,
     threads: usize,
     snapshot: Option<Snapshot>,
-    watch: &dyn Watch,
+    control: &dyn Control,
 ) -> Result<Estimate, FlowError> {
     let backend = CpuBackend::new(Some(threads)).expect("threads");
     let problem = Problem {
@@ -79,17 +79,17 @@ fn run(
         around: &[],
     };
     match snapshot {
-        None => estimate(&backend, &problem, options, watch),
-        Some(snapshot) => resume(&backend, &problem, options, snapshot, watch),
+        None => estimate(&backend, &problem, options, control),
+        Some(snapshot) => resume(&backend, &problem, options, snapshot, control),
     }
 }
 
 /// The snapshot after so many iterations, on its way through bytes.
 fn put_down(pair: &Pair, options: &Options, from: Option<Snapshot>, after: usize) -> Snapshot {
-    let watch = PutDown::after(after);
-    let error = run(pair, options, 2, from, &watch).expect_err("it is cancelled");
+    let control = PutDown::after(after);
+    let error = run(pair, options, 2, from, &control).expect_err("it is cancelled");
     assert!(matches!(error, FlowError::Cancelled), "{error}");
-    let snapshot = watch.taken().take().expect("a snapshot was due");
+    let snapshot = control.taken().take().expect("a snapshot was due");
     assert_eq!(snapshot.iterations(), after);
     Snapshot::from_bytes(&snapshot.to_bytes()).expect("whole bytes")
 }
@@ -125,7 +125,7 @@ fn taking_snapshots_changes_nothing() {
     /// Takes one after every iteration.
     #[derive(Default)]
     struct Always(AtomicUsize);
-    impl Watch for Always {
+    impl Control for Always {
         fn snapshot_due(&self) -> bool {
             true
         }
@@ -161,7 +161,7 @@ fn torn_and_altered_snapshots_are_refused() {
     let longer = [bytes.as_slice(), &[0]].concat();
     assert!(matches!(
         Snapshot::from_bytes(&longer),
-        Err(SnapshotError::Sealed(SealError::Length { .. }))
+        Err(SnapshotError::Sealed(EnvelopeError::Length { .. }))
     ));
     let places = (0..EDGE)
         .chain((EDGE..bytes.len()).step_by(STRIDE))

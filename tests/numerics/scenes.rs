@@ -10,7 +10,7 @@ use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Metrics, Truth, evaluate};
 use fnsf::flow::field::Backend;
 use fnsf::flow::simulate::{Street, StreetOptions};
-use fnsf::flow::{self, Estimate, Ground, Options, Problem, Unwatched};
+use fnsf::flow::{self, Estimate, Ground, Options, Problem, Uncontrolled};
 use fnsf::formats::{Pair, PairTruth, read_pair};
 
 /// The real pair of that name; none, said aloud, where there is no real data.
@@ -67,7 +67,7 @@ pub(crate) fn solve_on(backend: &dyn Backend, pair: &Pair, options: &Options) ->
         ground: Ground::Mask,
         ..options.clone()
     };
-    flow::estimate(backend, &problem, &options, &Unwatched).expect("a flow")
+    flow::estimate(backend, &problem, &options, &Uncontrolled).expect("a flow")
 }
 
 /// The error of the pair's flow by `options`.

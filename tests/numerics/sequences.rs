@@ -3,11 +3,11 @@
 use std::collections::BTreeMap;
 
 use fnsf::flow::cpu::CpuBackend;
-use fnsf::flow::densify::{Later, Leg, Plan, densify};
+use fnsf::flow::densify::{FlowEdge, LaterSweeps, Plan, densify};
 use fnsf::flow::simulate::{Frame, Street, StreetOptions};
 use fnsf::flow::{
-    DenseCloud, Ego, Estimate, Field, Options, Point, Preset, Problem, Residual, Sequence, Sweep,
-    Unwatched, estimate,
+    DenseCloud, Ego, Estimate, MotionField, Options, Point, Preset, Problem, Residual, Sequence,
+    Sweep, Uncontrolled, estimate,
 };
 
 /// Sweeps of the drive, and the one that all are carried into.
@@ -41,11 +41,11 @@ fn in_sequence(sweeps: &[Vec<Point>], options: &Options) -> Vec<Estimate> {
     let (backend, mut sequence) = (backend(), Sequence::default());
     let pushed = sweeps.iter().map(|points| {
         sequence
-            .push(&backend, sweep(points.clone()), options, &Unwatched)
+            .push(&backend, sweep(points.clone()), options, &Uncontrolled)
             .expect("a pair")
     });
     let mut estimates: Vec<Estimate> = pushed.flatten().collect();
-    estimates.extend(sequence.finish(&backend, &Unwatched).expect("the rest"));
+    estimates.extend(sequence.finish(&backend, &Uncontrolled).expect("the rest"));
     estimates
 }
 
@@ -84,7 +84,7 @@ fn a_pair_of_a_sequence_takes_fewer_iterations_than_alone_and_is_no_worse() {
             before: None,
             around: &[],
         };
-        let alone = estimate(&backend, &problem, &options, &Unwatched).expect("a flow");
+        let alone = estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
         if k == 0 {
             assert_eq!(alone.flow, together[0].flow, "the first has none before it");
         } else {
@@ -113,28 +113,28 @@ fn a_field_that_does_not_explain_the_next_pair_is_not_started_from() {
 }
 
 /// Fits the plan's legs, each chain from its beginning.
-fn fields(sweeps: &[Vec<Point>], plan: &Plan, preset: Preset) -> BTreeMap<Leg, Field> {
+fn fields(sweeps: &[Vec<Point>], plan: &Plan, preset: Preset) -> BTreeMap<FlowEdge, MotionField> {
     let (backend, options) = (backend(), preset.options(None));
     let mut fields = BTreeMap::new();
     for chain in plan.chains() {
         let mut sequence = Sequence::default();
-        let (mut legs, mut estimates) = (Vec::new(), Vec::new());
-        for (number, leg) in chain.into_iter().enumerate() {
+        let (mut edges, mut estimates) = (Vec::new(), Vec::new());
+        for (number, edge) in chain.into_iter().enumerate() {
             let mut push = |place: usize| {
                 let sweep = sweep(sweeps[place].clone());
-                let pushed = sequence.push(&backend, sweep, &options, &Unwatched);
+                let pushed = sequence.push(&backend, sweep, &options, &Uncontrolled);
                 pushed.expect("a pair")
             };
             if number == 0 {
-                push(leg.source);
+                push(edge.source);
             }
-            estimates.extend(push(leg.target));
-            legs.push(leg);
+            estimates.extend(push(edge.target));
+            edges.push(edge);
         }
-        estimates.extend(sequence.finish(&backend, &Unwatched).expect("the rest"));
-        assert_eq!(legs.len(), estimates.len());
+        estimates.extend(sequence.finish(&backend, &Uncontrolled).expect("the rest"));
+        assert_eq!(edges.len(), estimates.len());
         let found = estimates.into_iter().map(|estimate| estimate.field);
-        fields.extend(legs.into_iter().zip(found));
+        fields.extend(edges.into_iter().zip(found));
     }
     fields
 }
@@ -180,7 +180,7 @@ fn movers_are_carried_to_half_of_what_ego_motion_alone_leaves_and_the_static_wor
         .map(|k| street.frame(k).expect("a frame"))
         .collect();
     let sweeps: Vec<_> = frames.iter().map(|frame| frame.points.clone()).collect();
-    let plan = Plan::new(FRAMES, INTO as f64, Later::Reverse, 1).expect("a plan");
+    let plan = Plan::new(FRAMES, INTO as f64, LaterSweeps::Reverse, 1).expect("a plan");
     let masked: Vec<Sweep> = frames
         .iter()
         .map(|frame| Sweep {
@@ -191,17 +191,17 @@ fn movers_are_carried_to_half_of_what_ego_motion_alone_leaves_and_the_static_wor
     let oldest = [0, FRAMES - 1];
     for preset in [Preset::Neural, Preset::Label] {
         let fields = fields(&sweeps, &plan, preset);
-        let still: BTreeMap<Leg, Field> = fields
+        let still: BTreeMap<FlowEdge, MotionField> = fields
             .iter()
-            .map(|(&leg, field)| {
+            .map(|(&edge, field)| {
                 let residual = Residual::Still;
                 let ego = field.ego;
-                (leg, Field { ego, residual })
+                (edge, MotionField { ego, residual })
             })
             .collect();
-        let sums = |fields: &BTreeMap<Leg, Field>| {
-            let field = |leg: Leg| fields.get(&leg);
-            let cloud = densify(&backend(), &plan, &masked, field, &Unwatched).expect("a cloud");
+        let sums = |fields: &BTreeMap<FlowEdge, MotionField>| {
+            let field = |edge: FlowEdge| fields.get(&edge);
+            let cloud = densify(&backend(), &plan, &masked, field, &Uncontrolled).expect("a cloud");
             let errors = oldest.map(|k| errors(&street, &frames[k], &cloud));
             [0, 1].map(|class| mean(errors.iter().map(|error| error[class])))
         };

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use fnsf::flow::cpu::CpuBackend;
-use fnsf::flow::{Preset, Problem, Unwatched, estimate};
+use fnsf::flow::{Preset, Problem, Uncontrolled, estimate};
 use fnsf::formats::{CloudFormat, FlowFormat, read_flow};
 use futures_util::StreamExt;
 use reqwest::StatusCode;
@@ -56,7 +56,7 @@ async fn a_pair_comes_back_as_the_librarys_flow_in_every_format() {
     };
     let backend = CpuBackend::new(Some(2)).expect("threads");
     let options = Preset::Default.options(None);
-    let expected = estimate(&backend, &problem, &options, &Unwatched).expect("a flow");
+    let expected = estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
     for (media, format) in ANSWERS {
         let response = client()
             .post(server.url("/v1/flow"))

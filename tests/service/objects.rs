@@ -1,7 +1,7 @@
 //! Clusters and confidence through both doors, in every format that has room for them.
 
 use fnsf::flow::cpu::CpuBackend;
-use fnsf::flow::{Objects, Preset, Problem, Unwatched, estimate};
+use fnsf::flow::{Objects, Preset, Problem, Uncontrolled, estimate};
 use fnsf::formats::read_flow;
 use tokio_stream::StreamExt;
 
@@ -21,7 +21,7 @@ fn expected() -> Objects {
     };
     let backend = CpuBackend::new(Some(2)).expect("threads");
     let options = Preset::Default.options(None);
-    let estimate = estimate(&backend, &problem, &options, &Unwatched).expect("a flow");
+    let estimate = estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
     estimate.objects.expect("objects")
 }
 

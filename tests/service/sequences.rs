@@ -6,10 +6,10 @@ use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 use fnsf::flow::cpu::CpuBackend;
-use fnsf::flow::densify::{Leg, densify};
+use fnsf::flow::densify::{FlowEdge, densify};
 use fnsf::flow::ground::{GroundOptions, segment};
 use fnsf::flow::simulate::{Street, StreetOptions};
-use fnsf::flow::{DenseCloud, Field, Ground, Point, Sequence, Sweep, Unwatched};
+use fnsf::flow::{DenseCloud, Ground, MotionField, Point, Sequence, Sweep, Uncontrolled};
 use fnsf::formats::{CloudFormat, DENSE_FORMATS, DenseFormat, read_flow, write_dense};
 use fnsf::job::JobOptions;
 use fnsf::payload::points_from_le_bytes;
@@ -49,7 +49,11 @@ fn backend() -> CpuBackend {
 }
 
 /// The fields and flows of consecutive legs, each from the one before.
-fn chained(backend: &CpuBackend, options: &str, places: &[usize]) -> Vec<(Field, Vec<Point>)> {
+fn chained(
+    backend: &CpuBackend,
+    options: &str,
+    places: &[usize],
+) -> Vec<(MotionField, Vec<Point>)> {
     let options = JobOptions::from_json(options.as_bytes()).expect("good options");
     let mut sequence = Sequence::default();
     let mut found = Vec::new();
@@ -59,10 +63,10 @@ fn chained(backend: &CpuBackend, options: &str, places: &[usize]) -> Vec<(Field,
             ground: None,
         };
         let solver = options.solver_options(sweep.points.len());
-        let estimates = sequence.push(backend, sweep, &solver, &Unwatched);
+        let estimates = sequence.push(backend, sweep, &solver, &Uncontrolled);
         found.extend(estimates.expect("a flow"));
     }
-    found.extend(sequence.finish(backend, &Unwatched).expect("the rest"));
+    found.extend(sequence.finish(backend, &Uncontrolled).expect("the rest"));
     found.into_iter().map(|e| (e.field, e.flow)).collect()
 }
 
@@ -79,7 +83,7 @@ fn dense(options: &str) -> DenseCloud {
     for places in [[0, 1, 2, 3], [3, 2, 1, 0]] {
         let found = chained(&backend, options, &places);
         for (step, (field, _)) in places.windows(2).zip(found) {
-            let leg = Leg {
+            let leg = FlowEdge {
                 source: step[0],
                 target: step[1],
             };
@@ -97,8 +101,8 @@ fn dense(options: &str) -> DenseCloud {
         })
         .collect();
     let plan = asked.plan(sweeps.len()).expect("a plan");
-    let field = |leg: Leg| fields.get(&leg);
-    densify(&backend, &plan, &sweeps, field, &Unwatched).expect("a cloud")
+    let field = |leg: FlowEdge| fields.get(&leg);
+    densify(&backend, &plan, &sweeps, field, &Uncontrolled).expect("a cloud")
 }
 
 pub(crate) fn body(options: &str, frames: &[Vec<Point>]) -> Form {

@@ -6,7 +6,7 @@ use std::sync::OnceLock;
 
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::simulate::{Street, StreetOptions};
-use fnsf::flow::{Point, Preset, Sequence, Sweep, Unwatched};
+use fnsf::flow::{Point, Preset, Sequence, Sweep, Uncontrolled};
 use fnsf::formats::CloudFormat;
 use fnsf::payload::points_from_le_bytes;
 use tokio_stream::StreamExt;
@@ -44,10 +44,10 @@ fn flows(preset: Preset, sweeps: &[Vec<Point>]) -> Vec<Vec<Point>> {
             points: points.clone(),
             ground: None,
         };
-        let pushed = sequence.push(&backend, sweep, &options, &Unwatched);
+        let pushed = sequence.push(&backend, sweep, &options, &Uncontrolled);
         found.extend(pushed.expect("a flow"));
     }
-    found.extend(sequence.finish(&backend, &Unwatched).expect("the rest"));
+    found.extend(sequence.finish(&backend, &Uncontrolled).expect("the rest"));
     found.into_iter().map(|estimate| estimate.flow).collect()
 }
 

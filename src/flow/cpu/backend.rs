@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use super::kernels::Kernels;
 use super::tile::WorkingSets;
-use crate::flow::data::{Point, Watch};
+use crate::flow::data::{Control, Point};
 use crate::flow::distance::{DistanceOptions, DistanceTransform};
 use crate::flow::field::{Backend, BackendError, Network, Trainer, Transform};
 use crate::flow::host::Host;
@@ -58,11 +58,11 @@ impl Backend for CpuBackend {
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) -> Result<Box<dyn Transform>, BackendError> {
         let threads = self.host.threads();
-        let distance =
-            threads.install(|| DistanceTransform::build_watched(source, target, options, watch))?;
+        let distance = threads
+            .install(|| DistanceTransform::build_watched(source, target, options, control))?;
         let (kernels, threads) = (self.kernels, Arc::clone(threads));
         Ok(Box::new(CpuTransform {
             kernels,

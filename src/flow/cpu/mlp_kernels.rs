@@ -15,7 +15,7 @@
 use super::simd::Lanes;
 use super::tile::{ROW_STEP, STRIDE, TILE, Tile};
 use crate::flow::field::{
-    MIDDLE_LAYERS, PANEL, Parameters, WIDTH, first_layer, halved, last_layer, middle_layer,
+    MIDDLE_LAYERS, PANEL, Parameters, WIDTH, first_layer, last_layer, middle_layer, tree_sum,
 };
 
 /// Sums of the last layer that are taken side by side, whatever the width of a register.
@@ -150,7 +150,7 @@ pub(super) unsafe fn forward<L: Lanes, const ROWS: usize, const VECTORS: usize>(
                 }
             }
             for output in 0..3 {
-                tile.outputs[row][output] = halved(sums[output]) + *weights.add(at.bias + output);
+                tile.outputs[row][output] = tree_sum(sums[output]) + *weights.add(at.bias + output);
             }
         }
     }

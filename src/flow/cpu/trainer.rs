@@ -10,10 +10,10 @@ use rayon::prelude::*;
 use super::backend::CpuTransform;
 use super::inference::evaluate;
 use super::tile::{TILE, WorkingSets};
-use crate::flow::data::{Point, Progress, Watch};
+use crate::flow::data::{Control, Point, Progress};
 use crate::flow::field::{
-    Advance, BackendError, Chunks, Course, EarlyStop, Parameters, Report, Trainer, TrainerState,
-    reduction, transpose_middle_layers,
+    Advance, BackendError, Chunks, EarlyStop, FitReport, Parameters, Schedule, Trainer,
+    TrainerState, reduction, transpose_middle_layers,
 };
 use crate::flow::options::Options;
 
@@ -39,7 +39,7 @@ struct Due<'a> {
 /// The network, its optimizer and the distance that it is fitted to.
 pub(super) struct CpuTrainer<'a> {
     device: &'a CpuTransform,
-    course: Course,
+    course: Schedule,
     /// Parameters, moments, the result so far, and what has been reached.
     state: TrainerState,
     transposed: Parameters,
@@ -53,7 +53,7 @@ pub(super) struct CpuTrainer<'a> {
 
 impl<'a> CpuTrainer<'a> {
     pub(super) fn new(device: &'a CpuTransform, source: &[Point], options: &Options) -> Self {
-        let (course, parameters) = Course::new(source, options);
+        let (course, parameters) = Schedule::new(source, options);
         let mut transposed = Parameters::zeros();
         transpose_middle_layers(&parameters, &mut transposed);
         Self {
@@ -71,9 +71,9 @@ impl<'a> CpuTrainer<'a> {
 
     /// One iteration: gradients, keep, step. Returns the loss and whether the stopping rule fired;
     /// nothing where the loss is not finite.
-    fn iterate(&mut self, watch: &dyn Watch) -> Option<(f32, bool)> {
+    fn iterate(&mut self, control: &dyn Control) -> Option<(f32, bool)> {
         let batch = self.course.batch(self.state.iterations);
-        let held = self.accumulate(batch, watch);
+        let held = self.accumulate(batch, control);
         let loss = reduction::mean(&self.losses);
         if !loss.is_finite() {
             return None;
@@ -89,7 +89,7 @@ impl<'a> CpuTrainer<'a> {
     }
 
     /// Forward, query, backward over `batch`. Returns how many chunks hold its gradients.
-    fn accumulate(&mut self, batch: Range<usize>, watch: &dyn Watch) -> usize {
+    fn accumulate(&mut self, batch: Range<usize>, control: &dyn Control) -> usize {
         let cut = Chunks::new(self.course.largest_batch());
         self.losses.resize(batch.len(), 0.0);
         let mut next = 0;
@@ -100,7 +100,7 @@ impl<'a> CpuTrainer<'a> {
                 held = 1;
             }
             let now = (HELD - held).min(cut.count - next);
-            self.compute(&batch, &cut, next..next + now, held, watch);
+            self.compute(&batch, &cut, next..next + now, held, control);
             next += now;
             held += now;
         }
@@ -114,7 +114,7 @@ impl<'a> CpuTrainer<'a> {
         cut: &Chunks,
         some: Range<usize>,
         first: usize,
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) {
         let threads = self.device.threads.current_num_threads().min(some.len()) as f64;
         let held = first + some.len();
@@ -153,7 +153,7 @@ impl<'a> CpuTrainer<'a> {
             for (points, losses) in due.points.chunks(TILE).zip(due.losses.chunks_mut(TILE)) {
                 tile.load(points.iter().map(|&point| conditioning.apply(point)));
                 device.kernels.forward(parameters, &mut tile);
-                let began = watch.seconds();
+                let began = control.seconds();
                 for (row, (point, seen)) in points.iter().zip(losses).enumerate() {
                     let flow = tile.outputs[row];
                     let deformed = core::array::from_fn(|a| point[a] + flow[a]);
@@ -161,7 +161,7 @@ impl<'a> CpuTrainer<'a> {
                     *seen = loss.value;
                     tile.output_gradients[row] = loss.gradient.map(|g| g * weight);
                 }
-                *query_seconds += watch.seconds() - began;
+                *query_seconds += control.seconds() - began;
                 let kernels = &device.kernels;
                 kernels.backward(parameters, transposed, &mut tile, gradients);
             }
@@ -251,21 +251,21 @@ fn add_slices(sums: &mut [f32], chunks: &[Chunk], slice: usize) {
 }
 
 impl Trainer for CpuTrainer<'_> {
-    fn advance(&mut self, steps: usize, watch: &dyn Watch) -> Result<Advance, BackendError> {
+    fn advance(&mut self, steps: usize, control: &dyn Control) -> Result<Advance, BackendError> {
         for step in 0..steps {
             if self.state.iterations >= self.course.options.max_iterations {
                 return Ok(Advance::Exhausted);
             }
-            if let Some(interrupt) = watch.interrupt() {
+            if let Some(interrupt) = control.interrupt() {
                 return Ok(Advance::Interrupted(interrupt));
             }
-            if step > 0 && watch.snapshot_due() {
+            if step > 0 && control.snapshot_due() {
                 return Ok(Advance::Continues);
             }
-            let Some((loss, stop)) = self.iterate(watch) else {
+            let Some((loss, stop)) = self.iterate(control) else {
                 return Ok(Advance::Diverged);
             };
-            watch.progress(Progress {
+            control.progress(Progress {
                 iteration: self.state.iterations,
                 max_iterations: self.course.options.max_iterations,
                 loss: loss.into(),
@@ -287,8 +287,8 @@ impl Trainer for CpuTrainer<'_> {
         ))
     }
 
-    fn report(&self) -> Report {
-        Report {
+    fn report(&self) -> FitReport {
+        FitReport {
             iterations: self.state.iterations,
             best_iteration: self.state.best_iteration,
             best_loss: self.state.best_loss.into(),

@@ -15,7 +15,7 @@ pub(crate) const PARAMETERS_BYTES: usize = LAID_OUT * size_of::<f32>();
 
 /// What the bytes should be.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Seal {
+pub(crate) struct Envelope {
     pub(crate) magic: [u8; 8],
     pub(crate) version: u32,
     /// Bytes of the body, where there are always as many.
@@ -24,7 +24,7 @@ pub(crate) struct Seal {
 
 /// Why bytes were refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum SealError {
+pub enum EnvelopeError {
     /// The bytes are something else.
     #[error("the bytes are something else")]
     Magic,
@@ -49,7 +49,7 @@ pub enum SealError {
     Damaged,
 }
 
-impl Seal {
+impl Envelope {
     /// Bytes with this seal, to be filled and [closed](Self::close).
     pub(crate) fn begin(&self) -> Vec<u8> {
         let mut bytes = Vec::new();
@@ -68,15 +68,15 @@ impl Seal {
     /// The body of sealed bytes; nothing is allocated.
     ///
     /// # Errors
-    /// [`SealError`] where they are something else, of another version, torn or altered.
-    pub(crate) fn open<'a>(&self, bytes: &'a [u8]) -> Result<Body<'a>, SealError> {
+    /// [`EnvelopeError`] where they are something else, of another version, torn or altered.
+    pub(crate) fn open<'a>(&self, bytes: &'a [u8]) -> Result<Body<'a>, EnvelopeError> {
         if !bytes.starts_with(&self.magic) {
-            return Err(SealError::Magic);
+            return Err(EnvelopeError::Magic);
         }
         let mut rest = Body(&bytes[self.magic.len()..]);
         let version = u32::from_le_bytes(rest.take()?);
         if version != self.version {
-            return Err(SealError::Version {
+            return Err(EnvelopeError::Version {
                 version,
                 expected: self.version,
             });
@@ -85,17 +85,17 @@ impl Seal {
         if let Some(expected) = self.body.map(whole)
             && bytes.len() != expected
         {
-            return Err(SealError::Length {
+            return Err(EnvelopeError::Length {
                 bytes: bytes.len(),
                 expected,
             });
         }
-        let (sound, checksum) = bytes.split_last_chunk().ok_or(SealError::Damaged)?;
+        let (sound, checksum) = bytes.split_last_chunk().ok_or(EnvelopeError::Damaged)?;
         if *checksum != Hash::default().of(sound).to_le_bytes() {
-            return Err(SealError::Damaged);
+            return Err(EnvelopeError::Damaged);
         }
         // The checksum holds, so that what was read of the header is sound, too.
-        rest.0 = sound.get(HEADER..).ok_or(SealError::Damaged)?;
+        rest.0 = sound.get(HEADER..).ok_or(EnvelopeError::Damaged)?;
         Ok(rest)
     }
 }
@@ -104,49 +104,49 @@ impl Seal {
 pub(crate) struct Body<'a>(&'a [u8]);
 
 impl Body<'_> {
-    pub(crate) fn take<const N: usize>(&mut self) -> Result<[u8; N], SealError> {
-        let (taken, rest) = self.0.split_first_chunk().ok_or(SealError::Damaged)?;
+    pub(crate) fn take<const N: usize>(&mut self) -> Result<[u8; N], EnvelopeError> {
+        let (taken, rest) = self.0.split_first_chunk().ok_or(EnvelopeError::Damaged)?;
         self.0 = rest;
         Ok(*taken)
     }
 
     /// That all has been read.
-    pub(crate) fn end(&self) -> Result<(), SealError> {
+    pub(crate) fn end(&self) -> Result<(), EnvelopeError> {
         if self.0.is_empty() {
             Ok(())
         } else {
-            Err(SealError::Damaged)
+            Err(EnvelopeError::Damaged)
         }
     }
 
-    pub(crate) fn number(&mut self) -> Result<u64, SealError> {
+    pub(crate) fn number(&mut self) -> Result<u64, EnvelopeError> {
         self.take().map(u64::from_le_bytes)
     }
 
-    pub(crate) fn float(&mut self) -> Result<f64, SealError> {
+    pub(crate) fn float(&mut self) -> Result<f64, EnvelopeError> {
         self.number().map(f64::from_bits)
     }
 
-    pub(crate) fn count(&mut self) -> Result<usize, SealError> {
-        usize::try_from(self.number()?).map_err(|_| SealError::Damaged)
+    pub(crate) fn count(&mut self) -> Result<usize, EnvelopeError> {
+        usize::try_from(self.number()?).map_err(|_| EnvelopeError::Damaged)
     }
 
-    pub(crate) fn single(&mut self) -> Result<f32, SealError> {
+    pub(crate) fn single(&mut self) -> Result<f32, EnvelopeError> {
         self.take().map(f32::from_le_bytes)
     }
 
     /// How many things of `bytes` each follow: never more than there are bytes for.
-    pub(crate) fn count_of(&mut self, bytes: usize) -> Result<usize, SealError> {
+    pub(crate) fn count_of(&mut self, bytes: usize) -> Result<usize, EnvelopeError> {
         let count = self.count()?;
         match count.checked_mul(bytes) {
             Some(needed) if needed <= self.0.len() => Ok(count),
-            _ => Err(SealError::Damaged),
+            _ => Err(EnvelopeError::Damaged),
         }
     }
 
-    pub(crate) fn parameters(&mut self) -> Result<Parameters, SealError> {
+    pub(crate) fn parameters(&mut self) -> Result<Parameters, EnvelopeError> {
         if self.0.len() < PARAMETERS_BYTES {
-            return Err(SealError::Damaged);
+            return Err(EnvelopeError::Damaged);
         }
         let mut parameters = Parameters::zeros();
         for value in parameters.as_mut_slice() {

@@ -27,7 +27,7 @@ pub enum Interrupt {
 }
 
 /// Looked at before every iteration; every method has a default that asks for nothing.
-pub trait Watch: Sync {
+pub trait Control: Sync {
     /// Seconds since a fixed moment; constant where nobody keeps time.
     fn seconds(&self) -> f64 {
         0.0
@@ -54,12 +54,12 @@ pub trait Watch: Sync {
 }
 
 /// The watch's wish to end, as an error.
-pub(crate) fn check(watch: &dyn Watch) -> Result<(), Interrupt> {
-    watch.interrupt().map_or(Ok(()), Err)
+pub(crate) fn check(control: &dyn Control) -> Result<(), Interrupt> {
+    control.interrupt().map_or(Ok(()), Err)
 }
 
 /// A watch that keeps no time and never interrupts.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Unwatched;
+pub struct Uncontrolled;
 
-impl Watch for Unwatched {}
+impl Control for Uncontrolled {}

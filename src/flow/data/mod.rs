@@ -8,13 +8,13 @@ mod oriented_box;
 mod point;
 mod rng;
 
-pub use codec::SealError;
-pub use control::{Interrupt, Progress, Unwatched, Watch};
+pub use codec::EnvelopeError;
+pub use control::{Control, Interrupt, Progress, Uncontrolled};
 pub use dense_cloud::DenseCloud;
-pub use oriented_box::Bounds;
+pub use oriented_box::OrientedBox;
 pub use point::{DYNAMIC_M, MIN_POINTS, Point, RigidTransform};
 
-pub(crate) use codec::{Body, Hash, PARAMETERS_BYTES, Seal, put_parameters};
+pub(crate) use codec::{Body, Envelope, Hash, PARAMETERS_BYTES, put_parameters};
 pub(crate) use lazy::get_or_compute;
-pub(crate) use point::{all_moved, evenly, floor, moved, square_distance};
+pub(crate) use point::{floor, square_distance, stride_sample, transform_point, transform_points};
 pub(crate) use rng::Random;

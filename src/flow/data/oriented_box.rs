@@ -12,7 +12,7 @@ const MOST_EDGES: usize = 256;
 
 /// A box that stands upright.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Bounds {
+pub struct OrientedBox {
     /// Its middle, metres.
     pub center: Point,
     /// Length, width and height, metres.
@@ -21,7 +21,7 @@ pub struct Bounds {
     pub yaw: f32,
 }
 
-impl Bounds {
+impl OrientedBox {
     /// Around `points`, one at least, metres. The length is along the longer side and points forward,
     /// or, where the points move by `way`, along the side nearest to that.
     pub(crate) fn around(points: &[Point], way: Option<[f32; 2]>) -> Self {
@@ -153,7 +153,7 @@ mod tests {
         const FREE_M: f32 = 0.1;
         const TURN: f32 = 0.03;
         for yaw in [0.0, 0.4, -1.2] {
-            let bounds = Bounds::around(&car(yaw), None);
+            let bounds = OrientedBox::around(&car(yaw), None);
             for (found, true_) in bounds.center.iter().zip([20.0, -5.0, 0.0]) {
                 assert!(close(*found, true_, FREE_M), "{bounds:?}");
             }
@@ -167,15 +167,15 @@ mod tests {
     #[test]
     fn a_box_of_what_moves_points_where_it_goes() {
         const TURN: f32 = 0.03;
-        let backward = Bounds::around(&car(0.4), Some([-1.0, -0.35]));
+        let backward = OrientedBox::around(&car(0.4), Some([-1.0, -0.35]));
         assert!(close(backward.yaw, 0.4 - PI, TURN), "{backward:?}");
         assert!(backward.size[0] > backward.size[1]);
         for yaw in [0.15, -0.15] {
-            let bounds = Bounds::around(&car(yaw), Some([-1.0, 0.0]));
+            let bounds = OrientedBox::around(&car(yaw), Some([-1.0, 0.0]));
             let expected = yaw as f32 - PI * (yaw as f32).signum();
             assert!(close(bounds.yaw, expected, TURN), "{bounds:?}");
         }
-        let sideways = Bounds::around(&car(0.4), Some([-0.35, 1.0]));
+        let sideways = OrientedBox::around(&car(0.4), Some([-0.35, 1.0]));
         assert!(close(sideways.yaw, 0.4 + FRAC_PI_2, TURN), "{sideways:?}");
         assert!(sideways.size[0] < sideways.size[1]);
     }
@@ -188,16 +188,16 @@ mod tests {
             [3.0 * cos, 3.0 * sin, 0.0].map(|c| c as f32)
         };
         let ring: Vec<Point> = (0..100_000).map(point).collect();
-        let [length, width, _] = Bounds::around(&ring, None).size;
+        let [length, width, _] = OrientedBox::around(&ring, None).size;
         assert!(close(length, 6.0, ROUND) && close(width, 6.0, ROUND));
     }
 
     #[test]
     fn few_points_and_points_on_a_line_have_boxes_too() {
-        let one = Bounds::around(&[[1.0, 2.0, 3.0]], None);
+        let one = OrientedBox::around(&[[1.0, 2.0, 3.0]], None);
         assert_eq!((one.center, one.size), ([1.0, 2.0, 3.0], [0.0; 3]));
         let line: Vec<Point> = (0..5).map(|i| [i as f32, i as f32, 0.0]).collect();
-        let line = Bounds::around(&line, None);
+        let line = OrientedBox::around(&line, None);
         assert!(close(line.size[0], 4.0 * 2.0_f32.sqrt(), 1e-5), "{line:?}");
         assert!(close(line.size[1], 0.0, 1e-5), "{line:?}");
         assert!(close(line.yaw, PI / 4.0, 1e-5), "{line:?}");

@@ -10,7 +10,7 @@ pub type RigidTransform = nalgebra::Isometry3<f64>;
 pub const DYNAMIC_M: f32 = 0.05;
 
 /// `point`, moved rigidly: computed in double precision.
-pub(crate) fn moved(motion: &RigidTransform, point: Point) -> Point {
+pub(crate) fn transform_point(motion: &RigidTransform, point: Point) -> Point {
     let moved = motion * nalgebra::Point3::from(point.map(f64::from));
     [moved.x as f32, moved.y as f32, moved.z as f32]
 }
@@ -37,14 +37,17 @@ pub(crate) fn floor(value: f32) -> f32 {
 }
 
 /// At most `most` of the points, or of anything else, evenly.
-pub(crate) fn evenly<T: Copy>(all: &[T], most: usize) -> Vec<T> {
+pub(crate) fn stride_sample<T: Copy>(all: &[T], most: usize) -> Vec<T> {
     let kept = all.len().min(most);
     (0..kept).map(|i| all[i * all.len() / kept]).collect()
 }
 
 /// All points, moved rigidly.
-pub(crate) fn all_moved(motion: &RigidTransform, points: &[Point]) -> Vec<Point> {
-    points.iter().map(|&point| moved(motion, point)).collect()
+pub(crate) fn transform_points(motion: &RigidTransform, points: &[Point]) -> Vec<Point> {
+    points
+        .iter()
+        .map(|&point| transform_point(motion, point))
+        .collect()
 }
 
 /// Fewer points than this in a cloud determine no motion.
@@ -79,9 +82,12 @@ mod tests {
     #[test]
     fn some_of_the_points_are_spread_over_all_of_them() {
         let points: Vec<Point> = (0..10).map(|i| [i as f32, 0.0, 0.0]).collect();
-        let kept: Vec<f32> = evenly(&points, 4).iter().map(|point| point[0]).collect();
+        let kept: Vec<f32> = stride_sample(&points, 4)
+            .iter()
+            .map(|point| point[0])
+            .collect();
         assert_eq!(kept, [0.0, 2.0, 5.0, 7.0]);
-        assert_eq!(evenly(&points, 20), points);
-        assert_eq!(evenly::<Point>(&[], 5), [[0.0; 3]; 0]);
+        assert_eq!(stride_sample(&points, 20), points);
+        assert_eq!(stride_sample::<Point>(&[], 5), [[0.0; 3]; 0]);
     }
 }

@@ -1,10 +1,10 @@
 //! TODO doc
 
-use super::advect::{By, Carried};
-use super::plan::{Later, Leg, Plan};
-use crate::flow::data::{DenseCloud, Interrupt, RigidTransform, Watch, control};
+use super::advect::{Context, PropagatedCloud};
+use super::plan::{FlowEdge, LaterSweeps, Plan};
+use crate::flow::data::{Control, DenseCloud, Interrupt, RigidTransform, control};
 use crate::flow::field::{Backend, BackendError};
-use crate::flow::motion::{Field, Residual};
+use crate::flow::motion::{MotionField, Residual};
 use crate::flow::sequence::Sweep;
 
 /// Why there is no dense cloud.
@@ -20,7 +20,7 @@ pub enum DensifyError {
     },
     /// A field of the plan is missing.
     #[error("no field from sweep {} to sweep {}", .0.source, .0.target)]
-    NoField(Leg),
+    NoField(FlowEdge),
     /// A sweep's mask has another length than the sweep.
     #[error("sweep {0}: the ground mask has another number of rows than the sweep")]
     Mask(usize),
@@ -33,7 +33,7 @@ pub enum DensifyError {
 }
 
 /// Carries the points of all `sweeps` as `plan` says, through the fields that `field` gives for each of
-/// [`Plan::legs`]. Points that are not finite, or 1,000 km away, are left out. A sweep's ground mask, where it has one,
+/// [`Plan::edges`]. Points that are not finite, or 1,000 km away, are left out. A sweep's ground mask, where it has one,
 /// names points that never move of themselves.
 ///
 /// # Errors
@@ -42,8 +42,8 @@ pub fn densify<'a>(
     backend: &dyn Backend,
     plan: &Plan,
     sweeps: &[Sweep],
-    field: impl Fn(Leg) -> Option<&'a Field>,
-    watch: &dyn Watch,
+    field: impl Fn(FlowEdge) -> Option<&'a MotionField>,
+    control: &dyn Control,
 ) -> Result<DenseCloud, DensifyError> {
     if sweeps.len() != plan.sweeps {
         return Err(DensifyError::Sweeps {
@@ -56,15 +56,15 @@ pub fn densify<'a>(
         return Err(DensifyError::Mask(place));
     }
     let field = |source: usize, target: usize| {
-        let leg = Leg { source, target };
-        field(leg).ok_or(DensifyError::NoField(leg))
+        let edge = FlowEdge { source, target };
+        field(edge).ok_or(DensifyError::NoField(edge))
     };
-    let by = By { backend, watch };
-    let checked = || control::check(watch).map_err(DensifyError::Interrupted);
+    let by = Context { backend, control };
+    let checked = || control::check(control).map_err(DensifyError::Interrupted);
 
     // Sweeps up to the anchor, forward.
     let (anchor, substeps) = (plan.anchor, plan.substeps);
-    let mut earlier = Carried::default();
+    let mut earlier = PropagatedCloud::default();
     for (place, sweep) in sweeps[..=anchor].iter().enumerate() {
         checked()?;
         if place > 0 {
@@ -78,13 +78,13 @@ pub fn densify<'a>(
     } else {
         anchor
     };
-    let mut later = Carried::default();
+    let mut later = PropagatedCloud::default();
     for place in (first..plan.sweeps).rev() {
         checked()?;
         if place + 1 < plan.sweeps {
             match plan.later {
-                Later::Reverse => later.step(by, field(place + 1, place)?, substeps)?,
-                Later::Inverse => later.invert(by, field(place, place + 1)?)?,
+                LaterSweeps::Reverse => later.step(by, field(place + 1, place)?, substeps)?,
+                LaterSweeps::Inverse => later.invert(by, field(place, place + 1)?)?,
             }
         }
         if place > anchor {
@@ -100,11 +100,11 @@ pub fn densify<'a>(
         earlier.part_step(by, ahead, plan.fraction)?;
         earlier.transform(&(instant * step.inverse()));
         match plan.later {
-            Later::Reverse => {
+            LaterSweeps::Reverse => {
                 let back = field(anchor + 1, anchor)?;
                 later.part_step(by, back, 1.0 - plan.fraction)?;
             }
-            Later::Inverse => {
+            LaterSweeps::Inverse => {
                 later.invert(by, ahead)?;
                 later.part_step(by, ahead, plan.fraction)?;
                 later.transform(&step.inverse());
@@ -117,8 +117,11 @@ pub fn densify<'a>(
 
 /// What carries points through `fields`, as reports show it: the device where one of them is a network,
 /// else the host's threads.
-pub fn carrier<'a>(backend: &dyn Backend, fields: impl IntoIterator<Item = &'a Field>) -> String {
-    let is_network = |field: &Field| matches!(field.residual, Residual::Network(_));
+pub fn carrier<'a>(
+    backend: &dyn Backend,
+    fields: impl IntoIterator<Item = &'a MotionField>,
+) -> String {
+    let is_network = |field: &MotionField| matches!(field.residual, Residual::Network(_));
     if fields.into_iter().any(is_network) {
         backend.name()
     } else {

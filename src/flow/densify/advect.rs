@@ -1,9 +1,11 @@
 //! Points on their way from their own sweeps' frames to another. Knows fields, and no sequences.
 
 use super::accumulate::DensifyError;
-use crate::flow::data::{DYNAMIC_M, DenseCloud, Point, RigidTransform, Watch, all_moved, control};
+use crate::flow::data::{
+    Control, DYNAMIC_M, DenseCloud, Point, RigidTransform, control, transform_points,
+};
 use crate::flow::field::{Backend, length};
-use crate::flow::motion::Field;
+use crate::flow::motion::MotionField;
 use crate::flow::sequence::Sweep;
 
 /// An inverse has settled where its last correction is shorter than this, metres.
@@ -18,7 +20,7 @@ const PIECE: usize = 1 << 17;
 
 /// Points of several sweeps, all in one frame.
 #[derive(Default)]
-pub(super) struct Carried {
+pub(super) struct PropagatedCloud {
     points: Vec<Point>,
     frame: Vec<u32>,
     /// What never moves of itself.
@@ -27,7 +29,7 @@ pub(super) struct Carried {
     converged: Vec<bool>,
 }
 
-impl Carried {
+impl PropagatedCloud {
     /// Takes the finite points of the sweep whose frame this is.
     pub(super) fn take(&mut self, place: usize, sweep: &Sweep) {
         for (row, point) in sweep.points.iter().enumerate() {
@@ -45,13 +47,13 @@ impl Carried {
     /// Euler's step from the field's source frame to its target's, in parts.
     pub(super) fn step(
         &mut self,
-        by: By<'_>,
-        field: &Field,
+        by: Context<'_>,
+        field: &MotionField,
         substeps: usize,
     ) -> Result<(), DensifyError> {
         self.points = field.static_places(&self.points);
         for _ in 0..substeps {
-            self.drift(by, field, 1.0 / substeps as f32)?;
+            self.advect(by, field, 1.0 / substeps as f32)?;
         }
         Ok(())
     }
@@ -59,16 +61,21 @@ impl Carried {
     /// A step that ends after `share` of the time, still in the target's frame.
     pub(super) fn part_step(
         &mut self,
-        by: By<'_>,
-        field: &Field,
+        by: Context<'_>,
+        field: &MotionField,
         share: f64,
     ) -> Result<(), DensifyError> {
         self.points = field.static_places(&self.points);
-        self.drift(by, field, share as f32)
+        self.advect(by, field, share as f32)
     }
 
     /// Moves what moves of itself by `share` of what the field says where it is now.
-    fn drift(&mut self, by: By<'_>, field: &Field, share: f32) -> Result<(), DensifyError> {
+    fn advect(
+        &mut self,
+        by: Context<'_>,
+        field: &MotionField,
+        share: f32,
+    ) -> Result<(), DensifyError> {
         let rows = self.movable();
         let places: Vec<Point> = rows.iter().map(|&row| self.points[row]).collect();
         let residual = by.motion(field, &places)?;
@@ -89,7 +96,11 @@ impl Carried {
 
     /// From the field's target frame back to its source's: the fixed point of `z = y - g(z)` for
     /// each place y, where z is its static place.
-    pub(super) fn invert(&mut self, by: By<'_>, field: &Field) -> Result<(), DensifyError> {
+    pub(super) fn invert(
+        &mut self,
+        by: Context<'_>,
+        field: &MotionField,
+    ) -> Result<(), DensifyError> {
         let mut rows = self.movable();
         let ends = self.points.clone();
         for _ in 0..CORRECTIONS {
@@ -125,7 +136,7 @@ impl Carried {
 
     /// Moves all points rigidly.
     pub(super) fn transform(&mut self, motion: &RigidTransform) {
-        self.points = all_moved(motion, &self.points);
+        self.points = transform_points(motion, &self.points);
     }
 
     /// These points and those, as the cloud of the instant `into`.
@@ -157,19 +168,19 @@ impl Carried {
 
 /// What computes, and who looks in on it.
 #[derive(Clone, Copy)]
-pub(super) struct By<'a> {
+pub(super) struct Context<'a> {
     pub(super) backend: &'a dyn Backend,
-    pub(super) watch: &'a dyn Watch,
+    pub(super) control: &'a dyn Control,
 }
 
-impl By<'_> {
+impl Context<'_> {
     /// What the field moves at the static places, metres: nothing where that is less than counts as
     /// motion, so that the static world stands still. Without an ego motion the field moves that too,
     /// and all of it counts. Looks at the watch between pieces.
-    fn motion(self, field: &Field, places: &[Point]) -> Result<Vec<Point>, DensifyError> {
+    fn motion(self, field: &MotionField, places: &[Point]) -> Result<Vec<Point>, DensifyError> {
         let mut residual = Vec::with_capacity(places.len());
         for piece in places.chunks(PIECE) {
-            control::check(self.watch).map_err(DensifyError::Interrupted)?;
+            control::check(self.control).map_err(DensifyError::Interrupted)?;
             residual.extend(field.residual(self.backend, piece)?);
         }
         if field.ego.is_some() {

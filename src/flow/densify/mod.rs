@@ -15,4 +15,4 @@ mod plan;
 mod tests;
 
 pub use accumulate::{DensifyError, carrier, densify};
-pub use plan::{Later, Leg, Plan, PlanError};
+pub use plan::{FlowEdge, LaterSweeps, Plan, PlanError};

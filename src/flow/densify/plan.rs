@@ -3,7 +3,7 @@
 
 /// How sweeps after the frame are carried into it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Later {
+pub enum LaterSweeps {
     /// Through fields that are fitted backward in time, from each sweep to the one before.
     #[default]
     Reverse,
@@ -14,7 +14,7 @@ pub enum Later {
 
 /// A pair to be fitted: places of its sweeps in the sequence.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct Leg {
+pub struct FlowEdge {
     /// The sweep whose points the field moves.
     pub source: usize,
     /// The sweep whose time they are moved to: the one after, or before.
@@ -51,7 +51,7 @@ pub struct Plan {
     pub(super) anchor: usize,
     /// How far the instant lies behind it, 0 to 1, in sweeps.
     pub(super) fraction: f64,
-    pub(super) later: Later,
+    pub(super) later: LaterSweeps,
     pub(super) substeps: usize,
 }
 
@@ -61,7 +61,12 @@ impl Plan {
     ///
     /// # Errors
     /// [`PlanError`] where there is no such instant.
-    pub fn new(sweeps: usize, into: f64, later: Later, substeps: usize) -> Result<Self, PlanError> {
+    pub fn new(
+        sweeps: usize,
+        into: f64,
+        later: LaterSweeps,
+        substeps: usize,
+    ) -> Result<Self, PlanError> {
         if sweeps < 2 {
             return Err(PlanError::TooFewSweeps(sweeps));
         }
@@ -88,12 +93,12 @@ impl Plan {
     }
 
     /// All fits that are needed.
-    pub fn legs(&self) -> Vec<Leg> {
+    pub fn edges(&self) -> Vec<FlowEdge> {
         self.chains().concat()
     }
 
     /// The fits that are needed, as two sequences: forward in time, and backward from the end.
-    pub fn chains(&self) -> [Vec<Leg>; 2] {
+    pub fn chains(&self) -> [Vec<FlowEdge>; 2] {
         let last = self.sweeps - 1;
         // The sweep that those of before are carried to, and the one from which those of after are.
         let before = if self.fraction > 0.0 {
@@ -102,18 +107,18 @@ impl Plan {
             self.anchor
         };
         let forward = match self.later {
-            Later::Reverse => before,
-            Later::Inverse => last,
+            LaterSweeps::Reverse => before,
+            LaterSweeps::Inverse => last,
         };
-        let ahead = (0..forward).map(|source| Leg {
+        let ahead = (0..forward).map(|source| FlowEdge {
             source,
             target: source + 1,
         });
         let back = match self.later {
-            Later::Reverse => self.anchor..last,
-            Later::Inverse => 0..0,
+            LaterSweeps::Reverse => self.anchor..last,
+            LaterSweeps::Inverse => 0..0,
         };
-        let back = back.rev().map(|target| Leg {
+        let back = back.rev().map(|target| FlowEdge {
             source: target + 1,
             target,
         });
@@ -125,42 +130,48 @@ impl Plan {
 mod tests {
     use super::*;
 
-    fn legs(sweeps: usize, into: f64, later: Later) -> Vec<(usize, usize)> {
+    fn edges(sweeps: usize, into: f64, later: LaterSweeps) -> Vec<(usize, usize)> {
         let plan = Plan::new(sweeps, into, later, 1).expect("a plan");
-        let legs = plan.legs();
-        legs.iter().map(|leg| (leg.source, leg.target)).collect()
+        let edges = plan.edges();
+        edges
+            .iter()
+            .map(|edge| (edge.source, edge.target))
+            .collect()
     }
 
     #[test]
     fn sweeps_before_go_forward_and_sweeps_after_go_back() {
         assert_eq!(
-            legs(5, 2.0, Later::Reverse),
+            edges(5, 2.0, LaterSweeps::Reverse),
             [(0, 1), (1, 2), (4, 3), (3, 2)]
         );
         assert_eq!(
-            legs(4, 1.5, Later::Reverse),
+            edges(4, 1.5, LaterSweeps::Reverse),
             [(0, 1), (1, 2), (3, 2), (2, 1)]
         );
-        assert_eq!(legs(4, 1.0, Later::Inverse), [(0, 1), (1, 2), (2, 3)]);
-        assert_eq!(legs(3, 2.0, Later::Reverse), [(0, 1), (1, 2)]);
-        assert_eq!(legs(3, 0.0, Later::Reverse), [(2, 1), (1, 0)]);
+        assert_eq!(
+            edges(4, 1.0, LaterSweeps::Inverse),
+            [(0, 1), (1, 2), (2, 3)]
+        );
+        assert_eq!(edges(3, 2.0, LaterSweeps::Reverse), [(0, 1), (1, 2)]);
+        assert_eq!(edges(3, 0.0, LaterSweeps::Reverse), [(2, 1), (1, 0)]);
     }
 
     #[test]
     fn instants_outside_the_sequence_are_refused() {
         for into in [-0.5, 4.1, f64::NAN, f64::INFINITY] {
-            let refused = Plan::new(5, into, Later::Reverse, 1);
+            let refused = Plan::new(5, into, LaterSweeps::Reverse, 1);
             assert!(matches!(
                 refused,
                 Err(PlanError::NoSuchFrame { last: 4, .. })
             ));
         }
         assert_eq!(
-            Plan::new(1, 0.0, Later::Reverse, 1),
+            Plan::new(1, 0.0, LaterSweeps::Reverse, 1),
             Err(PlanError::TooFewSweeps(1))
         );
         assert_eq!(
-            Plan::new(2, 0.0, Later::Reverse, 0),
+            Plan::new(2, 0.0, LaterSweeps::Reverse, 0),
             Err(PlanError::Substeps(0))
         );
     }

@@ -5,9 +5,9 @@ use super::*;
 use crate::flow::cpu::CpuBackend;
 use crate::flow::data::DenseCloud;
 use crate::flow::data::RigidTransform;
-use crate::flow::data::{Point, Unwatched, moved};
+use crate::flow::data::{Point, Uncontrolled, transform_point};
 use crate::flow::field::{Conditioning, Network, Parameters, last_layer};
-use crate::flow::motion::Field;
+use crate::flow::motion::MotionField;
 use crate::flow::motion::Residual;
 use crate::flow::sequence::Sweep;
 
@@ -15,7 +15,7 @@ use crate::flow::sequence::Sweep;
 const ROUNDING_M: f32 = 1e-5;
 
 /// A field with the same flow everywhere.
-fn constant(ego: Option<RigidTransform>, flow: Point) -> Field {
+fn constant(ego: Option<RigidTransform>, flow: Point) -> MotionField {
     let mut parameters = Parameters::zeros();
     let bias = last_layer().bias;
     parameters.as_mut_slice()[bias..bias + 3].copy_from_slice(&flow);
@@ -23,7 +23,7 @@ fn constant(ego: Option<RigidTransform>, flow: Point) -> Field {
         center: [0.0; 3],
         scale: 0.1,
     };
-    Field {
+    MotionField {
         ego,
         residual: Residual::Network(Network {
             parameters,
@@ -49,12 +49,18 @@ fn drive() -> RigidTransform {
 fn dense(
     plan: &Plan,
     sweeps: &[Sweep],
-    ahead: &Field,
-    back: &Field,
+    ahead: &MotionField,
+    back: &MotionField,
 ) -> Result<DenseCloud, DensifyError> {
     let backend = CpuBackend::new(Some(1)).expect("a thread");
-    let of = |leg: Leg| Some(if leg.target > leg.source { ahead } else { back });
-    densify(&backend, plan, sweeps, of, &Unwatched)
+    let of = |edge: FlowEdge| {
+        Some(if edge.target > edge.source {
+            ahead
+        } else {
+            back
+        })
+    };
+    densify(&backend, plan, sweeps, of, &Uncontrolled)
 }
 
 /// Where a static point of sweep `frame` is seen at the instant `into`.
@@ -69,7 +75,7 @@ fn expected(point: Point, frame: usize, into: f64) -> Point {
             drive()
         };
     }
-    moved(&motion, point)
+    transform_point(&motion, point)
 }
 
 fn assert_near(found: Point, expected: Point, of: &str) {
@@ -81,13 +87,13 @@ fn assert_near(found: Point, expected: Point, of: &str) {
 
 #[test]
 fn the_static_world_lands_where_the_vehicle_sees_it_whatever_the_instant() {
-    let still = [drive(), drive().inverse()].map(|ego| Field {
+    let still = [drive(), drive().inverse()].map(|ego| MotionField {
         ego: Some(ego),
         residual: Residual::Still,
     });
     let [ahead, back] = &still;
     let sweeps = sweeps(5);
-    for later in [Later::Reverse, Later::Inverse] {
+    for later in [LaterSweeps::Reverse, LaterSweeps::Inverse] {
         for into in [0.0, 2.0, 2.25, 3.5, 4.0] {
             let plan = Plan::new(5, into, later, 2).expect("a plan");
             let cloud = dense(&plan, &sweeps, ahead, back).expect("a cloud");
@@ -117,7 +123,7 @@ fn what_moves_is_integrated_step_by_step_and_ground_is_not() {
         constant(standing, [-0.5, 0.0, 0.0]),
     );
     let sweeps = sweeps(4);
-    for later in [Later::Reverse, Later::Inverse] {
+    for later in [LaterSweeps::Reverse, LaterSweeps::Inverse] {
         for (into, substeps) in [(2.0, 1), (2.0, 4), (1.5, 1)] {
             let plan = Plan::new(4, into, later, substeps).expect("a plan");
             let cloud = dense(&plan, &sweeps, &ahead, &back).expect("a cloud");
@@ -125,10 +131,10 @@ fn what_moves_is_integrated_step_by_step_and_ground_is_not() {
                 let age = (into - f64::from(frame)) as f32;
                 let is_ground = row % 2 == 1;
                 let point = sweeps[frame as usize].points[if is_ground { 2 } else { 0 }];
-                let drift = if is_ground { 0.0 } else { 0.5 * age };
-                let expected = [point[0] + drift, point[1], point[2]];
+                let advect = if is_ground { 0.0 } else { 0.5 * age };
+                let expected = [point[0] + advect, point[1], point[2]];
                 assert_near(cloud.points[row], expected, &format!("{later:?} {into}"));
-                assert_eq!(cloud.dynamic[row], drift != 0.0);
+                assert_eq!(cloud.dynamic[row], advect != 0.0);
             }
         }
     }
@@ -138,7 +144,7 @@ fn what_moves_is_integrated_step_by_step_and_ground_is_not() {
 fn what_a_field_says_below_the_threshold_of_motion_moves_nothing() {
     let standing = Some(RigidTransform::identity());
     let noise = constant(standing, [0.02, 0.02, 0.0]);
-    let plan = Plan::new(3, 2.0, Later::Reverse, 1).expect("a plan");
+    let plan = Plan::new(3, 2.0, LaterSweeps::Reverse, 1).expect("a plan");
     let sweeps = sweeps(3);
     let cloud = dense(&plan, &sweeps, &noise, &noise).expect("a cloud");
     assert_eq!(cloud.points[0], sweeps[0].points[0]);
@@ -153,7 +159,7 @@ fn what_a_field_sends_out_of_the_world_stays_and_says_so() {
     let standing = Some(RigidTransform::identity());
     for flow in [[f32::NAN, 0.0, 0.0], [2e6, 0.0, 0.0]] {
         let wild = constant(standing, flow);
-        for later in [Later::Reverse, Later::Inverse] {
+        for later in [LaterSweeps::Reverse, LaterSweeps::Inverse] {
             let plan = Plan::new(3, 1.0, later, 1).expect("a plan");
             let sweeps = sweeps(3);
             let cloud = dense(&plan, &sweeps, &wild, &wild).expect("a cloud");
@@ -170,13 +176,13 @@ fn what_a_field_sends_out_of_the_world_stays_and_says_so() {
 #[test]
 fn missing_fields_and_sweeps_are_refused_by_name() {
     let backend = CpuBackend::new(Some(1)).expect("a thread");
-    let plan = Plan::new(3, 1.0, Later::Reverse, 1).expect("a plan");
-    let run = |sweeps: &[Sweep]| densify(&backend, &plan, sweeps, |_| None, &Unwatched);
-    let leg = Leg {
+    let plan = Plan::new(3, 1.0, LaterSweeps::Reverse, 1).expect("a plan");
+    let run = |sweeps: &[Sweep]| densify(&backend, &plan, sweeps, |_| None, &Uncontrolled);
+    let edge = FlowEdge {
         source: 0,
         target: 1,
     };
-    assert!(matches!(run(&sweeps(3)), Err(DensifyError::NoField(found)) if found == leg));
+    assert!(matches!(run(&sweeps(3)), Err(DensifyError::NoField(found)) if found == edge));
     let error = run(&sweeps(2)).expect_err("one is missing");
     assert!(matches!(
         error,

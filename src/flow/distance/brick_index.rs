@@ -5,7 +5,7 @@
 
 use super::grid::Grid;
 use super::options::DistanceError;
-use crate::flow::data::{Watch, control};
+use crate::flow::data::{Control, control};
 
 /// Vertices along a brick's edge, and bricks along a block's.
 pub(crate) const EDGE: u32 = 8;
@@ -44,7 +44,7 @@ impl Index {
         cells: &[[u32; 3]],
         band: i32,
         max_bytes: usize,
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) -> Result<Self, DistanceError> {
         let brick_counts = grid.vertices.map(|n| n.div_ceil(EDGE as usize));
         let blocks = brick_counts.map(|n| n.div_ceil(EDGE as usize));
@@ -72,7 +72,7 @@ impl Index {
         let above = |a: &[u32; 3], b: &[u32; 3]| a[..2] == b[..2] && b[2] == a[2] + 1;
         for (number, run) in cells.chunk_by(above).enumerate() {
             if number % RUNS_AT_ONCE == 0 {
-                control::check(watch)?;
+                control::check(control)?;
             }
             let needed = marks.index_bytes() + marks.active * BRICK_BYTES;
             if needed > limit_bytes {

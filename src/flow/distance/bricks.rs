@@ -14,7 +14,7 @@ use super::plan::Layout;
 use super::point_distance::{PointGather, PointSites};
 use super::transform::Sample;
 use super::vertex_distance::{CellGather, CellSites};
-use crate::flow::data::{Point, Unwatched, Watch};
+use crate::flow::data::{Control, Point, Uncontrolled};
 
 /// The transform: distances at the vertices of active bricks, and a far field.
 #[derive(Debug)]
@@ -40,10 +40,10 @@ impl Bricks {
         target: &[Point],
         options: &DistanceOptions,
     ) -> Result<Self, DistanceError> {
-        Self::build_watched(source, target, options, &Unwatched)
+        Self::build_watched(source, target, options, &Uncontrolled)
     }
 
-    /// As [`Self::build`]; looks at `watch` between pieces of some milliseconds.
+    /// As [`Self::build`]; looks at `control` between pieces of some milliseconds.
     ///
     /// # Errors
     /// As [`Self::build`], and [`DistanceError::Interrupted`].
@@ -51,7 +51,7 @@ impl Bricks {
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) -> Result<Self, DistanceError> {
         let Layout {
             grid,
@@ -59,17 +59,17 @@ impl Bricks {
             index,
             band,
             ..
-        } = Layout::plan(source, target, options, watch)?;
+        } = Layout::plan(source, target, options, control)?;
         // Before the bricks, so that what it needs meanwhile is free again.
-        let far = FarField::build(&grid, &cells, f64::from(band) * grid.cell, watch)?;
+        let far = FarField::build(&grid, &cells, f64::from(band) * grid.cell, control)?;
         let codes = match options.sites {
             Sites::Cells => {
                 let sites = CellSites::new(&cells, band);
-                fill::band_codes(&index, || CellGather::new(&sites), watch)?
+                fill::band_codes(&index, || CellGather::new(&sites), control)?
             }
             Sites::Points => {
                 let sites = PointSites::new(&grid, target, band);
-                fill::band_codes(&index, || PointGather::new(&sites), watch)?
+                fill::band_codes(&index, || PointGather::new(&sites), control)?
             }
         };
         Ok(Self {

@@ -10,7 +10,7 @@ use core::f32::consts::SQRT_2;
 use super::grid::{Grid, Lattice, trilinear};
 use super::options::{DistanceError, DistanceOptions};
 use super::transform::Sample;
-use crate::flow::data::{Interrupt, Point, Unwatched, Watch, control};
+use crate::flow::data::{Control, Interrupt, Point, Uncontrolled, control};
 
 /// Length of the diagonal of a cell.
 const SQRT_3: f32 = 1.732_050_8;
@@ -33,10 +33,10 @@ impl DenseChamfer {
         target: &[Point],
         options: &DistanceOptions,
     ) -> Result<Self, DistanceError> {
-        Self::build_watched(source, target, options, &Unwatched)
+        Self::build_watched(source, target, options, &Uncontrolled)
     }
 
-    /// As [`Self::build`]; looks at `watch` between planes.
+    /// As [`Self::build`]; looks at `control` between planes.
     ///
     /// # Errors
     /// As [`Self::build`], and [`DistanceError::Interrupted`].
@@ -44,7 +44,7 @@ impl DenseChamfer {
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) -> Result<Self, DistanceError> {
         let grid = Self::plan(source, target, options)?;
         let [nx, ny, nz] = grid.vertices;
@@ -55,8 +55,8 @@ impl DenseChamfer {
         }
         let strides = [ny * nz, nz, 1];
         for axis in 0..3 {
-            sweep(&mut distances, grid.vertices, strides, axis, false, watch)?;
-            sweep(&mut distances, grid.vertices, strides, axis, true, watch)?;
+            sweep(&mut distances, grid.vertices, strides, axis, false, control)?;
+            sweep(&mut distances, grid.vertices, strides, axis, true, control)?;
         }
         for distance in &mut distances {
             *distance *= grid.cell as f32;
@@ -129,7 +129,7 @@ fn sweep(
     strides: [usize; 3],
     axis: usize,
     back: bool,
-    watch: &dyn Watch,
+    control: &dyn Control,
 ) -> Result<(), Interrupt> {
     // z last wherever it can be: neighbors in memory are then neighbors in the plane.
     let (a, b) = [(1, 2), (0, 2), (0, 1)][axis];
@@ -142,7 +142,7 @@ fn sweep(
     let mut before = planes.empty();
     let mut current = planes.empty();
     for step in 0..counts[axis] {
-        control::check(watch)?;
+        control::check(control)?;
         let plane = if back { counts[axis] - 1 - step } else { step };
         planes.lower(
             &mut distances[plane * strides[axis]..],

@@ -10,7 +10,7 @@
 use rayon::prelude::*;
 
 use super::grid::{Grid, trilinear};
-use crate::flow::data::{Interrupt, Watch, control};
+use crate::flow::data::{Control, Interrupt, control};
 
 /// The most coarse vertices: 8 M floats are 32 MB.
 const MAX_VERTICES: usize = 8 << 20;
@@ -54,7 +54,7 @@ impl FarField {
         grid: &Grid,
         cells: &[[u32; 3]],
         band_m: f64,
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) -> Result<Self, Interrupt> {
         let (pitch, vertices) = Self::layout(grid);
         let [_, ny, nz] = vertices;
@@ -62,7 +62,7 @@ impl FarField {
         nearest.par_chunks_mut(ny * nz).try_for_each_init(
             || (Envelope::default(), vec![Nearest::NONE; ny]),
             |(envelope, line), slab| {
-                control::check(watch)?;
+                control::check(control)?;
                 for line in slab.chunks_mut(nz) {
                     envelope.transform(line);
                 }
@@ -78,7 +78,7 @@ impl FarField {
                 Ok(())
             },
         )?;
-        transform_along_x(&mut nearest, vertices, watch)?;
+        transform_along_x(&mut nearest, vertices, control)?;
         let beside = Beside {
             cells,
             pitch,
@@ -89,7 +89,7 @@ impl FarField {
         let mut distances = vec![0.0; nearest.len()];
         let slabs = distances.par_chunks_mut(ny * nz).enumerate();
         slabs.try_for_each(|(slab, distances)| {
-            control::check(watch)?;
+            control::check(control)?;
             for (at, distance) in (slab * ny * nz..).zip(distances) {
                 *distance = beside.distance(at, band) * grid.cell as f32;
             }
@@ -199,11 +199,11 @@ fn length(a: [u32; 3], b: [u32; 3]) -> f32 {
 fn transform_along_x(
     nearest: &mut [Nearest],
     [nx, ny, nz]: [usize; 3],
-    watch: &dyn Watch,
+    control: &dyn Control,
 ) -> Result<(), Interrupt> {
     let mut columns = vec![Nearest::NONE; nz * nx];
     for y in 0..ny {
-        control::check(watch)?;
+        control::check(control)?;
         let row = |x: usize| (x * ny + y) * nz..(x * ny + y + 1) * nz;
         for x in 0..nx {
             for (z, &nearest) in nearest[row(x)].iter().enumerate() {

@@ -6,7 +6,7 @@ use super::coarse_field::FarField;
 use super::options::{DistanceError, DistanceOptions, Metric, Sites};
 use super::plan::Layout;
 use super::transform::DistanceTransform;
-use crate::flow::data::{Point, Unwatched};
+use crate::flow::data::{Point, Uncontrolled};
 
 /// Multiply-adds of the network that take as long as a brick with a band of 20 cells, to cells.
 const BRICK: f64 = 3.4e5;
@@ -52,7 +52,7 @@ impl DistanceTransform {
                 multiply_adds: cells as f64 * DENSE_CELL,
             });
         }
-        let layout = Layout::plan(source, target, options, &Unwatched)?;
+        let layout = Layout::plan(source, target, options, &Uncontrolled)?;
         let bricks = layout.index.active;
         let far = FarField::vertices_over(&layout.grid);
         let bytes = layout.index.bytes() + bricks * BRICK_BYTES + far * size_of::<f32>();

@@ -9,7 +9,7 @@ use core::ops::Range;
 use rayon::prelude::*;
 
 use super::brick_index::{ABSENT, EDGE, Index, VOLUME};
-use crate::flow::data::{Interrupt, Watch, control};
+use crate::flow::data::{Control, Interrupt, control};
 
 /// Marks a vertex of an active brick that lies beyond the band.
 pub(super) const BEYOND: u16 = u16::MAX;
@@ -38,7 +38,7 @@ pub(crate) fn codes_per_cell(band: i32) -> f64 {
 pub(super) fn band_codes<G: Gather>(
     index: &Index,
     gather: impl Fn() -> G + Send + Sync,
-    watch: &dyn Watch,
+    control: &dyn Control,
 ) -> Result<Vec<u16>, Interrupt> {
     let mut codes = vec![0u16; index.active * VOLUME];
     let mut rest = codes.as_mut_slice();
@@ -53,7 +53,7 @@ pub(super) fn band_codes<G: Gather>(
     blocks
         .into_par_iter()
         .try_for_each_init(gather, |gather, (block, bricks, own)| {
-            control::check(watch)?;
+            control::check(control)?;
             fill_block(gather, block, bricks, own);
             Ok(())
         })?;

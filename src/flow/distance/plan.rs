@@ -6,7 +6,7 @@ use super::grid::Grid;
 use super::options::{DistanceError, DistanceOptions, Sites};
 use super::point_distance::PointSites;
 use super::vertex_distance::CellSites;
-use crate::flow::data::{Point, Watch};
+use crate::flow::data::{Control, Point};
 
 /// The plan of a transform.
 pub(crate) struct Layout {
@@ -29,7 +29,7 @@ impl Layout {
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) -> Result<Self, DistanceError> {
         options.check()?;
         let grid = Grid::covering(source, target, options.cell_m)?;
@@ -41,7 +41,7 @@ impl Layout {
         });
         cells.dedup();
         let band = options.band_cells();
-        let index = Index::activate(&grid, &cells, band, options.max_bytes, watch)?;
+        let index = Index::activate(&grid, &cells, band, options.max_bytes, control)?;
         let sites = match options.sites {
             Sites::Cells => CellSites::bytes(cells.len(), band),
             Sites::Points => PointSites::bytes(target.len()),

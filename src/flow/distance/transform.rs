@@ -3,7 +3,7 @@
 use super::bricks::Bricks;
 use super::chamfer::DenseChamfer;
 use super::options::{DistanceError, DistanceOptions, Metric};
-use crate::flow::data::{Point, Unwatched, Watch};
+use crate::flow::data::{Control, Point, Uncontrolled};
 
 /// The distance at a point and how it changes with the point.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -34,10 +34,10 @@ impl DistanceTransform {
         target: &[Point],
         options: &DistanceOptions,
     ) -> Result<Self, DistanceError> {
-        Self::build_watched(source, target, options, &Unwatched)
+        Self::build_watched(source, target, options, &Uncontrolled)
     }
 
-    /// As [`Self::build`]; looks at `watch` between pieces of some milliseconds.
+    /// As [`Self::build`]; looks at `control` between pieces of some milliseconds.
     ///
     /// # Errors
     /// As [`Self::build`], and [`DistanceError::Interrupted`].
@@ -45,15 +45,15 @@ impl DistanceTransform {
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) -> Result<Self, DistanceError> {
         Ok(match options.metric {
             Metric::Euclidean => {
-                Self::Bricks(Bricks::build_watched(source, target, options, watch)?)
+                Self::Bricks(Bricks::build_watched(source, target, options, control)?)
             }
-            Metric::Chamfer => {
-                Self::Chamfer(DenseChamfer::build_watched(source, target, options, watch)?)
-            }
+            Metric::Chamfer => Self::Chamfer(DenseChamfer::build_watched(
+                source, target, options, control,
+            )?),
         })
     }
 

@@ -1,13 +1,15 @@
 //! TODO doc
 
-use crate::flow::data::{DYNAMIC_M, Interrupt, Point, RigidTransform, Watch, all_moved, moved};
+use crate::flow::data::{
+    Control, DYNAMIC_M, Interrupt, Point, RigidTransform, transform_point, transform_points,
+};
 use crate::flow::error::FlowError;
 use crate::flow::field::{
-    Advance, Backend, BackendError, Loop, Network, Pace, Prepared, Report, Snapshot, TrainerState,
-    budget, length, warm_start,
+    Advance, Backend, BackendError, FitReport, Loop, Network, Prepared, Snapshot, Throughput,
+    TrainerState, budget, length, warm_start,
 };
-use crate::flow::motion::{Field, Residual};
-use crate::flow::objects::{Clouds, Labelled, Objects, confidence_of_ground};
+use crate::flow::motion::{MotionField, Residual};
+use crate::flow::objects::{ObjectSearch, Objects, SearchClouds, confidence_of_ground};
 use crate::flow::options::{Ego, Options, Precision};
 use crate::flow::registration::neighbors;
 use crate::flow::select;
@@ -53,7 +55,7 @@ pub struct Estimate {
     /// Bytes of the distance transform.
     pub distance_bytes: usize,
     /// The motion everywhere, not at the source's points alone.
-    pub field: Field,
+    pub field: MotionField,
 }
 
 /// Why an optimization ended.
@@ -101,9 +103,9 @@ pub fn estimate(
     backend: &dyn Backend,
     problem: &Problem,
     options: &Options,
-    watch: &dyn Watch,
+    control: &dyn Control,
 ) -> Result<Estimate, FlowError> {
-    solve(backend, problem, options, None, watch)
+    solve(backend, problem, options, None, control)
 }
 
 /// Goes on where `snapshot` was taken, and ends as [`estimate`] would have, bit for bit.
@@ -115,9 +117,9 @@ pub fn resume(
     problem: &Problem,
     options: &Options,
     snapshot: Snapshot,
-    watch: &dyn Watch,
+    control: &dyn Control,
 ) -> Result<Estimate, FlowError> {
-    solve(backend, problem, options, Some(snapshot), watch)
+    solve(backend, problem, options, Some(snapshot), control)
 }
 
 fn solve(
@@ -125,9 +127,9 @@ fn solve(
     problem: &Problem,
     options: &Options,
     snapshot: Option<Snapshot>,
-    watch: &dyn Watch,
+    control: &dyn Control,
 ) -> Result<Estimate, FlowError> {
-    let began = watch.seconds();
+    let began = control.seconds();
     let find_ground = |sweeps: &[&[Point]]| backend.host().ground(sweeps);
     let selection = select::select(problem, options, &find_ground)?;
     // Without a warm start pairs are independent: of each other, and of the order they are done in.
@@ -137,18 +139,18 @@ fn solve(
         .map(|snapshot| snapshot.state_for(&selection, options, before))
         .transpose()?;
     let prepared = match &options.label {
-        None => budget::prepare(backend, &selection, options, &prior, watch)?,
+        None => budget::prepare(backend, &selection, options, &prior, control)?,
         Some(_) => None,
     };
     let ego = match &prepared {
         Some(prepared) => prepared.ego,
-        None => budget::ego_alone(backend, &selection, options, &prior, watch),
+        None => budget::ego_alone(backend, &selection, options, &prior, control),
     };
     let aligned = match &ego {
         None => selection.source.clone(),
-        Some(motion) => all_moved(motion, &selection.source),
+        Some(motion) => transform_points(motion, &selection.source),
     };
-    if watch.interrupt() == Some(Interrupt::Cancelled) {
+    if control.interrupt() == Some(Interrupt::Cancelled) {
         return Err(FlowError::Cancelled);
     }
     let mut objects = None;
@@ -160,19 +162,19 @@ fn solve(
         (Some(label), _) => {
             let around = match &ego {
                 Some(ego) => {
-                    neighbors::aligned(backend, problem, options, ego, label.frames, watch)?
+                    neighbors::aligned(backend, problem, options, ego, label.frames, control)?
                 }
                 None => Vec::new(),
             };
-            let precomputed = watch.seconds();
-            let clouds = Clouds {
+            let precomputed = control.seconds();
+            let clouds = SearchClouds {
                 source: &aligned,
                 target: &selection.target,
                 around: &around,
                 sweeps: [problem.source, problem.target],
                 target_from_source: ego.unwrap_or_default(),
             };
-            let labelled = backend.host().movers(&clouds, label, watch);
+            let labelled = backend.host().find_objects(&clouds, label, control);
             backend.host().threads().install(|| {
                 objects = Some(Objects::new(
                     problem.source.len(),
@@ -184,7 +186,7 @@ fn solve(
                 Fitted::of_movers(labelled, &aligned, precomputed)
             })?
         }
-        (None, None) => Fitted::nothing(aligned.len(), watch),
+        (None, None) => Fitted::nothing(aligned.len(), control),
         (None, Some(prepared)) => Fit {
             backend,
             before,
@@ -192,7 +194,7 @@ fn solve(
             aligned: &aligned,
             asked: options,
             prepared,
-            watch,
+            control,
         }
         .run(state)?,
     };
@@ -200,7 +202,7 @@ fn solve(
     let mut flow = vec![[0.0; 3]; problem.source.len()];
     let mut valid = vec![false; problem.source.len()];
     let mut dynamic = ego.map(|_| vec![false; problem.source.len()]);
-    for &i in &selection.answered {
+    for &i in &selection.output_rows {
         let row = selection.rows[i];
         let (from, to, residual) = (selection.source[i], aligned[i], fitted.residual[i]);
         flow[row] = core::array::from_fn(|a| (to[a] - from[a]) + residual[a]);
@@ -213,8 +215,11 @@ fn solve(
     // Where there was no time for an ego motion they stand still, as everything else does.
     if options.ego != Ego::Off {
         let motion = ego.unwrap_or_default();
-        for &row in &selection.carried {
-            let (from, to) = (problem.source[row], moved(&motion, problem.source[row]));
+        for &row in &selection.ego_only_rows {
+            let (from, to) = (
+                problem.source[row],
+                transform_point(&motion, problem.source[row]),
+            );
             flow[row] = core::array::from_fn(|a| to[a] - from[a]);
             valid[row] = true;
             if let Some(objects) = &mut objects {
@@ -227,14 +232,14 @@ fn solve(
     }
     let report = fitted.report;
     let precompute = fitted.precomputed - began;
-    let total = watch.seconds() - began;
+    let total = control.seconds() - began;
     Ok(Estimate {
         flow,
         valid,
         dynamic,
         objects,
         ego,
-        points: selection.answered.len(),
+        points: selection.output_rows.len(),
         max_iterations: fitted.max_iterations,
         iterations: report.iterations,
         best_iteration: report.best_iteration,
@@ -251,7 +256,7 @@ fn solve(
             total,
         },
         distance_bytes: prepared.map_or(0, |prepared| prepared.transform.bytes()),
-        field: Field {
+        field: MotionField {
             ego,
             residual: fitted.field,
         },
@@ -261,20 +266,20 @@ fn solve(
 /// One fit of a field to what is prepared.
 struct Fit<'a> {
     backend: &'a dyn Backend,
-    before: Option<&'a Field>,
+    before: Option<&'a MotionField>,
     selection: &'a Selection,
     /// The source, the ego motion taken out.
     aligned: &'a [Point],
     asked: &'a Options,
     prepared: &'a Prepared,
-    watch: &'a dyn Watch,
+    control: &'a dyn Control,
 }
 
 /// A fitted field at the source's points.
 struct Fitted {
     residual: Vec<Point>,
     field: Residual,
-    report: Report,
+    report: FitReport,
     max_iterations: usize,
     stop_reason: StopReason,
     /// When the first iteration could begin.
@@ -283,25 +288,25 @@ struct Fitted {
 
 impl Fitted {
     /// No field at all: there was no time.
-    fn nothing(points: usize, watch: &dyn Watch) -> Self {
+    fn nothing(points: usize, control: &dyn Control) -> Self {
         Self {
             residual: vec![[0.0; 3]; points],
             field: Residual::Still,
             max_iterations: 0,
-            report: Report {
+            report: FitReport {
                 iterations: 0,
                 best_iteration: 0,
                 best_loss: f64::INFINITY,
                 query_seconds: 0.0,
             },
             stop_reason: StopReason::Deadline,
-            precomputed: watch.seconds(),
+            precomputed: control.seconds(),
         }
     }
 
     /// The motion of every point of `aligned` that moves with an object.
     fn of_movers(
-        labelled: Labelled,
+        labelled: ObjectSearch,
         aligned: &[Point],
         precomputed: f64,
     ) -> Result<Self, FlowError> {
@@ -312,7 +317,7 @@ impl Fitted {
             residual: labelled.residual_of(aligned),
             field: Residual::Objects(labelled.motions.into()),
             max_iterations: labelled.all_clusters,
-            report: Report {
+            report: FitReport {
                 iterations: labelled.clusters,
                 best_iteration: labelled.clusters,
                 best_loss: labelled.cost_m,
@@ -330,7 +335,7 @@ impl Fitted {
 impl Fit<'_> {
     /// Fits from the start, or from `state`.
     fn run(&self, state: Option<TrainerState>) -> Result<Fitted, FlowError> {
-        let (prepared, watch) = (self.prepared, self.watch);
+        let (prepared, control) = (self.prepared, self.control);
         let mut options = self.with_margin()?;
         let warm = warm_start(
             self.backend,
@@ -341,21 +346,26 @@ impl Fit<'_> {
         )?;
         let mut trainer = prepared.transform.start(self.aligned, &options)?;
         let mut cut = !prepared.whole;
-        let pace = match watch.seconds_left() {
+        let throughput = match control.seconds_left() {
             None => None,
-            Some(_) => Some(Pace::measure(trainer.as_mut(), self.aligned, watch)?),
+            Some(_) => Some(Throughput::measure(
+                trainer.as_mut(),
+                self.aligned,
+                control,
+            )?),
         };
-        let left = watch.seconds_left();
+        let left = control.seconds_left();
         if let Some(state) = state {
             trainer.restore(state)?;
-        } else if let (Some(pace), Some(left)) = (pace, left)
-            && let Some(hurried) = pace.hurried(&options, prepared, self.aligned.len(), left)
+        } else if let (Some(throughput), Some(left)) = (throughput, left)
+            && let Some(under_deadline) =
+                throughput.under_deadline(&options, prepared, self.aligned.len(), left)
         {
-            if hurried.max_iterations == 0 {
-                return Ok(Fitted::nothing(self.aligned.len(), watch));
+            if under_deadline.max_iterations == 0 {
+                return Ok(Fitted::nothing(self.aligned.len(), control));
             }
             cut = true;
-            options = hurried;
+            options = under_deadline;
             // A device may have room for one only.
             drop(trainer);
             trainer = prepared.transform.start(self.aligned, &options)?;
@@ -365,8 +375,8 @@ impl Fit<'_> {
         } else if let Some(warm) = warm {
             trainer.restore(warm)?;
         }
-        let precomputed = watch.seconds();
-        let clock = Loop::begin(watch, pace, trainer.report().iterations);
+        let precomputed = control.seconds();
+        let clock = Loop::begin(control, throughput, trainer.report().iterations);
         let stop_reason = loop {
             let done = trainer.report().iterations;
             if let Some(fitting) = clock.shortened(done, &options) {
@@ -376,9 +386,9 @@ impl Fit<'_> {
             }
             let (steps, early) = clock.next(done, STEPS_AT_ONCE);
             match trainer.advance(steps, &early)? {
-                Advance::Continues if !cut && watch.snapshot_due() => {
+                Advance::Continues if !cut && control.snapshot_due() => {
                     let state = trainer.state()?;
-                    watch.snapshot(Snapshot::new(
+                    control.snapshot(Snapshot::new(
                         self.selection,
                         self.asked,
                         self.before,
@@ -398,7 +408,7 @@ impl Fit<'_> {
                 }
             }
         };
-        let residual = budget::evaluate(trainer.as_mut(), self.aligned, watch)?;
+        let residual = budget::evaluate(trainer.as_mut(), self.aligned, control)?;
         let parameters = trainer.state()?.kept;
         Ok(Fitted {
             residual,

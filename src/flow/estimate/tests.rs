@@ -2,11 +2,11 @@
 
 use super::*;
 use crate::flow::cpu::CpuBackend;
+use crate::flow::data::Control;
 use crate::flow::data::Interrupt;
 use crate::flow::data::Point;
-use crate::flow::data::Watch;
-use crate::flow::data::moved;
-use crate::flow::data::{Progress, Unwatched};
+use crate::flow::data::transform_point;
+use crate::flow::data::{Progress, Uncontrolled};
 use crate::flow::error::FlowError;
 use crate::flow::options::Options;
 use crate::flow::options::{Ego, Ground, Preset};
@@ -17,7 +17,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 /// Interrupts after a number of iterations.
 struct After(usize, Interrupt, AtomicUsize);
 
-impl Watch for After {
+impl Control for After {
     fn interrupt(&self) -> Option<Interrupt> {
         (self.2.load(Ordering::Relaxed) >= self.0).then_some(self.1)
     }
@@ -40,7 +40,7 @@ fn street() -> SimulatedPair {
 fn solve(
     pair: &SimulatedPair,
     options: &Options,
-    watch: &dyn Watch,
+    control: &dyn Control,
 ) -> Result<Estimate, FlowError> {
     let backend = CpuBackend::new(Some(2)).expect("threads");
     let problem = Problem {
@@ -50,7 +50,7 @@ fn solve(
         before: None,
         around: &[],
     };
-    estimate(&backend, &problem, options, watch)
+    estimate(&backend, &problem, options, control)
 }
 
 #[test]
@@ -59,7 +59,7 @@ fn points_left_out_keep_their_row_with_zero_flow() {
     let mut options = Preset::Neural.options(None);
     options.ground = Ground::Mask;
     options.range_m = Some(30.0);
-    let estimate = solve(&pair, &options, &Unwatched).expect("a flow");
+    let estimate = solve(&pair, &options, &Uncontrolled).expect("a flow");
     assert_eq!(estimate.flow.len(), pair.source.len());
     for (row, point) in pair.source.iter().enumerate() {
         let kept = !pair.ground_source[row] && point[0].abs() <= 30.0 && point[1].abs() <= 30.0;
@@ -85,7 +85,7 @@ fn ground_that_is_found_moves_with_the_vehicle_and_takes_no_part() {
             before: None,
             around: &[],
         };
-        estimate(&backend, &problem, options, &Unwatched).expect("a flow")
+        estimate(&backend, &problem, options, &Uncontrolled).expect("a flow")
     };
     let estimate = solve(&options);
     let ego = estimate.ego.expect("it is estimated");
@@ -99,7 +99,7 @@ fn ground_that_is_found_moves_with_the_vehicle_and_takes_no_part() {
         .enumerate()
         .filter(|&(row, _)| found[row])
     {
-        let to = moved(&ego, *point);
+        let to = transform_point(&ego, *point);
         let expected: Point = core::array::from_fn(|a| to[a] - point[a]);
         assert_eq!(estimate.flow[row], expected, "row {row}");
         assert!(!dynamic[row], "row {row}");
@@ -143,7 +143,7 @@ fn a_given_ego_motion_is_taken_as_it_is_and_marks_what_moves_against_it() {
     let mut options = Preset::Neural.options(None);
     options.ego = Ego::Given(pair.target_from_source);
     options.max_iterations = 0;
-    let estimate = solve(&pair, &options, &Unwatched).expect("a flow");
+    let estimate = solve(&pair, &options, &Uncontrolled).expect("a flow");
     assert_eq!(estimate.ego, Some(pair.target_from_source));
     assert!(
         estimate
@@ -151,7 +151,7 @@ fn a_given_ego_motion_is_taken_as_it_is_and_marks_what_moves_against_it() {
             .is_some_and(|dynamic| dynamic.iter().all(|&moves| !moves))
     );
     for (row, &point) in pair.source.iter().enumerate() {
-        let to = moved(&pair.target_from_source, point);
+        let to = transform_point(&pair.target_from_source, point);
         let expected: Point = core::array::from_fn(|a| to[a] - point[a]);
         assert_eq!(estimate.flow[row], expected);
     }

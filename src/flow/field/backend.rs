@@ -2,7 +2,7 @@
 
 use super::network::Network;
 use super::snapshot::TrainerState;
-use crate::flow::data::{Interrupt, Point, Watch};
+use crate::flow::data::{Control, Interrupt, Point};
 use crate::flow::distance::{DistanceError, DistanceOptions};
 use crate::flow::host::Host;
 use crate::flow::options::Options;
@@ -16,7 +16,7 @@ pub trait Backend: Send + Sync {
     fn host(&self) -> &Host;
 
     /// Builds the distance transform of `target` over a grid that covers both clouds; looks at
-    /// `watch` between its pieces.
+    /// `control` between its pieces.
     ///
     /// # Errors
     /// [`BackendError`] where the clouds are refused, the watch interrupts or the device fails.
@@ -25,7 +25,7 @@ pub trait Backend: Send + Sync {
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) -> Result<Box<dyn Transform>, BackendError>;
 
     /// What `network` says at `points`: a displacement each, metres.
@@ -60,12 +60,12 @@ pub trait Transform: Send {
 
 /// One optimization in progress.
 pub trait Trainer: Send {
-    /// Does up to `steps` iterations; looks at `watch` before each. Comes back before the steps
+    /// Does up to `steps` iterations; looks at `control` before each. Comes back before the steps
     /// are done where a snapshot is due, but never without an iteration.
     ///
     /// # Errors
     /// [`BackendError`] where the device fails.
-    fn advance(&mut self, steps: usize, watch: &dyn Watch) -> Result<Advance, BackendError>;
+    fn advance(&mut self, steps: usize, control: &dyn Control) -> Result<Advance, BackendError>;
 
     /// The result so far at `points`, which need not be the fitted ones: a displacement each,
     /// metres.
@@ -75,7 +75,7 @@ pub trait Trainer: Send {
     fn evaluate(&mut self, points: &[Point]) -> Result<Vec<Point>, BackendError>;
 
     /// What has been reached and what it took.
-    fn report(&self) -> Report;
+    fn report(&self) -> FitReport;
 
     /// What the following iterations and the result depend on.
     ///
@@ -110,7 +110,7 @@ pub enum Advance {
 
 /// What a trainer has reached.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Report {
+pub struct FitReport {
     /// Iterations done.
     pub iterations: usize,
     /// The iteration, from 1, whose field [`Trainer::evaluate`] uses; the latest for an average.

@@ -7,9 +7,9 @@
 
 use super::backend::{Backend, BackendError, Trainer, Transform};
 use super::snapshot::Snapshot;
-use crate::flow::data::{Interrupt, Point, Progress, RigidTransform, Watch, evenly};
+use crate::flow::data::{Control, Interrupt, Point, Progress, RigidTransform, stride_sample};
 use crate::flow::error::FlowError;
-use crate::flow::options::{Decay, Ego, Hurry, Options};
+use crate::flow::options::{DeadlineLimits, Ego, LearningRateSchedule, Options};
 use crate::flow::select::Selection;
 
 /// Time left from which nothing is measured before the transform, seconds a point of both clouds:
@@ -58,32 +58,32 @@ const STEPS_SHARE: f64 = 0.05;
 const ITERATIONS_AT_ONCE: usize = 8;
 
 /// A watch whose deadline comes earlier.
-pub(crate) struct Early<'a> {
-    watch: &'a dyn Watch,
+pub(crate) struct EarlierDeadline<'a> {
+    control: &'a dyn Control,
     /// Seconds by which it does.
     reserve: f64,
 }
 
-impl Watch for Early<'_> {
+impl Control for EarlierDeadline<'_> {
     fn seconds(&self) -> f64 {
-        self.watch.seconds()
+        self.control.seconds()
     }
     fn seconds_left(&self) -> Option<f64> {
-        self.watch.seconds_left().map(|left| left - self.reserve)
+        self.control.seconds_left().map(|left| left - self.reserve)
     }
     fn interrupt(&self) -> Option<Interrupt> {
         let late = || self.seconds_left().is_some_and(|left| left <= 0.0);
-        let interrupt = self.watch.interrupt();
+        let interrupt = self.control.interrupt();
         interrupt.or_else(|| late().then_some(Interrupt::Deadline))
     }
     fn progress(&self, progress: Progress) {
-        self.watch.progress(progress);
+        self.control.progress(progress);
     }
     fn snapshot_due(&self) -> bool {
-        self.watch.snapshot_due()
+        self.control.snapshot_due()
     }
     fn snapshot(&self, snapshot: Snapshot) {
-        self.watch.snapshot(snapshot);
+        self.control.snapshot(snapshot);
     }
 }
 
@@ -102,17 +102,17 @@ pub(crate) fn prepare(
     selection: &Selection,
     options: &Options,
     prior: &RigidTransform,
-    watch: &dyn Watch,
+    control: &dyn Control,
 ) -> Result<Option<Prepared>, FlowError> {
-    let on_time = Early {
-        watch,
+    let on_time = EarlierDeadline {
+        control,
         reserve: 0.0,
     };
-    let transform = |coarser: f64, watch: &dyn Watch| {
+    let transform = |coarser: f64, control: &dyn Control| {
         let mut distance = options.distance.clone();
         distance.cell_m *= coarser;
         distance.band_m = distance.band_m.max(distance.cell_m);
-        match backend.transform(&selection.source, &selection.target, &distance, watch) {
+        match backend.transform(&selection.source, &selection.target, &distance, control) {
             Ok(transform) => Ok(Some(transform)),
             Err(BackendError::Interrupted(Interrupt::Deadline)) => Ok(None),
             Err(BackendError::Interrupted(Interrupt::Cancelled)) => Err(FlowError::Cancelled),
@@ -126,22 +126,22 @@ pub(crate) fn prepare(
     };
     let points = selection.source.len() + selection.target.len();
     let ample = AMPLE_SECONDS_PER_POINT * points as f64;
-    if watch.seconds_left().is_none_or(|left| left > ample) {
+    if control.seconds_left().is_none_or(|left| left > ample) {
         let transform = transform(1.0, &on_time)?;
         return Ok(transform.map(|transform| aligned(transform, true)));
     }
-    let began = watch.seconds();
+    let began = control.seconds();
     let Some(coarse) = transform(COARSE, &on_time)? else {
         return Ok(None);
     };
-    let took = watch.seconds() - began;
+    let took = control.seconds() - began;
     for (coarser, cost) in FINER {
         let left = on_time.seconds_left().unwrap_or(0.0);
         if took * cost > left * EXPECTED_SHARE {
             continue;
         }
-        let early = Early {
-            watch,
+        let early = EarlierDeadline {
+            control,
             reserve: left * (1.0 - GIVEN_UP_SHARE),
         };
         match transform(coarser, &early)? {
@@ -159,7 +159,7 @@ pub(crate) fn ego_alone(
     selection: &Selection,
     options: &Options,
     prior: &RigidTransform,
-    watch: &dyn Watch,
+    control: &dyn Control,
 ) -> Option<RigidTransform> {
     if options.label.is_none() {
         return match options.ego {
@@ -167,20 +167,25 @@ pub(crate) fn ego_alone(
             Ego::Auto | Ego::Off => None,
         };
     }
-    let points: usize = selection.surroundings.iter().flatten().map(Vec::len).sum();
+    let points: usize = selection
+        .registration_clouds
+        .iter()
+        .flatten()
+        .map(Vec::len)
+        .sum();
     let ample = ALIGNMENT_SECONDS_PER_POINT * points as f64;
-    let whole = watch.seconds_left().is_none_or(|left| left > ample);
-    let on_time = Early {
-        watch,
+    let whole = control.seconds_left().is_none_or(|left| left > ample);
+    let on_time = EarlierDeadline {
+        control,
         reserve: 0.0,
     };
     ego(backend, selection, options, prior, whole, &on_time)
 }
 
 /// Whether the time left holds a sweep around the pair: `points` to be aligned, and to be searched.
-pub(crate) fn has_time_around(points: usize, watch: &dyn Watch) -> bool {
+pub(crate) fn has_time_around(points: usize, control: &dyn Control) -> bool {
     let needed = AROUND_SECONDS_PER_POINT * points as f64;
-    watch.interrupt().is_none() && watch.seconds_left().is_none_or(|left| left > needed)
+    control.interrupt().is_none() && control.seconds_left().is_none_or(|left| left > needed)
 }
 
 /// The ego motion that the options ask for, from the whole clouds or some of their points.
@@ -190,15 +195,17 @@ fn ego(
     options: &Options,
     prior: &RigidTransform,
     whole: bool,
-    watch: &dyn Watch,
+    control: &dyn Control,
 ) -> Option<RigidTransform> {
     let align =
-        |[source, target]: [&[Point]; 2]| backend.host().align(source, target, prior, watch);
-    match (options.ego, &selection.surroundings) {
+        |[source, target]: [&[Point]; 2]| backend.host().align(source, target, prior, control);
+    match (options.ego, &selection.registration_clouds) {
         (Ego::Given(target_from_source), _) => Some(target_from_source),
         (Ego::Auto, Some([source, target])) if whole => Some(align([source, target])),
         (Ego::Auto, Some(clouds)) => {
-            let [source, target] = clouds.each_ref().map(|points| evenly(points, ALIGNED));
+            let [source, target] = clouds
+                .each_ref()
+                .map(|points| stride_sample(points, ALIGNED));
             Some(align([&source, &target]))
         }
         (Ego::Off, _) | (Ego::Auto, None) => None,
@@ -207,25 +214,25 @@ fn ego(
 
 /// How fast the network is, and what of the time is spoken for.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Pace {
+pub(crate) struct Throughput {
     /// Seconds that an evaluation takes a point.
     point: f64,
     /// Seconds for the final evaluation and all that follows.
     evaluation: f64,
 }
 
-impl Pace {
+impl Throughput {
     /// Measures on some of the points; the second time, for the first warms up.
     pub(crate) fn measure(
         trainer: &mut dyn Trainer,
         points: &[Point],
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) -> Result<Self, FlowError> {
         let first = |count: usize| &points[..points.len().min(count)];
         let mut seconds = |points: &[Point]| -> Result<f64, FlowError> {
-            let began = watch.seconds();
+            let began = control.seconds();
             trainer.evaluate(points)?;
-            Ok(watch.seconds() - began)
+            Ok(control.seconds() - began)
         };
         let mut measured = first(MEASURED);
         seconds(measured)?;
@@ -242,7 +249,7 @@ impl Pace {
     }
 
     /// The options that fit into `left` seconds; nothing where those that were asked for fit.
-    pub(crate) fn hurried(
+    pub(crate) fn under_deadline(
         &self,
         options: &Options,
         prepared: &Prepared,
@@ -254,17 +261,17 @@ impl Pace {
         let asked = options.batch.unwrap_or(points).min(points);
         let needed = options.expected_iterations() as f64 * iteration(asked);
         let tolerance = match options.decay {
-            Decay::Cosine => ROUGH,
-            Decay::Constant => 1.0,
+            LearningRateSchedule::Cosine => ROUGH,
+            LearningRateSchedule::Constant => 1.0,
         };
         if prepared.whole && needed <= budget * tolerance {
             return None;
         }
-        let Hurry {
+        let DeadlineLimits {
             batches: [least, most],
             iterations,
             least_iterations,
-        } = Hurry::new(prepared.ego.is_some());
+        } = DeadlineLimits::new(prepared.ego.is_some());
         let wished = iterations.min(options.max_iterations) as f64;
         let fitting = budget / (wished * iteration(1));
         let batch = (fitting as usize / least * least).clamp(least, most.max(least));
@@ -273,47 +280,51 @@ impl Pace {
         let most = options.max_iterations.saturating_mul(asked) / batch;
         let fitting = ((budget / iteration(batch)) as usize).min(most);
         let enough = fitting >= least_iterations.min(options.max_iterations);
-        Some(options.hurried(batch, if enough { fitting } else { 0 }))
+        Some(options.under_deadline(batch, if enough { fitting } else { 0 }))
     }
 }
 
 /// The loop's clock: when to stop iterating, and how many more iterations fit.
 pub(crate) struct Loop<'a> {
-    watch: &'a dyn Watch,
-    pace: Option<Pace>,
+    control: &'a dyn Control,
+    throughput: Option<Throughput>,
     began: f64,
     first: usize,
 }
 
 impl<'a> Loop<'a> {
     /// Begins after `first` iterations; without a pace there is no deadline to keep.
-    pub(crate) fn begin(watch: &'a dyn Watch, pace: Option<Pace>, first: usize) -> Self {
+    pub(crate) fn begin(
+        control: &'a dyn Control,
+        throughput: Option<Throughput>,
+        first: usize,
+    ) -> Self {
         Self {
-            watch,
-            pace,
-            began: watch.seconds(),
+            control,
+            throughput,
+            began: control.seconds(),
             first,
         }
     }
 
     /// Iterations that may be done at once, of `steps`, and the watch over them: it ends them while
     /// there is time for one iteration and the evaluation.
-    pub(crate) fn next(&self, done: usize, steps: usize) -> (usize, Early<'a>) {
-        let reserve = self
-            .pace
-            .map_or(0.0, |pace| pace.evaluation + self.iteration(done));
-        let early = Early {
-            watch: self.watch,
+    pub(crate) fn next(&self, done: usize, steps: usize) -> (usize, EarlierDeadline<'a>) {
+        let reserve = self.throughput.map_or(0.0, |throughput| {
+            throughput.evaluation + self.iteration(done)
+        });
+        let early = EarlierDeadline {
+            control: self.control,
             reserve,
         };
         let since = done - self.first;
-        let steps = match self.watch.seconds_left() {
-            Some(left) if self.pace.is_some() && since > 0 => {
+        let steps = match self.control.seconds_left() {
+            Some(left) if self.throughput.is_some() && since > 0 => {
                 let fitting = STEPS_SHARE * (left - reserve) / self.iteration(done).max(1e-9);
                 // As many as up to the next check of what fits.
                 (fitting as usize).clamp(1, ITERATIONS_AT_ONCE - since % ITERATIONS_AT_ONCE)
             }
-            _ if self.pace.is_some() => 1,
+            _ if self.throughput.is_some() => 1,
             _ => steps,
         };
         (steps, early)
@@ -321,13 +332,15 @@ impl<'a> Loop<'a> {
 
     /// Where the step size falls and the iterations up to the end do not fit: how many do.
     pub(crate) fn shortened(&self, done: usize, options: &Options) -> Option<usize> {
-        let pace = self.pace?;
+        let throughput = self.throughput?;
         let since = done - self.first;
-        if options.decay != Decay::Cosine || since == 0 || !since.is_multiple_of(ITERATIONS_AT_ONCE)
+        if options.decay != LearningRateSchedule::Cosine
+            || since == 0
+            || !since.is_multiple_of(ITERATIONS_AT_ONCE)
         {
             return None;
         }
-        let left = self.watch.seconds_left()? - pace.evaluation;
+        let left = self.control.seconds_left()? - throughput.evaluation;
         let fitting = (left / self.iteration(done)).max(0.0);
         let wanted = options.max_iterations.saturating_sub(done) as f64;
         (fitting < FITTING_SHARE * wanted).then_some(done + fitting as usize)
@@ -335,7 +348,7 @@ impl<'a> Loop<'a> {
 
     /// Seconds of one iteration: the mean so far.
     fn iteration(&self, done: usize) -> f64 {
-        (self.watch.seconds() - self.began) / (done - self.first).max(1) as f64
+        (self.control.seconds() - self.began) / (done - self.first).max(1) as f64
     }
 }
 
@@ -343,14 +356,14 @@ impl<'a> Loop<'a> {
 pub(crate) fn evaluate(
     trainer: &mut dyn Trainer,
     points: &[Point],
-    watch: &dyn Watch,
+    control: &dyn Control,
 ) -> Result<Vec<Point>, FlowError> {
-    if watch.seconds_left().is_none() {
+    if control.seconds_left().is_none() {
         return Ok(trainer.evaluate(points)?);
     }
     let mut flow = Vec::with_capacity(points.len());
     for rows in points.chunks(ROWS_AT_ONCE) {
-        if watch.seconds_left().is_some_and(|left| left <= 0.0) {
+        if control.seconds_left().is_some_and(|left| left <= 0.0) {
             break;
         }
         flow.extend(trainer.evaluate(rows)?);

@@ -14,11 +14,11 @@ use std::sync::Arc;
 
 use super::mlp::Conditioning;
 use super::network::Network;
-use crate::flow::data::{Body, RigidTransform, Seal, SealError, put_parameters};
-use crate::flow::motion::{Field, Residual};
-use crate::flow::objects::Motions;
+use crate::flow::data::{Body, Envelope, EnvelopeError, RigidTransform, put_parameters};
+use crate::flow::motion::{MotionField, Residual};
+use crate::flow::objects::ObjectMotions;
 
-const SEAL: Seal = Seal {
+const ENVELOPE: Envelope = Envelope {
     magic: *b"FNSFFILD",
     version: 1,
     body: None,
@@ -29,10 +29,10 @@ const OBJECTS: u8 = 2;
 /// How far from one a rotation's length may be: what doubles leave of it.
 const UNIT: f64 = 1e-9;
 
-impl Field {
+impl MotionField {
     /// The field as bytes, at most a few megabytes.
     pub fn to_bytes(&self) -> Vec<u8> {
-        let mut bytes = SEAL.begin();
+        let mut bytes = ENVELOPE.begin();
         bytes.push(self.ego.is_some().into());
         let motion = self.ego.unwrap_or_default();
         let rotation = motion.rotation.coords;
@@ -54,15 +54,15 @@ impl Field {
                 motions.put(&mut bytes);
             }
         }
-        SEAL.close(bytes)
+        ENVELOPE.close(bytes)
     }
 
     /// Reads what [`Self::to_bytes`] wrote; nothing is allocated before it is known to be there.
     ///
     /// # Errors
-    /// [`SealError`] where the bytes are no field, of another version, torn or altered.
-    pub fn from_bytes(bytes: &[u8]) -> Result<Self, SealError> {
-        let mut body = SEAL.open(bytes)?;
+    /// [`EnvelopeError`] where the bytes are no field, of another version, torn or altered.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, EnvelopeError> {
+        let mut body = ENVELOPE.open(bytes)?;
         let ego = motion(&mut body)?;
         let [kind] = body.take()?;
         let residual = match kind {
@@ -74,8 +74,8 @@ impl Field {
                 },
                 parameters: body.parameters()?,
             }),
-            OBJECTS => Residual::Objects(Arc::new(Motions::take(&mut body)?)),
-            _ => return Err(SealError::Damaged),
+            OBJECTS => Residual::Objects(Arc::new(ObjectMotions::take(&mut body)?)),
+            _ => return Err(EnvelopeError::Damaged),
         };
         body.end()?;
         Ok(Self { ego, residual })
@@ -83,7 +83,7 @@ impl Field {
 }
 
 /// The ego motion, where there is one.
-fn motion(body: &mut Body<'_>) -> Result<Option<RigidTransform>, SealError> {
+fn motion(body: &mut Body<'_>) -> Result<Option<RigidTransform>, EnvelopeError> {
     let [known] = body.take()?;
     let mut float = || body.float();
     let rotation = Quaternion::from([float()?, float()?, float()?, float()?]);
@@ -91,7 +91,7 @@ fn motion(body: &mut Body<'_>) -> Result<Option<RigidTransform>, SealError> {
     let is_turn = (rotation.norm() - 1.0).abs() < UNIT;
     let is_place = translation.vector.iter().all(|value| value.is_finite());
     if known > 1 || !is_turn || !is_place {
-        return Err(SealError::Damaged);
+        return Err(EnvelopeError::Damaged);
     }
     let rotation = UnitQuaternion::new_unchecked(rotation);
     Ok((known == 1).then(|| RigidTransform::from_parts(translation, rotation)))
@@ -119,18 +119,21 @@ mod tests {
             (Some(motion), Residual::Still),
             (None, Residual::Still),
         ] {
-            let bytes = Field { ego, residual }.to_bytes();
-            let back = Field::from_bytes(&bytes).expect("sound");
+            let bytes = MotionField { ego, residual }.to_bytes();
+            let back = MotionField::from_bytes(&bytes).expect("sound");
             assert_eq!(back.ego, ego);
             assert_eq!(back.to_bytes(), bytes);
             for place in [0, 9, 12, 13, 60, bytes.len() / 2, bytes.len() - 1] {
                 let mut altered = bytes.clone();
                 altered[place] ^= 1;
-                assert!(Field::from_bytes(&altered).is_err(), "byte {place}");
-                assert!(Field::from_bytes(&bytes[..place]).is_err(), "{place} bytes");
+                assert!(MotionField::from_bytes(&altered).is_err(), "byte {place}");
+                assert!(
+                    MotionField::from_bytes(&bytes[..place]).is_err(),
+                    "{place} bytes"
+                );
             }
             let longer = [bytes.as_slice(), &[0; 9]].concat();
-            assert!(Field::from_bytes(&longer).is_err());
+            assert!(MotionField::from_bytes(&longer).is_err());
         }
     }
 }

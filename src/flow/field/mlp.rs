@@ -6,7 +6,7 @@
 use bytemuck::{Pod, Zeroable};
 
 use crate::flow::data::{Point, Random};
-use crate::flow::options::Inputs;
+use crate::flow::options::InputNormalization;
 
 /// Features of every hidden layer.
 pub const WIDTH: usize = 128;
@@ -147,21 +147,21 @@ pub(crate) struct Conditioning {
 }
 
 impl Conditioning {
-    pub(crate) fn new(points: &[Point], inputs: Inputs) -> Self {
+    pub(crate) fn new(points: &[Point], inputs: InputNormalization) -> Self {
         let mean = |axis: usize| {
             let sum: f64 = points.iter().map(|point| f64::from(point[axis])).sum();
             (sum / points.len().max(1) as f64) as f32
         };
         let mean = [mean(0), mean(1), mean(2)];
         match inputs {
-            Inputs::Raw => {
+            InputNormalization::Raw => {
                 let is_far = mean.iter().any(|axis| axis.abs() > FAR_MEAN_M);
                 Self {
                     center: if is_far { mean } else { [0.0; 3] },
                     scale: 1.0,
                 }
             }
-            Inputs::Centered { scale_m } => Self {
+            InputNormalization::Centered { scale_m } => Self {
                 center: mean,
                 scale: 1.0 / scale_m,
             },

@@ -15,12 +15,12 @@ mod schedule;
 mod snapshot;
 mod warm_start;
 
-pub use backend::{Advance, Backend, BackendError, Report, Trainer, Transform};
+pub use backend::{Advance, Backend, BackendError, FitReport, Trainer, Transform};
 pub use mlp::{HIDDEN_LAYERS, MIDDLE_LAYERS, PARAMETERS, WIDTH};
 pub use network::Network;
 pub use snapshot::{Snapshot, SnapshotError, TrainerState};
 
-pub(crate) use budget::{Loop, Pace, Prepared};
+pub(crate) use budget::{Loop, Prepared, Throughput};
 pub(crate) use early_stopping::EarlyStop;
 #[cfg(feature = "gpu")]
 pub(crate) use early_stopping::Seen;
@@ -33,8 +33,8 @@ pub(crate) use mlp::{
 pub(crate) use reduction::MOST_POINTS;
 #[cfg(feature = "gpu")]
 pub(crate) use reduction::STRETCH;
-pub(crate) use reduction::{Chunks, halved};
+pub(crate) use reduction::{Chunks, tree_sum};
 #[cfg(test)]
 pub(crate) use reference::{ReferenceNetwork, first_losses};
-pub(crate) use schedule::Course;
+pub(crate) use schedule::Schedule;
 pub(crate) use warm_start::warm_start;

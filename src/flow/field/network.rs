@@ -6,7 +6,7 @@ use nalgebra::Vector3;
 
 use super::mlp::{Conditioning, Parameters, WIDTH, first_layer, last_layer};
 use crate::flow::data::{Point, RigidTransform};
-use crate::flow::options::Inputs;
+use crate::flow::options::InputNormalization;
 
 /// The coordinate network of one pair: `g(p; theta)` at any point p, FNSF Section 3.
 #[derive(Clone)]
@@ -17,7 +17,11 @@ pub struct Network {
 
 impl Network {
     /// The network that was fitted to `points` with `inputs`.
-    pub(crate) fn new(parameters: Parameters, points: &[Point], inputs: Inputs) -> Self {
+    pub(crate) fn new(
+        parameters: Parameters,
+        points: &[Point],
+        inputs: InputNormalization,
+    ) -> Self {
         Self {
             parameters,
             conditioning: Conditioning::new(points, inputs),
@@ -82,7 +86,7 @@ mod tests {
     use super::*;
     use crate::flow::cpu::CpuBackend;
     use crate::flow::data::Random;
-    use crate::flow::data::moved;
+    use crate::flow::data::transform_point;
     use crate::flow::field::backend::Backend;
 
     /// Metres: single precision of coordinates of 50 m and features of that size.
@@ -98,11 +102,14 @@ mod tests {
                 .collect()
         };
         let (fitted, others) = (points(), points());
-        let scales = [10.0, 8.0].map(|scale_m| Inputs::Centered { scale_m });
+        let scales = [10.0, 8.0].map(|scale_m| InputNormalization::Centered { scale_m });
         let parameters = Parameters::xavier(&mut Random::new(9));
         let network = Network::new(parameters, &fitted, scales[0]);
         let motion = RigidTransform::new([1.5, -0.4, 0.1].into(), [0.01, -0.02, 0.3].into());
-        let seen: Vec<Point> = others.iter().map(|&point| moved(&motion, point)).collect();
+        let seen: Vec<Point> = others
+            .iter()
+            .map(|&point| transform_point(&motion, point))
+            .collect();
         let conditioning = Conditioning::new(&seen, scales[1]);
         let carried = Network {
             parameters: network.carried(&motion, &conditioning),

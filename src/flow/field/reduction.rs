@@ -51,14 +51,14 @@ pub(crate) fn mean(losses: &[f32]) -> f32 {
     for (tile, losses) in losses.chunks(TILE).enumerate() {
         let mut padded = [0.0; TILE];
         padded[..losses.len()].copy_from_slice(losses);
-        sums[tile % SIDE_BY_SIDE] += halved(padded);
+        sums[tile % SIDE_BY_SIDE] += tree_sum(padded);
     }
-    halved(sums) * (1.0 / losses.len() as f32)
+    tree_sum(sums) * (1.0 / losses.len() as f32)
 }
 
 /// The sum of a power of two of terms: the upper half is added to the lower until one is left.
 #[inline(always)]
-pub(crate) fn halved<const N: usize>(mut terms: [f32; N]) -> f32 {
+pub(crate) fn tree_sum<const N: usize>(mut terms: [f32; N]) -> f32 {
     let mut half = N / 2;
     while half > 0 {
         for i in 0..half {
@@ -107,7 +107,7 @@ mod tests {
     fn halves_are_added_from_the_upper_to_the_lower() {
         // In this order the small terms survive; one after the other they would be lost.
         let small = f32::EPSILON / 2.0;
-        assert_eq!(halved([1.0, small, 0.0, small]), 1.0 + f32::EPSILON);
-        assert_eq!(halved([2.5]), 2.5);
+        assert_eq!(tree_sum([1.0, small, 0.0, small]), 1.0 + f32::EPSILON);
+        assert_eq!(tree_sum([2.5]), 2.5);
     }
 }

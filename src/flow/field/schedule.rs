@@ -6,20 +6,20 @@ use core::ops::Range;
 use super::adam::AdamStep;
 use super::mlp::{Conditioning, Parameters};
 use crate::flow::data::{Point, Random};
-use crate::flow::options::{Decay, Keep, Options, Start};
+use crate::flow::options::{LearningRateSchedule, Options, ResultChoice, Start};
 
 /// Iterations over which the weight of the past in a running average is ramped up.
 const RAMP: f32 = 10.0;
 
 /// What every iteration of one optimization does.
-pub(crate) struct Course {
+pub(crate) struct Schedule {
     pub(crate) options: Options,
     pub(crate) conditioning: Conditioning,
     /// Source points in the order in which batches take them.
     pub(crate) points: Vec<Point>,
 }
 
-impl Course {
+impl Schedule {
     /// The course over `source`, and the parameters at its start.
     pub(crate) fn new(source: &[Point], options: &Options) -> (Self, Parameters) {
         let mut random = Random::stream(options.seed, 0);
@@ -61,8 +61,8 @@ impl Course {
     /// Adam's step of the iteration after `done` others.
     pub(crate) fn adam(&self, done: usize) -> AdamStep {
         let share = match self.options.decay {
-            Decay::Constant => 1.0,
-            Decay::Cosine => {
+            LearningRateSchedule::Constant => 1.0,
+            LearningRateSchedule::Cosine => {
                 let done = done as f64 / self.options.max_iterations as f64;
                 0.5 + 0.5 * (core::f64::consts::PI * done).cos()
             }
@@ -74,8 +74,8 @@ impl Course {
     /// where the best is kept.
     pub(crate) fn fresh(&self, done: usize) -> Option<f32> {
         match self.options.keep {
-            Keep::Best => None,
-            Keep::Average { decay } => {
+            ResultChoice::Best => None,
+            ResultChoice::Average { decay } => {
                 let ramp = done as f32 / (done as f32 + RAMP);
                 Some(1.0 - decay.min(ramp))
             }
@@ -97,7 +97,7 @@ mod tests {
     fn every_point_is_in_one_batch_of_each_round() {
         let mut options = Preset::Neural.options(None);
         options.batch = Some(400);
-        let (course, _) = Course::new(&[[0.0; 3]; 1501], &options);
+        let (course, _) = Schedule::new(&[[0.0; 3]; 1501], &options);
         let mut covered = vec![0; 1501];
         for done in 8..12 {
             let batch = course.batch(done);

@@ -10,12 +10,12 @@
 
 use super::early_stopping::Seen;
 use super::mlp::Parameters;
-use crate::flow::data::{Hash, PARAMETERS_BYTES, Point, Seal, SealError, put_parameters};
-use crate::flow::motion::Field;
+use crate::flow::data::{Envelope, EnvelopeError, Hash, PARAMETERS_BYTES, Point, put_parameters};
+use crate::flow::motion::MotionField;
 use crate::flow::options::Options;
 use crate::flow::select::Selection;
 
-const SEAL: Seal = Seal {
+const ENVELOPE: Envelope = Envelope {
     magic: *b"FNSFSNAP",
     version: 3,
     body: Some(8 + 8 + 8 + 4 + 1 + 4 + 8 + ARRAYS * PARAMETERS_BYTES),
@@ -67,7 +67,7 @@ impl Snapshot {
     pub(crate) fn new(
         selection: &Selection,
         options: &Options,
-        before: Option<&Field>,
+        before: Option<&MotionField>,
         state: TrainerState,
     ) -> Self {
         Self {
@@ -84,7 +84,7 @@ impl Snapshot {
         self,
         selection: &Selection,
         options: &Options,
-        before: Option<&Field>,
+        before: Option<&MotionField>,
     ) -> Result<TrainerState, SnapshotError> {
         if self.identity == identity(selection, options, before) {
             Ok(self.state)
@@ -101,7 +101,7 @@ impl Snapshot {
     /// The snapshot as bytes, 1.9 MB.
     pub fn to_bytes(&self) -> Vec<u8> {
         let state = &self.state;
-        let mut bytes = SEAL.begin();
+        let mut bytes = ENVELOPE.begin();
         bytes.extend(self.identity.to_le_bytes());
         bytes.extend((state.iterations as u64).to_le_bytes());
         bytes.extend((state.best_iteration as u64).to_le_bytes());
@@ -113,7 +113,7 @@ impl Snapshot {
         for array in [&state.parameters, means, squares, &state.kept] {
             put_parameters(&mut bytes, array);
         }
-        SEAL.close(bytes)
+        ENVELOPE.close(bytes)
     }
 
     /// Reads what [`Self::to_bytes`] wrote; nothing is allocated before all is known to be there.
@@ -121,7 +121,7 @@ impl Snapshot {
     /// # Errors
     /// [`SnapshotError`] where the bytes are no snapshot, of another version, torn or altered.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, SnapshotError> {
-        let mut body = SEAL.open(bytes)?;
+        let mut body = ENVELOPE.open(bytes)?;
         let identity = body.number()?;
         let iterations = body.count()?;
         let best_iteration = body.count()?;
@@ -148,7 +148,7 @@ impl Snapshot {
 
 /// What a snapshot belongs to: both clouds as they take part, in the fit and in the ego motion, the
 /// field before them, and every option but the memory that the machine allows.
-fn identity(selection: &Selection, options: &Options, before: Option<&Field>) -> u64 {
+fn identity(selection: &Selection, options: &Options, before: Option<&MotionField>) -> u64 {
     let mut options = options.clone();
     options.distance.max_bytes = 0;
     let mut hash = Hash(Hash::default().of(format!("{options:?}").as_bytes()));
@@ -162,7 +162,7 @@ fn identity(selection: &Selection, options: &Options, before: Option<&Field>) ->
     cloud(&selection.source);
     cloud(&selection.target);
     selection
-        .surroundings
+        .registration_clouds
         .iter()
         .flatten()
         .for_each(|points| cloud(points));
@@ -180,7 +180,7 @@ fn identity(selection: &Selection, options: &Options, before: Option<&Field>) ->
 pub enum SnapshotError {
     /// The bytes are no sound snapshot of this version.
     #[error("no snapshot: {0}")]
-    Sealed(#[from] SealError),
+    Sealed(#[from] EnvelopeError),
     /// Taken of other clouds or by other options.
     #[error("the snapshot belongs to another problem or other options")]
     Foreign,

@@ -6,9 +6,9 @@ use super::budget::Prepared;
 use super::mlp::Conditioning;
 use super::network::Network;
 use super::snapshot::TrainerState;
-use crate::flow::data::{Point, evenly};
+use crate::flow::data::{Point, stride_sample};
 use crate::flow::error::FlowError;
-use crate::flow::motion::{Field, Residual};
+use crate::flow::motion::{MotionField, Residual};
 use crate::flow::options::Options;
 
 /// Points on which a field of the pair before is judged.
@@ -20,7 +20,7 @@ pub(crate) fn warm_start(
     backend: &dyn Backend,
     prepared: &Prepared,
     aligned: &[Point],
-    before: Option<&Field>,
+    before: Option<&MotionField>,
     options: &mut Options,
 ) -> Result<Option<TrainerState>, FlowError> {
     let (Some(warm_start), Some(before)) = (options.warm_start, before) else {
@@ -38,7 +38,7 @@ pub(crate) fn warm_start(
         parameters: network.carried(&motion, &conditioning),
         conditioning,
     };
-    let points = evenly(aligned, JUDGED);
+    let points = stride_sample(aligned, JUDGED);
     let flows = backend.evaluate(&carried, &points)?;
     let still = vec![[0.0; 3]; points.len()];
     let [carried_loss, still_loss] = [

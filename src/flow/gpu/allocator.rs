@@ -6,7 +6,7 @@ use core::time::Duration;
 use std::collections::VecDeque;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
-use crate::flow::data::{Watch, control};
+use crate::flow::data::{Control, control};
 use crate::flow::field::BackendError;
 
 /// How long somebody waits without any words being given back, in all.
@@ -16,7 +16,7 @@ const LOOK: Duration = Duration::from_millis(20);
 
 /// The store's words: who has which, and who waits for some.
 #[derive(Debug)]
-pub(super) struct Words {
+pub(super) struct Allocator {
     store: Mutex<Store>,
     /// Words were given back, or somebody has left the line.
     moved: Condvar,
@@ -45,7 +45,7 @@ impl Store {
     }
 }
 
-impl Words {
+impl Allocator {
     pub(super) fn new(words: u64) -> Self {
         Self {
             store: Mutex::new(Store {
@@ -71,7 +71,7 @@ impl Words {
         &self,
         what: &'static str,
         count: u64,
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) -> Result<u64, BackendError> {
         if count > self.all {
             return Err(BackendError::Memory {
@@ -94,7 +94,7 @@ impl Words {
             if waited >= PATIENCE {
                 break Err(BackendError::Busy);
             }
-            if let Err(interrupt) = control::check(watch) {
+            if let Err(interrupt) = control::check(control) {
                 break Err(BackendError::Interrupted(interrupt));
             }
             let (woken, timeout) = self
@@ -136,12 +136,12 @@ mod tests {
     use std::sync::atomic::{AtomicBool, Ordering};
 
     use super::*;
-    use crate::flow::data::{Interrupt, Unwatched};
+    use crate::flow::data::{Interrupt, Uncontrolled};
 
     /// Ends at the first look.
     struct Over;
 
-    impl Watch for Over {
+    impl Control for Over {
         fn interrupt(&self) -> Option<Interrupt> {
             Some(Interrupt::Deadline)
         }
@@ -149,8 +149,8 @@ mod tests {
 
     #[test]
     fn words_given_back_can_be_taken_again_in_one_piece() {
-        let words = Words::new(100);
-        let take = |count| words.take("points", count, &Unwatched).expect("free");
+        let words = Allocator::new(100);
+        let take = |count| words.take("points", count, &Uncontrolled).expect("free");
         let [a, b, c] = [take(30), take(30), take(40)];
         words.give_back(a, 30);
         words.give_back(c, 40);
@@ -160,13 +160,13 @@ mod tests {
 
     #[test]
     fn what_never_fits_is_refused_at_once_and_what_is_taken_is_waited_for() {
-        let words = Words::new(100);
-        let refused = words.take("points", 101, &Unwatched);
+        let words = Allocator::new(100);
+        let refused = words.take("points", 101, &Uncontrolled);
         assert!(matches!(
             refused,
             Err(BackendError::Memory { needed: 404, .. })
         ));
-        words.take("points", 60, &Unwatched).expect("free");
+        words.take("points", 60, &Uncontrolled).expect("free");
         let interrupted = words.take("points", 60, &Over);
         assert!(matches!(interrupted, Err(BackendError::Interrupted(_))));
     }
@@ -176,14 +176,14 @@ mod tests {
         /// Says that somebody has looked at it.
         #[derive(Default)]
         struct Waits(AtomicBool);
-        impl Watch for Waits {
+        impl Control for Waits {
             fn interrupt(&self) -> Option<Interrupt> {
                 self.0.store(true, Ordering::Relaxed);
                 None
             }
         }
-        let (words, waits) = (Words::new(100), Waits::default());
-        let taken = words.take("points", 60, &Unwatched).expect("free");
+        let (words, waits) = (Allocator::new(100), Waits::default());
+        let taken = words.take("points", 60, &Uncontrolled).expect("free");
         std::thread::scope(|scope| {
             let large = scope.spawn(|| words.take("points", 80, &waits));
             while !waits.0.load(Ordering::Relaxed) {
@@ -197,6 +197,6 @@ mod tests {
             assert_eq!(place, 0);
         });
         // Who has left the line keeps nobody out.
-        assert_eq!(words.take("points", 20, &Unwatched).expect("free"), 80);
+        assert_eq!(words.take("points", 20, &Uncontrolled).expect("free"), 80);
     }
 }

@@ -4,14 +4,14 @@ use core::time::Duration;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError, mpsc};
 
 use super::adapter::{Adapter, AdapterKind};
-use super::allocator::Words;
+use super::allocator::Allocator;
 use super::batcher::Batch;
 use super::half::Units;
 use super::layout::STEPS;
 use super::memory::Budget;
 use super::pipelines::Kernels;
 use super::{distance, half, inference, layout};
-use crate::flow::data::{Point, Watch};
+use crate::flow::data::{Control, Point};
 use crate::flow::distance::DistanceOptions;
 use crate::flow::field::{Backend, BackendError, Network, Transform};
 use crate::flow::host::Host;
@@ -98,9 +98,9 @@ impl Backend for Gpu {
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) -> Result<Box<dyn Transform>, BackendError> {
-        let built = distance::build(&self.0, source, target, options, watch)?;
+        let built = distance::build(&self.0, source, target, options, control)?;
         Ok(Box::new(built))
     }
 
@@ -145,7 +145,7 @@ pub(super) struct Card {
     pub(super) kernels: Kernels,
     pub(super) buffers: Buffers,
     pub(super) budget: Budget,
-    pub(super) words: Words,
+    pub(super) words: Allocator,
     pub(super) batch: Batch,
     pub(super) host: Host,
     /// Seconds of one tick of the card's clock; none where it shows none.
@@ -167,7 +167,7 @@ pub(super) struct Buffers {
     pub(super) activations: wgpu::Buffer,
     pub(super) deltas: wgpu::Buffer,
     pub(super) flows: wgpu::Buffer,
-    pub(super) pulls: wgpu::Buffer,
+    pub(super) loss_gradients: wgpu::Buffer,
     pub(super) partials: wgpu::Buffer,
     pub(super) lanes: wgpu::Buffer,
     pub(super) steps: wgpu::Buffer,
@@ -211,7 +211,7 @@ impl Card {
         Ok(Self {
             kernels,
             buffers,
-            words: Words::new(budget.store_words),
+            words: Allocator::new(budget.store_words),
             networks: Mutex::new((0..budget.lanes as u32).rev().collect()),
             budget,
             batch: Batch::default(),
@@ -425,7 +425,7 @@ impl Buffers {
             activations: buffer("activations", budget.row_bytes(), storage)?,
             deltas: buffer("deltas", budget.row_bytes(), storage)?,
             flows: buffer("flows", row_vectors, storage)?,
-            pulls: buffer("pulls", row_vectors, storage)?,
+            loss_gradients: buffer("pulls", row_vectors, storage)?,
             partials: buffer("gradients", budget.chunk_bytes(), storage)?,
             lanes: buffer("lanes", records(size_of::<layout::Lane>()), storage | to)?,
             steps: buffer(

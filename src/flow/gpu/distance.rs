@@ -6,7 +6,7 @@ use std::sync::Arc;
 use super::backend::{Card, spread};
 use super::layout;
 use super::trainer::GpuTrainer;
-use crate::flow::data::{Point, Watch};
+use crate::flow::data::{Control, Point};
 use crate::flow::distance::{
     ABSENT, CellSites, DistanceError, DistanceOptions, FarField, Index, Lattice, Layout, Metric,
     Sample, Sites, codes_per_cell,
@@ -24,15 +24,15 @@ const SAMPLED: usize = 1 << 20;
 const SAMPLE_GROUP: usize = 64;
 
 /// Words of the store that are a transform's, and its source points' behind them.
-struct Stretch {
+struct Allocation {
     card: Arc<Card>,
     place: u32,
     words: u64,
 }
 
-impl Stretch {
-    fn take(card: &Arc<Card>, words: u64, watch: &dyn Watch) -> Result<Self, BackendError> {
-        let place = card.words.take("distance transform", words, watch)?;
+impl Allocation {
+    fn take(card: &Arc<Card>, words: u64, control: &dyn Control) -> Result<Self, BackendError> {
+        let place = card.words.take("distance transform", words, control)?;
         Ok(Self {
             card: Arc::clone(card),
             place: place as u32,
@@ -41,7 +41,7 @@ impl Stretch {
     }
 }
 
-impl Drop for Stretch {
+impl Drop for Allocation {
     fn drop(&mut self) {
         self.card.words.give_back(self.place.into(), self.words);
     }
@@ -53,7 +53,7 @@ pub(super) struct GpuTransform {
     pub(super) record: layout::Transform,
     /// Words of the transform, before those of the points.
     words: u64,
-    stretch: Stretch,
+    stretch: Allocation,
 }
 
 /// Transforms `target` over a grid that covers both clouds.
@@ -62,7 +62,7 @@ pub(super) fn build(
     source: &[Point],
     target: &[Point],
     options: &DistanceOptions,
-    watch: &dyn Watch,
+    control: &dyn Control,
 ) -> Result<GpuTransform, BackendError> {
     card.watchdog.check()?;
     if options.metric == Metric::Chamfer {
@@ -75,9 +75,9 @@ pub(super) fn build(
     }
     // On the host's threads, which nobody may keep while he waits for the card.
     let planned = card.host.threads().install(|| {
-        let layout = Layout::plan(source, target, options, watch)?;
+        let layout = Layout::plan(source, target, options, control)?;
         let band_m = f64::from(layout.band) * layout.grid.cell;
-        let far = FarField::build(&layout.grid, &layout.cells, band_m, watch)?;
+        let far = FarField::build(&layout.grid, &layout.cells, band_m, control)?;
         let sites = CellSites::new(&layout.cells, layout.band);
         Ok::<_, DistanceError>((layout, far, sites))
     });
@@ -94,7 +94,7 @@ pub(super) fn build(
     ];
     let words = parts.iter().sum();
     let points = source.len() as u64 * POINT_WORDS;
-    let stretch = Stretch::take(card, words + points, watch)?;
+    let stretch = Allocation::take(card, words + points, control)?;
     let mut place = u64::from(stretch.place);
     let places = parts.map(|words| {
         let own = place;

@@ -7,9 +7,9 @@ use super::distance;
 use super::iteration::{Clock, Phase, Phases};
 use super::layout::{Lane, Status, Step};
 use super::tiling::{Cut, Plan};
-use crate::flow::data::{Point, Unwatched};
+use crate::flow::data::{Point, Uncontrolled};
 use crate::flow::distance::DistanceOptions;
-use crate::flow::field::{BackendError, Course, MIDDLE_LAYERS, WIDTH};
+use crate::flow::field::{BackendError, MIDDLE_LAYERS, Schedule, WIDTH};
 use crate::flow::options::{Options, Precision, Preset};
 
 /// Floating-point operations of a point's forward pass.
@@ -51,7 +51,7 @@ pub fn kernel_times(
         source,
         target,
         &DistanceOptions::default(),
-        &Unwatched,
+        &Uncontrolled,
     )?;
     let options = Options {
         precision,
@@ -59,7 +59,7 @@ pub fn kernel_times(
         early_stop: None,
         ..Preset::Paper.options(None)
     };
-    let (course, _) = Course::new(source, &options);
+    let (course, _) = Schedule::new(source, &options);
     // The trainer's network is at its start, and stays there: its rate is zero.
     let trainer = super::trainer::GpuTrainer::new(&built, source, &options)?;
     let adam = course.adam(0);

@@ -169,7 +169,7 @@ fn fill(card: &Card, buffers: &Buffers, cut: Cut) {
     transpose_middle_layers(&parameters, &mut transposed);
     let mut across = |width: f64| random.uniform(-width, width) as f32;
     let points: Vec<f32> = (0..3 * POINTS).map(|_| across(4.0)).collect();
-    let pulls: Vec<[f32; 4]> = (0..cut.tiles * TILE)
+    let loss_gradients: Vec<[f32; 4]> = (0..cut.tiles * TILE)
         .map(|row| match row < POINTS {
             true => [0; 4].map(|_| across(1.0 / POINTS as f64)),
             false => [0.0; 4],
@@ -187,7 +187,11 @@ fn fill(card: &Card, buffers: &Buffers, cut: Cut) {
         laid_out,
         &transposed.as_slice()[..LAID_OUT],
     );
-    write(&buffers.pulls, 0, bytemuck::cast_slice(&pulls));
+    write(
+        &buffers.loss_gradients,
+        0,
+        bytemuck::cast_slice(&loss_gradients),
+    );
     let request = Request {
         lane: Lane {
             scale: 1.0,

@@ -9,9 +9,9 @@ use super::layout::{ARRAYS, CONVERGED, DIVERGED, STEPS, Status};
 use super::memory::NETWORK_BYTES;
 use super::tiling::Cut;
 use super::{inference, layout};
-use crate::flow::data::{Point, Progress, Watch};
+use crate::flow::data::{Control, Point, Progress};
 use crate::flow::field::{
-    Advance, BackendError, Course, LAID_OUT, Parameters, Report, Seen, Trainer, TrainerState,
+    Advance, BackendError, FitReport, LAID_OUT, Parameters, Schedule, Seen, Trainer, TrainerState,
     transpose_middle_layers,
 };
 use crate::flow::options::{Options, Precision};
@@ -67,7 +67,7 @@ impl Drop for Network {
 /// The network, its optimizer and the distance that it is fitted to.
 pub(super) struct GpuTrainer<'a> {
     transform: &'a GpuTransform,
-    course: Course,
+    course: Schedule,
     network: Network,
     /// Their place in the store, words.
     points: u32,
@@ -85,7 +85,7 @@ impl<'a> GpuTrainer<'a> {
         if options.precision == Precision::F16 {
             card.units()?;
         }
-        let (course, parameters) = Course::new(source, options);
+        let (course, parameters) = Schedule::new(source, options);
         let chunks = Cut::new(course.largest_batch()).chunks.count as u64;
         if chunks > card.budget.chunks {
             return Err(BackendError::Memory {
@@ -193,7 +193,7 @@ impl<'a> GpuTrainer<'a> {
 }
 
 impl Trainer for GpuTrainer<'_> {
-    fn advance(&mut self, steps: usize, watch: &dyn Watch) -> Result<Advance, BackendError> {
+    fn advance(&mut self, steps: usize, control: &dyn Control) -> Result<Advance, BackendError> {
         let first = self.iterations();
         let most = self.course.options.max_iterations;
         loop {
@@ -204,17 +204,17 @@ impl Trainer for GpuTrainer<'_> {
             if done >= steps {
                 return Ok(Advance::Continues);
             }
-            if let Some(interrupt) = watch.interrupt() {
+            if let Some(interrupt) = control.interrupt() {
                 return Ok(Advance::Interrupted(interrupt));
             }
-            if done > 0 && watch.snapshot_due() {
+            if done > 0 && control.snapshot_due() {
                 return Ok(Advance::Continues);
             }
             let before = self.iterations();
             let steps = self.stride().min(steps - done).min(most - before);
             let submitted = self.submit(steps)?;
             for (iteration, &loss) in (before + 1..).zip(&submitted.losses) {
-                watch.progress(Progress {
+                control.progress(Progress {
                     iteration,
                     max_iterations: most,
                     loss: loss.into(),
@@ -233,8 +233,8 @@ impl Trainer for GpuTrainer<'_> {
         inference::evaluate(self.card(), networks, &self.lane(), points)
     }
 
-    fn report(&self) -> Report {
-        Report {
+    fn report(&self) -> FitReport {
+        FitReport {
             iterations: self.iterations(),
             best_iteration: self.status.best_iteration as usize,
             best_loss: widened(self.status.best_loss).into(),

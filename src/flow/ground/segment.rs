@@ -4,7 +4,7 @@
 
 use super::columns::{Column, Columns, TILE_M};
 use super::options::GroundOptions;
-use super::surface::Surface;
+use super::surface::HeightField;
 use crate::flow::data::Point;
 use nalgebra::{Matrix3, Vector3};
 
@@ -79,8 +79,8 @@ pub fn segment(points: &[Point], options: &GroundOptions) -> GroundSegmentation 
 }
 
 /// The surface under the columns, coarse to fine: each level keeps to what is near the last one's.
-fn fit(columns: &Columns) -> Surface {
-    let mut surface = Surface::level(columns.half_m, TILE_M, around(columns));
+fn fit(columns: &Columns) -> HeightField {
+    let mut surface = HeightField::level(columns.half_m, TILE_M, around(columns));
     let mut slope = TILT;
     loop {
         let step = surface.step_m();
@@ -127,7 +127,7 @@ fn around(columns: &Columns) -> f32 {
 
 /// Whether enough of what was seen is flat and lies on the surface. Without ground the surface
 /// hangs under whatever is lowest: walls, and cars without wheels, which are not flat.
-fn has_ground(columns: &Columns, surface: &Surface, options: &GroundOptions) -> bool {
+fn has_ground(columns: &Columns, surface: &HeightField, options: &GroundOptions) -> bool {
     let near = columns.columns.iter();
     let near = near.filter(|column| column.low[0].hypot(column.low[1]) < EVIDENCE_M);
     let mut seen = 0_usize;
@@ -141,7 +141,7 @@ fn has_ground(columns: &Columns, surface: &Surface, options: &GroundOptions) -> 
 
 /// Height of the origin above the plane through the ground around it, metres. The surface itself
 /// is a guess under the vehicle, where no ray falls.
-fn origin_height(columns: &Columns, surface: &Surface) -> f32 {
+fn origin_height(columns: &Columns, surface: &HeightField) -> f32 {
     let near = columns.columns.iter().filter(|column| {
         column.low[0].hypot(column.low[1]) < STAND_M && lies_flat(column, surface)
     });
@@ -165,7 +165,7 @@ fn origin_height(columns: &Columns, surface: &Surface) -> f32 {
     -height.unwrap_or_else(|| surface.height_at(0.0, 0.0))
 }
 
-fn lies_flat(column: &Column, surface: &Surface) -> bool {
+fn lies_flat(column: &Column, surface: &HeightField) -> bool {
     column.flatness() > FLAT && surface.above(&column.low).abs() < MEAN_M
 }
 

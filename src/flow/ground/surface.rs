@@ -12,7 +12,7 @@ const STIFFNESS: f32 = 0.3;
 const ROUNDS: usize = 6;
 
 /// Heights over a square area.
-pub(super) struct Surface {
+pub(super) struct HeightField {
     half_m: f32,
     step_m: f32,
     /// Nodes along a side, at least 2.
@@ -21,7 +21,7 @@ pub(super) struct Surface {
     heights: Vec<f32>,
 }
 
-impl Surface {
+impl HeightField {
     /// A level surface over |x|, |y| <= `half_m`, which is a multiple of `step_m`.
     pub(super) fn level(half_m: f32, step_m: f32, height_m: f32) -> Self {
         let side = (2.0 * half_m / step_m) as usize + 1;
@@ -152,7 +152,7 @@ mod tests {
 
     #[test]
     fn a_refined_surface_has_the_same_heights() {
-        let mut surface = Surface::level(32.0, 16.0, -1.0);
+        let mut surface = HeightField::level(32.0, 16.0, -1.0);
         for (node, height) in surface.heights.iter_mut().enumerate() {
             *height = (node * 7 % 5) as f32;
         }
@@ -164,7 +164,7 @@ mod tests {
 
     #[test]
     fn outside_the_area_the_height_is_the_borders() {
-        let surface = Surface::level(32.0, 8.0, 0.7);
+        let surface = HeightField::level(32.0, 8.0, 0.7);
         assert_eq!(surface.height_at(1e9, -40.0), 0.7);
         assert_eq!(surface.above(&[0.0, 900.0, 1.7]), 1.0);
     }
@@ -177,7 +177,7 @@ mod tests {
             .filter(|(x, y)| x.hypot(*y) > 3.0)
             .map(|(x, y)| [x, y, plane(x, y)])
             .collect();
-        let mut surface = Surface::level(32.0, 4.0, 0.0);
+        let mut surface = HeightField::level(32.0, 4.0, 0.0);
         for _ in 0..20 {
             surface.pull(samples.iter().map(|point| (point, 1.0)), ALL, 8.0);
         }
@@ -189,7 +189,7 @@ mod tests {
 
     #[test]
     fn samples_without_trust_pull_nothing() {
-        let mut surface = Surface::level(32.0, 32.0, 0.0);
+        let mut surface = HeightField::level(32.0, 32.0, 0.0);
         let samples = [[0.0, 0.0, 5.0]];
         surface.pull(samples.iter().map(|point| (point, 1.0)), |_| 0.0, 1.0);
         assert!(surface.heights.iter().all(|&height| height == 0.0));

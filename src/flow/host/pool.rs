@@ -6,11 +6,11 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use super::sweep_cache::Recall;
-use crate::flow::data::{Point, RigidTransform, Watch};
+use super::sweep_cache::SweepCache;
+use crate::flow::data::{Control, Point, RigidTransform};
 use crate::flow::field::BackendError;
-use crate::flow::objects::{Clouds, Labelled};
-use crate::flow::options::LabelOptions;
+use crate::flow::objects::{ObjectSearch, SearchClouds};
+use crate::flow::options::ObjectOptions;
 use crate::flow::{ground, objects, registration};
 
 /// A set of the host's threads.
@@ -18,7 +18,7 @@ use crate::flow::{ground, objects, registration};
 pub struct Host {
     name: String,
     threads: Arc<rayon::ThreadPool>,
-    recall: Arc<Recall>,
+    sweep_cache: Arc<SweepCache>,
 }
 
 impl core::fmt::Debug for Host {
@@ -46,7 +46,7 @@ impl Host {
                 None => format!("cpu ({count} threads)"),
             },
             threads: Arc::new(threads),
-            recall: Arc::default(),
+            sweep_cache: Arc::default(),
         })
     }
 
@@ -57,7 +57,7 @@ impl Host {
 
     /// Forgets what it has found of sweeps, as a measurement wants it that does the same twice.
     pub fn forget(&self) {
-        self.recall.forget();
+        self.sweep_cache.forget();
     }
 
     /// The threads themselves.
@@ -66,38 +66,41 @@ impl Host {
     }
 
     /// The rigid motion target_from_source, near `prior`, that aligns `source` with `target`; the
-    /// motion so far where `watch` interrupts.
+    /// motion so far where `control` interrupts.
     pub fn align(
         &self,
         source: &[Point],
         target: &[Point],
         prior: &RigidTransform,
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) -> RigidTransform {
-        let known = [source, target].map(|points| self.recall.of(points));
+        let known = [source, target].map(|points| self.sweep_cache.of(points));
         self.threads.install(|| {
             let (source, target) = rayon::join(|| known[0].surface(), || known[1].surface());
-            registration::align(source, target, prior, watch)
+            registration::align(source, target, prior, control)
         })
     }
 
     /// Which points of each sweep are ground; all of them are finite and in range.
     pub(crate) fn ground(&self, sweeps: &[&[Point]]) -> Vec<Vec<bool>> {
-        let known: Vec<_> = sweeps.iter().map(|points| self.recall.of(points)).collect();
+        let known: Vec<_> = sweeps
+            .iter()
+            .map(|points| self.sweep_cache.of(points))
+            .collect();
         let found = known
             .par_iter()
             .map(|known| known.ground(ground::mask).clone());
         self.threads.install(|| found.collect())
     }
 
-    /// What moves in `clouds`; what has been found so far where `watch` interrupts.
-    pub fn movers(
+    /// What moves in `clouds`; what has been found so far where `control` interrupts.
+    pub fn find_objects(
         &self,
-        clouds: &Clouds<'_>,
-        options: &LabelOptions,
-        watch: &dyn Watch,
-    ) -> Labelled {
-        let find = || objects::label(clouds, options, watch);
+        clouds: &SearchClouds<'_>,
+        options: &ObjectOptions,
+        control: &dyn Control,
+    ) -> ObjectSearch {
+        let find = || objects::find_objects(clouds, options, control);
         self.threads.install(find)
     }
 }
@@ -105,7 +108,7 @@ impl Host {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::flow::data::Unwatched;
+    use crate::flow::data::Uncontrolled;
     use crate::flow::simulate::{Street, StreetOptions};
 
     #[test]
@@ -119,7 +122,7 @@ mod tests {
         let sweeps = [0, 1, 2].map(|k| street.frame(k).expect("a sweep").points);
         let prior = RigidTransform::identity();
         let aligned = |host: &Host, source: usize, target: usize| {
-            host.align(&sweeps[source], &sweeps[target], &prior, &Unwatched)
+            host.align(&sweeps[source], &sweeps[target], &prior, &Uncontrolled)
         };
         let host = Host::new(Some(2), None).expect("threads");
         for (source, target) in [(0, 1), (1, 2), (2, 0), (1, 0), (0, 1)] {

@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 use crate::flow::data::Point;
 use crate::flow::data::get_or_compute;
-use crate::flow::registration::Surface;
+use crate::flow::registration::SurfelCloud;
 
 /// The points of all sweeps that are remembered: some twenty full sweeps, mostly 60 MB with their
 /// surfaces, and 230 MB where no two points share a voxel.
@@ -19,22 +19,22 @@ const POINTS: usize = 2 << 20;
 const SWEEPS: usize = 64;
 
 /// What is known of a sweep.
-pub(crate) struct Known {
+pub(crate) struct CachedSweep {
     /// What takes part of it: finite and in range.
     points: Vec<Point>,
     ground: OnceLock<Vec<bool>>,
-    surface: OnceLock<Surface>,
+    surface: OnceLock<SurfelCloud>,
 }
 
-impl Known {
+impl CachedSweep {
     /// Which of the points are ground; `find` says so where it is not known yet.
     pub(crate) fn ground(&self, find: impl FnOnce(&[Point]) -> Vec<bool>) -> &Vec<bool> {
         get_or_compute(&self.ground, || find(&self.points))
     }
 
     /// What alignments need of it.
-    pub(crate) fn surface(&self) -> &Surface {
-        get_or_compute(&self.surface, || Surface::new(&self.points))
+    pub(crate) fn surface(&self) -> &SurfelCloud {
+        get_or_compute(&self.surface, || SurfelCloud::new(&self.points))
     }
 }
 
@@ -45,27 +45,27 @@ fn same(a: &[Point], b: &[Point]) -> bool {
 
 /// The sweeps that were seen last.
 #[derive(Default)]
-pub(crate) struct Recall(Mutex<VecDeque<Arc<Known>>>);
+pub(crate) struct SweepCache(Mutex<VecDeque<Arc<CachedSweep>>>);
 
-impl Recall {
+impl SweepCache {
     /// Forgets all sweeps.
     pub(crate) fn forget(&self) {
         self.sweeps().clear();
     }
 
-    fn sweeps(&self) -> MutexGuard<'_, VecDeque<Arc<Known>>> {
+    fn sweeps(&self) -> MutexGuard<'_, VecDeque<Arc<CachedSweep>>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// What is known of the sweep of these points.
-    pub(crate) fn of(&self, points: &[Point]) -> Arc<Known> {
+    pub(crate) fn of(&self, points: &[Point]) -> Arc<CachedSweep> {
         let mut sweeps = self.sweeps();
         let known = match sweeps.iter().position(|known| same(&known.points, points)) {
             Some(place) => sweeps.remove(place),
             None => None,
         };
         let known = known.unwrap_or_else(|| {
-            Arc::new(Known {
+            Arc::new(CachedSweep {
                 points: points.to_vec(),
                 ground: OnceLock::new(),
                 surface: OnceLock::new(),
@@ -95,13 +95,13 @@ mod tests {
 
     #[test]
     fn a_sweep_is_known_again_by_its_points_and_by_nothing_else() {
-        let recall = Recall::default();
-        let first = recall.of(&sweep(100, 1.0));
+        let sweep_cache = SweepCache::default();
+        let first = sweep_cache.of(&sweep(100, 1.0));
         assert_eq!(
             first.ground(|points| vec![true; points.len()])[..],
             [true; 100]
         );
-        let again = recall.of(&sweep(100, 1.0));
+        let again = sweep_cache.of(&sweep(100, 1.0));
         assert_eq!(
             again.ground(|_| unreachable!("it is known"))[..],
             [true; 100]
@@ -109,7 +109,7 @@ mod tests {
         let mut other = sweep(100, 1.0);
         other[99][2] = -0.0;
         for other in [other, sweep(99, 1.0), sweep(100, 2.0)] {
-            let ground = recall.of(&other);
+            let ground = sweep_cache.of(&other);
             let ground = ground.ground(|points| vec![false; points.len()]);
             assert_eq!(*ground, vec![false; other.len()]);
         }
@@ -117,12 +117,16 @@ mod tests {
 
     #[test]
     fn what_was_not_seen_for_long_is_forgotten_and_what_is_too_large_is_not_kept() {
-        let held = |recall: &Recall| -> usize {
-            recall.sweeps().iter().map(|known| known.points.len()).sum()
+        let held = |sweep_cache: &SweepCache| -> usize {
+            sweep_cache
+                .sweeps()
+                .iter()
+                .map(|known| known.points.len())
+                .sum()
         };
-        let recall = Recall::default();
+        let sweep_cache = SweepCache::default();
         let asked = |x: f32| {
-            let known = recall.of(&sweep(POINTS / 4, x));
+            let known = sweep_cache.of(&sweep(POINTS / 4, x));
             let mut was_known = true;
             known.ground(|points| {
                 was_known = false;
@@ -133,15 +137,15 @@ mod tests {
         assert_eq!([1.0, 2.0, 3.0, 4.0].map(asked), [false; 4]);
         // The first is seen once more, so that the second has to go.
         assert_eq!([1.0, 5.0, 1.0, 2.0].map(asked), [true, false, true, false]);
-        assert!(held(&recall) <= POINTS);
-        let before = held(&recall);
-        recall.of(&sweep(POINTS + 1, 0.0));
-        assert_eq!(held(&recall), before);
-        recall.forget();
-        assert_eq!(held(&recall), 0);
+        assert!(held(&sweep_cache) <= POINTS);
+        let before = held(&sweep_cache);
+        sweep_cache.of(&sweep(POINTS + 1, 0.0));
+        assert_eq!(held(&sweep_cache), before);
+        sweep_cache.forget();
+        assert_eq!(held(&sweep_cache), 0);
         for few in 0..=SWEEPS as u16 {
-            recall.of(&sweep(3, few.into()));
+            sweep_cache.of(&sweep(3, few.into()));
         }
-        assert_eq!(recall.sweeps().len(), SWEEPS);
+        assert_eq!(sweep_cache.sweeps().len(), SWEEPS);
     }
 }

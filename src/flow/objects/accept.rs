@@ -4,36 +4,36 @@
 //! A sparse static surface can always be laid a little better on the other sweep's samples, and what
 //! only one sweep saw lies best on something else. It must not know how motions are found.
 
-use super::free_space::SeenThrough;
-use super::hypothesis::{Found, Witnesses};
+use super::free_space::FreeSpaceEvidence;
+use super::hypothesis::{Hypothesis, NeighborEvidence};
 use crate::flow::data::Point;
-use crate::flow::options::LabelOptions;
+use crate::flow::options::ObjectOptions;
 
 /// Whether `found`, the best motion of a cluster with these `points`, is needed; `seen` says what was
 /// seen through before and after it.
 pub(super) fn is_needed(
-    found: &Found,
+    found: &Hypothesis,
     points: &[Point],
-    seen: impl Fn() -> SeenThrough,
-    options: &LabelOptions,
+    seen: impl Fn() -> FreeSpaceEvidence,
+    options: &ObjectOptions,
 ) -> bool {
     let around = &found.around;
     let sweeps = 1.0 + around.weight;
     let still = (found.still.sum_m() + around.still_m) / sweeps;
     let moved = (found.cost.sum_m() + around.moved_m) / sweeps;
     let gain = (still - moved) * sweeps;
-    found.motion.length_m() >= options.least_motion_m
-        && found.still.there_m - found.cost.there_m >= options.gain_m
-        && moved <= options.kept_cost * still
+    found.motion.length_m() >= options.min_motion_m
+        && found.still.forward_m - found.cost.forward_m >= options.min_gain_m
+        && moved <= options.max_cost_ratio * still
         && gain * points.len() as f32
-            >= options.evidence_m + options.evidence_slope * found.motion.length_m()
-        && found.cost.there_m <= options.left_m
+            >= options.min_evidence_m + options.min_evidence_slope * found.motion.length_m()
+        && found.cost.forward_m <= options.max_residual_m
         && !is_flat(points, options)
         && {
             let seen = seen();
             let stayed = has_stayed(seen, options);
             !(stayed && seen.far)
-                && (found.hold >= options.least_hold
+                && (found.hold >= options.min_observability
                     || has_gone(seen, options)
                     || is_confirmed(around, options) && !stayed)
         }
@@ -42,10 +42,10 @@ pub(super) fn is_needed(
 /// Whether the sweeps around say plainly that a cluster moves, even one that its surfaces do not hold:
 /// a wall that seems to slide lies where it was in all of them, a bus has driven on. The nearest must
 /// say so itself: a wall may slide, by then, onto what lies behind it.
-fn is_confirmed(around: &Witnesses, options: &LabelOptions) -> bool {
+fn is_confirmed(around: &NeighborEvidence, options: &ObjectOptions) -> bool {
     let is_plain = |[still_m, moved_m]: [f32; 2], weight: f32| {
-        moved_m <= options.confirmed_cost * still_m
-            && still_m - moved_m >= options.confirmed_m * weight
+        moved_m <= options.neighbor_cost_ratio * still_m
+            && still_m - moved_m >= options.neighbor_gain_m * weight
     };
     around.weight > 0.0
         && is_plain(around.nearest_m, 1.0)
@@ -54,44 +54,47 @@ fn is_confirmed(around: &Witnesses, options: &LabelOptions) -> bool {
 
 /// Whether a cluster was seen to leave and to come, even one that its surfaces do not hold: the flat
 /// side of what drives past.
-fn has_gone(seen: SeenThrough, options: &LabelOptions) -> bool {
-    let is_seen = |share: Option<f32>| share.is_some_and(|share| share >= options.gone);
+fn has_gone(seen: FreeSpaceEvidence, options: &ObjectOptions) -> bool {
+    let is_seen = |share: Option<f32>| share.is_some_and(|share| share >= options.min_free_space);
     is_seen(seen.left) && is_seen(seen.came)
 }
 
 /// Whether a cluster was seen neither to leave nor to come: what is hidden in one of the sweeps may lie
 /// on anything in the other. Of a short way rays tell too little to stop what its surfaces hold.
-fn has_stayed(seen: SeenThrough, options: &LabelOptions) -> bool {
+fn has_stayed(seen: FreeSpaceEvidence, options: &ObjectOptions) -> bool {
     let both = seen.left.zip(seen.came);
-    both.is_some_and(|(left, came)| left + came < options.stayed)
+    both.is_some_and(|(left, came)| left + came < options.min_free_space_far)
 }
 
 /// Whether the points, many of them, lie at one height: a ring on ground that was not found.
-fn is_flat(points: &[Point], options: &LabelOptions) -> bool {
-    if points.len() < options.flat_points {
+fn is_flat(points: &[Point], options: &ObjectOptions) -> bool {
+    if points.len() < options.ground_min_points {
         return false;
     }
     let mut heights: Vec<f32> = points.iter().map(|point| point[2]).collect();
     heights.sort_unstable_by(f32::total_cmp);
     let at = |share: f32| heights[(share * (heights.len() - 1) as f32) as usize];
-    at(0.95) - at(0.05) < options.flat_m
+    at(0.95) - at(0.05) < options.ground_thickness_m
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::flow::objects::hypothesis::Cost;
-    use crate::flow::objects::planar_motion::Motion;
+    use crate::flow::objects::planar_motion::PlanarMotion;
 
     /// A motion that is needed whatever is asked.
-    fn plain() -> Found {
-        let cost = |there_m, back_m| Cost { there_m, back_m };
-        Found {
-            motion: Motion::still([0.0; 2]).shifted([0.8, 0.0]),
+    fn plain() -> Hypothesis {
+        let cost = |forward_m, backward_m| Cost {
+            forward_m,
+            backward_m,
+        };
+        Hypothesis {
+            motion: PlanarMotion::still([0.0; 2]).shifted([0.8, 0.0]),
             cost: cost(0.03, 0.03),
             still: cost(0.25, 0.2),
             hold: 0.4,
-            around: Witnesses::default(),
+            around: NeighborEvidence::default(),
         }
     }
 
@@ -102,25 +105,25 @@ mod tests {
     }
 
     /// Nobody looked.
-    const UNSEEN: SeenThrough = SeenThrough {
+    const UNSEEN: FreeSpaceEvidence = FreeSpaceEvidence {
         left: None,
         came: None,
         far: true,
     };
 
-    fn needed(change: impl Fn(&mut Found)) -> bool {
+    fn needed(change: impl Fn(&mut Hypothesis)) -> bool {
         needed_as_seen(UNSEEN, change)
     }
 
-    fn needed_as_seen(seen: SeenThrough, change: impl Fn(&mut Found)) -> bool {
+    fn needed_as_seen(seen: FreeSpaceEvidence, change: impl Fn(&mut Hypothesis)) -> bool {
         let mut found = plain();
         change(&mut found);
-        is_needed(&found, &points(60), || seen, &LabelOptions::default())
+        is_needed(&found, &points(60), || seen, &ObjectOptions::default())
     }
 
     /// The shares that were seen through.
-    fn seen(left: f32, came: f32) -> SeenThrough {
-        SeenThrough {
+    fn seen(left: f32, came: f32) -> FreeSpaceEvidence {
+        FreeSpaceEvidence {
             left: Some(left),
             came: Some(came),
             far: true,
@@ -135,11 +138,11 @@ mod tests {
     #[test]
     fn motions_that_are_short_gain_little_or_leave_much_are_not() {
         assert!(!needed(
-            |found| found.motion = Motion::still([0.0; 2]).shifted([0.02, 0.0])
+            |found| found.motion = PlanarMotion::still([0.0; 2]).shifted([0.02, 0.0])
         ));
-        assert!(!needed(|found| found.still.there_m = 0.04));
-        assert!(!needed(|found| found.cost.there_m = 0.2));
-        assert!(!needed(|found| found.cost.back_m = 0.3));
+        assert!(!needed(|found| found.still.forward_m = 0.04));
+        assert!(!needed(|found| found.cost.forward_m = 0.2));
+        assert!(!needed(|found| found.cost.backward_m = 0.3));
     }
 
     #[test]
@@ -164,7 +167,7 @@ mod tests {
         assert!(is_needed(seen(0.9, 0.0)));
         assert!(is_needed(seen(0.0, 0.9)));
         // Rays do not tell a short way.
-        let near = SeenThrough {
+        let near = FreeSpaceEvidence {
             far: false,
             ..seen(0.1, 0.1)
         };
@@ -173,7 +176,7 @@ mod tests {
 
     #[test]
     fn a_bus_that_all_sweeps_see_driving_moves_though_nothing_holds_it() {
-        let around = |still_m: f32, moved_m: f32| Witnesses {
+        let around = |still_m: f32, moved_m: f32| NeighborEvidence {
             weight: 1.5,
             still_m: still_m * 1.5,
             moved_m: moved_m * 1.5,
@@ -188,14 +191,14 @@ mod tests {
         assert!(slides(around(0.4, 0.05)));
         assert!(!slides(around(0.08, 0.05)));
         assert!(!slides(around(0.4, 0.3)));
-        let far = Witnesses {
+        let far = NeighborEvidence {
             nearest_m: [0.05; 2],
             ..around(0.4, 0.05)
         };
         assert!(!slides(far));
         // Nor one that is seen to stay, however short the way.
         let stays = |far| {
-            let seen = SeenThrough {
+            let seen = FreeSpaceEvidence {
                 far,
                 ..seen(0.1, 0.1)
             };
@@ -210,7 +213,7 @@ mod tests {
 
     #[test]
     fn the_farther_a_motion_the_more_points_it_takes() {
-        let options = LabelOptions::default();
+        let options = ObjectOptions::default();
         let mut found = plain();
         assert!(is_needed(&found, &points(12), || UNSEEN, &options));
         found.motion = found.motion.shifted([2.2, 0.0]);
@@ -225,7 +228,7 @@ mod tests {
             &plain(),
             &flat,
             || UNSEEN,
-            &LabelOptions::default()
+            &ObjectOptions::default()
         ));
     }
 }

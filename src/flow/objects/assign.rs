@@ -6,11 +6,11 @@
 
 use rayon::prelude::*;
 
-use super::hypothesis::{Found, Mover};
-use super::neighbor_view::Moment;
-use super::planar_motion::Motion;
+use super::hypothesis::{Hypothesis, Mover};
+use super::neighbor_view::NeighborView;
+use super::planar_motion::PlanarMotion;
 use super::scene::Scene;
-use crate::flow::data::evenly;
+use crate::flow::data::stride_sample;
 use crate::flow::spatial::NOISE;
 
 /// Points of a piece that look for movers beside it.
@@ -21,16 +21,20 @@ const BETTER_M: f32 = 0.05;
 const VOTE_M: f32 = 0.3;
 
 /// Whose motion everything has; [`NOISE`] where it stands still.
-pub(super) struct Spread {
+pub(super) struct Assignment {
     /// Of each cluster, the cluster whose motion it has.
-    pub(super) leaders: Vec<u32>,
+    pub(super) cluster_motion: Vec<u32>,
     /// Of each thinned source point likewise.
-    pub(super) owners: Vec<u32>,
+    pub(super) point_motion: Vec<u32>,
 }
 
 /// Shares the motions out.
-pub(super) fn spread(scene: &Scene<'_>, around: &[Moment<'_>], needed: &[Option<Found>]) -> Spread {
-    let leaders: Vec<u32> = (0..needed.len() as u32)
+pub(super) fn spread(
+    scene: &Scene<'_>,
+    around: &[NeighborView<'_>],
+    needed: &[Option<Hypothesis>],
+) -> Assignment {
+    let cluster_motion: Vec<u32> = (0..needed.len() as u32)
         .into_par_iter()
         .map(|cluster| leader(scene, around, needed, cluster))
         .collect();
@@ -38,7 +42,7 @@ pub(super) fn spread(scene: &Scene<'_>, around: &[Moment<'_>], needed: &[Option<
     let points = scene.source.labels.par_iter().zip(&scene.source.points);
     let worse_m: Vec<f32> = points
         .map(|(&label, &place)| {
-            let leader = leaders.get(label as usize).copied().unwrap_or(NOISE);
+            let leader = cluster_motion.get(label as usize).copied().unwrap_or(NOISE);
             let found = needed.get(leader as usize).and_then(Option::as_ref);
             found.map_or(0.0, |found| {
                 let moved = found.motion.apply(place);
@@ -46,12 +50,12 @@ pub(super) fn spread(scene: &Scene<'_>, around: &[Moment<'_>], needed: &[Option<
             })
         })
         .collect();
-    let owners = (0..scene.source.points.len() as u32)
+    let point_motion = (0..scene.source.points.len() as u32)
         .into_par_iter()
         .map(|row| match scene.source.labels[row as usize] {
             NOISE => leader_of_stray(scene, needed, row),
             label => {
-                let leader = leaders[label as usize];
+                let leader = cluster_motion[label as usize];
                 match needed.get(leader as usize).and_then(Option::as_ref) {
                     Some(_) if is_of(scene, row, &worse_m) => leader,
                     _ => NOISE,
@@ -59,16 +63,24 @@ pub(super) fn spread(scene: &Scene<'_>, around: &[Moment<'_>], needed: &[Option<
             }
         })
         .collect();
-    Spread { leaders, owners }
+    Assignment {
+        cluster_motion,
+        point_motion,
+    }
 }
 
 /// The cluster whose motion a cluster has: its own, that of a larger mover beside it, or none.
-fn leader(scene: &Scene<'_>, around: &[Moment<'_>], needed: &[Option<Found>], cluster: u32) -> u32 {
+fn leader(
+    scene: &Scene<'_>,
+    around: &[NeighborView<'_>],
+    needed: &[Option<Hypothesis>],
+    cluster: u32,
+) -> u32 {
     let members = &scene.source.members[cluster as usize];
     let own = needed[cluster as usize].as_ref();
     let size = |cluster: u32| scene.source.members[cluster as usize].len();
     let mut beside: Vec<u32> = Vec::new();
-    for row in evenly(members, LOOKING) {
+    for row in stride_sample(members, LOOKING) {
         let place = scene.source.points[row as usize];
         scene.source_around(place, scene.options.match_m, |other| {
             let label = scene.source.labels[other as usize];
@@ -84,11 +96,11 @@ fn leader(scene: &Scene<'_>, around: &[Moment<'_>], needed: &[Option<Found>], cl
         return if own.is_some() { cluster } else { NOISE };
     }
     let mover = Mover::new(scene, around, cluster);
-    let cost = |motion: &Motion| mover.cost(motion).sum_m() + mover.around_m(motion);
-    let still = cost(&Motion::still([0.0; 2]));
+    let cost = |motion: &PlanarMotion| mover.cost(motion).sum_m() + mover.around_m(motion);
+    let still = cost(&PlanarMotion::still([0.0; 2]));
     let mut best = match own {
         Some(found) => (cost(&found.motion) + BETTER_M, cluster),
-        None => (still * scene.options.beside_cost, NOISE),
+        None => (still * scene.options.adjacent_cost_ratio, NOISE),
     };
     for label in beside {
         if let Some(found) = &needed[label as usize] {
@@ -102,7 +114,7 @@ fn leader(scene: &Scene<'_>, around: &[Moment<'_>], needed: &[Option<Found>], cl
 }
 
 /// The mover whose motion a point of no cluster has, if any.
-fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Found>], row: u32) -> u32 {
+fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Hypothesis>], row: u32) -> u32 {
     let place = scene.source.points[row as usize];
     let mut beside: Vec<u32> = Vec::new();
     scene.source_around(place, scene.options.match_m, |other| {
@@ -114,7 +126,7 @@ fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Found>], row: u32) -> u32
     beside.sort_unstable();
     beside.dedup();
     let mut best = (
-        scene.distance_of(place, NOISE) * scene.options.beside_cost,
+        scene.distance_of(place, NOISE) * scene.options.adjacent_cost_ratio,
         NOISE,
     );
     for label in beside {
@@ -142,5 +154,5 @@ fn is_of(scene: &Scene<'_>, row: u32, worse_m: &[f32]) -> bool {
             count += 1.0;
         }
     });
-    worse <= scene.options.worse_m * count
+    worse <= scene.options.point_reject_m * count
 }

@@ -5,15 +5,15 @@
 //!   | moving points u64 | each: x y z f32, its motion u32 | standing points u64 | each: x y z f32
 //! ```
 
-use super::motion_field::Motions;
-use super::planar_motion::Motion;
-use crate::flow::data::{Body, Point, SealError};
+use super::motion_field::ObjectMotions;
+use super::planar_motion::PlanarMotion;
+use crate::flow::data::{Body, EnvelopeError, Point};
 use crate::flow::spatial::NOISE;
 
 const MOTION_BYTES: usize = 5 * size_of::<f32>();
 const POINT_BYTES: usize = 3 * size_of::<f32>();
 
-impl Motions {
+impl ObjectMotions {
     /// Appends the motions.
     pub(crate) fn put(&self, bytes: &mut Vec<u8>) {
         let (motions, moving, standing) = self.parts();
@@ -40,12 +40,12 @@ impl Motions {
     /// Reads what [`Self::put`] wrote.
     ///
     /// # Errors
-    /// [`SealError::Damaged`] where bytes are missing or name what is not there.
-    pub(crate) fn take(body: &mut Body<'_>) -> Result<Self, SealError> {
+    /// [`EnvelopeError::Damaged`] where bytes are missing or name what is not there.
+    pub(crate) fn take(body: &mut Body<'_>) -> Result<Self, EnvelopeError> {
         let count = body.count_of(MOTION_BYTES)?;
         let mut motions = Vec::with_capacity(count);
         for _ in 0..count {
-            motions.push(Motion {
+            motions.push(PlanarMotion {
                 shift_m: [finite(body)?, finite(body)?],
                 turn: finite(body)?,
                 center: [finite(body)?, finite(body)?],
@@ -53,24 +53,27 @@ impl Motions {
         }
         let count = body.count_of(POINT_BYTES + size_of::<u32>())?;
         let mut points: Vec<Point> = Vec::with_capacity(count);
-        let mut owners = Vec::with_capacity(count);
+        let mut point_motion = Vec::with_capacity(count);
         for _ in 0..count {
             points.push([finite(body)?, finite(body)?, finite(body)?]);
             let owner = u32::from_le_bytes(body.take()?);
             if owner as usize >= motions.len() {
-                return Err(SealError::Damaged);
+                return Err(EnvelopeError::Damaged);
             }
-            owners.push(owner);
+            point_motion.push(owner);
         }
         for _ in 0..body.count_of(POINT_BYTES)? {
             points.push([finite(body)?, finite(body)?, finite(body)?]);
-            owners.push(NOISE);
+            point_motion.push(NOISE);
         }
-        Ok(Self::new(motions, &points, &owners))
+        Ok(Self::new(motions, &points, &point_motion))
     }
 }
 
-fn finite(body: &mut Body<'_>) -> Result<f32, SealError> {
+fn finite(body: &mut Body<'_>) -> Result<f32, EnvelopeError> {
     let value = body.single()?;
-    value.is_finite().then_some(value).ok_or(SealError::Damaged)
+    value
+        .is_finite()
+        .then_some(value)
+        .ok_or(EnvelopeError::Damaged)
 }

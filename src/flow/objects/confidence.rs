@@ -3,7 +3,7 @@
 //! Logistic regressions on the evidence, one for what moves, one for what stands still and one for
 //! ground, fitted to labelled and simulated pairs (`examples/confidence.rs`, `docs/numerics.md`).
 
-use super::features::Evidence;
+use super::features::ConfidenceFeatures;
 
 /// An end-point error below this is right, metres: that of the metric Acc5.
 pub const SURE_M: f32 = 0.05;
@@ -11,7 +11,7 @@ pub const SURE_M: f32 = 0.05;
 /// What is weighed.
 const FEATURES: usize = 12;
 
-/// Weights of what moves, in the order of [`Evidence::features`].
+/// Weights of what moves, in the order of [`ConfidenceFeatures::features`].
 const MOVING: [f32; FEATURES] = [
     6.090, 0.710, -0.379, 0.340, -4.731, -3.398, -11.741, 0.000, 9.903, 0.619, -0.195, -4.113,
 ];
@@ -22,7 +22,7 @@ const STANDING: [f32; FEATURES] = [
 /// Weights of ground, which moves with the vehicle: none, and by [`range`].
 const GROUND: [f32; 2] = [5.792, -0.522];
 
-impl Evidence {
+impl ConfidenceFeatures {
     /// What is weighed, each of the order of one: 1, range, residual, whether nothing is there, the
     /// cluster's cost there and back, how few points it has, what a refused motion would have
     /// gained, how much of the cluster does otherwise, and its size: cars are neither as small as
@@ -38,8 +38,8 @@ impl Evidence {
             range(self.range_m),
             self.off_m / DISTANCE_M,
             f32::from(self.hidden),
-            self.there_m / DISTANCE_M,
-            self.back_m / DISTANCE_M,
+            self.forward_m / DISTANCE_M,
+            self.backward_m / DISTANCE_M,
             1.0 / (self.points.max(1) as f32).sqrt(),
             self.refused_m / DISTANCE_M,
             1.0 - self.together,

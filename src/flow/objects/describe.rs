@@ -4,9 +4,9 @@
 
 use rayon::prelude::*;
 
-use super::labels::Parts;
-use super::search::Labelled;
-use crate::flow::data::{Bounds, DYNAMIC_M, Point, RigidTransform, moved};
+use super::labels::ClusterLabels;
+use super::search::ObjectSearch;
+use crate::flow::data::{DYNAMIC_M, OrientedBox, Point, RigidTransform, transform_point};
 
 /// The clusters of a sweep of N rows.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -27,7 +27,7 @@ pub struct Cluster {
     /// Whether it moves by itself.
     pub dynamic: bool,
     /// Where it is in the source, as its points show it; along its motion where it moves.
-    pub bounds: Bounds,
+    pub bounds: OrientedBox,
     /// How far its center moves over the gap between the sweeps, ego motion left out: metres along
     /// the axes of the source. Zero where it stands still.
     pub velocity: Point,
@@ -47,7 +47,7 @@ impl Objects {
         count: usize,
         rows: &[usize],
         points: &[Point],
-        labelled: &Labelled,
+        labelled: &ObjectSearch,
         ego: &RigidTransform,
     ) -> Self {
         let mut objects = Self {
@@ -58,9 +58,13 @@ impl Objects {
         for (&row, evidence) in rows.iter().zip(&labelled.evidence) {
             objects.confidence[row] = evidence.confidence();
         }
-        let Parts { of, motions } = &labelled.parts;
+        let ClusterLabels { of, motions } = &labelled.parts;
         let mut members: Vec<Vec<usize>> = vec![Vec::new(); motions.len()];
-        for (i, &cluster) in of.iter().enumerate().filter(|&(_, &c)| c != Parts::NONE) {
+        for (i, &cluster) in of
+            .iter()
+            .enumerate()
+            .filter(|&(_, &c)| c != ClusterLabels::NONE)
+        {
             objects.cluster[rows[i]] = cluster as i32;
             members[cluster as usize].push(i);
         }
@@ -73,17 +77,19 @@ impl Objects {
                 ..Cluster::default()
             };
             let Some(motion) = motion else {
-                cluster.bounds = Bounds::around(&points, None);
+                cluster.bounds = OrientedBox::around(&points, None);
                 return cluster;
             };
             // Where its center goes does not depend much on where exactly that is.
-            let center = Bounds::around(&points, None).center;
-            let way = labelled.motions.displacement(motion, moved(ego, center));
+            let center = OrientedBox::around(&points, None).center;
+            let way = labelled
+                .motions
+                .displacement(motion, transform_point(ego, center));
             let way = ego.inverse_transform_vector(&way.map(f64::from).into());
             cluster.velocity = [way.x, way.y, way.z].map(|c| c as f32);
             cluster.yaw_rate = labelled.motions.turn(motion);
             let [x, y, _] = cluster.velocity;
-            cluster.bounds = Bounds::around(&points, Some([x, y]));
+            cluster.bounds = OrientedBox::around(&points, Some([x, y]));
             cluster.dynamic = x.hypot(y) >= DYNAMIC_M;
             cluster
         });
@@ -105,7 +111,7 @@ impl Objects {
 mod tests {
     use super::*;
     use crate::flow::cpu::CpuBackend;
-    use crate::flow::data::Unwatched;
+    use crate::flow::data::Uncontrolled;
     use crate::flow::estimate::estimate;
     use crate::flow::options::Preset;
     use crate::flow::select::Problem;
@@ -132,7 +138,7 @@ mod tests {
         };
         let backend = CpuBackend::new(None).expect("threads");
         let options = Preset::Default.options(None);
-        let estimate = estimate(&backend, &problem, &options, &Unwatched).expect("a flow");
+        let estimate = estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
         let objects = estimate.objects.expect("objects");
         let dynamic = estimate.dynamic.expect("the ego motion is known");
         let sizes = objects.clusters.iter().map(|cluster| cluster.points);
@@ -141,7 +147,7 @@ mod tests {
         for (number, cluster) in (0..).zip(&objects.clusters) {
             let rows = || (0..pair.source.len()).filter(|&row| objects.cluster[row] == number);
             assert_eq!(rows().count(), cluster.points as usize);
-            let Bounds { center, size, yaw } = cluster.bounds;
+            let OrientedBox { center, size, yaw } = cluster.bounds;
             let (sin, cos) = yaw.sin_cos();
             for row in rows() {
                 let [x, y, z] = core::array::from_fn(|a| pair.source[row][a] - center[a]);
@@ -157,11 +163,11 @@ mod tests {
                 moving += 1;
                 assert!((x - speed * cos).hypot(y - speed * sin) < speed, "forward");
                 let ego = estimate.ego.expect("it is known");
-                let still = moved(&ego, center);
+                let still = transform_point(&ego, center);
                 let rows: Vec<usize> = rows().collect();
                 let mean = |a: usize| {
                     let of = |&row: &usize| {
-                        let aligned = moved(&ego, pair.source[row]);
+                        let aligned = transform_point(&ego, pair.source[row]);
                         pair.source[row][a] + estimate.flow[row][a] - aligned[a]
                     };
                     rows.iter().map(of).sum::<f32>() / rows.len() as f32

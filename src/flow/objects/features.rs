@@ -4,31 +4,31 @@
 
 use rayon::prelude::*;
 
-use super::assign::Spread;
-use super::hypothesis::{Cost, Found};
-use super::motion_field::Motions;
+use super::assign::Assignment;
+use super::hypothesis::{Cost, Hypothesis};
+use super::motion_field::ObjectMotions;
 use super::scene::Scene;
 use crate::flow::data::Point;
-use crate::flow::options::LabelOptions;
+use crate::flow::options::ObjectOptions;
 use crate::flow::spatial::NOISE;
 
 /// What the search for a cluster's motion came to.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Searched {
+pub(super) struct SearchedCluster {
     /// What standing still costs.
     pub(super) still: Cost,
     /// The best motion, where one was sought.
-    pub(super) best: Option<Found>,
+    pub(super) best: Option<Hypothesis>,
     /// Whether it is needed.
     pub(super) needed: bool,
 }
 
-impl Searched {
+impl SearchedCluster {
     /// Nothing is known of it.
-    pub(super) fn not(options: &LabelOptions) -> Self {
+    pub(super) fn not(options: &ObjectOptions) -> Self {
         let worst = Cost {
-            there_m: options.truncation_m,
-            back_m: options.truncation_m,
+            forward_m: options.truncation_m,
+            backward_m: options.truncation_m,
         };
         Self {
             still: worst,
@@ -43,14 +43,14 @@ impl Searched {
     }
 
     /// The motion, where it is needed.
-    pub(super) fn found(&self) -> Option<Found> {
+    pub(super) fn found(&self) -> Option<Hypothesis> {
         self.best.filter(|_| self.needed)
     }
 }
 
 /// What is known of one source point's motion.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Evidence {
+pub struct ConfidenceFeatures {
     /// Whether it moves.
     pub moves: bool,
     /// Metres from the origin of the target's frame, level.
@@ -61,9 +61,9 @@ pub struct Evidence {
     pub hidden: bool,
     /// The mean of that over its cluster, and of the target around back to it: the agreement there
     /// and back.
-    pub there_m: f32,
-    /// See `there_m`.
-    pub back_m: f32,
+    pub forward_m: f32,
+    /// See `forward_m`.
+    pub backward_m: f32,
     /// Points of its cluster, one a voxel; zero where it is of none.
     pub points: usize,
     /// Metres that the cost would have fallen by with a motion that was refused.
@@ -79,27 +79,31 @@ pub struct Evidence {
 pub(super) struct Findings<'a> {
     pub(super) scene: &'a Scene<'a>,
     /// Of each cluster.
-    pub(super) searched: &'a [Searched],
-    pub(super) spread: &'a Spread,
-    pub(super) motions: &'a Motions,
+    pub(super) searched: &'a [SearchedCluster],
+    pub(super) spread: &'a Assignment,
+    pub(super) motions: &'a ObjectMotions,
     /// Of each motion, the cluster that it was found of.
     pub(super) movers: &'a [u32],
     /// Of each source point, which of the motions it has; [`NOISE`] where it stands still.
-    pub(super) owners: &'a [u32],
+    pub(super) point_motion: &'a [u32],
 }
 
 /// Of every point of `source`, which had `labels` before anything was known of motions.
-pub(super) fn evidence(findings: &Findings<'_>, source: &[Point], labels: &[u32]) -> Vec<Evidence> {
+pub(super) fn evidence(
+    findings: &Findings<'_>,
+    source: &[Point],
+    labels: &[u32],
+) -> Vec<ConfidenceFeatures> {
     let Findings {
         scene,
         searched,
         spread,
         motions,
         movers,
-        owners,
+        point_motion,
     } = *findings;
     let mut moving = vec![0_usize; scene.source.members.len()];
-    for (&label, &owner) in scene.source.labels.iter().zip(&spread.owners) {
+    for (&label, &owner) in scene.source.labels.iter().zip(&spread.point_motion) {
         if label != NOISE && owner != NOISE {
             moving[label as usize] += 1;
         }
@@ -110,8 +114,8 @@ pub(super) fn evidence(findings: &Findings<'_>, source: &[Point], labels: &[u32]
         .par_iter()
         .map(|rows| extent(rows.iter().map(|&row| scene.source.points[row as usize])))
         .collect();
-    let unknown = Searched::not(scene.options);
-    let rows = source.par_iter().zip(labels).zip(owners);
+    let unknown = SearchedCluster::not(scene.options);
+    let rows = source.par_iter().zip(labels).zip(point_motion);
     rows.map(|((&place, &label), &owner)| {
         let moves = owner != NOISE;
         let (cluster, at) = if moves {
@@ -134,13 +138,13 @@ pub(super) fn evidence(findings: &Findings<'_>, source: &[Point], labels: &[u32]
         let known = searched.get(cluster as usize).unwrap_or(&unknown);
         let cost = if moves { known.cost() } else { known.still };
         let refused = known.best.filter(|_| !known.needed && !moves);
-        Evidence {
+        ConfidenceFeatures {
             moves,
             range_m: place[0].hypot(place[1]),
             off_m,
             hidden: target.is_none(),
-            there_m: cost.there_m,
-            back_m: cost.back_m,
+            forward_m: cost.forward_m,
+            backward_m: cost.backward_m,
             points: members(cluster),
             refused_m: refused.map_or(0.0, |found| {
                 (found.still.sum_m() - found.cost.sum_m()).max(0.0)

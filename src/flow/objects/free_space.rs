@@ -7,7 +7,7 @@
 
 use std::f32::consts::{FRAC_PI_2, PI};
 
-use crate::flow::data::{Point, RigidTransform, moved};
+use crate::flow::data::{Point, RigidTransform, transform_point};
 
 /// Sides of the solid angles that rays are sorted into, radians: two rings of 64 beams are seen
 /// together.
@@ -27,7 +27,7 @@ const SEEN: f32 = 0.5;
 
 /// What both sweeps of a pair saw through, at places in the target's frame. Where the origin of a
 /// sweep's frame is not about where its rays began, as in a map's frame, no ray is seen to pass.
-pub(super) struct Sights {
+pub(super) struct FreeSpace {
     source: Rays,
     target: Rays,
     source_from_target: RigidTransform,
@@ -36,7 +36,7 @@ pub(super) struct Sights {
 /// What was seen through of the places that a cluster leaves and of those that it comes to: shares;
 /// none where there are hardly any such places, or rays to them.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct SeenThrough {
+pub(super) struct FreeSpaceEvidence {
     /// Of what it leaves, in the target.
     pub(super) left: Option<f32>,
     /// Of what it comes to, in the source.
@@ -45,7 +45,7 @@ pub(super) struct SeenThrough {
     pub(super) far: bool,
 }
 
-impl Sights {
+impl FreeSpace {
     /// Of the source and the target as they came, each in its own frame.
     pub(super) fn new(
         [source, target]: [&[Point]; 2],
@@ -60,9 +60,12 @@ impl Sights {
     }
 
     /// What was seen through of the places that a cluster leaves and of those that it comes to.
-    pub(super) fn of(&self, vacated: &[Point], occupied: &[Point], far: bool) -> SeenThrough {
-        let before = |&place: &Point| self.source.passed(moved(&self.source_from_target, place));
-        SeenThrough {
+    pub(super) fn of(&self, vacated: &[Point], occupied: &[Point], far: bool) -> FreeSpaceEvidence {
+        let before = |&place: &Point| {
+            self.source
+                .passed(transform_point(&self.source_from_target, place))
+        };
+        FreeSpaceEvidence {
             left: share(vacated.iter().map(|&place| self.target.passed(place))),
             came: share(occupied.iter().map(before)),
             far,
@@ -146,16 +149,16 @@ mod tests {
     #[test]
     fn a_pole_has_left_where_the_wall_behind_is_seen_and_come_where_it_was() {
         let sweeps = [sweep(0.0), sweep(1.0)];
-        let sights = Sights::new([&sweeps[0], &sweeps[1]], &RigidTransform::identity());
+        let free_space = FreeSpace::new([&sweeps[0], &sweeps[1]], &RigidTransform::identity());
         let at = |x, y| (0..6_i8).map(|i| [x, y, f32::from(i) * 0.1]).collect();
         let [was, is]: [Vec<Point>; 2] = [at(10.0, 0.0), at(10.0, 1.0)];
-        let seen = sights.of(&was, &is, true);
+        let seen = free_space.of(&was, &is, true);
         assert_eq!((seen.left, seen.came), (Some(1.0), Some(1.0)));
         // What stands is not seen through, nor what the pole hides.
-        let seen = sights.of(&is, &was, true);
+        let seen = free_space.of(&is, &was, true);
         assert_eq!((seen.left, seen.came), (Some(0.0), Some(0.0)));
         let hidden: Vec<Point> = at(20.0, 2.0);
-        assert_eq!(sights.of(&hidden, &[], true).left, Some(0.0));
+        assert_eq!(free_space.of(&hidden, &[], true).left, Some(0.0));
     }
 
     #[test]
@@ -163,8 +166,8 @@ mod tests {
         let sweep = [sweep(0.0), vec![[0.0; 3], [f32::NAN; 3], [0.1, 0.0, 0.0]]].concat();
         // Straight down behind, where what is not a number would lie.
         let below = [vec![[-0.01, -1e-9, -2.0]], sweep.clone()].concat();
-        let sights = Sights::new([&below, &below], &RigidTransform::identity());
-        let seen = |place: Point, count| sights.of(&vec![place; count], &[], true);
+        let free_space = FreeSpace::new([&below, &below], &RigidTransform::identity());
+        let seen = |place: Point, count| free_space.of(&vec![place; count], &[], true);
         assert_eq!(seen([10.0, 5.0, 0.0], 6).left, Some(1.0));
         assert_eq!(seen([10.0, 5.0, 0.0], 4).left, None);
         assert_eq!(seen([1.0, 0.0, 8.0], 6).left, None);

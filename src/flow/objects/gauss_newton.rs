@@ -6,10 +6,10 @@
 use nalgebra::{Matrix3, Vector3};
 
 use super::hypothesis::Mover;
-use super::neighbor_view::Moment;
-use super::planar_motion::Motion;
+use super::neighbor_view::NeighborView;
+use super::planar_motion::PlanarMotion;
 use super::scene::Scene;
-use crate::flow::data::{Point, evenly};
+use crate::flow::data::{Point, stride_sample};
 
 /// Steps after which the target points around a cluster are looked for again.
 const STEPS_BETWEEN_LOOKS: usize = 4;
@@ -26,12 +26,12 @@ impl Mover<'_> {
     /// Gauss-Newton from `start`, in the target and the sweeps `around`.
     pub(super) fn fitted(
         &self,
-        around: &[Moment<'_>],
+        around: &[NeighborView<'_>],
         rows: &[u32],
-        start: &Motion,
+        start: &PlanarMotion,
         turned: bool,
         steps: usize,
-    ) -> Motion {
+    ) -> PlanarMotion {
         let mut motion = *start;
         let mut views = vec![(self.scene, 1, 1.0)];
         views.extend(
@@ -46,7 +46,7 @@ impl Mover<'_> {
                 let by_then = motion.repeated(at);
                 if step % STEPS_BETWEEN_LOOKS == 0 {
                     let all = scene.touched(rows, self.cluster, &by_then);
-                    *touched = evenly(&all, rows.len());
+                    *touched = stride_sample(&all, rows.len());
                 }
                 sums.look(&motion, &by_then, at, weight);
                 for &row in rows {
@@ -106,7 +106,7 @@ impl Sums {
 
     /// What is added from now on is of a sweep `at` gaps after the source, by when `motion` has
     /// become `by_then`.
-    fn look(&mut self, motion: &Motion, by_then: &Motion, at: i8, share: f32) {
+    fn look(&mut self, motion: &PlanarMotion, by_then: &PlanarMotion, at: i8, share: f32) {
         self.pivot = [0, 1].map(|a| by_then.center[a] + by_then.shift_m[a]);
         self.gaps = f32::from(at);
         let swing = self.gaps * (self.gaps - 1.0) / 2.0;
@@ -128,7 +128,7 @@ impl Sums {
         let leak = if normal == [0.0; 3] {
             1.0
         } else {
-            scene.options.leak
+            scene.options.tangential_weight
         };
         let along = normal[0] * away[0] + normal[1] * away[1] + normal[2] * away[2];
         let rows = [

@@ -5,8 +5,8 @@
 
 use super::scene::Scene;
 use crate::flow::data::Point;
-use crate::flow::options::LabelOptions;
-use crate::flow::spatial::Near;
+use crate::flow::options::ObjectOptions;
+use crate::flow::spatial::ColumnIndex;
 use crate::flow::spatial::voxel_first;
 
 /// Points within this height of each other vote, in bins.
@@ -15,8 +15,8 @@ const LEVEL_BINS: f32 = 1.5;
 const PEAKS_APART: i32 = 2;
 
 /// The cloud that is voted with.
-pub(super) struct Ballot {
-    near: Near,
+pub(super) struct TranslationVotes {
+    near: ColumnIndex,
     bin_m: f32,
     /// Bins on each side of none.
     half: i32,
@@ -24,16 +24,20 @@ pub(super) struct Ballot {
     within_m: f32,
 }
 
-impl Ballot {
+impl TranslationVotes {
     /// Over the target of `scene`.
     pub(super) fn new(scene: &Scene<'_>) -> Self {
-        let LabelOptions { bin_m, reach_m, .. } = *scene.options;
+        let ObjectOptions {
+            bin_m,
+            max_displacement_m,
+            ..
+        } = *scene.options;
         let kept = voxel_first(&scene.target, bin_m);
         let points: Vec<Point> = kept.iter().map(|&row| scene.target[row as usize]).collect();
         Self {
-            near: Near::new(&points, reach_m / 3.0),
+            near: ColumnIndex::new(&points, max_displacement_m / 3.0),
             bin_m,
-            half: (reach_m / bin_m) as i32,
+            half: (max_displacement_m / bin_m) as i32,
             within_m: bin_m * LEVEL_BINS,
         }
     }
@@ -105,7 +109,7 @@ mod tests {
 
     #[test]
     fn the_first_peak_is_the_shift_of_the_points_and_the_others_lie_apart() {
-        let options = LabelOptions::default();
+        let options = ObjectOptions::default();
         let mut random = Random::new(4);
         let mut point = || [4.0, 1.8, 1.5].map(|side| random.uniform(0.0, side) as f32);
         let source: Vec<Point> = (0..80).map(|_| point()).collect();
@@ -116,7 +120,7 @@ mod tests {
         let target: Vec<Point> = moved.collect();
         let thinned = Thinned::new(&source, &[NOISE; 80], &options);
         let scene = Scene::new(&thinned, &target, &options);
-        let peaks = Ballot::new(&scene).peaks(&source, 4);
+        let peaks = TranslationVotes::new(&scene).peaks(&source, 4);
         assert_eq!(peaks.len(), 4);
         let [x, y] = [0, 1].map(|a| (peaks[0][a] - shift[a]).abs());
         assert!(x <= options.bin_m && y <= options.bin_m, "{peaks:?}");
@@ -130,9 +134,13 @@ mod tests {
 
     #[test]
     fn points_without_a_target_have_no_peaks() {
-        let options = LabelOptions::default();
+        let options = ObjectOptions::default();
         let thinned = Thinned::new(&[[0.0; 3]], &[NOISE], &options);
         let scene = Scene::new(&thinned, &[[50.0; 3]], &options);
-        assert!(Ballot::new(&scene).peaks(&[[0.0; 3]], 4).is_empty());
+        assert!(
+            TranslationVotes::new(&scene)
+                .peaks(&[[0.0; 3]], 4)
+                .is_empty()
+        );
     }
 }

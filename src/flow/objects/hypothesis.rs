@@ -6,11 +6,11 @@
 //! last steps try shifts, since the cost has edges that no derivative sees. It must not know whether
 //! the motion is needed.
 
-use super::hough::Ballot;
-use super::neighbor_view::Moment;
-use super::planar_motion::Motion;
+use super::hough::TranslationVotes;
+use super::neighbor_view::NeighborView;
+use super::planar_motion::PlanarMotion;
 use super::scene::Scene;
-use crate::flow::data::{Point, evenly, square_distance};
+use crate::flow::data::{Point, square_distance, stride_sample};
 
 /// Points of a cluster that vote, that a start is fitted with, and that costs are taken of.
 const VOTERS: usize = 64;
@@ -33,33 +33,33 @@ const HOLD_OF_A_POINT: f32 = 1.0 / 3.0;
 /// What a motion costs, metres: the moved cluster to the target, and back.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Cost {
-    pub(super) there_m: f32,
-    pub(super) back_m: f32,
+    pub(super) forward_m: f32,
+    pub(super) backward_m: f32,
 }
 
 impl Cost {
     /// Both together.
     pub(super) fn sum_m(self) -> f32 {
-        self.there_m + self.back_m
+        self.forward_m + self.backward_m
     }
 }
 
 /// The best motion of a cluster.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Found {
-    pub(super) motion: Motion,
+pub(super) struct Hypothesis {
+    pub(super) motion: PlanarMotion,
     /// What it costs, and what standing still does.
     pub(super) cost: Cost,
     pub(super) still: Cost,
     /// How well the cluster's surfaces hold it along the motion, 0 to 1.
     pub(super) hold: f32,
     /// What the sweeps around say.
-    pub(super) around: Witnesses,
+    pub(super) around: NeighborEvidence,
 }
 
 /// What the sweeps around that see a cluster, moved or standing still, say of its motion.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Witnesses {
+pub(super) struct NeighborEvidence {
     /// What they count in all, in times of the target.
     pub(super) weight: f32,
     /// Weighted costs, metres.
@@ -70,28 +70,28 @@ pub(super) struct Witnesses {
 }
 
 /// The best of the motions that were considered.
-struct Judged {
-    motion: Motion,
+struct BestHypothesis {
+    motion: PlanarMotion,
     cost: Cost,
     /// What it is compared by: its cost, here and in the sweeps around, and what else counts, metres.
     value_m: f32,
 }
 
-impl Judged {
+impl BestHypothesis {
     /// Worse than any motion.
     fn none() -> Self {
         Self {
-            motion: Motion::still([0.0; 2]),
+            motion: PlanarMotion::still([0.0; 2]),
             cost: Cost {
-                there_m: f32::INFINITY,
-                back_m: f32::INFINITY,
+                forward_m: f32::INFINITY,
+                backward_m: f32::INFINITY,
             },
             value_m: f32::INFINITY,
         }
     }
 
     /// Takes a motion of `mover` that costs less, `more_m` metres added.
-    fn consider(&mut self, mover: &Mover<'_>, motion: Motion, more_m: f32) {
+    fn consider(&mut self, mover: &Mover<'_>, motion: PlanarMotion, more_m: f32) {
         let Some(cost) = mover.cost_below(&motion, more_m, self.value_m) else {
             return;
         };
@@ -113,29 +113,29 @@ impl Judged {
 /// One cluster, to be moved.
 pub(super) struct Mover<'a> {
     pub(super) scene: &'a Scene<'a>,
-    around: &'a [Moment<'a>],
+    around: &'a [NeighborView<'a>],
     pub(super) cluster: u32,
     rows: Vec<u32>,
 }
 
 impl<'a> Mover<'a> {
-    pub(super) fn new(scene: &'a Scene<'a>, around: &'a [Moment<'a>], cluster: u32) -> Self {
+    pub(super) fn new(scene: &'a Scene<'a>, around: &'a [NeighborView<'a>], cluster: u32) -> Self {
         Self {
             scene,
             around,
             cluster,
-            rows: evenly(&scene.source.members[cluster as usize], JUDGED),
+            rows: stride_sample(&scene.source.members[cluster as usize], JUDGED),
         }
     }
 
     /// What standing still costs.
     pub(super) fn standing_still(&self) -> Cost {
-        self.cost(&Motion::still([0.0; 2]))
+        self.cost(&PlanarMotion::still([0.0; 2]))
     }
 
     /// The motion of least cost; none where standing still costs so little, `still`, that none is
     /// needed, or nearly as little as any.
-    pub(super) fn search(&self, ballot: &Ballot, still: Cost) -> Option<Found> {
+    pub(super) fn search(&self, votes: &TranslationVotes, still: Cost) -> Option<Hypothesis> {
         let options = self.scene.options;
         let members = &self.scene.source.members[self.cluster as usize];
         let count = members.len() as f32;
@@ -148,23 +148,26 @@ impl<'a> Mover<'a> {
                 *center += c / count;
             }
         }
-        let standing = Motion::still(center);
-        if still.there_m < options.needed_m {
+        let standing = PlanarMotion::still(center);
+        if still.forward_m < options.static_fit_m {
             return None;
         }
-        let few = evenly(members, FITTED);
-        let way_m = |motion: &Motion| options.way_penalty * motion.length_m();
-        let mut best = Judged::none();
-        let mut fit_from = |start: &Motion| {
+        let few = stride_sample(members, FITTED);
+        let way_m = |motion: &PlanarMotion| options.displacement_penalty * motion.length_m();
+        let mut best = BestHypothesis::none();
+        let mut fit_from = |start: &PlanarMotion| {
             let motion = self.fitted(&[], &few, start, false, STEPS[0]);
             best.consider(self, motion, way_m(&motion));
-            best.cost.there_m
+            best.cost.forward_m
         };
-        if fit_from(&standing) >= options.near_m {
+        if fit_from(&standing) >= options.close_fit_m {
             let place = |row: u32| self.scene.source.points[row as usize];
-            let voters: Vec<Point> = evenly(members, VOTERS).into_iter().map(place).collect();
-            let shifts = ballot.peaks(&voters, options.starts);
-            let mut promising: Vec<(f32, Motion)> = Vec::new();
+            let voters: Vec<Point> = stride_sample(members, VOTERS)
+                .into_iter()
+                .map(place)
+                .collect();
+            let shifts = votes.peaks(&voters, options.initial_guesses);
+            let mut promising: Vec<(f32, PlanarMotion)> = Vec::new();
             for start in shifts.into_iter().map(|shift| standing.shifted(shift)) {
                 let least = promising.get(PROMISING - 1);
                 let least_m = least.map_or(f32::INFINITY, |&(value_m, _)| value_m);
@@ -179,7 +182,7 @@ impl<'a> Mover<'a> {
                 fit_from(start);
             }
         }
-        if still.there_m - best.cost.there_m < options.gain_m {
+        if still.forward_m - best.cost.forward_m < options.min_gain_m {
             return None;
         }
         let motion = self.fitted(
@@ -189,8 +192,8 @@ impl<'a> Mover<'a> {
             members.len() >= TURNED,
             STEPS[1],
         );
-        let Judged { motion, cost, .. } = self.tried(motion);
-        Some(Found {
+        let BestHypothesis { motion, cost, .. } = self.tried(motion);
+        Some(Hypothesis {
             motion,
             cost,
             still,
@@ -200,8 +203,8 @@ impl<'a> Mover<'a> {
     }
 
     /// The motion of least cost among those a few shifts away.
-    fn tried(&self, start: Motion) -> Judged {
-        let mut best = Judged::none();
+    fn tried(&self, start: PlanarMotion) -> BestHypothesis {
+        let mut best = BestHypothesis::none();
         best.consider(self, start, 0.0);
         for shift_m in SHIFTS_M {
             for _ in 0..TRIES {
@@ -224,13 +227,13 @@ impl<'a> Mover<'a> {
     }
 
     /// What a motion costs.
-    pub(super) fn cost(&self, motion: &Motion) -> Cost {
+    pub(super) fn cost(&self, motion: &PlanarMotion) -> Cost {
         self.cost_in(self.scene, motion)
     }
 
     /// What a motion costs; none where that and `more_m` are plainly no less than `least_m`, metres: half
     /// of the cost shows that of most motions, and some of the points that half.
-    fn cost_below(&self, motion: &Motion, more_m: f32, least_m: f32) -> Option<Cost> {
+    fn cost_below(&self, motion: &PlanarMotion, more_m: f32, least_m: f32) -> Option<Cost> {
         let count = self.rows.len().max(1) as f32;
         let mut sum = 0.0;
         for rows in self.rows.chunks(JUDGED_AT_ONCE) {
@@ -242,23 +245,23 @@ impl<'a> Mover<'a> {
             }
         }
         Some(Cost {
-            there_m: sum / count,
-            back_m: self.back_m(self.scene, motion),
+            forward_m: sum / count,
+            backward_m: self.backward_m(self.scene, motion),
         })
     }
 
     /// What those sweeps around that see the cluster, moved or not, say of a motion.
-    fn witnesses(&self, motion: &Motion) -> Witnesses {
-        let mut all = Witnesses::default();
-        let still = Motion::still(motion.center);
+    fn witnesses(&self, motion: &PlanarMotion) -> NeighborEvidence {
+        let mut all = NeighborEvidence::default();
+        let still = PlanarMotion::still(motion.center);
         for (place, moment) in self.around.iter().enumerate() {
             let [moved, still] =
                 [moment.by_then(motion), still].map(|m| self.cost_in(&moment.scene, &m));
             if place == 0 {
                 all.nearest_m = [still, moved].map(Cost::sum_m);
             }
-            let least = moved.there_m.min(still.there_m);
-            if least <= self.scene.options.left_m {
+            let least = moved.forward_m.min(still.forward_m);
+            if least <= self.scene.options.max_residual_m {
                 all.weight += moment.weight;
                 all.moved_m += moment.weight * moved.sum_m();
                 all.still_m += moment.weight * still.sum_m();
@@ -268,7 +271,7 @@ impl<'a> Mover<'a> {
     }
 
     /// What a motion costs in the sweeps around: the weighted sum.
-    pub(super) fn around_m(&self, motion: &Motion) -> f32 {
+    pub(super) fn around_m(&self, motion: &PlanarMotion) -> f32 {
         let costs = self.around.iter().map(|moment| {
             moment.weight * self.cost_in(&moment.scene, &moment.by_then(motion)).sum_m()
         });
@@ -276,20 +279,20 @@ impl<'a> Mover<'a> {
     }
 
     /// What a motion that leads into the sweep of `scene` costs there.
-    fn cost_in(&self, scene: &Scene<'_>, motion: &Motion) -> Cost {
+    fn cost_in(&self, scene: &Scene<'_>, motion: &PlanarMotion) -> Cost {
         let distances = self.rows.iter();
         let distances = distances.map(|&row| self.distance(scene, row, motion));
         Cost {
-            there_m: distances.sum::<f32>() / self.rows.len().max(1) as f32,
-            back_m: self.back_m(scene, motion),
+            forward_m: distances.sum::<f32>() / self.rows.len().max(1) as f32,
+            backward_m: self.backward_m(scene, motion),
         }
     }
 
     /// How far the sweep of `scene` lies from the moved cluster where that touches it, metres.
-    fn back_m(&self, scene: &Scene<'_>, motion: &Motion) -> f32 {
+    fn backward_m(&self, scene: &Scene<'_>, motion: &PlanarMotion) -> f32 {
         let truncation_m = scene.options.truncation_m;
         let touched = scene.touched(&self.rows, self.cluster, motion);
-        let touched = evenly(&touched, JUDGED);
+        let touched = stride_sample(&touched, JUDGED);
         let back = touched.iter().map(|&row| {
             let place = motion.undo(scene.target[row as usize]);
             let origin = scene.origin_of(place, self.cluster);
@@ -308,7 +311,7 @@ impl<'a> Mover<'a> {
     /// How well the cluster's surfaces hold it along a motion's shift: the mean square of their
     /// normals along it, 0 for a wall that slides in its own plane, 1 for one that is pushed. Points
     /// without a normal hold in every direction by a third.
-    pub(super) fn hold(&self, motion: &Motion) -> f32 {
+    pub(super) fn hold(&self, motion: &PlanarMotion) -> f32 {
         let length = motion.length_m().max(f32::MIN_POSITIVE);
         let [x, y] = motion.shift_m.map(|c| c / length);
         let mut sum = 0.0;
@@ -328,7 +331,7 @@ impl<'a> Mover<'a> {
 
     /// Where the cluster was and is not after a motion: its places that none of it comes within
     /// `clear_m` metres of.
-    pub(super) fn vacated(&self, motion: &Motion, clear_m: f32) -> Vec<Point> {
+    pub(super) fn vacated(&self, motion: &PlanarMotion, clear_m: f32) -> Vec<Point> {
         let places = self.rows.iter();
         let places = places.map(|&row| self.scene.source.points[row as usize]);
         places
@@ -338,7 +341,7 @@ impl<'a> Mover<'a> {
 
     /// Where it is after a motion and was not: the target points that it lies on then that none of it
     /// was within `clear_m` metres of.
-    pub(super) fn occupied(&self, motion: &Motion, clear_m: f32) -> Vec<Point> {
+    pub(super) fn occupied(&self, motion: &PlanarMotion, clear_m: f32) -> Vec<Point> {
         let places = self.matches(motion);
         let places = places.map(|target| self.scene.target[target as usize]);
         places
@@ -356,7 +359,7 @@ impl<'a> Mover<'a> {
     }
 
     /// The target points that the cluster lies on once moved, one for each of its points that has one.
-    fn matches(&self, motion: &Motion) -> impl Iterator<Item = u32> {
+    fn matches(&self, motion: &PlanarMotion) -> impl Iterator<Item = u32> {
         self.rows.iter().filter_map(|&row| {
             let moved = motion.apply(self.scene.source.points[row as usize]);
             self.scene.match_of(moved, self.cluster)
@@ -364,7 +367,7 @@ impl<'a> Mover<'a> {
     }
 
     /// How far a source point, moved, lies from the target, metres, truncated.
-    fn distance(&self, scene: &Scene<'_>, row: u32, motion: &Motion) -> f32 {
+    fn distance(&self, scene: &Scene<'_>, row: u32, motion: &PlanarMotion) -> f32 {
         let moved = motion.apply(scene.source.points[row as usize]);
         scene.distance_of(moved, self.cluster)
     }

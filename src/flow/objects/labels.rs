@@ -7,26 +7,31 @@ use crate::flow::spatial::NOISE;
 
 /// The clusters of a source, those with the most points first.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Parts {
-    /// N places in `motions`: the cluster of each source point; [`Parts::NONE`] where it is of none.
+pub struct ClusterLabels {
+    /// N places in `motions`: the cluster of each source point; [`ClusterLabels::NONE`] where it is of none.
     pub of: Vec<u32>,
     /// K clusters: which of the motions each has; none where it stands still.
     pub motions: Vec<Option<u32>>,
 }
 
-impl Parts {
+impl ClusterLabels {
     /// Of no cluster.
     pub const NONE: u32 = NOISE;
 
-    /// Of a source whose points had `labels` before anything was known of motions. `leaders` says of
-    /// each label whose motion it has, `owners` of each point which of the `count` motions; [`NOISE`]
+    /// Of a source whose points had `labels` before anything was known of motions. `cluster_motion` says of
+    /// each label whose motion it has, `point_motion` of each point which of the `count` motions; [`NOISE`]
     /// where none.
     ///
     /// What was cut off a mover is of no cluster: it is not known what it is a part of.
-    pub(super) fn new(labels: &[u32], leaders: &[u32], owners: &[u32], count: usize) -> Self {
-        let groups = count + leaders.len();
-        let of = labels.iter().zip(owners).map(|(&label, &owner)| {
-            let stands = |label: u32| leaders.get(label as usize) == Some(&NOISE);
+    pub(super) fn new(
+        labels: &[u32],
+        cluster_motion: &[u32],
+        point_motion: &[u32],
+        count: usize,
+    ) -> Self {
+        let groups = count + cluster_motion.len();
+        let of = labels.iter().zip(point_motion).map(|(&label, &owner)| {
+            let stands = |label: u32| cluster_motion.get(label as usize) == Some(&NOISE);
             match owner {
                 NOISE if stands(label) => count as u32 + label,
                 owner => owner,
@@ -59,29 +64,30 @@ impl Parts {
 mod tests {
     use super::*;
     use crate::flow::data::Point;
-    use crate::flow::objects::motion_field::Motions;
-    use crate::flow::objects::planar_motion::Motion;
+    use crate::flow::objects::motion_field::ObjectMotions;
+    use crate::flow::objects::planar_motion::PlanarMotion;
 
     #[test]
     fn a_piece_is_of_the_mover_that_it_goes_with_and_what_stands_keeps_its_cluster() {
-        let motion = Motion::still([0.0; 2]).shifted([1.0, 0.0]);
+        let motion = PlanarMotion::still([0.0; 2]).shifted([1.0, 0.0]);
         // A car in two pieces, a wall, a stray point, and a point cut off the car.
         let source: Vec<Point> = [0.0, 0.2, 1.0, 9.0, 9.2, 9.4, 9.6, 30.0, 3.0]
             .map(|x| [x, 0.0, 0.0])
             .to_vec();
         let labels = [0, 0, 1, 2, 2, 2, 2, NOISE, 0];
-        let owners = [0, 0, 0, NOISE, NOISE, NOISE, NOISE, NOISE, NOISE];
-        let owners = Motions::new(vec![motion], &source, &owners).owners_at(&source);
-        let parts = Parts::new(&labels, &[0, 0, NOISE], &owners, 1);
-        const NONE: u32 = Parts::NONE;
+        let point_motion = [0, 0, 0, NOISE, NOISE, NOISE, NOISE, NOISE, NOISE];
+        let point_motion =
+            ObjectMotions::new(vec![motion], &source, &point_motion).owners_at(&source);
+        let parts = ClusterLabels::new(&labels, &[0, 0, NOISE], &point_motion, 1);
+        const NONE: u32 = ClusterLabels::NONE;
         assert_eq!(parts.of, [1, 1, 1, 0, 0, 0, 0, NONE, NONE]);
         assert_eq!(parts.motions, [None, Some(0)]);
     }
 
     #[test]
     fn nothing_has_no_clusters() {
-        let none = Parts::new(&[NOISE], &[], &[NOISE], 0);
-        assert_eq!(none.of, [Parts::NONE]);
+        let none = ClusterLabels::new(&[NOISE], &[], &[NOISE], 0);
+        assert_eq!(none.of, [ClusterLabels::NONE]);
         assert!(none.motions.is_empty());
     }
 }

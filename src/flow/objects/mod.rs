@@ -32,9 +32,9 @@ mod tests;
 
 pub use confidence::{SURE_M, confidence_of_ground};
 pub use describe::{Cluster, Objects};
-pub use features::Evidence;
-pub use labels::Parts;
-pub use motion_field::Motions;
-pub use search::{Clouds, Labelled};
+pub use features::ConfidenceFeatures;
+pub use labels::ClusterLabels;
+pub use motion_field::ObjectMotions;
+pub use search::{ObjectSearch, SearchClouds};
 
-pub(crate) use search::label;
+pub(crate) use search::find_objects;

@@ -5,9 +5,9 @@
 
 use rayon::prelude::*;
 
-use super::planar_motion::Motion;
+use super::planar_motion::PlanarMotion;
 use crate::flow::data::Point;
-use crate::flow::spatial::{NOISE, Near};
+use crate::flow::spatial::{ColumnIndex, NOISE};
 
 /// A place farther than this from every mover's points does not move, metres: what belongs to an
 /// object lies as near to the rest of it as its own points lie to each other.
@@ -15,15 +15,15 @@ const REACH_M: f32 = 0.5;
 
 /// Rigid motions, and the source points that have them or have none.
 #[derive(Debug)]
-pub struct Motions {
-    motions: Vec<Motion>,
+pub struct ObjectMotions {
+    motions: Vec<PlanarMotion>,
     /// Of each moving point, its motion.
-    owners: Vec<u32>,
-    moving: Near,
-    standing: Near,
+    point_motion: Vec<u32>,
+    moving: ColumnIndex,
+    standing: ColumnIndex,
 }
 
-impl Motions {
+impl ObjectMotions {
     /// Nothing moves.
     pub(super) fn none() -> Self {
         Self::new(Vec::new(), &[], &[])
@@ -31,29 +31,29 @@ impl Motions {
 
     /// Of `points`, in metres with the ego motion taken out, and which of `motions` each has;
     /// [`NOISE`] stands still.
-    pub(super) fn new(motions: Vec<Motion>, points: &[Point], owners: &[u32]) -> Self {
+    pub(super) fn new(motions: Vec<PlanarMotion>, points: &[Point], point_motion: &[u32]) -> Self {
         let of = |moves: bool| {
-            let chosen = points.iter().zip(owners);
+            let chosen = points.iter().zip(point_motion);
             chosen.filter(move |&(_, &owner)| (owner != NOISE) == moves)
         };
         let moving: Vec<Point> = of(true).map(|(&point, _)| point).collect();
-        let moving = Near::new(&moving, 2.0 * REACH_M);
+        let moving = ColumnIndex::new(&moving, 2.0 * REACH_M);
         // What stands farther from all that moves is the nearest to no place that may move.
         let matters = |point: Point| moving.nearest(point, 2.0 * REACH_M, |_| true).is_some();
         let standing = of(false).map(|(&point, _)| point);
         let standing: Vec<Point> = standing.filter(|&point| matters(point)).collect();
         Self {
             motions,
-            owners: of(true).map(|(_, &owner)| owner).collect(),
+            point_motion: of(true).map(|(_, &owner)| owner).collect(),
             moving,
-            standing: Near::new(&standing, REACH_M),
+            standing: ColumnIndex::new(&standing, REACH_M),
         }
     }
 
     /// The motions, the points that have them and which, and the points beside them that stand.
-    pub(super) fn parts(&self) -> (&[Motion], Vec<(Point, u32)>, Vec<Point>) {
+    pub(super) fn parts(&self) -> (&[PlanarMotion], Vec<(Point, u32)>, Vec<Point>) {
         let moving = self.moving.in_order().into_iter();
-        let moving = moving.zip(self.owners.iter().copied());
+        let moving = moving.zip(self.point_motion.iter().copied());
         (&self.motions, moving.collect(), self.standing.in_order())
     }
 
@@ -82,7 +82,7 @@ impl Motions {
         let stands = self.standing.nearest(place, square.sqrt(), |_| true);
         match stands {
             Some(_) => NOISE,
-            None => self.owners[row as usize],
+            None => self.point_motion[row as usize],
         }
     }
 
@@ -108,9 +108,9 @@ mod tests {
 
     #[test]
     fn a_place_moves_with_the_nearest_point_and_far_from_movers_not_at_all() {
-        let motion = Motion::still([0.0; 2]).shifted([0.5, 0.25]);
+        let motion = PlanarMotion::still([0.0; 2]).shifted([0.5, 0.25]);
         let points = [[0.0, 0.0, 0.0], [0.4, 0.0, 0.0]];
-        let motions = Motions::new(vec![motion], &points, &[0, NOISE]);
+        let motions = ObjectMotions::new(vec![motion], &points, &[0, NOISE]);
         let places = [
             [0.0, 0.0, 0.0],
             [0.1, 0.0, 0.0],
@@ -121,14 +121,14 @@ mod tests {
         let moved = motions.residual_at(&places).into_iter();
         let moved: Vec<bool> = moved.map(|residual| residual == [0.5, 0.25, 0.0]).collect();
         assert_eq!(moved, [true, true, false, true, false]);
-        assert_eq!(Motions::none().residual_at(&places), [[0.0; 3]; 5]);
+        assert_eq!(ObjectMotions::none().residual_at(&places), [[0.0; 3]; 5]);
 
-        let field = crate::flow::Field {
+        let field = crate::flow::MotionField {
             ego: None,
             residual: crate::flow::Residual::Objects(motions.into()),
         };
         let bytes = field.to_bytes();
-        let back = crate::flow::Field::from_bytes(&bytes).expect("sound");
+        let back = crate::flow::MotionField::from_bytes(&bytes).expect("sound");
         assert_eq!(back.to_bytes(), bytes);
         let crate::flow::Residual::Objects(back) = back.residual else {
             panic!("another kind of field came back");

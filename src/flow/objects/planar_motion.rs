@@ -7,7 +7,7 @@ use crate::flow::data::Point;
 
 /// A shift, and a turn about a point.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Motion {
+pub(super) struct PlanarMotion {
     /// Metres along x and y.
     pub(super) shift_m: [f32; 2],
     /// Radians about the vertical through `center`.
@@ -16,7 +16,7 @@ pub(super) struct Motion {
     pub(super) center: [f32; 2],
 }
 
-impl Motion {
+impl PlanarMotion {
     /// No motion, to be turned about `center`.
     pub(super) fn still(center: [f32; 2]) -> Self {
         Self {
@@ -103,7 +103,7 @@ mod tests {
     fn a_motion_undone_leads_back() {
         // Single precision at 50 m.
         const TOLERANCE_M: f32 = 2e-5;
-        let motion = Motion {
+        let motion = PlanarMotion {
             shift_m: [1.5, -0.5],
             turn: 0.3,
             center: [40.0, 10.0],
@@ -114,7 +114,7 @@ mod tests {
             assert!((back[axis] - point[axis]).abs() < TOLERANCE_M, "{back:?}");
         }
         assert_eq!(
-            Motion::still([3.0, 4.0]).displacement([1.0, 2.0, 3.0]),
+            PlanarMotion::still([3.0, 4.0]).displacement([1.0, 2.0, 3.0]),
             [0.0; 3]
         );
     }

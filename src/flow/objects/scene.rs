@@ -6,10 +6,10 @@
 
 use rayon::prelude::*;
 
-use super::planar_motion::Motion;
+use super::planar_motion::PlanarMotion;
 use crate::flow::data::Point;
-use crate::flow::options::LabelOptions;
-use crate::flow::spatial::{NOISE, Near, Neighborhood, voxel_first};
+use crate::flow::options::ObjectOptions;
+use crate::flow::spatial::{ColumnIndex, NOISE, Neighborhood, voxel_first};
 
 /// Share of a cluster that must lie on the target for it to stand still plainly.
 const PLAIN: f32 = 0.9;
@@ -23,13 +23,13 @@ pub(super) struct Thinned {
     pub(super) members: Vec<Vec<u32>>,
     /// By place, heights shrunk.
     low: Vec<Point>,
-    near: Near,
+    near: ColumnIndex,
 }
 
 impl Thinned {
     /// `labels` are the clusters of `source`.
-    pub(super) fn new(source: &[Point], labels: &[u32], options: &LabelOptions) -> Self {
-        let kept = voxel_first(source, options.thinned_m);
+    pub(super) fn new(source: &[Point], labels: &[u32], options: &ObjectOptions) -> Self {
+        let kept = voxel_first(source, options.voxel_m);
         let labels: Vec<u32> = kept.iter().map(|&row| labels[row as usize]).collect();
         let points: Vec<Point> = kept.iter().map(|&row| source[row as usize]).collect();
         let low: Vec<Point> = points.iter().map(|&p| lowered(p, options)).collect();
@@ -41,7 +41,7 @@ impl Thinned {
             }
         }
         Self {
-            near: Near::new(&low, options.match_m),
+            near: ColumnIndex::new(&low, options.match_m),
             points,
             labels,
             members,
@@ -52,32 +52,32 @@ impl Thinned {
 
 /// The clouds.
 pub(super) struct Scene<'a> {
-    pub(super) options: &'a LabelOptions,
+    pub(super) options: &'a ObjectOptions,
     pub(super) source: &'a Thinned,
     /// Target points, one a voxel, and their unit normals; zero where there is no flat surface.
     pub(super) target: Vec<Point>,
     normals: Vec<Point>,
     /// By place, heights shrunk.
-    near_target: Near,
+    near_target: ColumnIndex,
     /// Of each target point, the cluster that it is taken by.
     taken: Vec<u32>,
 }
 
 impl<'a> Scene<'a> {
     /// Of `source` and `target`.
-    pub(super) fn new(source: &'a Thinned, target: &[Point], options: &'a LabelOptions) -> Self {
-        let target: Vec<Point> = voxel_first(target, options.thinned_m)
+    pub(super) fn new(source: &'a Thinned, target: &[Point], options: &'a ObjectOptions) -> Self {
+        let target: Vec<Point> = voxel_first(target, options.voxel_m)
             .into_iter()
             .map(|row| target[row as usize])
             .collect();
         let low_target: Vec<Point> = target.iter().map(|&p| lowered(p, options)).collect();
-        let near_target = Near::new(&low_target, options.match_m);
-        let upright = Near::new(&target, options.match_m);
+        let near_target = ColumnIndex::new(&low_target, options.match_m);
+        let upright = ColumnIndex::new(&target, options.match_m);
         let normals = target
             .par_iter()
             .map(|&point| normal(&upright, point, options));
         let normals = normals.collect();
-        let within = options.taken_m;
+        let within = options.static_match_m;
         let on_target: Vec<bool> = source
             .low
             .par_iter()
@@ -152,7 +152,7 @@ impl<'a> Scene<'a> {
 
     /// The target points that lie within the match of the moved `rows` and may be of `cluster`, in
     /// their order.
-    pub(super) fn touched(&self, rows: &[u32], cluster: u32, motion: &Motion) -> Vec<u32> {
+    pub(super) fn touched(&self, rows: &[u32], cluster: u32, motion: &PlanarMotion) -> Vec<u32> {
         let within_m = self.options.match_m;
         let mut seen = self.near_target.unseen();
         let mut touched = vec![0_u64; self.target.len().div_ceil(64)];
@@ -190,7 +190,7 @@ impl<'a> Scene<'a> {
             plain
         } else {
             let along = normal[0] * x + normal[1] * y + normal[2] * z;
-            along * along + self.options.leak * self.options.leak * plain
+            along * along + self.options.tangential_weight * self.options.tangential_weight * plain
         };
         square.sqrt().min(self.options.truncation_m)
     }
@@ -206,12 +206,12 @@ fn ones(word: u64) -> impl Iterator<Item = u32> {
 
 /// Heights shrunk.
 #[inline]
-fn lowered([x, y, z]: Point, options: &LabelOptions) -> Point {
+fn lowered([x, y, z]: Point, options: &ObjectOptions) -> Point {
     [x, y, z * options.height_weight]
 }
 
 /// The normal of the surface around a point; zero where it is not flat.
-fn normal(near: &Near, point: Point, options: &LabelOptions) -> Point {
+fn normal(near: &ColumnIndex, point: Point, options: &ObjectOptions) -> Point {
     let range = point[0].hypot(point[1]);
     let [base, slope] = options.normal_m;
     let radius = (base + slope * range).min(options.match_m);
@@ -235,7 +235,7 @@ mod tests {
 
     #[test]
     fn what_a_cluster_touches_is_what_a_search_of_all_finds() {
-        let options = LabelOptions::default();
+        let options = ObjectOptions::default();
         // Three words of target points, the last one not full.
         let target: Vec<Point> = (0..150_u8)
             .map(|i| [f32::from(i) * 0.2, 1.0, 0.0])
@@ -243,7 +243,7 @@ mod tests {
         let source = [[7.0, 1.2, 0.0], [19.0, 1.0, 0.1], [29.7, 0.8, 0.0]];
         let thinned = Thinned::new(&source, &[0; 3], &options);
         let scene = Scene::new(&thinned, &target, &options);
-        let motion = Motion::still([0.0; 2]).shifted([0.5, 0.0]);
+        let motion = PlanarMotion::still([0.0; 2]).shifted([0.5, 0.0]);
         let near = |point: &Point| {
             source.iter().any(|&place| {
                 let away = square_distance(

@@ -1,20 +1,20 @@
 //! TODO doc
 
-use super::features::Evidence;
-use super::labels::Parts;
-use super::motion_field::Motions;
+use super::features::ConfidenceFeatures;
+use super::labels::ClusterLabels;
+use super::motion_field::ObjectMotions;
 use super::{accept, assign, features, free_space};
 use crate::flow::spatial::dbscan;
 use rayon::prelude::*;
 
-use super::features::{Findings, Searched};
-use super::free_space::Sights;
-use super::hough::Ballot;
+use super::features::{Findings, SearchedCluster};
+use super::free_space::FreeSpace;
+use super::hough::TranslationVotes;
 use super::hypothesis::Mover;
-use super::neighbor_view::Moment;
+use super::neighbor_view::NeighborView;
 use super::scene::{Scene, Thinned};
-use crate::flow::data::{Interrupt, Point, Progress, RigidTransform, Watch};
-use crate::flow::options::LabelOptions;
+use crate::flow::data::{Control, Interrupt, Point, Progress, RigidTransform};
+use crate::flow::options::ObjectOptions;
 use crate::flow::registration::AlignedSweep;
 use crate::flow::spatial::NOISE;
 
@@ -27,7 +27,7 @@ const REST: f64 = 0.5;
 
 /// What movers are sought in: metres.
 #[derive(Clone, Copy, Debug)]
-pub struct Clouds<'a> {
+pub struct SearchClouds<'a> {
     /// Points off the ground in the target's frame, every number finite: the source's, the ego motion
     /// taken out, and the target's.
     pub source: &'a [Point],
@@ -44,13 +44,13 @@ pub struct Clouds<'a> {
 
 /// The movers of a pair.
 #[derive(Debug)]
-pub struct Labelled {
+pub struct ObjectSearch {
     /// How they move.
-    pub motions: Motions,
+    pub motions: ObjectMotions,
     /// Which cluster each source point is of.
-    pub parts: Parts,
+    pub parts: ClusterLabels,
     /// N: what is known of each source point's motion.
-    pub evidence: Vec<Evidence>,
+    pub evidence: Vec<ConfidenceFeatures>,
     /// Clusters that were looked at.
     pub clusters: usize,
     /// Clusters that there are.
@@ -61,9 +61,9 @@ pub struct Labelled {
     pub interrupted: Option<Interrupt>,
 }
 
-impl Labelled {
+impl ObjectSearch {
     /// How far each of the `source` points that it is of moves, metres, the ego motion left out: as
-    /// [`Motions::residual_at`] says it, without looking for their objects again.
+    /// [`ObjectMotions::residual_at`] says it, without looking for their objects again.
     pub(crate) fn residual_of(&self, source: &[Point]) -> Vec<Point> {
         let motion = |place: usize| {
             let cluster = *self.parts.of.get(place)?;
@@ -80,8 +80,8 @@ impl Labelled {
     /// Nothing was looked at.
     fn nothing(interrupted: Interrupt) -> Self {
         Self {
-            motions: Motions::none(),
-            parts: Parts::default(),
+            motions: ObjectMotions::none(),
+            parts: ClusterLabels::default(),
             evidence: Vec::new(),
             clusters: 0,
             all_clusters: 0,
@@ -93,36 +93,40 @@ impl Labelled {
 
 /// Finds what moves in `clouds`. Large clusters come first; those that the watch leaves no time for
 /// stand still.
-pub(crate) fn label(clouds: &Clouds<'_>, options: &LabelOptions, watch: &dyn Watch) -> Labelled {
-    let Clouds { source, target, .. } = *clouds;
+pub(crate) fn find_objects(
+    clouds: &SearchClouds<'_>,
+    options: &ObjectOptions,
+    control: &dyn Control,
+) -> ObjectSearch {
+    let SearchClouds { source, target, .. } = *clouds;
     let late = |needed: f64| {
-        let late = watch.seconds_left().is_some_and(|left| left < needed);
-        watch.interrupt().or(late.then_some(Interrupt::Deadline))
+        let late = control.seconds_left().is_some_and(|left| left < needed);
+        control.interrupt().or(late.then_some(Interrupt::Deadline))
     };
     if let Some(interrupt) = late(0.0) {
-        return Labelled::nothing(interrupt);
+        return ObjectSearch::nothing(interrupt);
     }
-    let began = watch.seconds();
-    let labels = dbscan::clusters(source, options.cluster_radius_m, options.cluster_points);
-    let clustering = watch.seconds() - began;
+    let began = control.seconds();
+    let labels = dbscan::clusters(source, options.cluster_radius_m, options.cluster_min_points);
+    let clustering = control.seconds() - began;
     if let Some(interrupt) = late(clustering * SCENE) {
-        return Labelled::nothing(interrupt);
+        return ObjectSearch::nothing(interrupt);
     }
-    let began = watch.seconds();
+    let began = control.seconds();
     let thinned = Thinned::new(source, &labels, options);
     let scene = Scene::new(&thinned, target, options);
-    let sights = Sights::new(clouds.sweeps, &clouds.target_from_source);
-    let ballot = Ballot::new(&scene);
-    let around: Vec<Moment<'_>> = clouds
+    let free_space = FreeSpace::new(clouds.sweeps, &clouds.target_from_source);
+    let votes = TranslationVotes::new(&scene);
+    let around: Vec<NeighborView<'_>> = clouds
         .around
         .par_iter()
-        .map(|sweep| Moment::new(&thinned, sweep, options))
+        .map(|sweep| NeighborView::new(&thinned, sweep, options))
         .collect();
-    let rest = (watch.seconds() - began) * REST;
+    let rest = (control.seconds() - began) * REST;
 
     let mut order: Vec<u32> = (0..thinned.members.len() as u32).collect();
     order.sort_by_key(|&cluster| std::cmp::Reverse(thinned.members[cluster as usize].len()));
-    let mut searched = vec![Searched::not(options); order.len()];
+    let mut searched = vec![SearchedCluster::not(options); order.len()];
     let (mut clusters, mut sum_m) = (0, 0.0);
     let mut interrupted = None;
     for some in order.chunks(CLUSTERS_AT_ONCE) {
@@ -130,22 +134,22 @@ pub(crate) fn label(clouds: &Clouds<'_>, options: &LabelOptions, watch: &dyn Wat
         if interrupted.is_some() {
             break;
         }
-        let found: Vec<Searched> = some
+        let found: Vec<SearchedCluster> = some
             .par_iter()
-            .map(|&cluster| search(&scene, &around, &sights, &ballot, cluster))
+            .map(|&cluster| search(&scene, &around, &free_space, &votes, cluster))
             .collect();
         for (&cluster, found) in some.iter().zip(found) {
             searched[cluster as usize] = found;
-            sum_m += f64::from(found.cost().there_m);
+            sum_m += f64::from(found.cost().forward_m);
         }
         clusters += some.len();
-        watch.progress(Progress {
+        control.progress(Progress {
             iteration: clusters,
             max_iterations: order.len(),
             loss: sum_m / clusters as f64,
         });
     }
-    let needed: Vec<_> = searched.iter().map(Searched::found).collect();
+    let needed: Vec<_> = searched.iter().map(SearchedCluster::found).collect();
     let spread = assign::spread(&scene, &around, &needed);
     let movers: Vec<u32> = (0..)
         .zip(&needed)
@@ -156,21 +160,21 @@ pub(crate) fn label(clouds: &Clouds<'_>, options: &LabelOptions, watch: &dyn Wat
         numbers[cluster as usize] = number;
     }
     let number = |cluster: &u32| numbers.get(*cluster as usize).copied().unwrap_or(NOISE);
-    let owners: Vec<u32> = spread.owners.iter().map(number).collect();
+    let point_motion: Vec<u32> = spread.point_motion.iter().map(number).collect();
     let motions = needed.iter().flatten().map(|found| found.motion);
-    let motions = Motions::new(motions.collect(), &thinned.points, &owners);
-    let owners = motions.owners_at(source);
+    let motions = ObjectMotions::new(motions.collect(), &thinned.points, &point_motion);
+    let point_motion = motions.owners_at(source);
     let findings = Findings {
         scene: &scene,
         searched: &searched,
         spread: &spread,
         motions: &motions,
         movers: &movers,
-        owners: &owners,
+        point_motion: &point_motion,
     };
-    Labelled {
+    ObjectSearch {
         evidence: features::evidence(&findings, source, &labels),
-        parts: Parts::new(&labels, &spread.leaders, &owners, movers.len()),
+        parts: ClusterLabels::new(&labels, &spread.cluster_motion, &point_motion, movers.len()),
         motions,
         clusters,
         all_clusters: order.len(),
@@ -182,16 +186,16 @@ pub(crate) fn label(clouds: &Clouds<'_>, options: &LabelOptions, watch: &dyn Wat
 /// Looks for the motion of a cluster.
 fn search(
     scene: &Scene<'_>,
-    around: &[Moment<'_>],
-    sights: &Sights,
-    ballot: &Ballot,
+    around: &[NeighborView<'_>],
+    free_space: &FreeSpace,
+    votes: &TranslationVotes,
     cluster: u32,
-) -> Searched {
+) -> SearchedCluster {
     let members = &scene.source.members[cluster as usize];
     let mover = Mover::new(scene, around, cluster);
     let still = mover.standing_still();
-    if members.len() < scene.options.cluster_points {
-        return Searched {
+    if members.len() < scene.options.cluster_min_points {
+        return SearchedCluster {
             still,
             best: None,
             needed: false,
@@ -201,7 +205,7 @@ fn search(
         .iter()
         .map(|&row| scene.source.points[row as usize])
         .collect();
-    let best = mover.search(ballot, still);
+    let best = mover.search(votes, still);
     let needed = best.is_some_and(|found| {
         let seen = || {
             let motion = &found.motion;
@@ -209,11 +213,11 @@ fn search(
             let clear_m = free_space::passed_m(x.hypot(y));
             let vacated = mover.vacated(motion, clear_m);
             let far = motion.length_m() >= 2.0 * clear_m;
-            sights.of(&vacated, &mover.occupied(motion, clear_m), far)
+            free_space.of(&vacated, &mover.occupied(motion, clear_m), far)
         };
         accept::is_needed(&found, &points, seen, scene.options)
     });
-    Searched {
+    SearchedCluster {
         still,
         best,
         needed,

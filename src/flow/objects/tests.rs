@@ -4,9 +4,9 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use nalgebra::Point3;
 
-use super::search::{Clouds, Labelled, label};
-use crate::flow::data::{Interrupt, Point, Random, RigidTransform, Unwatched, Watch};
-use crate::flow::options::LabelOptions;
+use super::search::{ObjectSearch, SearchClouds, find_objects};
+use crate::flow::data::{Control, Interrupt, Point, Random, RigidTransform, Uncontrolled};
+use crate::flow::options::ObjectOptions;
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
 
 /// A wall along x that a car drives beside.
@@ -36,8 +36,8 @@ fn wall(random: &mut Random, [from, to]: [f64; 2]) -> Vec<Point> {
 }
 
 /// Two sweeps from the same place.
-fn clouds<'a>(source: &'a [Point], target: &'a [Point]) -> Clouds<'a> {
-    Clouds {
+fn clouds<'a>(source: &'a [Point], target: &'a [Point]) -> SearchClouds<'a> {
+    SearchClouds {
         source,
         target,
         around: &[],
@@ -46,11 +46,11 @@ fn clouds<'a>(source: &'a [Point], target: &'a [Point]) -> Clouds<'a> {
     }
 }
 
-fn found(source: &[Point], target: &[Point]) -> Labelled {
-    label(
+fn found(source: &[Point], target: &[Point]) -> ObjectSearch {
+    find_objects(
         &clouds(source, target),
-        &LabelOptions::default(),
-        &Unwatched,
+        &ObjectOptions::default(),
+        &Uncontrolled,
     )
 }
 
@@ -215,24 +215,24 @@ fn any_number_of_threads_gives_the_same_bits() {
 fn an_interrupt_keeps_what_was_found_until_then() {
     /// Interrupts from a number of looks on.
     struct After(usize, Interrupt, AtomicUsize);
-    impl Watch for After {
+    impl Control for After {
         fn interrupt(&self) -> Option<Interrupt> {
             (self.2.fetch_add(1, Ordering::Relaxed) >= self.0).then_some(self.1)
         }
     }
     let [source, target, _] = residual_problem(&street(5));
-    let options = LabelOptions::default();
+    let options = ObjectOptions::default();
     let whole = found(&source, &target).clusters;
     let mut last = 0;
     for looks in [0, 2, 3, 4] {
-        let watch = After(looks, Interrupt::Deadline, AtomicUsize::new(0));
-        let labelled = label(&clouds(&source, &target), &options, &watch);
+        let control = After(looks, Interrupt::Deadline, AtomicUsize::new(0));
+        let labelled = find_objects(&clouds(&source, &target), &options, &control);
         assert_eq!(labelled.interrupted, Some(Interrupt::Deadline));
         assert!(labelled.clusters >= last && labelled.clusters < whole);
         last = labelled.clusters;
     }
     assert!(last > 0);
-    let watch = After(3, Interrupt::Cancelled, AtomicUsize::new(0));
-    let labelled = label(&clouds(&source, &target), &options, &watch);
+    let control = After(3, Interrupt::Cancelled, AtomicUsize::new(0));
+    let labelled = find_objects(&clouds(&source, &target), &options, &control);
     assert_eq!(labelled.interrupted, Some(Interrupt::Cancelled));
 }

@@ -3,7 +3,7 @@
 use super::coarse;
 use super::gicp::{Fit, Schedule};
 use super::surfels::{Columns, Surfels};
-use crate::flow::data::{Point, RigidTransform, Watch};
+use crate::flow::data::{Control, Point, RigidTransform};
 use crate::flow::spatial::voxel_mean;
 
 /// Side of the voxels that both clouds are thinned to, metres.
@@ -21,12 +21,12 @@ const REFINEMENT: Schedule = Schedule {
 };
 
 /// A cloud as it is aligned, as source or as target: what alignments need of it alone.
-pub(crate) struct Surface {
+pub(crate) struct SurfelCloud {
     coarse: Surfels,
     fine: Surfels,
 }
 
-impl Surface {
+impl SurfelCloud {
     /// The surface of a cloud, ground and all.
     pub(crate) fn new(points: &[Point]) -> Self {
         let thin = voxel_mean(points, VOXEL_M);
@@ -43,16 +43,16 @@ impl Surface {
 ///
 /// The same bits whatever the number of threads.
 pub(crate) fn align(
-    source: &Surface,
-    target: &Surface,
+    source: &SurfelCloud,
+    target: &SurfelCloud,
     prior: &RigidTransform,
-    watch: &dyn Watch,
+    control: &dyn Control,
 ) -> RigidTransform {
-    let found = coarse::search(&source.coarse, &target.coarse, prior, watch);
-    if watch.interrupt().is_some() {
+    let found = coarse::search(&source.coarse, &target.coarse, prior, control);
+    if control.interrupt().is_some() {
         return found;
     }
     let target = target.fine.all();
     let source = source.fine.some(REFINED);
-    Fit::new(&source, target).run(&found, &REFINEMENT, watch)
+    Fit::new(&source, target).run(&found, &REFINEMENT, control)
 }

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use super::gicp::{Fit, Schedule};
 use super::surfels::{Columns, Surfels};
-use crate::flow::data::{Point, RigidTransform, Watch};
+use crate::flow::data::{Control, Point, RigidTransform};
 use crate::flow::spatial::voxel_mean;
 
 /// Side of the voxels that both clouds are thinned to, metres.
@@ -47,13 +47,13 @@ pub(super) fn search(
     source: &Surfels,
     target: &Surfels,
     prior: &RigidTransform,
-    watch: &dyn Watch,
+    control: &dyn Control,
 ) -> RigidTransform {
     let source = source.some(TRIED);
     let fit = Fit::new(&source, target.all());
     let tried = |starts: &[RigidTransform]| -> Vec<(RigidTransform, f64)> {
         let tried = starts.par_iter().map(|start| {
-            let motion = fit.run(start, &TRIAL, watch);
+            let motion = fit.run(start, &TRIAL, control);
             (motion, fit.score(&motion, &TRIAL))
         });
         tried.collect()

@@ -14,8 +14,8 @@ use nalgebra::{
 use rayon::prelude::*;
 
 use super::surfels::{AllSurfels, Surfel};
-use crate::flow::data::{Point, RigidTransform, Watch};
-use crate::flow::spatial::Flat;
+use crate::flow::data::{Control, Point, RigidTransform};
+use crate::flow::spatial::PlaneFit;
 
 /// Surfels whose sums one thread takes at a time; sums are added in the surfels' order.
 const AT_ONCE: usize = 256;
@@ -97,11 +97,11 @@ impl<'a> Fit<'a> {
         &self,
         start: &RigidTransform,
         schedule: &Schedule,
-        watch: &dyn Watch,
+        control: &dyn Control,
     ) -> RigidTransform {
         let mut motion = *start;
         for step in 0..schedule.steps {
-            if watch.interrupt().is_some() {
+            if control.interrupt().is_some() {
                 break;
             }
             let (within_m, scale_m, shrunk) = schedule.at(step);
@@ -216,12 +216,12 @@ impl Sums {
 }
 
 /// The covariance of a surfel with that normal: 1 across, thin along.
-fn covariance(flat: &Flat, normal: &Vector3<f64>) -> Matrix3<f64> {
+fn covariance(flat: &PlaneFit, normal: &Vector3<f64>) -> Matrix3<f64> {
     let along = THIN + THICKNESS * f64::from(flat.thickness);
     Matrix3::identity() - normal * normal.transpose() * (1.0 - along)
 }
 
-fn normal(flat: &Flat) -> Vector3<f64> {
+fn normal(flat: &PlaneFit) -> Vector3<f64> {
     Vector3::from(flat.normal.map(f64::from))
 }
 

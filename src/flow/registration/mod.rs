@@ -15,6 +15,6 @@ mod surfels;
 #[cfg(test)]
 mod tests;
 
-pub use neighbors::{AlignedSweep, Around};
+pub use neighbors::{AlignedSweep, NeighborSweep};
 
-pub(crate) use align::{Surface, align};
+pub(crate) use align::{SurfelCloud, align};

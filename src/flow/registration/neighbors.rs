@@ -3,7 +3,7 @@
 //! Each is aligned with the target, ground and all, near where the pair's ego motion at a constant
 //! velocity puts it. It must not know what the sweeps are for.
 
-use crate::flow::data::{Point, RigidTransform, Watch, all_moved};
+use crate::flow::data::{Control, Point, RigidTransform, transform_points};
 use crate::flow::error::FlowError;
 use crate::flow::field::{Backend, budget};
 use crate::flow::options::Options;
@@ -12,7 +12,7 @@ use crate::flow::select::Problem;
 
 /// Another sweep of the sequence that a pair is of.
 #[derive(Clone, Copy, Debug)]
-pub struct Around<'a> {
+pub struct NeighborSweep<'a> {
     /// Points, metres, in the sensor's frame of the sweep.
     pub points: &'a [Point],
     /// As many flags: which points are ground; as [`Problem::ground`].
@@ -27,14 +27,14 @@ pub struct Around<'a> {
 pub struct AlignedSweep {
     /// Points off the ground, metres.
     pub points: Vec<Point>,
-    /// As [`Around::at`].
+    /// As [`NeighborSweep::at`].
     pub at: i8,
 }
 
 /// The sweeps around the pair of `problem` that `frames` sweeps in all leave room for: the nearest in
 /// time first, the earlier of two as near.
-pub(crate) fn nearest<'a>(problem: &Problem<'a>, frames: usize) -> Vec<&'a Around<'a>> {
-    let mut order: Vec<&Around> = problem.around.iter().collect();
+pub(crate) fn nearest<'a>(problem: &Problem<'a>, frames: usize) -> Vec<&'a NeighborSweep<'a>> {
+    let mut order: Vec<&NeighborSweep> = problem.around.iter().collect();
     order.sort_by_key(|sweep| ((2 * i16::from(sweep.at) - 1).abs(), sweep.at));
     order.truncate(frames.saturating_sub(2));
     order
@@ -48,7 +48,7 @@ pub(crate) fn aligned(
     options: &Options,
     ego: &RigidTransform,
     frames: usize,
-    watch: &dyn Watch,
+    control: &dyn Control,
 ) -> Result<Vec<AlignedSweep>, FlowError> {
     let order = nearest(problem, frames);
     if order.is_empty() {
@@ -58,8 +58,8 @@ pub(crate) fn aligned(
     let target = select::in_range(problem.target, options);
     let mut found = Vec::with_capacity(order.len());
     for sweep in order {
-        let surroundings = select::in_range(sweep.points, options);
-        if !budget::has_time_around(surroundings.len() + target.len(), watch) {
+        let registration_clouds = select::in_range(sweep.points, options);
+        if !budget::has_time_around(registration_clouds.len() + target.len(), control) {
             break;
         }
         let points = select::off_ground(sweep, options, &find_ground)?;
@@ -67,9 +67,11 @@ pub(crate) fn aligned(
         let gaps = 1 - i32::from(sweep.at);
         let step = if gaps < 0 { ego.inverse() } else { *ego };
         let prior = (0..gaps.unsigned_abs()).fold(RigidTransform::identity(), |all, _| step * all);
-        let motion = backend.host().align(&surroundings, &target, &prior, watch);
+        let motion = backend
+            .host()
+            .align(&registration_clouds, &target, &prior, control);
         found.push(AlignedSweep {
-            points: all_moved(&motion, &points),
+            points: transform_points(&motion, &points),
             at: sweep.at,
         });
     }

@@ -8,8 +8,8 @@ use std::sync::OnceLock;
 
 use rayon::prelude::*;
 
-use crate::flow::data::{Point, evenly, floor, get_or_compute, square_distance};
-use crate::flow::spatial::{Flat, Neighborhood, REACH};
+use crate::flow::data::{Point, floor, get_or_compute, square_distance, stride_sample};
+use crate::flow::spatial::{Neighborhood, PlaneFit, REACH};
 
 /// Points whose surfels one thread makes at a time.
 const POINTS_AT_ONCE: usize = 256;
@@ -20,7 +20,7 @@ pub(super) struct Surfel {
     /// A point on it, metres.
     pub(super) point: Point,
     /// How it lies.
-    pub(super) flat: Flat,
+    pub(super) flat: PlaneFit,
 }
 
 /// A cloud by place: evenly thinned points, voxels apart that are smaller than a cell.
@@ -35,7 +35,7 @@ pub(super) struct Columns {
 /// A cloud's surfels, as far as they have been asked for.
 pub(super) struct Surfels {
     columns: Columns,
-    flats: OnceLock<Vec<Option<Flat>>>,
+    flats: OnceLock<Vec<Option<PlaneFit>>>,
 }
 
 /// All of a cloud's surfels.
@@ -43,7 +43,7 @@ pub(super) struct Surfels {
 pub(super) struct AllSurfels<'a> {
     columns: &'a Columns,
     /// One for each of the columns' points; none where there is no flat surface.
-    flats: &'a [Option<Flat>],
+    flats: &'a [Option<PlaneFit>],
 }
 
 impl Columns {
@@ -67,7 +67,7 @@ impl Columns {
         }
     }
 
-    fn flats(&self, points: &[Point]) -> Vec<Option<Flat>> {
+    fn flats(&self, points: &[Point]) -> Vec<Option<PlaneFit>> {
         let chunks = points.par_chunks(POINTS_AT_ONCE);
         let flats = chunks.flat_map_iter(|points| points.iter().map(|&point| self.flat_at(point)));
         flats.collect()
@@ -86,7 +86,7 @@ impl Columns {
         [x - 1, x, x + 1].map(|x| begin(x, y - 1)..begin(x, y + 2))
     }
 
-    fn flat_at(&self, point: Point) -> Option<Flat> {
+    fn flat_at(&self, point: Point) -> Option<PlaneFit> {
         let mut neighborhood = Neighborhood::of(point);
         for row in self.around(point) {
             for &other in &self.points[row] {
@@ -117,9 +117,9 @@ impl Surfels {
 
     /// Those of at most `most` of the points, evenly; points that lie on no flat surface have none.
     pub(super) fn some(&self, most: usize) -> Vec<Surfel> {
-        let points = evenly(&self.columns.points, most);
+        let points = stride_sample(&self.columns.points, most);
         let flats = match self.flats.get() {
-            Some(flats) => evenly(flats, most),
+            Some(flats) => stride_sample(flats, most),
             None => self.columns.flats(&points),
         };
         let surfels = points.into_iter().zip(flats);
@@ -199,7 +199,7 @@ mod tests {
         let surfels = Surfels::new(Columns::new(&plane, 1.0));
         let surfels = surfels.all();
         for &point in &plane {
-            let Flat { normal, thickness } = surfels.nearest(point, 1.0).expect("flat").flat;
+            let PlaneFit { normal, thickness } = surfels.nearest(point, 1.0).expect("flat").flat;
             let along = Vector3::from(normal.map(f64::from)).dot(&slope).abs();
             assert!(along > 1.0 - 1e-6, "{normal:?}");
             assert!(thickness < 1e-6, "{thickness}");

@@ -4,8 +4,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use nalgebra::{Isometry3, Point3, Vector3};
 
-use super::align::{Surface, align};
-use crate::flow::data::{Interrupt, Point, Random, RigidTransform, Unwatched, Watch};
+use super::align::{SurfelCloud, align};
+use crate::flow::data::{Control, Interrupt, Point, Random, RigidTransform, Uncontrolled};
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
 
 /// What is asked of it on real pairs.
@@ -16,13 +16,18 @@ fn aligned(
     source: &[Point],
     target: &[Point],
     prior: &RigidTransform,
-    watch: &dyn Watch,
+    control: &dyn Control,
 ) -> RigidTransform {
-    align(&Surface::new(source), &Surface::new(target), prior, watch)
+    align(
+        &SurfelCloud::new(source),
+        &SurfelCloud::new(target),
+        prior,
+        control,
+    )
 }
 
 fn found(source: &[Point], target: &[Point]) -> RigidTransform {
-    aligned(source, target, &RigidTransform::identity(), &Unwatched)
+    aligned(source, target, &RigidTransform::identity(), &Uncontrolled)
 }
 
 fn street(seed: u64, speed_mps: Option<f64>, yaw_rate_rps: Option<f64>) -> SimulatedPair {
@@ -108,7 +113,7 @@ fn five_metres_and_eight_degrees_are_found_from_rest_and_more_from_a_prior() {
     let truth = yaw([12.0, 7.0, 0.5], 60.0);
     let prior = yaw([10.0, 7.0, 0.5], 57.0);
     let source = moved(&pair.source, &(truth.inverse() * pair.target_from_source));
-    let found = aligned(&source, &pair.target, &prior, &Unwatched);
+    let found = aligned(&source, &pair.target, &prior, &Uncontrolled);
     assert_near(&found, &truth, "from a prior");
 }
 
@@ -142,7 +147,7 @@ fn what_a_scene_leaves_free_stays_as_in_the_prior() {
     let (source, target) = (tunnel(0.0), tunnel(0.4));
     for along in [0.0, 1.3] {
         let prior = yaw([along, 0.0, 0.0], 0.0);
-        let found = aligned(&source, &target, &prior, &Unwatched);
+        let found = aligned(&source, &target, &prior, &Uncontrolled);
         assert_near(&found, &yaw([along, -0.4, 0.0], 0.0), "a tunnel");
     }
     let [x, y, z] = axes;
@@ -191,7 +196,7 @@ fn clouds_that_have_nothing_in_common_keep_the_prior() {
     let here = street(2, None, None).source;
     let far = moved(&here, &yaw([500.0, 0.0, 0.0], 0.0));
     let prior = yaw([1.0, 2.0, 0.0], 3.0);
-    assert_eq!(aligned(&here, &far, &prior, &Unwatched), prior);
+    assert_eq!(aligned(&here, &far, &prior, &Uncontrolled), prior);
 }
 
 #[test]
@@ -211,7 +216,7 @@ fn any_number_of_threads_gives_the_same_bits() {
 fn an_interrupt_at_any_moment_gives_a_finite_motion() {
     /// Interrupts from a number of looks on.
     struct After(usize, AtomicUsize);
-    impl Watch for After {
+    impl Control for After {
         fn interrupt(&self) -> Option<Interrupt> {
             (self.1.fetch_add(1, Ordering::Relaxed) >= self.0).then_some(Interrupt::Deadline)
         }
@@ -219,8 +224,8 @@ fn an_interrupt_at_any_moment_gives_a_finite_motion() {
     let pair = street(6, Some(10.0), Some(0.0));
     let prior = RigidTransform::identity();
     for looks in [0, 1, 40, 110, 120] {
-        let watch = After(looks, AtomicUsize::new(0));
-        let found = aligned(&pair.source, &pair.target, &prior, &watch);
+        let control = After(looks, AtomicUsize::new(0));
+        let found = aligned(&pair.source, &pair.target, &prior, &control);
         assert!(gap(&found, &pair.target_from_source).0 < 20.0, "{looks}");
     }
 }

@@ -12,7 +12,7 @@ const REACH: f32 = (1 << 30) as f32;
 
 /// A cloud by place.
 #[derive(Debug)]
-pub(crate) struct Near {
+pub(crate) struct ColumnIndex {
     column_m: f32,
     /// Open addressing: the key of a column and where its points are.
     table: Vec<(u64, Range<u32>)>,
@@ -22,7 +22,7 @@ pub(crate) struct Near {
     rows: Vec<u32>,
 }
 
-impl Near {
+impl ColumnIndex {
     /// Of `points`, to be asked for places within `column_m` metres.
     pub(crate) fn new(points: &[Point], column_m: f32) -> Self {
         let keyed = points.iter().zip(0_u32..);
@@ -204,7 +204,7 @@ impl Near {
     }
 }
 
-/// Which of the points of a [`Near`] have been seen, in its order, a bit each.
+/// Which of the points of a [`ColumnIndex`] have been seen, in its order, a bit each.
 pub(crate) struct Seen(Vec<u64>);
 
 impl Seen {
@@ -306,7 +306,7 @@ mod tests {
         let mut random = Random::new(2);
         let mut point = || [0; 3].map(|_| random.uniform(-3.0, 3.0) as f32);
         let cloud: Vec<Point> = (0..700).map(|_| point()).collect();
-        let near = Near::new(&cloud, 0.7);
+        let near = ColumnIndex::new(&cloud, 0.7);
         for _ in 0..500 {
             let asked = point();
             let allowed = |row: u32| !row.is_multiple_of(3);
@@ -327,7 +327,7 @@ mod tests {
             [4000.0 + x * 0.25, -4000.0 + y * 0.25, z * 0.25]
         };
         let cloud: Vec<Point> = (0..720).map(lattice).collect();
-        let near = Near::new(&cloud, 0.5);
+        let near = ColumnIndex::new(&cloud, 0.5);
         let mut random = Random::new(5);
         for _ in 0..500 {
             let mut side = |low: f64, high: f64| (random.uniform(low, high) * 8.0).round() / 8.0;
@@ -359,7 +359,7 @@ mod tests {
         let mut random = Random::new(6);
         let mut point = || [0; 3].map(|_| random.uniform(-3.0, 3.0) as f32);
         let cloud: Vec<Point> = (0..3000).map(|_| point()).collect();
-        let near = Near::new(&cloud, 0.7);
+        let near = ColumnIndex::new(&cloud, 0.7);
         let places: Vec<Point> = (0..40).map(|_| point()).collect();
         let (mut seen, mut rows) = (near.unseen(), Vec::new());
         for &place in &places {
@@ -378,7 +378,7 @@ mod tests {
         let mut random = Random::new(3);
         let mut point = || [0; 3].map(|_| random.uniform(-3.0, 3.0) as f32);
         let cloud: Vec<Point> = (0..700).map(|_| point()).collect();
-        let near = Near::new(&cloud, 0.4);
+        let near = ColumnIndex::new(&cloud, 0.4);
         let asked = point();
         let inside = |other: &Point, half_m: f32| {
             (0..2).all(|a| (other[a] - asked[a]).abs() <= half_m)
@@ -395,8 +395,11 @@ mod tests {
 
     #[test]
     fn nothing_is_near_in_an_empty_cloud_and_far_from_every_point() {
-        assert_eq!(Near::new(&[], 0.5).nearest([0.0; 3], 0.5, |_| true), None);
-        let near = Near::new(&[[1e30, -1e30, 0.0]], 0.5);
+        assert_eq!(
+            ColumnIndex::new(&[], 0.5).nearest([0.0; 3], 0.5, |_| true),
+            None
+        );
+        let near = ColumnIndex::new(&[[1e30, -1e30, 0.0]], 0.5);
         assert_eq!(near.nearest([0.0; 3], 0.5, |_| true), None);
         assert_eq!(near.nearest([f32::NAN; 3], 0.5, |_| true), None);
     }

@@ -5,7 +5,7 @@ pub(crate) mod dbscan;
 mod plane;
 mod voxel;
 
-pub(crate) use column_index::Near;
+pub(crate) use column_index::ColumnIndex;
 pub(crate) use dbscan::NOISE;
-pub(crate) use plane::{Flat, Neighborhood};
+pub(crate) use plane::{Neighborhood, PlaneFit};
 pub(crate) use voxel::{REACH, voxel_first, voxel_mean};

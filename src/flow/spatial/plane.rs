@@ -17,7 +17,7 @@ const NO_SPREAD: f64 = 1e-12;
 
 /// A plane that points lie on.
 #[derive(Clone, Copy)]
-pub(crate) struct Flat {
+pub(crate) struct PlaneFit {
     /// Unit length, on either side.
     pub(crate) normal: [f32; 3],
     /// The points' spread along the normal over that along their second axis, as variances: 0 for
@@ -54,7 +54,7 @@ impl Neighborhood {
     }
 
     /// The plane of the points; none where there are few or they do not lie on one.
-    pub(crate) fn flat(&self) -> Option<Flat> {
+    pub(crate) fn flat(&self) -> Option<PlaneFit> {
         if self.count < NEIGHBORS {
             return None;
         }
@@ -64,7 +64,7 @@ impl Neighborhood {
 }
 
 /// The plane of points by their covariance, in closed form; none where they do not lie on one.
-fn flat(spread: &Matrix3<f64>) -> Option<Flat> {
+fn flat(spread: &Matrix3<f64>) -> Option<PlaneFit> {
     let mean = spread.trace() / 3.0;
     let rest = spread - Matrix3::identity() * mean;
     let radius = (rest.norm_squared() / 6.0).sqrt();
@@ -88,7 +88,7 @@ fn flat(spread: &Matrix3<f64>) -> Option<Flat> {
         .into_iter()
         .max_by(|a, b| a.norm_squared().total_cmp(&b.norm_squared()))?;
     let normal = longest.try_normalize(0.0)?;
-    Some(Flat {
+    Some(PlaneFit {
         normal: [normal.x as f32, normal.y as f32, normal.z as f32],
         thickness: (least / middle).max(0.0) as f32,
     })

@@ -4,7 +4,7 @@ use std::io::{Seek, Write};
 
 use serde::{Deserialize, Serialize};
 
-use crate::flow::{Bounds, Cluster, Objects, Point};
+use crate::flow::{Cluster, Objects, OrientedBox, Point};
 use crate::formats::error::{FileKind, FormatError};
 use crate::formats::limits::{check_chance, check_flag, check_id, check_value};
 use crate::formats::npy;
@@ -83,7 +83,7 @@ pub(super) fn take(npz: &mut Npz<'_>) -> Result<Option<Vec<Cluster>>, FormatErro
     let clusters = (0..count).map(|row| Cluster {
         points: counts[row],
         dynamic: dynamic[row],
-        bounds: Bounds {
+        bounds: OrientedBox {
             center: centers[row],
             size: sizes[row],
             yaw: yaws[row],
@@ -135,7 +135,7 @@ impl Described {
         Ok(Cluster {
             points: self.points,
             dynamic: self.dynamic,
-            bounds: Bounds {
+            bounds: OrientedBox {
                 center: self.center,
                 size: self.size,
                 yaw: self.yaw,

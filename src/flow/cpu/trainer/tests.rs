@@ -3,7 +3,7 @@
 use super::*;
 use crate::flow::cpu::backend::CpuBackend;
 use crate::flow::cpu::isa::Isa;
-use crate::flow::data::{Random, Unwatched};
+use crate::flow::data::{Random, Uncontrolled};
 use crate::flow::distance::{DistanceOptions, DistanceTransform};
 use crate::flow::field::{Backend, MOST_POINTS, Transform, first_losses};
 use crate::flow::options::Preset;
@@ -13,7 +13,7 @@ use std::sync::Mutex;
 #[derive(Default)]
 struct Losses(Mutex<Vec<f64>>);
 
-impl Watch for Losses {
+impl Control for Losses {
     fn progress(&self, progress: Progress) {
         self.0
             .lock()
@@ -51,7 +51,7 @@ fn transform(
 ) -> Box<dyn Transform> {
     let backend = CpuBackend::with_isa(isa, Some(threads)).expect("threads");
     backend
-        .transform(source, target, &options.distance, &Unwatched)
+        .transform(source, target, &options.distance, &Uncontrolled)
         .expect("small clouds")
 }
 
@@ -133,7 +133,7 @@ fn more_chunks_than_are_held_at_once_are_each_added_up_once() {
     let transform = transform(Isa::available()[0], 2, &source, &target, &options);
     let mut trainer = transform.start(&source, &options).expect("a trainer");
     trainer
-        .advance(1, &Unwatched)
+        .advance(1, &Uncontrolled)
         .expect("the cpu does not fail");
     // After one step from nothing the mean of the gradients is a tenth of the gradient: the sum of
     // the chunks', each of which a trainer of its points alone finds but for the batch's weight.
@@ -143,7 +143,8 @@ fn more_chunks_than_are_held_at_once_are_each_added_up_once() {
         let own = Chunks::new(points).points(chunk);
         let own = &source[own.start..own.end.min(points)];
         let mut part = transform.start(own, &options).expect("a trainer");
-        part.advance(1, &Unwatched).expect("the cpu does not fail");
+        part.advance(1, &Uncontrolled)
+            .expect("the cpu does not fail");
         let state = part.state().expect("the cpu does not fail");
         let share = own.len() as f64 / points as f64;
         for (sum, mean) in sums.iter_mut().zip(state.moments[0].as_slice()) {

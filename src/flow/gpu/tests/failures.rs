@@ -3,7 +3,7 @@
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use super::{clouds, opened, shared};
-use crate::flow::data::{Interrupt, Point, Progress, Unwatched, Watch};
+use crate::flow::data::{Control, Interrupt, Point, Progress, Uncontrolled};
 use crate::flow::distance::{DistanceOptions, Metric, Sites};
 use crate::flow::error::FlowError;
 use crate::flow::estimate::estimate;
@@ -16,7 +16,7 @@ use crate::flow::select::Problem;
 /// Gives the card up after some iterations.
 struct Kill<'a>(&'a Gpu, AtomicUsize);
 
-impl Watch for Kill<'_> {
+impl Control for Kill<'_> {
     fn progress(&self, _: Progress) {
         if self.1.fetch_add(1, Ordering::Relaxed) == 4 {
             self.0.destroy();
@@ -45,14 +45,14 @@ fn a_card_lost_in_the_middle_of_a_run_fails_the_run_and_can_be_opened_again() {
         killed.err()
     );
     assert!(gpu.is_lost());
-    let later = estimate(&gpu, &problem, &options, &Unwatched);
+    let later = estimate(&gpu, &problem, &options, &Uncontrolled);
     assert!(matches!(
         later,
         Err(FlowError::Backend(BackendError::Lost(_)))
     ));
     drop(gpu);
     let again = opened(&GpuOptions::default()).expect("it was there before");
-    estimate(&again, &problem, &options, &Unwatched).expect("a flow");
+    estimate(&again, &problem, &options, &Uncontrolled).expect("a flow");
 }
 
 #[test]
@@ -65,7 +65,7 @@ fn a_pair_that_never_fits_is_refused_before_it_takes_anything() {
         .flat_map(|x| (0..40u8).map(move |y| [x, y]))
         .flat_map(|[x, y]| (0..4u8).map(move |z| [x, y, z].map(|c| f32::from(c) * 8.0)))
         .collect();
-    let refused = gpu.transform(&cloud, &cloud, &DistanceOptions::default(), &Unwatched);
+    let refused = gpu.transform(&cloud, &cloud, &DistanceOptions::default(), &Uncontrolled);
     match refused.err() {
         Some(BackendError::Memory {
             needed, available, ..
@@ -91,7 +91,7 @@ fn what_only_the_cpu_computes_is_refused_by_name() {
             sites,
             ..DistanceOptions::default()
         };
-        let refused = gpu.transform(&source, &target, &options, &Unwatched);
+        let refused = gpu.transform(&source, &target, &options, &Uncontrolled);
         assert!(matches!(
             refused.err(),
             Some(BackendError::Unsupported(text)) if text.contains("CPU")
@@ -107,7 +107,7 @@ fn more_pairs_than_lanes_are_told_to_come_back() {
     let [source, target] = clouds(100);
     let options = Preset::Paper.options(None);
     let transform = gpu
-        .transform(&source, &target, &options.distance, &Unwatched)
+        .transform(&source, &target, &options.distance, &Uncontrolled)
         .expect("small clouds fit");
     let first = transform.start(&source, &options).expect("a trainer");
     let second = transform.start(&source, &options);
@@ -125,17 +125,17 @@ fn a_run_that_diverges_says_so() {
     let mut options = Preset::Paper.options(None);
     options.learning_rate = f32::INFINITY;
     let transform = gpu
-        .transform(&source, &target, &options.distance, &Unwatched)
+        .transform(&source, &target, &options.distance, &Uncontrolled)
         .expect("small clouds fit");
     let mut trainer = transform.start(&source, &options).expect("a trainer");
-    let ended = trainer.advance(5, &Unwatched).expect("an answer");
+    let ended = trainer.advance(5, &Uncontrolled).expect("an answer");
     assert_eq!(ended, Advance::Diverged);
 }
 
 #[test]
 fn an_interrupted_run_stops_between_submissions() {
     struct Now;
-    impl Watch for Now {
+    impl Control for Now {
         fn interrupt(&self) -> Option<Interrupt> {
             Some(Interrupt::Cancelled)
         }
@@ -146,7 +146,7 @@ fn an_interrupted_run_stops_between_submissions() {
     let [source, target] = clouds(100);
     let options = Preset::Paper.options(None);
     let transform = gpu
-        .transform(&source, &target, &options.distance, &Unwatched)
+        .transform(&source, &target, &options.distance, &Uncontrolled)
         .expect("small clouds fit");
     let mut trainer = transform.start(&source, &options).expect("a trainer");
     let ended = trainer.advance(5, &Now).expect("an answer");

@@ -6,7 +6,7 @@ use super::kernels::{after_one, network, plain, transform};
 use super::whole::{Losses, end_point_error, solved, street};
 use super::{clouds, shared};
 use crate::flow::cpu::CpuBackend;
-use crate::flow::data::Unwatched;
+use crate::flow::data::Uncontrolled;
 use crate::flow::distance::DistanceTransform;
 use crate::flow::field::{Backend, BackendError, Parameters, ReferenceNetwork};
 use crate::flow::gpu::backend::Gpu;
@@ -38,7 +38,7 @@ fn half_precision_is_refused_where_nothing_can_compute_it() {
     let options = half(Preset::Paper.options(None));
     let refused = |device: &dyn Backend| {
         let transform = device
-            .transform(&source, &target, &options.distance, &Unwatched)
+            .transform(&source, &target, &options.distance, &Uncontrolled)
             .expect("small clouds fit");
         let refused = transform.start(&source, &options).err();
         matches!(refused, Some(BackendError::Unsupported(text)) if text.contains("precision"))
@@ -179,7 +179,7 @@ fn the_first_losses_in_half_precision_are_those_of_single_precision() {
     let [source, target] = clouds(1000);
     let losses = [plain(), half(plain())].map(|options| {
         let transform = gpu
-            .transform(&source, &target, &options.distance, &Unwatched)
+            .transform(&source, &target, &options.distance, &Uncontrolled)
             .expect("small clouds fit");
         let losses = Losses::default();
         let mut trainer = transform.start(&source, &options).expect("a trainer");
@@ -227,10 +227,10 @@ fn pairs_of_both_precisions_at_once_have_the_bits_they_have_alone() {
     let fitted = |options: &Options| {
         let [source, target] = clouds(700);
         let transform = gpu
-            .transform(&source, &target, &options.distance, &Unwatched)
+            .transform(&source, &target, &options.distance, &Uncontrolled)
             .expect("small clouds fit");
         let mut trainer = transform.start(&source, options).expect("a trainer");
-        trainer.advance(8, &Unwatched).expect("iterations");
+        trainer.advance(8, &Uncontrolled).expect("iterations");
         trainer.evaluate(&source).expect("an answer")
     };
     let all = [plain(), half(plain())];

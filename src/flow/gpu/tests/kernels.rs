@@ -1,13 +1,13 @@
 //! Each kernel against the double-precision reference, at awkward sizes.
 
 use super::{clouds, shared};
-use crate::flow::data::{Point, Random, Unwatched};
+use crate::flow::data::{Point, Random, Uncontrolled};
 use crate::flow::distance::{Bricks, DistanceOptions, DistanceTransform};
 use crate::flow::field::{
     Backend, Conditioning, Parameters, ReferenceNetwork, TrainerState, Transform, first_losses,
 };
 use crate::flow::gpu::distance::{GpuTransform, build};
-use crate::flow::options::{Keep, Options, Preset};
+use crate::flow::options::{Options, Preset, ResultChoice};
 use crate::flow::simulate::{Street, StreetOptions};
 
 /// Single precision over sums of 128 terms, eight layers deep.
@@ -18,7 +18,7 @@ const GRADIENT_TOLERANCE: f64 = 1e-4;
 pub(super) fn transform(source: &[Point], target: &[Point]) -> Option<GpuTransform> {
     let card = shared()?.card();
     let options = DistanceOptions::default();
-    let built = build(card, source, target, &options, &Unwatched);
+    let built = build(card, source, target, &options, &Uncontrolled);
     Some(built.expect("small clouds fit"))
 }
 
@@ -130,7 +130,7 @@ fn the_network_is_the_references_at_awkward_row_counts() {
 /// The trainer's state after one iteration over the points.
 pub(super) fn after_one(gpu: &GpuTransform, source: &[Point], options: &Options) -> TrainerState {
     let mut trainer = gpu.start(source, options).expect("a trainer");
-    trainer.advance(1, &Unwatched).expect("an iteration");
+    trainer.advance(1, &Uncontrolled).expect("an iteration");
     trainer.state().expect("an answer")
 }
 
@@ -143,7 +143,7 @@ fn every_gradient_is_the_references_at_awkward_row_counts() {
             inputs: preset.options(None).inputs,
             ..plain()
         };
-        options.keep = Keep::Best;
+        options.keep = ResultChoice::Best;
         for rows in [3, 63, 64, 65, 600] {
             let source = &cloud[..rows];
             let Some(gpu) = transform(source, &target) else {
@@ -217,7 +217,7 @@ fn the_first_losses_are_those_of_the_method_in_double_precision() {
     let distance = distance.expect("small clouds fit");
     let expected = first_losses(&source, &distance, options.seed, RATE.into(), STEPS);
     let transform = gpu
-        .transform(&source, &target, &options.distance, &Unwatched)
+        .transform(&source, &target, &options.distance, &Uncontrolled)
         .expect("small clouds fit");
     let losses = super::whole::Losses::default();
     let mut trainer = transform.start(&source, &options).expect("a trainer");

@@ -4,10 +4,10 @@ use std::sync::Mutex;
 
 use super::{LANES, clouds, shared};
 use crate::flow::cpu::{CpuBackend, Isa};
-use crate::flow::data::{Point, Progress, Unwatched, Watch};
+use crate::flow::data::{Control, Point, Progress, Uncontrolled};
 use crate::flow::estimate::{Estimate, estimate};
 use crate::flow::field::{Backend, EarlyStop};
-use crate::flow::motion::Field;
+use crate::flow::motion::MotionField;
 use crate::flow::options::{Ground, Options, Preset};
 use crate::flow::select::Problem;
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
@@ -22,7 +22,7 @@ impl Losses {
     }
 }
 
-impl Watch for Losses {
+impl Control for Losses {
     fn progress(&self, progress: Progress) {
         let mut losses = self.0.lock().expect("no test panics in it");
         losses.push(progress.loss);
@@ -48,7 +48,7 @@ pub(super) fn solved(backend: &dyn Backend, pair: &SimulatedPair, options: &Opti
         before: None,
         around: &[],
     };
-    estimate(backend, &problem, options, &Unwatched).expect("a flow")
+    estimate(backend, &problem, options, &Uncontrolled).expect("a flow")
 }
 
 pub(super) fn end_point_error(flow: &[Point], truth: &[Point]) -> f64 {
@@ -105,7 +105,7 @@ fn every_loss_of_a_run_in_batches_is_the_cpus() {
         let run = |device: &dyn Backend| {
             let [source, target] = clouds(1500);
             let transform = device
-                .transform(&source, &target, &options.distance, &Unwatched)
+                .transform(&source, &target, &options.distance, &Uncontrolled)
                 .expect("small clouds fit");
             let losses = Losses::default();
             let mut trainer = transform.start(&source, &options).expect("a trainer");
@@ -127,7 +127,7 @@ fn a_field_that_was_kept_says_on_any_device_what_its_run_said() {
     options.max_iterations = 8;
     options.ground = Ground::Keep;
     let estimate = solved(gpu, &pair, &options);
-    let field = Field::from_bytes(&estimate.field.to_bytes()).expect("sound bytes");
+    let field = MotionField::from_bytes(&estimate.field.to_bytes()).expect("sound bytes");
     let places = field.static_places(&pair.source);
     let there = field.residual(gpu, &places).expect("flows");
     for (row, (residual, place)) in there.iter().zip(&places).enumerate() {
@@ -150,7 +150,7 @@ fn the_stopping_rule_and_the_best_are_the_cpus_for_the_same_losses() {
     options.learning_rate = 0.03;
     options.max_iterations = 120;
     let transform = gpu
-        .transform(&source, &target, &options.distance, &Unwatched)
+        .transform(&source, &target, &options.distance, &Uncontrolled)
         .expect("small clouds fit");
     let losses = Losses::default();
     let mut trainer = transform.start(&source, &options).expect("a trainer");
@@ -177,10 +177,10 @@ fn the_stopping_rule_and_the_best_are_the_cpus_for_the_same_losses() {
 fn fitted(device: &dyn Backend, points: usize, options: &Options, steps: usize) -> Vec<Point> {
     let [source, target] = clouds(points);
     let transform = device
-        .transform(&source, &target, &options.distance, &Unwatched)
+        .transform(&source, &target, &options.distance, &Uncontrolled)
         .expect("small clouds fit");
     let mut trainer = transform.start(&source, options).expect("a trainer");
-    trainer.advance(steps, &Unwatched).expect("iterations");
+    trainer.advance(steps, &Uncontrolled).expect("iterations");
     trainer.evaluate(&source).expect("an answer")
 }
 
@@ -222,15 +222,15 @@ fn a_pair_put_down_and_taken_up_again_has_the_same_bits() {
         let expected = fitted(gpu, 600, &options, 14);
         let [source, target] = clouds(600);
         let transform = gpu
-            .transform(&source, &target, &options.distance, &Unwatched)
+            .transform(&source, &target, &options.distance, &Uncontrolled)
             .expect("small clouds fit");
         let mut first = transform.start(&source, &options).expect("a trainer");
-        first.advance(5, &Unwatched).expect("iterations");
+        first.advance(5, &Uncontrolled).expect("iterations");
         let state = first.state().expect("an answer");
         drop(first);
         let mut second = transform.start(&source, &options).expect("a trainer");
         second.restore(state).expect("memory");
-        second.advance(9, &Unwatched).expect("iterations");
+        second.advance(9, &Uncontrolled).expect("iterations");
         assert!(second.evaluate(&source).expect("an answer") == expected);
     }
 }
