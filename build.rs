@@ -1,5 +1,5 @@
-//! Compiles the protocol, without protoc, where the service is built: the server's half for the
-//! library, the client's half for the tests.
+//! Compiles the protobuf definitions, without protoc, if the feature `service` is enabled: the
+//! server code for the library and the client code for the tests.
 
 use std::env;
 use std::error::Error;

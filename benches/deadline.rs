@@ -1,4 +1,4 @@
-//! What a deadline costs: when the answer comes and how good it is, off the ground.
+//! Response time and accuracy under a deadline, for points off the ground.
 //!
 //! ```text
 //! cargo bench --bench deadline -- PAIR.npz...
@@ -27,7 +27,7 @@ const DEADLINES_MS: [Option<u32>; 10] = [
     None,
 ];
 
-/// A clock with a deadline, seconds after it began.
+/// A clock with an optional deadline, seconds after its start.
 struct Clock(Instant, Option<f64>);
 
 impl Control for Clock {
@@ -43,13 +43,14 @@ impl Control for Clock {
     }
 }
 
-/// The middle of the values.
+/// The upper median of the values.
 fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     values[values.len() / 2]
 }
 
-/// One run: milliseconds, megabytes of the transform, iterations, EPE, EPE of movers.
+/// One run: milliseconds, megabytes of the distance transform, iterations, EPE in metres, and EPE
+/// of the moving points in metres.
 type Figures = [f64; 5];
 
 fn run(
@@ -65,7 +66,7 @@ fn run(
         target: &pair.target,
         ground: Some([&ground.source, &ground.target]),
         before: None,
-        around: &[],
+        neighbors: &[],
     };
     backend.host().forget();
     let clock = Clock(Instant::now(), deadline);
@@ -77,10 +78,11 @@ fn run(
         ..Truth::new(&known.flow, &known.valid)
     };
     let metrics = evaluate(&estimate.flow, &estimate.valid, &truth).map_err(|e| e.to_string())?;
+    let fit = estimate.fit();
     let figures = [
         milliseconds,
-        estimate.distance_bytes as f64 / 1e6,
-        estimate.iterations as f64,
+        fit.map_or(0.0, |fit| fit.distance_bytes as f64 / 1e6),
+        fit.map_or(0.0, |fit| fit.iterations as f64),
         metrics.epe,
         metrics.epe_dynamic.unwrap_or(f64::NAN),
     ];

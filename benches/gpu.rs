@@ -1,12 +1,12 @@
-//! A card: each kernel against the card's measured arithmetic peak, whole pairs of four sizes, and
-//! many small pairs at once.
+//! GPU benchmark: each kernel against the measured arithmetic peak of the GPU, whole pairs of four
+//! sizes, and many small pairs at once.
 //!
 //! ```text
 //! cargo bench --bench gpu -- [CARD] [--points N,N,...] [--pairs N,N,...]
 //! ```
 //!
-//! `CARD` is an index, a PCI id or a part of the name; without it the first card that is no
-//! software. `benches/gpu.sh` runs it, the tests and the peer from prebuilt programs.
+//! `CARD` is an index, a PCI id or a part of the name. The default is the first hardware GPU.
+//! `benches/gpu.sh` runs this benchmark, the tests and the PyTorch peer from prebuilt programs.
 #![expect(clippy::print_stdout, reason = "a benchmark prints its figures")]
 
 #[expect(dead_code, reason = "scenes are other benchmarks'")]
@@ -22,11 +22,11 @@ use fnsf::flow::gpu::{
 use fnsf::flow::simulate::{SimulatedPair, Street, StreetOptions};
 use fnsf::flow::{Control, Estimate, Options, Precision, Preset, Problem, estimate};
 
-/// Runs of each pair, after one to warm up.
+/// Timed runs of each pair, after one warm-up run.
 const RUNS: u64 = 5;
 /// Rounds of each kernel.
 const ROUNDS: usize = 10;
-/// Points of the pairs that are fitted at once.
+/// Points of each pair in the batch measurement.
 const SMALL: usize = 8192;
 
 /// A clock for the numerics.
@@ -38,7 +38,7 @@ impl Control for Clock {
     }
 }
 
-/// What the command line asks for.
+/// The command-line arguments.
 struct Asked {
     card: Selector,
     points: Vec<usize>,
@@ -70,7 +70,7 @@ impl Asked {
     }
 }
 
-/// A street whose sweeps have more points than any benchmark takes.
+/// A simulated pair with more points than any benchmark uses.
 fn street(seed: u64) -> Result<SimulatedPair, String> {
     let options = StreetOptions {
         seed,
@@ -87,19 +87,13 @@ fn solve(
     pair: &SimulatedPair,
     options: &Options,
 ) -> Result<Estimate, String> {
-    let problem = Problem {
-        source: &pair.source,
-        target: &pair.target,
-        ground: None,
-        before: None,
-        around: &[],
-    };
+    let problem = Problem::pair(&pair.source, &pair.target);
     backend.host().forget();
     let clock = Clock(Instant::now());
     estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())
 }
 
-/// Mean end-point error of the points that took part, metres.
+/// Mean end-point error of the points that have a flow, metres.
 fn end_point_error(estimate: &Estimate, pair: &SimulatedPair) -> f64 {
     let rows = estimate.flow.iter().zip(&pair.flow).zip(&estimate.valid);
     let errors = rows.filter(|&(_, &valid)| valid).map(|((flow, truth), _)| {
@@ -109,7 +103,7 @@ fn end_point_error(estimate: &Estimate, pair: &SimulatedPair) -> f64 {
     errors.sum::<f64>() / estimate.points as f64
 }
 
-/// One row of the table of kernels.
+/// Prints one row of the kernel table.
 fn kernel(precision: &str, points: usize, time: &KernelTime, peak: f64) {
     let speed = time.operations / time.seconds;
     let shares = if time.operations > 0.0 {
@@ -148,7 +142,7 @@ fn pairs(gpu: &Gpu, pair: &SimulatedPair, sizes: &[usize]) -> Result<(), String>
     println!("| preset | points | iterations | precompute | query | network | total ms | EPE m |");
     println!("|---|---|---|---|---|---|---|---|");
     for &points in sizes {
-        for preset in Preset::FITTED {
+        for preset in Preset::with_field() {
             let mut runs = Vec::new();
             for seed in 0..=RUNS {
                 let options = Options {
@@ -165,11 +159,15 @@ fn pairs(gpu: &Gpu, pair: &SimulatedPair, sizes: &[usize]) -> Result<(), String>
                 "| {} | {} | {:.0} | {:.1} | {:.1} | {:.1} | {:.1} | {:.3} |",
                 preset.name(),
                 runs[0].points,
-                of(&|e| e.iterations as f64),
-                of(&|e| e.seconds.precompute * 1e3),
-                of(&|e| e.seconds.query * 1e3),
-                of(&|e| e.seconds.network * 1e3),
-                of(&|e| e.seconds.total * 1e3),
+                of(&|e| e.fit().map_or(0.0, |fit| fit.iterations as f64)),
+                of(&|e| e.precompute_seconds * 1e3),
+                of(&|e| e.fit().map_or(0.0, |fit| fit.query_seconds) * 1e3),
+                of(&|e| e
+                    .fit()
+                    .map_or(e.total_seconds - e.precompute_seconds, |fit| fit
+                        .network_seconds)
+                    * 1e3),
+                of(&|e| e.total_seconds * 1e3),
                 of(&|e| end_point_error(e, pair)),
             );
         }
@@ -178,7 +176,7 @@ fn pairs(gpu: &Gpu, pair: &SimulatedPair, sizes: &[usize]) -> Result<(), String>
     Ok(())
 }
 
-/// Many pairs at once, one thread each, as the service's lanes work.
+/// Solves many pairs at once, one thread each, as the lanes of the service do.
 fn batches(gpu: &Gpu, pair: &SimulatedPair, counts: &[usize]) -> Result<(), String> {
     println!("| pairs of {SMALL} at once | seconds | pairs a second | of one at a time |");
     println!("|---|---|---|---|");

@@ -59,7 +59,7 @@ run() {
   for preset in paper neural; do
     for device in "$gpu" cpu; do
       "$from/fnsf" flow "$pair" -o /tmp/flow.npz --device "$device" --preset "$preset" \
-        --max-points 8192 --ground mask --range-m 51.2 --json &&
+        --max-points 8192 --ground mask --crop-m 51.2 --json &&
         "$from/fnsf" eval /tmp/flow.npz --truth "$pair" --json || failed=1
     done
   done
@@ -68,7 +68,7 @@ run() {
     for points in "--max-points 8192" ""; do
       # shellcheck disable=SC2086
       timeout 200 python3 "$here/peer/compare.py" "$pair" --fnsf "$from/fnsf" --device "$gpu" \
-        --ground mask --range-m 51.2 $points --seeds 0 1 2 --transforms edt || failed=1
+        --ground mask --crop-m 51.2 $points --seeds 0 1 2 --transforms edt || failed=1
     done
   else
     echo "python3 has no torch with CUDA: the peer was not run"

@@ -1,12 +1,13 @@
-//! The network's kernels as a share of the machine's own multiply-add peak, measured in turn.
+//! Throughput of the network's CPU kernels, as a share of the measured multiply-add peak.
 //!
 //! ```text
 //! cargo bench --bench kernels
 //! ```
 //!
-//! Every round measures the peak and then the kernels, so that a busy neighbour slows both; the
-//! shares are those of each round, and their median is printed. The portable kernels, which have no
-//! fused multiply-add to be measured against, are held against the fastest set's peak.
+//! Every round measures the peak and the kernels, so that other load on the machine slows both. The
+//! share is computed in each round, and the median over the rounds is printed. The portable kernels
+//! have no fused multiply-add peak of their own. They are compared with the peak of the fastest
+//! instruction set.
 #![expect(clippy::print_stdout, reason = "a benchmark prints its figures")]
 
 use std::sync::Barrier;
@@ -14,13 +15,13 @@ use std::time::Instant;
 
 use fnsf::flow::cpu::{Isa, NetworkWorkload, multiply_add_peak};
 
-/// Points of the cloud: the published sampled setting.
+/// Points of the cloud, as in the published setting with sampling.
 const POINTS: usize = 8192;
 const ROUNDS: usize = 15;
-/// Rounds of the peak loop: about as long as one pass over the points.
+/// Rounds of the peak loop. It takes about as long as one pass over the points.
 const PEAK_ROUNDS: usize = 8_000_000;
 
-/// One round on one thread, in floating-point operations a second.
+/// The results of one round on one thread, in floating-point operations per second.
 #[derive(Clone, Copy)]
 struct Round {
     peak: f64,
@@ -34,7 +35,7 @@ fn speed(work: impl FnOnce() -> f64) -> f64 {
     operations / began.elapsed().as_secs_f64()
 }
 
-/// Rounds on `threads` threads at once; each thread's own figures.
+/// Measures on `threads` threads at the same time. Returns the rounds of all threads.
 fn measure(isa: Isa, threads: usize) -> Vec<Round> {
     let start = Barrier::new(threads);
     let peak_of = match isa {

@@ -34,13 +34,7 @@ fn main() -> Result<(), String> {
         for points in [8192, 50_000, usize::MAX] {
             for preset in Preset::ALL {
                 let max_points = (points < scene.source.len()).then_some(points);
-                let problem = Problem {
-                    source: &scene.source,
-                    target: &scene.target,
-                    ground: None,
-                    before: None,
-                    around: &[],
-                };
+                let problem = Problem::pair(&scene.source, &scene.target);
                 let mut runs = Vec::new();
                 for seed in 0..SEEDS {
                     let options = Options {
@@ -60,11 +54,14 @@ fn main() -> Result<(), String> {
                     scene.name,
                     runs[0].points,
                     preset.name(),
-                    of(|e| e.iterations as f64),
-                    of(|e| e.seconds.precompute),
-                    of(|e| e.seconds.query),
-                    of(|e| e.seconds.network),
-                    of(|e| e.seconds.total)
+                    of(|e| e.fit().map_or(0.0, |fit| fit.iterations as f64)),
+                    of(|e| e.precompute_seconds),
+                    of(|e| e.fit().map_or(0.0, |fit| fit.query_seconds)),
+                    of(|e| e
+                        .fit()
+                        .map_or(e.total_seconds - e.precompute_seconds, |fit| fit
+                            .network_seconds)),
+                    of(|e| e.total_seconds)
                 );
             }
         }

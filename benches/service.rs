@@ -1,7 +1,8 @@
-//! What the service costs over the library, and what it answers by when there is little time.
+//! Overhead of the service over the library, and response times under deadlines.
 //!
-//! `cargo bench --bench service -- PAIR.npz`: a pair of 8,192 points by the library, over HTTP and
-//! over gRPC in turn, medians; then all points off the ground under deadlines, over HTTP.
+//! `cargo bench --bench service -- PAIR.npz` first solves a pair of 8,192 points by the library,
+//! over HTTP and over gRPC in turn, and prints the medians. Then it solves all points off the
+//! ground under deadlines, over HTTP.
 #![expect(
     clippy::print_stdout,
     clippy::unwrap_used,
@@ -21,7 +22,7 @@ use fnsf::formats::{CloudFormat, read_flow, read_pair, write_cloud};
 use reqwest::multipart::{Form, Part};
 use tokio_stream::StreamExt;
 
-/// The protocol's client.
+/// The generated gRPC client.
 #[expect(unreachable_pub, reason = "generated code is public to its module")]
 #[expect(
     unused_qualifications,
@@ -32,13 +33,13 @@ mod proto {
     tonic::include_proto!("client/fnsf.v1");
 }
 
-/// Points of a small pair.
+/// Points of each cloud in the overhead measurement.
 const POINTS: usize = 8192;
-/// Rounds of the overhead; library, HTTP and gRPC take turns in each.
+/// Rounds of the overhead measurement. Library, HTTP and gRPC run in turn in each round.
 const ROUNDS: usize = 25;
 /// Deadlines, milliseconds.
 const DEADLINES: [u64; 6] = [150, 200, 300, 500, 1000, 2000];
-/// Answers for each deadline.
+/// Requests per deadline.
 const ANSWERS: usize = 9;
 
 fn main() {
@@ -53,8 +54,8 @@ fn main() {
     runtime.block_on(run(&pair));
 }
 
-/// The points a little to the side, so that nobody has seen the sweep before: what is found of one
-/// is remembered.
+/// The points shifted along x by `times` millimetres, so that no round finds its sweeps in the
+/// sweep cache.
 fn elsewhere(points: &[Point], times: usize) -> Vec<Point> {
     let moved = points
         .iter()
@@ -166,13 +167,7 @@ async fn run(path: &PathBuf) {
     for round in 0..ROUNDS {
         let small = small.each_ref().map(|points| elsewhere(points, round));
         let began = Instant::now();
-        let problem = Problem {
-            source: &small[0],
-            target: &small[1],
-            ground: None,
-            before: None,
-            around: &[],
-        };
+        let problem = Problem::pair(&small[0], &small[1]);
         let flow = estimate(&backend, &problem, &options, &Uncontrolled).unwrap();
         library.push(began.elapsed().as_secs_f64());
         assert_eq!(flow.flow.len(), POINTS);

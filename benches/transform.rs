@@ -1,4 +1,4 @@
-//! The distance transform: what it costs to build, what it occupies, what a query takes.
+//! The distance transform: build time, memory and query time.
 //!
 //! ```text
 //! FNSF_REAL_DATA=... cargo bench --bench transform
@@ -15,7 +15,8 @@ use fnsf::flow::distance::{Bricks, DistanceOptions, Sites};
 
 const ROUNDS: usize = 5;
 
-/// CPU seconds of the calling thread so far; wall-clock seconds where the system does not say.
+/// CPU seconds of the calling thread so far; wall-clock seconds where the system does not report
+/// them.
 fn thread_seconds(began: Instant) -> f64 {
     let nanoseconds = std::fs::read_to_string("/proc/thread-self/schedstat")
         .ok()

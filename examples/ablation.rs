@@ -1,12 +1,12 @@
-//! The table of `docs/numerics.md`: what each choice of the `neural` preset changes, by
-//! experiment on pairs with ground truth.
+//! Ablation of the `neural` and `paper` presets on pairs with ground truth: a table of
+//! `docs/experiments/field.md`.
 //!
 //! ```text
 //! cargo run --release --example ablation -- [--seeds N] [--max-points N] [--only NAME] PAIR.npz...
 //! ```
 //!
-//! For each variant and pair, over the seeds: median EPE, the worst seed's EPE over the median,
-//! median Acc5, median EPE of moving points, median iterations and seconds.
+//! Each row is one variant on one pair, over all seeds: median EPE, the worst EPE divided by the
+//! median, median Acc5, median EPE of moving points, median iterations and seconds.
 #![expect(
     clippy::print_stdout,
     reason = "the table is the answer of this program"
@@ -21,12 +21,18 @@ use fnsf::flow::distance::{Metric, Sites};
 use fnsf::flow::evaluate::{Truth, evaluate};
 use fnsf::flow::field::Backend;
 use fnsf::flow::{
-    self, EarlyStopOptions, Ego, Ground, InputNormalization, Keep, LearningRateSchedule, Options,
-    Preset, Problem, Start,
+    self, EarlyStopOptions, Ego, FieldOptions, Ground, InputNormalization, LearningRateSchedule,
+    Options, Preset, Problem, ResultChoice, Start,
 };
 use fnsf::formats::{Pair, read_pair};
 
-/// A named change to a preset.
+fn field(options: &mut Options) -> &mut FieldOptions {
+    options
+        .field_mut()
+        .expect("the presets of this table fit a field")
+}
+
+/// A preset with a named change of its options.
 struct Variant {
     name: &'static str,
     preset: Preset,
@@ -49,7 +55,7 @@ const fn ours(name: &'static str, change: fn(&mut Options)) -> Variant {
     }
 }
 
-/// Stops only after a hundred iterations without a fall of 0.05 mm.
+/// Stops after 100 iterations without a decrease of the loss by 0.05 mm.
 const PATIENT: EarlyStopOptions = EarlyStopOptions {
     patience: 100,
     min_delta_m: 5e-5,
@@ -58,104 +64,134 @@ const PATIENT: EarlyStopOptions = EarlyStopOptions {
 const VARIANTS: &[Variant] = &[
     paper("paper", |_| {}),
     paper("paper, chamfer transform", |o| {
-        o.distance.metric = Metric::Chamfer;
+        field(o).distance.metric = Metric::Chamfer;
     }),
     paper("paper, exact points", |o| {
-        o.distance.sites = Sites::Points;
+        field(o).distance.sites = Sites::Points;
     }),
     paper("paper, patience 100, 0.05 mm, 400 iterations", |o| {
-        o.early_stop = Some(PATIENT);
-        o.max_iterations = 400;
+        field(o).early_stop = Some(PATIENT);
+        field(o).max_iterations = 400;
     }),
     paper("paper, centered inputs / 20 m", |o| {
-        o.inputs = InputNormalization::Centered { scale_m: 20.0 };
+        field(o).inputs = InputNormalization::Centered { scale_m: 20.0 };
     }),
-    paper("paper, zero start", |o| o.start = Start::ZeroFlow),
+    paper("paper, zero start", |o| {
+        field(o).start = Start::ZeroFlow;
+    }),
     paper("paper, truncation 2 m", |o| {
-        o.loss.truncation_m = Some(2.0);
+        field(o).loss.truncation_m = Some(2.0);
     }),
     paper("paper, ego motion first", |o| o.ego = Ego::Auto),
     paper("paper, ego motion first, centered, zero start", |o| {
         o.ego = Ego::Auto;
-        o.inputs = InputNormalization::Centered { scale_m: 20.0 };
-        o.start = Start::ZeroFlow;
+        field(o).inputs = InputNormalization::Centered { scale_m: 20.0 };
+        field(o).start = Start::ZeroFlow;
     }),
     paper(
         "paper, batches of 2,048, cosine, average, 150 iterations",
         |o| {
-            o.batch = Some(2048);
-            o.decay = LearningRateSchedule::Cosine;
-            o.keep = ResultChoice::Average { decay: 0.9 };
-            o.early_stop = None;
-            o.max_iterations = 150;
+            field(o).batch = Some(2048);
+            field(o).learning_rate_schedule = LearningRateSchedule::Cosine;
+            field(o).result = ResultChoice::Average { decay: 0.9 };
+            field(o).early_stop = None;
+            field(o).max_iterations = 150;
         },
     ),
     ours("neural", |_| {}),
-    ours("neural, ego motion alone", |o| o.max_iterations = 0),
+    ours("neural, ego motion alone", |o| {
+        field(o).max_iterations = 0;
+    }),
     ours("neural, no ego motion", |o| o.ego = Ego::Off),
     ours("neural, no margin", no_margin),
     ours("neural, margin 0.1 m at every range", |o| {
-        o.loss.margin_quantile = None;
+        field(o).loss.margin_quantile = None;
     }),
     ours("neural, margin from 70% of the points", |o| {
-        o.loss.margin_quantile = Some(0.7);
+        field(o).loss.margin_quantile = Some(0.7);
     }),
     ours("neural, margin from 80% of the points", |o| {
-        o.loss.margin_quantile = Some(0.8);
+        field(o).loss.margin_quantile = Some(0.8);
     }),
-    ours("neural, no flow penalty", |o| o.loss.flow_penalty = 0.0),
+    ours("neural, no flow penalty", |o| {
+        field(o).loss.flow_penalty = 0.0;
+    }),
     ours("neural, no margin, no flow penalty", |o| {
         no_margin(o);
-        o.loss.flow_penalty = 0.0;
+        field(o).loss.flow_penalty = 0.0;
     }),
-    ours("neural, flow penalty 0.01", |o| o.loss.flow_penalty = 0.01),
-    ours("neural, flow penalty 0.05", |o| o.loss.flow_penalty = 0.05),
-    ours("neural, no truncation", |o| o.loss.truncation_m = None),
+    ours("neural, flow penalty 0.01", |o| {
+        field(o).loss.flow_penalty = 0.01;
+    }),
+    ours("neural, flow penalty 0.05", |o| {
+        field(o).loss.flow_penalty = 0.05;
+    }),
+    ours("neural, no truncation", |o| {
+        field(o).loss.truncation_m = None;
+    }),
     ours("neural, truncation 0.5 m", |o| {
-        o.loss.truncation_m = Some(0.5);
+        field(o).loss.truncation_m = Some(0.5);
     }),
     ours("neural, truncation 2 m", |o| {
-        o.loss.truncation_m = Some(2.0);
+        field(o).loss.truncation_m = Some(2.0);
     }),
-    ours("neural, raw inputs", |o| o.inputs = InputNormalization::Raw),
+    ours("neural, raw inputs", |o| {
+        field(o).inputs = InputNormalization::Raw;
+    }),
     ours("neural, centered / 5 m", |o| {
-        o.inputs = InputNormalization::Centered { scale_m: 5.0 };
+        field(o).inputs = InputNormalization::Centered { scale_m: 5.0 };
     }),
     ours("neural, centered / 20 m", |o| {
-        o.inputs = InputNormalization::Centered { scale_m: 20.0 };
+        field(o).inputs = InputNormalization::Centered { scale_m: 20.0 };
     }),
     ours("neural, centered / 50 m", |o| {
-        o.inputs = InputNormalization::Centered { scale_m: 50.0 };
+        field(o).inputs = InputNormalization::Centered { scale_m: 50.0 };
     }),
-    ours("neural, Xavier start", |o| o.start = Start::Xavier),
+    ours("neural, Xavier start", |o| {
+        field(o).start = Start::Xavier;
+    }),
     ours("neural, exact points", |o| {
-        o.distance.sites = Sites::Points;
+        field(o).distance.sites = Sites::Points;
     }),
-    ours("neural, step size 0.008", |o| o.learning_rate = 0.008),
+    ours("neural, step size 0.008", |o| {
+        field(o).learning_rate = 0.008;
+    }),
     ours("neural, constant step size", |o| {
-        o.decay = LearningRateSchedule::Constant
+        field(o).learning_rate_schedule = LearningRateSchedule::Constant;
     }),
     ours("neural, best batch instead of average", |o| {
-        o.keep = ResultChoice::Best;
+        field(o).result = ResultChoice::Best;
     }),
-    ours("neural, batches of 1,024", |o| o.batch = Some(1024)),
-    ours("neural, batches of 4,096", |o| o.batch = Some(4096)),
-    ours("neural, all points each iteration", |o| o.batch = None),
-    ours("neural, 75 iterations", |o| o.max_iterations = 75),
-    ours("neural, 300 iterations", |o| o.max_iterations = 300),
-    ours("neural, 600 iterations", |o| o.max_iterations = 600),
+    ours("neural, batches of 1,024", |o| {
+        field(o).batch = Some(1024);
+    }),
+    ours("neural, batches of 4,096", |o| {
+        field(o).batch = Some(4096);
+    }),
+    ours("neural, all points each iteration", |o| {
+        field(o).batch = None;
+    }),
+    ours("neural, 75 iterations", |o| {
+        field(o).max_iterations = 75;
+    }),
+    ours("neural, 300 iterations", |o| {
+        field(o).max_iterations = 300;
+    }),
+    ours("neural, 600 iterations", |o| {
+        field(o).max_iterations = 600;
+    }),
     ours("neural, 1,024 a batch, 300 iterations", |o| {
-        o.batch = Some(1024);
-        o.max_iterations = 300;
+        field(o).batch = Some(1024);
+        field(o).max_iterations = 300;
     }),
 ];
 
 fn no_margin(options: &mut Options) {
-    options.loss.margin_m = 0.0;
-    options.loss.margin_quantile = None;
+    options.field_mut().expect("a field").loss.margin_m = 0.0;
+    options.field_mut().expect("a field").loss.margin_quantile = None;
 }
 
-/// One seed's result.
+/// The result of one seed.
 struct Run {
     epe: f64,
     acc5: f64,
@@ -171,7 +207,7 @@ fn run(backend: &CpuBackend, pair: &Pair, options: &Options) -> Result<Run, Stri
         target: &pair.target,
         ground: ground.map(|g| [g.source.as_slice(), g.target.as_slice()]),
         before: None,
-        around: &[],
+        neighbors: &[],
     };
     let clock = Clock::start();
     backend.host().forget();
@@ -187,12 +223,12 @@ fn run(backend: &CpuBackend, pair: &Pair, options: &Options) -> Result<Run, Stri
         epe: metrics.epe,
         acc5: metrics.acc5,
         moving: metrics.epe_dynamic.unwrap_or(f64::NAN),
-        iterations: estimate.iterations as f64,
-        seconds: estimate.seconds.total,
+        iterations: estimate.fit().expect("a fit").iterations as f64,
+        seconds: estimate.total_seconds,
     })
 }
 
-/// The middle of the values, and the largest.
+/// The upper median of the values, and the largest.
 fn median_and_worst(runs: &[Run], value: fn(&Run) -> f64) -> [f64; 2] {
     let mut values: Vec<f64> = runs.iter().map(value).collect();
     values.sort_by(f64::total_cmp);

@@ -1,12 +1,14 @@
-//! Confidence: fits its weights, and shows how far they can be believed.
+//! Fits the logistic regression of the confidence, and evaluates its calibration.
 //!
 //! ```text
 //! FNSF_REAL_DATA=... cargo run --release --example confidence -- [DIAGRAM.svg]
 //! ```
 //!
-//! Fitted to streets 0 to 11 of 64 and of 32 beams and to the labelled pairs below `FNSF_REAL_DATA`,
-//! where it is set; judged on streets 100 to 109 and 400 to 409 too, which nothing was fitted to, and on each labelled pair by weights that
-//! were fitted without it. Points off the ground by the pairs' own masks, the ego motion estimated.
+//! The training data are streets 0 to 11 with 64 and with 32 beams, and the labelled pairs in
+//! `FNSF_REAL_DATA` if it is set. The evaluation also uses streets 100 to 109 and 400 to 409, which
+//! are not in the training data. Each labelled pair is also evaluated with weights that were fitted
+//! without it. Ground points are taken from the masks of the pairs, and the ego motion is
+//! estimated.
 #![expect(
     clippy::print_stdout,
     reason = "the tables are the answer of this program"
@@ -20,28 +22,29 @@ use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Calibration, Reliability};
 use fnsf::flow::field::Backend;
 use fnsf::flow::{
-    ConfidenceFeatures, ObjectOptions, Point, RigidTransform, SURE_M, SearchClouds, Uncontrolled,
+    CONFIDENT_WITHIN_M, ConfidenceFeatures, ObjectOptions, Point, RigidTransform, SearchClouds,
+    Uncontrolled,
 };
 use known::{Known, PAIRS, real_pairs, street};
 use nalgebra::{DMatrix, DVector, Point3};
 
 const BEAMS: [usize; 2] = [64, 32];
-/// Streets that it is fitted to, of each number of beams.
+/// Number of training streets per number of beams.
 const STREETS: u64 = 12;
 
-/// A point of a pair, and how far off its motion is.
+/// The features of a point, and the end-point error of its flow.
 struct Judged {
     kind: usize,
     features: Vec<f64>,
     error_m: f64,
 }
 
-/// What moves, what stands, ground.
+/// The classes, each with separate weights: moving points, static points, ground points.
 const KINDS: [&str; 3] = ["MOVING", "STANDING", "GROUND"];
 
 struct Scene {
     name: String,
-    /// What it counts in a fit.
+    /// Weight of the scene in a fit.
     weight: f64,
     points: Vec<Judged>,
 }
@@ -51,7 +54,8 @@ fn moved(motion: &RigidTransform, point: Point) -> Point {
     moved.map(|c| c as f32).into()
 }
 
-/// A pair's points by what is found of them; `weight` is what it counts in a fit.
+/// Estimates a pair and collects the features and errors of its points. `weight` is the weight of
+/// the scene in a fit.
 fn judged(backend: &dyn Backend, known: Known, weight: f64) -> Scene {
     let ego = backend.host().align(
         &known.source,
@@ -76,7 +80,7 @@ fn judged(backend: &dyn Backend, known: Known, weight: f64) -> Scene {
     let clouds = SearchClouds {
         source: &aligned,
         target: &target,
-        around: &[],
+        neighbors: &[],
         sweeps: [&known.source, &known.target],
         target_from_source: ego,
     };
@@ -121,8 +125,9 @@ fn judged(backend: &dyn Backend, known: Known, weight: f64) -> Scene {
     }
 }
 
-/// Newton's method on the penalized likelihood. The points of a scene count alike, all streets together
-/// as much as three labelled pairs.
+/// Fits the weights of one class by Newton's method on the penalized likelihood. The points of a
+/// scene share its weight equally. All training streets together weigh as much as three labelled
+/// pairs.
 fn fitted(scenes: &[&Scene], kind: usize) -> Vec<f64> {
     const PENALTY: f64 = 1e-3;
     const STEPS: usize = 30;
@@ -141,7 +146,7 @@ fn fitted(scenes: &[&Scene], kind: usize) -> Vec<f64> {
             for point in of_kind() {
                 let features = DVector::from_column_slice(&point.features);
                 let chance = 1.0 / (1.0 + (-weights.dot(&features)).exp());
-                let right = f64::from(u8::from(point.error_m < f64::from(SURE_M)));
+                let right = f64::from(u8::from(point.error_m < f64::from(CONFIDENT_WITHIN_M)));
                 gradient.axpy(share * (right - chance), &features, 1.0);
                 normal.ger(share * chance * (1.0 - chance), &features, &features, 1.0);
             }
@@ -163,10 +168,11 @@ fn confidence(weights: &[Vec<f64>], point: &Judged) -> f64 {
     1.0 / (1.0 + (-sum).exp())
 }
 
-/// What was said of some scenes' points off the ground, and what was right.
+/// The calibration of the confidence on the points off the ground of some scenes.
 struct Told {
     calibration: Calibration,
-    /// EPE of the half with the least errors over that of the rest, which no confidence can beat.
+    /// EPE of the half of the points with the smallest errors, divided by that of the other half.
+    /// It is the lower bound of this ratio for any confidence.
     best: f64,
 }
 
@@ -207,7 +213,8 @@ impl Told {
     }
 }
 
-/// Reliability diagrams side by side: what was said along, what was right up, areas by points.
+/// Reliability diagrams side by side: confidence on the x axis, the share of correct points on the
+/// y axis. The area of a circle grows with the number of points in its bin.
 fn diagram(shown: &[(String, Told)]) -> String {
     const SIDE: f64 = 240.0;
     const MARGIN: f64 = 46.0;

@@ -1,12 +1,12 @@
-//! How well a sequence's sweeps fall together in one frame: the tables of `docs/numerics.md`.
+//! Accuracy of densification: the tables of `docs/experiments/densify.md`.
 //!
 //! ```text
 //! [FNSF_PRESET=label] cargo run --release --example densify [-- SWEEP...]
 //! ```
 //!
-//! On simulated streets: how far points are from their exact place, by their age, against what the
-//! ego motion alone leaves. On the sweeps that are named: how far points of other sweeps are from the
-//! surfaces of the middle one.
+//! On simulated streets: the error of the moved points by age, compared with that of the ego motion
+//! alone. On the given sweeps: the distance of the points of other sweeps to the surfaces of the
+//! middle sweep.
 #![expect(
     clippy::print_stdout,
     reason = "the tables are the answer of this program"
@@ -24,28 +24,28 @@ use fnsf::flow::depth::{Occlusion, project};
 use fnsf::flow::distance::{DistanceOptions, Sites};
 use fnsf::flow::field::Backend;
 use fnsf::flow::ground::{GroundOptions, segment};
-use fnsf::flow::simulate::{Frame, Street, StreetOptions};
+use fnsf::flow::simulate::{Street, StreetOptions, StreetSweep};
 use fnsf::flow::{DenseCloud, MotionField, Point, Preset, Residual, Sequence, Sweep, Uncontrolled};
 use fnsf::formats::read_cloud;
 use look::camera;
 
-/// Sweeps of a simulated drive, and the one that all are carried into.
+/// Number of sweeps of a simulated drive, and the index of the reference sweep.
 const FRAMES: usize = 11;
 const INTO: usize = 5;
 
-/// Simulated drives.
+/// Number of simulated drives.
 const STREETS: u64 = 4;
 
 type Fields = BTreeMap<FlowEdge, MotionField>;
 
-/// The preset that the environment names; `label` where it names none.
+/// The preset named by `FNSF_PRESET`; `label` by default.
 fn preset() -> anyhow::Result<Preset> {
     let name = std::env::var("FNSF_PRESET").unwrap_or_else(|_| "label".to_owned());
     let found = Preset::ALL.into_iter().find(|preset| preset.name() == name);
     found.ok_or_else(|| anyhow::anyhow!("no preset {name}"))
 }
 
-/// Fits all legs of the plans, each chain from its beginning.
+/// Estimates the motion fields of all edges of the plans, each chain in its order.
 fn fit(backend: &CpuBackend, sweeps: &[Sweep], plans: &[Plan]) -> anyhow::Result<Fields> {
     let options = preset()?.options(None);
     let mut fields = Fields::new();
@@ -63,7 +63,7 @@ fn fit(backend: &CpuBackend, sweeps: &[Sweep], plans: &[Plan]) -> anyhow::Result
             edges.push(edge);
         }
         found.extend(sequence.finish(backend, &Uncontrolled)?);
-        let found = found.into_iter().map(|estimate| estimate.field);
+        let found = found.into_iter().map(|estimate| estimate.motion);
         fields.extend(edges.into_iter().zip(found));
     }
     Ok(fields)
@@ -84,7 +84,7 @@ fn carried(
     )?)
 }
 
-/// The same fields without what moves against the static world.
+/// The same motion fields without their residual motion.
 fn still(fields: &Fields) -> Fields {
     let still = |field: &MotionField| MotionField {
         ego: field.ego,
@@ -111,7 +111,8 @@ fn mean(values: impl Iterator<Item = f64>) -> f64 {
     sum / count
 }
 
-/// One row for each age: mean error of movers and of the rest, metres.
+/// Adds one row per age: mean error of the moving points and of the static points, metres. Each for
+/// the ego motion alone, the reverse fields and the inverse fields.
 fn simulated(
     backend: &CpuBackend,
     seed: u64,
@@ -120,14 +121,14 @@ fn simulated(
 ) -> anyhow::Result<()> {
     let street = Street::new(&StreetOptions {
         seed,
-        frames: FRAMES,
+        sweeps: FRAMES,
         ..StreetOptions::default()
     })?;
-    let frames = (0..FRAMES).map(|k| street.frame(k));
-    let frames: Vec<Frame> = frames.collect::<Result<_, _>>()?;
-    let sweeps: Vec<Sweep> = frames
+    let scanned = (0..FRAMES).map(|k| street.sweep(k));
+    let scanned: Vec<StreetSweep> = scanned.collect::<Result<_, _>>()?;
+    let sweeps: Vec<Sweep> = scanned
         .iter()
-        .map(|frame| ground_found(frame.points.clone()))
+        .map(|sweep| ground_found(sweep.points.clone()))
         .collect();
     let reverse = Plan::new(FRAMES, INTO as f64, LaterSweeps::Reverse, 1)?;
     let inverse = Plan::new(FRAMES, INTO as f64, LaterSweeps::Inverse, 1)?;
@@ -138,7 +139,7 @@ fn simulated(
         carried(backend, &sweeps, &fields, &inverse)?,
     ];
     let mut first = 0;
-    for frame in &frames {
+    for frame in &scanned {
         let count = frame.points.len();
         let age = INTO as f64 - frame.index as f64;
         let to_into = street.flow_to(frame, INTO as f64);
@@ -179,7 +180,7 @@ fn simulated(
     let own = project(&sweeps[INTO].points, &camera);
     let seen = [&clouds[0], &clouds[1]].map(|cloud| project(&cloud.points, &camera));
     for (sum, image) in depths.iter_mut().zip([&own, &seen[0], &seen[1]]) {
-        let image = image.without_hidden(&Occlusion::of(&camera));
+        let image = image.without_occluded(&Occlusion::of(&camera));
         let errors = image.errors(&truth)?;
         let row = [
             image.density(),
@@ -194,12 +195,12 @@ fn simulated(
     Ok(())
 }
 
-/// Where the points of a sweep begin in a cloud.
+/// The first row of a sweep's points in a dense cloud.
 fn first_of(cloud: &DenseCloud, frame: usize) -> Option<usize> {
-    cloud.frame.iter().position(|&f| f as usize == frame)
+    cloud.sweep.iter().position(|&f| f as usize == frame)
 }
 
-/// How far points of each age are from the surfaces of the middle sweep.
+/// Prints the distance of the points of each age to the surfaces of the middle sweep.
 fn real(backend: &CpuBackend, paths: &[String]) -> anyhow::Result<()> {
     let read = |path: &String| anyhow::Ok(read_cloud(&std::fs::read(path)?, Some(path))?.points);
     let sweeps = paths.iter().map(|path| read(path).map(ground_found));
@@ -232,7 +233,7 @@ fn real(backend: &CpuBackend, paths: &[String]) -> anyhow::Result<()> {
     println!("|---|---|---|---|---|---|");
     let rows = |moving: bool, of: &dyn Fn(usize) -> bool| -> Vec<usize> {
         (0..cloud.points.len())
-            .filter(|&row| cloud.dynamic[row] == moving && of(cloud.frame[row] as usize))
+            .filter(|&row| cloud.dynamic[row] == moving && of(cloud.sweep[row] as usize))
             .collect()
     };
     let print = |name: String, of: &dyn Fn(usize) -> bool| {

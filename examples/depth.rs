@@ -1,7 +1,8 @@
-//! Depth of a simulated street from one sweep and from many, as rows for `docs/numerics.md`.
+//! Depth of a simulated street from one sweep and from several: rows of `docs/experiments/densify.md`.
 //!
-//! Static points of other sweeps are carried by the true poses: what is measured is the projection
-//! and its filter, not the flow. With an argument, the picture goes to that file.
+//! Static points of other sweeps are transformed by the true poses. The result therefore measures
+//! the projection and its occlusion filter, and not the flow. With an argument, a picture is
+//! written to that file.
 #![expect(clippy::print_stdout, reason = "the table is the program's purpose")]
 
 #[path = "common/camera.rs"]
@@ -16,7 +17,7 @@ use nalgebra::Point3;
 
 const SWEEPS: [usize; 4] = [1, 3, 10, 20];
 const SEEDS: u64 = 4;
-/// Of these a picture is drawn.
+/// Number of sweeps that the picture shows.
 const SHOWN: usize = 10;
 
 fn main() -> anyhow::Result<()> {
@@ -30,15 +31,16 @@ fn main() -> anyhow::Result<()> {
             for seed in 0..SEEDS {
                 let street = Street::new(&StreetOptions {
                     seed,
-                    // One more, so that all that is carried is known to stand still.
-                    frames: sweeps + 1,
+                    // One sweep more than is used, so that every used sweep has a pair with dynamic
+                    // flags.
+                    sweeps: sweeps + 1,
                     ..StreetOptions::default()
                 })?;
                 let into = sweeps / 2;
                 let truth = street.depth(into, &camera)?;
                 let mut image = project(&static_world(&street, into)?, &camera);
                 if filtered {
-                    image = image.without_hidden(&Occlusion::of(&camera));
+                    image = image.without_occluded(&Occlusion::of(&camera));
                 }
                 let errors = image.errors(&truth)?;
                 let row = [
@@ -51,7 +53,7 @@ fn main() -> anyhow::Result<()> {
                     *sum += value / SEEDS as f64;
                 }
                 if seed == 0 && sweeps == SHOWN && filtered {
-                    let one = project(&street.frame(into)?.points, &camera);
+                    let one = project(&street.sweep(into)?.points, &camera);
                     let all = project(&static_world(&street, into)?, &camera);
                     pictures = vec![one, all, image, truth];
                 }
@@ -74,12 +76,12 @@ fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// One sweep, and of all others the points of what stands still, in its frame.
+/// All points of one sweep, and the static points of all others, in the frame of that sweep.
 fn static_world(street: &Street, into: usize) -> anyhow::Result<Vec<Point>> {
-    let target = street.frame(into)?;
+    let target = street.sweep(into)?;
     let mut points = Vec::new();
-    for index in 0..street.frames() - 1 {
-        let frame = street.frame(index)?;
+    for index in 0..street.sweeps() - 1 {
+        let frame = street.sweep(index)?;
         let motion = target.world_from_sensor.inv_mul(&frame.world_from_sensor);
         let dynamic = street.pair(index)?.dynamic;
         for (point, dynamic) in frame.points.iter().zip(dynamic) {

@@ -1,6 +1,6 @@
-//! How far off the ego motion is, on real and simulated pairs, as rows for `docs/numerics.md`.
+//! Accuracy of the ego motion on real and simulated pairs: rows of `docs/experiments/registration.md`.
 //!
-//! Run with `FNSF_REAL_DATA` naming the folder of real pairs; without it only streets are tried.
+//! `FNSF_REAL_DATA` names the folder of the real pairs. Without it only simulated streets are used.
 #![expect(clippy::print_stdout, reason = "the table is the program's purpose")]
 
 use std::path::PathBuf;
@@ -13,13 +13,13 @@ use fnsf::flow::{Point, RigidTransform, Uncontrolled};
 use fnsf::formats::read_pair;
 use nalgebra::{Isometry3, Point3, Vector3};
 
-/// Shifts and turns of both clouds together, which move every voxel's border: the thinning differs
-/// and the truth stays.
+/// Number of shifts and rotations applied to both clouds together. They move the voxel borders, so
+/// that the voxel downsampling differs and the true motion does not.
 const OFFSETS: usize = 8;
-/// Seeds of each kind of street.
+/// Number of seeds of each kind of street.
 const SEEDS: u64 = 12;
 
-/// Two clouds and the motion between them.
+/// Two clouds and the true motion between them.
 struct Case {
     source: Vec<Point>,
     target: Vec<Point>,
@@ -35,7 +35,7 @@ impl Case {
         }
     }
 
-    /// In a frame that is moved against the sensor's.
+    /// The case in a frame that is shifted and rotated against the sensor's.
     fn seen_from(&self, offset: usize) -> Self {
         let shift = Vector3::new(0.11, 0.07, 0.05) * offset as f64;
         let frame = Isometry3::new(shift, Vector3::new(0.0, 0.0, 0.1 * offset as f64));
@@ -46,8 +46,8 @@ impl Case {
         }
     }
 
-    /// In every frame.
-    fn frames(&self) -> Vec<Self> {
+    /// The case in every shifted and rotated frame.
+    fn sweeps(&self) -> Vec<Self> {
         (0..OFFSETS).map(|i| self.seen_from(i)).collect()
     }
 
@@ -79,9 +79,9 @@ fn main() -> anyhow::Result<()> {
             };
             let off = all.without([&ground.source, &ground.target]);
             for (what, case) in [("", all), (", no ground", off)] {
-                row(&format!("{name}{what}"), &backend, &case.frames());
+                row(&format!("{name}{what}"), &backend, &case.sweeps());
                 let back = case.backward();
-                row(&format!("{name}{what}, back"), &backend, &back.frames());
+                row(&format!("{name}{what}, back"), &backend, &back.sweeps());
             }
         }
     }
@@ -120,7 +120,7 @@ fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The source turned, so that the yaw between the clouds is 5 degrees.
+/// The source rotated so that the yaw between the clouds is 5 degrees.
 fn five_degrees(case: &Case) -> Case {
     let own = case.truth.rotation.scaled_axis().z;
     let missing = 5_f64.to_radians() * own.signum() - own;
@@ -139,8 +139,8 @@ fn moved(points: &[Point], motion: &RigidTransform) -> Vec<Point> {
     moved.map(|p| p.map(|c| c as f32).into()).collect()
 }
 
-/// One row: of several cases the middle error and the largest; the shortest time, since the
-/// machine may be shared.
+/// Prints one row: the median and the largest error over the cases, and the shortest time. Other
+/// load on the machine affects the shortest time least.
 fn row(name: &str, backend: &CpuBackend, cases: &[Case]) {
     let mut meters = Vec::new();
     let mut degrees = Vec::new();

@@ -1,6 +1,6 @@
-//! The ground of real and simulated sweeps against their labels, as rows for `docs/numerics.md`.
+//! Accuracy of the ground segmentation on real and simulated sweeps: rows of `docs/experiments/ground.md`.
 //!
-//! Run with `FNSF_REAL_DATA` naming the folder of real pairs; without it only streets are tried.
+//! `FNSF_REAL_DATA` names the folder of the real pairs. Without it only simulated streets are used.
 #![expect(clippy::print_stdout, reason = "the table is the program's purpose")]
 
 use std::path::PathBuf;
@@ -11,7 +11,7 @@ use fnsf::flow::ground::{GroundOptions, segment};
 use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::formats::read_pair;
 
-/// Runs per sweep; the fastest counts, since the machine may be shared.
+/// Runs per sweep. The fastest one is reported, because the machine may have other load.
 const RUNS: usize = 7;
 
 type Sweep = (Vec<Point>, Vec<bool>);
@@ -36,7 +36,7 @@ fn main() -> anyhow::Result<()> {
                 azimuth_steps,
                 ..StreetOptions::default()
             })?
-            .frame(0)?;
+            .sweep(0)?;
             anyhow::Ok((frame.points, frame.ground))
         };
         let sweeps = (0..6).map(street).collect::<Result<Vec<_>, _>>()?;
@@ -45,7 +45,7 @@ fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// One row: of several sweeps the worst figures.
+/// Prints one row: the worst figures over the sweeps.
 fn row(name: &str, sweeps: &[Sweep]) {
     let options = GroundOptions::default();
     let mut worst = [[f64::INFINITY; 2]; 2];

@@ -1,13 +1,14 @@
-//! The table of `docs/numerics.md` on movers: presets, and what each piece of `label` changes, on
-//! labelled pairs and on simulated streets.
+//! Ablation of the object search on labelled pairs and simulated streets, next to the other
+//! presets: a table of `docs/experiments/objects.md`.
 //!
 //! ```text
 //! FNSF_REAL_DATA=... cargo run --release --example label -- [--only NAME] [--seeds N]
 //! ```
 //!
-//! Points off the ground by the pairs' own masks, the ego motion estimated. `av2_7fab`, `kitti_0000` and `small_gicp`
-//! below `FNSF_REAL_DATA`, where it is set, then the mean of ten streets of 64 and of 32 beams. Where
-//! a preset draws anything: the median over the seeds.
+//! Ground points are taken from the masks of the pairs, and the ego motion is estimated. The rows
+//! are `av2_7fab`, `kitti_0000` and `small_gicp` in the folder `FNSF_REAL_DATA` if it is set, then
+//! the means of ten streets of 64 and of 32 beams. Presets that depend on the seed report the
+//! median over the seeds.
 #![expect(
     clippy::print_stdout,
     reason = "the table is the answer of this program"
@@ -25,18 +26,18 @@ use fnsf::flow::field::Backend;
 use fnsf::flow::{self, Ground, ObjectOptions, Options, Preset, Problem};
 use known::{Known, real_pairs, street};
 
-/// Streets by their number of beams, and how many of each.
+/// Numbers of beams, and the number of streets of each.
 const BEAMS: [usize; 2] = [64, 32];
 const STREETS: u64 = 10;
 
-/// A preset with a change.
+/// A preset with a named change of its options.
 struct Variant {
     name: &'static str,
     preset: Preset,
     change: fn(&mut ObjectOptions),
 }
 
-const fn find_objects(name: &'static str, change: fn(&mut ObjectOptions)) -> Variant {
+const fn label(name: &'static str, change: fn(&mut ObjectOptions)) -> Variant {
     Variant {
         name,
         preset: Preset::Label,
@@ -56,18 +57,18 @@ const VARIANTS: &[Variant] = &[
     preset("paper", Preset::Paper),
     preset("neural", Preset::Neural),
     preset("label", Preset::Label),
-    // More than any cluster has.
+    // More evidence than any cluster has.
     label("ego motion alone", |o| o.min_evidence_m = f32::INFINITY),
     label("no starts but none", |o| o.initial_guesses = 0),
     label("starts whatever none leaves", |o| o.close_fit_m = 0.0),
     label("starts compared without the way", |o| {
-        o.displacement_penalty = 0.0
+        o.displacement_penalty = 0.0;
     }),
     label("distances to points, no normals", |o| o.normal_m = [0.0; 2]),
     label("distances to planes alone", |o| o.tangential_weight = 0.0),
     label("heights count in full", |o| o.height_weight = 1.0),
     label("nothing is taken by what stands still", |o| {
-        o.static_match_m = 0.0
+        o.static_match_m = 0.0;
     }),
     label("no evidence asked for", |o| {
         o.min_evidence_m = 0.0;
@@ -81,14 +82,14 @@ const VARIANTS: &[Variant] = &[
         o.min_free_space = f32::INFINITY;
     }),
     label("what is seen to have stayed may move", |o| {
-        o.min_free_space_far = 0.0
+        o.min_free_space_far = 0.0;
     }),
     label("walls may slide", |o| o.min_observability = 0.0),
     label("moved clusters may lie anywhere", |o| {
         o.max_residual_m = f32::INFINITY;
     }),
     label("any part of the cost may be left", |o| {
-        o.max_cost_ratio = 1.0
+        o.max_cost_ratio = 1.0;
     }),
     label("flat clusters may move", |o| o.ground_thickness_m = 0.0),
     label("no gate at all", |o| {
@@ -110,8 +111,8 @@ const VARIANTS: &[Variant] = &[
     label("matches within 1 m", |o| o.match_m = 1.0),
 ];
 
-/// EPE, that of movers, that of what stands still, three-way EPE where all movers are foreground,
-/// seconds.
+/// EPE of all points, of the moving points, of the static points, and three-way EPE of the dynamic
+/// foreground where all moving points count as foreground, metres; then seconds.
 type Row = [f64; 5];
 
 fn run(backend: &CpuBackend, pair: &Known, options: &Options) -> Result<Row, String> {
@@ -120,7 +121,7 @@ fn run(backend: &CpuBackend, pair: &Known, options: &Options) -> Result<Row, Str
         target: &pair.target,
         ground: Some([&pair.ground[0], &pair.ground[1]]),
         before: None,
-        around: &[],
+        neighbors: &[],
     };
     let clock = Clock::start();
     backend.host().forget();
@@ -146,11 +147,11 @@ fn run(backend: &CpuBackend, pair: &Known, options: &Options) -> Result<Row, Str
         metrics.epe_dynamic.unwrap_or(f64::NAN),
         metrics.epe_static.unwrap_or(f64::NAN),
         close(|three_way| three_way.foreground_dynamic.epe),
-        estimate.seconds.total,
+        estimate.total_seconds,
     ])
 }
 
-/// The middle of each column.
+/// The upper median of each column.
 fn median(rows: &[Row]) -> Row {
     core::array::from_fn(|column| {
         let mut values: Vec<f64> = rows.iter().map(|row| row[column]).collect();
@@ -195,10 +196,10 @@ fn main() -> Result<(), String> {
         }
         let mut options = variant.preset.options(None);
         options.ground = Ground::Mask;
-        if let Some(label) = &mut options.label {
-            (variant.change)(label);
+        if let Some(objects) = options.objects_mut() {
+            (variant.change)(objects);
         }
-        let draws = if options.label.is_some() { 1 } else { seeds };
+        let draws = if options.field().is_some() { seeds } else { 1 };
         for (name, group) in &groups {
             let mut rows = Vec::new();
             for pair in group {

@@ -1,11 +1,12 @@
-//! What a sequence's pairs cost, and how good they are, against the same pairs alone: rows for
-//! `docs/numerics.md`.
+//! Cost and accuracy of the warm-started pairs of a sequence, compared with the same pairs alone:
+//! rows of `docs/experiments/sequences.md`.
 //!
 //! ```text
 //! cargo run --release --example sequence [-- SWEEP...]
 //! ```
 //!
-//! Simulated streets with exact truth and, where sweeps are named, what is left of their distances.
+//! Simulated streets have exact ground truth. For the given sweeps, if any, the remaining loss is
+//! reported.
 #![expect(
     clippy::print_stdout,
     reason = "the table is the answer of this program"
@@ -21,10 +22,10 @@ use fnsf::flow::{
 };
 use fnsf::formats::read_cloud;
 
-/// Sweeps of a simulated drive.
+/// Number of sweeps of a simulated drive.
 const FRAMES: usize = 8;
 
-/// A drive, and for each pair the true flow and which points move, where they are known.
+/// A drive, and for each pair the true flow, dynamic flags and ground flags, if known.
 struct Drive {
     name: String,
     sweeps: Vec<Vec<Point>>,
@@ -37,7 +38,8 @@ struct Truth {
     ground: Vec<bool>,
 }
 
-/// What a drive's pairs come to: mean EPE off the ground, of movers and of the rest, seconds a pair.
+/// Sums over the pairs of a drive. Errors are end-point errors off the ground in metres: of all
+/// points, the moving points and the static points.
 #[derive(Default)]
 struct Sums {
     errors: [f64; 3],
@@ -52,8 +54,8 @@ impl Sums {
     fn add(&mut self, estimate: &Estimate, truth: Option<&Truth>, seconds: f64) {
         self.pairs += 1;
         self.seconds += seconds;
-        self.iterations += estimate.iterations;
-        self.loss += estimate.best_loss;
+        self.iterations += estimate.fit().expect("a fit").iterations;
+        self.loss += estimate.fit().expect("a fit").best_loss;
         let Some(truth) = truth else { return };
         for (row, flow) in estimate.flow.iter().enumerate() {
             if truth.ground[row] || !estimate.valid[row] {
@@ -85,11 +87,11 @@ impl Sums {
 fn simulated(seed: u64) -> anyhow::Result<Drive> {
     let street = Street::new(&StreetOptions {
         seed,
-        frames: FRAMES,
+        sweeps: FRAMES,
         ..StreetOptions::default()
     })?;
-    let frames = (0..FRAMES).map(|k| street.frame(k));
-    let frames = frames.collect::<Result<Vec<_>, _>>()?;
+    let sweeps = (0..FRAMES).map(|k| street.sweep(k));
+    let sweeps = sweeps.collect::<Result<Vec<_>, _>>()?;
     let truth = (0..FRAMES - 1).map(|k| {
         let pair = street.pair(k)?;
         anyhow::Ok(Truth {
@@ -101,25 +103,19 @@ fn simulated(seed: u64) -> anyhow::Result<Drive> {
     Ok(Drive {
         name: format!("street {seed}"),
         truth: truth.collect::<Result<_, _>>()?,
-        sweeps: frames.into_iter().map(|frame| frame.points).collect(),
+        sweeps: sweeps.into_iter().map(|frame| frame.points).collect(),
     })
 }
 
 fn alone(backend: &CpuBackend, drive: &Drive, options: &Options) -> anyhow::Result<Sums> {
     let mut sums = Sums::default();
     for (k, pair) in drive.sweeps.windows(2).enumerate() {
-        let problem = Problem {
-            source: &pair[0],
-            target: &pair[1],
-            ground: None,
-            before: None,
-            around: &[],
-        };
+        let problem = Problem::pair(&pair[0], &pair[1]);
         backend.host().forget();
         let began = Instant::now();
         let estimate = estimate(backend, &problem, options, &Uncontrolled)?;
         let seconds = began.elapsed().as_secs_f64();
-        // The first pair of a sequence is one alone: the others are compared.
+        // The first pair of a sequence has no warm start, so only the others are compared.
         if k > 0 {
             sums.add(&estimate, drive.truth.get(k), seconds);
         }
@@ -174,7 +170,7 @@ fn main() -> anyhow::Result<()> {
             (150, 0.004),
         ] {
             let mut options = options.clone();
-            options.warm_start = Some(WarmStart {
+            options.field_mut().expect("a field").warm_start = Some(WarmStart {
                 max_iterations,
                 learning_rate,
             });

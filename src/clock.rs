@@ -1,37 +1,37 @@
-//! Wall-clock moments, as they are kept and shown. It must not know what happens at them.
+//! Wall-clock time stamps for storage and display.
 
 use std::fmt;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde::{Serialize, Serializer};
 
-/// Milliseconds since 1970-01-01 UTC; shown as RFC 3339.
+/// Milliseconds since 1970-01-01 UTC, displayed as RFC 3339.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Timestamp(i64);
 
 impl Timestamp {
-    /// This moment.
+    /// The current time.
     pub fn now() -> Self {
         let since = SystemTime::now().duration_since(UNIX_EPOCH);
         Self(since.map_or(0, millis))
     }
 
-    /// From milliseconds since 1970.
+    /// From milliseconds since 1970-01-01 UTC.
     pub fn from_millis(millis: i64) -> Self {
         Self(millis)
     }
 
-    /// Milliseconds since 1970.
+    /// Milliseconds since 1970-01-01 UTC.
     pub fn as_millis(self) -> i64 {
         self.0
     }
 
-    /// The moment `duration` later.
+    /// The time `duration` later.
     pub fn after(self, duration: Duration) -> Self {
         Self(self.0.saturating_add(millis(duration)))
     }
 
-    /// What lies between this moment and a later one; zero where the other is earlier.
+    /// Duration from this time to a later one; zero if `later` is earlier.
     pub fn until(self, later: Self) -> Duration {
         Duration::from_millis(u64::try_from(later.0 - self.0).unwrap_or(0))
     }

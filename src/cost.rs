@@ -1,42 +1,45 @@
-//! What work costs: nominal seconds from its price, real seconds from what was measured.
+//! Cost model of jobs: nominal seconds predicted from the amount of work, and learned factors to
+//! real seconds.
 //!
-//! Nominal seconds are kept with a job and never change; one learned factor for each kind of device
-//! turns them into this machine's. It must not know jobs.
+//! Nominal seconds are stored with a job and never change. One learned factor per kind of device
+//! converts them to real seconds on this machine. Independent of jobs.
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::Mutex;
 
 use crate::flow::Cost;
 use crate::flow::field::PARAMETERS;
 use crate::job::DeviceKind;
+use crate::sync::locked;
 
-/// Multiply-adds of a nominal second: two cores with wide vector units.
+/// Multiply-adds per nominal second: about two cores with wide vector units.
 const NOMINAL_RATE: f64 = 2e11;
 
-/// Nominal seconds of any job, however small: it is written, leased, read and committed.
+/// Nominal seconds of overhead per job: it is written, leased, read and committed.
 const EACH: f64 = 0.005;
 
-/// Weight of a new measurement of a job of [`WHOLE`] nominal seconds or more; a smaller one has less,
-/// so that what is learned is learned of work and not of jobs.
+/// Weight of a measurement of a job of at least [`WHOLE`] nominal seconds. Smaller jobs weigh
+/// proportionally less, because their overhead dominates.
 const FRESH: f64 = 0.1;
+/// Nominal seconds from which a measurement has its full weight.
 const WHOLE: f64 = 0.1;
 
-/// A job of fewer nominal seconds says nothing of what work takes.
+/// Measurements of jobs below this many nominal seconds are ignored.
 const LEAST: f64 = 0.02;
 
-/// How many times slower or faster than nominal a machine is taken for.
+/// Range of the measured ratio of real to nominal seconds. Ratios outside it are clamped.
 const RANGE: (f64, f64) = (1e-3, 1e3);
 
-/// How many pairs are worked on at the same time, by kind of device.
+/// Number of pairs that are computed at the same time, by kind of device.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Lanes {
-    /// Those of processors.
+    /// Lanes on CPUs.
     pub cpu: usize,
-    /// Those of cards.
+    /// Lanes on GPUs.
     pub gpu: usize,
 }
 
 impl Lanes {
-    /// Those of one kind.
+    /// Lanes on devices of one kind.
     pub fn of(self, kind: DeviceKind) -> usize {
         match kind {
             DeviceKind::Cpu => self.cpu,
@@ -44,13 +47,13 @@ impl Lanes {
         }
     }
 
-    /// Those of any kind.
+    /// Lanes on all devices.
     pub fn total(self) -> usize {
         self.cpu + self.gpu
     }
 }
 
-/// The learned factors from nominal to real seconds in a lane, one for each kind of device.
+/// The learned factors from nominal to real seconds in a lane, one per kind of device.
 #[derive(Debug)]
 pub struct CostModel {
     lanes: Lanes,
@@ -58,7 +61,7 @@ pub struct CostModel {
 }
 
 impl CostModel {
-    /// A model that has measured nothing yet on its lanes.
+    /// A model without measurements. Its factors are 1.
     pub fn new(lanes: Lanes) -> Self {
         Self {
             lanes,
@@ -66,37 +69,33 @@ impl CostModel {
         }
     }
 
-    /// The lanes that it is about.
+    /// The lanes of the model.
     pub fn lanes(&self) -> Lanes {
         self.lanes
     }
 
-    /// Nominal seconds of some work.
+    /// Nominal seconds of a job of this cost, overhead included.
     pub fn nominal(price: &Cost) -> f64 {
         EACH + price.seconds(NOMINAL_RATE)
     }
 
-    /// Nominal seconds of asking a field about a point, so many times.
+    /// Nominal seconds of evaluating a field at this many points.
     pub fn asking(points: f64) -> f64 {
         points * PARAMETERS as f64 / NOMINAL_RATE
     }
 
-    /// The seconds that work of `nominal` seconds takes in a lane of that kind, by what was
-    /// measured so far.
+    /// Predicted real seconds of `nominal` seconds of work in a lane of this kind.
     pub fn seconds_on(&self, kind: DeviceKind, nominal: f64) -> f64 {
-        let log_factors = self
-            .log_factors
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
+        let log_factors = locked(&self.log_factors);
         nominal * log_factors[kind as usize].map_or(1.0, f64::exp)
     }
 
-    /// Nominal seconds that all lanes of one kind get through in a second.
+    /// Nominal seconds of work that all lanes of one kind complete per second.
     pub fn rate(&self, kind: DeviceKind) -> f64 {
         self.lanes.of(kind) as f64 / self.seconds_on(kind, 1.0)
     }
 
-    /// Nominal seconds that all lanes get through in a second.
+    /// Nominal seconds of work that all lanes complete per second.
     pub fn total_rate(&self) -> f64 {
         DeviceKind::ALL
             .into_iter()
@@ -104,21 +103,20 @@ impl CostModel {
             .sum()
     }
 
-    /// The seconds that work of `nominal` seconds keeps one lane busy, whichever takes it.
+    /// Predicted real seconds that `nominal` seconds of work occupy one lane, averaged over all
+    /// lanes.
     pub fn seconds(&self, nominal: f64) -> f64 {
         nominal * self.lanes.total().max(1) as f64 / self.total_rate().max(f64::MIN_POSITIVE)
     }
 
-    /// Learns that work of `nominal` seconds took `measured` in a lane of that kind.
+    /// Updates the factor of this kind: `nominal` seconds of work took `measured` seconds in a
+    /// lane.
     pub fn learn(&self, kind: DeviceKind, nominal: f64, measured: f64) {
         let ratio = (measured / nominal).clamp(RANGE.0, RANGE.1);
         if !ratio.is_finite() || nominal < LEAST {
             return;
         }
-        let mut log_factors = self
-            .log_factors
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
+        let mut log_factors = locked(&self.log_factors);
         let fresh = ratio.ln();
         let log_factor = &mut log_factors[kind as usize];
         let weight = FRESH * (nominal / WHOLE).min(1.0);
@@ -141,7 +139,7 @@ mod tests {
             learn(1.0, 0.5);
         }
         assert!((model.seconds(2.0) - 1.0).abs() < 1e-3);
-        // Tiny jobs take what jobs take, whatever their work is.
+        // Jobs below the limit are ignored at any ratio.
         for _ in 0..1000 {
             learn(0.01, 0.2);
         }
@@ -158,7 +156,7 @@ mod tests {
         model.learn(DeviceKind::Gpu, 1.0, 0.1);
         assert!((model.rate(DeviceKind::Cpu) - 0.5).abs() < 1e-9);
         assert!((model.rate(DeviceKind::Gpu) - 40.0).abs() < 1e-9);
-        // Five lanes get through 40.5 nominal seconds in a second.
+        // The five lanes complete 40.5 nominal seconds per second.
         assert!((model.seconds(40.5) - 5.0).abs() < 1e-9);
         assert!((model.seconds_on(DeviceKind::Cpu, 1.0) - 2.0).abs() < 1e-9);
     }

@@ -1,23 +1,23 @@
-//! Every error of the operating system, classified once: the job's, or the machine's.
+//! Classification of operating system errors: caused by the job, or by the machine.
 //!
-//! What is the machine's costs a job nothing: it waits until the machine has recovered.
+//! An error of the machine does not count against a job. The job waits until the machine recovers.
 
 use std::error::Error;
 use std::io;
 
-/// Whose fault an error is.
+/// The cause of an error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fault {
-    /// What was asked for is not there: trying again will not bring it back.
+    /// A file does not exist. A retry cannot succeed.
     Missing,
-    /// Nothing more can be written: no bytes, inodes or quota are left, or files may not grow.
+    /// No more data can be written: no space, inodes or quota, or a file size limit.
     Full,
-    /// Anything else: descriptors, permissions, a device that fails, memory.
+    /// All other errors: descriptors, permissions, device failures, memory.
     Machine,
 }
 
 impl Fault {
-    /// Of an error of the operating system.
+    /// Classifies an error of the operating system.
     pub fn of_io(error: &io::Error) -> Self {
         use io::ErrorKind::{FileTooLarge, NotFound, QuotaExceeded, StorageFull};
         match error.kind() {
@@ -27,8 +27,8 @@ impl Fault {
         }
     }
 
-    /// Of an error with one of the operating system among its causes; of the machine where there
-    /// is none.
+    /// Classifies an error by the first operating system error in its chain of causes. Without one
+    /// it is [`Fault::Machine`].
     pub fn of(error: &(dyn Error + 'static)) -> Self {
         let mut cause = Some(error);
         while let Some(error) = cause {

@@ -1,18 +1,19 @@
-//! What liveness and readiness look at besides the devices: loops that go on, and a store that
-//! can be written. It must not know what a loop does or where the store lies.
+//! Inputs of the liveness and readiness probes besides the devices: heartbeats of background loops,
+//! and the health of the store.
 
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use tokio::sync::watch;
 
 use crate::storage::FreeSpace;
+use crate::sync::locked;
 
-/// How often a loop gives a sign of life.
+/// Interval at which a loop updates its heartbeat.
 pub const HEARTBEAT: Duration = Duration::from_secs(1);
 
-/// A loop's sign of life.
+/// The heartbeat of a background loop.
 #[derive(Debug)]
 pub struct Heartbeat {
     began: Instant,
@@ -33,12 +34,12 @@ impl Heartbeat {
         u64::try_from(self.began.elapsed().as_millis()).unwrap_or(u64::MAX)
     }
 
-    /// The loop goes on.
+    /// Records that the loop is alive.
     pub fn beat(&self) {
         self.last.store(self.millis(), Ordering::Relaxed);
     }
 
-    /// As if the last sign of life were so old.
+    /// A heartbeat whose last update is this long ago.
     #[cfg(test)]
     pub(crate) fn silent_for(silence: Duration) -> Self {
         Self {
@@ -47,25 +48,25 @@ impl Heartbeat {
         }
     }
 
-    /// Time since the last sign of life.
+    /// Time since the last update.
     pub fn age(&self) -> Duration {
         let last = self.last.load(Ordering::Relaxed);
         Duration::from_millis(self.millis().saturating_sub(last))
     }
 }
 
-/// Whether the store can be read and written. Users of the store report failures; the probe reports
-/// recovery. Workers lease no job while the store fails.
+/// Health of the store. Its users report failures, and a probe reports the recovery. While the
+/// store fails, workers lease no jobs.
 #[derive(Debug, Default)]
 pub struct StoreHealth {
     trouble: watch::Sender<Option<String>>,
-    /// What could still be written, and when that was looked at.
+    /// Free space, and the time of its measurement.
     free: Mutex<Option<(Instant, FreeSpace)>>,
     needed: AtomicU64,
 }
 
 impl StoreHealth {
-    /// The store has failed, through no fault of a job.
+    /// Records a failure of the store that no job caused.
     pub fn failed(&self, error: &dyn std::fmt::Display) {
         let new = self.trouble.send_replace(Some(error.to_string())).is_none();
         if new {
@@ -73,17 +74,18 @@ impl StoreHealth {
         }
     }
 
-    /// There was no room for so many bytes: without it the store does not work again.
+    /// Records that a write of `bytes` bytes found no space. The store recovers only with this much
+    /// space.
     pub fn needs(&self, bytes: u64) {
         self.needed.fetch_max(bytes, Ordering::Relaxed);
     }
 
-    /// Bytes that there has to be room for.
+    /// Bytes of free space required for the recovery.
     pub fn needed(&self) -> u64 {
         self.needed.load(Ordering::Relaxed)
     }
 
-    /// A probe has written and read.
+    /// Records that a probe has written and read the store.
     pub fn works(&self) {
         self.needed.store(0, Ordering::Relaxed);
         if self.trouble.send_replace(None).is_some() {
@@ -91,29 +93,29 @@ impl StoreHealth {
         }
     }
 
-    /// So much can still be written.
+    /// Records the measured free space.
     pub fn has_free(&self, free: FreeSpace) {
-        *self.free.lock().unwrap_or_else(PoisonError::into_inner) = Some((Instant::now(), free));
+        *locked(&self.free) = Some((Instant::now(), free));
     }
 
-    /// What could still be written at the last look, and its age; none before the first.
+    /// The last measured free space and its age; none before the first measurement.
     pub fn free(&self) -> Option<(Duration, FreeSpace)> {
-        let free = *self.free.lock().unwrap_or_else(PoisonError::into_inner);
+        let free = *locked(&self.free);
         free.map(|(looked, free)| (looked.elapsed(), free))
     }
 
-    /// What is wrong, if anything is.
+    /// The current failure, if any.
     pub fn trouble(&self) -> Option<String> {
         self.trouble.borrow().clone()
     }
 
-    /// Returns when nothing is wrong.
+    /// Returns once the store works.
     pub async fn until_it_works(&self) {
         let mut trouble = self.trouble.subscribe();
         let _the_sender_is_here = trouble.wait_for(Option::is_none).await;
     }
 
-    /// Returns when something is wrong.
+    /// Returns once the store fails.
     pub async fn until_it_fails(&self) {
         let mut trouble = self.trouble.subscribe();
         let _the_sender_is_here = trouble.wait_for(Option::is_some).await;

@@ -1,13 +1,14 @@
-//! Scene flow as a service: two lidar clouds in, the motion of every point out.
+//! Scene flow as a service: estimates the motion of every point between two lidar sweeps.
 //!
 //! ```text
 //! file - formats -> Problem -> flow::estimate -> Estimate -> formats, picture - file
-//!     preprocess -> backend.transform -> align -> start
-//!     loop { forward, query, backward, Adam } -> early stop -> evaluate
+//!     objects: select -> registration -> clusters, search -> assignment
+//!     field:   select -> distance transform -> registration -> fit
+//!              fit: loop { forward, query, backward, Adam } -> early stopping -> evaluation
 //! ```
 //!
-//! [`flow`] is the numerics and knows nothing of files, clocks or services; everything else may
-//! know [`flow`].
+//! [`flow`] holds the numerics and is independent of files, clocks and the service. All other
+//! modules may depend on [`flow`].
 
 pub mod flow;
 
@@ -43,6 +44,8 @@ pub mod picture;
 pub mod queue;
 #[cfg(feature = "service")]
 pub mod storage;
+#[cfg(feature = "service")]
+mod sync;
 #[cfg(feature = "service")]
 pub mod telemetry;
 #[cfg(feature = "service")]

@@ -1,4 +1,4 @@
-//! The `fnsf` program: parse, dispatch, exit code.
+//! The `fnsf` program: parses the arguments, runs the command and returns its exit code.
 
 use std::process::ExitCode;
 

@@ -1,8 +1,9 @@
-//! What lies in store for a job: its clouds, its flow, its dense cloud, as versioned bytes.
+//! Binary encoding of the stored data of a job: clouds, flow and dense cloud.
 //!
-//! Little endian; counts are checked against the bytes present, and a sum over all of them tells a
-//! torn file. It must not know where the bytes are kept.
+//! Versioned and little endian. Counts are checked against the bytes present, and a checksum over
+//! all bytes detects truncated or altered files. Independent of the storage.
 
+use crate::flow::Solution;
 use crate::flow::{Cluster, DenseCloud, Estimate, Objects, OrientedBox, Point, RigidTransform};
 use crate::formats::{matrix_rows, rigid_motion};
 
@@ -10,40 +11,40 @@ const CLOUD: &[u8; 8] = b"fnsfcld1";
 const FLOW: &[u8; 8] = b"fnsfflw2";
 const DENSE: &[u8; 8] = b"fnsfdns1";
 
-/// Bytes of the sum at the end.
+/// Bytes of the checksum at the end: the first 16 bytes of the BLAKE3 hash.
 const SUM: usize = 16;
 
-/// Bytes that are not what they should be.
+/// The bytes are damaged or have another format version.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("stored bytes are damaged or of another version: {0}")]
 pub struct Damaged(&'static str);
 
-/// One sweep, as it waits for its turn.
+/// One stored sweep.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StoredCloud {
-    /// N points, metres; rows without return are NaN.
+    /// N points, metres. Rows without a return are NaN.
     pub points: Vec<Point>,
-    /// N flags: which points are ground, where that is known.
+    /// N flags: which points are ground, if known.
     pub ground: Option<Vec<bool>>,
 }
 
-/// The flow of a pair, as it waits to be fetched.
+/// The stored flow of a pair.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StoredFlow {
     /// N displacements, metres.
     pub flow: Vec<Point>,
     /// N flags: which rows have a flow.
     pub valid: Vec<bool>,
-    /// N flags: which points move by themselves, where that is known.
+    /// N flags: which points move beyond the ego motion, if known.
     pub dynamic: Option<Vec<bool>>,
-    /// What the points are parts of and how sure their motion is, where that is known.
+    /// Clusters of the points and confidence of their flow, if known.
     pub objects: Option<Objects>,
-    /// The ego motion target_from_source, where it is known.
+    /// The ego motion target_from_source, if known.
     pub ego: Option<RigidTransform>,
 }
 
 impl StoredCloud {
-    /// The cloud as bytes.
+    /// Encodes the cloud.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut out = Writer::new(CLOUD, self.points.len(), 13 * self.points.len());
         out.points(&self.points);
@@ -51,10 +52,10 @@ impl StoredCloud {
         out.finish()
     }
 
-    /// The cloud that some bytes are.
+    /// Decodes a cloud.
     ///
     /// # Errors
-    /// [`Damaged`] where they are torn or of another version.
+    /// [`Damaged`] if the bytes are damaged or of another version.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, Damaged> {
         let mut reader = Reader::new(CLOUD, bytes)?;
         let cloud = Self {
@@ -67,7 +68,7 @@ impl StoredCloud {
 }
 
 impl StoredFlow {
-    /// The flow as bytes.
+    /// Encodes the flow.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut out = Writer::new(FLOW, self.flow.len(), 22 * self.flow.len());
         out.points(&self.flow);
@@ -78,10 +79,10 @@ impl StoredFlow {
         out.finish()
     }
 
-    /// The flow that some bytes are.
+    /// Decodes a flow.
     ///
     /// # Errors
-    /// [`Damaged`] where they are torn or of another version.
+    /// [`Damaged`] if the bytes are damaged or of another version.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, Damaged> {
         let mut reader = Reader::new(FLOW, bytes)?;
         let flow = reader.points()?;
@@ -98,35 +99,35 @@ impl StoredFlow {
     }
 }
 
-/// The dense cloud of a sequence, as it waits to be fetched.
+/// The stored dense cloud of a sequence.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StoredDense(pub DenseCloud);
 
 impl StoredDense {
-    /// The cloud as bytes.
+    /// Encodes the cloud.
     pub fn to_bytes(&self) -> Vec<u8> {
         let Self(cloud) = self;
         let mut out = Writer::new(DENSE, cloud.points.len(), 22 * cloud.points.len());
         out.points(&cloud.points);
-        out.words(cloud.frame.iter().copied());
+        out.words(cloud.sweep.iter().copied());
         out.words(cloud.age.iter().map(|age| age.to_bits()));
         out.flags(Some(&cloud.dynamic));
         out.flags(Some(&cloud.converged));
         out.finish()
     }
 
-    /// The cloud that some bytes are.
+    /// Decodes a dense cloud.
     ///
     /// # Errors
-    /// [`Damaged`] where they are torn or of another version.
+    /// [`Damaged`] if the bytes are damaged or of another version.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, Damaged> {
         let mut reader = Reader::new(DENSE, bytes)?;
         let points = reader.points()?;
-        let frame = reader.words()?.collect();
+        let sweep = reader.words()?.collect();
         let age = reader.words()?.map(f32::from_bits).collect();
         let cloud = DenseCloud {
             points,
-            frame,
+            sweep,
             age,
             dynamic: reader.flags()?.ok_or(Damaged("no mask"))?,
             converged: reader.flags()?.ok_or(Damaged("no mask"))?,
@@ -142,7 +143,10 @@ impl From<Estimate> for StoredFlow {
             flow: estimate.flow,
             valid: estimate.valid,
             dynamic: estimate.dynamic,
-            objects: estimate.objects,
+            objects: match estimate.solution {
+                Solution::Objects(solution) => Some(solution.objects),
+                Solution::Field(_) => None,
+            },
             ego: estimate.ego,
         }
     }
@@ -329,7 +333,7 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// Packed little-endian float32 triples as points; what is left over is ignored.
+/// Decodes packed little-endian float32 triples as points. Remaining bytes are ignored.
 pub fn points_from_le_bytes(bytes: &[u8]) -> Vec<Point> {
     const POINT: usize = size_of::<Point>();
     let mut points: Vec<Point> = vec![[0.0; 3]; bytes.len() / POINT];
@@ -397,7 +401,7 @@ mod tests {
     fn a_dense_cloud_comes_back_bit_for_bit() {
         let stored = StoredDense(DenseCloud {
             points: vec![[1.0, -2.0, 0.5], [0.0; 3]],
-            frame: vec![0, 7],
+            sweep: vec![0, 7],
             age: vec![0.25, -6.75],
             dynamic: vec![true, false],
             converged: vec![true, false],

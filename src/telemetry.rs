@@ -1,4 +1,4 @@
-//! Logs on stderr, for people or for programs, and traces to a collector where one is configured.
+//! Logs on stderr, human-readable or JSON, and traces to an OTLP collector if one is configured.
 
 use std::io::IsTerminal;
 
@@ -12,28 +12,28 @@ use tracing_subscriber::{EnvFilter, Layer};
 
 use crate::config::{LogConfig, LogFormat};
 
-/// Why nothing can be logged.
+/// Why logging cannot start.
 #[derive(Debug, thiserror::Error)]
 pub enum TelemetryError {
-    /// The filter makes no sense.
+    /// The filter is invalid.
     #[error("log.filter: {0}")]
     Filter(#[from] tracing_subscriber::filter::ParseError),
-    /// The collector's address makes no sense.
+    /// The address of the collector is invalid.
     #[error("otlp_endpoint: {0}")]
     Otlp(#[from] opentelemetry_otlp::ExporterBuildError),
-    /// Somebody else logs already.
+    /// Logging was already started in this process.
     #[error("logging was started twice")]
     Twice(#[from] tracing_subscriber::util::TryInitError),
 }
 
-/// Keeps traces flowing; what is left is sent when it is dropped.
+/// Keeps tracing active. Dropping it sends the remaining traces.
 #[derive(Debug, Default)]
 pub struct Telemetry {
     traces: Option<SdkTracerProvider>,
 }
 
 impl Telemetry {
-    /// Starts logging, and tracing to `otlp_endpoint` where there is one. Needs a runtime then.
+    /// Starts logging, and tracing if `otlp_endpoint` is given. Tracing needs a tokio runtime.
     ///
     /// # Errors
     /// [`TelemetryError`].

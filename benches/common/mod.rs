@@ -1,4 +1,4 @@
-//! Clouds for the benchmarks: a simulated street, and real sweeps where there are any.
+//! Clouds for the benchmarks: a simulated street, and real pairs if `FNSF_REAL_DATA` is set.
 
 use std::path::PathBuf;
 
@@ -6,15 +6,15 @@ use fnsf::flow::Point;
 use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::formats::read_pair;
 
-/// Two clouds and what they are.
+/// The two clouds of a pair, metres, and its name.
 pub(crate) struct Scene {
     pub(crate) name: String,
     pub(crate) source: Vec<Point>,
     pub(crate) target: Vec<Point>,
 }
 
-/// The simulated street and, where `FNSF_REAL_DATA` names a folder, its pairs; uncropped, with
-/// ground.
+/// The simulated street and the real pairs in the folder `FNSF_REAL_DATA`, if it is set. The clouds
+/// are uncropped and include the ground.
 pub(crate) fn scenes() -> Result<Vec<Scene>, String> {
     let street = Street::new(&StreetOptions::default()).map_err(|e| e.to_string())?;
     let pair = street.pair(0).map_err(|e| e.to_string())?;
@@ -38,7 +38,7 @@ pub(crate) fn scenes() -> Result<Vec<Scene>, String> {
     Ok(scenes)
 }
 
-/// The middle of the values.
+/// The upper median of the values.
 pub(crate) fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     values[values.len() / 2]

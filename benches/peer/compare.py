@@ -58,8 +58,8 @@ def run_json(command: list[str]) -> dict:
 def problem_options(args: argparse.Namespace, seed: int) -> list[str]:
     """The options that `fnsf flow` and the peer share."""
     options = ["--ground", args.ground, "--seed", str(seed), "--threads", str(args.threads)]
-    if args.range_m is not None:
-        options += ["--range-m", str(args.range_m)]
+    if args.crop_m is not None:
+        options += ["--crop-m", str(args.crop_m)]
     if args.max_points is not None:
         options += ["--max-points", str(args.max_points)]
     return [*options, "--json"]
@@ -145,7 +145,7 @@ def print_table(args: argparse.Namespace, runs: dict[Contestant, list[Run]]) -> 
     header = ["", "seconds", "precompute", "EPE (m)", "worst EPE", "Acc5", "points", "iterations"]
     header += ["peak MiB", *(f"time / {preset.name}" for preset in presets)]
     print(
-        f"{args.pair}, range {args.range_m or 'off'}, ground {args.ground}, "
+        f"{args.pair}, range {args.crop_m or 'off'}, ground {args.ground}, "
         f"{args.max_points or 'all'} points, {args.device}, {args.threads} threads, "
         f"seeds {' '.join(map(str, args.seeds))}. Medians over seeds; time ratios are the median "
         "(lowest to highest) of the ratios per seed. A seed pairs runs in number only.\n"
@@ -162,7 +162,7 @@ def parse_args() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("pair", type=Path, metavar="PAIR.npz")
     parser.add_argument("--fnsf", default="fnsf", help="the binary (default: fnsf on PATH)")
-    parser.add_argument("--range-m", type=float, help="crop to |x|, |y| <= R (default: off)")
+    parser.add_argument("--crop-m", type=float, help="crop to |x|, |y| <= R (default: off)")
     parser.add_argument("--ground", choices=("keep", "mask"), default="mask")
     parser.add_argument("--max-points", type=int, help="sample both clouds (default: off)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])

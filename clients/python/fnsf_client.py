@@ -147,9 +147,9 @@ class Client:
                 chunks.append(answer.chunk)
                 rows += len(answer.chunk.flags)
             if pair.WhichOneof("outcome") == "error":
-                yield Pair(pair.place, pair.source, pair.target, None, pair.error)
+                yield Pair(pair.index, pair.source, pair.target, None, pair.error)
             elif rows == pair.header.points:
-                yield Pair(pair.place, pair.source, pair.target, _joined(pair.header, chunks), None)
+                yield Pair(pair.index, pair.source, pair.target, _joined(pair.header, chunks), None)
 
 
 def _joined(header, chunks):
@@ -190,9 +190,14 @@ class Clock:
 def summary(flow):
     header = flow.header
     length, moving = mean_length(flow)
+    method = header.WhichOneof("method")
+    if method == "objects":
+        done = f"{header.objects.searched} clusters, {header.objects.moving} move"
+    else:
+        done = f"{header.field.iterations} iterations"
     return (
         f"{header.valid_points} of {header.points} points, mean {length:.3f} m, {moving:.1%} moving, "
-        f"{header.iterations} iterations, {header.stop_reason}, {header.seconds.total:.3f} s on {header.device}"
+        f"{done}, {header.stop_reason}, {header.seconds.total:.3f} s on {header.device}"
     )
 
 
@@ -207,7 +212,7 @@ def run_pair(client, options, arguments):
         target,
         options,
         arguments.deadline,
-        lambda progress: clock.say(f"iteration {progress.iteration}, loss {progress.loss:.4f} m"),
+        lambda progress: clock.say(f"{progress.done} of {progress.total}, loss {progress.loss:.4f} m"),
     )
     clock.say(f"flow: {summary(flow)}")
     write_flow(arguments.output, flow)
@@ -215,7 +220,7 @@ def run_pair(client, options, arguments):
 
 
 def run_sequence(client, options, arguments):
-    if len(arguments.frames) < 2:
+    if len(arguments.sweeps) < 2:
         raise BadFile("a sequence has two sweeps or more")
     if arguments.output:
         Path(arguments.output).mkdir(parents=True, exist_ok=True)
@@ -223,7 +228,7 @@ def run_sequence(client, options, arguments):
 
     def sweeps():
         nonlocal sent
-        for place, path in enumerate(arguments.frames):
+        for place, path in enumerate(arguments.sweeps):
             due = clock.start + place * arguments.interval
             time.sleep(max(0.0, due - time.monotonic()))
             cloud = read_cloud(path)
@@ -233,7 +238,7 @@ def run_sequence(client, options, arguments):
 
     failed = 0
     for pair in client.sequence(sweeps(), options, arguments.deadline):
-        name = f"flow {pair.place}: {pair.source} -> {pair.target}"
+        name = f"flow {pair.index}: {pair.source} -> {pair.target}"
         came.append(sent)
         if pair.error:
             failed += 1
@@ -241,11 +246,11 @@ def run_sequence(client, options, arguments):
             continue
         clock.say(f"{name}: {summary(pair.flow)}")
         if arguments.output:
-            write_flow(Path(arguments.output) / f"flow_{pair.place:04}.npz", pair.flow)
-    frames = len(arguments.frames)
-    early = sum(place < frames for place in came)
-    print(f"{len(came)} of {frames - 1} flows came, {early} of them before the last sweep was sent, {failed} failed")
-    return failed == 0 and len(came) == frames - 1
+            write_flow(Path(arguments.output) / f"flow_{pair.index:04}.npz", pair.flow)
+    sweeps = len(arguments.sweeps)
+    early = sum(place < sweeps for place in came)
+    print(f"{len(came)} of {sweeps - 1} flows came, {early} of them before the last sweep was sent, {failed} failed")
+    return failed == 0 and len(came) == sweeps - 1
 
 
 def arguments_of(argv):
@@ -261,7 +266,7 @@ def arguments_of(argv):
     pair.add_argument("-o", "--output", required=True, help=".npz, .npy or packed .f32")
     pair.set_defaults(run=run_pair)
     sequence = commands.add_parser("sequence", help="the flow of each two consecutive sweeps, as they come")
-    sequence.add_argument("frames", nargs="+", metavar="FRAME", help=".pcd, .npy, .npz or packed .f32, in order")
+    sequence.add_argument("sweeps", nargs="+", metavar="SWEEP", help=".pcd, .npy, .npz or packed .f32, in order")
     sequence.add_argument("-o", "--output", metavar="DIR", help="write every flow into this folder")
     sequence.add_argument("--interval", type=float, default=0.0, metavar="SECONDS", help="between sweeps, as a sensor would")
     sequence.set_defaults(run=run_sequence)
@@ -270,7 +275,7 @@ def arguments_of(argv):
         command.add_argument("--preset", choices=["default", "label", "neural", "paper"])
         command.add_argument("--seed", type=int)
         command.add_argument("--max-points", type=int)
-        command.add_argument("--range-m", type=float)
+        command.add_argument("--crop-m", type=float)
         command.add_argument("--ground", choices=["keep", "mask", "auto"])
         command.add_argument("--ego", choices=["off", "auto"])
         command.add_argument("--priority", choices=["low", "normal", "high"])
@@ -279,7 +284,7 @@ def arguments_of(argv):
 
 def main(argv=None):
     arguments = arguments_of(argv)
-    names = ("preset", "seed", "max_points", "range_m", "ground", "ego", "priority")
+    names = ("preset", "seed", "max_points", "crop_m", "ground", "ego", "priority")
     try:
         client = Client(arguments.server, arguments.api_key, arguments.tls, arguments.proto)
         options = client.options(**{name: getattr(arguments, name) for name in names})

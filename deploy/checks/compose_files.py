@@ -1,6 +1,6 @@
 """The compose files, where no docker with compose is at hand: what it would refuse, and what it would not.
 
-compose_files.py DRAIN_SECONDS: the drain's deadline that the image has by default.
+compose_files.py TIMEOUT_SECONDS: the default of shutdown.timeout_seconds.
 """
 
 import re
@@ -47,7 +47,7 @@ def service_faults(name, service, volumes, services):
             yield f"{name}: depends on {other}, which is not there"
 
 
-def main(drain_seconds):
+def main(timeout_seconds):
     base = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
     gpu = yaml.safe_load((DEPLOY / "compose.gpu.yaml").read_text())
     faults = []
@@ -62,10 +62,10 @@ def main(drain_seconds):
     environment = fnsf["environment"]
     if not environment["FNSF_SERVE_API_KEY"].startswith("${FNSF_API_KEY:?"):
         faults.append("fnsf: starts without a key")
-    drain = int(environment.get("FNSF_SERVE_DRAIN__DEADLINE_SECONDS", drain_seconds))
+    timeout = int(environment.get("FNSF_SERVE_SHUTDOWN__TIMEOUT_SECONDS", timeout_seconds))
     grace = int(fnsf["stop_grace_period"].removesuffix("s"))
-    if grace <= drain:
-        faults.append(f"fnsf: is killed after {grace} s, within its drain of {drain} s")
+    if grace <= timeout:
+        faults.append(f"fnsf: is killed after {grace} s, within its shutdown timeout of {timeout} s")
 
     if set(gpu["services"]) - set(services):
         faults.append("compose.gpu.yaml: changes a service that is not there")

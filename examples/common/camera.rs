@@ -1,10 +1,11 @@
-//! The camera that the examples look through.
+//! The camera of the examples.
 
 use fnsf::flow::RigidTransform;
 use fnsf::flow::depth::{Camera, Intrinsics};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 
-/// A camera like KITTI's: 1242 x 375 pixels, 6 cm beside, 8 cm below and 27 cm before the lidar.
+/// A camera similar to KITTI's: 1242 x 375 pixels, 6 cm beside, 8 cm below and 27 cm in front of
+/// the lidar.
 pub(crate) fn camera() -> anyhow::Result<Camera> {
     let intrinsics = Intrinsics {
         fx: 721.5,

@@ -1,10 +1,10 @@
-//! A clock, which the numerics have none of.
+//! A wall clock for the numerics, which keep no time of their own.
 
 use std::time::Instant;
 
 use fnsf::flow::Control;
 
-/// Seconds since it was made.
+/// Measures seconds since its start.
 pub(crate) struct Clock(Instant);
 
 impl Clock {

@@ -1,4 +1,5 @@
-//! Pairs with what is true of them: the labelled ones below `FNSF_REAL_DATA`, and streets.
+//! Pairs with ground truth: labelled real pairs in the folder `FNSF_REAL_DATA`, and simulated
+//! streets.
 
 use std::path::Path;
 
@@ -6,22 +7,22 @@ use fnsf::flow::Point;
 use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::formats::read_pair;
 
-/// The labelled pairs, by folder.
+/// Folder names of the labelled real pairs.
 pub(crate) const PAIRS: [&str; 3] = ["av2_7fab", "kitti_0000", "small_gicp"];
 
-/// A pair with what is true of it.
+/// A pair with ground truth. Points and flow are in metres.
 pub(crate) struct Known {
     pub(crate) name: String,
     pub(crate) source: Vec<Point>,
     pub(crate) target: Vec<Point>,
-    /// Of the source and of the target.
+    /// Ground masks of the source and of the target.
     pub(crate) ground: [Vec<bool>; 2],
     pub(crate) flow: Vec<Point>,
     pub(crate) valid: Vec<bool>,
     pub(crate) dynamic: Option<Vec<bool>>,
 }
 
-/// The labelled pairs; none where `FNSF_REAL_DATA` is not set.
+/// The labelled real pairs; none if `FNSF_REAL_DATA` is not set.
 pub(crate) fn real_pairs() -> Result<Vec<Known>, String> {
     let Some(folder) = std::env::var_os("FNSF_REAL_DATA") else {
         return Ok(Vec::new());
@@ -47,7 +48,7 @@ fn real(name: &str, folder: &Path) -> Result<Known, String> {
     })
 }
 
-/// The first pair of a street.
+/// The first pair of a simulated street.
 pub(crate) fn street(seed: u64, beams: usize) -> Result<Known, String> {
     let options = StreetOptions {
         seed,

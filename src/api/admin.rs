@@ -1,6 +1,6 @@
-//! The admin port: is it alive, is it ready, what does it measure. No job is ever seen here.
+//! The admin port: liveness, readiness and metrics. It exposes no jobs.
 //!
-//! It runs on a thread of its own, so that it answers whatever the service is doing.
+//! It runs on its own thread, so it responds even when the service is busy.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -20,32 +20,33 @@ use crate::health::{Heartbeat, StoreHealth};
 use crate::metrics::Metrics;
 use crate::queue::Queue;
 
-/// What liveness and readiness depend on.
+/// The inputs of the liveness and readiness checks.
 #[derive(Clone)]
 pub struct Readiness {
-    /// The devices; one that is ready is enough.
+    /// The devices. The server is ready if at least one of them is.
     pub devices: Vec<Device>,
     /// Whether the server is about to stop.
     pub draining: watch::Receiver<bool>,
-    /// Whether the store can be written.
+    /// The health of the store.
     pub store: Arc<StoreHealth>,
-    /// Loops that have to go on, by name.
+    /// The heartbeats of the loops that must keep running, by name.
     pub loops: Vec<(&'static str, Arc<Heartbeat>)>,
 }
 
-/// Silence of a loop after which it is taken for stuck. A machine that is busy is not so slow.
+/// Age of a heartbeat after which its loop counts as stuck. A loop on a busy machine still beats
+/// more often.
 const STUCK: Duration = Duration::from_secs(10);
 
 impl Readiness {
-    /// The loop that does not go on, so that only a fresh process will.
+    /// Describes a loop that is stuck, from which only a restart of the process recovers.
     fn stuck(&self) -> Option<String> {
         let stuck = self.loops.iter().find(|(_, beat)| beat.age() > STUCK)?;
         let seconds = stuck.1.age().as_secs();
         Some(format!("{} has not moved for {seconds} s", stuck.0))
     }
 
-    /// Why the server is not ready; nothing where it is.
-    pub fn obstacle(&self) -> Option<String> {
+    /// The reason why the server is not ready. `None` if it is ready.
+    pub fn not_ready_reason(&self) -> Option<String> {
         if *self.draining.borrow() {
             return Some("the server is about to stop".to_owned());
         }
@@ -57,7 +58,7 @@ impl Readiness {
         }
         let mut reasons = Vec::new();
         for device in &self.devices {
-            reasons.push(device.obstacle()?);
+            reasons.push(device.not_ready_reason()?);
         }
         Some(reasons.join("; "))
     }
@@ -71,7 +72,7 @@ struct Admin {
     cost: Arc<CostModel>,
 }
 
-/// The routes of the admin port.
+/// The routes of the admin port: `/livez`, `/readyz` and `/metrics`.
 pub fn admin_router(
     readiness: Readiness,
     metrics: Arc<Metrics>,
@@ -94,7 +95,7 @@ async fn alive(State(admin): State<Admin>) -> Response {
     verdict("alive", admin.readiness.stuck())
 }
 
-/// 200, or 503 with what stands against it.
+/// 200, or 503 with the reason.
 fn verdict(word: &str, obstacle: Option<String>) -> Response {
     match obstacle {
         None => Json(json!({ word: true })).into_response(),
@@ -106,7 +107,7 @@ fn verdict(word: &str, obstacle: Option<String>) -> Response {
 }
 
 async fn ready(State(admin): State<Admin>) -> Response {
-    verdict("ready", admin.readiness.obstacle())
+    verdict("ready", admin.readiness.not_ready_reason())
 }
 
 async fn expose(State(admin): State<Admin>, headers: HeaderMap) -> Response {
@@ -149,10 +150,12 @@ mod tests {
             loops: vec![("the runtime", Arc::clone(&heartbeat))],
         };
         let stuck = readiness.stuck().expect("it is stuck");
-        assert!(stuck.contains("the runtime") && readiness.obstacle() == Some(stuck));
+        assert!(stuck.contains("the runtime") && readiness.not_ready_reason() == Some(stuck));
         heartbeat.beat();
         readiness.store.failed(&"no space left");
-        let trouble = readiness.obstacle().expect("the store does not work");
+        let trouble = readiness
+            .not_ready_reason()
+            .expect("the store does not work");
         assert!(trouble.contains("no space left") && readiness.stuck().is_none());
     }
 }

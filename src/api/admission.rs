@@ -1,8 +1,9 @@
-//! Whether a job is accepted: priced before anything is kept, bounded in predicted seconds.
+//! Admission control: a job is priced before it is accepted, and the backlog is bounded in
+//! predicted compute seconds.
 //!
-//! A refusal says when to come back, from the same numbers that it was made with.
+//! A refusal includes a retry delay, computed from the same backlog that caused the refusal.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use super::error::ApiError;
@@ -11,23 +12,24 @@ use crate::flow::{self, Cost, Problem};
 use crate::job::{DeviceKind, JobOptions, Priority, Tenant};
 use crate::payload::StoredCloud;
 use crate::queue::{Backlog, Queue};
+use crate::sync::locked;
 
-/// What is accepted at most.
+/// Limits on accepted work.
 #[derive(Clone, Debug)]
 pub struct AdmissionLimits {
-    /// Points of one cloud.
+    /// Maximum number of points in one cloud.
     pub max_points: usize,
-    /// Memory that one pair, or one dense cloud, may take on a device, bytes.
+    /// Maximum memory of one pair or one dense cloud on a device, bytes.
     pub max_pair_bytes: usize,
-    /// Predicted wait of somebody who waits on the line.
+    /// Maximum predicted waiting time of a job whose caller waits for the result.
     pub max_wait: Duration,
-    /// Predicted compute time of everything that waits.
+    /// Maximum predicted compute time of all queued jobs.
     pub max_queue: Duration,
-    /// Predicted compute time of everything that one tenant has waiting.
+    /// Maximum predicted compute time of all queued jobs of one tenant.
     pub max_tenant_queue: Duration,
 }
 
-/// The gate.
+/// Admission control for one queue.
 pub struct Admission {
     limits: AdmissionLimits,
     queue: Arc<dyn Queue>,
@@ -35,7 +37,8 @@ pub struct Admission {
     reserved: Arc<Mutex<f64>>,
 }
 
-/// A place in the queue that is kept until the job is in it.
+/// Predicted compute time that is reserved for a job until the job is in the queue. Released when
+/// dropped.
 #[derive(Debug)]
 pub struct Reservation {
     seconds: f64,
@@ -44,36 +47,36 @@ pub struct Reservation {
 
 impl Drop for Reservation {
     fn drop(&mut self) {
-        *self.reserved.lock().unwrap_or_else(PoisonError::into_inner) -= self.seconds;
+        *locked(&self.reserved) -= self.seconds;
     }
 }
 
-/// Who waits for a job.
+/// Whether a job depends on its caller's connection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Promise {
-    /// Somebody waits on the line: the job ends with the call.
-    WhileAwaited,
-    /// Nobody has to: the job outlives everything once it is accepted.
+pub enum Durability {
+    /// The caller waits for the result. The job is cancelled when the caller disconnects.
+    Ephemeral,
+    /// The job is durable: once accepted it does not depend on its caller or on this process.
     Durable,
 }
 
-/// Who asks for what.
+/// The properties of a job that admission control depends on.
 #[derive(Clone, Debug)]
 pub struct Asked<'a> {
-    /// Whose job it is.
+    /// The tenant of the job.
     pub tenant: &'a Tenant,
-    /// How urgent it is.
+    /// The priority of the job.
     pub priority: Priority,
-    /// The kind of device that it has to be done on; none where any will do.
+    /// The kind of device that the job requires. `None` if any device will do.
     pub device: Option<DeviceKind>,
-    /// Nominal seconds of all its pairs.
+    /// Nominal compute seconds of all its pairs.
     pub nominal_seconds: f64,
-    /// Who waits.
-    pub promise: Promise,
+    /// Whether the caller waits for the result.
+    pub durability: Durability,
 }
 
 impl Admission {
-    /// A gate before `queue`, behind which the lanes of `cost` work.
+    /// Admission control for `queue`, whose jobs are computed in the lanes of `cost`.
     pub fn new(limits: AdmissionLimits, queue: Arc<dyn Queue>, cost: Arc<CostModel>) -> Self {
         Self {
             limits,
@@ -83,7 +86,7 @@ impl Admission {
         }
     }
 
-    /// Points that one cloud may have.
+    /// The maximum number of points in one cloud.
     pub fn max_points(&self) -> usize {
         self.limits.max_points
     }
@@ -102,7 +105,7 @@ impl Admission {
         Ok(())
     }
 
-    /// Refuses a job for a kind of device that is not here.
+    /// Refuses a job for a kind of device that this server does not have.
     ///
     /// # Errors
     /// [`ApiError::NoDevice`].
@@ -113,22 +116,23 @@ impl Admission {
         }
     }
 
-    /// Memory that one pair, or one dense cloud, may take.
+    /// The maximum memory of one pair or one dense cloud, bytes.
     pub(super) fn max_pair_bytes(&self) -> usize {
         self.limits.max_pair_bytes
     }
 
-    /// Prices a pair, and refuses what no device could do. One that `goes_on` from the pair before
-    /// takes as many iterations as that allows.
+    /// Predicts the cost of a pair, and refuses a pair that exceeds the memory limit. With
+    /// `chained` the pair starts from the field of the pair before, so its number of iterations is
+    /// that of a warm start.
     ///
     /// # Errors
-    /// [`ApiError::BadInput`] or [`ApiError::TooLarge`], with what the solver says.
+    /// [`ApiError::BadInput`] with the message of the solver, or [`ApiError::TooLarge`].
     pub fn price(
         &self,
         source: &StoredCloud,
         target: &StoredCloud,
         options: &JobOptions,
-        goes_on: bool,
+        chained: bool,
     ) -> Result<Cost, ApiError> {
         let ground = source.ground.as_deref().zip(target.ground.as_deref());
         let problem = Problem {
@@ -136,12 +140,14 @@ impl Admission {
             target: &target.points,
             ground: ground.map(<[_; 2]>::from),
             before: None,
-            around: &[],
+            neighbors: &[],
         };
         let points = source.points.len().max(target.points.len());
         let mut options = options.solver_options(points);
-        if let Some(warm_start) = options.warm_start.filter(|_| goes_on) {
-            options = options.warmed(warm_start);
+        if let Some(field) = options.field_mut().filter(|_| chained)
+            && let Some(warm_start) = field.warm_start
+        {
+            *field = field.warmed(warm_start);
         }
         let price = flow::price(&problem, &options).map_err(|error| {
             if error.is_input() {
@@ -154,7 +160,7 @@ impl Admission {
         Ok(price)
     }
 
-    /// Refuses what needs more memory than a pair may take.
+    /// Refuses a cost that exceeds the memory limit of a pair.
     ///
     /// # Errors
     /// [`ApiError::TooLarge`].
@@ -162,7 +168,7 @@ impl Admission {
         let limit = self.limits.max_pair_bytes;
         if price.bytes > limit {
             return Err(ApiError::TooLarge(format!(
-                "the pair needs {} MiB on the device, {} are allowed: crop with range_m",
+                "the pair needs {} MiB on the device, {} are allowed: crop with crop_m",
                 price.bytes >> 20,
                 limit >> 20
             )));
@@ -170,14 +176,14 @@ impl Admission {
         Ok(())
     }
 
-    /// Keeps a place for a job, or says when to come back. Asked for no seconds it costs nothing
-    /// and says whether a body is worth reading.
+    /// Reserves predicted compute time for a job, or refuses it with a retry delay. With zero
+    /// nominal seconds it reserves nothing and only tests whether a request body is worth reading.
     ///
     /// # Errors
     /// [`ApiError::TenantLimit`] or [`ApiError::ServerFull`].
     pub fn admit(&self, asked: &Asked<'_>) -> Result<Reservation, ApiError> {
         let backlog = self.queue.backlog();
-        let mut reserved = self.reserved.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut reserved = locked(&self.reserved);
         let real = |nominal: f64| self.cost.seconds(nominal);
         let lanes = self.cost.lanes().total().max(1) as f64;
 
@@ -188,7 +194,7 @@ impl Admission {
         }
         let all = real(backlog.queued().seconds + *reserved + asked.nominal_seconds);
         let mut excess = all - self.limits.max_queue.as_secs_f64();
-        if asked.promise == Promise::WhileAwaited {
+        if asked.durability == Durability::Ephemeral {
             let wait = self.wait(&backlog, asked, *reserved);
             excess = excess.max((wait - self.limits.max_wait.as_secs_f64()) * lanes);
         }
@@ -204,8 +210,9 @@ impl Admission {
 }
 
 impl Admission {
-    /// Predicted seconds until a new job is started: all lanes share what any of them may do, and
-    /// one kind's own queue comes on top. A job that may go anywhere waits for the sooner kind.
+    /// Predicted seconds until a new job is started. All lanes share the jobs that may run on any
+    /// device; the jobs that require one kind of device come on top. A job for any device waits for
+    /// the kind that is free first.
     fn wait(&self, backlog: &Backlog, asked: &Asked<'_>, reserved: f64) -> f64 {
         let ahead =
             |device| backlog.ahead_of(asked.tenant, asked.priority, asked.nominal_seconds, device);
@@ -218,7 +225,7 @@ impl Admission {
     }
 }
 
-/// Whole seconds, at least one: what HTTP's header can say.
+/// A retry delay in whole seconds, from 1 s to 3600 s, as the `Retry-After` header requires.
 fn retry_after(seconds: f64) -> Duration {
     const LONGEST: f64 = 3600.0;
     Duration::from_secs(seconds.ceil().clamp(1.0, LONGEST) as u64)

@@ -1,11 +1,12 @@
-//! Room for the answers that are being made and sent, and the last ones that were made.
+//! Memory budget for results that are encoded and sent, and a cache of the latest ones.
 //!
-//! A client may read as slowly as it likes while nobody else needs the room that its answer takes;
-//! then whoever takes theirs most slowly has to go, and can come back with a range.
+//! A slow client may read at any rate while the budget suffices. When another result needs memory,
+//! the result with the slowest reader is evicted. Its client can fetch the rest with a range
+//! request.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::sync::{Arc, Mutex, Weak};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
@@ -15,36 +16,37 @@ use tokio_util::sync::CancellationToken;
 
 use super::error::ApiError;
 use crate::job::{JobId, Tenant};
+use crate::sync::locked;
 
-/// The unit in which room is counted, bytes.
+/// Granularity of the budget, bytes.
 const UNIT: usize = 1 << 10;
 
-/// The part of all room that answers which nobody reads any more may keep, for the next range of
+/// The reciprocal of the cache's share of the budget. Cached results serve later range requests for
 /// the same result.
 const KEPT: usize = 4;
 
-/// An answer that is younger than this is not ended for others, however slowly it is taken.
+/// Age below which a result is not evicted, however slow its reader is.
 const GRACE: Duration = Duration::from_secs(10);
 
-/// How often whoever waits for room looks again.
+/// Interval at which a request that waits for memory tries again.
 const LOOK: Duration = Duration::from_millis(100);
 
-/// What is handed to a connection at a time, bytes.
+/// Size of the chunks that are passed to a connection, bytes.
 const PIECE: usize = 64 << 10;
 
-/// Which answer: the job, its attempt, and the format's ending.
+/// Cache key: the job id, the attempt, and the file extension of the format.
 pub(super) type Name = (JobId, u32, &'static str);
 
-/// How much all answers may take, and for how long one waits.
+/// Limits on the memory of results, and on waiting for it.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct AnswerLimits {
-    /// Bytes of all answers together.
+    /// Budget for all results together, bytes.
     pub(super) all: u64,
-    /// Whether there are several tenants: then one may take half of it.
+    /// Whether there are several tenants. One tenant can then use at most half of the budget.
     pub(super) shared: bool,
-    /// How long an answer waits for room.
+    /// Maximum time that a result waits for memory.
     pub(super) patience: Duration,
-    /// Time after which one that has to make room may be ended.
+    /// Age below which a result is not evicted.
     pub(super) grace: Duration,
 }
 
@@ -59,7 +61,7 @@ impl AnswerLimits {
     }
 }
 
-/// Room for all answers.
+/// The memory budget for all results, and the cache.
 pub(super) struct Answers {
     units: usize,
     limits: AnswerLimits,
@@ -69,7 +71,7 @@ pub(super) struct Answers {
     kept: Mutex<VecDeque<(Name, Encoded)>>,
 }
 
-/// Room for one answer, given back when it is dropped.
+/// A memory reservation for one result, released when dropped.
 pub(super) struct AnswerRoom {
     permit: OwnedSemaphorePermit,
     tenant: Tenant,
@@ -77,7 +79,7 @@ pub(super) struct AnswerRoom {
     taking: Arc<Taking>,
 }
 
-/// How an answer is taken by its reader.
+/// The read progress of one result.
 pub(super) struct Taking {
     tenant: Tenant,
     since: Instant,
@@ -85,7 +87,7 @@ pub(super) struct Taking {
     evicted: CancellationToken,
 }
 
-/// An answer in its format, and the room that it takes as long as any of it is held.
+/// An encoded result. It holds its memory reservation as long as any slice of it exists.
 #[derive(Clone)]
 pub(super) struct Encoded {
     bytes: Bytes,
@@ -103,10 +105,6 @@ impl AsRef<[u8]> for Held {
     }
 }
 
-fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 impl Answers {
     pub(super) fn new(limits: AnswerLimits) -> Self {
         let units = usize::try_from(limits.all).unwrap_or(usize::MAX) / UNIT;
@@ -121,7 +119,7 @@ impl Answers {
         }
     }
 
-    /// Units that one tenant may have.
+    /// The share of one tenant, in units of [`UNIT`] bytes.
     fn share(&self) -> usize {
         if self.limits.shared {
             self.units / 2
@@ -130,11 +128,12 @@ impl Answers {
         }
     }
 
-    /// Room for a tenant's answer that takes `bytes` while it is made; one that takes more than all
-    /// there may be has to be alone.
+    /// Reserves `bytes` bytes for a tenant's result. A request above the tenant's share reserves
+    /// the whole share, so that it can be served alone. It waits for memory, clears the cache and
+    /// evicts slow readers as needed.
     ///
     /// # Errors
-    /// [`ApiError::ServerFull`] where others are not taken in time.
+    /// [`ApiError::ServerFull`] if no memory is released in time.
     pub(super) async fn room(&self, tenant: &Tenant, bytes: usize) -> Result<AnswerRoom, ApiError> {
         let units = bytes.div_ceil(UNIT).clamp(1, self.share());
         let until = Instant::now() + self.limits.patience;
@@ -182,7 +181,8 @@ impl Answers {
         })
     }
 
-    /// Ends the answer that is taken most slowly, of one tenant or of whoever holds most.
+    /// Evicts the result with the slowest reader: of tenant `of`, or else of the tenant that holds
+    /// the most memory.
     fn end_the_slowest(&self, of: Option<&Tenant>) {
         let most = {
             let held = locked(&self.held);
@@ -207,7 +207,7 @@ impl Answers {
         }
     }
 
-    /// An answer that was made before.
+    /// A cached result.
     pub(super) fn made(&self, name: &Name) -> Option<Encoded> {
         let kept = locked(&self.kept);
         let found = kept.iter().find(|(known, _)| known == name);
@@ -215,7 +215,7 @@ impl Answers {
         usable.map(|(_, made)| made.clone())
     }
 
-    /// Keeps an answer for whoever asks for it next, in place of the oldest.
+    /// Caches a result, and removes the oldest ones from the cache as needed.
     pub(super) fn keep(&self, name: Name, made: &Encoded) {
         let most = self.units / KEPT * UNIT;
         if made.bytes.len() > most {
@@ -234,30 +234,30 @@ impl Answers {
 }
 
 impl Taking {
-    /// Bytes a second that its reader has taken so far.
+    /// The mean rate at which the client has read so far, bytes per second.
     fn rate(&self) -> f64 {
         let taken = self.bytes.load(Ordering::Relaxed) as f64;
         taken / self.since.elapsed().as_secs_f64().max(1e-3)
     }
 
-    /// So many bytes were taken.
+    /// Records that the client has read `bytes` bytes.
     pub(super) fn took(&self, bytes: usize) {
         self.bytes.fetch_add(bytes as u64, Ordering::Relaxed);
     }
 
-    /// Returns when it has to make room.
+    /// Completes when the result is evicted.
     pub(super) async fn evicted(&self) {
         self.evicted.cancelled().await;
     }
 }
 
 impl AnswerRoom {
-    /// How its answer is taken.
+    /// The read progress of the result.
     pub(super) fn taking(&self) -> &Arc<Taking> {
         &self.taking
     }
 
-    /// Gives back what an answer of `bytes` does not need.
+    /// Reduces the reservation to `bytes` bytes.
     pub(super) fn shrink(&mut self, bytes: usize) {
         let needed = bytes.div_ceil(UNIT).max(1);
         let spare = self.permit.num_permits().saturating_sub(needed);
@@ -277,7 +277,8 @@ impl AnswerRoom {
         }
     }
 
-    /// The bytes of an answer, which keep their room as long as any part of them is held.
+    /// Attaches the reservation to the bytes of the result. It is held as long as any slice of them
+    /// exists.
     pub(super) fn hold(mut self, bytes: Vec<u8>) -> Encoded {
         self.shrink(bytes.len());
         let taking = Arc::clone(&self.taking);
@@ -295,17 +296,17 @@ impl Drop for AnswerRoom {
 }
 
 impl Encoded {
-    /// Its bytes.
+    /// The length, bytes.
     pub(super) fn len(&self) -> usize {
         self.bytes.len()
     }
 
-    /// Its bytes, for whoever writes them on piece by piece.
+    /// The bytes, for a writer that splits them itself.
     pub(super) fn bytes(&self) -> &Bytes {
         &self.bytes
     }
 
-    /// A part of it.
+    /// A slice that shares the memory and the reservation.
     pub(super) fn slice(&self, range: std::ops::Range<usize>) -> Self {
         Self {
             bytes: self.bytes.slice(range),
@@ -313,12 +314,13 @@ impl Encoded {
         }
     }
 
-    /// All of it in pieces, as they are taken; it lets go of all of it when it has to make room.
+    /// A stream of chunks at the rate of the reader. When the result is evicted, the stream
+    /// releases all of its memory and ends with an error.
     pub(super) fn into_pieces(mut self) -> ReceiverStream<Result<Bytes, std::io::Error>> {
         let (pieces, stream) = mpsc::channel::<Result<Bytes, std::io::Error>>(1);
         tokio::spawn(async move {
             while !self.bytes.is_empty() {
-                // A copy: what waits in the connection must not keep the whole.
+                // A copy: a chunk in the connection's buffer must not keep the whole result alive.
                 let length = self.bytes.len().min(PIECE);
                 let piece = Bytes::copy_from_slice(&self.bytes.split_to(length));
                 tokio::select! {
@@ -373,7 +375,7 @@ mod tests {
         assert!(matches!(refused, Err(ApiError::ServerFull(_))));
         let small = answers.room(&a, 400 * KIB).await.expect("what was spare");
         drop((part, small));
-        // One that is larger than all is alone, and not refused for ever.
+        // A request larger than the whole budget is served alone instead of being refused forever.
         drop(answers.room(&a, 1 << 30).await.expect("room"));
         assert!(locked(&answers.held).is_empty());
     }

@@ -1,7 +1,7 @@
-//! Who calls: keys, tenants and roles. One check for every door.
+//! Authentication and authorization: API keys, tenants and roles, for both protocols.
 //!
-//! Keys are kept hashed and compared in constant time. Without keys everybody is the default
-//! tenant and may do everything, which is why such a server listens on loopback alone.
+//! Keys are stored as hashes and compared in constant time. Without any keys every caller is the
+//! default tenant with full rights, so such a server should listen on loopback only.
 
 use constant_time_eq::constant_time_eq_32;
 use serde::{Deserialize, Serialize};
@@ -9,29 +9,29 @@ use serde::{Deserialize, Serialize};
 use super::error::ApiError;
 use crate::job::{Priority, Tenant};
 
-/// What a key may do.
+/// The rights of a key.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Role {
-    /// Look at jobs and fetch results.
+    /// Read jobs and fetch results.
     Read,
-    /// Submit, cancel and requeue too.
+    /// Also submit, cancel and requeue jobs.
     Write,
 }
 
-/// Somebody who has shown a key, or needs none.
+/// An authenticated caller, or any caller of a server without keys.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Caller {
-    /// Whose jobs are seen.
+    /// The tenant. A caller has access to this tenant's jobs only.
     pub tenant: Tenant,
-    /// What may be done.
+    /// The rights of the caller.
     pub role: Role,
-    /// How urgent its jobs may be.
+    /// The highest priority that the caller's jobs may have.
     pub max_priority: Priority,
 }
 
 impl Caller {
-    /// Refuses jobs that are more urgent than this key's may be.
+    /// Refuses a priority above the maximum of this key.
     ///
     /// # Errors
     /// [`ApiError::Priority`].
@@ -43,7 +43,7 @@ impl Caller {
         }
     }
 
-    /// Refuses callers that may only read.
+    /// Refuses callers with read access only.
     ///
     /// # Errors
     /// [`ApiError::Forbidden`].
@@ -56,22 +56,22 @@ impl Caller {
     }
 }
 
-/// The shortest key that is taken, characters.
+/// The minimum length of a key, characters.
 pub const MIN_KEY: usize = 16;
 
-/// A key that cannot be used.
+/// Why a key cannot be used.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidKey {
-    /// It could be guessed.
+    /// It is too short, so it could be guessed.
     #[error("the key of tenant {0} is shorter than {MIN_KEY} characters")]
     Short(Tenant),
-    /// No header could carry it as it is.
+    /// It cannot be sent unchanged in a header.
     #[error(
         "the key of tenant {0} has white space around it, or characters other than printable ASCII: \
          no header carries it"
     )]
     Unsendable(Tenant),
-    /// Two tenants cannot share one.
+    /// The same key was given twice.
     #[error("the key of tenant {0} is given twice")]
     Twice(Tenant),
 }
@@ -83,15 +83,15 @@ pub struct Keys {
 }
 
 impl Keys {
-    /// Takes one more key.
+    /// Adds a key.
     ///
     /// # Errors
-    /// [`InvalidKey`] where it is too short, cannot be sent or is known already.
+    /// [`InvalidKey`] if the key is too short, cannot be sent in a header, or is already present.
     pub fn add(&mut self, key: &str, caller: Caller) -> Result<(), InvalidKey> {
         if key.len() < MIN_KEY {
             return Err(InvalidKey::Short(caller.tenant));
         }
-        // What a header carries as it is: white space around a value is no part of it.
+        // HTTP strips white space around a header value.
         if key.trim() != key || !key.bytes().all(|byte| matches!(byte, b' '..=b'~')) {
             return Err(InvalidKey::Unsendable(caller.tenant));
         }
@@ -110,15 +110,16 @@ impl Keys {
         tenants.any(|tenant| Some(tenant) != first)
     }
 
-    /// Whether anybody may do anything.
+    /// Whether the server has no keys, so that every request is allowed.
     pub fn is_open(&self) -> bool {
         self.known.is_empty()
     }
 
-    /// The caller whose key a request shows: `authorization` is that header's value, if any.
+    /// The caller that a request identifies. `authorization` is the value of its `Authorization`
+    /// header.
     ///
     /// # Errors
-    /// [`ApiError::Unauthenticated`] where keys are needed and this is none of them.
+    /// [`ApiError::Unauthenticated`] if the server has keys and the header has none of them.
     pub fn caller(&self, authorization: Option<&str>) -> Result<Caller, ApiError> {
         if self.is_open() {
             return Ok(Caller {
@@ -132,7 +133,7 @@ impl Keys {
             scheme.eq_ignore_ascii_case("bearer").then_some(key.trim())
         });
         let hash = *blake3::hash(shown.unwrap_or_default().as_bytes()).as_bytes();
-        // All keys are compared, so that the time tells nothing of which one matched.
+        // All keys are compared, so the response time does not depend on the key that matches.
         let mut found = None;
         for (known, caller) in &self.known {
             if constant_time_eq_32(known, &hash) {

@@ -1,22 +1,23 @@
-//! Files to clouds, and flow to files: which formats the doors speak.
+//! The file formats of the API: decoding of clouds and encoding of flow.
 //!
-//! It must not know HTTP's or gRPC's types; media types are text here.
+//! Independent of HTTP and gRPC types; media types are plain text here.
 
 use super::error::ApiError;
-use crate::formats::{self, FlowFormat, FlowTable, MAX_COORDINATE_M};
+use crate::formats;
+use crate::formats::{FlowFormat, FlowTable, MAX_COORDINATE_M};
 use crate::job::Report;
 use crate::payload::{StoredCloud, StoredFlow};
 
-/// A format that flow is answered in.
+/// A format for the encoded flow.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum AnswerFormat {
     /// One of the file formats.
     File(FlowFormat),
-    /// Packed little-endian float32, x y z: nothing but the displacements.
+    /// Packed little-endian float32 displacements, x y z, without a header.
     Packed,
 }
 
-/// Every format with its media type and its name in an archive; the first is the default.
+/// All formats with their media type and file extension. The first is the default.
 pub(super) const ANSWER_FORMATS: [(AnswerFormat, &str, &str); 7] = [
     (
         AnswerFormat::File(FlowFormat::Npz),
@@ -57,34 +58,35 @@ impl AnswerFormat {
         found.unwrap_or(&ANSWER_FORMATS[0])
     }
 
-    /// Its media type.
+    /// The media type.
     pub(super) fn media_type(self) -> &'static str {
         self.entry().1
     }
 
-    /// The ending of a file in it.
+    /// The file extension, without the dot.
     pub(super) fn ending(self) -> &'static str {
         self.entry().2
     }
 
-    /// Whether the source's points go into it.
+    /// Whether the format contains the points of the source sweep.
     pub(super) fn needs_points(self) -> bool {
         matches!(self, Self::File(FlowFormat::Ply | FlowFormat::Pcd))
     }
 
-    /// The format that an `Accept` header asks for, by its weights; npz where it does not mind.
+    /// Selects the format for an `Accept` header by its quality weights. Without a preference it is
+    /// npz.
     ///
     /// # Errors
-    /// [`ApiError::NotAcceptable`], which lists what there is.
+    /// [`ApiError::NotAcceptable`], with a list of the formats.
     pub(super) fn accepted(accept: Option<&str>) -> Result<Self, ApiError> {
         accepted(accept, &ANSWER_FORMATS, "flow")
     }
 
-    /// Some flow in this format. `points` are the source's where [`Self::needs_points`], and may be
-    /// empty otherwise; `job` is its job's name.
+    /// Encodes a flow. `points` are the points of the source sweep if [`Self::needs_points`], and
+    /// may be empty otherwise. `job` is the job id.
     ///
     /// # Errors
-    /// [`ApiError::Internal`] where the stored parts do not belong together.
+    /// [`ApiError::Internal`] if the stored arrays are inconsistent or the encoder fails.
     pub(super) fn encode(
         self,
         flow: &StoredFlow,
@@ -121,11 +123,11 @@ impl AnswerFormat {
     }
 }
 
-/// Of some formats with their media types, the one that an `Accept` header asks for, by its
-/// weights; the first where it does not mind. `what` it is that comes in them.
+/// Selects one of `formats` (value, media type, file extension) for an `Accept` header by its
+/// quality weights. Without a preference it is the first. `what` is the noun for the error message.
 ///
 /// # Errors
-/// [`ApiError::NotAcceptable`], which lists what there is.
+/// [`ApiError::NotAcceptable`], with a list of the formats.
 pub(super) fn accepted<F: Copy>(
     accept: Option<&str>,
     formats: &[(F, &str, &str)],
@@ -154,7 +156,7 @@ pub(super) fn accepted<F: Copy>(
     })
 }
 
-/// The JSON form carries the report's fields beside the flow.
+/// Adds the fields of the report and the job id to the JSON form of a flow.
 fn with_report(json: &[u8], report: &Report, job: &str) -> Result<Vec<u8>, ApiError> {
     let rest = json.strip_prefix(b"{").ok_or(ApiError::Internal)?;
     let mut head = serde_json::to_value(report).map_err(ApiError::internal)?;
@@ -168,10 +170,11 @@ fn with_report(json: &[u8], report: &Report, job: &str) -> Result<Vec<u8>, ApiEr
     Ok(bytes)
 }
 
-/// Bytes that the clouds of a file take when they are read: a point, and a mask of it.
+/// Upper bound on the memory of the decoded clouds of a file: 12 bytes for a point and one for its
+/// mask, for each row that the file declares.
 ///
 /// # Errors
-/// [`ApiError::BadInput`] or [`ApiError::TooLarge`], which name the part and what is wrong in it.
+/// [`ApiError::BadInput`] or [`ApiError::TooLarge`], with the name of the part and the defect.
 pub(super) fn unfolded_bytes(
     part: &str,
     bytes: &[u8],
@@ -180,14 +183,14 @@ pub(super) fn unfolded_bytes(
 ) -> Result<u64, ApiError> {
     const ROW: u64 = size_of::<crate::flow::Point>() as u64 + 1;
     let rows = formats::declared_rows(bytes, name).map_err(|error| in_part(part, error))?;
-    // Of several arrays in one file no more are read than two clouds and their masks.
+    // A file with several arrays is read up to two clouds and their two masks.
     Ok(rows.min(4 * most) as u64 * ROW)
 }
 
-/// One cloud of any format, of at most `most` points.
+/// Decodes one cloud in any supported format, with at most `most` points.
 ///
 /// # Errors
-/// [`ApiError::BadInput`] or [`ApiError::TooLarge`], which name the part and what is wrong in it.
+/// [`ApiError::BadInput`] or [`ApiError::TooLarge`], with the name of the part and the defect.
 pub(super) fn read_cloud(
     part: &str,
     bytes: &[u8],
@@ -202,8 +205,8 @@ pub(super) fn read_cloud(
     })
 }
 
-/// Two clouds of one `.npz`, of at most `most` points each, with their ground masks where they are
-/// there.
+/// Decodes the two clouds of an `.npz` with at most `most` points each, and their ground masks if
+/// present.
 ///
 /// # Errors
 /// As for [`read_cloud`].
@@ -229,10 +232,10 @@ pub(super) fn read_pair(
     ])
 }
 
-/// Refuses raw coordinates that a file with them would be refused for.
+/// Refuses raw coordinates that are not finite or too large, as the file decoders do.
 ///
 /// # Errors
-/// [`ApiError::BadInput`], which names the row and the value.
+/// [`ApiError::BadInput`], with the row and the value.
 pub(super) fn check_points(part: &str, points: &[crate::flow::Point]) -> Result<(), ApiError> {
     let usable = |value: &f32| value.is_finite() && f64::from(value.abs()) <= MAX_COORDINATE_M;
     let broken = points.iter().position(|point| !point.iter().all(usable));

@@ -1,6 +1,7 @@
-//! A sequence's dense cloud: what it takes before it is accepted, and the cloud once it is there.
+//! Dense clouds of sequences: their cost before a job is accepted, and reading and encoding of the
+//! result.
 //!
-//! It must not know HTTP's or gRPC's types, nor how points are carried.
+//! Independent of HTTP and gRPC types, and of the densification algorithm.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -14,36 +15,40 @@ use crate::cost::CostModel;
 use crate::flow::densify::Plan;
 use crate::flow::{DenseCloud, window};
 use crate::formats::{DENSE_FORMATS, DenseFormat, write_dense};
-use crate::job::{DenseReport, Densify, InvalidOptions, Job, JobOptions, Kind, LaterChoice};
+use crate::job::{DenseReport, Densify, InvalidOptions, Job, JobOptions, Kind, LaterSweepsChoice};
 use crate::payload::StoredDense;
 use crate::queue::PairOf;
 
-/// Bytes that are held for a point while it is carried and written, at most: itself in its sweep and
-/// in the cloud, its masks, where it was before a step, the cloud's bytes, and its share of a field
-/// of objects: itself in it, read and unpacked.
+/// Upper bound on the memory per point while a dense cloud is computed and written, bytes: the
+/// point in its sweep and in the cloud, its masks, its position before a step, its encoded form,
+/// and its share of an object motion field (its position, and the field as read and as decoded).
 const POINT_BYTES: usize = 240;
 
-/// Bytes that are held for a field of a network: read, and unpacked.
+/// Memory for the field of one network, as read and as decoded, bytes.
 const FIELD_BYTES: usize = 1 << 20;
 
-/// How often an inverse asks its field about a point, usually.
+/// Typical number of field evaluations per point and step when a forward field is inverted.
 const CORRECTIONS: f64 = 5.0;
 
-/// What a dense cloud asks for besides the pairs that go forward.
+/// The work for a dense cloud in addition to the forward pairs.
 pub(super) struct Closing {
-    /// The pairs that go back in time, in the order of their turns.
+    /// The pairs backward in time, in the order of computation.
     pub(super) back: Vec<PairOf>,
-    /// Nominal seconds of carrying all points.
+    /// Nominal seconds for the advection of all points.
     pub(super) nominal_seconds: f64,
 }
 
 impl Closing {
-    /// What a sequence whose sweeps have `points` points asks for.
+    /// The additional work for a sequence whose sweep `i` has `points[i]` points. With `chained`
+    /// each backward pair starts from the field of the one before; `sweeps` is the window size.
+    ///
+    /// # Errors
+    /// [`ApiError::InvalidOptions`] if the options do not fit the number of sweeps.
     pub(super) fn of(
         asked: &Densify,
         points: &[usize],
-        goes_on: bool,
-        frames: usize,
+        chained: bool,
+        sweeps: usize,
     ) -> Result<Self, ApiError> {
         let plan = asked.plan(points.len()).map_err(InvalidOptions::Densify)?;
         let back = plan
@@ -53,8 +58,8 @@ impl Closing {
         let back = back.enumerate().map(|(turn, edge)| PairOf {
             place: edge.target as u32,
             backward: true,
-            sees: PairOf::seen(window_back(edge.target, points.len(), frames)),
-            follows: goes_on && turn > 0,
+            sees: PairOf::seen(window_back(edge.target, points.len(), sweeps)),
+            follows: chained && turn > 0,
         });
         Ok(Self {
             back: back.collect(),
@@ -63,18 +68,20 @@ impl Closing {
     }
 }
 
-/// The sweeps that the pair from sweep `place + 1` back to `place` is found from: its window in the
-/// sequence that runs backward.
-fn window_back(place: usize, sweeps: usize, frames: usize) -> Range<usize> {
-    let Range { start, end } = window(sweeps - 2 - place, sweeps, frames);
-    sweeps - end..sweeps - start
+/// The window of the pair from sweep `place + 1` back to sweep `place`: the window in the
+/// time-reversed sequence, as a range of sweep indices. `count` is the number of sweeps, `sweeps`
+/// the window size.
+fn window_back(place: usize, count: usize, sweeps: usize) -> Range<usize> {
+    let Range { start, end } = window(count - 2 - place, count, sweeps);
+    count - end..count - start
 }
 
-/// How often fields are asked about a point until all are in the frame.
+/// The number of field evaluations until all points are at the reference time.
 fn questions(asked: &Densify, plan: &Plan, points: &[usize]) -> f64 {
     let of_sweep = |(place, &points): (usize, &usize)| {
         let steps = (plan.into() - place as f64).abs().ceil();
-        let inverted = asked.later == LaterChoice::Inverse && place as f64 > plan.into();
+        let inverted =
+            asked.later_sweeps == LaterSweepsChoice::Inverse && place as f64 > plan.into();
         let each = if inverted {
             CORRECTIONS
         } else {
@@ -86,7 +93,8 @@ fn questions(asked: &Densify, plan: &Plan, points: &[usize]) -> f64 {
 }
 
 impl Admission {
-    /// Refuses sweeps that cannot be carried into one frame here.
+    /// Refuses a sequence whose dense cloud exceeds the memory limit. `points` holds the number of
+    /// points of each sweep.
     ///
     /// # Errors
     /// [`ApiError::TooLarge`].
@@ -105,32 +113,32 @@ impl Admission {
     }
 }
 
-/// Whether a job's result is a dense cloud.
+/// Whether the result of a job is a dense cloud.
 pub(super) fn is_dense(job: &Job) -> bool {
     let options = || JobOptions::from_json(job.options.as_bytes()).ok();
     job.kind == Kind::Sequence && options().is_some_and(|options| options.densify.is_some())
 }
 
-/// The format of dense clouds that an `Accept` header asks for; npz where it does not mind.
+/// Selects the format of a dense cloud for an `Accept` header. Without a preference it is npz.
 ///
 /// # Errors
-/// [`ApiError::NotAcceptable`], which lists what there is.
+/// [`ApiError::NotAcceptable`], with a list of the formats.
 pub(super) fn accepted(accept: Option<&str>) -> Result<DenseFormat, ApiError> {
     codec::accepted(accept, &DENSE_FORMATS, "a dense cloud")
 }
 
 impl Service {
-    /// How a sequence's dense cloud was made, where it is there.
+    /// The report on a sequence's dense cloud.
     ///
     /// # Errors
-    /// [`ApiError::NotEnded`], or how the sequence ended instead.
+    /// [`ApiError::NotEnded`], or the error that describes how the sequence ended.
     pub(super) fn dense_report(&self, job: &Job) -> Result<DenseReport, ApiError> {
         Self::check_success(job)?;
         let report = job.report.as_deref().unwrap_or_default();
         serde_json::from_str(report).map_err(ApiError::internal)
     }
 
-    /// A sequence's dense cloud, and the room that it takes.
+    /// A sequence's dense cloud, and the memory reservation for it.
     ///
     /// # Errors
     /// As for [`Service::dense_report`] and [`Service::room_for_result`].
@@ -150,8 +158,8 @@ impl Service {
         Ok(cloud)
     }
 
-    /// A sequence's dense cloud in a format; as it was made for the last who asked, where it still
-    /// is.
+    /// Encodes a sequence's dense cloud in a format. Returns the cached result of an earlier
+    /// request if it is still present.
     ///
     /// # Errors
     /// As for [`Service::dense_cloud`].
@@ -161,7 +169,7 @@ impl Service {
         format: DenseFormat,
     ) -> Result<Encoded, ApiError> {
         let name = (job.id, job.attempt, format.ending());
-        // One at a time: a cloud is as large as all of its sweeps.
+        // One at a time: a cloud is as large as all of its sweeps together.
         if let Some(made) = self.answers.made(&name) {
             return Ok(made);
         }

@@ -1,11 +1,13 @@
-//! A job that is being put together: clouds come one by one and go straight into store.
+//! Drafts: jobs that are assembled from clouds that arrive one by one. Each cloud is written to the
+//! store as soon as it arrives.
 //!
-//! Nothing is promised before [`Draft::submit`]; a draft that is dropped leaves nothing behind.
+//! A draft becomes a job with [`Draft::submit`]. A draft that is dropped before that removes its
+//! blobs.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::admission::{Asked, Promise, Reservation};
+use super::admission::{Asked, Durability, Reservation};
 use super::auth::Caller;
 use super::dense::Closing;
 use super::error::ApiError;
@@ -18,33 +20,34 @@ use crate::flow::{self, Cost, Ground, Sweep, window};
 use crate::job::{Job, JobId, JobOptions, Kind};
 use crate::payload::StoredCloud;
 use crate::queue::{Idempotency, PairOf, Submission, Submitted};
-use crate::storage::{Blob, BlobError, Sync};
+use crate::storage::{Blob, BlobError, Fsync};
 use bytes::Bytes;
 use tokio::task::JoinHandle;
 
-/// What is asked of a job before its clouds are there.
+/// The parameters of a job, without its clouds.
 #[derive(Clone, Debug)]
 pub(super) struct Request {
-    /// How the flow is found.
+    /// The options of the estimate.
     pub options: JobOptions,
-    /// Who waits.
-    pub promise: Promise,
-    /// Makes a repeated submission find the first one.
+    /// Whether the caller waits for the result.
+    pub durability: Durability,
+    /// The idempotency key: a repeated submission with the same key finds the job of the first one.
     pub idempotency_key: Option<String>,
-    /// When it arrived: deadlines count from here.
+    /// The arrival time of the request. Deadlines count from here.
     pub arrived: Instant,
-    /// The call's own deadline, from its arrival, if it has one.
+    /// The deadline of the call itself, relative to its arrival, if there is one.
     pub time_left: Option<Duration>,
-    /// Its place in a chain of pairs that come one by one, where it is of one.
+    /// The position in a chain of pairs that are submitted one by one. `None` outside of a chain.
     pub link: Option<Link>,
-    /// Which of the clouds that come a pair is of, where it is not the first two.
+    /// The pair and its window within the clouds that follow. [`PairOf::ALONE`] for the first two
+    /// clouds.
     pub pair: PairOf,
 }
 
-/// A pair's place in a chain.
+/// The position of a pair in a chain.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Link {
-    /// The pair before, where there is one.
+    /// The pair before it, if there is one.
     pub after: Option<JobId>,
 }
 
@@ -52,36 +55,40 @@ pub(super) struct Link {
 pub(super) struct Accepted {
     /// The job.
     pub(super) job: Arc<Job>,
-    /// Whether it is new: not one that an idempotency key has found.
+    /// Whether the job is new. False if an idempotency key has found an existing job.
     pub(super) new: bool,
-    /// Cancels a new job that somebody waits for, unless it is let go.
+    /// The registration of the caller as a waiter, if the job depends on its callers. Dropping it
+    /// as the last one cancels the job.
     pub(super) awaited: Option<Awaited>,
 }
 
-/// When a request arrived.
+/// The arrival time of a request: a request extension.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Arrived(pub(super) Instant);
 
-/// A job that is being put together.
+/// A job that is being assembled.
 pub(super) struct Draft {
     service: Arc<Service>,
     caller: Caller,
     request: Request,
     id: JobId,
-    frames: u32,
-    /// Points of each cloud.
+    sweeps: u32,
+    /// The number of points of each cloud.
     points: Vec<usize>,
-    /// The last cloud, and the room that it takes until the next one is there.
+    /// The latest cloud, and its memory reservation, which is held until the next cloud has
+    /// arrived.
     last: Option<(Arc<StoredCloud>, Option<Room>)>,
-    /// What each two clouds that follow each other cost alone, where they are a pair.
+    /// The cost of each two consecutive clouds without neighbor sweeps. `None` where they are not a
+    /// pair of the job.
     prices: Vec<Option<Cost>>,
     fingerprint: blake3::Hasher,
-    /// A cloud that is on its way into store.
+    /// The write of a cloud to the store that is in progress.
     writing: Option<JoinHandle<Result<(), BlobError>>>,
     submitted: bool,
 }
 
-/// The cloud, with the ground that its pairs would find.
+/// Adds the ground mask to a cloud if the options require ground segmentation and the cloud has no
+/// mask.
 fn with_ground(cloud: Arc<StoredCloud>, options: &JobOptions) -> Arc<StoredCloud> {
     let options = options.solver_options(cloud.points.len());
     if cloud.ground.is_some() || options.ground != Ground::Auto {
@@ -93,11 +100,11 @@ fn with_ground(cloud: Arc<StoredCloud>, options: &JobOptions) -> Arc<StoredCloud
 }
 
 impl Draft {
-    /// Begins a job whose clouds will follow.
+    /// Begins a draft without clouds.
     ///
     /// # Errors
     /// [`ApiError::Forbidden`], [`ApiError::Draining`], [`ApiError::InvalidOptions`],
-    /// [`ApiError::NoDevice`] or [`ApiError::BadRequest`].
+    /// [`ApiError::Priority`], [`ApiError::NoDevice`] or [`ApiError::BadRequest`].
     pub(super) fn begin(
         service: &Arc<Service>,
         caller: Caller,
@@ -124,7 +131,7 @@ impl Draft {
             caller,
             request,
             id: JobId::fresh(),
-            frames: 0,
+            sweeps: 0,
             points: Vec::new(),
             last: None,
             prices: Vec::new(),
@@ -134,17 +141,18 @@ impl Draft {
         })
     }
 
-    /// Clouds so far.
-    pub(super) fn frames(&self) -> u32 {
-        self.frames
+    /// The number of clouds so far.
+    pub(super) fn sweeps(&self) -> u32 {
+        self.sweeps
     }
 
-    /// Takes the next cloud, finds its ground where that is wanted and not known, prices it with the
-    /// one before, and puts it in store. Gives it back as it lies there: every attempt at every pair
-    /// that sees it is spared the search.
+    /// Adds the next cloud: segments the ground if needed, prices the pair with the cloud before,
+    /// and writes the cloud to the store. Returns the cloud with its ground mask, so that further
+    /// pairs that use the sweep do not repeat the segmentation. `room` is the memory reservation of
+    /// the cloud.
     ///
     /// # Errors
-    /// [`ApiError`] where the pair cannot be solved here, or the store fails.
+    /// [`ApiError`] if a limit is exceeded, the pair cannot be solved, or the store fails.
     pub(super) async fn push(
         &mut self,
         cloud: impl Into<Arc<StoredCloud>>,
@@ -154,10 +162,10 @@ impl Draft {
         let service = Arc::clone(&self.service);
         service.admission.check_points(cloud.points.len())?;
         service.check_disk()?;
-        let limit = service.limits.max_frames;
-        if self.frames >= limit && self.request.pair == PairOf::ALONE {
+        let limit = service.limits.max_sweeps;
+        if self.sweeps >= limit && self.request.pair == PairOf::ALONE {
             return Err(ApiError::TooLarge(format!(
-                "a sequence has more than the {limit} frames that this server takes"
+                "a sequence has more than the {limit} sweeps that this server takes"
             )));
         }
         self.points.push(cloud.points.len());
@@ -167,13 +175,14 @@ impl Draft {
         let (before, _room_before) = self.last.take().unzip();
         let options = self.request.options.clone();
         let after = self.request.link.and_then(|link| link.after);
-        let goes_on = options.goes_on() && (self.frames > 1 || after.is_some());
+        let chained = options.chained() && (self.sweeps > 1 || after.is_some());
         let pair = self.request.pair;
-        let is_pair = pair == PairOf::ALONE || self.frames == pair.place + 1;
+        let is_pair = pair == PairOf::ALONE || self.sweeps == pair.place + 1;
         let work = {
             let service = Arc::clone(&service);
             move || {
-                // As it came: what is found of it is no part of what was asked.
+                // The fingerprint covers the cloud as it was sent, without the computed ground
+                // mask.
                 let mut bytes = cloud.to_bytes();
                 let asked = blake3::hash(&bytes);
                 let known = cloud.ground.is_some();
@@ -183,56 +192,57 @@ impl Draft {
                 }
                 let price = before.filter(|_| is_pair).map(|before| {
                     let admission = &service.admission;
-                    admission.price(&before, &cloud, &options, goes_on)
+                    admission.price(&before, &cloud, &options, chained)
                 });
                 Ok((price.transpose()?, asked, bytes, cloud))
             }
         };
         let (price, asked, bytes, cloud) = service.compute(&self.caller.tenant, work).await?;
         self.last = Some((Arc::clone(&cloud), room));
-        if self.frames > 0 {
+        if self.sweeps > 0 {
             self.prices.push(price);
         }
         self.fingerprint.update(asked.as_bytes());
-        let sync = match self.request.promise {
-            Promise::Durable => Sync::Yes,
-            Promise::WhileAwaited => Sync::No,
+        let sync = match self.request.durability {
+            Durability::Durable => Fsync::Yes,
+            Durability::Ephemeral => Fsync::No,
         };
-        let blob = Blob::Frame(self.frames);
-        // The write runs in its own task: when the client disconnects, the write completes first and
-        // the draft's files are removed after it.
+        let blob = Blob::Sweep(self.sweeps);
+        // The write runs in its own task: when the client disconnects, the write completes first,
+        // and the draft's files are removed after it.
         let (blobs, id) = (service.blobs.clone(), self.id);
         let writing = async move { blobs.put(id, blob, Bytes::from(bytes), sync).await };
         let writing = self.writing.insert(tokio::spawn(writing));
         let written = writing.await.map_err(ApiError::internal);
         self.writing = None;
         written??;
-        self.frames += 1;
+        self.sweeps += 1;
         Ok(cloud)
     }
 
-    /// Submits the job: a pair for two clouds and `kind` pair, else a sequence.
+    /// Submits the job: a pair of two clouds if `kind` is a pair, otherwise a sequence.
     ///
-    /// A caller that goes away in the middle leaves nothing half done: the job is accepted with its
-    /// clouds, or neither is there; and what was only for that caller is cancelled.
+    /// The commit runs in its own task, so a client that disconnects cannot leave a partial state.
+    /// Either the job is accepted with its clouds, or neither is kept. A job that depends on its
+    /// caller is cancelled afterwards.
     ///
     /// # Errors
-    /// [`ApiError`] where clouds are missing, nothing more is accepted, or the store fails.
+    /// [`ApiError`] if clouds are missing, admission control refuses the job, or the store fails.
     pub(super) async fn submit(self, kind: Kind) -> Result<Accepted, ApiError> {
         if kind == Kind::Pair {
             self.request.options.check_for_pairs()?;
         } else {
             let options = &self.request.options;
-            options.check_for_sequence(self.frames as usize)?;
+            options.check_for_sequence(self.sweeps as usize)?;
         }
-        match (kind, self.frames) {
+        match (kind, self.sweeps) {
             (Kind::Pair, clouds) if clouds == self.request.pair.sees[1] => {}
             (Kind::Sequence, 2..) => {}
             (Kind::Pair, _) => {
                 return Err(ApiError::BadRequest("a pair is two clouds".to_owned()));
             }
             (Kind::Sequence, _) => {
-                let text = "a sequence is at least two frames";
+                let text = "a sequence is at least two sweeps";
                 return Err(ApiError::BadRequest(text.to_owned()));
             }
         }
@@ -247,9 +257,10 @@ impl Draft {
         submission: Submission,
         _place: Reservation,
     ) -> Result<Accepted, ApiError> {
-        // A job that is found may be given up at the same moment: then its key is free again.
+        // The job that an idempotency key finds may be cancelled at the same time. Then its key is
+        // free again, and the submission is repeated.
         const TRIES: u32 = 5;
-        let durable = self.request.promise == Promise::Durable;
+        let durable = self.request.durability == Durability::Durable;
         for _ in 0..TRIES {
             let (mut job, new) = match self.service.queue.submit(submission.clone()).await? {
                 Submitted::New(job) => {
@@ -288,39 +299,39 @@ impl Draft {
             priority: self.request.options.priority,
             device: self.request.options.device_kind(),
             nominal_seconds: submission.cost_seconds * pairs + closing,
-            promise: self.request.promise,
+            durability: self.request.durability,
         })
     }
 
-    /// The pairs of a sequence that go forward, in the order of their turns.
+    /// The forward pairs of the sequence, in the order of computation.
     fn pairs(&self) -> Vec<PairOf> {
         let options = &self.request.options;
-        let (goes_on, frames) = (options.goes_on(), options.frames());
-        let forward = (0..self.frames - 1).map(|place| PairOf {
+        let (chained, sweeps) = (options.chained(), options.sweeps());
+        let forward = (0..self.sweeps - 1).map(|place| PairOf {
             place,
             backward: false,
-            sees: PairOf::seen(window(place as usize, self.frames as usize, frames)),
-            follows: goes_on && place > 0,
+            sees: PairOf::seen(window(place as usize, self.sweeps as usize, sweeps)),
+            follows: chained && place > 0,
         });
         forward.collect()
     }
 
-    /// Nominal seconds of some pairs that go forward, with all that they see.
+    /// Nominal seconds of forward pairs, including their neighbor sweeps.
     ///
     /// # Errors
-    /// [`ApiError::TooLarge`] where one needs more memory than a pair may take.
+    /// [`ApiError::TooLarge`] if a pair exceeds the memory limit.
     fn nominal_seconds(&self, pairs: &[PairOf]) -> Result<f64, ApiError> {
         let mut seconds = 0.0;
         for pair in pairs {
             let Some(Some(price)) = self.prices.get(pair.place as usize) else {
                 continue;
             };
-            let around = (pair.sees[0]..pair.sees[1])
+            let neighbors = (pair.sees[0]..pair.sees[1])
                 .filter(|&place| place != pair.place && place != pair.place + 1)
                 .map(|place| flow::neighbor_cost(self.points[place as usize]));
-            let price = around.fold(*price, |price, around| Cost {
-                bytes: price.bytes + around.bytes,
-                multiply_adds: price.multiply_adds + around.multiply_adds,
+            let price = neighbors.fold(*price, |price, neighbor| Cost {
+                bytes: price.bytes + neighbor.bytes,
+                multiply_adds: price.multiply_adds + neighbor.multiply_adds,
                 ..price
             });
             self.service.admission.check_bytes(&price)?;
@@ -329,7 +340,8 @@ impl Draft {
         Ok(seconds)
     }
 
-    /// Of what was asked: options, clouds, and whether they are a pair or a sequence.
+    /// The fingerprint of the submission for its idempotency key: options, clouds, and pair or
+    /// sequence.
     fn fingerprint(&self, kind: Kind) -> [u8; 32] {
         let mut fingerprint = self.fingerprint.clone();
         fingerprint.update(match kind {
@@ -352,8 +364,8 @@ impl Draft {
         let mut closing_seconds = None;
         if let Some(densify) = &self.request.options.densify {
             let options = &self.request.options;
-            let (goes_on, frames) = (options.goes_on(), options.frames());
-            let closing = Closing::of(densify, &self.points, goes_on, frames)?;
+            let (chained, sweeps) = (options.chained(), options.sweeps());
+            let closing = Closing::of(densify, &self.points, chained, sweeps)?;
             pairs.extend(closing.back);
             closing_seconds = Some(closing.nominal_seconds);
         }
@@ -373,7 +385,7 @@ impl Draft {
             pairs,
             closing_seconds,
             after: link.and_then(|link| link.after),
-            followed: link.is_some(),
+            has_dependents: link.is_some(),
             priority: options.priority,
             device: options.device_kind(),
             options: options.to_json(),
@@ -382,7 +394,7 @@ impl Draft {
                 key,
                 fingerprint: self.fingerprint(kind),
             }),
-            durable: self.request.promise == Promise::Durable,
+            durable: self.request.durability == Durability::Durable,
         })
     }
 }
@@ -390,7 +402,7 @@ impl Draft {
 impl Drop for Draft {
     fn drop(&mut self) {
         let writing = self.writing.take();
-        if self.submitted || (self.frames == 0 && writing.is_none()) {
+        if self.submitted || (self.sweeps == 0 && writing.is_none()) {
             return;
         }
         let (service, id) = (Arc::clone(&self.service), self.id);
@@ -414,7 +426,7 @@ mod tests {
             azimuth_steps: 300,
             ..StreetOptions::default()
         };
-        let sweep = Street::new(&street).and_then(|street| street.frame(0));
+        let sweep = Street::new(&street).and_then(|street| street.sweep(0));
         let points = sweep.expect("a sweep").points;
         let options = |json: &str| JobOptions::from_json(json.as_bytes()).expect("good options");
         let stored = |ground: Option<Vec<bool>>, json: &str| {
@@ -432,7 +444,7 @@ mod tests {
             let found = stored(None, json);
             assert_eq!(found.is_some(), json == "{}", "{json}");
         }
-        let near = stored(None, r#"{"range_m": 15}"#).expect("found");
+        let near = stored(None, r#"{"crop_m": 15}"#).expect("found");
         let all = stored(None, "{}").expect("found");
         let ground = |mask: &[bool]| mask.iter().filter(|&&ground| ground).count();
         assert!(0 < ground(&near) && ground(&near) < ground(&all));

@@ -1,6 +1,6 @@
-//! Every way in which a request is refused, and what each door says then: one table.
+//! All errors of the API, and one table that maps them to HTTP and gRPC statuses.
 //!
-//! Status codes are here and nowhere else.
+//! Status codes of errors are defined here only.
 
 use std::time::Duration;
 
@@ -10,118 +10,121 @@ use crate::job::{DeviceKind, InvalidId, InvalidOptions, JobError, JobId, Priorit
 use crate::queue::QueueError;
 use crate::storage::BlobError;
 
-/// Why a request was refused, or its job gave no flow.
+/// Why a request was refused, or why its job has no result.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ApiError {
-    /// The request is not what the contract asks for.
+    /// The request is malformed or violates the API.
     #[error("{0}")]
     BadRequest(String),
-    /// An option is unknown or makes no sense.
+    /// An option is unknown or has an invalid value.
     #[error("{0}")]
     InvalidOptions(String),
-    /// A file cannot be read, or a pair cannot be solved.
+    /// A file cannot be decoded, or a pair cannot be solved.
     #[error("{0}")]
     BadInput(String),
-    /// More bytes, points or memory than is taken.
+    /// The request exceeds a limit on bytes, points or memory.
     #[error("{0}")]
     TooLarge(String),
-    /// This server has no device of the kind that the job is for.
+    /// The server has no device of the kind that the job requires.
     #[error("this server has no {}: leave device out, or ask another server", .0.name())]
     NoDevice(DeviceKind),
-    /// The body came too slowly.
+    /// The request body arrived too slowly.
     #[error("the request's body came too slowly")]
     TooSlow,
-    /// An answer was taken so slowly that it had to make room for others.
+    /// The client read the response so slowly that it was evicted.
     #[error("the answer was taken too slowly, and others needed its room: fetch the rest of it")]
     TakenTooSlowly,
-    /// No key, or one that is not known.
+    /// The key is missing or unknown.
     #[error("a valid key is needed: send Authorization: Bearer KEY")]
     Unauthenticated,
-    /// The key may not do this.
+    /// The key has read access only.
     #[error("this key may only read")]
     Forbidden,
-    /// The key may not ask for so urgent a job.
+    /// The requested priority is above the maximum of the key, which is given.
     #[error("this key's jobs may be of priority {} at most", .0.name())]
     Priority(Priority),
-    /// A page of another site has made a browser call a server without keys.
+    /// A request to a server without keys, made by a browser for a page of another site.
     #[error(
         "this server has no keys and is for this machine alone: call it as localhost, without a \
          foreign Origin, or name the host in its configuration (allowed_hosts)"
     )]
     ForeignSite,
-    /// No such job, or it is somebody else's.
+    /// There is no such job, or it belongs to another tenant.
     #[error("no job has this name")]
     NotFound,
-    /// No such route.
+    /// There is no such route.
     #[error("there is nothing here; GET /docs lists what there is")]
     NoRoute,
-    /// The route knows other methods.
+    /// The route does not support this method.
     #[error("this route does not know that method")]
     Method,
-    /// No format that is asked for is known.
+    /// None of the accepted formats is available.
     #[error("{0}")]
     NotAcceptable(String),
-    /// The body's type is not taken.
+    /// The media type or encoding of the body is not supported.
     #[error("{0}")]
     UnsupportedMedia(String),
-    /// The range lies outside the result.
+    /// The range is not satisfiable. The length of the result in bytes is given.
     #[error("the range lies outside the result's {0} bytes")]
     Range(u64),
-    /// The key was used for another payload.
+    /// The idempotency key was already used with another payload, by the given job.
     #[error(
         "the idempotency key was used with another payload; a retry is safe only with the same"
     )]
     KeyReused(JobId),
-    /// It has no result yet.
+    /// The job has no result yet.
     #[error("the job has not ended; GET it with ?wait=30 to wait for it")]
     NotEnded(JobId),
-    /// It ended without a result.
+    /// The job failed.
     #[error("the job failed: {}", .1.message)]
     JobFailed(JobId, JobError),
-    /// Its deadline passed before a device was free.
+    /// The deadline passed while the job was queued. Reported to a caller that waits for the
+    /// result.
     #[error("the deadline passed before a device was free")]
     Expired(JobId),
-    /// Its deadline passed before a device was free, and that stays so.
+    /// The job expired earlier: its deadline passed while it was queued. Reported when its result
+    /// is fetched. Only a requeue runs it again.
     #[error("the job has expired: POST its requeue to have it done after all")]
     HasExpired(JobId),
-    /// Somebody cancelled it.
+    /// The job was cancelled.
     #[error("the job was cancelled")]
     Cancelled(JobId),
-    /// The tenant has as much waiting as it may have.
+    /// The backlog of the tenant is at its limit. The retry delay is given.
     #[error("this tenant has as much waiting as it may; try again in {} s", .0.as_secs())]
     TenantLimit(Duration),
-    /// The server has as much waiting as it may have.
+    /// The server is at a limit. The retry delay is given.
     #[error("the server is full; try again in {} s", .0.as_secs())]
     ServerFull(Duration),
     /// The disk is nearly full.
     #[error("the server's disk is nearly full; fetch and forget results, or ask its operator")]
     DiskFull,
-    /// The server's store does not work at the moment; the log says why.
+    /// The store has failed. The log has the reason.
     #[error("the server's store does not work at the moment; try again")]
     StoreUnavailable,
-    /// The job's result, or what it was found from, lies no more where it was put.
+    /// The job's result, or an input that is needed to encode it, is missing from the store.
     #[error("the job's result is lost; POST its requeue to find it again")]
     ResultLost(JobId),
-    /// The server is about to stop.
+    /// The server is shutting down.
     #[error("the server is about to stop; another one will answer")]
     Draining,
-    /// Something broke; the log says what.
+    /// An internal error. The log has the reason.
     #[error("something broke on the server")]
     Internal,
 }
 
-/// What the doors say.
+/// The representation of an error in both protocols.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Row {
-    /// A stable name for programs.
+pub struct ErrorSpec {
+    /// The stable error code, for programs.
     pub code: &'static str,
-    /// HTTP's status.
+    /// The HTTP status.
     pub http: u16,
-    /// gRPC's code, by its number.
+    /// The number of the gRPC status code.
     pub grpc: i32,
     /// Whether the same request may succeed later.
     pub retryable: bool,
-    /// The `reason` under which the refusal is counted, where it is one.
+    /// The `reason` label of the rejection metric. `None` if the error is not counted as a
+    /// rejection.
     pub rejection: Option<&'static str>,
 }
 
@@ -131,8 +134,8 @@ const fn row(
     grpc: i32,
     retryable: bool,
     rejection: Option<&'static str>,
-) -> Row {
-    Row {
+) -> ErrorSpec {
+    ErrorSpec {
         code,
         http,
         grpc,
@@ -141,12 +144,12 @@ const fn row(
     }
 }
 
-/// The longest text of an error that a door says, bytes: gRPC has it in a header, and a client that
-/// gets more than its limit sees no reason at all.
+/// Maximum length of an error message, bytes. gRPC sends the message in a header, and a client with
+/// a smaller header limit would lose the whole error.
 const LONGEST_TEXT: usize = 1024;
 
-/// All that the doors ever say.
-const TABLE: [Row; 31] = [
+/// All errors.
+const ERRORS: [ErrorSpec; 31] = [
     row("bad_request", 400, 3, false, Some("bad_input")),
     row("invalid_options", 400, 3, false, Some("bad_input")),
     row("bad_input", 422, 3, false, Some("bad_input")),
@@ -186,8 +189,8 @@ const TABLE: [Row; 31] = [
     row("internal", 500, 13, true, None),
 ];
 
-impl Row {
-    /// Whose fault it is, as requests are counted.
+impl ErrorSpec {
+    /// The class of the error in the request metric.
     pub fn class(&self) -> &'static str {
         if self.http >= 500 {
             "server_error"
@@ -196,14 +199,14 @@ impl Row {
         }
     }
 
-    /// The row of a code.
+    /// The row of an error code.
     pub fn of(code: &str) -> Option<Self> {
-        TABLE.into_iter().find(|row| row.code == code)
+        ERRORS.into_iter().find(|row| row.code == code)
     }
 }
 
 impl ApiError {
-    /// The error's stable name.
+    /// The stable error code.
     pub fn code(&self) -> &'static str {
         match self {
             Self::BadRequest(_) => "bad_request",
@@ -241,11 +244,11 @@ impl ApiError {
     }
 
     /// The error's row of the table.
-    pub fn row(&self) -> Row {
-        Row::of(self.code()).expect("every code has a row; a test goes through all of them")
+    pub fn row(&self) -> ErrorSpec {
+        ErrorSpec::of(self.code()).expect("every code has a row; a test goes through all of them")
     }
 
-    /// What is wrong, in words, and not more of them than any client takes.
+    /// The error message, truncated to about 1 KiB.
     pub fn text(&self) -> String {
         let mut text = self.to_string();
         if text.len() > LONGEST_TEXT {
@@ -255,7 +258,7 @@ impl ApiError {
         text
     }
 
-    /// When the same request may succeed, where that is known.
+    /// The delay after which the same request may succeed, if it is known.
     pub fn retry_after(&self) -> Option<Duration> {
         match self {
             Self::TenantLimit(after) | Self::ServerFull(after) => Some(*after),
@@ -265,7 +268,7 @@ impl ApiError {
         }
     }
 
-    /// The job that it is about.
+    /// The job that the error refers to.
     pub fn job(&self) -> Option<JobId> {
         match self {
             Self::KeyReused(id)
@@ -279,7 +282,7 @@ impl ApiError {
         }
     }
 
-    /// Logs what broke and says no more of it than that.
+    /// Logs an internal error. The client gets no details.
     pub fn internal(error: impl std::fmt::Display) -> Self {
         tracing::error!(%error, "a request broke");
         Self::Internal
@@ -301,7 +304,7 @@ impl From<QueueError> for ApiError {
         match error {
             QueueError::NotFound => Self::NotFound,
             QueueError::KeyReused(id) => Self::KeyReused(id),
-            QueueError::NotOver(_) => Self::BadRequest(error.to_string()),
+            QueueError::NotTerminal(_) => Self::BadRequest(error.to_string()),
             QueueError::Closed => Self::Draining,
             QueueError::GivenUp => Self::internal(error),
             QueueError::Store(_) => Self::store(error),
@@ -394,7 +397,7 @@ mod tests {
         ];
         for error in all {
             let row = error.row();
-            // The caller's fault is 4xx and never UNAVAILABLE, INTERNAL or the like.
+            // An error of the client is 4xx, and never UNAVAILABLE, INTERNAL or the like.
             let ours_by_http = row.http >= 500;
             let ours_by_grpc = matches!(row.grpc, 4 | 10 | 13 | 14);
             let slow = error == ApiError::TooSlow;

@@ -1,8 +1,10 @@
-//! The doors, and the service behind them that knows no protocol.
+//! The HTTP and gRPC interfaces, and the protocol-independent service behind them.
 //!
-//! `service` and what it uses are the same for both; only `http` sees axum's types and only `grpc`
-//! sees the protocol's.
+//! `service` and the modules that it uses are shared by both protocols. HTTP types appear in
+//! `http`, gRPC types in `grpc`; `middleware`, `origin` and `listener` handle raw requests and
+//! connections.
 
+mod admin;
 mod admission;
 mod answers;
 mod auth;
@@ -10,20 +12,19 @@ mod codec;
 mod dense;
 mod draft;
 mod error;
+mod grpc;
+mod http;
+mod listener;
+mod middleware;
+mod origin;
 mod results;
+mod routes;
 mod service;
+#[cfg(test)]
+mod tests;
 mod turns;
 mod uploads;
 mod waiters;
-
-mod admin;
-mod grpc;
-mod guard;
-mod http;
-mod listener;
-mod origin;
-#[cfg(test)]
-mod tests;
 
 pub use admin::{Readiness, admin_router};
 pub use admission::{Admission, AdmissionLimits};
@@ -31,12 +32,5 @@ pub use auth::{Caller, InvalidKey, Keys, MIN_KEY, Role};
 pub use error::ApiError;
 pub use listener::{ListenOptions, Listener, TlsError, tls_acceptor};
 pub use origin::Hosts;
+pub use routes::public_router;
 pub use service::{Parts, Service, ServiceLimits};
-
-use std::sync::Arc;
-
-/// Everything on the public port: HTTP and gRPC.
-pub fn public_router(service: &Arc<Service>) -> axum::Router {
-    let calls = grpc::router(service).reset_fallback();
-    guard::guarded(http::router(service).merge(calls), service)
-}

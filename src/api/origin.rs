@@ -1,9 +1,10 @@
-//! Pages of other sites: without keys a browser on the same machine could be made to call this
-//! server for them.
+//! Origin checks for servers without API keys: a page of another site could otherwise make a
+//! browser on the same machine call the server.
 //!
-//! A form may be posted anywhere, and a name that is made to point at 127.0.0.1 (DNS rebinding)
-//! makes a foreign page one of ours. A browser says where a call comes from (`Origin`) and under
-//! which name it was sent (`Host`); other clients say what they like, and lose nothing by it.
+//! A page can post a form to any address. With DNS rebinding, a host name that is made to resolve
+//! to 127.0.0.1 gives a foreign page the origin of this server. Browsers send the origin of a call
+//! (`Origin`) and the host name (`Host`), and both are checked. Other clients can send any value,
+//! but they gain nothing by it.
 
 use axum::extract::Request;
 use axum::http::uri::Authority;
@@ -11,12 +12,13 @@ use axum::http::{HeaderMap, Version, header};
 
 use super::error::ApiError;
 
-/// Under which names a server without keys may be asked, besides those of the machine itself; none
-/// where any will do, since it is open to a network anyhow.
+/// The accepted host names of a server without keys, in addition to the loopback names. `None`
+/// accepts any name, for a server that is open to a network.
 #[derive(Clone, Debug, Default)]
 pub struct Hosts(pub Option<Vec<String>>);
 
-/// Refuses a request that does not say one host (RFC 9112, 3.2).
+/// Refuses a request without exactly one host (RFC 9112, 3.2). HTTP/2 requests may have no `Host`
+/// header.
 ///
 /// # Errors
 /// [`ApiError::BadRequest`].
@@ -58,7 +60,7 @@ pub(super) fn check(hosts: &Hosts, request: &Request) -> Result<(), ApiError> {
     }
 }
 
-/// The host that a header names; one that is no host is nobody's name.
+/// The host in the `Host` header. An invalid value yields a name that is not accepted.
 fn header_host(headers: &HeaderMap) -> Option<Authority> {
     let value = headers.get(header::HOST)?;
     let parsed = value.to_str().ok().and_then(|text| text.parse().ok());

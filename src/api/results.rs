@@ -1,6 +1,6 @@
-//! A pair's flow once it is there: read, encoded, and the room that this takes.
+//! Results of pairs: reading, encoding, and the memory reservation for both.
 //!
-//! It must not know HTTP's or gRPC's types.
+//! Independent of HTTP and gRPC types.
 
 use std::sync::Arc;
 
@@ -15,21 +15,21 @@ use crate::job::{Job, JobId, Kind, Report, State};
 use crate::payload::{StoredCloud, StoredFlow};
 use crate::storage::{Blob, BlobError};
 
-/// A flow that can be sent.
+/// A flow with its report, ready to be sent.
 #[derive(Clone)]
 pub struct Answer {
-    /// Its job.
+    /// The job.
     pub job: Arc<Job>,
-    /// How it was found.
+    /// The report on the estimate.
     pub report: Report,
-    /// The flow itself.
+    /// The flow.
     pub flow: Arc<StoredFlow>,
-    /// The room that it takes.
+    /// The memory reservation.
     pub(super) room: Arc<AnswerRoom>,
 }
 
 impl Service {
-    /// Whether a job has succeeded and its result lies no more where it was put.
+    /// Whether a job has succeeded but its result is missing from the store.
     pub(super) async fn result_is_lost(&self, job: &Job) -> Result<bool, ApiError> {
         let has_result = job.kind == Kind::Pair || is_dense(job);
         if job.state != State::Succeeded || !has_result {
@@ -42,12 +42,13 @@ impl Service {
         }
     }
 
-    /// Room to read, unpack and encode a job's result.
+    /// Reserves memory to read, decode and encode a job's result.
     ///
     /// # Errors
     /// [`ApiError::ServerFull`], [`ApiError::ResultLost`], or where the store fails.
     pub(super) async fn room_for_result(&self, job: &Job) -> Result<AnswerRoom, ApiError> {
-        /// Of the stored bytes, at most: read, unpacked, and in the longest format.
+        /// Upper bound on memory relative to the stored size: the stored bytes, the decoded arrays,
+        /// and the largest encoding.
         const FACTOR: usize = 6;
         let blob = Blob::Result(job.attempt);
         let size = self.blobs.size(job.id, blob).await;
@@ -57,7 +58,7 @@ impl Service {
             .await
     }
 
-    /// A job's result as it lies in store.
+    /// The stored bytes of a job's result.
     ///
     /// # Errors
     /// [`ApiError::ResultLost`], or where the store fails.
@@ -66,10 +67,11 @@ impl Service {
         bytes.map_err(|error| lost_or(job.id, error))
     }
 
-    /// How a pair's flow was found.
+    /// The report on a pair's flow.
     ///
     /// # Errors
-    /// [`ApiError::NotEnded`], or how it ended instead.
+    /// [`ApiError::NotEnded`], or the error that describes how the job ended.
+    /// [`ApiError::BadRequest`] for a sequence.
     pub(super) fn report(job: &Job) -> Result<Report, ApiError> {
         Self::check_success(job)?;
         if job.kind == Kind::Sequence {
@@ -83,7 +85,9 @@ impl Service {
     /// The flow of a pair that has succeeded.
     ///
     /// # Errors
-    /// How the job ended instead of with a flow, a full server, a lost result, or a store that fails.
+    /// The error that describes how the job ended without a flow, [`ApiError::ServerFull`],
+    /// [`ApiError::ResultLost`], or an error of the store. [`ApiError::Internal`] if the stored
+    /// flow cannot be decoded.
     pub async fn answer(&self, job: &Arc<Job>) -> Result<Answer, ApiError> {
         let report = Self::report(job)?;
         let mut room = self.room_for_result(job).await?;
@@ -98,8 +102,8 @@ impl Service {
         })
     }
 
-    /// The flow of a pair that has succeeded, in a format; as it was made for the last who asked,
-    /// where it still is.
+    /// Encodes the flow of a pair that has succeeded. Returns the cached result of an earlier
+    /// request if it is still present.
     ///
     /// # Errors
     /// As for [`Service::answer`].
@@ -122,7 +126,7 @@ impl Service {
         let bytes = self.result_bytes(job).await?;
         let points = if format.needs_points() {
             let (owner, [source, _]) = job.sweeps();
-            let cloud = self.blobs.get(owner, Blob::Frame(source)).await;
+            let cloud = self.blobs.get(owner, Blob::Sweep(source)).await;
             Some(cloud.map_err(|error| lost_or(job.id, error))?)
         } else {
             None
@@ -148,7 +152,7 @@ impl Service {
     }
 }
 
-/// What an error of reading a result is: lost, where it is not there.
+/// Maps a missing blob to [`ApiError::ResultLost`].
 fn lost_or(id: JobId, error: BlobError) -> ApiError {
     if error.is_missing() {
         tracing::error!(%error, job = %id, "a result is lost");

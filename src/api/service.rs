@@ -1,5 +1,5 @@
-//! The service without a protocol: what both doors call, so that both have the same limits,
-//! errors and results. It must not know HTTP's or gRPC's types.
+//! The protocol-independent service. Both protocols call it, so both have the same limits, errors
+//! and results. Independent of HTTP and gRPC types.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -8,7 +8,7 @@ use std::time::Duration;
 use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 
-use super::admission::{Admission, Asked, Promise};
+use super::admission::{Admission, Asked, Durability};
 use super::answers::{AnswerLimits, Answers};
 use super::auth::{Caller, Keys};
 use super::error::ApiError;
@@ -22,34 +22,36 @@ use crate::metrics::Metrics;
 use crate::queue::{Filter, Queue, QueueError};
 use crate::storage::{Blob, Blobs, FreeSpace};
 
-/// Archives and clouds that are sent at a time.
+/// Maximum number of zip archives and dense clouds that are being sent at the same time.
 const MAX_ARCHIVES: usize = 16;
 
-/// Nobody has seen the disk for so long: it hangs.
+/// Maximum age of the last measurement of free disk space. When it is older, the disk is assumed to
+/// hang.
 const OLD: Duration = Duration::from_secs(15);
 
-/// What a request may cost the doors.
+/// Resource limits for requests.
 #[derive(Clone, Debug)]
 pub struct ServiceLimits {
-    /// Bytes of one request's body.
+    /// Maximum size of one request body, bytes.
     pub max_upload_bytes: u64,
-    /// Bytes of all bodies that are being received.
+    /// Budget for all request bodies that are being received, bytes.
     pub max_uploads_bytes: u64,
-    /// Bytes of all answers that are being made and sent.
+    /// Budget for all results that are being encoded and sent, bytes.
     pub max_answers_bytes: u64,
-    /// Bytes that stay free on the disk: less, and nothing more is accepted.
+    /// Free disk space below which new work is refused, bytes.
     pub min_free_bytes: u64,
-    /// Files that can still be made on the disk: fewer, and nothing more is accepted.
+    /// Number of free inodes below which new work is refused.
     pub min_free_inodes: u64,
-    /// Frames of one sequence.
-    pub max_frames: u32,
-    /// Time without a byte of a body that is being received.
+    /// Maximum number of sweeps in one sequence.
+    pub max_sweeps: u32,
+    /// Maximum time without a byte of a request body that is being received.
     pub body_idle: Duration,
-    /// Pairs of a streamed sequence that are worked on ahead of what its client has taken.
-    pub sequence_ahead: usize,
+    /// Number of pairs of a streamed sequence that are computed ahead of the results that the
+    /// client has read.
+    pub stream_prefetch_pairs: usize,
 }
 
-/// What the doors call.
+/// The operations that both protocols call.
 pub struct Service {
     pub(super) queue: Arc<dyn Queue>,
     pub(super) blobs: Blobs,
@@ -63,44 +65,45 @@ pub struct Service {
     pub(super) answers: Answers,
     waiters: Arc<Waiters>,
     compute: Line,
-    /// Answers that are being encoded, apart from what comes in.
+    /// Permits for encoding results. Separate from the permits for decoding uploads.
     pub(super) encoding: Line,
-    /// Archives and clouds that are being sent: each holds a thread, or memory, while its client
-    /// reads.
+    /// Permits for archives and dense clouds that are being sent. Each occupies a thread or memory
+    /// while the client reads.
     pub(super) archives: Arc<Turns>,
-    /// Dense clouds that are being read and encoded.
+    /// Permit for reading and encoding one dense cloud at a time.
     pub(super) clouds: Semaphore,
-    /// Cancelled when the server is about to stop: health says so, everything is still served.
+    /// Cancelled when the server is about to stop. The gRPC health service then reports
+    /// NOT_SERVING; requests are still served.
     pub(super) leaving: CancellationToken,
     draining: AtomicBool,
-    /// Event streams and long polls end when this is cancelled.
+    /// Cancelled to end event streams and long polls.
     pub(super) closing: CancellationToken,
 }
 
-/// What a service is made of.
+/// The dependencies of a [`Service`].
 pub struct Parts {
-    /// Where jobs go.
+    /// The job queue.
     pub queue: Arc<dyn Queue>,
-    /// Where payloads go.
+    /// The blob store for payloads and results.
     pub blobs: Blobs,
-    /// What is accepted.
+    /// Admission control.
     pub admission: Admission,
-    /// What is counted.
+    /// The metrics registry.
     pub metrics: Arc<Metrics>,
-    /// Who may call.
+    /// The API keys.
     pub keys: Keys,
-    /// Under which names it may be called where there are no keys.
+    /// The host names that are accepted when there are no API keys.
     pub hosts: Hosts,
-    /// Whether the store works, and what can still be written.
+    /// The health of the store, and its free space.
     pub store_health: Arc<StoreHealth>,
-    /// What a request may cost.
+    /// Resource limits for requests.
     pub limits: ServiceLimits,
 }
 
 /// Why a job was not made durable.
 #[derive(Debug)]
 pub(super) enum MakeDurable {
-    /// Its last waiter has disconnected, and the job is being cancelled.
+    /// The last waiter of the job has disconnected, and the job is being cancelled.
     GivenUp,
     /// The store failed.
     Failed(ApiError),
@@ -112,21 +115,21 @@ impl<E: Into<ApiError>> From<E> for MakeDurable {
     }
 }
 
-/// What a wait has come to.
+/// The outcome of waiting for a job.
 #[derive(Clone, Debug)]
 pub enum Waited {
     /// The job has ended.
     Ended(Arc<Job>),
-    /// The time is up and it has not.
+    /// The timeout has passed, or the server closes, and the job has not ended.
     StillOpen(Arc<Job>),
 }
 
 impl Service {
-    /// A service of its parts.
+    /// A service with the given dependencies.
     pub fn new(parts: Parts) -> Self {
         let limits = &parts.limits;
         let all = limits.max_uploads_bytes;
-        // One tenant of several leaves the others half.
+        // With several tenants, one tenant gets at most half of the budget.
         let several = parts.keys.has_several_tenants();
         let tenant = if several {
             (all / 2).max(limits.max_upload_bytes.min(all))
@@ -162,7 +165,7 @@ impl Service {
         }
     }
 
-    /// The caller whose key a request shows.
+    /// The caller that the value of an `Authorization` header identifies.
     ///
     /// # Errors
     /// [`ApiError::Unauthenticated`].
@@ -170,21 +173,22 @@ impl Service {
         self.keys.caller(authorization)
     }
 
-    /// Counts an error that comes after an answer has begun, where no guard sees it.
-    pub(super) fn count_late_error(&self, door: &'static str, error: &ApiError) {
+    /// Counts an error that occurs after the response has begun, when the middleware has already
+    /// counted the response.
+    pub(super) fn count_late_error(&self, protocol: &'static str, error: &ApiError) {
         let row = error.row();
-        self.metrics.request(door, row.class());
+        self.metrics.request(protocol, row.class());
         if let Some(reason) = row.rejection {
             self.metrics.rejected(reason);
         }
     }
 
-    /// Says that the server is about to stop, and goes on as before.
+    /// Announces that the server is about to stop. Requests are still served.
     pub fn leave(&self) {
         self.leaving.cancel();
     }
 
-    /// Accepts nothing more.
+    /// Refuses new work from now on.
     pub fn stop_accepting(&self) {
         self.draining.store(true, Ordering::Relaxed);
     }
@@ -194,7 +198,7 @@ impl Service {
         self.closing.cancel();
     }
 
-    /// Refuses work where the server is about to stop.
+    /// Refuses new work once [`Service::stop_accepting`] was called.
     ///
     /// # Errors
     /// [`ApiError::Draining`].
@@ -206,11 +210,11 @@ impl Service {
         }
     }
 
-    /// Runs something that takes a core for a while, beside the requests, a few at a time and in
-    /// fair turns of the tenants.
+    /// Runs CPU-bound work on a blocking thread. At most one piece of work per core runs at a time,
+    /// and the tenants share these permits fairly.
     ///
     /// # Errors
-    /// Its own, and [`ApiError::Internal`] where it panics.
+    /// The error of the work itself, and [`ApiError::Internal`] if it panics.
     pub async fn compute<T: Send + 'static>(
         &self,
         tenant: &Tenant,
@@ -221,7 +225,8 @@ impl Service {
         done.map_err(ApiError::internal)?
     }
 
-    /// Refuses more where the disk is nearly full, of bytes or of files, or does not answer.
+    /// Refuses new work when the disk is nearly full (bytes or inodes), or when the store fails or
+    /// hangs.
     ///
     /// # Errors
     /// [`ApiError::DiskFull`] or [`ApiError::StoreUnavailable`].
@@ -241,8 +246,8 @@ impl Service {
         }
     }
 
-    /// Refuses a caller whose job would be refused however small it is, before its clouds are
-    /// read: under overload a refusal must cost little. Without its options it is taken for one of
+    /// Refuses a caller whose job would be refused regardless of its size, before its clouds are
+    /// read. This keeps refusals cheap under overload. Without `options` the job counts as one of
     /// the highest priority, for any device.
     ///
     /// # Errors
@@ -252,7 +257,7 @@ impl Service {
         &self,
         caller: &Caller,
         options: Option<&JobOptions>,
-        promise: Promise,
+        durability: Durability,
     ) -> Result<(), ApiError> {
         caller.may_write()?;
         self.check_draining()?;
@@ -265,12 +270,12 @@ impl Service {
                 priority: options.map_or(Priority::High, |options| options.priority),
                 device,
                 nominal_seconds: 0.0,
-                promise,
+                durability,
             })
             .map(drop)
     }
 
-    /// The caller's job.
+    /// A job of the caller's tenant.
     ///
     /// # Errors
     /// [`ApiError::NotFound`].
@@ -278,10 +283,10 @@ impl Service {
         Ok(self.queue.job(&caller.tenant, id).await?)
     }
 
-    /// The pairs of the caller's sequence that go forward in time, in order.
+    /// The forward pairs of a sequence in order. Empty for a pair.
     ///
     /// # Errors
-    /// Where the store fails.
+    /// [`ApiError::StoreUnavailable`] or another error of the queue.
     pub async fn pairs(&self, job: &Job) -> Result<Vec<Arc<Job>>, ApiError> {
         match job.kind {
             Kind::Pair => Ok(Vec::new()),
@@ -293,10 +298,11 @@ impl Service {
         }
     }
 
-    /// The caller's jobs, latest first.
+    /// The jobs of the caller's tenant, latest first. `state` filters by state, `before` returns
+    /// only older jobs, and `limit` is the maximum number of jobs.
     ///
     /// # Errors
-    /// Where the store fails.
+    /// [`ApiError::StoreUnavailable`] or another error of the queue.
     pub async fn jobs(
         &self,
         caller: &Caller,
@@ -313,7 +319,7 @@ impl Service {
         Ok(self.queue.list(filter).await?)
     }
 
-    /// Ends the caller's job.
+    /// Cancels a job of the caller's tenant.
     ///
     /// # Errors
     /// [`ApiError::Forbidden`] or [`ApiError::NotFound`].
@@ -323,12 +329,13 @@ impl Service {
         Ok(self.queue.cancel(id).await?)
     }
 
-    /// Queues the caller's job again: one that has ended without success, or whose result is lost.
-    /// It has to be admitted as a new one would.
+    /// Queues a job of the caller's tenant again. The job must have ended without success, or its
+    /// result must be lost. It is subject to admission control like a new job.
     ///
     /// # Errors
-    /// [`ApiError::Forbidden`], [`ApiError::NotFound`], the refusals of a full server, or a refusal
-    /// where it has not ended or its result is there.
+    /// [`ApiError::Forbidden`], [`ApiError::NotFound`], or the errors of admission control.
+    /// [`ApiError::BadRequest`] if the job has not ended, or has succeeded and still has its
+    /// result.
     pub async fn requeue(&self, caller: &Caller, id: JobId) -> Result<Arc<Job>, ApiError> {
         caller.may_write()?;
         self.check_draining()?;
@@ -342,7 +349,7 @@ impl Service {
             priority: job.priority,
             device: job.device,
             nominal_seconds: job.cost_seconds + of_pairs,
-            promise: Promise::Durable,
+            durability: Durability::Durable,
         })?;
         let lost = self.result_is_lost(&job).await?;
         if !job.durable {
@@ -351,7 +358,7 @@ impl Service {
         Ok(self.queue.requeue(id, lost).await?)
     }
 
-    /// Follows the caller's job.
+    /// Subscribes to the state changes of a job of the caller's tenant.
     ///
     /// # Errors
     /// [`ApiError::NotFound`].
@@ -364,10 +371,11 @@ impl Service {
         Ok(self.queue.watch(id).await?)
     }
 
-    /// Waits for a job's end, at most for `longest`, and no longer than the server lives.
+    /// Waits until a job ends, for at most `longest` (forever if `None`), or until the server
+    /// closes its streams.
     ///
     /// # Errors
-    /// Where the store fails.
+    /// [`ApiError::Draining`] if the queue is closed, or another error of the queue.
     pub async fn wait(&self, id: JobId, longest: Option<Duration>) -> Result<Waited, ApiError> {
         let mut news = self.queue.watch(id).await?;
         let longest = longest.unwrap_or(Duration::MAX);
@@ -384,30 +392,33 @@ impl Service {
         Ok(Waited::StillOpen(job))
     }
 
-    /// Puts all clouds that a job is found from on the disk.
+    /// Flushes to disk all sweeps that the estimate of a job uses.
     async fn sync_frames(&self, job: &Job) -> Result<(), ApiError> {
-        let frames = match job.kind {
+        let sweeps = match job.kind {
             Kind::Pair => job.sees[0]..job.sees[1],
             Kind::Sequence => 0..1 + self.pairs(job).await?.len() as u32,
         };
         let (owner, _) = job.sweeps();
-        for place in frames {
-            self.blobs.sync(owner, Blob::Frame(place)).await?;
+        for place in sweeps {
+            self.blobs.sync(owner, Blob::Sweep(place)).await?;
         }
         Ok(())
     }
 
-    /// Makes a job that somebody waited for outlive its caller.
+    /// Makes a job durable that its caller was waiting for, so that it continues without the
+    /// caller.
     ///
     /// # Errors
-    /// Where it is being given up, or the store fails.
+    /// [`MakeDurable::GivenUp`] if the job is being cancelled, [`MakeDurable::Failed`] if the store
+    /// fails.
     pub(super) async fn make_durable(&self, job: &Job) -> Result<Arc<Job>, MakeDurable> {
         self.sync_frames(job).await?;
         let job = match self.queue.make_durable(job.id).await {
             Err(QueueError::GivenUp) => return Err(MakeDurable::GivenUp),
             made => made?,
         };
-        // A result that came before the queue knew was not waited for.
+        // The result may have been written before the queue recorded the job as durable. That write
+        // was not flushed to disk.
         for blob in [Blob::Result(job.attempt), Blob::Field(job.attempt)] {
             match self.blobs.sync(job.id, blob).await {
                 Err(error) if !error.is_missing() => return Err(error.into()),
@@ -417,18 +428,19 @@ impl Service {
         Ok(job)
     }
 
-    /// One more waits for a job on the line: it ends when all who do have gone.
+    /// Registers one more waiter for a job. A job that is not durable is cancelled when its last
+    /// waiter disconnects.
     ///
     /// # Errors
-    /// Where it is being ended, for all who did have gone.
+    /// [`Ending`] if the job is already being cancelled because its last waiter has disconnected.
     pub(super) fn wait_for(&self, id: JobId) -> Result<Awaited, Ending> {
         self.waiters.wait(&self.queue, id)
     }
 
-    /// Refuses a job that has not succeeded.
+    /// Returns an error unless the job has succeeded.
     ///
     /// # Errors
-    /// [`ApiError::NotEnded`], or how it ended instead.
+    /// [`ApiError::NotEnded`], or the error that describes how the job ended.
     pub(super) fn check_success(job: &Job) -> Result<(), ApiError> {
         match job.state {
             State::Succeeded => Ok(()),
@@ -444,7 +456,7 @@ impl Service {
         }
     }
 
-    /// Removes what lies under a name that no job has.
+    /// Removes all blobs of a job id that has no job. A failure is logged and otherwise ignored.
     pub async fn forget_blobs(&self, id: JobId) {
         if let Err(error) = self.blobs.remove_job(id).await {
             tracing::warn!(%error, job = %id, "a payload was not removed");

@@ -1,4 +1,4 @@
-//! Every reader of a body or stream, driven by sources that never end.
+//! Tests that no reader of a body or stream blocks its thread, with sources that never end.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -15,22 +15,24 @@ use hyper::body::{Body, Frame};
 use tokio::sync::mpsc;
 use tower::ServiceExt;
 
-use super::listener::RequestBody;
-use super::{
-    Admission, AdmissionLimits, Hosts, Keys, Parts, Service, ServiceLimits, public_router,
-};
+use super::admission::{Admission, AdmissionLimits};
+use super::auth::Keys;
+use super::listener::bodies::RequestBody;
+use super::origin::Hosts;
+use super::routes::public_router;
+use super::service::{Parts, Service, ServiceLimits};
 use crate::cost::{CostModel, Lanes};
 use crate::metrics::Metrics;
 use crate::queue::{Queue, QueueOptions, SqliteQueue};
 use crate::storage::Blobs;
 
-/// Until a reader that keeps its thread for itself is taken for one that spins.
+/// Time after which a request that has not returned counts as a busy loop.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// What a body or stream may be silent for; nothing here is.
+/// The idle timeout of bodies and streams. The sources in these tests are never idle.
 const A_MOMENT: Duration = Duration::from_millis(300);
 
-/// A source that says the same for ever, and is always ready.
+/// A body that repeats one frame or one error forever and is always ready.
 pub(super) struct ForEver<E>(pub(super) Result<Bytes, E>);
 
 impl<E: Clone + Unpin> Body for ForEver<E> {
@@ -72,19 +74,19 @@ fn service(folder: &std::path::Path) -> Arc<Service> {
             max_answers_bytes: 1 << 20,
             min_free_bytes: 0,
             min_free_inodes: 0,
-            max_frames: 10,
+            max_sweeps: 10,
             body_idle: A_MOMENT,
-            sequence_ahead: 1,
+            stream_prefetch_pairs: 1,
         },
     }))
 }
 
-/// A source as it is, and as the port hands it on.
+/// The sources: as they are, or wrapped in [`RequestBody`] as the listener does.
 fn sources(port: bool) -> Vec<(&'static str, AnyBody)> {
     let piece = |bytes: &'static [u8]| ForEver(Ok::<_, &'static str>(Bytes::from_static(bytes)));
     let broken = || ForEver(Err::<Bytes, _>("reset"));
     if !port {
-        // The rest are always ready, and so the port's to slow down.
+        // All other sources are always ready. Only the listener's wrapper limits them.
         return vec![("errors", AnyBody::new(broken()))];
     }
     vec![
@@ -99,7 +101,7 @@ fn sources(port: bool) -> Vec<(&'static str, AnyBody)> {
     ]
 }
 
-/// One request; says whether its answer came.
+/// Sends one request. Returns whether the response was complete in time.
 async fn asked(service: &Arc<Service>, path: &str, media: &str, body: AnyBody) -> bool {
     let request = Request::post(path)
         .version(axum::http::Version::HTTP_2)
@@ -112,7 +114,7 @@ async fn asked(service: &Arc<Service>, path: &str, media: &str, body: AnyBody) -
         let Ok(answer) = answer;
         answer.into_body().collect().await.is_ok()
     };
-    // On one thread: who spins keeps the time from passing, and is found by the thread outside.
+    // On one thread: a busy loop also stops this timer, and is detected by the thread outside.
     tokio::time::timeout(A_MOMENT * 10, answered).await.is_ok()
 }
 
@@ -152,7 +154,7 @@ fn no_reader_of_a_body_or_stream_keeps_its_thread_for_itself() {
                 });
                 let answered = heard.recv_timeout(PATIENCE);
                 let answered = answered.unwrap_or_else(|_| panic!("{path} spins on {source}"));
-                // A stream of messages may go on for ever; an error is the end of anything.
+                // A stream of messages may continue forever, but an error has to end the request.
                 assert!(answered || source != "errors", "{path} does not end");
             }
         }

@@ -1,16 +1,17 @@
-//! Turns at something of which there are few, shared by tenants.
+//! Fair permits for scarce resources, shared by tenants.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::sync::{Arc, Mutex, MutexGuard, Weak};
 use std::time::Duration;
 
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::error::ApiError;
 use crate::job::Tenant;
+use crate::sync::locked;
 
-/// Turns that are waited for, in line: each tenant has only a few of its own in that line, so that
-/// nobody waits for all that another one has asked for.
+/// A waiting line for permits. Each tenant can have only a bounded number of its requests in the
+/// shared line, so a tenant with many requests does not delay the others by all of them.
 pub(super) struct Line {
     each: usize,
     all: Arc<Semaphore>,
@@ -18,7 +19,7 @@ pub(super) struct Line {
 }
 
 impl Line {
-    /// So many turns at a time.
+    /// `turns` permits. Each tenant may have up to `turns` requests in the shared line.
     pub(super) fn new(turns: usize) -> Self {
         Self {
             each: turns,
@@ -27,10 +28,10 @@ impl Line {
         }
     }
 
-    /// Waits for a turn of a tenant; it lasts until what is given is dropped.
+    /// Waits for a permit for the tenant. The permit is held until the returned value is dropped.
     pub(super) async fn wait(&self, tenant: &Tenant) -> Option<[OwnedSemaphorePermit; 2]> {
         let own = {
-            let mut own = self.own.lock().unwrap_or_else(PoisonError::into_inner);
+            let mut own = locked(&self.own);
             own.retain(|_, line| line.strong_count() > 0);
             let known = own.get(tenant).and_then(Weak::upgrade);
             known.unwrap_or_else(|| {
@@ -45,21 +46,22 @@ impl Line {
     }
 }
 
-/// Turns that are taken or refused: one of several tenants has half of them.
+/// Permits that are granted or refused at once. With several tenants, each may hold at most half of
+/// them.
 pub(super) struct Turns {
     most: usize,
     share: usize,
     held: Mutex<HashMap<Tenant, usize>>,
 }
 
-/// One turn, until it is dropped.
+/// One permit, released when dropped.
 pub(super) struct Turn {
     turns: Arc<Turns>,
     tenant: Tenant,
 }
 
 impl Turns {
-    /// So many turns, which `several` tenants may share.
+    /// `most` permits. With `several` tenants, each tenant may hold at most half of them.
     pub(super) fn new(most: usize, several: bool) -> Self {
         Self {
             most,
@@ -69,13 +71,13 @@ impl Turns {
     }
 
     fn held(&self) -> MutexGuard<'_, HashMap<Tenant, usize>> {
-        self.held.lock().unwrap_or_else(PoisonError::into_inner)
+        locked(&self.held)
     }
 
-    /// A turn of a tenant.
+    /// Takes a permit for a tenant.
     ///
     /// # Errors
-    /// [`ApiError::ServerFull`] where all are taken, or all that the tenant may have.
+    /// [`ApiError::ServerFull`] if all permits are taken, or the tenant holds its full share.
     pub(super) fn take(self: &Arc<Self>, tenant: &Tenant) -> Result<Turn, ApiError> {
         let mut held = self.held();
         let all: usize = held.values().sum();

@@ -1,10 +1,10 @@
-//! Room for the bodies that are being received, and time for them to come.
+//! Memory budget and time limits for request bodies that are being received.
 //!
-//! Room is memory that others want: a body has to come at a least rate, and a stream that pauses
-//! keeps its room only as long as nobody else needs it.
+//! A body must arrive at a minimum rate. A stream may pause, and keeps its memory until other
+//! requests need it.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
@@ -13,30 +13,31 @@ use tokio_util::sync::CancellationToken;
 use super::error::ApiError;
 use crate::job::Tenant;
 use crate::metrics::Metrics;
+use crate::sync::locked;
 
-/// The unit in which room is counted, bytes.
+/// Granularity of the budget, bytes.
 const UNIT: u64 = 1 << 10;
 
-/// The least rate of a body: a line that is slower than this is not served.
+/// Minimum rate of a body, bytes per second.
 const LEAST_BYTES_PER_SECOND: f64 = 1024.0;
 
-/// The longest that one body may take.
+/// Maximum time to receive one body.
 const LONGEST: Duration = Duration::from_secs(3600);
 
-/// What uploads may take.
+/// Limits on request bodies.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct UploadLimits {
-    /// Bytes of one body.
+    /// Maximum size of one body, bytes.
     pub(super) body: u64,
-    /// Bytes of all bodies together.
+    /// Budget for all bodies together, bytes.
     pub(super) all: u64,
-    /// Bytes of all bodies of one tenant.
+    /// Budget for all bodies of one tenant, bytes.
     pub(super) tenant: u64,
-    /// Time without a byte.
+    /// Maximum time without a byte.
     pub(super) idle: Duration,
 }
 
-/// Room for all bodies.
+/// The memory budget for all bodies.
 pub(super) struct Uploads {
     limits: UploadLimits,
     free: Arc<Semaphore>,
@@ -51,10 +52,6 @@ struct Paused {
     end: CancellationToken,
 }
 
-fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 impl Uploads {
     pub(super) fn new(limits: UploadLimits, metrics: Arc<Metrics>) -> Self {
         let units = usize::try_from(limits.all / UNIT).unwrap_or(usize::MAX);
@@ -67,7 +64,7 @@ impl Uploads {
         }
     }
 
-    /// Room for a body of a tenant: none yet.
+    /// A reservation for a body of a tenant, initially empty.
     pub(super) fn room(self: &Arc<Self>, tenant: &Tenant) -> Room {
         Room {
             uploads: Arc::clone(self),
@@ -79,7 +76,8 @@ impl Uploads {
         }
     }
 
-    /// Ends the longest pause, if it is long enough: of one tenant, or of whoever holds most.
+    /// Ends the longest pause if it is at least as long as a body may be silent: of tenant `of`, or
+    /// else of the tenants that hold the most memory.
     fn end_a_pause(&self, of: Option<&Tenant>) {
         let held = locked(&self.held).clone();
         let most = held.values().max().copied();
@@ -97,52 +95,54 @@ impl Uploads {
     }
 }
 
-/// Takes a pause off the list, however it ends.
+/// Removes a pause from the list when it is dropped.
 struct Over<'a>(&'a Uploads, &'a CancellationToken);
 
 impl Drop for Over<'_> {
     fn drop(&mut self) {
         let mut paused = locked(&self.0.paused);
-        // Each token is of one pause: none is cancelled but by the list itself.
+        // Each token belongs to one pause. Apart from this guard, a token is cancelled only when
+        // its pause has been removed from the list.
         self.1.cancel();
         paused.retain(|pause| !pause.end.is_cancelled());
     }
 }
 
-/// Room for one body's bytes, given back when it is dropped, and time for them to come.
+/// A memory reservation for one body, released when dropped, and the time credit of the body.
 pub(super) struct Room {
     uploads: Arc<Uploads>,
     tenant: Tenant,
     held: Option<OwnedSemaphorePermit>,
     bytes: u64,
-    /// When its first byte came.
+    /// The time of the first byte.
     began: Option<Instant>,
-    /// Time that it may still be silent; bytes earn more, up to what it began with.
+    /// Remaining time without a byte. Received bytes add to it, up to its initial value.
     credit: Duration,
 }
 
 impl Room {
-    /// Room for another body of the same tenant: this one's is given on.
+    /// Moves this reservation out for a complete body, and leaves an empty one for the next body of
+    /// the same tenant.
     pub(super) fn next(&mut self) -> Self {
         let next = self.uploads.room(&self.tenant);
         std::mem::replace(self, next)
     }
 
-    /// Whose it is.
+    /// The tenant.
     pub(super) fn tenant(&self) -> &Tenant {
         &self.tenant
     }
 
-    /// Room beside this one, of the same tenant.
+    /// A second, empty reservation for the same tenant.
     pub(super) fn another(&self) -> Self {
         self.uploads.room(&self.tenant)
     }
 
-    /// Takes room for `bytes` more.
+    /// Adds `bytes` received bytes to the reservation and to the time credit.
     ///
     /// # Errors
-    /// [`ApiError::TooLarge`] where one request has too many, [`ApiError::ServerFull`] where all
-    /// requests together have, or all of the tenant's.
+    /// [`ApiError::TooLarge`] if the body exceeds its limit, [`ApiError::ServerFull`] if the budget
+    /// of all bodies or of the tenant is exhausted.
     pub(super) fn take(&mut self, bytes: usize) -> Result<(), ApiError> {
         let limits = self.uploads.limits;
         self.bytes += bytes as u64;
@@ -159,13 +159,14 @@ impl Room {
         self.hold(self.bytes)
     }
 
-    /// Takes room until it holds `bytes`: of a body so far, or of what it is unfolded to.
+    /// Extends the reservation to `bytes` bytes: the body so far, or the size of the decoded cloud.
     ///
     /// # Errors
     /// [`ApiError::ServerFull`].
     pub(super) fn hold(&mut self, bytes: u64) -> Result<(), ApiError> {
         let limits = self.uploads.limits;
-        // Whole units of all bytes: small pieces must not cost more than large ones.
+        // Rounded up for the total of the body, so that small chunks do not cost more than large
+        // ones.
         let more = bytes.div_ceil(UNIT).saturating_sub(self.units());
         let full = || ApiError::ServerFull(Duration::from_secs(1));
         {
@@ -198,8 +199,8 @@ impl Room {
             .map_or(0, OwnedSemaphorePermit::num_permits) as u64
     }
 
-    /// Waits for more of a body: no longer than it may be silent, than the least rate allows, and
-    /// than any body may take.
+    /// Waits for more of a body, up to its time credit and the maximum time for one body. The
+    /// credit implies the minimum rate.
     ///
     /// # Errors
     /// [`ApiError::TooSlow`].
@@ -212,14 +213,15 @@ impl Room {
         came.map_err(|_| ApiError::TooSlow)
     }
 
-    /// Bytes that it holds.
+    /// The reserved bytes.
     pub(super) fn bytes(&self) -> u64 {
         self.units() * UNIT
     }
 
-    /// Waits for more of a stream for as long as it likes, unless others need the room that it
-    /// holds, `besides` this one's bytes: then the tenant's longest pause has to end, once it is
-    /// longer than a body may be silent. Who holds nothing is in nobody's way.
+    /// Waits for more of a stream without a time limit. `besides` is the number of bytes that the
+    /// stream holds in other reservations. When other requests need memory, the longest pause of a
+    /// tenant ends with an error, provided that it is at least as long as a body may be silent. A
+    /// stream that holds no memory may pause forever.
     ///
     /// # Errors
     /// [`ApiError::TooSlow`].
@@ -287,7 +289,7 @@ mod tests {
         let silent = room.wait(std::future::pending::<()>()).await;
         assert_eq!(silent, Err(ApiError::TooSlow));
         assert!(began.elapsed() < IDLE * 20);
-        // A byte now and then is as good as none: what it earns is a millisecond.
+        // Single bytes do not prolong a body: each adds about one millisecond.
         let mut room = uploads().room(&tenant("a"));
         let mut waits = 0;
         while room.wait(tokio::time::sleep(IDLE * 3 / 4)).await.is_ok() {
@@ -322,7 +324,7 @@ mod tests {
             room.take(1 << 20).expect("room");
         }
         let [first, second] = rooms;
-        // One that holds nothing is in nobody's way, however long it is silent.
+        // A stream that holds no memory is never ended, however long it pauses.
         let empty = uploads.room(&tenant("a"));
         let pausing = |room: Room| {
             tokio::spawn(async move { room.pause(0, std::future::pending::<()>()).await })

@@ -1,42 +1,45 @@
-//! Who waits for which job: the last one to go away ends it.
+//! The number of callers that wait for each job that is not durable.
 //!
-//! An idempotency key finds the job of a call whose connection was lost, so several calls may wait
-//! for one job. The job is cancelled when the last of them disconnects. A call that arrives during the
-//! cancellation waits for its end and submits a new job.
+//! A retry with the same idempotency key finds the job of a call whose connection was lost, so
+//! several calls may wait for one job. The job is cancelled when the last of them disconnects. A
+//! call that arrives during the cancellation waits for its end and submits a new job.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use tokio_util::sync::CancellationToken;
 
 use crate::job::JobId;
 use crate::queue::Queue;
+use crate::sync::locked;
 
-/// Who waits for which job.
+/// The waiters of all jobs.
 #[derive(Default)]
 pub(super) struct Waiters {
     waiting: Mutex<HashMap<JobId, Waiting>>,
 }
 
 enum Waiting {
-    /// So many wait.
+    /// The number of waiting calls.
     For(usize),
-    /// Nobody does: it is being ended, and this is cancelled when that is over.
+    /// The last waiter has disconnected and the job is being cancelled. The token is cancelled when
+    /// that is done.
     Ending(CancellationToken),
 }
 
-/// A job that somebody waits for on the line. Dropped, it is given up, unless others wait too.
+/// One waiter of a job. When it is dropped as the last waiter, the job is cancelled.
 pub(super) struct Awaited {
     waiters: Arc<Waiters>,
     queue: Arc<dyn Queue>,
     id: JobId,
-    let_go: bool,
+    disarm: bool,
 }
 
-/// The job is being ended; to be waited for before it is asked for again.
+/// A cancellation in progress. Wait for its end before the job is submitted again.
 pub(super) struct Ending(CancellationToken);
 
 impl Ending {
+    /// Waits until the cancellation is done.
     pub(super) async fn is_over(&self) {
         self.0.cancelled().await;
     }
@@ -44,10 +47,13 @@ impl Ending {
 
 impl Waiters {
     fn lock(&self) -> MutexGuard<'_, HashMap<JobId, Waiting>> {
-        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+        locked(&self.waiting)
     }
 
-    /// One more waits for a job, which `queue` has.
+    /// Registers one more waiter for a job of `queue`.
+    ///
+    /// # Errors
+    /// [`Ending`] if the job is being cancelled.
     pub(super) fn wait(
         self: &Arc<Self>,
         queue: &Arc<dyn Queue>,
@@ -61,11 +67,11 @@ impl Waiters {
             waiters: Arc::clone(self),
             queue: Arc::clone(queue),
             id,
-            let_go: false,
+            disarm: false,
         })
     }
 
-    /// One less waits, and the job goes on.
+    /// Removes a waiter without cancelling the job.
     fn leave(&self, id: JobId) {
         let mut waiting = self.lock();
         if let Some(Waiting::For(count)) = waiting.get_mut(&id) {
@@ -76,7 +82,7 @@ impl Waiters {
         }
     }
 
-    /// One less waits, and the job is ended if that was the last.
+    /// Removes a waiter, and cancels the job if it was the last one.
     fn abandon(self: &Arc<Self>, queue: &Arc<dyn Queue>, id: JobId) {
         let over = {
             let mut waiting = self.lock();
@@ -105,15 +111,15 @@ impl Waiters {
 }
 
 impl Awaited {
-    /// The job has ended, or goes on by itself.
-    pub(super) fn let_go(mut self) {
-        self.let_go = true;
+    /// Removes the waiter without cancelling the job: the job has ended, or it is durable now.
+    pub(super) fn disarm(mut self) {
+        self.disarm = true;
     }
 }
 
 impl Drop for Awaited {
     fn drop(&mut self) {
-        if self.let_go {
+        if self.disarm {
             self.waiters.leave(self.id);
         } else {
             self.waiters.abandon(&self.queue, self.id);

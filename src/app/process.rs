@@ -1,17 +1,18 @@
-//! What the operating system lets this process do, set once at the start.
+//! Process-wide operating system settings, made once at the start: open file limit, umask, SIGXFSZ.
 
 use rustix::fs::Mode;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit, umask};
 use tokio::signal::unix::{SignalKind, signal};
 
-/// Files that are not connections: the queue's, payloads that are read and written, devices.
+/// File descriptors reserved for everything but connections: the queue, payloads and devices.
 const OTHER_FILES: u64 = 256;
 
-/// The signal of a file that may not grow any more; its number on Linux, macOS and the BSDs.
+/// SIGXFSZ, raised when a file exceeds its size limit. Linux, macOS and the BSDs use the same
+/// number.
 const SIGXFSZ: i32 = 25;
 
-/// Raises the number of files that may be open as far as the system lets it. Says how many of them
-/// may be connections; none where there is no limit.
+/// Raises the limit of open files to the maximum. Returns the number of descriptors left for
+/// connections, or `None` if there is no limit.
 pub(super) fn raise_open_files() -> Option<usize> {
     let limit = getrlimit(Resource::Nofile);
     let raised = Rlimit {
@@ -29,15 +30,16 @@ pub(super) fn raise_open_files() -> Option<usize> {
     now.map(|all| usize::try_from(all - others(all)).unwrap_or(usize::MAX))
 }
 
-/// Keeps what is written from here on to the user who runs this: clouds say where people drive.
+/// Makes new files readable by the server's user only: point clouds reveal where people drive.
 pub(super) fn keep_files_private() {
     umask(Mode::RWXG | Mode::RWXO);
 }
 
-/// A file that may not grow is an error of a write, not the end of the process.
+/// Ignores SIGXFSZ, so that exceeding a file size limit fails the write and does not end the
+/// process.
 pub(super) fn survive_file_limits() {
     match signal(SignalKind::from_raw(SIGXFSZ)) {
-        // Once there is a handler the default is gone for good.
+        // Once installed, the handler replaces the default action for the rest of the process.
         Ok(stream) => drop(stream),
         Err(error) => tracing::debug!(%error, "SIGXFSZ is as it was"),
     }

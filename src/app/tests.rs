@@ -1,5 +1,5 @@
-//! Devices that fail, as a caller sees it: a whole server in this process, over HTTP, on cards that
-//! a test can destroy.
+//! Device failures end to end: a whole server in this process, over HTTP, with GPUs that a test can
+//! destroy.
 
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex};
@@ -9,11 +9,10 @@ use reqwest::multipart::{Form, Part};
 use serde_json::{Value, json};
 use tokio::time::timeout;
 
-use super::App;
-use super::pool::Pool;
+use super::devices::Pool;
+use super::start::App;
 use crate::config::Config;
-use crate::engine::cards::Switches;
-use crate::engine::{DeviceOptions, Health, Opened, Reopening};
+use crate::engine::{DeviceOptions, Health, Opened, ReopenPolicy, Switches};
 use crate::flow::gpu;
 use crate::flow::gpu::{Gpu, GpuOptions};
 use crate::flow::simulate::{Street, StreetOptions};
@@ -21,17 +20,18 @@ use crate::formats::{Pair, write_pair_npz};
 use crate::gpu_in_tests;
 use crate::job::DeviceKind;
 
-/// Long enough for a loaded machine and a card of software; only a failure waits so long.
+/// Timeout, long enough for a loaded machine and a software GPU. Only a failing test waits this
+/// long.
 const PATIENCE: Duration = Duration::from_secs(240);
 
-/// A server, and where its things lie.
+/// A server with its client and data folder.
 struct Stand {
     app: App,
     client: reqwest::Client,
     _folder: tempfile::TempDir,
 }
 
-/// A server on some cards, and one thread of the CPU where it is wanted.
+/// Starts a server on these GPUs, with one CPU thread in addition if `cpu` is set.
 async fn serve(cards: Vec<DeviceOptions>, cpu: bool) -> Stand {
     let folder = tempfile::tempdir().expect("a folder");
     let any_port = std::net::SocketAddr::from(([127, 0, 0, 1], 0));
@@ -95,7 +95,7 @@ impl Stand {
         sent.expect("an answer").json().await.expect("a job")
     }
 
-    /// The state that a job ends in, its attempts, and the device that did it.
+    /// The final state of a job, its number of attempts, and the device that ran it.
     async fn end(&self, id: &str) -> (String, u64, String) {
         let ended = timeout(PATIENCE, async {
             loop {
@@ -190,7 +190,7 @@ async fn a_real_card_that_is_destroyed_in_the_middle_of_a_job_is_opened_again_an
             known.lock().expect("no panic holds it").push(gpu.clone());
             Ok(Box::new(gpu) as Box<dyn Opened>)
         }),
-        reopening: Reopening::default(),
+        reopening: ReopenPolicy::default(),
     };
     let stand = serve(vec![card], true).await;
     let id = stand
@@ -200,12 +200,12 @@ async fn a_real_card_that_is_destroyed_in_the_middle_of_a_job_is_opened_again_an
         .submit(json!({"device": "cpu", "preset": "neural"}))
         .await;
     let under_way = async {
-        while stand.job(&id, 0).await["progress"]["iteration"].as_u64() < Some(2) {
+        while stand.job(&id, 0).await["progress"]["done"].as_u64() < Some(2) {
             tokio::time::sleep(Duration::from_millis(1)).await;
         }
     };
     timeout(PATIENCE, under_way).await.expect("in time");
-    // The test lets go of it, too: its memory is needed again.
+    // The test drops its handle as well, since the new device needs the memory.
     let first = opened
         .lock()
         .expect("no panic holds it")
@@ -277,7 +277,7 @@ async fn a_server_does_not_give_up_while_another_card_is_being_opened_again() {
     const A_MOMENT: Duration = Duration::from_millis(500);
     let switches = [Arc::new(Switches::default()), Arc::new(Switches::default())];
     let mut comes_back = switches[1].card("gpu1", 1);
-    // It has tries left as long as the test goes on.
+    // Enough tries for the whole test.
     comes_back.reopening.tries = u32::MAX;
     let mut stand = serve(vec![switches[0].card("gpu0", 1), comes_back], true).await;
     for (switches, device) in switches.iter().zip(stand.app.devices.iter().skip(1)) {
@@ -314,6 +314,6 @@ async fn a_server_whose_port_has_closed_is_given_up() {
     stand.app.stop_listening.cancel();
     let reason = timeout(PATIENCE, stand.app.given_up()).await;
     assert_eq!(reason.expect("in time"), "the public port has closed");
-    // And stops as any other does.
+    // It still shuts down normally.
     stand.app.drain().await;
 }

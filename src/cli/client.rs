@@ -1,4 +1,4 @@
-//! A small HTTP client for the demo: one server, a few requests, over a real socket.
+//! A minimal HTTP/1.1 client for the demo: requests to one server, each over a new TCP connection.
 
 use std::net::SocketAddr;
 
@@ -11,16 +11,16 @@ use hyper_util::rt::TokioIo;
 use serde_json::Value;
 use tokio::net::TcpStream;
 
-/// What separates the parts of a body; no file holds it.
+/// The boundary between the parts of a multipart body. The files that are sent must not contain it.
 const BOUNDARY: &str = "fnsf-2f1d9c7e5b3a-boundary";
 
-/// One file or value of a multipart body.
+/// One part of a `multipart/form-data` body.
 pub(super) struct Part<'a> {
-    /// The field's name.
+    /// The form field's name.
     pub(super) name: &'a str,
-    /// The file's name, for files.
+    /// The file name, for parts that are files.
     pub(super) file: Option<&'a str>,
-    /// What is in it.
+    /// The content.
     pub(super) bytes: &'a [u8],
 }
 
@@ -50,7 +50,8 @@ impl Client {
         Err(anyhow!("the service answered {status}: {detail}"))
     }
 
-    /// Sends files and values; gives the job that the answer is.
+    /// Posts a multipart form and returns the JSON of the accepted job. Any status except 202
+    /// Accepted is an error.
     pub(super) async fn post(&self, path: &str, parts: &[Part<'_>]) -> anyhow::Result<Value> {
         let mut body = Vec::new();
         for part in parts {
@@ -80,7 +81,7 @@ impl Client {
         serde_json::from_slice(&body).context("the answer is no JSON")
     }
 
-    /// Fetches what lies at a path.
+    /// Fetches the body at a path.
     pub(super) async fn get(&self, path: &str) -> anyhow::Result<Bytes> {
         let request = Request::get(path)
             .header("host", self.server.to_string())
@@ -94,7 +95,8 @@ impl Client {
             .to_bytes())
     }
 
-    /// Follows server-sent events to their end; `tell` gets each one's name and data.
+    /// Reads server-sent events until the stream ends, and calls `tell` with the name and data of
+    /// each.
     pub(super) async fn follow(
         &self,
         path: &str,

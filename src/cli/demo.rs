@@ -1,4 +1,4 @@
-//! `fnsf demo`: the main job on a fresh machine, through the service, over a real socket.
+//! `fnsf demo`: one simulated pair, estimated by a local service over a real socket.
 
 use std::path::PathBuf;
 
@@ -21,23 +21,25 @@ use crate::flow::simulate::{Street, StreetOptions};
 use crate::flow::{Control, Progress};
 use crate::formats::{FlowFile, Pair, read_flow, rigid_motion, write_pair_npz};
 use crate::job::{JobOptions, Report};
-use crate::picture::{self, TopDown, TopDownOptions};
+use crate::picture;
+use crate::picture::{TopDown, TopDownOptions};
 use crate::text::grouped;
 
-/// Start the service, send it a simulated street, print the flow's error and draw it.
+/// Run one simulated pair through the service, print the flow's error and draw the flow.
 ///
-/// The service runs inside this command, on a free port, with its data in a temporary folder.
+/// The service runs inside this command, on a free port of 127.0.0.1. Its data is in a temporary
+/// folder, which is removed at the end.
 #[derive(Debug, Args)]
 pub(super) struct Demo {
-    /// A folder for the flow and the picture
+    /// Folder for flow.npz and flow.png; created if missing
     #[arg(short, long, value_name = "DIR", default_value = "demo")]
     output: PathBuf,
-    /// Another seed is another street
+    /// Seed of the simulated street and of the estimate; the same seed gives the same street
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
 }
 
-/// A flow that has come back, and how it was found.
+/// A flow returned by the service, with the job's report.
 struct Answer {
     bytes: Vec<u8>,
     flow: FlowFile,
@@ -84,7 +86,7 @@ impl Demo {
             .enable_all()
             .build()
             .map_err(Failure::internal)?;
-        // It goes when this returns.
+        // The folder is removed when this function returns.
         let folder = tempfile::tempdir().map_err(Failure::internal)?;
         let answered = runtime.block_on(async {
             let mut terminate = signal(SignalKind::terminate())?;
@@ -100,7 +102,8 @@ impl Demo {
         answered.map_err(Failure::internal)
     }
 
-    /// Starts a server, sends the pair, follows its job, fetches its flow, and stops the server.
+    /// Starts a server, submits the pair, follows the job's events, fetches the flow and stops the
+    /// server.
     async fn ask(&self, pair: &Pair, data_dir: PathBuf) -> anyhow::Result<Answer> {
         let any_port = std::net::SocketAddr::from(([127, 0, 0, 1], 0));
         let app = App::start(Config {
@@ -117,7 +120,7 @@ impl Demo {
         ))
         .map_err(|failure| anyhow::anyhow!("{failure}"))?;
         let mut file = Vec::new();
-        // The clouds alone, as a sensor gives them.
+        // The points alone are sent, without truth, ground masks or ego motion.
         let sent = Pair {
             source: pair.source.clone(),
             target: pair.target.clone(),
@@ -172,8 +175,8 @@ impl Demo {
 fn progress(data: &Value) -> Progress {
     let count = |key: &str| data[key].as_u64().unwrap_or(0) as usize;
     Progress {
-        iteration: count("iteration"),
-        max_iterations: count("max_iterations"),
+        done: count("done"),
+        total: count("total"),
         loss: data["loss"].as_f64().unwrap_or(0.0),
     }
 }

@@ -1,4 +1,4 @@
-//! `fnsf densify`: a sequence's sweeps as one dense cloud, and as a dense depth image.
+//! `fnsf densify`: a sequence's sweeps accumulated in one dense cloud and one dense depth image.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::PathBuf;
@@ -7,76 +7,84 @@ use anyhow::anyhow;
 use clap::Args;
 use serde::Serialize;
 
-use super::estimation::{Estimation, check_sequence};
+use super::estimation::{Device, Estimation, Surroundings, check_sequence};
 use super::failure::Failure;
 use super::files;
 use super::output::say;
 use super::terminal::Terminal;
-use crate::flow::densify::{DensifyError, FlowEdge, carrier, densify};
+use crate::flow::densify::{DensifyError, FlowEdge, Plan, carrier, densify};
 use crate::flow::depth::{Camera, DepthImage, Occlusion, project};
 use crate::flow::{Control, DenseCloud, Estimate, MotionField, Point, Sequence, Sweep};
 use crate::formats::{DenseFormat, FormatError, write_dense, write_depth_png};
-use crate::job::{self, LaterChoice};
-use crate::picture::{self, DepthPanel};
+use crate::job::JobOptions;
+use crate::job::LaterSweepsChoice;
+use crate::picture::DepthPanel;
 use crate::text::grouped;
+use crate::{job, picture};
 
-/// Carry a sequence's sweeps into one frame: one dense cloud.
+/// Accumulate the sweeps of a sequence in one dense cloud at a reference time.
 ///
-/// Flow is estimated between consecutive sweeps, forward for those before the frame and backward
-/// for those after it; each point then follows the fields from its own sweep's time to the frame's.
-/// What moves is not smeared, what stands does not drift.
+/// Flow is estimated between consecutive sweeps: forward in time before the reference time,
+/// backward after it. Each point is then moved by Euler steps through these flows, from its own
+/// sweep's time to the reference time. So moving objects are not smeared along their paths.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
-    fnsf densify sweeps/*.pcd --into 5 -o dense.ply\n  \
-    fnsf densify sweeps/*.pcd --into 4.5 -o between.laz\n  \
-    fnsf densify sweeps/*.bin --into 3 --camera calib.txt --depth depth.png -o dense.npz")]
+    fnsf densify sweeps/*.pcd --reference-time 5 -o dense.ply\n  \
+    fnsf densify sweeps/*.pcd --reference-time 4.5 -o between.laz\n  \
+    fnsf densify sweeps/*.bin --reference-time 3 --camera calib.txt --depth depth.png -o dense.npz")]
 pub(super) struct Densify {
-    /// The sweeps, in order
+    /// The sweeps, two or more, in the order in which they were recorded
     #[arg(required = true, num_args = 2.., value_name = "SWEEP")]
     sweeps: Vec<PathBuf>,
-    /// The sweep whose frame and time all points are carried to, from 0; 4.5 is half way from 4 to 5
+    /// Reference time in sweeps, counted from 0: all points are moved to this time and its frame.
+    /// 4.5 is halfway from sweep 4 to sweep 5
     #[arg(long, value_name = "K")]
-    into: f64,
-    /// Where the cloud goes: .npz, .ply, .pcd, .laz or .las
+    reference_time: f64,
+    /// File for the dense cloud. Its ending gives the format: .npz, .ply, .pcd, .laz or .las
     #[arg(short, long, value_name = "OUT")]
     output: Option<PathBuf>,
-    /// Parts that each step from sweep to sweep is cut into
+    /// Euler steps per interval between consecutive sweeps, 1 to 64
     #[arg(long, value_name = "N", default_value_t = 1)]
     substeps: u32,
-    /// How sweeps after the frame are carried back: through fields fitted backward in time, or
-    /// through the inverses of the forward ones
+    /// How sweeps after the reference time are moved back to it: through flow estimated backward in
+    /// time (reverse), or by inverting the flow estimated forward (inverse)
     #[arg(long, value_enum, default_value_t)]
-    later: LaterChoice,
-    /// A camera: KITTI's calibration, or JSON with width, height, k and camera_from_lidar
+    later_sweeps: LaterSweepsChoice,
+    /// Camera calibration: a KITTI file, or JSON with width, height, k (3 x 3) and
+    /// camera_from_lidar (4 x 4)
     #[arg(long, value_name = "FILE", requires = "depth")]
     camera: Option<PathBuf>,
-    /// The dense cloud as the camera sees it: 16-bit PNG, metres times 256, 0 where nothing is known
+    /// File for the dense cloud's depth image in the camera: 16-bit PNG, depth in metres times 256,
+    /// 0 where it is unknown
     #[arg(long, value_name = "OUT.png", requires = "camera")]
     depth: Option<PathBuf>,
-    /// Draw the dense depth over that of the frame's own sweep
+    /// File for a picture that shows the depth image of the sweep nearest to the reference time
+    /// above the dense one
     #[arg(long, value_name = "OUT.png", requires = "camera")]
     picture: Option<PathBuf>,
-    /// Print one JSON object on stdout
+    /// Print the report as one JSON object on stdout, instead of text
     #[arg(long)]
     json: bool,
     #[command(flatten)]
     estimation: Estimation,
 }
 
-/// What is said of a dense cloud.
+/// The report on a dense cloud, as `--json` prints it.
 #[derive(Debug, Serialize)]
 struct Report {
     points: usize,
     sweeps: usize,
-    into: f64,
-    /// Points that moved against the static world.
+    reference_time: f64,
+    /// Points that moved relative to the static world.
     dynamic: usize,
-    /// Points whose place is not to be trusted.
+    /// Points without a reliable position: its computation did not converge or left the valid
+    /// range.
     unconverged: usize,
-    /// Pairs that were fitted.
+    /// Pairs of sweeps that were estimated.
     fits: usize,
     device: String,
-    /// Share of the depth image's pixels that know a depth: of the frame's own sweep, and of all.
+    /// Share of the depth image's pixels with a known depth: from the sweep nearest to the
+    /// reference time alone, then from all sweeps.
     #[serde(skip_serializing_if = "Option::is_none")]
     depth_density: Option<[f64; 2]>,
     seconds: Seconds,
@@ -93,9 +101,9 @@ impl Densify {
     pub(super) fn run(&self) -> Result<(), Failure> {
         self.check_outputs()?;
         let asked = job::Densify {
-            into: self.into,
+            reference_time: self.reference_time,
             substeps: self.substeps,
-            later: self.later,
+            later_sweeps: self.later_sweeps,
         };
         let plan = asked.plan(self.sweeps.len()).map_err(Failure::usage)?;
         let camera = self.camera.as_deref().map(files::read_camera).transpose()?;
@@ -115,28 +123,14 @@ impl Densify {
         let sweeps: Vec<Sweep> = sweeps.collect::<Result<_, Failure>>()?;
 
         let began = terminal.seconds();
-        let mut fields: BTreeMap<FlowEdge, MotionField> = BTreeMap::new();
-        let fits = plan.edges().len();
-        for chain in plan.chains() {
-            let (mut sequence, mut waiting) = (Sequence::default(), VecDeque::from(chain));
-            let mut last = None;
-            for place in way(&waiting, sweeps.len()) {
-                terminal.part(&format!("pair {} of {fits}", fields.len() + 1));
-                let before = last.replace(place).unwrap_or(place);
-                let larger = sweeps[before].points.len().max(sweeps[place].points.len());
-                let solver_options = surroundings.options(&options, larger, [before, place]);
-                let found =
-                    device.push(&mut sequence, &sweeps[place], &solver_options, &terminal)?;
-                fields.extend(fields_of_edges(found, &mut waiting));
-                if waiting.is_empty() {
-                    break;
-                }
-            }
-            while !waiting.is_empty() {
-                let rest = device.finish(&mut sequence, &terminal)?;
-                fields.extend(fields_of_edges(rest, &mut waiting));
-            }
-        }
+        let fields = fit(
+            &plan,
+            &sweeps,
+            &mut device,
+            &surroundings,
+            &options,
+            &terminal,
+        )?;
         let fitted = terminal.seconds();
         terminal.part("carrying");
         let field = |edge: FlowEdge| fields.get(&edge);
@@ -160,7 +154,7 @@ impl Densify {
         self.say(&Report {
             points: cloud.points.len(),
             sweeps: sweeps.len(),
-            into: self.into,
+            reference_time: self.reference_time,
             dynamic: count(&cloud.dynamic, true),
             unconverged: count(&cloud.converged, false),
             fits: fields.len(),
@@ -189,17 +183,19 @@ impl Densify {
         files::check_outputs(outputs.into_iter().flatten(), inputs)
     }
 
-    /// Writes the depth image; the densities of the own sweep's and of all points'.
+    /// Projects the cloud into the camera, and writes the depth image and the picture where they
+    /// are requested. Returns two densities: from the sweep nearest to the reference time alone,
+    /// and from all converged points with hidden ones removed.
     fn put_depth(&self, camera: &Camera, cloud: &DenseCloud) -> Result<[f64; 2], Failure> {
         let rows = |kept: &dyn Fn(usize) -> bool| -> Vec<Point> {
             let rows = (0..cloud.points.len()).filter(|&row| kept(row));
             rows.map(|row| cloud.points[row]).collect()
         };
-        let nearest = self.into.round() as u32;
-        let sparse = project(&rows(&|row| cloud.frame[row] == nearest), camera);
+        let nearest = self.reference_time.round() as u32;
+        let sparse = project(&rows(&|row| cloud.sweep[row] == nearest), camera);
         let trusted = rows(&|row| cloud.converged[row]);
         let occlusion = Occlusion::of(camera);
-        let dense: DepthImage = project(&trusted, camera).without_hidden(&occlusion);
+        let dense: DepthImage = project(&trusted, camera).without_occluded(&occlusion);
         if let Some(path) = &self.depth {
             let mut dropped = 0;
             files::write(path, |file| {
@@ -229,7 +225,7 @@ impl Densify {
             "{} points of {} sweeps in sweep {}, {} of them moved, in {:.1} s on {}",
             grouped(report.points),
             report.sweeps,
-            report.into,
+            report.reference_time,
             grouped(report.dynamic),
             report.seconds.total,
             report.device,
@@ -260,8 +256,42 @@ impl Densify {
     }
 }
 
-/// The sweeps that a chain of edges leads through, of `sweeps`, and those beyond its end, which its
-/// last pairs may see.
+/// The motion fields of all edges of the plan.
+fn fit(
+    plan: &Plan,
+    sweeps: &[Sweep],
+    device: &mut Device<'_>,
+    surroundings: &Surroundings,
+    options: &JobOptions,
+    terminal: &Terminal,
+) -> Result<BTreeMap<FlowEdge, MotionField>, Failure> {
+    let mut fields: BTreeMap<FlowEdge, MotionField> = BTreeMap::new();
+    let fits = plan.edges().len();
+    for chain in plan.chains() {
+        let (mut sequence, mut waiting) = (Sequence::default(), VecDeque::from(chain));
+        let mut last = None;
+        for place in way(&waiting, sweeps.len()) {
+            terminal.part(&format!("pair {} of {fits}", fields.len() + 1));
+            let before = last.replace(place).unwrap_or(place);
+            let larger = sweeps[before].points.len().max(sweeps[place].points.len());
+            let solver_options = surroundings.options(options, larger, [before, place]);
+            let found = device.push(&mut sequence, &sweeps[place], &solver_options, terminal)?;
+            fields.extend(fields_of_edges(found, &mut waiting));
+            if waiting.is_empty() {
+                break;
+            }
+        }
+        while !waiting.is_empty() {
+            let rest = device.finish(&mut sequence, terminal)?;
+            fields.extend(fields_of_edges(rest, &mut waiting));
+        }
+    }
+    Ok(fields)
+}
+
+/// The sweeps to push so that the edges of a chain are estimated, in order, out of a sequence of
+/// `sweeps`. They go on past the chain's end to the end of the sequence, because the windows of the
+/// chain's last pairs may contain them.
 fn way(chain: &VecDeque<FlowEdge>, sweeps: usize) -> Vec<usize> {
     match chain.front() {
         None => Vec::new(),
@@ -270,7 +300,7 @@ fn way(chain: &VecDeque<FlowEdge>, sweeps: usize) -> Vec<usize> {
     }
 }
 
-/// The fields of the edges that have waited longest.
+/// Pairs the estimates with the edges at the front of the queue, and removes these edges.
 fn fields_of_edges(
     estimates: Vec<Estimate>,
     waiting: &mut VecDeque<FlowEdge>,
@@ -278,6 +308,6 @@ fn fields_of_edges(
     let edges = waiting.drain(..estimates.len().min(waiting.len()));
     edges
         .zip(estimates)
-        .map(|(edge, estimate)| (edge, estimate.field))
+        .map(|(edge, estimate)| (edge, estimate.motion))
         .collect()
 }

@@ -1,4 +1,4 @@
-//! The device that the command line computes on: what `--device` may say, and how it is opened.
+//! The compute device of the command line: the values of `--device`, and opening a device.
 
 use std::fmt;
 use std::str::FromStr;
@@ -12,15 +12,16 @@ use crate::flow::gpu;
 use crate::flow::gpu::{Adapter, Gpu, GpuOptions, Selector};
 use crate::job::DeviceChoice;
 
-/// Takes drivers that only compute on the CPU for GPUs where it is 1: for tests.
-const SOFTWARE: &str = "FNSF_SOFTWARE_GPU";
+/// Environment variable for tests. Where it is 1, software drivers, which compute on the CPU, are
+/// accepted as GPUs.
+const SOFTWARE: &str = "FNSF_ALLOW_SOFTWARE_GPU";
 
-/// What `--device` says.
+/// The value of `--device`.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct DeviceArgument {
-    /// The kind of device, as a request names it.
+    /// The kind of device: auto, cpu or gpu.
     pub(super) choice: DeviceChoice,
-    /// Which one of them.
+    /// The selected GPU, where the kind is gpu.
     card: Selector,
 }
 
@@ -55,17 +56,18 @@ impl fmt::Display for DeviceArgument {
     }
 }
 
-/// Whether software is welcome where any GPU is.
+/// Whether software drivers are accepted as GPUs.
 pub(super) fn software_is_welcome() -> bool {
     std::env::var_os(SOFTWARE).is_some_and(|value| value == "1")
 }
 
-/// The card that `auto` takes.
+/// The GPU that `auto` selects.
 pub(super) fn best_card() -> Result<Adapter, BackendError> {
     gpu::select(&Selector::Any, software_is_welcome())
 }
 
-/// Opens a device; `threads` bounds the CPU's. Says on stderr where the CPU stands in for a GPU.
+/// Opens a device. `threads` limits the threads of the CPU backend. Prints a warning on stderr
+/// where `auto` falls back to the CPU.
 pub(super) fn open(
     device: &DeviceArgument,
     threads: Option<usize>,
@@ -90,14 +92,14 @@ pub(super) fn open(
     }
 }
 
-/// The CPU, on all cores where no number is given.
+/// The CPU backend, with `threads` threads or one per core.
 pub(super) fn cpu(threads: Option<usize>) -> Result<Box<dyn Backend>, Failure> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let opened = CpuBackend::new(Some(threads.unwrap_or(cores)));
     Ok(Box::new(opened.map_err(Failure::internal)?))
 }
 
-/// Says that the CPU does what a GPU would have done.
+/// Warns on stderr that the CPU is used instead of a GPU.
 pub(super) fn stand_in(error: &BackendError) {
     eprintln!("fnsf: warning: the CPU does the work: {error}");
 }

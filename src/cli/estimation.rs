@@ -1,66 +1,76 @@
-//! How flow is found, as arguments: what `flow` and `densify` share. Knows no outputs.
+//! Command-line options of the flow estimate, shared by `flow` and `densify`.
 
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use clap::Args;
 
-use super::device::{self, DeviceArgument};
+use super::device::DeviceArgument;
 use super::failure::Failure;
-use super::files;
 use super::terminal::Terminal;
+use super::{device, files};
 use crate::flow::field::{Backend, BackendError};
-use crate::flow::{self, Ego, Estimate, FlowError, Preset, RigidTransform, Sequence, Sweep};
+use crate::flow::{self, Ego, Estimate, FlowError, RigidTransform, Sequence, Sweep};
 use crate::formats;
 use crate::job::{
     DeviceChoice, EgoChoice, GroundChoice, JobOptions, PrecisionChoice, PresetChoice,
 };
 
-/// How the flow is found.
+/// Options of the flow estimate.
 #[derive(Clone, Debug, Args)]
 pub(super) struct Estimation {
-    /// default: movers found object by object, everything else still; label: default, and a pair of
-    /// a sequence is found from up to five sweeps, its own among them; neural: a neural field, robust and fast to fit;
-    /// paper: FNSF as published
+    /// Method of the estimate. default: ego motion, then one rigid motion for each moving object;
+    /// all other points are static. label: as default, but each pair of a sequence is estimated
+    /// from up to five sweeps, its own two among them. neural: ego motion, then a short fit of a
+    /// neural field to the remaining motion. paper: FNSF (ICCV 2023) with its published settings
     #[arg(long, value_enum, default_value_t)]
     preset: PresetChoice,
-    /// Where neural and paper are fitted: auto (a GPU, else the CPU), cpu, gpu, or gpu:CARD with a
-    /// card's number, PCI id or part of its name; fnsf doctor lists them. default and label compute
-    /// on the CPU whatever the device
+    /// Device for neural and paper: auto (a GPU, else the CPU), cpu, gpu, or gpu:CARD, where CARD
+    /// is a GPU's number, PCI id or part of its name, as listed by fnsf doctor. default and label
+    /// are computed on the CPU whatever the device
     #[arg(long, value_name = "DEVICE", default_value_t)]
     device: DeviceArgument,
-    /// CPU threads; all cores by default. The result does not depend on it
+    /// CPU threads, 1 to 256; all cores by default. The result does not depend on it
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: Option<u16>,
-    /// What the network's products are rounded to: f16 is for neural and paper on GPUs whose matrix
-    /// units pass their self-test, see fnsf doctor
+    /// Precision of the factors in the network's matrix products. f16 needs preset neural or paper,
+    /// and a GPU whose matrix units pass the self-test of fnsf doctor
     #[arg(long, value_enum, default_value_t)]
     precision: PrecisionChoice,
-    /// The same seed gives the same bits
+    /// Seed of all random choices; the same seed gives the same result, bit for bit
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
-    /// Draw this many points and give the others no flow. neural and paper draw from each cloud and
-    /// leave out the rest; default and label look at all points all the same
+    /// Sample this many points, at least 3; the other points get no flow. neural and paper sample
+    /// both clouds and use the sampled points alone. default and label use all points, and the
+    /// sampled source points get a flow. All points by default
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(3..))]
     max_points: Option<u32>,
-    /// Leave out points with |x| or |y| beyond R metres
+    /// Half the side of a square crop about the sensor, in metres: points with |x| or |y| beyond R
+    /// take no part. No crop by default
     #[arg(long, value_name = "R", value_parser = positive)]
-    range_m: Option<f32>,
-    /// Ground points: keep them, leave out those that the pair's ground1 and ground2 name (mask), or
-    /// let them move with the vehicle's own motion (auto): those of the masks or, without masks,
-    /// those that are found; by default what the preset does
+    crop_m: Option<f32>,
+    /// Seconds from one sweep to the next, above 0 and at most 60; the velocities of objects are
+    /// displacements over this time. By default the difference of the file names where they are
+    /// timestamps, else 0.1
+    #[arg(long, value_name = "SECONDS")]
+    dt: Option<f32>,
+    /// Treatment of ground points. keep: like any other point. mask: points in the pair's masks
+    /// ground1 and ground2 take no part and get no flow. auto: ground points, from the masks or
+    /// else from ground segmentation, get the flow of the ego motion. By default auto, for paper
+    /// keep
     #[arg(long, value_enum)]
     ground: Option<GroundChoice>,
-    /// The vehicle's own motion: off, auto (estimate it first), or a file with the 4 x 4 matrix
-    /// target_from_source; by default what the preset does
+    /// Ego motion between the sweeps. off: not estimated separately. auto: estimated first. FILE:
+    /// given, as the 16 numbers of the 4 x 4 matrix target_from_source, row by row, or as an .npz
+    /// pair with ego_SE3. By default auto, for paper off
     #[arg(long, value_name = "off|auto|FILE")]
     ego: Option<String>,
-    /// The pose of every sweep: KITTI's text (12 numbers a line), a JSON array of 4 x 4 matrices, or
-    /// Argoverse 2's city_SE3_egovehicle.feather
+    /// Poses of all sweeps, from which the ego motion is taken: KITTI's text (12 numbers a line), a
+    /// JSON array of 4 x 4 matrices world_from_frame, or Argoverse 2's city_SE3_egovehicle.feather
     #[arg(long, value_name = "FILE", conflicts_with = "ego")]
     poses: Option<PathBuf>,
-    /// Argoverse 2's raster of ground heights, with its ...Sim2_city.json beside it and --poses:
-    /// says which points are ground
+    /// Argoverse 2's raster of ground heights, from which the ground points of each sweep are
+    /// taken. Needs --poses, and the raster's ...___img_Sim2_city.json in the same folder
     #[arg(
         long,
         value_name = "RASTER.npy",
@@ -78,7 +88,7 @@ fn positive(text: &str) -> Result<f32, String> {
 }
 
 impl Estimation {
-    /// The same options that a request has.
+    /// Converts the arguments to the options of a job, and checks them.
     pub(super) fn options(&self) -> Result<JobOptions, Failure> {
         let ego = match self.ego.as_deref() {
             None => None,
@@ -91,7 +101,8 @@ impl Estimation {
             preset: self.preset,
             seed: self.seed,
             max_points: self.max_points,
-            range_m: self.range_m,
+            crop_m: self.crop_m,
+            dt_s: self.dt,
             ground: self.ground.or(raster.map(|_| GroundChoice::Auto)),
             ego,
             device: self.device.choice,
@@ -102,7 +113,7 @@ impl Estimation {
         Ok(options)
     }
 
-    /// The files that the options name.
+    /// The input files that the options name.
     pub(super) fn files(&self) -> Vec<PathBuf> {
         let ego = self
             .ego
@@ -112,7 +123,7 @@ impl Estimation {
         named.cloned().chain(ego.map(PathBuf::from)).collect()
     }
 
-    /// What is known of the sweeps beside their points.
+    /// Reads the poses and the ground raster for the sweeps at `paths`.
     pub(super) fn surroundings(&self, paths: &[PathBuf]) -> Result<Surroundings, Failure> {
         if paths.len() < 2 && self.poses.is_some() {
             return Err(Failure::usage(anyhow!(
@@ -133,17 +144,18 @@ impl Estimation {
             }
         };
         let raster = self.ground_raster.as_deref().map(files::read_ground_raster);
+        let name = |path: &PathBuf| path.to_string_lossy().into_owned();
         Ok(Surroundings {
+            names: paths.iter().map(name).collect(),
             poses,
             raster: raster.transpose()?,
         })
     }
 
-    /// The device that does the work. What fits no field is the host's work: no card is opened for
-    /// it that nobody asked for.
+    /// Opens the device. For presets that fit no field, `auto` opens the CPU backend and no GPU.
     pub(super) fn open(&self) -> Result<Device<'_>, Failure> {
         let threads = self.threads.map(usize::from);
-        let fits = Preset::FITTED.contains(&self.preset.preset());
+        let fits = self.preset.preset().fits_field();
         let backend = match self.device.choice {
             DeviceChoice::Auto if !fits => device::cpu(threads)?,
             _ => device::open(&self.device, threads)?,
@@ -155,15 +167,15 @@ impl Estimation {
     }
 }
 
-/// A device, and what stands in for it.
+/// The open backend, with the fallback to the CPU.
 pub(super) struct Device<'a> {
     asked: &'a Estimation,
     pub(super) backend: Box<dyn Backend>,
 }
 
 impl Device<'_> {
-    /// The pairs of a sequence that the next sweep completes; on the CPU from where the memory of a
-    /// device that was not asked for by name does not do.
+    /// Adds a sweep to the sequence, and returns the pairs that are complete with it. With
+    /// `--device auto` the work falls back to the CPU where the GPU has too little memory.
     pub(super) fn push(
         &mut self,
         sequence: &mut Sequence,
@@ -174,7 +186,7 @@ impl Device<'_> {
         self.tried(|backend| sequence.push(backend, sweep.clone(), options, terminal))
     }
 
-    /// The pairs of a sequence that waited for sweeps to come; likewise.
+    /// Returns the remaining pairs at the end of a sequence, with the same fallback as `push`.
     pub(super) fn finish(
         &mut self,
         sequence: &mut Sequence,
@@ -200,28 +212,44 @@ impl Device<'_> {
     }
 }
 
-/// What is known of a sequence's sweeps beside their points.
+/// Poses and ground raster of a sequence's sweeps.
 pub(super) struct Surroundings {
+    /// File names of the sweeps; empty for a pair in one file.
+    names: Vec<String>,
     poses: Option<Vec<RigidTransform>>,
     raster: Option<formats::GroundRaster>,
 }
 
 impl Surroundings {
-    /// The solver's options for the pair of two sweeps, of which the larger has `points` points.
+    /// The options with the time between the two sweeps of a pair, where the options do not give it
+    /// and the file names do.
+    pub(super) fn timed(&self, options: &JobOptions, [source, target]: [usize; 2]) -> JobOptions {
+        let mut options = options.clone();
+        if let (None, Some(source), Some(target)) =
+            (options.dt_s, self.names.get(source), self.names.get(target))
+        {
+            options.dt_s = formats::interval_s(source, target);
+        }
+        options
+    }
+
+    /// The solver's options for the pair of two sweeps, given by their indices. The larger sweep
+    /// has `points` points. Where poses are given, they determine the ego motion.
     pub(super) fn options(
         &self,
         options: &JobOptions,
         points: usize,
         [source, target]: [usize; 2],
     ) -> flow::Options {
-        let mut options = options.solver_options(points);
+        let mut options = self.timed(options, [source, target]).solver_options(points);
         if let Some(poses) = &self.poses {
             options.ego = Ego::Given(poses[target].inv_mul(&poses[source]));
         }
         options
     }
 
-    /// Reads a sweep; its ground, too, where a raster says which points are.
+    /// Reads the sweep with index `place`. Where a ground raster is given, the sweep gets a ground
+    /// mask.
     pub(super) fn sweep(&self, place: usize, path: &Path) -> Result<Sweep, Failure> {
         let points = files::read_cloud(path)?;
         let ground = self.raster.as_ref().zip(self.poses.as_ref());
@@ -230,7 +258,8 @@ impl Surroundings {
     }
 }
 
-/// Refuses options that only a pair in one file, or only one pair, can have.
+/// Refuses options that do not apply to sweeps in separate files: `--ground mask`, and a given ego
+/// motion for more than two sweeps.
 pub(super) fn check_sequence(options: &JobOptions, sweeps: usize) -> Result<(), Failure> {
     if options.ground == Some(GroundChoice::Mask) {
         return Err(Failure::usage(anyhow!(

@@ -1,4 +1,4 @@
-//! How a command fails: one line, and an exit code that says whose fault it was.
+//! Failures of a command: a one-line message, and an exit code by kind.
 
 use std::fmt;
 use std::process::ExitCode;
@@ -21,7 +21,7 @@ enum Kind {
 }
 
 impl Failure {
-    /// The arguments contradict each other or ask for the impossible.
+    /// The arguments are contradictory or impossible: exit code 2.
     pub(super) fn usage(error: impl Into<anyhow::Error>) -> Self {
         Self {
             kind: Kind::Usage,
@@ -29,7 +29,7 @@ impl Failure {
         }
     }
 
-    /// A file, or what is in it, cannot be used.
+    /// An input file or its content cannot be used: exit code 65.
     pub(super) fn bad_input(error: impl Into<anyhow::Error>) -> Self {
         Self {
             kind: Kind::BadInput,
@@ -37,7 +37,7 @@ impl Failure {
         }
     }
 
-    /// Something else went wrong.
+    /// Any other failure: exit code 70.
     pub(super) fn internal(error: impl Into<anyhow::Error>) -> Self {
         Self {
             kind: Kind::Internal,
@@ -45,7 +45,7 @@ impl Failure {
         }
     }
 
-    /// Nobody reads the answer any more; whoever asked has what it wanted.
+    /// The reader of stdout closed the pipe. This is not an error: exit code 0 and no message.
     pub(super) fn reader_gone(error: impl Into<anyhow::Error>) -> Self {
         Self {
             kind: Kind::ReaderGone,
@@ -53,7 +53,7 @@ impl Failure {
         }
     }
 
-    /// Whether there is something to say about it.
+    /// Whether the failure is printed.
     pub(super) fn is_worth_a_word(&self) -> bool {
         self.kind != Kind::ReaderGone
     }
@@ -79,7 +79,7 @@ impl From<FlowError> for Failure {
 }
 
 impl fmt::Display for Failure {
-    /// The error and its causes on one line.
+    /// The error and its causes, on one line.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let line = format!("{:#}", self.error);
         f.write_str(&line.replace(['\n', '\r'], " "))

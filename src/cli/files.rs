@@ -1,4 +1,4 @@
-//! Files on disk to values and back, with errors that name the file.
+//! Reading and writing of files, with errors that name the file.
 
 use std::collections::{HashMap, HashSet};
 use std::fs::{self, File};
@@ -13,12 +13,13 @@ use super::failure::Failure;
 use super::unfinished::Unfinished;
 use crate::flow::depth::Camera;
 use crate::flow::{Point, RigidTransform};
-use crate::formats::{self, FileKind, FlowFile, FormatError, GroundRaster, Pair, PairTruth};
+use crate::formats;
+use crate::formats::{FileKind, FlowFile, FormatError, GroundRaster, Pair, PairTruth};
 
 /// The largest file that is read, bytes.
 const MAX_FILE: u64 = 4 << 30;
 
-/// A whole file, up to the largest that is taken.
+/// Reads a whole file of at most 4 GiB.
 pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, Failure> {
     let read = || -> anyhow::Result<Vec<u8>> {
         let mut bytes = Vec::new();
@@ -35,7 +36,7 @@ pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, Failure> {
         .map_err(Failure::bad_input)
 }
 
-/// Runs a reader over a file.
+/// Reads a file and passes its bytes and name to `reader`.
 fn read<T>(
     path: &Path,
     reader: impl FnOnce(&[u8], Option<&str>) -> Result<T, FormatError>,
@@ -47,12 +48,12 @@ fn read<T>(
         .map_err(Failure::bad_input)
 }
 
-/// One sweep of any format.
+/// Reads one sweep, in any format.
 pub(super) fn read_cloud(path: &Path) -> Result<Vec<Point>, Failure> {
     read(path, formats::read_cloud).map(|cloud| cloud.points)
 }
 
-/// Two sweeps in one `.npz`.
+/// Reads a pair of sweeps from one `.npz`.
 pub(super) fn read_pair(path: &Path) -> Result<Pair, Failure> {
     let bytes = read_bytes(path)?;
     let name = path.file_name().map(|name| name.to_string_lossy());
@@ -71,12 +72,12 @@ pub(super) fn read_pair(path: &Path) -> Result<Pair, Failure> {
         .map_err(Failure::bad_input)
 }
 
-/// A flow of any format.
+/// Reads a flow, in any format.
 pub(super) fn read_flow(path: &Path) -> Result<FlowFile, Failure> {
     read(path, formats::read_flow)
 }
 
-/// Ground truth: a pair with `flow`, or Argoverse 2's labels.
+/// Reads ground truth: an `.npz` pair with `flow`, or Argoverse 2's labels.
 pub(super) fn read_truth(path: &Path) -> Result<(PairTruth, Pair), Failure> {
     read(path, |bytes, name| {
         if !formats::is_pair(bytes) {
@@ -111,7 +112,8 @@ pub(super) fn read_truth(path: &Path) -> Result<(PairTruth, Pair), Failure> {
     })
 }
 
-/// A rigid motion target_from_source: 16 numbers in rows, or an `.npz` pair with `ego_SE3`.
+/// Reads a rigid motion target_from_source: 16 numbers row by row, or the `ego_SE3` of an `.npz`
+/// pair.
 pub(super) fn read_motion(path: &Path) -> Result<RigidTransform, Failure> {
     let bytes = read_bytes(path)?;
     let motion = if formats::is_pair(&bytes) {
@@ -125,7 +127,8 @@ pub(super) fn read_motion(path: &Path) -> Result<RigidTransform, Failure> {
         .map_err(Failure::bad_input)
 }
 
-/// Argoverse 2's raster of ground heights, and its place, which lies beside it.
+/// Reads Argoverse 2's raster of ground heights, and the raster's transform from the city's frame,
+/// which is in the same folder.
 pub(super) fn read_ground_raster(path: &Path) -> Result<GroundRaster, Failure> {
     const PLACE: &str = "___img_Sim2_city.json";
     let folder = path.parent().unwrap_or(Path::new(""));
@@ -137,7 +140,8 @@ pub(super) fn read_ground_raster(path: &Path) -> Result<GroundRaster, Failure> {
         .map_err(Failure::bad_input)
 }
 
-/// A camera: one file, or KITTI's two, `calib_cam_to_cam.txt` with `calib_velo_to_cam.txt` beside it.
+/// Reads a camera: from one file, or from KITTI's `calib_cam_to_cam.txt` with
+/// `calib_velo_to_cam.txt` in the same folder.
 pub(super) fn read_camera(path: &Path) -> Result<Camera, Failure> {
     let beside = path.with_file_name("calib_velo_to_cam.txt");
     let is_first = path
@@ -149,8 +153,8 @@ pub(super) fn read_camera(path: &Path) -> Result<Camera, Failure> {
     })
 }
 
-/// Refuses, before any work, outputs that cannot be written, and those that are the same file as an
-/// input or as another output.
+/// Refuses outputs that cannot be written, and outputs that are the same file as an input or
+/// another output. Called before any work.
 pub(super) fn check_outputs<'a>(
     outputs: impl IntoIterator<Item = &'a PathBuf>,
     inputs: impl IntoIterator<Item = &'a PathBuf>,
@@ -200,8 +204,8 @@ pub(super) fn check_outputs<'a>(
     Ok(())
 }
 
-/// Where a file is or will be, whatever the links and dots on the way; nothing where its folder is
-/// not there.
+/// The absolute path of a file that exists or is to be created, with links and dots resolved.
+/// `None` where its folder does not exist.
 fn place_of(path: &Path) -> Option<PathBuf> {
     const LINKS: usize = 40;
     let mut path = path.to_owned();
@@ -216,7 +220,7 @@ fn place_of(path: &Path) -> Option<PathBuf> {
             folder
         };
         let place = fs::canonicalize(folder).ok()?.join(path.file_name()?);
-        // A link to what is not there yet says where it will be.
+        // A link to a missing file: its target is the path to be created.
         match fs::read_link(&place) {
             Ok(target) => path = place.parent()?.join(target),
             Err(_) => return Some(place),
@@ -225,8 +229,9 @@ fn place_of(path: &Path) -> Option<PathBuf> {
     None
 }
 
-/// Writes a file through `writer`; a failed write leaves no half file under the name. Links are
-/// followed, and what is no regular file (a pipe, a device) is written in place.
+/// Writes a file through `writer`. A regular file is written under a temporary name and renamed, so
+/// a failed write leaves no partial file. Links are followed; pipes and devices are written
+/// directly.
 pub(super) fn write<E: std::error::Error + Send + Sync + 'static>(
     path: &Path,
     writer: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,

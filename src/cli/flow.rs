@@ -1,4 +1,4 @@
-//! `fnsf flow`: pairs of sweeps, here and now.
+//! `fnsf flow`: scene flow of one pair, or of the consecutive pairs of a sequence.
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
@@ -15,48 +15,52 @@ use super::terminal::Terminal;
 use crate::flow::{Control, Estimate, Point, Sequence, Sweep};
 use crate::formats::{FlowFormat, FlowTable, write_flow};
 use crate::job::Report;
-use crate::picture::{self, TopDown, TopDownOptions};
+use crate::picture;
+use crate::picture::{TopDown, TopDownOptions};
 use crate::text::grouped;
 
-/// Estimate the motion of every point between two sweeps, or of a sequence's pairs.
+/// Estimate the displacement of every point between two sweeps, or for each pair of a sequence.
 ///
 /// Reads npz, npy, ply, pcd, KITTI bin, nuScenes pcd.bin and Argoverse 2 feather, recognized by
-/// content. The flow has one row per source point: where the point is in the target's frame, less
-/// where it was in the source's, in metres. Of a sequence every flow is written as soon as it
-/// is there; with neural each pair starts from the one before, with label each sees the sweeps around it.
+/// content. The flow has one row per source point, in metres: the point's position at the target's
+/// time in the target's frame, minus its position in the source's frame. Each flow of a sequence is
+/// written as soon as it is estimated. With neural, the fit of a pair starts from the pair before.
+/// With label, a pair is estimated from the sweeps around it too.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
     fnsf flow a.feather b.feather -o flow.npz\n  \
-    fnsf flow pair.npz --ground mask --range-m 51.2 -o flow.ply --picture flow.png\n  \
+    fnsf flow pair.npz --ground mask --crop-m 51.2 -o flow.ply --picture flow.png\n  \
     fnsf flow a.pcd b.pcd --preset paper --max-points 8192 --json\n  \
     fnsf flow sweeps/*.pcd -o flows/flow.npz        flows/flow_0000.npz, flow_0001.npz, ...")]
 pub(super) struct Flow {
-    /// Two sweeps or more, in order; or one .npz with two, as arrays pc1 and pc2
+    /// The sweeps, two or more, in the order in which they were recorded; or one .npz file with two
+    /// sweeps, as arrays pc1 and pc2
     #[arg(required = true, value_name = "SWEEP")]
     sweeps: Vec<PathBuf>,
-    /// Where the flow goes: .npz, .npy, .feather, .ply, .pcd or .json. The flows of more than two
-    /// sweeps are numbered: flow.npz becomes flow_0000.npz, flow_0001.npz, ...
+    /// File for the flow. Its ending gives the format: .npz, .npy, .feather, .ply, .pcd or .json.
+    /// With more than two sweeps the files are numbered: flow.npz becomes flow_0000.npz,
+    /// flow_0001.npz, ...
     #[arg(short, long, value_name = "OUT")]
     output: Option<PathBuf>,
-    /// Draw the flow from above, colored by direction; numbered likewise
+    /// File for a picture of the flow from above, colored by direction of motion; numbered likewise
     #[arg(long, value_name = "OUT.png")]
     picture: Option<PathBuf>,
-    /// Print one JSON object for each pair on stdout
+    /// Print the report of each pair as one JSON object on stdout, instead of text
     #[arg(long)]
     json: bool,
     #[command(flatten)]
     estimation: Estimation,
 }
 
-/// A pair whose flow is still to come.
+/// A pair whose estimate is not complete, because its window may need later sweeps.
 struct Waiting {
     pair: usize,
     source: Vec<Point>,
-    /// Seconds that its target took to read.
+    /// Seconds spent on reading the target sweep.
     load: f64,
 }
 
-/// Writes the flow in the format that the name asks for.
+/// Writes the flow in the format given by the path's ending.
 fn write(estimate: &Estimate, source: &[Point], path: &Path) -> Result<(), Failure> {
     let format = FlowFormat::from_path(path).map_err(Failure::usage)?;
     let table = FlowTable {
@@ -64,7 +68,7 @@ fn write(estimate: &Estimate, source: &[Point], path: &Path) -> Result<(), Failu
         flow: &estimate.flow,
         valid: &estimate.valid,
         dynamic: estimate.dynamic.as_deref(),
-        objects: estimate.objects.as_ref(),
+        objects: estimate.objects(),
         ego: estimate.ego.as_ref(),
     };
     files::write(path, |file| write_flow(format, &table, file))
@@ -79,8 +83,7 @@ fn draw(estimate: &Estimate, source: &[Point], path: &Path) -> Result<(), Failur
             valid: &estimate.valid,
             ego: estimate.ego.as_ref(),
             clusters: estimate
-                .objects
-                .as_ref()
+                .objects()
                 .map_or(&[], |objects| objects.clusters.as_slice()),
         },
         &TopDownOptions::default(),
@@ -88,37 +91,36 @@ fn draw(estimate: &Estimate, source: &[Point], path: &Path) -> Result<(), Failur
     files::write(path, |file| picture::write_png(&image, file))
 }
 
-/// What a person reads of a report.
+/// Prints a report as text.
 pub(super) fn print_report(report: &Report) -> Result<(), Failure> {
     let seconds = &report.seconds;
     say(format_args!(
         "flow of {} points in {:.2} s on {}",
-        grouped(report.points),
+        grouped(report.valid_points),
         seconds.total,
         report.device
     ))?;
-    let load = seconds.load.map(|load| format!("load {load:.2} s, "));
-    let (load, precompute) = (load.unwrap_or_default(), seconds.precompute);
-    let loss = report.best_loss.map(|loss| format!(", loss {loss:.4} m"));
-    let (preset, reason, loss) = (
-        &report.preset,
-        &report.stop_reason,
-        loss.unwrap_or_default(),
-    );
-    if let Some(moving) = report.moving {
-        let (movers, clusters) = (seconds.network, report.iterations);
+    let phases = [
+        ("load", seconds.load),
+        ("precompute", Some(seconds.precompute)),
+        ("search", seconds.search),
+        ("query", seconds.query),
+        ("network", seconds.network),
+    ];
+    let phases = phases.into_iter();
+    let phases = phases.filter_map(|(name, taken)| Some(format!("{name} {:.2} s", taken?)));
+    say(format_args!("  {}", phases.collect::<Vec<_>>().join(", ")))?;
+    let (preset, reason) = (&report.preset, &report.stop_reason);
+    if let Some(objects) = &report.objects {
+        let cost = objects.cost_m.map(|cost| format!(", cost {cost:.4} m"));
+        let (clusters, moving, cost) = (objects.searched, objects.moving, cost.unwrap_or_default());
         say(format_args!(
-            "  {load}precompute {precompute:.2} s, movers {movers:.2} s"
+            "  preset {preset}: {clusters} clusters, {moving} move ({reason}){cost}"
         ))?;
-        say(format_args!(
-            "  preset {preset}: {clusters} clusters, {moving} move ({reason}){loss}"
-        ))?;
-    } else {
-        let (query, network) = (seconds.query, seconds.network);
-        let (seed, iterations) = (report.seed, report.iterations);
-        say(format_args!(
-            "  {load}precompute {precompute:.2} s, query {query:.2} s, network {network:.2} s"
-        ))?;
+    }
+    if let Some(field) = &report.field {
+        let loss = field.best_loss_m.map(|loss| format!(", loss {loss:.4} m"));
+        let (seed, iterations, loss) = (report.seed, field.iterations, loss.unwrap_or_default());
         say(format_args!(
             "  preset {preset}, seed {seed}: {iterations} iterations ({reason}){loss}"
         ))?;
@@ -132,7 +134,7 @@ pub(super) fn print_report(report: &Report) -> Result<(), Failure> {
     Ok(())
 }
 
-/// `path` with the pair's number before its ending, where there are several.
+/// `path` with the pair's number before the ending, where there are several pairs.
 fn numbered(path: &Path, pair: usize, pairs: usize) -> PathBuf {
     if pairs < 2 {
         return path.to_owned();
@@ -142,7 +144,7 @@ fn numbered(path: &Path, pair: usize, pairs: usize) -> PathBuf {
     path.with_file_name(format!("{stem}_{pair:04}.{ending}"))
 }
 
-/// Sweeps to be read one after the other, or those of one file.
+/// The input sweeps: files, which are read one by one, or the two sweeps of one file.
 enum Sweeps<'a> {
     Files(&'a [PathBuf]),
     Pair(Box<[Sweep; 2]>),
@@ -183,7 +185,7 @@ impl Flow {
         let surroundings = self.estimation.surroundings(&self.sweeps)?;
         let mut device = self.estimation.open()?;
         let mut sequence = Sequence::default();
-        // What is known of the pairs that wait for sweeps to come, and of the last sweep.
+        // The pairs that are not complete, and the points of the last sweep.
         let mut waiting: VecDeque<Waiting> = VecDeque::new();
         let mut last = None::<Vec<Point>>;
         let count = sweeps.count();
@@ -206,11 +208,14 @@ impl Flow {
                 });
             }
             let mut found = device.push(&mut sequence, &sweep, &solver_options, &terminal)?;
-            // What is there is written before the next pair, which may fail, is tried.
+            // Complete pairs are written before the next one is estimated, which may fail.
             loop {
                 terminal.finish();
                 for (estimate, pair) in found.iter().zip(waiting.drain(..found.len())) {
-                    let mut report = Report::new(estimate, &options);
+                    let mut report = Report::new(
+                        estimate,
+                        &surroundings.timed(&options, [pair.pair, pair.pair + 1]),
+                    );
                     report.seconds.load = Some(pair.load);
                     report.seconds.total += pair.load;
                     report.peak_rss_bytes = peak_resident_bytes();
@@ -228,7 +233,7 @@ impl Flow {
         Ok(())
     }
 
-    /// Refuses, before any work, what could not be written at its end.
+    /// Refuses outputs that could not be written. Called before any work.
     fn check_outputs(&self) -> Result<(), Failure> {
         if self.output.is_none() && self.picture.is_none() && !self.json {
             return Err(Failure::usage(anyhow!(
@@ -252,7 +257,7 @@ impl Flow {
         files::check_outputs(&outputs, self.sweeps.iter().chain(&known))
     }
 
-    /// Writes, draws and prints what became of a pair, which is one of `pairs`.
+    /// Writes, draws and prints the estimate of number `pair` of `pairs` pairs.
     fn put(
         &self,
         estimate: &Estimate,

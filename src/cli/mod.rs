@@ -1,6 +1,6 @@
-//! The command line: one file per subcommand. The only room that prints.
+//! The command line: one file per subcommand. The only module that prints.
 //!
-//! Answers go to stdout, progress and errors to stderr. It knows the other rooms; none knows it.
+//! Results go to stdout, progress and errors to stderr. No other module depends on this one.
 #![expect(
     clippy::print_stderr,
     reason = "printing is what a command line is for"
@@ -28,7 +28,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-/// Scene flow: two lidar clouds in, the motion of every point out.
+/// Scene flow from lidar: estimates the displacement of every point between two sweeps.
 #[derive(Debug, Parser)]
 #[command(name = "fnsf", version, propagate_version = true, max_term_width = 100)]
 #[command(after_help = "Start here:\n  \
@@ -36,7 +36,7 @@ use clap::{Parser, Subcommand};
     fnsf serve                                 HTTP and gRPC on 127.0.0.1:8080\n  \
     fnsf flow a.pcd b.pcd -o flow.npz          two sweeps, any format\n  \
     fnsf flow a.pcd b.pcd --picture flow.png   the same, to look at\n  \
-    fnsf densify *.pcd --into 5 -o dense.laz   a drive's sweeps as one dense cloud")]
+    fnsf densify *.pcd --reference-time 5 -o dense.laz   a drive's sweeps as one dense cloud")]
 pub struct Arguments {
     #[command(subcommand)]
     command: Command,
@@ -53,8 +53,8 @@ enum Command {
     Doctor(doctor::Doctor),
 }
 
-/// Runs the command and turns its end into an exit code: 0 done, 2 usage, 65 bad input,
-/// 70 internal.
+/// Runs the command and returns its exit code: 0 success, 2 usage error, 65 bad input, 70 internal
+/// error.
 pub fn run(arguments: Arguments) -> ExitCode {
     let done = match arguments.command {
         Command::Demo(command) => command.run(),

@@ -1,4 +1,4 @@
-//! Answers on stdout. A reader that has gone away (`fnsf doctor | head -1`) is no failure.
+//! Output on stdout. A closed pipe (`fnsf doctor | head -1`) is not an error.
 
 use std::fmt;
 use std::io::{self, Write};
@@ -8,7 +8,8 @@ use super::failure::Failure;
 /// Prints one line on stdout.
 ///
 /// # Errors
-/// Where stdout cannot be written; [`Failure::reader_gone`] where nobody reads it any more.
+/// [`Failure::reader_gone`] where the reader has closed the pipe, an internal failure for any other
+/// write error.
 pub(super) fn say(line: fmt::Arguments<'_>) -> Result<(), Failure> {
     let mut stdout = io::stdout().lock();
     writeln!(stdout, "{line}").map_err(|error| match error.kind() {

@@ -1,4 +1,4 @@
-//! `fnsf serve`: the service, until it is told to stop.
+//! `fnsf serve`: runs the service until SIGTERM or SIGINT.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -15,26 +15,28 @@ use crate::app::App;
 use crate::config::{Config, LogFormat};
 use crate::telemetry::Telemetry;
 
-/// Time that threads have to end when everything else has.
+/// Time given to the remaining threads to end at shutdown.
 const TO_LET_GO: Duration = Duration::from_secs(1);
 
 /// Serve scene flow over HTTP and gRPC.
 ///
-/// Both on one port, health and metrics on another, jobs and results in a folder. Everything can
-/// stand in a file (--config), in the environment (FNSF_SERVE_LISTEN, FNSF_SERVE_LIMITS__MAX_POINTS)
-/// or, the most common, in flags; later ones win. --print-config shows every key and its value.
+/// HTTP and gRPC share one port; health and metrics have another. Jobs and results are kept in a
+/// folder. Every setting can be given in a TOML file (--config) or in the environment
+/// (FNSF_SERVE_LISTEN, FNSF_SERVE_LIMITS__MAX_POINTS); the most common ones have flags. Flags
+/// override the environment, which overrides the file. --print-config lists every key with its
+/// value.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
     fnsf serve\n  \
     fnsf serve --listen 0.0.0.0:8080 --config fnsf.toml\n  \
     curl -F source=@a.pcd -F target=@b.pcd localhost:8080/v1/flow -o flow.npz")]
 pub(super) struct Serve {
-    /// A TOML file; --print-config shows what it may say
+    /// Configuration file, TOML; --print-config lists its keys
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     #[command(flatten)]
     flags: Flags,
-    /// Show the whole configuration as TOML, secrets left out, and exit
+    /// Print the whole configuration as TOML, without secrets, and exit
     #[arg(long)]
     print_config: bool,
     /// Check the configuration and exit
@@ -42,23 +44,25 @@ pub(super) struct Serve {
     check_config: bool,
 }
 
-/// The keys that have flags; those not given are left to the file, the environment, the defaults.
+/// Configuration keys that have flags. Those not given come from the environment, the file or the
+/// defaults.
 #[derive(Debug, Args, Serialize)]
 struct Flags {
-    /// HTTP and gRPC [default: 127.0.0.1:8080]
+    /// Address of HTTP and gRPC [default: 127.0.0.1:8080]
     #[arg(long, value_name = "ADDRESS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     listen: Option<SocketAddr>,
-    /// Health and metrics [default: 127.0.0.1:9090]
+    /// Address of health and metrics [default: 127.0.0.1:9090]
     #[arg(long, value_name = "ADDRESS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     admin_listen: Option<SocketAddr>,
-    /// The queue, payloads and results [default: fnsf-data]
+    /// Folder for the queue, payloads and results [default: fnsf-data]
     #[arg(long, value_name = "DIR")]
     #[serde(skip_serializing_if = "Option::is_none")]
     data_dir: Option<PathBuf>,
-    /// A device: auto (every GPU, else the CPU), cpu, cpu:THREADS, gpu or gpu:CARD; give it again
-    /// for more than one [default: auto]
+    /// Compute device: auto (every GPU, else the CPU), cpu, cpu:THREADS, gpu (every GPU) or
+    /// gpu:CARD (a GPU's number, PCI id or part of its name); repeat it for several devices
+    /// [default: auto]
     #[arg(long = "device", value_name = "DEVICE")]
     #[serde(skip_serializing_if = "Vec::is_empty")]
     devices: Vec<String>,
@@ -69,11 +73,12 @@ struct Flags {
 
 #[derive(Debug, Args, Serialize)]
 struct LogFlags {
-    /// Logs for people or for programs [default: human]
+    /// Log format: human-readable lines, or one JSON object a line [default: human]
     #[arg(long = "log-format", value_enum)]
     #[serde(skip_serializing_if = "Option::is_none")]
     format: Option<LogFormat>,
-    /// Which logs: a level, or fnsf::worker=debug,info [default: info]
+    /// Log filter: a level such as info, or levels by module such as fnsf::worker=debug,info
+    /// [default: info]
     #[arg(long = "log", value_name = "FILTER")]
     #[serde(skip_serializing_if = "Option::is_none")]
     filter: Option<String>,
@@ -101,7 +106,7 @@ impl Serve {
             .build()
             .map_err(Failure::internal)?;
         let served = runtime.block_on(serve(config));
-        // A thread that hangs in a disk's hands must not keep the process.
+        // A thread that is blocked in disk I/O must not keep the process alive.
         runtime.shutdown_timeout(TO_LET_GO);
         served
     }
@@ -110,7 +115,7 @@ impl Serve {
 async fn serve(config: Config) -> Result<(), Failure> {
     let telemetry = Telemetry::start(&config.log, config.otlp_endpoint.as_deref());
     let _flushed_at_the_end = telemetry.map_err(Failure::usage)?;
-    // Before anything is promised, so that no signal is missed.
+    // The handlers are installed before the server starts, so that no signal is missed.
     let mut terminate = signal(SignalKind::terminate()).map_err(Failure::internal)?;
     let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::internal)?;
     let mut app = App::start(config).await.map_err(Failure::internal)?;

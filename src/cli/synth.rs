@@ -1,4 +1,4 @@
-//! `fnsf synth`: a simulated street as files, with its exact truth.
+//! `fnsf synth`: a simulated street as files, with exact ground truth.
 
 use std::path::PathBuf;
 
@@ -12,32 +12,33 @@ use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
 use crate::formats::{CloudFormat, Ground, Pair, PairTruth, write_cloud, write_pair_npz};
 use crate::text::grouped;
 
-/// Make a synthetic sequence with exact ground truth.
+/// Simulate a sequence of lidar sweeps with exact ground truth.
 ///
-/// Writes frame_0000.pcd, frame_0001.pcd, ... and, for each frame and the next, pair_0000.npz, ...
-/// with both clouds, the flow of every point, and which points move or are ground.
+/// Writes sweep_0000.pcd, sweep_0001.pcd, ... and, for each two consecutive sweeps, pair_0000.npz,
+/// ... A pair contains both clouds, the flow of every source point, the ego motion, and masks of
+/// dynamic points, points on objects and ground points.
 #[derive(Debug, Args)]
 #[command(after_help = "Example:\n  \
-    fnsf synth -o street --frames 3 && fnsf flow street/pair_0000.npz -o flow.npz")]
+    fnsf synth -o street --sweeps 3 && fnsf flow street/pair_0000.npz -o flow.npz")]
 pub(super) struct Synth {
-    /// A folder for the files; made if it is not there
+    /// Folder for the files; created if missing
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
-    /// Sweeps, 0.1 s apart
+    /// Number of sweeps, 0.1 s apart, 1 to 1,000
     #[arg(long, value_name = "N", default_value_t = 2)]
-    frames: usize,
-    /// The same seed gives the same street
+    sweeps: usize,
+    /// Seed of the simulation; the same seed gives the same street
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
-    /// Lasers of the lidar
+    /// Number of the lidar's lasers, 1 to 256
     #[arg(long, value_name = "N", default_value_t = StreetOptions::default().beams)]
     beams: usize,
-    /// Moving cars, cyclists and pedestrians
+    /// Number of moving objects (cars, cyclists and pedestrians), at most 256
     #[arg(long, value_name = "N", default_value_t = StreetOptions::default().movers)]
     movers: usize,
 }
 
-/// A simulated pair as files hold it.
+/// A simulated pair with its ground truth, in the form in which files store it.
 pub(super) fn labelled(simulated: SimulatedPair) -> Pair {
     let points = simulated.source.len();
     Pair {
@@ -62,7 +63,7 @@ impl Synth {
     pub(super) fn run(&self) -> Result<(), Failure> {
         let street = Street::new(&StreetOptions {
             seed: self.seed,
-            frames: self.frames,
+            sweeps: self.sweeps,
             beams: self.beams,
             movers: self.movers,
             ..StreetOptions::default()
@@ -72,22 +73,22 @@ impl Synth {
             .with_context(|| format!("cannot make {}", self.output.display()))
             .map_err(Failure::internal)?;
         let mut points = 0;
-        for index in 0..self.frames {
-            let frame = street.frame(index).map_err(Failure::internal)?;
+        for index in 0..self.sweeps {
+            let frame = street.sweep(index).map_err(Failure::internal)?;
             points += frame.points.len();
-            let path = self.output.join(format!("frame_{index:04}.pcd"));
+            let path = self.output.join(format!("sweep_{index:04}.pcd"));
             files::write(&path, |file| {
                 write_cloud(CloudFormat::Pcd, &frame.points, file)
             })?;
         }
-        for index in 0..self.frames.saturating_sub(1) {
+        for index in 0..self.sweeps.saturating_sub(1) {
             let pair = labelled(street.pair(index).map_err(Failure::internal)?);
             let path = self.output.join(format!("pair_{index:04}.npz"));
             files::write(&path, |file| write_pair_npz(&pair, file))?;
         }
         say(format_args!(
-            "{} frames, {} points, in {}",
-            self.frames,
+            "{} sweeps, {} points, in {}",
+            self.sweeps,
             grouped(points),
             self.output.display()
         ))?;

@@ -1,4 +1,4 @@
-//! A clock and a progress bar for the numerics.
+//! The command line's `Control`: a clock and a progress bar.
 
 use std::time::Instant;
 
@@ -6,7 +6,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::flow::{Control, Progress};
 
-/// Keeps time; shows iterations and loss where stderr is a terminal.
+/// Keeps time. Shows progress and loss where stderr is a terminal.
 pub(super) struct Terminal {
     began: Instant,
     bar: ProgressBar,
@@ -18,7 +18,7 @@ impl Terminal {
             "{spinner} {prefix}{msg}  {wide_bar:.cyan/blue} {pos} of at most {len}  {elapsed}",
         )
         .unwrap_or_else(|_| ProgressStyle::default_bar());
-        // Hidden by itself where stderr is not a terminal.
+        // indicatif hides the bar where stderr is not a terminal.
         let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
         bar.set_style(style);
         bar.set_message("preparing");
@@ -29,12 +29,12 @@ impl Terminal {
         }
     }
 
-    /// Names the part of the work that begins, and shows the bar again.
+    /// Sets the name of the current part of the work, shown before the bar's message.
     pub(super) fn part(&self, name: &str) {
         self.bar.set_prefix(format!("{name}, "));
     }
 
-    /// Takes the bar away.
+    /// Clears the bar.
     pub(super) fn finish(&self) {
         self.bar.finish_and_clear();
     }
@@ -46,8 +46,8 @@ impl Control for Terminal {
     }
 
     fn progress(&self, progress: Progress) {
-        self.bar.set_length(progress.max_iterations as u64);
-        self.bar.set_position(progress.iteration as u64);
+        self.bar.set_length(progress.total as u64);
+        self.bar.set_position(progress.done as u64);
         self.bar.set_message(format!("loss {:.4} m", progress.loss));
     }
 }

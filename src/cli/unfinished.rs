@@ -1,38 +1,39 @@
-//! Files that are being written, and that no signal leaves behind.
+//! Temporary output files, which are removed when a signal ends the program.
 
 use std::fs::{File, Permissions};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, MutexGuard, Once, PoisonError};
+use std::sync::{Mutex, MutexGuard, Once};
 
+use crate::sync::locked;
 use tempfile::{NamedTempFile, TempPath};
 use tokio::signal::unix::{SignalKind, signal};
 
-/// The names of files that are being written.
+/// Paths of the files being written.
 static WRITTEN: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
 
-/// A file under a name of its own, until it is whole.
+/// An output file under a temporary name, until it is complete.
 pub(super) struct Unfinished {
     path: TempPath,
 }
 
 fn written() -> MutexGuard<'static, Vec<PathBuf>> {
-    WRITTEN.lock().unwrap_or_else(PoisonError::into_inner)
+    locked(&WRITTEN)
 }
 
 impl Unfinished {
-    /// Makes a file beside `place`, under a name that nobody else has.
+    /// Creates a file with a unique temporary name in the folder of `place`.
     pub(super) fn beside(place: &Path) -> std::io::Result<(Self, File)> {
         remove_on_signals();
         let folder = place.parent().unwrap_or(Path::new("."));
         let name = place.file_name().unwrap_or_default();
         let mut names = written();
-        // A name may be as long as a name can be.
+        // Only the first 40 characters: `name` may already have the maximum length of a file name.
         let begins: String = name.to_string_lossy().chars().take(40).collect();
         let made: NamedTempFile = tempfile::Builder::new()
             .prefix(&format!("{begins}."))
             .suffix(".part")
-            // As any file is made: what the user's mask leaves of it.
+            // The mode of a regular new file; the user's umask is applied to it.
             .permissions(Permissions::from_mode(0o666))
             .tempfile_in(folder)?;
         let (file, path) = made.into_parts();
@@ -40,7 +41,7 @@ impl Unfinished {
         Ok((Self { path }, file))
     }
 
-    /// Gives the file its name, over what had it.
+    /// Renames the file to `place` and replaces any file there.
     pub(super) fn rename(self, place: &Path) -> std::io::Result<()> {
         let mut names = written();
         names.retain(|name| *name != *self.path);
@@ -48,10 +49,11 @@ impl Unfinished {
     }
 }
 
-/// The signal of a file that may not grow any more; its number on Linux, macOS and the BSDs.
+/// SIGXFSZ, the signal for exceeding the file size limit. This is its number on Linux, macOS and
+/// the BSDs.
 const SIGXFSZ: i32 = 25;
 
-/// Whether a signal was ignored when the program was started; not known but on Linux.
+/// Whether a signal was ignored when the program started. Detected on Linux only.
 fn is_ignored(kind: SignalKind) -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
@@ -59,7 +61,7 @@ fn is_ignored(kind: SignalKind) -> bool {
     mask.is_some_and(|mask| mask >> (kind.as_raw_value() - 1) & 1 == 1)
 }
 
-/// From here on a signal that ends the program takes unfinished files with it.
+/// Starts a thread, once, that removes temporary files when a signal ends the program.
 fn remove_on_signals() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {
@@ -68,14 +70,15 @@ fn remove_on_signals() {
                 .enable_all()
                 .build()?;
             runtime.block_on(async {
-                // A file that may not grow is an error of a write, not the end of the program.
+                // With a handler installed, exceeding the file size limit is a write error. By
+                // default the signal ends the program.
                 drop(signal(SignalKind::from_raw(SIGXFSZ))?);
                 let ends = [
                     SignalKind::interrupt(),
                     SignalKind::terminate(),
                     SignalKind::hangup(),
                 ];
-                // What nohup and shells have told it to ignore stays ignored.
+                // Signals that were ignored at the start, by nohup or a shell, stay ignored.
                 let ends = ends.into_iter().filter(|kind| !is_ignored(*kind));
                 let mut coming = Vec::new();
                 for kind in ends {
@@ -89,14 +92,15 @@ fn remove_on_signals() {
                     return Ok(());
                 }
                 let (number, ..) = futures_util::future::select_all(coming).await;
-                // Nothing is written between this and the end.
+                // The lock is held during the removal, so no file is created or renamed meanwhile.
                 for path in written().iter() {
                     let _gone_is_fine = std::fs::remove_file(path);
                 }
                 std::process::exit(128 + number.as_raw_value())
             })
         };
-        // Without it a signal leaves a file behind, and nothing worse.
+        // If the thread cannot start, a signal leaves a temporary file behind and has no other
+        // effect.
         let _without = std::thread::Builder::new()
             .name("signals".to_owned())
             .spawn(move || control().unwrap_or_default());

@@ -1,95 +1,61 @@
-//! What the numbers of a configuration may be.
+//! The least and the most that the numbers of a configuration may be.
 
-use super::Config;
+use super::keys::Config;
+
+/// A key's name, its value, and the least and the most that it may be.
+pub(super) type Range = (&'static str, u64, u64, u64);
+
+macro_rules! range {
+    ($section:ident.$key:ident, $least:expr, $most:expr) => {
+        (
+            concat!(stringify!($section), ".", stringify!($key)),
+            number($section.$key),
+            $least,
+            $most,
+        )
+    };
+}
+
+fn number(value: impl TryInto<u64>) -> u64 {
+    value.try_into().unwrap_or(u64::MAX)
+}
 
 impl Config {
-    /// Every number with the least and the most that it may be: past these, units wrap around and
-    /// timers end.
-    pub(super) fn ranges(&self) -> [(&'static str, u64, u64, u64); 24] {
+    /// The range of every number: beyond it, conversions of units overflow and timers expire.
+    pub(super) fn ranges(&self) -> [Range; 24] {
         const YEARS: u64 = 100 * 365 * 24 * 3600;
         const MIB: u64 = 1 << 43;
         let Self {
             limits,
             queue,
-            drain,
+            shutdown,
             ..
         } = self;
-        let count = |count: usize| count as u64;
         [
-            ("limits.max_points", count(limits.max_points), 1, 50_000_000),
-            ("limits.max_pair_mib", count(limits.max_pair_mib), 1, MIB),
-            ("limits.max_upload_mib", limits.max_upload_mib, 1, MIB),
-            ("limits.max_uploads_mib", limits.max_uploads_mib, 1, MIB),
-            ("limits.max_answers_mib", limits.max_answers_mib, 1, MIB),
-            ("limits.min_free_mib", limits.min_free_mib, 0, MIB),
-            ("limits.min_free_inodes", limits.min_free_inodes, 0, 1 << 40),
-            ("limits.max_frames", limits.max_frames.into(), 2, 1 << 20),
-            ("limits.max_wait_seconds", limits.max_wait_seconds, 0, YEARS),
-            (
-                "limits.max_queue_seconds",
-                limits.max_queue_seconds,
-                0,
-                YEARS,
-            ),
-            (
-                "limits.max_tenant_queue_seconds",
-                limits.max_tenant_queue_seconds,
-                0,
-                YEARS,
-            ),
-            (
-                "limits.max_connections",
-                count(limits.max_connections),
-                1,
-                1 << 20,
-            ),
-            (
-                "limits.header_timeout_seconds",
-                limits.header_timeout_seconds,
-                1,
-                3600,
-            ),
-            (
-                "limits.body_timeout_seconds",
-                limits.body_timeout_seconds,
-                1,
-                3600,
-            ),
-            (
-                "limits.write_timeout_seconds",
-                limits.write_timeout_seconds,
-                1,
-                3600,
-            ),
-            (
-                "limits.sequence_ahead",
-                count(limits.sequence_ahead),
-                1,
-                1000,
-            ),
-            ("queue.max_attempts", queue.max_attempts.into(), 1, 1000),
-            ("queue.max_crashes", queue.max_crashes.into(), 1, 1000),
-            ("queue.lease_seconds", queue.lease_seconds, 1, YEARS),
-            (
-                "queue.retry_delay_seconds",
-                queue.retry_delay_seconds,
-                0,
-                YEARS,
-            ),
-            (
-                "queue.time_to_live_seconds",
-                queue.time_to_live_seconds,
-                1,
-                YEARS,
-            ),
-            ("queue.retention_seconds", queue.retention_seconds, 1, YEARS),
-            (
-                "queue.answered_retention_seconds",
-                queue.answered_retention_seconds,
-                1,
-                YEARS,
-            ),
-            ("drain.deadline_seconds", drain.deadline_seconds, 0, YEARS),
+            range!(limits.max_points, 1, 50_000_000),
+            range!(limits.max_job_memory_mib, 1, MIB),
+            range!(limits.max_upload_mib, 1, MIB),
+            range!(limits.max_total_upload_mib, 1, MIB),
+            range!(limits.max_answers_mib, 1, MIB),
+            range!(limits.min_free_disk_mib, 0, MIB),
+            range!(limits.min_free_inodes, 0, 1 << 40),
+            range!(limits.max_sweeps, 2, 1 << 20),
+            range!(limits.max_wait_seconds, 0, YEARS),
+            range!(limits.max_queue_seconds, 0, YEARS),
+            range!(limits.max_tenant_queue_seconds, 0, YEARS),
+            range!(limits.max_connections, 1, 1 << 20),
+            range!(limits.header_timeout_seconds, 1, 3600),
+            range!(limits.body_timeout_seconds, 1, 3600),
+            range!(limits.write_timeout_seconds, 1, 3600),
+            range!(limits.stream_prefetch_pairs, 1, 1000),
+            range!(queue.max_attempts, 1, 1000),
+            range!(queue.max_crashes, 1, 1000),
+            range!(queue.lease_seconds, 1, YEARS),
+            range!(queue.retry_delay_seconds, 0, YEARS),
+            range!(queue.time_to_live_seconds, 1, YEARS),
+            range!(queue.retention_seconds, 1, YEARS),
+            range!(queue.sync_result_retention_seconds, 1, YEARS),
+            range!(shutdown.timeout_seconds, 0, YEARS),
         ]
     }
 }

@@ -1,4 +1,4 @@
-//! What a configuration holds and nobody may see: keys, and errors in their place.
+//! API keys in a configuration, and error messages that do not reveal them.
 
 use std::fmt;
 
@@ -6,12 +6,12 @@ use figment::error::Kind;
 use serde::de::Visitor;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// Text that is never shown.
+/// Text that is never printed: `Debug` and `Serialize` give `***`.
 #[derive(Clone)]
 pub struct Secret(String);
 
 impl Secret {
-    /// The text itself.
+    /// The secret text.
     pub fn reveal(&self) -> &str {
         &self.0
     }
@@ -35,10 +35,10 @@ impl<'de> Deserialize<'de> for Secret {
     }
 }
 
-/// Reads text, and says of anything else no more than that it is none.
+/// Accepts strings and single characters. The error for any other type does not contain the value.
 struct SecretVisitor;
 
-/// A value that is no text, without saying it.
+/// The error for a value that is not a string. It does not contain the value.
 fn no_text<E: serde::de::Error>() -> E {
     E::custom("a key is text: put it in quotes")
 }
@@ -87,7 +87,8 @@ impl<'de> Visitor<'de> for SecretVisitor {
     }
 }
 
-/// What is wrong, key by key. What was found in a key's place is never said: it may be the key.
+/// The errors of figment as one line, key by key. The values of keys that may be secret are left
+/// out.
 pub(super) fn wrong_values(error: figment::Error) -> String {
     const SECRET: [&str; 3] = ["api_key", "keys", "tls"];
     let said = error.into_iter().map(|mut error| {

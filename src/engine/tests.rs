@@ -1,4 +1,4 @@
-//! A device's health through losses, panics and refusals, with several lanes.
+//! Health of a device with several lanes under losses, panics and failed openings.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -6,13 +6,14 @@ use std::time::Duration;
 
 use tokio::time::timeout;
 
-use super::cards::Switches;
-use super::{Device, EngineError, Health, Lane, Work};
+use super::device::{Device, Lane};
+use super::test_gpu::Switches;
+use super::types::{EngineError, Health, Work};
 use crate::flow::field::BackendError;
 use crate::flow::{Point, Preset, Uncontrolled};
 use crate::metrics::Metrics;
 
-/// Long enough for a loaded machine; only a failure waits so long.
+/// Timeout, long enough for a loaded machine. Only a failing test waits this long.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 struct Stand {
@@ -39,8 +40,8 @@ impl Stand {
         reached.expect("in time").expect("threads live");
     }
 
-    /// As the server's upkeep does it: a look while a lane has its hands on the device says
-    /// nothing, so that there is always another.
+    /// Polls as the server's housekeeping does. A poll while a lane holds the supervisor's lock has
+    /// no effect, so it is repeated.
     async fn looked_at_until(&self, wanted: impl Fn(&Health) -> bool) {
         let looks = async {
             loop {
@@ -64,7 +65,7 @@ impl Stand {
     }
 }
 
-/// A wall of points, and one a tenth of a metre on.
+/// A wall of points, and the same wall 0.1 m further along x.
 fn work() -> Work {
     let source: Vec<Point> = (0..900u16)
         .map(|i| [8.0, f32::from(i % 30) * 0.2, f32::from(i / 30) * 0.2])
@@ -74,7 +75,7 @@ fn work() -> Work {
         source,
         ground: None,
         before: None,
-        around: Vec::new(),
+        neighbors: Vec::new(),
         options: Preset::Neural.options(None),
         snapshot: None,
         control: Arc::new(Uncontrolled),
@@ -193,7 +194,7 @@ async fn a_device_that_fails_its_trial_is_given_up_under_the_other_lanes_too() {
     stand.ready().await;
     stand.switches.brake.store(true, Ordering::Relaxed);
     let lanes: Vec<_> = stand.device.lanes().collect();
-    // Nothing but the end of the card lets it go on.
+    // Only the loss of the device lets it continue.
     let at_work = solved(&lanes[0]);
     let slips = async {
         stand.switches.until_at_the_brake(1).await;
@@ -218,14 +219,17 @@ async fn a_device_that_does_not_come_back_is_given_up_and_still_tried() {
     stand.switches.refusals.store(1000, Ordering::Relaxed);
     let lane = stand.device.lanes().next().expect("a lane");
     stand.switches.destroy();
-    // It is given back, or done in the end, by which lane is first to see the loss.
+    // It is returned unrun or solved, depending on which lane detects the loss first.
     let given_back_or_done = solved(&lane);
     let driver_comes_back = async {
         stand
             .until(|health| matches!(health, Health::Gone(_)))
             .await;
-        let obstacle = stand.device.obstacle().expect("an obstacle");
-        assert!(obstacle.contains("the driver is away"), "{obstacle}");
+        let not_ready_reason = stand.device.not_ready_reason().expect("an obstacle");
+        assert!(
+            not_ready_reason.contains("the driver is away"),
+            "{not_ready_reason}"
+        );
         stand.switches.refusals.store(0, Ordering::Relaxed);
         stand.ready().await;
     };

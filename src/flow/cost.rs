@@ -1,79 +1,77 @@
-//! What an estimate will take, known before anything is accepted: memory and work.
+//! Cost model: the memory and the work of an estimate, predicted from its input.
 //!
-//! Refuses what [`super::estimate()`] would refuse, for a hundredth of its time and without its
-//! memory. Work is counted in multiply-adds of the network; what is not one is counted as the
-//! multiply-adds that take as long on a CPU. Knows no device and no time: a rate turns work into
-//! seconds.
+//! Rejects the inputs that [`super::estimate()`] rejects, in about a hundredth of its time and
+//! without its memory. Work is counted in multiply-adds of the network. Other work is converted to
+//! the number of multiply-adds that take equally long on a CPU. Independent of the device: a
+//! throughput in multiply-adds per second turns work into seconds.
 
 use super::data::Point;
-use super::distance::{DistanceTransform, TransformPrice};
+use super::distance::DistanceTransform;
 use super::error::FlowError;
 use super::field::{LAID_OUT, PARAMETERS};
-use super::options::Options;
-use super::registration::neighbors;
-use super::select;
-use super::select::Problem;
+use super::options::{FieldOptions, Method, Options};
+use super::problem::Problem;
+use super::select::{find_ground, select};
 
-/// Passes over the network that an iteration takes a point: forward, and twice that backward.
+/// Network passes per point and iteration: one forward pass, and a backward pass that costs two.
 const PASSES: f64 = 3.0;
-/// An iteration's steps beside its points (gradients added, Adam, transposes), in points.
+/// Fixed cost of an iteration (gradient sum, Adam, transposes), expressed in points.
 const STEP_POINTS: f64 = 150.0;
-/// Multiply-adds that take as long as aligning whatever the number of points: nine coarse fits, and
-/// a fine one of 8,192 points.
+/// Fixed cost of a registration, multiply-adds: nine coarse fits, and a fine fit of 8,192 points.
 const ALIGNING: f64 = 4e9;
-/// Multiply-adds that take as long as thinning a point for that, and its share of the surfels.
+/// Cost per point of the registration's voxel downsampling and surfels, multiply-adds.
 const THINNING: f64 = 2e4;
-/// Bytes that are held for a point while it is: itself and a copy that is remembered, its voxel and
-/// its surfels, at most.
+/// Peak bytes per point of the same step: the point, a cached copy, its voxel and its surfels.
 const THINNING_BYTES: usize = 96;
-/// Multiply-adds that take as long as a point's share of the search for movers, and the bytes that
-/// are held for it: its cell, its thinned copies, three indices by place, its normal.
+/// Cost per point of the object search, multiply-adds. Its bytes per point cover the cell, the
+/// voxel-downsampled copies, three spatial indices and the normal.
 const LABELLING: f64 = 4e5;
 const LABELLING_BYTES: usize = 448;
-/// Multiply-adds that take as long as selecting and moving a point and its results.
+/// Cost per point of selection, of the rigid transform and of the result, multiply-adds.
 const POINT: f64 = 3e4;
-/// Sets of parameters that are held at once: of the network, its transposes, its optimizer, the
-/// result, and the most chunks of gradients.
+/// Parameter sets held at once: the network, its transposes, its optimizer and the result (6), and
+/// the largest number of gradient chunks (32).
 const PARAMETER_SETS: usize = 6 + 32;
-/// Copies of the source that are held at once: selected, aligned, the trainer's, flow twice.
+/// Copies of the source held at once: selected, aligned, the trainer's, and the flow twice.
 const POINT_COPIES: usize = 5;
-/// Working sets, one a thread, bytes in all: 28 threads.
+/// Bytes of the working sets of all threads together, for 28 threads.
 const WORKING_SETS: usize = 16 << 20;
 
-/// What an estimate will take.
+/// The predicted memory and work of an estimate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cost {
-    /// Source points that take part.
+    /// Source points that pass the selection.
     pub source_points: usize,
-    /// Target points that take part.
+    /// Target points that pass the selection.
     pub target_points: usize,
-    /// Bricks of the distance transform; none of a dense one.
+    /// Bricks of the distance transform; zero for a dense transform and for the object search.
     pub bricks: usize,
-    /// Bytes of the distance transform: what [`super::Estimate::distance_bytes`] will be.
+    /// Bytes of the distance transform, equal to [`super::FieldSolution::distance_bytes`].
     pub transform_bytes: usize,
-    /// At most the bytes that are held at once on the device, but for the problem itself.
+    /// Upper bound of the bytes held at once, without the problem itself.
     pub bytes: usize,
-    /// Work: multiply-adds of the network, and what takes as long as so many.
+    /// Work, in multiply-adds of the network. Other work is included as the number of multiply-adds
+    /// that take equally long.
     pub multiply_adds: f64,
 }
 
 impl Cost {
-    /// Seconds on a device that does `rate` multiply-adds a second.
+    /// Seconds at a throughput of `rate` multiply-adds per second.
     pub fn seconds(&self, rate: f64) -> f64 {
         self.multiply_adds / rate
     }
 }
 
-/// What one more sweep around a pair adds to its price.
+/// The cost that one neighbor sweep adds to the estimate of a pair.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct NeighborCost {
-    /// At most the bytes that are held for it.
+    /// Upper bound of the bytes held for the sweep.
     pub bytes: usize,
-    /// Work, as [`Cost::multiply_adds`].
+    /// Work, in the unit of [`Cost::multiply_adds`].
     pub multiply_adds: f64,
 }
 
-/// Prices a sweep of so many points around a pair.
+/// Predicts the cost of a neighbor sweep of `points` points.
 pub fn neighbor_cost(points: usize) -> NeighborCost {
     NeighborCost {
         bytes: points * (2 * size_of::<Point>() + THINNING_BYTES + LABELLING_BYTES),
@@ -81,58 +79,80 @@ pub fn neighbor_cost(points: usize) -> NeighborCost {
     }
 }
 
-/// Prices the estimate of `problem` by `options`, with as many iterations as
-/// [`Options::expected_iterations`].
+/// Predicts the cost of the estimate of `problem` with `options`. Assumes
+/// [`FieldOptions::expected_iterations`] iterations for a field.
 ///
 /// # Errors
-/// [`FlowError`] where [`super::estimate()`] would refuse the input.
+/// [`FlowError`] where [`super::estimate()`] would reject the input.
 pub fn price(problem: &Problem, options: &Options) -> Result<Cost, FlowError> {
-    let selection = select::select(problem, options, &select::find_ground)?;
+    let selection = select(problem, options, &find_ground)?;
     let (source_points, target_points) = (selection.source.len(), selection.target.len());
-    let clouds = [&selection.source, &selection.target];
-    let transform = match options.label {
-        None => DistanceTransform::price(clouds[0], clouds[1], &options.distance)
-            .map_err(|error| FlowError::Backend(error.into()))?,
-        Some(_) => TransformPrice::default(),
+    let method = match &options.method {
+        Method::Objects(_) => object_cost(source_points + target_points),
+        Method::Field(field) => field_cost([&selection.source, &selection.target], field)?,
     };
-    let batch = options.batch.unwrap_or(source_points).min(source_points) as f64;
-    let iterations = options.expected_iterations() as f64;
-    let passes = match options.label {
-        None => iterations * PASSES * (batch + STEP_POINTS) + source_points as f64,
-        Some(_) => 0.0,
+    let registered = selection.registration_clouds.iter().flatten();
+    let registered: usize = registered.map(Vec::len).sum();
+    let registration = match selection.registration_clouds {
+        Some(_) => ALIGNING + registered as f64 * THINNING,
+        None => 0.0,
     };
-    let labelled = options
-        .label
-        .as_ref()
-        .map_or(0, |_| source_points + target_points);
-    let aligned = selection
-        .registration_clouds
-        .map(|clouds| clouds.map(|points| points.len()));
-    let aligned = aligned.map(|[source, target]| source + target);
-    let aligning = aligned.map_or(0.0, |points| ALIGNING + points as f64 * THINNING);
-    let points = (source_points + target_points) as f64 * POINT;
-    let around = neighbors::nearest(problem, options.frames()).into_iter();
-    let around = around.map(|sweep| neighbor_cost(sweep.points.len()));
-    let (around_bytes, around_work) = around.fold((0, 0.0), |(bytes, work), around| {
-        (bytes + around.bytes, work + around.multiply_adds)
+    let neighbors = problem.nearest_neighbors(options.sweeps());
+    let neighbors = neighbors
+        .iter()
+        .map(|sweep| neighbor_cost(sweep.points.len()));
+    let (neighbor_bytes, neighbor_work) = neighbors.fold((0, 0.0), |(bytes, work), neighbor| {
+        (bytes + neighbor.bytes, work + neighbor.multiply_adds)
     });
     Ok(Cost {
         source_points,
         target_points,
+        bricks: method.bricks,
+        transform_bytes: method.transform_bytes,
+        bytes: method.bytes
+            + (POINT_COPIES * source_points + target_points) * size_of::<Point>()
+            + registered * THINNING_BYTES
+            + neighbor_bytes
+            + WORKING_SETS,
+        multiply_adds: method.multiply_adds
+            + neighbor_work
+            + registration
+            + (source_points + target_points) as f64 * POINT,
+    })
+}
+
+/// The part of the cost that depends on the method.
+struct MethodCost {
+    bricks: usize,
+    transform_bytes: usize,
+    bytes: usize,
+    multiply_adds: f64,
+}
+
+/// The object search in `points` points, source and target together.
+fn object_cost(points: usize) -> MethodCost {
+    MethodCost {
+        bricks: 0,
+        transform_bytes: 0,
+        bytes: PARAMETER_SETS * LAID_OUT * size_of::<f32>() + points * LABELLING_BYTES,
+        multiply_adds: points as f64 * LABELLING,
+    }
+}
+
+/// The distance transform and the fit of a field.
+fn field_cost(
+    [source, target]: [&[Point]; 2],
+    options: &FieldOptions,
+) -> Result<MethodCost, FlowError> {
+    let transform = DistanceTransform::price(source, target, &options.distance)
+        .map_err(|error| FlowError::Backend(error.into()))?;
+    let batch = options.batch.unwrap_or(source.len()).min(source.len()) as f64;
+    let iterations = options.expected_iterations() as f64;
+    let passes = iterations * PASSES * (batch + STEP_POINTS) + source.len() as f64;
+    Ok(MethodCost {
         bricks: transform.bricks,
         transform_bytes: transform.bytes,
-        bytes: transform.peak_bytes
-            + PARAMETER_SETS * LAID_OUT * size_of::<f32>()
-            + (POINT_COPIES * source_points + target_points) * size_of::<Point>()
-            + aligned.unwrap_or(0) * THINNING_BYTES
-            + labelled * LABELLING_BYTES
-            + around_bytes
-            + WORKING_SETS,
-        multiply_adds: transform.multiply_adds
-            + passes * PARAMETERS as f64
-            + labelled as f64 * LABELLING
-            + around_work
-            + aligning
-            + points,
+        bytes: transform.peak_bytes + PARAMETER_SETS * LAID_OUT * size_of::<f32>(),
+        multiply_adds: transform.multiply_adds + passes * PARAMETERS as f64,
     })
 }

@@ -1,47 +1,48 @@
-//! The numerics: scene flow of a pair of point clouds by run-time optimization.
+//! Scene flow estimation: the flow of a pair of point clouds by run-time optimization.
 //!
 //! ```text
 //! Problem - select - registration - objects or field - Estimate
 //! ```
 //!
-//! No async, no input or output, no clock, no environment, no globals. Deadlines, cancellation and
-//! time come in through a [`Control`].
+//! Free of async, input and output, clocks, environment variables and global state. Deadlines,
+//! cancellation and time come in through a [`Control`].
 //!
 //! ```
 //! use fnsf::flow::cpu::CpuBackend;
 //! use fnsf::flow::simulate::{Street, StreetOptions};
-//! use fnsf::flow::{Preset, Problem, Unwatched, estimate};
+//! use fnsf::flow::{Preset, Problem, Uncontrolled, estimate};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let street = StreetOptions { beams: 16, azimuth_steps: 400, ..StreetOptions::default() };
 //! let pair = Street::new(&street)?.pair(0)?;
-//! let problem = Problem { source: &pair.source, target: &pair.target, ground: None, before: None, around: &[] };
+//! let problem = Problem::pair(&pair.source, &pair.target);
 //! let options = Preset::Default.options(None);
-//! let estimate = estimate(&CpuBackend::new(None)?, &problem, &options, &Unwatched)?;
+//! let estimate = estimate(&CpuBackend::new(None)?, &problem, &options, &Uncontrolled)?;
 //! assert_eq!(estimate.flow.len(), pair.source.len());
 //! # Ok(())
 //! # }
 //! ```
 
-// The estimate of a pair and of a sequence, and its cost.
+// The estimate of a pair, of a sequence, and the prediction of its cost.
 mod cost;
 mod error;
 mod estimate;
 mod motion;
 mod options;
+mod problem;
 mod select;
 mod sequence;
 
-// Data and searches in space that all rooms share.
+// Shared data types, host threads and spatial indices.
 mod data;
 mod host;
 mod spatial;
 
-// Ground and ego motion.
+// Ground segmentation and ego motion.
 pub mod ground;
 mod registration;
 
-// The two methods: objects, and a neural field on a device.
+// The two methods: an object search, and the fit of a neural field on a backend.
 pub mod cpu;
 pub mod distance;
 pub mod field;
@@ -49,7 +50,7 @@ pub mod field;
 pub mod gpu;
 mod objects;
 
-// Results of a sequence, depth images, metrics and simulated data.
+// Densification, depth images, metrics and simulated data.
 pub mod densify;
 pub mod depth;
 pub mod evaluate;
@@ -57,19 +58,23 @@ pub mod simulate;
 
 pub use cost::{Cost, NeighborCost, neighbor_cost, price};
 pub use data::{
-    Control, DYNAMIC_M, DenseCloud, EnvelopeError, Interrupt, MIN_POINTS, OrientedBox, Point,
-    Progress, RigidTransform, Uncontrolled,
+    AlignedSweep, Control, DYNAMIC_M, DenseCloud, EnvelopeError, Interrupt, MIN_POINTS,
+    OrientedBox, Point, Progress, RigidTransform, Uncontrolled,
 };
 pub use error::FlowError;
-pub use estimate::{Estimate, PhaseSeconds, StopReason, estimate, resume};
+pub use estimate::{
+    Estimate, FieldSolution, ObjectSolution, Solution, StopReason, estimate, resume,
+};
 pub use field::{Network, Snapshot, SnapshotError, TrainerState};
-pub use host::Host;
+pub use host::{Host, HostError};
 pub use motion::{MotionField, Residual};
 pub use objects::{
-    Cluster, ClusterLabels, ConfidenceFeatures, ObjectMotions, ObjectSearch, Objects, SURE_M,
-    SearchClouds, confidence_of_ground,
+    CONFIDENT_WITHIN_M, Cluster, ClusterLabels, ConfidenceFeatures, ObjectMotions, ObjectSearch,
+    Objects, SearchClouds, confidence_of_ground,
 };
 pub use options::*;
-pub use registration::{AlignedSweep, NeighborSweep};
-pub use select::Problem;
-pub use sequence::{Sequence, Sweep, is_whole, window};
+pub use problem::{NeighborSweep, Problem};
+pub use sequence::{Sequence, Sweep, is_window_final, window};
+
+#[cfg(feature = "service")]
+pub(crate) use data::locked;

@@ -1,107 +1,88 @@
-//! Which rows of the two clouds take part: finite, in range, off the ground; and which are drawn.
+//! Selection of the points that take part, by crop, ground and sampling.
 //!
-//! Points that are left out keep their row in the result. Knows nothing of what comes after.
+//! Points that are excluded keep their row in the result.
+
+use std::borrow::Cow;
 
 use super::data::{MIN_POINTS, Point, Random};
 use super::error::FlowError;
 use super::ground;
-use super::motion::MotionField;
-use super::options::{Ego, Ground, Options};
-use super::registration::NeighborSweep;
+use super::options::{Ego, Ground, Method, Options};
+use super::problem::{NeighborSweep, Problem};
 
-/// Two clouds, as they came.
-#[derive(Clone, Copy, Debug)]
-pub struct Problem<'a> {
-    /// N points of the earlier sweep, metres, in its sensor's frame.
-    pub source: &'a [Point],
-    /// M points of the later sweep, metres, in its sensor's frame.
-    pub target: &'a [Point],
-    /// N and M flags: which points are ground. Needed by [`Ground::Mask`]; [`Ground::Auto`] finds
-    /// them where they are not given.
-    pub ground: Option<[&'a [bool]; 2]>,
-    /// The motion of the pair before, from the sweep before the source to the source: where a fit
-    /// may start, and the vehicle's motion be sought. None for a pair on its own.
-    pub before: Option<&'a MotionField>,
-    /// Other sweeps of the sequence, in any order; none for a pair on its own. Looked at where
-    /// [`super::ObjectOptions::frames`] asks for more than the pair.
-    pub around: &'a [NeighborSweep<'a>],
-}
-
-/// The points that take part.
+/// The selected points of a pair.
 #[derive(Clone, Debug)]
 pub(crate) struct Selection {
-    /// Rows of the source, one for each of `source`.
+    /// Source row of each point of `source`.
     pub(crate) rows: Vec<usize>,
     pub(crate) source: Vec<Point>,
     pub(crate) target: Vec<Point>,
-    /// Places in `rows` that get a flow: all, but where movers are found and some points are drawn.
+    /// Indices into `rows` of the points that get a flow. All of them, except where an object
+    /// search samples its output.
     pub(crate) output_rows: Vec<usize>,
-    /// Rows of the source that move with the ego motion without taking part: ground that was found.
+    /// Source rows of ground points that are excluded from the method and get the ego-motion flow.
     pub(crate) ego_only_rows: Vec<usize>,
-    /// Source and target for the ego motion, where it is to be found: all that is finite and in
-    /// range, the ground too, which holds pitch, roll and height.
+    /// Source and target clouds for the registration, where the ego motion is estimated: all points
+    /// that are finite and within the crop. Ground is included, because it determines pitch, roll
+    /// and height.
     pub(crate) registration_clouds: Option<[Vec<Point>; 2]>,
 }
 
-/// Which points of sweeps are ground, all of them finite and in range.
+/// Ground segmentation of several sweeps: one mask per sweep. All points are finite and within the
+/// crop.
 pub(crate) type FindGround<'a> = &'a dyn Fn(&[&[Point]]) -> Vec<Vec<bool>>;
 
-/// Finds the ground on this thread, and remembers nothing.
+/// Segments the ground on the calling thread, without a cache.
 pub(crate) fn find_ground(sweeps: &[&[Point]]) -> Vec<Vec<bool>> {
     sweeps.iter().map(|points| ground::mask(points)).collect()
 }
 
-/// Selects by `options`; refuses clouds of which too little is left.
+/// Selects the points of `problem` by `options`.
+///
+/// # Errors
+/// [`FlowError`] where a mask is missing or has another length, or where fewer than [`MIN_POINTS`]
+/// points of a cloud remain.
 pub(crate) fn select(
     problem: &Problem,
     options: &Options,
     find: FindGround<'_>,
 ) -> Result<Selection, FlowError> {
-    let mut found = match (options.ground, problem.ground) {
-        (Ground::Auto, Some(known)) => Some(known.map(<[bool]>::to_vec)),
-        (Ground::Auto, None) => Some(ground_of([problem.source, problem.target], options, find)),
-        (Ground::Keep | Ground::Mask, _) => None,
-    };
-    let [source_mask, target_mask] = match (options.ground, problem.ground, &found) {
-        (Ground::Mask, None, _) => return Err(FlowError::NoGroundMask),
-        (Ground::Mask, Some([source, target]), _) => [Some(source), Some(target)],
-        (_, _, Some([source, target])) => [Some(source.as_slice()), Some(target.as_slice())],
-        (_, _, None) => [None, None],
-    };
-    let mut rows = kept("source", problem.source, source_mask, options)?;
-    let mut target_rows = kept("target", problem.target, target_mask, options)?;
-    if found.is_some() && rows.len().min(target_rows.len()) < MIN_POINTS {
-        // Nothing but ground: it is what there is to fit.
-        found = None;
-        rows = kept("source", problem.source, None, options)?;
-        target_rows = kept("target", problem.target, None, options)?;
+    let given = problem.ground.map_or([None; 2], |masks| masks.map(Some));
+    let sweeps = [(problem.source, given[0]), (problem.target, given[1])];
+    let mut masks = ground_masks(sweeps, options, find)?;
+    let [mut rows, mut target_rows] = rows_of_pair(problem, &masks, options)?;
+    if options.ground == Ground::Auto && rows.len().min(target_rows.len()) < MIN_POINTS {
+        // Clouds that are nearly all ground keep their ground points.
+        masks = [None, None];
+        [rows, target_rows] = rows_of_pair(problem, &masks, options)?;
     }
-    let ego_only_rows = match &found {
-        Some([ground, _]) if options.max_points.is_none() => {
+    let ego_only_rows = match &masks {
+        [Some(ground), _] if options.ground == Ground::Auto && options.max_points.is_none() => {
             let rows = 0..ground.len();
-            rows.filter(|&row| ground[row] && is_in_range(problem.source[row], options))
+            rows.filter(|&row| ground[row] && is_in_crop(problem.source[row], options))
                 .collect()
         }
         _ => Vec::new(),
     };
     let mut output_rows: Vec<usize> = (0..rows.len()).collect();
     if let Some(max_points) = options.max_points {
-        // One permutation for both clouds, as the published code draws it; but each cloud is drawn
-        // from all of its rows, which lie in the order of the scan.
+        // One permutation for both clouds, as in the published code. Each cloud draws from all of
+        // its rows, because rows are in scan order.
         let mut order: Vec<usize> = (0..rows.len().max(target_rows.len())).collect();
         Random::stream(options.seed, 1).shuffle(&mut order);
         let drawn = |count: usize| -> Vec<usize> {
-            let places = order.iter().copied().filter(|&place| place < count);
-            places.take(max_points).collect()
+            let indices = order.iter().copied().filter(|&index| index < count);
+            indices.take(max_points).collect()
         };
-        if options.label.is_some() {
-            // Few points have no clusters: objects are found in all of them.
-            output_rows = drawn(rows.len());
-        } else {
-            for rows in [&mut rows, &mut target_rows] {
-                *rows = drawn(rows.len()).iter().map(|&place| rows[place]).collect();
+        match options.method {
+            // A sparse sample has no clusters, so the object search uses all points.
+            Method::Objects(_) => output_rows = drawn(rows.len()),
+            Method::Field(_) => {
+                for rows in [&mut rows, &mut target_rows] {
+                    *rows = drawn(rows.len()).iter().map(|&index| rows[index]).collect();
+                }
+                output_rows.truncate(rows.len());
             }
-            output_rows.truncate(rows.len());
         }
     }
     for (cloud, rows) in [("source", &rows), ("target", &target_rows)] {
@@ -116,67 +97,99 @@ pub(crate) fn select(
         source: rows.iter().map(|&row| problem.source[row]).collect(),
         target: target_rows.iter().map(|&row| problem.target[row]).collect(),
         registration_clouds: (options.ego == Ego::Auto)
-            .then(|| [problem.source, problem.target].map(|points| in_range(points, options))),
+            .then(|| [problem.source, problem.target].map(|points| cropped(points, options))),
         rows,
         output_rows,
         ego_only_rows,
     })
 }
 
-/// The points of a sweep around a pair that `options` let take part.
-pub(crate) fn off_ground(
+/// The selected points of a neighbor sweep.
+///
+/// # Errors
+/// As [`select`], except for the number of points.
+pub(crate) fn select_neighbor(
     sweep: &NeighborSweep,
     options: &Options,
     find: FindGround<'_>,
 ) -> Result<Vec<Point>, FlowError> {
-    let found = match (options.ground, sweep.ground) {
-        (Ground::Auto, None) => {
-            let [found] = ground_of([sweep.points], options, find);
-            Some(found)
-        }
-        (Ground::Mask, None) => return Err(FlowError::NoGroundMask),
-        _ => None,
-    };
-    let known = sweep.ground.filter(|_| options.ground != Ground::Keep);
-    let rows = kept(
-        "sweep around",
-        sweep.points,
-        found.as_deref().or(known),
-        options,
-    )?;
+    let [mask] = ground_masks([(sweep.points, sweep.ground)], options, find)?;
+    let rows = selected_rows("neighbor sweep", sweep.points, mask.as_deref(), options)?;
     Ok(rows.into_iter().map(|row| sweep.points[row]).collect())
 }
 
-/// Which points of each sweep are ground, of those that are finite and in range.
-pub(crate) fn ground_of<const SWEEPS: usize>(
-    sweeps: [&[Point]; SWEEPS],
+/// The ground masks of several sweeps: the given mask, or the segmentation of a sweep that has
+/// none. None with [`Ground::Keep`].
+///
+/// # Errors
+/// [`FlowError::NoGroundMask`] where [`Ground::Mask`] is set and a mask is missing.
+pub(crate) fn ground_masks<'a, const SWEEPS: usize>(
+    sweeps: [(&'a [Point], Option<&'a [bool]>); SWEEPS],
     options: &Options,
     find: FindGround<'_>,
-) -> [Vec<bool>; SWEEPS] {
-    let in_range = sweeps.map(|points| in_range(points, options));
-    let found = find(&in_range.each_ref().map(Vec::as_slice));
+) -> Result<[Option<Cow<'a, [bool]>>; SWEEPS], FlowError> {
+    let is_missing = sweeps.iter().any(|(_, mask)| mask.is_none());
+    match options.ground {
+        Ground::Keep => return Ok([const { None }; SWEEPS]),
+        Ground::Mask if is_missing => return Err(FlowError::NoGroundMask),
+        Ground::Mask | Ground::Auto => {}
+    }
+    let unmasked = sweeps.iter().filter(|(_, mask)| mask.is_none());
+    let clouds: Vec<Vec<Point>> = unmasked
+        .map(|(points, _)| cropped(points, options))
+        .collect();
+    let clouds: Vec<&[Point]> = clouds.iter().map(Vec::as_slice).collect();
+    let found = if clouds.is_empty() {
+        Vec::new()
+    } else {
+        find(&clouds)
+    };
     let mut found = found.into_iter();
-    sweeps.map(|points| {
-        let mut found = found.next().unwrap_or_default().into_iter();
-        let is_ground = |&point: &Point| is_in_range(point, options) && found.next() == Some(true);
-        points.iter().map(is_ground).collect()
-    })
+    Ok(sweeps.map(|(points, mask)| {
+        Some(mask.map_or_else(
+            || {
+                let mut found = found.next().unwrap_or_default().into_iter();
+                let is_ground =
+                    |&point: &Point| is_in_crop(point, options) && found.next() == Some(true);
+                Cow::Owned(points.iter().map(is_ground).collect())
+            },
+            Cow::Borrowed,
+        ))
+    }))
 }
 
-/// All points that are finite and in range.
-pub(crate) fn in_range(points: &[Point], options: &Options) -> Vec<Point> {
-    let kept = points.iter().filter(|&&point| is_in_range(point, options));
+/// All points that are finite and within the crop.
+pub(crate) fn cropped(points: &[Point], options: &Options) -> Vec<Point> {
+    let kept = points.iter().filter(|&&point| is_in_crop(point, options));
     kept.copied().collect()
 }
 
-/// The rows of `points` that are finite, in range and not masked.
-fn kept(
+/// Whether a point is finite and within the crop.
+pub(crate) fn is_in_crop([x, y, z]: Point, options: &Options) -> bool {
+    let crop = options.crop_m.unwrap_or(f32::INFINITY);
+    let finite = x.is_finite() && y.is_finite() && z.is_finite();
+    finite && x.abs() <= crop && y.abs() <= crop
+}
+
+fn rows_of_pair(
+    problem: &Problem,
+    [source, target]: &[Option<Cow<'_, [bool]>>; 2],
+    options: &Options,
+) -> Result<[Vec<usize>; 2], FlowError> {
+    Ok([
+        selected_rows("source", problem.source, source.as_deref(), options)?,
+        selected_rows("target", problem.target, target.as_deref(), options)?,
+    ])
+}
+
+/// Rows of `points` that are finite, within the crop and not masked.
+fn selected_rows(
     cloud: &'static str,
     points: &[Point],
-    ground: Option<&[bool]>,
+    mask: Option<&[bool]>,
     options: &Options,
 ) -> Result<Vec<usize>, FlowError> {
-    if let Some(flags) = ground.map(<[bool]>::len)
+    if let Some(flags) = mask.map(<[bool]>::len)
         && flags != points.len()
     {
         return Err(FlowError::GroundMaskLength {
@@ -186,16 +199,8 @@ fn kept(
         });
     }
     Ok((0..points.len())
-        .filter(|&row| {
-            is_in_range(points[row], options) && !ground.is_some_and(|ground| ground[row])
-        })
+        .filter(|&row| is_in_crop(points[row], options) && !mask.is_some_and(|mask| mask[row]))
         .collect())
-}
-
-pub(crate) fn is_in_range([x, y, z]: Point, options: &Options) -> bool {
-    let range = options.range_m.unwrap_or(f32::INFINITY);
-    let finite = x.is_finite() && y.is_finite() && z.is_finite();
-    finite && x.abs() <= range && y.abs() <= range
 }
 
 #[cfg(test)]
@@ -209,7 +214,7 @@ mod tests {
             target: source,
             ground: ground.map(|flags| [flags, flags]),
             before: None,
-            around: &[],
+            neighbors: &[],
         };
         select(&problem, options, &find_ground)
             .expect("enough points")
@@ -229,7 +234,7 @@ mod tests {
         ];
         let ground = [false, false, false, false, false, false, true];
         let mut options = Preset::Neural.options(None);
-        options.range_m = Some(51.2);
+        options.crop_m = Some(51.2);
         options.ground = Ground::Keep;
         assert_eq!(rows(&options, &source, Some(&ground)), [0, 2, 5, 6]);
         for leaves_out in [Ground::Mask, Ground::Auto] {
@@ -256,11 +261,11 @@ mod tests {
             target: &source,
             ground: Some([&ground, &ground]),
             before: None,
-            around: &[],
+            neighbors: &[],
         };
         let mut options = Preset::Neural.options(Some(10));
         options.ground = Ground::Mask;
-        options.range_m = Some(60.0);
+        options.crop_m = Some(60.0);
         let selection = select(&problem, &options, &find_ground).expect("enough points");
         assert_eq!(selection.source.len(), 10);
         assert_eq!(
@@ -292,13 +297,7 @@ mod tests {
         let mut fitted = Preset::Neural.options(Some(40));
         let mut objects = Preset::Default.options(Some(40));
         (fitted.ground, objects.ground) = (Ground::Keep, Ground::Keep);
-        let problem = Problem {
-            source: &source,
-            target: &source,
-            ground: None,
-            before: None,
-            around: &[],
-        };
+        let problem = Problem::pair(&source, &source);
         let fitted = select(&problem, &fitted, &find_ground).expect("enough points");
         let objects = select(&problem, &objects, &find_ground).expect("enough points");
         assert_eq!((objects.rows.len(), objects.target.len()), (100, 100));
@@ -318,13 +317,7 @@ mod tests {
                 .collect::<Vec<Point>>()
         };
         let (source, target) = (line(50), line(4000));
-        let problem = Problem {
-            source: &source,
-            target: &target,
-            ground: None,
-            before: None,
-            around: &[],
-        };
+        let problem = Problem::pair(&source, &target);
         let selection =
             select(&problem, &Preset::Neural.options(Some(300)), &find_ground).expect("points");
         assert_eq!(selection.source.len(), 50);
@@ -340,7 +333,7 @@ mod tests {
             target: &[[0.0; 3]],
             ground: None,
             before: None,
-            around: &[],
+            neighbors: &[],
         };
         let mut options = Preset::Neural.options(None);
         let error = select(&problem, &options, &find_ground).expect_err("one point");

@@ -1,10 +1,12 @@
-//! A sequence: sweeps in, the motion of each consecutive pair out.
+//! Sequence estimation: takes sweeps one by one and returns the motion of each consecutive pair.
 //!
-//! Keeps the sweeps of a window and the last pair's field, whatever the length. Each fit starts from the
-//! field before it, carried into the new frame, where the options have a warm start and that explains
-//! the new pair (`warm_start.rs` says how it is judged); the vehicle's motion is sought about the one
-//! before then. Knows no files.
+//! Memory does not grow with the length of the sequence: only the sweeps of one window and the
+//! motion field of the last pair are held. With a warm start, a field fit starts from the previous
+//! field, transformed into the new frame, if that field explains the new pair (see
+//! `field/warm_start.rs`). The previous ego motion is then the prior of the registration.
+//! Independent of files.
 
+use std::borrow::Cow;
 use std::collections::VecDeque;
 use std::ops::Range;
 
@@ -13,45 +15,42 @@ use super::error::FlowError;
 use super::estimate::{Estimate, estimate};
 use super::field::Backend;
 use super::motion::MotionField;
-use super::options::{Ground, Options};
-use super::registration::NeighborSweep;
-use super::select::{FindGround, Problem, find_ground, ground_of, is_in_range};
+use super::options::Options;
+use super::problem::{NeighborSweep, Problem};
+use super::select::{FindGround, find_ground, ground_masks, is_in_crop};
 
 /// One sweep of a sequence.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Sweep {
-    /// N points, metres, in the sensor's frame of the sweep.
+    /// N points, metres, in the sensor frame of the sweep.
     pub points: Vec<Point>,
-    /// N flags: which points are ground, where the sweep says so.
+    /// N flags: true for ground points. None where the ground is unknown.
     pub ground: Option<Vec<bool>>,
 }
 
 impl Sweep {
-    /// The sweep as `options` take it: its ground found where it is wanted and not known, and
-    /// forgotten where it is kept.
+    /// The sweep with the ground mask that `options` require: with [`super::Ground::Auto`] a
+    /// missing mask is replaced by a segmentation, with [`super::Ground::Keep`] the mask is
+    /// removed.
     #[must_use]
     pub fn prepared(self, options: &Options) -> Self {
         self.prepared_by(options, &find_ground)
     }
 
     fn prepared_by(mut self, options: &Options, find: FindGround<'_>) -> Self {
-        match options.ground {
-            Ground::Keep => self.ground = None,
-            Ground::Mask => {}
-            Ground::Auto if self.ground.is_some() => {}
-            Ground::Auto => {
-                let [found] = ground_of([&self.points], options, find);
-                self.ground = Some(found);
-            }
+        let sweep = [(self.points.as_slice(), self.ground.as_deref())];
+        // A missing mask is reported as an error by the estimate of the pair.
+        if let Ok([mask]) = ground_masks(sweep, options, find) {
+            self.ground = mask.map(Cow::into_owned);
         }
         self
     }
 
-    /// The points alone that `options` let take part in a dense cloud: those in range.
+    /// The sweep restricted to points that are finite and within the crop of `options`.
     #[must_use]
     pub fn cropped(self, options: &Options) -> Self {
         let rows: Vec<usize> = (0..self.points.len())
-            .filter(|&row| is_in_range(self.points[row], options))
+            .filter(|&row| is_in_crop(self.points[row], options))
             .collect();
         Self {
             points: rows.iter().map(|&row| self.points[row]).collect(),
@@ -62,61 +61,66 @@ impl Sweep {
     }
 }
 
-/// Which of `sweeps` sweeps the pair of sweep `pair` and the next is estimated from, where it may
-/// see `frames`: as many consecutive ones as there are, the pair among them, as centered as the ends
-/// of the sequence allow; the sweep that one side has more is before the pair.
-pub fn window(pair: usize, sweeps: usize, frames: usize) -> Range<usize> {
-    let frames = frames.max(2).min(sweeps);
-    let first = pair.saturating_sub(before_pair(frames));
-    let first = first.min(sweeps - frames);
-    first..first + frames
+/// The window of a pair: the range of consecutive sweeps that its estimate uses.
+///
+/// `pair` is the index of the pair, `count` the number of sweeps in the sequence, `sweeps` the
+/// window size. The window has at least two sweeps and contains both sweeps of the pair. It is
+/// centered on the pair as far as the ends of the sequence allow. With an odd size the extra sweep
+/// lies before the pair.
+pub fn window(pair: usize, count: usize, sweeps: usize) -> Range<usize> {
+    let sweeps = sweeps.max(2).min(count);
+    let first = pair.saturating_sub(before_pair(sweeps));
+    let first = first.min(count - sweeps);
+    first..first + sweeps
 }
 
-/// Whether no sweep to come after the first `sweeps` changes the window of a pair.
-pub fn is_whole(pair: usize, sweeps: usize, frames: usize) -> bool {
-    let frames = frames.max(2);
-    pair.saturating_sub(before_pair(frames)) + frames <= sweeps
+/// Whether the window of a pair is final: sweeps after the first `count` do not change it.
+pub fn is_window_final(pair: usize, count: usize, sweeps: usize) -> bool {
+    let sweeps = sweeps.max(2);
+    pair.saturating_sub(before_pair(sweeps)) + sweeps <= count
 }
 
-/// Sweeps of a centered window before its pair.
-fn before_pair(frames: usize) -> usize {
-    (frames - 1) / 2
+/// Number of sweeps before the pair in a centered window.
+fn before_pair(sweeps: usize) -> usize {
+    (sweeps - 1) / 2
 }
 
-/// A sweep, and the options of the pair that it is the target of.
+/// A sweep, and the options of the pair that has it as its target.
 #[derive(Clone, Debug)]
 struct Held {
     sweep: Sweep,
     options: Options,
 }
 
-/// The pairs of a sequence, one after the other.
+/// Streaming estimator of a sequence, pair by pair.
 ///
-/// Where the first sweep's options ask for more sweeps than the pair's own ([`Options::frames`]), a
-/// pair is estimated from its [`window`], by nothing but the sweeps in it: it has to wait for the last
-/// of them, and at most as many sweeps are held as the window has.
+/// The options of the first sweep set the window size ([`Options::sweeps`]). With more than two
+/// sweeps a pair is estimated from its [`window`] alone. Its result is delayed until the last sweep
+/// of the window arrives. At most one window of sweeps is held.
 #[derive(Clone, Debug, Default)]
 pub struct Sequence {
-    /// The sweeps that pairs to come may see.
+    /// Sweeps that a later pair may still use.
     held: VecDeque<Held>,
-    /// Sweeps that there have been.
+    /// Number of sweeps pushed so far.
     count: usize,
-    /// The pair that is next.
+    /// Index of the next pair.
     next: usize,
-    /// Sweeps of a window.
-    frames: usize,
+    /// Window size in sweeps.
+    sweeps: usize,
     before: Option<MotionField>,
 }
 
 impl Sequence {
-    /// Takes the next sweep, and gives the motion of every pair whose sweeps are now all there, in
-    /// order. `options` are those of the pair that ends in the sweep, and may change from sweep to
-    /// sweep, but for how many sweeps a pair sees: where the vehicle's motion is known,
-    /// [`super::Ego::Given`] says it.
+    /// Adds the next sweep and returns the estimates of all pairs whose windows are now complete,
+    /// in order.
+    ///
+    /// `options` are those of the pair that has the sweep as its target. They may differ from sweep
+    /// to sweep, except for the window size. A known ego motion is given as [`super::Ego::Given`].
     ///
     /// # Errors
-    /// As [`estimate`], of the first pair that is not there yet; the sequence is left as it was, and the
-    /// sweep may be pushed again. A pair behind one that is given is tried again with the next sweep.
+    /// As [`estimate`], for the first pair that is not yet estimated. The sequence is then
+    /// unchanged, and the sweep may be pushed again. Where a later pair fails, the estimates before
+    /// it are returned and the pair is tried again with the next sweep.
     pub fn push(
         &mut self,
         backend: &dyn Backend,
@@ -124,18 +128,18 @@ impl Sequence {
         options: &Options,
         control: &dyn Control,
     ) -> Result<Vec<Estimate>, FlowError> {
-        // Once for all that see it.
+        // Segmented once for all pairs that use the sweep.
         let find = |sweeps: &[&[Point]]| backend.host().ground(sweeps);
         let sweep = sweep.prepared_by(options, &find);
         if self.count == 0 {
-            self.frames = options.frames();
+            self.sweeps = options.sweeps();
         }
         self.held.push_back(Held {
             sweep,
             options: options.clone(),
         });
         self.count += 1;
-        let pushed = self.estimates(backend, is_whole, control);
+        let pushed = self.estimates(backend, is_window_final, control);
         if pushed.is_err() {
             self.held.pop_back();
             self.count -= 1;
@@ -145,12 +149,12 @@ impl Sequence {
         pushed
     }
 
-    /// Gives the motion of the pairs that were waiting for sweeps to come, as there are none: to be
-    /// asked until nothing more is given.
+    /// Returns the estimates of the remaining pairs at the end of the sequence. Call it until it
+    /// returns an empty list.
     ///
     /// # Errors
-    /// As [`estimate`], of the first pair that is not there yet; the sequence is left as it was, and may
-    /// be finished again.
+    /// As [`estimate`], for the first pair that is not yet estimated. The sequence is then
+    /// unchanged, and `finish` may be called again.
     pub fn finish(
         &mut self,
         backend: &dyn Backend,
@@ -159,8 +163,8 @@ impl Sequence {
         self.estimates(backend, |_, _, _| true, control)
     }
 
-    /// The next pairs, as long as `is_ready` says so of a pair, the sweeps so far and those of a window,
-    /// and none of them fails.
+    /// Estimates the next pairs in order, while `is_ready(pair, count, sweeps)` holds and no pair
+    /// fails.
     fn estimates(
         &mut self,
         backend: &dyn Backend,
@@ -169,7 +173,7 @@ impl Sequence {
     ) -> Result<Vec<Estimate>, FlowError> {
         let mut estimates = Vec::new();
         while self.next + 1 < self.count {
-            if !is_ready(self.next, self.count, self.frames) {
+            if !is_ready(self.next, self.count, self.sweeps) {
                 break;
             }
             let estimate = match self.estimate(backend, self.next, control) {
@@ -177,14 +181,14 @@ impl Sequence {
                 Err(error) if estimates.is_empty() => return Err(error),
                 Err(_) => break,
             };
-            self.before = Some(estimate.field.clone());
+            self.before = Some(estimate.motion.clone());
             self.next += 1;
             estimates.push(estimate);
         }
         Ok(estimates)
     }
 
-    /// The motion of a pair, from the sweeps of its window.
+    /// Estimates a pair from the sweeps of its window.
     fn estimate(
         &self,
         backend: &dyn Backend,
@@ -194,13 +198,13 @@ impl Sequence {
         let (source, target) = (&self.at(pair).sweep, self.at(pair + 1));
         let ground = source.ground.as_deref();
         let ground = ground.zip(target.sweep.ground.as_deref());
-        let others = window(pair, self.count, self.frames);
+        let others = window(pair, self.count, self.sweeps);
         let others = others.filter(|&place| place != pair && place != pair + 1);
-        let around: Vec<NeighborSweep> = others
+        let neighbors: Vec<NeighborSweep> = others
             .filter_map(|place| {
                 let Sweep { points, ground } = &self.at(place).sweep;
                 let ground = ground.as_deref();
-                // Farther sweeps than that are of no use.
+                // Sweeps more than 127 intervals away are skipped.
                 let at = i8::try_from(place as i64 - pair as i64).ok()?;
                 Some(NeighborSweep { points, ground, at })
             })
@@ -210,7 +214,7 @@ impl Sequence {
             target: &target.sweep.points,
             ground: ground.map(|(source, target)| [source, target]),
             before: self.before.as_ref(),
-            around: &around,
+            neighbors: &neighbors,
         };
         estimate(backend, &problem, &target.options, control)
     }
@@ -219,10 +223,10 @@ impl Sequence {
         &self.held[place + self.held.len() - self.count]
     }
 
-    /// Lets go of the sweeps that no pair to come may see.
+    /// Drops the sweeps that no later pair uses.
     fn forget(&mut self) {
         let sweeps = self.count.max(self.next + 2);
-        let first = window(self.next, sweeps, self.frames).start;
+        let first = window(self.next, sweeps, self.sweeps).start;
         while self.count - self.held.len() < first {
             self.held.pop_front();
         }
@@ -242,10 +246,10 @@ mod tests {
         assert_eq!([window(1, 3, 5), window(1, 4, 5)], [0..3, 0..4]);
         for pair in 0..8 {
             assert_eq!(window(pair, 9, 2), pair..pair + 2);
-            for frames in 0..12 {
-                let window = window(pair, 9, frames);
+            for sweeps in 0..12 {
+                let window = window(pair, 9, sweeps);
                 assert!(window.contains(&pair) && window.contains(&(pair + 1)));
-                assert_eq!(window.len(), frames.clamp(2, 9));
+                assert_eq!(window.len(), sweeps.clamp(2, 9));
             }
         }
     }

@@ -1,7 +1,8 @@
-//! Raw float32 rows: KITTI's `.bin` (x, y, z, intensity) and nuScenes' `.pcd.bin` (and ring).
+//! Raw float32 rows: KITTI's `.bin` (x, y, z, intensity) and nuScenes' `.pcd.bin` (x, y, z,
+//! intensity, ring).
 //!
-//! These files have no header at all: which of the two one is, its name says, or else whether the
-//! numbers make sense. It must not know of any file that can be recognized by its content.
+//! These files have no header. The format is taken from the file name or, failing that, from the
+//! row width that gives plausible values.
 
 use std::io::Write;
 
@@ -11,20 +12,22 @@ use super::error::{FileKind, FormatError};
 use super::limits::{check_rows, check_value, check_within};
 use super::scalar::write_floats;
 
-/// No lidar sees this far, metres; a misread column soon does.
+/// Largest plausible coordinate, metres: beyond the range of any lidar. Misread columns soon exceed
+/// it.
 const PLAUSIBLE_M: f32 = 1e4;
 
-/// Lidars have up to 128 rings.
+/// Largest plausible ring number: lidars have up to 128 rings.
 const PLAUSIBLE_RING: f32 = 127.0;
 
+/// Floats per row.
 fn width(kind: FileKind) -> usize {
     if kind == FileKind::NuscenesBin { 5 } else { 4 }
 }
 
-/// Decides between the two by name, then by what fits.
+/// Decides between the two formats, by name and then by plausible values.
 ///
 /// # Errors
-/// `Ambiguous` where both fit, `Unrecognized` where none does.
+/// `Ambiguous` where both are plausible, `Unrecognized` where neither is.
 pub(super) fn recognize(bytes: &[u8], name: Option<&str>) -> Result<FileKind, FormatError> {
     let name = name.unwrap_or_default().to_ascii_lowercase();
     if name.ends_with(".pcd.bin") || name.ends_with(".nuscenes.bin") {
@@ -71,14 +74,14 @@ fn plausible(bytes: &[u8], kind: FileKind) -> bool {
         && bytes.chunks_exact(row_len).all(row_is_plausible)
 }
 
-/// The float32 at the start of `bytes`; NaN where they are too few.
+/// The float32 at the start of `bytes`; NaN where there are fewer than four bytes.
 fn float(bytes: &[u8]) -> f32 {
     bytes
         .first_chunk::<4>()
         .map_or(f32::NAN, |raw| f32::from_le_bytes(*raw))
 }
 
-/// Reads all rows, at most `most`, of a file of a known width.
+/// Reads all rows of a file of known format, at most `most`.
 pub(super) fn read(bytes: &[u8], kind: FileKind, most: usize) -> Result<Vec<Point>, FormatError> {
     let row_len = width(kind) * 4;
     if !bytes.len().is_multiple_of(row_len) {
@@ -98,7 +101,7 @@ pub(super) fn read(bytes: &[u8], kind: FileKind, most: usize) -> Result<Vec<Poin
     bytes.chunks_exact(row_len).enumerate().map(point).collect()
 }
 
-/// Writes KITTI rows, intensity 0.
+/// Writes KITTI rows with intensity 0.
 pub(super) fn write_kitti<W: Write>(out: &mut W, points: &[Point]) -> Result<(), FormatError> {
     let rows: Vec<[f32; 4]> = points.iter().map(|[x, y, z]| [*x, *y, *z, 0.0]).collect();
     write_floats(out, rows.as_flattened())?;

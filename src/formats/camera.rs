@@ -1,6 +1,6 @@
-//! Cameras: ours as JSON, KITTI's as calibration text.
+//! Camera calibration files: this project's JSON, and KITTI's calibration text.
 //!
-//! KITTI's camera is its left color one, number 2, rectified. It must not know depths.
+//! For KITTI the camera is the left color camera, number 2, rectified.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -12,14 +12,15 @@ use super::motion::rigid_motion;
 
 const KIND: FileKind = FileKind::Camera;
 
-/// Calibrations have four kilobytes.
+/// Size limit of a calibration file, bytes. Typical ones have four kilobytes.
 const MAX_FILE: usize = 64 << 10;
 
-/// Width and height of KITTI's rectified images, taken where the calibration does not say: the
-/// object and odometry benchmarks' files do not. Some of their images are up to 20 pixels smaller.
+/// Width and height of KITTI's rectified images, pixels. Used where the calibration does not
+/// contain them, as in the object and odometry benchmarks. Some of their images are up to 20 pixels
+/// smaller.
 pub const KITTI_SIZE_PX: [u32; 2] = [1242, 375];
 
-/// What our JSON has.
+/// This project's JSON format.
 #[derive(serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Written {
@@ -29,17 +30,17 @@ struct Written {
     camera_from_lidar: [[f64; 4]; 4],
 }
 
-/// Reads a camera, recognized by content.
+/// Reads a camera; the format is recognized by content.
 ///
-/// - JSON: `{"width": 1242, "height": 375, "k": 3 x 3, "camera_from_lidar": 4 x 4}`, matrices row
-///   by row, the camera's frame x right, y down, z forward.
-/// - KITTI's object, tracking and odometry calibration: `P2`, `R0_rect`, `Tr_velo_to_cam`; the
-///   size is [`KITTI_SIZE_PX`].
+/// - JSON: `{"width": 1242, "height": 375, "k": 3 x 3, "camera_from_lidar": 4 x 4}`. Sizes are in
+///   pixels, matrices row by row. The camera frame has x right, y down, z forward.
+/// - KITTI's object, tracking and odometry calibration: `P2`, `R0_rect`, `Tr_velo_to_cam`; the size
+///   is [`KITTI_SIZE_PX`].
 /// - KITTI's raw `calib_cam_to_cam.txt`, with `calib_velo_to_cam.txt` as the second file.
 ///
 /// # Errors
-/// `Malformed`, `Unsupported` and `Missing` name the line or key, `TooLarge` a file past 64 KiB,
-/// `Camera` what no camera has.
+/// `Malformed`, `Unsupported` and `Missing` name the line or key. `TooLarge` for a file over 64
+/// KiB. `Camera` for parameters that are not those of a camera.
 pub fn read_camera(bytes: &[u8], velo_to_cam: Option<&[u8]>) -> Result<Camera, FormatError> {
     if bytes.len() <= MAX_FILE && bytes.trim_ascii_start().starts_with(b"{") {
         if velo_to_cam.is_some() {
@@ -58,7 +59,7 @@ pub fn read_camera(bytes: &[u8], velo_to_cam: Option<&[u8]>) -> Result<Camera, F
     let [a, b, c, _] = calibration.rows("the projection of camera 2", &["P2", "P_rect_02"])?;
     let matrix = [[a[0], a[1], a[2]], [b[0], b[1], b[2]], [c[0], c[1], c[2]]];
     let intrinsics = Intrinsics::from_matrix(&matrix)?;
-    // P is K (I | t): the camera stands beside the one that the others are measured from.
+    // P is K (I | t): camera 2 is displaced from the rectified camera 0.
     let depth = c[3];
     let beside = Vector3::new(
         (a[3] - intrinsics.cx * depth) / intrinsics.fx,
@@ -74,9 +75,9 @@ pub fn read_camera(bytes: &[u8], velo_to_cam: Option<&[u8]>) -> Result<Camera, F
     )?)
 }
 
-/// The pose of the lidar for KITTI's rectified camera 0, which the odometry benchmark's poses are
-/// those of: a sweep's own pose is `world_from_camera0 * camera0_from_lidar`. Files as for
-/// [`read_camera`].
+/// The lidar's pose in the frame of KITTI's rectified camera 0. The odometry benchmark's poses are
+/// those of this camera: a sweep's own pose is `world_from_camera0 * camera0_from_lidar`. The files
+/// are the same as for [`read_camera`].
 ///
 /// # Errors
 /// As [`read_camera`].
@@ -87,7 +88,7 @@ pub fn read_camera0_from_lidar(
     Calibration::open(bytes)?.camera0_from_lidar(velo_to_cam)
 }
 
-/// Lines of a key and numbers.
+/// A calibration text: lines of a key and numbers.
 struct Calibration<'a> {
     entries: Vec<(&'a str, &'a str)>,
 }
@@ -99,7 +100,7 @@ impl<'a> Calibration<'a> {
         }
         let text = std::str::from_utf8(bytes)
             .map_err(|_| KIND.malformed("neither JSON nor KITTI's calibration text"))?;
-        // Most keys end in a colon; those of the tracking benchmark need not.
+        // Most keys end in a colon; in the tracking benchmark some do not.
         let entry = |line: &'a str| {
             let line = line.trim();
             let (key, numbers) = line.split_once(char::is_whitespace)?;
@@ -110,7 +111,7 @@ impl<'a> Calibration<'a> {
         })
     }
 
-    /// The numbers of the first of `keys` that is there.
+    /// The numbers of the first entry with one of `keys`; `None` where there is none.
     fn numbers<const N: usize>(&self, keys: &[&str]) -> Result<Option<[f64; N]>, FormatError> {
         let Some((key, text)) = self.entries.iter().find(|(key, _)| keys.contains(key)) else {
             return Ok(None);
@@ -128,7 +129,7 @@ impl<'a> Calibration<'a> {
         Ok(Some(numbers))
     }
 
-    /// A 3 x 4 matrix that must be there, with its last row.
+    /// A required 3 x 4 matrix, completed to 4 x 4 by its last row.
     fn rows(&self, what: &str, keys: &[&str]) -> Result<[[f64; 4]; 4], FormatError> {
         let numbers: [f64; 12] = self.numbers(keys)?.ok_or_else(|| {
             let present = self.entries.iter().map(|(key, _)| shorten(key));
@@ -138,19 +139,19 @@ impl<'a> Calibration<'a> {
         Ok(with_last_row(&numbers))
     }
 
-    /// Width and height of camera 2's rectified images.
+    /// Width and height of camera 2's rectified images, pixels.
     fn size(&self) -> Result<Option<[u32; 2]>, FormatError> {
         let Some(size) = self.numbers::<2>(&["S_rect_02"])? else {
             return Ok(None);
         };
-        // A fraction of a pixel or a size past 32 bits is no size; saturation is refused later.
+        // Sizes over 32 bits saturate in the cast; `Camera::new` refuses them.
         if size.iter().any(|side| side.fract() != 0.0 || *side < 1.0) {
             return Err(KIND.malformed("S_rect_02 is not a size in pixels"));
         }
         Ok(Some(size.map(|side| side as u32)))
     }
 
-    /// Rectification after the lidar's pose.
+    /// The lidar's pose in the frame of the rectified camera 0: `camera0_from_lidar`.
     fn camera0_from_lidar(
         &self,
         velo_to_cam: Option<&[u8]>,
@@ -175,14 +176,14 @@ impl<'a> Calibration<'a> {
         };
         let rotation = self.numbers::<9>(&["R0_rect", "R_rect_00", "R_rect"])?;
         let Some(rotation) = rotation else {
-            // The odometry benchmark's pose is that of the rectified camera.
+            // The odometry benchmark's pose is already that of the rectified camera.
             return Ok(unrectified_from_lidar);
         };
         let rectified = rigid("the rectification", &pose_rows(&rotation, &[0.0; 3]))?;
         Ok(rectified * unrectified_from_lidar)
     }
 
-    /// `calib_velo_to_cam.txt`: R and T.
+    /// The pose in `calib_velo_to_cam.txt`: R and T.
     fn pose(&self) -> Result<RigidTransform, FormatError> {
         let lacks = || KIND.malformed("calib_velo_to_cam.txt has no R and T");
         let rotation = self.numbers::<9>(&["R"])?.ok_or_else(lacks)?;
@@ -191,7 +192,7 @@ impl<'a> Calibration<'a> {
     }
 }
 
-/// Twelve numbers as a matrix, row by row.
+/// Twelve numbers as the first three rows of a 4 x 4 matrix.
 pub(super) fn with_last_row(numbers: &[f64; 12]) -> [[f64; 4]; 4] {
     let mut rows = [[0.0; 4]; 4];
     rows[3][3] = 1.0;
@@ -201,7 +202,7 @@ pub(super) fn with_last_row(numbers: &[f64; 12]) -> [[f64; 4]; 4] {
     rows
 }
 
-/// The rigid transform that a matrix is, refused by the name that it has in the file.
+/// The rigid transform of a matrix; errors call it `what`.
 fn rigid(what: &str, rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError> {
     let refuse = |_| KIND.malformed(format!("{what} is not a rigid transform"));
     rigid_motion(rows).map_err(refuse)

@@ -1,30 +1,30 @@
-//! One cloud in any format: reading by content, writing by choice.
+//! Point clouds in all formats: recognized by content when read, chosen by the caller when written.
 //!
-//! Row order is kept, because flow goes out in it. It must not know of flow or of labels.
+//! The order of the rows is kept, because flow is returned in that order.
 
 use std::io::Write;
 
 use crate::flow::Point;
 
 use super::error::{FileKind, FormatError, shorten};
-use super::feather::{self, Table, Values};
+use super::feather::{Table, Values};
 use super::limits::{MAX_COORDINATE_M, MAX_POINTS, check_value, check_within};
 use super::npz::Npz;
-use super::pcd::{self, Pcd};
-use super::ply::{self, Ply};
+use super::pcd::Pcd;
+use super::ply::Ply;
 use super::scalar::{Scalar, write_floats};
 use super::sniff::recognize;
-use super::{bin, npy};
+use super::{bin, feather, npy, pcd, ply};
 
 const AXES: [&str; 3] = ["x", "y", "z"];
 
 /// The points of one sweep, in the order of the file's rows.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Cloud {
-    /// x, y, z in metres. Finite, except for the rows counted by `no_return`.
+    /// N x 3: x, y, z in metres. Finite, except for the rows counted by `no_return`.
     pub points: Vec<Point>,
-    /// Rows that are NaN in x, y and z: PCD's way to say that a beam did not return. They keep
-    /// their row; only PCD files have them.
+    /// Number of rows that are NaN in x, y and z, PCD's mark for a beam without return. They keep
+    /// their row. Only PCD files have them.
     pub no_return: usize,
 }
 
@@ -39,19 +39,19 @@ impl From<Vec<Point>> for Cloud {
 
 /// Reads a cloud of any known format.
 ///
-/// The format is recognized by content. `name`, a file name, decides only for raw floats, which
-/// have no beginning of their own: `*.pcd.bin` has rows of five, `*.kitti.bin` of four.
-/// An `.npz` has one cloud if it has one N x 3 array, or one named `points`, `xyz` or `pc1`.
+/// The format is recognized by content. The file name `name` matters for raw floats alone, which
+/// have no header: `*.pcd.bin` has rows of five floats, `*.kitti.bin` of four. An `.npz` contains
+/// one cloud where it has a single N x 3 array, or one named `points`, `xyz` or `pc1`.
 ///
 /// # Errors
-/// Every variant of [`FormatError`] except those of writing. Values that are not finite are
-/// refused by row and column, but for PCD's rows of three NaN; so is |coordinate| > 1e6 m.
+/// Every variant of [`FormatError`] except those of writing. Values that are not finite are refused
+/// with row and column, except PCD's rows of three NaN. So is |coordinate| > 1e6 m.
 pub fn read_cloud(bytes: &[u8], name: Option<&str>) -> Result<Cloud, FormatError> {
     read_cloud_within(bytes, name, MAX_POINTS)
 }
 
-/// The same of at most `most` points: a file that declares more is refused before memory is taken
-/// for them.
+/// As [`read_cloud`], for at most `most` points: a file that declares more is refused before memory
+/// is allocated for them.
 ///
 /// # Errors
 /// As for [`read_cloud`].
@@ -76,8 +76,8 @@ pub fn read_cloud_within(
     }
 }
 
-/// The rows that a file declares, of all its clouds and masks together: what it takes to read it.
-/// Nothing is unfolded for it.
+/// The number of rows that a file declares, over all its clouds and masks: a measure of the memory
+/// that reading it takes. Nothing but headers is decompressed.
 ///
 /// # Errors
 /// As for [`read_cloud`], where a header cannot be read.
@@ -95,7 +95,7 @@ pub fn declared_rows(bytes: &[u8], name: Option<&str>) -> Result<usize, FormatEr
         FileKind::Ply => Ply::open(bytes)?.rows(),
         FileKind::Pcd => Ok(Pcd::open(bytes)?.rows()),
         FileKind::Feather => Ok(Table::open(bytes)?.rows()),
-        // Of floats as they are there is no more than bytes.
+        // Raw floats: an upper bound, from the size of a point.
         _ => Ok(bytes.len() / size_of::<Point>()),
     }
 }
@@ -126,7 +126,7 @@ fn read_npz(bytes: &[u8], most: usize) -> Result<Vec<Point>, FormatError> {
     match known[..] {
         [name] => npz.points(name),
         [] => {
-            // An array that is refused says more than a cloud that is missing.
+            // The error of an unreadable array is more helpful than that of a missing cloud.
             for name in &names {
                 npz.header(name)?;
             }
@@ -152,7 +152,7 @@ fn read_ply(bytes: &[u8], most: usize) -> Result<Vec<Point>, FormatError> {
     let mut points = Vec::new();
     ply.each(&AXES, |row, values| {
         if points.is_empty() {
-            // Here the declared count has been checked against the bytes.
+            // `each` has checked the declared count against the size of the file before this call.
             points.reserve_exact(ply.rows()?);
         }
         points.push(point(kind, row, values)?);
@@ -188,7 +188,7 @@ fn read_feather(bytes: &[u8], most: usize) -> Result<Vec<Point>, FormatError> {
     read_columns(&table, AXES)
 }
 
-/// Three float columns of a feather table as points or displacements, in metres.
+/// Three float columns of a feather table as N points or displacements, in metres.
 pub(super) fn read_columns(table: &Table<'_>, names: [&str; 3]) -> Result<Vec<Point>, FormatError> {
     let kind = FileKind::Feather;
     for name in names {
@@ -210,7 +210,8 @@ pub(super) fn read_columns(table: &Table<'_>, names: [&str; 3]) -> Result<Vec<Po
     Ok(points)
 }
 
-/// Integers have no unit: centimetres, millimetres and scaled coordinates all exist.
+/// Refuses integer coordinates, whose unit is unknown: centimetres, millimetres and scaled
+/// coordinates all exist.
 fn refuse_integers(
     kind: FileKind,
     scalar_of: impl Fn(&str) -> Option<Scalar>,
@@ -237,7 +238,7 @@ fn point(kind: FileKind, row: usize, values: &[f64]) -> Result<Point, FormatErro
     Ok(point)
 }
 
-/// The formats that a cloud can be written in.
+/// The formats in which a cloud can be written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum CloudFormat {
@@ -245,19 +246,19 @@ pub enum CloudFormat {
     Npy,
     /// Binary little endian, x y z float.
     Ply,
-    /// Binary, x y z float32; the only one that can hold rows without return.
+    /// Binary, x y z float32. The only format with rows without return.
     Pcd,
-    /// Columns x, y, z, float32, LZ4.
+    /// Columns x, y, z, float32, LZ4-compressed.
     Feather,
-    /// KITTI rows, intensity 0.
+    /// KITTI's rows of four float32, intensity 0.
     KittiBin,
 }
 
-/// Writes a cloud.
+/// Writes a cloud of N points, metres.
 ///
 /// # Errors
-/// `NotFinite` for rows without return in any format but PCD, which no reader would take back;
-/// `Write` and `Encode` where writing fails.
+/// `NotFinite` for rows without return in any format except PCD, and `OutOfRange` for coordinates
+/// over 1e6 m: neither could be read back. `Write` and `Encode` where writing fails.
 pub fn write_cloud<W: Write>(
     format: CloudFormat,
     points: &[Point],

@@ -1,6 +1,4 @@
-//! A dense cloud out: one row per point, with the sweep that measured it, its age and its masks.
-//!
-//! It must not know how the sweeps were carried into one frame.
+//! Dense cloud files, written only: one row per point, with its sweep, age and flags.
 
 use std::io::{Cursor, Write};
 
@@ -13,23 +11,25 @@ use super::pair::check_count;
 use super::sniff::ending;
 use super::{las, npy, pcd, ply};
 
-/// The formats that a dense cloud is written in. All but LAS and LAZ read back as clouds.
+/// The formats in which a dense cloud is written. All except LAS and LAZ can be read back as
+/// clouds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum DenseFormat {
-    /// `points` M x 3 float32, `frame` uint32, `age` float32, `dynamic` bool, `converged` bool.
+    /// `points` M x 3 float32, `sweep` uint32, `age` float32, `dynamic` bool, `converged` bool.
     Npz,
-    /// Binary little endian: x y z, `frame`, `age`, `dynamic`, `converged`.
+    /// Binary little endian: x y z, `sweep`, `age`, `dynamic`, `converged`.
     Ply,
-    /// The same as binary PCD.
+    /// Binary, with the same fields as PLY.
     Pcd,
-    /// LAS 1.4 compressed: to the millimetre; the frame as point source, the age as an extra
-    /// dimension, bit 0 of the user data where dynamic, withheld where not converged.
+    /// LAS 1.4, compressed, with a resolution of 1 mm. The sweep is the point source id, the age an
+    /// extra dimension. Bit 0 of the user data marks dynamic points, the withheld flag those that
+    /// did not converge.
     Laz,
-    /// The same, not compressed.
+    /// As LAZ, not compressed.
     Las,
 }
 
-/// Every format with its media type and its ending; the first is the default.
+/// Every format with its media type and its file ending; the first is the default.
 pub const DENSE_FORMATS: [(DenseFormat, &str, &str); 5] = [
     (DenseFormat::Npz, "application/x-npz", "npz"),
     (DenseFormat::Ply, "application/x-ply", "ply"),
@@ -39,7 +39,7 @@ pub const DENSE_FORMATS: [(DenseFormat, &str, &str); 5] = [
 ];
 
 impl DenseFormat {
-    /// The endings that [`DenseFormat::from_path`] knows.
+    /// The endings that [`DenseFormat::from_path`] accepts.
     pub const KNOWN: &'static str = ".npz, .ply, .pcd, .laz, .las";
 
     fn entry(self) -> &'static (Self, &'static str, &'static str) {
@@ -47,20 +47,20 @@ impl DenseFormat {
         found.unwrap_or(&DENSE_FORMATS[0])
     }
 
-    /// Its media type.
+    /// The format's media type.
     pub fn media_type(self) -> &'static str {
         self.entry().1
     }
 
-    /// The ending of a file in it.
+    /// The format's file ending, without dot.
     pub fn ending(self) -> &'static str {
         self.entry().2
     }
 
-    /// The format that a file name's ending names.
+    /// The format of a file name's ending.
     ///
     /// # Errors
-    /// `UnknownExtension`, which lists the endings that are known.
+    /// `UnknownExtension`, which lists the known endings.
     pub fn from_path(path: &std::path::Path) -> Result<Self, FormatError> {
         let name = path
             .file_name()
@@ -87,19 +87,19 @@ impl DenseFormat {
     }
 }
 
-/// Writes a dense cloud.
+/// Writes a dense cloud of M points.
 ///
 /// # Errors
-/// `RowCount` where its lists differ in length, `NotFinite` or `OutOfRange` for a place or an age
-/// that could not be read back, `Unsupported` where LAS cannot hold a frame's number, `Write` and
-/// `Encode` where writing fails.
+/// `RowCount` where the cloud's lists differ in length. `NotFinite` or `OutOfRange` for a position
+/// or an age that could not be read back. `Unsupported` where LAS cannot hold a sweep's index.
+/// `Write` and `Encode` where writing fails.
 pub fn write_dense<W: Write>(
     format: DenseFormat,
     cloud: &DenseCloud,
     out: &mut W,
 ) -> Result<(), FormatError> {
     let count = cloud.points.len();
-    check_count("frame", cloud.frame.len(), count)?;
+    check_count("sweep", cloud.sweep.len(), count)?;
     check_count("age", cloud.age.len(), count)?;
     check_count("dynamic", cloud.dynamic.len(), count)?;
     check_count("converged", cloud.converged.len(), count)?;
@@ -120,7 +120,7 @@ pub fn write_dense<W: Write>(
 fn write_npz<W: Write>(cloud: &DenseCloud, out: &mut W) -> Result<(), FormatError> {
     let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
     npz.points("points", &cloud.points)?;
-    npz.array("frame", |out| npy::write_counts(out, &cloud.frame))?;
+    npz.array("sweep", |out| npy::write_counts(out, &cloud.sweep))?;
     npz.array("age", |out| npy::write_values(out, &cloud.age))?;
     npz.mask("dynamic", &cloud.dynamic)?;
     npz.mask("converged", &cloud.converged)?;
@@ -133,7 +133,7 @@ fn write_ply<W: Write>(cloud: &DenseCloud, out: &mut W) -> Result<(), FormatErro
         ("float", "x"),
         ("float", "y"),
         ("float", "z"),
-        ("uint", "frame"),
+        ("uint", "sweep"),
         ("float", "age"),
         ("uchar", "dynamic"),
         ("uchar", "converged"),
@@ -148,7 +148,7 @@ fn write_pcd<W: Write>(cloud: &DenseCloud, out: &mut W) -> Result<(), FormatErro
         ("x", 4, 'F'),
         ("y", 4, 'F'),
         ("z", 4, 'F'),
-        ("frame", 4, 'U'),
+        ("sweep", 4, 'U'),
         ("age", 4, 'F'),
         ("dynamic", 1, 'U'),
         ("converged", 1, 'U'),
@@ -157,13 +157,13 @@ fn write_pcd<W: Write>(cloud: &DenseCloud, out: &mut W) -> Result<(), FormatErro
     write_rows(cloud, out)
 }
 
-/// Rows of point, frame, age and masks, little endian.
+/// Writes rows of point, sweep, age and flags, little endian.
 fn write_rows<W: Write>(cloud: &DenseCloud, out: &mut W) -> Result<(), FormatError> {
     const FLUSH_AT: usize = 64 << 10;
     let mut bytes = Vec::with_capacity(FLUSH_AT + 64);
     for (row, point) in cloud.points.iter().enumerate() {
         bytes.extend(point.iter().flat_map(|value| value.to_le_bytes()));
-        bytes.extend(cloud.frame[row].to_le_bytes());
+        bytes.extend(cloud.sweep[row].to_le_bytes());
         bytes.extend(cloud.age[row].to_le_bytes());
         bytes.push(u8::from(cloud.dynamic[row]));
         bytes.push(u8::from(cloud.converged[row]));

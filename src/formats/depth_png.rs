@@ -1,6 +1,4 @@
-//! Depth as a 16-bit gray PNG, as KITTI has it: 1/256 m a step, 0 where nothing is known.
-//!
-//! It must not know cameras or colors.
+//! KITTI's depth images: 16-bit gray PNG, 1/256 m per step, 0 where the depth is unknown.
 
 use std::io::{Cursor, Write};
 
@@ -12,17 +10,19 @@ use super::pair::check_count;
 
 const KIND: FileKind = FileKind::Png;
 
-/// Steps of a metre.
+/// Steps per metre.
 const STEPS_PER_M: f32 = 256.0;
 
-/// Bytes that a pixel takes while it is read: its two, and four of its depth.
+/// Memory per pixel while a file is read, bytes: two of the PNG and four of the depth.
 const PIXEL_BYTES: u64 = 6;
 
-/// Writes a depth image, and says how many of its depths were dropped because the format ends at
-/// 255.996 m: such pixels are written as unknown, never as nearer than they are.
+/// Writes a depth image, depths in metres. Returns the number of known depths that the format
+/// cannot represent, mainly those beyond its limit of 255.996 m. Such pixels are written as
+/// unknown.
 ///
 /// # Errors
-/// `RowCount` where the depths are not those of its size, `Encode` where writing fails.
+/// `RowCount` where the number of depths does not match the image's size, `Encode` where writing
+/// fails.
 pub fn write_depth_png<W: Write>(image: &DepthImage, out: W) -> Result<usize, FormatError> {
     let pixels = image.width as usize * image.height as usize;
     check_count("the depth image", image.metres.len(), pixels)?;
@@ -45,11 +45,12 @@ pub fn write_depth_png<W: Write>(image: &DepthImage, out: W) -> Result<usize, Fo
     Ok(dropped)
 }
 
-/// Reads a depth image.
+/// Reads a depth image, depths in metres.
 ///
 /// # Errors
-/// `Malformed` for what is no PNG or breaks off, `Unsupported` for one of other than 16 bits of
-/// gray, `TooLarge` for sides past 16,384 pixels or more pixels than a file of its length holds.
+/// `Malformed` for bytes that are not a complete PNG. `Unsupported` for a PNG other than 16-bit
+/// gray. `TooLarge` for sides over 16,384 pixels, or for more pixels than a file of this size may
+/// hold.
 pub fn read_depth_png(bytes: &[u8]) -> Result<DepthImage, FormatError> {
     let broken = |error: png::DecodingError| KIND.malformed(error.to_string());
     let limits = png::Limits {

@@ -1,7 +1,7 @@
-//! Why a file was refused, and the names of the kinds of files.
+//! The kinds of files, and the errors of reading and writing them.
 //!
-//! Every error names the kind of file and what in it is wrong; it must not know paths, callers or
-//! status codes.
+//! Every error names the kind of file and the cause. Independent of paths, callers and status
+//! codes.
 
 use std::fmt;
 
@@ -17,17 +17,17 @@ pub enum FileKind {
     Ply,
     /// Point Cloud Library file.
     Pcd,
-    /// Arrow IPC file, as Argoverse 2 ships its sweeps.
+    /// Arrow IPC file, the format of Argoverse 2's sweeps.
     Feather,
-    /// JSON flow.
+    /// Flow as JSON.
     Json,
     /// LAS, or LAZ, its compressed form. Written only.
     Las,
-    /// A picture; depth is read from those of 16 bits of gray.
+    /// A picture; depth is read from 16-bit gray ones.
     Png,
-    /// A camera: our JSON, or KITTI's calibration text.
+    /// A camera: this project's JSON, or KITTI's calibration text.
     Camera,
-    /// Poses of a sequence: KITTI's text, or our JSON.
+    /// Poses of a sequence: KITTI's text, or JSON.
     Poses,
     /// KITTI: rows of four little-endian float32 (x, y, z, intensity).
     KittiBin,
@@ -63,39 +63,39 @@ pub enum FormatError {
         "unrecognized file: {0}; known are npy, npz, ply, pcd, feather, json, kitti bin and nuscenes bin"
     )]
     Unrecognized(String),
-    /// The content fits more than one reading, and nothing says which.
+    /// The content fits several formats, and the name does not decide between them.
     #[error("ambiguous file: {0}")]
     Ambiguous(String),
-    /// The file breaks its own format, or ends too early.
+    /// The file violates its own format, or is truncated.
     #[error("malformed {kind} file: {detail}")]
     Malformed {
         /// The kind of file.
         kind: FileKind,
-        /// What is wrong with it.
+        /// The violation.
         detail: String,
     },
-    /// The file is sound, but uses something that is refused or not read.
+    /// The file is valid, but uses a feature that is refused or not supported.
     #[error("unsupported {kind} file: {detail}")]
     Unsupported {
         /// The kind of file.
         kind: FileKind,
-        /// What it uses.
+        /// The feature.
         detail: String,
     },
-    /// An array, column or property that is needed is not there.
+    /// A required array, column or property is missing.
     #[error("{kind} file lacks {what}; it has {present}")]
     Missing {
         /// The kind of file.
         kind: FileKind,
-        /// What was looked for.
+        /// The required item.
         what: String,
-        /// What the file has instead.
+        /// The items that the file has.
         present: String,
     },
-    /// A camera that cannot be.
+    /// A camera with invalid parameters.
     #[error(transparent)]
     Camera(#[from] crate::flow::depth::CameraError),
-    /// A matrix is no rigid motion.
+    /// A matrix is not a rigid motion.
     #[error("{0}")]
     Motion(&'static str),
     /// A value is NaN or infinite.
@@ -110,7 +110,7 @@ pub enum FormatError {
         /// The value found.
         value: f64,
     },
-    /// A coordinate lies further out than any lidar sees.
+    /// A coordinate is beyond the range of any lidar.
     #[error("{kind} file, row {row}, column {column}: {value} m is out of range (limit {limit} m)")]
     OutOfRange {
         /// The kind of file.
@@ -121,33 +121,33 @@ pub enum FormatError {
         column: String,
         /// The value found, metres.
         value: f64,
-        /// The largest magnitude taken, metres.
+        /// The largest magnitude accepted, metres.
         limit: f64,
     },
-    /// The file declares more than is read.
+    /// The file declares more data than is accepted.
     #[error("{kind} file is too large: {detail}")]
     TooLarge {
         /// The kind of file.
         kind: FileKind,
-        /// What is declared, and the limit.
+        /// The declared size, and the limit.
         detail: String,
     },
-    /// Two arrays of one file, or of one table to be written, do not belong together.
+    /// Two arrays of one file, or two columns to be written, differ in length.
     #[error("{what} has {found} rows where {expected} are needed")]
     RowCount {
         /// The array.
         what: String,
-        /// Its rows.
+        /// Its number of rows.
         found: usize,
-        /// The rows it should have.
+        /// The number of rows required.
         expected: usize,
     },
-    /// An output name whose ending names no format.
+    /// An output file name whose ending is that of no known format.
     #[error("cannot tell the format of {name:?}: end it in one of {known}")]
     UnknownExtension {
         /// The name or ending given.
         name: String,
-        /// The endings that are known.
+        /// The known endings.
         known: &'static str,
     },
     /// Writing failed.
@@ -158,7 +158,7 @@ pub enum FormatError {
     Encode {
         /// The kind of file.
         kind: FileKind,
-        /// What the library said.
+        /// The library's message.
         detail: String,
     },
 }
@@ -206,7 +206,7 @@ impl FileKind {
     }
 }
 
-/// Names for a message; a hostile file with a thousand of them does not get to fill a log.
+/// Names for a message: the first 16, shortened, so that a hostile file cannot fill a log.
 fn list(names: &[String]) -> String {
     const SHOWN: usize = 16;
     let mut shown: Vec<String> = names.iter().take(SHOWN).map(|name| shorten(name)).collect();
@@ -216,7 +216,7 @@ fn list(names: &[String]) -> String {
     shown.join(", ")
 }
 
-/// Text taken from a file, cut to a length that a message can carry, control characters escaped.
+/// Text from a file, for a message: at most 48 characters, control characters escaped.
 pub(super) fn shorten(text: &str) -> String {
     const SHOWN: usize = 48;
     let mut short: String = text

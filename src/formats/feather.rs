@@ -1,8 +1,8 @@
 //! Feather (Arrow IPC file, version 2): named columns in record batches, LZ4-compressed or plain.
 //!
-//! Metadata is read through arrow's verified flatbuffers; the column buffers are streamed here,
-//! because arrow's own reader allocates whatever length a file declares. It must not know what
-//! the columns mean.
+//! Metadata is read through arrow's verified flatbuffers. The column buffers are streamed by this
+//! module, because arrow's own reader allocates whatever length a file declares. Independent of the
+//! meaning of the columns.
 
 use std::io::{Read, Write};
 use std::sync::Arc;
@@ -19,32 +19,32 @@ const KIND: FileKind = FileKind::Feather;
 
 pub(super) const MAGIC: &[u8] = b"ARROW1";
 
-/// Argoverse 2's names for a displacement, metres.
+/// Argoverse 2's column names of a displacement, metres.
 pub(super) const FLOW_COLUMNS: [&str; 3] = ["flow_tx_m", "flow_ty_m", "flow_tz_m"];
 
-/// Writers may pad a buffer to this many bytes.
+/// Largest padding that writers may add to a buffer, bytes.
 const BUFFER_PADDING: u64 = 64;
 
-/// Bytes that a decoded point takes; what batches may cost together is priced with it.
+/// Bytes of a decoded point; used to limit the number of rows that a file may declare.
 const POINT_BYTES: u64 = 12;
 
 #[derive(Clone, Copy)]
 enum Stored {
     Number(Scalar),
-    /// One bit a row.
+    /// One bit per row.
     Bit,
-    /// Text, dates and the like: stepped over.
+    /// Text, dates and the like: skipped.
     Other,
 }
 
 struct Column {
     name: String,
     stored: Stored,
-    /// The column's data buffer among the batch's buffers.
+    /// Index of the column's data buffer among the batch's buffers.
     buffer: usize,
 }
 
-/// One record batch: where its metadata and its body lie.
+/// One record batch: its metadata, its body and its number of rows.
 struct Batch<'a> {
     metadata: &'a [u8],
     body: &'a [u8],
@@ -59,7 +59,7 @@ pub(super) struct Table<'a> {
 }
 
 impl<'a> Table<'a> {
-    /// Reads footer, schema and the batches' metadata.
+    /// Reads the footer, the schema and the batches' metadata.
     pub(super) fn open(bytes: &'a [u8]) -> Result<Self, FormatError> {
         let trailer = bytes
             .strip_suffix(MAGIC)
@@ -82,7 +82,7 @@ impl<'a> Table<'a> {
             let name = field.name().unwrap_or_default().to_owned();
             let (stored, buffers) = layout(&field)
                 .ok_or_else(|| KIND.unsupported(format!("column {} is nested", shorten(&name))))?;
-            // The last buffer of a flat column is its data; the first is the null bitmap.
+            // A numeric column has two buffers: the null bitmap, then the data.
             columns.push(Column {
                 name,
                 stored,
@@ -98,7 +98,7 @@ impl<'a> Table<'a> {
             let start = usize::try_from(block.offset()).map_err(|_| outside())?;
             let metadata_len = usize::try_from(block.metaDataLength()).map_err(|_| outside())?;
             let body_len = usize::try_from(block.bodyLength()).map_err(|_| outside())?;
-            // In file order and apart: no batch may be counted twice.
+            // Batches must be in file order and must not overlap, so that none is counted twice.
             if start < end_of_last {
                 return Err(KIND.malformed("record batches overlap"));
             }
@@ -134,7 +134,7 @@ impl<'a> Table<'a> {
         })
     }
 
-    /// Rows of all batches together.
+    /// Number of rows, over all batches.
     pub(super) fn rows(&self) -> usize {
         self.rows
     }
@@ -151,7 +151,7 @@ impl<'a> Table<'a> {
         self.columns.iter().any(|column| column.name == name)
     }
 
-    /// Whether a column holds floats, which a coordinate must.
+    /// Whether a column holds floats, as coordinates must.
     pub(super) fn is_float(&self, name: &str) -> bool {
         self.columns.iter().any(|column| {
             column.name == name
@@ -159,7 +159,8 @@ impl<'a> Table<'a> {
         })
     }
 
-    /// A column of numbers, each checked and made what it is by `check`. `None` where it is not there.
+    /// Reads a numeric column. `check` converts each value, given its row. `None` where the column
+    /// does not exist.
     pub(super) fn column<T>(
         &self,
         name: &str,
@@ -179,7 +180,7 @@ impl<'a> Table<'a> {
         Ok(Some(column))
     }
 
-    /// Hands every value of a column to `take` (row, value); a bit is 0 or 1.
+    /// Calls `take` with the row and value of every entry of a column; a bit is 0 or 1.
     pub(super) fn each(
         &self,
         name: &str,
@@ -227,7 +228,7 @@ impl<'a> Table<'a> {
 }
 
 impl<'a> Batch<'a> {
-    /// A reader of one column's data, unfolding it as it goes.
+    /// A reader of one column's data, which decompresses as it reads.
     fn open(&self, node: usize, column: &Column) -> Result<Box<dyn Read + 'a>, FormatError> {
         let lacks = || KIND.malformed(format!("a batch lacks column {}", shorten(&column.name)));
         let batch = batch_of(message(self.metadata)?)?;
@@ -266,8 +267,9 @@ impl<'a> Batch<'a> {
         if stored.is_empty() {
             return Ok(Box::new(stored));
         }
-        // Eight bytes say the length unfolded, -1 that it is not folded at all. Only as much as
-        // the rows need is ever read; a number that says otherwise is a broken file.
+        // The first eight bytes are the decompressed length, or -1 for data that is not compressed.
+        // At most the bytes that the rows need are read; a length that does not match them is an
+        // error.
         let (unfolded, packed) = stored.split_first_chunk::<8>().ok_or_else(lacks)?;
         if i64::from_le_bytes(*unfolded) == -1 {
             return Ok(Box::new(packed));
@@ -288,7 +290,7 @@ impl<'a> Batch<'a> {
     }
 }
 
-/// The flatbuffer message behind its length prefix.
+/// The flatbuffer message after its length prefix.
 fn message(metadata: &[u8]) -> Result<Message<'_>, FormatError> {
     let continued = metadata.strip_prefix(&[0xff; 4]).unwrap_or(metadata);
     let flat = continued
@@ -304,7 +306,7 @@ fn batch_of(message: Message<'_>) -> Result<arrow_ipc::RecordBatch<'_>, FormatEr
         .ok_or_else(|| KIND.malformed("a batch is no record batch"))
 }
 
-/// How a flat column is stored, and its number of buffers. `None` for nested ones.
+/// The storage of a flat column, and its number of buffers. `None` for nested columns.
 fn layout(field: &arrow_ipc::Field<'_>) -> Option<(Stored, usize)> {
     if field.dictionary().is_some() {
         return Some((Stored::Other, 2));
@@ -355,7 +357,7 @@ pub(super) enum Values<'a> {
     Ids(&'a [i32]),
 }
 
-/// Writes one record batch, LZ4-compressed as Argoverse 2 does.
+/// Writes one record batch, LZ4-compressed as in Argoverse 2.
 pub(super) fn write<W: Write>(
     out: &mut W,
     columns: Vec<(&str, Values<'_>)>,

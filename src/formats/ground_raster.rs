@@ -1,6 +1,4 @@
-//! Argoverse 2's ground-height raster of a city, and which points of a sweep it calls ground.
-//!
-//! It must not know scene flow.
+//! Argoverse 2's raster of a city's ground heights, and ground masks of sweeps from it.
 
 use nalgebra::Point3;
 
@@ -9,23 +7,23 @@ use crate::flow::{Point, RigidTransform};
 use super::error::{FileKind, FormatError};
 use super::npy::Header;
 
-/// Points at most this far above the raster's height, or anywhere below it, are ground, metres.
-/// Argoverse 2's own threshold.
+/// Largest height of a ground point above the raster, metres; points below the raster are ground at
+/// any depth. Argoverse 2's own threshold.
 const GROUND_M: f64 = 0.3;
 
-/// How far the similarity's rotation may be from orthonormal.
+/// Tolerance of the similarity's rotation from orthonormal.
 const RIGID_TOLERANCE: f64 = 1e-6;
 
-/// Heights of a city's ground on a grid.
+/// Ground heights of a city on a grid.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GroundRaster {
-    /// Metres in the city's frame, row by row; NaN where they are not known.
+    /// Heights in the city's frame, metres, row by row; NaN where unknown.
     heights: Vec<f32>,
     columns: usize,
     raster_from_city: Similarity,
 }
 
-/// A cell's column and row are s (R x + t).
+/// The similarity from city coordinates to the raster: column and row are s (R x + t).
 #[derive(Debug, Clone, Copy, PartialEq, serde::Deserialize)]
 struct Similarity {
     #[serde(rename = "R")]
@@ -40,8 +38,8 @@ impl GroundRaster {
     /// Reads `*_ground_height_surface____*.npy` and `*___img_Sim2_city.json`.
     ///
     /// # Errors
-    /// `Malformed` and `Unsupported`, where the first is not a two-dimensional array of floats
-    /// whose bytes are there, or the second is not a similarity of the plane.
+    /// `Malformed` and `Unsupported` where the first is not a complete two-dimensional array of
+    /// floats, or the second is not a similarity of the plane.
     pub fn read(heights: &[u8], raster_from_city: &[u8]) -> Result<Self, FormatError> {
         let kind = FileKind::Npy;
         let mut rest = heights;
@@ -80,9 +78,10 @@ impl GroundRaster {
         })
     }
 
-    /// Which points of a sweep are ground: at most 0.3 m from the raster's height, or below it.
-    /// Points past the raster's edge, or where it has no height, are not. `city_from_frame` is the
-    /// sweep's pose in the city. N rows in, N rows out.
+    /// The ground mask of a sweep: N points, metres, in its own frame; N flags. A point is ground
+    /// where it is at most 0.3 m above the raster's height, or below it. Points outside the raster,
+    /// or where it has no height, are not ground. `city_from_frame` is the sweep's pose in the
+    /// city.
     pub fn ground(&self, points: &[Point], city_from_frame: &RigidTransform) -> Vec<bool> {
         let is_ground = |point: &Point| {
             let place = city_from_frame * Point3::from(point.map(f64::from));
@@ -92,9 +91,9 @@ impl GroundRaster {
         points.iter().map(is_ground).collect()
     }
 
-    /// Height of the ground at a place of the city, metres.
+    /// Ground height at city coordinates, metres; `None` where it is unknown.
     fn height(&self, x: f64, y: f64) -> Option<f64> {
-        // Cells are found by cutting the fraction off, as Argoverse 2's own tools do.
+        // Fractions are truncated, as in Argoverse 2's own tools.
         let [column, row] = self.raster_from_city.cell(x, y).map(f64::trunc);
         if !(column >= 0.0 && column < self.columns as f64 && row >= 0.0) {
             return None;
@@ -120,7 +119,7 @@ impl Similarity {
         Ok(read)
     }
 
-    /// Column and row, with their fractions.
+    /// Column and row of city coordinates, with their fractions.
     fn cell(&self, x: f64, y: f64) -> [f64; 2] {
         let [a, b, c, d] = self.rotation;
         let [right, down] = self.translation;

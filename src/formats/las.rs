@@ -1,7 +1,6 @@
-//! LAS and LAZ, what surveyors exchange: written only.
+//! LAS and LAZ, the formats of surveying; written only.
 //!
-//! Version 1.4, point format 0, and the age as one extra dimension. It must not know what the
-//! points show.
+//! Version 1.4, point format 0, with the age as an extra dimension.
 
 use std::io::{Cursor, Write};
 
@@ -14,19 +13,19 @@ use super::error::{FileKind, FormatError};
 
 const KIND: FileKind = FileKind::Las;
 
-/// Steps of a coordinate, metres, from the frame's origin: 32 bits of them reach 2,147 km.
+/// Resolution of a coordinate, metres. With 32 bits the range is 2,147 km from the frame's origin.
 const SCALE_M: f64 = 0.001;
 
-/// Bit of the user data that says that a point moved by itself.
+/// Bit of the user data that marks a dynamic point.
 const DYNAMIC: u8 = 1;
 
 /// Bytes of a float32 extra dimension.
 const AGE_BYTES: u16 = 4;
 
-/// Writes M points, compressed or not, with the same bytes for the same cloud.
+/// Writes M points, compressed or not. The same cloud gives the same bytes.
 ///
 /// # Errors
-/// `Unsupported` for frames past 65,535, `Encode` and `Write` where writing fails.
+/// `Unsupported` for sweep indices over 65,535, `Encode` and `Write` where writing fails.
 pub(super) fn write<W: Write>(
     cloud: &DenseCloud,
     compressed: bool,
@@ -55,7 +54,7 @@ pub(super) fn write<W: Write>(
     let mut writer = Writer::new(Cursor::new(Vec::new()), header).map_err(encode)?;
     for (row, point) in cloud.points.iter().enumerate() {
         let [x, y, z] = point.map(f64::from);
-        let frame = cloud.frame[row];
+        let frame = cloud.sweep[row];
         let point_source_id = u16::try_from(frame).map_err(|_| {
             KIND.unsupported(format!(
                 "it numbers {} sweeps at most, row {row} has frame {frame}; write npz, ply or pcd",
@@ -69,7 +68,7 @@ pub(super) fn write<W: Write>(
             return_number: 1,
             number_of_returns: 1,
             user_data: if cloud.dynamic[row] { DYNAMIC } else { 0 },
-            // LAS's own way to say that a point should not be used.
+            // The withheld flag is LAS's mark for a point that should not be used.
             is_withheld: !cloud.converged[row],
             point_source_id,
             extra_bytes: cloud.age[row].to_le_bytes().to_vec(),
@@ -81,7 +80,7 @@ pub(super) fn write<W: Write>(
     Ok(())
 }
 
-/// The record that names and types the extra bytes of every point.
+/// The variable-length record that names and types the extra bytes of every point.
 fn age_record() -> Vlr {
     const EXTRA_BYTES_RECORD: u16 = 4;
     const DESCRIPTOR_BYTES: usize = 192;

@@ -1,27 +1,27 @@
-//! What a file may cost: the largest counts, and the checks of values and of declared sizes.
+//! Limits on files: the largest counts, and checks of values and declared sizes.
 //!
-//! Sizes are checked here before anything is allocated; it must not know any single format.
+//! Sizes are checked before memory is allocated for them. Independent of any format.
 
 use crate::flow::Point;
 
 use super::error::{FileKind, FormatError};
 
-/// The most points that one cloud may have.
+/// The largest number of points in one cloud.
 pub const MAX_POINTS: usize = 50_000_000;
 
-/// The largest magnitude of a coordinate, metres: past it, float32 no longer resolves 6 cm.
+/// The largest magnitude of a coordinate, metres. At 1e6 m, adjacent float32 values are 6 cm apart.
 pub const MAX_COORDINATE_M: f64 = 1e6;
 
-/// Bytes that any compressed file may unfold to, however small it is.
+/// Bytes to which any compressed file may decompress, however small it is.
 const UNFOLD_FLOOR: u64 = 32 << 20;
 
-/// Above the floor, a file may unfold to this many times its own length. Real sweeps reach 4.
+/// Above the floor, a file may decompress to this many times its own size. Real sweeps reach 4.
 const UNFOLD_RATIO: u64 = 32;
 
-/// The most bytes that a compressed file may unfold to.
+/// The most bytes to which a compressed file may decompress.
 const UNFOLD_CEILING: u64 = 4 << 30;
 
-/// Bytes that a compressed file of `file_len` bytes may unfold to, all its parts together.
+/// Bytes to which a compressed file of `file_len` bytes may decompress, all its parts together.
 pub(super) fn unfold_limit(file_len: usize) -> u64 {
     let by_length = (file_len as u64)
         .saturating_mul(UNFOLD_RATIO)
@@ -39,7 +39,7 @@ pub(super) fn check_rows(kind: FileKind, rows: u64) -> Result<usize, FormatError
     }
 }
 
-/// Refuses more rows than a caller takes, before anything is allocated for them.
+/// Refuses more rows than the caller accepts, before memory is allocated for them.
 pub(super) fn check_within(kind: FileKind, rows: usize, most: usize) -> Result<(), FormatError> {
     if rows > most {
         return Err(kind.too_large(format!("{rows} points are declared, {most} are taken")));
@@ -47,7 +47,8 @@ pub(super) fn check_within(kind: FileKind, rows: usize, most: usize) -> Result<(
     Ok(())
 }
 
-/// Refuses a table of `rows` rows of `stride` bytes that `present` bytes cannot hold.
+/// Refuses a table of `rows` rows of `stride` bytes where only `present` bytes exist. Returns the
+/// table's size in bytes.
 pub(super) fn check_size(
     kind: FileKind,
     rows: usize,
@@ -107,7 +108,7 @@ pub(super) fn check_flag(
     Ok(value != 0.0)
 }
 
-/// The number of a cluster: whole, and in 32 bits.
+/// The index of a cluster: a whole number of 32 bits.
 pub(super) fn check_id(
     kind: FileKind,
     row: usize,
@@ -137,7 +138,7 @@ pub(super) fn check_category(
     Ok(value as u8)
 }
 
-/// A chance, 0 to 1.
+/// A probability, 0 to 1.
 pub(super) fn check_chance(
     kind: FileKind,
     row: usize,
@@ -152,7 +153,8 @@ pub(super) fn check_chance(
     Ok(value as f32)
 }
 
-/// Refuses displacements or coordinates that no reader would take back.
+/// Refuses points or displacements that could not be read back: not finite, or over
+/// [`MAX_COORDINATE_M`].
 pub(super) fn check_points(
     kind: FileKind,
     name: &str,

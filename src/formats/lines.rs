@@ -1,6 +1,6 @@
-//! Lines of a file that may be part text, part bytes.
+//! Lines of a file that mixes text and binary data.
 
-/// The bytes up to a line feed, which is dropped; `None` at the end of the file.
+/// The bytes up to the next line feed, which is dropped; `None` at the end of the file.
 pub(super) fn next_line<'a>(rest: &mut &'a [u8]) -> Option<&'a [u8]> {
     if rest.is_empty() {
         return None;

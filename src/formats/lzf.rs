@@ -1,9 +1,9 @@
-//! LZF decompression, as PCD's `binary_compressed` uses it.
+//! LZF decompression, as used by PCD's `binary_compressed`.
 //!
-//! A control byte below 32 starts a run of literals, any other a reference back into the output.
-//! It must not know what the bytes mean; the caller has checked `expected` against its limits.
+//! A control byte below 32 starts a run of literals; any other starts a reference back into the
+//! output. The caller must check `expected` against its limits.
 
-/// Unfolds `packed` into exactly `expected` bytes, or says where it breaks.
+/// Decompresses `packed` into exactly `expected` bytes; the error gives the position of the fault.
 pub(super) fn decompress(packed: &[u8], expected: usize) -> Result<Vec<u8>, String> {
     let mut out: Vec<u8> = Vec::with_capacity(expected);
     let mut rest = packed;
@@ -39,7 +39,7 @@ pub(super) fn decompress(packed: &[u8], expected: usize) -> Result<Vec<u8>, Stri
         if out.len() + length > expected {
             return Err(format!("more than the declared {expected} bytes"));
         }
-        // Byte by byte: a reference may reach into what it is itself writing.
+        // Byte by byte, because a reference may overlap the bytes that it writes.
         for source in start..start + length {
             out.push(out[source]);
         }
@@ -58,7 +58,8 @@ mod tests {
 
     #[test]
     fn literals_and_overlapping_references_unfold() {
-        // "ab", then 5 bytes from 2 back: "ababa"; then a long one of 9 + 1 bytes from 1 back.
+        // "ab", then 5 bytes from 2 back: "ababa"; then a long reference: 0 + 9 + 1 bytes from 1
+        // back.
         let packed = [1, b'a', b'b', 3 << 5, 1, 7 << 5, 1, 0];
         let unfolded = decompress(&packed, 17).unwrap();
         assert_eq!(unfolded, b"abababaaaaaaaaaaa");

@@ -1,12 +1,13 @@
-//! Files in and out: clouds, pairs and flow in the formats that people have.
+//! Files: clouds, pairs, flow, cameras, poses and depth images, in the common formats.
 //!
-//! Recognized by content, checked before anything is allocated, refused by name. It knows bytes
-//! and the vocabulary of `flow`; it must not know files, jobs, solvers or the command line.
+//! Formats are recognized by content, and sizes are checked before memory is allocated. Independent
+//! of the file system, jobs, solvers and the command line.
 
 mod error;
 mod limits;
 mod lines;
 mod sniff;
+mod timestamps;
 
 mod camera;
 mod cloud;
@@ -28,18 +29,21 @@ mod pcd;
 mod ply;
 mod scalar;
 
-pub use camera::{KITTI_SIZE_PX, read_camera, read_camera0_from_lidar};
-pub use cloud::{Cloud, CloudFormat, declared_rows, read_cloud, read_cloud_within, write_cloud};
-pub use dense_file::{DENSE_FORMATS, DenseFormat, write_dense};
-pub use depth_png::{read_depth_png, write_depth_png};
-pub use error::{FileKind, FormatError};
-pub use flow_file::{FlowFile, FlowFormat, FlowTable, read_flow, write_flow};
-pub use ground_raster::GroundRaster;
-pub use limits::{MAX_COORDINATE_M, MAX_POINTS};
-pub use motion::{ego_motion, matrix_rows, read_motion, rigid_motion};
-pub use pair::{
+pub use crate::formats::camera::{KITTI_SIZE_PX, read_camera, read_camera0_from_lidar};
+pub use crate::formats::cloud::{
+    Cloud, CloudFormat, declared_rows, read_cloud, read_cloud_within, write_cloud,
+};
+pub use crate::formats::dense_file::{DENSE_FORMATS, DenseFormat, write_dense};
+pub use crate::formats::depth_png::{read_depth_png, write_depth_png};
+pub use crate::formats::error::{FileKind, FormatError};
+pub use crate::formats::flow_file::{FlowFile, FlowFormat, FlowTable, read_flow, write_flow};
+pub use crate::formats::ground_raster::GroundRaster;
+pub use crate::formats::limits::{MAX_COORDINATE_M, MAX_POINTS};
+pub use crate::formats::motion::{ego_motion, matrix_rows, read_motion, rigid_motion};
+pub use crate::formats::pair::{
     Av2Labels, Ground, Pair, PairTruth, is_pair, read_av2_labels, read_pair, read_pair_within,
     write_pair_npz,
 };
-pub use poses::read_poses;
-pub use sniff::recognize;
+pub use crate::formats::poses::read_poses;
+pub use crate::formats::sniff::recognize;
+pub use timestamps::interval_s;

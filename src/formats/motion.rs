@@ -1,6 +1,4 @@
 //! Rigid motions as 4 x 4 matrices: in pairs, in flow files, and as text of 16 numbers.
-//!
-//! It must not know which motion it is.
 
 use nalgebra::{Matrix3, Matrix4, Rotation3, Translation3, UnitQuaternion};
 
@@ -9,17 +7,17 @@ use crate::flow::RigidTransform;
 use super::error::FormatError;
 use super::limits::MAX_COORDINATE_M;
 
-/// How far a stored rotation may be from orthonormal: float32 matrices are within 1e-6 of it,
-/// and a scale or a shear that would move a point 100 m away by a decimetre is not.
+/// Tolerance of a stored rotation from orthonormal. float32 matrices are within 1e-6. A scale or a
+/// shear that would move a point 100 m away by a decimetre is refused.
 const RIGID_TOLERANCE: f64 = 1e-3;
 
-/// Longest text that is taken for 16 numbers, bytes.
+/// Longest text that is parsed as 16 numbers, bytes.
 const MAX_TEXT: usize = 4096;
 
-/// Reads a motion written as 16 numbers, row by row, between white space or commas.
+/// Reads a motion as text: 16 numbers, row by row, separated by white space or commas.
 ///
 /// # Errors
-/// [`FormatError::Motion`] where there are not 16 finite numbers or they are no rigid motion.
+/// [`FormatError::Motion`] where there are not 16 finite numbers or they are not a rigid motion.
 pub fn read_motion(bytes: &[u8]) -> Result<RigidTransform, FormatError> {
     let text = core::str::from_utf8(bytes).ok();
     let Some(text) = text.filter(|text| text.len() <= MAX_TEXT) else {
@@ -35,11 +33,12 @@ pub fn read_motion(bytes: &[u8]) -> Result<RigidTransform, FormatError> {
     }))
 }
 
-/// The rigid motion between two sweeps that a 4 x 4 matrix is: as [`rigid_motion`], and short enough
-/// that coordinates moved by it can be written. Poses in a city's frame have no such bound.
+/// The rigid motion between two sweeps given by a 4 x 4 matrix, row by row, in metres. As
+/// [`rigid_motion`], with a limit on the translation so that transformed coordinates can be
+/// written. Poses in a city's frame have no such limit.
 ///
 /// # Errors
-/// [`FormatError::Motion`] where it is no rigid motion, or longer than [`MAX_COORDINATE_M`].
+/// [`FormatError::Motion`] where it is not a rigid motion, or longer than [`MAX_COORDINATE_M`].
 pub fn ego_motion(rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError> {
     let motion = rigid_motion(rows)?;
     if motion.translation.vector.amax() > MAX_COORDINATE_M {
@@ -48,10 +47,11 @@ pub fn ego_motion(rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError> {
     Ok(motion)
 }
 
-/// The rigid transform that a 4 x 4 matrix is, refused if it scales, shears or mirrors.
+/// The rigid transform given by a 4 x 4 matrix, row by row, in metres; refused where it scales,
+/// shears or mirrors.
 ///
 /// # Errors
-/// [`FormatError::Motion`] where it is no rigid motion.
+/// [`FormatError::Motion`] where it is not a rigid motion.
 pub fn rigid_motion(rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError> {
     let matrix = Matrix4::from_fn(|row, column| rows[row][column]);
     let rotation: Matrix3<f64> = matrix.fixed_view::<3, 3>(0, 0).into_owned();
@@ -66,7 +66,7 @@ pub fn rigid_motion(rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError>
     }
     let rotation =
         UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
-    // Of a rounded matrix its length is not quite 1, and it would scale what it turns.
+    // The quaternion of a rounded matrix does not have unit length, and would scale points.
     let rotation = UnitQuaternion::new_normalize(rotation.into_inner());
     let translation = Translation3::new(rows[0][3], rows[1][3], rows[2][3]);
     Ok(RigidTransform::from_parts(translation, rotation))

@@ -1,6 +1,6 @@
-//! numpy's `.npy`: one array behind a header that is a Python dictionary literal.
+//! numpy's `.npy`: one array after a header that is a Python dictionary literal.
 //!
-//! The header is parsed by hand, without executing anything; it must not know of archives.
+//! The header is parsed by hand; nothing in it is executed.
 
 use std::io::{Read, Write};
 
@@ -12,17 +12,18 @@ use super::scalar::{ByteOrder, Scalar, write_floats};
 
 pub(super) const MAGIC: &[u8] = b"\x93NUMPY";
 
-/// Headers are about a hundred bytes; numpy itself refuses to parse more than 10,000.
+/// Size limit of a header, bytes. Typical ones have about a hundred; numpy itself refuses to parse
+/// more than 10,000.
 const MAX_HEADER: usize = 10_000;
 
-/// What a header declares.
+/// The contents of a header.
 #[derive(Debug)]
 pub(super) struct Header {
     pub(super) scalar: Scalar,
     pub(super) order: ByteOrder,
     pub(super) fortran: bool,
     pub(super) shape: Vec<usize>,
-    /// Bytes that the header took.
+    /// Size of the header in the file, bytes.
     pub(super) len: usize,
 }
 
@@ -77,7 +78,7 @@ impl Header {
         })
     }
 
-    /// Bytes of data that the shape declares.
+    /// Size of the data by the declared shape, bytes.
     pub(super) fn data_len(&self, kind: FileKind) -> Result<u64, FormatError> {
         self.shape
             .iter()
@@ -87,12 +88,12 @@ impl Header {
             .ok_or_else(|| kind.too_large(format!("an array of shape {:?}", self.shape)))
     }
 
-    /// The first side: what is read of it is allocated by this.
+    /// The first dimension, by which memory is allocated.
     pub(super) fn rows(&self) -> usize {
         self.shape.first().copied().unwrap_or(0)
     }
 
-    /// Rows and columns, for an array of two dimensions.
+    /// Rows and columns of a two-dimensional array.
     pub(super) fn table(&self) -> Option<(usize, usize)> {
         match self.shape[..] {
             [rows, columns] => Some((rows, columns)),
@@ -168,7 +169,8 @@ fn parse_shape(kind: FileKind, value: &str) -> Result<Vec<usize>, FormatError> {
     }
 }
 
-/// Where an array stands: the kind of file, and its name there (empty for `.npy`).
+/// The origin of an array, for messages: the kind of file, and the array's name there (empty for
+/// `.npy`).
 #[derive(Clone, Copy)]
 pub(super) struct Place<'a> {
     pub(super) kind: FileKind,
@@ -196,7 +198,7 @@ impl Place<'_> {
 
 /// The first three columns of an N x k array of floats, k >= 3, as N points in metres.
 ///
-/// The caller has checked that the declared bytes are there; no more than N points are allocated.
+/// The caller must check that the declared bytes exist. Memory is allocated for N points only.
 pub(super) fn read_points<R: Read + ?Sized>(
     place: Place<'_>,
     header: &Header,
@@ -240,7 +242,7 @@ pub(super) fn read_points<R: Read + ?Sized>(
     Ok(points)
 }
 
-/// A column of N numbers, each checked and made what it is by `check`.
+/// Reads a column of N numbers. `check` converts each value, given its row.
 pub(super) fn read_column<R: Read + ?Sized, T>(
     place: Place<'_>,
     header: &Header,
@@ -267,7 +269,7 @@ pub(super) fn read_column<R: Read + ?Sized, T>(
     Ok(column)
 }
 
-/// A 4 x 4 matrix of floats, row by row.
+/// Reads a 4 x 4 matrix of floats, row by row.
 pub(super) fn read_matrix<R: Read + ?Sized>(
     place: Place<'_>,
     header: &Header,
@@ -295,12 +297,13 @@ pub(super) fn read_matrix<R: Read + ?Sized>(
     Ok(matrix)
 }
 
-/// Rows that a `.npy` file declares.
+/// The number of rows that a `.npy` file declares.
 pub(super) fn declared_rows(bytes: &[u8]) -> Result<usize, FormatError> {
     Ok(Header::read(FileKind::Npy, &mut &bytes[..])?.rows())
 }
 
-/// Reads a whole `.npy` file of N x k floats, k >= 3, with at most `most` rows.
+/// Reads a whole `.npy` file of N x k floats, k >= 3, with at most `most` rows, as N points in
+/// metres.
 pub(super) fn read_file(bytes: &[u8], most: usize) -> Result<Vec<Point>, FormatError> {
     let kind = FileKind::Npy;
     let mut rest = bytes;
@@ -317,7 +320,7 @@ pub(super) fn read_file(bytes: &[u8], most: usize) -> Result<Vec<Point>, FormatE
     read_points(Place { kind, array: "" }, &header, &mut rest)
 }
 
-/// Writes the header of a C-order array; `descr` and `shape` in Python's own spelling.
+/// Writes the header of a C-order array; `descr` and `shape` are Python literals.
 pub(super) fn write_header<W: Write>(
     out: &mut W,
     descr: &str,
@@ -373,7 +376,7 @@ pub(super) fn write_values<W: Write>(out: &mut W, values: &[f32]) -> Result<(), 
     write_floats(out, values)
 }
 
-/// Writes a 4 x 4 float64 matrix.
+/// Writes a 4 x 4 float64 matrix, row by row, little endian.
 pub(super) fn write_matrix<W: Write>(
     out: &mut W,
     matrix: &[[f64; 4]; 4],

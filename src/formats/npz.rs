@@ -1,6 +1,7 @@
-//! numpy's `.npz`: named arrays in a zip archive, read one by one and only where asked for.
+//! numpy's `.npz`: named arrays in a zip archive, each read on request.
 //!
-//! An archive says how far it unfolds before it does; what it may cost is checked against that.
+//! The archive declares the decompressed size of each array, which is checked against the limits
+//! before it is decompressed.
 
 use std::cell::Cell;
 use std::io::{Cursor, Read, Seek, Write};
@@ -12,32 +13,33 @@ use crate::flow::Point;
 
 use super::error::{FileKind, FormatError, shorten};
 use super::limits::{MAX_POINTS, check_flag, check_within, unfold_limit};
-use super::npy::{self, Header, Place};
+use super::npy;
+use super::npy::{Header, Place};
 
 const KIND: FileKind = FileKind::Npz;
 
-/// Data sets have ten arrays; a directory of thousands is not one of them.
+/// Largest number of members in an archive. Those of datasets have about ten.
 const MAX_MEMBERS: usize = 1024;
 
-/// The signature that every entry of a zip's central directory begins with.
+/// The signature at the start of every entry in a zip's central directory.
 const DIRECTORY_ENTRY: &[u8; 4] = b"PK\x01\x02";
 
-/// An opened archive.
+/// An open archive.
 pub(super) struct Npz<'a> {
     archive: ZipArchive<Cursor<&'a [u8]>>,
-    /// Bytes that the arrays still to be read may unfold to.
+    /// Bytes to which the arrays still to be read may decompress.
     budget: Cell<u64>,
-    /// Rows that an array may have.
+    /// Largest number of rows in an array.
     most: usize,
 }
 
 impl<'a> Npz<'a> {
-    /// Reads the directory. Nothing is unfolded.
+    /// Reads the directory. Nothing is decompressed.
     pub(super) fn open(bytes: &'a [u8]) -> Result<Self, FormatError> {
         Self::open_within(bytes, MAX_POINTS)
     }
 
-    /// The same; arrays with more than `most` rows are refused.
+    /// As [`Self::open`], and refuses arrays with more than `most` rows.
     pub(super) fn open_within(bytes: &'a [u8], most: usize) -> Result<Self, FormatError> {
         let entries = bytes
             .windows(4)
@@ -83,7 +85,7 @@ impl<'a> Npz<'a> {
         self.with(name, |header, _| Ok(header))
     }
 
-    /// N x 3 floats, in metres.
+    /// Reads N x 3 floats, in metres.
     pub(super) fn points(&mut self, name: &str) -> Result<Vec<Point>, FormatError> {
         let place = Place {
             kind: KIND,
@@ -96,12 +98,13 @@ impl<'a> Npz<'a> {
         })
     }
 
-    /// N booleans: nonzero is true. `None` where there is no such array.
+    /// Reads N booleans: nonzero is true. `None` where there is no such array.
     pub(super) fn mask(&mut self, name: &str) -> Result<Option<Vec<bool>>, FormatError> {
         self.column(name, |row, value| check_flag(KIND, row, name, value))
     }
 
-    /// N numbers, each checked and made what it is by `check`. `None` where there is no such array.
+    /// Reads N numbers. `check` converts each value, given its row. `None` where there is no such
+    /// array.
     pub(super) fn column<T>(
         &mut self,
         name: &str,
@@ -122,7 +125,7 @@ impl<'a> Npz<'a> {
         .map(Some)
     }
 
-    /// A 4 x 4 matrix. `None` where there is no such array.
+    /// Reads a 4 x 4 matrix, row by row. `None` where there is no such array.
     pub(super) fn matrix(&mut self, name: &str) -> Result<Option<[[f64; 4]; 4]>, FormatError> {
         if !self.has(name) {
             return Ok(None);
@@ -135,7 +138,7 @@ impl<'a> Npz<'a> {
             .map(Some)
     }
 
-    /// Opens a member, checks what its header declares, and hands its data to `read`.
+    /// Opens a member, checks the size that its header declares, and passes its data to `read`.
     fn with<T>(
         &mut self,
         name: &str,
@@ -167,7 +170,7 @@ impl<'a> Npz<'a> {
         let untouched = data.limit();
         self.budget.set(left.saturating_add(untouched));
         if untouched == 0 {
-            // Only at its end does a member tell whether its checksum is right.
+            // The checksum is verified only when the member is read to its end.
             match data.into_inner().read(&mut [0]) {
                 Ok(0) => {}
                 Ok(_) => return Err(KIND.malformed(format!("array {} goes on", shorten(name)))),
@@ -187,7 +190,7 @@ fn broken(error: zip::result::ZipError) -> FormatError {
     }
 }
 
-/// Writes arrays one by one into an archive, compressed as `numpy.savez_compressed` does.
+/// Writes arrays one by one into an archive, compressed as by `numpy.savez_compressed`.
 pub(super) struct NpzWriter<W: Write + Seek> {
     archive: ZipWriter<W>,
 }
@@ -199,16 +202,17 @@ impl<W: Write + Seek> NpzWriter<W> {
         }
     }
 
-    /// Starts an array; what `write` writes is the `.npy` file.
+    /// Adds an array; `write` writes its `.npy` file.
     pub(super) fn array(
         &mut self,
         name: &str,
         write: impl FnOnce(&mut ZipWriter<W>) -> Result<(), FormatError>,
     ) -> Result<(), FormatError> {
-        // A fixed time stamp: the same flow gives the same bytes.
+        // A fixed time stamp, so that the same flow gives the same bytes.
         let options = SimpleFileOptions::default()
             .compression_method(CompressionMethod::Deflated)
-            // Masks and left-out rows shrink as well as at any level; floats hardly do at all.
+            // Masks and zero rows compress equally well at any level; floats hardly compress at
+            // all.
             .compression_level(Some(1))
             .last_modified_time(zip::DateTime::default())
             .large_file(true);

@@ -1,6 +1,7 @@
-//! A pair of sweeps with what is known about it: truth, ground, ego motion.
+//! A pair of sweeps with its ground truth, ground masks and ego motion where known.
 //!
-//! `.npz` with the field's array names, and Argoverse 2's labels. It must not know of results.
+//! Read from `.npz` with the array names that are common in scene flow, and from Argoverse 2's
+//! labels.
 
 use std::io::{Cursor, Write};
 
@@ -17,72 +18,74 @@ use super::sniff::is_zip;
 
 const KIND: FileKind = FileKind::Npz;
 
-/// Two sweeps and what is known about the motion between them.
+/// Two sweeps, with the known data on the motion between them.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Pair {
-    /// The source sweep, N points, metres, in its own sensor frame.
+    /// The source sweep: N points, metres, in its own sensor frame.
     pub source: Vec<Point>,
-    /// The target sweep, M points, metres, in its own sensor frame.
+    /// The target sweep: M points, metres, in its own sensor frame.
     pub target: Vec<Point>,
-    /// The true motion, where it is known.
+    /// The true motion of the source points, where known.
     pub truth: Option<PairTruth>,
-    /// The ground of both sweeps, where it is known.
+    /// The ground masks of both sweeps, where known.
     pub ground: Option<Ground>,
-    /// The ego motion `target_from_source`, where it is known.
+    /// The ego motion `target_from_source`, where known.
     pub ego: Option<RigidTransform>,
 }
 
-/// The true motion of a sweep's points.
+/// The true motion of a sweep's N points.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PairTruth {
-    /// Displacement of each source point over the pair, metres, ego motion included.
+    /// N displacements from the source sweep's time to the target's, metres, ego motion included.
     pub flow: Vec<Point>,
-    /// Whether the displacement is known.
+    /// N flags: whether the displacement is known.
     pub valid: Vec<bool>,
-    /// Whether the point moves by itself.
+    /// N flags: whether the point moves relative to the static world.
     pub dynamic: Option<Vec<bool>>,
-    /// Whether the point lies on a labelled object.
+    /// N flags: whether the point lies on a labelled object.
     pub foreground: Option<Vec<bool>>,
-    /// Argoverse 2's category of the point, 0 where it is of none.
+    /// N Argoverse 2 categories; 0 for a point of none.
     pub category: Option<Vec<u8>>,
 }
 
-/// Which points of either sweep lie on the ground.
+/// Ground masks: which points of either sweep lie on the ground.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Ground {
-    /// One per source point.
+    /// N flags, one per source point.
     pub source: Vec<bool>,
-    /// One per target point.
+    /// M flags, one per target point.
     pub target: Vec<bool>,
 }
 
-/// Argoverse 2's labels of one sweep.
+/// Argoverse 2's labels of one sweep of N points.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Av2Labels {
     /// The true motion.
     pub truth: PairTruth,
-    /// Which points lie on the ground.
+    /// N flags: which points lie on the ground.
     pub ground: Vec<bool>,
 }
 
-/// Whether some bytes are an `.npz` with `pc1` and `pc2`.
+/// Whether the bytes are an `.npz` with `pc1` and `pc2`.
 pub fn is_pair(bytes: &[u8]) -> bool {
     is_zip(bytes) && Npz::open(bytes).is_ok_and(|npz| npz.has("pc1") && npz.has("pc2"))
 }
 
-/// Reads an `.npz` with `pc1` (N x 3), `pc2` (M x 3) and, where they are there, `flow` (N x 3),
-/// `valid` and `dynamic` (N), `ground1` (N), `ground2` (M), `ego_SE3` (4 x 4) and `box_id` (N,
-/// negative off every object) or `classes` (N, 0 off every object), and `category` (N, Argoverse 2's).
+/// Reads a pair from an `.npz` with `pc1` (N x 3) and `pc2` (M x 3), metres.
+///
+/// Optional arrays are `flow` (N x 3), `valid` and `dynamic` (N), `ground1` (N), `ground2` (M),
+/// `ego_SE3` (4 x 4), `category` (N, Argoverse 2's), and either `box_id` (N, negative off all
+/// objects) or `classes` (N, 0 off all objects).
 ///
 /// # Errors
-/// As for a cloud, and `RowCount` where arrays disagree, `Unsupported` where `ego_SE3` is not
-/// rigid or one of the two ground masks is missing.
+/// As for a cloud; `RowCount` where arrays differ in length, `Motion` where `ego_SE3` is not rigid,
+/// `Unsupported` where only one of the two ground masks is present.
 pub fn read_pair(bytes: &[u8]) -> Result<Pair, FormatError> {
     read_pair_within(bytes, MAX_POINTS)
 }
 
-/// The same of at most `most` points a cloud: a file that declares more is refused before memory is
-/// taken for them.
+/// As [`read_pair`], with at most `most` points per cloud: a file that declares more is refused
+/// before memory is allocated for them.
 ///
 /// # Errors
 /// As for [`read_pair`].
@@ -155,7 +158,7 @@ fn read_truth(npz: &mut Npz<'_>, count: usize) -> Result<Option<PairTruth>, Form
     }))
 }
 
-/// Which points are of any category.
+/// Which points have a category.
 fn of_some_category(category: &[u8]) -> Vec<bool> {
     category.iter().map(|&category| category != 0).collect()
 }
@@ -178,12 +181,12 @@ pub(super) fn check_count(what: &str, found: usize, expected: usize) -> Result<(
     }
 }
 
-/// Writes a pair with the array names that [`read_pair`] reads; `foreground` becomes `box_id`
-/// 0 on objects and -1 off them.
+/// Writes a pair with the array names that [`read_pair`] reads. `foreground` is written as
+/// `box_id`, 0 on objects and -1 off them.
 ///
 /// # Errors
-/// `RowCount` where the pair's parts disagree, `NotFinite` for values that could not be read
-/// back, `Write` and `Encode` where writing fails.
+/// `RowCount` where the pair's parts differ in length, `NotFinite` or `OutOfRange` for values that
+/// could not be read back, `Write` and `Encode` where writing fails.
 pub fn write_pair_npz<W: Write>(pair: &Pair, out: &mut W) -> Result<(), FormatError> {
     let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
     let count = pair.source.len();
@@ -229,14 +232,14 @@ pub fn write_pair_npz<W: Write>(pair: &Pair, out: &mut W) -> Result<(), FormatEr
     Ok(())
 }
 
-/// Reads Argoverse 2's `flow_labels.feather`: `flow_tx_m`, `flow_ty_m`, `flow_tz_m`, and
-/// `is_ground_0` (or `is_ground`), `dynamic` (or `is_dynamic`), `is_valid` (or `valid`; all valid
-/// where it is missing) and `classes` (or `classes_0`).
+/// Reads Argoverse 2's `flow_labels.feather`: `flow_tx_m`, `flow_ty_m`, `flow_tz_m` in metres,
+/// `is_ground_0` (or `is_ground`), `dynamic` (or `is_dynamic`), `is_valid` (or `valid`; all rows
+/// are valid where it is missing) and `classes` (or `classes_0`).
 ///
-/// Foreground is every class but 0, which is NONE: so Argoverse 2's own evaluation has it.
+/// Foreground is every class except 0, which is NONE, as in Argoverse 2's own evaluation.
 ///
 /// # Errors
-/// As for a cloud; `Missing` where flow or ground are not there.
+/// As for a cloud; `Missing` where the columns of flow or ground are missing.
 pub fn read_av2_labels(bytes: &[u8]) -> Result<Av2Labels, FormatError> {
     let table = Table::open(bytes)?;
     let flow = read_columns(&table, FLOW_COLUMNS)?;
@@ -267,7 +270,7 @@ pub fn read_av2_labels(bytes: &[u8]) -> Result<Av2Labels, FormatError> {
     })
 }
 
-/// The first of some columns that is there, as a mask: nonzero is true.
+/// The first existing column of `names`, as a mask: nonzero is true. `None` where none exists.
 pub(super) fn flags(table: &Table<'_>, names: &[&str]) -> Result<Option<Vec<bool>>, FormatError> {
     let Some(name) = names.iter().find(|name| table.has(name)) else {
         return Ok(None);

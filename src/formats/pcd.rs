@@ -1,6 +1,7 @@
-//! PCD, the Point Cloud Library's format: ascii, binary and binary_compressed (LZF, by columns).
+//! PCD, the Point Cloud Library's format: ascii, binary and binary_compressed (LZF, column by
+//! column).
 //!
-//! Reads the wanted fields and steps over the rest; it must not know what the fields mean.
+//! Reads the wanted fields and skips the others. Independent of the meaning of the fields.
 
 use std::borrow::Cow;
 use std::io::Write;
@@ -13,7 +14,8 @@ use super::scalar::{ByteOrder, Scalar};
 
 const KIND: FileKind = FileKind::Pcd;
 
-/// Headers are about two hundred bytes; comments may make them longer.
+/// Size limit of a header, bytes. Typical ones have about two hundred; comments may make them
+/// longer.
 const MAX_HEADER: usize = 64 << 10;
 
 struct Field {
@@ -100,12 +102,12 @@ impl<'a> Pcd<'a> {
         })
     }
 
-    /// Number of points declared.
+    /// The number of points declared.
     pub(super) fn rows(&self) -> usize {
         self.rows
     }
 
-    /// The type of a field of one number per point, where there is one of this name.
+    /// The type of the field `wanted`, where it exists and has one number per point.
     pub(super) fn field(&self, wanted: &str) -> Option<Scalar> {
         let found = self
             .fields
@@ -114,8 +116,8 @@ impl<'a> Pcd<'a> {
         Some(found.scalar)
     }
 
-    /// Checks the declared counts against the bytes present, then hands every point's values of
-    /// the `wanted` fields, in that order, to `take` (row, values).
+    /// Checks the declared counts against the bytes present. Then calls `take` with the row and
+    /// values of every point, the values being those of the `wanted` fields in that order.
     pub(super) fn each(
         &self,
         wanted: &[&str],
@@ -125,7 +127,7 @@ impl<'a> Pcd<'a> {
         let mut values = vec![0.0; wanted.len()];
         if self.encoding == Encoding::Ascii {
             let numbers = self.sum(|field| field.count)?;
-            // A number takes a digit and a space.
+            // Each number takes at least a digit and a separator.
             check_size(
                 KIND,
                 self.rows,
@@ -149,7 +151,7 @@ impl<'a> Pcd<'a> {
             for ((value, &index), &offset) in values.iter_mut().zip(&indices).zip(&offsets) {
                 let scalar = self.fields[index].scalar;
                 let at = match self.encoding {
-                    // By columns: every field's numbers stand together.
+                    // Column by column: the numbers of one field are contiguous.
                     Encoding::Compressed => offset * self.rows + row * scalar.size(),
                     _ => row * stride + offset,
                 };
@@ -163,7 +165,7 @@ impl<'a> Pcd<'a> {
         Ok(())
     }
 
-    /// The binary body, unfolded where it is compressed.
+    /// The binary body, decompressed where it is compressed.
     fn data(&self, stride: usize) -> Result<Cow<'a, [u8]>, FormatError> {
         if self.encoding == Encoding::Binary {
             check_size(KIND, self.rows, stride, self.body.len())?;
@@ -303,7 +305,7 @@ fn ascii_row(
     (found == numbers).then_some(())
 }
 
-/// Writes the header of a binary file of `rows` points; fields as (name, size, type).
+/// Writes the header of a binary file of `rows` points; fields as (name, size in bytes, type).
 pub(super) fn write_header<W: Write>(
     out: &mut W,
     rows: usize,

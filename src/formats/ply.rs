@@ -1,7 +1,7 @@
 //! PLY: a text header that declares elements and properties, then rows in text or binary.
 //!
-//! Reads the wanted scalar properties of the vertex element and steps over everything else; it
-//! must not know what the properties mean.
+//! Reads the wanted scalar properties of the vertex element and skips all others. Independent of
+//! the meaning of the properties.
 
 use std::io::Write;
 
@@ -12,7 +12,7 @@ use super::scalar::{ByteOrder, Scalar};
 
 const KIND: FileKind = FileKind::Ply;
 
-/// Headers are a few hundred bytes; comments may make them longer.
+/// Size limit of a header, bytes. Typical ones have a few hundred; comments may make them longer.
 const MAX_HEADER: usize = 64 << 10;
 
 enum Property {
@@ -27,7 +27,7 @@ struct Element {
 }
 
 impl Element {
-    /// Bytes of one binary row, where no list makes them vary.
+    /// Bytes of one binary row; `None` where a list makes rows vary.
     fn stride(&self) -> Option<usize> {
         self.properties
             .iter()
@@ -123,12 +123,12 @@ impl<'a> Ply<'a> {
         })
     }
 
-    /// Number of vertices declared.
+    /// The number of vertices declared.
     pub(super) fn rows(&self) -> Result<usize, FormatError> {
         check_rows(KIND, self.vertex()?.rows)
     }
 
-    /// The type of a scalar vertex property, where there is one of this name.
+    /// The type of the scalar vertex property `wanted`, where it exists.
     pub(super) fn property(&self, wanted: &str) -> Option<Scalar> {
         let properties = &self.vertex().ok()?.properties;
         properties.iter().find_map(|property| match property {
@@ -137,8 +137,8 @@ impl<'a> Ply<'a> {
         })
     }
 
-    /// Checks the declared counts against the bytes present, then hands every vertex's values of
-    /// the `wanted` properties, in that order, to `take` (row, values).
+    /// Checks the declared counts against the bytes present. Then calls `take` with the row and
+    /// values of every vertex, the values being those of the `wanted` properties in that order.
     pub(super) fn each(
         &self,
         wanted: &[&str],
@@ -155,7 +155,7 @@ impl<'a> Ply<'a> {
         {
             self.skip(element, &mut body)?;
         }
-        // Even a list takes a byte, and an ascii number takes a digit and a space.
+        // A list takes at least one byte, an ascii number at least a digit and a separator.
         let least = match self.encoding {
             Encoding::Ascii => vertex.properties.len().saturating_mul(2),
             Encoding::Binary(_) => vertex.stride().unwrap_or(vertex.properties.len()),
@@ -174,7 +174,7 @@ impl<'a> Ply<'a> {
         Ok(())
     }
 
-    /// For every property of the vertex, its place in `wanted`.
+    /// For every property of the vertex, its index in `wanted`.
     fn slots(&self, vertex: &Element, wanted: &[&str]) -> Result<Vec<Option<usize>>, FormatError> {
         let name_of = |property: &Property| match property {
             Property::Scalar { name, .. } => Some(name.clone()),
@@ -195,7 +195,7 @@ impl<'a> Ply<'a> {
         Ok(names.iter().map(slot).collect())
     }
 
-    /// Reads one row; `None` where it ends early or holds something that is no number.
+    /// Reads one row; `None` where it is truncated or contains a word that is not a number.
     fn row(
         &self,
         element: &Element,
@@ -242,7 +242,7 @@ impl<'a> Ply<'a> {
         Some(())
     }
 
-    /// Steps over an element that comes before the vertices.
+    /// Skips an element that comes before the vertices.
     fn skip(&self, element: &Element, body: &mut &[u8]) -> Result<(), FormatError> {
         let early = || KIND.malformed(format!("element {} ends early", shorten(&element.name)));
         if let (Encoding::Binary(_), Some(stride)) = (self.encoding, element.stride()) {
@@ -266,7 +266,7 @@ fn skip_list(count: Scalar, item: Scalar, order: ByteOrder, body: &mut &[u8]) ->
     if items < 0.0 {
         return None;
     }
-    // A float64 holds every count that memory can; larger ones saturate and fail the next line.
+    // A count too large for `usize` saturates, and the next lines then refuse it.
     let bytes = (items as usize)
         .checked_mul(item.size())?
         .checked_add(count.size())?;

@@ -1,7 +1,7 @@
-//! Where each sweep of a sequence was taken: KITTI's text, our JSON, Argoverse 2's table.
+//! Poses of a sequence's sweeps: KITTI's text, JSON, and Argoverse 2's table.
 //!
-//! A pose is `world_from_frame`; between two sweeps lies
-//! `world_from_target.inv_mul(&world_from_source)`. It must not know whose poses they are.
+//! A pose is `world_from_frame`. The ego motion between two sweeps is
+//! `world_from_target.inv_mul(&world_from_source)`.
 
 use std::collections::HashMap;
 
@@ -11,55 +11,57 @@ use crate::flow::RigidTransform;
 
 use super::camera::with_last_row;
 use super::error::{FileKind, FormatError, shorten};
-use super::feather::{self, Table};
+use super::feather;
+use super::feather::Table;
 use super::motion::rigid_motion;
 
 const KIND: FileKind = FileKind::Poses;
 
-/// Most poses of one file of text or JSON.
+/// Largest number of poses in one text file.
 const MAX_POSES: usize = 1_000_000;
 
-/// How far a stored quaternion's length may be from 1: float32 ones are within 1e-6.
+/// Tolerance of a stored quaternion's length from 1; float32 ones are within 1e-6.
 const UNIT_TOLERANCE: f64 = 1e-3;
 
-/// Argoverse 2's columns of a rotation and a place, metres.
+/// Argoverse 2's columns of a rotation and a translation, metres.
 const AV2_COLUMNS: [&str; 7] = ["qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"];
 
-/// Reads `world_from_frame` of every sweep, in the order of `frames`, their file names without
-/// folder; recognized by content.
+/// Reads the pose `world_from_frame` of every sweep, translations in metres. `sweeps` are the
+/// sweeps' file names, and the poses are in the same order. The format is recognized by content.
 ///
-/// - KITTI's odometry text: 12 numbers a line, the first three rows of a matrix. Its own poses are
-///   those of camera 0; see [`super::read_camera0_from_lidar`].
+/// - KITTI's odometry text: 12 numbers a line, the first three rows of a matrix. KITTI's own poses
+///   are those of camera 0; see [`super::read_camera0_from_lidar`].
 /// - JSON: an array of 4 x 4 matrices, row by row.
-/// - Argoverse 2's `city_SE3_egovehicle.feather`: the rows whose `timestamp_ns` are the frames'
-///   names, compared in float64, which tells 64 ns apart.
+/// - Argoverse 2's `city_SE3_egovehicle.feather`: the rows whose `timestamp_ns` equals a sweep's
+///   name. They are compared in float64, which resolves 64 ns.
 ///
-/// Text and JSON have a pose for every frame, in order; or poses for a whole drive, of which each
-/// frame whose name is a number takes the one of that number, counted from 0.
+/// Text and JSON have one pose for every sweep, in order, or the poses of a whole drive. In the
+/// latter case a sweep whose name is a number gets the pose with that index, counted from 0.
 ///
 /// # Errors
-/// `Malformed` names the line, `RowCount` a wrong number of poses, `Missing` a frame without
-/// one, `Motion` what is not rigid, `TooLarge` more than a million poses.
-pub fn read_poses(bytes: &[u8], frames: &[&str]) -> Result<Vec<RigidTransform>, FormatError> {
+/// `Malformed` names the line, or the sweep whose pose is not rigid. `RowCount` for a wrong number
+/// of poses, `Missing` for a sweep without a pose, `Motion` for a pose of Argoverse 2 that is not
+/// rigid, `TooLarge` for a text of more than a million poses.
+pub fn read_poses(bytes: &[u8], sweeps: &[&str]) -> Result<Vec<RigidTransform>, FormatError> {
     if bytes.starts_with(feather::MAGIC) {
-        return read_av2(bytes, frames);
+        return read_av2(bytes, sweeps);
     }
     let poses = match bytes.trim_ascii_start().first() {
         Some(b'[') => serde_json::from_slice(bytes)
             .map_err(|error| KIND.malformed(format!("not an array of 4 x 4 matrices: {error}")))?,
         _ => read_text(bytes)?,
     };
-    let chosen: Option<Vec<&[[f64; 4]; 4]>> = if poses.len() == frames.len() {
+    let chosen: Option<Vec<&[[f64; 4]; 4]>> = if poses.len() == sweeps.len() {
         Some(poses.iter().collect())
     } else {
         let pose = |frame: &&str| poses.get(stem(frame).parse::<usize>().ok()?);
-        frames.iter().map(pose).collect()
+        sweeps.iter().map(pose).collect()
     };
     let Some(chosen) = chosen else {
         return Err(FormatError::RowCount {
             what: "the file of poses".to_owned(),
             found: poses.len(),
-            expected: frames.len(),
+            expected: sweeps.len(),
         });
     };
     let pose = |(frame, rows): (&&str, &[[f64; 4]; 4])| {
@@ -70,10 +72,10 @@ pub fn read_poses(bytes: &[u8], frames: &[&str]) -> Result<Vec<RigidTransform>, 
             ))
         })
     };
-    frames.iter().zip(chosen).map(pose).collect()
+    sweeps.iter().zip(chosen).map(pose).collect()
 }
 
-/// A file's name without folder and ending.
+/// A file's name without folder, and without everything after its first dot.
 fn stem(frame: &str) -> &str {
     let file = frame.rsplit(['/', '\\']).next().unwrap_or(frame);
     file.split_once('.').map_or(file, |(stem, _)| stem)
@@ -106,10 +108,10 @@ fn read_text(bytes: &[u8]) -> Result<Vec<[[f64; 4]; 4]>, FormatError> {
     Ok(poses)
 }
 
-fn read_av2(bytes: &[u8], frames: &[&str]) -> Result<Vec<RigidTransform>, FormatError> {
+fn read_av2(bytes: &[u8], sweeps: &[&str]) -> Result<Vec<RigidTransform>, FormatError> {
     let table = Table::open(bytes)?;
     let time = |frame: &&str| {
-        // Nanoseconds as the table hands them out.
+        // Nanoseconds in float64, as `Table::each` gives them.
         let time = stem(frame).parse::<i64>().map(|time| time as f64);
         time.map_err(|_| {
             FileKind::Feather.unsupported(format!(
@@ -118,7 +120,7 @@ fn read_av2(bytes: &[u8], frames: &[&str]) -> Result<Vec<RigidTransform>, Format
             ))
         })
     };
-    let times: Vec<f64> = frames.iter().map(time).collect::<Result<_, _>>()?;
+    let times: Vec<f64> = sweeps.iter().map(time).collect::<Result<_, _>>()?;
     let mut found: HashMap<u64, Option<usize>> =
         times.iter().map(|time| (time.to_bits(), None)).collect();
     table.each("timestamp_ns", |row, stamp| {
@@ -158,5 +160,5 @@ fn read_av2(bytes: &[u8], frames: &[&str]) -> Result<Vec<RigidTransform>, Format
             UnitQuaternion::from_quaternion(rotation),
         ))
     };
-    frames.iter().zip(&times).map(pose).collect()
+    sweeps.iter().zip(&times).map(pose).collect()
 }

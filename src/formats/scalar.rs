@@ -1,6 +1,6 @@
-//! Numbers as files store them: width, signedness and byte order, decoded to float64.
+//! Numbers in binary files: width, signedness and byte order, decoded to float64.
 //!
-//! Shared by every binary format; it must not know what the numbers mean.
+//! Shared by all binary formats. Independent of the meaning of the numbers.
 
 use std::io::{Read, Write};
 
@@ -46,7 +46,7 @@ impl Scalar {
         matches!(self, Self::F16 | Self::F32 | Self::F64)
     }
 
-    /// Decodes the number at the start of `bytes`; `None` where they are too few.
+    /// Decodes the number at the start of `bytes`; `None` where there are too few bytes.
     pub(super) fn decode(self, bytes: &[u8], order: ByteOrder) -> Option<f64> {
         fn first<const N: usize>(bytes: &[u8], order: ByteOrder) -> Option<[u8; N]> {
             let mut raw = *bytes.first_chunk::<N>()?;
@@ -70,7 +70,7 @@ impl Scalar {
         })
     }
 
-    /// Streams `count` numbers from `reader` to `take` (index, value) without holding them.
+    /// Streams `count` numbers from `reader` to `take` (index, value) without storing them.
     pub(super) fn each<R: Read + ?Sized>(
         self,
         order: ByteOrder,

@@ -1,20 +1,18 @@
-//! Which kind of file some bytes are: by their beginning, and by name only where they have none.
-//!
-//! It must not read past the beginning of a file that has one.
+//! Recognition of a file's kind: by its first bytes, and by name only where they are not
+//! distinctive.
 
-use super::bin;
 use super::error::{FileKind, FormatError};
-use super::{feather, npy};
+use super::{bin, feather, npy};
 
-/// Lines of comments that a PCD header may begin with.
+/// Number of lines in which a PCD header must start; comments may precede it.
 const MAX_COMMENT_LINES: usize = 32;
 
-/// Recognizes a file. `name` is a file name or path; only its ending is looked at, and only for
-/// raw floats, which begin with nothing of their own.
+/// Recognizes a file. `name` is a file name or path. Only its ending is used, and only for raw
+/// floats, which have no header.
 ///
 /// # Errors
-/// `Unrecognized`, with what the file seems to be instead where that can be told; `Ambiguous` for
-/// raw floats of which nothing says how many make a row.
+/// `Unrecognized`, with the actual kind of file where it can be told; `Ambiguous` for raw floats
+/// whose row width cannot be determined.
 pub fn recognize(bytes: &[u8], name: Option<&str>) -> Result<FileKind, FormatError> {
     if bytes.is_empty() {
         return Err(FormatError::Unrecognized("it is empty".to_owned()));
@@ -58,7 +56,7 @@ pub(super) fn ending(name: &str) -> String {
     }
 }
 
-/// Whether some bytes are a zip archive, as an `.npz` is.
+/// Whether the bytes are a zip archive, as an `.npz` is.
 pub(super) fn is_zip(bytes: &[u8]) -> bool {
     bytes.starts_with(b"PK\x03\x04") || bytes.starts_with(b"PK\x05\x06")
 }
@@ -81,7 +79,7 @@ fn is_json(bytes: &[u8]) -> bool {
     })
 }
 
-/// Files that people send and that are something else.
+/// A message for common kinds of files that are not supported.
 fn known_stranger(bytes: &[u8]) -> Option<&'static str> {
     let beginnings: [(&[u8], &str); 6] = [
         (b"FEA1", "it is feather version 1; write version 2"),
@@ -94,7 +92,7 @@ fn known_stranger(bytes: &[u8]) -> Option<&'static str> {
             "it looks like a Python pickle, which is never opened; save npz",
         ),
     ];
-    // A pickle's first byte alone is weak evidence: its second is the protocol number.
+    // A pickle's first byte alone is weak evidence; its second is the protocol number.
     beginnings
         .into_iter()
         .find(|(beginning, _)| bytes.starts_with(beginning))

@@ -1,27 +1,27 @@
-//! Where work may be done: what a request may ask for, and the kinds of device that there are.
+//! The device that a request may choose, and the kinds of device.
 
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::options::InvalidOptions;
+use super::error::InvalidOptions;
 
-/// Where the work is done.
+/// The device for the computation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum DeviceChoice {
-    /// The fastest that is there: a GPU, or the CPU where there is none.
+    /// The fastest available: a GPU, or the CPU if there is none.
     #[default]
     Auto,
-    /// The CPU's vector units.
+    /// The CPU.
     Cpu,
-    /// A GPU, and nothing else.
+    /// A GPU. The request is refused if there is none.
     Gpu,
 }
 
 impl DeviceChoice {
-    /// The kind of device that it has to be; none where any will do.
+    /// The required kind of device; none if any kind will do.
     pub fn kind(self) -> Option<DeviceKind> {
         match self {
             Self::Auto => None,
@@ -44,10 +44,10 @@ impl FromStr for DeviceChoice {
     }
 }
 
-/// What a device is.
+/// The kind of a device.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum DeviceKind {
-    /// The CPU's vector units.
+    /// The CPU.
     Cpu,
     /// A GPU.
     Gpu,
@@ -57,7 +57,7 @@ impl DeviceKind {
     /// All kinds.
     pub const ALL: [Self; 2] = [Self::Cpu, Self::Gpu];
 
-    /// The name that requests and metrics use.
+    /// The name in requests and metrics.
     pub fn name(self) -> &'static str {
         match self {
             Self::Cpu => "cpu",

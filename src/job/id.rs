@@ -1,4 +1,4 @@
-//! Names of jobs and of tenants: typed, short, and never a path.
+//! Identifiers of jobs and tenants. Neither can contain a path separator.
 
 use std::fmt;
 use std::str::FromStr;
@@ -7,12 +7,12 @@ use std::sync::Arc;
 use serde::{Serialize, Serializer};
 use uuid::Uuid;
 
-/// A job's name: a version 7 UUID, so that names sort by time.
+/// The id of a job: a UUID of version 7, so that ids sort by creation time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct JobId(Uuid);
 
 impl JobId {
-    /// A name that nobody has used.
+    /// A new unique id.
     pub fn fresh() -> Self {
         Self(Uuid::now_v7())
     }
@@ -22,7 +22,7 @@ impl JobId {
         Self(Uuid::from_bytes(bytes))
     }
 
-    /// Its 16 bytes, which sort as the names do.
+    /// Its 16 bytes. Their order is the order of the ids.
     pub fn as_bytes(&self) -> &[u8; 16] {
         self.0.as_bytes()
     }
@@ -40,7 +40,7 @@ impl Serialize for JobId {
     }
 }
 
-/// Not a job's or a tenant's name.
+/// A text is not a valid job id or tenant name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidId {
     /// Not 8-4-4-4-12 hexadecimal digits.
@@ -62,12 +62,12 @@ impl FromStr for JobId {
     }
 }
 
-/// Whose job it is.
+/// The name of a tenant, the owner of jobs.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Tenant(Arc<str>);
 
 impl Tenant {
-    /// Its name.
+    /// The name.
     pub fn as_str(&self) -> &str {
         &self.0
     }

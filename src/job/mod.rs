@@ -1,19 +1,20 @@
-//! What a job is: its name, its options, its states, and what is known about it.
+//! The data model of jobs: id, options, states, record and report.
 //!
-//! The vocabulary that the doors, the queue and the workers share; it must not know any of them.
+//! Shared by the protocols, the queue and the workers. Independent of them.
 
+mod densify;
 mod device;
+mod error;
 mod id;
 mod options;
 mod record;
 mod report;
 mod sequence;
 
+pub use densify::{Densify, LaterSweepsChoice};
 pub use device::{DeviceChoice, DeviceKind};
+pub use error::InvalidOptions;
 pub use id::{InvalidId, JobId, Tenant};
-pub use options::{
-    EgoChoice, GroundChoice, InvalidOptions, JobOptions, PrecisionChoice, PresetChoice, Priority,
-};
+pub use options::{EgoChoice, GroundChoice, JobOptions, PrecisionChoice, PresetChoice, Priority};
 pub use record::{Job, JobError, JobProgress, Kind, State};
 pub use report::{DenseReport, PhaseSeconds, Report};
-pub use sequence::{Densify, LaterChoice};

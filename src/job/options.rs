@@ -1,63 +1,65 @@
-//! What a request may ask for: one set of names for the command line, HTTP and gRPC.
+//! The options of a request: one set of names for the command line, HTTP and gRPC.
 //!
-//! Every field has a default and unknown keys are refused. What the names mean to the solver is
-//! said here and nowhere else; the presets' values stay in `flow/options.rs`.
+//! Every option has a default, and unknown keys are refused. This module maps the names to the
+//! solver's options. The values of the presets are in `flow/options/`.
 
 use std::str::FromStr;
-use std::time::Duration;
 
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use utoipa::ToSchema;
 
+use super::densify::Densify;
 use super::device::{DeviceChoice, DeviceKind};
-use super::sequence::Densify;
-use crate::flow::densify::PlanError;
+use super::error::{InvalidOptions, MAX_DEADLINE, MAX_DT_S};
 use crate::flow::{self, Ego, Ground, MIN_POINTS, Precision, Preset, RigidTransform};
 use crate::formats::{ego_motion, matrix_rows};
 
-/// The longest deadline that may be asked for.
-const MAX_DEADLINE: Duration = Duration::from_secs(24 * 60 * 60);
-
-/// How a pair's, or a sequence's, flow is found.
+/// Options of a pair or of a sequence.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct JobOptions {
-    /// `default`: movers found object by object, everything else still; `label`: `default`, and a pair of
-    /// a sequence is found from up to five sweeps; `neural`: a neural field, robust and fast to fit;
-    /// `paper`: FNSF as published.
+    /// `default`: the rigid motion of each object, from the two sweeps of the pair; the remaining
+    /// points move with the ego motion. `label`: as `default`, and a pair of a sequence uses up to
+    /// five sweeps. `neural`: a short, robust fit of a neural field. `paper`: FNSF as published.
     pub preset: PresetChoice,
-    /// The same seed gives the same bits.
+    /// Seed of the random numbers. The same seed gives bit-identical results.
     pub seed: u64,
-    /// Draw this many points and give the others no flow. `neural` and `paper` draw from each cloud and
-    /// leave out the rest; `default` and `label` look at all points all the same.
+    /// Number of source points that get a flow, chosen at random. `neural` and `paper` sample both
+    /// clouds and use only the sampled points. `default` and `label` compute from all points and
+    /// return the flow of the sampled ones.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_points: Option<u32>,
-    /// Leave out points with |x| or |y| beyond this, metres.
+    /// Ignore points with |x| or |y| above this, metres.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub range_m: Option<f32>,
-    /// `keep` ground points, leave out those that the clouds' own masks name (`mask`), or let them
-    /// move with the vehicle's own motion (`auto`): those of the masks or, without masks, those that
-    /// are found; by default what the preset does.
+    pub crop_m: Option<f32>,
+    /// Time between consecutive sweeps, seconds, for velocities. 0.1 if not given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub dt_s: Option<f32>,
+    /// `keep`: ground points are treated as any other. `mask`: points marked in the ground masks of
+    /// the input are left out. `auto`: ground points move with the ego motion; they are taken from
+    /// the masks, or from a ground segmentation if there are no masks. By default chosen by the
+    /// preset.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ground: Option<GroundChoice>,
-    /// The vehicle's own motion: `off`, `auto` (estimate it first) or a 4 x 4 matrix
-    /// target_from_source; by default what the preset does.
+    /// The ego motion: `off`, `auto` (estimated first) or a 4 x 4 matrix target_from_source. By
+    /// default chosen by the preset.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<Object>)]
     pub ego: Option<EgoChoice>,
-    /// Where the work is done. A GPU is for `neural` and `paper`; `default` and `label` compute on the
-    /// host's processor whatever the device.
+    /// The device for the computation. `neural` and `paper` can use a GPU. `default` and `label`
+    /// always compute on the host's CPU.
     pub device: DeviceChoice,
-    /// `f32`: single precision; `f16`: half, for `neural` and `paper` on a GPU whose matrix units pass
-    /// their self-test.
+    /// `f32`: single precision. `f16`: half precision, for `neural` and `paper` on a GPU whose
+    /// matrix units pass their self-test.
     pub precision: PrecisionChoice,
-    /// Milliseconds from the request's arrival after which the best flow so far is wanted.
+    /// Deadline, milliseconds after the arrival of the request. The best flow so far is then
+    /// returned.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub deadline_ms: Option<u64>,
-    /// Jobs of a higher priority are started first.
+    /// Priority of the job. Jobs of a higher priority start first.
     pub priority: Priority,
-    /// One dense cloud of a sequence besides its flows.
+    /// Also computes one dense cloud of a sequence, in addition to its flows.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub densify: Option<Densify>,
 }
@@ -68,12 +70,12 @@ pub struct JobOptions {
 )]
 #[serde(rename_all = "snake_case")]
 pub enum PresetChoice {
-    /// Ours: movers found object by object, everything else still.
+    /// Rigid motion of each object; the remaining points move with the ego motion.
     #[default]
     Default,
-    /// As default, and a pair of a sequence sees the sweeps around it.
+    /// As default, and a pair of a sequence also uses its neighbor sweeps.
     Label,
-    /// Ours with a neural field: robust and fast to fit.
+    /// A short, robust fit of a neural field.
     Neural,
     /// FNSF as published.
     Paper,
@@ -91,19 +93,20 @@ impl PresetChoice {
     }
 }
 
-/// What becomes of ground points.
+/// Treatment of ground points.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema, clap::ValueEnum)]
 #[serde(rename_all = "snake_case")]
 pub enum GroundChoice {
-    /// They are points like any other.
+    /// As any other point.
     Keep,
-    /// Those that the pair's ground1 and ground2 name are left out.
+    /// Points marked in the masks ground1 and ground2 of the pair are left out.
     Mask,
-    /// Those of the masks, or without masks those that are found, move with the vehicle.
+    /// Ground points move with the ego motion. They are taken from the masks, or segmented if there
+    /// are no masks.
     Auto,
 }
 
-/// What the factors of the network's products are rounded to.
+/// Precision of the factors in the network's matrix products.
 #[derive(
     Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema, clap::ValueEnum,
 )]
@@ -128,7 +131,8 @@ impl FromStr for PrecisionChoice {
     }
 }
 
-/// How urgent a job is. Higher ones always go first; within one, tenants share fairly.
+/// Priority of a job. Jobs of a higher priority always start first. Within one priority, tenants
+/// share fairly.
 #[derive(
     Clone,
     Copy,
@@ -145,12 +149,12 @@ impl FromStr for PrecisionChoice {
 )]
 #[serde(rename_all = "snake_case")]
 pub enum Priority {
-    /// Bulk work.
+    /// Batch work.
     Low,
-    /// Everything else.
+    /// The default.
     #[default]
     Normal,
-    /// Somebody waits.
+    /// Interactive work.
     High,
 }
 
@@ -158,7 +162,7 @@ impl Priority {
     /// All priorities, lowest first.
     pub const ALL: [Self; 3] = [Self::Low, Self::Normal, Self::High];
 
-    /// The name that requests and metrics use.
+    /// The name in requests and metrics.
     pub fn name(self) -> &'static str {
         match self {
             Self::Low => "low",
@@ -168,14 +172,14 @@ impl Priority {
     }
 }
 
-/// The vehicle's own motion.
+/// The ego motion of a pair.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum EgoChoice {
-    /// Part of what the field has to explain.
+    /// Not removed: it is part of the flow that the method estimates.
     Off,
     /// Estimated first.
     Auto,
-    /// Known, as target_from_source.
+    /// Given as target_from_source.
     Given(RigidTransform),
 }
 
@@ -205,54 +209,13 @@ impl<'de> Deserialize<'de> for EgoChoice {
     }
 }
 
-/// Options that make no sense.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum InvalidOptions {
-    /// Not the JSON object that is wanted.
-    #[error("options: {0}")]
-    Json(String),
-    /// Too few points to fit anything to.
-    #[error("options: max_points is {0}, at least {MIN_POINTS} are needed")]
-    MaxPoints(u32),
-    /// No kind of device.
-    #[error("options: device is {0:?}, \"auto\", \"cpu\" and \"gpu\" are known")]
-    Device(String),
-    /// No precision.
-    #[error("options: precision is {0:?}, \"f32\" and \"f16\" are known")]
-    Precision(String),
-    /// Half precision of a device that has none.
-    #[error("options: precision is \"f16\", which the CPU does not compute in")]
-    HalfOnCpu,
-    /// Half precision of what fits no field.
-    #[error("options: precision is \"f16\", which {0} does not compute in: take preset neural")]
-    HalfWithoutField(&'static str),
-    /// Not a positive number of metres.
-    #[error("options: range_m is {0}, a positive number of metres is needed")]
-    Range(f32),
-    /// No time at all, or more than a day.
-    #[error("options: deadline_ms is {0}, 1 to {max} are possible", max = MAX_DEADLINE.as_millis())]
-    Deadline(u64),
-    /// No frame of any sequence.
-    #[error("options: densify.into is {0}, a frame counted from 0 is needed")]
-    Into(f64),
-    /// The sequence cannot be carried into that frame.
-    #[error("options: densify: {0}")]
-    Densify(PlanError),
-    /// One ego motion for all pairs of a sequence.
-    #[error("options: a given ego is the motion of one pair, not of a sequence's: leave it out")]
-    OneMotion,
-    /// Not a sequence that is submitted whole.
-    #[error("options: densify is for sequences that are submitted as jobs")]
-    NoSequence,
-}
-
 impl JobOptions {
     /// Reads and checks one JSON object.
     ///
     /// # Errors
-    /// [`InvalidOptions`], which names the key and what it may be.
+    /// [`InvalidOptions`], which names the key and its valid values.
     pub fn from_json(text: &[u8]) -> Result<Self, InvalidOptions> {
-        // An array would be read as the values of an object without its keys.
+        // serde would read an array as the values of the struct's fields in order.
         if !text.trim_ascii_start().starts_with(b"{") {
             return Err(InvalidOptions::Json("they are one JSON object".to_owned()));
         }
@@ -267,20 +230,25 @@ impl JobOptions {
         serde_json::to_string(self).expect("every option has a JSON form")
     }
 
-    /// Refuses values that make no sense.
+    /// Checks the values and their combinations.
     ///
     /// # Errors
-    /// [`InvalidOptions`], which names the key and what it may be.
+    /// [`InvalidOptions`], which names the key and its valid values.
     pub fn check(&self) -> Result<(), InvalidOptions> {
         if let Some(points) = self.max_points
             && (points as usize) < MIN_POINTS
         {
             return Err(InvalidOptions::MaxPoints(points));
         }
-        if let Some(range) = self.range_m
-            && !(range.is_finite() && range > 0.0)
+        if let Some(crop) = self.crop_m
+            && !(crop.is_finite() && crop > 0.0)
         {
-            return Err(InvalidOptions::Range(range));
+            return Err(InvalidOptions::Crop(crop));
+        }
+        if let Some(dt) = self.dt_s
+            && !(dt > 0.0 && dt <= MAX_DT_S)
+        {
+            return Err(InvalidOptions::Dt(dt));
         }
         if let Some(millis) = self.deadline_ms
             && (millis == 0 || u128::from(millis) > MAX_DEADLINE.as_millis())
@@ -291,13 +259,13 @@ impl JobOptions {
             return Err(InvalidOptions::HalfOnCpu);
         }
         let preset = self.preset.preset();
-        if self.precision == PrecisionChoice::F16 && !Preset::FITTED.contains(&preset) {
+        if self.precision == PrecisionChoice::F16 && !preset.fits_field() {
             return Err(InvalidOptions::HalfWithoutField(preset.name()));
         }
         self.densify.as_ref().map_or(Ok(()), Densify::check)
     }
 
-    /// The kind of device that it has to be; none where any will do.
+    /// The required kind of device; none if any kind will do.
     pub fn device_kind(&self) -> Option<DeviceKind> {
         match self.precision {
             PrecisionChoice::F32 => self.device.kind(),
@@ -305,7 +273,8 @@ impl JobOptions {
         }
     }
 
-    /// The solver's options for clouds of which the larger has `points` points.
+    /// The solver's options. `points` is the number of points of the larger cloud; sampling is off
+    /// if it is not above `max_points`.
     pub fn solver_options(&self, points: usize) -> flow::Options {
         let drawn = self.max_points.map(|points| points as usize);
         let mut options = self
@@ -313,7 +282,7 @@ impl JobOptions {
             .preset()
             .options(drawn.filter(|&drawn| drawn < points));
         options.seed = self.seed;
-        options.range_m = self.range_m;
+        options.crop_m = self.crop_m;
         match self.ground {
             None => {}
             Some(GroundChoice::Keep) => options.ground = Ground::Keep,
@@ -326,10 +295,15 @@ impl JobOptions {
             Some(EgoChoice::Auto) => options.ego = Ego::Auto,
             Some(EgoChoice::Given(motion)) => options.ego = Ego::Given(motion),
         }
-        options.precision = match self.precision {
-            PrecisionChoice::F32 => Precision::F32,
-            PrecisionChoice::F16 => Precision::F16,
-        };
+        if let Some(dt_s) = self.dt_s {
+            options.dt_s = dt_s;
+        }
+        if let Some(field) = options.field_mut() {
+            field.precision = match self.precision {
+                PrecisionChoice::F32 => Precision::F32,
+                PrecisionChoice::F16 => Precision::F16,
+            };
+        }
         options
     }
 }
@@ -341,8 +315,8 @@ mod tests {
     #[test]
     fn an_empty_object_is_the_default_and_every_option_comes_back() {
         assert_eq!(JobOptions::from_json(b"{}"), Ok(JobOptions::default()));
-        let text = br#"{"preset":"paper","seed":7,"max_points":8192,"range_m":51.2,"ground":"mask",
-            "ego":[[1,0,0,2],[0,1,0,0],[0,0,1,0],[0,0,0,1]],"device":"cpu","deadline_ms":300,"priority":"high","densify":{"into":1.5}}"#;
+        let text = br#"{"preset":"paper","seed":7,"max_points":8192,"crop_m":51.2,"dt_s":0.05,"ground":"mask",
+            "ego":[[1,0,0,2],[0,1,0,0],[0,0,1,0],[0,0,0,1]],"device":"cpu","deadline_ms":300,"priority":"high","densify":{"reference_time":1.5}}"#;
         let options = JobOptions::from_json(text).expect("good options");
         assert_eq!(options.preset, PresetChoice::Paper);
         assert_eq!(
@@ -356,7 +330,12 @@ mod tests {
         let options = |text: &str| JobOptions::from_json(text.as_bytes());
         let half = options(r#"{"preset":"neural","precision":"f16"}"#).expect("good options");
         assert_eq!(half.device_kind(), Some(DeviceKind::Gpu));
-        assert_eq!(half.solver_options(1000).precision, Precision::F16);
+        assert_eq!(
+            half.solver_options(1000)
+                .field()
+                .map(|field| field.precision),
+            Some(Precision::F16)
+        );
         let refused = options(r#"{"precision":"f16","device":"cpu"}"#);
         assert_eq!(refused, Err(InvalidOptions::HalfOnCpu));
         for (preset, fits) in [
@@ -390,7 +369,8 @@ mod tests {
                 "unknown variant `gpu:0`, expected one of `auto`, `cpu`, `gpu`",
             ),
             (r#"{"max_points":2}"#, "max_points is 2"),
-            (r#"{"range_m":-1}"#, "range_m is -1"),
+            (r#"{"crop_m":-1}"#, "crop_m is -1"),
+            (r#"{"dt_s":0}"#, "dt_s is 0"),
             (r#"{"deadline_ms":0}"#, "deadline_ms is 0"),
             (r#"{"ego":"yes"}"#, "ego is \"off\", \"auto\""),
             (
@@ -401,18 +381,21 @@ mod tests {
                 r#"{"ego":[[1,0,0,1e300],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}"#,
                 "longer than 1e6 m",
             ),
-            (r#"{"densify":{}}"#, "missing field `into`"),
+            (r#"{"densify":{}}"#, "missing field `reference_time`"),
             (
-                r#"{"densify":{"into":1,"steps":2}}"#,
+                r#"{"densify":{"reference_time":1,"steps":2}}"#,
                 "unknown field `steps`",
             ),
-            (r#"{"densify":{"into":-0.5}}"#, "densify.into is -0.5"),
             (
-                r#"{"densify":{"into":1,"substeps":65}}"#,
+                r#"{"densify":{"reference_time":-0.5}}"#,
+                "densify.reference_time is -0.5",
+            ),
+            (
+                r#"{"densify":{"reference_time":1,"substeps":65}}"#,
                 "densify: 65 substeps: 1 to 64 are possible",
             ),
             (
-                r#"{"densify":{"into":1,"later":"never"}}"#,
+                r#"{"densify":{"reference_time":1,"later_sweeps":"never"}}"#,
                 "unknown variant `never`",
             ),
             (r#"{"seed":-1}"#, "invalid value"),

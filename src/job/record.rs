@@ -1,4 +1,4 @@
-//! All that is known about a job, and how it goes through its states.
+//! The record of a job, and its states.
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -8,24 +8,23 @@ use super::id::{JobId, Tenant};
 use super::options::Priority;
 use crate::clock::Timestamp;
 
-/// Where a job is on its way. The last four are ends: nothing leaves them but by being asked for
-/// again.
+/// The state of a job. The last four are final: only a requeue leaves them.
 #[derive(
     Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema,
 )]
 #[serde(rename_all = "snake_case")]
 pub enum State {
-    /// Waits for a device.
+    /// Waiting for a device.
     Queued,
-    /// A device works on it.
+    /// Running on a device.
     Running,
-    /// Its flow can be fetched.
+    /// The result is available.
     Succeeded,
-    /// It was tried as often as is allowed, or cannot be done.
+    /// The job failed permanently or reached the maximum number of attempts.
     Failed,
-    /// Somebody did not want it any more.
+    /// Cancelled by a client, or its waiting caller disconnected.
     Cancelled,
-    /// Its time was up before a device was free.
+    /// The deadline or the time to live passed before a device was free.
     Expired,
 }
 
@@ -40,12 +39,12 @@ impl State {
         Self::Expired,
     ];
 
-    /// Whether nothing more will happen.
+    /// Whether the state is final.
     pub fn is_end(self) -> bool {
         !matches!(self, Self::Queued | Self::Running)
     }
 
-    /// The name that answers and metrics use.
+    /// The name in responses and metrics.
     pub fn name(self) -> &'static str {
         match self {
             Self::Queued => "queued",
@@ -58,106 +57,107 @@ impl State {
     }
 }
 
-/// What a job works on.
+/// The kind of a job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Kind {
-    /// Two sweeps.
+    /// One pair of sweeps.
     Pair,
-    /// Sweeps in order; its consecutive pairs are jobs of their own.
+    /// A sequence of sweeps. Each pair of consecutive sweeps is a separate job.
     Sequence,
 }
 
-/// How far an optimization has come.
+/// Progress of the computation.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, ToSchema)]
 pub struct JobProgress {
-    /// Iterations done.
-    pub iteration: u32,
-    /// Iterations at most.
-    pub max_iterations: u32,
-    /// Mean loss of the latest iteration, metres.
+    /// Finished iterations of a field's fit, or finished clusters of an object search.
+    pub done: u32,
+    /// Maximum number of iterations, or number of clusters.
+    pub total: u32,
+    /// Mean loss of the latest iteration's points, or mean cost of the clusters, metres.
     pub loss: f64,
 }
 
 /// Why a job did not succeed.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct JobError {
-    /// A stable name for programs.
+    /// A stable code for programs.
     pub code: String,
-    /// What a person reads.
+    /// A message for people.
     pub message: String,
-    /// Whether the same job may succeed when it is asked for again.
+    /// Whether a retry of the same job may succeed.
     pub retryable: bool,
 }
 
-/// A job, as the queue knows it.
+/// A job as the queue stores it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Job {
-    /// Its name.
+    /// Its id.
     pub id: JobId,
-    /// Whose it is.
+    /// The tenant that owns it.
     pub tenant: Tenant,
     /// A pair or a sequence.
     pub kind: Kind,
-    /// The sequence that it is a pair of.
+    /// The sequence that the pair belongs to; none for a single pair.
     pub parent: Option<JobId>,
-    /// The earlier of its two sweeps in that sequence, from 0.
+    /// Index in the sequence of the earlier of its two sweeps, from 0.
     pub place: u32,
-    /// Whether it goes back in time, from the later sweep to the earlier one.
+    /// Whether the pair is backward in time: its source is the later sweep.
     pub backward: bool,
-    /// The sweeps that it is found from: the first, and the one after the last.
+    /// The window of sweeps that the estimate uses: the first index, and one past the last.
     pub sees: [u32; 2],
-    /// Pairs of a sequence, those that go back in time included; 0 for a pair.
+    /// Number of pairs of a sequence, backward pairs included; 0 for a pair.
     pub pairs: u32,
-    /// Pairs of a sequence that have not ended yet.
+    /// Number of pairs of a sequence that are not finished.
     pub pairs_left: u32,
-    /// The job that has to end before it is started.
+    /// The job that must end, with or without success, before this one starts.
     pub after: Option<JobId>,
-    /// Whether another job may come after it, and use what it leaves behind.
-    pub followed: bool,
-    /// Since when nothing but a device is missing; none while it comes after a job that has not
-    /// ended, and for a sequence until it has something of its own to do.
+    /// Whether the next job of its chain starts from its motion field.
+    pub has_dependents: bool,
+    /// Time from which only a free device is missing. None while the job in `after` has not
+    /// ended, and for a sequence while only its pairs have work to do.
     pub ready: Option<Timestamp>,
-    /// How urgent it is.
+    /// The priority.
     pub priority: Priority,
-    /// The kind of device that it has to be done on; none where any will do.
+    /// The required kind of device; none if any kind will do.
     pub device: Option<DeviceKind>,
-    /// Where it is on its way.
+    /// The state.
     pub state: State,
-    /// Whether it outlives its caller: a job that was promised, not one that somebody waits for.
+    /// Whether the job continues when its caller disconnects: true for a submitted job, false for a
+    /// synchronous call.
     pub durable: bool,
-    /// How often it was started; the fence token of the latest start.
+    /// Number of starts. It is also the fencing token of the latest start.
     pub attempt: u32,
-    /// How often what it ran on died under it, process or device, since its latest snapshot.
+    /// Crashes of the process or the device during the job, since its latest snapshot.
     pub crashes: u32,
-    /// Predicted compute seconds.
+    /// Predicted compute time, nominal seconds.
     pub cost_seconds: f64,
-    /// The options, as JSON.
+    /// The options as JSON.
     pub options: String,
-    /// When it was accepted.
+    /// Time of acceptance.
     pub created: Timestamp,
-    /// When it was first started.
+    /// Time of the first start.
     pub started: Option<Timestamp>,
-    /// When it ended.
+    /// Time of the end.
     pub finished: Option<Timestamp>,
-    /// When the best flow so far is wanted.
+    /// Time at which the best flow so far is due.
     pub deadline: Option<Timestamp>,
-    /// How far it has come.
+    /// The latest known progress.
     pub progress: Option<JobProgress>,
-    /// Why its optimization stopped.
+    /// Why the computation stopped.
     pub stop_reason: Option<String>,
-    /// Why it did not succeed.
+    /// Why the job did not succeed.
     pub error: Option<JobError>,
-    /// Whether it lies in the dead letters: given up after too many attempts.
+    /// Whether it is a dead letter: given up after too many attempts.
     pub dead: bool,
-    /// Whether its end is asked for.
+    /// Whether its cancellation was requested.
     pub cancel_requested: bool,
-    /// What the solver reports, as JSON.
+    /// The report of the estimate as JSON.
     pub report: Option<String>,
 }
 
 impl Job {
-    /// Under whose name a pair's sweeps lie, and which of them are source and target.
+    /// The job that owns the stored sweeps of a pair, and the indices of the source and the target.
     pub fn sweeps(&self) -> (JobId, [u32; 2]) {
         let owner = self.parent.unwrap_or(self.id);
         match self.backward {

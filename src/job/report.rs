@@ -1,127 +1,184 @@
-//! What an estimate reports beside its flow; the command line prints it, the service keeps it.
+//! The report of an estimate, printed by the command line and stored by the service.
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::options::JobOptions;
 use super::record::JobProgress;
-use crate::flow::Estimate;
+use crate::flow::{DEFAULT_DT_S, Estimate, Solution};
 use crate::formats::matrix_rows;
 
-/// How a flow was found.
+/// The report of an estimate.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Report {
-    /// Points that took part and have a flow.
+    /// Number of source points, the rows of the flow.
     pub points: usize,
-    /// Iterations done; of `default` and `label` clusters looked at.
-    pub iterations: usize,
-    /// Iterations at most; of `default` and `label` all clusters.
-    pub max_iterations: usize,
-    /// The iteration whose field is the result.
-    pub best_iteration: usize,
-    /// Its loss, metres; none where there was no time for an iteration.
-    pub best_loss: Option<f64>,
-    /// `converged`, `max_iterations` or `deadline`.
-    pub stop_reason: String,
-    /// What did it: the device that fitted a field, or the host's threads, which find objects
-    /// whatever the device.
-    pub device: String,
-    /// The preset's name.
+    /// Number of points that have a flow.
+    pub valid_points: usize,
+    /// Name of the preset.
     pub preset: String,
-    /// The seed.
+    /// Seed of the random numbers.
     pub seed: u64,
-    /// target_from_source, row by row, where it is known.
+    /// Seconds from the source sweep to the target, used for velocities.
+    pub dt_s: f32,
+    /// Whether `dt_s` is the default because the request did not give it.
+    pub dt_assumed: bool,
+    /// `completed`, `converged`, `max_iterations` or `deadline`.
+    pub stop_reason: String,
+    /// The device that computed the method: that of the field's fit, or the host's threads for
+    /// objects.
+    pub device: String,
+    /// The ego motion target_from_source, row by row, if known.
     pub ego_motion: Option<[[f64; 4]; 4]>,
-    /// Clusters that move by themselves, where objects are told apart.
+    /// The object search, with `default` and `label`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub moving: Option<usize>,
+    pub objects: Option<ObjectsReport>,
+    /// The fit of a field, with `neural` and `paper`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub field: Option<FieldReport>,
     /// Wall-clock seconds by phase.
     pub seconds: PhaseSeconds,
-    /// The most memory that the process has held, where one process did one pair.
+    /// Peak resident memory of the process, bytes, if one process computed one pair.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub peak_rss_bytes: Option<u64>,
 }
 
-/// Wall-clock seconds by phase; the paper's own breakdown.
+/// The result of an object search.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct ObjectsReport {
+    /// Number of clusters in the result.
+    pub clusters: usize,
+    /// Number of candidates: clusters before fragments of one moving object were merged.
+    pub candidates: usize,
+    /// Number of candidates that were searched: all of them unless the deadline passed.
+    pub searched: usize,
+    /// Number of clusters with a motion beyond the ego motion.
+    pub moving: usize,
+    /// Mean distance of the clusters to the target, metres; none if no cluster was searched.
+    pub cost_m: Option<f64>,
+}
+
+/// The result of the fit of a field.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct FieldReport {
+    /// Number of finished iterations.
+    pub iterations: usize,
+    /// Maximum number of iterations.
+    pub max_iterations: usize,
+    /// The iteration whose field is the result.
+    pub best_iteration: usize,
+    /// Loss of that iteration, metres; none if the deadline allowed no iteration.
+    pub best_loss_m: Option<f64>,
+}
+
+/// Wall-clock seconds by phase. For a field they follow the breakdown of the paper.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PhaseSeconds {
-    /// Reading files, where the same process did it.
+    /// Reading of files, if the same process read them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub load: Option<f64>,
     /// Selection, distance transform and ego motion.
     pub precompute: f64,
-    /// Distance queries.
-    pub query: f64,
-    /// Network, optimizer and the final evaluation; of `default` and `label` the search for movers.
-    pub network: f64,
-    /// All of it.
+    /// The object search.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub search: Option<f64>,
+    /// The distance queries of a field's fit.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub query: Option<f64>,
+    /// The network, the optimizer and the evaluation of a field.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub network: Option<f64>,
+    /// All phases.
     pub total: f64,
 }
 
 impl Report {
-    /// The report on an estimate that was made with `options`.
+    /// The report of an estimate that was computed with `options`.
     pub fn new(estimate: &Estimate, options: &JobOptions) -> Self {
-        let seconds = estimate.seconds;
+        let finite = |value: f64| value.is_finite().then_some(value);
+        let mut seconds = PhaseSeconds {
+            precompute: estimate.precompute_seconds,
+            total: estimate.total_seconds,
+            ..PhaseSeconds::default()
+        };
+        let (mut objects, mut field) = (None, None);
+        match &estimate.solution {
+            Solution::Objects(solution) => {
+                let clusters = &solution.objects.clusters;
+                seconds.search = Some(solution.search_seconds);
+                objects = Some(ObjectsReport {
+                    clusters: clusters.len(),
+                    candidates: solution.candidates,
+                    searched: solution.searched,
+                    moving: clusters.iter().filter(|cluster| cluster.dynamic).count(),
+                    cost_m: finite(solution.cost_m),
+                });
+            }
+            Solution::Field(solution) => {
+                seconds.query = Some(solution.query_seconds);
+                seconds.network = Some(solution.network_seconds);
+                field = Some(FieldReport {
+                    iterations: solution.iterations,
+                    max_iterations: solution.max_iterations,
+                    best_iteration: solution.best_iteration,
+                    best_loss_m: finite(solution.best_loss),
+                });
+            }
+        }
         Self {
-            points: estimate.points,
-            iterations: estimate.iterations,
-            max_iterations: estimate.max_iterations,
-            best_iteration: estimate.best_iteration,
-            best_loss: estimate.best_loss.is_finite().then_some(estimate.best_loss),
-            stop_reason: estimate.stop_reason.name().to_owned(),
-            device: estimate.device.clone(),
+            points: estimate.flow.len(),
+            valid_points: estimate.points,
             preset: options.preset.preset().name().to_owned(),
             seed: options.seed,
+            dt_s: options.dt_s.unwrap_or(DEFAULT_DT_S),
+            dt_assumed: options.dt_s.is_none(),
+            stop_reason: estimate.stop_reason.name().to_owned(),
+            device: estimate.device.clone(),
             ego_motion: estimate.ego.as_ref().map(matrix_rows),
-            moving: estimate.objects.as_ref().map(|objects| {
-                let clusters = objects.clusters.iter();
-                clusters.filter(|cluster| cluster.dynamic).count()
-            }),
-            seconds: PhaseSeconds {
-                load: None,
-                precompute: seconds.precompute,
-                query: seconds.query,
-                network: seconds.network,
-                total: seconds.total,
-            },
+            objects,
+            field,
+            seconds,
             peak_rss_bytes: None,
         }
     }
-}
 
-impl Report {
-    /// How far the optimization has come; none where there was no time for an iteration.
+    /// Progress of the method; none if the deadline allowed no start.
     pub fn progress(&self) -> Option<JobProgress> {
         let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
-        self.best_loss.map(|loss| JobProgress {
-            iteration: count(self.iterations),
-            max_iterations: count(self.max_iterations),
+        let (done, total, loss) = match (&self.objects, &self.field) {
+            (Some(objects), _) => (objects.searched, objects.candidates, objects.cost_m),
+            (None, Some(field)) => (field.iterations, field.max_iterations, field.best_loss_m),
+            (None, None) => return None,
+        };
+        loss.map(|loss| JobProgress {
+            done: count(done),
+            total: count(total),
             loss,
         })
     }
 }
 
-/// How a dense cloud was made.
+/// The report of a dense cloud.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct DenseReport {
-    /// Points of all sweeps together.
+    /// Number of points of all sweeps together.
     pub points: usize,
-    /// Sweeps that were carried.
-    pub frames: usize,
-    /// The frame that they were carried into, in sweeps from 0.
-    pub into: f64,
-    /// Parts that each step was cut into.
+    /// Number of sweeps of the sequence.
+    pub sweeps: usize,
+    /// Reference time of the points, in sweeps from 0.
+    pub reference_time: f64,
+    /// Integration steps per sweep interval.
     pub substeps: u32,
-    /// What carried the points: the device that asked fields, or the host's threads for objects.
+    /// The device that moved the points: that of the fields, or the host's threads for objects.
     pub device: String,
-    /// Wall-clock seconds of carrying, fits left out.
+    /// Wall-clock seconds to move the points, without the estimates.
     pub seconds: f64,
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::flow::StopReason;
+    use crate::flow::{FieldSolution, MotionField, Residual, StopReason};
 
     #[test]
     fn a_report_without_an_iteration_comes_back_from_its_json() {
@@ -129,23 +186,28 @@ mod tests {
             flow: Vec::new(),
             valid: Vec::new(),
             dynamic: None,
-            objects: None,
             ego: None,
             points: 3,
-            max_iterations: 0,
-            iterations: 0,
-            best_iteration: 0,
-            best_loss: f64::INFINITY,
+            solution: Solution::Field(FieldSolution {
+                iterations: 0,
+                max_iterations: 0,
+                best_iteration: 0,
+                best_loss: f64::INFINITY,
+                query_seconds: 0.0,
+                distance_bytes: 0,
+                network_seconds: 0.0,
+            }),
             stop_reason: StopReason::Deadline,
             device: "cpu".to_owned(),
-            seconds: crate::flow::PhaseSeconds::default(),
-            distance_bytes: 0,
-            field: crate::flow::MotionField {
+            precompute_seconds: 0.0,
+            total_seconds: 0.0,
+            motion: MotionField {
                 ego: None,
-                residual: crate::flow::Residual::Still,
+                residual: Residual::Still,
             },
         };
         let report = Report::new(&estimate, &JobOptions::default());
+        assert_eq!(report.progress(), None);
         let json = serde_json::to_string(&report).expect("JSON");
         assert_eq!(serde_json::from_str::<Report>(&json).ok(), Some(report));
     }

@@ -1,17 +1,16 @@
-//! The boxes of what moves, as outlines, each with a line as long as its way in ten sweeps.
-//!
-//! It must not know how clusters were found.
+//! The boxes of moving clusters, as outlines. A line from each center shows the cluster's velocity.
 
 use super::canvas::{Image, Rgb};
 use crate::flow::{Cluster, OrientedBox, Point};
 
 const OUTLINE: Rgb = [255, 214, 102];
-/// Sweeps that a line shows the way in: a second of a common lidar.
-const SWEEPS: f32 = 10.0;
-/// A box is drawn a little larger than its points, metres.
+/// The time in which a cluster moves along its line, seconds.
+const LINE_S: f32 = 1.0;
+/// Margin around a cluster's box on each side, metres.
 const MARGIN_M: f32 = 0.15;
 
-/// Draws the boxes of those that move; `pixel` says where a point is, and a line is `width` pixels wide.
+/// Draws the boxes of the dynamic clusters. `pixel` maps a point, metres, to pixels; lines are
+/// `width` pixels wide.
 pub(super) fn draw(
     image: &mut Image,
     clusters: &[Cluster],
@@ -24,13 +23,13 @@ pub(super) fn draw(
             line(image, corner, corners[(place + 1) % corners.len()], width);
         }
         let center = cluster.bounds.center;
-        let way = cluster.velocity;
-        let there = core::array::from_fn(|a| center[a] + SWEEPS * way[a]);
+        let velocity = cluster.velocity;
+        let there = core::array::from_fn(|a| center[a] + LINE_S * velocity[a]);
         line(image, pixel(center), pixel(there), width);
     }
 }
 
-/// The corners of a box, from above.
+/// The corners of a box, with its margin, as seen from above, metres.
 fn corners(bounds: &OrientedBox) -> [Point; 4] {
     let [x, y, z] = bounds.center;
     let [length, width, _] = bounds.size.map(|side| side / 2.0 + MARGIN_M);
@@ -41,9 +40,9 @@ fn corners(bounds: &OrientedBox) -> [Point; 4] {
     })
 }
 
-/// A straight line; nothing where an end is not finite or far out of the image.
+/// A straight line; nothing where an end is not finite or far outside the image.
 fn line(image: &mut Image, [x0, y0]: [f32; 2], [x1, y1]: [f32; 2], width: f32) {
-    /// Longer lines than any image is wide say nothing.
+    /// Longest line that is drawn, pixels: more than the width of any image.
     const LONGEST: f32 = 1e4;
     let length = (x1 - x0).hypot(y1 - y0);
     if !length.is_finite() || length > LONGEST {
@@ -83,7 +82,7 @@ mod tests {
 
     #[test]
     fn what_moves_has_an_outline_and_a_line_ahead_and_what_stands_has_none() {
-        let image = drawn(true, [0.0, 3.0, 0.0]);
+        let image = drawn(true, [0.0, 30.0, 0.0]);
         assert!(is_drawn(&image, 55, 50) && is_drawn(&image, 50, 60));
         assert!(is_drawn(&image, 50, 78) && !is_drawn(&image, 50, 84));
         assert!(!is_drawn(&image, 53, 45));

@@ -1,6 +1,4 @@
-//! Pixels: an image, blending, smooth circles and lines, letters, and PNG.
-//!
-//! It must not know points, metres or flow.
+//! A canvas of pixels: blending, smooth circles and lines, text, and PNG output.
 
 use std::io::Write;
 
@@ -22,7 +20,7 @@ pub struct Image {
 #[error("failed to write the picture")]
 pub struct PictureError(#[from] png::EncodingError);
 
-/// How letters are set.
+/// The style of a text.
 #[derive(Clone, Copy)]
 pub(super) struct TextStyle {
     /// Pixels per dot of the font.
@@ -52,7 +50,7 @@ impl Image {
         self.width
     }
 
-    /// Rows.
+    /// Number of rows.
     pub fn height(&self) -> u32 {
         self.height
     }
@@ -62,7 +60,7 @@ impl Image {
         &self.pixels
     }
 
-    /// Lays a color over a pixel; outside the image nothing happens.
+    /// Blends a color over a pixel, opacity 0 to 1; does nothing outside the image.
     pub(super) fn blend(&mut self, x: i32, y: i32, color: Rgb, opacity: f32) {
         let (Ok(x), Ok(y)) = (u32::try_from(x), u32::try_from(y)) else {
             return;
@@ -80,7 +78,8 @@ impl Image {
         }
     }
 
-    /// Calls `shade` with the center of every pixel of a square and lays its color and opacity.
+    /// Calls `shade` for every pixel of a square, with the offset of the pixel's center from
+    /// `center`, and blends the color and opacity that it returns.
     pub(super) fn shade_square(
         &mut self,
         center: [f32; 2],
@@ -100,14 +99,14 @@ impl Image {
         }
     }
 
-    /// A filled circle with a smooth edge, pixels.
+    /// A filled circle with a smooth edge; lengths in pixels.
     pub(super) fn disk(&mut self, center: [f32; 2], radius: f32, color: Rgb, opacity: f32) {
         self.shade_square(center, radius + 1.0, |x, y| {
             (color, opacity * (radius + 0.5 - x.hypot(y)).clamp(0.0, 1.0))
         });
     }
 
-    /// A circle's line, one pixel wide and smooth.
+    /// The outline of a circle, smooth and one pixel wide.
     pub(super) fn ring(&mut self, center: [f32; 2], radius: f32, color: Rgb, opacity: f32) {
         self.shade_square(center, radius + 1.0, |x, y| {
             (
@@ -117,7 +116,7 @@ impl Image {
         });
     }
 
-    /// A rectangle with whole-pixel edges.
+    /// A rectangle with edges at whole pixels.
     pub(super) fn bar(&mut self, corner: [i32; 2], size: [i32; 2], color: Rgb, opacity: f32) {
         for y in corner[1]..corner[1] + size[1] {
             for x in corner[0]..corner[0] + size[0] {
@@ -154,7 +153,7 @@ impl Image {
 /// Writes an image as an 8-bit RGB PNG.
 ///
 /// # Errors
-/// Where `out` does not take the bytes.
+/// Where encoding or writing to `out` fails.
 pub fn write_png<W: Write>(image: &Image, out: W) -> Result<(), PictureError> {
     let mut encoder = png::Encoder::new(out, image.width, image.height);
     encoder.set_color(png::ColorType::Rgb);

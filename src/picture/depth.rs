@@ -1,25 +1,23 @@
 //! Depth images one above the other: near is red, far is blue, unknown is dark.
 //!
-//! All panels share one scale, so that a sparse one can be read against a dense one. It must not
-//! know cameras or files.
-
-use crate::flow::depth::DepthImage;
-use crate::text::grouped;
+//! All panels share one scale, so that a sparse one can be compared with a dense one.
 
 use super::canvas::{Align, Image, Rgb, TextStyle};
+use crate::flow::depth::DepthImage;
+use crate::text::grouped;
 
 const BACKGROUND: Rgb = [13, 16, 23];
 const UNKNOWN: Rgb = [24, 28, 38];
 const TITLE: Rgb = [222, 228, 240];
 const LABELS: Rgb = [126, 140, 166];
 
-/// Colors end here, metres: nearer is as red.
+/// Near end of the color scale, metres; smaller depths have the same red.
 const NEAREST_M: f32 = 3.0;
 
-/// Where the colors of the far end may lie, metres, and the labels of the scale.
+/// Possible far ends of the color scale, and the labels of the scale, metres.
 const STEPS_M: [f32; 6] = [5.0, 10.0, 20.0, 40.0, 80.0, 160.0];
 
-/// The part of the known pixels that lie before the far end of the colors.
+/// Share of the known pixels whose depth is below the far end of the color scale.
 const COVERED: f64 = 0.97;
 
 /// Colors from near to far, evenly spaced.
@@ -33,17 +31,18 @@ const COLORS: [[f32; 3]; 7] = [
     [94.0, 62.0, 168.0],
 ];
 
-/// One depth image and what it is called.
+/// One depth image and its title.
 #[derive(Clone, Copy, Debug)]
 pub struct DepthPanel<'a> {
-    /// A few words: capitals, digits and plain signs are drawn.
+    /// The title: capitals, digits and simple signs are drawn, small letters as capitals.
     pub title: &'a str,
-    /// Depths, metres; 0 where nothing is known.
+    /// Depths, metres; 0 where unknown.
     pub image: &'a DepthImage,
 }
 
-/// Draws depth images one above the other, each at its own size with its title and density, over a
-/// scale of colors. Dots are three pixels wide, the nearest on top, so that sparse depth is seen.
+/// Draws depth images one above the other, above a color scale. Each has its own size, with its
+/// title and density above it. Dots are three pixels wide, the nearest on top, so that sparse depth
+/// is visible.
 pub fn depth_panels(panels: &[DepthPanel<'_>]) -> Image {
     let width = panels.iter().map(|panel| panel.image.width).max();
     let width = width.unwrap_or(0).max(256);
@@ -67,7 +66,7 @@ pub fn depth_panels(panels: &[DepthPanel<'_>]) -> Image {
     image
 }
 
-/// The first of the steps that nearly all known depths stay below.
+/// The smallest step that is at least as large as nearly all known depths, metres.
 fn farthest(panels: &[DepthPanel<'_>]) -> f32 {
     let depths = panels.iter().flat_map(|panel| &panel.image.metres);
     let mut known: Vec<f32> = depths.copied().filter(|metres| *metres > 0.0).collect();
@@ -80,7 +79,7 @@ fn farthest(panels: &[DepthPanel<'_>]) -> f32 {
     step.unwrap_or(STEPS_M[5])
 }
 
-/// The color of a depth: what is twice as far is as much bluer everywhere.
+/// The color of a depth, metres: the position on the color scale is logarithmic.
 fn depth_color(metres: f32, farthest_m: f32) -> Rgb {
     let part = (metres / NEAREST_M).ln() / (farthest_m / NEAREST_M).ln();
     let place = part.clamp(0.0, 1.0) * (COLORS.len() - 1) as f32;

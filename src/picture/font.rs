@@ -1,12 +1,10 @@
-//! A hand-made 5 x 7 font for the few labels of a picture: capitals, digits, some signs.
-//!
-//! It must not know where its letters go.
+//! A 5 x 7 bitmap font for the labels of a picture: capitals, digits and some signs.
 
 /// Columns and rows of a glyph.
 pub(super) const GLYPH: (usize, usize) = (5, 7);
 
-/// The rows of a glyph from the top, five bits each, the leftmost highest. Small letters are
-/// drawn as capitals; what is unknown is blank.
+/// The rows of a glyph from the top, five bits each, the leftmost bit highest. Small letters are
+/// drawn as capitals; unknown characters are blank.
 pub(super) fn glyph(letter: char) -> [u8; 7] {
     match letter.to_ascii_uppercase() {
         'A' => [0x0e, 0x11, 0x11, 0x1f, 0x11, 0x11, 0x11],

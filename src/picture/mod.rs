@@ -1,6 +1,6 @@
-//! Pictures of flow: color by direction, seen from above; and of depth, seen by a camera.
+//! Pictures of flow from above, colored by direction, and of depth images.
 //!
-//! It knows points and pixels; it must not know where either came from.
+//! Independent of files and of how flow and depth were computed.
 
 mod motion;
 mod wheel;
@@ -11,8 +11,8 @@ mod depth;
 mod font;
 mod top_down;
 
-pub use canvas::{Image, PictureError, write_png};
-pub use depth::{DepthPanel, depth_panels};
-pub use motion::{full_scale, shown_motion};
-pub use top_down::{TopDown, TopDownOptions, top_down};
-pub use wheel::{INVALID_COLOR, color};
+pub use crate::picture::canvas::{Image, PictureError, write_png};
+pub use crate::picture::depth::{DepthPanel, depth_panels};
+pub use crate::picture::motion::{full_scale, shown_motion};
+pub use crate::picture::top_down::{TopDown, TopDownOptions, top_down};
+pub use crate::picture::wheel::{INVALID_COLOR, color};

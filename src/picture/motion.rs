@@ -1,19 +1,18 @@
-//! Which motion a picture shows, and the speed at which its colors are full.
-//!
-//! It must not know colors.
+//! The motion that a picture shows, and the displacement at which its colors saturate.
 
 use nalgebra::Point3;
 
 use crate::flow::{Point, RigidTransform};
 
-/// Colors are never stretched below this, metres: it would paint noise.
+/// Smallest full scale, metres: a smaller one would show noise in full color.
 const LEAST_SCALE_M: f32 = 0.1;
 
-/// The part of the moving points whose speed stays below the full scale; the rest saturates.
+/// Share of the moving points whose displacement is below the full scale; the others saturate.
 const COVERED: f64 = 0.98;
 
-/// The displacements to be shown: relative to the world where the ego motion
-/// (`target_from_source`) is known, else as they are. N rows in, N rows out, metres.
+/// The displacements to be shown, N x 3 in metres, for N source points and their flow. Where the
+/// ego motion (`target_from_source`) is known it is subtracted, so the motion is relative to the
+/// world. Otherwise the flow is returned unchanged.
 pub fn shown_motion(source: &[Point], flow: &[Point], ego: Option<&RigidTransform>) -> Vec<Point> {
     let Some(ego) = ego else {
         return flow.to_vec();
@@ -30,8 +29,8 @@ pub fn shown_motion(source: &[Point], flow: &[Point], ego: Option<&RigidTransfor
     source.iter().zip(flow).map(residual).collect()
 }
 
-/// The speed, metres over the pair, at which colors are full: one of 0.1, 0.15, 0.2, 0.3,
-/// 0.4, 0.5, 0.6, 0.8, 1, 1.5, ... that nearly all of the moving points stay below.
+/// The horizontal displacement, metres, at which colors saturate: the smallest of 0.1, 0.15, 0.2,
+/// 0.3, 0.4, 0.5, 0.6, 0.8, 1, 1.5, ... that covers nearly all of the moving points.
 pub fn full_scale(motion: &[Point], valid: &[bool]) -> f32 {
     let mut moving: Vec<f32> = motion
         .iter()
@@ -52,7 +51,7 @@ pub fn full_scale(motion: &[Point], valid: &[bool]) -> f32 {
 fn round_up(value: f32) -> f32 {
     let decade = 10.0_f32.powf(value.log10().floor());
     let steps = [1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0].map(|step| step * decade);
-    // A hair of slack: 0.2 m must not become 0.3 m for the rounding of a logarithm.
+    // A small tolerance: rounding of the logarithm must not turn 0.2 m into 0.3 m.
     steps
         .into_iter()
         .find(|step| *step >= value * 0.999)

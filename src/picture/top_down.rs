@@ -1,15 +1,13 @@
-//! Flow seen from above: the vehicle in the middle, forward up, color by direction of motion.
+//! Flow from above: the vehicle in the middle, forward up, colored by direction of motion.
 //!
-//! What stands still stays in the background, what moves lies on top of it. It must not know
-//! files.
-
-use crate::flow::{Cluster, Point, RigidTransform};
-use crate::text::grouped;
+//! Moving points are drawn on top of static ones.
 
 use super::boxes;
 use super::canvas::{Align, Image, Rgb, TextStyle};
 use super::motion::{full_scale, shown_motion};
 use super::wheel::color;
+use crate::flow::{Cluster, Point, RigidTransform};
+use crate::text::grouped;
 
 const BACKGROUND: Rgb = [13, 16, 23];
 const STATIC: Rgb = [128, 139, 160];
@@ -19,7 +17,8 @@ const LABELS: Rgb = [126, 140, 166];
 const TITLE: Rgb = [222, 228, 240];
 const VEHICLE: Rgb = [240, 244, 255];
 
-/// The field's threshold between static and dynamic, metres over a pair of sweeps.
+/// Threshold between static and dynamic points that is common in scene flow, metres from the source
+/// sweep's time to the target's.
 const MOVING_M: f32 = 0.05;
 
 /// Half ranges that a picture may have, metres.
@@ -27,40 +26,40 @@ const RANGES_M: [f32; 10] = [
     10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 80.0, 100.0, 150.0, 200.0,
 ];
 
-/// The part of the points that lies inside a range chosen by itself. A sweep's last points are
-/// far and few, and would shrink all others.
+/// Share of the points inside an automatically chosen range. The farthest points of a sweep are
+/// few, and would shrink all others.
 const COVERED: f64 = 0.93;
 
 /// A car, metres: length and width.
 const VEHICLE_M: [f32; 2] = [4.6, 1.9];
 
-/// What is drawn: N points, each with its flow.
+/// The scene to be drawn: N points, each with its flow.
 #[derive(Clone, Copy, Debug)]
 pub struct TopDown<'a> {
-    /// Source points, metres; rows that are not finite are left out.
+    /// N source points, metres; rows that are not finite are left out.
     pub source: &'a [Point],
-    /// Displacement of each over the pair, metres, ego motion included.
+    /// N displacements from the source sweep's time to the target's, metres, ego motion included.
     pub flow: &'a [Point],
-    /// Whether the row has a flow; those without are drawn gray.
+    /// N flags: whether the row has a flow. Rows without one are drawn gray.
     pub valid: &'a [bool],
     /// The ego motion `target_from_source`. Where it is given, motion relative to the world is
-    /// shown, else the flow as it is; the title says which.
+    /// shown, otherwise the flow itself; the title names which.
     pub ego: Option<&'a RigidTransform>,
-    /// Clusters, where they are known: those that move are outlined.
+    /// Clusters, where known; the dynamic ones are outlined.
     pub clusters: &'a [Cluster],
 }
 
-/// How it is drawn.
+/// Options of a picture from above.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TopDownOptions {
-    /// Width and height, pixels, held to 256..=8192.
+    /// Width and height, pixels, clamped to 256..=8192.
     pub side_px: u32,
-    /// Half the width of what is seen, metres; by itself what holds nearly all points.
+    /// Half the width of the visible square, metres; by default chosen to hold nearly all points.
     pub range_m: Option<f32>,
-    /// The displacement at which colors are full, metres; by itself what nearly all moving
-    /// points stay below.
+    /// The displacement at which colors saturate, metres; by default chosen to cover nearly all
+    /// moving points.
     pub full_scale_m: Option<f32>,
-    /// Time between the two sweeps, seconds: the legend then speaks of m/s.
+    /// Seconds from the source sweep to the target. Where given, the legend is in m/s.
     pub interval_s: Option<f32>,
 }
 
@@ -75,7 +74,7 @@ impl Default for TopDownOptions {
     }
 }
 
-/// From metres to pixels.
+/// The mapping from metres to pixels.
 #[derive(Clone, Copy)]
 struct View {
     side: f32,
@@ -87,7 +86,7 @@ impl View {
         self.side / (2.0 * self.range_m)
     }
 
-    /// x forward is up, y left is left.
+    /// The pixel of a point: x, forward, is up; y, left, is left.
     fn pixel(&self, point: Point) -> [f32; 2] {
         let scale = self.pixels_per_metre();
         [
@@ -145,7 +144,7 @@ pub fn top_down(scene: &TopDown<'_>, options: &TopDownOptions) -> Image {
     image
 }
 
-/// Half the range that holds nearly all points with a flow.
+/// Half the width, metres, of the square that holds nearly all points with a flow.
 fn choose_range(scene: &TopDown) -> f32 {
     let rows = scene.source.iter().zip(scene.valid);
     let mut reach: Vec<f32> = rows
@@ -164,7 +163,7 @@ fn choose_range(scene: &TopDown) -> f32 {
         .unwrap_or(RANGES_M[9])
 }
 
-/// Distance between rings, or the length of the scale bar: a fifth of the range, rounded.
+/// Distance between rings, and length of the scale bar, metres: about a fifth of the range.
 fn step_m(range_m: f32) -> f32 {
     [1.0, 2.0, 5.0, 10.0, 20.0, 50.0]
         .into_iter()
@@ -191,7 +190,7 @@ fn draw_rings(image: &mut Image, view: View) {
     }
 }
 
-/// Draws the points, the fastest last; the number of moving ones.
+/// Draws the points, the fastest last. Returns the number of moving ones.
 fn draw_points(
     image: &mut Image,
     view: View,
@@ -222,7 +221,7 @@ fn draw_points(
     moving.len()
 }
 
-/// A car from above with a bright nose, so that forward is plain.
+/// A car from above with a bright front, which marks the forward direction.
 fn draw_vehicle(image: &mut Image, view: View) {
     let scale = view.pixels_per_metre();
     let [length, width] = VEHICLE_M.map(|metres| metres * scale);
@@ -272,14 +271,14 @@ fn draw_title(image: &mut Image, view: View, scene: &TopDown<'_>, moving: usize)
     let boxes = scene.clusters.iter().filter(|cluster| cluster.dynamic);
     if let boxes @ 1.. = boxes.count() {
         let text = format!(
-            "{} boxes that move, and their way in 10 sweeps",
+            "{} moving boxes, and their displacement in 1 s",
             grouped(boxes)
         );
         image.text([margin, margin + 25 * dot], &text, small);
     }
 }
 
-/// The color wheel, turned as the picture is: up is forward.
+/// The color wheel, oriented as the picture: up is forward.
 fn draw_legend(image: &mut Image, view: View, scale_m: f32, interval_s: Option<f32>) {
     let dot = view.dot();
     let radius = view.side * 0.055;
@@ -288,7 +287,7 @@ fn draw_legend(image: &mut Image, view: View, scale_m: f32, interval_s: Option<f
     image.disk(center, radius + 4.0 * dot as f32, BACKGROUND, 0.8);
     image.shade_square(center, radius + 1.0, |x, y| {
         let inside = (radius + 0.5 - x.hypot(y)).clamp(0.0, 1.0);
-        // A hair inside the full scale, past which colors darken.
+        // Slightly inside the full scale, past which colors darken.
         (color([-y, -x, 0.0], radius * 1.01), inside)
     });
     image.disk(center, 1.5 * dot as f32, BACKGROUND, 0.7);
@@ -305,7 +304,7 @@ fn draw_legend(image: &mut Image, view: View, scale_m: f32, interval_s: Option<f
     image.text([center[0] as i32, below], &label, style);
 }
 
-/// At most two decimals, and none that say nothing.
+/// A number with at most two decimals, without trailing zeros.
 fn rounded(value: f32) -> String {
     let text = format!("{value:.2}");
     text.trim_end_matches('0').trim_end_matches('.').to_owned()

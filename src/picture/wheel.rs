@@ -1,17 +1,16 @@
-//! The color wheel that the field shows flow with (Baker et al., Middlebury flow benchmark):
-//! hue is direction, saturation is magnitude.
-//!
-//! It must not know points or pictures.
+//! The color wheel that is common for flow (Baker et al., Middlebury flow benchmark): hue is
+//! direction, saturation is magnitude.
 
 use crate::flow::Point;
 
 /// The color of a row without flow.
 pub const INVALID_COLOR: [u8; 3] = [170, 170, 170];
 
-/// Steps from red to yellow, green, cyan, blue, magenta and back: finer where the eye is.
+/// Steps from red to yellow, green, cyan, blue, magenta and back to red: finer where the eye
+/// distinguishes more hues.
 const TRANSITIONS: [usize; 6] = [15, 6, 4, 11, 13, 6];
 
-/// The corners that the transitions run between.
+/// The colors between which the transitions run.
 const CORNERS: [[f32; 3]; 7] = [
     [1.0, 0.0, 0.0],
     [1.0, 1.0, 0.0],
@@ -22,9 +21,9 @@ const CORNERS: [[f32; 3]; 7] = [
     [1.0, 0.0, 0.0],
 ];
 
-/// The color of a horizontal displacement, 8-bit red, green, blue: its direction in the x-y plane
-/// gives the hue, its length over `full_scale` (same unit) the saturation, so that rest is white.
-/// Past the full scale the color darkens by a quarter; NaN is [`INVALID_COLOR`].
+/// The color of a horizontal displacement, 8-bit red, green, blue. The direction in the x-y plane
+/// is the hue. The length over `full_scale` (same unit) is the saturation, so zero motion is white.
+/// Past the full scale the color darkens by a quarter; NaN gives [`INVALID_COLOR`].
 pub fn color(flow: Point, full_scale: f32) -> [u8; 3] {
     const PAST_SCALE: f32 = 0.75;
     let saturation = flow[0].hypot(flow[1]) / full_scale.max(f32::MIN_POSITIVE);
@@ -42,7 +41,7 @@ pub fn color(flow: Point, full_scale: f32) -> [u8; 3] {
     })
 }
 
-/// The pure color of a direction: red is +x, and it turns as atan2 does.
+/// The pure color of a direction: red is +x, and the hue turns as atan2 does.
 fn hue(x: f32, y: f32) -> [f32; 3] {
     let steps: usize = TRANSITIONS.iter().sum();
     let turn = y.atan2(x) / std::f32::consts::TAU;

@@ -1,4 +1,4 @@
-//! What waits and what runs, by tenant, priority and kind of device: what admission looks at.
+//! The backlog: queued and running load by tenant, priority and device kind, for admission control.
 
 use std::collections::HashMap;
 
@@ -29,7 +29,7 @@ impl Load {
     }
 }
 
-/// Where a job waits.
+/// Key of the queued load: tenant, priority and required device kind (`None`: any).
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub(super) struct Place {
     pub(super) tenant: Tenant,
@@ -47,7 +47,7 @@ impl Place {
     }
 }
 
-/// What waits and what runs at one moment.
+/// Queued and running load at one point in time.
 #[derive(Clone, Debug, Default)]
 pub struct Backlog {
     queued: HashMap<Place, Load>,
@@ -55,34 +55,35 @@ pub struct Backlog {
 }
 
 impl Backlog {
-    /// What is running.
+    /// Load of the running jobs.
     pub fn running(&self) -> Load {
         self.running
     }
 
-    /// All that waits at a priority.
+    /// Queued load of one priority, over all tenants.
     pub fn queued_at(&self, priority: Priority) -> Load {
         self.sum(|place| place.priority == priority)
     }
 
-    /// All that waits.
+    /// Queued load in total.
     pub fn queued(&self) -> Load {
         self.sum(|_| true)
     }
 
-    /// What waits for this kind of device and no other.
+    /// Queued load that requires this kind of device.
     pub fn queued_only_for(&self, device: DeviceKind) -> Load {
         self.sum(|place| place.device == Some(device))
     }
 
-    /// What a tenant has waiting.
+    /// Queued load of one tenant.
     pub fn queued_of(&self, tenant: &Tenant) -> Load {
         self.sum(|place| place.tenant == *tenant)
     }
 
-    /// Predicted compute seconds of what waits for `device` (none: for any) and goes before a new
-    /// job of `cost_seconds`: what is of higher priority, and of its own priority what the other
-    /// tenants' shares let pass.
+    /// Predicted compute seconds queued for exactly this `device` requirement (`None`: any device)
+    /// that run before a new job of `cost_seconds`. Counted are all jobs of higher priority. Of the
+    /// same priority, each other tenant counts up to this tenant's own queued work including the
+    /// new job, which is its fair share.
     pub fn ahead_of(
         &self,
         tenant: &Tenant,
@@ -94,7 +95,8 @@ impl Backlog {
         let equals = |place: &&Place| place.priority == priority && place.device == device;
         let own = self.sum(|place| place.priority == priority && place.tenant == *tenant);
         let waiting = self.queued.iter().filter(|(place, _)| equals(place));
-        // Each other tenant gets as much as this one until its own is done.
+        // By fair queueing, each other tenant is served as much work as this one until the new job
+        // is done.
         let equal: f64 = waiting
             .map(|(place, load)| match place.tenant == *tenant {
                 true => load.seconds,
@@ -117,6 +119,7 @@ impl Backlog {
         load.add(job.cost_seconds);
     }
 
+    /// Sets the queued load of a key.
     pub(super) fn enter_many(&mut self, place: Place, load: Load) {
         self.queued.insert(place, load);
     }

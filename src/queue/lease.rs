@@ -1,33 +1,33 @@
-//! A worker's hold on a job, and the sign of life that keeps it.
+//! The lease of a job, and the heartbeat that keeps it.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
-use super::Progress;
-use crate::job::Job;
+use crate::job::{Job, JobProgress};
+use crate::sync::locked;
 
-/// A job that one worker may work on.
+/// A job leased to one worker.
 #[derive(Debug)]
 pub struct Lease {
-    /// The job, running.
+    /// The job, in state running.
     pub job: Arc<Job>,
-    /// Given from the iteration loop.
-    pub pulse: Pulse,
+    /// The heartbeat, called from the iteration loop.
+    pub heartbeat: LeaseHeartbeat,
 }
 
-/// What a worker is to do.
+/// The queue's instruction to a worker.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Signal {
     /// Go on.
     Continue,
-    /// Stop: nobody wants the flow any more.
+    /// Stop: the job's cancellation was requested.
     Cancel,
-    /// Stop: the lease ran out and somebody else may hold the job.
+    /// Stop: the lease has expired, and another worker may hold the job.
     Lost,
 }
 
-/// What the queue tells a worker without being asked, and when it heard of it last.
+/// Flags that the queue sets for a running job, and the time of the last heartbeat.
 #[derive(Debug)]
 pub(super) struct Flags {
     cancel: AtomicBool,
@@ -65,41 +65,35 @@ impl Flags {
         self.lost.store(true, Ordering::Relaxed);
     }
 
-    /// The worker is alive.
+    /// Records a heartbeat.
     pub(super) fn beat(&self) {
-        let mut last = self
-            .last_beat
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
+        let mut last = locked(&self.last_beat);
         *last = Instant::now();
     }
 
-    /// When the worker was last alive.
+    /// Time of the last heartbeat.
     pub(super) fn last_beat(&self) -> Instant {
-        *self
-            .last_beat
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
+        *locked(&self.last_beat)
     }
 }
 
-/// Where signs of life go.
+/// Sink of a lease's heartbeats.
 pub(super) trait Heart: Send + Sync {
-    /// A sign of life, with progress where there is news.
-    fn beat(&self, progress: Option<Progress>);
-    /// A snapshot lies in store: a crash from here on is not the job's second at the same place.
+    /// A heartbeat, with progress if there is any.
+    fn beat(&self, progress: Option<JobProgress>);
+    /// A snapshot was stored: resets the crash counter of the job.
     fn snapshot_kept(&self);
 }
 
-/// A lease's sign of life; cheap enough for every iteration. It is given by the loop itself, not
-/// by a timer, so that a device that hangs loses its lease.
+/// The heartbeat of a lease, cheap enough for every iteration. The iteration loop calls it, not a
+/// timer, so a device that hangs loses its lease.
 #[derive(Clone)]
-pub struct Pulse {
+pub struct LeaseHeartbeat {
     flags: Arc<Flags>,
     heart: Arc<dyn Heart>,
 }
 
-impl std::fmt::Debug for Pulse {
+impl std::fmt::Debug for LeaseHeartbeat {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Pulse")
             .field("signal", &self.signal())
@@ -107,19 +101,19 @@ impl std::fmt::Debug for Pulse {
     }
 }
 
-impl Pulse {
+impl LeaseHeartbeat {
     pub(super) fn new(flags: Arc<Flags>, heart: Arc<dyn Heart>) -> Self {
         Self { flags, heart }
     }
 
-    /// A sign of life; says what to do.
-    pub fn beat(&self, progress: Option<Progress>) -> Signal {
+    /// Sends a heartbeat and returns the instruction.
+    pub fn beat(&self, progress: Option<JobProgress>) -> Signal {
         self.flags.beat();
         self.heart.beat(progress);
         self.signal()
     }
 
-    /// What to do, without a sign of life.
+    /// The current instruction, without a heartbeat.
     pub fn signal(&self) -> Signal {
         if self.flags.lost.load(Ordering::Relaxed) {
             Signal::Lost
@@ -130,12 +124,12 @@ impl Pulse {
         }
     }
 
-    /// Whether the job outlives its caller by now, whatever it was when it was leased.
+    /// Whether the job is durable by now. It may have become durable after it was leased.
     pub fn is_durable(&self) -> bool {
         self.flags.is_durable()
     }
 
-    /// Says that a snapshot lies in store.
+    /// Reports that a snapshot was stored.
     pub fn snapshot_kept(&self) {
         self.heart.snapshot_kept();
     }

@@ -1,7 +1,7 @@
-//! Where payloads, snapshots and results lie: files below one folder, by job.
+//! Storage of payloads, snapshots and results: files in one folder, by job.
 //!
-//! Written whole or not at all. What a promise rests on is on disk before the call returns; what
-//! dies with its caller does not wait for the disk. It must not know what the bytes mean.
+//! A write is atomic. A durable write is on disk before the call returns; an ephemeral one does not
+//! wait for the disk. Independent of the content of the blobs.
 
 use std::fs::{self, Permissions};
 use std::io::{self, Write};
@@ -18,7 +18,7 @@ use object_store::path::Path;
 use crate::fault::Fault;
 use crate::job::JobId;
 
-/// Payloads, snapshots and results.
+/// The blob store; clones share it.
 #[derive(Clone, Debug)]
 pub struct Blobs {
     folder: Arc<FilePath>,
@@ -28,24 +28,24 @@ pub struct Blobs {
 
 /// Whether a write waits for the disk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Sync {
-    /// It does: somebody is promised something.
+pub enum Fsync {
+    /// It waits: the job is durable.
     Yes,
-    /// It does not: it survives the process, but perhaps not the machine.
+    /// It does not wait: the blob survives a crash of the process, but perhaps not of the machine.
     No,
 }
 
-/// Something that lies under a job's name.
+/// A blob of a job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Blob {
-    /// One of its sweeps, from 0.
-    Frame(u32),
+    /// One of its sweeps, by index from 0.
+    Sweep(u32),
     /// The latest snapshot of its optimization.
     Snapshot,
-    /// The flow, or the cloud, that one attempt has found.
+    /// The flow, or the dense cloud, of one attempt.
     Result(u32),
-    /// The field that one attempt has fitted, for those who go on from it. By attempt, so that one
-    /// that is late cannot change what others have read.
+    /// The motion field of one attempt, for the jobs that follow. It is stored by attempt, so that
+    /// a late attempt cannot change a field that was already read.
     Field(u32),
 }
 
@@ -60,7 +60,7 @@ impl BlobError {
         self.fault() == Fault::Missing
     }
 
-    /// Whose fault it is.
+    /// The kind of fault.
     pub fn fault(&self) -> Fault {
         match &self.0 {
             object_store::Error::NotFound { .. } => Fault::Missing,
@@ -78,19 +78,20 @@ impl From<io::Error> for BlobError {
     }
 }
 
-/// What can still be written.
+/// Free space of the file system.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FreeSpace {
     /// Bytes.
     pub bytes: u64,
-    /// Files and folders; none where the file system does not count them.
+    /// Files and folders; `None` if the file system does not count them.
     pub inodes: Option<u64>,
 }
 
-/// The file that says which store this is.
+/// The file that holds the store's identity.
 const IDENTITY: &str = "identity";
 
-/// A job's folder. Names begin with their time, so siblings are of about one minute.
+/// The folder of a job. Ids begin with their time, so the jobs of one parent folder were created
+/// within about one minute.
 fn folder(id: JobId) -> String {
     let name = id.to_string();
     format!("jobs/{}/{name}", &name[..8])
@@ -99,7 +100,7 @@ fn folder(id: JobId) -> String {
 fn path(id: JobId, blob: Blob) -> Path {
     let folder = folder(id);
     Path::from(match blob {
-        Blob::Frame(place) => format!("{folder}/frame-{place}"),
+        Blob::Sweep(place) => format!("{folder}/sweep-{place}"),
         Blob::Snapshot => format!("{folder}/snapshot"),
         Blob::Result(attempt) => format!("{folder}/result-{attempt}"),
         Blob::Field(attempt) => format!("{folder}/field-{attempt}"),
@@ -107,13 +108,13 @@ fn path(id: JobId, blob: Blob) -> Path {
 }
 
 impl Blobs {
-    /// Opens or makes the store in `folder`.
+    /// Opens or creates the store in `folder`.
     ///
     /// # Errors
-    /// Where the folder cannot be used.
+    /// If the folder cannot be used.
     pub fn open(folder: &FilePath) -> Result<Self, BlobError> {
         fs::create_dir_all(folder)?;
-        // Also where an earlier version made it for everybody.
+        // An existing folder may have other permissions.
         fs::set_permissions(folder, Permissions::from_mode(0o700))?;
         let open = || -> Result<LocalFileSystem, BlobError> {
             Ok(LocalFileSystem::new_with_prefix(folder)?.with_automatic_cleanup(true))
@@ -125,8 +126,8 @@ impl Blobs {
         })
     }
 
-    /// What can still be written; none where the system does not say. It may wait for a disk that
-    /// hangs: not to be called where requests are answered.
+    /// Free space; `None` if the system does not report it. May block on a hanging disk, so it must
+    /// not be called on the async runtime.
     pub fn free_space(&self) -> Option<FreeSpace> {
         let filesystem = rustix::fs::statvfs(&*self.folder).ok()?;
         Some(FreeSpace {
@@ -135,10 +136,10 @@ impl Blobs {
         })
     }
 
-    /// The number that was written here when the store was made; none where there is none.
+    /// The identity that was written when the store was created; `None` if there is none.
     ///
     /// # Errors
-    /// Where it cannot be read.
+    /// If it cannot be read.
     pub fn identity(&self) -> io::Result<Option<i32>> {
         match fs::read_to_string(self.folder.join(IDENTITY)) {
             Ok(text) => match text.trim().parse() {
@@ -150,27 +151,27 @@ impl Blobs {
         }
     }
 
-    /// Writes the number that says which store this is.
+    /// Writes the identity of the store.
     ///
     /// # Errors
-    /// Where it cannot be written.
+    /// If it cannot be written.
     pub fn set_identity(&self, identity: i32) -> io::Result<()> {
         let mut file = fs::File::create(self.folder.join(IDENTITY))?;
         writeln!(file, "{identity}")?;
         file.sync_all()
     }
 
-    /// Writes, waits for the disk, reads back and removes a file, and looks whether this is still the
-    /// store of that `identity` and has room for `needed` bytes: what a job needs of it.
+    /// Tests the store: writes, syncs, reads back and removes a file. Checks that the store has
+    /// this `identity`, and free space for twice `needed` bytes, at least 4 MiB.
     ///
     /// # Errors
-    /// Where any of it fails.
+    /// If any of these fails.
     pub async fn probe(&self, identity: i32, needed: u64) -> Result<(), BlobError> {
         const BYTES: usize = 64 << 10;
         const ROOM: u64 = 4 << 20;
         let (store, path) = (self.clone(), self.folder.join("jobs/probe"));
         in_background(move || {
-            // A volume that is not mounted is an empty folder that can be written.
+            // A volume that is not mounted appears as an empty, writable folder.
             if store.identity()? != Some(identity) {
                 return Err(io::Error::other(
                     "the payloads are not there: is their volume mounted?",
@@ -195,55 +196,55 @@ impl Blobs {
         .await
     }
 
-    /// Writes a blob whole, over what was there.
+    /// Writes a blob atomically, replacing an existing one.
     ///
     /// # Errors
-    /// Where it cannot be written; then nothing is there under this name that was not before.
+    /// If it cannot be written. The blob is then unchanged.
     pub async fn put(
         &self,
         id: JobId,
         blob: Blob,
         bytes: Bytes,
-        sync: Sync,
+        sync: Fsync,
     ) -> Result<(), BlobError> {
         let store = match sync {
-            Sync::Yes => &self.synced,
-            Sync::No => &self.quick,
+            Fsync::Yes => &self.synced,
+            Fsync::No => &self.quick,
         };
         store.put(&path(id, blob), bytes.into()).await?;
         Ok(())
     }
 
-    /// Reads a blob whole.
+    /// Reads a whole blob.
     ///
     /// # Errors
-    /// Where there is none ([`BlobError::is_missing`]) or it cannot be read.
+    /// If there is none ([`BlobError::is_missing`]) or it cannot be read.
     pub async fn get(&self, id: JobId, blob: Blob) -> Result<Bytes, BlobError> {
         Ok(self.quick.get(&path(id, blob)).await?.bytes().await?)
     }
 
-    /// Bytes of a blob.
+    /// The size of a blob, bytes.
     ///
     /// # Errors
-    /// Where there is none ([`BlobError::is_missing`]) or it cannot be looked at.
+    /// If there is none ([`BlobError::is_missing`]) or its size cannot be read.
     pub async fn size(&self, id: JobId, blob: Blob) -> Result<usize, BlobError> {
         let size = self.quick.head(&path(id, blob)).await?.size;
         Ok(usize::try_from(size).unwrap_or(usize::MAX))
     }
 
-    /// Makes a blob that was written without waiting for the disk safe.
+    /// Rewrites a blob durably that was written without waiting for the disk.
     ///
     /// # Errors
     /// As for reading and writing.
     pub async fn sync(&self, id: JobId, blob: Blob) -> Result<(), BlobError> {
         let bytes = self.get(id, blob).await?;
-        self.put(id, blob, bytes, Sync::Yes).await
+        self.put(id, blob, bytes, Fsync::Yes).await
     }
 
-    /// Removes a blob, if it is there.
+    /// Removes a blob, if it exists.
     ///
     /// # Errors
-    /// Where it cannot be removed.
+    /// If it cannot be removed.
     pub async fn remove(&self, id: JobId, blob: Blob) -> Result<(), BlobError> {
         match self.quick.delete(&path(id, blob)).await {
             Ok(()) | Err(object_store::Error::NotFound { .. }) => Ok(()),
@@ -251,10 +252,10 @@ impl Blobs {
         }
     }
 
-    /// Removes all that lies under a job's name, and what a write that was cut off has left there.
+    /// Removes all blobs of a job, including the remains of interrupted writes.
     ///
     /// # Errors
-    /// Where something cannot be removed.
+    /// If a file cannot be removed.
     pub async fn remove_job(&self, id: JobId) -> Result<(), BlobError> {
         let folder = self.folder.join(folder(id));
         in_background(move || {
@@ -262,28 +263,28 @@ impl Blobs {
                 Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
                 _ => {}
             }
-            // Siblings may be left, and then it stays.
+            // This fails while the folder holds other jobs, as intended.
             let _not_empty = folder.parent().map(fs::remove_dir);
             Ok(())
         })
         .await
     }
 
-    /// Whether nothing of any job lies here.
+    /// Whether the store holds no jobs.
     ///
     /// # Errors
-    /// Where the folder cannot be listed.
+    /// If the folder cannot be listed.
     pub fn is_empty(&self) -> Result<bool, BlobError> {
-        // A probe that was cut off is a file; jobs lie in folders.
+        // An interrupted probe leaves a file; jobs are folders.
         Ok(!entries(&self.folder.join("jobs"))?
             .iter()
             .any(|path| path.is_dir()))
     }
 
-    /// The jobs under whose names nothing lies that is younger than `age`, whole or cut off.
+    /// The jobs whose files are all older than `age`, including the remains of interrupted writes.
     ///
     /// # Errors
-    /// Where the store cannot be listed.
+    /// If the store cannot be listed.
     pub async fn jobs_older_than(&self, age: Duration) -> Result<Vec<JobId>, BlobError> {
         let root = self.folder.join("jobs");
         in_background(move || {
@@ -308,11 +309,11 @@ impl Blobs {
         .await
     }
 
-    /// Removes what writes that were cut off have left, where it is older than `age`. Says how
-    /// many files that were.
+    /// Removes the remains of interrupted writes that are older than `age`. Returns the number of
+    /// files removed.
     ///
     /// # Errors
-    /// Where the store cannot be listed or a file cannot be removed.
+    /// If the store cannot be listed or a file cannot be removed.
     pub async fn remove_cut_off(&self, age: Duration) -> Result<usize, BlobError> {
         let root = self.folder.join("jobs");
         in_background(move || {
@@ -334,14 +335,14 @@ impl Blobs {
     }
 }
 
-/// Whether a file is one that is being written: `frame-0#1`, to be renamed when it is whole.
+/// Whether a file is a staged write, such as `sweep-0#1`, which is renamed when it is complete.
 fn is_staged(path: &FilePath) -> bool {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     name.rsplit_once('#')
         .is_some_and(|(_, number)| number.bytes().all(|byte| byte.is_ascii_digit()))
 }
 
-/// Whether a file was last changed before `limit`; so it was where it has gone meanwhile.
+/// Whether a file was last changed before `limit`. A file that is gone meanwhile counts as older.
 fn is_older(path: &FilePath, limit: Option<SystemTime>) -> io::Result<bool> {
     match fs::metadata(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(true),
@@ -352,7 +353,7 @@ fn is_older(path: &FilePath, limit: Option<SystemTime>) -> io::Result<bool> {
     }
 }
 
-/// What lies in a folder; nothing where it is not there, or goes meanwhile.
+/// The entries of a folder; empty if the folder does not exist or is not a folder.
 fn entries(folder: &FilePath) -> io::Result<Vec<PathBuf>> {
     let listed = match fs::read_dir(folder) {
         Err(error)
@@ -368,7 +369,7 @@ fn entries(folder: &FilePath) -> io::Result<Vec<PathBuf>> {
     listed.map(|entry| Ok(entry?.path())).collect()
 }
 
-/// Runs what waits for the disk beside the requests.
+/// Runs blocking file operations outside the async runtime's workers.
 async fn in_background<T: Send + 'static>(
     work: impl FnOnce() -> io::Result<T> + Send + 'static,
 ) -> Result<T, BlobError> {
@@ -395,27 +396,27 @@ mod tests {
         assert!(blobs.is_empty().expect("a list"));
         let (id, other) = (JobId::fresh(), JobId::fresh());
         let all = [
-            Blob::Frame(0),
-            Blob::Frame(1),
+            Blob::Sweep(0),
+            Blob::Sweep(1),
             Blob::Snapshot,
             Blob::Result(3),
             Blob::Field(3),
         ];
-        for (sync, blob) in [Sync::Yes, Sync::No].into_iter().cycle().zip(all) {
+        for (sync, blob) in [Fsync::Yes, Fsync::No].into_iter().cycle().zip(all) {
             for id in [id, other] {
                 let bytes = Bytes::from(format!("{blob:?}"));
                 blobs.put(id, blob, bytes, sync).await.expect("written");
             }
         }
-        blobs.sync(id, Blob::Frame(1)).await.expect("synced");
-        let back = blobs.get(id, Blob::Frame(1)).await.expect("there");
-        assert_eq!(back, "Frame(1)");
+        blobs.sync(id, Blob::Sweep(1)).await.expect("synced");
+        let back = blobs.get(id, Blob::Sweep(1)).await.expect("there");
+        assert_eq!(back, "Sweep(1)");
         let old = blobs.jobs_older_than(Duration::ZERO).await.expect("a list");
         assert_eq!(old.len(), 2);
         blobs.remove_job(id).await.expect("removed");
-        let gone = blobs.get(id, Blob::Frame(0)).await.expect_err("gone");
+        let gone = blobs.get(id, Blob::Sweep(0)).await.expect_err("gone");
         assert!(gone.is_missing());
-        blobs.get(other, Blob::Frame(0)).await.expect("still there");
+        blobs.get(other, Blob::Sweep(0)).await.expect("still there");
         let aged = blobs.jobs_older_than(Duration::from_secs(3600)).await;
         assert!(aged.expect("a list").is_empty());
     }
@@ -425,10 +426,10 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let blobs = Blobs::open(folder.path()).expect("a store");
         let (kept, orphan) = (JobId::fresh(), JobId::fresh());
-        let put = blobs.put(kept, Blob::Frame(0), Bytes::from("whole"), Sync::No);
+        let put = blobs.put(kept, Blob::Sweep(0), Bytes::from("whole"), Fsync::No);
         put.await.expect("written");
         let lies = |id: JobId, name: &str| folder.path().join(super::folder(id)).join(name);
-        let orphans = lies(orphan, "frame-0#1");
+        let orphans = lies(orphan, "sweep-0#1");
         fs::create_dir_all(orphans.parent().expect("a folder")).expect("made");
         for staged in [orphans, lies(kept, "result-1#12")] {
             fs::write(staged, "half").expect("written");
@@ -442,6 +443,6 @@ mod tests {
         assert_eq!(removed(an_hour).await.expect("a list"), 0);
         assert_eq!(removed(Duration::ZERO).await.expect("a list"), 1);
         assert!(!lies(kept, "result-1#12").exists());
-        blobs.get(kept, Blob::Frame(0)).await.expect("still there");
+        blobs.get(kept, Blob::Sweep(0)).await.expect("still there");
     }
 }

@@ -1,5 +1,5 @@
-//! Where payloads, snapshots and results lie.
+//! Storage of payloads, snapshots and results.
 
 mod blobs;
 
-pub use blobs::{Blob, BlobError, Blobs, FreeSpace, Sync};
+pub use crate::storage::blobs::{Blob, BlobError, Blobs, FreeSpace, Fsync};

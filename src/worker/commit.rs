@@ -1,19 +1,19 @@
-//! How an attempt ends: its result in store, its outcome in the queue, and what becomes of a job that
-//! the store has failed.
+//! The end of an attempt: stores its result, finishes it in the queue, and handles storage
+//! failures.
 
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 
-use super::inputs::StoreError;
-use super::{Attempt, Done, Worker, failure};
+use super::load::StoreError;
+use super::run::{Attempt, Done, Worker, failure};
 use crate::fault::Fault;
 use crate::job::Job;
 use crate::queue::{Committed, Lease, Outcome, QueueError};
-use crate::storage::{Blob, BlobError, Sync};
+use crate::storage::{Blob, BlobError, Fsync};
 
 impl Worker {
-    /// Puts the result in store, then ends the attempt in the queue.
+    /// Stores the result, then ends the attempt in the queue.
     pub(super) async fn commit(&self, lease: &Lease, attempt: Attempt) {
         let job = &lease.job;
         let began = Instant::now();
@@ -27,7 +27,7 @@ impl Worker {
             Ok(Committed::Yes(state)) => {
                 if succeeded {
                     self.metrics
-                        .phase("readback", began.elapsed().as_secs_f64(), Some(job));
+                        .phase("store", began.elapsed().as_secs_f64(), Some(job));
                 }
                 if state.is_end()
                     && let Err(error) = self.blobs.remove(job.id, Blob::Snapshot).await
@@ -43,8 +43,8 @@ impl Worker {
         }
     }
 
-    /// Ends the attempt; tries again for as long as the store fails, since the flow is already there
-    /// and the fence makes it safe.
+    /// Ends the attempt in the queue. Retries with exponential back-off while the store fails: the
+    /// result is already computed, and the fencing token makes a retry safe.
     pub(super) async fn finish(
         &self,
         lease: &Lease,
@@ -70,7 +70,8 @@ impl Worker {
         }
     }
 
-    /// Puts what an attempt has found in store, the field before the success that others wait for.
+    /// Stores the results of an attempt. The field is stored before the success that followers wait
+    /// for.
     async fn store(&self, lease: &Lease, done: Done) -> Outcome {
         let job = &lease.job;
         let (result, field) = (done.result, done.field);
@@ -96,7 +97,7 @@ impl Worker {
             },
             (Err(error), _) => {
                 tracing::error!(%error, job = %job.id, "a result was not kept");
-                // The next attempt writes its own.
+                // The next attempt writes its own blobs.
                 self.remove_attempt(job).await;
                 self.store_failed(error.fault(), size as u64, &error).await
             }
@@ -104,7 +105,7 @@ impl Worker {
         }
     }
 
-    /// Removes what an attempt has written.
+    /// Removes the blobs that an attempt has written.
     async fn remove_attempt(&self, job: &Job) {
         for blob in [Blob::Result(job.attempt), Blob::Field(job.attempt)] {
             if let Err(error) = self.blobs.remove(job.id, blob).await {
@@ -113,14 +114,14 @@ impl Worker {
         }
     }
 
-    /// Writes a blob of an attempt; what was promised is on disk then.
+    /// Writes a blob of an attempt; if the job is durable, the blob is on disk when this returns.
     async fn put(&self, lease: &Lease, blob: Blob, bytes: Vec<u8>) -> Result<(), BlobError> {
         let id = lease.job.id;
-        let promised = lease.pulse.is_durable();
-        let sync = if promised { Sync::Yes } else { Sync::No };
+        let promised = lease.heartbeat.is_durable();
+        let sync = if promised { Fsync::Yes } else { Fsync::No };
         self.blobs.put(id, blob, Bytes::from(bytes), sync).await?;
-        if !promised && lease.pulse.is_durable() {
-            // It was promised while it was being written.
+        if !promised && lease.heartbeat.is_durable() {
+            // The job became durable during the write.
             self.blobs.sync(id, blob).await?;
         }
         Ok(())
@@ -128,7 +129,7 @@ impl Worker {
 }
 
 impl Worker {
-    /// What becomes of a job whose payload cannot be read.
+    /// The outcome of a job whose payload cannot be read.
     pub(super) async fn unreadable(&self, error: &StoreError) -> Outcome {
         tracing::error!(%error, "the payload cannot be read");
         let fault = match error {
@@ -139,13 +140,14 @@ impl Worker {
         self.store_failed(fault, 0, error).await
     }
 
-    /// What becomes of a job that the store has failed: it waits for the machine without blame where
-    /// the store fails everybody, and goes behind the others where it fails this one alone.
+    /// The outcome of a job after a storage failure. If the store probe fails too, the job is
+    /// released without blame. If the store works otherwise, the job is delayed behind the others;
+    /// if a blob is missing, the attempt has failed.
     async fn store_failed(
         &self,
         fault: Fault,
         needed: u64,
-        error: &(dyn std::error::Error + core::marker::Sync),
+        error: &(dyn std::error::Error + Sync),
     ) -> Outcome {
         if fault == Fault::Full {
             self.store.health().needs(needed);

@@ -1,5 +1,5 @@
-//! Whether the store can be used: asked by upkeep again and again, and by a worker whose job it has
-//! just failed.
+//! The store probe, run periodically by housekeeping and by a worker whose job hit a storage
+//! failure.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,20 +12,20 @@ use crate::health::StoreHealth;
 use crate::queue::Queue;
 use crate::storage::Blobs;
 
-/// A store that takes longer than this does not answer.
+/// Timeout of a probe.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// Asks the queue and the payloads' store.
+/// Probes the queue and the blob store.
 pub struct StoreProbe {
     queue: Arc<dyn Queue>,
     blobs: Blobs,
     health: Arc<StoreHealth>,
-    /// One that has not come back yet: a disk that hangs is not asked twice.
+    /// A probe that has not returned yet: a hanging disk is not probed twice.
     asking: Mutex<Option<JoinHandle<Result<(), String>>>>,
 }
 
 impl StoreProbe {
-    /// A probe of both; what it finds goes into `health`.
+    /// Creates a probe of both; its results go into `health`.
     pub fn new(queue: Arc<dyn Queue>, blobs: Blobs, health: Arc<StoreHealth>) -> Self {
         Self {
             queue,
@@ -35,12 +35,12 @@ impl StoreProbe {
         }
     }
 
-    /// What it is told to.
+    /// The health record that the probe updates.
     pub fn health(&self) -> &Arc<StoreHealth> {
         &self.health
     }
 
-    /// Asks both, and says whether they work.
+    /// Runs a probe, or waits for the one that is running. Returns whether both stores work.
     pub async fn ask(&self) -> bool {
         let mut asking = self.asking.lock().await;
         let handle = asking.get_or_insert_with(|| {

@@ -1,4 +1,4 @@
-//! A worker on a real queue and store, with a device that misbehaves when it is told to.
+//! A worker on a real queue and store, with a device that fails on command.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -8,24 +8,23 @@ use bytes::Bytes;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
-use super::{Drain, Worker, WorkerOptions};
+use super::run::{Drain, Worker, WorkerOptions};
 use crate::cost::{CostModel, Lanes};
-use crate::engine::cards::Switches;
-use crate::engine::{Device, Health};
+use crate::engine::{Device, Health, Switches};
 use crate::flow::{MotionField, Point};
 use crate::job::{DeviceKind, Job, JobError, JobId, Kind, Priority, State, Tenant};
 use crate::metrics::Metrics;
 use crate::payload::{StoredCloud, StoredFlow};
 use crate::queue::{Outcome, PairOf, Queue, QueueOptions, SqliteQueue, Submission, Submitted};
-use crate::storage::{Blob, Blobs, Sync};
+use crate::storage::{Blob, Blobs, Fsync};
 
-/// Long enough for a loaded machine; only a failure waits so long.
+/// Timeout, long enough for a loaded machine. Only a failing test waits this long.
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// Points of the tests' pairs, and of no trial.
+/// Points of the tests' pairs; differs from the pair of the self-test.
 const POINTS: usize = 900;
 
-/// All that a worker needs, in a folder.
+/// A worker with its queue, store and device, in a temporary folder.
 struct Stand {
     queue: Arc<dyn Queue>,
     blobs: Blobs,
@@ -38,7 +37,7 @@ async fn stand() -> Stand {
     stand_with(1, None).await
 }
 
-async fn stand_with(lanes: usize, roomier: Option<DeviceKind>) -> Stand {
+async fn stand_with(lanes: usize, overflow_kind: Option<DeviceKind>) -> Stand {
     let folder = tempfile::tempdir().expect("a folder");
     let options = QueueOptions {
         retry_delay: Duration::from_millis(20),
@@ -66,10 +65,10 @@ async fn stand_with(lanes: usize, roomier: Option<DeviceKind>) -> Stand {
         metrics,
         options: WorkerOptions {
             snapshot_interval: Duration::from_secs(1),
-            roomier,
+            overflow_kind,
         },
         drain: Drain::default(),
-        company: Arc::default(),
+        isolation: Arc::default(),
         store: Arc::new(crate::worker::StoreProbe::new(
             Arc::clone(&queue),
             blobs.clone(),
@@ -85,7 +84,7 @@ async fn stand_with(lanes: usize, roomier: Option<DeviceKind>) -> Stand {
     }
 }
 
-/// A wall of points, and one a tenth of a metre on.
+/// A wall of points, and the same wall 0.1 m further along x.
 fn clouds() -> [Vec<Point>; 2] {
     let source: Vec<Point> = (0..900u16)
         .map(|i| [8.0, f32::from(i % 30) * 0.2, f32::from(i / 30) * 0.2])
@@ -95,13 +94,13 @@ fn clouds() -> [Vec<Point>; 2] {
 }
 
 impl Stand {
-    async fn submit(&self, frames: usize) -> Arc<Job> {
-        self.submit_after(frames, None).await
+    async fn submit(&self, sweeps: usize) -> Arc<Job> {
+        self.submit_after(sweeps, None).await
     }
 
-    /// A pair of a chain.
-    async fn submit_after(&self, frames: usize, after: Option<JobId>) -> Arc<Job> {
-        self.submit_clouds(clouds().into_iter().take(frames), after)
+    /// Submits a pair that follows the job `after`.
+    async fn submit_after(&self, sweeps: usize, after: Option<JobId>) -> Arc<Job> {
+        self.submit_clouds(clouds().into_iter().take(sweeps), after)
             .await
     }
 
@@ -117,7 +116,7 @@ impl Stand {
                 ground: None,
             };
             let bytes = Bytes::from(cloud.to_bytes());
-            let put = self.blobs.put(id, Blob::Frame(place), bytes, Sync::No);
+            let put = self.blobs.put(id, Blob::Sweep(place), bytes, Fsync::No);
             put.await.expect("written");
         }
         let submission = Submission {
@@ -128,7 +127,7 @@ impl Stand {
             pairs: Vec::new(),
             closing_seconds: None,
             after,
-            followed: true,
+            has_dependents: true,
             priority: Priority::Normal,
             device: None,
             cost_seconds: 0.1,
@@ -171,7 +170,7 @@ async fn a_panic_costs_one_attempt_of_one_job_and_the_device_works_again() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_job_that_panics_every_time_is_given_up_and_the_next_one_is_done() {
     let stand = stand().await;
-    // Only pairs of this size panic, so that the trials between the attempts pass.
+    // Only pairs of this size panic, so the self-tests between the attempts pass.
     stand.switches.panics.store(3, Ordering::Relaxed);
     let poison = stand.submit(2).await;
     tokio::spawn(stand.worker.clone().run());
@@ -264,7 +263,7 @@ async fn a_worker_whose_lane_has_ended_gives_its_job_back_and_takes_nothing_more
     let left = stand.queue.job(&job.tenant, job.id).await.expect("known");
     assert_eq!(left.state, State::Queued);
     assert!(left.attempt <= 1, "it was leased again");
-    assert!(stand.worker.lane.device().obstacle().is_some());
+    assert!(stand.worker.lane.device().not_ready_reason().is_some());
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -283,12 +282,12 @@ async fn a_lost_device_returns_the_job_to_the_queue_and_does_it_again() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_pair_that_does_not_fit_moves_where_there_is_another_kind_and_fails_where_there_is_none()
 {
-    for roomier in [Some(DeviceKind::Cpu), None] {
-        let stand = stand_with(1, roomier).await;
+    for overflow_kind in [Some(DeviceKind::Cpu), None] {
+        let stand = stand_with(1, overflow_kind).await;
         stand.switches.room.store(POINTS - 1, Ordering::Relaxed);
         let job = stand.submit(2).await;
         tokio::spawn(stand.worker.clone().run());
-        if roomier.is_some() {
+        if overflow_kind.is_some() {
             let mut news = stand.queue.watch(job.id).await.expect("known");
             let moves = news.wait_for(|job| job.device == Some(DeviceKind::Cpu));
             let moving = timeout(PATIENCE, moves).await.expect("in time");
@@ -315,7 +314,7 @@ async fn a_pair_that_kills_every_device_is_given_up_and_nothing_beside_it_is() {
     const DEADLY: usize = POINTS - 30;
     let stand = stand_with(LANES, None).await;
     stand.switches.deadly.store(DEADLY, Ordering::Relaxed);
-    // All begin together, so that the first death takes those beside it along.
+    // All pairs start together, so the first loss also fails the pairs beside the faulty one.
     stand.switches.brake.store(true, Ordering::Relaxed);
     let fewer = clouds().map(|cloud| cloud[..DEADLY].to_vec());
     let guilty = stand.submit_clouds(fewer.into_iter(), None).await;
@@ -394,7 +393,7 @@ async fn of_jobs_that_may_kill_the_process_one_is_held_at_a_time_and_nothing_bes
             {
                 break;
             }
-            // Whoever else had come in before is let through.
+            // A job that another worker had leased before is let through.
             stand.switches.brake.store(false, Ordering::Relaxed);
             tokio::time::sleep(Duration::from_millis(1)).await;
             stand.switches.brake.store(true, Ordering::Relaxed);

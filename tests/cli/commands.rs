@@ -1,4 +1,4 @@
-//! Every command does its job, and its answers hold what the contract says.
+//! Tests of every command of the command line, and of the fields of its JSON reports.
 
 use std::path::Path;
 
@@ -7,11 +7,11 @@ use fnsf::flow::gpu::{Adapter, AdapterKind, adapters};
 use super::gpu_rule;
 use super::program::{fnsf, json};
 
-/// A small simulated street in `folder/street`.
+/// Simulates a small street in `folder/street`.
 fn street(folder: &Path) {
     let ended = fnsf(
         folder,
-        &["synth", "-o", "street", "--beams", "16", "--frames", "2"],
+        &["synth", "-o", "street", "--beams", "16", "--sweeps", "2"],
     );
     assert_eq!(ended.code, 0, "{}", ended.stderr);
 }
@@ -57,8 +57,8 @@ fn the_json_report_has_every_field_of_the_contract() {
     street(folder);
     let arguments = [
         "flow",
-        "street/frame_0000.pcd",
-        "street/frame_0001.pcd",
+        "street/sweep_0000.pcd",
+        "street/sweep_0001.pcd",
         "--json",
         "--seed",
         "4",
@@ -70,9 +70,10 @@ fn the_json_report_has_every_field_of_the_contract() {
     let report = json(folder, &arguments);
     let fields = [
         "points",
-        "iterations",
-        "best_iteration",
-        "best_loss",
+        "valid_points",
+        "dt_s",
+        "dt_assumed",
+        "objects",
         "stop_reason",
         "device",
         "preset",
@@ -84,13 +85,13 @@ fn the_json_report_has_every_field_of_the_contract() {
     for field in fields {
         assert!(!report[field].is_null(), "{field} in {report}");
     }
-    for phase in ["load", "precompute", "query", "network", "total"] {
+    for phase in ["load", "precompute", "search", "total"] {
         assert!(
             report["seconds"][phase].as_f64().is_some_and(|s| s >= 0.0),
             "{phase}"
         );
     }
-    assert_eq!(report["points"], 4000);
+    assert_eq!(report["valid_points"], 4000);
     assert_eq!(report["seed"], 4);
     assert_eq!(report["preset"], "default");
     let paper = json(folder, &[&arguments[..], &["--preset", "paper"]].concat());
@@ -195,7 +196,7 @@ fn wrong_arguments_are_refused_with_exit_code_2_before_any_work() {
         &["flow", "a.npz"],
         &["flow", "a.npz", "-o", "flow.xyz"],
         &["flow", "a.npz", "-o", "flow.npz", "--preset", "best"],
-        &["flow", "a.npz", "-o", "flow.npz", "--range-m", "-3"],
+        &["flow", "a.npz", "-o", "flow.npz", "--crop-m", "-3"],
         &["synth", "-o", "s", "--beams", "0"],
         &["fly"],
     ];
@@ -226,7 +227,7 @@ fn clouds_far_from_the_origin_align_as_near_ones_do() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     street(folder);
-    // Single precision resolves 4 mm at 50 km; the motion is that of the same street at home.
+    // Single precision resolves 4 mm at 50 km. The motion is that of the same street at the origin.
     let shifted = |name: &str| {
         let pcd = std::fs::read(folder.join(name)).expect("written");
         let cloud = fnsf::formats::read_cloud(&pcd, None)
@@ -238,7 +239,7 @@ fn clouds_far_from_the_origin_align_as_near_ones_do() {
             .expect("memory takes all");
         std::fs::write(folder.join(format!("{name}.npy")), file).expect("written");
     };
-    let names = ["street/frame_0000.pcd", "street/frame_0001.pcd"];
+    let names = ["street/sweep_0000.pcd", "street/sweep_0001.pcd"];
     names.iter().for_each(|name| shifted(name));
     let near = json(
         folder,
@@ -265,11 +266,11 @@ fn a_field_that_is_fitted_far_from_the_origin_is_that_of_the_same_cloud_at_home(
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     street(folder);
-    let pcd = std::fs::read(folder.join("street/frame_0000.pcd")).expect("written");
+    let pcd = std::fs::read(folder.join("street/sweep_0000.pcd")).expect("written");
     let cloud = fnsf::formats::read_cloud(&pcd, None)
         .expect("a cloud")
         .points;
-    // Twice the same cloud: nothing moves. Single precision resolves 8 mm at 100 km.
+    // The same cloud twice, so nothing moves. Single precision resolves 8 mm at 100 km.
     for x in [0.0, 1e3, 1e5] {
         let points: Vec<_> = cloud.iter().map(|p| [p[0] + x, p[1], p[2]]).collect();
         let mut file = Vec::new();

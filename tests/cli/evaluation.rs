@@ -1,12 +1,12 @@
-//! Many flows are scored in one run, and what makes no sense is refused.
+//! Tests of `fnsf eval` with several flows, and of its refusals.
 
 use super::program::{fnsf, json};
 
-/// Two pairs of a street, and their flows.
+/// Two pairs of a street, and their estimated flows.
 fn two_flows(folder: &std::path::Path) {
     let made = fnsf(
         folder,
-        &["synth", "-o", "street", "--beams", "16", "--frames", "3"],
+        &["synth", "-o", "street", "--beams", "16", "--sweeps", "3"],
     );
     assert_eq!(made.code, 0, "{}", made.stderr);
     for (out, pair) in [("a.npz", "pair_0000"), ("b.feather", "pair_0001")] {

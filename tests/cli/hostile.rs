@@ -1,17 +1,19 @@
-//! Hostile files: one clear line, exit code 65, and hardly any memory.
+//! Tests of hostile input files: one line on stderr, exit code 65 and little memory.
+//!
+//! Also tested: output files that cannot be written or that are inputs.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
 
 use super::program::fnsf;
 
-/// The most memory that a refused file may take, bytes.
+/// Maximum memory for a file that is refused, bytes.
 const MEMORY: u64 = 100 << 20;
 
-/// Three points that are too far apart for a distance transform.
+/// Three points too far apart for a distance transform.
 const FAR: &str = "three far points.npy";
 
-/// An array in numpy's format, as its header and data.
+/// An array in numpy's format, from its header and data.
 fn npy(descr: &str, shape: &str, data: &[u8]) -> Vec<u8> {
     let header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}\n");
     let mut file = b"\x93NUMPY\x01\x00".to_vec();
@@ -88,7 +90,7 @@ fn corpus() -> Vec<(&'static str, Vec<u8>)> {
     ]
 }
 
-/// `fnsf flow FILE FILE` with a preset.
+/// The arguments of `fnsf flow FILE FILE` with a preset.
 fn flow<'a>(file: &'a str, preset: &'a str) -> [&'a str; 9] {
     let [device, out] = ["cpu", "out.npz"];
     [
@@ -96,7 +98,7 @@ fn flow<'a>(file: &'a str, preset: &'a str) -> [&'a str; 9] {
     ]
 }
 
-/// The most memory that it takes, bytes, by the system's own count.
+/// Peak resident memory of a run, bytes, as the system reports it.
 fn peak_memory(folder: &Path, arguments: &[&str]) -> Option<u64> {
     let mut child = Command::new(env!("CARGO_BIN_EXE_fnsf"))
         .args(arguments)
@@ -130,7 +132,8 @@ fn every_hostile_file_gets_one_line_exit_code_65_and_little_memory() {
             assert!(peak < MEMORY, "{name}: {peak} bytes");
         }
         if (*name, preset) == (FAR, "default") {
-            // Objects need no transform, and their extent no memory.
+            // The object search needs no distance transform, and its memory does not depend on the
+            // extent.
             assert_eq!(ended.code, 0, "{name}: {}", ended.stderr);
             std::fs::remove_file(folder.join("out.npz")).expect("it was written");
             continue;
@@ -180,10 +183,10 @@ fn an_output_that_cannot_be_written_is_an_internal_failure_and_leaves_nothing() 
     assert_eq!(ended.stderr.lines().count(), 1);
 }
 
-/// A folder with two sweeps and their pair.
+/// A folder with three sweeps and their two pairs.
 fn street() -> tempfile::TempDir {
     let folder = tempfile::tempdir().expect("a folder");
-    let made = fnsf(folder.path(), &["synth", "-o", ".", "--frames", "3"]);
+    let made = fnsf(folder.path(), &["synth", "-o", ".", "--sweeps", "3"]);
     assert_eq!(made.code, 0, "{}", made.stderr);
     folder
 }
@@ -193,7 +196,7 @@ fn an_output_that_is_an_input_is_refused_before_any_work() {
     let folder = street();
     let path = folder.path();
     std::fs::hard_link(path.join("pair_0000.npz"), path.join("same.npz")).expect("linked");
-    std::fs::copy(path.join("frame_0001.pcd"), path.join("s_0000.pcd")).expect("copied");
+    std::fs::copy(path.join("sweep_0001.pcd"), path.join("s_0000.pcd")).expect("copied");
     let ego = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1";
     std::fs::write(path.join("ego.npz"), ego).expect("written");
     let all = |folder: &Path| -> Vec<(std::ffi::OsString, Vec<u8>)> {
@@ -211,7 +214,7 @@ fn an_output_that_is_an_input_is_refused_before_any_work() {
         files
     };
     let before = all(path);
-    let sweeps = ["frame_0000.pcd", "s_0000.pcd", "frame_0002.pcd"];
+    let sweeps = ["sweep_0000.pcd", "s_0000.pcd", "sweep_0002.pcd"];
     let [first, second, third] = sweeps;
     for arguments in [
         &["flow", "pair_0000.npz", "-o", "pair_0000.npz"][..],
@@ -225,7 +228,7 @@ fn an_output_that_is_an_input_is_refused_before_any_work() {
             first,
             second,
             third,
-            "--into",
+            "--reference-time",
             "1",
             "-o",
             "s_0000.pcd",
@@ -241,7 +244,7 @@ fn an_output_that_is_an_input_is_refused_before_any_work() {
 fn nothing_unfinished_is_left_behind_or_in_the_way() {
     let folder = street();
     let path = folder.path();
-    // What another run has left, whatever number the next one has.
+    // Unfinished files of other runs, for any process id of the next run.
     for id in 1..70_000 {
         if id % 1000 == 1 {
             std::fs::write(path.join(format!("flow.npz.{id}.part")), "").expect("written");

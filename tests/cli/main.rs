@@ -1,4 +1,4 @@
-//! The program through its public door: real files, real processes, exit codes.
+//! Tests of the program from outside: real files, real processes, exit codes.
 
 mod commands;
 mod evaluation;

@@ -1,9 +1,9 @@
-//! Runs the program and keeps what it said.
+//! Runs the program and captures its output.
 
 use std::path::Path;
 use std::process::Command;
 
-/// How a run ended.
+/// Exit code and output of a run.
 pub(crate) struct Ended {
     pub(crate) code: i32,
     pub(crate) stdout: String,
@@ -15,7 +15,7 @@ pub(crate) fn fnsf(folder: &Path, arguments: &[&str]) -> Ended {
     let output = Command::new(env!("CARGO_BIN_EXE_fnsf"))
         .args(arguments)
         .current_dir(folder)
-        .env_remove("FNSF_SOFTWARE_GPU")
+        .env_remove("FNSF_ALLOW_SOFTWARE_GPU")
         .output()
         .expect("the program starts");
     Ended {
@@ -25,7 +25,7 @@ pub(crate) fn fnsf(folder: &Path, arguments: &[&str]) -> Ended {
     }
 }
 
-/// Runs `fnsf`, expects success, and reads its JSON answer.
+/// Runs `fnsf`, expects success, and parses its JSON output.
 pub(crate) fn json(folder: &Path, arguments: &[&str]) -> serde_json::Value {
     let ended = fnsf(folder, arguments);
     assert_eq!(ended.code, 0, "{arguments:?}: {}", ended.stderr);

@@ -1,4 +1,4 @@
-//! Sequences and dense clouds from the command line.
+//! Tests of sequences and dense clouds from the command line.
 
 use std::path::Path;
 
@@ -7,10 +7,10 @@ use fnsf::formats::{read_cloud, read_depth_png, read_flow};
 use super::program::{fnsf, json};
 
 const SWEEPS: [&str; 4] = [
-    "street/frame_0000.pcd",
-    "street/frame_0001.pcd",
-    "street/frame_0002.pcd",
-    "street/frame_0003.pcd",
+    "street/sweep_0000.pcd",
+    "street/sweep_0001.pcd",
+    "street/sweep_0002.pcd",
+    "street/sweep_0003.pcd",
 ];
 const CAMERA: &str = r#"{"width": 310, "height": 94, "k": [[180, 0, 155], [0, 180, 47], [0, 0, 1]],
     "camera_from_lidar": [[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]}"#;
@@ -18,7 +18,7 @@ const CAMERA: &str = r#"{"width": 310, "height": 94, "k": [[180, 0, 155], [0, 18
 fn street(folder: &Path) {
     let ended = fnsf(
         folder,
-        &["synth", "-o", "street", "--beams", "16", "--frames", "4"],
+        &["synth", "-o", "street", "--beams", "16", "--sweeps", "4"],
     );
     assert_eq!(ended.code, 0, "{}", ended.stderr);
 }
@@ -84,7 +84,7 @@ fn a_dense_cloud_has_every_point_and_shows_more_than_one_sweep_through_a_camera(
         ("0", "label", "dense.pcd"),
     ] {
         let options = [
-            "--into",
+            "--reference-time",
             into,
             "--preset",
             preset,
@@ -122,9 +122,9 @@ fn a_dense_cloud_has_every_point_and_shows_more_than_one_sweep_through_a_camera(
         assert!((depth.density() - dense).abs() < 1e-9);
     }
     let cropped = [
-        "--into",
+        "--reference-time",
         "1",
-        "--range-m",
+        "--crop-m",
         "20",
         "--device",
         "cpu",
@@ -137,7 +137,7 @@ fn a_dense_cloud_has_every_point_and_shows_more_than_one_sweep_through_a_camera(
     let points = read_cloud(&bytes, Some("near.ply"))
         .expect("a cloud")
         .points;
-    // What was in range of its own sweep, carried two metres at most.
+    // The crop applies to the sweep of each point. The points are then moved by at most two metres.
     assert!(
         points
             .iter()
@@ -157,11 +157,15 @@ fn what_no_sequence_can_be_asked_is_refused_with_advice() {
     let [a, b, c, _] = SWEEPS;
     let refused: [(&[&str], i32, &str); 6] = [
         (
-            &["densify", a, b, "--into", "2", "-o", "x.ply"],
+            &["densify", a, b, "--reference-time", "2", "-o", "x.ply"],
             2,
             "0 to 1",
         ),
-        (&["densify", a, b, "--into", "0", "-o", "x.obj"], 2, ".laz"),
+        (
+            &["densify", a, b, "--reference-time", "0", "-o", "x.obj"],
+            2,
+            ".laz",
+        ),
         (
             &["flow", a, b, c, "--ego", "ego.txt", "--json"],
             2,

@@ -1,10 +1,10 @@
-//! Whether what needs a GPU is tested here: one rule for all tests, inside the crate and outside.
+//! The rule for tests that need a GPU, shared by unit tests and integration tests.
 
-/// Whether to go on where so many cards were found, software included. Where there is none, a test
-/// leaves it at that and says so, unless `FNSF_REQUIRE_GPU=1` makes it a failure.
+/// Whether a test that needs a GPU runs, given the number of GPUs found, software ones included.
+/// Without a GPU the test is skipped with a message, unless `FNSF_REQUIRE_GPU=1` makes it fail.
 ///
 /// # Panics
-/// Where a card is required and there is none.
+/// If a GPU is required and none is found.
 #[expect(clippy::print_stderr, reason = "a test says what it leaves out")]
 pub(crate) fn is_there(cards: usize) -> bool {
     let required = std::env::var_os("FNSF_REQUIRE_GPU").is_some_and(|value| value == "1");

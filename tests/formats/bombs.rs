@@ -1,5 +1,5 @@
-//! Files that declare far more than they hold, read in a process of their own whose memory is
-//! then looked at: the refusal must come before the cost.
+//! Tests of files that declare far more data than they contain. They are read in a separate
+//! process, whose peak memory is checked: a file must be refused before memory is allocated for it.
 
 use std::io::Write;
 
@@ -7,10 +7,10 @@ use fnsf::formats::{read_cloud, read_flow, read_pair};
 
 use crate::samples::npy;
 
-/// What a hostile file may cost, and the process around it.
+/// Maximum resident memory of the process that reads the files, KiB.
 const MAX_RESIDENT_KIB: u64 = 100 << 10;
 
-/// Set in the process that does the reading.
+/// Environment variable that is set in the process that reads the files.
 const CHILD: &str = "FNSF_BOMBS_CHILD";
 
 #[test]
@@ -40,7 +40,7 @@ fn hostile_files_are_refused_in_little_memory() {
     }
 }
 
-/// The most memory that this process ever had, where the system says so.
+/// Peak resident memory of this process, KiB; none if the system does not report it.
 fn peak_resident_kib() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find(|line| line.starts_with("VmHWM:"))?;
@@ -112,7 +112,8 @@ fn bombs() -> Vec<(&'static str, Vec<u8>)> {
     ]
 }
 
-/// 40 million points of zeros: half a gigabyte in half a megabyte.
+/// A zip of two arrays of `rows` zero points each. With 40 million rows, about a gigabyte in about
+/// a megabyte.
 fn zip_bomb(rows: usize) -> Vec<u8> {
     let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
     for name in ["pc1.npy", "flow.npy"] {
@@ -143,7 +144,7 @@ fn many_members() -> Vec<u8> {
     zip.finish().unwrap().into_inner()
 }
 
-/// A sound file whose compressed buffers are made to declare 2^62 bytes each.
+/// A valid file whose compressed buffers are changed to declare 2^62 bytes each.
 fn feather_bomb() -> Vec<u8> {
     let mut bytes = Vec::new();
     let zeros = vec![[0.0; 3]; 1000];

@@ -1,4 +1,4 @@
-//! Cameras and the depth seen by them: read in every spelling, refused where they cannot be.
+//! Tests of camera calibrations in every supported form, and of depth images.
 
 use fnsf::flow::RigidTransform;
 use fnsf::flow::depth::{DepthImage, MAX_SIDE_PX};
@@ -9,10 +9,11 @@ use fnsf::formats::{
 use nalgebra::Point3;
 use proptest::prelude::*;
 
-/// Calibrations are printed with 13 digits, and rotations go through a quaternion.
+/// Tolerance: calibrations are printed with 13 digits, and rotations are converted to a quaternion.
 const PRINTED: f64 = 1e-7;
 
-/// A camera 0.06 m right of number 0, whose lidar looks along x, 0.3 m behind and 0.1 m above.
+/// A camera 0.06 m to the right of camera 0. The lidar's x axis points forward. It is 0.3 m behind
+/// camera 0 and 0.1 m above it.
 const OBJECT: &str = "P0: 700 0 600 0 0 700 180 0 0 0 1 0
 P2: 7.000000000000e+02 0 600 54 0 700 180 0.9 0 0 1 0.005
 R0_rect: 1 0 0 0 1 0 0 0 1
@@ -53,7 +54,8 @@ fn difference(left: &RigidTransform, right: &RigidTransform) -> f64 {
 fn kittis_object_calibration_sees_a_point_where_its_projection_puts_it() {
     let camera = read_camera(OBJECT.as_bytes(), None).unwrap();
     assert_eq!([camera.width(), camera.height()], KITTI_SIZE_PX);
-    // Ten metres ahead, two to the left, one up: P2 (x, y, z, 1) by hand.
+    // Ten metres ahead, two to the left, one up. The expected pixel is P2 (x, y, z, 1), computed by
+    // hand.
     let [x, y, z] = [-2.0, -1.0 - 0.1, 10.0 - 0.3];
     let depth = z + 0.005;
     let column = (700.0 * x + 600.0 * z + 54.0) / depth;
@@ -202,7 +204,7 @@ fn pictures_that_hold_no_depth_are_refused() {
     assert!(read_depth_png(b"").is_err());
 }
 
-/// A header of 16-bit gray that declares a size, with its checksum, and nothing behind it.
+/// A header of a 16-bit grayscale image of the given size, with its checksum, and no image data.
 fn png_header(width: u32, height: u32) -> Vec<u8> {
     let mut chunk = b"IHDR".to_vec();
     chunk.extend(width.to_be_bytes());

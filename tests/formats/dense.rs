@@ -1,4 +1,4 @@
-//! Dense clouds: written in every format, read back as clouds and row by row.
+//! Tests of dense clouds: written in every format, read back as clouds and row by row.
 
 use std::io::Cursor;
 use std::path::Path;
@@ -8,13 +8,13 @@ use fnsf::formats::{DENSE_FORMATS, DenseFormat, FormatError, read_cloud, write_d
 
 use crate::samples::{pattern, points};
 
-/// LAS rounds to whole millimetres: half of one, and float32's share of 60 m.
+/// Rounding error of LAS: half of its step of one millimetre, plus the float32 error at 60 m.
 const LAS_STEP_M: f64 = 0.0005 + 5e-6;
 
 fn dense(count: usize) -> DenseCloud {
     DenseCloud {
         points: points(count),
-        frame: (0..count as u32).map(|row| row % 7).collect(),
+        sweep: (0..count as u32).map(|row| row % 7).collect(),
         age: (0..count).map(|row| 3.0 - (row % 7) as f32).collect(),
         dynamic: pattern(count, 3),
         converged: pattern(count, 5).into_iter().map(|flag| !flag).collect(),
@@ -38,7 +38,8 @@ fn a_dense_cloud_reads_back_as_a_cloud() {
     }
 }
 
-/// Ply and pcd share their rows: 12 bytes of place, 4 of frame, 4 of age, a byte a mask.
+/// Ply and pcd share their row layout: 12 bytes of coordinates, 4 of the sweep index, 4 of the age,
+/// and one byte per mask.
 #[test]
 fn ply_and_pcd_rows_hold_frame_age_and_masks() {
     const STRIDE: usize = 22;
@@ -48,7 +49,7 @@ fn ply_and_pcd_rows_hold_frame_age_and_masks() {
     let rows = &ply[ply.len() - 50 * STRIDE..];
     assert!(pcd.ends_with(rows));
     for (row, bytes) in rows.chunks_exact(STRIDE).enumerate() {
-        assert_eq!(bytes[12..16], dense.frame[row].to_le_bytes());
+        assert_eq!(bytes[12..16], dense.sweep[row].to_le_bytes());
         assert_eq!(bytes[16..20], dense.age[row].to_le_bytes());
         let masks = [dense.dynamic[row], dense.converged[row]].map(u8::from);
         assert_eq!(bytes[20..], masks);
@@ -65,7 +66,7 @@ fn npz_arrays_have_the_types_that_they_are_documented_with() {
     let mut archive = zip::ZipArchive::new(Cursor::new(bytes)).unwrap();
     for (name, descr, shape) in [
         ("points", "<f4", "(9, 3)"),
-        ("frame", "<u4", "(9,)"),
+        ("sweep", "<u4", "(9,)"),
         ("age", "<f4", "(9,)"),
         ("dynamic", "|b1", "(9,)"),
         ("converged", "|b1", "(9,)"),
@@ -96,7 +97,7 @@ fn las_and_laz_come_back_through_another_reader() {
             for (found, written) in found.into_iter().zip(dense.points[row]) {
                 assert!((found - f64::from(written)).abs() <= LAS_STEP_M, "{row}");
             }
-            assert_eq!(u32::from(point.point_source_id), dense.frame[row]);
+            assert_eq!(u32::from(point.point_source_id), dense.sweep[row]);
             assert_eq!(point.extra_bytes, dense.age[row].to_le_bytes());
             assert_eq!(point.user_data == 1, dense.dynamic[row]);
             assert_eq!(point.is_withheld, !dense.converged[row]);
@@ -111,7 +112,7 @@ fn las_and_laz_come_back_through_another_reader() {
 #[test]
 fn a_frame_past_sixteen_bits_is_refused_in_las_alone() {
     let mut dense = dense(3);
-    dense.frame[1] = 65_536;
+    dense.sweep[1] = 65_536;
     let error = write_dense(DenseFormat::Laz, &dense, &mut Vec::new()).unwrap_err();
     let text = error.to_string();
     assert!(text.contains("row 1 has frame 65536; write npz"), "{text}");

@@ -1,4 +1,4 @@
-//! Files that lie, break off or are built to cost: refused by name, cheaply, without a panic.
+//! Tests of invalid, truncated and oversized files: refused by name, cheaply and without a panic.
 
 use fnsf::flow::Point;
 use fnsf::formats::{FormatError, is_pair, read_av2_labels, read_cloud, read_flow, read_pair};
@@ -148,7 +148,7 @@ fn strangers_are_named() {
     assert!(read_flow(b"{\"flow\": [[1, 2]]}", None).is_err());
 }
 
-/// A small valid file of every kind, with a reader of it.
+/// A small valid file of every kind, with its name.
 fn every_valid_file() -> Vec<(String, Vec<u8>)> {
     let points = points(20);
     let pair = pair(20);
@@ -195,7 +195,7 @@ fn compressed_pcd(points: &[Point]) -> Vec<u8> {
     bytes
 }
 
-/// Every reader; whether any of them took the file.
+/// Calls every reader. Returns whether any of them accepts the file.
 fn read_all(bytes: &[u8], name: Option<&str>) -> bool {
     let cloud = read_cloud(bytes, name).is_ok();
     let flow = read_flow(bytes, name).is_ok();
@@ -211,8 +211,8 @@ fn every_valid_file_is_taken_whole() {
     }
 }
 
-/// Raw floats cut between rows are shorter files, and text cut inside its last number or before
-/// its last line feed may be whole; every other cut must be seen.
+/// Raw floats cut between rows are valid shorter files. Text cut inside its last number or before
+/// its last line feed may be valid. Every other cut must be detected.
 #[test]
 fn every_truncated_file_is_refused() {
     for (name, bytes) in every_valid_file() {

@@ -1,7 +1,7 @@
-//! Formats, seen from outside: what goes out comes back, what is hostile is refused, what is
-//! real is read.
+//! Tests of the file formats from outside: round trips, hostile files and real data.
 
-// cfg(test) is always set here; it tells clippy that the modules' plain functions are tests too.
+// cfg(test) is always set in this crate. It makes clippy treat the modules' helper functions as
+// tests.
 #[cfg(test)]
 mod bombs;
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! Poses of a sequence, and the ground that Argoverse 2's raster sees from them.
+//! Tests of pose files, and of the ground raster of Argoverse 2.
 
 use fnsf::flow::RigidTransform;
 use fnsf::formats::{FormatError, GroundRaster, matrix_rows, read_poses};
@@ -7,10 +7,10 @@ use proptest::prelude::*;
 
 use crate::samples::npy;
 
-/// A rotation goes through a quaternion and back in float64.
+/// Tolerance of a rotation that is converted to a quaternion and back in float64.
 const SAME: f64 = 1e-12;
 
-/// What a rotation of float32 keeps.
+/// Tolerance of a rotation in float32.
 const SINGLE: f64 = 1e-6;
 
 fn pose(index: usize) -> RigidTransform {
@@ -25,7 +25,7 @@ fn difference(left: &RigidTransform, right: &RigidTransform) -> f64 {
     (left.to_homogeneous() - right.to_homogeneous()).abs().max()
 }
 
-/// KITTI's text of `count` poses.
+/// The text of `count` poses in KITTI's format.
 fn text(count: usize) -> String {
     let line = |index: usize| {
         let rows = matrix_rows(&pose(index));
@@ -39,19 +39,19 @@ fn text(count: usize) -> String {
     (0..count).map(line).collect()
 }
 
-fn refusal(bytes: &[u8], frames: &[&str]) -> String {
-    read_poses(bytes, frames).unwrap_err().to_string()
+fn refusal(bytes: &[u8], sweeps: &[&str]) -> String {
+    read_poses(bytes, sweeps).unwrap_err().to_string()
 }
 
 #[test]
 fn text_and_json_have_a_pose_for_every_frame_in_order() {
-    let frames = ["b.bin", "a.bin", "c.bin"];
+    let sweeps = ["b.bin", "a.bin", "c.bin"];
     let json: Vec<String> = (0..3)
         .map(|index| format!("{:?}", matrix_rows(&pose(index))))
         .collect();
     let json = format!(" [{}]", json.join(","));
     for file in [text(3), text(3).replace('\n', " \r\n\n"), json] {
-        let poses = read_poses(file.as_bytes(), &frames).unwrap();
+        let poses = read_poses(file.as_bytes(), &sweeps).unwrap();
         assert_eq!(poses.len(), 3);
         for (index, found) in poses.iter().enumerate() {
             assert!(difference(found, &pose(index)) < SAME);
@@ -62,8 +62,8 @@ fn text_and_json_have_a_pose_for_every_frame_in_order() {
 
 #[test]
 fn frames_of_a_whole_drive_take_the_pose_of_their_number() {
-    let frames = ["velodyne/000004.bin", "000007.bin"];
-    let poses = read_poses(text(10).as_bytes(), &frames).unwrap();
+    let sweeps = ["velodyne/000004.bin", "000007.bin"];
+    let poses = read_poses(text(10).as_bytes(), &sweeps).unwrap();
     assert!(difference(&poses[0], &pose(4)) < SAME);
     assert!(difference(&poses[1], &pose(7)) < SAME);
     let text = refusal(text(10).as_bytes(), &["000004.bin", "000010.bin"]);
@@ -72,23 +72,23 @@ fn frames_of_a_whole_drive_take_the_pose_of_their_number() {
 
 #[test]
 fn what_is_no_pose_is_refused_by_line_or_frame() {
-    let frames = ["a.bin", "b.bin"];
+    let sweeps = ["a.bin", "b.bin"];
     let short = text(2).replacen(' ', "", 1);
-    assert!(refusal(short.as_bytes(), &frames).contains("line 1 is not 12 numbers"));
+    assert!(refusal(short.as_bytes(), &sweeps).contains("line 1 is not 12 numbers"));
     let long = text(2) + "1";
-    assert!(refusal(long.as_bytes(), &frames).contains("line 3 is not"));
+    assert!(refusal(long.as_bytes(), &sweeps).contains("line 3 is not"));
     let scaled = "1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0 0 0 1 0 0 0 0 1 0\n";
-    let told = refusal(scaled.as_bytes(), &frames);
+    let told = refusal(scaled.as_bytes(), &sweeps);
     assert!(told.contains("the pose of b.bin is no rigid"), "{told}");
     let lost = "1 0 0 nan 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0 1 0\n";
-    assert!(refusal(lost.as_bytes(), &frames).contains("the pose of a.bin"));
-    let error = read_poses(text(3).as_bytes(), &frames).unwrap_err();
+    assert!(refusal(lost.as_bytes(), &sweeps).contains("the pose of a.bin"));
+    let error = read_poses(text(3).as_bytes(), &sweeps).unwrap_err();
     assert!(matches!(error, FormatError::RowCount { .. }), "{error}");
-    assert!(refusal(b"[[1, 2]]", &frames).contains("not an array of 4 x 4"));
-    assert!(refusal(b"\xff\xff", &frames).contains("neither 12 numbers a line"));
+    assert!(refusal(b"[[1, 2]]", &sweeps).contains("not an array of 4 x 4"));
+    assert!(refusal(b"\xff\xff", &sweeps).contains("neither 12 numbers a line"));
 }
 
-/// A table as Argoverse 2 has it: time stamps as integers, the rest as float64.
+/// A pose table as in Argoverse 2: time stamps as integers, the rest as float64.
 fn av2(times: &[i64], poses: &[RigidTransform]) -> Vec<u8> {
     use arrow_array::{ArrayRef, Float64Array, Int64Array, RecordBatch};
     use std::sync::Arc;
@@ -122,11 +122,11 @@ fn argoverse_poses_are_found_by_time_stamp() {
         .collect();
     let poses: Vec<RigidTransform> = (0..20).map(pose).collect();
     let file = av2(&times, &poses);
-    let frames = [
+    let sweeps = [
         "lidar/315966265259848000.feather",
         "315966265259839000.feather",
     ];
-    let found = read_poses(&file, &frames).unwrap();
+    let found = read_poses(&file, &sweeps).unwrap();
     assert!(difference(&found[0], &pose(12)) < SINGLE);
     assert!(difference(&found[1], &pose(3)) < SINGLE);
     let told = refusal(&file, &["315966265259800000.feather"]);
@@ -139,11 +139,12 @@ fn argoverse_poses_are_found_by_time_stamp() {
     let mut broken = poses;
     broken[3].rotation =
         nalgebra::UnitQuaternion::new_unchecked(nalgebra::Quaternion::new(0.5, 0.0, 0.0, 0.0));
-    let told = refusal(&av2(&times, &broken), &frames);
+    let told = refusal(&av2(&times, &broken), &sweeps);
     assert!(told.contains("not a rigid transform"), "{told}");
 }
 
-/// Two rows of three cells of half a metre, the corner at (10, 20): level at 1 m, one cell unknown.
+/// Two rows of three cells of half a metre, with the corner at (10, 20). One cell is unknown, one
+/// is at 5 m, and the others are at 1 m.
 fn raster() -> (Vec<u8>, &'static str) {
     let heights = [1.0, 1.0, f32::NAN, 1.0, 1.0, 5.0_f32];
     let bytes: Vec<u8> = heights
@@ -163,9 +164,9 @@ fn points_near_or_below_the_raster_are_ground() {
         [0.2, 0.2, 0.29],
         [0.2, 0.2, 0.31],
         [0.2, 0.2, -9.0],
-        [1.2, 0.2, 0.0], // unknown
+        [1.2, 0.2, 0.0], // the unknown cell
         [1.2, 0.7, 4.2], // the higher cell
-        [1.6, 0.2, 0.0], // past the edges
+        [1.6, 0.2, 0.0], // outside the raster
         [0.2, 1.1, 0.0],
         [-0.6, 0.2, 0.0],
         [f32::NAN, 0.2, 0.0],

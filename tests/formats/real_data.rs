@@ -1,24 +1,21 @@
-//! Real sweeps, where the folder named by `FNSF_REAL_DATA` has them.
-
-use std::path::PathBuf;
+//! Tests on real sweeps, if `FNSF_REAL_DATA` names a folder that has them.
 
 use fnsf::flow::Point;
 use fnsf::formats::{
     GroundRaster, Pair, is_pair, read_av2_labels, read_cloud, read_flow, read_pair, read_poses,
 };
 
-/// Sweeps are float16 on disk and float32 in `pair.npz`: the same numbers, exactly.
+#[path = "../common/real_data.rs"]
+mod folder;
+
+/// Sweeps are float16 on disk and float32 in `pair.npz`. The conversion is exact.
 const SAME: f32 = 0.0;
 
-/// Flow in `pair.npz` is the labels' own float32.
+/// The flow in `pair.npz` is the float32 flow of the labels.
 const SAME_FLOW_M: f32 = 1e-6;
 
 fn real(path: &str) -> Option<Vec<u8>> {
-    let Some(folder) = std::env::var_os("FNSF_REAL_DATA") else {
-        println!("FNSF_REAL_DATA is unset: real data is not read");
-        return None;
-    };
-    let path = PathBuf::from(folder).join(path);
+    let path = folder::real_data()?.join(path);
     Some(std::fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display())))
 }
 
@@ -68,7 +65,7 @@ fn av2_labels_are_the_pairs_truth() {
     assert!(largest_difference(&labels.truth.flow, &truth.flow) <= SAME_FLOW_M);
     assert!(labels.truth.valid == truth.valid);
     assert!(labels.truth.dynamic == truth.dynamic);
-    // One point of 17,374 stands on the edge of the ground raster.
+    // One point of 17,374 lies on the edge of the ground raster.
     let ground = pair.ground.unwrap().source;
     assert!(
         labels
@@ -79,7 +76,7 @@ fn av2_labels_are_the_pairs_truth() {
             .count()
             <= 1
     );
-    // Two points lie in a box and carry class 0.
+    // Two points lie in a box and have class 0.
     assert_eq!(count(&labels.truth.foreground.unwrap()), 9_397);
     assert_eq!(count(&truth.foreground.unwrap()), 9_399);
     let dynamic = labels.truth.dynamic.unwrap();
@@ -119,7 +116,7 @@ fn the_small_gicp_ply_is_the_pairs_cloud() {
     }
 }
 
-/// In a static world the flow is what the ego motion says.
+/// In a static world the flow equals the motion of the points by the ego motion.
 #[test]
 fn the_static_pairs_flow_is_its_ego_motion() {
     // The transform was printed with six digits: 1e-6 off orthonormal, 0.1 mm at 75 m.

@@ -1,4 +1,4 @@
-//! What is written comes back, and every spelling of a format that the field uses is read.
+//! Tests that written files are read back, and that common variants of each format are read.
 
 use fnsf::flow::Point;
 use fnsf::formats::{
@@ -11,7 +11,7 @@ use crate::samples::{
     objects, pair, pair_file, points,
 };
 
-/// A rotation goes through a quaternion and back in float64.
+/// Tolerance of a rotation that is converted to a quaternion and back in float64.
 const SAME_EGO: f64 = 1e-12;
 
 #[test]
@@ -189,7 +189,7 @@ fn flow_formats_are_named_by_ending() {
     assert!(named("flow").is_err());
 }
 
-/// The same 2 x 3 points in every type, byte order and memory order that numpy saves.
+/// The same 2 x 3 points in the float types, byte orders and memory orders that numpy saves.
 #[test]
 fn npy_is_read_in_every_float_type_and_order() {
     let expected: Vec<Point> = vec![[1.0, 2.0, 3.0], [-4.0, 5.5, 6.0]];

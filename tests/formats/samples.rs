@@ -1,4 +1,4 @@
-//! Small files of every format, made by hand or by our own writers.
+//! Small files of every format, made by hand or by the library's writers.
 
 use fnsf::flow::{Cluster, Objects, OrientedBox, Point, RigidTransform};
 use fnsf::formats::{
@@ -23,7 +23,7 @@ pub(crate) const FLOW_FORMATS: [FlowFormat; 6] = [
     FlowFormat::Json,
 ];
 
-/// `count` points on a spiral: all different, none at the origin.
+/// `count` points on a spiral, all different and none at the origin.
 pub(crate) fn points(count: usize) -> Vec<Point> {
     let point = |index: usize| {
         let turn = index as f32 * 0.7;
@@ -87,7 +87,7 @@ pub(crate) fn pair_file(pair: &Pair) -> Vec<u8> {
     bytes
 }
 
-/// Two clusters, one of which moves; every third row is of none.
+/// Two clusters, one of which moves. Every third row belongs to none.
 pub(crate) fn objects(count: usize) -> Objects {
     let cluster = Cluster {
         points: count as u32 / 3,
@@ -129,7 +129,7 @@ pub(crate) fn flow_file(format: FlowFormat, pair: &Pair) -> Vec<u8> {
     bytes
 }
 
-/// An `.npy` file with a header of our choosing.
+/// An `.npy` file with the given header.
 pub(crate) fn npy(descr: &str, fortran: bool, shape: &str, data: &[u8]) -> Vec<u8> {
     let fortran = if fortran { "True" } else { "False" };
     let header = format!("{{'descr': {descr}, 'fortran_order': {fortran}, 'shape': {shape}, }}\n");
@@ -140,7 +140,7 @@ pub(crate) fn npy(descr: &str, fortran: bool, shape: &str, data: &[u8]) -> Vec<u
     bytes
 }
 
-/// A zip of arrays, each a name and the bytes of an `.npy` file.
+/// A zip of arrays, each given by its name and the bytes of an `.npy` file.
 pub(crate) fn npz(members: &[(&str, &[u8])]) -> Vec<u8> {
     use std::io::Write;
     let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
@@ -181,7 +181,7 @@ pub(crate) fn feather(columns: &[(&str, Vec<Option<f32>>)]) -> Vec<u8> {
     bytes
 }
 
-/// Literals only: the simplest stream that an LZF reader must take.
+/// An LZF stream of literals only, the simplest valid stream.
 pub(crate) fn lzf_literals(bytes: &[u8]) -> Vec<u8> {
     let run = |chunk: &[u8]| [&[chunk.len() as u8 - 1], chunk].concat();
     bytes.chunks(32).flat_map(run).collect()

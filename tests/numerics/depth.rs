@@ -1,17 +1,19 @@
-//! Depth of simulated streets: what the lidar measures and what the camera sees are one world.
+//! Tests of depth images of simulated streets: the lidar's points and the camera's depth must
+//! agree.
 
 use fnsf::flow::depth::{Camera, DepthImage, Intrinsics, Occlusion, project};
 use fnsf::flow::simulate::{Street, StreetError, StreetOptions};
 use fnsf::flow::{Point, RigidTransform};
 use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion};
 
-/// A pixel of 1/360 rad looks up to half of that beside the point that was measured.
+/// A pixel covers 1/360 rad, so its center is up to half of that off the measured point.
 const MEDIAN_M: f64 = 0.02;
 
-/// Share of points beside an edge of something, whose pixel looks past it.
+/// Share of points next to an edge of an object, whose pixel shows the background.
 const PAST_EDGES: f64 = 0.05;
 
-/// KITTI's camera, half its size: 6 cm beside, 8 cm below and 27 cm before the lidar.
+/// A camera with half of KITTI's resolution: 6 cm beside, 8 cm below and 27 cm in front of the
+/// lidar.
 fn camera() -> Camera {
     let intrinsics = Intrinsics {
         fx: 360.0,
@@ -25,10 +27,10 @@ fn camera() -> Camera {
     Camera::new(intrinsics, mount, [621, 187]).expect("a camera")
 }
 
-fn street(frames: usize) -> Street {
+fn street(sweeps: usize) -> Street {
     let options = StreetOptions {
         seed: 8,
-        frames,
+        sweeps,
         range_noise_m: 0.0,
         beam_bias_m: 0.0,
         dropout: 0.0,
@@ -37,11 +39,11 @@ fn street(frames: usize) -> Street {
     Street::new(&options).expect("a street")
 }
 
-/// The static points of every frame, in the frame of one of them.
+/// The static points of every sweep, in the frame of one of them, and all points of that one.
 fn static_world(street: &Street, into: usize) -> Vec<Point> {
-    let target = street.frame(into).expect("a frame");
+    let target = street.sweep(into).expect("a frame");
     let carried = |index: usize| {
-        let frame = street.frame(index).expect("a frame");
+        let frame = street.sweep(index).expect("a frame");
         let motion = target.world_from_sensor.inv_mul(&frame.world_from_sensor);
         let keep = move |object: i32| index == into || object < 0;
         let rows = frame.points.into_iter().zip(frame.object);
@@ -51,7 +53,7 @@ fn static_world(street: &Street, into: usize) -> Vec<Point> {
                 [there.x as f32, there.y as f32, there.z as f32]
             })
     };
-    (0..street.frames()).flat_map(carried).collect()
+    (0..street.sweeps()).flat_map(carried).collect()
 }
 
 fn errors(image: &DepthImage, truth: &DepthImage) -> fnsf::flow::depth::DepthErrors {
@@ -64,7 +66,7 @@ fn the_lidars_points_lie_on_what_the_camera_sees() {
     for index in 0..2 {
         let truth = street.depth(index, &camera()).unwrap();
         assert!(truth.density() > 0.85, "{}", truth.density());
-        let measured = project(&street.frame(index).unwrap().points, &camera());
+        let measured = project(&street.sweep(index).unwrap().points, &camera());
         let errors = errors(&measured, &truth);
         assert!(errors.pixels > 8_000, "{errors:?}");
         assert!(errors.median_m < MEDIAN_M, "{errors:?}");
@@ -82,10 +84,10 @@ fn a_camera_in_the_lidars_place_finds_the_lidars_ranges() {
     let camera = Camera::new(camera().intrinsics(), mount, [621, 187]).unwrap();
     let street = street(1);
     let truth = street.depth(0, &camera).unwrap();
-    let measured = project(&street.frame(0).unwrap().points, &camera);
+    let measured = project(&street.sweep(0).unwrap().points, &camera);
     let errors = errors(&measured, &truth);
     assert!(errors.median_m < MEDIAN_M, "{errors:?}");
-    // Without parallax nothing is seen past an edge but by half a pixel.
+    // Without parallax only the pixel size lets a pixel show the background of an edge.
     assert!(errors.within_5_percent > 0.97, "{errors:?}");
 }
 
@@ -94,19 +96,19 @@ fn ten_sweeps_see_three_times_as_much_as_one_and_nothing_through_walls() {
     let street = street(10);
     let into = 5;
     let truth = street.depth(into, &camera()).unwrap();
-    let sparse = project(&street.frame(into).unwrap().points, &camera());
+    let sparse = project(&street.sweep(into).unwrap().points, &camera());
     let dense = project(&static_world(&street, into), &camera());
     assert!(dense.density() > 3.0 * sparse.density());
-    // Sweeps from elsewhere have seen what stands behind the houses.
+    // Other sweeps contain points behind the houses, which this camera cannot observe.
     let before = errors(&dense, &truth);
     assert!(before.within_5_percent < 0.8, "{before:?}");
-    let clean = dense.without_hidden(&Occlusion::of(&camera()));
+    let clean = dense.without_occluded(&Occlusion::of(&camera()));
     let after = errors(&clean, &truth);
     assert!(clean.density() > 2.0 * sparse.density());
     assert!(after.within_5_percent > 0.96, "{after:?}");
     assert!(after.mean_m < 0.25 * before.mean_m, "{after:?}");
-    // One sweep has little to lose.
-    let alone = sparse.without_hidden(&Occlusion::of(&camera()));
+    // The filter removes few points of a single sweep.
+    let alone = sparse.without_occluded(&Occlusion::of(&camera()));
     assert!(alone.density() > 0.95 * sparse.density());
 }
 
@@ -115,9 +117,9 @@ fn a_frame_that_the_street_does_not_have_has_no_depth() {
     let refused = street(2).depth(2, &camera());
     assert_eq!(
         refused,
-        Err(StreetError::NoSuchFrame {
+        Err(StreetError::ReferenceTimeOutOfRange {
             frame: 2,
-            frames: 2
+            sweeps: 2
         })
     );
 }

@@ -1,4 +1,4 @@
-//! The ego motion that comes with an estimate, against known poses. `examples/ego.rs` has the
+//! Tests of the estimated ego motion against known poses. `examples/ego.rs` prints the measured
 //! figures.
 
 use fnsf::flow::cpu::CpuBackend;
@@ -8,15 +8,15 @@ use fnsf::formats::Pair;
 
 use super::scenes::{real_pair, street};
 
-/// What is asked of it.
+/// Maximum errors.
 const TRANSLATION_M: f64 = 0.02;
 const ROTATION_DEGREES: f64 = 0.1;
-/// What it does on sweeps of 64 beams.
+/// Maximum errors, metres and degrees, on sweeps of 64 beams from a vehicle.
 const DRIVEN: [f64; 2] = [0.012, 0.04];
-/// Half of small_gicp's points lie within 3.6 m of who carried the lidar, and its pose is itself from
-/// a registration. Seen: up to 0.24 degrees, as voxels fall.
+/// Half of small_gicp's points lie within 3.6 m of the person with the lidar, and its pose is
+/// itself from a registration. Observed: up to 0.24 degrees, depending on the voxel borders.
 const HANDHELD: [f64; 2] = [TRANSLATION_M, 0.3];
-/// Two rings of 16 beams rarely see the same wall. Seen: up to 0.11 degrees.
+/// Two rings of 16 beams rarely hit the same wall. Observed: up to 0.11 degrees.
 const SPARSE_DEGREES: f64 = 0.15;
 
 /// The ego motion of an estimate without iterations.
@@ -27,24 +27,24 @@ fn found(pair: &Pair, ground: Ground, max_points: Option<usize>) -> RigidTransfo
         target: &pair.target,
         ground: Some([&masks.source, &masks.target]),
         before: None,
-        around: &[],
+        neighbors: &[],
     };
     let mut options = Preset::Neural.options(max_points);
     options.ground = ground;
-    options.max_iterations = 0;
+    options.field_mut().expect("a field").max_iterations = 0;
     let backend = CpuBackend::new(Some(2)).expect("threads");
     let estimate = estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
     estimate.ego.expect("it was asked for")
 }
 
-/// Metres and degrees off.
+/// Errors in metres and degrees.
 fn gap(found: &RigidTransform, truth: &RigidTransform) -> [f64; 2] {
     let gap = truth.inv_mul(found);
     let degrees = gap.rotation.angle().to_degrees();
     [gap.translation.vector.norm(), degrees]
 }
 
-/// The same pair, the later sweep first.
+/// The same pair with source and target swapped.
 fn reversed(pair: Pair) -> Pair {
     let ground = pair.ground.map(|ground| fnsf::formats::Ground {
         source: ground.target,

@@ -1,4 +1,4 @@
-//! A card on a real pair, beside the CPU. Needs a card; a software one will do.
+//! Tests of a GPU on a real pair, compared with the CPU. They need a GPU; a software one suffices.
 
 use fnsf::flow::Preset;
 use fnsf::flow::cpu::{CpuBackend, Isa};
@@ -18,10 +18,10 @@ fn a_card_gives_the_cpus_flow_on_argoverse_2_bit_by_bit() {
     }
     let gpu = Gpu::open(&cards[0], &GpuOptions::default()).expect("the card opens");
     let mut options = Preset::Neural.options(Some(8192));
-    options.range_m = Some(51.2);
+    options.crop_m = Some(51.2);
     let card = solve_on(&gpu, &pair, &options);
-    // Some cards round a product before they add to it, as the portable kernels do, others do not,
-    // as the others do.
+    // Some GPUs round a product before the addition, as the portable kernels do. Others use fused
+    // multiply-add, as the other kernels do.
     let cpus = Isa::available().into_iter().map(|isa| {
         let cpu = CpuBackend::with_isa(isa, Some(2)).expect("threads");
         solve_on(&cpu, &pair, &options)
@@ -30,9 +30,9 @@ fn a_card_gives_the_cpus_flow_on_argoverse_2_bit_by_bit() {
     let errors: Vec<_> = cpus.iter().map(|cpu| scored(&pair, cpu).epe).collect();
     let same = cpus.iter().any(|cpu| cpu.flow == card.flow);
     assert!(same, "{} {errors:?}", scored(&pair, &card).epe);
-    // Twice the same bits, on fewer points: a software card takes its time.
+    // Twice the same bits, on fewer points because a software GPU is slow.
     let mut fewer = Preset::Neural.options(Some(1024));
-    fewer.max_iterations = 40;
+    fewer.field_mut().expect("a field").max_iterations = 40;
     let [first, second] = [(), ()].map(|()| solve_on(&gpu, &pair, &fewer).flow);
     assert!(first == second);
 }

@@ -1,4 +1,4 @@
-//! Ground found without a mask: simulated streets, real sweeps, and both of them disturbed.
+//! Tests of the ground segmentation: simulated streets, real sweeps, and both with disturbances.
 
 use fnsf::flow::Point;
 use fnsf::flow::ground::{GroundOptions, GroundSegmentation, segment};
@@ -8,12 +8,12 @@ use proptest::prelude::*;
 
 use super::scenes::real_pair;
 
-/// What is asked of precision and of recall.
+/// Minimum precision and recall.
 const ENOUGH: f64 = 0.95;
-/// Within this distance of the origin, metres.
+/// Range of the evaluated points, metres.
 const WITHIN_M: f32 = 35.0;
 
-/// A sweep and which of its points are ground.
+/// A sweep and its ground labels.
 struct ObjectSearch {
     name: String,
     points: Vec<Point>,
@@ -42,7 +42,7 @@ impl ObjectSearch {
         segment(&self.points, &GroundOptions::default())
     }
 
-    /// Precision and recall near the origin.
+    /// Precision and recall within `WITHIN_M` of the origin.
     fn score(&self) -> [f64; 2] {
         let found = self.found().ground;
         let near = |row: &usize| self.points[*row][0].hypot(self.points[*row][1]) < WITHIN_M;
@@ -67,7 +67,7 @@ impl ObjectSearch {
 
 fn street(options: &StreetOptions) -> ObjectSearch {
     let frame = Street::new(options)
-        .and_then(|street| street.frame(0))
+        .and_then(|street| street.sweep(0))
         .expect("a street");
     ObjectSearch {
         name: format!("{} beams, seed {}", options.beams, options.seed),
@@ -76,7 +76,7 @@ fn street(options: &StreetOptions) -> ObjectSearch {
     }
 }
 
-/// Streets of 16 to 128 beams.
+/// Streets with 16 to 128 beams.
 fn streets(seeds: u64) -> impl Iterator<Item = ObjectSearch> {
     (0..seeds).flat_map(|seed| {
         [16, 32, 64, 128].map(|beams| {
@@ -90,7 +90,7 @@ fn streets(seeds: u64) -> impl Iterator<Item = ObjectSearch> {
     })
 }
 
-/// Both sweeps of the real pairs that have ground labels; none where there is no real data.
+/// Both sweeps of the real pairs with ground labels; none without real data.
 fn real_sweeps() -> Vec<ObjectSearch> {
     let mut sweeps = Vec::new();
     for name in ["av2_7fab", "kitti_0000", "small_gicp"] {
@@ -209,7 +209,7 @@ fn mirror_images_below_the_ground_are_told_from_it() {
 
 #[test]
 fn a_sweep_whose_ground_was_taken_off_has_none() {
-    // The mask of kitti_0000 leaves 2,000 points on the ground, so that pair is not asked.
+    // The mask of kitti_0000 misses 2,000 ground points, so that pair is not used.
     let taken_off = |sweep: ObjectSearch| sweep.kept(|row| !sweep.ground[row]);
     let real = real_sweeps().into_iter().filter(|s| s.name != "kitti_0000");
     for sweep in streets(3).chain(real).map(taken_off) {

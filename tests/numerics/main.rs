@@ -1,19 +1,21 @@
-//! The numerics as a whole, on simulated streets and on real pairs with ground truth.
+//! Tests of the numerics as a whole, on simulated streets and on real pairs with ground truth.
 //!
-//! Real pairs are read from the folder that `FNSF_REAL_DATA` names; without it those tests say so
-//! and pass. They never are part of the project.
+//! Real pairs are read from the folder `FNSF_REAL_DATA`. They are not part of the project. Without
+//! the folder their tests print a message and pass, or fail where `FNSF_REQUIRE_REAL_DATA` is `1`.
 
 mod accuracy;
 mod deadlines;
 mod depth;
 mod ego;
-mod frames;
 mod gpu;
 #[path = "../common/gpu.rs"]
 mod gpu_rule;
 mod ground;
 mod labels;
 mod prices;
+#[path = "../common/real_data.rs"]
+mod real_data;
 mod resumption;
 mod scenes;
 mod sequences;
+mod sweeps;

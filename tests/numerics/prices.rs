@@ -1,4 +1,4 @@
-//! What an estimate is priced at, against what it takes.
+//! Tests of the predicted cost of an estimate against its actual memory and work.
 
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::distance::{DistanceError, Metric, Sites};
@@ -9,7 +9,7 @@ use fnsf::flow::{Ground, Options, Preset, Problem, estimate, price};
 
 use super::scenes::{real_pair, solve, street};
 
-/// Everything beside the transform's own bytes: sites, points and the network's working sets.
+/// Bound on the memory beside the distance transform: sites, points and the network's working sets.
 const BESIDE_BYTES: usize = 48 << 20;
 const BESIDE_SHARE: f64 = 1.5;
 
@@ -24,20 +24,23 @@ fn bytes_and_bricks_are_never_below_the_truth_and_not_far_above() {
             target: &pair.target,
             ground: Some([&ground.source, &ground.target]),
             before: None,
-            around: &[],
+            neighbors: &[],
         };
         for sites in [Sites::Cells, Sites::Points] {
             for max_points in [None, Some(5000)] {
                 let mut options = Preset::Neural.options(max_points);
                 options.ground = Ground::Mask;
-                options.distance.sites = sites;
-                options.max_iterations = 0;
+                options.field_mut().expect("a field").distance.sites = sites;
+                options.field_mut().expect("a field").max_iterations = 0;
                 let price = price(&problem, &options).expect("it is taken");
                 let estimate = solve(&pair, &options);
                 assert_eq!(price.source_points, estimate.points);
-                assert_eq!(price.transform_bytes, estimate.distance_bytes);
-                assert!(price.bytes >= estimate.distance_bytes);
-                let most = estimate.distance_bytes as f64 * BESIDE_SHARE;
+                assert_eq!(
+                    price.transform_bytes,
+                    estimate.fit().expect("a fit").distance_bytes
+                );
+                assert!(price.bytes >= estimate.fit().expect("a fit").distance_bytes);
+                let most = estimate.fit().expect("a fit").distance_bytes as f64 * BESIDE_SHARE;
                 assert!(price.bytes <= most as usize + BESIDE_BYTES, "{price:?}");
             }
         }
@@ -50,13 +53,7 @@ fn work_grows_with_iterations_points_and_detail() {
         azimuth_steps: 400,
         ..StreetOptions::default()
     });
-    let problem = Problem {
-        source: &pair.source,
-        target: &pair.target,
-        ground: None,
-        before: None,
-        around: &[],
-    };
+    let problem = Problem::pair(&pair.source, &pair.target);
     let work = |options: &Options| price(&problem, options).expect("taken").multiply_adds;
     let base = Preset::Neural.options(None);
     let change = |change: fn(&mut Options)| {
@@ -64,9 +61,11 @@ fn work_grows_with_iterations_points_and_detail() {
         change(&mut options);
         work(&options)
     };
-    assert!(change(|o| o.max_iterations = 300) > work(&base));
-    assert!(change(|o| o.batch = None) > work(&base));
-    assert!(change(|o| o.distance.sites = Sites::Points) > work(&base));
+    assert!(change(|o| o.field_mut().expect("a field").max_iterations = 300) > work(&base));
+    assert!(change(|o| o.field_mut().expect("a field").batch = None) > work(&base));
+    assert!(
+        change(|o| o.field_mut().expect("a field").distance.sites = Sites::Points) > work(&base)
+    );
     assert!(change(|o| o.max_points = Some(1000)) < work(&base));
     assert!(work(&Preset::Paper.options(None)) > work(&base));
     let paper = price(&problem, &Preset::Paper.options(None)).expect("taken");
@@ -80,13 +79,13 @@ fn what_the_estimate_refuses_has_no_price() {
     let flags = [false; 2];
     let backend = CpuBackend::new(Some(1)).expect("threads");
     let mut options = Preset::Neural.options(None);
-    options.max_iterations = 0;
+    options.field_mut().expect("a field").max_iterations = 0;
     let mut masked = options.clone();
     masked.ground = Ground::Mask;
     let mut tight = options.clone();
-    tight.distance.max_bytes = 1000;
+    tight.field_mut().expect("a field").distance.max_bytes = 1000;
     let mut dense = tight.clone();
-    dense.distance.metric = Metric::Chamfer;
+    dense.field_mut().expect("a field").distance.metric = Metric::Chamfer;
     let cases = [
         (&cloud[..2], None, &options),
         (&wide[..], None, &options),
@@ -101,20 +100,14 @@ fn what_the_estimate_refuses_has_no_price() {
             target: &cloud,
             ground,
             before: None,
-            around: &[],
+            neighbors: &[],
         };
         let refused = price(&problem, options).expect_err("refused");
         let truth = estimate(&backend, &problem, options, &Uncontrolled).expect_err("refused");
         assert_eq!(refused.to_string(), truth.to_string());
         assert!(refused.is_input());
     }
-    let problem = Problem {
-        source: &cloud,
-        target: &cloud,
-        ground: None,
-        before: None,
-        around: &[],
-    };
+    let problem = Problem::pair(&cloud, &cloud);
     assert!(matches!(
         price(&problem, &tight),
         Err(FlowError::Backend(BackendError::Distance(
@@ -129,13 +122,7 @@ fn a_search_for_objects_is_priced_by_all_points_whatever_is_drawn() {
         azimuth_steps: 400,
         ..StreetOptions::default()
     });
-    let problem = Problem {
-        source: &pair.source,
-        target: &pair.target,
-        ground: None,
-        before: None,
-        around: &[],
-    };
+    let problem = Problem::pair(&pair.source, &pair.target);
     for preset in [Preset::Default, Preset::Label] {
         let of = |max_points| price(&problem, &preset.options(max_points)).expect("taken");
         assert_eq!(of(Some(100)), of(None));

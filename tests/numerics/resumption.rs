@@ -1,5 +1,5 @@
-//! An optimization put down and taken up again ends as if nothing had happened; bytes that are no
-//! snapshot of it are refused.
+//! Tests of snapshots: a resumed fit ends with the bits of an uninterrupted one, and invalid or
+//! foreign snapshots are refused.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -14,7 +14,7 @@ use fnsf::formats::Pair;
 
 use super::scenes::street;
 
-/// Asks for a snapshot after some iterations and ends the run once it has it.
+/// Requests a snapshot after some iterations and cancels the run once it has one.
 struct PutDown {
     after: usize,
     done: AtomicUsize,
@@ -40,17 +40,17 @@ impl Control for PutDown {
         self.taken().is_some().then_some(Interrupt::Cancelled)
     }
     fn progress(&self, progress: Progress) {
-        self.done.store(progress.iteration, Ordering::Relaxed);
+        self.done.store(progress.done, Ordering::Relaxed);
     }
     fn snapshot_due(&self) -> bool {
         self.done.load(Ordering::Relaxed) >= self.after && self.taken().is_none()
     }
-    fn snapshot(&self, snapshot: Snapshot) {
-        *self.taken() = Some(snapshot);
+    fn snapshot(&self, bytes: Vec<u8>) {
+        *self.taken() = Some(Snapshot::from_bytes(&bytes).expect("a sound snapshot"));
     }
 }
 
-/// Lets a run go on to its end.
+/// Lets a run finish.
 struct Onward;
 
 impl Control for Onward {}
@@ -71,20 +71,14 @@ fn run(
     control: &dyn Control,
 ) -> Result<Estimate, FlowError> {
     let backend = CpuBackend::new(Some(threads)).expect("threads");
-    let problem = Problem {
-        source: &pair.source,
-        target: &pair.target,
-        ground: None,
-        before: None,
-        around: &[],
-    };
+    let problem = Problem::pair(&pair.source, &pair.target);
     match snapshot {
         None => estimate(&backend, &problem, options, control),
         Some(snapshot) => resume(&backend, &problem, options, snapshot, control),
     }
 }
 
-/// The snapshot after so many iterations, on its way through bytes.
+/// The snapshot after `after` iterations, encoded to bytes and decoded again.
 fn put_down(pair: &Pair, options: &Options, from: Option<Snapshot>, after: usize) -> Snapshot {
     let control = PutDown::after(after);
     let error = run(pair, options, 2, from, &control).expect_err("it is cancelled");
@@ -97,11 +91,12 @@ fn put_down(pair: &Pair, options: &Options, from: Option<Snapshot>, after: usize
 #[test]
 fn a_run_that_was_put_down_ends_with_the_bits_of_one_that_was_not() {
     let pair = small_street();
-    for preset in Preset::FITTED {
+    for preset in Preset::with_field() {
         let mut options = preset.options(None);
-        options.batch = options.batch.map(|_| 700);
+        let field = options.field_mut().expect("a field");
+        field.batch = field.batch.map(|_| 700);
         let undisturbed = run(&pair, &options, 2, None, &Onward).expect("a flow");
-        let halfway = undisturbed.iterations / 2;
+        let halfway = undisturbed.fit().expect("a fit").iterations / 2;
         for stops in [vec![1], vec![halfway], vec![2, 3, halfway, halfway + 5]] {
             let mut snapshot = None;
             for after in stops {
@@ -109,9 +104,18 @@ fn a_run_that_was_put_down_ends_with_the_bits_of_one_that_was_not() {
             }
             let resumed = run(&pair, &options, 1, snapshot, &Onward).expect("a flow");
             assert!(resumed.flow == undisturbed.flow, "{preset:?}");
-            assert_eq!(resumed.iterations, undisturbed.iterations);
-            assert_eq!(resumed.best_iteration, undisturbed.best_iteration);
-            assert_eq!(resumed.best_loss.to_bits(), undisturbed.best_loss.to_bits());
+            assert_eq!(
+                resumed.fit().expect("a fit").iterations,
+                undisturbed.fit().expect("a fit").iterations
+            );
+            assert_eq!(
+                resumed.fit().expect("a fit").best_iteration,
+                undisturbed.fit().expect("a fit").best_iteration
+            );
+            assert_eq!(
+                resumed.fit().expect("a fit").best_loss.to_bits(),
+                undisturbed.fit().expect("a fit").best_loss.to_bits()
+            );
             assert_eq!(resumed.stop_reason, undisturbed.stop_reason);
         }
         if preset == Preset::Paper {
@@ -122,31 +126,31 @@ fn a_run_that_was_put_down_ends_with_the_bits_of_one_that_was_not() {
 
 #[test]
 fn taking_snapshots_changes_nothing() {
-    /// Takes one after every iteration.
+    /// Takes a snapshot after every iteration.
     #[derive(Default)]
     struct Always(AtomicUsize);
     impl Control for Always {
         fn snapshot_due(&self) -> bool {
             true
         }
-        fn snapshot(&self, _: Snapshot) {
+        fn snapshot(&self, _: Vec<u8>) {
             self.0.fetch_add(1, Ordering::Relaxed);
         }
     }
     let pair = small_street();
     let mut options = Preset::Neural.options(None);
-    options.max_iterations = 12;
+    options.field_mut().expect("a field").max_iterations = 12;
     let always = Always::default();
     let watched = run(&pair, &options, 2, None, &always).expect("a flow");
     let plain = run(&pair, &options, 2, None, &Onward).expect("a flow");
     assert!(watched.flow == plain.flow);
-    // After the last iteration there is nothing to put down.
+    // No snapshot is taken after the last iteration.
     assert_eq!(always.0.into_inner(), 11);
 }
 
 #[test]
 fn torn_and_altered_snapshots_are_refused() {
-    // Every byte of the header and of the end, and bytes all over the floats.
+    // Every byte of the header and of the end, and some bytes of the floats.
     const EDGE: usize = 128;
     const STRIDE: usize = 9973;
     let pair = small_street();
@@ -185,7 +189,7 @@ fn a_foreign_snapshot_is_refused() {
     let mut other_seed = options.clone();
     other_seed.seed = 1;
     let mut longer = options.clone();
-    longer.max_iterations += 1;
+    longer.field_mut().expect("a field").max_iterations += 1;
     let mut other_pair = pair.clone();
     other_pair.target[7][1] += 0.25;
     let foreign = [

@@ -1,10 +1,8 @@
-//! Pairs to solve, and how well they were solved.
+//! Pairs for the tests, and the errors of their flow.
 #![expect(
     clippy::print_stdout,
     reason = "a test that cannot run for want of data says so"
 )]
-
-use std::path::PathBuf;
 
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Metrics, Truth, evaluate};
@@ -13,18 +11,16 @@ use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::flow::{self, Estimate, Ground, Options, Problem, Uncontrolled};
 use fnsf::formats::{Pair, PairTruth, read_pair};
 
-/// The real pair of that name; none, said aloud, where there is no real data.
+use super::real_data::real_data;
+
+/// The real pair of that name. None, with a message, without real data.
 pub(crate) fn real_pair(name: &str) -> Option<Pair> {
-    let Some(folder) = std::env::var_os("FNSF_REAL_DATA") else {
-        println!("FNSF_REAL_DATA is not set: {name} is not tested");
-        return None;
-    };
-    let path = PathBuf::from(folder).join(name).join("pair.npz");
+    let path = real_data()?.join(name).join("pair.npz");
     let bytes = std::fs::read(&path).expect("FNSF_REAL_DATA holds the pair");
     Some(read_pair(&bytes).expect("the pair is sound"))
 }
 
-/// A simulated pair with its truth.
+/// A simulated pair with its ground truth.
 pub(crate) fn street(options: &StreetOptions) -> Pair {
     let simulated = Street::new(options)
         .and_then(|street| street.pair(0))
@@ -47,13 +43,13 @@ pub(crate) fn street(options: &StreetOptions) -> Pair {
     }
 }
 
-/// The pair's flow without its ground, on two threads.
+/// Estimates the pair without its ground points, on two CPU threads.
 pub(crate) fn solve(pair: &Pair, options: &Options) -> Estimate {
     let backend = CpuBackend::new(Some(2)).expect("threads");
     solve_on(&backend, pair, options)
 }
 
-/// The pair's flow without its ground, on a device.
+/// Estimates the pair without its ground points, on the given backend.
 pub(crate) fn solve_on(backend: &dyn Backend, pair: &Pair, options: &Options) -> Estimate {
     let ground = pair.ground.as_ref().expect("the pair has ground masks");
     let problem = Problem {
@@ -61,7 +57,7 @@ pub(crate) fn solve_on(backend: &dyn Backend, pair: &Pair, options: &Options) ->
         target: &pair.target,
         ground: Some([&ground.source, &ground.target]),
         before: None,
-        around: &[],
+        neighbors: &[],
     };
     let options = Options {
         ground: Ground::Mask,
@@ -70,12 +66,12 @@ pub(crate) fn solve_on(backend: &dyn Backend, pair: &Pair, options: &Options) ->
     flow::estimate(backend, &problem, &options, &Uncontrolled).expect("a flow")
 }
 
-/// The error of the pair's flow by `options`.
+/// The error metrics of the pair's flow, estimated with `options`.
 pub(crate) fn score(pair: &Pair, options: &Options) -> Metrics {
     scored(pair, &solve(pair, options))
 }
 
-/// The error of a flow of the pair.
+/// The error metrics of an estimate of the pair.
 pub(crate) fn scored(pair: &Pair, estimate: &Estimate) -> Metrics {
     let known = pair.truth.as_ref().expect("the pair has truth");
     let ground = pair.ground.as_ref().expect("the pair has ground masks");
@@ -87,7 +83,7 @@ pub(crate) fn scored(pair: &Pair, estimate: &Estimate) -> Metrics {
     evaluate(&estimate.flow, &estimate.valid, &truth).expect("points to score")
 }
 
-/// The middle EPE of several seeds, and the largest, metres.
+/// The median EPE over several seeds, and the largest, metres.
 pub(crate) fn median_and_worst(pair: &Pair, options: &Options, seeds: u64) -> [f64; 2] {
     let epe = |seed| {
         score(

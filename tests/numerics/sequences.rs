@@ -1,24 +1,24 @@
-//! Sequences: each pair starts from the one before, and all sweeps fall together in one frame.
+//! Tests of sequences: the warm start of each pair from the previous one, and densification.
 
 use std::collections::BTreeMap;
 
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::densify::{FlowEdge, LaterSweeps, Plan, densify};
-use fnsf::flow::simulate::{Frame, Street, StreetOptions};
+use fnsf::flow::simulate::{Street, StreetOptions, StreetSweep};
 use fnsf::flow::{
     DenseCloud, Ego, Estimate, MotionField, Options, Point, Preset, Problem, Residual, Sequence,
     Sweep, Uncontrolled, estimate,
 };
 
-/// Sweeps of the drive, and the one that all are carried into.
+/// Number of sweeps of the drive, and the index of the reference sweep.
 const FRAMES: usize = 11;
 const INTO: usize = 5;
-/// Residual motion of a step from which a point moves, metres.
+/// Residual motion per sweep interval from which a point counts as moving, metres.
 const MOVING_M: f64 = 0.05;
 
-fn drive(frames: usize) -> Street {
+fn drive(sweeps: usize) -> Street {
     let options = StreetOptions {
-        frames,
+        sweeps,
         beams: 32,
         azimuth_steps: 1000,
         ..StreetOptions::default()
@@ -61,12 +61,12 @@ fn mean(values: impl Iterator<Item = f64>) -> f64 {
 
 #[test]
 fn a_pair_of_a_sequence_takes_fewer_iterations_than_alone_and_is_no_worse() {
-    /// Between one start and another, EPE varies by a fifth.
+    /// The EPE varies by a fifth between random initializations.
     const NO_WORSE: f64 = 1.2;
     let street = drive(5);
     let pairs: Vec<_> = (0..4).map(|k| street.pair(k).expect("a pair")).collect();
     let sweeps: Vec<_> = (0..5)
-        .map(|k| street.frame(k).expect("a frame").points)
+        .map(|k| street.sweep(k).expect("a frame").points)
         .collect();
     let options = Preset::Neural.options(None);
     let together = in_sequence(&sweeps, &options);
@@ -77,21 +77,16 @@ fn a_pair_of_a_sequence_takes_fewer_iterations_than_alone_and_is_no_worse() {
     };
     let mut sums = [0.0; 2];
     for (k, pair) in pairs.iter().enumerate() {
-        let problem = Problem {
-            source: &pair.source,
-            target: &pair.target,
-            ground: None,
-            before: None,
-            around: &[],
-        };
+        let problem = Problem::pair(&pair.source, &pair.target);
         let alone = estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
         if k == 0 {
             assert_eq!(alone.flow, together[0].flow, "the first has none before it");
         } else {
             assert!(
-                together[k].iterations * 2 <= alone.iterations,
+                together[k].fit().expect("a fit").iterations * 2
+                    <= alone.fit().expect("a fit").iterations,
                 "pair {k}: {} iterations",
-                together[k].iterations
+                together[k].fit().expect("a fit").iterations
             );
             sums[0] += epe(&alone, k);
             sums[1] += epe(&together[k], k);
@@ -102,17 +97,21 @@ fn a_pair_of_a_sequence_takes_fewer_iterations_than_alone_and_is_no_worse() {
 
 #[test]
 fn a_field_that_does_not_explain_the_next_pair_is_not_started_from() {
-    let points = drive(1).frame(0).expect("a frame").points;
+    let points = drive(1).sweep(0).expect("a sweep").points;
     let shifted: Vec<Point> = points.iter().map(|[x, y, z]| [x + 0.8, *y, *z]).collect();
     let mut options = Preset::Neural.options(None);
-    // The field itself has to explain that everything moves, and then that nothing does.
+    // The field has to explain first that all points move, then that none do.
     options.ego = Ego::Off;
     let estimates = in_sequence(&[points, shifted.clone(), shifted], &options);
-    let iterations: Vec<_> = estimates.iter().map(|e| e.iterations).collect();
-    assert_eq!(iterations, [options.max_iterations; 2]);
+    let iterations: Vec<_> = estimates
+        .iter()
+        .map(|e| e.fit().expect("a fit").iterations)
+        .collect();
+    let most = options.field().expect("a field").max_iterations;
+    assert_eq!(iterations, [most; 2]);
 }
 
-/// Fits the plan's legs, each chain from its beginning.
+/// Estimates the motion fields of the plan's edges, each chain in its order.
 fn fields(sweeps: &[Vec<Point>], plan: &Plan, preset: Preset) -> BTreeMap<FlowEdge, MotionField> {
     let (backend, options) = (backend(), preset.options(None));
     let mut fields = BTreeMap::new();
@@ -133,16 +132,17 @@ fn fields(sweeps: &[Vec<Point>], plan: &Plan, preset: Preset) -> BTreeMap<FlowEd
         }
         estimates.extend(sequence.finish(&backend, &Uncontrolled).expect("the rest"));
         assert_eq!(edges.len(), estimates.len());
-        let found = estimates.into_iter().map(|estimate| estimate.field);
+        let found = estimates.into_iter().map(|estimate| estimate.motion);
         fields.extend(edges.into_iter().zip(found));
     }
     fields
 }
 
-/// Mean errors of a sweep's movers and of its static points off the ground, carried to another.
-fn errors(street: &Street, frame: &Frame, cloud: &DenseCloud) -> [f64; 2] {
+/// Mean errors of a sweep's moving points and of its static points off the ground, moved to the
+/// reference sweep, metres.
+fn errors(street: &Street, frame: &StreetSweep, cloud: &DenseCloud) -> [f64; 2] {
     let first = cloud
-        .frame
+        .sweep
         .iter()
         .position(|&place| place as usize == frame.index)
         .expect("the sweep is there");
@@ -173,15 +173,16 @@ fn errors(street: &Street, frame: &Frame, cloud: &DenseCloud) -> [f64; 2] {
 
 #[test]
 fn movers_are_carried_to_half_of_what_ego_motion_alone_leaves_and_the_static_world_stays() {
-    /// Metres that the static world may be off after five steps, by estimated ego motion.
+    /// Maximum error of the static points after five sweep intervals by estimated ego motion,
+    /// metres.
     const STATIC_M: f64 = 0.06;
     let street = drive(FRAMES);
-    let frames: Vec<_> = (0..FRAMES)
-        .map(|k| street.frame(k).expect("a frame"))
+    let scanned: Vec<_> = (0..FRAMES)
+        .map(|k| street.sweep(k).expect("a frame"))
         .collect();
-    let sweeps: Vec<_> = frames.iter().map(|frame| frame.points.clone()).collect();
+    let sweeps: Vec<_> = scanned.iter().map(|sweep| sweep.points.clone()).collect();
     let plan = Plan::new(FRAMES, INTO as f64, LaterSweeps::Reverse, 1).expect("a plan");
-    let masked: Vec<Sweep> = frames
+    let masked: Vec<Sweep> = scanned
         .iter()
         .map(|frame| Sweep {
             points: frame.points.clone(),
@@ -202,7 +203,7 @@ fn movers_are_carried_to_half_of_what_ego_motion_alone_leaves_and_the_static_wor
         let sums = |fields: &BTreeMap<FlowEdge, MotionField>| {
             let field = |edge: FlowEdge| fields.get(&edge);
             let cloud = densify(&backend(), &plan, &masked, field, &Uncontrolled).expect("a cloud");
-            let errors = oldest.map(|k| errors(&street, &frames[k], &cloud));
+            let errors = oldest.map(|k| errors(&street, &scanned[k], &cloud));
             [0, 1].map(|class| mean(errors.iter().map(|error| error[class])))
         };
         let ([left, _], [movers, static_world]) = (sums(&still), sums(&fields));

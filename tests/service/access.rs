@@ -1,4 +1,4 @@
-//! Who may do what: every route and every method against every kind of key.
+//! Tests of access control: every route and every method with every kind of key.
 
 use std::process::Command;
 
@@ -13,14 +13,14 @@ use crate::grpc::{client, pair, proto};
 use crate::server::{Folder, Server, ended};
 use crate::wire::SMALL;
 
-/// Of tenant a, which may do everything.
+/// A key of tenant a with the write role.
 const WRITER: &str = "key-of-the-writer-of-a";
-/// Of tenant a, which may look.
+/// A key of tenant a with the read role.
 const READER: &str = "key-of-the-reader-of-a";
-/// Of tenant b, which may do everything.
+/// A key of tenant b with the write role.
 const OTHER: &str = "key-of-the-writer-of-b";
 
-/// A server with three keys.
+/// A server with the three keys.
 fn guarded() -> Server {
     let mut config = String::new();
     for (tenant, role, key) in [
@@ -33,7 +33,7 @@ fn guarded() -> Server {
     Server::with_config(&config)
 }
 
-/// Values of the header that open nothing.
+/// Values of the authorization header that must be refused.
 const SHUT: [Option<&str>; 9] = [
     None,
     Some(""),
@@ -46,7 +46,7 @@ const SHUT: [Option<&str>; 9] = [
     Some("key-of-the-writer-of-a"),
 ];
 
-/// A finished job of tenant a.
+/// Submits a job as tenant a and waits until it has succeeded. Returns its id.
 async fn finished(server: &Server) -> String {
     let sent = Client::new()
         .post(server.url("/v1/jobs"))
@@ -62,7 +62,7 @@ async fn finished(server: &Server) -> String {
     id
 }
 
-/// The status of a request; routes that take a pair get one.
+/// The status of a request. Submission routes are sent a pair.
 async fn ask(server: &Server, method: &Method, path: &str, shown: Option<&str>) -> u16 {
     let mut request = Client::new().request(method.clone(), server.url(path));
     if let Some(shown) = shown {
@@ -125,7 +125,7 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
         format!("{own}/result"),
         format!("{own}/requeue"),
     );
-    // What the reader, the other tenant and the writer get.
+    // Expected status for the reader, the other tenant and the writer.
     let expected = [
         (Method::POST, "/v1/flow", [403, 200, 200]),
         (Method::POST, "/v1/jobs", [403, 202, 202]),
@@ -156,7 +156,7 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
     for open in ["/openapi.json", "/docs", "/docs/"] {
         assert_eq!(ask(&server, &Method::GET, open, None).await, 200, "{open}");
     }
-    // The admin port takes no keys: it shows no job, and listens on loopback.
+    // The admin port needs no key: it exposes no jobs and listens on loopback.
     for open in ["/livez", "/readyz", "/metrics"] {
         let answer = reqwest::get(format!("http://{}{open}", server.admin))
             .await
@@ -227,7 +227,7 @@ async fn lists_and_keys_of_submissions_are_each_tenants_own() {
     }
 }
 
-/// A call that shows something in its metadata.
+/// A request with the given authorization metadata.
 fn showing<T>(message: T, shown: Option<&str>) -> Request<T> {
     let mut request = Request::new(message);
     if let Some(shown) = shown {
@@ -237,7 +237,7 @@ fn showing<T>(message: T, shown: Option<&str>) -> Request<T> {
     request
 }
 
-/// The codes of the nine calls, on a job of tenant a where they name one.
+/// The status codes of the nine methods. Those that need a job id use `id`, a job of tenant a.
 async fn codes(server: &Server, id: &str, shown: Option<&str>) -> [Code; 9] {
     use proto::estimate_sequence_request as sequence;
     use proto::submit_job_request as submit;
@@ -340,7 +340,7 @@ async fn every_call_of_grpc_takes_a_key_and_gives_only_what_it_opens() {
     }
 }
 
-/// The code of a call with an empty message; the method is all of the path.
+/// The status code of a call with an empty message. `method` is the path without its leading slash.
 async fn plain_call(server: &Server, method: &str, shown: Option<&str>) -> Code {
     let stream = tokio::net::TcpStream::connect(&server.public).await;
     let (client, connection) = h2::client::handshake(stream.expect("a connection"))
@@ -356,7 +356,7 @@ async fn plain_call(server: &Server, method: &str, shown: Option<&str>) -> Code 
     let request = request.body(()).expect("a request");
     let mut client = client.ready().await.expect("open");
     let (response, mut sending) = client.send_request(request, false).expect("sent");
-    // The server may have refused already.
+    // The server may have refused the call already.
     let _refused_early = sending.send_data(bytes::Bytes::from_static(&[0; 5]), true);
     let mut response = response.await.expect("an answer");
     let mut headers = response.headers().clone();

@@ -1,4 +1,4 @@
-//! TLS on the public port, with a certificate made for the occasion.
+//! Tests of TLS on the public port, with a certificate that openssl makes for the test.
 
 use std::path::Path;
 use std::process::Command;
@@ -16,7 +16,7 @@ use crate::wire::{connect, exchange, status, until_closed};
 
 const REQUEST: &[u8] = b"GET /v1/jobs HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n";
 
-/// Makes a certificate of localhost and its key; false where there is no `openssl`.
+/// Makes a self-signed certificate of localhost and its key; false if there is no `openssl`.
 fn certificate(folder: &Path) -> bool {
     let made = Command::new("openssl")
         .args([
@@ -56,7 +56,7 @@ fn config(folder: &Folder) -> String {
     )
 }
 
-/// A connection that trusts the certificate and offers protocols.
+/// A TLS connection that trusts the certificate and offers these ALPN protocols.
 async fn secure(server: &Server, folder: &Folder, protocols: &[&str]) -> TlsStream<TcpStream> {
     let certificate = CertificateDer::from_pem_file(folder.path().join("certificate.pem"));
     let mut roots = rustls::RootCertStore::empty();
@@ -111,7 +111,7 @@ async fn both_protocols_are_served_over_tls_and_neither_without_it() {
 
     let plain = exchange(&server, REQUEST);
     assert_ne!(status(&plain), Some(200), "{plain}");
-    // A handshake that is not begun is given up like headers that do not come.
+    // A TLS handshake that does not start is subject to the timeout of request headers.
     let _alert = until_closed(connect(&server));
     let mut stalled = secure(&server, &folder, &["http/1.1"]).await;
     let mut nothing = Vec::new();

@@ -1,4 +1,4 @@
-//! Attacks with connections: slow ones, silent ones, many of them, and bodies that never end.
+//! Attacks by connections: slow, silent or numerous connections, and bodies without an end.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -12,13 +12,14 @@ use crate::wire::{
     Besieged, SMALL, connect, exchange, multipart, post, serves, status, until_closed,
 };
 
-/// Between two bytes of somebody who is slow on purpose.
+/// Interval between two bytes of a client that is slow on purpose.
 const DRIP: Duration = Duration::from_millis(50);
 
-/// Until a server that waits one second must have given up, on a loaded machine.
+/// Time within which a server with timeouts of one second must give up, on a loaded machine.
 const GIVEN_UP: Duration = Duration::from_secs(20);
 
-/// Sends bytes one by one until the server closes or `GIVEN_UP`; gives what came back.
+/// Sends bytes one by one until the server closes the connection, at most for `GIVEN_UP`. Returns
+/// the response.
 fn drip(mut stream: TcpStream, bytes: impl Iterator<Item = u8>) -> String {
     let began = Instant::now();
     stream.set_read_timeout(Some(DRIP)).expect("a timeout");
@@ -37,7 +38,7 @@ fn drip(mut stream: TcpStream, bytes: impl Iterator<Item = u8>) -> String {
     String::from_utf8_lossy(&answer).into_owned()
 }
 
-/// The body of a small pair.
+/// The multipart body of a small pair.
 fn pair() -> Vec<u8> {
     let [source, target] = small_pair()
         .each_ref()
@@ -49,7 +50,7 @@ fn pair() -> Vec<u8> {
     ])
 }
 
-/// A body in chunks of HTTP/1.1.
+/// A body in the chunked encoding of HTTP/1.1.
 fn chunked(body: &[u8], size: usize) -> Vec<u8> {
     let mut bytes = Vec::new();
     for piece in body.chunks(size) {
@@ -151,8 +152,9 @@ async fn a_client_that_does_not_read_is_given_up() {
 
 #[tokio::test]
 async fn a_body_in_chunks_of_one_byte_is_read_or_refused_in_little_memory() {
-    // Room for what is sent and not much more: a byte must not be counted as a page.
-    let siege = Besieged::new("[limits]\nmax_uploads_mib = 4\nmax_upload_mib = 4\n").await;
+    // The limit is little more than the body. A chunk of one byte must not be counted as a whole
+    // page.
+    let siege = Besieged::new("[limits]\nmax_total_upload_mib = 4\nmax_upload_mib = 4\n").await;
     let head = post(
         "/v1/flow",
         "transfer-encoding: chunked\r\nconnection: close\r\n\r\n",
@@ -249,7 +251,7 @@ async fn lengths_that_lie_are_refused_or_end_with_the_connection() {
         ("content-length: 0x10".to_owned(), 400),
         ("content-length: 1099511627776".to_owned(), 413),
         ("content-length: 10".to_owned(), 400),
-        // The last boundary has come, and nothing after it is waited for.
+        // The body is complete at its last boundary; the server does not wait for the rest.
         (format!("content-length: {longer}"), 200),
     ] {
         let answer = ask(&headers);

@@ -1,4 +1,5 @@
-//! Attacks with files and coordinates: bombs, lies, pickles, and clouds at the edge of sense.
+//! Attacks by files and coordinates: decompression bombs, false counts, pickles and degenerate
+//! clouds.
 
 use std::io::Write;
 
@@ -12,7 +13,7 @@ use crate::grpc::{client, pair, proto};
 use crate::server::Server;
 use crate::wire::Besieged;
 
-/// Posts two files with a preset; gives the status and the problem's code and detail, or the flow.
+/// Posts two files with a preset. Returns the flow, or the problem document.
 async fn post(
     server: &Server,
     [source, target]: [&[u8]; 2],
@@ -35,7 +36,7 @@ async fn post(
     Err(answer.json().await.expect("a problem"))
 }
 
-/// An `.npy` file with a header of our choosing.
+/// An `.npy` file with the given header.
 fn npy(descr: &str, shape: &str, data: &[u8]) -> Vec<u8> {
     let header = format!("{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}\n");
     let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
@@ -56,7 +57,7 @@ fn zip(members: &[(&str, &[u8])]) -> Vec<u8> {
     zip.finish().expect("finished").into_inner()
 }
 
-/// A hundred and twenty megabytes of zeros in little more than a hundred kilobytes.
+/// 120 MB of zeros in little more than a hundred kilobytes.
 fn zip_bomb() -> Vec<u8> {
     let array = npy("'<f4'", "(10000000, 3)", &vec![0; 120_000_000]);
     zip(&[("pc1.npy", &array)])
@@ -80,7 +81,7 @@ fn ply(vertices: &str, before: &str) -> Vec<u8> {
     .into_bytes()
 }
 
-/// Back-references of LZF, each 264 bytes of what was there before.
+/// A stream of LZF back-references, each of which copies 264 earlier bytes.
 fn lzf_bomb() -> Vec<u8> {
     let mut packed = vec![0, 7];
     for _ in 0..150_000 {
@@ -152,7 +153,7 @@ async fn objects_pickles_and_broken_archives_are_refused() {
     let good = file(CloudFormat::Npy, &small_pair()[0]);
     let pickle = b"\x80\x04cos\nsystem\n(S'touch /tmp/fnsf-was-here'\ntR.";
     let mut encrypted = zip(&[("pc1.npy", &good), ("pc2.npy", &good)]);
-    // The flag of an encrypted member, in its own header and in the directory's.
+    // Sets the encryption flag in the local header and in the directory entry of each member.
     for at in 0..encrypted.len() - 8 {
         match &encrypted[at..at + 4] {
             b"PK\x03\x04" => encrypted[at + 6] |= 1,
@@ -201,7 +202,7 @@ async fn objects_pickles_and_broken_archives_are_refused() {
     siege.stands().await;
 }
 
-/// What the gRPC door says to a pair: the flow, or the code of its refusal.
+/// Sends a pair over gRPC. Returns the flow, or the code of the refusal.
 async fn call(
     server: &Server,
     clouds: &[Vec<Point>; 2],
@@ -328,14 +329,15 @@ async fn clouds_at_the_edge_of_sense_get_the_same_verdict_on_both_doors() {
     let cases = presets.flat_map(|preset| cases.iter().map(move |case| (preset, case)));
     for (preset, (name, source, target, expected)) in cases {
         let far = name.contains("a million metres");
-        // Objects need no transform, and their extent no memory.
+        // The object search needs no distance transform, and its memory does not depend on the
+        // extent.
         let expected = if far && preset == "default" {
             solved
         } else {
             *expected
         };
         let [first, second] = [source, target].map(|points| {
-            // By hand: the library writes no file that it would not read.
+            // Encoded by hand: the library's writer refuses some of these clouds.
             let values = points.as_flattened().iter();
             let bytes: Vec<u8> = values.flat_map(|value| value.to_le_bytes()).collect();
             npy("'<f4'", &format!("({}, 3)", points.len()), &bytes)
@@ -381,7 +383,8 @@ async fn clouds_at_the_edge_of_sense_get_the_same_verdict_on_both_doors() {
 
 #[tokio::test]
 async fn a_file_with_more_points_than_the_server_takes_is_refused_before_it_is_unfolded() {
-    // Within what files may hold, and within what a file of its length may unfold to.
+    // Below the point limit of the readers, and below the maximum decompression ratio of a file of
+    // this length.
     const POINTS: usize = 5_000_000;
     let siege = Besieged::new("").await;
     let noise: Vec<u8> = (0..4 << 20_u32)
@@ -411,7 +414,7 @@ async fn a_file_with_more_points_than_the_server_takes_is_refused_before_it_is_u
     let line = peak.lines().find_map(|line| line.strip_prefix("VmHWM:"));
     let kibibytes = line.and_then(|line| line.trim().strip_suffix("kB")?.trim().parse().ok());
     let before = siege.server.resident_bytes() >> 10;
-    // Its own bytes a few times over, and not its points.
+    // The memory of the compressed file a few times over, but not of its decoded points.
     assert!(
         kibibytes.is_some_and(|peak: u64| peak < before + (40 << 10)),
         "{kibibytes:?} KiB at most, {before} now"
@@ -422,7 +425,7 @@ async fn a_file_with_more_points_than_the_server_takes_is_refused_before_it_is_u
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn small_files_that_unfold_to_large_clouds_share_the_room_of_uploads() {
     const POINTS: usize = 2_000_000;
-    let siege = Besieged::new("[limits]\nmax_uploads_mib = 64\nmax_upload_mib = 64\n").await;
+    let siege = Besieged::new("[limits]\nmax_total_upload_mib = 64\nmax_upload_mib = 64\n").await;
     let array = npy("'<f2'", &format!("({POINTS}, 3)"), &vec![0; 6 * POINTS]);
     let file = zip(&[("points.npy", &array)]);
     assert!(file.len() < 1 << 20, "{}", file.len());
@@ -439,14 +442,15 @@ async fn small_files_that_unfold_to_large_clouds_share_the_room_of_uploads() {
     }
     while let Some(status) = sent.join_next().await {
         let status = status.expect("no panic");
-        // Accepted, refused for what it holds, or told to come again: never broken.
+        // Accepted, refused for its content or for lack of space; never an internal error.
         assert!(status != 500, "{status}");
     }
     let about = std::fs::read_to_string(format!("/proc/{}/status", siege.server.id()));
     let about = about.expect("it runs on Linux");
     let peak = about.lines().find_map(|line| line.strip_prefix("VmHWM:"));
     let peak = peak.and_then(|line| line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok());
-    // Two clouds of 26 MB at a time, what one of them is read from, and its bytes for the store.
+    // Two clouds of 26 MB at a time, the data that one of them is decoded from, and its encoded
+    // bytes.
     assert!(
         peak.is_some_and(|kibibytes| kibibytes < 500 << 10),
         "{peak:?} KiB"

@@ -1,4 +1,5 @@
-//! Attacks on the gRPC door: lengths that lie, garbage, unknown numbers, messages out of order.
+//! Attacks on the gRPC protocol: false lengths, random bytes, unknown enum values, messages out of
+//! order.
 
 use std::time::Duration;
 
@@ -29,7 +30,7 @@ const METHODS: [&str; 13] = [
     "grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo",
 ];
 
-/// The status of a call with bytes of our own; nothing where the stream was reset.
+/// The status of a call with raw bytes as its body; none if the stream was reset.
 async fn raw(server: &Server, method: &str, bytes: &[u8], ends: bool) -> Option<Code> {
     let stream = tokio::net::TcpStream::connect(&server.public).await;
     let (client, connection) = h2::client::handshake(stream.expect("a connection"))
@@ -58,7 +59,7 @@ async fn raw(server: &Server, method: &str, bytes: &[u8], ends: bool) -> Option<
         }
         let mut body = response.into_body();
         match body.data().await {
-            // A message: some streams go on for as long as they are listened to.
+            // A response message. Some streams have no end, so only the first message is read.
             Some(piece) => piece.ok().map(|_| Code::Ok),
             None => code(&body.trailers().await.ok()??),
         }
@@ -68,7 +69,7 @@ async fn raw(server: &Server, method: &str, bytes: &[u8], ends: bool) -> Option<
     answered.expect("an answer")
 }
 
-/// A message with its prefix.
+/// A message with its gRPC prefix.
 fn message(compressed: u8, length: u32, bytes: &[u8]) -> Vec<u8> {
     let mut framed = vec![compressed];
     framed.extend(length.to_be_bytes());
@@ -88,7 +89,7 @@ async fn a_length_that_lies_is_refused_before_anything_is_kept_for_it() {
                     code,
                     Some(Code::InvalidArgument | Code::OutOfRange | Code::ResourceExhausted)
                 );
-                // Reflection ends its stream without a word.
+                // Reflection ends its stream without a status.
                 let reflection = method.contains("Reflection");
                 assert!(refused || reflection, "{method}: {code:?}");
             }
@@ -119,7 +120,7 @@ async fn garbage_is_refused_by_every_method() {
                 (bytes.clone(), false),
             ] {
                 let code = raw(&siege.server, method, &framed, true).await;
-                // Some garbage is a message; a list or a health check may even be answered.
+                // Some random bytes are a valid message. A list or a health check may then succeed.
                 let plain = good || framed.is_empty();
                 let refused = matches!(
                     code,
@@ -190,7 +191,7 @@ async fn numbers_that_are_no_values_and_messages_out_of_order_are_refused() {
         vec![begin(|o| o.ego_motion = vec![f64::NAN; 16])],
         vec![begin(|o| o.ego_motion = vec![1e308; 16])],
         vec![begin(|o| o.ego_motion = vec![0.0; 100_000])],
-        vec![begin(|o| o.range_m = Some(f32::INFINITY))],
+        vec![begin(|o| o.crop_m = Some(f32::INFINITY))],
         vec![begin(|o| o.max_points = Some(0))],
         vec![begin(|o| o.deadline_ms = Some(u64::MAX))],
         vec![begin(|o| o.device = "../cpu\n".to_owned())],

@@ -9,13 +9,13 @@ use crate::wire::{
     RST_STREAM, SETTINGS, WINDOW_UPDATE, field, frame, head,
 };
 
-/// Streams of an attack: far more than any limit.
+/// Number of streams of an attack, far above every limit.
 const STREAMS: u32 = 5000;
 
-/// The last stream that may be looked at: the limit of 1,024, and what was under way.
+/// Highest stream id that the server may process: its limit of 1,024 streams, plus those in flight.
 const LAST: u32 = 2 * 1200;
 
-/// The names of the streams of a client.
+/// The ids of the first `count` streams of a client.
 fn streams(count: u32) -> impl Iterator<Item = u32> {
     (0..count).map(|number| 2 * number + 1)
 }
@@ -60,7 +60,7 @@ async fn streams_that_are_opened_and_reset_at_once_end_the_connection() {
 #[tokio::test]
 async fn streams_that_make_the_server_reset_them_end_the_connection() {
     let siege = Besieged::new("").await;
-    // Each makes the server reset the stream: a window that overflows, and more data than said.
+    // Each makes the server reset the stream: a window overflow, or more data than declared.
     let overflow = |stream| frame(WINDOW_UPDATE, 0, stream, &0x7fff_ffff_u32.to_be_bytes());
     let lie = |stream| frame(DATA, END_STREAM, stream, &[0; 100]);
     let errors: [&dyn Fn(u32) -> Vec<u8>; 2] = [&overflow, &lie];
@@ -98,10 +98,10 @@ async fn headers_that_never_end_end_the_connection_or_the_request() {
         }
         bytes.extend(frame(CONTINUATION, END_HEADERS, 1, &[]));
         frames.send(bytes);
-        // Refused, one way or another, and not answered with what was asked for.
+        // Each must be refused in some form, and not answered with the requested resource.
         let refused = std::iter::from_fn(|| frames.next()).find_map(|frame| match frame.kind {
             GOAWAY | RST_STREAM => Some(true),
-            // ":status: 431" has no place in the static table; 200, 404 and the like do.
+            // ":status: 431" is not in the static table of HPACK. 200, 404 and others are.
             HEADERS => Some(!matches!(frame.payload[0], 0x88..=0x8e)),
             _ => None,
         });
@@ -128,7 +128,7 @@ async fn floods_of_pings_settings_and_small_data_cost_little() {
         for _ in 0..200_000 {
             bytes.extend(&flood);
         }
-        // Nothing of what comes back is read.
+        // The responses are never read.
         frames.send(bytes);
         frames.patience(Duration::from_secs(1));
         held.push(frames);
@@ -200,7 +200,7 @@ async fn requests_that_are_refused_by_their_head_and_hang_up_keep_nothing_busy()
                     _ => {}
                 }
                 frames.send(bytes);
-                // It is being refused when the client goes.
+                // The client closes while the server is refusing the request.
                 std::thread::sleep(Duration::from_millis(20));
                 frames.hang_up(away == "resets all");
             }
@@ -249,7 +249,7 @@ async fn answers_that_nobody_reads_are_bounded_and_given_up() {
         })
         .collect();
     let answering: Vec<_> = held.into_iter().map(Frames::answer_pings).collect();
-    // 240 answers of some megabytes: all together they may not take a tenth of that.
+    // 240 responses of some megabytes each. Together they may use at most a tenth of that.
     let began = std::time::Instant::now();
     while began.elapsed() < Duration::from_secs(2) {
         let grown = siege.grown();
@@ -257,10 +257,10 @@ async fn answers_that_nobody_reads_are_bounded_and_given_up() {
         std::thread::sleep(Duration::from_millis(20));
     }
     for connection in answering {
-        // Each ends because the server closes it, although pings are answered.
+        // Each connection is closed by the server although its pings are answered.
         connection.join().expect("no panic");
     }
-    // And what they held is free again.
+    // Their memory is available again.
     let url = siege.server.url(&format!("/v1/jobs/{id}/result"));
     let answer = client.get(url).send().await.expect("an answer");
     assert_eq!(answer.status(), 200);
@@ -281,7 +281,7 @@ async fn connections_that_only_answer_pings_make_room() {
             .bearer_auth("0123456789abcdef");
         sent.timeout(PATIENCE).send()
     };
-    // At once: connections without a key make room for a new one.
+    // A connection without a key is closed at once to admit a new one.
     assert_eq!(list().await.expect("an answer").status(), 200);
     for connection in idle {
         connection.join().expect("no panic");
@@ -295,7 +295,7 @@ async fn a_call_without_a_key_does_not_keep_a_connection() {
     let config = format!("{keys}[limits]\nheader_timeout_seconds = 1\n");
     let server = Server::with_config(&config);
     let frames = Frames::open(&server);
-    // Health may be watched by anybody, for ever.
+    // Health may be watched without a key and without a time limit.
     let mut block = head("POST", "/grpc.health.v1.Health/Watch");
     block.extend(field("content-type", "application/grpc"));
     block.extend(field("te", "trailers"));

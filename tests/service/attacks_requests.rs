@@ -1,4 +1,4 @@
-//! Attacks with text: names of jobs, options, and what ends up in the log.
+//! Attacks by text: job ids, options, and forged log lines.
 
 use fnsf::formats::CloudFormat;
 use reqwest::multipart::{Form, Part};
@@ -47,7 +47,7 @@ async fn a_name_that_is_no_jobs_is_not_found_whatever_it_holds() {
             let answer = exchange(&siege.server, request.as_bytes());
             let short = name.chars().take(60).collect::<String>();
             if status(&answer) == Some(400) {
-                // Not a request: the path has bytes that no path has.
+                // Not a valid HTTP request: the path contains bytes that no path may contain.
                 assert!(
                     !name.is_ascii() || name.contains(['{', '\'']),
                     "{short}: {answer}"
@@ -110,9 +110,9 @@ async fn options_that_are_deep_huge_doubled_or_wrong_are_refused_by_name() {
         (r#"{"max_points": 4294967296}"#.to_owned(), 400),
         (r#"{"max_points": 0}"#.to_owned(), 400),
         (r#"{"max_points": 1e9}"#.to_owned(), 400),
-        (r#"{"range_m": 1e39}"#.to_owned(), 400),
-        (r#"{"range_m": -1}"#.to_owned(), 400),
-        (r#"{"range_m": NaN}"#.to_owned(), 400),
+        (r#"{"crop_m": 1e39}"#.to_owned(), 400),
+        (r#"{"crop_m": -1}"#.to_owned(), 400),
+        (r#"{"crop_m": NaN}"#.to_owned(), 400),
         (r#"{"deadline_ms": 18446744073709551615}"#.to_owned(), 400),
         (r#"{"deadline_ms": 0}"#.to_owned(), 400),
         (

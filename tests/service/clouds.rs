@@ -1,6 +1,5 @@
-//! Clouds to send, and the bodies that carry them.
+//! Clouds for the tests, and request bodies with them.
 
-use std::path::PathBuf;
 use std::sync::OnceLock;
 
 use fnsf::flow::Point;
@@ -14,7 +13,7 @@ pub(crate) fn small_pair() -> &'static [Vec<Point>; 2] {
     PAIR.get_or_init(|| street(16, 400))
 }
 
-/// A simulated pair of about thirty thousand points: seconds of work for the published method.
+/// A simulated pair of about thirty thousand points. The published method takes seconds for it.
 pub(crate) fn medium_pair() -> &'static [Vec<Point>; 2] {
     static PAIR: OnceLock<[Vec<Point>; 2]> = OnceLock::new();
     PAIR.get_or_init(|| street(32, 1000))
@@ -31,7 +30,7 @@ fn street(beams: usize, azimuth_steps: usize) -> [Vec<Point>; 2] {
     [pair.source, pair.target]
 }
 
-/// A cloud as a file.
+/// A cloud encoded as a file.
 pub(crate) fn file(format: CloudFormat, points: &[Point]) -> Vec<u8> {
     let mut bytes = Vec::new();
     write_cloud(format, points, &mut bytes).expect("written");
@@ -46,13 +45,4 @@ pub(crate) fn form([source, target]: &[Vec<Point>; 2], options: &str) -> Form {
         .part("source", part(source))
         .part("target", part(target))
         .text("options", options.to_owned())
-}
-
-/// The folder with real pairs, where there is one.
-pub(crate) fn real_data() -> Option<PathBuf> {
-    let folder = std::env::var_os("FNSF_REAL_DATA").map(PathBuf::from);
-    if folder.is_none() {
-        eprintln!("FNSF_REAL_DATA is not set: real pairs are not tested");
-    }
-    folder
 }

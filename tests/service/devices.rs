@@ -1,4 +1,4 @@
-//! Which device does a job: refusals at both doors, and a server that works on a card.
+//! Tests of the choice of a device: refusals over HTTP and gRPC, and a server with a GPU.
 
 use fnsf::flow::gpu;
 use reqwest::StatusCode;
@@ -36,7 +36,9 @@ async fn a_job_for_a_kind_of_device_that_is_not_here_is_refused_at_both_doors() 
         .expect_err("a refusal");
     assert_eq!(refused.code(), Code::FailedPrecondition, "{refused}");
     assert!(refused.message().contains("no gpu"), "{refused}");
-    assert!((server.metric("fnsf_rejected_total{reason=\"no_device\"}") - 3.0).abs() < 0.5);
+    assert!(
+        (server.metric("fnsf_requests_rejected_total{reason=\"no_device\"}") - 3.0).abs() < 0.5
+    );
 }
 
 #[tokio::test]
@@ -106,6 +108,6 @@ async fn a_server_on_a_card_gives_it_the_jobs_that_ask_for_one() {
         devices.push(job["report"]["device"].as_str().expect("a name").to_owned());
     }
     assert_ne!(devices[0], devices[1]);
-    // Objects are found by the host, and the report does not say otherwise.
+    // Objects are searched on the host, and the report names it.
     assert!(devices[2].starts_with("cpu ("), "{devices:?}");
 }

@@ -1,4 +1,4 @@
-//! The gRPC door: the same flow as HTTP's, streamed; sequences in and out; jobs.
+//! Tests of the gRPC protocol: the flow of a pair compared with HTTP, streamed sequences, and jobs.
 
 use std::time::Duration;
 
@@ -12,7 +12,7 @@ use tonic::{Code, Request};
 use crate::clouds::{form, medium_pair, small_pair};
 use crate::server::Server;
 
-/// The protocol's client, made from the proto alone.
+/// The gRPC client, generated from the protobuf definitions.
 #[expect(unreachable_pub, reason = "generated code is public to its module")]
 #[expect(
     clippy::allow_attributes_without_reason,
@@ -28,7 +28,7 @@ pub(crate) mod proto {
 
 use proto::scene_flow_client::SceneFlowClient;
 
-/// Points of one chunk.
+/// Number of points per chunk.
 const POINTS: usize = 50_000;
 
 pub(crate) async fn client(server: &Server) -> SceneFlowClient<Channel> {
@@ -45,7 +45,7 @@ pub(crate) fn chunk(points: &[Point]) -> proto::Chunk {
     }
 }
 
-/// A pair as a stream of messages.
+/// A pair as a stream of request messages.
 pub(crate) fn pair(
     clouds: &[Vec<Point>; 2],
     options: proto::Options,
@@ -84,7 +84,7 @@ async fn a_pair_gives_the_bits_that_http_gives() {
     let (mut header, mut flow, mut flags, mut progress) = (None, Vec::new(), Vec::new(), 0);
     while let Some(message) = answer.next().await {
         match message.expect("a message").part.expect("a part") {
-            Part::Progress(news) => progress = news.iteration.max(progress),
+            Part::Progress(news) => progress = news.done.max(progress),
             Part::Header(found) => header = Some(found),
             Part::Chunk(piece) => {
                 flow.extend(points_from_le_bytes(&piece.flow));
@@ -152,7 +152,7 @@ async fn a_sequence_is_answered_pair_by_pair_while_it_is_still_coming() {
             match answer.next().await.expect("more").expect("a message").part {
                 Some(Answer::Pair(pair)) => {
                     assert!(matches!(pair.outcome, Some(Outcome::Header(_))), "{pair:?}");
-                    assert_eq!(pair.place, expected);
+                    assert_eq!(pair.index, expected);
                     assert_eq!(pair.source, format!("sweep {expected}"));
                     assert_eq!(pair.target, format!("sweep {}", expected + 1));
                 }
@@ -161,7 +161,7 @@ async fn a_sequence_is_answered_pair_by_pair_while_it_is_still_coming() {
             }
         }
     };
-    // Each flow comes before the next sweep is sent.
+    // Each flow arrives before the next sweep is sent.
     next_pair(0).await;
     sweep(2).await;
     next_pair(1).await;

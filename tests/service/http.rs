@@ -1,4 +1,4 @@
-//! The HTTP door: flow for files, jobs, news, ranges.
+//! Tests of the HTTP protocol: flow of files, jobs, events and range requests.
 
 use std::time::{Duration, Instant};
 
@@ -10,10 +10,11 @@ use reqwest::StatusCode;
 use reqwest::multipart::{Form, Part};
 use serde_json::Value;
 
-use crate::clouds::{file, form, medium_pair, real_data, small_pair};
+use crate::clouds::{file, form, medium_pair, small_pair};
+use crate::real_data::real_data;
 use crate::server::{PATIENCE, Server, ended};
 
-/// Every media type and how its bytes are read.
+/// Every media type of a flow, and the format of its bytes.
 const ANSWERS: [(&str, Option<FlowFormat>); 7] = [
     ("application/x-npz", Some(FlowFormat::Npz)),
     ("application/x-npy", Some(FlowFormat::Npy)),
@@ -47,13 +48,7 @@ async fn job_of(response: reqwest::Response) -> String {
 async fn a_pair_comes_back_as_the_librarys_flow_in_every_format() {
     let server = Server::start(&[]);
     let pair = small_pair();
-    let problem = Problem {
-        source: &pair[0],
-        target: &pair[1],
-        ground: None,
-        before: None,
-        around: &[],
-    };
+    let problem = Problem::pair(&pair[0], &pair[1]);
     let backend = CpuBackend::new(Some(2)).expect("threads");
     let options = Preset::Default.options(None);
     let expected = estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
@@ -68,11 +63,9 @@ async fn a_pair_comes_back_as_the_librarys_flow_in_every_format() {
         assert_eq!(response.status(), StatusCode::OK, "{media}");
         let headers = response.headers().clone();
         assert_eq!(headers["content-type"], media);
-        assert_eq!(headers["fnsf-stop-reason"], "max_iterations");
-        assert_eq!(
-            headers["fnsf-iterations"],
-            expected.iterations.to_string().as_str()
-        );
+        assert_eq!(headers["fnsf-stop-reason"], "completed");
+        let clusters = expected.objects().expect("objects").clusters.len();
+        assert_eq!(headers["fnsf-clusters"], clusters.to_string().as_str());
         assert!(headers.contains_key("fnsf-job-id") && headers.contains_key("fnsf-seconds"));
         let bytes = response.bytes().await.expect("a body");
         let flow = match format {
@@ -82,7 +75,7 @@ async fn a_pair_comes_back_as_the_librarys_flow_in_every_format() {
         assert_eq!(flow, expected.flow, "{media}");
         if format == Some(FlowFormat::Json) {
             let json: Value = serde_json::from_slice(&bytes).expect("JSON");
-            assert_eq!(json["stop_reason"], "max_iterations");
+            assert_eq!(json["stop_reason"], "completed");
             assert_eq!(
                 json["job_id"].as_str(),
                 headers["fnsf-job-id"].to_str().ok()
@@ -211,7 +204,7 @@ async fn a_job_is_submitted_followed_and_fetched_in_parts() {
 }
 
 #[tokio::test]
-async fn events_tell_states_and_iterations_and_end_with_the_job() {
+async fn events_tell_states_and_progress_and_end_with_the_job() {
     let server = Server::start(&[]);
     let options = r#"{"preset": "paper"}"#;
     let response = client()
@@ -237,7 +230,7 @@ async fn events_tell_states_and_iterations_and_end_with_the_job() {
         "{text}"
     );
     assert!(
-        text.contains(r#""iteration":"#) && text.contains(r#""loss":"#),
+        text.contains(r#""done":"#) && text.contains(r#""loss":"#),
         "{text}"
     );
     assert!(text.trim_end().contains(r#""state":"succeeded""#), "{text}");
@@ -331,7 +324,7 @@ async fn a_sequence_gives_one_archive_and_every_pair_by_itself() {
     let mut body = Form::new().text("options", r#"{"max_points": 2048}"#);
     for points in [first, second, first] {
         let part = Part::bytes(file(CloudFormat::Npy, points)).file_name("f.npy");
-        body = body.part("frame", part);
+        body = body.part("sweep", part);
     }
     let response = client()
         .post(server.url("/v1/sequences"))
@@ -411,7 +404,7 @@ async fn refusals_say_what_is_wrong_as_problems() {
             400,
             "source is there twice",
         ),
-        (Form::new().part("frame", cloud()), 400, "/v1/sequences"),
+        (Form::new().part("sweep", cloud()), 400, "/v1/sequences"),
     ];
     for (body, status, said) in cases {
         let response = client()
@@ -449,7 +442,7 @@ async fn refusals_say_what_is_wrong_as_problems() {
 
 #[tokio::test]
 async fn a_disk_that_is_nearly_full_takes_no_more_work() {
-    let server = Server::with_config("[limits]\nmin_free_mib = 1000000000000\n");
+    let server = Server::with_config("[limits]\nmin_free_disk_mib = 1000000000000\n");
     let answer = client()
         .post(server.url("/v1/jobs"))
         .multipart(form(small_pair(), "{}"));

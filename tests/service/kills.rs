@@ -1,4 +1,4 @@
-//! The process is killed at any moment, again and again: every promise is kept, once.
+//! Tests with a process that is killed at random times: every acknowledged job ends exactly once.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
@@ -12,16 +12,16 @@ use fnsf::formats::CloudFormat;
 use crate::clouds::{file, form, medium_pair, small_pair};
 use crate::server::{Folder, Server, ended};
 
-/// Kills, and jobs that are promised among them; `FNSF_KILLS` asks for more kills.
+/// Default number of kills. `FNSF_KILLS` overrides it.
 const KILLS: usize = 25;
-/// Jobs for every kill.
+/// Jobs submitted per kill.
 const JOBS_A_KILL: usize = 3;
 
-/// Retries are quick and snapshots frequent, so that kills fall into all of it.
+/// Short retries and frequent snapshots, so that kills hit every stage of a job.
 const CONFIG: &str =
     "[queue]\nretry_delay_seconds = 1\nsnapshot_interval_ms = 50\nmax_crashes = 40\n";
 
-/// Numbers that look random and are the same every time (SplitMix64).
+/// A deterministic random number generator (SplitMix64).
 struct Dice(u64);
 
 impl Dice {
@@ -34,7 +34,7 @@ impl Dice {
     }
 }
 
-/// Small jobs of a few kinds, the same every time.
+/// The options of job `job`: a few kinds of small jobs, the same in every run.
 fn options(job: usize) -> String {
     let seed = job % 7;
     match job % 5 {
@@ -55,7 +55,7 @@ async fn submit(server: &Server, client: &reqwest::Client, job: usize) -> Option
     if !matches!(sent.status(), StatusCode::ACCEPTED | StatusCode::OK) {
         panic!("job {job} was refused: {:?}", sent.text().await);
     }
-    // Acknowledged is what has arrived whole.
+    // A job counts as acknowledged once the response has arrived completely.
     let view: Value = sent.json().await.ok()?;
     Some(view["id"].as_str()?.to_owned())
 }
@@ -81,10 +81,10 @@ async fn every_acknowledged_job_ends_once_with_the_undisturbed_result_however_of
     for _ in 0..kills {
         let server = Server::start_in(&folder, CONFIG, &[]);
         let client = reqwest::Client::new();
-        // While a few jobs are being sent, and for a while after, anything may be under way.
+        // The kill may come while jobs are being submitted or later.
         let batch = JOBS_A_KILL.min(jobs - next);
         let life = Duration::from_millis(20 + dice.below(700));
-        // Acknowledgements are kept as they come, since the future is dropped by the kill.
+        // Stored outside the future, which the timeout drops.
         let kept = std::sync::Mutex::new(Vec::new());
         let sending = async {
             for job in next..next + batch {
@@ -108,7 +108,7 @@ async fn every_acknowledged_job_ends_once_with_the_undisturbed_result_however_of
 
     let server = Server::start_in(&folder, CONFIG, &[]);
     let client = reqwest::Client::new();
-    // What was never acknowledged is asked for again; what was has its name still.
+    // Jobs that were not acknowledged are submitted again. The others must keep their ids.
     for job in 0..jobs {
         let id = submit(&server, &client, job).await.expect("it lives");
         let known = acknowledged.insert(job, id.clone());
@@ -145,7 +145,7 @@ async fn every_acknowledged_job_ends_once_with_the_undisturbed_result_however_of
     println!("{kills} kills, {jobs} jobs, {attempts} attempts");
 }
 
-/// The number of durable jobs that the server knows.
+/// The number of durable jobs in the server's list.
 async fn list_all(server: &Server, client: &reqwest::Client) -> usize {
     let (mut count, mut before) = (0, String::new());
     loop {
@@ -187,7 +187,7 @@ async fn a_killed_job_goes_on_from_its_snapshot() {
     let view: Value = sent.expect("an answer").json().await.expect("a job");
     let id = view["id"].as_str().expect("a name").to_owned();
     let began = Instant::now();
-    while server.metric("fnsf_snapshots_total") < 3.0 {
+    while server.metric("fnsf_snapshots_written_total") < 3.0 {
         assert!(
             began.elapsed() < Duration::from_secs(60),
             "no snapshot: {}",

@@ -1,4 +1,4 @@
-//! Under load: a stop in the middle of it, ten times too much of it, one tenant's flood, deadlines.
+//! Tests under load: shutdown, overload by a factor of ten, one tenant's flood, and deadlines.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -30,11 +30,11 @@ async fn submit(server: &Server, client: &reqwest::Client, options: &str, key: &
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_stop_under_load_loses_nothing_and_ends_in_time_with_open_streams() {
     const DEADLINE: Duration = Duration::from_secs(8);
-    let config = "[drain]\ndelay_seconds = 1\ndeadline_seconds = 8\n";
+    let config = "[shutdown]\nreadiness_delay_seconds = 1\ntimeout_seconds = 8\n";
     let folder = Folder::new();
     let mut server = Server::start_in(&folder, config, &[]);
     let client = reqwest::Client::new();
-    // One that runs for longer than the deadline, and a queue behind it.
+    // One job that runs beyond the shutdown timeout, and a queue behind it.
     let long = client
         .post(server.url("/v1/jobs"))
         .multipart(form(
@@ -66,7 +66,7 @@ async fn a_stop_under_load_loses_nothing_and_ends_in_time_with_open_streams() {
             "it is still ready"
         );
     }
-    // Not ready, but a load balancer that has not noticed is still served.
+    // Not ready, but requests from a load balancer that has not reacted are still served.
     ids.push(submit(&server, &client, SMALL, "").await);
     let status = server
         .wait(DEADLINE + Duration::from_secs(2))
@@ -87,11 +87,11 @@ async fn a_stop_under_load_loses_nothing_and_ends_in_time_with_open_streams() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn ten_times_too_much_is_refused_with_a_time_to_come_back_and_health_answers_at_once() {
-    /// Seconds of it; `FNSF_OVERLOAD_SECONDS` asks for more.
+    /// Seconds of overload. `FNSF_OVERLOAD_SECONDS` overrides it.
     const SECONDS: u64 = 8;
     const CALLERS: usize = 60;
     const MAX_WAIT: Duration = Duration::from_secs(2);
-    /// Growth of memory that is no leak: buffers of sixty connections.
+    /// Memory growth that is not a leak: the buffers of sixty connections.
     const GROWTH: u64 = 96 << 20;
     let asked = std::env::var("FNSF_OVERLOAD_SECONDS").ok();
     let seconds = asked
@@ -99,7 +99,7 @@ async fn ten_times_too_much_is_refused_with_a_time_to_come_back_and_health_answe
         .unwrap_or(SECONDS);
     let server = Arc::new(Server::with_config("[limits]\nmax_wait_seconds = 2\n"));
     let client = reqwest::Client::new();
-    // The price of a small job is learned first.
+    // The cost model first learns the time of a small job.
     let mut alone = Duration::MAX;
     for _ in 0..10 {
         let asked = Instant::now();
@@ -139,7 +139,8 @@ async fn ten_times_too_much_is_refused_with_a_time_to_come_back_and_health_answe
                         let after = answer.headers()["retry-after"].to_str().expect("text");
                         let after: u64 = after.parse().expect("seconds");
                         assert!((1..=60).contains(&after), "{after}");
-                        // Much sooner than it was asked to: about ten times what can be done.
+                        // Much earlier than the server asked for. The load is then about ten times
+                        // the capacity.
                         tokio::time::sleep(Duration::from_millis(400 * after)).await;
                     }
                     other => panic!("{other}: {:?}", answer.text().await),
@@ -168,9 +169,10 @@ async fn ten_times_too_much_is_refused_with_a_time_to_come_back_and_health_answe
         refused.load(Ordering::Relaxed),
     );
     let longest = *longest.lock().expect("no panic holds it");
-    // How many were in line before the one that waited longest, at the pace of those that were done:
-    // about as many as fit in the wait, however slow the machine is today. They are done at half of
-    // that pace, since those who are refused take the cores, too; unguarded all callers are in line.
+    // Queue length ahead of the request that waited longest, at the average throughput. It must be
+    // about the number of jobs that fit in the maximum wait, independent of the machine's speed.
+    // The throughput is about half of that without load, since refusing requests also takes CPU
+    // time. Without admission control all callers would be queued.
     let line = longest.as_secs_f64() * accepted as f64 / lasted.as_secs_f64();
     let fit = MAX_WAIT.as_secs_f64() / alone.as_secs_f64();
     let bound = (3.0 * fit).min(CALLERS as f64 / 2.0);
@@ -198,7 +200,7 @@ key = "the key of few jobs!"
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_tenant_with_few_jobs_waits_for_two_of_the_others_at_most() {
-    /// `FNSF_FLOOD` asks for more.
+    /// Number of queued jobs. `FNSF_FLOOD` overrides it.
     const FLOOD: usize = 300;
     let asked = std::env::var("FNSF_FLOOD").ok();
     let flood = asked.and_then(|flood| flood.parse().ok()).unwrap_or(FLOOD);
@@ -336,7 +338,7 @@ async fn small_jobs_do_not_wait_behind_a_long_one_while_another_device_is_free()
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_number_of_series_does_not_grow_with_the_jobs() {
-    /// `FNSF_FLOOD` asks for more.
+    /// Number of jobs. `FNSF_FLOOD` overrides it.
     const FLOOD: usize = 150;
     let asked = std::env::var("FNSF_FLOOD").ok();
     let flood = asked.and_then(|flood| flood.parse().ok()).unwrap_or(FLOOD);
@@ -376,7 +378,7 @@ async fn what_is_asked_for_again_is_admitted_as_what_is_new() {
     let server = Server::with_config(config);
     let client = reqwest::Client::new();
     let mut ids = Vec::new();
-    // Filled and cancelled again and again: more than there is room for.
+    // Filled and cancelled several times, so that there are more jobs than the queue admits.
     for _ in 0..3 {
         let mut refused = false;
         while !refused {

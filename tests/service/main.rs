@@ -1,4 +1,4 @@
-//! The service through its public doors: the real program, over real sockets, with real files.
+//! Tests of the service from outside: the real program, real sockets and real files.
 
 #![expect(
     clippy::panic,
@@ -23,6 +23,8 @@ mod kills;
 mod load;
 mod objects;
 mod readme;
+#[path = "../common/real_data.rs"]
+mod real_data;
 mod retries;
 mod sequences;
 mod server;

@@ -1,4 +1,4 @@
-//! Clusters and confidence through both doors, in every format that has room for them.
+//! Tests of clusters and confidence over HTTP and gRPC, in every format that can hold them.
 
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::{Objects, Preset, Problem, Uncontrolled, estimate};
@@ -9,20 +9,14 @@ use crate::clouds::{form, medium_pair};
 use crate::grpc::{client, pair, proto};
 use crate::server::Server;
 
-/// What the library finds on its own.
+/// The objects that the library finds.
 fn expected() -> Objects {
     let [source, target] = medium_pair();
-    let problem = Problem {
-        source,
-        target,
-        ground: None,
-        before: None,
-        around: &[],
-    };
+    let problem = Problem::pair(source, target);
     let backend = CpuBackend::new(Some(2)).expect("threads");
     let options = Preset::Default.options(None);
     let estimate = estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
-    estimate.objects.expect("objects")
+    estimate.objects().cloned().expect("objects")
 }
 
 #[tokio::test]
@@ -68,7 +62,10 @@ async fn clusters_and_confidence_are_the_librarys_in_every_format_and_over_grpc(
         use proto::estimate_flow_response::Part;
         match message.expect("a message").part.expect("a part") {
             Part::Progress(_) => {}
-            Part::Header(header) => count = header.clusters,
+            Part::Header(header) => match header.method {
+                Some(proto::flow_header::Method::Objects(objects)) => count = objects.clusters,
+                other => panic!("{other:?}"),
+            },
             Part::Chunk(piece) => {
                 clusters.extend(piece.clusters);
                 let (ids, _) = piece.cluster.as_chunks::<4>();

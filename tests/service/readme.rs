@@ -1,4 +1,4 @@
-//! Every `curl` of the README is run as it stands there, against a server and files of its own.
+//! Runs every `curl` example of the README unchanged against a server with matching files.
 
 use std::fs;
 use std::path::Path;
@@ -10,7 +10,7 @@ use serde_json::Value;
 use crate::clouds::{file, small_pair};
 use crate::server::Server;
 
-/// The block that is run.
+/// The commands of the marked block in the README.
 fn examples() -> Vec<String> {
     let readme = fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/README.md"));
     let readme = readme.expect("a README");
@@ -23,7 +23,7 @@ fn examples() -> Vec<String> {
     lines.map(str::to_owned).collect()
 }
 
-/// The files that the examples name.
+/// Writes the files that the examples name.
 fn lay_out(folder: &Path) {
     let [source, target] = small_pair();
     for (name, points) in [("a", source), ("b", target), ("c", source)] {
@@ -80,7 +80,7 @@ fn every_curl_of_the_readme_does_what_it_says() {
             assert_eq!(flow.len(), small_pair()[0].len(), "{command}");
             fs::remove_file(folder.path().join(name)).expect("it is ours");
         }
-        // The examples that ask after a job ask after the pair that was submitted last.
+        // Examples that query a job use the pair that was submitted last.
         let view: Value = serde_json::from_str(&said).unwrap_or_default();
         if view["kind"] == "pair" {
             job = view["id"].as_str().unwrap_or_default().to_owned();

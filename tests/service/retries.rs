@@ -1,4 +1,4 @@
-//! A client whose line is lost asks again with its key: what it was promised is kept.
+//! Tests of a client that loses its connection and retries with its idempotency key.
 
 use std::io::Write;
 use std::time::Duration;
@@ -12,10 +12,10 @@ use crate::clouds::{file, form, small_pair};
 use crate::server::{PATIENCE, Server, ended};
 use crate::wire::{connect, multipart, post};
 
-/// Some seconds of work, so that it runs when its client goes.
+/// Some seconds of work, so that the job runs when its client disconnects.
 const OPTIONS: &str = r#"{"preset": "paper", "max_points": 2048}"#;
 
-/// Asks for a flow, and goes when it is being worked on.
+/// Requests a flow and disconnects while it is being computed.
 fn hang_up(server: &Server, key: &str) {
     let [source, target] = small_pair()
         .each_ref()
@@ -47,7 +47,7 @@ async fn ask(server: &Server, path: &str, key: &str) -> reqwest::Response {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_retry_after_a_lost_line_gets_its_flow() {
     let server = Server::start(&[]);
-    // At once, and when the job is being ended.
+    // Immediately, and while the job is being cancelled.
     for millis in [0, 1, 3, 10, 30, 100] {
         let key = format!("after {millis} ms");
         hang_up(&server, &key);
@@ -100,15 +100,15 @@ async fn who_still_waits_gets_the_flow_that_another_has_given_up() {
 async fn a_key_is_of_a_pair_or_of_a_sequence() {
     let server = Server::start(&[]);
     let client = reqwest::Client::new();
-    let frames = || {
+    let sweeps = || {
         let part = |points: &[fnsf::flow::Point]| {
             reqwest::multipart::Part::bytes(file(CloudFormat::Npy, points)).file_name("a.npy")
         };
         let [source, target] = small_pair();
         reqwest::multipart::Form::new()
             .text("options", "{}")
-            .part("frame", part(source))
-            .part("frame", part(target))
+            .part("sweep", part(source))
+            .part("sweep", part(target))
     };
     let of_pair = client
         .post(server.url("/v1/jobs"))
@@ -122,7 +122,7 @@ async fn a_key_is_of_a_pair_or_of_a_sequence() {
     let of_sequence = client
         .post(server.url("/v1/sequences"))
         .header("idempotency-key", "one")
-        .multipart(frames())
+        .multipart(sweeps())
         .send();
     let refused = of_sequence.await.expect("an answer");
     assert_eq!(refused.status(), StatusCode::UNPROCESSABLE_ENTITY);

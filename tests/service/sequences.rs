@@ -1,5 +1,5 @@
-//! Sequences: the same bits through every door and in the library, and one dense cloud of them,
-//! whatever happens on the way.
+//! Tests of sequences: identical results over every protocol and in the library, also for the dense
+//! cloud, after kills and after failed pairs.
 
 use std::collections::HashMap;
 use std::sync::OnceLock;
@@ -23,23 +23,22 @@ use crate::clouds::file;
 use crate::grpc::{chunk, client, pair, proto};
 use crate::server::{Folder, PATIENCE, Server, ended};
 
-/// Few points, so that a pair takes a moment; the dense cloud has all of them.
+/// Few points, so that a pair is quick. The dense cloud contains all points.
 const FLOWS: &str = r#"{"preset": "neural", "max_points": 1024, "ground": "auto"}"#;
-const DENSE: &str =
-    r#"{"preset": "neural", "max_points": 1024, "ground": "auto", "densify": {"into": 1.5}}"#;
+const DENSE: &str = r#"{"preset": "neural", "max_points": 1024, "ground": "auto", "densify": {"reference_time": 1.5}}"#;
 
 /// The sweeps of a short simulated drive.
-fn frames() -> &'static [Vec<Point>] {
+fn sweeps() -> &'static [Vec<Point>] {
     static FRAMES: OnceLock<Vec<Vec<Point>>> = OnceLock::new();
     FRAMES.get_or_init(|| {
         let options = StreetOptions {
             beams: 16,
             azimuth_steps: 400,
-            frames: 4,
+            sweeps: 4,
             ..StreetOptions::default()
         };
         let street = Street::new(&options).expect("a street");
-        let frame = |place| street.frame(place).expect("a frame").points;
+        let frame = |place| street.sweep(place).expect("a frame").points;
         (0..4).map(frame).collect()
     })
 }
@@ -48,7 +47,7 @@ fn backend() -> CpuBackend {
     CpuBackend::new(Some(2)).expect("threads")
 }
 
-/// The fields and flows of consecutive legs, each from the one before.
+/// The motion fields and flows of consecutive edges, each warm-started from the previous one.
 fn chained(
     backend: &CpuBackend,
     options: &str,
@@ -59,7 +58,7 @@ fn chained(
     let mut found = Vec::new();
     for &place in places {
         let sweep = Sweep {
-            points: frames()[place].clone(),
+            points: sweeps()[place].clone(),
             ground: None,
         };
         let solver = options.solver_options(sweep.points.len());
@@ -67,16 +66,16 @@ fn chained(
         found.extend(estimates.expect("a flow"));
     }
     found.extend(sequence.finish(backend, &Uncontrolled).expect("the rest"));
-    found.into_iter().map(|e| (e.field, e.flow)).collect()
+    found.into_iter().map(|e| (e.motion, e.flow)).collect()
 }
 
-/// The flows of the library's own sequence.
+/// The flows of the sequence, computed by the library.
 fn flows(options: &str) -> Vec<Vec<Point>> {
     let found = chained(&backend(), options, &[0, 1, 2, 3]);
     found.into_iter().map(|(_, flow)| flow).collect()
 }
 
-/// The library's own dense cloud.
+/// The dense cloud of the sequence, computed by the library.
 fn dense(options: &str) -> DenseCloud {
     let backend = backend();
     let mut fields = HashMap::new();
@@ -93,7 +92,7 @@ fn dense(options: &str) -> DenseCloud {
     let options = JobOptions::from_json(options.as_bytes()).expect("good options");
     let asked = options.densify.expect("a frame");
     let finds_ground = options.solver_options(usize::MAX).ground == Ground::Auto;
-    let sweeps: Vec<Sweep> = frames()
+    let sweeps: Vec<Sweep> = sweeps()
         .iter()
         .map(|points| Sweep {
             points: points.clone(),
@@ -105,11 +104,11 @@ fn dense(options: &str) -> DenseCloud {
     densify(&backend, &plan, &sweeps, field, &Uncontrolled).expect("a cloud")
 }
 
-pub(crate) fn body(options: &str, frames: &[Vec<Point>]) -> Form {
+pub(crate) fn body(options: &str, sweeps: &[Vec<Point>]) -> Form {
     let form = Form::new().text("options", options.to_owned());
-    frames.iter().fold(form, |form, points| {
+    sweeps.iter().fold(form, |form, points| {
         let part = Part::bytes(file(CloudFormat::Npy, points)).file_name("f.npy");
-        form.part("frame", part)
+        form.part("sweep", part)
     })
 }
 
@@ -122,7 +121,7 @@ pub(crate) async fn post(server: &Server, path: &str, form: Form) -> (StatusCode
 }
 
 async fn submit(server: &Server, options: &str) -> String {
-    let (status, job) = post(server, "/v1/sequences", body(options, frames())).await;
+    let (status, job) = post(server, "/v1/sequences", body(options, sweeps())).await;
     assert_eq!(status, StatusCode::ACCEPTED, "{job}");
     job["id"].as_str().expect("a name").to_owned()
 }
@@ -139,7 +138,7 @@ pub(crate) async fn get(
     request.send().await.expect("an answer")
 }
 
-/// The flows of a sequence's pairs, each by itself.
+/// The flows of a sequence's pairs, downloaded one by one.
 pub(crate) async fn pair_flows(server: &Server, job: &Value) -> Vec<Vec<Point>> {
     let mut flows = Vec::new();
     for pair in job["pairs"]["jobs"].as_array().expect("pairs") {
@@ -151,7 +150,7 @@ pub(crate) async fn pair_flows(server: &Server, job: &Value) -> Vec<Vec<Point>> 
     flows
 }
 
-/// A dense cloud as the service sends it.
+/// A dense cloud encoded as the service sends it.
 fn packed(format: DenseFormat, cloud: &DenseCloud) -> Vec<u8> {
     let mut bytes = Vec::new();
     write_dense(format, cloud, &mut bytes).expect("written");
@@ -164,7 +163,7 @@ async fn streamed(server: &Server) -> Vec<Vec<Point>> {
     let mut parts = vec![Part::Begin(Begin {
         options: Some(grpc_options(None)),
     })];
-    for points in frames() {
+    for points in sweeps() {
         parts.push(Part::Sweep(Sweep::default()));
         parts.push(Part::Chunk(chunk(points)));
     }
@@ -196,14 +195,14 @@ fn grpc_options(densify: Option<proto::Densify>) -> proto::Options {
     }
 }
 
-/// Submits the sequence over gRPC, and waits for its end.
+/// Submits the sequence over gRPC and waits for its end.
 async fn submitted(server: &Server, densify: Option<proto::Densify>) -> proto::Job {
     use proto::submit_job_request::{Begin, NextCloud, Part};
     let mut parts = vec![Part::Begin(Begin {
         options: Some(grpc_options(densify)),
         idempotency_key: String::new(),
     })];
-    for points in frames() {
+    for points in sweeps() {
         parts.push(Part::Next(NextCloud {}));
         parts.push(Part::Chunk(chunk(points)));
     }
@@ -259,7 +258,7 @@ async fn the_dense_cloud_of_a_sequence_is_the_librarys_in_every_format_and_door(
     assert_eq!(job["report"]["points"], expected.points.len());
     assert_eq!(job["pairs"]["total"], 5);
     assert_eq!(job["pairs"]["ended"], 5);
-    // The flows are there besides, and only those.
+    // Only the forward flows are listed as results.
     assert!(pair_flows(&server, &job).await == flows(FLOWS));
     let path = format!("/v1/jobs/{id}/result");
     for (format, media, _) in DENSE_FORMATS {
@@ -283,7 +282,7 @@ async fn the_dense_cloud_of_a_sequence_is_the_librarys_in_every_format_and_door(
     assert_eq!(other.status(), StatusCode::NOT_ACCEPTABLE);
 
     let into = proto::Densify {
-        into: 1.5,
+        reference_time: 1.5,
         ..proto::Densify::default()
     };
     let job = submitted(&server, Some(into)).await;
@@ -300,12 +299,12 @@ async fn the_dense_cloud_of_a_sequence_is_the_librarys_in_every_format_and_door(
         match part.expect("a part").part.expect("something") {
             Part::DenseHeader(header) => {
                 assert_eq!(header.points as usize, expected.points.len());
-                assert_eq!((header.frames, header.substeps), (4, 1));
+                assert_eq!((header.sweeps, header.substeps), (4, 1));
             }
             Part::DenseChunk(piece) => {
                 let word = |bytes: &[u8]| u32::from_le_bytes(bytes.try_into().expect("4 bytes"));
                 found.points.extend(points_from_le_bytes(&piece.points));
-                found.frame.extend(piece.frame.chunks(4).map(word));
+                found.sweep.extend(piece.sweep.chunks(4).map(word));
                 let ages = piece.age.chunks(4).map(word);
                 found.age.extend(ages.map(f32::from_bits));
                 let flags = |bit: u8| piece.flags.iter().map(move |flag| flag & bit != 0);
@@ -317,7 +316,7 @@ async fn the_dense_cloud_of_a_sequence_is_the_librarys_in_every_format_and_door(
     }
     let rest = DenseCloud {
         points: expected.points[10..].to_vec(),
-        frame: expected.frame[10..].to_vec(),
+        sweep: expected.sweep[10..].to_vec(),
         age: expected.age[10..].to_vec(),
         dynamic: expected.dynamic[10..].to_vec(),
         converged: expected.converged[10..].to_vec(),
@@ -329,9 +328,9 @@ async fn the_dense_cloud_of_a_sequence_is_the_librarys_in_every_format_and_door(
 async fn a_sequence_that_is_killed_in_its_pairs_and_while_it_is_carried_ends_with_the_same_bits() {
     const CONFIG: &str =
         "[queue]\nretry_delay_seconds = 1\nsnapshot_interval_ms = 50\nmax_crashes = 40\n";
-    // So many steps that carrying takes seconds.
+    // Enough integration steps that the densification takes seconds.
     const LONG: &str = r#"{"preset": "neural", "max_points": 1024, "ground": "auto",
-        "densify": {"into": 0, "substeps": 64}}"#;
+        "densify": {"reference_time": 0, "substeps": 64}}"#;
     let folder = Folder::new();
     let mut server = Server::start_in(&folder, CONFIG, &[]);
     let id = submit(&server, LONG).await;
@@ -368,7 +367,7 @@ async fn a_dense_cloud_whose_pair_fails_fails_and_names_it_and_the_others_are_th
     let server = Server::start_in(&folder, "[queue]\nretry_delay_seconds = 1\n", &[]);
     let id = submit(&server, DENSE).await;
     let blobs = folder.path().join("data/blobs/jobs").join(&id[..8]);
-    let last = blobs.join(&id).join("frame-3");
+    let last = blobs.join(&id).join("sweep-3");
     std::fs::remove_file(last).expect("it was stored");
     let job = ended(&server, &id).await;
     assert_eq!(job["state"], "failed", "{job}");
@@ -383,41 +382,46 @@ async fn a_dense_cloud_whose_pair_fails_fails_and_names_it_and_the_others_are_th
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_dense_cloud_that_cannot_be_made_is_refused_with_clear_words_and_costs_nothing() {
-    let server = Server::with_config("[limits]\nmax_pair_mib = 128\n");
-    let small: Vec<Vec<Point>> = frames()
+    let server = Server::with_config("[limits]\nmax_job_memory_mib = 128\n");
+    let small: Vec<Vec<Point>> = sweeps()
         .iter()
         .map(|points| points.iter().step_by(4).copied().collect())
         .collect();
     let many: Vec<Vec<Point>> = small.iter().cycle().take(150).cloned().collect();
-    for (densify, frames, status, said) in [
+    for (densify, sweeps, status, said) in [
         (
-            r#"{"into": 9}"#,
+            r#"{"reference_time": 9}"#,
             &small,
             400,
             "into 9 lies outside the sequence's sweeps, 0 to 3",
         ),
-        (r#"{"into": -1}"#, &small, 400, "densify.into is -1"),
         (
-            r#"{"into": 1, "substeps": 0}"#,
+            r#"{"reference_time": -1}"#,
+            &small,
+            400,
+            "densify.reference_time is -1",
+        ),
+        (
+            r#"{"reference_time": 1, "substeps": 0}"#,
             &small,
             400,
             "0 substeps: 1 to 64 are possible",
         ),
         (
-            r#"{"into": 1, "steps": 2}"#,
+            r#"{"reference_time": 1, "steps": 2}"#,
             &small,
             400,
             "unknown field `steps`",
         ),
-        (r#"{"into": 1}"#, &many, 413, "the dense cloud of"),
+        (r#"{"reference_time": 1}"#, &many, 413, "the dense cloud of"),
     ] {
         let options = format!(r#"{{"preset": "neural", "max_points": 512, "densify": {densify}}}"#);
-        let (found, problem) = post(&server, "/v1/sequences", body(&options, frames)).await;
+        let (found, problem) = post(&server, "/v1/sequences", body(&options, sweeps)).await;
         let detail = problem["detail"].as_str().unwrap_or_default();
         assert_eq!(found.as_u16(), status, "{problem}");
         assert!(detail.contains(said), "{said}: {problem}");
     }
-    let cloud = || Part::bytes(file(CloudFormat::Npy, &frames()[0])).file_name("f.npy");
+    let cloud = || Part::bytes(file(CloudFormat::Npy, &sweeps()[0])).file_name("f.npy");
     for path in ["/v1/flow", "/v1/jobs"] {
         let form = Form::new()
             .text("options", DENSE)
@@ -430,7 +434,7 @@ async fn a_dense_cloud_that_cannot_be_made_is_refused_with_clear_words_and_costs
     }
     let into = || Some(proto::Densify::default());
     let mut calls = client(&server).await;
-    let clouds = [frames()[0].clone(), frames()[1].clone()];
+    let clouds = [sweeps()[0].clone(), sweeps()[1].clone()];
     let refused = calls
         .estimate_flow(pair(&clouds, grpc_options(into())))
         .await;

@@ -1,4 +1,4 @@
-//! Runs the real server on ports of its own, and stops or kills it.
+//! Runs the real server on free ports, and stops or kills it.
 
 use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
@@ -9,10 +9,10 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-/// Long enough for a loaded machine; only a failure waits so long.
+/// Timeout that suffices on a loaded machine. Only a failing test waits this long.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
 
-/// A running server. It is killed when it is dropped.
+/// A running server. It is killed on drop.
 pub(crate) struct Server {
     child: Child,
     pub(crate) public: String,
@@ -21,7 +21,7 @@ pub(crate) struct Server {
     folder: Folder,
 }
 
-/// Where a server keeps its things.
+/// A temporary folder for the configuration and the data of a server.
 #[derive(Clone)]
 pub(crate) struct Folder(Arc<tempfile::TempDir>);
 
@@ -36,23 +36,23 @@ impl Folder {
 }
 
 impl Server {
-    /// A fresh server with the defaults and some more arguments.
+    /// A new server with the default configuration and these additional arguments.
     pub(crate) fn start(arguments: &[&str]) -> Self {
         Self::start_in(&Folder::new(), "", arguments)
     }
 
-    /// A fresh server with some more lines of configuration.
+    /// A new server with these lines of configuration.
     pub(crate) fn with_config(config: &str) -> Self {
         Self::start_in(&Folder::new(), config, &[])
     }
 
-    /// A server on what another one left behind.
+    /// A server on the data of an earlier one.
     pub(crate) fn start_in(folder: &Folder, config: &str, arguments: &[&str]) -> Self {
         let program = Command::new(env!("CARGO_BIN_EXE_fnsf"));
         Self::start_as(program, folder, config, arguments)
     }
 
-    /// A fresh server that a shell starts after some commands, such as `ulimit -n 100`.
+    /// A new server started by a shell after some commands, such as `ulimit -n 100`.
     pub(crate) fn start_after(commands: &str, config: &str) -> Self {
         let mut shell = Command::new("sh");
         let program = env!("CARGO_BIN_EXE_fnsf");
@@ -75,7 +75,7 @@ impl Server {
             .arg(folder.path().join("data"))
             .arg("--config")
             .arg(&file)
-            // The same bits wherever the tests run; a test that wants something else says so.
+            // The CPU by default, for identical results on every machine. A test may override it.
             .env("FNSF_SERVE_DEVICES", "[\"cpu\"]")
             .args(arguments)
             .stdout(Stdio::piped())
@@ -112,7 +112,7 @@ impl Server {
         self.child.id()
     }
 
-    /// The URL of a path of the public port.
+    /// The URL of a path on the public port.
     pub(crate) fn url(&self, path: &str) -> String {
         format!("http://{}{path}", self.public)
     }
@@ -125,7 +125,7 @@ impl Server {
         self.until("it is ready", || self.is_ready());
     }
 
-    /// Waits for something; only a failure waits long.
+    /// Waits until a condition holds. Fails after `PATIENCE`.
     pub(crate) fn until(&self, what: &str, is_so: impl Fn() -> bool) {
         let began = Instant::now();
         while !is_so() {
@@ -138,28 +138,29 @@ impl Server {
         }
     }
 
-    /// Where it keeps its things.
+    /// The data directory of the server.
     pub(crate) fn data(&self) -> PathBuf {
         self.folder.path().join("data")
     }
 
-    /// Processor time that it has used, seconds.
+    /// CPU time used by the server, seconds.
     pub(crate) fn processor_seconds(&self) -> f64 {
         let about =
             std::fs::read_to_string(format!("/proc/{}/stat", self.id())).expect("it runs on Linux");
-        // The fields after the program's name in brackets: user and system time are 14 and 15.
+        // User and system time are fields 14 and 15. Counting starts after the program's name in
+        // parentheses.
         let fields = about.rsplit(')').next().unwrap_or_default();
         let ticks = fields.split_whitespace().skip(11).take(2);
         let ticks = ticks.filter_map(|ticks| ticks.parse::<f64>().ok());
         ticks.sum::<f64>() / 100.0
     }
 
-    /// Whether the admin port says that it is ready.
+    /// Whether the admin port reports readiness.
     pub(crate) fn is_ready(&self) -> bool {
         plain_get(&self.admin, "/readyz").is_some_and(|answer| answer.starts_with("HTTP/1.1 200"))
     }
 
-    /// Memory that it holds, bytes.
+    /// Resident memory of the server, bytes.
     pub(crate) fn resident_bytes(&self) -> u64 {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.id()))
             .expect("it runs on Linux");
@@ -168,7 +169,7 @@ impl Server {
         kibibytes.map_or(0, |kibibytes: u64| kibibytes * 1024)
     }
 
-    /// Sends it a signal.
+    /// Sends a signal to the server.
     pub(crate) fn signal(&self, name: &str) {
         let id = self.id().to_string();
         let sent = Command::new("kill")
@@ -177,14 +178,14 @@ impl Server {
         assert!(sent.expect("kill is there").success());
     }
 
-    /// Kills it as a crash would, and waits until it is gone.
+    /// Kills the server as a crash would, and waits until it has exited.
     pub(crate) fn kill(mut self) -> Folder {
         self.child.kill().expect("it runs");
         self.child.wait().expect("it ends");
         self.folder.clone()
     }
 
-    /// Waits for its end.
+    /// Waits for the exit of the server, at most for `longest`.
     pub(crate) fn wait(&mut self, longest: Duration) -> Option<ExitStatus> {
         let began = Instant::now();
         while began.elapsed() < longest {
@@ -196,7 +197,7 @@ impl Server {
         None
     }
 
-    /// A metric's value, all its series together.
+    /// The value of a metric, summed over its series.
     pub(crate) fn metric(&self, name: &str) -> f64 {
         let page = plain_get(&self.admin, "/metrics").expect("metrics");
         let series = page.lines().filter(|line| {
@@ -216,7 +217,7 @@ impl Drop for Server {
     }
 }
 
-/// Keeps what a server logs.
+/// Collects the log of a server.
 fn keep(mut from: impl Read + Send + 'static, log: Arc<Mutex<String>>) {
     thread::spawn(move || {
         let mut piece = [0; 4096];
@@ -230,7 +231,7 @@ fn keep(mut from: impl Read + Send + 'static, log: Arc<Mutex<String>>) {
     });
 }
 
-/// A request without any library: what the admin port must answer whatever else happens.
+/// A GET request over a plain socket, for the admin port. Returns the whole response.
 pub(crate) fn plain_get(address: &str, path: &str) -> Option<String> {
     use std::io::Write;
     let mut stream = std::net::TcpStream::connect(address).ok()?;
@@ -242,7 +243,7 @@ pub(crate) fn plain_get(address: &str, path: &str) -> Option<String> {
     Some(answer)
 }
 
-/// Waits until a job has ended, by long polls; gives what is known about it.
+/// Waits until a job has ended, by long polling. Returns its JSON document.
 pub(crate) async fn ended(server: &Server, id: &str) -> Value {
     let began = Instant::now();
     loop {

@@ -1,4 +1,5 @@
-//! The machine fails, and not the jobs: what it owes them waits until it works again.
+//! Tests of failures of the machine: they cost no job an attempt, and jobs wait until it works
+//! again.
 
 use std::net::TcpStream;
 use std::path::Path;
@@ -12,7 +13,7 @@ use crate::clouds::{form, medium_pair, small_pair};
 use crate::server::{Folder, Server, ended, plain_get};
 use crate::wire::SMALL;
 
-/// Quick retries: three failures of a job would be its end within a second or two.
+/// Immediate retries: with counted failures, a job would fail after three of them, within seconds.
 const CONFIG: &str = "[queue]\nretry_delay_seconds = 0\n";
 
 async fn submit(server: &Server) -> Result<String, (StatusCode, Value)> {
@@ -45,7 +46,8 @@ async fn all_succeed(server: &Server, ids: Vec<String>) {
     assert_eq!(server.metric("fnsf_dead_letters_total"), 0.0);
 }
 
-/// Puts a file where a folder was. Writes below it fail for every user, root too.
+/// Replaces a folder by a file, so that writes below it fail for every user, root included. Returns
+/// a function that restores the folder.
 fn break_folder(folder: &Path) -> impl Fn() + use<> {
     let (folder, aside) = (folder.to_owned(), folder.with_extension("aside"));
     std::fs::rename(&folder, &aside).expect("renamed");
@@ -70,7 +72,7 @@ async fn a_store_that_fails_costs_no_job_an_attempt_and_readiness_says_so() {
     assert_eq!(status, StatusCode::SERVICE_UNAVAILABLE, "{said}");
     assert_eq!(said["code"], "store_unavailable");
     assert_eq!(said["retryable"], true);
-    // Long enough for three attempts at each of them.
+    // Long enough for three attempts of each job.
     tokio::time::sleep(Duration::from_secs(4)).await;
     mend();
     server.until_ready();
@@ -79,7 +81,7 @@ async fn a_store_that_fails_costs_no_job_an_attempt_and_readiness_says_so() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn descriptors_that_connections_take_are_none_that_jobs_need() {
-    // As many connections as the system lets a process have files, and as the server was told.
+    // More connections than the process may open files, as the configuration allows.
     let config = format!("{CONFIG}[limits]\nmax_connections = 1024\n");
     let server = Server::start_after("ulimit -n 300", &config);
     assert!(
@@ -117,7 +119,7 @@ async fn files_that_can_still_be_made_are_watched_as_bytes_are() {
 
 #[tokio::test]
 async fn a_file_that_may_not_grow_is_an_error_and_not_the_end() {
-    // In blocks of 512 bytes or 1 KiB, as the shell counts: less than this cloud takes.
+    // In blocks of 512 bytes or 1 KiB, depending on the shell: less than this cloud needs.
     let server = Server::start_after("ulimit -f 3000", "");
     let cloud: Vec<Point> = (0..400_000_u32)
         .map(|at| [(at % 1000) as f32 * 0.1, (at / 1000) as f32 * 0.1, 0.0])
@@ -188,7 +190,7 @@ async fn a_result_that_is_lost_is_found_again_when_it_is_asked_for() {
     assert_eq!(refused.status(), StatusCode::BAD_REQUEST);
     let folder = server.data().join("blobs/jobs").join(&id[..8]).join(&id);
     std::fs::remove_file(folder.join("result-1")).expect("it was there");
-    // Another format, since what was sent just now may still be at hand.
+    // Requested in another format, because the previous response may be cached.
     let url = server.url(&format!("/v1/jobs/{id}/result"));
     let lost = client.get(url).header("accept", "application/x-ply").send();
     let lost = lost.await.expect("an answer");
@@ -214,7 +216,7 @@ async fn what_a_server_keeps_is_for_its_user_alone() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_payload_that_cannot_be_read_keeps_nobody_else_waiting() {
     let server = Server::start(&[]);
-    // Something to do first, so that what comes is still in line.
+    // A long job first, so that the next ones are still queued.
     let sent = reqwest::Client::new()
         .post(server.url("/v1/jobs"))
         .multipart(form(medium_pair(), r#"{"preset": "paper"}"#))
@@ -222,13 +224,13 @@ async fn a_payload_that_cannot_be_read_keeps_nobody_else_waiting() {
     assert!(sent.await.expect("an answer").status().is_success());
     let broken = submit(&server).await.expect("accepted");
     let others = submit_some(&server).await;
-    // A link to itself where a file was: reading it fails for every user, root too.
+    // Replaces a file by a symbolic link to itself: reading it fails for every user, root included.
     let folder = server
         .data()
         .join("blobs/jobs")
         .join(&broken[..8])
         .join(&broken);
-    let (file, aside) = (folder.join("frame-0"), folder.join("aside"));
+    let (file, aside) = (folder.join("sweep-0"), folder.join("aside"));
     std::fs::rename(&file, &aside).expect("renamed");
     std::os::unix::fs::symlink(&file, &file).expect("linked");
     all_succeed(&server, others).await;
@@ -260,7 +262,7 @@ async fn payloads_whose_volume_is_not_there_are_waited_for() {
     std::fs::create_dir(&blobs).expect("made");
     server.until("it is not ready", || !server.is_ready());
     tokio::time::sleep(Duration::from_secs(3)).await;
-    // Nor does a start take an empty folder for the payloads of these jobs.
+    // A restart does not accept an empty folder as the payloads of these jobs either.
     let folder = server.kill();
     let started = std::process::Command::new(env!("CARGO_BIN_EXE_fnsf"))
         .args(["serve", "--device", "cpu", "--data-dir"])

@@ -1,5 +1,5 @@
-//! Pairs that see the sweeps around them: the same bits through every door, in the library and on the
-//! command line, whichever comes first and wherever the sequence ends.
+//! Tests of estimates with neighbor sweeps: identical results over every protocol, in the library
+//! and on the command line.
 
 use std::process::Command;
 use std::sync::OnceLock;
@@ -16,7 +16,7 @@ use crate::grpc::{chunk, client, proto};
 use crate::sequences::{body, get, pair_flows, post};
 use crate::server::{Server, ended};
 
-/// More than a window has, so that one slides.
+/// More sweeps than a window has, so that the window moves.
 const SWEEPS: usize = 7;
 
 fn sweeps() -> &'static [Vec<Point>] {
@@ -25,16 +25,16 @@ fn sweeps() -> &'static [Vec<Point>] {
         let options = StreetOptions {
             beams: 16,
             azimuth_steps: 400,
-            frames: SWEEPS,
+            sweeps: SWEEPS,
             ..StreetOptions::default()
         };
         let street = Street::new(&options).expect("a street");
-        let frame = |place| street.frame(place).expect("a frame").points;
+        let frame = |place| street.sweep(place).expect("a frame").points;
         (0..SWEEPS).map(frame).collect()
     })
 }
 
-/// The flows of the library's own sequence.
+/// The flows of the sequence, computed by the library.
 fn flows(preset: Preset, sweeps: &[Vec<Point>]) -> Vec<Vec<Point>> {
     let backend = CpuBackend::new(Some(2)).expect("threads");
     let (options, mut sequence) = (preset.options(None), Sequence::default());
@@ -51,8 +51,8 @@ fn flows(preset: Preset, sweeps: &[Vec<Point>]) -> Vec<Vec<Point>> {
     found.into_iter().map(|estimate| estimate.flow).collect()
 }
 
-/// The flows of a stream, with the names of each pair's sweeps; and what it broke with, where
-/// `broken` bytes come in the place of a sweep after the first four.
+/// Streams the sequence over gRPC. Returns each pair's sweep names and flow, and the status code of
+/// an error. The bytes of `broken`, if any, replace the sweep after the first four.
 async fn streamed(
     server: &Server,
     broken: Option<&'static [u8]>,
@@ -137,7 +137,7 @@ async fn pairs_that_see_the_sweeps_around_them_have_the_same_bits_through_every_
 async fn a_dense_cloud_whose_pairs_see_the_sweeps_around_them_is_the_command_lines() {
     let server = Server::start(&[]);
     for into in ["2", "4.5"] {
-        let options = format!(r#"{{"preset": "label", "densify": {{"into": {into}}}}}"#);
+        let options = format!(r#"{{"preset": "label", "densify": {{"reference_time": {into}}}}}"#);
         let (_, job) = post(&server, "/v1/sequences", body(&options, sweeps())).await;
         let id = job["id"].as_str().expect("a name").to_owned();
         let job = ended(&server, &id).await;
@@ -156,7 +156,14 @@ async fn a_dense_cloud_whose_pairs_see_the_sweeps_around_them_is_the_command_lin
             .current_dir(folder.path())
             .arg("densify")
             .args(&names)
-            .args(["--into", into, "--preset", "label", "--device", "cpu"])
+            .args([
+                "--reference-time",
+                into,
+                "--preset",
+                "label",
+                "--device",
+                "cpu",
+            ])
             .args(["-o", "dense.ply"])
             .output();
         let done = done.expect("the program starts");

@@ -1,4 +1,4 @@
-//! Bytes on the wire that no well-behaved client would send, and what a server must be afterwards.
+//! Helpers for attacks: malformed bytes on the wire, and checks of the server afterwards.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -9,25 +9,25 @@ use reqwest::StatusCode;
 use crate::clouds::{form, small_pair};
 use crate::server::{Folder, PATIENCE, Server};
 
-/// A request of a few hundredths of a second.
+/// The options of a request of a few hundredths of a second.
 pub(crate) const SMALL: &str = r#"{"preset": "neural", "max_points": 512}"#;
 
-/// What an attack may cost a server for good.
+/// Maximum memory growth of the server after an attack, bytes.
 const MAX_GROWTH: u64 = 64 << 20;
 
-/// A server under attack.
+/// A server under attack, and its resident memory before it.
 pub(crate) struct Besieged {
     pub(crate) server: Server,
     resident: u64,
 }
 
 impl Besieged {
-    /// A server that has served already, so that what it keeps for work is there.
+    /// A server that has already solved some pairs, so that its working memory is allocated.
     pub(crate) async fn new(config: &str) -> Self {
         Self::with(config, &[]).await
     }
 
-    /// The same with some more arguments.
+    /// The same with additional arguments.
     pub(crate) async fn with(config: &str, arguments: &[&str]) -> Self {
         let server = Server::start_in(&Folder::new(), config, arguments);
         for _ in 0..3 {
@@ -37,7 +37,8 @@ impl Besieged {
         Self { server, resident }
     }
 
-    /// Asserts that the attack has cost little memory, and that work is still done.
+    /// Asserts that the memory has grown little, that a pair is still solved and that nothing
+    /// panicked.
     pub(crate) async fn stands(&self) {
         self.has_not_grown();
         serves(&self.server).await;
@@ -45,7 +46,7 @@ impl Besieged {
         assert!(!log.contains("panicked"), "{log}");
     }
 
-    /// Memory that it holds more than before the attack, bytes.
+    /// Memory growth since the start of the attack, bytes.
     pub(crate) fn grown(&self) -> u64 {
         self.server.resident_bytes().saturating_sub(self.resident)
     }
@@ -76,15 +77,15 @@ pub(crate) fn connect(server: &Server) -> TcpStream {
     stream
 }
 
-/// Sends bytes and takes all that comes back until the server closes.
+/// Sends bytes and reads until the server closes the connection.
 pub(crate) fn exchange(server: &Server, bytes: &[u8]) -> String {
     let mut stream = connect(server);
-    // A server that has refused already need not read the rest.
+    // A server that has already refused need not read the rest.
     let _refused_early = stream.write_all(bytes);
     until_closed(stream)
 }
 
-/// All that comes until the server closes the connection.
+/// Reads until the server closes the connection.
 pub(crate) fn until_closed(mut stream: TcpStream) -> String {
     let began = Instant::now();
     let mut all = Vec::new();
@@ -101,7 +102,7 @@ pub(crate) fn until_closed(mut stream: TcpStream) -> String {
     String::from_utf8_lossy(&all).into_owned()
 }
 
-/// The status of an HTTP/1.1 answer; nothing where there is none.
+/// The status of an HTTP/1.1 response; none if there is no status line.
 pub(crate) fn status(answer: &str) -> Option<u16> {
     answer
         .strip_prefix("HTTP/1.1 ")
@@ -111,7 +112,7 @@ pub(crate) fn status(answer: &str) -> Option<u16> {
         .ok()
 }
 
-/// A multipart body of named parts, and its content type's boundary is `x`.
+/// A multipart body of named parts, with the boundary `x`.
 pub(crate) fn multipart(parts: &[(&str, &[u8])]) -> Vec<u8> {
     let mut body = Vec::new();
     for (name, bytes) in parts {
@@ -142,7 +143,7 @@ pub(crate) struct Frames {
     stream: TcpStream,
 }
 
-/// A frame that has come.
+/// A received frame.
 pub(crate) struct Frame {
     pub(crate) kind: u8,
     pub(crate) flags: u8,
@@ -170,7 +171,7 @@ impl Frames {
         Self { stream }
     }
 
-    /// Sends bytes from a thread of its own, since the server may answer before it has read them.
+    /// Sends bytes from a separate thread, since the server may respond before it has read them.
     pub(crate) fn send(&self, bytes: Vec<u8>) {
         let mut stream = self.stream.try_clone().expect("a handle");
         std::thread::spawn(move || {
@@ -178,7 +179,7 @@ impl Frames {
         });
     }
 
-    /// The next frame; nothing where the connection is closed.
+    /// The next frame; none if the connection is closed.
     pub(crate) fn next(&mut self) -> Option<Frame> {
         let mut head = [0; 9];
         self.stream.read_exact(&mut head).ok()?;
@@ -192,7 +193,7 @@ impl Frames {
         })
     }
 
-    /// The last stream and the error code of the GOAWAY that must come, now or before the end.
+    /// The last stream id and the error code of the next GOAWAY frame. Panics if none arrives.
     pub(crate) fn goaway(&mut self) -> (u32, u32) {
         while let Some(frame) = self.next() {
             if frame.kind == GOAWAY {
@@ -206,8 +207,8 @@ impl Frames {
         panic!("it was closed without a GOAWAY")
     }
 
-    /// Answers pings and nothing else, from a thread of its own, until the server closes the
-    /// connection; says how long that took.
+    /// Answers pings and settings, and nothing else, from a separate thread until the server closes
+    /// the connection. The thread returns the time until then.
     pub(crate) fn answer_pings(mut self) -> std::thread::JoinHandle<Duration> {
         const ACK: u8 = 1;
         std::thread::spawn(move || {
@@ -228,22 +229,22 @@ impl Frames {
         })
     }
 
-    /// Closes the connection; by a reset, where one is asked for.
+    /// Closes the connection, by a reset if `by_reset`.
     pub(crate) fn hang_up(self, by_reset: bool) {
         if !by_reset {
-            // Else what is unread makes the system reset instead of close.
+            // Without the shutdown, unread data makes the system send a reset.
             let _gone_is_fine = self.stream.shutdown(std::net::Shutdown::Both);
         }
     }
 
-    /// Shortens how long a read may take.
+    /// Sets the timeout of a read.
     pub(crate) fn patience(&self, patience: Duration) {
         let set = self.stream.set_read_timeout(Some(patience));
         set.expect("a timeout");
     }
 }
 
-/// A frame's bytes.
+/// The bytes of a frame.
 pub(crate) fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
     let length = u32::try_from(payload.len()).expect("a small frame");
     let mut bytes = length.to_be_bytes()[1..].to_vec();
@@ -253,7 +254,7 @@ pub(crate) fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8>
     bytes
 }
 
-/// A field of a header block, as a literal that is not indexed.
+/// A header field as a literal without indexing.
 pub(crate) fn field(name: &str, value: &str) -> Vec<u8> {
     let mut bytes = vec![0];
     for text in [name, value] {
@@ -263,7 +264,7 @@ pub(crate) fn field(name: &str, value: &str) -> Vec<u8> {
     bytes
 }
 
-/// The header block of a request without a body of its own.
+/// The header block of a request.
 pub(crate) fn head(method: &str, path: &str) -> Vec<u8> {
     let fields = [
         (":method", method),

@@ -1,4 +1,4 @@
-//! What every call has: who calls, since when, until when.
+//! The context of a gRPC call: caller, arrival time and deadline.
 
 use std::pin::Pin;
 use std::time::{Duration, Instant};
@@ -7,17 +7,17 @@ use tokio_stream::Stream;
 use tonic::{Request, Status};
 
 use super::convert;
-use crate::api::admission::Promise;
+use crate::api::admission::Durability;
 use crate::api::auth::Caller;
 use crate::api::draft::{Arrived, Request as DraftRequest};
 use crate::api::error::ApiError;
 use crate::job::JobOptions;
 use crate::queue::PairOf;
 
-/// A stream of answers.
+/// A stream of responses.
 pub(super) type Answers<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
-/// Who calls, and until when.
+/// The caller, the arrival time, and the remaining time of a call.
 #[derive(Clone)]
 pub(super) struct Call {
     pub(super) caller: Caller,
@@ -26,6 +26,10 @@ pub(super) struct Call {
 }
 
 impl Call {
+    /// The context of a request.
+    ///
+    /// # Errors
+    /// [`ApiError::Unauthenticated`] if the middleware has not identified a caller.
     pub(super) fn of<T>(request: &Request<T>) -> Result<Self, ApiError> {
         let extensions = request.extensions();
         let caller = extensions.get::<Caller>().cloned();
@@ -37,12 +41,17 @@ impl Call {
         })
     }
 
-    /// What is asked of a job of this call.
-    pub(super) fn draft_request(&self, options: JobOptions, promise: Promise) -> DraftRequest {
-        let awaited = promise == Promise::WhileAwaited;
+    /// The parameters of a job that this call submits. The deadline of the call applies only if the
+    /// caller waits for the result.
+    pub(super) fn draft_request(
+        &self,
+        options: JobOptions,
+        durability: Durability,
+    ) -> DraftRequest {
+        let awaited = durability == Durability::Ephemeral;
         DraftRequest {
             options,
-            promise,
+            durability,
             idempotency_key: None,
             arrived: self.arrived,
             time_left: self.time_left.filter(|_| awaited),
@@ -52,7 +61,7 @@ impl Call {
     }
 }
 
-/// The first message of a stream has to begin it.
+/// The error for a stream that does not begin with exactly one `begin` message.
 pub(super) fn no_begin() -> ApiError {
     ApiError::BadRequest("the first message is begin, and there is one of it".to_owned())
 }

@@ -1,4 +1,4 @@
-//! The calls, but for the streamed sequence.
+//! The gRPC calls, except for the stream of `EstimateSequence`.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,10 +9,10 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::call::{Answers, Call, no_begin};
-use super::chunks::{self, CloudBuilder};
+use super::chunks::CloudBuilder;
 use super::proto::{self, scene_flow_server::SceneFlow};
-use super::{convert, sequence};
-use crate::api::admission::Promise;
+use super::{chunks, convert, sequence};
+use crate::api::admission::Durability;
 use crate::api::answers::Taking;
 use crate::api::dense;
 use crate::api::draft::{Accepted, Draft};
@@ -21,10 +21,10 @@ use crate::api::listener::Asking;
 use crate::api::service::{Service, Waited};
 use crate::job::{InvalidId, Job, JobId, Kind, State};
 
-/// Messages that wait for a client that reads slowly.
+/// Number of response messages that are buffered for a slow client.
 const AHEAD: usize = 4;
 
-/// The calls on a service.
+/// The implementation of the gRPC service.
 pub(super) struct Calls {
     service: Arc<Service>,
 }
@@ -40,14 +40,15 @@ impl Calls {
         self.service.job(&call.caller, named(id)?).await
     }
 
-    /// Reads a pair and submits it.
+    /// Receives the two clouds of a pair and submits the job. Also returns the interval of progress
+    /// messages, if the client requests them.
     async fn read_pair(
         &self,
         call: &Call,
         inbound: &mut Streaming<proto::EstimateFlowRequest>,
     ) -> Result<(Accepted, Option<Duration>), ApiError> {
         use proto::estimate_flow_request::Part;
-        let awaited = Promise::WhileAwaited;
+        let awaited = Durability::Ephemeral;
         self.service.check_room(&call.caller, None, awaited)?;
         let mut room = self.service.uploads.room(&call.caller.tenant);
         let begin = match chunks::next(&mut room, inbound).await?.and_then(|m| m.part) {
@@ -85,17 +86,18 @@ impl Calls {
     }
 }
 
-/// The job of a name; what is no name is no job.
+/// Parses a job id. A malformed id is reported as a job that does not exist.
 fn named(id: &str) -> Result<JobId, ApiError> {
     Ok(id.parse()?)
 }
 
-/// A page's name that is none.
+/// The error for a malformed page token.
 fn bad_page(error: InvalidId) -> ApiError {
     ApiError::BadRequest(format!("page_token: {error}"))
 }
 
-/// Sends progress until the job ends, then its flow. False where its client went away before.
+/// Sends progress until the job ends, then its flow. Returns false if the client disconnects while
+/// progress is sent.
 async fn send_flow(
     service: &Arc<Service>,
     id: JobId,
@@ -144,7 +146,7 @@ async fn send_flow(
     }
 }
 
-/// Sends a result's parts, one by one, until they have to make room for others.
+/// Sends the parts of a result until it is evicted for a slow client.
 async fn send_result(
     parts: impl Iterator<Item = proto::download_result_response::Part>,
     answers: mpsc::Sender<Result<proto::DownloadResultResponse, Status>>,
@@ -184,7 +186,7 @@ impl SceneFlow for Calls {
         let service = Arc::clone(&self.service);
         tokio::spawn(async move {
             let sent = tokio::select! {
-                // The client is gone: the guard cancels the job.
+                // The client has disconnected. Dropping `awaited` cancels the job.
                 () = answers.closed() => return,
                 sent = send_flow(&service, job.id, pause, &answers) => sent,
             };
@@ -192,7 +194,7 @@ impl SceneFlow for Calls {
                 Ok(false) => {}
                 Ok(true) => {
                     if let Some(awaited) = awaited {
-                        awaited.let_go();
+                        awaited.disarm();
                     }
                 }
                 Err(error) => {
@@ -209,7 +211,7 @@ impl SceneFlow for Calls {
         request: Request<Streaming<proto::EstimateSequenceRequest>>,
     ) -> Result<Response<Self::EstimateSequenceStream>, Status> {
         let call = Call::of(&request)?;
-        let awaited = Promise::WhileAwaited;
+        let awaited = Durability::Ephemeral;
         self.service.check_room(&call.caller, None, awaited)?;
         if let Some(asking) = request.extensions().get::<Asking>() {
             asking.may_wait();
@@ -225,7 +227,7 @@ impl SceneFlow for Calls {
         use proto::submit_job_request::Part;
         let call = Call::of(&request)?;
         self.service
-            .check_room(&call.caller, None, Promise::Durable)?;
+            .check_room(&call.caller, None, Durability::Durable)?;
         let mut inbound = request.into_inner();
         let service = &self.service;
         let mut room = service.uploads.room(&call.caller.tenant);
@@ -238,14 +240,14 @@ impl SceneFlow for Calls {
         };
         let options = convert::options(begin.options)?;
         let dense = options.densify.is_some();
-        let mut draft_request = call.draft_request(options, Promise::Durable);
+        let mut draft_request = call.draft_request(options, Durability::Durable);
         let key = begin.idempotency_key;
         draft_request.idempotency_key = (!key.is_empty()).then_some(key);
         let mut draft = Draft::begin(service, call.caller.clone(), draft_request)?;
         let mut cloud: Option<CloudBuilder> = None;
         loop {
             let part = chunks::next(&mut room, &mut inbound).await?.map(|m| m.part);
-            let place = format!("cloud {}", draft.frames());
+            let place = format!("cloud {}", draft.sweeps());
             match part {
                 Some(Some(Part::Chunk(chunk))) => match &mut cloud {
                     Some(cloud) => cloud.take(service, &mut room, &place, &chunk)?,
@@ -265,7 +267,7 @@ impl SceneFlow for Calls {
                 Some(_) => return Err(no_begin().into()),
             }
         }
-        let kind = if draft.frames() > 2 || dense {
+        let kind = if draft.sweeps() > 2 || dense {
             Kind::Sequence
         } else {
             Kind::Pair
@@ -378,7 +380,7 @@ impl SceneFlow for Calls {
         let (answers, stream) = mpsc::channel(AHEAD);
         if dense::is_dense(&job) {
             let header = convert::dense_header(job.id, &self.service.dense_report(&job)?);
-            // It is held as long as its client reads.
+            // The permit is held as long as the client reads.
             let turn = self.service.archives.take(&job.tenant)?;
             let (cloud, room) = self.service.dense_cloud(&job).await?;
             let pieces = chunks::dense_pieces(cloud, first).map(Part::DenseChunk);

@@ -1,4 +1,4 @@
-//! Clouds out of chunks, and flow into them.
+//! Conversion between chunks on the wire, and clouds and flow.
 
 use std::sync::Arc;
 
@@ -13,10 +13,14 @@ use crate::api::uploads::Room;
 use crate::flow::{DenseCloud, Point};
 use crate::payload::{StoredCloud, points_from_le_bytes};
 
-/// Rows of one chunk of flow: below 1 MiB with all of its columns.
+/// Rows of flow in one chunk: below 1 MiB with all of its columns.
 const ROWS: usize = 45_000;
 
-/// The next message, within the time that a body may take.
+/// Receives the next message, within the time limits of a body.
+///
+/// # Errors
+/// [`ApiError::TooSlow`], [`ApiError::TooLarge`] for a message above the size limit, or
+/// [`ApiError::BadRequest`] if the stream is broken.
 pub(super) async fn next<T>(
     room: &mut Room,
     inbound: &mut Streaming<T>,
@@ -34,7 +38,7 @@ pub(super) async fn next<T>(
     }
 }
 
-/// A cloud that comes in pieces.
+/// A cloud that is assembled from chunks.
 #[derive(Default)]
 pub(super) struct CloudBuilder {
     points: Vec<u8>,
@@ -42,7 +46,11 @@ pub(super) struct CloudBuilder {
 }
 
 impl CloudBuilder {
-    /// Takes a piece.
+    /// Adds a chunk. `part` is the name of the cloud for error messages.
+    ///
+    /// # Errors
+    /// [`ApiError::BadInput`] for a malformed chunk, [`ApiError::TooLarge`] or
+    /// [`ApiError::ServerFull`] at a limit.
     pub(super) fn take(
         &mut self,
         service: &Service,
@@ -73,12 +81,15 @@ impl CloudBuilder {
         Ok(())
     }
 
-    /// Points so far.
+    /// The number of points so far.
     pub(super) fn points(&self) -> u64 {
         (self.points.len() / size_of::<Point>()) as u64
     }
 
-    /// The whole cloud, checked as a file's would be.
+    /// The complete cloud, with the same checks as for a file.
+    ///
+    /// # Errors
+    /// [`ApiError::BadInput`] for unusable coordinates or an incomplete ground mask.
     pub(super) fn finish(self, part: &str) -> Result<StoredCloud, ApiError> {
         let points = points_from_le_bytes(&self.points);
         codec::check_points(part, &points)?;
@@ -96,10 +107,10 @@ impl CloudBuilder {
     }
 }
 
-/// Rows of one chunk of a dense cloud: below 1 MiB with all of its columns.
+/// Rows of a dense cloud in one chunk: below 1 MiB with all of its columns.
 const DENSE_ROWS: usize = 45_000;
 
-/// A dense cloud's rows from `first` on, in pieces.
+/// The chunks of a dense cloud from row `first`.
 pub(super) fn dense_pieces(
     cloud: Arc<DenseCloud>,
     first: usize,
@@ -111,8 +122,8 @@ pub(super) fn dense_pieces(
             let piece = from..(from + DENSE_ROWS).min(rows);
             let points = cloud.points[piece.clone()].as_flattened().iter();
             let points: Vec<u8> = points.flat_map(|value| value.to_le_bytes()).collect();
-            let frame = cloud.frame[piece.clone()].iter();
-            let frame: Vec<u8> = frame.flat_map(|frame| frame.to_le_bytes()).collect();
+            let sweep = cloud.sweep[piece.clone()].iter();
+            let sweep: Vec<u8> = sweep.flat_map(|sweep| sweep.to_le_bytes()).collect();
             let age = cloud.age[piece.clone()].iter();
             let age: Vec<u8> = age.flat_map(|age| age.to_le_bytes()).collect();
             let flags: Vec<u8> = piece
@@ -120,14 +131,14 @@ pub(super) fn dense_pieces(
                 .collect();
             proto::DenseChunk {
                 points: points.into(),
-                frame: frame.into(),
+                sweep: sweep.into(),
                 age: age.into(),
                 flags: flags.into(),
             }
         })
 }
 
-/// A flow's rows from `first` on, in pieces.
+/// The chunks of a flow from row `first`.
 pub(super) fn pieces(
     answer: &Answer,
     first: usize,
@@ -135,7 +146,7 @@ pub(super) fn pieces(
     let (flow, room) = (Arc::clone(&answer.flow), Arc::clone(&answer.room));
     let rows = flow.flow.len();
     (first.min(rows)..rows).step_by(ROWS).map(move |from| {
-        // It is held as long as there are pieces to come.
+        // Moved into the closure: the reservation is held until the iterator is dropped.
         let _room = &room;
         let to = (from + ROWS).min(rows);
         let values = flow.flow[from..to].as_flattened().iter();
@@ -148,7 +159,8 @@ pub(super) fn pieces(
             .collect();
         let (mut cluster, mut confidence, mut clusters) = (Vec::new(), Vec::new(), Vec::new());
         if let Some(objects) = &flow.objects {
-            // By the rows alone: who takes up a flow in the middle has those that came before.
+            // The clusters are distributed over the rows by row index alone. A client that resumes
+            // at a row has received the clusters of the rows before it.
             let part = |row: usize| objects.clusters.len() * row / rows;
             let described = &objects.clusters[part(from)..part(to)];
             clusters.extend(described.iter().map(convert::cluster));

@@ -1,4 +1,5 @@
-//! The protocol's messages to our vocabulary and back. Unknown numbers are refused by name.
+//! Conversion between protocol messages and domain types. Unknown enum values are refused with the
+//! name of the field.
 
 use std::time::Duration;
 
@@ -11,14 +12,17 @@ use crate::flow::Cluster;
 use crate::formats::ego_motion;
 use crate::job::{
     DenseReport, Densify, DeviceChoice, EgoChoice, GroundChoice, Job, JobError, JobId, JobOptions,
-    JobProgress, Kind, LaterChoice, PrecisionChoice, PresetChoice, Priority, State,
+    JobProgress, Kind, LaterSweepsChoice, PrecisionChoice, PresetChoice, Priority, State,
 };
 
 fn unknown(field: &str, number: i32) -> ApiError {
     ApiError::InvalidOptions(format!("options: {field} has no value {number}"))
 }
 
-/// The options of a message; the defaults where there is none.
+/// Converts and checks the options of a job. A missing message means the defaults.
+///
+/// # Errors
+/// [`ApiError::InvalidOptions`].
 pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, ApiError> {
     let Some(message) = message else {
         return Ok(JobOptions::default());
@@ -55,7 +59,8 @@ pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, Api
         preset,
         seed: message.seed,
         max_points: message.max_points,
-        range_m: message.range_m,
+        crop_m: message.crop_m,
+        dt_s: message.dt_s,
         ground,
         ego: ego(message.ego, &message.ego_motion)?,
         device,
@@ -69,15 +74,17 @@ pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, Api
 }
 
 fn densify(message: proto::Densify) -> Result<Densify, ApiError> {
-    let later = match proto::Later::try_from(message.later) {
-        Ok(proto::Later::Unspecified | proto::Later::Reverse) => LaterChoice::Reverse,
-        Ok(proto::Later::Inverse) => LaterChoice::Inverse,
-        Err(_) => return Err(unknown("densify.later", message.later)),
+    let later_sweeps = match proto::LaterSweeps::try_from(message.later_sweeps) {
+        Ok(proto::LaterSweeps::Unspecified | proto::LaterSweeps::Reverse) => {
+            LaterSweepsChoice::Reverse
+        }
+        Ok(proto::LaterSweeps::Inverse) => LaterSweepsChoice::Inverse,
+        Err(_) => return Err(unknown("densify.later_sweeps", message.later_sweeps)),
     };
     Ok(Densify {
-        into: message.into,
+        reference_time: message.reference_time,
         substeps: message.substeps.unwrap_or(1),
-        later,
+        later_sweeps,
     })
 }
 
@@ -99,7 +106,7 @@ fn ego(named: i32, motion: &[f64]) -> Result<Option<EgoChoice>, ApiError> {
     }
 }
 
-/// The state that a filter names; any where unspecified.
+/// The state that a list request filters by. `None` for all states.
 pub(super) fn wanted_state(number: i32) -> Result<Option<State>, ApiError> {
     let found = match proto::State::try_from(number) {
         Ok(proto::State::Unspecified) => None,
@@ -125,7 +132,7 @@ fn state(state: State) -> proto::State {
     }
 }
 
-/// A job as a message.
+/// Converts a job. `pair_ids` remains empty.
 pub(super) fn job(job: &Job) -> proto::Job {
     let moment = |moment: Option<crate::clock::Timestamp>| {
         moment.map(|moment| moment.to_string()).unwrap_or_default()
@@ -152,8 +159,8 @@ pub(super) fn job(job: &Job) -> proto::Job {
 
 pub(super) fn progress(progress: JobProgress) -> proto::Progress {
     proto::Progress {
-        iteration: progress.iteration,
-        max_iterations: progress.max_iterations,
+        done: progress.done,
+        total: progress.total,
         loss: progress.loss,
     }
 }
@@ -166,7 +173,7 @@ fn job_error(error: &JobError) -> proto::JobError {
     }
 }
 
-/// How a pair of a stream failed.
+/// Converts the error of one pair of a streamed sequence.
 pub(super) fn pair_error(error: &ApiError) -> proto::JobError {
     match error {
         ApiError::JobFailed(_, failure) => job_error(failure),
@@ -178,38 +185,52 @@ pub(super) fn pair_error(error: &ApiError) -> proto::JobError {
     }
 }
 
-/// What is known about a flow before its rows.
+/// The header that precedes the rows of a flow.
 pub(super) fn header(answer: &Answer) -> proto::FlowHeader {
     let report = &answer.report;
     let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
     let seconds = report.seconds;
     let motion = report.ego_motion.as_ref();
+    use proto::flow_header::Method;
+    let method = match (report.objects, report.field) {
+        (Some(objects), _) => Some(Method::Objects(proto::ObjectSearch {
+            clusters: count(objects.clusters),
+            candidates: count(objects.candidates),
+            searched: count(objects.searched),
+            moving: count(objects.moving),
+            cost_m: objects.cost_m,
+        })),
+        (None, Some(field)) => Some(Method::Field(proto::FieldFit {
+            iterations: count(field.iterations),
+            max_iterations: count(field.max_iterations),
+            best_iteration: count(field.best_iteration),
+            best_loss_m: field.best_loss_m,
+        })),
+        (None, None) => None,
+    };
     proto::FlowHeader {
         job_id: answer.job.id.to_string(),
         stop_reason: report.stop_reason.clone(),
-        iterations: count(report.iterations),
-        best_loss: report.best_loss,
-        points: answer.flow.flow.len() as u64,
-        valid_points: report.points as u64,
+        points: report.points as u64,
+        valid_points: report.valid_points as u64,
         ego_motion: motion
             .map(|rows| rows.as_flattened().to_vec())
             .unwrap_or_default(),
         device: report.device.clone(),
         seconds: Some(proto::Seconds {
             precompute: seconds.precompute,
+            search: seconds.search,
             query: seconds.query,
             network: seconds.network,
             total: seconds.total,
         }),
-        clusters: answer
-            .flow
-            .objects
-            .as_ref()
-            .map_or(0, |objects| count(objects.clusters.len())),
+        dt_s: report.dt_s,
+        dt_assumed: report.dt_assumed,
+        method,
     }
 }
 
-/// A cluster as a message.
+/// Converts a cluster.
 pub(super) fn cluster(cluster: &Cluster) -> proto::Cluster {
     proto::Cluster {
         points: cluster.points,
@@ -223,20 +244,21 @@ pub(super) fn cluster(cluster: &Cluster) -> proto::Cluster {
     }
 }
 
-/// What is known about a dense cloud before its rows.
+/// The header that precedes the rows of a dense cloud.
 pub(super) fn dense_header(job: JobId, report: &DenseReport) -> proto::DenseHeader {
     proto::DenseHeader {
         job_id: job.to_string(),
         points: report.points as u64,
-        frames: u32::try_from(report.frames).unwrap_or(u32::MAX),
-        into: report.into,
+        sweeps: u32::try_from(report.sweeps).unwrap_or(u32::MAX),
+        reference_time: report.reference_time,
         substeps: report.substeps,
         device: report.device.clone(),
         seconds: report.seconds,
     }
 }
 
-/// The call's own deadline, from `grpc-timeout`: at most eight digits and a unit.
+/// The deadline of the call as a duration, from `grpc-timeout`: at most eight digits and a unit.
+/// `None` if it is missing or malformed.
 pub(super) fn time_left(metadata: &MetadataMap) -> Option<Duration> {
     let text = metadata.get("grpc-timeout")?.to_str().ok()?;
     let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
@@ -273,12 +295,12 @@ mod tests {
         assert!(refused(|o| o.ego_motion = vec![1.0; 3]).contains("16 numbers"));
         let nowhere = |o: &mut proto::Options| {
             o.densify = Some(proto::Densify {
-                into: f64::NAN,
+                reference_time: f64::NAN,
                 ..proto::Densify::default()
             });
         };
-        assert!(refused(nowhere).contains("densify.into is NaN"));
-        assert!(refused(|o| o.range_m = Some(f32::NAN)).contains("range_m"));
+        assert!(refused(nowhere).contains("densify.reference_time is NaN"));
+        assert!(refused(|o| o.crop_m = Some(f32::NAN)).contains("crop_m"));
         assert!(refused(|o| o.max_points = Some(1)).contains("max_points is 1"));
         assert_eq!(
             options(Some(proto::Options::default())),

@@ -1,7 +1,8 @@
-//! A streamed sequence: sweeps in, the flow of each consecutive pair out, in order.
+//! Streamed sequences: the client sends sweeps and receives the flow of each consecutive pair, in
+//! order.
 //!
-//! Two tasks and a bounded channel between them: the reader waits when the channel is full, so
-//! that memory stays bounded and the client feels it.
+//! A reader task and a writer task are connected by a bounded channel. When the channel is full,
+//! the reader stops reading. This bounds the memory and applies back-pressure to the client.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -11,50 +12,51 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Status, Streaming};
 
 use super::call::{Call, no_begin};
-use super::chunks::{self, CloudBuilder};
-use super::{convert, proto};
-use crate::api::admission::Promise;
+use super::chunks::CloudBuilder;
+use super::{chunks, convert, proto};
+use crate::api::admission::Durability;
 use crate::api::draft::{Accepted, Draft, Link};
 use crate::api::error::ApiError;
 use crate::api::service::{Service, Waited};
 use crate::api::uploads::Room;
-use crate::flow::{is_whole, window};
+use crate::flow::{is_window_final, window};
 use crate::job::{JobId, JobOptions, Kind};
 use crate::payload::StoredCloud;
 use crate::queue::PairOf;
 
 type Answers = mpsc::Sender<Result<proto::EstimateSequenceResponse, Status>>;
 
-/// The longest name of a sweep, bytes: it comes back with every pair, and in errors.
+/// Maximum length of the name of a sweep, bytes. Each pair and some errors repeat the name.
 const MAX_NAME: usize = 255;
 
-/// A pair that is being worked on.
+/// A pair that has been submitted.
 struct Pending {
     place: u32,
     source: String,
     target: String,
-    /// Its job, or why it has none.
+    /// The job, or the error of its submission.
     job: Result<Accepted, ApiError>,
 }
 
-/// What the writer has to send, in order.
+/// A message from the reader task to the writer task, in order.
 enum Item {
     Pair(Pending),
-    /// The stream ends here, and why.
+    /// The stream ends with this error.
     Broken(ApiError),
 }
 
-/// A sweep that has arrived, and the room that it takes until no pair sees it any more.
+/// A sweep that has arrived completely. Its memory reservation is held until no further pair has it
+/// in its window.
 struct Sweep {
     name: String,
     cloud: Arc<StoredCloud>,
     room: Room,
 }
 
-/// A sweep that is arriving.
+/// A sweep of which chunks are arriving.
 struct Coming {
     name: String,
-    /// How many points it will have, where its client says so.
+    /// The number of points that the client has announced, if any.
     points: Option<u64>,
     cloud: CloudBuilder,
 }
@@ -79,14 +81,14 @@ impl Coming {
     }
 }
 
-/// Starts both tasks.
+/// Starts the reader task and the writer task.
 pub(super) fn run(
     service: Arc<Service>,
     call: Call,
     inbound: Streaming<proto::EstimateSequenceRequest>,
 ) -> ReceiverStream<Result<proto::EstimateSequenceResponse, Status>> {
     let (answers, stream) = mpsc::channel(2);
-    let (pending, pairs) = mpsc::channel(service.limits.sequence_ahead.max(1));
+    let (pending, pairs) = mpsc::channel(service.limits.stream_prefetch_pairs.max(1));
     let writing = (Arc::clone(&service), answers.clone());
     tokio::spawn(async move { write(&writing.0, pairs, &writing.1).await });
     tokio::spawn(async move {
@@ -102,7 +104,8 @@ pub(super) fn run(
             options: JobOptions::default(),
         };
         if let Err(error) = reader.run().await {
-            // Behind the pairs that came before it: their flows are not lost.
+            // The error follows the pairs of the complete sweeps, so that their flows are still
+            // sent.
             reader.submit_rest().await;
             let _gone_is_fine = pending.send(Item::Broken(error)).await;
         }
@@ -115,12 +118,13 @@ struct Reader {
     call: Call,
     inbound: Streaming<proto::EstimateSequenceRequest>,
     pending: mpsc::Sender<Item>,
-    /// The pair that is next.
+    /// The index of the next pair to submit.
     place: usize,
-    /// Sweeps that there have been, and the last of them: those that pairs to come may see.
+    /// The number of sweeps so far, and the latest of them, which windows of further pairs may
+    /// contain.
     count: usize,
     held: VecDeque<Sweep>,
-    /// The job of the pair before, from whose field the next one goes on.
+    /// The job of the pair before. With a warm start the next pair starts from its field.
     before: Option<JobId>,
     options: JobOptions,
 }
@@ -139,12 +143,13 @@ impl Reader {
         self.options = options;
         let mut current: Option<Coming> = None;
         loop {
-            // A drive may pause for as long as nobody needs the room that it holds.
+            // The stream may pause until other requests need its memory, except within a sweep
+            // whose number of points was announced.
             let coming = current
                 .as_ref()
                 .is_some_and(|coming| coming.points.is_some());
             let message = if coming {
-                // One that is known to be incomplete must come on.
+                // A sweep that is known to be incomplete must continue to arrive.
                 room.wait(self.inbound.message()).await?
             } else {
                 let held: u64 = self.held.iter().map(|sweep| sweep.room.bytes()).sum();
@@ -188,29 +193,30 @@ impl Reader {
         }
     }
 
-    /// Takes a whole sweep, and submits the pairs that no sweep to come says anything about.
+    /// Adds a complete sweep, and submits the pairs whose windows are final.
     async fn take(&mut self, coming: Coming, room: Room) -> Result<(), ApiError> {
         self.held.push_back(coming.finish(room)?);
         self.count += 1;
-        let frames = self.options.frames();
-        while self.place + 1 < self.count && is_whole(self.place, self.count, frames) {
+        let sweeps = self.options.sweeps();
+        while self.place + 1 < self.count && is_window_final(self.place, self.count, sweeps) {
             self.submit_next().await;
         }
-        let first = window(self.place, self.count.max(self.place + 2), frames).start;
+        let first = window(self.place, self.count.max(self.place + 2), sweeps).start;
         while self.count - self.held.len() < first {
             self.held.pop_front();
         }
         Ok(())
     }
 
-    /// Submits the pairs that waited for sweeps to come: there are none.
+    /// At the end of the stream: submits the remaining pairs, with windows that end at the last
+    /// sweep.
     async fn submit_rest(&mut self) {
         while self.place + 1 < self.count {
             self.submit_next().await;
         }
     }
 
-    /// Submits the next pair, with the sweeps of its window.
+    /// Submits the next pair with the sweeps of its window.
     async fn submit_next(&mut self) {
         let place = self.place;
         self.place += 1;
@@ -234,10 +240,10 @@ impl Reader {
         let options = &self.options;
         let mut request = self
             .call
-            .draft_request(options.clone(), Promise::WhileAwaited);
+            .draft_request(options.clone(), Durability::Ephemeral);
         let after = self.before;
-        request.link = options.goes_on().then_some(Link { after });
-        let sees = window(place, self.count, options.frames());
+        request.link = options.chained().then_some(Link { after });
+        let sees = window(place, self.count, options.sweeps());
         request.pair = PairOf {
             place: u32::try_from(place - sees.start).unwrap_or(u32::MAX),
             sees: PairOf::seen(0..sees.len()),
@@ -253,8 +259,8 @@ impl Reader {
     }
 }
 
-/// Sends every pair's flow, in order, as soon as it is there. What is still pending when the
-/// client goes away is dropped, and so cancelled.
+/// Sends the flow of every pair in order, as soon as it is available. When the client disconnects,
+/// the pending pairs are dropped, which cancels their jobs.
 async fn write(service: &Arc<Service>, mut items: mpsc::Receiver<Item>, answers: &Answers) {
     while let Some(item) = items.recv().await {
         let pair = match item {
@@ -275,13 +281,13 @@ async fn write(service: &Arc<Service>, mut items: mpsc::Receiver<Item>, answers:
     }
 }
 
-/// Sends one pair; false where nobody listens any more.
+/// Sends one pair. Returns false if the client has disconnected or the result was evicted.
 async fn send(service: &Arc<Service>, pair: Pending, answers: &Answers) -> bool {
     use proto::estimate_sequence_response::pair::Outcome;
     use proto::estimate_sequence_response::{Pair, Part};
     let message = |part: Part| Ok(proto::EstimateSequenceResponse { part: Some(part) });
     let header = |outcome: Outcome| Pair {
-        place: pair.place,
+        index: pair.place,
         source: pair.source.clone(),
         target: pair.target.clone(),
         outcome: Some(outcome),
@@ -291,7 +297,7 @@ async fn send(service: &Arc<Service>, pair: Pending, answers: &Answers) -> bool 
         Ok(accepted) => match service.wait(accepted.job.id, None).await {
             Ok(Waited::Ended(job)) => {
                 if let Some(awaited) = accepted.awaited {
-                    awaited.let_go();
+                    awaited.disarm();
                 }
                 service.answer(&job).await
             }

@@ -1,4 +1,4 @@
-//! Errors as gRPC statuses with rich details, from the same table as HTTP's.
+//! Errors as gRPC statuses with `google.rpc` details, from the same table as the HTTP statuses.
 
 use std::collections::HashMap;
 
@@ -6,15 +6,16 @@ use tonic::metadata::MetadataValue;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
-use crate::api::error::{ApiError, Row};
+use crate::api::error::{ApiError, ErrorSpec};
 
-/// Who says so, in `google.rpc.ErrorInfo`.
+/// The `domain` of `google.rpc.ErrorInfo`.
 const DOMAIN: &str = "fnsf";
 
-/// The metadata in which the stable code stands, for clients without rich errors.
+/// The metadata key of the stable error code, for clients that do not decode the details.
 const CODE_KEY: &str = "fnsf-code";
 
-/// The status of an error: `ErrorInfo` always, `RetryInfo` and a pushback where waiting helps.
+/// The status of an error. It always has an `ErrorInfo`. If a retry delay is known, it has a
+/// `RetryInfo` and the `grpc-retry-pushback-ms` metadata as well.
 pub(in crate::api) fn status(error: &ApiError) -> Status {
     let row = error.row();
     let mut about = HashMap::new();
@@ -41,9 +42,9 @@ pub(in crate::api) fn status(error: &ApiError) -> Status {
     status
 }
 
-/// The row of the error that an answer of this door carries, if it does.
-pub(in crate::api) fn row_of(headers: &axum::http::HeaderMap) -> Option<Row> {
-    Row::of(headers.get(CODE_KEY)?.to_str().ok()?)
+/// The error table row of a gRPC response, from its headers. `None` if it is not an error.
+pub(in crate::api) fn row_of(headers: &axum::http::HeaderMap) -> Option<ErrorSpec> {
+    ErrorSpec::of(headers.get(CODE_KEY)?.to_str().ok()?)
 }
 
 impl From<ApiError> for Status {

@@ -1,4 +1,4 @@
-//! A job's news as server-sent events, to its end.
+//! Job events as server-sent events, until the job ends.
 
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -18,10 +18,10 @@ use crate::api::error::ApiError;
 use crate::api::service::Service;
 use crate::job::{Job, State as JobState};
 
-/// A comment that keeps proxies from closing a quiet stream.
+/// Interval of keep-alive comments, so that proxies do not close an idle stream.
 const HEARTBEAT: Duration = Duration::from_secs(15);
 
-/// What a stream has told so far.
+/// The state of an event stream.
 struct Told {
     service: Arc<Service>,
     news: watch::Receiver<Arc<Job>>,
@@ -29,10 +29,11 @@ struct Told {
     ended: bool,
 }
 
-/// Follows a job: `state` events with the job, `progress` events with iteration and loss.
+/// Streams the state changes and the progress of a job as server-sent events.
 ///
-/// The stream begins with the job as it is, so that a client that lost it misses nothing that
-/// still matters, and ends with the job.
+/// A `state` event contains the job, a `progress` event its progress. The stream begins with the
+/// current state of the job, so a client can reconnect at any time. It ends when the job ends, or
+/// when the server shuts down.
 #[utoipa::path(
     get,
     path = "/v1/jobs/{id}/events",
@@ -59,7 +60,7 @@ pub(super) async fn follow_job(
     Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(HEARTBEAT)))
 }
 
-/// The next event; nothing after the job's end, or when the server closes.
+/// The next event. `None` after the end of the job, or when the server closes its streams.
 async fn next(mut told: Told) -> Option<(Result<Event, Infallible>, Told)> {
     if told.ended {
         return None;
@@ -76,7 +77,7 @@ async fn next(mut told: Told) -> Option<(Result<Event, Infallible>, Told)> {
     let same_state = told.last == Some(now);
     told.last = Some(now);
     told.ended = job.state.is_end();
-    let iteration = job.progress.map_or(0, |progress| progress.iteration);
+    let iteration = job.progress.map_or(0, |progress| progress.done);
     let id = format!("{}.{iteration}", job.attempt);
     let event = match job.progress {
         Some(progress) if same_state => Event::default().event("progress").json_data(progress),

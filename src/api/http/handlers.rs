@@ -1,4 +1,4 @@
-//! What the routes do: estimate, submit, show, list, cancel, requeue.
+//! The handlers of the job routes: estimate, submit, get, list, cancel and requeue.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -10,13 +10,13 @@ use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::answer;
-use super::bodies::{Body, PairFiles, Part};
+use super::multipart::{Body, PairFiles, Part};
 use super::named::Named;
 use super::prefer::Prefer;
 use super::problem::Problem;
-use super::view::{self, JobView};
-use crate::api::admission::Promise;
+use super::view::JobView;
+use super::{results, view};
+use crate::api::admission::Durability;
 use crate::api::auth::Caller;
 use crate::api::codec::AnswerFormat;
 use crate::api::draft::{Accepted, Arrived, Draft, Request as DraftRequest};
@@ -25,13 +25,13 @@ use crate::api::service::{MakeDurable, Service, Waited};
 use crate::job::{Job, JobId, JobOptions, Kind, State as JobState};
 use crate::queue::PairOf;
 
-/// The longest long poll.
+/// Maximum duration of a long poll.
 const MAX_POLL: Duration = Duration::from_secs(60);
 
-/// Jobs on a page, where nobody says.
+/// Default number of jobs on a page.
 const PAGE: u32 = 100;
 
-/// What the headers of a submission say.
+/// The parameters of a submission from its headers.
 struct Asked {
     prefer: Prefer,
     key: Option<String>,
@@ -56,11 +56,11 @@ impl Asked {
         })
     }
 
-    fn draft_request(&self, options: JobOptions, promise: Promise) -> DraftRequest {
-        let wait_is_deadline = promise == Promise::WhileAwaited && !self.prefer.respond_async;
+    fn draft_request(&self, options: JobOptions, durability: Durability) -> DraftRequest {
+        let wait_is_deadline = durability == Durability::Ephemeral && !self.prefer.respond_async;
         DraftRequest {
             options,
-            promise,
+            durability,
             idempotency_key: self.key.clone(),
             arrived: self.arrived.0,
             time_left: self.prefer.wait.filter(|_| wait_is_deadline),
@@ -70,17 +70,18 @@ impl Asked {
     }
 }
 
-/// Estimates the flow of one pair and answers with it.
+/// Estimates the flow of one pair and returns it.
 ///
-/// Without `Prefer` the answer comes when it is there. `Prefer: wait=N` is a deadline: after N
-/// seconds the best flow so far comes back, with `Fnsf-Stop-Reason: deadline`. With
-/// `Prefer: respond-async` the answer is a job; with `respond-async, wait=N` it is a job if the
-/// flow is not there after N seconds. A client that goes away cancels the work.
+/// Without `Prefer` the response is sent when the flow is available. `Prefer: wait=N` sets a
+/// deadline: after N seconds the best flow so far is returned, with `Fnsf-Stop-Reason: deadline`.
+/// With `Prefer: respond-async` the response is a job. With `respond-async, wait=N` it is a job if
+/// the flow is not available after N seconds. If the client disconnects while the server waits for
+/// the flow, the estimate is cancelled.
 #[utoipa::path(
     post,
     path = "/v1/flow",
     tag = "flow",
-    request_body(content = super::bodies::PairBody, content_type = "multipart/form-data"),
+    request_body(content = super::multipart::PairBody, content_type = "multipart/form-data"),
     params(
         ("Accept" = Option<String>, Header, description = "The format of the flow; application/x-npz by default"),
         ("Prefer" = Option<String>, Header, description = "respond-async, wait=N"),
@@ -105,21 +106,21 @@ pub(super) async fn estimate(
         .and_then(|value| value.to_str().ok());
     let format = AnswerFormat::accepted(accept)?;
     let asked = Asked::of(&headers, arrived)?;
-    let promise = match asked.prefer {
+    let durability = match asked.prefer {
         Prefer {
             respond_async: true,
             wait: None,
-        } => Promise::Durable,
-        _ => Promise::WhileAwaited,
+        } => Durability::Durable,
+        _ => Durability::Ephemeral,
     };
     let Accepted { job, awaited, .. } =
-        submit_pair(&service, caller, &asked, promise, request).await?;
-    if promise == Promise::Durable {
+        submit_pair(&service, caller, &asked, durability, request).await?;
+    if durability == Durability::Durable {
         return Ok(accepted(&job, asked.prefer));
     }
     let longest = asked.prefer.wait.filter(|_| asked.prefer.respond_async);
     let response = match service.wait(job.id, longest).await? {
-        Waited::Ended(job) => answer::flow(&service, &job, format).await,
+        Waited::Ended(job) => results::flow(&service, &job, format).await,
         Waited::StillOpen(job) if longest.is_some() => match service.make_durable(&job).await {
             Ok(job) => Ok(accepted(&job, asked.prefer)),
             Err(MakeDurable::GivenUp) => Err(ApiError::Cancelled(job.id)),
@@ -128,7 +129,7 @@ pub(super) async fn estimate(
         Waited::StillOpen(_) => return Err(ApiError::Draining),
     };
     if let Some(awaited) = awaited {
-        awaited.let_go();
+        awaited.disarm();
     }
     response
 }
@@ -137,11 +138,11 @@ async fn submit_pair(
     service: &Arc<Service>,
     caller: Caller,
     asked: &Asked,
-    promise: Promise,
+    durability: Durability,
     request: Request,
 ) -> Result<Accepted, ApiError> {
     let mut body = Body::of(service, &caller, request).await?;
-    match read_pair(service, &caller, asked, promise, &mut body).await {
+    match read_pair(service, &caller, asked, durability, &mut body).await {
         Ok(draft) => {
             service.metrics.phase("decode", body.decode_seconds(), None);
             draft.submit(Kind::Pair).await
@@ -153,15 +154,15 @@ async fn submit_pair(
     }
 }
 
-/// Reads source, target and options. With options first, their priority counts from the start.
+/// Reads source, target and options, and creates the draft.
 async fn read_pair(
     service: &Arc<Service>,
     caller: &Caller,
     asked: &Asked,
-    promise: Promise,
+    durability: Durability,
     body: &mut Body,
 ) -> Result<Draft, ApiError> {
-    service.check_room(caller, None, promise)?;
+    service.check_room(caller, None, durability)?;
     let (mut files, mut options) = (PairFiles::default(), JobOptions::default());
     while let Some(part) = body.next().await? {
         match part {
@@ -172,11 +173,12 @@ async fn read_pair(
         }
     }
     options.check_for_pairs()?;
-    service.check_room(caller, Some(&options), promise)?;
+    options.dt_s = options.dt_s.or_else(|| files.interval_s());
+    service.check_room(caller, Some(&options), durability)?;
     let mut draft = Draft::begin(
         service,
         caller.clone(),
-        asked.draft_request(options, promise),
+        asked.draft_request(options, durability),
     )?;
     files.push_to(body, &mut draft).await?;
     Ok(draft)
@@ -184,13 +186,13 @@ async fn read_pair(
 
 /// Submits a pair or a sequence as a job.
 ///
-/// The body is that of `/v1/flow` or of `/v1/sequences`. The answer comes when the job is safe on
-/// disk; from then on it is done, whatever happens to client and server.
+/// The body is the same as for `/v1/flow` or `/v1/sequences`. The response is sent when the job is
+/// stored on disk. The job then survives a disconnect of the client and a restart of the server.
 #[utoipa::path(
     post,
     path = "/v1/jobs",
     tag = "jobs",
-    request_body(content = super::bodies::PairBody, content_type = "multipart/form-data"),
+    request_body(content = super::multipart::PairBody, content_type = "multipart/form-data"),
     params(("Idempotency-Key" = Option<String>, Header, description = "A repeated request with the same key finds the first one's job")),
     responses(
         (status = 202, description = "A new job; Location names it", body = JobView),
@@ -210,16 +212,17 @@ pub(super) async fn submit_job(
     submit(&service, caller, &asked, request).await
 }
 
-/// Submits a sequence: frames in order, the flow of each consecutive pair out.
+/// Submits a sequence of sweeps as a job, for the flow of each consecutive pair.
 ///
-/// `options` comes before the frames. Its result is a zip archive with one flow a pair; each pair
-/// is a job of its own, whose flow can be fetched as soon as it has succeeded. With `densify` its
-/// result is one cloud: the points of all frames, carried into one of them.
+/// The `options` part must precede the sweeps. The result is a zip archive with one flow per pair.
+/// Each pair is a separate job, and its flow is available as soon as that job has succeeded. With
+/// `densify` the result is one dense cloud: the points of all sweeps, transformed to one reference
+/// time.
 #[utoipa::path(
     post,
     path = "/v1/sequences",
     tag = "jobs",
-    request_body(content = super::bodies::SequenceBody, content_type = "multipart/form-data"),
+    request_body(content = super::multipart::SequenceBody, content_type = "multipart/form-data"),
     params(("Idempotency-Key" = Option<String>, Header, description = "A repeated request with the same key finds the first one's job")),
     responses(
         (status = 202, description = "A new job; Location names it", body = JobView),
@@ -237,7 +240,7 @@ pub(super) async fn submit_sequence(
     submit_job(service, caller, arrived, headers, request).await
 }
 
-/// Takes a body of source and target, or of frames, as a durable job.
+/// Reads a body with source and target, or with sweeps, and submits it as a durable job.
 async fn submit(
     service: &Arc<Service>,
     caller: Caller,
@@ -269,41 +272,42 @@ async fn read_job(
     asked: &Asked,
     body: &mut Body,
 ) -> Result<(Draft, Kind), ApiError> {
-    service.check_room(caller, None, Promise::Durable)?;
+    service.check_room(caller, None, Durability::Durable)?;
     let mut files = PairFiles::default();
     let mut options = JobOptions::default();
-    let mut frames: Option<Draft> = None;
+    let mut sweeps: Option<Draft> = None;
     while let Some(part) = body.next().await? {
         match part {
-            Part::Options(_) if frames.is_some() => {
-                let text = "options come before the frames";
+            Part::Options(_) if sweeps.is_some() => {
+                let text = "options come before the sweeps";
                 return Err(ApiError::BadRequest(text.to_owned()));
             }
             Part::Options(read) => options = read,
-            Part::File(part, name, bytes) if part == "frame" && files.is_empty() => {
-                let draft = match &mut frames {
+            Part::File(part, name, bytes) if part == "sweep" && files.is_empty() => {
+                let draft = match &mut sweeps {
                     Some(draft) => draft,
                     none => {
-                        let request = asked.draft_request(options.clone(), Promise::Durable);
+                        let request = asked.draft_request(options.clone(), Durability::Durable);
                         none.insert(Draft::begin(service, caller.clone(), request)?)
                     }
                 };
-                let place = format!("frame {}", draft.frames());
+                let place = format!("sweep {}", draft.sweeps());
                 let (cloud, room) = body.cloud(place, name, bytes).await?;
                 draft.push(cloud, Some(room)).await?;
             }
             Part::File(part, name, bytes) => files.take(&part, name, bytes)?,
         }
     }
-    match frames {
+    match sweeps {
         Some(_) if !files.is_empty() => {
-            let text = "send source and target, or frames, but not both";
+            let text = "send source and target, or sweeps, but not both";
             Err(ApiError::BadRequest(text.to_owned()))
         }
         Some(draft) => Ok((draft, Kind::Sequence)),
         None => {
             options.check_for_pairs()?;
-            let request = asked.draft_request(options, Promise::Durable);
+            options.dt_s = options.dt_s.or_else(|| files.interval_s());
+            let request = asked.draft_request(options, Durability::Durable);
             let mut draft = Draft::begin(service, caller.clone(), request)?;
             files.push_to(body, &mut draft).await?;
             Ok((draft, Kind::Pair))
@@ -311,7 +315,7 @@ async fn read_job(
     }
 }
 
-/// 202, with where to ask.
+/// The 202 response with the location of the job.
 fn accepted(job: &Arc<Job>, prefer: Prefer) -> Response {
     let mut response = (StatusCode::ACCEPTED, Json(JobView::new(job, &[]))).into_response();
     let headers = response.headers_mut();
@@ -328,15 +332,15 @@ fn accepted(job: &Arc<Job>, prefer: Prefer) -> Response {
     response
 }
 
-/// What a look at a job may ask for.
+/// The query parameters of a job request.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Look {
-    /// Seconds to wait for its end, at most 60.
+    /// Seconds to wait for the end of the job, at most 60.
     wait: Option<u64>,
 }
 
-/// Shows a job; with `wait`, when it ends or the time is up.
+/// Returns a job. With `wait` the response is delayed until the job ends or the timeout passes.
 #[utoipa::path(
     get,
     path = "/v1/jobs/{id}",
@@ -367,23 +371,24 @@ pub(super) async fn get_job(
     Ok(Json(JobView::new(&job, &pairs)))
 }
 
-/// Which jobs to list.
+/// The query parameters of a list request.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Page {
-    /// Only those in this state.
+    /// Only jobs in this state.
     state: Option<JobState>,
-    /// At most so many, 1 to 1000; 100 by default.
+    /// Maximum number of jobs, 1 to 1000. The default is 100.
     limit: Option<u32>,
-    /// Only those before this one: `next` of the page before.
+    /// Only jobs older than this job id: the value of `next` on the page before.
     before: Option<String>,
 }
 
 /// A page of jobs, latest first.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct JobPage {
+    /// The jobs. The pairs of a sequence are not listed as separate jobs.
     jobs: Vec<JobView>,
-    /// The value of `before` for the next page; none on the last.
+    /// The value of `before` for the next page. Null on the last page.
     next: Option<String>,
 }
 
@@ -417,7 +422,7 @@ pub(super) async fn list_jobs(
     }))
 }
 
-/// Cancels a job: at once if it waits, within an iteration if it runs.
+/// Cancels a job: at once if it is queued, within an iteration if it is running.
 #[utoipa::path(
     delete,
     path = "/v1/jobs/{id}",
@@ -437,7 +442,8 @@ pub(super) async fn cancel_job(
     Ok(Json(JobView::new(&job, &[])))
 }
 
-/// Queues a job again that failed, expired or was cancelled; of a sequence, the pairs that did.
+/// Queues a job again that failed, expired or was cancelled, or whose result is lost. For a
+/// sequence, the pairs that did not succeed are queued again.
 #[utoipa::path(
     post,
     path = "/v1/jobs/{id}/requeue",

@@ -1,7 +1,8 @@
-//! A body that is handed on in small pieces, and given up when nothing comes of them.
+//! A request body in small chunks, with a limit on the bytes that the multipart parser consumes
+//! without result.
 //!
-//! The multipart reader keeps what it does not understand yet: a preamble or a part's headers that
-//! never end would be kept and searched again with every piece.
+//! The multipart parser buffers unparsed input and searches it again with every chunk. Without the
+//! limit, an endless preamble or endless part headers would be buffered and searched forever.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -13,18 +14,19 @@ use axum::body::{Body, BodyDataStream, Bytes};
 use axum::extract::Request;
 use futures_util::Stream;
 
-/// The largest piece that is handed on.
+/// Maximum size of a chunk, bytes.
 const PIECE: usize = 16 << 10;
 
-/// What may be handed on before something is understood: headers of a part, and a piece.
+/// Maximum number of bytes without a parsed part or chunk of data: the headers of a part and one
+/// chunk, bytes.
 const MAX_UNREAD: usize = 2 * PIECE;
 
-/// What has been handed on since something was understood.
+/// The number of bytes since the parser last made progress.
 #[derive(Clone, Default)]
 pub(super) struct Meter(Arc<AtomicUsize>);
 
 impl Meter {
-    /// The pieces so far have led to something.
+    /// Records that the parser has made progress.
     pub(super) fn understood(&self) {
         self.0.store(0, Ordering::Relaxed);
     }
@@ -37,7 +39,7 @@ struct Metered {
     pause: bool,
 }
 
-/// The same request with a metered body.
+/// Replaces the body of a request by a metered one.
 pub(super) fn metered(request: Request) -> (Request, Meter) {
     let meter = Meter::default();
     let request = request.map(|body| {
@@ -55,7 +57,8 @@ impl Stream for Metered {
     type Item = Result<Bytes, BoxError>;
 
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
-        // The reader takes all that is ready before it looks at any of it.
+        // The parser consumes all ready input before it parses any of it. Every second poll is
+        // therefore pending.
         self.pause = !self.pause;
         if !self.pause {
             context.waker().wake_by_ref();

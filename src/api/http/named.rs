@@ -1,4 +1,4 @@
-//! The job that a path names.
+//! The job id in the path of a request.
 
 use axum::extract::{FromRequestParts, Path};
 use axum::http::request::Parts;
@@ -6,7 +6,7 @@ use axum::http::request::Parts;
 use crate::api::error::ApiError;
 use crate::job::JobId;
 
-/// `{id}` of a route; what cannot be a job's name is the name of no job.
+/// The `{id}` of a route. A malformed id is reported as a job that does not exist.
 pub(super) struct Named(pub(super) JobId);
 
 impl<S: Send + Sync> FromRequestParts<S> for Named {

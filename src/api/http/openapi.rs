@@ -1,4 +1,4 @@
-//! The contract as OpenAPI, made from the handlers themselves, and a page to try it.
+//! The OpenAPI document, generated from the handlers, and the Swagger UI.
 
 use std::sync::Arc;
 
@@ -7,7 +7,7 @@ use utoipa::openapi::security::{Http, HttpAuthScheme, SecurityScheme};
 use utoipa::{Modify, OpenApi};
 use utoipa_swagger_ui::SwaggerUi;
 
-use super::{answer, events, handlers};
+use super::{events, handlers, results};
 use crate::api::service::Service;
 
 struct Bearer;
@@ -20,7 +20,7 @@ impl Modify for Bearer {
     }
 }
 
-/// The whole contract.
+/// The OpenAPI document.
 #[derive(OpenApi)]
 #[openapi(
     info(
@@ -36,7 +36,7 @@ impl Modify for Bearer {
         handlers::cancel_job,
         handlers::requeue_job,
         events::follow_job,
-        answer::result,
+        results::result,
     ),
     security((), ("key" = [])),
     modifiers(&Bearer),
@@ -47,7 +47,7 @@ impl Modify for Bearer {
 )]
 struct Contract;
 
-/// `/openapi.json` and `/docs`.
+/// The routes `/openapi.json` and `/docs`.
 pub(super) fn router() -> Router<Arc<Service>> {
     SwaggerUi::new("/docs")
         .url("/openapi.json", Contract::openapi())

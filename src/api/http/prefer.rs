@@ -1,20 +1,20 @@
-//! The `Prefer` header (RFC 7240): how long somebody is willing to wait, and what comes then.
+//! The `Prefer` header (RFC 7240): `respond-async` and `wait`.
 
 use std::time::Duration;
 
 use axum::http::HeaderMap;
 
-/// What a client prefers.
+/// The preferences of a client.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Prefer {
-    /// A job to ask after is as good as a flow.
+    /// Whether the client accepts a job instead of a flow.
     pub(super) respond_async: bool,
-    /// How long to wait.
+    /// The time that the client is willing to wait.
     pub(super) wait: Option<Duration>,
 }
 
 impl Prefer {
-    /// What the headers say; what is not understood is ignored, as the RFC asks.
+    /// Parses the `Prefer` headers. Unknown preferences are ignored, as the RFC requires.
     pub(super) fn from_headers(headers: &HeaderMap) -> Self {
         let mut prefer = Self::default();
         for value in headers.get_all("prefer") {
@@ -34,7 +34,7 @@ impl Prefer {
         prefer
     }
 
-    /// What was understood, for `Preference-Applied`.
+    /// The value of `Preference-Applied`. `None` if no preference was recognized.
     pub(super) fn applied(self) -> Option<String> {
         let mut words = Vec::new();
         if self.respond_async {

@@ -1,4 +1,4 @@
-//! Errors as RFC 9457 problems.
+//! Errors as RFC 9457 problem details.
 
 use axum::Json;
 use axum::http::{HeaderValue, StatusCode, header};
@@ -9,28 +9,28 @@ use utoipa::ToSchema;
 use crate::api::error::ApiError;
 use crate::job::JobError;
 
-/// An error, as `application/problem+json`.
+/// An error, as `application/problem+json` (RFC 9457).
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Problem {
-    /// A stable name of the kind of problem, as a URI.
+    /// The kind of error, as a URI: `urn:fnsf:problem:` and the code.
     r#type: String,
-    /// The kind of problem, in words.
+    /// The standard phrase of the HTTP status.
     title: &'static str,
     /// The HTTP status.
     status: u16,
-    /// What is wrong with this request.
+    /// The error message for this request.
     detail: String,
-    /// The stable name, for programs.
+    /// The stable error code, for programs.
     code: &'static str,
     /// Whether the same request may succeed later.
     retryable: bool,
-    /// Seconds after which it may, where that is known.
+    /// Seconds after which the request may be repeated, if known.
     #[serde(skip_serializing_if = "Option::is_none")]
     retry_after_seconds: Option<u64>,
-    /// The job that it is about.
+    /// The job that the error refers to.
     #[serde(skip_serializing_if = "Option::is_none")]
     job_id: Option<String>,
-    /// How that job failed.
+    /// Why that job failed.
     #[serde(skip_serializing_if = "Option::is_none")]
     job_error: Option<JobError>,
 }
@@ -88,6 +88,7 @@ impl IntoResponse for ApiError {
     }
 }
 
+/// The response to a method that the route does not support.
 pub(super) async fn method() -> ApiError {
     ApiError::Method
 }

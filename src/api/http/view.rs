@@ -1,4 +1,4 @@
-//! A job as JSON.
+//! The JSON representation of a job.
 
 use std::sync::Arc;
 
@@ -8,40 +8,48 @@ use utoipa::ToSchema;
 
 use crate::job::{Job, JobError, JobProgress, Kind, State};
 
-/// A job, as the contract shows it.
+/// A job.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct JobView {
-    /// Its name, a UUID.
+    /// The job id, a UUID.
     id: String,
+    /// The state of the job.
     state: State,
+    /// A pair or a sequence.
     kind: Kind,
-    /// RFC 3339, UTC, like the other moments.
+    /// When the job was accepted: RFC 3339, UTC. All times have this format.
     created_at: String,
+    /// When the job was first started.
     started_at: Option<String>,
+    /// When the job ended.
     finished_at: Option<String>,
-    /// When the best flow so far is wanted.
+    /// The deadline. A running job then returns its best flow so far; a queued job expires.
     deadline: Option<String>,
-    /// How often it was started.
+    /// The number of times that the job was started.
     attempt: u32,
+    /// The progress of the estimate.
     progress: Option<JobProgress>,
-    /// `converged`, `max_iterations` or `deadline`.
+    /// Why the estimate stopped: `completed`, `converged`, `max_iterations` or `deadline`.
     stop_reason: Option<String>,
+    /// Why the job failed.
     error: Option<JobError>,
-    /// Given up after too many attempts; POST to links.requeue tries again.
+    /// Whether the job was given up after too many attempts. POST to `links.requeue` to run it
+    /// again.
     dead_letter: bool,
-    /// The options that it was submitted with.
+    /// The options of the submission.
     #[schema(value_type = Object)]
     options: Option<Box<RawValue>>,
-    /// How the flow was found; of a sequence with `densify`, how its cloud was made.
+    /// The report on the estimate. For a sequence with `densify`, the report on its dense cloud.
     #[schema(value_type = Option<Reported>)]
     report: Option<Box<RawValue>>,
-    /// The pairs of a sequence, in order.
+    /// The pairs of a sequence.
     #[serde(skip_serializing_if = "Option::is_none")]
     pairs: Option<PairsView>,
+    /// Related resources.
     links: Links,
 }
 
-/// What a report is.
+/// The report of a job.
 #[derive(Serialize, ToSchema)]
 #[serde(untagged)]
 #[expect(dead_code, reason = "it describes what is kept as JSON")]
@@ -50,14 +58,14 @@ enum Reported {
     Cloud(crate::job::DenseReport),
 }
 
-/// How far a sequence has come.
+/// The pairs of a sequence, and its progress.
 #[derive(Debug, Serialize, ToSchema)]
 struct PairsView {
-    /// All of them, those that `densify` has fitted backward in time included.
+    /// The number of pairs, including the backward pairs of `densify`.
     total: u32,
-    /// Those that have ended.
+    /// The number of pairs that have ended.
     ended: u32,
-    /// The consecutive pairs' jobs, in order, where a single job is shown.
+    /// The jobs of the consecutive pairs, in order. Only present when a single job is requested.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     jobs: Vec<PairView>,
 }
@@ -65,19 +73,25 @@ struct PairsView {
 /// A pair of a sequence.
 #[derive(Debug, Serialize, ToSchema)]
 struct PairView {
+    /// The job id of the pair, a UUID.
     id: String,
+    /// The state of the pair's job.
     state: State,
-    /// Where its own result is.
+    /// The path of the pair's flow.
     result: String,
 }
 
-/// Where to go from here.
+/// The paths of related resources.
 #[derive(Debug, Serialize, ToSchema)]
 struct Links {
+    /// The job.
     #[serde(rename = "self")]
     this: String,
+    /// The job's events, as server-sent events (GET).
     events: String,
+    /// The job's result (GET).
     result: String,
+    /// Queues the job again (POST).
     requeue: String,
 }
 
@@ -87,7 +101,7 @@ pub(super) fn path(job: &Job) -> String {
 }
 
 impl JobView {
-    /// The view of a job; `pairs` are those of a sequence, where they are wanted.
+    /// The representation of a job. `pairs` are the pairs to include for a sequence.
     pub(super) fn new(job: &Job, pairs: &[Arc<Job>]) -> Self {
         let raw = |text: &str| RawValue::from_string(text.to_owned()).ok();
         let this = path(job);

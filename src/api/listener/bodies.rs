@@ -1,5 +1,5 @@
-//! Bodies as the port hands them on: what comes in ends at its first error and lets others run,
-//! what goes out is cut into pieces whose taking is watched.
+//! Wrappers for bodies: a request body ends at its first error and yields to other tasks, and a
+//! response body is sent in chunks with its read progress recorded.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -15,14 +15,13 @@ use tokio::task::coop::poll_proceed;
 
 use super::connections::OpenRequest;
 
-/// The largest piece of an answer: all that is held for a stream that is not read.
+/// Maximum size of a response chunk, bytes. It bounds the memory of a stream that is not read.
 const PIECE: usize = 64 << 10;
 
-/// A request's body that cannot keep its reader busy for ever.
+/// A request body that cannot keep its reader busy forever.
 ///
-/// After an error comes the end, whatever the source says: HTTP/2 repeats an error at every poll.
-/// Each frame costs the task of its budget, so that a source that is always ready cannot keep
-/// timers and other tasks from running.
+/// After an error the body ends, although HTTP/2 repeats the error at every poll. Each frame costs
+/// cooperative task budget, so a source that is always ready cannot starve timers and other tasks.
 pub(in crate::api) struct RequestBody<B> {
     body: B,
     ended: bool,
@@ -61,10 +60,10 @@ impl<B: Body<Data = Bytes> + Unpin> Body for RequestBody<B> {
     }
 }
 
-/// An answer's body in pieces; its request is open until it is dropped.
+/// A response body in chunks. Its request is open until it is dropped.
 ///
-/// What a body gives at once and its reader has not taken yet is held, and takes room of the port's
-/// until it is; where there is none the answer ends.
+/// A frame of the inner body that is larger than a chunk is held until it is sent, and is charged
+/// to the port's budget. If the budget is exhausted, the response ends with an error.
 pub(super) struct AnswerBody {
     body: AnyBody,
     rest: Bytes,
@@ -74,7 +73,7 @@ pub(super) struct AnswerBody {
 }
 
 impl AnswerBody {
-    /// `room` in bytes; none where the body has its own, and may wait for its reader.
+    /// `room` is the budget in bytes. `None` if the body has its own reservation.
     pub(super) fn new(body: AnyBody, request: OpenRequest, room: Option<Arc<Semaphore>>) -> Self {
         Self {
             body,
@@ -85,7 +84,7 @@ impl AnswerBody {
         }
     }
 
-    /// Takes room for what was given, and gives back that of what was given before.
+    /// Charges the current frame to the budget, and releases the frame before.
     fn hold(&mut self) -> Result<(), BoxError> {
         self.held = None;
         if self.rest.len() <= PIECE {
@@ -108,7 +107,7 @@ impl Body for AnswerBody {
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Bytes>, BoxError>>> {
-        // Asked for more, the connection has taken what it was given.
+        // A poll for more means that the connection has taken the chunk before.
         self.request.handed(None);
         let budget = ready!(poll_proceed(context));
         if self.rest.is_empty() {
@@ -161,8 +160,8 @@ mod tests {
     use http_body_util::BodyExt;
     use tokio::time::timeout;
 
-    use super::super::connections::Connections;
     use super::*;
+    use crate::api::listener::connections::Connections;
     use crate::api::tests::ForEver;
 
     #[tokio::test]
@@ -172,7 +171,7 @@ mod tests {
         assert!(broken.frame().await.is_none() && broken.is_end_stream());
         let mut endless = RequestBody::new(ForEver(Ok::<_, Infallible>(Bytes::new())));
         let reading = async { while endless.frame().await.is_some() {} };
-        // On one thread: without a budget this would never come back.
+        // On one thread: without the task budget this would never return.
         let read = timeout(Duration::from_millis(20), reading).await;
         assert!(read.is_err());
     }
@@ -197,7 +196,7 @@ mod tests {
             assert!(piece.len() <= PIECE);
             read.extend_from_slice(&piece);
             if read.len() < bytes.len() {
-                // Another one of that size does not fit beside it.
+                // A second response of that size exceeds the budget.
                 let body = AnyBody::from(bytes.clone());
                 let request = entry.connection.begin();
                 let mut other = AnswerBody::new(body, request, full.clone());

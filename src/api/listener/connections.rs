@@ -1,20 +1,22 @@
-//! The open connections of a port: what each of them does, and which one makes room for another.
+//! The table of open connections of a port: their activity, timeouts, and eviction.
 //!
-//! The limits of a socket do not see HTTP/2: a stream without a window writes nothing, and a client
-//! that answers pings is never silent. So every connection is looked at for what it asks and takes.
+//! Socket timeouts do not cover HTTP/2: a stream without a flow-control window writes nothing, and
+//! a client that replies to pings is never idle. The activity of each connection is therefore
+//! tracked by its requests and responses.
 
 use std::cmp::Reverse;
 use std::collections::HashMap;
 use std::net::IpAddr;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::sync::{Arc, Mutex, Weak};
 use std::time::{Duration, Instant};
 
 use tokio_util::sync::CancellationToken;
 
 use crate::job::Tenant;
+use crate::sync::locked;
 
-/// The rank from which on a connection has shown a key.
+/// The lowest eviction rank of a connection with a valid key.
 const KNOWN: u8 = 2;
 
 /// The open connections of one port.
@@ -30,77 +32,76 @@ pub(super) struct Connection {
     address: IpAddr,
     connections: Weak<Connections>,
     state: Mutex<State>,
-    /// Cancelled when it has to make room.
+    /// Cancelled when the connection is evicted.
     evicted: CancellationToken,
 }
 
 struct State {
-    /// Whose key it has shown.
+    /// The tenant of the latest valid key. `None` before a key is received.
     tenant: Option<Tenant>,
-    /// Requests that are being answered.
+    /// The open requests.
     requests: HashMap<u64, Open>,
     next: u64,
-    /// Since when there is none.
+    /// The time since which there has been no open request. Meaningful only without open requests.
     idle_since: Instant,
-    /// When a piece of any answer was taken last.
+    /// When the client last took a chunk of any response.
     taken: Instant,
 }
 
-/// A request that is being answered.
+/// An open request.
 #[derive(Default)]
 struct Open {
-    /// When a piece of its answer was handed over that has not been taken yet.
+    /// When the latest chunk of the response was handed to the connection. `None` once it was
+    /// taken.
     handed: Option<Instant>,
-    /// Whether it only observes: its client can ask again at any time.
+    /// Whether the request only observes a job or health, so that its client can repeat it at any
+    /// time.
     observes: bool,
-    /// Whether its client may leave the answer unread.
+    /// Whether the client may leave the response unread.
     may_wait: bool,
 }
 
-/// A request, for those who answer it: a request extension.
+/// A handle to an open request for its handlers: a request extension.
 #[derive(Clone)]
 pub(in crate::api) struct Asking {
     connection: Arc<Connection>,
     number: u64,
 }
 
-/// How long a connection may be without what it is for.
+/// The timeouts of a connection.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Patience {
-    /// Without a request.
+    /// Maximum time without a request.
     pub(super) idle: Duration,
-    /// Without a good key; none where no key is needed.
+    /// Maximum time without a valid key. `None` if no key is needed.
     pub(super) unknown: Option<Duration>,
-    /// Without taking a piece of any answer.
+    /// Maximum time with an unread chunk in which no chunk of any response is taken.
     pub(super) unread: Duration,
 }
 
-/// What is to be done with a connection.
+/// The result of a check of a connection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Verdict {
+    /// The connection remains open.
     Keep,
-    /// It is idle: it may end what is on its way.
+    /// The connection is shut down gracefully: open requests are finished.
     Close,
-    /// It is to end now.
+    /// The connection is terminated.
     End,
 }
 
-/// A connection's place in the table, until it is dropped.
+/// The entry of a connection in the table, removed when dropped.
 pub(super) struct Entry {
     connections: Arc<Connections>,
     number: u64,
     pub(super) connection: Arc<Connection>,
 }
 
-/// A request that is being answered, until it is dropped.
+/// An open request, which ends when dropped.
 pub(super) struct OpenRequest(Asking);
 
-fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 impl Connections {
-    /// No connection yet, of so many at most.
+    /// An empty table for at most `most` connections.
     pub(super) fn new(most: usize) -> Self {
         Self {
             most,
@@ -109,6 +110,7 @@ impl Connections {
         }
     }
 
+    /// Adds a connection from `address`.
     pub(super) fn enter(self: &Arc<Self>, address: IpAddr) -> Entry {
         let now = Instant::now();
         let connection = Arc::new(Connection {
@@ -133,9 +135,10 @@ impl Connections {
         }
     }
 
-    /// Evicts one connection so that a new one has room. Candidates in order: without a key, without
-    /// a request, with observing requests alone. Of several it takes the longest idle. It never evicts
-    /// a connection with other requests of a known tenant. False without a candidate.
+    /// Evicts one connection to admit a new one. Candidates in order: without a key and without a
+    /// request, without a key, without a request, with observing requests only. Among equals it
+    /// evicts the longest idle. Connections with other requests of an authenticated tenant are
+    /// never evicted. Returns false if there is no candidate.
     pub(super) fn make_room(&self) -> bool {
         let mut open = locked(&self.open);
         let rank = |connection: &Connection| {
@@ -154,7 +157,8 @@ impl Connections {
             .iter()
             .filter_map(|(number, one)| Some((rank(one)?, one.address, one.idle_since(), *number)))
             .collect();
-        // Of those without a key, one of the address that has most: a flood evicts itself.
+        // Among connections without a key, the address with the most such connections is chosen
+        // first. A connection flood thus evicts itself.
         let mut held: HashMap<IpAddr, usize> = HashMap::new();
         for (_, address, ..) in ranked.iter().filter(|(rank, ..)| *rank < KNOWN) {
             *held.entry(*address).or_default() += 1;
@@ -172,7 +176,7 @@ impl Connections {
         true
     }
 
-    /// Whether a tenant is being answered on more than half of all connections.
+    /// Whether a tenant has open requests on more than half of the maximum number of connections.
     fn is_crowded_by(&self, tenant: &Tenant) -> bool {
         let half = self.most.div_ceil(2);
         let open = locked(&self.open);
@@ -188,8 +192,9 @@ impl Connections {
 }
 
 impl Connection {
-    /// A good key was shown, or none is needed. Says whether its tenant may have one more connection
-    /// at work: of several tenants one may have half of all.
+    /// Records the tenant of a valid key (the default tenant if no key is needed). Returns whether
+    /// the tenant may use one more busy connection: with `several` tenants, each may use half of
+    /// them.
     fn is_known(&self, tenant: &Tenant, several: bool) -> bool {
         locked(&self.state).tenant = Some(tenant.clone());
         let Some(connections) = self.connections.upgrade().filter(|_| several) else {
@@ -198,17 +203,17 @@ impl Connection {
         !connections.is_crowded_by(tenant)
     }
 
-    /// Since when it has no request.
+    /// The time since which the connection has been without a request.
     fn idle_since(&self) -> Instant {
         locked(&self.state).idle_since
     }
 
-    /// Returns when it has to make room.
+    /// Completes when the connection is evicted.
     pub(super) async fn evicted(&self) {
         self.evicted.cancelled().await;
     }
 
-    /// A request begins; it ends when the guard is dropped.
+    /// Registers a request, which ends when the guard is dropped.
     pub(super) fn begin(self: &Arc<Self>) -> OpenRequest {
         let mut state = locked(&self.state);
         let number = state.next;
@@ -220,10 +225,11 @@ impl Connection {
         })
     }
 
-    /// What is to be done with it now.
+    /// Checks the connection against the timeouts.
     pub(super) fn verdict(&self, patience: &Patience) -> Verdict {
         let state = locked(&self.state);
-        // One stream that its reader has paused does not end those beside it.
+        // A single stream that its reader has paused does not end the other streams of the
+        // connection.
         let mut handed = state.requests.values().filter_map(|open| open.handed);
         let waits = handed.any(|at| at.elapsed() >= patience.unread);
         if waits && state.taken.elapsed() >= patience.unread {
@@ -231,7 +237,7 @@ impl Connection {
         }
         let unknown = patience.unknown.filter(|_| state.tenant.is_none());
         if let Some(longest) = unknown {
-            // It may end what it asks, and not ask for ever.
+            // Without a key, open requests may finish, but not for longer than twice the limit.
             let age = self.opened.elapsed();
             if age >= longest * 2 {
                 return Verdict::End;
@@ -254,32 +260,34 @@ impl Asking {
         }
     }
 
-    /// Its caller has shown a good key, or none is needed. Says whether the tenant may have one more
-    /// connection at work: of `several` tenants one may have half of all.
+    /// Records the tenant of the request's valid key (the default tenant if no key is needed).
+    /// Returns whether the tenant may use one more busy connection: with `several` tenants, each
+    /// may use half of them.
     pub(in crate::api) fn is_known(&self, tenant: &Tenant, several: bool) -> bool {
         self.connection.is_known(tenant, several)
     }
 
-    /// It only observes a job or health: event streams, long polls and the like. Its connection may
-    /// have to make room, and its client asks again.
+    /// Marks the request as an observer of a job or health, such as an event stream or a long poll.
+    /// Its connection may be evicted, since the client can repeat the request.
     pub(in crate::api) fn observes(&self) {
         self.update(|open| open.observes = true);
     }
 
-    /// Its answer holds little and may be left unread: a stream whose client works on each message
-    /// before it takes the next one.
+    /// Allows the client to leave the response unread. For streams that hold little memory and
+    /// whose client processes each message before it reads the next one.
     pub(in crate::api) fn may_wait(&self) {
         self.update(|open| open.may_wait = true);
     }
 }
 
 impl OpenRequest {
-    /// What those who answer it see of it.
+    /// A handle for the handlers of the request.
     pub(super) fn asking(&self) -> Asking {
         self.0.clone()
     }
 
-    /// A piece of the answer was handed over, or (none) the piece before has been taken.
+    /// Records that a chunk of the response was handed to the connection (`Some`), or that the
+    /// chunk before was taken (`None`).
     pub(super) fn handed(&self, at: Option<Instant>) {
         let mut state = locked(&self.0.connection.state);
         let Some(request) = state.requests.get_mut(&self.0.number) else {
@@ -363,7 +371,7 @@ mod tests {
         assert_eq!(connection.verdict(&unread), Verdict::End);
         request.handed(None);
         assert_eq!(connection.verdict(&unread), Verdict::Keep);
-        // Beside a stream that is taken, one that is not may wait.
+        // An unread stream may wait while another stream of the connection is read.
         let short = Patience {
             unread: Duration::from_millis(100),
             ..PATIENCE

@@ -1,4 +1,4 @@
-//! A connection that is given up when its other end stops reading.
+//! A write timeout for connections whose client stops reading.
 
 use std::io;
 use std::pin::Pin;
@@ -24,7 +24,7 @@ impl<S> Stall<S> {
         }
     }
 
-    /// Passes progress on; turns a wait that is too long into an error.
+    /// Passes progress on. Fails with `TimedOut` after a wait longer than the timeout.
     fn judge<T>(
         &mut self,
         context: &mut Context<'_>,
@@ -96,7 +96,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_reader_that_stops_is_given_up_and_a_slow_one_is_not() {
-        // Reads follow each other far sooner than patience ends, whatever else the machine does.
+        // The pauses are much shorter than the timeout, even on a busy machine.
         const PATIENCE: Duration = Duration::from_secs(2);
         const PAUSE: Duration = Duration::from_millis(20);
         let (near, mut far) = tokio::io::duplex(8);

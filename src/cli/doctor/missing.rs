@@ -1,16 +1,17 @@
-//! What a GPU needs and does not have here: the loader, a driver's manifest, a container's leave.
+//! Detection of missing GPU prerequisites: the Vulkan loader, a driver's manifest, a container's
+//! permissions.
 //!
-//! Looks at names of files alone; what they mean is said in [`Found::advice`], which looks at
-//! nothing.
+//! [`Found::here`] inspects files and environment variables. [`Found::advice`] turns the findings
+//! into advice, without any access to the system.
 
 use std::env;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Variables that name the only manifests the loader reads; the latter is an older name.
+/// Environment variables that replace the loader's list of manifests. The second is an older name.
 const DRIVER_FILES: [&str; 2] = ["VK_DRIVER_FILES", "VK_ICD_FILENAMES"];
 
-/// Where the loader looks for drivers' manifests.
+/// Folders that the loader searches for drivers' manifests.
 const MANIFESTS: [&str; 4] = [
     "/usr/share/vulkan/icd.d",
     "/usr/local/share/vulkan/icd.d",
@@ -18,30 +19,31 @@ const MANIFESTS: [&str; 4] = [
     "/usr/local/etc/vulkan/icd.d",
 ];
 
-/// The loader's file.
+/// The Vulkan loader's shared library.
 const LOADER: &str = "libvulkan.so.1";
 
-/// What was found on this machine.
+/// The GPU prerequisites found on this machine.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Found {
-    /// Cards that drivers answer for, software left out.
+    /// GPUs that drivers offer, software drivers not counted.
     hardware: usize,
-    /// All that drivers answer for.
+    /// All adapters that drivers offer, software drivers included.
     answering: usize,
     loader: bool,
     manifests: usize,
-    /// What a variable says about manifests, where one does: its name, and whether files are there.
+    /// The first of `DRIVER_FILES` that is set, and whether any file that it names exists.
     restricted: Option<(&'static str, bool)>,
-    /// Devices of cards, such as `/dev/dri/renderD128`.
+    /// Device files of GPUs, such as `/dev/dri/renderD128`.
     devices: Vec<String>,
     nvidia: bool,
     container: bool,
-    /// What a container's NVIDIA driver may be used for, where that is said.
+    /// The value of `NVIDIA_DRIVER_CAPABILITIES`, where it is set.
     capabilities: Option<String>,
 }
 
 impl Found {
-    /// What is here, beside the cards that answer.
+    /// Inspects this machine. `hardware` and `answering` are the numbers of GPUs that drivers
+    /// offer, without and with software drivers.
     pub(super) fn here(hardware: usize, answering: usize) -> Self {
         let restricted = DRIVER_FILES.into_iter().find_map(|name| {
             let files = env::var_os(name)?;
@@ -72,7 +74,8 @@ impl Found {
         }
     }
 
-    /// What is missing and how to mend it, the first thing first; nothing where a card answers.
+    /// Advice on missing prerequisites, in the order in which to fix them; empty where a GPU was
+    /// found.
     pub(super) fn advice(&self) -> Vec<String> {
         if self.hardware > 0 {
             return Vec::new();
@@ -133,7 +136,7 @@ impl Found {
     }
 }
 
-/// Files of a folder that are of a kind, sorted.
+/// Paths of a folder's entries whose names are `wanted`, sorted.
 fn names(folder: &str, wanted: impl Fn(&str) -> bool) -> Vec<String> {
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
     let mut found: Vec<String> = entries
@@ -144,8 +147,8 @@ fn names(folder: &str, wanted: impl Fn(&str) -> bool) -> Vec<String> {
     found
 }
 
-/// Whether the system's linker would find the loader: by its cache, or in a folder that it looks
-/// into without one.
+/// Whether the dynamic linker would find the loader: in its cache, in `LD_LIBRARY_PATH`, or in a
+/// default folder.
 fn loader_is_there() -> bool {
     let cached = fs::read("/etc/ld.so.cache").unwrap_or_default();
     let needle = LOADER.as_bytes();
@@ -162,7 +165,7 @@ fn loader_is_there() -> bool {
 mod tests {
     use super::*;
 
-    /// A machine with everything but a card.
+    /// A machine with a loader and a driver's manifest, but without a GPU.
     fn machine() -> Found {
         Found {
             loader: true,

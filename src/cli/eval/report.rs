@@ -1,4 +1,4 @@
-//! Scores as they are gathered, and as JSON and people have them. Knows no files.
+//! Scores of flow files: accumulated over pairs, and printed as JSON or text.
 
 use serde::Serialize;
 
@@ -11,7 +11,8 @@ use crate::flow::evaluate::{
 use crate::formats::{FlowFile, Pair, PairTruth};
 use crate::text::grouped;
 
-/// The scores of one flow, or of many together: every scored point weighs the same.
+/// The scores of one flow, or of several together. Every scored point weighs the same, except in
+/// the bucket-normalized EPE, which is a mean over classes and speeds.
 pub(super) struct Scores {
     paper: Pool,
     argoverse2: Argoverse2Pool,
@@ -31,7 +32,7 @@ impl Default for Scores {
 }
 
 impl Scores {
-    /// Adds a flow, by its truth and what else is known of the pair.
+    /// Adds one pair: its flow, its truth, and the other data of the pair.
     pub(super) fn add(
         &mut self,
         flow: &FlowFile,
@@ -71,7 +72,7 @@ impl Scores {
         Ok(())
     }
 
-    /// What they come to; `flow` is the name of the one that they are of.
+    /// The scores of all flows added; `flow` is the name of the flow where there is only one.
     pub(super) fn report(&self, flow: Option<String>) -> Result<Report, EvaluateError> {
         let metrics = self.paper.finish()?;
         let argoverse2 = self.argoverse2.finish()?;
@@ -99,7 +100,7 @@ impl Scores {
     }
 }
 
-/// What `--json` prints.
+/// The scores, as `--json` prints them: errors in metres, angles in radians, shares from 0 to 1.
 #[derive(Debug, Serialize)]
 pub(super) struct Report {
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -176,7 +177,7 @@ impl From<ThreeWay> for ThreeWayReport {
 }
 
 impl BucketNormalizedReport {
-    /// None where no point was of any class.
+    /// `None` where no point has a class.
     fn new(report: &BucketReport) -> Option<Self> {
         let classes = CLASSES.iter().zip(&report.classes);
         let classes: Vec<ClassReport> = classes
@@ -207,7 +208,7 @@ impl From<Calibration> for ConfidenceReport {
 }
 
 impl Report {
-    /// What a person reads of one.
+    /// Prints the scores as text.
     pub(super) fn print(&self) -> Result<(), Failure> {
         let metres = |value: Option<f64>| value.map_or("-".to_owned(), |m| format!("{m:.4} m"));
         say(format_args!("{} points scored", grouped(self.points)))?;
@@ -246,7 +247,7 @@ impl Report {
         Ok(())
     }
 
-    /// One row of a table of many.
+    /// Prints the scores as one row of a table.
     pub(super) fn print_row(&self, name: &str, width: usize) -> Result<(), Failure> {
         let value = |value: Option<f64>| value.map_or("-".to_owned(), |v| format!("{v:.4}"));
         let three_way = self.three_way.as_ref().and_then(|three_way| three_way.epe);
@@ -265,7 +266,7 @@ impl Report {
         ))
     }
 
-    /// What stands above [`Self::print_row`].
+    /// Prints the heading of the table, above [`Self::print_row`].
     pub(super) fn print_heading(width: usize) -> Result<(), Failure> {
         say(format_args!(
             "{:width$}  {:>10}  {:>7}  {:>7}  {:>7}  {:>6}  {:>6}  {:>9}  {:>9}  {:>11}",

@@ -1,7 +1,9 @@
-//! TODO doc
+//! The CPU backend: builds the distance transform, starts fits and evaluates networks on a thread
+//! pool.
 
+use super::inference;
 use super::isa::Isa;
-use super::{inference, trainer};
+use super::trainer::{CpuTrainer, CpuTransform};
 use std::sync::Arc;
 
 use rayon::prelude::*;
@@ -12,19 +14,20 @@ use crate::flow::data::{Control, Point};
 use crate::flow::distance::{DistanceOptions, DistanceTransform};
 use crate::flow::field::{Backend, BackendError, Network, Trainer, Transform};
 use crate::flow::host::Host;
-use crate::flow::options::{Options, Precision};
+use crate::flow::options::{FieldOptions, Precision};
 
-/// The CPU, or a set of its threads.
+/// A backend that computes in single precision on a pool of CPU threads.
 pub struct CpuBackend {
     kernels: Kernels,
     host: Host,
 }
 
 impl CpuBackend {
-    /// The CPU's fastest instruction set on `threads` threads; on all cores where none are named.
+    /// A backend with the machine's fastest instruction set on `threads` threads, or on all cores
+    /// if none.
     ///
     /// # Errors
-    /// Where the operating system gives no threads.
+    /// If the thread pool cannot be started.
     pub fn new(threads: Option<usize>) -> Result<Self, BackendError> {
         Self::with_isa(Isa::available()[0], threads)
     }
@@ -32,10 +35,10 @@ impl CpuBackend {
     /// As [`Self::new`], with an instruction set of [`Isa::available`].
     ///
     /// # Errors
-    /// Where the operating system gives no threads.
+    /// If the thread pool cannot be started.
     ///
     /// # Panics
-    /// Where the machine lacks the instruction set.
+    /// If the machine lacks the instruction set.
     pub fn with_isa(isa: Isa, threads: Option<usize>) -> Result<Self, BackendError> {
         Ok(Self {
             kernels: Kernels::new(isa),
@@ -62,7 +65,7 @@ impl Backend for CpuBackend {
     ) -> Result<Box<dyn Transform>, BackendError> {
         let threads = self.host.threads();
         let distance = threads
-            .install(|| DistanceTransform::build_watched(source, target, options, control))?;
+            .install(|| DistanceTransform::build_with_control(source, target, options, control))?;
         let (kernels, threads) = (self.kernels, Arc::clone(threads));
         Ok(Box::new(CpuTransform {
             kernels,
@@ -82,13 +85,6 @@ impl Backend for CpuBackend {
     }
 }
 
-/// A distance transform in memory, and what will fit a field to it.
-pub(super) struct CpuTransform {
-    pub(super) kernels: Kernels,
-    pub(super) threads: Arc<rayon::ThreadPool>,
-    pub(super) distance: DistanceTransform,
-}
-
 impl Transform for CpuTransform {
     fn bytes(&self) -> usize {
         self.distance.bytes()
@@ -103,12 +99,13 @@ impl Transform for CpuTransform {
     fn start(
         &self,
         source: &[Point],
-        options: &Options,
+        options: &FieldOptions,
+        seed: u64,
     ) -> Result<Box<dyn Trainer + '_>, BackendError> {
         if options.precision == Precision::F16 {
             let text = "the CPU computes in single precision alone";
             return Err(BackendError::Unsupported(text));
         }
-        Ok(Box::new(trainer::CpuTrainer::new(self, source, options)))
+        Ok(Box::new(CpuTrainer::new(self, source, options, seed)))
     }
 }

@@ -1,4 +1,4 @@
-//! A network's flow at any points, on all threads. Fits nothing.
+//! Evaluation of a fitted network at given points, in parallel tiles.
 
 use rayon::prelude::*;
 
@@ -7,7 +7,7 @@ use super::tile::{TILE, WorkingSets};
 use crate::flow::data::Point;
 use crate::flow::field::{Conditioning, Parameters};
 
-/// The flow at each of `points`, metres.
+/// The flow at each of the N `points`, N x 3 displacements in metres.
 pub(super) fn evaluate(
     kernels: &Kernels,
     threads: &rayon::ThreadPool,

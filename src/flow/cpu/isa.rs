@@ -1,18 +1,18 @@
-//! Which instruction sets the kernels are compiled for, and which this machine has.
+//! The instruction sets that the kernels are compiled for, and their detection at run time.
 
 /// An instruction set that the kernels are compiled for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Isa {
-    /// 16 floats a register.
+    /// AVX-512F: 16 floats per register.
     Avx512,
-    /// 8 floats a register, with fused multiply-add.
+    /// AVX2 and FMA: 8 floats per register, with fused multiply-add.
     Avx2,
-    /// Plain Rust, on every target.
+    /// Plain Rust, available on every target.
     Portable,
 }
 
 impl Isa {
-    /// The instruction sets of this machine, fastest first.
+    /// The instruction sets that this machine supports, fastest first.
     pub fn available() -> Vec<Self> {
         let mut sets = Vec::new();
         #[cfg(target_arch = "x86_64")]
@@ -28,7 +28,7 @@ impl Isa {
         sets
     }
 
-    /// The name that reports and `fnsf doctor` show.
+    /// The name shown in reports and by `fnsf doctor`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Avx512 => "AVX-512",

@@ -1,8 +1,9 @@
-//! The fused network kernels: all layers forward, then all layers backward, over one tile of points.
+//! The fused network kernels: forward and backward passes through all layers over one tile of
+//! points.
 //!
-//! A tile stays in the second-level cache from the first layer to the last gradient; weights
-//! stream past it in panels that fit the first-level cache. Compiled for AVX-512, AVX2 + FMA and
-//! plain Rust; the fastest that the machine has is chosen at run time.
+//! A tile stays in the second-level cache from the first layer to the last gradient. The weights
+//! are read in panels that fit the first-level cache. The kernels are compiled for AVX-512, AVX2 +
+//! FMA and plain Rust. The instruction set is chosen at run time.
 #![expect(
     unsafe_code,
     reason = "calls into code compiled for instruction sets that were checked"
@@ -30,7 +31,7 @@ impl Kernels {
     /// The kernels of `isa`.
     ///
     /// # Panics
-    /// Where the machine lacks it.
+    /// If the machine lacks the instruction set.
     pub(crate) fn new(isa: Isa) -> Self {
         assert!(Isa::available().contains(&isa), "{isa:?} is not available");
         match isa {
@@ -51,15 +52,16 @@ impl Kernels {
         }
     }
 
-    /// `outputs = g(inputs)` for the tile's rows; keeps the activations for [`Self::backward`].
+    /// `outputs = g(inputs)` for the tile's rows. Keeps the activations for [`Self::backward`].
     pub(crate) fn forward(&self, parameters: &Parameters, tile: &mut Tile) {
         // SAFETY: `new` checked the instruction set.
         unsafe { (self.forward)(parameters, tile) }
     }
 
-    /// Adds the tile's parameter gradients to `gradients`, from its `output_gradients` and the
-    /// activations of the last [`Self::forward`]. `transposed` holds the middle layers'
-    /// transposes, see [`crate::flow::field::mlp::transpose_middle_layers`].
+    /// Adds the tile's parameter gradients to `gradients`. They follow from the tile's
+    /// `output_gradients` and the activations of the last [`Self::forward`]. `transposed` holds the
+    /// transposed weights of the middle layers, see
+    /// [`crate::flow::field::mlp::transpose_middle_layers`].
     pub(crate) fn backward(
         &self,
         parameters: &Parameters,
@@ -75,33 +77,33 @@ impl Kernels {
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f")]
 unsafe fn forward_avx512(parameters: &Parameters, tile: &mut Tile) {
-    // SAFETY: avx512f is on.
+    // SAFETY: avx512f is enabled.
     unsafe { forward::<F32x16, 12, 2>(parameters, tile) }
 }
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f")]
 unsafe fn backward_avx512(p: &Parameters, t: &Parameters, tile: &mut Tile, g: &mut Parameters) {
-    // SAFETY: avx512f is on.
+    // SAFETY: avx512f is enabled.
     unsafe { backward::<F32x16, 12, 8, 2>(p, t, tile, g) }
 }
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
 unsafe fn forward_avx2(parameters: &Parameters, tile: &mut Tile) {
-    // SAFETY: avx2 and fma are on.
+    // SAFETY: avx2 and fma are enabled.
     unsafe { forward::<F32x8, 6, 2>(parameters, tile) }
 }
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
 unsafe fn backward_avx2(p: &Parameters, t: &Parameters, tile: &mut Tile, g: &mut Parameters) {
-    // SAFETY: avx2 and fma are on.
+    // SAFETY: avx2 and fma are enabled.
     unsafe { backward::<F32x8, 6, 2, 2>(p, t, tile, g) }
 }
 unsafe fn forward_portable(parameters: &Parameters, tile: &mut Tile) {
-    // SAFETY: plain Rust needs no feature.
+    // SAFETY: plain Rust needs no CPU feature.
     unsafe { forward::<F32x4, 6, 2>(parameters, tile) }
 }
 unsafe fn backward_portable(p: &Parameters, t: &Parameters, tile: &mut Tile, g: &mut Parameters) {
-    // SAFETY: plain Rust needs no feature.
+    // SAFETY: plain Rust needs no CPU feature.
     unsafe { backward::<F32x4, 6, 2, 2>(p, t, tile, g) }
 }
 
@@ -112,9 +114,9 @@ mod tests {
     use crate::flow::field::ReferenceNetwork;
     use crate::flow::field::{MIDDLE_LAYERS, WIDTH, middle_layer, transpose_middle_layers};
 
-    /// Single precision over sums of 128 and of 96 terms, eight layers deep.
+    /// Rounding error of single-precision sums of 128 and of 96 terms, through eight layers.
     const TOLERANCE: f64 = 2e-5;
-    /// Row counts around a register tile, a tile, and an empty one.
+    /// Row counts around a register tile and a tile, and zero.
     const ROWS: [usize; 8] = [0, 1, 5, 11, 12, 13, 95, 96];
 
     fn network() -> Parameters {
@@ -135,7 +137,7 @@ mod tests {
         (0..rows).map(|_| point()).collect()
     }
 
-    /// The largest difference, relative to the largest reference value.
+    /// The largest difference, divided by the largest reference value.
     fn worst(values: &[f64], reference: &[f64]) -> f64 {
         assert!(values.iter().all(|v| v.is_finite()), "not finite");
         let scale = reference.iter().fold(1e-12f64, |a, r| a.max(r.abs()));
@@ -201,7 +203,8 @@ mod tests {
 
     #[test]
     fn the_reference_gradient_is_the_finite_difference_of_the_reference_network() {
-        // Central differences in double precision; a step of 1e-6 crosses no kink of this input.
+        // Central differences in double precision. A step of 1e-6 crosses no ReLU kink for this
+        // input.
         const STEP: f64 = 1e-6;
         let mut reference = ReferenceNetwork::read(&network());
         let (input, pull) = ([0.4, -1.3, 0.8], [0.7, -0.2, 0.5]);

@@ -1,8 +1,7 @@
-//! The network's two passes over one tile, written once over [`Lanes`].
+//! Forward and backward passes of the network over one tile, generic over [`Lanes`].
 //!
-//! Register tiles of `ROWS` points by `VECTORS` registers; every operand is read in the order in
-//! which it lies in memory. Every sum is taken in the order in which the shaders of `flow/gpu` take
-//! it. Knows nothing of instruction sets, distances, losses or threads.
+//! The inner loops compute register tiles of `ROWS` points by `VECTORS` registers. Every operand is
+//! read in its memory order. Every sum is taken in the same order as in the shaders of `flow/gpu`.
 #![expect(
     unsafe_code,
     reason = "register-tiled loops over raw rows, compiled per instruction set"
@@ -18,11 +17,11 @@ use crate::flow::field::{
     MIDDLE_LAYERS, PANEL, Parameters, WIDTH, first_layer, last_layer, middle_layer, tree_sum,
 };
 
-/// Sums of the last layer that are taken side by side, whatever the width of a register.
+/// Partial sums of the last layer per output, independent of the register width.
 const SIDE_BY_SIDE: usize = 16;
 
-/// A matrix in memory: where it starts and the floats from a row, and from a step of the summed
-/// index, to the next.
+/// A strided matrix: its first element, the floats from one row to the next, and the floats from
+/// one step of the summed index to the next.
 #[derive(Clone, Copy)]
 struct Strided {
     at: *const f32,
@@ -33,7 +32,7 @@ struct Strided {
 /// `acc[r][..] += sum_k a[r][k] * b[k][..]`: `ROWS` x `VECTORS` registers.
 ///
 /// # Safety
-/// `a` has `ROWS` rows and `depth` steps, `b` has `depth` rows of `VECTORS` registers, `b_step`
+/// `a` has `ROWS` rows and `depth` steps. `b` has `depth` rows of `VECTORS` registers, `b_step`
 /// floats apart.
 #[inline(always)]
 unsafe fn multiply<L: Lanes, const ROWS: usize, const VECTORS: usize>(
@@ -43,7 +42,7 @@ unsafe fn multiply<L: Lanes, const ROWS: usize, const VECTORS: usize>(
     b: *const f32,
     b_step: usize,
 ) {
-    // SAFETY: as the caller promises.
+    // SAFETY: guaranteed by the caller.
     unsafe {
         let mut a_at = a.at;
         let mut b_at = b;
@@ -79,7 +78,7 @@ fn for_columns<L: Lanes, const VECTORS: usize>(mut body: impl FnMut(usize, usize
 /// `outputs = g(inputs)`, layer by layer.
 ///
 /// # Safety
-/// The caller has the instruction set of `L`.
+/// The caller has enabled the instruction set of `L`.
 #[inline(always)]
 pub(super) unsafe fn forward<L: Lanes, const ROWS: usize, const VECTORS: usize>(
     parameters: &Parameters,
@@ -156,11 +155,12 @@ pub(super) unsafe fn forward<L: Lanes, const ROWS: usize, const VECTORS: usize>(
     }
 }
 
-/// Adds the derivatives of `output_gradients . g(inputs)` by every parameter to `gradients`. `TAIL`
-/// divides the rest of 128 inputs after the last whole group of `ROWS`.
+/// Adds the derivatives of `output_gradients . g(inputs)` with respect to every parameter to
+/// `gradients`. `TAIL` is the group size for the `128 mod ROWS` remaining inputs, and divides their
+/// number.
 ///
 /// # Safety
-/// The caller has the instruction set of `L`.
+/// The caller has enabled the instruction set of `L`.
 #[inline(always)]
 pub(super) unsafe fn backward<
     L: Lanes,
@@ -275,7 +275,7 @@ pub(super) unsafe fn backward<
     }
 }
 
-/// `to[0..128] += sum of rows`.
+/// `to[0..128] +=` the sum of the rows.
 #[inline(always)]
 unsafe fn add_column_sums<L: Lanes>(from: *const f32, rows: usize, to: *mut f32) {
     for column in (0..WIDTH).step_by(L::COUNT) {

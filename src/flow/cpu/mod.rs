@@ -1,4 +1,4 @@
-//! The CPU backend: vector kernels on all cores. Knows nothing of the GPU backend.
+//! The CPU backend: vectorized network kernels on all cores. Independent of the GPU backend.
 
 mod backend;
 mod inference;

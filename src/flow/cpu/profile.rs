@@ -1,7 +1,7 @@
-//! Measured amounts of work: the network's kernels, and the machine's multiply-add peak.
+//! Workloads for benchmarks: the network's kernels, and the multiply-add peak of one thread.
 //!
-//! Runs work and says how many floating-point operations it was; whoever holds a clock divides.
-//! Benchmarks and `fnsf doctor` do.
+//! Each workload returns its number of floating-point operations; the caller measures the time.
+//! Used by the benchmarks and by `fnsf doctor`.
 #![expect(
     unsafe_code,
     reason = "the peak is measured with the same registers as the kernels"
@@ -16,12 +16,13 @@ use super::tile::{TILE, Tile};
 use crate::flow::data::{Point, Random};
 use crate::flow::field::{MIDDLE_LAYERS, Parameters, WIDTH, transpose_middle_layers};
 
-/// Multiplications and additions of one point's forward pass.
+/// Floating-point operations of the forward pass per point.
 const FORWARD: usize = 2 * (3 * WIDTH + MIDDLE_LAYERS * WIDTH * WIDTH + 3 * WIDTH);
-/// Of its backward pass: as many for the weights, and for the inputs of all layers but the first.
+/// Floating-point operations of the backward pass per point: those of the forward pass for the
+/// weights, and again for the inputs of every layer but the first.
 const BACKWARD: usize = 2 * FORWARD - 2 * 3 * WIDTH;
 
-/// The kernels of one instruction set over a cloud, on the calling thread.
+/// The kernels of one instruction set over a synthetic cloud, on the calling thread.
 pub struct NetworkWorkload {
     kernels: Kernels,
     parameters: Parameters,
@@ -32,10 +33,10 @@ pub struct NetworkWorkload {
 }
 
 impl NetworkWorkload {
-    /// A network and `points` points.
+    /// A random network and `points` random points.
     ///
     /// # Panics
-    /// Where the machine lacks the instruction set.
+    /// If the machine lacks the instruction set.
     pub fn new(isa: Isa, points: usize) -> Self {
         let mut random = Random::new(1);
         let parameters = Parameters::xavier(&mut random);
@@ -52,7 +53,7 @@ impl NetworkWorkload {
         }
     }
 
-    /// Forward over all points; returns the floating-point operations.
+    /// Runs the forward pass over all points. Returns the number of floating-point operations.
     pub fn forward(&mut self) -> f64 {
         for points in self.points.chunks(TILE) {
             self.tile.load(points.iter().copied());
@@ -61,7 +62,8 @@ impl NetworkWorkload {
         (self.points.len() * FORWARD) as f64
     }
 
-    /// Forward and backward over all points; returns the floating-point operations.
+    /// Runs the forward and backward passes over all points. Returns the number of floating-point
+    /// operations.
     pub fn forward_and_backward(&mut self) -> f64 {
         for points in self.points.chunks(TILE) {
             self.tile.load(points.iter().copied());
@@ -78,14 +80,14 @@ impl NetworkWorkload {
     }
 }
 
-/// Runs `rounds` rounds of independent multiply-adds in registers; returns the floating-point
-/// operations. Nothing can be faster on one thread.
+/// Runs `rounds` rounds of independent multiply-adds in registers. Returns the number of
+/// floating-point operations. Their rate is the peak of one thread.
 ///
 /// # Panics
-/// Where the machine lacks the instruction set.
+/// If the machine lacks the instruction set.
 pub fn multiply_add_peak(isa: Isa, rounds: usize) -> f64 {
     assert!(Isa::available().contains(&isa), "{isa:?} is not available");
-    // SAFETY: the instruction set is there.
+    // SAFETY: the assertion checked the instruction set.
     unsafe {
         match isa {
             #[cfg(target_arch = "x86_64")]
@@ -100,21 +102,21 @@ pub fn multiply_add_peak(isa: Isa, rounds: usize) -> f64 {
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f")]
 unsafe fn peak_avx512(rounds: usize) -> f64 {
-    // SAFETY: avx512f is on.
+    // SAFETY: avx512f is enabled.
     unsafe { peak::<F32x16>(rounds) }
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
 unsafe fn peak_avx2(rounds: usize) -> f64 {
-    // SAFETY: avx2 and fma are on.
+    // SAFETY: avx2 and fma are enabled.
     unsafe { peak::<F32x8>(rounds) }
 }
 
 #[inline(always)]
 unsafe fn peak<L: Lanes>(rounds: usize) -> f64 {
     const CHAINS: usize = 12;
-    // SAFETY: the caller has the instruction set.
+    // SAFETY: the caller has enabled the instruction set.
     unsafe {
         let factor = L::splat(core::hint::black_box(0.999));
         let addend = L::splat(core::hint::black_box(0.001));

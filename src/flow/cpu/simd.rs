@@ -1,7 +1,7 @@
-//! Vector registers: the few operations that the kernels need, on AVX-512, AVX2 + FMA and plain arrays.
+//! Vector registers: the operations of the kernels on AVX-512, AVX2 + FMA and plain arrays.
 //!
-//! One trait, so that every kernel is written once. Nothing here knows what is computed. Every
-//! operation is inlined into a caller that has the instruction set switched on.
+//! One trait, so that every kernel is written once. Every operation is inlined into a caller for
+//! which the instruction set is enabled.
 #![expect(
     unsafe_code,
     reason = "vector intrinsics and unchecked loads are the point of this file"
@@ -21,11 +21,11 @@ pub(super) unsafe trait Lanes: Copy {
     unsafe fn load(from: *const f32) -> Self;
     unsafe fn store(self, to: *mut f32);
     unsafe fn add(self, other: Self) -> Self;
-    /// `self * factor + addend`.
+    /// `self * factor + addend`; fused on AVX-512 and AVX2 + FMA, rounded twice in plain Rust.
     unsafe fn mul_add(self, factor: Self, addend: Self) -> Self;
     /// `max(self, 0)`.
     unsafe fn relu(self) -> Self;
-    /// `self` where `gate > 0`, else zero.
+    /// `self` where `gate > 0`, else 0.
     unsafe fn where_positive(self, gate: Self) -> Self;
 }
 
@@ -34,10 +34,10 @@ pub(super) use x86::{F32x8, F32x16};
 
 #[cfg(target_arch = "x86_64")]
 mod x86 {
-    use super::Lanes;
+    use crate::flow::cpu::simd::Lanes;
     use core::arch::x86_64::*;
 
-    /// An AVX-512 register.
+    /// An AVX-512 register of 16 floats.
     #[derive(Clone, Copy)]
     pub(in crate::flow::cpu) struct F32x16(__m512);
 
@@ -85,7 +85,7 @@ mod x86 {
         }
     }
 
-    /// An AVX register, with FMA.
+    /// An AVX register of 8 floats, with FMA.
     #[derive(Clone, Copy)]
     pub(in crate::flow::cpu) struct F32x8(__m256);
 
@@ -134,7 +134,7 @@ mod x86 {
     }
 }
 
-/// Four floats in plain Rust: every target has them, and most make them one register.
+/// Four floats in plain Rust, which most targets compile to one register.
 #[derive(Clone, Copy)]
 pub(super) struct F32x4([f32; 4]);
 

@@ -1,31 +1,31 @@
-//! The working set of each thread: a tile of points with its activations and deltas.
-//!
-//! Knows where things lie; computes nothing.
+//! The working set of one thread: a tile of points with its activations and their derivatives.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use crate::flow::field::{Aligned, HIDDEN_LAYERS, WIDTH};
 
-/// Points in one tile: eight rows of activations of 96 points fill half of a 1 MiB cache.
+/// Points per tile. The activations of its eight hidden layers fill half of a 1 MiB cache.
 pub(crate) const TILE: usize = 96;
-/// Rows are padded to a multiple of this, which every kernel's row count divides.
+/// Rows are padded to a multiple of this number. The row count of every register tile divides it.
 pub(super) const ROW_STEP: usize = 12;
-/// Floats from one point's features to the next point's: 128 would map rows onto few cache sets.
+/// Floats from one point's features to the next point's. A stride of 128 would map the rows to few
+/// cache sets.
 pub(super) const STRIDE: usize = WIDTH + 16;
 
 /// The working set of one thread: a tile's inputs, activations and deltas.
 pub(crate) struct Tile {
     /// Points in the tile, at most [`TILE`].
     pub(super) rows: usize,
-    /// Network inputs, x y z a point.
+    /// Network inputs, x y z per point.
     pub(crate) inputs: [[f32; 3]; TILE],
-    /// Network outputs of the last forward pass.
+    /// Network outputs of the last forward pass, metres.
     pub(crate) outputs: [[f32; 3]; TILE],
-    /// The loss's derivative by each output, read by the backward pass.
+    /// Derivative of the loss with respect to each output, input of the backward pass.
     pub(crate) output_gradients: [[f32; 3]; TILE],
-    /// Rows of every hidden layer.
+    /// Activations of every hidden layer, one row per point.
     pub(super) activations: Aligned,
-    /// Loss derivatives by one layer's and the next lower layer's linear parts.
+    /// Derivatives of the loss with respect to the pre-activations of a layer and of the layer
+    /// below it.
     pub(super) deltas: [Aligned; 2],
 }
 
@@ -41,7 +41,7 @@ impl Tile {
         }
     }
 
-    /// Takes up to [`TILE`] inputs; the rest of the rows become zeros, with zero gradients.
+    /// Loads up to [`TILE`] inputs. The remaining rows and their gradients are set to zero.
     pub(crate) fn load(&mut self, inputs: impl ExactSizeIterator<Item = [f32; 3]>) {
         assert!(inputs.len() <= TILE, "a tile holds {TILE} points");
         self.rows = inputs.len();
@@ -52,13 +52,13 @@ impl Tile {
         self.output_gradients[self.rows..].fill([0.0; 3]);
     }
 
-    /// Rows including the padding to whole register tiles.
+    /// Number of rows, padded to whole register tiles.
     pub(super) fn padded_rows(&self) -> usize {
         self.rows.next_multiple_of(ROW_STEP)
     }
 }
 
-/// One working set a thread.
+/// One working set per thread.
 pub(super) struct WorkingSets(Vec<Mutex<Tile>>);
 
 impl WorkingSets {
@@ -67,7 +67,7 @@ impl WorkingSets {
         Self((0..threads).map(|_| Mutex::new(Tile::new())).collect())
     }
 
-    /// The calling thread's.
+    /// The calling thread's working set.
     pub(super) fn own(&self) -> MutexGuard<'_, Tile> {
         let thread = rayon::current_thread_index().unwrap_or(0);
         self.0[thread]

@@ -1,64 +1,81 @@
-//! One optimization on the CPU: forward, query, backward over tiles on all threads, then Adam.
-//! Knows neither deadlines nor files: a watch says when to come back.
+//! One fit on the CPU: forward pass, distance query and backward pass over tiles on all threads,
+//! then Adam.
 //!
-//! Sums are taken as `sums.rs` says, so that the bits do not depend on the threads.
+//! Sums are taken in the fixed order of `field/reduction.rs`, so the result has the same bits for
+//! any number of threads.
 
 use core::ops::Range;
 
+use std::sync::Arc;
+
 use rayon::prelude::*;
 
-use super::backend::CpuTransform;
 use super::inference::evaluate;
+use super::kernels::Kernels;
 use super::tile::{TILE, WorkingSets};
 use crate::flow::data::{Control, Point, Progress};
+use crate::flow::distance::DistanceTransform;
 use crate::flow::field::{
     Advance, BackendError, Chunks, EarlyStop, FitReport, Parameters, Schedule, Trainer,
     TrainerState, reduction, transpose_middle_layers,
 };
-use crate::flow::options::Options;
+use crate::flow::options::FieldOptions;
 
-/// Floats that one thread reduces and steps at a time.
+/// Parameters that one thread sums and updates at a time.
 const SLICE: usize = 4096;
 
-/// Chunks that are held at once: what is added of them is held in the first.
+/// Chunk gradients held in memory at once. If a batch has more chunks, the held ones are summed
+/// into the first.
 const HELD: usize = 32;
 
-/// What one chunk adds up over its tiles.
+/// The gradient sum of one chunk, and its time in the distance query.
 struct Chunk {
     gradients: Parameters,
     query_seconds: f64,
 }
 
-/// A chunk that is to be computed: its points, and where their losses go.
+/// A chunk to compute: its points, and the output slice of their losses.
 struct Due<'a> {
     chunk: &'a mut Chunk,
     points: &'a [Point],
     losses: &'a mut [f32],
 }
 
-/// The network, its optimizer and the distance that it is fitted to.
+/// A distance transform in memory, with the kernels and threads that fit a field to it.
+pub(super) struct CpuTransform {
+    pub(super) kernels: Kernels,
+    pub(super) threads: Arc<rayon::ThreadPool>,
+    pub(super) distance: DistanceTransform,
+}
+
+/// A network, its optimizer and the distance transform it is fitted to.
 pub(super) struct CpuTrainer<'a> {
     device: &'a CpuTransform,
-    course: Schedule,
-    /// Parameters, moments, the result so far, and what has been reached.
+    schedule: Schedule,
+    /// Parameters, moments, the result so far and the iteration counts.
     state: TrainerState,
     transposed: Parameters,
     early_stop: Option<EarlyStop>,
     chunks: Vec<Chunk>,
-    /// Of an iteration's points.
+    /// Losses of the current iteration's points, metres.
     losses: Vec<f32>,
     working_sets: WorkingSets,
     query_seconds: f64,
 }
 
 impl<'a> CpuTrainer<'a> {
-    pub(super) fn new(device: &'a CpuTransform, source: &[Point], options: &Options) -> Self {
-        let (course, parameters) = Schedule::new(source, options);
+    pub(super) fn new(
+        device: &'a CpuTransform,
+        source: &[Point],
+        options: &FieldOptions,
+        seed: u64,
+    ) -> Self {
+        let (schedule, parameters) = Schedule::new(source, options, seed);
         let mut transposed = Parameters::zeros();
         transpose_middle_layers(&parameters, &mut transposed);
         Self {
             device,
-            course,
+            schedule,
             state: TrainerState::at_start(parameters),
             transposed,
             early_stop: options.early_stop.map(EarlyStop::new),
@@ -69,10 +86,10 @@ impl<'a> CpuTrainer<'a> {
         }
     }
 
-    /// One iteration: gradients, keep, step. Returns the loss and whether the stopping rule fired;
-    /// nothing where the loss is not finite.
+    /// One iteration: gradients, update of the result, Adam step. Returns the loss and whether
+    /// early stopping fired; none if the loss is not finite.
     fn iterate(&mut self, control: &dyn Control) -> Option<(f32, bool)> {
-        let batch = self.course.batch(self.state.iterations);
+        let batch = self.schedule.batch(self.state.iterations);
         let held = self.accumulate(batch, control);
         let loss = reduction::mean(&self.losses);
         if !loss.is_finite() {
@@ -88,9 +105,10 @@ impl<'a> CpuTrainer<'a> {
         Some((loss, stop))
     }
 
-    /// Forward, query, backward over `batch`. Returns how many chunks hold its gradients.
+    /// Forward pass, distance query and backward pass over `batch`. Returns how many chunks hold
+    /// its gradients.
     fn accumulate(&mut self, batch: Range<usize>, control: &dyn Control) -> usize {
-        let cut = Chunks::new(self.course.largest_batch());
+        let cut = Chunks::new(self.schedule.largest_batch());
         self.losses.resize(batch.len(), 0.0);
         let mut next = 0;
         let mut held = 0;
@@ -107,7 +125,8 @@ impl<'a> CpuTrainer<'a> {
         held
     }
 
-    /// Forward, query, backward over some chunks of `batch`, to be held from `first` on.
+    /// Forward pass, distance query and backward pass over some chunks of `batch`, held from index
+    /// `first` on.
     fn compute(
         &mut self,
         batch: &Range<usize>,
@@ -123,7 +142,7 @@ impl<'a> CpuTrainer<'a> {
             query_seconds: 0.0,
         };
         self.chunks.resize_with(held.max(self.chunks.len()), empty);
-        let points = &self.course.points[batch.clone()];
+        let points = &self.schedule.points[batch.clone()];
         let within =
             |range: Range<usize>| range.start.min(points.len())..range.end.min(points.len());
         let mut due = Vec::with_capacity(some.len());
@@ -139,9 +158,9 @@ impl<'a> CpuTrainer<'a> {
             });
         }
         let weight = 1.0 / points.len() as f32;
-        let (device, loss) = (self.device, &self.course.options.loss);
+        let (device, loss) = (self.device, &self.schedule.options.loss);
         let (parameters, transposed) = (&self.state.parameters, &self.transposed);
-        let (conditioning, working_sets) = (&self.course.conditioning, &self.working_sets);
+        let (conditioning, working_sets) = (&self.schedule.conditioning, &self.working_sets);
         let run = |due: Due<'_>| {
             let mut tile = working_sets.own();
             let Chunk {
@@ -172,7 +191,7 @@ impl<'a> CpuTrainer<'a> {
         self.query_seconds += query / threads;
     }
 
-    /// Adds the gradients of all that are held to those of the first, in order.
+    /// Adds the gradients of all other held chunks to those of the first, in order.
     fn add_to_the_first(&mut self) {
         let [first, others @ ..] = self.chunks.as_mut_slice() else {
             return;
@@ -185,13 +204,13 @@ impl<'a> CpuTrainer<'a> {
         });
     }
 
-    /// Takes the current parameters into the result. As in the published code, the iteration at
-    /// which the stopping rule fires is not a candidate.
+    /// Updates the result with the current parameters. As in the published code, the iteration at
+    /// which early stopping fires is not a candidate for the best one.
     fn keep(&mut self, loss: f32, stop: bool) {
         let state = &mut self.state;
-        let fresh = self.course.fresh(state.iterations);
+        let ema_weight = self.schedule.ema_weight(state.iterations);
         let iteration = state.iterations + 1;
-        match fresh {
+        match ema_weight {
             None if loss <= state.best_loss && !stop => {
                 state.best_loss = loss;
                 state.best_iteration = iteration;
@@ -199,11 +218,11 @@ impl<'a> CpuTrainer<'a> {
                 state.kept.as_mut_slice().copy_from_slice(parameters);
             }
             None => {}
-            Some(fresh) => {
+            Some(ema_weight) => {
                 let kept = state.kept.as_mut_slice().iter_mut();
                 for (kept, parameter) in kept.zip(state.parameters.as_slice()) {
-                    *kept = if fresh < 1.0 {
-                        *kept + fresh * (parameter - *kept)
+                    *kept = if ema_weight < 1.0 {
+                        *kept + ema_weight * (parameter - *kept)
                     } else {
                         *parameter
                     };
@@ -213,15 +232,15 @@ impl<'a> CpuTrainer<'a> {
                 } else {
                     state.best_loss
                 };
-                state.best_loss = before + fresh * (loss - before);
+                state.best_loss = before + ema_weight * (loss - before);
                 state.best_iteration = iteration;
             }
         }
     }
 
-    /// Adds the chunks' gradients in order and steps the parameters.
+    /// Sums the chunks' gradients in order and takes one Adam step.
     fn step(&mut self, held: usize) {
-        let adam = self.course.adam(self.state.iterations);
+        let adam = self.schedule.adam(self.state.iterations);
         let chunks = &self.chunks[..held];
         let [means, squares] = &mut self.state.moments;
         let parameters = self.state.parameters.as_mut_slice().par_chunks_mut(SLICE);
@@ -253,7 +272,7 @@ fn add_slices(sums: &mut [f32], chunks: &[Chunk], slice: usize) {
 impl Trainer for CpuTrainer<'_> {
     fn advance(&mut self, steps: usize, control: &dyn Control) -> Result<Advance, BackendError> {
         for step in 0..steps {
-            if self.state.iterations >= self.course.options.max_iterations {
+            if self.state.iterations >= self.schedule.options.max_iterations {
                 return Ok(Advance::Exhausted);
             }
             if let Some(interrupt) = control.interrupt() {
@@ -266,8 +285,8 @@ impl Trainer for CpuTrainer<'_> {
                 return Ok(Advance::Diverged);
             };
             control.progress(Progress {
-                iteration: self.state.iterations,
-                max_iterations: self.course.options.max_iterations,
+                done: self.state.iterations,
+                total: self.schedule.options.max_iterations,
                 loss: loss.into(),
             });
             if stop {
@@ -282,7 +301,7 @@ impl Trainer for CpuTrainer<'_> {
             &self.device.kernels,
             &self.device.threads,
             &self.working_sets,
-            (&self.state.kept, &self.course.conditioning),
+            (&self.state.kept, &self.schedule.conditioning),
             points,
         ))
     }
@@ -305,7 +324,7 @@ impl Trainer for CpuTrainer<'_> {
     }
 
     fn restore(&mut self, state: TrainerState) -> Result<(), BackendError> {
-        let rule = self.course.options.early_stop;
+        let rule = self.schedule.options.early_stop;
         self.early_stop = rule.map(|options| EarlyStop::resumed(options, state.seen));
         transpose_middle_layers(&state.parameters, &mut self.transposed);
         self.state = state;
@@ -313,7 +332,7 @@ impl Trainer for CpuTrainer<'_> {
     }
 
     fn shorten(&mut self, max_iterations: usize) {
-        self.course.shorten(max_iterations);
+        self.schedule.shorten(max_iterations);
     }
 }
 

@@ -1,56 +1,52 @@
-//! Numbers as bytes that can be trusted: a magic, a version, a body, a checksum.
+//! A binary envelope: magic, version, body and checksum.
 //!
 //! ```text
 //! magic 8 | version u32 | body | FNV-1a of all before it, u64
 //! ```
 //!
-//! Little-endian. Knows neither what the numbers mean nor any files.
-
-use crate::flow::field::{LAID_OUT, Parameters};
+//! All numbers are little-endian.
 
 /// Bytes before the body.
 const HEADER: usize = 8 + 4;
-/// Bytes of a network's parameters.
-pub(crate) const PARAMETERS_BYTES: usize = LAID_OUT * size_of::<f32>();
 
-/// What the bytes should be.
+/// The expected envelope of a format.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Envelope {
     pub(crate) magic: [u8; 8],
     pub(crate) version: u32,
-    /// Bytes of the body, where there are always as many.
+    /// Length of the body in bytes, for formats of fixed length.
     pub(crate) body: Option<usize>,
 }
 
-/// Why bytes were refused.
+/// Why an envelope was rejected.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum EnvelopeError {
-    /// The bytes are something else.
+    /// The magic does not match: the bytes are of another format.
     #[error("the bytes are something else")]
     Magic,
-    /// Written by another version.
+    /// Written as another version of the format.
     #[error("written as version {version}, this program reads version {expected}")]
     Version {
-        /// The version that the bytes name.
+        /// The version in the bytes.
         version: u32,
-        /// The version that is read.
+        /// The version that this program reads.
         expected: u32,
     },
-    /// Bytes are missing, or there are too many.
+    /// The length does not match the format's fixed length.
     #[error("{bytes} bytes, {expected} are expected")]
     Length {
-        /// Bytes there.
+        /// Actual number of bytes.
         bytes: usize,
-        /// Bytes expected.
+        /// Expected number of bytes.
         expected: usize,
     },
-    /// The checksum is wrong, bytes are missing or left over, or a number is none.
+    /// The checksum does not match, bytes are missing or left over, or a number is invalid.
     #[error("the bytes are damaged")]
     Damaged,
 }
 
 impl Envelope {
-    /// Bytes with this seal, to be filled and [closed](Self::close).
+    /// The envelope's header, to be extended by the body and [closed](Self::close).
     pub(crate) fn begin(&self) -> Vec<u8> {
         let mut bytes = Vec::new();
         bytes.extend(self.magic);
@@ -58,17 +54,17 @@ impl Envelope {
         bytes
     }
 
-    /// The bytes with their checksum.
+    /// The bytes with their checksum appended.
     pub(crate) fn close(&self, mut bytes: Vec<u8>) -> Vec<u8> {
         let checksum = Hash::default().of(&bytes);
         bytes.extend(checksum.to_le_bytes());
         bytes
     }
 
-    /// The body of sealed bytes; nothing is allocated.
+    /// Checks the envelope and returns its body; allocates nothing.
     ///
     /// # Errors
-    /// [`EnvelopeError`] where they are something else, of another version, torn or altered.
+    /// [`EnvelopeError`] if the bytes are of another format or version, truncated or altered.
     pub(crate) fn open<'a>(&self, bytes: &'a [u8]) -> Result<Body<'a>, EnvelopeError> {
         if !bytes.starts_with(&self.magic) {
             return Err(EnvelopeError::Magic);
@@ -94,13 +90,13 @@ impl Envelope {
         if *checksum != Hash::default().of(sound).to_le_bytes() {
             return Err(EnvelopeError::Damaged);
         }
-        // The checksum holds, so that what was read of the header is sound, too.
+        // The checksum matches, so the header fields read above are valid, too.
         rest.0 = sound.get(HEADER..).ok_or(EnvelopeError::Damaged)?;
         Ok(rest)
     }
 }
 
-/// A body's bytes that are left to read.
+/// The unread bytes of a body.
 pub(crate) struct Body<'a>(&'a [u8]);
 
 impl Body<'_> {
@@ -110,7 +106,7 @@ impl Body<'_> {
         Ok(*taken)
     }
 
-    /// That all has been read.
+    /// Checks that all bytes have been read.
     pub(crate) fn end(&self) -> Result<(), EnvelopeError> {
         if self.0.is_empty() {
             Ok(())
@@ -135,7 +131,8 @@ impl Body<'_> {
         self.take().map(f32::from_le_bytes)
     }
 
-    /// How many things of `bytes` each follow: never more than there are bytes for.
+    /// Reads the number of items of `bytes` bytes each that follow; an error if the remaining bytes
+    /// cannot hold them.
     pub(crate) fn count_of(&mut self, bytes: usize) -> Result<usize, EnvelopeError> {
         let count = self.count()?;
         match count.checked_mul(bytes) {
@@ -144,25 +141,13 @@ impl Body<'_> {
         }
     }
 
-    pub(crate) fn parameters(&mut self) -> Result<Parameters, EnvelopeError> {
-        if self.0.len() < PARAMETERS_BYTES {
-            return Err(EnvelopeError::Damaged);
-        }
-        let mut parameters = Parameters::zeros();
-        for value in parameters.as_mut_slice() {
-            *value = f32::from_le_bytes(self.take()?);
-        }
-        Ok(parameters)
+    /// Number of unread bytes.
+    pub(crate) fn bytes_left(&self) -> usize {
+        self.0.len()
     }
 }
 
-/// Appends the parameters.
-pub(crate) fn put_parameters(bytes: &mut Vec<u8>, parameters: &Parameters) {
-    let floats = parameters.as_slice().iter();
-    bytes.extend(floats.flat_map(|value| value.to_le_bytes()));
-}
-
-/// FNV-1a over 64 bits: a single altered byte always shows.
+/// FNV-1a over 64 bits. Any single altered byte changes the hash.
 pub(crate) struct Hash(pub(crate) u64);
 
 impl Default for Hash {

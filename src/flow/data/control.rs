@@ -1,65 +1,94 @@
-//! How the world outside looks in on an optimization: time, deadlines, cancellation, progress,
-//! snapshots.
+//! Control of a running computation: time, deadline, interruption, progress and snapshots.
 //!
-//! The numerics own no clock; whoever calls them may lend one.
+//! The numerics read no clock. The caller may provide one through [`Control`].
 
-use crate::flow::field::Snapshot;
-
-/// One iteration's news.
+/// Progress of a method.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Progress {
-    /// Iterations done.
-    pub iteration: usize,
-    /// Iterations at most.
-    pub max_iterations: usize,
-    /// Mean loss of the iteration's points, metres: for the published method the distance to the
-    /// target.
+    /// Finished iterations of a field's fit, or finished clusters of an object search.
+    pub done: usize,
+    /// Maximum number of iterations, or number of clusters.
+    pub total: usize,
+    /// The mean loss of the latest iteration's points, or the mean cost of the clusters, metres.
     pub loss: f64,
 }
 
-/// Why an optimization is asked to end early.
+/// Why a computation is to end early.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Interrupt {
-    /// Time is up: the best flow so far is wanted.
+    /// The deadline has passed: the best result so far is returned.
     Deadline,
-    /// Nobody wants the flow any more.
+    /// The computation was cancelled; its result is not needed.
     Cancelled,
 }
 
-/// Looked at before every iteration; every method has a default that asks for nothing.
+/// The caller's control of a computation. By default it keeps no time and never interrupts.
 pub trait Control: Sync {
-    /// Seconds since a fixed moment; constant where nobody keeps time.
+    /// Seconds since a fixed time; constant if no time is kept.
     fn seconds(&self) -> f64 {
         0.0
     }
-    /// Seconds until the flow must be there; none without a deadline. Where they do not hold all
-    /// of the work, less is done. A watch that gives them keeps time in [`Self::seconds`].
+    /// Seconds until the flow is due; none without a deadline. If the time does not suffice for all
+    /// of the work, less is computed. An implementation that returns a value must keep time in
+    /// [`Self::seconds`].
     fn seconds_left(&self) -> Option<f64> {
         None
     }
-    /// Whether the work should end now. Asked before every iteration and between the pieces of
-    /// what comes before the first, several times a second and from any thread: a sign of life.
+    /// Whether the work should end now. Called from any thread, several times a second: before each
+    /// iteration or group of iterations, and between the parts of the work before the first one. It
+    /// can therefore serve as a heartbeat.
     fn interrupt(&self) -> Option<Interrupt> {
         None
     }
-    /// Called after every iteration.
+    /// Receives the progress after every iteration.
     fn progress(&self, _progress: Progress) {}
-    /// Whether a snapshot is wanted: true until [`Self::snapshot`] has brought one. Asked before
-    /// every iteration, after [`Self::interrupt`].
+    /// Whether a snapshot is due. It stays true until [`Self::snapshot`] has been called. Checked
+    /// after [`Self::interrupt`], before each iteration or group of iterations.
     fn snapshot_due(&self) -> bool {
         false
     }
-    /// Takes a snapshot that was due. None comes of a run that its deadline has already changed.
-    fn snapshot(&self, _snapshot: Snapshot) {}
+    /// Receives the bytes of a due snapshot, to be read by [`crate::flow::Snapshot::from_bytes`]. A
+    /// fit that its deadline has altered produces no snapshots.
+    fn snapshot(&self, _bytes: Vec<u8>) {}
 }
 
-/// The watch's wish to end, as an error.
+/// The control's interrupt as an error.
 pub(crate) fn check(control: &dyn Control) -> Result<(), Interrupt> {
     control.interrupt().map_or(Ok(()), Err)
 }
 
-/// A watch that keeps no time and never interrupts.
+/// A control that keeps no time and never interrupts.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Uncontrolled;
 
 impl Control for Uncontrolled {}
+
+/// A control with an earlier deadline.
+pub(crate) struct EarlierDeadline<'a> {
+    pub(crate) control: &'a dyn Control,
+    /// Seconds by which the deadline is earlier.
+    pub(crate) reserve: f64,
+}
+
+impl Control for EarlierDeadline<'_> {
+    fn seconds(&self) -> f64 {
+        self.control.seconds()
+    }
+    fn seconds_left(&self) -> Option<f64> {
+        self.control.seconds_left().map(|left| left - self.reserve)
+    }
+    fn interrupt(&self) -> Option<Interrupt> {
+        let late = || self.seconds_left().is_some_and(|left| left <= 0.0);
+        let interrupt = self.control.interrupt();
+        interrupt.or_else(|| late().then_some(Interrupt::Deadline))
+    }
+    fn progress(&self, progress: Progress) {
+        self.control.progress(progress);
+    }
+    fn snapshot_due(&self) -> bool {
+        self.control.snapshot_due()
+    }
+    fn snapshot(&self, bytes: Vec<u8>) {
+        self.control.snapshot(bytes);
+    }
+}

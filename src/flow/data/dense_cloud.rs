@@ -1,21 +1,22 @@
-//! Sweeps of a sequence, carried into the frame of one of them.
-//!
-//! It must not know how they were carried there, nor what is made of them.
+//! A dense cloud: the points of several sweeps, transformed into one frame.
 
 use super::point::Point;
 
-/// Sweeps carried into one frame: M points, one row each in every list.
+/// The points of several sweeps in one frame: M points, one row each in every list.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct DenseCloud {
-    /// Where each point is at the instant of the sweep `into`, metres, in that sweep's frame.
+    /// M x 3: position of each point at the reference time, metres, in the frame of the reference
+    /// time.
     pub points: Vec<Point>,
-    /// Place in the sequence of the sweep that measured each point, counted from 0.
-    pub frame: Vec<u32>,
-    /// `into - frame` in sweeps: positive where the point was measured before, 0 where it belongs
-    /// to `into` itself, negative where it was measured after.
+    /// M: index in the sequence of the sweep that measured each point, counted from 0.
+    pub sweep: Vec<u32>,
+    /// M: the reference time minus the time of the point's sweep, in sweep intervals; negative if
+    /// the point was measured after the reference time.
     pub age: Vec<f32>,
-    /// Whether the point moved against the static world on its way.
+    /// M: whether the point moved relative to the static world between its sweep and the reference
+    /// time.
     pub dynamic: Vec<bool>,
-    /// False where inverting a field did not settle: the point's place is not to be trusted.
+    /// M: false if inverting a flow field did not converge; the point's position is then
+    /// unreliable.
     pub converged: Vec<bool>,
 }

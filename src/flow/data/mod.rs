@@ -1,20 +1,27 @@
-//! TODO doc
+//! Basic data types of the numerics: points and transforms, control, random numbers and the
+//! envelope of binary formats.
 
+mod aligned_sweep;
 mod codec;
 pub(crate) mod control;
 mod dense_cloud;
 mod lazy;
+mod lock;
 mod oriented_box;
 mod point;
 mod rng;
 
+pub use aligned_sweep::AlignedSweep;
 pub use codec::EnvelopeError;
 pub use control::{Control, Interrupt, Progress, Uncontrolled};
+
+pub(crate) use control::EarlierDeadline;
 pub use dense_cloud::DenseCloud;
 pub use oriented_box::OrientedBox;
 pub use point::{DYNAMIC_M, MIN_POINTS, Point, RigidTransform};
 
-pub(crate) use codec::{Body, Envelope, Hash, PARAMETERS_BYTES, put_parameters};
+pub(crate) use codec::{Body, Envelope, Hash};
 pub(crate) use lazy::get_or_compute;
+pub(crate) use lock::locked;
 pub(crate) use point::{floor, square_distance, stride_sample, transform_point, transform_points};
 pub(crate) use rng::Random;

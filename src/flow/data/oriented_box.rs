@@ -1,33 +1,34 @@
-//! The smallest upright box around points.
+//! The smallest upright bounding box of a set of points.
 //!
-//! One side of the rectangle of least area around a set of points lies on an edge of its convex hull
-//! (Freeman and Shapira 1975). It must not know what the points are of.
+//! One side of the rectangle of least area around a set of points lies on an edge of its convex
+//! hull (Freeman and Shapira 1975).
 
 use std::f32::consts::{FRAC_PI_2, PI, TAU};
 
 use super::point::Point;
 
-/// Edges of a hull that are tried, at most.
+/// Most edges of a hull that are tried.
 const MOST_EDGES: usize = 256;
 
-/// A box that stands upright.
+/// An upright bounding box: rotated about the z axis only.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct OrientedBox {
-    /// Its middle, metres.
+    /// Its center, metres.
     pub center: Point,
     /// Length, width and height, metres.
     pub size: Point,
-    /// Radians from the x axis to its length, counterclockwise, above -pi and up to pi.
+    /// Angle from the x axis to its length, counterclockwise, in (-pi, pi], radians.
     pub yaw: f32,
 }
 
 impl OrientedBox {
-    /// Around `points`, one at least, metres. The length is along the longer side and points forward,
-    /// or, where the points move by `way`, along the side nearest to that.
+    /// The box around `points` (at least one), metres. If the points move by `way` (x, y), the
+    /// length is along the side whose direction is nearest to it. Otherwise the length is the
+    /// longer side, in the direction nearest to +x.
     pub(crate) fn around(points: &[Point], way: Option<[f32; 2]>) -> Self {
         let level: Vec<[f64; 2]> = points.iter().map(|p| [p[0], p[1]].map(f64::from)).collect();
         let hull = hull(level);
-        // Around so many corners nearly every direction is as good as any.
+        // A hull with more corners is nearly round, so every n-th edge suffices.
         let apart = hull.len().div_ceil(MOST_EDGES).max(1);
         let edges = (0..hull.len()).step_by(apart).map(|i| {
             let ([a, b], [c, d]) = (hull[i], hull[(i + 1) % hull.len()]);
@@ -40,7 +41,7 @@ impl OrientedBox {
         if way.is_none() && found.size[1] > found.size[0] {
             found = Rectangle::along(found.yaw + std::f64::consts::FRAC_PI_2, &hull);
         }
-        // Of the directions that the box allows, the one nearest to what is wanted.
+        // The allowed direction nearest to the wanted one.
         let step = if way.is_some() { FRAC_PI_2 } else { PI };
         let yaw = found.yaw as f32;
         let yaw = yaw + ((wanted - yaw) / step).round() * step;
@@ -67,7 +68,7 @@ impl OrientedBox {
     }
 }
 
-/// A rectangle with a direction.
+/// A rectangle with the direction of its length.
 struct Rectangle {
     yaw: f64,
     center: [f64; 2],
@@ -75,7 +76,7 @@ struct Rectangle {
 }
 
 impl Rectangle {
-    /// The smallest of this direction around some points.
+    /// The smallest rectangle of direction `yaw` around `points`.
     fn along(yaw: f64, points: &[[f64; 2]]) -> Self {
         let (sin, cos) = yaw.sin_cos();
         let mut ends = [[f64::INFINITY, f64::NEG_INFINITY]; 2];
@@ -98,8 +99,8 @@ impl Rectangle {
     }
 }
 
-/// The corners of the convex hull, counterclockwise (Andrew 1979); the points themselves where they
-/// are fewer than three.
+/// The corners of the convex hull, counterclockwise (Andrew 1979). Fewer than three distinct points
+/// are returned as they are.
 fn hull(mut points: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
     points.sort_unstable_by(|a, b| a[0].total_cmp(&b[0]).then(a[1].total_cmp(&b[1])));
     points.dedup();
@@ -132,7 +133,7 @@ mod tests {
     use super::*;
     use crate::flow::data::rng::Random;
 
-    /// Points of a car at (20, -5), 4 m long and 1.8 m wide, at an angle.
+    /// Points of a car at (20, -5), 4 m long and 1.8 m wide, rotated by `yaw`.
     fn car(yaw: f64) -> Vec<Point> {
         let mut random = Random::new(6);
         let mut point = || {
@@ -149,7 +150,7 @@ mod tests {
 
     #[test]
     fn a_box_is_the_car_that_it_is_around() {
-        // 4,000 points leave a few centimetres free along every side.
+        // 4,000 random points leave a margin of a few centimetres along every side.
         const FREE_M: f32 = 0.1;
         const TURN: f32 = 0.03;
         for yaw in [0.0, 0.4, -1.2] {

@@ -1,32 +1,34 @@
-//! Points and rigid transforms: the vocabulary that every other room shares.
+//! Points and rigid transforms.
 
 /// A point or a displacement: x, y, z in metres (x forward, y left, z up in lidar convention).
 pub type Point = [f32; 3];
 
-/// A rigid motion, column vectors, metres. Named `target_from_source` where it is stored.
+/// A rigid transform of column vectors, metres. Stored ego motions are named `target_from_source`.
 pub type RigidTransform = nalgebra::Isometry3<f64>;
 
-/// Residual motion of a frame from which a point counts as moving, metres (Argoverse 2).
+/// Residual motion within one sweep interval from which a point counts as moving, metres (Argoverse
+/// 2).
 pub const DYNAMIC_M: f32 = 0.05;
 
-/// `point`, moved rigidly: computed in double precision.
+/// `point` transformed by `motion`, computed in double precision.
 pub(crate) fn transform_point(motion: &RigidTransform, point: Point) -> Point {
     let moved = motion * nalgebra::Point3::from(point.map(f64::from));
     [moved.x as f32, moved.y as f32, moved.z as f32]
 }
 
-/// Squared distance, square metres.
+/// Squared Euclidean distance, square metres.
 #[inline]
 pub(crate) fn square_distance(a: Point, b: Point) -> f32 {
     let [x, y, z] = [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
     x * x + y * y + z * z
 }
 
-/// The largest whole number that is not above `value`: what [`f32::floor`] gives, but for the sign of
-/// zero, which calls a function where processors are not known to have an instruction for it.
+/// The largest integer that is not above `value`. Equal to [`f32::floor`] except for the sign of
+/// zero. On targets without a rounding instruction in their baseline, [`f32::floor`] is a function
+/// call.
 #[inline]
 pub(crate) fn floor(value: f32) -> f32 {
-    /// From here on all numbers are whole.
+    /// All numbers of at least this magnitude are integers.
     const WHOLE: f32 = (1 << 23) as f32;
     if value.abs() < WHOLE {
         let toward_zero = value as i32 as f32;
@@ -36,13 +38,13 @@ pub(crate) fn floor(value: f32) -> f32 {
     }
 }
 
-/// At most `most` of the points, or of anything else, evenly.
+/// At most `most` of the items, evenly spaced.
 pub(crate) fn stride_sample<T: Copy>(all: &[T], most: usize) -> Vec<T> {
     let kept = all.len().min(most);
     (0..kept).map(|i| all[i * all.len() / kept]).collect()
 }
 
-/// All points, moved rigidly.
+/// All `points` transformed by `motion`.
 pub(crate) fn transform_points(motion: &RigidTransform, points: &[Point]) -> Vec<Point> {
     points
         .iter()
@@ -50,7 +52,7 @@ pub(crate) fn transform_points(motion: &RigidTransform, points: &[Point]) -> Vec
         .collect()
 }
 
-/// Fewer points than this in a cloud determine no motion.
+/// Minimum number of points of a cloud; fewer do not determine a motion.
 pub const MIN_POINTS: usize = 3;
 
 #[cfg(test)]

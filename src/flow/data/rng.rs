@@ -1,17 +1,16 @@
-//! The one random stream of the numerics: seeded, small and the same on every machine.
+//! The random number generator of the numerics: PCG64, seeded explicitly, equal on every machine.
 //!
-//! PCG64 makes the bits and a few maps turn them into numbers. It must not know what the numbers
-//! are for, and it never reads a clock or the system's entropy.
+//! It uses neither a clock nor the system's entropy.
 
 use rand_core::{Rng, SeedableRng};
 use rand_pcg::Pcg64;
 
-/// 2^-53: maps the top 53 bits of a word onto an f64 in [0, 1) without rounding.
+/// 2^-53: maps the top 53 bits of a word to an f64 in [0, 1) without rounding.
 const UNIT: f64 = 1.0 / (1u64 << 53) as f64;
 
-/// A seeded stream of numbers.
+/// A seeded random stream.
 ///
-/// `uniform`, `below` and `shuffle` give the same bits on every machine; `normal` calls the
+/// `uniform`, `below` and `shuffle` give the same bits on every machine. `normal` calls the
 /// platform's logarithm and may differ in the last bit between platforms.
 #[derive(Debug, Clone)]
 pub(crate) struct Random {
@@ -20,7 +19,7 @@ pub(crate) struct Random {
 }
 
 impl Random {
-    /// The stream that belongs to `seed`.
+    /// The stream of `seed`.
     pub(crate) fn new(seed: u64) -> Self {
         Self {
             bits: Pcg64::seed_from_u64(seed),
@@ -28,7 +27,8 @@ impl Random {
         }
     }
 
-    /// One of many unrelated streams of the same seed, so that parallel parts can draw in any order.
+    /// One of many independent streams of the same seed, so that parallel parts can draw in any
+    /// order.
     pub(crate) fn stream(seed: u64, stream: u64) -> Self {
         Self::new(mix(seed ^ mix(stream)))
     }
@@ -39,7 +39,8 @@ impl Random {
         lo + (hi - lo) * unit
     }
 
-    /// A draw from the normal distribution of mean 0 and deviation 1 (Marsaglia's polar method).
+    /// A draw from the standard normal distribution, mean 0 and deviation 1 (Marsaglia's polar
+    /// method).
     pub(crate) fn normal(&mut self) -> f64 {
         if let Some(spare) = self.spare_normal.take() {
             return spare;
@@ -55,7 +56,7 @@ impl Random {
         }
     }
 
-    /// A whole number in 0..n without bias (Lemire's method); 0 where n is 0.
+    /// An unbiased integer in 0..n (Lemire's method); 0 if n is 0.
     pub(crate) fn below(&mut self, n: usize) -> usize {
         let n = n as u64;
         if n == 0 {
@@ -70,7 +71,7 @@ impl Random {
         }
     }
 
-    /// Puts the items in a random order, every order equally likely.
+    /// Shuffles the items; every order is equally likely.
     pub(crate) fn shuffle<T>(&mut self, items: &mut [T]) {
         for last in (1..items.len()).rev() {
             items.swap(last, self.below(last + 1));
@@ -132,7 +133,7 @@ mod tests {
         let mut random = Random::new(2);
         let values: Vec<f64> = (0..DRAWS).map(|_| random.normal()).collect();
         let moment = |power: i32| values.iter().map(|v| v.powi(power)).sum::<f64>() / DRAWS as f64;
-        // Five standard errors of each moment at this many draws.
+        // Five standard errors of each moment for this number of draws.
         assert!(moment(1).abs() < 0.016);
         assert!((moment(2) - 1.0).abs() < 0.023);
         assert!((moment(4) - 3.0).abs() < 0.16);

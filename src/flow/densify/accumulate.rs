@@ -1,43 +1,25 @@
-//! TODO doc
+//! Densification: the sweeps of a sequence, transformed into the frame of one reference time.
+//!
+//! Earlier sweeps are advected forward and later sweeps backward, sweep by sweep, to the two sweeps
+//! around the reference time. A last partial step ends at the reference time itself.
 
 use super::advect::{Context, PropagatedCloud};
+use super::error::DensifyError;
 use super::plan::{FlowEdge, LaterSweeps, Plan};
-use crate::flow::data::{Control, DenseCloud, Interrupt, RigidTransform, control};
-use crate::flow::field::{Backend, BackendError};
+use crate::flow::data::{Control, DenseCloud, RigidTransform, control};
+use crate::flow::field::Backend;
 use crate::flow::motion::{MotionField, Residual};
 use crate::flow::sequence::Sweep;
 
-/// Why there is no dense cloud.
-#[derive(Debug, thiserror::Error)]
-pub enum DensifyError {
-    /// The plan is for another number of sweeps.
-    #[error("{sweeps} sweeps, and a plan for {planned}")]
-    Sweeps {
-        /// Sweeps there.
-        sweeps: usize,
-        /// Sweeps planned for.
-        planned: usize,
-    },
-    /// A field of the plan is missing.
-    #[error("no field from sweep {} to sweep {}", .0.source, .0.target)]
-    NoField(FlowEdge),
-    /// A sweep's mask has another length than the sweep.
-    #[error("sweep {0}: the ground mask has another number of rows than the sweep")]
-    Mask(usize),
-    /// The watch asked for the end; half of a dense cloud is none.
-    #[error("interrupted")]
-    Interrupted(Interrupt),
-    /// The device failed.
-    #[error(transparent)]
-    Backend(#[from] BackendError),
-}
-
-/// Carries the points of all `sweeps` as `plan` says, through the fields that `field` gives for each of
-/// [`Plan::edges`]. Points that are not finite, or 1,000 km away, are left out. A sweep's ground mask, where it has one,
-/// names points that never move of themselves.
+/// Transforms the points of all `sweeps` into the frame of the plan's reference time.
+///
+/// `field` returns the motion field of each of [`Plan::edges`]. Points with a coordinate that is
+/// not finite, or of 1,000 km or more, are left out. A sweep's ground mask, where present, marks
+/// points that have no residual motion.
 ///
 /// # Errors
-/// [`DensifyError`] where sweeps or fields are missing, the watch interrupts or the device fails.
+/// [`DensifyError`] if the number of sweeps is not the plan's, a ground mask has another length
+/// than its sweep, a field is missing, the control interrupts or the device fails.
 pub fn densify<'a>(
     backend: &dyn Backend,
     plan: &Plan,
@@ -62,7 +44,7 @@ pub fn densify<'a>(
     let by = Context { backend, control };
     let checked = || control::check(control).map_err(DensifyError::Interrupted);
 
-    // Sweeps up to the anchor, forward.
+    // Sweeps up to the anchor, forward in time.
     let (anchor, substeps) = (plan.anchor, plan.substeps);
     let mut earlier = PropagatedCloud::default();
     for (place, sweep) in sweeps[..=anchor].iter().enumerate() {
@@ -72,7 +54,8 @@ pub fn densify<'a>(
         }
         earlier.take(place, sweep);
     }
-    // Sweeps behind it, back to the one before which the instant lies.
+    // Sweeps after the anchor, backward in time. If the reference time lies between two sweeps,
+    // they end in the frame of sweep `anchor + 1`.
     let first = if plan.fraction > 0.0 {
         anchor + 1
     } else {
@@ -95,7 +78,8 @@ pub fn densify<'a>(
     if plan.fraction > 0.0 {
         let ahead = field(anchor, anchor + 1)?;
         let step = ahead.ego.unwrap_or_default();
-        // The frame of the instant lies a share of the way, and of the turn, between the two sweeps'.
+        // The frame of the reference time: translation and rotation are interpolated between the
+        // two sweeps' frames.
         let instant = part_of(&step, plan.fraction);
         earlier.part_step(by, ahead, plan.fraction)?;
         earlier.transform(&(instant * step.inverse()));
@@ -115,8 +99,8 @@ pub fn densify<'a>(
     Ok(earlier.joined(later, plan.into()))
 }
 
-/// What carries points through `fields`, as reports show it: the device where one of them is a network,
-/// else the host's threads.
+/// The name of the device that advects points through `fields`, for reports: the backend's if any
+/// field is a network, else that of the host's threads.
 pub fn carrier<'a>(
     backend: &dyn Backend,
     fields: impl IntoIterator<Item = &'a MotionField>,
@@ -129,7 +113,8 @@ pub fn carrier<'a>(
     }
 }
 
-/// The part of a rigid motion that is done after `share` of its time.
+/// The part of a rigid motion up to `share` (0 to 1) of its duration: linear in the translation,
+/// spherical linear interpolation of the rotation.
 pub(super) fn part_of(motion: &RigidTransform, share: f64) -> RigidTransform {
     RigidTransform::identity().lerp_slerp(motion, share)
 }

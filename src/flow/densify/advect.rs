@@ -1,6 +1,7 @@
-//! Points on their way from their own sweeps' frames to another. Knows fields, and no sequences.
+//! Advection of points through motion fields: Euler steps, and their inverse by fixed-point
+//! iteration.
 
-use super::accumulate::DensifyError;
+use super::error::DensifyError;
 use crate::flow::data::{
     Control, DYNAMIC_M, DenseCloud, Point, RigidTransform, control, transform_points,
 };
@@ -8,29 +9,30 @@ use crate::flow::field::{Backend, length};
 use crate::flow::motion::MotionField;
 use crate::flow::sequence::Sweep;
 
-/// An inverse has settled where its last correction is shorter than this, metres.
+/// The inverse has converged when its last correction is shorter than this, metres.
 const SETTLED_M: f32 = 0.01;
-/// Corrections of an inverse at most.
+/// Maximum number of corrections of an inverse.
 const CORRECTIONS: usize = 20;
 
-/// Places farther than this from the frame's origin are none, metres.
+/// Coordinates of this size or larger are invalid, metres.
 const FARTHEST_M: f32 = 1e6;
-/// Points between two looks at the watch: a tenth of a second of two cores.
+/// Points between two checks of the control: about a tenth of a second on two cores.
 const PIECE: usize = 1 << 17;
 
-/// Points of several sweeps, all in one frame.
+/// Points of several sweeps, all in the frame and at the time of one sweep.
 #[derive(Default)]
 pub(super) struct PropagatedCloud {
     points: Vec<Point>,
-    frame: Vec<u32>,
-    /// What never moves of itself.
+    sweep: Vec<u32>,
+    /// Marks ground points, which have no residual motion.
     ground: Vec<bool>,
     dynamic: Vec<bool>,
     converged: Vec<bool>,
 }
 
 impl PropagatedCloud {
-    /// Takes the finite points of the sweep whose frame this is.
+    /// Appends the valid points of `sweep`, whose index in the sequence is `place`. The cloud must
+    /// be in that sweep's frame.
     pub(super) fn take(&mut self, place: usize, sweep: &Sweep) {
         for (row, point) in sweep.points.iter().enumerate() {
             if is_place(*point) {
@@ -39,37 +41,40 @@ impl PropagatedCloud {
                     .push(sweep.ground.as_ref().is_some_and(|ground| ground[row]));
             }
         }
-        self.frame.resize(self.points.len(), place as u32);
+        self.sweep.resize(self.points.len(), place as u32);
         self.dynamic.resize(self.points.len(), false);
         self.converged.resize(self.points.len(), true);
     }
 
-    /// Euler's step from the field's source frame to its target's, in parts.
+    /// Euler integration from the time of the field's source sweep to that of its target, in
+    /// `substeps` equal steps. Afterwards the cloud is in the target's frame.
     pub(super) fn step(
         &mut self,
         by: Context<'_>,
         field: &MotionField,
         substeps: usize,
     ) -> Result<(), DensifyError> {
-        self.points = field.static_places(&self.points);
+        self.points = field.static_positions(&self.points);
         for _ in 0..substeps {
             self.advect(by, field, 1.0 / substeps as f32)?;
         }
         Ok(())
     }
 
-    /// A step that ends after `share` of the time, still in the target's frame.
+    /// One Euler step that ends after `share` (0 to 1) of the interval. The points are still given
+    /// in the target's frame.
     pub(super) fn part_step(
         &mut self,
         by: Context<'_>,
         field: &MotionField,
         share: f64,
     ) -> Result<(), DensifyError> {
-        self.points = field.static_places(&self.points);
+        self.points = field.static_positions(&self.points);
         self.advect(by, field, share as f32)
     }
 
-    /// Moves what moves of itself by `share` of what the field says where it is now.
+    /// Adds `share` of the residual motion at the current positions to all points that are not
+    /// ground.
     fn advect(
         &mut self,
         by: Context<'_>,
@@ -94,8 +99,9 @@ impl PropagatedCloud {
         Ok(())
     }
 
-    /// From the field's target frame back to its source's: the fixed point of `z = y - g(z)` for
-    /// each place y, where z is its static place.
+    /// The inverse step, from the time of the field's target sweep to that of its source. For each
+    /// position y it solves `z = y - g(z)` by fixed-point iteration, where z is the static
+    /// position.
     pub(super) fn invert(
         &mut self,
         by: Context<'_>,
@@ -111,14 +117,14 @@ impl PropagatedCloud {
                 let place: Point = core::array::from_fn(|a| ends[row][a] - residual[a]);
                 let correction = core::array::from_fn(|a| place[a] - self.points[row][a]);
                 self.points[row] = place;
-                // Not the other way round: what is no number has not settled.
+                // Negated, so that NaN counts as not converged.
                 if !(length(correction) < SETTLED_M && is_place(place)) {
                     unsettled.push(row);
                 }
             }
             rows = unsettled;
         }
-        // What did not settle is left where it would be if it stood.
+        // Points that did not converge are treated as static.
         for row in rows {
             self.converged[row] = false;
             self.points[row] = ends[row];
@@ -134,31 +140,31 @@ impl PropagatedCloud {
         Ok(())
     }
 
-    /// Moves all points rigidly.
+    /// Applies a rigid motion to all points.
     pub(super) fn transform(&mut self, motion: &RigidTransform) {
         self.points = transform_points(motion, &self.points);
     }
 
-    /// These points and those, as the cloud of the instant `into`.
+    /// Joins both clouds into the dense cloud of the reference time `into`, in sweeps.
     pub(super) fn joined(mut self, other: Self, into: f64) -> DenseCloud {
         self.points.extend(other.points);
-        self.frame.extend(other.frame);
+        self.sweep.extend(other.sweep);
         self.dynamic.extend(other.dynamic);
         self.converged.extend(other.converged);
         DenseCloud {
             age: self
-                .frame
+                .sweep
                 .iter()
-                .map(|&frame| (into - f64::from(frame)) as f32)
+                .map(|&sweep| (into - f64::from(sweep)) as f32)
                 .collect(),
             points: self.points,
-            frame: self.frame,
+            sweep: self.sweep,
             dynamic: self.dynamic,
             converged: self.converged,
         }
     }
 
-    /// Rows of what may move of itself.
+    /// Rows of the points that are not ground.
     fn movable(&self) -> Vec<usize> {
         (0..self.points.len())
             .filter(|&row| !self.ground[row])
@@ -166,7 +172,7 @@ impl PropagatedCloud {
     }
 }
 
-/// What computes, and who looks in on it.
+/// The device that evaluates fields, and the control that is checked meanwhile.
 #[derive(Clone, Copy)]
 pub(super) struct Context<'a> {
     pub(super) backend: &'a dyn Backend,
@@ -174,9 +180,12 @@ pub(super) struct Context<'a> {
 }
 
 impl Context<'_> {
-    /// What the field moves at the static places, metres: nothing where that is less than counts as
-    /// motion, so that the static world stands still. Without an ego motion the field moves that too,
-    /// and all of it counts. Looks at the watch between pieces.
+    /// The field's residual motion at the static positions (N x 3), metres. Checks the control
+    /// between pieces.
+    ///
+    /// With an ego motion, residuals below [`DYNAMIC_M`] are set to zero, so that the static world
+    /// does not move. Without one the field describes the motion of the static world, too, and
+    /// nothing is set to zero.
     fn motion(self, field: &MotionField, places: &[Point]) -> Result<Vec<Point>, DensifyError> {
         let mut residual = Vec::with_capacity(places.len());
         for piece in places.chunks(PIECE) {
@@ -194,7 +203,7 @@ impl Context<'_> {
     }
 }
 
-/// Whether a lidar could have measured something there.
+/// Whether all coordinates are finite and below [`FARTHEST_M`].
 fn is_place(point: Point) -> bool {
     point.iter().all(|value| value.abs() < FARTHEST_M)
 }

@@ -1,18 +1,22 @@
-//! One dense cloud of a sequence: every sweep's points, carried into one frame by Euler integration.
+//! Densification: one dense cloud from a sequence, with every sweep transformed into one frame by
+//! Euler integration of motion fields.
 //!
 //! ```text
-//! sweep - static place: T x - y <- y + g(y) / substeps, again - next sweep's frame - ... - the frame
+//! sweep -> static position x = T p -> x <- x + g(x) / substeps, repeated -> next sweep's frame
+//!       -> ... -> frame of the reference time
 //! ```
 //!
-//! The ego motion is taken out of every step and put back exactly, so that the static world does
-//! not drift; what the fields say is integrated only where it counts as motion. Ground never moves
-//! of itself. Knows no files, and not how the fields were fitted.
+//! Each step applies the ego motion exactly and integrates only the residual motion, so that the
+//! static world does not drift. Residuals below the threshold of motion are ignored. Ground points
+//! have no residual motion.
 
 mod accumulate;
 mod advect;
+mod error;
 mod plan;
 #[cfg(test)]
 mod tests;
 
-pub use accumulate::{DensifyError, carrier, densify};
+pub use accumulate::{carrier, densify};
+pub use error::DensifyError;
 pub use plan::{FlowEdge, LaterSweeps, Plan, PlanError};

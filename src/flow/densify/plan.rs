@@ -1,66 +1,68 @@
-//! Which pairs of a sequence have to be fitted so that all of its sweeps can be carried into one
-//! frame. Fits nothing.
+//! The densification plan: which sweep pairs need a motion field so that all sweeps of a sequence
+//! can be transformed into one frame.
 
-/// How sweeps after the frame are carried into it.
+/// How sweeps after the reference time are transformed into its frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum LaterSweeps {
-    /// Through fields that are fitted backward in time, from each sweep to the one before.
+    /// By fields that are fitted backward in time, from each sweep to the previous one.
     #[default]
     Reverse,
-    /// Through the inverses of the fields that are fitted forward: half of the fits, but where a
-    /// field folds space it has no inverse, and points do not settle.
+    /// By inverting the forward fields. This halves the number of fits. Where a field maps two
+    /// points to one it has no inverse, and points do not converge.
     Inverse,
 }
 
-/// A pair to be fitted: places of its sweeps in the sequence.
+/// A sweep pair that needs a motion field, as indices in the sequence.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct FlowEdge {
-    /// The sweep whose points the field moves.
+    /// Index of the sweep whose points the field moves.
     pub source: usize,
-    /// The sweep whose time they are moved to: the one after, or before.
+    /// Index of the sweep whose time and frame they are moved to: the next or the previous one.
     pub target: usize,
 }
 
-/// Why a sequence cannot be carried into a frame.
+/// Why a plan is impossible.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum PlanError {
-    /// The frame is not one of the sequence's, nor between two.
+    /// The reference time lies outside the sequence.
     #[error("into {into} lies outside the sequence's sweeps, 0 to {last}")]
-    NoSuchFrame {
-        /// What was asked for.
+    ReferenceTimeOutOfRange {
+        /// The requested reference time, in sweeps.
         into: f64,
-        /// The last sweep.
+        /// Index of the last sweep.
         last: usize,
     },
-    /// One sweep is no sequence.
+    /// A sequence needs at least two sweeps.
     #[error("{0} sweeps are no sequence: two are needed at least")]
     TooFewSweeps(usize),
-    /// A step that is cut into nothing, or into too many.
+    /// The number of substeps is not between 1 and 64.
     #[error("{0} substeps: 1 to 64 are possible")]
     Substeps(usize),
 }
 
-/// Substeps at most.
+/// Maximum number of substeps.
 const MOST_SUBSTEPS: usize = 64;
 
-/// How a sequence's sweeps become one cloud.
+/// How the sweeps of a sequence are transformed into one cloud.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Plan {
     pub(super) sweeps: usize,
-    /// The last sweep at or before the instant.
+    /// Index of the last sweep at or before the reference time.
     pub(super) anchor: usize,
-    /// How far the instant lies behind it, 0 to 1, in sweeps.
+    /// Reference time minus the anchor, in sweeps: at least 0 and below 1.
     pub(super) fraction: f64,
     pub(super) later: LaterSweeps,
     pub(super) substeps: usize,
 }
 
 impl Plan {
-    /// All of `sweeps` sweeps into the instant `into`, counted in sweeps from 0: a sweep's own, or
-    /// one between two. Each step from sweep to sweep is cut into `substeps`.
+    /// Plans to transform all of `sweeps` sweeps into the frame of the reference time `into`. It is
+    /// counted in sweeps from 0, and may lie between two sweeps. Each step from sweep to sweep is
+    /// integrated in `substeps` Euler steps.
     ///
     /// # Errors
-    /// [`PlanError`] where there is no such instant.
+    /// [`PlanError`] if there are fewer than two sweeps, `into` lies outside the sequence, or
+    /// `substeps` is not 1 to 64.
     pub fn new(
         sweeps: usize,
         into: f64,
@@ -72,7 +74,7 @@ impl Plan {
         }
         let last = sweeps - 1;
         if !(0.0..=last as f64).contains(&into) {
-            return Err(PlanError::NoSuchFrame { into, last });
+            return Err(PlanError::ReferenceTimeOutOfRange { into, last });
         }
         if !(1..=MOST_SUBSTEPS).contains(&substeps) {
             return Err(PlanError::Substeps(substeps));
@@ -87,20 +89,22 @@ impl Plan {
         })
     }
 
-    /// The instant, in sweeps.
+    /// The reference time, in sweeps from 0.
     pub fn into(&self) -> f64 {
         self.anchor as f64 + self.fraction
     }
 
-    /// All fits that are needed.
+    /// All motion fields that are needed, as edges: the chains of [`Self::chains`], one after the
+    /// other.
     pub fn edges(&self) -> Vec<FlowEdge> {
         self.chains().concat()
     }
 
-    /// The fits that are needed, as two sequences: forward in time, and backward from the end.
+    /// The motion fields that are needed, as two chains in the order of use: forward in time, and
+    /// backward from the last sweep.
     pub fn chains(&self) -> [Vec<FlowEdge>; 2] {
         let last = self.sweeps - 1;
-        // The sweep that those of before are carried to, and the one from which those of after are.
+        // Index of the last sweep that earlier sweeps are advected to.
         let before = if self.fraction > 0.0 {
             self.anchor + 1
         } else {
@@ -163,7 +167,7 @@ mod tests {
             let refused = Plan::new(5, into, LaterSweeps::Reverse, 1);
             assert!(matches!(
                 refused,
-                Err(PlanError::NoSuchFrame { last: 4, .. })
+                Err(PlanError::ReferenceTimeOutOfRange { last: 4, .. })
             ));
         }
         assert_eq!(

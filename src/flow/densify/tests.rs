@@ -1,4 +1,4 @@
-//! Fields whose flow is known everywhere: networks that say the same at every point.
+//! Densification with constant fields, whose flow is the same at every point.
 
 use super::accumulate::part_of;
 use super::*;
@@ -11,7 +11,7 @@ use crate::flow::motion::MotionField;
 use crate::flow::motion::Residual;
 use crate::flow::sequence::Sweep;
 
-/// Metres: single precision of coordinates of some metres.
+/// Rounding of single-precision coordinates of a few metres, metres.
 const ROUNDING_M: f32 = 1e-5;
 
 /// A field with the same flow everywhere.
@@ -41,7 +41,7 @@ fn sweeps(count: usize) -> Vec<Sweep> {
         .collect()
 }
 
-/// A vehicle that drives 1 m forward and turns a little at each step.
+/// A vehicle that drives 1 m forward and turns 0.1 rad per step.
 fn drive() -> RigidTransform {
     RigidTransform::new([-1.0, 0.0, 0.0].into(), [0.0, 0.0, 0.1].into())
 }
@@ -63,7 +63,7 @@ fn dense(
     densify(&backend, plan, sweeps, of, &Uncontrolled)
 }
 
-/// Where a static point of sweep `frame` is seen at the instant `into`.
+/// Position of a static point of sweep `frame` in the frame of the reference time `into`.
 fn expected(point: Point, frame: usize, into: f64) -> Point {
     let anchor = into.floor();
     let mut motion = part_of(&drive(), into - anchor);
@@ -102,7 +102,7 @@ fn the_static_world_lands_where_the_vehicle_sees_it_whatever_the_instant() {
                 10,
                 "points that are no numbers stay out"
             );
-            for (row, &frame) in cloud.frame.iter().enumerate() {
+            for (row, &frame) in cloud.sweep.iter().enumerate() {
                 let place = frame as usize;
                 let point = sweeps[place].points[if row % 2 == 0 { 0 } else { 2 }];
                 let expected = expected(point, place, into);
@@ -116,7 +116,7 @@ fn the_static_world_lands_where_the_vehicle_sees_it_whatever_the_instant() {
 
 #[test]
 fn what_moves_is_integrated_step_by_step_and_ground_is_not() {
-    // Seen from a vehicle that stands, so that the steps add up.
+    // The vehicle stands still, so that the steps add up.
     let standing = Some(RigidTransform::identity());
     let (ahead, back) = (
         constant(standing, [0.5, 0.0, 0.0]),
@@ -127,7 +127,7 @@ fn what_moves_is_integrated_step_by_step_and_ground_is_not() {
         for (into, substeps) in [(2.0, 1), (2.0, 4), (1.5, 1)] {
             let plan = Plan::new(4, into, later, substeps).expect("a plan");
             let cloud = dense(&plan, &sweeps, &ahead, &back).expect("a cloud");
-            for (row, &frame) in cloud.frame.iter().enumerate() {
+            for (row, &frame) in cloud.sweep.iter().enumerate() {
                 let age = (into - f64::from(frame)) as f32;
                 let is_ground = row % 2 == 1;
                 let point = sweeps[frame as usize].points[if is_ground { 2 } else { 0 }];
@@ -148,7 +148,7 @@ fn what_a_field_says_below_the_threshold_of_motion_moves_nothing() {
     let sweeps = sweeps(3);
     let cloud = dense(&plan, &sweeps, &noise, &noise).expect("a cloud");
     assert_eq!(cloud.points[0], sweeps[0].points[0]);
-    // Without an ego motion the field carries the static world, too.
+    // Without an ego motion the field moves static points, too.
     let all = constant(None, [0.02, 0.02, 0.0]);
     let cloud = dense(&plan, &sweeps, &all, &all).expect("a cloud");
     assert_near(cloud.points[0], [0.04, 0.04, 0.0], "two steps");
@@ -163,7 +163,7 @@ fn what_a_field_sends_out_of_the_world_stays_and_says_so() {
             let plan = Plan::new(3, 1.0, later, 1).expect("a plan");
             let sweeps = sweeps(3);
             let cloud = dense(&plan, &sweeps, &wild, &wild).expect("a cloud");
-            for (row, &frame) in cloud.frame.iter().enumerate() {
+            for (row, &frame) in cloud.sweep.iter().enumerate() {
                 let is_ground = row % 2 == 1;
                 let point = sweeps[frame as usize].points[if is_ground { 2 } else { 0 }];
                 assert_eq!(cloud.points[row], point, "{later:?}");

@@ -1,78 +1,79 @@
-//! A pinhole camera beside a lidar.
+//! The pinhole camera model.
 //!
-//! Camera frame: x right, y down, z forward, metres. Whole pixel coordinates are the middles of
-//! pixels, counted from 0, as KITTI and OpenCV have it. It must not know depths.
+//! Camera frame: x right, y down, z forward, metres. Whole pixel coordinates are the centers of
+//! pixels, counted from 0, as in KITTI and OpenCV.
 
 use crate::flow::data::{Point, RigidTransform};
 use nalgebra::{Point3, Vector3};
 
-/// Widest and tallest image, pixels.
+/// Maximum image width and height, pixels.
 pub const MAX_SIDE_PX: u32 = 16_384;
 
-/// Most pixels of an image: their depths take four bytes each.
+/// Maximum number of pixels of an image; each depth takes four bytes.
 const MAX_PIXELS: u64 = 1 << 26;
 
-/// Largest focal length and distance of the principal point, pixels.
+/// Maximum focal length, and maximum distance of the principal point from the image corner, pixels.
 const MAX_FOCAL_PX: f64 = 1e6;
 
-/// Farthest that a camera may stand from its lidar, metres.
+/// Maximum distance from the camera to the lidar, metres.
 const MAX_MOUNT_M: f64 = 1e3;
 
-/// Nearer than this to the camera nothing is seen, metres.
+/// Points nearer than this along the optical axis are ignored, metres.
 pub(super) const NEAR_M: f64 = 0.1;
 
-/// How far a quaternion's length may be from 1.
+/// Tolerance of a quaternion's norm around 1.
 const UNIT_TOLERANCE: f64 = 1e-6;
 
 /// Why a camera was refused.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum CameraError {
-    /// A side is zero, or the image is too large.
+    /// A side is zero or too long, or the image has too many pixels.
     #[error(
         "an image of {width} x {height} pixels; each side must lie between 1 and {MAX_SIDE_PX}, and both together make at most {MAX_PIXELS}"
     )]
     Size {
-        /// Pixels per row.
+        /// Width, pixels.
         width: u32,
-        /// Rows.
+        /// Height, pixels.
         height: u32,
     },
-    /// An intrinsic parameter is not a number, or no camera has it.
+    /// An intrinsic parameter is not finite or out of range.
     #[error("{name} of the camera is {value} pixels; {wanted}")]
     Intrinsic {
         /// `fx`, `fy`, `cx` or `cy`.
         name: &'static str,
-        /// The value found, pixels.
+        /// The rejected value, pixels.
         value: f64,
-        /// What it should be.
+        /// The accepted range.
         wanted: &'static str,
     },
-    /// A 3 x 3 matrix is not of the form fx 0 cx, 0 fy cy, 0 0 1.
+    /// The 3 x 3 matrix is not of the form fx 0 cx, 0 fy cy, 0 0 1.
     #[error("the camera matrix is not fx 0 cx, 0 fy cy, 0 0 1: rectify skewed or scaled images")]
     Matrix,
-    /// The pose is not finite, or far from any vehicle.
+    /// The pose is not finite, its rotation is not a unit quaternion, or the translation is over 1
+    /// km.
     #[error("camera_from_lidar is not a rigid transform of finite numbers within {MAX_MOUNT_M} m")]
     Pose,
 }
 
-/// Focal lengths and principal point, pixels.
+/// Intrinsic parameters: focal lengths and principal point, pixels.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Intrinsics {
-    /// Focal length across columns.
+    /// Focal length in x (along a row).
     pub fx: f64,
-    /// Focal length across rows.
+    /// Focal length in y (along a column).
     pub fy: f64,
-    /// Column of the optical axis.
+    /// Column of the principal point.
     pub cx: f64,
-    /// Row of the optical axis.
+    /// Row of the principal point.
     pub cy: f64,
 }
 
 impl Intrinsics {
-    /// The parameters of a 3 x 3 camera matrix, row by row.
+    /// The parameters of a 3 x 3 camera matrix, given row by row.
     ///
     /// # Errors
-    /// [`CameraError::Matrix`] where it has a skew or another last row.
+    /// [`CameraError::Matrix`] if it has a skew, a scale, or a last row that is not 0 0 1.
     pub fn from_matrix(rows: &[[f64; 3]; 3]) -> Result<Self, CameraError> {
         let [[fx, skew, cx], [zero, fy, cy], last] = *rows;
         if skew != 0.0 || zero != 0.0 || last != [0.0, 0.0, 1.0] {
@@ -82,7 +83,7 @@ impl Intrinsics {
     }
 }
 
-/// A camera: what it sees of the lidar's frame, and how large its image is.
+/// A pinhole camera: intrinsic parameters, pose relative to the lidar and image size.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
     intrinsics: Intrinsics,
@@ -92,11 +93,11 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// A camera of `width` x `height` pixels. `camera_from_lidar` takes the frame that clouds are
-    /// in to the camera's: x right, y down, z forward.
+    /// A camera of `width` x `height` pixels. `camera_from_lidar` transforms points of the lidar's
+    /// frame into the camera's: x right, y down, z forward, metres.
     ///
     /// # Errors
-    /// [`CameraError`] for sizes, parameters and poses that no camera has.
+    /// [`CameraError`] for an image size, parameters or a pose out of range.
     pub fn new(
         intrinsics: Intrinsics,
         camera_from_lidar: RigidTransform,
@@ -118,7 +119,7 @@ impl Camera {
             }
         }
         for (name, value) in [("cx", cx), ("cy", cy)] {
-            // Not a number fails this too.
+            // NaN is rejected, too.
             if !matches!(value.abs(), size if size <= MAX_FOCAL_PX) {
                 return Err(CameraError::Intrinsic {
                     name,
@@ -141,28 +142,28 @@ impl Camera {
         })
     }
 
-    /// Focal lengths and principal point.
+    /// Focal lengths and principal point, pixels.
     pub fn intrinsics(&self) -> Intrinsics {
         self.intrinsics
     }
 
-    /// Where the lidar's points are for the camera.
+    /// The transform from the lidar's frame to the camera's.
     pub fn camera_from_lidar(&self) -> &RigidTransform {
         &self.camera_from_lidar
     }
 
-    /// Pixels per row.
+    /// Image width, pixels.
     pub fn width(&self) -> u32 {
         self.width
     }
 
-    /// Rows.
+    /// Image height, pixels.
     pub fn height(&self) -> u32 {
         self.height
     }
 
-    /// Column, row and depth in metres of a point of the lidar's frame; none where it is not
-    /// finite, behind the camera, or outside the image.
+    /// Column, row and depth (metres along the optical axis) of a point of the lidar's frame. None
+    /// if the point is not finite, less than 0.1 m in front of the camera, or outside the image.
     pub fn pixel(&self, point: Point) -> Option<(usize, usize, f32)> {
         let seen = self.camera_from_lidar * Point3::from(point.map(f64::from));
         if !(seen.z >= NEAR_M && seen.z.is_finite()) {
@@ -179,7 +180,7 @@ impl Camera {
         ))
     }
 
-    /// The ray through the middle of a pixel in the camera's frame, one metre deep.
+    /// The ray through the center of a pixel, in the camera's frame, scaled to z = 1 m.
     pub fn ray(&self, column: u32, row: u32) -> Vector3<f64> {
         let Intrinsics { fx, fy, cx, cy } = self.intrinsics;
         let across = (f64::from(column) - cx) / fx;

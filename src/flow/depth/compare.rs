@@ -1,49 +1,50 @@
-//! How far a depth image is from a true one.
-//!
-//! It must not know how either was made.
+//! Errors of a depth image against ground truth.
 
 use super::image::DepthImage;
 
-/// A depth is close where it is within this part of the true one.
+/// Relative error up to which a depth counts as close.
 const CLOSE: f64 = 0.05;
 
-/// Two depth images of different sizes.
+/// Two depth images have different sizes and cannot be compared.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "a depth image of {} x {} pixels cannot be compared with one of {} x {}",
     found[0], found[1], expected[0], expected[1]
 )]
 pub struct SizeMismatch {
-    /// Width and height of the image that is judged.
+    /// Width and height of the evaluated image, pixels.
     pub found: [u32; 2],
-    /// Width and height of the true one.
+    /// Width and height of the ground truth, pixels.
     pub expected: [u32; 2],
 }
 
-/// Differences over the pixels that both images know; not a number where there are none.
+/// Error measures over the pixels with a depth in both images. Means and median are NaN if there
+/// are none.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DepthErrors {
-    /// Pixels that both know.
+    /// Number of pixels with a depth in both images.
     pub pixels: usize,
-    /// Share of the true image's known pixels that the other knows too.
+    /// Share of the pixels with a true depth that have a depth in the evaluated image, 0 to 1. NaN
+    /// if the ground truth is empty.
     pub coverage: f64,
     /// Mean absolute error, metres.
     pub mean_m: f64,
-    /// Median absolute error, metres.
+    /// Median absolute error, metres; of an even number of values, the upper of the two middle
+    /// ones.
     pub median_m: f64,
-    /// Root of the mean squared error, metres.
+    /// Root mean squared error, metres.
     pub rmse_m: f64,
-    /// Mean of the absolute error over the true depth.
+    /// Mean of the absolute error divided by the true depth.
     pub relative: f64,
-    /// Share of the pixels within 5 % of the true depth.
+    /// Share of the pixels whose error is at most 5 % of the true depth, 0 to 1.
     pub within_5_percent: f64,
 }
 
 impl DepthImage {
-    /// Compares with a true depth image of the same size.
+    /// Compares with the ground truth `truth`, an image of the same size.
     ///
     /// # Errors
-    /// [`SizeMismatch`].
+    /// [`SizeMismatch`] if the sizes differ.
     pub fn errors(&self, truth: &DepthImage) -> Result<DepthErrors, SizeMismatch> {
         let size = |image: &DepthImage| [image.width, image.height];
         if size(self) != size(truth) {

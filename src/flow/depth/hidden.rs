@@ -1,31 +1,35 @@
-//! Points seen through a nearer surface: behind a car, between the points that were measured on it.
+//! Occlusion filter: removes points that are visible only through a nearer surface. A sparse cloud
+//! of a car, for instance, has holes through which the background is projected.
 //!
-//! A pixel is hidden where nearer ones stand all around it. One side alone does not count: the
-//! road rises to the horizon, and the house beside the car begins at its edge.
+//! A pixel is hidden if nearer pixels surround it. One side alone does not count: the road rises to
+//! the horizon, and the house beside a car begins at the car's edge.
 
 use super::camera::Camera;
 use super::image::DepthImage;
 use rayon::prelude::*;
 
-/// When a pixel counts as hidden.
+/// Parameters of the occlusion filter.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Occlusion {
-    /// How far around a pixel is looked, pixels.
+    /// Half the side of the square search window around a pixel, pixels.
     pub reach_px: usize,
-    /// A neighbor hides a pixel only where it is nearer by this part of the pixel's depth.
+    /// A neighbor counts as nearer if its depth is smaller by more than this fraction of the
+    /// pixel's depth.
     pub nearer: f32,
-    /// Of the four quadrants around a pixel, how many must hold one that is nearer, 1 to 4.
+    /// Number of quadrants around a pixel, 1 to 4, that must contain a nearer pixel.
     pub quadrants: u32,
 }
 
-/// Angle that the gaps of an accumulated cloud stay below, radians: two lasers of an HDL-64E.
+/// Search radius as an angle, radians. The holes of an accumulated cloud stay below it. It is about
+/// twice the spacing of the beams of an HDL-64E.
 const REACH_RAD: f64 = 1.0 / 60.0;
 
-/// Farthest that is looked around a pixel: time grows with its square.
+/// Maximum search radius, pixels; the time grows with its square.
 const MAX_REACH_PX: usize = 16;
 
 impl Occlusion {
-    /// What suits clouds of a spinning lidar seen through this camera: all around, one degree far.
+    /// Default parameters for clouds of a spinning lidar projected into this camera: all four
+    /// quadrants, one degree of search radius.
     pub fn of(camera: &Camera) -> Self {
         let reach_px = (camera.intrinsics().fx * REACH_RAD).round() as usize;
         Self {
@@ -37,8 +41,9 @@ impl Occlusion {
 }
 
 impl DepthImage {
-    /// The image without the pixels that are hidden.
-    pub fn without_hidden(&self, occlusion: &Occlusion) -> DepthImage {
+    /// The image without its hidden pixels, whose depths are set to 0. The input image is not
+    /// changed.
+    pub fn without_occluded(&self, occlusion: &Occlusion) -> DepthImage {
         let width = (self.width as usize).max(1);
         let metres = (0..self.metres.len()).into_par_iter().map(|index| {
             let depth = self.metres[index];
@@ -57,7 +62,7 @@ impl DepthImage {
         }
     }
 
-    /// Number of quadrants around a pixel with a depth that is nearer than its own.
+    /// Number of quadrants around a pixel that contain a nearer pixel.
     fn nearer_quadrants(&self, [column, row]: [usize; 2], depth: f32, of: &Occlusion) -> u32 {
         let limit = depth * (1.0 - of.nearer);
         let width = (self.width as usize).max(1);
@@ -72,7 +77,7 @@ impl DepthImage {
             for x in columns.clone() {
                 let near = self.metres[y * width + x];
                 if near > 0.0 && near < limit {
-                    // Each quadrant has one of the four half axes that bound it.
+                    // Each quadrant includes one of the two half axes that bound it.
                     let quadrant = match (x > column, x < column, y > row, y < row) {
                         (true, _, _, false) => 0,
                         (false, _, true, _) => 1,
@@ -100,8 +105,8 @@ mod tests {
         quadrants: 4,
     };
 
-    /// Depths of a checkered sheet of `near` with `far` in its gaps on the right half, `far` alone
-    /// on the left.
+    /// Depths of a sheet at 10 m with holes onto a background at 30 m in the right half of the
+    /// image, and of the background alone in the left.
     fn sheet() -> DepthImage {
         let depth = |index: usize| match (index % 40 >= 20, index % 3) {
             (true, 0) => 10.0,
@@ -116,7 +121,7 @@ mod tests {
 
     #[test]
     fn what_shines_through_a_sheet_is_dropped_and_what_stands_beside_it_stays() {
-        let seen = sheet().without_hidden(&AROUND);
+        let seen = sheet().without_occluded(&AROUND);
         for (index, (&before, &after)) in sheet().metres.iter().zip(&seen.metres).enumerate() {
             let [column, row] = [index % 40, index / 40];
             let is_inside = (22..38).contains(&column) && (2..28).contains(&row);
@@ -136,6 +141,6 @@ mod tests {
             height: 30,
             metres: metres.collect(),
         };
-        assert_eq!(plane.without_hidden(&AROUND), plane);
+        assert_eq!(plane.without_occluded(&AROUND), plane);
     }
 }

@@ -1,23 +1,21 @@
-//! A depth image, and a cloud projected into one.
-//!
-//! It must not know files or colors.
+//! Depth images, and the projection of a cloud into one.
 
 use super::camera::Camera;
 use crate::flow::data::Point;
 
-/// Depths along the optical axis, not along rays.
+/// A depth image. Depths are measured along the optical axis, not along the pixels' rays.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DepthImage {
-    /// Pixels per row.
+    /// Image width, pixels.
     pub width: u32,
-    /// Rows.
+    /// Image height, pixels.
     pub height: u32,
-    /// Depth of each pixel, metres, row by row from the top; 0 where nothing is known.
+    /// Depth of each pixel, metres, row by row from the top; 0 if unknown.
     pub metres: Vec<f32>,
 }
 
 impl DepthImage {
-    /// An image of which nothing is known.
+    /// An image without any depths.
     pub fn empty(width: u32, height: u32) -> Self {
         Self {
             width,
@@ -26,20 +24,20 @@ impl DepthImage {
         }
     }
 
-    /// Pixels whose depth is known.
+    /// Number of pixels with a depth.
     pub fn known(&self) -> usize {
         self.metres.iter().filter(|&&metres| metres > 0.0).count()
     }
 
-    /// Share of all pixels whose depth is known, 0 to 1.
+    /// Share of all pixels that have a depth, 0 to 1.
     pub fn density(&self) -> f64 {
         self.known() as f64 / self.metres.len().max(1) as f64
     }
 }
 
-/// What a camera sees of some points of its lidar's frame, metres: in every pixel the nearest of
-/// those that fall on it. Points that are not finite, behind the camera or outside its image are
-/// left out.
+/// Projects points of the lidar's frame (N x 3, metres) into the camera. Each pixel keeps the
+/// smallest depth of the points that fall on it. Points that are not finite, behind the camera or
+/// outside its image are left out.
 pub fn project(points: &[Point], camera: &Camera) -> DepthImage {
     let mut image = DepthImage::empty(camera.width(), camera.height());
     let width = camera.width() as usize;

@@ -1,6 +1,5 @@
-//! Clouds seen through a camera: how deep each pixel is, and how well that is known.
-//!
-//! It must not know where points or cameras came from, nor files.
+//! Depth images of lidar clouds: projection into a pinhole camera, occlusion filter and error
+//! measures.
 
 mod camera;
 mod compare;

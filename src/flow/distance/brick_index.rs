@@ -1,44 +1,46 @@
-//! Which bricks the band touches, and where each one is kept.
+//! The index of active bricks: which bricks the band touches, and the storage number of each.
 //!
-//! A two-level index: blocks of 8x8x8 bricks over the whole grid, tables only where a block holds
-//! an active brick. Its size follows the surface, not the volume.
+//! Two levels: blocks of 8x8x8 bricks over the whole grid, with a table only for blocks that hold
+//! an active brick. Its size grows with the surface, not with the volume.
 
 use super::grid::Grid;
 use super::options::DistanceError;
 use crate::flow::data::{Control, control};
 
-/// Vertices along a brick's edge, and bricks along a block's.
+/// Vertices along a brick's edge, and bricks along a block's edge.
 pub(crate) const EDGE: u32 = 8;
-/// Vertices of a brick, and bricks of a block.
+/// Vertices per brick, and bricks per block.
 pub(crate) const VOLUME: usize = 512;
-/// Marks a block without a table and a brick that is not active.
+/// Marks a block without a table, and an inactive brick.
 pub(crate) const ABSENT: u32 = u32::MAX;
-/// Bytes of a brick's 16-bit codes.
+/// Bytes of a brick's 16-bit distance codes.
 pub(crate) const BRICK_BYTES: usize = VOLUME * size_of::<u16>();
-/// The most blocks: 64 MB of index.
+/// The most blocks of a grid: 64 MiB of index.
 const MAX_BLOCKS: usize = 16 << 20;
-/// Runs of occupied vertices between two looks at the watch: a few milliseconds.
+/// Runs of occupied vertices between two checks of the control: a few milliseconds.
 const RUNS_AT_ONCE: usize = 4096;
 
-/// Where each active brick is kept.
+/// The two-level index from bricks to their storage numbers.
 #[derive(Debug)]
 pub(crate) struct Index {
     /// Blocks along each axis.
     pub(crate) blocks: [usize; 3],
-    /// Each block's table, or [`ABSENT`].
+    /// The table number of each block, or [`ABSENT`].
     pub(crate) tables: Vec<u32>,
-    /// 512 entries a table: the brick's number, or [`ABSENT`]. Numbers rise along this list.
+    /// 512 entries per table: the brick's storage number, or [`ABSENT`]. The numbers ascend along
+    /// this list.
     pub(crate) bricks: Vec<u32>,
-    /// Active bricks.
+    /// Number of active bricks.
     pub(crate) active: usize,
 }
 
 impl Index {
-    /// Marks every brick that has a vertex within `band` cells of an occupied vertex.
+    /// Activates every brick that has a vertex within `band` cells of an occupied vertex. `cells`
+    /// are the occupied vertices, sorted.
     ///
     /// # Errors
-    /// Where the grid has too many blocks, index and bricks would take more than `max_bytes`, or the
-    /// watch interrupts.
+    /// If the grid has too many blocks, index and bricks would take more than `max_bytes`, or the
+    /// control interrupts.
     pub(crate) fn activate(
         grid: &Grid,
         cells: &[[u32; 3]],
@@ -64,11 +66,13 @@ impl Index {
         };
         let reach = (band + EDGE as i32 - 1) / EDGE as i32;
         let limit = band * band;
-        // How far the band reaches along z from a column of bricks at each squared gap.
+        // Half the height of the band along z, by the squared horizontal distance between an
+        // occupied vertex and a column of bricks; both in cells.
         let along_z: Vec<i32> = (0..=limit).map(|gap| (limit - gap).isqrt()).collect();
         // Bricks are numbered by 32 bits.
         let limit_bytes = max_bytes.min(ABSENT as usize * BRICK_BYTES);
-        // Cells one above the other reach as far as their ends.
+        // The band around a run of vertices consecutive in z spans from its lowest to its highest
+        // vertex, so each run is marked once.
         let above = |a: &[u32; 3], b: &[u32; 3]| a[..2] == b[..2] && b[2] == a[2] + 1;
         for (number, run) in cells.chunk_by(above).enumerate() {
             if number % RUNS_AT_ONCE == 0 {
@@ -84,7 +88,7 @@ impl Index {
             let at = run[0].map(|c| c as i32);
             let top = run[run.len() - 1][2] as i32;
             let [bx, by, _] = at.map(|c| c / EDGE as i32);
-            // Squared gap along one axis between the cell and a brick.
+            // Squared distance along one axis between the vertex and a brick, in cells.
             let gap = |axis: usize, brick: i32| {
                 let low = brick * EDGE as i32 - at[axis];
                 let high = low + EDGE as i32 - 1;
@@ -109,7 +113,7 @@ impl Index {
         Ok(marks.numbered())
     }
 
-    /// The number of the brick that holds `vertex`, or [`ABSENT`].
+    /// The storage number of the brick that holds `vertex`, or [`ABSENT`].
     #[inline]
     pub(crate) fn brick_of(&self, vertex: [u32; 3]) -> u32 {
         let brick = vertex.map(|v| v / EDGE);
@@ -121,8 +125,8 @@ impl Index {
         self.bricks[table as usize * VOLUME + within(brick)]
     }
 
-    /// Blocks that have a table, in the order of their tables: where each is, in blocks, and its
-    /// table.
+    /// The blocks that have a table, in the order of their tables: the position in blocks, and the
+    /// table number.
     pub(crate) fn tabled_blocks(&self) -> Vec<([usize; 3], usize)> {
         let [_, ny, nz] = self.blocks;
         let tables = self.tables.iter().enumerate();
@@ -137,7 +141,7 @@ impl Index {
         order
     }
 
-    /// Where each active brick is, in bricks, in the order of their numbers.
+    /// The positions of the active bricks, in bricks, in the order of their storage numbers.
     #[cfg(feature = "gpu")]
     pub(crate) fn active_places(&self) -> Vec<[u32; 3]> {
         let mut places = Vec::with_capacity(self.active);
@@ -157,20 +161,20 @@ impl Index {
     }
 }
 
-/// Bricks marked so far: a bit each, eight along z in a byte.
+/// The bricks marked so far: one bit each, eight along z per byte.
 struct Marks {
     blocks: [usize; 3],
     tables: Vec<u32>,
-    /// 64 columns a table, by x and y.
+    /// 64 columns per table, by x and y.
     columns: Vec<u8>,
     active: usize,
 }
 
 impl Marks {
-    /// Columns of a table.
+    /// Columns per table.
     const COLUMNS: usize = (EDGE * EDGE) as usize;
 
-    /// Marks the bricks from `low` to `high` along z.
+    /// Marks the bricks from `low` to `high` along z, both included.
     fn mark(&mut self, [x, y]: [u32; 2], low: u32, high: u32) {
         let [bx, by] = [x, y].map(|b| (b / EDGE) as usize);
         let row = (bx * self.blocks[1] + by) * self.blocks[2];
@@ -196,7 +200,7 @@ impl Marks {
         entries * size_of::<u32>()
     }
 
-    /// The marked bricks, numbered.
+    /// The index, with the marked bricks numbered.
     fn numbered(self) -> Index {
         let mut numbers = 0..;
         let bits = self.columns.iter();
@@ -211,7 +215,7 @@ impl Marks {
     }
 }
 
-/// The place of a vertex in its brick, or of a brick in its block.
+/// The position of a vertex in its brick, or of a brick in its block, in 0..512.
 #[inline]
 pub(crate) fn within(at: [u32; 3]) -> usize {
     let [x, y, z] = at.map(|c| (c % EDGE) as usize);

@@ -1,53 +1,53 @@
 //! Exact Euclidean distance transform in a narrow band, on bricks of 8x8x8 vertices.
 //!
-//! Space is empty almost everywhere: only bricks within the band of a target point are stored,
-//! with 16-bit distances; beyond the band a coarse far field goes on, so that a lost point is still
-//! pulled home. Deterministic whatever the number of threads. FNSF Section 3.2, eq. 4 and 5.
+//! Most of space is empty, so only the bricks within the band of a target point are stored, as
+//! 16-bit distances. Beyond the band, a coarse far field keeps the gradient toward the target. The
+//! result has the same bits for any number of threads. FNSF Section 3.2, eq. 4 and 5.
 
 use super::brick_index::{ABSENT, Index, VOLUME, within};
-use super::coarse_field::FarField;
+use super::coarse_field::CoarseField;
 use super::fill;
 use super::fill::BEYOND;
 use super::grid::{Grid, Lattice, trilinear};
 use super::options::{DistanceError, DistanceOptions, Sites};
 use super::plan::Layout;
 use super::point_distance::{PointGather, PointSites};
-use super::transform::Sample;
-use super::vertex_distance::{CellGather, CellSites};
+use super::sample::Sample;
+use super::vertex_distance::{VertexGather, VertexSites};
 use crate::flow::data::{Control, Point, Uncontrolled};
 
-/// The transform: distances at the vertices of active bricks, and a far field.
+/// The transform: distances at the vertices of the active bricks, and a far field.
 #[derive(Debug)]
 pub struct Bricks {
     grid: Grid,
     lattice: Lattice,
-    /// Metres of one code.
+    /// Metres per code.
     scale: f32,
     index: Index,
-    /// 512 codes an active brick: distance in units of `scale`, or [`BEYOND`].
+    /// 512 codes per active brick: distances in units of `scale`, or [`BEYOND`].
     codes: Vec<u16>,
-    far: FarField,
+    far: CoarseField,
 }
 
 impl Bricks {
-    /// Transforms `target` over a grid that covers both clouds.
+    /// Transforms `target` over a grid that covers both clouds, metres.
     ///
     /// # Errors
-    /// [`DistanceError`] where the options make no sense, the clouds span too much space, or the
-    /// transform would take more than `options.max_bytes`.
+    /// [`DistanceError`] if the options are out of range, the target is empty, the clouds span too
+    /// much space, or the transform would take more than `options.max_bytes`.
     pub fn build(
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,
     ) -> Result<Self, DistanceError> {
-        Self::build_watched(source, target, options, &Uncontrolled)
+        Self::build_with_control(source, target, options, &Uncontrolled)
     }
 
-    /// As [`Self::build`]; looks at `control` between pieces of some milliseconds.
+    /// As [`Self::build`]. Checks `control` between parts of a few milliseconds.
     ///
     /// # Errors
     /// As [`Self::build`], and [`DistanceError::Interrupted`].
-    pub fn build_watched(
+    pub fn build_with_control(
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,
@@ -60,12 +60,12 @@ impl Bricks {
             band,
             ..
         } = Layout::plan(source, target, options, control)?;
-        // Before the bricks, so that what it needs meanwhile is free again.
-        let far = FarField::build(&grid, &cells, f64::from(band) * grid.cell, control)?;
+        // Built before the bricks, so that its temporary memory is free again.
+        let far = CoarseField::build(&grid, &cells, f64::from(band) * grid.cell, control)?;
         let codes = match options.sites {
             Sites::Cells => {
-                let sites = CellSites::new(&cells, band);
-                fill::band_codes(&index, || CellGather::new(&sites), control)?
+                let sites = VertexSites::new(&cells, band);
+                fill::band_codes(&index, || VertexGather::new(&sites), control)?
             }
             Sites::Points => {
                 let sites = PointSites::new(&grid, target, band);
@@ -103,13 +103,13 @@ impl Bricks {
         &self.grid
     }
 
-    /// 512 codes an active brick.
+    /// 512 codes per active brick.
     #[cfg(all(test, feature = "gpu"))]
     pub(crate) fn codes(&self) -> &[u16] {
         &self.codes
     }
 
-    /// Active bricks.
+    /// Number of active bricks.
     pub fn active_bricks(&self) -> usize {
         self.index.active
     }
@@ -121,7 +121,7 @@ impl Bricks {
             + self.far.distances.len() * size_of::<f32>()
     }
 
-    /// Distances at the cell's eight corners; none where no corner is within the band.
+    /// Distances at the cell's eight corners, metres; none if no corner is within the band.
     #[inline]
     fn corners(&self, corner: [u32; 3]) -> Option<[f32; 8]> {
         let codes = if corner.iter().all(|c| c % 8 != 7) {
@@ -147,7 +147,7 @@ impl Bricks {
         }))
     }
 
-    /// Metres at a vertex.
+    /// Distance at a vertex, metres; from the far field beyond the band.
     pub(super) fn at_vertex(&self, vertex: [u32; 3]) -> f32 {
         match self.code(vertex) {
             BEYOND => self.far.sample(vertex, [0.0; 3]).0,

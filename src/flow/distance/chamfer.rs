@@ -1,21 +1,22 @@
-//! The published code's transform: a chamfer path metric on a dense grid, for comparison.
+//! The published code's distance transform: a chamfer metric on a dense grid, for comparison.
 //!
-//! Six raster sweeps, each cell taking the least of the 3x3 cells of the plane before it plus the
-//! step's length. In closed form, per occupied vertex, with `a >= b >= c` the sorted offsets:
-//! `a + (sqrt 2 - 1) b + (sqrt 3 - sqrt 2) c` cells: up to 12.8% longer than the Euclidean
-//! distance. Takes 4 bytes for every cell of the scene, so it is for small grids.
+//! Six raster passes. In each, a cell takes the minimum of itself and the 3x3 cells of the
+//! preceding plane plus the length of the step. In closed form, per occupied vertex, with the sorted
+//! offsets `a >= b >= c`: `a + (sqrt 2 - 1) b + (sqrt 3 - sqrt 2) c` cells. This is up to 12.8%
+//! longer than the Euclidean distance. The transform takes 4 bytes for every cell of the grid, so
+//! it suits small grids only.
 
 use core::f32::consts::SQRT_2;
 
 use super::grid::{Grid, Lattice, trilinear};
 use super::options::{DistanceError, DistanceOptions};
-use super::transform::Sample;
+use super::sample::Sample;
 use crate::flow::data::{Control, Interrupt, Point, Uncontrolled, control};
 
-/// Length of the diagonal of a cell.
+/// Length of a cell's space diagonal, in cells.
 const SQRT_3: f32 = 1.732_050_8;
 
-/// The transform: metres at every vertex of the grid.
+/// The transform: distances in metres at every vertex of the grid.
 #[derive(Debug)]
 pub struct DenseChamfer {
     grid: Grid,
@@ -24,7 +25,8 @@ pub struct DenseChamfer {
 }
 
 impl DenseChamfer {
-    /// Transforms `target` over a grid that covers both clouds.
+    /// Transforms `target` over a grid that covers both clouds. Distances are to the vertices
+    /// nearest to the target's points.
     ///
     /// # Errors
     /// [`DistanceError`] as [`super::Bricks::build`].
@@ -33,14 +35,14 @@ impl DenseChamfer {
         target: &[Point],
         options: &DistanceOptions,
     ) -> Result<Self, DistanceError> {
-        Self::build_watched(source, target, options, &Uncontrolled)
+        Self::build_with_control(source, target, options, &Uncontrolled)
     }
 
-    /// As [`Self::build`]; looks at `control` between planes.
+    /// As [`Self::build`]. Checks `control` between planes.
     ///
     /// # Errors
     /// As [`Self::build`], and [`DistanceError::Interrupted`].
-    pub fn build_watched(
+    pub fn build_with_control(
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,
@@ -68,7 +70,7 @@ impl DenseChamfer {
         })
     }
 
-    /// The grid of the transform, refused where it would not fit.
+    /// The grid of the transform; an error if it would not fit in memory.
     pub(super) fn plan(
         source: &[Point],
         target: &[Point],
@@ -81,7 +83,7 @@ impl DenseChamfer {
             .iter()
             .try_fold(size_of::<f32>(), |n, &v| n.checked_mul(v));
         let needed = bytes.unwrap_or(usize::MAX);
-        // No allocation can be larger than isize::MAX, whatever is allowed.
+        // No allocation can exceed isize::MAX bytes, whatever `max_bytes` is.
         let limit = options.max_bytes.min(isize::MAX as usize);
         if needed > limit {
             return Err(DistanceError::Memory { needed, limit });
@@ -121,8 +123,8 @@ impl DenseChamfer {
     }
 }
 
-/// One pass along `axis`: every cell takes the least of itself and the 3x3 cells of the plane
-/// before it, one, sqrt 2 or sqrt 3 cells away.
+/// One raster pass along `axis`: every cell takes the minimum of itself and the 3x3 cells of the
+/// preceding plane, which are 1, sqrt 2 or sqrt 3 cells away.
 fn sweep(
     distances: &mut [f32],
     counts: [usize; 3],
@@ -131,7 +133,8 @@ fn sweep(
     back: bool,
     control: &dyn Control,
 ) -> Result<(), Interrupt> {
-    // z last wherever it can be: neighbors in memory are then neighbors in the plane.
+    // z is the inner axis wherever possible: cells adjacent in memory are then adjacent in the
+    // plane.
     let (a, b) = [(1, 2), (0, 2), (0, 1)][axis];
     let planes = Planes {
         rows: counts[a],
@@ -154,7 +157,7 @@ fn sweep(
     Ok(())
 }
 
-/// The planes across a sweep: their size and where their cells lie.
+/// The planes across a raster pass: their size and memory layout.
 struct Planes {
     rows: usize,
     columns: usize,
@@ -163,7 +166,7 @@ struct Planes {
 }
 
 impl Planes {
-    /// A copy of a plane, with a border of one cell that is infinitely far.
+    /// A buffer for one plane with a border of one cell, all at infinite distance.
     fn empty(&self) -> Vec<f32> {
         vec![f32::INFINITY; (self.rows + 2) * (self.columns + 2)]
     }
@@ -188,7 +191,7 @@ impl Planes {
     }
 }
 
-/// Lowers a row by the three rows of the plane before it, which have one cell more at both ends.
+/// Lowers a row by the three rows of the preceding plane, which have one more cell at both ends.
 fn lower_row(row: &mut [f32], near: [&[f32]; 3]) {
     let lower = |a: f32, b: f32| if b < a { b } else { a };
     let [above, middle, below] = near.map(|row| row.windows(3));

@@ -1,31 +1,32 @@
 //! The far field: a coarse distance transform of the whole grid, for points beyond the band.
 //!
-//! Its vertices are every 8th (16th, ...) fine vertex, and its trilinear interpolation gives the
-//! fine vertices beyond the band their values, so that distance has no jump there. Coarse on
-//! purpose: it only has to pull a lost point home. Which occupied vertex is nearest is found with
-//! all of them moved to coarse vertices, by separable lower envelopes of parabolas (Felzenszwalb
-//! and Huttenlocher 2012). How far it is, is then measured: were a vertex beside the band to fall
-//! short of the truth and be raised to the band, a point there would find no slope.
+//! Its vertices are every 8th (16th, ...) fine vertex. Fine vertices beyond the band take their
+//! values from its trilinear interpolation, so distance is continuous there. Coarse distances
+//! suffice: they only have to attract distant points to the target. The nearest occupied vertex is
+//! found with all occupied vertices rounded to coarse vertices, by separable lower envelopes of
+//! parabolas (Felzenszwalb and Huttenlocher 2012). The distance to that vertex is then computed
+//! from its fine position. An underestimate beside the band would be raised to the band's radius,
+//! and the gradient there would vanish.
 
 use rayon::prelude::*;
 
 use super::grid::{Grid, trilinear};
 use crate::flow::data::{Control, Interrupt, control};
 
-/// The most coarse vertices: 8 M floats are 32 MB.
+/// The most coarse vertices: 8 Mi floats are 32 MiB.
 const MAX_VERTICES: usize = 8 << 20;
 
 /// Distances at every `pitch`-th vertex, in metres, nowhere below the band's radius.
 #[derive(Debug)]
-pub(crate) struct FarField {
+pub(crate) struct CoarseField {
     /// Fine cells between coarse vertices: a power of two, at least 8.
     pub(crate) pitch: u32,
     pub(crate) vertices: [usize; 3],
     pub(crate) distances: Vec<f32>,
 }
 
-impl FarField {
-    /// The coarse vertices over `grid`: pitch and counts.
+impl CoarseField {
+    /// The pitch and the vertex counts of the far field over `grid`.
     fn layout(grid: &Grid) -> (u32, [usize; 3]) {
         let mut pitch = 8u32;
         loop {
@@ -37,19 +38,22 @@ impl FarField {
         }
     }
 
-    /// At most the bytes that [`Self::build`] will take over `grid`.
+    /// An upper bound on the bytes that [`Self::build`] takes over `grid`.
     pub(crate) fn bytes_over(grid: &Grid) -> usize {
         let bytes = size_of::<Nearest>() + size_of::<f32>();
         Self::vertices_over(grid) * bytes
     }
 
-    /// Coarse vertices over `grid`.
+    /// Number of coarse vertices over `grid`.
     pub(crate) fn vertices_over(grid: &Grid) -> usize {
         Self::layout(grid).1.iter().product()
     }
 
-    /// Transforms the occupied fine vertices `cells`; distances below the radius `band_m` are
-    /// raised to it. Nothing where the watch, looked at between slabs, interrupts.
+    /// Transforms the occupied fine vertices `cells`. Distances below the radius `band_m` are
+    /// raised to it. Checks `control` between slabs.
+    ///
+    /// # Errors
+    /// [`Interrupt`] if the control interrupts.
     pub(crate) fn build(
         grid: &Grid,
         cells: &[[u32; 3]],
@@ -102,7 +106,8 @@ impl FarField {
         })
     }
 
-    /// Distance at a place given in fine cells from the origin, and its derivative by fine cells.
+    /// Distance in metres at a position in fine cells from the origin, and its derivative per fine
+    /// cell.
     #[inline]
     pub(crate) fn sample(&self, corner: [u32; 3], fraction: [f32; 3]) -> (f32, [f32; 3]) {
         let scale = 1.0 / self.pitch as f32;
@@ -119,12 +124,12 @@ impl FarField {
     }
 }
 
-/// The occupied vertex that a coarse vertex takes for the nearest.
+/// The occupied vertex that a coarse vertex has found as the nearest.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Nearest {
-    /// Squared distance in coarse cells, from the coarse vertex that `cell` was moved to.
+    /// Squared distance in coarse cells, from the coarse vertex that `cell` was rounded to.
     square: f32,
-    /// Its number.
+    /// Index of the occupied vertex.
     cell: u32,
 }
 
@@ -135,7 +140,7 @@ impl Nearest {
     };
 }
 
-/// What coarse vertices took for the nearest, and how far that is in truth.
+/// The nearest occupied vertices found, for computing the distances from their fine positions.
 struct Beside<'a> {
     cells: &'a [[u32; 3]],
     pitch: u32,
@@ -144,8 +149,9 @@ struct Beside<'a> {
 }
 
 impl Beside<'_> {
-    /// Fine cells from coarse vertex number `at`, at least `band`. Beside the band, where an
-    /// error would make a step, what the vertices around took is tried too.
+    /// Distance of coarse vertex `at` in fine cells, at least `band`. Beside the band, where an
+    /// error would make a step, the vertices found by the neighboring coarse vertices are tried as
+    /// well.
     fn distance(&self, at: usize, band: f32) -> f32 {
         let [nx, ny, nz] = self.vertices;
         let coarse = [at / (ny * nz), at / nz % ny, at % nz];
@@ -170,7 +176,7 @@ impl Beside<'_> {
     }
 }
 
-/// Moves every occupied vertex to the coarse vertex beside it, which keeps the closest.
+/// Rounds every occupied vertex to the nearest coarse vertex, which keeps the closest one.
 fn seeds(cells: &[[u32; 3]], pitch: u32, [nx, ny, nz]: [usize; 3]) -> Vec<Nearest> {
     let mut nearest = vec![Nearest::NONE; nx * ny * nz];
     for (number, &cell) in (0..).zip(cells) {
@@ -188,14 +194,14 @@ fn seeds(cells: &[[u32; 3]], pitch: u32, [nx, ny, nz]: [usize; 3]) -> Vec<Neares
     nearest
 }
 
-/// Cells between two fine vertices.
+/// Distance between two fine vertices, in cells.
 fn length(a: [u32; 3], b: [u32; 3]) -> f32 {
     let square = |axis: usize| (a[axis].abs_diff(b[axis]) as f32).powi(2);
     (square(0) + square(1) + square(2)).sqrt()
 }
 
-/// The last pass, `y` by `y` through a copy with x innermost: columns of the whole grid are too
-/// far apart to be read one by one.
+/// The last pass. Each `y` slice is processed in a copy with x innermost, because columns along x
+/// are too far apart in memory to be read one by one.
 fn transform_along_x(
     nearest: &mut [Nearest],
     [nx, ny, nz]: [usize; 3],
@@ -242,7 +248,8 @@ impl Envelope {
             }
             let mut start = f32::NEG_INFINITY;
             while let Some(&(last, last_source)) = self.sources.last() {
-                // Without squares of places: on long lines they leave no digits to the heights.
+                // The intersection is computed without squared indices, which on long lines would
+                // cancel the significant digits of the heights.
                 let (rise, run) = (source.square - last_source.square, (place - last) as f32);
                 start = (rise / run + (place + last) as f32) / 2.0;
                 if self.starts.last().is_some_and(|&begin| start <= begin) {

@@ -1,39 +1,40 @@
-//! What a distance transform will take: its bytes exactly, its work by measured constants.
+//! The predicted cost of a distance transform: memory exactly, time by measured constants.
 
 use super::brick_index::BRICK_BYTES;
 use super::chamfer::DenseChamfer;
-use super::coarse_field::FarField;
+use super::coarse_field::CoarseField;
 use super::options::{DistanceError, DistanceOptions, Metric, Sites};
 use super::plan::Layout;
 use super::transform::DistanceTransform;
 use crate::flow::data::{Point, Uncontrolled};
 
-/// Multiply-adds of the network that take as long as a brick with a band of 20 cells, to cells.
+/// Multiply-adds of the network that take as long as one brick with a band of 20 cells, for
+/// [`Sites::Cells`].
 const BRICK: f64 = 3.4e5;
-/// The band for which that is so.
+/// The band of that measurement, cells.
 const BRICK_BAND: f64 = 20.0;
-/// What a brick takes to points, in bricks to cells: 2.6 to 5.6 on four scenes.
+/// Time of a brick for [`Sites::Points`], relative to [`Sites::Cells`]: 2.6 to 5.6 on four scenes.
 const TO_POINTS: f64 = 4.0;
 /// As [`BRICK`], for a vertex of the far field.
 const FAR_VERTEX: f64 = 2.7e3;
 /// As [`BRICK`], for a cell of the dense transform.
 const DENSE_CELL: f64 = 5e3;
 
-/// What a distance transform will take.
+/// The predicted cost of a distance transform.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct TransformPrice {
-    /// Active bricks; none of a dense transform.
+pub struct TransformCost {
+    /// Active bricks; 0 for a dense transform.
     pub bricks: usize,
-    /// Bytes that it will occupy.
+    /// Bytes that the transform will occupy.
     pub bytes: usize,
-    /// Bytes that building it takes at most.
+    /// Peak memory while it is built, bytes: an upper bound.
     pub peak_bytes: usize,
-    /// Work: as many multiply-adds of the network take as long.
+    /// Computing time, as the number of the network's multiply-adds that take equally long.
     pub multiply_adds: f64,
 }
 
 impl DistanceTransform {
-    /// What [`Self::build`] will take.
+    /// The predicted cost of [`Self::build`]. Plans the transform but computes no distances.
     ///
     /// # Errors
     /// As [`Self::build`].
@@ -41,11 +42,11 @@ impl DistanceTransform {
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,
-    ) -> Result<TransformPrice, DistanceError> {
+    ) -> Result<TransformCost, DistanceError> {
         if options.metric == Metric::Chamfer {
             let grid = DenseChamfer::plan(source, target, options)?;
             let cells = grid.vertices.iter().product::<usize>();
-            return Ok(TransformPrice {
+            return Ok(TransformCost {
                 bricks: 0,
                 bytes: cells * size_of::<f32>(),
                 peak_bytes: cells * size_of::<f32>(),
@@ -54,18 +55,18 @@ impl DistanceTransform {
         }
         let layout = Layout::plan(source, target, options, &Uncontrolled)?;
         let bricks = layout.index.active;
-        let far = FarField::vertices_over(&layout.grid);
+        let far = CoarseField::vertices_over(&layout.grid);
         let bytes = layout.index.bytes() + bricks * BRICK_BYTES + far * size_of::<f32>();
         let sites = match options.sites {
             Sites::Cells => 1.0,
             Sites::Points => TO_POINTS,
         };
         let brick = BRICK * sites * f64::from(layout.band) / BRICK_BAND;
-        Ok(TransformPrice {
+        Ok(TransformCost {
             bricks,
             bytes,
             peak_bytes: (bytes + layout.sites)
-                .max(layout.index.bytes() + FarField::bytes_over(&layout.grid))
+                .max(layout.index.bytes() + CoarseField::bytes_over(&layout.grid))
                 + layout.cells.len() * size_of::<[u32; 3]>(),
             multiply_adds: bricks as f64 * brick + far as f64 * FAR_VERTEX,
         })

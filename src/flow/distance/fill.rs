@@ -1,8 +1,9 @@
-//! Fills the active bricks with exact distances, block by block and strip by strip.
+//! Computes the distances of the active bricks, block by block and strip by strip.
 //!
-//! A strip is the bricks of a block that share y and z: they look at the same sites, so those are
-//! gathered once a strip. No distance is approximated and no two bricks write the same value, so
-//! threads cannot change the result. Knows nothing of what a site is: see [`Gather`].
+//! A strip is the bricks of a block that share y and z. They depend on nearly the same sites, which
+//! are gathered once per strip. Distances are exact up to the rounding to 16 bits, and every brick
+//! is written by one thread, so the number of threads does not change the result. Independent of
+//! the kind of site: see [`Gather`].
 
 use core::ops::Range;
 
@@ -14,27 +15,30 @@ use crate::flow::data::{Control, Interrupt, control};
 /// Marks a vertex of an active brick that lies beyond the band.
 pub(super) const BEYOND: u16 = u16::MAX;
 
-/// Bricks along a block's edge.
+/// Bricks along a block's edge, equal to the vertices along a brick's edge.
 const STRIP: usize = EDGE as usize;
 
-/// One thread's way from sites to the codes of one brick after the other.
+/// One thread's state for computing the codes of bricks from the sites.
 pub(super) trait Gather {
-    /// Gathers what the bricks of one strip share: their vertices are `x`, and eight from `y` and
-    /// from `z` on.
+    /// Gathers the sites that the bricks of one strip share. The strip's vertices are `x` along x,
+    /// and eight from `y` and from `z` on.
     fn open_strip(&mut self, x: Range<i32>, y: i32, z: i32);
 
     /// Writes the codes of the strip's brick that begins at `x`: the distance from each vertex to
-    /// the nearest site, or [`BEYOND`] where that is farther than the band.
+    /// the nearest site, or [`BEYOND`] if that is farther than the band.
     fn fill(&mut self, x: i32, codes: &mut [u16]);
 }
 
-/// Codes that one cell of distance is divided into: the band's radius takes nearly all 16 bits.
+/// Codes per cell of distance. The band's radius maps to the largest code below [`BEYOND`].
 pub(crate) fn codes_per_cell(band: i32) -> f64 {
     f64::from(BEYOND - 1) / f64::from(band)
 }
 
-/// The codes of all active bricks, 512 a brick, by as many gathers as there are threads; nothing
-/// where the watch, looked at before every block, interrupts.
+/// The codes of all active bricks, 512 per brick, with one gather per thread. Checks the control
+/// before every block.
+///
+/// # Errors
+/// [`Interrupt`] if the control interrupts.
 pub(super) fn band_codes<G: Gather>(
     index: &Index,
     gather: impl Fn() -> G + Send + Sync,
@@ -60,9 +64,10 @@ pub(super) fn band_codes<G: Gather>(
     Ok(codes)
 }
 
-/// Fills the active bricks of one block; `own` are their codes, in the order of their numbers.
+/// Computes the active bricks of one block. `own` are their codes, in the order of their storage
+/// numbers.
 fn fill_block(gather: &mut impl Gather, block: [usize; 3], bricks: &[u32], own: &mut [u16]) {
-    // Numbers rise along the table, and ABSENT is above them all.
+    // Storage numbers ascend along the table, and ABSENT exceeds all of them.
     let Some(&first) = bricks.iter().min() else {
         return;
     };
@@ -88,16 +93,16 @@ fn fill_block(gather: &mut impl Gather, block: [usize; 3], bricks: &[u32], own: 
     }
 }
 
-/// Items with integer x and y, sorted by both, found by row.
+/// Items with integer x and y, sorted by both and indexed by x.
 #[derive(Debug)]
 pub(crate) struct Rows {
-    /// First item of each x, one past the last at the end.
+    /// First item of each x, and the number of items at the end.
     starts: Vec<u32>,
     y: Vec<i32>,
 }
 
 impl Rows {
-    /// Rows of `(x, y)`, sorted.
+    /// The index of `(x, y)` items, which are sorted.
     pub(super) fn new(items: impl Iterator<Item = [u32; 2]>) -> Self {
         let mut rows = Self {
             starts: vec![],
@@ -111,7 +116,8 @@ impl Rows {
         rows
     }
 
-    /// Items of the rows `x` with `y`: each row's x and the numbers of its items, never none.
+    /// The items with x and y in the given ranges: for each x with items, x and the range of item
+    /// indices.
     pub(super) fn window(
         &self,
         x: Range<i32>,
@@ -127,19 +133,19 @@ impl Rows {
         })
     }
 
-    /// First item of each x, one past the last at the end.
+    /// First item of each x, and the number of items at the end.
     #[cfg(feature = "gpu")]
     pub(crate) fn starts(&self) -> &[u32] {
         &self.starts
     }
 
-    /// Every item's y.
+    /// The y of every item.
     #[cfg(feature = "gpu")]
     pub(crate) fn all_y(&self) -> &[i32] {
         &self.y
     }
 
-    /// The y of an item.
+    /// The y of item `item`.
     pub(super) fn y(&self, item: usize) -> i32 {
         self.y[item]
     }

@@ -1,38 +1,38 @@
-//! The lattice that a distance transform is sampled on: where its vertices lie and which cell a
-//! point falls into. Knows no distances. Bounds as the published code draws them: both clouds and
-//! one cell on every side.
+//! The regular grid that a distance transform is sampled on: its vertices, and the cell of a point.
+//!
+//! As in the published code, it extends over both clouds and one cell more on every side.
 
 use super::options::DistanceError;
 use crate::flow::data::Point;
 
-/// A lattice of vertices, `cell` metres apart.
+/// A regular grid of vertices, `cell` metres apart.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Grid {
     /// Position of vertex (0, 0, 0), metres.
     pub origin: [f64; 3],
-    /// Distance between neighbouring vertices, metres.
+    /// Distance between neighboring vertices, metres.
     pub cell: f64,
     /// Vertices along each axis, at least 2.
     pub vertices: [usize; 3],
 }
 
-/// A place between the vertices: the lower corner and the fraction beyond it.
+/// A position between the vertices: the lower corner of its cell, and the fraction beyond it.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Cell {
     pub(crate) corner: [u32; 3],
     pub(crate) fraction: [f32; 3],
-    /// 1 where the point lies within the grid on that axis, else 0.
+    /// Per axis, 1 if the point lies within the grid, else 0.
     pub(crate) inside: [f32; 3],
 }
 
 impl Grid {
-    /// The longest extent on an axis, metres: single-precision coordinates resolve 2 mm there.
+    /// The longest extent along an axis, metres. Single-precision coordinates resolve 2 mm there.
     pub const MAX_EXTENT_M: f64 = 20_000.0;
 
-    /// The grid that covers both clouds.
+    /// The grid that covers both clouds, with cells of `cell` metres.
     ///
     /// # Errors
-    /// Where the target is empty or the clouds span more than [`Self::MAX_EXTENT_M`].
+    /// If the target is empty, or the clouds span more than [`Self::MAX_EXTENT_M`] along an axis.
     pub fn covering(source: &[Point], target: &[Point], cell: f64) -> Result<Self, DistanceError> {
         if target.is_empty() {
             return Err(DistanceError::EmptyTarget);
@@ -82,10 +82,10 @@ impl Grid {
     }
 }
 
-/// A grid as it is sampled, in single precision on every device.
+/// The grid in single precision, as every device samples it.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Lattice {
-    /// The first vertex, metres, as a sum of two floats an axis.
+    /// Position of the first vertex, metres: the sum of a high and a low float per axis.
     pub(crate) origin_high: Point,
     pub(crate) origin_low: Point,
     pub(crate) inverse_cell: f32,
@@ -104,7 +104,8 @@ impl Lattice {
         }
     }
 
-    /// Where `point` lies between the vertices; outside points are moved to the border.
+    /// The cell of `point` and its position there. Points outside the grid are clamped to its
+    /// border.
     #[inline]
     pub(crate) fn locate(&self, point: Point) -> Cell {
         let mut cell = Cell {
@@ -129,7 +130,8 @@ impl Lattice {
     }
 }
 
-/// Trilinear value of eight corners (`corners[4 x + 2 y + z]`) and its derivative by the fraction.
+/// Trilinear value of eight corners (`corners[4 x + 2 y + z]`) and its derivative with respect to
+/// the fraction.
 #[inline]
 pub(crate) fn trilinear(corners: [f32; 8], fraction: [f32; 3]) -> (f32, [f32; 3]) {
     let [x, y, z] = fraction;

@@ -1,7 +1,7 @@
-//! What a deformed point is pulled toward: the distance to the target cloud, anywhere in space.
+//! Distance transforms of the target cloud, FNSF Section 3.2.
 //!
-//! [`Bricks`] is the product's transform; [`DenseChamfer`] is the published code's, for comparison.
-//! FNSF Section 3.2. Knows nothing of networks or losses.
+//! [`Bricks`] is the default transform. [`DenseChamfer`] is the published code's, for comparison.
+//! Independent of networks and losses.
 
 mod brick_index;
 mod bricks;
@@ -13,6 +13,7 @@ mod grid;
 mod options;
 mod plan;
 mod point_distance;
+mod sample;
 #[cfg(test)]
 mod tests;
 mod transform;
@@ -20,15 +21,16 @@ mod vertex_distance;
 
 pub use bricks::Bricks;
 pub use chamfer::DenseChamfer;
-pub use cost::TransformPrice;
+pub use cost::TransformCost;
 pub use grid::Grid;
 pub use options::{DistanceError, DistanceOptions, Metric, Sites};
-pub use transform::{DistanceTransform, Sample};
+pub use sample::Sample;
+pub use transform::DistanceTransform;
 
 #[cfg(feature = "gpu")]
 pub(crate) use brick_index::{ABSENT, Index};
 #[cfg(feature = "gpu")]
-pub(crate) use coarse_field::FarField;
+pub(crate) use coarse_field::CoarseField;
 #[cfg(feature = "gpu")]
 pub(crate) use fill::codes_per_cell;
 #[cfg(feature = "gpu")]
@@ -36,4 +38,4 @@ pub(crate) use grid::Lattice;
 #[cfg(feature = "gpu")]
 pub(crate) use plan::Layout;
 #[cfg(feature = "gpu")]
-pub(crate) use vertex_distance::CellSites;
+pub(crate) use vertex_distance::VertexSites;

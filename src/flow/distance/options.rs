@@ -1,20 +1,20 @@
-//! The distance transform's options and errors; checked before anything is allocated.
+//! Options and errors of the distance transform, checked before memory is allocated.
 
 use crate::flow::data::Interrupt;
 
-/// How distance is measured.
+/// The distance metric.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Metric {
-    /// Exact Euclidean distance, in bricks.
+    /// Exact Euclidean distance, on bricks.
     Euclidean,
-    /// The published code's path metric on a dense grid: up to 12.8% too long.
+    /// The published code's chamfer metric on a dense grid: up to 12.8% too long.
     Chamfer,
 }
 
-/// What distances are measured to.
+/// The sites that distances are measured to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Sites {
-    /// The vertices nearest to the target's points, as published.
+    /// The grid vertices nearest to the target's points, as published.
     Cells,
     /// The target's points themselves.
     Points,
@@ -23,21 +23,21 @@ pub enum Sites {
 /// Options of the distance transform.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DistanceOptions {
-    /// How distance is measured.
+    /// The distance metric.
     pub metric: Metric,
-    /// What distances are measured to, by [`Metric::Euclidean`].
+    /// The sites that distances are measured to. Used by [`Metric::Euclidean`] only.
     pub sites: Sites,
-    /// Edge of a cell, metres. FNSF Section 4: 0.1.
+    /// Edge of a cell, metres, at least 0.001. FNSF Section 4: 0.1.
     pub cell_m: f64,
-    /// Radius of the band in which distances are exact, metres. At most [`Self::MAX_BAND_CELLS`]
-    /// cells.
+    /// Radius of the band in which distances are exact, metres: 1 to [`Self::MAX_BAND_CELLS`]
+    /// cells. Used by [`Metric::Euclidean`] only.
     pub band_m: f64,
-    /// Bytes that the transform may take; more is refused.
+    /// Limit on the transform's memory, bytes. A larger transform is refused.
     pub max_bytes: usize,
 }
 
 impl DistanceOptions {
-    /// The band's largest radius in cells: squared sums stay within 16 bits.
+    /// The band's largest radius in cells. Sums of squared offsets then stay within 16 bits.
     pub const MAX_BAND_CELLS: f64 = 64.0;
 
     /// The band's radius in whole cells.
@@ -45,7 +45,7 @@ impl DistanceOptions {
         (self.band_m / self.cell_m).round() as i32
     }
 
-    /// Refuses sizes that are not positive and finite, and bands that are too wide.
+    /// Checks that the sizes are positive and finite, and that the band is 1 to 64 cells wide.
     pub(crate) fn check(&self) -> Result<(), DistanceError> {
         let positive = |x: f64| x.is_finite() && x > 0.0;
         if !positive(self.cell_m) || self.cell_m < 1e-3 {
@@ -79,27 +79,27 @@ impl Default for DistanceOptions {
 /// Why a distance transform was refused.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum DistanceError {
-    /// The cell's edge is unusable.
+    /// The cell's edge is out of range.
     #[error("a cell of {cell_m} m is not possible: choose at least 0.001 m")]
     Cell {
-        /// The edge asked for.
+        /// The requested edge, metres.
         cell_m: f64,
     },
-    /// The band is empty or too wide.
+    /// The band's radius is out of range.
     #[error("a band of {band_m} m with cells of {cell_m} m is not possible: choose 1 to 64 cells")]
     Band {
-        /// The radius asked for.
+        /// The requested radius, metres.
         band_m: f64,
-        /// The cell's edge.
+        /// The cell's edge, metres.
         cell_m: f64,
     },
-    /// A cloud has no point.
+    /// The target cloud has no points.
     #[error("the target cloud is empty")]
     EmptyTarget,
-    /// The clouds span too much space.
+    /// The clouds span too much space along an axis, or have no finite extent.
     #[error(
         "the clouds span {x_m:.0} x {y_m:.0} x {z_m:.0} m, more than {limit_m:.0} m on an axis: \
-         remove stray points or crop with range_m"
+         remove stray points or crop with crop_m"
     )]
     Extent {
         /// Extent along x, metres.
@@ -108,18 +108,18 @@ pub enum DistanceError {
         y_m: f64,
         /// Extent along z, metres.
         z_m: f64,
-        /// The longest extent that is taken, metres.
+        /// The longest extent allowed, metres.
         limit_m: f64,
     },
-    /// The transform would not fit.
-    #[error("the distance transform needs {needed} bytes, {limit} are allowed: crop with range_m")]
+    /// The transform would take too much memory.
+    #[error("the distance transform needs {needed} bytes, {limit} are allowed: crop with crop_m")]
     Memory {
         /// Bytes needed.
         needed: usize,
         /// Bytes allowed.
         limit: usize,
     },
-    /// The watch asked for the end.
+    /// The control interrupted the transform.
     #[error("the distance transform was interrupted")]
     Interrupted(Interrupt),
 }
@@ -174,7 +174,7 @@ mod tests {
             };
             needed > limit
         };
-        // 1e5 cells on every axis: 1e15.
+        // 1e5 cells along every axis: 1e15 in all.
         let corners = [[-5000.0; 3], [5000.0; 3]];
         let dense = DistanceOptions {
             metric: Metric::Chamfer,
@@ -182,7 +182,7 @@ mod tests {
         };
         assert!(memory(&[], &corners, &dense));
         assert!(memory(&[], &corners, &DistanceOptions::default()));
-        // 2e7 cells on every axis: more bytes than 64 bits count.
+        // 2e7 cells along every axis: more bytes than 64 bits can count.
         let huge = [[-10_000.0; 3], [10_000.0; 3]];
         for metric in [Metric::Chamfer, Metric::Euclidean] {
             let options = DistanceOptions {
@@ -213,7 +213,7 @@ mod tests {
         }
     }
 
-    /// Two thousand columns that each reach over 18 km would take 9 GB along z if empty space counted.
+    /// 2,000 columns of 18 km each would take 9 GB along z if empty space were stored.
     #[test]
     fn tall_empty_columns_take_no_memory() {
         let mut target = boxed(2000, [4.0, 4.0, 0.0]);

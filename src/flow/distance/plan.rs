@@ -1,22 +1,22 @@
-//! What a transform in bricks will occupy and cost, known before any distance is taken.
+//! The layout of a transform on bricks and its memory, known before any distance is computed.
 
 use super::brick_index::{BRICK_BYTES, Index};
-use super::coarse_field::FarField;
+use super::coarse_field::CoarseField;
 use super::grid::Grid;
 use super::options::{DistanceError, DistanceOptions, Sites};
 use super::point_distance::PointSites;
-use super::vertex_distance::CellSites;
+use super::vertex_distance::VertexSites;
 use crate::flow::data::{Control, Point};
 
-/// The plan of a transform.
+/// The layout of a transform on bricks.
 pub(crate) struct Layout {
     pub(crate) grid: Grid,
-    /// Occupied vertices, sorted, each once.
+    /// Occupied vertices, sorted, without duplicates.
     pub(crate) cells: Vec<[u32; 3]>,
     pub(crate) index: Index,
     /// The band's radius in cells.
     pub(crate) band: i32,
-    /// At most the bytes of what the bricks are filled from.
+    /// An upper bound on the bytes of the sites that the bricks are computed from.
     pub(crate) sites: usize,
 }
 
@@ -24,7 +24,7 @@ impl Layout {
     /// Plans the transform of `target` over a grid that covers both clouds.
     ///
     /// # Errors
-    /// Whatever the transform is refused for.
+    /// [`DistanceError`] as [`super::Bricks::build_with_control`].
     pub(crate) fn plan(
         source: &[Point],
         target: &[Point],
@@ -34,7 +34,7 @@ impl Layout {
         options.check()?;
         let grid = Grid::covering(source, target, options.cell_m)?;
         let mut cells: Vec<_> = target.iter().map(|&p| grid.nearest_vertex(p)).collect();
-        // One comparison instead of three, half of them mispredicted.
+        // One comparison of 128-bit keys is faster than three, of which half are mispredicted.
         cells.sort_unstable_by_key(|&cell| {
             let [x, y, z] = cell.map(u128::from);
             x << 64 | y << 32 | z
@@ -43,11 +43,11 @@ impl Layout {
         let band = options.band_cells();
         let index = Index::activate(&grid, &cells, band, options.max_bytes, control)?;
         let sites = match options.sites {
-            Sites::Cells => CellSites::bytes(cells.len(), band),
+            Sites::Cells => VertexSites::bytes(cells.len(), band),
             Sites::Points => PointSites::bytes(target.len()),
         };
         let bytes =
-            index.bytes() + index.active * BRICK_BYTES + FarField::bytes_over(&grid) + sites;
+            index.bytes() + index.active * BRICK_BYTES + CoarseField::bytes_over(&grid) + sites;
         if bytes > options.max_bytes {
             return Err(DistanceError::Memory {
                 needed: bytes,

@@ -1,8 +1,9 @@
-//! Exact distance to the nearest target point itself, not to its vertex.
+//! Exact distance to the nearest target point itself, instead of its nearest vertex.
 //!
-//! Rasterizing moves points by up to 0.87 cells; this undoes it. Around a cube of vertices only
-//! points can matter that are at most its diagonal farther from its center than the nearest one:
-//! a brick is halved to cubes of 4 and of 2 vertices, and each passes on what can matter within.
+//! Rounding a point to its vertex moves it by up to 0.87 cells; this variant avoids that error. A
+//! point can be nearest to a vertex of a cube only if its distance from the cube's center exceeds
+//! that of the nearest point by at most the cube's diagonal. A brick is halved to cubes of 4 and of
+//! 2 vertices along an edge, and each passes on only the points that can be nearest within it.
 
 use core::ops::Range;
 
@@ -13,7 +14,7 @@ use crate::flow::data::Point;
 
 /// Vertices along a brick's edge.
 const SIDE: i32 = EDGE as i32;
-/// Added to every bound, cells: more than single precision loses at 100 cells.
+/// Added to every bound, cells: more than the single-precision rounding error at 100 cells.
 const SLACK: f32 = 1e-3;
 
 /// The target's points, sorted by their nearest vertices.
@@ -24,7 +25,7 @@ pub(super) struct PointSites {
     points: Vec<Site>,
 }
 
-/// A point: its nearest vertex, and where it lies from there, cells.
+/// A target point: its nearest vertex, and its offset from that vertex, cells.
 #[derive(Debug, Clone, Copy)]
 struct Site {
     vertex: [u32; 3],
@@ -48,7 +49,7 @@ impl PointSites {
         }
     }
 
-    /// What [`Self::new`] takes for so many points, bytes.
+    /// An upper bound on the bytes of [`Self::new`] for `points` points.
     pub(super) fn bytes(points: usize) -> usize {
         points * (size_of::<Site>() + size_of::<i32>())
     }
@@ -59,14 +60,16 @@ pub(super) struct PointGather<'a> {
     sites: &'a PointSites,
     /// First vertex of the open strip along x.
     x: i32,
-    /// Rows that reach the strip, by x: where their points begin in `strip`.
+    /// The rows within the band of the strip, by x: the row's x, and the index of its first point
+    /// in `strip`.
     rows: Vec<(i32, usize)>,
     strip: Points,
-    /// What can matter to a brick, a half and a quarter of its edge.
+    /// The points that can be nearest within a brick, and within cubes of half and a quarter of its
+    /// edge.
     brick: Points,
     half: Points,
     quarter: Points,
-    /// Scratch of [`Points::keep_close`].
+    /// Scratch buffer of [`Points::keep_close`].
     squares: Vec<f32>,
 }
 
@@ -134,7 +137,7 @@ impl Gather for PointGather<'_> {
                 let least = quarter.least_squares(first);
                 for (to_vertex, square) in corners(1).into_iter().zip(least) {
                     let at = add(add(to_half, to_quarter), to_vertex).map(|c| c as u32);
-                    // Rounded; a cast saturates, which makes what is too far BEYOND.
+                    // Rounded. The cast saturates, so distances beyond the band become BEYOND.
                     codes[within(at)] = (square.sqrt() * per_cell + 0.5) as u16;
                 }
             }
@@ -142,11 +145,11 @@ impl Gather for PointGather<'_> {
     }
 }
 
-/// A cube of vertices, and how far from its center a point can matter.
+/// A cube of vertices, and the bounds on the distance of its relevant points.
 struct Cube {
     center: [f32; 3],
     diagonal: f32,
-    /// A point farther from the center is beyond the band of every vertex.
+    /// A point farther from the center is beyond the band of every vertex, cells.
     reach: f32,
 }
 
@@ -162,7 +165,8 @@ impl Cube {
     }
 }
 
-/// Points in cells from a strip's first vertex, one list an axis; the lists only grow.
+/// Points in cells from a strip's first vertex, one list per axis. The lists may be longer than
+/// `len`.
 #[derive(Default)]
 struct Points {
     axes: [Vec<f32>; 3],
@@ -182,7 +186,7 @@ impl Points {
         self.len += 1;
     }
 
-    /// Copies to `kept` those of `range` that can be nearest to some vertex of the cube.
+    /// Copies to `kept` the points of `range` that can be nearest to some vertex of the cube.
     fn keep_close(
         &self,
         range: Range<usize>,
@@ -205,7 +209,8 @@ impl Points {
         }
         let [kept_x, kept_y, kept_z] = kept.axes.each_mut().map(|axis| &mut axis[..xs.len()]);
         let mut len = 0;
-        // Written always and counted only where close: half of these branches would be missed.
+        // Each point is written but counted only if it is close: a branch would be mispredicted
+        // half of the time.
         for (((&px, &py), &pz), &square) in xs.iter().zip(ys).zip(zs).zip(squares.iter()) {
             (kept_x[len], kept_y[len], kept_z[len]) = (px, py, pz);
             len += usize::from(square <= limit);
@@ -235,7 +240,7 @@ impl Points {
     }
 }
 
-/// The least of the values, eight at a time; infinite where there are none.
+/// The minimum of the values, computed eight at a time; infinite if there are none.
 fn least(values: &[f32]) -> f32 {
     let lower = |a: f32, b: f32| if b < a { b } else { a };
     let (chunks, rest) = values.as_chunks::<8>();

@@ -1,4 +1,4 @@
-//! The transforms against brute force in double precision, and what must hold of any scene.
+//! Tests of the transforms: against brute force in double precision, and properties of any scene.
 
 use proptest::prelude::*;
 
@@ -7,23 +7,23 @@ use crate::flow::data::Point;
 use crate::flow::data::Random;
 use crate::flow::field::reference;
 
-/// Single precision: sums of a few terms of at most 100 m.
+/// Rounding error of single-precision sums of a few terms of at most 100 m.
 const SINGLE: f64 = 1e-4;
-/// Single precision of values of at most 20 m, over a cell of 0.1 m.
+/// Rounding error of single-precision values of at most 20 m, divided by a cell of 0.1 m.
 const SLOPE: f64 = 1e-3;
-/// Fine cells between the far field's vertices on grids as small as these.
+/// Fine cells between the far field's vertices, on grids as small as these.
 const PITCH: f64 = 8.0;
-/// Half the diagonal of a coarse cell, cells. Distance changes by no more than the place does.
+/// Half the diagonal of a coarse cell, cells. Distance changes by no more than the position does.
 const HALF: f64 = PITCH * 0.866_026;
-/// How much the far field falls short at most, cells: its vertices never do, and interpolation
-/// looks from corners up to half a diagonal away on average.
+/// Largest underestimate of the far field, cells. Its vertices never underestimate, and
+/// interpolation averages over corners up to half a diagonal away.
 const FAR_BELOW: f64 = HALF;
-/// How much the far field is too long at most, cells: as above, and what a coarse vertex takes for
-/// the nearest and what is were each moved by up to half a diagonal.
+/// Largest overestimate of the far field, cells. In addition to the interpolation, the vertex found
+/// as the nearest and the true nearest one were each rounded by up to half a diagonal.
 const FAR_ABOVE: f64 = 3.0 * HALF;
-/// Rasterizing moves a point by at most half a cell on each axis, cells.
+/// Rasterizing moves a point by at most half a cell along each axis; the norm of that, cells.
 const RASTER: f64 = 0.866_026;
-/// Places that a random check looks at.
+/// Number of random positions of a check.
 const PLACES: usize = 2000;
 
 fn options(cell_m: f64, band_cells: f64, sites: Sites) -> DistanceOptions {
@@ -39,7 +39,7 @@ fn bricks(source: &[Point], target: &[Point], options: &DistanceOptions) -> Bric
     Bricks::build(source, target, options).expect("small scenes fit")
 }
 
-/// A number of points of the box between `low` and `high` (metres).
+/// `count` random points of the box between `low` and `high`, metres.
 fn boxed(seed: u64, count: usize, low: [f64; 3], high: [f64; 3]) -> Vec<Point> {
     let mut random = Random::new(seed);
     let mut point = || core::array::from_fn(|a| random.uniform(low[a], high[a]) as f32);
@@ -57,7 +57,8 @@ fn scenes() -> Vec<(&'static str, Vec<Point>, Vec<Point>)> {
     let ground = boxed(2, 60, [-15.0, -15.0, -1.0], [15.0, 15.0, -1.0]);
     let scattered = boxed(3, 25, [-20.0, -12.0, -8.0], [20.0, 12.0, 8.0]);
     let column = vec![[0.0, 0.0, -60.0], [0.3, 0.0, 0.0], [0.0, 0.4, 58.0]];
-    // The grid's first vertex is one cell below: these lie on both sides of brick and block edges.
+    // The grid's first vertex is one cell below: these points lie on both sides of brick and block
+    // edges.
     let edges = [0.0, 5.0, 6.0, 7.0, 8.0, 61.0, 62.0, 63.0, 64.0];
     let edges = edges.map(|x: f32| [x, x / 4.0, x / 8.0]).to_vec();
     let box_m = || corners([-30.0, -17.0, -11.0], [25.0, 20.0, 13.0]);
@@ -113,7 +114,7 @@ fn check_every_vertex(name: &str, bricks: &Bricks, target: &[Point], band: f64, 
         Sites::Cells => (&vertices, 0.0),
         Sites::Points => (&points, RASTER),
     };
-    // Half a code, and single precision in cells.
+    // Half a code, and single-precision rounding, in cells.
     let tolerance = band / 65534.0 / 2.0 + 1e-6 * (band + 1.0);
     for vertex in every_vertex(grid) {
         let at = vertex.map(f64::from);
@@ -124,7 +125,7 @@ fn check_every_vertex(name: &str, bricks: &Bricks, target: &[Point], band: f64, 
             assert!(exact <= band + tolerance, "{place}");
             assert!((value - exact).abs() <= tolerance, "{place}");
         } else {
-            // Bricks are active where an occupied vertex is within the band.
+            // Bricks are active if an occupied vertex is within the band.
             let active = reference::nearest_distance(at, &vertices) <= band;
             assert!(!active || exact > band - tolerance, "{place}");
             assert!(value >= band - tolerance, "{place}");
@@ -175,7 +176,7 @@ proptest! {
     }
 }
 
-/// A scene that lies partly far beyond the band, with its distance to points and to cells.
+/// A scene that lies partly far beyond the band: its source and target.
 fn street() -> (Vec<Point>, Vec<Point>) {
     let mut target = boxed(5, 300, [-4.0, -3.0, -1.5], [4.0, 3.0, -1.5]);
     target.extend(boxed(6, 300, [-4.0, 3.0, -1.5], [4.0, 3.0, 1.5]));
@@ -184,7 +185,7 @@ fn street() -> (Vec<Point>, Vec<Point>) {
 
 #[test]
 fn a_query_is_the_trilinear_value_of_the_vertices() {
-    // Slopes are at most 14 at the seam; single precision of a fraction is 1e-7.
+    // Slopes are at most 14 at the edge of the band; a fraction in single precision resolves 1e-7.
     const TOLERANCE: f64 = 1e-4;
     let (source, target) = street();
     for sites in [Sites::Cells, Sites::Points] {
@@ -222,7 +223,7 @@ fn a_query_is_the_trilinear_value_of_the_vertices() {
 
 #[test]
 fn the_gradient_is_the_finite_difference_of_the_value() {
-    // Values of up to 20 m resolve 2e-6 m, a step is 1e-2 m.
+    // Values of up to 20 m resolve 2e-6 m, and a central difference spans 1e-2 m.
     const TOLERANCE: f64 = 2e-3;
     const STEP: f32 = 5e-3;
     let (source, target) = street();
@@ -272,8 +273,8 @@ fn grids_too_large_for_the_finest_far_field_take_a_coarser_one() {
 #[test]
 fn distance_has_no_jump_from_near_to_far_and_out_of_the_grid() {
     const STEP_M: f64 = 1e-3;
-    // Neighboring vertices differ by a cell and the far field's error; the slope along a line is
-    // at most that of three axes.
+    // Neighboring vertices differ by a cell and the far field's error. The slope along a line is at
+    // most that of three axes.
     let jump = STEP_M * (1.0 + FAR_ABOVE) * 1.733 + SINGLE;
     let (source, target) = street();
     let mut random = Random::new(10);
@@ -328,7 +329,7 @@ fn a_point_thirty_metres_away_is_pulled_home() {
     for start in boxed(12, 50, [-1.0; 3], [1.0; 3]) {
         let length = start.iter().map(|c| c * c).sum::<f32>().sqrt();
         let mut point = start.map(|c| c / length * 30.0);
-        // Coarse gradients lead astray by a few per cent.
+        // Gradients of the coarse field are off by a few per cent.
         for _ in 0..400 {
             let gradient = bricks.sample(point).gradient;
             let slope = gradient.iter().map(|g| g * g).sum::<f32>().sqrt();
@@ -341,8 +342,8 @@ fn a_point_thirty_metres_away_is_pulled_home() {
     }
 }
 
-/// The root of `1 + (sqrt 2 - 1)^2 + (sqrt 3 - sqrt 2)^2`, rounded up: how much longer than the
-/// straight line a chamfer path can be.
+/// The root of `1 + (sqrt 2 - 1)^2 + (sqrt 3 - sqrt 2)^2`, rounded up: the largest ratio of a
+/// chamfer path to the straight line.
 const LONGEST: f64 = 1.1281;
 
 #[test]

@@ -1,63 +1,55 @@
-//! TODO doc
+//! The distance transform of a target by either metric, FNSF Section 3.2.
 
 use super::bricks::Bricks;
 use super::chamfer::DenseChamfer;
 use super::options::{DistanceError, DistanceOptions, Metric};
+use super::sample::Sample;
 use crate::flow::data::{Control, Point, Uncontrolled};
 
-/// The distance at a point and how it changes with the point.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Sample {
-    /// Metres to the target.
-    pub distance: f32,
-    /// Derivative of `distance` by x, y and z; zero along an axis on which the point lies outside
-    /// the grid.
-    pub gradient: Point,
-}
-
-/// A distance transform of the target, as the options asked for it.
+/// A distance transform of the target, with the metric of the options.
 #[derive(Debug)]
 pub enum DistanceTransform {
-    /// Exact Euclidean, narrow band with a far field.
+    /// Exact Euclidean distance in a narrow band, with a far field.
     Bricks(Bricks),
     /// The published code's chamfer metric on a dense grid.
     Chamfer(DenseChamfer),
 }
 
 impl DistanceTransform {
-    /// Transforms `target` over a grid that covers both clouds.
+    /// Transforms `target` over a grid that covers both clouds, metres.
     ///
     /// # Errors
-    /// [`DistanceError`] where the options make no sense or the clouds span too much space.
+    /// [`DistanceError`] if the options are out of range, the target is empty, the clouds span too
+    /// much space, or the transform would take more than `options.max_bytes`.
     pub fn build(
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,
     ) -> Result<Self, DistanceError> {
-        Self::build_watched(source, target, options, &Uncontrolled)
+        Self::build_with_control(source, target, options, &Uncontrolled)
     }
 
-    /// As [`Self::build`]; looks at `control` between pieces of some milliseconds.
+    /// As [`Self::build`]. Checks `control` between parts of a few milliseconds.
     ///
     /// # Errors
     /// As [`Self::build`], and [`DistanceError::Interrupted`].
-    pub fn build_watched(
+    pub fn build_with_control(
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,
         control: &dyn Control,
     ) -> Result<Self, DistanceError> {
         Ok(match options.metric {
-            Metric::Euclidean => {
-                Self::Bricks(Bricks::build_watched(source, target, options, control)?)
-            }
-            Metric::Chamfer => Self::Chamfer(DenseChamfer::build_watched(
+            Metric::Euclidean => Self::Bricks(Bricks::build_with_control(
+                source, target, options, control,
+            )?),
+            Metric::Chamfer => Self::Chamfer(DenseChamfer::build_with_control(
                 source, target, options, control,
             )?),
         })
     }
 
-    /// Trilinear distance and gradient at `point`.
+    /// Trilinear distance and gradient at `point`, see [`Sample`].
     #[inline]
     pub fn sample(&self, point: Point) -> Sample {
         match self {

@@ -1,35 +1,38 @@
-//! Exact distance to the nearest occupied vertex: a banded, separable gather.
+//! Exact distance to the nearest occupied vertex, by a separable transform within the band.
 //!
-//! Along z each occupied column is transformed once; a strip takes the minimum over columns in y,
-//! a brick the minimum over those rows in x, 64 values at a time in 16-bit integers.
+//! Each occupied column is transformed along z once. A strip takes the minimum over the columns
+//! along y, and a brick the minimum over those rows along x, 64 values at a time in 16-bit
+//! integers.
 
 use core::ops::Range;
 
 use super::brick_index::EDGE;
 use super::fill::{BEYOND, Gather, Rows, codes_per_cell};
 
-/// Farther than any sum of squares within the band; sums with it stay within 16 bits.
+/// Exceeds every squared distance within the band, square cells. Adding a squared offset to it does
+/// not overflow 16 bits.
 const FAR: i16 = 0x3FFF;
 /// Vertices along a brick's edge.
 const SIDE: i32 = EDGE as i32;
 
 /// Occupied columns, each with its squared distances along z.
 #[derive(Debug)]
-pub(crate) struct CellSites {
+pub(crate) struct VertexSites {
     band: i32,
-    /// Columns by x and y; one with a gap wider than two bands is cut into several.
+    /// Columns by x and y. A column is split where consecutive vertices are more than twice the
+    /// band plus eight cells apart.
     pub(crate) columns: Rows,
-    /// The brick layer at which a column's distances begin, and its place in `squares`; one more
-    /// at the end.
+    /// For each column, the brick layer at which its distances begin and the index of the first one
+    /// in `squares`; one more entry at the end.
     pub(crate) layers: Vec<(u32, u32)>,
-    /// Eight squared distances a layer, [`FAR`] beyond the band.
+    /// Eight squared distances per layer, square cells; [`FAR`] beyond the band.
     pub(crate) squares: Vec<[i16; 8]>,
-    /// The code of each square up to the band's, then [`BEYOND`].
+    /// The code of each squared distance up to the band's, then [`BEYOND`].
     pub(crate) codes: Vec<u16>,
 }
 
-impl CellSites {
-    /// Transforms `cells` (sorted, unique) along z.
+impl VertexSites {
+    /// Transforms `cells` (sorted, unique) along z, with a band of `band` cells.
     pub(crate) fn new(cells: &[[u32; 3]], band: i32) -> Self {
         let near =
             |a: &[u32; 3], b: &[u32; 3]| a[..2] == b[..2] && b[2] - a[2] <= 2 * band as u32 + EDGE;
@@ -53,13 +56,14 @@ impl CellSites {
         }
     }
 
-    /// At most what [`Self::new`] takes for so many cells, bytes.
+    /// An upper bound on the bytes of [`Self::new`] for `cells` occupied vertices.
     pub(super) fn bytes(cells: usize, band: i32) -> usize {
         let layers = (2 * band + SIDE) / SIDE + 2;
         cells * (layers as usize * size_of::<[i16; 8]>() + size_of::<(u32, u32, i32)>())
     }
 
-    /// The column's squared distances in brick layer `layer`, if it reaches there.
+    /// The column's squared distances in brick layer `layer`; none if its band does not extend
+    /// there.
     fn at(&self, column: usize, layer: u32) -> Option<&[i16; 8]> {
         let (first, start) = self.layers[column];
         let end = self.layers[column + 1].1;
@@ -68,8 +72,8 @@ impl CellSites {
     }
 }
 
-/// Appends the squared distances to a column's cells, from brick layer `first` to the last within
-/// the band.
+/// Appends the squared distances to a column's vertices along z, from brick layer `first` to the
+/// last one within the band.
 fn push_squares(squares: &mut Vec<[i16; 8]>, column: &[[u32; 3]], first: u32, band: i32) {
     let last = (column[column.len() - 1][2] + band as u32) / EDGE;
     let mut above = 0;
@@ -98,14 +102,14 @@ struct Row {
 }
 
 /// One thread's working set.
-pub(super) struct CellGather<'a> {
-    sites: &'a CellSites,
-    /// Rows that reach the open strip, by x.
+pub(super) struct VertexGather<'a> {
+    sites: &'a VertexSites,
+    /// The rows within the band of the open strip, by x.
     rows: Vec<Row>,
 }
 
-impl<'a> CellGather<'a> {
-    pub(super) fn new(sites: &'a CellSites) -> Self {
+impl<'a> VertexGather<'a> {
+    pub(super) fn new(sites: &'a VertexSites) -> Self {
         Self {
             sites,
             rows: Vec::new(),
@@ -113,7 +117,7 @@ impl<'a> CellGather<'a> {
     }
 }
 
-impl Gather for CellGather<'_> {
+impl Gather for VertexGather<'_> {
     fn open_strip(&mut self, x: Range<i32>, y: i32, z: i32) {
         let (sites, band) = (self.sites, self.sites.band);
         let layer = z as u32 / EDGE;
@@ -160,7 +164,7 @@ impl Gather for CellGather<'_> {
     }
 }
 
-/// Lowers each of `out` to the square beside it plus `gap`.
+/// Lowers each element of `out` to that of `squares` plus `gap`.
 #[inline(always)]
 fn lower<const N: usize>(out: &mut [i16; N], squares: &[i16; N], gap: i16) {
     for (out, &square) in out.iter_mut().zip(squares) {

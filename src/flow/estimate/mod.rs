@@ -1,10 +1,18 @@
-//! The loop: select, transform, align, then forward, query, backward and Adam until the end.
+//! The estimate of one pair.
 //!
-//! FNSF Section 3: `theta* = argmin mean_p D(p + g(p; theta))`. Sees only the backend's traits.
-//! What becomes of it under a deadline is in `deadline.rs`.
+//! ```text
+//! Problem - select - ego motion - by objects or by field - Estimate
+//! ```
 
+mod by_field;
+mod by_objects;
+mod ego_motion;
+mod method;
+mod neighbors;
+mod result;
 mod run;
 #[cfg(test)]
 mod tests;
 
-pub use run::{Estimate, PhaseSeconds, StopReason, estimate, resume};
+pub use result::{Estimate, FieldSolution, ObjectSolution, Solution, StopReason};
+pub use run::{estimate, resume};

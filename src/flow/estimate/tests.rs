@@ -1,4 +1,4 @@
-//! What comes out of an estimate, whatever goes in.
+//! Tests of the estimate: masks, ground, deadlines, cancellation and a given ego motion.
 
 use super::*;
 use crate::flow::cpu::CpuBackend;
@@ -10,7 +10,7 @@ use crate::flow::data::{Progress, Uncontrolled};
 use crate::flow::error::FlowError;
 use crate::flow::options::Options;
 use crate::flow::options::{Ego, Ground, Preset};
-use crate::flow::select::Problem;
+use crate::flow::problem::Problem;
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -22,7 +22,7 @@ impl Control for After {
         (self.2.load(Ordering::Relaxed) >= self.0).then_some(self.1)
     }
     fn progress(&self, progress: Progress) {
-        self.2.store(progress.iteration, Ordering::Relaxed);
+        self.2.store(progress.done, Ordering::Relaxed);
     }
 }
 
@@ -37,7 +37,7 @@ fn street() -> SimulatedPair {
         .expect("a small street")
 }
 
-fn solve(
+fn estimated(
     pair: &SimulatedPair,
     options: &Options,
     control: &dyn Control,
@@ -48,7 +48,7 @@ fn solve(
         target: &pair.target,
         ground: Some([&pair.ground_source, &pair.ground_target]),
         before: None,
-        around: &[],
+        neighbors: &[],
     };
     estimate(&backend, &problem, options, control)
 }
@@ -58,8 +58,8 @@ fn points_left_out_keep_their_row_with_zero_flow() {
     let pair = street();
     let mut options = Preset::Neural.options(None);
     options.ground = Ground::Mask;
-    options.range_m = Some(30.0);
-    let estimate = solve(&pair, &options, &Uncontrolled).expect("a flow");
+    options.crop_m = Some(30.0);
+    let estimate = estimated(&pair, &options, &Uncontrolled).expect("a flow");
     assert_eq!(estimate.flow.len(), pair.source.len());
     for (row, point) in pair.source.iter().enumerate() {
         let kept = !pair.ground_source[row] && point[0].abs() <= 30.0 && point[1].abs() <= 30.0;
@@ -76,18 +76,12 @@ fn points_left_out_keep_their_row_with_zero_flow() {
 fn ground_that_is_found_moves_with_the_vehicle_and_takes_no_part() {
     let pair = street();
     let mut options = Preset::Neural.options(None);
-    let solve = |options: &Options| {
+    let estimated = |options: &Options| {
         let backend = CpuBackend::new(Some(2)).expect("threads");
-        let problem = Problem {
-            source: &pair.source,
-            target: &pair.target,
-            ground: None,
-            before: None,
-            around: &[],
-        };
+        let problem = Problem::pair(&pair.source, &pair.target);
         estimate(&backend, &problem, options, &Uncontrolled).expect("a flow")
     };
-    let estimate = solve(&options);
+    let estimate = estimated(&options);
     let ego = estimate.ego.expect("it is estimated");
     assert!(estimate.valid.iter().all(|&valid| valid));
     assert!(estimate.points < pair.source.len());
@@ -104,11 +98,11 @@ fn ground_that_is_found_moves_with_the_vehicle_and_takes_no_part() {
         assert_eq!(estimate.flow[row], expected, "row {row}");
         assert!(!dynamic[row], "row {row}");
     }
-    // Without the vehicle's motion, or sampled, it is left out.
+    // Ground is invalid without an ego motion, or where points are sampled.
     for (ego, max_points) in [(Ego::Off, None), (Ego::Auto, Some(500))] {
         options.ego = ego;
         options.max_points = max_points;
-        let estimate = solve(&options);
+        let estimate = estimated(&options);
         assert!((0..found.len()).all(|row| !found[row] || !estimate.valid[row]));
     }
 }
@@ -116,15 +110,15 @@ fn ground_that_is_found_moves_with_the_vehicle_and_takes_no_part() {
 #[test]
 fn a_deadline_gives_the_best_flow_so_far_and_a_cancellation_gives_none() {
     let pair = street();
-    for preset in Preset::FITTED {
+    for preset in Preset::with_field() {
         let options = preset.options(None);
         let deadline = After(3, Interrupt::Deadline, AtomicUsize::new(0));
-        let estimate = solve(&pair, &options, &deadline).expect("a flow");
+        let estimate = estimated(&pair, &options, &deadline).expect("a flow");
         assert_eq!(estimate.stop_reason, StopReason::Deadline);
-        assert_eq!(estimate.iterations, 3);
+        assert_eq!(estimate.fit().expect("a fit").iterations, 3);
         assert!(estimate.flow.iter().flatten().all(|f| f.is_finite()));
         let cancel = After(3, Interrupt::Cancelled, AtomicUsize::new(0));
-        let error = solve(&pair, &options, &cancel).expect_err("cancelled");
+        let error = estimated(&pair, &options, &cancel).expect_err("cancelled");
         assert!(matches!(error, FlowError::Cancelled));
     }
 }
@@ -132,8 +126,8 @@ fn a_deadline_gives_the_best_flow_so_far_and_a_cancellation_gives_none() {
 #[test]
 fn a_deadline_before_the_first_iteration_still_gives_a_flow() {
     let now = After(0, Interrupt::Deadline, AtomicUsize::new(0));
-    let estimate = solve(&street(), &Preset::Neural.options(None), &now).expect("a flow");
-    assert_eq!(estimate.iterations, 0);
+    let estimate = estimated(&street(), &Preset::Neural.options(None), &now).expect("a flow");
+    assert_eq!(estimate.fit().expect("a fit").iterations, 0);
     assert!(estimate.flow.iter().flatten().all(|f| f.is_finite()));
 }
 
@@ -142,8 +136,8 @@ fn a_given_ego_motion_is_taken_as_it_is_and_marks_what_moves_against_it() {
     let pair = street();
     let mut options = Preset::Neural.options(None);
     options.ego = Ego::Given(pair.target_from_source);
-    options.max_iterations = 0;
-    let estimate = solve(&pair, &options, &Uncontrolled).expect("a flow");
+    options.field_mut().expect("a field").max_iterations = 0;
+    let estimate = estimated(&pair, &options, &Uncontrolled).expect("a flow");
     assert_eq!(estimate.ego, Some(pair.target_from_source));
     assert!(
         estimate

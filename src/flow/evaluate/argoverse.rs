@@ -1,37 +1,40 @@
-//! Argoverse 2's own accuracy, angle error, dynamic IoU and three-way EPE at every distance.
+//! Argoverse 2 scene flow metrics: accuracy, angle error, dynamic IoU, three-way EPE.
 //!
-//! They differ from the paper's: the angle is one in space-time, the relative error has another
-//! floor, and the three-way EPE pools all scored points, close or far. The official task scores a
-//! square of 50 m half-width around the sensor: give it as part of the valid mask.
+//! They cover all ranges and differ from the paper's metrics: the angle is in space-time, the
+//! relative error has another floor, and the three-way EPE pools all scored points, close or far.
+//! The official task scores a square of 50 m half-width around the sensor. Include that square in
+//! the valid mask.
 
 use super::three_way::{ThreeWay, ThreeWaySums};
 use super::truth::{EvaluateError, Mean, Truth, double, end_point_error, norm};
 use crate::flow::data::Point;
 
-/// Time between sweeps, seconds: the fourth component of every flow.
+/// Time between sweeps, seconds: the fourth component of every flow vector.
 const SWEEP_SECONDS: f64 = 0.1;
-/// Keeps the relative error of a zero true flow finite, metres.
+/// Added to the length of the true flow in the relative error, metres, to keep it finite.
 const LENGTH_FLOOR: f64 = 1e-10;
 
-/// Argoverse 2's metrics over the scored points.
+/// Argoverse 2 metrics over the scored points.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Argoverse2 {
-    /// Scored points.
+    /// Number of scored points.
     pub points: usize,
-    /// Share of points with an error under 0.05 m or 5 %.
+    /// Share of points with an end-point error under 0.05 m or under 5 % of the true flow.
     pub accuracy_strict: f64,
-    /// Share of points with an error under 0.1 m or 10 %.
+    /// Share of points with an end-point error under 0.1 m or under 10 % of the true flow.
     pub accuracy_relax: f64,
-    /// Mean angle between the flows with 0.1 s appended to each, radians.
+    /// Mean angle between estimated and true flow with 0.1 s appended to each as a fourth
+    /// component, radians.
     pub angle_error: f64,
-    /// True positives over true positives, false positives and false negatives; none without a
-    /// predicted mask, a true mask, or a point that either calls dynamic.
+    /// True positives over the sum of true positives, false positives and false negatives. None
+    /// without a predicted mask, without a true mask, or if no point is dynamic in either.
     pub dynamic_iou: Option<f64>,
     /// Three-way EPE over all scored points; none without the dynamic and foreground masks.
     pub three_way: Option<ThreeWay>,
 }
 
-/// Scores one flow and, where given, the mask of points it calls dynamic.
+/// Scores the flow of one pair (N x 3, metres) and, where given, its predicted dynamic mask (N
+/// flags). `covered` marks the rows for which the estimate has a flow.
 ///
 /// # Errors
 /// Arrays of different lengths, or no row that can be scored.
@@ -46,22 +49,23 @@ pub fn evaluate_argoverse2(
     pool.finish()
 }
 
-/// Gathers Argoverse 2's metrics over many pairs; every scored point weighs the same.
+/// Accumulator of Argoverse 2 metrics over many pairs. Every scored point has the same weight.
 #[derive(Debug, Clone, Default)]
 pub struct Argoverse2Pool {
     strict: Mean,
     relax: Mean,
     angle: Mean,
-    /// Over points that the estimate or the truth calls dynamic: whether both do.
+    /// Over points that are dynamic in the estimate or in the truth: whether they are dynamic in
+    /// both.
     overlap: Mean,
     three_way: ThreeWaySums,
 }
 
 impl Argoverse2Pool {
-    /// Adds the scored points of one pair.
+    /// Adds the scored points of one pair. Arguments as in [`evaluate_argoverse2`].
     ///
     /// # Errors
-    /// Arrays of different lengths; the pool is unchanged then.
+    /// Arrays of different lengths; the pool is then unchanged.
     pub fn add(
         &mut self,
         flow: &[Point],
@@ -95,7 +99,7 @@ impl Argoverse2Pool {
         Ok(())
     }
 
-    /// The metrics of everything added so far.
+    /// The metrics of all pairs added so far.
     ///
     /// # Errors
     /// No row was scored.
@@ -112,7 +116,8 @@ impl Argoverse2Pool {
     }
 }
 
-/// Angle between (flow, 0.1 s) of both, radians; never undefined, for time never stands still.
+/// Angle between (flow, 0.1 s) of both flows, radians. Always defined, because the fourth component
+/// is not zero.
 fn space_time_angle(a: [f64; 3], b: [f64; 3]) -> f64 {
     let square = SWEEP_SECONDS * SWEEP_SECONDS;
     let dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + square;
@@ -139,7 +144,7 @@ mod tests {
         let score = evaluate_argoverse2(&flow, &[true; 4], Some(&predicted), &truth).unwrap();
         assert_eq!(score.points, 4);
         assert_eq!(score.accuracy_strict, 0.75);
-        // 0.1 in single precision is a little more than a tenth.
+        // 0.1 in single precision is slightly more than a tenth.
         assert_eq!(score.accuracy_relax, 0.75);
         assert!((score.angle_error - FRAC_PI_4 / 4.0).abs() < 1e-7);
         assert_eq!(score.dynamic_iou, Some(1.0 / 3.0));

@@ -1,31 +1,31 @@
-//! Bucket-normalized EPE: the error as a share of the speed, per class and bucket of speed.
+//! Bucket-normalized EPE: the end-point error relative to the speed, per class and speed bucket.
 //!
-//! Argoverse 2's second benchmark. Flows are compared with the ego motion taken out, and a slow
-//! pedestrian weighs as much as a fast truck. Here "close" is taken in the source sensor's frame;
-//! the official code takes it in the first sweep's frame of each sequence.
+//! Argoverse 2's second scene flow benchmark. Flows are compared with the ego motion taken out, and
+//! a slow pedestrian has the same weight as a fast truck. Here "close" is measured in the source
+//! sensor's frame; the official code measures it in the frame of the first sweep of each sequence.
 
 use super::truth::{EvaluateError, Mean, Truth, double, end_point_error, is_close, norm};
 use crate::flow::data::{Point, RigidTransform};
 use nalgebra::Point3;
 
-/// The class of points that belong to none and are left out.
+/// Class index of points that belong to no class and are excluded.
 pub const UNCLASSIFIED: u8 = u8::MAX;
 
-/// Width of a bucket, metres per frame.
+/// Width of a speed bucket, metres per sweep interval.
 const BUCKET_M: f64 = 0.04;
-/// Buckets of that width from 0 to 2 m per frame, and one more for everything faster.
+/// Number of buckets: 50 of that width from 0 to 2 m per sweep interval, and one for higher speeds.
 const BUCKETS: usize = 51;
 
-/// One bucket of one class.
+/// One speed bucket of one class.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Bucket {
-    /// Lowest true speed of the bucket, metres per frame.
+    /// Lower bound of the true speed, metres per sweep interval.
     pub from: f64,
-    /// Points in it.
+    /// Number of points in the bucket.
     pub points: usize,
     /// Mean end-point error, metres.
     pub epe: f64,
-    /// Mean true speed, metres per frame.
+    /// Mean true speed, metres per sweep interval.
     pub speed: f64,
 }
 
@@ -34,27 +34,27 @@ pub struct Bucket {
 pub struct ClassError {
     /// EPE of the slowest bucket, metres; none where it is empty.
     pub static_epe: Option<f64>,
-    /// Mean over the other buckets with points of EPE by speed; 1 is what a zero flow scores.
+    /// Mean of EPE over speed, over the other buckets that have points. A zero flow scores 1.
     pub dynamic_error: Option<f64>,
-    /// Every bucket with points, slowest first.
+    /// All buckets that have points, slowest first.
     pub buckets: Vec<Bucket>,
 }
 
-/// Bucket-normalized EPE of everything that was added.
+/// Bucket-normalized EPE over all pairs added.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BucketReport {
-    /// One entry per class, by its index.
+    /// One entry per class, by class index.
     pub classes: Vec<ClassError>,
-    /// Mean of the static errors of the classes that have one, metres.
+    /// Mean static error over the classes that have one, metres.
     pub static_epe: Option<f64>,
-    /// Mean of the dynamic errors of the classes that have one: the benchmark's headline.
+    /// Mean dynamic error over the classes that have one: the benchmark's main score.
     pub dynamic_error: Option<f64>,
 }
 
-/// Gathers bucket-normalized EPE over many pairs.
+/// Accumulator of bucket-normalized EPE over many pairs.
 #[derive(Debug, Clone)]
 pub struct BucketNormalized {
-    /// Per class and bucket: errors, and true speeds.
+    /// Per class and bucket: the errors and the true speeds.
     cells: Vec<[(Mean, Mean); BUCKETS]>,
 }
 
@@ -66,11 +66,12 @@ impl BucketNormalized {
         }
     }
 
-    /// Adds the scored, close points of one pair. `flow` and the true flow include ego motion;
-    /// `class` holds a class index per point, or [`UNCLASSIFIED`].
+    /// Adds the scored, close points of one pair. `flow` and the true flow (N x 3, metres) include
+    /// the ego motion. `covered` marks the rows for which the estimate has a flow. `class` holds a
+    /// class index per point, or [`UNCLASSIFIED`].
     ///
     /// # Errors
-    /// Arrays of different lengths, a truth without source cloud or ego motion, a class that is
+    /// Arrays of different lengths, a truth without source cloud or ego motion, or a class index
     /// out of range. Nothing is added then.
     pub fn add(
         &mut self,
@@ -108,7 +109,7 @@ impl BucketNormalized {
         Ok(())
     }
 
-    /// The report over everything added so far.
+    /// The report over all pairs added so far.
     pub fn finish(&self) -> BucketReport {
         let classes: Vec<ClassError> = self.cells.iter().map(class_error).collect();
         let static_epe = mean(classes.iter().filter_map(|class| class.static_epe));
@@ -146,14 +147,14 @@ fn class_error(cells: &[(Mean, Mean); BUCKETS]) -> ClassError {
     }
 }
 
-/// The mean of the values, or none of nothing.
+/// The mean of the values; none without values.
 fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
     let mut mean = Mean::default();
     values.for_each(|value| mean.add(value));
     mean.value()
 }
 
-/// Flow of a point of the static world, metres.
+/// Flow of a static point: its displacement by the ego motion, metres.
 fn ego_flow(target_from_source: &RigidTransform, point: Point) -> [f64; 3] {
     let source = Point3::from(double(point));
     let motion = target_from_source * source - source;
@@ -164,10 +165,11 @@ fn lower_edge(bucket: usize) -> f64 {
     bucket as f64 * BUCKET_M
 }
 
-/// The bucket of a true speed, metres per frame: its lower edge belongs to it, its upper does not.
+/// Bucket of a true speed, metres per sweep interval. The lower bound is inclusive, the upper
+/// exclusive.
 fn bucket(speed: f64) -> usize {
     let near = ((speed / BUCKET_M) as usize).min(BUCKETS - 1);
-    // The quotient may land on the wrong side of an edge by its rounding.
+    // Corrects the rounding of the quotient at a bucket boundary.
     if speed < lower_edge(near) {
         near - 1
     } else if near + 1 < BUCKETS && speed >= lower_edge(near + 1) {
@@ -183,7 +185,7 @@ mod tests {
     use nalgebra::{Translation3, UnitQuaternion, Vector3};
     use proptest::prelude::*;
 
-    /// The data is in single precision.
+    /// Tolerance of single-precision input.
     const SINGLE: f64 = 1e-5;
 
     #[test]
@@ -234,7 +236,7 @@ mod tests {
         add(&mut pool, &first, &still).unwrap();
         add(&mut pool, &second, &still).unwrap();
         let report = pool.finish();
-        // Bucket of 1 m: errors 0.5 and 0 over speeds 1 and 1.01; the open bucket: 1 over 4.
+        // Bucket of 1 m: errors 0.5 and 0 over speeds 1 and 1.01. Open bucket: 1 over 4.
         let car = (0.25 / 1.005 + 0.25) / 2.0;
         assert!((report.classes[0].dynamic_error.unwrap() - car).abs() < SINGLE);
         assert!((report.classes[0].static_epe.unwrap() - 0.03).abs() < SINGLE);

@@ -1,12 +1,12 @@
-//! The classes that bucket-normalized EPE tells apart: Argoverse 2's categories, gathered.
+//! Classes of bucket-normalized EPE: groups of Argoverse 2 categories.
 //!
-//! Categories are numbered as in `flow_labels.feather`: 0 is no object, the others follow the
-//! alphabet of the data set's 30. Signs, cones and barrels are left out by the benchmark because of
-//! odd labels; animals are in none of its classes.
+//! Categories are numbered as in `flow_labels.feather`: 0 is no object, and 1 to 30 are the
+//! categories of the data set in alphabetical order. The benchmark excludes signs, cones and
+//! barrels because of inconsistent labels. Animals are in none of its classes.
 
 use super::buckets::UNCLASSIFIED;
 
-/// The benchmark's classes, and one for objects of which no more is known.
+/// Class names: those of the benchmark, and OBJECT for foreground of unknown class.
 pub const CLASSES: [&str; 6] = [
     "BACKGROUND",
     "CAR",
@@ -16,7 +16,7 @@ pub const CLASSES: [&str; 6] = [
     "OBJECT",
 ];
 
-/// The class of a category, a place in [`CLASSES`]; [`UNCLASSIFIED`] where it is left out.
+/// Class of a category, as an index into [`CLASSES`]; [`UNCLASSIFIED`] if the category is excluded.
 pub fn class_of_category(category: u8) -> u8 {
     match category {
         0 => 0,
@@ -33,7 +33,7 @@ pub fn class_of_category(category: u8) -> u8 {
     }
 }
 
-/// The class of a point of which no more is known than whether it lies on an object.
+/// Class of a point that is only known to be foreground or background: OBJECT or BACKGROUND.
 pub fn class_of_foreground(foreground: bool) -> u8 {
     if foreground { 5 } else { 0 }
 }
@@ -42,7 +42,7 @@ pub fn class_of_foreground(foreground: bool) -> u8 {
 mod tests {
     use super::*;
 
-    /// Argoverse 2's categories in their order, and the class that the benchmark puts them in.
+    /// Argoverse 2 categories in order, with the benchmark's class of each.
     const CATEGORIES: [(&str, Option<&str>); 31] = [
         ("NONE", Some("BACKGROUND")),
         ("ANIMAL", None),

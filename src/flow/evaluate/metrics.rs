@@ -1,29 +1,31 @@
-//! The paper's metrics: EPE, Acc5, Acc10, outliers and angle error, and the parts of the EPE.
+//! The paper's metrics: EPE, Acc5, Acc10, outliers and angle error, and the EPE of subsets.
 //!
-//! The definitions are those of the official code, down to its clamp and its constants; sums are
-//! taken in double precision, where that code has single. It must not know how rows are chosen.
+//! The definitions are those of the official code, including its clamp and its constants. Sums are
+//! in double precision; the official code uses single precision.
 
 use super::three_way::{ThreeWay, ThreeWaySums};
 use super::truth::{EvaluateError, Mean, Truth, dot, double, end_point_error, is_close, norm};
 use crate::flow::data::Point;
 
-/// Keeps the relative error of a zero true flow finite, metres (official code).
+/// Added to the length of the true flow in the relative error, metres, to keep it finite (official
+/// code).
 const LENGTH_FLOOR: f64 = 1e-20;
-/// Cosines are clamped this far inside [-1, 1] (official code), so a perfect flow scores 4.5e-4 rad.
+/// Cosines are clamped this far inside [-1, 1] (official code), so a perfect flow scores 4.5e-4
+/// rad.
 const COSINE_MARGIN: f64 = 1e-7;
 
-/// How good a flow is, over the scored points.
+/// Error metrics of a flow over the scored points.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Metrics {
-    /// Scored points.
+    /// Number of scored points.
     pub points: usize,
-    /// Mean end-point error, metres.
+    /// Mean end-point error (EPE), metres.
     pub epe: f64,
-    /// Share of points with an error under 0.05 m or 5 %.
+    /// Share of points with an end-point error under 0.05 m or under 5 % of the true flow.
     pub acc5: f64,
-    /// Share of points with an error under 0.1 m or 10 %.
+    /// Share of points with an end-point error under 0.1 m or under 10 % of the true flow.
     pub acc10: f64,
-    /// Share of points with an error over 0.3 m or 10 %.
+    /// Share of points with an end-point error over 0.3 m or over 10 % of the true flow.
     pub outliers: f64,
     /// Mean angle between estimated and true flow, radians; pi/2 where either is zero.
     pub angle_error: f64,
@@ -31,12 +33,13 @@ pub struct Metrics {
     pub epe_dynamic: Option<f64>,
     /// EPE over static points, metres; none without a dynamic mask or without such points.
     pub epe_static: Option<f64>,
-    /// Three-way EPE over points in the close square; none without the dynamic and foreground
+    /// Three-way EPE over the points in the close square. None without the dynamic and foreground
     /// masks, the source cloud, or any close point.
     pub three_way: Option<ThreeWay>,
 }
 
-/// Scores one flow, N x 3 metres, against its truth; `covered` marks rows the estimate speaks for.
+/// Scores the flow of one pair (N x 3, metres) against its truth. `covered` marks the rows for
+/// which the estimate has a flow.
 ///
 /// # Errors
 /// Arrays of different lengths, or no row that can be scored.
@@ -46,7 +49,7 @@ pub fn evaluate(flow: &[Point], covered: &[bool], truth: &Truth) -> Result<Metri
     pool.finish()
 }
 
-/// Gathers metrics over many pairs; every scored point weighs the same.
+/// Accumulator of metrics over many pairs. Every scored point has the same weight.
 #[derive(Debug, Clone, Default)]
 pub struct Pool {
     error: Mean,
@@ -60,10 +63,11 @@ pub struct Pool {
 }
 
 impl Pool {
-    /// Adds the scored points of one pair. A pair without a mask adds nothing to what needs it.
+    /// Adds the scored points of one pair. A pair without a mask adds nothing to the metrics that
+    /// need it.
     ///
     /// # Errors
-    /// Arrays of different lengths; the pool is unchanged then.
+    /// Arrays of different lengths; the pool is then unchanged.
     pub fn add(
         &mut self,
         flow: &[Point],
@@ -101,7 +105,7 @@ impl Pool {
         self.outlier.add_share(error > 0.3 || relative > 0.1);
     }
 
-    /// The metrics of everything added so far.
+    /// The metrics of all pairs added so far.
     ///
     /// # Errors
     /// No row was scored.
@@ -121,13 +125,13 @@ impl Pool {
     }
 }
 
-/// Angle between two flows, radians; a zero flow has no direction and counts as a right angle.
+/// Angle between two flows, radians. A zero flow has no direction and counts as a right angle.
 fn angle_between(a: [f64; 3], b: [f64; 3]) -> f64 {
     let cosine = dot(unit(a), unit(b)).clamp(COSINE_MARGIN - 1.0, 1.0 - COSINE_MARGIN);
     if cosine.is_nan() { 0.0 } else { cosine }.acos()
 }
 
-/// The direction of a vector; not a number for the zero vector.
+/// Unit vector; NaN for the zero vector.
 fn unit(vector: [f64; 3]) -> [f64; 3] {
     let length = norm(vector);
     vector.map(|component| component / length)
@@ -139,9 +143,9 @@ mod tests {
     use proptest::prelude::*;
     use std::f64::consts::FRAC_PI_2;
 
-    /// The data is in single precision, up to 10 m.
+    /// Tolerance of single-precision input up to 10 m.
     const SINGLE: f64 = 1e-6;
-    /// Sums in another order differ by their rounding only.
+    /// Tolerance of sums in another order.
     const ROUNDING: f64 = 1e-12;
 
     fn plain(flow: &[Point], truth: &[Point]) -> Metrics {
@@ -203,7 +207,8 @@ mod tests {
         assert!((metrics.epe - (0.04 + far + 0.2 + 0.4) / 4.0).abs() < SINGLE);
         // Row 0 is within 5 cm, row 3 within 5 %.
         assert_eq!((metrics.acc5, metrics.acc10), (0.5, 0.5));
-        // Row 1 by length, row 2 by its infinite share, row 3 by length.
+        // Row 1 by its absolute error, row 2 by its infinite relative error, row 3 by its absolute
+        // error.
         assert_eq!(metrics.outliers, 0.75);
         let parallel = (1.0f64 - 1e-7).acos();
         let angle = (0.04f64.atan() + FRAC_PI_2 + FRAC_PI_2 + parallel) / 4.0;

@@ -1,8 +1,8 @@
-//! How good a flow is: the metrics of the paper and of the field's two public benchmarks.
+//! Evaluation metrics of scene flow: those of the paper and of two public benchmarks.
 //!
-//! Works on arrays in memory; it must not know where a flow or its truth came from.
-//! The paper's metrics are those of its evaluation code; the benchmarks are Argoverse 2's scene
-//! flow task (three-way EPE) and its second edition (bucket-normalized EPE).
+//! Works on arrays in memory. The paper's metrics follow its evaluation code. The benchmarks are
+//! the Argoverse 2 scene flow task (three-way EPE) and its second edition (bucket-normalized EPE).
+//! The calibration of the confidence is measured as well.
 
 mod argoverse;
 mod buckets;

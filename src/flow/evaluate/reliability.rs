@@ -1,19 +1,20 @@
-//! How far a confidence can be believed: what it said against what was right.
+//! Calibration of the confidence: reliability diagram and expected calibration error.
 //!
-//! A point is right where its end-point error is below [`SURE_M`]; the calibration error is the mean
-//! over ten bins of confidence of the gap between both, by points (Guo et al. 2017). It must not know
-//! how confidence was made.
+//! A point is correct if its end-point error is below [`CONFIDENT_WITHIN_M`]. The expected calibration error is
+//! the mean absolute difference between confidence and share of correct points over ten confidence
+//! bins, weighted by points (Guo et al. 2017).
 
 use super::truth::{EvaluateError, Truth, double, end_point_error};
 use crate::flow::data::Point;
-use crate::flow::objects::SURE_M;
+use crate::flow::objects::CONFIDENT_WITHIN_M;
 
-/// Bins of the diagram.
+/// Bins of the reliability diagram.
 const BINS: usize = 10;
-/// Cells of confidence that errors are gathered in: what is sorted into one cell counts alike.
+/// Histogram cells of the confidence, in which errors are summed. Points in one cell are not
+/// distinguished.
 const CELLS: usize = 1000 * BINS;
 
-/// Gathers confidence and errors over many pairs, in memory that does not grow.
+/// Accumulator of confidence and errors over many pairs, in constant memory.
 #[derive(Clone, Debug)]
 pub struct Reliability {
     cells: Vec<Cell>,
@@ -27,29 +28,29 @@ struct Cell {
     points: f64,
 }
 
-/// How a confidence and what is right go together.
+/// Calibration of a confidence.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Calibration {
-    /// Points.
+    /// Number of points.
     pub points: usize,
-    /// The expected calibration error, 0 to 1.
+    /// Expected calibration error, 0 to 1.
     pub error: f64,
-    /// EPE of the more confident half, metres.
+    /// EPE of the half of the points with the higher confidence, metres.
     pub sure_half_epe: f64,
-    /// EPE of the rest, metres.
+    /// EPE of the other half, metres.
     pub rest_epe: f64,
-    /// The bins that hold points, the least confident first.
+    /// The bins that have points, lowest confidence first.
     pub bins: Vec<CalibrationBin>,
 }
 
 /// One bin of a reliability diagram.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CalibrationBin {
-    /// Share of all points.
+    /// Share of all points that are in the bin.
     pub share: f64,
-    /// Mean confidence.
+    /// Mean confidence of its points.
     pub confidence: f64,
-    /// Share of its points that are right.
+    /// Share of its points that are correct.
     pub right: f64,
 }
 
@@ -62,17 +63,18 @@ impl Default for Reliability {
 }
 
 impl Reliability {
-    /// Adds a point of a confidence, 0 to 1, that is `error_m` metres off.
+    /// Adds a point with a confidence of 0 to 1 and an end-point error of `error_m` metres.
     pub fn add(&mut self, confidence: f64, error_m: f64) {
         let cell = ((confidence * CELLS as f64) as usize).min(CELLS - 1);
         let cell = &mut self.cells[cell];
         cell.confidence += confidence;
         cell.error_m += error_m;
-        cell.right += f64::from(u8::from(error_m < f64::from(SURE_M)));
+        cell.right += f64::from(u8::from(error_m < f64::from(CONFIDENT_WITHIN_M)));
         cell.points += 1.0;
     }
 
-    /// Adds the scored points of one pair, each with its confidence.
+    /// Adds the scored points of one pair, with N confidences. `covered` marks the rows for which
+    /// the estimate has a flow.
     ///
     /// # Errors
     /// Arrays of different lengths; nothing is added then.
@@ -92,7 +94,7 @@ impl Reliability {
         Ok(())
     }
 
-    /// The calibration of everything added so far; none of nothing.
+    /// The calibration over all points added so far; none without points.
     pub fn finish(&self) -> Option<Calibration> {
         let sum = |cells: &[Cell]| {
             cells.iter().fold(Cell::default(), |sum, cell| Cell {
@@ -118,7 +120,7 @@ impl Reliability {
         let off = bins
             .iter()
             .map(|bin| bin.share * (bin.confidence - bin.right).abs());
-        // The cell that the middle lies in belongs to both halves in part.
+        // The cell that contains the median counts partly in each half.
         let (mut left, mut sure_m) = (all.points / 2.0, 0.0);
         for cell in self.cells.iter().rev().filter(|cell| cell.points > 0.0) {
             let taken = cell.points.min(left);
@@ -149,7 +151,7 @@ mod tests {
     #[test]
     fn a_case_done_by_hand() {
         let mut reliability = Reliability::default();
-        // Of four at 0.9 three are right, of two at 0.25 none is.
+        // Of four points at 0.9 three are correct, of two at 0.25 none is.
         for (confidence, error_m) in [
             (0.9, 0.01),
             (0.9, 0.02),
@@ -164,7 +166,7 @@ mod tests {
         assert_eq!(found.points, 6);
         let expected = 4.0 / 6.0 * 0.15 + 2.0 / 6.0 * 0.25;
         assert!((found.error - expected).abs() < ROUNDING, "{found:?}");
-        // Three of the four in the upper cell: their mean error each.
+        // Three of the four points in the upper cell, each with the mean error of the cell.
         assert!((found.sure_half_epe - 0.09).abs() < ROUNDING, "{found:?}");
         let rest = (0.09 + 0.6) / 3.0;
         assert!((found.rest_epe - rest).abs() < ROUNDING, "{found:?}");

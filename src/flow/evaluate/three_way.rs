@@ -1,7 +1,8 @@
-//! Three-way EPE: foreground dynamic, foreground static and background static weigh the same.
+//! Three-way EPE: mean over foreground dynamic, foreground static and background static.
 //!
-//! Argoverse 2's official mean, each part pooled over the points of all frames. Dynamic background
-//! points belong to no part, as there.
+//! The official Argoverse 2 definition: each part is pooled over the points of all sweeps, and the
+//! three parts have the same weight. Dynamic background points belong to no part, as in the
+//! official code.
 
 use super::truth::Mean;
 
@@ -10,25 +11,25 @@ use super::truth::Mean;
 pub struct Part {
     /// Mean end-point error, metres; none where the part has no points.
     pub epe: Option<f64>,
-    /// Scored points of the part.
+    /// Number of scored points of the part.
     pub points: usize,
 }
 
 /// Three-way EPE and its parts.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ThreeWay {
-    /// Mean of the three parts, metres. None where a part has no points: the official mean is not
-    /// a number then, and a mean over two parts could not be compared with one over three.
+    /// Mean of the three parts, metres. None where a part has no points: the official mean is then
+    /// NaN, and a mean over two parts would not be comparable with one over three.
     pub epe: Option<f64>,
     /// Moving objects.
     pub foreground_dynamic: Part,
-    /// Objects that stand still.
+    /// Static objects.
     pub foreground_static: Part,
-    /// The static world.
+    /// The static background.
     pub background_static: Part,
 }
 
-/// Gathers the three parts.
+/// Accumulator of the three parts.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct ThreeWaySums {
     asked: bool,
@@ -49,7 +50,7 @@ impl ThreeWaySums {
         }
     }
 
-    /// The parts and their mean; none where no point with masks was added.
+    /// The parts and their mean; none if no point with masks was added.
     pub(super) fn finish(&self) -> Option<ThreeWay> {
         let part = |mean: Mean| Part {
             epe: mean.value(),

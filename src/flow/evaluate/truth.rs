@@ -1,36 +1,36 @@
-//! What is known about a pair, and which of its rows are scored.
+//! Ground truth of a pair, and the selection of the scored rows.
 //!
-//! One rule for every metric: a row counts where the truth is valid, the point is not ground, the
-//! estimate covers it and both flows are finite. It must not know any metric.
+//! All metrics share one rule: a row is scored if the truth is valid, the point is not ground, the
+//! estimate covers it and both flows are finite.
 
 use crate::flow::data::{Point, RigidTransform};
 
-/// Half the width of the square around the sensor that "close" means, metres (Argoverse 2).
+/// Half-width of the square around the sensor whose points are "close", metres (Argoverse 2).
 pub const CLOSE_HALF_WIDTH_M: f32 = 35.0;
 
-/// Why a flow could not be scored.
+/// The reason why a flow could not be scored.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum EvaluateError {
     /// An array does not have one row per point.
     #[error("{what} has {found} rows where {expected} are needed")]
     Length {
-        /// The array.
+        /// Name of the array.
         what: &'static str,
         /// Rows of the true flow.
         expected: usize,
         /// Rows of the array.
         found: usize,
     },
-    /// A metric needs something that the truth does not hold.
+    /// A metric needs data that the truth does not have.
     #[error("the truth has no {what}")]
     Missing {
-        /// What is missing.
+        /// Name of the missing data.
         what: &'static str,
     },
-    /// A class index past the classes the accumulator was made for.
+    /// A class index out of range of the accumulator.
     #[error("class {class} is not one of {classes} classes")]
     UnknownClass {
-        /// The index found.
+        /// The class index.
         class: u8,
         /// Number of classes.
         classes: usize,
@@ -40,27 +40,27 @@ pub enum EvaluateError {
     NoPoints,
 }
 
-/// Ground truth of one pair: every slice has one row per source point.
+/// Ground truth of one pair. Every slice has one row per source point.
 #[derive(Debug, Clone, Copy)]
 pub struct Truth<'a> {
-    /// True flow, metres per frame, ego motion included.
+    /// True flow, N x 3 metres per sweep interval, ego motion included.
     pub flow: &'a [Point],
-    /// Where the true flow is known.
+    /// Points whose true flow is known.
     pub valid: &'a [bool],
-    /// Points that move relative to the world.
+    /// Points that move relative to the static world.
     pub dynamic: Option<&'a [bool]>,
     /// Points on an object of a known class, parked or moving.
     pub foreground: Option<&'a [bool]>,
     /// Ground points, which are never scored.
     pub ground: Option<&'a [bool]>,
-    /// Source points, metres, sensor frame: they say what is close.
+    /// Source points, metres, in the sensor frame. They determine which points are close.
     pub source: Option<&'a [Point]>,
-    /// Ego motion as target_from_source: where a static source point is found in the target frame.
+    /// Ego motion as target_from_source, which maps a static source point into the target's frame.
     pub ego: Option<&'a RigidTransform>,
 }
 
 impl<'a> Truth<'a> {
-    /// Truth without masks: metrics that need one are left out.
+    /// Truth without masks. Metrics that need a mask are then omitted.
     pub fn new(flow: &'a [Point], valid: &'a [bool]) -> Self {
         Self {
             flow,
@@ -73,7 +73,8 @@ impl<'a> Truth<'a> {
         }
     }
 
-    /// Checks that every array, the estimate's too, has one row per point of the true flow.
+    /// Checks that every array, including those of the estimate, has one row per point of the true
+    /// flow.
     pub(super) fn check_lengths(
         &self,
         flow: &[Point],
@@ -88,7 +89,7 @@ impl<'a> Truth<'a> {
         self.check_length("the source cloud", self.source.map(<[Point]>::len))
     }
 
-    /// Checks one more array against the rows of the true flow.
+    /// Checks that one array has one row per point of the true flow.
     pub(super) fn check_length(
         &self,
         what: &'static str,
@@ -105,7 +106,7 @@ impl<'a> Truth<'a> {
         }
     }
 
-    /// The scored rows, in order. Lengths have been checked.
+    /// The scored rows, in order. The lengths must have been checked.
     pub(super) fn scored(&self, flow: &[Point], covered: &[bool]) -> impl Iterator<Item = usize> {
         (0..self.flow.len()).filter(move |&row| {
             self.valid[row]
@@ -126,7 +127,7 @@ fn is_finite(vector: Point) -> bool {
     vector.iter().all(|component| component.is_finite())
 }
 
-/// The vector in double precision: sums and angles are taken there.
+/// The vector in double precision, which sums and angles use.
 pub(super) fn double(vector: Point) -> [f64; 3] {
     vector.map(f64::from)
 }
@@ -144,7 +145,7 @@ pub(super) fn end_point_error(estimate: [f64; 3], truth: [f64; 3]) -> f64 {
     norm([0, 1, 2].map(|axis| estimate[axis] - truth[axis]))
 }
 
-/// A mean that is gathered one value at a time.
+/// Running mean.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Mean {
     sum: f64,
@@ -161,7 +162,7 @@ impl Mean {
         self.add(f64::from(u8::from(holds)));
     }
 
-    /// The mean, or none of nothing.
+    /// The mean; none without values.
     pub(super) fn value(&self) -> Option<f64> {
         (self.count > 0).then(|| self.sum / self.count as f64)
     }

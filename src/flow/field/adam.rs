@@ -1,13 +1,13 @@
-//! Adam (Kingma and Ba 2015), on slices: every backend with plain floats steps through this.
+//! Adam (Kingma and Ba 2015), on slices of single-precision floats.
 
-/// Decay of the mean of the gradients.
+/// Decay of the running mean of the gradients.
 const BETA1: f64 = 0.9;
-/// Decay of the mean of their squares.
+/// Decay of the running mean of their squares.
 const BETA2: f64 = 0.999;
-/// Keeps the quotient finite.
+/// Added to the denominator.
 const EPSILON: f32 = 1e-8;
 
-/// The factors of one step, the same for every parameter.
+/// The factors of one Adam step, equal for all parameters.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct AdamStep {
     pub(crate) step_size: f32,
@@ -24,8 +24,8 @@ impl AdamStep {
         }
     }
 
-    /// Moves `parameters` against their `gradients`; `moments` are the means of the gradients and
-    /// of their squares.
+    /// Updates `parameters` and `moments` by their `gradients`. `moments` are the running means of
+    /// the gradients and of their squares.
     pub(crate) fn apply(
         &self,
         gradients: &[f32],
@@ -48,7 +48,7 @@ impl AdamStep {
 mod tests {
     use super::*;
 
-    /// Single-precision steps against double-precision ones over a hundred iterations.
+    /// Single-precision against double-precision steps, over a hundred iterations.
     const TOLERANCE: f64 = 1e-5;
 
     #[test]

@@ -1,25 +1,25 @@
-//! The seam to a device: what the solver asks of whatever computes.
+//! The interface between the fit and a compute device.
 
 use super::network::Network;
 use super::snapshot::TrainerState;
 use crate::flow::data::{Control, Interrupt, Point};
 use crate::flow::distance::{DistanceError, DistanceOptions};
-use crate::flow::host::Host;
-use crate::flow::options::Options;
+use crate::flow::host::{Host, HostError};
+use crate::flow::options::FieldOptions;
 
 /// A device that can fit a field to a pair.
 pub trait Backend: Send + Sync {
     /// The device's name, as reports show it.
     fn name(&self) -> String;
 
-    /// The host's threads: they align and find movers whatever the device.
+    /// The host's thread pool. Registration and the object search run there on every device.
     fn host(&self) -> &Host;
 
-    /// Builds the distance transform of `target` over a grid that covers both clouds; looks at
-    /// `control` between its pieces.
+    /// Builds the distance transform of `target` over a grid that covers both clouds, metres.
+    /// Checks `control` between parts of the work.
     ///
     /// # Errors
-    /// [`BackendError`] where the clouds are refused, the watch interrupts or the device fails.
+    /// [`BackendError`] if the clouds are refused, the control interrupts or the device fails.
     fn transform(
         &self,
         source: &[Point],
@@ -28,10 +28,10 @@ pub trait Backend: Send + Sync {
         control: &dyn Control,
     ) -> Result<Box<dyn Transform>, BackendError>;
 
-    /// What `network` says at `points`: a displacement each, metres.
+    /// The flow of `network` at N `points`: N x 3 displacements, metres.
     ///
     /// # Errors
-    /// [`BackendError`] where the device fails.
+    /// [`BackendError`] if the device fails.
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError>;
 }
 
@@ -43,119 +43,122 @@ pub trait Transform: Send {
     /// The distance to the target at each of `points`, metres.
     ///
     /// # Errors
-    /// [`BackendError`] where the device fails.
+    /// [`BackendError`] if the device fails.
     fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError>;
 
-    /// A field at its start, to be fitted to `source`: at most as many points as the transform was
-    /// built for.
+    /// Starts a fit of a field to `source`, before its first iteration. `source` has at most as
+    /// many points as the transform was built for.
     ///
     /// # Errors
-    /// [`BackendError`] where the device fails.
+    /// [`BackendError`] if the device fails, or does not support the options.
     fn start(
         &self,
         source: &[Point],
-        options: &Options,
+        options: &FieldOptions,
+        seed: u64,
     ) -> Result<Box<dyn Trainer + '_>, BackendError>;
 }
 
-/// One optimization in progress.
+/// A fit in progress.
 pub trait Trainer: Send {
-    /// Does up to `steps` iterations; looks at `control` before each. Comes back before the steps
-    /// are done where a snapshot is due, but never without an iteration.
+    /// Does up to `steps` iterations. Checks `control` before each, or before each group of
+    /// iterations that a GPU does at once. Returns early if a snapshot is due, but only after at
+    /// least one iteration.
     ///
     /// # Errors
-    /// [`BackendError`] where the device fails.
+    /// [`BackendError`] if the device fails.
     fn advance(&mut self, steps: usize, control: &dyn Control) -> Result<Advance, BackendError>;
 
-    /// The result so far at `points`, which need not be the fitted ones: a displacement each,
-    /// metres.
+    /// The flow of the result so far at N `points`: N x 3 displacements, metres. The points need
+    /// not be those of the fit.
     ///
     /// # Errors
-    /// [`BackendError`] where the device fails.
+    /// [`BackendError`] if the device fails.
     fn evaluate(&mut self, points: &[Point]) -> Result<Vec<Point>, BackendError>;
 
-    /// What has been reached and what it took.
+    /// The iterations, the loss and the time of the distance query so far.
     fn report(&self) -> FitReport;
 
-    /// What the following iterations and the result depend on.
+    /// The state that the following iterations and the result depend on.
     ///
     /// # Errors
-    /// [`BackendError`] where the device fails.
+    /// [`BackendError`] if the device fails.
     fn state(&mut self) -> Result<TrainerState, BackendError>;
 
-    /// Goes on from `state`, which a trainer of the same points and options had.
+    /// Resumes from `state`, which is that of a trainer with the same points and options.
     ///
     /// # Errors
-    /// [`BackendError`] where the device fails.
+    /// [`BackendError`] if the device fails.
     fn restore(&mut self, state: TrainerState) -> Result<(), BackendError>;
 
-    /// Ends after `max_iterations` at the latest, and lets the step size fall accordingly.
+    /// Limits the fit to `max_iterations`; a cosine schedule then falls to zero at that iteration.
     fn shorten(&mut self, max_iterations: usize);
 }
 
 /// How a call of [`Trainer::advance`] ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Advance {
-    /// All steps were done, or a snapshot is due; more may follow.
+    /// All steps were done, or a snapshot is due; more iterations may follow.
     Continues,
-    /// The stopping rule fired.
+    /// Early stopping fired.
     Converged,
-    /// All iterations that the options allow are done.
+    /// The maximum number of iterations of the options is done.
     Exhausted,
-    /// A loss was not a number.
+    /// A loss was not finite.
     Diverged,
-    /// The watch asked for the end.
+    /// The control interrupted the fit.
     Interrupted(Interrupt),
 }
 
-/// What a trainer has reached.
+/// The state of a fit, for reports.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FitReport {
-    /// Iterations done.
+    /// Number of iterations done.
     pub iterations: usize,
-    /// The iteration, from 1, whose field [`Trainer::evaluate`] uses; the latest for an average.
+    /// The iteration, from 1, whose field [`Trainer::evaluate`] uses; the latest one if the result
+    /// is a running average.
     pub best_iteration: usize,
-    /// Its loss, metres; the running mean of the batches' losses for an average.
+    /// Its mean loss, metres; for a running average, the running mean of the batches' losses.
     pub best_loss: f64,
-    /// Seconds in the distance query: the mean over the threads that ran it.
+    /// Time of the distance query, seconds: the mean over the threads that ran it.
     pub query_seconds: f64,
 }
 
-/// Why a device could not go on.
+/// Why a device failed or refused the work.
 #[derive(Debug, thiserror::Error)]
 pub enum BackendError {
     /// The distance transform was refused.
     #[error(transparent)]
     Distance(DistanceError),
-    /// The watch asked for the end before there was anything to fit to.
+    /// The control interrupted the work before the first iteration.
     #[error("interrupted before the first iteration")]
     Interrupted(Interrupt),
-    /// Threads could not be started.
-    #[error("cannot start worker threads: {0}")]
-    Threads(String),
-    /// No device answers to what was asked for.
+    /// The thread pool could not be started.
+    #[error(transparent)]
+    Threads(#[from] HostError),
+    /// No device matches the request.
     #[error("no such device: {0}")]
     NoDevice(String),
-    /// The device cannot do what the options ask for.
+    /// The device does not support the options.
     #[error("the device cannot do this: {0}")]
     Unsupported(&'static str),
-    /// The pair does not fit on the device.
+    /// The pair does not fit in the device's memory.
     #[error("{needed} bytes are needed for the {what}, and the device has {available}")]
     Memory {
-        /// What does not fit.
+        /// The data that does not fit.
         what: &'static str,
         /// Bytes needed.
         needed: u64,
         /// Bytes that the device has for it.
         available: u64,
     },
-    /// Other pairs have the memory that this one needs; later there will be room.
+    /// Other pairs occupy the memory that this pair needs. Retry later.
     #[error("the memory of the device is taken by other pairs")]
     Busy,
-    /// The device is gone: it must be opened again before it can do anything.
+    /// The device was lost and must be reopened before further use.
     #[error("the device was lost: {0}")]
     Lost(String),
-    /// The device refused a command: a defect of this program or of the driver.
+    /// The device rejected a command: a defect of this program or of the driver.
     #[error("the device failed: {0}")]
     Device(String),
 }

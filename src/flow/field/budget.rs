@@ -1,109 +1,73 @@
-//! How work is cut so that a deadline holds: coarser cells, cheaper iterations, fewer of them.
+//! Adapts a fit to its deadline: coarser cells, cheaper iterations, or fewer of them.
 //!
-//! A transform of four times coarser cells takes a thirtieth of the time. It is built first: it
-//! shows how fast the machine is, and it is there should nothing finer fit. Later the network's
-//! speed is measured on some points, and what is left is cut into as many iterations as fit, with
-//! the final evaluation set aside. Sees only the backend's traits.
+//! With four times coarser cells, a distance transform takes a thirtieth of the time. Under a tight
+//! deadline it is built first. It measures the machine's speed, and it is the fallback if no finer
+//! transform fits. Then the network's speed is measured on some points. The remaining time, less a
+//! reserve for the final evaluation, determines the batch size and the number of iterations.
 
 use super::backend::{Backend, BackendError, Trainer, Transform};
-use super::snapshot::Snapshot;
-use crate::flow::data::{Control, Interrupt, Point, Progress, RigidTransform, stride_sample};
-use crate::flow::error::FlowError;
-use crate::flow::options::{DeadlineLimits, Ego, LearningRateSchedule, Options};
-use crate::flow::select::Selection;
+use super::error::FitError;
+use crate::flow::data::{Control, EarlierDeadline, Interrupt, Point};
+use crate::flow::options::{DeadlineLimits, FieldOptions, LearningRateSchedule};
 
-/// Time left from which nothing is measured before the transform, seconds a point of both clouds:
-/// twenty times what a slow core takes for the transform.
+/// With more time left than this, the requested transform is built directly, seconds per point of
+/// both clouds: twenty times the time of the transform on a slow core.
 const AMPLE_SECONDS_PER_POINT: f64 = 4e-5;
-/// The first transform's cells, in cells of the options.
+/// Cells of the first transform, relative to those of the options.
 const COARSE: f64 = 4.0;
-/// Finer cells, best first, and what their transform takes in times of the first one: 20 to 35 and
-/// 3.6 to 4.5, measured on three sweeps. Wrong guesses cost accuracy, not the deadline.
+/// Finer cells, best first, and the time of their transform relative to the first one: 20 to 35 and
+/// 3.6 to 4.5, measured on three sweeps. Wrong values cost accuracy, not the deadline.
 const FINER: [(f64, f64); 2] = [(1.0, 28.0), (2.0, 4.5)];
-/// Share of the time left that a finer transform may be expected to take.
+/// A finer transform is tried only if it is expected to take at most this share of the time left.
 const EXPECTED_SHARE: f64 = 0.4;
-/// Share of the time left after which a finer transform is given up.
+/// A finer transform is abandoned after this share of the time left.
 const GIVEN_UP_SHARE: f64 = 0.6;
-/// Points of each cloud that are aligned where time is short: a millimetre is not to be had then.
-const ALIGNED: usize = 8192;
-/// Time left from which all points are aligned where nothing else shows how fast the machine is,
-/// seconds a point: four times what a slow core takes.
-const ALIGNMENT_SECONDS_PER_POINT: f64 = 2e-6;
-/// Time left from which a sweep around the pair is looked at, seconds a point of it and the target:
-/// it is the first to be done without.
-const AROUND_SECONDS_PER_POINT: f64 = 2e-5;
-/// Points on which the network's speed is measured: about a millisecond, whole tiles.
+/// Points on which the network's speed is measured: about a millisecond, and a whole number of
+/// tiles.
 const MEASURED: usize = 1536;
-/// Less than this is what it takes to ask a device anything, seconds: then more points are measured.
+/// A shorter measurement is dominated by the device's latency, seconds; more points are then
+/// measured.
 const LATENCY: f64 = 4e-4;
-/// As many.
+/// Number of points of that second measurement.
 const MEASURED_WHERE_FAST: usize = 16 * MEASURED;
-/// What an iteration costs a point, in evaluations: forward, twice that backward, and the query.
+/// Cost of an iteration relative to an evaluation, per point: forward pass, twice that for the
+/// backward pass, and the distance query.
 const ITERATION: f64 = 3.4;
-/// Where the step size falls, a run that is predicted to take this many times too long is begun
-/// all the same: the prediction is rough, and it can be shortened.
+/// With a cosine schedule, a fit that is predicted to take up to this many times the available time
+/// is started unchanged. The prediction is rough, and the fit can be shortened later.
 const ROUGH: f64 = 1.35;
-/// What is set aside for the final evaluation, in times of what it should take.
+/// Reserve for the final evaluation, relative to its predicted time.
 const EVALUATION: f64 = 1.15;
-/// Set aside for what nobody measures, seconds.
+/// Reserve for unmeasured work, seconds.
 const SLACK: f64 = 0.006;
-/// Rows that are evaluated between two looks at the clock.
+/// Points that are evaluated between two checks of the time left.
 const ROWS_AT_ONCE: usize = 9216;
-/// A run is shortened where less than this share of its iterations fits.
+/// A fit is shortened if less than this share of its remaining iterations fits.
 const FITTING_SHARE: f64 = 0.95;
-/// Share of the time left that may pass without a look at the clock, on devices that do several
-/// iterations at once.
+/// Share of the time left that may pass without a check, on devices that do several iterations at
+/// once.
 const STEPS_SHARE: f64 = 0.05;
-/// Iterations between two such checks.
+/// Iterations between two checks of whether the remaining ones fit.
 const ITERATIONS_AT_ONCE: usize = 8;
 
-/// A watch whose deadline comes earlier.
-pub(crate) struct EarlierDeadline<'a> {
-    control: &'a dyn Control,
-    /// Seconds by which it does.
-    reserve: f64,
-}
-
-impl Control for EarlierDeadline<'_> {
-    fn seconds(&self) -> f64 {
-        self.control.seconds()
-    }
-    fn seconds_left(&self) -> Option<f64> {
-        self.control.seconds_left().map(|left| left - self.reserve)
-    }
-    fn interrupt(&self) -> Option<Interrupt> {
-        let late = || self.seconds_left().is_some_and(|left| left <= 0.0);
-        let interrupt = self.control.interrupt();
-        interrupt.or_else(|| late().then_some(Interrupt::Deadline))
-    }
-    fn progress(&self, progress: Progress) {
-        self.control.progress(progress);
-    }
-    fn snapshot_due(&self) -> bool {
-        self.control.snapshot_due()
-    }
-    fn snapshot(&self, snapshot: Snapshot) {
-        self.control.snapshot(snapshot);
-    }
-}
-
-/// What the field is fitted to.
+/// The finest distance transform that the time allows.
 pub(crate) struct Prepared {
     pub(crate) transform: Box<dyn Transform>,
-    pub(crate) ego: Option<RigidTransform>,
-    /// Whether it is all that the options ask for.
+    /// Whether it has the cells of the options.
     pub(crate) whole: bool,
 }
 
-/// The finest transform that the time left holds, and the ego motion, sought about `prior`; none
-/// where the deadline leaves no time for any.
+/// The finest transform of `target` that fits in the time left, over a grid that covers both
+/// clouds; none if there is no time for any.
+///
+/// # Errors
+/// [`FitError`] if the clouds are refused, the control cancels or the device fails.
 pub(crate) fn prepare(
     backend: &dyn Backend,
-    selection: &Selection,
-    options: &Options,
-    prior: &RigidTransform,
+    [source, target]: [&[Point]; 2],
+    options: &FieldOptions,
     control: &dyn Control,
-) -> Result<Option<Prepared>, FlowError> {
+) -> Result<Option<Prepared>, FitError> {
     let on_time = EarlierDeadline {
         control,
         reserve: 0.0,
@@ -112,23 +76,18 @@ pub(crate) fn prepare(
         let mut distance = options.distance.clone();
         distance.cell_m *= coarser;
         distance.band_m = distance.band_m.max(distance.cell_m);
-        match backend.transform(&selection.source, &selection.target, &distance, control) {
+        match backend.transform(source, target, &distance, control) {
             Ok(transform) => Ok(Some(transform)),
             Err(BackendError::Interrupted(Interrupt::Deadline)) => Ok(None),
-            Err(BackendError::Interrupted(Interrupt::Cancelled)) => Err(FlowError::Cancelled),
+            Err(BackendError::Interrupted(Interrupt::Cancelled)) => Err(FitError::Cancelled),
             Err(error) => Err(error.into()),
         }
     };
-    let aligned = |transform: Box<dyn Transform>, whole: bool| Prepared {
-        transform,
-        ego: ego(backend, selection, options, prior, whole, &on_time),
-        whole,
-    };
-    let points = selection.source.len() + selection.target.len();
-    let ample = AMPLE_SECONDS_PER_POINT * points as f64;
+    let prepared = |transform: Box<dyn Transform>, whole: bool| Prepared { transform, whole };
+    let ample = AMPLE_SECONDS_PER_POINT * (source.len() + target.len()) as f64;
     if control.seconds_left().is_none_or(|left| left > ample) {
         let transform = transform(1.0, &on_time)?;
-        return Ok(transform.map(|transform| aligned(transform, true)));
+        return Ok(transform.map(|transform| prepared(transform, true)));
     }
     let began = control.seconds();
     let Some(coarse) = transform(COARSE, &on_time)? else {
@@ -145,91 +104,31 @@ pub(crate) fn prepare(
             reserve: left * (1.0 - GIVEN_UP_SHARE),
         };
         match transform(coarser, &early)? {
-            Some(transform) => return Ok(Some(aligned(transform, coarser == 1.0))),
+            Some(transform) => return Ok(Some(prepared(transform, coarser == 1.0))),
             None => break,
         }
     }
-    Ok(Some(aligned(coarse, false)))
+    Ok(Some(prepared(coarse, false)))
 }
 
-/// The ego motion where there is no transform: given, or, where nothing but it is needed, found from
-/// as many points as the time left holds.
-pub(crate) fn ego_alone(
-    backend: &dyn Backend,
-    selection: &Selection,
-    options: &Options,
-    prior: &RigidTransform,
-    control: &dyn Control,
-) -> Option<RigidTransform> {
-    if options.label.is_none() {
-        return match options.ego {
-            Ego::Given(target_from_source) => Some(target_from_source),
-            Ego::Auto | Ego::Off => None,
-        };
-    }
-    let points: usize = selection
-        .registration_clouds
-        .iter()
-        .flatten()
-        .map(Vec::len)
-        .sum();
-    let ample = ALIGNMENT_SECONDS_PER_POINT * points as f64;
-    let whole = control.seconds_left().is_none_or(|left| left > ample);
-    let on_time = EarlierDeadline {
-        control,
-        reserve: 0.0,
-    };
-    ego(backend, selection, options, prior, whole, &on_time)
-}
-
-/// Whether the time left holds a sweep around the pair: `points` to be aligned, and to be searched.
-pub(crate) fn has_time_around(points: usize, control: &dyn Control) -> bool {
-    let needed = AROUND_SECONDS_PER_POINT * points as f64;
-    control.interrupt().is_none() && control.seconds_left().is_none_or(|left| left > needed)
-}
-
-/// The ego motion that the options ask for, from the whole clouds or some of their points.
-fn ego(
-    backend: &dyn Backend,
-    selection: &Selection,
-    options: &Options,
-    prior: &RigidTransform,
-    whole: bool,
-    control: &dyn Control,
-) -> Option<RigidTransform> {
-    let align =
-        |[source, target]: [&[Point]; 2]| backend.host().align(source, target, prior, control);
-    match (options.ego, &selection.registration_clouds) {
-        (Ego::Given(target_from_source), _) => Some(target_from_source),
-        (Ego::Auto, Some([source, target])) if whole => Some(align([source, target])),
-        (Ego::Auto, Some(clouds)) => {
-            let [source, target] = clouds
-                .each_ref()
-                .map(|points| stride_sample(points, ALIGNED));
-            Some(align([&source, &target]))
-        }
-        (Ego::Off, _) | (Ego::Auto, None) => None,
-    }
-}
-
-/// How fast the network is, and what of the time is spoken for.
+/// The measured speed of the network, and the time reserved for the final evaluation.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Throughput {
-    /// Seconds that an evaluation takes a point.
+    /// Seconds per point of an evaluation.
     point: f64,
-    /// Seconds for the final evaluation and all that follows.
+    /// Seconds reserved for the final evaluation and all later work.
     evaluation: f64,
 }
 
 impl Throughput {
-    /// Measures on some of the points; the second time, for the first warms up.
+    /// Evaluates some of the points twice and times the second run; the first one is a warm-up.
     pub(crate) fn measure(
         trainer: &mut dyn Trainer,
         points: &[Point],
         control: &dyn Control,
-    ) -> Result<Self, FlowError> {
+    ) -> Result<Self, FitError> {
         let first = |count: usize| &points[..points.len().min(count)];
-        let mut seconds = |points: &[Point]| -> Result<f64, FlowError> {
+        let mut seconds = |points: &[Point]| -> Result<f64, FitError> {
             let began = control.seconds();
             trainer.evaluate(points)?;
             Ok(control.seconds() - began)
@@ -248,19 +147,21 @@ impl Throughput {
         })
     }
 
-    /// The options that fit into `left` seconds; nothing where those that were asked for fit.
+    /// Options that fit in `left` seconds; none if the requested options fit. With `max_iterations`
+    /// 0 there is no time for a useful number of iterations.
     pub(crate) fn under_deadline(
         &self,
-        options: &Options,
+        options: &FieldOptions,
         prepared: &Prepared,
+        has_ego: bool,
         points: usize,
         left: f64,
-    ) -> Option<Options> {
+    ) -> Option<FieldOptions> {
         let budget = (left - self.evaluation).max(0.0);
         let iteration = |batch: usize| self.point * ITERATION * batch as f64;
         let asked = options.batch.unwrap_or(points).min(points);
         let needed = options.expected_iterations() as f64 * iteration(asked);
-        let tolerance = match options.decay {
+        let tolerance = match options.learning_rate_schedule {
             LearningRateSchedule::Cosine => ROUGH,
             LearningRateSchedule::Constant => 1.0,
         };
@@ -271,12 +172,12 @@ impl Throughput {
             batches: [least, most],
             iterations,
             least_iterations,
-        } = DeadlineLimits::new(prepared.ego.is_some());
+        } = DeadlineLimits::new(has_ego);
         let wished = iterations.min(options.max_iterations) as f64;
         let fitting = budget / (wished * iteration(1));
         let batch = (fitting as usize / least * least).clamp(least, most.max(least));
         let batch = batch.min(asked);
-        // Never more work than was asked for, in more steps.
+        // Never more work than requested, even if it is divided into more iterations.
         let most = options.max_iterations.saturating_mul(asked) / batch;
         let fitting = ((budget / iteration(batch)) as usize).min(most);
         let enough = fitting >= least_iterations.min(options.max_iterations);
@@ -284,7 +185,7 @@ impl Throughput {
     }
 }
 
-/// The loop's clock: when to stop iterating, and how many more iterations fit.
+/// Time control of the iterations: when to stop, and how many more fit.
 pub(crate) struct Loop<'a> {
     control: &'a dyn Control,
     throughput: Option<Throughput>,
@@ -293,7 +194,8 @@ pub(crate) struct Loop<'a> {
 }
 
 impl<'a> Loop<'a> {
-    /// Begins after `first` iterations; without a pace there is no deadline to keep.
+    /// Starts the clock after `first` iterations. Without a throughput there is no deadline to
+    /// keep.
     pub(crate) fn begin(
         control: &'a dyn Control,
         throughput: Option<Throughput>,
@@ -307,8 +209,8 @@ impl<'a> Loop<'a> {
         }
     }
 
-    /// Iterations that may be done at once, of `steps`, and the watch over them: it ends them while
-    /// there is time for one iteration and the evaluation.
+    /// How many of `steps` iterations may be done at once, and their control. Its deadline leaves
+    /// time for one more iteration and the final evaluation.
     pub(crate) fn next(&self, done: usize, steps: usize) -> (usize, EarlierDeadline<'a>) {
         let reserve = self.throughput.map_or(0.0, |throughput| {
             throughput.evaluation + self.iteration(done)
@@ -321,7 +223,7 @@ impl<'a> Loop<'a> {
         let steps = match self.control.seconds_left() {
             Some(left) if self.throughput.is_some() && since > 0 => {
                 let fitting = STEPS_SHARE * (left - reserve) / self.iteration(done).max(1e-9);
-                // As many as up to the next check of what fits.
+                // At most up to the next check of the remaining iterations.
                 (fitting as usize).clamp(1, ITERATIONS_AT_ONCE - since % ITERATIONS_AT_ONCE)
             }
             _ if self.throughput.is_some() => 1,
@@ -330,11 +232,12 @@ impl<'a> Loop<'a> {
         (steps, early)
     }
 
-    /// Where the step size falls and the iterations up to the end do not fit: how many do.
-    pub(crate) fn shortened(&self, done: usize, options: &Options) -> Option<usize> {
+    /// With a cosine schedule, the maximum number of iterations that fits; none if the planned ones
+    /// fit or no check is due.
+    pub(crate) fn shortened(&self, done: usize, options: &FieldOptions) -> Option<usize> {
         let throughput = self.throughput?;
         let since = done - self.first;
-        if options.decay != LearningRateSchedule::Cosine
+        if options.learning_rate_schedule != LearningRateSchedule::Cosine
             || since == 0
             || !since.is_multiple_of(ITERATIONS_AT_ONCE)
         {
@@ -346,18 +249,18 @@ impl<'a> Loop<'a> {
         (fitting < FITTING_SHARE * wanted).then_some(done + fitting as usize)
     }
 
-    /// Seconds of one iteration: the mean so far.
+    /// Mean seconds per iteration so far.
     fn iteration(&self, done: usize) -> f64 {
         (self.control.seconds() - self.began) / (done - self.first).max(1) as f64
     }
 }
 
-/// The result so far at `points`; zero from where the deadline passes.
+/// The flow of the result so far at `points`, metres; zero for the points after the deadline.
 pub(crate) fn evaluate(
     trainer: &mut dyn Trainer,
     points: &[Point],
     control: &dyn Control,
-) -> Result<Vec<Point>, FlowError> {
+) -> Result<Vec<Point>, FitError> {
     if control.seconds_left().is_none() {
         return Ok(trainer.evaluate(points)?);
     }

@@ -1,139 +1,29 @@
-//! A field as bytes, so that another process can go on with it. Knows no files.
-//!
-//! ```text
-//! ego: has one u8, rotation i j k w, translation x y z: f64 each
-//!   | residual u8: 0 still | 1 network: center x y z, scale, parameters: f32 each
-//!   | 2 objects: as `label/stored.rs` says
-//! ```
-//!
-//! Sealed as `sealed.rs` says; an ego motion that is not there is that of a vehicle that stands.
+//! Binary encoding of a network's parameters: f32 each, little-endian, in the order of
+//! [`Parameters`].
 
-use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+use super::mlp::{LAID_OUT, Parameters};
+use crate::flow::data::{Body, EnvelopeError};
 
-use std::sync::Arc;
+/// Bytes of a network's parameters.
+pub(super) const PARAMETERS_BYTES: usize = LAID_OUT * size_of::<f32>();
 
-use super::mlp::Conditioning;
-use super::network::Network;
-use crate::flow::data::{Body, Envelope, EnvelopeError, RigidTransform, put_parameters};
-use crate::flow::motion::{MotionField, Residual};
-use crate::flow::objects::ObjectMotions;
-
-const ENVELOPE: Envelope = Envelope {
-    magic: *b"FNSFFILD",
-    version: 1,
-    body: None,
-};
-const STILL: u8 = 0;
-const NETWORK: u8 = 1;
-const OBJECTS: u8 = 2;
-/// How far from one a rotation's length may be: what doubles leave of it.
-const UNIT: f64 = 1e-9;
-
-impl MotionField {
-    /// The field as bytes, at most a few megabytes.
-    pub fn to_bytes(&self) -> Vec<u8> {
-        let mut bytes = ENVELOPE.begin();
-        bytes.push(self.ego.is_some().into());
-        let motion = self.ego.unwrap_or_default();
-        let rotation = motion.rotation.coords;
-        for value in rotation.iter().chain(motion.translation.vector.iter()) {
-            bytes.extend(value.to_le_bytes());
-        }
-        match &self.residual {
-            Residual::Still => bytes.push(STILL),
-            Residual::Network(network) => {
-                bytes.push(NETWORK);
-                let Conditioning { center, scale } = network.conditioning;
-                for value in center.into_iter().chain([scale]) {
-                    bytes.extend(value.to_le_bytes());
-                }
-                put_parameters(&mut bytes, &network.parameters);
-            }
-            Residual::Objects(motions) => {
-                bytes.push(OBJECTS);
-                motions.put(&mut bytes);
-            }
-        }
-        ENVELOPE.close(bytes)
-    }
-
-    /// Reads what [`Self::to_bytes`] wrote; nothing is allocated before it is known to be there.
-    ///
-    /// # Errors
-    /// [`EnvelopeError`] where the bytes are no field, of another version, torn or altered.
-    pub fn from_bytes(bytes: &[u8]) -> Result<Self, EnvelopeError> {
-        let mut body = ENVELOPE.open(bytes)?;
-        let ego = motion(&mut body)?;
-        let [kind] = body.take()?;
-        let residual = match kind {
-            STILL => Residual::Still,
-            NETWORK => Residual::Network(Network {
-                conditioning: Conditioning {
-                    center: [body.single()?, body.single()?, body.single()?],
-                    scale: body.single()?,
-                },
-                parameters: body.parameters()?,
-            }),
-            OBJECTS => Residual::Objects(Arc::new(ObjectMotions::take(&mut body)?)),
-            _ => return Err(EnvelopeError::Damaged),
-        };
-        body.end()?;
-        Ok(Self { ego, residual })
-    }
+/// Appends the parameters to `bytes`.
+pub(crate) fn put_parameters(bytes: &mut Vec<u8>, parameters: &Parameters) {
+    let floats = parameters.as_slice().iter();
+    bytes.extend(floats.flat_map(|value| value.to_le_bytes()));
 }
 
-/// The ego motion, where there is one.
-fn motion(body: &mut Body<'_>) -> Result<Option<RigidTransform>, EnvelopeError> {
-    let [known] = body.take()?;
-    let mut float = || body.float();
-    let rotation = Quaternion::from([float()?, float()?, float()?, float()?]);
-    let translation = Translation3::new(float()?, float()?, float()?);
-    let is_turn = (rotation.norm() - 1.0).abs() < UNIT;
-    let is_place = translation.vector.iter().all(|value| value.is_finite());
-    if known > 1 || !is_turn || !is_place {
+/// Reads the output of [`put_parameters`]. Allocates nothing if bytes are missing.
+///
+/// # Errors
+/// [`EnvelopeError::Damaged`] if bytes are missing.
+pub(crate) fn take_parameters(body: &mut Body<'_>) -> Result<Parameters, EnvelopeError> {
+    if body.bytes_left() < PARAMETERS_BYTES {
         return Err(EnvelopeError::Damaged);
     }
-    let rotation = UnitQuaternion::new_unchecked(rotation);
-    Ok((known == 1).then(|| RigidTransform::from_parts(translation, rotation)))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::flow::data::Random;
-    use crate::flow::field::mlp::Parameters;
-
-    #[test]
-    fn a_field_comes_back_from_its_bytes_and_altered_bytes_are_refused() {
-        let motion = RigidTransform::new([1.5, -0.4, 0.1].into(), [0.01, -0.02, 0.3].into());
-        let network = Residual::Network(Network {
-            parameters: Parameters::xavier(&mut Random::new(2)),
-            conditioning: Conditioning {
-                center: [1.0, 2.0, 3.0],
-                scale: 0.1,
-            },
-        });
-        for (ego, residual) in [
-            (Some(motion), network.clone()),
-            (None, network),
-            (Some(motion), Residual::Still),
-            (None, Residual::Still),
-        ] {
-            let bytes = MotionField { ego, residual }.to_bytes();
-            let back = MotionField::from_bytes(&bytes).expect("sound");
-            assert_eq!(back.ego, ego);
-            assert_eq!(back.to_bytes(), bytes);
-            for place in [0, 9, 12, 13, 60, bytes.len() / 2, bytes.len() - 1] {
-                let mut altered = bytes.clone();
-                altered[place] ^= 1;
-                assert!(MotionField::from_bytes(&altered).is_err(), "byte {place}");
-                assert!(
-                    MotionField::from_bytes(&bytes[..place]).is_err(),
-                    "{place} bytes"
-                );
-            }
-            let longer = [bytes.as_slice(), &[0; 9]].concat();
-            assert!(MotionField::from_bytes(&longer).is_err());
-        }
+    let mut parameters = Parameters::zeros();
+    for value in parameters.as_mut_slice() {
+        *value = body.single()?;
     }
+    Ok(parameters)
 }

@@ -1,43 +1,44 @@
-//! Absolute early stopping, as the published code does it.
+//! Early stopping with an absolute threshold, as in the published code.
 //!
-//! The first loss is the best; a loss more than `min_delta` below the best is progress; as many
-//! iterations as `patience` without progress, or a loss that is not a number, are the end.
+//! The first loss is the initial best. A loss more than `min_delta_m` below the best is progress
+//! and becomes the best. After `patience` iterations without progress, or at a loss that is not a
+//! number, the fit ends.
 
 use crate::flow::options::EarlyStopOptions;
 
-/// The rule's state.
+/// The early stopping rule and its state.
 #[derive(Clone, Debug)]
 pub(crate) struct EarlyStop {
     options: EarlyStopOptions,
-    seen: Seen,
+    seen: EarlyStopState,
 }
 
-/// What the rule has seen.
+/// The state of the rule.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(crate) struct Seen {
-    /// The lowest loss that counted as progress, metres.
+pub(crate) struct EarlyStopState {
+    /// The lowest loss that counted as progress, metres; none before the first loss.
     pub(crate) best: Option<f32>,
-    /// Iterations since.
+    /// Iterations since then.
     pub(crate) without_progress: usize,
 }
 
 impl EarlyStop {
-    /// A rule that has seen nothing.
+    /// A rule before the first loss.
     pub(crate) fn new(options: EarlyStopOptions) -> Self {
-        Self::resumed(options, Seen::default())
+        Self::resumed(options, EarlyStopState::default())
     }
 
-    /// A rule that goes on from what it has seen.
-    pub(crate) fn resumed(options: EarlyStopOptions, seen: Seen) -> Self {
+    /// A rule that resumes from the state `seen`.
+    pub(crate) fn resumed(options: EarlyStopOptions, seen: EarlyStopState) -> Self {
         Self { options, seen }
     }
 
-    /// What it has seen.
-    pub(crate) fn seen(&self) -> Seen {
+    /// The state of the rule.
+    pub(crate) fn seen(&self) -> EarlyStopState {
         self.seen
     }
 
-    /// Takes the next loss, metres; true where the optimization should end.
+    /// Adds the next loss, metres. Returns true if the fit should end.
     pub(crate) fn observe(&mut self, loss: f32) -> bool {
         if loss.is_nan() {
             return true;
@@ -47,7 +48,7 @@ impl EarlyStop {
                 self.seen.without_progress += 1;
             }
             _ => {
-                self.seen = Seen {
+                self.seen = EarlyStopState {
                     best: Some(loss),
                     without_progress: 0,
                 };

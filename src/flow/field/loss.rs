@@ -1,16 +1,17 @@
-//! The loss of one deformed point and its derivative by the flow; every backend mirrors this.
+//! The loss of one deformed point and its derivative with respect to the flow. Every backend
+//! implements these formulas.
 //!
-//! `clamp(D(p + f), margin, truncation) + penalty * |f|`; with the published settings just
-//! `D(p + f)`, FNSF eq. 6.
+//! `clamp(D(p + f), margin, truncation) + penalty * |f|`; with the published settings just `D(p +
+//! f)`, FNSF eq. 6.
 
 use crate::flow::data::Point;
 use crate::flow::distance::Sample;
 use crate::flow::options::LossOptions;
 
-/// Flows shorter than this are penalized quadratically, so that the derivative has no jump.
+/// Flows shorter than this are penalized quadratically, so that the derivative is continuous.
 const SMALL_FLOW_M: f32 = 1e-3;
 
-/// The loss of one point and its derivative.
+/// The loss of one point, metres, and its derivative with respect to the flow.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct PointLoss {
     pub(crate) value: f32,
@@ -18,7 +19,8 @@ pub(crate) struct PointLoss {
 }
 
 impl LossOptions {
-    /// The loss of `point` where it sees `sample` after the field moved it by `flow`.
+    /// The loss of `point` with `flow`, where `sample` is the distance transform at the deformed
+    /// point.
     #[inline]
     pub(crate) fn at(&self, point: Point, sample: Sample, flow: Point) -> PointLoss {
         let [margin, truncation] = self.bounds(point);
@@ -31,7 +33,8 @@ impl LossOptions {
         }
     }
 
-    /// The loss of `point`, where the field moved it by `flow` to a place at `distance`.
+    /// The loss of `point` with `flow`, where the deformed point lies at `distance` from the
+    /// target, metres.
     #[inline]
     pub(crate) fn value(&self, point: Point, distance: f32, flow: Point) -> f32 {
         let [margin, truncation] = self.bounds(point);
@@ -44,7 +47,7 @@ impl LossOptions {
         distance.max(margin).min(truncation) + self.flow_penalty * penalized
     }
 
-    /// Between which distances `point` is pulled, metres.
+    /// The margin and the truncation: the distances between which `point` is attracted, metres.
     #[inline]
     fn bounds(&self, point: Point) -> [f32; 2] {
         let margin = self.margin_m.max(self.margin_slope * length(point));
@@ -62,7 +65,8 @@ pub(crate) fn length(vector: Point) -> f32 {
 mod tests {
     use super::*;
 
-    /// A distance field with a constant slope: exact differences, no kinks but the loss's own.
+    /// The loss in a distance field of constant slope: finite differences are exact, and the only
+    /// kinks are the loss's own.
     fn value(options: &LossOptions, flow: [f64; 3]) -> f64 {
         f64::from(loss(options, flow).value)
     }
@@ -76,7 +80,8 @@ mod tests {
 
     #[test]
     fn the_gradient_is_the_finite_difference_of_the_value() {
-        // Single precision resolves 6e-8 of a value near 1: with steps of 1e-3 that is 6e-5.
+        // Single precision resolves 6e-8 of a value near 1. With steps of 1e-3 that is a slope
+        // error of 6e-5.
         const TOLERANCE: f64 = 5e-4;
         const STEP: f64 = 1e-3;
         let options = LossOptions {

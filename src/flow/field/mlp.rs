@@ -1,7 +1,8 @@
-//! The coordinate network of FNSF: 3 -> 128, seven times 128 -> 128, 128 -> 3, ReLU between.
+//! The coordinate network of FNSF, Section 3: a ReLU MLP with layers 3 -> 128, seven times 128 ->
+//! 128 and 128 -> 3; `g(p; theta)` in the paper.
 //!
-//! Knows the shape, the Xavier start and the memory layout that the kernels of every backend
-//! share; computes nothing. FNSF Section 3; `g(p; theta)` there.
+//! This file holds its shape, its Xavier initialization, and the memory layout that the kernels of
+//! every backend share.
 
 use bytemuck::{Pod, Zeroable};
 
@@ -17,14 +18,14 @@ pub const HIDDEN_LAYERS: usize = MIDDLE_LAYERS + 1;
 /// Parameters of the network: 116,483.
 pub const PARAMETERS: usize = 4 * WIDTH + MIDDLE_LAYERS * (WIDTH * WIDTH + WIDTH) + 3 * WIDTH + 3;
 
-/// Output features that lie together in memory, so that a kernel reads one stream.
+/// Output features per panel of a middle layer's weights. A kernel reads a panel as one stream.
 pub(crate) const PANEL: usize = 32;
 
 const FIRST: usize = 0;
 const MIDDLE: usize = 4 * WIDTH;
 const MIDDLE_STRIDE: usize = WIDTH * WIDTH + WIDTH;
 const LAST: usize = MIDDLE + MIDDLE_LAYERS * MIDDLE_STRIDE;
-/// Floats of the laid-out network: the parameters and padding to whole cache lines.
+/// Floats of the network in memory: the parameters, padded to whole cache lines.
 pub(crate) const LAID_OUT: usize = (LAST + 3 * WIDTH + 3).next_multiple_of(16);
 
 /// One cache line of floats.
@@ -32,12 +33,12 @@ pub(crate) const LAID_OUT: usize = (LAST + 3 * WIDTH + 3).next_multiple_of(16);
 #[repr(C, align(64))]
 pub(crate) struct Line([f32; 16]);
 
-/// A zeroed buffer of floats that starts on a cache line.
+/// A zero-initialized buffer of floats, aligned to cache lines.
 #[derive(Clone)]
 pub(crate) struct Aligned(Vec<Line>);
 
 impl Aligned {
-    /// `floats` zeros, rounded up to a whole line.
+    /// A buffer of `floats` zeros, rounded up to a whole line.
     pub(crate) fn zeros(floats: usize) -> Self {
         Self(vec![Line::zeroed(); floats.div_ceil(16)])
     }
@@ -49,14 +50,14 @@ impl Aligned {
     }
 }
 
-/// The parameters of one network, or anything of their shape (gradients, moments).
+/// The parameters of one network, or arrays of the same shape (gradients, moments).
 ///
 /// Layout, in floats: first layer `W[3][128]`, bias; each middle layer `W` in panels of 32 output
 /// features (`[panel][input][32]`), bias; last layer `W[3][128]` (output-major), bias; padding.
 #[derive(Clone)]
 pub(crate) struct Parameters(Aligned);
 
-/// Where a layer's weights and biases begin.
+/// The offsets of a layer's weights and biases, in floats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct LayerAt {
     pub(crate) weights: usize,
@@ -88,7 +89,7 @@ pub(crate) const fn last_layer() -> LayerAt {
     }
 }
 
-/// The place of weight (`input`, `output`) within a middle layer's panels.
+/// The index of weight (`input`, `output`) within a middle layer's panels.
 pub(crate) const fn panel_index(input: usize, output: usize) -> usize {
     (output / PANEL * WIDTH + input) * PANEL + output % PANEL
 }
@@ -98,8 +99,8 @@ impl Parameters {
         Self(Aligned::zeros(LAID_OUT))
     }
 
-    /// Xavier-uniform weights, `U(-a, a)` with `a = sqrt(6 / (inputs + outputs))`, zero biases.
-    /// Drawn layer by layer, output by output, as a linear layer stores them.
+    /// Xavier-uniform weights, `U(-a, a)` with `a = sqrt(6 / (inputs + outputs))`, and zero biases.
+    /// The weights are drawn layer by layer in output-major order, as a linear layer stores them.
     pub(crate) fn xavier(random: &mut Random) -> Self {
         let mut parameters = Self::zeros();
         let floats = parameters.as_mut_slice();
@@ -120,7 +121,7 @@ impl Parameters {
         parameters
     }
 
-    /// Makes the last layer zero, and with it the flow.
+    /// Sets the last layer, and therefore the flow, to zero.
     pub(crate) fn clear_last_layer(&mut self) {
         self.as_mut_slice()[LAST..].fill(0.0);
     }
@@ -134,12 +135,12 @@ impl Parameters {
     }
 }
 
-/// How far a cloud's mean may lie from the origin, along an axis, for coordinates to be taken as they
-/// are, metres. In a sensor's frame it is tens of metres; from a kilometre away the network's first
-/// flows are metres, and no step is small enough to take them back.
+/// Largest coordinate of a cloud's mean, along any axis, for which raw coordinates are used,
+/// metres. In a sensor's frame the mean is tens of metres from the origin. At a kilometre, the
+/// network's initial flow is several metres long, and the fit cannot undo it with any step size.
 const FAR_MEAN_M: f32 = 200.0;
 
-/// Points' coordinates to network inputs.
+/// The normalization of coordinates to network inputs: `(p - center) * scale`.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Conditioning {
     pub(crate) center: Point,
@@ -174,8 +175,8 @@ impl Conditioning {
     }
 }
 
-/// Writes the middle layers' transposes, in the same panels, so that backward kernels read one
-/// stream as well.
+/// Writes the transposes of the middle layers, in the same panels, so that the backward kernels
+/// also read one stream.
 pub(crate) fn transpose_middle_layers(from: &Parameters, to: &mut Parameters) {
     for layer in 0..MIDDLE_LAYERS {
         let at = middle_layer(layer);

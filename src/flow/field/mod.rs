@@ -1,10 +1,12 @@
-//! What produces the flow: the continuous field fitted to one pair, to be asked anywhere.
+//! The neural scene flow prior: a continuous flow field fitted to one pair, evaluated at any point.
 
 mod adam;
 mod backend;
-pub(crate) mod budget;
+mod budget;
 mod codec;
 mod early_stopping;
+mod error;
+mod fit;
 mod loss;
 pub mod mlp;
 mod network;
@@ -20,10 +22,13 @@ pub use mlp::{HIDDEN_LAYERS, MIDDLE_LAYERS, PARAMETERS, WIDTH};
 pub use network::Network;
 pub use snapshot::{Snapshot, SnapshotError, TrainerState};
 
-pub(crate) use budget::{Loop, Prepared, Throughput};
+pub(crate) use budget::prepare;
+pub(crate) use codec::{put_parameters, take_parameters};
 pub(crate) use early_stopping::EarlyStop;
 #[cfg(feature = "gpu")]
-pub(crate) use early_stopping::Seen;
+pub(crate) use early_stopping::EarlyStopState;
+pub(crate) use error::FitError;
+pub(crate) use fit::{Fit, Fitted, Stop};
 pub(crate) use loss::length;
 pub(crate) use mlp::{
     Aligned, Conditioning, LAID_OUT, PANEL, Parameters, first_layer, last_layer, middle_layer,
@@ -37,4 +42,4 @@ pub(crate) use reduction::{Chunks, tree_sum};
 #[cfg(test)]
 pub(crate) use reference::{ReferenceNetwork, first_losses};
 pub(crate) use schedule::Schedule;
-pub(crate) use warm_start::warm_start;
+pub(crate) use warm_start::Prior;

@@ -1,4 +1,4 @@
-//! A fitted network: its parameters and what it is fed. Knows no distances and computes no layers.
+//! A fitted network: its parameters and its input normalization.
 
 use core::fmt;
 
@@ -8,7 +8,7 @@ use super::mlp::{Conditioning, Parameters, WIDTH, first_layer, last_layer};
 use crate::flow::data::{Point, RigidTransform};
 use crate::flow::options::InputNormalization;
 
-/// The coordinate network of one pair: `g(p; theta)` at any point p, FNSF Section 3.
+/// The coordinate network of one pair: `g(p; theta)` at any point p, metres. FNSF Section 3.
 #[derive(Clone)]
 pub struct Network {
     pub(crate) parameters: Parameters,
@@ -16,7 +16,7 @@ pub struct Network {
 }
 
 impl Network {
-    /// The network that was fitted to `points` with `inputs`.
+    /// The network with `parameters` fitted to `points`, with the input normalization `inputs`.
     pub(crate) fn new(
         parameters: Parameters,
         points: &[Point],
@@ -28,9 +28,10 @@ impl Network {
         }
     }
 
-    /// Parameters of the same field for a network that is fed by `conditioning`, once all that it
-    /// moves was itself moved by `motion`: `g'(p) = R g(motion^-1 p)`. Exact: both rotations and
-    /// the shift go into the outer layers.
+    /// The parameters of the same field in another frame, for inputs normalized by `conditioning`.
+    /// With `motion` as the transform to the new frame: `g'(p) = R g(motion^-1 p)`. The result is
+    /// exact up to rounding: both rotations and the translation are absorbed by the first and last
+    /// layers.
     pub(crate) fn carried(
         &self,
         motion: &RigidTransform,
@@ -39,8 +40,8 @@ impl Network {
         let rotation = motion.rotation.to_rotation_matrix().into_inner();
         let vector = |point: Point| Vector3::from(point.map(f64::from));
         let (own, new) = (&self.conditioning, conditioning);
-        // What the network was fed is (R^T (p - t) - center) * scale, and p is the new input over
-        // the new scale, about the new center.
+        // The old input is (R^T (p - t) - center) * scale. In it, p is the new input divided by the
+        // new scale, plus the new center.
         let stretch = f64::from(own.scale) / f64::from(new.scale);
         let shift = rotation.transpose() * (vector(new.center) - motion.translation.vector);
         let shift = (shift - vector(own.center)) * f64::from(own.scale);
@@ -58,7 +59,7 @@ impl Network {
         }
         let layer = last_layer();
         for feature in 0..=WIDTH {
-            // Behind the weights of all features stand the biases.
+            // The biases follow the weights of all features.
             let place = |output: usize| match feature {
                 WIDTH => layer.bias + output,
                 _ => layer.weights + output * WIDTH + feature,
@@ -89,7 +90,7 @@ mod tests {
     use crate::flow::data::transform_point;
     use crate::flow::field::backend::Backend;
 
-    /// Metres: single precision of coordinates of 50 m and features of that size.
+    /// Metres: single-precision rounding of coordinates of 50 m and of features of that size.
     const ROUNDING_M: f32 = 2e-4;
 
     #[test]

@@ -1,19 +1,21 @@
-//! The order in which an iteration's sums are taken: gradients chunk by chunk, losses tile by tile.
+//! The fixed order of an iteration's sums: gradients chunk by chunk, losses tile by tile.
 //!
-//! Single precision sums depend on their order. This one follows from the number of points alone,
-//! and every backend takes it, so that they find the same bits whatever the threads, the registers
-//! or the card. Knows no network.
+//! Single-precision sums depend on their order. This order depends on the number of points alone,
+//! and every backend uses it. The result therefore has the same bits for any number of threads, any
+//! register width and any GPU, as far as they round a multiply-add alike.
 
 use core::ops::Range;
 
-/// Chunks are whole numbers of so many points: of every backend's tiles.
+/// Chunks hold a multiple of this number of points, which itself is a multiple of every backend's
+/// tile.
 pub(crate) const STRETCH: usize = 192;
 /// The most points of a chunk.
 pub(crate) const MOST_POINTS: usize = 42 * STRETCH;
-/// The most chunks of a batch of usual size: adding them stays small beside computing them.
+/// The most chunks of a batch of usual size, so that adding them takes little time beside computing
+/// them.
 const USUAL_CHUNKS: usize = 32;
 
-/// How a batch is cut. A chunk's points are added up one after the other, and then the chunks are.
+/// The division of a batch into chunks. A chunk's points are summed in order, and then the chunks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Chunks {
     stretches: usize,
@@ -21,8 +23,8 @@ pub(crate) struct Chunks {
 }
 
 impl Chunks {
-    /// Cuts a batch of at most `points` points: for two threads to share where it is small, and
-    /// with more for each of them to do where it is large.
+    /// Divides a batch of at most `points` points. A small batch gets enough chunks for two threads
+    /// to share it. A large batch gets chunks of more points.
     pub(crate) fn new(points: usize) -> Self {
         let stretches = points.div_ceil(STRETCH).max(1);
         let usual = stretches.div_ceil(2).min(8 + stretches / 6);
@@ -34,18 +36,18 @@ impl Chunks {
         }
     }
 
-    /// The points of a chunk, as far as there are so many.
+    /// The points of a chunk. The range may extend beyond the end of the batch.
     pub(crate) fn points(&self, chunk: usize) -> Range<usize> {
         let first = |chunk: usize| chunk * self.stretches / self.count * STRETCH;
         first(chunk)..first(chunk + 1)
     }
 }
 
-/// Losses that are added up together first, and how many of such sums side by side.
+/// Losses that are first summed by a tree, and the number of partial sums of such tiles.
 const TILE: usize = 64;
 const SIDE_BY_SIDE: usize = 256;
 
-/// The mean of an iteration's losses.
+/// The mean of an iteration's losses, metres.
 pub(crate) fn mean(losses: &[f32]) -> f32 {
     let mut sums = [0.0; SIDE_BY_SIDE];
     for (tile, losses) in losses.chunks(TILE).enumerate() {
@@ -56,7 +58,8 @@ pub(crate) fn mean(losses: &[f32]) -> f32 {
     tree_sum(sums) * (1.0 / losses.len() as f32)
 }
 
-/// The sum of a power of two of terms: the upper half is added to the lower until one is left.
+/// Tree sum of `N` terms, a power of two: the upper half is added to the lower half until one
+/// remains.
 #[inline(always)]
 pub(crate) fn tree_sum<const N: usize>(mut terms: [f32; N]) -> f32 {
     let mut half = N / 2;
@@ -105,7 +108,7 @@ mod tests {
 
     #[test]
     fn halves_are_added_from_the_upper_to_the_lower() {
-        // In this order the small terms survive; one after the other they would be lost.
+        // In this order the small terms survive; summed one after the other they would be lost.
         let small = f32::EPSILON / 2.0;
         assert_eq!(tree_sum([1.0, small, 0.0, small]), 1.0 + f32::EPSILON);
         assert_eq!(tree_sum([2.5]), 2.5);

@@ -1,7 +1,7 @@
-//! The oracle: the paper's formulas in plain double-precision loops. Slow, obvious, test-only.
+//! Reference implementation for the tests: the paper's formulas in double-precision loops.
 //!
-//! Every kernel is tested against it. It shares no code with what it checks but the layout of
-//! [`Parameters`], their start, and the distance transform, which has its own tests.
+//! The kernels are tested against it. It shares with them only the layout of [`Parameters`], their
+//! initialization, and the distance transform, which has its own tests.
 
 use super::mlp::{
     MIDDLE_LAYERS, PANEL, Parameters, WIDTH, first_layer, last_layer, middle_layer, panel_index,
@@ -16,7 +16,7 @@ pub(crate) struct ReferenceNetwork {
 }
 
 impl ReferenceNetwork {
-    /// Reads the laid-out parameters, or gradients, one by one.
+    /// Reads parameters or gradients from their memory layout, one by one.
     pub(crate) fn read(parameters: &Parameters) -> Self {
         assert_eq!(PANEL, 32, "the layout below is written for panels of 32");
         let floats = parameters.as_slice();
@@ -60,7 +60,8 @@ impl ReferenceNetwork {
         [output[0], output[1], output[2]]
     }
 
-    /// Adds to `gradients` the derivative of `output_gradient . g(input)` by every parameter.
+    /// Adds to `gradients` the derivative of `output_gradient . g(input)` with respect to every
+    /// parameter.
     pub(crate) fn backward(
         &self,
         input: [f64; 3],
@@ -113,7 +114,7 @@ impl ReferenceNetwork {
         }
     }
 
-    /// All weights and biases in one row.
+    /// All weights, then all biases, in one list.
     pub(crate) fn flat(&self) -> Vec<f64> {
         let weights = self.weights.iter().flatten().flatten();
         weights
@@ -123,8 +124,8 @@ impl ReferenceNetwork {
     }
 }
 
-/// The mean distances that the published method sees in its first iterations over `source`, metres,
-/// from where `seed` starts it, with Adam at a constant `rate`.
+/// The mean distances of the published method in its first iterations over `source`, metres,
+/// initialized from `seed`, with Adam at a constant `rate`.
 pub(crate) fn first_losses(
     source: &[Point],
     distance: &DistanceTransform,
@@ -182,7 +183,7 @@ pub(crate) fn nearest_chamfer(at: [f64; 3], sites: &[[f64; 3]]) -> f64 {
     nearest
 }
 
-/// Trilinear value and gradient at `at`, in cells, of values known at whole places.
+/// Trilinear value and gradient at `at`, in cells, of values given at integer positions.
 pub(crate) fn trilinear(at: [f64; 3], value: impl Fn([u32; 3]) -> f64) -> (f64, [f64; 3]) {
     let (mut sum, mut gradient) = (0.0, [0.0; 3]);
     let fraction = at.map(|c| c - c.floor());

@@ -1,28 +1,28 @@
-//! The course of an optimization: where it starts, which points an iteration looks at, and how far
-//! it steps. Every backend follows it; computes no network.
+//! The schedule of a fit, common to all backends: the initial parameters, the batch of each
+//! iteration, and its step size.
 
 use core::ops::Range;
 
 use super::adam::AdamStep;
 use super::mlp::{Conditioning, Parameters};
 use crate::flow::data::{Point, Random};
-use crate::flow::options::{LearningRateSchedule, Options, ResultChoice, Start};
+use crate::flow::options::{FieldOptions, LearningRateSchedule, ResultChoice, Start};
 
 /// Iterations over which the weight of the past in a running average is ramped up.
 const RAMP: f32 = 10.0;
 
-/// What every iteration of one optimization does.
+/// The schedule of one fit.
 pub(crate) struct Schedule {
-    pub(crate) options: Options,
+    pub(crate) options: FieldOptions,
     pub(crate) conditioning: Conditioning,
-    /// Source points in the order in which batches take them.
+    /// Source points in the order of the batches.
     pub(crate) points: Vec<Point>,
 }
 
 impl Schedule {
-    /// The course over `source`, and the parameters at its start.
-    pub(crate) fn new(source: &[Point], options: &Options) -> (Self, Parameters) {
-        let mut random = Random::stream(options.seed, 0);
+    /// The schedule over `source`, and the initial parameters.
+    pub(crate) fn new(source: &[Point], options: &FieldOptions, seed: u64) -> (Self, Parameters) {
+        let mut random = Random::stream(seed, 0);
         let mut parameters = Parameters::xavier(&mut random);
         if options.start == Start::ZeroFlow {
             parameters.clear_last_layer();
@@ -31,22 +31,22 @@ impl Schedule {
         if options.batch.is_some_and(|batch| batch < points.len()) {
             random.shuffle(&mut points);
         }
-        let course = Self {
+        let schedule = Self {
             options: options.clone(),
             conditioning: Conditioning::new(source, options.inputs),
             points,
         };
-        (course, parameters)
+        (schedule, parameters)
     }
 
-    /// Parts that the points are cut into, nearly equal.
+    /// Number of batches that the points are divided into, of nearly equal size.
     fn parts(&self) -> usize {
         let all = self.points.len();
         let batch = self.options.batch;
         batch.map_or(1, |batch| all.div_ceil(batch.max(1)))
     }
 
-    /// The points of the iteration after `done` others: one part, in turn.
+    /// The points of the iteration after `done` others: the batches in turn.
     pub(crate) fn batch(&self, done: usize) -> Range<usize> {
         let (all, parts) = (self.points.len(), self.parts());
         let part = done % parts;
@@ -58,9 +58,9 @@ impl Schedule {
         self.points.len().div_ceil(self.parts())
     }
 
-    /// Adam's step of the iteration after `done` others.
+    /// The Adam step of the iteration after `done` others.
     pub(crate) fn adam(&self, done: usize) -> AdamStep {
-        let share = match self.options.decay {
+        let share = match self.options.learning_rate_schedule {
             LearningRateSchedule::Constant => 1.0,
             LearningRateSchedule::Cosine => {
                 let done = done as f64 / self.options.max_iterations as f64;
@@ -70,10 +70,10 @@ impl Schedule {
         AdamStep::new(done + 1, f64::from(self.options.learning_rate) * share)
     }
 
-    /// Weight of the present in a running average, in the iteration after `done` others; none
-    /// where the best is kept.
-    pub(crate) fn fresh(&self, done: usize) -> Option<f32> {
-        match self.options.keep {
+    /// Weight of the current parameters in the running average, in the iteration after `done`
+    /// others; none if the result is the best iteration.
+    pub(crate) fn ema_weight(&self, done: usize) -> Option<f32> {
+        match self.options.result {
             ResultChoice::Best => None,
             ResultChoice::Average { decay } => {
                 let ramp = done as f32 / (done as f32 + RAMP);
@@ -82,7 +82,7 @@ impl Schedule {
         }
     }
 
-    /// Ends after `max_iterations` at the latest, and lets the step size fall accordingly.
+    /// Limits the fit to `max_iterations`; a cosine schedule then falls to zero at that iteration.
     pub(crate) fn shorten(&mut self, max_iterations: usize) {
         self.options.max_iterations = self.options.max_iterations.min(max_iterations);
     }
@@ -95,12 +95,12 @@ mod tests {
 
     #[test]
     fn every_point_is_in_one_batch_of_each_round() {
-        let mut options = Preset::Neural.options(None);
+        let mut options = Preset::Neural.field();
         options.batch = Some(400);
-        let (course, _) = Schedule::new(&[[0.0; 3]; 1501], &options);
+        let (schedule, _) = Schedule::new(&[[0.0; 3]; 1501], &options, 0);
         let mut covered = vec![0; 1501];
         for done in 8..12 {
-            let batch = course.batch(done);
+            let batch = schedule.batch(done);
             assert!(batch.len() <= 376, "{batch:?}");
             batch.for_each(|point| covered[point] += 1);
         }

@@ -1,4 +1,4 @@
-//! An optimization put down, to be taken up again with the same bits: its state, as bytes.
+//! Snapshots of an interrupted fit: its state as bytes, from which it resumes with the same bits.
 //!
 //! ```text
 //! identity u64 | iterations u64 | best iteration u64 | best loss f32
@@ -6,14 +6,13 @@
 //!   | parameters, means, squares, kept: f32 each
 //! ```
 //!
-//! Sealed as `sealed.rs` says. What can be derived (transposes, the points' order) is left out. Knows no files.
+//! This is the body of an envelope, see `data/codec.rs`. Derived values (transposes, the order of
+//! the points) are not stored.
 
-use super::early_stopping::Seen;
+use super::codec::{PARAMETERS_BYTES, put_parameters, take_parameters};
+use super::early_stopping::EarlyStopState;
 use super::mlp::Parameters;
-use crate::flow::data::{Envelope, EnvelopeError, Hash, PARAMETERS_BYTES, Point, put_parameters};
-use crate::flow::motion::MotionField;
-use crate::flow::options::Options;
-use crate::flow::select::Selection;
+use crate::flow::data::{Envelope, EnvelopeError};
 
 const ENVELOPE: Envelope = Envelope {
     magic: *b"FNSFSNAP",
@@ -23,29 +22,29 @@ const ENVELOPE: Envelope = Envelope {
 /// Parameters, two moments, the kept parameters.
 const ARRAYS: usize = 4;
 
-/// What the iterations that follow depend on, besides points and options.
+/// The state that the following iterations depend on, besides points and options.
 #[derive(Clone)]
 pub struct TrainerState {
     pub(crate) parameters: Parameters,
-    /// Adam's means of the gradients and of their squares.
+    /// Adam's running means of the gradients and of their squares.
     pub(crate) moments: [Parameters; 2],
-    /// The result so far.
+    /// Parameters of the result so far.
     pub(crate) kept: Parameters,
-    /// What the stopping rule has seen; nothing where there is none.
-    pub(crate) seen: Seen,
+    /// State of early stopping; the default without early stopping.
+    pub(crate) seen: EarlyStopState,
     pub(crate) iterations: usize,
     pub(crate) best_iteration: usize,
     pub(crate) best_loss: f32,
 }
 
 impl TrainerState {
-    /// Before the first iteration.
+    /// The state before the first iteration.
     pub(crate) fn at_start(parameters: Parameters) -> Self {
         Self {
             moments: [Parameters::zeros(), Parameters::zeros()],
             kept: parameters.clone(),
             parameters,
-            seen: Seen::default(),
+            seen: EarlyStopState::default(),
             iterations: 0,
             best_iteration: 0,
             best_loss: f32::INFINITY,
@@ -53,9 +52,9 @@ impl TrainerState {
     }
 }
 
-/// An optimization between two iterations. Resumed with the same problem and options it ends with the
-/// bits of one that was never put down, whatever the number of threads, and on any device that
-/// rounds as the first one does.
+/// A fit interrupted between two iterations. Resumed with the same problem and options, it ends
+/// with the same bits as an uninterrupted fit. This holds for any number of threads, and on any
+/// device that rounds like the first one.
 #[derive(Clone)]
 pub struct Snapshot {
     identity: u64,
@@ -63,37 +62,25 @@ pub struct Snapshot {
 }
 
 impl Snapshot {
-    /// `state` of the optimization of `selection` by `options`, after the pair of `before`.
-    pub(crate) fn new(
-        selection: &Selection,
-        options: &Options,
-        before: Option<&MotionField>,
-        state: TrainerState,
-    ) -> Self {
-        Self {
-            identity: identity(selection, options, before),
-            state,
-        }
+    /// A snapshot of `state` for the fit with this identity, see [`Self::state_for`].
+    pub(crate) fn new(identity: u64, state: TrainerState) -> Self {
+        Self { identity, state }
     }
 
-    /// The state, for the optimization that it belongs to.
+    /// The state, for the fit it belongs to. `identity` is a hash of all inputs and options of the
+    /// fit.
     ///
     /// # Errors
-    /// [`SnapshotError::Foreign`] for any other.
-    pub(crate) fn state_for(
-        self,
-        selection: &Selection,
-        options: &Options,
-        before: Option<&MotionField>,
-    ) -> Result<TrainerState, SnapshotError> {
-        if self.identity == identity(selection, options, before) {
+    /// [`SnapshotError::Foreign`] for any other fit.
+    pub(crate) fn state_for(self, identity: u64) -> Result<TrainerState, SnapshotError> {
+        if self.identity == identity {
             Ok(self.state)
         } else {
             Err(SnapshotError::Foreign)
         }
     }
 
-    /// Iterations done.
+    /// Number of iterations done.
     pub fn iterations(&self) -> usize {
         self.state.iterations
     }
@@ -116,10 +103,11 @@ impl Snapshot {
         ENVELOPE.close(bytes)
     }
 
-    /// Reads what [`Self::to_bytes`] wrote; nothing is allocated before all is known to be there.
+    /// Reads the output of [`Self::to_bytes`]. Allocates nothing before the length and the checksum
+    /// have been verified.
     ///
     /// # Errors
-    /// [`SnapshotError`] where the bytes are no snapshot, of another version, torn or altered.
+    /// [`SnapshotError`] if the bytes are not a snapshot, of another version, truncated or altered.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, SnapshotError> {
         let mut body = ENVELOPE.open(bytes)?;
         let identity = body.number()?;
@@ -128,14 +116,14 @@ impl Snapshot {
         let best_loss = f32::from_le_bytes(body.take()?);
         let [has_best] = body.take()?;
         let best = f32::from_le_bytes(body.take()?);
-        let seen = Seen {
+        let seen = EarlyStopState {
             best: (has_best != 0).then_some(best),
             without_progress: body.count()?,
         };
         let state = TrainerState {
-            parameters: body.parameters()?,
-            moments: [body.parameters()?, body.parameters()?],
-            kept: body.parameters()?,
+            parameters: take_parameters(&mut body)?,
+            moments: [take_parameters(&mut body)?, take_parameters(&mut body)?],
+            kept: take_parameters(&mut body)?,
             seen,
             iterations,
             best_iteration,
@@ -146,42 +134,13 @@ impl Snapshot {
     }
 }
 
-/// What a snapshot belongs to: both clouds as they take part, in the fit and in the ego motion, the
-/// field before them, and every option but the memory that the machine allows.
-fn identity(selection: &Selection, options: &Options, before: Option<&MotionField>) -> u64 {
-    let mut options = options.clone();
-    options.distance.max_bytes = 0;
-    let mut hash = Hash(Hash::default().of(format!("{options:?}").as_bytes()));
-    let mut cloud = |points: &[Point]| {
-        hash.word(points.len() as u64);
-        for [x, y, z] in points.iter().map(|point| point.map(f32::to_bits)) {
-            hash.word(u64::from(x) << 32 | u64::from(y));
-            hash.word(u64::from(z));
-        }
-    };
-    cloud(&selection.source);
-    cloud(&selection.target);
-    selection
-        .registration_clouds
-        .iter()
-        .flatten()
-        .for_each(|points| cloud(points));
-    if let Some(field) = before {
-        field
-            .to_bytes()
-            .into_iter()
-            .for_each(|byte| hash.word(byte.into()));
-    }
-    hash.0
-}
-
 /// Why a snapshot was refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SnapshotError {
-    /// The bytes are no sound snapshot of this version.
+    /// The bytes are not a valid snapshot of this version.
     #[error("no snapshot: {0}")]
     Sealed(#[from] EnvelopeError),
-    /// Taken of other clouds or by other options.
+    /// The snapshot was taken with other clouds or other options.
     #[error("the snapshot belongs to another problem or other options")]
     Foreign,
 }

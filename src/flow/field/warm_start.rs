@@ -1,41 +1,48 @@
-//! Where a fit starts that has a pair before it: from that pair's field, carried into the new frame,
-//! if that explains the new pair. Fits nothing.
+//! Warm start of a fit from the preceding pair's field, transformed into the new frame. It is used
+//! only if it explains the new pair better than no motion.
 
 use super::backend::Backend;
 use super::budget::Prepared;
+use super::error::FitError;
 use super::mlp::Conditioning;
 use super::network::Network;
 use super::snapshot::TrainerState;
-use crate::flow::data::{Point, stride_sample};
-use crate::flow::error::FlowError;
-use crate::flow::motion::{MotionField, Residual};
-use crate::flow::options::Options;
+use crate::flow::data::{Point, RigidTransform, stride_sample};
+use crate::flow::options::FieldOptions;
 
-/// Points on which a field of the pair before is judged.
+/// Points on which the preceding pair's field is evaluated.
 const JUDGED: usize = 4096;
 
-/// The state of a fit to `aligned` that starts from the field before, and its options; none where the
-/// options want none, or the field explains this pair no better than that nothing moves.
+/// The field of the preceding pair.
+#[derive(Clone, Copy)]
+pub(crate) struct Prior<'a> {
+    pub(crate) network: &'a Network,
+    /// Whether it is the residual motion after an ego motion.
+    pub(crate) has_ego: bool,
+}
+
+/// The initial state of a fit to `aligned` that starts from the preceding pair's field. Sets
+/// `options` to those of a warm start. None, with `options` unchanged, if the options have no warm
+/// start, there is no preceding field, only one of the pairs has an ego motion, or the field
+/// explains this pair no better than no motion.
 pub(crate) fn warm_start(
     backend: &dyn Backend,
     prepared: &Prepared,
     aligned: &[Point],
-    before: Option<&MotionField>,
-    options: &mut Options,
-) -> Result<Option<TrainerState>, FlowError> {
-    let (Some(warm_start), Some(before)) = (options.warm_start, before) else {
+    ego: Option<&RigidTransform>,
+    prior: Option<Prior<'_>>,
+    options: &mut FieldOptions,
+) -> Result<Option<TrainerState>, FitError> {
+    let (Some(warm_start), Some(prior)) = (options.warm_start, prior) else {
         return Ok(None);
     };
-    let Residual::Network(network) = &before.residual else {
-        return Ok(None);
-    };
-    if before.ego.is_some() != prepared.ego.is_some() {
+    if prior.has_ego != ego.is_some() {
         return Ok(None);
     }
     let conditioning = Conditioning::new(aligned, options.inputs);
-    let motion = prepared.ego.unwrap_or_default();
+    let motion = ego.copied().unwrap_or_default();
     let carried = Network {
-        parameters: network.carried(&motion, &conditioning),
+        parameters: prior.network.carried(&motion, &conditioning),
         conditioning,
     };
     let points = stride_sample(aligned, JUDGED);
@@ -45,7 +52,7 @@ pub(crate) fn warm_start(
         mean_loss(prepared, options, &points, &flows)?,
         mean_loss(prepared, options, &points, &still)?,
     ];
-    // Not the other way round: a loss that is no number starts afresh.
+    // Written so that a loss that is not a number starts from new weights.
     if carried_loss < still_loss {
         *options = options.warmed(warm_start);
         return Ok(Some(TrainerState::at_start(carried.parameters)));
@@ -53,13 +60,13 @@ pub(crate) fn warm_start(
     Ok(None)
 }
 
-/// The mean loss of `points` moved by `flows`.
+/// The mean loss of `points` displaced by `flows`, metres.
 fn mean_loss(
     prepared: &Prepared,
-    options: &Options,
+    options: &FieldOptions,
     points: &[Point],
     flows: &[Point],
-) -> Result<f64, FlowError> {
+) -> Result<f64, FitError> {
     let pairs = || points.iter().zip(flows);
     let moved = pairs().map(|(point, flow)| core::array::from_fn(|a| point[a] + flow[a]));
     let distances = prepared.transform.distances(&moved.collect::<Vec<_>>())?;

@@ -1,27 +1,27 @@
-//! The cards that are there, and the choice of one. Opens nothing.
+//! Enumeration of the GPUs (adapters) of the machine, and selection of one.
 
 use core::fmt;
 use core::str::FromStr;
 
 use crate::flow::field::BackendError;
 
-/// What kind of device an adapter is, fastest first.
+/// The kind of a GPU, fastest first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum AdapterKind {
-    /// A card with its own memory.
+    /// A GPU with its own memory.
     Discrete,
-    /// A part of the processor's package.
+    /// A GPU that is part of the processor's package and shares its memory.
     Integrated,
-    /// A share of a card that a hypervisor gives.
+    /// A share of a GPU, provided by a hypervisor.
     Virtual,
-    /// The driver does not say.
+    /// The driver does not report the kind.
     Other,
-    /// No card: a driver that computes on the CPU, many times slower than the CPU backend.
+    /// No GPU: a driver that computes on the CPU, many times slower than the CPU backend.
     Software,
 }
 
 impl AdapterKind {
-    /// The name that reports use.
+    /// The name used in reports.
     pub fn name(self) -> &'static str {
         match self {
             Self::Discrete => "discrete",
@@ -33,41 +33,42 @@ impl AdapterKind {
     }
 }
 
-/// A card that can be opened.
+/// A GPU that can be opened.
 #[derive(Clone, Debug)]
 pub struct Adapter {
-    /// Its place among all, fastest kind first.
+    /// Its index among all adapters, fastest kind first.
     pub index: usize,
-    /// Its name, as the driver gives it.
+    /// Its name, as the driver reports it.
     pub name: String,
-    /// Where it is plugged in, such as `0000:01:00.0`; empty where the driver does not say.
+    /// PCI address, such as `0000:01:00.0`; empty if the driver does not report it.
     pub pci_id: String,
     /// The driver and its version.
     pub driver: String,
-    /// The programming interface: `vulkan`, `metal` or `dx12`.
+    /// The graphics API: `vulkan`, `metal` or `dx12`.
     pub interface: &'static str,
-    /// What kind of device it is.
+    /// The kind of the GPU.
     pub kind: AdapterKind,
-    /// The largest buffer that a kernel can see, bytes.
+    /// The largest buffer that a kernel can bind, bytes.
     pub max_binding_bytes: u64,
-    /// Workgroup memory, bytes.
+    /// Workgroup memory per workgroup, bytes.
     pub workgroup_bytes: u32,
-    /// Matrix units: the tiles that they multiply, such as `16x16x16 f16 -> f32`.
+    /// The tile sizes and types that the matrix units multiply, such as `16x16x16 f16 -> f32`.
+    /// Empty if there are none.
     pub matrix_tiles: Vec<String>,
     pub(super) handle: wgpu::Adapter,
 }
 
-/// Which card is meant.
+/// Selects a GPU.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Selector {
-    /// The first that is no software.
+    /// The first adapter that is not a software device.
     #[default]
     Any,
-    /// The one with this [`Adapter::index`]; where there is none, the first whose name has the
-    /// number in it.
+    /// The adapter with this [`Adapter::index`]. If there is none, the first whose name contains
+    /// the number.
     Index(usize),
-    /// The one at this [`Adapter::pci_id`], or the first whose name has this in it, upper and
-    /// lower case alike.
+    /// The adapter with this [`Adapter::pci_id`], or the first whose name contains this text,
+    /// ignoring case.
     Named(String),
 }
 
@@ -93,7 +94,7 @@ impl fmt::Display for Selector {
     }
 }
 
-/// All cards, fastest kind first.
+/// All adapters for Vulkan, Metal or DX12, fastest kind first.
 pub fn adapters() -> Vec<Adapter> {
     let mut found: Vec<_> =
         pollster::block_on(instance().enumerate_adapters(wgpu::Backends::all()))
@@ -107,11 +108,11 @@ pub fn adapters() -> Vec<Adapter> {
     found
 }
 
-/// The card that `selector` means. A software device is given where it is selected by its place or
-/// its name, or where `software` says that it is welcome.
+/// The adapter that `selector` selects. A software device is selected only by its index or its
+/// name, or if `software` is true.
 ///
 /// # Errors
-/// [`BackendError::NoDevice`] where there is none such, with what there is.
+/// [`BackendError::NoDevice`] if no adapter matches; its text lists the adapters.
 pub fn select(selector: &Selector, software: bool) -> Result<Adapter, BackendError> {
     let all = adapters();
     let there = match all.is_empty() {
@@ -136,7 +137,7 @@ pub fn select(selector: &Selector, software: bool) -> Result<Adapter, BackendErr
                 .find(|adapter| software || adapter.kind != AdapterKind::Software)
                 .ok_or_else(|| no_such(hint))
         }
-        // A number may be a part of a name, such as 4090.
+        // A number may be part of a name, such as 4090.
         Selector::Index(index) if *index >= candidates.len() => candidates
             .find(|adapter| is_named(adapter, &index.to_string()))
             .ok_or_else(|| no_such("")),
@@ -147,7 +148,7 @@ pub fn select(selector: &Selector, software: bool) -> Result<Adapter, BackendErr
     }
 }
 
-/// Whether the card is at this PCI id or has this in its name.
+/// Whether the adapter has this PCI address, or this text in its name.
 fn is_named(adapter: &Adapter, name: &str) -> bool {
     let name = name.to_lowercase();
     adapter.pci_id.to_lowercase() == name || adapter.name.to_lowercase().contains(&name)
@@ -164,12 +165,13 @@ fn described_shortly(adapter: &Adapter) -> String {
 
 fn instance() -> wgpu::Instance {
     let mut description = wgpu::InstanceDescriptor::new_without_display_handle();
-    // Near a full card an allocation is refused, rather than every later one slow.
+    // Above 95 % of the GPU's memory an allocation is refused. Otherwise every later one would be
+    // slow.
     description.memory_budget_thresholds.for_resource_creation = Some(95);
     wgpu::Instance::new(description)
 }
 
-/// What the adapter says of itself; nothing where it cannot compute.
+/// The adapter's description; none for an API that is not supported.
 fn described(handle: wgpu::Adapter) -> Option<Adapter> {
     let info = handle.get_info();
     let interface = match info.backend {

@@ -1,41 +1,43 @@
-//! The words of the card's store, given out to pairs for their transforms and points.
+//! Allocator of the GPU's store: the buffer that holds the pairs' distance transforms and points.
 //!
-//! A pair is priced against the store before it gets any, and gets them in its turn. Knows no kernels.
+//! Sizes and offsets are in 32-bit words. Requests are served in order of arrival.
 
 use core::time::Duration;
 use std::collections::VecDeque;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
+use crate::flow::data::locked;
 use crate::flow::data::{Control, control};
 use crate::flow::field::BackendError;
 
-/// How long somebody waits without any words being given back, in all.
+/// Longest wait of a request, counting only polling intervals in which no words were released.
 const PATIENCE: Duration = Duration::from_secs(20);
-/// How often who waits looks at its watch.
+/// Interval at which a waiting request checks its control.
 const LOOK: Duration = Duration::from_millis(20);
 
-/// The store's words: who has which, and who waits for some.
+/// First-fit allocator with a queue of waiting requests.
 #[derive(Debug)]
 pub(super) struct Allocator {
     store: Mutex<Store>,
-    /// Words were given back, or somebody has left the line.
+    /// Signals that words were released or a request has left the queue.
     moved: Condvar,
     all: u64,
 }
 
 #[derive(Debug)]
 struct Store {
-    /// Free stretches: place and length, by place.
+    /// Free ranges: offset and length, ordered by offset.
     free: Vec<(u64, u64)>,
-    /// Who waits, the longest first. Nobody is served before those who came before him: else many
-    /// small pairs would keep a large one out for ever.
+    /// Tickets of the waiting requests, oldest first. Only the first is served; otherwise many
+    /// small pairs could block a large one for ever.
     line: VecDeque<u64>,
-    /// Who comes next.
+    /// The next ticket.
     next: u64,
 }
 
 impl Store {
-    /// The place of `count` free words, which are no longer.
+    /// Takes `count` words from the first free range that is large enough, and returns their
+    /// offset.
     fn taken(&mut self, count: u64) -> Option<u64> {
         let stretch = self.free.iter_mut().find(|(_, length)| *length >= count)?;
         let place = stretch.0;
@@ -59,14 +61,15 @@ impl Allocator {
     }
 
     fn store(&self) -> MutexGuard<'_, Store> {
-        self.store.lock().unwrap_or_else(PoisonError::into_inner)
+        locked(&self.store)
     }
 
-    /// The place of `count` words; waits a while for others to give theirs back.
+    /// Allocates `count` words and returns their offset. Waits for other pairs to release theirs.
     ///
     /// # Errors
-    /// [`BackendError::Memory`] where the store never has so many, [`BackendError::Busy`] where
-    /// others keep them, [`BackendError::Interrupted`] where the watch asks for the end.
+    /// [`BackendError::Memory`] if the store is smaller than `count` words. [`BackendError::Busy`]
+    /// if too few words are released in time. [`BackendError::Interrupted`] if the control
+    /// interrupts.
     pub(super) fn take(
         &self,
         what: &'static str,
@@ -111,7 +114,7 @@ impl Allocator {
         place
     }
 
-    /// Takes words back.
+    /// Releases `count` words at offset `place`.
     pub(super) fn give_back(&self, place: u64, count: u64) {
         if count == 0 {
             return;
@@ -138,7 +141,7 @@ mod tests {
     use super::*;
     use crate::flow::data::{Interrupt, Uncontrolled};
 
-    /// Ends at the first look.
+    /// Interrupts at the first check.
     struct Over;
 
     impl Control for Over {
@@ -173,7 +176,7 @@ mod tests {
 
     #[test]
     fn who_asks_for_little_does_not_pass_who_waits_for_much() {
-        /// Says that somebody has looked at it.
+        /// Records that it was checked.
         #[derive(Default)]
         struct Waits(AtomicBool);
         impl Control for Waits {
@@ -189,14 +192,14 @@ mod tests {
             while !waits.0.load(Ordering::Relaxed) {
                 std::thread::yield_now();
             }
-            // 40 are free.
+            // 40 words are free.
             let small = words.take("points", 10, &Over);
             assert!(matches!(small, Err(BackendError::Interrupted(_))));
             words.give_back(taken, 60);
             let place = large.join().expect("no panic").expect("its turn");
             assert_eq!(place, 0);
         });
-        // Who has left the line keeps nobody out.
+        // A request that has left the queue blocks no other.
         assert_eq!(words.take("points", 20, &Uncontrolled).expect("free"), 80);
     }
 }

@@ -1,57 +1,49 @@
-//! Submissions: the next iterations of every pair that is being fitted, together.
+//! Submissions: the next iterations of all pairs that are being fitted, as one batch of GPU work.
 //!
-//! Small pairs leave a large card idle, so whoever wants iterations joins those who do at the same
-//! moment; one of them submits for all. Pairs stay independent: each has its own network, stopping
-//! rule and bits. Knows records and kernels, neither points nor options.
+//! A small pair leaves a large GPU idle, so requests that arrive at about the same time are
+//! submitted together. One of the waiting threads submits for all. Pairs stay independent: each has
+//! its own network and stopping rule, and its result is bit-identical to that of a fit alone.
 
 use core::time::Duration;
 use std::collections::HashMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
-use super::backend::{Buffers, Card};
-use super::iteration::{Clock, Phase, Phases};
-use super::layout::{Lane, STEPS, Status, Step};
-use super::tiling::{Cut, Plan, Wave};
+use super::context::Context;
+use super::half::Units;
+use super::iteration::Phases;
+use super::layout::{STEPS, Status};
+use super::phase::{Clock, Phase};
+use super::request::{Request, write};
+use super::tiling::{Plan, Wave};
+use crate::flow::data::locked;
 use crate::flow::field::BackendError;
 use crate::flow::options::Precision;
 
-/// How long the one who submits waits for others that are about to join.
+/// How long the submitting thread waits for further requests.
 const MOMENT: Duration = Duration::from_micros(300);
 
-/// The next iterations of one pair.
-#[derive(Clone, Debug)]
-pub(super) struct Request {
-    pub(super) lane: Lane,
-    pub(super) status: Status,
-    /// One for each iteration that is wanted, at most [`STEPS`].
-    pub(super) steps: Vec<Step>,
-    pub(super) cut: Cut,
-    /// Of everything in one submission: the kernels of one precision know no others.
-    pub(super) precision: Precision,
-}
-
-/// What became of a request.
+/// The result of a request.
 #[derive(Clone, Debug)]
 pub(super) struct Done {
     pub(super) status: Status,
-    /// The mean loss of each iteration that was done, metres.
+    /// Mean loss of each completed iteration, metres.
     pub(super) losses: Vec<f32>,
-    /// How fast it went; none where the card shows no clock.
+    /// Speed of the submission; none if the GPU has no timestamps.
     pub(super) pace: Option<Pace>,
 }
 
-/// How fast a submission's first iteration was, by the card's clock.
+/// Speed of a submission's first iteration, by GPU timestamps.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Pace {
-    /// Seconds of the iteration, of all pairs that shared it.
+    /// Seconds of one iteration of all pairs in the submission.
     pub(super) iteration: f64,
-    /// Seconds of a tile, and those of them in the distance query.
+    /// Seconds per tile: of the whole iteration, and of its distance query.
     pub(super) tile: f64,
     pub(super) tile_query: f64,
 }
 
-/// Who wants iterations.
+/// The queue of requests for iterations.
 #[derive(Default)]
 pub(super) struct Batch {
     state: Mutex<State>,
@@ -60,43 +52,48 @@ pub(super) struct Batch {
 
 #[derive(Default)]
 struct State {
-    /// Pairs that are being fitted.
+    /// Number of pairs that are being fitted.
     members: usize,
     next_ticket: u64,
     waiting: Vec<(u64, Request)>,
     done: HashMap<u64, Result<Done, BackendError>>,
-    /// Whether somebody submits at the moment.
+    /// Whether a thread is submitting.
     submitting: bool,
-    /// The latest submission's.
+    /// Speed of the latest submission.
     pace: Option<Pace>,
 }
 
 impl Batch {
     fn state(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        locked(&self.state)
     }
 
-    /// One more pair is being fitted.
+    /// Registers a pair that is being fitted.
     pub(super) fn joined(&self) {
         self.state().members += 1;
     }
 
-    /// How fast the card was last.
+    /// Speed of the latest submission.
     pub(super) fn pace(&self) -> Option<Pace> {
         self.state().pace
     }
 
-    /// A pair is fitted, or given up.
+    /// Unregisters a pair whose fit has ended.
     pub(super) fn left(&self) {
         self.state().members -= 1;
         self.changed.notify_all();
     }
 
-    /// Does the request's iterations, together with what others ask for meanwhile.
+    /// Runs the request's iterations, together with those that other threads request meanwhile.
     ///
     /// # Errors
-    /// [`BackendError`] where the card fails.
-    pub(super) fn run(&self, card: &Card, request: Request) -> Result<Done, BackendError> {
+    /// [`BackendError`] if the GPU fails.
+    pub(super) fn run<'u>(
+        &self,
+        context: &Context,
+        units: &dyn Fn() -> Result<&'u Units, BackendError>,
+        request: Request,
+    ) -> Result<Done, BackendError> {
         let mut state = self.state();
         let ticket = state.next_ticket;
         state.next_ticket += 1;
@@ -120,13 +117,13 @@ impl Batch {
                 .wait_timeout_while(state, MOMENT, incomplete)
                 .unwrap_or_else(PoisonError::into_inner)
                 .0;
-            let taken = state.take(card);
+            let taken = state.take(context);
             drop(state);
             let requests: Vec<_> = taken.iter().map(|(_, request)| request).collect();
-            let submitted = catch_unwind(AssertUnwindSafe(|| submit(card, &requests)));
+            let submitted = catch_unwind(AssertUnwindSafe(|| submit(context, units, &requests)));
             let submitted = submitted.unwrap_or_else(|_| {
                 let reason = "the driver's bindings panicked".to_owned();
-                card.watchdog.lost(reason.clone());
+                context.watchdog.lost(reason.clone());
                 Err(BackendError::Lost(reason))
             });
             state = self.state();
@@ -139,7 +136,7 @@ impl Batch {
                 }
                 Err(error) => {
                     for (other, _) in &taken {
-                        let own = card.watchdog.check().err().unwrap_or(match &error {
+                        let own = context.watchdog.check().err().unwrap_or(match &error {
                             BackendError::Busy => BackendError::Busy,
                             error => BackendError::Device(error.to_string()),
                         });
@@ -153,9 +150,9 @@ impl Batch {
 }
 
 impl State {
-    /// Takes requests in the order of their arrival, as many of the first one's precision as the
-    /// card has room for. The others stay, one of them now the first.
-    fn take(&mut self, card: &Card) -> Vec<(u64, Request)> {
+    /// Takes requests in order of arrival, up to the capacity of the GPU, all with the precision of
+    /// the first one. The others remain in the queue.
+    fn take(&mut self, context: &Context) -> Vec<(u64, Request)> {
         let precision = self.waiting.first().map(|(_, request)| request.precision);
         let mut chunks = 0;
         let mut fitting = 0;
@@ -165,8 +162,8 @@ impl State {
                 return false;
             }
             chunks += request.cut.chunks.count as u64;
-            full =
-                fitting > 0 && (chunks > card.budget.chunks || fitting as u64 >= card.budget.lanes);
+            full = fitting > 0
+                && (chunks > context.budget.chunks || fitting as u64 >= context.budget.lanes);
             fitting += usize::from(!full);
             !full
         });
@@ -174,27 +171,32 @@ impl State {
     }
 }
 
-/// Moments of a submission's clock: when its first iteration began, when that one's first query
-/// began and ended, and when it ended itself.
+/// Timestamps of a submission: begin of the first iteration, begin and end of its first query, and
+/// end of the first iteration.
 const MOMENTS: u32 = 4;
 
-/// Does the iterations of all requests; who wants fewer than others rests meanwhile.
-fn submit(card: &Card, requests: &[&Request]) -> Result<Vec<Done>, BackendError> {
-    card.watchdog.check()?;
+/// Runs the iterations of all requests in one submission. A lane with fewer iterations than others
+/// idles for the rest.
+fn submit<'u>(
+    context: &Context,
+    units: &dyn Fn() -> Result<&'u Units, BackendError>,
+    requests: &[&Request],
+) -> Result<Vec<Done>, BackendError> {
+    context.watchdog.check()?;
     let iterations = requests.iter().map(|request| request.steps.len());
     let iterations = iterations.max().unwrap_or(0);
     let cuts: Vec<_> = requests.iter().map(|request| request.cut).collect();
-    let plan = Plan::new(&cuts, card.budget.rows as usize);
-    write(card, &card.buffers, requests);
+    let plan = Plan::new(&cuts, context.budget.rows as usize);
+    write(context, &context.buffers, requests);
     let precision = requests.first().map(|request| request.precision);
     let units = match precision.unwrap_or_default() {
         Precision::F32 => None,
-        Precision::F16 => Some(card.units()?),
+        Precision::F16 => Some(units()?),
     };
-    let phases = Phases::bind(card, &card.buffers, &plan, requests.len(), units)?;
-    let clock = Clock::new(card, MOMENTS);
+    let phases = Phases::bind(context, &context.buffers, &plan, requests.len(), units)?;
+    let clock = Clock::new(context, MOMENTS);
 
-    let mut encoder = card.encoder();
+    let mut encoder = context.encoder();
     for step in 0..iterations {
         let clock = clock.as_ref().filter(|_| step == 0);
         iterate(&mut encoder, &phases, &plan, step, clock);
@@ -203,14 +205,14 @@ fn submit(card: &Card, requests: &[&Request]) -> Result<Vec<Done>, BackendError>
     let loss_bytes = (requests.len() * STEPS * size_of::<f32>()) as u64;
     let bytes = status_bytes + loss_bytes + u64::from(MOMENTS) * 8;
     let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
-    let results = card.empty(bytes, usage)?;
-    let (statuses, losses) = (&card.buffers.statuses, &card.buffers.losses);
+    let results = context.empty(bytes, usage)?;
+    let (statuses, losses) = (&context.buffers.statuses, &context.buffers.losses);
     encoder.copy_buffer_to_buffer(statuses, 0, &results, 0, status_bytes);
     encoder.copy_buffer_to_buffer(losses, 0, &results, status_bytes, loss_bytes);
     if let Some(clock) = &clock {
         clock.resolve(&mut encoder, &results, status_bytes + loss_bytes);
     }
-    let read = card.finish(encoder, &results, bytes)?;
+    let read = context.finish(encoder, &results, bytes)?;
 
     let (statuses, rest) = read.split_at(status_bytes as usize);
     let (losses, moments) = rest.split_at(loss_bytes as usize);
@@ -242,32 +244,8 @@ fn submit(card: &Card, requests: &[&Request]) -> Result<Vec<Done>, BackendError>
         .collect())
 }
 
-/// Writes what the kernels read of each request.
-pub(super) fn write(card: &Card, buffers: &Buffers, requests: &[&Request]) {
-    let (mut first_tile, mut first_chunk) = (0, 0);
-    let mut lanes = Vec::new();
-    let mut steps = vec![Step::default(); requests.len() * STEPS];
-    for (index, request) in requests.iter().enumerate() {
-        lanes.push(Lane {
-            first_tile: first_tile as u32,
-            tiles: request.cut.tiles as u32,
-            first_chunk: first_chunk as u32,
-            chunks: request.cut.chunks.count as u32,
-            steps: request.steps.len() as u32,
-            ..request.lane
-        });
-        first_tile += request.cut.tiles;
-        first_chunk += request.cut.chunks.count;
-        steps[index * STEPS..][..request.steps.len()].copy_from_slice(&request.steps);
-    }
-    let statuses: Vec<_> = requests.iter().map(|request| request.status).collect();
-    let write = |buffer: &wgpu::Buffer, bytes: &[u8]| card.queue.write_buffer(buffer, 0, bytes);
-    write(&buffers.lanes, bytemuck::cast_slice(&lanes));
-    write(&buffers.steps, bytemuck::cast_slice(&steps));
-    write(&buffers.statuses, bytemuck::cast_slice(&statuses));
-}
-
-/// One iteration of all lanes. A timed one is done in passes, so that the card can tell them apart.
+/// One iteration of all lanes. A timed iteration is split into several passes, because timestamps
+/// are taken at the boundaries of passes.
 fn iterate(
     encoder: &mut wgpu::CommandEncoder,
     phases: &Phases<'_>,

@@ -1,40 +1,43 @@
-//! A target's distance transform on the card: planned and its far field built by the host, its
-//! bricks filled by the card.
+//! A target's distance transform on the GPU. The host plans it and builds its coarse field; the GPU
+//! fills its bricks.
 
 use std::sync::Arc;
 
-use super::backend::{Card, spread};
+use super::buffers::spread;
+use super::context::Context;
+use super::device::Device;
 use super::layout;
-use super::trainer::GpuTrainer;
 use crate::flow::data::{Control, Point};
 use crate::flow::distance::{
-    ABSENT, CellSites, DistanceError, DistanceOptions, FarField, Index, Lattice, Layout, Metric,
-    Sample, Sites, codes_per_cell,
+    ABSENT, CoarseField, DistanceError, DistanceOptions, Index, Lattice, Layout, Metric, Sample,
+    Sites, VertexSites, codes_per_cell,
 };
-use crate::flow::field::{BackendError, Trainer, Transform};
-use crate::flow::options::Options;
+use crate::flow::field::BackendError;
 
-/// Words of a brick's 16-bit codes.
+/// 32-bit words of a brick's 512 16-bit codes.
 const BRICK_WORDS: u64 = 256;
-/// Words of a point.
+/// 32-bit words of a point.
 const POINT_WORDS: u64 = 3;
-/// Points that are sampled at a time.
+/// Maximum number of points per sampling dispatch.
 const SAMPLED: usize = 1 << 20;
-/// Points that a workgroup of `sample.wgsl` samples.
+/// Points per workgroup of `sample.wgsl`.
 const SAMPLE_GROUP: usize = 64;
 
-/// Words of the store that are a transform's, and its source points' behind them.
+/// Words of the store for a distance transform, followed by the source points. Released on drop.
 struct Allocation {
-    card: Arc<Card>,
+    device: Arc<Device>,
     place: u32,
-    words: u64,
+    pub(super) words: u64,
 }
 
 impl Allocation {
-    fn take(card: &Arc<Card>, words: u64, control: &dyn Control) -> Result<Self, BackendError> {
-        let place = card.words.take("distance transform", words, control)?;
+    fn take(device: &Arc<Device>, words: u64, control: &dyn Control) -> Result<Self, BackendError> {
+        let place = device
+            .context
+            .allocator
+            .take("distance transform", words, control)?;
         Ok(Self {
-            card: Arc::clone(card),
+            device: Arc::clone(device),
             place: place as u32,
             words,
         })
@@ -43,28 +46,31 @@ impl Allocation {
 
 impl Drop for Allocation {
     fn drop(&mut self) {
-        self.card.words.give_back(self.place.into(), self.words);
+        self.device
+            .context
+            .allocator
+            .give_back(self.place.into(), self.words);
     }
 }
 
-/// A distance transform in the card's store.
+/// A distance transform in the GPU's store.
 pub(super) struct GpuTransform {
-    pub(super) card: Arc<Card>,
+    pub(super) device: Arc<Device>,
     pub(super) record: layout::Transform,
-    /// Words of the transform, before those of the points.
-    words: u64,
+    /// Words of the transform, without those of the points that follow it.
+    pub(super) words: u64,
     stretch: Allocation,
 }
 
-/// Transforms `target` over a grid that covers both clouds.
+/// Builds the distance transform of `target` over a grid that covers both clouds, metres.
 pub(super) fn build(
-    card: &Arc<Card>,
+    device: &Arc<Device>,
     source: &[Point],
     target: &[Point],
     options: &DistanceOptions,
     control: &dyn Control,
 ) -> Result<GpuTransform, BackendError> {
-    card.watchdog.check()?;
+    device.context.watchdog.check()?;
     if options.metric == Metric::Chamfer {
         let text = "the published chamfer metric is computed on the CPU alone";
         return Err(BackendError::Unsupported(text));
@@ -73,12 +79,12 @@ pub(super) fn build(
         let text = "distances to the points themselves are computed on the CPU alone";
         return Err(BackendError::Unsupported(text));
     }
-    // On the host's threads, which nobody may keep while he waits for the card.
-    let planned = card.host.threads().install(|| {
+    // Runs on the host's threads, which are released before the GPU's memory is waited for.
+    let planned = device.host.threads().install(|| {
         let layout = Layout::plan(source, target, options, control)?;
         let band_m = f64::from(layout.band) * layout.grid.cell;
-        let far = FarField::build(&layout.grid, &layout.cells, band_m, control)?;
-        let sites = CellSites::new(&layout.cells, layout.band);
+        let far = CoarseField::build(&layout.grid, &layout.cells, band_m, control)?;
+        let sites = VertexSites::new(&layout.cells, layout.band);
         Ok::<_, DistanceError>((layout, far, sites))
     });
     let (layout, far, sites) = planned?;
@@ -94,7 +100,7 @@ pub(super) fn build(
     ];
     let words = parts.iter().sum();
     let points = source.len() as u64 * POINT_WORDS;
-    let stretch = Allocation::take(card, words + points, control)?;
+    let stretch = Allocation::take(device, words + points, control)?;
     let mut place = u64::from(stretch.place);
     let places = parts.map(|words| {
         let own = place;
@@ -102,13 +108,15 @@ pub(super) fn build(
         own
     });
     let write = |place: u64, words: &[u8]| {
-        card.queue
-            .write_buffer(&card.buffers.store, place * 4, words);
+        device
+            .context
+            .queue
+            .write_buffer(&device.context.buffers.store, place * 4, words);
     };
     write(places[0], bytemuck::cast_slice(&index.tables));
     write(places[1], bytemuck::cast_slice(&index.bricks));
     write(places[3], bytemuck::cast_slice(&far.distances));
-    fill_bricks(card, &index, &sites, band, places[2] as u32)?;
+    fill_bricks(&device.context, &index, &sites, band, places[2] as u32)?;
 
     let lattice = Lattice::new(&grid);
     let record = layout::Transform {
@@ -126,18 +134,18 @@ pub(super) fn build(
         far_vertices: far.vertices.map(|n| n as u32),
     };
     Ok(GpuTransform {
-        card: Arc::clone(card),
+        device: Arc::clone(device),
         record,
         words,
         stretch,
     })
 }
 
-/// Has the card fill the active bricks.
+/// Fills the active bricks on the GPU.
 fn fill_bricks(
-    card: &Card,
+    context: &Context,
     index: &Index,
-    sites: &CellSites,
+    sites: &VertexSites,
     band: i32,
     codes: u32,
 ) -> Result<(), BackendError> {
@@ -158,18 +166,18 @@ fn fill_bricks(
         .collect();
     let code_of: Vec<u32> = sites.codes.iter().map(|&code| code.into()).collect();
     let buffers = [
-        card.filled(bytemuck::bytes_of(&plan))?,
-        card.filled(bytemuck::cast_slice(&places))?,
-        card.filled(bytemuck::cast_slice(sites.columns.starts()))?,
-        card.filled(bytemuck::cast_slice(&columns))?,
-        card.filled(bytemuck::cast_slice(&sites.squares))?,
-        card.filled(bytemuck::cast_slice(&code_of))?,
+        context.filled(bytemuck::bytes_of(&plan))?,
+        context.filled(bytemuck::cast_slice(&places))?,
+        context.filled(bytemuck::cast_slice(sites.columns.starts()))?,
+        context.filled(bytemuck::cast_slice(&columns))?,
+        context.filled(bytemuck::cast_slice(&sites.squares))?,
+        context.filled(bytemuck::cast_slice(&code_of))?,
     ];
-    let pipeline = &card.kernels.bricks;
+    let pipeline = &context.kernels.bricks;
     let mut bound: Vec<_> = buffers.iter().collect();
-    bound.push(&card.buffers.store);
-    let group = card.bound(pipeline, &bound);
-    let mut encoder = card.encoder();
+    bound.push(&context.buffers.store);
+    let group = context.bound(pipeline, &bound);
+    let mut encoder = context.encoder();
     {
         let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
         pass.set_pipeline(pipeline);
@@ -177,13 +185,13 @@ fn fill_bricks(
         let [x, y] = spread(index.active as u32);
         pass.dispatch_workgroups(x, y, 1);
     }
-    card.queue.submit([encoder.finish()]);
-    card.watchdog.check()
+    context.queue.submit([encoder.finish()]);
+    context.watchdog.check()
 }
 
 impl GpuTransform {
-    /// The place in the store of the points that are fitted, words: as many as the source that the
-    /// transform was built for.
+    /// Offset in the store of the points that are fitted, in words. There is room for the number of
+    /// source points that the transform was built for.
     pub(super) fn room_for(&self, points: usize) -> Result<u32, BackendError> {
         let (needed, available) = (points as u64 * POINT_WORDS, self.stretch.words - self.words);
         if needed > available {
@@ -196,19 +204,22 @@ impl GpuTransform {
         Ok(self.stretch.place + self.words as u32)
     }
 
-    /// The transform at each of the points.
+    /// Distance (metres) and gradient at each of `points` (N x 3, metres).
     pub(super) fn samples(&self, points: &[Point]) -> Result<Vec<Sample>, BackendError> {
         let mut samples = Vec::with_capacity(points.len());
-        let record = self.card.filled(bytemuck::bytes_of(&self.record))?;
+        let record = self
+            .device
+            .context
+            .filled(bytemuck::bytes_of(&self.record))?;
         for points in points.chunks(SAMPLED) {
-            let card = &self.card;
-            let places = card.filled(bytemuck::cast_slice(points))?;
+            let context = &self.device.context;
+            let places = context.filled(bytemuck::cast_slice(points))?;
             let bytes = points.len() as u64 * 16;
             let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC;
-            let out = card.empty(bytes, usage)?;
-            let pipeline = &card.kernels.sample;
-            let group = card.bound(pipeline, &[&card.buffers.store, &places, &record, &out]);
-            let mut encoder = card.encoder();
+            let out = context.empty(bytes, usage)?;
+            let pipeline = &context.kernels.sample;
+            let group = context.bound(pipeline, &[&context.buffers.store, &places, &record, &out]);
+            let mut encoder = context.encoder();
             {
                 let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
                 pass.set_pipeline(pipeline);
@@ -217,7 +228,7 @@ impl GpuTransform {
                 let [x, y] = spread(points.len().div_ceil(SAMPLE_GROUP) as u32);
                 pass.dispatch_workgroups(x, y, 1);
             }
-            let read = card.finish(encoder, &out, bytes)?;
+            let read = context.finish(encoder, &out, bytes)?;
             samples.extend(read.as_chunks::<16>().0.iter().map(|bytes| {
                 let [x, y, z, distance]: [f32; 4] = bytemuck::pod_read_unaligned(bytes);
                 Sample {
@@ -230,24 +241,5 @@ impl GpuTransform {
     }
 }
 
-impl Transform for GpuTransform {
-    fn bytes(&self) -> usize {
-        self.words as usize * 4
-    }
-
-    fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError> {
-        let samples = self.samples(points)?;
-        Ok(samples.into_iter().map(|sample| sample.distance).collect())
-    }
-
-    fn start(
-        &self,
-        source: &[Point],
-        options: &Options,
-    ) -> Result<Box<dyn Trainer + '_>, BackendError> {
-        Ok(Box::new(GpuTrainer::new(self, source, options)?))
-    }
-}
-
-/// Marks an absent table or brick; `distance.wgsl` has the same.
+/// Marks an absent table or brick; `distance.wgsl` has the same constant.
 const _: () = assert!(ABSENT == u32::MAX);

@@ -1,24 +1,24 @@
-//! A network's flow at any points, on the card. Fits nothing.
+//! Evaluation of a network at arbitrary points on the GPU.
 
-use super::backend::{Card, spread};
+use super::buffers::spread;
+use super::context::Context;
 use super::layout;
-use super::layout::{ARRAYS, TILE};
+use super::layout::{ARRAYS, KEPT, TILE};
 use super::memory::NETWORK_BYTES;
 use super::tiling::Cut;
-use super::trainer::KEPT;
 use crate::flow::data::Point;
 use crate::flow::field::{BackendError, LAID_OUT, Network};
 
-/// Points that are evaluated at a time.
+/// Maximum number of points per dispatch.
 const EVALUATED: usize = 1 << 18;
 
-/// The flow at each of `points` that `network` says, metres.
+/// The flow (N x 3, metres) that `network` predicts at `points` (N x 3, metres).
 pub(super) fn network(
-    card: &Card,
+    context: &Context,
     network: &Network,
     points: &[Point],
 ) -> Result<Vec<Point>, BackendError> {
-    card.watchdog.check()?;
+    context.watchdog.check()?;
     let mut arrays = vec![0; ARRAYS * NETWORK_BYTES as usize];
     let kept = bytemuck::cast_slice(&network.parameters.as_slice()[..LAID_OUT]);
     arrays[(KEPT * NETWORK_BYTES) as usize..][..kept.len()].copy_from_slice(kept);
@@ -27,26 +27,27 @@ pub(super) fn network(
         scale: network.conditioning.scale,
         ..layout::Lane::default()
     };
-    evaluate(card, &card.filled(&arrays)?, &lane, points)
+    evaluate(context, &context.filled(&arrays)?, &lane, points)
 }
 
-/// The flow at each of `points` that the kept parameters of the lane's network say, metres.
+/// The flow (N x 3, metres) that the kept parameters of the lane's network predict at `points` (N x
+/// 3, metres).
 pub(super) fn evaluate(
-    card: &Card,
+    context: &Context,
     networks: &wgpu::Buffer,
     lane: &layout::Lane,
     points: &[Point],
 ) -> Result<Vec<Point>, BackendError> {
     let mut flow = Vec::with_capacity(points.len());
     for points in points.chunks(EVALUATED) {
-        flow.extend(evaluated(card, networks, lane, points)?);
+        flow.extend(evaluated(context, networks, lane, points)?);
     }
     Ok(flow)
 }
 
-/// As many points as fit into one dispatch.
+/// Evaluates up to [`EVALUATED`] points in one dispatch.
 fn evaluated(
-    card: &Card,
+    context: &Context,
     networks: &wgpu::Buffer,
     lane: &layout::Lane,
     points: &[Point],
@@ -60,16 +61,16 @@ fn evaluated(
     let list: Vec<_> = (0..tiles as u32)
         .map(|tile| layout::Tile { lane: 0, tile })
         .collect();
-    let places = card.filled(bytemuck::cast_slice(points))?;
-    let lane = card.filled(bytemuck::bytes_of(&lane))?;
-    let step = card.filled(bytemuck::bytes_of(&step))?;
-    let list = card.filled(bytemuck::cast_slice(&list))?;
+    let places = context.filled(bytemuck::cast_slice(points))?;
+    let lane = context.filled(bytemuck::bytes_of(&lane))?;
+    let step = context.filled(bytemuck::bytes_of(&step))?;
+    let list = context.filled(bytemuck::cast_slice(&list))?;
     let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC;
-    let flows = card.empty((tiles * TILE * 16) as u64, usage)?;
-    let pipeline = &card.kernels.evaluate;
-    let buffers = &card.buffers;
-    // An evaluation looks at no status and remembers no activations; the bindings are there.
-    let group = card.bound(
+    let flows = context.empty((tiles * TILE * 16) as u64, usage)?;
+    let pipeline = &context.kernels.evaluate;
+    let buffers = &context.buffers;
+    // The evaluation reads no status and writes no activations, but the bindings must be present.
+    let group = context.bound(
         pipeline,
         &[
             &places,
@@ -82,7 +83,7 @@ fn evaluated(
             &buffers.activations,
         ],
     );
-    let mut encoder = card.encoder();
+    let mut encoder = context.encoder();
     {
         let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
         pass.set_pipeline(pipeline);
@@ -95,7 +96,7 @@ fn evaluated(
         let [x, y] = spread(tiles as u32);
         pass.dispatch_workgroups(x, y, 1);
     }
-    let read = card.finish(encoder, &flows, points.len() as u64 * 16)?;
+    let read = context.finish(encoder, &flows, points.len() as u64 * 16)?;
     let rows = read.as_chunks::<16>().0.iter();
     Ok(rows
         .map(|bytes| {

@@ -1,43 +1,18 @@
-//! One iteration as the card does it: the kernels in their order, what each is bound to, and the
-//! card's own clock over them. Knows neither pairs nor stopping rules.
+//! One iteration on the GPU: its kernels, their bindings and their dispatches.
 
-use super::backend::{Buffers, Card, spread};
+use super::buffers::{Buffers, spread};
+use super::context::Context;
 use super::half::{HalfPhases, Units};
 use super::layout::Part;
+use super::phase::{Dispatch, Phase};
 use super::tiling::{Plan, Wave};
 use crate::flow::field::{BackendError, LAID_OUT, MIDDLE_LAYERS};
 
-/// A kernel of an iteration.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Phase {
-    /// Of half precision alone: the weights that the others read, before the first wave.
-    Halve,
-    Forward,
-    Query,
-    Backward,
-    Gradients,
-    Judge,
-    Step,
-    /// Of single precision alone.
-    Transpose,
-}
-
-/// A dispatch: its kernel, what that is bound to, and workgroups in two dimensions.
-pub(super) type Dispatch<'a> = (&'a wgpu::ComputePipeline, &'a wgpu::BindGroup, [u32; 2]);
-
-impl Phase {
-    /// What is done for each wave of points, in order.
-    pub(super) const OF_A_WAVE: [Self; 4] =
-        [Self::Forward, Self::Query, Self::Backward, Self::Gradients];
-    /// What is done once all waves are, in order.
-    pub(super) const OF_THE_END: [Self; 3] = [Self::Judge, Self::Step, Self::Transpose];
-}
-
-/// The kernels of a submission, bound to its buffers.
+/// The kernels of an iteration, bound to a submission's buffers.
 pub(super) struct Phases<'a> {
-    card: &'a Card,
+    context: &'a Context,
     lanes: u32,
-    /// Rows of a layer's activations.
+    /// Number of rows of a layer's activations.
     rows: u32,
     forward: wgpu::BindGroup,
     query: wgpu::BindGroup,
@@ -50,106 +25,56 @@ pub(super) struct Phases<'a> {
 }
 
 impl<'a> Phases<'a> {
-    /// Binds the kernels for a submission of `lanes` lanes; with matrix units, in half precision.
+    /// Binds the kernels for a submission of `lanes` lanes. With `units`, half precision is used.
     ///
     /// # Errors
-    /// [`BackendError::Busy`] where the card has no room for the plan now.
+    /// [`BackendError::Busy`] if the GPU has no free memory for the plan now.
     pub(super) fn bind(
-        card: &'a Card,
+        context: &'a Context,
         buffers: &Buffers,
         plan: &Plan,
         lanes: usize,
         units: Option<&'a Units>,
     ) -> Result<Self, BackendError> {
-        let tiles = &card.filled(bytemuck::cast_slice(&plan.tiles))?;
-        let chunks = &card.filled(bytemuck::cast_slice(&plan.chunks))?;
+        let tiles = &context.filled(bytemuck::cast_slice(&plan.tiles))?;
+        let chunks = &context.filled(bytemuck::cast_slice(&plan.chunks))?;
         let storage = wgpu::BufferUsages::STORAGE;
-        let tile_losses = &card.empty(plan.tiles.len() as u64 * 4, storage)?;
+        let tile_losses = &context.empty(plan.tiles.len() as u64 * 4, storage)?;
         let Buffers {
-            store,
             networks,
-            activations,
-            deltas,
-            flows,
-            loss_gradients,
             partials,
             lanes: records,
             steps,
             statuses,
             losses,
+            ..
         } = buffers;
-        let half = units.map(|units| HalfPhases::bind(card, buffers, units, tiles, chunks));
-        let kernels = &card.kernels;
+        let [forward, query, backward, gradients] =
+            bind_wave(context, buffers, [tiles, chunks, tile_losses]);
+        let half = units.map(|units| HalfPhases::bind(context, buffers, units, [tiles, chunks]));
+        let kernels = &context.kernels;
         Ok(Self {
-            card,
+            context,
             lanes: lanes as u32,
             rows: buffers.rows() as u32,
-            forward: card.bound(
-                &kernels.forward,
-                &[
-                    store,
-                    networks,
-                    records,
-                    steps,
-                    tiles,
-                    statuses,
-                    flows,
-                    activations,
-                ],
-            ),
-            query: card.bound(
-                &kernels.query,
-                &[
-                    store,
-                    records,
-                    steps,
-                    tiles,
-                    statuses,
-                    flows,
-                    loss_gradients,
-                    tile_losses,
-                ],
-            ),
-            backward: card.bound(
-                &kernels.backward,
-                &[
-                    networks,
-                    tiles,
-                    statuses,
-                    loss_gradients,
-                    activations,
-                    records,
-                    deltas,
-                ],
-            ),
-            gradients: card.bound(
-                &kernels.gradients,
-                &[
-                    store,
-                    records,
-                    steps,
-                    chunks,
-                    statuses,
-                    activations,
-                    deltas,
-                    loss_gradients,
-                    partials,
-                ],
-            ),
-            judge: card.bound(
+            forward,
+            query,
+            backward,
+            gradients,
+            judge: context.bound(
                 &kernels.judge,
                 &[records, steps, tile_losses, statuses, losses],
             ),
-            step: card.bound(
+            step: context.bound(
                 &kernels.step,
                 &[records, steps, statuses, partials, networks],
             ),
-            transpose: card.bound(&kernels.transpose, &[statuses, records, networks]),
+            transpose: context.bound(&kernels.transpose, &[statuses, records, networks]),
             half,
         })
     }
 
-    /// Does one kernel of iteration `step`, over `wave` where it goes by waves.
+    /// Dispatches one kernel of iteration `step`; the kernels that work by waves, over `wave`.
     pub(super) fn dispatch(
         &self,
         pass: &mut wgpu::ComputePass<'_>,
@@ -178,9 +103,9 @@ impl<'a> Phases<'a> {
         }
     }
 
-    /// What is dispatched in single precision.
+    /// The dispatch of a phase in single precision.
     fn dispatches(&self, phase: Phase, wave: &Wave) -> Option<Dispatch<'_>> {
-        let kernels = &self.card.kernels;
+        let kernels = &self.context.kernels;
         let tiles = spread(wave.tiles as u32);
         Some(match phase {
             Phase::Halve => return None,
@@ -205,69 +130,83 @@ impl<'a> Phases<'a> {
     }
 }
 
-/// Invocations of a workgroup of `step.wgsl`.
+/// Invocations per workgroup of `step.wgsl`.
 const STEP_GROUP: u32 = 128;
-/// Squares of 32 x 32 weights of a layer, see `transpose.wgsl`.
+/// Squares of 32 x 32 weights per layer, see `transpose.wgsl`.
 const SQUARES: u32 = 16;
 
-/// Moments of the card's own clock.
-pub(super) struct Clock {
-    set: wgpu::QuerySet,
-    resolved: wgpu::Buffer,
-    moments: u32,
-    tick: f64,
-}
-
-impl Clock {
-    /// A clock that notes so many moments; none where the card shows no time.
-    pub(super) fn new(card: &Card, moments: u32) -> Option<Self> {
-        let tick = card.tick?;
-        let set = card.device.create_query_set(&wgpu::QuerySetDescriptor {
-            label: None,
-            ty: wgpu::QueryType::Timestamp,
-            count: moments,
-        });
-        let resolved = card.device.create_buffer(&wgpu::BufferDescriptor {
-            label: None,
-            size: u64::from(moments) * 8,
-            usage: wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC,
-            mapped_at_creation: false,
-        });
-        Some(Self {
-            set,
-            resolved,
-            moments,
-            tick,
-        })
-    }
-
-    /// A pass whose begin and end are noted in these places.
-    pub(super) fn pass<'a>(
-        &self,
-        encoder: &'a mut wgpu::CommandEncoder,
-        begin: Option<u32>,
-        end: Option<u32>,
-    ) -> wgpu::ComputePass<'a> {
-        encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
-            label: None,
-            timestamp_writes: Some(wgpu::ComputePassTimestampWrites {
-                query_set: &self.set,
-                beginning_of_pass_write_index: begin,
-                end_of_pass_write_index: end,
-            }),
-        })
-    }
-
-    /// Writes the moments, eight bytes each, to `to` from `at` on.
-    pub(super) fn resolve(&self, encoder: &mut wgpu::CommandEncoder, to: &wgpu::Buffer, at: u64) {
-        encoder.resolve_query_set(&self.set, 0..self.moments, &self.resolved, 0);
-        let bytes = u64::from(self.moments) * 8;
-        encoder.copy_buffer_to_buffer(&self.resolved, 0, to, at, bytes);
-    }
-
-    /// Seconds between two moments of those that [`Self::resolve`] wrote.
-    pub(super) fn seconds(&self, moments: &[u8], from: usize, to: usize) -> f64 {
-        let at = |place: usize| u64::from_ne_bytes(moments.as_chunks::<8>().0[place]);
-        at(to).saturating_sub(at(from)) as f64 * self.tick
-    }
+/// The bindings of the kernels that run for each wave: forward, query, backward and gradients.
+fn bind_wave(
+    context: &Context,
+    buffers: &Buffers,
+    [tiles, chunks, tile_losses]: [&wgpu::Buffer; 3],
+) -> [wgpu::BindGroup; 4] {
+    let Buffers {
+        store,
+        networks,
+        activations,
+        deltas,
+        flows,
+        loss_gradients,
+        partials,
+        lanes: records,
+        steps,
+        statuses,
+        ..
+    } = buffers;
+    let kernels = &context.kernels;
+    [
+        context.bound(
+            &kernels.forward,
+            &[
+                store,
+                networks,
+                records,
+                steps,
+                tiles,
+                statuses,
+                flows,
+                activations,
+            ],
+        ),
+        context.bound(
+            &kernels.query,
+            &[
+                store,
+                records,
+                steps,
+                tiles,
+                statuses,
+                flows,
+                loss_gradients,
+                tile_losses,
+            ],
+        ),
+        context.bound(
+            &kernels.backward,
+            &[
+                networks,
+                tiles,
+                statuses,
+                loss_gradients,
+                activations,
+                records,
+                deltas,
+            ],
+        ),
+        context.bound(
+            &kernels.gradients,
+            &[
+                store,
+                records,
+                steps,
+                chunks,
+                statuses,
+                activations,
+                deltas,
+                loss_gradients,
+                partials,
+            ],
+        ),
+    ]
 }

@@ -1,17 +1,24 @@
-//! The records that host and kernels share; `shaders/common.wgsl` mirrors them, and a test compares
-//! every offset. Scalars alone, so that both sides agree on every place. Computes nothing.
+//! The records that host and kernels share. `shaders/common.wgsl` mirrors them, and a test compares
+//! all offsets. Records contain only scalars, so that both sides agree on all offsets.
 
 use bytemuck::{Pod, Zeroable};
 
-/// Points that one workgroup carries through the network.
+/// Points that one workgroup evaluates.
 pub(super) const TILE: usize = 64;
-/// Steps that a submission may have.
+/// Maximum number of iterations of a submission.
 pub(super) const STEPS: usize = 64;
-/// Arrays of a network's size that a lane keeps: parameters, transposes, Adam's two moments, and
-/// the parameters of the result.
+/// Number of arrays of a network's size per lane: parameters, transposed weights, Adam's two
+/// moments, and the parameters of the result.
 pub(super) const ARRAYS: usize = 5;
 
-/// Where a transform lies in the store, in words, and its geometry.
+/// Indices of a lane's arrays; common.wgsl has the same.
+pub(super) const PARAMETERS: u64 = 0;
+pub(super) const TRANSPOSED: u64 = 1;
+pub(super) const MEANS: u64 = 2;
+pub(super) const SQUARES: u64 = 3;
+pub(super) const KEPT: u64 = 4;
+
+/// Offsets of a distance transform in the store, in 32-bit words, and its geometry.
 #[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
 #[repr(C)]
 pub(super) struct Transform {
@@ -29,7 +36,7 @@ pub(super) struct Transform {
     pub(super) far_vertices: [u32; 3],
 }
 
-/// One pair's optimization, in one submission.
+/// The fit of one pair within one submission.
 #[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
 #[repr(C)]
 pub(super) struct Lane {
@@ -61,10 +68,10 @@ pub(super) struct Step {
     pub(super) weight: f32,
     pub(super) step_size: f32,
     pub(super) square_correction: f32,
-    pub(super) fresh: f32,
+    pub(super) ema_weight: f32,
 }
 
-/// What one workgroup carries through the network.
+/// A tile: the points of one workgroup.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub(super) struct Tile {
@@ -72,7 +79,7 @@ pub(super) struct Tile {
     pub(super) tile: u32,
 }
 
-/// Points whose weight gradients are added up together.
+/// A chunk: consecutive points whose weight gradients are summed by one workgroup per layer.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub(super) struct Chunk {
@@ -82,7 +89,7 @@ pub(super) struct Chunk {
     pub(super) first_point: u32,
 }
 
-/// How a lane's optimization stands.
+/// The state of a lane's optimization.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub(super) struct Status {
@@ -102,7 +109,7 @@ pub(super) const CONVERGED: u32 = 1;
 /// [`Status::state`]: a loss was not finite.
 pub(super) const DIVERGED: u32 = 2;
 
-/// Which part of the submission a dispatch does.
+/// The part of the submission that a dispatch processes.
 #[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
 #[repr(C)]
 pub(super) struct Part {
@@ -111,7 +118,7 @@ pub(super) struct Part {
     pub(super) first_chunk: u32,
     pub(super) tiles: u32,
     pub(super) rows: u32,
-    /// Zero, which no compiler of a kernel knows.
+    /// Always zero. The shader compilers cannot assume so, see `arithmetic.wgsl`.
     pub(super) nothing: u32,
 }
 

@@ -1,43 +1,63 @@
-//! The card's memory: taken once, when it is opened, and cut up by what it is for. Knows no kernels.
+//! The GPU's memory budget. Memory is allocated once, when the GPU is opened, and divided among the
+//! buffers.
 
 use super::adapter::AdapterKind;
 use super::layout::{ARRAYS, TILE};
 use crate::flow::field::{BackendError, HIDDEN_LAYERS, LAID_OUT, WIDTH};
 
-/// Bytes of a row's activations, or deltas, of all hidden layers.
+/// Options for opening a GPU.
+#[derive(Clone, Debug)]
+pub struct GpuOptions {
+    /// Number of lanes: pairs that can be fitted at the same time.
+    pub lanes: usize,
+    /// GPU memory to allocate, bytes. If none, the default for the kind of GPU.
+    pub memory_bytes: Option<u64>,
+}
+
+impl Default for GpuOptions {
+    fn default() -> Self {
+        Self {
+            lanes: 1,
+            memory_bytes: None,
+        }
+    }
+}
+
+/// Bytes of a row's activations, or of its deltas, for all hidden layers.
 const ROW_BYTES: u64 = (HIDDEN_LAYERS * WIDTH * size_of::<f32>()) as u64;
 /// Bytes of one network, or of one chunk's gradients.
 pub(super) const NETWORK_BYTES: u64 = (LAID_OUT * size_of::<f32>()) as u64;
-/// Bytes of a lane's arrays: those of all lanes lie in one binding.
+/// Bytes of a lane's arrays: parameters, transposed weights, Adam's moments and result. The arrays
+/// of all lanes share one binding.
 pub const LANE_NETWORK_BYTES: u64 = ARRAYS as u64 * NETWORK_BYTES;
-/// The fewest rows that are worth a dispatch: no chunk has more points.
+/// Minimum number of rows. No chunk has more points.
 pub(super) const LEAST_ROWS: u64 = 8192;
-/// The most rows: more of them would be busy no longer at once on any card.
+/// Maximum number of rows: 8,192 tiles, enough to occupy a large GPU.
 const MOST_ROWS: u64 = 1 << 19;
-/// The fewest chunks: those of a batch of two million points.
+/// Minimum number of chunks: those of a batch of two million points.
 const LEAST_CHUNKS: u64 = 256;
-/// Bytes of the store that a lane should find: a full sweep's transform and points. Sweeps of 400 m
-/// take twice as much; where there is memory, a quarter of it is the store's.
+/// Bytes of the store per lane: a full sweep's distance transform and points. A sweep with a range
+/// of 400 m takes twice as much. With enough memory, at least a quarter of it goes to the store.
 const LANE_STORE_BYTES: u64 = 96 << 20;
 
-/// What of the card's memory is for what.
+/// The division of the GPU's memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Budget {
-    /// Pairs that may be fitted at the same time.
+    /// Number of lanes.
     pub(super) lanes: u64,
-    /// Rows that go through the network at a time.
+    /// Rows of activations: points that are processed at the same time.
     pub(super) rows: u64,
-    /// Chunks of gradients of one submission.
+    /// Chunks of gradients per submission.
     pub(super) chunks: u64,
-    /// Words of transforms and points.
+    /// Words of the store, for distance transforms and points.
     pub(super) store_words: u64,
 }
 
 impl Budget {
-    /// Cuts `bytes` up, where a binding holds at most `binding` bytes.
+    /// Divides `bytes` bytes, where a binding holds at most `binding` bytes.
     ///
     /// # Errors
-    /// [`BackendError::Memory`] where not even the least fits.
+    /// [`BackendError::Memory`] if the minimum does not fit.
     pub(super) fn new(lanes: usize, bytes: u64, binding: u64) -> Result<Self, BackendError> {
         let lanes = (lanes as u64).min(binding / LANE_NETWORK_BYTES).max(1);
         let networks = lanes * LANE_NETWORK_BYTES;
@@ -53,7 +73,7 @@ impl Budget {
                 available: bytes,
             });
         }
-        // What is left over goes to the store, then to chunks, then to rows.
+        // Memory beyond the minimum goes to the store, then to chunks, then to rows.
         let mut left = bytes - least;
         let mut more = |wished: u64, room: u64| {
             let taken = wished.min(room).min(left);
@@ -78,7 +98,7 @@ impl Budget {
         })
     }
 
-    /// Bytes to take of a card where nobody says how many.
+    /// Default number of bytes to allocate.
     pub(super) fn usual(kind: AdapterKind, lanes: usize) -> u64 {
         match kind {
             AdapterKind::Discrete | AdapterKind::Virtual => (2 << 30) + lanes as u64 * (256 << 20),
@@ -99,7 +119,7 @@ impl Budget {
         self.chunks * NETWORK_BYTES
     }
 
-    /// All of it, bytes.
+    /// The sum of all parts, bytes.
     pub(super) fn bytes(&self) -> u64 {
         self.network_bytes() + 2 * self.row_bytes() + self.chunk_bytes() + self.store_words * 4
     }

@@ -1,21 +1,28 @@
-//! The GPU backend: the solver's kernels in WGSL, on any card that wgpu reaches.
+//! The GPU backend: the kernels of the field fit in WGSL, on any GPU that wgpu supports.
 //!
-//! Knows nothing of the CPU backend; no type of wgpu leaves this folder. One [`Gpu`] is one opened
-//! card: it is cheap to clone, every clone may fit a pair of its own from a thread of its own, and
-//! pairs that are fitted at the same time share the card's submissions.
+//! Independent of the CPU backend; no type of wgpu is public. A [`Gpu`] is one opened GPU. It is
+//! cheap to clone, and each clone can fit its own pair from its own thread. Pairs that are fitted
+//! at the same time share the GPU's submissions.
 
 mod adapter;
 mod allocator;
 mod backend;
 mod batcher;
+mod buffers;
+mod context;
+mod device;
 mod distance;
 mod half;
+mod health;
 mod inference;
 mod iteration;
 mod layout;
+mod matrix_units;
 mod memory;
+mod phase;
 mod pipelines;
 mod profile;
+mod request;
 mod self_test;
 #[cfg(test)]
 mod tests;
@@ -23,6 +30,6 @@ mod tiling;
 mod trainer;
 
 pub use adapter::{Adapter, AdapterKind, Selector, adapters, select};
-pub use backend::{Gpu, GpuOptions};
-pub use memory::LANE_NETWORK_BYTES;
+pub use backend::Gpu;
+pub use memory::{GpuOptions, LANE_NETWORK_BYTES};
 pub use profile::{KernelTime, arithmetic_peak, kernel_times};

@@ -1,6 +1,6 @@
-//! The kernels: their sources and their pipelines. Knows neither what they compute nor on what.
+//! The kernels' sources and compute pipelines.
 
-use super::backend::Watchdog;
+use super::health::Watchdog;
 use crate::flow::field::BackendError;
 
 macro_rules! source {
@@ -9,7 +9,7 @@ macro_rules! source {
     };
 }
 
-/// Each kernel's entry point and source.
+/// Entry point and source of each single-precision kernel.
 pub(super) const SOURCES: [(&str, &str); 10] = [
     ("bricks", source!("bricks")),
     (
@@ -49,17 +49,17 @@ macro_rules! half_sources {
     };
 }
 
-/// The kernels of half precision, for matrix units whose tiles are 8 and 16 to a side.
+/// The half-precision kernels, for matrix units with tiles of 8 x 8 and of 16 x 16.
 pub(super) const HALF_SOURCES: [[(&str, &str); 4]; 2] =
     [half_sources!("tile8"), half_sources!("tile16")];
 
-/// The pipelines of all kernels but those of half precision.
+/// The pipelines of all kernels except those of half precision.
 #[derive(Debug)]
 pub(super) struct Kernels {
     pub(super) bricks: wgpu::ComputePipeline,
     pub(super) sample: wgpu::ComputePipeline,
     pub(super) forward: wgpu::ComputePipeline,
-    /// [`Self::forward`] with the kept network, remembering nothing.
+    /// [`Self::forward`] with the kept parameters and without storing activations.
     pub(super) evaluate: wgpu::ComputePipeline,
     pub(super) query: wgpu::ComputePipeline,
     pub(super) backward: wgpu::ComputePipeline,
@@ -67,7 +67,7 @@ pub(super) struct Kernels {
     pub(super) judge: wgpu::ComputePipeline,
     pub(super) step: wgpu::ComputePipeline,
     pub(super) transpose: wgpu::ComputePipeline,
-    /// The device's arithmetic peak, for measurements.
+    /// Measures the GPU's peak arithmetic throughput.
     pub(super) multiply_adds: wgpu::ComputePipeline,
 }
 
@@ -75,7 +75,7 @@ impl Kernels {
     /// Builds all pipelines.
     ///
     /// # Errors
-    /// [`BackendError::Device`] where the driver refuses one.
+    /// [`BackendError::Lost`] if the driver rejects one.
     pub(super) fn new(device: &wgpu::Device, watchdog: &Watchdog) -> Result<Self, BackendError> {
         let pipeline =
             |name: &str, constants: &[(&str, f64)]| pipeline(device, &SOURCES, name, constants);
@@ -97,15 +97,15 @@ impl Kernels {
     }
 }
 
-/// The pipelines of half precision.
+/// The half-precision pipelines.
 #[derive(Debug)]
 pub(super) struct HalfKernels {
     pub(super) halve: wgpu::ComputePipeline,
     pub(super) forward: wgpu::ComputePipeline,
     pub(super) backward: wgpu::ComputePipeline,
-    /// The middle layers'.
+    /// Gradients of the middle layers.
     pub(super) gradients: wgpu::ComputePipeline,
-    /// Those of the first layer and the last, in single precision.
+    /// Gradients of the first and the last layer, in single precision.
     pub(super) outer_gradients: wgpu::ComputePipeline,
 }
 
@@ -113,12 +113,13 @@ impl HalfKernels {
     /// Builds the pipelines from one of [`HALF_SOURCES`].
     ///
     /// # Errors
-    /// [`BackendError::Device`] where the driver refuses one.
+    /// [`BackendError::Device`] if the driver rejects one.
     pub(super) fn new(
         device: &wgpu::Device,
         sources: &[(&str, &str)],
     ) -> Result<Self, BackendError> {
-        // A driver's refusal costs half precision, not the card.
+        // If the driver rejects a pipeline, only half precision is unavailable; the GPU remains
+        // usable.
         let internal = device.push_error_scope(wgpu::ErrorFilter::Internal);
         let invalid = device.push_error_scope(wgpu::ErrorFilter::Validation);
         let half = |name: &str| pipeline(device, sources, name, &[]);
@@ -138,7 +139,7 @@ impl HalfKernels {
     }
 }
 
-/// The pipeline of the kernel of this name.
+/// Builds the pipeline of the kernel `name`.
 fn pipeline(
     device: &wgpu::Device,
     sources: &[(&str, &str)],

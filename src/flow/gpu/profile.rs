@@ -1,37 +1,42 @@
-//! Measured amounts of work: every kernel of an iteration by the card's own clock, and the card's
-//! arithmetic peak. For benchmarks and `fnsf doctor`.
+//! Profiling: the time of every kernel of an iteration by GPU timestamps, and the GPU's peak
+//! arithmetic throughput. For benchmarks and `fnsf doctor`.
 
-use super::backend::{Gpu, spread};
-use super::batcher::{Request, write};
+use super::backend::Gpu;
+use super::buffers::spread;
 use super::distance;
-use super::iteration::{Clock, Phase, Phases};
+use super::distance::GpuTransform;
+use super::iteration::Phases;
 use super::layout::{Lane, Status, Step};
+use super::phase::{Clock, Phase};
+use super::request::{Request, write};
 use super::tiling::{Cut, Plan};
 use crate::flow::data::{Point, Uncontrolled};
 use crate::flow::distance::DistanceOptions;
 use crate::flow::field::{BackendError, MIDDLE_LAYERS, Schedule, WIDTH};
-use crate::flow::options::{Options, Precision, Preset};
+use crate::flow::options::{FieldOptions, Precision};
 
-/// Floating-point operations of a point's forward pass.
+/// Floating-point operations of the forward pass, per point.
 const FORWARD: f64 = 2.0 * (3 * WIDTH + MIDDLE_LAYERS * WIDTH * WIDTH + 3 * WIDTH) as f64;
-/// Of the way back through all layers but the first.
+/// Floating-point operations of the backward pass, which stops at the first hidden layer, per
+/// point.
 const BACKWARD: f64 = FORWARD - 2.0 * (3 * WIDTH) as f64;
 
-/// What one kernel takes.
+/// Time and work of one kernel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct KernelTime {
-    /// The kernel.
+    /// Name of the kernel.
     pub name: &'static str,
-    /// Seconds by the card's clock, the least of all rounds.
+    /// Seconds by GPU timestamps, the minimum of all rounds.
     pub seconds: f64,
-    /// Floating-point operations; zero of a kernel that is bound by memory.
+    /// Floating-point operations; zero for a kernel that is limited by memory traffic.
     pub operations: f64,
 }
 
-/// Times each kernel of an iteration over all of `source` in one precision, `rounds` times.
+/// Times each kernel of an iteration over all points of `source` in one precision, `rounds` times.
 ///
 /// # Errors
-/// [`BackendError`] where the pair does not fit at once, or the card shows no clock.
+/// [`BackendError`] if the pair does not fit into the GPU's memory in one wave, or the GPU has no
+/// timestamps.
 pub fn kernel_times(
     gpu: &Gpu,
     source: &[Point],
@@ -39,54 +44,28 @@ pub fn kernel_times(
     precision: Precision,
     rounds: usize,
 ) -> Result<Vec<KernelTime>, BackendError> {
-    let card = gpu.card();
+    let device = gpu.device();
+    let context = &device.context;
     let cut = Cut::new(source.len());
-    let plan = Plan::new(&[cut], card.budget.rows as usize);
+    let plan = Plan::new(&[cut], context.budget.rows as usize);
     let [wave] = plan.waves.as_slice() else {
         let text = "the kernels are timed on what fits into the card's memory at once";
         return Err(BackendError::Unsupported(text));
     };
     let built = distance::build(
-        card,
+        device,
         source,
         target,
         &DistanceOptions::default(),
         &Uncontrolled,
     )?;
-    let options = Options {
-        precision,
-        // The same iteration again and again is no progress, and no reason to stop.
-        early_stop: None,
-        ..Preset::Paper.options(None)
-    };
-    let (course, _) = Schedule::new(source, &options);
-    // The trainer's network is at its start, and stays there: its rate is zero.
-    let trainer = super::trainer::GpuTrainer::new(&built, source, &options)?;
-    let adam = course.adam(0);
-    let request = Request {
-        lane: Lane {
-            tiles: cut.tiles as u32,
-            chunks: cut.chunks.count as u32,
-            ..trainer.lane()
-        },
-        status: Status::default(),
-        steps: vec![Step {
-            first: 0,
-            count: source.len() as u32,
-            weight: 1.0 / source.len() as f32,
-            step_size: 0.0,
-            square_correction: adam.square_correction,
-            fresh: 1.0,
-        }],
-        cut,
-        precision,
-    };
-    write(card, &card.buffers, &[&request]);
+    let request = repeated_iteration(&built, source, cut, precision)?;
+    write(context, &context.buffers, &[&request]);
     let units = match precision {
         Precision::F32 => None,
-        Precision::F16 => Some(card.units()?),
+        Precision::F16 => Some(device.units()?),
     };
-    let phases = Phases::bind(card, &card.buffers, &plan, 1, units)?;
+    let phases = Phases::bind(context, &context.buffers, &plan, 1, units)?;
     let points = source.len() as f64;
     let kernels = [
         ("forward", Phase::Forward, points * FORWARD),
@@ -107,7 +86,7 @@ pub fn kernel_times(
     });
     for _ in 0..rounds.max(1) {
         let clock = clock(gpu, 2 * kernels.len() as u32)?;
-        let mut encoder = card.encoder();
+        let mut encoder = context.encoder();
         for (place, (_, phase, _)) in (0..).zip(kernels) {
             let mut pass = clock.pass(&mut encoder, Some(2 * place), Some(2 * place + 1));
             phases.dispatch(&mut pass, phase, 0, wave);
@@ -121,25 +100,65 @@ pub fn kernel_times(
     Ok(times.to_vec())
 }
 
-/// Floating-point operations a second that the card does at most, by independent multiply-adds.
+/// One iteration over all points that can be repeated: its step size is zero.
+fn repeated_iteration(
+    built: &GpuTransform,
+    source: &[Point],
+    cut: Cut,
+    precision: Precision,
+) -> Result<Request, BackendError> {
+    let options = FieldOptions {
+        precision,
+        // The repeated iteration makes no progress and must not stop the fit.
+        early_stop: None,
+        ..FieldOptions::published(false)
+    };
+    let (schedule, _) = Schedule::new(source, &options, 0);
+    // The network keeps its initial parameters, because the step size is zero.
+    let trainer = super::trainer::GpuTrainer::new(built, source, &options, 0)?;
+    let adam = schedule.adam(0);
+    Ok(Request {
+        lane: Lane {
+            tiles: cut.tiles as u32,
+            chunks: cut.chunks.count as u32,
+            ..trainer.lane()
+        },
+        status: Status::default(),
+        steps: vec![Step {
+            first: 0,
+            count: source.len() as u32,
+            weight: 1.0 / source.len() as f32,
+            step_size: 0.0,
+            square_correction: adam.square_correction,
+            ema_weight: 1.0,
+        }],
+        cut,
+        precision,
+    })
+}
+
+/// Peak arithmetic throughput of the GPU, in floating-point operations per second, measured with
+/// independent multiply-adds.
 ///
 /// # Errors
-/// [`BackendError`] where the card fails or shows no clock.
+/// [`BackendError`] if the GPU fails or has no timestamps.
 pub fn arithmetic_peak(gpu: &Gpu) -> Result<f64, BackendError> {
-    /// Invocations, of eight chains of 512 multiply-adds of vec4s each: see `multiply_adds.wgsl`.
+    /// Workgroups, invocations per workgroup, and operations per invocation: eight chains of 512
+    /// multiply-adds of vec4s, see `multiply_adds.wgsl`.
     const GROUPS: u32 = 4096;
     const GROUP: f64 = 128.0;
     const OPERATIONS: f64 = 8.0 * 512.0 * 4.0 * 2.0;
-    let card = gpu.card();
-    let factors = card.filled(bytemuck::cast_slice(&[[0.999f32; 4], [0.001; 4], [1.0; 4]]))?;
-    let sums = card.empty(1 << 20, wgpu::BufferUsages::STORAGE)?;
-    let pipeline = &card.kernels.multiply_adds;
-    let group = card.bound(pipeline, &[&factors, &sums]);
+    let device = gpu.device();
+    let context = &device.context;
+    let factors = context.filled(bytemuck::cast_slice(&[[0.999f32; 4], [0.001; 4], [1.0; 4]]))?;
+    let sums = context.empty(1 << 20, wgpu::BufferUsages::STORAGE)?;
+    let pipeline = &context.kernels.multiply_adds;
+    let group = context.bound(pipeline, &[&factors, &sums]);
     let mut best = 0.0f64;
-    // A quarter of the groups first: a slow card must not be busy for seconds.
+    // Starts with 1/64 of the workgroups, so that a slow GPU is not busy for seconds.
     for groups in [GROUPS / 64, GROUPS / 8, GROUPS, GROUPS] {
         let clock = clock(gpu, 2)?;
-        let mut encoder = card.encoder();
+        let mut encoder = context.encoder();
         {
             let mut pass = clock.pass(&mut encoder, Some(0), Some(1));
             pass.set_pipeline(pipeline);
@@ -159,10 +178,10 @@ pub fn arithmetic_peak(gpu: &Gpu) -> Result<f64, BackendError> {
 
 fn clock(gpu: &Gpu, moments: u32) -> Result<Clock, BackendError> {
     let text = "the card shows no clock";
-    Clock::new(gpu.card(), moments).ok_or(BackendError::Unsupported(text))
+    Clock::new(&gpu.device().context, moments).ok_or(BackendError::Unsupported(text))
 }
 
-/// Submits, and reads the clock's moments.
+/// Submits the commands and reads the timestamps.
 fn read(
     gpu: &Gpu,
     mut encoder: wgpu::CommandEncoder,
@@ -170,7 +189,7 @@ fn read(
     moments: u64,
 ) -> Result<Vec<u8>, BackendError> {
     let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
-    let to = gpu.card().empty(moments * 8, usage)?;
+    let to = gpu.device().context.empty(moments * 8, usage)?;
     clock.resolve(&mut encoder, &to, 0);
-    gpu.card().finish(encoder, &to, moments * 8)
+    gpu.device().context.finish(encoder, &to, moments * 8)
 }

@@ -1,17 +1,20 @@
-//! Whether the kernels of half precision compute what those of single precision do, on a random
-//! network and random points: asked once a card, before anything relies on its matrix units.
+//! Self-test of the matrix units: compares the half-precision kernels with those of single
+//! precision on a random network and random points. Runs once per opened GPU, before half precision
+//! is used.
 //!
-//! Cooperative matrices are experimental in wgpu, whose barriers do not say all that the Vulkan
-//! memory model asks for (gfx-rs/wgpu#8805): a driver may take advantage of it. Each kernel is run
-//! on the same inputs in both precisions, so that what differs is rounding alone. Knows no pair.
+//! Cooperative matrices are experimental in wgpu, whose barriers do not cover all requirements of
+//! the Vulkan memory model (gfx-rs/wgpu#8805). A driver may therefore compute wrong results. Each
+//! kernel runs on the same inputs in both precisions, so that only rounding differs.
 
-use super::backend::{Buffers, Card};
-use super::batcher;
-use super::batcher::Request;
+use super::buffers::Buffers;
+use super::context::Context;
 use super::half::Units;
-use super::iteration::{Phase, Phases};
+use super::iteration::Phases;
 use super::layout::{Lane, Status, Step, TILE};
+use super::matrix_units::Tile;
 use super::memory::Budget;
+use super::phase::Phase;
+use super::request::{Request, write as write_request};
 use super::tiling::{Cut, Plan};
 use crate::flow::data::Random;
 use crate::flow::field::{
@@ -20,19 +23,32 @@ use crate::flow::field::{
 };
 use crate::flow::options::Precision;
 
-/// Points: enough for many workgroups at once, and no whole number of tiles.
+/// Number of points: enough for many concurrent workgroups, and not a multiple of the tile size.
 const POINTS: usize = 2000;
-/// The largest difference, in parts of the largest value of the layer. A factor that is rounded to
-/// a half is off by 2^-12 of itself on average; sums over 128 of them, seven layers deep, are off
-/// by a few times that in parts of the largest. A wrong tile is off by about one.
+/// Maximum difference, relative to the largest value of the layer. Rounding a factor to half
+/// precision has a relative error of 2^-12 on average. Sums over 128 of them, seven layers deep,
+/// are off by a few times that, relative to the largest. A wrong tile is off by about one.
 const TOLERANCE: f32 = 0.01;
+
+/// Builds the half-precision kernels and compares them with those of single precision.
+///
+/// # Errors
+/// The reason why half precision is not available on this GPU.
+pub(super) fn tested_units(
+    context: &Context,
+    tile: Tile,
+    sources: &[(&str, &str)],
+) -> Result<Units, String> {
+    run(context, &Units::new(context, tile, sources, 1)?)?;
+    Units::new(context, tile, sources, context.budget.lanes)
+}
 
 /// Compares the kernels.
 ///
 /// # Errors
-/// What differs, or why nothing could be compared.
-pub(super) fn run(card: &Card, units: &Units) -> Result<(), String> {
-    let [single, half] = computed(card, units).map_err(|error| error.to_string())?;
+/// The result that differs, or the failure that prevented the comparison.
+fn run(context: &Context, units: &Units) -> Result<(), String> {
+    let [single, half] = computed(context, units).map_err(|error| error.to_string())?;
     let layer = TILE * POINTS.div_ceil(TILE) * WIDTH;
     for (name, single, half) in [
         ("activations", &single.activations, &half.activations),
@@ -60,14 +76,14 @@ pub(super) fn run(card: &Card, units: &Units) -> Result<(), String> {
 }
 
 /// # Errors
-/// How far off the values are, where that is too far.
+/// The relative difference, if it exceeds the tolerance.
 fn compare(what: &str, single: &[f32], half: &[f32]) -> Result<(), String> {
     let largest = single.iter().fold(0.0f32, |most, x| most.max(x.abs()));
     let differences = single
         .iter()
         .zip(half)
         .map(|(a, b)| (a - b).abs() / largest);
-    // What is not a number is larger than any.
+    // NaN counts as larger than any number.
     let off = differences.fold(0.0, |most: f32, off| if off <= most { most } else { off });
     if off <= TOLERANCE {
         return Ok(());
@@ -77,21 +93,21 @@ fn compare(what: &str, single: &[f32], half: &[f32]) -> Result<(), String> {
     ))
 }
 
-/// What the kernels of one precision make of the same inputs.
+/// The results of the kernels of one precision.
 struct Computed {
     /// `[layer][row][128]`.
     activations: Vec<f32>,
-    /// A quad a row.
+    /// One vec4 per row.
     flows: Vec<f32>,
     /// `[layer][row][128]`.
     deltas: Vec<f32>,
-    /// A network's worth a chunk.
+    /// One network's worth per chunk.
     gradients: Vec<f32>,
 }
 
-/// What both precisions compute, single first. Derivatives and gradients of both are made of the
-/// activations, and gradients of the derivatives, that single precision found.
-fn computed(card: &Card, units: &Units) -> Result<[Computed; 2], BackendError> {
+/// The results of both precisions, single precision first. Both backward passes read the
+/// activations of single precision, and both gradient kernels read its activations and deltas.
+fn computed(context: &Context, units: &Units) -> Result<[Computed; 2], BackendError> {
     let cut = Cut::new(POINTS);
     let budget = Budget {
         lanes: 1,
@@ -100,11 +116,11 @@ fn computed(card: &Card, units: &Units) -> Result<[Computed; 2], BackendError> {
         store_words: 3 * POINTS as u64,
     };
     let more = wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST;
-    let buffers = Buffers::allocate(&card.device, &budget, more)?;
+    let buffers = Buffers::allocate(&context.device, &budget, more)?;
     let plan = Plan::new(&[cut], cut.tiles * TILE);
-    fill(card, &buffers, cut);
-    let single = Phases::bind(card, &buffers, &plan, 1, None)?;
-    let half = Phases::bind(card, &buffers, &plan, 1, Some(units))?;
+    fill(context, &buffers, cut);
+    let single = Phases::bind(context, &buffers, &plan, 1, None)?;
+    let half = Phases::bind(context, &buffers, &plan, 1, Some(units))?;
 
     let row_bytes = budget.row_bytes();
     let sizes = [
@@ -114,8 +130,8 @@ fn computed(card: &Card, units: &Units) -> Result<[Computed; 2], BackendError> {
         (&buffers.partials, budget.chunk_bytes()),
     ];
     let all: u64 = sizes.iter().map(|(_, bytes)| 2 * bytes).sum();
-    let results = card.empty(all, more)?;
-    let mut encoder = card.encoder();
+    let results = context.empty(all, more)?;
+    let mut encoder = context.encoder();
     let mut at = 0;
     let mut spans = Vec::new();
     let mut done = |phases: &Phases<'_>, todo: &[Phase], kept: &[usize]| {
@@ -138,7 +154,7 @@ fn computed(card: &Card, units: &Units) -> Result<[Computed; 2], BackendError> {
     done(&single, &[Phase::Backward], &[2]);
     done(&half, &[Phase::Gradients], &[3]);
     done(&single, &[Phase::Gradients], &[3]);
-    let read = card.finish(encoder, &results, all)?;
+    let read = context.finish(encoder, &results, all)?;
     let values = |number: usize| {
         let quads = read[spans[number].clone()].as_chunks::<4>().0;
         quads
@@ -155,8 +171,9 @@ fn computed(card: &Card, units: &Units) -> Result<[Computed; 2], BackendError> {
     Ok([of([2, 3, 5, 7]), of([0, 1, 4, 6])])
 }
 
-/// Random points, pulls and a random network, biases too.
-fn fill(card: &Card, buffers: &Buffers, cut: Cut) {
+/// Writes random points, random loss gradients and a random network, with random biases in the
+/// middle layers.
+fn fill(context: &Context, buffers: &Buffers, cut: Cut) {
     let mut random = Random::new(1);
     let mut parameters = Parameters::xavier(&mut random);
     for number in 0..MIDDLE_LAYERS {
@@ -176,7 +193,8 @@ fn fill(card: &Card, buffers: &Buffers, cut: Cut) {
         })
         .collect();
     let write = |buffer: &wgpu::Buffer, at: u64, floats: &[f32]| {
-        card.queue
+        context
+            .queue
             .write_buffer(buffer, at * 4, bytemuck::cast_slice(floats));
     };
     let laid_out = LAID_OUT as u64;
@@ -205,5 +223,5 @@ fn fill(card: &Card, buffers: &Buffers, cut: Cut) {
         cut,
         precision: Precision::F16,
     };
-    batcher::write(card, buffers, &[&request]);
+    write_request(context, buffers, &[&request]);
 }

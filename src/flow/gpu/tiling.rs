@@ -1,15 +1,16 @@
-//! How a submission's points are cut up: tiles for the network, chunks for the gradients, waves
-//! for the memory; chunks as `sums.rs` says. By a batch's size alone, so that a pair's bits depend
-//! neither on the memory nor on which pairs share the submission. Knows no card.
+//! Division of a submission's points into tiles for the network, chunks for the gradients (see
+//! field/reduction.rs), and waves that fit into memory. Tiles and chunks depend only on the batch's
+//! size, so that a result does not depend on the memory or on other pairs of the submission, to the
+//! bit.
 
 use super::layout::{Chunk, TILE, Tile};
 use super::memory::LEAST_ROWS;
 use crate::flow::field::{Chunks, MOST_POINTS, STRETCH};
 
-/// A chunk is a whole number of tiles, and fits into the least memory.
+/// A chunk is a whole number of tiles and fits into the minimum number of rows.
 const _: () = assert!(STRETCH.is_multiple_of(TILE) && MOST_POINTS <= LEAST_ROWS as usize);
 
-/// Tiles and chunks of a batch.
+/// Number of tiles, and chunks, of a batch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Cut {
     pub(super) tiles: usize,
@@ -17,7 +18,7 @@ pub(super) struct Cut {
 }
 
 impl Cut {
-    /// Cuts a batch of at most `points` points.
+    /// Divides a batch of at most `points` points.
     pub(super) fn new(points: usize) -> Self {
         Self {
             tiles: points.div_ceil(TILE).max(1),
@@ -32,7 +33,7 @@ impl Cut {
     }
 }
 
-/// What goes through the network at a time.
+/// A wave: tiles and chunks that are processed at the same time.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Wave {
     pub(super) first_tile: usize,
@@ -41,7 +42,7 @@ pub(super) struct Wave {
     pub(super) chunks: usize,
 }
 
-/// All lanes' tiles and chunks, and the waves that they go in.
+/// The tiles and chunks of all lanes, and their waves.
 #[derive(Debug, Default)]
 pub(super) struct Plan {
     pub(super) tiles: Vec<Tile>,
@@ -50,7 +51,7 @@ pub(super) struct Plan {
 }
 
 impl Plan {
-    /// Plans lanes of these cuts, with `rows` rows of memory.
+    /// Plans lanes with these divisions, where memory holds `rows` rows.
     pub(super) fn new(cuts: &[Cut], rows: usize) -> Self {
         let mut plan = Self::default();
         let mut wave = Wave::default();

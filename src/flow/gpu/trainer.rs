@@ -1,75 +1,72 @@
-//! One optimization on the card. Knows what a pair wants; how pairs share the card is batch.rs's.
+//! The fit of one pair on the GPU. Submissions with other pairs are in gpu/batcher.rs.
 
 use std::sync::Arc;
 
-use super::backend::Card;
-use super::batcher::{Done, Request};
+use super::batcher::Done;
+use super::device::Device;
 use super::distance::GpuTransform;
-use super::layout::{ARRAYS, CONVERGED, DIVERGED, STEPS, Status};
+use super::layout::{
+    ARRAYS, CONVERGED, DIVERGED, KEPT, MEANS, PARAMETERS, SQUARES, STEPS, Status, TRANSPOSED,
+};
 use super::memory::NETWORK_BYTES;
+use super::request::Request;
 use super::tiling::Cut;
 use super::{inference, layout};
 use crate::flow::data::{Control, Point, Progress};
 use crate::flow::field::{
-    Advance, BackendError, FitReport, LAID_OUT, Parameters, Schedule, Seen, Trainer, TrainerState,
-    transpose_middle_layers,
+    Advance, BackendError, EarlyStopState, FitReport, LAID_OUT, Parameters, Schedule, Trainer,
+    TrainerState, transpose_middle_layers,
 };
-use crate::flow::options::{Options, Precision};
+use crate::flow::options::{FieldOptions, Precision};
 
-/// Seconds that a submission should take: a look at the watch, and at the card's health.
+/// Target duration of a submission, seconds. The control and the GPU's health are checked once per
+/// submission.
 const SUBMISSION_SECONDS: f64 = 0.03;
-/// Iterations of a submission where the card shows no clock.
+/// Iterations per submission if the GPU has no timestamps.
 const BLIND_STEPS: usize = 4;
-/// Iterations of a submission at most, where a stopping rule may end the run in any of them.
+/// Maximum number of iterations per submission if a stopping rule may end the fit at any iteration.
 const STOPPABLE_STEPS: usize = 16;
-/// The places of a lane's arrays; common.wgsl has the same.
-const PARAMETERS: u64 = 0;
-const TRANSPOSED: u64 = 1;
-const MEANS: u64 = 2;
-const SQUARES: u64 = 3;
-pub(super) const KEPT: u64 = 4;
-
-/// One of the card's networks, as long as somebody fits it.
+/// A network slot of the GPU. Released on drop.
 struct Network {
-    card: Arc<Card>,
+    device: Arc<Device>,
     number: u32,
 }
 
 impl Network {
-    fn take(card: &Arc<Card>) -> Result<Self, BackendError> {
-        let number = card.take_network()?;
-        card.batch.joined();
+    fn take(device: &Arc<Device>) -> Result<Self, BackendError> {
+        let number = device.context.take_network()?;
+        device.batch.joined();
         Ok(Self {
-            card: Arc::clone(card),
+            device: Arc::clone(device),
             number,
         })
     }
 
-    /// Where one of its arrays begins, bytes.
+    /// Byte offset of one of the slot's arrays.
     fn at(&self, array: u64) -> u64 {
         (u64::from(self.number) * ARRAYS as u64 + array) * NETWORK_BYTES
     }
 
     fn write(&self, array: u64, parameters: &Parameters) {
         let bytes = bytemuck::cast_slice(&parameters.as_slice()[..LAID_OUT]);
-        let queue = &self.card.queue;
-        queue.write_buffer(&self.card.buffers.networks, self.at(array), bytes);
+        let queue = &self.device.context.queue;
+        queue.write_buffer(&self.device.context.buffers.networks, self.at(array), bytes);
     }
 }
 
 impl Drop for Network {
     fn drop(&mut self) {
-        self.card.batch.left();
-        self.card.give_network_back(self.number);
+        self.device.batch.left();
+        self.device.context.give_network_back(self.number);
     }
 }
 
-/// The network, its optimizer and the distance that it is fitted to.
+/// The network, its optimizer and the distance transform of the target.
 pub(super) struct GpuTrainer<'a> {
     transform: &'a GpuTransform,
-    course: Schedule,
+    schedule: Schedule,
     network: Network,
-    /// Their place in the store, words.
+    /// Offset of the points in the store, in words.
     points: u32,
     status: Status,
     query_seconds: f64,
@@ -79,29 +76,33 @@ impl<'a> GpuTrainer<'a> {
     pub(super) fn new(
         transform: &'a GpuTransform,
         source: &[Point],
-        options: &Options,
+        options: &FieldOptions,
+        seed: u64,
     ) -> Result<Self, BackendError> {
-        let card = &transform.card;
+        let device = &transform.device;
         if options.precision == Precision::F16 {
-            card.units()?;
+            device.units()?;
         }
-        let (course, parameters) = Schedule::new(source, options);
-        let chunks = Cut::new(course.largest_batch()).chunks.count as u64;
-        if chunks > card.budget.chunks {
+        let (schedule, parameters) = Schedule::new(source, options, seed);
+        let chunks = Cut::new(schedule.largest_batch()).chunks.count as u64;
+        if chunks > device.context.budget.chunks {
             return Err(BackendError::Memory {
                 what: "gradients",
                 needed: chunks * NETWORK_BYTES,
-                available: card.budget.chunk_bytes(),
+                available: device.context.budget.chunk_bytes(),
             });
         }
-        let points = transform.room_for(course.points.len())?;
+        let points = transform.room_for(schedule.points.len())?;
         let at = u64::from(points) * 4;
-        let bytes = bytemuck::cast_slice(&course.points);
-        card.queue.write_buffer(&card.buffers.store, at, bytes);
+        let bytes = bytemuck::cast_slice(&schedule.points);
+        device
+            .context
+            .queue
+            .write_buffer(&device.context.buffers.store, at, bytes);
         let mut trainer = Self {
             transform,
-            network: Network::take(card)?,
-            course,
+            network: Network::take(device)?,
+            schedule,
             points,
             status: Status::default(),
             query_seconds: 0.0,
@@ -110,79 +111,83 @@ impl<'a> GpuTrainer<'a> {
         Ok(trainer)
     }
 
-    fn card(&self) -> &Arc<Card> {
-        &self.transform.card
+    fn device(&self) -> &Arc<Device> {
+        &self.transform.device
     }
 
-    /// The lane's record, but for its place among those of a submission.
+    /// The lane's record, without the offsets of its tiles and chunks in a submission.
     pub(super) fn lane(&self) -> layout::Lane {
-        let options = &self.course.options;
+        let options = &self.schedule.options;
         let (loss, rule) = (&options.loss, options.early_stop);
         layout::Lane {
             transform: self.transform.record,
             network: self.network.number,
             points: self.points,
-            center: self.course.conditioning.center,
-            scale: self.course.conditioning.scale,
+            center: self.schedule.conditioning.center,
+            scale: self.schedule.conditioning.scale,
             margin: loss.margin_m,
             margin_slope: loss.margin_slope,
             truncation: loss.truncation_m.unwrap_or(f32::MAX),
             flow_penalty: loss.flow_penalty,
-            average: self.course.fresh(0).is_some().into(),
+            average: self.schedule.ema_weight(0).is_some().into(),
             patience: rule.map_or(0, |rule| rule.patience.max(1) as u32),
             min_delta: rule.map_or(0.0, |rule| rule.min_delta_m as f32),
             ..layout::Lane::default()
         }
     }
 
-    /// The iteration after `done` others.
+    /// The record of the iteration that follows `done` others.
     fn step(&self, done: usize) -> layout::Step {
-        let batch = self.course.batch(done);
-        let adam = self.course.adam(done);
+        let batch = self.schedule.batch(done);
+        let adam = self.schedule.adam(done);
         layout::Step {
             first: batch.start as u32,
             count: batch.len() as u32,
             weight: 1.0 / batch.len() as f32,
             step_size: adam.step_size,
             square_correction: adam.square_correction,
-            fresh: self.course.fresh(done).unwrap_or(1.0),
+            ema_weight: self.schedule.ema_weight(done).unwrap_or(1.0),
         }
     }
 
-    /// Does up to `steps` iterations in one submission.
+    /// Runs up to `steps` iterations in one submission.
     fn submit(&mut self, steps: usize) -> Result<Done, BackendError> {
         let done = self.status.iterations as usize;
         let request = Request {
             lane: self.lane(),
             status: self.status,
             steps: (done..done + steps).map(|done| self.step(done)).collect(),
-            cut: Cut::new(self.course.largest_batch()),
-            precision: self.course.options.precision,
+            cut: Cut::new(self.schedule.largest_batch()),
+            precision: self.schedule.options.precision,
         };
-        let done = self.card().batch.run(self.card(), request)?;
+        let done = {
+            let device = self.device();
+            let units = || device.units();
+            device.batch.run(&device.context, &units, request)?
+        };
         self.status = done.status;
         if let Some(pace) = done.pace {
-            let tiles = Cut::new(self.course.largest_batch()).tiles * done.losses.len();
+            let tiles = Cut::new(self.schedule.largest_batch()).tiles * done.losses.len();
             self.query_seconds += pace.tile_query * tiles as f64;
         }
         Ok(done)
     }
 
-    /// Iterations that a submission should have.
+    /// The number of iterations for the next submission.
     fn stride(&self) -> usize {
-        let seconds = self.card().batch.pace().map(|pace| {
-            let own = pace.tile * Cut::new(self.course.largest_batch()).tiles as f64;
+        let seconds = self.device().batch.pace().map(|pace| {
+            let own = pace.tile * Cut::new(self.schedule.largest_batch()).tiles as f64;
             own.max(pace.iteration)
         });
-        // What follows a stop is dispatched in vain.
-        let most = match self.course.options.early_stop {
+        // Iterations after a stop are dispatched in vain.
+        let most = match self.schedule.options.early_stop {
             Some(_) => STOPPABLE_STEPS,
             None => STEPS,
         };
         match seconds {
             Some(seconds) => ((SUBMISSION_SECONDS / seconds.max(1e-6)) as usize).clamp(1, most),
-            // The first submission shows how fast the card is.
-            None if self.card().tick.is_some() => 1,
+            // The first submission measures the GPU's speed.
+            None if self.device().context.tick.is_some() => 1,
             None => BLIND_STEPS,
         }
     }
@@ -195,7 +200,7 @@ impl<'a> GpuTrainer<'a> {
 impl Trainer for GpuTrainer<'_> {
     fn advance(&mut self, steps: usize, control: &dyn Control) -> Result<Advance, BackendError> {
         let first = self.iterations();
-        let most = self.course.options.max_iterations;
+        let most = self.schedule.options.max_iterations;
         loop {
             let done = self.iterations() - first;
             if self.iterations() >= most {
@@ -215,8 +220,8 @@ impl Trainer for GpuTrainer<'_> {
             let submitted = self.submit(steps)?;
             for (iteration, &loss) in (before + 1..).zip(&submitted.losses) {
                 control.progress(Progress {
-                    iteration,
-                    max_iterations: most,
+                    done: iteration,
+                    total: most,
                     loss: loss.into(),
                 });
             }
@@ -229,8 +234,8 @@ impl Trainer for GpuTrainer<'_> {
     }
 
     fn evaluate(&mut self, points: &[Point]) -> Result<Vec<Point>, BackendError> {
-        let networks = &self.card().buffers.networks;
-        inference::evaluate(self.card(), networks, &self.lane(), points)
+        let networks = &self.device().context.buffers.networks;
+        inference::evaluate(&self.device().context, networks, &self.lane(), points)
     }
 
     fn report(&self) -> FitReport {
@@ -243,14 +248,14 @@ impl Trainer for GpuTrainer<'_> {
     }
 
     fn state(&mut self) -> Result<TrainerState, BackendError> {
-        let card = self.card();
+        let context = &self.device().context;
         let bytes = ARRAYS as u64 * NETWORK_BYTES;
         let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
-        let copy = card.empty(bytes, usage)?;
-        let mut encoder = card.encoder();
+        let copy = context.empty(bytes, usage)?;
+        let mut encoder = context.encoder();
         let from = self.network.at(PARAMETERS);
-        encoder.copy_buffer_to_buffer(&card.buffers.networks, from, &copy, 0, bytes);
-        let read = card.finish(encoder, &copy, bytes)?;
+        encoder.copy_buffer_to_buffer(&context.buffers.networks, from, &copy, 0, bytes);
+        let read = context.finish(encoder, &copy, bytes)?;
         let array = |array: u64| {
             let mut parameters = Parameters::zeros();
             let from = (array * NETWORK_BYTES) as usize;
@@ -264,7 +269,7 @@ impl Trainer for GpuTrainer<'_> {
             parameters: array(PARAMETERS),
             moments: [array(MEANS), array(SQUARES)],
             kept: array(KEPT),
-            seen: Seen {
+            seen: EarlyStopState {
                 best: (status.seen == 1).then_some(status.seen_best),
                 without_progress: status.without_progress as usize,
             },
@@ -292,15 +297,15 @@ impl Trainer for GpuTrainer<'_> {
             without_progress: state.seen.without_progress as u32,
             ..Status::default()
         };
-        self.card().watchdog.check()
+        self.device().context.watchdog.check()
     }
 
     fn shorten(&mut self, max_iterations: usize) {
-        self.course.shorten(max_iterations);
+        self.schedule.shorten(max_iterations);
     }
 }
 
-/// The card's largest number stands for infinity.
+/// On the GPU the largest finite float stands for infinity.
 fn widened(loss: f32) -> f32 {
     if loss == f32::MAX {
         f32::INFINITY

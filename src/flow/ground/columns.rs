@@ -1,7 +1,7 @@
-//! A sweep as upright columns of one square metre, and the lowest layer of each.
+//! A sweep divided into vertical columns of 1 m x 1 m, with the lowest layer of each.
 //!
-//! A column of ground is flat: nearly all of its points lie in one thin layer. A wall's or a
-//! bush's points go on above it. It must not know of surfaces.
+//! In a column of ground nearly all points lie in one thin layer. A wall or a bush has points above
+//! that layer as well.
 
 use std::ops::Range;
 
@@ -9,35 +9,36 @@ use crate::flow::data::Point;
 
 /// Side of a column, metres.
 const SIDE_M: f32 = 1.0;
-/// Half extents of the area looked at are whole multiples of this, metres.
+/// Granularity of the area, metres: its half extent is a multiple of this.
 pub(super) const TILE_M: f32 = 32.0;
-/// Nothing farther than this along x or y is looked at, metres: rings there are tens of metres
-/// apart, and what is seen is rarely ground.
+/// Largest half extent of the area along x and y, metres. Farther out the rings are tens of metres
+/// apart, and few of the points are ground.
 const REACH_M: f32 = 128.0;
-/// Thickness of a layer, metres: a slope of 15% across a column, and noise.
+/// Thickness of a layer, metres: room for a slope of 15% across a column, and for noise.
 const LAYER_M: f32 = 0.25;
-/// What lies up to this above a layer's bottom tells whether the column is flat, metres. Crowns of
-/// trees and bridges are higher.
+/// Height above a layer's bottom up to which points count in the flatness test, metres. Tree crowns
+/// and bridges are higher.
 const ABOVE_M: f32 = 1.25;
-/// A layer is no stray reflection if it has this share of the densest layer's points.
+/// Share of the densest layer's points from which a layer is accepted and not rejected as a stray
+/// reflection.
 const LAYER_SHARE: f32 = 0.2;
-/// Nor if it has this many points.
+/// Number of points from which a layer is accepted in any case.
 const LAYER_POINTS: usize = 4;
 
-/// A sweep, cut into columns.
+/// A sweep divided into columns.
 pub(super) struct Columns {
-    /// The area is |x|, |y| < this, metres.
+    /// Half extent of the area, metres: |x|, |y| < `half_m`.
     pub(super) half_m: f32,
-    /// The area's points, column by column, each from low to high: the same order whatever the
-    /// order they came in.
+    /// The points in the area, column by column, and from low to high within each. Their order does
+    /// not depend on the input order.
     pub(super) points: Vec<Point>,
-    /// Columns that have points.
+    /// The columns that hold points.
     pub(super) columns: Vec<Column>,
 }
 
 /// One column.
 pub(super) struct Column {
-    /// Its points.
+    /// Indices of its points in `Columns::points`.
     pub(super) rows: Range<usize>,
     /// The lowest point of its lowest layer.
     pub(super) low: Point,
@@ -46,19 +47,21 @@ pub(super) struct Column {
 }
 
 impl Column {
-    /// Share of the low points that lie in the lowest layer: 1 for flat ground, 0.2 for a wall.
+    /// Share of the points up to 1.25 m above the lowest layer's bottom that lie in this layer: 1
+    /// for flat ground, 0.2 for a wall.
     pub(super) fn flatness(&self) -> f32 {
         self.in_layer as f32 / (self.in_layer + self.above_layer) as f32
     }
 
-    /// Flatness with one point above taken for granted: a single point says little.
+    /// Flatness with one additional point assumed above the layer, so that columns of few points
+    /// weigh less.
     pub(super) fn weight(&self) -> f32 {
         self.in_layer as f32 / (self.in_layer + self.above_layer + 1) as f32
     }
 
     fn new(points: &[Point], rows: Range<usize>, counts: &mut Vec<usize>) -> Self {
         let column = &points[rows.clone()];
-        // Points in the layer that starts at each point.
+        // Number of points in the layer that starts at each point.
         counts.clear();
         let mut end = 0;
         for (start, point) in column.iter().enumerate() {
@@ -89,10 +92,10 @@ impl Columns {
         reach(point) < self.half_m
     }
 
-    /// Cuts a sweep into columns; points outside the area are left out.
+    /// Divides a sweep into columns. Points outside the area are dropped.
     pub(super) fn new(points: &[Point]) -> Self {
         let farthest = points.iter().map(reach).fold(0.0, f32::max);
-        // A point right on the border is outside, hence one tile more.
+        // A point exactly on the border is outside, hence the additional tile.
         let half_m = ((farthest / TILE_M).floor() * TILE_M + TILE_M).min(REACH_M);
         let side = (2.0 * half_m / SIDE_M) as usize;
         let outside = side * side;
@@ -105,7 +108,7 @@ impl Columns {
             }
         };
 
-        // Counting sort by cell, then each cell by height.
+        // Counting sort by cell, then a sort by height within each cell.
         let cells: Vec<usize> = points.iter().map(cell).collect();
         let mut starts = vec![0; outside + 2];
         for &cell in &cells {
@@ -138,12 +141,12 @@ impl Columns {
     }
 }
 
-/// The farther of |x| and |y|, metres.
+/// The larger of |x| and |y|, metres.
 fn reach(point: &Point) -> f32 {
     point[0].abs().max(point[1].abs())
 }
 
-/// By height; equal heights by place.
+/// Order by height, then by x, then by y.
 fn low_to_high(a: &Point, b: &Point) -> std::cmp::Ordering {
     let by = |axis: usize| a[axis].total_cmp(&b[axis]);
     by(2).then(by(0)).then(by(1))

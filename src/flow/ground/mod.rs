@@ -1,13 +1,14 @@
-//! Which points of one raw sweep lie on the ground: any spinning lidar, no map, no calibration.
+//! Ground segmentation of one raw sweep of any spinning lidar, without a map and without
+//! calibration.
 //!
 //! ```text
-//! points - columns - surface, 32 m cells to 1 m cells - is there ground at all? - flags
+//! points - columns - height field, 32 m cells to 1 m cells - is there any ground? - flags
 //! ```
 //!
-//! The sweep is cut into upright columns. A smooth surface is laid under the columns' lowest
-//! layers, coarse to fine, as cloth would be from below (the idea of Zhang et al.'s cloth
-//! simulation filter, with the flatness test of Patchwork in place of its forces), and points near
-//! it are ground. It must not know of rings, sensors, labels or the other sweep.
+//! The sweep is divided into vertical columns. A smooth height field is fitted under the lowest
+//! layers of the columns, coarse to fine, like a cloth laid from below. This is the idea of the
+//! cloth simulation filter of Zhang et al., with the flatness test of Patchwork in place of its
+//! forces. Points near the height field are ground.
 
 mod columns;
 mod mask;

@@ -1,18 +1,20 @@
-//! What counts as ground, and the defaults. It must not know how the surface is found.
+//! Options of the ground segmentation and their defaults.
 
-/// How near the fitted surface a point must lie to be ground.
+/// Tolerances of the ground segmentation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GroundOptions {
-    /// Points up to this above the surface are ground, metres, at the origin: less than things that
-    /// stand on it, more than the noise of a lidar.
+    /// Upper tolerance at the origin, metres: points up to this height above the surface are
+    /// ground. It is below the height of objects on the ground and above the noise of a lidar.
     pub height_m: f32,
-    /// `height_m` grows with range by this, metres a metre: rings lie farther apart, and the
-    /// surface between them is less certain. It stops growing at 40 m.
+    /// Growth of `height_m` with horizontal range, metres per metre, up to 40 m. At longer range
+    /// the rings are farther apart, and the surface between them is less certain.
     pub height_slope: f32,
-    /// Points deeper than this below the surface are mirror images, not ground, metres.
+    /// Lower tolerance, metres: points deeper than this below the surface are mirror images, not
+    /// ground.
     pub depth_m: f32,
-    /// Least share, 0 to 1, of the square metres with points, within 40 m, that have to be flat and
-    /// on the surface. Below it the sweep has no ground: it was taken off, or there are only walls.
+    /// Least share, 0 to 1, of the occupied 1 m x 1 m columns within 40 m that must be flat and on
+    /// the surface. Below it the sweep has no ground: the ground was removed beforehand, or there
+    /// are only walls.
     pub min_share: f32,
 }
 

@@ -1,6 +1,7 @@
-//! The method in one function: columns, a surface under them from coarse to fine, and its points.
+//! Ground segmentation: columns, a height field fitted under them from coarse to fine, and the
+//! points near it.
 //!
-//! It must not know where the points came from: what it reads is x, y, z and nothing else.
+//! Only x, y and z of the points are used.
 
 use super::columns::{Column, Columns, TILE_M};
 use super::options::GroundOptions;
@@ -8,40 +9,41 @@ use super::surface::HeightField;
 use crate::flow::data::Point;
 use nalgebra::{Matrix3, Vector3};
 
-/// Distance between nodes of the finest surface, metres.
+/// Distance between the nodes of the finest height field, metres.
 const FINEST_M: f32 = 1.0;
-/// Corrections per level.
+/// Corrections of the height field per level.
 const ROUNDS: usize = 3;
-/// The coarsest level's columns may lie this far from the height around the vehicle, metres a
-/// metre of its cells: how much the sweep may be tilted.
+/// Tolerance at the coarsest level, metres per metre of node distance: how far columns may lie from
+/// the ground's height around the vehicle. It allows for a tilted sweep.
 const TILT: f32 = 0.2;
-/// The same for a finer level and the coarser one's surface: how much the ground may bend.
+/// The same at a finer level, from the coarser level's surface. It allows for curved ground.
 const BEND: f32 = 0.1;
-/// And this far besides, metres: a kerb.
+/// Added to both tolerances, metres: the height of a kerb.
 const STEP_M: f32 = 0.2;
-/// A column this share of the tolerance above the surface weighs 1/e of one on it: what is lower
-/// is nearer the ground.
+/// A column this share of the tolerance above the surface weighs 1/e of a column on it: lower
+/// points are more likely ground.
 const FADING: f32 = 0.4;
-/// A node is held fully by this many columns.
+/// Total weight of the columns at a node from which they pull it fully.
 const FULL: f32 = 8.0;
-/// The last correction is by all points this near the surface, metres: their mean is the ground,
-/// where the lowest points are ground and noise.
+/// The last correction uses all points within this distance of the surface, metres. Their mean is
+/// the height of the ground, whereas the lowest points are biased by noise.
 const MEAN_M: f32 = 0.15;
-/// And a node is held fully by this many of them.
+/// Total weight of the points at a node from which they pull it fully in the last correction.
 const FULL_POINTS: f32 = 4.0;
-/// The height of the ground around the vehicle is taken within this, metres.
+/// Radius around the origin within which the initial height of the ground is estimated, metres.
 const AROUND_M: f32 = 20.0;
-/// At this quantile of the columns' lowest points: below walls and cars, above reflections.
+/// Quantile of the columns' lowest points that is this height: below walls and cars, above
+/// reflections.
 const LOW_QUANTILE: f32 = 0.15;
-/// The plane that the vehicle stands on is taken within this, metres.
+/// Radius around the origin within which the plane under the vehicle is fitted, metres.
 const STAND_M: f32 = 8.0;
-/// The tolerance of a point grows up to this range, metres.
+/// Range up to which the tolerance of a point grows, metres.
 const GROWTH_M: f32 = 40.0;
-/// Flat columns within this say whether there is ground, metres.
+/// Radius around the origin within which flat columns are evidence of ground, metres.
 const EVIDENCE_M: f32 = 40.0;
-/// So many of them are needed, square metres.
+/// Least number of flat columns; each is 1 square metre.
 const EVIDENCE_COLUMNS: usize = 16;
-/// A column is flat if its lowest layer has this share of its low points.
+/// Flatness above which a column is flat: the share of its low points in its lowest layer.
 const FLAT: f32 = 0.7;
 
 /// The ground of one sweep.
@@ -49,14 +51,14 @@ const FLAT: f32 = 0.7;
 pub struct GroundSegmentation {
     /// N flags for N points: whether the point lies on the ground.
     pub ground: Vec<bool>,
-    /// Height of the frame's origin above the ground below it, metres: the lidar's height where
-    /// the origin is the lidar, near zero where it is on the road. None where there is no ground.
+    /// Height of the frame's origin above the ground below it, metres: the lidar's height where the
+    /// origin is the lidar, near zero where the origin is on the road. None without ground.
     pub origin_height_m: Option<f32>,
 }
 
-/// Finds the ground of one sweep: N finite points, metres, x forward, y left, z up to within some
-/// degrees, the vehicle near the origin. The flags do not depend on the points' order. Points
-/// beyond 128 m along x or y are never ground.
+/// Segments the ground of one sweep: N finite points, metres, x forward, y left, z up to within
+/// some degrees, with the vehicle near the origin. The flags do not depend on the points' order.
+/// Points at |x| or |y| of 128 m or more are never ground.
 pub fn segment(points: &[Point], options: &GroundOptions) -> GroundSegmentation {
     let columns = Columns::new(points);
     let surface = fit(&columns);
@@ -78,7 +80,8 @@ pub fn segment(points: &[Point], options: &GroundOptions) -> GroundSegmentation 
     }
 }
 
-/// The surface under the columns, coarse to fine: each level keeps to what is near the last one's.
+/// Fits the height field under the columns, coarse to fine. Each level uses only the columns near
+/// the surface so far.
 fn fit(columns: &Columns) -> HeightField {
     let mut surface = HeightField::level(columns.half_m, TILE_M, around(columns));
     let mut slope = TILT;
@@ -113,7 +116,7 @@ fn fit(columns: &Columns) -> HeightField {
     surface
 }
 
-/// About the height of the ground around the vehicle, metres; 0 where nothing is near.
+/// Approximate height of the ground around the vehicle, metres; 0 where no column is within 20 m.
 fn around(columns: &Columns) -> f32 {
     let near = columns.columns.iter().map(|column| column.low);
     let near = near.filter(|low| low[0].hypot(low[1]) < AROUND_M);
@@ -125,8 +128,8 @@ fn around(columns: &Columns) -> f32 {
     *heights.select_nth_unstable_by(index, f32::total_cmp).1
 }
 
-/// Whether enough of what was seen is flat and lies on the surface. Without ground the surface
-/// hangs under whatever is lowest: walls, and cars without wheels, which are not flat.
+/// Whether enough columns are flat and lie on the surface. Without ground the surface lies under
+/// the lowest points present, such as walls and car bodies, which are not flat.
 fn has_ground(columns: &Columns, surface: &HeightField, options: &GroundOptions) -> bool {
     let near = columns.columns.iter();
     let near = near.filter(|column| column.low[0].hypot(column.low[1]) < EVIDENCE_M);
@@ -139,8 +142,8 @@ fn has_ground(columns: &Columns, surface: &HeightField, options: &GroundOptions)
     flat >= EVIDENCE_COLUMNS && flat as f32 >= options.min_share * seen as f32
 }
 
-/// Height of the origin above the plane through the ground around it, metres. The surface itself
-/// is a guess under the vehicle, where no ray falls.
+/// Height of the origin above the plane through the ground around it, metres. The height field is
+/// only interpolated under the vehicle, where no ray falls.
 fn origin_height(columns: &Columns, surface: &HeightField) -> f32 {
     let near = columns.columns.iter().filter(|column| {
         column.low[0].hypot(column.low[1]) < STAND_M && lies_flat(column, surface)
@@ -157,7 +160,8 @@ fn origin_height(columns: &Columns, surface: &HeightField) -> f32 {
             }
         }
     }
-    // Points on one side alone do not tell the height at the origin any better than the surface.
+    // Points on one side only do not determine the height at the origin better than the surface
+    // does.
     let solved = normal
         .cholesky()
         .map(|factors| factors.solve(&right)[2] as f32);
@@ -175,7 +179,7 @@ mod tests {
 
     const HEIGHT_M: f32 = 1.8;
 
-    /// 32 rings on level ground, seen from `HEIGHT_M` above it.
+    /// 32 rings on level ground, from a sensor `HEIGHT_M` above it.
     fn plain() -> Vec<Point> {
         let ring = |beam: usize| HEIGHT_M / (2.0 + beam as f32 * 0.8).to_radians().tan();
         let shot = |range: f32, step: usize| {
@@ -234,7 +238,7 @@ mod tests {
 
     #[test]
     fn a_room_has_a_floor_and_its_walls_alone_have_none() {
-        // 8 m by 6 m by 2.6 m, seen from 1.1 m above the floor; rays spread evenly.
+        // A room of 8 m by 6 m by 2.6 m, from 1.1 m above the floor, with evenly spread rays.
         let shot = |i: usize| {
             let up = i as f32 / 10_000.0 - 1.0;
             let (sin, cos) = (i as f32 * 2.4).sin_cos();

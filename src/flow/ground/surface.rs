@@ -1,28 +1,28 @@
-//! A height above every place: nodes on a square grid, bilinear between them.
+//! Height field: nodes on a square grid, bilinear between them.
 //!
-//! The surface is pulled toward samples and stays smooth where there are none: a screened Poisson
-//! equation for the correction, relaxed in place. It must not know what the samples are.
+//! The height field is pulled toward samples and stays smooth where there are none. The correction
+//! solves a screened Poisson equation by Gauss-Seidel relaxation.
 
 use crate::flow::data::Point;
 
-/// How strongly a node's correction follows its four neighbors', against a full pull of 1.
+/// Weight of each of a node's four neighbors in its correction, relative to a full pull of 1.
 const STIFFNESS: f32 = 0.3;
-/// Rounds of Gauss-Seidel per correction. Coarser levels carry corrections far; this spreads them
-/// over the next few nodes.
+/// Gauss-Seidel iterations per correction. Coarser levels spread corrections over long distances;
+/// these iterations spread them over the next few nodes.
 const ROUNDS: usize = 6;
 
-/// Heights over a square area.
+/// Heights over a square area centered on the origin.
 pub(super) struct HeightField {
     half_m: f32,
     step_m: f32,
     /// Nodes along a side, at least 2.
     side: usize,
-    /// Row by row along x, metres.
+    /// Heights, metres, row by row; a row runs along x.
     heights: Vec<f32>,
 }
 
 impl HeightField {
-    /// A level surface over |x|, |y| <= `half_m`, which is a multiple of `step_m`.
+    /// A level surface over |x|, |y| <= `half_m` metres, which is a multiple of `step_m`.
     pub(super) fn level(half_m: f32, step_m: f32, height_m: f32) -> Self {
         let side = (2.0 * half_m / step_m) as usize + 1;
         Self {
@@ -33,7 +33,7 @@ impl HeightField {
         }
     }
 
-    /// The same surface on nodes twice as near.
+    /// The same surface with half the distance between nodes.
     pub(super) fn refined(&self) -> Self {
         let mut fine = Self::level(self.half_m, self.step_m / 2.0, 0.0);
         let place = |node: usize| node as f32 * fine.step_m - fine.half_m;
@@ -50,7 +50,7 @@ impl HeightField {
         self.step_m
     }
 
-    /// Height at a place, metres; outside the area the border's.
+    /// Height at (x, y), metres; outside the area, the height at the nearest border point.
     pub(super) fn height_at(&self, x: f32, y: f32) -> f32 {
         let [u, v] = self.position(x, y);
         let [column, row] = [u, v].map(|position| (position as usize).min(self.side - 2));
@@ -66,15 +66,16 @@ impl HeightField {
         point[2] - self.height_at(point[0], point[1])
     }
 
-    /// Moves the surface toward samples, points with weights. `trust` makes a weight, 0 or more,
-    /// of a sample's height above the surface; a node whose samples weigh `full` goes all the way.
+    /// Moves the surface toward weighted samples, metres. `trust` maps a sample's height above the
+    /// surface to a factor on its weight, 0 or more. Samples of a total weight of `full` or more
+    /// pull a node fully.
     pub(super) fn pull<'a>(
         &mut self,
         samples: impl Iterator<Item = (&'a Point, f32)>,
         trust: impl Fn(f32) -> f32,
         full: f32,
     ) {
-        // Per node: weight, and weighted height above the surface.
+        // Per node: the sum of weights, and the weighted sum of heights above the surface.
         let mut pulls = vec![[0.0_f32; 2]; self.heights.len()];
         for (point, weight) in samples {
             let above = self.above(point);
@@ -104,16 +105,16 @@ impl HeightField {
         row * self.side + column
     }
 
-    /// Steps from the first node along x and y, within the area.
+    /// Position in node distances from the first node along x and y, clamped to the area.
     fn position(&self, x: f32, y: f32) -> [f32; 2] {
         let last = (self.side - 1) as f32;
         [x, y].map(|value| ((value + self.half_m) / self.step_m).clamp(0.0, last))
     }
 }
 
-/// Corrections that balance the pulls against smoothness, nearly.
+/// Corrections that approximately balance the pulls against smoothness.
 fn relaxed(pulls: &[[f32; 2]], side: usize) -> Vec<f32> {
-    // Border nodes have neighbors that mirror them: a ring of nodes that copy the nearest.
+    // Mirror boundary: a border of padding nodes that copy the nearest node.
     let padded = side + 2;
     let mut corrections = vec![0.0_f32; padded * padded];
     let shares: Vec<f32> = pulls

@@ -1,6 +1,6 @@
-//! TODO doc
+//! The host's thread pool and its cache of per-sweep results.
 
 mod pool;
 mod sweep_cache;
 
-pub use pool::Host;
+pub use pool::{Host, HostError};

@@ -1,6 +1,7 @@
-//! The host's threads, and what is done on them whatever the device: ground, alignment, and the
-//! search for movers. What is found of a sweep by itself is found once, as long as it is remembered.
-//! It must not know what a device is.
+//! The host's thread pool, and the stages that run on it with every backend: ground segmentation,
+//! registration and the object search.
+//!
+//! Results that depend on a single sweep are cached.
 
 use std::sync::Arc;
 
@@ -8,18 +9,22 @@ use rayon::prelude::*;
 
 use super::sweep_cache::SweepCache;
 use crate::flow::data::{Control, Point, RigidTransform};
-use crate::flow::field::BackendError;
 use crate::flow::objects::{ObjectSearch, SearchClouds};
 use crate::flow::options::ObjectOptions;
 use crate::flow::{ground, objects, registration};
 
-/// A set of the host's threads.
+/// A thread pool of the host with its sweep cache. Clones share both.
 #[derive(Clone)]
 pub struct Host {
     name: String,
     threads: Arc<rayon::ThreadPool>,
     sweep_cache: Arc<SweepCache>,
 }
+
+/// The operating system could not start the threads.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot start worker threads: {0}")]
+pub struct HostError(String);
 
 impl core::fmt::Debug for Host {
     fn fmt(&self, formatter: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
@@ -28,17 +33,17 @@ impl core::fmt::Debug for Host {
 }
 
 impl Host {
-    /// So many threads, or as many as there are cores; `known` for the instruction set of what
-    /// computes on them besides, where there is one.
+    /// Starts `threads` threads, or one for each core. `known` is the instruction set of the CPU
+    /// backend that shares the threads, if there is one; it appears in the name.
     ///
     /// # Errors
-    /// [`BackendError::Threads`] where the operating system gives none.
-    pub(crate) fn new(threads: Option<usize>, known: Option<&str>) -> Result<Self, BackendError> {
+    /// [`HostError`] where the operating system cannot start the threads.
+    pub(crate) fn new(threads: Option<usize>, known: Option<&str>) -> Result<Self, HostError> {
         let threads = rayon::ThreadPoolBuilder::new()
             .num_threads(threads.unwrap_or(0))
             .thread_name(|i| format!("fnsf-cpu-{i}"))
             .build()
-            .map_err(|error| BackendError::Threads(error.to_string()))?;
+            .map_err(|error| HostError(error.to_string()))?;
         let count = threads.current_num_threads();
         Ok(Self {
             name: match known {
@@ -50,23 +55,24 @@ impl Host {
         })
     }
 
-    /// What it is, as reports show it.
+    /// Name for reports: the instruction set, if given, and the number of threads.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Forgets what it has found of sweeps, as a measurement wants it that does the same twice.
+    /// Clears the sweep cache, for measurements that repeat the same work.
     pub fn forget(&self) {
         self.sweep_cache.forget();
     }
 
-    /// The threads themselves.
+    /// The thread pool.
     pub(crate) fn threads(&self) -> &Arc<rayon::ThreadPool> {
         &self.threads
     }
 
-    /// The rigid motion target_from_source, near `prior`, that aligns `source` with `target`; the
-    /// motion so far where `control` interrupts.
+    /// Registers `source` to `target` (points in metres, each cloud in its own frame) and returns
+    /// the rigid motion `target_from_source` near `prior`. Where `control` interrupts, it is the
+    /// motion so far.
     pub fn align(
         &self,
         source: &[Point],
@@ -81,7 +87,7 @@ impl Host {
         })
     }
 
-    /// Which points of each sweep are ground; all of them are finite and in range.
+    /// Ground masks of the sweeps, one flag a point. All points must be finite and in range.
     pub(crate) fn ground(&self, sweeps: &[&[Point]]) -> Vec<Vec<bool>> {
         let known: Vec<_> = sweeps
             .iter()
@@ -93,7 +99,8 @@ impl Host {
         self.threads.install(|| found.collect())
     }
 
-    /// What moves in `clouds`; what has been found so far where `control` interrupts.
+    /// Searches `clouds` for moving objects. Where `control` interrupts, the result holds the
+    /// motions found so far.
     pub fn find_objects(
         &self,
         clouds: &SearchClouds<'_>,
@@ -114,12 +121,12 @@ mod tests {
     #[test]
     fn what_is_remembered_of_sweeps_does_not_change_a_bit() {
         let options = StreetOptions {
-            frames: 3,
+            sweeps: 3,
             azimuth_steps: 500,
             ..StreetOptions::default()
         };
         let street = Street::new(&options).expect("a street");
-        let sweeps = [0, 1, 2].map(|k| street.frame(k).expect("a sweep").points);
+        let sweeps = [0, 1, 2].map(|k| street.sweep(k).expect("a sweep").points);
         let prior = RigidTransform::identity();
         let aligned = |host: &Host, source: usize, target: usize| {
             host.align(&sweeps[source], &sweeps[target], &prior, &Uncontrolled)

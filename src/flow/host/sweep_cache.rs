@@ -1,63 +1,66 @@
-//! What has been found out about sweeps, each by itself, for the pairs that see them next.
+//! Cache of the results that depend on a single sweep: its ground mask and its surfels.
 //!
-//! A sweep of a sequence is the target of a pair, the source of the next one and, where pairs see
-//! more than their own, around others: its ground and its surface are found once. Sweeps are told
-//! by the bits of all their points, so that nothing is mistaken for something else and the bits are
-//! those that would be found again. It must not know pairs.
+//! A sweep of a sequence is the target of one pair and the source of the next. Where estimates use
+//! neighbor sweeps, it is also a neighbor of other pairs. Its ground and its surfels are computed
+//! once. The key is the bits of all points, so that a cached result is bit-identical to a
+//! recomputed one.
 
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 
 use crate::flow::data::Point;
 use crate::flow::data::get_or_compute;
+use crate::flow::data::locked;
 use crate::flow::registration::SurfelCloud;
 
-/// The points of all sweeps that are remembered: some twenty full sweeps, mostly 60 MB with their
-/// surfaces, and 230 MB where no two points share a voxel.
+/// Bound on the total points of the cached sweeps: about twenty full sweeps. They take about 60 MB
+/// with their surfels, and 230 MB where no two points share a voxel.
 const POINTS: usize = 2 << 20;
-/// The most sweeps: looking through them takes no time beside finding anything.
+/// Bound on the number of cached sweeps. A linear search over them is cheap compared with the
+/// cached computations.
 const SWEEPS: usize = 64;
 
-/// What is known of a sweep.
+/// The cached results of one sweep, each computed on first use.
 pub(crate) struct CachedSweep {
-    /// What takes part of it: finite and in range.
+    /// The points that take part: finite and in range.
     points: Vec<Point>,
     ground: OnceLock<Vec<bool>>,
     surface: OnceLock<SurfelCloud>,
 }
 
 impl CachedSweep {
-    /// Which of the points are ground; `find` says so where it is not known yet.
+    /// Ground mask, one flag a point; `find` computes it on first use.
     pub(crate) fn ground(&self, find: impl FnOnce(&[Point]) -> Vec<bool>) -> &Vec<bool> {
         get_or_compute(&self.ground, || find(&self.points))
     }
 
-    /// What alignments need of it.
+    /// Surfels for the registration, computed on first use.
     pub(crate) fn surface(&self) -> &SurfelCloud {
         get_or_compute(&self.surface, || SurfelCloud::new(&self.points))
     }
 }
 
-/// Whether two clouds have the same bits.
+/// Whether two clouds are bit-identical.
 fn same(a: &[Point], b: &[Point]) -> bool {
     bytemuck::cast_slice::<Point, u8>(a) == bytemuck::cast_slice::<Point, u8>(b)
 }
 
-/// The sweeps that were seen last.
+/// The most recently used sweeps, the latest first.
 #[derive(Default)]
 pub(crate) struct SweepCache(Mutex<VecDeque<Arc<CachedSweep>>>);
 
 impl SweepCache {
-    /// Forgets all sweeps.
+    /// Removes all sweeps.
     pub(crate) fn forget(&self) {
         self.sweeps().clear();
     }
 
     fn sweeps(&self) -> MutexGuard<'_, VecDeque<Arc<CachedSweep>>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        locked(&self.0)
     }
 
-    /// What is known of the sweep of these points.
+    /// The entry for exactly these points; a new one where there is none. Sweeps of more than
+    /// `POINTS` points are not kept.
     pub(crate) fn of(&self, points: &[Point]) -> Arc<CachedSweep> {
         let mut sweeps = self.sweeps();
         let known = match sweeps.iter().position(|known| same(&known.points, points)) {
@@ -135,7 +138,7 @@ mod tests {
             was_known
         };
         assert_eq!([1.0, 2.0, 3.0, 4.0].map(asked), [false; 4]);
-        // The first is seen once more, so that the second has to go.
+        // The first sweep is used once more, so that the second is evicted.
         assert_eq!([1.0, 5.0, 1.0, 2.0].map(asked), [true, false, true, false]);
         assert!(held(&sweep_cache) <= POINTS);
         let before = held(&sweep_cache);

@@ -1,16 +1,16 @@
-//! Whether a motion is needed: whether a cluster's points say that it moved, or could as well have
-//! been sampled elsewhere.
+//! Acceptance test of a motion hypothesis: whether there is sufficient evidence that a cluster
+//! moved, or whether the sweeps only sample a static surface differently.
 //!
-//! A sparse static surface can always be laid a little better on the other sweep's samples, and what
-//! only one sweep saw lies best on something else. It must not know how motions are found.
+//! A sparse static surface can always be fitted a little better to the samples of the other sweep
+//! by a motion. A surface present in one sweep only fits best to an unrelated surface.
 
 use super::free_space::FreeSpaceEvidence;
 use super::hypothesis::{Hypothesis, NeighborEvidence};
 use crate::flow::data::Point;
 use crate::flow::options::ObjectOptions;
 
-/// Whether `found`, the best motion of a cluster with these `points`, is needed; `seen` says what was
-/// seen through before and after it.
+/// Whether the motion of `found` is accepted, the best hypothesis of a cluster with these `points`.
+/// `seen` computes the free-space evidence; it is called only where the conditions before it hold.
 pub(super) fn is_needed(
     found: &Hypothesis,
     points: &[Point],
@@ -39,9 +39,10 @@ pub(super) fn is_needed(
         }
 }
 
-/// Whether the sweeps around say plainly that a cluster moves, even one that its surfaces do not hold:
-/// a wall that seems to slide lies where it was in all of them, a bus has driven on. The nearest must
-/// say so itself: a wall may slide, by then, onto what lies behind it.
+/// Whether the neighbor sweeps clearly confirm a motion, even one of low observability. A wall that
+/// seems to slide lies at its old position in all of them, whereas a bus has driven on. The nearest
+/// sweep must confirm the motion by itself, since by the time of a farther one the sliding wall may
+/// coincide with a surface behind it.
 fn is_confirmed(around: &NeighborEvidence, options: &ObjectOptions) -> bool {
     let is_plain = |[still_m, moved_m]: [f32; 2], weight: f32| {
         moved_m <= options.neighbor_cost_ratio * still_m
@@ -52,21 +53,23 @@ fn is_confirmed(around: &NeighborEvidence, options: &ObjectOptions) -> bool {
         && is_plain([around.still_m, around.moved_m], around.weight)
 }
 
-/// Whether a cluster was seen to leave and to come, even one that its surfaces do not hold: the flat
-/// side of what drives past.
+/// Whether the free-space evidence confirms both that a cluster left its old position and that it
+/// came to its new one. This suffices even at low observability, as for the flat side of a passing
+/// vehicle.
 fn has_gone(seen: FreeSpaceEvidence, options: &ObjectOptions) -> bool {
     let is_seen = |share: Option<f32>| share.is_some_and(|share| share >= options.min_free_space);
     is_seen(seen.left) && is_seen(seen.came)
 }
 
-/// Whether a cluster was seen neither to leave nor to come: what is hidden in one of the sweeps may lie
-/// on anything in the other. Of a short way rays tell too little to stop what its surfaces hold.
+/// Whether the free-space evidence supports neither that a cluster left nor that it came. A surface
+/// hidden in one of the sweeps may fit any surface of the other. Over short displacements the rays
+/// discriminate too little to reject a motion of sufficient observability.
 fn has_stayed(seen: FreeSpaceEvidence, options: &ObjectOptions) -> bool {
     let both = seen.left.zip(seen.came);
     both.is_some_and(|(left, came)| left + came < options.min_free_space_far)
 }
 
-/// Whether the points, many of them, lie at one height: a ring on ground that was not found.
+/// Whether many points lie at one height: a ring on ground that the segmentation missed.
 fn is_flat(points: &[Point], options: &ObjectOptions) -> bool {
     if points.len() < options.ground_min_points {
         return false;
@@ -83,7 +86,7 @@ mod tests {
     use crate::flow::objects::hypothesis::Cost;
     use crate::flow::objects::planar_motion::PlanarMotion;
 
-    /// A motion that is needed whatever is asked.
+    /// A hypothesis that passes every condition.
     fn plain() -> Hypothesis {
         let cost = |forward_m, backward_m| Cost {
             forward_m,
@@ -98,13 +101,13 @@ mod tests {
         }
     }
 
-    /// So many points on a slope.
+    /// `count` points on a slope.
     fn points(count: u8) -> Vec<Point> {
         let point = |i| [f32::from(i) * 0.1, 0.0, f32::from(i) * 0.05];
         (0..count).map(point).collect()
     }
 
-    /// Nobody looked.
+    /// No free-space evidence.
     const UNSEEN: FreeSpaceEvidence = FreeSpaceEvidence {
         left: None,
         came: None,
@@ -121,7 +124,7 @@ mod tests {
         is_needed(&found, &points(60), || seen, &ObjectOptions::default())
     }
 
-    /// The shares that were seen through.
+    /// Free-space evidence with the given shares.
     fn seen(left: f32, came: f32) -> FreeSpaceEvidence {
         FreeSpaceEvidence {
             left: Some(left),
@@ -163,10 +166,11 @@ mod tests {
     fn what_is_seen_neither_to_leave_nor_to_come_does_not_move_far() {
         let is_needed = |seen| needed_as_seen(seen, |_| {});
         assert!(!is_needed(seen(0.1, 0.1)));
-        // What drives away hides where it comes to lie, what draws near where it was.
+        // A receding object hides its new position from the source, an approaching one its old
+        // position from the target.
         assert!(is_needed(seen(0.9, 0.0)));
         assert!(is_needed(seen(0.0, 0.9)));
-        // Rays do not tell a short way.
+        // Rays do not discriminate over a short displacement.
         let near = FreeSpaceEvidence {
             far: false,
             ..seen(0.1, 0.1)
@@ -196,7 +200,7 @@ mod tests {
             ..around(0.4, 0.05)
         };
         assert!(!slides(far));
-        // Nor one that is seen to stay, however short the way.
+        // Nor one that stayed by the free-space evidence, however short the displacement.
         let stays = |far| {
             let seen = FreeSpaceEvidence {
                 far,
@@ -207,7 +211,8 @@ mod tests {
             })
         };
         assert!(!stays(true) && !stays(false));
-        // And what held was none where the others say that it stands.
+        // A motion of sufficient observability is rejected where the neighbor sweeps show a static
+        // cluster.
         assert!(!needed(|found| found.around = around(0.05, 0.5)));
     }
 

@@ -1,34 +1,37 @@
-//! Who moves with whom: pieces and stray points beside a mover that its motion explains, and points
-//! of a mover that it does not.
+//! Assignment of motions to clusters and points: the motion of a moving object also goes to the
+//! fragments and noise points beside it that it explains, and not to its own points that it does
+//! not explain.
 //!
-//! A far car falls into pieces too small to say anything alone; a ring of ground that was not found
-//! hangs on to a near one. It must not know how motions are found.
+//! A distant car falls into fragments too small to be accepted alone. A ring of missed ground may
+//! be attached to a near car.
 
 use rayon::prelude::*;
 
-use super::hypothesis::{Hypothesis, Mover};
+use super::hypothesis::{ClusterSearch, Hypothesis};
 use super::neighbor_view::NeighborView;
 use super::planar_motion::PlanarMotion;
 use super::scene::Scene;
 use crate::flow::data::stride_sample;
 use crate::flow::spatial::NOISE;
 
-/// Points of a piece that look for movers beside it.
+/// Points of a cluster from which moving objects beside it are searched.
 const LOOKING: usize = 64;
-/// An own motion must be this much better than that of a larger mover beside it, metres.
+/// Margin by which a cluster's own motion must be better than that of a larger moving object beside
+/// it, metres.
 const BETTER_M: f32 = 0.05;
-/// Points of a mover within this vote on whether they are of it, metres.
+/// Radius within which points of a cluster vote on whether a point follows its motion, metres.
 const VOTE_M: f32 = 0.3;
 
-/// Whose motion everything has; [`NOISE`] where it stands still.
+/// The assignment, with each motion named by the cluster that it was found for; [`NOISE`] is
+/// static.
 pub(super) struct Assignment {
-    /// Of each cluster, the cluster whose motion it has.
+    /// For each cluster, the cluster whose motion it has.
     pub(super) cluster_motion: Vec<u32>,
-    /// Of each thinned source point likewise.
+    /// For each downsampled source point, the cluster whose motion it has.
     pub(super) point_motion: Vec<u32>,
 }
 
-/// Shares the motions out.
+/// Assigns the accepted hypotheses `needed`, one entry a cluster, to clusters and points.
 pub(super) fn spread(
     scene: &Scene<'_>,
     around: &[NeighborView<'_>],
@@ -38,7 +41,8 @@ pub(super) fn spread(
         .into_par_iter()
         .map(|cluster| leader(scene, around, needed, cluster))
         .collect();
-    // How much worse its cluster's motion is than none, of each point; metres.
+    // For each point, by how much the motion of its cluster increases its distance to the target,
+    // metres.
     let points = scene.source.labels.par_iter().zip(&scene.source.points);
     let worse_m: Vec<f32> = points
         .map(|(&label, &place)| {
@@ -69,7 +73,8 @@ pub(super) fn spread(
     }
 }
 
-/// The cluster whose motion a cluster has: its own, that of a larger mover beside it, or none.
+/// The cluster whose motion a cluster gets: its own, that of a larger moving object beside it, or
+/// none.
 fn leader(
     scene: &Scene<'_>,
     around: &[NeighborView<'_>],
@@ -95,7 +100,7 @@ fn leader(
     if beside.is_empty() {
         return if own.is_some() { cluster } else { NOISE };
     }
-    let mover = Mover::new(scene, around, cluster);
+    let mover = ClusterSearch::new(scene, around, cluster);
     let cost = |motion: &PlanarMotion| mover.cost(motion).sum_m() + mover.around_m(motion);
     let still = cost(&PlanarMotion::still([0.0; 2]));
     let mut best = match own {
@@ -113,7 +118,7 @@ fn leader(
     best.1
 }
 
-/// The mover whose motion a point of no cluster has, if any.
+/// The cluster whose motion a noise point gets, if any.
 fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Hypothesis>], row: u32) -> u32 {
     let place = scene.source.points[row as usize];
     let mut beside: Vec<u32> = Vec::new();
@@ -140,8 +145,8 @@ fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Hypothesis>], row: u32) -
     best.1
 }
 
-/// Whether the points around one of a mover's are explained by its motion no worse than by none, given
-/// how much worse each is.
+/// Whether a point follows the motion of its cluster: the mean of `worse_m` over the points of the
+/// cluster around it is at most `point_reject_m`.
 fn is_of(scene: &Scene<'_>, row: u32, worse_m: &[f32]) -> bool {
     let label = scene.source.labels[row as usize];
     let center = scene.source.points[row as usize];

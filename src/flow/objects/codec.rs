@@ -1,8 +1,8 @@
-//! Motions as bytes. Knows no fields and no files.
+//! Binary encoding of the motions, little-endian.
 //!
 //! ```text
 //! motions u64 | each: shift x y, turn, center x y: f32
-//!   | moving points u64 | each: x y z f32, its motion u32 | standing points u64 | each: x y z f32
+//!   | moving points u64 | each: x y z f32, its motion u32 | static points u64 | each: x y z f32
 //! ```
 
 use super::motion_field::ObjectMotions;
@@ -14,7 +14,7 @@ const MOTION_BYTES: usize = 5 * size_of::<f32>();
 const POINT_BYTES: usize = 3 * size_of::<f32>();
 
 impl ObjectMotions {
-    /// Appends the motions.
+    /// Appends the encoded motions to `bytes`.
     pub(crate) fn put(&self, bytes: &mut Vec<u8>) {
         let (motions, moving, standing) = self.parts();
         let count = |bytes: &mut Vec<u8>, count: usize| bytes.extend((count as u64).to_le_bytes());
@@ -37,10 +37,11 @@ impl ObjectMotions {
         }
     }
 
-    /// Reads what [`Self::put`] wrote.
+    /// Decodes the bytes written by [`Self::put`].
     ///
     /// # Errors
-    /// [`EnvelopeError::Damaged`] where bytes are missing or name what is not there.
+    /// [`EnvelopeError::Damaged`] where bytes are missing, a number is not finite or a motion's
+    /// index is out of range.
     pub(crate) fn take(body: &mut Body<'_>) -> Result<Self, EnvelopeError> {
         let count = body.count_of(MOTION_BYTES)?;
         let mut motions = Vec::with_capacity(count);

@@ -1,6 +1,4 @@
-//! What a sweep's points are parts of: clusters, their boxes and velocities, and how sure it all is.
-//!
-//! It must not know how clusters and their motions were found.
+//! Description of a sweep's clusters: bounding boxes, velocities and confidences.
 
 use rayon::prelude::*;
 
@@ -11,54 +9,59 @@ use crate::flow::data::{DYNAMIC_M, OrientedBox, Point, RigidTransform, transform
 /// The clusters of a sweep of N rows.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Objects {
-    /// N places in `clusters`, one of each row; [`Objects::NONE`] where a row is of none.
+    /// N indices into `clusters`, one a row; [`Objects::NONE`] where a row is in no cluster.
     pub cluster: Vec<i32>,
-    /// N chances, 0 to 1, that a row's flow is less than [`super::SURE_M`] off; zero where it has none.
+    /// N confidences, 0 to 1: the probability that the flow of a row is less than [`super::CONFIDENT_WITHIN_M`]
+    /// off; zero where it has none.
     pub confidence: Vec<f32>,
-    /// K clusters, those with the most points first.
+    /// K clusters, in descending order of their number of points.
     pub clusters: Vec<Cluster>,
 }
 
-/// Points that belong together.
+/// A set of points with one motion, or a static one.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Cluster {
-    /// Points that it has.
+    /// Number of points.
     pub points: u32,
-    /// Whether it moves by itself.
+    /// Whether it moves with respect to the world: its center's displacement, ego motion taken out,
+    /// is at least 0.05 m horizontally.
     pub dynamic: bool,
-    /// Where it is in the source, as its points show it; along its motion where it moves.
+    /// Bounding box of its points in the source's frame, metres; along the motion where it moves.
     pub bounds: OrientedBox,
-    /// How far its center moves over the gap between the sweeps, ego motion left out: metres along
-    /// the axes of the source. Zero where it stands still.
+    /// Velocity of its center with the ego motion taken out, m/s along the axes of the source's
+    /// frame: the displacement over [`crate::flow::Options::dt_s`]. Zero where it is static.
     pub velocity: Point,
-    /// Radians that it turns about the vertical meanwhile, counterclockwise.
+    /// Yaw rate about the vertical, rad/s, counterclockwise.
     pub yaw_rate: f32,
-    /// The mean confidence of its points.
+    /// Mean confidence of its points.
     pub confidence: f32,
 }
 
 impl Objects {
-    /// Of no cluster.
+    /// Index for rows in no cluster.
     pub const NONE: i32 = -1;
 
-    /// Of a sweep of `count` rows, of which `rows` were looked at: their `points`, metres in the
-    /// sweep's frame, are what `labelled` speaks of, with the `ego` motion taken out.
+    /// Describes the clusters of a sweep of `count` rows. `rows` are the rows that took part, and
+    /// `points` their positions, metres in the source's frame. `search` is the search on these
+    /// points with the `ego` motion (`target_from_source`) taken out. `dt_s` is the sweep interval,
+    /// seconds.
     pub(crate) fn new(
         count: usize,
         rows: &[usize],
         points: &[Point],
-        labelled: &ObjectSearch,
+        search: &ObjectSearch,
         ego: &RigidTransform,
+        dt_s: f32,
     ) -> Self {
         let mut objects = Self {
             cluster: vec![Self::NONE; count],
             confidence: vec![0.0; count],
             clusters: Vec::new(),
         };
-        for (&row, evidence) in rows.iter().zip(&labelled.evidence) {
+        for (&row, evidence) in rows.iter().zip(&search.evidence) {
             objects.confidence[row] = evidence.confidence();
         }
-        let ClusterLabels { of, motions } = &labelled.parts;
+        let ClusterLabels { of, motions } = &search.parts;
         let mut members: Vec<Vec<usize>> = vec![Vec::new(); motions.len()];
         for (i, &cluster) in of
             .iter()
@@ -80,15 +83,15 @@ impl Objects {
                 cluster.bounds = OrientedBox::around(&points, None);
                 return cluster;
             };
-            // Where its center goes does not depend much on where exactly that is.
+            // The displacement depends little on the exact center.
             let center = OrientedBox::around(&points, None).center;
-            let way = labelled
+            let way = search
                 .motions
                 .displacement(motion, transform_point(ego, center));
             let way = ego.inverse_transform_vector(&way.map(f64::from).into());
-            cluster.velocity = [way.x, way.y, way.z].map(|c| c as f32);
-            cluster.yaw_rate = labelled.motions.turn(motion);
-            let [x, y, _] = cluster.velocity;
+            let [x, y, z] = [way.x, way.y, way.z].map(|c| c as f32);
+            cluster.velocity = [x, y, z].map(|c| c / dt_s);
+            cluster.yaw_rate = search.motions.turn(motion) / dt_s;
             cluster.bounds = OrientedBox::around(&points, Some([x, y]));
             cluster.dynamic = x.hypot(y) >= DYNAMIC_M;
             cluster
@@ -97,8 +100,8 @@ impl Objects {
         objects
     }
 
-    /// Nothing is sure of rows that have no flow.
-    pub(crate) fn sure_of(&mut self, valid: &[bool]) {
+    /// Sets the confidence of rows without a flow to zero.
+    pub(crate) fn clear_invalid(&mut self, valid: &[bool]) {
         for (confidence, &valid) in self.confidence.iter_mut().zip(valid) {
             if !valid {
                 *confidence = 0.0;
@@ -114,12 +117,13 @@ mod tests {
     use crate::flow::data::Uncontrolled;
     use crate::flow::estimate::estimate;
     use crate::flow::options::Preset;
-    use crate::flow::select::Problem;
+    use crate::flow::problem::Problem;
     use crate::flow::simulate::{Street, StreetOptions};
 
     #[test]
     fn clusters_of_a_street_hold_their_points_and_those_that_move_go_where_their_points_do() {
-        /// What the ego motion's rotation and rounding leave between a point's flow and its box's.
+        /// Difference that the ego motion's rotation and rounding leave between the flow of the
+        /// points and that of their box.
         const TOLERANCE_M: f32 = 0.3;
         let street = StreetOptions {
             seed: 3,
@@ -129,17 +133,11 @@ mod tests {
         };
         let pair = Street::new(&street).and_then(|street| street.pair(0));
         let pair = pair.expect("a street");
-        let problem = Problem {
-            source: &pair.source,
-            target: &pair.target,
-            ground: None,
-            before: None,
-            around: &[],
-        };
+        let problem = Problem::pair(&pair.source, &pair.target);
         let backend = CpuBackend::new(None).expect("threads");
         let options = Preset::Default.options(None);
         let estimate = estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
-        let objects = estimate.objects.expect("objects");
+        let objects = estimate.objects().cloned().expect("objects");
         let dynamic = estimate.dynamic.expect("the ego motion is known");
         let sizes = objects.clusters.iter().map(|cluster| cluster.points);
         assert!(sizes.is_sorted_by(|a, b| a >= b));
@@ -158,10 +156,11 @@ mod tests {
                 assert_eq!(dynamic[row], cluster.dynamic, "{cluster:?}");
             }
             let [x, y, _] = cluster.velocity;
-            let speed = x.hypot(y);
+            let way = x.hypot(y) * options.dt_s;
             if cluster.dynamic {
                 moving += 1;
-                assert!((x - speed * cos).hypot(y - speed * sin) < speed, "forward");
+                let [x, y] = [x, y].map(|c| c * options.dt_s);
+                assert!((x - way * cos).hypot(y - way * sin) < way, "forward");
                 let ego = estimate.ego.expect("it is known");
                 let still = transform_point(&ego, center);
                 let rows: Vec<usize> = rows().collect();
@@ -172,7 +171,7 @@ mod tests {
                     };
                     rows.iter().map(of).sum::<f32>() / rows.len() as f32
                 };
-                let off = (mean(0).hypot(mean(1)) - speed).abs();
+                let off = (mean(0).hypot(mean(1)) - way).abs();
                 assert!(off < TOLERANCE_M, "{cluster:?} {still:?} {off}");
             } else {
                 assert_eq!(cluster.velocity, [0.0; 3]);

@@ -1,6 +1,4 @@
-//! What speaks for and against the motion that a source point was given, and how sure that makes it.
-//!
-//! It must not know how motions are found.
+//! Confidence features: the evidence for and against the motion assigned to a source point.
 
 use rayon::prelude::*;
 
@@ -12,19 +10,19 @@ use crate::flow::data::Point;
 use crate::flow::options::ObjectOptions;
 use crate::flow::spatial::NOISE;
 
-/// What the search for a cluster's motion came to.
+/// Result of the search for one cluster's motion.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct SearchedCluster {
-    /// What standing still costs.
+    /// Cost of standing still.
     pub(super) still: Cost,
-    /// The best motion, where one was sought.
+    /// The best hypothesis, where the search gave one.
     pub(super) best: Option<Hypothesis>,
-    /// Whether it is needed.
+    /// Whether the hypothesis was accepted.
     pub(super) needed: bool,
 }
 
 impl SearchedCluster {
-    /// Nothing is known of it.
+    /// A cluster that was not searched, with the largest cost.
     pub(super) fn not(options: &ObjectOptions) -> Self {
         let worst = Cost {
             forward_m: options.truncation_m,
@@ -37,58 +35,59 @@ impl SearchedCluster {
         }
     }
 
-    /// What the cluster costs in the end.
+    /// Cost of the cluster with its accepted motion, or at rest.
     pub(super) fn cost(&self) -> Cost {
         self.found().map_or(self.still, |found| found.cost)
     }
 
-    /// The motion, where it is needed.
+    /// The hypothesis, where it was accepted.
     pub(super) fn found(&self) -> Option<Hypothesis> {
         self.best.filter(|_| self.needed)
     }
 }
 
-/// What is known of one source point's motion.
+/// Confidence features of one source point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ConfidenceFeatures {
-    /// Whether it moves.
+    /// Whether the point moves.
     pub moves: bool,
-    /// Metres from the origin of the target's frame, level.
+    /// Horizontal distance from the origin of the target's frame, metres.
     pub range_m: f32,
-    /// Metres from the target once moved, truncated: the residual.
+    /// Residual: distance of the moved point from the target, metres, truncated.
     pub off_m: f32,
-    /// Whether the target has nothing near it there.
+    /// Whether the target has no point near the moved point that it may match.
     pub hidden: bool,
-    /// The mean of that over its cluster, and of the target around back to it: the agreement there
-    /// and back.
+    /// Forward cost of the point's cluster: the mean of that distance over its points, metres.
     pub forward_m: f32,
-    /// See `forward_m`.
+    /// Backward cost of the point's cluster: the mean distance from the target points around the
+    /// moved cluster to it, metres.
     pub backward_m: f32,
-    /// Points of its cluster, one a voxel; zero where it is of none.
+    /// Voxel-downsampled points of its cluster; zero where it is in no cluster.
     pub points: usize,
-    /// Metres that the cost would have fallen by with a motion that was refused.
+    /// Cost reduction of a hypothesis that was rejected, metres; zero where there was none.
     pub refused_m: f32,
-    /// Share of its cluster that does as it does.
+    /// Share of its cluster that is assigned alike: moving, or static.
     pub together: f32,
-    /// How long and how high its cluster is, metres: level, the longer side along the axes. Zero where
-    /// it is of none.
+    /// Length and height of its cluster, metres. The length is the larger extent along x or y. Zero
+    /// where it is in no cluster.
     pub extent_m: [f32; 2],
 }
 
-/// What was found out about a pair's clusters.
+/// Results of the object search on a pair.
 pub(super) struct Findings<'a> {
     pub(super) scene: &'a Scene<'a>,
-    /// Of each cluster.
+    /// One entry a cluster.
     pub(super) searched: &'a [SearchedCluster],
     pub(super) spread: &'a Assignment,
     pub(super) motions: &'a ObjectMotions,
-    /// Of each motion, the cluster that it was found of.
+    /// For each motion, the cluster that it was found for.
     pub(super) movers: &'a [u32],
-    /// Of each source point, which of the motions it has; [`NOISE`] where it stands still.
+    /// For each source point, the index of its motion; [`NOISE`] where it is static.
     pub(super) point_motion: &'a [u32],
 }
 
-/// Of every point of `source`, which had `labels` before anything was known of motions.
+/// Features of the N points of `source`, metres in the target's frame with the ego motion taken
+/// out. `labels` are their DBSCAN clusters.
 pub(super) fn evidence(
     findings: &Findings<'_>,
     source: &[Point],
@@ -156,7 +155,7 @@ pub(super) fn evidence(
     .collect()
 }
 
-/// How long and how high some points reach, metres.
+/// Length and height of a set of points, metres.
 fn extent(points: impl Iterator<Item = Point>) -> [f32; 2] {
     let mut ends = [[f32::INFINITY, f32::NEG_INFINITY]; 3];
     for point in points {

@@ -1,52 +1,54 @@
-//! What the sweeps saw through: whether their rays passed a place on the way to something farther.
+//! Free-space evidence: whether rays of a sweep passed through a position to a return farther out.
 //!
-//! Where something stood that the target sees through it has left, and where it stands now it has
-//! come if the source saw through there. A wall of which another part is hidden in each sweep does
-//! neither: its places are hidden, or it is still there. Rays begin at the origin of a sweep's frame,
-//! the sensor or a vehicle around it. It must not know how motions are found.
+//! A cluster has left a position if rays of the target pass through it. It has come to a position
+//! if rays of the source passed through it. A wall of which each sweep hides another part does
+//! neither: its positions are hidden or still occupied. Rays begin at the origin of a sweep's
+//! frame, which must be at the sensor or on the vehicle around it.
 
 use std::f32::consts::{FRAC_PI_2, PI};
 
 use crate::flow::data::{Point, RigidTransform, transform_point};
 
-/// Sides of the solid angles that rays are sorted into, radians: two rings of 64 beams are seen
-/// together.
+/// Sides of the solid angles that rays are binned into, radians. Two rings of a 64-beam lidar fall
+/// into one bin.
 const AZIMUTH: f32 = 0.6 * PI / 180.0;
 const ELEVATION: f32 = 1.0 * PI / 180.0;
-/// Solid angles around, and from below to above.
+/// Number of bins in azimuth, and in elevation from nadir to zenith.
 const AZIMUTHS: usize = 600;
 const ELEVATIONS: usize = 180;
-/// A ray has passed a place where it ends this much farther out, metres, and metres more for each
-/// metre of range.
+/// A ray has passed a position where it ends farther out by this: metres, and metres per metre of
+/// range.
 const PASSED_M: [f32; 2] = [0.2, 0.01];
-/// Rays that end nearer than this, metres, hit what carries the sensor, or nothing.
+/// Returns nearer than this, metres, are the vehicle or invalid.
 const NEAREST_M: f32 = 0.5;
-/// Fewer places with rays to them say nothing, nor do they where there are none to this share.
+/// Least number of positions with rays toward them, and their least share of all positions, for a
+/// result.
 const PLACES: f32 = 5.0;
 const SEEN: f32 = 0.5;
 
-/// What both sweeps of a pair saw through, at places in the target's frame. Where the origin of a
-/// sweep's frame is not about where its rays began, as in a map's frame, no ray is seen to pass.
+/// The rays of both sweeps of a pair, for positions in the target's frame. Where the origin of a
+/// sweep's frame is far from the sensor, as in a map's frame, no ray counts as passing.
 pub(super) struct FreeSpace {
     source: Rays,
     target: Rays,
     source_from_target: RigidTransform,
 }
 
-/// What was seen through of the places that a cluster leaves and of those that it comes to: shares;
-/// none where there are hardly any such places, or rays to them.
+/// Free-space evidence for a cluster's motion: shares of the vacated positions (those that it
+/// leaves) and of the occupied ones (those that it comes to). A share is none where there are too
+/// few positions with rays toward them.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct FreeSpaceEvidence {
-    /// Of what it leaves, in the target.
+    /// Share of the vacated positions that rays of the target passed through.
     pub(super) left: Option<f32>,
-    /// Of what it comes to, in the source.
+    /// Share of the occupied positions that rays of the source passed through.
     pub(super) came: Option<f32>,
-    /// Whether it goes so far that rays would tell.
+    /// Whether the displacement is long enough for rays to discriminate.
     pub(super) far: bool,
 }
 
 impl FreeSpace {
-    /// Of the source and the target as they came, each in its own frame.
+    /// From the raw source and target, metres, each in its own frame.
     pub(super) fn new(
         [source, target]: [&[Point]; 2],
         target_from_source: &RigidTransform,
@@ -59,7 +61,8 @@ impl FreeSpace {
         }
     }
 
-    /// What was seen through of the places that a cluster leaves and of those that it comes to.
+    /// The evidence for a motion from the `vacated` positions to the `occupied` ones, metres in the
+    /// target's frame.
     pub(super) fn of(&self, vacated: &[Point], occupied: &[Point], far: bool) -> FreeSpaceEvidence {
         let before = |&place: &Point| {
             self.source
@@ -75,12 +78,12 @@ impl FreeSpace {
 
 /// The rays of one sweep.
 struct Rays {
-    /// Of each solid angle the end of the shortest ray, metres; infinite where there is none.
+    /// For each bin, the range of the nearest return, metres; infinite where there is none.
     shortest_m: Vec<f32>,
 }
 
 impl Rays {
-    /// To `points`; one that is not finite is no ray.
+    /// Rays to `points`. Points that are not finite are ignored.
     fn new(points: &[Point]) -> Self {
         let mut shortest_m = vec![f32::INFINITY; AZIMUTHS * ELEVATIONS];
         for &point in points {
@@ -92,7 +95,7 @@ impl Rays {
         Self { shortest_m }
     }
 
-    /// Whether all rays toward a place passed it; none where there are none.
+    /// Whether all rays toward a position passed it; none where there are no rays.
     fn passed(&self, place: Point) -> Option<bool> {
         let (angle, range_m) = direction(place);
         let end_m = self.shortest_m[angle];
@@ -101,13 +104,14 @@ impl Rays {
     }
 }
 
-/// How much farther than a place at this range, metres, a ray ends that passed it, metres.
+/// How much farther than a position at this range, metres, a ray must end to have passed it,
+/// metres.
 pub(super) fn passed_m(range_m: f32) -> f32 {
     let [base, slope] = PASSED_M;
     base + slope * range_m
 }
 
-/// The solid angle that a place lies in, and its range, metres.
+/// The bin of a position's direction, and its range, metres.
 fn direction([x, y, z]: Point) -> (usize, f32) {
     let level = x.hypot(y);
     let azimuth = ((y.atan2(x) + PI) / AZIMUTH) as usize;
@@ -116,7 +120,8 @@ fn direction([x, y, z]: Point) -> (usize, f32) {
     (angle, level.hypot(z))
 }
 
-/// The share that passed of those that are known, where enough are.
+/// The share that rays passed, of the positions with rays toward them; none where there are too
+/// few.
 fn share(places: impl Iterator<Item = Option<bool>>) -> Option<f32> {
     let (mut all, mut known, mut passed) = (0.0, 0.0, 0.0);
     for place in places {
@@ -131,7 +136,7 @@ fn share(places: impl Iterator<Item = Option<bool>>) -> Option<f32> {
 mod tests {
     use super::*;
 
-    /// A wall across, 20 m ahead, but for what a pole of half a metre at `pole_y_m` hides of it.
+    /// A wall 20 m ahead, and a pole of 0.5 m at `pole_y_m` in front, which hides a part of it.
     fn sweep(pole_y_m: f32) -> Vec<Point> {
         let mut points = Vec::new();
         for across in -400_i16..400 {
@@ -154,7 +159,7 @@ mod tests {
         let [was, is]: [Vec<Point>; 2] = [at(10.0, 0.0), at(10.0, 1.0)];
         let seen = free_space.of(&was, &is, true);
         assert_eq!((seen.left, seen.came), (Some(1.0), Some(1.0)));
-        // What stands is not seen through, nor what the pole hides.
+        // Rays pass neither the pole nor the part of the wall that it hides.
         let seen = free_space.of(&is, &was, true);
         assert_eq!((seen.left, seen.came), (Some(0.0), Some(0.0)));
         let hidden: Vec<Point> = at(20.0, 2.0);
@@ -164,7 +169,7 @@ mod tests {
     #[test]
     fn where_nobody_looked_or_few_places_are_nothing_is_known() {
         let sweep = [sweep(0.0), vec![[0.0; 3], [f32::NAN; 3], [0.1, 0.0, 0.0]]].concat();
-        // Straight down behind, where what is not a number would lie.
+        // Straight down and behind: the bin that a direction that is not a number falls into.
         let below = [vec![[-0.01, -1e-9, -2.0]], sweep.clone()].concat();
         let free_space = FreeSpace::new([&below, &below], &RigidTransform::identity());
         let seen = |place: Point, count| free_space.of(&vec![place; count], &[], true);
@@ -174,13 +179,14 @@ mod tests {
         assert_eq!(seen([f32::NAN; 3], 6).left, None);
         assert_eq!(seen([f32::INFINITY, 0.0, 0.0], 6).left, None);
         assert_eq!(seen([10.0, 5.0, 0.0], 6).came, None);
-        // What ends at the sensor hides nothing.
+        // A return at the sensor hides nothing.
         assert_eq!(seen([5.0, 0.0, 0.0], 6).left, Some(1.0));
     }
 
     #[test]
     fn neighboring_directions_share_an_angle_or_lie_side_by_side() {
-        // A little to the left and up of straight ahead, behind on both sides of the seam, above.
+        // Slightly to the left of and above straight ahead; behind, on both sides of the seam;
+        // straight up.
         let (ahead, above) = (direction([2.0, 0.01, 0.01]), direction([0.0, 0.0, 2.0]));
         assert_eq!(ahead.0, AZIMUTHS / 2 * ELEVATIONS + ELEVATIONS / 2);
         assert_eq!(above.0 % ELEVATIONS, ELEVATIONS - 1);

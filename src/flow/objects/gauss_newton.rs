@@ -1,29 +1,32 @@
-//! The fit of a motion: Gauss-Newton on the distances to planes with a little of what lies across.
+//! Gauss-Newton fit of a cluster's motion: point-to-plane distances with a small weight across the
+//! planes.
 //!
-//! In a sweep that is `k` gaps after the source a motion has been done `k` times, so that an error of
-//! it shows `k` times as large. It must not know which fit is the best.
+//! In a sweep `k` sweep intervals after the source, the motion has been applied `k` times, so that
+//! an error of it is `k` times as large there.
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::hypothesis::Mover;
+use super::hypothesis::ClusterSearch;
 use super::neighbor_view::NeighborView;
 use super::planar_motion::PlanarMotion;
 use super::scene::Scene;
 use crate::flow::data::{Point, stride_sample};
 
-/// Steps after which the target points around a cluster are looked for again.
+/// Steps between two searches for the target points around a cluster.
 const STEPS_BETWEEN_LOOKS: usize = 4;
-/// Scale of the weight (Geman and McClure) in the first half of the steps and after, metres.
+/// Scale of the robust weight (Geman and McClure) in the first half of the steps and in the second,
+/// metres.
 const SCALES_M: [f32; 2] = [0.2, 0.1];
-/// Pulls toward no shift, and toward no turn, in parts of the weight.
+/// Damping of the translation and of the rotation of a step, relative to the total weight.
 const DAMPING: [f64; 2] = [1e-3, 0.05];
-/// Less weight than this in all moves nothing.
+/// Total weight below which there is no step.
 const LEAST_WEIGHT: f64 = 1e-6;
-/// A step shorter than this is the last, metres.
+/// A shorter step in the second half is the last, metres.
 const SHORT_STEP_M: f64 = 1e-3;
 
-impl Mover<'_> {
-    /// Gauss-Newton from `start`, in the target and the sweeps `around`.
+impl ClusterSearch<'_> {
+    /// Fits the motion of the cluster's points `rows`, from `start`, to the target and to the
+    /// neighbor sweeps `around` in at most `steps` steps. A rotation is fitted only if `turned`.
     pub(super) fn fitted(
         &self,
         around: &[NeighborView<'_>],
@@ -76,13 +79,16 @@ impl Mover<'_> {
     }
 }
 
-/// The normal equations of a shift and a turn.
+/// Normal equations of a translation and a rotation.
 struct Sums {
+    /// Center of rotation after the motion, metres.
     pivot: [f32; 2],
-    /// Gaps that the motion is repeated over, what a turn adds to the shift by then, and what the
-    /// sweep counts.
+    /// Sweep intervals over which the motion is repeated.
     gaps: f32,
+    /// Derivative of the repeated motion's translation with respect to the rotation, metres a
+    /// radian.
     swing: [f32; 2],
+    /// Weight of the sweep.
     share: f32,
     square_scale: f32,
     normal: Matrix3<f64>,
@@ -104,8 +110,8 @@ impl Sums {
         }
     }
 
-    /// What is added from now on is of a sweep `at` gaps after the source, by when `motion` has
-    /// become `by_then`.
+    /// Selects the sweep of the matches added next: `at` sweep intervals after the source, where
+    /// `motion` has become `by_then`, with the weight `share`.
     fn look(&mut self, motion: &PlanarMotion, by_then: &PlanarMotion, at: i8, share: f32) {
         self.pivot = [0, 1].map(|a| by_then.center[a] + by_then.shift_m[a]);
         self.gaps = f32::from(at);
@@ -122,7 +128,8 @@ impl Sums {
         let away: Point = core::array::from_fn(|a| to[a] - moved[a]);
         let k = self.gaps;
         let [rx, ry] = [0, 1].map(|a| k * (moved[a] - self.pivot[a]));
-        // What a turn moves: the lever's end, and the pivot itself.
+        // Derivative with respect to the rotation: of the point about the pivot, and of the pivot
+        // itself.
         let [tx, ty] = [self.swing[0] - ry, self.swing[1] + rx];
         let normal = scene.normal(target);
         let leak = if normal == [0.0; 3] {
@@ -151,7 +158,8 @@ impl Sums {
         self.weight += weight;
     }
 
-    /// The shift and the turn that follow; none where nothing was matched.
+    /// The step: a translation along x and y, metres, and a rotation, radians. None where there are
+    /// no matches.
     fn step(mut self, turned: bool) -> Option<[f64; 3]> {
         if self.weight < LEAST_WEIGHT {
             return None;

@@ -1,7 +1,7 @@
-//! Where a cluster may have moved to: the displacements that most of its points agree on.
+//! Hough voting over translations: the displacements that most points of a cluster agree on.
 //!
-//! Every pair of a source point and a target point at its height votes for the shift between them
-//! (ICP-Flow, Lin et al. 2024). It must not know how good a start is in the end.
+//! Every pair of a source point and a target point at about its height votes for the translation
+//! between them (ICP-Flow, Lin et al. 2024).
 
 use super::scene::Scene;
 use crate::flow::data::Point;
@@ -9,23 +9,23 @@ use crate::flow::options::ObjectOptions;
 use crate::flow::spatial::ColumnIndex;
 use crate::flow::spatial::voxel_first;
 
-/// Points within this height of each other vote, in bins.
+/// Largest height difference of a pair that votes, in bins.
 const LEVEL_BINS: f32 = 1.5;
-/// Bins between two peaks.
+/// Two peaks are more than this many bins apart.
 const PEAKS_APART: i32 = 2;
 
-/// The cloud that is voted with.
+/// The target points that pairs are formed with, and the bins of the votes.
 pub(super) struct TranslationVotes {
     near: ColumnIndex,
     bin_m: f32,
-    /// Bins on each side of none.
+    /// Bins on each side of the zero translation.
     half: i32,
-    /// Difference in height up to which points vote, metres.
+    /// Largest height difference of a pair that votes, metres.
     within_m: f32,
 }
 
 impl TranslationVotes {
-    /// Over the target of `scene`.
+    /// For the target of `scene`.
     pub(super) fn new(scene: &Scene<'_>) -> Self {
         let ObjectOptions {
             bin_m,
@@ -42,8 +42,8 @@ impl TranslationVotes {
         }
     }
 
-    /// At most `most` shifts along x and y, metres, the one with the most votes first; shorter
-    /// ones before longer ones with as many.
+    /// At most `most` translations along x and y of the source `points`, metres, in descending
+    /// order of votes. Of equal votes, the shorter translation comes first.
     pub(super) fn peaks(&self, points: &[Point], most: usize) -> Vec<[f32; 2]> {
         let side = 2 * self.half + 1;
         let mut votes = vec![0_u32; (side * side) as usize];
@@ -58,7 +58,7 @@ impl TranslationVotes {
                     if shift.iter().all(|bins| bins.abs() <= self.half as f32) {
                         let [x, y] = shift.map(|bins| bins as i32);
                         let bin = ((y + self.half) * side + x + self.half) as usize;
-                        // A point has one vote for a shift, however dense the target.
+                        // A source point votes once for a translation, however dense the target is.
                         if last[bin] != voter {
                             last[bin] = voter;
                             votes[bin] += 1;
@@ -104,7 +104,7 @@ impl TranslationVotes {
 mod tests {
     use super::*;
     use crate::flow::data::Random;
-    use crate::flow::objects::scene::Thinned;
+    use crate::flow::objects::scene::SourceCloud;
     use crate::flow::spatial::NOISE;
 
     #[test]
@@ -118,8 +118,8 @@ mod tests {
             .iter()
             .map(|&[x, y, z]| [x + shift[0], y + shift[1], z]);
         let target: Vec<Point> = moved.collect();
-        let thinned = Thinned::new(&source, &[NOISE; 80], &options);
-        let scene = Scene::new(&thinned, &target, &options);
+        let downsampled = SourceCloud::new(&source, &[NOISE; 80], &options);
+        let scene = Scene::new(&downsampled, &target, &options);
         let peaks = TranslationVotes::new(&scene).peaks(&source, 4);
         assert_eq!(peaks.len(), 4);
         let [x, y] = [0, 1].map(|a| (peaks[0][a] - shift[a]).abs());
@@ -135,8 +135,8 @@ mod tests {
     #[test]
     fn points_without_a_target_have_no_peaks() {
         let options = ObjectOptions::default();
-        let thinned = Thinned::new(&[[0.0; 3]], &[NOISE], &options);
-        let scene = Scene::new(&thinned, &[[50.0; 3]], &options);
+        let downsampled = SourceCloud::new(&[[0.0; 3]], &[NOISE], &options);
+        let scene = Scene::new(&downsampled, &[[50.0; 3]], &options);
         assert!(
             TranslationVotes::new(&scene)
                 .peaks(&[[0.0; 3]], 4)

@@ -1,10 +1,11 @@
-//! The motion of one cluster: from several starts, fitted both ways, the one of least cost.
+//! Motion hypothesis of one cluster: fits from several initial guesses, of which the one of least
+//! cost is taken.
 //!
-//! The cost is the mean truncated distance of the moved cluster to the target plus that of the
-//! target around it to the moved cluster: the former alone lets a cluster slide along what it is a
-//! part of. Fits are Gauss-Newton on the distances to planes with a little of what lies across; the
-//! last steps try shifts, since the cost has edges that no derivative sees. It must not know whether
-//! the motion is needed.
+//! The cost is symmetric: the mean truncated distance from the moved cluster to the target, plus
+//! that from the target around it to the moved cluster. The forward cost alone lets a cluster slide
+//! along a larger surface that it is a part of. The fits are Gauss-Newton on point-to-plane
+//! distances with a small weight across the planes. A direct search over small shifts ends the
+//! optimization, since the cost is not smooth and its derivatives do not show every descent.
 
 use super::hough::TranslationVotes;
 use super::neighbor_view::NeighborView;
@@ -12,25 +13,27 @@ use super::planar_motion::PlanarMotion;
 use super::scene::Scene;
 use crate::flow::data::{Point, square_distance, stride_sample};
 
-/// Points of a cluster that vote, that a start is fitted with, and that costs are taken of.
+/// Points of a cluster that vote, that are fitted from an initial guess, and that costs are
+/// computed from.
 const VOTERS: usize = 64;
 const FITTED: usize = 100;
 const JUDGED: usize = 200;
-/// Points between two looks at whether a cost is too high to matter.
+/// Points between two checks of whether a cost is already too high.
 const JUDGED_AT_ONCE: usize = 16;
-/// Starts that a motion is fitted from, besides none: those that cost the least as they are.
+/// Initial guesses that are fitted besides the zero motion: those of least cost before the fit.
 const PROMISING: usize = 2;
-/// Steps of the fit from each start, and of the last one.
+/// Steps of the fit from each initial guess, and of the last fit.
 const STEPS: [usize; 2] = [10, 20];
-/// Shifts that are tried in the end, metres, each up to [`TRIES`] times.
+/// Shifts of the direct search, metres, each applied up to [`TRIES`] times.
 const SHIFTS_M: [f32; 3] = [0.1, 0.05, 0.025];
 const TRIES: usize = 4;
-/// Points from which a cluster is turned, too.
+/// Number of points from which a rotation is fitted as well.
 const TURNED: usize = 40;
-/// What a point without a normal holds along every direction: as much as normals all around do.
+/// Observability of a point without a normal in every direction: the mean over normals of all
+/// directions.
 const HOLD_OF_A_POINT: f32 = 1.0 / 3.0;
 
-/// What a motion costs, metres: the moved cluster to the target, and back.
+/// Cost of a motion, metres: from the moved cluster to the target, and back.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Cost {
     pub(super) forward_m: f32,
@@ -38,47 +41,51 @@ pub(super) struct Cost {
 }
 
 impl Cost {
-    /// Both together.
+    /// The sum of both, metres.
     pub(super) fn sum_m(self) -> f32 {
         self.forward_m + self.backward_m
     }
 }
 
-/// The best motion of a cluster.
+/// The best motion of a cluster, with its evidence.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Hypothesis {
     pub(super) motion: PlanarMotion,
-    /// What it costs, and what standing still does.
+    /// Cost of the motion.
     pub(super) cost: Cost,
+    /// Cost of standing still.
     pub(super) still: Cost,
-    /// How well the cluster's surfaces hold it along the motion, 0 to 1.
+    /// Observability: how well the cluster's surfaces determine the motion along itself, 0 to 1.
     pub(super) hold: f32,
-    /// What the sweeps around say.
+    /// Evidence of the neighbor sweeps.
     pub(super) around: NeighborEvidence,
 }
 
-/// What the sweeps around that see a cluster, moved or standing still, say of its motion.
+/// Costs of a cluster's motion in the neighbor sweeps that show the cluster, moved or standing
+/// still.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct NeighborEvidence {
-    /// What they count in all, in times of the target.
+    /// Sum of the weights of these sweeps, where the target has a weight of 1.
     pub(super) weight: f32,
-    /// Weighted costs, metres.
+    /// Weighted sum of the costs of standing still, metres.
     pub(super) still_m: f32,
+    /// Weighted sum of the costs of the motion, metres.
     pub(super) moved_m: f32,
-    /// Costs in the sweep nearest in time, standing still and moved, metres.
+    /// Costs in the sweep nearest in time, metres: standing still, and moved.
     pub(super) nearest_m: [f32; 2],
 }
 
-/// The best of the motions that were considered.
+/// The best of the motions considered so far.
 struct BestHypothesis {
     motion: PlanarMotion,
     cost: Cost,
-    /// What it is compared by: its cost, here and in the sweeps around, and what else counts, metres.
+    /// Value that is minimized, metres: the cost in the target and in the neighbor sweeps, plus a
+    /// penalty.
     value_m: f32,
 }
 
 impl BestHypothesis {
-    /// Worse than any motion.
+    /// The initial value, worse than any motion.
     fn none() -> Self {
         Self {
             motion: PlanarMotion::still([0.0; 2]),
@@ -90,8 +97,8 @@ impl BestHypothesis {
         }
     }
 
-    /// Takes a motion of `mover` that costs less, `more_m` metres added.
-    fn consider(&mut self, mover: &Mover<'_>, motion: PlanarMotion, more_m: f32) {
+    /// Takes `motion` if its value is lower, with `more_m` metres added as a penalty.
+    fn consider(&mut self, mover: &ClusterSearch<'_>, motion: PlanarMotion, more_m: f32) {
         let Some(cost) = mover.cost_below(&motion, more_m, self.value_m) else {
             return;
         };
@@ -110,15 +117,15 @@ impl BestHypothesis {
     }
 }
 
-/// One cluster, to be moved.
-pub(super) struct Mover<'a> {
+/// One cluster, and the sweeps in which its motion is evaluated.
+pub(super) struct ClusterSearch<'a> {
     pub(super) scene: &'a Scene<'a>,
     around: &'a [NeighborView<'a>],
     pub(super) cluster: u32,
     rows: Vec<u32>,
 }
 
-impl<'a> Mover<'a> {
+impl<'a> ClusterSearch<'a> {
     pub(super) fn new(scene: &'a Scene<'a>, around: &'a [NeighborView<'a>], cluster: u32) -> Self {
         Self {
             scene,
@@ -128,13 +135,13 @@ impl<'a> Mover<'a> {
         }
     }
 
-    /// What standing still costs.
+    /// Cost of standing still.
     pub(super) fn standing_still(&self) -> Cost {
         self.cost(&PlanarMotion::still([0.0; 2]))
     }
 
-    /// The motion of least cost; none where standing still costs so little, `still`, that none is
-    /// needed, or nearly as little as any.
+    /// The hypothesis of least cost. None where the cost `still` of standing still is so low that
+    /// no motion is needed, or where a motion hardly lowers it.
     pub(super) fn search(&self, votes: &TranslationVotes, still: Cost) -> Option<Hypothesis> {
         let options = self.scene.options;
         let members = &self.scene.source.members[self.cluster as usize];
@@ -202,7 +209,7 @@ impl<'a> Mover<'a> {
         })
     }
 
-    /// The motion of least cost among those a few shifts away.
+    /// Direct search: the motion of least cost within a few small shifts of `start`.
     fn tried(&self, start: PlanarMotion) -> BestHypothesis {
         let mut best = BestHypothesis::none();
         best.consider(self, start, 0.0);
@@ -226,13 +233,13 @@ impl<'a> Mover<'a> {
         best
     }
 
-    /// What a motion costs.
+    /// Cost of a motion in the target.
     pub(super) fn cost(&self, motion: &PlanarMotion) -> Cost {
         self.cost_in(self.scene, motion)
     }
 
-    /// What a motion costs; none where that and `more_m` are plainly no less than `least_m`, metres: half
-    /// of the cost shows that of most motions, and some of the points that half.
+    /// Cost of a motion; none where the forward cost plus `more_m` reaches `least_m`, metres. The
+    /// forward cost alone, or some of its points, is enough to rule out most motions.
     fn cost_below(&self, motion: &PlanarMotion, more_m: f32, least_m: f32) -> Option<Cost> {
         let count = self.rows.len().max(1) as f32;
         let mut sum = 0.0;
@@ -250,7 +257,7 @@ impl<'a> Mover<'a> {
         })
     }
 
-    /// What those sweeps around that see the cluster, moved or not, say of a motion.
+    /// Costs of a motion in the neighbor sweeps that show the cluster, moved or not.
     fn witnesses(&self, motion: &PlanarMotion) -> NeighborEvidence {
         let mut all = NeighborEvidence::default();
         let still = PlanarMotion::still(motion.center);
@@ -270,7 +277,7 @@ impl<'a> Mover<'a> {
         all
     }
 
-    /// What a motion costs in the sweeps around: the weighted sum.
+    /// Weighted sum of the costs of a motion in the neighbor sweeps, metres.
     pub(super) fn around_m(&self, motion: &PlanarMotion) -> f32 {
         let costs = self.around.iter().map(|moment| {
             moment.weight * self.cost_in(&moment.scene, &moment.by_then(motion)).sum_m()
@@ -278,7 +285,7 @@ impl<'a> Mover<'a> {
         costs.sum()
     }
 
-    /// What a motion that leads into the sweep of `scene` costs there.
+    /// Cost, in the sweep of `scene`, of a motion that leads from the source to that sweep.
     fn cost_in(&self, scene: &Scene<'_>, motion: &PlanarMotion) -> Cost {
         let distances = self.rows.iter();
         let distances = distances.map(|&row| self.distance(scene, row, motion));
@@ -288,7 +295,8 @@ impl<'a> Mover<'a> {
         }
     }
 
-    /// How far the sweep of `scene` lies from the moved cluster where that touches it, metres.
+    /// Backward cost: mean truncated distance from the points of `scene` around the moved cluster
+    /// to it, metres.
     fn backward_m(&self, scene: &Scene<'_>, motion: &PlanarMotion) -> f32 {
         let truncation_m = scene.options.truncation_m;
         let touched = scene.touched(&self.rows, self.cluster, motion);
@@ -308,9 +316,9 @@ impl<'a> Mover<'a> {
         }
     }
 
-    /// How well the cluster's surfaces hold it along a motion's shift: the mean square of their
-    /// normals along it, 0 for a wall that slides in its own plane, 1 for one that is pushed. Points
-    /// without a normal hold in every direction by a third.
+    /// Observability of a motion: the mean square of the cluster's normals along its translation, 0
+    /// for a wall that slides in its own plane, 1 for one that moves along its normal. Points
+    /// without a normal count as a third in every direction.
     pub(super) fn hold(&self, motion: &PlanarMotion) -> f32 {
         let length = motion.length_m().max(f32::MIN_POSITIVE);
         let [x, y] = motion.shift_m.map(|c| c / length);
@@ -329,8 +337,8 @@ impl<'a> Mover<'a> {
         sum / f32::max(count, 1.0)
     }
 
-    /// Where the cluster was and is not after a motion: its places that none of it comes within
-    /// `clear_m` metres of.
+    /// The positions that the cluster leaves: its source points from which every point of the moved
+    /// cluster is farther than `clear_m` metres.
     pub(super) fn vacated(&self, motion: &PlanarMotion, clear_m: f32) -> Vec<Point> {
         let places = self.rows.iter();
         let places = places.map(|&row| self.scene.source.points[row as usize]);
@@ -339,8 +347,8 @@ impl<'a> Mover<'a> {
             .collect()
     }
 
-    /// Where it is after a motion and was not: the target points that it lies on then that none of it
-    /// was within `clear_m` metres of.
+    /// The positions that the cluster comes to: the target points that it matches after the motion
+    /// and from which all its source points are farther than `clear_m` metres.
     pub(super) fn occupied(&self, motion: &PlanarMotion, clear_m: f32) -> Vec<Point> {
         let places = self.matches(motion);
         let places = places.map(|target| self.scene.target[target as usize]);
@@ -349,7 +357,7 @@ impl<'a> Mover<'a> {
             .collect()
     }
 
-    /// Whether no point of the cluster, standing, lies within `clear_m` metres of a place.
+    /// Whether all source points of the cluster are farther than `clear_m` metres from `place`.
     fn is_clear(&self, place: Point, clear_m: f32) -> bool {
         let nearest = self.scene.origin_of(place, self.cluster);
         nearest.is_none_or(|row| {
@@ -358,7 +366,8 @@ impl<'a> Mover<'a> {
         })
     }
 
-    /// The target points that the cluster lies on once moved, one for each of its points that has one.
+    /// The target points that the moved cluster matches, one for each of its points that has a
+    /// match.
     fn matches(&self, motion: &PlanarMotion) -> impl Iterator<Item = u32> {
         self.rows.iter().filter_map(|&row| {
             let moved = motion.apply(self.scene.source.points[row as usize]);
@@ -366,7 +375,7 @@ impl<'a> Mover<'a> {
         })
     }
 
-    /// How far a source point, moved, lies from the target, metres, truncated.
+    /// Distance of a moved source point from the target, metres, truncated.
     fn distance(&self, scene: &Scene<'_>, row: u32, motion: &PlanarMotion) -> f32 {
         let moved = motion.apply(scene.source.points[row as usize]);
         scene.distance_of(moved, self.cluster)

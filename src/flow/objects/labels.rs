@@ -1,28 +1,28 @@
-//! Which cluster each source point is of in the end: a mover with the pieces that move with it, or
-//! something that stands still.
-//!
-//! It must not know how movers were found.
+//! The final cluster of each source point: a moving object with the fragments assigned to it, or a
+//! static cluster.
 
 use crate::flow::spatial::NOISE;
 
-/// The clusters of a source, those with the most points first.
+/// The final clusters of a source, in descending order of their number of points.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ClusterLabels {
-    /// N places in `motions`: the cluster of each source point; [`ClusterLabels::NONE`] where it is of none.
+    /// N indices, one a source point: its cluster, as an index into `motions`;
+    /// [`ClusterLabels::NONE`] where it is in no cluster.
     pub of: Vec<u32>,
-    /// K clusters: which of the motions each has; none where it stands still.
+    /// K entries, one a cluster: the index of its motion; none where it is static.
     pub motions: Vec<Option<u32>>,
 }
 
 impl ClusterLabels {
-    /// Of no cluster.
+    /// Label of a point in no cluster.
     pub const NONE: u32 = NOISE;
 
-    /// Of a source whose points had `labels` before anything was known of motions. `cluster_motion` says of
-    /// each label whose motion it has, `point_motion` of each point which of the `count` motions; [`NOISE`]
-    /// where none.
+    /// From the DBSCAN `labels` of the source points. `cluster_motion` gives for each DBSCAN
+    /// cluster the cluster whose motion it has, `point_motion` for each point the index of its
+    /// motion, of `count`; [`NOISE`] is no motion.
     ///
-    /// What was cut off a mover is of no cluster: it is not known what it is a part of.
+    /// Points rejected from a moving object are in no cluster, since it is unknown which object
+    /// they belong to.
     pub(super) fn new(
         labels: &[u32],
         cluster_motion: &[u32],
@@ -70,7 +70,7 @@ mod tests {
     #[test]
     fn a_piece_is_of_the_mover_that_it_goes_with_and_what_stands_keeps_its_cluster() {
         let motion = PlanarMotion::still([0.0; 2]).shifted([1.0, 0.0]);
-        // A car in two pieces, a wall, a stray point, and a point cut off the car.
+        // A car in two fragments, a wall, a stray point, and a point rejected from the car.
         let source: Vec<Point> = [0.0, 0.2, 1.0, 9.0, 9.2, 9.4, 9.6, 30.0, 3.0]
             .map(|x| [x, 0.0, 0.0])
             .to_vec();

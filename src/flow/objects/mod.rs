@@ -1,15 +1,15 @@
-//! Movers found, the static world kept still: rigid motions, cluster by cluster.
+//! Object search: a rigid motion for each cluster that moves, and none for the static world.
 //!
 //! ```text
-//! source, ego motion out - cluster ─┐                 ┌ vote - starts
-//! target ───────────────── scene ───┼─ each cluster: ─┤ rigid - the motion of least cost
-//! both sweeps, whole ───── sight ───┘                 └ gate - needed, or none
-//!                          spread: pieces beside a mover, points that are not of it - Motions
+//! source, ego motion out - clusters ─┐                 ┌ Hough voting - initial guesses
+//! target ────────────────── scene ───┼─ each cluster: ─┤ fits - the hypothesis of least cost
+//! both raw sweeps ───── free space ──┘                 └ acceptance - its motion, or none
+//!     assignment: fragments beside moving objects, points that do not follow - ObjectMotions
 //! ```
 //!
-//! After ICP-Flow (Lin et al. 2024): clusters, shifts by votes, rigid fits; the cost both ways, the
-//! gate and what is taken are ours. No field, no distance transform, no random choice: the same bits
-//! whatever the number of threads. It must not know devices, backends or where an ego motion is from.
+//! After ICP-Flow (Lin et al. 2024): clusters, Hough voting over translations and rigid fits. The
+//! symmetric cost, the acceptance test and the static matches are additions to it. There is no
+//! random choice, and the result is bit-identical for any number of threads.
 
 mod accept;
 mod assign;
@@ -30,7 +30,7 @@ mod search;
 #[cfg(test)]
 mod tests;
 
-pub use confidence::{SURE_M, confidence_of_ground};
+pub use confidence::{CONFIDENT_WITHIN_M, confidence_of_ground};
 pub use describe::{Cluster, Objects};
 pub use features::ConfidenceFeatures;
 pub use labels::ClusterLabels;

@@ -1,7 +1,7 @@
-//! The motions of the movers of a pair, at any place.
+//! The motions of a pair's moving objects as a field over space.
 //!
-//! A place moves with the source point nearest to it: with its mover, or not at all. It must not
-//! know how movers were found.
+//! A position moves with the source point nearest to it: with the object of that point, or not at
+//! all.
 
 use rayon::prelude::*;
 
@@ -9,28 +9,28 @@ use super::planar_motion::PlanarMotion;
 use crate::flow::data::Point;
 use crate::flow::spatial::{ColumnIndex, NOISE};
 
-/// A place farther than this from every mover's points does not move, metres: what belongs to an
-/// object lies as near to the rest of it as its own points lie to each other.
+/// Range of moving points, metres: positions farther from all of them do not move. It is the
+/// default cluster radius, within which the points of one object lie of each other.
 const REACH_M: f32 = 0.5;
 
-/// Rigid motions, and the source points that have them or have none.
+/// Rigid motions, and the source points that have them or are static.
 #[derive(Debug)]
 pub struct ObjectMotions {
     motions: Vec<PlanarMotion>,
-    /// Of each moving point, its motion.
+    /// For each moving point, the index of its motion.
     point_motion: Vec<u32>,
     moving: ColumnIndex,
     standing: ColumnIndex,
 }
 
 impl ObjectMotions {
-    /// Nothing moves.
+    /// No motion.
     pub(super) fn none() -> Self {
         Self::new(Vec::new(), &[], &[])
     }
 
-    /// Of `points`, in metres with the ego motion taken out, and which of `motions` each has;
-    /// [`NOISE`] stands still.
+    /// From N `points`, metres in the target's frame with the ego motion taken out, and the index
+    /// into `motions` of each; [`NOISE`] is static.
     pub(super) fn new(motions: Vec<PlanarMotion>, points: &[Point], point_motion: &[u32]) -> Self {
         let of = |moves: bool| {
             let chosen = points.iter().zip(point_motion);
@@ -38,7 +38,8 @@ impl ObjectMotions {
         };
         let moving: Vec<Point> = of(true).map(|(&point, _)| point).collect();
         let moving = ColumnIndex::new(&moving, 2.0 * REACH_M);
-        // What stands farther from all that moves is the nearest to no place that may move.
+        // A static point farther from all moving points is never the nearest to a position that may
+        // move.
         let matters = |point: Point| moving.nearest(point, 2.0 * REACH_M, |_| true).is_some();
         let standing = of(false).map(|(&point, _)| point);
         let standing: Vec<Point> = standing.filter(|&point| matters(point)).collect();
@@ -50,16 +51,17 @@ impl ObjectMotions {
         }
     }
 
-    /// The motions, the points that have them and which, and the points beside them that stand.
+    /// The motions, the moving points with the index of each one's motion, and the static points
+    /// beside them.
     pub(super) fn parts(&self) -> (&[PlanarMotion], Vec<(Point, u32)>, Vec<Point>) {
         let moving = self.moving.in_order().into_iter();
         let moving = moving.zip(self.point_motion.iter().copied());
         (&self.motions, moving.collect(), self.standing.in_order())
     }
 
-    /// How far each place moves within one gap between the sweeps, beyond what the ego motion
-    /// explains: metres, in the target's frame, at places in the source's frame with the ego motion
-    /// taken out. They need not be the source's own.
+    /// Residual flow at N `places`, N x 3 metres in the target's frame: the displacement in one
+    /// sweep interval beyond the ego motion. `places` are positions at the source's time, metres,
+    /// transformed to the target's frame by the ego motion. They need not be source points.
     pub fn residual_at(&self, places: &[Point]) -> Vec<Point> {
         places
             .par_iter()
@@ -74,7 +76,7 @@ impl ObjectMotions {
         }
     }
 
-    /// Which of the motions a place has; [`NOISE`] where it stands still.
+    /// The index of the motion at a position; [`NOISE`] where it is static.
     fn owner(&self, place: Point) -> u32 {
         let Some((row, square)) = self.moving.nearest(place, REACH_M, |_| true) else {
             return NOISE;
@@ -86,17 +88,18 @@ impl ObjectMotions {
         }
     }
 
-    /// [`Self::owner`] of every place.
+    /// [`Self::owner`] of every position.
     pub(super) fn owners_at(&self, places: &[Point]) -> Vec<u32> {
         places.par_iter().map(|&place| self.owner(place)).collect()
     }
 
-    /// How far the motion of this number moves a place, metres, as [`Self::residual_at`] says it.
+    /// Displacement of a position by the motion of this index, metres, in the frame of
+    /// [`Self::residual_at`].
     pub(crate) fn displacement(&self, motion: u32, place: Point) -> Point {
         self.motions[motion as usize].displacement(place)
     }
 
-    /// Radians that the motion of this number turns about the vertical, counterclockwise.
+    /// Rotation of the motion of this index about the vertical, radians, counterclockwise.
     pub(crate) fn turn(&self, motion: u32) -> f32 {
         self.motions[motion as usize].turn
     }

@@ -1,29 +1,30 @@
-//! Another sweep of the sequence, as the search for movers sees it.
+//! A neighbor sweep, prepared for the object search.
 //!
-//! What moves at a constant velocity has moved as often by then as gaps have passed. It must not know
-//! what its evidence is for.
+//! At constant velocity, a cluster has moved once for each sweep interval between the source and
+//! the neighbor sweep.
 
 use super::planar_motion::PlanarMotion;
-use super::scene::{Scene, Thinned};
+use super::scene::{Scene, SourceCloud};
+use crate::flow::data::AlignedSweep;
 use crate::flow::options::ObjectOptions;
-use crate::flow::registration::AlignedSweep;
 
-/// A sweep at its time.
+/// A neighbor sweep with its time and weight.
 pub(super) struct NeighborView<'a> {
     pub(super) scene: Scene<'a>,
-    /// Gaps after the source.
+    /// Its time in sweep intervals after the source.
     pub(super) at: i8,
-    /// What it counts, in times of the target.
+    /// Weight of its costs, where the target has a weight of 1.
     pub(super) weight: f32,
 }
 
 impl<'a> NeighborView<'a> {
     pub(super) fn new(
-        source: &'a Thinned,
+        source: &'a SourceCloud,
         sweep: &AlignedSweep,
         options: &'a ObjectOptions,
     ) -> Self {
-        // A sweep is trusted the less the longer ago a velocity must have been what it is.
+        // The weight falls with the square of the time difference, over which the velocity may have
+        // changed.
         let away = f32::from(sweep.at).abs().max(1.0);
         Self {
             scene: Scene::new(source, &sweep.points, options),
@@ -32,7 +33,7 @@ impl<'a> NeighborView<'a> {
         }
     }
 
-    /// Where a motion of one gap leads to by then.
+    /// The motion from the source to this sweep's time, for a motion of one sweep interval.
     pub(super) fn by_then(&self, motion: &PlanarMotion) -> PlanarMotion {
         motion.repeated(self.at)
     }

@@ -1,23 +1,23 @@
-//! A rigid motion over the ground: a shift in x and y and a turn about the vertical.
+//! Planar rigid motion: a translation in x and y and a rotation about the vertical.
 //!
-//! Nothing that drives or walks rises or tilts by more than a lidar's noise in a tenth of a second;
-//! with heights left free, surfaces follow the scan lines. It must not know what is moved.
+//! Vehicles and pedestrians rise or tilt by less than a lidar's noise in a tenth of a second. With
+//! a free height, fitted surfaces follow the scan lines.
 
 use crate::flow::data::Point;
 
-/// A shift, and a turn about a point.
+/// A translation, and a rotation about a center.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct PlanarMotion {
-    /// Metres along x and y.
+    /// Translation along x and y, metres.
     pub(super) shift_m: [f32; 2],
-    /// Radians about the vertical through `center`.
+    /// Rotation about the vertical through `center`, radians, counterclockwise.
     pub(super) turn: f32,
-    /// Metres.
+    /// Center of the rotation, x and y, metres.
     pub(super) center: [f32; 2],
 }
 
 impl PlanarMotion {
-    /// No motion, to be turned about `center`.
+    /// The zero motion, with the center of rotation `center`.
     pub(super) fn still(center: [f32; 2]) -> Self {
         Self {
             shift_m: [0.0; 2],
@@ -26,7 +26,7 @@ impl PlanarMotion {
         }
     }
 
-    /// This motion, `shift_m` farther.
+    /// This motion with a translation of `[x, y]` metres added.
     pub(super) fn shifted(&self, [x, y]: [f32; 2]) -> Self {
         Self {
             shift_m: [self.shift_m[0] + x, self.shift_m[1] + y],
@@ -34,7 +34,7 @@ impl PlanarMotion {
         }
     }
 
-    /// This motion `times` over, or undone as often where that is negative.
+    /// This motion applied `times` times; where `times` is negative, its inverse applied as often.
     pub(super) fn repeated(&self, times: i8) -> Self {
         let mut shift_m = [0.0; 2];
         for _ in 0..times.unsigned_abs() {
@@ -58,7 +58,7 @@ impl PlanarMotion {
         }
     }
 
-    /// Where a point comes to lie.
+    /// Position of a point after the motion.
     #[inline]
     pub(super) fn apply(&self, [x, y, z]: Point) -> Point {
         let (sin, cos) = self.turn.sin_cos();
@@ -70,7 +70,7 @@ impl PlanarMotion {
         ]
     }
 
-    /// Where a point came from.
+    /// Position of a point before the motion: the inverse of [`Self::apply`].
     #[inline]
     pub(super) fn undo(&self, [x, y, z]: Point) -> Point {
         let (sin, cos) = self.turn.sin_cos();
@@ -83,13 +83,13 @@ impl PlanarMotion {
         ]
     }
 
-    /// How far a point is moved.
+    /// Displacement of a point, metres.
     pub(super) fn displacement(&self, point: Point) -> Point {
         let moved = self.apply(point);
         core::array::from_fn(|a| moved[a] - point[a])
     }
 
-    /// Metres that the center is moved.
+    /// Displacement of the center, metres.
     pub(super) fn length_m(&self) -> f32 {
         self.shift_m[0].hypot(self.shift_m[1])
     }
@@ -101,7 +101,7 @@ mod tests {
 
     #[test]
     fn a_motion_undone_leads_back() {
-        // Single precision at 50 m.
+        // Single-precision error at 50 m.
         const TOLERANCE_M: f32 = 2e-5;
         let motion = PlanarMotion {
             shift_m: [1.5, -0.5],

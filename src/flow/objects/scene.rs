@@ -1,8 +1,8 @@
-//! Both clouds as the search for movers sees them: thinned, with normals, and with what is taken.
+//! The clouds of the object search: voxel-downsampled, with normals and static matches.
 //!
-//! A target point that lies on a source point of something that plainly stands still belongs to it,
-//! and nothing else can have moved there. Heights count less than what lies level: a lidar's rings
-//! are far apart, its samples along a ring are not. It must not know how motions are found.
+//! A target point on a source point of a clearly static cluster is a static match: that cluster
+//! explains it, and no other cluster can be matched to it. Heights are scaled down for matching,
+//! since the rings of a lidar are far apart and the samples along a ring are not.
 
 use rayon::prelude::*;
 
@@ -11,23 +11,25 @@ use crate::flow::data::Point;
 use crate::flow::options::ObjectOptions;
 use crate::flow::spatial::{ColumnIndex, NOISE, Neighborhood, voxel_first};
 
-/// Share of a cluster that must lie on the target for it to stand still plainly.
+/// Share of a cluster's points that must lie on the target for the cluster to be clearly static.
 const PLAIN: f32 = 0.9;
 
-/// What moves: the source, the ego motion taken out, thinned.
-pub(super) struct Thinned {
-    /// One point a voxel, and the cluster of each.
+/// The source with the ego motion taken out, voxel-downsampled.
+pub(super) struct SourceCloud {
+    /// One point a voxel, metres in the target's frame.
     pub(super) points: Vec<Point>,
+    /// The cluster of each point, or [`NOISE`].
     pub(super) labels: Vec<u32>,
-    /// Of each cluster, the rows of `points`.
+    /// For each cluster, the indices of its points in `points`.
     pub(super) members: Vec<Vec<u32>>,
-    /// By place, heights shrunk.
+    /// The points with scaled heights.
     low: Vec<Point>,
+    /// Index of `low`.
     near: ColumnIndex,
 }
 
-impl Thinned {
-    /// `labels` are the clusters of `source`.
+impl SourceCloud {
+    /// Downsamples `source`. `labels` are the clusters of its points.
     pub(super) fn new(source: &[Point], labels: &[u32], options: &ObjectOptions) -> Self {
         let kept = voxel_first(source, options.voxel_m);
         let labels: Vec<u32> = kept.iter().map(|&row| labels[row as usize]).collect();
@@ -50,22 +52,27 @@ impl Thinned {
     }
 }
 
-/// The clouds.
+/// The source and one other sweep, prepared for matching.
 pub(super) struct Scene<'a> {
     pub(super) options: &'a ObjectOptions,
-    pub(super) source: &'a Thinned,
-    /// Target points, one a voxel, and their unit normals; zero where there is no flat surface.
+    pub(super) source: &'a SourceCloud,
+    /// Target points, one a voxel, metres.
     pub(super) target: Vec<Point>,
+    /// Unit normals of the target points; zero where the surface is not flat.
     normals: Vec<Point>,
-    /// By place, heights shrunk.
+    /// Index of the target points with scaled heights.
     near_target: ColumnIndex,
-    /// Of each target point, the cluster that it is taken by.
+    /// For each target point, the static cluster that explains it, or [`NOISE`].
     taken: Vec<u32>,
 }
 
 impl<'a> Scene<'a> {
-    /// Of `source` and `target`.
-    pub(super) fn new(source: &'a Thinned, target: &[Point], options: &'a ObjectOptions) -> Self {
+    /// Prepares `source` and `target` for matching. Both are in the target's frame, metres.
+    pub(super) fn new(
+        source: &'a SourceCloud,
+        target: &[Point],
+        options: &'a ObjectOptions,
+    ) -> Self {
         let target: Vec<Point> = voxel_first(target, options.voxel_m)
             .into_iter()
             .map(|row| target[row as usize])
@@ -111,7 +118,8 @@ impl<'a> Scene<'a> {
         }
     }
 
-    /// The target point nearest to a place that `cluster` may have moved to, within the match.
+    /// The target point nearest to `place`, within `match_m`. Static matches of clusters other than
+    /// `cluster` are excluded.
     #[inline]
     pub(super) fn match_of(&self, place: Point, cluster: u32) -> Option<u32> {
         let allowed = |row: u32| {
@@ -125,7 +133,7 @@ impl<'a> Scene<'a> {
         found.map(|(row, _)| row)
     }
 
-    /// The source point of `cluster` nearest to a place, within the match.
+    /// The source point of `cluster` nearest to `place`, within `match_m`.
     #[inline]
     pub(super) fn origin_of(&self, place: Point, cluster: u32) -> Option<u32> {
         let place = lowered(place, self.options);
@@ -134,15 +142,15 @@ impl<'a> Scene<'a> {
         found.map(|(row, _)| row)
     }
 
-    /// Calls `see` with every source point within `within_m` metres of a place, at most the match,
-    /// heights shrunk.
+    /// Calls `see` with every source point within `within_m` metres of `place`, with scaled
+    /// heights. `within_m` is at most `match_m`.
     pub(super) fn source_around(&self, place: Point, within_m: f32, mut see: impl FnMut(u32)) {
         let place = lowered(place, self.options);
         self.source.near.around(place, within_m, |row, _| see(row));
     }
 
-    /// How far a place that `cluster` may have moved to lies from the target, metres, truncated; for
-    /// [`NOISE`], from whatever of it is free.
+    /// Distance from `place` to the target for a point of `cluster`, metres, truncated. With
+    /// [`NOISE`] all static matches are excluded.
     pub(super) fn distance_of(&self, place: Point, cluster: u32) -> f32 {
         let target = self.match_of(place, cluster);
         target.map_or(self.options.truncation_m, |target| {
@@ -150,8 +158,8 @@ impl<'a> Scene<'a> {
         })
     }
 
-    /// The target points that lie within the match of the moved `rows` and may be of `cluster`, in
-    /// their order.
+    /// The target points within `match_m` of the moved `rows` that are no static match of another
+    /// cluster than `cluster`, in ascending order.
     pub(super) fn touched(&self, rows: &[u32], cluster: u32, motion: &PlanarMotion) -> Vec<u32> {
         let within_m = self.options.match_m;
         let mut seen = self.near_target.unseen();
@@ -172,14 +180,14 @@ impl<'a> Scene<'a> {
             .collect()
     }
 
-    /// The unit normal of a target point; zero where there is no flat surface.
+    /// The unit normal of a target point; zero where the surface is not flat.
     #[inline]
     pub(super) fn normal(&self, row: u32) -> Point {
         self.normals[row as usize]
     }
 
-    /// How far a place lies from a target point, metres: along its normal, and a little of what
-    /// lies across, or plainly where it has none. At most the truncation.
+    /// Distance from `place` to a target point, metres, truncated: along its normal with a small
+    /// share of the full distance, or the full distance where it has no normal.
     #[inline]
     pub(super) fn distance(&self, place: Point, row: u32) -> f32 {
         let (target, normal) = (self.target[row as usize], self.normals[row as usize]);
@@ -196,7 +204,7 @@ impl<'a> Scene<'a> {
     }
 }
 
-/// The bits that are set in a word, the lowest first.
+/// The indices of the set bits of a word, in ascending order.
 fn ones(word: u64) -> impl Iterator<Item = u32> {
     let without_lowest = |&left: &u64| Some(left & left.wrapping_sub(1));
     std::iter::successors(Some(word), without_lowest)
@@ -204,13 +212,13 @@ fn ones(word: u64) -> impl Iterator<Item = u32> {
         .map(u64::trailing_zeros)
 }
 
-/// Heights shrunk.
+/// The point with its height scaled.
 #[inline]
 fn lowered([x, y, z]: Point, options: &ObjectOptions) -> Point {
     [x, y, z * options.height_weight]
 }
 
-/// The normal of the surface around a point; zero where it is not flat.
+/// The unit normal of the surface around a point; zero where it is not flat.
 fn normal(near: &ColumnIndex, point: Point, options: &ObjectOptions) -> Point {
     let range = point[0].hypot(point[1]);
     let [base, slope] = options.normal_m;
@@ -236,13 +244,13 @@ mod tests {
     #[test]
     fn what_a_cluster_touches_is_what_a_search_of_all_finds() {
         let options = ObjectOptions::default();
-        // Three words of target points, the last one not full.
+        // 150 target points fill two words of the bit set and a part of a third.
         let target: Vec<Point> = (0..150_u8)
             .map(|i| [f32::from(i) * 0.2, 1.0, 0.0])
             .collect();
         let source = [[7.0, 1.2, 0.0], [19.0, 1.0, 0.1], [29.7, 0.8, 0.0]];
-        let thinned = Thinned::new(&source, &[0; 3], &options);
-        let scene = Scene::new(&thinned, &target, &options);
+        let downsampled = SourceCloud::new(&source, &[0; 3], &options);
+        let scene = Scene::new(&downsampled, &target, &options);
         let motion = PlanarMotion::still([0.0; 2]).shifted([0.5, 0.0]);
         let near = |point: &Point| {
             source.iter().any(|&place| {

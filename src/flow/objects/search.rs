@@ -1,4 +1,5 @@
-//! TODO doc
+//! The object search on a pair: clustering, the search for each cluster's motion, acceptance and
+//! assignment.
 
 use super::features::ConfidenceFeatures;
 use super::labels::ClusterLabels;
@@ -10,60 +11,61 @@ use rayon::prelude::*;
 use super::features::{Findings, SearchedCluster};
 use super::free_space::FreeSpace;
 use super::hough::TranslationVotes;
-use super::hypothesis::Mover;
+use super::hypothesis::{ClusterSearch, Hypothesis};
 use super::neighbor_view::NeighborView;
-use super::scene::{Scene, Thinned};
+use super::scene::{Scene, SourceCloud};
+use crate::flow::data::AlignedSweep;
 use crate::flow::data::{Control, Interrupt, Point, Progress, RigidTransform};
 use crate::flow::options::ObjectOptions;
-use crate::flow::registration::AlignedSweep;
 use crate::flow::spatial::NOISE;
 
-/// Clusters between two looks at the watch.
+/// Clusters between two checks of `control`.
 const CLUSTERS_AT_ONCE: usize = 32;
-/// What the scene takes, in times of the clustering: 2 to 4.
+/// Expected time to prepare the scene, relative to that of the clustering: 2 to 4, with a margin.
 const SCENE: f64 = 5.0;
-/// What is left to do once clusters have been searched, in times of the scene.
+/// Expected time of the stages after the cluster searches, relative to that of the scene.
 const REST: f64 = 0.5;
 
-/// What movers are sought in: metres.
+/// The clouds of an object search, metres.
 #[derive(Clone, Copy, Debug)]
 pub struct SearchClouds<'a> {
-    /// Points off the ground in the target's frame, every number finite: the source's, the ego motion
-    /// taken out, and the target's.
+    /// N source points off the ground, all finite, in the target's frame: the ego motion is taken
+    /// out.
     pub source: &'a [Point],
-    /// See `source`.
+    /// M target points off the ground, all finite, in the target's frame.
     pub target: &'a [Point],
-    /// Other sweeps of the sequence.
-    pub around: &'a [AlignedSweep],
-    /// The source and the target as they came, ground, points out of range and all, each in its own
-    /// frame, whose origin is the sensor or about it: what was seen through on the way to them.
+    /// Neighbor sweeps of the sequence, nearest in time first.
+    pub neighbors: &'a [AlignedSweep],
+    /// The raw source and target, each in its own frame, with ground and points out of range. The
+    /// frame's origin must be at the sensor or near it. They give the free-space evidence.
     pub sweeps: [&'a [Point]; 2],
-    /// The ego motion; none where it is not known.
+    /// The ego motion; the identity where it is unknown.
     pub target_from_source: RigidTransform,
 }
 
-/// The movers of a pair.
+/// The moving objects of a pair.
 #[derive(Debug)]
 pub struct ObjectSearch {
-    /// How they move.
+    /// Their motions.
     pub motions: ObjectMotions,
-    /// Which cluster each source point is of.
+    /// The final cluster of each source point.
     pub parts: ClusterLabels,
-    /// N: what is known of each source point's motion.
+    /// N confidence features, one set a source point.
     pub evidence: Vec<ConfidenceFeatures>,
-    /// Clusters that were looked at.
+    /// Number of clusters that were searched.
     pub clusters: usize,
-    /// Clusters that there are.
+    /// Number of all clusters.
     pub all_clusters: usize,
-    /// How far their points lie from the target in the end, metres: the mean over the clusters.
+    /// Mean forward cost of the clusters that were searched, metres, each with its accepted motion
+    /// or at rest.
     pub cost_m: f64,
-    /// Why not all clusters were looked at.
+    /// The reason why not all clusters were searched; none where all were.
     pub interrupted: Option<Interrupt>,
 }
 
 impl ObjectSearch {
-    /// How far each of the `source` points that it is of moves, metres, the ego motion left out: as
-    /// [`ObjectMotions::residual_at`] says it, without looking for their objects again.
+    /// Residual flow of the N `source` points of the search, metres, ego motion taken out. It is
+    /// [`ObjectMotions::residual_at`] at these points, without another search for their objects.
     pub(crate) fn residual_of(&self, source: &[Point]) -> Vec<Point> {
         let motion = |place: usize| {
             let cluster = *self.parts.of.get(place)?;
@@ -77,7 +79,7 @@ impl ObjectSearch {
         residual.collect()
     }
 
-    /// Nothing was looked at.
+    /// The empty result of a search that was interrupted at its start.
     fn nothing(interrupted: Interrupt) -> Self {
         Self {
             motions: ObjectMotions::none(),
@@ -91,78 +93,54 @@ impl ObjectSearch {
     }
 }
 
-/// Finds what moves in `clouds`. Large clusters come first; those that the watch leaves no time for
-/// stand still.
+/// Searches `clouds` for moving objects. Large clusters are searched first. Clusters that were not
+/// searched because `control` interrupted or the time was too short are static.
 pub(crate) fn find_objects(
     clouds: &SearchClouds<'_>,
     options: &ObjectOptions,
     control: &dyn Control,
 ) -> ObjectSearch {
     let SearchClouds { source, target, .. } = *clouds;
-    let late = |needed: f64| {
-        let late = control.seconds_left().is_some_and(|left| left < needed);
-        control.interrupt().or(late.then_some(Interrupt::Deadline))
-    };
-    if let Some(interrupt) = late(0.0) {
+    if let Some(interrupt) = out_of_time(control, 0.0) {
         return ObjectSearch::nothing(interrupt);
     }
     let began = control.seconds();
     let labels = dbscan::clusters(source, options.cluster_radius_m, options.cluster_min_points);
     let clustering = control.seconds() - began;
-    if let Some(interrupt) = late(clustering * SCENE) {
+    if let Some(interrupt) = out_of_time(control, clustering * SCENE) {
         return ObjectSearch::nothing(interrupt);
     }
     let began = control.seconds();
-    let thinned = Thinned::new(source, &labels, options);
-    let scene = Scene::new(&thinned, target, options);
+    let downsampled = SourceCloud::new(source, &labels, options);
+    let scene = Scene::new(&downsampled, target, options);
     let free_space = FreeSpace::new(clouds.sweeps, &clouds.target_from_source);
     let votes = TranslationVotes::new(&scene);
     let around: Vec<NeighborView<'_>> = clouds
-        .around
+        .neighbors
         .par_iter()
-        .map(|sweep| NeighborView::new(&thinned, sweep, options))
+        .map(|sweep| NeighborView::new(&downsampled, sweep, options))
         .collect();
     let rest = (control.seconds() - began) * REST;
 
-    let mut order: Vec<u32> = (0..thinned.members.len() as u32).collect();
-    order.sort_by_key(|&cluster| std::cmp::Reverse(thinned.members[cluster as usize].len()));
-    let mut searched = vec![SearchedCluster::not(options); order.len()];
-    let (mut clusters, mut sum_m) = (0, 0.0);
-    let mut interrupted = None;
-    for some in order.chunks(CLUSTERS_AT_ONCE) {
-        interrupted = late(rest);
-        if interrupted.is_some() {
-            break;
-        }
-        let found: Vec<SearchedCluster> = some
-            .par_iter()
-            .map(|&cluster| search(&scene, &around, &free_space, &votes, cluster))
-            .collect();
-        for (&cluster, found) in some.iter().zip(found) {
-            searched[cluster as usize] = found;
-            sum_m += f64::from(found.cost().forward_m);
-        }
-        clusters += some.len();
-        control.progress(Progress {
-            iteration: clusters,
-            max_iterations: order.len(),
-            loss: sum_m / clusters as f64,
-        });
-    }
+    let views = Views {
+        scene: &scene,
+        neighbors: &around,
+        free_space: &free_space,
+        votes: &votes,
+    };
+    let Progressed {
+        searched,
+        clusters,
+        sum_m,
+        interrupted,
+    } = search_all(&views, rest, control);
     let needed: Vec<_> = searched.iter().map(SearchedCluster::found).collect();
     let spread = assign::spread(&scene, &around, &needed);
-    let movers: Vec<u32> = (0..)
-        .zip(&needed)
-        .filter_map(|(cluster, found)| found.map(|_| cluster))
-        .collect();
-    let mut numbers = vec![NOISE; needed.len()];
-    for (number, &cluster) in (0..).zip(&movers) {
-        numbers[cluster as usize] = number;
-    }
+    let (movers, numbers) = numbered(&needed);
     let number = |cluster: &u32| numbers.get(*cluster as usize).copied().unwrap_or(NOISE);
     let point_motion: Vec<u32> = spread.point_motion.iter().map(number).collect();
     let motions = needed.iter().flatten().map(|found| found.motion);
-    let motions = ObjectMotions::new(motions.collect(), &thinned.points, &point_motion);
+    let motions = ObjectMotions::new(motions.collect(), &downsampled.points, &point_motion);
     let point_motion = motions.owners_at(source);
     let findings = Findings {
         scene: &scene,
@@ -177,22 +155,94 @@ pub(crate) fn find_objects(
         parts: ClusterLabels::new(&labels, &spread.cluster_motion, &point_motion, movers.len()),
         motions,
         clusters,
-        all_clusters: order.len(),
+        all_clusters: searched.len(),
         cost_m: sum_m / clusters.max(1) as f64,
         interrupted,
     }
 }
 
-/// Looks for the motion of a cluster.
-fn search(
-    scene: &Scene<'_>,
-    around: &[NeighborView<'_>],
-    free_space: &FreeSpace,
-    votes: &TranslationVotes,
-    cluster: u32,
-) -> SearchedCluster {
+/// What the search of a cluster reads.
+struct Views<'a> {
+    scene: &'a Scene<'a>,
+    neighbors: &'a [NeighborView<'a>],
+    free_space: &'a FreeSpace,
+    votes: &'a TranslationVotes,
+}
+
+/// The clusters as searched so far.
+struct Progressed {
+    /// Of each cluster; clusters that were not searched stand still.
+    searched: Vec<SearchedCluster>,
+    /// Clusters that were searched.
+    clusters: usize,
+    /// The sum of their costs, metres.
+    sum_m: f64,
+    interrupted: Option<Interrupt>,
+}
+
+/// Why a search must end, where the control ends it or less than `needed` seconds are left.
+fn out_of_time(control: &dyn Control, needed: f64) -> Option<Interrupt> {
+    let late = control.seconds_left().is_some_and(|left| left < needed);
+    control.interrupt().or(late.then_some(Interrupt::Deadline))
+}
+
+/// Searches all clusters, large ones first, as long as `rest` seconds are left for what follows.
+fn search_all(views: &Views<'_>, rest: f64, control: &dyn Control) -> Progressed {
+    let members = &views.scene.source.members;
+    let mut order: Vec<u32> = (0..members.len() as u32).collect();
+    order.sort_by_key(|&cluster| std::cmp::Reverse(members[cluster as usize].len()));
+    let mut progressed = Progressed {
+        searched: vec![SearchedCluster::not(views.scene.options); order.len()],
+        clusters: 0,
+        sum_m: 0.0,
+        interrupted: None,
+    };
+    for some in order.chunks(CLUSTERS_AT_ONCE) {
+        progressed.interrupted = out_of_time(control, rest);
+        if progressed.interrupted.is_some() {
+            break;
+        }
+        let found: Vec<SearchedCluster> = some
+            .par_iter()
+            .map(|&cluster| search(views, cluster))
+            .collect();
+        for (&cluster, found) in some.iter().zip(found) {
+            progressed.searched[cluster as usize] = found;
+            progressed.sum_m += f64::from(found.cost().forward_m);
+        }
+        progressed.clusters += some.len();
+        control.progress(Progress {
+            done: progressed.clusters,
+            total: order.len(),
+            loss: progressed.sum_m / progressed.clusters as f64,
+        });
+    }
+    progressed
+}
+
+/// The clusters with a motion, and of each cluster its index among them or [`NOISE`].
+fn numbered(found: &[Option<Hypothesis>]) -> (Vec<u32>, Vec<u32>) {
+    let movers: Vec<u32> = (0..)
+        .zip(found)
+        .filter_map(|(cluster, found)| found.map(|_| cluster))
+        .collect();
+    let mut numbers = vec![NOISE; found.len()];
+    for (number, &cluster) in (0..).zip(&movers) {
+        numbers[cluster as usize] = number;
+    }
+    (movers, numbers)
+}
+
+/// Searches for the motion of one cluster.
+fn search(views: &Views<'_>, cluster: u32) -> SearchedCluster {
+    let Views {
+        scene,
+        neighbors,
+        free_space,
+        votes,
+    } = *views;
     let members = &scene.source.members[cluster as usize];
-    let mover = Mover::new(scene, around, cluster);
+    let mover = ClusterSearch::new(scene, neighbors, cluster);
     let still = mover.standing_still();
     if members.len() < scene.options.cluster_min_points {
         return SearchedCluster {

@@ -1,4 +1,4 @@
-//! Movers on scenes made for it, and on simulated streets.
+//! The object search on constructed scenes and on simulated streets.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -9,10 +9,10 @@ use crate::flow::data::{Control, Interrupt, Point, Random, RigidTransform, Uncon
 use crate::flow::options::ObjectOptions;
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
 
-/// A wall along x that a car drives beside.
+/// Position along y of a wall along x, beside which a car drives, metres.
 const WALL_Y_M: f64 = 6.0;
 
-/// The sides and the roof of a box at a place, sampled at random.
+/// Two sides and the roof of a box with a corner at (x, y), sampled at random.
 fn car(random: &mut Random, [x, y]: [f64; 2]) -> Vec<Point> {
     let mut point = || {
         let [a, b] = [0; 2].map(|_| random.uniform(0.0, 1.0));
@@ -35,12 +35,12 @@ fn wall(random: &mut Random, [from, to]: [f64; 2]) -> Vec<Point> {
     (0..count).map(|_| point()).collect()
 }
 
-/// Two sweeps from the same place.
+/// Two sweeps from the same position.
 fn clouds<'a>(source: &'a [Point], target: &'a [Point]) -> SearchClouds<'a> {
     SearchClouds {
         source,
         target,
-        around: &[],
+        neighbors: &[],
         sweeps: [source, target],
         target_from_source: RigidTransform::identity(),
     }
@@ -56,16 +56,16 @@ fn found(source: &[Point], target: &[Point]) -> ObjectSearch {
 
 #[test]
 fn a_car_moves_and_the_wall_beside_it_stands_still() {
-    // Both sweeps sample the car at 1,500 random places of 14 square metres: 0.1 m apart.
+    // Both sweeps sample the car at 1,500 random points of 16 square metres: 0.1 m apart.
     const TOLERANCE_M: f32 = 0.05;
     let mut random = Random::new(1);
     let street = wall(&mut random, [-15.0, 15.0]);
     let source = [car(&mut random, [5.0, 0.0]), street].concat();
     let street = wall(&mut random, [-15.0, 15.0]);
     let target = [car(&mut random, [6.1, 0.1]), street].concat();
-    let labelled = found(&source, &target);
-    let residual = labelled.motions.residual_at(&source);
-    assert_eq!(labelled.residual_of(&source), residual);
+    let search = found(&source, &target);
+    let residual = search.motions.residual_at(&source);
+    assert_eq!(search.residual_of(&source), residual);
     for (residual, point) in residual.iter().zip(&source) {
         if point[1] > 5.0 {
             assert_eq!(*residual, [0.0; 3]);
@@ -85,7 +85,8 @@ fn a_wall_whose_hidden_part_shifts_does_not_move() {
     assert!(residual.iter().all(|&residual| residual == [0.0; 3]));
 }
 
-/// A wall far behind [`wall`], but for what the part `from..to` of that hides of it.
+/// A wall three times as far as [`wall`], without the part that the section `from..to` of that
+/// hides.
 fn wall_behind(random: &mut Random, [from, to]: [f64; 2]) -> Vec<Point> {
     let mut points = Vec::new();
     for _ in 0..60_000 {
@@ -100,7 +101,7 @@ fn wall_behind(random: &mut Random, [from, to]: [f64; 2]) -> Vec<Point> {
 
 #[test]
 fn a_flat_side_moves_that_uncovers_what_is_behind_it() {
-    // Its ends alone say how far.
+    // Only its ends determine the displacement.
     const TOLERANCE_M: f32 = 0.15;
     let mut random = Random::new(2);
     let mut sweep = |part| [wall(&mut random, part), wall_behind(&mut random, part)].concat();
@@ -155,7 +156,8 @@ fn street(seed: u64) -> SimulatedPair {
     street.and_then(|street| street.pair(0)).expect("a street")
 }
 
-/// Source and target off the ground, the true ego motion out, and the true residual.
+/// Source and target off the ground, the source with the true ego motion taken out, and the true
+/// residual flow.
 fn residual_problem(pair: &SimulatedPair) -> [Vec<Point>; 3] {
     let moved = |motion: &RigidTransform, point: Point| -> Point {
         let moved = motion * Point3::from(point.map(f64::from));
@@ -176,7 +178,8 @@ fn residual_problem(pair: &SimulatedPair) -> [Vec<Point>; 3] {
 
 #[test]
 fn most_of_what_moves_on_a_street_is_found_and_little_else() {
-    // Loose on purpose: without a motion movers are 0.5 to 0.65 m off, and here below 0.2 m.
+    // Loose bounds: without motions the mean error of moving points is 0.5 to 0.65 m, here it is
+    // below 0.2 m.
     const MOVING_M: f32 = 0.25;
     const STANDING_M: f32 = 0.02;
     for seed in 0..3 {
@@ -200,11 +203,8 @@ fn any_number_of_threads_gives_the_same_bits() {
     let [source, target, _] = residual_problem(&street(4));
     let on = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
-        let labelled = pool.expect("threads").install(|| found(&source, &target));
-        (
-            labelled.motions.residual_at(&source),
-            labelled.cost_m.to_bits(),
-        )
+        let search = pool.expect("threads").install(|| found(&source, &target));
+        (search.motions.residual_at(&source), search.cost_m.to_bits())
     };
     let one = on(1);
     assert!(one == on(2));
@@ -213,7 +213,7 @@ fn any_number_of_threads_gives_the_same_bits() {
 
 #[test]
 fn an_interrupt_keeps_what_was_found_until_then() {
-    /// Interrupts from a number of looks on.
+    /// Interrupts from a given number of checks on.
     struct After(usize, Interrupt, AtomicUsize);
     impl Control for After {
         fn interrupt(&self) -> Option<Interrupt> {
@@ -226,13 +226,13 @@ fn an_interrupt_keeps_what_was_found_until_then() {
     let mut last = 0;
     for looks in [0, 2, 3, 4] {
         let control = After(looks, Interrupt::Deadline, AtomicUsize::new(0));
-        let labelled = find_objects(&clouds(&source, &target), &options, &control);
-        assert_eq!(labelled.interrupted, Some(Interrupt::Deadline));
-        assert!(labelled.clusters >= last && labelled.clusters < whole);
-        last = labelled.clusters;
+        let search = find_objects(&clouds(&source, &target), &options, &control);
+        assert_eq!(search.interrupted, Some(Interrupt::Deadline));
+        assert!(search.clusters >= last && search.clusters < whole);
+        last = search.clusters;
     }
     assert!(last > 0);
     let control = After(3, Interrupt::Cancelled, AtomicUsize::new(0));
-    let labelled = find_objects(&clouds(&source, &target), &options, &control);
-    assert_eq!(labelled.interrupted, Some(Interrupt::Cancelled));
+    let search = find_objects(&clouds(&source, &target), &options, &control);
+    assert_eq!(search.interrupted, Some(Interrupt::Cancelled));
 }

@@ -1,4 +1,4 @@
-//! TODO doc
+//! Registration of two clouds: a coarse search, then a refinement.
 
 use super::coarse;
 use super::gicp::{Fit, Schedule};
@@ -6,28 +6,29 @@ use super::surfels::{Columns, Surfels};
 use crate::flow::data::{Control, Point, RigidTransform};
 use crate::flow::spatial::voxel_mean;
 
-/// Side of the voxels that both clouds are thinned to, metres.
+/// Side of the voxels that both clouds are downsampled to, metres.
 const VOXEL_M: f32 = 0.25;
-/// Normals are taken, and matches are sought, within this, metres: wide enough for two rings of
-/// 64 beams.
+/// Radius of the neighborhoods of normals, and range of matches, metres: wide enough for two rings
+/// of a 64-beam lidar.
 const CELL_M: f32 = 0.8;
-/// Source points that are looked at: enough for millimetres.
+/// Source points used by the refinement: enough for millimetre accuracy.
 const REFINED: usize = 8192;
-/// How the motion is refined: from where the search ends, down to the noise of a lidar.
+/// Schedule of the refinement: from the accuracy of the coarse search down to the noise of a lidar.
 const REFINEMENT: Schedule = Schedule {
     steps: 12,
     within_m: [0.8, 0.5],
     scale_m: [0.3, 0.1],
 };
 
-/// A cloud as it is aligned, as source or as target: what alignments need of it alone.
+/// The surfels of a cloud, as a source or a target of registrations. They depend on this cloud
+/// only.
 pub(crate) struct SurfelCloud {
     coarse: Surfels,
     fine: Surfels,
 }
 
 impl SurfelCloud {
-    /// The surface of a cloud, ground and all.
+    /// Surfels of `points`, metres, ground included.
     pub(crate) fn new(points: &[Point]) -> Self {
         let thin = voxel_mean(points, VOXEL_M);
         Self {
@@ -37,11 +38,12 @@ impl SurfelCloud {
     }
 }
 
-/// The motion target_from_source that aligns `source` with `target`, sought around `prior`; the
-/// motion so far where the watch interrupts. Where the clouds leave a direction free, it stays as
-/// in `prior`; so does all of it where they have nothing in common.
+/// The rigid motion `target_from_source` that aligns `source` with `target`, searched around
+/// `prior`. Where `control` interrupts, it is the motion so far. In directions that the clouds do
+/// not determine, the motion stays as in `prior`. It equals `prior` where the clouds have nothing
+/// in common.
 ///
-/// The same bits whatever the number of threads.
+/// The result is bit-identical for any number of threads.
 pub(crate) fn align(
     source: &SurfelCloud,
     target: &SurfelCloud,

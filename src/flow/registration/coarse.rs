@@ -1,8 +1,9 @@
-//! Where a fit may start: coarse fits from several motions, the best of which is taken.
+//! Coarse registration: fits from several initial guesses, of which the best is taken.
 //!
-//! One coarse fit mostly finds turns of 4 degrees and drives of 3 m together; vehicles move forward
-//! and turn, so the starts do. The right one scores 0.06 to 0.28. Turned starts are left out where those
-//! along the way end together. It must not know how exact a motion is in the end.
+//! A single coarse fit mostly recovers a rotation of 4 degrees together with a translation of 3 m.
+//! Vehicles drive forward and turn, so the initial guesses are translations along x and rotations
+//! about z. The correct motion scores 0.06 to 0.28. Rotated guesses are skipped where all guesses
+//! without rotation converge to one motion.
 
 use nalgebra::{Isometry3, Vector3};
 use rayon::prelude::*;
@@ -12,37 +13,38 @@ use super::surfels::{Columns, Surfels};
 use crate::flow::data::{Control, Point, RigidTransform};
 use crate::flow::spatial::voxel_mean;
 
-/// Side of the voxels that both clouds are thinned to, metres.
+/// Side of the voxels that both clouds are downsampled to, metres.
 const VOXEL_M: f32 = 1.0;
-/// Normals are taken, and matches are sought, within this, metres.
+/// Radius of the neighborhoods of normals, and range of matches, metres.
 const CELL_M: f32 = 3.0;
-/// Source points that each start is tried on.
+/// Source points used in the fit from each initial guess.
 const TRIED: usize = 512;
-/// The fit of each start.
+/// Schedule of the fit from each initial guess.
 const TRIAL: Schedule = Schedule {
     steps: 12,
     within_m: [3.0, 2.0],
     scale_m: [1.0, 0.3],
 };
-/// Drives from the prior, along x, metres.
+/// Translations of the initial guesses from the prior, along x, metres.
 const DRIVES_M: [f64; 3] = [0.0, 3.0, -3.0];
-/// Turns from the prior, about z, degrees.
+/// Rotations of the initial guesses from the prior, about z, degrees.
 const TURNS_DEG: [f64; 3] = [0.0, 4.0, -4.0];
-/// A fit that scores this is of clouds that have found each other: others scored up to 0.03.
+/// Score from which a fit counts as aligned. Fits that were not aligned scored up to 0.03.
 const PLAIN: f64 = 0.05;
-/// Fits that end nearer to each other than this, metres and degrees, end at one motion.
+/// Fits that end closer to each other than this, metres and degrees, have converged to one motion.
 const SAME_M: f64 = 0.05;
 const SAME_DEG: f64 = 0.1;
-/// A start must score this much more than an earlier one to be taken: along a tunnel, all starts
-/// are equal, and the prior is the likeliest.
+/// Margin by which the score of a fit must exceed that of an earlier one. Along a tunnel all
+/// initial guesses score alike, and the prior is the most probable.
 const BETTER: f64 = 0.01;
 
-/// What a thinned cloud's surfels are for this search.
+/// Coarse surfels of a voxel-downsampled cloud.
 pub(super) fn coarse(points: &[Point]) -> Surfels {
     Surfels::new(Columns::new(&voxel_mean(points, VOXEL_M), CELL_M))
 }
 
-/// The motion near `prior` that fits best, to some centimetres; `prior` where none does.
+/// The motion near `prior` with the best score, accurate to some centimetres; `prior` where no fit
+/// scores above the margin.
 pub(super) fn search(
     source: &Surfels,
     target: &Surfels,
@@ -73,8 +75,8 @@ pub(super) fn search(
     best.0
 }
 
-/// Whether fits that began metres apart ended at one motion, and one that plainly fits: no start about
-/// them would end anywhere else.
+/// Whether fits from initial guesses metres apart have all converged to one motion and count as
+/// aligned. Other guesses near them are then taken to converge to the same motion.
 fn agree(ends: &[(RigidTransform, f64)]) -> bool {
     let (first, _) = ends[0];
     ends.iter().all(|(motion, score)| {
@@ -85,7 +87,7 @@ fn agree(ends: &[(RigidTransform, f64)]) -> bool {
     })
 }
 
-/// Drives and turns about the prior, itself first.
+/// The initial guesses: the prior first, then translations and rotations from it.
 fn starts(prior: &RigidTransform) -> Vec<RigidTransform> {
     let turned = |degrees: f64| {
         let turn = Vector3::new(0.0, 0.0, degrees.to_radians());
@@ -108,7 +110,7 @@ mod tests {
         assert!(agree(&[end(0.0, 5.0, 0.07), end(0.01, 5.01, 0.07)]));
         assert!(!agree(&[end(0.0, 5.0, 0.07), end(0.2, 5.0, 0.07)]));
         assert!(!agree(&[end(0.0, 5.0, 0.07), end(0.0, 5.5, 0.07)]));
-        // Nothing holds clouds that have nothing in common: all starts stay together.
+        // Clouds that have nothing in common score zero.
         assert!(!agree(&[end(0.0, 5.0, 0.0), end(0.0, 5.0, 0.0)]));
         assert!(!agree(&[end(0.0, 5.0, 0.07), end(0.0, 5.0, f64::NAN)]));
     }

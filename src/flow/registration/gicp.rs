@@ -1,11 +1,12 @@
-//! Gauss-Newton on the distances of surfels to the surfels nearest to them (generalized ICP, Segal
-//! et al., 2009).
+//! Generalized ICP (GICP; Segal et al., 2009): Gauss-Newton on the distances between matched
+//! surfels.
 //!
-//! A surfel is thin along its normal and wide across it, and so a match is as sure of a direction
-//! as both surfels are: two that face one another measure along their normal, and two that do not
-//! hardly measure. The weight (Geman and McClure) and the reach of a match shrink on the way, so
-//! that movers and what only one sweep saw lose their say. Directions that the matches leave free
-//! are not moved along. It must not know where a fit starts, or why.
+//! The covariance of a surfel is thin along its normal and wide across it. The information of a
+//! match comes from both surfels: two parallel ones constrain the motion along their normal, and
+//! two that are not parallel hardly constrain it. The robust weight is that of Geman and McClure.
+//! Its scale and the range of matches shrink during the fit, so that moving objects and surfaces
+//! present in one sweep only lose their influence. The motion is not updated in directions that the
+//! matches do not determine.
 
 use nalgebra::{
     Isometry3, Matrix3, Matrix6, Point3, SymmetricEigen, Translation3, UnitQuaternion, Vector3,
@@ -17,35 +18,37 @@ use super::surfels::{AllSurfels, Surfel};
 use crate::flow::data::{Control, Point, RigidTransform};
 use crate::flow::spatial::PlaneFit;
 
-/// Surfels whose sums one thread takes at a time; sums are added in the surfels' order.
+/// Surfels whose sums one thread computes at a time. The partial sums are added in the surfels'
+/// order.
 const AT_ONCE: usize = 256;
-/// Reach and scale shrink over this share of the steps.
+/// Share of the steps over which the range and the scale shrink.
 const SHRINKING: f64 = 0.5;
-/// Variance of a perfect plane along its normal, that across being 1, and how much of a surfel's
-/// thickness is added to it: normals are 2 degrees uncertain at best, and more on what is thick.
+/// Variance of a perfect plane along its normal, where the variance across it is 1, and the factor
+/// of a surfel's thickness that is added to it. Normals are uncertain by 2 degrees at best, and by
+/// more on thick surfaces.
 const THIN: f64 = 1e-3;
 const THICKNESS: f64 = 0.1;
-/// A step shorter than this, metres at the points' spread, is the last.
+/// A step shorter than this is the last, metres at the points' spread.
 const SHORT_STEP_M: f64 = 2e-4;
-/// A direction is free where the matches hold it by less than this share of what they hold of all
-/// shifts together, or of what one match of two planes does: normals are 1.4 degrees uncertain
-/// together. Some streets are held by 1%.
+/// A direction is undetermined where its eigenvalue is below this share of the information about
+/// all translations together, or of that of one match of two planes. Two normals are uncertain by
+/// 1.4 degrees together. On some streets the weakest direction has 1%.
 const FREE: f64 = 3e-4;
-/// The least spread of points that turns are measured by, metres.
+/// Least spread of the points that rotations are scaled by, metres.
 const LEAST_SPREAD_M: f64 = 1e-3;
 
-/// How a fit goes from coarse to fine: at its first step, and at its last.
+/// Schedule of a fit from coarse to fine: values at its first step and at its last.
 pub(super) struct Schedule {
-    /// Steps at most.
+    /// Maximum number of steps.
     pub(super) steps: usize,
-    /// Matches are sought within this, metres.
+    /// Range of matches, metres.
     pub(super) within_m: [f32; 2],
-    /// Scale of the weight, metres.
+    /// Scale of the robust weight, metres.
     pub(super) scale_m: [f64; 2],
 }
 
 impl Schedule {
-    /// Reach and scale at a step, and whether they have shrunk to their last.
+    /// Range and scale at a step, and whether both have reached their last values.
     fn at(&self, step: usize) -> (f32, f64, bool) {
         let share = step as f64 / ((self.steps - 1) as f64 * SHRINKING).max(1.0);
         let share = share.min(1.0);
@@ -58,21 +61,21 @@ impl Schedule {
     }
 }
 
-/// Surfels, and those that they are fitted to.
+/// Source surfels, and the target surfels that they are fitted to.
 pub(super) struct Fit<'a> {
     source: &'a [Surfel],
     target: AllSurfels<'a>,
-    /// The source's middle, about which turns are taken, and its root-mean-square distance from
-    /// it, which makes turns and shifts comparable.
+    /// Centroid of the source, which is the center of rotations. The root-mean-square distance of
+    /// its points from the centroid scales rotations to metres.
     center: Point3<f64>,
     spread_m: f64,
 }
 
-/// What the matches say together.
+/// Sums over the matches: the normal equations and the total information.
 struct Sums {
     normal: Matrix6<f64>,
     gradient: Vector6<f64>,
-    /// How much they hold of shifts, in all directions together.
+    /// Weighted information about translations, summed over all directions.
     held: f64,
 }
 
@@ -92,7 +95,8 @@ impl<'a> Fit<'a> {
         }
     }
 
-    /// The motion that a fit from `start` ends at; the motion so far where the watch interrupts.
+    /// The motion at the end of a fit from `start`, or the motion so far where `control`
+    /// interrupts.
     pub(super) fn run(
         &self,
         start: &RigidTransform,
@@ -117,8 +121,8 @@ impl<'a> Fit<'a> {
         motion
     }
 
-    /// How well a motion fits, 0 to 1: what its matches hold of shifts, a surfel; 1 where all lie on
-    /// perfect planes that they face.
+    /// Score of a motion, 0 to 1: the information of its matches about translations, per surfel. It
+    /// is 1 where every surfel lies on a perfect plane parallel to it.
     pub(super) fn score(&self, motion: &RigidTransform, schedule: &Schedule) -> f64 {
         let (within_m, scale_m, _) = schedule.at(schedule.steps);
         self.sums(motion, within_m, scale_m).held / self.source.len().max(1) as f64
@@ -159,8 +163,8 @@ impl<'a> Fit<'a> {
             let Some(inverse) = (source + covariance(&nearest.flat, &target)).try_inverse() else {
                 continue;
             };
-            // Two perfect planes that face one another count as what they are along their normal
-            // and not at all across it.
+            // Scaled and offset so that two perfect, parallel planes have full information along
+            // their normal and none across it.
             let information = inverse * (2.0 * THIN) - Matrix3::identity() * THIN;
             let residual = moved - double(nearest.point);
             let pull = information * residual;
@@ -198,8 +202,8 @@ impl Default for Sums {
 }
 
 impl Sums {
-    /// The step that minimizes the weighted, linearized distances, metres (turns in metres at the
-    /// points' spread), without what would move along free directions.
+    /// The step that minimizes the weighted, linearized squared distances, metres (rotations in
+    /// metres at the points' spread). Components along undetermined directions are left out.
     fn update(&self) -> Vector6<f64> {
         let SymmetricEigen {
             eigenvalues,
@@ -215,7 +219,7 @@ impl Sums {
     }
 }
 
-/// The covariance of a surfel with that normal: 1 across, thin along.
+/// Covariance of a surfel with the given normal: 1 across it, thin along it.
 fn covariance(flat: &PlaneFit, normal: &Vector3<f64>) -> Matrix3<f64> {
     let along = THIN + THICKNESS * f64::from(flat.thickness);
     Matrix3::identity() - normal * normal.transpose() * (1.0 - along)

@@ -1,20 +1,19 @@
-//! Ego motion: the rigid motion that carries most source points onto the target.
+//! Registration (GICP on surfels): the ego motion `target_from_source`, which aligns most source
+//! points with the target.
 //!
 //! ```text
-//! two clouds - thinned - search: up to nine starts on coarse surfels - refinement on fine ones - motion
+//! two clouds - voxel downsampling - coarse surfels: fits from up to nine initial guesses
+//!   - fine surfels: refinement - motion
 //! ```
 //!
-//! Plane to plane on evenly thinned clouds, robustly weighted, from a prior. Needs the ground, which
-//! alone holds pitch, roll and height. It must not know of fields, flows or distance transforms.
+//! The distances are plane to plane with robust weights, and the search starts from a prior. The
+//! clouds must include the ground, which alone determines pitch, roll and height.
 
 mod align;
 mod coarse;
 mod gicp;
-pub(crate) mod neighbors;
 mod surfels;
 #[cfg(test)]
 mod tests;
-
-pub use neighbors::{AlignedSweep, NeighborSweep};
 
 pub(crate) use align::{SurfelCloud, align};

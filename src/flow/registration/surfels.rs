@@ -1,7 +1,8 @@
-//! Small flat pieces of a cloud's surfaces, and which of them lies nearest to a point.
+//! Surfels: small flat patches of a cloud's surfaces, and a nearest-neighbor search over them.
 //!
-//! Points lie in square columns, sorted, so that the nine columns around a point are three runs in
-//! memory. A surfel is made of a point's neighbors within a cell. It must not know of motions.
+//! Points lie in sorted square columns, so that the nine columns around a point are three
+//! contiguous ranges in memory. A surfel is fitted to the neighbors of a point within a cell's
+//! side.
 
 use std::ops::Range;
 use std::sync::OnceLock;
@@ -11,47 +12,47 @@ use rayon::prelude::*;
 use crate::flow::data::{Point, floor, get_or_compute, square_distance, stride_sample};
 use crate::flow::spatial::{Neighborhood, PlaneFit, REACH};
 
-/// Points whose surfels one thread makes at a time.
+/// Points whose surfels one thread computes at a time.
 const POINTS_AT_ONCE: usize = 256;
 
-/// A flat piece of surface.
+/// A flat patch of surface.
 #[derive(Clone, Copy)]
 pub(super) struct Surfel {
-    /// A point on it, metres.
+    /// The point of the cloud that it is centered on, metres.
     pub(super) point: Point,
-    /// How it lies.
+    /// The plane fitted to the neighbors of `point`.
     pub(super) flat: PlaneFit,
 }
 
-/// A cloud by place: evenly thinned points, voxels apart that are smaller than a cell.
+/// A voxel-downsampled cloud in square columns. The voxels are smaller than a cell.
 pub(super) struct Columns {
     cell_m: f32,
-    /// Columns that are not empty, by x, then y, and where their points begin; closed by one that
-    /// begins at the end.
+    /// Columns that are not empty, by x and then y, with the index of the first point of each. A
+    /// sentinel that begins at the end closes the list.
     columns: Vec<(u64, u32)>,
     points: Vec<Point>,
 }
 
-/// A cloud's surfels, as far as they have been asked for.
+/// The surfels of a cloud, computed on first use.
 pub(super) struct Surfels {
     columns: Columns,
     flats: OnceLock<Vec<Option<PlaneFit>>>,
 }
 
-/// All of a cloud's surfels.
+/// All surfels of a cloud.
 #[derive(Clone, Copy)]
 pub(super) struct AllSurfels<'a> {
     columns: &'a Columns,
-    /// One for each of the columns' points; none where there is no flat surface.
+    /// One for each of the columns' points; none where the surface is not flat.
     flats: &'a [Option<PlaneFit>],
 }
 
 impl Columns {
-    /// Normals will be taken, and points will be sought, within `cell_m` metres.
+    /// Sorts `points`, metres, into columns for normals and matches within `cell_m` metres.
     pub(super) fn new(points: &[Point], cell_m: f32) -> Self {
         let keyed = points.iter().map(|&point| (column(point, cell_m), point));
         let mut keyed: Vec<_> = keyed.collect();
-        // Stable: the order within a column is that of the points.
+        // The sort is stable and keeps the points' order within a column.
         keyed.sort_by_key(|&(key, _)| key);
         let mut columns: Vec<(u64, u32)> = Vec::new();
         for (&(key, _), begin) in keyed.iter().zip(0..) {
@@ -73,7 +74,7 @@ impl Columns {
         flats.collect()
     }
 
-    /// The points of the columns around `point`: three runs.
+    /// The points of the nine columns around `point`: three ranges.
     fn around(&self, point: Point) -> [Range<usize>; 3] {
         let middle = column(point, self.cell_m);
         let (x, y) = (middle >> 32, middle & u64::from(u32::MAX));
@@ -100,7 +101,7 @@ impl Columns {
 }
 
 impl Surfels {
-    /// Those of a cloud.
+    /// Surfels of the points in `columns`.
     pub(super) fn new(columns: Columns) -> Self {
         Self {
             columns,
@@ -108,14 +109,14 @@ impl Surfels {
         }
     }
 
-    /// All of them.
+    /// All surfels.
     pub(super) fn all(&self) -> AllSurfels<'_> {
         let columns = &self.columns;
         let flats = get_or_compute(&self.flats, || columns.flats(&columns.points));
         AllSurfels { columns, flats }
     }
 
-    /// Those of at most `most` of the points, evenly; points that lie on no flat surface have none.
+    /// The surfels of at most `most` points, chosen evenly. Points on no flat surface have none.
     pub(super) fn some(&self, most: usize) -> Vec<Surfel> {
         let points = stride_sample(&self.columns.points, most);
         let flats = match self.flats.get() {
@@ -129,8 +130,9 @@ impl Surfels {
 }
 
 impl AllSurfels<'_> {
-    /// The surfel whose point is nearest to `point`, less than `within_m` from it, which is at
-    /// most a cell; none where nothing or nothing flat is there.
+    /// The surfel whose point is nearest to `point` and less than `within_m` metres from it;
+    /// `within_m` is at most a cell's side. None where there is no such point, or where its surface
+    /// is not flat.
     pub(super) fn nearest(&self, point: Point, within_m: f32) -> Option<Surfel> {
         let near = |c: &f32| (c / self.columns.cell_m).abs() < REACH - 2.0;
         if !point.iter().all(near) {
@@ -156,7 +158,7 @@ impl AllSurfels<'_> {
     }
 }
 
-/// The column of a point within reach; one cell of room is left around all of them.
+/// The key of the column of a point within range. One column of margin is left around all of them.
 fn column(point: Point, cell_m: f32) -> u64 {
     let [x, y] = [point[0], point[1]].map(|c| (floor(c / cell_m) + REACH + 1.0) as u64);
     x << 32 | y

@@ -1,4 +1,4 @@
-//! Alignment on simulated streets, and on scenes that determine it in part or not at all.
+//! Registration of simulated streets, and of scenes that determine the motion partly or not at all.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -8,7 +8,7 @@ use super::align::{SurfelCloud, align};
 use crate::flow::data::{Control, Interrupt, Point, Random, RigidTransform, Uncontrolled};
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
 
-/// What is asked of it on real pairs.
+/// Accuracy that is required on real pairs.
 const ACCURACY_M: f64 = 0.02;
 const ACCURACY_DEG: f64 = 0.1;
 
@@ -70,7 +70,8 @@ fn assert_near(found: &RigidTransform, truth: &RigidTransform, what: &str) {
     );
 }
 
-/// Points all over a rectangle at `corner` with sides `along` and `across`, with noise.
+/// Random points on a rectangle with a corner at `corner` and the sides `along` and `across`, with
+/// noise of 0.01 m along the normal.
 fn rectangle(
     random: &mut Random,
     points: usize,
@@ -214,7 +215,7 @@ fn any_number_of_threads_gives_the_same_bits() {
 
 #[test]
 fn an_interrupt_at_any_moment_gives_a_finite_motion() {
-    /// Interrupts from a number of looks on.
+    /// Interrupts from a given number of checks on.
     struct After(usize, AtomicUsize);
     impl Control for After {
         fn interrupt(&self) -> Option<Interrupt> {

@@ -1,7 +1,7 @@
-//! The spinning lidar: one ray per laser and step of azimuth, and what comes back.
+//! Model of a spinning lidar: one ray per laser and azimuth step, with range noise and dropout.
 //!
-//! A sweep is taken at one instant. Columns run in parallel and each has its own random stream, so
-//! the sweep does not depend on the number of threads. It must not know what moves.
+//! A sweep is taken at one instant. Columns run in parallel, each with its own random stream, so
+//! the sweep does not depend on the number of threads.
 
 use super::options::StreetOptions;
 use super::scene::{FARTHEST_M, Scene, Target};
@@ -12,10 +12,11 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 use std::f64::consts::{PI, TAU};
 
-/// Returns from nearer or farther than this do not arrive, metres.
+/// Minimum and maximum range, metres. Returns outside are dropped.
 const RANGES_M: [f64; 2] = [1.0, FARTHEST_M];
-/// Elevations of the top laser, of the middle of the fan, and of the bottom laser, degrees: one
-/// third of a degree apart above the middle, half a degree below, as the HDL-64E's are.
+/// Elevations of the top laser, of the middle of the fan, and of the bottom laser, degrees. With 64
+/// lasers the spacing is one third of a degree above the middle and half a degree below, as in the
+/// HDL-64E.
 const ELEVATIONS_DEG: [f64; 3] = [2.0, -8.5, -24.8];
 
 /// One return of a sweep.
@@ -33,12 +34,12 @@ pub(super) struct Lidar {
     azimuth_steps: usize,
     range_noise: f64,
     dropout: f64,
-    /// Sine and cosine of elevation and constant range error of each laser.
+    /// Sine and cosine of the elevation, and the constant range error in metres, of each laser.
     lasers: Vec<([f64; 2], f64)>,
 }
 
 impl Lidar {
-    /// A lidar whose lasers' range errors are drawn once.
+    /// A lidar whose constant range errors are drawn once.
     pub(super) fn new(options: &StreetOptions, random: &mut Random) -> Self {
         let laser = |index: usize| {
             let share = index as f64 / (options.beams - 1).max(1) as f64;
@@ -60,7 +61,7 @@ impl Lidar {
         }
     }
 
-    /// One sweep, column by column, each from the top laser to the bottom one; sensor frame.
+    /// One sweep in the sensor frame, column by column, each from the top laser to the bottom one.
     pub(super) fn sweep(
         &self,
         frame: usize,
@@ -71,7 +72,7 @@ impl Lidar {
         let stream =
             |column: usize| Random::stream(self.seed, (frame as u64) << 32 | column as u64);
         let step = TAU / self.azimuth_steps as f64;
-        // A real sensor does not shoot at the same angles in every turn.
+        // The azimuths of a real sensor differ from turn to turn.
         let phase = stream(self.azimuth_steps).uniform(0.0, step);
         let scene = self.prepare(terrain, world_from_sensor, targets, phase);
         let columns: Vec<Vec<Return>> = (0..self.azimuth_steps)
@@ -115,7 +116,7 @@ impl Lidar {
         returns
     }
 
-    /// Notes for each column which of the targets it can meet.
+    /// Lists for each column the targets that its rays can hit.
     fn prepare<'a>(
         &self,
         terrain: &'a Terrain,
@@ -150,7 +151,8 @@ impl Lidar {
     }
 }
 
-/// Chance that a return is too weak to be seen: it grows with range and with grazing incidence.
+/// Probability that a return is too weak to be detected. It increases with range and with grazing
+/// incidence.
 fn loss(hit: Hit) -> f64 {
     let far = hit.range / RANGES_M[1];
     let grazing = (1.0 - hit.cosine).clamp(0.0, 1.0).powi(8);

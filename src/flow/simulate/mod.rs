@@ -1,7 +1,7 @@
-//! A street seen by a spinning lidar, with the exact motion of every point.
+//! Simulated street scanned by a spinning lidar, with the exact motion of every point.
 //!
-//! Everything follows from the options and their seed. Each sweep is taken at one instant: there
-//! is no rolling shutter. It must not know how flow is estimated or scored.
+//! The options and their seed determine all data. Each sweep is taken at one instant: there is no
+//! rolling shutter. Independent of the estimation and of the metrics.
 
 mod lidar;
 mod objects;
@@ -14,5 +14,5 @@ mod view;
 mod world;
 
 pub use objects::Kind;
-pub use options::{FRAME_SECONDS, StreetError, StreetOptions};
-pub use street::{Frame, SimulatedPair, Street};
+pub use options::{SWEEP_SECONDS, StreetError, StreetOptions};
+pub use street::{SimulatedPair, Street, StreetSweep};

@@ -1,6 +1,6 @@
-//! Cars, cyclists and pedestrians: what they are made of and how they move.
+//! Cars, cyclists and pedestrians: their shapes and trajectories.
 //!
-//! Every object is rigid. It must not know the lidar or the static world.
+//! Every object is rigid.
 
 use super::shapes::Shape;
 use super::terrain::Terrain;
@@ -8,12 +8,12 @@ use crate::flow::data::{Random, RigidTransform};
 use nalgebra::Vector3;
 use std::f64::consts::{FRAC_PI_2, PI};
 
-/// Middle of a lane, metres from the center line; traffic keeps to the right.
+/// Lateral offset of a lane's middle from the center line, metres; traffic keeps to the right.
 pub(super) const LANE_M: f64 = 1.75;
-/// Between two cars of a lane, metres.
+/// Spacing of the cars in a lane, metres.
 const SPACING_M: f64 = 14.0;
 
-/// What an object is.
+/// Type of an object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// A car, parked or driving.
@@ -24,12 +24,13 @@ pub enum Kind {
     Pedestrian,
 }
 
-/// How an object moves; distances in metres, speeds in m/s.
+/// Trajectory of an object; distances in metres, speeds in m/s.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Path {
-    /// Along the street at a lateral offset; a negative speed is against its direction.
+    /// Along the street at a lateral offset. A negative speed is against the direction of the
+    /// street.
     Along { x: f64, lateral: f64, speed: f64 },
-    /// Straight for a while, then a quarter turn (to the left for a positive radius), then straight.
+    /// Straight, then a quarter turn (to the left for a positive radius), then straight.
     Turn {
         from: [f64; 2],
         yaw: f64,
@@ -40,7 +41,7 @@ pub(super) enum Path {
 }
 
 impl Path {
-    /// World x, y and yaw after some seconds.
+    /// World x and y, metres, and yaw, radians, at a time in seconds.
     fn at(&self, terrain: &Terrain, seconds: f64) -> ([f64; 2], f64) {
         match *self {
             Path::Along { x, lateral, speed } => {
@@ -77,15 +78,15 @@ impl Path {
 #[derive(Debug, Clone)]
 pub(super) struct Object {
     pub(super) kind: Kind,
-    /// Solids and where their centers are in the object's frame: x forward, z up from the ground.
+    /// Solids and their centers in the object's frame: x forward, z up from the ground.
     pub(super) parts: Vec<(Shape, Vector3<f64>)>,
-    /// Length and width of its stand on the ground, metres.
+    /// Length and width of its footprint on the ground, metres.
     stand: [f64; 2],
     path: Path,
 }
 
 impl Object {
-    /// A car of a size drawn at random.
+    /// A car of random size.
     pub(super) fn car(path: Path, random: &mut Random) -> Self {
         let [length, width] = [random.uniform(3.8, 4.9), random.uniform(1.7, 1.9)];
         let roof = random.uniform(1.4, 1.75);
@@ -136,14 +137,14 @@ impl Object {
         }
     }
 
-    /// The object's pose, world_from_object, after some seconds.
+    /// Pose of the object, world_from_object, at a time in seconds.
     pub(super) fn pose(&self, terrain: &Terrain, seconds: f64) -> RigidTransform {
         let (place, yaw) = self.path.at(terrain, seconds);
         terrain.seat(place, yaw, self.stand)
     }
 }
 
-/// The moving objects around the start of the street; the first is always an oncoming car nearby.
+/// The moving objects around the start of the street. The first is always an oncoming car nearby.
 pub(super) fn traffic(
     movers: usize,
     ego_speed: f64,
@@ -151,7 +152,8 @@ pub(super) fn traffic(
     random: &mut Random,
 ) -> Vec<Object> {
     let oncoming_speed = random.uniform(6.0, 12.0);
-    // The ego vehicle's lane keeps its pace, so that nobody runs into anybody in a long sequence.
+    // Cars in the ego vehicle's lane drive at its speed, so that they do not collide in a long
+    // sequence.
     let lane_speed = if ego_speed >= 1.0 { ego_speed } else { 5.0 };
     let mut oncoming_slots = slots(movers, random);
     let mut lane_slots = slots(movers, random);
@@ -190,7 +192,8 @@ pub(super) fn traffic(
     (0..movers).map(object).collect()
 }
 
-/// Places of the cars of a lane, in metres along the street: near ones, ahead and behind, shuffled.
+/// Positions of the cars of a lane, metres along the street: the nearest ones ahead and behind, in
+/// random order.
 fn slots(cars: usize, random: &mut Random) -> Vec<f64> {
     let place = |slot: usize| {
         let distance = SPACING_M * (slot / 2 + 1) as f64;
@@ -205,7 +208,7 @@ fn slots(cars: usize, random: &mut Random) -> Vec<f64> {
     slots
 }
 
-/// Out of the side street on the right, turning right into the ego vehicle's lane.
+/// Trajectory out of the side street on the right, turning right into the ego vehicle's lane.
 fn joining(terrain: &Terrain, corner: f64, round: f64, random: &mut Random) -> Path {
     let radius = 6.5;
     let straight = SPACING_M * round;
@@ -220,7 +223,7 @@ fn joining(terrain: &Terrain, corner: f64, round: f64, random: &mut Random) -> P
     }
 }
 
-/// Across the street, from one side street to the other.
+/// Trajectory across the street, from one side street to the other.
 fn crossing(terrain: &Terrain, corner: f64, [side, round]: [f64; 2], random: &mut Random) -> Path {
     let start = -side * (random.uniform(8.0, 14.0) + SPACING_M * round);
     Path::Turn {

@@ -1,38 +1,40 @@
-//! What can be asked of a simulated street, and what is refused.
+//! Options of a simulated street and their validation.
 //!
-//! Sizes are bounded here, before anything is allocated.
+//! Sizes are checked before any memory is allocated.
 
-/// Time between frames, seconds.
-pub const FRAME_SECONDS: f64 = 0.1;
+/// Time between sweeps, seconds.
+pub const SWEEP_SECONDS: f64 = 0.1;
 
-/// Most rays of one sweep.
+/// Maximum number of rays per sweep.
 const MAX_RAYS: usize = 1 << 20;
-/// Tightest turn of the street at the ego vehicle, metres: a tighter one would meet the houses.
+/// Minimum curve radius of the street at the ego vehicle, metres. A tighter curve would run into
+/// the houses.
 const MIN_RADIUS_M: f64 = 40.0;
 
 /// Options of a simulated street.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StreetOptions {
-    /// Places everything; the same seed gives the same street.
+    /// Seed of all random choices. The same seed gives the same street.
     pub seed: u64,
-    /// Sweeps, 1 to 1,000.
-    pub frames: usize,
-    /// Lasers, 1 to 256, between 2 degrees up and 24.8 degrees down, dense in the upper half.
+    /// Number of sweeps, 1 to 1,000.
+    pub sweeps: usize,
+    /// Number of lasers, 1 to 256, between 2 degrees up and 24.8 degrees down, denser in the upper
+    /// half.
     pub beams: usize,
-    /// Shots of each laser per turn, 16 to 8,192.
+    /// Azimuth steps per turn, 16 to 8,192.
     pub azimuth_steps: usize,
-    /// Moving cars, cyclists and pedestrians, at most 256.
+    /// Number of moving cars, cyclists and pedestrians, at most 256.
     pub movers: usize,
-    /// Forward speed of the ego vehicle, 0 to 40 m/s; drawn from the seed where none.
+    /// Forward speed of the ego vehicle, 0 to 40 m/s; drawn from the seed if none.
     pub speed_mps: Option<f64>,
-    /// Yaw rate in the first frame, rad/s, positive to the left; drawn from the seed where none.
-    /// The street winds, so the rate changes later on.
+    /// Yaw rate at the first sweep, rad/s, positive to the left; drawn from the seed if none. The
+    /// street winds, so the rate changes afterwards. The curve radius must be at least 40 m.
     pub yaw_rate_rps: Option<f64>,
-    /// Deviation of the noise of each range, 0 to 1 m.
+    /// Standard deviation of the range noise of each return, 0 to 1 m.
     pub range_noise_m: f64,
-    /// Deviation of the constant range error of each laser, 0 to 1 m.
+    /// Standard deviation of the constant range error of each laser, 0 to 1 m.
     pub beam_bias_m: f64,
-    /// How much of the usual loss of far and grazing returns there is, 0 (none) to 1.
+    /// Factor on the loss probability of far and grazing returns, 0 (no loss) to 1.
     pub dropout: f64,
 }
 
@@ -40,7 +42,7 @@ impl Default for StreetOptions {
     fn default() -> Self {
         Self {
             seed: 0,
-            frames: 2,
+            sweeps: 2,
             beams: 64,
             azimuth_steps: 2000,
             movers: 24,
@@ -53,43 +55,43 @@ impl Default for StreetOptions {
     }
 }
 
-/// Why a street or a part of it was refused.
+/// The reason why a street or a sweep of it was rejected.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum StreetError {
-    /// An option is outside its range, or not a number.
+    /// An option is out of range or not a number.
     #[error("{name} must lie between {low} and {high}, not {value}")]
     OutOfRange {
         /// The option.
         name: &'static str,
-        /// What was asked for.
+        /// Its value.
         value: f64,
-        /// Least value allowed.
+        /// Minimum value.
         low: f64,
-        /// Greatest value allowed.
+        /// Maximum value.
         high: f64,
     },
-    /// Lasers times shots are more than a sweep may have.
+    /// Lasers times azimuth steps exceed the limit of a sweep.
     #[error("a sweep of {rays} rays is over the limit of {limit}")]
     TooManyRays {
-        /// Rays asked for.
+        /// Requested rays per sweep.
         rays: usize,
-        /// Most rays allowed.
+        /// Maximum rays per sweep.
         limit: usize,
     },
-    /// A frame, or the frame after it, that the street does not have.
-    #[error("frame {frame} of a street of {frames} frames")]
-    NoSuchFrame {
-        /// The frame asked for.
+    /// The street does not have this sweep, or not the one after it.
+    #[error("frame {frame} of a street of {sweeps} sweeps")]
+    ReferenceTimeOutOfRange {
+        /// The requested sweep.
         frame: usize,
-        /// Frames of the street.
-        frames: usize,
+        /// Number of sweeps of the street.
+        sweeps: usize,
     },
 }
 
 impl StreetOptions {
-    /// Refuses what is not a number, out of range or too large.
+    /// Rejects values that are not a number, out of range or too large.
     pub(super) fn validate(&self) -> Result<(), StreetError> {
-        check("frames", self.frames as f64, [1.0, 1000.0])?;
+        check("sweeps", self.sweeps as f64, [1.0, 1000.0])?;
         check("beams", self.beams as f64, [1.0, 256.0])?;
         check("azimuth_steps", self.azimuth_steps as f64, [16.0, 8192.0])?;
         check("movers", self.movers as f64, [0.0, 256.0])?;
@@ -112,7 +114,7 @@ impl StreetOptions {
         Ok(())
     }
 
-    /// The curvature of the street at the first frame, 1/m, for the speed that was settled on.
+    /// Curvature of the street at the first sweep, 1/m, for a yaw rate in rad/s and a speed in m/s.
     pub(super) fn curvature(yaw_rate: f64, speed: f64) -> Result<f64, StreetError> {
         let limit = speed / MIN_RADIUS_M;
         check("yaw_rate_rps", yaw_rate, [-limit, limit])?;
@@ -145,8 +147,8 @@ mod tests {
     #[test]
     fn values_that_are_zero_huge_or_not_a_number_are_refused() {
         assert_eq!(StreetOptions::default().validate(), Ok(()));
-        assert!(refused(|o| o.frames = 0).starts_with("frames must"));
-        assert!(refused(|o| o.frames = usize::MAX).starts_with("frames must"));
+        assert!(refused(|o| o.sweeps = 0).starts_with("sweeps must"));
+        assert!(refused(|o| o.sweeps = usize::MAX).starts_with("sweeps must"));
         assert!(refused(|o| o.beams = 0).starts_with("beams must"));
         assert!(refused(|o| o.beams = usize::MAX).starts_with("beams must"));
         assert!(refused(|o| o.azimuth_steps = 3).starts_with("azimuth_steps must"));

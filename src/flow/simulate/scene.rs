@@ -1,27 +1,26 @@
-//! What rays from one place meet: solids, nearest first, and the ground.
+//! Ray casting from a common origin: solids, nearest first, and the ground.
 //!
-//! Rays come in columns; whoever casts them says which solids a column can meet. It must not know
-//! what casts them.
+//! Rays are grouped in columns. The caller lists the solids that each column can hit.
 
 use super::shapes::{Hit, Shape};
 use super::terrain::Terrain;
 use crate::flow::data::RigidTransform;
 use nalgebra::{Matrix3, Vector3};
 
-/// Returns from farther than this do not arrive, metres.
+/// Maximum range, metres. Returns from farther away are dropped.
 pub(super) const FARTHEST_M: f64 = 120.0;
 
-/// A solid as the sensor finds it.
+/// A solid in the sensor's frame.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Target {
     pub(super) shape: Shape,
     /// Pose of the solid, sensor_from_solid.
     pub(super) sensor_from_solid: RigidTransform,
-    /// The object it belongs to, -1 for none.
+    /// Index of the object it belongs to, -1 for none.
     pub(super) object: i32,
 }
 
-/// A target prepared for many rays from the sensor's origin.
+/// A target, preprocessed for many rays from the sensor's origin.
 struct Prepared {
     shape: Shape,
     origin: Vector3<f64>,
@@ -30,18 +29,18 @@ struct Prepared {
     nearest: f64,
 }
 
-/// What every ray of a sweep or an image meets.
+/// The scene of a sweep or an image.
 pub(super) struct Scene<'a> {
     terrain: &'a Terrain,
     world_from_sensor: &'a RigidTransform,
     targets: Vec<Prepared>,
-    /// Per column: the targets it can meet, nearest first.
+    /// Per column: the targets that its rays can hit, nearest first.
     columns: Vec<Vec<u32>>,
 }
 
 impl<'a> Scene<'a> {
-    /// Sorts the targets by distance and notes for each of `columns` columns which of them it can
-    /// meet: those for which `spread` calls its second argument with the column's number.
+    /// Sorts the targets by distance and lists for each of `columns` columns those that its rays
+    /// can hit. `spread` calls its second argument with the index of each such column.
     pub(super) fn new(
         terrain: &'a Terrain,
         world_from_sensor: &'a RigidTransform,
@@ -72,7 +71,7 @@ impl<'a> Scene<'a> {
         }
     }
 
-    /// The first thing on a ray of unit length: a solid with its object, or the ground with none.
+    /// First hit of a ray of unit length: a solid with its object, or the ground with none.
     pub(super) fn first_hit(
         &self,
         column: usize,

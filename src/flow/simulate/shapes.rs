@@ -1,6 +1,6 @@
-//! The three solids that everything but the ground is made of, and where a ray enters them.
+//! The three solids of the scene, and their intersection with a ray.
 //!
-//! Each is centred on its own origin with its height along z. It must not know where solids stand.
+//! Each is centered at its own origin, with its height along z.
 
 use nalgebra::Vector3;
 
@@ -15,16 +15,16 @@ pub(super) enum Shape {
     Ellipsoid([f64; 3]),
 }
 
-/// Where a ray meets a surface.
+/// Intersection of a ray and a surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Hit {
     /// Distance along the ray, metres.
     pub(super) range: f64,
-    /// Cosine of the angle between the ray and the surface normal, 0 where it grazes.
+    /// Cosine of the angle between the ray and the surface normal; 0 at grazing incidence.
     pub(super) cosine: f64,
 }
 
-/// The stretch of a ray inside a set; `cosine` belongs to its beginning.
+/// The interval of a ray inside a set. `cosine` belongs to its start.
 #[derive(Clone, Copy)]
 struct Stretch {
     enter: f64,
@@ -33,7 +33,7 @@ struct Stretch {
 }
 
 impl Shape {
-    /// Radius of the sphere around the shape.
+    /// Radius of the bounding sphere, metres.
     pub(super) fn bounding_radius(&self) -> f64 {
         match *self {
             Shape::Box([x, y, z]) => (x * x + y * y + z * z).sqrt(),
@@ -45,7 +45,7 @@ impl Shape {
         }
     }
 
-    /// Where a ray with a unit direction enters the shape; none where it misses or starts inside.
+    /// Entry of a ray with a unit direction into the shape; none where it misses or starts inside.
     pub(super) fn hit(&self, origin: &Vector3<f64>, direction: &Vector3<f64>) -> Option<Hit> {
         let inside = match *self {
             Shape::Box(half) => (0..3)
@@ -76,7 +76,7 @@ fn overlap(a: Option<Stretch>, b: Option<Stretch>) -> Option<Stretch> {
     })
 }
 
-/// The stretch within `half` of zero along one axis.
+/// The interval within `half` of zero along one axis.
 fn slab(origin: f64, direction: f64, half: f64) -> Option<Stretch> {
     if direction == 0.0 {
         return (origin.abs() <= half).then_some(Stretch {
@@ -93,7 +93,7 @@ fn slab(origin: f64, direction: f64, half: f64) -> Option<Stretch> {
     })
 }
 
-/// The stretch within an endless upright cylinder.
+/// The interval within an infinite upright cylinder.
 fn mantle(origin: &Vector3<f64>, direction: &Vector3<f64>, radius: f64) -> Option<Stretch> {
     let (o, d) = (origin.xy(), direction.xy());
     let inside = o.norm_squared() - radius * radius;
@@ -132,7 +132,7 @@ fn roots(a: f64, b: f64, c: f64) -> Option<[f64; 2]> {
 
 #[cfg(test)]
 impl Shape {
-    /// Distance of a point from the surface, metres; for an ellipsoid along the ray to its center.
+    /// Distance of a point to the surface, metres; for an ellipsoid, along the ray to its center.
     pub(super) fn surface_distance(&self, point: &Vector3<f64>) -> f64 {
         let outside = |gaps: &[f64]| {
             let far = gaps

@@ -1,11 +1,11 @@
-//! A street in time: sweeps, and the exact flow of every point of them.
+//! Simulated street over time: sweeps, and the exact flow of every point.
 //!
-//! The truth belongs to the measured point, noise and all: it moves rigidly with what it was
-//! measured on, and the ego vehicle moves too. x2 = T x1 for a point of the static world.
+//! The true flow is that of the measured point, noise included: it moves rigidly with the object or
+//! surface that the ray hit, and the ego vehicle moves as well. For a static point x2 = T x1.
 
 use super::lidar::Lidar;
 use super::objects::{Kind, LANE_M, Object, traffic};
-use super::options::{FRAME_SECONDS, StreetError, StreetOptions};
+use super::options::{SWEEP_SECONDS, StreetError, StreetOptions};
 use super::scene::Target;
 use super::terrain::Terrain;
 use super::view;
@@ -14,17 +14,17 @@ use crate::flow::data::{Point, Random, RigidTransform};
 use crate::flow::depth::{Camera, DepthImage};
 use nalgebra::{Point3, Translation3, Vector3};
 
-/// The sensor stands this high above the ground, metres.
+/// Height of the sensor above the ground, metres.
 const SENSOR_HEIGHT_M: f64 = 1.73;
 /// Wheelbase and track of the ego vehicle, metres.
 const EGO_STAND_M: [f64; 2] = [2.7, 1.6];
-/// A point is dynamic if it moves this far per frame relative to the world, metres.
+/// Minimum residual displacement of a dynamic point, metres per sweep interval.
 const DYNAMIC_M: f64 = 0.05;
 
 /// A simulated street.
 #[derive(Debug)]
 pub struct Street {
-    frames: usize,
+    sweeps: usize,
     speed: f64,
     terrain: Terrain,
     world: World,
@@ -33,47 +33,47 @@ pub struct Street {
     lidar: Lidar,
 }
 
-/// One sweep, N points in the sensor's frame.
+/// One sweep of N points in the sensor's frame.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Frame {
-    /// Its number.
+pub struct StreetSweep {
+    /// Index of the sweep.
     pub index: usize,
-    /// Points, metres, sensor frame: x forward, y left, z up, the ground near z = -1.73.
+    /// N points, metres, sensor frame: x forward, y left, z up, the ground near z = -1.73.
     pub points: Vec<Point>,
-    /// Per point the object it lies on, or -1 for the ground and the static world. Movers come
-    /// first, parked cars after them; an object keeps its number in every frame.
+    /// N object indices; -1 for the ground and the static world. Moving objects come first, parked
+    /// cars after them. An object keeps its index in all sweeps.
     pub object: Vec<i32>,
-    /// Per point whether it lies on the ground.
+    /// N flags: true for ground points.
     pub ground: Vec<bool>,
     /// Pose of the sensor.
     pub world_from_sensor: RigidTransform,
 }
 
-/// Two consecutive sweeps and what is true of them; masks and flow have one row per source point.
+/// Two consecutive sweeps and their ground truth. Flow and masks have one row per source point.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SimulatedPair {
-    /// Points of the first sweep, metres, its sensor frame.
+    /// N points of the first sweep, metres, in its sensor frame.
     pub source: Vec<Point>,
-    /// Points of the second sweep, metres, its own sensor frame.
+    /// M points of the second sweep, metres, in its own sensor frame.
     pub target: Vec<Point>,
-    /// True flow, metres per frame, ego motion included.
+    /// True flow, N x 3 metres per sweep interval, ego motion included.
     pub flow: Vec<Point>,
-    /// Points that move 0.05 m or more relative to the world.
+    /// Points that move 0.05 m or more relative to the static world.
     pub dynamic: Vec<bool>,
     /// Points on cars, cyclists and pedestrians, parked or moving.
     pub foreground: Vec<bool>,
-    /// Object of each source point, as in [`Frame::object`].
+    /// Object index of each source point, as in [`StreetSweep::object`].
     pub object: Vec<i32>,
-    /// Source points on the ground.
+    /// N flags: true for source points on the ground.
     pub ground_source: Vec<bool>,
-    /// Target points on the ground.
+    /// M flags: true for target points on the ground.
     pub ground_target: Vec<bool>,
-    /// Ego motion: where a static source point is found in the target's frame.
+    /// Ego motion, which maps a static source point into the target's frame.
     pub target_from_source: RigidTransform,
 }
 
 impl Street {
-    /// Builds the street; sweeps are taken when asked for.
+    /// Builds the street. Sweeps are computed on demand.
     ///
     /// # Errors
     /// An option that is not a number, out of range or too large.
@@ -87,9 +87,9 @@ impl Street {
         let curvature = StreetOptions::curvature(yaw_rate, speed)?;
 
         let terrain = Terrain::new(curvature, &mut random);
-        let travel = speed * FRAME_SECONDS * options.frames as f64;
+        let travel = speed * SWEEP_SECONDS * options.sweeps as f64;
         Ok(Self {
-            frames: options.frames,
+            sweeps: options.sweeps,
             speed,
             world: World::new(&terrain, travel, &mut random),
             movers: traffic(options.movers, speed, &terrain, &mut random),
@@ -99,27 +99,28 @@ impl Street {
     }
 
     /// Number of sweeps.
-    pub fn frames(&self) -> usize {
-        self.frames
+    pub fn sweeps(&self) -> usize {
+        self.sweeps
     }
 
-    /// What an object is; none for the static world and for numbers that no object has.
+    /// Type of an object; none for the static world and for indices without an object.
     pub fn kind(&self, object: i32) -> Option<Kind> {
         self.object(object).map(|object| object.kind)
     }
 
-    /// Takes one sweep: the same bits whenever and with however many threads.
+    /// Computes one sweep. The result is bit-identical for any order of calls and number of
+    /// threads.
     ///
     /// # Errors
-    /// A frame that the street does not have.
-    pub fn frame(&self, index: usize) -> Result<Frame, StreetError> {
-        self.check_frame(index)?;
+    /// A sweep that the street does not have.
+    pub fn sweep(&self, index: usize) -> Result<StreetSweep, StreetError> {
+        self.check_sweep(index)?;
         let world_from_sensor = self.pose(index as f64);
         let targets = self.targets(index, &world_from_sensor);
         let returns = self
             .lidar
             .sweep(index, &self.terrain, &world_from_sensor, &targets);
-        Ok(Frame {
+        Ok(StreetSweep {
             index,
             points: returns.iter().map(|hit| hit.point).collect(),
             object: returns.iter().map(|hit| hit.object).collect(),
@@ -128,13 +129,13 @@ impl Street {
         })
     }
 
-    /// True depth of a frame through a camera beside the lidar, up to 120 m: the street as it is,
+    /// True depth at the time of a sweep, seen by a camera mounted next to the lidar, up to 120 m,
     /// without noise and loss.
     ///
     /// # Errors
-    /// A frame that the street does not have.
+    /// A sweep that the street does not have.
     pub fn depth(&self, index: usize, camera: &Camera) -> Result<DepthImage, StreetError> {
-        self.check_frame(index)?;
+        self.check_sweep(index)?;
         let world_from_camera = self.pose(index as f64) * camera.camera_from_lidar().inverse();
         let targets = self.targets(index, &world_from_camera);
         Ok(view::depth(
@@ -145,22 +146,23 @@ impl Street {
         ))
     }
 
-    /// Flow of a frame's points to the next instant, N x 3 metres: where each is then, in the
-    /// sensor's frame of then, minus where it is now. The last frame has a flow too.
+    /// Flow of the points of a sweep to the time of the next one, N x 3 metres: the later position
+    /// in the later sensor frame, minus the position in the sweep. The last sweep has a flow as
+    /// well.
     ///
     /// # Errors
-    /// A frame that the street does not have.
+    /// A sweep that the street does not have.
     pub fn flow(&self, index: usize) -> Result<Vec<Point>, StreetError> {
-        Ok(self.flow_of(&self.frame(index)?))
+        Ok(self.flow_of(&self.sweep(index)?))
     }
 
-    /// A frame, the next one, and the truth about them.
+    /// A sweep, the next one, and their ground truth.
     ///
     /// # Errors
-    /// Either is a frame that the street does not have.
+    /// One of the two is a sweep that the street does not have.
     pub fn pair(&self, index: usize) -> Result<SimulatedPair, StreetError> {
-        let source = self.frame(index)?;
-        let target = self.frame(index + 1)?;
+        let source = self.sweep(index)?;
+        let target = self.sweep(index + 1)?;
         let target_from_source = target.world_from_sensor.inv_mul(&source.world_from_sensor);
         let flow = self.flow_of(&source);
         let dynamic = flow.iter().zip(&source.points).map(|(flow, &point)| {
@@ -181,23 +183,23 @@ impl Street {
         })
     }
 
-    fn check_frame(&self, frame: usize) -> Result<(), StreetError> {
-        let frames = self.frames;
-        if frame < frames {
+    fn check_sweep(&self, frame: usize) -> Result<(), StreetError> {
+        let sweeps = self.sweeps;
+        if frame < sweeps {
             Ok(())
         } else {
-            Err(StreetError::NoSuchFrame { frame, frames })
+            Err(StreetError::ReferenceTimeOutOfRange { frame, sweeps })
         }
     }
 
-    fn flow_of(&self, frame: &Frame) -> Vec<Point> {
+    fn flow_of(&self, frame: &StreetSweep) -> Vec<Point> {
         self.flow_to(frame, (frame.index + 1) as f64)
     }
 
-    /// Flow of a frame's points to the instant `at`, in frames, N x 3 metres: where each is then, in
-    /// the sensor's frame of then, minus where it is in its own. Instants between frames and before
-    /// the frame have a flow too.
-    pub fn flow_to(&self, frame: &Frame, at: f64) -> Vec<Point> {
+    /// Flow of the points of a sweep to the time `at`, in sweep intervals since the first sweep, N
+    /// x 3 metres: the position at that time in the sensor frame of that time, minus the position
+    /// in the sweep. `at` may lie between sweeps or before the sweep.
+    pub fn flow_to(&self, frame: &StreetSweep, at: f64) -> Vec<Point> {
         let now = frame.world_from_sensor;
         let next_from_world = self.pose(at).inverse();
         let next_from_now = next_from_world * now;
@@ -223,7 +225,7 @@ impl Street {
             .collect()
     }
 
-    /// Pose of the sensor at an instant, in frames: `world_from_sensor`.
+    /// Pose of the sensor, `world_from_sensor`, at a time in sweep intervals since the first sweep.
     pub fn pose(&self, at: f64) -> RigidTransform {
         let x = self.terrain.advance(0.0, self.speed * seconds(at));
         let place = self.terrain.place(x, -LANE_M);
@@ -238,7 +240,7 @@ impl Street {
         self.movers.iter().chain(&self.world.parked).nth(index)
     }
 
-    /// Every solid of the street as the sensor finds it in a frame.
+    /// All solids of the street at the time of a sweep, in the sensor's frame.
     fn targets(&self, index: usize, world_from_sensor: &RigidTransform) -> Vec<Target> {
         let sensor_from_world = world_from_sensor.inverse();
         let still = self.world.solids.iter().map(|solid| Target {
@@ -259,12 +261,12 @@ impl Street {
     }
 }
 
-/// Time of an instant in frames, seconds.
+/// Converts a time in sweep intervals to seconds.
 fn seconds(at: f64) -> f64 {
-    at * FRAME_SECONDS
+    at * SWEEP_SECONDS
 }
 
-/// How a transform moves a point, metres.
+/// Displacement of a point by a transform, metres.
 fn motion(transform: &RigidTransform, point: Point) -> Vector3<f64> {
     let point = Point3::from(point.map(f64::from));
     transform * point - point
@@ -275,7 +277,7 @@ mod tests {
     use super::*;
     use std::collections::HashMap;
 
-    /// Coordinates in single precision, up to 120 m.
+    /// Tolerance of single-precision coordinates up to 120 m.
     const SINGLE: f64 = 2e-5;
 
     fn small(seed: u64) -> StreetOptions {
@@ -291,7 +293,7 @@ mod tests {
         Vector3::from(point.map(f64::from)) + Vector3::from(flow.map(f64::from))
     }
 
-    /// Distance of a point of a sensor frame from the surface of an object, metres.
+    /// Distance of a point in a sensor frame to the surface of an object, metres.
     fn distance(street: &Street, frame: usize, object: i32, point: Vector3<f64>) -> f64 {
         let body = street.object(object).unwrap();
         let world = street.pose(frame as f64) * Point3::from(point);
@@ -377,7 +379,7 @@ mod tests {
         let pair = street.pair(0).unwrap();
         for row in (0..pair.source.len()).filter(|&row| pair.foreground[row]) {
             let next = moved(pair.source[row], pair.flow[row]);
-            // Six deviations of noise and bias together.
+            // Six standard deviations of noise and bias together.
             assert!(distance(&street, 1, pair.object[row], next) < 0.14);
         }
     }
@@ -411,7 +413,8 @@ mod tests {
             sum.sum::<f64>() / rows.len() as f64
         };
         let [still, flowed] = [mean(&|_| [0.0; 3]), mean(&|row| pair.flow[row])];
-        // Real pairs have 0.07 to 0.10 m: what is left is resampling and occlusion.
+        // Real pairs have 0.07 to 0.10 m. The remaining distance is due to resampling and
+        // occlusion.
         assert!(flowed < 0.13 && flowed < 0.7 * still, "{still} {flowed}");
     }
 
@@ -446,17 +449,17 @@ mod tests {
         let street = Street::new(&options).unwrap();
         let step = street.pose(0.0).inv_mul(&street.pose(1.0));
         let (_, _, yaw) = step.rotation.euler_angles();
-        // The waves of the ground and the winding of the street change both a little.
+        // The waves of the ground and the winding of the street change both slightly.
         assert!((yaw - 0.01).abs() < 2e-3, "{yaw}");
         assert!((step.translation.vector.norm() - 1.0).abs() < 0.03);
         let last = street.flow(1).unwrap();
-        assert_eq!(last.len(), street.frame(1).unwrap().points.len());
+        assert_eq!(last.len(), street.sweep(1).unwrap().points.len());
     }
 
     #[test]
     fn the_last_frame_of_the_longest_fastest_street_is_sane() {
         let options = StreetOptions {
-            frames: 1000,
+            sweeps: 1000,
             beams: 1,
             azimuth_steps: 200,
             movers: 256,
@@ -474,10 +477,10 @@ mod tests {
     #[test]
     fn frames_past_the_end_and_bad_options_are_refused() {
         let street = Street::new(&small(0)).unwrap();
-        assert_eq!(street.frames(), 2);
-        assert!(street.frame(2).is_err() && street.flow(2).is_err());
+        assert_eq!(street.sweeps(), 2);
+        assert!(street.sweep(2).is_err() && street.flow(2).is_err());
         let error = street.pair(1).unwrap_err();
-        assert_eq!(error.to_string(), "frame 2 of a street of 2 frames");
+        assert_eq!(error.to_string(), "frame 2 of a street of 2 sweeps");
         let tight = StreetOptions {
             yaw_rate_rps: Some(0.9),
             ..small(0)

@@ -1,28 +1,30 @@
 //! The ground: a winding road with a crown, kerbs, sidewalks, side streets and gentle waves.
 //!
-//! World frame: x along the street where it starts, y to the left, z up. The center line is
-//! y = A (1 - cos(x / L)): level with x at the origin, with the curvature asked for, and never
-//! crossing itself. Places are also given as x and lateral offset, metres to the left of it.
+//! World frame: x along the street where it starts, y to the left, z up.
+//!
+//! The center line is y = A (1 - cos(x / L)). It is parallel to x at the origin, has the requested
+//! curvature there and never intersects itself. Positions are also given as x and lateral offset,
+//! metres to the left of the center line.
 
 use super::shapes::Hit;
 use crate::flow::data::{Random, RigidTransform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 
-/// From the center line to the kerb, metres.
+/// Distance from the center line to the kerb, metres.
 const KERB_M: f64 = 6.0;
-/// How far the sidewalk stands above the road, metres.
+/// Height of the sidewalk above the road, metres.
 const KERB_HEIGHT_M: f64 = 0.15;
-/// The kerb is this wide, so that the ground has no jumps, metres.
+/// Width of the kerb, metres. It keeps the ground continuous.
 const KERB_WIDTH_M: f64 = 0.06;
-/// How far the road's middle stands above its edges, metres.
+/// Height of the road's middle above its edges, metres.
 const CROWN_M: f64 = 0.12;
-/// Half width of side streets, metres.
+/// Half-width of side streets, metres.
 const SIDE_STREET_M: f64 = 5.0;
-/// From one side street to the next, metres.
+/// Distance between side streets, metres.
 const BLOCK_M: f64 = 110.0;
-/// The steepest angle of the center line against x, as a slope.
+/// Maximum slope of the center line against x.
 const WINDING: f64 = 0.35;
-/// The ground stays between these heights, metres.
+/// Bounds of the ground height, metres.
 const HEIGHTS_M: [f64; 2] = [-0.4, 0.7];
 
 /// The ground of one street.
@@ -35,7 +37,7 @@ pub(super) struct Terrain {
 }
 
 impl Terrain {
-    /// A ground whose center line starts with this curvature, 1/m.
+    /// Ground whose center line starts with this curvature, 1/m.
     pub(super) fn new(curvature: f64, random: &mut Random) -> Self {
         let length = WINDING / curvature.abs().max(1e-6);
         Self {
@@ -51,13 +53,13 @@ impl Terrain {
         (self.swing / self.length * (x / self.length).sin()).atan()
     }
 
-    /// World x and y of a place beside the center line.
+    /// World x and y of a position given by x and lateral offset.
     pub(super) fn place(&self, x: f64, lateral: f64) -> [f64; 2] {
         let (sin, cos) = self.heading(x).sin_cos();
         [x - lateral * sin, self.center(x) + lateral * cos]
     }
 
-    /// The x that is reached from another by following the center line, metres (may be negative).
+    /// The x at the end of a path of `distance` metres along the center line; negative is backward.
     pub(super) fn advance(&self, from: f64, distance: f64) -> f64 {
         let steps = distance.abs().ceil().max(1.0);
         let step = distance / steps;
@@ -67,13 +69,13 @@ impl Terrain {
         })
     }
 
-    /// The side street nearest to x.
+    /// The x of the side street nearest to x.
     pub(super) fn side_street(&self, x: f64) -> f64 {
         let block = ((x - self.first_side_street) / BLOCK_M).round();
         self.first_side_street + block * BLOCK_M
     }
 
-    /// The side streets between two x.
+    /// The x of all side streets between two x.
     pub(super) fn side_streets(&self, from: f64, to: f64) -> impl Iterator<Item = f64> {
         let block = ((from - self.first_side_street) / BLOCK_M).ceil();
         let first = self.first_side_street + block * BLOCK_M;
@@ -81,7 +83,7 @@ impl Terrain {
         streets.take_while(move |&x| x < to)
     }
 
-    /// Height of the ground, metres.
+    /// Height of the ground at world x and y, metres.
     pub(super) fn height(&self, x: f64, y: f64) -> f64 {
         let [a, b, c] = self.phases;
         let waves = 0.05 * (x / 13.0 + a).sin() + 0.04 * (y / 11.0 + b).sin();
@@ -97,7 +99,7 @@ impl Terrain {
         waves + hills + crown + KERB_HEIGHT_M * beside * kept
     }
 
-    /// The pose of something of this length and width that stands on the ground.
+    /// Pose of a body of this length and width that stands on the ground.
     pub(super) fn seat(
         &self,
         [x, y]: [f64; 2],
@@ -121,7 +123,8 @@ impl Terrain {
         )
     }
 
-    /// Where a ray from above the ground meets it, up to a range; world frame, unit direction.
+    /// Intersection of a ray from above with the ground, up to a range; world frame, unit
+    /// direction.
     pub(super) fn hit(
         &self,
         origin: &Vector3<f64>,
@@ -169,7 +172,7 @@ impl Terrain {
     }
 }
 
-/// 0 below 0, 1 above 1, smooth between.
+/// Smooth step: 0 below 0, 1 above 1.
 fn ramp(value: f64) -> f64 {
     let value = value.clamp(0.0, 1.0);
     value * value * (3.0 - 2.0 * value)

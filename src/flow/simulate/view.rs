@@ -1,6 +1,4 @@
-//! The true depth of a street through a camera: one exact ray a pixel, no noise, no loss.
-//!
-//! It must not know the lidar: nothing but the world is common to both.
+//! True depth image of a street: one exact ray per pixel, without noise and loss.
 
 use super::scene::{FARTHEST_M, Scene, Target};
 use super::terrain::Terrain;
@@ -8,8 +6,8 @@ use crate::flow::data::RigidTransform;
 use crate::flow::depth::{Camera, DepthImage};
 use rayon::prelude::*;
 
-/// What a camera sees from `world_from_camera`; `targets` are in the camera's frame. Depth ends
-/// where the lidar's range does.
+/// Depth image of a camera at `world_from_camera`; `targets` are in the camera's frame. The maximum
+/// range is that of the lidar.
 pub(super) fn depth(
     camera: &Camera,
     terrain: &Terrain,
@@ -17,8 +15,8 @@ pub(super) fn depth(
     targets: &[Target],
 ) -> DepthImage {
     let [width, height] = [camera.width(), camera.height()];
-    // A column's rays lie in one plane through the camera, upright in the image; a solid that
-    // the plane misses is not met.
+    // The rays of a column lie in one plane through the camera center. A solid that does not
+    // intersect the plane is skipped.
     let normals: Vec<[f64; 2]> = (0..width)
         .map(|column| {
             let across = camera.ray(column, 0).x;
@@ -65,7 +63,7 @@ mod tests {
     use crate::flow::depth::Intrinsics;
     use crate::flow::simulate::shapes::Shape;
 
-    /// A wide camera that looks along the street's x, a little downward.
+    /// A wide camera that faces along the street's x, slightly downward.
     fn camera() -> (Camera, RigidTransform) {
         let intrinsics = Intrinsics {
             fx: 30.0,

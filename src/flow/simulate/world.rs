@@ -1,6 +1,6 @@
-//! Everything that stands still: houses, trees, poles, small things, and parked cars.
+//! The static world: houses, trees, poles, small obstacles, and parked cars.
 //!
-//! Placed by the seed along the street, and kept clear of side streets. It must not know the lidar.
+//! Objects are placed along the street by the seed, clear of the side streets.
 
 use super::objects::{Object, Path};
 use super::shapes::Shape;
@@ -8,9 +8,9 @@ use super::terrain::Terrain;
 use crate::flow::data::{Random, RigidTransform};
 use nalgebra::{Translation3, UnitQuaternion};
 
-/// From the center line to the line of houses, metres.
+/// Distance from the center line to the row of houses, metres.
 const HOUSES_M: f64 = 10.5;
-/// The street goes on this far behind and before the ego vehicle, metres.
+/// Extent of the street behind the start and beyond the end of the ego vehicle's path, metres.
 const MARGIN_M: f64 = 130.0;
 
 /// A solid of the static world.
@@ -27,7 +27,7 @@ pub(super) struct World {
     pub(super) parked: Vec<Object>,
 }
 
-/// Where on the street something is put: along, to the left, and above the ground, metres.
+/// Position relative to the street: along, to the left, and above the ground, metres.
 #[derive(Clone, Copy)]
 struct Spot {
     x: f64,
@@ -83,7 +83,7 @@ impl World {
                 },
             );
 
-            // Bays and pillars: a front is never one plane.
+            // Bays and pillars, so that a facade is not a single plane.
             let bays = random.below(5);
             for bay in 0..bays {
                 let along = (bay as f64 + 0.5) / bays as f64 - 0.5;

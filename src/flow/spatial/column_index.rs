@@ -1,29 +1,31 @@
-//! Which points of a cloud lie near a place.
+//! Column index: radius and nearest-neighbor queries on a point cloud.
 //!
-//! Points lie in square columns that a small table finds, by height within each: at most nine columns
-//! are looked at for one place. It must not know of motions or clusters.
+//! Points lie in square vertical columns, sorted by height within each. A hash table finds a
+//! column. A query within one column side visits at most nine columns.
 
 use std::ops::Range;
 
 use crate::flow::data::{Point, floor, square_distance};
 
-/// Columns along an axis on each side of the origin; what is farther shares the outermost.
+/// Bound on a column's index along an axis, on each side of the origin. Points beyond it share the
+/// outermost column.
 const REACH: f32 = (1 << 30) as f32;
 
-/// A cloud by place.
+/// A point cloud indexed by vertical columns.
 #[derive(Debug)]
 pub(crate) struct ColumnIndex {
     column_m: f32,
-    /// Open addressing: the key of a column and where its points are.
+    /// Open addressing: the key of a column and the range of its points. An empty range is a vacant
+    /// slot.
     table: Vec<(u64, Range<u32>)>,
-    /// By column, then by height.
+    /// Sorted by column, then by height.
     points: Vec<Point>,
-    /// The row that each of `points` had.
+    /// The input row of each of `points`.
     rows: Vec<u32>,
 }
 
 impl ColumnIndex {
-    /// Of `points`, to be asked for places within `column_m` metres.
+    /// Indexes `points`, metres, for queries within `column_m` metres.
     pub(crate) fn new(points: &[Point], column_m: f32) -> Self {
         let keyed = points.iter().zip(0_u32..);
         let mut keyed: Vec<(u64, f32, u32)> = keyed
@@ -53,7 +55,7 @@ impl ColumnIndex {
         }
     }
 
-    /// All points, in their own order.
+    /// All points in their input order.
     pub(crate) fn in_order(&self) -> Vec<Point> {
         let mut points = vec![[0.0; 3]; self.points.len()];
         for (&row, &point) in self.rows.iter().zip(&self.points) {
@@ -62,8 +64,8 @@ impl ColumnIndex {
         points
     }
 
-    /// Calls `see` with the row and the point of everything that lies less than `within_m` (a column's
-    /// side at most) from `center`.
+    /// Calls `see` with the input row and the coordinates of every point less than `within_m`
+    /// metres from `center`. `within_m` is at most a column's side.
     #[inline]
     pub(crate) fn around(&self, center: Point, within_m: f32, mut see: impl FnMut(u32, Point)) {
         self.columns_around(center, within_m, |places| {
@@ -79,12 +81,13 @@ impl ColumnIndex {
         });
     }
 
-    /// Calls `see` with the row of everything that [`Self::around`] gives and that was not yet `seen`.
+    /// Calls `see` with the input row of every point that [`Self::around`] gives and that is not in
+    /// `seen`, and adds these points to `seen`.
     pub(crate) fn around_unseen(
         &self,
         center: Point,
         within_m: f32,
-        seen: &mut Seen,
+        seen: &mut EarlyStopState,
         mut see: impl FnMut(u32),
     ) {
         self.columns_around(center, within_m, |mut places| {
@@ -102,8 +105,8 @@ impl ColumnIndex {
         });
     }
 
-    /// Calls `see` with where the points of each column are that may come within `within_m` of
-    /// `center`, from the lowest that may.
+    /// Calls `see` with the range of the points of each column that may lie within `within_m` of
+    /// `center`. A range starts at the first point that is high enough.
     #[inline]
     fn columns_around(&self, center: Point, within_m: f32, mut see: impl FnMut(Range<usize>)) {
         let neighbors = Neighbors::of(center, self.column_m);
@@ -118,13 +121,13 @@ impl ColumnIndex {
         }
     }
 
-    /// None of the points.
-    pub(crate) fn unseen(&self) -> Seen {
-        Seen(vec![0; self.points.len().div_ceil(64)])
+    /// The empty set of visited points.
+    pub(crate) fn unseen(&self) -> EarlyStopState {
+        EarlyStopState(vec![0; self.points.len().div_ceil(64)])
     }
 
-    /// Calls `see` with every point of the columns that touch the square of `half_m` around
-    /// `center`, no more than `height_m` higher or lower.
+    /// Calls `see` with every point of the columns that touch the square of half side `half_m`
+    /// around `center`, at most `height_m` higher or lower. Metres.
     pub(crate) fn square_around(
         &self,
         center: Point,
@@ -148,8 +151,9 @@ impl ColumnIndex {
         }
     }
 
-    /// The row and the squared distance of the nearest point that `allowed` lets through and that
-    /// lies less than `within_m` (a column's side at most) from `center`; the lowest row of equals.
+    /// The input row and the squared distance of the nearest point that `allowed` accepts, less
+    /// than `within_m` metres from `center`. `within_m` is at most a column's side. Of equally near
+    /// points, the one of the lowest row is taken.
     #[inline]
     pub(crate) fn nearest(
         &self,
@@ -160,7 +164,8 @@ impl ColumnIndex {
         let neighbors = Neighbors::of(center, self.column_m);
         let mut best: Option<(u32, f32)> = None;
         let mut least = within_m * within_m;
-        // The own column first, and in each what is nearest in height: the rest is soon too far.
+        // The center's own column comes first. Within a column the search runs up and down from the
+        // center's height, and ends where the height difference alone is too large.
         for offset in OFFSETS {
             if neighbors.square_gap(offset) > least {
                 continue;
@@ -192,7 +197,7 @@ impl ColumnIndex {
         let mut slot = hash(key) as usize & (self.table.len() - 1);
         loop {
             let (found, Range { start, end }) = &self.table[slot];
-            // No column is empty: this place is vacant.
+            // No column is empty: an empty range is a vacant slot.
             if start == end {
                 return 0..0;
             }
@@ -204,16 +209,16 @@ impl ColumnIndex {
     }
 }
 
-/// Which of the points of a [`ColumnIndex`] have been seen, in its order, a bit each.
-pub(crate) struct Seen(Vec<u64>);
+/// The set of visited points of a [`ColumnIndex`], one bit a point, in the index's order.
+pub(crate) struct EarlyStopState(Vec<u64>);
 
-impl Seen {
+impl EarlyStopState {
     #[inline]
     fn add(&mut self, place: usize) {
         self.0[place / 64] |= 1 << (place % 64);
     }
 
-    /// The first of some places that has not been seen.
+    /// The first of the indices `places` that has not been visited.
     #[inline]
     fn next_unseen(&self, places: Range<usize>) -> Option<usize> {
         let Range { mut start, end } = places;
@@ -229,7 +234,7 @@ impl Seen {
     }
 }
 
-/// A column and those around it, the own one first.
+/// Offsets of the nine columns around a point, its own column first.
 const OFFSETS: [[i32; 2]; 9] = [
     [0, 0],
     [-1, 0],
@@ -242,11 +247,11 @@ const OFFSETS: [[i32; 2]; 9] = [
     [1, 1],
 ];
 
-/// The columns around a place, and how far off they begin.
+/// The columns around a point, and the distances to their borders.
 struct Neighbors {
     place: [i32; 2],
-    /// Along each axis to the column before and to the one after, square metres; a little less than
-    /// that, since columns are told apart in single precision.
+    /// Along each axis, the squared distances to the preceding and to the following column, square
+    /// metres. They are slightly underestimated, since columns are computed in single precision.
     square_gaps: [[f32; 2]; 2],
 }
 
@@ -265,7 +270,7 @@ impl Neighbors {
         }
     }
 
-    /// How far off the column at `offset` begins at least, square metres.
+    /// Lower bound on the squared distance to the column at `offset`, square metres.
     #[inline]
     fn square_gap(&self, offset: [i32; 2]) -> f32 {
         let gap = |axis: usize| match offset[axis] {
@@ -282,7 +287,7 @@ impl Neighbors {
     }
 }
 
-/// The column that a point lies in.
+/// Indices of the column that a point lies in.
 fn place(point: Point, column_m: f32) -> [i32; 2] {
     [point[0], point[1]].map(|c| floor(c / column_m).clamp(-REACH, REACH) as i32)
 }
@@ -321,7 +326,8 @@ mod tests {
 
     #[test]
     fn on_a_lattice_far_out_the_nearest_is_the_lowest_row_of_equals_and_nothing_near_is_left_out() {
-        // Borders of columns go through the points, and single precision is half a millimetre.
+        // Column borders pass through the points, and single precision resolves a quarter of a
+        // millimetre.
         let lattice = |i: u16| {
             let [x, y, z] = [i % 12, i / 12 % 12, i / 144].map(f32::from);
             [4000.0 + x * 0.25, -4000.0 + y * 0.25, z * 0.25]

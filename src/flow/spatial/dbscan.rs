@@ -1,25 +1,26 @@
-//! Which points belong together: DBSCAN (Ester et al. 1996) on a grid.
+//! DBSCAN clustering (Ester et al. 1996) on a grid.
 //!
-//! Cells are so small that all points of one lie within the radius of each other: a cell with
-//! enough points is one piece of a cluster without a look at its points. It must not know what
-//! clusters are for.
+//! The diagonal of a cell is the radius, so that all points of a cell lie within the radius of each
+//! other. A cell with enough points holds core points only, without a distance computation.
 
 use rayon::prelude::*;
 
 use super::voxel::voxel_first;
 use crate::flow::data::{Point, floor, square_distance};
 
-/// More cores of a cell than this are thinned, to one a voxel of a share of the radius.
+/// Number of core points in a cell above which they are voxel-downsampled. The voxel side is the
+/// radius over `VOXELS`.
 const FULL: usize = 64;
 const VOXELS: f32 = 16.0;
 
-/// A point that belongs to no cluster.
+/// Label of a point that belongs to no cluster.
 pub(crate) const NOISE: u32 = u32::MAX;
 
-/// The clusters of `points`: for each its number, from 0 in the order of their first point, or
-/// [`NOISE`]. A point with `least` points within `radius_m` metres, itself among them, is a core;
-/// cores within the radius of each other are of one cluster, and so is any other point within the
-/// radius of a core: of the nearest one's.
+/// DBSCAN clusters of `points`, metres: N labels, numbered from 0 in the order of each cluster's
+/// first point, or [`NOISE`]. A point with at least `least` points within `radius_m` metres, itself
+/// included, is a core point. Core points within the radius of each other are in one cluster. Any
+/// other point within the radius of a core point joins the cluster of the nearest one. Points
+/// farther out than about 2^20 cells along an axis are noise.
 pub(crate) fn clusters(points: &[Point], radius_m: f32, least: usize) -> Vec<u32> {
     let grid = Cells::new(points, radius_m / 3_f32.sqrt());
     let square = radius_m * radius_m;
@@ -36,7 +37,8 @@ pub(crate) fn clusters(points: &[Point], radius_m: f32, least: usize) -> Vec<u32
         })
         .collect();
     let distance = |a: u32, b: u32| square_distance(points[a as usize], points[b as usize]);
-    // Which cells with cores touch: later ones alone, since touching is mutual.
+    // Pairs of cells with core points within the radius. The relation is symmetric, so later cells
+    // suffice.
     let touching: Vec<Vec<usize>> = (0..grid.cells.len())
         .into_par_iter()
         .map(|cell| {
@@ -57,7 +59,7 @@ pub(crate) fn clusters(points: &[Point], radius_m: f32, least: usize) -> Vec<u32
             sets.join(cell as u32, other as u32);
         }
     }
-    // A core takes its cell's set, another point that of the nearest core.
+    // A core point takes the set of its cell, any other point that of the nearest core point.
     let root: Vec<u32> = (0..grid.cells.len() as u32)
         .map(|cell| sets.root(cell))
         .collect();
@@ -97,8 +99,8 @@ pub(crate) fn clusters(points: &[Point], radius_m: f32, least: usize) -> Vec<u32
     labels
 }
 
-/// The rows, or where they are many one of each small voxel, so that two full cells are compared in
-/// bounded time: what lies within a voxel of touching may then be told apart.
+/// The rows or, where they are many, one row for each small voxel, which bounds the time to compare
+/// two full cells. Cells that touch by less than a voxel may then stay separate.
 fn few(points: &[Point], rows: Vec<u32>, radius_m: f32) -> Vec<u32> {
     if rows.len() <= FULL {
         return rows;
@@ -108,7 +110,7 @@ fn few(points: &[Point], rows: Vec<u32>, radius_m: f32) -> Vec<u32> {
     kept.into_iter().map(|i| rows[i as usize]).collect()
 }
 
-/// Numbers from 0 in the order in which they are met.
+/// Renumbers labels from 0 in the order of their first occurrence.
 fn renumber(labels: &mut [u32], roots: usize) {
     let mut numbers = vec![NOISE; roots];
     let mut next = 0;
@@ -122,18 +124,20 @@ fn renumber(labels: &mut [u32], roots: usize) {
     }
 }
 
-/// Points by small cubes.
+/// Points in cubic cells.
 struct Cells<'a> {
     points: &'a [Point],
-    /// Key and where the members begin, by key.
+    /// Key of each cell and the index of its first member in `rows`, sorted by key.
     cells: Vec<(u64, u32)>,
     rows: Vec<u32>,
-    /// Columns: key without height, and where their cells begin.
+    /// Key of each column (a cell's key without the height) and the index of its first cell. A
+    /// sentinel closes the list.
     columns: Vec<(u64, u32)>,
 }
 
-/// Cells along an axis on each side of the origin.
+/// Bound on a cell's index along an axis, on each side of the origin.
 const REACH: f32 = (1 << 20) as f32 - 4.0;
+/// Bits of a key for each axis; the height has the lowest.
 const HEIGHT: u64 = 21;
 
 impl<'a> Cells<'a> {
@@ -141,7 +145,7 @@ impl<'a> Cells<'a> {
         let mut keyed: Vec<(u64, u32)> = points
             .iter()
             .zip(0..)
-            // What is out of reach belongs to nothing.
+            // Points out of range belong to no cell.
             .filter(|(point, _)| point.iter().all(|c| (c / side_m).abs() < REACH))
             .map(|(&point, row)| (key(point, side_m), row))
             .collect();
@@ -174,7 +178,7 @@ impl<'a> Cells<'a> {
         &self.rows[self.cells[cell].1 as usize..end]
     }
 
-    /// The cells, this one among them, that may hold points within the radius.
+    /// The cells that may hold points within the radius of this cell's points, this cell included.
     fn around(&self, cell: usize) -> Vec<usize> {
         let key = self.cells[cell].0;
         let (column, z) = (key >> HEIGHT, key & ((1 << HEIGHT) - 1));
@@ -199,7 +203,7 @@ impl<'a> Cells<'a> {
         found
     }
 
-    /// Which of a cell's members have `least` points within the radius.
+    /// Which of a cell's members are core points: those with `least` points within the radius.
     fn cores(&self, cell: usize, square: f32, least: usize) -> Vec<bool> {
         let members = self.members(cell);
         if members.len() >= least {
@@ -224,7 +228,7 @@ fn key(point: Point, side_m: f32) -> u64 {
     at(point[0]) << (2 * HEIGHT) | at(point[1]) << HEIGHT | at(point[2])
 }
 
-/// Disjoint sets of cells; the lowest number stands for its set.
+/// Union-find over cells; the lowest index is the root of its set.
 struct Sets(Vec<u32>);
 
 impl Sets {
@@ -252,7 +256,8 @@ mod tests {
     use super::*;
     use crate::flow::data::Random;
 
-    /// The definition, word by word; points of no core go to the lowest cluster within the radius.
+    /// DBSCAN by its definition: the core flags, and the labels of the core points. All other
+    /// points are labelled noise.
     fn by_definition(points: &[Point], radius_m: f32, least: usize) -> (Vec<bool>, Vec<u32>) {
         let near =
             |a: usize, b: usize| square_distance(points[a], points[b]) <= radius_m * radius_m;
@@ -306,9 +311,9 @@ mod tests {
 
     #[test]
     fn a_pole_of_many_cells_and_points_out_of_reach_take_no_longer_than_others() {
-        // A column of 200,000 cells: looked through for each of them they would be 4e10.
+        // A column of 200,000 cells: scanning the column for each of them would take 4e10 steps.
         let mut points: Vec<Point> = (0..200_000).map(|i| [1.0, 2.0, i as f32 * 0.3]).collect();
-        // And as many points in what would be the last cell.
+        // Also 200,000 points out of range, which all belong to the outermost cell if clamped.
         points.extend((0..200_000).map(|i| [9e5, 9e5, i as f32 * 0.5]));
         let found = clusters(&points, 0.5, 2);
         assert!(found[..200_000].iter().all(|&label| label == 0));
@@ -327,7 +332,8 @@ mod tests {
 
     #[test]
     fn full_cells_that_do_not_touch_are_told_apart_in_time() {
-        // 36 cells' pairs of 10,000 points each would be billions of comparisons.
+        // Comparing all pairs of core points of neighboring full cells would take billions of
+        // distances.
         let mut random = Random::new(5);
         let mut clump = |x: f64| -> Vec<Point> {
             let mut side = || random.uniform(0.0, 0.25) as f32;

@@ -1,4 +1,4 @@
-//! TODO doc
+//! Spatial indices and point-set geometry: column index, DBSCAN, plane fit and voxel downsampling.
 
 mod column_index;
 pub(crate) mod dbscan;

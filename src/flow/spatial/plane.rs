@@ -1,31 +1,28 @@
-//! The plane through a few points, where they lie nearly on one.
-//!
-//! It must not know which points are neighbors, or what a plane is for.
+//! Plane fit to the neighborhood of a point, from the covariance of its points.
 
 use nalgebra::{Matrix3, Vector3};
 
 use crate::flow::data::Point;
 
-/// Fewer points than this, the one in the middle among them, make no surface.
+/// Least number of points, the center included, for a plane.
 const NEIGHBORS: f64 = 4.0;
-/// A surface is flat where its spread along its second axis exceeds that along its normal by this
-/// share of the spread along its first. Less flat ones are branches and wires; with more asked for,
-/// walls seen by one ring are lost.
+/// Flatness threshold: the variance along the second axis must exceed that along the normal by this
+/// share of the variance along the first axis. Less flat neighborhoods are branches and wires. With
+/// a higher threshold, walls hit by a single ring are lost.
 const FLAT: f64 = 0.05;
-/// Spreads below this are none, square metres.
+/// Variances below this count as zero, square metres.
 const NO_SPREAD: f64 = 1e-12;
 
-/// A plane that points lie on.
+/// A plane fitted to points.
 #[derive(Clone, Copy)]
 pub(crate) struct PlaneFit {
-    /// Unit length, on either side.
+    /// Unit normal of either sign.
     pub(crate) normal: [f32; 3],
-    /// The points' spread along the normal over that along their second axis, as variances: 0 for
-    /// a plane.
+    /// Variance along the normal over the variance along the second axis: 0 for a plane.
     pub(crate) thickness: f32,
 }
 
-/// How the points around one lie about it.
+/// Sums over the points around a center point, for their mean and covariance.
 pub(crate) struct Neighborhood {
     middle: Point,
     count: f64,
@@ -34,7 +31,7 @@ pub(crate) struct Neighborhood {
 }
 
 impl Neighborhood {
-    /// Of nothing yet.
+    /// An empty neighborhood of the center `middle`.
     pub(crate) fn of(middle: Point) -> Self {
         Self {
             middle,
@@ -44,7 +41,7 @@ impl Neighborhood {
         }
     }
 
-    /// Takes a point in.
+    /// Adds a point.
     #[inline]
     pub(crate) fn add(&mut self, point: Point) {
         let away = Vector3::from_fn(|a, _| f64::from(point[a] - self.middle[a]));
@@ -53,7 +50,8 @@ impl Neighborhood {
         self.squares += away * away.transpose();
     }
 
-    /// The plane of the points; none where there are few or they do not lie on one.
+    /// The plane of the points; none where there are fewer than four, or where they do not lie on a
+    /// plane.
     pub(crate) fn flat(&self) -> Option<PlaneFit> {
         if self.count < NEIGHBORS {
             return None;
@@ -63,7 +61,8 @@ impl Neighborhood {
     }
 }
 
-/// The plane of points by their covariance, in closed form; none where they do not lie on one.
+/// The plane of points with the covariance `spread`, in closed form; none where the points do not
+/// lie on a plane.
 fn flat(spread: &Matrix3<f64>) -> Option<PlaneFit> {
     let mean = spread.trace() / 3.0;
     let rest = spread - Matrix3::identity() * mean;
@@ -80,7 +79,7 @@ fn flat(spread: &Matrix3<f64>) -> Option<PlaneFit> {
     if middle - least < FLAT * most {
         return None;
     }
-    // The rows of what is left without the least spread are at right angles to its axis.
+    // With the least eigenvalue subtracted, the columns are perpendicular to its eigenvector.
     let across = spread - Matrix3::identity() * least;
     let [a, b, c] = [0, 1, 2].map(|i| across.column(i).into_owned());
     let candidates = [a.cross(&b), b.cross(&c), c.cross(&a)];

@@ -2,11 +2,12 @@
 
 use crate::flow::data::{Point, floor};
 
-/// Voxels along an axis on each side of the origin.
+/// Bound on a voxel's index along an axis, on each side of the origin.
 pub(crate) const REACH: f32 = (1 << 20) as f32;
 
-/// The mean of each voxel's points, metres, ordered by voxel: x, then y, then z. Points beyond
-/// [`REACH`] and points that are not finite are left out.
+/// Voxel downsampling to the mean of each voxel's points, metres, with voxels of `side_m` metres.
+/// The means are ordered by voxel: x, then y, then z. Points beyond [`REACH`] voxels and points
+/// that are not finite are dropped.
 pub(crate) fn voxel_mean(points: &[Point], side_m: f32) -> Vec<Point> {
     let is_in_reach = |point: &Point| point.iter().all(|c| (c / side_m).abs() < REACH);
     let rows = (0..points.len() as u32).filter(|&row| is_in_reach(&points[row as usize]));
@@ -15,8 +16,9 @@ pub(crate) fn voxel_mean(points: &[Point], side_m: f32) -> Vec<Point> {
     voxels.map(|voxel| mean(points, voxel)).collect()
 }
 
-/// The first row of each voxel of `side_m` metres, in the order of the rows. Points beyond [`REACH`]
-/// share the outermost voxels. Every number must be finite.
+/// Voxel downsampling to the first row of each voxel of `side_m` metres. The rows are in ascending
+/// order. Points beyond [`REACH`] voxels share the outermost voxels. All coordinates must be
+/// finite.
 pub(crate) fn voxel_first(points: &[Point], side_m: f32) -> Vec<u32> {
     let mut keyed = sorted_by_voxel(points, 0..points.len() as u32, side_m);
     keyed.dedup_by_key(|&mut (voxel, _)| voxel);
@@ -25,7 +27,7 @@ pub(crate) fn voxel_first(points: &[Point], side_m: f32) -> Vec<u32> {
     rows
 }
 
-/// The voxel of each of the rows and the row itself, ordered by voxel and then by row.
+/// The voxel's key of each row and the row itself, ordered by key and then by row.
 fn sorted_by_voxel(
     points: &[Point],
     rows: impl Iterator<Item = u32>,
@@ -38,7 +40,7 @@ fn sorted_by_voxel(
     keyed
 }
 
-/// The number of the point's voxel: 21 bits an axis, x first.
+/// The key of a point's voxel: 21 bits an axis, x in the highest.
 fn key(point: Point, side_m: f32) -> u64 {
     let index = |c: f32| (floor(c / side_m).clamp(-REACH, REACH - 1.0) + REACH) as u64;
     let [x, y, z] = point.map(index);

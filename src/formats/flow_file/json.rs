@@ -1,15 +1,14 @@
-//! Flow as one JSON object: `flow` [[x, y, z], ...], `valid`, and `dynamic`, `ego`, `cluster`,
-//! `confidence` and `clusters` if known.
+//! Flow as one JSON object: `flow` [[x, y, z], ...] in metres, `valid`, and where known `dynamic`,
+//! `ego`, `cluster`, `confidence` and `clusters`.
 //!
-//! Keys of others are stepped over, so that an answer of the service can be read back. It must
-//! not know what else such an answer carries.
+//! Other keys are ignored when reading, so that an answer of the service can be read back.
 
 use std::io::Write;
 
 use crate::flow::{Cluster, Point};
 
 use super::objects::Described;
-use super::{FlowFile, FlowTable};
+use super::table::{FlowFile, FlowTable};
 use crate::formats::error::{FileKind, FormatError};
 use crate::formats::limits::{check_chance, check_value};
 use crate::formats::motion::matrix_rows;
@@ -22,7 +21,7 @@ struct Written<'a> {
     valid: &'a [bool],
     #[serde(skip_serializing_if = "Option::is_none")]
     dynamic: Option<&'a [bool]>,
-    /// Row by row; null where it is not known.
+    /// 4 x 4, row by row; null where the ego motion is unknown.
     ego: Option<[[f64; 4]; 4]>,
     #[serde(skip_serializing_if = "Option::is_none")]
     cluster: Option<&'a [i32]>,

@@ -1,4 +1,4 @@
-//! Clusters as arrays and as JSON, out and back in. It must not know how they were found.
+//! Clusters as npz arrays and as JSON objects: writing and reading.
 
 use std::io::{Seek, Write};
 
@@ -11,7 +11,7 @@ use crate::formats::npy;
 use crate::formats::npz::{Npz, NpzWriter};
 use crate::formats::pair::check_count;
 
-/// Writes what [`super::FlowFormat::Npz`] lists.
+/// Writes the cluster arrays that [`super::FlowFormat::Npz`] lists.
 pub(super) fn put<W: Write + Seek>(
     objects: &Objects,
     npz: &mut NpzWriter<W>,
@@ -43,7 +43,7 @@ pub(super) fn put<W: Write + Seek>(
     values("clusters_confidence", |cluster| cluster.confidence)
 }
 
-/// Reads back the clusters that [`put`] wrote. `None` where there are none.
+/// Reads the clusters that [`put`] writes. `None` where the file has none.
 pub(super) fn take(npz: &mut Npz<'_>) -> Result<Option<Vec<Cluster>>, FormatError> {
     const KIND: FileKind = FileKind::Npz;
     let Some(counts) = npz.column("clusters_points", |row, value| {
@@ -95,7 +95,8 @@ pub(super) fn take(npz: &mut Npz<'_>) -> Result<Option<Vec<Cluster>>, FormatErro
     Ok(Some(clusters.collect()))
 }
 
-/// A cluster in JSON, which has no other numbers than finite ones.
+/// A cluster as a JSON object: center and size in metres, yaw in radians, velocity in m/s, yaw rate
+/// in rad/s. All numbers must be finite, because JSON has no others.
 #[derive(Serialize, Deserialize)]
 pub(super) struct Described {
     points: u32,
@@ -124,7 +125,7 @@ impl From<&Cluster> for Described {
 }
 
 impl Described {
-    /// The cluster, if its numbers can be those of one.
+    /// The cluster, where its numbers are finite and in range. `row` is used in errors.
     pub(super) fn checked(self, kind: FileKind, row: usize) -> Result<Cluster, FormatError> {
         let vectors = [self.center, self.size, self.velocity];
         let values = vectors.iter().flatten().chain([&self.yaw, &self.yaw_rate]);

@@ -1,7 +1,8 @@
-//! Flow back in, in any format that it is written in. It must not know how the flow was found.
+//! Reading of flow files, in every format in which flow is written.
 
-use super::{FLOW_AXES, json, objects};
-use crate::flow::{Cluster, Point};
+use super::table::FLOW_AXES;
+use super::table::FlowFile;
+use super::{json, objects};
 use crate::formats::cloud::read_columns;
 use crate::formats::error::{FileKind, FormatError};
 use crate::formats::feather::{FLOW_COLUMNS, Table};
@@ -13,28 +14,12 @@ use crate::formats::pcd::Pcd;
 use crate::formats::ply::Ply;
 use crate::formats::sniff::recognize;
 
-/// A flow read back, and whatever the file says of its N rows besides.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct FlowFile {
-    /// N displacements, metres.
-    pub flow: Vec<Point>,
-    /// Whether each row has a flow.
-    pub valid: Option<Vec<bool>>,
-    /// Whether each point moves by itself.
-    pub dynamic: Option<Vec<bool>>,
-    /// The cluster of each point; negative where it is of none.
-    pub cluster: Option<Vec<i32>>,
-    /// The chance that each row's flow is right, 0 to 1.
-    pub confidence: Option<Vec<f32>>,
-    /// The clusters themselves; npz and JSON alone hold them.
-    pub clusters: Option<Vec<Cluster>>,
-}
-
 /// Reads back a flow in any of the formats that [`super::write_flow`] writes, recognized by content;
 /// also a pair's `.npz` with `flow` and Argoverse 2's `.feather`.
 ///
 /// # Errors
-/// As for a cloud, and `RowCount` where masks and flow disagree.
+/// As for a cloud, `RowCount` where the columns differ in length, and `Malformed` for the index of
+/// a cluster that does not exist.
 pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatError> {
     let file = match recognize(bytes, name)? {
         FileKind::Npy => FlowFile {
@@ -105,18 +90,18 @@ pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatErr
     Ok(file)
 }
 
-/// Gathers flow and what goes with it from the rows of a PLY or PCD file.
+/// Collects flow and its optional columns from the rows of a PLY or PCD file.
 struct Rows {
     kind: FileKind,
     wanted: Vec<&'static str>,
     file: FlowFile,
 }
 
-/// What takes a row of wanted values.
+/// A callback that takes the index and the wanted values of a row.
 type TakeRow<'a> = &'a mut dyn FnMut(usize, &[f64]) -> Result<(), FormatError>;
 
 impl Rows {
-    /// Of a file that has the columns which `has` says.
+    /// For a file in which the columns exist for which `has` is true.
     fn new(kind: FileKind, has: impl Fn(&str) -> bool) -> Self {
         let mut wanted = FLOW_AXES.to_vec();
         let columns = ["valid", "dynamic", "cluster", "confidence"];

@@ -1,11 +1,11 @@
-//! The queue's files besides the database: whether they are still those that it has open, and how the
-//! last process ended.
+//! Files of the queue besides the database: detection of replaced files, and the marker of a
+//! graceful shutdown.
 
 use std::fs::File;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-/// The queue's files by name, and which they were when it was opened.
+/// Paths of the queue's files, each with its device and inode numbers at opening.
 pub(super) struct Files([(PathBuf, (u64, u64)); 2]);
 
 impl Files {
@@ -16,7 +16,8 @@ impl Files {
         Ok(Self([(one, first), (other, second)]))
     }
 
-    /// Whether the names are still those of the same files: what is written to others is lost.
+    /// Whether the paths still refer to the same files. Writes to a removed or replaced file are
+    /// lost.
     pub(super) fn are_there(&self) -> bool {
         self.0.iter().all(|(path, was)| {
             std::fs::metadata(path).is_ok_and(|about| (about.dev(), about.ino()) == *was)
@@ -24,12 +25,13 @@ impl Files {
     }
 }
 
-/// The file that says by its name whether the last process that had the queue ended in order. It is
-/// made when there is room and only renamed later.
+/// Names of a marker file that records whether the last process shut down gracefully. The file is
+/// normally created once, when there is space, and only renamed later.
 pub(super) const RUNNING: &str = "queue.running";
 pub(super) const STOPPED: &str = "queue.stopped";
 
-/// Renames that file; says whether it had that name. Where it has none it gets the new one.
+/// Renames the marker file and returns whether it had the name `from`. If it did not, creates it as
+/// `to`.
 pub(super) fn run_mark(folder: &Path, from: &str, to: &str) -> bool {
     let renamed = std::fs::rename(folder.join(from), folder.join(to)).is_ok();
     if !renamed && let Err(error) = File::create(folder.join(to)) {

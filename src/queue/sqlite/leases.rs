@@ -1,32 +1,35 @@
-//! A job in a worker's hands: taken, kept by signs of life, put back or brought to its end.
+//! Leases: claiming a job, renewing its lease, and requeueing it or ending its attempt.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use rusqlite::{Connection, OptionalExtension, params};
 
-use super::ends::{End, end};
-use super::rows::{self, COLUMNS, device_code};
-use super::transitions::Effects;
+use super::effects::Effects;
+use super::finish::{End, end};
+use super::rows;
+use super::rows::{COLUMNS, device_code};
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, State};
-use crate::queue::{Committed, Event, Outcome, QueueError, QueueOptions};
+use crate::queue::types::{Committed, Event, Outcome, QueueError, QueueOptions};
 
-/// The statement that finds the first ready job of one need; the test of the plan reads it too.
+/// The statement that finds the first ready job of one device requirement. The query plan test also
+/// uses it.
 pub(super) const FIRST_READY: &str = "SELECT priority, virtual_start, seq FROM jobs \
     INDEXED BY jobs_ready WHERE state = 0 AND ready IS NOT NULL AND delayed = 0 AND device = ?1 \
     ORDER BY priority DESC, virtual_start, seq LIMIT 1";
 
-/// How often a store may fail for one job alone, and how long that one waits: half an hour in all.
+/// Limit and back-off of storage failures that affect a single job. With the default retry delay
+/// the delays add up to about half an hour.
 const MAX_DELAYS: u32 = 13;
 const FIRST_DELAY: Duration = Duration::from_millis(500);
 const LONGEST_DELAY: Duration = Duration::from_secs(300);
 
-/// A ready job's place: the lesser goes first.
+/// Sort key of a ready job: the lowest runs first.
 type Place = (core::cmp::Reverse<i64>, f64, i64);
 
-/// The first job of two needs at most: one that any device may do, or one for this kind. Two
-/// lookups, so that a thousand jobs that wait for the other kind cost nothing.
+/// The first ready job among those for any device and those for this kind. Two index lookups, so
+/// that the jobs that wait for the other kind cost nothing.
 fn first_ready(connection: &Connection, kind: DeviceKind) -> Result<Option<i64>, QueueError> {
     let mut statement = connection.prepare_cached(FIRST_READY)?;
     let mut first: Option<Place> = None;
@@ -42,7 +45,7 @@ fn first_ready(connection: &Connection, kind: DeviceKind) -> Result<Option<i64>,
     Ok(first.map(|(_, _, seq)| seq))
 }
 
-/// Takes the next job for `worker`, whose device is of a kind.
+/// Leases the next job to `worker`, whose device is of this kind.
 pub(super) fn claim(
     connection: &Connection,
     effects: &mut Effects,
@@ -86,7 +89,7 @@ pub(super) fn claim(
     Ok(Some(job))
 }
 
-/// Prolongs a lease and notes progress; nothing where the lease is lost.
+/// Renews a lease and records progress. No effect if the lease is lost.
 pub(super) fn beat(
     connection: &Connection,
     options: &QueueOptions,
@@ -94,21 +97,21 @@ pub(super) fn beat(
     attempt: u32,
     progress: Option<JobProgress>,
 ) -> Result<(), QueueError> {
-    let sql = "UPDATE jobs SET due = ?3, iteration = coalesce(?4, iteration), \
-               max_iterations = coalesce(?5, max_iterations), loss = coalesce(?6, loss) \
+    let sql = "UPDATE jobs SET due = ?3, progress_done = coalesce(?4, progress_done), \
+               progress_total = coalesce(?5, progress_total), loss = coalesce(?6, loss) \
                WHERE id = ?1 AND attempt = ?2 AND state = 1";
     connection.prepare_cached(sql)?.execute(params![
         id.as_bytes(),
         attempt,
         Timestamp::now().after(options.lease).as_millis(),
-        progress.map(|progress| progress.iteration),
-        progress.map(|progress| progress.max_iterations),
+        progress.map(|progress| progress.done),
+        progress.map(|progress| progress.total),
         progress.map(|progress| progress.loss),
     ])?;
     Ok(())
 }
 
-/// Prolongs the lease of a job whose worker is alive.
+/// Sets the remaining lease of a job whose worker is alive.
 pub(super) fn prolong(
     connection: &Connection,
     id: JobId,
@@ -121,7 +124,7 @@ pub(super) fn prolong(
     Ok(())
 }
 
-/// Forgets the crashes before a snapshot.
+/// Resets the crash counter after a snapshot.
 pub(super) fn snapshot_kept(
     connection: &Connection,
     id: JobId,
@@ -134,7 +137,8 @@ pub(super) fn snapshot_kept(
     Ok(())
 }
 
-/// Ends an attempt, if it is the one that holds the job.
+/// Ends an attempt. The attempt number is the fencing token: only the attempt that holds the job
+/// counts.
 pub(super) fn finish(
     connection: &Connection,
     effects: &mut Effects,
@@ -147,7 +151,7 @@ pub(super) fn finish(
         Some(job) if job.state == State::Running && job.attempt == attempt => job,
         _ => return Ok(Committed::Fenced),
     };
-    // What comes after its end was asked for is not wanted any more.
+    // Any outcome after a cancellation request counts as cancelled.
     let outcome = if job.cancel_requested {
         Outcome::Cancelled
     } else {
@@ -187,7 +191,7 @@ pub(super) fn finish(
     Ok(Committed::Yes(state))
 }
 
-/// One failure more: another attempt after a while, or the end.
+/// Counts a failure: the job is retried after a delay, or ends.
 pub(super) fn fail(
     connection: &Connection,
     effects: &mut Effects,
@@ -209,8 +213,8 @@ pub(super) fn fail(
     end(connection, effects, options, job, State::Failed, &how)
 }
 
-/// The store has failed for this job alone: it goes behind the others for a while, longer each time,
-/// and is given up in the end.
+/// Counts a storage failure that affects only this job: it is requeued with growing delays, and
+/// becomes a dead letter in the end.
 fn delay(
     connection: &Connection,
     effects: &mut Effects,
@@ -227,7 +231,7 @@ fn delay(
     give_up(connection, effects, options, job, error)
 }
 
-/// One death in its run more: another attempt at once, or the end.
+/// Counts a crash: the job is retried at once, or becomes a dead letter.
 pub(super) fn crash(
     connection: &Connection,
     effects: &mut Effects,
@@ -242,7 +246,7 @@ pub(super) fn crash(
     give_up(connection, effects, options, job, error)
 }
 
-/// Adds one to a job's counter, which is a column of its row.
+/// Increments a counter column of a job and returns its new value.
 fn count(connection: &Connection, job: &Job, counter: &str) -> Result<u32, QueueError> {
     let sql =
         format!("UPDATE jobs SET {counter} = {counter} + 1 WHERE id = ?1 RETURNING {counter}");
@@ -266,7 +270,7 @@ fn give_up(
     end(connection, effects, options, job, State::Failed, &how)
 }
 
-/// Puts a running job back where it was in the queue; its fence stays with the lost attempt.
+/// Requeues a running job at its previous position. The attempt that held it is fenced off.
 pub(super) fn requeue_running(
     connection: &Connection,
     effects: &mut Effects,

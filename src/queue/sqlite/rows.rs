@@ -1,16 +1,16 @@
-//! A row to a job and its parts to numbers.
+//! Conversion between database rows and jobs.
 
 use rusqlite::{Connection, OptionalExtension, Row};
 
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, State, Tenant};
-use crate::queue::QueueError;
+use crate::queue::types::QueueError;
 
 /// The columns that [`job`] reads, in its order.
 pub(super) const COLUMNS: &str = "id, tenant, kind, parent, place, pairs, pairs_left, priority, \
-    state, durable, attempt, cost, options, created, started, finished, deadline, iteration, \
-    max_iterations, loss, stop_reason, error_code, error_message, error_retryable, dead, \
-    cancel_requested, report, device, backward, after, followed, ready, sees_from, sees_to, \
+    state, durable, attempt, cost, options, created, started, finished, deadline, progress_done, \
+    progress_total, loss, stop_reason, error_code, error_message, error_retryable, dead, \
+    cancel_requested, report, device, backward, after, has_dependents, ready, sees_from, sees_to, \
     crashes";
 
 pub(super) fn state_code(state: State) -> i64 {
@@ -32,7 +32,7 @@ pub(super) fn priority_code(priority: Priority) -> i64 {
     }
 }
 
-/// What a job's need is written as: a number of [`DEVICES`].
+/// The code of a job's device requirement: its index in [`DEVICES`].
 pub(super) fn device_code(device: Option<DeviceKind>) -> i64 {
     match device {
         None => 0,
@@ -41,7 +41,7 @@ pub(super) fn device_code(device: Option<DeviceKind>) -> i64 {
     }
 }
 
-/// Every need, in the order of its codes.
+/// Every device requirement, in the order of its codes.
 pub(super) const DEVICES: [Option<DeviceKind>; 3] =
     [None, Some(DeviceKind::Cpu), Some(DeviceKind::Gpu)];
 
@@ -56,7 +56,7 @@ pub(super) fn kind_code(kind: Kind) -> i64 {
     }
 }
 
-/// The place of a code in a list of all values.
+/// Decodes a column as an index into a list of all values.
 fn from_code<T: Copy>(row: &Row<'_>, column: usize, all: &[T]) -> rusqlite::Result<T> {
     let code: i64 = row.get(column)?;
     let found = usize::try_from(code).ok().and_then(|code| all.get(code));
@@ -75,13 +75,13 @@ pub(super) fn tenant_at(row: &Row<'_>, column: usize) -> rusqlite::Result<Tenant
         .map_err(|_| rusqlite::Error::InvalidColumnType(column, name, rusqlite::types::Type::Text))
 }
 
-/// One row as a job.
+/// Converts one row to a job.
 pub(super) fn job(row: &Row<'_>) -> rusqlite::Result<Job> {
     let moment = |column: usize| -> rusqlite::Result<Option<Timestamp>> {
         let millis: Option<i64> = row.get(column)?;
         Ok(millis.map(Timestamp::from_millis))
     };
-    let iteration: Option<u32> = row.get(17)?;
+    let done: Option<u32> = row.get(17)?;
     let code: Option<String> = row.get(21)?;
     let parent: Option<[u8; 16]> = row.get(3)?;
     let after: Option<[u8; 16]> = row.get(29)?;
@@ -103,11 +103,11 @@ pub(super) fn job(row: &Row<'_>) -> rusqlite::Result<Job> {
         started: moment(14)?,
         finished: moment(15)?,
         deadline: moment(16)?,
-        progress: match iteration {
+        progress: match done {
             None => None,
-            Some(iteration) => Some(JobProgress {
-                iteration,
-                max_iterations: row.get(18)?,
+            Some(done) => Some(JobProgress {
+                done,
+                total: row.get(18)?,
                 loss: row.get(19)?,
             }),
         },
@@ -126,26 +126,26 @@ pub(super) fn job(row: &Row<'_>) -> rusqlite::Result<Job> {
         device: device_at(row, 27)?,
         backward: row.get(28)?,
         after: after.map(JobId::from_bytes),
-        followed: row.get(30)?,
+        has_dependents: row.get(30)?,
         ready: moment(31)?,
         sees: [row.get(32)?, row.get(33)?],
         crashes: row.get(34)?,
     })
 }
 
-/// The job of a name, if there is one.
+/// The job with this id, if there is one.
 pub(super) fn find(connection: &Connection, id: JobId) -> Result<Option<Job>, QueueError> {
     let sql = format!("SELECT {COLUMNS} FROM jobs INDEXED BY jobs_id WHERE id = ?1");
     let mut statement = connection.prepare_cached(&sql)?;
     Ok(statement.query_row([id.as_bytes()], job).optional()?)
 }
 
-/// The job of a name.
+/// The job with this id.
 pub(super) fn get(connection: &Connection, id: JobId) -> Result<Job, QueueError> {
     find(connection, id)?.ok_or(QueueError::NotFound)
 }
 
-/// The pairs of a sequence, in the order of their turns.
+/// The pairs of a sequence, in the order of submission.
 pub(super) fn pairs(connection: &Connection, parent: JobId) -> Result<Vec<Job>, QueueError> {
     let sql =
         format!("SELECT {COLUMNS} FROM jobs INDEXED BY jobs_parent WHERE parent = ?1 ORDER BY seq");

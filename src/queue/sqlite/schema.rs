@@ -1,21 +1,22 @@
-//! The table, its indexes, and how an older file becomes a newer one.
+//! The table, its indexes, and the check of the schema version.
 //!
-//! One row a job. Every statement that must stay fast at a million rows names its index, and a
-//! test reads the plan: the planner's own choice costs a thousand times more.
+//! One row per job. Every statement that must stay fast at a million rows names its index, and a
+//! test checks its query plan: the planner's own choice costs a thousand times more.
 
 use std::time::Duration;
 
 use rusqlite::{Connection, TransactionBehavior};
 
-use crate::queue::QueueError;
+use crate::queue::types::QueueError;
 
-/// What this program reads and writes; kept in `user_version`.
-pub(super) const VERSION: i64 = 5;
+/// The schema version that this program reads and writes; stored in `user_version`.
+pub(super) const VERSION: i64 = 6;
 
-/// `due` is when the sweeper looks at a row next: the end of a queued job's time or of its delay,
-/// of a running job's lease, of an ended job's retention. `ready` is since when a job could be
-/// leased: null while it comes after one that has not ended, and for a sequence until all of its
-/// pairs have succeeded and something is left to do.
+/// `due` is the next time at which the expiry handles a row: the expiry or the end of the retry
+/// delay of a queued job, the end of a running job's lease, or the end of an ended job's retention.
+/// `ready` is the time since which a job can be leased. It is null while the job follows one that
+/// has not ended. For a sequence it is null until all of its pairs have succeeded and its closing
+/// job is queued.
 const TABLE: &str = "
 CREATE TABLE jobs (
     seq INTEGER PRIMARY KEY,
@@ -28,7 +29,7 @@ CREATE TABLE jobs (
     sees_from INTEGER NOT NULL,
     sees_to INTEGER NOT NULL,
     after BLOB,
-    followed INTEGER NOT NULL,
+    has_dependents INTEGER NOT NULL,
     ready INTEGER,
     pairs INTEGER NOT NULL,
     pairs_left INTEGER NOT NULL,
@@ -55,8 +56,8 @@ CREATE TABLE jobs (
     expires INTEGER NOT NULL,
     due INTEGER,
     worker TEXT,
-    iteration INTEGER,
-    max_iterations INTEGER,
+    progress_done INTEGER,
+    progress_total INTEGER,
     loss REAL,
     stop_reason TEXT,
     error_code TEXT,
@@ -81,7 +82,7 @@ CREATE INDEX jobs_list_by_state ON jobs (tenant, state, id) WHERE parent IS NULL
 CREATE INDEX jobs_parent ON jobs (parent) WHERE parent IS NOT NULL;
 ";
 
-/// Opens the connection that writes.
+/// Opens the connection of the writer.
 pub(super) fn open_writer(path: &std::path::Path) -> Result<Connection, QueueError> {
     let mut connection = open(path)?;
     connection.pragma_update(None, "journal_mode", "WAL")?;
@@ -89,7 +90,7 @@ pub(super) fn open_writer(path: &std::path::Path) -> Result<Connection, QueueErr
     Ok(connection)
 }
 
-/// Opens a connection that only reads.
+/// Opens a read-only connection.
 pub(super) fn open_reader(path: &std::path::Path) -> Result<Connection, QueueError> {
     let connection = open(path)?;
     connection.pragma_update(None, "query_only", true)?;
@@ -105,10 +106,11 @@ fn open(path: &std::path::Path) -> Result<Connection, QueueError> {
     Ok(connection)
 }
 
-/// A number that no other queue has, most likely: payloads lie elsewhere, and say whose they are.
+/// A random number that identifies this queue. The payload store records it, to detect a mismatch
+/// of the two.
 fn identity() -> i32 {
     let bytes = *crate::job::JobId::fresh().as_bytes();
-    // The last bytes of a name are random; zero is what a file without an identity has.
+    // The last bytes of a job id are random. Zero means that a file has no identity.
     i32::from_le_bytes([bytes[12], bytes[13], bytes[14], bytes[15] | 1])
 }
 
@@ -141,7 +143,7 @@ fn migrate(connection: &mut Connection) -> Result<(), QueueError> {
 
 impl From<rusqlite::Error> for QueueError {
     fn from(error: rusqlite::Error) -> Self {
-        // Whatever a database's store fails in is the machine's fault.
+        // Every database error counts as a fault of the machine, not of a job.
         match error.sqlite_error_code() {
             Some(rusqlite::ErrorCode::DiskFull) => Self::Full(error.to_string()),
             _ => Self::Store(error.to_string()),

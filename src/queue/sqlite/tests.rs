@@ -1,4 +1,4 @@
-//! The embedded queue against the contract, and what only it must show: plans, locks, files.
+//! Contract tests of the embedded queue, and tests of its query plans, lock and files.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -6,12 +6,14 @@ use std::time::{Duration, Instant};
 use rusqlite::params;
 use tokio::sync::mpsc;
 
-use super::{SqliteQueue, leases, schema, sweep, turns};
+use super::store::SqliteQueue;
+use super::{expiry, fair_queue, leases, schema};
 use crate::job::{DeviceKind, State};
-use crate::queue::contract::{Stand, queue_contract, submission};
-use crate::queue::{Event, Queue, QueueError, QueueOptions, Signal};
+use crate::queue::contract_tests::{Stand, queue_contract, submission};
+use crate::queue::lease::Signal;
+use crate::queue::types::{Event, Queue, QueueError, QueueOptions};
 
-/// A folder in which one queue after the other is opened.
+/// A folder in which the queue is opened repeatedly.
 struct Folder(tempfile::TempDir);
 
 impl Folder {
@@ -23,7 +25,7 @@ impl Folder {
 impl Stand for Folder {
     fn open(&mut self, options: QueueOptions) -> (Arc<dyn Queue>, mpsc::UnboundedReceiver<Event>) {
         let (events, heard) = mpsc::unbounded_channel();
-        // The one before may take a moment to let go of its lock.
+        // The previous queue may release its lock with a delay.
         let patience = Instant::now() + Duration::from_secs(10);
         loop {
             match SqliteQueue::open(self.0.path(), options.clone(), events.clone()) {
@@ -37,10 +39,10 @@ impl Stand for Folder {
 
 queue_contract!(Folder::new());
 
-/// Rows of the backlog that the plans are tried on.
+/// Rows in the table of the query plan test.
 const BACKLOG: u32 = 20_000;
 
-/// What the planner does with a statement.
+/// The query plan of a statement.
 fn plan(connection: &rusqlite::Connection, sql: &str, parameters: usize) -> String {
     let mut statement = connection
         .prepare(&format!("EXPLAIN QUERY PLAN {sql}"))
@@ -67,7 +69,7 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
                 "INSERT INTO jobs (id, tenant, kind, place, pairs, pairs_left, priority, state, \
                  durable, delayed, attempt, failures, crashes, delays, cost, virtual_start, \
                  virtual_finish, options, created, expires, due, error_retryable, dead, \
-                 cancel_requested, device, backward, after, followed, ready, closes, \
+                 cancel_requested, device, backward, after, has_dependents, ready, closes, \
                  sees_from, sees_to) \
                  VALUES (?1, 't', 0, 0, 0, 0, ?2, 0, 1, 0, 0, 0, 0, 0, \
                  1.0, ?1, ?1 + 1, '{}', ?1, 9, 9, 0, 0, 0, ?3, 0, ?1, 0, ?1, 0, 0, 2)",
@@ -82,7 +84,7 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
     assert!(claim.contains("jobs_ready (device=?)"), "{claim}");
     for (sql, parameters) in [
         (leases::FIRST_READY.to_owned(), 1),
-        (turns::FOLLOWERS.to_owned(), 1),
+        (fair_queue::FOLLOWERS.to_owned(), 1),
         (
             "SELECT ready FROM jobs INDEXED BY jobs_age WHERE state = 0 AND ready IS NOT NULL \
              ORDER BY ready LIMIT 1"
@@ -113,7 +115,7 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
             "{sql}: {plan}"
         );
     }
-    assert!(sweep::next_due(&connection).expect("an answer").is_some());
+    assert!(expiry::next_due(&connection).expect("an answer").is_some());
 }
 
 #[test]
@@ -180,25 +182,25 @@ async fn a_lease_ends_by_signs_of_life_and_not_by_the_clock() {
         .lease("worker", DeviceKind::Cpu)
         .await
         .expect("a lease");
-    // As if the clock had been set a day forward, again and again.
+    // Simulates a clock that was set a day forward, several times.
     let path = folder.0.path().join("queue.sqlite3");
     let clock = schema::open_writer(&path).expect("the file");
     for _ in 0..4 {
         clock
             .execute("UPDATE jobs SET due = 1 WHERE state = 1", [])
             .expect("set");
-        // Whatever is written makes it look again.
+        // Any write triggers the expiry check.
         queue.probe().await.expect("it can be written");
         tokio::time::sleep(Duration::from_millis(300)).await;
-        assert_eq!(held.pulse.beat(None), Signal::Continue);
+        assert_eq!(held.heartbeat.beat(None), Signal::Continue);
         let due: i64 = clock
             .query_row("SELECT due FROM jobs", [], |row| row.get(0))
             .expect("a row");
         assert!(due > 1, "it was not looked at");
     }
-    // Silence ends it all the same.
+    // Without heartbeats the lease still expires.
     let silent = async {
-        while held.pulse.signal() != Signal::Lost {
+        while held.heartbeat.signal() != Signal::Lost {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     };
@@ -233,7 +235,7 @@ async fn a_job_that_an_orderly_stop_could_not_give_back_is_not_blamed() {
         drop((held, queue));
         (queue, _) = folder.open(options.clone());
     }
-    // A death is one.
+    // A restart without a graceful shutdown counts as a crash.
     let held = queue
         .lease("worker", DeviceKind::Cpu)
         .await

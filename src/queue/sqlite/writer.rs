@@ -1,7 +1,7 @@
-//! The one thread that writes: it gathers what is asked at the same time into one transaction.
+//! The writer thread: groups concurrent changes into one transaction (group commit).
 //!
-//! A commit waits for the disk only if somebody was promised something by it: leases, signs of
-//! life and jobs that die with their caller do not wait. It must not know what is written.
+//! A commit waits for the disk only if it contains a durable change. Leases, heartbeats and
+//! ephemeral jobs do not wait. Independent of the content of the changes.
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
@@ -11,22 +11,22 @@ use std::time::{Duration, Instant};
 use rusqlite::Connection;
 use tokio::sync::oneshot;
 
-use super::Shared;
-use super::sweep;
-use super::transitions::Effects;
+use super::effects::Effects;
+use super::expiry;
+use super::shared::Shared;
 use crate::clock::Timestamp;
-use crate::queue::{QueueError, QueueOptions};
+use crate::queue::types::{QueueError, QueueOptions};
 
-/// Changes that one transaction takes at most.
+/// Maximum number of changes in one transaction.
 const AT_ONCE: usize = 64;
 
-/// The longest sleep: how late a clock that was set may be noticed.
+/// Maximum sleep, and so the delay until a change of the wall clock is noticed.
 const MAX_SLEEP: Duration = Duration::from_secs(1);
 
-/// What a change does, inside a transaction.
+/// A change, run inside a transaction.
 type Change = Box<dyn FnOnce(&Connection, &mut Effects) -> Reply + Send>;
 
-/// Tells the caller, once it is known whether the transaction stands.
+/// Sends the result to the caller after the commit or rollback.
 type Reply = Box<dyn FnOnce(Result<(), QueueError>) + Send>;
 
 struct Command {
@@ -34,14 +34,14 @@ struct Command {
     change: Change,
 }
 
-/// The way to the thread. It ends when the last of these is gone.
+/// Handle to the writer thread, which ends when the last handle is dropped.
 #[derive(Clone)]
 pub(super) struct Writer {
     commands: Sender<Command>,
 }
 
 impl Writer {
-    /// Starts the thread. `connection` is already recovered.
+    /// Starts the thread. The recovery of `connection` must be complete.
     pub(super) fn start(
         connection: Connection,
         options: QueueOptions,
@@ -59,7 +59,7 @@ impl Writer {
         Ok(Self { commands })
     }
 
-    /// Makes a change and waits until it stands; until it is on disk, where it is `durable`.
+    /// Makes a change and waits for its commit; if `durable`, until it is on disk.
     pub(super) async fn write<T: Send + 'static>(
         &self,
         durable: bool,
@@ -84,7 +84,7 @@ impl Writer {
         answered.await.map_err(|_| lost())?
     }
 
-    /// Makes a change that nobody waits for.
+    /// Makes a change without waiting for it.
     pub(super) fn write_later(
         &self,
         change: impl FnOnce(&Connection, &mut Effects) -> Result<(), QueueError> + Send + 'static,
@@ -105,7 +105,8 @@ impl Writer {
     }
 }
 
-/// Undoes what a change did if it fails half-way, and leaves the transaction alone.
+/// Runs a change in a savepoint. If it fails, its statements are undone and the transaction
+/// continues.
 fn in_savepoint<T>(
     connection: &Connection,
     change: impl FnOnce() -> Result<T, QueueError>,
@@ -121,13 +122,61 @@ fn in_savepoint<T>(
     done
 }
 
+/// Commits the commands in one transaction and, with `sweep_at`, does what is due at that time.
+/// Returns whether nothing that is due was left undone.
+fn commit(
+    connection: &Connection,
+    options: &QueueOptions,
+    shared: &Shared,
+    commands: Vec<Command>,
+    sweep_at: Option<Instant>,
+) -> bool {
+    let mut effects = Effects::default();
+    let mut replies = Vec::with_capacity(commands.len());
+    let mut swept = false;
+    let done = transact(
+        connection,
+        commands,
+        &mut effects,
+        &mut replies,
+        |effects| {
+            let Some(now) = sweep_at else {
+                swept = true;
+                return;
+            };
+            let lease_left = |id| shared.lease_left(id, options.lease, now);
+            let mut own = Effects::default();
+            let sweep = || expiry::sweep(connection, &mut own, options, lease_left);
+            match in_savepoint(connection, sweep) {
+                Ok(()) => {
+                    swept = true;
+                    effects.merge(own);
+                }
+                // The commands of the same transaction are committed all the same.
+                Err(error) => {
+                    tracing::error!(%error, "the queue cannot look after what is due");
+                }
+            }
+        },
+    );
+    if done.is_ok() {
+        shared.apply(effects);
+    } else if !connection.is_autocommit() {
+        let _rolled_back = connection.execute_batch("ROLLBACK");
+    }
+    for reply in replies {
+        reply(done.clone());
+    }
+    swept && done.is_ok()
+}
+
 fn run(
     connection: &Connection,
     options: &QueueOptions,
     shared: &Shared,
     inbox: &Receiver<Command>,
 ) {
-    let mut next_due = sweep::next_due(connection).unwrap_or(None);
+    let mut next_due = expiry::next_due(connection).unwrap_or(None);
     let mut awake = Instant::now();
     loop {
         let now = Timestamp::now();
@@ -155,46 +204,17 @@ fn run(
         if commands.is_empty() && !sweeping {
             continue;
         }
-        let mut effects = Effects::default();
-        let mut replies = Vec::with_capacity(commands.len());
-        let mut swept = false;
-        let lease_left = |id| shared.lease_left(id, options.lease, awake);
-        let done = transact(
+        let swept = commit(
             connection,
+            options,
+            shared,
             commands,
-            &mut effects,
-            &mut replies,
-            |effects| {
-                if !sweeping {
-                    swept = true;
-                    return;
-                }
-                let mut own = Effects::default();
-                let sweep = || sweep::sweep(connection, &mut own, options, lease_left);
-                match in_savepoint(connection, sweep) {
-                    Ok(()) => {
-                        swept = true;
-                        effects.merge(own);
-                    }
-                    // What others asked for at the same time stands all the same.
-                    Err(error) => {
-                        tracing::error!(%error, "the queue cannot look after what is due");
-                    }
-                }
-            },
+            sweeping.then_some(awake),
         );
-        if done.is_ok() {
-            shared.apply(effects);
-        } else if !connection.is_autocommit() {
-            let _rolled_back = connection.execute_batch("ROLLBACK");
-        }
-        for reply in replies {
-            reply(done.clone());
-        }
         // A store that fails is not asked again at once.
         let later = Some(Timestamp::now().after(MAX_SLEEP));
-        next_due = match sweep::next_due(connection) {
-            Ok(due) if swept && done.is_ok() => due,
+        next_due = match expiry::next_due(connection) {
+            Ok(due) if swept => due,
             Ok(due) => due.max(later),
             Err(error) => {
                 tracing::error!(%error, "the queue's store cannot be read");
@@ -204,8 +224,8 @@ fn run(
     }
 }
 
-/// Refuses to go on where the transaction is gone: SQLite takes all of it back when a statement meets
-/// a fault of the disk or of memory, and what came next would stand alone.
+/// Fails if the transaction is gone. SQLite rolls it back when a statement meets a disk or memory
+/// fault, and later statements would run outside of it.
 fn check_transaction(connection: &Connection) -> Result<(), QueueError> {
     if connection.is_autocommit() {
         let gone = "a fault has taken the transaction back".to_owned();
@@ -214,7 +234,7 @@ fn check_transaction(connection: &Connection) -> Result<(), QueueError> {
     Ok(())
 }
 
-/// One transaction over all commands.
+/// Runs all commands in one transaction.
 fn transact(
     connection: &Connection,
     commands: Vec<Command>,
@@ -254,7 +274,7 @@ mod tests {
             });
             Box::new(move |committed| assert!(committed.and(done.map(drop)).is_err()))
         };
-        // What SQLite does by itself when it meets a fault of the disk.
+        // SQLite does this by itself after a disk fault.
         let fault = |connection: &Connection, _: &mut Effects| -> Reply {
             connection.execute_batch("ROLLBACK").expect("a transaction");
             Box::new(|committed| assert!(committed.is_err()))

@@ -1,4 +1,4 @@
-//! The trainer against the method in double precision, and what must not change its bits.
+//! Tests of the trainer: against the method in double precision, and for reproducible bits.
 
 use super::*;
 use crate::flow::cpu::backend::CpuBackend;
@@ -6,10 +6,11 @@ use crate::flow::cpu::isa::Isa;
 use crate::flow::data::{Random, Uncontrolled};
 use crate::flow::distance::{DistanceOptions, DistanceTransform};
 use crate::flow::field::{Backend, MOST_POINTS, Transform, first_losses};
+use crate::flow::options::FieldOptions;
 use crate::flow::options::Preset;
 use std::sync::Mutex;
 
-/// Collects the losses.
+/// Records the losses.
 #[derive(Default)]
 struct Losses(Mutex<Vec<f64>>);
 
@@ -22,7 +23,7 @@ impl Control for Losses {
     }
 }
 
-/// A wall and a box in front of it, and the same moved by a quarter of a metre.
+/// A wall and a box in front of it, and the same cloud moved by a quarter of a metre.
 fn clouds(points: usize) -> [Vec<Point>; 2] {
     let mut random = Random::new(5);
     let source: Vec<Point> = (0..points)
@@ -47,7 +48,7 @@ fn transform(
     threads: usize,
     source: &[Point],
     target: &[Point],
-    options: &Options,
+    options: &FieldOptions,
 ) -> Box<dyn Transform> {
     let backend = CpuBackend::with_isa(isa, Some(threads)).expect("threads");
     backend
@@ -55,11 +56,26 @@ fn transform(
         .expect("small clouds")
 }
 
-fn fitted(isa: Isa, threads: usize, options: &Options, steps: usize) -> (Vec<f64>, Vec<Point>) {
+fn fitted(
+    isa: Isa,
+    threads: usize,
+    options: &FieldOptions,
+    steps: usize,
+) -> (Vec<f64>, Vec<Point>) {
+    fitted_from(0, isa, threads, options, steps)
+}
+
+fn fitted_from(
+    seed: u64,
+    isa: Isa,
+    threads: usize,
+    options: &FieldOptions,
+    steps: usize,
+) -> (Vec<f64>, Vec<Point>) {
     let [source, target] = clouds(1500);
     let losses = Losses::default();
     let transform = transform(isa, threads, &source, &target, options);
-    let mut trainer = transform.start(&source, options).expect("a trainer");
+    let mut trainer = transform.start(&source, options, seed).expect("a trainer");
     trainer
         .advance(steps, &losses)
         .expect("the cpu does not fail");
@@ -69,18 +85,18 @@ fn fitted(isa: Isa, threads: usize, options: &Options, steps: usize) -> (Vec<f64
 
 #[test]
 fn the_first_losses_are_those_of_the_method_in_double_precision() {
-    // Single against double precision, over ten steps that each move every weight by 0.008.
+    // Single against double precision, over ten steps that each change every weight by about 0.008.
     const TOLERANCE: f64 = 2e-3;
     const STEPS: i32 = 10;
     let [source, target] = clouds(200);
-    let options = Preset::Paper.options(None);
+    let options = Preset::Paper.field();
     let distance = DistanceTransform::build(&source, &target, &DistanceOptions::default())
         .expect("small clouds");
-    let expected = first_losses(&source, &distance, options.seed, 0.008, STEPS);
+    let expected = first_losses(&source, &distance, 0, 0.008, STEPS);
     for isa in Isa::available() {
         let losses = Losses::default();
         let transform = transform(isa, 2, &source, &target, &options);
-        let mut trainer = transform.start(&source, &options).expect("a trainer");
+        let mut trainer = transform.start(&source, &options, 0).expect("a trainer");
         trainer
             .advance(STEPS as usize, &losses)
             .expect("the cpu does not fail");
@@ -95,8 +111,8 @@ fn the_first_losses_are_those_of_the_method_in_double_precision() {
 
 #[test]
 fn the_number_of_threads_does_not_change_a_bit() {
-    for preset in Preset::FITTED {
-        let mut options = preset.options(None);
+    for preset in Preset::with_field() {
+        let mut options = preset.field();
         options.batch = options.batch.map(|_| 700);
         let [one, two, five] =
             [1, 2, 5].map(|threads| fitted(Isa::available()[0], threads, &options, 12));
@@ -107,11 +123,11 @@ fn the_number_of_threads_does_not_change_a_bit() {
 
 #[test]
 fn registers_of_any_width_give_the_same_bits_where_they_fuse() {
-    // Says something where the machine has both sets, as one with AVX-512 does.
+    // Only meaningful on a machine with both sets, such as one with AVX-512.
     let fusing = Isa::available().into_iter();
     let fusing: Vec<Isa> = fusing.filter(|&isa| isa != Isa::Portable).collect();
-    for preset in Preset::FITTED {
-        let options = preset.options(None);
+    for preset in Preset::with_field() {
+        let options = preset.field();
         let all: Vec<_> = fusing
             .iter()
             .map(|&isa| fitted(isa, 2, &options, 30))
@@ -122,27 +138,29 @@ fn registers_of_any_width_give_the_same_bits_where_they_fuse() {
 
 #[test]
 fn more_chunks_than_are_held_at_once_are_each_added_up_once() {
-    // Of the largest: single precision over 8,000 points, one after the other.
+    // Relative to the largest gradient: single-precision sums over 8,000 points, one after the
+    // other.
     const TOLERANCE: f64 = 1e-4;
     let points = 33 * MOST_POINTS;
     let chunks = Chunks::new(points).count;
     assert!(chunks > HELD);
     let [source, target] = clouds(points);
-    let mut options = Preset::Paper.options(None);
+    let mut options = Preset::Paper.field();
     options.early_stop = None;
     let transform = transform(Isa::available()[0], 2, &source, &target, &options);
-    let mut trainer = transform.start(&source, &options).expect("a trainer");
+    let mut trainer = transform.start(&source, &options, 0).expect("a trainer");
     trainer
         .advance(1, &Uncontrolled)
         .expect("the cpu does not fail");
-    // After one step from nothing the mean of the gradients is a tenth of the gradient: the sum of
-    // the chunks', each of which a trainer of its points alone finds but for the batch's weight.
+    // After one step from zero moments, the mean of the gradients is a tenth of the gradient. That
+    // is the sum of the chunks' gradients. A trainer of one chunk's points finds that chunk's
+    // gradient, up to the weight of the batch.
     let whole = trainer.state().expect("the cpu does not fail").moments[0].clone();
     let mut sums = vec![0.0f64; whole.as_slice().len()];
     for chunk in 0..chunks {
         let own = Chunks::new(points).points(chunk);
         let own = &source[own.start..own.end.min(points)];
-        let mut part = transform.start(own, &options).expect("a trainer");
+        let mut part = transform.start(own, &options, 0).expect("a trainer");
         part.advance(1, &Uncontrolled)
             .expect("the cpu does not fail");
         let state = part.state().expect("the cpu does not fail");
@@ -160,29 +178,28 @@ fn more_chunks_than_are_held_at_once_are_each_added_up_once() {
 
 #[test]
 fn seeds_give_different_fields() {
-    let mut options = Preset::Neural.options(None);
-    let first = fitted(Isa::Portable, 1, &options, 3);
-    options.seed = 1;
-    assert_ne!(first, fitted(Isa::Portable, 1, &options, 3));
+    let options = Preset::Neural.field();
+    let seeded = |seed| fitted_from(seed, Isa::Portable, 1, &options, 3);
+    assert_ne!(seeded(0), seeded(1));
 }
 
 #[test]
 fn a_zero_start_is_no_flow() {
-    let options = Preset::Neural.options(None);
+    let options = Preset::Neural.field();
     let (_, flow) = fitted(Isa::available()[0], 1, &options, 0);
     assert!(flow.iter().flatten().all(|&f| f == 0.0));
 }
 
 #[test]
 fn the_best_field_has_the_lowest_loss_and_not_the_last() {
-    let mut options = Preset::Paper.options(None);
+    let mut options = Preset::Paper.field();
     options.early_stop = None;
-    // Steps this long overshoot after a while.
+    // A step size this large overshoots after some iterations.
     options.learning_rate = 0.05;
     let [source, target] = clouds(500);
     let losses = Losses::default();
     let transform = transform(Isa::available()[0], 2, &source, &target, &options);
-    let mut trainer = transform.start(&source, &options).expect("a trainer");
+    let mut trainer = transform.start(&source, &options, 0).expect("a trainer");
     trainer.advance(40, &losses).expect("the cpu does not fail");
     let losses = losses.0.into_inner().expect("no test panics in it");
     let lowest = losses.iter().copied().fold(f64::INFINITY, f64::min);

@@ -1,10 +1,11 @@
-// Single operations as IEEE 754 and the CPU round them, or as near to that as a driver lets them be.
+// Single operations rounded as in IEEE 754 and on the CPU, as far as the driver allows.
 //
-// A driver may fuse a product with the sum that it goes into, and may round quotients and roots
-// carelessly; either sends the bits of an optimization elsewhere. Where a product is meant to be
-// fused, kernels say fma. Needs a Part, whose zero no compiler knows.
+// A driver may fuse a product with the sum that follows it, and may round quotients and square
+// roots inexactly. Either changes the bits of an optimization. Where a product is meant to be
+// fused, kernels call fma. Needs `part` of type Part, whose field `nothing` is a zero that no
+// compiler can assume.
 
-// A product that is rounded before anything is added to it.
+// A product that is rounded before it is added to anything.
 fn rounded(product: f32) -> f32 {
     return bitcast<f32>(bitcast<u32>(product) ^ part.nothing);
 }
@@ -21,15 +22,16 @@ fn rounded4(product: vec4<f32>) -> vec4<f32> {
     return bitcast<vec4<f32>>(bitcast<vec4<u32>>(product) ^ vec4(part.nothing));
 }
 
-// Whether fma rounds once: what it leaves of a square beyond the rounded one is not nothing then.
+// Whether fma rounds only once. Then the difference between an exact square and the rounded one is
+// not zero.
 fn fuses() -> bool {
     let slightly_more_than_one = bitcast<f32>(0x3f800800u ^ part.nothing);
     let square = rounded(slightly_more_than_one * slightly_more_than_one);
     return fma(slightly_more_than_one, slightly_more_than_one, -square) != 0.0;
 }
 
-// A quotient. Where fma rounds once it tells what a quotient is short of, and what a reciprocal is:
-// twice, since the first correction may itself be careless.
+// A quotient. If fma rounds once, it yields the remainders by which reciprocal and quotient are
+// corrected. The quotient is corrected twice, because the first correction may still be inexact.
 fn quotient(dividend: vec4<f32>, divisor: vec4<f32>) -> vec4<f32> {
     var about = rounded4(dividend / divisor);
     if !fuses() { return about; }
@@ -41,7 +43,7 @@ fn quotient(dividend: vec4<f32>, divisor: vec4<f32>) -> vec4<f32> {
     return rounded4(about);
 }
 
-// A root, likewise; that of zero is exact.
+// A square root, corrected in the same manner. The root of zero is exact.
 fn root(square: vec4<f32>) -> vec4<f32> {
     let first = rounded4(sqrt(square));
     if !fuses() { return first; }

@@ -1,8 +1,10 @@
-// The derivative of the loss by every hidden feature, over one tile of points a workgroup.
+// Backward pass: the derivative of the loss by every hidden feature, one tile of points per
+// workgroup.
 //
-// In: pulls (the derivative by the flow, a row each), activations, transposed networks.
-// Out: deltas, [layer][row][128]: the derivative by each hidden layer's features, zero where ReLU
-// cut them off. Mirrors ReferenceNetwork::backward. Registers and memory as in forward.wgsl.
+// In: pulls (the derivative of the loss by the flow, one per row), activations, transposed
+// networks. Out: deltas, [layer][row][128]: the derivative by each hidden layer's features, zero
+// where ReLU is inactive. Mirrors ReferenceNetwork::backward. Registers and memory as in
+// forward.wgsl.
 
 var<immediate> part: Part;
 @group(0) @binding(0) var<storage, read> networks: array<vec4<f32>>;
@@ -15,7 +17,7 @@ var<immediate> part: Part;
 
 var<workgroup> outputs: array<vec4<f32>, 2048>;
 
-// Keeps a quad of a row's derivatives, zero where the feature is off, and gives it back.
+// Stores four of a row's derivatives, zero where the feature is inactive, and returns them.
 fn gated(layer: u32, row: u32, column: u32, sum: vec4<f32>) -> vec4<f32> {
     let place = (layer * part.rows + row) * QUADS + column;
     let delta = select(vec4(0.0), sum, activations[place] > vec4(0.0));
@@ -38,7 +40,8 @@ fn backward(
     let first = local / 16u * 8u;
     let quad = local % 16u;
 
-    // Sums of the point's derivatives: its quad of the lower half, and of the upper.
+    // Sums for each of the eight points: derivatives by four of the lower 64 features and four of
+    // the upper 64.
     var low: array<vec4<f32>, 8>;
     var high: array<vec4<f32>, 8>;
     {

@@ -1,13 +1,14 @@
-// The derivative of the loss by every hidden feature with the middle layers by the matrix units,
-// over half a tile of points a workgroup.
+// Backward pass in half precision: the derivative of the loss by every hidden feature, with the
+// middle layers on the matrix units, half a tile of points per workgroup.
 //
-// In: pulls (the derivative by the flow, a row each), activations, networks, and the middle layers'
-// weights as halves. Out: deltas, [layer][row][128]: the derivative by each hidden layer's features,
-// zero where ReLU cut them off. Mirrors backward.wgsl but for the rounding of a middle layer's
-// derivatives and weights.
+// In: pulls (the derivative of the loss by the flow, one per row), activations, networks, and the
+// middle layers' weights as halves. Out: deltas, [layer][row][128]: the derivative by each hidden
+// layer's features, zero where ReLU is inactive. Mirrors backward.wgsl except for the rounding of a
+// middle layer's derivatives and weights.
 //
-// Pulls are a batch's mean: its count is multiplied in before anything is rounded, lest halves
-// underflow, and divided out of what is kept. An invocation holds one feature of every point.
+// Pulls are the derivative of the batch's mean loss. They are multiplied by the batch's number of
+// points before rounding, to avoid underflow of halves, and the stored deltas are divided by it. An
+// invocation holds one feature of every point.
 
 var<immediate> part: Part;
 @group(0) @binding(0) var<storage, read> networks: array<f32>;
@@ -20,12 +21,12 @@ var<immediate> part: Part;
 @group(0) @binding(7) var<storage, read> halves: array<f16>;
 @group(0) @binding(8) var<storage, read_write> deltas: array<f32>;
 
-// The right factor's tile: the same weights as forward, turned.
+// The tile of the right factor: the weights of the forward pass, transposed.
 fn right(weights: u32, summed: u32, column: u32) -> Right {
     return coopLoad<Right>(&halves[weights + tile_place(column, summed)], BLOCK);
 }
 
-// Keeps a point's derivative, zero where the feature is off, for the layer before.
+// Stores a point's derivative, zero where the feature is inactive, as input of the previous layer.
 fn keep(layer: u32, row: u32, point: u32, feature: u32, sum: f32, count: f32) {
     let place = (layer * part.rows + row + point) * WIDTH + feature;
     let delta = select(0.0, sum, activations[place] > 0.0);
@@ -44,7 +45,8 @@ fn backward_half(
     let wave_half = group.y * groups.x + group.x;
     if wave_half >= part.tiles * 2u { return; }
     let work = tiles[part.first_tile + wave_half / 2u];
-    // Not by a function of its own: only so is it plain that all invocations go the same way.
+    // Not in a separate function: only in this form does the compiler recognize uniform control
+    // flow.
     if statuses[work.lane].state != RUNNING { return; }
     if part.step >= lanes[work.lane].steps { return; }
     let network = lanes[work.lane].network * ARRAYS * LAID_OUT * 4u;

@@ -1,31 +1,32 @@
-// Exact distances at the vertices of the active bricks, one brick a workgroup.
+// Exact distances at the vertices of the active bricks, one brick per workgroup.
 //
-// In: the occupied columns, each with its squared distances along z, and where each brick lies.
-// Out: 512 16-bit codes a brick, in the store: distance in units of code_scale, or BEYOND.
-// Mirrors CellGather, to the bit: squares are whole numbers.
+// In: the occupied columns, each with its squared distances along z, and the positions of the
+// bricks. Out: 512 16-bit codes per brick, in the store: distance in units of code_scale, or
+// BEYOND. Mirrors CellGather bit by bit: squared distances are integers.
 //
-// An invocation holds 8 vertices along x for one y and two z; rows of columns are gone through in
-// x, and each row's least square over y and z serves all eight.
+// An invocation computes 8 vertices along x for one y and two z. It iterates over the rows of
+// columns in x. The minimum of each row over y and z is shared by all eight vertices.
 
 struct Plan {
     band: i32,
-    // Rows of columns along x.
+    // Number of rows of columns along x.
     rows: u32,
-    // Bricks, and where their codes go in the store, words.
+    // Number of bricks, and the offset of their codes in the store, words.
     bricks: u32,
     codes: u32,
 }
 
 @group(0) @binding(0) var<storage, read> plan: array<Plan>;
-// Each brick's place, in bricks from the origin.
+// Position of each brick, in bricks from the origin.
 @group(0) @binding(1) var<storage, read> places: array<u32>;
-// First column of each row, one past the last at the end.
+// Index of the first column of each row, followed by the end of the last row.
 @group(0) @binding(2) var<storage, read> starts: array<u32>;
-// Each column's y; the brick layer at which its squares begin and their place; one more at the end.
+// Per column: its y, the brick layer at which its squares begin, and their offset. One more entry
+// at the end.
 @group(0) @binding(3) var<storage, read> columns: array<Column>;
-// Eight 16-bit squares a layer.
+// Eight 16-bit squared distances per layer.
 @group(0) @binding(4) var<storage, read> squares: array<u32>;
-// The code of each square up to the band's, then BEYOND.
+// The code of each squared distance up to the band's, then BEYOND.
 @group(0) @binding(5) var<storage, read> code_of: array<u32>;
 @group(0) @binding(6) var<storage, read_write> store: array<u32>;
 
@@ -35,7 +36,7 @@ struct Column {
     squares: u32,
 }
 
-// Farther than any square within the band.
+// Larger than any squared distance within the band.
 const FAR = 0x3fff;
 
 @compute @workgroup_size(32)
@@ -83,7 +84,7 @@ fn bricks(
     }
 }
 
-// The first column of a row from `y` on.
+// The first column of a row with this or a larger `y`.
 fn first_from(start: u32, end: u32, y: i32) -> u32 {
     var low = start;
     var high = end;

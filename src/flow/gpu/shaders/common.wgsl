@@ -1,22 +1,22 @@
-// What every kernel shares: sizes, and the records that the host writes (records.rs mirrors them).
-// Records hold scalars alone, so that both sides agree on every offset.
+// Shared by all kernels: sizes, and the records that the host writes (gpu/layout.rs mirrors them).
+// Records contain only scalars, so that both sides agree on all offsets.
 
 // Features of a hidden layer, and the same in vec4s.
 const WIDTH = 128u;
 const QUADS = 32u;
 // Layers from 128 to 128 features.
 const MIDDLE_LAYERS = 7u;
-// Points that one workgroup carries through the network.
+// Points that one workgroup evaluates.
 const TILE = 64u;
 
-// Places in a network's floats, in vec4s; field/mlp.rs lays them out.
+// Offsets in a network's floats, in vec4s; field/mlp.rs defines the layout.
 const FIRST_BIAS = 96u;
 const MIDDLE = 128u;
 const MIDDLE_STRIDE = 4128u;
 const MIDDLE_BIAS = 4096u;
 const LAST = 29024u;
 const LAST_BIAS = 29120u;
-// A network's vec4s, and the arrays that a lane keeps of this size.
+// Length of a network in vec4s, and the arrays of this length per lane.
 const LAID_OUT = 29124u;
 const ARRAYS = 5u;
 const PARAMETERS = 0u;
@@ -25,13 +25,13 @@ const MEANS = 2u;
 const SQUARES = 3u;
 const KEPT = 4u;
 
-// A target's distance transform: where it lies in the store, in words, and its geometry.
+// A target's distance transform: offsets in the store, in words, and its geometry.
 struct Transform {
-    // The grid's first vertex, metres, as a sum of two floats an axis.
+    // The grid's first vertex, metres, as a sum of two floats per axis.
     origin_high: array<f32, 3>,
     origin_low: array<f32, 3>,
     inverse_cell: f32,
-    // Metres of one code.
+    // Metres per code.
     code_scale: f32,
     vertices: array<u32, 3>,
     blocks: array<u32, 3>,
@@ -43,12 +43,12 @@ struct Transform {
     far_vertices: array<u32, 3>,
 }
 
-// One pair's optimization, in one submission.
+// The fit of one pair within one submission.
 struct Lane {
     transform: Transform,
-    // Which of the card's networks it fits.
+    // Index of its network slot.
     network: u32,
-    // Source points in the store, words.
+    // Offset of the source points in the store, words.
     points: u32,
     // Its tiles and chunks among those of the submission.
     first_tile: u32,
@@ -58,65 +58,65 @@ struct Lane {
     // Network inputs: (point - center) * scale.
     center: array<f32, 3>,
     scale: f32,
-    // The loss, see loss.rs.
+    // Parameters of the loss, see field/loss.rs.
     margin: f32,
     margin_slope: f32,
     truncation: f32,
     flow_penalty: f32,
-    // 1 where the result is a running average, 0 where it is the best.
+    // 1 if the result is a running average of the parameters, 0 if it is the best iteration.
     average: u32,
-    // The stopping rule; none where patience is 0.
+    // The stopping rule; disabled if patience is 0.
     patience: u32,
     min_delta: f32,
-    // Iterations that it has in this submission.
+    // Number of iterations in this submission.
     steps: u32,
 }
 
 // One iteration of one lane.
 struct Step {
-    // The batch's points among the lane's.
+    // The batch's first point among the lane's points, and its number of points.
     first: u32,
     count: u32,
-    // One by the count.
+    // 1 / count.
     weight: f32,
-    // Adam's factors.
+    // Factors of Adam's step.
     step_size: f32,
     square_correction: f32,
-    // Weight of the present in a running average.
+    // Weight of the new parameters in the running average.
     fresh: f32,
 }
 
-// What one workgroup carries through the network: a tile of a lane's batch.
+// A tile of a lane's batch: the points of one workgroup.
 struct Tile {
     lane: u32,
     tile: u32,
 }
 
-// Points whose weight gradients are added up together: rows of the wave's activations.
+// A chunk: rows of the wave's activations whose weight gradients are summed together.
 struct Chunk {
     lane: u32,
     first_row: u32,
     rows: u32,
-    // Its first point in the lane's batch.
+    // Index of its first point in the lane's batch.
     first_point: u32,
 }
 
-// How a lane's optimization stands.
+// The state of a lane's optimization.
 struct Status {
     state: u32,
     iterations: u32,
     best_iteration: u32,
     best_loss: f32,
-    // What the stopping rule has seen: whether anything, the best, and iterations since.
+    // State of the stopping rule: 1 after its first loss, its best loss, and iterations since then.
     seen: u32,
     seen_best: f32,
     without_progress: u32,
-    // Whether this iteration's gradients are to be applied, and whether it is the best so far.
+    // Whether this iteration's gradients are applied, and whether it is the best so far.
     applies: u32,
     improves: u32,
 }
 
-// Whether a lane has this iteration.
+// Whether the lane is running and has this iteration.
 fn iterates(status: Status, lane_steps: u32, step: u32) -> bool {
     return status.state == RUNNING && step < lane_steps;
 }
@@ -125,20 +125,20 @@ const RUNNING = 0u;
 const CONVERGED = 1u;
 const DIVERGED = 2u;
 
-// Which part of the submission a dispatch does.
+// The part of the submission that a dispatch processes.
 struct Part {
-    // The iteration of this submission.
+    // Index of the iteration in this submission.
     step: u32,
-    // The wave's first tile and chunk.
+    // The wave's first tile and first chunk.
     first_tile: u32,
     first_chunk: u32,
-    // The wave's tiles.
+    // Number of tiles of the wave.
     tiles: u32,
-    // Rows of a layer's activations.
+    // Number of rows of a layer's activations.
     rows: u32,
-    // Zero, which no compiler knows.
+    // Always zero, which no compiler can assume; see arithmetic.wgsl.
     nothing: u32,
 }
 
-// Steps that a submission may have.
+// Maximum number of iterations of a submission.
 const STEPS = 64u;

@@ -1,5 +1,5 @@
-// The distance transform at a place: trilinear, with its gradient. Mirrors Bricks::sample; the
-// store's layout is written by transform.rs.
+// The distance transform at a point: trilinear interpolation and its gradient. Mirrors
+// Bricks::sample. The host writes the store in gpu/distance.rs.
 
 @group(0) @binding(0) var<storage, read> store: array<u32>;
 
@@ -11,7 +11,8 @@ struct Sample {
     gradient: vec3<f32>,
 }
 
-// Trilinear value (w) and derivative by the fraction (xyz) of eight corners, x y z by bits 4 2 1.
+// Trilinear value (w) and its derivative by the fraction (xyz), from eight corners. Bits 4, 2 and 1
+// of a corner's index are x, y and z.
 fn trilinear(corners: array<f32, 8>, fraction: vec3<f32>) -> vec4<f32> {
     let low = vec4(corners[0], corners[2], corners[4], corners[6]);
     let slope_z = vec4(corners[1], corners[3], corners[5], corners[7]) - low;
@@ -20,14 +21,14 @@ fn trilinear(corners: array<f32, 8>, fraction: vec3<f32>) -> vec4<f32> {
     let along_y = along_z.xz + rounded2(slope_y * fraction.y);
     let dx = along_y.y - along_y.x;
     let along_yz = slope_z.xz + rounded2((slope_z.yw - slope_z.xz) * fraction.y);
-    // Of y, z and the value itself, along x.
+    // The derivatives by y and z and the value, interpolated along x.
     let begin = vec3(slope_y.x, along_yz.x, along_y.x);
     let slope = vec3(slope_y.y - slope_y.x, along_yz.y - along_yz.x, dx);
     let along_x = begin + rounded3(slope * fraction.x);
     return vec4(dx, along_x);
 }
 
-// Metres at a place in the coarse far field, and the derivative by fine cells.
+// Distance in the coarse field, metres (w), and its derivative by fine cells (xyz).
 fn far_sample(transform: ptr<function, Transform>, corner: vec3<u32>, fraction: vec3<f32>) -> vec4<f32> {
     let pitch = (*transform).far_pitch;
     let scale = 1.0 / f32(pitch);
@@ -45,7 +46,7 @@ fn far_sample(transform: ptr<function, Transform>, corner: vec3<u32>, fraction: 
     return vec4(value.xyz * scale, value.w);
 }
 
-// The code at a vertex: units of code_scale, or BEYOND.
+// The code at a vertex: distance in units of code_scale, or BEYOND.
 fn code_at(transform: ptr<function, Transform>, vertex: vec3<u32>) -> u32 {
     let block = vertex >> vec3(6u);
     let table = store[(*transform).tables

@@ -1,12 +1,12 @@
-// The network, all layers, over one tile of points a workgroup: flow = g(point).
+// Forward pass: flow = g(point), all layers, one tile of points per workgroup.
 //
-// In: points, networks. Out: a flow a row, metres; and, unless it only evaluates, the activations
-// of the eight hidden layers, [layer][row][128]. Mirrors ReferenceNetwork::forward.
+// In: points, networks. Out: one flow per row, metres. Unless EVALUATES, also the activations of
+// the eight hidden layers, [layer][row][128]. Mirrors ReferenceNetwork::forward.
 //
-// An invocation holds 8 points x 8 features in registers; a layer's inputs lie in workgroup memory,
-// its weights stream from the cache, four features at a time.
+// An invocation holds 8 points x 8 features in registers. A layer's inputs are in workgroup memory.
+// Its weights are read through the cache, four features at a time.
 
-// Whether the kept network is evaluated, and nothing is remembered for a backward pass.
+// Whether to evaluate the kept parameters, without storing activations for a backward pass.
 override EVALUATES = false;
 
 var<immediate> part: Part;
@@ -21,12 +21,12 @@ var<immediate> part: Part;
 
 var<workgroup> inputs: array<vec4<f32>, 2048>;
 
-// Where a quad of a point's features lies: points side by side in different banks.
+// Index of four of a point's features. The exclusive or avoids bank conflicts between points.
 fn place(point: u32, column: u32) -> u32 {
     return point * QUADS + (column ^ (point % 8u));
 }
 
-// Keeps a quad of a point's features for the next layer, and for the backward pass.
+// Stores four of a point's features for the next layer, and for the backward pass.
 fn remember(layer: u32, row: u32, point: u32, column: u32, features: vec4<f32>) {
     inputs[place(point, column)] = features;
     if !EVALUATES {
@@ -48,11 +48,11 @@ fn forward(
     let network = (lanes[work.lane].network * ARRAYS + which) * LAID_OUT;
     let step = steps[work.lane * STEPS + part.step];
     let row = wave_tile * TILE;
-    // This invocation's points, from `first` on, and features: a quad of each half.
+    // This invocation's points, from `first`, and its features: four of each half.
     let first = local / 16u * 8u;
     let quad = local % 16u;
 
-    // Sums of the point's features: its quad of the lower half, and of the upper.
+    // Sums for each of the eight points: four of the lower 64 features and four of the upper 64.
     var low: array<vec4<f32>, 8>;
     var high: array<vec4<f32>, 8>;
     let scale = lanes[work.lane].scale;
@@ -68,7 +68,7 @@ fn forward(
         let z_high = networks[at + 2u * QUADS + 16u];
         let bias_high = networks[at + FIRST_BIAS + 16u];
         for (var i = 0u; i < 8u; i++) {
-            // Rows past the batch's end repeat its last point; their gradients are zero.
+            // Rows beyond the batch's end repeat its last point; their gradients are zero.
             let index = min(work.tile * TILE + first + i, step.count - 1u);
             let at = lanes[work.lane].points + (step.first + index) * 3u;
             let p = (vec3(points[at], points[at + 1u], points[at + 2u]) - center) * scale;
@@ -78,7 +78,7 @@ fn forward(
     }
 
     for (var layer = 0u; layer < MIDDLE_LAYERS; layer++) {
-        // The features of this layer, for all; and the sums of the next one's begin.
+        // Stores the features of this layer and initializes the sums of the next with its biases.
         let weights = network + MIDDLE + layer * MIDDLE_STRIDE;
         let bias_low = networks[weights + MIDDLE_BIAS + quad];
         let bias_high = networks[weights + MIDDLE_BIAS + quad + 16u];
@@ -90,7 +90,7 @@ fn forward(
             high[i] = bias_high;
         }
         workgroupBarrier();
-        // Panels of 32 features.
+        // Weights are stored in panels of 32 features.
         let at_low = weights + quad / 8u * 1024u + quad % 8u;
         let at_high = at_low + 2048u;
         for (var k = 0u; k < QUADS; k++) {
@@ -115,8 +115,9 @@ fn forward(
     }
     workgroupBarrier();
 
-    // Sixteen sums side by side, four quads of them: two invocations a point, the first of which
-    // takes the first quad and the third, as they are added up.
+    // The last layer. Each output is summed in sixteen partial sums: four vec4s, by the index of
+    // the feature's vec4 modulo 4. Two invocations share a point. The first one takes vec4s 0 and
+    // 2, the second one 1 and 3, as in the fixed order of the reduction.
     let point = local / 2u;
     var sums: array<vec4<f32>, 3>;
     for (var output = 0u; output < 3u; output++) {

@@ -1,14 +1,15 @@
-// The network with its middle layers by the matrix units, over half a tile of points a workgroup:
-// flow = g(point).
+// Forward pass in half precision: flow = g(point), with the middle layers on the matrix units, half
+// a tile of points per workgroup.
 //
-// In: points, networks, and the middle layers' weights as halves. Out: a flow a row, metres, and
-// the activations of the eight hidden layers, [layer][row][128]. Mirrors forward.wgsl but for the
-// rounding of a middle layer's inputs and weights and the order of sums; sums, the first layer and
-// the last are single.
+// In: points, networks, and the middle layers' weights as halves. Out: one flow per row, metres,
+// and the activations of the eight hidden layers, [layer][row][128]. Mirrors forward.wgsl except
+// for the rounding of a middle layer's inputs and weights and the order of sums. Sums, the first
+// and the last layer are in single precision.
 //
-// An invocation holds one feature of every point, but for the products and the last layer.
-// Activations stay single in memory, so that every other kernel is the same for both precisions;
-// as halves they would take half the traffic, which is what bounds this kernel on a large card.
+// An invocation holds one feature of every point, except in the products and the last layer.
+// Activations are stored in single precision, so that all other kernels are the same for both
+// precisions. Stored as halves they would halve the memory traffic, which limits this kernel on a
+// large GPU.
 
 var<immediate> part: Part;
 @group(0) @binding(0) var<storage, read> points: array<f32>;
@@ -21,7 +22,7 @@ var<immediate> part: Part;
 @group(0) @binding(7) var<storage, read_write> flows: array<vec4<f32>>;
 @group(0) @binding(8) var<storage, read_write> activations: array<f32>;
 
-// The right factor's tile: weights from the features that are summed over to the layer's own.
+// The tile of the right factor: weights, from the inputs `summed` to the outputs `column`.
 fn right(weights: u32, summed: u32, column: u32) -> Right {
     return coopLoadT<Right>(&halves[weights + tile_place(summed, column)], BLOCK);
 }
@@ -37,7 +38,8 @@ fn forward_half(
     let wave_half = group.y * groups.x + group.x;
     if wave_half >= part.tiles * 2u { return; }
     let work = tiles[part.first_tile + wave_half / 2u];
-    // Not by a function of its own: only so is it plain that all invocations go the same way.
+    // Not in a separate function: only in this form does the compiler recognize uniform control
+    // flow.
     if statuses[work.lane].state != RUNNING { return; }
     if part.step >= lanes[work.lane].steps { return; }
     let network = lanes[work.lane].network * ARRAYS * LAID_OUT * 4u;
@@ -52,7 +54,7 @@ fn forward_half(
         let weights = vec3(networks[at], networks[at + WIDTH], networks[at + 2u * WIDTH]);
         let bias = networks[at + FIRST_BIAS * 4u];
         for (var point = 0u; point < POINTS; point++) {
-            // Rows past the batch's end repeat its last point; their gradients are zero.
+            // Rows beyond the batch's end repeat its last point; their gradients are zero.
             let index = min(first_point + point, step.count - 1u);
             let at = lanes[work.lane].points + (step.first + index) * 3u;
             let p = (vec3(points[at], points[at + 1u], points[at + 2u]) - center) * scale;
@@ -78,7 +80,8 @@ fn forward_half(
     }
     workgroupBarrier();
 
-    // The last layer: an axis of a point's flow an invocation, the fourth of each of no use.
+    // The last layer: one axis of a point's flow per invocation. The fourth invocation of each
+    // point writes zero.
     let point = local / 4u;
     let axis = min(local % 4u, 2u);
     let weights = network + LAST * 4u + axis * WIDTH;

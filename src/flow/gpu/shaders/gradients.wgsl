@@ -1,12 +1,13 @@
-// Weight gradients of one chunk of points: sums over its rows of activation x delta.
+// Weight gradients of one chunk of points: sums of activation x delta over its rows.
 //
-// In: activations, deltas, pulls, points. Out: one network's worth of partial gradients a chunk.
-// A workgroup does one layer (y: seven middle ones, then the first, then the last) of one chunk
-// (x), rows one after the other; chunks are added up, in order, by step.wgsl: no atomics, and the
-// bits of the CPU, which takes its sums in the same order.
-// Mirrors ReferenceNetwork::backward.
+// In: activations, deltas, pulls, points. Out: one network's worth of partial gradients per chunk.
+// A workgroup computes one layer (y: seven middle layers, then the first, then the last) of one
+// chunk (x), adding its rows in order. step.wgsl adds the chunks in order. Without atomics the
+// result is deterministic, and bit-identical to the CPU's, which sums in the same order. Mirrors
+// ReferenceNetwork::backward.
 
-// Whether the matrix units do the middle layers, and these are the first (y: 0) and the last.
+// Whether only the first (y = 0) and the last layer are computed, because the matrix units compute
+// the middle layers.
 override OUTER = false;
 
 var<immediate> part: Part;
@@ -20,7 +21,7 @@ var<immediate> part: Part;
 @group(0) @binding(7) var<storage, read> pulls: array<vec4<f32>>;
 @group(0) @binding(8) var<storage, read_write> partials: array<vec4<f32>>;
 
-// Rows that are read at a time where an invocation has one sum.
+// Rows that are loaded together by an invocation with a single sum.
 const ROWS = 8u;
 
 @compute @workgroup_size(256)
@@ -39,13 +40,14 @@ fn gradients(
     }
 }
 
-// 8 inputs x 8 outputs an invocation, in registers.
+// 8 inputs x 8 outputs per invocation, in registers.
 fn middle_layer(layer: u32, chunk: Chunk, place: u32, local: u32) {
     let input = local / 16u;
     let output = local % 16u;
     let above = (layer * part.rows + chunk.first_row) * QUADS;
     let below = ((layer + 1u) * part.rows + chunk.first_row) * QUADS;
-    // Four inputs of the lower half by a quad of outputs of either half, and of the upper half.
+    // Products of four inputs with four outputs: inputs of the lower and of the upper half, each
+    // with outputs of the lower and of the upper half.
     var low_low: array<vec4<f32>, 4>;
     var low_high: array<vec4<f32>, 4>;
     var high_low: array<vec4<f32>, 4>;
@@ -85,7 +87,7 @@ fn middle_layer(layer: u32, chunk: Chunk, place: u32, local: u32) {
     }
 }
 
-// A sum an invocation: of delta times x, y, z or one, for a quad of features.
+// One sum per invocation: of delta times x, y, z or one, for four features.
 fn first_layer(chunk: Chunk, place: u32, local: u32) {
     let which = local / QUADS;
     let quad = local % QUADS;
@@ -112,7 +114,7 @@ fn first_layer(chunk: Chunk, place: u32, local: u32) {
     partials[place + which * QUADS + quad] = sum;
 }
 
-// A sum an invocation: of a pull's x, y or z times a quad of features, or of the pulls themselves.
+// One sum per invocation: of x, y or z of the pull times four features, or of the pulls themselves.
 fn last_layer(chunk: Chunk, place: u32, local: u32) {
     let which = local / QUADS;
     let quad = local % QUADS;

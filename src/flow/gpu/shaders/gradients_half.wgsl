@@ -1,14 +1,14 @@
-// Weight gradients of one chunk of points for the middle layers by the matrix units: sums over its
-// rows of activation x delta.
+// Weight gradients of one chunk of points for the middle layers, on the matrix units: sums of
+// activation x delta over its rows.
 //
 // In: activations, deltas. Out: the middle layers' part of one network's worth of partial gradients
-// a chunk. A workgroup does one layer (y) of one chunk (x). Mirrors gradients.wgsl, which does the
-// first layer and the last, but for the rounding of both factors and the order of sums; sums and
-// biases are single.
+// per chunk. A workgroup computes one layer (y) of one chunk (x). Mirrors gradients.wgsl, which
+// computes the first and the last layer, except for the rounding of both factors and the order of
+// sums. Sums and biases are in single precision.
 //
-// A subgroup holds two by four tiles of the product; where there are fewer subgroups than such
-// pieces the rows are gone through again. Deltas are multiplied by the batch's count before they
-// are rounded, see backward_half.wgsl.
+// A subgroup holds a piece of two by four tiles of the product. If there are fewer subgroups than
+// pieces, the rows are read repeatedly. Deltas are multiplied by the batch's number of points
+// before they are rounded, see backward_half.wgsl.
 
 var<immediate> part: Part;
 @group(0) @binding(0) var<storage, read> steps: array<Step>;
@@ -19,17 +19,17 @@ var<immediate> part: Part;
 @group(0) @binding(5) var<storage, read> lanes: array<Lane>;
 @group(0) @binding(6) var<storage, read_write> partials: array<f32>;
 
-// Pieces across the outputs, and in all.
+// Number of pieces across the outputs, and in total.
 const PIECES_ACROSS = WIDTH / (4u * SIDE);
 const PIECE_COUNT = WIDTH / (2u * SIDE) * PIECES_ACROSS;
-// Outputs that lie together in a network's memory.
+// Outputs that are adjacent in a network's memory.
 const PANEL = 32u;
 
 var<workgroup> above: array<f16, 4352>;
 var<workgroup> below: array<f16, 4352>;
 var<workgroup> biases: array<f32, 256>;
 
-// The place of a tile's first entry among a layer's floats.
+// Index of a tile's first entry among a layer's floats.
 fn panel_place(input: u32, output: u32) -> u32 {
     return (output / PANEL * WIDTH + input) * PANEL + output % PANEL;
 }
@@ -43,7 +43,8 @@ fn gradients_half(
 ) {
     let layer = group.y;
     let chunk = chunks[part.first_chunk + group.x];
-    // Not by a function of its own: only so is it plain that all invocations go the same way.
+    // Not in a separate function: only in this form does the compiler recognize uniform control
+    // flow.
     if statuses[chunk.lane].state != RUNNING { return; }
     if part.step >= lanes[chunk.lane].steps { return; }
     let count = f32(steps[chunk.lane * STEPS + part.step].count);

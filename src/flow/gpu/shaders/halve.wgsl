@@ -1,16 +1,16 @@
-// The middle layers' weights of a lane as halves, in blocks of 16 x 16: whole tiles lie together,
-// and are read as they are by the way forward and turned by the way back.
+// Rounds the middle layers' weights of a lane to halves, in blocks of 16 x 16. Each tile lies
+// within one block. The forward pass reads the tiles as stored, the backward pass transposed.
 //
-// A quad of one lane's (y) weights an invocation. In: networks. Out: halves,
-// [lane][layer][input / 16][output / 16][16][16]. Done before every iteration of a submission, so
-// that nothing outlives it: the parameters themselves stay single.
+// Four of one lane's (y) weights per invocation. In: networks. Out: halves, [lane][layer][input /
+// 16][output / 16][16][16]. Runs before every iteration of a submission. The parameters themselves
+// stay in single precision.
 
 @group(0) @binding(0) var<storage, read> lanes: array<Lane>;
 @group(0) @binding(1) var<storage, read> statuses: array<Status>;
 @group(0) @binding(2) var<storage, read> networks: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read_write> halves: array<vec4<f16>>;
 
-// Quads of a layer's weights.
+// vec4s of a layer's weights.
 const LAYER_QUADS = 4096u;
 
 @compute @workgroup_size(256)
@@ -24,7 +24,7 @@ fn halve(
     let place = id.x % LAYER_QUADS;
     let network = lanes[lane].network * ARRAYS * LAID_OUT;
     let weights = networks[network + MIDDLE + layer * MIDDLE_STRIDE + place];
-    // Panels of 32 outputs, as field/mlp.rs lays them out.
+    // Panels of 32 outputs, see field/mlp.rs.
     let input = place / 8u % WIDTH;
     let output = place / 1024u * 32u + place % 8u * 4u;
     let at = (lane * MIDDLE_LAYERS + layer) * LAYER_HALVES + tile_place(input, output);

@@ -1,8 +1,9 @@
-// Adds up an iteration's losses and decides: go on, converged, diverged; is it the best so far?
+// Sums an iteration's losses and updates the lane's state: running, converged or diverged, and
+// whether the iteration is the best so far.
 //
-// One workgroup a lane. In: each tile's sum of losses. Out: the lane's status and the iteration's
-// mean loss. Mirrors EarlyStop::observe and what the CPU's trainer keeps: the iteration at which
-// the stopping rule fires is no candidate for the best.
+// One workgroup per lane. In: each tile's sum of losses. Out: the lane's status and the iteration's
+// mean loss. Mirrors EarlyStop::observe and the result that the CPU's trainer keeps. The iteration
+// at which the stopping rule fires is not a candidate for the best.
 
 var<immediate> part: Part;
 @group(0) @binding(0) var<storage, read> lanes: array<Lane>;
@@ -40,7 +41,7 @@ fn judge(
         let place = lane * STEPS + part.step;
         let loss = rounded(sums[0] * steps[place].weight);
         losses[place] = loss;
-        // No comparison with what is not a number or not finite holds.
+        // False for NaN and infinity.
         if loss < 3.4e38 {
             observe(&status, lane, place, loss);
         } else {

@@ -1,4 +1,4 @@
-// As many independent multiply-adds as the card can do: its peak, to measure the kernels against.
+// Benchmark kernel: independent multiply-adds that measure the GPU's peak arithmetic throughput.
 
 // Multiply-adds of each of the eight chains of an invocation.
 const LENGTH = 512u;

@@ -1,11 +1,12 @@
-// A middle layer's product by the matrix units, for the way forward and the way back: of all points'
-// features in `inputs` and a layer's weights in `halves`, into `products`. The kernel that it is
-// put before has `right`, which reads the weights as they are or turned.
+// A middle layer's matrix product on the matrix units, for the forward and the backward pass: all
+// points' features in `inputs` times a layer's weights in `halves`, into `products`. This file is
+// placed before a kernel that defines `right`, which loads a tile of the weights, transposed or
+// not.
 //
-// A matrix operation is a whole subgroup's, however large that is: subgroups take squares of two
-// by two tiles in turn.
+// A matrix operation is executed by a whole subgroup of any size. Subgroups take squares of two by
+// two tiles in turn.
 
-// Squares across the features, and in all.
+// Number of squares across the features, and in total.
 const SQUARES_ACROSS = WIDTH / (2u * SIDE);
 const SQUARE_COUNT = POINTS / (2u * SIDE) * SQUARES_ACROSS;
 

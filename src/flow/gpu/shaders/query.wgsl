@@ -1,7 +1,8 @@
-// The loss of every deformed point and its derivative by the flow, one tile a workgroup.
+// Distance query: the loss of every deformed point and its derivative by the flow, one tile per
+// workgroup.
 //
 // In: points, flows. Out: pulls, the derivative of the batch's mean loss by each row's flow, zero
-// past the batch's end; and each tile's sum of losses. Mirrors LossOptions::at.
+// beyond the batch's end; and each tile's sum of losses. Mirrors LossOptions::at.
 
 var<immediate> part: Part;
 @group(0) @binding(1) var<storage, read> lanes: array<Lane>;

@@ -1,7 +1,7 @@
-// The distance transform at any points: gradient (xyz) and distance (w) of each.
+// The distance transform at arbitrary points: gradient (xyz) and distance (w).
 //
-// In: points, metres, three floats each. Out: a vec4 each, metres a metre and metres.
-// Mirrors Bricks::sample.
+// In: points, metres, three floats each. Out: one vec4 per point: gradient in metres per metre,
+// distance in metres. Mirrors Bricks::sample.
 
 var<immediate> part: Part;
 @group(0) @binding(1) var<storage, read> points: array<f32>;

@@ -1,7 +1,8 @@
-// Adds up the chunks' gradients, in order, keeps what is to be kept, and takes Adam's step.
+// Optimizer step: sums the chunks' gradients in order, updates the kept parameters and applies
+// Adam.
 //
-// A vec4 of one lane's network an invocation. In: partial gradients, statuses. Out: the lane's
-// parameters, transposes, moments and kept parameters. Mirrors AdamStep::apply.
+// One vec4 of one lane's network per invocation. In: partial gradients, statuses. Out: the lane's
+// parameters, moments and kept parameters. Mirrors AdamStep::apply.
 
 var<immediate> part: Part;
 @group(0) @binding(0) var<storage, read> lanes: array<Lane>;
@@ -11,7 +12,8 @@ var<immediate> part: Part;
 @group(0) @binding(4) var<storage, read_write> networks: array<vec4<f32>>;
 
 const EPSILON = vec4(1e-8);
-// 1 - beta: weights of the present in the means of the gradients and of their squares.
+// 1 - beta: weights of the new values in the moments, the means of the gradients and of their
+// squares.
 const FRESH_MEAN = vec4(0.1);
 const FRESH_SQUARE = vec4(0.001);
 

@@ -1,5 +1,5 @@
-// Matrix units that multiply 16 x 16 tiles of halves and add up in singles: NVIDIA's and others'.
-// Put before the kernels of half precision; tile8.wgsl is the other one.
+// Matrix units that multiply 16 x 16 tiles of halves with single-precision sums, such as NVIDIA's.
+// This file is placed before the half-precision kernels; tile8.wgsl is the alternative.
 
 enable f16;
 enable wgpu_cooperative_matrix;

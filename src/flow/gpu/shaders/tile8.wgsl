@@ -1,5 +1,5 @@
-// Matrix units that multiply 8 x 8 tiles of halves and add up in singles: lavapipe's.
-// Put before the kernels of half precision; tile16.wgsl is the other one.
+// Matrix units that multiply 8 x 8 tiles of halves with single-precision sums, such as lavapipe's.
+// This file is placed before the half-precision kernels; tile16.wgsl is the alternative.
 
 enable f16;
 enable wgpu_cooperative_matrix;

@@ -1,15 +1,14 @@
-// The transposes of a lane's middle layers, which the backward pass reads. Mirrors
-// transpose_middle_layers: entry (output, input) of the one is entry (input, output) of the other,
-// both in panels of 32.
+// Transposes a lane's middle layers for the backward pass. Mirrors transpose_middle_layers: entry
+// (output, input) of the result is entry (input, output) of the weights, both in panels of 32.
 //
-// A workgroup moves one square of 32 x 32 floats (x) of one lane (y), through workgroup memory, so
-// that both sides are read and written in whole lines.
+// A workgroup transposes one square of 32 x 32 floats (x) of one lane (y) in workgroup memory, so
+// that reads and writes cover whole cache lines.
 
 @group(0) @binding(0) var<storage, read> statuses: array<Status>;
 @group(0) @binding(1) var<storage, read> lanes: array<Lane>;
 @group(0) @binding(2) var<storage, read_write> networks: array<vec4<f32>>;
 
-// A float more a row, so that columns lie in different banks.
+// One float of padding per row, to avoid bank conflicts when a column is read.
 const ROW = 33u;
 var<workgroup> square: array<f32, 1056>;
 

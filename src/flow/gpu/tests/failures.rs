@@ -1,4 +1,4 @@
-//! What happens when a card cannot do what is asked of it, or goes away.
+//! Refused requests and a lost GPU.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -9,11 +9,12 @@ use crate::flow::error::FlowError;
 use crate::flow::estimate::estimate;
 use crate::flow::field::{Advance, Backend, BackendError};
 use crate::flow::gpu::adapter::{Selector, select};
-use crate::flow::gpu::backend::{Gpu, GpuOptions};
+use crate::flow::gpu::backend::Gpu;
+use crate::flow::gpu::memory::GpuOptions;
 use crate::flow::options::Preset;
-use crate::flow::select::Problem;
+use crate::flow::problem::Problem;
 
-/// Gives the card up after some iterations.
+/// Destroys the device after some iterations.
 struct Kill<'a>(&'a Gpu, AtomicUsize);
 
 impl Control for Kill<'_> {
@@ -30,13 +31,7 @@ fn a_card_lost_in_the_middle_of_a_run_fails_the_run_and_can_be_opened_again() {
         return;
     };
     let [source, target] = clouds(500);
-    let problem = Problem {
-        source: &source,
-        target: &target,
-        ground: None,
-        before: None,
-        around: &[],
-    };
+    let problem = Problem::pair(&source, &target);
     let options = Preset::Neural.options(None);
     let killed = estimate(&gpu, &problem, &options, &Kill(&gpu, AtomicUsize::new(0)));
     assert!(
@@ -60,7 +55,7 @@ fn a_pair_that_never_fits_is_refused_before_it_takes_anything() {
     let Some(gpu) = shared() else {
         return;
     };
-    // Points 8 m apart in space: each of them activates hundreds of bricks of its own.
+    // Points 8 m apart: each of them activates hundreds of bricks.
     let cloud: Vec<Point> = (0..40u8)
         .flat_map(|x| (0..40u8).map(move |y| [x, y]))
         .flat_map(|[x, y]| (0..4u8).map(move |z| [x, y, z].map(|c| f32::from(c) * 8.0)))
@@ -70,7 +65,7 @@ fn a_pair_that_never_fits_is_refused_before_it_takes_anything() {
         Some(BackendError::Memory {
             needed, available, ..
         }) => assert!(needed > available),
-        // A large card has room for it.
+        // A large GPU has enough memory.
         None => assert!(gpu.memory_bytes() > 1 << 30),
         Some(error) => panic!("{error}"),
     }
@@ -105,15 +100,15 @@ fn more_pairs_than_lanes_are_told_to_come_back() {
         return;
     };
     let [source, target] = clouds(100);
-    let options = Preset::Paper.options(None);
+    let options = Preset::Paper.field();
     let transform = gpu
         .transform(&source, &target, &options.distance, &Uncontrolled)
         .expect("small clouds fit");
-    let first = transform.start(&source, &options).expect("a trainer");
-    let second = transform.start(&source, &options);
+    let first = transform.start(&source, &options, 0).expect("a trainer");
+    let second = transform.start(&source, &options, 0);
     assert!(matches!(second.err(), Some(BackendError::Busy)));
     drop(first);
-    transform.start(&source, &options).expect("a trainer");
+    transform.start(&source, &options, 0).expect("a trainer");
 }
 
 #[test]
@@ -122,12 +117,12 @@ fn a_run_that_diverges_says_so() {
         return;
     };
     let [source, target] = clouds(100);
-    let mut options = Preset::Paper.options(None);
+    let mut options = Preset::Paper.field();
     options.learning_rate = f32::INFINITY;
     let transform = gpu
         .transform(&source, &target, &options.distance, &Uncontrolled)
         .expect("small clouds fit");
-    let mut trainer = transform.start(&source, &options).expect("a trainer");
+    let mut trainer = transform.start(&source, &options, 0).expect("a trainer");
     let ended = trainer.advance(5, &Uncontrolled).expect("an answer");
     assert_eq!(ended, Advance::Diverged);
 }
@@ -144,11 +139,11 @@ fn an_interrupted_run_stops_between_submissions() {
         return;
     };
     let [source, target] = clouds(100);
-    let options = Preset::Paper.options(None);
+    let options = Preset::Paper.field();
     let transform = gpu
         .transform(&source, &target, &options.distance, &Uncontrolled)
         .expect("small clouds fit");
-    let mut trainer = transform.start(&source, &options).expect("a trainer");
+    let mut trainer = transform.start(&source, &options, 0).expect("a trainer");
     let ended = trainer.advance(5, &Now).expect("an answer");
     assert_eq!(ended, Advance::Interrupted(Interrupt::Cancelled));
     assert_eq!(trainer.report().iterations, 0);

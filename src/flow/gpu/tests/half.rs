@@ -1,6 +1,6 @@
-//! Half precision by the card's matrix units, against the double-precision reference and against
-//! single precision. Where the card has no such units these tests say so and pass; the one that
-//! wants it refused does so where it has.
+//! Half precision on the GPU's matrix units, against the double-precision reference and against
+//! single precision. Without matrix units these tests print a note and pass. Only the test of the
+//! refusal checks something in that case, too.
 
 use super::kernels::{after_one, network, plain, transform};
 use super::whole::{Losses, end_point_error, solved, street};
@@ -11,9 +11,10 @@ use crate::flow::distance::DistanceTransform;
 use crate::flow::field::{Backend, BackendError, Parameters, ReferenceNetwork};
 use crate::flow::gpu::backend::Gpu;
 use crate::flow::gpu::half::Units;
-use crate::flow::options::{Options, Precision, Preset};
+use crate::flow::gpu::self_test::tested_units;
+use crate::flow::options::{FieldOptions, Method, Options, Precision, Preset};
 
-/// The shared card, where its matrix units can be used.
+/// The shared GPU, if its matrix units can be used.
 fn with_units() -> Option<&'static Gpu> {
     let gpu = shared()?;
     match gpu.matrix_units() {
@@ -25,8 +26,8 @@ fn with_units() -> Option<&'static Gpu> {
     }
 }
 
-fn half(options: Options) -> Options {
-    Options {
+fn half(options: FieldOptions) -> FieldOptions {
+    FieldOptions {
         precision: Precision::F16,
         ..options
     }
@@ -35,12 +36,12 @@ fn half(options: Options) -> Options {
 #[test]
 fn half_precision_is_refused_where_nothing_can_compute_it() {
     let [source, target] = clouds(100);
-    let options = half(Preset::Paper.options(None));
+    let options = half(Preset::Paper.field());
     let refused = |device: &dyn Backend| {
         let transform = device
             .transform(&source, &target, &options.distance, &Uncontrolled)
             .expect("small clouds fit");
-        let refused = transform.start(&source, &options).err();
+        let refused = transform.start(&source, &options, 0).err();
         matches!(refused, Some(BackendError::Unsupported(text)) if text.contains("precision"))
     };
     assert!(refused(&CpuBackend::new(Some(1)).expect("threads")));
@@ -49,7 +50,7 @@ fn half_precision_is_refused_where_nothing_can_compute_it() {
     }
 }
 
-/// The kernels' sources after one change, which must change something.
+/// The kernels' sources with one replacement, whose text must occur.
 fn changed(
     sources: &[(&'static str, &'static str)],
     kernel: &str,
@@ -72,13 +73,18 @@ fn changed(
 }
 
 fn tested(gpu: &Gpu, kernel: &str, from: &str, to: &str) -> Result<Units, String> {
-    let tile = gpu.card().tile.clone().expect("it was there before");
+    let tile = gpu
+        .device()
+        .context
+        .tile
+        .clone()
+        .expect("it was there before");
     let sources = changed(tile.sources(), kernel, from, to);
     let sources: Vec<_> = sources
         .iter()
         .map(|(name, text)| (*name, text.as_str()))
         .collect();
-    Units::tested(gpu.card(), tile, &sources)
+    tested_units(&gpu.device().context, tile, &sources)
 }
 
 #[test]
@@ -131,8 +137,8 @@ fn kernels_that_take_a_wrong_tile_or_layer_fail_the_self_test() {
 #[test]
 fn gradients_in_half_precision_are_near_the_references_at_awkward_row_counts() {
     // Rounding moves features across zero and points into other cells, which switches whole
-    // derivatives on and off: each layer's gradient is compared as a whole. With three rows it is
-    // off by 0.04; a single wrong tile of 16 x 16 would be by an eighth.
+    // derivatives on and off. Each layer's gradient is therefore compared as a whole. With three
+    // rows its relative error is 0.04; a single wrong tile of 16 x 16 would cause one eighth.
     const TOLERANCE: f64 = 0.08;
     let [cloud, target] = clouds(9000);
     let options = half(plain());
@@ -143,7 +149,7 @@ fn gradients_in_half_precision_are_near_the_references_at_awkward_row_counts() {
         };
         let distance = DistanceTransform::build(source, &target, &options.distance);
         let distance = distance.expect("small clouds fit");
-        let reference = network(&options);
+        let reference = network();
         let mut expected = ReferenceNetwork::read(&Parameters::zeros());
         for &point in source {
             let input = point.map(f64::from);
@@ -153,7 +159,7 @@ fn gradients_in_half_precision_are_near_the_references_at_awkward_row_counts() {
             let pull = loss.gradient.map(|g| f64::from(g) / rows as f64);
             reference.backward(input, pull, &mut expected);
         }
-        // After one step from nothing the mean of the gradients is a tenth of the gradient.
+        // After the first step the mean of the gradients is a tenth of the gradient.
         let state = after_one(&gpu, source, &options);
         let found = ReferenceNetwork::read(&state.moments[0]);
         for (layer, (found, expected)) in found.weights.iter().zip(&expected.weights).enumerate() {
@@ -169,8 +175,8 @@ fn gradients_in_half_precision_are_near_the_references_at_awkward_row_counts() {
 
 #[test]
 fn the_first_losses_in_half_precision_are_those_of_single_precision() {
-    // Each step moves every weight by 0.008 by its gradient's sign, and the smallest gradients'
-    // signs are rounding's: after some steps the losses go their own ways.
+    // Each step moves every weight by 0.008 in the direction of its gradient's sign. The signs of
+    // the smallest gradients depend on rounding, so the losses diverge after some steps.
     const STEPS: usize = 3;
     const TOLERANCE: f64 = 0.01;
     let Some(gpu) = with_units() else {
@@ -182,7 +188,7 @@ fn the_first_losses_in_half_precision_are_those_of_single_precision() {
             .transform(&source, &target, &options.distance, &Uncontrolled)
             .expect("small clouds fit");
         let losses = Losses::default();
-        let mut trainer = transform.start(&source, &options).expect("a trainer");
+        let mut trainer = transform.start(&source, &options, 0).expect("a trainer");
         trainer.advance(STEPS, &losses).expect("iterations");
         losses.taken()
     });
@@ -193,24 +199,30 @@ fn the_first_losses_in_half_precision_are_those_of_single_precision() {
 
 #[test]
 fn whole_runs_in_half_precision_find_the_flow_of_single_precision() {
-    // As between the card and the CPU: rounding sends two runs of one seed apart.
+    // As between the GPU and the CPU: with the same seed, rounding makes two runs diverge.
     const LOSS: f64 = 0.05;
     const ERROR_M: f64 = 0.03;
     let Some(gpu) = with_units() else {
         return;
     };
     let pair = street(1);
-    for preset in Preset::FITTED {
+    for preset in Preset::with_field() {
         let mut options = preset.options(Some(1500));
-        options.max_iterations = 40;
-        let [single, half] = [options.clone(), half(options)].map(|options| {
+        let field = options.field_mut().expect("a field");
+        field.max_iterations = 40;
+        let precisions = [field.clone(), half(field.clone())];
+        let [single, half] = precisions.map(|field| {
+            let options = Options {
+                method: Method::Field(field),
+                ..options.clone()
+            };
             let estimate = solved(gpu, &pair, &options);
             let kept = |points: &[[f32; 3]]| -> Vec<[f32; 3]> {
                 let rows = points.iter().zip(&estimate.valid);
                 rows.filter(|&(_, &valid)| valid).map(|(&p, _)| p).collect()
             };
             let error = end_point_error(&kept(&estimate.flow), &kept(&pair.flow));
-            (estimate.best_loss, error)
+            (estimate.fit().expect("a fit").best_loss, error)
         });
         let loss = (half.0 - single.0).abs() / single.0;
         assert!(loss < LOSS, "{preset:?}: {half:?} {single:?}");
@@ -224,12 +236,12 @@ fn pairs_of_both_precisions_at_once_have_the_bits_they_have_alone() {
     let Some(gpu) = with_units() else {
         return;
     };
-    let fitted = |options: &Options| {
+    let fitted = |options: &FieldOptions| {
         let [source, target] = clouds(700);
         let transform = gpu
             .transform(&source, &target, &options.distance, &Uncontrolled)
             .expect("small clouds fit");
-        let mut trainer = transform.start(&source, options).expect("a trainer");
+        let mut trainer = transform.start(&source, options, 0).expect("a trainer");
         trainer.advance(8, &Uncontrolled).expect("iterations");
         trainer.evaluate(&source).expect("an answer")
     };

@@ -1,4 +1,5 @@
-//! Each kernel against the double-precision reference, at awkward sizes.
+//! Each kernel against the double-precision reference, including sizes that are not multiples of a
+//! tile.
 
 use super::{clouds, shared};
 use crate::flow::data::{Point, Random, Uncontrolled};
@@ -7,16 +8,16 @@ use crate::flow::field::{
     Backend, Conditioning, Parameters, ReferenceNetwork, TrainerState, Transform, first_losses,
 };
 use crate::flow::gpu::distance::{GpuTransform, build};
-use crate::flow::options::{Options, Preset, ResultChoice};
+use crate::flow::options::{FieldOptions, Preset, ResultChoice};
 use crate::flow::simulate::{Street, StreetOptions};
 
-/// Single precision over sums of 128 terms, eight layers deep.
+/// Rounding of single-precision sums of 128 terms, eight layers deep.
 const NETWORK_TOLERANCE: f64 = 2e-5;
-/// As above, and over the points; single-precision losses' signs may differ at kinks.
+/// As above, and over the points. The signs of the single-precision losses may differ at kinks.
 const GRADIENT_TOLERANCE: f64 = 1e-4;
 
 pub(super) fn transform(source: &[Point], target: &[Point]) -> Option<GpuTransform> {
-    let card = shared()?.card();
+    let card = shared()?.device();
     let options = DistanceOptions::default();
     let built = build(card, source, target, &options, &Uncontrolled);
     Some(built.expect("small clouds fit"))
@@ -42,7 +43,7 @@ fn street() -> [Vec<Point>; 2] {
 #[test]
 fn bricks_have_the_bits_of_the_cpus() {
     let [source, target] = street();
-    // The second has more bricks than a dispatch has groups along one dimension.
+    // The second pair has more bricks than a dispatch can have workgroups along one dimension.
     let sparse = scattered(520, [300.0, 300.0, 20.0], 3);
     for (source, target) in [(source, target), (sparse.clone(), sparse)] {
         let Some(gpu) = transform(&source, &target) else {
@@ -51,13 +52,17 @@ fn bricks_have_the_bits_of_the_cpus() {
         let cpu = Bricks::build(&source, &target, &DistanceOptions::default());
         let cpu = cpu.expect("small clouds fit");
         assert_eq!(gpu.bytes(), cpu.bytes());
-        let mut encoder = gpu.card.encoder();
+        let mut encoder = gpu.device.context.encoder();
         let bytes = cpu.codes().len() as u64 * 2;
         let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
-        let copy = gpu.card.empty(bytes, usage).expect("memory");
+        let copy = gpu.device.context.empty(bytes, usage).expect("memory");
         let from = u64::from(gpu.record.codes) * 4;
-        encoder.copy_buffer_to_buffer(&gpu.card.buffers.store, from, &copy, 0, bytes);
-        let read = gpu.card.finish(encoder, &copy, bytes).expect("an answer");
+        encoder.copy_buffer_to_buffer(&gpu.device.context.buffers.store, from, &copy, 0, bytes);
+        let read = gpu
+            .device
+            .context
+            .finish(encoder, &copy, bytes)
+            .expect("an answer");
         let wrong = read
             .as_chunks::<2>()
             .0
@@ -88,15 +93,16 @@ fn samples_have_the_bits_of_the_cpus_near_far_and_outside() {
     }
 }
 
-/// The options of a run whose network is neither zero nor decayed.
-pub(super) fn plain() -> Options {
-    let mut options = Preset::Paper.options(None);
+/// The published options without early stopping. The network does not start at zero, and the
+/// learning rate is constant.
+pub(super) fn plain() -> FieldOptions {
+    let mut options = Preset::Paper.field();
     options.early_stop = None;
     options
 }
 
-pub(super) fn network(options: &Options) -> ReferenceNetwork {
-    let mut random = Random::stream(options.seed, 0);
+pub(super) fn network() -> ReferenceNetwork {
+    let mut random = Random::stream(0, 0);
     ReferenceNetwork::read(&Parameters::xavier(&mut random))
 }
 
@@ -107,8 +113,8 @@ fn the_network_is_the_references_at_awkward_row_counts() {
         return;
     };
     let options = plain();
-    let mut trainer = gpu.start(&source, &options).expect("a trainer");
-    let reference = network(&options);
+    let mut trainer = gpu.start(&source, &options, 0).expect("a trainer");
+    let reference = network();
     for rows in [0, 1, 7, 8, 63, 64, 65, 1000] {
         let points = scattered(rows, [9.0, 6.0, 2.0], 11);
         let flow = trainer.evaluate(&points).expect("an answer");
@@ -127,9 +133,13 @@ fn the_network_is_the_references_at_awkward_row_counts() {
     }
 }
 
-/// The trainer's state after one iteration over the points.
-pub(super) fn after_one(gpu: &GpuTransform, source: &[Point], options: &Options) -> TrainerState {
-    let mut trainer = gpu.start(source, options).expect("a trainer");
+/// The trainer's state after one iteration over `source`.
+pub(super) fn after_one(
+    gpu: &GpuTransform,
+    source: &[Point],
+    options: &FieldOptions,
+) -> TrainerState {
+    let mut trainer = gpu.start(source, options, 0).expect("a trainer");
     trainer.advance(1, &Uncontrolled).expect("an iteration");
     trainer.state().expect("an answer")
 }
@@ -137,13 +147,13 @@ pub(super) fn after_one(gpu: &GpuTransform, source: &[Point], options: &Options)
 #[test]
 fn every_gradient_is_the_references_at_awkward_row_counts() {
     let [cloud, target] = clouds(9000);
-    for preset in Preset::FITTED {
-        let mut options = Options {
-            loss: preset.options(None).loss,
-            inputs: preset.options(None).inputs,
+    for preset in Preset::with_field() {
+        let mut options = FieldOptions {
+            loss: preset.field().loss,
+            inputs: preset.field().inputs,
             ..plain()
         };
-        options.keep = ResultChoice::Best;
+        options.result = ResultChoice::Best;
         for rows in [3, 63, 64, 65, 600] {
             let source = &cloud[..rows];
             let Some(gpu) = transform(source, &target) else {
@@ -151,7 +161,7 @@ fn every_gradient_is_the_references_at_awkward_row_counts() {
             };
             let distance = DistanceTransform::build(source, &target, &options.distance);
             let distance = distance.expect("small clouds fit");
-            let reference = network(&options);
+            let reference = network();
             let conditioning = Conditioning::new(source, options.inputs);
             let mut expected = ReferenceNetwork::read(&Parameters::zeros());
             for &point in source {
@@ -162,7 +172,7 @@ fn every_gradient_is_the_references_at_awkward_row_counts() {
                 let pull = loss.gradient.map(|g| f64::from(g) / rows as f64);
                 reference.backward(input, pull, &mut expected);
             }
-            // After one step from nothing the mean of the gradients is a tenth of the gradient.
+            // After the first step the mean of the gradients is a tenth of the gradient.
             let mut state = after_one(&gpu, source, &options);
             let means = &mut state.moments[0];
             means
@@ -185,8 +195,8 @@ fn every_gradient_is_the_references_at_awkward_row_counts() {
 
 #[test]
 fn more_points_than_the_memory_holds_at_once_give_the_gradient_of_all() {
-    // The software card holds fewer rows than this at once; the mean over twice the same points is
-    // the mean over them.
+    // The software adapter holds fewer rows than this at once. The mean over the points taken twice
+    // equals the mean over the points.
     let [cloud, target] = clouds(12_288);
     let twice: Vec<_> = cloud.iter().chain(&cloud).copied().collect();
     let Some(gpu) = transform(&twice, &target) else {
@@ -203,24 +213,25 @@ fn more_points_than_the_memory_holds_at_once_give_the_gradient_of_all() {
 
 #[test]
 fn the_first_losses_are_those_of_the_method_in_double_precision() {
-    // Ten steps that each move every weight by a thousandth: longer ones let rounding grow.
+    // Ten steps that move every weight by a thousandth each. With longer steps rounding errors
+    // grow.
     const TOLERANCE: f64 = 2e-3;
     const STEPS: i32 = 10;
     const RATE: f32 = 1e-3;
     let [source, target] = clouds(200);
-    let mut options = Preset::Paper.options(None);
+    let mut options = Preset::Paper.field();
     options.learning_rate = RATE;
     let Some(gpu) = shared() else {
         return;
     };
     let distance = DistanceTransform::build(&source, &target, &options.distance);
     let distance = distance.expect("small clouds fit");
-    let expected = first_losses(&source, &distance, options.seed, RATE.into(), STEPS);
+    let expected = first_losses(&source, &distance, 0, RATE.into(), STEPS);
     let transform = gpu
         .transform(&source, &target, &options.distance, &Uncontrolled)
         .expect("small clouds fit");
     let losses = super::whole::Losses::default();
-    let mut trainer = transform.start(&source, &options).expect("a trainer");
+    let mut trainer = transform.start(&source, &options, 0).expect("a trainer");
     trainer
         .advance(STEPS as usize, &losses)
         .expect("iterations");

@@ -1,6 +1,6 @@
-//! The card against the double-precision reference and the CPU backend.
+//! Tests of the GPU backend against the double-precision reference and the CPU backend.
 //!
-//! Needs a card; a software one will do.
+//! They need an adapter; a software adapter suffices.
 
 mod failures;
 mod half;
@@ -11,21 +11,22 @@ mod whole;
 use std::sync::OnceLock;
 
 use super::adapter::adapters;
-use super::backend::{Gpu, GpuOptions};
+use super::backend::Gpu;
+use super::memory::GpuOptions;
 use crate::flow::data::{Point, Random};
 use crate::gpu_in_tests;
 
-/// Pairs that the shared card fits at the same time.
+/// Number of lanes of the shared GPU.
 const LANES: usize = 4;
 
-/// A card of this test's own, the first that there is; none where the machine has none.
+/// Opens the first adapter for one test; none if the machine has none.
 fn opened(options: &GpuOptions) -> Option<Gpu> {
     let cards = adapters();
     gpu_in_tests::is_there(cards.len())
         .then(|| Gpu::open(&cards[0], options).expect("the card opens"))
 }
 
-/// The card that tests share which do it no harm.
+/// The GPU shared by the tests that leave it intact.
 fn shared() -> Option<&'static Gpu> {
     static SHARED: OnceLock<Option<Gpu>> = OnceLock::new();
     let options = GpuOptions {
@@ -35,8 +36,8 @@ fn shared() -> Option<&'static Gpu> {
     SHARED.get_or_init(|| opened(&options)).as_ref()
 }
 
-/// A wall and a box in front of it, and the same moved by a quarter of a metre. Not on a face of
-/// the grid's cells, where rounding decides which side's slope is seen.
+/// A wall with a box in front of it, and the same moved by 0.22 m. The points avoid the faces of
+/// the grid's cells, where rounding decides which side's gradient is sampled.
 fn clouds(points: usize) -> [Vec<Point>; 2] {
     let mut random = Random::new(5);
     let mut across = |width: f64| random.uniform(-width, width) as f32;

@@ -1,4 +1,4 @@
-//! What can be said of the shaders without a card.
+//! Tests of the shaders that need no GPU.
 
 use core::mem::offset_of;
 
@@ -44,7 +44,7 @@ fn every_shader_is_valid_and_fits_the_smallest_workgroup_memory() {
     }
 }
 
-/// Each record's fields as the shader places them: name and offset, and the record's size.
+/// The record's fields in the shader: names and offsets, and the record's size.
 fn layout(source: &str, record: &str) -> (Vec<(String, usize)>, usize) {
     let module = parsed(record, source);
     let found = module
@@ -76,7 +76,7 @@ fn host_and_shaders_agree_on_every_record() {
         blocks, tables, bricks, codes, far, far_pitch, far_vertices);
     same_layout!("query", Lane: transform, network, points, first_tile, tiles, first_chunk, chunks,
         center, scale, margin, margin_slope, truncation, flow_penalty, average, patience, min_delta, steps);
-    same_layout!("forward", Step: first, count, weight, step_size, square_correction, fresh);
+    same_layout!("forward", Step: first, count, weight, step_size, square_correction, ema_weight);
     same_layout!("forward", Tile: lane, tile);
     same_layout!("gradients", Chunk: lane, first_row, rows, first_point);
     same_layout!("judge", Status: state, iterations, best_iteration, best_loss, seen, seen_best,
@@ -91,7 +91,7 @@ fn host_and_brick_kernel_agree_on_every_record() {
     assert_eq!(layout(source, "Column").1, size_of::<layout::Column>());
 }
 
-/// The value of a whole constant of a shader.
+/// The value of an integer constant of a shader.
 fn constant(source: &str, name: &str) -> usize {
     let line = source
         .lines()

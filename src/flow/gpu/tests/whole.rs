@@ -1,4 +1,4 @@
-//! Whole runs, bit by bit: against the CPU backend, and against themselves.
+//! Whole fits, compared bit by bit with the CPU backend and with each other.
 
 use std::sync::Mutex;
 
@@ -8,8 +8,8 @@ use crate::flow::data::{Control, Point, Progress, Uncontrolled};
 use crate::flow::estimate::{Estimate, estimate};
 use crate::flow::field::{Backend, EarlyStop};
 use crate::flow::motion::MotionField;
-use crate::flow::options::{Ground, Options, Preset};
-use crate::flow::select::Problem;
+use crate::flow::options::{FieldOptions, Ground, Options, Preset};
+use crate::flow::problem::Problem;
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
 
 /// Collects the losses.
@@ -41,13 +41,7 @@ pub(super) fn street(seed: u64) -> SimulatedPair {
 }
 
 pub(super) fn solved(backend: &dyn Backend, pair: &SimulatedPair, options: &Options) -> Estimate {
-    let problem = Problem {
-        source: &pair.source,
-        target: &pair.target,
-        ground: None,
-        before: None,
-        around: &[],
-    };
+    let problem = Problem::pair(&pair.source, &pair.target);
     estimate(backend, &problem, options, &Uncontrolled).expect("a flow")
 }
 
@@ -59,15 +53,15 @@ pub(super) fn end_point_error(flow: &[Point], truth: &[Point]) -> f64 {
     errors.sum::<f64>() / flow.len() as f64
 }
 
-/// The CPU by each of its instruction sets.
+/// The CPU backend with each available instruction set.
 fn cpus() -> Vec<CpuBackend> {
     let sets = Isa::available().into_iter();
     sets.map(|isa| CpuBackend::with_isa(isa, Some(2)).expect("threads"))
         .collect()
 }
 
-/// That a card found what one of the CPU's instruction sets does, bit by bit: one that rounds a
-/// product before it adds to it, or one that does not, as the card does.
+/// Asserts that the GPU's result is bit-identical to the CPU's with one of its instruction sets.
+/// They differ in whether a product is rounded before it is added, and so do GPUs.
 fn assert_among<T: PartialEq>(found: &T, of: impl Fn(&CpuBackend) -> T, what: &str) {
     assert!(cpus().iter().any(|cpu| of(cpu) == *found), "{what}");
 }
@@ -86,8 +80,9 @@ fn a_card_finds_the_bits_of_the_cpu_that_rounds_as_it_does() {
         options.ground = ground;
         let found = |device: &dyn Backend| {
             let found = solved(device, &pair, &options);
-            let ends = (found.iterations, found.best_iteration, found.best_loss);
-            (found.flow, ends, found.field.to_bytes())
+            let fit = found.fit().expect("a fit");
+            let ends = (fit.iterations, fit.best_iteration, fit.best_loss);
+            (found.flow, ends, found.motion.to_bytes())
         };
         assert_among(&found(gpu), |cpu| found(cpu), preset.name());
     }
@@ -100,7 +95,7 @@ fn every_loss_of_a_run_in_batches_is_the_cpus() {
         return;
     };
     let mut stopping = batched();
-    stopping.early_stop = Preset::Paper.options(None).early_stop;
+    stopping.early_stop = Preset::Paper.field().early_stop;
     for options in [batched(), stopping] {
         let run = |device: &dyn Backend| {
             let [source, target] = clouds(1500);
@@ -108,7 +103,7 @@ fn every_loss_of_a_run_in_batches_is_the_cpus() {
                 .transform(&source, &target, &options.distance, &Uncontrolled)
                 .expect("small clouds fit");
             let losses = Losses::default();
-            let mut trainer = transform.start(&source, &options).expect("a trainer");
+            let mut trainer = transform.start(&source, &options, 0).expect("a trainer");
             trainer.advance(STEPS, &losses).expect("iterations");
             let flow = trainer.evaluate(&source).expect("an answer");
             (losses.taken(), flow)
@@ -124,11 +119,11 @@ fn a_field_that_was_kept_says_on_any_device_what_its_run_said() {
     };
     let pair = street(2);
     let mut options = Preset::Neural.options(None);
-    options.max_iterations = 8;
+    options.field_mut().expect("a field").max_iterations = 8;
     options.ground = Ground::Keep;
     let estimate = solved(gpu, &pair, &options);
-    let field = MotionField::from_bytes(&estimate.field.to_bytes()).expect("sound bytes");
-    let places = field.static_places(&pair.source);
+    let field = MotionField::from_bytes(&estimate.motion.to_bytes()).expect("sound bytes");
+    let places = field.static_positions(&pair.source);
     let there = field.residual(gpu, &places).expect("flows");
     for (row, (residual, place)) in there.iter().zip(&places).enumerate() {
         let from = pair.source[row];
@@ -145,15 +140,15 @@ fn the_stopping_rule_and_the_best_are_the_cpus_for_the_same_losses() {
         return;
     };
     let [source, target] = clouds(500);
-    let mut options = Preset::Paper.options(None);
-    // Steps this long overshoot after a while.
+    let mut options = Preset::Paper.field();
+    // Steps of this length overshoot after some iterations.
     options.learning_rate = 0.03;
     options.max_iterations = 120;
     let transform = gpu
         .transform(&source, &target, &options.distance, &Uncontrolled)
         .expect("small clouds fit");
     let losses = Losses::default();
-    let mut trainer = transform.start(&source, &options).expect("a trainer");
+    let mut trainer = transform.start(&source, &options, 0).expect("a trainer");
     trainer.advance(200, &losses).expect("iterations");
     let report = trainer.report();
     let losses = losses.taken();
@@ -173,19 +168,19 @@ fn the_stopping_rule_and_the_best_are_the_cpus_for_the_same_losses() {
     assert_eq!(last.map(|place| place + 1), Some(report.best_iteration));
 }
 
-/// The flow of a pair that is fitted for `steps` iterations.
-fn fitted(device: &dyn Backend, points: usize, options: &Options, steps: usize) -> Vec<Point> {
+/// The flow of a pair after `steps` iterations.
+fn fitted(device: &dyn Backend, points: usize, options: &FieldOptions, steps: usize) -> Vec<Point> {
     let [source, target] = clouds(points);
     let transform = device
         .transform(&source, &target, &options.distance, &Uncontrolled)
         .expect("small clouds fit");
-    let mut trainer = transform.start(&source, options).expect("a trainer");
+    let mut trainer = transform.start(&source, options, 0).expect("a trainer");
     trainer.advance(steps, &Uncontrolled).expect("iterations");
     trainer.evaluate(&source).expect("an answer")
 }
 
-fn batched() -> Options {
-    let mut options = Preset::Neural.options(None);
+fn batched() -> FieldOptions {
+    let mut options = Preset::Neural.field();
     options.batch = Some(300);
     options
 }
@@ -197,7 +192,7 @@ fn a_pair_has_the_same_bits_alone_and_among_others() {
     };
     let sizes = [700, 901, 64];
     assert!(sizes.len() < LANES);
-    for options in [batched(), Preset::Paper.options(None)] {
+    for options in [batched(), Preset::Paper.field()] {
         let alone = sizes.map(|points| fitted(gpu, points, &options, 12));
         let together = std::thread::scope(|scope| {
             let options = &options;
@@ -218,17 +213,17 @@ fn a_pair_put_down_and_taken_up_again_has_the_same_bits() {
     let Some(gpu) = shared() else {
         return;
     };
-    for options in [batched(), Preset::Paper.options(None)] {
+    for options in [batched(), Preset::Paper.field()] {
         let expected = fitted(gpu, 600, &options, 14);
         let [source, target] = clouds(600);
         let transform = gpu
             .transform(&source, &target, &options.distance, &Uncontrolled)
             .expect("small clouds fit");
-        let mut first = transform.start(&source, &options).expect("a trainer");
+        let mut first = transform.start(&source, &options, 0).expect("a trainer");
         first.advance(5, &Uncontrolled).expect("iterations");
         let state = first.state().expect("an answer");
         drop(first);
-        let mut second = transform.start(&source, &options).expect("a trainer");
+        let mut second = transform.start(&source, &options, 0).expect("a trainer");
         second.restore(state).expect("memory");
         second.advance(9, &Uncontrolled).expect("iterations");
         assert!(second.evaluate(&source).expect("an answer") == expected);

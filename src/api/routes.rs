@@ -1,0 +1,11 @@
+//! The router of the public port.
+
+use super::service::Service;
+use super::{grpc, http, middleware};
+use std::sync::Arc;
+
+/// The routes of the public port: HTTP and gRPC, behind the common middleware.
+pub fn public_router(service: &Arc<Service>) -> axum::Router {
+    let calls = grpc::router(service).reset_fallback();
+    middleware::guarded(http::router(service).merge(calls), service)
+}

@@ -1,0 +1,404 @@
+//! Device selection: turns the `devices` entries of the configuration into devices to open.
+//!
+//! It opens no device, except to probe the GPUs that `auto` finds. Independent of queues and
+//! protocols.
+
+use std::collections::HashSet;
+use std::str::FromStr;
+use std::sync::Arc;
+use std::thread;
+
+use anyhow::{anyhow, bail};
+
+use crate::config::Config;
+use crate::cost::Lanes;
+use crate::engine::{DeviceFactory, DeviceOptions, Opened, ReopenPolicy, try_opening};
+use crate::flow::cpu::CpuBackend;
+use crate::flow::field::{Backend, BackendError};
+use crate::flow::gpu;
+use crate::flow::gpu::{Adapter, AdapterKind, Gpu, GpuOptions, Selector};
+use crate::job::DeviceKind;
+
+/// Default number of lanes of a hardware GPU. Small pairs alone leave a large GPU idle.
+const GPU_LANES: usize = 8;
+
+/// Default number of lanes of a software GPU, which shares the CPU cores with everything else.
+const SOFTWARE_LANES: usize = 2;
+
+/// Tests whether the device behind an opener works; the error is the reason why it does not.
+type Probe<'a> = &'a dyn Fn(&DeviceFactory) -> Result<(), String>;
+
+/// The devices of one server.
+pub(super) struct Pool {
+    /// Not opened yet.
+    pub(super) devices: Vec<DeviceOptions>,
+    /// Whether `auto` found no working GPU and chose the CPU instead.
+    pub(super) fell_back: bool,
+}
+
+impl Pool {
+    /// The devices that the configuration names. For `auto`, each GPU found is opened, self-tested
+    /// and closed again.
+    ///
+    /// # Errors
+    /// If an entry is malformed, or names a device that does not exist.
+    pub(super) fn of(config: &Config) -> anyhow::Result<Self> {
+        Self::probed(config, &try_opening)
+    }
+
+    /// The same without opening a GPU: every GPU found counts as working.
+    ///
+    /// # Errors
+    /// If an entry is malformed, or names a device that does not exist.
+    pub(super) fn unopened(config: &Config) -> anyhow::Result<Self> {
+        Self::probed(config, &|_| Ok(()))
+    }
+
+    fn probed(config: &Config, probe: Probe<'_>) -> anyhow::Result<Self> {
+        let mut pool = Self {
+            devices: Vec::new(),
+            fell_back: false,
+        };
+        for named in &config.devices {
+            match named.as_str() {
+                "auto" => pool.add_the_best(config, probe)?,
+                "cpu" => pool.add_cpu(None)?,
+                "gpu" => pool.add_every_gpu(config)?,
+                other => match other.split_once(':') {
+                    Some(("cpu", threads)) => pool.add_cpu(Some(threads))?,
+                    Some(("gpu", card)) if !card.is_empty() => {
+                        let Ok(selector) = Selector::from_str(card);
+                        pool.add_gpu(chosen(&selector, config)?, config);
+                    }
+                    _ => bail!(
+                        "devices: {other:?} is none; known are \"auto\", \"cpu\", \"cpu:THREADS\", \
+                         \"gpu\" and \"gpu:CARD\", where CARD is a number, a PCI id or a part of \
+                         a name that fnsf doctor shows"
+                    ),
+                },
+            }
+        }
+        Ok(pool)
+    }
+
+    /// Number of pairs that run at the same time, by device kind.
+    pub(super) fn lanes(&self) -> Lanes {
+        let of = |kind| {
+            let devices = self.devices.iter().filter(|device| device.kind == kind);
+            devices.map(|device| device.lanes).sum()
+        };
+        Lanes {
+            cpu: of(DeviceKind::Cpu),
+            gpu: of(DeviceKind::Gpu),
+        }
+    }
+
+    /// Adds every working GPU, or the CPU if there is none. A GPU that fails its probe is left out:
+    /// the configuration does not name it, and a server that waited for it would do no work.
+    fn add_the_best(&mut self, config: &Config, probe: Probe<'_>) -> anyhow::Result<()> {
+        let mut found = false;
+        let mut taken = Taken::default();
+        for card in welcome(config) {
+            if taken.has(&card) {
+                continue;
+            }
+            let (name, place) = (card.name.clone(), card.pci_id.clone());
+            let (lanes, open) = card_opener(card, config);
+            match probe(&open) {
+                Ok(()) => {
+                    found = true;
+                    taken.take(place);
+                    self.add(DeviceKind::Gpu, lanes, open);
+                }
+                Err(reason) => tracing::warn!(card = name, reason, "a GPU is left out"),
+            }
+        }
+        if found {
+            return Ok(());
+        }
+        self.fell_back = true;
+        self.add_cpu(None)
+    }
+
+    fn add_every_gpu(&mut self, config: &Config) -> anyhow::Result<()> {
+        let cards = welcome(config);
+        if cards.is_empty() {
+            // Returns the error that lists the available GPUs.
+            chosen(&Selector::Any, config)?;
+        }
+        let mut taken = Taken::default();
+        for card in cards {
+            if !taken.has(&card) {
+                taken.take(card.pci_id.clone());
+                self.add_gpu(card, config);
+            }
+        }
+        Ok(())
+    }
+
+    fn add_cpu(&mut self, threads: Option<&str>) -> anyhow::Result<()> {
+        let cores = thread::available_parallelism().map_or(1, usize::from);
+        let threads = match threads {
+            None => Some(cores.min(256)),
+            Some(threads) => threads.parse().ok(),
+        };
+        let threads = threads.filter(|threads| (1..=256).contains(threads));
+        let threads = threads.ok_or_else(|| anyhow!("devices: \"cpu:THREADS\" takes 1 to 256"))?;
+        let open: DeviceFactory = Box::new(move || {
+            let backend = CpuBackend::new(Some(threads))?;
+            Ok(Box::new(Processor(Arc::new(backend))))
+        });
+        self.add(DeviceKind::Cpu, 1, open);
+        Ok(())
+    }
+
+    fn add_gpu(&mut self, card: Adapter, config: &Config) {
+        let (lanes, open) = card_opener(card, config);
+        self.add(DeviceKind::Gpu, lanes, open);
+    }
+
+    fn add(&mut self, kind: DeviceKind, lanes: usize, open: DeviceFactory) {
+        let before = self.devices.iter().filter(|device| device.kind == kind);
+        self.devices.push(DeviceOptions {
+            name: format!("{}{}", kind.name(), before.count()),
+            kind,
+            lanes,
+            open,
+            reopening: ReopenPolicy::default(),
+        });
+    }
+}
+
+/// The number of lanes of a GPU, and its opener.
+fn card_opener(card: Adapter, config: &Config) -> (usize, DeviceFactory) {
+    let wanted = config.gpu_lanes.unwrap_or(match card.kind {
+        AdapterKind::Software => SOFTWARE_LANES,
+        _ => GPU_LANES,
+    });
+    let lanes = fitting_lanes(wanted, card.max_binding_bytes);
+    if lanes < wanted {
+        tracing::warn!(
+            card = card.name,
+            wanted,
+            lanes,
+            "no more pairs fit on the GPU"
+        );
+    }
+    let options = GpuOptions {
+        lanes,
+        memory_bytes: config.gpu_memory_mib.map(|mib| mib << 20),
+    };
+    let open: DeviceFactory = Box::new(move || {
+        let opened = Gpu::open(&found_again(&card)?, &options)?;
+        Ok(Box::new(opened))
+    });
+    (lanes, open)
+}
+
+/// Limits the lanes to the number of networks that fit into one GPU binding. A pair without a
+/// network would be given back to the queue again and again.
+fn fitting_lanes(wanted: usize, binding_bytes: u64) -> usize {
+    let networks = (binding_bytes / gpu::LANE_NETWORK_BYTES).max(1);
+    usize::try_from(networks).map_or(wanted, |networks| wanted.min(networks))
+}
+
+/// The GPU that a selector names.
+fn chosen(selector: &Selector, config: &Config) -> anyhow::Result<Adapter> {
+    let found = gpu::select(selector, config.allow_software_gpu);
+    found.map_err(|error| anyhow!("devices: {error}; fnsf doctor says how to mend it"))
+}
+
+/// Every GPU that may be used without being named: software GPUs only if the configuration allows
+/// them.
+fn welcome(config: &Config) -> Vec<Adapter> {
+    let mut cards = gpu::adapters();
+    cards.retain(|card| config.allow_software_gpu || card.kind != AdapterKind::Software);
+    cards
+}
+
+/// PCI ids of the GPUs taken so far. Two drivers may expose the same GPU, and opening it twice
+/// would use its memory twice.
+#[derive(Default)]
+struct Taken(HashSet<String>);
+
+impl Taken {
+    /// Whether this GPU is already taken through another driver.
+    fn has(&self, card: &Adapter) -> bool {
+        let has = self.0.contains(&card.pci_id);
+        if has {
+            tracing::info!(
+                card = card.name,
+                place = card.pci_id,
+                driver = card.driver,
+                "left out: another driver answers for the same card"
+            );
+        }
+        has
+    }
+
+    fn take(&mut self, place: String) {
+        // Without a PCI id every adapter counts as a separate GPU.
+        if !place.is_empty() {
+            self.0.insert(place);
+        }
+    }
+}
+
+/// Enumerates the adapters again and returns the same GPU. The adapter found before a loss may be
+/// stale.
+fn found_again(card: &Adapter) -> Result<Adapter, BackendError> {
+    let mut alike = gpu::adapters();
+    alike.retain(|other| other.name == card.name && other.pci_id == card.pci_id);
+    // Without a PCI id, identical GPUs are told apart by their index.
+    let twin = alike.iter().position(|other| other.index == card.index);
+    if alike.is_empty() {
+        return Err(BackendError::NoDevice(format!(
+            "{} does not answer any more",
+            card.name
+        )));
+    }
+    Ok(alike.swap_remove(twin.unwrap_or(0)))
+}
+
+/// The CPU backend with a fixed number of threads.
+struct Processor(Arc<CpuBackend>);
+
+impl Opened for Processor {
+    fn lane(&self) -> Arc<dyn Backend> {
+        Arc::<CpuBackend>::clone(&self.0)
+    }
+
+    fn is_lost(&self) -> bool {
+        false
+    }
+
+    /// The threads end when the last lane drops the backend.
+    fn destroy(&self) {}
+}
+
+impl Opened for Gpu {
+    fn lane(&self) -> Arc<dyn Backend> {
+        Arc::new(self.clone())
+    }
+
+    fn is_lost(&self) -> bool {
+        Gpu::is_lost(self)
+    }
+
+    fn destroy(&self) {
+        Gpu::destroy(self);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::Cell;
+
+    use super::*;
+    use crate::gpu_in_tests;
+
+    fn pool(devices: &[&str]) -> anyhow::Result<Pool> {
+        Pool::of(&Config {
+            devices: devices.iter().map(|name| (*name).to_owned()).collect(),
+            ..Config::default()
+        })
+    }
+
+    #[test]
+    fn processors_are_numbered_and_have_a_lane_each() {
+        let pool = pool(&["cpu", "cpu:2"]).expect("devices");
+        let names: Vec<_> = pool.devices.iter().map(|device| &device.name).collect();
+        assert_eq!(names, ["cpu0", "cpu1"]);
+        assert_eq!(pool.lanes(), Lanes { cpu: 2, gpu: 0 });
+        assert!(!pool.fell_back);
+    }
+
+    #[test]
+    fn what_is_no_device_is_refused_with_what_is() {
+        for devices in [["tpu"], ["cpu:0"], ["cpu:many"], ["gpu:"], ["auto:1"]] {
+            let refused = pool(&devices).err().expect("a refusal").to_string();
+            assert!(refused.starts_with("devices: "), "{refused}");
+        }
+        let refused = pool(&["gpu:no card has this name"]).err();
+        let refused = refused.expect("a refusal").to_string();
+        assert!(refused.contains("no such device"), "{refused}");
+    }
+
+    #[test]
+    fn auto_always_finds_something_and_says_when_it_is_no_card() {
+        let pool = pool(&["auto"]).expect("a device");
+        let first = pool.devices.first().expect("a device");
+        assert_eq!(pool.fell_back, first.kind == DeviceKind::Cpu);
+    }
+
+    #[test]
+    fn auto_leaves_out_cards_that_do_not_work_and_falls_back_to_the_cpu() {
+        let config = Config {
+            devices: vec!["auto".to_owned()],
+            allow_software_gpu: true,
+            ..Config::default()
+        };
+        let probed = Cell::new(0);
+        let broken = |_: &DeviceFactory| {
+            probed.set(probed.get() + 1);
+            Err("it computes nonsense".to_owned())
+        };
+        let pool = Pool::probed(&config, &broken).expect("a CPU");
+        assert_eq!(probed.get(), welcome(&config).len());
+        let names: Vec<_> = pool.devices.iter().map(|device| &device.name).collect();
+        assert_eq!(names, ["cpu0"]);
+        assert!(pool.fell_back);
+    }
+
+    #[test]
+    fn no_more_pairs_share_a_card_than_it_has_networks_for() {
+        assert_eq!(fitting_lanes(64, 128 << 20), 57);
+        assert_eq!(fitting_lanes(8, 128 << 20), 8);
+        assert_eq!(fitting_lanes(64, u64::from(u32::MAX)), 64);
+        assert_eq!(fitting_lanes(8, 0), 1);
+    }
+
+    #[test]
+    fn a_card_that_two_drivers_answer_for_is_taken_once() {
+        let cards = gpu::adapters();
+        if !gpu_in_tests::is_there(cards.len()) {
+            return;
+        }
+        let Some(card) = cards.into_iter().next() else {
+            return;
+        };
+        let at = |place: &str| {
+            let mut card = card.clone();
+            place.clone_into(&mut card.pci_id);
+            card
+        };
+        let cards = ["0000:01:00.0", "0000:02:00.0", "0000:01:00.0", "", ""].map(at);
+        let mut taken = Taken::default();
+        let mut kept = Vec::new();
+        for card in cards {
+            if !taken.has(&card) {
+                taken.take(card.pci_id.clone());
+                kept.push(card.pci_id);
+            }
+        }
+        assert_eq!(kept, ["0000:01:00.0", "0000:02:00.0", "", ""]);
+    }
+
+    #[test]
+    fn a_card_that_is_opened_with_the_most_lanes_has_a_network_for_each() {
+        let cards = gpu::adapters();
+        if !gpu_in_tests::is_there(cards.len()) {
+            return;
+        }
+        let Some(card) = cards.into_iter().next() else {
+            return;
+        };
+        let lanes = fitting_lanes(64, card.max_binding_bytes);
+        let options = GpuOptions {
+            lanes,
+            memory_bytes: None,
+        };
+        let gpu = Gpu::open(&card, &options).expect("it opens");
+        assert_eq!(gpu.lanes(), lanes);
+    }
+}

@@ -1,0 +1,11 @@
+//! The server process: assembles the components, starts them in order, and stops them in order.
+
+mod devices;
+mod housekeeping;
+mod process;
+mod shutdown;
+mod start;
+#[cfg(test)]
+mod tests;
+
+pub use start::App;

@@ -1,0 +1,59 @@
+//! Graceful shutdown within a deadline: report not ready, accept no new work, finish or interrupt
+//! running jobs, then close streams and connections.
+
+use std::time::Duration;
+
+use tokio::task::JoinSet;
+use tokio::time::{Instant, timeout_at};
+
+use super::start::App;
+
+/// Time reserved for interrupting the jobs that still run, before the connections are closed.
+const TO_PUT_DOWN: Duration = Duration::from_secs(2);
+
+/// Time for connections to flush their responses after streams are closed.
+const TO_CLOSE: Duration = Duration::from_secs(1);
+
+impl App {
+    /// Stops the server. Returns when everything has stopped or the deadline has passed.
+    pub async fn drain(mut self) {
+        let began = Instant::now();
+        let deadline = began + Duration::from_secs(self.config.shutdown.timeout_seconds);
+        self.draining.send_replace(true);
+        self.service.leave();
+        tracing::info!("not ready any more");
+        tokio::time::sleep(Duration::from_secs(
+            self.config.shutdown.readiness_delay_seconds,
+        ))
+        .await;
+
+        self.service.stop_accepting();
+        self.workers_drain.stop.cancel();
+        let to_finish = deadline - TO_PUT_DOWN.min(deadline - Instant::now()) - TO_CLOSE;
+        if timeout_at(to_finish, all(&mut self.workers)).await.is_err() {
+            tracing::info!("what still runs is put down, to go on later");
+            self.workers_drain.release.cancel();
+            if timeout_at(deadline - TO_CLOSE, all(&mut self.workers))
+                .await
+                .is_err()
+            {
+                tracing::warn!("a job did not stop in time; its lease ends with the process");
+            }
+        }
+        self.service.close_streams();
+        self.stop_listening.cancel();
+        let closing = deadline.min(Instant::now() + TO_CLOSE);
+        // A task that has finished must not be polled again.
+        if !self.listener.is_finished() && timeout_at(closing, &mut self.listener).await.is_err() {
+            tracing::debug!("some connections were still open");
+            self.listener.abort();
+        }
+        self.upkeep.shutdown().await;
+        self.queue.stopped();
+        tracing::info!(seconds = began.elapsed().as_secs_f64(), "stopped");
+    }
+}
+
+async fn all(workers: &mut JoinSet<()>) {
+    while workers.join_next().await.is_some() {}
+}

@@ -1,0 +1,485 @@
+//! The start of the server: checks, stores, devices, workers, ports, in this order.
+
+use super::{housekeeping, process};
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::thread;
+use std::time::Duration;
+
+use anyhow::{Context, anyhow};
+use tokio::sync::{mpsc, watch};
+use tokio::task::{JoinHandle, JoinSet};
+use tokio_util::sync::CancellationToken;
+
+use super::devices::Pool;
+use crate::api::{
+    Admission, AdmissionLimits, Caller, Hosts, Keys, ListenOptions, Listener, Parts, Readiness,
+    Role, Service, ServiceLimits, admin_router, public_router, tls_acceptor,
+};
+use crate::config::{Config, LimitsConfig, QueueConfig};
+use crate::cost::{CostModel, Lanes};
+use crate::engine::{Device, Health};
+use crate::health::{Heartbeat, StoreHealth};
+use crate::job::{DeviceKind, Priority, Tenant};
+use crate::metrics::Metrics;
+use crate::queue::{Event, Queue, QueueOptions, SqliteQueue};
+use crate::storage::Blobs;
+use crate::worker::{Drain, IsolationLock, StoreProbe, Worker, WorkerOptions};
+
+/// A server that runs.
+pub struct App {
+    public: SocketAddr,
+    admin: SocketAddr,
+    pub(super) config: Config,
+    pub(super) service: Arc<Service>,
+    pub(super) devices: Vec<Device>,
+    pub(super) workers: JoinSet<()>,
+    pub(super) workers_drain: Drain,
+    pub(super) draining: watch::Sender<bool>,
+    pub(super) queue: Arc<dyn Queue>,
+    pub(super) listener: JoinHandle<()>,
+    pub(super) stop_listening: CancellationToken,
+    pub(super) upkeep: JoinSet<()>,
+}
+
+impl App {
+    /// Starts everything. When this returns, both ports answer; devices may still be on trial.
+    ///
+    /// # Errors
+    /// Where a port, the data folder, a key or a device cannot be used, with what to do about it.
+    pub async fn start(config: Config) -> anyhow::Result<Self> {
+        config.check()?;
+        let pool = Pool::of(&config)?;
+        Self::start_on(pool, config).await
+    }
+
+    /// The same on devices that are chosen already.
+    pub(super) async fn start_on(pool: Pool, config: Config) -> anyhow::Result<Self> {
+        let lanes = pool.lanes();
+        let names: Vec<_> = pool.devices.iter().map(|device| &device.name).collect();
+        let metrics = Arc::new(Metrics::new(&names));
+        if pool.fell_back {
+            metrics.fell_back();
+            tracing::warn!(
+                "no GPU was found that works: the CPU does the work; fnsf doctor says why"
+            );
+        }
+        let keys = keys(&config)?;
+        process::keep_files_private();
+        process::survive_file_limits();
+        let open_files = process::raise_open_files();
+        let (stores, events) = Stores::open(&config).await?;
+        warn_of_stranded_jobs(stores.queue.as_ref(), lanes);
+
+        let mut devices = Vec::new();
+        for device in pool.devices {
+            devices.push(Device::start(device, &metrics)?);
+        }
+        let cost = Arc::new(CostModel::new(lanes));
+        let workers_drain = Drain::default();
+        let workers = start_workers(&devices, &stores, &cost, &metrics, &workers_drain, &config);
+        let keys_are_open = keys.is_open();
+        let service = Arc::new(service(&stores, &cost, &metrics, keys, &config));
+        let runtime = Arc::new(Heartbeat::default());
+        let upkeep = housekeeping::start(
+            &stores.queue,
+            &stores.blobs,
+            &metrics,
+            &devices,
+            events,
+            (&stores.probe, &runtime),
+        );
+        let listener = open_listener(&config, !keys_are_open, open_files, &metrics).await?;
+        let public = listener.address()?;
+        let (draining, drains) = watch::channel(false);
+        let readiness = Readiness {
+            devices: devices.clone(),
+            draining: drains,
+            store: stores.health,
+            loops: vec![
+                ("the runtime", runtime),
+                ("the public port", listener.heartbeat()),
+            ],
+        };
+        let queue = stores.queue;
+        let admin = serve_admin(config.admin_listen, readiness, &metrics, &queue, &cost)?;
+        let stop_listening = CancellationToken::new();
+        let router = public_router(&service);
+        let listener = tokio::spawn(listener.serve(router, stop_listening.clone()));
+        Ok(Self {
+            public,
+            admin,
+            config,
+            service,
+            devices,
+            workers,
+            workers_drain,
+            draining,
+            queue,
+            listener,
+            stop_listening,
+            upkeep,
+        })
+    }
+
+    /// Checks what can be checked without starting anything.
+    ///
+    /// # Errors
+    /// Where values do not go together, or a key or a device cannot be used.
+    pub fn check(config: &Config) -> anyhow::Result<()> {
+        config.check()?;
+        Pool::unopened(config)?;
+        keys(config)?;
+        Ok(())
+    }
+
+    /// Where HTTP and gRPC are served.
+    pub fn public_address(&self) -> SocketAddr {
+        self.public
+    }
+
+    /// Where health and metrics are served.
+    pub fn admin_address(&self) -> SocketAddr {
+        self.admin
+    }
+
+    /// Waits until a device has passed its trial.
+    ///
+    /// # Errors
+    /// Where none can.
+    pub async fn ready(&self) -> anyhow::Result<()> {
+        let mut reasons = Vec::new();
+        for device in &self.devices {
+            let mut health = device.health();
+            let tried = health
+                .wait_for(|health| *health != Health::Starting)
+                .await?;
+            match &*tried {
+                Health::Broken(reason) | Health::Gone(reason) => {
+                    reasons.push(format!("{}: {reason}", device.name()));
+                }
+                _ => return Ok(()),
+            }
+        }
+        Err(anyhow!(
+            "no device can be used: {}; fnsf doctor says more, --device cpu does without a GPU",
+            reasons.join("; ")
+        ))
+    }
+
+    /// Waits until a fresh process may do what this one cannot: until the last device of a kind has
+    /// worked, is lost, and does not come back, or until the queue or the public port has ended.
+    /// Says which.
+    pub async fn given_up(&mut self) -> String {
+        let (queue, listener) = (Arc::clone(&self.queue), &mut self.listener);
+        let devices = devices_given_up(&self.devices);
+        tokio::select! {
+            reason = devices => reason,
+            () = queue.ended() => "the queue's thread has ended".to_owned(),
+            _ = listener => "the public port has closed".to_owned(),
+        }
+    }
+}
+
+/// The queue and the stores below the data directory.
+struct Stores {
+    queue: Arc<dyn Queue>,
+    blobs: Blobs,
+    health: Arc<StoreHealth>,
+    probe: Arc<StoreProbe>,
+}
+
+impl Stores {
+    /// Opens them and checks that they belong together. Returns the queue's events, too.
+    async fn open(config: &Config) -> anyhow::Result<(Self, mpsc::UnboundedReceiver<Event>)> {
+        let (events, heard) = mpsc::unbounded_channel();
+        let blobs = Blobs::open(&config.data_dir.join("blobs"))
+            .with_context(|| format!("cannot use {}", config.data_dir.display()))?;
+        check_queue_is_there(config, &blobs)?;
+        let may_be_new = blobs.is_empty()?;
+        let queue = SqliteQueue::open(&config.data_dir, queue_options(&config.queue), events)
+            .with_context(|| format!("cannot open the queue in {}", config.data_dir.display()))?;
+        let queue: Arc<dyn Queue> = Arc::new(queue);
+        check_identity(queue.as_ref(), &blobs, may_be_new, config).await?;
+        let health = Arc::new(StoreHealth::default());
+        if let Some(free) = blobs.free_space() {
+            health.has_free(free);
+        }
+        let probe = StoreProbe::new(Arc::clone(&queue), blobs.clone(), Arc::clone(&health));
+        let stores = Self {
+            queue,
+            blobs,
+            health,
+            probe: Arc::new(probe),
+        };
+        Ok((stores, heard))
+    }
+}
+
+/// One worker for each lane of the devices.
+fn start_workers(
+    devices: &[Device],
+    stores: &Stores,
+    cost: &Arc<CostModel>,
+    metrics: &Arc<Metrics>,
+    drain: &Drain,
+    config: &Config,
+) -> JoinSet<()> {
+    let isolation = Arc::new(IsolationLock::default());
+    let has_cpu = cost.lanes().cpu > 0;
+    let mut workers = JoinSet::new();
+    for lane in devices.iter().flat_map(Device::lanes) {
+        let cpu_besides = lane.kind() == DeviceKind::Gpu && has_cpu;
+        let worker = Worker {
+            queue: Arc::clone(&stores.queue),
+            blobs: stores.blobs.clone(),
+            lane,
+            cost: Arc::clone(cost),
+            metrics: Arc::clone(metrics),
+            options: WorkerOptions {
+                snapshot_interval: Duration::from_millis(config.queue.snapshot_interval_ms),
+                overflow_kind: cpu_besides.then_some(DeviceKind::Cpu),
+            },
+            drain: drain.clone(),
+            isolation: Arc::clone(&isolation),
+            store: Arc::clone(&stores.probe),
+        };
+        workers.spawn(worker.run());
+    }
+    workers
+}
+
+/// The service behind both protocols.
+fn service(
+    stores: &Stores,
+    cost: &Arc<CostModel>,
+    metrics: &Arc<Metrics>,
+    keys: Keys,
+    config: &Config,
+) -> Service {
+    let is_loopback = config.listen.ip().is_loopback();
+    Service::new(Parts {
+        queue: Arc::clone(&stores.queue),
+        blobs: stores.blobs.clone(),
+        admission: Admission::new(
+            admission_limits(&config.limits),
+            Arc::clone(&stores.queue),
+            Arc::clone(cost),
+        ),
+        metrics: Arc::clone(metrics),
+        keys,
+        hosts: Hosts(is_loopback.then(|| config.allowed_hosts.clone())),
+        store_health: Arc::clone(&stores.health),
+        limits: service_limits(&config.limits),
+    })
+}
+
+/// The public port, with no more connections than the system allows open files.
+async fn open_listener(
+    config: &Config,
+    needs_key: bool,
+    open_files: Option<usize>,
+    metrics: &Arc<Metrics>,
+) -> anyhow::Result<Listener> {
+    let tls = match &config.tls {
+        None => None,
+        Some(tls) => Some(tls_acceptor(&tls.certificate, &tls.key)?),
+    };
+    let mut options = listen_options(&config.limits);
+    options.needs_key = needs_key;
+    if let Some(most) = open_files.filter(|&most| most < options.max_connections) {
+        tracing::warn!(
+            connections = most,
+            "fewer connections than max_connections: the system allows no more open files \
+             (ulimit -n)"
+        );
+        options.max_connections = most.max(1);
+    }
+    let listener = Listener::bind(config.listen, tls, options, Some(Arc::clone(metrics)));
+    listener
+        .await
+        .with_context(|| format!("cannot listen on {}", config.listen))
+}
+
+/// Waits until the last device of a kind has worked, is lost, and does not come back.
+async fn devices_given_up(devices: &[Device]) -> String {
+    let mut healths: Vec<_> = devices.iter().map(Device::health).collect();
+    loop {
+        if let Some(reason) = last_of_its_kind_is_gone(devices) {
+            return reason;
+        }
+        let changes = healths.iter_mut().map(|health| Box::pin(health.changed()));
+        let (changed, ..) = futures_util::future::select_all(changes).await;
+        if changed.is_err() {
+            return "a device's threads have ended".to_owned();
+        }
+    }
+}
+
+fn last_of_its_kind_is_gone(devices: &[Device]) -> Option<String> {
+    DeviceKind::ALL.into_iter().find_map(|kind| {
+        let of_kind = || devices.iter().filter(move |device| device.kind() == kind);
+        let may_work = of_kind().any(Device::may_work);
+        of_kind().find_map(|device| match &*device.health().borrow() {
+            Health::Gone(reason) if !may_work => Some(format!("{}: {reason}", device.name())),
+            _ => None,
+        })
+    })
+}
+
+/// Refuses to make a new queue where payloads of an older one lie: its file was lost or moved, and
+/// all that it promised would be taken for rubbish.
+fn check_queue_is_there(config: &Config, blobs: &Blobs) -> anyhow::Result<()> {
+    let file = config.data_dir.join("queue.sqlite3");
+    if file.exists() || blobs.is_empty()? {
+        return Ok(());
+    }
+    Err(anyhow!(
+        "{} is missing, but payloads of its jobs lie in {}: put it back, or name another data_dir",
+        file.display(),
+        config.data_dir.join("blobs").display()
+    ))
+}
+
+/// Refuses payloads that are not the queue's: those of another one, or an empty folder where a volume
+/// should be. A queue and a store that are both new are made for each other.
+async fn check_identity(
+    queue: &dyn Queue,
+    blobs: &Blobs,
+    may_be_new: bool,
+    config: &Config,
+) -> anyhow::Result<()> {
+    let folder = config.data_dir.join("blobs");
+    let found = blobs.identity();
+    let found = found.with_context(|| format!("cannot use {}", folder.display()))?;
+    match found {
+        Some(identity) if identity == queue.identity() => Ok(()),
+        None if may_be_new && queue.is_empty().await? => Ok(blobs.set_identity(queue.identity())?),
+        _ => Err(anyhow!(
+            "the payloads in {} are not those of the queue's jobs: is their volume mounted? put them \
+             back, or name another data_dir",
+            folder.display()
+        )),
+    }
+}
+
+/// Jobs of an earlier start may wait for a kind of device that this one does not have: they would
+/// do so in silence until their time is over.
+fn warn_of_stranded_jobs(queue: &dyn Queue, lanes: Lanes) {
+    let backlog = queue.backlog();
+    for kind in DeviceKind::ALL {
+        let jobs = backlog.queued_only_for(kind).jobs;
+        if lanes.of(kind) == 0 && jobs > 0 {
+            tracing::warn!(
+                jobs,
+                needs = kind.name(),
+                "jobs wait for a kind of device that this server does not have: start it with one, \
+                 or cancel them"
+            );
+        }
+    }
+}
+
+fn keys(config: &Config) -> anyhow::Result<Keys> {
+    let mut keys = Keys::default();
+    if let Some(key) = &config.api_key {
+        let caller = Caller {
+            tenant: Tenant::default(),
+            role: Role::Write,
+            max_priority: Priority::High,
+        };
+        keys.add(key.reveal(), caller).context("api_key")?;
+    }
+    for key in &config.keys {
+        let tenant = key.tenant.parse().context("keys")?;
+        let caller = Caller {
+            tenant,
+            role: key.role,
+            max_priority: key.max_priority,
+        };
+        keys.add(key.key.reveal(), caller).context("keys")?;
+    }
+    Ok(keys)
+}
+
+fn queue_options(config: &QueueConfig) -> QueueOptions {
+    let seconds = Duration::from_secs;
+    QueueOptions {
+        max_attempts: config.max_attempts,
+        max_crashes: config.max_crashes,
+        lease: seconds(config.lease_seconds),
+        retry_delay: seconds(config.retry_delay_seconds),
+        time_to_live: seconds(config.time_to_live_seconds),
+        retention: seconds(config.retention_seconds),
+        answered_retention: seconds(config.sync_result_retention_seconds),
+    }
+}
+
+fn admission_limits(config: &LimitsConfig) -> AdmissionLimits {
+    AdmissionLimits {
+        max_points: config.max_points,
+        max_pair_bytes: config.max_job_memory_mib << 20,
+        max_wait: Duration::from_secs(config.max_wait_seconds),
+        max_queue: Duration::from_secs(config.max_queue_seconds),
+        max_tenant_queue: Duration::from_secs(config.max_tenant_queue_seconds),
+    }
+}
+
+fn service_limits(config: &LimitsConfig) -> ServiceLimits {
+    ServiceLimits {
+        max_upload_bytes: config.max_upload_mib << 20,
+        max_uploads_bytes: config.max_total_upload_mib << 20,
+        max_answers_bytes: config.max_answers_mib << 20,
+        min_free_bytes: config.min_free_disk_mib << 20,
+        min_free_inodes: config.min_free_inodes,
+        max_sweeps: config.max_sweeps,
+        body_idle: Duration::from_secs(config.body_timeout_seconds),
+        stream_prefetch_pairs: config.stream_prefetch_pairs,
+    }
+}
+
+fn listen_options(config: &LimitsConfig) -> ListenOptions {
+    ListenOptions {
+        max_connections: config.max_connections,
+        header_timeout: Duration::from_secs(config.header_timeout_seconds),
+        write_timeout: Duration::from_secs(config.write_timeout_seconds),
+        ..ListenOptions::default()
+    }
+}
+
+/// Serves the admin port from a thread with a runtime of its own, to the end of the process.
+fn serve_admin(
+    address: SocketAddr,
+    readiness: Readiness,
+    metrics: &Arc<Metrics>,
+    queue: &Arc<dyn Queue>,
+    cost: &Arc<CostModel>,
+) -> anyhow::Result<SocketAddr> {
+    let socket = std::net::TcpListener::bind(address)
+        .with_context(|| format!("cannot listen on {address}"))?;
+    let bound = socket.local_addr()?;
+    let router = admin_router(
+        readiness,
+        Arc::clone(metrics),
+        Arc::clone(queue),
+        Arc::clone(cost),
+    );
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()?;
+    let serve = move || {
+        let served = runtime.block_on(async move {
+            let options = ListenOptions::of_admin();
+            let listener = Listener::on(socket, options)?;
+            listener.serve(router, CancellationToken::new()).await;
+            std::io::Result::Ok(())
+        });
+        if let Err(error) = served {
+            tracing::error!(%error, "the admin port has closed");
+        }
+    };
+    thread::Builder::new()
+        .name("admin".to_owned())
+        .spawn(serve)?;
+    Ok(bound)
+}

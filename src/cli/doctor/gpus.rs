@@ -1,0 +1,91 @@
+//! The GPU part of `fnsf doctor`: the properties of each GPU, the one that `auto` selects, and
+//! whether it estimates a test pair correctly.
+
+use std::time::Instant;
+
+use super::missing::Found;
+use crate::cli::device::{best_card, software_is_welcome};
+use crate::cli::failure::Failure;
+use crate::cli::output::say;
+use crate::engine::self_test_backend;
+use crate::flow::gpu;
+use crate::flow::gpu::{Adapter, AdapterKind, Gpu, GpuOptions};
+
+/// Prints the report on all GPUs.
+pub(super) fn report() -> Result<(), Failure> {
+    let cards = gpu::adapters();
+    if cards.is_empty() {
+        say(format_args!("gpu: none found"))?;
+    }
+    let taken = best_card().ok();
+    for card in &cards {
+        let taken = taken.as_ref().filter(|taken| taken.index == card.index);
+        describe(card, taken.is_some())?;
+        if let Some(taken) = taken {
+            say(format_args!("  {}", tried(taken)))?;
+        }
+    }
+    if taken.is_none() {
+        say(format_args!("  auto takes the CPU"))?;
+    }
+    say(format_args!(
+        "  a card is for presets neural and paper; default and label compute on the CPU whatever the device"
+    ))?;
+    let hardware = |card: &&Adapter| card.kind != AdapterKind::Software;
+    let found = Found::here(cards.iter().filter(hardware).count(), cards.len());
+    for advice in found.advice() {
+        say(format_args!("  {advice}"))?;
+    }
+    if taken.is_none() && !cards.is_empty() && !software_is_welcome() {
+        say(format_args!(
+            "  software is taken by its number alone, or for tests with FNSF_ALLOW_SOFTWARE_GPU=1"
+        ))?;
+    }
+    Ok(())
+}
+
+fn describe(card: &Adapter, taken: bool) -> Result<(), Failure> {
+    let taken = if taken { ", taken by auto" } else { "" };
+    let place = match card.pci_id.as_str() {
+        "" => String::new(),
+        place => format!(", {place}"),
+    };
+    say(format_args!(
+        "gpu:{}: {} ({}{place}){taken}",
+        card.index,
+        card.name,
+        card.kind.name(),
+    ))?;
+    say(format_args!("  {}, driver {}", card.interface, card.driver))?;
+    say(format_args!(
+        "  largest buffer {:.1} GB, workgroup memory {} KiB",
+        card.max_binding_bytes as f64 / 1e9,
+        card.workgroup_bytes >> 10
+    ))?;
+    match card.matrix_tiles.as_slice() {
+        [] => say(format_args!("  no matrix units that this program can use")),
+        tiles => say(format_args!("  matrix units: {}", tiles.join(", "))),
+    }
+}
+
+/// Opens the GPU and estimates the test pair on it. Returns the outcome as text.
+fn tried(card: &Adapter) -> String {
+    let opening = Instant::now();
+    let opened = match Gpu::open(card, &GpuOptions::default()) {
+        Ok(opened) => opened,
+        Err(error) => return format!("cannot be opened: {error}"),
+    };
+    let opening = opening.elapsed().as_secs_f64();
+    let trial = Instant::now();
+    let passed = match self_test_backend(&opened) {
+        Ok(()) => format!(
+            "opened in {opening:.1} s, passed its trial in {:.2} s",
+            trial.elapsed().as_secs_f64()
+        ),
+        Err(reason) => return format!("opened in {opening:.1} s, but {reason}"),
+    };
+    match opened.matrix_units() {
+        Ok(tile) => format!("{passed}; precision f16 by {tile}"),
+        Err(reason) => format!("{passed}; no precision f16: {reason}"),
+    }
+}

@@ -1,0 +1,7 @@
+//! `fnsf eval`: how good flow files are.
+
+mod report;
+mod run;
+
+pub(super) use run::Eval;
+pub(crate) use run::print_score;

@@ -1,0 +1,489 @@
+//! The configuration of the server: its keys, their defaults and their checks.
+//!
+//! Values are read from defaults, a TOML file, the environment and the command line, in that order.
+
+use super::secret::Secret;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+
+use figment::Figment;
+use figment::providers::{Env, Format, Serialized, Toml};
+use serde::{Deserialize, Serialize};
+
+use super::secret::wrong_values;
+use crate::api::Role;
+use crate::job::Priority;
+
+/// Prefix of environment variables. `__` descends one level, as in
+/// `FNSF_SERVE_LIMITS__MAX_POINTS=200000`.
+const PREFIX: &str = "FNSF_SERVE_";
+
+/// Name, after the prefix, of the variable that holds `api_key`.
+const API_KEY: &str = "API_KEY";
+
+/// Minimum time to interrupt running jobs and to close connections, seconds.
+const MIN_DRAIN_SECONDS: u64 = 4;
+
+/// Maximum number of lanes of a GPU. Each lane is a thread and takes a share of the GPU memory.
+const MAX_LANES: usize = 64;
+
+/// The complete configuration of the server.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Address of the public port, which serves both HTTP and gRPC.
+    pub listen: SocketAddr,
+    /// Address of the admin port, which serves health checks and metrics.
+    pub admin_listen: SocketAddr,
+    /// Directory of the queue, the payloads and the results.
+    pub data_dir: PathBuf,
+    /// Allow a listen address beyond loopback without any API key.
+    pub allow_unauthenticated: bool,
+    /// Host names besides localhost that requests may use on a loopback server without keys, such
+    /// as that of a reverse proxy. Other host names are refused, because a browser could be made to
+    /// send requests from another site's page.
+    pub allowed_hosts: Vec<String>,
+    /// One API key for the default tenant, with full access.
+    pub api_key: Option<Secret>,
+    /// API keys with tenants and roles.
+    pub keys: Vec<KeyConfig>,
+    /// TLS on the public port.
+    pub tls: Option<TlsConfig>,
+    /// Compute devices. `auto`: every usable GPU, or the CPU if there is none. `cpu`: all cores.
+    /// `cpu:4`: four threads. `gpu`: every GPU. `gpu:CARD`: one GPU by index, PCI id or part of its
+    /// name.
+    pub devices: Vec<String>,
+    /// Number of pairs that one GPU computes at the same time. By default chosen for the GPU.
+    pub gpu_lanes: Option<usize>,
+    /// Memory to use on a GPU, MiB. By default chosen for the GPU.
+    pub gpu_memory_mib: Option<u64>,
+    /// Accept GPU drivers that compute on the CPU. For tests.
+    pub allow_software_gpu: bool,
+    /// Limits on requests, uploads and connections.
+    pub limits: LimitsConfig,
+    /// Retries, leases and retention of jobs.
+    pub queue: QueueConfig,
+    /// Times of the shutdown.
+    pub shutdown: ShutdownConfig,
+    /// Log format and filter.
+    pub log: LogConfig,
+    /// Destination of traces: an OTLP endpoint over gRPC, such as http://localhost:4317.
+    pub otlp_endpoint: Option<String>,
+}
+
+/// An API key.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct KeyConfig {
+    /// Tenant that owns the jobs created and read with the key.
+    pub tenant: String,
+    /// Permissions of the key: read or write.
+    pub role: Role,
+    /// The key, at least 16 characters.
+    pub key: Secret,
+    /// Highest priority that its jobs may have: low, normal or high. High-priority jobs start
+    /// before all others, across tenants.
+    #[serde(default = "high")]
+    pub max_priority: Priority,
+}
+
+fn high() -> Priority {
+    Priority::High
+}
+
+/// Certificate and key of the public port.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TlsConfig {
+    /// Certificate chain, PEM.
+    pub certificate: PathBuf,
+    /// Private key of the certificate, PEM.
+    pub key: PathBuf,
+}
+
+/// Limits on requests, uploads and connections.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LimitsConfig {
+    /// Maximum number of points of one cloud.
+    pub max_points: usize,
+    /// Maximum memory of one pair on a device, or of one dense cloud, MiB.
+    pub max_job_memory_mib: usize,
+    /// Maximum size of one request body, MiB.
+    pub max_upload_mib: u64,
+    /// Maximum total size of all bodies that are being received and of the clouds decoded from them,
+    /// MiB.
+    pub max_total_upload_mib: u64,
+    /// Maximum total size of all responses that are being prepared and sent, MiB.
+    pub max_answers_mib: u64,
+    /// Free disk space below which new work is refused, MiB.
+    pub min_free_disk_mib: u64,
+    /// Number of free inodes (files that can still be created) below which new work is refused.
+    pub min_free_inodes: u64,
+    /// Maximum number of sweeps of one sequence.
+    pub max_sweeps: u32,
+    /// Maximum predicted wait of a synchronous call, seconds.
+    pub max_wait_seconds: u64,
+    /// Maximum predicted compute time of all queued jobs, seconds.
+    pub max_queue_seconds: u64,
+    /// Maximum predicted compute time of all queued jobs of one tenant, seconds.
+    pub max_tenant_queue_seconds: u64,
+    /// Maximum number of open connections.
+    pub max_connections: usize,
+    /// Timeout for the headers of a request, seconds.
+    pub header_timeout_seconds: u64,
+    /// Maximum time between two bytes of a request body, seconds. It is also the maximum delay of a
+    /// body behind a rate of 1 KiB/s.
+    pub body_timeout_seconds: u64,
+    /// Time that a response may stay unread by its client, seconds.
+    pub write_timeout_seconds: u64,
+    /// Number of pairs of a streamed sequence that are computed ahead of the client's reading.
+    pub stream_prefetch_pairs: usize,
+}
+
+/// Retries, leases and retention of jobs.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct QueueConfig {
+    /// Failures after which a job is not retried.
+    pub max_attempts: u32,
+    /// Crashes without a new snapshot in between after which a job is not retried.
+    pub max_crashes: u32,
+    /// Time without a heartbeat after which a running job is given to another worker, seconds.
+    pub lease_seconds: u64,
+    /// Delay before the second attempt, seconds. It doubles with each further attempt.
+    pub retry_delay_seconds: u64,
+    /// Maximum time in the queue of a job without a deadline, seconds.
+    pub time_to_live_seconds: u64,
+    /// Time that a finished job and its flow are kept, seconds.
+    pub retention_seconds: u64,
+    /// The same for a job whose result was already sent to its waiting caller, seconds.
+    pub sync_result_retention_seconds: u64,
+    /// Interval between snapshots of a running job, milliseconds.
+    pub snapshot_interval_ms: u64,
+}
+
+/// Times of the shutdown.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ShutdownConfig {
+    /// Time between reporting not ready and refusing new work, seconds. Load balancers need it to
+    /// react.
+    pub readiness_delay_seconds: u64,
+    /// Maximum time from the signal to the exit, seconds. Jobs that are still running are
+    /// interrupted and resumed after a restart.
+    pub timeout_seconds: u64,
+}
+
+/// Log format and filter.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LogConfig {
+    /// Output format.
+    pub format: LogFormat,
+    /// A level, or a filter such as `fnsf::worker=debug,info`.
+    pub filter: String,
+}
+
+/// Output format of the log.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum LogFormat {
+    /// Human-readable lines.
+    Human,
+    /// One JSON object per line.
+    Json,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        const DAY: u64 = 24 * 60 * 60;
+        Self {
+            listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
+            admin_listen: SocketAddr::from(([127, 0, 0, 1], 9090)),
+            data_dir: PathBuf::from("fnsf-data"),
+            allow_unauthenticated: false,
+            allowed_hosts: Vec::new(),
+            api_key: None,
+            keys: Vec::new(),
+            tls: None,
+            devices: vec!["auto".to_owned()],
+            gpu_lanes: None,
+            gpu_memory_mib: None,
+            allow_software_gpu: false,
+            limits: LimitsConfig {
+                max_points: 2_000_000,
+                max_job_memory_mib: 8192,
+                max_upload_mib: 1024,
+                max_total_upload_mib: 2048,
+                max_answers_mib: 1024,
+                min_free_disk_mib: 1024,
+                min_free_inodes: 10_000,
+                max_sweeps: 1000,
+                max_wait_seconds: 30,
+                max_queue_seconds: 7 * DAY,
+                max_tenant_queue_seconds: 7 * DAY / 2,
+                max_connections: 1024,
+                header_timeout_seconds: 15,
+                body_timeout_seconds: 30,
+                write_timeout_seconds: 60,
+                stream_prefetch_pairs: 3,
+            },
+            queue: QueueConfig {
+                max_attempts: 3,
+                max_crashes: 5,
+                lease_seconds: 60,
+                retry_delay_seconds: 1,
+                time_to_live_seconds: 7 * DAY,
+                retention_seconds: DAY,
+                sync_result_retention_seconds: 60,
+                snapshot_interval_ms: 1000,
+            },
+            shutdown: ShutdownConfig {
+                readiness_delay_seconds: 0,
+                timeout_seconds: 30,
+            },
+            log: LogConfig {
+                format: LogFormat::Human,
+                filter: "info".to_owned(),
+            },
+            otlp_endpoint: None,
+        }
+    }
+}
+
+/// Why a configuration is refused.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// A file cannot be read or is not TOML.
+    #[error("cannot read {path}: {reason}")]
+    File {
+        /// Path of the file.
+        path: String,
+        /// The reason.
+        reason: String,
+    },
+    /// A key is unknown, or a value has the wrong type or form.
+    #[error("{0}")]
+    Value(String),
+    /// A value is out of range, or two values contradict each other.
+    #[error("{0}")]
+    Together(String),
+}
+
+impl Config {
+    /// Reads the defaults, `file`, the environment and `flags`. Each overrides the previous ones.
+    ///
+    /// # Errors
+    /// [`ConfigError`], which names the key and its source.
+    pub fn load(file: Option<&Path>, flags: &impl Serialize) -> Result<Self, ConfigError> {
+        let mut figment = Figment::from(Serialized::defaults(Self::default()));
+        if let Some(path) = file {
+            let text = std::fs::read_to_string(path).map_err(|error| ConfigError::File {
+                path: path.display().to_string(),
+                reason: error.to_string(),
+            })?;
+            // figment's own message would quote the line, which may contain a key.
+            let _table: toml::Table = toml::from_str(&text).map_err(|error| {
+                let before = error.span().map_or(0, |span| span.start).min(text.len());
+                let line = 1 + text.as_bytes()[..before]
+                    .iter()
+                    .filter(|&&b| b == b'\n')
+                    .count();
+                ConfigError::File {
+                    path: path.display().to_string(),
+                    reason: format!("line {line}: {}", error.message()),
+                }
+            })?;
+            figment = figment.merge(Toml::file_exact(path));
+        }
+        let mut variables = Env::prefixed(PREFIX).split("__");
+        if let Ok(key) = std::env::var(format!("{PREFIX}{API_KEY}")) {
+            // Taken as a string: figment would parse a key of digits as a number.
+            figment = figment.merge(Serialized::default("api_key", key));
+            variables = variables.ignore(&["api_key"]);
+        }
+        let config: Self = figment
+            .merge(variables)
+            .merge(Serialized::defaults(flags))
+            .extract()
+            .map_err(|error| ConfigError::Value(wrong_values(error)))?;
+        config.check()?;
+        Ok(config)
+    }
+
+    /// Checks ranges, and values that must agree with each other.
+    ///
+    /// # Errors
+    /// [`ConfigError::Together`].
+    pub fn check(&self) -> Result<(), ConfigError> {
+        let refuse = |text: &str| Err(ConfigError::Together(text.to_owned()));
+        let open = self.api_key.is_none() && self.keys.is_empty();
+        if open && !self.listen.ip().is_loopback() && !self.allow_unauthenticated {
+            return refuse(
+                "listen goes beyond loopback and no key is needed: set api_key or keys, or \
+                 allow_unauthenticated = true if the network keeps strangers out",
+            );
+        }
+        if self.devices.is_empty() {
+            return refuse("devices is empty: name at least one, such as \"cpu\"");
+        }
+        if self
+            .gpu_lanes
+            .is_some_and(|lanes| !(1..=MAX_LANES).contains(&lanes))
+        {
+            return refuse("gpu_lanes must be 1 to 64");
+        }
+        if self.gpu_memory_mib == Some(0) {
+            return refuse("gpu_memory_mib must be at least 1");
+        }
+        if self.shutdown.timeout_seconds
+            < self
+                .shutdown
+                .readiness_delay_seconds
+                .saturating_add(MIN_DRAIN_SECONDS)
+        {
+            return refuse(
+                "shutdown.timeout_seconds must be at least 4 s longer than shutdown.readiness_delay_seconds: \
+                 what runs has to be put down",
+            );
+        }
+        for (key, value, least, most) in self.ranges() {
+            if !(least..=most).contains(&value) {
+                return refuse(&format!("{key} is {value}, {least} to {most} are possible"));
+            }
+        }
+        if self.limits.max_total_upload_mib < self.limits.max_upload_mib {
+            return refuse(
+                "limits.max_total_upload_mib must be no less than limits.max_upload_mib",
+            );
+        }
+        Ok(())
+    }
+
+    /// The configuration as TOML, with `***` for secrets.
+    ///
+    /// # Errors
+    /// If a value has no TOML form.
+    pub fn to_toml(&self) -> Result<String, ConfigError> {
+        let mut shown = self.clone();
+        // The URL may contain a password.
+        if let Some(endpoint) = &mut shown.otlp_endpoint
+            && let Some((scheme, rest)) = endpoint.split_once("://")
+            && let Some((_, host)) = rest.rsplit_once('@')
+        {
+            *endpoint = format!("{scheme}://***@{host}");
+        }
+        toml::to_string_pretty(&shown).map_err(|error| ConfigError::Together(error.to_string()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io::Write;
+
+    #[derive(Serialize)]
+    struct Nothing {}
+
+    fn load(text: &str) -> Result<Config, ConfigError> {
+        let mut file = tempfile::NamedTempFile::new().expect("a file");
+        file.write_all(text.as_bytes()).expect("written");
+        Config::load(Some(file.path()), &Nothing {})
+    }
+
+    #[test]
+    fn what_is_printed_is_read_back() {
+        let printed = Config::default().to_toml().expect("TOML");
+        let read = load(&printed).expect("a configuration");
+        assert_eq!(read.to_toml().expect("TOML"), printed);
+    }
+
+    #[test]
+    fn unknown_keys_and_wrong_values_are_refused_by_name() {
+        for (text, said) in [
+            ("lisen = \"127.0.0.1:1\"", "lisen"),
+            ("[limits]\nmax_pionts = 1", "max_pionts"),
+            ("listen = \"here\"", "listen"),
+            ("listen = \"0.0.0.0:8080\"", "listen goes beyond loopback"),
+            ("devices = []", "devices is empty"),
+            ("gpu_lanes = 0", "gpu_lanes"),
+            ("gpu_memory_mib = 0", "gpu_memory_mib"),
+            (
+                "[limits]\nmax_upload_mib = 17592186044416",
+                "1 to 8796093022208",
+            ),
+            (
+                "[limits]\nmin_free_disk_mib = 17592186044416",
+                "min_free_disk_mib",
+            ),
+            (
+                "[limits]\nmax_connections = 9223372036854775807",
+                "max_connections",
+            ),
+            (
+                "[limits]\nheader_timeout_seconds = 9223372036854775807",
+                "header_timeout",
+            ),
+            (
+                "[limits]\nstream_prefetch_pairs = 9223372036854775807",
+                "stream_prefetch_pairs",
+            ),
+            ("[limits]\nmax_connections = 0", "max_connections"),
+            (
+                "[shutdown]\ntimeout_seconds = 9223372036854775807",
+                "shutdown.timeout",
+            ),
+            (
+                "[shutdown]\nreadiness_delay_seconds = 9223372036854775807",
+                "readiness_delay_seconds",
+            ),
+            ("[queue]\nlease_seconds = 0", "lease_seconds"),
+            (
+                "[[keys]]\ntenant = \"a\"\nrole = \"root\"\nkey = \"x\"",
+                "one of read, write",
+            ),
+        ] {
+            let error = load(text).expect_err(text).to_string();
+            assert!(error.contains(said), "{text}: {error}");
+        }
+        let missing = Config::load(Some(Path::new("/nonexistent")), &Nothing {});
+        assert!(missing.is_err());
+    }
+
+    #[test]
+    fn a_key_that_is_wrong_is_not_shown() {
+        for text in [
+            "api_key = 12345678901234567890",
+            "api_key = 1234567890123456",
+            "api_key = 1234567890123.456",
+            "api_key = [\"1234567890123456\"]",
+            "api_key = \"1234567890123456\" x",
+            "api_key = 1234567890123456x",
+            "[[keys]]\ntenant = \"a\"\nrole = \"read\"\nkey = 1234567890123456",
+            "[[keys]]\ntenant = \"a\"\nrole = \"1234567890123456\"\nkey = \"read\"",
+            "keys = \"1234567890123456\"",
+            "keys = [\"1234567890123456\"]",
+            "tls = \"1234567890123456\"",
+        ] {
+            let error = load(text).expect_err(text);
+            let said = format!("{error} {error:?}");
+            assert!(!said.contains("1234567890"), "{text}: {said}");
+        }
+    }
+
+    #[test]
+    fn secrets_are_read_and_never_shown() {
+        let config = "api_key = \"a very long secret\"\notlp_endpoint = \"http://a:secret@b:1\"";
+        let config = load(config).expect("a configuration");
+        let key = config.api_key.clone().expect("a key");
+        assert_eq!(key.reveal(), "a very long secret");
+        let shown = config.to_toml().expect("TOML");
+        let debug = format!("{:?} {:?}", config.api_key, config.keys);
+        let shown = format!("{debug}{shown}");
+        assert!(
+            !shown.contains("secret") && shown.contains("***"),
+            "{shown}"
+        );
+    }
+}

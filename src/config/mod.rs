@@ -1,0 +1,12 @@
+//! The server's configuration: one tree of values, read from defaults, a file, the environment and
+//! command-line flags, in that order.
+//!
+//! Unknown keys are refused. Secrets are never printed. Independent of the parts of the server that
+//! use the values.
+
+mod keys;
+mod ranges;
+mod secret;
+
+pub use keys::{Config, ConfigError, LimitsConfig, LogConfig, LogFormat, QueueConfig};
+pub use secret::Secret;

@@ -1,0 +1,218 @@
+//! A device and its lanes: the handles that workers use.
+
+use super::densify::{Densification, Densified};
+use super::{densify, self_test, slot};
+use std::sync::Arc;
+use std::thread;
+use std::time::Duration;
+
+use tokio::sync::{mpsc, oneshot, watch};
+
+use super::liveness::Liveness;
+use super::slot::{Command, Request};
+use super::supervisor::DeviceSupervisor;
+use super::types::{DeviceFactory, DeviceOptions, EngineError, Health, Work};
+use crate::flow::Estimate;
+use crate::flow::field::Backend;
+use crate::job::DeviceKind;
+use crate::metrics::Metrics;
+
+/// Runs the self-test: solves a small pair with known flow.
+///
+/// # Errors
+/// The reason why the device failed.
+pub fn self_test_backend(backend: &dyn Backend) -> Result<(), String> {
+    self_test::run(backend).map_err(|error| error.to_string())
+}
+
+/// Opens a device, runs the self-test, and closes it again.
+///
+/// # Errors
+/// The reason why the device failed.
+pub fn try_opening(open: &DeviceFactory) -> Result<(), String> {
+    self_test::opened(open).map(|opened| opened.destroy())
+}
+
+/// Handle to the thread of one lane.
+struct LaneHandle {
+    commands: mpsc::Sender<Command>,
+    liveness: Arc<Liveness>,
+}
+
+/// Handle to a device; clones share it.
+#[derive(Clone)]
+pub struct Device {
+    name: Arc<str>,
+    kind: DeviceKind,
+    health: watch::Receiver<Health>,
+    supervisor: Arc<DeviceSupervisor>,
+    lanes: Arc<[LaneHandle]>,
+}
+
+/// One lane of a device: runs one pair at a time.
+#[derive(Clone)]
+pub struct Lane {
+    device: Device,
+    place: usize,
+}
+
+impl Device {
+    /// Starts the threads of the lanes; the first one opens the device.
+    ///
+    /// # Errors
+    /// If a thread cannot be started.
+    pub fn start(options: DeviceOptions, metrics: &Arc<Metrics>) -> std::io::Result<Self> {
+        let (tell, health) = watch::channel(Health::Starting);
+        let name: Arc<str> = Arc::from(options.name);
+        let supervisor = Arc::new(DeviceSupervisor::new(
+            Arc::clone(&name),
+            options.open,
+            options.reopening,
+            Arc::clone(metrics),
+            tell,
+        ));
+        let mut lanes = Vec::new();
+        for place in 0..options.lanes.max(1) {
+            let (commands, inbox) = mpsc::channel(1);
+            let liveness = Arc::new(Liveness::default());
+            let (lane_supervisor, lane_liveness) = (Arc::clone(&supervisor), Arc::clone(&liveness));
+            thread::Builder::new()
+                .name(format!("device {name} {place}"))
+                .spawn(move || slot::run(&lane_supervisor, inbox, &lane_liveness))?;
+            lanes.push(LaneHandle { commands, liveness });
+        }
+        metrics.device_lanes(&name, lanes.len());
+        Ok(Self {
+            name,
+            kind: options.kind,
+            health,
+            supervisor,
+            lanes: lanes.into(),
+        })
+    }
+
+    /// The device's name in metrics and logs.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The kind of the device.
+    pub fn kind(&self) -> DeviceKind {
+        self.kind
+    }
+
+    /// The device's health as a watch channel.
+    pub fn health(&self) -> watch::Receiver<Health> {
+        self.health.clone()
+    }
+
+    /// Whether the device works, or may recover without intervention. A device that has worked
+    /// before usually recovers after a loss; one that never worked does not.
+    pub fn may_work(&self) -> bool {
+        match &*self.health.borrow() {
+            Health::Starting | Health::Ready => true,
+            Health::Broken(_) => self.supervisor.has_worked(),
+            Health::Gone(_) => false,
+        }
+    }
+
+    /// The lanes, one for each worker.
+    pub fn lanes(&self) -> impl ExactSizeIterator<Item = Lane> + '_ {
+        (0..self.lanes.len()).map(|place| Lane {
+            device: self.clone(),
+            place,
+        })
+    }
+
+    /// The reason why the device is not ready, if there is one. It is ready if a lane's thread
+    /// runs, the self-test has passed, and every lane at work has had a heartbeat within the last
+    /// 30 s.
+    pub fn not_ready_reason(&self) -> Option<String> {
+        if self.lanes().all(|lane| lane.has_ended()) {
+            return Some(format!("{} has no thread any more", self.name));
+        }
+        match &*self.health.borrow() {
+            Health::Starting => Some(format!("{} is being tried", self.name)),
+            Health::Broken(reason) | Health::Gone(reason) => {
+                Some(format!("{}: {reason}", self.name))
+            }
+            Health::Ready => {
+                let silences = self
+                    .lanes
+                    .iter()
+                    .map(|lane| lane.liveness.since_heartbeat());
+                let since_heartbeat = silences.max().unwrap_or_default();
+                (since_heartbeat > LONGEST_SILENCE).then(|| {
+                    format!(
+                        "{} gave no sign of life for {} s",
+                        self.name,
+                        since_heartbeat.as_secs()
+                    )
+                })
+            }
+        }
+    }
+
+    /// Reopens a device that was lost while idle. A lane at work detects the loss itself.
+    pub fn look(&self) {
+        if self.supervisor.is_lost_unreported() {
+            let _a_busy_lane_finds_out = self.lanes[0].commands.try_send(Command::Look);
+        }
+    }
+
+    /// Total working time, summed over the lanes.
+    pub fn busy_time(&self) -> Duration {
+        self.lanes.iter().map(|lane| lane.liveness.total()).sum()
+    }
+}
+
+impl Lane {
+    /// The device of this lane.
+    pub fn device(&self) -> &Device {
+        &self.device
+    }
+
+    /// The kind of the device.
+    pub fn kind(&self) -> DeviceKind {
+        self.device.kind
+    }
+
+    /// Whether the lane's thread has ended, by a panic that was not caught. It does not recover.
+    pub fn has_ended(&self) -> bool {
+        self.device.lanes[self.place].commands.is_closed()
+    }
+
+    /// Estimates the flow of one pair.
+    ///
+    /// # Errors
+    /// [`EngineError`]. After an error the device is ready for the next pair, or its health shows
+    /// otherwise.
+    pub async fn solve(&self, work: Work) -> Result<Estimate, EngineError> {
+        self.run(move |backend, liveness| Ok(slot::solve(backend, work, liveness)?))
+            .await
+    }
+
+    /// Transforms the sweeps of a sequence into one reference frame.
+    ///
+    /// # Errors
+    /// As [`Lane::solve`].
+    pub async fn densify(&self, work: Densification) -> Result<Densified, EngineError> {
+        self.run(move |backend, liveness| densify::densify(backend, &work, liveness))
+            .await
+    }
+
+    async fn run<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&dyn Backend, &Liveness) -> Result<T, EngineError> + Send + 'static,
+    ) -> Result<T, EngineError> {
+        let gone = || EngineError::Broken("its thread has ended".to_owned());
+        let (reply, answer) = oneshot::channel();
+        let command = Command::Do(Box::new(Request { work, reply }));
+        let commands = &self.device.lanes[self.place].commands;
+        commands.send(command).await.map_err(|_| gone())?;
+        answer.await.map_err(|_| gone())?
+    }
+}
+
+/// Time without a heartbeat during work after which a device counts as not ready.
+const LONGEST_SILENCE: Duration = Duration::from_secs(30);

@@ -1,0 +1,13 @@
+//! A sample of a distance transform.
+
+use crate::flow::data::Point;
+
+/// The distance at a point, and its gradient.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Sample {
+    /// Distance to the target, metres.
+    pub distance: f32,
+    /// Derivative of `distance` with respect to x, y and z. Zero along an axis on which the point
+    /// lies outside the grid.
+    pub gradient: Point,
+}

@@ -1,0 +1,127 @@
+//! Method field: distance transform, registration, then the fit of a neural field (FNSF).
+
+use super::ego_motion::ego_motion;
+use super::method::{Input, Solved};
+use super::result::{FieldSolution, Solution, StopReason};
+use crate::flow::data::{Hash, Point, transform_points};
+use crate::flow::error::FlowError;
+use crate::flow::field::{self, Backend, Fit, Fitted, Prior, Snapshot, Stop};
+use crate::flow::motion::{MotionField, Residual};
+use crate::flow::options::{Ego, FieldOptions, Options};
+use crate::flow::select::Selection;
+
+/// Estimates the residual motion by fitting a field on the backend, resumed from `snapshot` where
+/// one is given.
+///
+/// # Errors
+/// [`FlowError`] where the clouds or the snapshot are rejected, the control cancels, the fit
+/// diverges or the device fails.
+pub(super) fn residual_motion(
+    backend: &dyn Backend,
+    input: &Input<'_>,
+    options: &FieldOptions,
+    snapshot: Option<Snapshot>,
+) -> Result<Solved, FlowError> {
+    let Input {
+        problem,
+        selection,
+        control,
+        ..
+    } = *input;
+    // Without a warm start each pair is independent of the other pairs and of their order.
+    let before = problem.before.filter(|_| options.warm_start.is_some());
+    let identity = || identity(selection, input.options, before);
+    let state = snapshot
+        .map(|snapshot| snapshot.state_for(identity()))
+        .transpose()?;
+    let clouds = [selection.source.as_slice(), &selection.target];
+    let prepared = field::prepare(backend, clouds, options, control)?;
+    let prior = before.and_then(|field| field.ego).unwrap_or_default();
+    let ego = match (&prepared, input.options.ego) {
+        (Some(prepared), ego) => {
+            let host = backend.host();
+            ego_motion(host, selection, ego, &prior, prepared.whole, control)
+        }
+        (None, Ego::Given(target_from_source)) => Some(target_from_source),
+        (None, Ego::Auto | Ego::Off) => None,
+    };
+    let aligned = match &ego {
+        None => selection.source.clone(),
+        Some(motion) => transform_points(motion, &selection.source),
+    };
+    input.check_cancelled()?;
+    let fitted = match &prepared {
+        None => Fitted::nothing(aligned.len(), control),
+        Some(prepared) => Fit {
+            backend,
+            prior: before.and_then(|field| match &field.residual {
+                Residual::Network(network) => Some(Prior {
+                    network,
+                    has_ego: field.ego.is_some(),
+                }),
+                Residual::Still | Residual::Objects(_) => None,
+            }),
+            aligned: &aligned,
+            ego: ego.as_ref(),
+            options,
+            seed: input.options.seed,
+            identity: &identity,
+            prepared,
+            control,
+        }
+        .run(state)?,
+    };
+    Ok(Solved {
+        ego,
+        aligned,
+        residual: fitted.residual,
+        motion: fitted.network.map_or(Residual::Still, Residual::Network),
+        solution: Solution::Field(FieldSolution {
+            iterations: fitted.report.iterations,
+            max_iterations: fitted.max_iterations,
+            best_iteration: fitted.report.best_iteration,
+            best_loss: fitted.report.best_loss,
+            query_seconds: fitted.report.query_seconds,
+            distance_bytes: prepared.map_or(0, |prepared| prepared.transform.bytes()),
+            network_seconds: 0.0,
+        }),
+        stop_reason: match fitted.stop {
+            Stop::Converged => StopReason::Converged,
+            Stop::MaxIterations => StopReason::MaxIterations,
+            Stop::Deadline => StopReason::Deadline,
+        },
+        device: backend.name(),
+        precomputed_at: fitted.precomputed_at,
+    })
+}
+
+/// Hash of all inputs of a fit: the selected clouds, the registration clouds, the previous motion
+/// field, and every option except the memory limit.
+fn identity(selection: &Selection, options: &Options, before: Option<&MotionField>) -> u64 {
+    let mut options = options.clone();
+    if let Some(field) = options.field_mut() {
+        field.distance.max_bytes = 0;
+    }
+    let mut hash = Hash(Hash::default().of(format!("{options:?}").as_bytes()));
+    let mut cloud = |points: &[Point]| {
+        hash.word(points.len() as u64);
+        for [x, y, z] in points.iter().map(|point| point.map(f32::to_bits)) {
+            hash.word(u64::from(x) << 32 | u64::from(y));
+            hash.word(u64::from(z));
+        }
+    };
+    cloud(&selection.source);
+    cloud(&selection.target);
+    selection
+        .registration_clouds
+        .iter()
+        .flatten()
+        .for_each(|points| cloud(points));
+    if let Some(field) = before {
+        field
+            .to_bytes()
+            .into_iter()
+            .for_each(|byte| hash.word(byte.into()));
+    }
+    hash.0
+}

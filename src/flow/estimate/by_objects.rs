@@ -1,0 +1,85 @@
+//! Method objects: registration, then a rigid motion for each moving cluster.
+
+use super::ego_motion::{ego_motion, has_time_for_all};
+use super::method::{Input, Solved};
+use super::neighbors::aligned_neighbors;
+use super::result::{ObjectSolution, Solution, StopReason};
+use crate::flow::data::{Interrupt, Point, RigidTransform, transform_points};
+use crate::flow::error::FlowError;
+use crate::flow::host::Host;
+use crate::flow::motion::Residual;
+use crate::flow::objects::{Objects, SearchClouds};
+use crate::flow::options::ObjectOptions;
+
+/// Estimates the residual motion by an object search on the host's threads.
+///
+/// # Errors
+/// [`FlowError`] where the ground mask of a neighbor sweep is rejected or the control cancels.
+pub(super) fn residual_motion(
+    host: &Host,
+    input: &Input<'_>,
+    options: &ObjectOptions,
+) -> Result<Solved, FlowError> {
+    let Input {
+        problem,
+        selection,
+        control,
+        ..
+    } = *input;
+    let whole = has_time_for_all(selection, control);
+    let prior = RigidTransform::identity();
+    let ego = ego_motion(host, selection, input.options.ego, &prior, whole, control);
+    let motion = ego.unwrap_or_default();
+    let aligned = match &ego {
+        None => selection.source.clone(),
+        Some(motion) => transform_points(motion, &selection.source),
+    };
+    input.check_cancelled()?;
+    let find_ground = |sweeps: &[&[Point]]| host.ground(sweeps);
+    let neighbors = match &ego {
+        None => Vec::new(),
+        Some(ego) => aligned_neighbors(host, problem, input.options, ego, &find_ground, control)?,
+    };
+    let precomputed_at = control.seconds();
+    let clouds = SearchClouds {
+        source: &aligned,
+        target: &selection.target,
+        neighbors: &neighbors,
+        sweeps: [problem.source, problem.target],
+        target_from_source: motion,
+    };
+    let search = host.find_objects(&clouds, options, control);
+    if search.interrupted == Some(Interrupt::Cancelled) {
+        return Err(FlowError::Cancelled);
+    }
+    let objects = host.threads().install(|| {
+        let (rows, source) = (&selection.rows, &selection.source);
+        Objects::new(
+            problem.source.len(),
+            rows,
+            source,
+            &search,
+            &motion,
+            input.options.dt_s,
+        )
+    });
+    Ok(Solved {
+        ego,
+        residual: search.residual_of(&aligned),
+        aligned,
+        solution: Solution::Objects(ObjectSolution {
+            objects,
+            searched: search.clusters,
+            candidates: search.all_clusters,
+            cost_m: search.cost_m,
+            search_seconds: 0.0,
+        }),
+        stop_reason: match search.interrupted {
+            Some(_) => StopReason::Deadline,
+            None => StopReason::Completed,
+        },
+        motion: Residual::Objects(search.motions.into()),
+        device: host.name().to_owned(),
+        precomputed_at,
+    })
+}

@@ -1,0 +1,210 @@
+//! An opened GPU: queue, kernels, buffers, and detection of a lost device.
+
+use core::time::Duration;
+use std::sync::{Arc, Mutex, mpsc};
+
+use super::adapter::{Adapter, AdapterKind};
+use super::allocator::Allocator;
+use super::buffers::{Buffers, allocated};
+use super::health::Watchdog;
+use super::matrix_units;
+use super::matrix_units::Tile;
+use super::memory::{Budget, GpuOptions};
+use super::pipelines::Kernels;
+use crate::flow::data::locked;
+use crate::flow::field::BackendError;
+
+/// Time without an answer after which a GPU counts as hung. It is well below the default job lease
+/// of 60 s.
+const LONGEST_SILENCE: Duration = Duration::from_secs(20);
+/// The same limit for a software device, whose speed depends on the load of the machine.
+const SOFTWARE_SILENCE: Duration = Duration::from_secs(120);
+/// Interval at which a thread that waits for the GPU checks whether it is lost. It is long on
+/// purpose: a wait that times out while another thread finds the queue empty trips an assertion of
+/// wgpu 30 (gfx-rs/wgpu#9958), which loses the device.
+const LOOK: Duration = Duration::from_secs(2);
+/// An opened GPU: its queue, its kernels, its buffers, its health.
+pub(super) struct Context {
+    pub(super) device: wgpu::Device,
+    pub(super) queue: wgpu::Queue,
+    pub(super) kernels: Kernels,
+    pub(super) buffers: Buffers,
+    pub(super) budget: Budget,
+    pub(super) allocator: Allocator,
+    /// Seconds per tick of the GPU's timestamps; none if it has none.
+    pub(super) tick: Option<f64>,
+    pub(super) watchdog: Arc<Watchdog>,
+    /// The tile of its matrix units, or the reason why they cannot be used.
+    pub(super) tile: Result<Tile, String>,
+    networks: Mutex<Vec<u32>>,
+    longest_silence: Duration,
+}
+
+impl Context {
+    pub(super) fn open(adapter: &Adapter, options: &GpuOptions) -> Result<Self, BackendError> {
+        let handle = &adapter.handle;
+        let clock = handle.features() & wgpu::Features::TIMESTAMP_QUERY;
+        let tile = Tile::offered(handle);
+        let (matrices, experiments) = match tile {
+            Ok(_) => matrix_units::asked_for(),
+            Err(_) => Default::default(),
+        };
+        let opening = handle.request_device(&wgpu::DeviceDescriptor {
+            label: Some("fnsf"),
+            required_features: wgpu::Features::IMMEDIATES | clock | matrices,
+            experimental_features: experiments,
+            required_limits: handle.limits(),
+            memory_hints: wgpu::MemoryHints::MemoryUsage,
+            ..wgpu::DeviceDescriptor::default()
+        });
+        let (device, queue) = pollster::block_on(opening)
+            .map_err(|error| BackendError::NoDevice(format!("{}: {error}", adapter.name)))?;
+        let watchdog = Arc::new(Watchdog::default());
+        let heard = Arc::clone(&watchdog);
+        device.set_device_lost_callback(move |_, reason| heard.lost(reason));
+        let heard = Arc::clone(&watchdog);
+        // Only a defect causes an uncaptured error, and the results that it affects cannot be
+        // trusted.
+        device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
+            heard.lost(error.to_string());
+        }));
+
+        let kernels = Kernels::new(&device, &watchdog)?;
+        let (budget, buffers) = Buffers::take(&device, adapter, options)?;
+        let period = f64::from(queue.get_timestamp_period());
+        watchdog.check()?;
+        Ok(Self {
+            kernels,
+            buffers,
+            allocator: Allocator::new(budget.store_words),
+            networks: Mutex::new((0..budget.lanes as u32).rev().collect()),
+            budget,
+            tick: (!clock.is_empty()).then_some(period * 1e-9),
+            watchdog,
+            longest_silence: match adapter.kind {
+                AdapterKind::Software => SOFTWARE_SILENCE,
+                _ => LONGEST_SILENCE,
+            },
+            tile,
+            device,
+            queue,
+        })
+    }
+
+    /// Allocates a network slot and returns its index.
+    ///
+    /// # Errors
+    /// [`BackendError::Busy`] if all slots are in use.
+    pub(super) fn take_network(&self) -> Result<u32, BackendError> {
+        let mut free = locked(&self.networks);
+        free.pop().ok_or(BackendError::Busy)
+    }
+
+    pub(super) fn give_network_back(&self, network: u32) {
+        let mut free = locked(&self.networks);
+        free.push(network);
+    }
+
+    /// A temporary buffer that contains `contents`, a whole number of 32-bit words.
+    ///
+    /// # Errors
+    /// As [`Self::empty`].
+    pub(super) fn filled(&self, contents: &[u8]) -> Result<wgpu::Buffer, BackendError> {
+        let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST;
+        let buffer = self.empty(contents.len() as u64, usage)?;
+        self.queue.write_buffer(&buffer, 0, contents);
+        Ok(buffer)
+    }
+
+    /// A temporary buffer of `bytes` bytes.
+    ///
+    /// # Errors
+    /// [`BackendError::Busy`] if the GPU has no free memory now. [`BackendError::Memory`] if the
+    /// size exceeds the device's limit.
+    pub(super) fn empty(
+        &self,
+        bytes: u64,
+        usage: wgpu::BufferUsages,
+    ) -> Result<wgpu::Buffer, BackendError> {
+        let limit = self.device.limits().max_buffer_size;
+        allocated(&self.device, "work", bytes.max(16), usage).map_err(|error| match error {
+            BackendError::Memory { needed, .. } if needed <= limit => BackendError::Busy,
+            error => error,
+        })
+    }
+
+    pub(super) fn bound(
+        &self,
+        pipeline: &wgpu::ComputePipeline,
+        buffers: &[&wgpu::Buffer],
+    ) -> wgpu::BindGroup {
+        let entries: Vec<_> = (0..)
+            .zip(buffers)
+            .map(|(binding, buffer)| wgpu::BindGroupEntry {
+                binding,
+                resource: buffer.as_entire_binding(),
+            })
+            .collect();
+        self.device.create_bind_group(&wgpu::BindGroupDescriptor {
+            label: None,
+            layout: &pipeline.get_bind_group_layout(0),
+            entries: &entries,
+        })
+    }
+
+    pub(super) fn encoder(&self) -> wgpu::CommandEncoder {
+        let description = wgpu::CommandEncoderDescriptor::default();
+        self.device.create_command_encoder(&description)
+    }
+
+    /// Submits the commands, waits for them, and returns the first `bytes` bytes of `buffer`.
+    ///
+    /// # Errors
+    /// [`BackendError::Lost`] if the GPU does not answer.
+    pub(super) fn finish(
+        &self,
+        mut encoder: wgpu::CommandEncoder,
+        buffer: &wgpu::Buffer,
+        bytes: u64,
+    ) -> Result<Vec<u8>, BackendError> {
+        let usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
+        let staging = self.empty(bytes, usage)?;
+        encoder.copy_buffer_to_buffer(buffer, 0, &staging, 0, bytes);
+        let submission = self.queue.submit([encoder.finish()]);
+        let (mapped, answer) = mpsc::channel();
+        staging.map_async(wgpu::MapMode::Read, .., move |result| {
+            let _who_waits_may_have_given_up = mapped.send(result);
+        });
+        let mut waited = Duration::ZERO;
+        loop {
+            self.watchdog.check()?;
+            let wait = wgpu::PollType::Wait {
+                submission_index: Some(submission.clone()),
+                timeout: Some(LOOK),
+            };
+            match self.device.poll(wait) {
+                Ok(_) => break,
+                Err(wgpu::PollError::Timeout) => waited += LOOK,
+                Err(error) => return Err(BackendError::Device(error.to_string())),
+            }
+            if waited > self.longest_silence {
+                let seconds = waited.as_secs();
+                self.watchdog.lost(format!("no answer for {seconds} s"));
+            }
+        }
+        self.watchdog.check()?;
+        // The thread that polls runs the callbacks, and another thread may still be running this
+        // one.
+        match answer.recv_timeout(self.longest_silence) {
+            Ok(Ok(())) => {}
+            Ok(Err(error)) => {
+                self.watchdog.check()?;
+                return Err(BackendError::Device(error.to_string()));
+            }
+            Err(_) => return Err(BackendError::Device("no memory was mapped".to_owned())),
+        }
+        let view = staging.get_mapped_range(..);
+        let view = view.map_err(|error| BackendError::Device(error.to_string()))?;
+        Ok(view.to_vec())
+    }
+}

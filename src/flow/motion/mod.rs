@@ -1,0 +1,6 @@
+//! The motion between two sweeps at any point, for the neural method and for the object method.
+
+mod codec;
+mod motion_field;
+
+pub use motion_field::{MotionField, Residual};

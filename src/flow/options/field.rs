@@ -1,0 +1,273 @@
+//! Options of the neural field fit (FNSF).
+
+use crate::flow::distance::DistanceOptions;
+
+/// Options of the fit of a neural field to one pair.
+///
+/// The field is a ReLU MLP with 8 hidden layers, from a point to its displacement. Adam minimizes
+/// the mean distance of the displaced source points to the target (FNSF Section 3).
+#[derive(Clone, Debug, PartialEq)]
+pub struct FieldOptions {
+    /// Distance transform of the target, from which the loss takes its distances. A smaller cell is
+    /// more accurate, and costs memory and time.
+    pub distance: DistanceOptions,
+    /// The loss of one point.
+    pub loss: LossOptions,
+    /// Normalization of the network's inputs.
+    pub inputs: InputNormalization,
+    /// Initial weights of the network.
+    pub start: Start,
+    /// Learning rate (Adam's step size) of the first iteration.
+    pub learning_rate: f32,
+    /// Schedule of the learning rate over the iterations.
+    pub learning_rate_schedule: LearningRateSchedule,
+    /// Points per iteration (batch size); none for all points. The points are shuffled once and cut
+    /// into nearly equal batches, which are used in turn. Larger batches give less noisy gradients
+    /// at a proportionally higher cost per iteration.
+    pub batch: Option<usize>,
+    /// Which iteration's parameters become the result.
+    pub result: ResultChoice,
+    /// Early stopping before `max_iterations`; none to do all iterations.
+    pub early_stop: Option<EarlyStopOptions>,
+    /// Maximum number of iterations. The cosine schedule reaches a learning rate of zero there.
+    pub max_iterations: usize,
+    /// Floating-point precision of the network's matrix products during the fit.
+    pub precision: Precision,
+    /// Warm start: in a sequence, the fit of a pair starts from the field of the previous pair.
+    /// With none, each pair starts from new weights and is independent of the others.
+    pub warm_start: Option<WarmStart>,
+}
+
+impl FieldOptions {
+    /// FNSF with the settings of its published code, for full clouds or for sampled ones.
+    pub(crate) fn published(sampled: bool) -> Self {
+        let (learning_rate, patience) = if sampled { (0.01, 5) } else { (0.008, 10) };
+        Self {
+            distance: DistanceOptions::default(),
+            loss: LossOptions {
+                margin_m: 0.0,
+                margin_slope: 0.0,
+                margin_quantile: None,
+                truncation_m: None,
+                flow_penalty: 0.0,
+            },
+            inputs: InputNormalization::Raw,
+            start: Start::Xavier,
+            learning_rate,
+            learning_rate_schedule: LearningRateSchedule::Constant,
+            batch: None,
+            result: ResultChoice::Best,
+            early_stop: Some(EarlyStopOptions {
+                patience,
+                min_delta_m: 1e-3,
+            }),
+            max_iterations: 5000,
+            precision: Precision::F32,
+            warm_start: None,
+        }
+    }
+
+    /// Options of the preset `neural`. `docs/experiments/field.md` measures the effect of each
+    /// choice.
+    pub(super) fn neural() -> Self {
+        Self {
+            loss: LossOptions {
+                margin_m: 0.1,
+                margin_slope: 0.0,
+                margin_quantile: Some(0.9),
+                truncation_m: Some(1.0),
+                flow_penalty: 0.02,
+            },
+            inputs: InputNormalization::Centered { scale_m: 10.0 },
+            start: Start::ZeroFlow,
+            learning_rate: 0.004,
+            learning_rate_schedule: LearningRateSchedule::Cosine,
+            batch: Some(2048),
+            result: ResultChoice::Average { decay: 0.9 },
+            early_stop: None,
+            max_iterations: 150,
+            warm_start: Some(WarmStart {
+                max_iterations: 75,
+                learning_rate: 0.004,
+            }),
+            ..Self::published(false)
+        }
+    }
+
+    /// Number of iterations that a run usually takes: all of them without early stopping, otherwise
+    /// at most 60. The published stopping rule ends runs after 36 to 115.
+    pub fn expected_iterations(&self) -> usize {
+        match self.early_stop {
+            None => self.max_iterations,
+            Some(_) => self.max_iterations.min(60),
+        }
+    }
+
+    /// These options for a fit with a warm start.
+    pub(crate) fn warmed(&self, warm_start: WarmStart) -> Self {
+        Self {
+            max_iterations: warm_start.max_iterations.min(self.max_iterations),
+            learning_rate: warm_start.learning_rate,
+            ..self.clone()
+        }
+    }
+
+    /// These options for a run that its deadline shortens: batches of `batch` points, and a
+    /// learning rate that falls to zero within `iterations`.
+    pub(crate) fn under_deadline(&self, batch: usize, iterations: usize) -> Self {
+        Self {
+            learning_rate_schedule: LearningRateSchedule::Cosine,
+            batch: Some(batch),
+            result: ResultChoice::Average { decay: 0.9 },
+            early_stop: None,
+            max_iterations: iterations,
+            ..self.clone()
+        }
+    }
+}
+
+/// Options of a fit that starts from the field of the previous pair. They replace the options of
+/// the same name where the previous field explains the pair better than no residual motion.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct WarmStart {
+    /// Maximum number of iterations. [`FieldOptions::max_iterations`] still applies.
+    pub max_iterations: usize,
+    /// Learning rate (Adam's step size) of the first iteration.
+    pub learning_rate: f32,
+}
+
+/// Limits of a fit that its deadline shortens.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct DeadlineLimits {
+    /// Smallest and largest batch, points. Half of the smallest is no cheaper on two cores.
+    pub(crate) batches: [usize; 2],
+    /// Target number of iterations, achieved by a smaller batch. If the time allows more with the
+    /// largest batch, more are done.
+    pub(crate) iterations: usize,
+    /// Minimum number of iterations. With fewer, the fit is skipped, because its field would be
+    /// worse than none.
+    pub(crate) least_iterations: usize,
+}
+
+impl DeadlineLimits {
+    /// The limits, with an ego motion as a fallback (`ego`) or without one.
+    pub(crate) fn new(ego: bool) -> Self {
+        Self {
+            batches: [768, 2048],
+            iterations: 150,
+            least_iterations: if ego { 40 } else { 10 },
+        }
+    }
+}
+
+/// Loss of one point: `clamp(D(p + f), margin, truncation) + flow_penalty * |f|`.
+///
+/// `D` is the distance to the target, `p` a source point after the ego motion, `f` its displacement
+/// by the field. The published loss is `D(p + f)` alone (FNSF eq. 6).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LossOptions {
+    /// Margin of the distance, metres. Smaller distances have no gradient: two sweeps sample a
+    /// static surface at different points, and following the samples is not motion. A larger margin
+    /// suppresses more sampling noise and hides slower motion.
+    pub margin_m: f32,
+    /// Growth of the margin with a point's range, metres per metre. The point spacing of a lidar
+    /// grows with range as well. The margin of a point is the larger of `margin_m` and
+    /// `margin_slope` times its range.
+    pub margin_slope: f32,
+    /// Adapts `margin_slope` to the density of the pair: this quantile, 0 to 1, of distance over
+    /// range.
+    ///
+    /// It is taken after the ego motion and before the field moves the points, with ranges below 1
+    /// m counted as 1 m. It only raises the slope. A larger quantile gives a wider margin. Without
+    /// an ego motion it is ignored, because the distances then contain the ego motion. None keeps
+    /// `margin_slope`.
+    pub margin_quantile: Option<f32>,
+    /// Truncation of the distance, metres; none for no truncation. Larger distances have no
+    /// gradient, so that points without a counterpart in the target do not pull on the field. A
+    /// larger value admits counterparts farther away.
+    pub truncation_m: Option<f32>,
+    /// Weight of the length of the displacement, metres of loss per metre of flow. It keeps the
+    /// field at zero where the distance has no gradient. Larger values shorten all displacements.
+    pub flow_penalty: f32,
+}
+
+/// Normalization of the coordinates that the network takes as input.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum InputNormalization {
+    /// Coordinates in metres, without normalization. If the mean of the cloud is far from the
+    /// origin (more than 200 m along an axis, as in a map frame), the mean is subtracted.
+    Raw,
+    /// The mean of the cloud is subtracted, and the coordinates are divided by `scale_m`.
+    Centered {
+        /// Length that becomes one, metres.
+        scale_m: f32,
+    },
+}
+
+/// Initial weights of the network.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Start {
+    /// Xavier-uniform weights in every layer. The initial flows are metres long.
+    Xavier,
+    /// Xavier-uniform weights, with the last layer zero. The initial flow is zero.
+    ZeroFlow,
+}
+
+/// Schedule of the learning rate.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LearningRateSchedule {
+    /// Constant.
+    Constant,
+    /// Half a cosine, from the initial value to zero at `max_iterations`.
+    Cosine,
+}
+
+/// Which iteration's parameters become the result.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum ResultChoice {
+    /// Those of the iteration with the lowest loss.
+    Best,
+    /// The exponential moving average of the parameters over the iterations.
+    Average {
+        /// Weight of the previous average at each iteration, 0 to 1. Ramped up over the first
+        /// iterations. Larger values average over more iterations.
+        decay: f32,
+    },
+}
+
+/// Floating-point precision of the network's matrix products during the fit.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Precision {
+    /// Single precision throughout.
+    #[default]
+    F32,
+    /// Half-precision factors in the layers from 128 to 128 features: features, weights and
+    /// derivatives are rounded before they are multiplied. Sums, parameters, the optimizer, the
+    /// other layers, the loss and the evaluation of the result remain in single precision. Requires
+    /// a GPU whose matrix units pass their self-test; every other device rejects it.
+    F16,
+}
+
+impl Precision {
+    /// All precisions.
+    pub const ALL: [Self; 2] = [Self::F32, Self::F16];
+
+    /// The name used by the command line and the service.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::F32 => "f32",
+            Self::F16 => "f16",
+        }
+    }
+}
+
+/// Early stopping, as in the published code. A fit ends after `patience` iterations in which the
+/// loss was never more than `min_delta_m` below the best loss so far.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct EarlyStopOptions {
+    /// Iterations without progress before the fit ends. Larger values give longer fits.
+    pub patience: usize,
+    /// Decrease of the mean loss that counts as progress, metres. Larger values end the fit
+    /// earlier.
+    pub min_delta_m: f64,
+}

@@ -1,0 +1,17 @@
+//! Options of an estimate and their defaults.
+//!
+//! The values of the presets are defined here and nowhere else.
+
+mod field;
+mod objects;
+mod pair;
+mod preset;
+
+pub(crate) use field::DeadlineLimits;
+pub use field::{
+    EarlyStopOptions, FieldOptions, InputNormalization, LearningRateSchedule, LossOptions,
+    Precision, ResultChoice, Start, WarmStart,
+};
+pub use objects::ObjectOptions;
+pub use pair::{DEFAULT_DT_S, Ego, Ground, Method, Options};
+pub use preset::Preset;

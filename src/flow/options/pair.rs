@@ -1,0 +1,103 @@
+//! Options of the estimate of one pair, for both methods.
+
+use super::field::FieldOptions;
+use super::objects::ObjectOptions;
+use crate::flow::data::RigidTransform;
+
+/// Default time from the source sweep to the target sweep, seconds: a lidar at 10 Hz.
+pub const DEFAULT_DT_S: f32 = 0.1;
+
+/// Options of one estimate. Start from a [`super::Preset`] and change single values.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Options {
+    /// Seed of all random choices (weights, sampling, batches). The same seed gives bit-identical
+    /// results.
+    pub seed: u64,
+    /// Number of points sampled from each cloud after the crop and the ground removal; none for
+    /// all. A field is fitted to the sampled points only. The object search uses all points, and
+    /// only the sampled source points get a flow.
+    pub max_points: Option<usize>,
+    /// Half the side of the square crop around the sensor, metres: points with `|x|` or `|y|`
+    /// beyond it are excluded. None for no crop.
+    pub crop_m: Option<f32>,
+    /// Time from the source sweep to the target sweep, seconds. Velocities are displacements
+    /// divided by it.
+    pub dt_s: f32,
+    /// Handling of ground points.
+    pub ground: Ground,
+    /// Handling of the ego motion.
+    pub ego: Ego,
+    /// Method that estimates the residual motion.
+    pub method: Method,
+}
+
+/// Method that estimates the residual motion, with the ego motion taken out.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Method {
+    /// Object search: a rigid motion for each moving cluster. All other points are static.
+    Objects(ObjectOptions),
+    /// Neural field fitted to the pair (FNSF Section 3).
+    Field(FieldOptions),
+}
+
+impl Options {
+    /// Window size: the number of sweeps that an estimate uses where a sequence has them, at least
+    /// the two of the pair. It is 2 for a field, and for objects without an ego motion.
+    pub fn sweeps(&self) -> usize {
+        match &self.method {
+            Method::Objects(objects) if self.ego != Ego::Off => objects.sweeps.max(2),
+            Method::Objects(_) | Method::Field(_) => 2,
+        }
+    }
+
+    /// The options of the field fit; none for objects.
+    pub fn field(&self) -> Option<&FieldOptions> {
+        match &self.method {
+            Method::Field(field) => Some(field),
+            Method::Objects(_) => None,
+        }
+    }
+
+    /// Mutable access to [`Self::field`].
+    pub fn field_mut(&mut self) -> Option<&mut FieldOptions> {
+        match &mut self.method {
+            Method::Field(field) => Some(field),
+            Method::Objects(_) => None,
+        }
+    }
+
+    /// Mutable access to the options of the object search; none for a field.
+    pub fn objects_mut(&mut self) -> Option<&mut ObjectOptions> {
+        match &mut self.method {
+            Method::Objects(objects) => Some(objects),
+            Method::Field(_) => None,
+        }
+    }
+}
+
+/// Handling of ground points.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ground {
+    /// Ground points take part like all other points.
+    Keep,
+    /// Points of the problem's ground masks are excluded and get no flow.
+    Mask,
+    /// Points of the problem's ground masks are excluded. Without masks, those of
+    /// [`crate::flow::ground::segment()`] are.
+    ///
+    /// They get the ego-motion flow if the ego motion is separated and no points are sampled,
+    /// otherwise no flow. If fewer than [`crate::flow::MIN_POINTS`] other points remain in a cloud,
+    /// ground takes part.
+    Auto,
+}
+
+/// Handling of the ego motion, the rigid motion of the sensor between the two sweeps.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Ego {
+    /// Not separated: the method estimates the full motion.
+    Off,
+    /// Estimated by registration; the method estimates the residual motion.
+    Auto,
+    /// Given as target_from_source; the method estimates the residual motion.
+    Given(RigidTransform),
+}

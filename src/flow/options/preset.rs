@@ -1,0 +1,80 @@
+//! Presets: named sets of options.
+
+use super::field::FieldOptions;
+use super::objects::ObjectOptions;
+use super::pair::{DEFAULT_DT_S, Ego, Ground, Method, Options};
+
+/// A named set of options.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Preset {
+    /// Ego motion, then the rigid motion of each object from the two sweeps of the pair.
+    Default,
+    /// As [`Preset::Default`], with a window of up to five sweeps of a sequence.
+    Label,
+    /// Ego motion, then a short stochastic fit of a neural field to the residual motion.
+    Neural,
+    /// FNSF (ICCV 2023) with the settings of its published code.
+    Paper,
+}
+
+impl Preset {
+    /// All presets.
+    pub const ALL: [Self; 4] = [Self::Default, Self::Label, Self::Neural, Self::Paper];
+
+    /// The name used by the command line and the service.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Default => "default",
+            Self::Label => "label",
+            Self::Neural => "neural",
+            Self::Paper => "paper",
+        }
+    }
+
+    /// Whether the preset fits a neural field. Such a preset runs on a GPU where one is available,
+    /// and supports snapshots.
+    pub fn fits_field(self) -> bool {
+        matches!(self.options(None).method, Method::Field(_))
+    }
+
+    /// The presets that fit a neural field.
+    pub fn with_field() -> impl Iterator<Item = Self> {
+        Self::ALL.into_iter().filter(|preset| preset.fits_field())
+    }
+
+    /// The options of the preset.
+    ///
+    /// With `max_points` the presets that fit a field sample the clouds first. `paper` then uses
+    /// the published settings for sampled clouds instead of those for full clouds.
+    pub fn options(self, max_points: Option<usize>) -> Options {
+        let method = match self {
+            Self::Default => Method::Objects(ObjectOptions::default()),
+            Self::Label => Method::Objects(ObjectOptions {
+                sweeps: 5,
+                ..ObjectOptions::default()
+            }),
+            Self::Neural => Method::Field(FieldOptions::neural()),
+            Self::Paper => Method::Field(FieldOptions::published(max_points.is_some())),
+        };
+        let (ground, ego) = match self {
+            Self::Default | Self::Label | Self::Neural => (Ground::Auto, Ego::Auto),
+            Self::Paper => (Ground::Keep, Ego::Off),
+        };
+        Options {
+            seed: 0,
+            max_points,
+            crop_m: None,
+            dt_s: DEFAULT_DT_S,
+            ground,
+            ego,
+            method,
+        }
+    }
+
+    /// The options of the preset's field fit.
+    #[cfg(test)]
+    pub(crate) fn field(self) -> FieldOptions {
+        let options = self.options(None);
+        options.field().expect("a preset that fits a field").clone()
+    }
+}

@@ -1,0 +1,242 @@
+//! Writes flows.
+
+use super::{json, objects};
+use std::io::{Cursor, Write};
+
+use super::table::FLOW_AXES;
+use super::table::FlowTable;
+use crate::formats::error::{FileKind, FormatError, shorten};
+use crate::formats::feather::{FLOW_COLUMNS, Values};
+use crate::formats::limits::check_points;
+use crate::formats::motion::matrix_rows;
+use crate::formats::npz::NpzWriter;
+use crate::formats::pair::check_count;
+use crate::formats::sniff::ending;
+use crate::formats::{feather, npy, pcd, ply};
+use crate::picture::{INVALID_COLOR, color, full_scale, shown_motion};
+
+/// The formats that flow is written in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum FlowFormat {
+    /// `flow` N x 3 float32 and `valid` bool; where known, `dynamic` bool and `ego` 4 x 4 float64.
+    /// With objects, `cluster` int32 and `confidence` float32, and the clusters themselves with K
+    /// rows each: `clusters_points` uint32, `clusters_dynamic` bool; `clusters_center` (metres),
+    /// `clusters_size` (length, width, height in metres) and `clusters_velocity` (m/s), K x 3
+    /// float32; `clusters_yaw` (radians), `clusters_yaw_rate` (rad/s) and `clusters_confidence`,
+    /// float32.
+    Npz,
+    /// The displacements alone, N x 3 float32.
+    Npy,
+    /// Argoverse 2's columns and `is_valid`, `is_dynamic`, `cluster`, `confidence`. Float32, so
+    /// there is no rounding. Argoverse 2 accepts float16 too, which would round 1 m to half a
+    /// millimetre.
+    Feather,
+    /// Points with `flow_x`, `flow_y`, `flow_z`, `valid`, `dynamic`, `cluster`, `confidence`, and a
+    /// color by direction of motion.
+    Ply,
+    /// As PLY, with the color packed into `rgb`.
+    Pcd,
+    /// An object with `flow`, `valid`, `dynamic`, `ego`, `cluster`, `confidence`, `clusters`.
+    Json,
+}
+
+impl FlowFormat {
+    /// The endings that [`FlowFormat::from_path`] accepts.
+    pub const KNOWN: &'static str = ".npz, .npy, .feather, .ply, .pcd, .json";
+
+    /// The format of a file name's ending.
+    ///
+    /// # Errors
+    /// `UnknownExtension`, which lists the known endings.
+    pub fn from_path(path: &std::path::Path) -> Result<Self, FormatError> {
+        let name = path
+            .file_name()
+            .map(|name| name.to_string_lossy())
+            .unwrap_or_default();
+        Self::from_extension(&ending(&name)).map_err(|_| FormatError::UnknownExtension {
+            name: shorten(&name),
+            known: Self::KNOWN,
+        })
+    }
+
+    /// The format of an ending, with or without its dot, in upper or lower case.
+    ///
+    /// # Errors
+    /// `UnknownExtension`, which lists the known endings.
+    pub fn from_extension(extension: &str) -> Result<Self, FormatError> {
+        let bare = extension
+            .strip_prefix('.')
+            .unwrap_or(extension)
+            .to_ascii_lowercase();
+        Ok(match bare.as_str() {
+            "npz" => Self::Npz,
+            "npy" => Self::Npy,
+            "feather" => Self::Feather,
+            "ply" => Self::Ply,
+            "pcd" => Self::Pcd,
+            "json" => Self::Json,
+            _ => {
+                let name = shorten(extension);
+                return Err(FormatError::UnknownExtension {
+                    name,
+                    known: Self::KNOWN,
+                });
+            }
+        })
+    }
+
+    fn kind(self) -> FileKind {
+        match self {
+            Self::Npz => FileKind::Npz,
+            Self::Npy => FileKind::Npy,
+            Self::Feather => FileKind::Feather,
+            Self::Ply => FileKind::Ply,
+            Self::Pcd => FileKind::Pcd,
+            Self::Json => FileKind::Json,
+        }
+    }
+}
+
+/// Writes a flow of N rows.
+///
+/// # Errors
+/// `RowCount` where the table's parts differ in length. `NotFinite` or `OutOfRange` for a
+/// displacement that could not be read back. `Write` and `Encode` where writing fails.
+pub fn write_flow<W: Write>(
+    format: FlowFormat,
+    table: &FlowTable<'_>,
+    out: &mut W,
+) -> Result<(), FormatError> {
+    let count = table.source.len();
+    check_count("flow", table.flow.len(), count)?;
+    check_count("valid", table.valid.len(), count)?;
+    if let Some(dynamic) = table.dynamic {
+        check_count("dynamic", dynamic.len(), count)?;
+    }
+    if let Some(objects) = table.objects {
+        check_count("cluster", objects.cluster.len(), count)?;
+        check_count("confidence", objects.confidence.len(), count)?;
+    }
+    check_points(format.kind(), "flow", table.flow)?;
+    match format {
+        FlowFormat::Npz => write_npz(table, out),
+        FlowFormat::Npy => npy::write_points(out, table.flow),
+        FlowFormat::Feather => write_feather(table, out),
+        FlowFormat::Ply => write_ply(table, out),
+        FlowFormat::Pcd => write_pcd(table, out),
+        FlowFormat::Json => json::write(table, out),
+    }
+}
+
+fn write_npz<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatError> {
+    let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
+    npz.points("flow", table.flow)?;
+    npz.mask("valid", table.valid)?;
+    if let Some(dynamic) = table.dynamic {
+        npz.mask("dynamic", dynamic)?;
+    }
+    if let Some(ego) = table.ego {
+        npz.matrix("ego", &matrix_rows(ego))?;
+    }
+    if let Some(found) = table.objects {
+        objects::put(found, &mut npz)?;
+    }
+    out.write_all(npz.finish()?.get_ref())?;
+    Ok(())
+}
+
+fn write_feather<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatError> {
+    let axis = |axis: usize| -> Values<'_> {
+        Values::Floats(Box::new(table.flow.iter().map(move |flow| flow[axis])))
+    };
+    let [x, y, z] = FLOW_COLUMNS;
+    let mut columns = vec![(x, axis(0)), (y, axis(1)), (z, axis(2))];
+    columns.push(("is_valid", Values::Flags(table.valid)));
+    if let Some(dynamic) = table.dynamic {
+        columns.push(("is_dynamic", Values::Flags(dynamic)));
+    }
+    if let Some(objects) = table.objects {
+        columns.push(("cluster", Values::Ids(&objects.cluster)));
+        let confidence = objects.confidence.iter().copied();
+        columns.push(("confidence", Values::Floats(Box::new(confidence))));
+    }
+    feather::write(out, columns)
+}
+
+/// The color of every row, by direction of motion, with the ego motion taken out where it is known.
+fn colors(table: &FlowTable<'_>) -> Vec<[u8; 3]> {
+    let motion = shown_motion(table.source, table.flow, table.ego);
+    let scale = full_scale(&motion, table.valid);
+    let color_of = |(&motion, &valid)| {
+        if valid {
+            color(motion, scale)
+        } else {
+            INVALID_COLOR
+        }
+    };
+    motion.iter().zip(table.valid).map(color_of).collect()
+}
+
+fn write_ply<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatError> {
+    let mut properties = vec![("float", "x"), ("float", "y"), ("float", "z")];
+    properties.extend(FLOW_AXES.map(|axis| ("float", axis)));
+    properties.push(("uchar", "valid"));
+    if table.dynamic.is_some() {
+        properties.push(("uchar", "dynamic"));
+    }
+    if table.objects.is_some() {
+        properties.extend([("int", "cluster"), ("float", "confidence")]);
+    }
+    properties.extend(["red", "green", "blue"].map(|channel| ("uchar", channel)));
+    let comment = "flow is the displacement over the pair, metres, ego motion included";
+    ply::write_header(out, table.source.len(), &[comment], &properties)?;
+    write_rows(table, out, |[red, green, blue], row| {
+        row.extend([red, green, blue]);
+    })
+}
+
+fn write_pcd<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatError> {
+    let mut fields = vec![("x", 4, 'F'), ("y", 4, 'F'), ("z", 4, 'F')];
+    fields.extend(FLOW_AXES.map(|axis| (axis, 4, 'F')));
+    fields.push(("valid", 1, 'U'));
+    if table.dynamic.is_some() {
+        fields.push(("dynamic", 1, 'U'));
+    }
+    if table.objects.is_some() {
+        fields.extend([("cluster", 4, 'I'), ("confidence", 4, 'F')]);
+    }
+    fields.push(("rgb", 4, 'F'));
+    pcd::write_header(out, table.source.len(), &fields)?;
+    // PCL's convention: 0x00rrggbb, reinterpreted as a float.
+    write_rows(table, out, |[red, green, blue], row| {
+        row.extend([blue, green, red, 0]);
+    })
+}
+
+/// Writes rows of point, displacement, flags, cluster, confidence and color, little endian.
+fn write_rows<W: Write>(
+    table: &FlowTable<'_>,
+    out: &mut W,
+    push_color: impl Fn([u8; 3], &mut Vec<u8>),
+) -> Result<(), FormatError> {
+    const FLUSH_AT: usize = 64 << 10;
+    let mut bytes = Vec::with_capacity(FLUSH_AT + 64);
+    for (row, color) in colors(table).into_iter().enumerate() {
+        for value in table.source[row].iter().chain(&table.flow[row]) {
+            bytes.extend(value.to_le_bytes());
+        }
+        bytes.push(u8::from(table.valid[row]));
+        bytes.extend(table.dynamic.map(|dynamic| u8::from(dynamic[row])));
+        if let Some(objects) = table.objects {
+            bytes.extend(objects.cluster[row].to_le_bytes());
+            bytes.extend(objects.confidence[row].to_le_bytes());
+        }
+        push_color(color, &mut bytes);
+        if bytes.len() >= FLUSH_AT {
+            out.write_all(&bytes)?;
+            bytes.clear();
+        }
+    }
+    out.write_all(&bytes)?;
+    Ok(())
+}

@@ -1,0 +1,64 @@
+//! The options of a dense cloud.
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use super::error::InvalidOptions;
+use crate::flow::densify::{LaterSweeps, Plan, PlanError};
+
+/// A dense cloud of a sequence: the points of all sweeps, moved to one reference time by the
+/// estimated motion, in the sensor frame of that time.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Densify {
+    /// The reference time, in sweeps counted from 0. It may lie between two sweeps.
+    pub reference_time: f64,
+    /// Integration steps per sweep interval, 1 to 64.
+    #[serde(default = "one")]
+    pub substeps: u32,
+    /// How sweeps after the reference time are moved back to it.
+    #[serde(default)]
+    pub later_sweeps: LaterSweepsChoice,
+}
+
+/// How sweeps after the reference time are moved back to it.
+#[derive(
+    Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema, clap::ValueEnum,
+)]
+#[serde(rename_all = "snake_case")]
+pub enum LaterSweepsChoice {
+    /// With motion estimated backward in time, from each sweep to the previous one.
+    #[default]
+    Reverse,
+    /// With the inverse of the forward motion. It halves the number of estimates.
+    Inverse,
+}
+
+fn one() -> u32 {
+    1
+}
+
+impl Densify {
+    /// The densification plan for a sequence of `sweeps` sweeps.
+    ///
+    /// # Errors
+    /// [`PlanError`] if the reference time or the substeps are out of range, or the sweeps are too
+    /// few.
+    pub fn plan(&self, sweeps: usize) -> Result<Plan, PlanError> {
+        let later = match self.later_sweeps {
+            LaterSweepsChoice::Reverse => LaterSweeps::Reverse,
+            LaterSweepsChoice::Inverse => LaterSweeps::Inverse,
+        };
+        Plan::new(sweeps, self.reference_time, later, self.substeps as usize)
+    }
+
+    /// Rejects options that are invalid for every sequence.
+    pub(super) fn check(&self) -> Result<(), InvalidOptions> {
+        if !(self.reference_time.is_finite() && self.reference_time >= 0.0) {
+            return Err(InvalidOptions::ReferenceTime(self.reference_time));
+        }
+        // A sequence that contains the reference time, so that only the other options can fail.
+        let sweeps = (self.reference_time.ceil() as usize).saturating_add(2);
+        self.plan(sweeps).map(drop).map_err(InvalidOptions::Densify)
+    }
+}

@@ -1,0 +1,55 @@
+//! Errors of job options.
+
+use std::time::Duration;
+
+use crate::flow::MIN_POINTS;
+use crate::flow::densify::PlanError;
+
+/// The longest allowed deadline.
+pub(super) const MAX_DEADLINE: Duration = Duration::from_secs(24 * 60 * 60);
+/// The longest allowed time between two sweeps, seconds.
+pub(super) const MAX_DT_S: f32 = 60.0;
+
+/// Why options are refused.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum InvalidOptions {
+    /// The text is not the expected JSON object.
+    #[error("options: {0}")]
+    Json(String),
+    /// Fewer points than any method needs.
+    #[error("options: max_points is {0}, at least {MIN_POINTS} are needed")]
+    MaxPoints(u32),
+    /// The device is unknown.
+    #[error("options: device is {0:?}, \"auto\", \"cpu\" and \"gpu\" are known")]
+    Device(String),
+    /// The precision is unknown.
+    #[error("options: precision is {0:?}, \"f32\" and \"f16\" are known")]
+    Precision(String),
+    /// Half precision on the CPU, which does not support it.
+    #[error("options: precision is \"f16\", which the CPU does not compute in")]
+    HalfOnCpu,
+    /// Half precision with a preset that fits no field.
+    #[error("options: precision is \"f16\", which {0} does not compute in: take preset neural")]
+    HalfWithoutField(&'static str),
+    /// The crop is not a positive number of metres.
+    #[error("options: crop_m is {0}, a positive number of metres is needed")]
+    Crop(f32),
+    /// The time between two sweeps is out of range.
+    #[error("options: dt_s is {0}, more than 0 and at most {MAX_DT_S} seconds are possible")]
+    Dt(f32),
+    /// The deadline is zero or longer than a day.
+    #[error("options: deadline_ms is {0}, 1 to {max} are possible", max = MAX_DEADLINE.as_millis())]
+    Deadline(u64),
+    /// The reference time is negative or not finite.
+    #[error("options: densify.reference_time is {0}, a time in sweeps from 0 is needed")]
+    ReferenceTime(f64),
+    /// The sequence cannot be densified with these options.
+    #[error("options: densify: {0}")]
+    Densify(PlanError),
+    /// A given ego motion with a sequence of more than one pair.
+    #[error("options: a given ego is the motion of one pair, not of a sequence's: leave it out")]
+    OneMotion,
+    /// Densification of a single pair or of a streamed sequence.
+    #[error("options: densify is for sequences that are submitted as jobs")]
+    NoSequence,
+}

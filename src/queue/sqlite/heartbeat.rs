@@ -1,0 +1,57 @@
+//! Heartbeats of a lease, forwarded to the writer thread.
+
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use super::leases;
+use super::shared::Shared;
+use super::writer::Writer;
+use crate::job::JobId;
+use crate::job::JobProgress;
+use crate::queue::lease::Heart;
+use crate::queue::types::QueueOptions;
+use crate::sync::locked;
+
+/// Minimum interval between two lease renewals on disk.
+const BEAT: Duration = Duration::from_secs(1);
+
+/// The heartbeat of one lease. Every progress update goes to the subscribers; a renewal goes to
+/// disk once a second, or every quarter of the lease if that is shorter.
+pub(super) struct SqliteHeartbeat {
+    pub(super) id: JobId,
+    pub(super) attempt: u32,
+    pub(super) writer: Writer,
+    pub(super) shared: Arc<Shared>,
+    pub(super) options: QueueOptions,
+    pub(super) last: Mutex<Instant>,
+    pub(super) latest: Mutex<Option<JobProgress>>,
+}
+
+impl Heart for SqliteHeartbeat {
+    fn beat(&self, progress: Option<JobProgress>) {
+        if let Some(progress) = progress {
+            *locked(&self.latest) = Some(progress);
+            self.shared
+                .watchers
+                .progress(self.id, self.attempt, progress);
+        }
+        {
+            let mut last = locked(&self.last);
+            if last.elapsed() < BEAT.min(self.options.lease / 4) {
+                return;
+            }
+            *last = Instant::now();
+        }
+        let (id, attempt, options) = (self.id, self.attempt, self.options.clone());
+        let progress = *locked(&self.latest);
+        self.writer.write_later(move |connection, _| {
+            leases::beat(connection, &options, id, attempt, progress)
+        });
+    }
+
+    fn snapshot_kept(&self) {
+        let (id, attempt) = (self.id, self.attempt);
+        self.writer
+            .write_later(move |connection, _| leases::snapshot_kept(connection, id, attempt));
+    }
+}

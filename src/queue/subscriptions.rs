@@ -1,0 +1,74 @@
+//! Subscriptions: publishes the latest state of each watched job to its subscribers.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard};
+
+use tokio::sync::watch;
+
+use crate::job::{Job, JobId, JobProgress, State};
+use crate::sync::locked;
+
+/// The watched jobs. An entry is removed when its job ends, or at a state update without
+/// subscribers.
+#[derive(Debug, Default)]
+pub(super) struct Watchers {
+    has_dependents: Mutex<HashMap<JobId, watch::Sender<Arc<Job>>>>,
+}
+
+impl Watchers {
+    fn lock(&self) -> MutexGuard<'_, HashMap<JobId, watch::Sender<Arc<Job>>>> {
+        locked(&self.has_dependents)
+    }
+
+    /// Subscribes to `job`, as just read from the database. A newer published state is kept.
+    pub(super) fn follow(&self, job: &Arc<Job>) -> watch::Receiver<Arc<Job>> {
+        if job.state.is_end() {
+            // An ended job does not change: its last state is enough.
+            return watch::Sender::new(Arc::clone(job)).subscribe();
+        }
+        let mut has_dependents = self.lock();
+        let sender = has_dependents
+            .entry(job.id)
+            .or_insert_with(|| watch::Sender::new(Arc::clone(job)));
+        sender.send_if_modified(|known| {
+            let newer = is_newer(job, known);
+            if newer {
+                *known = Arc::clone(job);
+            }
+            newer
+        });
+        sender.subscribe()
+    }
+
+    /// Publishes the stored state of a job.
+    pub(super) fn push(&self, job: &Arc<Job>) {
+        let mut has_dependents = self.lock();
+        if let Some(sender) = has_dependents.get(&job.id) {
+            sender.send_replace(Arc::clone(job));
+            // Subscribers can still read the last state after the sender is dropped.
+            if sender.receiver_count() == 0 || job.state.is_end() {
+                has_dependents.remove(&job.id);
+            }
+        }
+    }
+
+    /// Publishes the progress of a running job.
+    pub(super) fn progress(&self, id: JobId, attempt: u32, progress: JobProgress) {
+        let has_dependents = self.lock();
+        if let Some(sender) = has_dependents.get(&id) {
+            sender.send_if_modified(|job| {
+                let current = job.state == State::Running && job.attempt == attempt;
+                if current {
+                    Arc::make_mut(job).progress = Some(progress);
+                }
+                current
+            });
+        }
+    }
+}
+
+/// Whether `job` is a later state than `known`.
+fn is_newer(job: &Job, known: &Job) -> bool {
+    let rank = |job: &Job| (job.attempt, job.state.is_end(), job.state == State::Running);
+    rank(job) > rank(known)
+}

@@ -1,0 +1,3 @@
+//! Locks for the rooms around the numerics.
+
+pub(crate) use crate::flow::locked;
