@@ -66,7 +66,7 @@ fn every_metric_is_described() {
 #[test]
 fn every_error_code_is_in_the_table_of_errors() {
     let source = read("src/api/error.rs");
-    let table = between(&source, "const TABLE: ", "];").expect("the table of errors");
+    let table = between(&source, "const ERRORS: ", "];").expect("the table of errors");
     let page = read("docs/api.md");
     let rows = table.split("row(").skip(1);
     let codes: Vec<&str> = rows.filter_map(|row| between(row, "\"", "\"")).collect();
