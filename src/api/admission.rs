@@ -216,7 +216,14 @@ impl Admission {
     fn wait(&self, backlog: &Backlog, asked: &Asked<'_>, reserved: f64) -> f64 {
         let ahead =
             |device| backlog.ahead_of(asked.tenant, asked.priority, asked.nominal_seconds, device);
-        let shared = ahead(None) + backlog.running().seconds + reserved;
+        let running = backlog.running();
+        // Running jobs delay a new one only where they occupy every lane.
+        let occupied = if running.jobs < self.cost.lanes().total() as u64 {
+            0.0
+        } else {
+            running.seconds
+        };
+        let shared = ahead(None) + occupied + reserved;
         let kinds = DeviceKind::ALL.into_iter().filter(|kind| {
             self.cost.lanes().of(*kind) > 0 && asked.device.is_none_or(|asked| asked == *kind)
         });
