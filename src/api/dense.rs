@@ -56,7 +56,7 @@ impl Closing {
             .into_iter()
             .filter(|edge| edge.source > edge.target);
         let back = back.enumerate().map(|(turn, edge)| PairOf {
-            place: edge.target as u32,
+            index: edge.target as u32,
             backward: true,
             sees: PairOf::seen(window_back(edge.target, points.len(), sweeps)),
             follows: chained && turn > 0,
@@ -68,20 +68,20 @@ impl Closing {
     }
 }
 
-/// The window of the pair from sweep `place + 1` back to sweep `place`: the window in the
+/// The window of the pair from sweep `index + 1` back to sweep `index`: the window in the
 /// time-reversed sequence, as a range of sweep indices. `count` is the number of sweeps, `sweeps`
 /// the window size.
-fn window_back(place: usize, count: usize, sweeps: usize) -> Range<usize> {
-    let Range { start, end } = window(count - 2 - place, count, sweeps);
+fn window_back(index: usize, count: usize, sweeps: usize) -> Range<usize> {
+    let Range { start, end } = window(count - 2 - index, count, sweeps);
     count - end..count - start
 }
 
 /// The number of field evaluations until all points are at the reference time.
 fn questions(asked: &Densify, plan: &Plan, points: &[usize]) -> f64 {
-    let of_sweep = |(place, &points): (usize, &usize)| {
-        let steps = (plan.into() - place as f64).abs().ceil();
+    let of_sweep = |(index, &points): (usize, &usize)| {
+        let steps = (plan.into() - index as f64).abs().ceil();
         let inverted =
-            asked.later_sweeps == LaterSweepsChoice::Inverse && place as f64 > plan.into();
+            asked.later_sweeps == LaterSweepsChoice::Inverse && index as f64 > plan.into();
         let each = if inverted {
             CORRECTIONS
         } else {

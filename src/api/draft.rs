@@ -177,7 +177,7 @@ impl Draft {
         let after = self.request.link.and_then(|link| link.after);
         let chained = options.chained() && (self.sweeps > 1 || after.is_some());
         let pair = self.request.pair;
-        let is_pair = pair == PairOf::ALONE || self.sweeps == pair.place + 1;
+        let is_pair = pair == PairOf::ALONE || self.sweeps == pair.index + 1;
         let work = {
             let service = Arc::clone(&service);
             move || {
@@ -247,8 +247,8 @@ impl Draft {
             }
         }
         let submission = self.submission(kind)?;
-        let place = self.admit(&submission)?;
-        let committed = tokio::spawn(self.commit(submission, place));
+        let index = self.admit(&submission)?;
+        let committed = tokio::spawn(self.commit(submission, index));
         committed.await.map_err(ApiError::internal)?
     }
 
@@ -307,11 +307,11 @@ impl Draft {
     fn pairs(&self) -> Vec<PairOf> {
         let options = &self.request.options;
         let (chained, sweeps) = (options.chained(), options.sweeps());
-        let forward = (0..self.sweeps - 1).map(|place| PairOf {
-            place,
+        let forward = (0..self.sweeps - 1).map(|index| PairOf {
+            index,
             backward: false,
-            sees: PairOf::seen(window(place as usize, self.sweeps as usize, sweeps)),
-            follows: chained && place > 0,
+            sees: PairOf::seen(window(index as usize, self.sweeps as usize, sweeps)),
+            follows: chained && index > 0,
         });
         forward.collect()
     }
@@ -323,12 +323,12 @@ impl Draft {
     fn nominal_seconds(&self, pairs: &[PairOf]) -> Result<f64, ApiError> {
         let mut seconds = 0.0;
         for pair in pairs {
-            let Some(Some(price)) = self.prices.get(pair.place as usize) else {
+            let Some(Some(price)) = self.prices.get(pair.index as usize) else {
                 continue;
             };
             let neighbors = (pair.sees[0]..pair.sees[1])
-                .filter(|&place| place != pair.place && place != pair.place + 1)
-                .map(|place| flow::neighbor_cost(self.points[place as usize]));
+                .filter(|&index| index != pair.index && index != pair.index + 1)
+                .map(|index| flow::neighbor_cost(self.points[index as usize]));
             let price = neighbors.fold(*price, |price, neighbor| Cost {
                 bytes: price.bytes + neighbor.bytes,
                 multiply_adds: price.multiply_adds + neighbor.multiply_adds,

@@ -399,8 +399,8 @@ impl Service {
             Kind::Sequence => 0..1 + self.pairs(job).await?.len() as u32,
         };
         let (owner, _) = job.sweeps();
-        for place in sweeps {
-            self.blobs.sync(owner, Blob::Sweep(place)).await?;
+        for index in sweeps {
+            self.blobs.sync(owner, Blob::Sweep(index)).await?;
         }
         Ok(())
     }

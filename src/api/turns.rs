@@ -127,8 +127,8 @@ mod tests {
         drop(first);
         while waiting.join_next().await.is_some() {}
         let done = done.lock().expect("no panic").clone();
-        let place = done.iter().position(|name| *name == "few");
-        assert!(place.is_some_and(|place| place <= 1), "{done:?}");
+        let index = done.iter().position(|name| *name == "few");
+        assert!(index.is_some_and(|index| index <= 1), "{done:?}");
     }
 
     #[test]

@@ -86,11 +86,11 @@ impl Uploads {
             None => held.get(tenant).copied() == most,
         };
         let mut paused = locked(&self.paused);
-        let own = (0..paused.len()).filter(|&place| may_end(&paused[place].tenant));
-        if let Some(place) = own.min_by_key(|&place| paused[place].since)
-            && paused[place].since.elapsed() >= self.limits.idle
+        let own = (0..paused.len()).filter(|&index| may_end(&paused[index].tenant));
+        if let Some(index) = own.min_by_key(|&index| paused[index].since)
+            && paused[index].since.elapsed() >= self.limits.idle
         {
-            paused.swap_remove(place).end.cancel();
+            paused.swap_remove(index).end.cancel();
         }
     }
 }

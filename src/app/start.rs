@@ -122,10 +122,13 @@ impl App {
         })
     }
 
-    /// Checks what can be checked without starting anything.
+    /// Checks a configuration without starting the server: the ranges and combinations of its values,
+    /// every API key and tenant name, and that the devices it names exist. GPUs are listed but not
+    /// opened. Ports, the data folder and the TLS files are not checked.
     ///
     /// # Errors
-    /// Where values do not go together, or a key or a device cannot be used.
+    /// If a value is out of range or contradicts another, a key or tenant name is invalid, or `devices`
+    /// names an unknown device or a GPU that the machine does not have.
     pub fn check(config: &Config) -> anyhow::Result<()> {
         config.check()?;
         Pool::unopened(config)?;

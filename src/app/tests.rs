@@ -252,14 +252,14 @@ async fn a_server_gives_up_when_the_last_card_does_not_come_back_and_not_before(
     let switches = [Arc::new(Switches::default()), Arc::new(Switches::default())];
     let cards = vec![switches[0].card("gpu0", 1), switches[1].card("gpu1", 1)];
     let mut stand = serve(cards, true).await;
-    for (place, switches) in switches.iter().enumerate() {
+    for (index, switches) in switches.iter().enumerate() {
         switches.refusals.store(u32::MAX, Ordering::Relaxed);
         switches.destroy();
         let job = stand
             .submit(json!({"device": "gpu", "preset": "neural"}))
             .await;
         let given_up = timeout(A_MOMENT, stand.app.given_up()).await;
-        if place == 0 {
+        if index == 0 {
             assert!(given_up.is_err(), "there was another card");
             assert_eq!(stand.end(&job).await.0, "succeeded");
         } else {

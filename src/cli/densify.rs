@@ -113,9 +113,9 @@ impl Densify {
         let surroundings = self.estimation.surroundings(&self.sweeps)?;
         let mut device = self.estimation.open()?;
         let solver_options = options.solver_options(usize::MAX);
-        let read = |(place, path): (usize, &PathBuf)| {
+        let read = |(index, path): (usize, &PathBuf)| {
             Ok(surroundings
-                .sweep(place, path)?
+                .sweep(index, path)?
                 .prepared(&solver_options)
                 .cropped(&solver_options))
         };
@@ -270,12 +270,12 @@ fn fit(
     for chain in plan.chains() {
         let (mut sequence, mut waiting) = (Sequence::default(), VecDeque::from(chain));
         let mut last = None;
-        for place in way(&waiting, sweeps.len()) {
+        for index in way(&waiting, sweeps.len()) {
             terminal.part(&format!("pair {} of {fits}", fields.len() + 1));
-            let before = last.replace(place).unwrap_or(place);
-            let larger = sweeps[before].points.len().max(sweeps[place].points.len());
-            let solver_options = surroundings.options(options, larger, [before, place]);
-            let found = device.push(&mut sequence, &sweeps[place], &solver_options, terminal)?;
+            let before = last.replace(index).unwrap_or(index);
+            let larger = sweeps[before].points.len().max(sweeps[index].points.len());
+            let solver_options = surroundings.options(options, larger, [before, index]);
+            let found = device.push(&mut sequence, &sweeps[index], &solver_options, terminal)?;
             fields.extend(fields_of_edges(found, &mut waiting));
             if waiting.is_empty() {
                 break;

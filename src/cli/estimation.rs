@@ -248,12 +248,12 @@ impl Surroundings {
         options
     }
 
-    /// Reads the sweep with index `place`. Where a ground raster is given, the sweep gets a ground
+    /// Reads the sweep with index `index`. Where a ground raster is given, the sweep gets a ground
     /// mask.
-    pub(super) fn sweep(&self, place: usize, path: &Path) -> Result<Sweep, Failure> {
+    pub(super) fn sweep(&self, index: usize, path: &Path) -> Result<Sweep, Failure> {
         let points = files::read_cloud(path)?;
         let ground = self.raster.as_ref().zip(self.poses.as_ref());
-        let ground = ground.map(|(raster, poses)| raster.ground(&points, &poses[place]));
+        let ground = ground.map(|(raster, poses)| raster.ground(&points, &poses[index]));
         Ok(Sweep { points, ground })
     }
 }

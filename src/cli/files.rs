@@ -134,8 +134,8 @@ pub(super) fn read_ground_raster(path: &Path) -> Result<GroundRaster, Failure> {
     let folder = path.parent().unwrap_or(Path::new(""));
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     let log = name.split("_ground_height_surface").next();
-    let place = folder.join(format!("{}{PLACE}", log.unwrap_or_default()));
-    GroundRaster::read(&read_bytes(path)?, &read_bytes(&place)?)
+    let index = folder.join(format!("{}{PLACE}", log.unwrap_or_default()));
+    GroundRaster::read(&read_bytes(path)?, &read_bytes(&index)?)
         .with_context(|| path.display().to_string())
         .map_err(Failure::bad_input)
 }
@@ -169,19 +169,19 @@ pub(super) fn check_outputs<'a>(
             .into_iter()
             .filter_map(|path| Some((identity(path)?, path.as_path()))),
     );
-    let mut places: HashSet<PathBuf> = HashSet::new();
+    let mut indices: HashSet<PathBuf> = HashSet::new();
     for path in outputs {
         let refuse = |why: &str| {
             let message = format!("cannot write {}: {why}", path.display());
             Err(Failure::internal(anyhow!(message)))
         };
-        let Some(place) = place_of(path) else {
+        let Some(index) = place_of(path) else {
             return refuse("its folder is not there");
         };
-        if place.is_dir() {
+        if index.is_dir() {
             return refuse("it is a folder");
         }
-        if !place.exists() && access(place.parent().unwrap_or(&place), Access::WRITE_OK).is_err() {
+        if !index.exists() && access(index.parent().unwrap_or(&index), Access::WRITE_OK).is_err() {
             return refuse("nothing can be written to its folder");
         }
         let same = identity(path).and_then(|identity| taken.insert(identity, path));
@@ -193,7 +193,7 @@ pub(super) fn check_outputs<'a>(
             );
             return Err(Failure::usage(anyhow!(message)));
         }
-        if !places.insert(place) {
+        if !indices.insert(index) {
             let message = format!(
                 "{} would be written twice: give another name",
                 path.display()
@@ -210,8 +210,8 @@ fn place_of(path: &Path) -> Option<PathBuf> {
     const LINKS: usize = 40;
     let mut path = path.to_owned();
     for _ in 0..LINKS {
-        if let Ok(place) = fs::canonicalize(&path) {
-            return Some(place);
+        if let Ok(index) = fs::canonicalize(&path) {
+            return Some(index);
         }
         let folder = path.parent()?;
         let folder = if folder.as_os_str().is_empty() {
@@ -219,11 +219,11 @@ fn place_of(path: &Path) -> Option<PathBuf> {
         } else {
             folder
         };
-        let place = fs::canonicalize(folder).ok()?.join(path.file_name()?);
+        let index = fs::canonicalize(folder).ok()?.join(path.file_name()?);
         // A link to a missing file: its target is the path to be created.
-        match fs::read_link(&place) {
-            Ok(target) => path = place.parent()?.join(target),
-            Err(_) => return Some(place),
+        match fs::read_link(&index) {
+            Ok(target) => path = index.parent()?.join(target),
+            Err(_) => return Some(index),
         }
     }
     None
@@ -237,17 +237,17 @@ pub(super) fn write<E: std::error::Error + Send + Sync + 'static>(
     writer: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
 ) -> Result<(), Failure> {
     let written = || -> anyhow::Result<()> {
-        let place = place_of(path).context("its folder is not there")?;
-        if place.exists() && !place.is_file() {
-            let mut file = BufWriter::new(File::create(&place)?);
+        let index = place_of(path).context("its folder is not there")?;
+        if index.exists() && !index.is_file() {
+            let mut file = BufWriter::new(File::create(&index)?);
             writer(&mut file)?;
             return Ok(file.flush()?);
         }
-        let (unfinished, file) = Unfinished::beside(&place)?;
+        let (unfinished, file) = Unfinished::beside(&index)?;
         let mut file = BufWriter::new(file);
         writer(&mut file)?;
         file.flush()?;
-        Ok(unfinished.rename(&place)?)
+        Ok(unfinished.rename(&index)?)
     };
     written()
         .with_context(|| format!("cannot write {}", path.display()))

@@ -189,16 +189,16 @@ impl Flow {
         let mut waiting: VecDeque<Waiting> = VecDeque::new();
         let mut last = None::<Vec<Point>>;
         let count = sweeps.count();
-        for place in 0..count {
+        for index in 0..count {
             let began = terminal.seconds();
             let sweep = match &sweeps {
-                Sweeps::Pair(pair) => pair[place].clone(),
-                Sweeps::Files(files) => surroundings.sweep(place, &files[place])?,
+                Sweeps::Pair(pair) => pair[index].clone(),
+                Sweeps::Files(files) => surroundings.sweep(index, &files[index])?,
             };
             let load = terminal.seconds() - began;
             let points = sweep.points.clone();
             let larger = points.len().max(last.as_ref().map_or(0, Vec::len));
-            let pair = [place.saturating_sub(1), place];
+            let pair = [index.saturating_sub(1), index];
             let solver_options = surroundings.options(&options, larger, pair);
             if let Some(source) = last.replace(points) {
                 waiting.push_back(Waiting {
@@ -221,7 +221,7 @@ impl Flow {
                     report.peak_rss_bytes = peak_resident_bytes();
                     self.put(estimate, &report, &pair.source, [pair.pair, count - 1])?;
                 }
-                if place + 1 < count {
+                if index + 1 < count {
                     break;
                 }
                 found = device.finish(&mut sequence, &terminal)?;
@@ -265,10 +265,10 @@ impl Flow {
         source: &[Point],
         [pair, pairs]: [usize; 2],
     ) -> Result<(), Failure> {
-        let place = |path: &PathBuf| numbered(path, pair, pairs);
+        let index = |path: &PathBuf| numbered(path, pair, pairs);
         let (output, picture) = (
-            self.output.as_ref().map(place),
-            self.picture.as_ref().map(place),
+            self.output.as_ref().map(index),
+            self.picture.as_ref().map(index),
         );
         if let Some(path) = &output {
             write(estimate, source, path)?;

@@ -53,7 +53,7 @@ pub struct Device {
 #[derive(Clone)]
 pub struct Lane {
     device: Device,
-    place: usize,
+    index: usize,
 }
 
 impl Device {
@@ -72,12 +72,12 @@ impl Device {
             tell,
         ));
         let mut lanes = Vec::new();
-        for place in 0..options.lanes.max(1) {
+        for index in 0..options.lanes.max(1) {
             let (commands, inbox) = mpsc::channel(1);
             let liveness = Arc::new(Liveness::default());
             let (lane_supervisor, lane_liveness) = (Arc::clone(&supervisor), Arc::clone(&liveness));
             thread::Builder::new()
-                .name(format!("device {name} {place}"))
+                .name(format!("device {name} {index}"))
                 .spawn(move || slot::run(&lane_supervisor, inbox, &lane_liveness))?;
             lanes.push(LaneHandle { commands, liveness });
         }
@@ -118,9 +118,9 @@ impl Device {
 
     /// The lanes, one for each worker.
     pub fn lanes(&self) -> impl ExactSizeIterator<Item = Lane> + '_ {
-        (0..self.lanes.len()).map(|place| Lane {
+        (0..self.lanes.len()).map(|index| Lane {
             device: self.clone(),
-            place,
+            index,
         })
     }
 
@@ -179,7 +179,7 @@ impl Lane {
 
     /// Whether the lane's thread has ended, by a panic that was not caught. It does not recover.
     pub fn has_ended(&self) -> bool {
-        self.device.lanes[self.place].commands.is_closed()
+        self.device.lanes[self.index].commands.is_closed()
     }
 
     /// Estimates the flow of one pair.
@@ -208,7 +208,7 @@ impl Lane {
         let gone = || EngineError::Broken("its thread has ended".to_owned());
         let (reply, answer) = oneshot::channel();
         let command = Command::Do(Box::new(Request { work, reply }));
-        let commands = &self.device.lanes[self.place].commands;
+        let commands = &self.device.lanes[self.index].commands;
         commands.send(command).await.map_err(|_| gone())?;
         answer.await.map_err(|_| gone())?
     }

@@ -199,13 +199,13 @@ impl Sequence {
         let ground = source.ground.as_deref();
         let ground = ground.zip(target.sweep.ground.as_deref());
         let others = window(pair, self.count, self.sweeps);
-        let others = others.filter(|&place| place != pair && place != pair + 1);
+        let others = others.filter(|&index| index != pair && index != pair + 1);
         let neighbors: Vec<NeighborSweep> = others
-            .filter_map(|place| {
-                let Sweep { points, ground } = &self.at(place).sweep;
+            .filter_map(|index| {
+                let Sweep { points, ground } = &self.at(index).sweep;
                 let ground = ground.as_deref();
                 // Sweeps more than 127 intervals away are skipped.
-                let at = i8::try_from(place as i64 - pair as i64).ok()?;
+                let at = i8::try_from(index as i64 - pair as i64).ok()?;
                 Some(NeighborSweep { points, ground, at })
             })
             .collect();
@@ -219,8 +219,8 @@ impl Sequence {
         estimate(backend, &problem, &target.options, control)
     }
 
-    fn at(&self, place: usize) -> &Held {
-        &self.held[place + self.held.len() - self.count]
+    fn at(&self, index: usize) -> &Held {
+        &self.held[index + self.held.len() - self.count]
     }
 
     /// Drops the sweeps that no later pair uses.

@@ -36,10 +36,11 @@ pub struct JobOptions {
     /// Time between consecutive sweeps, seconds, for velocities. 0.1 if not given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub dt_s: Option<f32>,
-    /// `keep`: ground points are treated as any other. `mask`: points marked in the ground masks of
-    /// the input are left out. `auto`: ground points move with the ego motion; they are taken from
-    /// the masks, or from a ground segmentation if there are no masks. By default chosen by the
-    /// preset.
+    /// Treatment of ground points. `keep`: as any other point. `mask`: points marked in the input's
+    /// ground masks are left out and get no flow; refused if a mask is missing. `auto`: ground points
+    /// are left out of the method and get the ego-motion flow, or none with `max_points` or without ego
+    /// motion; they are taken from the masks, or from a ground segmentation if there are none. Clouds
+    /// that are nearly all ground keep it. Default: `auto`; `keep` with `paper`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ground: Option<GroundChoice>,
     /// The ego motion: `off`, `auto` (estimated first) or a 4 x 4 matrix target_from_source. By

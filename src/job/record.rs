@@ -101,7 +101,7 @@ pub struct Job {
     /// The sequence that the pair belongs to; none for a single pair.
     pub parent: Option<JobId>,
     /// Index in the sequence of the earlier of its two sweeps, from 0.
-    pub place: u32,
+    pub index: u32,
     /// Whether the pair is backward in time: its source is the later sweep.
     pub backward: bool,
     /// The window of sweeps that the estimate uses: the first index, and one past the last.
@@ -112,7 +112,8 @@ pub struct Job {
     pub pairs_left: u32,
     /// The job that must end, with or without success, before this one starts.
     pub after: Option<JobId>,
-    /// Whether the next job of its chain starts from its motion field.
+    /// Whether the motion field of the result is stored for the next pair of the chain, which may start
+    /// from it (warm start). True for every pair of a streamed chain, because its end is not known.
     pub has_dependents: bool,
     /// Time from which only a free device is missing. None while the job in `after` has not
     /// ended, and for a sequence while only its pairs have work to do.
@@ -161,8 +162,8 @@ impl Job {
     pub fn sweeps(&self) -> (JobId, [u32; 2]) {
         let owner = self.parent.unwrap_or(self.id);
         match self.backward {
-            false => (owner, [self.place, self.place + 1]),
-            true => (owner, [self.place + 1, self.place]),
+            false => (owner, [self.index, self.index + 1]),
+            true => (owner, [self.index + 1, self.index]),
         }
     }
 }

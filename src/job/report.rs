@@ -63,7 +63,8 @@ pub struct ObjectsReport {
 pub struct FieldReport {
     /// Number of finished iterations.
     pub iterations: usize,
-    /// Maximum number of iterations.
+    /// Iteration limit of the fit, after a deadline may have shortened it; 0 if the deadline allowed no
+    /// fit.
     pub max_iterations: usize,
     /// The iteration whose field is the result.
     pub best_iteration: usize,
@@ -85,7 +86,9 @@ pub struct PhaseSeconds {
     /// The distance queries of a field's fit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub query: Option<f64>,
-    /// The network, the optimizer and the evaluation of a field.
+    /// The rest of a field's fit, `total` less `precompute` and `query`: the network, the optimizer and
+    /// the evaluation of the result. Includes the distance queries on a GPU without timestamps. None for
+    /// an object search.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub network: Option<f64>,
     /// All phases.
@@ -142,7 +145,9 @@ impl Report {
         }
     }
 
-    /// Progress of the method; none if the deadline allowed no start.
+    /// The final progress. Objects: searched candidates of all candidates, and their mean cost, metres.
+    /// Field: completed iterations, the iteration limit, and the loss of the best iteration, metres. None
+    /// if the deadline allowed no candidate or no iteration.
     pub fn progress(&self) -> Option<JobProgress> {
         let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
         let (done, total, loss) = match (&self.objects, &self.field) {

@@ -26,5 +26,6 @@ pub const REJECTIONS: [&str; 10] = [
 ];
 /// The protocols of requests.
 pub const PROTOCOLS: [&str; 2] = ["http", "grpc"];
-/// How requests end: done, the caller's fault, the server's.
+/// Values of the label `class` of `fnsf_requests_total`: a success, an error with an HTTP status
+/// below 500, an error with 500 or above. A gRPC error counts by its HTTP status in the error table.
 pub const CLASSES: [&str; 3] = ["ok", "client_error", "server_error"];

@@ -19,8 +19,8 @@ pub(super) fn draw(
 ) {
     for cluster in clusters.iter().filter(|cluster| cluster.dynamic) {
         let corners = corners(&cluster.bounds).map(&pixel);
-        for (place, &corner) in corners.iter().enumerate() {
-            line(image, corner, corners[(place + 1) % corners.len()], width);
+        for (index, &corner) in corners.iter().enumerate() {
+            line(image, corner, corners[(index + 1) % corners.len()], width);
         }
         let center = cluster.bounds.center;
         let velocity = cluster.velocity;

@@ -34,7 +34,8 @@ const COLORS: [[f32; 3]; 7] = [
 /// One depth image and its title.
 #[derive(Clone, Copy, Debug)]
 pub struct DepthPanel<'a> {
-    /// The title: capitals, digits and simple signs are drawn, small letters as capitals.
+    /// The title above the image. Drawn: A to Z, 0 to 9 and `. , / % -`; lowercase letters as capitals,
+    /// any other character as a blank.
     pub title: &'a str,
     /// Depths, metres; 0 where unknown.
     pub image: &'a DepthImage,

@@ -42,7 +42,10 @@ pub struct Submission {
     pub options: String,
     /// Time at which the best flow so far is returned. A job that is still queued then expires.
     pub deadline: Option<Timestamp>,
-    /// Idempotency key: a repeated submission finds the first one.
+    /// Idempotency key and fingerprint. A submission of the same tenant with the same key and
+    /// fingerprint returns the existing job; with another fingerprint it fails with
+    /// [`QueueError::KeyReused`]. The key of an ephemeral job that ended without success, or whose
+    /// cancellation was requested, is free again. None: always a new job.
     pub idempotency: Option<Idempotency>,
     /// Whether the job survives this process. An ephemeral job ends with the process.
     pub durable: bool,
@@ -52,7 +55,7 @@ pub struct Submission {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PairOf {
     /// Index of the earlier of its two sweeps.
-    pub place: u32,
+    pub index: u32,
     /// Whether the flow goes backward in time, from the later sweep to the earlier one.
     pub backward: bool,
     /// The half-open range of sweeps used for the estimate, including its own two: first, and one
@@ -65,7 +68,7 @@ pub struct PairOf {
 impl PairOf {
     /// A single pair of sweeps without neighbors.
     pub const ALONE: Self = Self {
-        place: 0,
+        index: 0,
         backward: false,
         sees: [0, 2],
         follows: false,
@@ -73,7 +76,7 @@ impl PairOf {
 
     /// A range of sweeps in the form of [`PairOf::sees`].
     pub fn seen(sweeps: Range<usize>) -> [u32; 2] {
-        [sweeps.start, sweeps.end].map(|place| u32::try_from(place).unwrap_or(u32::MAX))
+        [sweeps.start, sweeps.end].map(|index| u32::try_from(index).unwrap_or(u32::MAX))
     }
 }
 

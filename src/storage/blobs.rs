@@ -100,7 +100,7 @@ fn folder(id: JobId) -> String {
 fn path(id: JobId, blob: Blob) -> Path {
     let folder = folder(id);
     Path::from(match blob {
-        Blob::Sweep(place) => format!("{folder}/sweep-{place}"),
+        Blob::Sweep(index) => format!("{folder}/sweep-{index}"),
         Blob::Snapshot => format!("{folder}/snapshot"),
         Blob::Result(attempt) => format!("{folder}/result-{attempt}"),
         Blob::Field(attempt) => format!("{folder}/field-{attempt}"),

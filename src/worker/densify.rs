@@ -97,9 +97,9 @@ impl Worker {
         };
         let solver_options = Arc::new(options.solver_options(usize::MAX));
         let mut sweeps = Vec::with_capacity(count);
-        for place in (0u32..).take(count) {
+        for index in (0u32..).take(count) {
             go_on()?;
-            let bytes = self.blobs.get(job.id, Blob::Sweep(place)).await?;
+            let bytes = self.blobs.get(job.id, Blob::Sweep(index)).await?;
             let solver_options = Arc::clone(&solver_options);
             let read = move || {
                 let StoredCloud { points, ground } = StoredCloud::from_bytes(&bytes)?;

@@ -8,7 +8,9 @@ use std::sync::Arc;
 
 use tokio::sync::watch;
 
-/// The gate that all workers of one process share.
+/// A shared-exclusive lock of all workers of a process. A worker holds it shared while it leases and
+/// runs a job. A worker whose job is suspect (more than one crash) takes it exclusively, so that a
+/// further crash affects no other job. After 30 s of waiting it runs beside the others.
 #[derive(Debug, Default)]
 pub struct IsolationLock(watch::Sender<State>);
 

@@ -97,12 +97,12 @@ impl Worker {
         let (owner, pair) = job.sweeps();
         let [first, end] = job.sees;
         let mut around = Vec::new();
-        for place in (first..end).filter(|place| !pair.contains(place)) {
-            let gaps = i64::from(place) - i64::from(pair[0]);
+        for index in (first..end).filter(|index| !pair.contains(index)) {
+            let gaps = i64::from(index) - i64::from(pair[0]);
             let at = if job.backward { -gaps } else { gaps };
             // Sweeps farther away are of no use.
             let Ok(at) = i8::try_from(at) else { continue };
-            let bytes = self.blobs.get(owner, Blob::Sweep(place)).await?;
+            let bytes = self.blobs.get(owner, Blob::Sweep(index)).await?;
             let StoredCloud { points, ground } = StoredCloud::from_bytes(&bytes)?;
             around.push((Sweep { points, ground }, at));
         }

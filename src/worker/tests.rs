@@ -110,13 +110,13 @@ impl Stand {
         after: Option<JobId>,
     ) -> Arc<Job> {
         let id = JobId::fresh();
-        for (place, points) in (0..).zip(clouds) {
+        for (index, points) in (0..).zip(clouds) {
             let cloud = StoredCloud {
                 points,
                 ground: None,
             };
             let bytes = Bytes::from(cloud.to_bytes());
-            let put = self.blobs.put(id, Blob::Sweep(place), bytes, Fsync::No);
+            let put = self.blobs.put(id, Blob::Sweep(index), bytes, Fsync::No);
             put.await.expect("written");
         }
         let submission = Submission {

@@ -247,10 +247,10 @@ impl SceneFlow for Calls {
         let mut cloud: Option<CloudBuilder> = None;
         loop {
             let part = chunks::next(&mut room, &mut inbound).await?.map(|m| m.part);
-            let place = format!("cloud {}", draft.sweeps());
+            let index = format!("cloud {}", draft.sweeps());
             match part {
                 Some(Some(Part::Chunk(chunk))) => match &mut cloud {
-                    Some(cloud) => cloud.take(service, &mut room, &place, &chunk)?,
+                    Some(cloud) => cloud.take(service, &mut room, &index, &chunk)?,
                     None => {
                         let text = "a chunk belongs to a cloud: send next first";
                         return Err(ApiError::BadRequest(text.to_owned()).into());
@@ -258,7 +258,7 @@ impl SceneFlow for Calls {
                 },
                 Some(Some(Part::Next(_))) | None => {
                     if let Some(cloud) = cloud.replace(CloudBuilder::default()) {
-                        draft.push(cloud.finish(&place)?, Some(room.next())).await?;
+                        draft.push(cloud.finish(&index)?, Some(room.next())).await?;
                     }
                     if part.is_none() {
                         break;

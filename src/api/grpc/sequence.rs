@@ -245,7 +245,7 @@ impl Reader {
         request.link = options.chained().then_some(Link { after });
         let sees = window(place, self.count, options.sweeps());
         request.pair = PairOf {
-            place: u32::try_from(place - sees.start).unwrap_or(u32::MAX),
+            index: u32::try_from(place - sees.start).unwrap_or(u32::MAX),
             sees: PairOf::seen(0..sees.len()),
             ..PairOf::ALONE
         };

@@ -291,8 +291,8 @@ async fn read_job(
                         none.insert(Draft::begin(service, caller.clone(), request)?)
                     }
                 };
-                let place = format!("sweep {}", draft.sweeps());
-                let (cloud, room) = body.cloud(place, name, bytes).await?;
+                let index = format!("sweep {}", draft.sweeps());
+                let (cloud, room) = body.cloud(index, name, bytes).await?;
                 draft.push(cloud, Some(room)).await?;
             }
             Part::File(part, name, bytes) => files.take(&part, name, bytes)?,

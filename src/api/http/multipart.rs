@@ -313,7 +313,7 @@ impl PairFiles {
         name: Option<String>,
         bytes: Vec<u8>,
     ) -> Result<(), ApiError> {
-        let place = match part {
+        let index = match part {
             "source" => &mut self.source,
             "target" => &mut self.target,
             _ => {
@@ -321,7 +321,7 @@ impl PairFiles {
                 return Err(ApiError::BadRequest(text.to_owned()));
             }
         };
-        if place.replace((name, bytes)).is_some() {
+        if index.replace((name, bytes)).is_some() {
             return Err(ApiError::BadRequest(format!("{part} is there twice")));
         }
         Ok(())

@@ -270,7 +270,7 @@ async fn archive(
         let mut write = || -> Result<(), Box<dyn std::error::Error>> {
             for pair in &pairs {
                 let encoded = runtime.block_on(service.encoded(pair, format))?;
-                zip.start_file(format!("{:06}.{}", pair.place, format.ending()), plain)?;
+                zip.start_file(format!("{:06}.{}", pair.index, format.ending()), plain)?;
                 std::io::Write::write_all(&mut zip, encoded.bytes())?;
             }
             Ok(())

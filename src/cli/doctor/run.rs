@@ -23,8 +23,8 @@ impl Doctor {
         let threads = std::thread::available_parallelism().map_or(1, usize::from);
         say(format_args!("fnsf {}", env!("CARGO_PKG_VERSION")))?;
         say(format_args!("cpu: {threads} threads"))?;
-        for (place, isa) in Isa::available().into_iter().enumerate() {
-            let used = if place == 0 { ", used" } else { "" };
+        for (index, isa) in Isa::available().into_iter().enumerate() {
+            let used = if index == 0 { ", used" } else { "" };
             say(format_args!(
                 "  {}: network at {:.0} GFLOP/s a thread{used}",
                 isa.name(),

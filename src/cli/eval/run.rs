@@ -76,8 +76,8 @@ impl Eval {
             Report::print_heading(width)?;
         }
         let mut all = Scores::default();
-        for (place, name) in names.iter().enumerate() {
-            let (flow, truth, pair) = self.read(place)?;
+        for (index, name) in names.iter().enumerate() {
+            let (flow, truth, pair) = self.read(index)?;
             let mut scores = Scores::default();
             for scores in [&mut scores, &mut all] {
                 let added = scores
@@ -107,14 +107,14 @@ impl Eval {
         Ok(())
     }
 
-    /// Reads flow number `place`, its truth, and the other data of the pair.
-    fn read(&self, place: usize) -> Result<(FlowFile, PairTruth, Pair), Failure> {
-        let flow = files::read_flow(&self.flows[place])?;
-        let (truth, mut pair) = files::read_truth(&self.truth[place])?;
-        if let Some(source) = self.source.get(place) {
+    /// Reads flow number `index`, its truth, and the other data of the pair.
+    fn read(&self, index: usize) -> Result<(FlowFile, PairTruth, Pair), Failure> {
+        let flow = files::read_flow(&self.flows[index])?;
+        let (truth, mut pair) = files::read_truth(&self.truth[index])?;
+        if let Some(source) = self.source.get(index) {
             pair.source = files::read_cloud(source)?;
         }
-        if let Some(ego) = self.ego.get(place) {
+        if let Some(ego) = self.ego.get(index) {
             pair.ego = Some(files::read_motion(ego)?);
         }
         Ok((flow, truth, pair))

@@ -247,9 +247,9 @@ pub(super) unsafe fn backward<
                     );
                     for r in 0..ROWS {
                         for v in 0..VECTORS {
-                            let place = (row + r) * STRIDE + column + v * L::COUNT;
-                            let gate = L::load(h.add(place));
-                            acc[r][v].where_positive(gate).store(next_delta.add(place));
+                            let index = (row + r) * STRIDE + column + v * L::COUNT;
+                            let gate = L::load(h.add(index));
+                            acc[r][v].where_positive(gate).store(next_delta.add(index));
                         }
                     }
                 }

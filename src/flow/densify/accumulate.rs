@@ -34,8 +34,8 @@ pub fn densify<'a>(
         });
     }
     let masked = |sweep: &Sweep| sweep.ground.as_ref().map_or(sweep.points.len(), Vec::len);
-    if let Some(place) = sweeps.iter().position(|s| masked(s) != s.points.len()) {
-        return Err(DensifyError::Mask(place));
+    if let Some(index) = sweeps.iter().position(|s| masked(s) != s.points.len()) {
+        return Err(DensifyError::Mask(index));
     }
     let field = |source: usize, target: usize| {
         let edge = FlowEdge { source, target };
@@ -47,12 +47,12 @@ pub fn densify<'a>(
     // Sweeps up to the anchor, forward in time.
     let (anchor, substeps) = (plan.anchor, plan.substeps);
     let mut earlier = PropagatedCloud::default();
-    for (place, sweep) in sweeps[..=anchor].iter().enumerate() {
+    for (index, sweep) in sweeps[..=anchor].iter().enumerate() {
         checked()?;
-        if place > 0 {
-            earlier.step(by, field(place - 1, place)?, substeps)?;
+        if index > 0 {
+            earlier.step(by, field(index - 1, index)?, substeps)?;
         }
-        earlier.take(place, sweep);
+        earlier.take(index, sweep);
     }
     // Sweeps after the anchor, backward in time. If the reference time lies between two sweeps,
     // they end in the frame of sweep `anchor + 1`.
@@ -62,16 +62,16 @@ pub fn densify<'a>(
         anchor
     };
     let mut later = PropagatedCloud::default();
-    for place in (first..plan.sweeps).rev() {
+    for index in (first..plan.sweeps).rev() {
         checked()?;
-        if place + 1 < plan.sweeps {
+        if index + 1 < plan.sweeps {
             match plan.later {
-                LaterSweeps::Reverse => later.step(by, field(place + 1, place)?, substeps)?,
-                LaterSweeps::Inverse => later.invert(by, field(place, place + 1)?)?,
+                LaterSweeps::Reverse => later.step(by, field(index + 1, index)?, substeps)?,
+                LaterSweeps::Inverse => later.invert(by, field(index, index + 1)?)?,
             }
         }
-        if place > anchor {
-            later.take(place, &sweeps[place]);
+        if index > anchor {
+            later.take(index, &sweeps[index]);
         }
     }
     checked()?;

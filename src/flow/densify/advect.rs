@@ -31,9 +31,9 @@ pub(super) struct PropagatedCloud {
 }
 
 impl PropagatedCloud {
-    /// Appends the valid points of `sweep`, whose index in the sequence is `place`. The cloud must
+    /// Appends the valid points of `sweep`, whose index in the sequence is `index`. The cloud must
     /// be in that sweep's frame.
-    pub(super) fn take(&mut self, place: usize, sweep: &Sweep) {
+    pub(super) fn take(&mut self, index: usize, sweep: &Sweep) {
         for (row, point) in sweep.points.iter().enumerate() {
             if is_place(*point) {
                 self.points.push(*point);
@@ -41,7 +41,7 @@ impl PropagatedCloud {
                     .push(sweep.ground.as_ref().is_some_and(|ground| ground[row]));
             }
         }
-        self.sweep.resize(self.points.len(), place as u32);
+        self.sweep.resize(self.points.len(), index as u32);
         self.dynamic.resize(self.points.len(), false);
         self.converged.resize(self.points.len(), true);
     }
@@ -82,14 +82,14 @@ impl PropagatedCloud {
         share: f32,
     ) -> Result<(), DensifyError> {
         let rows = self.movable();
-        let places: Vec<Point> = rows.iter().map(|&row| self.points[row]).collect();
-        let residual = by.motion(field, &places)?;
+        let indices: Vec<Point> = rows.iter().map(|&row| self.points[row]).collect();
+        let residual = by.motion(field, &indices)?;
         for (row, residual) in rows.into_iter().zip(residual) {
             if field.ego.is_some() && residual != [0.0; 3] {
                 self.dynamic[row] = true;
             }
-            let place = self.points[row];
-            let moved = core::array::from_fn(|a| place[a] + share * residual[a]);
+            let index = self.points[row];
+            let moved = core::array::from_fn(|a| index[a] + share * residual[a]);
             if is_place(moved) {
                 self.points[row] = moved;
             } else {
@@ -110,15 +110,15 @@ impl PropagatedCloud {
         let mut rows = self.movable();
         let ends = self.points.clone();
         for _ in 0..CORRECTIONS {
-            let places: Vec<Point> = rows.iter().map(|&row| self.points[row]).collect();
-            let residual = by.motion(field, &places)?;
+            let indices: Vec<Point> = rows.iter().map(|&row| self.points[row]).collect();
+            let residual = by.motion(field, &indices)?;
             let mut unsettled = Vec::new();
             for (&row, residual) in rows.iter().zip(residual) {
-                let place: Point = core::array::from_fn(|a| ends[row][a] - residual[a]);
-                let correction = core::array::from_fn(|a| place[a] - self.points[row][a]);
-                self.points[row] = place;
+                let index: Point = core::array::from_fn(|a| ends[row][a] - residual[a]);
+                let correction = core::array::from_fn(|a| index[a] - self.points[row][a]);
+                self.points[row] = index;
                 // Negated, so that NaN counts as not converged.
-                if !(length(correction) < SETTLED_M && is_place(place)) {
+                if !(length(correction) < SETTLED_M && is_place(index)) {
                     unsettled.push(row);
                 }
             }
@@ -186,9 +186,9 @@ impl Context<'_> {
     /// With an ego motion, residuals below [`DYNAMIC_M`] are set to zero, so that the static world
     /// does not move. Without one the field describes the motion of the static world, too, and
     /// nothing is set to zero.
-    fn motion(self, field: &MotionField, places: &[Point]) -> Result<Vec<Point>, DensifyError> {
-        let mut residual = Vec::with_capacity(places.len());
-        for piece in places.chunks(PIECE) {
+    fn motion(self, field: &MotionField, indices: &[Point]) -> Result<Vec<Point>, DensifyError> {
+        let mut residual = Vec::with_capacity(indices.len());
+        for piece in indices.chunks(PIECE) {
             control::check(self.control).map_err(DensifyError::Interrupted)?;
             residual.extend(field.residual(self.backend, piece)?);
         }

@@ -34,8 +34,8 @@ fn constant(ego: Option<RigidTransform>, flow: Point) -> MotionField {
 
 fn sweeps(count: usize) -> Vec<Sweep> {
     (0..count)
-        .map(|place| Sweep {
-            points: vec![[place as f32, 0.0, 0.0], [f32::NAN; 3], [0.0, 1.0, 2.0]],
+        .map(|index| Sweep {
+            points: vec![[index as f32, 0.0, 0.0], [f32::NAN; 3], [0.0, 1.0, 2.0]],
             ground: Some(vec![false, false, true]),
         })
         .collect()
@@ -103,9 +103,9 @@ fn the_static_world_lands_where_the_vehicle_sees_it_whatever_the_instant() {
                 "points that are no numbers stay out"
             );
             for (row, &frame) in cloud.sweep.iter().enumerate() {
-                let place = frame as usize;
-                let point = sweeps[place].points[if row % 2 == 0 { 0 } else { 2 }];
-                let expected = expected(point, place, into);
+                let index = frame as usize;
+                let point = sweeps[index].points[if row % 2 == 0 { 0 } else { 2 }];
+                let expected = expected(point, index, into);
                 assert_near(cloud.points[row], expected, &format!("{later:?} {into}"));
                 assert_eq!(cloud.age[row], (into - f64::from(frame)) as f32);
                 assert!(!cloud.dynamic[row] && cloud.converged[row]);

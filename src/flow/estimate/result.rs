@@ -94,7 +94,9 @@ pub struct FieldSolution {
     pub best_loss: f64,
     /// Bytes of the distance transform.
     pub distance_bytes: usize,
-    /// Seconds of the distance queries, averaged over the threads that ran them.
+    /// Seconds of the distance queries in this run, without those before a resumed snapshot. CPU: the
+    /// mean over the threads. GPU: extrapolated from the timestamps of each submission's first
+    /// iteration, zero where the GPU has no timestamps.
     pub query_seconds: f64,
     /// Seconds of the network, the optimizer and the evaluation of the result.
     pub network_seconds: f64,

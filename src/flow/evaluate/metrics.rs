@@ -14,7 +14,9 @@ const LENGTH_FLOOR: f64 = 1e-20;
 /// rad.
 const COSINE_MARGIN: f64 = 1e-7;
 
-/// Error metrics of a flow over the scored points.
+/// Scene flow metrics of the FNSF paper (ICCV 2023), as its official evaluation code defines them,
+/// over the scored points. A point is scored if its true flow is valid, it is not ground, the
+/// estimate has a flow for it and both flows are finite. Definitions: `docs/method/evaluation.md`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Metrics {
     /// Number of scored points.

@@ -35,7 +35,10 @@ pub trait Backend: Send + Sync {
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError>;
 }
 
-/// A target's distance transform on a device.
+/// The distance transform of a target cloud in a device's memory (FNSF Section 3.2): the distance to
+/// the target, metres, sampled on a grid and interpolated trilinearly. A point outside the grid gets
+/// the value at the grid's border. All points are in the frame of the two clouds that it was built
+/// for. Dropping it frees the memory.
 pub trait Transform: Send {
     /// Bytes that it occupies.
     fn bytes(&self) -> usize;

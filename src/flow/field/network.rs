@@ -60,14 +60,14 @@ impl Network {
         let layer = last_layer();
         for feature in 0..=WIDTH {
             // The biases follow the weights of all features.
-            let place = |output: usize| match feature {
+            let index = |output: usize| match feature {
                 WIDTH => layer.bias + output,
                 _ => layer.weights + output * WIDTH + feature,
             };
-            let flow = Vector3::from_fn(|output, _| f64::from(from[place(output)]));
+            let flow = Vector3::from_fn(|output, _| f64::from(from[index(output)]));
             let turned = rotation * flow;
             for output in 0..3 {
-                to[place(output)] = turned[output] as f32;
+                to[index(output)] = turned[output] as f32;
             }
         }
         carried

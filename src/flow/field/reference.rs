@@ -20,18 +20,18 @@ impl ReferenceNetwork {
     pub(crate) fn read(parameters: &Parameters) -> Self {
         assert_eq!(PANEL, 32, "the layout below is written for panels of 32");
         let floats = parameters.as_slice();
-        let at = |place: usize| f64::from(floats[place]);
+        let at = |index: usize| f64::from(floats[index]);
         let mut weights = Vec::new();
         let mut biases = Vec::new();
         let first = first_layer();
         weights.push(matrix(WIDTH, 3, |o, i| at(first.weights + i * WIDTH + o)));
         biases.push((0..WIDTH).map(|o| at(first.bias + o)).collect());
         for layer in 0..MIDDLE_LAYERS {
-            let place = middle_layer(layer);
+            let index = middle_layer(layer);
             weights.push(matrix(WIDTH, WIDTH, |o, i| {
-                at(place.weights + panel_index(i, o))
+                at(index.weights + panel_index(i, o))
             }));
-            biases.push((0..WIDTH).map(|o| at(place.bias + o)).collect());
+            biases.push((0..WIDTH).map(|o| at(index.bias + o)).collect());
         }
         let last = last_layer();
         weights.push(matrix(3, WIDTH, |o, i| at(last.weights + o * WIDTH + i)));

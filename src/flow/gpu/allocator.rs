@@ -40,10 +40,10 @@ impl Store {
     /// offset.
     fn taken(&mut self, count: u64) -> Option<u64> {
         let stretch = self.free.iter_mut().find(|(_, length)| *length >= count)?;
-        let place = stretch.0;
-        *stretch = (place + count, stretch.1 - count);
+        let index = stretch.0;
+        *stretch = (index + count, stretch.1 - count);
         self.free.retain(|&(_, length)| length > 0);
-        Some(place)
+        Some(index)
     }
 }
 
@@ -88,11 +88,11 @@ impl Allocator {
         store.next += 1;
         store.line.push_back(own);
         let mut waited = Duration::ZERO;
-        let place = loop {
+        let index = loop {
             if store.line.front() == Some(&own)
-                && let Some(place) = store.taken(count)
+                && let Some(index) = store.taken(count)
             {
-                break Ok(place);
+                break Ok(index);
             }
             if waited >= PATIENCE {
                 break Err(BackendError::Busy);
@@ -111,22 +111,22 @@ impl Allocator {
         };
         store.line.retain(|&other| other != own);
         self.moved.notify_all();
-        place
+        index
     }
 
-    /// Releases `count` words at offset `place`.
-    pub(super) fn give_back(&self, place: u64, count: u64) {
+    /// Releases `count` words at offset `index`.
+    pub(super) fn give_back(&self, index: u64, count: u64) {
         if count == 0 {
             return;
         }
         let mut store = self.store();
-        store.free.push((place, count));
+        store.free.push((index, count));
         store.free.sort_unstable();
         let mut joined: Vec<(u64, u64)> = Vec::with_capacity(store.free.len());
-        for &(place, length) in &store.free {
+        for &(index, length) in &store.free {
             match joined.last_mut() {
-                Some(last) if last.0 + last.1 == place => last.1 += length,
-                _ => joined.push((place, length)),
+                Some(last) if last.0 + last.1 == index => last.1 += length,
+                _ => joined.push((index, length)),
             }
         }
         store.free = joined;
@@ -196,8 +196,8 @@ mod tests {
             let small = words.take("points", 10, &Over);
             assert!(matches!(small, Err(BackendError::Interrupted(_))));
             words.give_back(taken, 60);
-            let place = large.join().expect("no panic").expect("its turn");
-            assert_eq!(place, 0);
+            let index = large.join().expect("no panic").expect("its turn");
+            assert_eq!(index, 0);
         });
         // A request that has left the queue blocks no other.
         assert_eq!(words.take("points", 20, &Uncontrolled).expect("free"), 80);

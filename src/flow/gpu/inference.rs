@@ -61,7 +61,7 @@ fn evaluated(
     let list: Vec<_> = (0..tiles as u32)
         .map(|tile| layout::Tile { lane: 0, tile })
         .collect();
-    let places = context.filled(bytemuck::cast_slice(points))?;
+    let indices = context.filled(bytemuck::cast_slice(points))?;
     let lane = context.filled(bytemuck::bytes_of(&lane))?;
     let step = context.filled(bytemuck::bytes_of(&step))?;
     let list = context.filled(bytemuck::cast_slice(&list))?;
@@ -73,7 +73,7 @@ fn evaluated(
     let group = context.bound(
         pipeline,
         &[
-            &places,
+            &indices,
             networks,
             &lane,
             &step,

@@ -10,7 +10,10 @@ use crate::flow::field::{BackendError, HIDDEN_LAYERS, LAID_OUT, WIDTH};
 pub struct GpuOptions {
     /// Number of lanes: pairs that can be fitted at the same time.
     pub lanes: usize,
-    /// GPU memory to allocate, bytes. If none, the default for the kind of GPU.
+    /// GPU memory to allocate when the GPU is opened, bytes. An explicit size that cannot be allocated,
+    /// or is below the minimum, is refused with [`BackendError::Memory`]. None: 2 GiB plus 256 MiB per
+    /// lane on a discrete or virtual GPU, 1 GiB on an integrated or unknown one, 320 MiB plus 4 MiB per
+    /// lane on a software device; halved, down to the minimum, until the allocation succeeds.
     pub memory_bytes: Option<u64>,
 }
 

@@ -85,7 +85,7 @@ impl Clock {
 
     /// Seconds between two of the timestamps that [`Self::resolve`] wrote.
     pub(super) fn seconds(&self, moments: &[u8], from: usize, to: usize) -> f64 {
-        let at = |place: usize| u64::from_ne_bytes(moments.as_chunks::<8>().0[place]);
+        let at = |index: usize| u64::from_ne_bytes(moments.as_chunks::<8>().0[index]);
         at(to).saturating_sub(at(from)) as f64 * self.tick
     }
 }

@@ -87,13 +87,13 @@ pub fn kernel_times(
     for _ in 0..rounds.max(1) {
         let clock = clock(gpu, 2 * kernels.len() as u32)?;
         let mut encoder = context.encoder();
-        for (place, (_, phase, _)) in (0..).zip(kernels) {
-            let mut pass = clock.pass(&mut encoder, Some(2 * place), Some(2 * place + 1));
+        for (index, (_, phase, _)) in (0..).zip(kernels) {
+            let mut pass = clock.pass(&mut encoder, Some(2 * index), Some(2 * index + 1));
             phases.dispatch(&mut pass, phase, 0, wave);
         }
         let moments = read(gpu, encoder, &clock, 2 * kernels.len() as u64)?;
-        for (place, time) in times.iter_mut().enumerate() {
-            let seconds = clock.seconds(&moments, 2 * place, 2 * place + 1);
+        for (index, time) in times.iter_mut().enumerate() {
+            let seconds = clock.seconds(&moments, 2 * index, 2 * index + 1);
             time.seconds = time.seconds.min(seconds);
         }
     }

@@ -64,7 +64,7 @@ impl SweepCache {
     pub(crate) fn of(&self, points: &[Point]) -> Arc<CachedSweep> {
         let mut sweeps = self.sweeps();
         let known = match sweeps.iter().position(|known| same(&known.points, points)) {
-            Some(place) => sweeps.remove(place),
+            Some(index) => sweeps.remove(index),
             None => None,
         };
         let known = known.unwrap_or_else(|| {

@@ -53,7 +53,10 @@ impl ConfidenceFeatures {
         ]
     }
 
-    /// The probability, 0 to 1, that the flow is less than [`CONFIDENT_WITHIN_M`] off.
+    /// The probability, 0 to 1, that the end-point error of the point's flow is below
+    /// [`CONFIDENT_WITHIN_M`]: a logistic regression on the features, with separate weights for moving
+    /// and static points. The weights are fitted by `examples/confidence.rs`; see
+    /// `docs/experiments/confidence.md`.
     pub fn confidence(&self) -> f32 {
         let weights = if self.moves { &MOVING } else { &STANDING };
         chance(weights, &self.features())

@@ -12,17 +12,17 @@ fn after(job: &Job) -> Submission {
 /// A sequence whose pairs form one chain.
 fn chain(pairs: u32) -> Submission {
     Submission {
-        pairs: (0..pairs).map(|place| forward(place, place > 0)).collect(),
+        pairs: (0..pairs).map(|index| forward(index, index > 0)).collect(),
         ..sequence(0)
     }
 }
 
 /// A sequence of two chains of two pairs, one of them backward, and a closing job.
 fn closing() -> Submission {
-    let back = |place, follows| PairOf {
-        place,
+    let back = |index, follows| PairOf {
+        index,
         backward: true,
-        sees: [place, place + 2],
+        sees: [index, index + 2],
         follows,
     };
     Submission {
@@ -148,7 +148,7 @@ pub(crate) async fn a_chain_is_cancelled_whole_and_asked_for_again_in_its_order(
 ) {
     let (queue, _events) = stand.open(QueueOptions::default());
     let job = submit(&queue, chain(4)).await;
-    assert_eq!(finish_next(&queue).await.place, 0);
+    assert_eq!(finish_next(&queue).await.index, 0);
     let second = lease(&queue).await;
     queue.cancel(job.id).await.expect("known");
     finish(&queue, &second.job, Outcome::Cancelled).await;
@@ -157,9 +157,9 @@ pub(crate) async fn a_chain_is_cancelled_whole_and_asked_for_again_in_its_order(
     assert_eq!(queue.backlog().queued().jobs, 0);
     queue.requeue(job.id, false).await.expect("it has ended");
     assert_eq!(queue.backlog().queued().jobs, 3);
-    for place in 1..4 {
+    for index in 1..4 {
         let held = lease(&queue).await;
-        assert_eq!(held.job.place, place);
+        assert_eq!(held.job.index, index);
         nothing_is_ready(&queue).await;
         finish(&queue, &held.job, done()).await;
     }
@@ -177,17 +177,17 @@ pub(crate) async fn a_chain_survives_a_crash_in_its_order(stand: &mut impl Stand
     let promised = submit(&queue, after(&awaited)).await;
     finish_next(&queue).await;
     let held = lease(&queue).await;
-    assert_eq!(held.job.place, 1);
+    assert_eq!(held.job.index, 1);
     drop((queue, events));
     let (queue, _events) = stand.open(QueueOptions::default());
     assert_eq!(queue.backlog().queued().jobs, 3);
     let again = lease(&queue).await;
-    assert_eq!((again.job.place, again.job.attempt), (1, 2));
+    assert_eq!((again.job.index, again.job.attempt), (1, 2));
     // An ephemeral job that the crash removed does not block its followers.
     assert_eq!(lease(&queue).await.job.id, promised.id);
     nothing_is_ready(&queue).await;
     finish(&queue, &again.job, done()).await;
-    assert_eq!(finish_next(&queue).await.place, 2);
+    assert_eq!(finish_next(&queue).await.index, 2);
     reaches(&queue, &job, State::Succeeded).await;
 }
 
@@ -202,7 +202,7 @@ pub(crate) async fn chains_go_side_by_side_and_leave_other_tenants_their_share(
         submit(&queue, submission("b")).await;
     }
     let held = [lease(&queue).await, lease(&queue).await];
-    assert!(held.iter().all(|held| held.job.place == 0));
+    assert!(held.iter().all(|held| held.job.index == 0));
     for held in held {
         finish(&queue, &held.job, done()).await;
     }
@@ -243,13 +243,13 @@ pub(crate) async fn a_sequence_with_something_left_to_do_is_leased_when_its_pair
     let job = submit(&queue, closing()).await;
     assert_eq!((job.pairs, job.pairs_left), (4, 4));
     assert_eq!(queue.backlog().queued().jobs, 4);
-    let mut places = Vec::new();
+    let mut indices = Vec::new();
     for _ in 0..4 {
         let pair = finish_next(&queue).await;
-        places.push((pair.backward, pair.place));
+        indices.push((pair.backward, pair.index));
     }
-    places.sort_unstable();
-    assert_eq!(places, [(false, 0), (false, 1), (true, 0), (true, 1)]);
+    indices.sort_unstable();
+    assert_eq!(indices, [(false, 0), (false, 1), (true, 0), (true, 1)]);
     let backlog = queue.backlog().queued();
     assert_eq!((backlog.jobs, backlog.seconds), (1, 5.0));
     let held = lease(&queue).await;
@@ -333,7 +333,7 @@ pub(crate) async fn a_pair_that_fails_back_in_time_is_named_and_nothing_is_left_
     let job = submit(&queue, closing()).await;
     for _ in 0..4 {
         let held = lease(&queue).await;
-        let breaks = held.job.backward && held.job.place == 1;
+        let breaks = held.job.backward && held.job.index == 1;
         let outcome = if breaks { failure(false) } else { done() };
         finish(&queue, &held.job, outcome).await;
     }

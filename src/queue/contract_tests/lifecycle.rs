@@ -127,9 +127,9 @@ pub(crate) async fn a_sequence_ends_with_its_last_pair(stand: &mut impl Stand) {
     let job = submit(&queue, sequence(3)).await;
     assert_eq!((job.pairs, job.pairs_left), (3, 3));
     assert_eq!(queue.backlog().queued().jobs, 3);
-    for place in 0..3 {
+    for index in 0..3 {
         let held = lease(&queue).await;
-        assert_eq!((held.job.parent, held.job.place), (Some(job.id), place));
+        assert_eq!((held.job.parent, held.job.index), (Some(job.id), index));
         assert_eq!(state(&queue, &job).await, State::Running);
         finish(&queue, &held.job, done()).await;
     }
@@ -149,7 +149,7 @@ pub(crate) async fn a_sequence_ends_with_its_last_pair(stand: &mut impl Stand) {
 pub(crate) async fn a_pair_says_which_sweeps_it_is_of_and_found_from(stand: &mut impl Stand) {
     let (queue, _events) = stand.open(QueueOptions::default());
     let amid = PairOf {
-        place: 2,
+        index: 2,
         sees: [0, 5],
         ..PairOf::ALONE
     };
@@ -159,7 +159,7 @@ pub(crate) async fn a_pair_says_which_sweeps_it_is_of_and_found_from(stand: &mut
     };
     submit(&queue, alone).await;
     let held = lease(&queue).await;
-    assert_eq!((held.job.place, held.job.sees), (2, [0, 5]));
+    assert_eq!((held.job.index, held.job.sees), (2, [0, 5]));
     assert_eq!(held.job.sweeps(), (held.job.id, [2, 3]));
     let of_sequence = Submission {
         pairs: vec![PairOf {
@@ -170,7 +170,7 @@ pub(crate) async fn a_pair_says_which_sweeps_it_is_of_and_found_from(stand: &mut
     };
     let job = submit(&queue, of_sequence).await;
     let held = lease(&queue).await;
-    assert_eq!((held.job.place, held.job.sees), (2, [0, 5]));
+    assert_eq!((held.job.index, held.job.sees), (2, [0, 5]));
     assert_eq!(held.job.sweeps(), (job.id, [3, 2]));
 }
 

@@ -196,16 +196,16 @@ fn quick() -> QueueOptions {
 fn sequence(pairs: u32) -> Submission {
     Submission {
         kind: Kind::Sequence,
-        pairs: (0..pairs).map(|place| forward(place, false)).collect(),
+        pairs: (0..pairs).map(|index| forward(index, false)).collect(),
         ..submission("a")
     }
 }
 
-fn forward(place: u32, follows: bool) -> PairOf {
+fn forward(index: u32, follows: bool) -> PairOf {
     PairOf {
-        place,
+        index,
         backward: false,
-        sees: [place, place + 2],
+        sees: [index, index + 2],
         follows,
     }
 }

@@ -67,12 +67,12 @@ pub(super) fn end(
     )?);
     // A sequence counts in the load only while its closing job is queued or running.
     if job.kind == Kind::Pair || job.ready.is_some() {
-        let place = if job.state == State::Running {
+        let index = if job.state == State::Running {
             &mut effects.stopped
         } else {
             &mut effects.left
         };
-        place.push(Arc::clone(&ended));
+        index.push(Arc::clone(&ended));
     }
     effects.changed.push(Arc::clone(&ended));
     effects.events.push(Event::Ended(ended));
@@ -113,7 +113,7 @@ fn close_sequence(
         Some(pair) => {
             let back = if pair.backward { ", back in time" } else { "" };
             let error = pair.error.clone().map(|error| JobError {
-                message: format!("pair {}{back}: {}", pair.place, error.message),
+                message: format!("pair {}{back}: {}", pair.index, error.message),
                 ..error
             });
             (pair.state, error)

@@ -182,11 +182,11 @@ fn every_gradient_is_the_references_at_awkward_row_counts() {
             let gradients = ReferenceNetwork::read(means).flat();
             let expected = expected.flat();
             let scale = expected.iter().fold(0.0f64, |most, g| most.max(g.abs()));
-            for (place, (gradient, expected)) in gradients.iter().zip(&expected).enumerate() {
+            for (index, (gradient, expected)) in gradients.iter().zip(&expected).enumerate() {
                 let error = (gradient - expected).abs() / scale;
                 assert!(
                     error < GRADIENT_TOLERANCE,
-                    "{preset:?}, {rows} rows, parameter {place}: {gradient} {expected}"
+                    "{preset:?}, {rows} rows, parameter {index}: {gradient} {expected}"
                 );
             }
         }

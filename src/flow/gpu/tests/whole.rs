@@ -123,14 +123,14 @@ fn a_field_that_was_kept_says_on_any_device_what_its_run_said() {
     options.ground = Ground::Keep;
     let estimate = solved(gpu, &pair, &options);
     let field = MotionField::from_bytes(&estimate.motion.to_bytes()).expect("sound bytes");
-    let places = field.static_positions(&pair.source);
-    let there = field.residual(gpu, &places).expect("flows");
-    for (row, (residual, place)) in there.iter().zip(&places).enumerate() {
+    let indices = field.static_positions(&pair.source);
+    let there = field.residual(gpu, &indices).expect("flows");
+    for (row, (residual, index)) in there.iter().zip(&indices).enumerate() {
         let from = pair.source[row];
-        let flow: Point = core::array::from_fn(|a| (place[a] - from[a]) + residual[a]);
+        let flow: Point = core::array::from_fn(|a| (index[a] - from[a]) + residual[a]);
         assert_eq!(flow, estimate.flow[row], "row {row}");
     }
-    let here = |cpu: &CpuBackend| field.residual(cpu, &places).expect("flows");
+    let here = |cpu: &CpuBackend| field.residual(cpu, &indices).expect("flows");
     assert_among(&there, here, "residuals");
 }
 
@@ -165,7 +165,7 @@ fn the_stopping_rule_and_the_best_are_the_cpus_for_the_same_losses() {
     let lowest = candidates.iter().copied().fold(f64::INFINITY, f64::min);
     assert_eq!(report.best_loss, lowest);
     let last = candidates.iter().rposition(|&loss| loss == lowest);
-    assert_eq!(last.map(|place| place + 1), Some(report.best_iteration));
+    assert_eq!(last.map(|index| index + 1), Some(report.best_iteration));
 }
 
 /// The flow of a pair after `steps` iterations.
