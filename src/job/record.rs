@@ -100,7 +100,8 @@ pub struct Job {
     pub kind: Kind,
     /// The sequence that the pair belongs to; none for a single pair.
     pub parent: Option<JobId>,
-    /// Index in the sequence of the earlier of its two sweeps, from 0.
+    /// Index of the earlier of its two sweeps, from 0: in its sequence, or, for a pair of a stream,
+    /// among the sweeps that are stored with the job.
     pub index: u32,
     /// Whether the pair is backward in time: its source is the later sweep.
     pub backward: bool,

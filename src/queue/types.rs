@@ -232,7 +232,11 @@ pub enum Event {
     Forgotten(JobId),
 }
 
-/// The job queue. Every acknowledged change has happened, and is on disk if the job is durable.
+/// The job queue: submission, subscription, leases for workers, completion, cancellation and
+/// requeueing. [`super::SqliteQueue`] implements it.
+///
+/// When a call returns `Ok` the change has taken effect, and is on disk if the job is durable. A job
+/// may run more than once: an expired lease requeues it, and only the latest attempt can finish it.
 #[async_trait]
 pub trait Queue: Send + Sync {
     /// Accepts a job and, for a sequence, all of its pairs. A known idempotency key returns its

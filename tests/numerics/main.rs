@@ -13,6 +13,8 @@ mod gpu_rule;
 mod ground;
 mod labels;
 mod prices;
+// cfg(test) is always set in this crate. It makes clippy treat the module as a test.
+#[cfg(test)]
 #[path = "../common/real_data.rs"]
 mod real_data;
 mod resumption;

@@ -1,8 +1,4 @@
 //! Pairs for the tests, and the errors of their flow.
-#![expect(
-    clippy::print_stdout,
-    reason = "a test that cannot run for want of data says so"
-)]
 
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Metrics, Truth, evaluate};
