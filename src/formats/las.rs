@@ -54,10 +54,10 @@ pub(super) fn write<W: Write>(
     let mut writer = Writer::new(Cursor::new(Vec::new()), header).map_err(encode)?;
     for (row, point) in cloud.points.iter().enumerate() {
         let [x, y, z] = point.map(f64::from);
-        let frame = cloud.sweep[row];
-        let point_source_id = u16::try_from(frame).map_err(|_| {
+        let sweep = cloud.sweep[row];
+        let point_source_id = u16::try_from(sweep).map_err(|_| {
             KIND.unsupported(format!(
-                "it numbers {} sweeps at most, row {row} has frame {frame}; write npz, ply or pcd",
+                "it numbers {} sweeps at most, row {row} has sweep {sweep}; write npz, ply or pcd",
                 u32::from(u16::MAX) + 1
             ))
         })?;

@@ -166,7 +166,7 @@ fn the_far_points_are_refused_for_their_extent() {
     let ended = fnsf(folder.path(), &flow("far.npy", "neural"));
     assert_eq!(ended.code, 65);
     assert!(ended.stderr.contains("900000"), "{}", ended.stderr);
-    assert!(ended.stderr.contains("range"), "{}", ended.stderr);
+    assert!(ended.stderr.contains("crop_m"), "{}", ended.stderr);
 }
 
 #[test]

@@ -41,7 +41,7 @@ fn a_dense_cloud_reads_back_as_a_cloud() {
 /// Ply and pcd share their row layout: 12 bytes of coordinates, 4 of the sweep index, 4 of the age,
 /// and one byte per mask.
 #[test]
-fn ply_and_pcd_rows_hold_frame_age_and_masks() {
+fn ply_and_pcd_rows_hold_sweep_age_and_masks() {
     const STRIDE: usize = 22;
     let dense = dense(50);
     let ply = file(DenseFormat::Ply, &dense);
@@ -55,9 +55,9 @@ fn ply_and_pcd_rows_hold_frame_age_and_masks() {
         assert_eq!(bytes[20..], masks);
     }
     let header = String::from_utf8_lossy(&ply[..ply.len() - rows.len()]).into_owned();
-    assert!(header.contains("property uint frame\nproperty float age\nproperty uchar dynamic"));
+    assert!(header.contains("property uint sweep\nproperty float age\nproperty uchar dynamic"));
     let header = String::from_utf8_lossy(&pcd[..pcd.len() - rows.len()]).into_owned();
-    assert!(header.contains("FIELDS x y z frame age dynamic converged\nSIZE 4 4 4 4 4 1 1\n"));
+    assert!(header.contains("FIELDS x y z sweep age dynamic converged\nSIZE 4 4 4 4 4 1 1\n"));
 }
 
 #[test]
@@ -110,12 +110,12 @@ fn las_and_laz_come_back_through_another_reader() {
 }
 
 #[test]
-fn a_frame_past_sixteen_bits_is_refused_in_las_alone() {
+fn a_sweep_past_sixteen_bits_is_refused_in_las_alone() {
     let mut dense = dense(3);
     dense.sweep[1] = 65_536;
     let error = write_dense(DenseFormat::Laz, &dense, &mut Vec::new()).unwrap_err();
     let text = error.to_string();
-    assert!(text.contains("row 1 has frame 65536; write npz"), "{text}");
+    assert!(text.contains("row 1 has sweep 65536; write npz"), "{text}");
     file(DenseFormat::Npz, &dense);
 }
 

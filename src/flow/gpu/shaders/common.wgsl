@@ -83,7 +83,7 @@ struct Step {
     step_size: f32,
     square_correction: f32,
     // Weight of the new parameters in the running average.
-    fresh: f32,
+    ema_weight: f32,
 }
 
 // A tile of a lane's batch: the points of one workgroup.

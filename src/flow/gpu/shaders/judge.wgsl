@@ -69,7 +69,7 @@ fn observe(status: ptr<function, Status>, lane: u32, place: u32, loss: f32) {
     (*status).applies = 1u;
     if lanes[lane].average == 1u {
         let before = select((*status).best_loss, loss, (*status).iterations == 1u);
-        (*status).best_loss = before + rounded(steps[place].fresh * (loss - before));
+        (*status).best_loss = before + rounded(steps[place].ema_weight * (loss - before));
         (*status).best_iteration = (*status).iterations;
         (*status).improves = 1u;
     } else if loss <= (*status).best_loss && (*status).state == RUNNING {

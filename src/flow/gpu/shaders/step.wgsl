@@ -36,8 +36,8 @@ fn step(
     let parameter = networks[at + PARAMETERS * LAID_OUT];
     if status.improves == 1u {
         let kept = networks[at + KEPT * LAID_OUT];
-        let fresh = select(1.0, now.fresh, lanes[lane].average == 1u);
-        networks[at + KEPT * LAID_OUT] = select(kept + rounded4(fresh * (parameter - kept)), parameter, vec4(fresh == 1.0));
+        let ema_weight = select(1.0, now.ema_weight, lanes[lane].average == 1u);
+        networks[at + KEPT * LAID_OUT] = select(kept + rounded4(ema_weight * (parameter - kept)), parameter, vec4(ema_weight == 1.0));
     }
     let before = networks[at + MEANS * LAID_OUT];
     let before_square = networks[at + SQUARES * LAID_OUT];
