@@ -1,6 +1,6 @@
 # syntax=docker/dockerfile:1
 
-# One image for processors and for NVIDIA cards: see deploy/README.md.
+# One image for CPUs and for NVIDIA GPUs: see deploy/README.md.
 
 FROM rust:1.95.0-slim-bookworm AS builder
 WORKDIR /build
