@@ -67,12 +67,12 @@ pub(super) fn end(
     )?);
     // A sequence counts in the load only while its closing job is queued or running.
     if job.kind == Kind::Pair || job.ready.is_some() {
-        let index = if job.state == State::Running {
+        let list = if job.state == State::Running {
             &mut effects.stopped
         } else {
             &mut effects.left
         };
-        index.push(Arc::clone(&ended));
+        list.push(Arc::clone(&ended));
     }
     effects.changed.push(Arc::clone(&ended));
     effects.events.push(Event::Ended(ended));

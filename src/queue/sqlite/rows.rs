@@ -7,7 +7,7 @@ use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, 
 use crate::queue::types::QueueError;
 
 /// The columns that [`job`] reads, in its order.
-pub(super) const COLUMNS: &str = "id, tenant, kind, parent, index, pairs, pairs_left, priority, \
+pub(super) const COLUMNS: &str = "id, tenant, kind, parent, pair_index, pairs, pairs_left, priority, \
     state, durable, attempt, cost, options, created, started, finished, deadline, progress_done, \
     progress_total, loss, stop_reason, error_code, error_message, error_retryable, dead, \
     cancel_requested, report, device, backward, after, has_dependents, ready, sees_from, sees_to, \

@@ -24,7 +24,7 @@ CREATE TABLE jobs (
     tenant TEXT NOT NULL,
     kind INTEGER NOT NULL,
     parent BLOB,
-    index INTEGER NOT NULL,
+    pair_index INTEGER NOT NULL,
     backward INTEGER NOT NULL,
     sees_from INTEGER NOT NULL,
     sees_to INTEGER NOT NULL,

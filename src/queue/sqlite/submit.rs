@@ -126,7 +126,7 @@ fn insert(
     };
     let is_ready = is_pair && !fair_queue::is_held_back(connection, submission.after)?;
     let sql = format!(
-        "INSERT INTO jobs (id, tenant, kind, parent, index, pairs, pairs_left, priority, \
+        "INSERT INTO jobs (id, tenant, kind, parent, pair_index, pairs, pairs_left, priority, \
          device, state, durable, delayed, attempt, failures, crashes, delays, cost, virtual_start, virtual_finish, \
          options, idempotency_key, fingerprint, created, deadline, expires, due, error_retryable, \
          dead, cancel_requested, backward, after, has_dependents, ready, closes, sees_from, sees_to) \

@@ -66,7 +66,7 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
     for row in 0..BACKLOG {
         connection
             .execute(
-                "INSERT INTO jobs (id, tenant, kind, index, pairs, pairs_left, priority, state, \
+                "INSERT INTO jobs (id, tenant, kind, pair_index, pairs, pairs_left, priority, state, \
                  durable, delayed, attempt, failures, crashes, delays, cost, virtual_start, \
                  virtual_finish, options, created, expires, due, error_retryable, dead, \
                  cancel_requested, device, backward, after, has_dependents, ready, closes, \
