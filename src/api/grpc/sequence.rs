@@ -53,7 +53,7 @@ struct Sweep {
     room: Room,
 }
 
-/// A sweep of which chunks are arriving.
+/// A sweep that is being received in chunks.
 struct Coming {
     name: String,
     /// The number of points that the client has announced, if any.

@@ -11,10 +11,7 @@ const FEATURES: wgpu::Features = wgpu::Features::EXPERIMENTAL_COOPERATIVE_MATRIX
 
 /// The features to request when a GPU with a supported tile is opened, and the permission to use
 /// features that wgpu calls experimental.
-#[expect(
-    unsafe_code,
-    reason = "wgpu gives its matrix operations to nobody else"
-)]
+#[expect(unsafe_code, reason = "wgpu requires it for matrix operations")]
 pub(super) fn asked_for() -> (wgpu::Features, wgpu::ExperimentalFeatures) {
     // SAFETY: the caller must accept that experimental features may have defects that cause
     // undefined behavior. Only the half-precision kernels use these features. Their memory accesses

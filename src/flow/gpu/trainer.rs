@@ -179,7 +179,7 @@ impl<'a> GpuTrainer<'a> {
             let own = pace.tile * Cut::new(self.schedule.largest_batch()).tiles as f64;
             own.max(pace.iteration)
         });
-        // Iterations after a stop are dispatched in vain.
+        // Dispatched iterations after a stop have no effect.
         let most = match self.schedule.options.early_stop {
             Some(_) => STOPPABLE_STEPS,
             None => STEPS,

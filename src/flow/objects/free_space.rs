@@ -1,9 +1,9 @@
 //! Free-space evidence: whether rays of a sweep passed through a position to a return farther out.
 //!
 //! A cluster has left a position if rays of the target pass through it. It has come to a position
-//! if rays of the source passed through it. A wall of which each sweep hides another part does
-//! neither: its positions are hidden or still occupied. Rays begin at the origin of a sweep's
-//! frame, which must be at the sensor or on the vehicle around it.
+//! if rays of the source passed through it. A static wall shows neither: each sweep hides a
+//! different part of it, and its positions are hidden or still occupied. Rays begin at the origin
+//! of a sweep's frame, which must be at the sensor or on the vehicle around it.
 
 use std::f32::consts::{FRAC_PI_2, PI};
 

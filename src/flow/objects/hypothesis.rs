@@ -1,5 +1,4 @@
-//! Motion hypothesis of one cluster: fits from several initial guesses, of which the one of least
-//! cost is taken.
+//! Motion hypothesis of one cluster: the fit of least cost from several initial guesses.
 //!
 //! The cost is symmetric: the mean truncated distance from the moved cluster to the target, plus
 //! that from the target around it to the moved cluster. The forward cost alone lets a cluster slide

@@ -1,4 +1,4 @@
-//! Coarse registration: fits from several initial guesses, of which the best is taken.
+//! Coarse registration: the best fit from several initial guesses.
 //!
 //! A single coarse fit mostly recovers a rotation of 4 degrees together with a translation of 3 m.
 //! Vehicles drive forward and turn, so the initial guesses are translations along x and rotations
