@@ -12,7 +12,7 @@ use std::time::Instant;
 use common::{median, scenes};
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::field::Backend;
-use fnsf::flow::{Control, Options, Preset, Problem, estimate};
+use fnsf::flow::{Control, Estimate, Options, Preset, Problem, estimate};
 
 const SEEDS: u64 = 3;
 
@@ -23,6 +23,11 @@ impl Control for Clock {
     fn seconds(&self) -> f64 {
         self.0.elapsed().as_secs_f64()
     }
+}
+
+/// Seconds of the distance queries of a field; zero of an object search.
+fn queries(estimate: &Estimate) -> f64 {
+    estimate.fit().map_or(0.0, |fit| fit.query_seconds)
 }
 
 fn main() -> Result<(), String> {
@@ -46,9 +51,7 @@ fn main() -> Result<(), String> {
                     let run = estimate(&backend, &problem, &options, &clock);
                     runs.push(run.map_err(|e| e.to_string())?);
                 }
-                let of = |value: fn(&fnsf::flow::Estimate) -> f64| {
-                    median(runs.iter().map(value).collect())
-                };
+                let of = |value: fn(&Estimate) -> f64| median(runs.iter().map(value).collect());
                 println!(
                     "| {} | {} | {} | {:.0} | {:.3} | {:.3} | {:.3} | {:.3} |",
                     scene.name,
@@ -56,11 +59,8 @@ fn main() -> Result<(), String> {
                     preset.name(),
                     of(|e| e.fit().map_or(0.0, |fit| fit.iterations as f64)),
                     of(|e| e.precompute_seconds),
-                    of(|e| e.fit().map_or(0.0, |fit| fit.query_seconds)),
-                    of(|e| e
-                        .fit()
-                        .map_or(e.total_seconds - e.precompute_seconds, |fit| fit
-                            .network_seconds)),
+                    of(queries),
+                    of(|e| e.method_seconds() - queries(e)),
                     of(|e| e.total_seconds)
                 );
             }

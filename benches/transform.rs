@@ -11,6 +11,7 @@ use std::hint::black_box;
 use std::time::Instant;
 
 use common::{median, scenes};
+use fnsf::flow::Uncontrolled;
 use fnsf::flow::distance::{Bricks, DistanceOptions, Sites};
 
 const ROUNDS: usize = 5;
@@ -42,8 +43,10 @@ fn main() -> Result<(), String> {
                 sites,
                 ..DistanceOptions::default()
             };
-            let build =
-                || Bricks::build(&scene.source, &scene.target, &options).map_err(|e| e.to_string());
+            let build = || {
+                Bricks::build(&scene.source, &scene.target, &options, &Uncontrolled)
+                    .map_err(|e| e.to_string())
+            };
             let bricks = build()?;
             let mut cpu = Vec::new();
             let mut wall = Vec::new();

@@ -59,12 +59,10 @@ pub mod simulate;
 pub use cost::{Cost, NeighborCost, neighbor_cost, price};
 pub use data::{
     AlignedSweep, Control, DYNAMIC_M, DenseCloud, EnvelopeError, Interrupt, MIN_POINTS,
-    OrientedBox, Point, Progress, RigidTransform, Uncontrolled,
+    OrientedBox, Point, Progress, RigidTransform, StopReason, Uncontrolled,
 };
 pub use error::FlowError;
-pub use estimate::{
-    Estimate, FieldSolution, ObjectSolution, Solution, StopReason, estimate, resume,
-};
+pub use estimate::{Estimate, FieldSolution, ObjectSolution, Solution, estimate, resume};
 pub use field::{Network, Snapshot, SnapshotError, TrainerState};
 pub use host::{Host, HostError};
 pub use motion::{MotionField, Residual};

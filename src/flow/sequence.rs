@@ -15,7 +15,7 @@ use super::error::FlowError;
 use super::estimate::{Estimate, estimate};
 use super::field::Backend;
 use super::motion::MotionField;
-use super::options::Options;
+use super::options::{Ground, Options};
 use super::problem::{NeighborSweep, Problem};
 use super::select::{FindGround, find_ground, ground_masks, is_in_crop};
 
@@ -38,9 +38,12 @@ impl Sweep {
     }
 
     fn prepared_by(mut self, options: &Options, find: FindGround<'_>) -> Self {
-        let sweep = [(self.points.as_slice(), self.ground.as_deref())];
-        // A missing mask is reported as an error by the estimate of the pair.
-        if let Ok([mask]) = ground_masks(sweep, options, find) {
+        if options.ground == Ground::Keep {
+            self.ground = None;
+        } else if self.ground.is_none()
+            // A missing mask is reported as an error by the estimate of the pair.
+            && let Ok([mask]) = ground_masks([(self.points.as_slice(), None)], options, find)
+        {
             self.ground = mask.map(Cow::into_owned);
         }
         self

@@ -108,7 +108,7 @@ impl Report {
         match &estimate.solution {
             Solution::Objects(solution) => {
                 let clusters = &solution.objects.clusters;
-                seconds.search = Some(solution.search_seconds);
+                seconds.search = Some(estimate.method_seconds());
                 objects = Some(ObjectsReport {
                     clusters: clusters.len(),
                     candidates: solution.candidates,
@@ -119,7 +119,7 @@ impl Report {
             }
             Solution::Field(solution) => {
                 seconds.query = Some(solution.query_seconds);
-                seconds.network = Some(solution.network_seconds);
+                seconds.network = Some(estimate.method_seconds() - solution.query_seconds);
                 field = Some(FieldReport {
                     iterations: solution.iterations,
                     max_iterations: solution.max_iterations,
@@ -200,7 +200,6 @@ mod tests {
                 best_loss: f64::INFINITY,
                 query_seconds: 0.0,
                 distance_bytes: 0,
-                network_seconds: 0.0,
             }),
             stop_reason: StopReason::Deadline,
             device: "cpu".to_owned(),

@@ -51,6 +51,30 @@ pub struct Submission {
     pub durable: bool,
 }
 
+impl Submission {
+    /// A durable job of a single pair under a new id: any device, normal priority, no cost, no
+    /// options, no deadline and no idempotency key.
+    pub(super) fn pair(tenant: Tenant) -> Self {
+        Self {
+            id: JobId::fresh(),
+            tenant,
+            kind: Kind::Pair,
+            pair: PairOf::ALONE,
+            pairs: Vec::new(),
+            closing_seconds: None,
+            after: None,
+            has_dependents: false,
+            priority: Priority::Normal,
+            device: None,
+            cost_seconds: 0.0,
+            options: String::new(),
+            deadline: None,
+            idempotency: None,
+            durable: true,
+        }
+    }
+}
+
 /// The sweeps of a pair, as indices into the sweeps stored under its own id or its sequence's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PairOf {

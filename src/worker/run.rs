@@ -309,12 +309,15 @@ impl Worker {
         phase("precompute", estimate.precompute_seconds);
         match &estimate.solution {
             Solution::Objects(solution) => {
-                phase("search", solution.search_seconds);
+                phase("search", estimate.method_seconds());
                 self.metrics.searched(solution.searched);
             }
             Solution::Field(solution) => {
                 phase("query", solution.query_seconds);
-                phase("network", solution.network_seconds);
+                phase(
+                    "network",
+                    estimate.method_seconds() - solution.query_seconds,
+                );
                 self.metrics.fitted(solution.iterations);
             }
         }

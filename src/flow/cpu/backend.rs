@@ -64,8 +64,8 @@ impl Backend for CpuBackend {
         control: &dyn Control,
     ) -> Result<Box<dyn Transform>, BackendError> {
         let threads = self.host.threads();
-        let distance = threads
-            .install(|| DistanceTransform::build_with_control(source, target, options, control))?;
+        let distance =
+            threads.install(|| DistanceTransform::build(source, target, options, control))?;
         let (kernels, threads) = (self.kernels, Arc::clone(threads));
         Ok(Box::new(CpuTransform {
             kernels,

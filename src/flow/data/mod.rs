@@ -10,6 +10,7 @@ mod lock;
 mod oriented_box;
 mod point;
 mod rng;
+mod stop_reason;
 
 pub use aligned_sweep::AlignedSweep;
 pub use codec::EnvelopeError;
@@ -19,6 +20,7 @@ pub(crate) use control::EarlierDeadline;
 pub use dense_cloud::DenseCloud;
 pub use oriented_box::OrientedBox;
 pub use point::{DYNAMIC_M, MIN_POINTS, Point, RigidTransform};
+pub use stop_reason::StopReason;
 
 pub(crate) use codec::{Body, Envelope, Hash};
 pub(crate) use lazy::get_or_compute;

@@ -14,7 +14,7 @@ use super::plan::Layout;
 use super::point_distance::{PointGather, PointSites};
 use super::sample::Sample;
 use super::vertex_distance::{VertexGather, VertexSites};
-use crate::flow::data::{Control, Point, Uncontrolled};
+use crate::flow::data::{Control, Point};
 
 /// The transform: distances at the vertices of the active bricks, and a far field.
 #[derive(Debug)]
@@ -30,24 +30,13 @@ pub struct Bricks {
 }
 
 impl Bricks {
-    /// Transforms `target` over a grid that covers both clouds, metres.
+    /// Transforms `target` over a grid that covers both clouds, metres. Checks `control` between
+    /// parts of a few milliseconds.
     ///
     /// # Errors
     /// [`DistanceError`] if the options are out of range, the target is empty, the clouds span too
-    /// much space, or the transform would take more than `options.max_bytes`.
+    /// much space, the transform would take more than `options.max_bytes`, or `control` interrupts.
     pub fn build(
-        source: &[Point],
-        target: &[Point],
-        options: &DistanceOptions,
-    ) -> Result<Self, DistanceError> {
-        Self::build_with_control(source, target, options, &Uncontrolled)
-    }
-
-    /// As [`Self::build`]. Checks `control` between parts of a few milliseconds.
-    ///
-    /// # Errors
-    /// As [`Self::build`], and [`DistanceError::Interrupted`].
-    pub fn build_with_control(
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,

@@ -11,7 +11,7 @@ use core::f32::consts::SQRT_2;
 use super::grid::{Grid, Lattice, trilinear};
 use super::options::{DistanceError, DistanceOptions};
 use super::sample::Sample;
-use crate::flow::data::{Control, Interrupt, Point, Uncontrolled, control};
+use crate::flow::data::{Control, Interrupt, Point, control};
 
 /// Length of a cell's space diagonal, in cells.
 const SQRT_3: f32 = 1.732_050_8;
@@ -26,23 +26,11 @@ pub struct DenseChamfer {
 
 impl DenseChamfer {
     /// Transforms `target` over a grid that covers both clouds. Distances are to the vertices
-    /// nearest to the target's points.
+    /// nearest to the target's points. Checks `control` between planes.
     ///
     /// # Errors
     /// [`DistanceError`] as [`super::Bricks::build`].
     pub fn build(
-        source: &[Point],
-        target: &[Point],
-        options: &DistanceOptions,
-    ) -> Result<Self, DistanceError> {
-        Self::build_with_control(source, target, options, &Uncontrolled)
-    }
-
-    /// As [`Self::build`]. Checks `control` between planes.
-    ///
-    /// # Errors
-    /// As [`Self::build`], and [`DistanceError::Interrupted`].
-    pub fn build_with_control(
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,

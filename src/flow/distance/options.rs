@@ -135,6 +135,7 @@ mod tests {
     use super::*;
     use crate::flow::data::Point;
     use crate::flow::data::Random;
+    use crate::flow::data::Uncontrolled;
     use crate::flow::distance::bricks::Bricks;
     use crate::flow::distance::transform::DistanceTransform;
 
@@ -153,7 +154,7 @@ mod tests {
                 ..DistanceOptions::default()
             };
             let build = |source: &[Point], target: &[Point]| {
-                DistanceTransform::build(source, target, &options).unwrap_err()
+                DistanceTransform::build(source, target, &options, &Uncontrolled).unwrap_err()
             };
             let extent = |error| matches!(error, DistanceError::Extent { .. });
             assert!(extent(build(&strays, &[[0.0; 3]])));
@@ -168,7 +169,8 @@ mod tests {
     #[test]
     fn transforms_that_would_not_fit_are_refused_before_they_are_built() {
         let memory = |source: &[Point], target: &[Point], options: &DistanceOptions| {
-            let error = DistanceTransform::build(source, target, options).unwrap_err();
+            let error =
+                DistanceTransform::build(source, target, options, &Uncontrolled).unwrap_err();
             let DistanceError::Memory { needed, limit } = error else {
                 return false;
             };
@@ -202,7 +204,9 @@ mod tests {
                 band_m: 6.4,
                 ..DistanceOptions::default()
             };
-            let bytes = Bricks::build(&source, &target, &fits).unwrap().bytes();
+            let bytes = Bricks::build(&source, &target, &fits, &Uncontrolled)
+                .unwrap()
+                .bytes();
             for max_bytes in [0, 1000, bytes / 2] {
                 let options = DistanceOptions {
                     max_bytes,
@@ -224,7 +228,7 @@ mod tests {
             band_m: 0.2,
             ..DistanceOptions::default()
         };
-        let bricks = Bricks::build(&[], &target, &options).unwrap();
+        let bricks = Bricks::build(&[], &target, &options, &Uncontrolled).unwrap();
         assert_eq!(
             bricks.sample(target[0]).distance,
             bricks.sample(target[2000]).distance
@@ -240,7 +244,7 @@ mod tests {
                 band_m,
                 ..DistanceOptions::default()
             };
-            DistanceTransform::build(&[], &[[0.0; 3]], &options).err()
+            DistanceTransform::build(&[], &[[0.0; 3]], &options, &Uncontrolled).err()
         };
         for cell in [0.0, -0.1, 1e-4, f64::NAN, f64::INFINITY] {
             assert!(matches!(

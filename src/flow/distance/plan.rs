@@ -24,7 +24,7 @@ impl Layout {
     /// Plans the transform of `target` over a grid that covers both clouds.
     ///
     /// # Errors
-    /// [`DistanceError`] as [`super::Bricks::build_with_control`].
+    /// [`DistanceError`] as [`super::Bricks::build`].
     pub(crate) fn plan(
         source: &[Point],
         target: &[Point],
@@ -34,7 +34,8 @@ impl Layout {
         options.check()?;
         let grid = Grid::covering(source, target, options.cell_m)?;
         let mut cells: Vec<_> = target.iter().map(|&p| grid.nearest_vertex(p)).collect();
-        // One comparison of 128-bit keys is faster than three, of which half are mispredicted.
+        // One comparison of 128-bit keys is faster than three comparisons of coordinates: half of those
+        // are mispredicted.
         cells.sort_unstable_by_key(|&cell| {
             let [x, y, z] = cell.map(u128::from);
             x << 64 | y << 32 | z

@@ -5,6 +5,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::flow::data::Point;
 use crate::flow::data::Random;
+use crate::flow::data::Uncontrolled;
 use crate::flow::field::reference;
 
 /// Rounding error of single-precision sums of a few terms of at most 100 m.
@@ -36,7 +37,7 @@ fn options(cell_m: f64, band_cells: f64, sites: Sites) -> DistanceOptions {
 }
 
 fn bricks(source: &[Point], target: &[Point], options: &DistanceOptions) -> Bricks {
-    Bricks::build(source, target, options).expect("small scenes fit")
+    Bricks::build(source, target, options, &Uncontrolled).expect("small scenes fit")
 }
 
 /// `count` random points of the box between `low` and `high`, metres.
@@ -304,7 +305,8 @@ fn outside_the_grid_the_border_goes_on_and_pulls_only_along_it() {
         ..options(0.2, 10.0, Sites::Cells)
     };
     for options in [options(0.2, 10.0, Sites::Cells), chamfer] {
-        let transform = DistanceTransform::build(&source, &target, &options).unwrap();
+        let transform =
+            DistanceTransform::build(&source, &target, &options, &Uncontrolled).unwrap();
         let on_border = [1.0, 2.0, 9.4];
         let outside = [1.0, 2.0, 5e4];
         let (border, sample) = (transform.sample(on_border), transform.sample(outside));
@@ -353,7 +355,7 @@ fn chamfer_distances_are_the_closed_form() {
             metric: Metric::Chamfer,
             ..options(1.0, 1.0, Sites::Cells)
         };
-        let dense = DenseChamfer::build(&source, &target, &options).unwrap();
+        let dense = DenseChamfer::build(&source, &target, &options, &Uncontrolled).unwrap();
         let (_, vertices) = in_cells(dense.grid(), &target);
         for vertex in every_vertex(dense.grid()) {
             let at = vertex.map(f64::from);
@@ -379,7 +381,7 @@ fn a_chamfer_query_is_the_trilinear_value_of_the_vertices() {
         metric: Metric::Chamfer,
         ..options(0.2, 10.0, Sites::Cells)
     };
-    let dense = DenseChamfer::build(&source, &target, &options).unwrap();
+    let dense = DenseChamfer::build(&source, &target, &options, &Uncontrolled).unwrap();
     for place in boxed(13, PLACES, [-19.9, -15.9, -3.9], [17.9, 13.9, 8.9]) {
         let at = dense.grid().in_cells(place);
         let (value, gradient) = reference::trilinear(at, |v| f64::from(dense.at(v)));

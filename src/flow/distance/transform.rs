@@ -4,7 +4,7 @@ use super::bricks::Bricks;
 use super::chamfer::DenseChamfer;
 use super::options::{DistanceError, DistanceOptions, Metric};
 use super::sample::Sample;
-use crate::flow::data::{Control, Point, Uncontrolled};
+use crate::flow::data::{Control, Point};
 
 /// A distance transform of the target, with the metric of the options.
 #[derive(Debug)]
@@ -16,36 +16,23 @@ pub enum DistanceTransform {
 }
 
 impl DistanceTransform {
-    /// Transforms `target` over a grid that covers both clouds, metres.
+    /// Transforms `target` over a grid that covers both clouds, metres. Checks `control` between
+    /// parts of a few milliseconds.
     ///
     /// # Errors
     /// [`DistanceError`] if the options are out of range, the target is empty, the clouds span too
-    /// much space, or the transform would take more than `options.max_bytes`.
+    /// much space, the transform would take more than `options.max_bytes`, or `control` interrupts.
     pub fn build(
-        source: &[Point],
-        target: &[Point],
-        options: &DistanceOptions,
-    ) -> Result<Self, DistanceError> {
-        Self::build_with_control(source, target, options, &Uncontrolled)
-    }
-
-    /// As [`Self::build`]. Checks `control` between parts of a few milliseconds.
-    ///
-    /// # Errors
-    /// As [`Self::build`], and [`DistanceError::Interrupted`].
-    pub fn build_with_control(
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,
         control: &dyn Control,
     ) -> Result<Self, DistanceError> {
         Ok(match options.metric {
-            Metric::Euclidean => Self::Bricks(Bricks::build_with_control(
-                source, target, options, control,
-            )?),
-            Metric::Chamfer => Self::Chamfer(DenseChamfer::build_with_control(
-                source, target, options, control,
-            )?),
+            Metric::Euclidean => Self::Bricks(Bricks::build(source, target, options, control)?),
+            Metric::Chamfer => {
+                Self::Chamfer(DenseChamfer::build(source, target, options, control)?)
+            }
         })
     }
 

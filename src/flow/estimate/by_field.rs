@@ -2,10 +2,10 @@
 
 use super::ego_motion::ego_motion;
 use super::method::{Input, Solved};
-use super::result::{FieldSolution, Solution, StopReason};
+use super::result::{FieldSolution, Solution};
 use crate::flow::data::{Hash, Point, transform_points};
 use crate::flow::error::FlowError;
-use crate::flow::field::{self, Backend, Fit, Fitted, Prior, Snapshot, Stop};
+use crate::flow::field::{self, Backend, Fit, Fitted, Prior, Snapshot};
 use crate::flow::motion::{MotionField, Residual};
 use crate::flow::options::{Ego, FieldOptions, Options};
 use crate::flow::select::Selection;
@@ -83,13 +83,8 @@ pub(super) fn residual_motion(
             best_loss: fitted.report.best_loss,
             query_seconds: fitted.report.query_seconds,
             distance_bytes: prepared.map_or(0, |prepared| prepared.transform.bytes()),
-            network_seconds: 0.0,
         }),
-        stop_reason: match fitted.stop {
-            Stop::Converged => StopReason::Converged,
-            Stop::MaxIterations => StopReason::MaxIterations,
-            Stop::Deadline => StopReason::Deadline,
-        },
+        stop_reason: fitted.stop_reason,
         device: backend.name(),
         precomputed_at: fitted.precomputed_at,
     })

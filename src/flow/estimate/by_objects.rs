@@ -3,7 +3,8 @@
 use super::ego_motion::{ego_motion, has_time_for_all};
 use super::method::{Input, Solved};
 use super::neighbors::aligned_neighbors;
-use super::result::{ObjectSolution, Solution, StopReason};
+use super::result::{ObjectSolution, Solution};
+use crate::flow::data::StopReason;
 use crate::flow::data::{Interrupt, Point, RigidTransform, transform_points};
 use crate::flow::error::FlowError;
 use crate::flow::host::Host;
@@ -72,7 +73,6 @@ pub(super) fn residual_motion(
             searched: search.clusters,
             candidates: search.all_clusters,
             cost_m: search.cost_m,
-            search_seconds: 0.0,
         }),
         stop_reason: match search.interrupted {
             Some(_) => StopReason::Deadline,

@@ -1,6 +1,7 @@
 //! The common interface of the two methods: input and result.
 
-use super::result::{Solution, StopReason};
+use super::result::Solution;
+use crate::flow::data::StopReason;
 use crate::flow::data::{Control, Interrupt, Point, RigidTransform};
 use crate::flow::error::FlowError;
 use crate::flow::motion::Residual;

@@ -14,5 +14,5 @@ mod run;
 #[cfg(test)]
 mod tests;
 
-pub use result::{Estimate, FieldSolution, ObjectSolution, Solution, StopReason};
+pub use result::{Estimate, FieldSolution, ObjectSolution, Solution};
 pub use run::{estimate, resume};

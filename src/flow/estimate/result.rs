@@ -1,6 +1,6 @@
 //! The result of an estimate.
 
-use crate::flow::data::{Point, RigidTransform};
+use crate::flow::data::{Point, RigidTransform, StopReason};
 use crate::flow::motion::MotionField;
 use crate::flow::objects::Objects;
 
@@ -37,6 +37,11 @@ pub struct Estimate {
 }
 
 impl Estimate {
+    /// Seconds of the method: the object search, or the fit of the field with its distance queries.
+    pub fn method_seconds(&self) -> f64 {
+        self.total_seconds - self.precompute_seconds
+    }
+
     /// The objects, for [`crate::flow::Method::Objects`].
     pub fn objects(&self) -> Option<&Objects> {
         match &self.solution {
@@ -76,8 +81,6 @@ pub struct ObjectSolution {
     /// metres, averaged over the clusters: the objective of the search. Infinite where the search
     /// did not start.
     pub cost_m: f64,
-    /// Seconds of the search.
-    pub search_seconds: f64,
 }
 
 /// The outcome of the fit of a field.
@@ -98,39 +101,4 @@ pub struct FieldSolution {
     /// mean over the threads. GPU: extrapolated from the timestamps of each submission's first
     /// iteration, zero where the GPU has no timestamps.
     pub query_seconds: f64,
-    /// Seconds of the network, the optimizer and the evaluation of the result.
-    pub network_seconds: f64,
-}
-
-/// The reason why a method ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum StopReason {
-    /// The object search covered all clusters.
-    Completed,
-    /// The early-stopping rule ended the fit.
-    Converged,
-    /// The fit did all iterations.
-    MaxIterations,
-    /// The deadline passed, or shortened the method. The flow is the best so far.
-    Deadline,
-}
-
-impl StopReason {
-    /// All reasons.
-    pub const ALL: [Self; 4] = [
-        Self::Completed,
-        Self::Converged,
-        Self::MaxIterations,
-        Self::Deadline,
-    ];
-
-    /// The name used in reports.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Completed => "completed",
-            Self::Converged => "converged",
-            Self::MaxIterations => "max_iterations",
-            Self::Deadline => "deadline",
-        }
-    }
 }

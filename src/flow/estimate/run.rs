@@ -111,15 +111,6 @@ fn assemble(input: &Input<'_>, solved: Solved, began: f64) -> Estimate {
     if let Some(objects) = objects {
         objects.clear_invalid(&valid);
     }
-    let precompute_seconds = solved.precomputed_at - began;
-    let total_seconds = input.control.seconds() - began;
-    let method_seconds = total_seconds - precompute_seconds;
-    match &mut solution {
-        Solution::Objects(solution) => solution.search_seconds = method_seconds,
-        Solution::Field(solution) => {
-            solution.network_seconds = method_seconds - solution.query_seconds;
-        }
-    }
     Estimate {
         flow,
         valid,
@@ -129,8 +120,8 @@ fn assemble(input: &Input<'_>, solved: Solved, began: f64) -> Estimate {
         solution,
         stop_reason: solved.stop_reason,
         device: solved.device,
-        precompute_seconds,
-        total_seconds,
+        precompute_seconds: solved.precomputed_at - began,
+        total_seconds: input.control.seconds() - began,
         motion: MotionField {
             ego,
             residual: motion,

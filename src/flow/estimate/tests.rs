@@ -5,6 +5,7 @@ use crate::flow::cpu::CpuBackend;
 use crate::flow::data::Control;
 use crate::flow::data::Interrupt;
 use crate::flow::data::Point;
+use crate::flow::data::StopReason;
 use crate::flow::data::transform_point;
 use crate::flow::data::{Progress, Uncontrolled};
 use crate::flow::error::FlowError;

@@ -8,7 +8,7 @@ use super::loss::length;
 use super::network::Network;
 use super::snapshot::{Snapshot, TrainerState};
 use super::warm_start::{Prior, warm_start};
-use crate::flow::data::{Control, Interrupt, Point, RigidTransform};
+use crate::flow::data::{Control, Interrupt, Point, RigidTransform, StopReason};
 use crate::flow::options::FieldOptions;
 
 /// Most iterations of one call to a backend.
@@ -40,17 +40,9 @@ pub(crate) struct Fitted {
     pub(crate) report: FitReport,
     /// The maximum number of iterations, as shortened by the deadline.
     pub(crate) max_iterations: usize,
-    pub(crate) stop: Stop,
+    pub(crate) stop_reason: StopReason,
     /// When the first iteration could begin, seconds of the control's clock.
     pub(crate) precomputed_at: f64,
-}
-
-/// Why a fit ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Stop {
-    Converged,
-    MaxIterations,
-    Deadline,
 }
 
 impl Fitted {
@@ -66,7 +58,7 @@ impl Fitted {
                 best_loss: f64::INFINITY,
                 query_seconds: 0.0,
             },
-            stop: Stop::Deadline,
+            stop_reason: StopReason::Deadline,
             precomputed_at: control.seconds(),
         }
     }
@@ -91,7 +83,7 @@ impl Fit<'_> {
             return Ok(Fitted::nothing(self.aligned.len(), self.control));
         };
         let precomputed_at = self.control.seconds();
-        let stop = self.iterate(&mut started)?;
+        let stop_reason = self.iterate(&mut started)?;
         let Started {
             mut trainer,
             options,
@@ -104,7 +96,7 @@ impl Fit<'_> {
             max_iterations: options.max_iterations,
             network: Some(Network::new(parameters, self.aligned, options.inputs)),
             report: trainer.report(),
-            stop,
+            stop_reason,
             precomputed_at,
         })
     }
@@ -165,7 +157,7 @@ impl Fit<'_> {
     }
 
     /// Iterates until a stopping criterion.
-    fn iterate(&self, started: &mut Started<'_>) -> Result<Stop, FitError> {
+    fn iterate(&self, started: &mut Started<'_>) -> Result<StopReason, FitError> {
         let Started {
             trainer,
             options,
@@ -188,10 +180,10 @@ impl Fit<'_> {
                     control.snapshot(snapshot.to_bytes());
                 }
                 Advance::Continues => {}
-                Advance::Converged | Advance::Exhausted if *cut => return Ok(Stop::Deadline),
-                Advance::Converged => return Ok(Stop::Converged),
-                Advance::Exhausted => return Ok(Stop::MaxIterations),
-                Advance::Interrupted(Interrupt::Deadline) => return Ok(Stop::Deadline),
+                Advance::Converged | Advance::Exhausted if *cut => return Ok(StopReason::Deadline),
+                Advance::Converged => return Ok(StopReason::Converged),
+                Advance::Exhausted => return Ok(StopReason::MaxIterations),
+                Advance::Interrupted(Interrupt::Deadline) => return Ok(StopReason::Deadline),
                 Advance::Interrupted(Interrupt::Cancelled) => return Err(FitError::Cancelled),
                 Advance::Diverged => {
                     return Err(FitError::Diverged {

@@ -28,7 +28,7 @@ pub(crate) use early_stopping::EarlyStop;
 #[cfg(feature = "gpu")]
 pub(crate) use early_stopping::EarlyStopState;
 pub(crate) use error::FitError;
-pub(crate) use fit::{Fit, Fitted, Stop};
+pub(crate) use fit::{Fit, Fitted};
 pub(crate) use loss::length;
 pub(crate) use mlp::{
     Aligned, Conditioning, LAID_OUT, PANEL, Parameters, first_layer, last_layer, middle_layer,

@@ -102,21 +102,9 @@ fn tenant(name: &str) -> Tenant {
 
 pub(crate) fn submission(of: &str) -> Submission {
     Submission {
-        id: JobId::fresh(),
-        tenant: tenant(of),
-        kind: Kind::Pair,
-        pair: PairOf::ALONE,
-        pairs: Vec::new(),
-        closing_seconds: None,
-        after: None,
-        has_dependents: false,
-        priority: Priority::Normal,
-        device: None,
         cost_seconds: 1.0,
         options: "{}".to_owned(),
-        deadline: None,
-        idempotency: None,
-        durable: true,
+        ..Submission::pair(tenant(of))
     }
 }
 

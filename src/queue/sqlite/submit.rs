@@ -12,8 +12,8 @@ use super::effects::Effects;
 use super::rows::{COLUMNS, device_code, kind_code, priority_code};
 use super::{fair_queue, rows};
 use crate::clock::Timestamp;
-use crate::job::{Job, JobId, Kind, Priority, State, Tenant};
-use crate::queue::types::{Event, PairOf, QueueError, QueueOptions, Submission, Submitted};
+use crate::job::{Job, JobId, Kind, State, Tenant};
+use crate::queue::types::{Event, QueueError, QueueOptions, Submission, Submitted};
 
 /// Accepts a job and, for a sequence, its pairs.
 pub(super) fn submit(
@@ -78,23 +78,7 @@ pub(super) fn submit(
 
 /// Inserts a job and deletes it again: exercises the writes of a submission.
 pub(super) fn probe(connection: &Connection, options: &QueueOptions) -> Result<(), QueueError> {
-    let submission = Submission {
-        id: JobId::fresh(),
-        tenant: Tenant::default(),
-        kind: Kind::Pair,
-        pair: PairOf::ALONE,
-        pairs: Vec::new(),
-        closing_seconds: None,
-        after: None,
-        has_dependents: false,
-        priority: Priority::Normal,
-        device: None,
-        cost_seconds: 0.0,
-        options: String::new(),
-        deadline: None,
-        idempotency: None,
-        durable: true,
-    };
+    let submission = Submission::pair(Tenant::default());
     let job = insert(connection, options, &submission, None)?;
     let sql = "DELETE FROM jobs WHERE id = ?1";
     connection

@@ -90,8 +90,9 @@ fn the_first_losses_are_those_of_the_method_in_double_precision() {
     const STEPS: i32 = 10;
     let [source, target] = clouds(200);
     let options = Preset::Paper.field();
-    let distance = DistanceTransform::build(&source, &target, &DistanceOptions::default())
-        .expect("small clouds");
+    let distance =
+        DistanceTransform::build(&source, &target, &DistanceOptions::default(), &Uncontrolled)
+            .expect("small clouds");
     let expected = first_losses(&source, &distance, 0, 0.008, STEPS);
     for isa in Isa::available() {
         let losses = Losses::default();

@@ -147,7 +147,7 @@ fn gradients_in_half_precision_are_near_the_references_at_awkward_row_counts() {
         let (Some(_), Some(gpu)) = (with_units(), transform(source, &target)) else {
             return;
         };
-        let distance = DistanceTransform::build(source, &target, &options.distance);
+        let distance = DistanceTransform::build(source, &target, &options.distance, &Uncontrolled);
         let distance = distance.expect("small clouds fit");
         let reference = network();
         let mut expected = ReferenceNetwork::read(&Parameters::zeros());

@@ -49,7 +49,7 @@ fn bricks_have_the_bits_of_the_cpus() {
         let Some(gpu) = transform(&source, &target) else {
             return;
         };
-        let cpu = Bricks::build(&source, &target, &DistanceOptions::default());
+        let cpu = Bricks::build(&source, &target, &DistanceOptions::default(), &Uncontrolled);
         let cpu = cpu.expect("small clouds fit");
         assert_eq!(gpu.bytes(), cpu.bytes());
         let mut encoder = gpu.device.context.encoder();
@@ -79,7 +79,8 @@ fn samples_have_the_bits_of_the_cpus_near_far_and_outside() {
     let Some(gpu) = transform(&source, &target) else {
         return;
     };
-    let cpu = DistanceTransform::build(&source, &target, &DistanceOptions::default());
+    let cpu =
+        DistanceTransform::build(&source, &target, &DistanceOptions::default(), &Uncontrolled);
     let cpu = cpu.expect("small clouds fit");
     let mut points = scattered(20_000, [120.0, 120.0, 12.0], 4);
     points.extend(&source);
@@ -159,7 +160,8 @@ fn every_gradient_is_the_references_at_awkward_row_counts() {
             let Some(gpu) = transform(source, &target) else {
                 return;
             };
-            let distance = DistanceTransform::build(source, &target, &options.distance);
+            let distance =
+                DistanceTransform::build(source, &target, &options.distance, &Uncontrolled);
             let distance = distance.expect("small clouds fit");
             let reference = network();
             let conditioning = Conditioning::new(source, options.inputs);
@@ -224,7 +226,7 @@ fn the_first_losses_are_those_of_the_method_in_double_precision() {
     let Some(gpu) = shared() else {
         return;
     };
-    let distance = DistanceTransform::build(&source, &target, &options.distance);
+    let distance = DistanceTransform::build(&source, &target, &options.distance, &Uncontrolled);
     let distance = distance.expect("small clouds fit");
     let expected = first_losses(&source, &distance, 0, RATE.into(), STEPS);
     let transform = gpu

@@ -1,0 +1,34 @@
+//! Why a method ended.
+
+/// The reason why a method ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum StopReason {
+    /// The object search covered all clusters.
+    Completed,
+    /// The early-stopping rule ended the fit.
+    Converged,
+    /// The fit did all iterations.
+    MaxIterations,
+    /// The deadline passed, or shortened the method. The flow is the best so far.
+    Deadline,
+}
+
+impl StopReason {
+    /// All reasons.
+    pub const ALL: [Self; 4] = [
+        Self::Completed,
+        Self::Converged,
+        Self::MaxIterations,
+        Self::Deadline,
+    ];
+
+    /// The name used in reports.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Completed => "completed",
+            Self::Converged => "converged",
+            Self::MaxIterations => "max_iterations",
+            Self::Deadline => "deadline",
+        }
+    }
+}
