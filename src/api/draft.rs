@@ -7,6 +7,9 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use bytes::Bytes;
+use tokio::task::JoinHandle;
+
 use super::admission::{Asked, Durability, Reservation};
 use super::auth::Caller;
 use super::dense::Closing;
@@ -21,8 +24,6 @@ use crate::job::{Job, JobId, JobOptions, Kind};
 use crate::payload::StoredCloud;
 use crate::queue::{Idempotency, PairOf, Submission, Submitted};
 use crate::storage::{Blob, BlobError, Fsync};
-use bytes::Bytes;
-use tokio::task::JoinHandle;
 
 /// The parameters of a job, without its clouds.
 #[derive(Clone, Debug)]

@@ -1,8 +1,9 @@
 //! The router of the public port.
 
+use std::sync::Arc;
+
 use super::service::Service;
 use super::{grpc, http, middleware};
-use std::sync::Arc;
 
 /// The routes of the public port: HTTP and gRPC, behind the common middleware.
 pub fn public_router(service: &Arc<Service>) -> axum::Router {

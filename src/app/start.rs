@@ -1,6 +1,5 @@
 //! The start of the server: checks, stores, devices, workers, ports, in this order.
 
-use super::{housekeeping, process};
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::thread;
@@ -12,6 +11,7 @@ use tokio::task::{JoinHandle, JoinSet};
 use tokio_util::sync::CancellationToken;
 
 use super::devices::Pool;
+use super::{housekeeping, process};
 use crate::api::{
     Admission, AdmissionLimits, Caller, Hosts, Keys, ListenOptions, Listener, Parts, Readiness,
     Role, Service, ServiceLimits, admin_router, public_router, tls_acceptor,

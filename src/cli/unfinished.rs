@@ -5,9 +5,10 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, Once};
 
-use crate::sync::locked;
 use tempfile::{NamedTempFile, TempPath};
 use tokio::signal::unix::{SignalKind, signal};
+
+use crate::sync::locked;
 
 /// Paths of the files being written.
 static WRITTEN: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());

@@ -2,7 +2,6 @@
 //!
 //! Values are read from defaults, a TOML file, the environment and the command line, in that order.
 
-use super::secret::Secret;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
@@ -10,6 +9,7 @@ use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};
 
+use super::secret::Secret;
 use super::secret::wrong_values;
 use crate::api::Role;
 use crate::job::Priority;

@@ -1,17 +1,17 @@
 //! A device and its lanes: the handles that workers use.
 
-use super::densify::{Densification, Densified};
-use super::{densify, self_test, slot};
 use std::sync::Arc;
 use std::thread;
 use std::time::Duration;
 
 use tokio::sync::{mpsc, oneshot, watch};
 
+use super::densify::{Densification, Densified};
 use super::liveness::Liveness;
 use super::slot::{Command, Request};
 use super::supervisor::DeviceSupervisor;
 use super::types::{DeviceFactory, DeviceOptions, EngineError, Health, Work};
+use super::{densify, self_test, slot};
 use crate::flow::Estimate;
 use crate::flow::field::Backend;
 use crate::job::DeviceKind;

@@ -1,10 +1,11 @@
 //! Liveness of a lane: its working time and its last heartbeat.
 
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
 use crate::flow::Control;
 use crate::flow::Interrupt;
 use crate::flow::Progress;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::{Duration, Instant};
 
 /// Working time of a lane, including the current task, and its last heartbeat. All times are
 /// microseconds after `epoch`.

@@ -6,11 +6,10 @@
 
 use std::io::Write;
 
-use crate::flow::Point;
-
 use super::error::{FileKind, FormatError};
 use super::limits::{check_rows, check_value, check_within};
 use super::scalar::write_floats;
+use crate::flow::Point;
 
 /// Largest plausible coordinate, metres: beyond the range of any lidar. Misread columns soon exceed
 /// it.

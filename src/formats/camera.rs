@@ -4,11 +4,10 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use crate::flow::RigidTransform;
-use crate::flow::depth::{Camera, Intrinsics};
-
 use super::error::{FileKind, FormatError, shorten};
 use super::motion::rigid_motion;
+use crate::flow::RigidTransform;
+use crate::flow::depth::{Camera, Intrinsics};
 
 const KIND: FileKind = FileKind::Camera;
 

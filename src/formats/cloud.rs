@@ -4,8 +4,6 @@
 
 use std::io::Write;
 
-use crate::flow::Point;
-
 use super::error::{FileKind, FormatError, shorten};
 use super::feather::{Table, Values};
 use super::limits::{MAX_COORDINATE_M, MAX_POINTS, check_value, check_within};
@@ -15,6 +13,7 @@ use super::ply::Ply;
 use super::scalar::{Scalar, write_floats};
 use super::sniff::recognize;
 use super::{bin, feather, npy, pcd, ply};
+use crate::flow::Point;
 
 const AXES: [&str; 3] = ["x", "y", "z"];
 

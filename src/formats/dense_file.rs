@@ -2,14 +2,13 @@
 
 use std::io::{Cursor, Write};
 
-use crate::flow::DenseCloud;
-
 use super::error::{FileKind, FormatError, shorten};
 use super::limits::{check_points, check_value};
 use super::npz::NpzWriter;
 use super::pair::check_count;
 use super::sniff::ending;
 use super::{las, npy, pcd, ply};
+use crate::flow::DenseCloud;
 
 /// The formats in which a dense cloud is written. All except LAS and LAZ can be read back as
 /// clouds.

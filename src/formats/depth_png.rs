@@ -2,11 +2,10 @@
 
 use std::io::{Cursor, Write};
 
-use crate::flow::depth::{DepthImage, MAX_SIDE_PX};
-
 use super::error::{FileKind, FormatError};
 use super::limits::unfold_limit;
 use super::pair::check_count;
+use crate::flow::depth::{DepthImage, MAX_SIDE_PX};
 
 const KIND: FileKind = FileKind::Png;
 

@@ -2,10 +2,9 @@
 
 use nalgebra::Point3;
 
-use crate::flow::{Point, RigidTransform};
-
 use super::error::{FileKind, FormatError};
 use super::npy::Header;
+use crate::flow::{Point, RigidTransform};
 
 /// Largest height of a ground point above the raster, metres; points below the raster are ground at
 /// any depth. Argoverse 2's own threshold.

@@ -7,9 +7,8 @@ use std::io::{Cursor, Write};
 use las::point::Format;
 use las::{Builder, Point, Transform, Vector, Version, Vlr, Writer};
 
-use crate::flow::DenseCloud;
-
 use super::error::{FileKind, FormatError};
+use crate::flow::DenseCloud;
 
 const KIND: FileKind = FileKind::Las;
 

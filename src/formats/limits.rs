@@ -2,9 +2,8 @@
 //!
 //! Sizes are checked before memory is allocated for them. Independent of any format.
 
-use crate::flow::Point;
-
 use super::error::{FileKind, FormatError};
+use crate::flow::Point;
 
 /// The largest number of points in one cloud.
 pub const MAX_POINTS: usize = 50_000_000;

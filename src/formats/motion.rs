@@ -2,10 +2,9 @@
 
 use nalgebra::{Matrix3, Matrix4, Rotation3, Translation3, UnitQuaternion};
 
-use crate::flow::RigidTransform;
-
 use super::error::FormatError;
 use super::limits::MAX_COORDINATE_M;
+use crate::flow::RigidTransform;
 
 /// Tolerance of a stored rotation from orthonormal. float32 matrices are within 1e-6. A scale or a
 /// shear that would move a point 100 m away by a decimetre is refused.

@@ -4,11 +4,10 @@
 
 use std::io::{Read, Write};
 
-use crate::flow::Point;
-
 use super::error::{FileKind, FormatError, shorten};
 use super::limits::{MAX_COORDINATE_M, check_rows, check_value, check_within};
 use super::scalar::{ByteOrder, Scalar, write_floats};
+use crate::flow::Point;
 
 pub(super) const MAGIC: &[u8] = b"\x93NUMPY";
 

@@ -9,12 +9,11 @@ use std::io::{Cursor, Read, Seek, Write};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
-use crate::flow::Point;
-
 use super::error::{FileKind, FormatError, shorten};
 use super::limits::{MAX_POINTS, check_flag, check_within, unfold_limit};
 use super::npy;
 use super::npy::{Header, Place};
+use crate::flow::Point;
 
 const KIND: FileKind = FileKind::Npz;
 

@@ -5,8 +5,6 @@
 
 use std::io::{Cursor, Write};
 
-use crate::flow::{Point, RigidTransform};
-
 use super::cloud::read_columns;
 use super::error::{FileKind, FormatError};
 use super::feather::{FLOW_COLUMNS, Table};
@@ -15,6 +13,7 @@ use super::motion::{ego_motion, matrix_rows};
 use super::npy;
 use super::npz::{Npz, NpzWriter};
 use super::sniff::is_zip;
+use crate::flow::{Point, RigidTransform};
 
 const KIND: FileKind = FileKind::Npz;
 

@@ -7,13 +7,12 @@ use std::collections::HashMap;
 
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 
-use crate::flow::RigidTransform;
-
 use super::camera::with_last_row;
 use super::error::{FileKind, FormatError, shorten};
 use super::feather;
 use super::feather::Table;
 use super::motion::rigid_motion;
+use crate::flow::RigidTransform;
 
 const KIND: FileKind = FileKind::Poses;
 

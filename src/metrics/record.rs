@@ -1,15 +1,16 @@
 //! What moves the metrics.
 
-use super::exposition;
-use crate::job::{Job, Priority};
-use crate::queue::Event;
-use prometheus_client::encoding::text;
-use prometheus_client::metrics::gauge::Gauge;
 use std::time::Duration;
 
+use prometheus_client::encoding::text;
+use prometheus_client::metrics::gauge::Gauge;
+
+use super::exposition;
 use super::series::{
     DeviceLabel, JobLabel, Metrics, Outcome, Phase, ProtocolAndClass, Reason, Seconds, Urgency,
 };
+use crate::job::{Job, Priority};
+use crate::queue::Event;
 
 impl Metrics {
     /// Counts what the queue tells.

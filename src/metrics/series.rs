@@ -1,6 +1,5 @@
 //! The series of all metrics, with their labels and buckets.
 
-use super::labels::{CLASSES, PHASES, PROTOCOLS, REJECTIONS};
 use std::sync::atomic::AtomicU64;
 
 use prometheus_client::encoding::EncodeLabelSet;
@@ -11,9 +10,9 @@ use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::Histogram;
 use prometheus_client::registry::Registry;
 
-use crate::job::{Priority, State};
-
+use super::labels::{CLASSES, PHASES, PROTOCOLS, REJECTIONS};
 use crate::flow::StopReason;
+use crate::job::{Priority, State};
 
 /// A gauge of a number that is not whole.
 pub(super) type Float = Gauge<f64, AtomicU64>;

@@ -1,7 +1,5 @@
 //! The interface of the queue: the `Queue` trait, its arguments, results, errors and events.
 
-use super::backlog::Backlog;
-use super::lease::Lease;
 use std::ops::Range;
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,6 +7,8 @@ use std::time::Duration;
 use async_trait::async_trait;
 use tokio::sync::watch;
 
+use super::backlog::Backlog;
+use super::lease::Lease;
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, State, Tenant};
 

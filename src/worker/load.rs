@@ -3,7 +3,6 @@
 //!
 //! Independent of how the result is used.
 
-use crate::engine::Work;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -14,6 +13,7 @@ use tokio::task::JoinHandle;
 use super::control::JobControl;
 use super::run::Worker;
 use crate::clock::Timestamp;
+use crate::engine::Work;
 use crate::flow::{Ego, EnvelopeError, MotionField, Snapshot, Sweep};
 use crate::job::{Job, JobOptions, State};
 use crate::payload::{Damaged, StoredCloud};

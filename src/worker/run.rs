@@ -1,7 +1,5 @@
 //! The worker's main loop, the attempt at a pair, and the classification of its errors.
 
-use super::isolation::IsolationLock;
-use super::probe::StoreProbe;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -9,6 +7,8 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
 use super::isolation::IsolationGuard;
+use super::isolation::IsolationLock;
+use super::probe::StoreProbe;
 use crate::clock::Timestamp;
 use crate::cost::CostModel;
 use crate::engine::{EngineError, Health, Lane};

@@ -2,7 +2,6 @@
 
 use fnsf::flow::RigidTransform;
 use fnsf::formats::{FormatError, GroundRaster, matrix_rows, read_poses};
-
 use proptest::prelude::*;
 
 use crate::samples::npy;

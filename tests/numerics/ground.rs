@@ -3,7 +3,6 @@
 use fnsf::flow::Point;
 use fnsf::flow::ground::{GroundOptions, GroundSegmentation, segment};
 use fnsf::flow::simulate::{Street, StreetOptions};
-
 use proptest::prelude::*;
 
 use super::scenes::real_pair;

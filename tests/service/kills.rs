@@ -3,11 +3,10 @@
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
+use fnsf::formats::CloudFormat;
 use reqwest::StatusCode;
 use reqwest::multipart::{Form, Part};
 use serde_json::Value;
-
-use fnsf::formats::CloudFormat;
 
 use crate::clouds::{file, form, medium_pair, small_pair};
 use crate::server::{Folder, Server, ended};

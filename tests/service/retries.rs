@@ -3,10 +3,9 @@
 use std::io::Write;
 use std::time::Duration;
 
+use fnsf::formats::CloudFormat;
 use reqwest::StatusCode;
 use serde_json::Value;
-
-use fnsf::formats::CloudFormat;
 
 use crate::clouds::{file, form, small_pair};
 use crate::server::{PATIENCE, Server, ended};

@@ -1,6 +1,5 @@
 //! The gRPC routes: the calls, health checks and reflection.
 
-use super::{calls, proto};
 use std::sync::Arc;
 
 use axum::Router;
@@ -8,6 +7,7 @@ use tonic::server::NamedService;
 use tonic::service::Routes;
 use tonic_health::ServingStatus;
 
+use super::{calls, proto};
 use crate::api::service::Service;
 
 /// Maximum size of an incoming message, bytes: a chunk of 1 MiB and its envelope.

@@ -1,12 +1,12 @@
 //! The HTTP routes.
 
-use super::{events, handlers, openapi, problem, results};
 use std::sync::Arc;
 
 use axum::Router;
 use axum::extract::DefaultBodyLimit;
 use axum::routing::{get, post};
 
+use super::{events, handlers, openapi, problem, results};
 use crate::api::service::Service;
 
 /// The HTTP routes, with the OpenAPI document and its page.

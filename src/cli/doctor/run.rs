@@ -1,10 +1,10 @@
 //! The `doctor` command.
 
-use super::gpus;
 use std::time::Instant;
 
 use clap::Args;
 
+use super::gpus;
 use crate::cli::failure::Failure;
 use crate::cli::machine::available_bytes;
 use crate::cli::output::say;

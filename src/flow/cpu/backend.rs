@@ -1,15 +1,15 @@
 //! The CPU backend: builds the distance transform, starts fits and evaluates networks on a thread
 //! pool.
 
-use super::inference;
-use super::isa::Isa;
-use super::trainer::{CpuTrainer, CpuTransform};
 use std::sync::Arc;
 
 use rayon::prelude::*;
 
+use super::inference;
+use super::isa::Isa;
 use super::kernels::Kernels;
 use super::tile::WorkingSets;
+use super::trainer::{CpuTrainer, CpuTransform};
 use crate::flow::data::{Control, Point};
 use crate::flow::distance::{DistanceOptions, DistanceTransform};
 use crate::flow::field::{Backend, BackendError, Network, Trainer, Transform};

@@ -12,6 +12,7 @@
 use super::isa::Isa;
 use super::mlp_kernels::{backward, forward};
 use super::simd::F32x4;
+
 #[cfg(target_arch = "x86_64")]
 use super::simd::{F32x8, F32x16};
 use super::tile::Tile;

@@ -10,6 +10,7 @@
 use super::isa::Isa;
 use super::kernels::Kernels;
 use super::simd::{F32x4, Lanes};
+
 #[cfg(target_arch = "x86_64")]
 use super::simd::{F32x8, F32x16};
 use super::tile::{TILE, Tile};

@@ -5,7 +5,6 @@
 //! any number of threads.
 
 use core::ops::Range;
-
 use std::sync::Arc;
 
 use rayon::prelude::*;

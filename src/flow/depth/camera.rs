@@ -3,8 +3,9 @@
 //! Camera frame: x right, y down, z forward, metres. Whole pixel coordinates are the centers of
 //! pixels, counted from 0, as in KITTI and OpenCV.
 
-use crate::flow::data::{Point, RigidTransform};
 use nalgebra::{Point3, Vector3};
+
+use crate::flow::data::{Point, RigidTransform};
 
 /// Maximum image width and height, pixels.
 pub const MAX_SIDE_PX: u32 = 16_384;

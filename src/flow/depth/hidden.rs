@@ -4,9 +4,10 @@
 //! A pixel is hidden if nearer pixels surround it. One side alone does not count: the road rises to
 //! the horizon, and the house beside a car begins at the car's edge.
 
+use rayon::prelude::*;
+
 use super::camera::Camera;
 use super::image::DepthImage;
-use rayon::prelude::*;
 
 /// Parameters of the occlusion filter.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -1,5 +1,7 @@
 //! Tests of the estimate: masks, ground, deadlines, cancellation and a given ego motion.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
+
 use super::*;
 use crate::flow::cpu::CpuBackend;
 use crate::flow::data::Control;
@@ -13,7 +15,6 @@ use crate::flow::options::Options;
 use crate::flow::options::{Ego, Ground, Preset};
 use crate::flow::problem::Problem;
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Interrupts after a number of iterations.
 struct After(usize, Interrupt, AtomicUsize);

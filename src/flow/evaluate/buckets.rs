@@ -4,9 +4,10 @@
 //! a slow pedestrian has the same weight as a fast truck. Here "close" is measured in the source
 //! sensor's frame; the official code measures it in the frame of the first sweep of each sequence.
 
+use nalgebra::Point3;
+
 use super::truth::{EvaluateError, Mean, Truth, double, end_point_error, is_close, norm};
 use crate::flow::data::{Point, RigidTransform};
-use nalgebra::Point3;
 
 /// Class index of points that belong to no class and are excluded.
 pub const UNCLASSIFIED: u8 = u8::MAX;

@@ -3,11 +3,12 @@
 //!
 //! Only x, y and z of the points are used.
 
+use nalgebra::{Matrix3, Vector3};
+
 use super::columns::{Column, Columns, TILE_M};
 use super::options::GroundOptions;
 use super::surface::HeightField;
 use crate::flow::data::Point;
-use nalgebra::{Matrix3, Vector3};
 
 /// Distance between the nodes of the finest height field, metres.
 const FINEST_M: f32 = 1.0;

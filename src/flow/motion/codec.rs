@@ -9,9 +9,9 @@
 //! The envelope (magic, version, checksum) is that of `data/codec.rs`. A missing ego motion is
 //! written as the identity with `present` 0.
 
-use nalgebra::{Quaternion, Translation3, UnitQuaternion};
-
 use std::sync::Arc;
+
+use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 
 use super::motion_field::{MotionField, Residual};
 use crate::flow::data::{Body, Envelope, EnvelopeError, RigidTransform};

@@ -1,23 +1,23 @@
 //! The object search on a pair: clustering, the search for each cluster's motion, acceptance and
 //! assignment.
 
-use super::features::ConfidenceFeatures;
-use super::labels::ClusterLabels;
-use super::motion_field::ObjectMotions;
-use super::{accept, assign, features, free_space};
-use crate::flow::spatial::dbscan;
 use rayon::prelude::*;
 
+use super::features::ConfidenceFeatures;
 use super::features::{Findings, SearchedCluster};
 use super::free_space::FreeSpace;
 use super::hough::TranslationVotes;
 use super::hypothesis::{ClusterSearch, Hypothesis};
+use super::labels::ClusterLabels;
+use super::motion_field::ObjectMotions;
 use super::neighbor_view::NeighborView;
 use super::scene::{Scene, SourceCloud};
+use super::{accept, assign, features, free_space};
 use crate::flow::data::AlignedSweep;
 use crate::flow::data::{Control, Interrupt, Point, Progress, RigidTransform};
 use crate::flow::options::ObjectOptions;
 use crate::flow::spatial::NOISE;
+use crate::flow::spatial::dbscan;
 
 /// Clusters between two checks of `control`.
 const CLUSTERS_AT_ONCE: usize = 32;

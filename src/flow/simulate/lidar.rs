@@ -3,14 +3,16 @@
 //! A sweep is taken at one instant. Columns run in parallel, each with its own random stream, so
 //! the sweep does not depend on the number of threads.
 
+use std::f64::consts::{PI, TAU};
+
+use nalgebra::Vector3;
+use rayon::prelude::*;
+
 use super::options::StreetOptions;
 use super::scene::{FARTHEST_M, Scene, Target};
 use super::shapes::Hit;
 use super::terrain::Terrain;
 use crate::flow::data::{Point, Random, RigidTransform};
-use nalgebra::Vector3;
-use rayon::prelude::*;
-use std::f64::consts::{PI, TAU};
 
 /// Minimum and maximum range, metres. Returns outside are dropped.
 const RANGES_M: [f64; 2] = [1.0, FARTHEST_M];

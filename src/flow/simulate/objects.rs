@@ -2,11 +2,13 @@
 //!
 //! Every object is rigid.
 
+use std::f64::consts::{FRAC_PI_2, PI};
+
+use nalgebra::Vector3;
+
 use super::shapes::Shape;
 use super::terrain::Terrain;
 use crate::flow::data::{Random, RigidTransform};
-use nalgebra::Vector3;
-use std::f64::consts::{FRAC_PI_2, PI};
 
 /// Lateral offset of a lane's middle from the center line, metres; traffic keeps to the right.
 pub(super) const LANE_M: f64 = 1.75;

@@ -2,10 +2,11 @@
 //!
 //! Rays are grouped in columns. The caller lists the solids that each column can hit.
 
+use nalgebra::{Matrix3, Vector3};
+
 use super::shapes::{Hit, Shape};
 use super::terrain::Terrain;
 use crate::flow::data::RigidTransform;
-use nalgebra::{Matrix3, Vector3};
 
 /// Maximum range, metres. Returns from farther away are dropped.
 pub(super) const FARTHEST_M: f64 = 120.0;

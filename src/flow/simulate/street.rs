@@ -3,6 +3,8 @@
 //! The true flow is that of the measured point, noise included: it moves rigidly with the object or
 //! surface that the ray hit, and the ego vehicle moves as well. For a static point x2 = T x1.
 
+use nalgebra::{Point3, Translation3, Vector3};
+
 use super::lidar::Lidar;
 use super::objects::{Kind, LANE_M, Object, traffic};
 use super::options::{SWEEP_SECONDS, StreetError, StreetOptions};
@@ -12,7 +14,6 @@ use super::view;
 use super::world::World;
 use crate::flow::data::{Point, Random, RigidTransform};
 use crate::flow::depth::{Camera, DepthImage};
-use nalgebra::{Point3, Translation3, Vector3};
 
 /// Height of the sensor above the ground, metres.
 const SENSOR_HEIGHT_M: f64 = 1.73;

@@ -6,9 +6,10 @@
 //! curvature there and never intersects itself. Positions are also given as x and lateral offset,
 //! metres to the left of the center line.
 
+use nalgebra::{Translation3, UnitQuaternion, Vector3};
+
 use super::shapes::Hit;
 use crate::flow::data::{Random, RigidTransform};
-use nalgebra::{Translation3, UnitQuaternion, Vector3};
 
 /// Distance from the center line to the kerb, metres.
 const KERB_M: f64 = 6.0;

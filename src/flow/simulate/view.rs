@@ -1,10 +1,11 @@
 //! True depth image of a street: one exact ray per pixel, without noise and loss.
 
+use rayon::prelude::*;
+
 use super::scene::{FARTHEST_M, Scene, Target};
 use super::terrain::Terrain;
 use crate::flow::data::RigidTransform;
 use crate::flow::depth::{Camera, DepthImage};
-use rayon::prelude::*;
 
 /// Depth image of a camera at `world_from_camera`; `targets` are in the camera's frame. The maximum
 /// range is that of the lidar.

@@ -2,11 +2,12 @@
 //!
 //! Objects are placed along the street by the seed, clear of the side streets.
 
+use nalgebra::{Translation3, UnitQuaternion};
+
 use super::objects::{Object, Path};
 use super::shapes::Shape;
 use super::terrain::Terrain;
 use crate::flow::data::{Random, RigidTransform};
-use nalgebra::{Translation3, UnitQuaternion};
 
 /// Distance from the center line to the row of houses, metres.
 const HOUSES_M: f64 = 10.5;

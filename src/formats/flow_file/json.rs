@@ -5,10 +5,9 @@
 
 use std::io::Write;
 
-use crate::flow::{Cluster, Point};
-
 use super::objects::Described;
 use super::table::{FlowFile, FlowTable};
+use crate::flow::{Cluster, Point};
 use crate::formats::error::{FileKind, FormatError};
 use crate::formats::limits::{check_chance, check_value};
 use crate::formats::motion::matrix_rows;

@@ -4,6 +4,7 @@ use crate::flow::Cluster;
 use crate::flow::Objects;
 use crate::flow::Point;
 use crate::flow::RigidTransform;
+
 /// Property names of a displacement in PLY and PCD.
 pub(super) const FLOW_AXES: [&str; 3] = ["flow_x", "flow_y", "flow_z"];
 

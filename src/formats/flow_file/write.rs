@@ -1,10 +1,10 @@
 //! Writes flows.
 
-use super::{json, objects};
 use std::io::{Cursor, Write};
 
 use super::table::FLOW_AXES;
 use super::table::FlowTable;
+use super::{json, objects};
 use crate::formats::error::{FileKind, FormatError, shorten};
 use crate::formats::feather::{FLOW_COLUMNS, Values};
 use crate::formats::limits::check_points;

@@ -1,6 +1,5 @@
 //! Implementation of the queue on one SQLite file.
 
-use super::{expiry, finish, leases, rows, schema, submit};
 use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -17,6 +16,7 @@ use super::heartbeat::SqliteHeartbeat;
 use super::rows::{COLUMNS, state_code};
 use super::shared::Shared;
 use super::writer::Writer;
+use super::{expiry, finish, leases, rows, schema, submit};
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobId, Tenant};
 use crate::queue::backlog::{Backlog, Load, Place};

@@ -1,5 +1,7 @@
 //! Tests of the trainer: against the method in double precision, and for reproducible bits.
 
+use std::sync::Mutex;
+
 use super::*;
 use crate::flow::cpu::backend::CpuBackend;
 use crate::flow::cpu::isa::Isa;
@@ -8,7 +10,6 @@ use crate::flow::distance::{DistanceOptions, DistanceTransform};
 use crate::flow::field::{Backend, MOST_POINTS, Transform, first_losses};
 use crate::flow::options::FieldOptions;
 use crate::flow::options::Preset;
-use std::sync::Mutex;
 
 /// Records the losses.
 #[derive(Default)]
