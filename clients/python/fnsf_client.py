@@ -60,7 +60,7 @@ class Flow:
 class Pair:
     """Two consecutive sweeps of a sequence: their flow, or why there is none."""
 
-    place: int
+    index: int
     source: str
     target: str
     flow: Flow | None
