@@ -39,13 +39,13 @@ impl Control for Clock {
 }
 
 /// The command-line arguments.
-struct Asked {
+struct Arguments {
     card: Selector,
     points: Vec<usize>,
     pairs: Vec<usize>,
 }
 
-impl Asked {
+impl Arguments {
     fn read() -> Result<Self, String> {
         let mut asked = Self {
             card: Selector::Any,
@@ -216,7 +216,7 @@ fn queries(estimate: &Estimate) -> f64 {
 }
 
 fn main() -> Result<(), String> {
-    let asked = Asked::read()?;
+    let asked = Arguments::read()?;
     let adapter = select(&asked.card, false).map_err(|e| e.to_string())?;
     let lanes = asked.pairs.iter().copied().max().unwrap_or(1);
     let options = GpuOptions {

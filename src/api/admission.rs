@@ -62,7 +62,7 @@ pub enum Durability {
 
 /// The properties of a job that admission control depends on.
 #[derive(Clone, Debug)]
-pub struct Asked<'a> {
+pub struct AdmissionRequest<'a> {
     /// The tenant of the job.
     pub tenant: &'a Tenant,
     /// The priority of the job.
@@ -181,7 +181,7 @@ impl Admission {
     ///
     /// # Errors
     /// [`ApiError::TenantLimit`] or [`ApiError::ServerFull`].
-    pub fn admit(&self, asked: &Asked<'_>) -> Result<Reservation, ApiError> {
+    pub fn admit(&self, asked: &AdmissionRequest<'_>) -> Result<Reservation, ApiError> {
         let backlog = self.queue.backlog();
         let mut reserved = locked(&self.reserved);
         let real = |nominal: f64| self.cost.seconds(nominal);
@@ -213,7 +213,7 @@ impl Admission {
     /// Predicted seconds until a new job is started. All lanes share the jobs that may run on any
     /// device; the jobs that require one kind of device come on top. A job for any device waits for
     /// the kind that is free first.
-    fn wait(&self, backlog: &Backlog, asked: &Asked<'_>, reserved: f64) -> f64 {
+    fn wait(&self, backlog: &Backlog, asked: &AdmissionRequest<'_>, reserved: f64) -> f64 {
         let ahead =
             |device| backlog.ahead_of(asked.tenant, asked.priority, asked.nominal_seconds, device);
         let running = backlog.running();

@@ -7,9 +7,9 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use super::admission::Admission;
-use super::answers::{AnswerRoom, Encoded};
 use super::codec;
 use super::error::ApiError;
+use super::result_budget::{Encoded, ResultReservation};
 use super::service::Service;
 use crate::cost::CostModel;
 use crate::flow::densify::Plan;
@@ -31,14 +31,14 @@ const FIELD_BYTES: usize = 1 << 20;
 const CORRECTIONS: f64 = 5.0;
 
 /// The work for a dense cloud in addition to the forward pairs.
-pub(super) struct Closing {
+pub(super) struct Finalizer {
     /// The pairs backward in time, in the order of computation.
     pub(super) back: Vec<PairOf>,
     /// Nominal seconds for the advection of all points.
     pub(super) nominal_seconds: f64,
 }
 
-impl Closing {
+impl Finalizer {
     /// The additional work for a sequence whose sweep `i` has `points[i]` points. With `chained`
     /// each backward pair starts from the field of the one before; `sweeps` is the window size.
     ///
@@ -58,8 +58,8 @@ impl Closing {
         let back = back.enumerate().map(|(turn, edge)| PairOf {
             index: edge.target as u32,
             backward: true,
-            sees: PairOf::seen(window_back(edge.target, points.len(), sweeps)),
-            follows: chained && turn > 0,
+            window: PairOf::seen(window_back(edge.target, points.len(), sweeps)),
+            chained: chained && turn > 0,
         });
         Ok(Self {
             back: back.collect(),
@@ -79,9 +79,9 @@ fn window_back(index: usize, count: usize, sweeps: usize) -> Range<usize> {
 /// The number of field evaluations until all points are at the reference time.
 fn questions(asked: &Densify, plan: &Plan, points: &[usize]) -> f64 {
     let of_sweep = |(index, &points): (usize, &usize)| {
-        let steps = (plan.into() - index as f64).abs().ceil();
-        let inverted =
-            asked.later_sweeps == LaterSweepsChoice::Inverse && index as f64 > plan.into();
+        let steps = (plan.reference_time() - index as f64).abs().ceil();
+        let inverted = asked.later_sweeps == LaterSweepsChoice::Inverse
+            && index as f64 > plan.reference_time();
         let each = if inverted {
             CORRECTIONS
         } else {
@@ -145,7 +145,7 @@ impl Service {
     pub(super) async fn dense_cloud(
         &self,
         job: &Job,
-    ) -> Result<(Arc<DenseCloud>, AnswerRoom), ApiError> {
+    ) -> Result<(Arc<DenseCloud>, ResultReservation), ApiError> {
         Self::check_success(job)?;
         let room = self.room_for_result(job).await?;
         Ok((Arc::new(self.read_dense(job).await?), room))

@@ -13,9 +13,9 @@ use axum::response::{IntoResponse, Response};
 use tower_http::catch_panic::CatchPanicLayer;
 use tracing::Instrument;
 
-use super::draft::Arrived;
 use super::error::{ApiError, ErrorSpec};
 use super::listener::Asking;
+use super::pending_job::ReceivedAt;
 use super::service::Service;
 use super::{grpc, origin};
 
@@ -57,7 +57,7 @@ async fn check_key(
     mut request: Request,
     next: Next,
 ) -> Response {
-    request.extensions_mut().insert(Arrived(Instant::now()));
+    request.extensions_mut().insert(ReceivedAt(Instant::now()));
     if observes(&request)
         && let Some(asking) = request.extensions().get::<Asking>()
     {

@@ -6,24 +6,24 @@
 
 mod admin;
 mod admission;
-mod answers;
 mod auth;
 mod codec;
 mod dense;
-mod draft;
 mod error;
 mod grpc;
 mod http;
 mod listener;
 mod middleware;
 mod origin;
+mod pending_job;
+mod permits;
+mod result_budget;
 mod results;
 mod routes;
 mod service;
 #[cfg(test)]
 mod tests;
-mod turns;
-mod uploads;
+mod upload_budget;
 mod waiters;
 
 pub use admin::{Readiness, admin_router};
@@ -33,4 +33,4 @@ pub use error::ApiError;
 pub use listener::{ListenOptions, Listener, TlsError, tls_acceptor};
 pub use origin::Hosts;
 pub use routes::public_router;
-pub use service::{Parts, Service, ServiceLimits};
+pub use service::{Service, ServiceLimits, ServiceParts};

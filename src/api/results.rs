@@ -6,10 +6,10 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 
-use super::answers::{AnswerRoom, Encoded};
 use super::codec::AnswerFormat;
 use super::dense::is_dense;
 use super::error::ApiError;
+use super::result_budget::{Encoded, ResultReservation};
 use super::service::Service;
 use crate::job::{Job, JobId, Kind, Report, State};
 use crate::payload::{StoredCloud, StoredFlow};
@@ -25,7 +25,7 @@ pub struct Answer {
     /// The flow.
     pub flow: Arc<StoredFlow>,
     /// The memory reservation.
-    pub(super) room: Arc<AnswerRoom>,
+    pub(super) room: Arc<ResultReservation>,
 }
 
 impl Service {
@@ -46,7 +46,7 @@ impl Service {
     ///
     /// # Errors
     /// [`ApiError::ServerFull`], [`ApiError::ResultLost`], or where the store fails.
-    pub(super) async fn room_for_result(&self, job: &Job) -> Result<AnswerRoom, ApiError> {
+    pub(super) async fn room_for_result(&self, job: &Job) -> Result<ResultReservation, ApiError> {
         /// Upper bound on memory relative to the stored size: the stored bytes, the decoded arrays,
         /// and the largest encoding.
         const FACTOR: usize = 6;

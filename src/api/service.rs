@@ -8,13 +8,13 @@ use std::time::Duration;
 use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 
-use super::admission::{Admission, Asked, Durability};
-use super::answers::{AnswerLimits, Answers};
+use super::admission::{Admission, AdmissionRequest, Durability};
 use super::auth::{Caller, Keys};
 use super::error::ApiError;
 use super::origin::Hosts;
-use super::turns::{Line, Turns};
-use super::uploads::{UploadLimits, Uploads};
+use super::permits::{FairQueue, TenantPermits};
+use super::result_budget::{ResultBudget, ResultLimits};
+use super::upload_budget::{UploadBudget, UploadLimits};
 use super::waiters::{Awaited, Ending, Waiters};
 use crate::health::StoreHealth;
 use crate::job::{Job, JobId, JobOptions, Kind, Priority, State, Tenant};
@@ -61,15 +61,15 @@ pub struct Service {
     pub(super) hosts: Hosts,
     store_health: Arc<StoreHealth>,
     pub(super) limits: ServiceLimits,
-    pub(super) uploads: Arc<Uploads>,
-    pub(super) answers: Answers,
+    pub(super) uploads: Arc<UploadBudget>,
+    pub(super) answers: ResultBudget,
     waiters: Arc<Waiters>,
-    compute: Line,
+    compute: FairQueue,
     /// Permits for encoding results. Separate from the permits for decoding uploads.
-    pub(super) encoding: Line,
+    pub(super) encoding: FairQueue,
     /// Permits for archives and dense clouds that are being sent. Each occupies a thread or memory
     /// while the client reads.
-    pub(super) archives: Arc<Turns>,
+    pub(super) archives: Arc<TenantPermits>,
     /// Permit for reading and encoding one dense cloud at a time.
     pub(super) clouds: Semaphore,
     /// Cancelled when the server is about to stop. The gRPC health service then reports
@@ -81,7 +81,7 @@ pub struct Service {
 }
 
 /// The dependencies of a [`Service`].
-pub struct Parts {
+pub struct ServiceParts {
     /// The job queue.
     pub queue: Arc<dyn Queue>,
     /// The blob store for payloads and results.
@@ -126,7 +126,7 @@ pub enum Waited {
 
 impl Service {
     /// A service with the given dependencies.
-    pub fn new(parts: Parts) -> Self {
+    pub fn new(parts: ServiceParts) -> Self {
         let limits = &parts.limits;
         let all = limits.max_uploads_bytes;
         // With several tenants, one tenant gets at most half of the budget.
@@ -147,17 +147,17 @@ impl Service {
             queue: parts.queue,
             blobs: parts.blobs,
             admission: parts.admission,
-            uploads: Arc::new(Uploads::new(uploads, Arc::clone(&parts.metrics))),
-            answers: Answers::new(AnswerLimits::new(limits.max_answers_bytes, several)),
+            uploads: Arc::new(UploadBudget::new(uploads, Arc::clone(&parts.metrics))),
+            answers: ResultBudget::new(ResultLimits::new(limits.max_answers_bytes, several)),
             waiters: Arc::default(),
             metrics: parts.metrics,
             keys: parts.keys,
             hosts: parts.hosts,
             store_health: parts.store_health,
             limits: parts.limits,
-            compute: Line::new(cores),
-            encoding: Line::new(cores),
-            archives: Arc::new(Turns::new(MAX_ARCHIVES, several)),
+            compute: FairQueue::new(cores),
+            encoding: FairQueue::new(cores),
+            archives: Arc::new(TenantPermits::new(MAX_ARCHIVES, several)),
             clouds: Semaphore::new(1),
             leaving: CancellationToken::new(),
             draining: AtomicBool::new(false),
@@ -202,7 +202,7 @@ impl Service {
     ///
     /// # Errors
     /// [`ApiError::Draining`].
-    pub fn check_draining(&self) -> Result<(), ApiError> {
+    pub(super) fn check_draining(&self) -> Result<(), ApiError> {
         if self.draining.load(Ordering::Relaxed) {
             Err(ApiError::Draining)
         } else {
@@ -246,26 +246,36 @@ impl Service {
         }
     }
 
+    /// Refuses new work of a caller that may not write, and any new work while the server drains or
+    /// its store cannot take it.
+    ///
+    /// # Errors
+    /// [`ApiError::Forbidden`], [`ApiError::Draining`], [`ApiError::DiskFull`] or
+    /// [`ApiError::StoreUnavailable`].
+    pub(super) fn check_new_work(&self, caller: &Caller) -> Result<(), ApiError> {
+        caller.may_write()?;
+        self.check_draining()?;
+        self.check_disk()
+    }
+
     /// Refuses a caller whose job would be refused regardless of its size, before its clouds are
     /// read. This keeps refusals cheap under overload. Without `options` the job counts as one of
     /// the highest priority, for any device.
     ///
     /// # Errors
-    /// [`ApiError::Forbidden`], [`ApiError::Draining`], [`ApiError::DiskFull`],
-    /// [`ApiError::NoDevice`], [`ApiError::TenantLimit`] or [`ApiError::ServerFull`].
-    pub fn check_room(
+    /// Those of [`Self::check_new_work`], [`ApiError::NoDevice`], [`ApiError::TenantLimit`] or
+    /// [`ApiError::ServerFull`].
+    pub(super) fn check_room(
         &self,
         caller: &Caller,
         options: Option<&JobOptions>,
         durability: Durability,
     ) -> Result<(), ApiError> {
-        caller.may_write()?;
-        self.check_draining()?;
-        self.check_disk()?;
+        self.check_new_work(caller)?;
         let device = options.and_then(JobOptions::device_kind);
         self.admission.check_device(device)?;
         self.admission
-            .admit(&Asked {
+            .admit(&AdmissionRequest {
                 tenant: &caller.tenant,
                 priority: options.map_or(Priority::High, |options| options.priority),
                 device,
@@ -337,14 +347,12 @@ impl Service {
     /// [`ApiError::BadRequest`] if the job has not ended, or has succeeded and still has its
     /// result.
     pub async fn requeue(&self, caller: &Caller, id: JobId) -> Result<Arc<Job>, ApiError> {
-        caller.may_write()?;
-        self.check_draining()?;
+        self.check_new_work(caller)?;
         let job = self.job(caller, id).await?;
-        self.check_disk()?;
         let pairs = self.queue.pairs(id).await?;
         let undone = pairs.iter().filter(|pair| pair.state != State::Succeeded);
         let of_pairs: f64 = undone.map(|pair| pair.cost_seconds).sum();
-        let _place = self.admission.admit(&Asked {
+        let _place = self.admission.admit(&AdmissionRequest {
             tenant: &caller.tenant,
             priority: job.priority,
             device: job.device,
@@ -395,7 +403,7 @@ impl Service {
     /// Flushes to disk all sweeps that the estimate of a job uses.
     async fn sync_frames(&self, job: &Job) -> Result<(), ApiError> {
         let sweeps = match job.kind {
-            Kind::Pair => job.sees[0]..job.sees[1],
+            Kind::Pair => job.window[0]..job.window[1],
             Kind::Sequence => 0..1 + self.pairs(job).await?.len() as u32,
         };
         let (owner, _) = job.sweeps();

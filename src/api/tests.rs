@@ -20,7 +20,7 @@ use super::auth::Keys;
 use super::listener::bodies::RequestBody;
 use super::origin::Hosts;
 use super::routes::public_router;
-use super::service::{Parts, Service, ServiceLimits};
+use super::service::{Service, ServiceLimits, ServiceParts};
 use crate::cost::{CostModel, Lanes};
 use crate::metrics::Metrics;
 use crate::queue::{Queue, QueueOptions, SqliteQueue};
@@ -60,7 +60,7 @@ fn service(folder: &std::path::Path) -> Arc<Service> {
         max_queue: long,
         max_tenant_queue: long,
     };
-    Arc::new(Service::new(Parts {
+    Arc::new(Service::new(ServiceParts {
         admission: Admission::new(limits, Arc::clone(&queue), cost),
         queue,
         blobs: Blobs::open(&folder.join("blobs")).expect("a store"),

@@ -66,8 +66,8 @@ impl Pool {
                 "gpu" => pool.add_every_gpu(config)?,
                 other => match other.split_once(':') {
                     Some(("cpu", threads)) => pool.add_cpu(Some(threads))?,
-                    Some(("gpu", card)) if !card.is_empty() => {
-                        let Ok(selector) = Selector::from_str(card);
+                    Some(("gpu", adapter)) if !adapter.is_empty() => {
+                        let Ok(selector) = Selector::from_str(adapter);
                         pool.add_gpu(chosen(&selector, config)?, config);
                     }
                     _ => bail!(
@@ -98,19 +98,19 @@ impl Pool {
     fn add_the_best(&mut self, config: &Config, probe: Probe<'_>) -> anyhow::Result<()> {
         let mut found = false;
         let mut taken = Taken::default();
-        for card in welcome(config) {
-            if taken.has(&card) {
+        for adapter in welcome(config) {
+            if taken.has(&adapter) {
                 continue;
             }
-            let (name, place) = (card.name.clone(), card.pci_id.clone());
-            let (lanes, open) = card_opener(card, config);
+            let (name, place) = (adapter.name.clone(), adapter.pci_id.clone());
+            let (lanes, open) = adapter_factory(adapter, config);
             match probe(&open) {
                 Ok(()) => {
                     found = true;
                     taken.take(place);
                     self.add(DeviceKind::Gpu, lanes, open);
                 }
-                Err(reason) => tracing::warn!(card = name, reason, "a GPU is left out"),
+                Err(reason) => tracing::warn!(adapter = name, reason, "a GPU is left out"),
             }
         }
         if found {
@@ -121,16 +121,16 @@ impl Pool {
     }
 
     fn add_every_gpu(&mut self, config: &Config) -> anyhow::Result<()> {
-        let cards = welcome(config);
-        if cards.is_empty() {
+        let adapters = welcome(config);
+        if adapters.is_empty() {
             // Returns the error that lists the available GPUs.
             chosen(&Selector::Any, config)?;
         }
         let mut taken = Taken::default();
-        for card in cards {
-            if !taken.has(&card) {
-                taken.take(card.pci_id.clone());
-                self.add_gpu(card, config);
+        for adapter in adapters {
+            if !taken.has(&adapter) {
+                taken.take(adapter.pci_id.clone());
+                self.add_gpu(adapter, config);
             }
         }
         Ok(())
@@ -152,8 +152,8 @@ impl Pool {
         Ok(())
     }
 
-    fn add_gpu(&mut self, card: Adapter, config: &Config) {
-        let (lanes, open) = card_opener(card, config);
+    fn add_gpu(&mut self, adapter: Adapter, config: &Config) {
+        let (lanes, open) = adapter_factory(adapter, config);
         self.add(DeviceKind::Gpu, lanes, open);
     }
 
@@ -170,15 +170,15 @@ impl Pool {
 }
 
 /// The number of lanes of a GPU, and its opener.
-fn card_opener(card: Adapter, config: &Config) -> (usize, DeviceFactory) {
-    let wanted = config.gpu_lanes.unwrap_or(match card.kind {
+fn adapter_factory(adapter: Adapter, config: &Config) -> (usize, DeviceFactory) {
+    let wanted = config.gpu_lanes.unwrap_or(match adapter.kind {
         AdapterKind::Software => SOFTWARE_LANES,
         _ => GPU_LANES,
     });
-    let lanes = fitting_lanes(wanted, card.max_binding_bytes);
+    let lanes = fitting_lanes(wanted, adapter.max_binding_bytes);
     if lanes < wanted {
         tracing::warn!(
-            card = card.name,
+            adapter = adapter.name,
             wanted,
             lanes,
             "no more pairs fit on the GPU"
@@ -189,7 +189,7 @@ fn card_opener(card: Adapter, config: &Config) -> (usize, DeviceFactory) {
         memory_bytes: config.gpu_memory_mib.map(|mib| mib << 20),
     };
     let open: DeviceFactory = Box::new(move || {
-        let opened = Gpu::open(&found_again(&card)?, &options)?;
+        let opened = Gpu::open(&found_again(&adapter)?, &options)?;
         Ok(Box::new(opened))
     });
     (lanes, open)
@@ -211,9 +211,9 @@ fn chosen(selector: &Selector, config: &Config) -> anyhow::Result<Adapter> {
 /// Every GPU that may be used without being named: software GPUs only if the configuration allows
 /// them.
 fn welcome(config: &Config) -> Vec<Adapter> {
-    let mut cards = gpu::adapters();
-    cards.retain(|card| config.allow_software_gpu || card.kind != AdapterKind::Software);
-    cards
+    let mut adapters = gpu::adapters();
+    adapters.retain(|adapter| config.allow_software_gpu || adapter.kind != AdapterKind::Software);
+    adapters
 }
 
 /// PCI ids of the GPUs taken so far. Two drivers may expose the same GPU, and opening it twice
@@ -223,13 +223,13 @@ struct Taken(HashSet<String>);
 
 impl Taken {
     /// Whether this GPU is already taken through another driver.
-    fn has(&self, card: &Adapter) -> bool {
-        let has = self.0.contains(&card.pci_id);
+    fn has(&self, adapter: &Adapter) -> bool {
+        let has = self.0.contains(&adapter.pci_id);
         if has {
             tracing::info!(
-                card = card.name,
-                place = card.pci_id,
-                driver = card.driver,
+                adapter = adapter.name,
+                place = adapter.pci_id,
+                driver = adapter.driver,
                 "left out: another driver answers for the same card"
             );
         }
@@ -246,15 +246,15 @@ impl Taken {
 
 /// Enumerates the adapters again and returns the same GPU. The adapter found before a loss may be
 /// stale.
-fn found_again(card: &Adapter) -> Result<Adapter, BackendError> {
+fn found_again(adapter: &Adapter) -> Result<Adapter, BackendError> {
     let mut alike = gpu::adapters();
-    alike.retain(|other| other.name == card.name && other.pci_id == card.pci_id);
+    alike.retain(|other| other.name == adapter.name && other.pci_id == adapter.pci_id);
     // Without a PCI id, identical GPUs are told apart by their index.
-    let twin = alike.iter().position(|other| other.index == card.index);
+    let twin = alike.iter().position(|other| other.index == adapter.index);
     if alike.is_empty() {
         return Err(BackendError::NoDevice(format!(
             "{} does not answer any more",
-            card.name
+            adapter.name
         )));
     }
     Ok(alike.swap_remove(twin.unwrap_or(0)))
@@ -360,25 +360,25 @@ mod tests {
 
     #[test]
     fn a_card_that_two_drivers_answer_for_is_taken_once() {
-        let cards = gpu::adapters();
-        if !gpu_in_tests::is_there(cards.len()) {
+        let adapters = gpu::adapters();
+        if !gpu_in_tests::is_there(adapters.len()) {
             return;
         }
-        let Some(card) = cards.into_iter().next() else {
+        let Some(adapter) = adapters.into_iter().next() else {
             return;
         };
         let at = |place: &str| {
-            let mut card = card.clone();
-            place.clone_into(&mut card.pci_id);
-            card
+            let mut adapter = adapter.clone();
+            place.clone_into(&mut adapter.pci_id);
+            adapter
         };
-        let cards = ["0000:01:00.0", "0000:02:00.0", "0000:01:00.0", "", ""].map(at);
+        let adapters = ["0000:01:00.0", "0000:02:00.0", "0000:01:00.0", "", ""].map(at);
         let mut taken = Taken::default();
         let mut kept = Vec::new();
-        for card in cards {
-            if !taken.has(&card) {
-                taken.take(card.pci_id.clone());
-                kept.push(card.pci_id);
+        for adapter in adapters {
+            if !taken.has(&adapter) {
+                taken.take(adapter.pci_id.clone());
+                kept.push(adapter.pci_id);
             }
         }
         assert_eq!(kept, ["0000:01:00.0", "0000:02:00.0", "", ""]);
@@ -386,19 +386,19 @@ mod tests {
 
     #[test]
     fn a_card_that_is_opened_with_the_most_lanes_has_a_network_for_each() {
-        let cards = gpu::adapters();
-        if !gpu_in_tests::is_there(cards.len()) {
+        let adapters = gpu::adapters();
+        if !gpu_in_tests::is_there(adapters.len()) {
             return;
         }
-        let Some(card) = cards.into_iter().next() else {
+        let Some(adapter) = adapters.into_iter().next() else {
             return;
         };
-        let lanes = fitting_lanes(64, card.max_binding_bytes);
+        let lanes = fitting_lanes(64, adapter.max_binding_bytes);
         let options = GpuOptions {
             lanes,
             memory_bytes: None,
         };
-        let gpu = Gpu::open(&card, &options).expect("it opens");
+        let gpu = Gpu::open(&adapter, &options).expect("it opens");
         assert_eq!(gpu.lanes(), lanes);
     }
 }

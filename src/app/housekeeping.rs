@@ -16,7 +16,7 @@ use crate::storage::Blobs;
 use crate::worker::StoreProbe;
 
 /// Polling interval of the devices, and the period of their busy ratio.
-const LOOK: Duration = Duration::from_secs(2);
+const PROBE_INTERVAL: Duration = Duration::from_secs(2);
 
 /// Interval between scans for orphaned payloads, and their minimum age. A payload is written before
 /// its job is accepted, so a young payload without a job is normal.
@@ -58,7 +58,7 @@ pub(super) fn start(
 async fn listen(blobs: Blobs, metrics: Arc<Metrics>, mut heard: mpsc::UnboundedReceiver<Event>) {
     while let Some(event) = heard.recv().await {
         metrics.observe(&event);
-        if let Event::Forgotten(id) = event
+        if let Event::Deleted(id) = event
             && let Err(error) = blobs.remove_job(id).await
         {
             tracing::warn!(%error, job = %id, "a forgotten job left something behind");
@@ -118,7 +118,7 @@ async fn probe(store: Arc<StoreProbe>, metrics: Arc<Metrics>) {
 
 /// Polls the devices and updates their metrics.
 async fn look(devices: Vec<Device>, metrics: Arc<Metrics>) {
-    let mut ticks = interval(LOOK);
+    let mut ticks = interval(PROBE_INTERVAL);
     let mut before: Vec<Duration> = devices.iter().map(Device::busy_time).collect();
     let mut then = Instant::now();
     loop {

@@ -13,8 +13,8 @@ use tokio_util::sync::CancellationToken;
 use super::devices::Pool;
 use super::{housekeeping, process};
 use crate::api::{
-    Admission, AdmissionLimits, Caller, Hosts, Keys, ListenOptions, Listener, Parts, Readiness,
-    Role, Service, ServiceLimits, admin_router, public_router, tls_acceptor,
+    Admission, AdmissionLimits, Caller, Hosts, Keys, ListenOptions, Listener, Readiness, Role,
+    Service, ServiceLimits, ServiceParts, admin_router, public_router, tls_acceptor,
 };
 use crate::config::{Config, LimitsConfig, QueueConfig};
 use crate::cost::{CostModel, Lanes};
@@ -261,7 +261,7 @@ fn service(
     config: &Config,
 ) -> Service {
     let is_loopback = config.listen.ip().is_loopback();
-    Service::new(Parts {
+    Service::new(ServiceParts {
         queue: Arc::clone(&stores.queue),
         blobs: stores.blobs.clone(),
         admission: Admission::new(

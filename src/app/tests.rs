@@ -32,7 +32,7 @@ struct Stand {
 }
 
 /// Starts a server on these GPUs, with one CPU thread in addition if `cpu` is set.
-async fn serve(cards: Vec<DeviceOptions>, cpu: bool) -> Stand {
+async fn serve(gpus: Vec<DeviceOptions>, cpu: bool) -> Stand {
     let folder = tempfile::tempdir().expect("a folder");
     let any_port = std::net::SocketAddr::from(([127, 0, 0, 1], 0));
     let config = Config {
@@ -44,7 +44,7 @@ async fn serve(cards: Vec<DeviceOptions>, cpu: bool) -> Stand {
     };
     let mut pool = Pool::of(&config).expect("a CPU");
     pool.devices.retain(|_| cpu);
-    pool.devices.extend(cards);
+    pool.devices.extend(gpus);
     let app = App::start_on(pool, config).await.expect("a server");
     for device in &app.devices {
         let mut health = device.health();
@@ -125,7 +125,7 @@ impl Stand {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_card_that_dies_costs_its_jobs_one_attempt_and_the_others_nothing() {
     let switches = Arc::new(Switches::default());
-    let stand = serve(vec![switches.card("gpu0", 2)], true).await;
+    let stand = serve(vec![switches.gpu("gpu0", 2)], true).await;
     switches.brake.store(true, Ordering::Relaxed);
     let on_the_card = [
         stand
@@ -170,14 +170,14 @@ async fn a_card_that_dies_costs_its_jobs_one_attempt_and_the_others_nothing() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_real_card_that_is_destroyed_in_the_middle_of_a_job_is_opened_again_and_does_it() {
-    let mut cards = gpu::adapters();
-    if !gpu_in_tests::is_there(cards.len()) {
+    let mut gpus = gpu::adapters();
+    if !gpu_in_tests::is_there(gpus.len()) {
         return;
     }
-    let adapter = cards.swap_remove(0);
+    let adapter = gpus.swap_remove(0);
     let opened: Arc<Mutex<Vec<Gpu>>> = Arc::default();
     let known = Arc::clone(&opened);
-    let card = DeviceOptions {
+    let gpu = DeviceOptions {
         name: "gpu0".to_owned(),
         kind: DeviceKind::Gpu,
         lanes: 2,
@@ -192,7 +192,7 @@ async fn a_real_card_that_is_destroyed_in_the_middle_of_a_job_is_opened_again_an
         }),
         reopening: ReopenPolicy::default(),
     };
-    let stand = serve(vec![card], true).await;
+    let stand = serve(vec![gpu], true).await;
     let id = stand
         .submit(json!({"device": "gpu", "preset": "paper", "max_points": 1000}))
         .await;
@@ -230,7 +230,7 @@ async fn a_real_card_that_is_destroyed_in_the_middle_of_a_job_is_opened_again_an
 async fn a_pair_too_large_for_the_card_is_done_by_the_cpu_unless_its_caller_wants_the_card() {
     let switches = Arc::new(Switches::default());
     switches.room.store(10, Ordering::Relaxed);
-    let stand = serve(vec![switches.card("gpu0", 1)], true).await;
+    let stand = serve(vec![switches.gpu("gpu0", 1)], true).await;
     let anywhere = stand.submit(json!({"preset": "neural"})).await;
     let (state, _, device) = stand.end(&anywhere).await;
     assert_eq!(state, "succeeded");
@@ -250,8 +250,8 @@ async fn a_pair_too_large_for_the_card_is_done_by_the_cpu_unless_its_caller_want
 async fn a_server_gives_up_when_the_last_card_does_not_come_back_and_not_before() {
     const A_MOMENT: Duration = Duration::from_millis(500);
     let switches = [Arc::new(Switches::default()), Arc::new(Switches::default())];
-    let cards = vec![switches[0].card("gpu0", 1), switches[1].card("gpu1", 1)];
-    let mut stand = serve(cards, true).await;
+    let gpus = vec![switches[0].gpu("gpu0", 1), switches[1].gpu("gpu1", 1)];
+    let mut stand = serve(gpus, true).await;
     for (index, switches) in switches.iter().enumerate() {
         switches.refusals.store(u32::MAX, Ordering::Relaxed);
         switches.destroy();
@@ -276,10 +276,10 @@ async fn a_server_gives_up_when_the_last_card_does_not_come_back_and_not_before(
 async fn a_server_does_not_give_up_while_another_card_is_being_opened_again() {
     const A_MOMENT: Duration = Duration::from_millis(500);
     let switches = [Arc::new(Switches::default()), Arc::new(Switches::default())];
-    let mut comes_back = switches[1].card("gpu1", 1);
+    let mut comes_back = switches[1].gpu("gpu1", 1);
     // Enough tries for the whole test.
     comes_back.reopening.tries = u32::MAX;
-    let mut stand = serve(vec![switches[0].card("gpu0", 1), comes_back], true).await;
+    let mut stand = serve(vec![switches[0].gpu("gpu0", 1), comes_back], true).await;
     for (switches, device) in switches.iter().zip(stand.app.devices.iter().skip(1)) {
         switches.refusals.store(u32::MAX, Ordering::Relaxed);
         switches.destroy();

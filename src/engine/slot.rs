@@ -85,7 +85,7 @@ pub(super) fn run(
             continue;
         };
         trust = task.run(supervisor, &handle, liveness);
-        let_go(handle);
+        disarm(handle);
     }
 }
 
@@ -104,7 +104,7 @@ fn rejected(inbox: &mut mpsc::Receiver<Command>) -> bool {
 
 /// Drops a lane's share of the device, after the result is sent. Dropping the last handle of a dead
 /// GPU may take long or panic.
-fn let_go(handle: DeviceHandle) {
+fn disarm(handle: DeviceHandle) {
     if let Err(panic) = catch_unwind(AssertUnwindSafe(move || drop(handle))) {
         let panic = message(panic.as_ref());
         tracing::warn!(panic, "a device that was let go of panicked");

@@ -149,7 +149,7 @@ impl DeviceSupervisor {
     /// A self-test that finds no memory beside the pairs of other lanes proves no fault, and losing
     /// the device would fail those pairs. In this case the device stays open.
     pub(super) fn open(&self, trust: SelfTest, ended: &mut dyn FnMut() -> bool) -> bool {
-        const LOOK: Duration = Duration::from_millis(100);
+        const POLL_INTERVAL: Duration = Duration::from_millis(100);
         if trust == SelfTest::Shaken
             && let Some(handle) = self.share()
             && let Err(error) = self_test::run(handle.backend.as_ref())
@@ -161,7 +161,7 @@ impl DeviceSupervisor {
             match self.opened() {
                 Ok(()) => return true,
                 Err(_) if ended() => return false,
-                Err(wait) => thread::sleep(wait.min(LOOK)),
+                Err(wait) => thread::sleep(wait.min(POLL_INTERVAL)),
             }
         }
     }

@@ -71,7 +71,7 @@ impl Switches {
     }
 
     /// A GPU with this number of lanes and these faults, with short pauses between reopenings.
-    pub(crate) fn card(self: &Arc<Self>, name: &str, lanes: usize) -> DeviceOptions {
+    pub(crate) fn gpu(self: &Arc<Self>, name: &str, lanes: usize) -> DeviceOptions {
         DeviceOptions {
             name: name.to_owned(),
             kind: DeviceKind::Gpu,
@@ -95,7 +95,7 @@ impl Switches {
             let lost = Arc::new(AtomicBool::new(false));
             *switches.lost.lock().expect("no panic holds it") = Arc::clone(&lost);
             let switches = Arc::clone(&switches);
-            Ok(Box::new(Card { switches, lost }))
+            Ok(Box::new(TestGpu { switches, lost }))
         })
     }
 }
@@ -108,15 +108,15 @@ fn taken(count: &AtomicU32) -> bool {
         .is_ok()
 }
 
-struct Card {
+struct TestGpu {
     switches: Arc<Switches>,
     lost: Arc<AtomicBool>,
 }
 
-impl Opened for Card {
+impl Opened for TestGpu {
     fn lane(&self) -> Arc<dyn Backend> {
         assert!(!self.switches.tears.load(Ordering::Relaxed), "it tears");
-        Arc::new(CardLane {
+        Arc::new(TestBackend {
             cpu: CpuBackend::new(Some(1)).expect("a thread"),
             switches: Arc::clone(&self.switches),
             lost: Arc::clone(&self.lost),
@@ -132,13 +132,13 @@ impl Opened for Card {
     }
 }
 
-struct CardLane {
+struct TestBackend {
     cpu: CpuBackend,
     switches: Arc<Switches>,
     lost: Arc<AtomicBool>,
 }
 
-impl Backend for CardLane {
+impl Backend for TestBackend {
     fn name(&self) -> String {
         "a card of the tests".to_owned()
     }
@@ -169,7 +169,7 @@ impl Backend for CardLane {
                 available: room as u64,
             });
         }
-        Ok(Box::new(CardTransform {
+        Ok(Box::new(TestTransform {
             cpu: self.cpu.transform(source, target, options, control)?,
             switches: (!on_trial).then(|| Arc::clone(&self.switches)),
             lost: Arc::clone(&self.lost),
@@ -181,13 +181,13 @@ impl Backend for CardLane {
     }
 }
 
-struct CardTransform {
+struct TestTransform {
     cpu: Box<dyn Transform>,
     switches: Option<Arc<Switches>>,
     lost: Arc<AtomicBool>,
 }
 
-impl Transform for CardTransform {
+impl Transform for TestTransform {
     fn bytes(&self) -> usize {
         self.cpu.bytes()
     }
@@ -202,7 +202,7 @@ impl Transform for CardTransform {
         options: &FieldOptions,
         seed: u64,
     ) -> Result<Box<dyn Trainer + '_>, BackendError> {
-        Ok(Box::new(CardTrainer {
+        Ok(Box::new(TestTrainer {
             kills: self
                 .switches
                 .as_ref()
@@ -214,14 +214,14 @@ impl Transform for CardTransform {
     }
 }
 
-struct CardTrainer<'a> {
+struct TestTrainer<'a> {
     kills: bool,
     cpu: Box<dyn Trainer + 'a>,
     switches: Option<Arc<Switches>>,
     lost: Arc<AtomicBool>,
 }
 
-impl CardTrainer<'_> {
+impl TestTrainer<'_> {
     fn brake(&self, switches: &Switches) {
         let stands =
             || switches.brake.load(Ordering::Relaxed) && !self.lost.load(Ordering::Relaxed);
@@ -236,7 +236,7 @@ impl CardTrainer<'_> {
     }
 }
 
-impl Trainer for CardTrainer<'_> {
+impl Trainer for TestTrainer<'_> {
     fn advance(&mut self, steps: usize, control: &dyn Control) -> Result<Advance, BackendError> {
         if let Some(switches) = &self.switches {
             self.brake(switches);

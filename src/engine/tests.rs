@@ -25,7 +25,7 @@ struct Stand {
 fn stand(lanes: usize) -> Stand {
     let switches = Arc::new(Switches::default());
     let metrics = Arc::new(Metrics::new(&["gpu0"]));
-    let device = Device::start(switches.card("gpu0", lanes), &metrics).expect("threads");
+    let device = Device::start(switches.gpu("gpu0", lanes), &metrics).expect("threads");
     Stand {
         switches,
         device,
@@ -259,7 +259,7 @@ async fn a_device_that_never_worked_is_broken_and_not_given_up() {
     let switches = Arc::new(Switches::default());
     switches.refusals.store(5, Ordering::Relaxed);
     let metrics = Arc::new(Metrics::new(&["gpu0"]));
-    let device = Device::start(switches.card("gpu0", 1), &metrics).expect("threads");
+    let device = Device::start(switches.gpu("gpu0", 1), &metrics).expect("threads");
     let mut health = device.health();
     loop {
         timeout(PATIENCE, health.changed())

@@ -90,7 +90,7 @@ fn before_pair(sweeps: usize) -> usize {
 
 /// A sweep, and the options of the pair that has it as its target.
 #[derive(Clone, Debug)]
-struct Held {
+struct QueuedSweep {
     sweep: Sweep,
     options: Options,
 }
@@ -103,7 +103,7 @@ struct Held {
 #[derive(Clone, Debug, Default)]
 pub struct Sequence {
     /// Sweeps that a later pair may still use.
-    held: VecDeque<Held>,
+    held: VecDeque<QueuedSweep>,
     /// Number of sweeps pushed so far.
     count: usize,
     /// Index of the next pair.
@@ -137,7 +137,7 @@ impl Sequence {
         if self.count == 0 {
             self.sweeps = options.sweeps();
         }
-        self.held.push_back(Held {
+        self.held.push_back(QueuedSweep {
             sweep,
             options: options.clone(),
         });
@@ -222,7 +222,7 @@ impl Sequence {
         estimate(backend, &problem, &target.options, control)
     }
 
-    fn at(&self, index: usize) -> &Held {
+    fn at(&self, index: usize) -> &QueuedSweep {
         &self.held[index + self.held.len() - self.count]
     }
 

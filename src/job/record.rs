@@ -106,7 +106,7 @@ pub struct Job {
     /// Whether the pair is backward in time: its source is the later sweep.
     pub backward: bool,
     /// The window of sweeps that the estimate uses: the first index, and one past the last.
-    pub sees: [u32; 2],
+    pub window: [u32; 2],
     /// Number of pairs of a sequence, backward pairs included; 0 for a pair.
     pub pairs: u32,
     /// Number of pairs of a sequence that are not finished.

@@ -30,7 +30,7 @@ impl Metrics {
                 self.leases_expired.inc();
             }
             Event::Ended(job) => self.count_ended(job),
-            Event::Forgotten(_) => {}
+            Event::Deleted(_) => {}
         }
     }
 

@@ -78,7 +78,7 @@ impl Flags {
 }
 
 /// Sink of a lease's heartbeats.
-pub(super) trait Heart: Send + Sync {
+pub(super) trait HeartbeatStore: Send + Sync {
     /// A heartbeat, with progress if there is any.
     fn beat(&self, progress: Option<JobProgress>);
     /// A snapshot was stored: resets the crash counter of the job.
@@ -90,7 +90,7 @@ pub(super) trait Heart: Send + Sync {
 #[derive(Clone)]
 pub struct LeaseHeartbeat {
     flags: Arc<Flags>,
-    heart: Arc<dyn Heart>,
+    store: Arc<dyn HeartbeatStore>,
 }
 
 impl std::fmt::Debug for LeaseHeartbeat {
@@ -102,14 +102,14 @@ impl std::fmt::Debug for LeaseHeartbeat {
 }
 
 impl LeaseHeartbeat {
-    pub(super) fn new(flags: Arc<Flags>, heart: Arc<dyn Heart>) -> Self {
-        Self { flags, heart }
+    pub(super) fn new(flags: Arc<Flags>, store: Arc<dyn HeartbeatStore>) -> Self {
+        Self { flags, store }
     }
 
     /// Sends a heartbeat and returns the instruction.
     pub fn beat(&self, progress: Option<JobProgress>) -> Signal {
         self.flags.beat();
-        self.heart.beat(progress);
+        self.store.beat(progress);
         self.signal()
     }
 
@@ -131,6 +131,6 @@ impl LeaseHeartbeat {
 
     /// Reports that a snapshot was stored.
     pub fn snapshot_kept(&self) {
-        self.heart.snapshot_kept();
+        self.store.snapshot_kept();
     }
 }

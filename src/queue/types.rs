@@ -27,7 +27,7 @@ pub struct Submission {
     pub pairs: Vec<PairOf>,
     /// Predicted compute seconds of a sequence's closing job, which runs when all of its pairs have
     /// succeeded; `None` if there is no closing job.
-    pub closing_seconds: Option<f64>,
+    pub finalizer_seconds: Option<f64>,
     /// The job that must end, in any state, before this one is started.
     pub after: Option<JobId>,
     /// Whether another job may follow this one and use its field.
@@ -61,7 +61,7 @@ impl Submission {
             kind: Kind::Pair,
             pair: PairOf::ALONE,
             pairs: Vec::new(),
-            closing_seconds: None,
+            finalizer_seconds: None,
             after: None,
             has_dependents: false,
             priority: Priority::Normal,
@@ -84,9 +84,9 @@ pub struct PairOf {
     pub backward: bool,
     /// The half-open range of sweeps used for the estimate, including its own two: first, and one
     /// past the last.
-    pub sees: [u32; 2],
+    pub window: [u32; 2],
     /// Whether it follows the pair before it in the list.
-    pub follows: bool,
+    pub chained: bool,
 }
 
 impl PairOf {
@@ -94,11 +94,11 @@ impl PairOf {
     pub const ALONE: Self = Self {
         index: 0,
         backward: false,
-        sees: [0, 2],
-        follows: false,
+        window: [0, 2],
+        chained: false,
     };
 
-    /// A range of sweeps in the form of [`PairOf::sees`].
+    /// A range of sweeps in the form of [`PairOf::window`].
     pub fn seen(sweeps: Range<usize>) -> [u32; 2] {
         [sweeps.start, sweeps.end].map(|index| u32::try_from(index).unwrap_or(u32::MAX))
     }
@@ -253,7 +253,7 @@ pub enum Event {
     /// A job ended.
     Ended(Arc<Job>),
     /// A job was forgotten: its payload, snapshot and result can be removed.
-    Forgotten(JobId),
+    Deleted(JobId),
 }
 
 /// The job queue: submission, subscription, leases for workers, completion, cancellation and

@@ -9,7 +9,7 @@ use std::time::Instant;
 
 use super::control::DenseControl;
 use super::load::StoreError;
-use super::run::{Attempt, Done, Found, Worker, alive};
+use super::run::{Attempt, Done, Output, Worker, alive};
 use crate::engine::{Densification, Densified, EngineError};
 use crate::flow::densify::Plan;
 use crate::flow::{Control, FlowError, Sweep};
@@ -72,7 +72,7 @@ impl Worker {
                     progress: None,
                     report: serde_json::to_string(&report),
                     field: None,
-                    result: Found::Cloud(StoredDense(cloud)),
+                    result: Output::Cloud(StoredDense(cloud)),
                 }))
             }
             Err(EngineError::Flow(FlowError::Cancelled)) => self.interrupted(lease),

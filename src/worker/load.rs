@@ -95,7 +95,7 @@ impl Worker {
     /// from source to target. For a backward pair, earlier sweeps have positive times.
     async fn around(&self, job: &Job) -> Result<Vec<(Sweep, i8)>, StoreError> {
         let (owner, pair) = job.sweeps();
-        let [first, end] = job.sees;
+        let [first, end] = job.window;
         let mut around = Vec::new();
         for index in (first..end).filter(|index| !pair.contains(index)) {
             let gaps = i64::from(index) - i64::from(pair[0]);

@@ -50,7 +50,7 @@ const A_MOMENT: Duration = Duration::from_millis(100);
 const PATIENCE_ALONE: Duration = Duration::from_secs(30);
 
 /// Interval between the checks and heartbeats of a waiting job.
-const LOOK: Duration = Duration::from_millis(200);
+const POLL_INTERVAL: Duration = Duration::from_millis(200);
 
 /// A worker and its dependencies.
 #[derive(Clone)]
@@ -154,7 +154,10 @@ impl Worker {
             return Some(Attempt::Ended(Outcome::Released));
         }
         let began = Instant::now();
-        while tokio::time::timeout(LOOK, inside.is_alone()).await.is_err() {
+        while tokio::time::timeout(POLL_INTERVAL, inside.is_alone())
+            .await
+            .is_err()
+        {
             let gone = lease.heartbeat.beat(None) != Signal::Continue;
             if gone || self.drain.release.is_cancelled() {
                 return Some(self.interrupted(lease));
@@ -240,7 +243,7 @@ impl Worker {
                     progress: report.progress(),
                     report: serde_json::to_string(&report),
                     field,
-                    result: Found::Flow(StoredFlow::from(estimate)),
+                    result: Output::Flow(StoredFlow::from(estimate)),
                 }))
             }
             Err(EngineError::Flow(FlowError::Cancelled)) => self.interrupted(lease),
@@ -337,12 +340,12 @@ impl Worker {
 }
 
 /// The result of an attempt.
-pub(super) enum Found {
+pub(super) enum Output {
     Flow(StoredFlow),
     Cloud(StoredDense),
 }
 
-impl Found {
+impl Output {
     pub(super) fn to_bytes(&self) -> Vec<u8> {
         match self {
             Self::Flow(flow) => flow.to_bytes(),
@@ -353,7 +356,7 @@ impl Found {
 
 /// The data to store after a successful attempt.
 pub(super) struct Done {
-    pub(super) result: Found,
+    pub(super) result: Output,
     /// For followers and the closing job.
     pub(super) field: Option<MotionField>,
     pub(super) report: serde_json::Result<String>,
@@ -411,7 +414,7 @@ fn out_of_range(flow: &[Point]) -> Option<JobError> {
 /// to detect a device that hangs.
 pub(super) async fn alive<T>(lease: &Lease, work: impl Future<Output = T>) -> T {
     let mut work = std::pin::pin!(work);
-    let mut ticks = tokio::time::interval(LOOK);
+    let mut ticks = tokio::time::interval(POLL_INTERVAL);
     loop {
         tokio::select! {
             done = &mut work => return done,

@@ -50,7 +50,7 @@ async fn stand_with(lanes: usize, overflow_kind: Option<DeviceKind>) -> Stand {
     blobs.set_identity(queue.identity()).expect("written");
     let switches = Arc::new(Switches::default());
     let metrics = Arc::new(Metrics::new(&["fragile"]));
-    let device = Device::start(switches.card("fragile", lanes), &metrics).expect("a thread");
+    let device = Device::start(switches.gpu("fragile", lanes), &metrics).expect("a thread");
     let mut health = device.health();
     let ready = health.wait_for(|health| *health == Health::Ready);
     timeout(PATIENCE, ready)
@@ -125,7 +125,7 @@ impl Stand {
             kind: Kind::Pair,
             pair: PairOf::ALONE,
             pairs: Vec::new(),
-            closing_seconds: None,
+            finalizer_seconds: None,
             after,
             has_dependents: true,
             priority: Priority::Normal,

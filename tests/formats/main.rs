@@ -3,9 +3,9 @@
 // cfg(test) is always set in this crate. It makes clippy treat the modules' helper functions as
 // tests.
 #[cfg(test)]
-mod bombs;
-#[cfg(test)]
 mod cameras;
+#[cfg(test)]
+mod decompression_bombs;
 #[cfg(test)]
 mod dense;
 #[cfg(test)]

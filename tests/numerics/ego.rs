@@ -1,4 +1,4 @@
-//! Tests of the estimated ego motion against known poses. `examples/ego.rs` prints the measured
+//! Tests of the estimated ego motion against known poses. `benches/accuracy/registration.rs` prints the measured
 //! figures.
 
 use fnsf::flow::cpu::CpuBackend;

@@ -1,4 +1,4 @@
-//! Tests of the object search on simulated streets and real pairs. `examples/label.rs` prints the
+//! Tests of the object search on simulated streets and real pairs. `benches/accuracy/objects.rs` prints the
 //! measured figures.
 
 use fnsf::flow::simulate::StreetOptions;

@@ -1,4 +1,4 @@
-//! Tests of estimates with neighbor sweeps. `examples/sweeps.rs` prints the measured figures.
+//! Tests of estimates with neighbor sweeps. `benches/accuracy/neighbors.rs` prints the measured figures.
 
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::Metrics;

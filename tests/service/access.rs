@@ -10,8 +10,8 @@ use tonic::{Code, Request};
 
 use crate::clouds::{form, small_pair};
 use crate::grpc::{client, pair, proto};
+use crate::raw_http::SMALL;
 use crate::server::{Folder, Server, ended};
-use crate::wire::SMALL;
 
 /// A key of tenant a with the write role.
 const WRITER: &str = "key-of-the-writer-of-a";

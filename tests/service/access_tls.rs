@@ -11,8 +11,8 @@ use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 
+use crate::raw_http::{connect, exchange, status, until_closed};
 use crate::server::{Folder, Server};
-use crate::wire::{connect, exchange, status, until_closed};
 
 const REQUEST: &[u8] = b"GET /v1/jobs HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n";
 

@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 use fnsf::formats::CloudFormat;
 
 use crate::clouds::{file, small_pair};
-use crate::server::Server;
-use crate::wire::{
+use crate::raw_http::{
     Besieged, SMALL, connect, exchange, multipart, post, serves, status, until_closed,
 };
+use crate::server::Server;
 
 /// Interval between two bytes of a client that is slow on purpose.
 const DRIP: Duration = Duration::from_millis(50);

@@ -10,8 +10,8 @@ use serde_json::Value;
 
 use crate::clouds::{file, small_pair};
 use crate::grpc::{client, pair, proto};
+use crate::raw_http::Besieged;
 use crate::server::Server;
-use crate::wire::Besieged;
 
 /// Posts two files with a preset. Returns the flow, or the problem document.
 async fn post(

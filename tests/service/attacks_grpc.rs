@@ -10,8 +10,8 @@ use tonic::Code;
 
 use crate::clouds::small_pair;
 use crate::grpc::{client, proto};
+use crate::raw_http::Besieged;
 use crate::server::{PATIENCE, Server};
-use crate::wire::Besieged;
 
 /// Every method of the public port.
 const METHODS: [&str; 13] = [

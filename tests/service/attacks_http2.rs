@@ -3,11 +3,11 @@
 use std::time::Duration;
 
 use crate::clouds::{form, medium_pair};
-use crate::server::{PATIENCE, Server, ended};
-use crate::wire::{
+use crate::raw_http::{
     Besieged, CONTINUATION, DATA, END_HEADERS, END_STREAM, Frames, GOAWAY, HEADERS, PING,
     RST_STREAM, SETTINGS, WINDOW_UPDATE, field, frame, head,
 };
+use crate::server::{PATIENCE, Server, ended};
 
 /// Number of streams of an attack, far above every limit.
 const STREAMS: u32 = 5000;
@@ -148,17 +148,17 @@ async fn ten_thousand_headers_and_a_mebibyte_of_one_are_refused() {
     let long = format!("long: {}\r\n", "a".repeat(1 << 20));
     for headers in [many, long] {
         let request = format!("GET /openapi.json HTTP/1.1\r\nhost: localhost\r\n{headers}\r\n");
-        let answer = crate::wire::exchange(&siege.server, request.as_bytes());
+        let answer = crate::raw_http::exchange(&siege.server, request.as_bytes());
         assert!(
-            matches!(crate::wire::status(&answer), Some(431) | None),
+            matches!(crate::raw_http::status(&answer), Some(431) | None),
             "{answer}"
         );
     }
     let path = "a".repeat(1 << 20);
     let request = format!("GET /{path} HTTP/1.1\r\nhost: localhost\r\n\r\n");
-    let answer = crate::wire::exchange(&siege.server, request.as_bytes());
+    let answer = crate::raw_http::exchange(&siege.server, request.as_bytes());
     assert!(
-        matches!(crate::wire::status(&answer), Some(414 | 431) | None),
+        matches!(crate::raw_http::status(&answer), Some(414 | 431) | None),
         "{answer}"
     );
     siege.stands().await;

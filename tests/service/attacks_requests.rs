@@ -7,8 +7,8 @@ use serde_json::Value;
 
 use crate::clouds::{file, form, small_pair};
 use crate::grpc::proto::ListJobsRequest;
+use crate::raw_http::{Besieged, SMALL, exchange, multipart, post, status};
 use crate::server::Server;
-use crate::wire::{Besieged, SMALL, exchange, multipart, post, status};
 
 #[tokio::test]
 async fn a_name_that_is_no_jobs_is_not_found_whatever_it_holds() {

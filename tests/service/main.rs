@@ -14,14 +14,15 @@ mod attacks_grpc;
 mod attacks_http2;
 mod attacks_requests;
 mod clouds;
+mod crash_recovery;
 mod devices;
 #[path = "../common/gpu.rs"]
 mod gpu_rule;
 mod grpc;
 mod http;
-mod kills;
 mod load;
 mod objects;
+mod raw_http;
 mod readme;
 #[path = "../common/real_data.rs"]
 mod real_data;
@@ -30,4 +31,3 @@ mod sequences;
 mod server;
 mod store_trouble;
 mod windows;
-mod wire;

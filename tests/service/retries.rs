@@ -8,8 +8,8 @@ use reqwest::StatusCode;
 use serde_json::Value;
 
 use crate::clouds::{file, form, small_pair};
+use crate::raw_http::{connect, multipart, post};
 use crate::server::{PATIENCE, Server, ended};
-use crate::wire::{connect, multipart, post};
 
 /// Some seconds of work, so that the job runs when its client disconnects.
 const OPTIONS: &str = r#"{"preset": "paper", "max_points": 2048}"#;

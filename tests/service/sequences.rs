@@ -393,7 +393,7 @@ async fn a_dense_cloud_that_cannot_be_made_is_refused_with_clear_words_and_costs
             r#"{"reference_time": 9}"#,
             &small,
             400,
-            "into 9 lies outside the sequence's sweeps, 0 to 3",
+            "the reference time 9 lies outside the sequence's sweeps, 0 to 3",
         ),
         (
             r#"{"reference_time": -1}"#,

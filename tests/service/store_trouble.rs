@@ -10,8 +10,8 @@ use reqwest::StatusCode;
 use serde_json::Value;
 
 use crate::clouds::{form, medium_pair, small_pair};
+use crate::raw_http::SMALL;
 use crate::server::{Folder, Server, ended, plain_get};
-use crate::wire::SMALL;
 
 /// Immediate retries: with counted failures, a job would fail after three of them, within seconds.
 const CONFIG: &str = "[queue]\nretry_delay_seconds = 0\n";

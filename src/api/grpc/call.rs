@@ -9,13 +9,13 @@ use tonic::{Request, Status};
 use super::convert;
 use crate::api::admission::Durability;
 use crate::api::auth::Caller;
-use crate::api::draft::{Arrived, Request as DraftRequest};
 use crate::api::error::ApiError;
+use crate::api::pending_job::{ReceivedAt, Request as JobRequest};
 use crate::job::JobOptions;
 use crate::queue::PairOf;
 
 /// A stream of responses.
-pub(super) type Answers<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+pub(super) type ResultBudget<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
 /// The caller, the arrival time, and the remaining time of a call.
 #[derive(Clone)]
@@ -33,7 +33,7 @@ impl Call {
     pub(super) fn of<T>(request: &Request<T>) -> Result<Self, ApiError> {
         let extensions = request.extensions();
         let caller = extensions.get::<Caller>().cloned();
-        let arrived = extensions.get::<Arrived>().map(|arrived| arrived.0);
+        let arrived = extensions.get::<ReceivedAt>().map(|arrived| arrived.0);
         Ok(Self {
             caller: caller.ok_or(ApiError::Unauthenticated)?,
             arrived: arrived.unwrap_or_else(Instant::now),
@@ -43,13 +43,9 @@ impl Call {
 
     /// The parameters of a job that this call submits. The deadline of the call applies only if the
     /// caller waits for the result.
-    pub(super) fn draft_request(
-        &self,
-        options: JobOptions,
-        durability: Durability,
-    ) -> DraftRequest {
+    pub(super) fn job_request(&self, options: JobOptions, durability: Durability) -> JobRequest {
         let awaited = durability == Durability::Ephemeral;
-        DraftRequest {
+        JobRequest {
             options,
             durability,
             idempotency_key: None,

@@ -8,16 +8,16 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::call::{Answers, Call, no_begin};
+use super::call::{Call, ResultBudget, no_begin};
 use super::chunks::CloudBuilder;
 use super::proto::{self, scene_flow_server::SceneFlow};
 use super::{chunks, convert, sequence};
 use crate::api::admission::Durability;
-use crate::api::answers::Taking;
 use crate::api::dense;
-use crate::api::draft::{Accepted, Draft};
 use crate::api::error::ApiError;
 use crate::api::listener::Asking;
+use crate::api::pending_job::{Accepted, PendingJob};
+use crate::api::result_budget::ReadProgress;
 use crate::api::service::{Service, Waited};
 use crate::job::{InvalidId, Job, JobId, Kind, State};
 
@@ -60,8 +60,8 @@ impl Calls {
         options.check_for_pairs().map_err(ApiError::from)?;
         self.service
             .check_room(&call.caller, Some(&options), awaited)?;
-        let request = call.draft_request(options, awaited);
-        let mut draft = Draft::begin(&self.service, call.caller.clone(), request)?;
+        let request = call.job_request(options, awaited);
+        let mut pending = PendingJob::begin(&self.service, call.caller.clone(), request)?;
         let mut clouds = [CloudBuilder::default(), CloudBuilder::default()];
         while let Some(message) = chunks::next(&mut room, inbound).await? {
             let Some(Part::Cloud(piece)) = message.part else {
@@ -79,9 +79,9 @@ impl Calls {
             cloud.take(&self.service, &mut room, part, &chunk)?;
         }
         for (cloud, part) in clouds.into_iter().zip(["source", "target"]) {
-            draft.push(cloud.finish(part)?, None).await?;
+            pending.push(cloud.finish(part)?, None).await?;
         }
-        let accepted = draft.submit(Kind::Pair).await?;
+        let accepted = pending.submit(Kind::Pair).await?;
         Ok((accepted, (pause > 0).then(|| Duration::from_millis(pause))))
     }
 }
@@ -150,7 +150,7 @@ async fn send_flow(
 async fn send_result(
     parts: impl Iterator<Item = proto::download_result_response::Part>,
     answers: mpsc::Sender<Result<proto::DownloadResultResponse, Status>>,
-    taking: Arc<Taking>,
+    taking: Arc<ReadProgress>,
 ) {
     for part in parts {
         let message = proto::DownloadResultResponse { part: Some(part) };
@@ -170,10 +170,10 @@ async fn send_result(
 
 #[tonic::async_trait]
 impl SceneFlow for Calls {
-    type EstimateFlowStream = Answers<proto::EstimateFlowResponse>;
-    type EstimateSequenceStream = Answers<proto::EstimateSequenceResponse>;
-    type WatchJobStream = Answers<proto::Job>;
-    type DownloadResultStream = Answers<proto::DownloadResultResponse>;
+    type EstimateFlowStream = ResultBudget<proto::EstimateFlowResponse>;
+    type EstimateSequenceStream = ResultBudget<proto::EstimateSequenceResponse>;
+    type WatchJobStream = ResultBudget<proto::Job>;
+    type DownloadResultStream = ResultBudget<proto::DownloadResultResponse>;
 
     async fn estimate_flow(
         &self,
@@ -240,14 +240,14 @@ impl SceneFlow for Calls {
         };
         let options = convert::options(begin.options)?;
         let dense = options.densify.is_some();
-        let mut draft_request = call.draft_request(options, Durability::Durable);
+        let mut job_request = call.job_request(options, Durability::Durable);
         let key = begin.idempotency_key;
-        draft_request.idempotency_key = (!key.is_empty()).then_some(key);
-        let mut draft = Draft::begin(service, call.caller.clone(), draft_request)?;
+        job_request.idempotency_key = (!key.is_empty()).then_some(key);
+        let mut pending = PendingJob::begin(service, call.caller.clone(), job_request)?;
         let mut cloud: Option<CloudBuilder> = None;
         loop {
             let part = chunks::next(&mut room, &mut inbound).await?.map(|m| m.part);
-            let index = format!("cloud {}", draft.sweeps());
+            let index = format!("cloud {}", pending.sweeps());
             match part {
                 Some(Some(Part::Chunk(chunk))) => match &mut cloud {
                     Some(cloud) => cloud.take(service, &mut room, &index, &chunk)?,
@@ -258,7 +258,9 @@ impl SceneFlow for Calls {
                 },
                 Some(Some(Part::Next(_))) | None => {
                     if let Some(cloud) = cloud.replace(CloudBuilder::default()) {
-                        draft.push(cloud.finish(&index)?, Some(room.next())).await?;
+                        pending
+                            .push(cloud.finish(&index)?, Some(room.next()))
+                            .await?;
                     }
                     if part.is_none() {
                         break;
@@ -267,12 +269,12 @@ impl SceneFlow for Calls {
                 Some(_) => return Err(no_begin().into()),
             }
         }
-        let kind = if draft.sweeps() > 2 || dense {
+        let kind = if pending.sweeps() > 2 || dense {
             Kind::Sequence
         } else {
             Kind::Pair
         };
-        let accepted = draft.submit(kind).await?;
+        let accepted = pending.submit(kind).await?;
         Ok(Response::new(convert::job(&accepted.job)))
     }
 

@@ -9,7 +9,7 @@ use crate::api::codec;
 use crate::api::error::ApiError;
 use crate::api::results::Answer;
 use crate::api::service::Service;
-use crate::api::uploads::Room;
+use crate::api::upload_budget::UploadReservation;
 use crate::flow::{DenseCloud, Point};
 use crate::payload::{StoredCloud, points_from_le_bytes};
 
@@ -22,7 +22,7 @@ const ROWS: usize = 45_000;
 /// [`ApiError::TooSlow`], [`ApiError::TooLarge`] for a message above the size limit, or
 /// [`ApiError::BadRequest`] if the stream is broken.
 pub(super) async fn next<T>(
-    room: &mut Room,
+    room: &mut UploadReservation,
     inbound: &mut Streaming<T>,
 ) -> Result<Option<T>, ApiError> {
     match room.wait(inbound.message()).await? {
@@ -54,7 +54,7 @@ impl CloudBuilder {
     pub(super) fn take(
         &mut self,
         service: &Service,
-        room: &mut Room,
+        room: &mut UploadReservation,
         part: &str,
         chunk: &proto::Chunk,
     ) -> Result<(), ApiError> {

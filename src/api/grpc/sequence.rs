@@ -15,16 +15,16 @@ use super::call::{Call, no_begin};
 use super::chunks::CloudBuilder;
 use super::{chunks, convert, proto};
 use crate::api::admission::Durability;
-use crate::api::draft::{Accepted, Draft, Link};
 use crate::api::error::ApiError;
+use crate::api::pending_job::{Accepted, ChainLink, PendingJob};
 use crate::api::service::{Service, Waited};
-use crate::api::uploads::Room;
+use crate::api::upload_budget::UploadReservation;
 use crate::flow::{is_window_final, window};
 use crate::job::{JobId, JobOptions, Kind};
 use crate::payload::StoredCloud;
 use crate::queue::PairOf;
 
-type Answers = mpsc::Sender<Result<proto::EstimateSequenceResponse, Status>>;
+type ResultBudget = mpsc::Sender<Result<proto::EstimateSequenceResponse, Status>>;
 
 /// Maximum length of the name of a sweep, bytes. Each pair and some errors repeat the name.
 const MAX_NAME: usize = 255;
@@ -50,7 +50,7 @@ enum Item {
 struct Sweep {
     name: String,
     cloud: Arc<StoredCloud>,
-    room: Room,
+    room: UploadReservation,
 }
 
 /// A sweep that is being received in chunks.
@@ -62,7 +62,7 @@ struct Coming {
 }
 
 impl Coming {
-    fn finish(self, room: Room) -> Result<Sweep, ApiError> {
+    fn finish(self, room: UploadReservation) -> Result<Sweep, ApiError> {
         let cloud = self.cloud.finish(&self.name)?;
         if let Some(points) = self.points
             && points != cloud.points.len() as u64
@@ -194,7 +194,7 @@ impl Reader {
     }
 
     /// Adds a complete sweep, and submits the pairs whose windows are final.
-    async fn take(&mut self, coming: Coming, room: Room) -> Result<(), ApiError> {
+    async fn take(&mut self, coming: Coming, room: UploadReservation) -> Result<(), ApiError> {
         self.held.push_back(coming.finish(room)?);
         self.count += 1;
         let sweeps = self.options.sweeps();
@@ -240,28 +240,28 @@ impl Reader {
         let options = &self.options;
         let mut request = self
             .call
-            .draft_request(options.clone(), Durability::Ephemeral);
+            .job_request(options.clone(), Durability::Ephemeral);
         let after = self.before;
-        request.link = options.chained().then_some(Link { after });
-        let sees = window(place, self.count, options.sweeps());
+        request.link = options.chained().then_some(ChainLink { after });
+        let window = window(place, self.count, options.sweeps());
         request.pair = PairOf {
-            index: u32::try_from(place - sees.start).unwrap_or(u32::MAX),
-            sees: PairOf::seen(0..sees.len()),
+            index: u32::try_from(place - window.start).unwrap_or(u32::MAX),
+            window: PairOf::seen(0..window.len()),
             ..PairOf::ALONE
         };
-        let mut draft = Draft::begin(&self.service, self.call.caller.clone(), request)?;
+        let mut pending = PendingJob::begin(&self.service, self.call.caller.clone(), request)?;
         let first_held = self.count - self.held.len();
-        for place in sees {
+        for place in window {
             let cloud = &mut self.held[place - first_held].cloud;
-            *cloud = draft.push(Arc::clone(cloud), None).await?;
+            *cloud = pending.push(Arc::clone(cloud), None).await?;
         }
-        draft.submit(Kind::Pair).await
+        pending.submit(Kind::Pair).await
     }
 }
 
 /// Sends the flow of every pair in order, as soon as it is available. When the client disconnects,
 /// the pending pairs are dropped, which cancels their jobs.
-async fn write(service: &Arc<Service>, mut items: mpsc::Receiver<Item>, answers: &Answers) {
+async fn write(service: &Arc<Service>, mut items: mpsc::Receiver<Item>, answers: &ResultBudget) {
     while let Some(item) = items.recv().await {
         let pair = match item {
             Item::Pair(pair) => pair,
@@ -282,7 +282,7 @@ async fn write(service: &Arc<Service>, mut items: mpsc::Receiver<Item>, answers:
 }
 
 /// Sends one pair. Returns false if the client has disconnected or the result was evicted.
-async fn send(service: &Arc<Service>, pair: Pending, answers: &Answers) -> bool {
+async fn send(service: &Arc<Service>, pair: Pending, answers: &ResultBudget) -> bool {
     use proto::estimate_sequence_response::pair::Outcome;
     use proto::estimate_sequence_response::{Pair, Part};
     let message = |part: Part| Ok(proto::EstimateSequenceResponse { part: Some(part) });

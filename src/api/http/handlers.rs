@@ -19,8 +19,8 @@ use super::{results, view};
 use crate::api::admission::Durability;
 use crate::api::auth::Caller;
 use crate::api::codec::AnswerFormat;
-use crate::api::draft::{Accepted, Arrived, Draft, Request as DraftRequest};
 use crate::api::error::ApiError;
+use crate::api::pending_job::{Accepted, PendingJob, ReceivedAt, Request as JobRequest};
 use crate::api::service::{MakeDurable, Service, Waited};
 use crate::job::{Job, JobId, JobOptions, Kind, State as JobState};
 use crate::queue::PairOf;
@@ -32,14 +32,14 @@ const MAX_POLL: Duration = Duration::from_secs(60);
 const PAGE: u32 = 100;
 
 /// The parameters of a submission from its headers.
-struct Asked {
+struct RequestHeaders {
     prefer: Prefer,
     key: Option<String>,
-    arrived: Arrived,
+    arrived: ReceivedAt,
 }
 
-impl Asked {
-    fn of(headers: &HeaderMap, arrived: Arrived) -> Result<Self, ApiError> {
+impl RequestHeaders {
+    fn of(headers: &HeaderMap, arrived: ReceivedAt) -> Result<Self, ApiError> {
         let key = match headers.get("idempotency-key") {
             None => None,
             Some(value) => {
@@ -56,9 +56,9 @@ impl Asked {
         })
     }
 
-    fn draft_request(&self, options: JobOptions, durability: Durability) -> DraftRequest {
+    fn job_request(&self, options: JobOptions, durability: Durability) -> JobRequest {
         let wait_is_deadline = durability == Durability::Ephemeral && !self.prefer.respond_async;
-        DraftRequest {
+        JobRequest {
             options,
             durability,
             idempotency_key: self.key.clone(),
@@ -97,7 +97,7 @@ impl Asked {
 pub(super) async fn estimate(
     State(service): State<Arc<Service>>,
     Extension(caller): Extension<Caller>,
-    Extension(arrived): Extension<Arrived>,
+    Extension(arrived): Extension<ReceivedAt>,
     headers: HeaderMap,
     request: Request,
 ) -> Result<Response, ApiError> {
@@ -105,7 +105,7 @@ pub(super) async fn estimate(
         .get(header::ACCEPT)
         .and_then(|value| value.to_str().ok());
     let format = AnswerFormat::accepted(accept)?;
-    let asked = Asked::of(&headers, arrived)?;
+    let asked = RequestHeaders::of(&headers, arrived)?;
     let durability = match asked.prefer {
         Prefer {
             respond_async: true,
@@ -137,15 +137,15 @@ pub(super) async fn estimate(
 async fn submit_pair(
     service: &Arc<Service>,
     caller: Caller,
-    asked: &Asked,
+    asked: &RequestHeaders,
     durability: Durability,
     request: Request,
 ) -> Result<Accepted, ApiError> {
     let mut body = Body::of(service, &caller, request).await?;
     match read_pair(service, &caller, asked, durability, &mut body).await {
-        Ok(draft) => {
+        Ok(pending) => {
             service.metrics.phase("decode", body.decode_seconds(), None);
-            draft.submit(Kind::Pair).await
+            pending.submit(Kind::Pair).await
         }
         Err(error) => {
             body.drain().await;
@@ -158,10 +158,10 @@ async fn submit_pair(
 async fn read_pair(
     service: &Arc<Service>,
     caller: &Caller,
-    asked: &Asked,
+    asked: &RequestHeaders,
     durability: Durability,
     body: &mut Body,
-) -> Result<Draft, ApiError> {
+) -> Result<PendingJob, ApiError> {
     service.check_room(caller, None, durability)?;
     let (mut files, mut options) = (PairFiles::default(), JobOptions::default());
     while let Some(part) = body.next().await? {
@@ -175,13 +175,13 @@ async fn read_pair(
     options.check_for_pairs()?;
     options.dt_s = options.dt_s.or_else(|| files.interval_s());
     service.check_room(caller, Some(&options), durability)?;
-    let mut draft = Draft::begin(
+    let mut pending = PendingJob::begin(
         service,
         caller.clone(),
-        asked.draft_request(options, durability),
+        asked.job_request(options, durability),
     )?;
-    files.push_to(body, &mut draft).await?;
-    Ok(draft)
+    files.push_to(body, &mut pending).await?;
+    Ok(pending)
 }
 
 /// Submits a pair or a sequence as a job.
@@ -204,11 +204,11 @@ async fn read_pair(
 pub(super) async fn submit_job(
     State(service): State<Arc<Service>>,
     Extension(caller): Extension<Caller>,
-    Extension(arrived): Extension<Arrived>,
+    Extension(arrived): Extension<ReceivedAt>,
     headers: HeaderMap,
     request: Request,
 ) -> Result<Response, ApiError> {
-    let asked = Asked::of(&headers, arrived)?;
+    let asked = RequestHeaders::of(&headers, arrived)?;
     submit(&service, caller, &asked, request).await
 }
 
@@ -233,7 +233,7 @@ pub(super) async fn submit_job(
 pub(super) async fn submit_sequence(
     service: State<Arc<Service>>,
     caller: Extension<Caller>,
-    arrived: Extension<Arrived>,
+    arrived: Extension<ReceivedAt>,
     headers: HeaderMap,
     request: Request,
 ) -> Result<Response, ApiError> {
@@ -244,18 +244,18 @@ pub(super) async fn submit_sequence(
 async fn submit(
     service: &Arc<Service>,
     caller: Caller,
-    asked: &Asked,
+    asked: &RequestHeaders,
     request: Request,
 ) -> Result<Response, ApiError> {
     let mut body = Body::of(service, &caller, request).await?;
-    let (draft, kind) = match read_job(service, &caller, asked, &mut body).await {
+    let (pending, kind) = match read_job(service, &caller, asked, &mut body).await {
         Ok(read) => read,
         Err(error) => {
             body.drain().await;
             return Err(error);
         }
     };
-    let Accepted { job, new, .. } = draft.submit(kind).await?;
+    let Accepted { job, new, .. } = pending.submit(kind).await?;
     service
         .metrics
         .phase("decode", body.decode_seconds(), Some(&job));
@@ -269,13 +269,13 @@ async fn submit(
 async fn read_job(
     service: &Arc<Service>,
     caller: &Caller,
-    asked: &Asked,
+    asked: &RequestHeaders,
     body: &mut Body,
-) -> Result<(Draft, Kind), ApiError> {
+) -> Result<(PendingJob, Kind), ApiError> {
     service.check_room(caller, None, Durability::Durable)?;
     let mut files = PairFiles::default();
     let mut options = JobOptions::default();
-    let mut sweeps: Option<Draft> = None;
+    let mut sweeps: Option<PendingJob> = None;
     while let Some(part) = body.next().await? {
         match part {
             Part::Options(_) if sweeps.is_some() => {
@@ -284,16 +284,16 @@ async fn read_job(
             }
             Part::Options(read) => options = read,
             Part::File(part, name, bytes) if part == "sweep" && files.is_empty() => {
-                let draft = match &mut sweeps {
-                    Some(draft) => draft,
+                let pending = match &mut sweeps {
+                    Some(pending) => pending,
                     none => {
-                        let request = asked.draft_request(options.clone(), Durability::Durable);
-                        none.insert(Draft::begin(service, caller.clone(), request)?)
+                        let request = asked.job_request(options.clone(), Durability::Durable);
+                        none.insert(PendingJob::begin(service, caller.clone(), request)?)
                     }
                 };
-                let index = format!("sweep {}", draft.sweeps());
+                let index = format!("sweep {}", pending.sweeps());
                 let (cloud, room) = body.cloud(index, name, bytes).await?;
-                draft.push(cloud, Some(room)).await?;
+                pending.push(cloud, Some(room)).await?;
             }
             Part::File(part, name, bytes) => files.take(&part, name, bytes)?,
         }
@@ -303,14 +303,14 @@ async fn read_job(
             let text = "send source and target, or sweeps, but not both";
             Err(ApiError::BadRequest(text.to_owned()))
         }
-        Some(draft) => Ok((draft, Kind::Sequence)),
+        Some(pending) => Ok((pending, Kind::Sequence)),
         None => {
             options.check_for_pairs()?;
             options.dt_s = options.dt_s.or_else(|| files.interval_s());
-            let request = asked.draft_request(options, Durability::Durable);
-            let mut draft = Draft::begin(service, caller.clone(), request)?;
-            files.push_to(body, &mut draft).await?;
-            Ok((draft, Kind::Pair))
+            let request = asked.job_request(options, Durability::Durable);
+            let mut pending = PendingJob::begin(service, caller.clone(), request)?;
+            files.push_to(body, &mut pending).await?;
+            Ok((pending, Kind::Pair))
         }
     }
 }

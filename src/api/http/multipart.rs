@@ -13,10 +13,10 @@ use utoipa::ToSchema;
 use super::metered::{Meter, metered};
 use crate::api::auth::Caller;
 use crate::api::codec;
-use crate::api::draft::Draft;
 use crate::api::error::ApiError;
+use crate::api::pending_job::PendingJob;
 use crate::api::service::Service;
-use crate::api::uploads::Room;
+use crate::api::upload_budget::UploadReservation;
 use crate::formats;
 use crate::job::JobOptions;
 use crate::payload::StoredCloud;
@@ -59,7 +59,7 @@ pub(super) struct Body {
     service: Arc<Service>,
     multipart: Multipart,
     meter: Meter,
-    room: Room,
+    room: UploadReservation,
     has_options: bool,
     decode_seconds: f64,
 }
@@ -103,7 +103,7 @@ impl Body {
     ///
     /// # Errors
     /// [`ApiError::BadRequest`] for an unknown, repeated or malformed part,
-    /// [`ApiError::InvalidOptions`], or the errors of [`Room::take`] and [`Room::wait`].
+    /// [`ApiError::InvalidOptions`], or the errors of [`UploadReservation::take`] and [`UploadReservation::wait`].
     pub(super) async fn next(&mut self) -> Result<Option<Part>, ApiError> {
         let field = self.multipart.next_field();
         let field = self.room.wait(field).await?;
@@ -145,7 +145,7 @@ impl Body {
         part: String,
         name: Option<String>,
         bytes: Vec<u8>,
-    ) -> Result<(StoredCloud, Room), ApiError> {
+    ) -> Result<(StoredCloud, UploadReservation), ApiError> {
         let most = self.service.admission.max_points();
         let mut room = self.room.another();
         self.timed(move || {
@@ -164,7 +164,7 @@ impl Body {
     pub(super) async fn pair(
         &mut self,
         bytes: Vec<u8>,
-    ) -> Result<([StoredCloud; 2], Room), ApiError> {
+    ) -> Result<([StoredCloud; 2], UploadReservation), ApiError> {
         const PART: &str = "source";
         let most = self.service.admission.max_points();
         let mut room = self.room.another();
@@ -264,7 +264,7 @@ async fn drain<E>(pieces: impl Stream<Item = Result<usize, E>>) {
 
 /// The reservation and the meter that reading a part updates.
 struct Reading<'a> {
-    room: &'a mut Room,
+    room: &'a mut UploadReservation,
     meter: &'a Meter,
 }
 
@@ -339,7 +339,11 @@ impl PairFiles {
     }
 
     /// Decodes the clouds and adds them to a draft.
-    pub(super) async fn push_to(self, body: &mut Body, draft: &mut Draft) -> Result<(), ApiError> {
+    pub(super) async fn push_to(
+        self,
+        body: &mut Body,
+        pending: &mut PendingJob,
+    ) -> Result<(), ApiError> {
         let missing = |part: &str| {
             ApiError::BadRequest(format!(
                 "the part {part} is missing: send source and target"
@@ -351,16 +355,16 @@ impl PairFiles {
                 return Err(missing("target"));
             }
             let ([source, target], _room) = body.pair(bytes).await?;
-            draft.push(source, None).await?;
-            draft.push(target, None).await?;
+            pending.push(source, None).await?;
+            pending.push(target, None).await?;
             return Ok(());
         };
         // One file at a time: a request does not hold a decoded cloud while it waits for a permit
         // to decode the other one.
         let (source, room) = body.cloud("source".to_owned(), name, bytes).await?;
-        draft.push(source, Some(room)).await?;
+        pending.push(source, Some(room)).await?;
         let (target, room) = body.cloud("target".to_owned(), target_name, target).await?;
-        draft.push(target, Some(room)).await?;
+        pending.push(target, Some(room)).await?;
         Ok(())
     }
 }

@@ -12,12 +12,12 @@ use tokio_stream::wrappers::ReceiverStream;
 
 use super::named::Named;
 use super::problem::Problem;
-use crate::api::answers::Encoded;
 use crate::api::auth::Caller;
 use crate::api::codec::AnswerFormat;
 use crate::api::dense;
 use crate::api::error::ApiError;
 use crate::api::listener::HasRoom;
+use crate::api::result_budget::Encoded;
 use crate::api::service::Service;
 use crate::formats::DenseFormat;
 use crate::job::{DenseReport, Job, Kind, State as JobState};

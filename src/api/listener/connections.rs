@@ -399,14 +399,14 @@ mod tests {
         for entry in [&works, &idle] {
             assert!(entry.connection.is_known(&tenant("a"), true));
         }
-        let follows = connections.enter(address(1));
-        assert!(follows.connection.is_known(&tenant("a"), true));
-        let events = follows.connection.begin();
+        let chained = connections.enter(address(1));
+        assert!(chained.connection.is_known(&tenant("a"), true));
+        let events = chained.connection.begin();
         events.asking().observes();
         let [waits, unknown] = [connections.enter(address(1)), connections.enter(address(1))];
         let _request_of_nobody = waits.connection.begin();
         let is_evicted = |entry: &Entry| entry.connection.evicted.is_cancelled();
-        for gone in [&unknown, &waits, &idle, &follows] {
+        for gone in [&unknown, &waits, &idle, &chained] {
             assert!(!is_evicted(gone));
             assert!(connections.make_room());
             assert!(is_evicted(gone));

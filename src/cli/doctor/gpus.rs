@@ -3,7 +3,7 @@
 
 use std::time::Instant;
 
-use super::missing::Found;
+use super::missing::Environment;
 use crate::cli::device::{best_card, software_is_welcome};
 use crate::cli::failure::Failure;
 use crate::cli::output::say;
@@ -13,14 +13,14 @@ use crate::flow::gpu::{Adapter, AdapterKind, Gpu, GpuOptions};
 
 /// Prints the report on all GPUs.
 pub(super) fn report() -> Result<(), Failure> {
-    let cards = gpu::adapters();
-    if cards.is_empty() {
+    let adapters = gpu::adapters();
+    if adapters.is_empty() {
         say(format_args!("gpu: none found"))?;
     }
     let taken = best_card().ok();
-    for card in &cards {
-        let taken = taken.as_ref().filter(|taken| taken.index == card.index);
-        describe(card, taken.is_some())?;
+    for adapter in &adapters {
+        let taken = taken.as_ref().filter(|taken| taken.index == adapter.index);
+        describe(adapter, taken.is_some())?;
         if let Some(taken) = taken {
             say(format_args!("  {}", tried(taken)))?;
         }
@@ -31,12 +31,12 @@ pub(super) fn report() -> Result<(), Failure> {
     say(format_args!(
         "  a card is for presets neural and paper; default and label compute on the CPU whatever the device"
     ))?;
-    let hardware = |card: &&Adapter| card.kind != AdapterKind::Software;
-    let found = Found::here(cards.iter().filter(hardware).count(), cards.len());
+    let hardware = |adapter: &&Adapter| adapter.kind != AdapterKind::Software;
+    let found = Environment::here(adapters.iter().filter(hardware).count(), adapters.len());
     for advice in found.advice() {
         say(format_args!("  {advice}"))?;
     }
-    if taken.is_none() && !cards.is_empty() && !software_is_welcome() {
+    if taken.is_none() && !adapters.is_empty() && !software_is_welcome() {
         say(format_args!(
             "  software is taken by its number alone, or for tests with FNSF_ALLOW_SOFTWARE_GPU=1"
         ))?;
@@ -44,34 +44,37 @@ pub(super) fn report() -> Result<(), Failure> {
     Ok(())
 }
 
-fn describe(card: &Adapter, taken: bool) -> Result<(), Failure> {
+fn describe(adapter: &Adapter, taken: bool) -> Result<(), Failure> {
     let taken = if taken { ", taken by auto" } else { "" };
-    let place = match card.pci_id.as_str() {
+    let place = match adapter.pci_id.as_str() {
         "" => String::new(),
         place => format!(", {place}"),
     };
     say(format_args!(
         "gpu:{}: {} ({}{place}){taken}",
-        card.index,
-        card.name,
-        card.kind.name(),
+        adapter.index,
+        adapter.name,
+        adapter.kind.name(),
     ))?;
-    say(format_args!("  {}, driver {}", card.interface, card.driver))?;
+    say(format_args!(
+        "  {}, driver {}",
+        adapter.interface, adapter.driver
+    ))?;
     say(format_args!(
         "  largest buffer {:.1} GB, workgroup memory {} KiB",
-        card.max_binding_bytes as f64 / 1e9,
-        card.workgroup_bytes >> 10
+        adapter.max_binding_bytes as f64 / 1e9,
+        adapter.workgroup_bytes >> 10
     ))?;
-    match card.matrix_tiles.as_slice() {
+    match adapter.matrix_tiles.as_slice() {
         [] => say(format_args!("  no matrix units that this program can use")),
         tiles => say(format_args!("  matrix units: {}", tiles.join(", "))),
     }
 }
 
 /// Opens the GPU and estimates the test pair on it. Returns the outcome as text.
-fn tried(card: &Adapter) -> String {
+fn tried(adapter: &Adapter) -> String {
     let opening = Instant::now();
-    let opened = match Gpu::open(card, &GpuOptions::default()) {
+    let opened = match Gpu::open(adapter, &GpuOptions::default()) {
         Ok(opened) => opened,
         Err(error) => return format!("cannot be opened: {error}"),
     };

@@ -1,7 +1,7 @@
 //! Detection of missing GPU prerequisites: the Vulkan loader, a driver's manifest, a container's
 //! permissions.
 //!
-//! [`Found::here`] inspects files and environment variables. [`Found::advice`] turns the findings
+//! [`Environment::here`] inspects files and environment variables. [`Environment::advice`] turns the findings
 //! into advice, without any access to the system.
 
 use std::env;
@@ -24,7 +24,7 @@ const LOADER: &str = "libvulkan.so.1";
 
 /// The GPU prerequisites found on this machine.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Found {
+pub(super) struct Environment {
     /// GPUs that drivers offer, software drivers not counted.
     hardware: usize,
     /// All adapters that drivers offer, software drivers included.
@@ -41,7 +41,7 @@ pub(super) struct Found {
     capabilities: Option<String>,
 }
 
-impl Found {
+impl Environment {
     /// Inspects this machine. `hardware` and `answering` are the numbers of GPUs that drivers
     /// offer, without and with software drivers.
     pub(super) fn here(hardware: usize, answering: usize) -> Self {
@@ -166,24 +166,24 @@ mod tests {
     use super::*;
 
     /// A machine with a loader and a driver's manifest, but without a GPU.
-    fn machine() -> Found {
-        Found {
+    fn machine() -> Environment {
+        Environment {
             loader: true,
             manifests: 1,
-            ..Found::default()
+            ..Environment::default()
         }
     }
 
-    fn advice(found: &Found) -> String {
+    fn advice(found: &Environment) -> String {
         found.advice().join("\n")
     }
 
     #[test]
     fn a_machine_whose_card_answers_needs_no_advice() {
-        let found = Found {
+        let found = Environment {
             hardware: 1,
             answering: 1,
-            ..Found::default()
+            ..Environment::default()
         };
         assert_eq!(found.advice(), [""; 0]);
     }
@@ -191,7 +191,7 @@ mod tests {
     #[test]
     fn what_is_missing_is_named_with_what_mends_it() {
         let card = || vec!["/dev/dri/renderD128".to_owned()];
-        let nvidia = |capabilities: Option<&str>, container| Found {
+        let nvidia = |capabilities: Option<&str>, container| Environment {
             nvidia: true,
             container,
             devices: vec!["/dev/nvidia0".to_owned()],
@@ -200,42 +200,42 @@ mod tests {
         };
         for (found, said) in [
             (
-                Found {
+                Environment {
                     loader: false,
                     ..machine()
                 },
                 "apt-get install libvulkan1",
             ),
             (
-                Found {
+                Environment {
                     manifests: 0,
                     ..machine()
                 },
                 "mesa-vulkan-drivers",
             ),
             (
-                Found {
+                Environment {
                     restricted: Some(("VK_DRIVER_FILES", false)),
                     ..machine()
                 },
                 "VK_DRIVER_FILES names no file",
             ),
             (
-                Found {
+                Environment {
                     devices: card(),
                     ..machine()
                 },
                 "group render",
             ),
             (
-                Found {
+                Environment {
                     container: true,
                     ..machine()
                 },
                 "--gpus all",
             ),
             (
-                Found {
+                Environment {
                     answering: 1,
                     ..machine()
                 },

@@ -8,11 +8,14 @@ use rayon::prelude::*;
 use super::inference;
 use super::isa::Isa;
 use super::kernels::Kernels;
+use super::model::{Mlp, Model};
 use super::tile::WorkingSets;
-use super::trainer::{CpuTrainer, CpuTransform};
-use crate::flow::data::{Control, Point};
+use super::trainer::CpuTrainer;
+use crate::flow::data::{Control, Point, Random};
 use crate::flow::distance::{DistanceOptions, DistanceTransform};
-use crate::flow::field::{Backend, BackendError, Network, Trainer, Transform};
+use crate::flow::field::{
+    Backend, BackendError, Conditioning, DistanceLoss, Network, Schedule, Trainer, Transform, mlp,
+};
 use crate::flow::host::Host;
 use crate::flow::options::{FieldOptions, Precision};
 
@@ -75,14 +78,25 @@ impl Backend for CpuBackend {
     }
 
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {
+        let model = Mlp::new(self.kernels, network.conditioning);
+        let threads = self.host.threads();
+        let working_sets = WorkingSets::new(threads, || model.working_set());
+        let parameters = &network.parameters;
         Ok(inference::evaluate(
-            &self.kernels,
-            self.host.threads(),
-            &WorkingSets::new(self.host.threads()),
-            (&network.parameters, &network.conditioning),
+            &model,
+            parameters,
+            threads,
+            &working_sets,
             points,
         ))
     }
+}
+
+/// A distance transform in memory, with the kernels and threads that fit a field to it.
+struct CpuTransform {
+    kernels: Kernels,
+    threads: Arc<rayon::ThreadPool>,
+    distance: DistanceTransform,
 }
 
 impl Transform for CpuTransform {
@@ -106,6 +120,17 @@ impl Transform for CpuTransform {
             let text = "the CPU computes in single precision alone";
             return Err(BackendError::Unsupported(text));
         }
-        Ok(Box::new(CpuTrainer::new(self, source, options, seed)))
+        let mut random = Random::stream(seed, 0);
+        let parameters = mlp::initial(options.start, &mut random);
+        let schedule = Schedule::new(source, options, &mut random);
+        let model = Mlp::new(self.kernels, Conditioning::new(source, options.inputs));
+        let loss = DistanceLoss {
+            options: options.loss,
+            distance: &self.distance,
+        };
+        let threads = Arc::clone(&self.threads);
+        Ok(Box::new(CpuTrainer::new(
+            threads, model, loss, schedule, parameters,
+        )))
     }
 }

@@ -1,18 +1,18 @@
-//! Evaluation of a fitted network at given points, in parallel tiles.
+//! Evaluation of a model at given points, in parallel tiles.
 
 use rayon::prelude::*;
 
-use super::kernels::Kernels;
+use super::model::Model;
 use super::tile::{TILE, WorkingSets};
 use crate::flow::data::Point;
-use crate::flow::field::{Conditioning, Parameters};
+use crate::flow::field::Parameters;
 
 /// The flow at each of the N `points`, N x 3 displacements in metres.
-pub(super) fn evaluate(
-    kernels: &Kernels,
+pub(super) fn evaluate<M: Model>(
+    model: &M,
+    parameters: &Parameters,
     threads: &rayon::ThreadPool,
-    working_sets: &WorkingSets,
-    (parameters, conditioning): (&Parameters, &Conditioning),
+    working_sets: &WorkingSets<M::WorkingSet>,
     points: &[Point],
 ) -> Vec<Point> {
     let mut flow = vec![[0.0; 3]; points.len()];
@@ -20,10 +20,8 @@ pub(super) fn evaluate(
         flow.par_chunks_mut(TILE)
             .zip(points.par_chunks(TILE))
             .for_each(|(flow, points)| {
-                let mut tile = working_sets.own();
-                tile.load(points.iter().map(|&point| conditioning.apply(point)));
-                kernels.forward(parameters, &mut tile);
-                flow.copy_from_slice(&tile.outputs[..points.len()]);
+                let mut working_set = working_sets.own();
+                flow.copy_from_slice(model.forward(parameters, points, &mut working_set));
             });
     });
     flow

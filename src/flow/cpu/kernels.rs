@@ -113,7 +113,7 @@ mod tests {
     use super::*;
     use crate::flow::data::Random;
     use crate::flow::field::ReferenceNetwork;
-    use crate::flow::field::{MIDDLE_LAYERS, WIDTH, middle_layer, transpose_middle_layers};
+    use crate::flow::field::{MIDDLE_LAYERS, WIDTH, middle_layer, mlp, transpose_middle_layers};
 
     /// Rounding error of single-precision sums of 128 and of 96 terms, through eight layers.
     const TOLERANCE: f64 = 2e-5;
@@ -122,7 +122,7 @@ mod tests {
 
     fn network() -> Parameters {
         let mut random = Random::new(7);
-        let mut parameters = Parameters::xavier(&mut random);
+        let mut parameters = mlp::xavier(&mut random);
         for layer in 0..MIDDLE_LAYERS {
             let bias = middle_layer(layer).bias;
             for b in &mut parameters.as_mut_slice()[bias..bias + WIDTH] {
@@ -179,14 +179,14 @@ mod tests {
     fn every_instruction_set_computes_every_gradient_at_awkward_row_counts() {
         let parameters = network();
         let reference = ReferenceNetwork::read(&parameters);
-        let mut transposed = Parameters::zeros();
+        let mut transposed = mlp::zeros();
         transpose_middle_layers(&parameters, &mut transposed);
         for isa in Isa::available() {
             let kernels = Kernels::new(isa);
             let mut tile = Tile::new();
             for rows in ROWS {
                 let (inputs, pulls) = (points(rows, 12), points(rows, 13));
-                let mut gradients = Parameters::zeros();
+                let mut gradients = mlp::zeros();
                 let mut expected = ReferenceNetwork::read(&gradients);
                 tile.load(inputs.iter().copied());
                 kernels.forward(&parameters, &mut tile);
@@ -209,7 +209,7 @@ mod tests {
         const STEP: f64 = 1e-6;
         let mut reference = ReferenceNetwork::read(&network());
         let (input, pull) = ([0.4, -1.3, 0.8], [0.7, -0.2, 0.5]);
-        let mut gradients = ReferenceNetwork::read(&Parameters::zeros());
+        let mut gradients = ReferenceNetwork::read(&mlp::zeros());
         reference.backward(input, pull, &mut gradients);
         let value = |network: &ReferenceNetwork| -> f64 {
             network

@@ -5,6 +5,7 @@ mod inference;
 mod isa;
 mod kernels;
 mod mlp_kernels;
+mod model;
 mod profile;
 mod simd;
 mod tile;

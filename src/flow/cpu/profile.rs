@@ -15,7 +15,7 @@ use super::simd::{F32x4, Lanes};
 use super::simd::{F32x8, F32x16};
 use super::tile::{TILE, Tile};
 use crate::flow::data::{Point, Random};
-use crate::flow::field::{MIDDLE_LAYERS, Parameters, WIDTH, transpose_middle_layers};
+use crate::flow::field::{MIDDLE_LAYERS, Parameters, WIDTH, mlp, transpose_middle_layers};
 
 /// Floating-point operations of the forward pass per point.
 const FORWARD: usize = 2 * (3 * WIDTH + MIDDLE_LAYERS * WIDTH * WIDTH + 3 * WIDTH);
@@ -40,8 +40,8 @@ impl NetworkWorkload {
     /// If the machine lacks the instruction set.
     pub fn new(isa: Isa, points: usize) -> Self {
         let mut random = Random::new(1);
-        let parameters = Parameters::xavier(&mut random);
-        let mut transposed = Parameters::zeros();
+        let parameters = mlp::xavier(&mut random);
+        let mut transposed = mlp::zeros();
         transpose_middle_layers(&parameters, &mut transposed);
         let mut point = || core::array::from_fn(|_| random.uniform(-1.0, 1.0) as f32);
         Self {
@@ -49,7 +49,7 @@ impl NetworkWorkload {
             points: (0..points).map(|_| point()).collect(),
             parameters,
             transposed,
-            gradients: Parameters::zeros(),
+            gradients: mlp::zeros(),
             tile: Tile::new(),
         }
     }

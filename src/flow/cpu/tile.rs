@@ -59,16 +59,16 @@ impl Tile {
 }
 
 /// One working set per thread.
-pub(super) struct WorkingSets(Vec<Mutex<Tile>>);
+pub(super) struct WorkingSets<T>(Vec<Mutex<T>>);
 
-impl WorkingSets {
-    pub(super) fn new(threads: &rayon::ThreadPool) -> Self {
+impl<T> WorkingSets<T> {
+    pub(super) fn new(threads: &rayon::ThreadPool, working_set: impl Fn() -> T) -> Self {
         let threads = threads.current_num_threads();
-        Self((0..threads).map(|_| Mutex::new(Tile::new())).collect())
+        Self((0..threads).map(|_| Mutex::new(working_set())).collect())
     }
 
     /// The calling thread's working set.
-    pub(super) fn own(&self) -> MutexGuard<'_, Tile> {
+    pub(super) fn own(&self) -> MutexGuard<'_, T> {
         let thread = rayon::current_thread_index().unwrap_or(0);
         self.0[thread]
             .lock()

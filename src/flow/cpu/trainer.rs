@@ -1,5 +1,5 @@
-//! One fit on the CPU: forward pass, distance query and backward pass over tiles on all threads,
-//! then Adam.
+//! One fit on the CPU: forward pass, loss and backward pass over tiles on all threads, then Adam. The
+//! loop is the same for every model, loss and schedule.
 //!
 //! Sums are taken in the fixed order of `field/reduction.rs`, so the result has the same bits for
 //! any number of threads.
@@ -10,15 +10,13 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use super::inference::evaluate;
-use super::kernels::Kernels;
+use super::model::Model;
 use super::tile::{TILE, WorkingSets};
 use crate::flow::data::{Control, Point, Progress};
-use crate::flow::distance::DistanceTransform;
 use crate::flow::field::{
-    Advance, BackendError, Chunks, EarlyStop, FitReport, Parameters, Schedule, Trainer,
-    TrainerState, reduction, transpose_middle_layers,
+    Advance, BackendError, Chunks, EarlyStop, FitReport, Loss, Parameters, Schedule, Trainer,
+    TrainerState, reduction,
 };
-use crate::flow::options::FieldOptions;
 
 /// Parameters that one thread sums and updates at a time.
 const SLICE: usize = 4096;
@@ -27,7 +25,7 @@ const SLICE: usize = 4096;
 /// into the first.
 const HELD: usize = 32;
 
-/// The gradient sum of one chunk, and its time in the distance query.
+/// The gradient sum of one chunk, and the time of its losses.
 struct Chunk {
     gradients: Parameters,
     query_seconds: f64,
@@ -36,51 +34,48 @@ struct Chunk {
 /// A chunk to compute: its points, and the output slice of their losses.
 struct Due<'a> {
     chunk: &'a mut Chunk,
+    /// Index of the first point in the batch.
+    first: usize,
     points: &'a [Point],
     losses: &'a mut [f32],
 }
 
-/// A distance transform in memory, with the kernels and threads that fit a field to it.
-pub(super) struct CpuTransform {
-    pub(super) kernels: Kernels,
-    pub(super) threads: Arc<rayon::ThreadPool>,
-    pub(super) distance: DistanceTransform,
-}
-
-/// A network, its optimizer and the distance transform it is fitted to.
-pub(super) struct CpuTrainer<'a> {
-    device: &'a CpuTransform,
+/// A model with its optimizer, the loss that it is fitted to, and the schedule of its iterations.
+pub(super) struct CpuTrainer<M: Model, L: Loss> {
+    threads: Arc<rayon::ThreadPool>,
+    model: M,
+    loss: L,
     schedule: Schedule,
     /// Parameters, moments, the result so far and the iteration counts.
     state: TrainerState,
-    transposed: Parameters,
     early_stop: Option<EarlyStop>,
     chunks: Vec<Chunk>,
     /// Losses of the current iteration's points, metres.
     losses: Vec<f32>,
-    working_sets: WorkingSets,
+    working_sets: WorkingSets<M::WorkingSet>,
     query_seconds: f64,
 }
 
-impl<'a> CpuTrainer<'a> {
+impl<M: Model, L: Loss> CpuTrainer<M, L> {
+    /// A fit of `model` to `loss` that starts from `parameters`.
     pub(super) fn new(
-        device: &'a CpuTransform,
-        source: &[Point],
-        options: &FieldOptions,
-        seed: u64,
+        threads: Arc<rayon::ThreadPool>,
+        mut model: M,
+        loss: L,
+        schedule: Schedule,
+        parameters: Parameters,
     ) -> Self {
-        let (schedule, parameters) = Schedule::new(source, options, seed);
-        let mut transposed = Parameters::zeros();
-        transpose_middle_layers(&parameters, &mut transposed);
+        model.update(&parameters);
         Self {
-            device,
+            working_sets: WorkingSets::new(&threads, || model.working_set()),
+            threads,
+            model,
+            loss,
+            early_stop: schedule.options.early_stop.map(EarlyStop::new),
             schedule,
             state: TrainerState::at_start(parameters),
-            transposed,
-            early_stop: options.early_stop.map(EarlyStop::new),
             chunks: Vec::new(),
             losses: Vec::new(),
-            working_sets: WorkingSets::new(&device.threads),
             query_seconds: 0.0,
         }
     }
@@ -89,6 +84,7 @@ impl<'a> CpuTrainer<'a> {
     /// early stopping fired; none if the loss is not finite.
     fn iterate(&mut self, control: &dyn Control) -> Option<(f32, bool)> {
         let batch = self.schedule.batch(self.state.iterations);
+        self.prepare(&batch, control);
         let held = self.accumulate(batch, control);
         let loss = reduction::mean(&self.losses);
         if !loss.is_finite() {
@@ -104,8 +100,21 @@ impl<'a> CpuTrainer<'a> {
         Some((loss, stop))
     }
 
-    /// Forward pass, distance query and backward pass over `batch`. Returns how many chunks hold
-    /// its gradients.
+    /// Prepares the loss for `batch`.
+    fn prepare(&mut self, batch: &Range<usize>, control: &dyn Control) {
+        let began = control.seconds();
+        let points = &self.schedule.points[batch.clone()];
+        let flow = || {
+            let parameters = &self.state.parameters;
+            let (model, sets) = (&self.model, &self.working_sets);
+            evaluate(model, parameters, &self.threads, sets, points)
+        };
+        self.loss.prepare(self.state.iterations, points, &flow);
+        self.query_seconds += control.seconds() - began;
+    }
+
+    /// Forward pass, loss and backward pass over `batch`. Returns how many chunks hold its
+    /// gradients.
     fn accumulate(&mut self, batch: Range<usize>, control: &dyn Control) -> usize {
         let cut = Chunks::new(self.schedule.largest_batch());
         self.losses.resize(batch.len(), 0.0);
@@ -124,8 +133,7 @@ impl<'a> CpuTrainer<'a> {
         held
     }
 
-    /// Forward pass, distance query and backward pass over some chunks of `batch`, held from index
-    /// `first` on.
+    /// Forward pass, loss and backward pass over some chunks of `batch`, held from index `first` on.
     fn compute(
         &mut self,
         batch: &Range<usize>,
@@ -134,10 +142,11 @@ impl<'a> CpuTrainer<'a> {
         first: usize,
         control: &dyn Control,
     ) {
-        let threads = self.device.threads.current_num_threads().min(some.len()) as f64;
+        let threads = self.threads.current_num_threads().min(some.len()) as f64;
         let held = first + some.len();
+        let parameters = &self.state.parameters;
         let empty = || Chunk {
-            gradients: Parameters::zeros(),
+            gradients: parameters.zeros_like(),
             query_seconds: 0.0,
         };
         self.chunks.resize_with(held.max(self.chunks.len()), empty);
@@ -152,39 +161,38 @@ impl<'a> CpuTrainer<'a> {
             losses = rest;
             due.push(Due {
                 chunk,
+                first: own.start,
                 points: &points[own],
                 losses: losses_here,
             });
         }
         let weight = 1.0 / points.len() as f32;
-        let (device, loss) = (self.device, &self.schedule.options.loss);
-        let (parameters, transposed) = (&self.state.parameters, &self.transposed);
-        let (conditioning, working_sets) = (&self.schedule.conditioning, &self.working_sets);
+        let (model, loss, working_sets) = (&self.model, &self.loss, &self.working_sets);
         let run = |due: Due<'_>| {
-            let mut tile = working_sets.own();
+            let mut working_set = working_sets.own();
+            let mut flow_gradients = [[0.0; 3]; TILE];
             let Chunk {
                 gradients,
                 query_seconds,
             } = due.chunk;
             gradients.as_mut_slice().fill(0.0);
             *query_seconds = 0.0;
+            let mut index = due.first;
             for (points, losses) in due.points.chunks(TILE).zip(due.losses.chunks_mut(TILE)) {
-                tile.load(points.iter().map(|&point| conditioning.apply(point)));
-                device.kernels.forward(parameters, &mut tile);
+                let flow = model.forward(parameters, points, &mut working_set);
                 let began = control.seconds();
-                for (row, (point, seen)) in points.iter().zip(losses).enumerate() {
-                    let flow = tile.outputs[row];
-                    let deformed = core::array::from_fn(|a| point[a] + flow[a]);
-                    let loss = loss.at(*point, device.distance.sample(deformed), flow);
+                for (row, seen) in losses.iter_mut().enumerate() {
+                    let loss = loss.at(index, points[row], flow[row]);
                     *seen = loss.value;
-                    tile.output_gradients[row] = loss.gradient.map(|g| g * weight);
+                    flow_gradients[row] = loss.gradient.map(|g| g * weight);
+                    index += 1;
                 }
                 *query_seconds += control.seconds() - began;
-                let kernels = &device.kernels;
-                kernels.backward(parameters, transposed, &mut tile, gradients);
+                let flow_gradients = &flow_gradients[..points.len()];
+                model.backward(parameters, flow_gradients, &mut working_set, gradients);
             }
         };
-        device.threads.install(|| due.into_par_iter().for_each(run));
+        self.threads.install(|| due.into_par_iter().for_each(run));
         let chunks = &self.chunks[first..held];
         let query: f64 = chunks.iter().map(|chunk| chunk.query_seconds).sum();
         self.query_seconds += query / threads;
@@ -196,7 +204,7 @@ impl<'a> CpuTrainer<'a> {
             return;
         };
         let slices = first.gradients.as_mut_slice().par_chunks_mut(SLICE);
-        self.device.threads.install(|| {
+        self.threads.install(|| {
             slices.enumerate().for_each(|(slice, sums)| {
                 add_slices(sums, others, slice);
             });
@@ -246,7 +254,7 @@ impl<'a> CpuTrainer<'a> {
         let means = means.as_mut_slice().par_chunks_mut(SLICE);
         let squares = squares.as_mut_slice().par_chunks_mut(SLICE);
         let slices = parameters.zip(means).zip(squares).enumerate();
-        self.device.threads.install(|| {
+        self.threads.install(|| {
             slices.for_each(|(slice, ((parameters, means), squares))| {
                 let mut sums = [0.0f32; SLICE];
                 let sums = &mut sums[..parameters.len()];
@@ -254,7 +262,7 @@ impl<'a> CpuTrainer<'a> {
                 adam.apply(sums, parameters, [means, squares]);
             });
         });
-        transpose_middle_layers(&self.state.parameters, &mut self.transposed);
+        self.model.update(&self.state.parameters);
     }
 }
 
@@ -268,7 +276,7 @@ fn add_slices(sums: &mut [f32], chunks: &[Chunk], slice: usize) {
     }
 }
 
-impl Trainer for CpuTrainer<'_> {
+impl<M: Model, L: Loss> Trainer for CpuTrainer<M, L> {
     fn advance(&mut self, steps: usize, control: &dyn Control) -> Result<Advance, BackendError> {
         for step in 0..steps {
             if self.state.iterations >= self.schedule.options.max_iterations {
@@ -297,10 +305,10 @@ impl Trainer for CpuTrainer<'_> {
 
     fn evaluate(&mut self, points: &[Point]) -> Result<Vec<Point>, BackendError> {
         Ok(evaluate(
-            &self.device.kernels,
-            &self.device.threads,
+            &self.model,
+            &self.state.kept,
+            &self.threads,
             &self.working_sets,
-            (&self.state.kept, &self.schedule.conditioning),
             points,
         ))
     }
@@ -325,7 +333,7 @@ impl Trainer for CpuTrainer<'_> {
     fn restore(&mut self, state: TrainerState) -> Result<(), BackendError> {
         let rule = self.schedule.options.early_stop;
         self.early_stop = rule.map(|options| EarlyStop::resumed(options, state.seen));
-        transpose_middle_layers(&state.parameters, &mut self.transposed);
+        self.model.update(&state.parameters);
         self.state = state;
         Ok(())
     }
@@ -335,5 +343,7 @@ impl Trainer for CpuTrainer<'_> {
     }
 }
 
+#[cfg(test)]
+mod interface_tests;
 #[cfg(test)]
 mod tests;

@@ -25,7 +25,7 @@ impl OrientedBox {
     /// The box around `points` (at least one), metres. If the points move by `way` (x, y), the
     /// length is along the side whose direction is nearest to it. Otherwise the length is the
     /// longer side, in the direction nearest to +x.
-    pub(crate) fn around(points: &[Point], way: Option<[f32; 2]>) -> Self {
+    pub(crate) fn enclosing(points: &[Point], way: Option<[f32; 2]>) -> Self {
         let level: Vec<[f64; 2]> = points.iter().map(|p| [p[0], p[1]].map(f64::from)).collect();
         let hull = hull(level);
         // A hull with more corners is nearly round, so every n-th edge suffices.
@@ -154,7 +154,7 @@ mod tests {
         const FREE_M: f32 = 0.1;
         const TURN: f32 = 0.03;
         for yaw in [0.0, 0.4, -1.2] {
-            let bounds = OrientedBox::around(&car(yaw), None);
+            let bounds = OrientedBox::enclosing(&car(yaw), None);
             for (found, true_) in bounds.center.iter().zip([20.0, -5.0, 0.0]) {
                 assert!(close(*found, true_, FREE_M), "{bounds:?}");
             }
@@ -168,15 +168,15 @@ mod tests {
     #[test]
     fn a_box_of_what_moves_points_where_it_goes() {
         const TURN: f32 = 0.03;
-        let backward = OrientedBox::around(&car(0.4), Some([-1.0, -0.35]));
+        let backward = OrientedBox::enclosing(&car(0.4), Some([-1.0, -0.35]));
         assert!(close(backward.yaw, 0.4 - PI, TURN), "{backward:?}");
         assert!(backward.size[0] > backward.size[1]);
         for yaw in [0.15, -0.15] {
-            let bounds = OrientedBox::around(&car(yaw), Some([-1.0, 0.0]));
+            let bounds = OrientedBox::enclosing(&car(yaw), Some([-1.0, 0.0]));
             let expected = yaw as f32 - PI * (yaw as f32).signum();
             assert!(close(bounds.yaw, expected, TURN), "{bounds:?}");
         }
-        let sideways = OrientedBox::around(&car(0.4), Some([-0.35, 1.0]));
+        let sideways = OrientedBox::enclosing(&car(0.4), Some([-0.35, 1.0]));
         assert!(close(sideways.yaw, 0.4 + FRAC_PI_2, TURN), "{sideways:?}");
         assert!(sideways.size[0] < sideways.size[1]);
     }
@@ -189,16 +189,16 @@ mod tests {
             [3.0 * cos, 3.0 * sin, 0.0].map(|c| c as f32)
         };
         let ring: Vec<Point> = (0..100_000).map(point).collect();
-        let [length, width, _] = OrientedBox::around(&ring, None).size;
+        let [length, width, _] = OrientedBox::enclosing(&ring, None).size;
         assert!(close(length, 6.0, ROUND) && close(width, 6.0, ROUND));
     }
 
     #[test]
     fn few_points_and_points_on_a_line_have_boxes_too() {
-        let one = OrientedBox::around(&[[1.0, 2.0, 3.0]], None);
+        let one = OrientedBox::enclosing(&[[1.0, 2.0, 3.0]], None);
         assert_eq!((one.center, one.size), ([1.0, 2.0, 3.0], [0.0; 3]));
         let line: Vec<Point> = (0..5).map(|i| [i as f32, i as f32, 0.0]).collect();
-        let line = OrientedBox::around(&line, None);
+        let line = OrientedBox::enclosing(&line, None);
         assert!(close(line.size[0], 4.0 * 2.0_f32.sqrt(), 1e-5), "{line:?}");
         assert!(close(line.size[1], 0.0, 1e-5), "{line:?}");
         assert!(close(line.yaw, PI / 4.0, 1e-5), "{line:?}");

@@ -96,7 +96,7 @@ pub fn densify<'a>(
         }
         later.transform(&instant);
     }
-    Ok(earlier.joined(later, plan.into()))
+    Ok(earlier.joined(later, plan.reference_time()))
 }
 
 /// The name of the device that advects points through `fields`, for reports: the backend's if any

@@ -145,8 +145,8 @@ impl PropagatedCloud {
         self.points = transform_points(motion, &self.points);
     }
 
-    /// Joins both clouds into the dense cloud of the reference time `into`, in sweeps.
-    pub(super) fn joined(mut self, other: Self, into: f64) -> DenseCloud {
+    /// Joins both clouds into the dense cloud of the reference time `reference_time`, in sweeps.
+    pub(super) fn joined(mut self, other: Self, reference_time: f64) -> DenseCloud {
         self.points.extend(other.points);
         self.sweep.extend(other.sweep);
         self.dynamic.extend(other.dynamic);
@@ -155,7 +155,7 @@ impl PropagatedCloud {
             age: self
                 .sweep
                 .iter()
-                .map(|&sweep| (into - f64::from(sweep)) as f32)
+                .map(|&sweep| (reference_time - f64::from(sweep)) as f32)
                 .collect(),
             points: self.points,
             sweep: self.sweep,

@@ -25,10 +25,10 @@ pub struct FlowEdge {
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum PlanError {
     /// The reference time lies outside the sequence.
-    #[error("into {into} lies outside the sequence's sweeps, 0 to {last}")]
+    #[error("the reference time {reference_time} lies outside the sequence's sweeps, 0 to {last}")]
     ReferenceTimeOutOfRange {
         /// The requested reference time, in sweeps.
-        into: f64,
+        reference_time: f64,
         /// Index of the last sweep.
         last: usize,
     },
@@ -56,16 +56,16 @@ pub struct Plan {
 }
 
 impl Plan {
-    /// Plans to transform all of `sweeps` sweeps into the frame of the reference time `into`. It is
+    /// Plans to transform all of `sweeps` sweeps into the frame of the reference time. It is
     /// counted in sweeps from 0, and may lie between two sweeps. Each step from sweep to sweep is
     /// integrated in `substeps` Euler steps.
     ///
     /// # Errors
-    /// [`PlanError`] if there are fewer than two sweeps, `into` lies outside the sequence, or
+    /// [`PlanError`] if there are fewer than two sweeps, `reference_time` lies outside the sequence, or
     /// `substeps` is not 1 to 64.
     pub fn new(
         sweeps: usize,
-        into: f64,
+        reference_time: f64,
         later: LaterSweeps,
         substeps: usize,
     ) -> Result<Self, PlanError> {
@@ -73,24 +73,27 @@ impl Plan {
             return Err(PlanError::TooFewSweeps(sweeps));
         }
         let last = sweeps - 1;
-        if !(0.0..=last as f64).contains(&into) {
-            return Err(PlanError::ReferenceTimeOutOfRange { into, last });
+        if !(0.0..=last as f64).contains(&reference_time) {
+            return Err(PlanError::ReferenceTimeOutOfRange {
+                reference_time,
+                last,
+            });
         }
         if !(1..=MOST_SUBSTEPS).contains(&substeps) {
             return Err(PlanError::Substeps(substeps));
         }
-        let anchor = into as usize;
+        let anchor = reference_time as usize;
         Ok(Self {
             sweeps,
             anchor,
-            fraction: into - anchor as f64,
+            fraction: reference_time - anchor as f64,
             later,
             substeps,
         })
     }
 
     /// The reference time, in sweeps from 0.
-    pub fn into(&self) -> f64 {
+    pub fn reference_time(&self) -> f64 {
         self.anchor as f64 + self.fraction
     }
 
@@ -134,8 +137,8 @@ impl Plan {
 mod tests {
     use super::*;
 
-    fn edges(sweeps: usize, into: f64, later: LaterSweeps) -> Vec<(usize, usize)> {
-        let plan = Plan::new(sweeps, into, later, 1).expect("a plan");
+    fn edges(sweeps: usize, reference_time: f64, later: LaterSweeps) -> Vec<(usize, usize)> {
+        let plan = Plan::new(sweeps, reference_time, later, 1).expect("a plan");
         let edges = plan.edges();
         edges
             .iter()
@@ -163,8 +166,8 @@ mod tests {
 
     #[test]
     fn instants_outside_the_sequence_are_refused() {
-        for into in [-0.5, 4.1, f64::NAN, f64::INFINITY] {
-            let refused = Plan::new(5, into, LaterSweeps::Reverse, 1);
+        for reference_time in [-0.5, 4.1, f64::NAN, f64::INFINITY] {
+            let refused = Plan::new(5, reference_time, LaterSweeps::Reverse, 1);
             assert!(matches!(
                 refused,
                 Err(PlanError::ReferenceTimeOutOfRange { last: 4, .. })

@@ -6,7 +6,7 @@ use crate::flow::cpu::CpuBackend;
 use crate::flow::data::DenseCloud;
 use crate::flow::data::RigidTransform;
 use crate::flow::data::{Point, Uncontrolled, transform_point};
-use crate::flow::field::{Conditioning, Network, Parameters, last_layer};
+use crate::flow::field::{Conditioning, Network, last_layer, mlp};
 use crate::flow::motion::MotionField;
 use crate::flow::motion::Residual;
 use crate::flow::sequence::Sweep;
@@ -16,7 +16,7 @@ const ROUNDING_M: f32 = 1e-5;
 
 /// A field with the same flow everywhere.
 fn constant(ego: Option<RigidTransform>, flow: Point) -> MotionField {
-    let mut parameters = Parameters::zeros();
+    let mut parameters = mlp::zeros();
     let bias = last_layer().bias;
     parameters.as_mut_slice()[bias..bias + 3].copy_from_slice(&flow);
     let conditioning = Conditioning {
@@ -63,10 +63,10 @@ fn dense(
     densify(&backend, plan, sweeps, of, &Uncontrolled)
 }
 
-/// Position of a static point of sweep `frame` in the frame of the reference time `into`.
-fn expected(point: Point, frame: usize, into: f64) -> Point {
-    let anchor = into.floor();
-    let mut motion = part_of(&drive(), into - anchor);
+/// Position of a static point of sweep `frame` in the frame of the reference time `reference_time`.
+fn expected(point: Point, frame: usize, reference_time: f64) -> Point {
+    let anchor = reference_time.floor();
+    let mut motion = part_of(&drive(), reference_time - anchor);
     let steps = anchor - frame as f64;
     for _ in 0..steps.abs() as usize {
         motion *= if steps < 0.0 {
@@ -94,8 +94,8 @@ fn the_static_world_lands_where_the_vehicle_sees_it_whatever_the_instant() {
     let [ahead, back] = &still;
     let sweeps = sweeps(5);
     for later in [LaterSweeps::Reverse, LaterSweeps::Inverse] {
-        for into in [0.0, 2.0, 2.25, 3.5, 4.0] {
-            let plan = Plan::new(5, into, later, 2).expect("a plan");
+        for reference_time in [0.0, 2.0, 2.25, 3.5, 4.0] {
+            let plan = Plan::new(5, reference_time, later, 2).expect("a plan");
             let cloud = dense(&plan, &sweeps, ahead, back).expect("a cloud");
             assert_eq!(
                 cloud.points.len(),
@@ -105,9 +105,13 @@ fn the_static_world_lands_where_the_vehicle_sees_it_whatever_the_instant() {
             for (row, &frame) in cloud.sweep.iter().enumerate() {
                 let index = frame as usize;
                 let point = sweeps[index].points[if row % 2 == 0 { 0 } else { 2 }];
-                let expected = expected(point, index, into);
-                assert_near(cloud.points[row], expected, &format!("{later:?} {into}"));
-                assert_eq!(cloud.age[row], (into - f64::from(frame)) as f32);
+                let expected = expected(point, index, reference_time);
+                assert_near(
+                    cloud.points[row],
+                    expected,
+                    &format!("{later:?} {reference_time}"),
+                );
+                assert_eq!(cloud.age[row], (reference_time - f64::from(frame)) as f32);
                 assert!(!cloud.dynamic[row] && cloud.converged[row]);
             }
         }
@@ -124,16 +128,20 @@ fn what_moves_is_integrated_step_by_step_and_ground_is_not() {
     );
     let sweeps = sweeps(4);
     for later in [LaterSweeps::Reverse, LaterSweeps::Inverse] {
-        for (into, substeps) in [(2.0, 1), (2.0, 4), (1.5, 1)] {
-            let plan = Plan::new(4, into, later, substeps).expect("a plan");
+        for (reference_time, substeps) in [(2.0, 1), (2.0, 4), (1.5, 1)] {
+            let plan = Plan::new(4, reference_time, later, substeps).expect("a plan");
             let cloud = dense(&plan, &sweeps, &ahead, &back).expect("a cloud");
             for (row, &frame) in cloud.sweep.iter().enumerate() {
-                let age = (into - f64::from(frame)) as f32;
+                let age = (reference_time - f64::from(frame)) as f32;
                 let is_ground = row % 2 == 1;
                 let point = sweeps[frame as usize].points[if is_ground { 2 } else { 0 }];
                 let advect = if is_ground { 0.0 } else { 0.5 * age };
                 let expected = [point[0] + advect, point[1], point[2]];
-                assert_near(cloud.points[row], expected, &format!("{later:?} {into}"));
+                assert_near(
+                    cloud.points[row],
+                    expected,
+                    &format!("{later:?} {reference_time}"),
+                );
                 assert_eq!(cloud.dynamic[row], advect != 0.0);
             }
         }

@@ -68,11 +68,11 @@ impl DepthImage {
         let limit = depth * (1.0 - of.nearer);
         let width = (self.width as usize).max(1);
         let height = self.metres.len() / width;
-        let around = |middle: usize, side: usize| {
+        let window = |middle: usize, side: usize| {
             let end = middle.saturating_add(of.reach_px).saturating_add(1);
             middle.saturating_sub(of.reach_px)..side.min(end)
         };
-        let [columns, rows] = [around(column, width), around(row, height)];
+        let [columns, rows] = [window(column, width), window(row, height)];
         let mut found = [false; 4];
         for y in rows {
             for x in columns.clone() {

@@ -1,5 +1,7 @@
 //! Method field: distance transform, registration, then the fit of a neural field (FNSF).
 
+use std::cell::LazyCell;
+
 use super::ego_motion::ego_motion;
 use super::method::{Input, Solved};
 use super::result::{FieldSolution, Solution};
@@ -30,9 +32,10 @@ pub(super) fn residual_motion(
     } = *input;
     // Without a warm start each pair is independent of the other pairs and of their order.
     let before = problem.before.filter(|_| options.warm_start.is_some());
-    let identity = || identity(selection, input.options, before);
+    // Computed at most once, and only if there are snapshots.
+    let identity = LazyCell::new(|| identity(selection, input.options, before));
     let state = snapshot
-        .map(|snapshot| snapshot.state_for(identity()))
+        .map(|snapshot| snapshot.state_for(*identity))
         .transpose()?;
     let clouds = [selection.source.as_slice(), &selection.target];
     let prepared = field::prepare(backend, clouds, options, control)?;
@@ -65,7 +68,7 @@ pub(super) fn residual_motion(
             ego: ego.as_ref(),
             options,
             seed: input.options.seed,
-            identity: &identity,
+            identity: &|| *identity,
             prepared,
             control,
         }

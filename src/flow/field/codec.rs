@@ -1,7 +1,8 @@
 //! Binary encoding of a network's parameters: f32 each, little-endian, in the order of
 //! [`Parameters`].
 
-use super::mlp::{LAID_OUT, Parameters};
+use super::mlp::{self, LAID_OUT};
+use super::parameters::Parameters;
 use crate::flow::data::{Body, EnvelopeError};
 
 /// Bytes of a network's parameters.
@@ -21,7 +22,7 @@ pub(crate) fn take_parameters(body: &mut Body<'_>) -> Result<Parameters, Envelop
     if body.bytes_left() < PARAMETERS_BYTES {
         return Err(EnvelopeError::Damaged);
     }
-    let mut parameters = Parameters::zeros();
+    let mut parameters = mlp::zeros();
     for value in parameters.as_mut_slice() {
         *value = body.single()?;
     }

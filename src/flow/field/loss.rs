@@ -1,11 +1,12 @@
-//! The loss of one deformed point and its derivative with respect to the flow. Every backend
-//! implements these formulas.
+//! The loss of an iteration: a value for every deformed point and its derivative with respect to
+//! the flow.
 //!
-//! `clamp(D(p + f), margin, truncation) + penalty * |f|`; with the published settings just `D(p +
+//! [`Loss`] is the interface to the fit. [`DistanceLoss`] is FNSF's, of one deformed point in the
+//! distance transform; every backend implements its formulas: `clamp(D(p + f), margin, truncation) + penalty * |f|`; with the published settings just `D(p +
 //! f)`, FNSF eq. 6.
 
 use crate::flow::data::Point;
-use crate::flow::distance::Sample;
+use crate::flow::distance::{DistanceTransform, Sample};
 use crate::flow::options::LossOptions;
 
 /// Flows shorter than this are penalized quadratically, so that the derivative is continuous.
@@ -16,6 +17,36 @@ const SMALL_FLOW_M: f32 = 1e-3;
 pub(crate) struct PointLoss {
     pub(crate) value: f32,
     pub(crate) gradient: Point,
+}
+
+/// A loss that a field can be fitted to. The fit minimizes the mean of [`Self::at`] over the points
+/// of each iteration.
+pub(crate) trait Loss: Send + Sync {
+    /// Prepares the iteration that follows `done` others over `points`. A loss that couples the
+    /// points, such as the Chamfer distance, calls `flow` for the flow of each point, metres, and
+    /// renews its correspondences.
+    fn prepare(&mut self, done: usize, points: &[Point], flow: &dyn Fn() -> Vec<Point>);
+
+    /// The loss of `point` with `flow`. `index` is that of the point among those of the iteration.
+    fn at(&self, index: usize, point: Point, flow: Point) -> PointLoss;
+}
+
+/// The loss of FNSF, eq. 6, with a margin, a truncation and a penalty on the flow: each deformed
+/// point's distance to the target, by the target's distance transform.
+pub(crate) struct DistanceLoss<'a> {
+    pub(crate) options: LossOptions,
+    pub(crate) distance: &'a DistanceTransform,
+}
+
+impl Loss for DistanceLoss<'_> {
+    /// Nothing: the points are independent of each other.
+    fn prepare(&mut self, _: usize, _: &[Point], _: &dyn Fn() -> Vec<Point>) {}
+
+    #[inline]
+    fn at(&self, _: usize, point: Point, flow: Point) -> PointLoss {
+        let deformed = core::array::from_fn(|a| point[a] + flow[a]);
+        self.options.at(point, self.distance.sample(deformed), flow)
+    }
 }
 
 impl LossOptions {

@@ -4,10 +4,9 @@
 //! This file holds its shape, its Xavier initialization, and the memory layout that the kernels of
 //! every backend share.
 
-use bytemuck::{Pod, Zeroable};
-
+use super::parameters::Parameters;
 use crate::flow::data::{Point, Random};
-use crate::flow::options::InputNormalization;
+use crate::flow::options::{InputNormalization, Start};
 
 /// Features of every hidden layer.
 pub const WIDTH: usize = 128;
@@ -27,35 +26,6 @@ const MIDDLE_STRIDE: usize = WIDTH * WIDTH + WIDTH;
 const LAST: usize = MIDDLE + MIDDLE_LAYERS * MIDDLE_STRIDE;
 /// Floats of the network in memory: the parameters, padded to whole cache lines.
 pub(crate) const LAID_OUT: usize = (LAST + 3 * WIDTH + 3).next_multiple_of(16);
-
-/// One cache line of floats.
-#[derive(Clone, Copy, Pod, Zeroable)]
-#[repr(C, align(64))]
-pub(crate) struct Line([f32; 16]);
-
-/// A zero-initialized buffer of floats, aligned to cache lines.
-#[derive(Clone)]
-pub(crate) struct Aligned(Vec<Line>);
-
-impl Aligned {
-    /// A buffer of `floats` zeros, rounded up to a whole line.
-    pub(crate) fn zeros(floats: usize) -> Self {
-        Self(vec![Line::zeroed(); floats.div_ceil(16)])
-    }
-    pub(crate) fn as_slice(&self) -> &[f32] {
-        bytemuck::cast_slice(&self.0)
-    }
-    pub(crate) fn as_mut_slice(&mut self) -> &mut [f32] {
-        bytemuck::cast_slice_mut(&mut self.0)
-    }
-}
-
-/// The parameters of one network, or arrays of the same shape (gradients, moments).
-///
-/// Layout, in floats: first layer `W[3][128]`, bias; each middle layer `W` in panels of 32 output
-/// features (`[panel][input][32]`), bias; last layer `W[3][128]` (output-major), bias; padding.
-#[derive(Clone)]
-pub(crate) struct Parameters(Aligned);
 
 /// The offsets of a layer's weights and biases, in floats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -94,45 +64,43 @@ pub(crate) const fn panel_index(input: usize, output: usize) -> usize {
     (output / PANEL * WIDTH + input) * PANEL + output % PANEL
 }
 
-impl Parameters {
-    pub(crate) fn zeros() -> Self {
-        Self(Aligned::zeros(LAID_OUT))
-    }
+/// Zeros in the layout of the network: first layer `W[3][128]`, bias; each middle layer `W` in panels
+/// of 32 output features (`[panel][input][32]`), bias; last layer `W[3][128]` (output-major), bias;
+/// padding.
+pub(crate) fn zeros() -> Parameters {
+    Parameters::zeros(LAID_OUT)
+}
 
-    /// Xavier-uniform weights, `U(-a, a)` with `a = sqrt(6 / (inputs + outputs))`, and zero biases.
-    /// The weights are drawn layer by layer in output-major order, as a linear layer stores them.
-    pub(crate) fn xavier(random: &mut Random) -> Self {
-        let mut parameters = Self::zeros();
-        let floats = parameters.as_mut_slice();
-        let mut layer = |inputs: usize, outputs: usize, place: &dyn Fn(usize, usize) -> usize| {
-            let bound = (6.0 / (inputs + outputs) as f64).sqrt();
-            for output in 0..outputs {
-                for input in 0..inputs {
-                    floats[place(input, output)] = random.uniform(-bound, bound) as f32;
-                }
+/// Xavier-uniform weights, `U(-a, a)` with `a = sqrt(6 / (inputs + outputs))`, and zero biases. The
+/// weights are drawn layer by layer in output-major order, as a linear layer stores them.
+pub(crate) fn xavier(random: &mut Random) -> Parameters {
+    let mut parameters = zeros();
+    let floats = parameters.as_mut_slice();
+    let mut layer = |inputs: usize, outputs: usize, index: &dyn Fn(usize, usize) -> usize| {
+        let bound = (6.0 / (inputs + outputs) as f64).sqrt();
+        for output in 0..outputs {
+            for input in 0..inputs {
+                floats[index(input, output)] = random.uniform(-bound, bound) as f32;
             }
-        };
-        layer(3, WIDTH, &|i, o| FIRST + i * WIDTH + o);
-        for index in 0..MIDDLE_LAYERS {
-            let at = middle_layer(index).weights;
-            layer(WIDTH, WIDTH, &|i, o| at + panel_index(i, o));
         }
-        layer(WIDTH, 3, &|i, o| LAST + o * WIDTH + i);
-        parameters
+    };
+    layer(3, WIDTH, &|i, o| FIRST + i * WIDTH + o);
+    for number in 0..MIDDLE_LAYERS {
+        let at = middle_layer(number).weights;
+        layer(WIDTH, WIDTH, &|i, o| at + panel_index(i, o));
     }
+    layer(WIDTH, 3, &|i, o| LAST + o * WIDTH + i);
+    parameters
+}
 
-    /// Sets the last layer, and therefore the flow, to zero.
-    pub(crate) fn clear_last_layer(&mut self) {
-        self.as_mut_slice()[LAST..].fill(0.0);
+/// The parameters before the first iteration: [`xavier`], for [`Start::ZeroFlow`] with a last layer
+/// of zeros.
+pub(crate) fn initial(start: Start, random: &mut Random) -> Parameters {
+    let mut parameters = xavier(random);
+    if start == Start::ZeroFlow {
+        parameters.as_mut_slice()[LAST..].fill(0.0);
     }
-
-    pub(crate) fn as_slice(&self) -> &[f32] {
-        self.0.as_slice()
-    }
-
-    pub(crate) fn as_mut_slice(&mut self) -> &mut [f32] {
-        self.0.as_mut_slice()
-    }
+    parameters
 }
 
 /// Largest coordinate of a cloud's mean, along any axis, for which raw coordinates are used,
@@ -215,7 +183,7 @@ mod tests {
 
     #[test]
     fn xavier_weights_fill_their_interval_and_biases_are_zero() {
-        let parameters = Parameters::xavier(&mut Random::new(3));
+        let parameters = xavier(&mut Random::new(3));
         let floats = parameters.as_slice();
         let at = middle_layer(4);
         let bound = (6.0f32 / 256.0).sqrt();
@@ -230,7 +198,7 @@ mod tests {
 
     #[test]
     fn transposing_twice_gives_the_layer_back() {
-        let parameters = Parameters::xavier(&mut Random::new(1));
+        let parameters = xavier(&mut Random::new(1));
         let at = middle_layer(0);
         let layer = &parameters.as_slice()[at.weights..at.bias];
         let mut once = vec![0.0; layer.len()];

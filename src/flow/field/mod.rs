@@ -10,6 +10,7 @@ mod fit;
 mod loss;
 pub mod mlp;
 mod network;
+mod parameters;
 pub(crate) mod reduction;
 #[cfg(test)]
 pub(crate) mod reference;
@@ -29,11 +30,13 @@ pub(crate) use early_stopping::EarlyStop;
 pub(crate) use early_stopping::EarlyStopState;
 pub(crate) use error::FitError;
 pub(crate) use fit::{Fit, Fitted};
-pub(crate) use loss::length;
+#[cfg(test)]
+pub(crate) use loss::PointLoss;
+pub(crate) use loss::{DistanceLoss, Loss, length};
 pub(crate) use mlp::{
-    Aligned, Conditioning, LAID_OUT, PANEL, Parameters, first_layer, last_layer, middle_layer,
-    transpose_middle_layers,
+    Conditioning, LAID_OUT, PANEL, first_layer, last_layer, middle_layer, transpose_middle_layers,
 };
+pub(crate) use parameters::{Aligned, Parameters};
 #[cfg(any(feature = "gpu", test))]
 pub(crate) use reduction::MOST_POINTS;
 #[cfg(feature = "gpu")]

@@ -4,7 +4,8 @@ use core::fmt;
 
 use nalgebra::Vector3;
 
-use super::mlp::{Conditioning, Parameters, WIDTH, first_layer, last_layer};
+use super::mlp::{Conditioning, WIDTH, first_layer, last_layer};
+use super::parameters::Parameters;
 use crate::flow::data::{Point, RigidTransform};
 use crate::flow::options::InputNormalization;
 
@@ -89,6 +90,7 @@ mod tests {
     use crate::flow::data::Random;
     use crate::flow::data::transform_point;
     use crate::flow::field::backend::Backend;
+    use crate::flow::field::mlp;
 
     /// Metres: single-precision rounding of coordinates of 50 m and of features of that size.
     const ROUNDING_M: f32 = 2e-4;
@@ -104,7 +106,7 @@ mod tests {
         };
         let (fitted, others) = (points(), points());
         let scales = [10.0, 8.0].map(|scale_m| InputNormalization::Centered { scale_m });
-        let parameters = Parameters::xavier(&mut Random::new(9));
+        let parameters = mlp::xavier(&mut Random::new(9));
         let network = Network::new(parameters, &fitted, scales[0]);
         let motion = RigidTransform::new([1.5, -0.4, 0.1].into(), [0.01, -0.02, 0.3].into());
         let seen: Vec<Point> = others

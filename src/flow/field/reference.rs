@@ -4,8 +4,9 @@
 //! initialization, and the distance transform, which has its own tests.
 
 use super::mlp::{
-    MIDDLE_LAYERS, PANEL, Parameters, WIDTH, first_layer, last_layer, middle_layer, panel_index,
+    self, MIDDLE_LAYERS, PANEL, WIDTH, first_layer, last_layer, middle_layer, panel_index,
 };
+use super::parameters::Parameters;
 use crate::flow::data::{Point, Random};
 use crate::flow::distance::DistanceTransform;
 
@@ -133,12 +134,12 @@ pub(crate) fn first_losses(
     rate: f64,
     iterations: i32,
 ) -> Vec<f64> {
-    let mut network = ReferenceNetwork::read(&Parameters::xavier(&mut Random::stream(seed, 0)));
+    let mut network = ReferenceNetwork::read(&mlp::xavier(&mut Random::stream(seed, 0)));
     let zeros = vec![0.0; network.flat().len()];
     let mut moments = [zeros.clone(), zeros];
     let mut losses = Vec::new();
     for iteration in 1..=iterations {
-        let mut gradients = ReferenceNetwork::read(&Parameters::zeros());
+        let mut gradients = ReferenceNetwork::read(&mlp::zeros());
         let mut loss = 0.0;
         for point in source {
             let input = point.map(f64::from);

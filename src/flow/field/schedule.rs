@@ -1,12 +1,11 @@
-//! The schedule of a fit, common to all backends: the initial parameters, the batch of each
-//! iteration, and its step size.
+//! The schedule of a fit, common to all models, losses and backends: the points of each iteration,
+//! its step size, and which iterations become the result.
 
 use core::ops::Range;
 
 use super::adam::AdamStep;
-use super::mlp::{Conditioning, Parameters};
 use crate::flow::data::{Point, Random};
-use crate::flow::options::{FieldOptions, LearningRateSchedule, ResultChoice, Start};
+use crate::flow::options::{FieldOptions, LearningRateSchedule, ResultChoice};
 
 /// Iterations over which the weight of the past in a running average is ramped up.
 const RAMP: f32 = 10.0;
@@ -14,29 +13,21 @@ const RAMP: f32 = 10.0;
 /// The schedule of one fit.
 pub(crate) struct Schedule {
     pub(crate) options: FieldOptions,
-    pub(crate) conditioning: Conditioning,
     /// Source points in the order of the batches.
     pub(crate) points: Vec<Point>,
 }
 
 impl Schedule {
-    /// The schedule over `source`, and the initial parameters.
-    pub(crate) fn new(source: &[Point], options: &FieldOptions, seed: u64) -> (Self, Parameters) {
-        let mut random = Random::stream(seed, 0);
-        let mut parameters = Parameters::xavier(&mut random);
-        if options.start == Start::ZeroFlow {
-            parameters.clear_last_layer();
-        }
+    /// The schedule over `source`, with its batches drawn from `random`.
+    pub(crate) fn new(source: &[Point], options: &FieldOptions, random: &mut Random) -> Self {
         let mut points = source.to_vec();
         if options.batch.is_some_and(|batch| batch < points.len()) {
             random.shuffle(&mut points);
         }
-        let schedule = Self {
+        Self {
             options: options.clone(),
-            conditioning: Conditioning::new(source, options.inputs),
             points,
-        };
-        (schedule, parameters)
+        }
     }
 
     /// Number of batches that the points are divided into, of nearly equal size.
@@ -97,7 +88,7 @@ mod tests {
     fn every_point_is_in_one_batch_of_each_round() {
         let mut options = Preset::Neural.field();
         options.batch = Some(400);
-        let (schedule, _) = Schedule::new(&[[0.0; 3]; 1501], &options, 0);
+        let schedule = Schedule::new(&[[0.0; 3]; 1501], &options, &mut Random::new(0));
         let mut covered = vec![0; 1501];
         for done in 8..12 {
             let batch = schedule.batch(done);

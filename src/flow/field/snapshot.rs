@@ -11,7 +11,7 @@
 
 use super::codec::{PARAMETERS_BYTES, put_parameters, take_parameters};
 use super::early_stopping::EarlyStopState;
-use super::mlp::Parameters;
+use super::parameters::Parameters;
 use crate::flow::data::{Envelope, EnvelopeError};
 
 const ENVELOPE: Envelope = Envelope {
@@ -41,7 +41,7 @@ impl TrainerState {
     /// The state before the first iteration.
     pub(crate) fn at_start(parameters: Parameters) -> Self {
         Self {
-            moments: [Parameters::zeros(), Parameters::zeros()],
+            moments: [parameters.zeros_like(), parameters.zeros_like()],
             kept: parameters.clone(),
             parameters,
             seen: EarlyStopState::default(),

@@ -13,7 +13,7 @@ use crate::flow::field::BackendError;
 /// Longest wait of a request, counting only polling intervals in which no words were released.
 const PATIENCE: Duration = Duration::from_secs(20);
 /// Interval at which a waiting request checks its control.
-const LOOK: Duration = Duration::from_millis(20);
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 /// First-fit allocator with a queue of waiting requests.
 #[derive(Debug)]
@@ -102,11 +102,11 @@ impl Allocator {
             }
             let (woken, timeout) = self
                 .moved
-                .wait_timeout(store, LOOK)
+                .wait_timeout(store, POLL_INTERVAL)
                 .unwrap_or_else(PoisonError::into_inner);
             store = woken;
             if timeout.timed_out() {
-                waited += LOOK;
+                waited += POLL_INTERVAL;
             }
         };
         store.line.retain(|&other| other != own);

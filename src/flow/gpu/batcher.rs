@@ -30,12 +30,12 @@ pub(super) struct Done {
     /// Mean loss of each completed iteration, metres.
     pub(super) losses: Vec<f32>,
     /// Speed of the submission; none if the GPU has no timestamps.
-    pub(super) pace: Option<Pace>,
+    pub(super) pace: Option<TileThroughput>,
 }
 
 /// Speed of a submission's first iteration, by GPU timestamps.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Pace {
+pub(super) struct TileThroughput {
     /// Seconds of one iteration of all pairs in the submission.
     pub(super) iteration: f64,
     /// Seconds per tile: of the whole iteration, and of its distance query.
@@ -60,7 +60,7 @@ struct State {
     /// Whether a thread is submitting.
     submitting: bool,
     /// Speed of the latest submission.
-    pace: Option<Pace>,
+    pace: Option<TileThroughput>,
 }
 
 impl Batch {
@@ -74,7 +74,7 @@ impl Batch {
     }
 
     /// Speed of the latest submission.
-    pub(super) fn pace(&self) -> Option<Pace> {
+    pub(super) fn pace(&self) -> Option<TileThroughput> {
         self.state().pace
     }
 
@@ -221,7 +221,7 @@ fn submit<'u>(
         let iteration = clock.seconds(moments, 0, 3);
         let query = (clock.seconds(moments, 1, 2) / first_wave).min(iteration);
         let tiles = plan.tiles.len() as f64;
-        Pace {
+        TileThroughput {
             iteration,
             tile: iteration / tiles,
             tile_query: query / tiles,

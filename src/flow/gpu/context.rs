@@ -22,7 +22,7 @@ const SOFTWARE_SILENCE: Duration = Duration::from_secs(120);
 /// Interval at which a thread that waits for the GPU checks whether it is lost. It is long on
 /// purpose: a wait that times out while another thread finds the queue empty trips an assertion of
 /// wgpu 30 (gfx-rs/wgpu#9958), which loses the device.
-const LOOK: Duration = Duration::from_secs(2);
+const POLL_INTERVAL: Duration = Duration::from_secs(2);
 /// An opened GPU: its queue, its kernels, its buffers, its health.
 pub(super) struct Context {
     pub(super) device: wgpu::Device,
@@ -180,11 +180,11 @@ impl Context {
             self.watchdog.check()?;
             let wait = wgpu::PollType::Wait {
                 submission_index: Some(submission.clone()),
-                timeout: Some(LOOK),
+                timeout: Some(POLL_INTERVAL),
             };
             match self.device.poll(wait) {
                 Ok(_) => break,
-                Err(wgpu::PollError::Timeout) => waited += LOOK,
+                Err(wgpu::PollError::Timeout) => waited += POLL_INTERVAL,
                 Err(error) => return Err(BackendError::Device(error.to_string())),
             }
             if waited > self.longest_silence {

@@ -10,7 +10,7 @@ use super::layout::{Lane, Status, Step};
 use super::phase::{Clock, Phase};
 use super::request::{Request, write};
 use super::tiling::{Cut, Plan};
-use crate::flow::data::{Point, Uncontrolled};
+use crate::flow::data::{Point, Random, Uncontrolled};
 use crate::flow::distance::DistanceOptions;
 use crate::flow::field::{BackendError, MIDDLE_LAYERS, Schedule, WIDTH};
 use crate::flow::options::{FieldOptions, Precision};
@@ -113,7 +113,7 @@ fn repeated_iteration(
         early_stop: None,
         ..FieldOptions::published(false)
     };
-    let (schedule, _) = Schedule::new(source, &options, 0);
+    let schedule = Schedule::new(source, &options, &mut Random::new(0));
     // The network keeps its initial parameters, because the step size is zero.
     let trainer = super::trainer::GpuTrainer::new(built, source, &options, 0)?;
     let adam = schedule.adam(0);

@@ -18,8 +18,8 @@ use super::request::{Request, write as write_request};
 use super::tiling::{Cut, Plan};
 use crate::flow::data::Random;
 use crate::flow::field::{
-    BackendError, HIDDEN_LAYERS, LAID_OUT, MIDDLE_LAYERS, Parameters, WIDTH, last_layer,
-    middle_layer, transpose_middle_layers,
+    BackendError, HIDDEN_LAYERS, LAID_OUT, MIDDLE_LAYERS, WIDTH, last_layer, middle_layer, mlp,
+    transpose_middle_layers,
 };
 use crate::flow::options::Precision;
 
@@ -175,14 +175,14 @@ fn computed(context: &Context, units: &Units) -> Result<[Computed; 2], BackendEr
 /// middle layers.
 fn fill(context: &Context, buffers: &Buffers, cut: Cut) {
     let mut random = Random::new(1);
-    let mut parameters = Parameters::xavier(&mut random);
+    let mut parameters = mlp::xavier(&mut random);
     for number in 0..MIDDLE_LAYERS {
         let at = middle_layer(number).bias;
         for bias in &mut parameters.as_mut_slice()[at..at + WIDTH] {
             *bias = random.uniform(-0.1, 0.1) as f32;
         }
     }
-    let mut transposed = Parameters::zeros();
+    let mut transposed = mlp::zeros();
     transpose_middle_layers(&parameters, &mut transposed);
     let mut across = |width: f64| random.uniform(-width, width) as f32;
     let points: Vec<f32> = (0..3 * POINTS).map(|_| across(4.0)).collect();

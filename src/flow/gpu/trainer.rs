@@ -12,10 +12,10 @@ use super::memory::NETWORK_BYTES;
 use super::request::Request;
 use super::tiling::Cut;
 use super::{inference, layout};
-use crate::flow::data::{Control, Point, Progress};
+use crate::flow::data::{Control, Point, Progress, Random};
 use crate::flow::field::{
-    Advance, BackendError, EarlyStopState, FitReport, LAID_OUT, Parameters, Schedule, Trainer,
-    TrainerState, transpose_middle_layers,
+    Advance, BackendError, Conditioning, EarlyStopState, FitReport, LAID_OUT, Parameters, Schedule,
+    Trainer, TrainerState, mlp, transpose_middle_layers,
 };
 use crate::flow::options::{FieldOptions, Precision};
 
@@ -64,6 +64,7 @@ impl Drop for Network {
 /// The network, its optimizer and the distance transform of the target.
 pub(super) struct GpuTrainer<'a> {
     transform: &'a GpuTransform,
+    conditioning: Conditioning,
     schedule: Schedule,
     network: Network,
     /// Offset of the points in the store, in words.
@@ -83,7 +84,9 @@ impl<'a> GpuTrainer<'a> {
         if options.precision == Precision::F16 {
             device.units()?;
         }
-        let (schedule, parameters) = Schedule::new(source, options, seed);
+        let mut random = Random::stream(seed, 0);
+        let parameters = mlp::initial(options.start, &mut random);
+        let schedule = Schedule::new(source, options, &mut random);
         let chunks = Cut::new(schedule.largest_batch()).chunks.count as u64;
         if chunks > device.context.budget.chunks {
             return Err(BackendError::Memory {
@@ -102,6 +105,7 @@ impl<'a> GpuTrainer<'a> {
         let mut trainer = Self {
             transform,
             network: Network::take(device)?,
+            conditioning: Conditioning::new(source, options.inputs),
             schedule,
             points,
             status: Status::default(),
@@ -123,8 +127,8 @@ impl<'a> GpuTrainer<'a> {
             transform: self.transform.record,
             network: self.network.number,
             points: self.points,
-            center: self.schedule.conditioning.center,
-            scale: self.schedule.conditioning.scale,
+            center: self.conditioning.center,
+            scale: self.conditioning.scale,
             margin: loss.margin_m,
             margin_slope: loss.margin_slope,
             truncation: loss.truncation_m.unwrap_or(f32::MAX),
@@ -257,7 +261,7 @@ impl Trainer for GpuTrainer<'_> {
         encoder.copy_buffer_to_buffer(&context.buffers.networks, from, &copy, 0, bytes);
         let read = context.finish(encoder, &copy, bytes)?;
         let array = |array: u64| {
-            let mut parameters = Parameters::zeros();
+            let mut parameters = mlp::zeros();
             let from = (array * NETWORK_BYTES) as usize;
             let bytes = &read[from..from + NETWORK_BYTES as usize];
             bytemuck::cast_slice_mut::<f32, u8>(&mut parameters.as_mut_slice()[..LAID_OUT])
@@ -280,7 +284,7 @@ impl Trainer for GpuTrainer<'_> {
     }
 
     fn restore(&mut self, state: TrainerState) -> Result<(), BackendError> {
-        let mut transposed = Parameters::zeros();
+        let mut transposed = mlp::zeros();
         transpose_middle_layers(&state.parameters, &mut transposed);
         let [means, squares] = &state.moments;
         self.network.write(PARAMETERS, &state.parameters);

@@ -88,7 +88,7 @@ impl Column {
 
 impl Columns {
     /// Whether a point lies in the area.
-    pub(super) fn hold(&self, point: &Point) -> bool {
+    pub(super) fn contains(&self, point: &Point) -> bool {
         reach(point) < self.half_m
     }
 

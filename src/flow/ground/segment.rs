@@ -73,7 +73,7 @@ pub fn segment(points: &[Point], options: &GroundOptions) -> GroundSegmentation 
         let range = point[0].hypot(point[1]).min(GROWTH_M);
         let tolerance = options.height_m + options.height_slope * range;
         let above = surface.above(point);
-        columns.hold(point) && -options.depth_m < above && above < tolerance
+        columns.contains(point) && -options.depth_m < above && above < tolerance
     };
     GroundSegmentation {
         ground: points.iter().map(is_ground).collect(),
@@ -84,7 +84,7 @@ pub fn segment(points: &[Point], options: &GroundOptions) -> GroundSegmentation 
 /// Fits the height field under the columns, coarse to fine. Each level uses only the columns near
 /// the surface so far.
 fn fit(columns: &Columns) -> HeightField {
-    let mut surface = HeightField::level(columns.half_m, TILE_M, around(columns));
+    let mut surface = HeightField::level(columns.half_m, TILE_M, median_height(columns));
     let mut slope = TILT;
     loop {
         let step = surface.step_m();
@@ -118,7 +118,7 @@ fn fit(columns: &Columns) -> HeightField {
 }
 
 /// Approximate height of the ground around the vehicle, metres; 0 where no column is within 20 m.
-fn around(columns: &Columns) -> f32 {
+fn median_height(columns: &Columns) -> f32 {
     let near = columns.columns.iter().map(|column| column.low);
     let near = near.filter(|low| low[0].hypot(low[1]) < AROUND_M);
     let mut heights: Vec<f32> = near.map(|low| low[2]).collect();

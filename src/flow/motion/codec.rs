@@ -104,13 +104,13 @@ fn motion(body: &mut Body<'_>) -> Result<Option<RigidTransform>, EnvelopeError> 
 mod tests {
     use super::*;
     use crate::flow::data::Random;
-    use crate::flow::field::Parameters;
+    use crate::flow::field::mlp;
 
     #[test]
     fn a_field_comes_back_from_its_bytes_and_altered_bytes_are_refused() {
         let motion = RigidTransform::new([1.5, -0.4, 0.1].into(), [0.01, -0.02, 0.3].into());
         let network = Residual::Network(Network {
-            parameters: Parameters::xavier(&mut Random::new(2)),
+            parameters: mlp::xavier(&mut Random::new(2)),
             conditioning: Conditioning {
                 center: [1.0, 2.0, 3.0],
                 scale: 0.1,

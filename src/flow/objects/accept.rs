@@ -17,10 +17,10 @@ pub(super) fn is_needed(
     seen: impl Fn() -> FreeSpaceEvidence,
     options: &ObjectOptions,
 ) -> bool {
-    let around = &found.around;
-    let sweeps = 1.0 + around.weight;
-    let still = (found.still.sum_m() + around.still_m) / sweeps;
-    let moved = (found.cost.sum_m() + around.moved_m) / sweeps;
+    let neighbors = &found.neighbors;
+    let sweeps = 1.0 + neighbors.weight;
+    let still = (found.still.sum_m() + neighbors.still_m) / sweeps;
+    let moved = (found.cost.sum_m() + neighbors.moved_m) / sweeps;
     let gain = (still - moved) * sweeps;
     found.motion.length_m() >= options.min_motion_m
         && found.still.forward_m - found.cost.forward_m >= options.min_gain_m
@@ -31,11 +31,11 @@ pub(super) fn is_needed(
         && !is_flat(points, options)
         && {
             let seen = seen();
-            let stayed = has_stayed(seen, options);
-            !(stayed && seen.far)
-                && (found.hold >= options.min_observability
+            let is_static = has_stayed(seen, options);
+            !(is_static && seen.far)
+                && (found.observability >= options.min_observability
                     || has_gone(seen, options)
-                    || is_confirmed(around, options) && !stayed)
+                    || is_confirmed(neighbors, options) && !is_static)
         }
 }
 
@@ -43,14 +43,14 @@ pub(super) fn is_needed(
 /// seems to slide lies at its old position in all of them, whereas a bus has driven on. The nearest
 /// sweep must confirm the motion by itself, since by the time of a farther one the sliding wall may
 /// coincide with a surface behind it.
-fn is_confirmed(around: &NeighborEvidence, options: &ObjectOptions) -> bool {
+fn is_confirmed(neighbors: &NeighborEvidence, options: &ObjectOptions) -> bool {
     let is_plain = |[still_m, moved_m]: [f32; 2], weight: f32| {
         moved_m <= options.neighbor_cost_ratio * still_m
             && still_m - moved_m >= options.neighbor_gain_m * weight
     };
-    around.weight > 0.0
-        && is_plain(around.nearest_m, 1.0)
-        && is_plain([around.still_m, around.moved_m], around.weight)
+    neighbors.weight > 0.0
+        && is_plain(neighbors.nearest_m, 1.0)
+        && is_plain([neighbors.still_m, neighbors.moved_m], neighbors.weight)
 }
 
 /// Whether the free-space evidence confirms both that a cluster left its old position and that it
@@ -96,8 +96,8 @@ mod tests {
             motion: PlanarMotion::still([0.0; 2]).shifted([0.8, 0.0]),
             cost: cost(0.03, 0.03),
             still: cost(0.25, 0.2),
-            hold: 0.4,
-            around: NeighborEvidence::default(),
+            observability: 0.4,
+            neighbors: NeighborEvidence::default(),
         }
     }
 
@@ -150,12 +150,12 @@ mod tests {
 
     #[test]
     fn a_wall_that_slides_in_its_plane_does_not_move() {
-        assert!(!needed(|found| found.hold = 0.02));
+        assert!(!needed(|found| found.observability = 0.02));
     }
 
     #[test]
     fn a_flat_side_that_is_seen_to_leave_and_to_come_moves_though_nothing_holds_it() {
-        let slides = |seen| needed_as_seen(seen, |found| found.hold = 0.02);
+        let slides = |seen| needed_as_seen(seen, |found| found.observability = 0.02);
         assert!(slides(seen(0.8, 0.8)));
         assert!(!slides(seen(0.9, 0.2)));
         assert!(!slides(seen(0.2, 0.9)));
@@ -180,24 +180,24 @@ mod tests {
 
     #[test]
     fn a_bus_that_all_sweeps_see_driving_moves_though_nothing_holds_it() {
-        let around = |still_m: f32, moved_m: f32| NeighborEvidence {
+        let neighbors = |still_m: f32, moved_m: f32| NeighborEvidence {
             weight: 1.5,
             still_m: still_m * 1.5,
             moved_m: moved_m * 1.5,
             nearest_m: [still_m, moved_m],
         };
-        let slides = |around| {
+        let slides = |neighbors| {
             needed(|found| {
-                found.hold = 0.02;
-                found.around = around;
+                found.observability = 0.02;
+                found.neighbors = neighbors;
             })
         };
-        assert!(slides(around(0.4, 0.05)));
-        assert!(!slides(around(0.08, 0.05)));
-        assert!(!slides(around(0.4, 0.3)));
+        assert!(slides(neighbors(0.4, 0.05)));
+        assert!(!slides(neighbors(0.08, 0.05)));
+        assert!(!slides(neighbors(0.4, 0.3)));
         let far = NeighborEvidence {
             nearest_m: [0.05; 2],
-            ..around(0.4, 0.05)
+            ..neighbors(0.4, 0.05)
         };
         assert!(!slides(far));
         // Nor one that stayed by the free-space evidence, however short the displacement.
@@ -207,13 +207,13 @@ mod tests {
                 ..seen(0.1, 0.1)
             };
             needed_as_seen(seen, |found| {
-                (found.hold, found.around) = (0.02, around(0.4, 0.05));
+                (found.observability, found.neighbors) = (0.02, neighbors(0.4, 0.05));
             })
         };
         assert!(!stays(true) && !stays(false));
         // A motion of sufficient observability is rejected where the neighbor sweeps show a static
         // cluster.
-        assert!(!needed(|found| found.around = around(0.05, 0.5)));
+        assert!(!needed(|found| found.neighbors = neighbors(0.05, 0.5)));
     }
 
     #[test]

@@ -34,17 +34,17 @@ pub(super) struct Assignment {
 /// Assigns the accepted hypotheses `needed`, one entry a cluster, to clusters and points.
 pub(super) fn spread(
     scene: &Scene<'_>,
-    around: &[NeighborView<'_>],
+    neighbors: &[NeighborView<'_>],
     needed: &[Option<Hypothesis>],
 ) -> Assignment {
     let cluster_motion: Vec<u32> = (0..needed.len() as u32)
         .into_par_iter()
-        .map(|cluster| leader(scene, around, needed, cluster))
+        .map(|cluster| leader(scene, neighbors, needed, cluster))
         .collect();
     // For each point, by how much the motion of its cluster increases its distance to the target,
     // metres.
     let points = scene.source.labels.par_iter().zip(&scene.source.points);
-    let worse_m: Vec<f32> = points
+    let residual_m: Vec<f32> = points
         .map(|(&label, &place)| {
             let leader = cluster_motion.get(label as usize).copied().unwrap_or(NOISE);
             let found = needed.get(leader as usize).and_then(Option::as_ref);
@@ -61,7 +61,7 @@ pub(super) fn spread(
             label => {
                 let leader = cluster_motion[label as usize];
                 match needed.get(leader as usize).and_then(Option::as_ref) {
-                    Some(_) if is_of(scene, row, &worse_m) => leader,
+                    Some(_) if is_of(scene, row, &residual_m) => leader,
                     _ => NOISE,
                 }
             }
@@ -77,7 +77,7 @@ pub(super) fn spread(
 /// none.
 fn leader(
     scene: &Scene<'_>,
-    around: &[NeighborView<'_>],
+    neighbors: &[NeighborView<'_>],
     needed: &[Option<Hypothesis>],
     cluster: u32,
 ) -> u32 {
@@ -87,7 +87,7 @@ fn leader(
     let mut beside: Vec<u32> = Vec::new();
     for row in stride_sample(members, LOOKING) {
         let place = scene.source.points[row as usize];
-        scene.source_around(place, scene.options.match_m, |other| {
+        scene.source_within(place, scene.options.match_m, |other| {
             let label = scene.source.labels[other as usize];
             if label != NOISE && label != cluster && needed[label as usize].is_some() {
                 beside.push(label);
@@ -100,8 +100,8 @@ fn leader(
     if beside.is_empty() {
         return if own.is_some() { cluster } else { NOISE };
     }
-    let mover = ClusterSearch::new(scene, around, cluster);
-    let cost = |motion: &PlanarMotion| mover.cost(motion).sum_m() + mover.around_m(motion);
+    let mover = ClusterSearch::new(scene, neighbors, cluster);
+    let cost = |motion: &PlanarMotion| mover.cost(motion).sum_m() + mover.neighbor_cost_m(motion);
     let still = cost(&PlanarMotion::still([0.0; 2]));
     let mut best = match own {
         Some(found) => (cost(&found.motion) + BETTER_M, cluster),
@@ -122,7 +122,7 @@ fn leader(
 fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Hypothesis>], row: u32) -> u32 {
     let place = scene.source.points[row as usize];
     let mut beside: Vec<u32> = Vec::new();
-    scene.source_around(place, scene.options.match_m, |other| {
+    scene.source_within(place, scene.options.match_m, |other| {
         let label = scene.source.labels[other as usize];
         if label != NOISE && needed[label as usize].is_some() {
             beside.push(label);
@@ -145,17 +145,17 @@ fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Hypothesis>], row: u32) -
     best.1
 }
 
-/// Whether a point follows the motion of its cluster: the mean of `worse_m` over the points of the
+/// Whether a point follows the motion of its cluster: the mean of `residual_m` over the points of the
 /// cluster around it is at most `point_reject_m`.
-fn is_of(scene: &Scene<'_>, row: u32, worse_m: &[f32]) -> bool {
+fn is_of(scene: &Scene<'_>, row: u32, residual_m: &[f32]) -> bool {
     let label = scene.source.labels[row as usize];
     let center = scene.source.points[row as usize];
     let (mut worse, mut count) = (0.0, 0.0_f32);
-    scene.source_around(center, VOTE_M, |other| {
+    scene.source_within(center, VOTE_M, |other| {
         let place = scene.source.points[other as usize];
         let near = (0..3).map(|a| (place[a] - center[a]).powi(2)).sum::<f32>();
         if scene.source.labels[other as usize] == label && near < VOTE_M * VOTE_M {
-            worse += worse_m[other as usize];
+            worse += residual_m[other as usize];
             count += 1.0;
         }
     });

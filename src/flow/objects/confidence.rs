@@ -1,7 +1,7 @@
 //! Confidence of a point's flow: the probability that its end-point error is below [`CONFIDENT_WITHIN_M`].
 //!
 //! Logistic regressions on the features: one for moving points, one for static points and one for
-//! ground. They are fitted to labelled and simulated pairs (`examples/confidence.rs`,
+//! ground. They are fitted to labelled and simulated pairs (`benches/accuracy/confidence.rs`,
 //! `docs/experiments/confidence.md`).
 
 use super::features::ConfidenceFeatures;
@@ -55,7 +55,7 @@ impl ConfidenceFeatures {
 
     /// The probability, 0 to 1, that the end-point error of the point's flow is below
     /// [`CONFIDENT_WITHIN_M`]: a logistic regression on the features, with separate weights for moving
-    /// and static points. The weights are fitted by `examples/confidence.rs`; see
+    /// and static points. The weights are fitted by `benches/accuracy/confidence.rs`; see
     /// `docs/experiments/confidence.md`.
     pub fn confidence(&self) -> f32 {
         let weights = if self.moves { &MOVING } else { &STANDING };

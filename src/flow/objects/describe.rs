@@ -80,11 +80,11 @@ impl Objects {
                 ..Cluster::default()
             };
             let Some(motion) = motion else {
-                cluster.bounds = OrientedBox::around(&points, None);
+                cluster.bounds = OrientedBox::enclosing(&points, None);
                 return cluster;
             };
             // The displacement depends little on the exact center.
-            let center = OrientedBox::around(&points, None).center;
+            let center = OrientedBox::enclosing(&points, None).center;
             let way = search
                 .motions
                 .displacement(motion, transform_point(ego, center));
@@ -92,7 +92,7 @@ impl Objects {
             let [x, y, z] = [way.x, way.y, way.z].map(|c| c as f32);
             cluster.velocity = [x, y, z].map(|c| c / dt_s);
             cluster.yaw_rate = search.motions.turn(motion) / dt_s;
-            cluster.bounds = OrientedBox::around(&points, Some([x, y]));
+            cluster.bounds = OrientedBox::enclosing(&points, Some([x, y]));
             cluster.dynamic = x.hypot(y) >= DYNAMIC_M;
             cluster
         });

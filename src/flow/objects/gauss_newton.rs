@@ -26,10 +26,10 @@ const SHORT_STEP_M: f64 = 1e-3;
 
 impl ClusterSearch<'_> {
     /// Fits the motion of the cluster's points `rows`, from `start`, to the target and to the
-    /// neighbor sweeps `around` in at most `steps` steps. A rotation is fitted only if `turned`.
+    /// neighbor sweeps `neighbors` in at most `steps` steps. A rotation is fitted only if `turned`.
     pub(super) fn fitted(
         &self,
-        around: &[NeighborView<'_>],
+        neighbors: &[NeighborView<'_>],
         rows: &[u32],
         start: &PlanarMotion,
         turned: bool,
@@ -38,7 +38,7 @@ impl ClusterSearch<'_> {
         let mut motion = *start;
         let mut views = vec![(self.scene, 1, 1.0)];
         views.extend(
-            around
+            neighbors
                 .iter()
                 .map(|moment| (&moment.scene, moment.at, moment.weight)),
         );
@@ -132,7 +132,7 @@ impl Sums {
         // itself.
         let [tx, ty] = [self.swing[0] - ry, self.swing[1] + rx];
         let normal = scene.normal(target);
-        let leak = if normal == [0.0; 3] {
+        let tangential_weight = if normal == [0.0; 3] {
             1.0
         } else {
             scene.options.tangential_weight
@@ -147,8 +147,14 @@ impl Sums {
                 ],
                 along,
             ),
-            ([leak * k, 0.0, leak * tx], leak * away[0]),
-            ([0.0, leak * k, leak * ty], leak * away[1]),
+            (
+                [tangential_weight * k, 0.0, tangential_weight * tx],
+                tangential_weight * away[0],
+            ),
+            (
+                [0.0, tangential_weight * k, tangential_weight * ty],
+                tangential_weight * away[1],
+            ),
         ];
         for (jacobian, residual) in rows {
             let jacobian = Vector3::from(jacobian.map(f64::from));

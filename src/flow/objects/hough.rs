@@ -49,7 +49,7 @@ impl TranslationVotes {
         let mut votes = vec![0_u32; (side * side) as usize];
         let mut last = vec![u32::MAX; votes.len()];
         for (&point, voter) in points.iter().zip(0..) {
-            self.near.square_around(
+            self.near.within_square(
                 point,
                 self.half as f32 * self.bin_m,
                 self.within_m,

@@ -15,7 +15,7 @@ use crate::flow::data::{Point, square_distance, stride_sample};
 /// Points of a cluster that vote, that are fitted from an initial guess, and that costs are
 /// computed from.
 const VOTERS: usize = 64;
-const FITTED: usize = 100;
+const MAX_FIT_POINTS: usize = 100;
 const JUDGED: usize = 200;
 /// Points between two checks of whether a cost is already too high.
 const JUDGED_AT_ONCE: usize = 16;
@@ -55,9 +55,9 @@ pub(super) struct Hypothesis {
     /// Cost of standing still.
     pub(super) still: Cost,
     /// Observability: how well the cluster's surfaces determine the motion along itself, 0 to 1.
-    pub(super) hold: f32,
+    pub(super) observability: f32,
     /// Evidence of the neighbor sweeps.
-    pub(super) around: NeighborEvidence,
+    pub(super) neighbors: NeighborEvidence,
 }
 
 /// Costs of a cluster's motion in the neighbor sweeps that show the cluster, moved or standing
@@ -105,7 +105,7 @@ impl BestHypothesis {
         if here_m >= self.value_m {
             return;
         }
-        let value_m = here_m + mover.around_m(&motion);
+        let value_m = here_m + mover.neighbor_cost_m(&motion);
         if value_m < self.value_m {
             *self = Self {
                 motion,
@@ -119,16 +119,20 @@ impl BestHypothesis {
 /// One cluster, and the sweeps in which its motion is evaluated.
 pub(super) struct ClusterSearch<'a> {
     pub(super) scene: &'a Scene<'a>,
-    around: &'a [NeighborView<'a>],
+    neighbors: &'a [NeighborView<'a>],
     pub(super) cluster: u32,
     rows: Vec<u32>,
 }
 
 impl<'a> ClusterSearch<'a> {
-    pub(super) fn new(scene: &'a Scene<'a>, around: &'a [NeighborView<'a>], cluster: u32) -> Self {
+    pub(super) fn new(
+        scene: &'a Scene<'a>,
+        neighbors: &'a [NeighborView<'a>],
+        cluster: u32,
+    ) -> Self {
         Self {
             scene,
-            around,
+            neighbors,
             cluster,
             rows: stride_sample(&scene.source.members[cluster as usize], JUDGED),
         }
@@ -158,7 +162,7 @@ impl<'a> ClusterSearch<'a> {
         if still.forward_m < options.static_fit_m {
             return None;
         }
-        let few = stride_sample(members, FITTED);
+        let few = stride_sample(members, MAX_FIT_POINTS);
         let way_m = |motion: &PlanarMotion| options.displacement_penalty * motion.length_m();
         let mut best = BestHypothesis::none();
         let mut fit_from = |start: &PlanarMotion| {
@@ -192,7 +196,7 @@ impl<'a> ClusterSearch<'a> {
             return None;
         }
         let motion = self.fitted(
-            self.around,
+            self.neighbors,
             &self.rows,
             &best.motion,
             members.len() >= TURNED,
@@ -203,8 +207,8 @@ impl<'a> ClusterSearch<'a> {
             motion,
             cost,
             still,
-            hold: self.hold(&motion),
-            around: self.witnesses(&motion),
+            observability: self.observability(&motion),
+            neighbors: self.witnesses(&motion),
         })
     }
 
@@ -215,13 +219,13 @@ impl<'a> ClusterSearch<'a> {
         for shift_m in SHIFTS_M {
             for _ in 0..TRIES {
                 let center = best.motion;
-                let around = [
+                let neighbors = [
                     [shift_m, 0.0],
                     [-shift_m, 0.0],
                     [0.0, shift_m],
                     [0.0, -shift_m],
                 ];
-                for motion in around.map(|shift| center.shifted(shift)) {
+                for motion in neighbors.map(|shift| center.shifted(shift)) {
                     best.consider(self, motion, 0.0);
                 }
                 if best.motion == center {
@@ -260,7 +264,7 @@ impl<'a> ClusterSearch<'a> {
     fn witnesses(&self, motion: &PlanarMotion) -> NeighborEvidence {
         let mut all = NeighborEvidence::default();
         let still = PlanarMotion::still(motion.center);
-        for (place, moment) in self.around.iter().enumerate() {
+        for (place, moment) in self.neighbors.iter().enumerate() {
             let [moved, still] =
                 [moment.by_then(motion), still].map(|m| self.cost_in(&moment.scene, &m));
             if place == 0 {
@@ -277,8 +281,8 @@ impl<'a> ClusterSearch<'a> {
     }
 
     /// Weighted sum of the costs of a motion in the neighbor sweeps, metres.
-    pub(super) fn around_m(&self, motion: &PlanarMotion) -> f32 {
-        let costs = self.around.iter().map(|moment| {
+    pub(super) fn neighbor_cost_m(&self, motion: &PlanarMotion) -> f32 {
+        let costs = self.neighbors.iter().map(|moment| {
             moment.weight * self.cost_in(&moment.scene, &moment.by_then(motion)).sum_m()
         });
         costs.sum()
@@ -318,7 +322,7 @@ impl<'a> ClusterSearch<'a> {
     /// Observability of a motion: the mean square of the cluster's normals along its translation, 0
     /// for a wall that slides in its own plane, 1 for one that moves along its normal. Points
     /// without a normal count as a third in every direction.
-    pub(super) fn hold(&self, motion: &PlanarMotion) -> f32 {
+    pub(super) fn observability(&self, motion: &PlanarMotion) -> f32 {
         let length = motion.length_m().max(f32::MIN_POSITIVE);
         let [x, y] = motion.shift_m.map(|c| c / length);
         let mut sum = 0.0;

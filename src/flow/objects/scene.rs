@@ -144,9 +144,9 @@ impl<'a> Scene<'a> {
 
     /// Calls `see` with every source point within `within_m` metres of `place`, with scaled
     /// heights. `within_m` is at most `match_m`.
-    pub(super) fn source_around(&self, place: Point, within_m: f32, mut see: impl FnMut(u32)) {
+    pub(super) fn source_within(&self, place: Point, within_m: f32, mut see: impl FnMut(u32)) {
         let place = lowered(place, self.options);
-        self.source.near.around(place, within_m, |row, _| see(row));
+        self.source.near.within(place, within_m, |row, _| see(row));
     }
 
     /// Distance from `place` to the target for a point of `cluster`, metres, truncated. With
@@ -167,7 +167,7 @@ impl<'a> Scene<'a> {
         for &row in rows {
             let place = lowered(motion.apply(self.source.points[row as usize]), self.options);
             self.near_target
-                .around_unseen(place, within_m, &mut seen, |row| {
+                .within_unseen(place, within_m, &mut seen, |row| {
                     let owner = self.taken[row as usize];
                     if owner == NOISE || owner == cluster {
                         touched[row as usize / 64] |= 1 << (row % 64);
@@ -224,7 +224,7 @@ fn normal(near: &ColumnIndex, point: Point, options: &ObjectOptions) -> Point {
     let [base, slope] = options.normal_m;
     let radius = (base + slope * range).min(options.match_m);
     let mut neighborhood = Neighborhood::of(point);
-    near.around(point, radius, |_, other| neighborhood.add(other));
+    near.within(point, radius, |_, other| neighborhood.add(other));
     let flat = neighborhood.flat();
     flat.map_or([0.0; 3], |flat| flat.normal)
 }

@@ -115,7 +115,7 @@ pub(crate) fn find_objects(
     let scene = Scene::new(&downsampled, target, options);
     let free_space = FreeSpace::new(clouds.sweeps, &clouds.target_from_source);
     let votes = TranslationVotes::new(&scene);
-    let around: Vec<NeighborView<'_>> = clouds
+    let neighbors: Vec<NeighborView<'_>> = clouds
         .neighbors
         .par_iter()
         .map(|sweep| NeighborView::new(&downsampled, sweep, options))
@@ -124,7 +124,7 @@ pub(crate) fn find_objects(
 
     let views = Views {
         scene: &scene,
-        neighbors: &around,
+        neighbors: &neighbors,
         free_space: &free_space,
         votes: &votes,
     };
@@ -135,7 +135,7 @@ pub(crate) fn find_objects(
         interrupted,
     } = search_all(&views, rest, control);
     let needed: Vec<_> = searched.iter().map(SearchedCluster::found).collect();
-    let spread = assign::spread(&scene, &around, &needed);
+    let spread = assign::spread(&scene, &neighbors, &needed);
     let (movers, numbers) = numbered(&needed);
     let number = |cluster: &u32| numbers.get(*cluster as usize).copied().unwrap_or(NOISE);
     let point_motion: Vec<u32> = spread.point_motion.iter().map(number).collect();

@@ -210,9 +210,9 @@ impl Sums {
             eigenvectors,
         } = self.normal.symmetric_eigen();
         let mut update = Vector6::zeros();
-        for (axis, &hold) in eigenvectors.column_iter().zip(&eigenvalues) {
-            if hold > FREE * self.held.max(1.0) {
-                update -= axis * (axis.dot(&self.gradient) / hold);
+        for (axis, &eigenvalue) in eigenvectors.column_iter().zip(&eigenvalues) {
+            if eigenvalue > FREE * self.held.max(1.0) {
+                update -= axis * (axis.dot(&self.gradient) / eigenvalue);
             }
         }
         update

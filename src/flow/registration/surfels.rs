@@ -75,7 +75,7 @@ impl Columns {
     }
 
     /// The points of the nine columns around `point`: three ranges.
-    fn around(&self, point: Point) -> [Range<usize>; 3] {
+    fn within(&self, point: Point) -> [Range<usize>; 3] {
         let middle = column(point, self.cell_m);
         let (x, y) = (middle >> 32, middle & u64::from(u32::MAX));
         let begin = |x: u64, y: u64| {
@@ -89,7 +89,7 @@ impl Columns {
 
     fn flat_at(&self, point: Point) -> Option<PlaneFit> {
         let mut neighborhood = Neighborhood::of(point);
-        for row in self.around(point) {
+        for row in self.within(point) {
             for &other in &self.points[row] {
                 if square_distance(point, other) < self.cell_m * self.cell_m {
                     neighborhood.add(other);
@@ -141,7 +141,7 @@ impl AllSurfels<'_> {
         let points = &self.columns.points;
         let mut nearest = None;
         let mut least = within_m * within_m;
-        for row in self.columns.around(point) {
+        for row in self.columns.within(point) {
             for (other, i) in points[row.clone()].iter().zip(row) {
                 let square = square_distance(point, *other);
                 if square < least {

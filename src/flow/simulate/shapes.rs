@@ -26,7 +26,7 @@ pub(super) struct Hit {
 
 /// The interval of a ray inside a set. `cosine` belongs to its start.
 #[derive(Clone, Copy)]
-struct Stretch {
+struct Interval {
     enter: f64,
     exit: f64,
     cosine: f64,
@@ -67,26 +67,26 @@ impl Shape {
     }
 }
 
-fn overlap(a: Option<Stretch>, b: Option<Stretch>) -> Option<Stretch> {
+fn overlap(a: Option<Interval>, b: Option<Interval>) -> Option<Interval> {
     let (a, b) = (a?, b?);
     let later = if a.enter >= b.enter { a } else { b };
-    Some(Stretch {
+    Some(Interval {
         exit: a.exit.min(b.exit),
         ..later
     })
 }
 
 /// The interval within `half` of zero along one axis.
-fn slab(origin: f64, direction: f64, half: f64) -> Option<Stretch> {
+fn slab(origin: f64, direction: f64, half: f64) -> Option<Interval> {
     if direction == 0.0 {
-        return (origin.abs() <= half).then_some(Stretch {
+        return (origin.abs() <= half).then_some(Interval {
             enter: f64::NEG_INFINITY,
             exit: f64::INFINITY,
             cosine: 0.0,
         });
     }
     let (a, b) = ((-half - origin) / direction, (half - origin) / direction);
-    Some(Stretch {
+    Some(Interval {
         enter: a.min(b),
         exit: a.max(b),
         cosine: direction.abs(),
@@ -94,30 +94,30 @@ fn slab(origin: f64, direction: f64, half: f64) -> Option<Stretch> {
 }
 
 /// The interval within an infinite upright cylinder.
-fn mantle(origin: &Vector3<f64>, direction: &Vector3<f64>, radius: f64) -> Option<Stretch> {
+fn mantle(origin: &Vector3<f64>, direction: &Vector3<f64>, radius: f64) -> Option<Interval> {
     let (o, d) = (origin.xy(), direction.xy());
     let inside = o.norm_squared() - radius * radius;
     if d.norm_squared() == 0.0 {
-        return (inside <= 0.0).then_some(Stretch {
+        return (inside <= 0.0).then_some(Interval {
             enter: f64::NEG_INFINITY,
             exit: f64::INFINITY,
             cosine: 0.0,
         });
     }
     let [enter, exit] = roots(d.norm_squared(), o.dot(&d), inside)?;
-    Some(Stretch {
+    Some(Interval {
         enter,
         exit,
         cosine: ((o + d * enter).dot(&d) / radius).abs(),
     })
 }
 
-fn ellipsoid(origin: &Vector3<f64>, direction: &Vector3<f64>, half: [f64; 3]) -> Option<Stretch> {
+fn ellipsoid(origin: &Vector3<f64>, direction: &Vector3<f64>, half: [f64; 3]) -> Option<Interval> {
     let half = Vector3::from(half);
     let (o, d) = (origin.component_div(&half), direction.component_div(&half));
     let [enter, exit] = roots(d.norm_squared(), o.dot(&d), o.norm_squared() - 1.0)?;
     let normal = (o + d * enter).component_div(&half).normalize();
-    Some(Stretch {
+    Some(Interval {
         enter,
         exit,
         cosine: normal.dot(direction).abs(),

@@ -67,8 +67,8 @@ impl ColumnIndex {
     /// Calls `see` with the input row and the coordinates of every point less than `within_m`
     /// metres from `center`. `within_m` is at most a column's side.
     #[inline]
-    pub(crate) fn around(&self, center: Point, within_m: f32, mut see: impl FnMut(u32, Point)) {
-        self.columns_around(center, within_m, |places| {
+    pub(crate) fn within(&self, center: Point, within_m: f32, mut see: impl FnMut(u32, Point)) {
+        self.columns_within(center, within_m, |places| {
             let rows = self.rows[places.clone()].iter();
             for (&point, &row) in self.points[places].iter().zip(rows) {
                 if point[2] > center[2] + within_m {
@@ -81,16 +81,16 @@ impl ColumnIndex {
         });
     }
 
-    /// Calls `see` with the input row of every point that [`Self::around`] gives and that is not in
+    /// Calls `see` with the input row of every point that [`Self::within`] gives and that is not in
     /// `seen`, and adds these points to `seen`.
-    pub(crate) fn around_unseen(
+    pub(crate) fn within_unseen(
         &self,
         center: Point,
         within_m: f32,
         seen: &mut EarlyStopState,
         mut see: impl FnMut(u32),
     ) {
-        self.columns_around(center, within_m, |mut places| {
+        self.columns_within(center, within_m, |mut places| {
             while let Some(unseen) = seen.next_unseen(places.clone()) {
                 let point = self.points[unseen];
                 if point[2] > center[2] + within_m {
@@ -108,7 +108,7 @@ impl ColumnIndex {
     /// Calls `see` with the range of the points of each column that may lie within `within_m` of
     /// `center`. A range starts at the first point that is high enough.
     #[inline]
-    fn columns_around(&self, center: Point, within_m: f32, mut see: impl FnMut(Range<usize>)) {
+    fn columns_within(&self, center: Point, within_m: f32, mut see: impl FnMut(Range<usize>)) {
         let neighbors = Neighbors::of(center, self.column_m);
         for offset in OFFSETS {
             if neighbors.square_gap(offset) > within_m * within_m {
@@ -128,7 +128,7 @@ impl ColumnIndex {
 
     /// Calls `see` with every point of the columns that touch the square of half side `half_m`
     /// around `center`, at most `height_m` higher or lower. Metres.
-    pub(crate) fn square_around(
+    pub(crate) fn within_square(
         &self,
         center: Point,
         half_m: f32,
@@ -348,11 +348,11 @@ mod tests {
                 let inside = |&(square, _): &(f32, u32)| square < within_m * within_m;
                 let all = cloud.iter().map(square).zip(0..).filter(inside);
                 let mut all: Vec<(f32, u32)> = all.collect();
-                let mut around = Vec::new();
-                near.around(asked, within_m, |row, _| around.push(row));
-                around.sort_unstable();
+                let mut within = Vec::new();
+                near.within(asked, within_m, |row, _| within.push(row));
+                within.sort_unstable();
                 let rows: Vec<u32> = all.iter().map(|&(_, row)| row).collect();
-                assert_eq!(around, rows);
+                assert_eq!(within, rows);
                 all.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
                 let first = all.first().map(|&(square, row)| (row, square));
                 assert_eq!(near.nearest(asked, within_m, |_| true), first);
@@ -369,7 +369,7 @@ mod tests {
         let places: Vec<Point> = (0..40).map(|_| point()).collect();
         let (mut seen, mut rows) = (near.unseen(), Vec::new());
         for &place in &places {
-            near.around_unseen(place, 0.7, &mut seen, |row| rows.push(row));
+            near.within_unseen(place, 0.7, &mut seen, |row| rows.push(row));
         }
         rows.sort_unstable();
         let is_near = |point: &Point| places.iter().any(|&p| square_distance(p, *point) < 0.49);
@@ -391,7 +391,7 @@ mod tests {
                 && (other[2] - asked[2]).abs() <= 0.5
         };
         let mut seen = 0;
-        near.square_around(asked, 1.5, 0.5, |other| {
+        near.within_square(asked, 1.5, 0.5, |other| {
             assert!(inside(&other, 1.5 + 0.4), "{other:?}");
             seen += usize::from(inside(&other, 1.5));
         });

@@ -47,7 +47,7 @@ pub(crate) fn clusters(points: &[Point], radius_m: f32, least: usize) -> Vec<u32
             }
             let touches =
                 |&a: &u32, other: usize| cores[other].iter().any(|&b| distance(a, b) <= square);
-            let later = grid.around(cell).into_iter().filter(|&other| other > cell);
+            let later = grid.within(cell).into_iter().filter(|&other| other > cell);
             later
                 .filter(|&other| cores[cell].iter().any(|a| touches(a, other)))
                 .collect()
@@ -65,7 +65,7 @@ pub(crate) fn clusters(points: &[Point], radius_m: f32, least: usize) -> Vec<u32
         .collect();
     let beside = |cell: usize, row: u32| {
         let mut best = (f32::INFINITY, NOISE);
-        for other in grid.around(cell) {
+        for other in grid.within(cell) {
             for &core in &cores[other] {
                 let far = distance(row, core);
                 if far <= square && far < best.0 {
@@ -179,7 +179,7 @@ impl<'a> Cells<'a> {
     }
 
     /// The cells that may hold points within the radius of this cell's points, this cell included.
-    fn around(&self, cell: usize) -> Vec<usize> {
+    fn within(&self, cell: usize) -> Vec<usize> {
         let key = self.cells[cell].0;
         let (column, z) = (key >> HEIGHT, key & ((1 << HEIGHT) - 1));
         let mut found = Vec::with_capacity(32);
@@ -209,9 +209,9 @@ impl<'a> Cells<'a> {
         if members.len() >= least {
             return vec![true; members.len()];
         }
-        let around = self.around(cell);
+        let within = self.within(cell);
         let is_core = |&row: &u32| {
-            let near = around.iter().flat_map(|&other| self.members(other));
+            let near = within.iter().flat_map(|&other| self.members(other));
             near.filter(|&&other| {
                 square_distance(self.points[row as usize], self.points[other as usize]) <= square
             })

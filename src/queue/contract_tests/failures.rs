@@ -116,7 +116,7 @@ pub(crate) async fn a_crash_keeps_promises_and_forgets_what_nobody_waits_for(
     assert_eq!(state(&queue, &ended).await, State::Succeeded);
     let gone = queue.job(&awaited.tenant, awaited.id).await;
     assert_eq!(gone, Err(QueueError::NotFound));
-    let forgotten = |event: &Event| matches!(event, Event::Forgotten(id) if *id == awaited.id);
+    let forgotten = |event: &Event| matches!(event, Event::Deleted(id) if *id == awaited.id);
     let mut told = false;
     while let Ok(event) = events.try_recv() {
         told |= forgotten(&event);
@@ -185,7 +185,7 @@ pub(crate) async fn ended_jobs_are_kept_for_a_while_and_then_forgotten(stand: &m
     let mut forgotten = Vec::new();
     while forgotten.len() < 2 {
         let event = timeout(PATIENCE, events.recv()).await.expect("in time");
-        if let Some(Event::Forgotten(id)) = event {
+        if let Some(Event::Deleted(id)) = event {
             forgotten.push(id);
         }
     }

@@ -19,11 +19,11 @@ fn chain(pairs: u32) -> Submission {
 
 /// A sequence of two chains of two pairs, one of them backward, and a closing job.
 fn closing() -> Submission {
-    let back = |index, follows| PairOf {
+    let back = |index, chained| PairOf {
         index,
         backward: true,
-        sees: [index, index + 2],
-        follows,
+        window: [index, index + 2],
+        chained,
     };
     Submission {
         pairs: vec![
@@ -32,7 +32,7 @@ fn closing() -> Submission {
             back(1, false),
             back(0, true),
         ],
-        closing_seconds: Some(5.0),
+        finalizer_seconds: Some(5.0),
         ..sequence(0)
     }
 }

@@ -150,7 +150,7 @@ pub(crate) async fn a_pair_says_which_sweeps_it_is_of_and_found_from(stand: &mut
     let (queue, _events) = stand.open(QueueOptions::default());
     let amid = PairOf {
         index: 2,
-        sees: [0, 5],
+        window: [0, 5],
         ..PairOf::ALONE
     };
     let alone = Submission {
@@ -159,7 +159,7 @@ pub(crate) async fn a_pair_says_which_sweeps_it_is_of_and_found_from(stand: &mut
     };
     submit(&queue, alone).await;
     let held = lease(&queue).await;
-    assert_eq!((held.job.index, held.job.sees), (2, [0, 5]));
+    assert_eq!((held.job.index, held.job.window), (2, [0, 5]));
     assert_eq!(held.job.sweeps(), (held.job.id, [2, 3]));
     let of_sequence = Submission {
         pairs: vec![PairOf {
@@ -170,7 +170,7 @@ pub(crate) async fn a_pair_says_which_sweeps_it_is_of_and_found_from(stand: &mut
     };
     let job = submit(&queue, of_sequence).await;
     let held = lease(&queue).await;
-    assert_eq!((held.job.index, held.job.sees), (2, [0, 5]));
+    assert_eq!((held.job.index, held.job.window), (2, [0, 5]));
     assert_eq!(held.job.sweeps(), (job.id, [3, 2]));
 }
 

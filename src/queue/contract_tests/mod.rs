@@ -189,11 +189,11 @@ fn sequence(pairs: u32) -> Submission {
     }
 }
 
-fn forward(index: u32, follows: bool) -> PairOf {
+fn forward(index: u32, chained: bool) -> PairOf {
     PairOf {
         index,
         backward: false,
-        sees: [index, index + 2],
-        follows,
+        window: [index, index + 2],
+        chained,
     }
 }

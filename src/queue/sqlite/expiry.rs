@@ -136,13 +136,13 @@ fn forget_or_keep(
 /// Removes an ended job and its pairs.
 fn forget(connection: &Connection, effects: &mut Effects, id: JobId) -> Result<(), QueueError> {
     for pair in rows::pairs(connection, id)? {
-        effects.events.push(Event::Forgotten(pair.id));
+        effects.events.push(Event::Deleted(pair.id));
     }
     let sql = "DELETE FROM jobs WHERE parent = ?1";
     connection.prepare_cached(sql)?.execute([id.as_bytes()])?;
     let sql = "DELETE FROM jobs WHERE id = ?1";
     connection.prepare_cached(sql)?.execute([id.as_bytes()])?;
-    effects.events.push(Event::Forgotten(id));
+    effects.events.push(Event::Deleted(id));
     Ok(())
 }
 

@@ -8,7 +8,7 @@ use super::shared::Shared;
 use super::writer::Writer;
 use crate::job::JobId;
 use crate::job::JobProgress;
-use crate::queue::lease::Heart;
+use crate::queue::lease::HeartbeatStore;
 use crate::queue::types::QueueOptions;
 use crate::sync::locked;
 
@@ -27,7 +27,7 @@ pub(super) struct SqliteHeartbeat {
     pub(super) latest: Mutex<Option<JobProgress>>,
 }
 
-impl Heart for SqliteHeartbeat {
+impl HeartbeatStore for SqliteHeartbeat {
     fn beat(&self, progress: Option<JobProgress>) {
         if let Some(progress) = progress {
             *locked(&self.latest) = Some(progress);

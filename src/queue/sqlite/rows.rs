@@ -128,7 +128,7 @@ pub(super) fn job(row: &Row<'_>) -> rusqlite::Result<Job> {
         after: after.map(JobId::from_bytes),
         has_dependents: row.get(30)?,
         ready: moment(31)?,
-        sees: [row.get(32)?, row.get(33)?],
+        window: [row.get(32)?, row.get(33)?],
         crashes: row.get(34)?,
     })
 }

@@ -361,7 +361,7 @@ impl SqliteQueue {
                 Arc::new(flags)
             }
         };
-        let heart = SqliteHeartbeat {
+        let store = SqliteHeartbeat {
             id: job.id,
             attempt: job.attempt,
             writer: self.writer.clone(),
@@ -372,7 +372,7 @@ impl SqliteQueue {
         };
         Lease {
             job,
-            heartbeat: LeaseHeartbeat::new(flags, Arc::new(heart)),
+            heartbeat: LeaseHeartbeat::new(flags, Arc::new(store)),
         }
     }
 }

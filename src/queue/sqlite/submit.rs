@@ -59,9 +59,9 @@ pub(super) fn submit(
                     kind: Kind::Pair,
                     pair: *of,
                     pairs: Vec::new(),
-                    closing_seconds: None,
-                    after: before.filter(|_| of.follows),
-                    has_dependents: next.is_some_and(|next| next.follows),
+                    finalizer_seconds: None,
+                    after: before.filter(|_| of.chained),
+                    has_dependents: next.is_some_and(|next| next.chained),
                     idempotency: None,
                     ..submission.clone()
                 };
@@ -106,7 +106,7 @@ fn insert(
         .unwrap_or_else(|| now.after(options.time_to_live));
     let cost = match submission.kind {
         Kind::Pair => submission.cost_seconds,
-        Kind::Sequence => submission.closing_seconds.unwrap_or(0.0),
+        Kind::Sequence => submission.finalizer_seconds.unwrap_or(0.0),
     };
     let is_ready = is_pair && !fair_queue::is_held_back(connection, submission.after)?;
     let sql = format!(
@@ -145,9 +145,9 @@ fn insert(
             submission.after.map(|after| *after.as_bytes()),
             submission.has_dependents,
             is_ready.then_some(now.as_millis()),
-            submission.closing_seconds.is_some(),
-            submission.pair.sees[0],
-            submission.pair.sees[1],
+            submission.finalizer_seconds.is_some(),
+            submission.pair.window[0],
+            submission.pair.window[1],
         ],
         rows::job,
     )?;

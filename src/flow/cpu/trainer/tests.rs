@@ -8,8 +8,7 @@ use crate::flow::cpu::isa::Isa;
 use crate::flow::data::{Random, Uncontrolled};
 use crate::flow::distance::{DistanceOptions, DistanceTransform};
 use crate::flow::field::{Backend, MOST_POINTS, Transform, first_losses};
-use crate::flow::options::FieldOptions;
-use crate::flow::options::Preset;
+use crate::flow::options::{FieldOptions, Preset};
 
 /// Records the losses.
 #[derive(Default)]
@@ -25,7 +24,7 @@ impl Control for Losses {
 }
 
 /// A wall and a box in front of it, and the same cloud moved by a quarter of a metre.
-fn clouds(points: usize) -> [Vec<Point>; 2] {
+pub(super) fn clouds(points: usize) -> [Vec<Point>; 2] {
     let mut random = Random::new(5);
     let source: Vec<Point> = (0..points)
         .map(|i| {

@@ -8,7 +8,7 @@ use super::{clouds, shared};
 use crate::flow::cpu::CpuBackend;
 use crate::flow::data::Uncontrolled;
 use crate::flow::distance::DistanceTransform;
-use crate::flow::field::{Backend, BackendError, Parameters, ReferenceNetwork};
+use crate::flow::field::{Backend, BackendError, ReferenceNetwork, mlp};
 use crate::flow::gpu::backend::Gpu;
 use crate::flow::gpu::half::Units;
 use crate::flow::gpu::self_test::tested_units;
@@ -150,7 +150,7 @@ fn gradients_in_half_precision_are_near_the_references_at_awkward_row_counts() {
         let distance = DistanceTransform::build(source, &target, &options.distance, &Uncontrolled);
         let distance = distance.expect("small clouds fit");
         let reference = network();
-        let mut expected = ReferenceNetwork::read(&Parameters::zeros());
+        let mut expected = ReferenceNetwork::read(&mlp::zeros());
         for &point in source {
             let input = point.map(f64::from);
             let flow = reference.forward(input).map(|f| f as f32);

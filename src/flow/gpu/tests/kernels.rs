@@ -5,7 +5,7 @@ use super::{clouds, shared};
 use crate::flow::data::{Point, Random, Uncontrolled};
 use crate::flow::distance::{Bricks, DistanceOptions, DistanceTransform};
 use crate::flow::field::{
-    Backend, Conditioning, Parameters, ReferenceNetwork, TrainerState, Transform, first_losses,
+    Backend, Conditioning, ReferenceNetwork, TrainerState, Transform, first_losses, mlp,
 };
 use crate::flow::gpu::distance::{GpuTransform, build};
 use crate::flow::options::{FieldOptions, Preset, ResultChoice};
@@ -17,9 +17,9 @@ const NETWORK_TOLERANCE: f64 = 2e-5;
 const GRADIENT_TOLERANCE: f64 = 1e-4;
 
 pub(super) fn transform(source: &[Point], target: &[Point]) -> Option<GpuTransform> {
-    let card = shared()?.device();
+    let adapter = shared()?.device();
     let options = DistanceOptions::default();
-    let built = build(card, source, target, &options, &Uncontrolled);
+    let built = build(adapter, source, target, &options, &Uncontrolled);
     Some(built.expect("small clouds fit"))
 }
 
@@ -104,7 +104,7 @@ pub(super) fn plain() -> FieldOptions {
 
 pub(super) fn network() -> ReferenceNetwork {
     let mut random = Random::stream(0, 0);
-    ReferenceNetwork::read(&Parameters::xavier(&mut random))
+    ReferenceNetwork::read(&mlp::xavier(&mut random))
 }
 
 #[test]
@@ -165,7 +165,7 @@ fn every_gradient_is_the_references_at_awkward_row_counts() {
             let distance = distance.expect("small clouds fit");
             let reference = network();
             let conditioning = Conditioning::new(source, options.inputs);
-            let mut expected = ReferenceNetwork::read(&Parameters::zeros());
+            let mut expected = ReferenceNetwork::read(&mlp::zeros());
             for &point in source {
                 let input = conditioning.apply(point).map(f64::from);
                 let flow = reference.forward(input).map(|f| f as f32);

@@ -21,9 +21,9 @@ const LANES: usize = 4;
 
 /// Opens the first adapter for one test; none if the machine has none.
 fn opened(options: &GpuOptions) -> Option<Gpu> {
-    let cards = adapters();
-    gpu_in_tests::is_there(cards.len())
-        .then(|| Gpu::open(&cards[0], options).expect("the card opens"))
+    let adapters = adapters();
+    gpu_in_tests::is_there(adapters.len())
+        .then(|| Gpu::open(&adapters[0], options).expect("the card opens"))
 }
 
 /// The GPU shared by the tests that leave it intact.

@@ -2,29 +2,20 @@
 //! presets: a table of `docs/experiments/objects.md`.
 //!
 //! ```text
-//! FNSF_REAL_DATA=... cargo run --release --example label -- [--only NAME] [--seeds N]
+//! FNSF_REAL_DATA=... cargo bench --bench accuracy -- objects [--only NAME] [--seeds N]
 //! ```
 //!
 //! Ground points are taken from the masks of the pairs, and the ego motion is estimated. The rows
 //! are `av2_7fab`, `kitti_0000` and `small_gicp` in the folder `FNSF_REAL_DATA` if it is set, then
 //! the means of ten streets of 64 and of 32 beams. Presets that depend on the seed report the
 //! median over the seeds.
-#![expect(
-    clippy::print_stdout,
-    reason = "the table is the answer of this program"
-)]
 
-#[path = "common/clock.rs"]
-mod clock;
-#[path = "common/known.rs"]
-mod known;
-
-use clock::Clock;
+use super::clock::Clock;
+use super::labelled::{Known, real_pairs, street};
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Truth, evaluate};
 use fnsf::flow::field::Backend;
 use fnsf::flow::{self, Ground, ObjectOptions, Options, Preset, Problem};
-use known::{Known, real_pairs, street};
 
 /// Numbers of beams, and the number of streets of each.
 const BEAMS: [usize; 2] = [64, 32];
@@ -115,7 +106,7 @@ const VARIANTS: &[Variant] = &[
 /// foreground where all moving points count as foreground, metres; then seconds.
 type Row = [f64; 5];
 
-fn run(backend: &CpuBackend, pair: &Known, options: &Options) -> Result<Row, String> {
+fn searched(backend: &CpuBackend, pair: &Known, options: &Options) -> Result<Row, String> {
     let problem = Problem {
         source: &pair.source,
         target: &pair.target,
@@ -165,10 +156,10 @@ fn mean(rows: &[Row]) -> Row {
     core::array::from_fn(|column| rows.iter().map(|row| row[column]).sum::<f64>() / count)
 }
 
-fn main() -> Result<(), String> {
+pub(super) fn run(arguments: Vec<String>) -> Result<(), String> {
     let mut only = String::new();
     let mut seeds = 1;
-    let mut arguments = std::env::args().skip(1);
+    let mut arguments = arguments.into_iter();
     while let Some(argument) = arguments.next() {
         let value = arguments
             .next()
@@ -206,7 +197,7 @@ fn main() -> Result<(), String> {
                 let mut of_seeds = Vec::new();
                 for seed in 0..draws {
                     options.seed = seed;
-                    of_seeds.push(run(&backend, pair, &options)?);
+                    of_seeds.push(searched(&backend, pair, &options)?);
                 }
                 rows.push(median(&of_seeds));
             }

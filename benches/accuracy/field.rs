@@ -2,20 +2,13 @@
 //! `docs/experiments/field.md`.
 //!
 //! ```text
-//! cargo run --release --example ablation -- [--seeds N] [--max-points N] [--only NAME] PAIR.npz...
+//! cargo bench --bench accuracy -- field [--seeds N] [--max-points N] [--only NAME] PAIR.npz...
 //! ```
 //!
 //! Each row is one variant on one pair, over all seeds: median EPE, the worst EPE divided by the
 //! median, median Acc5, median EPE of moving points, median iterations and seconds.
-#![expect(
-    clippy::print_stdout,
-    reason = "the table is the answer of this program"
-)]
 
-#[path = "common/clock.rs"]
-mod clock;
-
-use clock::Clock;
+use super::clock::Clock;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::distance::{Metric, Sites};
 use fnsf::flow::evaluate::{Truth, evaluate};
@@ -200,7 +193,7 @@ struct Run {
     seconds: f64,
 }
 
-fn run(backend: &CpuBackend, pair: &Pair, options: &Options) -> Result<Run, String> {
+fn fitted(backend: &CpuBackend, pair: &Pair, options: &Options) -> Result<Run, String> {
     let ground = pair.ground.as_ref();
     let problem = Problem {
         source: &pair.source,
@@ -235,12 +228,12 @@ fn median_and_worst(runs: &[Run], value: fn(&Run) -> f64) -> [f64; 2] {
     [values[values.len() / 2], values[values.len() - 1]]
 }
 
-fn main() -> Result<(), String> {
+pub(super) fn run(arguments: Vec<String>) -> Result<(), String> {
     let mut seeds = 5;
     let mut max_points = None;
     let mut only = String::new();
     let mut pairs = Vec::new();
-    let mut arguments = std::env::args().skip(1);
+    let mut arguments = arguments.into_iter();
     while let Some(argument) = arguments.next() {
         let mut value = || arguments.next().ok_or(format!("{argument} needs a value"));
         let number = |text: String| text.parse::<usize>().map_err(|e| e.to_string());
@@ -273,7 +266,7 @@ fn main() -> Result<(), String> {
             let runs: Result<Vec<Run>, String> = (0..seeds)
                 .map(|seed| {
                     options.seed = seed as u64;
-                    run(&backend, pair, &options)
+                    fitted(&backend, pair, &options)
                 })
                 .collect();
             let name = std::path::Path::new(path)

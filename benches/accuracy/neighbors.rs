@@ -1,22 +1,15 @@
 //! Object search with two sweeps and with neighbor sweeps: a table of `docs/experiments/neighbors.md`.
 //!
 //! ```text
-//! FNSF_REAL_DATA=... cargo run --release --example sweeps -- [--streets FROM..TO]
+//! FNSF_REAL_DATA=... cargo bench --bench accuracy -- neighbors [--streets FROM..TO]
 //! ```
 //!
 //! Ground points are taken from the masks of the sweeps, and the ego motion is estimated. The rows
 //! are `kitti_0000` in the folder `FNSF_REAL_DATA` if it is set, with segmented ground in its later
 //! sweeps. Then follow the means of streets of 64 and of 32 beams with five sweeps: the first pair,
 //! and the one in the middle.
-#![expect(
-    clippy::print_stdout,
-    reason = "the table is the answer of this program"
-)]
 
-#[path = "common/clock.rs"]
-mod clock;
-
-use clock::Clock;
+use super::clock::Clock;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Truth, evaluate};
 use fnsf::flow::field::Backend;
@@ -124,7 +117,7 @@ fn street(beams: usize, seed: u64, first: usize) -> Result<Known, String> {
 /// EPE of all points, of the moving points and of the static points, metres; then seconds.
 type Row = [f64; 4];
 
-fn run(backend: &CpuBackend, known: &Known, label: &ObjectOptions) -> Result<Row, String> {
+fn searched(backend: &CpuBackend, known: &Known, label: &ObjectOptions) -> Result<Row, String> {
     let mut options = Preset::Label.options(None);
     options.ground = Ground::Mask;
     options.method = Method::Objects(label.clone());
@@ -170,8 +163,8 @@ fn mean(rows: &[Row]) -> Row {
 }
 
 /// The requested range of street seeds: the first, and one past the last.
-fn seeds() -> Result<[u64; 2], String> {
-    let mut arguments = std::env::args().skip(1);
+fn seeds(arguments: Vec<String>) -> Result<[u64; 2], String> {
+    let mut arguments = arguments.into_iter();
     match (arguments.next().as_deref(), arguments.next()) {
         (None, _) => Ok(STREETS),
         (Some("--streets"), Some(range)) => {
@@ -183,8 +176,8 @@ fn seeds() -> Result<[u64; 2], String> {
     }
 }
 
-fn main() -> Result<(), String> {
-    let [from, to] = seeds()?;
+pub(super) fn run(arguments: Vec<String>) -> Result<(), String> {
+    let [from, to] = seeds(arguments)?;
     let mut groups = vec![kitti()?];
     for beams in BEAMS {
         for first in PAIRS {
@@ -203,7 +196,7 @@ fn main() -> Result<(), String> {
         };
         change(&mut label);
         for group in &groups {
-            let rows = group.iter().map(|known| run(&backend, known, &label));
+            let rows = group.iter().map(|known| searched(&backend, known, &label));
             let rows: Vec<Row> = rows.collect::<Result<_, _>>()?;
             let [epe, moving, still, seconds] = mean(&rows);
             let name = &group[0].name;

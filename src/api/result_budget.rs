@@ -29,7 +29,7 @@ const KEPT: usize = 4;
 const GRACE: Duration = Duration::from_secs(10);
 
 /// Interval at which a request that waits for memory tries again.
-const LOOK: Duration = Duration::from_millis(100);
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Size of the chunks that are passed to a connection, bytes.
 const PIECE: usize = 64 << 10;
@@ -39,7 +39,7 @@ pub(super) type Name = (JobId, u32, &'static str);
 
 /// Limits on the memory of results, and on waiting for it.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct AnswerLimits {
+pub(super) struct ResultLimits {
     /// Budget for all results together, bytes.
     pub(super) all: u64,
     /// Whether there are several tenants. One tenant can then use at most half of the budget.
@@ -50,7 +50,7 @@ pub(super) struct AnswerLimits {
     pub(super) grace: Duration,
 }
 
-impl AnswerLimits {
+impl ResultLimits {
     pub(super) fn new(all: u64, shared: bool) -> Self {
         Self {
             all,
@@ -62,25 +62,25 @@ impl AnswerLimits {
 }
 
 /// The memory budget for all results, and the cache.
-pub(super) struct Answers {
+pub(super) struct ResultBudget {
     units: usize,
-    limits: AnswerLimits,
+    limits: ResultLimits,
     free: Arc<Semaphore>,
     held: Arc<Mutex<HashMap<Tenant, usize>>>,
-    rooms: Mutex<Vec<Weak<Taking>>>,
+    rooms: Mutex<Vec<Weak<ReadProgress>>>,
     kept: Mutex<VecDeque<(Name, Encoded)>>,
 }
 
 /// A memory reservation for one result, released when dropped.
-pub(super) struct AnswerRoom {
+pub(super) struct ResultReservation {
     permit: OwnedSemaphorePermit,
     tenant: Tenant,
     held: Arc<Mutex<HashMap<Tenant, usize>>>,
-    taking: Arc<Taking>,
+    taking: Arc<ReadProgress>,
 }
 
 /// The read progress of one result.
-pub(super) struct Taking {
+pub(super) struct ReadProgress {
     tenant: Tenant,
     since: Instant,
     bytes: AtomicU64,
@@ -91,22 +91,22 @@ pub(super) struct Taking {
 #[derive(Clone)]
 pub(super) struct Encoded {
     bytes: Bytes,
-    taking: Arc<Taking>,
+    taking: Arc<ReadProgress>,
 }
 
-struct Held {
+struct ReservedBytes {
     bytes: Vec<u8>,
-    _room: AnswerRoom,
+    _room: ResultReservation,
 }
 
-impl AsRef<[u8]> for Held {
+impl AsRef<[u8]> for ReservedBytes {
     fn as_ref(&self) -> &[u8] {
         &self.bytes
     }
 }
 
-impl Answers {
-    pub(super) fn new(limits: AnswerLimits) -> Self {
+impl ResultBudget {
+    pub(super) fn new(limits: ResultLimits) -> Self {
         let units = usize::try_from(limits.all).unwrap_or(usize::MAX) / UNIT;
         let units = units.clamp(2, u32::MAX as usize);
         Self {
@@ -134,7 +134,11 @@ impl Answers {
     ///
     /// # Errors
     /// [`ApiError::ServerFull`] if no memory is released in time.
-    pub(super) async fn room(&self, tenant: &Tenant, bytes: usize) -> Result<AnswerRoom, ApiError> {
+    pub(super) async fn room(
+        &self,
+        tenant: &Tenant,
+        bytes: usize,
+    ) -> Result<ResultReservation, ApiError> {
         let units = bytes.div_ceil(UNIT).clamp(1, self.share());
         let until = Instant::now() + self.limits.patience;
         loop {
@@ -151,11 +155,11 @@ impl Answers {
             if Instant::now() >= until {
                 return Err(ApiError::ServerFull(Duration::from_secs(5)));
             }
-            tokio::time::sleep(LOOK.min(self.limits.patience)).await;
+            tokio::time::sleep(POLL_INTERVAL.min(self.limits.patience)).await;
         }
     }
 
-    fn try_room(&self, tenant: &Tenant, units: usize) -> Option<AnswerRoom> {
+    fn try_room(&self, tenant: &Tenant, units: usize) -> Option<ResultReservation> {
         let mut held = locked(&self.held);
         let own = held.get(tenant).copied().unwrap_or(0);
         if own + units > self.share() {
@@ -164,7 +168,7 @@ impl Answers {
         let free = Arc::clone(&self.free);
         let permit = free.try_acquire_many_owned(units as u32).ok()?;
         *held.entry(tenant.clone()).or_default() += units;
-        let taking = Arc::new(Taking {
+        let taking = Arc::new(ReadProgress {
             tenant: tenant.clone(),
             since: Instant::now(),
             bytes: AtomicU64::new(0),
@@ -173,7 +177,7 @@ impl Answers {
         let mut rooms = locked(&self.rooms);
         rooms.retain(|room| room.strong_count() > 0);
         rooms.push(Arc::downgrade(&taking));
-        Some(AnswerRoom {
+        Some(ResultReservation {
             permit,
             tenant: tenant.clone(),
             held: Arc::clone(&self.held),
@@ -193,7 +197,7 @@ impl Answers {
         let Some(tenant) = of.cloned().or(most) else {
             return;
         };
-        let rooms: Vec<Arc<Taking>> = locked(&self.rooms)
+        let rooms: Vec<Arc<ReadProgress>> = locked(&self.rooms)
             .iter()
             .filter_map(Weak::upgrade)
             .collect();
@@ -233,7 +237,7 @@ impl Answers {
     }
 }
 
-impl Taking {
+impl ReadProgress {
     /// The mean rate at which the client has read so far, bytes per second.
     fn rate(&self) -> f64 {
         let taken = self.bytes.load(Ordering::Relaxed) as f64;
@@ -251,9 +255,9 @@ impl Taking {
     }
 }
 
-impl AnswerRoom {
+impl ResultReservation {
     /// The read progress of the result.
-    pub(super) fn taking(&self) -> &Arc<Taking> {
+    pub(super) fn taking(&self) -> &Arc<ReadProgress> {
         &self.taking
     }
 
@@ -283,13 +287,13 @@ impl AnswerRoom {
         self.shrink(bytes.len());
         let taking = Arc::clone(&self.taking);
         Encoded {
-            bytes: Bytes::from_owner(Held { bytes, _room: self }),
+            bytes: Bytes::from_owner(ReservedBytes { bytes, _room: self }),
             taking,
         }
     }
 }
 
-impl Drop for AnswerRoom {
+impl Drop for ResultReservation {
     fn drop(&mut self) {
         self.give_back(self.permit.num_permits());
     }
@@ -350,8 +354,8 @@ mod tests {
 
     const KIB: usize = 1 << 10;
 
-    fn answers(shared: bool, grace: Duration) -> Answers {
-        Answers::new(AnswerLimits {
+    fn answers(shared: bool, grace: Duration) -> ResultBudget {
+        ResultBudget::new(ResultLimits {
             all: 1 << 20,
             shared,
             patience: Duration::from_millis(300),
@@ -384,7 +388,7 @@ mod tests {
     async fn the_slowest_reader_makes_room_and_the_whole_answer_with_it() {
         let answers = answers(false, Duration::ZERO);
         let a = tenant("a");
-        let made = |room: AnswerRoom| room.hold(vec![7; 400 * KIB]).into_pieces();
+        let made = |room: ResultReservation| room.hold(vec![7; 400 * KIB]).into_pieces();
         let mut slow = made(answers.room(&a, 400 * KIB).await.expect("room"));
         let mut quick = made(answers.room(&a, 400 * KIB).await.expect("room"));
         for _ in 0..5 {

@@ -1,7 +1,6 @@
 //! Accuracy of the ego motion on real and simulated pairs: rows of `docs/experiments/registration.md`.
 //!
 //! `FNSF_REAL_DATA` names the folder of the real pairs. Without it only simulated streets are used.
-#![expect(clippy::print_stdout, reason = "the table is the program's purpose")]
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -64,7 +63,7 @@ impl Case {
     }
 }
 
-fn main() -> anyhow::Result<()> {
+pub(super) fn run() -> anyhow::Result<()> {
     println!("| pairs | points | motion | off, m | worst | off, degrees | worst | ms |");
     println!("|---|---|---|---|---|---|---|---|");
     let backend = CpuBackend::new(Some(1))?;

@@ -12,13 +12,13 @@ use crate::sync::locked;
 
 /// A waiting line for permits. Each tenant can have only a bounded number of its requests in the
 /// shared line, so a tenant with many requests does not delay the others by all of them.
-pub(super) struct Line {
+pub(super) struct FairQueue {
     each: usize,
     all: Arc<Semaphore>,
     own: Mutex<HashMap<Tenant, Weak<Semaphore>>>,
 }
 
-impl Line {
+impl FairQueue {
     /// `turns` permits. Each tenant may have up to `turns` requests in the shared line.
     pub(super) fn new(turns: usize) -> Self {
         Self {
@@ -48,19 +48,19 @@ impl Line {
 
 /// Permits that are granted or refused at once. With several tenants, each may hold at most half of
 /// them.
-pub(super) struct Turns {
+pub(super) struct TenantPermits {
     most: usize,
     share: usize,
     held: Mutex<HashMap<Tenant, usize>>,
 }
 
 /// One permit, released when dropped.
-pub(super) struct Turn {
-    turns: Arc<Turns>,
+pub(super) struct TenantPermit {
+    turns: Arc<TenantPermits>,
     tenant: Tenant,
 }
 
-impl Turns {
+impl TenantPermits {
     /// `most` permits. With `several` tenants, each tenant may hold at most half of them.
     pub(super) fn new(most: usize, several: bool) -> Self {
         Self {
@@ -78,7 +78,7 @@ impl Turns {
     ///
     /// # Errors
     /// [`ApiError::ServerFull`] if all permits are taken, or the tenant holds its full share.
-    pub(super) fn take(self: &Arc<Self>, tenant: &Tenant) -> Result<Turn, ApiError> {
+    pub(super) fn take(self: &Arc<Self>, tenant: &Tenant) -> Result<TenantPermit, ApiError> {
         let mut held = self.held();
         let all: usize = held.values().sum();
         let own = held.get(tenant).copied().unwrap_or(0);
@@ -86,14 +86,14 @@ impl Turns {
             return Err(ApiError::ServerFull(Duration::from_secs(1)));
         }
         *held.entry(tenant.clone()).or_default() += 1;
-        Ok(Turn {
+        Ok(TenantPermit {
             turns: Arc::clone(self),
             tenant: tenant.clone(),
         })
     }
 }
 
-impl Drop for Turn {
+impl Drop for TenantPermit {
     fn drop(&mut self) {
         let mut held = self.turns.held();
         if let Some(own) = held.get_mut(&self.tenant) {
@@ -112,7 +112,7 @@ mod tests {
     #[tokio::test]
     async fn nobody_waits_for_all_that_another_tenant_has_asked_for() {
         let tenant = |name: &str| name.parse::<Tenant>().expect("a good name");
-        let line = Arc::new(Line::new(1));
+        let line = Arc::new(FairQueue::new(1));
         let first = line.wait(&tenant("many")).await;
         let done = Arc::new(Mutex::new(Vec::new()));
         let mut waiting = tokio::task::JoinSet::new();
@@ -134,7 +134,7 @@ mod tests {
     #[test]
     fn one_of_several_tenants_leaves_the_others_half() {
         let tenant = |name: &str| name.parse::<Tenant>().expect("a good name");
-        let turns = Arc::new(Turns::new(4, true));
+        let turns = Arc::new(TenantPermits::new(4, true));
         let first = [(); 2].map(|()| turns.take(&tenant("a")).expect("a turn"));
         assert!(turns.take(&tenant("a")).is_err());
         let second = [(); 2].map(|()| turns.take(&tenant("b")).expect("a turn"));
@@ -143,7 +143,7 @@ mod tests {
         drop(turns.take(&tenant("c")).expect("a turn"));
         drop(second);
         assert!(turns.held().is_empty());
-        let alone = Arc::new(Turns::new(2, false));
+        let alone = Arc::new(TenantPermits::new(2, false));
         let _both = [(); 2].map(|()| alone.take(&tenant("a")).expect("a turn"));
         assert!(alone.take(&tenant("a")).is_err());
     }

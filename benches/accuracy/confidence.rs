@@ -1,7 +1,7 @@
 //! Fits the logistic regression of the confidence, and evaluates its calibration.
 //!
 //! ```text
-//! FNSF_REAL_DATA=... cargo run --release --example confidence -- [DIAGRAM.svg]
+//! FNSF_REAL_DATA=... cargo bench --bench accuracy -- confidence [DIAGRAM.svg]
 //! ```
 //!
 //! The training data are streets 0 to 11 with 64 and with 32 beams, and the labelled pairs in
@@ -9,15 +9,8 @@
 //! are not in the training data. Each labelled pair is also evaluated with weights that were fitted
 //! without it. Ground points are taken from the masks of the pairs, and the ego motion is
 //! estimated.
-#![expect(
-    clippy::print_stdout,
-    reason = "the tables are the answer of this program"
-)]
 
-#[path = "common/known.rs"]
-#[expect(dead_code, reason = "what moves is said by the evidence here")]
-mod known;
-
+use super::labelled::{Known, PAIRS, real_pairs, street};
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Calibration, Reliability};
 use fnsf::flow::field::Backend;
@@ -25,7 +18,6 @@ use fnsf::flow::{
     CONFIDENT_WITHIN_M, ConfidenceFeatures, ObjectOptions, Point, RigidTransform, SearchClouds,
     Uncontrolled,
 };
-use known::{Known, PAIRS, real_pairs, street};
 use nalgebra::{DMatrix, DVector, Point3};
 
 const BEAMS: [usize; 2] = [64, 32];
@@ -266,8 +258,8 @@ fn diagram(shown: &[(String, Told)]) -> String {
     svg + "</svg>\n"
 }
 
-fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let backend = CpuBackend::new(None)?;
+pub(super) fn run(arguments: &[String]) -> Result<(), String> {
+    let backend = CpuBackend::new(None).map_err(|error| error.to_string())?;
     let pairs = real_pairs()?.into_iter();
     let pairs: Vec<Scene> = pairs.map(|pair| judged(&backend, pair, 1.0)).collect();
     let weight = PAIRS.len() as f64 / (STREETS as usize * BEAMS.len()) as f64;
@@ -317,8 +309,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let (_, left_out) = told(&name, &[pair], &others)?;
         shown.push((pair.name.clone(), left_out));
     }
-    if let Some(path) = std::env::args_os().nth(1) {
-        std::fs::write(path, diagram(&shown))?;
+    if let Some(path) = arguments.first() {
+        std::fs::write(path, diagram(&shown)).map_err(|error| format!("{path}: {error}"))?;
     }
     Ok(())
 }

@@ -1,8 +1,8 @@
-//! Drafts: jobs that are assembled from clouds that arrive one by one. Each cloud is written to the
+//! Pending jobs: they are assembled from clouds that arrive one by one. Each cloud is written to the
 //! store as soon as it arrives.
 //!
-//! A draft becomes a job with [`Draft::submit`]. A draft that is dropped before that removes its
-//! blobs.
+//! A pending job becomes a job of the queue with [`PendingJob::submit`]. If it is dropped before
+//! that, its blobs are removed.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -10,12 +10,12 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use tokio::task::JoinHandle;
 
-use super::admission::{Asked, Durability, Reservation};
+use super::admission::{AdmissionRequest, Durability, Reservation};
 use super::auth::Caller;
-use super::dense::Closing;
+use super::dense::Finalizer;
 use super::error::ApiError;
 use super::service::{MakeDurable, Service};
-use super::uploads::Room;
+use super::upload_budget::UploadReservation;
 use super::waiters::Awaited;
 use crate::clock::Timestamp;
 use crate::cost::CostModel;
@@ -39,7 +39,7 @@ pub(super) struct Request {
     /// The deadline of the call itself, relative to its arrival, if there is one.
     pub time_left: Option<Duration>,
     /// The position in a chain of pairs that are submitted one by one. `None` outside of a chain.
-    pub link: Option<Link>,
+    pub link: Option<ChainLink>,
     /// The pair and its window within the clouds that follow. [`PairOf::ALONE`] for the first two
     /// clouds.
     pub pair: PairOf,
@@ -47,7 +47,7 @@ pub(super) struct Request {
 
 /// The position of a pair in a chain.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Link {
+pub(super) struct ChainLink {
     /// The pair before it, if there is one.
     pub after: Option<JobId>,
 }
@@ -65,10 +65,10 @@ pub(super) struct Accepted {
 
 /// The arrival time of a request: a request extension.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Arrived(pub(super) Instant);
+pub(super) struct ReceivedAt(pub(super) Instant);
 
 /// A job that is being assembled.
-pub(super) struct Draft {
+pub(super) struct PendingJob {
     service: Arc<Service>,
     caller: Caller,
     request: Request,
@@ -78,7 +78,7 @@ pub(super) struct Draft {
     points: Vec<usize>,
     /// The latest cloud, and its memory reservation, which is held until the next cloud has
     /// arrived.
-    last: Option<(Arc<StoredCloud>, Option<Room>)>,
+    last: Option<(Arc<StoredCloud>, Option<UploadReservation>)>,
     /// The cost of each two consecutive clouds without neighbor sweeps. `None` where they are not a
     /// pair of the job.
     prices: Vec<Option<Cost>>,
@@ -100,7 +100,7 @@ fn with_ground(cloud: Arc<StoredCloud>, options: &JobOptions) -> Arc<StoredCloud
     Arc::new(StoredCloud { points, ground })
 }
 
-impl Draft {
+impl PendingJob {
     /// Begins a draft without clouds.
     ///
     /// # Errors
@@ -112,8 +112,7 @@ impl Draft {
         request: Request,
     ) -> Result<Self, ApiError> {
         const MAX_KEY: usize = 255;
-        caller.may_write()?;
-        service.check_draining()?;
+        service.check_new_work(&caller)?;
         request.options.check()?;
         caller.may_ask_for(request.options.priority)?;
         service
@@ -157,7 +156,7 @@ impl Draft {
     pub(super) async fn push(
         &mut self,
         cloud: impl Into<Arc<StoredCloud>>,
-        room: Option<Room>,
+        room: Option<UploadReservation>,
     ) -> Result<Arc<StoredCloud>, ApiError> {
         let cloud = cloud.into();
         let service = Arc::clone(&self.service);
@@ -237,7 +236,7 @@ impl Draft {
             options.check_for_sequence(self.sweeps as usize)?;
         }
         match (kind, self.sweeps) {
-            (Kind::Pair, clouds) if clouds == self.request.pair.sees[1] => {}
+            (Kind::Pair, clouds) if clouds == self.request.pair.window[1] => {}
             (Kind::Sequence, 2..) => {}
             (Kind::Pair, _) => {
                 return Err(ApiError::BadRequest("a pair is two clouds".to_owned()));
@@ -294,8 +293,8 @@ impl Draft {
     fn admit(&self, submission: &Submission) -> Result<Reservation, ApiError> {
         self.service.check_draining()?;
         let pairs = submission.pairs.len().max(1) as f64;
-        let closing = submission.closing_seconds.unwrap_or(0.0);
-        self.service.admission.admit(&Asked {
+        let closing = submission.finalizer_seconds.unwrap_or(0.0);
+        self.service.admission.admit(&AdmissionRequest {
             tenant: &self.caller.tenant,
             priority: self.request.options.priority,
             device: self.request.options.device_kind(),
@@ -311,8 +310,8 @@ impl Draft {
         let forward = (0..self.sweeps - 1).map(|index| PairOf {
             index,
             backward: false,
-            sees: PairOf::seen(window(index as usize, self.sweeps as usize, sweeps)),
-            follows: chained && index > 0,
+            window: PairOf::seen(window(index as usize, self.sweeps as usize, sweeps)),
+            chained: chained && index > 0,
         });
         forward.collect()
     }
@@ -327,7 +326,7 @@ impl Draft {
             let Some(Some(price)) = self.prices.get(pair.index as usize) else {
                 continue;
             };
-            let neighbors = (pair.sees[0]..pair.sees[1])
+            let neighbors = (pair.window[0]..pair.window[1])
                 .filter(|&index| index != pair.index && index != pair.index + 1)
                 .map(|index| flow::neighbor_cost(self.points[index as usize]));
             let price = neighbors.fold(*price, |price, neighbor| Cost {
@@ -362,13 +361,13 @@ impl Draft {
             Kind::Sequence => self.nominal_seconds(&pairs)?,
         };
         let cost_seconds = nominal / pairs.len().max(1) as f64;
-        let mut closing_seconds = None;
+        let mut finalizer_seconds = None;
         if let Some(densify) = &self.request.options.densify {
             let options = &self.request.options;
             let (chained, sweeps) = (options.chained(), options.sweeps());
-            let closing = Closing::of(densify, &self.points, chained, sweeps)?;
+            let closing = Finalizer::of(densify, &self.points, chained, sweeps)?;
             pairs.extend(closing.back);
-            closing_seconds = Some(closing.nominal_seconds);
+            finalizer_seconds = Some(closing.nominal_seconds);
         }
         let link = self.request.link;
         let options = &self.request.options;
@@ -384,7 +383,7 @@ impl Draft {
             pair: self.request.pair,
             cost_seconds,
             pairs,
-            closing_seconds,
+            finalizer_seconds,
             after: link.and_then(|link| link.after),
             has_dependents: link.is_some(),
             priority: options.priority,
@@ -400,7 +399,7 @@ impl Draft {
     }
 }
 
-impl Drop for Draft {
+impl Drop for PendingJob {
     fn drop(&mut self) {
         let writing = self.writing.take();
         if self.submitted || (self.sweeps == 0 && writing.is_none()) {

@@ -3,16 +3,12 @@
 //! Static points of other sweeps are transformed by the true poses. The result therefore measures
 //! the projection and its occlusion filter, and not the flow. With an argument, a picture is
 //! written to that file.
-#![expect(clippy::print_stdout, reason = "the table is the program's purpose")]
 
-#[path = "common/camera.rs"]
-mod look;
-
+use super::camera::camera;
 use fnsf::flow::Point;
 use fnsf::flow::depth::{Occlusion, project};
 use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::picture::{DepthPanel, depth_panels, write_png};
-use look::camera;
 use nalgebra::Point3;
 
 const SWEEPS: [usize; 4] = [1, 3, 10, 20];
@@ -20,7 +16,7 @@ const SEEDS: u64 = 4;
 /// Number of sweeps that the picture shows.
 const SHOWN: usize = 10;
 
-fn main() -> anyhow::Result<()> {
+pub(super) fn run(arguments: &[String]) -> anyhow::Result<()> {
     let camera = camera()?;
     println!("| sweeps | filter | pixels | mean error, m | RMSE, m | within 5 % |");
     println!("|---|---|---|---|---|---|");
@@ -67,7 +63,7 @@ fn main() -> anyhow::Result<()> {
             );
         }
     }
-    if let Some(path) = std::env::args_os().nth(1) {
+    if let Some(path) = arguments.first() {
         let panel = |(title, image)| DepthPanel { title, image };
         let titles = ["1 sweep", "10 sweeps", "10 sweeps, filtered", "truth"];
         let panels: Vec<DepthPanel<'_>> = titles.into_iter().zip(&pictures).map(panel).collect();

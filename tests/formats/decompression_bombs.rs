@@ -19,7 +19,7 @@ fn hostile_files_are_refused_in_little_memory() {
         let child = std::process::Command::new(std::env::current_exe().unwrap())
             .args([
                 "--exact",
-                "bombs::hostile_files_are_refused_in_little_memory",
+                "decompression_bombs::hostile_files_are_refused_in_little_memory",
             ])
             .env(CHILD, "1")
             .output()

@@ -1,7 +1,6 @@
 //! Accuracy of the ground segmentation on real and simulated sweeps: rows of `docs/experiments/ground.md`.
 //!
 //! `FNSF_REAL_DATA` names the folder of the real pairs. Without it only simulated streets are used.
-#![expect(clippy::print_stdout, reason = "the table is the program's purpose")]
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -16,7 +15,7 @@ const RUNS: usize = 7;
 
 type Sweep = (Vec<Point>, Vec<bool>);
 
-fn main() -> anyhow::Result<()> {
+pub(super) fn run() -> anyhow::Result<()> {
     println!("| sweeps | points | precision | recall | 35 to 80 m | origin above ground, m | ms |");
     println!("|---|---|---|---|---|---|---|");
     if let Some(folder) = std::env::var_os("FNSF_REAL_DATA").map(PathBuf::from) {

@@ -38,7 +38,7 @@ pub(super) struct UploadLimits {
 }
 
 /// The memory budget for all bodies.
-pub(super) struct Uploads {
+pub(super) struct UploadBudget {
     limits: UploadLimits,
     free: Arc<Semaphore>,
     held: Mutex<HashMap<Tenant, u64>>,
@@ -52,7 +52,7 @@ struct Paused {
     end: CancellationToken,
 }
 
-impl Uploads {
+impl UploadBudget {
     pub(super) fn new(limits: UploadLimits, metrics: Arc<Metrics>) -> Self {
         let units = usize::try_from(limits.all / UNIT).unwrap_or(usize::MAX);
         Self {
@@ -65,8 +65,8 @@ impl Uploads {
     }
 
     /// A reservation for a body of a tenant, initially empty.
-    pub(super) fn room(self: &Arc<Self>, tenant: &Tenant) -> Room {
-        Room {
+    pub(super) fn room(self: &Arc<Self>, tenant: &Tenant) -> UploadReservation {
+        UploadReservation {
             uploads: Arc::clone(self),
             tenant: tenant.clone(),
             held: None,
@@ -96,7 +96,7 @@ impl Uploads {
 }
 
 /// Removes a pause from the list when it is dropped.
-struct Over<'a>(&'a Uploads, &'a CancellationToken);
+struct Over<'a>(&'a UploadBudget, &'a CancellationToken);
 
 impl Drop for Over<'_> {
     fn drop(&mut self) {
@@ -109,8 +109,8 @@ impl Drop for Over<'_> {
 }
 
 /// A memory reservation for one body, released when dropped, and the time credit of the body.
-pub(super) struct Room {
-    uploads: Arc<Uploads>,
+pub(super) struct UploadReservation {
+    uploads: Arc<UploadBudget>,
     tenant: Tenant,
     held: Option<OwnedSemaphorePermit>,
     bytes: u64,
@@ -120,7 +120,7 @@ pub(super) struct Room {
     credit: Duration,
 }
 
-impl Room {
+impl UploadReservation {
     /// Moves this reservation out for a complete body, and leaves an empty one for the next body of
     /// the same tenant.
     pub(super) fn next(&mut self) -> Self {
@@ -248,7 +248,7 @@ impl Room {
     }
 }
 
-impl Drop for Room {
+impl Drop for UploadReservation {
     fn drop(&mut self) {
         let units = self.units();
         let mut held = locked(&self.uploads.held);
@@ -267,14 +267,14 @@ mod tests {
 
     const IDLE: Duration = Duration::from_millis(200);
 
-    fn uploads() -> Arc<Uploads> {
+    fn uploads() -> Arc<UploadBudget> {
         let limits = UploadLimits {
             body: 1 << 20,
             all: 2 << 20,
             tenant: 1 << 20,
             idle: IDLE,
         };
-        Arc::new(Uploads::new(limits, Arc::new(Metrics::new(&["cpu"]))))
+        Arc::new(UploadBudget::new(limits, Arc::new(Metrics::new(&["cpu"]))))
     }
 
     fn tenant(name: &str) -> Tenant {
@@ -326,7 +326,7 @@ mod tests {
         let [first, second] = rooms;
         // A stream that holds no memory is never ended, however long it pauses.
         let empty = uploads.room(&tenant("a"));
-        let pausing = |room: Room| {
+        let pausing = |room: UploadReservation| {
             tokio::spawn(async move { room.pause(0, std::future::pending::<()>()).await })
         };
         let empty = pausing(empty);
