@@ -1,6 +1,8 @@
-//! Classification of operating system errors: caused by the job, or by the machine.
+//! Classification of operating system errors: a missing file, a full disk, or another fault of the
+//! machine.
 //!
-//! An error of the machine does not count against a job. The job waits until the machine recovers.
+//! A missing file counts as a failed attempt of its job. The other faults do not: the job waits and
+//! is tried again.
 
 use std::error::Error;
 use std::io;
@@ -8,7 +10,7 @@ use std::io;
 /// The cause of an error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fault {
-    /// A file does not exist. A retry cannot succeed.
+    /// A file does not exist.
     Missing,
     /// No more data can be written: no space, inodes or quota, or a file size limit.
     Full,

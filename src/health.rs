@@ -13,7 +13,7 @@ use crate::sync::locked;
 /// Interval at which a loop updates its heartbeat.
 pub const HEARTBEAT: Duration = Duration::from_secs(1);
 
-/// The heartbeat of a background loop.
+/// The heartbeat of a background loop. Its creation counts as the first update.
 #[derive(Debug)]
 pub struct Heartbeat {
     began: Instant,
@@ -55,8 +55,8 @@ impl Heartbeat {
     }
 }
 
-/// Health of the store. Its users report failures, and a probe reports the recovery. While the
-/// store fails, workers lease no jobs.
+/// Health of the store: the queue and the blobs. Its users report failures, and a probe reports
+/// the recovery. While the store fails, workers lease no jobs. A new record is healthy.
 #[derive(Debug, Default)]
 pub struct StoreHealth {
     trouble: watch::Sender<Option<String>>,
@@ -74,18 +74,18 @@ impl StoreHealth {
         }
     }
 
-    /// Records that a write of `bytes` bytes found no space. The store recovers only with this much
-    /// space.
+    /// Records that a write of `bytes` bytes found no space. The largest such size since the last
+    /// recovery counts. The store recovers only with twice this much free space, at least 4 MiB.
     pub fn needs(&self, bytes: u64) {
         self.needed.fetch_max(bytes, Ordering::Relaxed);
     }
 
-    /// Bytes of free space required for the recovery.
+    /// The largest write that found no space since the last recovery, bytes; 0 if none.
     pub fn needed(&self) -> u64 {
         self.needed.load(Ordering::Relaxed)
     }
 
-    /// Records that a probe has written and read the store.
+    /// Records that a probe has written and read the store. Resets [`StoreHealth::needed`] to 0.
     pub fn works(&self) {
         self.needed.store(0, Ordering::Relaxed);
         if self.trouble.send_replace(None).is_some() {
@@ -98,13 +98,13 @@ impl StoreHealth {
         *locked(&self.free) = Some((Instant::now(), free));
     }
 
-    /// The last measured free space and its age; none before the first measurement.
+    /// The age of the last measurement of free space, and its result; `None` before the first one.
     pub fn free(&self) -> Option<(Duration, FreeSpace)> {
         let free = *locked(&self.free);
         free.map(|(looked, free)| (looked.elapsed(), free))
     }
 
-    /// The current failure, if any.
+    /// The message of the current failure; `None` while the store works.
     pub fn trouble(&self) -> Option<String> {
         self.trouble.borrow().clone()
     }

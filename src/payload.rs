@@ -3,12 +3,15 @@
 //! Versioned and little endian. Counts are checked against the bytes present, and a checksum over
 //! all bytes detects truncated or altered files. Independent of the storage.
 
-use crate::flow::Solution;
-use crate::flow::{Cluster, DenseCloud, Estimate, Objects, OrientedBox, Point, RigidTransform};
-use crate::formats::{matrix_rows, rigid_motion};
+use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 
-const CLOUD: &[u8; 8] = b"fnsfcld1";
-const FLOW: &[u8; 8] = b"fnsfflw2";
+use crate::flow::{
+    Cluster, DenseCloud, Estimate, Objects, OrientedBox, Point, RigidTransform, Solution,
+};
+use crate::formats::{SweepTime, TimeUnit};
+
+const CLOUD: &[u8; 8] = b"fnsfcld2";
+const FLOW: &[u8; 8] = b"fnsfflw3";
 const DENSE: &[u8; 8] = b"fnsfdns1";
 
 /// Bytes of the checksum at the end: the first 16 bytes of the BLAKE3 hash.
@@ -22,16 +25,18 @@ pub struct Damaged(&'static str);
 /// One stored sweep.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StoredCloud {
-    /// N points, metres. Rows without a return are NaN.
+    /// N points, metres. Rows without return are NaN.
     pub points: Vec<Point>,
     /// N flags: which points are ground, if known.
     pub ground: Option<Vec<bool>>,
+    /// The time of recording, if known.
+    pub time: Option<SweepTime>,
 }
 
 /// The stored flow of a pair.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StoredFlow {
-    /// N displacements, metres.
+    /// N displacements from the source sweep's time to the target's, metres, ego motion included.
     pub flow: Vec<Point>,
     /// N flags: which rows have a flow.
     pub valid: Vec<bool>,
@@ -44,11 +49,12 @@ pub struct StoredFlow {
 }
 
 impl StoredCloud {
-    /// Encodes the cloud.
+    /// Encodes the cloud. All its lists must have N rows.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut out = Writer::new(CLOUD, self.points.len(), 13 * self.points.len());
         out.points(&self.points);
         out.flags(self.ground.as_deref());
+        out.time(self.time);
         out.finish()
     }
 
@@ -61,6 +67,7 @@ impl StoredCloud {
         let cloud = Self {
             points: reader.points()?,
             ground: reader.flags()?,
+            time: reader.time()?,
         };
         reader.finish()?;
         Ok(cloud)
@@ -68,7 +75,7 @@ impl StoredCloud {
 }
 
 impl StoredFlow {
-    /// Encodes the flow.
+    /// Encodes the flow. All its lists must have N rows.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut out = Writer::new(FLOW, self.flow.len(), 22 * self.flow.len());
         out.points(&self.flow);
@@ -104,7 +111,7 @@ impl StoredFlow {
 pub struct StoredDense(pub DenseCloud);
 
 impl StoredDense {
-    /// Encodes the cloud.
+    /// Encodes the cloud. All its lists must have the same number of rows.
     pub fn to_bytes(&self) -> Vec<u8> {
         let Self(cloud) = self;
         let mut out = Writer::new(DENSE, cloud.points.len(), 22 * cloud.points.len());
@@ -203,10 +210,23 @@ impl Writer {
     fn motion(&mut self, motion: Option<&RigidTransform>) {
         self.0.push(u8::from(motion.is_some()));
         if let Some(motion) = motion {
-            let values = matrix_rows(motion);
-            let values = values.as_flattened().iter();
+            let (translation, rotation) = (motion.translation.vector, motion.rotation.coords);
+            let values = translation.iter().chain(&rotation);
             self.0.extend(values.flat_map(|value| value.to_le_bytes()));
         }
+    }
+
+    fn time(&mut self, time: Option<SweepTime>) {
+        let (unit, ticks) = match time {
+            None => (0, 0),
+            Some(SweepTime { ticks, unit }) => match unit {
+                TimeUnit::Nanoseconds => (1, ticks),
+                TimeUnit::Microseconds => (2, ticks),
+                TimeUnit::Milliseconds => (3, ticks),
+            },
+        };
+        self.0.push(unit);
+        self.0.extend(ticks.to_le_bytes());
     }
 
     fn finish(mut self) -> Vec<u8> {
@@ -316,12 +336,28 @@ impl<'a> Reader<'a> {
         if there == 0 {
             return Ok(None);
         }
-        let mut rows = [[0.0; 4]; 4];
-        for value in rows.as_flattened_mut() {
+        let mut values = [0.0; 7];
+        for value in &mut values {
             *value = f64::from_le_bytes(self.array()?);
         }
-        let motion = rigid_motion(&rows).map_err(|_| Damaged("the motion is not rigid"))?;
-        Ok(Some(motion))
+        let [x, y, z, i, j, k, w] = values;
+        // The same bits as before: not normalized again.
+        let rotation = UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k));
+        let translation = Translation3::new(x, y, z);
+        Ok(Some(RigidTransform::from_parts(translation, rotation)))
+    }
+
+    fn time(&mut self) -> Result<Option<SweepTime>, Damaged> {
+        let [unit] = self.array()?;
+        let ticks = u64::from_le_bytes(self.array()?);
+        let unit = match unit {
+            0 => return Ok(None),
+            1 => TimeUnit::Nanoseconds,
+            2 => TimeUnit::Microseconds,
+            3 => TimeUnit::Milliseconds,
+            _ => return Err(Damaged("no unit of time")),
+        };
+        Ok(Some(SweepTime { ticks, unit }))
     }
 
     fn finish(self) -> Result<(), Damaged> {
@@ -333,7 +369,8 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// Decodes packed little-endian float32 triples as points. Remaining bytes are ignored.
+/// Decodes packed little-endian float32 triples (x, y, z; 12 bytes each) as points. The bytes of an
+/// incomplete triple at the end are ignored.
 pub fn points_from_le_bytes(bytes: &[u8]) -> Vec<Point> {
     const POINT: usize = size_of::<Point>();
     let mut points: Vec<Point> = vec![[0.0; 3]; bytes.len() / POINT];
@@ -384,17 +421,13 @@ mod tests {
         let cloud = StoredCloud {
             points: vec![[1.5, f32::MIN_POSITIVE, -3.0]],
             ground: Some(vec![true]),
+            time: SweepTime::from_name("315966265259836000.feather"),
         };
+        assert!(cloud.time.is_some());
         assert_eq!(StoredCloud::from_bytes(&cloud.to_bytes()), Ok(cloud));
         let stored = flow();
         let back = StoredFlow::from_bytes(&stored.to_bytes()).expect("good bytes");
-        assert_eq!(
-            (back.flow, back.valid, back.dynamic, back.objects),
-            (stored.flow, stored.valid, stored.dynamic, stored.objects)
-        );
-        let [one, other] =
-            [back.ego, stored.ego].map(|ego| ego.expect("a motion").to_homogeneous());
-        assert!((one - other).abs().max() < 1e-12);
+        assert_eq!(back, stored);
     }
 
     #[test]

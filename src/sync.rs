@@ -1,3 +1,3 @@
-//! Locks for the rooms around the numerics.
+//! The lock helper of `flow`, for the modules of the service.
 
 pub(crate) use crate::flow::locked;

@@ -12,16 +12,16 @@ use tracing_subscriber::{EnvFilter, Layer};
 
 use crate::config::{LogConfig, LogFormat};
 
-/// Why logging cannot start.
+/// Why logging or tracing cannot start.
 #[derive(Debug, thiserror::Error)]
 pub enum TelemetryError {
-    /// The filter is invalid.
+    /// `log.filter` is not a valid filter.
     #[error("log.filter: {0}")]
     Filter(#[from] tracing_subscriber::filter::ParseError),
-    /// The address of the collector is invalid.
+    /// No exporter can be built for `otlp_endpoint`, for example because it is not a URL.
     #[error("otlp_endpoint: {0}")]
     Otlp(#[from] opentelemetry_otlp::ExporterBuildError),
-    /// Logging was already started in this process.
+    /// A logger was already installed in this process.
     #[error("logging was started twice")]
     Twice(#[from] tracing_subscriber::util::TryInitError),
 }
@@ -33,10 +33,15 @@ pub struct Telemetry {
 }
 
 impl Telemetry {
-    /// Starts logging, and tracing if `otlp_endpoint` is given. Tracing needs a tokio runtime.
+    /// Starts logging, and tracing if `otlp_endpoint` is given, for the whole process.
     ///
     /// # Errors
-    /// [`TelemetryError`].
+    /// - [`TelemetryError::Filter`] if the log filter is invalid.
+    /// - [`TelemetryError::Otlp`] if no exporter can be built for `otlp_endpoint`.
+    /// - [`TelemetryError::Twice`] if a logger was already installed in this process.
+    ///
+    /// # Panics
+    /// If `otlp_endpoint` is given and there is no current tokio runtime.
     pub fn start(log: &LogConfig, otlp_endpoint: Option<&str>) -> Result<Self, TelemetryError> {
         let filter: EnvFilter = log.filter.parse()?;
         let lines = tracing_subscriber::fmt::layer()

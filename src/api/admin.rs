@@ -25,7 +25,7 @@ use crate::queue::Queue;
 pub struct Readiness {
     /// The devices. The server is ready if at least one of them is.
     pub devices: Vec<Device>,
-    /// Whether the server is about to stop.
+    /// True once the server is about to stop.
     pub draining: watch::Receiver<bool>,
     /// The health of the store.
     pub store: Arc<StoreHealth>,
@@ -45,7 +45,8 @@ impl Readiness {
         Some(format!("{} has not moved for {seconds} s", stuck.0))
     }
 
-    /// The reason why the server is not ready. `None` if it is ready.
+    /// The reason why the server is not ready: it is about to stop, a loop has not run for 10 s,
+    /// the store fails, or no device is ready. `None` if it is ready.
     pub fn not_ready_reason(&self) -> Option<String> {
         if *self.draining.borrow() {
             return Some("the server is about to stop".to_owned());
@@ -72,7 +73,11 @@ struct Admin {
     cost: Arc<CostModel>,
 }
 
-/// The routes of the admin port: `/livez`, `/readyz` and `/metrics`.
+/// The routes of the admin port. They need no key.
+///
+/// - `GET /livez`: 503 if a loop has not run for 10 s.
+/// - `GET /readyz`: 503 if [`Readiness::not_ready_reason`] gives a reason.
+/// - `GET /metrics`: the Prometheus text format, or OpenMetrics if `Accept` asks for it.
 pub fn admin_router(
     readiness: Readiness,
     metrics: Arc<Metrics>,

@@ -23,9 +23,9 @@ pub struct AdmissionLimits {
     pub max_pair_bytes: usize,
     /// Maximum predicted waiting time of a job whose caller waits for the result.
     pub max_wait: Duration,
-    /// Maximum predicted compute time of all queued jobs.
+    /// Maximum predicted compute time of all queued jobs, summed over the lanes.
     pub max_queue: Duration,
-    /// Maximum predicted compute time of all queued jobs of one tenant.
+    /// Maximum predicted compute time of all queued jobs of one tenant, summed over the lanes.
     pub max_tenant_queue: Duration,
 }
 
@@ -69,7 +69,7 @@ pub struct AdmissionRequest<'a> {
     pub priority: Priority,
     /// The kind of device that the job requires. `None` if any device will do.
     pub device: Option<DeviceKind>,
-    /// Nominal compute seconds of all its pairs.
+    /// Nominal compute seconds of all its pairs and of its dense cloud. Zero only tests for room.
     pub nominal_seconds: f64,
     /// Whether the caller waits for the result.
     pub durability: Durability,
@@ -94,7 +94,7 @@ impl Admission {
     /// Refuses a cloud with too many points.
     ///
     /// # Errors
-    /// [`ApiError::TooLarge`].
+    /// [`ApiError::TooLarge`] if `points` is above the limit.
     pub fn check_points(&self, points: usize) -> Result<(), ApiError> {
         let limit = self.limits.max_points;
         if points > limit {
@@ -108,7 +108,7 @@ impl Admission {
     /// Refuses a job for a kind of device that this server does not have.
     ///
     /// # Errors
-    /// [`ApiError::NoDevice`].
+    /// [`ApiError::NoDevice`] if no lane is of the required kind.
     pub fn check_device(&self, device: Option<DeviceKind>) -> Result<(), ApiError> {
         match device {
             Some(kind) if self.cost.lanes().of(kind) == 0 => Err(ApiError::NoDevice(kind)),
@@ -121,12 +121,14 @@ impl Admission {
         self.limits.max_pair_bytes
     }
 
-    /// Predicts the cost of a pair, and refuses a pair that exceeds the memory limit. With
-    /// `chained` the pair starts from the field of the pair before, so its number of iterations is
-    /// that of a warm start.
+    /// Predicts the cost of a pair, without neighbor sweeps, and refuses a pair that exceeds the
+    /// memory limit. With `chained` the pair starts from the field of the pair before, so its
+    /// number of iterations is that of a warm start.
     ///
     /// # Errors
-    /// [`ApiError::BadInput`] with the message of the solver, or [`ApiError::TooLarge`].
+    /// - [`ApiError::BadInput`] if the pair cannot be estimated, with the message of the solver.
+    /// - [`ApiError::TooLarge`] if the pair needs more memory than the limit.
+    /// - [`ApiError::Internal`] if the prediction fails for another reason.
     pub fn price(
         &self,
         source: &StoredCloud,
@@ -176,11 +178,14 @@ impl Admission {
         Ok(())
     }
 
-    /// Reserves predicted compute time for a job, or refuses it with a retry delay. With zero
-    /// nominal seconds it reserves nothing and only tests whether a request body is worth reading.
+    /// Reserves predicted compute time for a job, or refuses it with a retry delay of 1 s to 3600
+    /// s. With zero nominal seconds it reserves nothing and only tests whether a request body is
+    /// worth reading.
     ///
     /// # Errors
-    /// [`ApiError::TenantLimit`] or [`ApiError::ServerFull`].
+    /// - [`ApiError::TenantLimit`] if the job would exceed the limit on the tenant's queued jobs.
+    /// - [`ApiError::ServerFull`] if it would exceed the limit on all queued jobs, or if its caller
+    ///   would wait longer than the limit.
     pub fn admit(&self, asked: &AdmissionRequest<'_>) -> Result<Reservation, ApiError> {
         let backlog = self.queue.backlog();
         let mut reserved = locked(&self.reserved);

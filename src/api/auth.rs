@@ -31,10 +31,10 @@ pub struct Caller {
 }
 
 impl Caller {
-    /// Refuses a priority above the maximum of this key.
+    /// Refuses a priority above the maximum of this caller.
     ///
     /// # Errors
-    /// [`ApiError::Priority`].
+    /// [`ApiError::Priority`], with the maximum.
     pub fn may_ask_for(&self, priority: Priority) -> Result<(), ApiError> {
         if priority <= self.max_priority {
             Ok(())
@@ -46,7 +46,7 @@ impl Caller {
     /// Refuses callers with read access only.
     ///
     /// # Errors
-    /// [`ApiError::Forbidden`].
+    /// [`ApiError::Forbidden`] for [`Role::Read`].
     pub fn may_write(&self) -> Result<(), ApiError> {
         if self.role >= Role::Write {
             Ok(())
@@ -59,13 +59,14 @@ impl Caller {
 /// The minimum length of a key, characters.
 pub const MIN_KEY: usize = 16;
 
-/// Why a key cannot be used.
+/// Why a key cannot be used. The tenant of the key is given.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidKey {
     /// It is too short, so it could be guessed.
     #[error("the key of tenant {0} is shorter than {MIN_KEY} characters")]
     Short(Tenant),
-    /// It cannot be sent unchanged in a header.
+    /// It starts or ends with white space, or has characters other than printable ASCII, so no
+    /// header can carry it unchanged.
     #[error(
         "the key of tenant {0} has white space around it, or characters other than printable ASCII: \
          no header carries it"
@@ -76,7 +77,7 @@ pub enum InvalidKey {
     Twice(Tenant),
 }
 
-/// All keys of a server.
+/// All keys of a server. Only hashes of the keys are stored.
 #[derive(Clone, Debug, Default)]
 pub struct Keys {
     known: Vec<([u8; 32], Caller)>,
@@ -86,7 +87,9 @@ impl Keys {
     /// Adds a key.
     ///
     /// # Errors
-    /// [`InvalidKey`] if the key is too short, cannot be sent in a header, or is already present.
+    /// - [`InvalidKey::Short`] if the key is shorter than [`MIN_KEY`].
+    /// - [`InvalidKey::Unsendable`] if it cannot be sent in a header.
+    /// - [`InvalidKey::Twice`] if it is already present, for any tenant.
     pub fn add(&mut self, key: &str, caller: Caller) -> Result<(), InvalidKey> {
         if key.len() < MIN_KEY {
             return Err(InvalidKey::Short(caller.tenant));
@@ -110,16 +113,20 @@ impl Keys {
         tenants.any(|tenant| Some(tenant) != first)
     }
 
-    /// Whether the server has no keys, so that every request is allowed.
+    /// Whether the server has no keys, so that requests need none.
     pub fn is_open(&self) -> bool {
         self.known.is_empty()
     }
 
-    /// The caller that a request identifies. `authorization` is the value of its `Authorization`
-    /// header.
+    /// The caller that a request identifies.
+    ///
+    /// `authorization` is the value of its `Authorization` header: `Bearer KEY`, where the case of
+    /// `Bearer` does not matter. A server without keys ignores it. Every caller is then the default
+    /// tenant with [`Role::Write`] and priorities up to [`Priority::High`].
     ///
     /// # Errors
-    /// [`ApiError::Unauthenticated`] if the server has keys and the header has none of them.
+    /// [`ApiError::Unauthenticated`] if the server has keys and the value is missing, has another
+    /// form, or has an unknown key.
     pub fn caller(&self, authorization: Option<&str>) -> Result<Caller, ApiError> {
         if self.is_open() {
             return Ok(Caller {

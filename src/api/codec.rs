@@ -4,7 +4,7 @@
 
 use super::error::ApiError;
 use crate::formats;
-use crate::formats::{FlowFormat, FlowTable, MAX_COORDINATE_M};
+use crate::formats::{FlowFormat, FlowTable, MAX_COORDINATE_M, SweepTime};
 use crate::job::Report;
 use crate::payload::{StoredCloud, StoredFlow};
 
@@ -202,6 +202,7 @@ pub(super) fn read_cloud(
     Ok(StoredCloud {
         points: cloud.points,
         ground: None,
+        time: name.and_then(SweepTime::from_name),
     })
 }
 
@@ -224,10 +225,12 @@ pub(super) fn read_pair(
         StoredCloud {
             points: pair.source,
             ground: source,
+            time: None,
         },
         StoredCloud {
             points: pair.target,
             ground: target,
+            time: None,
         },
     ])
 }

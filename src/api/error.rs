@@ -22,7 +22,7 @@ pub enum ApiError {
     /// A file cannot be decoded, or a pair cannot be solved.
     #[error("{0}")]
     BadInput(String),
-    /// The request exceeds a limit on bytes, points or memory.
+    /// The request exceeds a limit on bytes, points, sweeps or memory.
     #[error("{0}")]
     TooLarge(String),
     /// The server has no device of the kind that the job requires.
@@ -43,7 +43,8 @@ pub enum ApiError {
     /// The requested priority is above the maximum of the key, which is given.
     #[error("this key's jobs may be of priority {} at most", .0.name())]
     Priority(Priority),
-    /// A request to a server without keys, made by a browser for a page of another site.
+    /// A request to a server without keys whose `Host` is not accepted, or whose `Origin` is
+    /// another site.
     #[error(
         "this server has no keys and is for this machine alone: call it as localhost, without a \
          foreign Origin, or name the host in its configuration (allowed_hosts)"
@@ -89,13 +90,14 @@ pub enum ApiError {
     /// The job was cancelled.
     #[error("the job was cancelled")]
     Cancelled(JobId),
-    /// The backlog of the tenant is at its limit. The retry delay is given.
+    /// The tenant has reached its limit of queued work or of connections. The retry delay is given.
     #[error("this tenant has as much waiting as it may; try again in {} s", .0.as_secs())]
     TenantLimit(Duration),
-    /// The server is at a limit. The retry delay is given.
+    /// The server has reached a limit, such as that of queued work, waiting time or memory. The
+    /// retry delay is given.
     #[error("the server is full; try again in {} s", .0.as_secs())]
     ServerFull(Duration),
-    /// The disk is nearly full.
+    /// The disk has too few free bytes or inodes.
     #[error("the server's disk is nearly full; fetch and forget results, or ask its operator")]
     DiskFull,
     /// The store has failed. The log has the reason.
@@ -199,7 +201,7 @@ impl ErrorSpec {
         }
     }
 
-    /// The row of an error code.
+    /// The row of an error code in the table of all errors. `None` for an unknown code.
     pub fn of(code: &str) -> Option<Self> {
         ERRORS.into_iter().find(|row| row.code == code)
     }
@@ -243,12 +245,12 @@ impl ApiError {
         }
     }
 
-    /// The error's row of the table.
+    /// The error's row in the table of all errors.
     pub fn row(&self) -> ErrorSpec {
         ErrorSpec::of(self.code()).expect("every code has a row; a test goes through all of them")
     }
 
-    /// The error message, truncated to about 1 KiB.
+    /// The error message, truncated to 1 KiB.
     pub fn text(&self) -> String {
         let mut text = self.to_string();
         if text.len() > LONGEST_TEXT {
@@ -258,7 +260,9 @@ impl ApiError {
         text
     }
 
-    /// The delay after which the same request may succeed, if it is known.
+    /// The delay after which the same request may succeed, if it is known: as given in
+    /// [`ApiError::TenantLimit`] and [`ApiError::ServerFull`], 5 s while the server drains or its
+    /// store fails, 60 s while its disk is full.
     pub fn retry_after(&self) -> Option<Duration> {
         match self {
             Self::TenantLimit(after) | Self::ServerFull(after) => Some(*after),
@@ -282,7 +286,7 @@ impl ApiError {
         }
     }
 
-    /// Logs an internal error. The client gets no details.
+    /// Logs an error and returns [`ApiError::Internal`], which gives the client no details.
     pub fn internal(error: impl std::fmt::Display) -> Self {
         tracing::error!(%error, "a request broke");
         Self::Internal

@@ -12,8 +12,9 @@ use axum::http::{HeaderMap, Version, header};
 
 use super::error::ApiError;
 
-/// The accepted host names of a server without keys, in addition to the loopback names. `None`
-/// accepts any name, for a server that is open to a network.
+/// The host names that a server without keys accepts in `Host`, without port and in any case. The
+/// loopback names (`localhost`, names below `.localhost`, loopback addresses) are always accepted.
+/// `None` accepts any name, for a server that is open to a network.
 #[derive(Clone, Debug, Default)]
 pub struct Hosts(pub Option<Vec<String>>);
 

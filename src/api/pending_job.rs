@@ -95,9 +95,17 @@ fn with_ground(cloud: Arc<StoredCloud>, options: &JobOptions) -> Arc<StoredCloud
     if cloud.ground.is_some() || options.ground != Ground::Auto {
         return cloud;
     }
-    let StoredCloud { points, ground } = Arc::unwrap_or_clone(cloud);
+    let StoredCloud {
+        points,
+        ground,
+        time,
+    } = Arc::unwrap_or_clone(cloud);
     let Sweep { points, ground } = Sweep { points, ground }.prepared(&options);
-    Arc::new(StoredCloud { points, ground })
+    Arc::new(StoredCloud {
+        points,
+        ground,
+        time,
+    })
 }
 
 impl PendingJob {
@@ -431,7 +439,11 @@ mod tests {
         let options = |json: &str| JobOptions::from_json(json.as_bytes()).expect("good options");
         let stored = |ground: Option<Vec<bool>>, json: &str| {
             let points = points.clone();
-            let cloud = Arc::new(StoredCloud { points, ground });
+            let cloud = Arc::new(StoredCloud {
+                points,
+                ground,
+                time: None,
+            });
             with_ground(cloud, &options(json)).ground.clone()
         };
         let mask = vec![true; points.len()];

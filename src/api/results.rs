@@ -18,7 +18,7 @@ use crate::storage::{Blob, BlobError};
 /// A flow with its report, ready to be sent.
 #[derive(Clone)]
 pub struct Answer {
-    /// The job.
+    /// The job of the pair.
     pub job: Arc<Job>,
     /// The report on the estimate.
     pub report: Report,
@@ -82,12 +82,16 @@ impl Service {
         serde_json::from_str(report).map_err(ApiError::internal)
     }
 
-    /// The flow of a pair that has succeeded.
+    /// The flow of a pair that has succeeded, with its report.
     ///
     /// # Errors
-    /// The error that describes how the job ended without a flow, [`ApiError::ServerFull`],
-    /// [`ApiError::ResultLost`], or an error of the store. [`ApiError::Internal`] if the stored
-    /// flow cannot be decoded.
+    /// - [`ApiError::NotEnded`], [`ApiError::JobFailed`], [`ApiError::Cancelled`] or
+    ///   [`ApiError::Expired`] if the job has not succeeded.
+    /// - [`ApiError::BadRequest`] for a sequence.
+    /// - [`ApiError::ServerFull`] if there is no memory for the result.
+    /// - [`ApiError::ResultLost`] if the stored flow is missing.
+    /// - [`ApiError::StoreUnavailable`] or [`ApiError::DiskFull`] if the store fails.
+    /// - [`ApiError::Internal`] if the stored flow or report cannot be decoded.
     pub async fn answer(&self, job: &Arc<Job>) -> Result<Answer, ApiError> {
         let report = Self::report(job)?;
         let mut room = self.room_for_result(job).await?;

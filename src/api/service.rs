@@ -34,9 +34,11 @@ const OLD: Duration = Duration::from_secs(15);
 pub struct ServiceLimits {
     /// Maximum size of one request body, bytes.
     pub max_upload_bytes: u64,
-    /// Budget for all request bodies that are being received, bytes.
+    /// Budget for all request bodies that are being received, and their clouds, bytes. With several
+    /// tenants, one tenant gets at most half of it.
     pub max_uploads_bytes: u64,
-    /// Budget for all results that are being encoded and sent, bytes.
+    /// Budget for all results that are being encoded and sent, bytes. With several tenants, one
+    /// tenant gets at most half of it.
     pub max_answers_bytes: u64,
     /// Free disk space below which new work is refused, bytes.
     pub min_free_bytes: u64,
@@ -44,7 +46,8 @@ pub struct ServiceLimits {
     pub min_free_inodes: u64,
     /// Maximum number of sweeps in one sequence.
     pub max_sweeps: u32,
-    /// Maximum time without a byte of a request body that is being received.
+    /// Maximum time without a byte of a request body. The time by which a body lags behind 1 KiB/s
+    /// is deducted.
     pub body_idle: Duration,
     /// Number of pairs of a streamed sequence that are computed ahead of the results that the
     /// client has read.
@@ -120,7 +123,7 @@ impl<E: Into<ApiError>> From<E> for MakeDurable {
 pub enum Waited {
     /// The job has ended.
     Ended(Arc<Job>),
-    /// The timeout has passed, or the server closes, and the job has not ended.
+    /// The timeout has passed, or the server closes its streams, and the job has not ended.
     StillOpen(Arc<Job>),
 }
 
@@ -165,10 +168,12 @@ impl Service {
         }
     }
 
-    /// The caller that the value of an `Authorization` header identifies.
+    /// The caller that the value of an `Authorization` header identifies: `Bearer KEY`. A server
+    /// without keys accepts every caller as the default tenant with full rights.
     ///
     /// # Errors
-    /// [`ApiError::Unauthenticated`].
+    /// [`ApiError::Unauthenticated`] if the server has keys and the value is missing, has another
+    /// form, or has an unknown key.
     pub fn caller(&self, authorization: Option<&str>) -> Result<Caller, ApiError> {
         self.keys.caller(authorization)
     }
@@ -183,17 +188,20 @@ impl Service {
         }
     }
 
-    /// Announces that the server is about to stop. Requests are still served.
+    /// Announces that the server is about to stop: the gRPC health service reports NOT_SERVING.
+    /// Requests are still served. It is the first step of a shutdown, before
+    /// [`Service::stop_accepting`].
     pub fn leave(&self) {
         self.leaving.cancel();
     }
 
-    /// Refuses new work from now on.
+    /// Refuses new work from now on, with [`ApiError::Draining`]. Results and running jobs stay
+    /// accessible.
     pub fn stop_accepting(&self) {
         self.draining.store(true, Ordering::Relaxed);
     }
 
-    /// Ends event streams and long polls.
+    /// Ends event streams and long polls. In a shutdown it follows [`Service::stop_accepting`].
     pub fn close_streams(&self) {
         self.closing.cancel();
     }
@@ -288,7 +296,9 @@ impl Service {
     /// A job of the caller's tenant.
     ///
     /// # Errors
-    /// [`ApiError::NotFound`].
+    /// - [`ApiError::NotFound`] if there is no such job, or another tenant owns it.
+    /// - [`ApiError::StoreUnavailable`], [`ApiError::DiskFull`] or [`ApiError::Draining`] if the
+    ///   queue fails or is closed.
     pub async fn job(&self, caller: &Caller, id: JobId) -> Result<Arc<Job>, ApiError> {
         Ok(self.queue.job(&caller.tenant, id).await?)
     }
@@ -296,7 +306,8 @@ impl Service {
     /// The forward pairs of a sequence in order. Empty for a pair.
     ///
     /// # Errors
-    /// [`ApiError::StoreUnavailable`] or another error of the queue.
+    /// [`ApiError::StoreUnavailable`], [`ApiError::DiskFull`] or [`ApiError::Draining`] if the
+    /// queue fails or is closed.
     pub async fn pairs(&self, job: &Job) -> Result<Vec<Arc<Job>>, ApiError> {
         match job.kind {
             Kind::Pair => Ok(Vec::new()),
@@ -308,11 +319,13 @@ impl Service {
         }
     }
 
-    /// The jobs of the caller's tenant, latest first. `state` filters by state, `before` returns
-    /// only older jobs, and `limit` is the maximum number of jobs.
+    /// The jobs of the caller's tenant, latest first. The pairs of sequences are not listed.
+    /// `state` filters by state, `before` returns only older jobs, and `limit` is the maximum
+    /// number of jobs.
     ///
     /// # Errors
-    /// [`ApiError::StoreUnavailable`] or another error of the queue.
+    /// [`ApiError::StoreUnavailable`], [`ApiError::DiskFull`] or [`ApiError::Draining`] if the
+    /// queue fails or is closed.
     pub async fn jobs(
         &self,
         caller: &Caller,
@@ -329,23 +342,33 @@ impl Service {
         Ok(self.queue.list(filter).await?)
     }
 
-    /// Cancels a job of the caller's tenant.
+    /// Cancels a job of the caller's tenant: at once if it is queued, within an iteration or a
+    /// cluster if it is running. An ended job is not changed.
     ///
     /// # Errors
-    /// [`ApiError::Forbidden`] or [`ApiError::NotFound`].
+    /// - [`ApiError::Forbidden`] if the caller may only read.
+    /// - [`ApiError::NotFound`] if there is no such job, or another tenant owns it.
+    /// - [`ApiError::StoreUnavailable`], [`ApiError::DiskFull`] or [`ApiError::Draining`] if the
+    ///   queue fails or is closed.
     pub async fn cancel(&self, caller: &Caller, id: JobId) -> Result<Arc<Job>, ApiError> {
         caller.may_write()?;
         self.job(caller, id).await?;
         Ok(self.queue.cancel(id).await?)
     }
 
-    /// Queues a job of the caller's tenant again. The job must have ended without success, or its
-    /// result must be lost. It is subject to admission control like a new job.
+    /// Queues a job of the caller's tenant again, durable and without a deadline. The job must have
+    /// ended without success, or its result must be lost. It is subject to admission control like a
+    /// new job.
     ///
     /// # Errors
-    /// [`ApiError::Forbidden`], [`ApiError::NotFound`], or the errors of admission control.
-    /// [`ApiError::BadRequest`] if the job has not ended, or has succeeded and still has its
-    /// result.
+    /// - [`ApiError::Forbidden`] if the caller may only read.
+    /// - [`ApiError::NotFound`] if there is no such job, or another tenant owns it.
+    /// - [`ApiError::BadRequest`] if the job has not ended, or has succeeded and still has its
+    ///   result.
+    /// - [`ApiError::TenantLimit`] or [`ApiError::ServerFull`] if admission control refuses it.
+    /// - [`ApiError::Draining`], [`ApiError::DiskFull`] or [`ApiError::StoreUnavailable`] if the
+    ///   server takes no new work, or the store fails.
+    /// - [`ApiError::Internal`] if a sweep of the job is missing from the store.
     pub async fn requeue(&self, caller: &Caller, id: JobId) -> Result<Arc<Job>, ApiError> {
         self.check_new_work(caller)?;
         let job = self.job(caller, id).await?;
@@ -366,10 +389,12 @@ impl Service {
         Ok(self.queue.requeue(id, lost).await?)
     }
 
-    /// Subscribes to the state changes of a job of the caller's tenant.
+    /// Subscribes to a job of the caller's tenant: its state and, while it runs, its progress.
     ///
     /// # Errors
-    /// [`ApiError::NotFound`].
+    /// - [`ApiError::NotFound`] if there is no such job, or another tenant owns it.
+    /// - [`ApiError::StoreUnavailable`], [`ApiError::DiskFull`] or [`ApiError::Draining`] if the
+    ///   queue fails or is closed.
     pub async fn watch(
         &self,
         caller: &Caller,
@@ -379,11 +404,13 @@ impl Service {
         Ok(self.queue.watch(id).await?)
     }
 
-    /// Waits until a job ends, for at most `longest` (forever if `None`), or until the server
-    /// closes its streams.
+    /// Waits until a job ends, for at most `longest` (without limit if `None`), or until
+    /// [`Service::close_streams`] is called.
     ///
     /// # Errors
-    /// [`ApiError::Draining`] if the queue is closed, or another error of the queue.
+    /// - [`ApiError::NotFound`] if there is no such job.
+    /// - [`ApiError::StoreUnavailable`], [`ApiError::DiskFull`] or [`ApiError::Draining`] if the
+    ///   queue fails or is closed.
     pub async fn wait(&self, id: JobId, longest: Option<Duration>) -> Result<Waited, ApiError> {
         let mut news = self.queue.watch(id).await?;
         let longest = longest.unwrap_or(Duration::MAX);

@@ -1,5 +1,5 @@
-//! Graceful shutdown within a deadline: report not ready, accept no new work, finish or interrupt
-//! running jobs, then close streams and connections.
+//! Graceful shutdown within `shutdown.timeout_seconds`: report not ready, accept no new work,
+//! finish or interrupt running jobs, then close streams and connections.
 
 use std::time::Duration;
 
@@ -15,7 +15,22 @@ const TO_PUT_DOWN: Duration = Duration::from_secs(2);
 const TO_CLOSE: Duration = Duration::from_secs(1);
 
 impl App {
-    /// Stops the server. Returns when everything has stopped or the deadline has passed.
+    /// Stops the server. The deadline is `shutdown.timeout_seconds` after the call. The steps are:
+    ///
+    /// 1. The server reports that it is not ready. It accepts work for
+    ///    `shutdown.readiness_delay_seconds` more.
+    /// 2. New work is refused, and no job is leased. Running jobs go on until 3 s before the
+    ///    deadline.
+    /// 3. Jobs that still run are interrupted and queued again, a fit with a snapshot. They have
+    ///    until 1 s before the deadline. An object search is not interrupted, nor is a fit that its
+    ///    deadline has shortened. A durable job that does not stop in time is queued again at the
+    ///    next start.
+    /// 4. Event streams and long polls end, and the listener closes. Open connections have 1 s to
+    ///    send their responses, but not beyond the deadline.
+    /// 5. Background tasks end, and the queue records the graceful shutdown.
+    ///
+    /// Steps 2 to 4 end early when nothing is left to wait for. The admin port answers until the
+    /// process ends.
     pub async fn drain(mut self) {
         let began = Instant::now();
         let deadline = began + Duration::from_secs(self.config.shutdown.timeout_seconds);

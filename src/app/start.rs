@@ -26,7 +26,8 @@ use crate::queue::{Event, Queue, QueueOptions, SqliteQueue};
 use crate::storage::Blobs;
 use crate::worker::{Drain, IsolationLock, StoreProbe, Worker, WorkerOptions};
 
-/// A server that runs.
+/// A running server: its ports, devices, workers, stores and background tasks. [`App::drain`]
+/// stops it.
 pub struct App {
     public: SocketAddr,
     admin: SocketAddr,
@@ -43,10 +44,20 @@ pub struct App {
 }
 
 impl App {
-    /// Starts everything. When this returns, both ports answer; devices may still be on trial.
+    /// Starts the server: the stores, the devices, the workers, the public port and the admin port,
+    /// in this order. When it returns, both ports answer. The devices may not have passed their
+    /// self-tests yet.
+    ///
+    /// It changes the process: the umask becomes 077, SIGXFSZ is ignored, and the limit of open
+    /// files is raised to its maximum.
     ///
     /// # Errors
-    /// Where a port, the data folder, a key or a device cannot be used, with what to do about it.
+    /// - [`App::check`] refuses the configuration.
+    /// - The data folder cannot be used, or another process uses it.
+    /// - The queue file has another schema version.
+    /// - The payloads are not those of the queue, or the queue file is missing beside payloads.
+    /// - A TLS file cannot be used, or the certificate and the key do not match.
+    /// - A port cannot be bound, or a thread cannot be started.
     pub async fn start(config: Config) -> anyhow::Result<Self> {
         config.check()?;
         let pool = Pool::of(&config)?;
@@ -122,13 +133,16 @@ impl App {
         })
     }
 
-    /// Checks a configuration without starting the server: the ranges and combinations of its values,
-    /// every API key and tenant name, and that the devices it names exist. GPUs are listed but not
-    /// opened. Ports, the data folder and the TLS files are not checked.
+    /// Checks a configuration without starting the server. GPUs are listed but not opened. Ports,
+    /// the data folder, the TLS files, `log.filter` and `otlp_endpoint` are not checked.
     ///
     /// # Errors
-    /// If a value is out of range or contradicts another, a key or tenant name is invalid, or `devices`
-    /// names an unknown device or a GPU that the machine does not have.
+    /// - [`Config::check`] refuses a value.
+    /// - An entry of `devices` has none of its forms, or names more than 256 or no threads.
+    /// - An entry of `devices` names a GPU that the machine does not have.
+    /// - An API key is shorter than 16 characters, is given twice, is not printable ASCII, or has
+    ///   white space at an end.
+    /// - A tenant name is not 1 to 64 letters, digits, `-`, `_` or `.`.
     pub fn check(config: &Config) -> anyhow::Result<()> {
         config.check()?;
         Pool::unopened(config)?;
@@ -136,20 +150,22 @@ impl App {
         Ok(())
     }
 
-    /// Where HTTP and gRPC are served.
+    /// The bound address of the public port, which serves HTTP and gRPC.
     pub fn public_address(&self) -> SocketAddr {
         self.public
     }
 
-    /// Where health and metrics are served.
+    /// The bound address of the admin port, which serves health checks and metrics.
     pub fn admin_address(&self) -> SocketAddr {
         self.admin
     }
 
-    /// Waits until a device has passed its trial.
+    /// Waits until a device has been opened and has passed its self-test. The devices are awaited
+    /// in the order of the configuration.
     ///
     /// # Errors
-    /// Where none can.
+    /// If every device has failed its opening or its self-test, with the reason of each. Their
+    /// openings are still retried.
     pub async fn ready(&self) -> anyhow::Result<()> {
         let mut reasons = Vec::new();
         for device in &self.devices {
@@ -170,9 +186,14 @@ impl App {
         ))
     }
 
-    /// Waits until a fresh process may do what this one cannot: until the last device of a kind has
-    /// worked, is lost, and does not come back, or until the queue or the public port has ended.
-    /// Says which.
+    /// Waits until only a restart of the process can repair a failure, and returns the reason:
+    /// - A device that has worked cannot be reopened ([`Health::Gone`]), and no other device of its
+    ///   kind is expected to work ([`Device::may_work`]).
+    /// - The thread of the queue has ended.
+    /// - The public port has closed.
+    ///
+    /// # Panics
+    /// If it is called again after the public port has closed.
     pub async fn given_up(&mut self) -> String {
         let (queue, listener) = (Arc::clone(&self.queue), &mut self.listener);
         let devices = devices_given_up(&self.devices);
@@ -344,8 +365,8 @@ fn check_queue_is_there(config: &Config, blobs: &Blobs) -> anyhow::Result<()> {
     ))
 }
 
-/// Refuses payloads that are not the queue's: those of another one, or an empty folder where a volume
-/// should be. A queue and a store that are both new are made for each other.
+/// Refuses payloads that are not the queue's: those of another one, or an empty folder where a
+/// volume should be. A queue and a store that are both new are made for each other.
 async fn check_identity(
     queue: &dyn Queue,
     blobs: &Blobs,

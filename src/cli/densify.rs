@@ -81,7 +81,7 @@ struct Report {
     /// range.
     unconverged: usize,
     /// Pairs of sweeps that were estimated.
-    fits: usize,
+    pairs: usize,
     device: String,
     /// Share of the depth image's pixels with a known depth: from the sweep nearest to the
     /// reference time alone, then from all sweeps.
@@ -92,8 +92,8 @@ struct Report {
 
 #[derive(Debug, Serialize)]
 struct Seconds {
-    fit: f64,
-    carry: f64,
+    estimate: f64,
+    advect: f64,
     total: f64,
 }
 
@@ -131,15 +131,15 @@ impl Densify {
             &options,
             &terminal,
         )?;
-        let fitted = terminal.seconds();
-        terminal.part("carrying");
+        let estimated = terminal.seconds();
+        terminal.part("advection");
         let field = |edge: FlowEdge| fields.get(&edge);
         let cloud = densify(device.backend.as_ref(), &plan, &sweeps, field, &terminal);
         let cloud = cloud.map_err(|error| match error {
             DensifyError::Backend(error) => Failure::from(crate::flow::FlowError::from(error)),
             error => Failure::internal(error),
         })?;
-        let carried = terminal.seconds();
+        let advected = terminal.seconds();
         terminal.finish();
 
         if let Some(path) = &self.output {
@@ -157,12 +157,12 @@ impl Densify {
             reference_time: self.reference_time,
             dynamic: count(&cloud.dynamic, true),
             unconverged: count(&cloud.converged, false),
-            fits: fields.len(),
+            pairs: fields.len(),
             device: carrier(device.backend.as_ref(), fields.values()),
             depth_density: density,
             seconds: Seconds {
-                fit: fitted - began,
-                carry: carried - fitted,
+                estimate: estimated - began,
+                advect: advected - estimated,
                 total: terminal.seconds(),
             },
         })
@@ -222,7 +222,7 @@ impl Densify {
             return say(format_args!("{json}"));
         }
         say(format_args!(
-            "{} points of {} sweeps in sweep {}, {} of them moved, in {:.1} s on {}",
+            "{} points of {} sweeps at reference time {}, {} of them dynamic, in {:.1} s on {}",
             grouped(report.points),
             report.sweeps,
             report.reference_time,
@@ -231,8 +231,8 @@ impl Densify {
             report.device,
         ))?;
         say(format_args!(
-            "  {} pairs fitted in {:.1} s, points carried in {:.1} s",
-            report.fits, report.seconds.fit, report.seconds.carry
+            "  {} pairs estimated in {:.1} s, points advected in {:.1} s",
+            report.pairs, report.seconds.estimate, report.seconds.advect
         ))?;
         if report.unconverged > 0 {
             let count = grouped(report.unconverged);
@@ -266,12 +266,12 @@ fn fit(
     terminal: &Terminal,
 ) -> Result<BTreeMap<FlowEdge, MotionField>, Failure> {
     let mut fields: BTreeMap<FlowEdge, MotionField> = BTreeMap::new();
-    let fits = plan.edges().len();
+    let pairs = plan.edges().len();
     for chain in plan.chains() {
         let (mut sequence, mut waiting) = (Sequence::default(), VecDeque::from(chain));
         let mut last = None;
         for index in way(&waiting, sweeps.len()) {
-            terminal.part(&format!("pair {} of {fits}", fields.len() + 1));
+            terminal.part(&format!("pair {} of {pairs}", fields.len() + 1));
             let before = last.replace(index).unwrap_or(index);
             let larger = sweeps[before].points.len().max(sweeps[index].points.len());
             let solver_options = surroundings.options(options, larger, [before, index]);

@@ -11,7 +11,7 @@ use super::terminal::Terminal;
 use super::{device, files};
 use crate::flow::field::{Backend, BackendError};
 use crate::flow::{self, Ego, Estimate, FlowError, RigidTransform, Sequence, Sweep};
-use crate::formats;
+use crate::formats::{self, SweepTime};
 use crate::job::{
     DeviceChoice, EgoChoice, GroundChoice, JobOptions, PrecisionChoice, PresetChoice,
 };
@@ -225,11 +225,10 @@ impl Surroundings {
     /// and the file names do.
     pub(super) fn timed(&self, options: &JobOptions, [source, target]: [usize; 2]) -> JobOptions {
         let mut options = options.clone();
-        if let (None, Some(source), Some(target)) =
-            (options.dt_s, self.names.get(source), self.names.get(target))
-        {
-            options.dt_s = formats::interval_s(source, target);
-        }
+        let time = |sweep: usize| SweepTime::from_name(self.names.get(sweep)?);
+        options.dt_s = options
+            .dt_s
+            .or_else(|| time(source)?.interval_s(time(target)?));
         options
     }
 

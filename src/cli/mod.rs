@@ -54,7 +54,7 @@ enum Command {
 }
 
 /// Runs the command and returns its exit code: 0 success, 2 usage error, 65 bad input, 70 internal
-/// error.
+/// error. Prints a failure as one line on stderr. A closed stdout is a success.
 pub fn run(arguments: Arguments) -> ExitCode {
     let done = match arguments.command {
         Command::Demo(command) => command.run(),

@@ -27,13 +27,13 @@ const MIN_DRAIN_SECONDS: u64 = 4;
 /// Maximum number of lanes of a GPU. Each lane is a thread and takes a share of the GPU memory.
 const MAX_LANES: usize = 64;
 
-/// The complete configuration of the server.
+/// The complete configuration of the server. [`Config::check`] checks the ranges of its values.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
-    /// Address of the public port, which serves both HTTP and gRPC.
+    /// Address of the public port, which serves both HTTP and gRPC. Port 0 takes a free port.
     pub listen: SocketAddr,
-    /// Address of the admin port, which serves health checks and metrics.
+    /// Address of the admin port, which serves health checks and metrics. Port 0 takes a free port.
     pub admin_listen: SocketAddr,
     /// Directory of the queue, the payloads and the results.
     pub data_dir: PathBuf,
@@ -43,19 +43,22 @@ pub struct Config {
     /// as that of a reverse proxy. Other host names are refused, because a browser could be made to
     /// send requests from another site's page.
     pub allowed_hosts: Vec<String>,
-    /// One API key for the default tenant, with full access.
+    /// One API key for the tenant `default`, with full access: 16 or more printable ASCII
+    /// characters without white space at the ends.
     pub api_key: Option<Secret>,
     /// API keys with tenants and roles.
     pub keys: Vec<KeyConfig>,
     /// TLS on the public port.
     pub tls: Option<TlsConfig>,
-    /// Compute devices. `auto`: every usable GPU, or the CPU if there is none. `cpu`: all cores.
-    /// `cpu:4`: four threads. `gpu`: every GPU. `gpu:CARD`: one GPU by index, PCI id or part of its
-    /// name.
+    /// Compute devices, at least one. `auto`: every usable GPU, or the CPU if there is none. `cpu`:
+    /// all cores, at most 256. `cpu:4`: four threads, 1 to 256. `gpu`: every GPU. `gpu:CARD`: one
+    /// GPU by index, PCI id or part of its name.
     pub devices: Vec<String>,
-    /// Number of pairs that one GPU computes at the same time. By default chosen for the GPU.
+    /// Number of pairs that one GPU computes at the same time, 1 to 64. `None`: 8, or 2 for a
+    /// software driver. Fewer are used if the GPU cannot hold as many networks.
     pub gpu_lanes: Option<usize>,
-    /// Memory to use on a GPU, MiB. By default chosen for the GPU.
+    /// Memory to allocate on each GPU, MiB, at least 1. `None`: chosen by
+    /// [`crate::flow::gpu::GpuOptions`].
     pub gpu_memory_mib: Option<u64>,
     /// Accept GPU drivers that compute on the CPU. For tests.
     pub allow_software_gpu: bool,
@@ -75,11 +78,13 @@ pub struct Config {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct KeyConfig {
-    /// Tenant that owns the jobs created and read with the key.
+    /// Tenant that owns the jobs created and read with the key: 1 to 64 letters, digits, `-`, `_`
+    /// or `.`.
     pub tenant: String,
     /// Permissions of the key: read or write.
     pub role: Role,
-    /// The key, at least 16 characters.
+    /// The key: 16 or more printable ASCII characters without white space at the ends. Each key is
+    /// given once.
     pub key: Secret,
     /// Highest priority that its jobs may have: low, normal or high. High-priority jobs start
     /// before all others, across tenants.
@@ -101,65 +106,72 @@ pub struct TlsConfig {
     pub key: PathBuf,
 }
 
-/// Limits on requests, uploads and connections.
+/// Limits on requests, uploads and connections. Sizes in MiB are at most 2^43. Times are at most
+/// 100 years, if not said otherwise.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LimitsConfig {
-    /// Maximum number of points of one cloud.
+    /// Maximum number of points of one cloud, 1 to 50,000,000.
     pub max_points: usize,
-    /// Maximum memory of one pair on a device, or of one dense cloud, MiB.
+    /// Maximum predicted memory of one pair on a device, or of one dense cloud, MiB, at least 1.
     pub max_job_memory_mib: usize,
-    /// Maximum size of one request body, MiB.
+    /// Maximum size of one request body, MiB, at least 1.
     pub max_upload_mib: u64,
-    /// Maximum total size of all bodies that are being received and of the clouds decoded from them,
-    /// MiB.
+    /// Maximum total size of all bodies that are being received and of the clouds decoded from
+    /// them, MiB, at least `max_upload_mib`.
     pub max_total_upload_mib: u64,
-    /// Maximum total size of all responses that are being prepared and sent, MiB.
+    /// Maximum total size of all responses that are being prepared and sent, MiB, at least 1.
     pub max_answers_mib: u64,
     /// Free disk space below which new work is refused, MiB.
     pub min_free_disk_mib: u64,
-    /// Number of free inodes (files that can still be created) below which new work is refused.
+    /// Number of free inodes (files that can still be created) below which new work is refused, at
+    /// most 2^40.
     pub min_free_inodes: u64,
-    /// Maximum number of sweeps of one sequence.
+    /// Maximum number of sweeps of one sequence, 2 to 2^20.
     pub max_sweeps: u32,
-    /// Maximum predicted wait of a synchronous call, seconds.
+    /// Maximum predicted wait of a synchronous call until its job starts, seconds.
     pub max_wait_seconds: u64,
     /// Maximum predicted compute time of all queued jobs, seconds.
     pub max_queue_seconds: u64,
     /// Maximum predicted compute time of all queued jobs of one tenant, seconds.
     pub max_tenant_queue_seconds: u64,
-    /// Maximum number of open connections.
+    /// Maximum number of open connections of the public port, 1 to 2^20. Fewer are used if the
+    /// limit of open files is lower.
     pub max_connections: usize,
-    /// Timeout for the headers of a request, seconds.
+    /// Timeout for the headers of a request, for a TLS handshake, and between two requests of a
+    /// connection, seconds, 1 to 3600.
     pub header_timeout_seconds: u64,
-    /// Maximum time between two bytes of a request body, seconds. It is also the maximum delay of a
-    /// body behind a rate of 1 KiB/s.
+    /// Maximum time between two bytes of a request body, seconds, 1 to 3600. It is also the maximum
+    /// delay of a body behind a rate of 1 KiB/s.
     pub body_timeout_seconds: u64,
-    /// Time that a response may stay unread by its client, seconds.
+    /// Time that a response may stay unread by its client, seconds, 1 to 3600.
     pub write_timeout_seconds: u64,
-    /// Number of pairs of a streamed sequence that are computed ahead of the client's reading.
+    /// Number of pairs of a streamed sequence that are computed ahead of the client's reading, 1 to
+    /// 1000.
     pub stream_prefetch_pairs: usize,
 }
 
-/// Retries, leases and retention of jobs.
+/// Retries, leases and retention of jobs. Times in seconds are at most 100 years.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct QueueConfig {
-    /// Failures after which a job is not retried.
+    /// Failures after which a job is not retried, 1 to 1000.
     pub max_attempts: u32,
-    /// Crashes without a new snapshot in between after which a job is not retried.
+    /// Crashes without a new snapshot in between after which a job is not retried, 1 to 1000.
     pub max_crashes: u32,
-    /// Time without a heartbeat after which a running job is given to another worker, seconds.
+    /// Time without a heartbeat after which a running job is queued again, seconds, at least 1. It
+    /// counts as a failure.
     pub lease_seconds: u64,
-    /// Delay before the second attempt, seconds. It doubles with each further attempt.
+    /// Delay before the second attempt, seconds. It doubles with each further attempt, up to 1024
+    /// times the first one.
     pub retry_delay_seconds: u64,
-    /// Maximum time in the queue of a job without a deadline, seconds.
+    /// Maximum time in the queue of a job without a deadline, seconds, at least 1.
     pub time_to_live_seconds: u64,
-    /// Time that a finished job and its flow are kept, seconds.
+    /// Time that a finished durable job, its sweeps and its result are kept, seconds, at least 1.
     pub retention_seconds: u64,
-    /// The same for a job whose result was already sent to its waiting caller, seconds.
+    /// The same for an ephemeral job, whose caller waited for the result, seconds, at least 1.
     pub sync_result_retention_seconds: u64,
-    /// Interval between snapshots of a running job, milliseconds.
+    /// Interval between snapshots of a running fit, milliseconds.
     pub snapshot_interval_ms: u64,
 }
 
@@ -170,8 +182,9 @@ pub struct ShutdownConfig {
     /// Time between reporting not ready and refusing new work, seconds. Load balancers need it to
     /// react.
     pub readiness_delay_seconds: u64,
-    /// Maximum time from the signal to the exit, seconds. Jobs that are still running are
-    /// interrupted and resumed after a restart.
+    /// Deadline of the shutdown, seconds after the signal: at least `readiness_delay_seconds` + 4,
+    /// at most 100 years. Jobs that still run shortly before it are queued again, and continue
+    /// after a restart. The exit may take a few seconds more, to send the last traces.
     pub timeout_seconds: u64,
 }
 
@@ -181,7 +194,7 @@ pub struct ShutdownConfig {
 pub struct LogConfig {
     /// Output format.
     pub format: LogFormat,
-    /// A level, or a filter such as `fnsf::worker=debug,info`.
+    /// A level such as `info`, or levels by module such as `fnsf::worker=debug,info`.
     pub filter: String,
 }
 
@@ -255,27 +268,33 @@ impl Default for Config {
 /// Why a configuration is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
-    /// A file cannot be read or is not TOML.
+    /// The configuration file cannot be read or is not TOML.
     #[error("cannot read {path}: {reason}")]
     File {
         /// Path of the file.
         path: String,
-        /// The reason.
+        /// The error, with the line number if the file is not TOML. It does not quote the line.
         reason: String,
     },
     /// A key is unknown, or a value has the wrong type or form.
     #[error("{0}")]
     Value(String),
-    /// A value is out of range, or two values contradict each other.
+    /// A value is out of range or has no TOML form, or two values contradict each other.
     #[error("{0}")]
     Together(String),
 }
 
 impl Config {
-    /// Reads the defaults, `file`, the environment and `flags`. Each overrides the previous ones.
+    /// Reads the defaults, the TOML `file`, the environment and `flags`. Each overrides the
+    /// previous ones. Environment variables have the prefix `FNSF_SERVE_`. In their names `__`
+    /// goes one level down, as in `FNSF_SERVE_LIMITS__MAX_POINTS`. `flags` serializes to a map of
+    /// the keys that are given.
     ///
     /// # Errors
-    /// [`ConfigError`], which names the key and its source.
+    /// - [`ConfigError::File`] if `file` cannot be read or is not TOML.
+    /// - [`ConfigError::Value`] if a key is unknown, or a value has the wrong type or form. It
+    ///   names the key and its source.
+    /// - [`ConfigError::Together`] as [`Config::check`].
     pub fn load(file: Option<&Path>, flags: &impl Serialize) -> Result<Self, ConfigError> {
         let mut figment = Figment::from(Serialized::defaults(Self::default()));
         if let Some(path) = file {
@@ -315,7 +334,12 @@ impl Config {
     /// Checks ranges, and values that must agree with each other.
     ///
     /// # Errors
-    /// [`ConfigError::Together`].
+    /// [`ConfigError::Together`] in these cases:
+    /// - `listen` is beyond loopback without `api_key`, `keys` and `allow_unauthenticated`.
+    /// - `devices` is empty.
+    /// - A number is outside the range that its field states.
+    /// - `shutdown.timeout_seconds` is less than `shutdown.readiness_delay_seconds` + 4.
+    /// - `limits.max_total_upload_mib` is less than `limits.max_upload_mib`.
     pub fn check(&self) -> Result<(), ConfigError> {
         let refuse = |text: &str| Err(ConfigError::Together(text.to_owned()));
         let open = self.api_key.is_none() && self.keys.is_empty();
@@ -361,10 +385,11 @@ impl Config {
         Ok(())
     }
 
-    /// The configuration as TOML, with `***` for secrets.
+    /// The configuration as TOML, with `***` for API keys and for the user and password of
+    /// `otlp_endpoint`. Keys without a value are left out.
     ///
     /// # Errors
-    /// If a value has no TOML form.
+    /// [`ConfigError::Together`] if a path is not UTF-8, or a number is 2^63 or more.
     pub fn to_toml(&self) -> Result<String, ConfigError> {
         let mut shown = self.clone();
         // The URL may contain a password.

@@ -6,7 +6,8 @@ use figment::error::Kind;
 use serde::de::Visitor;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// Text that is never printed: `Debug` and `Serialize` give `***`.
+/// Text that is never printed: `Debug` and `Serialize` give `***`. It is deserialized from a
+/// string.
 #[derive(Clone)]
 pub struct Secret(String);
 

@@ -12,22 +12,22 @@ use crate::flow::{Control, DenseCloud, FlowError, MotionField, Sweep};
 
 /// The input of one densification.
 pub struct Densification {
-    /// The reference frame, the edges and the integration parameters.
+    /// The reference time, the edges and the integration parameters.
     pub plan: Plan,
-    /// All sweeps, in order.
+    /// All sweeps of the plan, in order of time.
     pub sweeps: Vec<Sweep>,
     /// A motion field for each edge of the plan.
     pub fields: HashMap<FlowEdge, MotionField>,
-    /// Interruption and heartbeat.
+    /// Interruption and heartbeat. Any interrupt cancels the work without a result.
     pub control: Arc<dyn Control + Send + Sync>,
 }
 
 /// A dense cloud and the device that computed it, as reports show it.
 #[derive(Debug)]
 pub struct Densified {
-    /// The points of all sweeps.
+    /// The points of all sweeps in the frame of the reference time.
     pub cloud: DenseCloud,
-    /// The device, or the host's threads.
+    /// The name of the device, or of the host's threads if no field is a network.
     pub device: String,
 }
 

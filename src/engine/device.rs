@@ -17,18 +17,20 @@ use crate::flow::field::Backend;
 use crate::job::DeviceKind;
 use crate::metrics::Metrics;
 
-/// Runs the self-test: solves a small pair with known flow.
+/// Runs the self-test: fits a field to a small synthetic pair with known flow.
 ///
 /// # Errors
-/// The reason why the device failed.
+/// The reason why the device failed: the estimate fails, its mean end-point error is 0.11 m or
+/// more, or it panics.
 pub fn self_test_backend(backend: &dyn Backend) -> Result<(), String> {
     self_test::run(backend).map_err(|error| error.to_string())
 }
 
-/// Opens a device, runs the self-test, and closes it again.
+/// Opens a device, runs the self-test, and closes the device again.
 ///
 /// # Errors
-/// The reason why the device failed.
+/// The reason why the device failed: it cannot be opened, it fails its self-test, or one of them
+/// panics.
 pub fn try_opening(open: &DeviceFactory) -> Result<(), String> {
     self_test::opened(open).map(|opened| opened.destroy())
 }
@@ -49,7 +51,7 @@ pub struct Device {
     lanes: Arc<[LaneHandle]>,
 }
 
-/// One lane of a device: runs one pair at a time.
+/// One lane of a device: runs one pair, or one densification, at a time. Clones share it.
 #[derive(Clone)]
 pub struct Lane {
     device: Device,
@@ -57,10 +59,12 @@ pub struct Lane {
 }
 
 impl Device {
-    /// Starts the threads of the lanes; the first one opens the device.
+    /// Starts the threads of the lanes. One of them opens the device and runs its self-test. This
+    /// call does not wait for it. The number of lanes and the losses of the device go into
+    /// `metrics`.
     ///
     /// # Errors
-    /// If a thread cannot be started.
+    /// The error of the operating system if a thread cannot be started.
     pub fn start(options: DeviceOptions, metrics: &Arc<Metrics>) -> std::io::Result<Self> {
         let (tell, health) = watch::channel(Health::Starting);
         let name: Arc<str> = Arc::from(options.name);
@@ -101,13 +105,13 @@ impl Device {
         self.kind
     }
 
-    /// The device's health as a watch channel.
+    /// A channel with the device's current health, which reports every change.
     pub fn health(&self) -> watch::Receiver<Health> {
         self.health.clone()
     }
 
-    /// Whether the device works, or may recover without intervention. A device that has worked
-    /// before usually recovers after a loss; one that never worked does not.
+    /// Whether the device works or is expected to work again. False for [`Health::Gone`], and for
+    /// [`Health::Broken`] if the device has never passed its self-test.
     pub fn may_work(&self) -> bool {
         match &*self.health.borrow() {
             Health::Starting | Health::Ready => true,
@@ -124,9 +128,9 @@ impl Device {
         })
     }
 
-    /// The reason why the device is not ready, if there is one. It is ready if a lane's thread
-    /// runs, the self-test has passed, and every lane at work has had a heartbeat within the last
-    /// 30 s.
+    /// The reason why the device is not ready; `None` if it is ready. It is ready if at least one
+    /// lane's thread runs, the self-test has passed, and every lane at work has had a heartbeat
+    /// within the last 30 s.
     pub fn not_ready_reason(&self) -> Option<String> {
         if self.lanes().all(|lane| lane.has_ended()) {
             return Some(format!("{} has no thread any more", self.name));
@@ -153,14 +157,15 @@ impl Device {
         }
     }
 
-    /// Reopens a device that was lost while idle. A lane at work detects the loss itself.
+    /// Checks whether the device was lost while idle. If so, tells the first lane to reopen it.
+    /// Returns at once. A lane at work detects a loss itself.
     pub fn look(&self) {
         if self.supervisor.is_lost_unreported() {
             let _a_busy_lane_finds_out = self.lanes[0].commands.try_send(Command::Look);
         }
     }
 
-    /// Total working time, summed over the lanes.
+    /// Total working time since the start, summed over the lanes, current work included.
     pub fn busy_time(&self) -> Duration {
         self.lanes.iter().map(|lane| lane.liveness.total()).sum()
     }
@@ -182,20 +187,26 @@ impl Lane {
         self.device.lanes[self.index].commands.is_closed()
     }
 
-    /// Estimates the flow of one pair.
+    /// Estimates the flow of one pair. Resumes from the snapshot, or starts afresh if the snapshot
+    /// does not fit the work.
     ///
     /// # Errors
-    /// [`EngineError`]. After an error the device is ready for the next pair, or its health shows
-    /// otherwise.
+    /// - [`EngineError::Flow`] if the estimate refuses its input, fails or is cancelled.
+    /// - [`EngineError::Panicked`] if the estimate panics.
+    /// - [`EngineError::Lost`] if the device is lost during the work.
+    /// - [`EngineError::Broken`] if the device could not start the work.
+    ///
+    /// After an error the device is ready for the next pair, or its health shows otherwise.
     pub async fn solve(&self, work: Work) -> Result<Estimate, EngineError> {
         self.run(move |backend, liveness| Ok(slot::solve(backend, work, liveness)?))
             .await
     }
 
-    /// Transforms the sweeps of a sequence into one reference frame.
+    /// Transforms the points of the sweeps of a sequence into the frame of the reference time.
     ///
     /// # Errors
-    /// As [`Lane::solve`].
+    /// As [`Lane::solve`], and [`EngineError::Densify`] if the sweeps, their ground masks or the
+    /// fields do not fit the plan.
     pub async fn densify(&self, work: Densification) -> Result<Densified, EngineError> {
         self.run(move |backend, liveness| densify::densify(backend, &work, liveness))
             .await

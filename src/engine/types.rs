@@ -46,19 +46,21 @@ pub enum Health {
 /// Why a device returned no result.
 #[derive(Debug, thiserror::Error)]
 pub enum EngineError {
-    /// The solver refused the input or failed.
+    /// The estimate refused its input, failed or was cancelled, or the device failed in a
+    /// densification.
     #[error(transparent)]
     Flow(#[from] FlowError),
-    /// The sweeps and fields do not form a cloud.
+    /// The sweeps, their ground masks or the fields do not fit the plan of a densification.
     #[error(transparent)]
     Densify(DensifyError),
-    /// The solver panicked. The device must pass its self-test again.
+    /// The work panicked, with this message. The device must pass its self-test again.
     #[error("the solver panicked: {0}")]
     Panicked(String),
-    /// The device was lost during the work. It is reopened.
+    /// The device was lost during the work, with the reason. It is reopened.
     #[error("the device was lost: {0}")]
     Lost(String),
-    /// The device could not start the work.
+    /// The device could not start the work: it cannot be opened, is being opened again, or the
+    /// lane's thread has ended.
     #[error("the device cannot be used: {0}")]
     Broken(String),
 }
@@ -81,7 +83,7 @@ pub type DeviceFactory = Box<dyn Fn() -> Result<Box<dyn Opened>, BackendError> +
 /// Retry policy for opening a device.
 #[derive(Clone, Copy, Debug)]
 pub struct ReopenPolicy {
-    /// Pause before the second try. Each later pause is four times as long.
+    /// Pause after the first failure. Each later pause is four times as long. A success resets it.
     pub first_pause: Duration,
     /// Upper limit of the pause.
     pub longest_pause: Duration,
@@ -106,9 +108,9 @@ pub struct DeviceOptions {
     pub name: String,
     /// Its kind.
     pub kind: DeviceKind,
-    /// Number of pairs that run on it at the same time.
+    /// Number of pairs that run on it at the same time; 0 counts as 1.
     pub lanes: usize,
-    /// Opens it.
+    /// Opens the device, at the start and after each loss.
     pub open: DeviceFactory,
     /// Retry policy for opening it.
     pub reopening: ReopenPolicy,

@@ -40,15 +40,19 @@ const WORKING_SETS: usize = 16 << 20;
 /// The predicted memory and work of an estimate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cost {
-    /// Source points that pass the selection.
+    /// Number of source points that take part: finite, within the crop, not excluded as ground and,
+    /// for a field, sampled.
     pub source_points: usize,
-    /// Target points that pass the selection.
+    /// Number of target points that take part, by the same conditions.
     pub target_points: usize,
-    /// Bricks of the distance transform; zero for a dense transform and for the object search.
+    /// Number of bricks of the distance transform; zero for a dense transform and for the object
+    /// search.
     pub bricks: usize,
-    /// Bytes of the distance transform, equal to [`super::FieldSolution::distance_bytes`].
+    /// Bytes of the distance transform; zero for the object search. Equal to
+    /// [`super::FieldSolution::distance_bytes`] of a fit on the CPU without a deadline.
     pub transform_bytes: usize,
-    /// Upper bound of the bytes held at once, without the problem itself.
+    /// Upper bound of the bytes held at once on a CPU with up to 28 threads, without the problem
+    /// itself.
     pub bytes: usize,
     /// Work, in multiply-adds of the network. Other work is included as the number of multiply-adds
     /// that take equally long.
@@ -79,11 +83,17 @@ pub fn neighbor_cost(points: usize) -> NeighborCost {
     }
 }
 
-/// Predicts the cost of the estimate of `problem` with `options`. Assumes
+/// Predicts the cost of the estimate of `problem` with `options`, without a deadline. Assumes
 /// [`FieldOptions::expected_iterations`] iterations for a field.
 ///
+/// Selects the points, with a segmentation of the ground where one is needed, and plans the
+/// distance transform. Computes no distances.
+///
 /// # Errors
-/// [`FlowError`] where [`super::estimate()`] would reject the input.
+/// [`FlowError::TooFewPoints`], [`FlowError::NoGroundMask`] or [`FlowError::GroundMaskLength`] for
+/// the pair, and [`FlowError::Backend`] if the distance transform is rejected: as
+/// [`super::estimate()`]. The ground masks of neighbor sweeps and the limits of a device are not
+/// checked.
 pub fn price(problem: &Problem, options: &Options) -> Result<Cost, FlowError> {
     let selection = select(problem, options, &find_ground)?;
     let (source_points, target_points) = (selection.source.len(), selection.target.len());

@@ -7,15 +7,17 @@ use super::field::{BackendError, FitError, SnapshotError};
 /// The reason why an estimate was rejected or failed.
 #[derive(Debug, thiserror::Error)]
 pub enum FlowError {
-    /// A cloud has too few points, or too few that are finite, within the crop and not masked.
+    /// Fewer than [`MIN_POINTS`] points of a cloud are selected: finite, within the crop and not
+    /// masked. For a field, [`super::Options::max_points`] below this number causes it as well.
     #[error("the {cloud} cloud has {points} usable points, at least {MIN_POINTS} are needed")]
     TooFewPoints {
         /// `source` or `target`.
         cloud: &'static str,
-        /// Points that are finite, within the crop and not masked.
+        /// Number of selected points.
         points: usize,
     },
-    /// [`super::Ground::Mask`] is set, but the problem has no ground masks.
+    /// [`super::Ground::Mask`] is set, but the problem or one of its used neighbor sweeps has no
+    /// ground mask.
     #[error("the ground cannot be masked: the input has no ground masks")]
     NoGroundMask,
     /// A ground mask does not have one flag per point of its cloud.
@@ -23,24 +25,26 @@ pub enum FlowError {
     GroundMaskLength {
         /// `source`, `target` or `neighbor sweep`.
         cloud: &'static str,
-        /// Length of the mask.
+        /// Number of flags in the mask.
         flags: usize,
-        /// Points of the cloud.
+        /// Number of points in the cloud.
         points: usize,
     },
     /// The control cancelled the estimate.
     #[error("the estimate was cancelled")]
     Cancelled,
-    /// The loss was not a number.
+    /// The loss of a field was not finite.
     #[error("the optimization diverged at iteration {iteration}")]
     Diverged {
-        /// Completed iterations.
+        /// Number of iterations completed before it.
         iteration: usize,
     },
-    /// The snapshot was rejected, for example because it belongs to another problem.
+    /// The snapshot was rejected: it belongs to another problem, other options or another method,
+    /// or its bytes are damaged.
     #[error(transparent)]
     Snapshot(#[from] SnapshotError),
-    /// The backend failed.
+    /// The distance transform was rejected, or the device failed, is busy, has too little memory or
+    /// does not support the options.
     #[error(transparent)]
     Backend(#[from] BackendError),
 }
@@ -56,9 +60,12 @@ impl From<FitError> for FlowError {
 }
 
 impl FlowError {
-    /// Whether the input caused the error, rather than the machine. Includes a pair that exceeds
-    /// the device memory and an option that the device does not support. Excludes an invalid cell
-    /// or band of the distance transform.
+    /// Whether the input or its options caused the error, rather than the machine.
+    ///
+    /// True for too few points, a missing or wrong ground mask, clouds that span too much space, a
+    /// pair that exceeds the allowed memory or the memory of the device, and an option that the
+    /// device does not support. False for all other errors, including an invalid cell or band of
+    /// the distance transform.
     pub fn is_input(&self) -> bool {
         match self {
             Self::TooFewPoints { .. } | Self::NoGroundMask | Self::GroundMaskLength { .. } => true,

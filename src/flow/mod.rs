@@ -1,4 +1,5 @@
-//! Scene flow estimation: the flow of a pair of point clouds by run-time optimization.
+//! Scene flow estimation: the motion of every point between two lidar sweeps, by an object search
+//! or by the fit of a neural field.
 //!
 //! ```text
 //! Problem - select - registration - objects or field - Estimate

@@ -3,31 +3,38 @@
 use super::data::Point;
 use super::motion::MotionField;
 
-/// A pair of unprocessed sweeps.
+/// The input of an estimate: a pair of raw sweeps, with optional ground masks, previous motion
+/// field and neighbor sweeps.
 #[derive(Clone, Copy, Debug)]
 pub struct Problem<'a> {
     /// N points of the earlier sweep, metres, in its sensor frame.
     pub source: &'a [Point],
     /// M points of the later sweep, metres, in its sensor frame.
     pub target: &'a [Point],
-    /// N and M flags: true for ground points. Required by [`super::Ground::Mask`]. With
-    /// [`super::Ground::Auto`] the ground is segmented where the masks are absent.
+    /// N and M flags: true for ground points. Required by [`super::Ground::Mask`] and ignored by
+    /// [`super::Ground::Keep`]. With [`super::Ground::Auto`] the ground is segmented where the
+    /// masks are absent.
     pub ground: Option<[&'a [bool]; 2]>,
-    /// The motion field of the previous pair, whose target is this pair's source. A field fit with
-    /// a warm start uses it as its initial guess and as the prior of the ego motion. None for an
+    /// The motion field of the previous pair, whose target is this pair's source. None for an
     /// independent pair.
+    ///
+    /// Only a field fit with [`super::FieldOptions::warm_start`] uses it. Its ego motion is then
+    /// the prior of the registration. Its network is the initial guess of the fit if it explains
+    /// this pair better than no residual motion. Either both pairs or neither must have an ego
+    /// motion for that.
     pub before: Option<&'a MotionField>,
-    /// Other sweeps of the sequence, in any order; empty for an independent pair. Used where
-    /// [`super::ObjectOptions::sweeps`] is more than two.
+    /// Other sweeps of the sequence, in any order; empty for an independent pair. An object search
+    /// uses at most [`super::Options::sweeps`] minus two of them: those nearest in time to the
+    /// middle of the pair. A deadline may drop some.
     pub neighbors: &'a [NeighborSweep<'a>],
 }
 
 /// A neighbor sweep: another sweep of the same sequence.
 #[derive(Clone, Copy, Debug)]
 pub struct NeighborSweep<'a> {
-    /// Points, metres, in the sensor frame of the sweep.
+    /// K points, metres, in the sensor frame of the sweep.
     pub points: &'a [Point],
-    /// One flag per point: true for ground points, as in [`Problem::ground`].
+    /// K flags: true for ground points, as in [`Problem::ground`].
     pub ground: Option<&'a [bool]>,
     /// Time of the sweep, in sweep intervals after the source. The target is at 1, the sweep before
     /// the source at -1.
@@ -35,7 +42,7 @@ pub struct NeighborSweep<'a> {
 }
 
 impl<'a> Problem<'a> {
-    /// A pair without ground masks, prior and neighbor sweeps.
+    /// A pair without ground masks, previous motion field and neighbor sweeps.
     pub fn pair(source: &'a [Point], target: &'a [Point]) -> Self {
         Self {
             source,

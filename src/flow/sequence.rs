@@ -29,9 +29,13 @@ pub struct Sweep {
 }
 
 impl Sweep {
-    /// The sweep with the ground mask that `options` require: with [`super::Ground::Auto`] a
-    /// missing mask is replaced by a segmentation, with [`super::Ground::Keep`] the mask is
-    /// removed.
+    /// The sweep with the ground mask that `options.ground` requires.
+    ///
+    /// - [`Ground::Keep`]: the mask is removed.
+    /// - [`Ground::Auto`]: a missing mask is made by segmenting the points within the crop. A mask
+    ///   that is there is kept.
+    /// - [`Ground::Mask`]: the sweep is unchanged, even if its mask is missing. The estimate of the
+    ///   pair then reports the error.
     #[must_use]
     pub fn prepared(self, options: &Options) -> Self {
         self.prepared_by(options, &find_ground)
@@ -49,7 +53,11 @@ impl Sweep {
         self
     }
 
-    /// The sweep restricted to points that are finite and within the crop of `options`.
+    /// The sweep restricted to points that are finite and within the crop of `options`, in the same
+    /// order.
+    ///
+    /// # Panics
+    /// If a point that is kept has no flag in a ground mask that is too short.
     #[must_use]
     pub fn cropped(self, options: &Options) -> Self {
         let rows: Vec<usize> = (0..self.points.len())
@@ -66,10 +74,15 @@ impl Sweep {
 
 /// The window of a pair: the range of consecutive sweeps that its estimate uses.
 ///
-/// `pair` is the index of the pair, `count` the number of sweeps in the sequence, `sweeps` the
-/// window size. The window has at least two sweeps and contains both sweeps of the pair. It is
-/// centered on the pair as far as the ends of the sequence allow. With an odd size the extra sweep
-/// lies before the pair.
+/// `pair` is the index of the pair's earlier sweep. `count` is the number of sweeps in the
+/// sequence, and `pair + 1 < count` is required. `sweeps` is the window size, raised to two and
+/// limited to `count`.
+///
+/// The window contains both sweeps of the pair. It is centered on the pair as far as the ends of
+/// the sequence allow. With an odd size the extra sweep lies before the pair.
+///
+/// # Panics
+/// If `count` is 0, in builds with overflow checks.
 pub fn window(pair: usize, count: usize, sweeps: usize) -> Range<usize> {
     let sweeps = sweeps.max(2).min(count);
     let first = pair.saturating_sub(before_pair(sweeps));
@@ -78,6 +91,8 @@ pub fn window(pair: usize, count: usize, sweeps: usize) -> Range<usize> {
 }
 
 /// Whether the window of a pair is final: sweeps after the first `count` do not change it.
+///
+/// `pair` is the index of the pair's earlier sweep. `sweeps` is the window size, raised to two.
 pub fn is_window_final(pair: usize, count: usize, sweeps: usize) -> bool {
     let sweeps = sweeps.max(2);
     pair.saturating_sub(before_pair(sweeps)) + sweeps <= count
@@ -95,11 +110,13 @@ struct QueuedSweep {
     options: Options,
 }
 
-/// Streaming estimator of a sequence, pair by pair.
+/// Streaming estimator of a sequence, pair by pair. `Sequence::default()` starts a sequence.
 ///
-/// The options of the first sweep set the window size ([`Options::sweeps`]). With more than two
-/// sweeps a pair is estimated from its [`window`] alone. Its result is delayed until the last sweep
-/// of the window arrives. At most one window of sweeps is held.
+/// The options of the first sweep set the window size ([`Options::sweeps`]). Each pair is estimated
+/// from the sweeps of its [`window`]. Its result is delayed until the last of them arrives. The
+/// motion field of a pair is passed to the next pair as [`Problem::before`].
+///
+/// Memory does not grow with the length of the sequence: fewer than two windows of sweeps are held.
 #[derive(Clone, Debug, Default)]
 pub struct Sequence {
     /// Sweeps that a later pair may still use.
@@ -115,15 +132,16 @@ pub struct Sequence {
 
 impl Sequence {
     /// Adds the next sweep and returns the estimates of all pairs whose windows are now complete,
-    /// in order.
+    /// in order. The list is empty where no window is complete.
     ///
     /// `options` are those of the pair that has the sweep as its target. They may differ from sweep
-    /// to sweep, except for the window size. A known ego motion is given as [`super::Ego::Given`].
+    /// to sweep, except for the window size. They also prepare the ground mask of the sweep, as
+    /// [`Sweep::prepared`] does. A known ego motion is given as [`super::Ego::Given`].
     ///
     /// # Errors
     /// As [`estimate`], for the first pair that is not yet estimated. The sequence is then
     /// unchanged, and the sweep may be pushed again. Where a later pair fails, the estimates before
-    /// it are returned and the pair is tried again with the next sweep.
+    /// it are returned and the pair is tried again by the next call.
     pub fn push(
         &mut self,
         backend: &dyn Backend,
@@ -152,8 +170,9 @@ impl Sequence {
         pushed
     }
 
-    /// Returns the estimates of the remaining pairs at the end of the sequence. Call it until it
-    /// returns an empty list.
+    /// Returns the estimates of the remaining pairs at the end of the sequence, in order. Where a
+    /// pair after the first of them fails, the list ends before it. Call `finish` until it returns
+    /// an empty list.
     ///
     /// # Errors
     /// As [`estimate`], for the first pair that is not yet estimated. The sequence is then

@@ -29,17 +29,23 @@ struct Written {
     camera_from_lidar: [[f64; 4]; 4],
 }
 
-/// Reads a camera; the format is recognized by content.
+/// Reads a camera. `bytes` is the content of the file; its format is recognized by content.
 ///
-/// - JSON: `{"width": 1242, "height": 375, "k": 3 x 3, "camera_from_lidar": 4 x 4}`. Sizes are in
-///   pixels, matrices row by row. The camera frame has x right, y down, z forward.
-/// - KITTI's object, tracking and odometry calibration: `P2`, `R0_rect`, `Tr_velo_to_cam`; the size
-///   is [`KITTI_SIZE_PX`].
-/// - KITTI's raw `calib_cam_to_cam.txt`, with `calib_velo_to_cam.txt` as the second file.
+/// - JSON: `{"width": 1242, "height": 375, "k": 3 x 3, "camera_from_lidar": 4 x 4}`. Sizes and `k`
+///   are in pixels, the translation in metres, matrices row by row. The camera frame has x right, y
+///   down, z forward.
+/// - KITTI's object, tracking and odometry calibration: `P2`; `R0_rect` or `R_rect` (none in
+///   odometry); `Tr_velo_to_cam`, `Tr_velo_cam` or `Tr`. The size is [`KITTI_SIZE_PX`].
+/// - KITTI's raw `calib_cam_to_cam.txt`, with the content of `calib_velo_to_cam.txt` as
+///   `velo_to_cam`. The other formats have no second file.
 ///
 /// # Errors
-/// `Malformed`, `Unsupported` and `Missing` name the line or key. `TooLarge` for a file over 64
-/// KiB. `Camera` for parameters that are not those of a camera.
+/// - `Malformed` for text in neither format, an entry without the required finite numbers, or a
+///   pose that is not rigid.
+/// - `Unsupported` where `velo_to_cam` is missing, or is given with another format.
+/// - `Missing` where the projection or the lidar's pose is missing.
+/// - `TooLarge` for a file over 64 KiB.
+/// - `Camera` for an image size, a camera matrix or a pose that is invalid or out of range.
 pub fn read_camera(bytes: &[u8], velo_to_cam: Option<&[u8]>) -> Result<Camera, FormatError> {
     if bytes.len() <= MAX_FILE && bytes.trim_ascii_start().starts_with(b"{") {
         if velo_to_cam.is_some() {
@@ -74,12 +80,13 @@ pub fn read_camera(bytes: &[u8], velo_to_cam: Option<&[u8]>) -> Result<Camera, F
     )?)
 }
 
-/// The lidar's pose in the frame of KITTI's rectified camera 0. The odometry benchmark's poses are
-/// those of this camera: a sweep's own pose is `world_from_camera0 * camera0_from_lidar`. The files
-/// are the same as for [`read_camera`].
+/// The lidar's pose in the frame of KITTI's rectified camera 0, translation in metres, from KITTI's
+/// calibration text. The odometry benchmark's poses are those of this camera. A sweep's own pose is
+/// `world_from_camera0 * camera0_from_lidar`. The arguments are those of [`read_camera`].
 ///
 /// # Errors
-/// As [`read_camera`].
+/// `Malformed`, `Unsupported`, `Missing` and `TooLarge` as for [`read_camera`]. A camera in JSON
+/// does not contain this pose.
 pub fn read_camera0_from_lidar(
     bytes: &[u8],
     velo_to_cam: Option<&[u8]>,

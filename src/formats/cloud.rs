@@ -36,24 +36,34 @@ impl From<Vec<Point>> for Cloud {
     }
 }
 
-/// Reads a cloud of any known format.
+/// Reads a cloud of any known format. Coordinates are in metres.
 ///
-/// The format is recognized by content. The file name `name` matters for raw floats alone, which
-/// have no header: `*.pcd.bin` has rows of five floats, `*.kitti.bin` of four. An `.npz` contains
-/// one cloud where it has a single N x 3 array, or one named `points`, `xyz` or `pc1`.
+/// The format is recognized by [`recognize`]: by content, and for raw floats by the file name
+/// `name`. An `.npy` array is N x k floats with k at least 3; the first three columns are read. An
+/// `.npz` contains one cloud where it has a single such array, or exactly one named `points`, `xyz`
+/// or `pc1`.
 ///
 /// # Errors
-/// Every variant of [`FormatError`] except those of writing. Values that are not finite are refused
-/// with row and column, except PCD's rows of three NaN. So is |coordinate| > 1e6 m.
+/// - `Unrecognized` and `Ambiguous` as for [`recognize`]. `Ambiguous` also for an `.npz` with
+///   several clouds or with a pair (`pc1` and `pc2`).
+/// - `Malformed` for a file that violates its format or is truncated.
+/// - `Unsupported` for JSON, integer coordinates, missing values, and arrays, compressions or
+///   archives that are not supported.
+/// - `Missing` where x, y or z, or an N x 3 array, is missing.
+/// - `NotFinite` for a coordinate that is NaN or infinite, with row and column. Rows of three NaN
+///   are accepted in PCD.
+/// - `OutOfRange` for a coordinate over 1e6 m in magnitude, with row and column.
+/// - `TooLarge` for more than [`MAX_POINTS`] points. Also for a compressed file that unfolds to
+///   more than 32 MiB plus 32 times its own size, or to more than 4 GiB.
 pub fn read_cloud(bytes: &[u8], name: Option<&str>) -> Result<Cloud, FormatError> {
     read_cloud_within(bytes, name, MAX_POINTS)
 }
 
-/// As [`read_cloud`], for at most `most` points: a file that declares more is refused before memory
+/// As [`read_cloud`], for at most `most` points. A file that declares more is refused before memory
 /// is allocated for them.
 ///
 /// # Errors
-/// As for [`read_cloud`].
+/// As for [`read_cloud`], and `TooLarge` for more than `most` points.
 pub fn read_cloud_within(
     bytes: &[u8],
     name: Option<&str>,
@@ -75,11 +85,13 @@ pub fn read_cloud_within(
     }
 }
 
-/// The number of rows that a file declares, over all its clouds and masks: a measure of the memory
-/// that reading it takes. Nothing but headers is decompressed.
+/// The number of rows that a file declares, over all its arrays: a measure of the memory that
+/// reading it takes. For raw floats it is an upper bound. Nothing but headers is decompressed.
 ///
 /// # Errors
-/// As for [`read_cloud`], where a header cannot be read.
+/// `Unrecognized` and `Ambiguous` as for [`recognize`]. `Malformed`, `Unsupported`, `Missing` and
+/// `TooLarge` where the header of the file cannot be read, has no vertices, or declares too much.
+/// Unreadable arrays of an `.npz` are not counted.
 pub fn declared_rows(bytes: &[u8], name: Option<&str>) -> Result<usize, FormatError> {
     match recognize(bytes, name)? {
         FileKind::Npy => npy::declared_rows(bytes),
@@ -237,7 +249,7 @@ fn point(kind: FileKind, row: usize, values: &[f64]) -> Result<Point, FormatErro
     Ok(point)
 }
 
-/// The formats in which a cloud can be written.
+/// The formats in which a cloud can be written. Coordinates are in metres.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum CloudFormat {
@@ -256,8 +268,10 @@ pub enum CloudFormat {
 /// Writes a cloud of N points, metres.
 ///
 /// # Errors
-/// `NotFinite` for rows without return in any format except PCD, and `OutOfRange` for coordinates
-/// over 1e6 m: neither could be read back. `Write` and `Encode` where writing fails.
+/// - `NotFinite` for a coordinate that is NaN or infinite. Rows of three NaN (no return) are
+///   accepted in PCD.
+/// - `OutOfRange` for a coordinate over 1e6 m in magnitude.
+/// - `Write` where writing to `out` fails, `Encode` where encoding fails.
 pub fn write_cloud<W: Write>(
     format: CloudFormat,
     points: &[Point],

@@ -10,25 +10,27 @@ use super::sniff::ending;
 use super::{las, npy, pcd, ply};
 use crate::flow::DenseCloud;
 
-/// The formats in which a dense cloud is written. All except LAS and LAZ can be read back as
-/// clouds.
+/// The formats in which a dense cloud of M points is written. Positions are in metres, ages in
+/// sweeps. All except LAS and LAZ can be read back as clouds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum DenseFormat {
-    /// `points` M x 3 float32, `sweep` uint32, `age` float32, `dynamic` bool, `converged` bool.
+    /// `points` M x 3 float32; M each: `sweep` uint32, `age` float32, `dynamic` bool, `converged`
+    /// bool.
     Npz,
-    /// Binary little endian: x y z, `sweep`, `age`, `dynamic`, `converged`.
+    /// Binary little endian: x y z float32, `sweep` uint32, `age` float32, `dynamic` and
+    /// `converged` uint8.
     Ply,
     /// Binary, with the same fields as PLY.
     Pcd,
-    /// LAS 1.4, compressed, with a resolution of 1 mm. The sweep is the point source id, the age an
-    /// extra dimension. Bit 0 of the user data marks dynamic points, the withheld flag those that
-    /// did not converge.
+    /// LAS 1.4, compressed, with a resolution of 1 mm. The sweep is the point source id, the age
+    /// the extra dimension `age` (float32). Bit 0 of the user data marks dynamic points. The
+    /// withheld flag marks points that did not converge.
     Laz,
     /// As LAZ, not compressed.
     Las,
 }
 
-/// Every format with its media type and its file ending; the first is the default.
+/// Every format with its media type and its file ending without dot; the first is the default.
 pub const DENSE_FORMATS: [(DenseFormat, &str, &str); 5] = [
     (DenseFormat::Npz, "application/x-npz", "npz"),
     (DenseFormat::Ply, "application/x-ply", "ply"),
@@ -56,7 +58,7 @@ impl DenseFormat {
         self.entry().2
     }
 
-    /// The format of a file name's ending.
+    /// The format of a file name's ending, in upper or lower case.
     ///
     /// # Errors
     /// `UnknownExtension`, which lists the known endings.
@@ -89,9 +91,11 @@ impl DenseFormat {
 /// Writes a dense cloud of M points.
 ///
 /// # Errors
-/// `RowCount` where the cloud's lists differ in length. `NotFinite` or `OutOfRange` for a position
-/// or an age that could not be read back. `Unsupported` where LAS cannot hold a sweep's index.
-/// `Write` and `Encode` where writing fails.
+/// - `RowCount` where the cloud's lists differ in length.
+/// - `NotFinite` for a coordinate or age that is NaN or infinite.
+/// - `OutOfRange` for a coordinate over 1e6 m or an age over 1e6 sweeps in magnitude.
+/// - `Unsupported` for a sweep index over 65,535 in LAS and LAZ.
+/// - `Write` where writing to `out` fails, `Encode` where encoding fails.
 pub fn write_dense<W: Write>(
     format: DenseFormat,
     cloud: &DenseCloud,

@@ -15,13 +15,15 @@ const STEPS_PER_M: f32 = 256.0;
 /// Memory per pixel while a file is read, bytes: two of the PNG and four of the depth.
 const PIXEL_BYTES: u64 = 6;
 
-/// Writes a depth image, depths in metres. Returns the number of known depths that the format
-/// cannot represent, mainly those beyond its limit of 255.996 m. Such pixels are written as
+/// Writes a depth image as KITTI's PNG: 16-bit gray, 1/256 m per step, 0 where the depth is
 /// unknown.
 ///
+/// Returns the number of known depths that the format cannot represent: less than 1/512 m, or at
+/// least 255.998 m. Such pixels are written as unknown.
+///
 /// # Errors
-/// `RowCount` where the number of depths does not match the image's size, `Encode` where writing
-/// fails.
+/// `RowCount` where the number of depths does not match the image's size. `Encode` for an image
+/// without pixels, and where encoding or writing fails.
 pub fn write_depth_png<W: Write>(image: &DepthImage, out: W) -> Result<usize, FormatError> {
     let pixels = image.width as usize * image.height as usize;
     check_count("the depth image", image.metres.len(), pixels)?;
@@ -44,12 +46,14 @@ pub fn write_depth_png<W: Write>(image: &DepthImage, out: W) -> Result<usize, Fo
     Ok(dropped)
 }
 
-/// Reads a depth image, depths in metres.
+/// Reads a depth image in KITTI's format: 16-bit gray PNG, 1/256 m per step, 0 where the depth is
+/// unknown.
 ///
 /// # Errors
-/// `Malformed` for bytes that are not a complete PNG. `Unsupported` for a PNG other than 16-bit
-/// gray. `TooLarge` for sides over 16,384 pixels, or for more pixels than a file of this size may
-/// hold.
+/// - `Malformed` for bytes that are not a complete PNG.
+/// - `Unsupported` for a PNG other than 16-bit gray.
+/// - `TooLarge` for sides over 16,384 pixels. Also for an image that needs, at 6 bytes per pixel,
+///   more than 32 MiB plus 32 times the file's size, or more than 4 GiB.
 pub fn read_depth_png(bytes: &[u8]) -> Result<DepthImage, FormatError> {
     let broken = |error: png::DecodingError| KIND.malformed(error.to_string());
     let limits = png::Limits {

@@ -19,19 +19,19 @@ pub enum FileKind {
     Pcd,
     /// Arrow IPC file, the format of Argoverse 2's sweeps.
     Feather,
-    /// Flow as JSON.
+    /// JSON: a flow, or the similarity transform of a ground raster.
     Json,
     /// LAS, or LAZ, its compressed form. Written only.
     Las,
-    /// A picture; depth is read from 16-bit gray ones.
+    /// PNG: a depth image, 16-bit gray.
     Png,
     /// A camera: this project's JSON, or KITTI's calibration text.
     Camera,
-    /// Poses of a sequence: KITTI's text, or JSON.
+    /// Poses of a sequence: KITTI's text, or JSON. Argoverse 2's are a [`FileKind::Feather`].
     Poses,
-    /// KITTI: rows of four little-endian float32 (x, y, z, intensity).
+    /// KITTI: rows of four little-endian float32 (x, y, z in metres, intensity).
     KittiBin,
-    /// nuScenes: rows of five little-endian float32 (x, y, z, intensity, ring).
+    /// nuScenes: rows of five little-endian float32 (x, y, z in metres, intensity, ring).
     NuscenesBin,
 }
 
@@ -58,15 +58,17 @@ impl fmt::Display for FileKind {
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum FormatError {
-    /// The content is of no known kind.
+    /// The content is of no kind that the function reads; with the reason.
     #[error(
-        "unrecognized file: {0}; known are npy, npz, ply, pcd, feather, json, kitti bin and nuscenes bin"
+        "unrecognized file: {0}; known are npy, npz, ply, pcd, feather, kitti bin and nuscenes bin, and json for a flow"
     )]
     Unrecognized(String),
-    /// The content fits several formats, and the name does not decide between them.
+    /// The content can be read in several ways, and neither the content nor the name decides
+    /// between them; with the reason.
     #[error("ambiguous file: {0}")]
     Ambiguous(String),
-    /// The file violates its own format, or is truncated.
+    /// The file violates its own format, is truncated, or has a value outside of the range of its
+    /// column, such as a confidence above 1.
     #[error("malformed {kind} file: {detail}")]
     Malformed {
         /// The kind of file.
@@ -95,7 +97,8 @@ pub enum FormatError {
     /// A camera with invalid parameters.
     #[error(transparent)]
     Camera(#[from] crate::flow::depth::CameraError),
-    /// A matrix is not a rigid motion.
+    /// A matrix, text or quaternion is not a rigid motion, or its translation is too long; with the
+    /// reason.
     #[error("{0}")]
     Motion(&'static str),
     /// A value is NaN or infinite.
@@ -110,7 +113,8 @@ pub enum FormatError {
         /// The value found.
         value: f64,
     },
-    /// A coordinate is beyond the range of any lidar.
+    /// A coordinate, displacement or other number is larger in magnitude than
+    /// [`MAX_COORDINATE_M`](super::MAX_COORDINATE_M).
     #[error("{kind} file, row {row}, column {column}: {value} m is out of range (limit {limit} m)")]
     OutOfRange {
         /// The kind of file.
@@ -119,12 +123,12 @@ pub enum FormatError {
         row: usize,
         /// Column, by name.
         column: String,
-        /// The value found, metres.
+        /// The value found, metres for a coordinate or displacement.
         value: f64,
         /// The largest magnitude accepted, metres.
         limit: f64,
     },
-    /// The file declares more data than is accepted.
+    /// The file has or declares more data than is accepted.
     #[error("{kind} file is too large: {detail}")]
     TooLarge {
         /// The kind of file.
@@ -132,17 +136,18 @@ pub enum FormatError {
         /// The declared size, and the limit.
         detail: String,
     },
-    /// Two arrays of one file, or two columns to be written, differ in length.
+    /// An array or column does not have one row per point or pixel, or a file of poses does not
+    /// have one pose per sweep.
     #[error("{what} has {found} rows where {expected} are needed")]
     RowCount {
-        /// The array.
+        /// Name of the array, column or file.
         what: String,
         /// Its number of rows.
         found: usize,
         /// The number of rows required.
         expected: usize,
     },
-    /// An output file name whose ending is that of no known format.
+    /// An output file name or ending is that of no known format.
     #[error("cannot tell the format of {name:?}: end it in one of {known}")]
     UnknownExtension {
         /// The name or ending given.
@@ -150,7 +155,7 @@ pub enum FormatError {
         /// The known endings.
         known: &'static str,
     },
-    /// Writing failed.
+    /// Writing to the output failed.
     #[error("failed to write")]
     Write(#[from] std::io::Error),
     /// A library that encodes the file failed.

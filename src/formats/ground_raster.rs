@@ -13,7 +13,7 @@ const GROUND_M: f64 = 0.3;
 /// Tolerance of the similarity's rotation from orthonormal.
 const RIGID_TOLERANCE: f64 = 1e-6;
 
-/// Ground heights of a city on a grid.
+/// Argoverse 2's raster of a city's ground heights, metres.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GroundRaster {
     /// Heights in the city's frame, metres, row by row; NaN where unknown.
@@ -34,11 +34,16 @@ struct Similarity {
 }
 
 impl GroundRaster {
-    /// Reads `*_ground_height_surface____*.npy` and `*___img_Sim2_city.json`.
+    /// Reads a raster from the contents of its two files. `heights` is
+    /// `*_ground_height_surface____*.npy`: rows x columns floats, metres in the city's frame, NaN
+    /// where unknown. `raster_from_city` is `*___img_Sim2_city.json`: the similarity s (R x + t)
+    /// from city coordinates in metres to column and row, with `R` (row by row), `t` and `s`.
     ///
     /// # Errors
-    /// `Malformed` and `Unsupported` where the first is not a complete two-dimensional array of
-    /// floats, or the second is not a similarity of the plane.
+    /// - `Unsupported` where `heights` is not a two-dimensional array of floats.
+    /// - `Malformed` where it is not `.npy` or is truncated. Also where `raster_from_city` is not
+    ///   such a JSON object, `R` is not orthonormal within 1e-6, or `s` is not positive.
+    /// - `TooLarge` where the size of the array overflows.
     pub fn read(heights: &[u8], raster_from_city: &[u8]) -> Result<Self, FormatError> {
         let kind = FileKind::Npy;
         let mut rest = heights;
@@ -77,10 +82,14 @@ impl GroundRaster {
         })
     }
 
-    /// The ground mask of a sweep: N points, metres, in its own frame; N flags. A point is ground
-    /// where it is at most 0.3 m above the raster's height, or below it. Points outside the raster,
-    /// or where it has no height, are not ground. `city_from_frame` is the sweep's pose in the
-    /// city.
+    /// Ground mask of a sweep.
+    ///
+    /// `points` are N points of the sweep in its own frame, metres. `city_from_frame` is the pose
+    /// of the sweep in the city. The result is N flags.
+    ///
+    /// A point is ground if it is at most 0.3 m above the raster's height, or anywhere below it
+    /// (Argoverse 2's own threshold). Points outside the raster, or where the height is unknown,
+    /// are not ground.
     pub fn ground(&self, points: &[Point], city_from_frame: &RigidTransform) -> Vec<bool> {
         let is_ground = |point: &Point| {
             let place = city_from_frame * Point3::from(point.map(f64::from));

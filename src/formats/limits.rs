@@ -8,7 +8,8 @@ use crate::flow::Point;
 /// The largest number of points in one cloud.
 pub const MAX_POINTS: usize = 50_000_000;
 
-/// The largest magnitude of a coordinate, metres. At 1e6 m, adjacent float32 values are 6 cm apart.
+/// The largest magnitude of a coordinate or a displacement, metres. At 1e6 m, adjacent float32
+/// values are 6 cm apart.
 pub const MAX_COORDINATE_M: f64 = 1e6;
 
 /// Bytes to which any compressed file may decompress, however small it is.

@@ -46,4 +46,4 @@ pub use crate::formats::pair::{
 };
 pub use crate::formats::poses::read_poses;
 pub use crate::formats::sniff::recognize;
-pub use timestamps::interval_s;
+pub use timestamps::{SweepTime, TimeUnit};

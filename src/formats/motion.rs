@@ -13,10 +13,12 @@ const RIGID_TOLERANCE: f64 = 1e-3;
 /// Longest text that is parsed as 16 numbers, bytes.
 const MAX_TEXT: usize = 4096;
 
-/// Reads a motion as text: 16 numbers, row by row, separated by white space or commas.
+/// Reads a rigid motion from text: the 16 numbers of a 4 x 4 matrix, row by row, separated by white
+/// space or commas. The translation is in metres. The text has at most 4,096 bytes.
 ///
 /// # Errors
-/// [`FormatError::Motion`] where there are not 16 finite numbers or they are not a rigid motion.
+/// [`FormatError::Motion`] where the text is not 16 numbers, or the matrix is refused by
+/// [`ego_motion`].
 pub fn read_motion(bytes: &[u8]) -> Result<RigidTransform, FormatError> {
     let text = core::str::from_utf8(bytes).ok();
     let Some(text) = text.filter(|text| text.len() <= MAX_TEXT) else {
@@ -32,12 +34,13 @@ pub fn read_motion(bytes: &[u8]) -> Result<RigidTransform, FormatError> {
     }))
 }
 
-/// The rigid motion between two sweeps given by a 4 x 4 matrix, row by row, in metres. As
-/// [`rigid_motion`], with a limit on the translation so that transformed coordinates can be
+/// The rigid motion between two sweeps, from its 4 x 4 matrix, row by row, translation in metres.
+/// As [`rigid_motion`], with a limit on the translation, so that transformed coordinates can be
 /// written. Poses in a city's frame have no such limit.
 ///
 /// # Errors
-/// [`FormatError::Motion`] where it is not a rigid motion, or longer than [`MAX_COORDINATE_M`].
+/// [`FormatError::Motion`] where the matrix is not a rigid motion, or a component of its
+/// translation is larger in magnitude than [`MAX_COORDINATE_M`].
 pub fn ego_motion(rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError> {
     let motion = rigid_motion(rows)?;
     if motion.translation.vector.amax() > MAX_COORDINATE_M {
@@ -46,11 +49,12 @@ pub fn ego_motion(rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError> {
     Ok(motion)
 }
 
-/// The rigid transform given by a 4 x 4 matrix, row by row, in metres; refused where it scales,
-/// shears or mirrors.
+/// The rigid transform given by a 4 x 4 matrix, row by row, translation in metres. The rotation R
+/// of the result is normalized.
 ///
 /// # Errors
-/// [`FormatError::Motion`] where it is not a rigid motion.
+/// [`FormatError::Motion`] where a number is not finite, the last row is not 0 0 0 1, an entry of
+/// R^T R differs from the identity by more than 1e-3 (scale or shear), or R mirrors.
 pub fn rigid_motion(rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError> {
     let matrix = Matrix4::from_fn(|row, column| rows[row][column]);
     let rotation: Matrix3<f64> = matrix.fixed_view::<3, 3>(0, 0).into_owned();

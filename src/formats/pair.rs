@@ -72,22 +72,33 @@ pub fn is_pair(bytes: &[u8]) -> bool {
 
 /// Reads a pair from an `.npz` with `pc1` (N x 3) and `pc2` (M x 3), metres.
 ///
-/// Optional arrays are `flow` (N x 3), `valid` and `dynamic` (N), `ground1` (N), `ground2` (M),
-/// `ego_SE3` (4 x 4), `category` (N, Argoverse 2's), and either `box_id` (N, negative off all
-/// objects) or `classes` (N, 0 off all objects).
+/// Optional arrays are `flow` (N x 3, metres), `ground1` (N) and `ground2` (M), and `ego_SE3` (4 x
+/// 4, `target_from_source`). With `flow`, the file may have `valid` (N; without it all rows are
+/// valid), `dynamic` (N), `category` (N, Argoverse 2's), and either `box_id` (N, negative for
+/// points on no object) or `classes` (N, 0 for points on no object).
 ///
 /// # Errors
-/// As for a cloud; `RowCount` where arrays differ in length, `Motion` where `ego_SE3` is not rigid,
-/// `Unsupported` where only one of the two ground masks is present.
+/// - `Unrecognized` for bytes that are not a zip archive.
+/// - `Missing` where `pc1` or `pc2` is missing.
+/// - `Malformed` for a file that violates its format or is truncated, and for a category that is
+///   not a whole number from 0 to 255.
+/// - `Unsupported` for an array of another type or shape, and where only one of the two ground
+///   masks is present.
+/// - `NotFinite` for a NaN, or an infinite coordinate or displacement; `OutOfRange` for one over
+///   1e6 m in magnitude.
+/// - `TooLarge` for more than [`MAX_POINTS`] rows, or a file that unfolds to more than 32 MiB plus
+///   32 times its own size, or to more than 4 GiB.
+/// - `RowCount` where an array does not have the N or M rows of its cloud.
+/// - `Motion` where `ego_SE3` is not rigid, or its translation is over 1e6 m.
 pub fn read_pair(bytes: &[u8]) -> Result<Pair, FormatError> {
     read_pair_within(bytes, MAX_POINTS)
 }
 
-/// As [`read_pair`], with at most `most` points per cloud: a file that declares more is refused
+/// As [`read_pair`], with at most `most` points per cloud. A file that declares more is refused
 /// before memory is allocated for them.
 ///
 /// # Errors
-/// As for [`read_pair`].
+/// As for [`read_pair`], and `TooLarge` for an array of more than `most` rows.
 pub fn read_pair_within(bytes: &[u8], most: usize) -> Result<Pair, FormatError> {
     if !is_zip(bytes) {
         return Err(FormatError::Unrecognized(
@@ -184,8 +195,11 @@ pub(super) fn check_count(what: &str, found: usize, expected: usize) -> Result<(
 /// `box_id`, 0 on objects and -1 off them.
 ///
 /// # Errors
-/// `RowCount` where the pair's parts differ in length, `NotFinite` or `OutOfRange` for values that
-/// could not be read back, `Write` and `Encode` where writing fails.
+/// - `RowCount` where the pair's lists differ in length.
+/// - `NotFinite` for a coordinate or displacement that is NaN or infinite. Points without return
+///   are therefore refused.
+/// - `OutOfRange` for a coordinate or displacement over 1e6 m in magnitude.
+/// - `Write` where writing to `out` fails, `Encode` where encoding fails.
 pub fn write_pair_npz<W: Write>(pair: &Pair, out: &mut W) -> Result<(), FormatError> {
     let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
     let count = pair.source.len();
@@ -238,7 +252,14 @@ pub fn write_pair_npz<W: Write>(pair: &Pair, out: &mut W) -> Result<(), FormatEr
 /// Foreground is every class except 0, which is NONE, as in Argoverse 2's own evaluation.
 ///
 /// # Errors
-/// As for a cloud; `Missing` where the columns of flow or ground are missing.
+/// - `Malformed` for bytes that are not an intact feather file, and for a class that is not a whole
+///   number from 0 to 255.
+/// - `Missing` where a column of the flow or the ground column is missing.
+/// - `Unsupported` for a flow column that is not of floats, a column with missing values or without
+///   numbers, or a compression other than LZ4.
+/// - `NotFinite` for a NaN, or an infinite displacement; `OutOfRange` for a displacement over 1e6 m
+///   along an axis.
+/// - `TooLarge` for more than [`MAX_POINTS`] rows, or far more than a file of this size holds.
 pub fn read_av2_labels(bytes: &[u8]) -> Result<Av2Labels, FormatError> {
     let table = Table::open(bytes)?;
     let flow = read_columns(&table, FLOW_COLUMNS)?;

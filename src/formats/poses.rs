@@ -26,21 +26,33 @@ const UNIT_TOLERANCE: f64 = 1e-3;
 const AV2_COLUMNS: [&str; 7] = ["qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"];
 
 /// Reads the pose `world_from_frame` of every sweep, translations in metres. `sweeps` are the
-/// sweeps' file names, and the poses are in the same order. The format is recognized by content.
+/// sweeps' file names. The poses are returned in the same order. The format is recognized by
+/// content.
 ///
-/// - KITTI's odometry text: 12 numbers a line, the first three rows of a matrix. KITTI's own poses
-///   are those of camera 0; see [`super::read_camera0_from_lidar`].
+/// - KITTI's odometry text: 12 numbers a line, the first three rows of a 4 x 4 matrix. KITTI's own
+///   poses are those of camera 0; see [`super::read_camera0_from_lidar`].
 /// - JSON: an array of 4 x 4 matrices, row by row.
 /// - Argoverse 2's `city_SE3_egovehicle.feather`: the rows whose `timestamp_ns` equals a sweep's
 ///   name. They are compared in float64, which resolves 64 ns.
 ///
 /// Text and JSON have one pose for every sweep, in order, or the poses of a whole drive. In the
-/// latter case a sweep whose name is a number gets the pose with that index, counted from 0.
+/// latter case a sweep whose name is a number gets the pose with that index, counted from 0. A name
+/// is read without its folder and without everything from its first dot.
+///
+/// The ego motion between two sweeps is `world_from_target.inv_mul(&world_from_source)`.
 ///
 /// # Errors
-/// `Malformed` names the line, or the sweep whose pose is not rigid. `RowCount` for a wrong number
-/// of poses, `Missing` for a sweep without a pose, `Motion` for a pose of Argoverse 2 that is not
-/// rigid, `TooLarge` for a text of more than a million poses.
+/// - `Malformed` for a line of text that is not 12 numbers, for bytes that are neither text nor
+///   JSON nor feather, and for a damaged feather file. Also for a pose of text or JSON that is not
+///   finite or not rigid; the error names its sweep.
+/// - `RowCount` where text or JSON has neither one pose for every sweep nor a pose at the index
+///   that each sweep's name gives.
+/// - `Unsupported` for feather, where a sweep's name is not an integer time stamp, or a column has
+///   missing values, no numbers or a compression other than LZ4.
+/// - `Missing` for feather, where no row has the time of a sweep, or a column is missing.
+/// - `Motion` for a pose of feather whose quaternion's length is not within 1e-3 of 1, or whose
+///   translation is not finite.
+/// - `TooLarge` for a text of more than a million poses, or a feather file of too many rows.
 pub fn read_poses(bytes: &[u8], sweeps: &[&str]) -> Result<Vec<RigidTransform>, FormatError> {
     if bytes.starts_with(feather::MAGIC) {
         return read_av2(bytes, sweeps);

@@ -7,12 +7,17 @@ use super::{bin, feather, npy};
 /// Number of lines in which a PCD header must start; comments may precede it.
 const MAX_COMMENT_LINES: usize = 32;
 
-/// Recognizes a file. `name` is a file name or path. Only its ending is used, and only for raw
-/// floats, which have no header.
+/// Recognizes the kind of a file with a cloud, a pair or a flow. `bytes` is the whole file, `name`
+/// a file name or path.
+///
+/// The content decides, except for raw floats ([`FileKind::KittiBin`], [`FileKind::NuscenesBin`]),
+/// which have no header. Raw floats need a name that ends in `.bin`, a name without an ending, or
+/// no name. `*.pcd.bin` and `*.nuscenes.bin` have rows of five floats, `*.kitti.bin` of four. For
+/// other names the row width is the one that gives plausible values.
 ///
 /// # Errors
-/// `Unrecognized`, with the actual kind of file where it can be told; `Ambiguous` for raw floats
-/// whose row width cannot be determined.
+/// `Unrecognized` for an empty file and for content of any other kind, which is named where it is
+/// known. `Ambiguous` for raw floats that are plausible as rows of four and of five.
 pub fn recognize(bytes: &[u8], name: Option<&str>) -> Result<FileKind, FormatError> {
     if bytes.is_empty() {
         return Err(FormatError::Unrecognized("it is empty".to_owned()));

@@ -3,34 +3,61 @@
 /// The longest time between two sweeps of one flow, seconds.
 const MAX_INTERVAL_S: f64 = 60.0;
 
-/// The time from one sweep to the other, seconds, by the timestamps in their file names: the
-/// distance of both in either order. None where a name holds no timestamp, or both are the same or
-/// more than a minute apart.
-///
-/// A timestamp is a run of digits in the name without its folder and ending: 18 or 19 digits are
-/// nanoseconds (Argoverse 2), 16 microseconds (nuScenes), 13 milliseconds.
-pub fn interval_s(source: &str, target: &str) -> Option<f32> {
-    let (source, unit) = timestamp(source)?;
-    let (target, other) = timestamp(target)?;
-    let seconds = source.abs_diff(target) as f64 * unit;
-    (unit == other && seconds > 0.0 && seconds <= MAX_INTERVAL_S).then_some(seconds as f32)
+/// The time at which a sweep was recorded, by the timestamp in its file name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SweepTime {
+    /// The digits of the timestamp as an integer, in units of `unit`.
+    pub ticks: u64,
+    /// The unit of `ticks`.
+    pub unit: TimeUnit,
 }
 
-/// The timestamp of a name, and its unit, seconds.
-fn timestamp(name: &str) -> Option<(u64, f64)> {
-    let file = name.rsplit(['/', '\\']).next()?;
-    let stem = file.split('.').next()?;
-    let runs = stem.split(|letter: char| !letter.is_ascii_digit());
-    let mut found = runs.filter_map(|digits| {
-        let unit = match digits.len() {
-            18 | 19 => 1e-9,
-            16 => 1e-6,
-            13 => 1e-3,
-            _ => return None,
+/// The unit of a timestamp.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TimeUnit {
+    /// 1e-9 s, as in Argoverse 2.
+    Nanoseconds,
+    /// 1e-6 s, as in nuScenes.
+    Microseconds,
+    /// 1e-3 s.
+    Milliseconds,
+}
+
+impl SweepTime {
+    /// The time in a file name or path; none if it holds no timestamp.
+    ///
+    /// A timestamp is a run of digits between the last path separator and the first dot of the file
+    /// name. 18 or 19 digits are nanoseconds, 16 microseconds, 13 milliseconds. The last of several
+    /// timestamps is used.
+    pub fn from_name(name: &str) -> Option<Self> {
+        let file = name.rsplit(['/', '\\']).next()?;
+        let stem = file.split('.').next()?;
+        let runs = stem.split(|letter: char| !letter.is_ascii_digit());
+        let mut found = runs.filter_map(|digits| {
+            let unit = match digits.len() {
+                18 | 19 => TimeUnit::Nanoseconds,
+                16 => TimeUnit::Microseconds,
+                13 => TimeUnit::Milliseconds,
+                _ => return None,
+            };
+            let ticks = digits.parse().ok()?;
+            Some(Self { ticks, unit })
+        });
+        found.next_back()
+    }
+
+    /// Seconds between two sweeps, in either order. None if the units differ, the times are the
+    /// same, or they are more than 60 s apart.
+    pub fn interval_s(self, other: Self) -> Option<f32> {
+        let unit = match self.unit {
+            TimeUnit::Nanoseconds => 1e-9,
+            TimeUnit::Microseconds => 1e-6,
+            TimeUnit::Milliseconds => 1e-3,
         };
-        Some((digits.parse().ok()?, unit))
-    });
-    found.next_back()
+        let seconds = self.ticks.abs_diff(other.ticks) as f64 * unit;
+        let is_interval = self.unit == other.unit && seconds > 0.0 && seconds <= MAX_INTERVAL_S;
+        is_interval.then_some(seconds as f32)
+    }
 }
 
 #[cfg(test)]
@@ -58,7 +85,9 @@ mod tests {
             ("source.ply", "target.ply", None),
         ];
         for (source, target, expected) in cases {
-            let found = interval_s(source, target);
+            let [source_time, target_time] = [source, target].map(SweepTime::from_name);
+            let found = source_time.zip(target_time);
+            let found = found.and_then(|(source, target)| source.interval_s(target));
             let off = found.unwrap_or(-1.0) - expected.unwrap_or(-1.0);
             assert!(off.abs() < 1e-6, "{source}: {found:?}");
         }

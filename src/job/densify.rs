@@ -11,9 +11,10 @@ use crate::flow::densify::{LaterSweeps, Plan, PlanError};
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Densify {
-    /// The reference time, in sweeps counted from 0. It may lie between two sweeps.
+    /// The reference time, in sweeps from 0 to the index of the last sweep. It may lie between two
+    /// sweeps: 4.5 is half way from sweep 4 to sweep 5.
     pub reference_time: f64,
-    /// Integration steps per sweep interval, 1 to 64.
+    /// Euler integration steps per sweep interval, 1 to 64. 1 if not given.
     #[serde(default = "one")]
     pub substeps: u32,
     /// How sweeps after the reference time are moved back to it.
@@ -30,7 +31,8 @@ pub enum LaterSweepsChoice {
     /// With motion estimated backward in time, from each sweep to the previous one.
     #[default]
     Reverse,
-    /// With the inverse of the forward motion. It halves the number of estimates.
+    /// With the inverse of the forward motion, which needs no additional estimates. Points for
+    /// which the inversion does not converge are flagged.
     Inverse,
 }
 
@@ -42,8 +44,8 @@ impl Densify {
     /// The densification plan for a sequence of `sweeps` sweeps.
     ///
     /// # Errors
-    /// [`PlanError`] if the reference time or the substeps are out of range, or the sweeps are too
-    /// few.
+    /// [`PlanError`] if there are fewer than two sweeps, the reference time is not from 0 to
+    /// `sweeps - 1`, or the substeps are not 1 to 64.
     pub fn plan(&self, sweeps: usize) -> Result<Plan, PlanError> {
         let later = match self.later_sweeps {
             LaterSweepsChoice::Reverse => LaterSweeps::Reverse,

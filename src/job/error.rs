@@ -13,34 +13,35 @@ pub(super) const MAX_DT_S: f32 = 60.0;
 /// Why options are refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum InvalidOptions {
-    /// The text is not the expected JSON object.
+    /// The text is not one JSON object, has an unknown key, or has a value that cannot be read;
+    /// with the reason.
     #[error("options: {0}")]
     Json(String),
-    /// Fewer points than any method needs.
+    /// `max_points` is less than [`MIN_POINTS`], which every method needs.
     #[error("options: max_points is {0}, at least {MIN_POINTS} are needed")]
     MaxPoints(u32),
-    /// The device is unknown.
+    /// The name of the device is unknown.
     #[error("options: device is {0:?}, \"auto\", \"cpu\" and \"gpu\" are known")]
     Device(String),
-    /// The precision is unknown.
+    /// The name of the precision is unknown.
     #[error("options: precision is {0:?}, \"f32\" and \"f16\" are known")]
     Precision(String),
     /// Half precision on the CPU, which does not support it.
     #[error("options: precision is \"f16\", which the CPU does not compute in")]
     HalfOnCpu,
-    /// Half precision with a preset that fits no field.
+    /// Half precision with a preset that fits no field; with the name of the preset.
     #[error("options: precision is \"f16\", which {0} does not compute in: take preset neural")]
     HalfWithoutField(&'static str),
-    /// The crop is not a positive number of metres.
+    /// The crop is not a positive, finite number of metres.
     #[error("options: crop_m is {0}, a positive number of metres is needed")]
     Crop(f32),
-    /// The time between two sweeps is out of range.
+    /// The time between two sweeps is not more than 0 and at most 60 s.
     #[error("options: dt_s is {0}, more than 0 and at most {MAX_DT_S} seconds are possible")]
     Dt(f32),
-    /// The deadline is zero or longer than a day.
+    /// The deadline, milliseconds, is zero or longer than a day.
     #[error("options: deadline_ms is {0}, 1 to {max} are possible", max = MAX_DEADLINE.as_millis())]
     Deadline(u64),
-    /// The reference time is negative or not finite.
+    /// The reference time of the dense cloud, in sweeps, is negative or not finite.
     #[error("options: densify.reference_time is {0}, a time in sweeps from 0 is needed")]
     ReferenceTime(f64),
     /// The sequence cannot be densified with these options.

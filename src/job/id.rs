@@ -17,12 +17,12 @@ impl JobId {
         Self(Uuid::now_v7())
     }
 
-    /// From its 16 bytes.
+    /// The id with these 16 bytes.
     pub fn from_bytes(bytes: [u8; 16]) -> Self {
         Self(Uuid::from_bytes(bytes))
     }
 
-    /// Its 16 bytes. Their order is the order of the ids.
+    /// Its 16 bytes. Their lexicographic order is the order of the ids.
     pub fn as_bytes(&self) -> &[u8; 16] {
         self.0.as_bytes()
     }
@@ -46,7 +46,7 @@ pub enum InvalidId {
     /// Not 8-4-4-4-12 hexadecimal digits.
     #[error("a job's name is a UUID, such as 0192f0c1-7b7a-7000-8000-000000000000")]
     Job,
-    /// Not 1 to 64 letters, digits, `-`, `_` or `.`.
+    /// Not 1 to 64 ASCII letters, digits, `-`, `_` or `.`.
     #[error("a tenant's name has 1 to 64 letters, digits, '-', '_' or '.'")]
     Tenant,
 }
@@ -62,7 +62,7 @@ impl FromStr for JobId {
     }
 }
 
-/// The name of a tenant, the owner of jobs.
+/// The name of a tenant, the owner of jobs: 1 to 64 ASCII letters, digits, `-`, `_` or `.`.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Tenant(Arc<str>);
 

@@ -25,22 +25,23 @@ pub struct JobOptions {
     pub preset: PresetChoice,
     /// Seed of the random numbers. The same seed gives bit-identical results.
     pub seed: u64,
-    /// Number of source points that get a flow, chosen at random. `neural` and `paper` sample both
-    /// clouds and use only the sampled points. `default` and `label` compute from all points and
-    /// return the flow of the sampled ones.
+    /// Number of source points that get a flow, at least 3, chosen at random. `neural` and `paper`
+    /// sample both clouds and use only the sampled points. `default` and `label` compute from all
+    /// points and return the flow of the sampled ones.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_points: Option<u32>,
-    /// Ignore points with |x| or |y| above this, metres.
+    /// Ignore points with |x| or |y| above this, metres. More than 0.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub crop_m: Option<f32>,
-    /// Time between consecutive sweeps, seconds, for velocities. 0.1 if not given.
+    /// Time between consecutive sweeps, seconds, for velocities: more than 0, at most 60. If not
+    /// given, the timestamps in the file names give it, otherwise it is 0.1.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub dt_s: Option<f32>,
     /// Treatment of ground points. `keep`: as any other point. `mask`: points marked in the input's
-    /// ground masks are left out and get no flow; refused if a mask is missing. `auto`: ground points
-    /// are left out of the method and get the ego-motion flow, or none with `max_points` or without ego
-    /// motion; they are taken from the masks, or from a ground segmentation if there are none. Clouds
-    /// that are nearly all ground keep it. Default: `auto`; `keep` with `paper`.
+    /// ground masks are left out and get no flow; refused if a mask is missing. `auto`: ground
+    /// points are left out of the method and get the ego-motion flow, or none with `max_points` or
+    /// without ego motion; they are taken from the masks, or from a ground segmentation if there
+    /// are none. Clouds that are nearly all ground keep it. Default: `auto`; `keep` with `paper`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ground: Option<GroundChoice>,
     /// The ego motion: `off`, `auto` (estimated first) or a 4 x 4 matrix target_from_source. By
@@ -54,8 +55,8 @@ pub struct JobOptions {
     /// `f32`: single precision. `f16`: half precision, for `neural` and `paper` on a GPU whose
     /// matrix units pass their self-test.
     pub precision: PrecisionChoice,
-    /// Deadline, milliseconds after the arrival of the request. The best flow so far is then
-    /// returned.
+    /// Deadline, milliseconds after the arrival of the request, at most one day. The best flow so
+    /// far is then returned.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub deadline_ms: Option<u64>,
     /// Priority of the job. Jobs of a higher priority start first.
@@ -214,7 +215,8 @@ impl JobOptions {
     /// Reads and checks one JSON object.
     ///
     /// # Errors
-    /// [`InvalidOptions`], which names the key and its valid values.
+    /// [`InvalidOptions::Json`] if the text is not a JSON object with known keys and readable
+    /// values. Otherwise as for [`JobOptions::check`].
     pub fn from_json(text: &[u8]) -> Result<Self, InvalidOptions> {
         // serde would read an array as the values of the struct's fields in order.
         if !text.trim_ascii_start().starts_with(b"{") {
@@ -226,7 +228,8 @@ impl JobOptions {
         Ok(options)
     }
 
-    /// One JSON object that [`JobOptions::from_json`] reads back.
+    /// One JSON object. [`JobOptions::from_json`] reads it back if the options pass
+    /// [`JobOptions::check`].
     pub fn to_json(&self) -> String {
         serde_json::to_string(self).expect("every option has a JSON form")
     }
@@ -234,7 +237,12 @@ impl JobOptions {
     /// Checks the values and their combinations.
     ///
     /// # Errors
-    /// [`InvalidOptions`], which names the key and its valid values.
+    /// [`InvalidOptions`], which names the key and its valid values:
+    /// - `MaxPoints`, `Crop`, `Dt`, `Deadline` for a value out of range.
+    /// - `HalfOnCpu`, `HalfWithoutField` for `f16` with device `cpu` or a preset that fits no
+    ///   field.
+    /// - `ReferenceTime`, `Densify` for options of a dense cloud that are invalid for every
+    ///   sequence.
     pub fn check(&self) -> Result<(), InvalidOptions> {
         if let Some(points) = self.max_points
             && (points as usize) < MIN_POINTS
@@ -266,7 +274,7 @@ impl JobOptions {
         self.densify.as_ref().map_or(Ok(()), Densify::check)
     }
 
-    /// The required kind of device; none if any kind will do.
+    /// The required kind of device; none if any kind will do. `f16` requires a GPU.
     pub fn device_kind(&self) -> Option<DeviceKind> {
         match self.precision {
             PrecisionChoice::F32 => self.device.kind(),
@@ -274,8 +282,8 @@ impl JobOptions {
         }
     }
 
-    /// The solver's options. `points` is the number of points of the larger cloud; sampling is off
-    /// if it is not above `max_points`.
+    /// The solver's options. `points` is the number of points of the larger cloud. Points are
+    /// sampled only if `points` is above `max_points`.
     pub fn solver_options(&self, points: usize) -> flow::Options {
         let drawn = self.max_points.map(|points| points as usize);
         let mut options = self

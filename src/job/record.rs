@@ -113,11 +113,12 @@ pub struct Job {
     pub pairs_left: u32,
     /// The job that must end, with or without success, before this one starts.
     pub after: Option<JobId>,
-    /// Whether the motion field of the result is stored for the next pair of the chain, which may start
-    /// from it (warm start). True for every pair of a streamed chain, because its end is not known.
+    /// Whether the motion field of the result is stored for the next pair of the chain, which may
+    /// start from it (warm start). True for every pair of a streamed chain, because its end is not
+    /// known.
     pub has_dependents: bool,
-    /// Time from which only a free device is missing. None while the job in `after` has not
-    /// ended, and for a sequence while only its pairs have work to do.
+    /// Time since which the job waits only for a free device. None while the job in `after` has not
+    /// ended. For a sequence it is set when only its dense cloud is left to compute.
     pub ready: Option<Timestamp>,
     /// The priority.
     pub priority: Priority,
@@ -128,33 +129,36 @@ pub struct Job {
     /// Whether the job continues when its caller disconnects: true for a submitted job, false for a
     /// synchronous call.
     pub durable: bool,
-    /// Number of starts. It is also the fencing token of the latest start.
+    /// Number of starts, requeues included. It is also the fencing token of the latest start.
     pub attempt: u32,
     /// Crashes of the process or the device during the job, since its latest snapshot.
     pub crashes: u32,
-    /// Predicted compute time, nominal seconds.
+    /// Predicted compute time in nominal seconds, which [`CostModel`](crate::cost::CostModel)
+    /// converts to seconds on this machine. For a sequence: that of its dense cloud alone, 0
+    /// without one.
     pub cost_seconds: f64,
-    /// The options as JSON.
+    /// The options, a [`JobOptions`](super::JobOptions), as JSON.
     pub options: String,
     /// Time of acceptance.
     pub created: Timestamp,
-    /// Time of the first start.
+    /// Time of the first start since it was submitted or requeued.
     pub started: Option<Timestamp>,
     /// Time of the end.
     pub finished: Option<Timestamp>,
-    /// Time at which the best flow so far is due.
+    /// Time at which the best flow so far is due. None without a deadline.
     pub deadline: Option<Timestamp>,
     /// The latest known progress.
     pub progress: Option<JobProgress>,
-    /// Why the computation stopped.
+    /// Why the estimate of a pair ended: `completed`, `converged`, `max_iterations` or `deadline`.
     pub stop_reason: Option<String>,
     /// Why the job did not succeed.
     pub error: Option<JobError>,
-    /// Whether it is a dead letter: given up after too many attempts.
+    /// Whether it is a dead letter: given up after too many attempts or crashes.
     pub dead: bool,
     /// Whether its cancellation was requested.
     pub cancel_requested: bool,
-    /// The report of the estimate as JSON.
+    /// The report as JSON: a [`Report`](super::Report), or a [`DenseReport`](super::DenseReport) of
+    /// a sequence with a dense cloud.
     pub report: Option<String>,
 }
 

@@ -13,22 +13,24 @@ use crate::formats::matrix_rows;
 pub struct Report {
     /// Number of source points, the rows of the flow.
     pub points: usize,
-    /// Number of points that have a flow.
+    /// Number of points that took part in the method and have a flow. Ground points that only get
+    /// the ego-motion flow are not counted.
     pub valid_points: usize,
     /// Name of the preset.
     pub preset: String,
     /// Seed of the random numbers.
     pub seed: u64,
     /// Seconds from the source sweep to the target, used for velocities.
-    pub dt_s: f32,
-    /// Whether `dt_s` is the default because the request did not give it.
+    pub dt_s: f64,
+    /// Whether `dt_s` is the default of 0.1 s, because neither the request nor the timestamps in
+    /// the file names gave it.
     pub dt_assumed: bool,
     /// `completed`, `converged`, `max_iterations` or `deadline`.
     pub stop_reason: String,
     /// The device that computed the method: that of the field's fit, or the host's threads for
     /// objects.
     pub device: String,
-    /// The ego motion target_from_source, row by row, if known.
+    /// The ego motion target_from_source, 4 x 4, row by row, if known.
     pub ego_motion: Option<[[f64; 4]; 4]>,
     /// The object search, with `default` and `label`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -52,7 +54,7 @@ pub struct ObjectsReport {
     pub candidates: usize,
     /// Number of candidates that were searched: all of them unless the deadline passed.
     pub searched: usize,
-    /// Number of clusters with a motion beyond the ego motion.
+    /// Number of clusters whose center moves by at least 0.05 m horizontally, ego motion taken out.
     pub moving: usize,
     /// Mean distance of the clusters to the target, metres; none if no cluster was searched.
     pub cost_m: Option<f64>,
@@ -63,22 +65,23 @@ pub struct ObjectsReport {
 pub struct FieldReport {
     /// Number of finished iterations.
     pub iterations: usize,
-    /// Iteration limit of the fit, after a deadline may have shortened it; 0 if the deadline allowed no
-    /// fit.
+    /// Iteration limit of the fit, after a deadline may have shortened it; 0 if the deadline
+    /// allowed no fit.
     pub max_iterations: usize,
-    /// The iteration whose field is the result.
+    /// The iteration, from 1, whose field is the result; 0 if the deadline allowed no iteration.
     pub best_iteration: usize,
     /// Loss of that iteration, metres; none if the deadline allowed no iteration.
     pub best_loss_m: Option<f64>,
 }
 
-/// Wall-clock seconds by phase. For a field they follow the breakdown of the paper.
+/// Wall-clock seconds by phase. For a field they follow the breakdown in the FNSF paper.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PhaseSeconds {
     /// Reading of files, if the same process read them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub load: Option<f64>,
-    /// Selection, distance transform and ego motion.
+    /// Selection, ground segmentation, distance transform, ego motion and the registration of
+    /// neighbor sweeps.
     pub precompute: f64,
     /// The object search.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -86,9 +89,9 @@ pub struct PhaseSeconds {
     /// The distance queries of a field's fit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub query: Option<f64>,
-    /// The rest of a field's fit, `total` less `precompute` and `query`: the network, the optimizer and
-    /// the evaluation of the result. Includes the distance queries on a GPU without timestamps. None for
-    /// an object search.
+    /// The rest of a field's fit, `total` less `precompute` and `query`: the network, the optimizer
+    /// and the evaluation of the result. Includes the distance queries on a GPU without timestamps.
+    /// None for an object search.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub network: Option<f64>,
     /// All phases.
@@ -133,7 +136,7 @@ impl Report {
             valid_points: estimate.points,
             preset: options.preset.preset().name().to_owned(),
             seed: options.seed,
-            dt_s: options.dt_s.unwrap_or(DEFAULT_DT_S),
+            dt_s: decimal(options.dt_s.unwrap_or(DEFAULT_DT_S)),
             dt_assumed: options.dt_s.is_none(),
             stop_reason: estimate.stop_reason.name().to_owned(),
             device: estimate.device.clone(),
@@ -145,9 +148,9 @@ impl Report {
         }
     }
 
-    /// The final progress. Objects: searched candidates of all candidates, and their mean cost, metres.
-    /// Field: completed iterations, the iteration limit, and the loss of the best iteration, metres. None
-    /// if the deadline allowed no candidate or no iteration.
+    /// The final progress. Objects: searched candidates of all candidates, and their mean cost,
+    /// metres. Field: completed iterations, the iteration limit, and the loss of the best
+    /// iteration, metres. None if the deadline allowed no candidate or no iteration.
     pub fn progress(&self) -> Option<JobProgress> {
         let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
         let (done, total, loss) = match (&self.objects, &self.field) {
@@ -176,8 +179,13 @@ pub struct DenseReport {
     pub substeps: u32,
     /// The device that moved the points: that of the fields, or the host's threads for objects.
     pub device: String,
-    /// Wall-clock seconds to move the points, without the estimates.
+    /// Wall-clock seconds to move the points, without the estimates of the pairs.
     pub seconds: f64,
+}
+
+/// Seconds in double precision, rounded to nanoseconds: 0.1 and not 0.10000000149.
+fn decimal(seconds: f32) -> f64 {
+    (f64::from(seconds) * 1e9).round() / 1e9
 }
 
 #[cfg(test)]

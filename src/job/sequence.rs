@@ -5,10 +5,10 @@ use super::error::InvalidOptions;
 use super::options::{EgoChoice, JobOptions};
 
 impl JobOptions {
-    /// Rejects options that only a sequence can have.
+    /// Rejects `densify`, which only a sequence that is submitted as a job can have.
     ///
     /// # Errors
-    /// [`InvalidOptions::NoSequence`].
+    /// [`InvalidOptions::NoSequence`] if `densify` is given.
     pub fn check_for_pairs(&self) -> Result<(), InvalidOptions> {
         match self.densify {
             None => Ok(()),
@@ -19,7 +19,8 @@ impl JobOptions {
     /// Rejects a given ego motion for a sequence of `sweeps` sweeps with more than one pair.
     ///
     /// # Errors
-    /// [`InvalidOptions::OneMotion`].
+    /// [`InvalidOptions::OneMotion`] if the ego motion is a given matrix and there are more than
+    /// two sweeps.
     pub fn check_for_sequence(&self, sweeps: usize) -> Result<(), InvalidOptions> {
         match self.ego {
             Some(EgoChoice::Given(_)) if sweeps > 2 => Err(InvalidOptions::OneMotion),
@@ -27,7 +28,8 @@ impl JobOptions {
         }
     }
 
-    /// Number of sweeps in the window of a pair, as far as the sequence has them.
+    /// Number of sweeps in the window of a pair, its own two included. Near the ends of a sequence
+    /// there may be fewer.
     pub fn sweeps(&self) -> usize {
         self.solver_options(usize::MAX).sweeps()
     }

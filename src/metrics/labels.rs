@@ -1,6 +1,8 @@
-//! The values that labels may have.
+//! The values of labels.
 
-/// The phases of a job, in order: the paper's own, and what a service adds around them.
+/// Values of the label `phase` of `fnsf_phase_seconds`: the phases of a job in order, then
+/// `total`. A pair has either `search`, or `query` and `network`. `total` is the whole estimate,
+/// from `precompute` to `search` or `network`.
 pub const PHASES: [&str; 8] = [
     "decode",
     "precompute",
@@ -11,7 +13,7 @@ pub const PHASES: [&str; 8] = [
     "encode",
     "total",
 ];
-/// Why requests are refused.
+/// Values of the label `reason` of `fnsf_requests_rejected_total`.
 pub const REJECTIONS: [&str; 10] = [
     "no_device",
     "disk_full",
@@ -24,8 +26,8 @@ pub const REJECTIONS: [&str; 10] = [
     "unauthorized",
     "too_slow",
 ];
-/// The protocols of requests.
+/// Values of the label `protocol` of `fnsf_requests_total`.
 pub const PROTOCOLS: [&str; 2] = ["http", "grpc"];
 /// Values of the label `class` of `fnsf_requests_total`: a success, an error with an HTTP status
-/// below 500, an error with 500 or above. A gRPC error counts by its HTTP status in the error table.
+/// below 500, an error with 500 or above. A gRPC error counts by the HTTP status of the same error.
 pub const CLASSES: [&str; 3] = ["ok", "client_error", "server_error"];

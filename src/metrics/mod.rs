@@ -1,6 +1,7 @@
-//! Every metric's name, labels and buckets: here and nowhere else.
+//! The Prometheus metrics of the server: their names, labels and buckets.
 //!
-//! No label holds a job, a tenant or anything else that grows; every series exists from the start.
+//! Every series exists from the start, so their number is constant. No label holds a job or a
+//! tenant. Job ids are exemplars.
 
 mod exposition;
 mod labels;

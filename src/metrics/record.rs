@@ -1,4 +1,4 @@
-//! What moves the metrics.
+//! Updates of the metrics, and their text form.
 
 use std::time::Duration;
 
@@ -13,7 +13,18 @@ use crate::job::{Job, Priority};
 use crate::queue::Event;
 
 impl Metrics {
-    /// Counts what the queue tells.
+    /// Updates the metrics of jobs with an event of the queue:
+    /// - `Submitted` counts in `fnsf_jobs_submitted_total`.
+    /// - `Started` enters the seconds from ready to first start in `fnsf_job_queue_seconds`.
+    /// - `Requeued` counts in `fnsf_jobs_retried_total`.
+    /// - `LeaseExpired` counts in `fnsf_leases_expired_total`.
+    /// - `Ended` counts in `fnsf_jobs_finished_total` and, for a dead letter, in
+    ///   `fnsf_dead_letters_total`. It enters the seconds from first start to end, if the job had
+    ///   started, in `fnsf_job_run_seconds`.
+    /// - `Deleted` has no effect.
+    ///
+    /// A sequence counts by its pairs. It counts itself only as requeued, or if its closing job
+    /// becomes a dead letter.
     pub fn observe(&self, event: &Event) {
         match event {
             Event::Submitted(job) => self.count_submitted(job),
@@ -60,7 +71,8 @@ impl Metrics {
         }
     }
 
-    /// Notes how long one phase of a job took.
+    /// Enters the duration of one phase of a job in `fnsf_phase_seconds`. `phase` is one of
+    /// [`super::PHASES`]. The exemplar is the id of `job`.
     pub fn phase(&self, phase: &'static str, seconds: f64, job: Option<&Job>) {
         let label = job.map(|job| JobLabel {
             job_id: job.id.to_string(),
@@ -69,62 +81,66 @@ impl Metrics {
         series.observe(seconds, label, None);
     }
 
-    /// Notes the iterations of the fit of a field.
+    /// Enters the number of iterations of one fit in `fnsf_fit_iterations`.
     pub fn fitted(&self, iterations: usize) {
         self.fit_iterations.observe(iterations as f64);
     }
 
-    /// Notes the clusters of an object search.
+    /// Enters the number of clusters of one object search in `fnsf_searched_clusters`.
     pub fn searched(&self, clusters: usize) {
         self.searched_clusters.observe(clusters as f64);
     }
 
-    /// Notes how an estimate ended, and how well its time was predicted.
+    /// Counts an estimate in `fnsf_estimates_total`, and enters its measured over predicted compute
+    /// time in `fnsf_prediction_ratio`. `stop_reason` is a name of [`crate::flow::StopReason`].
     pub fn solved(&self, stop_reason: &'static str, measured_over_predicted: f64) {
         let reason = stop_reason;
         self.estimates.get_or_create(&Reason { reason }).inc();
         self.prediction_ratio.observe(measured_over_predicted);
     }
 
-    /// Counts a refused request; `reason` is one of [`super::REJECTIONS`].
+    /// Counts a refused request in `fnsf_requests_rejected_total`; `reason` is one of
+    /// [`super::REJECTIONS`].
     pub fn rejected(&self, reason: &'static str) {
         self.rejected.get_or_create(&Reason { reason }).inc();
     }
 
-    /// Counts an answered request; `class` is one of [`super::CLASSES`].
+    /// Counts an answered request in `fnsf_requests_total`; `protocol` is one of
+    /// [`super::PROTOCOLS`], and `class` one of [`super::CLASSES`].
     pub fn request(&self, protocol: &'static str, class: &'static str) {
         self.requests
             .get_or_create(&ProtocolAndClass { protocol, class })
             .inc();
     }
 
-    /// Says whether the store can be written.
+    /// Sets `fnsf_store_ready`: true after a probe has written and read the queue and the blobs,
+    /// false after a failure of the store.
     pub fn store(&self, ready: bool) {
         self.store_ready.set(i64::from(ready));
     }
 
-    /// Counts bytes of request bodies.
+    /// Adds `bytes` received bytes of a request body to `fnsf_upload_bytes_total`.
     pub fn uploaded(&self, bytes: usize) {
         self.upload_bytes.inc_by(bytes as u64);
     }
 
-    /// Counts a connection until the guard is dropped.
+    /// Counts an open connection in `fnsf_connections` until the guard is dropped.
     pub fn connection(&self) -> ConnectionGuard {
         self.connections.inc();
         ConnectionGuard(self.connections.clone())
     }
 
-    /// Counts a snapshot.
+    /// Counts a stored snapshot in `fnsf_snapshots_written_total`.
     pub fn snapshot_kept(&self) {
         self.snapshots.inc();
     }
 
-    /// Counts a job taken up at a snapshot.
+    /// Counts an attempt that continues from a snapshot in `fnsf_jobs_resumed_total`.
     pub fn resumed(&self) {
         self.resumed.inc();
     }
 
-    /// Counts a lost device.
+    /// Counts a loss of the device `name` in `fnsf_device_lost_total`.
     pub fn device_lost(&self, name: &str) {
         let device = name.to_owned();
         self.device_lost
@@ -132,19 +148,20 @@ impl Metrics {
             .inc();
     }
 
-    /// Notes how many pairs a device works on at the same time.
+    /// Sets `fnsf_device_lanes`, the number of lanes of the device `name`.
     pub fn device_lanes(&self, name: &str, lanes: usize) {
         let device = name.to_owned();
         let series = self.device_lanes.get_or_create(&DeviceLabel { device });
         series.set(i64::try_from(lanes).unwrap_or(i64::MAX));
     }
 
-    /// Notes that the CPU works because no GPU was found.
+    /// Sets `fnsf_device_fallback` to 1: `auto` found no working GPU, so the CPU is used.
     pub fn fell_back(&self) {
         self.device_fallback.set(1);
     }
 
-    /// Notes a device's health and its share of time at work.
+    /// Sets `fnsf_device_ready` and `fnsf_device_busy_ratio` of the device `name`. `busy_ratio` is
+    /// the share of its lanes' time, 0 to 1, that it worked since the last call.
     pub fn device(&self, name: &str, ready: bool, busy_ratio: f64) {
         let label = DeviceLabel {
             device: name.to_owned(),
@@ -155,7 +172,12 @@ impl Metrics {
         self.device_busy_ratio.get_or_create(&label).set(busy_ratio);
     }
 
-    /// Notes what waits, what runs, and the seconds of this machine that what waits will take.
+    /// Sets the gauges of the queue:
+    /// - `fnsf_queue_depth`: the queued jobs of `backlog`, by priority.
+    /// - `fnsf_queue_work_seconds`: `work_seconds`, the predicted seconds of one lane for all
+    ///   queued jobs.
+    /// - `fnsf_queue_oldest_seconds`: `oldest`, the time since the oldest queued job became ready.
+    /// - `fnsf_jobs_running`: the running jobs of `backlog`.
     pub fn backlog(&self, backlog: &crate::queue::Backlog, work_seconds: f64, oldest: Duration) {
         for priority in Priority::ALL {
             let label = Urgency {
@@ -169,7 +191,8 @@ impl Metrics {
         self.running.set(backlog.running().jobs as i64);
     }
 
-    /// All metrics as text: OpenMetrics with exemplars, or Prometheus' classic format.
+    /// All metrics as text: OpenMetrics 1.0.0 with exemplars if `openmetrics`, else the Prometheus
+    /// text format 0.0.4.
     pub fn expose(&self, openmetrics: bool) -> String {
         let mut text = String::new();
         if let Err(error) = text::encode(&mut text, &self.registry) {
@@ -190,7 +213,7 @@ fn observe(series: &Seconds, took: Duration, job: &Job) {
     series.observe(took.as_secs_f64(), Some(label), None);
 }
 
-/// Counts one connection less when it is dropped.
+/// An open connection in `fnsf_connections`. It counts until it is dropped.
 #[derive(Debug)]
 pub struct ConnectionGuard(Gauge);
 

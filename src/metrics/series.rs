@@ -107,7 +107,7 @@ fn seconds() -> Seconds {
 }
 
 impl Metrics {
-    /// Every series at zero. `devices` are the names that `device` may have.
+    /// Creates every series with the value 0. `devices` are the values of the label `device`.
     pub fn new(devices: &[impl AsRef<str>]) -> Self {
         let metrics = Self {
             registry: Registry::default(),

@@ -7,7 +7,7 @@ use super::font::{GLYPH, glyph};
 /// Red, green, blue, 8 bits each.
 pub(super) type Rgb = [u8; 3];
 
-/// A picture in memory, rows from the top.
+/// An 8-bit RGB picture in memory, rows from the top.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Image {
     width: u32,
@@ -153,7 +153,7 @@ impl Image {
 /// Writes an image as an 8-bit RGB PNG.
 ///
 /// # Errors
-/// Where encoding or writing to `out` fails.
+/// [`PictureError`] where encoding or writing to `out` fails.
 pub fn write_png<W: Write>(image: &Image, out: W) -> Result<(), PictureError> {
     let mut encoder = png::Encoder::new(out, image.width, image.height);
     encoder.set_color(png::ColorType::Rgb);

@@ -34,16 +34,20 @@ const COLORS: [[f32; 3]; 7] = [
 /// One depth image and its title.
 #[derive(Clone, Copy, Debug)]
 pub struct DepthPanel<'a> {
-    /// The title above the image. Drawn: A to Z, 0 to 9 and `. , / % -`; lowercase letters as capitals,
-    /// any other character as a blank.
+    /// The title above the image. Drawn are A to Z, 0 to 9 and `. , / % -`. Lowercase letters are
+    /// drawn as capitals, any other character as a blank.
     pub title: &'a str,
     /// Depths, metres; 0 where unknown.
     pub image: &'a DepthImage,
 }
 
 /// Draws depth images one above the other, above a color scale. Each has its own size, with its
-/// title and density above it. Dots are three pixels wide, the nearest on top, so that sparse depth
-/// is visible.
+/// title and density above it. The picture is as wide as the widest of them, and at least 256
+/// pixels.
+///
+/// Near is red, far is blue, unknown is dark. The scale is logarithmic and the same for all images:
+/// from 3 m to the smallest of 5, 10, 20, 40, 80 and 160 m that covers 97 % of the known pixels.
+/// Each depth is a dot three pixels wide, with nearer dots on top, so that sparse depth is visible.
 pub fn depth_panels(panels: &[DepthPanel<'_>]) -> Image {
     let width = panels.iter().map(|panel| panel.image.width).max();
     let width = width.unwrap_or(0).max(256);

@@ -10,9 +10,9 @@ const LEAST_SCALE_M: f32 = 0.1;
 /// Share of the moving points whose displacement is below the full scale; the others saturate.
 const COVERED: f64 = 0.98;
 
-/// The displacements to be shown, N x 3 in metres, for N source points and their flow. Where the
-/// ego motion (`target_from_source`) is known it is subtracted, so the motion is relative to the
-/// world. Otherwise the flow is returned unchanged.
+/// The displacements to be shown, N x 3 in metres, for N source points and their flow, both in
+/// metres. Where the ego motion (`target_from_source`) is given, its displacement of each point is
+/// subtracted, so the motion is relative to the world. Otherwise the flow is returned unchanged.
 pub fn shown_motion(source: &[Point], flow: &[Point], ego: Option<&RigidTransform>) -> Vec<Point> {
     let Some(ego) = ego else {
         return flow.to_vec();
@@ -30,7 +30,9 @@ pub fn shown_motion(source: &[Point], flow: &[Point], ego: Option<&RigidTransfor
 }
 
 /// The horizontal displacement, metres, at which colors saturate: the smallest of 0.1, 0.15, 0.2,
-/// 0.3, 0.4, 0.5, 0.6, 0.8, 1, 1.5, ... that covers nearly all of the moving points.
+/// 0.3, 0.4, 0.5, 0.6, 0.8, 1, 1.5, ... that covers 98 % of the moving points. `motion` are N
+/// displacements, metres, and `valid` N flags: which of them count. Points that move less than 0.05
+/// m horizontally do not count as moving. The result is 0.1 m without moving points.
 pub fn full_scale(motion: &[Point], valid: &[bool]) -> f32 {
     let mut moving: Vec<f32> = motion
         .iter()

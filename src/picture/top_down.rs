@@ -45,7 +45,8 @@ pub struct TopDown<'a> {
     /// The ego motion `target_from_source`. Where it is given, motion relative to the world is
     /// shown, otherwise the flow itself; the title names which.
     pub ego: Option<&'a RigidTransform>,
-    /// Clusters, where known; the dynamic ones are outlined.
+    /// Clusters, where known. The dynamic ones get an outline of their box, and a line that shows
+    /// their displacement in 1 s.
     pub clusters: &'a [Cluster],
 }
 
@@ -54,12 +55,15 @@ pub struct TopDown<'a> {
 pub struct TopDownOptions {
     /// Width and height, pixels, clamped to 256..=8192.
     pub side_px: u32,
-    /// Half the width of the visible square, metres; by default chosen to hold nearly all points.
+    /// Half the width of the visible square, metres. By default, and where not positive, the
+    /// smallest of 10, 20, 30, 40, 50, 60, 80, 100, 150 and 200 m that holds 93 % of the points
+    /// with a flow.
     pub range_m: Option<f32>,
-    /// The displacement at which colors saturate, metres; by default chosen to cover nearly all
-    /// moving points.
+    /// The horizontal displacement at which colors saturate, metres. By default, and where not
+    /// positive, that of [`full_scale`].
     pub full_scale_m: Option<f32>,
-    /// Seconds from the source sweep to the target. Where given, the legend is in m/s.
+    /// Seconds from the source sweep to the target. Where given, the legend is in m/s, otherwise in
+    /// metres per interval.
     pub interval_s: Option<f32>,
 }
 
@@ -111,7 +115,12 @@ impl View {
     }
 }
 
-/// Draws flow from above. Rows past the shortest of the three inputs are left out.
+/// Draws flow from above. The sensor is in the middle, forward (+x) is up and left (+y) is left.
+/// Rows past the shortest of the three inputs are left out.
+///
+/// Points that move at least 0.05 m horizontally have the [`color`] of their motion, faster ones on
+/// top. Slower points and points without a flow are gray. The picture has distance rings, a scale
+/// bar and a legend of the colors.
 pub fn top_down(scene: &TopDown<'_>, options: &TopDownOptions) -> Image {
     let side = options.side_px.clamp(256, 8192);
     let range_m = options
@@ -268,7 +277,9 @@ fn draw_title(image: &mut Image, view: View, scene: &TopDown<'_>, moving: usize)
         None => format!("{points} points"),
     };
     image.text([margin, margin + 18 * dot], &counts, small);
-    let boxes = scene.clusters.iter().filter(|cluster| cluster.dynamic);
+    let is_shown = |point: Point| point[0].abs().max(point[1].abs()) <= view.range_m;
+    let boxes = scene.clusters.iter();
+    let boxes = boxes.filter(|cluster| cluster.dynamic && is_shown(cluster.bounds.center));
     if let boxes @ 1.. = boxes.count() {
         let text = format!(
             "{} moving boxes, and their displacement in 1 s",
@@ -293,15 +304,23 @@ fn draw_legend(image: &mut Image, view: View, scale_m: f32, interval_s: Option<f
     image.disk(center, 1.5 * dot as f32, BACKGROUND, 0.7);
     let label = match interval_s.filter(|seconds| *seconds > 0.0) {
         Some(seconds) => format!("{} m/s", rounded(scale_m / seconds)),
-        None => format!("{} m / frame", rounded(scale_m)),
+        None => format!("{} m / sweep", rounded(scale_m)),
     };
     let style = TextStyle {
         dot: view.small_dot(),
         color: TITLE,
         align: Align::Center,
     };
-    let below = (center[1] + radius) as i32 + 6 * dot;
-    image.text([center[0] as i32, below], &label, style);
+    let (middle, below) = (center[0] as i32, (center[1] + radius) as i32 + 6 * dot);
+    let small = TextStyle {
+        color: LABELS,
+        ..style
+    };
+    image.text([middle, below], &label, style);
+    image.text([middle, below + 7 * dot], "at the rim", small);
+    image.text([middle, below + 16 * dot], "static", small);
+    let swatch = [center[0] - radius * 0.75, (below + 18 * dot) as f32];
+    image.disk(swatch, 2.0 * dot as f32, STATIC, 0.9);
 }
 
 /// A number with at most two decimals, without trailing zeros.
@@ -327,7 +346,7 @@ fn draw_scale_bar(image: &mut Image, view: View) {
     };
     image.text(
         [margin + length / 2, bottom - 12 * thick],
-        &format!("{step} m"),
+        &format!("{step} m, x up, y left"),
         style,
     );
 }

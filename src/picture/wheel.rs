@@ -3,7 +3,7 @@
 
 use crate::flow::Point;
 
-/// The color of a row without flow.
+/// The color of a row without flow: gray, 8-bit red, green, blue.
 pub const INVALID_COLOR: [u8; 3] = [170, 170, 170];
 
 /// Steps from red to yellow, green, cyan, blue, magenta and back to red: finer where the eye
@@ -21,9 +21,13 @@ const CORNERS: [[f32; 3]; 7] = [
     [1.0, 0.0, 0.0],
 ];
 
-/// The color of a horizontal displacement, 8-bit red, green, blue. The direction in the x-y plane
-/// is the hue. The length over `full_scale` (same unit) is the saturation, so zero motion is white.
-/// Past the full scale the color darkens by a quarter; NaN gives [`INVALID_COLOR`].
+/// The color of a horizontal displacement, 8-bit red, green, blue, on the color wheel of the
+/// Middlebury flow benchmark (Baker et al. 2011).
+///
+/// The direction in the x-y plane is the hue: +x is red, and the hue turns counterclockwise over
+/// yellow, green, cyan, blue and magenta. The length over `full_scale` (same unit) is the
+/// saturation, so zero motion is white. Past the full scale the color darkens by a quarter. NaN
+/// gives [`INVALID_COLOR`].
 pub fn color(flow: Point, full_scale: f32) -> [u8; 3] {
     const PAST_SCALE: f32 = 0.75;
     let saturation = flow[0].hypot(flow[1]) / full_scale.max(f32::MIN_POSITIVE);

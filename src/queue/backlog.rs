@@ -4,12 +4,12 @@ use std::collections::HashMap;
 
 use crate::job::{DeviceKind, Job, Priority, Tenant};
 
-/// A number of jobs and the compute seconds predicted for them.
+/// A number of jobs and the compute time predicted for them.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Load {
-    /// Jobs.
+    /// Number of jobs.
     pub jobs: u64,
-    /// Predicted compute seconds.
+    /// Predicted compute time, nominal seconds ([`crate::cost`]).
     pub seconds: f64,
 }
 
@@ -47,7 +47,8 @@ impl Place {
     }
 }
 
-/// Queued and running load at one point in time.
+/// Queued and running load at one point in time. Pairs of a sequence count as jobs. The sequence
+/// counts only while its closing job is queued or running.
 #[derive(Clone, Debug, Default)]
 pub struct Backlog {
     queued: HashMap<Place, Load>,
@@ -65,7 +66,7 @@ impl Backlog {
         self.sum(|place| place.priority == priority)
     }
 
-    /// Queued load in total.
+    /// Queued load in total, with the jobs that follow another one or wait for a retry.
     pub fn queued(&self) -> Load {
         self.sum(|_| true)
     }
@@ -80,10 +81,12 @@ impl Backlog {
         self.sum(|place| place.tenant == *tenant)
     }
 
-    /// Predicted compute seconds queued for exactly this `device` requirement (`None`: any device)
-    /// that run before a new job of `cost_seconds`. Counted are all jobs of higher priority. Of the
-    /// same priority, each other tenant counts up to this tenant's own queued work including the
-    /// new job, which is its fair share.
+    /// Predicted compute time of the queued jobs that run before a new job of `tenant`, nominal
+    /// seconds. `cost_seconds` is the predicted compute time of the new job, nominal seconds.
+    ///
+    /// Only jobs with exactly this `device` requirement count (`None`: any device). All jobs of
+    /// higher priority count. Of the same priority, the tenant's own jobs count in full. Each other
+    /// tenant counts up to its fair share: the tenant's own queued work plus the new job.
     pub fn ahead_of(
         &self,
         tenant: &Tenant,

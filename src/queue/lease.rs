@@ -12,14 +12,14 @@ use crate::sync::locked;
 pub struct Lease {
     /// The job, in state running.
     pub job: Arc<Job>,
-    /// The heartbeat, called from the iteration loop.
+    /// The heartbeat, which keeps the lease.
     pub heartbeat: LeaseHeartbeat,
 }
 
 /// The queue's instruction to a worker.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Signal {
-    /// Go on.
+    /// Continue the work.
     Continue,
     /// Stop: the job's cancellation was requested.
     Cancel,
@@ -85,8 +85,8 @@ pub(super) trait HeartbeatStore: Send + Sync {
     fn snapshot_kept(&self);
 }
 
-/// The heartbeat of a lease, cheap enough for every iteration. The iteration loop calls it, not a
-/// timer, so a device that hangs loses its lease.
+/// The heartbeat of a lease, cheap enough for every iteration. During an estimate the iteration
+/// loop calls it, not a timer, so a device that hangs loses its lease. Clones share the lease.
 #[derive(Clone)]
 pub struct LeaseHeartbeat {
     flags: Arc<Flags>,
@@ -95,7 +95,7 @@ pub struct LeaseHeartbeat {
 
 impl std::fmt::Debug for LeaseHeartbeat {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Pulse")
+        f.debug_struct("LeaseHeartbeat")
             .field("signal", &self.signal())
             .finish_non_exhaustive()
     }
@@ -106,14 +106,20 @@ impl LeaseHeartbeat {
         Self { flags, store }
     }
 
-    /// Sends a heartbeat and returns the instruction.
+    /// Renews the lease for [`QueueOptions::lease`] and returns the queue's current instruction.
+    /// `progress` is published to the subscribers of the job; `None` leaves it unchanged.
+    ///
+    /// The call does not wait for the store. The store writes a renewal at most once a second, or
+    /// once in a quarter of the lease if that is shorter.
+    ///
+    /// [`QueueOptions::lease`]: super::QueueOptions::lease
     pub fn beat(&self, progress: Option<JobProgress>) -> Signal {
         self.flags.beat();
         self.store.beat(progress);
         self.signal()
     }
 
-    /// The current instruction, without a heartbeat.
+    /// The current instruction, without a heartbeat. [`Signal::Lost`] precedes [`Signal::Cancel`].
     pub fn signal(&self) -> Signal {
         if self.flags.lost.load(Ordering::Relaxed) {
             Signal::Lost
@@ -129,7 +135,7 @@ impl LeaseHeartbeat {
         self.flags.is_durable()
     }
 
-    /// Reports that a snapshot was stored.
+    /// Reports that a snapshot was stored, which resets the job's count of crashes to 0.
     pub fn snapshot_kept(&self) {
         self.store.snapshot_kept();
     }

@@ -2,8 +2,8 @@
 //!
 //! Payloads and options are opaque to the queue. It orders the pairs of a sequence. A sequence may
 //! have a closing job, which is queued under the sequence's own id when all pairs have succeeded.
-//! [`Queue`] is the interface and `contract_tests` its tests; [`SqliteQueue`] implements it on one
-//! machine. Independent of protocols, workers and solvers.
+//! [`Queue`] is the interface; [`SqliteQueue`] implements it on one machine. Independent of
+//! protocols, workers and solvers.
 
 mod backlog;
 #[cfg(test)]

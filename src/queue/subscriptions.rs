@@ -12,12 +12,12 @@ use crate::sync::locked;
 /// subscribers.
 #[derive(Debug, Default)]
 pub(super) struct Watchers {
-    has_dependents: Mutex<HashMap<JobId, watch::Sender<Arc<Job>>>>,
+    senders: Mutex<HashMap<JobId, watch::Sender<Arc<Job>>>>,
 }
 
 impl Watchers {
     fn lock(&self) -> MutexGuard<'_, HashMap<JobId, watch::Sender<Arc<Job>>>> {
-        locked(&self.has_dependents)
+        locked(&self.senders)
     }
 
     /// Subscribes to `job`, as just read from the database. A newer published state is kept.
@@ -26,8 +26,8 @@ impl Watchers {
             // An ended job does not change: its last state is enough.
             return watch::Sender::new(Arc::clone(job)).subscribe();
         }
-        let mut has_dependents = self.lock();
-        let sender = has_dependents
+        let mut senders = self.lock();
+        let sender = senders
             .entry(job.id)
             .or_insert_with(|| watch::Sender::new(Arc::clone(job)));
         sender.send_if_modified(|known| {
@@ -42,20 +42,20 @@ impl Watchers {
 
     /// Publishes the stored state of a job.
     pub(super) fn push(&self, job: &Arc<Job>) {
-        let mut has_dependents = self.lock();
-        if let Some(sender) = has_dependents.get(&job.id) {
+        let mut senders = self.lock();
+        if let Some(sender) = senders.get(&job.id) {
             sender.send_replace(Arc::clone(job));
             // Subscribers can still read the last state after the sender is dropped.
             if sender.receiver_count() == 0 || job.state.is_end() {
-                has_dependents.remove(&job.id);
+                senders.remove(&job.id);
             }
         }
     }
 
     /// Publishes the progress of a running job.
     pub(super) fn progress(&self, id: JobId, attempt: u32, progress: JobProgress) {
-        let has_dependents = self.lock();
-        if let Some(sender) = has_dependents.get(&id) {
+        let senders = self.lock();
+        if let Some(sender) = senders.get(&id) {
             sender.send_if_modified(|job| {
                 let current = job.state == State::Running && job.attempt == attempt;
                 if current {

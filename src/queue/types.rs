@@ -25,8 +25,8 @@ pub struct Submission {
     pub pair: PairOf,
     /// The pairs of a sequence, in the order of their execution; empty for a pair.
     pub pairs: Vec<PairOf>,
-    /// Predicted compute seconds of a sequence's closing job, which runs when all of its pairs have
-    /// succeeded; `None` if there is no closing job.
+    /// Predicted compute time of a sequence's closing job, nominal seconds ([`crate::cost`]). It
+    /// runs when all of the pairs have succeeded. `None` if there is no closing job.
     pub finalizer_seconds: Option<f64>,
     /// The job that must end, in any state, before this one is started.
     pub after: Option<JobId>,
@@ -36,16 +36,17 @@ pub struct Submission {
     pub priority: Priority,
     /// The kind of device that it requires; `None` for any.
     pub device: Option<DeviceKind>,
-    /// Predicted compute seconds, per pair.
+    /// Predicted compute time of a pair, or of each pair of a sequence, nominal seconds.
     pub cost_seconds: f64,
     /// The options, as JSON; opaque to the queue.
     pub options: String,
-    /// Time at which the best flow so far is returned. A job that is still queued then expires.
+    /// Time at which the best flow so far is returned. A job that is still queued then expires. It
+    /// does not apply to a closing job. `None`: [`QueueOptions::time_to_live`] limits the wait.
     pub deadline: Option<Timestamp>,
     /// Idempotency key and fingerprint. A submission of the same tenant with the same key and
     /// fingerprint returns the existing job; with another fingerprint it fails with
     /// [`QueueError::KeyReused`]. The key of an ephemeral job that ended without success, or whose
-    /// cancellation was requested, is free again. None: always a new job.
+    /// cancellation was requested, is free again. `None`: always a new job.
     pub idempotency: Option<Idempotency>,
     /// Whether the job survives this process. An ephemeral job ends with the process.
     pub durable: bool,
@@ -85,7 +86,7 @@ pub struct PairOf {
     /// The half-open range of sweeps used for the estimate, including its own two: first, and one
     /// past the last.
     pub window: [u32; 2],
-    /// Whether it follows the pair before it in the list.
+    /// Whether it is started only after the end of the pair before it in [`Submission::pairs`].
     pub chained: bool,
 }
 
@@ -98,7 +99,7 @@ impl PairOf {
         chained: false,
     };
 
-    /// A range of sweeps in the form of [`PairOf::window`].
+    /// A range of sweep indices in the form of [`PairOf::window`].
     pub fn seen(sweeps: Range<usize>) -> [u32; 2] {
         [sweeps.start, sweeps.end].map(|index| u32::try_from(index).unwrap_or(u32::MAX))
     }
@@ -109,7 +110,7 @@ impl PairOf {
 pub struct Idempotency {
     /// The caller's key, unique per tenant.
     pub key: String,
-    /// Hash of payload and options. The same key with another fingerprint is an error.
+    /// Hash of payload and options. The same key with another fingerprint is refused.
     pub fingerprint: [u8; 32],
 }
 
@@ -131,7 +132,7 @@ pub struct Filter {
     pub state: Option<State>,
     /// Only jobs older than this one.
     pub before: Option<JobId>,
-    /// Maximum number of jobs.
+    /// Maximum number of jobs. [`super::SqliteQueue`] returns at most 1000.
     pub limit: u32,
 }
 
@@ -140,11 +141,11 @@ pub struct Filter {
 pub enum Outcome {
     /// The result is stored under this attempt.
     Succeeded {
-        /// Why the optimization stopped, if there was one.
+        /// The name of the [`crate::flow::StopReason`]; `None` for a dense cloud.
         stop_reason: Option<String>,
-        /// The solver's report, as JSON.
+        /// The report of the estimate or of the dense cloud, as JSON.
         report: String,
-        /// The final progress, if there was an iteration.
+        /// The final progress, if there is one.
         progress: Option<JobProgress>,
     },
     /// It failed. A retryable failure is retried while attempts are left.
@@ -153,20 +154,20 @@ pub enum Outcome {
     Cancelled,
     /// The worker released the job through no fault of the job. It is requeued unchanged.
     Released,
-    /// The store works but fails for this job. It is requeued with a delay that grows each time,
-    /// and becomes a dead letter after a fixed number of these.
+    /// The store works but fails for this job. It is requeued with a delay that doubles each time,
+    /// up to 300 s, and becomes a dead letter the 13th time.
     Delayed(JobError),
     /// The job does not fit this device. It is requeued and now requires this kind.
     Moved(DeviceKind),
-    /// The device was lost during the attempt, perhaps through another job. The job is requeued,
-    /// and becomes a dead letter after [`QueueOptions::max_crashes`].
+    /// The device was lost during the attempt, perhaps through another job. The job is requeued at
+    /// once, and becomes a dead letter after [`QueueOptions::max_crashes`].
     Crashed(JobError),
 }
 
 /// The result of finishing an attempt.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Committed {
-    /// The outcome was stored; the job's new state.
+    /// The outcome was stored. The value is the job's new state.
     Yes(State),
     /// The attempt no longer holds the job, or the job has ended. The outcome is discarded.
     Fenced,
@@ -180,15 +181,15 @@ pub struct QueueOptions {
     /// Crashes of the process or of a device during a job's run, counted since its last snapshot,
     /// after which it becomes a dead letter.
     pub max_crashes: u32,
-    /// Time without a heartbeat after which a running job is requeued.
+    /// Time without a heartbeat after which a running job is requeued. It counts as a failure.
     pub lease: Duration,
-    /// Delay before the second attempt; doubled for each later one.
+    /// Delay before the second attempt. It doubles for each later one, up to 1024 times the first.
     pub retry_delay: Duration,
-    /// Maximum waiting time of a job without a deadline.
+    /// Maximum time in the queue of a job without a deadline, and of a closing job.
     pub time_to_live: Duration,
-    /// Retention of an ended job and its result.
+    /// Time for which an ended durable job and its result are kept.
     pub retention: Duration,
-    /// Retention of an ephemeral job, whose caller waited and has received the response.
+    /// The same for an ephemeral job, whose caller waited for the result.
     pub answered_retention: Duration,
 }
 
@@ -212,10 +213,11 @@ pub enum QueueError {
     /// No such job, or it belongs to another tenant.
     #[error("no job has this name")]
     NotFound,
-    /// The idempotency key was used with another payload, by this job.
+    /// The idempotency key was used by this job, with another payload or other options.
     #[error("the idempotency key was used with another payload, by job {0}")]
     KeyReused(JobId),
-    /// Only a job that has ended without success can be requeued.
+    /// The job cannot be requeued: it has not ended, or it has succeeded and its result is not
+    /// lost. The value is its state.
     #[error("only a job that failed, expired or was cancelled is queued again: this one is {}", .0.name())]
     NotTerminal(State),
     /// The ephemeral job is being cancelled or was cancelled, and cannot become durable.
@@ -224,16 +226,17 @@ pub enum QueueError {
     /// The store failed: a fault of the machine, not of a job.
     #[error("the queue's store failed: {0}")]
     Store(String),
-    /// The store cannot grow: the disk is full.
+    /// The store cannot grow because the disk is full: a fault of the machine.
     #[error("the queue's store is full: {0}")]
     Full(String),
-    /// The queue is closed.
+    /// The writer of the queue has ended. Only a new process can write again.
     #[error("the queue is closed")]
     Closed,
 }
 
 impl QueueError {
-    /// Whether the machine is at fault, so that a retry may succeed.
+    /// Whether the machine is at fault, so that a retry may succeed: [`QueueError::Store`] or
+    /// [`QueueError::Full`].
     pub fn is_of_the_machine(&self) -> bool {
         matches!(self, Self::Store(_) | Self::Full(_))
     }
@@ -242,13 +245,13 @@ impl QueueError {
 /// An event of the queue, for the metrics and the cleanup of blobs.
 #[derive(Clone, Debug)]
 pub enum Event {
-    /// A job was accepted.
+    /// A job was accepted. A sequence sends it for each pair and for itself.
     Submitted(Arc<Job>),
     /// A job was leased for the first time.
     Started(Arc<Job>),
-    /// A job was requeued.
+    /// A job was requeued: by a retry, a release, a recovery or [`Queue::requeue`].
     Requeued(Arc<Job>),
-    /// A lease expired.
+    /// The lease of this job expired.
     LeaseExpired(JobId),
     /// A job ended.
     Ended(Arc<Job>),
@@ -259,46 +262,97 @@ pub enum Event {
 /// The job queue: submission, subscription, leases for workers, completion, cancellation and
 /// requeueing. [`super::SqliteQueue`] implements it.
 ///
-/// When a call returns `Ok` the change has taken effect, and is on disk if the job is durable. A job
-/// may run more than once: an expired lease requeues it, and only the latest attempt can finish it.
+/// When a call returns `Ok` the change has taken effect. It is on disk if the job is durable,
+/// except for a lease. A job may run more than once: an expired lease requeues it, and only the
+/// latest attempt can finish it.
+///
+/// # Errors
+/// Every call that returns a result fails with an error of the store in these cases. Further errors
+/// are listed with each method.
+/// - [`QueueError::Store`] if the store cannot be read or written.
+/// - [`QueueError::Full`] if the disk is full.
+/// - [`QueueError::Closed`] if the writer has ended.
 #[async_trait]
 pub trait Queue: Send + Sync {
     /// Accepts a job and, for a sequence, all of its pairs. A known idempotency key returns its
-    /// job, unless that job is ephemeral and was cancelled, expired or failed: then the key is free
-    /// again. A job that follows another one is queued, but not leased before that one has ended.
+    /// job, unless that job is ephemeral and has failed, expired or been cancelled: then the key is
+    /// free again. A job that follows another one is queued, but not leased before that one has
+    /// ended.
+    ///
+    /// # Errors
+    /// [`QueueError::KeyReused`] if the idempotency key belongs to a job with another fingerprint,
+    /// or an error of the store.
     async fn submit(&self, submission: Submission) -> Result<Submitted, QueueError>;
 
-    /// Makes a job durable. Fails with [`QueueError::GivenUp`] if it is ephemeral and its
-    /// cancellation was requested.
+    /// Makes a job durable and, for a sequence, its pairs.
+    ///
+    /// # Errors
+    /// [`QueueError::NotFound`] if there is no such job. [`QueueError::GivenUp`] if it is ephemeral
+    /// and its cancellation was requested. Otherwise an error of the store.
     async fn make_durable(&self, id: JobId) -> Result<Arc<Job>, QueueError>;
 
-    /// A job of one tenant; the jobs of other tenants are not found.
+    /// A job of one tenant.
+    ///
+    /// # Errors
+    /// [`QueueError::NotFound`] if there is no such job or it belongs to another tenant, or an
+    /// error of the store.
     async fn job(&self, tenant: &Tenant, id: JobId) -> Result<Arc<Job>, QueueError>;
 
-    /// The pairs of a sequence, in the order of submission.
+    /// The pairs of a sequence, in the order of submission. Empty for a pair or an unknown id.
+    ///
+    /// # Errors
+    /// An error of the store.
     async fn pairs(&self, id: JobId) -> Result<Vec<Arc<Job>>, QueueError>;
 
     /// Lists jobs, latest first. The pairs of sequences are not listed.
+    ///
+    /// # Errors
+    /// An error of the store.
     async fn list(&self, filter: Filter) -> Result<Vec<Arc<Job>>, QueueError>;
 
-    /// Cancels a job: at once if it is queued, within an iteration if it is running.
+    /// Cancels a job and, for a sequence, its pairs. A queued job ends at once. A running job ends
+    /// when its worker has received [`super::Signal::Cancel`]. An ended job is not changed.
+    ///
+    /// # Errors
+    /// [`QueueError::NotFound`] if there is no such job, or an error of the store.
     async fn cancel(&self, id: JobId) -> Result<Arc<Job>, QueueError>;
 
-    /// Cancels an ephemeral job whose caller has disconnected. A durable job is not changed.
+    /// Cancels an ephemeral job whose caller has disconnected. A durable or unknown job is not
+    /// changed.
+    ///
+    /// # Errors
+    /// An error of the store.
     async fn abandon(&self, id: JobId) -> Result<(), QueueError>;
 
-    /// Requeues an ended job with all counters but the attempt number reset, and makes it durable.
-    /// A job that has succeeded is requeued only if its result is `lost`.
+    /// Requeues an ended job, makes it durable and removes its deadline. All counters but the
+    /// attempt number are reset. Of a sequence, the pairs that did not succeed and the closing job
+    /// are requeued. A job that has succeeded is requeued only if its result is `lost`.
+    ///
+    /// # Errors
+    /// [`QueueError::NotFound`] if there is no such job. [`QueueError::NotTerminal`] if it has not
+    /// ended, or has succeeded and is not `lost`. Otherwise an error of the store.
     async fn requeue(&self, id: JobId, lost: bool) -> Result<Arc<Job>, QueueError>;
 
-    /// Subscribes to a job: its state and, while it runs, every iteration.
+    /// Subscribes to a job: every change of its state and, while it runs, its progress. The channel
+    /// keeps the latest value only. It closes when the job has ended.
+    ///
+    /// # Errors
+    /// [`QueueError::NotFound`] if there is no such job, or an error of the store.
     async fn watch(&self, id: JobId) -> Result<watch::Receiver<Arc<Job>>, QueueError>;
 
-    /// Waits for the next job that a device of this kind may run, and leases it. Jobs that require
-    /// the other kind are skipped.
+    /// Waits for the next job that a device of this kind may run, and leases it to `worker`, a name
+    /// that is stored with the job. Jobs that require the other kind are skipped. If the future is
+    /// dropped, a job may stay leased to nobody until its lease expires.
+    ///
+    /// # Errors
+    /// An error of the store.
     async fn lease(&self, worker: &str, kind: DeviceKind) -> Result<Lease, QueueError>;
 
-    /// Ends an attempt. Only the latest attempt of a running job counts.
+    /// Ends an attempt. Only the latest attempt of a running job counts. After a cancellation
+    /// request, every outcome counts as [`Outcome::Cancelled`].
+    ///
+    /// # Errors
+    /// An error of the store.
     async fn finish(
         &self,
         id: JobId,
@@ -309,25 +363,38 @@ pub trait Queue: Send + Sync {
     /// The queued and running load.
     fn backlog(&self) -> Backlog;
 
-    /// The earliest time since which a queued job has been ready to be leased.
+    /// The earliest time since which a queued job has been ready to be leased; `None` if none is.
+    ///
+    /// # Errors
+    /// An error of the store.
     async fn oldest_queued(&self) -> Result<Option<Timestamp>, QueueError>;
 
-    /// Tests the store: inserts and deletes a job, and waits for the disk.
+    /// Tests the store: inserts and deletes a job, waits for the disk, and reads.
+    ///
+    /// # Errors
+    /// An error of the store. [`QueueError::Store`] also if its files were removed or replaced.
     async fn probe(&self) -> Result<(), QueueError>;
 
     /// Whether there are no jobs.
+    ///
+    /// # Errors
+    /// An error of the store.
     async fn is_empty(&self) -> Result<bool, QueueError>;
 
-    /// Records a graceful shutdown: jobs that could not be released do not count as crashed.
+    /// Records a graceful shutdown. The next start then counts no crash for the jobs that could not
+    /// be released.
     fn stopped(&self);
 
-    /// The number that identifies this queue. A payload store with another number belongs to
-    /// another queue.
+    /// The number that identifies this queue. A blob store with another number belongs to another
+    /// queue.
     fn identity(&self) -> i32;
 
     /// Returns when the writer has ended. Only a new process can write again.
     async fn ended(&self);
 
     /// The ids in this list that belong to jobs.
+    ///
+    /// # Errors
+    /// An error of the store.
     async fn known(&self, ids: Vec<JobId>) -> Result<Vec<JobId>, QueueError>;
 }

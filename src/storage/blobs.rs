@@ -18,7 +18,8 @@ use object_store::path::Path;
 use crate::fault::Fault;
 use crate::job::JobId;
 
-/// The blob store; clones share it.
+/// The store of payloads, snapshots, motion fields and results: files below one folder, by job.
+/// Clones share it. Its async methods need a tokio runtime.
 #[derive(Clone, Debug)]
 pub struct Blobs {
     folder: Arc<FilePath>,
@@ -29,7 +30,7 @@ pub struct Blobs {
 /// Whether a write waits for the disk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fsync {
-    /// It waits: the job is durable.
+    /// It waits: the blob is on disk when the write returns.
     Yes,
     /// It does not wait: the blob survives a crash of the process, but perhaps not of the machine.
     No,
@@ -42,10 +43,10 @@ pub enum Blob {
     Sweep(u32),
     /// The latest snapshot of its optimization.
     Snapshot,
-    /// The flow, or the dense cloud, of one attempt.
+    /// The flow, or the dense cloud, of one attempt, by attempt number.
     Result(u32),
-    /// The motion field of one attempt, for the jobs that follow. It is stored by attempt, so that
-    /// a late attempt cannot change a field that was already read.
+    /// The motion field of one attempt, by attempt number, for the jobs that follow. A late attempt
+    /// cannot change a field that was already read.
     Field(u32),
 }
 
@@ -78,12 +79,12 @@ impl From<io::Error> for BlobError {
     }
 }
 
-/// Free space of the file system.
+/// Free space of the file system that holds the store.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FreeSpace {
-    /// Bytes.
+    /// Free bytes for unprivileged processes.
     pub bytes: u64,
-    /// Files and folders; `None` if the file system does not count them.
+    /// Files and folders that can still be created; `None` if the file system does not count them.
     pub inodes: Option<u64>,
 }
 
@@ -108,10 +109,10 @@ fn path(id: JobId, blob: Blob) -> Path {
 }
 
 impl Blobs {
-    /// Opens or creates the store in `folder`.
+    /// Opens or creates the store in `folder`, and gives the folder the mode 0700.
     ///
     /// # Errors
-    /// If the folder cannot be used.
+    /// If the folder cannot be created, opened or given that mode.
     pub fn open(folder: &FilePath) -> Result<Self, BlobError> {
         fs::create_dir_all(folder)?;
         // An existing folder may have other permissions.
@@ -136,10 +137,13 @@ impl Blobs {
         })
     }
 
-    /// The identity that was written when the store was created; `None` if there is none.
+    /// The identity of the store: the number of the queue that it belongs to, as
+    /// [`crate::queue::Queue::identity`] returns it. `None` if the file `identity` does not exist,
+    /// as in a new store.
     ///
     /// # Errors
-    /// If it cannot be read.
+    /// If the file cannot be read. [`io::ErrorKind::InvalidData`] if it does not hold an `i32` in
+    /// decimal digits.
     pub fn identity(&self) -> io::Result<Option<i32>> {
         match fs::read_to_string(self.folder.join(IDENTITY)) {
             Ok(text) => match text.trim().parse() {
@@ -151,21 +155,30 @@ impl Blobs {
         }
     }
 
-    /// Writes the identity of the store.
+    /// Writes the identity of the store to the file `identity`, replacing an earlier one, and waits
+    /// for the disk. [`Blobs::probe`] fails until the store has an identity.
     ///
     /// # Errors
-    /// If it cannot be written.
+    /// If the file cannot be created, written or synced.
     pub fn set_identity(&self, identity: i32) -> io::Result<()> {
-        let mut file = fs::File::create(self.folder.join(IDENTITY))?;
+        // A crash leaves the earlier file or the new one, never an empty one.
+        let written = self.folder.join("identity.new");
+        let mut file = fs::File::create(&written)?;
         writeln!(file, "{identity}")?;
-        file.sync_all()
+        file.sync_all()?;
+        fs::rename(&written, self.folder.join(IDENTITY))?;
+        fs::File::open(&self.folder)?.sync_all()
     }
 
-    /// Tests the store: writes, syncs, reads back and removes a file. Checks that the store has
-    /// this `identity`, and free space for twice `needed` bytes, at least 4 MiB.
+    /// Tests the store. It checks the `identity`, then writes, syncs, reads back and removes a file
+    /// of 64 KiB. Last it checks the free space: twice `needed` bytes, at least 4 MiB. This check
+    /// is skipped if the system does not report the free space.
     ///
     /// # Errors
-    /// If any of these fails.
+    /// [`BlobError`] in these cases:
+    /// - The store has another identity, or none.
+    /// - A file operation fails, or other bytes are read back.
+    /// - There is too little free space. Its fault is [`Fault::Full`].
     pub async fn probe(&self, identity: i32, needed: u64) -> Result<(), BlobError> {
         const BYTES: usize = 64 << 10;
         const ROOM: u64 = 4 << 20;
@@ -199,7 +212,8 @@ impl Blobs {
     /// Writes a blob atomically, replacing an existing one.
     ///
     /// # Errors
-    /// If it cannot be written. The blob is then unchanged.
+    /// If it cannot be written. The blob is then unchanged or, with [`Fsync::Yes`], possibly
+    /// replaced.
     pub async fn put(
         &self,
         id: JobId,
@@ -232,10 +246,11 @@ impl Blobs {
         Ok(usize::try_from(size).unwrap_or(usize::MAX))
     }
 
-    /// Rewrites a blob durably that was written without waiting for the disk.
+    /// Makes a blob durable that was written with [`Fsync::No`]: reads it and writes it again with
+    /// [`Fsync::Yes`].
     ///
     /// # Errors
-    /// As for reading and writing.
+    /// If there is none ([`BlobError::is_missing`]), or it cannot be read or written.
     pub async fn sync(&self, id: JobId, blob: Blob) -> Result<(), BlobError> {
         let bytes = self.get(id, blob).await?;
         self.put(id, blob, bytes, Fsync::Yes).await

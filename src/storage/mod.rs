@@ -1,4 +1,4 @@
-//! Storage of payloads, snapshots and results.
+//! Storage of payloads, snapshots, motion fields and results.
 
 mod blobs;
 

@@ -102,7 +102,7 @@ impl Worker {
             let bytes = self.blobs.get(job.id, Blob::Sweep(index)).await?;
             let solver_options = Arc::clone(&solver_options);
             let read = move || {
-                let StoredCloud { points, ground } = StoredCloud::from_bytes(&bytes)?;
+                let StoredCloud { points, ground, .. } = StoredCloud::from_bytes(&bytes)?;
                 let sweep = Sweep { points, ground }.prepared(&solver_options);
                 Ok::<_, Damaged>(sweep.cropped(&solver_options))
             };

@@ -8,9 +8,10 @@ use std::sync::Arc;
 
 use tokio::sync::watch;
 
-/// A shared-exclusive lock of all workers of a process. A worker holds it shared while it leases and
-/// runs a job. A worker whose job is suspect (more than one crash) takes it exclusively, so that a
-/// further crash affects no other job. After 30 s of waiting it runs beside the others.
+/// A shared-exclusive lock of all workers of a process. A worker holds it shared while it leases
+/// and runs a job. A worker whose job is suspect (more than one crash) takes it exclusively, so
+/// that a further crash affects no other job. After 30 s of waiting the suspect job runs beside the
+/// others. A second suspect job goes back to the queue while the first one waits or runs alone.
 #[derive(Debug, Default)]
 pub struct IsolationLock(watch::Sender<State>);
 

@@ -46,7 +46,7 @@ impl Worker {
         lease: &Lease,
     ) -> Result<(Work, JoinHandle<()>, JobOptions), StoreError> {
         let job = &lease.job;
-        let options = JobOptions::from_json(job.options.as_bytes())?;
+        let mut options = JobOptions::from_json(job.options.as_bytes())?;
         let (owner, [source, target]) = job.sweeps();
         let (source, target, before) = tokio::try_join!(
             async { Ok(self.blobs.get(owner, Blob::Sweep(source)).await?) },
@@ -57,6 +57,9 @@ impl Worker {
         let snapshot = self.earlier_snapshot(job).await;
         let source = StoredCloud::from_bytes(&source)?;
         let target = StoredCloud::from_bytes(&target)?;
+        options.dt_s = options
+            .dt_s
+            .or_else(|| source.time?.interval_s(target.time?));
         let points = source.points.len().max(target.points.len());
         let (snapshots, kept) = mpsc::channel(1);
         let deadline = job.deadline.map(|deadline| {
@@ -103,7 +106,7 @@ impl Worker {
             // Sweeps farther away are of no use.
             let Ok(at) = i8::try_from(at) else { continue };
             let bytes = self.blobs.get(owner, Blob::Sweep(index)).await?;
-            let StoredCloud { points, ground } = StoredCloud::from_bytes(&bytes)?;
+            let StoredCloud { points, ground, .. } = StoredCloud::from_bytes(&bytes)?;
             around.push((Sweep { points, ground }, at));
         }
         Ok(around)

@@ -15,7 +15,7 @@ use crate::storage::Blobs;
 /// Timeout of a probe.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// Probes the queue and the blob store.
+/// Probes the queue and the blob store, and records the result in their [`StoreHealth`].
 pub struct StoreProbe {
     queue: Arc<dyn Queue>,
     blobs: Blobs,
@@ -25,7 +25,7 @@ pub struct StoreProbe {
 }
 
 impl StoreProbe {
-    /// Creates a probe of both; its results go into `health`.
+    /// Creates a probe of `queue` and `blobs`; its results go into `health`.
     pub fn new(queue: Arc<dyn Queue>, blobs: Blobs, health: Arc<StoreHealth>) -> Self {
         Self {
             queue,
@@ -40,7 +40,8 @@ impl StoreProbe {
         &self.health
     }
 
-    /// Runs a probe, or waits for the one that is running. Returns whether both stores work.
+    /// Runs a probe, or waits for the one that is running, for 10 s at most. Returns whether the
+    /// queue and the blob store work. A probe that takes longer counts as a failure.
     pub async fn ask(&self) -> bool {
         let mut asking = self.asking.lock().await;
         let handle = asking.get_or_insert_with(|| {

@@ -25,19 +25,21 @@ use crate::storage::Blobs;
 /// Options of a worker.
 #[derive(Clone, Debug)]
 pub struct WorkerOptions {
-    /// Interval between the snapshots of a running job.
+    /// Interval between the snapshots of a running fit.
     pub snapshot_interval: Duration,
     /// The device kind for jobs that do not fit into this device's memory; `None` if there is no
     /// other.
     pub overflow_kind: Option<DeviceKind>,
 }
 
-/// Shutdown signals to the workers.
+/// Shutdown signals to the workers, given by cancelling a token. Clones share the tokens.
 #[derive(Clone, Debug, Default)]
 pub struct Drain {
-    /// No new job is leased.
+    /// No new job is leased. Running jobs go on.
     pub stop: CancellationToken,
-    /// Running jobs are interrupted with a snapshot and go back to the queue.
+    /// Running jobs are interrupted and go back to the queue: a fit after a snapshot, a
+    /// densification at once. An object search goes on to its end, and so does a fit that its
+    /// deadline has shortened.
     pub release: CancellationToken,
 }
 
@@ -69,14 +71,17 @@ pub struct Worker {
     pub options: WorkerOptions,
     /// The shutdown signals.
     pub drain: Drain,
-    /// The isolation gate, shared by all workers of the process.
+    /// The isolation lock, shared by all workers of the process.
     pub isolation: Arc<IsolationLock>,
     /// The store probe. While the store fails, no job is leased.
     pub store: Arc<StoreProbe>,
 }
 
 impl Worker {
-    /// Runs until shutdown, or until the lane's thread has ended.
+    /// Leases jobs, runs them on the lane, stores their results and finishes their attempts.
+    ///
+    /// Returns after [`Drain::stop`], when the running job has ended and its result is stored. It
+    /// also returns when the lane's thread or the queue has ended.
     pub async fn run(self) {
         let mut committing: Option<JoinHandle<()>> = None;
         loop {

@@ -114,6 +114,7 @@ impl Stand {
             let cloud = StoredCloud {
                 points,
                 ground: None,
+                time: None,
             };
             let bytes = Bytes::from(cloud.to_bytes());
             let put = self.blobs.put(id, Blob::Sweep(index), bytes, Fsync::No);

@@ -117,8 +117,8 @@ fn a_frame_that_the_street_does_not_have_has_no_depth() {
     let refused = street(2).depth(2, &camera());
     assert_eq!(
         refused,
-        Err(StreetError::ReferenceTimeOutOfRange {
-            frame: 2,
+        Err(StreetError::NoSuchSweep {
+            index: 2,
             sweeps: 2
         })
     );

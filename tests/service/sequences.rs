@@ -457,3 +457,28 @@ async fn a_dense_cloud_that_cannot_be_made_is_refused_with_clear_words_and_costs
     let listed: Value = listed.json().await.expect("a page");
     assert_eq!(listed["jobs"].as_array().map(Vec::len), Some(0));
 }
+
+#[tokio::test]
+async fn velocities_of_a_sequence_are_by_the_times_in_the_names_of_its_files() {
+    let server = Server::start(&[]);
+    let names = [
+        "1700000000000.npy",
+        "1700000000050.npy",
+        "1700000000150.npy",
+    ];
+    let parts = names
+        .iter()
+        .zip(sweeps())
+        .map(|(name, points)| Part::bytes(file(CloudFormat::Npy, points)).file_name(*name));
+    let form = parts.fold(Form::new(), |form, part| form.part("sweep", part));
+    let (status, job) = post(&server, "/v1/sequences", form).await;
+    assert_eq!(status, StatusCode::ACCEPTED, "{job}");
+    let job = ended(&server, job["id"].as_str().expect("an id")).await;
+    let mut intervals = Vec::new();
+    for pair in job["pairs"]["jobs"].as_array().expect("pairs") {
+        let pair = ended(&server, pair["id"].as_str().expect("an id")).await;
+        assert_eq!(pair["report"]["dt_assumed"], false, "{pair}");
+        intervals.push(pair["report"]["dt_s"].as_f64().expect("seconds"));
+    }
+    assert_eq!(intervals, [0.05, 0.1]);
+}

@@ -103,7 +103,11 @@ impl CloudBuilder {
                 )));
             }
         };
-        Ok(StoredCloud { points, ground })
+        Ok(StoredCloud {
+            points,
+            ground,
+            time: None,
+        })
     }
 }
 

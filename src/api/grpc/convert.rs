@@ -224,7 +224,7 @@ pub(super) fn header(answer: &Answer) -> proto::FlowHeader {
             network: seconds.network,
             total: seconds.total,
         }),
-        dt_s: report.dt_s,
+        dt_s: report.dt_s as f32,
         dt_assumed: report.dt_assumed,
         method,
     }

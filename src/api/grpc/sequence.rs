@@ -20,6 +20,7 @@ use crate::api::pending_job::{Accepted, ChainLink, PendingJob};
 use crate::api::service::{Service, Waited};
 use crate::api::upload_budget::UploadReservation;
 use crate::flow::{is_window_final, window};
+use crate::formats::SweepTime;
 use crate::job::{JobId, JobOptions, Kind};
 use crate::payload::StoredCloud;
 use crate::queue::PairOf;
@@ -63,7 +64,8 @@ struct Coming {
 
 impl Coming {
     fn finish(self, room: UploadReservation) -> Result<Sweep, ApiError> {
-        let cloud = self.cloud.finish(&self.name)?;
+        let mut cloud = self.cloud.finish(&self.name)?;
+        cloud.time = SweepTime::from_name(&self.name);
         if let Some(points) = self.points
             && points != cloud.points.len() as u64
         {

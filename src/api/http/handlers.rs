@@ -173,7 +173,6 @@ async fn read_pair(
         }
     }
     options.check_for_pairs()?;
-    options.dt_s = options.dt_s.or_else(|| files.interval_s());
     service.check_room(caller, Some(&options), durability)?;
     let mut pending = PendingJob::begin(
         service,
@@ -306,7 +305,6 @@ async fn read_job(
         Some(pending) => Ok((pending, Kind::Sequence)),
         None => {
             options.check_for_pairs()?;
-            options.dt_s = options.dt_s.or_else(|| files.interval_s());
             let request = asked.job_request(options, Durability::Durable);
             let mut pending = PendingJob::begin(service, caller.clone(), request)?;
             files.push_to(body, &mut pending).await?;

@@ -327,12 +327,6 @@ impl PairFiles {
         Ok(())
     }
 
-    /// Seconds between the two sweeps, by the timestamps in their file names.
-    pub(super) fn interval_s(&self) -> Option<f32> {
-        let name = |file: &Option<(Option<String>, Vec<u8>)>| file.as_ref()?.0.clone();
-        formats::interval_s(&name(&self.source)?, &name(&self.target)?)
-    }
-
     /// Whether no file has been added.
     pub(super) fn is_empty(&self) -> bool {
         self.source.is_none() && self.target.is_none()

@@ -46,17 +46,18 @@ pub struct ListenOptions {
     /// Maximum number of open connections. Beyond it a less important connection is evicted, or
     /// else the new one is closed.
     pub max_connections: usize,
-    /// Timeout for the headers of a request, for a TLS handshake, and between two requests.
+    /// Timeout for the headers of a request, for a TLS handshake, and between two requests of a
+    /// connection.
     pub header_timeout: Duration,
     /// Time after which a client that does not read its response is disconnected.
     pub write_timeout: Duration,
     /// Maximum number of concurrent requests on one HTTP/2 connection.
     pub max_streams: u32,
-    /// Budget for the unread parts of all responses, bytes. Responses with results have their own
-    /// budget.
+    /// Budget for the unread parts of all responses, bytes. Beyond it a response ends with an
+    /// error. Responses with results have their own budget.
     pub max_answer_bytes: usize,
     /// Whether requests need a key. Then a connection without a valid key is closed after two
-    /// header timeouts, and terminated after four.
+    /// header timeouts if it has no open request, and terminated after four.
     pub needs_key: bool,
 }
 
@@ -160,11 +161,12 @@ pub enum TlsError {
     Rustls(#[from] rustls::Error),
 }
 
-/// A TLS acceptor with a certificate chain and its private key, both PEM. It offers HTTP/2 and
-/// HTTP/1.1 (ALPN).
+/// A TLS acceptor with a certificate chain and its private key, both paths of PEM files. It offers
+/// HTTP/2 and HTTP/1.1 (ALPN).
 ///
 /// # Errors
-/// [`TlsError`], with the path of the file.
+/// [`TlsError::File`] if a file cannot be read or is not such a PEM file. [`TlsError::Rustls`] if
+/// the certificate and the key are invalid or do not match.
 pub fn tls_acceptor(certificate: &Path, key: &Path) -> Result<TlsAcceptor, TlsError> {
     let bad = |path: &Path, error: &dyn std::fmt::Display| TlsError::File {
         path: path.display().to_string(),
@@ -184,7 +186,8 @@ pub fn tls_acceptor(certificate: &Path, key: &Path) -> Result<TlsAcceptor, TlsEr
 }
 
 impl Listener {
-    /// Binds `address`. If `metrics` is given, it counts the open connections.
+    /// Binds `address`. Without `tls` the port is unencrypted. If `metrics` is given, it counts the
+    /// open connections.
     ///
     /// # Errors
     /// The error of the operating system, for example if the address is in use.
@@ -203,11 +206,14 @@ impl Listener {
         })
     }
 
-    /// A listener on a socket that is already bound. Must be called in the runtime that will serve
-    /// it.
+    /// A listener without TLS and metrics on a socket that is already bound. Must be called in the
+    /// runtime that will serve it.
     ///
     /// # Errors
-    /// If the socket cannot be registered with the runtime.
+    /// If the socket cannot be made non-blocking or registered with the runtime.
+    ///
+    /// # Panics
+    /// Outside of a Tokio runtime.
     pub fn on(socket: std::net::TcpListener, options: ListenOptions) -> std::io::Result<Self> {
         socket.set_nonblocking(true)?;
         Ok(Self {
@@ -219,7 +225,7 @@ impl Listener {
         })
     }
 
-    /// The local address.
+    /// The local address of the port.
     ///
     /// # Errors
     /// The error of the operating system.
@@ -232,8 +238,11 @@ impl Listener {
         Arc::clone(&self.heartbeat)
     }
 
-    /// Serves connections until `stop` is cancelled, then shuts down gracefully: open requests are
-    /// finished.
+    /// Serves connections until `stop` is cancelled, then shuts down gracefully: no connection is
+    /// accepted any more, and open requests are finished. Returns when all connections have ended.
+    ///
+    /// # Panics
+    /// If `max_connections` or `max_answer_bytes` is above [`Semaphore::MAX_PERMITS`].
     pub async fn serve(self, router: Router, stop: CancellationToken) {
         const PAUSE: Duration = Duration::from_millis(50);
         let room = Arc::new(Semaphore::new(self.options.max_connections));

@@ -1,8 +1,8 @@
 //! Detection of missing GPU prerequisites: the Vulkan loader, a driver's manifest, a container's
 //! permissions.
 //!
-//! [`Environment::here`] inspects files and environment variables. [`Environment::advice`] turns the findings
-//! into advice, without any access to the system.
+//! [`Environment::here`] inspects files and environment variables. [`Environment::advice`] turns
+//! the findings into advice, without any access to the system.
 
 use std::env;
 use std::fs;

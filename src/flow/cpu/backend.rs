@@ -26,22 +26,22 @@ pub struct CpuBackend {
 }
 
 impl CpuBackend {
-    /// A backend with the machine's fastest instruction set on `threads` threads, or on all cores
-    /// if none.
+    /// A backend with the machine's fastest instruction set on `threads` threads, or on one thread
+    /// per core if none or zero.
     ///
     /// # Errors
-    /// If the thread pool cannot be started.
+    /// [`BackendError::Threads`] if the operating system cannot start the threads.
     pub fn new(threads: Option<usize>) -> Result<Self, BackendError> {
         Self::with_isa(Isa::available()[0], threads)
     }
 
-    /// As [`Self::new`], with an instruction set of [`Isa::available`].
+    /// As [`Self::new`], with the instruction set `isa`.
     ///
     /// # Errors
-    /// If the thread pool cannot be started.
+    /// [`BackendError::Threads`] if the operating system cannot start the threads.
     ///
     /// # Panics
-    /// If the machine lacks the instruction set.
+    /// If `isa` is not one of [`Isa::available`].
     pub fn with_isa(isa: Isa, threads: Option<usize>) -> Result<Self, BackendError> {
         Ok(Self {
             kernels: Kernels::new(isa),

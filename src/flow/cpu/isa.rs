@@ -1,13 +1,14 @@
 //! The instruction sets that the kernels are compiled for, and their detection at run time.
 
-/// An instruction set that the kernels are compiled for.
+/// An instruction set that the kernels are compiled for. Results have the same bits with
+/// [`Self::Avx512`] and [`Self::Avx2`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Isa {
-    /// AVX-512F: 16 floats per register.
+    /// AVX-512F: 16 floats per register, with fused multiply-add.
     Avx512,
     /// AVX2 and FMA: 8 floats per register, with fused multiply-add.
     Avx2,
-    /// Plain Rust, available on every target.
+    /// Plain Rust, available on every target. Multiply-adds round the product before the sum.
     Portable,
 }
 

@@ -23,7 +23,8 @@ const FORWARD: usize = 2 * (3 * WIDTH + MIDDLE_LAYERS * WIDTH * WIDTH + 3 * WIDT
 /// weights, and again for the inputs of every layer but the first.
 const BACKWARD: usize = 2 * FORWARD - 2 * 3 * WIDTH;
 
-/// The kernels of one instruction set over a synthetic cloud, on the calling thread.
+/// A benchmark of the network's kernels: a random network and a random cloud, processed by the
+/// calling thread. The caller measures the time.
 pub struct NetworkWorkload {
     kernels: Kernels,
     parameters: Parameters,
@@ -34,10 +35,11 @@ pub struct NetworkWorkload {
 }
 
 impl NetworkWorkload {
-    /// A random network and `points` random points.
+    /// A random network and `points` random points, for the kernels of `isa`. They are the same at
+    /// every call.
     ///
     /// # Panics
-    /// If the machine lacks the instruction set.
+    /// If `isa` is not one of [`Isa::available`].
     pub fn new(isa: Isa, points: usize) -> Self {
         let mut random = Random::new(1);
         let parameters = mlp::xavier(&mut random);
@@ -54,7 +56,8 @@ impl NetworkWorkload {
         }
     }
 
-    /// Runs the forward pass over all points. Returns the number of floating-point operations.
+    /// Runs the forward pass over all points. Returns the number of floating-point operations of
+    /// its matrix products, two per multiply-add.
     pub fn forward(&mut self) -> f64 {
         for points in self.points.chunks(TILE) {
             self.tile.load(points.iter().copied());
@@ -64,7 +67,7 @@ impl NetworkWorkload {
     }
 
     /// Runs the forward and backward passes over all points. Returns the number of floating-point
-    /// operations.
+    /// operations of their matrix products, two per multiply-add.
     pub fn forward_and_backward(&mut self) -> f64 {
         for points in self.points.chunks(TILE) {
             self.tile.load(points.iter().copied());
@@ -81,11 +84,15 @@ impl NetworkWorkload {
     }
 }
 
-/// Runs `rounds` rounds of independent multiply-adds in registers. Returns the number of
-/// floating-point operations. Their rate is the peak of one thread.
+/// Benchmark of the peak arithmetic throughput of one thread.
+///
+/// Runs `rounds` rounds of 12 independent multiply-adds on full vector registers of `isa`, on the
+/// calling thread. Returns the number of floating-point operations: two per multiply-add and
+/// element of a register. Divided by the time that the caller measures, it is the peak in
+/// operations per second.
 ///
 /// # Panics
-/// If the machine lacks the instruction set.
+/// If `isa` is not one of [`Isa::available`].
 pub fn multiply_add_peak(isa: Isa, rounds: usize) -> f64 {
     assert!(Isa::available().contains(&isa), "{isa:?} is not available");
     // SAFETY: the assertion checked the instruction set.

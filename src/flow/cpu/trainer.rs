@@ -1,5 +1,5 @@
-//! One fit on the CPU: forward pass, loss and backward pass over tiles on all threads, then Adam. The
-//! loop is the same for every model, loss and schedule.
+//! One fit on the CPU: forward pass, loss and backward pass over tiles on all threads, then Adam.
+//! The loop is the same for every model, loss and schedule.
 //!
 //! Sums are taken in the fixed order of `field/reduction.rs`, so the result has the same bits for
 //! any number of threads.
@@ -133,7 +133,8 @@ impl<M: Model, L: Loss> CpuTrainer<M, L> {
         held
     }
 
-    /// Forward pass, loss and backward pass over some chunks of `batch`, held from index `first` on.
+    /// Forward pass, loss and backward pass over some chunks of `batch`, held from index `first`
+    /// on.
     fn compute(
         &mut self,
         batch: &Range<usize>,

@@ -5,8 +5,9 @@ use super::point::Point;
 /// The points of a neighbor sweep that an estimate uses, in the target's frame.
 #[derive(Clone, Debug)]
 pub struct AlignedSweep {
-    /// Points that are not ground, metres.
+    /// K points that are not ground, metres, in the target's frame.
     pub points: Vec<Point>,
-    /// Its time after the source, in sweep intervals; negative for a sweep before the source.
+    /// Time of the sweep after the source, in sweep intervals; negative for a sweep before the
+    /// source.
     pub at: i8,
 }

@@ -18,10 +18,11 @@ pub(crate) struct Envelope {
     pub(crate) body: Option<usize>,
 }
 
-/// Why an envelope was rejected.
+/// The reason why the bytes of a snapshot or of a motion field were rejected. Such bytes are a
+/// magic number of 8 bytes, a format version, a body and a checksum.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum EnvelopeError {
-    /// The magic does not match: the bytes are of another format.
+    /// The magic number does not match: the bytes are of another format.
     #[error("the bytes are something else")]
     Magic,
     /// Written as another version of the format.

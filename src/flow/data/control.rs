@@ -9,7 +9,8 @@ pub struct Progress {
     pub done: usize,
     /// Maximum number of iterations, or number of clusters.
     pub total: usize,
-    /// The mean loss of the latest iteration's points, or the mean cost of the clusters, metres.
+    /// Mean loss of the latest iteration's points, metres. For an object search, the mean truncated
+    /// distance of the finished clusters from the target, metres.
     pub loss: f64,
 }
 
@@ -28,27 +29,32 @@ pub trait Control: Sync {
     fn seconds(&self) -> f64 {
         0.0
     }
-    /// Seconds until the flow is due; none without a deadline. If the time does not suffice for all
-    /// of the work, less is computed. An implementation that returns a value must keep time in
-    /// [`Self::seconds`].
+    /// Seconds until the result is due, negative after that; none without a deadline. If the time
+    /// does not suffice for all of the work, less is computed. An implementation that returns a
+    /// value must keep time in [`Self::seconds`].
     fn seconds_left(&self) -> Option<f64> {
         None
     }
-    /// Whether the work should end now. Called from any thread, several times a second: before each
-    /// iteration or group of iterations, and between the parts of the work before the first one. It
-    /// can therefore serve as a heartbeat.
+    /// The reason why the work should end now; none to continue.
+    ///
+    /// Called from any thread, usually several times a second: before each iteration or group of
+    /// iterations of a fit, before each group of clusters of an object search, and between the
+    /// parts of the work before them. It can therefore serve as a heartbeat.
     fn interrupt(&self) -> Option<Interrupt> {
         None
     }
-    /// Receives the progress after every iteration.
+    /// Receives the progress of each iteration of a fit, or of each group of clusters of an object
+    /// search. Iterations that a GPU does as a group are reported after the group.
     fn progress(&self, _progress: Progress) {}
-    /// Whether a snapshot is due. It stays true until [`Self::snapshot`] has been called. Checked
-    /// after [`Self::interrupt`], before each iteration or group of iterations.
+    /// Whether a snapshot of the fit is due. An implementation keeps it true until
+    /// [`Self::snapshot`] has been called. Checked after [`Self::interrupt`], before each iteration
+    /// or group of iterations.
     fn snapshot_due(&self) -> bool {
         false
     }
-    /// Receives the bytes of a due snapshot, to be read by [`crate::flow::Snapshot::from_bytes`]. A
-    /// fit that its deadline has altered produces no snapshots.
+    /// Receives the bytes of a due snapshot, about 1.9 MB, to be read by
+    /// [`crate::flow::Snapshot::from_bytes`]. Only the fit of a field produces snapshots, and none
+    /// after its deadline has altered it.
     fn snapshot(&self, _bytes: Vec<u8>) {}
 }
 

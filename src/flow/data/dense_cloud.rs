@@ -13,10 +13,11 @@ pub struct DenseCloud {
     /// M: the reference time minus the time of the point's sweep, in sweep intervals; negative if
     /// the point was measured after the reference time.
     pub age: Vec<f32>,
-    /// M: whether the point moved relative to the static world between its sweep and the reference
-    /// time.
+    /// M flags: true for points that moved relative to the static world between their sweep and the
+    /// reference time, by at least [`crate::flow::DYNAMIC_M`] in some interval. False where the ego
+    /// motion is unknown.
     pub dynamic: Vec<bool>,
-    /// M: false if inverting a flow field did not converge; the point's position is then
-    /// unreliable.
+    /// M flags: false for points for which inverting a motion field did not converge, or a step led
+    /// out of the range of valid coordinates. Their positions are unreliable.
     pub converged: Vec<bool>,
 }

@@ -13,11 +13,13 @@ const MOST_EDGES: usize = 256;
 /// An upright bounding box: rotated about the z axis only.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct OrientedBox {
-    /// Its center, metres.
+    /// Center of the box, metres.
     pub center: Point,
-    /// Length, width and height, metres.
+    /// Length along `yaw`, width across it, and height, metres. The length is the longer side,
+    /// except in a box that is aligned with a motion.
     pub size: Point,
-    /// Angle from the x axis to its length, counterclockwise, in (-pi, pi], radians.
+    /// Angle from the x axis to the direction of the length, counterclockwise, in (-pi, pi],
+    /// radians.
     pub yaw: f32,
 }
 

@@ -1,9 +1,11 @@
 //! Points and rigid transforms.
 
-/// A point or a displacement: x, y, z in metres (x forward, y left, z up in lidar convention).
+/// A point or a displacement: x, y, z in metres unless said otherwise (x forward, y left, z up in
+/// lidar convention).
 pub type Point = [f32; 3];
 
-/// A rigid transform of column vectors, metres. Stored ego motions are named `target_from_source`.
+/// A rigid transform: a rotation, then a translation in metres. An ego motion is given as
+/// `target_from_source`, which takes coordinates in the source's frame to the target's frame.
 pub type RigidTransform = nalgebra::Isometry3<f64>;
 
 /// Residual motion within one sweep interval from which a point counts as moving, metres (Argoverse
@@ -52,7 +54,8 @@ pub(crate) fn transform_points(motion: &RigidTransform, points: &[Point]) -> Vec
         .collect()
 }
 
-/// Minimum number of points of a cloud; fewer do not determine a motion.
+/// Minimum number of points of each cloud that take part in an estimate; fewer do not determine a
+/// motion.
 pub const MIN_POINTS: usize = 3;
 
 #[cfg(test)]

@@ -3,7 +3,8 @@
 /// The reason why a method ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum StopReason {
-    /// The object search covered all clusters.
+    /// The object search covered all clusters. A deadline may still have dropped neighbor sweeps or
+    /// points of the registration.
     Completed,
     /// The early-stopping rule ended the fit.
     Converged,
@@ -22,7 +23,7 @@ impl StopReason {
         Self::Deadline,
     ];
 
-    /// The name used in reports.
+    /// The name used in reports: `completed`, `converged`, `max_iterations` or `deadline`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Completed => "completed",

@@ -11,15 +11,20 @@ use crate::flow::field::Backend;
 use crate::flow::motion::{MotionField, Residual};
 use crate::flow::sequence::Sweep;
 
-/// Transforms the points of all `sweeps` into the frame of the plan's reference time.
+/// Transforms the points of all `sweeps`, in order of time, into the frame of the plan's reference
+/// time.
 ///
 /// `field` returns the motion field of each of [`Plan::edges`]. Points with a coordinate that is
-/// not finite, or of 1,000 km or more, are left out. A sweep's ground mask, where present, marks
-/// points that have no residual motion.
+/// not finite, or of 1,000 km or more, are left out. A sweep's ground mask, if it has one, marks
+/// points without residual motion. `control` is checked before each sweep, and before each 131,072
+/// points of an Euler step.
 ///
 /// # Errors
-/// [`DensifyError`] if the number of sweeps is not the plan's, a ground mask has another length
-/// than its sweep, a field is missing, the control interrupts or the device fails.
+/// - [`DensifyError::Sweeps`] if the number of sweeps is not the plan's.
+/// - [`DensifyError::Mask`] if a ground mask has another length than its sweep.
+/// - [`DensifyError::NoField`] if `field` returns none for an edge of the plan.
+/// - [`DensifyError::Interrupted`] if `control` interrupts.
+/// - [`DensifyError::Backend`] if the device fails.
 pub fn densify<'a>(
     backend: &dyn Backend,
     plan: &Plan,
@@ -99,7 +104,7 @@ pub fn densify<'a>(
     Ok(earlier.joined(later, plan.reference_time()))
 }
 
-/// The name of the device that advects points through `fields`, for reports: the backend's if any
+/// The name, for reports, of the device that moves points through `fields`: the backend's if any
 /// field is a network, else that of the host's threads.
 pub fn carrier<'a>(
     backend: &dyn Backend,

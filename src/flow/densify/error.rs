@@ -15,7 +15,7 @@ pub enum DensifyError {
         /// Number of sweeps in the plan.
         planned: usize,
     },
-    /// The motion field of an edge of the plan is missing.
+    /// The motion field of this edge of the plan is missing.
     #[error("no field from sweep {} to sweep {}", .0.source, .0.target)]
     NoField(FlowEdge),
     /// The ground mask of the sweep with this index has another length than the sweep.
@@ -24,7 +24,7 @@ pub enum DensifyError {
     /// The control interrupted; no partial result is returned.
     #[error("interrupted")]
     Interrupted(Interrupt),
-    /// The device failed.
+    /// The device failed to evaluate a motion field.
     #[error(transparent)]
     Backend(#[from] BackendError),
 }

@@ -1,30 +1,32 @@
 //! The densification plan: which sweep pairs need a motion field so that all sweeps of a sequence
 //! can be transformed into one frame.
 
-/// How sweeps after the reference time are transformed into its frame.
+/// How the sweeps after the reference time are transformed into its frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum LaterSweeps {
-    /// By fields that are fitted backward in time, from each sweep to the previous one.
+    /// By motion fields that are estimated backward in time, from each sweep to the previous one.
     #[default]
     Reverse,
-    /// By inverting the forward fields. This halves the number of fits. Where a field maps two
-    /// points to one it has no inverse, and points do not converge.
+    /// By inverses of the forward motion fields, so that no backward fields are estimated. Where a
+    /// field maps two points to one it has no inverse. Points that do not converge there count as
+    /// static and are marked in [`crate::flow::DenseCloud::converged`].
     Inverse,
 }
 
-/// A sweep pair that needs a motion field, as indices in the sequence.
+/// A pair of consecutive sweeps that needs a motion field, as indices in the sequence, from 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct FlowEdge {
     /// Index of the sweep whose points the field moves.
     pub source: usize,
-    /// Index of the sweep whose time and frame they are moved to: the next or the previous one.
+    /// Index of the sweep to whose time and frame the points are moved: the next or the previous
+    /// sweep.
     pub target: usize,
 }
 
 /// Why a plan is impossible.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum PlanError {
-    /// The reference time lies outside the sequence.
+    /// The reference time lies outside the sequence, or is not a number.
     #[error("the reference time {reference_time} lies outside the sequence's sweeps, 0 to {last}")]
     ReferenceTimeOutOfRange {
         /// The requested reference time, in sweeps.
@@ -32,7 +34,7 @@ pub enum PlanError {
         /// Index of the last sweep.
         last: usize,
     },
-    /// A sequence needs at least two sweeps.
+    /// There are fewer than two sweeps.
     #[error("{0} sweeps are no sequence: two are needed at least")]
     TooFewSweeps(usize),
     /// The number of substeps is not between 1 and 64.
@@ -56,13 +58,14 @@ pub struct Plan {
 }
 
 impl Plan {
-    /// Plans to transform all of `sweeps` sweeps into the frame of the reference time. It is
-    /// counted in sweeps from 0, and may lie between two sweeps. Each step from sweep to sweep is
-    /// integrated in `substeps` Euler steps.
+    /// Plans to transform all of `sweeps` sweeps into the frame of `reference_time`. The reference
+    /// time is counted in sweeps from 0, and may lie between two sweeps: 4.5 is half way from sweep
+    /// 4 to sweep 5. Each step from sweep to sweep is integrated in `substeps` Euler steps.
     ///
     /// # Errors
-    /// [`PlanError`] if there are fewer than two sweeps, `reference_time` lies outside the sequence, or
-    /// `substeps` is not 1 to 64.
+    /// - [`PlanError::TooFewSweeps`] if there are fewer than two sweeps.
+    /// - [`PlanError::ReferenceTimeOutOfRange`] if `reference_time` is not from 0 to `sweeps - 1`.
+    /// - [`PlanError::Substeps`] if `substeps` is not 1 to 64.
     pub fn new(
         sweeps: usize,
         reference_time: f64,
@@ -97,14 +100,15 @@ impl Plan {
         self.anchor as f64 + self.fraction
     }
 
-    /// All motion fields that are needed, as edges: the chains of [`Self::chains`], one after the
-    /// other.
+    /// The pairs whose motion fields [`super::densify`] needs: both chains of [`Self::chains`], one
+    /// after the other.
     pub fn edges(&self) -> Vec<FlowEdge> {
         self.chains().concat()
     }
 
-    /// The motion fields that are needed, as two chains in the order of use: forward in time, and
-    /// backward from the last sweep.
+    /// The pairs whose motion fields [`super::densify`] needs, as two chains: forward in time from
+    /// sweep 0, and backward in time from the last sweep. In a chain, the target of each pair is
+    /// the source of the next one. A chain may be empty.
     pub fn chains(&self) -> [Vec<FlowEdge>; 2] {
         let last = self.sweeps - 1;
         // Index of the last sweep that earlier sweeps are advected to.

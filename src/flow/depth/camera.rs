@@ -28,7 +28,7 @@ const UNIT_TOLERANCE: f64 = 1e-6;
 /// Why a camera was refused.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum CameraError {
-    /// A side is zero or too long, or the image has too many pixels.
+    /// A side is zero or longer than [`MAX_SIDE_PX`], or the image has more than 2^26 pixels.
     #[error(
         "an image of {width} x {height} pixels; each side must lie between 1 and {MAX_SIDE_PX}, and both together make at most {MAX_PIXELS}"
     )]
@@ -38,14 +38,14 @@ pub enum CameraError {
         /// Height, pixels.
         height: u32,
     },
-    /// An intrinsic parameter is not finite or out of range.
+    /// An intrinsic parameter is not finite or out of the range that [`Camera::new`] accepts.
     #[error("{name} of the camera is {value} pixels; {wanted}")]
     Intrinsic {
         /// `fx`, `fy`, `cx` or `cy`.
         name: &'static str,
         /// The rejected value, pixels.
         value: f64,
-        /// The accepted range.
+        /// The accepted range, as text.
         wanted: &'static str,
     },
     /// The 3 x 3 matrix is not of the form fx 0 cx, 0 fy cy, 0 0 1.
@@ -57,24 +57,26 @@ pub enum CameraError {
     Pose,
 }
 
-/// Intrinsic parameters: focal lengths and principal point, pixels.
+/// Intrinsic parameters of a pinhole camera, in pixels: focal lengths and principal point. A camera
+/// point (x, y, z) is seen at column `fx x / z + cx` and row `fy y / z + cy`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Intrinsics {
-    /// Focal length in x (along a row).
+    /// Focal length in x (along a row), pixels.
     pub fx: f64,
-    /// Focal length in y (along a column).
+    /// Focal length in y (along a column), pixels.
     pub fy: f64,
-    /// Column of the principal point.
+    /// Column of the principal point, pixels; 0 is the center of the first column.
     pub cx: f64,
-    /// Row of the principal point.
+    /// Row of the principal point, pixels; 0 is the center of the first row.
     pub cy: f64,
 }
 
 impl Intrinsics {
-    /// The parameters of a 3 x 3 camera matrix, given row by row.
+    /// The parameters of a 3 x 3 camera matrix `fx 0 cx, 0 fy cy, 0 0 1`, given row by row. Their
+    /// values are checked by [`Camera::new`] only.
     ///
     /// # Errors
-    /// [`CameraError::Matrix`] if it has a skew, a scale, or a last row that is not 0 0 1.
+    /// [`CameraError::Matrix`] if the matrix has another form, such as a skew or a scale.
     pub fn from_matrix(rows: &[[f64; 3]; 3]) -> Result<Self, CameraError> {
         let [[fx, skew, cx], [zero, fy, cy], last] = *rows;
         if skew != 0.0 || zero != 0.0 || last != [0.0, 0.0, 1.0] {
@@ -85,6 +87,9 @@ impl Intrinsics {
 }
 
 /// A pinhole camera: intrinsic parameters, pose relative to the lidar and image size.
+///
+/// The camera's frame has x right, y down and z forward, in metres. As in KITTI and OpenCV, whole
+/// pixel coordinates are the centers of pixels, counted from 0 at the top left.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
     intrinsics: Intrinsics,
@@ -98,7 +103,12 @@ impl Camera {
     /// frame into the camera's: x right, y down, z forward, metres.
     ///
     /// # Errors
-    /// [`CameraError`] for an image size, parameters or a pose out of range.
+    /// - [`CameraError::Size`] if a side is not 1 to [`MAX_SIDE_PX`] pixels, or the image has more
+    ///   than 2^26 pixels.
+    /// - [`CameraError::Intrinsic`] if a focal length is not above 0 and at most 1e6 pixels, or a
+    ///   coordinate of the principal point is not within 1e6 pixels of zero.
+    /// - [`CameraError::Pose`] if the translation is not finite or longer than 1 km, or the norm of
+    ///   the rotation's quaternion differs from 1 by more than 1e-6.
     pub fn new(
         intrinsics: Intrinsics,
         camera_from_lidar: RigidTransform,
@@ -148,7 +158,7 @@ impl Camera {
         self.intrinsics
     }
 
-    /// The transform from the lidar's frame to the camera's.
+    /// The transform from the lidar's frame to the camera's, metres.
     pub fn camera_from_lidar(&self) -> &RigidTransform {
         &self.camera_from_lidar
     }
@@ -163,8 +173,9 @@ impl Camera {
         self.height
     }
 
-    /// Column, row and depth (metres along the optical axis) of a point of the lidar's frame. None
-    /// if the point is not finite, less than 0.1 m in front of the camera, or outside the image.
+    /// Column, row and depth (metres along the optical axis) of the pixel that a point of the
+    /// lidar's frame falls on. None if the point is not finite, less than 0.1 m in front of the
+    /// camera, or outside the image.
     pub fn pixel(&self, point: Point) -> Option<(usize, usize, f32)> {
         let seen = self.camera_from_lidar * Point3::from(point.map(f64::from));
         if !(seen.z >= NEAR_M && seen.z.is_finite()) {
@@ -181,7 +192,8 @@ impl Camera {
         ))
     }
 
-    /// The ray through the center of a pixel, in the camera's frame, scaled to z = 1 m.
+    /// The ray through the center of a pixel, in the camera's frame, scaled to a depth of 1 m. The
+    /// pixel may lie outside the image.
     pub fn ray(&self, column: u32, row: u32) -> Vector3<f64> {
         let Intrinsics { fx, fy, cx, cy } = self.intrinsics;
         let across = (f64::from(column) - cx) / fx;

@@ -18,8 +18,8 @@ pub struct SizeMismatch {
     pub expected: [u32; 2],
 }
 
-/// Error measures over the pixels with a depth in both images. Means and median are NaN if there
-/// are none.
+/// Errors of a depth image against the ground truth, over the pixels with a depth in both images.
+/// Means, median and shares of these pixels are NaN if there are none.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DepthErrors {
     /// Number of pixels with a depth in both images.
@@ -34,17 +34,17 @@ pub struct DepthErrors {
     pub median_m: f64,
     /// Root mean squared error, metres.
     pub rmse_m: f64,
-    /// Mean of the absolute error divided by the true depth.
+    /// Mean relative error: absolute error divided by true depth.
     pub relative: f64,
     /// Share of the pixels whose error is at most 5 % of the true depth, 0 to 1.
     pub within_5_percent: f64,
 }
 
 impl DepthImage {
-    /// Compares with the ground truth `truth`, an image of the same size.
+    /// The errors of this image against the ground truth `truth`, an image of the same size.
     ///
     /// # Errors
-    /// [`SizeMismatch`] if the sizes differ.
+    /// [`SizeMismatch`] if the widths or the heights differ.
     pub fn errors(&self, truth: &DepthImage) -> Result<DepthErrors, SizeMismatch> {
         let size = |image: &DepthImage| [image.width, image.height];
         if size(self) != size(truth) {

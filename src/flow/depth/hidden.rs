@@ -9,15 +9,15 @@ use rayon::prelude::*;
 use super::camera::Camera;
 use super::image::DepthImage;
 
-/// Parameters of the occlusion filter.
+/// Parameters of the occlusion filter, [`DepthImage::without_occluded`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Occlusion {
-    /// Half the side of the square search window around a pixel, pixels.
+    /// Search radius, pixels: the window is a square that extends this far to each side of a pixel.
     pub reach_px: usize,
-    /// A neighbor counts as nearer if its depth is smaller by more than this fraction of the
-    /// pixel's depth.
+    /// A pixel of the window counts as nearer if its depth is smaller by more than this fraction of
+    /// the central pixel's depth, 0 to 1.
     pub nearer: f32,
-    /// Number of quadrants around a pixel, 1 to 4, that must contain a nearer pixel.
+    /// Number of the four quadrants of the window, 1 to 4, that must contain a nearer pixel.
     pub quadrants: u32,
 }
 
@@ -29,8 +29,10 @@ const REACH_RAD: f64 = 1.0 / 60.0;
 const MAX_REACH_PX: usize = 16;
 
 impl Occlusion {
-    /// Default parameters for clouds of a spinning lidar projected into this camera: all four
-    /// quadrants, one degree of search radius.
+    /// Default parameters for clouds of a spinning lidar that are projected into `camera`. The
+    /// search radius is 1/60 rad (about one degree) at the focal length `fx`, limited to 2 to 16
+    /// pixels. A pixel counts as nearer if its depth is smaller by more than 5%, and all four
+    /// quadrants must contain one.
     pub fn of(camera: &Camera) -> Self {
         let reach_px = (camera.intrinsics().fx * REACH_RAD).round() as usize;
         Self {
@@ -42,8 +44,12 @@ impl Occlusion {
 }
 
 impl DepthImage {
-    /// The image without its hidden pixels, whose depths are set to 0. The input image is not
-    /// changed.
+    /// The image without hidden pixels: points that were seen through the gaps of a nearer surface.
+    /// Their depths are 0 in the result.
+    ///
+    /// A pixel is hidden if enough of the four quadrants around it contain a nearer pixel. One side
+    /// alone does not count, so the road keeps its horizon and a wall its edge beside a car. Runs
+    /// on the rayon pool of the calling thread.
     pub fn without_occluded(&self, occlusion: &Occlusion) -> DepthImage {
         let width = (self.width as usize).max(1);
         let metres = (0..self.metres.len()).into_par_iter().map(|index| {

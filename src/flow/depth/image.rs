@@ -3,19 +3,21 @@
 use super::camera::Camera;
 use crate::flow::data::Point;
 
-/// A depth image. Depths are measured along the optical axis, not along the pixels' rays.
+/// A depth image of `width` x `height` pixels. Depths are measured along the optical axis, not
+/// along the pixels' rays.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DepthImage {
     /// Image width, pixels.
     pub width: u32,
     /// Image height, pixels.
     pub height: u32,
-    /// Depth of each pixel, metres, row by row from the top; 0 if unknown.
+    /// `width * height` depths, metres, row by row from the top, each row from the left; 0 if
+    /// unknown.
     pub metres: Vec<f32>,
 }
 
 impl DepthImage {
-    /// An image without any depths.
+    /// An image of `width` x `height` pixels whose depths are all unknown.
     pub fn empty(width: u32, height: u32) -> Self {
         Self {
             width,
@@ -29,15 +31,15 @@ impl DepthImage {
         self.metres.iter().filter(|&&metres| metres > 0.0).count()
     }
 
-    /// Share of all pixels that have a depth, 0 to 1.
+    /// Share of all pixels that have a depth, 0 to 1; 0 for an image without pixels.
     pub fn density(&self) -> f64 {
         self.known() as f64 / self.metres.len().max(1) as f64
     }
 }
 
 /// Projects points of the lidar's frame (N x 3, metres) into the camera. Each pixel keeps the
-/// smallest depth of the points that fall on it. Points that are not finite, behind the camera or
-/// outside its image are left out.
+/// smallest depth of the points that fall on it. Points that are not finite, less than 0.1 m in
+/// front of the camera, or outside its image are left out.
 pub fn project(points: &[Point], camera: &Camera) -> DepthImage {
     let mut image = DepthImage::empty(camera.width(), camera.height());
     let width = camera.width() as usize;

@@ -16,7 +16,15 @@ use super::sample::Sample;
 use super::vertex_distance::{VertexGather, VertexSites};
 use crate::flow::data::{Control, Point};
 
-/// The transform: distances at the vertices of the active bricks, and a far field.
+/// Euclidean distance transform in a narrow band (FNSF Section 3.2, eq. 4 and 5).
+///
+/// It measures the distance to sites, see [`Sites`]. A brick is a block of 8 x 8 x 8 vertices of
+/// the [`Grid`]. A brick is active, that is stored, if one of its vertices lies within
+/// [`DistanceOptions::band_m`] of a vertex that is nearest to a target point. Within the band the
+/// distance at a vertex is exact up to its rounding to 16 bits: 0.03 mm steps for a band of 2 m.
+/// Beyond the band a coarse field takes over, with a vertex every 8 cells or more. Its distances
+/// are approximate and never shorter than the band. Between vertices, distances are interpolated
+/// trilinearly. The result has the same bits for any number of threads.
 #[derive(Debug)]
 pub struct Bricks {
     grid: Grid,
@@ -30,12 +38,23 @@ pub struct Bricks {
 }
 
 impl Bricks {
-    /// Transforms `target` over a grid that covers both clouds, metres. Checks `control` between
-    /// parts of a few milliseconds.
+    /// Builds the transform of `target` (M x 3, metres) on a grid that covers `target` and `source`
+    /// (N x 3, metres). `source` affects only the size of the grid. Coordinates must not be NaN.
+    /// `options.metric` is ignored.
+    ///
+    /// Runs on the rayon pool of the calling thread. `control` is checked before each part of the
+    /// work, from any of the threads: a block of 64 x 64 x 64 vertices, a slab of the coarse field,
+    /// or 4,096 runs of neighboring vertices while bricks are activated.
     ///
     /// # Errors
-    /// [`DistanceError`] if the options are out of range, the target is empty, the clouds span too
-    /// much space, the transform would take more than `options.max_bytes`, or `control` interrupts.
+    /// - [`DistanceError::Cell`] if `options.cell_m` is not finite or below 0.001 m.
+    /// - [`DistanceError::Band`] if `options.band_m`, in cells and rounded, is not 1 to 64.
+    /// - [`DistanceError::EmptyTarget`] if `target` has no points.
+    /// - [`DistanceError::Extent`] if both clouds together span more than [`Grid::MAX_EXTENT_M`]
+    ///   along an axis, or a coordinate is infinite.
+    /// - [`DistanceError::Memory`] if more than `options.max_bytes` are needed, or the grid has
+    ///   more than 2^24 blocks of 64 x 64 x 64 vertices.
+    /// - [`DistanceError::Interrupted`] if `control` interrupts.
     pub fn build(
         source: &[Point],
         target: &[Point],
@@ -71,7 +90,7 @@ impl Bricks {
         })
     }
 
-    /// Trilinear distance and gradient at `point`, see [`Sample`].
+    /// Distance and gradient at `point`, in metres, by trilinear interpolation.
     #[inline]
     pub fn sample(&self, point: Point) -> Sample {
         let cell = self.lattice.locate(point);
@@ -87,7 +106,7 @@ impl Bricks {
         }
     }
 
-    /// The grid's geometry.
+    /// The grid whose vertices hold the distances.
     pub fn grid(&self) -> &Grid {
         &self.grid
     }
@@ -98,7 +117,7 @@ impl Bricks {
         &self.codes
     }
 
-    /// Number of active bricks.
+    /// Number of stored bricks, of 512 vertices each.
     pub fn active_bricks(&self) -> usize {
         self.index.active
     }

@@ -23,21 +23,22 @@ const DENSE_CELL: f64 = 5e3;
 /// The predicted cost of a distance transform.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TransformCost {
-    /// Active bricks; 0 for a dense transform.
+    /// Number of stored bricks; 0 for [`Metric::Chamfer`].
     pub bricks: usize,
     /// Bytes that the transform will occupy.
     pub bytes: usize,
-    /// Peak memory while it is built, bytes: an upper bound.
+    /// Predicted peak memory of the build, bytes, without the small buffers of each thread.
     pub peak_bytes: usize,
     /// Computing time, as the number of the network's multiply-adds that take equally long.
     pub multiply_adds: f64,
 }
 
 impl DistanceTransform {
-    /// The predicted cost of [`Self::build`]. Plans the transform but computes no distances.
+    /// The predicted cost of [`Self::build`] with the same arguments. Plans the transform but
+    /// computes no distances.
     ///
     /// # Errors
-    /// As [`Self::build`].
+    /// [`DistanceError`] as [`Self::build`], but never [`DistanceError::Interrupted`].
     pub fn price(
         source: &[Point],
         target: &[Point],

@@ -5,14 +5,14 @@
 use super::options::DistanceError;
 use crate::flow::data::Point;
 
-/// A regular grid of vertices, `cell` metres apart.
+/// A regular, axis-parallel grid of nx x ny x nz vertices, `cell` metres apart.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Grid {
     /// Position of vertex (0, 0, 0), metres.
     pub origin: [f64; 3],
     /// Distance between neighboring vertices, metres.
     pub cell: f64,
-    /// Vertices along each axis, at least 2.
+    /// Number of vertices along x, y and z, each at least 2.
     pub vertices: [usize; 3],
 }
 
@@ -26,13 +26,19 @@ pub(crate) struct Cell {
 }
 
 impl Grid {
-    /// The longest extent along an axis, metres. Single-precision coordinates resolve 2 mm there.
+    /// The longest extent of the clouds along an axis, metres. A single-precision coordinate of
+    /// that size has a resolution of 2 mm.
     pub const MAX_EXTENT_M: f64 = 20_000.0;
 
-    /// The grid that covers both clouds, with cells of `cell` metres.
+    /// The grid that covers `source` (N x 3, metres) and `target` (M x 3, metres), with cells of
+    /// `cell` metres. As in the published code, it extends at least one cell beyond the clouds on
+    /// every side. `cell` must be at least 0.001, and coordinates must not be NaN; neither is
+    /// checked.
     ///
     /// # Errors
-    /// If the target is empty, or the clouds span more than [`Self::MAX_EXTENT_M`] along an axis.
+    /// - [`DistanceError::EmptyTarget`] if `target` has no points.
+    /// - [`DistanceError::Extent`] if both clouds together span more than [`Self::MAX_EXTENT_M`]
+    ///   along an axis, or a coordinate is infinite.
     pub fn covering(source: &[Point], target: &[Point], cell: f64) -> Result<Self, DistanceError> {
         if target.is_empty() {
             return Err(DistanceError::EmptyTarget);

@@ -5,7 +5,7 @@ use crate::flow::data::Interrupt;
 /// The distance metric.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Metric {
-    /// Exact Euclidean distance, on bricks.
+    /// Euclidean distance on bricks: exact within the band, approximate beyond it.
     Euclidean,
     /// The published code's chamfer metric on a dense grid: up to 12.8% too long.
     Chamfer,
@@ -29,10 +29,13 @@ pub struct DistanceOptions {
     pub sites: Sites,
     /// Edge of a cell, metres, at least 0.001. FNSF Section 4: 0.1.
     pub cell_m: f64,
-    /// Radius of the band in which distances are exact, metres: 1 to [`Self::MAX_BAND_CELLS`]
-    /// cells. Used by [`Metric::Euclidean`] only.
+    /// Radius of the band around the target in which distances are exact, metres. Rounded to whole
+    /// cells, it must be 1 to [`Self::MAX_BAND_CELLS`] cells. [`Metric::Chamfer`] checks it but
+    /// does not use it.
     pub band_m: f64,
-    /// Limit on the transform's memory, bytes. A larger transform is refused.
+    /// Limit on the memory of the transform, bytes; more is refused with [`DistanceError::Memory`].
+    /// For [`Metric::Euclidean`] it includes the working memory of the build, except for 12 bytes a
+    /// target point.
     pub max_bytes: usize,
 }
 
@@ -79,13 +82,13 @@ impl Default for DistanceOptions {
 /// Why a distance transform was refused.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum DistanceError {
-    /// The cell's edge is out of range.
+    /// The cell's edge is not finite, or below 0.001 m.
     #[error("a cell of {cell_m} m is not possible: choose at least 0.001 m")]
     Cell {
         /// The requested edge, metres.
         cell_m: f64,
     },
-    /// The band's radius is out of range.
+    /// The band's radius, rounded to whole cells, is not 1 to 64 cells.
     #[error("a band of {band_m} m with cells of {cell_m} m is not possible: choose 1 to 64 cells")]
     Band {
         /// The requested radius, metres.
@@ -96,7 +99,8 @@ pub enum DistanceError {
     /// The target cloud has no points.
     #[error("the target cloud is empty")]
     EmptyTarget,
-    /// The clouds span too much space along an axis, or have no finite extent.
+    /// The clouds span more than [`super::Grid::MAX_EXTENT_M`] along an axis, or have no finite
+    /// extent.
     #[error(
         "the clouds span {x_m:.0} x {y_m:.0} x {z_m:.0} m, more than {limit_m:.0} m on an axis: \
          remove stray points or crop with crop_m"
@@ -111,12 +115,13 @@ pub enum DistanceError {
         /// The longest extent allowed, metres.
         limit_m: f64,
     },
-    /// The transform would take too much memory.
+    /// The transform would take more memory than [`DistanceOptions::max_bytes`], or its grid has
+    /// too many vertices for the index of its bricks.
     #[error("the distance transform needs {needed} bytes, {limit} are allowed: crop with crop_m")]
     Memory {
-        /// Bytes needed.
+        /// Bytes needed, or a lower bound.
         needed: usize,
-        /// Bytes allowed.
+        /// Bytes allowed: [`DistanceOptions::max_bytes`], or a fixed limit.
         limit: usize,
     },
     /// The control interrupted the transform.

@@ -2,10 +2,11 @@
 
 use crate::flow::data::Point;
 
-/// The distance at a point, and its gradient.
+/// The distance to the target at a point, and its gradient.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Sample {
-    /// Distance to the target, metres.
+    /// Distance to the target, metres. Outside the grid it is the distance at the nearest position
+    /// on the grid's border.
     pub distance: f32,
     /// Derivative of `distance` with respect to x, y and z. Zero along an axis on which the point
     /// lies outside the grid.

@@ -6,22 +6,31 @@ use super::options::{DistanceError, DistanceOptions, Metric};
 use super::sample::Sample;
 use crate::flow::data::{Control, Point};
 
-/// A distance transform of the target, with the metric of the options.
+/// A distance transform of a target cloud (FNSF Section 3.2), of either [`Metric`].
 #[derive(Debug)]
 pub enum DistanceTransform {
-    /// Exact Euclidean distance in a narrow band, with a far field.
+    /// Of [`Metric::Euclidean`]: exact near the target, approximate farther away.
     Bricks(Bricks),
-    /// The published code's chamfer metric on a dense grid.
+    /// Of [`Metric::Chamfer`]: the published code's transform on a dense grid.
     Chamfer(DenseChamfer),
 }
 
 impl DistanceTransform {
-    /// Transforms `target` over a grid that covers both clouds, metres. Checks `control` between
-    /// parts of a few milliseconds.
+    /// Builds the transform of `target` (M x 3, metres) on a grid that covers `target` and `source`
+    /// (N x 3, metres). `source` affects only the size of the grid. Coordinates must not be NaN.
+    ///
+    /// `control` is checked several times a second: see [`Bricks::build`] and
+    /// [`DenseChamfer::build`].
     ///
     /// # Errors
-    /// [`DistanceError`] if the options are out of range, the target is empty, the clouds span too
-    /// much space, the transform would take more than `options.max_bytes`, or `control` interrupts.
+    /// - [`DistanceError::Cell`] if `options.cell_m` is not finite or below 0.001 m.
+    /// - [`DistanceError::Band`] if `options.band_m`, in cells and rounded, is not 1 to 64.
+    /// - [`DistanceError::EmptyTarget`] if `target` has no points.
+    /// - [`DistanceError::Extent`] if both clouds together span more than
+    ///   [`super::Grid::MAX_EXTENT_M`] along an axis, or a coordinate is infinite.
+    /// - [`DistanceError::Memory`] if more than `options.max_bytes` are needed, or a brick
+    ///   transform's grid has more than 2^24 blocks of 64 x 64 x 64 vertices.
+    /// - [`DistanceError::Interrupted`] if `control` interrupts.
     pub fn build(
         source: &[Point],
         target: &[Point],
@@ -36,7 +45,7 @@ impl DistanceTransform {
         })
     }
 
-    /// Trilinear distance and gradient at `point`, see [`Sample`].
+    /// Distance and gradient at `point`, in metres, by trilinear interpolation.
     #[inline]
     pub fn sample(&self, point: Point) -> Sample {
         match self {

@@ -7,16 +7,17 @@ use crate::flow::objects::Objects;
 /// The motion of every source point of a pair.
 #[derive(Clone, Debug)]
 pub struct Estimate {
-    /// N displacements from the source sweep's time to the target's, metres, ego motion included:
-    /// the position in the target's frame minus the position in the source's frame. Zero where
-    /// `valid` is false.
+    /// N x 3 displacements from the source sweep's time to the target's, metres, ego motion
+    /// included: the position in the target's frame minus the position in the source's frame. Zero
+    /// where `valid` is false.
     pub flow: Vec<Point>,
     /// N flags: true for points with a flow.
     pub valid: Vec<bool>,
     /// N flags: true for points whose residual motion is at least [`crate::flow::DYNAMIC_M`]. None
-    /// where the ego motion is unknown.
+    /// where `ego` is none.
     pub dynamic: Option<Vec<bool>>,
-    /// The ego motion as target_from_source, where it was given or estimated.
+    /// The ego motion as target_from_source. None with [`crate::flow::Ego::Off`], and where a
+    /// deadline left no time to estimate it.
     pub ego: Option<RigidTransform>,
     /// Number of points that took part and have a flow. Ground points with the ego-motion flow
     /// alone are not counted.
@@ -28,21 +29,24 @@ pub struct Estimate {
     /// Name of the processor that ran the method, for reports: the device of a field, or the host's
     /// threads for objects.
     pub device: String,
-    /// Seconds of the preparation: selection, distance transform and ego motion.
+    /// Seconds before the method could begin, by the control's clock: selection, ground
+    /// segmentation, distance transform, ego motion and the registration of neighbor sweeps. Zero
+    /// if the control keeps no time.
     pub precompute_seconds: f64,
-    /// Seconds of all phases, by the control's clock.
+    /// Seconds of all phases, by the control's clock. Zero if the control keeps no time.
     pub total_seconds: f64,
     /// The motion at any point in space, not only at the source points.
     pub motion: MotionField,
 }
 
 impl Estimate {
-    /// Seconds of the method: the object search, or the fit of the field with its distance queries.
+    /// Seconds of the method, by the control's clock: the object search, or the fit of the field
+    /// with its distance queries and its evaluation.
     pub fn method_seconds(&self) -> f64 {
         self.total_seconds - self.precompute_seconds
     }
 
-    /// The objects, for [`crate::flow::Method::Objects`].
+    /// The objects; none for [`crate::flow::Method::Field`].
     pub fn objects(&self) -> Option<&Objects> {
         match &self.solution {
             Solution::Objects(solution) => Some(&solution.objects),
@@ -50,7 +54,7 @@ impl Estimate {
         }
     }
 
-    /// The outcome of the fit, for [`crate::flow::Method::Field`].
+    /// The outcome of the fit; none for [`crate::flow::Method::Objects`].
     pub fn fit(&self) -> Option<&FieldSolution> {
         match &self.solution {
             Solution::Field(solution) => Some(solution),
@@ -73,32 +77,35 @@ pub enum Solution {
 pub struct ObjectSolution {
     /// The clusters of the source with their boxes and motions.
     pub objects: Objects,
-    /// Number of candidates that were searched: all of them, unless a deadline passed.
+    /// Number of candidates that were searched: all of them, unless a deadline ended the search.
     pub searched: usize,
     /// Number of candidates: clusters before fragments of one moving object were merged.
     pub candidates: usize,
-    /// Mean truncated distance of the searched clusters' points to the target after their motion,
-    /// metres, averaged over the clusters: the objective of the search. Infinite where the search
-    /// did not start.
+    /// Mean truncated distance of a searched cluster's points from the target after their motion,
+    /// metres, averaged over the searched clusters. Infinite where the search did not start.
     pub cost_m: f64,
 }
 
 /// The outcome of the fit of a field.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FieldSolution {
-    /// Completed iterations; zero where the deadline allowed none.
+    /// Number of completed iterations; zero where the deadline allowed none.
     pub iterations: usize,
-    /// Iteration limit, after a deadline may have shortened it.
+    /// Iteration limit of this fit. A warm start or a deadline can make it differ from
+    /// [`crate::flow::FieldOptions::max_iterations`].
     pub max_iterations: usize,
-    /// Iteration, from 1, whose field is the result; the last one for an average.
-    pub best_iteration: usize,
-    /// Loss of that iteration, metres. Comparable within one preset and pair; infinite without an
+    /// Iteration, from 1, whose field is the result; the last one for an average. Zero without an
     /// iteration.
+    pub best_iteration: usize,
+    /// Mean loss of that iteration, metres; for an average, the moving average of the losses.
+    /// Comparable within one preset and pair. Infinite without an iteration.
     pub best_loss: f64,
-    /// Bytes of the distance transform.
+    /// Bytes of the distance transform; zero where the deadline left no time for one.
     pub distance_bytes: usize,
-    /// Seconds of the distance queries in this run, without those before a resumed snapshot. CPU: the
-    /// mean over the threads. GPU: extrapolated from the timestamps of each submission's first
-    /// iteration, zero where the GPU has no timestamps.
+    /// Seconds of the distance queries in this run, without those before a resumed snapshot.
+    ///
+    /// On the CPU, the mean over the threads; zero if the control keeps no time. On a GPU,
+    /// extrapolated from the timestamps of each submission's first iteration; zero if the GPU has
+    /// no timestamps.
     pub query_seconds: f64,
 }

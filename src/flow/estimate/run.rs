@@ -13,11 +13,18 @@ use crate::flow::options::{Ego, Method, Options};
 use crate::flow::problem::Problem;
 use crate::flow::select::select;
 
-/// Estimates the motion of every source point.
+/// Estimates the motion of every source point. A field is fitted on `backend`; all other stages run
+/// on its [`Backend::host`].
+///
+/// A deadline is not an error: the result is the best flow that the time allows.
 ///
 /// # Errors
-/// [`FlowError`] where the input is rejected, the control cancels or the device fails. A deadline
-/// is not an error: the result is the best flow that the time allows.
+/// - [`FlowError::TooFewPoints`], [`FlowError::NoGroundMask`] or [`FlowError::GroundMaskLength`] if
+///   the problem does not suit the options.
+/// - [`FlowError::Cancelled`] if the control cancels.
+/// - [`FlowError::Diverged`] if the loss of a field is not finite.
+/// - [`FlowError::Backend`] if the distance transform is rejected, or the device fails, is busy,
+///   has too little memory or does not support the options.
 pub fn estimate(
     backend: &dyn Backend,
     problem: &Problem,
@@ -27,12 +34,13 @@ pub fn estimate(
     estimate_from(backend, problem, options, None, control)
 }
 
-/// Resumes the fit of a field from `snapshot`. The result is bit-identical to that of an
-/// uninterrupted [`estimate`].
+/// Resumes the fit of a field from `snapshot`. Without a deadline, the result is bit-identical to
+/// that of an uninterrupted [`estimate`] on a device that rounds alike.
 ///
 /// # Errors
 /// As [`estimate`], and [`FlowError::Snapshot`] where the snapshot belongs to another problem,
-/// other options or another method.
+/// other options or another method. A different
+/// [`crate::flow::distance::DistanceOptions::max_bytes`] is allowed.
 pub fn resume(
     backend: &dyn Backend,
     problem: &Problem,

@@ -14,30 +14,36 @@ const SWEEP_SECONDS: f64 = 0.1;
 /// Added to the length of the true flow in the relative error, metres, to keep it finite.
 const LENGTH_FLOOR: f64 = 1e-10;
 
-/// Argoverse 2 metrics over the scored points.
+/// Metrics of the Argoverse 2 scene flow task, over the scored points at all ranges.
+///
+/// A point is scored under the same conditions as for [`super::Metrics`]. The official task scores
+/// a square of 50 m half-width around the sensor: put that square into [`Truth::valid`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Argoverse2 {
     /// Number of scored points.
     pub points: usize,
-    /// Share of points with an end-point error under 0.05 m or under 5 % of the true flow.
+    /// Share of points, 0 to 1, with an end-point error under 0.05 m or under 5 % of the true flow.
     pub accuracy_strict: f64,
-    /// Share of points with an end-point error under 0.1 m or under 10 % of the true flow.
+    /// Share of points, 0 to 1, with an end-point error under 0.1 m or under 10 % of the true flow.
     pub accuracy_relax: f64,
     /// Mean angle between estimated and true flow with 0.1 s appended to each as a fourth
     /// component, radians.
     pub angle_error: f64,
-    /// True positives over the sum of true positives, false positives and false negatives. None
-    /// without a predicted mask, without a true mask, or if no point is dynamic in either.
+    /// Intersection over union of the predicted and the true dynamic mask: true positives over true
+    /// positives, false positives and false negatives. None without a predicted mask, without a
+    /// true mask, or if no point is dynamic in either.
     pub dynamic_iou: Option<f64>,
-    /// Three-way EPE over all scored points; none without the dynamic and foreground masks.
+    /// Three-way EPE over all scored points, close or far; none without the dynamic and foreground
+    /// masks.
     pub three_way: Option<ThreeWay>,
 }
 
-/// Scores the flow of one pair (N x 3, metres) and, where given, its predicted dynamic mask (N
-/// flags). `covered` marks the rows for which the estimate has a flow.
+/// Scores the flow of one pair (N x 3, metres) and its predicted dynamic mask (N flags), if given.
+/// `covered` (N flags) marks the rows for which the estimate has a flow.
 ///
 /// # Errors
-/// Arrays of different lengths, or no row that can be scored.
+/// [`EvaluateError::Length`] if the arrays have different lengths. [`EvaluateError::NoPoints`] if
+/// no row can be scored.
 pub fn evaluate_argoverse2(
     flow: &[Point],
     covered: &[bool],
@@ -49,7 +55,7 @@ pub fn evaluate_argoverse2(
     pool.finish()
 }
 
-/// Accumulator of Argoverse 2 metrics over many pairs. Every scored point has the same weight.
+/// Accumulator of [`Argoverse2`] metrics over many pairs. Every scored point has the same weight.
 #[derive(Debug, Clone, Default)]
 pub struct Argoverse2Pool {
     strict: Mean,
@@ -62,10 +68,11 @@ pub struct Argoverse2Pool {
 }
 
 impl Argoverse2Pool {
-    /// Adds the scored points of one pair. Arguments as in [`evaluate_argoverse2`].
+    /// Adds the scored points of one pair. Arguments as in [`evaluate_argoverse2`]. A pair without
+    /// a mask adds nothing to the metrics that need it.
     ///
     /// # Errors
-    /// Arrays of different lengths; the pool is then unchanged.
+    /// [`EvaluateError::Length`] if the arrays have different lengths; the pool is then unchanged.
     pub fn add(
         &mut self,
         flow: &[Point],
@@ -102,7 +109,7 @@ impl Argoverse2Pool {
     /// The metrics of all pairs added so far.
     ///
     /// # Errors
-    /// No row was scored.
+    /// [`EvaluateError::NoPoints`] if no row was scored.
     pub fn finish(&self) -> Result<Argoverse2, EvaluateError> {
         let mean = |mean: Mean| mean.value().ok_or(EvaluateError::NoPoints);
         Ok(Argoverse2 {

@@ -17,10 +17,12 @@ const BUCKET_M: f64 = 0.04;
 /// Number of buckets: 50 of that width from 0 to 2 m per sweep interval, and one for higher speeds.
 const BUCKETS: usize = 51;
 
-/// One speed bucket of one class.
+/// One speed bucket of one class. The speed is the length of the true flow with the ego motion
+/// taken out.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Bucket {
-    /// Lower bound of the true speed, metres per sweep interval.
+    /// Lower bound of the true speed, metres per sweep interval: a multiple of 0.04 up to 2. Each
+    /// bucket is 0.04 wide, the last one unbounded.
     pub from: f64,
     /// Number of points in the bucket.
     pub points: usize,
@@ -30,29 +32,36 @@ pub struct Bucket {
     pub speed: f64,
 }
 
-/// The errors of one class.
+/// The static and the dynamic error of one class.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ClassError {
-    /// EPE of the slowest bucket, metres; none where it is empty.
+    /// EPE of the bucket of speeds below 0.04 m per sweep interval, metres; none if it is empty.
     pub static_epe: Option<f64>,
-    /// Mean of EPE over speed, over the other buckets that have points. A zero flow scores 1.
+    /// Mean of the ratio of EPE to mean speed, over the other buckets that have points; none if
+    /// they are all empty. An estimate of the ego motion alone scores 1.
     pub dynamic_error: Option<f64>,
     /// All buckets that have points, slowest first.
     pub buckets: Vec<Bucket>,
 }
 
-/// Bucket-normalized EPE over all pairs added.
+/// Bucket-normalized EPE over all pairs that were added: Argoverse 2's second scene flow benchmark.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BucketReport {
     /// One entry per class, by class index.
     pub classes: Vec<ClassError>,
-    /// Mean static error over the classes that have one, metres.
+    /// Mean static error over the classes that have one, metres; none if no class has one.
     pub static_epe: Option<f64>,
-    /// Mean dynamic error over the classes that have one: the benchmark's main score.
+    /// Mean dynamic error over the classes that have one, the benchmark's main score; none if no
+    /// class has one.
     pub dynamic_error: Option<f64>,
 }
 
 /// Accumulator of bucket-normalized EPE over many pairs.
+///
+/// Flows are compared with the ego motion taken out. Points count if they are scored, under the
+/// same conditions as for [`super::Metrics`], and close, see [`super::CLOSE_HALF_WIDTH_M`]. Close
+/// is measured in the source's frame; the official code uses the frame of the first sweep of each
+/// sequence.
 #[derive(Debug, Clone)]
 pub struct BucketNormalized {
     /// Per class and bucket: the errors and the true speeds.
@@ -60,7 +69,7 @@ pub struct BucketNormalized {
 }
 
 impl BucketNormalized {
-    /// An empty accumulator for classes 0 to `classes` - 1.
+    /// An empty accumulator for class indices below `classes`.
     pub fn new(classes: u8) -> Self {
         Self {
             cells: vec![[(Mean::default(), Mean::default()); BUCKETS]; usize::from(classes)],
@@ -68,12 +77,15 @@ impl BucketNormalized {
     }
 
     /// Adds the scored, close points of one pair. `flow` and the true flow (N x 3, metres) include
-    /// the ego motion. `covered` marks the rows for which the estimate has a flow. `class` holds a
-    /// class index per point, or [`UNCLASSIFIED`].
+    /// the ego motion. `covered` (N flags) marks the rows for which the estimate has a flow.
+    /// `class` holds N class indices, or [`UNCLASSIFIED`].
     ///
     /// # Errors
-    /// Arrays of different lengths, a truth without source cloud or ego motion, or a class index
-    /// out of range. Nothing is added then.
+    /// - [`EvaluateError::Length`] if the arrays have different lengths.
+    /// - [`EvaluateError::Missing`] if `truth` has no source cloud or no ego motion.
+    /// - [`EvaluateError::UnknownClass`] if a class index is out of range.
+    ///
+    /// Nothing is added then.
     pub fn add(
         &mut self,
         flow: &[Point],

@@ -6,7 +6,8 @@
 
 use super::buckets::UNCLASSIFIED;
 
-/// Class names: those of the benchmark, and OBJECT for foreground of unknown class.
+/// Names of the classes of bucket-normalized EPE, by class index: those of the benchmark, and
+/// OBJECT for foreground of unknown class.
 pub const CLASSES: [&str; 6] = [
     "BACKGROUND",
     "CAR",
@@ -16,7 +17,11 @@ pub const CLASSES: [&str; 6] = [
     "OBJECT",
 ];
 
-/// Class of a category, as an index into [`CLASSES`]; [`UNCLASSIFIED`] if the category is excluded.
+/// Class of an Argoverse 2 category, as an index into [`CLASSES`].
+///
+/// Categories are numbered as in `flow_labels.feather`: 0 is no object, and 1 to 30 are the
+/// categories in alphabetical order. Categories that the benchmark excludes, such as animals, signs
+/// and cones, and unknown numbers are [`UNCLASSIFIED`].
 pub fn class_of_category(category: u8) -> u8 {
     match category {
         0 => 0,
@@ -33,7 +38,8 @@ pub fn class_of_category(category: u8) -> u8 {
     }
 }
 
-/// Class of a point that is only known to be foreground or background: OBJECT or BACKGROUND.
+/// Class of a point that is only known to be foreground or background: OBJECT or BACKGROUND, as an
+/// index into [`CLASSES`].
 pub fn class_of_foreground(foreground: bool) -> u8 {
     if foreground { 5 } else { 0 }
 }

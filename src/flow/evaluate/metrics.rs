@@ -23,35 +23,37 @@ pub struct Metrics {
     pub points: usize,
     /// Mean end-point error (EPE), metres.
     pub epe: f64,
-    /// Share of points with an end-point error under 0.05 m or under 5 % of the true flow.
+    /// Share of points, 0 to 1, with an end-point error under 0.05 m or under 5 % of the true flow.
     pub acc5: f64,
-    /// Share of points with an end-point error under 0.1 m or under 10 % of the true flow.
+    /// Share of points, 0 to 1, with an end-point error under 0.1 m or under 10 % of the true flow.
     pub acc10: f64,
-    /// Share of points with an end-point error over 0.3 m or over 10 % of the true flow.
+    /// Share of points, 0 to 1, with an end-point error over 0.3 m or over 10 % of the true flow.
     pub outliers: f64,
-    /// Mean angle between estimated and true flow, radians; pi/2 where either is zero.
+    /// Mean angle between estimated and true flow, radians; pi/2 for a point where either is zero.
+    /// The official code clamps cosines, so a perfect flow scores 4.5e-4.
     pub angle_error: f64,
     /// EPE over dynamic points, metres; none without a dynamic mask or without such points.
     pub epe_dynamic: Option<f64>,
     /// EPE over static points, metres; none without a dynamic mask or without such points.
     pub epe_static: Option<f64>,
-    /// Three-way EPE over the points in the close square. None without the dynamic and foreground
-    /// masks, the source cloud, or any close point.
+    /// Three-way EPE over the points in the close square, see [`super::CLOSE_HALF_WIDTH_M`]. None
+    /// without the dynamic and foreground masks, the source cloud, or any close point.
     pub three_way: Option<ThreeWay>,
 }
 
-/// Scores the flow of one pair (N x 3, metres) against its truth. `covered` marks the rows for
-/// which the estimate has a flow.
+/// Scores the flow of one pair (N x 3, metres) against its truth. `covered` (N flags) marks the
+/// rows for which the estimate has a flow.
 ///
 /// # Errors
-/// Arrays of different lengths, or no row that can be scored.
+/// [`EvaluateError::Length`] if the arrays have different lengths. [`EvaluateError::NoPoints`] if
+/// no row can be scored.
 pub fn evaluate(flow: &[Point], covered: &[bool], truth: &Truth) -> Result<Metrics, EvaluateError> {
     let mut pool = Pool::default();
     pool.add(flow, covered, truth)?;
     pool.finish()
 }
 
-/// Accumulator of metrics over many pairs. Every scored point has the same weight.
+/// Accumulator of [`Metrics`] over many pairs. Every scored point has the same weight.
 #[derive(Debug, Clone, Default)]
 pub struct Pool {
     error: Mean,
@@ -65,11 +67,11 @@ pub struct Pool {
 }
 
 impl Pool {
-    /// Adds the scored points of one pair. A pair without a mask adds nothing to the metrics that
-    /// need it.
+    /// Adds the scored points of one pair. Arguments as in [`evaluate`]. A pair without a mask adds
+    /// nothing to the metrics that need it.
     ///
     /// # Errors
-    /// Arrays of different lengths; the pool is then unchanged.
+    /// [`EvaluateError::Length`] if the arrays have different lengths; the pool is then unchanged.
     pub fn add(
         &mut self,
         flow: &[Point],
@@ -110,7 +112,7 @@ impl Pool {
     /// The metrics of all pairs added so far.
     ///
     /// # Errors
-    /// No row was scored.
+    /// [`EvaluateError::NoPoints`] if no row was scored.
     pub fn finish(&self) -> Result<Metrics, EvaluateError> {
         let mean = |mean: Mean| mean.value().ok_or(EvaluateError::NoPoints);
         Ok(Metrics {

@@ -1,8 +1,8 @@
 //! Calibration of the confidence: reliability diagram and expected calibration error.
 //!
-//! A point is correct if its end-point error is below [`CONFIDENT_WITHIN_M`]. The expected calibration error is
-//! the mean absolute difference between confidence and share of correct points over ten confidence
-//! bins, weighted by points (Guo et al. 2017).
+//! A point is correct if its end-point error is below [`CONFIDENT_WITHIN_M`]. The expected
+//! calibration error is the mean absolute difference between confidence and share of correct points
+//! over ten confidence bins, weighted by points (Guo et al. 2017).
 
 use super::truth::{EvaluateError, Truth, double, end_point_error};
 use crate::flow::data::Point;
@@ -14,7 +14,7 @@ const BINS: usize = 10;
 /// distinguished.
 const CELLS: usize = 1000 * BINS;
 
-/// Accumulator of confidence and errors over many pairs, in constant memory.
+/// Accumulator of confidences and end-point errors over many pairs, in constant memory.
 #[derive(Clone, Debug)]
 pub struct Reliability {
     cells: Vec<Cell>,
@@ -28,29 +28,32 @@ struct Cell {
     points: f64,
 }
 
-/// Calibration of a confidence.
+/// Calibration of a confidence. A point is correct if its end-point error is below
+/// [`CONFIDENT_WITHIN_M`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Calibration {
     /// Number of points.
     pub points: usize,
-    /// Expected calibration error, 0 to 1.
+    /// Expected calibration error, 0 to 1: the mean absolute difference between the confidence and
+    /// the share of correct points over the bins, weighted by points (Guo et al. 2017).
     pub error: f64,
     /// EPE of the half of the points with the higher confidence, metres.
     pub sure_half_epe: f64,
     /// EPE of the other half, metres.
     pub rest_epe: f64,
-    /// The bins that have points, lowest confidence first.
+    /// Those of the ten bins of confidence, each 0.1 wide, that have points, lowest confidence
+    /// first.
     pub bins: Vec<CalibrationBin>,
 }
 
 /// One bin of a reliability diagram.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CalibrationBin {
-    /// Share of all points that are in the bin.
+    /// Share of all points that are in the bin, 0 to 1.
     pub share: f64,
-    /// Mean confidence of its points.
+    /// Mean confidence of its points, 0 to 1.
     pub confidence: f64,
-    /// Share of its points that are correct.
+    /// Share of its points that are correct, 0 to 1.
     pub right: f64,
 }
 
@@ -73,11 +76,12 @@ impl Reliability {
         cell.points += 1.0;
     }
 
-    /// Adds the scored points of one pair, with N confidences. `covered` marks the rows for which
-    /// the estimate has a flow.
+    /// Adds the scored points of one pair, with its flow (N x 3, metres) and N confidences.
+    /// `covered` (N flags) marks the rows for which the estimate has a flow. Points are scored
+    /// under the same conditions as for [`super::Metrics`].
     ///
     /// # Errors
-    /// Arrays of different lengths; nothing is added then.
+    /// [`EvaluateError::Length`] if the arrays have different lengths; nothing is added then.
     pub fn add_pair(
         &mut self,
         flow: &[Point],

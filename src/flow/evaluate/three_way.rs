@@ -6,26 +6,27 @@
 
 use super::truth::Mean;
 
-/// One part of the three-way EPE.
+/// The EPE of one of the three sets of points of a three-way EPE.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Part {
-    /// Mean end-point error, metres; none where the part has no points.
+    /// Mean end-point error, metres; none if the part has no points.
     pub epe: Option<f64>,
     /// Number of scored points of the part.
     pub points: usize,
 }
 
-/// Three-way EPE and its parts.
+/// Three-way EPE (Argoverse 2) and its parts. Dynamic background points belong to no part.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ThreeWay {
-    /// Mean of the three parts, metres. None where a part has no points: the official mean is then
-    /// NaN, and a mean over two parts would not be comparable with one over three.
+    /// Mean of the EPE of the three parts, with equal weights, metres. None if a part has no
+    /// points: the official mean is then NaN, and a mean over two parts would not be comparable
+    /// with one over three.
     pub epe: Option<f64>,
-    /// Moving objects.
+    /// Dynamic points on objects.
     pub foreground_dynamic: Part,
-    /// Static objects.
+    /// Static points on objects.
     pub foreground_static: Part,
-    /// The static background.
+    /// Static points of the background.
     pub background_static: Part,
 }
 

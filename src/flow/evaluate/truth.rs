@@ -5,7 +5,8 @@
 
 use crate::flow::data::{Point, RigidTransform};
 
-/// Half-width of the square around the sensor whose points are "close", metres (Argoverse 2).
+/// Half-width of the close square, metres (Argoverse 2). A point is close if neither `abs(x)` nor
+/// `abs(y)` exceeds it in the sensor's frame.
 pub const CLOSE_HALF_WIDTH_M: f32 = 35.0;
 
 /// The reason why a flow could not be scored.
@@ -27,7 +28,7 @@ pub enum EvaluateError {
         /// Name of the missing data.
         what: &'static str,
     },
-    /// A class index out of range of the accumulator.
+    /// A class index is out of the accumulator's range.
     #[error("class {class} is not one of {classes} classes")]
     UnknownClass {
         /// The class index.
@@ -35,32 +36,33 @@ pub enum EvaluateError {
         /// Number of classes.
         classes: usize,
     },
-    /// No row is valid, off the ground, covered and finite.
+    /// No row can be scored: none is valid, off the ground, covered by the estimate and finite.
     #[error("no point can be scored")]
     NoPoints,
 }
 
-/// Ground truth of one pair. Every slice has one row per source point.
+/// Ground truth of one pair. Every slice has N rows, one per source point.
 #[derive(Debug, Clone, Copy)]
 pub struct Truth<'a> {
     /// True flow, N x 3 metres per sweep interval, ego motion included.
     pub flow: &'a [Point],
-    /// Points whose true flow is known.
+    /// N flags: points whose true flow is known.
     pub valid: &'a [bool],
-    /// Points that move relative to the static world.
+    /// N flags: points that move relative to the static world.
     pub dynamic: Option<&'a [bool]>,
-    /// Points on an object of a known class, parked or moving.
+    /// N flags: points on an object of a known class, parked or moving.
     pub foreground: Option<&'a [bool]>,
-    /// Ground points, which are never scored.
+    /// N flags: ground points, which are never scored. Without it, no point counts as ground.
     pub ground: Option<&'a [bool]>,
-    /// Source points, metres, in the sensor frame. They determine which points are close.
+    /// Source points, N x 3 metres, in the sensor's frame. They determine which points are close.
     pub source: Option<&'a [Point]>,
     /// Ego motion as target_from_source, which maps a static source point into the target's frame.
     pub ego: Option<&'a RigidTransform>,
 }
 
 impl<'a> Truth<'a> {
-    /// Truth without masks. Metrics that need a mask are then omitted.
+    /// Truth of a flow (N x 3, metres) and its valid mask (N flags) alone. Metrics that need more
+    /// are then omitted.
     pub fn new(flow: &'a [Point], valid: &'a [bool]) -> Self {
         Self {
             flow,

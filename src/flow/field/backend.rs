@@ -7,7 +7,7 @@ use crate::flow::distance::{DistanceError, DistanceOptions};
 use crate::flow::host::{Host, HostError};
 use crate::flow::options::FieldOptions;
 
-/// A device that can fit a field to a pair.
+/// A device that builds distance transforms, fits fields to them and evaluates fitted networks.
 pub trait Backend: Send + Sync {
     /// The device's name, as reports show it.
     fn name(&self) -> String;
@@ -15,11 +15,19 @@ pub trait Backend: Send + Sync {
     /// The host's thread pool. Registration and the object search run there on every device.
     fn host(&self) -> &Host;
 
-    /// Builds the distance transform of `target` over a grid that covers both clouds, metres.
-    /// Checks `control` between parts of the work.
+    /// Builds the distance transform of `target` (M x 3, metres) on a grid that covers `target` and
+    /// `source` (N x 3, metres), both in the same frame. Checks `control` several times a second.
     ///
     /// # Errors
-    /// [`BackendError`] if the clouds are refused, the control interrupts or the device fails.
+    /// - [`BackendError::Distance`] if the clouds or the options are refused, see
+    ///   [`crate::flow::distance::DistanceTransform::build`].
+    /// - [`BackendError::Interrupted`] if `control` interrupts.
+    /// - [`BackendError::Unsupported`] if the device lacks the metric or the sites of `options`. A
+    ///   GPU has only [`crate::flow::distance::Metric::Euclidean`] with
+    ///   [`crate::flow::distance::Sites::Cells`].
+    /// - [`BackendError::Memory`] if the transform and N points can never fit in the GPU's memory.
+    /// - [`BackendError::Busy`] if other pairs occupy that memory and release too little of it.
+    /// - [`BackendError::Lost`] or [`BackendError::Device`] if the GPU fails.
     fn transform(
         &self,
         source: &[Point],
@@ -28,32 +36,40 @@ pub trait Backend: Send + Sync {
         control: &dyn Control,
     ) -> Result<Box<dyn Transform>, BackendError>;
 
-    /// The flow of `network` at N `points`: N x 3 displacements, metres.
+    /// The flow of `network` at `points` (N x 3, metres): N x 3 displacements, metres.
     ///
     /// # Errors
-    /// [`BackendError`] if the device fails.
+    /// [`BackendError::Memory`], [`BackendError::Busy`], [`BackendError::Lost`] or
+    /// [`BackendError::Device`] if a GPU has no memory for the points or fails. A CPU never fails.
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError>;
 }
 
-/// The distance transform of a target cloud in a device's memory (FNSF Section 3.2): the distance to
-/// the target, metres, sampled on a grid and interpolated trilinearly. A point outside the grid gets
-/// the value at the grid's border. All points are in the frame of the two clouds that it was built
-/// for. Dropping it frees the memory.
+/// The distance transform of a target cloud in a device's memory (FNSF Section 3.2).
+///
+/// It gives the distance to the target, metres, sampled on a grid and interpolated trilinearly. A
+/// point outside the grid gets the value at the grid's border. All points are in the frame of the
+/// two clouds that it was built for. Dropping it frees the memory.
 pub trait Transform: Send {
-    /// Bytes that it occupies.
+    /// Bytes that the transform occupies on the device.
     fn bytes(&self) -> usize;
 
-    /// The distance to the target at each of `points`, metres.
+    /// N distances to the target, metres, one for each of `points` (N x 3, metres).
     ///
     /// # Errors
-    /// [`BackendError`] if the device fails.
+    /// [`BackendError::Memory`], [`BackendError::Busy`], [`BackendError::Lost`] or
+    /// [`BackendError::Device`] if a GPU has no memory for the points or fails. A CPU never fails.
     fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError>;
 
-    /// Starts a fit of a field to `source`, before its first iteration. `source` has at most as
-    /// many points as the transform was built for.
+    /// Starts a fit of a field to `source` (N x 3, metres) and returns it before its first
+    /// iteration. `source` has at least one point, and at most as many as the source that the
+    /// transform was built for. `seed` determines the initial parameters and the batches.
     ///
     /// # Errors
-    /// [`BackendError`] if the device fails, or does not support the options.
+    /// - [`BackendError::Unsupported`] if the device lacks the precision of `options`.
+    /// - [`BackendError::Memory`] if a GPU has too little memory for the points or for the
+    ///   gradients of a batch.
+    /// - [`BackendError::Busy`] if all lanes of a GPU are in use.
+    /// - [`BackendError::Lost`] if the GPU is lost.
     fn start(
         &self,
         source: &[Point],
@@ -62,39 +78,42 @@ pub trait Transform: Send {
     ) -> Result<Box<dyn Trainer + '_>, BackendError>;
 }
 
-/// A fit in progress.
+/// A fit of a field in progress, see [`Transform::start`].
 pub trait Trainer: Send {
-    /// Does up to `steps` iterations. Checks `control` before each, or before each group of
-    /// iterations that a GPU does at once. Returns early if a snapshot is due, but only after at
-    /// least one iteration.
+    /// Does up to `steps` iterations and reports the progress of each to `control`. Checks
+    /// `control` before each iteration, or before each group of iterations that a GPU does at once.
+    /// Returns early if a snapshot is due, but only after at least one iteration.
     ///
     /// # Errors
-    /// [`BackendError`] if the device fails.
+    /// [`BackendError::Busy`], [`BackendError::Lost`] or [`BackendError::Device`] if a GPU has no
+    /// free memory or fails. A CPU never fails.
     fn advance(&mut self, steps: usize, control: &dyn Control) -> Result<Advance, BackendError>;
 
-    /// The flow of the result so far at N `points`: N x 3 displacements, metres. The points need
-    /// not be those of the fit.
+    /// The flow of the result so far at `points` (N x 3, metres): N x 3 displacements, metres. The
+    /// points need not be those of the fit.
     ///
     /// # Errors
-    /// [`BackendError`] if the device fails.
+    /// As [`Backend::evaluate`].
     fn evaluate(&mut self, points: &[Point]) -> Result<Vec<Point>, BackendError>;
 
-    /// The iterations, the loss and the time of the distance query so far.
+    /// The number of iterations, the loss and the time of the distance query so far.
     fn report(&self) -> FitReport;
 
-    /// The state that the following iterations and the result depend on.
+    /// A copy of the state that the following iterations and the result depend on.
     ///
     /// # Errors
-    /// [`BackendError`] if the device fails.
+    /// As [`Self::advance`].
     fn state(&mut self) -> Result<TrainerState, BackendError>;
 
-    /// Resumes from `state`, which is that of a trainer with the same points and options.
+    /// Continues from `state` instead. To continue another fit with the same bits, the points and
+    /// the options must be those of that fit.
     ///
     /// # Errors
-    /// [`BackendError`] if the device fails.
+    /// [`BackendError::Lost`] if the GPU is lost. A CPU never fails.
     fn restore(&mut self, state: TrainerState) -> Result<(), BackendError>;
 
-    /// Limits the fit to `max_iterations`; a cosine schedule then falls to zero at that iteration.
+    /// Lowers the maximum number of iterations to `max_iterations`; a larger value has no effect. A
+    /// cosine schedule then falls to zero at the new maximum.
     fn shorten(&mut self, max_iterations: usize);
 }
 
@@ -105,7 +124,7 @@ pub enum Advance {
     Continues,
     /// Early stopping fired.
     Converged,
-    /// The maximum number of iterations of the options is done.
+    /// The maximum number of iterations of the options, or of [`Trainer::shorten`], is done.
     Exhausted,
     /// A loss was not finite.
     Diverged,
@@ -118,34 +137,38 @@ pub enum Advance {
 pub struct FitReport {
     /// Number of iterations done.
     pub iterations: usize,
-    /// The iteration, from 1, whose field [`Trainer::evaluate`] uses; the latest one if the result
-    /// is a running average.
+    /// The iteration, counted from 1, whose field [`Trainer::evaluate`] uses; the latest one if the
+    /// result is a running average. Zero before the first iteration.
     pub best_iteration: usize,
-    /// Its mean loss, metres; for a running average, the running mean of the batches' losses.
+    /// Mean loss of that iteration, metres; for a running average, the running mean of the batches'
+    /// losses. Infinite before the first iteration.
     pub best_loss: f64,
-    /// Time of the distance query, seconds: the mean over the threads that ran it.
+    /// Time of the distance queries so far, seconds. On a CPU it is the mean over the threads that
+    /// ran them, by the control's clock. On a GPU it is estimated from timestamps. Zero without a
+    /// clock or timestamps.
     pub query_seconds: f64,
 }
 
 /// Why a device failed or refused the work.
 #[derive(Debug, thiserror::Error)]
 pub enum BackendError {
-    /// The distance transform was refused.
+    /// The distance transform was refused: its options are out of range, the target is empty, the
+    /// clouds span too much space, or `max_bytes` is too small.
     #[error(transparent)]
     Distance(DistanceError),
-    /// The control interrupted the work before the first iteration.
+    /// The control interrupted the distance transform, before the first iteration.
     #[error("interrupted before the first iteration")]
     Interrupted(Interrupt),
     /// The thread pool could not be started.
     #[error(transparent)]
     Threads(#[from] HostError),
-    /// No device matches the request.
+    /// No device matches the request, or the driver refused to open it.
     #[error("no such device: {0}")]
     NoDevice(String),
     /// The device does not support the options.
     #[error("the device cannot do this: {0}")]
     Unsupported(&'static str),
-    /// The pair does not fit in the device's memory.
+    /// The GPU has too little memory, for its kernels when it is opened or for this pair.
     #[error("{needed} bytes are needed for the {what}, and the device has {available}")]
     Memory {
         /// The data that does not fit.
@@ -155,13 +178,13 @@ pub enum BackendError {
         /// Bytes that the device has for it.
         available: u64,
     },
-    /// Other pairs occupy the memory that this pair needs. Retry later.
+    /// Other pairs occupy the memory or the lanes of the GPU that this pair needs. Retry later.
     #[error("the memory of the device is taken by other pairs")]
     Busy,
-    /// The device was lost and must be reopened before further use.
+    /// The GPU was lost and must be reopened before further use.
     #[error("the device was lost: {0}")]
     Lost(String),
-    /// The device rejected a command: a defect of this program or of the driver.
+    /// The GPU rejected a command: a defect of this program or of the driver.
     #[error("the device failed: {0}")]
     Device(String),
 }

@@ -159,7 +159,7 @@ impl Throughput {
     ) -> Option<FieldOptions> {
         let budget = (left - self.evaluation).max(0.0);
         let iteration = |batch: usize| self.point * ITERATION * batch as f64;
-        let asked = options.batch.unwrap_or(points).min(points);
+        let asked = options.batch.unwrap_or(points).clamp(1, points.max(1));
         let needed = options.expected_iterations() as f64 * iteration(asked);
         let tolerance = match options.learning_rate_schedule {
             LearningRateSchedule::Cosine => ROUGH,

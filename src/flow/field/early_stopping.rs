@@ -54,7 +54,7 @@ impl EarlyStop {
                 };
             }
         }
-        self.seen.without_progress >= self.options.patience
+        self.seen.without_progress >= self.options.patience.max(1)
     }
 }
 

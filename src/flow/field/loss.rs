@@ -2,8 +2,9 @@
 //! the flow.
 //!
 //! [`Loss`] is the interface to the fit. [`DistanceLoss`] is FNSF's, of one deformed point in the
-//! distance transform; every backend implements its formulas: `clamp(D(p + f), margin, truncation) + penalty * |f|`; with the published settings just `D(p +
-//! f)`, FNSF eq. 6.
+//! distance transform. Every backend implements its formulas:
+//! `clamp(D(p + f), margin, truncation) + penalty * |f|`. With the published settings it is just
+//! `D(p + f)`, FNSF eq. 6.
 
 use crate::flow::data::Point;
 use crate::flow::distance::{DistanceTransform, Sample};

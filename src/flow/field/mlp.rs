@@ -8,13 +8,13 @@ use super::parameters::Parameters;
 use crate::flow::data::{Point, Random};
 use crate::flow::options::{InputNormalization, Start};
 
-/// Features of every hidden layer.
+/// Number of features of every hidden layer.
 pub const WIDTH: usize = 128;
-/// Layers from 128 to 128 features.
+/// Number of layers from 128 to 128 features.
 pub const MIDDLE_LAYERS: usize = 7;
-/// Hidden layers: the first (3 -> 128) and the middle ones.
+/// Number of hidden layers: the first (3 -> 128) and the middle ones.
 pub const HIDDEN_LAYERS: usize = MIDDLE_LAYERS + 1;
-/// Parameters of the network: 116,483.
+/// Number of parameters of the network: 116,483.
 pub const PARAMETERS: usize = 4 * WIDTH + MIDDLE_LAYERS * (WIDTH * WIDTH + WIDTH) + 3 * WIDTH + 3;
 
 /// Output features per panel of a middle layer's weights. A kernel reads a panel as one stream.
@@ -64,9 +64,9 @@ pub(crate) const fn panel_index(input: usize, output: usize) -> usize {
     (output / PANEL * WIDTH + input) * PANEL + output % PANEL
 }
 
-/// Zeros in the layout of the network: first layer `W[3][128]`, bias; each middle layer `W` in panels
-/// of 32 output features (`[panel][input][32]`), bias; last layer `W[3][128]` (output-major), bias;
-/// padding.
+/// Zeros in the layout of the network: first layer `W[3][128]`, bias; each middle layer `W` in
+/// panels of 32 output features (`[panel][input][32]`), bias; last layer `W[3][128]`
+/// (output-major), bias; padding.
 pub(crate) fn zeros() -> Parameters {
     Parameters::zeros(LAID_OUT)
 }

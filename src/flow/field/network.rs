@@ -9,7 +9,12 @@ use super::parameters::Parameters;
 use crate::flow::data::{Point, RigidTransform};
 use crate::flow::options::InputNormalization;
 
-/// The coordinate network of one pair: `g(p; theta)` at any point p, metres. FNSF Section 3.
+/// The fitted coordinate network of one pair (FNSF Section 3): parameters and input normalization.
+///
+/// It maps a position to the displacement in one sweep interval, `g(p; theta)` in the paper, both
+/// in metres. With an ego motion, the position is a source point after the ego motion, in the
+/// target's frame, and the displacement is the residual flow.
+/// [`crate::flow::field::Backend::evaluate`] computes it.
 #[derive(Clone)]
 pub struct Network {
     pub(crate) parameters: Parameters,

@@ -22,7 +22,11 @@ const ENVELOPE: Envelope = Envelope {
 /// Parameters, two moments, the kept parameters.
 const ARRAYS: usize = 4;
 
-/// The state that the following iterations depend on, besides points and options.
+/// The state of a fit between two iterations.
+///
+/// It holds the parameters, Adam's moments, the parameters of the result so far, the state of early
+/// stopping, and the iteration counts. Together with the points and the options it determines all
+/// following iterations.
 #[derive(Clone)]
 pub struct TrainerState {
     pub(crate) parameters: Parameters,
@@ -52,9 +56,11 @@ impl TrainerState {
     }
 }
 
-/// A fit interrupted between two iterations. Resumed with the same problem and options, it ends
-/// with the same bits as an uninterrupted fit. This holds for any number of threads, and on any
-/// device that rounds like the first one.
+/// A field fit stopped between two iterations, to be continued by [`crate::flow::resume`].
+///
+/// Resumed with the same problem and options, it ends with the same bits as an uninterrupted fit.
+/// This holds for any number of threads, and on any device that rounds multiply-adds like the first
+/// one.
 #[derive(Clone)]
 pub struct Snapshot {
     identity: u64,
@@ -85,7 +91,7 @@ impl Snapshot {
         self.state.iterations
     }
 
-    /// The snapshot as bytes, 1.9 MB.
+    /// The snapshot as 1.9 MB of bytes, with a header, a format version and a checksum.
     pub fn to_bytes(&self) -> Vec<u8> {
         let state = &self.state;
         let mut bytes = ENVELOPE.begin();
@@ -107,7 +113,8 @@ impl Snapshot {
     /// have been verified.
     ///
     /// # Errors
-    /// [`SnapshotError`] if the bytes are not a snapshot, of another version, truncated or altered.
+    /// [`SnapshotError::Sealed`] if the bytes are not a snapshot, are of another format version, or
+    /// are truncated or altered.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, SnapshotError> {
         let mut body = ENVELOPE.open(bytes)?;
         let identity = body.number()?;
@@ -137,10 +144,10 @@ impl Snapshot {
 /// Why a snapshot was refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SnapshotError {
-    /// The bytes are not a valid snapshot of this version.
+    /// The bytes are not a valid snapshot of this format version.
     #[error("no snapshot: {0}")]
     Sealed(#[from] EnvelopeError),
-    /// The snapshot was taken with other clouds or other options.
+    /// The snapshot was taken with other clouds, other options or another method.
     #[error("the snapshot belongs to another problem or other options")]
     Foreign,
 }

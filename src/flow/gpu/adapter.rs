@@ -36,7 +36,7 @@ impl AdapterKind {
 /// A GPU that can be opened.
 #[derive(Clone, Debug)]
 pub struct Adapter {
-    /// Its index among all adapters, fastest kind first.
+    /// Its index in the list of [`adapters`], from 0.
     pub index: usize,
     /// Its name, as the driver reports it.
     pub name: String,
@@ -52,23 +52,24 @@ pub struct Adapter {
     pub max_binding_bytes: u64,
     /// Workgroup memory per workgroup, bytes.
     pub workgroup_bytes: u32,
-    /// The tile sizes and types that the matrix units multiply, such as `16x16x16 f16 -> f32`.
-    /// Empty if there are none.
+    /// The tile sizes and types that the matrix units multiply, such as `16x16x16 f16 -> f32`: the
+    /// sizes m x n x k, the type of the factors, and the type of the sums. Empty if there are none.
     pub matrix_tiles: Vec<String>,
     pub(super) handle: wgpu::Adapter,
 }
 
-/// Selects a GPU.
+/// Selects a GPU. Parsed from text, a number is [`Self::Index`], an empty text [`Self::Any`], and
+/// any other text [`Self::Named`].
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Selector {
-    /// The first adapter that is not a software device.
+    /// The first adapter that is not a software device, unless [`select`] is told to accept those.
     #[default]
     Any,
     /// The adapter with this [`Adapter::index`]. If there is none, the first whose name contains
     /// the number.
     Index(usize),
-    /// The adapter with this [`Adapter::pci_id`], or the first whose name contains this text,
-    /// ignoring case.
+    /// The first adapter with this [`Adapter::pci_id`] or with this text in its name, ignoring
+    /// case.
     Named(String),
 }
 
@@ -94,7 +95,7 @@ impl fmt::Display for Selector {
     }
 }
 
-/// All adapters for Vulkan, Metal or DX12, fastest kind first.
+/// All GPUs of the machine with a driver for Vulkan, Metal or DX12, fastest kind first.
 pub fn adapters() -> Vec<Adapter> {
     let mut found: Vec<_> =
         pollster::block_on(instance().enumerate_adapters(wgpu::Backends::all()))
@@ -108,8 +109,8 @@ pub fn adapters() -> Vec<Adapter> {
     found
 }
 
-/// The adapter that `selector` selects. A software device is selected only by its index or its
-/// name, or if `software` is true.
+/// The GPU that `selector` selects. [`Selector::Any`] selects a software device only if `software`
+/// is true.
 ///
 /// # Errors
 /// [`BackendError::NoDevice`] if no adapter matches; its text lists the adapters.

@@ -14,34 +14,42 @@ use crate::flow::field::{Backend, BackendError, Network, Trainer, Transform};
 use crate::flow::host::Host;
 use crate::flow::options::FieldOptions;
 
-/// An opened GPU. Clones share it.
+/// An opened GPU, as a [`Backend`]. Clones share it, and each can fit a pair from its own thread.
 #[derive(Clone)]
 pub struct Gpu(Arc<Device>);
 
 impl Gpu {
-    /// Opens a GPU, allocates its memory and builds its kernels.
+    /// Opens a GPU, builds its kernels and allocates its memory. Starts one host thread per core.
     ///
     /// # Errors
-    /// [`BackendError`] if the driver refuses, or the GPU has too little memory.
+    /// - [`BackendError::NoDevice`] if the driver refuses to open the GPU.
+    /// - [`BackendError::Memory`] if the GPU or the requested size has too little memory, or a
+    ///   kernel cannot bind a buffer of the minimum size.
+    /// - [`BackendError::Lost`] if the driver rejects a kernel.
+    /// - [`BackendError::Threads`] if the operating system cannot start the threads.
     pub fn open(adapter: &Adapter, options: &GpuOptions) -> Result<Self, BackendError> {
         Device::open(adapter, options).map(|device| Self(Arc::new(device)))
     }
 
-    /// The number of lanes: pairs that can be fitted at the same time.
+    /// The number of lanes: pairs that can be fitted at the same time. It is smaller than
+    /// [`GpuOptions::lanes`] if the networks of all lanes exceed the largest buffer that a kernel
+    /// can bind.
     pub fn lanes(&self) -> usize {
         self.0.context.budget.lanes as usize
     }
 
-    /// GPU memory that was allocated, bytes.
+    /// GPU memory that was allocated when the GPU was opened, bytes.
     pub fn memory_bytes(&self) -> u64 {
         self.0.context.budget.bytes()
     }
 
-    /// The tile that the GPU's matrix units multiply, such as `16x16x16 f16 -> f32`, if they pass
-    /// their self-test. The first call runs the self-test.
+    /// The tile that the GPU's matrix units multiply in half precision, such as
+    /// `16x16x16 f16 -> f32`. The first call runs the self-test of the matrix units, and all calls
+    /// return its result.
     ///
     /// # Errors
-    /// The reason why half precision is not available on this GPU.
+    /// The reason why half precision is not available on this GPU, as text: a missing feature or
+    /// tile, a failed self-test, or a failure of the GPU during the self-test.
     pub fn matrix_units(&self) -> Result<String, String> {
         let units = self.0.tested_units().as_ref().map_err(Clone::clone)?;
         Ok(units.tile.name().to_owned())
@@ -52,7 +60,8 @@ impl Gpu {
         self.0.context.watchdog.check().is_err()
     }
 
-    /// Destroys the device, as if it had been lost: everything that runs on it fails.
+    /// Destroys the device for all clones. All work on it fails with [`BackendError::Lost`] from
+    /// then on.
     pub fn destroy(&self) {
         self.0.context.device.destroy();
         self.0.context.watchdog.lost("it was given up".to_owned());

@@ -8,12 +8,14 @@ use crate::flow::field::{BackendError, HIDDEN_LAYERS, LAID_OUT, WIDTH};
 /// Options for opening a GPU.
 #[derive(Clone, Debug)]
 pub struct GpuOptions {
-    /// Number of lanes: pairs that can be fitted at the same time.
+    /// Number of lanes: pairs that can be fitted at the same time. Zero counts as one.
     pub lanes: usize,
-    /// GPU memory to allocate when the GPU is opened, bytes. An explicit size that cannot be allocated,
-    /// or is below the minimum, is refused with [`BackendError::Memory`]. None: 2 GiB plus 256 MiB per
-    /// lane on a discrete or virtual GPU, 1 GiB on an integrated or unknown one, 320 MiB plus 4 MiB per
-    /// lane on a software device; halved, down to the minimum, until the allocation succeeds.
+    /// GPU memory to allocate when the GPU is opened, bytes. An explicit size that cannot be
+    /// allocated, or is below the minimum, is refused with [`BackendError::Memory`].
+    ///
+    /// None stands for 2 GiB plus 256 MiB per lane on a discrete or virtual GPU, 1 GiB on an
+    /// integrated or unknown one, and 320 MiB plus 4 MiB per lane on a software device. This size
+    /// is halved, down to the minimum, until the allocation succeeds.
     pub memory_bytes: Option<u64>,
 }
 
@@ -31,7 +33,8 @@ const ROW_BYTES: u64 = (HIDDEN_LAYERS * WIDTH * size_of::<f32>()) as u64;
 /// Bytes of one network, or of one chunk's gradients.
 pub(super) const NETWORK_BYTES: u64 = (LAID_OUT * size_of::<f32>()) as u64;
 /// Bytes of a lane's arrays: parameters, transposed weights, Adam's moments and result. The arrays
-/// of all lanes share one binding.
+/// of all lanes share one buffer, so [`super::Adapter::max_binding_bytes`] limits the number of
+/// lanes.
 pub const LANE_NETWORK_BYTES: u64 = ARRAYS as u64 * NETWORK_BYTES;
 /// Minimum number of rows. No chunk has more points.
 pub(super) const LEAST_ROWS: u64 = 8192;

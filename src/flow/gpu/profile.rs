@@ -21,22 +21,30 @@ const FORWARD: f64 = 2.0 * (3 * WIDTH + MIDDLE_LAYERS * WIDTH * WIDTH + 3 * WIDT
 /// point.
 const BACKWARD: f64 = FORWARD - 2.0 * (3 * WIDTH) as f64;
 
-/// Time and work of one kernel.
+/// Time and work of one kernel in one iteration of a fit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct KernelTime {
-    /// Name of the kernel.
+    /// Name of the kernel: `forward`, `query`, `backward`, `gradients`, `judge`, `step`, and
+    /// `transpose` in single or `halve` in half precision.
     pub name: &'static str,
-    /// Seconds by GPU timestamps, the minimum of all rounds.
+    /// Time by GPU timestamps, seconds: the minimum over all rounds.
     pub seconds: f64,
-    /// Floating-point operations; zero for a kernel that is limited by memory traffic.
+    /// Number of floating-point operations, two per multiply-add; zero for a kernel without matrix
+    /// products.
     pub operations: f64,
 }
 
-/// Times each kernel of an iteration over all points of `source` in one precision, `rounds` times.
+/// Times each kernel of an iteration over all points of `source` in one precision, in `rounds`
+/// rounds, at least one. `source` (N x 3) and `target` (M x 3) are in metres, in the same frame.
+/// The GPU should do no other work meanwhile.
 ///
 /// # Errors
-/// [`BackendError`] if the pair does not fit into the GPU's memory in one wave, or the GPU has no
-/// timestamps.
+/// - [`BackendError::Unsupported`] if the memory cannot hold all points at once, the GPU has no
+///   timestamps, or it lacks the precision.
+/// - [`BackendError::Distance`] if the distance transform refuses the clouds.
+/// - [`BackendError::Memory`] if the pair does not fit in the GPU's memory.
+/// - [`BackendError::Busy`] if other pairs occupy the GPU.
+/// - [`BackendError::Lost`] or [`BackendError::Device`] if the GPU fails.
 pub fn kernel_times(
     gpu: &Gpu,
     source: &[Point],
@@ -137,11 +145,13 @@ fn repeated_iteration(
     })
 }
 
-/// Peak arithmetic throughput of the GPU, in floating-point operations per second, measured with
-/// independent multiply-adds.
+/// Peak arithmetic throughput of the GPU in single precision, in floating-point operations per
+/// second. It is measured with independent multiply-adds, of two operations each.
 ///
 /// # Errors
-/// [`BackendError`] if the GPU fails or has no timestamps.
+/// - [`BackendError::Unsupported`] if the GPU has no timestamps.
+/// - [`BackendError::Busy`] if the GPU has no free memory for the measurement.
+/// - [`BackendError::Lost`] or [`BackendError::Device`] if the GPU fails.
 pub fn arithmetic_peak(gpu: &Gpu) -> Result<f64, BackendError> {
     /// Workgroups, invocations per workgroup, and operations per invocation: eight chains of 512
     /// multiply-adds of vec4s, see `multiply_adds.wgsl`.

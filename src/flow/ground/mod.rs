@@ -6,9 +6,9 @@
 //! ```
 //!
 //! The sweep is divided into vertical columns. A smooth height field is fitted under the lowest
-//! layers of the columns, coarse to fine, like a cloth laid from below. This is the idea of the
-//! cloth simulation filter of Zhang et al., with the flatness test of Patchwork in place of its
-//! forces. Points near the height field are ground.
+//! layers of the columns, coarse to fine. This is the cloth simulation filter (Zhang et al. 2016),
+//! written as a linear problem. The flatness of columns as evidence of ground is that of Patchwork
+//! (Lim et al. 2021). Points near the height field are ground.
 
 mod columns;
 mod mask;

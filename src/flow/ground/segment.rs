@@ -50,7 +50,7 @@ const FLAT: f32 = 0.7;
 /// The ground of one sweep.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct GroundSegmentation {
-    /// N flags for N points: whether the point lies on the ground.
+    /// N flags: true for points on the ground.
     pub ground: Vec<bool>,
     /// Height of the frame's origin above the ground below it, metres: the lidar's height where the
     /// origin is the lidar, near zero where the origin is on the road. None without ground.
@@ -58,8 +58,11 @@ pub struct GroundSegmentation {
 }
 
 /// Segments the ground of one sweep: N finite points, metres, x forward, y left, z up to within
-/// some degrees, with the vehicle near the origin. The flags do not depend on the points' order.
-/// Points at |x| or |y| of 128 m or more are never ground.
+/// some degrees, with the vehicle near the origin.
+///
+/// The flags do not depend on the points' order. Points at `|x|` or `|y|` of 128 m or more are
+/// never ground. Without sufficient evidence no point is ground: fewer than 16 flat columns of 1 m
+/// x 1 m within 40 m, or a smaller share of them than [`GroundOptions::min_share`].
 pub fn segment(points: &[Point], options: &GroundOptions) -> GroundSegmentation {
     let columns = Columns::new(points);
     let surface = fit(&columns);

@@ -13,7 +13,8 @@ use crate::flow::objects::{ObjectSearch, SearchClouds};
 use crate::flow::options::ObjectOptions;
 use crate::flow::{ground, objects, registration};
 
-/// A thread pool of the host with its sweep cache. Clones share both.
+/// A pool of CPU threads with a cache of the ground masks and the surfels of the latest sweeps.
+/// Clones share both.
 #[derive(Clone)]
 pub struct Host {
     name: String,
@@ -55,12 +56,13 @@ impl Host {
         })
     }
 
-    /// Name for reports: the instruction set, if given, and the number of threads.
+    /// Name for reports: the instruction set of the CPU backend, if given, and the number of
+    /// threads.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Clears the sweep cache, for measurements that repeat the same work.
+    /// Clears the cache of ground masks and surfels, for measurements that repeat the same work.
     pub fn forget(&self) {
         self.sweep_cache.forget();
     }
@@ -70,9 +72,13 @@ impl Host {
         &self.threads
     }
 
-    /// Registers `source` to `target` (points in metres, each cloud in its own frame) and returns
-    /// the rigid motion `target_from_source` near `prior`. Where `control` interrupts, it is the
-    /// motion so far.
+    /// Registers `source` (N x 3) to `target` (M x 3), metres, each in its own frame, and returns
+    /// the rigid motion `target_from_source`. The method is generalized ICP (Segal et al. 2009),
+    /// started from a coarse search around `prior`.
+    ///
+    /// In directions that the clouds do not determine, the motion stays as in `prior`. Points that
+    /// are not finite are ignored. Where `control` interrupts, the result is the motion so far. The
+    /// result is bit-identical for any number of threads.
     pub fn align(
         &self,
         source: &[Point],
@@ -99,8 +105,9 @@ impl Host {
         self.threads.install(|| found.collect())
     }
 
-    /// Searches `clouds` for moving objects. Where `control` interrupts, the result holds the
-    /// motions found so far.
+    /// Searches `clouds` for moving objects, large clusters first. Where `control` interrupts or
+    /// too little time is left, the other clusters are static, and [`ObjectSearch::interrupted`] is
+    /// the reason. An interrupt before the first cluster can leave the lists of the result empty.
     pub fn find_objects(
         &self,
         clouds: &SearchClouds<'_>,

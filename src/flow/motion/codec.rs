@@ -30,8 +30,8 @@ const OBJECTS: u8 = 2;
 const UNIT: f64 = 1e-9;
 
 impl MotionField {
-    /// The field as bytes. A network takes about 0.5 MB. Object motions grow with their number of
-    /// points.
+    /// The motion field as bytes, which [`Self::from_bytes`] reads. A network takes about 0.5 MB.
+    /// Object motions grow with their number of points.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut bytes = ENVELOPE.begin();
         bytes.push(self.ego.is_some().into());
@@ -62,8 +62,9 @@ impl MotionField {
     /// input really contains.
     ///
     /// # Errors
-    /// [`EnvelopeError`] if the bytes are not a motion field, of another version, truncated or
-    /// altered.
+    /// [`EnvelopeError::Magic`] if the bytes are not a motion field, [`EnvelopeError::Version`] if
+    /// they are of another version, and [`EnvelopeError::Damaged`] if they are truncated or altered
+    /// or hold an invalid ego motion or object motion.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, EnvelopeError> {
         let mut body = ENVELOPE.open(bytes)?;
         let ego = motion(&mut body)?;

@@ -10,26 +10,28 @@ use crate::flow::objects::ObjectMotions;
 /// of the source's frame to its position at the target's time, in the target's frame.
 #[derive(Clone, Debug)]
 pub struct MotionField {
-    /// Ego motion as target_from_source. None if the residual includes it.
+    /// Ego motion as target_from_source. None where it is unknown: the residual motion is then the
+    /// full motion.
     pub ego: Option<RigidTransform>,
-    /// Motion relative to the static world.
+    /// Motion relative to the static world, in the target's frame.
     pub residual: Residual,
 }
 
-/// Residual motion: motion with the ego motion taken out, as a function of the static position.
+/// Residual motion: the motion with the ego motion taken out, as a function of the static position.
+/// The static position is where a static point would be in the target's frame.
 #[derive(Clone, Debug)]
 pub enum Residual {
     /// No residual motion.
     Still,
-    /// A neural scene flow prior.
+    /// The network of a fitted field: a neural scene flow prior (FNSF Section 3).
     Network(Network),
-    /// Rigid motions of objects.
+    /// Rigid motions of the objects that an object search found.
     Objects(Arc<ObjectMotions>),
 }
 
 impl MotionField {
-    /// Transforms `points` (N x 3, metres) of the source's frame into the target's by the ego
-    /// motion: their positions if they are static. Without an ego motion the points are returned
+    /// Transforms `points` (N x 3, metres) of the source's frame into the target's frame by the ego
+    /// motion: N x 3 static positions, metres. Without an ego motion the points are returned
     /// unchanged.
     pub fn static_positions(&self, points: &[Point]) -> Vec<Point> {
         match &self.ego {
@@ -38,11 +40,12 @@ impl MotionField {
         }
     }
 
-    /// The residual motion (N x 3, metres) of points with these static positions, in the target's
-    /// frame.
+    /// The residual motion in one sweep interval, N x 3 displacements in metres in the target's
+    /// frame, of points with these static positions (N x 3, metres), see
+    /// [`Self::static_positions`].
     ///
     /// # Errors
-    /// [`BackendError`] if the device fails.
+    /// [`BackendError`] if the device fails, which happens only for a network on a GPU.
     pub fn residual(
         &self,
         backend: &dyn Backend,

@@ -145,8 +145,8 @@ fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Hypothesis>], row: u32) -
     best.1
 }
 
-/// Whether a point follows the motion of its cluster: the mean of `residual_m` over the points of the
-/// cluster around it is at most `point_reject_m`.
+/// Whether a point follows the motion of its cluster: the mean of `residual_m` over the points of
+/// the cluster around it is at most `point_reject_m`.
 fn is_of(scene: &Scene<'_>, row: u32, residual_m: &[f32]) -> bool {
     let label = scene.source.labels[row as usize];
     let center = scene.source.points[row as usize];

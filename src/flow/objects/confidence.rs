@@ -1,4 +1,5 @@
-//! Confidence of a point's flow: the probability that its end-point error is below [`CONFIDENT_WITHIN_M`].
+//! Confidence of a point's flow: the probability that its end-point error is below
+//! [`CONFIDENT_WITHIN_M`].
 //!
 //! Logistic regressions on the features: one for moving points, one for static points and one for
 //! ground. They are fitted to labelled and simulated pairs (`benches/accuracy/confidence.rs`,
@@ -24,12 +25,21 @@ const STANDING: [f32; FEATURES] = [
 const GROUND: [f32; 2] = [5.792, -0.522];
 
 impl ConfidenceFeatures {
-    /// The 12 features of the regression, each of the order of one: the constant 1, the logarithmic
-    /// range, the residual, whether the target has no point there, the forward and the backward
-    /// cost of the cluster, one over the square root of its points, the cost reduction of a
-    /// rejected hypothesis, the share of the cluster assigned otherwise, the logarithm of its
-    /// length, the square of that, and its height. The size matters because cars are neither as
-    /// small as posts nor as large as walls.
+    /// The 12 inputs of the logistic regression, without units and scaled to the order of one. In
+    /// this order, with the fields of this type and lengths in metres:
+    ///
+    /// - the constant 1,
+    /// - `ln(1 + range_m / 10)`,
+    /// - `off_m / 0.1`,
+    /// - 1 if `hidden`, else 0,
+    /// - `forward_m / 0.1`,
+    /// - `backward_m / 0.1`,
+    /// - `1 / sqrt(points)`, with at least one point,
+    /// - `refused_m / 0.1`,
+    /// - `1 - together`,
+    /// - `ln(1 + extent_m[0])`,
+    /// - the square of that,
+    /// - `min(extent_m[1], 3) / 3`.
     pub fn features(&self) -> [f32; FEATURES] {
         /// Distance that is scaled to one, metres.
         const DISTANCE_M: f32 = 0.1;
@@ -54,18 +64,18 @@ impl ConfidenceFeatures {
     }
 
     /// The probability, 0 to 1, that the end-point error of the point's flow is below
-    /// [`CONFIDENT_WITHIN_M`]: a logistic regression on the features, with separate weights for moving
-    /// and static points. The weights are fitted by `benches/accuracy/confidence.rs`; see
-    /// `docs/experiments/confidence.md`.
+    /// [`CONFIDENT_WITHIN_M`]. It is a logistic regression on [`Self::features`], with separate
+    /// weights for moving and static points. The weights are fitted by
+    /// `benches/accuracy/confidence.rs`; see `docs/experiments/confidence.md`.
     pub fn confidence(&self) -> f32 {
         let weights = if self.moves { &MOVING } else { &STANDING };
         chance(weights, &self.features())
     }
 }
 
-/// The probability, 0 to 1, that the flow of a ground point is less than [`CONFIDENT_WITHIN_M`] off where it
-/// gets the ego motion alone. `range_m` is its horizontal distance from the origin of the target's
-/// frame, metres.
+/// The probability, 0 to 1, that the end-point error of a ground point is below
+/// [`CONFIDENT_WITHIN_M`]. The flow of the point is the ego motion alone. `range_m` is its
+/// horizontal distance from the origin of the target's frame, metres.
 pub fn confidence_of_ground(range_m: f32) -> f32 {
     chance(&GROUND, &[1.0, range(range_m)])
 }

@@ -9,16 +9,16 @@ use crate::flow::data::{DYNAMIC_M, OrientedBox, Point, RigidTransform, transform
 /// The clusters of a sweep of N rows.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Objects {
-    /// N indices into `clusters`, one a row; [`Objects::NONE`] where a row is in no cluster.
+    /// N indices into `clusters`, one for each row; [`Objects::NONE`] for rows in no cluster.
     pub cluster: Vec<i32>,
-    /// N confidences, 0 to 1: the probability that the flow of a row is less than [`super::CONFIDENT_WITHIN_M`]
-    /// off; zero where it has none.
+    /// N confidences, 0 to 1: the probability that the end-point error of a row's flow is below
+    /// [`super::CONFIDENT_WITHIN_M`]. Zero for rows without a flow.
     pub confidence: Vec<f32>,
     /// K clusters, in descending order of their number of points.
     pub clusters: Vec<Cluster>,
 }
 
-/// A set of points with one motion, or a static one.
+/// A cluster: a moving object with the fragments that share its motion, or a static set of points.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Cluster {
     /// Number of points.
@@ -26,14 +26,15 @@ pub struct Cluster {
     /// Whether it moves with respect to the world: its center's displacement, ego motion taken out,
     /// is at least 0.05 m horizontally.
     pub dynamic: bool,
-    /// Bounding box of its points in the source's frame, metres; along the motion where it moves.
+    /// Bounding box of its points in the source's frame, metres. Its length lies along the side
+    /// nearest to the motion, or along the longer side if the cluster is static.
     pub bounds: OrientedBox,
     /// Velocity of its center with the ego motion taken out, m/s along the axes of the source's
-    /// frame: the displacement over [`crate::flow::Options::dt_s`]. Zero where it is static.
+    /// frame: the displacement over [`crate::flow::Options::dt_s`]. Zero if it is static.
     pub velocity: Point,
-    /// Yaw rate about the vertical, rad/s, counterclockwise.
+    /// Yaw rate about the vertical, rad/s, positive counterclockwise. Zero if it is static.
     pub yaw_rate: f32,
-    /// Mean confidence of its points.
+    /// Mean confidence of its points, 0 to 1.
     pub confidence: f32,
 }
 

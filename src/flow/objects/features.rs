@@ -46,30 +46,39 @@ impl SearchedCluster {
     }
 }
 
-/// Confidence features of one source point.
+/// Confidence features of one source point: the evidence for and against its motion.
+///
+/// The point's cluster is its DBSCAN cluster if it is static. If it moves, it is the cluster whose
+/// motion it has, which may be a larger one beside it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ConfidenceFeatures {
-    /// Whether the point moves.
+    /// Whether the point has the motion of a moving object.
     pub moves: bool,
-    /// Horizontal distance from the origin of the target's frame, metres.
+    /// Horizontal distance of the point, ego motion taken out, from the origin of the target's
+    /// frame, metres.
     pub range_m: f32,
-    /// Residual: distance of the moved point from the target, metres, truncated.
+    /// Residual: distance of the point, moved by its motion, from the target, metres. At most
+    /// [`ObjectOptions::truncation_m`].
     pub off_m: f32,
-    /// Whether the target has no point near the moved point that it may match.
+    /// Whether the moved point has no match: no target point within [`ObjectOptions::match_m`], not
+    /// counting static matches of other clusters.
     pub hidden: bool,
-    /// Forward cost of the point's cluster: the mean of that distance over its points, metres.
+    /// Forward cost of the point's cluster, metres: the mean distance of the moved cluster from the
+    /// target.
     pub forward_m: f32,
-    /// Backward cost of the point's cluster: the mean distance from the target points around the
-    /// moved cluster to it, metres.
+    /// Backward cost of the point's cluster, metres: the mean distance of the target points around
+    /// the moved cluster from it.
     pub backward_m: f32,
-    /// Voxel-downsampled points of its cluster; zero where it is in no cluster.
+    /// Number of voxel-downsampled points of the point's cluster; zero if it is in none.
     pub points: usize,
-    /// Cost reduction of a hypothesis that was rejected, metres; zero where there was none.
+    /// Decrease of the forward plus backward cost by the cluster's rejected hypothesis, metres.
+    /// Zero if the point moves or there was no such hypothesis.
     pub refused_m: f32,
-    /// Share of its cluster that is assigned alike: moving, or static.
+    /// Share of the point's DBSCAN cluster, 0 to 1, that moves if the point moves, or is static if
+    /// the point is static. One for noise points.
     pub together: f32,
-    /// Length and height of its cluster, metres. The length is the larger extent along x or y. Zero
-    /// where it is in no cluster.
+    /// Length and height of the point's cluster, metres. The length is the larger of its extents
+    /// along x and y. Zero if the point is in no cluster.
     pub extent_m: [f32; 2],
 }
 

@@ -3,13 +3,15 @@
 
 use crate::flow::spatial::NOISE;
 
-/// The final clusters of a source, in descending order of their number of points.
+/// The final clusters of a source of N points: K clusters, in descending order of their number of
+/// points. A cluster is a moving object with the fragments assigned to it, or a static cluster.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ClusterLabels {
-    /// N indices, one a source point: its cluster, as an index into `motions`;
-    /// [`ClusterLabels::NONE`] where it is in no cluster.
+    /// N cluster indices, 0 to K - 1, one for each source point; [`ClusterLabels::NONE`] for a
+    /// point in no cluster. Points that were cut off from a moving object are in no cluster.
     pub of: Vec<u32>,
-    /// K entries, one a cluster: the index of its motion; none where it is static.
+    /// K entries, one for each cluster: the index of its motion among those of the moving objects;
+    /// none if the cluster is static.
     pub motions: Vec<Option<u32>>,
 }
 

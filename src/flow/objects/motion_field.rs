@@ -13,7 +13,10 @@ use crate::flow::spatial::{ColumnIndex, NOISE};
 /// default cluster radius, within which the points of one object lie of each other.
 const REACH_M: f32 = 0.5;
 
-/// Rigid motions, and the source points that have them or are static.
+/// The rigid motions of a pair's moving objects, as a field over space.
+///
+/// A position has the motion of the nearest downsampled source point, if that point moves and is
+/// within 0.5 m. All other positions are static.
 #[derive(Debug)]
 pub struct ObjectMotions {
     motions: Vec<PlanarMotion>,
@@ -60,8 +63,8 @@ impl ObjectMotions {
     }
 
     /// Residual flow at N `places`, N x 3 metres in the target's frame: the displacement in one
-    /// sweep interval beyond the ego motion. `places` are positions at the source's time, metres,
-    /// transformed to the target's frame by the ego motion. They need not be source points.
+    /// sweep interval beyond the ego motion. `places` (N x 3, metres) are positions at the source's
+    /// time, transformed to the target's frame by the ego motion. They need not be source points.
     pub fn residual_at(&self, places: &[Point]) -> Vec<Point> {
         places
             .par_iter()

@@ -34,32 +34,39 @@ pub struct SearchClouds<'a> {
     pub source: &'a [Point],
     /// M target points off the ground, all finite, in the target's frame.
     pub target: &'a [Point],
-    /// Neighbor sweeps of the sequence, nearest in time first.
+    /// Neighbor sweeps of the sequence in the target's frame, nearest in time first. Empty for a
+    /// pair alone.
     pub neighbors: &'a [AlignedSweep],
-    /// The raw source and target, each in its own frame, with ground and points out of range. The
-    /// frame's origin must be at the sensor or near it. They give the free-space evidence.
+    /// The complete source and target, each in its own frame, with the ground and the points that
+    /// are not searched. They give the free-space evidence, so the origin of each frame must be at
+    /// the sensor or near it.
     pub sweeps: [&'a [Point]; 2],
-    /// The ego motion; the identity where it is unknown.
+    /// The ego motion; the identity if it is unknown.
     pub target_from_source: RigidTransform,
 }
 
-/// The moving objects of a pair.
+/// The result of an object search on a pair of N source points.
 #[derive(Debug)]
 pub struct ObjectSearch {
-    /// Their motions.
+    /// The rigid motions of the moving objects, as a field over space.
     pub motions: ObjectMotions,
-    /// The final cluster of each source point.
+    /// The final cluster of each source point. Empty if the search was interrupted before or right
+    /// after the clustering.
     pub parts: ClusterLabels,
-    /// N confidence features, one set a source point.
+    /// N sets of confidence features, one for each source point. Empty if the search was
+    /// interrupted before or right after the clustering.
     pub evidence: Vec<ConfidenceFeatures>,
     /// Number of clusters that were searched.
     pub clusters: usize,
-    /// Number of all clusters.
+    /// Number of DBSCAN clusters; zero if the search was interrupted before or right after the
+    /// clustering.
     pub all_clusters: usize,
     /// Mean forward cost of the clusters that were searched, metres, each with its accepted motion
-    /// or at rest.
+    /// or at rest. Zero if none was searched; infinite if the search was interrupted before or
+    /// right after the clustering.
     pub cost_m: f64,
-    /// The reason why not all clusters were searched; none where all were.
+    /// Why not all clusters were searched; none if all were. [`Interrupt::Deadline`] also stands
+    /// for too little time left before the deadline.
     pub interrupted: Option<Interrupt>,
 }
 

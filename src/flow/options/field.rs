@@ -4,8 +4,8 @@ use crate::flow::distance::DistanceOptions;
 
 /// Options of the fit of a neural field to one pair.
 ///
-/// The field is a ReLU MLP with 8 hidden layers, from a point to its displacement. Adam minimizes
-/// the mean distance of the displaced source points to the target (FNSF Section 3).
+/// The field is a ReLU MLP with 8 hidden layers of 128 features, from a point to its displacement.
+/// Adam minimizes the mean loss of the displaced source points (FNSF Section 3).
 #[derive(Clone, Debug, PartialEq)]
 pub struct FieldOptions {
     /// Distance transform of the target, from which the loss takes its distances. A smaller cell is
@@ -21,20 +21,22 @@ pub struct FieldOptions {
     pub learning_rate: f32,
     /// Schedule of the learning rate over the iterations.
     pub learning_rate_schedule: LearningRateSchedule,
-    /// Points per iteration (batch size); none for all points. The points are shuffled once and cut
-    /// into nearly equal batches, which are used in turn. Larger batches give less noisy gradients
-    /// at a proportionally higher cost per iteration.
+    /// Points per iteration (batch size), at least 1; none for all points. The points are shuffled
+    /// once and cut into nearly equal batches, which are used in turn. Larger batches give less
+    /// noisy gradients at a proportionally higher cost per iteration.
     pub batch: Option<usize>,
     /// Which iteration's parameters become the result.
     pub result: ResultChoice,
     /// Early stopping before `max_iterations`; none to do all iterations.
     pub early_stop: Option<EarlyStopOptions>,
     /// Maximum number of iterations. The cosine schedule reaches a learning rate of zero there.
+    /// Under a deadline the same work may be divided into more iterations of smaller batches.
     pub max_iterations: usize,
     /// Floating-point precision of the network's matrix products during the fit.
     pub precision: Precision,
-    /// Warm start: in a sequence, the fit of a pair starts from the field of the previous pair.
-    /// With none, each pair starts from new weights and is independent of the others.
+    /// Warm start: in a sequence, the fit of a pair starts from the field of the previous pair, and
+    /// the registration from its ego motion. With none, each pair starts from new weights and is
+    /// independent of the others.
     pub warm_start: Option<WarmStart>,
 }
 
@@ -94,8 +96,8 @@ impl FieldOptions {
         }
     }
 
-    /// Number of iterations that a run usually takes: all of them without early stopping, otherwise
-    /// at most 60. The published stopping rule ends runs after 36 to 115.
+    /// Number of iterations that a fit without a deadline usually takes: all of them without early
+    /// stopping, otherwise at most 60. The published stopping rule ends fits after 36 to 115.
     pub fn expected_iterations(&self) -> usize {
         match self.early_stop {
             None => self.max_iterations,
@@ -186,8 +188,9 @@ pub struct LossOptions {
     /// gradient, so that points without a counterpart in the target do not pull on the field. A
     /// larger value admits counterparts farther away.
     pub truncation_m: Option<f32>,
-    /// Weight of the length of the displacement, metres of loss per metre of flow. It keeps the
-    /// field at zero where the distance has no gradient. Larger values shorten all displacements.
+    /// Weight of the length of the displacement, metres of loss per metre of flow. Lengths below 1
+    /// mm count quadratically. The penalty keeps the field at zero where the distance has no
+    /// gradient. Larger values shorten all displacements.
     pub flow_penalty: f32,
 }
 
@@ -199,7 +202,7 @@ pub enum InputNormalization {
     Raw,
     /// The mean of the cloud is subtracted, and the coordinates are divided by `scale_m`.
     Centered {
-        /// Length that becomes one, metres.
+        /// Length that becomes one, metres; above zero.
         scale_m: f32,
     },
 }
@@ -216,16 +219,17 @@ pub enum Start {
 /// Schedule of the learning rate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LearningRateSchedule {
-    /// Constant.
+    /// The initial learning rate at every iteration.
     Constant,
-    /// Half a cosine, from the initial value to zero at `max_iterations`.
+    /// Half a cosine, from the initial learning rate to zero at `max_iterations`.
     Cosine,
 }
 
 /// Which iteration's parameters become the result.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum ResultChoice {
-    /// Those of the iteration with the lowest loss.
+    /// Those of the iteration with the lowest loss. As in the published code, the iteration at
+    /// which early stopping ends the fit does not count.
     Best,
     /// The exponential moving average of the parameters over the iterations.
     Average {
@@ -252,7 +256,7 @@ impl Precision {
     /// All precisions.
     pub const ALL: [Self; 2] = [Self::F32, Self::F16];
 
-    /// The name used by the command line and the service.
+    /// The name used by the command line and the service: `f32` or `f16`.
     pub fn name(self) -> &'static str {
         match self {
             Self::F32 => "f32",
@@ -261,11 +265,13 @@ impl Precision {
     }
 }
 
-/// Early stopping, as in the published code. A fit ends after `patience` iterations in which the
-/// loss was never more than `min_delta_m` below the best loss so far.
+/// Early stopping, as in the published code. An iteration is progress if its mean loss is more than
+/// `min_delta_m` below that of the last progress; the first iteration counts as progress. A fit
+/// ends after `patience` successive iterations without progress.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EarlyStopOptions {
-    /// Iterations without progress before the fit ends. Larger values give longer fits.
+    /// Successive iterations without progress that end the fit, at least 1. Larger values give
+    /// longer fits.
     pub patience: usize,
     /// Decrease of the mean loss that counts as progress, metres. Larger values end the fit
     /// earlier.

@@ -4,23 +4,24 @@
 ///
 /// The stages, in order: DBSCAN clustering, voxel downsampling, Hough voting over translations for
 /// initial guesses, a Gauss-Newton fit of a planar motion, acceptance tests, and the assignment of
-/// small clusters and single points to moving objects. All distances are measured after the ego
-/// motion has been taken out. `docs/experiments/objects.md` measures the effect of the choices.
+/// motions to small clusters and single points beside moving objects. All distances are measured
+/// after the ego motion has been taken out. `docs/experiments/objects.md` measures the effect of
+/// the choices.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ObjectOptions {
     /// DBSCAN radius, metres: points within it of a core point join its cluster. Larger values
     /// merge neighboring objects, smaller ones split sparse objects.
     pub cluster_radius_m: f32,
-    /// Points within `cluster_radius_m`, the point itself included, that make a point a DBSCAN core
-    /// point. Raising it turns sparse points into noise. Clusters with fewer voxel-downsampled
-    /// points get no motion search.
+    /// Least number of points within `cluster_radius_m`, the point itself included, that make a
+    /// point a DBSCAN core point. Raising it turns sparse points into noise. Clusters with fewer
+    /// voxel-downsampled points get no motion search.
     pub cluster_min_points: usize,
     /// Voxel size of the downsampling of both clouds, metres: one point per voxel is kept. Larger
     /// values are faster and coarser.
     pub voxel_m: f32,
     /// Radius of the neighborhood of a target normal: `[base, slope]`, metres and metres per metre
-    /// of range. It is limited to `match_m`. Larger values give normals to sparser points and
-    /// smooth small surfaces.
+    /// of horizontal range. It is limited to `match_m`. Larger values give normals to sparser
+    /// points and smooth small surfaces.
     pub normal_m: [f32; 2],
     /// Factor on height differences in nearest-neighbor searches, and in the distance to a target
     /// point except along its normal. Below 1, because the rings of a lidar are farther apart than
@@ -30,14 +31,15 @@ pub struct ObjectOptions {
     /// point without a target point within it costs `truncation_m`. It is also the distance up to
     /// which a cluster or point counts as adjacent to a moving object.
     pub match_m: f32,
-    /// Static match distance, metres. A cluster is static if nine in ten of its points lie within
-    /// it of the target. The target points within it of a static cluster then belong to that
-    /// cluster, and no other cluster is matched to them. Larger values exclude more of the target.
+    /// Static match distance, metres, with heights scaled by `height_weight`. A cluster counts as
+    /// clearly static if nine in ten of its points lie within it of the target. The target points
+    /// within it of such a cluster then belong to that cluster, and no other cluster is matched to
+    /// them. Larger values exclude more of the target.
     pub static_match_m: f32,
     /// Weight of the full offset `d` to a target point, relative to its component along the normal
     /// `n`. The distance is `sqrt((n.d)^2 + (tangential_weight * |d|)^2)`, with heights in `|d|`
-    /// scaled by `height_weight`. 0 is point to plane; larger values constrain sliding along a
-    /// surface more.
+    /// scaled by `height_weight`. It is `|d|` where there is no normal. 0 is point to plane; larger
+    /// values constrain sliding along a surface more.
     pub tangential_weight: f32,
     /// Truncation of the distance of a point to its match, metres. It limits the cost of points
     /// without a counterpart, such as occluded ones.
@@ -61,8 +63,8 @@ pub struct ObjectOptions {
     /// A cluster is static, and its search is skipped, if its mean distance to the target without
     /// motion is below this, metres. Larger values save time and miss slow objects.
     pub static_fit_m: f32,
-    /// Acceptance: minimum displacement of the cluster's center, metres per sweep interval. Shorter
-    /// motions are rejected as static.
+    /// Acceptance: minimum displacement of the cluster's center, metres per sweep interval.
+    /// Clusters with a shorter motion are static.
     pub min_motion_m: f32,
     /// Acceptance: minimum decrease of the cluster's mean distance to the target, metres. The
     /// search also ends early where no fit reaches it.
@@ -71,16 +73,16 @@ pub struct ObjectOptions {
     /// the mean distance of the cluster to the target plus that of the target around it to the
     /// cluster, averaged with the neighbor sweeps. Smaller values are stricter.
     pub max_cost_ratio: f32,
-    /// Acceptance: minimum evidence of a motion, metres. The evidence is the decrease of the cost,
-    /// summed over the pair and the neighbor sweeps, times the number of voxel-downsampled points
-    /// of the cluster. Larger values reject small clusters.
+    /// Acceptance: minimum evidence of a motion, metres times points. The evidence is the decrease
+    /// of the cost, summed over the pair and the neighbor sweeps, times the number of
+    /// voxel-downsampled points of the cluster. Larger values reject small clusters.
     pub min_evidence_m: f32,
-    /// Additional minimum evidence per metre of displacement, metres per metre. A longer
-    /// displacement has more surfaces that it can match by mistake.
+    /// Additional minimum evidence per metre of displacement, metres times points per metre. A
+    /// longer displacement has more surfaces that it can match by mistake.
     pub min_evidence_slope: f32,
-    /// Acceptance: maximum mean distance of the moved cluster to the target, metres. Also the
-    /// largest such distance, with the motion or without it, at which a neighbor sweep contributes
-    /// evidence.
+    /// Acceptance: maximum mean distance of the moved cluster to the target, metres. A neighbor
+    /// sweep contributes evidence only if the mean distance of the cluster to it, moved or not, is
+    /// at most this.
     pub max_residual_m: f32,
     /// Acceptance: minimum observability, the mean square of the matched normals' component along
     /// the motion, 0 to 1. A wall that slides in its own plane has 0. A target point without a
@@ -91,28 +93,28 @@ pub struct ObjectOptions {
     /// the vacated positions that rays of the target passed through, and also of the newly occupied
     /// positions that rays of the source passed through. Larger values demand more evidence.
     pub min_free_space: f32,
-    /// Minimum sum of the two shares of free-space evidence. Below it the cluster counts as static:
-    /// a motion of at least 0.4 m plus 0.02 m per metre of range is rejected, and a shorter one is
-    /// rejected if only neighbor evidence replaces the observability. Ignored where the shares are
-    /// unknown. Larger values reject more.
+    /// Minimum sum of the two shares of free-space evidence, 0 to 2. Below it the cluster counts as
+    /// static: a motion of at least 0.4 m plus 0.02 m per metre of range is rejected, and a shorter
+    /// one is rejected if only neighbor evidence replaces the observability. Ignored where one of
+    /// the shares is unknown. Larger values reject more.
     pub min_free_space_far: f32,
     /// Assignment: maximum ratio of the cost with the motion of an adjacent moving object to the
-    /// cost without it. A cluster without a motion, or a noise point, below this ratio gets that
-    /// motion. Larger values let moving objects absorb more.
+    /// cost without it. A noise point below this ratio gets that motion, and so does a cluster
+    /// without a motion if the object is larger. Larger values let moving objects absorb more.
     pub adjacent_cost_ratio: f32,
-    /// Assignment: a point of a moving object is cut off if the motion increases its distance to
-    /// the target by more than this, metres. The increase is averaged over the points of its
+    /// Assignment: a point of a moving object becomes static if the motion increases its distance
+    /// to the target by more than this, metres. The increase is averaged over the points of its
     /// cluster within 0.3 m. Larger values keep more points.
     pub point_reject_m: f32,
     /// Acceptance: number of voxel-downsampled points from which a cluster thinner than
     /// `ground_thickness_m` is rejected as ground that the segmentation missed.
     pub ground_min_points: usize,
-    /// Height range, metres, between the 5th and the 95th percentile. See `ground_min_points`.
-    /// Larger values reject more flat clusters.
+    /// Acceptance: minimum height range, metres, between the 5th and the 95th percentile of a
+    /// cluster with `ground_min_points` points or more. Larger values reject more flat clusters.
     pub ground_thickness_m: f32,
     /// Number of sweeps in the window: the pair's two, plus neighbor sweeps of its sequence where
-    /// they exist. More sweeps give more evidence, cost time, and delay the result in a sequence.
-    /// Neighbor sweeps require an ego motion.
+    /// they exist. Values below 2 count as 2. More sweeps give more evidence, cost time, and delay
+    /// the result in a sequence. Without an ego motion no neighbor sweeps are used.
     pub sweeps: usize,
     /// Neighbor evidence that replaces `min_observability`: maximum ratio of the cost with the
     /// motion to the cost without it. It must hold in the neighbor sweep nearest in time and in all

@@ -10,12 +10,12 @@ pub const DEFAULT_DT_S: f32 = 0.1;
 /// Options of one estimate. Start from a [`super::Preset`] and change single values.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {
-    /// Seed of all random choices (weights, sampling, batches). The same seed gives bit-identical
-    /// results.
+    /// Seed of all random choices (weights, sampling, batches). Without a deadline, the same seed
+    /// gives bit-identical results on the same device.
     pub seed: u64,
-    /// Number of points sampled from each cloud after the crop and the ground removal; none for
-    /// all. A field is fitted to the sampled points only. The object search uses all points, and
-    /// only the sampled source points get a flow.
+    /// Maximum number of points sampled from each cloud after the crop and the ground removal; none
+    /// for all. Only the sampled source points get a flow. A field is fitted to the sampled points
+    /// only. The object search uses all points.
     pub max_points: Option<usize>,
     /// Half the side of the square crop around the sensor, metres: points with `|x|` or `|y|`
     /// beyond it are excluded. None for no crop.
@@ -42,7 +42,7 @@ pub enum Method {
 
 impl Options {
     /// Window size: the number of sweeps that an estimate uses where a sequence has them, at least
-    /// the two of the pair. It is 2 for a field, and for objects without an ego motion.
+    /// the two of the pair. It is 2 for a field, and for objects with [`Ego::Off`].
     pub fn sweeps(&self) -> usize {
         match &self.method {
             Method::Objects(objects) if self.ego != Ego::Off => objects.sweeps.max(2),
@@ -58,7 +58,7 @@ impl Options {
         }
     }
 
-    /// Mutable access to [`Self::field`].
+    /// Mutable access to the options of the field fit; none for objects.
     pub fn field_mut(&mut self) -> Option<&mut FieldOptions> {
         match &mut self.method {
             Method::Field(field) => Some(field),
@@ -75,19 +75,20 @@ impl Options {
     }
 }
 
-/// Handling of ground points.
+/// Handling of ground points by the method. The registration uses them in every case.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ground {
-    /// Ground points take part like all other points.
+    /// Ground points take part like all other points. Ground masks are ignored.
     Keep,
-    /// Points of the problem's ground masks are excluded and get no flow.
+    /// Points of the problem's ground masks are excluded and get no flow. Without masks the
+    /// estimate fails.
     Mask,
     /// Points of the problem's ground masks are excluded. Without masks, those of
     /// [`crate::flow::ground::segment()`] are.
     ///
     /// They get the ego-motion flow if the ego motion is separated and no points are sampled,
     /// otherwise no flow. If fewer than [`crate::flow::MIN_POINTS`] other points remain in a cloud,
-    /// ground takes part.
+    /// the ground of both clouds takes part.
     Auto,
 }
 
@@ -96,8 +97,9 @@ pub enum Ground {
 pub enum Ego {
     /// Not separated: the method estimates the full motion.
     Off,
-    /// Estimated by registration; the method estimates the residual motion.
+    /// Estimated by registration. The method estimates the residual motion.
     Auto,
-    /// Given as target_from_source; the method estimates the residual motion.
+    /// Given as target_from_source, without a registration of the pair. The method estimates the
+    /// residual motion.
     Given(RigidTransform),
 }

@@ -21,7 +21,7 @@ impl Preset {
     /// All presets.
     pub const ALL: [Self; 4] = [Self::Default, Self::Label, Self::Neural, Self::Paper];
 
-    /// The name used by the command line and the service.
+    /// The name used by the command line and the service: `default`, `label`, `neural` or `paper`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Default => "default",
@@ -42,10 +42,10 @@ impl Preset {
         Self::ALL.into_iter().filter(|preset| preset.fits_field())
     }
 
-    /// The options of the preset.
+    /// The options of the preset, with `max_points` as [`Options::max_points`].
     ///
-    /// With `max_points` the presets that fit a field sample the clouds first. `paper` then uses
-    /// the published settings for sampled clouds instead of those for full clouds.
+    /// With `max_points`, `paper` has the published settings for sampled clouds instead of those
+    /// for full clouds.
     pub fn options(self, max_points: Option<usize>) -> Options {
         let method = match self {
             Self::Default => Method::Objects(ObjectOptions::default()),

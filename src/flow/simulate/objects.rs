@@ -15,7 +15,7 @@ pub(super) const LANE_M: f64 = 1.75;
 /// Spacing of the cars in a lane, metres.
 const SPACING_M: f64 = 14.0;
 
-/// Type of an object.
+/// Type of an object of a simulated street.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// A car, parked or driving.

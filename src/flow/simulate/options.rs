@@ -2,7 +2,7 @@
 //!
 //! Sizes are checked before any memory is allocated.
 
-/// Time between sweeps, seconds.
+/// Time between consecutive sweeps of a simulated street, seconds.
 pub const SWEEP_SECONDS: f64 = 0.1;
 
 /// Maximum number of rays per sweep.
@@ -11,7 +11,8 @@ const MAX_RAYS: usize = 1 << 20;
 /// the houses.
 const MIN_RADIUS_M: f64 = 40.0;
 
-/// Options of a simulated street.
+/// Options of a simulated street. `beams` times `azimuth_steps`, the rays of a sweep, must not
+/// exceed 1,048,576.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StreetOptions {
     /// Seed of all random choices. The same seed gives the same street.
@@ -21,20 +22,22 @@ pub struct StreetOptions {
     /// Number of lasers, 1 to 256, between 2 degrees up and 24.8 degrees down, denser in the upper
     /// half.
     pub beams: usize,
-    /// Azimuth steps per turn, 16 to 8,192.
+    /// Number of azimuth steps per turn, 16 to 8,192.
     pub azimuth_steps: usize,
-    /// Number of moving cars, cyclists and pedestrians, at most 256.
+    /// Number of moving cars, cyclists and pedestrians, 0 to 256.
     pub movers: usize,
-    /// Forward speed of the ego vehicle, 0 to 40 m/s; drawn from the seed if none.
+    /// Forward speed of the ego vehicle, 0 to 40 m/s; drawn from the seed if none, 5 to 11 m/s.
     pub speed_mps: Option<f64>,
-    /// Yaw rate at the first sweep, rad/s, positive to the left; drawn from the seed if none. The
-    /// street winds, so the rate changes afterwards. The curve radius must be at least 40 m.
+    /// Yaw rate of the ego vehicle at the first sweep, -1 to 1 rad/s, positive to the left; drawn
+    /// from the seed if none. The curve radius, speed over yaw rate, must be at least 40 m, so a
+    /// standing vehicle has a yaw rate of zero. The street winds, so the rate changes afterwards.
     pub yaw_rate_rps: Option<f64>,
     /// Standard deviation of the range noise of each return, 0 to 1 m.
     pub range_noise_m: f64,
     /// Standard deviation of the constant range error of each laser, 0 to 1 m.
     pub beam_bias_m: f64,
-    /// Factor on the loss probability of far and grazing returns, 0 (no loss) to 1.
+    /// Factor on the probability that a return is lost, 0 (no loss) to 1. Far and grazing returns
+    /// are lost more often.
     pub dropout: f64,
 }
 
@@ -55,13 +58,13 @@ impl Default for StreetOptions {
     }
 }
 
-/// The reason why a street or a sweep of it was rejected.
+/// Why the options of a street, or the index of a sweep, were rejected.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum StreetError {
     /// An option is out of range or not a number.
     #[error("{name} must lie between {low} and {high}, not {value}")]
     OutOfRange {
-        /// The option.
+        /// Name of the option.
         name: &'static str,
         /// Its value.
         value: f64,
@@ -78,11 +81,11 @@ pub enum StreetError {
         /// Maximum rays per sweep.
         limit: usize,
     },
-    /// The street does not have this sweep, or not the one after it.
-    #[error("frame {frame} of a street of {sweeps} sweeps")]
-    ReferenceTimeOutOfRange {
-        /// The requested sweep.
-        frame: usize,
+    /// The street has no sweep with this index.
+    #[error("sweep {index} of a street of {sweeps} sweeps")]
+    NoSuchSweep {
+        /// The requested index, from 0.
+        index: usize,
         /// Number of sweeps of the street.
         sweeps: usize,
     },

@@ -22,7 +22,11 @@ const EGO_STAND_M: [f64; 2] = [2.7, 1.6];
 /// Minimum residual displacement of a dynamic point, metres per sweep interval.
 const DYNAMIC_M: f64 = 0.05;
 
-/// A simulated street.
+/// A simulated street with traffic, scanned by a spinning lidar on an ego vehicle that drives along
+/// it.
+///
+/// The exact motion of every point is known. Times are counted in sweep intervals of
+/// [`SWEEP_SECONDS`] since the first sweep. The options determine all data.
 #[derive(Debug)]
 pub struct Street {
     sweeps: usize,
@@ -34,10 +38,10 @@ pub struct Street {
     lidar: Lidar,
 }
 
-/// One sweep of N points in the sensor's frame.
+/// One sweep of N points in the sensor's frame, taken at one instant.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StreetSweep {
-    /// Index of the sweep.
+    /// Index of the sweep in the street, from 0.
     pub index: usize,
     /// N points, metres, sensor frame: x forward, y left, z up, the ground near z = -1.73.
     pub points: Vec<Point>,
@@ -46,7 +50,7 @@ pub struct StreetSweep {
     pub object: Vec<i32>,
     /// N flags: true for ground points.
     pub ground: Vec<bool>,
-    /// Pose of the sensor.
+    /// Pose of the sensor: the transform from its frame to that of the world, metres, z up.
     pub world_from_sensor: RigidTransform,
 }
 
@@ -59,11 +63,12 @@ pub struct SimulatedPair {
     pub target: Vec<Point>,
     /// True flow, N x 3 metres per sweep interval, ego motion included.
     pub flow: Vec<Point>,
-    /// Points that move 0.05 m or more relative to the static world.
+    /// N flags: true for points that move 0.05 m or more per sweep interval relative to the static
+    /// world.
     pub dynamic: Vec<bool>,
-    /// Points on cars, cyclists and pedestrians, parked or moving.
+    /// N flags: true for points on cars, cyclists and pedestrians, parked or moving.
     pub foreground: Vec<bool>,
-    /// Object index of each source point, as in [`StreetSweep::object`].
+    /// N object indices, one for each source point, as in [`StreetSweep::object`].
     pub object: Vec<i32>,
     /// N flags: true for source points on the ground.
     pub ground_source: Vec<bool>,
@@ -74,10 +79,12 @@ pub struct SimulatedPair {
 }
 
 impl Street {
-    /// Builds the street. Sweeps are computed on demand.
+    /// Builds the street. Its sweeps are computed on demand.
     ///
     /// # Errors
-    /// An option that is not a number, out of range or too large.
+    /// - [`StreetError::OutOfRange`] if an option is not a number or out of its range. The yaw rate
+    ///   is out of range if the curve radius is below 40 m.
+    /// - [`StreetError::TooManyRays`] if a sweep has more than 1,048,576 rays.
     pub fn new(options: &StreetOptions) -> Result<Self, StreetError> {
         options.validate()?;
         let mut random = Random::new(options.seed);
@@ -104,16 +111,17 @@ impl Street {
         self.sweeps
     }
 
-    /// Type of an object; none for the static world and for indices without an object.
+    /// Type of the object with an index as in [`StreetSweep::object`]; none for -1, and for indices
+    /// without an object.
     pub fn kind(&self, object: i32) -> Option<Kind> {
         self.object(object).map(|object| object.kind)
     }
 
-    /// Computes one sweep. The result is bit-identical for any order of calls and number of
-    /// threads.
+    /// Computes the sweep with this index, from 0. The result is bit-identical for any order of
+    /// calls and number of threads.
     ///
     /// # Errors
-    /// A sweep that the street does not have.
+    /// [`StreetError::NoSuchSweep`] if the street has no sweep with this index.
     pub fn sweep(&self, index: usize) -> Result<StreetSweep, StreetError> {
         self.check_sweep(index)?;
         let world_from_sensor = self.pose(index as f64);
@@ -130,11 +138,12 @@ impl Street {
         })
     }
 
-    /// True depth at the time of a sweep, seen by a camera mounted next to the lidar, up to 120 m,
-    /// without noise and loss.
+    /// True depth image at the time of a sweep, without noise and loss. The camera is mounted at
+    /// [`Camera::camera_from_lidar`] relative to the lidar. Pixels without a surface within 120 m
+    /// have no depth.
     ///
     /// # Errors
-    /// A sweep that the street does not have.
+    /// [`StreetError::NoSuchSweep`] if the street has no sweep with this index.
     pub fn depth(&self, index: usize, camera: &Camera) -> Result<DepthImage, StreetError> {
         self.check_sweep(index)?;
         let world_from_camera = self.pose(index as f64) * camera.camera_from_lidar().inverse();
@@ -147,20 +156,20 @@ impl Street {
         ))
     }
 
-    /// Flow of the points of a sweep to the time of the next one, N x 3 metres: the later position
-    /// in the later sensor frame, minus the position in the sweep. The last sweep has a flow as
-    /// well.
+    /// True flow of the points of the sweep with this index to the time of the next one, N x 3
+    /// metres: the later position in the later sensor frame, minus the position in the sweep. The
+    /// last sweep has a flow as well.
     ///
     /// # Errors
-    /// A sweep that the street does not have.
+    /// [`StreetError::NoSuchSweep`] if the street has no sweep with this index.
     pub fn flow(&self, index: usize) -> Result<Vec<Point>, StreetError> {
         Ok(self.flow_of(&self.sweep(index)?))
     }
 
-    /// A sweep, the next one, and their ground truth.
+    /// The sweeps `index` and `index + 1`, and their ground truth.
     ///
     /// # Errors
-    /// One of the two is a sweep that the street does not have.
+    /// [`StreetError::NoSuchSweep`] if the street lacks one of the two sweeps.
     pub fn pair(&self, index: usize) -> Result<SimulatedPair, StreetError> {
         let source = self.sweep(index)?;
         let target = self.sweep(index + 1)?;
@@ -189,7 +198,10 @@ impl Street {
         if frame < sweeps {
             Ok(())
         } else {
-            Err(StreetError::ReferenceTimeOutOfRange { frame, sweeps })
+            Err(StreetError::NoSuchSweep {
+                index: frame,
+                sweeps,
+            })
         }
     }
 
@@ -197,9 +209,11 @@ impl Street {
         self.flow_to(frame, (frame.index + 1) as f64)
     }
 
-    /// Flow of the points of a sweep to the time `at`, in sweep intervals since the first sweep, N
-    /// x 3 metres: the position at that time in the sensor frame of that time, minus the position
-    /// in the sweep. `at` may lie between sweeps or before the sweep.
+    /// True flow of the points of `frame`, a sweep of this street, to the time `at`. The time is in
+    /// sweep intervals since the first sweep, and may lie between sweeps or before `frame`.
+    ///
+    /// The result is N x 3 metres: the position at that time in the sensor frame of that time,
+    /// minus the position in the sweep.
     pub fn flow_to(&self, frame: &StreetSweep, at: f64) -> Vec<Point> {
         let now = frame.world_from_sensor;
         let next_from_world = self.pose(at).inverse();
@@ -226,7 +240,8 @@ impl Street {
             .collect()
     }
 
-    /// Pose of the sensor, `world_from_sensor`, at a time in sweep intervals since the first sweep.
+    /// Pose of the sensor, `world_from_sensor` in metres, at a time in sweep intervals since the
+    /// first sweep.
     pub fn pose(&self, at: f64) -> RigidTransform {
         let x = self.terrain.advance(0.0, self.speed * seconds(at));
         let place = self.terrain.place(x, -LANE_M);

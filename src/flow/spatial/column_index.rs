@@ -87,7 +87,7 @@ impl ColumnIndex {
         &self,
         center: Point,
         within_m: f32,
-        seen: &mut EarlyStopState,
+        seen: &mut VisitedRows,
         mut see: impl FnMut(u32),
     ) {
         self.columns_within(center, within_m, |mut places| {
@@ -122,8 +122,8 @@ impl ColumnIndex {
     }
 
     /// The empty set of visited points.
-    pub(crate) fn unseen(&self) -> EarlyStopState {
-        EarlyStopState(vec![0; self.points.len().div_ceil(64)])
+    pub(crate) fn unseen(&self) -> VisitedRows {
+        VisitedRows(vec![0; self.points.len().div_ceil(64)])
     }
 
     /// Calls `see` with every point of the columns that touch the square of half side `half_m`
@@ -210,9 +210,9 @@ impl ColumnIndex {
 }
 
 /// The set of visited points of a [`ColumnIndex`], one bit a point, in the index's order.
-pub(crate) struct EarlyStopState(Vec<u64>);
+pub(crate) struct VisitedRows(Vec<u64>);
 
-impl EarlyStopState {
+impl VisitedRows {
     #[inline]
     fn add(&mut self, place: usize) {
         self.0[place / 64] |= 1 << (place % 64);

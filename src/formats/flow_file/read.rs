@@ -14,12 +14,21 @@ use crate::formats::pcd::Pcd;
 use crate::formats::ply::Ply;
 use crate::formats::sniff::recognize;
 
-/// Reads back a flow in any of the formats that [`super::write_flow`] writes, recognized by content;
-/// also a pair's `.npz` with `flow` and Argoverse 2's `.feather`.
+/// Reads a flow in any of the formats that [`super::write_flow`] writes. Also reads `flow` of a
+/// pair's `.npz`, and Argoverse 2's `.feather`. The format is recognized by content. A file with at
+/// most [`MAX_POINTS`] rows is accepted, except for JSON, which has no limit.
 ///
 /// # Errors
-/// As for a cloud, `RowCount` where the columns differ in length, and `Malformed` for the index of
-/// a cluster that does not exist.
+/// - `Unrecognized` and `Ambiguous` as for [`recognize`].
+/// - `Malformed` for a file that violates its format or is truncated. Also for a cluster index that
+///   is not a whole number of 32 bits or has no cluster, and for a confidence outside of 0 to 1.
+/// - `Unsupported` for a file that holds a cloud, and for arrays or columns of another type or
+///   shape.
+/// - `Missing` where the flow, or a part of the clusters, is missing.
+/// - `NotFinite` and `OutOfRange` for a displacement or other number that is not finite or over 1e6
+///   in magnitude.
+/// - `TooLarge` for too many rows, or a compressed file that unfolds to far more than its size.
+/// - `RowCount` where the columns differ in length.
 pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatError> {
     let file = match recognize(bytes, name)? {
         FileKind::Npy => FlowFile {

@@ -16,11 +16,11 @@ pub struct FlowTable<'a> {
     /// N displacements from the source sweep's time to the target's, metres, ego motion included.
     /// Finite in every row.
     pub flow: &'a [Point],
-    /// N flags: whether the row has a flow. Rows without one are zero.
+    /// N flags: whether the row has a flow. The displacement of a row without one is zero.
     pub valid: &'a [bool],
     /// N flags: whether the point moves relative to the static world, where known.
     pub dynamic: Option<&'a [bool]>,
-    /// The clusters of the points and the confidence of their flow, where known.
+    /// The clusters of the N points, and the confidence of their flow, where known.
     pub objects: Option<&'a Objects>,
     /// The ego motion `target_from_source`, where known.
     pub ego: Option<&'a RigidTransform>,
@@ -35,9 +35,9 @@ pub struct FlowFile {
     pub valid: Option<Vec<bool>>,
     /// N flags: whether the point moves relative to the static world.
     pub dynamic: Option<Vec<bool>>,
-    /// N indices of clusters; negative where a point is in none.
+    /// N indices into `clusters`; negative where a point is in none.
     pub cluster: Option<Vec<i32>>,
-    /// N probabilities, 0 to 1, that the row's flow is right, within 0.05 m.
+    /// N probabilities, 0 to 1, that the row's flow is less than 0.05 m off.
     pub confidence: Option<Vec<f32>>,
     /// The K clusters; only npz and JSON contain them.
     pub clusters: Option<Vec<Cluster>>,

@@ -15,28 +15,30 @@ use crate::formats::sniff::ending;
 use crate::formats::{feather, npy, pcd, ply};
 use crate::picture::{INVALID_COLOR, color, full_scale, shown_motion};
 
-/// The formats that flow is written in.
+/// The formats that flow is written in. Displacements are in metres. `dynamic`, `ego`, `cluster`,
+/// `confidence` and the clusters are written only where they are known.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum FlowFormat {
-    /// `flow` N x 3 float32 and `valid` bool; where known, `dynamic` bool and `ego` 4 x 4 float64.
-    /// With objects, `cluster` int32 and `confidence` float32, and the clusters themselves with K
-    /// rows each: `clusters_points` uint32, `clusters_dynamic` bool; `clusters_center` (metres),
+    /// `flow` N x 3 float32, `valid` and `dynamic` bool, `ego` 4 x 4 float64 (`target_from_source`,
+    /// row by row), `cluster` int32, `confidence` float32. The clusters have K rows each:
+    /// `clusters_points` uint32, `clusters_dynamic` bool; `clusters_center` (metres),
     /// `clusters_size` (length, width, height in metres) and `clusters_velocity` (m/s), K x 3
     /// float32; `clusters_yaw` (radians), `clusters_yaw_rate` (rad/s) and `clusters_confidence`,
     /// float32.
     Npz,
     /// The displacements alone, N x 3 float32.
     Npy,
-    /// Argoverse 2's columns and `is_valid`, `is_dynamic`, `cluster`, `confidence`. Float32, so
-    /// there is no rounding. Argoverse 2 accepts float16 too, which would round 1 m to half a
-    /// millimetre.
+    /// Argoverse 2's columns `flow_tx_m`, `flow_ty_m` and `flow_tz_m`, and `is_valid`,
+    /// `is_dynamic`, `cluster`, `confidence`. LZ4-compressed. Displacements are float32; Argoverse
+    /// 2 also accepts float16, which would round 1 m to half a millimetre.
     Feather,
-    /// Points with `flow_x`, `flow_y`, `flow_z`, `valid`, `dynamic`, `cluster`, `confidence`, and a
-    /// color by direction of motion.
+    /// Binary little endian: source points x y z, `flow_x`, `flow_y`, `flow_z`, `valid`, `dynamic`,
+    /// `cluster`, `confidence`, and a color by direction of motion.
     Ply,
-    /// As PLY, with the color packed into `rgb`.
+    /// Binary, with the fields of PLY; the color is packed into `rgb`.
     Pcd,
-    /// An object with `flow`, `valid`, `dynamic`, `ego`, `cluster`, `confidence`, `clusters`.
+    /// An object with `flow`, `valid`, `dynamic`, `ego` (null where unknown), `cluster`,
+    /// `confidence`, `clusters`.
     Json,
 }
 
@@ -100,8 +102,10 @@ impl FlowFormat {
 /// Writes a flow of N rows.
 ///
 /// # Errors
-/// `RowCount` where the table's parts differ in length. `NotFinite` or `OutOfRange` for a
-/// displacement that could not be read back. `Write` and `Encode` where writing fails.
+/// - `RowCount` where the table's lists differ in length.
+/// - `NotFinite` for a displacement that is NaN or infinite, and `OutOfRange` for one over 1e6 m
+///   along an axis, also in rows that are not valid.
+/// - `Write` where writing to `out` fails, `Encode` where encoding fails.
 pub fn write_flow<W: Write>(
     format: FlowFormat,
     table: &FlowTable<'_>,

@@ -32,7 +32,10 @@ const READERS: usize = 2;
 /// Maximum number of rows in one list.
 const MAX_LISTED: u32 = 1000;
 
-/// The embedded queue.
+/// The queue in one SQLite file of one machine. One thread writes, and reads run concurrently.
+///
+/// Changes of durable jobs, other than leases, are on disk before they are acknowledged. A lock
+/// file admits one process at a time. The async methods need a tokio runtime.
 pub struct SqliteQueue {
     writer: Writer,
     readers: [Arc<Mutex<Connection>>; READERS],
@@ -46,12 +49,17 @@ pub struct SqliteQueue {
 }
 
 impl SqliteQueue {
-    /// Opens or creates the queue in `folder`. Jobs that were running when it was last open are
-    /// requeued. `events` receives all events from now on, including those of the recovery.
+    /// Opens or creates the queue in `folder`. `events` receives all events from now on, including
+    /// those of the recovery.
+    ///
+    /// Recovery requeues the durable jobs that were running when the queue was last open, and ends
+    /// those whose cancellation was requested. It counts a crash for each requeued job, unless
+    /// [`Queue::stopped`] was called. Ephemeral jobs that were queued or running are forgotten.
     ///
     /// # Errors
-    /// If another process has the queue open, the folder cannot be used, or the file has another
-    /// schema version.
+    /// - [`QueueError::Store`] if another process has the queue open, a file or the folder cannot
+    ///   be used, the file has another schema version, or the writer thread cannot be started.
+    /// - [`QueueError::Full`] if the disk is full.
     pub fn open(
         folder: &Path,
         options: QueueOptions,
