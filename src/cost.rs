@@ -75,8 +75,8 @@ impl CostModel {
     }
 
     /// Nominal seconds of a job of this cost: one per 2e11 multiply-adds, plus 0.005 of overhead.
-    pub fn nominal(price: &Cost) -> f64 {
-        EACH + price.seconds(NOMINAL_RATE)
+    pub fn nominal(cost: &Cost) -> f64 {
+        EACH + cost.seconds(NOMINAL_RATE)
     }
 
     /// Nominal seconds of evaluating a field at this many points, without overhead.

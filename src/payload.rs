@@ -20,7 +20,7 @@ const SUM: usize = 16;
 /// The bytes are damaged or have another format version.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("stored bytes are damaged or of another version: {0}")]
-pub struct Damaged(&'static str);
+pub struct CorruptPayload(&'static str);
 
 /// One stored sweep.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -62,7 +62,7 @@ impl StoredCloud {
     ///
     /// # Errors
     /// [`Damaged`] if the bytes are damaged or of another version.
-    pub fn from_bytes(bytes: &[u8]) -> Result<Self, Damaged> {
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, CorruptPayload> {
         let mut reader = Reader::new(CLOUD, bytes)?;
         let cloud = Self {
             points: reader.points()?,
@@ -90,10 +90,10 @@ impl StoredFlow {
     ///
     /// # Errors
     /// [`Damaged`] if the bytes are damaged or of another version.
-    pub fn from_bytes(bytes: &[u8]) -> Result<Self, Damaged> {
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, CorruptPayload> {
         let mut reader = Reader::new(FLOW, bytes)?;
         let flow = reader.points()?;
-        let valid = reader.flags()?.ok_or(Damaged("no mask"))?;
+        let valid = reader.flags()?.ok_or(CorruptPayload("no mask"))?;
         let stored = Self {
             flow,
             valid,
@@ -127,7 +127,7 @@ impl StoredDense {
     ///
     /// # Errors
     /// [`Damaged`] if the bytes are damaged or of another version.
-    pub fn from_bytes(bytes: &[u8]) -> Result<Self, Damaged> {
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, CorruptPayload> {
         let mut reader = Reader::new(DENSE, bytes)?;
         let points = reader.points()?;
         let sweep = reader.words()?.collect();
@@ -136,8 +136,8 @@ impl StoredDense {
             points,
             sweep,
             age,
-            dynamic: reader.flags()?.ok_or(Damaged("no mask"))?,
-            converged: reader.flags()?.ok_or(Damaged("no mask"))?,
+            dynamic: reader.flags()?.ok_or(CorruptPayload("no mask"))?,
+            converged: reader.flags()?.ok_or(CorruptPayload("no mask"))?,
         };
         reader.finish()?;
         Ok(Self(cloud))
@@ -242,41 +242,47 @@ struct Reader<'a> {
 }
 
 impl<'a> Reader<'a> {
-    fn new(magic: &[u8], bytes: &'a [u8]) -> Result<Self, Damaged> {
-        let body = bytes.len().checked_sub(SUM).ok_or(Damaged("too short"))?;
+    fn new(magic: &[u8], bytes: &'a [u8]) -> Result<Self, CorruptPayload> {
+        let body = bytes
+            .len()
+            .checked_sub(SUM)
+            .ok_or(CorruptPayload("too short"))?;
         let (body, sum) = bytes.split_at(body);
         if blake3::hash(body).as_bytes()[..SUM] != *sum {
-            return Err(Damaged("the sum is wrong"));
+            return Err(CorruptPayload("the sum is wrong"));
         }
         let rest = body
             .strip_prefix(magic)
-            .ok_or(Damaged("the beginning is wrong"))?;
+            .ok_or(CorruptPayload("the beginning is wrong"))?;
         let mut reader = Self { rows: 0, rest };
         let rows = u64::from_le_bytes(reader.array()?);
-        reader.rows = usize::try_from(rows).map_err(|_| Damaged("too many rows"))?;
+        reader.rows = usize::try_from(rows).map_err(|_| CorruptPayload("too many rows"))?;
         Ok(reader)
     }
 
-    fn take(&mut self, count: usize) -> Result<&'a [u8], Damaged> {
+    fn take(&mut self, count: usize) -> Result<&'a [u8], CorruptPayload> {
         let (taken, rest) = self
             .rest
             .split_at_checked(count)
-            .ok_or(Damaged("too short"))?;
+            .ok_or(CorruptPayload("too short"))?;
         self.rest = rest;
         Ok(taken)
     }
 
-    fn array<const N: usize>(&mut self) -> Result<[u8; N], Damaged> {
+    fn array<const N: usize>(&mut self) -> Result<[u8; N], CorruptPayload> {
         let taken = self.take(N)?;
-        taken.try_into().map_err(|_| Damaged("too short"))
+        taken.try_into().map_err(|_| CorruptPayload("too short"))
     }
 
-    fn points(&mut self) -> Result<Vec<Point>, Damaged> {
-        let bytes = self.rows.checked_mul(12).ok_or(Damaged("too many rows"))?;
+    fn points(&mut self) -> Result<Vec<Point>, CorruptPayload> {
+        let bytes = self
+            .rows
+            .checked_mul(12)
+            .ok_or(CorruptPayload("too many rows"))?;
         Ok(points_from_le_bytes(self.take(bytes)?))
     }
 
-    fn flags(&mut self) -> Result<Option<Vec<bool>>, Damaged> {
+    fn flags(&mut self) -> Result<Option<Vec<bool>>, CorruptPayload> {
         let [there] = self.array()?;
         if there == 0 {
             return Ok(None);
@@ -285,13 +291,16 @@ impl<'a> Reader<'a> {
         Ok(Some(flags.iter().map(|&flag| flag != 0).collect()))
     }
 
-    fn words(&mut self) -> Result<impl Iterator<Item = u32> + 'a, Damaged> {
-        let bytes = self.rows.checked_mul(4).ok_or(Damaged("too many rows"))?;
+    fn words(&mut self) -> Result<impl Iterator<Item = u32> + 'a, CorruptPayload> {
+        let bytes = self
+            .rows
+            .checked_mul(4)
+            .ok_or(CorruptPayload("too many rows"))?;
         let (words, _) = self.take(bytes)?.as_chunks::<4>();
         Ok(words.iter().map(|word| u32::from_le_bytes(*word)))
     }
 
-    fn objects(&mut self) -> Result<Option<Objects>, Damaged> {
+    fn objects(&mut self) -> Result<Option<Objects>, CorruptPayload> {
         const WORDS: usize = 14;
         let [there] = self.array()?;
         if there == 0 {
@@ -302,7 +311,7 @@ impl<'a> Reader<'a> {
         let count = u64::from_le_bytes(self.array()?);
         let bytes = usize::try_from(count).ok();
         let bytes = bytes.and_then(|count| count.checked_mul(4 * WORDS));
-        let described = self.take(bytes.ok_or(Damaged("too many clusters"))?)?;
+        let described = self.take(bytes.ok_or(CorruptPayload("too many clusters"))?)?;
         let (described, _) = described.as_chunks::<{ 4 * WORDS }>();
         let clusters = described.iter().map(|described| {
             let word = |at: usize| {
@@ -331,7 +340,7 @@ impl<'a> Reader<'a> {
         }))
     }
 
-    fn motion(&mut self) -> Result<Option<RigidTransform>, Damaged> {
+    fn motion(&mut self) -> Result<Option<RigidTransform>, CorruptPayload> {
         let [there] = self.array()?;
         if there == 0 {
             return Ok(None);
@@ -347,7 +356,7 @@ impl<'a> Reader<'a> {
         Ok(Some(RigidTransform::from_parts(translation, rotation)))
     }
 
-    fn time(&mut self) -> Result<Option<SweepTime>, Damaged> {
+    fn time(&mut self) -> Result<Option<SweepTime>, CorruptPayload> {
         let [unit] = self.array()?;
         let ticks = u64::from_le_bytes(self.array()?);
         let unit = match unit {
@@ -355,16 +364,16 @@ impl<'a> Reader<'a> {
             1 => TimeUnit::Nanoseconds,
             2 => TimeUnit::Microseconds,
             3 => TimeUnit::Milliseconds,
-            _ => return Err(Damaged("no unit of time")),
+            _ => return Err(CorruptPayload("no unit of time")),
         };
         Ok(Some(SweepTime { ticks, unit }))
     }
 
-    fn finish(self) -> Result<(), Damaged> {
+    fn finish(self) -> Result<(), CorruptPayload> {
         if self.rest.is_empty() {
             Ok(())
         } else {
-            Err(Damaged("too long"))
+            Err(CorruptPayload("too long"))
         }
     }
 }

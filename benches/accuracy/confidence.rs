@@ -10,7 +10,7 @@
 //! without it. Ground points are taken from the masks of the pairs, and the ego motion is
 //! estimated.
 
-use super::labelled::{Known, PAIRS, real_pairs, street};
+use super::labelled::{LabelledPair, PAIRS, real_pairs, street};
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Calibration, Reliability};
 use fnsf::flow::field::Backend;
@@ -25,7 +25,7 @@ const BEAMS: [usize; 2] = [64, 32];
 const STREETS: u64 = 12;
 
 /// The features of a point, and the end-point error of its flow.
-struct Judged {
+struct Evaluated {
     kind: usize,
     features: Vec<f64>,
     error_m: f64,
@@ -38,7 +38,7 @@ struct Scene {
     name: String,
     /// Weight of the scene in a fit.
     weight: f64,
-    points: Vec<Judged>,
+    points: Vec<Evaluated>,
 }
 
 fn moved(motion: &RigidTransform, point: Point) -> Point {
@@ -48,7 +48,7 @@ fn moved(motion: &RigidTransform, point: Point) -> Point {
 
 /// Estimates a pair and collects the features and errors of its points. `weight` is the weight of
 /// the scene in a fit.
-fn judged(backend: &dyn Backend, known: Known, weight: f64) -> Scene {
+fn judged(backend: &dyn Backend, known: LabelledPair, weight: f64) -> Scene {
     let ego = backend.host().align(
         &known.source,
         &known.target,
@@ -93,7 +93,7 @@ fn judged(backend: &dyn Backend, known: Known, weight: f64) -> Scene {
     {
         let at = core::array::from_fn(|a| aligned[i][a] + residual[i][a]);
         let evidence: &ConfidenceFeatures = &labelled.evidence[i];
-        points.push(Judged {
+        points.push(Evaluated {
             kind: usize::from(!evidence.moves),
             features: evidence.features().into_iter().map(f64::from).collect(),
             error_m: error(row, at),
@@ -103,7 +103,7 @@ fn judged(backend: &dyn Backend, known: Known, weight: f64) -> Scene {
         let at = moved(&ego, known.source[row]);
         if at.iter().all(|c| c.is_finite()) {
             let range = (1.0 + at[0].hypot(at[1]) / 10.0).ln();
-            points.push(Judged {
+            points.push(Evaluated {
                 kind: 2,
                 features: vec![1.0, f64::from(range)],
                 error_m: error(row, at),
@@ -151,7 +151,7 @@ fn fitted(scenes: &[&Scene], kind: usize) -> Vec<f64> {
     weights.iter().copied().collect()
 }
 
-fn confidence(weights: &[Vec<f64>], point: &Judged) -> f64 {
+fn confidence(weights: &[Vec<f64>], point: &Evaluated) -> f64 {
     let sum: f64 = weights[point.kind]
         .iter()
         .zip(&point.features)
@@ -217,9 +217,9 @@ fn diagram(shown: &[(String, Told)]) -> String {
          font-family=\"sans-serif\" font-size=\"12\">\n\
          <rect width=\"100%\" height=\"100%\" fill=\"#fff\"/>\n"
     );
-    for (place, (name, told)) in shown.iter().enumerate() {
+    for (index, (name, told)) in shown.iter().enumerate() {
         let Calibration { error, bins, .. } = &told.calibration;
-        let (left, top) = (MARGIN + step * place as f64, MARGIN);
+        let (left, top) = (MARGIN + step * index as f64, MARGIN);
         let at = |said: f64, right: f64| (left + said * SIDE, top + (1.0 - right) * SIDE);
         let ((x0, y0), (x1, y1)) = (at(0.0, 0.0), at(1.0, 1.0));
         svg += &format!(

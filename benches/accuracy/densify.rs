@@ -46,8 +46,8 @@ fn fit(backend: &CpuBackend, sweeps: &[Sweep], plans: &[Plan]) -> anyhow::Result
         let mut sequence = Sequence::default();
         let (mut edges, mut found) = (Vec::new(), Vec::new());
         for (number, edge) in chain.into_iter().enumerate() {
-            let mut push = |place: usize| {
-                sequence.push(backend, sweeps[place].clone(), &options, &Uncontrolled)
+            let mut push = |index: usize| {
+                sequence.push(backend, sweeps[index].clone(), &options, &Uncontrolled)
             };
             if number == 0 {
                 push(edge.source)?;
@@ -148,14 +148,14 @@ fn simulated(
         let moves: Vec<bool> = (0..count).map(moves).collect();
         let mut row = [age, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
         for (k, cloud) in clouds.iter().enumerate() {
-            let places: Vec<usize> = match first_of(cloud, frame.index) {
+            let indices: Vec<usize> = match first_of(cloud, frame.index) {
                 Some(at) => (at..at + count).collect(),
                 None => continue,
             };
             let error = |row: usize| {
                 let point = frame.points[row];
                 let truth = core::array::from_fn(|a| point[a] + to_into[row][a]);
-                distance(cloud.points[places[row]], truth)
+                distance(cloud.points[indices[row]], truth)
             };
             row[1 + k] = mean((0..count).filter(|&r| moves[r]).map(error));
             row[4 + k] = mean(
@@ -244,9 +244,9 @@ fn real(backend: &CpuBackend, paths: &[String]) -> anyhow::Result<()> {
             moving(&alone),
         );
     };
-    for place in 0..sweeps.len() {
-        print(format!("{:+}", into as i64 - place as i64), &|frame| {
-            frame == place
+    for index in 0..sweeps.len() {
+        print(format!("{:+}", into as i64 - index as i64), &|frame| {
+            frame == index
         });
     }
     print("both neighbors".to_owned(), &|frame| {
@@ -281,8 +281,8 @@ pub(super) fn run(arguments: Vec<String>) -> anyhow::Result<()> {
         "| age | movers: ego motion alone, m | reverse fields, m | inverse fields, m | static: ego motion alone, m | reverse, m | inverse, m |"
     );
     println!("|---|---|---|---|---|---|---|");
-    for place in 0..FRAMES {
-        let of_age: Vec<&[f64; 7]> = rows.iter().skip(place).step_by(FRAMES).collect();
+    for index in 0..FRAMES {
+        let of_age: Vec<&[f64; 7]> = rows.iter().skip(index).step_by(FRAMES).collect();
         let column = |k: usize| mean(of_age.iter().map(|row| row[k]));
         println!(
             "| {:+} | {:.3} | {:.3} | {:.3} | {:.4} | {:.4} | {:.4} |",

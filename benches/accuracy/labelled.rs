@@ -11,7 +11,7 @@ use fnsf::formats::read_pair;
 pub(crate) const PAIRS: [&str; 3] = ["av2_7fab", "kitti_0000", "small_gicp"];
 
 /// A pair with ground truth. Points and flow are in metres.
-pub(crate) struct Known {
+pub(crate) struct LabelledPair {
     pub(crate) name: String,
     pub(crate) source: Vec<Point>,
     pub(crate) target: Vec<Point>,
@@ -23,7 +23,7 @@ pub(crate) struct Known {
 }
 
 /// The labelled real pairs; none if `FNSF_REAL_DATA` is not set.
-pub(crate) fn real_pairs() -> Result<Vec<Known>, String> {
+pub(crate) fn real_pairs() -> Result<Vec<LabelledPair>, String> {
     let Some(folder) = std::env::var_os("FNSF_REAL_DATA") else {
         return Ok(Vec::new());
     };
@@ -31,13 +31,13 @@ pub(crate) fn real_pairs() -> Result<Vec<Known>, String> {
     pairs.collect()
 }
 
-fn real(name: &str, folder: &Path) -> Result<Known, String> {
+fn real(name: &str, folder: &Path) -> Result<LabelledPair, String> {
     let path = folder.join(name).join("pair.npz");
     let bytes = std::fs::read(&path).map_err(|e| format!("{}: {e}", path.display()))?;
     let pair = read_pair(&bytes).map_err(|e| format!("{}: {e}", path.display()))?;
     let truth = pair.truth.ok_or("the pair has no truth")?;
     let ground = pair.ground.ok_or("the pair has no ground masks")?;
-    Ok(Known {
+    Ok(LabelledPair {
         name: name.to_owned(),
         source: pair.source,
         target: pair.target,
@@ -49,7 +49,7 @@ fn real(name: &str, folder: &Path) -> Result<Known, String> {
 }
 
 /// The first pair of a simulated street.
-pub(crate) fn street(seed: u64, beams: usize) -> Result<Known, String> {
+pub(crate) fn street(seed: u64, beams: usize) -> Result<LabelledPair, String> {
     let options = StreetOptions {
         seed,
         beams,
@@ -57,7 +57,7 @@ pub(crate) fn street(seed: u64, beams: usize) -> Result<Known, String> {
     };
     let pair = Street::new(&options).and_then(|street| street.pair(0));
     let pair = pair.map_err(|e| e.to_string())?;
-    Ok(Known {
+    Ok(LabelledPair {
         name: format!("street {seed}, {beams} beams"),
         valid: vec![true; pair.source.len()],
         source: pair.source,

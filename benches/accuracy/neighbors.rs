@@ -41,7 +41,7 @@ const VARIANTS: [(&str, Change); 5] = [
 ];
 
 /// A pair with ground truth, and its neighbor sweeps by offset to the source.
-struct Known {
+struct LabelledPair {
     name: String,
     pair: [Sweep; 2],
     neighbors: Vec<(i8, Sweep)>,
@@ -50,7 +50,7 @@ struct Known {
     dynamic: Vec<bool>,
 }
 
-fn kitti() -> Result<Vec<Known>, String> {
+fn kitti() -> Result<Vec<LabelledPair>, String> {
     let Some(folder) = std::env::var_os("FNSF_REAL_DATA") else {
         return Ok(Vec::new());
     };
@@ -73,7 +73,7 @@ fn kitti() -> Result<Vec<Known>, String> {
         points,
         ground: Some(ground),
     };
-    Ok(vec![Known {
+    Ok(vec![LabelledPair {
         name: "kitti_0000".to_owned(),
         pair: [
             sweep(pair.source, ground.source),
@@ -86,7 +86,7 @@ fn kitti() -> Result<Vec<Known>, String> {
     }])
 }
 
-fn street(beams: usize, seed: u64, first: usize) -> Result<Known, String> {
+fn street(beams: usize, seed: u64, first: usize) -> Result<LabelledPair, String> {
     let options = StreetOptions {
         seed,
         beams,
@@ -104,7 +104,7 @@ fn street(beams: usize, seed: u64, first: usize) -> Result<Known, String> {
     let truth = street.pair(first).map_err(|e| e.to_string())?;
     let neighbors = (0..5).filter(|&frame| frame != first && frame != first + 1);
     let neighbors = neighbors.map(|frame| Ok((frame as i8 - first as i8, sweep(frame)?)));
-    Ok(Known {
+    Ok(LabelledPair {
         name: format!("streets, {beams} beams, pair {first}"),
         pair: [sweep(first)?, sweep(first + 1)?],
         neighbors: neighbors.collect::<Result<_, String>>()?,
@@ -117,7 +117,11 @@ fn street(beams: usize, seed: u64, first: usize) -> Result<Known, String> {
 /// EPE of all points, of the moving points and of the static points, metres; then seconds.
 type Row = [f64; 4];
 
-fn searched(backend: &CpuBackend, known: &Known, label: &ObjectOptions) -> Result<Row, String> {
+fn searched(
+    backend: &CpuBackend,
+    known: &LabelledPair,
+    label: &ObjectOptions,
+) -> Result<Row, String> {
     let mut options = Preset::Label.options(None);
     options.ground = Ground::Mask;
     options.method = Method::Objects(label.clone());

@@ -11,7 +11,7 @@
 //! median over the seeds.
 
 use super::clock::Clock;
-use super::labelled::{Known, real_pairs, street};
+use super::labelled::{LabelledPair, real_pairs, street};
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Truth, evaluate};
 use fnsf::flow::field::Backend;
@@ -106,7 +106,7 @@ const VARIANTS: &[Variant] = &[
 /// foreground where all moving points count as foreground, metres; then seconds.
 type Row = [f64; 5];
 
-fn searched(backend: &CpuBackend, pair: &Known, options: &Options) -> Result<Row, String> {
+fn searched(backend: &CpuBackend, pair: &LabelledPair, options: &Options) -> Result<Row, String> {
     let problem = Problem {
         source: &pair.source,
         target: &pair.target,
@@ -171,7 +171,7 @@ pub(super) fn run(arguments: Vec<String>) -> Result<(), String> {
         }
     }
     let pairs = real_pairs()?.into_iter();
-    let mut groups: Vec<(String, Vec<Known>)> =
+    let mut groups: Vec<(String, Vec<LabelledPair>)> =
         pairs.map(|pair| (pair.name.clone(), vec![pair])).collect();
     for beams in BEAMS {
         let streets = (0..STREETS).map(|seed| street(seed, beams));

@@ -101,8 +101,8 @@ async fn alive(State(admin): State<Admin>) -> Response {
 }
 
 /// 200, or 503 with the reason.
-fn verdict(word: &str, obstacle: Option<String>) -> Response {
-    match obstacle {
+fn verdict(word: &str, not_ready_reason: Option<String>) -> Response {
+    match not_ready_reason {
         None => Json(json!({ word: true })).into_response(),
         Some(reason) => {
             let body = Json(json!({ word: false, "reason": reason }));

@@ -129,7 +129,7 @@ impl Admission {
     /// - [`ApiError::BadInput`] if the pair cannot be estimated, with the message of the solver.
     /// - [`ApiError::TooLarge`] if the pair needs more memory than the limit.
     /// - [`ApiError::Internal`] if the prediction fails for another reason.
-    pub fn price(
+    pub fn predict_cost(
         &self,
         source: &StoredCloud,
         target: &StoredCloud,
@@ -151,27 +151,27 @@ impl Admission {
         {
             *field = field.warmed(warm_start);
         }
-        let price = flow::price(&problem, &options).map_err(|error| {
+        let cost = flow::predict_cost(&problem, &options).map_err(|error| {
             if error.is_input() {
                 ApiError::BadInput(error.to_string())
             } else {
                 ApiError::internal(error)
             }
         })?;
-        self.check_bytes(&price)?;
-        Ok(price)
+        self.check_bytes(&cost)?;
+        Ok(cost)
     }
 
     /// Refuses a cost that exceeds the memory limit of a pair.
     ///
     /// # Errors
     /// [`ApiError::TooLarge`].
-    pub(super) fn check_bytes(&self, price: &Cost) -> Result<(), ApiError> {
+    pub(super) fn check_bytes(&self, cost: &Cost) -> Result<(), ApiError> {
         let limit = self.limits.max_pair_bytes;
-        if price.bytes > limit {
+        if cost.bytes > limit {
             return Err(ApiError::TooLarge(format!(
                 "the pair needs {} MiB on the device, {} are allowed: crop with crop_m",
-                price.bytes >> 20,
+                cost.bytes >> 20,
                 limit >> 20
             )));
         }

@@ -81,7 +81,7 @@ pub(super) struct PendingJob {
     last: Option<(Arc<StoredCloud>, Option<UploadReservation>)>,
     /// The cost of each two consecutive clouds without neighbor sweeps. `None` where they are not a
     /// pair of the job.
-    prices: Vec<Option<Cost>>,
+    costs: Vec<Option<Cost>>,
     fingerprint: blake3::Hasher,
     /// The write of a cloud to the store that is in progress.
     writing: Option<JoinHandle<Result<(), BlobError>>>,
@@ -142,7 +142,7 @@ impl PendingJob {
             sweeps: 0,
             points: Vec::new(),
             last: None,
-            prices: Vec::new(),
+            costs: Vec::new(),
             fingerprint,
             writing: None,
             submitted: false,
@@ -198,17 +198,17 @@ impl PendingJob {
                 if cloud.ground.is_some() != known {
                     bytes = cloud.to_bytes();
                 }
-                let price = before.filter(|_| is_pair).map(|before| {
+                let cost = before.filter(|_| is_pair).map(|before| {
                     let admission = &service.admission;
-                    admission.price(&before, &cloud, &options, chained)
+                    admission.predict_cost(&before, &cloud, &options, chained)
                 });
-                Ok((price.transpose()?, asked, bytes, cloud))
+                Ok((cost.transpose()?, asked, bytes, cloud))
             }
         };
-        let (price, asked, bytes, cloud) = service.compute(&self.caller.tenant, work).await?;
+        let (cost, asked, bytes, cloud) = service.compute(&self.caller.tenant, work).await?;
         self.last = Some((Arc::clone(&cloud), room));
         if self.sweeps > 0 {
-            self.prices.push(price);
+            self.costs.push(cost);
         }
         self.fingerprint.update(asked.as_bytes());
         let sync = match self.request.durability {
@@ -263,7 +263,7 @@ impl PendingJob {
     async fn commit(
         mut self,
         submission: Submission,
-        _place: Reservation,
+        _reservation: Reservation,
     ) -> Result<Accepted, ApiError> {
         // The job that an idempotency key finds may be cancelled at the same time. Then its key is
         // free again, and the submission is repeated.
@@ -331,19 +331,19 @@ impl PendingJob {
     fn nominal_seconds(&self, pairs: &[PairOf]) -> Result<f64, ApiError> {
         let mut seconds = 0.0;
         for pair in pairs {
-            let Some(Some(price)) = self.prices.get(pair.index as usize) else {
+            let Some(Some(cost)) = self.costs.get(pair.index as usize) else {
                 continue;
             };
             let neighbors = (pair.window[0]..pair.window[1])
                 .filter(|&index| index != pair.index && index != pair.index + 1)
                 .map(|index| flow::neighbor_cost(self.points[index as usize]));
-            let price = neighbors.fold(*price, |price, neighbor| Cost {
-                bytes: price.bytes + neighbor.bytes,
-                multiply_adds: price.multiply_adds + neighbor.multiply_adds,
-                ..price
+            let cost = neighbors.fold(*cost, |cost, neighbor| Cost {
+                bytes: cost.bytes + neighbor.bytes,
+                multiply_adds: cost.multiply_adds + neighbor.multiply_adds,
+                ..cost
             });
-            self.service.admission.check_bytes(&price)?;
-            seconds += CostModel::nominal(&price);
+            self.service.admission.check_bytes(&cost)?;
+            seconds += CostModel::nominal(&cost);
         }
         Ok(seconds)
     }

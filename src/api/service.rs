@@ -375,7 +375,7 @@ impl Service {
         let pairs = self.queue.pairs(id).await?;
         let undone = pairs.iter().filter(|pair| pair.state != State::Succeeded);
         let of_pairs: f64 = undone.map(|pair| pair.cost_seconds).sum();
-        let _place = self.admission.admit(&AdmissionRequest {
+        let _reservation = self.admission.admit(&AdmissionRequest {
             tenant: &caller.tenant,
             priority: job.priority,
             device: job.device,

@@ -102,12 +102,12 @@ impl Pool {
             if taken.has(&adapter) {
                 continue;
             }
-            let (name, place) = (adapter.name.clone(), adapter.pci_id.clone());
+            let (name, pci_id) = (adapter.name.clone(), adapter.pci_id.clone());
             let (lanes, open) = adapter_factory(adapter, config);
             match probe(&open) {
                 Ok(()) => {
                     found = true;
-                    taken.take(place);
+                    taken.take(pci_id);
                     self.add(DeviceKind::Gpu, lanes, open);
                 }
                 Err(reason) => tracing::warn!(adapter = name, reason, "a GPU is left out"),
@@ -228,7 +228,7 @@ impl Taken {
         if has {
             tracing::info!(
                 adapter = adapter.name,
-                place = adapter.pci_id,
+                pci_id = adapter.pci_id,
                 driver = adapter.driver,
                 "left out: another driver answers for the same card"
             );
@@ -236,10 +236,10 @@ impl Taken {
         has
     }
 
-    fn take(&mut self, place: String) {
+    fn take(&mut self, pci_id: String) {
         // Without a PCI id every adapter counts as a separate GPU.
-        if !place.is_empty() {
-            self.0.insert(place);
+        if !pci_id.is_empty() {
+            self.0.insert(pci_id);
         }
     }
 }
@@ -367,9 +367,9 @@ mod tests {
         let Some(adapter) = adapters.into_iter().next() else {
             return;
         };
-        let at = |place: &str| {
+        let at = |pci_id: &str| {
             let mut adapter = adapter.clone();
-            place.clone_into(&mut adapter.pci_id);
+            pci_id.clone_into(&mut adapter.pci_id);
             adapter
         };
         let adapters = ["0000:01:00.0", "0000:02:00.0", "0000:01:00.0", "", ""].map(at);

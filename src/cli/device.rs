@@ -22,7 +22,7 @@ pub(super) struct DeviceArgument {
     /// The kind of device: auto, cpu or gpu.
     pub(super) choice: DeviceChoice,
     /// The selected GPU, where the kind is gpu.
-    card: Selector,
+    adapter: Selector,
 }
 
 impl FromStr for DeviceArgument {
@@ -30,17 +30,17 @@ impl FromStr for DeviceArgument {
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let wrong = || format!("{text:?} is none of auto, cpu, gpu and gpu:CARD");
-        let (kind, card) = match text.split_once(':') {
-            Some((kind, card)) if !card.is_empty() => (kind, Some(card)),
+        let (kind, adapter) = match text.split_once(':') {
+            Some((kind, adapter)) if !adapter.is_empty() => (kind, Some(adapter)),
             Some(_) => return Err(wrong()),
             None => (text, None),
         };
         let choice: DeviceChoice = kind.parse().map_err(|_| wrong())?;
-        match card {
+        match adapter {
             Some(_) if choice != DeviceChoice::Gpu => Err(wrong()),
             _ => {
-                let Ok(card) = Selector::from_str(card.unwrap_or_default());
-                Ok(Self { choice, card })
+                let Ok(adapter) = Selector::from_str(adapter.unwrap_or_default());
+                Ok(Self { choice, adapter })
             }
         }
     }
@@ -51,7 +51,7 @@ impl fmt::Display for DeviceArgument {
         match self.choice {
             DeviceChoice::Auto => f.write_str("auto"),
             DeviceChoice::Cpu => f.write_str("cpu"),
-            DeviceChoice::Gpu => write!(f, "{}", self.card),
+            DeviceChoice::Gpu => write!(f, "{}", self.adapter),
         }
     }
 }
@@ -75,14 +75,14 @@ pub(super) fn open(
     match device.choice {
         DeviceChoice::Cpu => cpu(threads),
         DeviceChoice::Gpu => {
-            let opened =
-                gpu::select(&device.card, software_is_welcome()).and_then(|card| open_card(&card));
+            let opened = gpu::select(&device.adapter, software_is_welcome())
+                .and_then(|adapter| open_card(&adapter));
             let opened = opened.with_context(|| format!("--device {device}"));
             opened.map_err(|error| {
                 Failure::internal(anyhow!("{error:#}; fnsf doctor says how to mend it"))
             })
         }
-        DeviceChoice::Auto => match best_card().and_then(|card| open_card(&card)) {
+        DeviceChoice::Auto => match best_card().and_then(|adapter| open_card(&adapter)) {
             Ok(opened) => Ok(opened),
             Err(error) => {
                 stand_in(&error);
@@ -104,8 +104,8 @@ pub(super) fn stand_in(error: &BackendError) {
     eprintln!("fnsf: warning: the CPU does the work: {error}");
 }
 
-fn open_card(card: &Adapter) -> Result<Box<dyn Backend>, BackendError> {
-    Ok(Box::new(Gpu::open(card, &GpuOptions::default())?))
+fn open_card(adapter: &Adapter) -> Result<Box<dyn Backend>, BackendError> {
+    Ok(Box::new(Gpu::open(adapter, &GpuOptions::default())?))
 }
 
 #[cfg(test)]
@@ -126,7 +126,7 @@ mod tests {
             assert_eq!(device.to_string(), text);
         }
         let by_place: DeviceArgument = "gpu:0000:01:00.0".parse().expect("a device");
-        assert_eq!(by_place.card, Selector::Named("0000:01:00.0".to_owned()));
+        assert_eq!(by_place.adapter, Selector::Named("0000:01:00.0".to_owned()));
         for text in ["", "tpu", "cpu:0", "auto:0", "gpu:", ":0"] {
             assert!(text.parse::<DeviceArgument>().is_err(), "{text}");
         }

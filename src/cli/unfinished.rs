@@ -23,11 +23,11 @@ fn written() -> MutexGuard<'static, Vec<PathBuf>> {
 }
 
 impl Unfinished {
-    /// Creates a file with a unique temporary name in the folder of `place`.
-    pub(super) fn beside(place: &Path) -> std::io::Result<(Self, File)> {
+    /// Creates a file with a unique temporary name in the folder of `path`.
+    pub(super) fn beside(path: &Path) -> std::io::Result<(Self, File)> {
         remove_on_signals();
-        let folder = place.parent().unwrap_or(Path::new("."));
-        let name = place.file_name().unwrap_or_default();
+        let folder = path.parent().unwrap_or(Path::new("."));
+        let name = path.file_name().unwrap_or_default();
         let mut names = written();
         // Only the first 40 characters: `name` may already have the maximum length of a file name.
         let begins: String = name.to_string_lossy().chars().take(40).collect();
@@ -42,11 +42,11 @@ impl Unfinished {
         Ok((Self { path }, file))
     }
 
-    /// Renames the file to `place` and replaces any file there.
-    pub(super) fn rename(self, place: &Path) -> std::io::Result<()> {
+    /// Renames the file to `path` and replaces any file there.
+    pub(super) fn rename(self, path: &Path) -> std::io::Result<()> {
         let mut names = written();
         names.retain(|name| *name != *self.path);
-        self.path.persist(place).map_err(|error| error.error)
+        self.path.persist(path).map_err(|error| error.error)
     }
 }
 

@@ -94,7 +94,7 @@ pub fn neighbor_cost(points: usize) -> NeighborCost {
 /// the pair, and [`FlowError::Backend`] if the distance transform is rejected: as
 /// [`super::estimate()`]. The ground masks of neighbor sweeps and the limits of a device are not
 /// checked.
-pub fn price(problem: &Problem, options: &Options) -> Result<Cost, FlowError> {
+pub fn predict_cost(problem: &Problem, options: &Options) -> Result<Cost, FlowError> {
     let selection = select(problem, options, &find_ground)?;
     let (source_points, target_points) = (selection.source.len(), selection.target.len());
     let method = match &options.method {
@@ -154,7 +154,7 @@ fn field_cost(
     [source, target]: [&[Point]; 2],
     options: &FieldOptions,
 ) -> Result<MethodCost, FlowError> {
-    let transform = DistanceTransform::price(source, target, &options.distance)
+    let transform = DistanceTransform::predict_cost(source, target, &options.distance)
         .map_err(|error| FlowError::Backend(error.into()))?;
     let batch = options.batch.unwrap_or(source.len()).min(source.len()) as f64;
     let iterations = options.expected_iterations() as f64;

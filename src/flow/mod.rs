@@ -57,7 +57,7 @@ pub mod depth;
 pub mod evaluate;
 pub mod simulate;
 
-pub use cost::{Cost, NeighborCost, neighbor_cost, price};
+pub use cost::{Cost, NeighborCost, neighbor_cost, predict_cost};
 pub use data::{
     AlignedSweep, Control, DYNAMIC_M, DenseCloud, EnvelopeError, Interrupt, MIN_POINTS,
     OrientedBox, Point, Progress, RigidTransform, StopReason, Uncontrolled,

@@ -92,9 +92,9 @@ impl GroundRaster {
     /// are not ground.
     pub fn ground(&self, points: &[Point], city_from_frame: &RigidTransform) -> Vec<bool> {
         let is_ground = |point: &Point| {
-            let place = city_from_frame * Point3::from(point.map(f64::from));
-            self.height(place.x, place.y)
-                .is_some_and(|height| place.z - height <= GROUND_M)
+            let array_path = city_from_frame * Point3::from(point.map(f64::from));
+            self.height(array_path.x, array_path.y)
+                .is_some_and(|height| array_path.z - height <= GROUND_M)
         };
         points.iter().map(is_ground).collect()
     }

@@ -171,12 +171,12 @@ fn parse_shape(kind: FileKind, value: &str) -> Result<Vec<usize>, FormatError> {
 /// The origin of an array, for messages: the kind of file, and the array's name there (empty for
 /// `.npy`).
 #[derive(Clone, Copy)]
-pub(super) struct Place<'a> {
+pub(super) struct ArrayPath<'a> {
     pub(super) kind: FileKind,
     pub(super) array: &'a str,
 }
 
-impl Place<'_> {
+impl ArrayPath<'_> {
     fn column(&self, axis: usize) -> String {
         let axis = ["x", "y", "z"][axis.min(2)];
         if self.array.is_empty() {
@@ -199,17 +199,17 @@ impl Place<'_> {
 ///
 /// The caller must check that the declared bytes exist. Memory is allocated for N points only.
 pub(super) fn read_points<R: Read + ?Sized>(
-    place: Place<'_>,
+    array_path: ArrayPath<'_>,
     header: &Header,
     reader: &mut R,
 ) -> Result<Vec<Point>, FormatError> {
-    let kind = place.kind;
+    let kind = array_path.kind;
     let (rows, columns) = match header.table() {
         Some((rows, columns)) if columns >= 3 && header.scalar.is_float() => (rows, columns),
         _ => {
             return Err(kind.unsupported(format!(
                 "{} has shape {:?} and {} bytes a number where N x 3 floats are needed",
-                place.described(),
+                array_path.described(),
                 header.shape,
                 header.scalar.size()
             )));
@@ -232,7 +232,7 @@ pub(super) fn read_points<R: Read + ?Sized>(
             };
             if axis < 3 {
                 if !value.is_finite() || value.abs() > MAX_COORDINATE_M {
-                    check_value(kind, row, &place.column(axis), value)?;
+                    check_value(kind, row, &array_path.column(axis), value)?;
                 }
                 points[row][axis] = value as f32;
             }
@@ -243,17 +243,17 @@ pub(super) fn read_points<R: Read + ?Sized>(
 
 /// Reads a column of N numbers. `check` converts each value, given its row.
 pub(super) fn read_column<R: Read + ?Sized, T>(
-    place: Place<'_>,
+    array_path: ArrayPath<'_>,
     header: &Header,
     reader: &mut R,
     check: impl Fn(usize, f64) -> Result<T, FormatError>,
 ) -> Result<Vec<T>, FormatError> {
     let rows = match header.shape[..] {
-        [rows] | [rows, 1] => check_rows(place.kind, rows as u64)?,
+        [rows] | [rows, 1] => check_rows(array_path.kind, rows as u64)?,
         _ => {
-            return Err(place.kind.unsupported(format!(
+            return Err(array_path.kind.unsupported(format!(
                 "{} has shape {:?} where one value a point is needed",
-                place.described(),
+                array_path.described(),
                 header.shape
             )));
         }
@@ -261,7 +261,7 @@ pub(super) fn read_column<R: Read + ?Sized, T>(
     let mut column = Vec::with_capacity(rows);
     header
         .scalar
-        .each(header.order, rows, place.kind, reader, |row, value| {
+        .each(header.order, rows, array_path.kind, reader, |row, value| {
             column.push(check(row, value)?);
             Ok(())
         })?;
@@ -270,21 +270,21 @@ pub(super) fn read_column<R: Read + ?Sized, T>(
 
 /// Reads a 4 x 4 matrix of floats, row by row.
 pub(super) fn read_matrix<R: Read + ?Sized>(
-    place: Place<'_>,
+    array_path: ArrayPath<'_>,
     header: &Header,
     reader: &mut R,
 ) -> Result<[[f64; 4]; 4], FormatError> {
     if header.shape != [4, 4] || !header.scalar.is_float() {
-        return Err(place.kind.unsupported(format!(
+        return Err(array_path.kind.unsupported(format!(
             "{} has shape {:?} where a 4 x 4 matrix of floats is needed",
-            place.described(),
+            array_path.described(),
             header.shape
         )));
     }
     let mut matrix = [[0.0; 4]; 4];
     header
         .scalar
-        .each(header.order, 16, place.kind, reader, |index, value| {
+        .each(header.order, 16, array_path.kind, reader, |index, value| {
             let (row, column) = if header.fortran {
                 (index % 4, index / 4)
             } else {
@@ -316,7 +316,7 @@ pub(super) fn read_file(bytes: &[u8], most: usize) -> Result<Vec<Point>, FormatE
         )));
     }
     check_within(kind, header.rows(), most)?;
-    read_points(Place { kind, array: "" }, &header, &mut rest)
+    read_points(ArrayPath { kind, array: "" }, &header, &mut rest)
 }
 
 /// Writes the header of a C-order array; `descr` and `shape` are Python literals.

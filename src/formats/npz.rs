@@ -12,7 +12,7 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 use super::error::{FileKind, FormatError, shorten};
 use super::limits::{MAX_POINTS, check_flag, check_within, unfold_limit};
 use super::npy;
-use super::npy::{Header, Place};
+use super::npy::{ArrayPath, Header};
 use crate::flow::Point;
 
 const KIND: FileKind = FileKind::Npz;
@@ -86,14 +86,14 @@ impl<'a> Npz<'a> {
 
     /// Reads N x 3 floats, in metres.
     pub(super) fn points(&mut self, name: &str) -> Result<Vec<Point>, FormatError> {
-        let place = Place {
+        let array_path = ArrayPath {
             kind: KIND,
             array: name,
         };
         let most = self.most;
         self.with(name, |header, data| {
             check_within(KIND, header.rows(), most)?;
-            npy::read_points(place, &header, data)
+            npy::read_points(array_path, &header, data)
         })
     }
 
@@ -112,14 +112,14 @@ impl<'a> Npz<'a> {
         if !self.has(name) {
             return Ok(None);
         }
-        let place = Place {
+        let array_path = ArrayPath {
             kind: KIND,
             array: name,
         };
         let most = self.most;
         self.with(name, |header, data| {
             check_within(KIND, header.rows(), most)?;
-            npy::read_column(place, &header, data, check)
+            npy::read_column(array_path, &header, data, check)
         })
         .map(Some)
     }
@@ -129,12 +129,14 @@ impl<'a> Npz<'a> {
         if !self.has(name) {
             return Ok(None);
         }
-        let place = Place {
+        let array_path = ArrayPath {
             kind: KIND,
             array: name,
         };
-        self.with(name, |header, data| npy::read_matrix(place, &header, data))
-            .map(Some)
+        self.with(name, |header, data| {
+            npy::read_matrix(array_path, &header, data)
+        })
+        .map(Some)
     }
 
     /// Opens a member, checks the size that its header declares, and passes its data to `read`.

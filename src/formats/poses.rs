@@ -160,14 +160,14 @@ fn read_av2(bytes: &[u8], sweeps: &[&str]) -> Result<Vec<RigidTransform>, Format
             let what = format!("a pose at the time of {}", shorten(frame));
             return Err(FileKind::Feather.missing(what, &present));
         };
-        let [w, x, y, z, place @ ..] = *values;
+        let [w, x, y, z, array_path @ ..] = *values;
         let rotation = Quaternion::new(w, x, y, z);
         let is_unit = (rotation.norm() - 1.0).abs() <= UNIT_TOLERANCE;
-        if !is_unit || place.iter().any(|metres| !metres.is_finite()) {
+        if !is_unit || array_path.iter().any(|metres| !metres.is_finite()) {
             return Err(FormatError::Motion("a pose is not a rigid transform"));
         }
         Ok(RigidTransform::from_parts(
-            Translation3::from(place),
+            Translation3::from(array_path),
             UnitQuaternion::from_quaternion(rotation),
         ))
     };

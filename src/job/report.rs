@@ -183,9 +183,10 @@ pub struct DenseReport {
     pub seconds: f64,
 }
 
-/// Seconds in double precision, rounded to nanoseconds: 0.1 and not 0.10000000149.
+/// The double with the shortest decimal digits of `seconds`: 0.1 and not 0.10000000149.
 fn decimal(seconds: f32) -> f64 {
-    (f64::from(seconds) * 1e9).round() / 1e9
+    let shortest = seconds.to_string().parse();
+    shortest.unwrap_or_else(|_| seconds.into())
 }
 
 #[cfg(test)]

@@ -87,9 +87,9 @@ fn farthest(panels: &[DepthPanel<'_>]) -> f32 {
 /// The color of a depth, metres: the position on the color scale is logarithmic.
 fn depth_color(metres: f32, farthest_m: f32) -> Rgb {
     let part = (metres / NEAREST_M).ln() / (farthest_m / NEAREST_M).ln();
-    let place = part.clamp(0.0, 1.0) * (COLORS.len() - 1) as f32;
-    let index = (place as usize).min(COLORS.len() - 2);
-    let rest = place - index as f32;
+    let position = part.clamp(0.0, 1.0) * (COLORS.len() - 1) as f32;
+    let index = (position as usize).min(COLORS.len() - 2);
+    let rest = position - index as f32;
     std::array::from_fn(|channel| {
         let [from, to] = [COLORS[index][channel], COLORS[index + 1][channel]];
         (from + rest * (to - from)).round() as u8

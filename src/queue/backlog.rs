@@ -31,13 +31,13 @@ impl Load {
 
 /// Key of the queued load: tenant, priority and required device kind (`None`: any).
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
-pub(super) struct Place {
+pub(super) struct BacklogKey {
     pub(super) tenant: Tenant,
     pub(super) priority: Priority,
     pub(super) device: Option<DeviceKind>,
 }
 
-impl Place {
+impl BacklogKey {
     fn of(job: &Job) -> Self {
         Self {
             tenant: job.tenant.clone(),
@@ -51,7 +51,7 @@ impl Place {
 /// counts only while its closing job is queued or running.
 #[derive(Clone, Debug, Default)]
 pub struct Backlog {
-    queued: HashMap<Place, Load>,
+    queued: HashMap<BacklogKey, Load>,
     running: Load,
 }
 
@@ -63,7 +63,7 @@ impl Backlog {
 
     /// Queued load of one priority, over all tenants.
     pub fn queued_at(&self, priority: Priority) -> Load {
-        self.sum(|place| place.priority == priority)
+        self.sum(|key| key.priority == priority)
     }
 
     /// Queued load in total, with the jobs that follow another one or wait for a retry.
@@ -73,12 +73,12 @@ impl Backlog {
 
     /// Queued load that requires this kind of device.
     pub fn queued_only_for(&self, device: DeviceKind) -> Load {
-        self.sum(|place| place.device == Some(device))
+        self.sum(|key| key.device == Some(device))
     }
 
     /// Queued load of one tenant.
     pub fn queued_of(&self, tenant: &Tenant) -> Load {
-        self.sum(|place| place.tenant == *tenant)
+        self.sum(|key| key.tenant == *tenant)
     }
 
     /// Predicted compute time of the queued jobs that run before a new job of `tenant`, nominal
@@ -94,14 +94,14 @@ impl Backlog {
         cost_seconds: f64,
         device: Option<DeviceKind>,
     ) -> f64 {
-        let higher = self.sum(|place| place.priority > priority && place.device == device);
-        let equals = |place: &&Place| place.priority == priority && place.device == device;
-        let own = self.sum(|place| place.priority == priority && place.tenant == *tenant);
-        let waiting = self.queued.iter().filter(|(place, _)| equals(place));
+        let higher = self.sum(|key| key.priority > priority && key.device == device);
+        let equals = |key: &&BacklogKey| key.priority == priority && key.device == device;
+        let own = self.sum(|key| key.priority == priority && key.tenant == *tenant);
+        let waiting = self.queued.iter().filter(|(key, _)| equals(key));
         // By fair queueing, each other tenant is served as much work as this one until the new job
         // is done.
         let equal: f64 = waiting
-            .map(|(place, load)| match place.tenant == *tenant {
+            .map(|(key, load)| match key.tenant == *tenant {
                 true => load.seconds,
                 false => load.seconds.min(own.seconds + cost_seconds),
             })
@@ -109,8 +109,8 @@ impl Backlog {
         higher.seconds + equal
     }
 
-    fn sum(&self, take: impl Fn(&Place) -> bool) -> Load {
-        let taken = self.queued.iter().filter(|(place, _)| take(place));
+    fn sum(&self, take: impl Fn(&BacklogKey) -> bool) -> Load {
+        let taken = self.queued.iter().filter(|(key, _)| take(key));
         taken.fold(Load::default(), |sum, (_, load)| Load {
             jobs: sum.jobs + load.jobs,
             seconds: sum.seconds + load.seconds,
@@ -118,21 +118,21 @@ impl Backlog {
     }
 
     pub(super) fn entered(&mut self, job: &Job) {
-        let load = self.queued.entry(Place::of(job)).or_default();
+        let load = self.queued.entry(BacklogKey::of(job)).or_default();
         load.add(job.cost_seconds);
     }
 
     /// Sets the queued load of a key.
-    pub(super) fn enter_many(&mut self, place: Place, load: Load) {
-        self.queued.insert(place, load);
+    pub(super) fn enter_many(&mut self, key: BacklogKey, load: Load) {
+        self.queued.insert(key, load);
     }
 
     pub(super) fn left(&mut self, job: &Job) {
-        let place = Place::of(job);
-        if let Some(load) = self.queued.get_mut(&place) {
+        let key = BacklogKey::of(job);
+        if let Some(load) = self.queued.get_mut(&key) {
             load.remove(job.cost_seconds);
             if load.jobs == 0 {
-                self.queued.remove(&place);
+                self.queued.remove(&key);
             }
         }
     }

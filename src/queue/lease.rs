@@ -61,7 +61,7 @@ impl Flags {
         self.durable.load(Ordering::Relaxed)
     }
 
-    pub(super) fn lose(&self) {
+    pub(super) fn mark_lost(&self) {
         self.lost.store(true, Ordering::Relaxed);
     }
 

@@ -14,7 +14,7 @@ use crate::engine::{Densification, Densified, EngineError};
 use crate::flow::densify::Plan;
 use crate::flow::{Control, FlowError, Sweep};
 use crate::job::{DenseReport, Densify, Job, JobOptions};
-use crate::payload::{Damaged, StoredCloud, StoredDense};
+use crate::payload::{CorruptPayload, StoredCloud, StoredDense};
 use crate::queue::Lease;
 use crate::storage::Blob;
 
@@ -104,7 +104,7 @@ impl Worker {
             let read = move || {
                 let StoredCloud { points, ground, .. } = StoredCloud::from_bytes(&bytes)?;
                 let sweep = Sweep { points, ground }.prepared(&solver_options);
-                Ok::<_, Damaged>(sweep.cropped(&solver_options))
+                Ok::<_, CorruptPayload>(sweep.cropped(&solver_options))
             };
             let read = tokio::task::spawn_blocking(read).await;
             sweeps.push(read??);

@@ -16,7 +16,7 @@ use crate::clock::Timestamp;
 use crate::engine::Work;
 use crate::flow::{Ego, EnvelopeError, MotionField, Snapshot, Sweep};
 use crate::job::{Job, JobOptions, State};
-use crate::payload::{Damaged, StoredCloud};
+use crate::payload::{CorruptPayload, StoredCloud};
 use crate::queue::{Lease, QueueError};
 use crate::storage::{Blob, BlobError, Fsync};
 
@@ -26,7 +26,7 @@ pub(super) enum StoreError {
     #[error(transparent)]
     Blob(#[from] BlobError),
     #[error(transparent)]
-    Damaged(#[from] Damaged),
+    CorruptPayload(#[from] CorruptPayload),
     #[error("a field cannot be read: {0}")]
     MotionField(#[from] EnvelopeError),
     #[error("reading it failed: {0}")]

@@ -93,8 +93,8 @@ fn odometrys_camera_is_rectified_already() {
         .join("\n")
         .replace("Tr_velo_to_cam", "Tr");
     let mount = read_camera0_from_lidar(odometry.as_bytes(), None).unwrap();
-    let place = mount * Point3::new(10.0, 2.0, 1.0);
-    assert!((place - Point3::new(-2.0, -1.1, 9.7)).norm() < PRINTED);
+    let index = mount * Point3::new(10.0, 2.0, 1.0);
+    assert!((index - Point3::new(-2.0, -1.1, 9.7)).norm() < PRINTED);
 }
 
 #[test]

@@ -150,15 +150,15 @@ fn feather_bomb() -> Vec<u8> {
     let zeros = vec![[0.0; 3]; 1000];
     fnsf::formats::write_cloud(fnsf::formats::CloudFormat::Feather, &zeros, &mut bytes).unwrap();
     let declared = 4000_u64.to_le_bytes();
-    let places: Vec<usize> = (0..bytes.len() - 8)
+    let indices: Vec<usize> = (0..bytes.len() - 8)
         .filter(|&index| bytes[index..index + 8] == declared)
         .collect();
     assert!(
-        places.len() >= 3,
+        indices.len() >= 3,
         "compressed buffers begin with their length"
     );
-    for place in places {
-        bytes[place..place + 8].copy_from_slice(&(1_u64 << 62).to_le_bytes());
+    for index in indices {
+        bytes[index..index + 8].copy_from_slice(&(1_u64 << 62).to_le_bytes());
     }
     bytes
 }

@@ -4,6 +4,7 @@
 //! the folder their tests print a message and pass, or fail where `FNSF_REQUIRE_REAL_DATA` is `1`.
 
 mod accuracy;
+mod costs;
 mod deadlines;
 mod depth;
 mod ego;
@@ -12,7 +13,6 @@ mod gpu;
 mod gpu_rule;
 mod ground;
 mod labels;
-mod prices;
 // cfg(test) is always set in this crate. It makes clippy treat the module as a test.
 #[cfg(test)]
 #[path = "../common/real_data.rs"]

@@ -167,15 +167,15 @@ fn torn_and_altered_snapshots_are_refused() {
         Snapshot::from_bytes(&longer),
         Err(SnapshotError::Sealed(EnvelopeError::Length { .. }))
     ));
-    let places = (0..EDGE)
+    let indices = (0..EDGE)
         .chain((EDGE..bytes.len()).step_by(STRIDE))
         .chain(bytes.len() - EDGE..bytes.len());
     let mut altered = bytes.clone();
-    for place in places {
+    for index in indices {
         for flip in [1, 0x80, 0xFF] {
-            altered[place] ^= flip;
-            assert!(Snapshot::from_bytes(&altered).is_err(), "byte {place}");
-            altered[place] ^= flip;
+            altered[index] ^= flip;
+            assert!(Snapshot::from_bytes(&altered).is_err(), "byte {index}");
+            altered[index] ^= flip;
         }
     }
     assert!(Snapshot::from_bytes(&altered).is_ok());

@@ -119,8 +119,8 @@ fn fields(sweeps: &[Vec<Point>], plan: &Plan, preset: Preset) -> BTreeMap<FlowEd
         let mut sequence = Sequence::default();
         let (mut edges, mut estimates) = (Vec::new(), Vec::new());
         for (number, edge) in chain.into_iter().enumerate() {
-            let mut push = |place: usize| {
-                let sweep = sweep(sweeps[place].clone());
+            let mut push = |index: usize| {
+                let sweep = sweep(sweeps[index].clone());
                 let pushed = sequence.push(&backend, sweep, &options, &Uncontrolled);
                 pushed.expect("a pair")
             };
@@ -144,7 +144,7 @@ fn errors(street: &Street, frame: &StreetSweep, cloud: &DenseCloud) -> [f64; 2] 
     let first = cloud
         .sweep
         .iter()
-        .position(|&place| place as usize == frame.index)
+        .position(|&index| index as usize == frame.index)
         .expect("the sweep is there");
     let truth = street.flow_to(frame, INTO as f64);
     let (next, still) = (

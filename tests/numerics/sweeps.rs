@@ -22,14 +22,14 @@ fn seeing(sweeps: usize) -> Options {
 /// Estimates pair `pair` of `sweeps`, with all other sweeps as neighbor sweeps.
 fn alone(sweeps: &[Sweep], pair: usize, options: &Options, control: &dyn Control) -> Estimate {
     let backend = CpuBackend::new(Some(2)).expect("threads");
-    let others = (0..sweeps.len()).filter(|&place| place != pair && place != pair + 1);
-    let others = others.map(|place| NeighborSweep {
-        points: &sweeps[place].points,
-        ground: sweeps[place].ground.as_deref(),
-        at: place as i8 - pair as i8,
+    let others = (0..sweeps.len()).filter(|&index| index != pair && index != pair + 1);
+    let others = others.map(|index| NeighborSweep {
+        points: &sweeps[index].points,
+        ground: sweeps[index].ground.as_deref(),
+        at: index as i8 - pair as i8,
     });
     let neighbors: Vec<NeighborSweep> = others.collect();
-    let [source, target] = [pair, pair + 1].map(|place| &sweeps[place]);
+    let [source, target] = [pair, pair + 1].map(|index| &sweeps[index]);
     let ground = source.ground.as_deref().zip(target.ground.as_deref());
     let problem = Problem {
         source: &source.points,
@@ -50,8 +50,8 @@ fn drive(seed: u64, sweeps: usize, beams: usize) -> (Street, Vec<Sweep>) {
         ..StreetOptions::default()
     };
     let street = Street::new(&options).expect("a street");
-    let sweep = |place| {
-        let frame = street.sweep(place).expect("a frame");
+    let sweep = |index| {
+        let frame = street.sweep(index).expect("a frame");
         Sweep {
             points: frame.points,
             ground: Some(frame.ground),
@@ -160,8 +160,8 @@ fn five_sweeps_beat_two_on_a_real_drive() {
         sweep(pair.source.clone(), Some(ground.source)),
         sweep(pair.target.clone(), Some(ground.target)),
     ];
-    for place in 2..5 {
-        let name = format!("{place:010}.pcd");
+    for index in 2..5 {
+        let name = format!("{index:010}.pcd");
         let bytes = std::fs::read(folder.join(&name)).expect("the drive has the sweep");
         let cloud = read_cloud(&bytes, Some(&name)).expect("the sweep is sound");
         let options = seeing(5);

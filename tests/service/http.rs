@@ -348,7 +348,7 @@ async fn a_sequence_gives_one_archive_and_every_pair_by_itself() {
     let bytes = archive.bytes().await.expect("a body").to_vec();
     let mut zip = zip::ZipArchive::new(std::io::Cursor::new(bytes)).expect("an archive");
     assert_eq!(zip.len(), 2);
-    for (place, pair) in job["pairs"]["jobs"]
+    for (index, pair) in job["pairs"]["jobs"]
         .as_array()
         .expect("pairs")
         .iter()
@@ -361,7 +361,7 @@ async fn a_sequence_gives_one_archive_and_every_pair_by_itself() {
             .await
             .expect("an answer");
         let own = own.bytes().await.expect("a body").to_vec();
-        let mut entry = zip.by_name(&format!("{place:06}.npy")).expect("an entry");
+        let mut entry = zip.by_name(&format!("{index:06}.npy")).expect("an entry");
         let mut packed = Vec::new();
         std::io::Read::read_to_end(&mut entry, &mut packed).expect("bytes");
         assert_eq!(own, packed);

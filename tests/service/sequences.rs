@@ -38,7 +38,7 @@ fn sweeps() -> &'static [Vec<Point>] {
             ..StreetOptions::default()
         };
         let street = Street::new(&options).expect("a street");
-        let frame = |place| street.sweep(place).expect("a frame").points;
+        let frame = |index| street.sweep(index).expect("a frame").points;
         (0..4).map(frame).collect()
     })
 }
@@ -51,14 +51,14 @@ fn backend() -> CpuBackend {
 fn chained(
     backend: &CpuBackend,
     options: &str,
-    places: &[usize],
+    indices: &[usize],
 ) -> Vec<(MotionField, Vec<Point>)> {
     let options = JobOptions::from_json(options.as_bytes()).expect("good options");
     let mut sequence = Sequence::default();
     let mut found = Vec::new();
-    for &place in places {
+    for &index in indices {
         let sweep = Sweep {
-            points: sweeps()[place].clone(),
+            points: sweeps()[index].clone(),
             ground: None,
         };
         let solver = options.solver_options(sweep.points.len());
@@ -79,9 +79,9 @@ fn flows(options: &str) -> Vec<Vec<Point>> {
 fn dense(options: &str) -> DenseCloud {
     let backend = backend();
     let mut fields = HashMap::new();
-    for places in [[0, 1, 2, 3], [3, 2, 1, 0]] {
-        let found = chained(&backend, options, &places);
-        for (step, (field, _)) in places.windows(2).zip(found) {
+    for indices in [[0, 1, 2, 3], [3, 2, 1, 0]] {
+        let found = chained(&backend, options, &indices);
+        for (step, (field, _)) in indices.windows(2).zip(found) {
             let leg = FlowEdge {
                 source: step[0],
                 target: step[1],

@@ -29,7 +29,7 @@ fn sweeps() -> &'static [Vec<Point>] {
             ..StreetOptions::default()
         };
         let street = Street::new(&options).expect("a street");
-        let frame = |place| street.sweep(place).expect("a frame").points;
+        let frame = |index| street.sweep(index).expect("a frame").points;
         (0..SWEEPS).map(frame).collect()
     })
 }
@@ -65,12 +65,12 @@ async fn streamed(
             ..proto::Options::default()
         }),
     })];
-    for (place, points) in sweeps().iter().enumerate() {
+    for (index, points) in sweeps().iter().enumerate() {
         parts.push(Part::Sweep(Sweep {
-            name: place.to_string(),
+            name: index.to_string(),
             points: None,
         }));
-        match broken.filter(|_| place == 4) {
+        match broken.filter(|_| index == 4) {
             None => parts.push(Part::Chunk(chunk(points))),
             Some(bytes) => parts.push(Part::Chunk(proto::Chunk {
                 points: bytes.into(),
@@ -126,8 +126,8 @@ async fn pairs_that_see_the_sweeps_around_them_have_the_same_bits_through_every_
 
     let (streamed, broken) = streamed(&server, None).await;
     assert_eq!(broken, None);
-    for (place, (names, _)) in streamed.iter().enumerate() {
-        assert_eq!(*names, [place.to_string(), (place + 1).to_string()]);
+    for (index, (names, _)) in streamed.iter().enumerate() {
+        assert_eq!(*names, [index.to_string(), (index + 1).to_string()]);
     }
     let streamed: Vec<Vec<Point>> = streamed.into_iter().map(|(_, flow)| flow).collect();
     assert!(streamed == expected, "as a stream");
@@ -147,7 +147,7 @@ async fn a_dense_cloud_whose_pairs_see_the_sweeps_around_them_is_the_command_lin
         let over_http = answer.bytes().await.expect("a body");
 
         let folder = tempfile::tempdir().expect("a folder");
-        let names: Vec<String> = (0..SWEEPS).map(|place| format!("{place}.npy")).collect();
+        let names: Vec<String> = (0..SWEEPS).map(|index| format!("{index}.npy")).collect();
         for (name, points) in names.iter().zip(sweeps()) {
             let bytes = file(CloudFormat::Npy, points);
             std::fs::write(folder.path().join(name), bytes).expect("written");

@@ -32,7 +32,7 @@ const MAX_NAME: usize = 255;
 
 /// A pair that has been submitted.
 struct Pending {
-    place: u32,
+    index: u32,
     source: String,
     target: String,
     /// The job, or the error of its submission.
@@ -99,7 +99,7 @@ pub(super) fn run(
             call,
             inbound,
             pending: pending.clone(),
-            place: 0,
+            index: 0,
             count: 0,
             held: VecDeque::new(),
             before: None,
@@ -121,7 +121,7 @@ struct Reader {
     inbound: Streaming<proto::EstimateSequenceRequest>,
     pending: mpsc::Sender<Item>,
     /// The index of the next pair to submit.
-    place: usize,
+    index: usize,
     /// The number of sweeps so far, and the latest of them, which windows of further pairs may
     /// contain.
     count: usize,
@@ -200,10 +200,10 @@ impl Reader {
         self.held.push_back(coming.finish(room)?);
         self.count += 1;
         let sweeps = self.options.sweeps();
-        while self.place + 1 < self.count && is_window_final(self.place, self.count, sweeps) {
+        while self.index + 1 < self.count && is_window_final(self.index, self.count, sweeps) {
             self.submit_next().await;
         }
-        let first = window(self.place, self.count.max(self.place + 2), sweeps).start;
+        let first = window(self.index, self.count.max(self.index + 2), sweeps).start;
         while self.count - self.held.len() < first {
             self.held.pop_front();
         }
@@ -213,48 +213,48 @@ impl Reader {
     /// At the end of the stream: submits the remaining pairs, with windows that end at the last
     /// sweep.
     async fn submit_rest(&mut self) {
-        while self.place + 1 < self.count {
+        while self.index + 1 < self.count {
             self.submit_next().await;
         }
     }
 
     /// Submits the next pair with the sweeps of its window.
     async fn submit_next(&mut self) {
-        let place = self.place;
-        self.place += 1;
+        let index = self.index;
+        self.index += 1;
         let Ok(place_in_line) = self.pending.clone().reserve_owned().await else {
             return;
         };
         let first_held = self.count - self.held.len();
-        let name = |place: usize| self.held[place - first_held].name.clone();
-        let names = (name(place), name(place + 1));
-        let job = self.submit(place).await;
+        let name = |index: usize| self.held[index - first_held].name.clone();
+        let names = (name(index), name(index + 1));
+        let job = self.submit(index).await;
         self.before = job.as_ref().ok().map(|accepted| accepted.job.id);
         let _sender = place_in_line.send(Item::Pair(Pending {
-            place: u32::try_from(place).unwrap_or(u32::MAX),
+            index: u32::try_from(index).unwrap_or(u32::MAX),
             source: names.0,
             target: names.1,
             job,
         }));
     }
 
-    async fn submit(&mut self, place: usize) -> Result<Accepted, ApiError> {
+    async fn submit(&mut self, index: usize) -> Result<Accepted, ApiError> {
         let options = &self.options;
         let mut request = self
             .call
             .job_request(options.clone(), Durability::Ephemeral);
         let after = self.before;
         request.link = options.chained().then_some(ChainLink { after });
-        let window = window(place, self.count, options.sweeps());
+        let window = window(index, self.count, options.sweeps());
         request.pair = PairOf {
-            index: u32::try_from(place - window.start).unwrap_or(u32::MAX),
+            index: u32::try_from(index - window.start).unwrap_or(u32::MAX),
             window: PairOf::seen(0..window.len()),
             ..PairOf::ALONE
         };
         let mut pending = PendingJob::begin(&self.service, self.call.caller.clone(), request)?;
         let first_held = self.count - self.held.len();
-        for place in window {
-            let cloud = &mut self.held[place - first_held].cloud;
+        for index in window {
+            let cloud = &mut self.held[index - first_held].cloud;
             *cloud = pending.push(Arc::clone(cloud), None).await?;
         }
         pending.submit(Kind::Pair).await
@@ -289,7 +289,7 @@ async fn send(service: &Arc<Service>, pair: Pending, answers: &ResultBudget) -> 
     use proto::estimate_sequence_response::{Pair, Part};
     let message = |part: Part| Ok(proto::EstimateSequenceResponse { part: Some(part) });
     let header = |outcome: Outcome| Pair {
-        index: pair.place,
+        index: pair.index,
         source: pair.source.clone(),
         target: pair.target.clone(),
         outcome: Some(outcome),

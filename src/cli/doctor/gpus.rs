@@ -46,12 +46,12 @@ pub(super) fn report() -> Result<(), Failure> {
 
 fn describe(adapter: &Adapter, taken: bool) -> Result<(), Failure> {
     let taken = if taken { ", taken by auto" } else { "" };
-    let place = match adapter.pci_id.as_str() {
+    let pci_id = match adapter.pci_id.as_str() {
         "" => String::new(),
-        place => format!(", {place}"),
+        pci_id => format!(", {pci_id}"),
     };
     say(format_args!(
-        "gpu:{}: {} ({}{place}){taken}",
+        "gpu:{}: {} ({}{pci_id}){taken}",
         adapter.index,
         adapter.name,
         adapter.kind.name(),

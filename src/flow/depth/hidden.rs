@@ -54,8 +54,9 @@ impl DepthImage {
         let width = (self.width as usize).max(1);
         let metres = (0..self.metres.len()).into_par_iter().map(|index| {
             let depth = self.metres[index];
-            let place = [index % width, index / width];
-            if depth > 0.0 && self.nearer_quadrants(place, depth, occlusion) >= occlusion.quadrants
+            let position = [index % width, index / width];
+            if depth > 0.0
+                && self.nearer_quadrants(position, depth, occlusion) >= occlusion.quadrants
             {
                 0.0
             } else {

@@ -143,17 +143,17 @@ impl Index {
 
     /// The positions of the active bricks, in bricks, in the order of their storage numbers.
     #[cfg(feature = "gpu")]
-    pub(crate) fn active_places(&self) -> Vec<[u32; 3]> {
-        let mut places = Vec::with_capacity(self.active);
+    pub(crate) fn active_brick_positions(&self) -> Vec<[u32; 3]> {
+        let mut indices = Vec::with_capacity(self.active);
         for (block, table) in self.tabled_blocks() {
             let bricks = &self.bricks[table * VOLUME..(table + 1) * VOLUME];
             let active = (0..VOLUME as u32).filter(|&at| bricks[at as usize] != ABSENT);
-            places.extend(active.map(|at| {
+            indices.extend(active.map(|at| {
                 let within = [at >> 6, at >> 3 & 7, at & 7];
                 core::array::from_fn(|axis| block[axis] as u32 * EDGE + within[axis])
             }));
         }
-        places
+        indices
     }
 
     pub(crate) fn bytes(&self) -> usize {

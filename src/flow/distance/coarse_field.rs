@@ -242,7 +242,7 @@ impl Envelope {
     fn transform(&mut self, line: &mut [Nearest]) {
         self.sources.clear();
         self.starts.clear();
-        for (place, &source) in line.iter().enumerate() {
+        for (index, &source) in line.iter().enumerate() {
             if source.square == f32::INFINITY {
                 continue;
             }
@@ -250,8 +250,8 @@ impl Envelope {
             while let Some(&(last, last_source)) = self.sources.last() {
                 // The intersection is computed without squared indices, which on long lines would
                 // cancel the significant digits of the heights.
-                let (rise, run) = (source.square - last_source.square, (place - last) as f32);
-                start = (rise / run + (place + last) as f32) / 2.0;
+                let (rise, run) = (source.square - last_source.square, (index - last) as f32);
+                start = (rise / run + (index + last) as f32) / 2.0;
                 if self.starts.last().is_some_and(|&begin| start <= begin) {
                     self.sources.pop();
                     self.starts.pop();
@@ -262,15 +262,15 @@ impl Envelope {
             if self.sources.is_empty() {
                 start = f32::NEG_INFINITY;
             }
-            self.sources.push((place, source));
+            self.sources.push((index, source));
             self.starts.push(start);
         }
         if self.sources.is_empty() {
             return;
         }
         let mut current = 0;
-        for (place, nearest) in line.iter_mut().enumerate() {
-            let at = place as f32;
+        for (index, nearest) in line.iter_mut().enumerate() {
+            let at = index as f32;
             while current + 1 < self.starts.len() && self.starts[current + 1] < at {
                 current += 1;
             }
@@ -294,9 +294,9 @@ mod tests {
         line
     }
 
-    fn check(squares: &[f32], places: impl Iterator<Item = usize>) {
+    fn check(squares: &[f32], indices: impl Iterator<Item = usize>) {
         let fast = transformed(squares);
-        for i in places {
+        for i in indices {
             let at = |j: usize| (i as f64 - j as f64).powi(2) + f64::from(squares[j]);
             let slow = (0..squares.len()).map(at).fold(f64::INFINITY, f64::min);
             assert_eq!(f64::from(fast[i].square), slow, "at {i}");
@@ -314,8 +314,8 @@ mod tests {
     #[test]
     fn the_far_end_of_a_long_line_is_as_exact_as_its_beginning() {
         let mut line = vec![f32::INFINITY; 30_000];
-        for place in (0..line.len()).step_by(7) {
-            line[place] = (place * 31 % 97) as f32;
+        for index in (0..line.len()).step_by(7) {
+            line[index] = (index * 31 % 97) as f32;
         }
         check(&line, (0..100).chain(29_900..30_000));
     }

@@ -39,7 +39,7 @@ impl DistanceTransform {
     ///
     /// # Errors
     /// [`DistanceError`] as [`Self::build`], but never [`DistanceError::Interrupted`].
-    pub fn price(
+    pub fn predict_cost(
         source: &[Point],
         target: &[Point],
         options: &DistanceOptions,

@@ -121,17 +121,17 @@ fn check_every_vertex(name: &str, bricks: &Bricks, target: &[Point], band: f64, 
         let at = vertex.map(f64::from);
         let exact = reference::nearest_distance(at, sites);
         let value = f64::from(bricks.at_vertex(vertex)) / cell;
-        let place = format!("{name}, band {band}, {vertex:?}: {value} for {exact}");
+        let position = format!("{name}, band {band}, {vertex:?}: {value} for {exact}");
         if bricks.code(vertex) != fill::BEYOND {
-            assert!(exact <= band + tolerance, "{place}");
-            assert!((value - exact).abs() <= tolerance, "{place}");
+            assert!(exact <= band + tolerance, "{position}");
+            assert!((value - exact).abs() <= tolerance, "{position}");
         } else {
             // Bricks are active if an occupied vertex is within the band.
             let active = reference::nearest_distance(at, &vertices) <= band;
-            assert!(!active || exact > band - tolerance, "{place}");
-            assert!(value >= band - tolerance, "{place}");
-            assert!(value >= exact - FAR_BELOW - moved, "{place}");
-            assert!(value <= exact.max(band) + FAR_ABOVE + moved, "{place}");
+            assert!(!active || exact > band - tolerance, "{position}");
+            assert!(value >= band - tolerance, "{position}");
+            assert!(value >= exact - FAR_BELOW - moved, "{position}");
+            assert!(value <= exact.max(band) + FAR_ABOVE + moved, "{position}");
         }
     }
 }
@@ -200,23 +200,23 @@ fn a_query_is_the_trilinear_value_of_the_vertices() {
         };
         let near = boxed(7, PLACES, [-5.0, -4.0, -3.0], [5.0, 4.0, 3.0]);
         let far = boxed(8, PLACES, [-19.9, -15.9, -3.9], [17.9, 13.9, 8.9]);
-        for place in near.into_iter().chain(far) {
-            let at = grid.in_cells(place);
+        for position in near.into_iter().chain(far) {
+            let at = grid.in_cells(position);
             let stored = |v: [u32; 3]| f64::from(bricks.at_vertex(v));
             let (value, gradient) = reference::trilinear(at, stored);
-            let sample = bricks.sample(place);
+            let sample = bricks.sample(position);
             assert!(
                 (f64::from(sample.distance) - value).abs() < TOLERANCE,
-                "{place:?}"
+                "{position:?}"
             );
             for (slope, exact) in sample.gradient.into_iter().zip(gradient) {
                 let error = (f64::from(slope) - exact / grid.cell).abs();
-                assert!(error < SLOPE, "{place:?}");
+                assert!(error < SLOPE, "{position:?}");
             }
             if value < 1.7 {
                 let oracle = |v: [u32; 3]| reference::nearest_distance(v.map(f64::from), &sites);
                 let exact = reference::trilinear(at, oracle).0 * grid.cell;
-                assert!((value - exact).abs() < TOLERANCE, "{place:?}");
+                assert!((value - exact).abs() < TOLERANCE, "{position:?}");
             }
         }
     }
@@ -230,21 +230,21 @@ fn the_gradient_is_the_finite_difference_of_the_value() {
     let (source, target) = street();
     let bricks = bricks(&source, &target, &options(0.1, 20.0, Sites::Cells));
     let mut checked = 0;
-    for place in boxed(9, PLACES, [-9.0, -8.0, -3.5], [9.0, 8.0, 5.0]) {
+    for position in boxed(9, PLACES, [-9.0, -8.0, -3.5], [9.0, 8.0, 5.0]) {
         let inside = |c: f64| (0.1..0.9).contains(&(c - c.floor()));
-        if !bricks.grid().in_cells(place).into_iter().all(inside) {
+        if !bricks.grid().in_cells(position).into_iter().all(inside) {
             continue;
         }
         checked += 1;
-        let gradient = bricks.sample(place).gradient;
+        let gradient = bricks.sample(position).gradient;
         for axis in 0..3 {
-            let (mut ahead, mut behind) = (place, place);
+            let (mut ahead, mut behind) = (position, position);
             ahead[axis] += STEP;
             behind[axis] -= STEP;
             let rise = bricks.sample(ahead).distance - bricks.sample(behind).distance;
             let slope = f64::from(rise) / f64::from(ahead[axis] - behind[axis]);
             let error = (slope - f64::from(gradient[axis])).abs();
-            assert!(error < TOLERANCE, "{place:?}: {slope} {gradient:?}");
+            assert!(error < TOLERANCE, "{position:?}: {slope} {gradient:?}");
         }
     }
     assert!(checked > PLACES / 4);
@@ -259,10 +259,10 @@ fn grids_too_large_for_the_finest_far_field_take_a_coarser_one() {
     let source = [low, high].map(|corner| corner.map(|c| c as f32));
     let bricks = bricks(&source, &target, &options(0.1, 20.0, Sites::Cells));
     let (_, vertices) = in_cells(bricks.grid(), &target);
-    for place in boxed(16, PLACES, low, high) {
-        let at = bricks.grid().in_cells(place);
+    for position in boxed(16, PLACES, low, high) {
+        let at = bricks.grid().in_cells(position);
         let exact = reference::nearest_distance(at, &vertices);
-        let value = f64::from(bricks.sample(place).distance) / bricks.grid().cell;
+        let value = f64::from(bricks.sample(position).distance) / bricks.grid().cell;
         assert!(value >= exact - FAR_BELOW * COARSER, "{value} for {exact}");
         assert!(
             value <= exact.max(20.0) + FAR_ABOVE * COARSER,
@@ -382,13 +382,16 @@ fn a_chamfer_query_is_the_trilinear_value_of_the_vertices() {
         ..options(0.2, 10.0, Sites::Cells)
     };
     let dense = DenseChamfer::build(&source, &target, &options, &Uncontrolled).unwrap();
-    for place in boxed(13, PLACES, [-19.9, -15.9, -3.9], [17.9, 13.9, 8.9]) {
-        let at = dense.grid().in_cells(place);
+    for position in boxed(13, PLACES, [-19.9, -15.9, -3.9], [17.9, 13.9, 8.9]) {
+        let at = dense.grid().in_cells(position);
         let (value, gradient) = reference::trilinear(at, |v| f64::from(dense.at(v)));
-        let sample = dense.sample(place);
+        let sample = dense.sample(position);
         assert!((f64::from(sample.distance) - value).abs() < SINGLE);
         for (slope, exact) in sample.gradient.into_iter().zip(gradient) {
-            assert!((f64::from(slope) - exact / 0.2).abs() < SLOPE, "{place:?}");
+            assert!(
+                (f64::from(slope) - exact / 0.2).abs() < SLOPE,
+                "{position:?}"
+            );
         }
     }
 }
@@ -401,8 +404,8 @@ fn the_number_of_threads_changes_no_bit() {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
             let options = options(0.1, 20.0, sites);
             let bricks = pool.unwrap().install(|| bricks(&source, &target, &options));
-            let places = every_vertex(bricks.grid()).step_by(7);
-            places.map(|v| bricks.at_vertex(v).to_bits()).collect()
+            let positions = every_vertex(bricks.grid()).step_by(7);
+            positions.map(|v| bricks.at_vertex(v).to_bits()).collect()
         };
         let one = values(1);
         assert!(one == values(2) && one == values(5));

@@ -67,8 +67,8 @@ impl VertexSites {
     fn at(&self, column: usize, layer: u32) -> Option<&[i16; 8]> {
         let (first, start) = self.layers[column];
         let end = self.layers[column + 1].1;
-        let place = start + layer.checked_sub(first)?;
-        (place < end).then(|| &self.squares[place as usize])
+        let index = start + layer.checked_sub(first)?;
+        (index < end).then(|| &self.squares[index as usize])
     }
 }
 

@@ -38,7 +38,7 @@ impl Network {
     /// With `motion` as the transform to the new frame: `g'(p) = R g(motion^-1 p)`. The result is
     /// exact up to rounding: both rotations and the translation are absorbed by the first and last
     /// layers.
-    pub(crate) fn carried(
+    pub(crate) fn transformed(
         &self,
         motion: &RigidTransform,
         conditioning: &Conditioning,
@@ -51,8 +51,8 @@ impl Network {
         let stretch = f64::from(own.scale) / f64::from(new.scale);
         let shift = rotation.transpose() * (vector(new.center) - motion.translation.vector);
         let shift = (shift - vector(own.center)) * f64::from(own.scale);
-        let mut carried = self.parameters.clone();
-        let (from, to) = (self.parameters.as_slice(), carried.as_mut_slice());
+        let mut transformed = self.parameters.clone();
+        let (from, to) = (self.parameters.as_slice(), transformed.as_mut_slice());
         let layer = first_layer();
         for feature in 0..WIDTH {
             let weight = |input: usize| layer.weights + input * WIDTH + feature;
@@ -76,7 +76,7 @@ impl Network {
                 to[index(output)] = turned[output] as f32;
             }
         }
-        carried
+        transformed
     }
 }
 
@@ -119,13 +119,13 @@ mod tests {
             .map(|&point| transform_point(&motion, point))
             .collect();
         let conditioning = Conditioning::new(&seen, scales[1]);
-        let carried = Network {
-            parameters: network.carried(&motion, &conditioning),
+        let transformed = Network {
+            parameters: network.transformed(&motion, &conditioning),
             conditioning,
         };
         let backend = CpuBackend::new(Some(1)).expect("a thread");
         let before = backend.evaluate(&network, &others).expect("flows");
-        let after = backend.evaluate(&carried, &seen).expect("flows");
+        let after = backend.evaluate(&transformed, &seen).expect("flows");
         for (before, after) in before.into_iter().zip(after) {
             let turned = motion.rotation * Vector3::from(before.map(f64::from));
             for axis in 0..3 {

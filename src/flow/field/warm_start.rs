@@ -41,21 +41,21 @@ pub(crate) fn warm_start(
     }
     let conditioning = Conditioning::new(aligned, options.inputs);
     let motion = ego.copied().unwrap_or_default();
-    let carried = Network {
-        parameters: prior.network.carried(&motion, &conditioning),
+    let transformed = Network {
+        parameters: prior.network.transformed(&motion, &conditioning),
         conditioning,
     };
     let points = stride_sample(aligned, JUDGED);
-    let flows = backend.evaluate(&carried, &points)?;
+    let flows = backend.evaluate(&transformed, &points)?;
     let still = vec![[0.0; 3]; points.len()];
-    let [carried_loss, still_loss] = [
+    let [prior_loss, still_loss] = [
         mean_loss(prepared, options, &points, &flows)?,
         mean_loss(prepared, options, &points, &still)?,
     ];
     // Written so that a loss that is not a number starts from new weights.
-    if carried_loss < still_loss {
+    if prior_loss < still_loss {
         *options = options.warmed(warm_start);
-        return Ok(Some(TrainerState::at_start(carried.parameters)));
+        return Ok(Some(TrainerState::at_start(transformed.parameters)));
     }
     Ok(None)
 }

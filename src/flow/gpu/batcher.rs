@@ -259,7 +259,7 @@ fn iterate(
             let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
             phases.dispatch(&mut pass, Phase::Halve, step, first);
             phases.dispatch(&mut pass, Phase::Forward, step, first);
-            phases.dispatch(&mut pass, Phase::Query, step, first);
+            phases.dispatch(&mut pass, Phase::DistanceLoss, step, first);
             pass
         }
         Some(clock) => {
@@ -268,7 +268,7 @@ fn iterate(
             phases.dispatch(&mut pass, Phase::Forward, step, first);
             drop(pass);
             let mut pass = clock.pass(encoder, Some(1), Some(2));
-            phases.dispatch(&mut pass, Phase::Query, step, first);
+            phases.dispatch(&mut pass, Phase::DistanceLoss, step, first);
             drop(pass);
             clock.pass(encoder, None, Some(3))
         }

@@ -26,19 +26,19 @@ const SAMPLE_GROUP: usize = 64;
 /// Words of the store for a distance transform, followed by the source points. Released on drop.
 struct Allocation {
     device: Arc<Device>,
-    place: u32,
+    offset: u32,
     pub(super) words: u64,
 }
 
 impl Allocation {
     fn take(device: &Arc<Device>, words: u64, control: &dyn Control) -> Result<Self, BackendError> {
-        let place = device
+        let offset = device
             .context
             .allocator
             .take("distance transform", words, control)?;
         Ok(Self {
             device: Arc::clone(device),
-            place: place as u32,
+            offset: offset as u32,
             words,
         })
     }
@@ -49,7 +49,7 @@ impl Drop for Allocation {
         self.device
             .context
             .allocator
-            .give_back(self.place.into(), self.words);
+            .give_back(self.offset.into(), self.words);
     }
 }
 
@@ -101,22 +101,22 @@ pub(super) fn build(
     let words = parts.iter().sum();
     let points = source.len() as u64 * POINT_WORDS;
     let stretch = Allocation::take(device, words + points, control)?;
-    let mut place = u64::from(stretch.place);
-    let places = parts.map(|words| {
-        let own = place;
-        place += words;
+    let mut offset = u64::from(stretch.offset);
+    let offsets = parts.map(|words| {
+        let own = offset;
+        offset += words;
         own
     });
-    let write = |place: u64, words: &[u8]| {
+    let write = |offset: u64, words: &[u8]| {
         device
             .context
             .queue
-            .write_buffer(&device.context.buffers.store, place * 4, words);
+            .write_buffer(&device.context.buffers.store, offset * 4, words);
     };
-    write(places[0], bytemuck::cast_slice(&index.tables));
-    write(places[1], bytemuck::cast_slice(&index.bricks));
-    write(places[3], bytemuck::cast_slice(&far.distances));
-    fill_bricks(&device.context, &index, &sites, band, places[2] as u32)?;
+    write(offsets[0], bytemuck::cast_slice(&index.tables));
+    write(offsets[1], bytemuck::cast_slice(&index.bricks));
+    write(offsets[3], bytemuck::cast_slice(&far.distances));
+    fill_bricks(&device.context, &index, &sites, band, offsets[2] as u32)?;
 
     let lattice = Lattice::new(&grid);
     let record = layout::Transform {
@@ -126,10 +126,10 @@ pub(super) fn build(
         code_scale: (grid.cell / codes_per_cell(band)) as f32,
         vertices: lattice.vertices,
         blocks: index.blocks.map(|n| n as u32),
-        tables: places[0] as u32,
-        bricks: places[1] as u32,
-        codes: places[2] as u32,
-        far: places[3] as u32,
+        tables: offsets[0] as u32,
+        bricks: offsets[1] as u32,
+        codes: offsets[2] as u32,
+        far: offsets[3] as u32,
         far_pitch: far.pitch,
         far_vertices: far.vertices.map(|n| n as u32),
     };
@@ -152,7 +152,7 @@ fn fill_bricks(
     if index.active == 0 {
         return Ok(());
     }
-    let places: Vec<[u32; 3]> = index.active_places();
+    let positions: Vec<[u32; 3]> = index.active_brick_positions();
     let plan = layout::BrickPlan {
         band,
         rows: sites.columns.starts().len() as u32 - 1,
@@ -167,7 +167,7 @@ fn fill_bricks(
     let code_of: Vec<u32> = sites.codes.iter().map(|&code| code.into()).collect();
     let buffers = [
         context.filled(bytemuck::bytes_of(&plan))?,
-        context.filled(bytemuck::cast_slice(&places))?,
+        context.filled(bytemuck::cast_slice(&positions))?,
         context.filled(bytemuck::cast_slice(sites.columns.starts()))?,
         context.filled(bytemuck::cast_slice(&columns))?,
         context.filled(bytemuck::cast_slice(&sites.squares))?,
@@ -201,7 +201,7 @@ impl GpuTransform {
                 available: available * 4,
             });
         }
-        Ok(self.stretch.place + self.words as u32)
+        Ok(self.stretch.offset + self.words as u32)
     }
 
     /// Distance (metres) and gradient at each of `points` (N x 3, metres).
@@ -213,12 +213,12 @@ impl GpuTransform {
             .filled(bytemuck::bytes_of(&self.record))?;
         for points in points.chunks(SAMPLED) {
             let context = &self.device.context;
-            let places = context.filled(bytemuck::cast_slice(points))?;
+            let offsets = context.filled(bytemuck::cast_slice(points))?;
             let bytes = points.len() as u64 * 16;
             let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC;
             let out = context.empty(bytes, usage)?;
             let pipeline = &context.kernels.sample;
-            let group = context.bound(pipeline, &[&context.buffers.store, &places, &record, &out]);
+            let group = context.bound(pipeline, &[&context.buffers.store, &offsets, &record, &out]);
             let mut encoder = context.encoder();
             {
                 let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());

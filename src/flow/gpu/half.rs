@@ -163,7 +163,7 @@ impl<'a> HalfPhases<'a> {
                 (&kernels.outer_gradients, &self.outer_gradients, [chunks, 2]),
             ],
             Phase::Transpose => Vec::new(),
-            Phase::Query | Phase::Judge | Phase::Step => return None,
+            Phase::DistanceLoss | Phase::ReduceLoss | Phase::Step => return None,
         })
     }
 }

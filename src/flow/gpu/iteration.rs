@@ -15,10 +15,10 @@ pub(super) struct Phases<'a> {
     /// Number of rows of a layer's activations.
     rows: u32,
     forward: wgpu::BindGroup,
-    query: wgpu::BindGroup,
+    distance_loss: wgpu::BindGroup,
     backward: wgpu::BindGroup,
     gradients: wgpu::BindGroup,
-    judge: wgpu::BindGroup,
+    reduce_loss: wgpu::BindGroup,
     step: wgpu::BindGroup,
     transpose: wgpu::BindGroup,
     half: Option<HalfPhases<'a>>,
@@ -49,7 +49,7 @@ impl<'a> Phases<'a> {
             losses,
             ..
         } = buffers;
-        let [forward, query, backward, gradients] =
+        let [forward, distance_loss, backward, gradients] =
             bind_wave(context, buffers, [tiles, chunks, tile_losses]);
         let half = units.map(|units| HalfPhases::bind(context, buffers, units, [tiles, chunks]));
         let kernels = &context.kernels;
@@ -58,11 +58,11 @@ impl<'a> Phases<'a> {
             lanes: lanes as u32,
             rows: buffers.rows() as u32,
             forward,
-            query,
+            distance_loss,
             backward,
             gradients,
-            judge: context.bound(
-                &kernels.judge,
+            reduce_loss: context.bound(
+                &kernels.reduce_loss,
                 &[records, steps, tile_losses, statuses, losses],
             ),
             step: context.bound(
@@ -110,14 +110,14 @@ impl<'a> Phases<'a> {
         Some(match phase {
             Phase::Halve => return None,
             Phase::Forward => (&kernels.forward, &self.forward, tiles),
-            Phase::Query => (&kernels.query, &self.query, tiles),
+            Phase::DistanceLoss => (&kernels.distance_loss, &self.distance_loss, tiles),
             Phase::Backward => (&kernels.backward, &self.backward, tiles),
             Phase::Gradients => {
                 let layers = MIDDLE_LAYERS as u32 + 2;
                 let groups = [wave.chunks as u32, layers];
                 (&kernels.gradients, &self.gradients, groups)
             }
-            Phase::Judge => (&kernels.judge, &self.judge, [self.lanes, 1]),
+            Phase::ReduceLoss => (&kernels.reduce_loss, &self.reduce_loss, [self.lanes, 1]),
             Phase::Step => {
                 let groups = (LAID_OUT as u32 / 4).div_ceil(STEP_GROUP);
                 (&kernels.step, &self.step, [groups, self.lanes])
@@ -135,7 +135,7 @@ const STEP_GROUP: u32 = 128;
 /// Squares of 32 x 32 weights per layer, see `transpose.wgsl`.
 const SQUARES: u32 = 16;
 
-/// The bindings of the kernels that run for each wave: forward, query, backward and gradients.
+/// The bindings of the kernels that run for each wave: forward, distance_loss, backward and gradients.
 fn bind_wave(
     context: &Context,
     buffers: &Buffers,
@@ -170,7 +170,7 @@ fn bind_wave(
             ],
         ),
         context.bound(
-            &kernels.query,
+            &kernels.distance_loss,
             &[
                 store,
                 records,

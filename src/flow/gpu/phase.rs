@@ -8,10 +8,10 @@ pub(super) enum Phase {
     /// Half precision only: rounds the weights for the other kernels, before the first wave.
     Halve,
     Forward,
-    Query,
+    DistanceLoss,
     Backward,
     Gradients,
-    Judge,
+    ReduceLoss,
     Step,
     /// Single precision only.
     Transpose,
@@ -22,10 +22,14 @@ pub(super) type Dispatch<'a> = (&'a wgpu::ComputePipeline, &'a wgpu::BindGroup, 
 
 impl Phase {
     /// The phases that run for each wave, in order.
-    pub(super) const OF_A_WAVE: [Self; 4] =
-        [Self::Forward, Self::Query, Self::Backward, Self::Gradients];
+    pub(super) const OF_A_WAVE: [Self; 4] = [
+        Self::Forward,
+        Self::DistanceLoss,
+        Self::Backward,
+        Self::Gradients,
+    ];
     /// The phases that run after all waves, in order.
-    pub(super) const OF_THE_END: [Self; 3] = [Self::Judge, Self::Step, Self::Transpose];
+    pub(super) const OF_THE_END: [Self; 3] = [Self::ReduceLoss, Self::Step, Self::Transpose];
 }
 
 /// A set of GPU timestamps.

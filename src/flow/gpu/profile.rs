@@ -24,7 +24,7 @@ const BACKWARD: f64 = FORWARD - 2.0 * (3 * WIDTH) as f64;
 /// Time and work of one kernel in one iteration of a fit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct KernelTime {
-    /// Name of the kernel: `forward`, `query`, `backward`, `gradients`, `judge`, `step`, and
+    /// Name of the kernel: `forward`, `distance_loss`, `backward`, `gradients`, `reduce_loss`, `step`, and
     /// `transpose` in single or `halve` in half precision.
     pub name: &'static str,
     /// Time by GPU timestamps, seconds: the minimum over all rounds.
@@ -77,10 +77,10 @@ pub fn kernel_times(
     let points = source.len() as f64;
     let kernels = [
         ("forward", Phase::Forward, points * FORWARD),
-        ("query", Phase::Query, 0.0),
+        ("distance_loss", Phase::DistanceLoss, 0.0),
         ("backward", Phase::Backward, points * BACKWARD),
         ("gradients", Phase::Gradients, points * FORWARD),
-        ("judge", Phase::Judge, 0.0),
+        ("reduce_loss", Phase::ReduceLoss, 0.0),
         ("step", Phase::Step, 0.0),
         match precision {
             Precision::F32 => ("transpose", Phase::Transpose, 0.0),

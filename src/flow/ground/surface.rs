@@ -36,10 +36,11 @@ impl HeightField {
     /// The same surface with half the distance between nodes.
     pub(super) fn refined(&self) -> Self {
         let mut fine = Self::level(self.half_m, self.step_m / 2.0, 0.0);
-        let place = |node: usize| node as f32 * fine.step_m - fine.half_m;
+        let position = |node: usize| node as f32 * fine.step_m - fine.half_m;
         for row in 0..fine.side {
             for column in 0..fine.side {
-                fine.heights[row * fine.side + column] = self.height_at(place(column), place(row));
+                fine.heights[row * fine.side + column] =
+                    self.height_at(position(column), position(row));
             }
         }
         fine

@@ -127,14 +127,11 @@ mod tests {
             let back = MotionField::from_bytes(&bytes).expect("sound");
             assert_eq!(back.ego, ego);
             assert_eq!(back.to_bytes(), bytes);
-            for place in [0, 9, 12, 13, 60, bytes.len() / 2, bytes.len() - 1] {
+            for at in [0, 9, 12, 13, 60, bytes.len() / 2, bytes.len() - 1] {
                 let mut altered = bytes.clone();
-                altered[place] ^= 1;
-                assert!(MotionField::from_bytes(&altered).is_err(), "byte {place}");
-                assert!(
-                    MotionField::from_bytes(&bytes[..place]).is_err(),
-                    "{place} bytes"
-                );
+                altered[at] ^= 1;
+                assert!(MotionField::from_bytes(&altered).is_err(), "byte {at}");
+                assert!(MotionField::from_bytes(&bytes[..at]).is_err(), "{at} bytes");
             }
             let longer = [bytes.as_slice(), &[0; 9]].concat();
             assert!(MotionField::from_bytes(&longer).is_err());

@@ -45,12 +45,12 @@ pub(super) fn spread(
     // metres.
     let points = scene.source.labels.par_iter().zip(&scene.source.points);
     let residual_m: Vec<f32> = points
-        .map(|(&label, &place)| {
+        .map(|(&label, &position)| {
             let leader = cluster_motion.get(label as usize).copied().unwrap_or(NOISE);
             let found = needed.get(leader as usize).and_then(Option::as_ref);
             found.map_or(0.0, |found| {
-                let moved = found.motion.apply(place);
-                scene.distance_of(moved, label) - scene.distance_of(place, label)
+                let moved = found.motion.apply(position);
+                scene.distance_of(moved, label) - scene.distance_of(position, label)
             })
         })
         .collect();
@@ -86,8 +86,8 @@ fn leader(
     let size = |cluster: u32| scene.source.members[cluster as usize].len();
     let mut beside: Vec<u32> = Vec::new();
     for row in stride_sample(members, LOOKING) {
-        let place = scene.source.points[row as usize];
-        scene.source_within(place, scene.options.match_m, |other| {
+        let position = scene.source.points[row as usize];
+        scene.source_within(position, scene.options.match_m, |other| {
             let label = scene.source.labels[other as usize];
             if label != NOISE && label != cluster && needed[label as usize].is_some() {
                 beside.push(label);
@@ -120,9 +120,9 @@ fn leader(
 
 /// The cluster whose motion a noise point gets, if any.
 fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Hypothesis>], row: u32) -> u32 {
-    let place = scene.source.points[row as usize];
+    let position = scene.source.points[row as usize];
     let mut beside: Vec<u32> = Vec::new();
-    scene.source_within(place, scene.options.match_m, |other| {
+    scene.source_within(position, scene.options.match_m, |other| {
         let label = scene.source.labels[other as usize];
         if label != NOISE && needed[label as usize].is_some() {
             beside.push(label);
@@ -131,12 +131,12 @@ fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Hypothesis>], row: u32) -
     beside.sort_unstable();
     beside.dedup();
     let mut best = (
-        scene.distance_of(place, NOISE) * scene.options.adjacent_cost_ratio,
+        scene.distance_of(position, NOISE) * scene.options.adjacent_cost_ratio,
         NOISE,
     );
     for label in beside {
         if let Some(found) = &needed[label as usize] {
-            let moved = scene.distance_of(found.motion.apply(place), NOISE);
+            let moved = scene.distance_of(found.motion.apply(position), NOISE);
             if moved < best.0 {
                 best = (moved, label);
             }
@@ -152,8 +152,10 @@ fn is_of(scene: &Scene<'_>, row: u32, residual_m: &[f32]) -> bool {
     let center = scene.source.points[row as usize];
     let (mut worse, mut count) = (0.0, 0.0_f32);
     scene.source_within(center, VOTE_M, |other| {
-        let place = scene.source.points[other as usize];
-        let near = (0..3).map(|a| (place[a] - center[a]).powi(2)).sum::<f32>();
+        let position = scene.source.points[other as usize];
+        let near = (0..3)
+            .map(|a| (position[a] - center[a]).powi(2))
+            .sum::<f32>();
         if scene.source.labels[other as usize] == label && near < VOTE_M * VOTE_M {
             worse += residual_m[other as usize];
             count += 1.0;

@@ -124,16 +124,16 @@ pub(super) fn evidence(
         .collect();
     let unknown = SearchedCluster::not(scene.options);
     let rows = source.par_iter().zip(labels).zip(point_motion);
-    rows.map(|((&place, &label), &owner)| {
+    rows.map(|((&position, &label), &owner)| {
         let moves = owner != NOISE;
         let (cluster, at) = if moves {
-            let way = motions.displacement(owner, place);
+            let way = motions.displacement(owner, position);
             (
                 movers[owner as usize],
-                core::array::from_fn(|a| place[a] + way[a]),
+                core::array::from_fn(|a| position[a] + way[a]),
             )
         } else {
-            (label, place)
+            (label, position)
         };
         let target = scene.match_of(at, cluster);
         let truncation = scene.options.truncation_m;
@@ -148,7 +148,7 @@ pub(super) fn evidence(
         let refused = known.best.filter(|_| !known.needed && !moves);
         ConfidenceFeatures {
             moves,
-            range_m: place[0].hypot(place[1]),
+            range_m: position[0].hypot(position[1]),
             off_m,
             hidden: target.is_none(),
             forward_m: cost.forward_m,

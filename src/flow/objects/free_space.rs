@@ -64,12 +64,12 @@ impl FreeSpace {
     /// The evidence for a motion from the `vacated` positions to the `occupied` ones, metres in the
     /// target's frame.
     pub(super) fn of(&self, vacated: &[Point], occupied: &[Point], far: bool) -> FreeSpaceEvidence {
-        let before = |&place: &Point| {
+        let before = |&position: &Point| {
             self.source
-                .passed(transform_point(&self.source_from_target, place))
+                .passed(transform_point(&self.source_from_target, position))
         };
         FreeSpaceEvidence {
-            left: share(vacated.iter().map(|&place| self.target.passed(place))),
+            left: share(vacated.iter().map(|&position| self.target.passed(position))),
             came: share(occupied.iter().map(before)),
             far,
         }
@@ -96,8 +96,8 @@ impl Rays {
     }
 
     /// Whether all rays toward a position passed it; none where there are no rays.
-    fn passed(&self, place: Point) -> Option<bool> {
-        let (angle, range_m) = direction(place);
+    fn passed(&self, position: Point) -> Option<bool> {
+        let (angle, range_m) = direction(position);
         let end_m = self.shortest_m[angle];
         let is_known = end_m.is_finite() && range_m.is_finite();
         is_known.then(|| end_m > range_m + passed_m(range_m))
@@ -122,12 +122,12 @@ fn direction([x, y, z]: Point) -> (usize, f32) {
 
 /// The share that rays passed, of the positions with rays toward them; none where there are too
 /// few.
-fn share(places: impl Iterator<Item = Option<bool>>) -> Option<f32> {
+fn share(positions: impl Iterator<Item = Option<bool>>) -> Option<f32> {
     let (mut all, mut known, mut passed) = (0.0, 0.0, 0.0);
-    for place in places {
+    for position in positions {
         all += 1.0;
-        known += f32::from(place.is_some());
-        passed += f32::from(place == Some(true));
+        known += f32::from(position.is_some());
+        passed += f32::from(position == Some(true));
     }
     (known >= PLACES && known >= SEEN * all).then(|| passed / known)
 }
@@ -172,7 +172,7 @@ mod tests {
         // Straight down and behind: the bin that a direction that is not a number falls into.
         let below = [vec![[-0.01, -1e-9, -2.0]], sweep.clone()].concat();
         let free_space = FreeSpace::new([&below, &below], &RigidTransform::identity());
-        let seen = |place: Point, count| free_space.of(&vec![place; count], &[], true);
+        let seen = |position: Point, count| free_space.of(&vec![position; count], &[], true);
         assert_eq!(seen([10.0, 5.0, 0.0], 6).left, Some(1.0));
         assert_eq!(seen([10.0, 5.0, 0.0], 4).left, None);
         assert_eq!(seen([1.0, 0.0, 8.0], 6).left, None);

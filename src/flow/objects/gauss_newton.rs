@@ -59,8 +59,8 @@ impl ClusterSearch<'_> {
                     }
                 }
                 for &target in touched.iter() {
-                    let place = by_then.undo(scene.target[target as usize]);
-                    if let Some(origin) = scene.origin_of(place, self.cluster) {
+                    let position = by_then.undo(scene.target[target as usize]);
+                    if let Some(origin) = scene.origin_of(position, self.cluster) {
                         let moved = by_then.apply(scene.source.points[origin as usize]);
                         sums.add(scene, moved, target);
                     }

@@ -171,10 +171,10 @@ impl<'a> ClusterSearch<'a> {
             best.cost.forward_m
         };
         if fit_from(&standing) >= options.close_fit_m {
-            let place = |row: u32| self.scene.source.points[row as usize];
+            let position = |row: u32| self.scene.source.points[row as usize];
             let voters: Vec<Point> = stride_sample(members, VOTERS)
                 .into_iter()
-                .map(place)
+                .map(position)
                 .collect();
             let shifts = votes.peaks(&voters, options.initial_guesses);
             let mut promising: Vec<(f32, PlanarMotion)> = Vec::new();
@@ -183,8 +183,8 @@ impl<'a> ClusterSearch<'a> {
                 let least_m = least.map_or(f32::INFINITY, |&(value_m, _)| value_m);
                 if let Some(cost) = self.cost_below(&start, way_m(&start), least_m) {
                     let value_m = cost.sum_m() + way_m(&start);
-                    let place = promising.partition_point(|&(other_m, _)| other_m <= value_m);
-                    promising.insert(place, (value_m, start));
+                    let slot = promising.partition_point(|&(other_m, _)| other_m <= value_m);
+                    promising.insert(slot, (value_m, start));
                     promising.truncate(PROMISING);
                 }
             }
@@ -264,10 +264,10 @@ impl<'a> ClusterSearch<'a> {
     fn witnesses(&self, motion: &PlanarMotion) -> NeighborEvidence {
         let mut all = NeighborEvidence::default();
         let still = PlanarMotion::still(motion.center);
-        for (place, moment) in self.neighbors.iter().enumerate() {
+        for (number, moment) in self.neighbors.iter().enumerate() {
             let [moved, still] =
                 [moment.by_then(motion), still].map(|m| self.cost_in(&moment.scene, &m));
-            if place == 0 {
+            if number == 0 {
                 all.nearest_m = [still, moved].map(Cost::sum_m);
             }
             let least = moved.forward_m.min(still.forward_m);
@@ -305,8 +305,8 @@ impl<'a> ClusterSearch<'a> {
         let touched = scene.touched(&self.rows, self.cluster, motion);
         let touched = stride_sample(&touched, JUDGED);
         let back = touched.iter().map(|&row| {
-            let place = motion.undo(scene.target[row as usize]);
-            let origin = scene.origin_of(place, self.cluster);
+            let position = motion.undo(scene.target[row as usize]);
+            let origin = scene.origin_of(position, self.cluster);
             origin.map_or(truncation_m, |origin| {
                 let moved = motion.apply(scene.source.points[origin as usize]);
                 scene.distance(moved, row)
@@ -343,29 +343,29 @@ impl<'a> ClusterSearch<'a> {
     /// The positions that the cluster leaves: its source points from which every point of the moved
     /// cluster is farther than `clear_m` metres.
     pub(super) fn vacated(&self, motion: &PlanarMotion, clear_m: f32) -> Vec<Point> {
-        let places = self.rows.iter();
-        let places = places.map(|&row| self.scene.source.points[row as usize]);
-        places
-            .filter(|&place| self.is_clear(motion.undo(place), clear_m))
+        let positions = self.rows.iter();
+        let positions = positions.map(|&row| self.scene.source.points[row as usize]);
+        positions
+            .filter(|&position| self.is_clear(motion.undo(position), clear_m))
             .collect()
     }
 
     /// The positions that the cluster comes to: the target points that it matches after the motion
     /// and from which all its source points are farther than `clear_m` metres.
     pub(super) fn occupied(&self, motion: &PlanarMotion, clear_m: f32) -> Vec<Point> {
-        let places = self.matches(motion);
-        let places = places.map(|target| self.scene.target[target as usize]);
-        places
-            .filter(|&place| self.is_clear(place, clear_m))
+        let positions = self.matches(motion);
+        let positions = positions.map(|target| self.scene.target[target as usize]);
+        positions
+            .filter(|&position| self.is_clear(position, clear_m))
             .collect()
     }
 
-    /// Whether all source points of the cluster are farther than `clear_m` metres from `place`.
-    fn is_clear(&self, place: Point, clear_m: f32) -> bool {
-        let nearest = self.scene.origin_of(place, self.cluster);
+    /// Whether all source points of the cluster are farther than `clear_m` metres from `position`.
+    fn is_clear(&self, position: Point, clear_m: f32) -> bool {
+        let nearest = self.scene.origin_of(position, self.cluster);
         nearest.is_none_or(|row| {
             let point = self.scene.source.points[row as usize];
-            square_distance(place, point) > clear_m * clear_m
+            square_distance(position, point) > clear_m * clear_m
         })
     }
 

@@ -62,29 +62,29 @@ impl ObjectMotions {
         (&self.motions, moving.collect(), self.standing.in_order())
     }
 
-    /// Residual flow at N `places`, N x 3 metres in the target's frame: the displacement in one
-    /// sweep interval beyond the ego motion. `places` (N x 3, metres) are positions at the source's
+    /// Residual flow at N `positions`, N x 3 metres in the target's frame: the displacement in one
+    /// sweep interval beyond the ego motion. `positions` (N x 3, metres) are positions at the source's
     /// time, transformed to the target's frame by the ego motion. They need not be source points.
-    pub fn residual_at(&self, places: &[Point]) -> Vec<Point> {
-        places
+    pub fn residual_at(&self, positions: &[Point]) -> Vec<Point> {
+        positions
             .par_iter()
-            .map(|&place| self.residual(place))
+            .map(|&position| self.residual(position))
             .collect()
     }
 
-    fn residual(&self, place: Point) -> Point {
-        match self.owner(place) {
+    fn residual(&self, position: Point) -> Point {
+        match self.owner(position) {
             NOISE => [0.0; 3],
-            owner => self.displacement(owner, place),
+            owner => self.displacement(owner, position),
         }
     }
 
     /// The index of the motion at a position; [`NOISE`] where it is static.
-    fn owner(&self, place: Point) -> u32 {
-        let Some((row, square)) = self.moving.nearest(place, REACH_M, |_| true) else {
+    fn owner(&self, position: Point) -> u32 {
+        let Some((row, square)) = self.moving.nearest(position, REACH_M, |_| true) else {
             return NOISE;
         };
-        let stands = self.standing.nearest(place, square.sqrt(), |_| true);
+        let stands = self.standing.nearest(position, square.sqrt(), |_| true);
         match stands {
             Some(_) => NOISE,
             None => self.point_motion[row as usize],
@@ -92,14 +92,17 @@ impl ObjectMotions {
     }
 
     /// [`Self::owner`] of every position.
-    pub(super) fn owners_at(&self, places: &[Point]) -> Vec<u32> {
-        places.par_iter().map(|&place| self.owner(place)).collect()
+    pub(super) fn owners_at(&self, positions: &[Point]) -> Vec<u32> {
+        positions
+            .par_iter()
+            .map(|&position| self.owner(position))
+            .collect()
     }
 
     /// Displacement of a position by the motion of this index, metres, in the frame of
     /// [`Self::residual_at`].
-    pub(crate) fn displacement(&self, motion: u32, place: Point) -> Point {
-        self.motions[motion as usize].displacement(place)
+    pub(crate) fn displacement(&self, motion: u32, position: Point) -> Point {
+        self.motions[motion as usize].displacement(position)
     }
 
     /// Rotation of the motion of this index about the vertical, radians, counterclockwise.
@@ -117,17 +120,17 @@ mod tests {
         let motion = PlanarMotion::still([0.0; 2]).shifted([0.5, 0.25]);
         let points = [[0.0, 0.0, 0.0], [0.4, 0.0, 0.0]];
         let motions = ObjectMotions::new(vec![motion], &points, &[0, NOISE]);
-        let places = [
+        let positions = [
             [0.0, 0.0, 0.0],
             [0.1, 0.0, 0.0],
             [0.3, 0.0, 0.0],
             [-0.3, 0.0, 0.0],
             [-0.6, 0.0, 0.0],
         ];
-        let moved = motions.residual_at(&places).into_iter();
+        let moved = motions.residual_at(&positions).into_iter();
         let moved: Vec<bool> = moved.map(|residual| residual == [0.5, 0.25, 0.0]).collect();
         assert_eq!(moved, [true, true, false, true, false]);
-        assert_eq!(ObjectMotions::none().residual_at(&places), [[0.0; 3]; 5]);
+        assert_eq!(ObjectMotions::none().residual_at(&positions), [[0.0; 3]; 5]);
 
         let field = crate::flow::MotionField {
             ego: None,
@@ -139,7 +142,7 @@ mod tests {
         let crate::flow::Residual::Objects(back) = back.residual else {
             panic!("another kind of field came back");
         };
-        let moved = back.residual_at(&places).into_iter();
+        let moved = back.residual_at(&positions).into_iter();
         let moved: Vec<bool> = moved.map(|residual| residual == [0.5, 0.25, 0.0]).collect();
         assert_eq!(moved, [true, true, false, true, false]);
     }

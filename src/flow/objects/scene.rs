@@ -118,43 +118,48 @@ impl<'a> Scene<'a> {
         }
     }
 
-    /// The target point nearest to `place`, within `match_m`. Static matches of clusters other than
+    /// The target point nearest to `position`, within `match_m`. Static matches of clusters other than
     /// `cluster` are excluded.
     #[inline]
-    pub(super) fn match_of(&self, place: Point, cluster: u32) -> Option<u32> {
+    pub(super) fn match_of(&self, position: Point, cluster: u32) -> Option<u32> {
         let allowed = |row: u32| {
             let owner = self.taken[row as usize];
             owner == NOISE || owner == cluster
         };
-        let place = lowered(place, self.options);
+        let position = lowered(position, self.options);
         let found = self
             .near_target
-            .nearest(place, self.options.match_m, allowed);
+            .nearest(position, self.options.match_m, allowed);
         found.map(|(row, _)| row)
     }
 
-    /// The source point of `cluster` nearest to `place`, within `match_m`.
+    /// The source point of `cluster` nearest to `position`, within `match_m`.
     #[inline]
-    pub(super) fn origin_of(&self, place: Point, cluster: u32) -> Option<u32> {
-        let place = lowered(place, self.options);
+    pub(super) fn origin_of(&self, position: Point, cluster: u32) -> Option<u32> {
+        let position = lowered(position, self.options);
         let of_it = |row: u32| self.source.labels[row as usize] == cluster;
-        let found = self.source.near.nearest(place, self.options.match_m, of_it);
+        let found = self
+            .source
+            .near
+            .nearest(position, self.options.match_m, of_it);
         found.map(|(row, _)| row)
     }
 
-    /// Calls `see` with every source point within `within_m` metres of `place`, with scaled
+    /// Calls `see` with every source point within `within_m` metres of `position`, with scaled
     /// heights. `within_m` is at most `match_m`.
-    pub(super) fn source_within(&self, place: Point, within_m: f32, mut see: impl FnMut(u32)) {
-        let place = lowered(place, self.options);
-        self.source.near.within(place, within_m, |row, _| see(row));
+    pub(super) fn source_within(&self, position: Point, within_m: f32, mut see: impl FnMut(u32)) {
+        let position = lowered(position, self.options);
+        self.source
+            .near
+            .within(position, within_m, |row, _| see(row));
     }
 
-    /// Distance from `place` to the target for a point of `cluster`, metres, truncated. With
+    /// Distance from `position` to the target for a point of `cluster`, metres, truncated. With
     /// [`NOISE`] all static matches are excluded.
-    pub(super) fn distance_of(&self, place: Point, cluster: u32) -> f32 {
-        let target = self.match_of(place, cluster);
+    pub(super) fn distance_of(&self, position: Point, cluster: u32) -> f32 {
+        let target = self.match_of(position, cluster);
         target.map_or(self.options.truncation_m, |target| {
-            self.distance(place, target)
+            self.distance(position, target)
         })
     }
 
@@ -165,9 +170,9 @@ impl<'a> Scene<'a> {
         let mut seen = self.near_target.unseen();
         let mut touched = vec![0_u64; self.target.len().div_ceil(64)];
         for &row in rows {
-            let place = lowered(motion.apply(self.source.points[row as usize]), self.options);
+            let position = lowered(motion.apply(self.source.points[row as usize]), self.options);
             self.near_target
-                .within_unseen(place, within_m, &mut seen, |row| {
+                .within_unseen(position, within_m, &mut seen, |row| {
                     let owner = self.taken[row as usize];
                     if owner == NOISE || owner == cluster {
                         touched[row as usize / 64] |= 1 << (row % 64);
@@ -186,12 +191,12 @@ impl<'a> Scene<'a> {
         self.normals[row as usize]
     }
 
-    /// Distance from `place` to a target point, metres, truncated: along its normal with a small
+    /// Distance from `position` to a target point, metres, truncated: along its normal with a small
     /// share of the full distance, or the full distance where it has no normal.
     #[inline]
-    pub(super) fn distance(&self, place: Point, row: u32) -> f32 {
+    pub(super) fn distance(&self, position: Point, row: u32) -> f32 {
         let (target, normal) = (self.target[row as usize], self.normals[row as usize]);
-        let [x, y, z]: Point = core::array::from_fn(|a| target[a] - place[a]);
+        let [x, y, z]: Point = core::array::from_fn(|a| target[a] - position[a]);
         let height = z * self.options.height_weight;
         let plain = x * x + y * y + height * height;
         let square = if normal == [0.0; 3] {
@@ -253,9 +258,9 @@ mod tests {
         let scene = Scene::new(&downsampled, &target, &options);
         let motion = PlanarMotion::still([0.0; 2]).shifted([0.5, 0.0]);
         let near = |point: &Point| {
-            source.iter().any(|&place| {
+            source.iter().any(|&position| {
                 let away = square_distance(
-                    lowered(motion.apply(place), &options),
+                    lowered(motion.apply(position), &options),
                     lowered(*point, &options),
                 );
                 away < options.match_m * options.match_m

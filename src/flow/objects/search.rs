@@ -74,12 +74,12 @@ impl ObjectSearch {
     /// Residual flow of the N `source` points of the search, metres, ego motion taken out. It is
     /// [`ObjectMotions::residual_at`] at these points, without another search for their objects.
     pub(crate) fn residual_of(&self, source: &[Point]) -> Vec<Point> {
-        let motion = |place: usize| {
-            let cluster = *self.parts.of.get(place)?;
+        let motion = |position: usize| {
+            let cluster = *self.parts.of.get(position)?;
             *self.parts.motions.get(cluster as usize)?
         };
-        let places = source.iter().enumerate();
-        let residual = places.map(|(place, &point)| match motion(place) {
+        let positions = source.iter().enumerate();
+        let residual = positions.map(|(position, &point)| match motion(position) {
             None => [0.0; 3],
             Some(motion) => self.motions.displacement(motion, point),
         });

@@ -49,7 +49,7 @@ impl Path {
             Path::Along { x, lateral, speed } => {
                 let x = terrain.advance(x, speed * seconds);
                 let back = if speed < 0.0 { PI } else { 0.0 };
-                (terrain.place(x, lateral), terrain.heading(x) + back)
+                (terrain.position(x, lateral), terrain.heading(x) + back)
             }
             Path::Turn {
                 from,
@@ -66,11 +66,11 @@ impl Path {
                 let left =
                     radius.signum() * (radius.abs() * (1.0 - turned.cos()) + after * turned.sin());
                 let (sin, cos) = yaw.sin_cos();
-                let place = [
+                let position = [
                     from[0] + forward * cos - left * sin,
                     from[1] + forward * sin + left * cos,
                 ];
-                (place, yaw + radius.signum() * turned)
+                (position, yaw + radius.signum() * turned)
             }
         }
     }
@@ -141,8 +141,8 @@ impl Object {
 
     /// Pose of the object, world_from_object, at a time in seconds.
     pub(super) fn pose(&self, terrain: &Terrain, seconds: f64) -> RigidTransform {
-        let (place, yaw) = self.path.at(terrain, seconds);
-        terrain.seat(place, yaw, self.stand)
+        let (position, yaw) = self.path.at(terrain, seconds);
+        terrain.seat(position, yaw, self.stand)
     }
 }
 
@@ -197,7 +197,7 @@ pub(super) fn traffic(
 /// Positions of the cars of a lane, metres along the street: the nearest ones ahead and behind, in
 /// random order.
 fn slots(cars: usize, random: &mut Random) -> Vec<f64> {
-    let place = |slot: usize| {
+    let position = |slot: usize| {
         let distance = SPACING_M * (slot / 2 + 1) as f64;
         if slot.is_multiple_of(2) {
             distance
@@ -205,7 +205,7 @@ fn slots(cars: usize, random: &mut Random) -> Vec<f64> {
             -distance
         }
     };
-    let mut slots: Vec<f64> = (0..cars / 4 + 3).map(place).collect();
+    let mut slots: Vec<f64> = (0..cars / 4 + 3).map(position).collect();
     random.shuffle(&mut slots);
     slots
 }
@@ -215,7 +215,7 @@ fn joining(terrain: &Terrain, corner: f64, round: f64, random: &mut Random) -> P
     let radius = 6.5;
     let straight = SPACING_M * round;
     let run_up = -LANE_M - radius - straight + random.uniform(0.0, 4.0);
-    let from = terrain.place(corner + LANE_M, run_up);
+    let from = terrain.position(corner + LANE_M, run_up);
     Path::Turn {
         from,
         yaw: terrain.heading(corner) + FRAC_PI_2,
@@ -229,7 +229,7 @@ fn joining(terrain: &Terrain, corner: f64, round: f64, random: &mut Random) -> P
 fn crossing(terrain: &Terrain, corner: f64, [side, round]: [f64; 2], random: &mut Random) -> Path {
     let start = -side * (random.uniform(8.0, 14.0) + SPACING_M * round);
     Path::Turn {
-        from: terrain.place(corner + side * LANE_M, start),
+        from: terrain.position(corner + side * LANE_M, start),
         yaw: terrain.heading(corner) + side * FRAC_PI_2,
         straight: f64::MAX,
         radius: 1.0,

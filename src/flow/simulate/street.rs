@@ -244,10 +244,10 @@ impl Street {
     /// first sweep.
     pub fn pose(&self, at: f64) -> RigidTransform {
         let x = self.terrain.advance(0.0, self.speed * seconds(at));
-        let place = self.terrain.place(x, -LANE_M);
+        let position = self.terrain.position(x, -LANE_M);
         let world_from_ego = self
             .terrain
-            .seat(place, self.terrain.heading(x), EGO_STAND_M);
+            .seat(position, self.terrain.heading(x), EGO_STAND_M);
         world_from_ego * Translation3::new(0.0, 0.0, SENSOR_HEIGHT_M)
     }
 

@@ -55,7 +55,7 @@ impl Terrain {
     }
 
     /// World x and y of a position given by x and lateral offset.
-    pub(super) fn place(&self, x: f64, lateral: f64) -> [f64; 2] {
+    pub(super) fn position(&self, x: f64, lateral: f64) -> [f64; 2] {
         let (sin, cos) = self.heading(x).sin_cos();
         [x - lateral * sin, self.center(x) + lateral * cos]
     }
@@ -193,7 +193,7 @@ mod tests {
         assert_eq!(terrain.heading(0.0), 0.0);
         assert!((terrain.heading(1.0) - 0.005).abs() < 1e-5);
         let straight = Terrain::new(0.0, &mut Random::new(4));
-        assert_eq!(straight.place(70.0, 2.0), [70.0, 2.0]);
+        assert_eq!(straight.position(70.0, 2.0), [70.0, 2.0]);
         assert!((straight.advance(5.0, -12.5) + 7.5).abs() < 1e-12);
     }
 
@@ -238,7 +238,7 @@ mod tests {
         let terrain = terrain();
         let x = terrain.side_street(0.0) + 50.0;
         let [inner, outer] = [5.9, 6.2].map(|lateral| {
-            let [x, y] = terrain.place(x, lateral);
+            let [x, y] = terrain.position(x, lateral);
             terrain.height(x, y)
         });
         assert!((outer - inner - KERB_HEIGHT_M).abs() < 0.02);

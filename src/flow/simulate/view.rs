@@ -88,7 +88,7 @@ mod tests {
             Shape::Ellipsoid([2.0, 1.0, 0.8]),
         ];
         let solid = |index: usize| {
-            let place = [
+            let position = [
                 random.uniform(-30.0, 60.0),
                 random.uniform(-30.0, 30.0),
                 random.uniform(0.0, 4.0),
@@ -98,7 +98,7 @@ mod tests {
                 0.0,
                 random.uniform(-3.0, 3.0),
             );
-            let world_from_solid = RigidTransform::from_parts(place.into(), turn);
+            let world_from_solid = RigidTransform::from_parts(position.into(), turn);
             Target {
                 shape: shapes[index % 3],
                 sensor_from_solid: world_from_camera.inv_mul(&world_from_solid),

@@ -259,12 +259,12 @@ impl World {
     }
 
     fn add(&mut self, terrain: &Terrain, shape: Shape, spot: Spot) {
-        let [x, y] = terrain.place(spot.x, spot.lateral);
-        let place = Translation3::new(x, y, terrain.height(x, y) + spot.above);
+        let [x, y] = terrain.position(spot.x, spot.lateral);
+        let position = Translation3::new(x, y, terrain.height(x, y) + spot.above);
         let turn = UnitQuaternion::from_euler_angles(0.0, 0.0, terrain.heading(spot.x));
         self.solids.push(Solid {
             shape,
-            world_from_solid: RigidTransform::from_parts(place, turn),
+            world_from_solid: RigidTransform::from_parts(position, turn),
         });
     }
 }

@@ -29,7 +29,7 @@ impl ColumnIndex {
     pub(crate) fn new(points: &[Point], column_m: f32) -> Self {
         let keyed = points.iter().zip(0_u32..);
         let mut keyed: Vec<(u64, f32, u32)> = keyed
-            .map(|(&point, row)| (key(place(point, column_m)), point[2], row))
+            .map(|(&point, row)| (key(column_of(point, column_m)), point[2], row))
             .collect();
         keyed.sort_unstable_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)).then(a.2.cmp(&b.2)));
         let columns = keyed.chunk_by(|a, b| a.0 == b.0).count();
@@ -68,9 +68,9 @@ impl ColumnIndex {
     /// metres from `center`. `within_m` is at most a column's side.
     #[inline]
     pub(crate) fn within(&self, center: Point, within_m: f32, mut see: impl FnMut(u32, Point)) {
-        self.columns_within(center, within_m, |places| {
-            let rows = self.rows[places.clone()].iter();
-            for (&point, &row) in self.points[places].iter().zip(rows) {
+        self.columns_within(center, within_m, |slots| {
+            let rows = self.rows[slots.clone()].iter();
+            for (&point, &row) in self.points[slots].iter().zip(rows) {
                 if point[2] > center[2] + within_m {
                     break;
                 }
@@ -90,8 +90,8 @@ impl ColumnIndex {
         seen: &mut VisitedRows,
         mut see: impl FnMut(u32),
     ) {
-        self.columns_within(center, within_m, |mut places| {
-            while let Some(unseen) = seen.next_unseen(places.clone()) {
+        self.columns_within(center, within_m, |mut slots| {
+            while let Some(unseen) = seen.next_unseen(slots.clone()) {
                 let point = self.points[unseen];
                 if point[2] > center[2] + within_m {
                     break;
@@ -100,7 +100,7 @@ impl ColumnIndex {
                     seen.add(unseen);
                     see(self.rows[unseen]);
                 }
-                places.start = unseen + 1;
+                slots.start = unseen + 1;
             }
         });
     }
@@ -135,7 +135,8 @@ impl ColumnIndex {
         height_m: f32,
         mut see: impl FnMut(Point),
     ) {
-        let corner = |side: f32| place([center[0] + side, center[1] + side, 0.0], self.column_m);
+        let corner =
+            |side: f32| column_of([center[0] + side, center[1] + side, 0.0], self.column_m);
         let ([left, low], [right, high]) = (corner(-half_m), corner(half_m));
         for x in left..=right {
             for y in low..=high {
@@ -173,11 +174,11 @@ impl ColumnIndex {
             let Range { start, end } = self.column(neighbors.key(offset));
             let column = &self.points[start..end];
             let level = column.partition_point(|point| point[2] < center[2]);
-            let mut may_go_on = |place: usize| {
-                let point = column[place];
+            let mut may_go_on = |slot: usize| {
+                let point = column[slot];
                 let height = point[2] - center[2];
                 let square = square_distance(center, point);
-                let row = self.rows[start + place];
+                let row = self.rows[start + slot];
                 let is_lower = |(other, _): (u32, f32)| row < other;
                 if (square < least || (square == least && best.is_some_and(is_lower)))
                     && allowed(row)
@@ -214,14 +215,14 @@ pub(crate) struct VisitedRows(Vec<u64>);
 
 impl VisitedRows {
     #[inline]
-    fn add(&mut self, place: usize) {
-        self.0[place / 64] |= 1 << (place % 64);
+    fn add(&mut self, slot: usize) {
+        self.0[slot / 64] |= 1 << (slot % 64);
     }
 
-    /// The first of the indices `places` that has not been visited.
+    /// The first of the indices `slots` that has not been visited.
     #[inline]
-    fn next_unseen(&self, places: Range<usize>) -> Option<usize> {
-        let Range { mut start, end } = places;
+    fn next_unseen(&self, slots: Range<usize>) -> Option<usize> {
+        let Range { mut start, end } = slots;
         while start < end {
             let left = !self.0[start / 64] >> (start % 64);
             if left != 0 {
@@ -249,7 +250,7 @@ const OFFSETS: [[i32; 2]; 9] = [
 
 /// The columns around a point, and the distances to their borders.
 struct Neighbors {
-    place: [i32; 2],
+    slot: [i32; 2],
     /// Along each axis, the squared distances to the preceding and to the following column, square
     /// metres. They are slightly underestimated, since columns are computed in single precision.
     square_gaps: [[f32; 2]; 2],
@@ -265,7 +266,7 @@ impl Neighbors {
             [before_m, column_m - before_m].map(|gap_m| (gap_m - slack_m).max(0.0).powi(2))
         };
         Self {
-            place: place(center, column_m),
+            slot: column_of(center, column_m),
             square_gaps: [gaps(center[0]), gaps(center[1])],
         }
     }
@@ -282,13 +283,13 @@ impl Neighbors {
 
     #[inline]
     fn key(&self, [dx, dy]: [i32; 2]) -> u64 {
-        let [x, y] = self.place;
+        let [x, y] = self.slot;
         key([x + dx, y + dy])
     }
 }
 
 /// Indices of the column that a point lies in.
-fn place(point: Point, column_m: f32) -> [i32; 2] {
+fn column_of(point: Point, column_m: f32) -> [i32; 2] {
     [point[0], point[1]].map(|c| floor(c / column_m).clamp(-REACH, REACH) as i32)
 }
 
@@ -366,13 +367,13 @@ mod tests {
         let mut point = || [0; 3].map(|_| random.uniform(-3.0, 3.0) as f32);
         let cloud: Vec<Point> = (0..3000).map(|_| point()).collect();
         let near = ColumnIndex::new(&cloud, 0.7);
-        let places: Vec<Point> = (0..40).map(|_| point()).collect();
+        let slots: Vec<Point> = (0..40).map(|_| point()).collect();
         let (mut seen, mut rows) = (near.unseen(), Vec::new());
-        for &place in &places {
-            near.within_unseen(place, 0.7, &mut seen, |row| rows.push(row));
+        for &slot in &slots {
+            near.within_unseen(slot, 0.7, &mut seen, |row| rows.push(row));
         }
         rows.sort_unstable();
-        let is_near = |point: &Point| places.iter().any(|&p| square_distance(p, *point) < 0.49);
+        let is_near = |point: &Point| slots.iter().any(|&p| square_distance(p, *point) < 0.49);
         let expected = cloud.iter().zip(0..).filter(|(point, _)| is_near(point));
         let expected: Vec<u32> = expected.map(|(_, row)| row).collect();
         assert!(expected.len() > 500);

@@ -26,20 +26,20 @@ const FIRST_DELAY: Duration = Duration::from_millis(500);
 const LONGEST_DELAY: Duration = Duration::from_secs(300);
 
 /// Sort key of a ready job: the lowest runs first.
-type Place = (core::cmp::Reverse<i64>, f64, i64);
+type BacklogKey = (core::cmp::Reverse<i64>, f64, i64);
 
 /// The first ready job among those for any device and those for this kind. Two index lookups, so
 /// that the jobs that wait for the other kind cost nothing.
 fn first_ready(connection: &Connection, kind: DeviceKind) -> Result<Option<i64>, QueueError> {
     let mut statement = connection.prepare_cached(FIRST_READY)?;
-    let mut first: Option<Place> = None;
+    let mut first: Option<BacklogKey> = None;
     for need in [None, Some(kind)] {
-        let found: Option<Place> = statement
+        let found: Option<BacklogKey> = statement
             .query_row([device_code(need)], |row| {
                 Ok((core::cmp::Reverse(row.get(0)?), row.get(1)?, row.get(2)?))
             })
             .optional()?;
-        let earlier = |one: Place, other: Place| if other < one { other } else { one };
+        let earlier = |one: BacklogKey, other: BacklogKey| if other < one { other } else { one };
         first = first.into_iter().chain(found).reduce(earlier);
     }
     Ok(first.map(|(_, _, seq)| seq))

@@ -76,7 +76,7 @@ impl Shared {
             for job in &effects.stopped {
                 backlog.stopped(job);
                 if let Some(held) = running.remove(&job.id) {
-                    held.flags.lose();
+                    held.flags.mark_lost();
                 }
             }
             for job in &effects.started {

@@ -19,7 +19,7 @@ use super::writer::Writer;
 use super::{expiry, finish, leases, rows, schema, submit};
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobId, Tenant};
-use crate::queue::backlog::{Backlog, Load, Place};
+use crate::queue::backlog::{Backlog, BacklogKey, Load};
 use crate::queue::lease::{Flags, Lease, LeaseHeartbeat};
 use crate::queue::types::{
     Committed, Event, Filter, Outcome, Queue, QueueError, QueueOptions, Submission, Submitted,
@@ -134,7 +134,7 @@ fn count_backlog(connection: &Connection) -> Result<Backlog, QueueError> {
     let mut statement = connection.prepare(sql)?;
     let mut rows = statement.query([])?;
     while let Some(row) = rows.next()? {
-        let place = Place {
+        let key = BacklogKey {
             tenant: rows::tenant_at(row, 0)?,
             priority: rows::priority_at(row, 1)?,
             device: rows::device_at(row, 2)?,
@@ -144,7 +144,7 @@ fn count_backlog(connection: &Connection) -> Result<Backlog, QueueError> {
             jobs: u64::from(jobs),
             seconds: row.get(4)?,
         };
-        backlog.enter_many(place, load);
+        backlog.enter_many(key, load);
     }
     Ok(backlog)
 }
@@ -365,7 +365,7 @@ impl SqliteQueue {
             // The lease was lost after the claim.
             _ => {
                 let flags = Flags::default();
-                flags.lose();
+                flags.mark_lost();
                 Arc::new(flags)
             }
         };

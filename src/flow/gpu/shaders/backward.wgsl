@@ -19,9 +19,9 @@ var<workgroup> outputs: array<vec4<f32>, 2048>;
 
 // Stores four of a row's derivatives, zero where the feature is inactive, and returns them.
 fn gated(layer: u32, row: u32, column: u32, sum: vec4<f32>) -> vec4<f32> {
-    let place = (layer * part.rows + row) * QUADS + column;
-    let delta = select(vec4(0.0), sum, activations[place] > vec4(0.0));
-    deltas[place] = delta;
+    let slot = (layer * part.rows + row) * QUADS + column;
+    let delta = select(vec4(0.0), sum, activations[slot] > vec4(0.0));
+    deltas[slot] = delta;
     return delta;
 }
 

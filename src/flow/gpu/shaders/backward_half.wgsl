@@ -28,10 +28,10 @@ fn right(weights: u32, summed: u32, column: u32) -> Right {
 
 // Stores a point's derivative, zero where the feature is inactive, as input of the previous layer.
 fn keep(layer: u32, row: u32, point: u32, feature: u32, sum: f32, count: f32) {
-    let place = (layer * part.rows + row + point) * WIDTH + feature;
-    let delta = select(0.0, sum, activations[place] > 0.0);
+    let slot = (layer * part.rows + row + point) * WIDTH + feature;
+    let delta = select(0.0, sum, activations[slot] > 0.0);
     inputs[point * INPUT_PITCH + feature] = halved(delta);
-    deltas[place] = delta / count;
+    deltas[slot] = delta / count;
 }
 
 @compute @workgroup_size(128)

@@ -65,9 +65,9 @@ fn bricks(
         for (var column = first_from(starts[row], end, top - band); column < end; column++) {
             let at = columns[column];
             if at.y >= top + 8 + band { break; }
-            let place = at.squares + layer - at.layer;
-            if layer < at.layer || place >= columns[column + 1u].squares { continue; }
-            let word = squares[place * 4u + pair];
+            let slot = at.squares + layer - at.layer;
+            if layer < at.layer || slot >= columns[column + 1u].squares { continue; }
+            let word = squares[slot * 4u + pair];
             let gap = y - at.y;
             along = min(along, vec2(i32(word & 0xffffu), i32(word >> 16u)) + gap * gap);
         }

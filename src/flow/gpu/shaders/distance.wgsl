@@ -39,8 +39,8 @@ fn far_sample(transform: ptr<function, Transform>, corner: vec3<u32>, fraction: 
     var corners: array<f32, 8>;
     for (var i = 0u; i < 8u; i++) {
         let at = select(low, high, vec3((i & 4u) != 0u, (i & 2u) != 0u, (i & 1u) != 0u));
-        let place = (at.x * count.y + at.y) * count.z + at.z;
-        corners[i] = bitcast<f32>(store[(*transform).far + place]);
+        let slot = (at.x * count.y + at.y) * count.z + at.z;
+        corners[i] = bitcast<f32>(store[(*transform).far + slot]);
     }
     let value = trilinear(corners, within);
     return vec4(value.xyz * scale, value.w);
@@ -56,9 +56,9 @@ fn code_at(transform: ptr<function, Transform>, vertex: vec3<u32>) -> u32 {
     let brick = store[(*transform).bricks + table * 512u + brick_in.x * 64u + brick_in.y * 8u + brick_in.z];
     if brick == ABSENT { return BEYOND; }
     let within = vertex & vec3(7u);
-    let place = within.x * 64u + within.y * 8u + within.z;
-    let word = store[(*transform).codes + brick * 256u + place / 2u];
-    return (word >> ((place & 1u) * 16u)) & 0xffffu;
+    let slot = within.x * 64u + within.y * 8u + within.z;
+    let word = store[(*transform).codes + brick * 256u + slot / 2u];
+    return (word >> ((slot & 1u) * 16u)) & 0xffffu;
 }
 
 fn sample(transform: ptr<function, Transform>, point: vec3<f32>) -> Sample {

@@ -22,13 +22,13 @@ var<immediate> part: Part;
 var<workgroup> inputs: array<vec4<f32>, 2048>;
 
 // Index of four of a point's features. The exclusive or avoids bank conflicts between points.
-fn place(point: u32, column: u32) -> u32 {
+fn slot(point: u32, column: u32) -> u32 {
     return point * QUADS + (column ^ (point % 8u));
 }
 
 // Stores four of a point's features for the next layer, and for the backward pass.
 fn remember(layer: u32, row: u32, point: u32, column: u32, features: vec4<f32>) {
-    inputs[place(point, column)] = features;
+    inputs[slot(point, column)] = features;
     if !EVALUATES {
         activations[(layer * part.rows + row + point) * QUADS + column] = features;
     }
@@ -96,7 +96,7 @@ fn forward(
         for (var k = 0u; k < QUADS; k++) {
             var h: array<vec4<f32>, 8>;
             for (var i = 0u; i < 8u; i++) {
-                h[i] = inputs[place(first + i, k)];
+                h[i] = inputs[slot(first + i, k)];
             }
             for (var j = 0u; j < 4u; j++) {
                 let w_low = networks[at_low + (k * 4u + j) * 8u];
@@ -125,8 +125,8 @@ fn forward(
         var lower = vec4(0.0);
         var upper = vec4(0.0);
         for (var k = local % 2u; k < QUADS; k += 4u) {
-            lower = fma(inputs[place(point, k)], networks[at + k], lower);
-            upper = fma(inputs[place(point, k + 2u)], networks[at + k + 2u], upper);
+            lower = fma(inputs[slot(point, k)], networks[at + k], lower);
+            upper = fma(inputs[slot(point, k + 2u)], networks[at + k + 2u], upper);
         }
         sums[output] = lower + upper;
     }

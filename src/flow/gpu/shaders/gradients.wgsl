@@ -31,17 +31,17 @@ fn gradients(
 ) {
     let chunk = chunks[part.first_chunk + group.x];
     if !iterates(statuses[chunk.lane], lanes[chunk.lane].steps, part.step) { return; }
-    let place = (part.first_chunk + group.x) * LAID_OUT;
+    let slot = (part.first_chunk + group.x) * LAID_OUT;
     let layer = group.y + select(0u, MIDDLE_LAYERS, OUTER);
     switch layer {
-        case 7u: { first_layer(chunk, place, local); }
-        case 8u: { last_layer(chunk, place, local); }
-        default: { middle_layer(layer, chunk, place, local); }
+        case 7u: { first_layer(chunk, slot, local); }
+        case 8u: { last_layer(chunk, slot, local); }
+        default: { middle_layer(layer, chunk, slot, local); }
     }
 }
 
 // 8 inputs x 8 outputs per invocation, in registers.
-fn middle_layer(layer: u32, chunk: Chunk, place: u32, local: u32) {
+fn middle_layer(layer: u32, chunk: Chunk, slot: u32, local: u32) {
     let input = local / 16u;
     let output = local % 16u;
     let above = (layer * part.rows + chunk.first_row) * QUADS;
@@ -70,7 +70,7 @@ fn middle_layer(layer: u32, chunk: Chunk, place: u32, local: u32) {
             bias_high += d_high;
         }
     }
-    let weights = place + MIDDLE + layer * MIDDLE_STRIDE;
+    let weights = slot + MIDDLE + layer * MIDDLE_STRIDE;
     let low = weights + output / 8u * 1024u + output % 8u;
     let high = low + 2048u;
     for (var i = 0u; i < 4u; i++) {
@@ -88,7 +88,7 @@ fn middle_layer(layer: u32, chunk: Chunk, place: u32, local: u32) {
 }
 
 // One sum per invocation: of delta times x, y, z or one, for four features.
-fn first_layer(chunk: Chunk, place: u32, local: u32) {
+fn first_layer(chunk: Chunk, slot: u32, local: u32) {
     let which = local / QUADS;
     let quad = local % QUADS;
     if which > 3u { return; }
@@ -111,11 +111,11 @@ fn first_layer(chunk: Chunk, place: u32, local: u32) {
             sum = fma(vec4(factors[i]), some[i], sum);
         }
     }
-    partials[place + which * QUADS + quad] = sum;
+    partials[slot + which * QUADS + quad] = sum;
 }
 
 // One sum per invocation: of x, y or z of the pull times four features, or of the pulls themselves.
-fn last_layer(chunk: Chunk, place: u32, local: u32) {
+fn last_layer(chunk: Chunk, slot: u32, local: u32) {
     let which = local / QUADS;
     let quad = local % QUADS;
     if which > 3u { return; }
@@ -137,9 +137,9 @@ fn last_layer(chunk: Chunk, place: u32, local: u32) {
         }
     }
     if which < 3u {
-        partials[place + LAST + which * QUADS + quad] = sum;
+        partials[slot + LAST + which * QUADS + quad] = sum;
     } else if quad == 0u {
         // The network's last vec4.
-        partials[place + LAST_BIAS] = sum;
+        partials[slot + LAST_BIAS] = sum;
     }
 }

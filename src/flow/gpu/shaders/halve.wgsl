@@ -21,12 +21,12 @@ fn halve(
     let lane = group.y;
     if statuses[lane].state != RUNNING { return; }
     let layer = id.x / LAYER_QUADS;
-    let place = id.x % LAYER_QUADS;
+    let slot = id.x % LAYER_QUADS;
     let network = lanes[lane].network * ARRAYS * LAID_OUT;
-    let weights = networks[network + MIDDLE + layer * MIDDLE_STRIDE + place];
+    let weights = networks[network + MIDDLE + layer * MIDDLE_STRIDE + slot];
     // Panels of 32 outputs, see field/mlp.rs.
-    let input = place / 8u % WIDTH;
-    let output = place / 1024u * 32u + place % 8u * 4u;
+    let input = slot / 8u % WIDTH;
+    let output = slot / 1024u * 32u + slot % 8u * 4u;
     let at = (lane * MIDDLE_LAYERS + layer) * LAYER_HALVES + tile_place(input, output);
     halves[at / 4u] = vec4(halved(weights.x), halved(weights.y), halved(weights.z), halved(weights.w));
 }

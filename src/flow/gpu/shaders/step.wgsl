@@ -23,16 +23,16 @@ fn step(
     @builtin(workgroup_id) group: vec3<u32>,
 ) {
     let lane = group.y;
-    let place = id.x;
+    let slot = id.x;
     let status = statuses[lane];
-    if place >= LAID_OUT || status.applies == 0u { return; }
+    if slot >= LAID_OUT || status.applies == 0u { return; }
     let now = steps[lane * STEPS + part.step];
     var gradient = vec4(0.0);
     let first = lanes[lane].first_chunk;
     for (var chunk = 0u; chunk < lanes[lane].chunks; chunk++) {
-        gradient += partials[(first + chunk) * LAID_OUT + place];
+        gradient += partials[(first + chunk) * LAID_OUT + slot];
     }
-    let at = lanes[lane].network * ARRAYS * LAID_OUT + place;
+    let at = lanes[lane].network * ARRAYS * LAID_OUT + slot;
     let parameter = networks[at + PARAMETERS * LAID_OUT];
     if status.improves == 1u {
         let kept = networks[at + KEPT * LAID_OUT];

@@ -72,14 +72,14 @@ macro_rules! same_layout {
 
 #[test]
 fn host_and_shaders_agree_on_every_record() {
-    same_layout!("query", Transform: origin_high, origin_low, inverse_cell, code_scale, vertices,
+    same_layout!("distance_loss", Transform: origin_high, origin_low, inverse_cell, code_scale, vertices,
         blocks, tables, bricks, codes, far, far_pitch, far_vertices);
-    same_layout!("query", Lane: transform, network, points, first_tile, tiles, first_chunk, chunks,
+    same_layout!("distance_loss", Lane: transform, network, points, first_tile, tiles, first_chunk, chunks,
         center, scale, margin, margin_slope, truncation, flow_penalty, average, patience, min_delta, steps);
     same_layout!("forward", Step: first, count, weight, step_size, square_correction, ema_weight);
     same_layout!("forward", Tile: lane, tile);
     same_layout!("gradients", Chunk: lane, first_row, rows, first_point);
-    same_layout!("judge", Status: state, iterations, best_iteration, best_loss, seen, seen_best,
+    same_layout!("reduce_loss", Status: state, iterations, best_iteration, best_loss, seen, seen_best,
         without_progress, applies, improves);
     same_layout!("forward", Part: step, first_tile, first_chunk, tiles, rows, nothing);
 }

@@ -5,7 +5,7 @@ use fnsf::flow::distance::{DistanceError, Metric, Sites};
 use fnsf::flow::field::BackendError;
 use fnsf::flow::simulate::StreetOptions;
 use fnsf::flow::{FlowError, Uncontrolled};
-use fnsf::flow::{Ground, Options, Preset, Problem, estimate, price};
+use fnsf::flow::{Ground, Options, Preset, Problem, estimate, predict_cost};
 
 use super::scenes::{real_pair, solve, street};
 
@@ -32,16 +32,16 @@ fn bytes_and_bricks_are_never_below_the_truth_and_not_far_above() {
                 options.ground = Ground::Mask;
                 options.field_mut().expect("a field").distance.sites = sites;
                 options.field_mut().expect("a field").max_iterations = 0;
-                let price = price(&problem, &options).expect("it is taken");
+                let cost = predict_cost(&problem, &options).expect("it is taken");
                 let estimate = solve(&pair, &options);
-                assert_eq!(price.source_points, estimate.points);
+                assert_eq!(cost.source_points, estimate.points);
                 assert_eq!(
-                    price.transform_bytes,
+                    cost.transform_bytes,
                     estimate.fit().expect("a fit").distance_bytes
                 );
-                assert!(price.bytes >= estimate.fit().expect("a fit").distance_bytes);
+                assert!(cost.bytes >= estimate.fit().expect("a fit").distance_bytes);
                 let most = estimate.fit().expect("a fit").distance_bytes as f64 * BESIDE_SHARE;
-                assert!(price.bytes <= most as usize + BESIDE_BYTES, "{price:?}");
+                assert!(cost.bytes <= most as usize + BESIDE_BYTES, "{cost:?}");
             }
         }
     }
@@ -54,7 +54,11 @@ fn work_grows_with_iterations_points_and_detail() {
         ..StreetOptions::default()
     });
     let problem = Problem::pair(&pair.source, &pair.target);
-    let work = |options: &Options| price(&problem, options).expect("taken").multiply_adds;
+    let work = |options: &Options| {
+        predict_cost(&problem, options)
+            .expect("taken")
+            .multiply_adds
+    };
     let base = Preset::Neural.options(None);
     let change = |change: fn(&mut Options)| {
         let mut options = base.clone();
@@ -68,7 +72,7 @@ fn work_grows_with_iterations_points_and_detail() {
     );
     assert!(change(|o| o.max_points = Some(1000)) < work(&base));
     assert!(work(&Preset::Paper.options(None)) > work(&base));
-    let paper = price(&problem, &Preset::Paper.options(None)).expect("taken");
+    let paper = predict_cost(&problem, &Preset::Paper.options(None)).expect("taken");
     assert!((paper.seconds(2.0) - paper.multiply_adds / 2.0).abs() < f64::EPSILON);
 }
 
@@ -102,14 +106,14 @@ fn what_the_estimate_refuses_has_no_price() {
             before: None,
             neighbors: &[],
         };
-        let refused = price(&problem, options).expect_err("refused");
+        let refused = predict_cost(&problem, options).expect_err("refused");
         let truth = estimate(&backend, &problem, options, &Uncontrolled).expect_err("refused");
         assert_eq!(refused.to_string(), truth.to_string());
         assert!(refused.is_input());
     }
     let problem = Problem::pair(&cloud, &cloud);
     assert!(matches!(
-        price(&problem, &tight),
+        predict_cost(&problem, &tight),
         Err(FlowError::Backend(BackendError::Distance(
             DistanceError::Memory { .. }
         )))
@@ -124,10 +128,10 @@ fn a_search_for_objects_is_priced_by_all_points_whatever_is_drawn() {
     });
     let problem = Problem::pair(&pair.source, &pair.target);
     for preset in [Preset::Default, Preset::Label] {
-        let of = |max_points| price(&problem, &preset.options(max_points)).expect("taken");
+        let of = |max_points| predict_cost(&problem, &preset.options(max_points)).expect("taken");
         assert_eq!(of(Some(100)), of(None));
         assert_eq!(of(None).transform_bytes, 0);
     }
-    let fitted = price(&problem, &Preset::Neural.options(Some(100))).expect("taken");
+    let fitted = predict_cost(&problem, &Preset::Neural.options(Some(100))).expect("taken");
     assert_eq!(fitted.source_points, 100);
 }

@@ -16,7 +16,7 @@ const THREADS = 256u;
 var<workgroup> sums: array<f32, THREADS>;
 
 @compute @workgroup_size(THREADS)
-fn judge(
+fn reduce_loss(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
@@ -38,12 +38,12 @@ fn judge(
     status.applies = 0u;
     status.improves = 0u;
     if iterates(status, lanes[lane].steps, part.step) {
-        let place = lane * STEPS + part.step;
-        let loss = rounded(sums[0] * steps[place].weight);
-        losses[place] = loss;
+        let slot = lane * STEPS + part.step;
+        let loss = rounded(sums[0] * steps[slot].weight);
+        losses[slot] = loss;
         // False for NaN and infinity.
         if loss < 3.4e38 {
-            observe(&status, lane, place, loss);
+            observe(&status, lane, slot, loss);
         } else {
             status.state = DIVERGED;
         }
@@ -51,7 +51,7 @@ fn judge(
     statuses[lane] = status;
 }
 
-fn observe(status: ptr<function, Status>, lane: u32, place: u32, loss: f32) {
+fn observe(status: ptr<function, Status>, lane: u32, slot: u32, loss: f32) {
     let patience = lanes[lane].patience;
     if patience > 0u {
         if (*status).seen == 1u && loss >= (*status).seen_best - lanes[lane].min_delta {
@@ -69,7 +69,7 @@ fn observe(status: ptr<function, Status>, lane: u32, place: u32, loss: f32) {
     (*status).applies = 1u;
     if lanes[lane].average == 1u {
         let before = select((*status).best_loss, loss, (*status).iterations == 1u);
-        (*status).best_loss = before + rounded(steps[place].ema_weight * (loss - before));
+        (*status).best_loss = before + rounded(steps[slot].ema_weight * (loss - before));
         (*status).best_iteration = (*status).iterations;
         (*status).improves = 1u;
     } else if loss <= (*status).best_loss && (*status).state == RUNNING {

@@ -19,7 +19,7 @@ const SMALL_FLOW = 1e-3;
 var<workgroup> losses: array<f32, TILE>;
 
 @compute @workgroup_size(64)
-fn query(
+fn distance_loss(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
