@@ -5,12 +5,13 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde::{Serialize, Serializer};
 
-/// Milliseconds since 1970-01-01 UTC, displayed as RFC 3339.
+/// Milliseconds since 1970-01-01 UTC, displayed as RFC 3339. A time before the year -9999 or after
+/// 9999 is displayed as a time at the end of 9999.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Timestamp(i64);
 
 impl Timestamp {
-    /// The current time.
+    /// The current time of the system clock. A clock set before 1970 gives 1970-01-01.
     pub fn now() -> Self {
         let since = SystemTime::now().duration_since(UNIX_EPOCH);
         Self(since.map_or(0, millis))
@@ -26,7 +27,7 @@ impl Timestamp {
         self.0
     }
 
-    /// The time `duration` later.
+    /// The time `duration` later, at most `i64::MAX` milliseconds.
     pub fn after(self, duration: Duration) -> Self {
         Self(self.0.saturating_add(millis(duration)))
     }

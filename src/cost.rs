@@ -74,12 +74,14 @@ impl CostModel {
         self.lanes
     }
 
-    /// Nominal seconds of a job of this cost: one per 2e11 multiply-adds, plus 0.005 of overhead.
+    /// Nominal seconds of a job of this cost: its multiply-adds divided by 2e11, plus 0.005 of
+    /// overhead.
     pub fn nominal(cost: &Cost) -> f64 {
         EACH + cost.seconds(NOMINAL_RATE)
     }
 
-    /// Nominal seconds of evaluating a field at this many points, without overhead.
+    /// Nominal seconds to evaluate a field at `points` points, without overhead: one multiply-add
+    /// per point and network parameter.
     pub fn asking(points: f64) -> f64 {
         points * PARAMETERS as f64 / NOMINAL_RATE
     }
@@ -90,12 +92,13 @@ impl CostModel {
         nominal * log_factors[kind as usize].map_or(1.0, f64::exp)
     }
 
-    /// Nominal seconds of work that all lanes of one kind complete per second.
+    /// Nominal seconds of work that all lanes of one kind complete per second. Zero without such
+    /// lanes.
     pub fn rate(&self, kind: DeviceKind) -> f64 {
         self.lanes.of(kind) as f64 / self.seconds_on(kind, 1.0)
     }
 
-    /// Nominal seconds of work that all lanes complete per second.
+    /// Nominal seconds of work that all lanes complete per second. Zero without lanes.
     pub fn total_rate(&self) -> f64 {
         DeviceKind::ALL
             .into_iter()
@@ -104,7 +107,7 @@ impl CostModel {
     }
 
     /// Predicted real seconds that `nominal` seconds of work occupy one lane, averaged over all
-    /// lanes.
+    /// lanes. Without lanes the result is huge (more than 1e300 for one nominal second).
     pub fn seconds(&self, nominal: f64) -> f64 {
         nominal * self.lanes.total().max(1) as f64 / self.total_rate().max(f64::MIN_POSITIVE)
     }

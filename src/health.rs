@@ -66,7 +66,8 @@ pub struct StoreHealth {
 }
 
 impl StoreHealth {
-    /// Records a failure of the store that no job caused.
+    /// Records a failure of the store that no job caused. `error` becomes the message of
+    /// [`StoreHealth::trouble`].
     pub fn failed(&self, error: &dyn std::fmt::Display) {
         let new = self.trouble.send_replace(Some(error.to_string())).is_none();
         if new {
@@ -109,13 +110,13 @@ impl StoreHealth {
         self.trouble.borrow().clone()
     }
 
-    /// Returns once the store works.
+    /// Waits until the store works. Returns at once if it works now.
     pub async fn until_it_works(&self) {
         let mut trouble = self.trouble.subscribe();
         let _the_sender_is_here = trouble.wait_for(Option::is_none).await;
     }
 
-    /// Returns once the store fails.
+    /// Waits until the store fails. Returns at once if it fails now.
     pub async fn until_it_fails(&self) {
         let mut trouble = self.trouble.subscribe();
         let _the_sender_is_here = trouble.wait_for(Option::is_some).await;

@@ -22,10 +22,10 @@ const SUM: usize = 16;
 #[error("stored bytes are damaged or of another version: {0}")]
 pub struct CorruptPayload(&'static str);
 
-/// One stored sweep.
+/// One stored sweep of N points.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StoredCloud {
-    /// N points, metres. Rows without return are NaN.
+    /// N x 3 coordinates, metres, in the sensor frame. Points without a return are NaN.
     pub points: Vec<Point>,
     /// N flags: which points are ground, if known.
     pub ground: Option<Vec<bool>>,
@@ -33,23 +33,25 @@ pub struct StoredCloud {
     pub time: Option<SweepTime>,
 }
 
-/// The stored flow of a pair.
+/// The stored flow of a pair with N source points.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StoredFlow {
-    /// N displacements from the source sweep's time to the target's, metres, ego motion included.
+    /// N x 3 displacements from the source sweep's time to the target's, metres, ego motion
+    /// included. Zero where `valid` is false.
     pub flow: Vec<Point>,
     /// N flags: which rows have a flow.
     pub valid: Vec<bool>,
-    /// N flags: which points move beyond the ego motion, if known.
+    /// N flags: true for points whose residual motion is at least 0.05 m, if the ego motion is
+    /// known.
     pub dynamic: Option<Vec<bool>>,
     /// Clusters of the points and confidence of their flow, if known.
     pub objects: Option<Objects>,
-    /// The ego motion target_from_source, if known.
+    /// The ego motion target_from_source, translation in metres, if known.
     pub ego: Option<RigidTransform>,
 }
 
 impl StoredCloud {
-    /// Encodes the cloud. All its lists must have N rows.
+    /// Encodes the cloud. If its lists differ in length, the bytes cannot be decoded.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut out = Writer::new(CLOUD, self.points.len(), 13 * self.points.len());
         out.points(&self.points);
@@ -61,7 +63,7 @@ impl StoredCloud {
     /// Decodes a cloud.
     ///
     /// # Errors
-    /// [`Damaged`] if the bytes are damaged or of another version.
+    /// [`CorruptPayload`] if the bytes are damaged or of another version.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, CorruptPayload> {
         let mut reader = Reader::new(CLOUD, bytes)?;
         let cloud = Self {
@@ -75,7 +77,7 @@ impl StoredCloud {
 }
 
 impl StoredFlow {
-    /// Encodes the flow. All its lists must have N rows.
+    /// Encodes the flow. If its lists differ in length, the bytes cannot be decoded.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut out = Writer::new(FLOW, self.flow.len(), 22 * self.flow.len());
         out.points(&self.flow);
@@ -89,7 +91,7 @@ impl StoredFlow {
     /// Decodes a flow.
     ///
     /// # Errors
-    /// [`Damaged`] if the bytes are damaged or of another version.
+    /// [`CorruptPayload`] if the bytes are damaged or of another version.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, CorruptPayload> {
         let mut reader = Reader::new(FLOW, bytes)?;
         let flow = reader.points()?;
@@ -106,12 +108,12 @@ impl StoredFlow {
     }
 }
 
-/// The stored dense cloud of a sequence.
+/// The stored dense cloud of a sequence, with its points in metres.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StoredDense(pub DenseCloud);
 
 impl StoredDense {
-    /// Encodes the cloud. All its lists must have the same number of rows.
+    /// Encodes the dense cloud. If its lists differ in length, the bytes cannot be decoded.
     pub fn to_bytes(&self) -> Vec<u8> {
         let Self(cloud) = self;
         let mut out = Writer::new(DENSE, cloud.points.len(), 22 * cloud.points.len());
@@ -126,7 +128,7 @@ impl StoredDense {
     /// Decodes a dense cloud.
     ///
     /// # Errors
-    /// [`Damaged`] if the bytes are damaged or of another version.
+    /// [`CorruptPayload`] if the bytes are damaged or of another version.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, CorruptPayload> {
         let mut reader = Reader::new(DENSE, bytes)?;
         let points = reader.points()?;

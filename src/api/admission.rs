@@ -19,9 +19,9 @@ use crate::sync::locked;
 pub struct AdmissionLimits {
     /// Maximum number of points in one cloud.
     pub max_points: usize,
-    /// Maximum memory of one pair or one dense cloud on a device, bytes.
+    /// Maximum predicted memory of one pair or one dense cloud on a device, bytes.
     pub max_pair_bytes: usize,
-    /// Maximum predicted waiting time of a job whose caller waits for the result.
+    /// Maximum predicted time until the start of a job whose caller waits for the result.
     pub max_wait: Duration,
     /// Maximum predicted compute time of all queued jobs, summed over the lanes.
     pub max_queue: Duration,
@@ -29,7 +29,12 @@ pub struct AdmissionLimits {
     pub max_tenant_queue: Duration,
 }
 
-/// Admission control for one queue.
+/// Decides whether a queue accepts a job.
+///
+/// It checks the number of points and the required kind of device, and predicts the cost of a job.
+/// It compares the predicted compute time of the queued jobs with the [`AdmissionLimits`]. An
+/// accepted job gets a [`Reservation`]. A job that is refused because too much is queued gets a
+/// retry delay.
 pub struct Admission {
     limits: AdmissionLimits,
     queue: Arc<dyn Queue>,
@@ -69,14 +74,16 @@ pub struct AdmissionRequest<'a> {
     pub priority: Priority,
     /// The kind of device that the job requires. `None` if any device will do.
     pub device: Option<DeviceKind>,
-    /// Nominal compute seconds of all its pairs and of its dense cloud. Zero only tests for room.
+    /// Nominal compute seconds of all its pairs and of its dense cloud. Zero tests whether the
+    /// limits are already exceeded, without a reservation.
     pub nominal_seconds: f64,
     /// Whether the caller waits for the result.
     pub durability: Durability,
 }
 
 impl Admission {
-    /// Admission control for `queue`, whose jobs are computed in the lanes of `cost`.
+    /// Admission control for `queue` with these limits. `cost` gives the lanes that compute the
+    /// jobs, and converts nominal to real seconds.
     pub fn new(limits: AdmissionLimits, queue: Arc<dyn Queue>, cost: Arc<CostModel>) -> Self {
         Self {
             limits,
@@ -105,7 +112,8 @@ impl Admission {
         Ok(())
     }
 
-    /// Refuses a job for a kind of device that this server does not have.
+    /// Refuses a job for a kind of device that this server does not have. `None`, for any device,
+    /// is accepted.
     ///
     /// # Errors
     /// [`ApiError::NoDevice`] if no lane is of the required kind.
@@ -178,9 +186,10 @@ impl Admission {
         Ok(())
     }
 
-    /// Reserves predicted compute time for a job, or refuses it with a retry delay of 1 s to 3600
-    /// s. With zero nominal seconds it reserves nothing and only tests whether a request body is
-    /// worth reading.
+    /// Reserves predicted compute time for a job, or refuses it with a retry delay from 1 s to 3600
+    /// s. With zero nominal seconds it reserves nothing, and only tests whether a request body is
+    /// worth reading. Reservations count against the limit on all queued jobs, not against that of
+    /// a tenant.
     ///
     /// # Errors
     /// - [`ApiError::TenantLimit`] if the job would exceed the limit on the tenant's queued jobs.

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::error::ApiError;
 use crate::job::{Priority, Tenant};
 
-/// The rights of a key.
+/// What a caller may do. Each role includes the rights of those before it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Role {
@@ -59,7 +59,7 @@ impl Caller {
 /// The minimum length of a key, characters.
 pub const MIN_KEY: usize = 16;
 
-/// Why a key cannot be used. The tenant of the key is given.
+/// Why a key cannot be used, with the tenant of the key.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidKey {
     /// It is too short, so it could be guessed.
@@ -84,11 +84,12 @@ pub struct Keys {
 }
 
 impl Keys {
-    /// Adds a key.
+    /// Adds a key that identifies `caller`.
     ///
     /// # Errors
     /// - [`InvalidKey::Short`] if the key is shorter than [`MIN_KEY`].
-    /// - [`InvalidKey::Unsendable`] if it cannot be sent in a header.
+    /// - [`InvalidKey::Unsendable`] if it has white space at an end, or characters other than
+    ///   printable ASCII.
     /// - [`InvalidKey::Twice`] if it is already present, for any tenant.
     pub fn add(&mut self, key: &str, caller: Caller) -> Result<(), InvalidKey> {
         if key.len() < MIN_KEY {

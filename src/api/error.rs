@@ -28,10 +28,12 @@ pub enum ApiError {
     /// The server has no device of the kind that the job requires.
     #[error("this server has no {}: leave device out, or ask another server", .0.name())]
     NoDevice(DeviceKind),
-    /// The request body arrived too slowly.
+    /// The request body arrived too slowly: no byte came for too long, or it lagged too far behind
+    /// 1 KiB/s.
     #[error("the request's body came too slowly")]
     TooSlow,
-    /// The client read the response so slowly that it was evicted.
+    /// The client read the response so slowly that its memory was given to another one. The rest of
+    /// the response was not sent.
     #[error("the answer was taken too slowly, and others needed its room: fetch the rest of it")]
     TakenTooSlowly,
     /// The key is missing or unknown.
@@ -192,7 +194,8 @@ const ERRORS: [ErrorSpec; 31] = [
 ];
 
 impl ErrorSpec {
-    /// The class of the error in the request metric.
+    /// The class of the error in the request metric: `server_error` from HTTP status 500, else
+    /// `client_error`.
     pub fn class(&self) -> &'static str {
         if self.http >= 500 {
             "server_error"
@@ -245,12 +248,12 @@ impl ApiError {
         }
     }
 
-    /// The error's row in the table of all errors.
+    /// The representation of this error in both protocols.
     pub fn row(&self) -> ErrorSpec {
         ErrorSpec::of(self.code()).expect("every code has a row; a test goes through all of them")
     }
 
-    /// The error message, truncated to 1 KiB.
+    /// The error message. Beyond 1 KiB it is cut, and ` ...` is appended.
     pub fn text(&self) -> String {
         let mut text = self.to_string();
         if text.len() > LONGEST_TEXT {
@@ -272,7 +275,7 @@ impl ApiError {
         }
     }
 
-    /// The job that the error refers to.
+    /// The job that the error refers to. `None` if it refers to no job.
     pub fn job(&self) -> Option<JobId> {
         match self {
             Self::KeyReused(id)

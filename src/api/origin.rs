@@ -14,7 +14,8 @@ use super::error::ApiError;
 
 /// The host names that a server without keys accepts in `Host`, without port and in any case. The
 /// loopback names (`localhost`, names below `.localhost`, loopback addresses) are always accepted.
-/// `None` accepts any name, for a server that is open to a network.
+/// `None` accepts any name, for a server that is open to a network. In either case, the `Origin` of
+/// a request, if it has one, must name the same host and port as its `Host`.
 #[derive(Clone, Debug, Default)]
 pub struct Hosts(pub Option<Vec<String>>);
 

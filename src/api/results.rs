@@ -88,10 +88,11 @@ impl Service {
     /// - [`ApiError::NotEnded`], [`ApiError::JobFailed`], [`ApiError::Cancelled`] or
     ///   [`ApiError::Expired`] if the job has not succeeded.
     /// - [`ApiError::BadRequest`] for a sequence.
-    /// - [`ApiError::ServerFull`] if there is no memory for the result.
+    /// - [`ApiError::ServerFull`] if no memory for the result becomes free within 5 s.
     /// - [`ApiError::ResultLost`] if the stored flow is missing.
     /// - [`ApiError::StoreUnavailable`] or [`ApiError::DiskFull`] if the store fails.
-    /// - [`ApiError::Internal`] if the stored flow or report cannot be decoded.
+    /// - [`ApiError::Internal`] if the stored flow or report cannot be decoded, or the job failed
+    ///   without a stored reason.
     pub async fn answer(&self, job: &Arc<Job>) -> Result<Answer, ApiError> {
         let report = Self::report(job)?;
         let mut room = self.room_for_result(job).await?;

@@ -35,7 +35,8 @@ pub struct ServiceLimits {
     /// Maximum size of one request body, bytes.
     pub max_upload_bytes: u64,
     /// Budget for all request bodies that are being received, and their clouds, bytes. With several
-    /// tenants, one tenant gets at most half of it.
+    /// tenants, one tenant gets at most half of it, but always enough for one body of the maximum
+    /// size if the whole budget allows that.
     pub max_uploads_bytes: u64,
     /// Budget for all results that are being encoded and sent, bytes. With several tenants, one
     /// tenant gets at most half of it.
@@ -89,7 +90,7 @@ pub struct ServiceParts {
     pub queue: Arc<dyn Queue>,
     /// The blob store for payloads and results.
     pub blobs: Blobs,
-    /// Admission control.
+    /// Decides whether the queue accepts a job.
     pub admission: Admission,
     /// The metrics registry.
     pub metrics: Arc<Metrics>,
@@ -97,7 +98,7 @@ pub struct ServiceParts {
     pub keys: Keys,
     /// The host names that are accepted when there are no API keys.
     pub hosts: Hosts,
-    /// The health of the store, and its free space.
+    /// The health of the store and its free disk space, as last measured.
     pub store_health: Arc<StoreHealth>,
     /// Resource limits for requests.
     pub limits: ServiceLimits,
@@ -118,7 +119,7 @@ impl<E: Into<ApiError>> From<E> for MakeDurable {
     }
 }
 
-/// The outcome of waiting for a job.
+/// The outcome of waiting for a job, with the latest known state of the job.
 #[derive(Clone, Debug)]
 pub enum Waited {
     /// The job has ended.
@@ -218,11 +219,11 @@ impl Service {
         }
     }
 
-    /// Runs CPU-bound work on a blocking thread. At most one piece of work per core runs at a time,
-    /// and the tenants share these permits fairly.
+    /// Runs CPU-bound work on a blocking thread and returns its result. At most one piece of work
+    /// per core runs at a time. The others wait, and the tenants take turns fairly.
     ///
     /// # Errors
-    /// The error of the work itself, and [`ApiError::Internal`] if it panics.
+    /// The error of the work itself, or [`ApiError::Internal`] if it panics.
     pub async fn compute<T: Send + 'static>(
         &self,
         tenant: &Tenant,
@@ -293,7 +294,7 @@ impl Service {
             .map(drop)
     }
 
-    /// A job of the caller's tenant.
+    /// The job `id` of the caller's tenant, which may be a pair of a sequence.
     ///
     /// # Errors
     /// - [`ApiError::NotFound`] if there is no such job, or another tenant owns it.
@@ -342,8 +343,9 @@ impl Service {
         Ok(self.queue.list(filter).await?)
     }
 
-    /// Cancels a job of the caller's tenant: at once if it is queued, within an iteration or a
-    /// cluster if it is running. An ended job is not changed.
+    /// Cancels a job of the caller's tenant and returns it. A queued job ends at once. A running
+    /// one ends within an iteration of its fit or a cluster of its search, after this call has
+    /// returned. Of a sequence all pairs are cancelled. An ended job is not changed.
     ///
     /// # Errors
     /// - [`ApiError::Forbidden`] if the caller may only read.
@@ -389,7 +391,8 @@ impl Service {
         Ok(self.queue.requeue(id, lost).await?)
     }
 
-    /// Subscribes to a job of the caller's tenant: its state and, while it runs, its progress.
+    /// Subscribes to a job of the caller's tenant: its state and, while it runs, its progress. The
+    /// receiver holds the latest version of the job. It closes when the job has ended.
     ///
     /// # Errors
     /// - [`ApiError::NotFound`] if there is no such job, or another tenant owns it.
@@ -404,8 +407,8 @@ impl Service {
         Ok(self.queue.watch(id).await?)
     }
 
-    /// Waits until a job ends, for at most `longest` (without limit if `None`), or until
-    /// [`Service::close_streams`] is called.
+    /// Waits until a job of any tenant ends, for at most `longest` (without limit if `None`), or
+    /// until [`Service::close_streams`] is called.
     ///
     /// # Errors
     /// - [`ApiError::NotFound`] if there is no such job.
@@ -491,7 +494,8 @@ impl Service {
         }
     }
 
-    /// Removes all blobs of a job id that has no job. A failure is logged and otherwise ignored.
+    /// Removes all blobs stored under `id`, for an upload that became no job. A failure is logged
+    /// and otherwise ignored.
     pub async fn forget_blobs(&self, id: JobId) {
         if let Err(error) = self.blobs.remove_job(id).await {
             tracing::warn!(%error, job = %id, "a payload was not removed");

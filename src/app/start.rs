@@ -48,12 +48,12 @@ impl App {
     /// in this order. When it returns, both ports answer. The devices may not have passed their
     /// self-tests yet.
     ///
-    /// It changes the process: the umask becomes 077, SIGXFSZ is ignored, and the limit of open
-    /// files is raised to its maximum.
+    /// It changes the process: the umask becomes 077, SIGXFSZ no longer ends the process, and the
+    /// limit of open files is raised to its hard limit.
     ///
     /// # Errors
     /// - [`App::check`] refuses the configuration.
-    /// - The data folder cannot be used, or another process uses it.
+    /// - The data folder cannot be used, its disk is full, or another process uses it.
     /// - The queue file has another schema version.
     /// - The payloads are not those of the queue, or the queue file is missing beside payloads.
     /// - A TLS file cannot be used, or the certificate and the key do not match.
@@ -160,12 +160,12 @@ impl App {
         self.admin
     }
 
-    /// Waits until a device has been opened and has passed its self-test. The devices are awaited
-    /// in the order of the configuration.
+    /// Waits until a device has been opened and has passed its self-test. It waits for the first
+    /// try of each device in the order of the configuration, and returns at the first success.
     ///
     /// # Errors
-    /// If every device has failed its opening or its self-test, with the reason of each. Their
-    /// openings are still retried.
+    /// If every device could not be opened or failed its self-test, with the reason of each. They
+    /// are still retried in the background.
     pub async fn ready(&self) -> anyhow::Result<()> {
         let mut reasons = Vec::new();
         for device in &self.devices {

@@ -27,7 +27,8 @@ const MIN_DRAIN_SECONDS: u64 = 4;
 /// Maximum number of lanes of a GPU. Each lane is a thread and takes a share of the GPU memory.
 const MAX_LANES: usize = 64;
 
-/// The complete configuration of the server. [`Config::check`] checks the ranges of its values.
+/// The complete configuration of the server. [`Config::check`] checks the ranges of its values,
+/// [`App::check`](crate::app::App::check) also the devices, API keys and tenants.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
@@ -70,7 +71,8 @@ pub struct Config {
     pub shutdown: ShutdownConfig,
     /// Log format and filter.
     pub log: LogConfig,
-    /// Destination of traces: an OTLP endpoint over gRPC, such as http://localhost:4317.
+    /// Destination of traces: an OTLP endpoint over gRPC, such as http://localhost:4317. No traces
+    /// are sent without it.
     pub otlp_endpoint: Option<String>,
 }
 
@@ -131,9 +133,10 @@ pub struct LimitsConfig {
     pub max_sweeps: u32,
     /// Maximum predicted wait of a synchronous call until its job starts, seconds.
     pub max_wait_seconds: u64,
-    /// Maximum predicted compute time of all queued jobs, seconds.
+    /// Maximum predicted compute time of all queued jobs, summed over the lanes, seconds.
     pub max_queue_seconds: u64,
-    /// Maximum predicted compute time of all queued jobs of one tenant, seconds.
+    /// Maximum predicted compute time of all queued jobs of one tenant, summed over the lanes,
+    /// seconds.
     pub max_tenant_queue_seconds: u64,
     /// Maximum number of open connections of the public port, 1 to 2^20. Fewer are used if the
     /// limit of open files is lower.
@@ -171,7 +174,8 @@ pub struct QueueConfig {
     pub retention_seconds: u64,
     /// The same for an ephemeral job, whose caller waited for the result, seconds, at least 1.
     pub sync_result_retention_seconds: u64,
-    /// Interval between snapshots of a running fit, milliseconds.
+    /// Minimum time between two snapshots of a running fit, milliseconds. 0 saves one whenever the
+    /// fit offers it.
     pub snapshot_interval_ms: u64,
 }
 
@@ -331,11 +335,12 @@ impl Config {
         Ok(config)
     }
 
-    /// Checks ranges, and values that must agree with each other.
+    /// Checks ranges, and values that must agree with each other. The texts in `devices`, the API
+    /// keys and the tenants are not checked.
     ///
     /// # Errors
     /// [`ConfigError::Together`] in these cases:
-    /// - `listen` is beyond loopback without `api_key`, `keys` and `allow_unauthenticated`.
+    /// - `listen` is beyond loopback, no API key is given, and `allow_unauthenticated` is false.
     /// - `devices` is empty.
     /// - A number is outside the range that its field states.
     /// - `shutdown.timeout_seconds` is less than `shutdown.readiness_delay_seconds` + 4.
@@ -386,7 +391,8 @@ impl Config {
     }
 
     /// The configuration as TOML, with `***` for API keys and for the user and password of
-    /// `otlp_endpoint`. Keys without a value are left out.
+    /// `otlp_endpoint`. These are found only in an endpoint with a scheme, such as `http://`. Keys
+    /// without a value are left out.
     ///
     /// # Errors
     /// [`ConfigError::Together`] if a path is not UTF-8, or a number is 2^63 or more.

@@ -6,8 +6,7 @@ use figment::error::Kind;
 use serde::de::Visitor;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// Text that is never printed: `Debug` and `Serialize` give `***`. It is deserialized from a
-/// string.
+/// Secret text. `Debug` and `Serialize` give `***` in its place. It is deserialized from a string.
 #[derive(Clone)]
 pub struct Secret(String);
 

@@ -18,11 +18,12 @@ pub struct Densification {
     pub sweeps: Vec<Sweep>,
     /// A motion field for each edge of the plan.
     pub fields: HashMap<FlowEdge, MotionField>,
-    /// Interruption and heartbeat. Any interrupt cancels the work without a result.
+    /// Interruption and heartbeat. Any interrupt, a deadline included, cancels the work without a
+    /// result.
     pub control: Arc<dyn Control + Send + Sync>,
 }
 
-/// A dense cloud and the device that computed it, as reports show it.
+/// A dense cloud, and the name of the device that computed it.
 #[derive(Debug)]
 pub struct Densified {
     /// The points of all sweeps in the frame of the reference time.

@@ -20,8 +20,8 @@ use crate::metrics::Metrics;
 /// Runs the self-test: fits a field to a small synthetic pair with known flow.
 ///
 /// # Errors
-/// The reason why the device failed: the estimate fails, its mean end-point error is 0.11 m or
-/// more, or it panics.
+/// The reason why the device failed: the estimate fails or panics, or the mean end-point error of
+/// its flow is 0.11 m or more, or not finite.
 pub fn self_test_backend(backend: &dyn Backend) -> Result<(), String> {
     self_test::run(backend).map_err(|error| error.to_string())
 }
@@ -41,7 +41,8 @@ struct LaneHandle {
     liveness: Arc<Liveness>,
 }
 
-/// Handle to a device; clones share it.
+/// Handle to a device and the threads of its lanes. Clones share them. The threads end when the
+/// last [`Device`] and [`Lane`] of the device are dropped.
 #[derive(Clone)]
 pub struct Device {
     name: Arc<str>,
@@ -59,8 +60,8 @@ pub struct Lane {
 }
 
 impl Device {
-    /// Starts the threads of the lanes. One of them opens the device and runs its self-test. This
-    /// call does not wait for it. The number of lanes and the losses of the device go into
+    /// Starts the threads of the lanes. One of them opens the device and runs its self-test; this
+    /// call does not wait for that. The number of lanes and the losses of the device go into
     /// `metrics`.
     ///
     /// # Errors
@@ -105,7 +106,8 @@ impl Device {
         self.kind
     }
 
-    /// A channel with the device's current health, which reports every change.
+    /// A receiver of the device's health. It holds the current value and reports changes; a slow
+    /// receiver misses values in between.
     pub fn health(&self) -> watch::Receiver<Health> {
         self.health.clone()
     }
@@ -157,8 +159,8 @@ impl Device {
         }
     }
 
-    /// Checks whether the device was lost while idle. If so, tells the first lane to reopen it.
-    /// Returns at once. A lane at work detects a loss itself.
+    /// Checks whether the device was lost while idle. If so, tells the first lane to reopen it, and
+    /// does not wait for that. A lane at work detects a loss itself.
     pub fn look(&self) {
         if self.supervisor.is_lost_unreported() {
             let _a_busy_lane_finds_out = self.lanes[0].commands.try_send(Command::Look);
@@ -187,8 +189,9 @@ impl Lane {
         self.device.lanes[self.index].commands.is_closed()
     }
 
-    /// Estimates the flow of one pair. Resumes from the snapshot, or starts afresh if the snapshot
-    /// does not fit the work.
+    /// Estimates the flow of one pair. Resumes from the snapshot, or starts afresh if there is none
+    /// or it does not fit the work. Waits while the lane is at work. Dropping the future does not
+    /// stop the estimate; its control does.
     ///
     /// # Errors
     /// - [`EngineError::Flow`] if the estimate refuses its input, fails or is cancelled.
@@ -196,17 +199,24 @@ impl Lane {
     /// - [`EngineError::Lost`] if the device is lost during the work.
     /// - [`EngineError::Broken`] if the device could not start the work.
     ///
-    /// After an error the device is ready for the next pair, or its health shows otherwise.
+    /// After an error the lane takes the next pair, unless [`Device::health`] or
+    /// [`Lane::has_ended`] shows otherwise.
     pub async fn solve(&self, work: Work) -> Result<Estimate, EngineError> {
         self.run(move |backend, liveness| Ok(slot::solve(backend, work, liveness)?))
             .await
     }
 
     /// Transforms the points of the sweeps of a sequence into the frame of the reference time.
+    /// Waits while the lane is at work. Dropping the future does not stop the work; its control
+    /// does.
     ///
     /// # Errors
-    /// As [`Lane::solve`], and [`EngineError::Densify`] if the sweeps, their ground masks or the
-    /// fields do not fit the plan.
+    /// - [`EngineError::Densify`] if the number of sweeps is not that of the plan, a ground mask
+    ///   has another length than its sweep, or the field of an edge is missing.
+    /// - [`EngineError::Flow`] if the device fails, or the control interrupts.
+    /// - [`EngineError::Panicked`] if the work panics.
+    /// - [`EngineError::Lost`] if the device is lost during the work.
+    /// - [`EngineError::Broken`] if the device could not start the work.
     pub async fn densify(&self, work: Densification) -> Result<Densified, EngineError> {
         self.run(move |backend, liveness| densify::densify(backend, &work, liveness))
             .await

@@ -8,11 +8,11 @@ use crate::flow::field::{Backend, BackendError};
 use crate::flow::{Control, FlowError, MotionField, Options, Point, Snapshot, Sweep};
 use crate::job::DeviceKind;
 
-/// One pair for a device.
+/// The input of one estimate on a device: a pair of sweeps, its options and its control.
 pub struct Work {
-    /// The source sweep: N points, metres.
+    /// The source sweep: N points (x, y, z), metres.
     pub source: Vec<Point>,
-    /// The target sweep: M points, metres.
+    /// The target sweep: M points (x, y, z), metres.
     pub target: Vec<Point>,
     /// Ground flags of the source (N) and the target (M), if they are known.
     pub ground: Option<[Vec<bool>; 2]>,
@@ -23,7 +23,8 @@ pub struct Work {
     pub neighbors: Vec<(Sweep, i8)>,
     /// Options of the estimate.
     pub options: Options,
-    /// The snapshot of an earlier, interrupted attempt.
+    /// The snapshot of an earlier, interrupted attempt, from which a fit continues. `None`: the
+    /// estimate starts afresh.
     pub snapshot: Option<Snapshot>,
     /// Time, deadline, interruption and progress.
     pub control: Arc<dyn Control + Send + Sync>,
@@ -36,21 +37,22 @@ pub enum Health {
     Starting,
     /// It has passed its self-test.
     Ready,
-    /// It cannot be used, with the reason. Opening it is retried.
+    /// It could not be opened or failed its self-test, with the reason. Both are retried.
     Broken(String),
-    /// It has worked and does not recover after repeated openings, with the reason. Opening is
-    /// still retried, but only a new process may help.
+    /// It has worked, but its last [`ReopenPolicy::tries`] reopenings failed; with the reason.
+    /// Opening is still retried, but perhaps only a new process helps.
     Gone(String),
 }
 
 /// Why a device returned no result.
 #[derive(Debug, thiserror::Error)]
 pub enum EngineError {
-    /// The estimate refused its input, failed or was cancelled, or the device failed in a
-    /// densification.
+    /// The estimate refused its input or failed, the device failed in a densification, or either
+    /// work was cancelled.
     #[error(transparent)]
     Flow(#[from] FlowError),
-    /// The sweeps, their ground masks or the fields do not fit the plan of a densification.
+    /// A densification has another number of sweeps than its plan, a ground mask of another length
+    /// than its sweep, or no field for an edge of the plan.
     #[error(transparent)]
     Densify(DensifyError),
     /// The work panicked, with this message. The device must pass its self-test again.
@@ -65,7 +67,7 @@ pub enum EngineError {
     Broken(String),
 }
 
-/// An open device.
+/// An open device, as a [`DeviceFactory`] returns it.
 pub trait Opened: Send + Sync {
     /// A backend for one pair. The backends of several lanes work at the same time.
     fn lane(&self) -> Arc<dyn Backend>;
@@ -77,22 +79,25 @@ pub trait Opened: Send + Sync {
     fn destroy(&self);
 }
 
-/// Opens a device; called again after a loss.
+/// Opens a device. It is called again after a failed try and after a loss.
 pub type DeviceFactory = Box<dyn Fn() -> Result<Box<dyn Opened>, BackendError> + Send + Sync>;
 
-/// Retry policy for opening a device.
+/// Pauses between the tries to open a device, and the number of failures after which it counts as
+/// given up.
 #[derive(Clone, Copy, Debug)]
 pub struct ReopenPolicy {
-    /// Pause after the first failure. Each later pause is four times as long. A success resets it.
+    /// Pause after the first failure. Each later pause is four times as long as the one before. A
+    /// success resets the pause.
     pub first_pause: Duration,
-    /// Upper limit of the pause.
+    /// Upper limit of the later pauses.
     pub longest_pause: Duration,
-    /// Consecutive failures after which a device that has worked is given up.
+    /// Number of consecutive failures at which the health of a device that has worked becomes
+    /// [`Health::Gone`].
     pub tries: u32,
 }
 
 impl Default for ReopenPolicy {
-    /// Six tries in about three quarters of a minute, longer than a driver takes to reset a GPU.
+    /// Six tries with pauses of 0.2, 0.8, 3.2, 12.8 and 30 s between them.
     fn default() -> Self {
         Self {
             first_pause: Duration::from_millis(200),
@@ -110,7 +115,7 @@ pub struct DeviceOptions {
     pub kind: DeviceKind,
     /// Number of pairs that run on it at the same time; 0 counts as 1.
     pub lanes: usize,
-    /// Opens the device, at the start and after each loss.
+    /// Opens the device: at the start, after a failed try and after each loss.
     pub open: DeviceFactory,
     /// Retry policy for opening it.
     pub reopening: ReopenPolicy,

@@ -60,13 +60,14 @@ pub struct Cost {
 }
 
 impl Cost {
-    /// Seconds at a throughput of `rate` multiply-adds per second.
+    /// The predicted duration of the estimate, seconds, on a device that does `rate` multiply-adds
+    /// of the network per second. `rate` must be above zero.
     pub fn seconds(&self, rate: f64) -> f64 {
         self.multiply_adds / rate
     }
 }
 
-/// The cost that one neighbor sweep adds to the estimate of a pair.
+/// The predicted cost that one neighbor sweep adds to the estimate of a pair by an object search.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct NeighborCost {
     /// Upper bound of the bytes held for the sweep.
@@ -75,7 +76,9 @@ pub struct NeighborCost {
     pub multiply_adds: f64,
 }
 
-/// Predicts the cost of a neighbor sweep of `points` points.
+/// Predicts the cost that a neighbor sweep of `points` points adds to an object search: its ground
+/// segmentation, its registration to the target and its part in the search. The work is a constant
+/// plus a term proportional to `points`.
 pub fn neighbor_cost(points: usize) -> NeighborCost {
     NeighborCost {
         bytes: points * (2 * size_of::<Point>() + THINNING_BYTES + LABELLING_BYTES),

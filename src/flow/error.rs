@@ -39,8 +39,8 @@ pub enum FlowError {
         /// Number of iterations completed before it.
         iteration: usize,
     },
-    /// The snapshot was rejected: it belongs to another problem, other options or another method,
-    /// or its bytes are damaged.
+    /// The snapshot was rejected. It belongs to another problem, other options or another method,
+    /// or its bytes are not a valid snapshot of this format version.
     #[error(transparent)]
     Snapshot(#[from] SnapshotError),
     /// The distance transform was rejected, or the device failed, is busy, has too little memory or
@@ -62,10 +62,10 @@ impl From<FitError> for FlowError {
 impl FlowError {
     /// Whether the input or its options caused the error, rather than the machine.
     ///
-    /// True for too few points, a missing or wrong ground mask, clouds that span too much space, a
-    /// pair that exceeds the allowed memory or the memory of the device, and an option that the
-    /// device does not support. False for all other errors, including an invalid cell or band of
-    /// the distance transform.
+    /// True for too few points, a missing ground mask or one of the wrong length, an empty target,
+    /// clouds that span too much space, a pair that exceeds the allowed memory or the memory of the
+    /// device, and an option that the device does not support. False for all other errors,
+    /// including an invalid cell or band of the distance transform.
     pub fn is_input(&self) -> bool {
         match self {
             Self::TooFewPoints { .. } | Self::NoGroundMask | Self::GroundMaskLength { .. } => true,

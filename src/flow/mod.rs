@@ -5,8 +5,9 @@
 //! Problem - select - registration - objects or field - Estimate
 //! ```
 //!
-//! Free of async, input and output, clocks, environment variables and global state. Deadlines,
-//! cancellation and time come in through a [`Control`].
+//! The module contains no async code, reads and writes no files, reads no clock and holds no global
+//! state. The caller provides deadlines, cancellation and time through a [`Control`]. Of the
+//! environment only `RAYON_NUM_THREADS` is read, for a thread pool of unspecified size.
 //!
 //! ```
 //! use fnsf::flow::cpu::CpuBackend;

@@ -7,9 +7,11 @@ use super::motion::MotionField;
 /// field and neighbor sweeps.
 #[derive(Clone, Copy, Debug)]
 pub struct Problem<'a> {
-    /// N points of the earlier sweep, metres, in its sensor frame.
+    /// N points of the earlier sweep, metres, in its sensor frame. Points that are not finite take
+    /// no part and get no flow.
     pub source: &'a [Point],
-    /// M points of the later sweep, metres, in its sensor frame.
+    /// M points of the later sweep, metres, in its sensor frame. Points that are not finite take no
+    /// part.
     pub target: &'a [Point],
     /// N and M flags: true for ground points. Required by [`super::Ground::Mask`] and ignored by
     /// [`super::Ground::Keep`]. With [`super::Ground::Auto`] the ground is segmented where the
@@ -19,13 +21,13 @@ pub struct Problem<'a> {
     /// independent pair.
     ///
     /// Only a field fit with [`super::FieldOptions::warm_start`] uses it. Its ego motion is then
-    /// the prior of the registration. Its network is the initial guess of the fit if it explains
-    /// this pair better than no residual motion. Either both pairs or neither must have an ego
-    /// motion for that.
+    /// the prior of the registration. The fit starts from its network if two conditions hold. The
+    /// loss of the network on this pair is lower than that of zero residual motion. Either both
+    /// pairs or neither have an ego motion.
     pub before: Option<&'a MotionField>,
     /// Other sweeps of the sequence, in any order; empty for an independent pair. An object search
     /// uses at most [`super::Options::sweeps`] minus two of them: those nearest in time to the
-    /// middle of the pair. A deadline may drop some.
+    /// middle of the pair. Without an ego motion it uses none. A deadline may drop some.
     pub neighbors: &'a [NeighborSweep<'a>],
 }
 
@@ -36,8 +38,9 @@ pub struct NeighborSweep<'a> {
     pub points: &'a [Point],
     /// K flags: true for ground points, as in [`Problem::ground`].
     pub ground: Option<&'a [bool]>,
-    /// Time of the sweep, in sweep intervals after the source. The target is at 1, the sweep before
-    /// the source at -1.
+    /// Time of the sweep, in sweep intervals after the source. The sweep before the source is at
+    /// -1, the sweep after the target at 2. The values 0 and 1 are the pair itself; they are not
+    /// rejected but count its sweeps twice.
     pub at: i8,
 }
 

@@ -57,7 +57,7 @@ impl Sweep {
     /// order.
     ///
     /// # Panics
-    /// If a point that is kept has no flag in a ground mask that is too short.
+    /// If the ground mask is so short that a point within the crop has no flag.
     #[must_use]
     pub fn cropped(self, options: &Options) -> Self {
         let rows: Vec<usize> = (0..self.points.len())
@@ -75,14 +75,14 @@ impl Sweep {
 /// The window of a pair: the range of consecutive sweeps that its estimate uses.
 ///
 /// `pair` is the index of the pair's earlier sweep. `count` is the number of sweeps in the
-/// sequence, and `pair + 1 < count` is required. `sweeps` is the window size, raised to two and
-/// limited to `count`.
+/// sequence, and `pair + 1 < count` is required; otherwise the range lacks a sweep of the pair.
+/// `sweeps` is the window size. It is raised to 2 if it is smaller, and limited to `count`.
 ///
 /// The window contains both sweeps of the pair. It is centered on the pair as far as the ends of
 /// the sequence allow. With an odd size the extra sweep lies before the pair.
 ///
 /// # Panics
-/// If `count` is 0, in builds with overflow checks.
+/// If `count` is 0, in builds with overflow checks. Other builds return an empty range.
 pub fn window(pair: usize, count: usize, sweeps: usize) -> Range<usize> {
     let sweeps = sweeps.max(2).min(count);
     let first = pair.saturating_sub(before_pair(sweeps));
@@ -90,9 +90,11 @@ pub fn window(pair: usize, count: usize, sweeps: usize) -> Range<usize> {
     first..first + sweeps
 }
 
-/// Whether the window of a pair is final: sweeps after the first `count` do not change it.
+/// Whether the window of a pair lies within the first `count` sweeps of its sequence. The window is
+/// then final: later sweeps do not change it, and the pair can be estimated.
 ///
-/// `pair` is the index of the pair's earlier sweep. `sweeps` is the window size, raised to two.
+/// `pair` is the index of the pair's earlier sweep. `sweeps` is the window size; values below 2
+/// count as 2.
 pub fn is_window_final(pair: usize, count: usize, sweeps: usize) -> bool {
     let sweeps = sweeps.max(2);
     pair.saturating_sub(before_pair(sweeps)) + sweeps <= count
@@ -113,8 +115,9 @@ struct QueuedSweep {
 /// Streaming estimator of a sequence, pair by pair. `Sequence::default()` starts a sequence.
 ///
 /// The options of the first sweep set the window size ([`Options::sweeps`]). Each pair is estimated
-/// from the sweeps of its [`window`]. Its result is delayed until the last of them arrives. The
-/// motion field of a pair is passed to the next pair as [`Problem::before`].
+/// from the sweeps of its [`window`]. Its result is delayed until the last of them arrives, or
+/// until [`Sequence::finish`]. The motion field of a pair is passed to the next pair as
+/// [`Problem::before`].
 ///
 /// Memory does not grow with the length of the sequence: fewer than two windows of sweeps are held.
 #[derive(Clone, Debug, Default)]
@@ -135,7 +138,8 @@ impl Sequence {
     /// in order. The list is empty where no window is complete.
     ///
     /// `options` are those of the pair that has the sweep as its target. They may differ from sweep
-    /// to sweep, except for the window size. They also prepare the ground mask of the sweep, as
+    /// to sweep, except for the window size. The first sweep is the target of no pair; its options
+    /// set the window size. The options also prepare the ground mask of the sweep, as
     /// [`Sweep::prepared`] does. A known ego motion is given as [`super::Ego::Given`].
     ///
     /// # Errors

@@ -37,13 +37,16 @@ struct Written {
 /// - KITTI's object, tracking and odometry calibration: `P2`; `R0_rect` or `R_rect` (none in
 ///   odometry); `Tr_velo_to_cam`, `Tr_velo_cam` or `Tr`. The size is [`KITTI_SIZE_PX`].
 /// - KITTI's raw `calib_cam_to_cam.txt`, with the content of `calib_velo_to_cam.txt` as
-///   `velo_to_cam`. The other formats have no second file.
+///   `velo_to_cam`. The other formats have no second file. The size is `S_rect_02`, or
+///   [`KITTI_SIZE_PX`] without it.
 ///
 /// # Errors
-/// - `Malformed` for text in neither format, an entry without the required finite numbers, or a
-///   pose that is not rigid.
+/// - `Malformed` for bytes that are not UTF-8 text, JSON without exactly these keys and shapes, and
+///   an entry without the required finite numbers. Also for a pose that is not rigid, and a
+///   `velo_to_cam` without `R` or `T`.
 /// - `Unsupported` where `velo_to_cam` is missing, or is given with another format.
-/// - `Missing` where the projection or the lidar's pose is missing.
+/// - `Missing` where text lacks the projection or the lidar's pose. Text that is no calibration
+///   lacks both.
 /// - `TooLarge` for a file over 64 KiB.
 /// - `Camera` for an image size, a camera matrix or a pose that is invalid or out of range.
 pub fn read_camera(bytes: &[u8], velo_to_cam: Option<&[u8]>) -> Result<Camera, FormatError> {
@@ -85,8 +88,8 @@ pub fn read_camera(bytes: &[u8], velo_to_cam: Option<&[u8]>) -> Result<Camera, F
 /// `world_from_camera0 * camera0_from_lidar`. The arguments are those of [`read_camera`].
 ///
 /// # Errors
-/// `Malformed`, `Unsupported`, `Missing` and `TooLarge` as for [`read_camera`]. A camera in JSON
-/// does not contain this pose.
+/// - `Malformed`, `Unsupported` and `TooLarge` as for [`read_camera`] of KITTI's text.
+/// - `Missing` where the lidar's pose is missing. A camera in JSON does not contain this pose.
 pub fn read_camera0_from_lidar(
     bytes: &[u8],
     velo_to_cam: Option<&[u8]>,

@@ -40,8 +40,8 @@ impl From<Vec<Point>> for Cloud {
 ///
 /// The format is recognized by [`recognize`]: by content, and for raw floats by the file name
 /// `name`. An `.npy` array is N x k floats with k at least 3; the first three columns are read. An
-/// `.npz` contains one cloud where it has a single such array, or exactly one named `points`, `xyz`
-/// or `pc1`.
+/// `.npz` contains one cloud where it has exactly one array named `points`, `xyz` or `pc1`, or none
+/// of these and a single array of that shape. A 4 x 4 array counts only if the file has no other.
 ///
 /// # Errors
 /// - `Unrecognized` and `Ambiguous` as for [`recognize`]. `Ambiguous` also for an `.npz` with
@@ -49,12 +49,13 @@ impl From<Vec<Point>> for Cloud {
 /// - `Malformed` for a file that violates its format or is truncated.
 /// - `Unsupported` for JSON, integer coordinates, missing values, and arrays, compressions or
 ///   archives that are not supported.
-/// - `Missing` where x, y or z, or an N x 3 array, is missing.
+/// - `Missing` where x, y or z, a PLY file's vertices, or an N x 3 array of an `.npz`, is missing.
 /// - `NotFinite` for a coordinate that is NaN or infinite, with row and column. Rows of three NaN
 ///   are accepted in PCD.
 /// - `OutOfRange` for a coordinate over 1e6 m in magnitude, with row and column.
-/// - `TooLarge` for more than [`MAX_POINTS`] points. Also for a compressed file that unfolds to
-///   more than 32 MiB plus 32 times its own size, or to more than 4 GiB.
+/// - `TooLarge` for more than [`MAX_POINTS`] points, an `.npz` of more than 1,024 members, or a PCD
+///   point of more than 64 KiB. Also where the data of an `.npz`, a feather file or a compressed
+///   PCD takes more than 4 GiB, or more than 32 MiB plus 32 times the size of the file.
 pub fn read_cloud(bytes: &[u8], name: Option<&str>) -> Result<Cloud, FormatError> {
     read_cloud_within(bytes, name, MAX_POINTS)
 }
@@ -86,12 +87,17 @@ pub fn read_cloud_within(
 }
 
 /// The number of rows that a file declares, over all its arrays: a measure of the memory that
-/// reading it takes. For raw floats it is an upper bound. Nothing but headers is decompressed.
+/// reading it takes. Nothing but headers is decompressed.
+///
+/// Raw floats and JSON declare no number. For them the result is the size of the file divided by 12
+/// bytes, which for raw floats is an upper bound. The arrays of an `.npz` whose header cannot be
+/// read are not counted.
 ///
 /// # Errors
-/// `Unrecognized` and `Ambiguous` as for [`recognize`]. `Malformed`, `Unsupported`, `Missing` and
-/// `TooLarge` where the header of the file cannot be read, has no vertices, or declares too much.
-/// Unreadable arrays of an `.npz` are not counted.
+/// - `Unrecognized` and `Ambiguous` as for [`recognize`].
+/// - `Malformed`, `Unsupported` and `TooLarge` where the header of the file cannot be read, is not
+///   supported, or declares too much.
+/// - `Missing` for a PLY file without vertices.
 pub fn declared_rows(bytes: &[u8], name: Option<&str>) -> Result<usize, FormatError> {
     match recognize(bytes, name)? {
         FileKind::Npy => npy::declared_rows(bytes),
@@ -271,7 +277,7 @@ pub enum CloudFormat {
 /// - `NotFinite` for a coordinate that is NaN or infinite. Rows of three NaN (no return) are
 ///   accepted in PCD.
 /// - `OutOfRange` for a coordinate over 1e6 m in magnitude.
-/// - `Write` where writing to `out` fails, `Encode` where encoding fails.
+/// - `Write` where writing to `out` fails. For feather this is `Encode`, as is a failure to encode.
 pub fn write_cloud<W: Write>(
     format: CloudFormat,
     points: &[Point],

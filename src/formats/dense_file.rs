@@ -40,7 +40,7 @@ pub const DENSE_FORMATS: [(DenseFormat, &str, &str); 5] = [
 ];
 
 impl DenseFormat {
-    /// The endings that [`DenseFormat::from_path`] accepts.
+    /// The endings that [`DenseFormat::from_path`] accepts, as text for messages.
     pub const KNOWN: &'static str = ".npz, .ply, .pcd, .laz, .las";
 
     fn entry(self) -> &'static (Self, &'static str, &'static str) {
@@ -61,7 +61,7 @@ impl DenseFormat {
     /// The format of a file name's ending, in upper or lower case.
     ///
     /// # Errors
-    /// `UnknownExtension`, which lists the known endings.
+    /// `UnknownExtension` for any other name; it lists the known endings.
     pub fn from_path(path: &std::path::Path) -> Result<Self, FormatError> {
         let name = path
             .file_name()

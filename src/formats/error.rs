@@ -123,9 +123,10 @@ pub enum FormatError {
         row: usize,
         /// Column, by name.
         column: String,
-        /// The value found, metres for a coordinate or displacement.
+        /// The value found: metres for a coordinate or displacement, otherwise the unit of its
+        /// column.
         value: f64,
-        /// The largest magnitude accepted, metres.
+        /// The largest magnitude accepted, in the unit of the value.
         limit: f64,
     },
     /// The file has or declares more data than is accepted.
@@ -158,7 +159,7 @@ pub enum FormatError {
     /// Writing to the output failed.
     #[error("failed to write")]
     Write(#[from] std::io::Error),
-    /// A library that encodes the file failed.
+    /// A library that encodes the file failed, or could not write to the output.
     #[error("failed to encode a {kind} file: {detail}")]
     Encode {
         /// The kind of file.

@@ -34,13 +34,17 @@ struct Similarity {
 }
 
 impl GroundRaster {
-    /// Reads a raster from the contents of its two files. `heights` is
-    /// `*_ground_height_surface____*.npy`: rows x columns floats, metres in the city's frame, NaN
-    /// where unknown. `raster_from_city` is `*___img_Sim2_city.json`: the similarity s (R x + t)
-    /// from city coordinates in metres to column and row, with `R` (row by row), `t` and `s`.
+    /// Reads a raster from the contents of its two files.
+    ///
+    /// - `heights` is `*_ground_height_surface____*.npy`: rows x columns floats, metres in the
+    ///   city's frame, NaN where unknown.
+    /// - `raster_from_city` is `*___img_Sim2_city.json`: the similarity s (R x + t) from city
+    ///   coordinates in metres to column and row, with `R` (2 x 2, row by row, as four numbers),
+    ///   `t` and `s`.
     ///
     /// # Errors
-    /// - `Unsupported` where `heights` is not a two-dimensional array of floats.
+    /// - `Unsupported` where `heights` is not a two-dimensional array of floats, or of an npy
+    ///   version other than 1 to 3.
     /// - `Malformed` where it is not `.npy` or is truncated. Also where `raster_from_city` is not
     ///   such a JSON object, `R` is not orthonormal within 1e-6, or `s` is not positive.
     /// - `TooLarge` where the size of the array overflows.
@@ -85,11 +89,11 @@ impl GroundRaster {
     /// Ground mask of a sweep.
     ///
     /// `points` are N points of the sweep in its own frame, metres. `city_from_frame` is the pose
-    /// of the sweep in the city. The result is N flags.
+    /// of the sweep in the city, translation in metres. The result is N flags.
     ///
     /// A point is ground if it is at most 0.3 m above the raster's height, or anywhere below it
-    /// (Argoverse 2's own threshold). Points outside the raster, or where the height is unknown,
-    /// are not ground.
+    /// (Argoverse 2's own threshold). Points that are not finite, lie outside the raster or where
+    /// its height is unknown are not ground.
     pub fn ground(&self, points: &[Point], city_from_frame: &RigidTransform) -> Vec<bool> {
         let is_ground = |point: &Point| {
             let array_path = city_from_frame * Point3::from(point.map(f64::from));

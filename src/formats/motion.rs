@@ -14,11 +14,11 @@ const RIGID_TOLERANCE: f64 = 1e-3;
 const MAX_TEXT: usize = 4096;
 
 /// Reads a rigid motion from text: the 16 numbers of a 4 x 4 matrix, row by row, separated by white
-/// space or commas. The translation is in metres. The text has at most 4,096 bytes.
+/// space or commas. The translation is in metres.
 ///
 /// # Errors
-/// [`FormatError::Motion`] where the text is not 16 numbers, or the matrix is refused by
-/// [`ego_motion`].
+/// [`FormatError::Motion`] where the text is longer than 4,096 bytes or is not 16 numbers, or
+/// [`ego_motion`] refuses the matrix.
 pub fn read_motion(bytes: &[u8]) -> Result<RigidTransform, FormatError> {
     let text = core::str::from_utf8(bytes).ok();
     let Some(text) = text.filter(|text| text.len() <= MAX_TEXT) else {
@@ -35,11 +35,13 @@ pub fn read_motion(bytes: &[u8]) -> Result<RigidTransform, FormatError> {
 }
 
 /// The rigid motion between two sweeps, from its 4 x 4 matrix, row by row, translation in metres.
-/// As [`rigid_motion`], with a limit on the translation, so that transformed coordinates can be
-/// written. Poses in a city's frame have no such limit.
+///
+/// The matrix is checked and its rotation normalized as by [`rigid_motion`]. In addition, each
+/// component of the translation is limited to [`MAX_COORDINATE_M`] in magnitude. A pose in a city's
+/// frame may exceed that limit: use [`rigid_motion`] for it.
 ///
 /// # Errors
-/// [`FormatError::Motion`] where the matrix is not a rigid motion, or a component of its
+/// [`FormatError::Motion`] where [`rigid_motion`] refuses the matrix, or a component of its
 /// translation is larger in magnitude than [`MAX_COORDINATE_M`].
 pub fn ego_motion(rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError> {
     let motion = rigid_motion(rows)?;
@@ -75,7 +77,8 @@ pub fn rigid_motion(rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError>
     Ok(RigidTransform::from_parts(translation, rotation))
 }
 
-/// The 4 x 4 matrix of a rigid transform, row by row.
+/// The 4 x 4 matrix of a rigid transform, row by row. The first three rows end with the
+/// translation, in the transform's unit; the last row is 0 0 0 1.
 pub fn matrix_rows(transform: &RigidTransform) -> [[f64; 4]; 4] {
     let matrix = transform.to_homogeneous();
     core::array::from_fn(|row| core::array::from_fn(|column| matrix[(row, column)]))

@@ -65,31 +65,45 @@ pub struct Av2Labels {
     pub ground: Vec<bool>,
 }
 
-/// Whether the bytes are an `.npz` with `pc1` and `pc2`.
+/// Whether the bytes are an `.npz` with arrays `pc1` and `pc2`. False for an archive that cannot be
+/// opened. The arrays themselves are not read.
 pub fn is_pair(bytes: &[u8]) -> bool {
     is_zip(bytes) && Npz::open(bytes).is_ok_and(|npz| npz.has("pc1") && npz.has("pc2"))
 }
 
 /// Reads a pair from an `.npz` with `pc1` (N x 3) and `pc2` (M x 3), metres.
 ///
-/// Optional arrays are `flow` (N x 3, metres), `ground1` (N) and `ground2` (M), and `ego_SE3` (4 x
-/// 4, `target_from_source`). With `flow`, the file may have `valid` (N; without it all rows are
-/// valid), `dynamic` (N), `category` (N, Argoverse 2's), and either `box_id` (N, negative for
-/// points on no object) or `classes` (N, 0 for points on no object).
+/// Optional arrays are:
+/// - `flow` (N x 3): the true displacements, metres.
+/// - `ground1` (N) and `ground2` (M): the ground masks, both or neither.
+/// - `ego_SE3` (4 x 4): the ego motion `target_from_source`, translation in metres.
+///
+/// The following arrays are read only if the file has `flow`:
+/// - `valid` (N): whether the displacement is known. Without it all rows are valid.
+/// - `dynamic` (N): whether the point moves relative to the static world.
+/// - `category` (N): Argoverse 2's category, 0 to 255.
+/// - `box_id` (N): negative for points on no object.
+/// - `classes` (N): 0 for points on no object. Ignored if there is a `box_id`.
+///
+/// Columns of `pc1`, `pc2` and `flow` after the third are ignored. In a mask, every number except 0
+/// is true.
 ///
 /// # Errors
 /// - `Unrecognized` for bytes that are not a zip archive.
 /// - `Missing` where `pc1` or `pc2` is missing.
-/// - `Malformed` for a file that violates its format or is truncated, and for a category that is
-///   not a whole number from 0 to 255.
-/// - `Unsupported` for an array of another type or shape, and where only one of the two ground
-///   masks is present.
-/// - `NotFinite` for a NaN, or an infinite coordinate or displacement; `OutOfRange` for one over
-///   1e6 m in magnitude.
-/// - `TooLarge` for more than [`MAX_POINTS`] rows, or a file that unfolds to more than 32 MiB plus
-///   32 times its own size, or to more than 4 GiB.
+/// - `Malformed` for a file that violates its format or is truncated, for an array compressed by
+///   another method than deflate, and for a category that is not a whole number from 0 to 255.
+/// - `Unsupported` for an array of another type or shape, an npy version other than 1 to 3, or an
+///   encrypted archive, and where only one of the two ground masks is present.
+/// - `NotFinite` for a coordinate or displacement that is NaN or infinite, and for a NaN in a mask,
+///   in `box_id` or in `classes`.
+/// - `OutOfRange` for a coordinate or displacement over 1e6 m in magnitude.
+/// - `TooLarge` for an array of more than [`MAX_POINTS`] rows, or an archive of more than 1,024
+///   members. Also for arrays that together decompress to more than 4 GiB, or to more than 32 MiB
+///   plus 32 times the size of the file.
 /// - `RowCount` where an array does not have the N or M rows of its cloud.
-/// - `Motion` where `ego_SE3` is not rigid, or its translation is over 1e6 m.
+/// - `Motion` where `ego_SE3` is not a rigid motion, or a component of its translation is over
+///   1e6 m in magnitude.
 pub fn read_pair(bytes: &[u8]) -> Result<Pair, FormatError> {
     read_pair_within(bytes, MAX_POINTS)
 }
@@ -245,21 +259,24 @@ pub fn write_pair_npz<W: Write>(pair: &Pair, out: &mut W) -> Result<(), FormatEr
     Ok(())
 }
 
-/// Reads Argoverse 2's `flow_labels.feather`: `flow_tx_m`, `flow_ty_m`, `flow_tz_m` in metres,
-/// `is_ground_0` (or `is_ground`), `dynamic` (or `is_dynamic`), `is_valid` (or `valid`; all rows
-/// are valid where it is missing) and `classes` (or `classes_0`).
-///
-/// Foreground is every class except 0, which is NONE, as in Argoverse 2's own evaluation.
+/// Reads Argoverse 2's `flow_labels.feather`, with these columns:
+/// - `flow_tx_m`, `flow_ty_m` and `flow_tz_m`: the true displacements, metres.
+/// - `is_ground_0` or `is_ground`: the ground mask.
+/// - `is_valid` or `valid`: whether the displacement is known. Without it all rows are valid.
+/// - `dynamic` or `is_dynamic`: whether the point moves. Optional.
+/// - `classes` or `classes_0`: the category, 0 to 255. Optional. Foreground is every category
+///   except 0, which is NONE, as in Argoverse 2's own evaluation.
 ///
 /// # Errors
-/// - `Malformed` for bytes that are not an intact feather file, and for a class that is not a whole
-///   number from 0 to 255.
+/// - `Malformed` for bytes that are not an intact feather file, and for a category that is not a
+///   whole number from 0 to 255.
 /// - `Missing` where a column of the flow or the ground column is missing.
 /// - `Unsupported` for a flow column that is not of floats, a column with missing values or without
-///   numbers, or a compression other than LZ4.
-/// - `NotFinite` for a NaN, or an infinite displacement; `OutOfRange` for a displacement over 1e6 m
-///   along an axis.
-/// - `TooLarge` for more than [`MAX_POINTS`] rows, or far more than a file of this size holds.
+///   numbers, nested or big-endian columns, or a compression other than LZ4.
+/// - `NotFinite` for a displacement that is NaN or infinite, and for a NaN in a mask.
+/// - `OutOfRange` for a displacement over 1e6 m along an axis.
+/// - `TooLarge` for more than [`MAX_POINTS`] rows. Also where the displacements, at 12 bytes a row,
+///   take more than 4 GiB, or more than 32 MiB plus 32 times the size of the file.
 pub fn read_av2_labels(bytes: &[u8]) -> Result<Av2Labels, FormatError> {
     let table = Table::open(bytes)?;
     let flow = read_columns(&table, FLOW_COLUMNS)?;

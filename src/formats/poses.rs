@@ -32,8 +32,9 @@ const AV2_COLUMNS: [&str; 7] = ["qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"];
 /// - KITTI's odometry text: 12 numbers a line, the first three rows of a 4 x 4 matrix. KITTI's own
 ///   poses are those of camera 0; see [`super::read_camera0_from_lidar`].
 /// - JSON: an array of 4 x 4 matrices, row by row.
-/// - Argoverse 2's `city_SE3_egovehicle.feather`: the rows whose `timestamp_ns` equals a sweep's
-///   name. They are compared in float64, which resolves 64 ns.
+/// - Argoverse 2's `city_SE3_egovehicle.feather`: for each sweep the first row whose `timestamp_ns`
+///   equals the sweep's name. They are compared in float64, which resolves 64 ns at Argoverse 2's
+///   times.
 ///
 /// Text and JSON have one pose for every sweep, in order, or the poses of a whole drive. In the
 /// latter case a sweep whose name is a number gets the pose with that index, counted from 0. A name
@@ -42,17 +43,19 @@ const AV2_COLUMNS: [&str; 7] = ["qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"];
 /// The ego motion between two sweeps is `world_from_target.inv_mul(&world_from_source)`.
 ///
 /// # Errors
-/// - `Malformed` for a line of text that is not 12 numbers, for bytes that are neither text nor
-///   JSON nor feather, and for a damaged feather file. Also for a pose of text or JSON that is not
-///   finite or not rigid; the error names its sweep.
+/// - `Malformed` for a line of text that is not 12 numbers, for JSON that is not an array of 4 x 4
+///   matrices, for bytes of no known format, and for a damaged feather file. Also for a pose of
+///   text or JSON that is not finite or not rigid; the error names its sweep.
 /// - `RowCount` where text or JSON has neither one pose for every sweep nor a pose at the index
 ///   that each sweep's name gives.
-/// - `Unsupported` for feather, where a sweep's name is not an integer time stamp, or a column has
-///   missing values, no numbers or a compression other than LZ4.
+/// - `Unsupported` for feather, where a sweep's name is not an integer time stamp. Also where a
+///   column has missing values, no numbers or a compression other than LZ4, and for nested or
+///   big-endian columns.
 /// - `Missing` for feather, where no row has the time of a sweep, or a column is missing.
 /// - `Motion` for a pose of feather whose quaternion's length is not within 1e-3 of 1, or whose
 ///   translation is not finite.
-/// - `TooLarge` for a text of more than a million poses, or a feather file of too many rows.
+/// - `TooLarge` for a text of more than a million poses, or a feather file of more than
+///   [`super::MAX_POINTS`] rows or of far more rows than its size can hold.
 pub fn read_poses(bytes: &[u8], sweeps: &[&str]) -> Result<Vec<RigidTransform>, FormatError> {
     if bytes.starts_with(feather::MAGIC) {
         return read_av2(bytes, sweeps);

@@ -6,8 +6,8 @@ use utoipa::ToSchema;
 use super::error::InvalidOptions;
 use crate::flow::densify::{LaterSweeps, Plan, PlanError};
 
-/// A dense cloud of a sequence: the points of all sweeps, moved to one reference time by the
-/// estimated motion, in the sensor frame of that time.
+/// Options of the dense cloud of a sequence: the points of all sweeps, moved to one reference time
+/// by the estimated motion. The points are in the sensor frame of that time.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Densify {

@@ -7,11 +7,12 @@ use utoipa::ToSchema;
 
 use super::error::InvalidOptions;
 
-/// The device for the computation.
+/// The device that a request asks for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum DeviceChoice {
-    /// The fastest available: a GPU, or the CPU if there is none.
+    /// Any device: in the service the first that is free, on the command line a GPU or, if there is
+    /// none, the CPU.
     #[default]
     Auto,
     /// The CPU.

@@ -26,7 +26,7 @@ pub enum InvalidOptions {
     /// The name of the precision is unknown.
     #[error("options: precision is {0:?}, \"f32\" and \"f16\" are known")]
     Precision(String),
-    /// Half precision on the CPU, which does not support it.
+    /// Half precision (`f16`) with device `cpu`, which computes in single precision only.
     #[error("options: precision is \"f16\", which the CPU does not compute in")]
     HalfOnCpu,
     /// Half precision with a preset that fits no field; with the name of the preset.
@@ -35,7 +35,7 @@ pub enum InvalidOptions {
     /// The crop is not a positive, finite number of metres.
     #[error("options: crop_m is {0}, a positive number of metres is needed")]
     Crop(f32),
-    /// The time between two sweeps is not more than 0 and at most 60 s.
+    /// The time between two sweeps, seconds, is not a number above 0 and at most 60.
     #[error("options: dt_s is {0}, more than 0 and at most {MAX_DT_S} seconds are possible")]
     Dt(f32),
     /// The deadline, milliseconds, is zero or longer than a day.
@@ -44,13 +44,14 @@ pub enum InvalidOptions {
     /// The reference time of the dense cloud, in sweeps, is negative or not finite.
     #[error("options: densify.reference_time is {0}, a time in sweeps from 0 is needed")]
     ReferenceTime(f64),
-    /// The sequence cannot be densified with these options.
+    /// A dense cloud is impossible: the substeps are not 1 to 64, the reference time lies after the
+    /// last sweep, or there are fewer than two sweeps.
     #[error("options: densify: {0}")]
     Densify(PlanError),
-    /// A given ego motion with a sequence of more than one pair.
+    /// The ego motion is a given matrix, and the sequence has more than one pair.
     #[error("options: a given ego is the motion of one pair, not of a sequence's: leave it out")]
     OneMotion,
-    /// Densification of a single pair or of a streamed sequence.
+    /// `densify` is given for a single pair or for a streamed sequence.
     #[error("options: densify is for sequences that are submitted as jobs")]
     NoSequence,
 }

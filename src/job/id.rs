@@ -7,17 +7,17 @@ use std::sync::Arc;
 use serde::{Serialize, Serializer};
 use uuid::Uuid;
 
-/// The id of a job: a UUID of version 7, so that ids sort by creation time.
+/// The id of a job, a UUID. New ids are of version 7, so that they sort by creation time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct JobId(Uuid);
 
 impl JobId {
-    /// A new unique id.
+    /// A new unique id: a UUID of version 7, with the current time in its first bytes.
     pub fn fresh() -> Self {
         Self(Uuid::now_v7())
     }
 
-    /// The id with these 16 bytes.
+    /// The id with these 16 bytes, as [`JobId::as_bytes`] returns them. All values are accepted.
     pub fn from_bytes(bytes: [u8; 16]) -> Self {
         Self(Uuid::from_bytes(bytes))
     }
@@ -40,13 +40,13 @@ impl Serialize for JobId {
     }
 }
 
-/// A text is not a valid job id or tenant name.
+/// Why a text is not a job id or a tenant name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidId {
-    /// Not 8-4-4-4-12 hexadecimal digits.
+    /// The text is not a UUID in the form of 8-4-4-4-12 hexadecimal digits.
     #[error("a job's name is a UUID, such as 0192f0c1-7b7a-7000-8000-000000000000")]
     Job,
-    /// Not 1 to 64 ASCII letters, digits, `-`, `_` or `.`.
+    /// The text is not 1 to 64 ASCII letters, digits, `-`, `_` or `.`.
     #[error("a tenant's name has 1 to 64 letters, digits, '-', '_' or '.'")]
     Tenant,
 }

@@ -23,18 +23,21 @@ pub struct JobOptions {
     /// points move with the ego motion. `label`: as `default`, and a pair of a sequence uses up to
     /// five sweeps. `neural`: a short, robust fit of a neural field. `paper`: FNSF as published.
     pub preset: PresetChoice,
-    /// Seed of the random numbers. The same seed gives bit-identical results.
+    /// Seed of the random numbers. On the same device, the same input, options and seed give a
+    /// bit-identical result, unless a deadline ends the estimate.
     pub seed: u64,
-    /// Number of source points that get a flow, at least 3, chosen at random. `neural` and `paper`
-    /// sample both clouds and use only the sampled points. `default` and `label` compute from all
-    /// points and return the flow of the sampled ones.
+    /// Maximum number of source points that get a flow, at least 3. They are chosen at random from
+    /// a larger cloud. `neural` and `paper` sample both clouds and use only the sampled points.
+    /// `default` and `label` compute from all points and return the flow of the sampled ones. If
+    /// not given, no points are sampled.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_points: Option<u32>,
-    /// Ignore points with |x| or |y| above this, metres. More than 0.
+    /// Points with |x| or |y| above this, metres, are ignored and get no flow. More than 0. No crop
+    /// if not given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub crop_m: Option<f32>,
     /// Time between consecutive sweeps, seconds, for velocities: more than 0, at most 60. If not
-    /// given, the timestamps in the file names give it, otherwise it is 0.1.
+    /// given, it is taken from the timestamps in the file names, or is 0.1 without them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub dt_s: Option<f32>,
     /// Treatment of ground points. `keep`: as any other point. `mask`: points marked in the input's
@@ -44,8 +47,8 @@ pub struct JobOptions {
     /// are none. Clouds that are nearly all ground keep it. Default: `auto`; `keep` with `paper`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ground: Option<GroundChoice>,
-    /// The ego motion: `off`, `auto` (estimated first) or a 4 x 4 matrix target_from_source. By
-    /// default chosen by the preset.
+    /// The ego motion: `off` (not separated), `auto` (estimated first) or a 4 x 4 matrix
+    /// target_from_source, translation in metres. Default: `auto`; `off` with `paper`.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<Object>)]
     pub ego: Option<EgoChoice>,
@@ -55,8 +58,9 @@ pub struct JobOptions {
     /// `f32`: single precision. `f16`: half precision, for `neural` and `paper` on a GPU whose
     /// matrix units pass their self-test.
     pub precision: PrecisionChoice,
-    /// Deadline, milliseconds after the arrival of the request, at most one day. The best flow so
-    /// far is then returned.
+    /// Deadline, milliseconds after the arrival of the request, from 1 to 86,400,000 (one day). The
+    /// best flow so far is then returned. A job that has not started by then expires. No deadline
+    /// if not given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub deadline_ms: Option<u64>,
     /// Priority of the job. Jobs of a higher priority start first.
@@ -181,7 +185,7 @@ pub enum EgoChoice {
     Off,
     /// Estimated first.
     Auto,
-    /// Given as target_from_source.
+    /// Given as target_from_source, translation in metres.
     Given(RigidTransform),
 }
 
@@ -212,11 +216,12 @@ impl<'de> Deserialize<'de> for EgoChoice {
 }
 
 impl JobOptions {
-    /// Reads and checks one JSON object.
+    /// Reads the options from one JSON object and checks them.
     ///
     /// # Errors
-    /// [`InvalidOptions::Json`] if the text is not a JSON object with known keys and readable
-    /// values. Otherwise as for [`JobOptions::check`].
+    /// - [`InvalidOptions::Json`] if the text is not a JSON object with known keys and readable
+    ///   values, or `ego` is a matrix that is not rigid or moves by more than 1e6 m along an axis.
+    /// - Otherwise as [`JobOptions::check`].
     pub fn from_json(text: &[u8]) -> Result<Self, InvalidOptions> {
         // serde would read an array as the values of the struct's fields in order.
         if !text.trim_ascii_start().starts_with(b"{") {
@@ -228,16 +233,16 @@ impl JobOptions {
         Ok(options)
     }
 
-    /// One JSON object. [`JobOptions::from_json`] reads it back if the options pass
-    /// [`JobOptions::check`].
+    /// The options as one JSON object. [`JobOptions::from_json`] reads it back if the options pass
+    /// [`JobOptions::check`] and a given ego motion moves by at most 1e6 m along each axis.
     pub fn to_json(&self) -> String {
         serde_json::to_string(self).expect("every option has a JSON form")
     }
 
-    /// Checks the values and their combinations.
+    /// Checks the values and their combinations. A given ego motion is not checked.
     ///
     /// # Errors
-    /// [`InvalidOptions`], which names the key and its valid values:
+    /// The [`InvalidOptions`] of the first option that is refused:
     /// - `MaxPoints`, `Crop`, `Dt`, `Deadline` for a value out of range.
     /// - `HalfOnCpu`, `HalfWithoutField` for `f16` with device `cpu` or a preset that fits no
     ///   field.

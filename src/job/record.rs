@@ -14,17 +14,18 @@ use crate::clock::Timestamp;
 )]
 #[serde(rename_all = "snake_case")]
 pub enum State {
-    /// Waiting for a device.
+    /// Not started: it waits for a device, for the pair before it, or for a retry.
     Queued,
-    /// Running on a device.
+    /// A device computes it. A sequence is running from the start of its first pair, and is queued
+    /// again once only its dense cloud is left to compute.
     Running,
-    /// The result is available.
+    /// All its work is done, and the result was stored.
     Succeeded,
     /// The job failed permanently or reached the maximum number of attempts.
     Failed,
     /// Cancelled by a client, or its waiting caller disconnected.
     Cancelled,
-    /// The deadline or the time to live passed before a device was free.
+    /// The deadline or the time to live passed before the job started.
     Expired,
 }
 
@@ -74,7 +75,9 @@ pub struct JobProgress {
     pub done: u32,
     /// Maximum number of iterations, or number of clusters.
     pub total: u32,
-    /// Mean loss of the latest iteration's points, or mean cost of the clusters, metres.
+    /// Loss in metres. During a fit it is the mean over the points of the latest iteration; at its
+    /// end it is that of the best iteration. For an object search it is the mean cost of the
+    /// finished clusters.
     pub loss: f64,
 }
 
@@ -98,7 +101,8 @@ pub struct Job {
     pub tenant: Tenant,
     /// A pair or a sequence.
     pub kind: Kind,
-    /// The sequence that the pair belongs to; none for a single pair.
+    /// The sequence that the pair belongs to. None for a sequence, for a single pair and for a pair
+    /// of a stream.
     pub parent: Option<JobId>,
     /// Index of the earlier of its two sweeps, from 0: in its sequence, or, for a pair of a stream,
     /// among the sweeps that are stored with the job.
@@ -109,7 +113,7 @@ pub struct Job {
     pub window: [u32; 2],
     /// Number of pairs of a sequence, backward pairs included; 0 for a pair.
     pub pairs: u32,
-    /// Number of pairs of a sequence that are not finished.
+    /// Number of pairs of a sequence that have not ended; 0 for a pair.
     pub pairs_left: u32,
     /// The job that must end, with or without success, before this one starts.
     pub after: Option<JobId>,
@@ -141,29 +145,31 @@ pub struct Job {
     pub options: String,
     /// Time of acceptance.
     pub created: Timestamp,
-    /// Time of the first start since it was submitted or requeued.
+    /// Time of the first start since the job was submitted or requeued by a client. None before it.
     pub started: Option<Timestamp>,
-    /// Time of the end.
+    /// Time of the end. None before it.
     pub finished: Option<Timestamp>,
-    /// Time at which the best flow so far is due. None without a deadline.
+    /// Time by which the best flow so far is to be returned. None without a deadline.
     pub deadline: Option<Timestamp>,
-    /// The latest known progress.
+    /// The latest known progress. None before the first report of progress, and for a sequence.
     pub progress: Option<JobProgress>,
     /// Why the estimate of a pair ended: `completed`, `converged`, `max_iterations` or `deadline`.
     pub stop_reason: Option<String>,
-    /// Why the job did not succeed.
+    /// Why the job did not succeed. None before the end, and of a job that succeeded.
     pub error: Option<JobError>,
     /// Whether it is a dead letter: given up after too many attempts or crashes.
     pub dead: bool,
     /// Whether its cancellation was requested.
     pub cancel_requested: bool,
     /// The report as JSON: a [`Report`](super::Report), or a [`DenseReport`](super::DenseReport) of
-    /// a sequence with a dense cloud.
+    /// a sequence with a dense cloud. None before success, and for other sequences.
     pub report: Option<String>,
 }
 
 impl Job {
-    /// The job that owns the stored sweeps of a pair, and the indices of the source and the target.
+    /// For a pair: the job that owns its stored sweeps, and the indices of its source and its
+    /// target among them. For a sequence the first value is its own id, and the indices have no
+    /// meaning.
     pub fn sweeps(&self) -> (JobId, [u32; 2]) {
         let owner = self.parent.unwrap_or(self.id);
         match self.backward {

@@ -8,7 +8,7 @@ use super::record::JobProgress;
 use crate::flow::{DEFAULT_DT_S, Estimate, Solution};
 use crate::formats::matrix_rows;
 
-/// The report of an estimate.
+/// The report of the estimate of one pair.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Report {
     /// Number of source points, the rows of the flow.
@@ -25,12 +25,13 @@ pub struct Report {
     /// Whether `dt_s` is the default of 0.1 s, because neither the request nor the timestamps in
     /// the file names gave it.
     pub dt_assumed: bool,
-    /// `completed`, `converged`, `max_iterations` or `deadline`.
+    /// Why the method ended: `completed`, `converged`, `max_iterations` or `deadline`.
     pub stop_reason: String,
     /// The device that computed the method: that of the field's fit, or the host's threads for
     /// objects.
     pub device: String,
-    /// The ego motion target_from_source, 4 x 4, row by row, if known.
+    /// The ego motion target_from_source as a 4 x 4 matrix, row by row, translation in metres. None
+    /// if it was not separated, or a deadline left no time to estimate it.
     pub ego_motion: Option<[[f64; 4]; 4]>,
     /// The object search, with `default` and `label`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -56,7 +57,9 @@ pub struct ObjectsReport {
     pub searched: usize,
     /// Number of clusters whose center moves by at least 0.05 m horizontally, ego motion taken out.
     pub moving: usize,
-    /// Mean distance of the clusters to the target, metres; none if no cluster was searched.
+    /// Mean truncated distance of the points of a searched cluster from the target after their
+    /// motion, metres, averaged over the searched clusters. 0 if there was no cluster to search.
+    /// None if a deadline ended the search at its start.
     pub cost_m: Option<f64>,
 }
 
@@ -74,7 +77,8 @@ pub struct FieldReport {
     pub best_loss_m: Option<f64>,
 }
 
-/// Wall-clock seconds by phase. For a field they follow the breakdown in the FNSF paper.
+/// Wall-clock seconds of an estimate by phase. For a field they follow the breakdown in the FNSF
+/// paper.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PhaseSeconds {
     /// Reading of files, if the same process read them.
@@ -99,7 +103,8 @@ pub struct PhaseSeconds {
 }
 
 impl Report {
-    /// The report of an estimate that was computed with `options`.
+    /// The report of `estimate`. `options` are those that it was computed with. The fields
+    /// [`PhaseSeconds::load`] and [`Report::peak_rss_bytes`] are left empty.
     pub fn new(estimate: &Estimate, options: &JobOptions) -> Self {
         let finite = |value: f64| value.is_finite().then_some(value);
         let mut seconds = PhaseSeconds {
@@ -148,9 +153,10 @@ impl Report {
         }
     }
 
-    /// The final progress. Objects: searched candidates of all candidates, and their mean cost,
-    /// metres. Field: completed iterations, the iteration limit, and the loss of the best
-    /// iteration, metres. None if the deadline allowed no candidate or no iteration.
+    /// The progress at the end of the estimate. For objects: the searched candidates, all
+    /// candidates, and their mean cost in metres. For a field: the finished iterations, the
+    /// iteration limit, and the loss of the best iteration in metres. None if a deadline ended the
+    /// search at its start or allowed no iteration.
     pub fn progress(&self) -> Option<JobProgress> {
         let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
         let (done, total, loss) = match (&self.objects, &self.field) {

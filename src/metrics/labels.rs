@@ -13,7 +13,10 @@ pub const PHASES: [&str; 8] = [
     "encode",
     "total",
 ];
-/// Values of the label `reason` of `fnsf_requests_rejected_total`.
+/// Values of the label `reason` of `fnsf_requests_rejected_total`. `unauthorized` counts the error
+/// codes `unauthenticated`, `forbidden`, `priority` and `foreign_site`. Each other value counts the
+/// code of the same name. `bad_input` also counts `bad_request` and `invalid_options`, and
+/// `too_slow` also counts `taken_too_slowly`.
 pub const REJECTIONS: [&str; 10] = [
     "no_device",
     "disk_full",
@@ -29,5 +32,6 @@ pub const REJECTIONS: [&str; 10] = [
 /// Values of the label `protocol` of `fnsf_requests_total`.
 pub const PROTOCOLS: [&str; 2] = ["http", "grpc"];
 /// Values of the label `class` of `fnsf_requests_total`: a success, an error with an HTTP status
-/// below 500, an error with 500 or above. A gRPC error counts by the HTTP status of the same error.
+/// below 500, and an error with an HTTP status of 500 or above. A gRPC error counts by the HTTP
+/// status of the same error.
 pub const CLASSES: [&str; 3] = ["ok", "client_error", "server_error"];

@@ -23,8 +23,8 @@ impl Metrics {
     ///   started, in `fnsf_job_run_seconds`.
     /// - `Deleted` has no effect.
     ///
-    /// A sequence counts by its pairs. It counts itself only as requeued, or if its closing job
-    /// becomes a dead letter.
+    /// A sequence counts by its pairs. Its closing job counts only as requeued, as an expired lease
+    /// or as a dead letter.
     pub fn observe(&self, event: &Event) {
         match event {
             Event::Submitted(job) => self.count_submitted(job),
@@ -71,8 +71,9 @@ impl Metrics {
         }
     }
 
-    /// Enters the duration of one phase of a job in `fnsf_phase_seconds`. `phase` is one of
-    /// [`super::PHASES`]. The exemplar is the id of `job`.
+    /// Enters the duration of one phase of a job, `seconds`, in `fnsf_phase_seconds`. `phase` is
+    /// one of [`super::PHASES`]; any other value adds a series. The exemplar is the id of `job`;
+    /// `None` leaves it out.
     pub fn phase(&self, phase: &'static str, seconds: f64, job: Option<&Job>) {
         let label = job.map(|job| JobLabel {
             job_id: job.id.to_string(),
@@ -91,8 +92,9 @@ impl Metrics {
         self.searched_clusters.observe(clusters as f64);
     }
 
-    /// Counts an estimate in `fnsf_estimates_total`, and enters its measured over predicted compute
-    /// time in `fnsf_prediction_ratio`. `stop_reason` is a name of [`crate::flow::StopReason`].
+    /// Counts an estimate in `fnsf_estimates_total` by `stop_reason`, a name of
+    /// [`crate::flow::StopReason`]. Enters `measured_over_predicted`, the ratio of its measured to
+    /// its predicted compute time, in `fnsf_prediction_ratio`.
     pub fn solved(&self, stop_reason: &'static str, measured_over_predicted: f64) {
         let reason = stop_reason;
         self.estimates.get_or_create(&Reason { reason }).inc();
@@ -174,8 +176,8 @@ impl Metrics {
 
     /// Sets the gauges of the queue:
     /// - `fnsf_queue_depth`: the queued jobs of `backlog`, by priority.
-    /// - `fnsf_queue_work_seconds`: `work_seconds`, the predicted seconds of one lane for all
-    ///   queued jobs.
+    /// - `fnsf_queue_work_seconds`: `work_seconds`, the predicted compute time of all queued jobs
+    ///   if one lane did them all.
     /// - `fnsf_queue_oldest_seconds`: `oldest`, the time since the oldest queued job became ready.
     /// - `fnsf_jobs_running`: the running jobs of `backlog`.
     pub fn backlog(&self, backlog: &crate::queue::Backlog, work_seconds: f64, oldest: Duration) {
@@ -191,8 +193,8 @@ impl Metrics {
         self.running.set(backlog.running().jobs as i64);
     }
 
-    /// All metrics as text: OpenMetrics 1.0.0 with exemplars if `openmetrics`, else the Prometheus
-    /// text format 0.0.4.
+    /// Returns all metrics as text: OpenMetrics 1.0.0 with exemplars if `openmetrics` is true, else
+    /// the Prometheus text format 0.0.4.
     pub fn expose(&self, openmetrics: bool) -> String {
         let mut text = String::new();
         if let Err(error) = text::encode(&mut text, &self.registry) {

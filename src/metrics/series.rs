@@ -68,7 +68,8 @@ pub(super) struct ProtocolAndClass {
     pub(super) class: &'static str,
 }
 
-/// All metrics of one server.
+/// All metrics of one server. [`Metrics::expose`] returns them as text; the other methods update
+/// them.
 #[derive(Debug)]
 pub struct Metrics {
     pub(super) registry: Registry,
@@ -107,7 +108,8 @@ fn seconds() -> Seconds {
 }
 
 impl Metrics {
-    /// Creates every series with the value 0. `devices` are the values of the label `device`.
+    /// Creates every series with the value 0. `devices` are the names of all devices, the values of
+    /// the label `device`.
     pub fn new(devices: &[impl AsRef<str>]) -> Self {
         let metrics = Self {
             registry: Registry::default(),

@@ -15,7 +15,7 @@ pub struct Image {
     pixels: Vec<Rgb>,
 }
 
-/// Why a picture could not be written.
+/// The encoding of a picture as PNG failed, or the writing of the file.
 #[derive(Debug, thiserror::Error)]
 #[error("failed to write the picture")]
 pub struct PictureError(#[from] png::EncodingError);

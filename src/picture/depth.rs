@@ -1,4 +1,4 @@
-//! Depth images one above the other: near is red, far is blue, unknown is dark.
+//! Depth images one above the other: near is red, far is violet, unknown is dark.
 //!
 //! All panels share one scale, so that a sparse one can be compared with a dense one.
 
@@ -41,13 +41,17 @@ pub struct DepthPanel<'a> {
     pub image: &'a DepthImage,
 }
 
-/// Draws depth images one above the other, above a color scale. Each has its own size, with its
+/// Draws depth images one above the other, above a color scale. Each keeps its own size, with its
 /// title and density above it. The picture is as wide as the widest of them, and at least 256
-/// pixels.
+/// pixels. Without images only the color scale is drawn.
 ///
-/// Near is red, far is blue, unknown is dark. The scale is logarithmic and the same for all images:
-/// from 3 m to the smallest of 5, 10, 20, 40, 80 and 160 m that covers 97 % of the known pixels.
-/// Each depth is a dot three pixels wide, with nearer dots on top, so that sparse depth is visible.
+/// Near is red, far is violet, unknown is dark. The scale is logarithmic and the same for all
+/// images. It starts at 3 m, and smaller depths have the same red. It ends at the smallest of 5,
+/// 10, 20, 40, 80 and 160 m that covers 97 % of the known pixels, and larger depths have the same
+/// violet. The end is 160 m if none of these does, and 80 m without known pixels.
+///
+/// Each depth is a square of 3 x 3 pixels, with nearer depths on top, so that sparse depth is
+/// visible.
 pub fn depth_panels(panels: &[DepthPanel<'_>]) -> Image {
     let width = panels.iter().map(|panel| panel.image.width).max();
     let width = width.unwrap_or(0).max(256);

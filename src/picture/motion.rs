@@ -11,8 +11,11 @@ const LEAST_SCALE_M: f32 = 0.1;
 const COVERED: f64 = 0.98;
 
 /// The displacements to be shown, N x 3 in metres, for N source points and their flow, both in
-/// metres. Where the ego motion (`target_from_source`) is given, its displacement of each point is
-/// subtracted, so the motion is relative to the world. Otherwise the flow is returned unchanged.
+/// metres.
+///
+/// With the ego motion (`target_from_source`), its displacement of each point is subtracted, so the
+/// motion is relative to the world. Rows past the shorter of `source` and `flow` are then left out.
+/// Without it the flow is returned unchanged.
 pub fn shown_motion(source: &[Point], flow: &[Point], ego: Option<&RigidTransform>) -> Vec<Point> {
     let Some(ego) = ego else {
         return flow.to_vec();
@@ -29,10 +32,12 @@ pub fn shown_motion(source: &[Point], flow: &[Point], ego: Option<&RigidTransfor
     source.iter().zip(flow).map(residual).collect()
 }
 
-/// The horizontal displacement, metres, at which colors saturate: the smallest of 0.1, 0.15, 0.2,
-/// 0.3, 0.4, 0.5, 0.6, 0.8, 1, 1.5, ... that covers 98 % of the moving points. `motion` are N
-/// displacements, metres, and `valid` N flags: which of them count. Points that move less than 0.05
-/// m horizontally do not count as moving. The result is 0.1 m without moving points.
+/// The horizontal displacement at which colors saturate, metres: the smallest of 0.1, 0.15, 0.2,
+/// 0.3, 0.4, 0.5, 0.6, 0.8, 1, 1.5, ... that covers 98 % of the moving points.
+///
+/// `motion` are N displacements, metres, and `valid` N flags: which of them count. Rows past the
+/// shorter of the two are left out. Points whose horizontal displacement is NaN or below 0.05 m do
+/// not count as moving. Without moving points the result is 0.1 m.
 pub fn full_scale(motion: &[Point], valid: &[bool]) -> f32 {
     let mut moving: Vec<f32> = motion
         .iter()

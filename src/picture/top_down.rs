@@ -36,17 +36,18 @@ const VEHICLE_M: [f32; 2] = [4.6, 1.9];
 /// The scene to be drawn: N points, each with its flow.
 #[derive(Clone, Copy, Debug)]
 pub struct TopDown<'a> {
-    /// N source points, metres; rows that are not finite are left out.
+    /// N source points, metres. Rows that are not finite, here or in the shown motion, are left
+    /// out.
     pub source: &'a [Point],
     /// N displacements from the source sweep's time to the target's, metres, ego motion included.
     pub flow: &'a [Point],
     /// N flags: whether the row has a flow. Rows without one are drawn gray.
     pub valid: &'a [bool],
-    /// The ego motion `target_from_source`. Where it is given, motion relative to the world is
-    /// shown, otherwise the flow itself; the title names which.
+    /// The ego motion `target_from_source`, translation in metres. If it is given, motion relative
+    /// to the world is shown, otherwise the flow itself. The title names which.
     pub ego: Option<&'a RigidTransform>,
-    /// Clusters, where known. The dynamic ones get an outline of their box, and a line that shows
-    /// their displacement in 1 s.
+    /// Clusters of the source points, or an empty slice. The dynamic ones get an outline of their
+    /// box, and a line that shows their displacement in 1 s.
     pub clusters: &'a [Cluster],
 }
 
@@ -55,15 +56,18 @@ pub struct TopDown<'a> {
 pub struct TopDownOptions {
     /// Width and height, pixels, clamped to 256..=8192.
     pub side_px: u32,
-    /// Half the width of the visible square, metres. By default, and where not positive, the
-    /// smallest of 10, 20, 30, 40, 50, 60, 80, 100, 150 and 200 m that holds 93 % of the points
-    /// with a flow.
+    /// Half the width of the visible square, metres. A value that is not positive and finite counts
+    /// as none.
+    ///
+    /// If none, it is the smallest of 10, 20, 30, 40, 50, 60, 80, 100, 150 and 200 m that holds
+    /// 93 % of the points with a flow. It is 200 m if none of these does, and 50 m without such
+    /// points.
     pub range_m: Option<f32>,
-    /// The horizontal displacement at which colors saturate, metres. By default, and where not
-    /// positive, that of [`full_scale`].
+    /// The horizontal displacement at which colors saturate, metres. If none, or not positive and
+    /// finite, it is the result of [`full_scale`].
     pub full_scale_m: Option<f32>,
-    /// Seconds from the source sweep to the target. Where given, the legend is in m/s, otherwise in
-    /// metres per interval.
+    /// Time from the source sweep to the target sweep, seconds. With a positive value the legend is
+    /// in m/s. Otherwise it is in metres per sweep.
     pub interval_s: Option<f32>,
 }
 

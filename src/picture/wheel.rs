@@ -26,8 +26,9 @@ const CORNERS: [[f32; 3]; 7] = [
 ///
 /// The direction in the x-y plane is the hue: +x is red, and the hue turns counterclockwise over
 /// yellow, green, cyan, blue and magenta. The length over `full_scale` (same unit) is the
-/// saturation, so zero motion is white. Past the full scale the color darkens by a quarter. NaN
-/// gives [`INVALID_COLOR`].
+/// saturation, so zero motion is white. Past the full scale the color darkens by a quarter. With a
+/// full scale that is not positive, every motion except zero is past it. A length that is NaN gives
+/// [`INVALID_COLOR`]. z is ignored.
 pub fn color(flow: Point, full_scale: f32) -> [u8; 3] {
     const PAST_SCALE: f32 = 0.75;
     let saturation = flow[0].hypot(flow[1]) / full_scale.max(f32::MIN_POSITIVE);

@@ -56,7 +56,7 @@ pub struct Backlog {
 }
 
 impl Backlog {
-    /// Load of the running jobs.
+    /// Load of the running jobs. Each counts with its whole predicted compute time.
     pub fn running(&self) -> Load {
         self.running
     }
@@ -66,12 +66,12 @@ impl Backlog {
         self.sum(|key| key.priority == priority)
     }
 
-    /// Queued load in total, with the jobs that follow another one or wait for a retry.
+    /// Queued load in total, including jobs that follow another one or wait for a retry.
     pub fn queued(&self) -> Load {
         self.sum(|_| true)
     }
 
-    /// Queued load that requires this kind of device.
+    /// Queued load of the jobs that require this kind of device. Jobs for any device do not count.
     pub fn queued_only_for(&self, device: DeviceKind) -> Load {
         self.sum(|key| key.device == Some(device))
     }
@@ -84,9 +84,10 @@ impl Backlog {
     /// Predicted compute time of the queued jobs that run before a new job of `tenant`, nominal
     /// seconds. `cost_seconds` is the predicted compute time of the new job, nominal seconds.
     ///
-    /// Only jobs with exactly this `device` requirement count (`None`: any device). All jobs of
-    /// higher priority count. Of the same priority, the tenant's own jobs count in full. Each other
-    /// tenant counts up to its fair share: the tenant's own queued work plus the new job.
+    /// Only jobs with exactly this `device` requirement count (`None`: any device). Running jobs
+    /// do not count. All jobs of higher priority count. Of the same priority, the jobs of `tenant`
+    /// count in full. Each other tenant counts up to its fair share: `cost_seconds` plus the queued
+    /// work of `tenant` at this priority, for all devices.
     pub fn ahead_of(
         &self,
         tenant: &Tenant,

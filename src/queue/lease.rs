@@ -7,7 +7,9 @@ use std::time::Instant;
 use crate::job::{Job, JobProgress};
 use crate::sync::locked;
 
-/// A job leased to one worker.
+/// A job leased to one worker. Dropping the lease does not release the job; [`Queue::finish`] does.
+///
+/// [`Queue::finish`]: super::Queue::finish
 #[derive(Debug)]
 pub struct Lease {
     /// The job, in state running.
@@ -23,7 +25,8 @@ pub enum Signal {
     Continue,
     /// Stop: the job's cancellation was requested.
     Cancel,
-    /// Stop: the lease has expired, and another worker may hold the job.
+    /// Stop: the attempt no longer holds the job, because its lease has expired or it was finished.
+    /// Another worker may hold the job.
     Lost,
 }
 
@@ -85,8 +88,10 @@ pub(super) trait HeartbeatStore: Send + Sync {
     fn snapshot_kept(&self);
 }
 
-/// The heartbeat of a lease, cheap enough for every iteration. During an estimate the iteration
-/// loop calls it, not a timer, so a device that hangs loses its lease. Clones share the lease.
+/// The heartbeat of a lease, cheap enough for every iteration. Clones share the lease.
+///
+/// During an estimate the iteration loop calls it, not a timer. The lease of a job on a device that
+/// hangs therefore expires.
 #[derive(Clone)]
 pub struct LeaseHeartbeat {
     flags: Arc<Flags>,
@@ -107,7 +112,8 @@ impl LeaseHeartbeat {
     }
 
     /// Renews the lease for [`QueueOptions::lease`] and returns the queue's current instruction.
-    /// `progress` is published to the subscribers of the job; `None` leaves it unchanged.
+    /// `progress` is published to the subscribers of the job; `None` leaves it unchanged. A lost
+    /// lease is not renewed.
     ///
     /// The call does not wait for the store. The store writes a renewal at most once a second, or
     /// once in a quarter of the lease if that is shorter.
@@ -119,7 +125,8 @@ impl LeaseHeartbeat {
         self.signal()
     }
 
-    /// The current instruction, without a heartbeat. [`Signal::Lost`] precedes [`Signal::Cancel`].
+    /// The current instruction, without a heartbeat. If the lease is lost and a cancellation was
+    /// requested, it is [`Signal::Lost`].
     pub fn signal(&self) -> Signal {
         if self.flags.lost.load(Ordering::Relaxed) {
             Signal::Lost

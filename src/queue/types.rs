@@ -15,7 +15,7 @@ use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, 
 /// A job to be accepted.
 #[derive(Clone, Debug)]
 pub struct Submission {
-    /// Its id. The payload is already stored under it.
+    /// Its id, which no other job has. The payload is already stored under it.
     pub id: JobId,
     /// The tenant that owns it.
     pub tenant: Tenant,
@@ -26,17 +26,21 @@ pub struct Submission {
     /// The pairs of a sequence, in the order of their execution; empty for a pair.
     pub pairs: Vec<PairOf>,
     /// Predicted compute time of a sequence's closing job, nominal seconds ([`crate::cost`]). It
-    /// runs when all of the pairs have succeeded. `None` if there is no closing job.
+    /// runs when all of the pairs have succeeded. `None` if there is no closing job. Ignored for a
+    /// pair.
     pub finalizer_seconds: Option<f64>,
-    /// The job that must end, in any state, before this one is started.
+    /// The job that must end, in any state, before this pair is started. An unknown job does not
+    /// delay it. Must be `None` for a sequence, whose order [`PairOf::chained`] gives.
     pub after: Option<JobId>,
-    /// Whether another job may follow this one and use its field.
+    /// Whether another job may follow this pair and use its motion field, which is then stored.
+    /// Ignored for a sequence.
     pub has_dependents: bool,
     /// Its priority.
     pub priority: Priority,
     /// The kind of device that it requires; `None` for any.
     pub device: Option<DeviceKind>,
-    /// Predicted compute time of a pair, or of each pair of a sequence, nominal seconds.
+    /// Predicted compute time of a pair, or of each pair of a sequence, nominal seconds
+    /// ([`crate::cost`]). Must be finite and at least 0.
     pub cost_seconds: f64,
     /// The options, as JSON; opaque to the queue.
     pub options: String,
@@ -48,7 +52,8 @@ pub struct Submission {
     /// [`QueueError::KeyReused`]. The key of an ephemeral job that ended without success, or whose
     /// cancellation was requested, is free again. `None`: always a new job.
     pub idempotency: Option<Idempotency>,
-    /// Whether the job survives this process. An ephemeral job ends with the process.
+    /// Whether the job survives this process. A job that is not durable is ephemeral: the next
+    /// start of the queue removes it if it has not ended.
     pub durable: bool,
 }
 
@@ -87,11 +92,12 @@ pub struct PairOf {
     /// past the last.
     pub window: [u32; 2],
     /// Whether it is started only after the end of the pair before it in [`Submission::pairs`].
+    /// Ignored for the first of them and for a single pair.
     pub chained: bool,
 }
 
 impl PairOf {
-    /// A single pair of sweeps without neighbors.
+    /// The pair of sweeps 0 and 1: forward in time, without neighbors, not chained.
     pub const ALONE: Self = Self {
         index: 0,
         backward: false,
@@ -99,7 +105,8 @@ impl PairOf {
         chained: false,
     };
 
-    /// A range of sweep indices in the form of [`PairOf::window`].
+    /// Converts a range of sweep indices to the form of [`PairOf::window`]. Indices beyond
+    /// `u32::MAX` become `u32::MAX`.
     pub fn seen(sweeps: Range<usize>) -> [u32; 2] {
         [sweeps.start, sweeps.end].map(|index| u32::try_from(index).unwrap_or(u32::MAX))
     }
@@ -110,7 +117,8 @@ impl PairOf {
 pub struct Idempotency {
     /// The caller's key, unique per tenant.
     pub key: String,
-    /// Hash of payload and options. The same key with another fingerprint is refused.
+    /// Hash of payload and options, computed by the caller. The same key with another fingerprint
+    /// is refused.
     pub fingerprint: [u8; 32],
 }
 
@@ -130,7 +138,8 @@ pub struct Filter {
     pub tenant: Tenant,
     /// Their state; `None` for any.
     pub state: Option<State>,
-    /// Only jobs older than this one.
+    /// Only jobs whose id is less than this one, so that they were created earlier. It need not be
+    /// the id of a job. `None` for all jobs.
     pub before: Option<JobId>,
     /// Maximum number of jobs. [`super::SqliteQueue`] returns at most 1000.
     pub limit: u32,
@@ -148,19 +157,22 @@ pub enum Outcome {
         /// The final progress, if there is one.
         progress: Option<JobProgress>,
     },
-    /// It failed. A retryable failure is retried while attempts are left.
+    /// It failed. A job with a retryable failure is requeued after [`QueueOptions::retry_delay`],
+    /// and becomes a dead letter at failure number [`QueueOptions::max_attempts`]. Another failure
+    /// ends the job at once.
     Failed(JobError),
     /// The worker stopped because of a cancellation.
     Cancelled,
     /// The worker released the job through no fault of the job. It is requeued unchanged.
     Released,
-    /// The store works but fails for this job. It is requeued with a delay that doubles each time,
-    /// up to 300 s, and becomes a dead letter the 13th time.
+    /// The store works but fails for this job. The job is requeued with a delay, and becomes a dead
+    /// letter the 13th time. The first delay is twice the larger of 0.5 s and
+    /// [`QueueOptions::retry_delay`]. It doubles each time, up to 300 s.
     Delayed(JobError),
     /// The job does not fit this device. It is requeued and now requires this kind.
     Moved(DeviceKind),
     /// The device was lost during the attempt, perhaps through another job. The job is requeued at
-    /// once, and becomes a dead letter after [`QueueOptions::max_crashes`].
+    /// once, and becomes a dead letter at crash number [`QueueOptions::max_crashes`].
     Crashed(JobError),
 }
 
@@ -169,31 +181,39 @@ pub enum Outcome {
 pub enum Committed {
     /// The outcome was stored. The value is the job's new state.
     Yes(State),
-    /// The attempt no longer holds the job, or the job has ended. The outcome is discarded.
+    /// The attempt no longer holds the job, or the job has ended or is unknown. The outcome is
+    /// discarded.
     Fenced,
 }
 
 /// Timeouts, limits and retention of the queue.
 #[derive(Clone, Debug)]
 pub struct QueueOptions {
-    /// Failures after which a job becomes a dead letter.
+    /// Number of retryable failures at which a job becomes a dead letter; 0 counts as 1. A failure
+    /// that is not retryable ends the job at once.
     pub max_attempts: u32,
-    /// Crashes of the process or of a device during a job's run, counted since its last snapshot,
-    /// after which it becomes a dead letter.
+    /// Number of crashes of the process or of a device during a job's run, counted since its last
+    /// snapshot, at which the job becomes a dead letter; 0 counts as 1.
     pub max_crashes: u32,
-    /// Time without a heartbeat after which a running job is requeued. It counts as a failure.
+    /// Time without a heartbeat after which a running job loses its lease. It counts as a retryable
+    /// failure.
     pub lease: Duration,
-    /// Delay before the second attempt. It doubles for each later one, up to 1024 times the first.
+    /// Delay after the first retryable failure of a job. It doubles with each further failure, up
+    /// to 1024 times the first delay.
     pub retry_delay: Duration,
-    /// Maximum time in the queue of a job without a deadline, and of a closing job.
+    /// Time after its submission or [`Queue::requeue`] at which a job without a deadline expires if
+    /// it is queued then. For a closing job the time starts when all pairs have succeeded.
     pub time_to_live: Duration,
-    /// Time for which an ended durable job and its result are kept.
+    /// Time for which an ended durable job and its result are kept. They are kept for longer while
+    /// a job that follows has not ended.
     pub retention: Duration,
-    /// The same for an ephemeral job, whose caller waited for the result.
+    /// The same for an ended ephemeral job, whose caller waited for the result.
     pub answered_retention: Duration,
 }
 
 impl Default for QueueOptions {
+    /// 3 failures, 5 crashes, a lease of 60 s, a retry delay of 1 s, a time to live of 7 days, a
+    /// retention of 24 h, and an answered retention of 60 s.
     fn default() -> Self {
         Self {
             max_attempts: 3,
@@ -223,7 +243,7 @@ pub enum QueueError {
     /// The ephemeral job is being cancelled or was cancelled, and cannot become durable.
     #[error("the job is being cancelled")]
     GivenUp,
-    /// The store failed: a fault of the machine, not of a job.
+    /// The store failed, with the reason: a fault of the machine, not of a job.
     #[error("the queue's store failed: {0}")]
     Store(String),
     /// The store cannot grow because the disk is full: a fault of the machine.
@@ -249,13 +269,16 @@ pub enum Event {
     Submitted(Arc<Job>),
     /// A job was leased for the first time.
     Started(Arc<Job>),
-    /// A job was requeued: by a retry, a release, a recovery or [`Queue::requeue`].
+    /// A job was requeued: by the outcome of an attempt, an expired lease, the recovery, or
+    /// [`Queue::requeue`].
     Requeued(Arc<Job>),
-    /// The lease of this job expired.
+    /// The lease of this job expired. Not sent if its cancellation was requested: such a job ends
+    /// as cancelled.
     LeaseExpired(JobId),
-    /// A job ended.
+    /// A job ended. A sequence sends it for each pair and for itself. An ephemeral job that the
+    /// recovery removes before its end does not send it.
     Ended(Arc<Job>),
-    /// A job was forgotten: its payload, snapshot and result can be removed.
+    /// A job was removed from the queue: its payload, snapshot and result can be removed.
     Deleted(JobId),
 }
 
@@ -267,31 +290,32 @@ pub enum Event {
 /// latest attempt can finish it.
 ///
 /// # Errors
-/// Every call that returns a result fails with an error of the store in these cases. Further errors
-/// are listed with each method.
+/// "An error of the store" below is one of these. Further errors are listed with each method.
 /// - [`QueueError::Store`] if the store cannot be read or written.
 /// - [`QueueError::Full`] if the disk is full.
-/// - [`QueueError::Closed`] if the writer has ended.
+/// - [`QueueError::Closed`] if the writer has ended. Methods that only read, other than
+///   [`Queue::watch`], still work then.
 #[async_trait]
 pub trait Queue: Send + Sync {
     /// Accepts a job and, for a sequence, all of its pairs. A known idempotency key returns its
-    /// job, unless that job is ephemeral and has failed, expired or been cancelled: then the key is
-    /// free again. A job that follows another one is queued, but not leased before that one has
-    /// ended.
+    /// job, unless that job is ephemeral, and has ended without success or is being cancelled: then
+    /// the key is free again. A job that follows another one is queued, but not leased before that
+    /// one has ended.
     ///
     /// # Errors
-    /// [`QueueError::KeyReused`] if the idempotency key belongs to a job with another fingerprint,
-    /// or an error of the store.
+    /// [`QueueError::KeyReused`] if the idempotency key belongs to a job with another fingerprint.
+    /// [`QueueError::Store`] if the id belongs to another job. Otherwise an error of the store.
     async fn submit(&self, submission: Submission) -> Result<Submitted, QueueError>;
 
-    /// Makes a job durable and, for a sequence, its pairs.
+    /// Makes a job durable and, for a sequence, its pairs. Returns the job. If it has ended, its
+    /// [`QueueOptions::retention`] applies from its end.
     ///
     /// # Errors
     /// [`QueueError::NotFound`] if there is no such job. [`QueueError::GivenUp`] if it is ephemeral
     /// and its cancellation was requested. Otherwise an error of the store.
     async fn make_durable(&self, id: JobId) -> Result<Arc<Job>, QueueError>;
 
-    /// A job of one tenant.
+    /// Reads the job with this id, if it belongs to this tenant.
     ///
     /// # Errors
     /// [`QueueError::NotFound`] if there is no such job or it belongs to another tenant, or an
@@ -310,8 +334,9 @@ pub trait Queue: Send + Sync {
     /// An error of the store.
     async fn list(&self, filter: Filter) -> Result<Vec<Arc<Job>>, QueueError>;
 
-    /// Cancels a job and, for a sequence, its pairs. A queued job ends at once. A running job ends
-    /// when its worker has received [`super::Signal::Cancel`]. An ended job is not changed.
+    /// Cancels a job and, for a sequence, its pairs. Returns the job as it is then. A queued job
+    /// ends at once. The worker of a running job receives [`super::Signal::Cancel`], and the job
+    /// ends when the worker finishes the attempt or its lease expires. An ended job is not changed.
     ///
     /// # Errors
     /// [`QueueError::NotFound`] if there is no such job, or an error of the store.
@@ -326,15 +351,19 @@ pub trait Queue: Send + Sync {
 
     /// Requeues an ended job, makes it durable and removes its deadline. All counters but the
     /// attempt number are reset. Of a sequence, the pairs that did not succeed and the closing job
-    /// are requeued. A job that has succeeded is requeued only if its result is `lost`.
+    /// are requeued. A requeued pair reopens its sequence.
+    ///
+    /// A job that has succeeded is requeued only if `lost` is true. It says that the job's result
+    /// is lost; for a sequence, the result of its closing job.
     ///
     /// # Errors
     /// [`QueueError::NotFound`] if there is no such job. [`QueueError::NotTerminal`] if it has not
     /// ended, or has succeeded and is not `lost`. Otherwise an error of the store.
     async fn requeue(&self, id: JobId, lost: bool) -> Result<Arc<Job>, QueueError>;
 
-    /// Subscribes to a job: every change of its state and, while it runs, its progress. The channel
-    /// keeps the latest value only. It closes when the job has ended.
+    /// Subscribes to a job: its state and, while it runs, its progress. The channel keeps only the
+    /// latest value, so a slow receiver misses values in between. It closes when the job has ended.
+    /// The last value can still be read then.
     ///
     /// # Errors
     /// [`QueueError::NotFound`] if there is no such job, or an error of the store.
@@ -348,8 +377,9 @@ pub trait Queue: Send + Sync {
     /// An error of the store.
     async fn lease(&self, worker: &str, kind: DeviceKind) -> Result<Lease, QueueError>;
 
-    /// Ends an attempt. Only the latest attempt of a running job counts. After a cancellation
-    /// request, every outcome counts as [`Outcome::Cancelled`].
+    /// Ends an attempt. Only the latest attempt of a running job counts; for any other the result
+    /// is [`Committed::Fenced`]. After a cancellation request, every outcome counts as
+    /// [`Outcome::Cancelled`].
     ///
     /// # Errors
     /// An error of the store.
@@ -360,10 +390,12 @@ pub trait Queue: Send + Sync {
         outcome: Outcome,
     ) -> Result<Committed, QueueError>;
 
-    /// The queued and running load.
+    /// The load of the jobs that are queued and running now.
     fn backlog(&self) -> Backlog;
 
-    /// The earliest time since which a queued job has been ready to be leased; `None` if none is.
+    /// The earliest time at which one of the queued jobs became ready to be leased. Jobs that wait
+    /// for a retry count with their first such time; jobs that follow a job that has not ended do
+    /// not count. `None` if there is no such job.
     ///
     /// # Errors
     /// An error of the store.
@@ -392,7 +424,7 @@ pub trait Queue: Send + Sync {
     /// Returns when the writer has ended. Only a new process can write again.
     async fn ended(&self);
 
-    /// The ids in this list that belong to jobs.
+    /// The ids in this list that belong to jobs, pairs of sequences included, in the same order.
     ///
     /// # Errors
     /// An error of the store.

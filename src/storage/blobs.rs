@@ -45,23 +45,24 @@ pub enum Blob {
     Snapshot,
     /// The flow, or the dense cloud, of one attempt, by attempt number.
     Result(u32),
-    /// The motion field of one attempt, by attempt number, for the jobs that follow. A late attempt
-    /// cannot change a field that was already read.
+    /// The motion field of one attempt, by attempt number, for the jobs that follow and for the
+    /// dense cloud. A late attempt cannot change a field that was already read.
     Field(u32),
 }
 
-/// Why a blob could not be read or written.
+/// Why an operation of the store failed. [`BlobError::fault`] classifies it.
 #[derive(Debug, thiserror::Error)]
 #[error("the blob store failed: {0}")]
 pub struct BlobError(#[from] object_store::Error);
 
 impl BlobError {
-    /// Whether there is no such blob.
+    /// Whether the operation failed because the blob or file does not exist.
     pub fn is_missing(&self) -> bool {
         self.fault() == Fault::Missing
     }
 
-    /// The kind of fault.
+    /// The cause: [`Fault::Missing`] if the blob or file does not exist, [`Fault::Full`] if no more
+    /// data can be written, otherwise [`Fault::Machine`].
     pub fn fault(&self) -> Fault {
         match &self.0 {
             object_store::Error::NotFound { .. } => Fault::Missing,
@@ -127,8 +128,8 @@ impl Blobs {
         })
     }
 
-    /// Free space; `None` if the system does not report it. May block on a hanging disk, so it must
-    /// not be called on the async runtime.
+    /// Free space of the file system that holds the store; `None` if the system does not report it.
+    /// The call blocks while the disk hangs, so it must not run on a thread of the async runtime.
     pub fn free_space(&self) -> Option<FreeSpace> {
         let filesystem = rustix::fs::statvfs(&*self.folder).ok()?;
         Some(FreeSpace {
@@ -159,7 +160,7 @@ impl Blobs {
     /// for the disk. [`Blobs::probe`] fails until the store has an identity.
     ///
     /// # Errors
-    /// If the file cannot be created, written or synced.
+    /// If the file cannot be created, written, renamed or synced.
     pub fn set_identity(&self, identity: i32) -> io::Result<()> {
         // A crash leaves the earlier file or the new one, never an empty one.
         let written = self.folder.join("identity.new");
@@ -267,10 +268,11 @@ impl Blobs {
         }
     }
 
-    /// Removes all blobs of a job, including the remains of interrupted writes.
+    /// Removes all blobs of a job, including the remains of interrupted writes. No effect for a job
+    /// without blobs.
     ///
     /// # Errors
-    /// If a file cannot be removed.
+    /// If a file cannot be removed. Others may have been removed by then.
     pub async fn remove_job(&self, id: JobId) -> Result<(), BlobError> {
         let folder = self.folder.join(folder(id));
         in_background(move || {
@@ -285,7 +287,7 @@ impl Blobs {
         .await
     }
 
-    /// Whether the store holds no jobs.
+    /// Whether the store holds no blobs of any job.
     ///
     /// # Errors
     /// If the folder cannot be listed.
@@ -296,7 +298,8 @@ impl Blobs {
             .any(|path| path.is_dir()))
     }
 
-    /// The jobs whose files are all older than `age`, including the remains of interrupted writes.
+    /// The jobs whose folder and files were all last changed more than `age` ago. The remains of
+    /// interrupted writes count as files.
     ///
     /// # Errors
     /// If the store cannot be listed.
@@ -324,11 +327,12 @@ impl Blobs {
         .await
     }
 
-    /// Removes the remains of interrupted writes that are older than `age`. Returns the number of
-    /// files removed.
+    /// Removes the remains of interrupted writes that were last changed more than `age` ago.
+    /// Returns the number of files removed.
     ///
     /// # Errors
-    /// If the store cannot be listed or a file cannot be removed.
+    /// If the store cannot be listed or a file cannot be removed. Others may have been removed by
+    /// then.
     pub async fn remove_cut_off(&self, age: Duration) -> Result<usize, BlobError> {
         let root = self.folder.join("jobs");
         in_background(move || {

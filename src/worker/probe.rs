@@ -40,8 +40,10 @@ impl StoreProbe {
         &self.health
     }
 
-    /// Runs a probe, or waits for the one that is running, for 10 s at most. Returns whether the
-    /// queue and the blob store work. A probe that takes longer counts as a failure.
+    /// Writes and reads the blob store and the queue, and returns whether both work.
+    ///
+    /// Calls run one after the other, each for at most 10 s. A probe that takes longer counts as a
+    /// failure. It goes on in the background, and the next call waits for it instead of a new one.
     pub async fn ask(&self) -> bool {
         let mut asking = self.asking.lock().await;
         let handle = asking.get_or_insert_with(|| {

@@ -25,10 +25,11 @@ use crate::storage::Blobs;
 /// Options of a worker.
 #[derive(Clone, Debug)]
 pub struct WorkerOptions {
-    /// Interval between the snapshots of a running fit.
+    /// Minimum interval between the snapshots of a running fit.
     pub snapshot_interval: Duration,
-    /// The device kind for jobs that do not fit into this device's memory; `None` if there is no
-    /// other.
+    /// The other device kind of the server. A job that does not fit into this device's memory and
+    /// requires no kind is requeued for it. If this is `None`, or the job requires a kind, the job
+    /// fails.
     pub overflow_kind: Option<DeviceKind>,
 }
 
@@ -39,7 +40,7 @@ pub struct Drain {
     pub stop: CancellationToken,
     /// Running jobs are interrupted and go back to the queue: a fit after a snapshot, a
     /// densification at once. An object search goes on to its end, and so does a fit that its
-    /// deadline has shortened.
+    /// deadline has shortened. Cancel `stop` first, or workers lease the jobs again.
     pub release: CancellationToken,
 }
 
@@ -54,7 +55,8 @@ const PATIENCE_ALONE: Duration = Duration::from_secs(30);
 /// Interval between the checks and heartbeats of a waiting job.
 const POLL_INTERVAL: Duration = Duration::from_millis(200);
 
-/// A worker and its dependencies.
+/// Leases jobs from the queue and runs them on one lane ([`Worker::run`]). The fields are its
+/// dependencies, which clones share.
 #[derive(Clone)]
 pub struct Worker {
     /// The job queue.
@@ -65,9 +67,9 @@ pub struct Worker {
     pub lane: Lane,
     /// The cost model, which learns from the measured times.
     pub cost: Arc<CostModel>,
-    /// The metrics.
+    /// The metrics that the worker updates.
     pub metrics: Arc<Metrics>,
-    /// Options of the worker.
+    /// The snapshot interval, and where jobs go that need more memory.
     pub options: WorkerOptions,
     /// The shutdown signals.
     pub drain: Drain,

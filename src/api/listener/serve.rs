@@ -136,7 +136,7 @@ pub(crate) struct HasRoom;
 /// Time that an evicted connection has to close.
 const EVICTION: Duration = Duration::from_millis(200);
 
-/// A bound port.
+/// A bound TCP port, which [`Listener::serve`] serves over HTTP/1.1 and HTTP/2.
 pub struct Listener {
     listener: TcpListener,
     tls: Option<TlsAcceptor>,
@@ -225,7 +225,8 @@ impl Listener {
         })
     }
 
-    /// The local address of the port.
+    /// The local address of the port, with the port number that the system chose if 0 was asked
+    /// for.
     ///
     /// # Errors
     /// The error of the operating system.

@@ -26,8 +26,9 @@ pub struct CpuBackend {
 }
 
 impl CpuBackend {
-    /// A backend with the machine's fastest instruction set on `threads` threads, or on one thread
-    /// per core if none or zero.
+    /// A backend with the machine's fastest instruction set on `threads` threads. None or zero
+    /// stands for the default of rayon: the environment variable `RAYON_NUM_THREADS` if it is set,
+    /// else one thread per logical core.
     ///
     /// # Errors
     /// [`BackendError::Threads`] if the operating system cannot start the threads.
@@ -35,7 +36,7 @@ impl CpuBackend {
         Self::with_isa(Isa::available()[0], threads)
     }
 
-    /// As [`Self::new`], with the instruction set `isa`.
+    /// A backend with the instruction set `isa`, on `threads` threads as in [`Self::new`].
     ///
     /// # Errors
     /// [`BackendError::Threads`] if the operating system cannot start the threads.

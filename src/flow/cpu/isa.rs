@@ -13,7 +13,8 @@ pub enum Isa {
 }
 
 impl Isa {
-    /// The instruction sets that this machine supports, fastest first.
+    /// The instruction sets that this machine supports, fastest first. The last one is always
+    /// [`Self::Portable`].
     pub fn available() -> Vec<Self> {
         let mut sets = Vec::new();
         #[cfg(target_arch = "x86_64")]
@@ -29,7 +30,7 @@ impl Isa {
         sets
     }
 
-    /// The name shown in reports and by `fnsf doctor`.
+    /// The name shown in reports and by `fnsf doctor`: `AVX-512`, `AVX2 + FMA` or `portable`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Avx512 => "AVX-512",

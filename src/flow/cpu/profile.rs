@@ -35,8 +35,8 @@ pub struct NetworkWorkload {
 }
 
 impl NetworkWorkload {
-    /// A random network and `points` random points, for the kernels of `isa`. They are the same at
-    /// every call.
+    /// A random network and `points` random points, for the kernels of `isa`. The seed is fixed, so
+    /// every call gives the same network and the same points.
     ///
     /// # Panics
     /// If `isa` is not one of [`Isa::available`].
@@ -87,9 +87,9 @@ impl NetworkWorkload {
 /// Benchmark of the peak arithmetic throughput of one thread.
 ///
 /// Runs `rounds` rounds of 12 independent multiply-adds on full vector registers of `isa`, on the
-/// calling thread. Returns the number of floating-point operations: two per multiply-add and
-/// element of a register. Divided by the time that the caller measures, it is the peak in
-/// operations per second.
+/// calling thread. Returns the number of floating-point operations: two for each element of a
+/// register in each multiply-add. The caller measures the time. The number over the time in seconds
+/// is the peak in operations per second.
 ///
 /// # Panics
 /// If `isa` is not one of [`Isa::available`].

@@ -2,10 +2,11 @@
 
 use super::point::Point;
 
-/// The points of a neighbor sweep that an estimate uses, in the target's frame.
+/// A neighbor sweep, transformed into the target's frame, for an object search.
 #[derive(Clone, Debug)]
 pub struct AlignedSweep {
-    /// K points that are not ground, metres, in the target's frame.
+    /// K points, metres, in the target's frame: those that are finite, within the crop and not
+    /// excluded as ground.
     pub points: Vec<Point>,
     /// Time of the sweep after the source, in sweep intervals; negative for a sweep before the
     /// source.

@@ -18,11 +18,13 @@ pub(crate) struct Envelope {
     pub(crate) body: Option<usize>,
 }
 
-/// The reason why the bytes of a snapshot or of a motion field were rejected. Such bytes are a
-/// magic number of 8 bytes, a format version, a body and a checksum.
+/// The reason why the bytes of a snapshot or of a motion field were rejected.
+///
+/// The bytes consist of a magic number of 8 bytes, a format version, a body and a checksum.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum EnvelopeError {
-    /// The magic number does not match: the bytes are of another format.
+    /// The bytes do not begin with the format's magic number: they are of another format, or fewer
+    /// than 8.
     #[error("the bytes are something else")]
     Magic,
     /// Written as another version of the format.
@@ -33,7 +35,7 @@ pub enum EnvelopeError {
         /// The version that this program reads.
         expected: u32,
     },
-    /// The length does not match the format's fixed length.
+    /// The length is not the fixed length of the format. Only snapshots have a fixed length.
     #[error("{bytes} bytes, {expected} are expected")]
     Length {
         /// Actual number of bytes.
@@ -41,7 +43,7 @@ pub enum EnvelopeError {
         /// Expected number of bytes.
         expected: usize,
     },
-    /// The checksum does not match, bytes are missing or left over, or a number is invalid.
+    /// The checksum does not match, bytes are missing or left over, or a value is invalid.
     #[error("the bytes are damaged")]
     Damaged,
 }

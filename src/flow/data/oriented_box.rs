@@ -10,16 +10,16 @@ use super::point::Point;
 /// Most edges of a hull that are tried.
 const MOST_EDGES: usize = 256;
 
-/// An upright bounding box: rotated about the z axis only.
+/// The upright bounding box of a set of points, rotated about the z axis only.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct OrientedBox {
     /// Center of the box, metres.
     pub center: Point,
-    /// Length along `yaw`, width across it, and height, metres. The length is the longer side,
-    /// except in a box that is aligned with a motion.
+    /// Length along `yaw`, width across it, and height along z, metres. The length is the longer
+    /// side, except in a box that is aligned with a motion. Zero along an axis without extent.
     pub size: Point,
-    /// Angle from the x axis to the direction of the length, counterclockwise, in (-pi, pi],
-    /// radians.
+    /// Angle from the x axis to the direction of the length, radians, counterclockwise, in (-pi,
+    /// pi]. It is between -pi/2 and pi/2 in a box that is not aligned with a motion.
     pub yaw: f32,
 }
 

@@ -1,15 +1,15 @@
 //! Points and rigid transforms.
 
-/// A point or a displacement: x, y, z in metres unless said otherwise (x forward, y left, z up in
-/// lidar convention).
+/// A point or a displacement: x, y, z, in metres unless said otherwise. In a sensor frame x points
+/// forward, y left and z up.
 pub type Point = [f32; 3];
 
 /// A rigid transform: a rotation, then a translation in metres. An ego motion is given as
 /// `target_from_source`, which takes coordinates in the source's frame to the target's frame.
 pub type RigidTransform = nalgebra::Isometry3<f64>;
 
-/// Residual motion within one sweep interval from which a point counts as moving, metres (Argoverse
-/// 2).
+/// Threshold of moving points, metres (Argoverse 2). A point is dynamic if its residual motion in
+/// one sweep interval is at least this long.
 pub const DYNAMIC_M: f32 = 0.05;
 
 /// `point` transformed by `motion`, computed in double precision.
@@ -54,8 +54,8 @@ pub(crate) fn transform_points(motion: &RigidTransform, points: &[Point]) -> Vec
         .collect()
 }
 
-/// Minimum number of points of each cloud that take part in an estimate; fewer do not determine a
-/// motion.
+/// Minimum number of points of each cloud that take part in an estimate; fewer points do not
+/// determine a rigid motion.
 pub const MIN_POINTS: usize = 3;
 
 #[cfg(test)]

@@ -8,9 +8,10 @@ pub enum StopReason {
     Completed,
     /// The early-stopping rule ended the fit.
     Converged,
-    /// The fit did all iterations.
+    /// The fit did its maximum number of iterations.
     MaxIterations,
-    /// The deadline passed, or shortened the method. The flow is the best so far.
+    /// The deadline ended, shortened or prevented the method. The flow is the best that the time
+    /// allowed.
     Deadline,
 }
 

@@ -45,7 +45,8 @@ pub enum PlanError {
 /// Maximum number of substeps.
 const MOST_SUBSTEPS: usize = 64;
 
-/// How the sweeps of a sequence are transformed into one cloud.
+/// The plan of a densification: the number of sweeps, the reference time, the treatment of later
+/// sweeps and the number of Euler steps. It determines which motion fields are needed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Plan {
     pub(super) sweeps: usize,
@@ -60,7 +61,11 @@ pub struct Plan {
 impl Plan {
     /// Plans to transform all of `sweeps` sweeps into the frame of `reference_time`. The reference
     /// time is counted in sweeps from 0, and may lie between two sweeps: 4.5 is half way from sweep
-    /// 4 to sweep 5. Each step from sweep to sweep is integrated in `substeps` Euler steps.
+    /// 4 to sweep 5. `later` selects how the sweeps after it are transformed.
+    ///
+    /// Each step from one sweep to the next or the previous one takes `substeps` Euler steps of
+    /// equal length. The last, partial step to a reference time between two sweeps is a single
+    /// Euler step. Inverses of fields ([`LaterSweeps::Inverse`]) do not use `substeps`.
     ///
     /// # Errors
     /// - [`PlanError::TooFewSweeps`] if there are fewer than two sweeps.

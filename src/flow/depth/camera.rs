@@ -51,8 +51,7 @@ pub enum CameraError {
     /// The 3 x 3 matrix is not of the form fx 0 cx, 0 fy cy, 0 0 1.
     #[error("the camera matrix is not fx 0 cx, 0 fy cy, 0 0 1: rectify skewed or scaled images")]
     Matrix,
-    /// The pose is not finite, its rotation is not a unit quaternion, or the translation is over 1
-    /// km.
+    /// The translation is not finite or longer than 1 km, or the rotation is not a unit quaternion.
     #[error("camera_from_lidar is not a rigid transform of finite numbers within {MAX_MOUNT_M} m")]
     Pose,
 }
@@ -105,10 +104,11 @@ impl Camera {
     /// # Errors
     /// - [`CameraError::Size`] if a side is not 1 to [`MAX_SIDE_PX`] pixels, or the image has more
     ///   than 2^26 pixels.
-    /// - [`CameraError::Intrinsic`] if a focal length is not above 0 and at most 1e6 pixels, or a
-    ///   coordinate of the principal point is not within 1e6 pixels of zero.
+    /// - [`CameraError::Intrinsic`] if a focal length is not a positive number of at most 1e6
+    ///   pixels. Also if a coordinate of the principal point is not a number or is larger in
+    ///   magnitude than 1e6 pixels.
     /// - [`CameraError::Pose`] if the translation is not finite or longer than 1 km, or the norm of
-    ///   the rotation's quaternion differs from 1 by more than 1e-6.
+    ///   the rotation's quaternion is not within 1e-6 of 1.
     pub fn new(
         intrinsics: Intrinsics,
         camera_from_lidar: RigidTransform,
@@ -158,7 +158,7 @@ impl Camera {
         self.intrinsics
     }
 
-    /// The transform from the lidar's frame to the camera's, metres.
+    /// The transform from the lidar's frame to the camera's, with the translation in metres.
     pub fn camera_from_lidar(&self) -> &RigidTransform {
         &self.camera_from_lidar
     }
@@ -173,9 +173,11 @@ impl Camera {
         self.height
     }
 
-    /// Column, row and depth (metres along the optical axis) of the pixel that a point of the
-    /// lidar's frame falls on. None if the point is not finite, less than 0.1 m in front of the
-    /// camera, or outside the image.
+    /// The pixel that a point of the lidar's frame, metres, falls on: its column, its row and the
+    /// point's depth. The depth is measured along the optical axis, metres.
+    ///
+    /// None if the point is not finite, its depth is less than 0.1 m, or it falls outside the
+    /// image. Points behind the camera have a negative depth.
     pub fn pixel(&self, point: Point) -> Option<(usize, usize, f32)> {
         let seen = self.camera_from_lidar * Point3::from(point.map(f64::from));
         if !(seen.z >= NEAR_M && seen.z.is_finite()) {

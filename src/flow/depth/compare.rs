@@ -19,13 +19,13 @@ pub struct SizeMismatch {
 }
 
 /// Errors of a depth image against the ground truth, over the pixels with a depth in both images.
-/// Means, median and shares of these pixels are NaN if there are none.
+/// Without such pixels all means, the median and `within_5_percent` are NaN.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DepthErrors {
     /// Number of pixels with a depth in both images.
     pub pixels: usize,
     /// Share of the pixels with a true depth that have a depth in the evaluated image, 0 to 1. NaN
-    /// if the ground truth is empty.
+    /// if no pixel has a true depth.
     pub coverage: f64,
     /// Mean absolute error, metres.
     pub mean_m: f64,

@@ -13,11 +13,13 @@ use super::image::DepthImage;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Occlusion {
     /// Search radius, pixels: the window is a square that extends this far to each side of a pixel.
+    /// With 0 no pixel has a nearer one. The time grows with the square of the radius.
     pub reach_px: usize,
     /// A pixel of the window counts as nearer if its depth is smaller by more than this fraction of
     /// the central pixel's depth, 0 to 1.
     pub nearer: f32,
-    /// Number of the four quadrants of the window, 1 to 4, that must contain a nearer pixel.
+    /// Number of the four quadrants of the window, 1 to 4, that must contain a nearer pixel. With 0
+    /// every pixel is hidden, with more than 4 none.
     pub quadrants: u32,
 }
 
@@ -47,9 +49,10 @@ impl DepthImage {
     /// The image without hidden pixels: points that were seen through the gaps of a nearer surface.
     /// Their depths are 0 in the result.
     ///
-    /// A pixel is hidden if enough of the four quadrants around it contain a nearer pixel. One side
-    /// alone does not count, so the road keeps its horizon and a wall its edge beside a car. Runs
-    /// on the rayon pool of the calling thread.
+    /// A pixel is hidden if at least [`Occlusion::quadrants`] of the four quadrants around it
+    /// contain a nearer pixel. With the default of four, nearer pixels on one side alone do not
+    /// hide it. The road therefore keeps its horizon, and a wall its edge beside a car. Runs on the
+    /// rayon pool of the calling thread.
     pub fn without_occluded(&self, occlusion: &Occlusion) -> DepthImage {
         let width = (self.width as usize).max(1);
         let metres = (0..self.metres.len()).into_par_iter().map(|index| {

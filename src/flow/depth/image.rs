@@ -38,8 +38,8 @@ impl DepthImage {
 }
 
 /// Projects points of the lidar's frame (N x 3, metres) into the camera. Each pixel keeps the
-/// smallest depth of the points that fall on it. Points that are not finite, less than 0.1 m in
-/// front of the camera, or outside its image are left out.
+/// smallest depth of the points that fall on it, and is 0 where none does. A point is left out if
+/// it is not finite, outside the image, behind the camera, or less than 0.1 m in front of it.
 pub fn project(points: &[Point], camera: &Camera) -> DepthImage {
     let mut image = DepthImage::empty(camera.width(), camera.height());
     let width = camera.width() as usize;

@@ -22,6 +22,8 @@ use crate::flow::data::{Control, Point};
 /// the [`Grid`]. A brick is active, that is stored, if one of its vertices lies within
 /// [`DistanceOptions::band_m`] of a vertex that is nearest to a target point. Within the band the
 /// distance at a vertex is exact up to its rounding to 16 bits: 0.03 mm steps for a band of 2 m.
+/// For [`Sites::Points`] this holds up to one cell less than the band.
+///
 /// Beyond the band a coarse field takes over, with a vertex every 8 cells or more. Its distances
 /// are approximate and never shorter than the band. Between vertices, distances are interpolated
 /// trilinearly. The result has the same bits for any number of threads.
@@ -39,8 +41,8 @@ pub struct Bricks {
 
 impl Bricks {
     /// Builds the transform of `target` (M x 3, metres) on a grid that covers `target` and `source`
-    /// (N x 3, metres). `source` affects only the size of the grid. Coordinates must not be NaN.
-    /// `options.metric` is ignored.
+    /// (N x 3, metres). `source` affects only the size of the grid. Coordinates must not be NaN:
+    /// this is not checked, and the distances would be wrong. `options.metric` is ignored.
     ///
     /// Runs on the rayon pool of the calling thread. `control` is checked before each part of the
     /// work, from any of the threads: a block of 64 x 64 x 64 vertices, a slab of the coarse field,
@@ -90,7 +92,15 @@ impl Bricks {
         })
     }
 
-    /// Distance and gradient at `point`, in metres, by trilinear interpolation.
+    /// The distance from `point` (x, y, z in metres) to the target, and its gradient.
+    ///
+    /// The distance, metres, is interpolated trilinearly between the vertices of the grid. The
+    /// gradient is the derivative of that interpolation and has no unit. Outside the grid the
+    /// distance is that of the nearest position on the grid's border. The gradient is then zero
+    /// along each axis on which the point lies outside. A NaN coordinate gives a NaN distance.
+    ///
+    /// Beyond the band the distances at the vertices come from the coarse field. They are
+    /// approximate, and never below [`DistanceOptions::band_m`], rounded to whole cells.
     #[inline]
     pub fn sample(&self, point: Point) -> Sample {
         let cell = self.lattice.locate(point);
@@ -122,7 +132,8 @@ impl Bricks {
         self.index.active
     }
 
-    /// Bytes that the transform occupies.
+    /// Bytes of memory that the transform occupies: the index and distances of its bricks, and the
+    /// coarse field.
     pub fn bytes(&self) -> usize {
         self.index.bytes()
             + self.codes.len() * size_of::<u16>()

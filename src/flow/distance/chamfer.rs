@@ -32,9 +32,10 @@ pub struct DenseChamfer {
 
 impl DenseChamfer {
     /// Builds the transform of `target` (M x 3, metres) on a grid that covers `target` and `source`
-    /// (N x 3, metres). Coordinates must not be NaN. Only `cell_m` and `max_bytes` of `options`
-    /// have an effect, but `band_m` is checked as well. Runs on the calling thread. Six raster
-    /// passes cross the grid, two along each axis, and each checks `control` before every plane.
+    /// (N x 3, metres). Coordinates must not be NaN: this is not checked, and the distances would
+    /// be wrong. Only `cell_m` and `max_bytes` of `options` have an effect, but `band_m` is checked
+    /// as well. Runs on the calling thread. Six raster passes cross the grid, two along each axis,
+    /// and each checks `control` before every plane.
     ///
     /// # Errors
     /// - [`DistanceError::Cell`] if `options.cell_m` is not finite or below 0.001 m.
@@ -42,7 +43,8 @@ impl DenseChamfer {
     /// - [`DistanceError::EmptyTarget`] if `target` has no points.
     /// - [`DistanceError::Extent`] if both clouds together span more than [`Grid::MAX_EXTENT_M`]
     ///   along an axis, or a coordinate is infinite.
-    /// - [`DistanceError::Memory`] if 4 bytes a vertex are more than `options.max_bytes`.
+    /// - [`DistanceError::Memory`] if 4 bytes a vertex are more than `options.max_bytes` or
+    ///   [`isize::MAX`].
     /// - [`DistanceError::Interrupted`] if `control` interrupts.
     pub fn build(
         source: &[Point],
@@ -93,7 +95,12 @@ impl DenseChamfer {
         Ok(grid)
     }
 
-    /// Distance and gradient at `point`, in metres, by trilinear interpolation.
+    /// The distance from `point` (x, y, z in metres) to the target, and its gradient.
+    ///
+    /// The distance, metres, is interpolated trilinearly between the vertices of the grid. The
+    /// gradient is the derivative of that interpolation and has no unit. Outside the grid the
+    /// distance is that of the nearest position on the grid's border. The gradient is then zero
+    /// along each axis on which the point lies outside. A NaN coordinate gives a NaN distance.
     #[inline]
     pub fn sample(&self, point: Point) -> Sample {
         let cell = self.lattice.locate(point);
@@ -113,7 +120,7 @@ impl DenseChamfer {
         &self.grid
     }
 
-    /// Bytes that the transform occupies.
+    /// Bytes of memory that the transform occupies: 4 for each vertex of the grid.
     pub fn bytes(&self) -> usize {
         self.distances.len() * size_of::<f32>()
     }

@@ -20,25 +20,27 @@ const FAR_VERTEX: f64 = 2.7e3;
 /// As [`BRICK`], for a cell of the dense transform.
 const DENSE_CELL: f64 = 5e3;
 
-/// The predicted cost of a distance transform.
+/// The predicted memory and computing time of a distance transform.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TransformCost {
     /// Number of stored bricks; 0 for [`Metric::Chamfer`].
     pub bricks: usize,
-    /// Bytes that the transform will occupy.
+    /// Bytes that the finished transform occupies.
     pub bytes: usize,
     /// Predicted peak memory of the build, bytes, without the small buffers of each thread.
     pub peak_bytes: usize,
-    /// Computing time, as the number of the network's multiply-adds that take equally long.
+    /// Predicted computing time, in multiply-adds: the number of multiply-adds of the network's fit
+    /// that take as long as the build. It is computed with constants measured on a CPU.
     pub multiply_adds: f64,
 }
 
 impl DistanceTransform {
-    /// The predicted cost of [`Self::build`] with the same arguments. Plans the transform but
-    /// computes no distances.
+    /// Predicts the memory and time of [`Self::build`] with the same arguments. It plans
+    /// the grid and its bricks but computes no distances.
     ///
     /// # Errors
-    /// [`DistanceError`] as [`Self::build`], but never [`DistanceError::Interrupted`].
+    /// [`DistanceError::Cell`], [`DistanceError::Band`], [`DistanceError::EmptyTarget`],
+    /// [`DistanceError::Extent`] or [`DistanceError::Memory`] where [`Self::build`] returns them.
     pub fn predict_cost(
         source: &[Point],
         target: &[Point],

@@ -32,8 +32,8 @@ impl Grid {
 
     /// The grid that covers `source` (N x 3, metres) and `target` (M x 3, metres), with cells of
     /// `cell` metres. As in the published code, it extends at least one cell beyond the clouds on
-    /// every side. `cell` must be at least 0.001, and coordinates must not be NaN; neither is
-    /// checked.
+    /// every side. `cell` must be at least 0.001, and coordinates must not be NaN. Neither is
+    /// checked, and the grid would be wrong.
     ///
     /// # Errors
     /// - [`DistanceError::EmptyTarget`] if `target` has no points.

@@ -20,27 +20,30 @@ pub enum Sites {
     Points,
 }
 
-/// Options of the distance transform.
+/// Options of the distance transform. They are checked when a transform is built or its cost is
+/// predicted.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DistanceOptions {
-    /// The distance metric.
+    /// The distance metric. Default: [`Metric::Euclidean`].
     pub metric: Metric,
-    /// The sites that distances are measured to. Used by [`Metric::Euclidean`] only.
+    /// The sites that distances are measured to. Used by [`Metric::Euclidean`] only. Default:
+    /// [`Sites::Cells`].
     pub sites: Sites,
-    /// Edge of a cell, metres, at least 0.001. FNSF Section 4: 0.1.
+    /// Edge of a cell, metres, at least 0.001. Default: 0.1, as in FNSF Section 4.
     pub cell_m: f64,
-    /// Radius of the band around the target in which distances are exact, metres. Rounded to whole
-    /// cells, it must be 1 to [`Self::MAX_BAND_CELLS`] cells. [`Metric::Chamfer`] checks it but
-    /// does not use it.
+    /// Radius of the band around the target in which distances are exact, metres. It is rounded to
+    /// whole cells, and must then be 1 to [`Self::MAX_BAND_CELLS`] cells. It is checked for
+    /// [`Metric::Chamfer`] too, which has no band. Default: 2.
     pub band_m: f64,
-    /// Limit on the memory of the transform, bytes; more is refused with [`DistanceError::Memory`].
-    /// For [`Metric::Euclidean`] it includes the working memory of the build, except for 12 bytes a
-    /// target point.
+    /// Limit on the memory of the transform, bytes. If more is needed, the build fails with
+    /// [`DistanceError::Memory`]. For [`Metric::Euclidean`] it includes the working memory of the
+    /// build, except for 12 bytes a target point and small buffers of each thread. Default: 8 GiB.
     pub max_bytes: usize,
 }
 
 impl DistanceOptions {
-    /// The band's largest radius in cells. Sums of squared offsets then stay within 16 bits.
+    /// The largest radius of the band, in cells. It keeps squared distances, in square cells,
+    /// within 16-bit integers.
     pub const MAX_BAND_CELLS: f64 = 64.0;
 
     /// The band's radius in whole cells.
@@ -79,16 +82,16 @@ impl Default for DistanceOptions {
     }
 }
 
-/// Why a distance transform was refused.
+/// Why a distance transform, its grid or the prediction of its cost failed.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum DistanceError {
-    /// The cell's edge is not finite, or below 0.001 m.
+    /// [`DistanceOptions::cell_m`] is not finite, or below 0.001 m.
     #[error("a cell of {cell_m} m is not possible: choose at least 0.001 m")]
     Cell {
         /// The requested edge, metres.
         cell_m: f64,
     },
-    /// The band's radius, rounded to whole cells, is not 1 to 64 cells.
+    /// [`DistanceOptions::band_m`] is not finite, or, rounded to whole cells, is not 1 to 64 cells.
     #[error("a band of {band_m} m with cells of {cell_m} m is not possible: choose 1 to 64 cells")]
     Band {
         /// The requested radius, metres.
@@ -99,8 +102,8 @@ pub enum DistanceError {
     /// The target cloud has no points.
     #[error("the target cloud is empty")]
     EmptyTarget,
-    /// The clouds span more than [`super::Grid::MAX_EXTENT_M`] along an axis, or have no finite
-    /// extent.
+    /// Both clouds together span more than [`super::Grid::MAX_EXTENT_M`] along an axis, or a
+    /// coordinate is infinite.
     #[error(
         "the clouds span {x_m:.0} x {y_m:.0} x {z_m:.0} m, more than {limit_m:.0} m on an axis: \
          remove stray points or crop with crop_m"
@@ -124,7 +127,7 @@ pub enum DistanceError {
         /// Bytes allowed: [`DistanceOptions::max_bytes`], or a fixed limit.
         limit: usize,
     },
-    /// The control interrupted the transform.
+    /// The control interrupted the build, for the reason given.
     #[error("the distance transform was interrupted")]
     Interrupted(Interrupt),
 }

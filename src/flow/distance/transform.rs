@@ -17,9 +17,10 @@ pub enum DistanceTransform {
 
 impl DistanceTransform {
     /// Builds the transform of `target` (M x 3, metres) on a grid that covers `target` and `source`
-    /// (N x 3, metres). `source` affects only the size of the grid. Coordinates must not be NaN.
+    /// (N x 3, metres). `options.metric` selects the variant. `source` affects only the size of the
+    /// grid. Coordinates must not be NaN: this is not checked, and the distances would be wrong.
     ///
-    /// `control` is checked several times a second: see [`Bricks::build`] and
+    /// `control` is checked before each part of the work, see [`Bricks::build`] and
     /// [`DenseChamfer::build`].
     ///
     /// # Errors
@@ -28,8 +29,8 @@ impl DistanceTransform {
     /// - [`DistanceError::EmptyTarget`] if `target` has no points.
     /// - [`DistanceError::Extent`] if both clouds together span more than
     ///   [`super::Grid::MAX_EXTENT_M`] along an axis, or a coordinate is infinite.
-    /// - [`DistanceError::Memory`] if more than `options.max_bytes` are needed, or a brick
-    ///   transform's grid has more than 2^24 blocks of 64 x 64 x 64 vertices.
+    /// - [`DistanceError::Memory`] if more than `options.max_bytes` are needed. For
+    ///   [`Metric::Euclidean`] also if the grid has more than 2^24 blocks of 64 x 64 x 64 vertices.
     /// - [`DistanceError::Interrupted`] if `control` interrupts.
     pub fn build(
         source: &[Point],
@@ -45,7 +46,12 @@ impl DistanceTransform {
         })
     }
 
-    /// Distance and gradient at `point`, in metres, by trilinear interpolation.
+    /// The distance from `point` (x, y, z in metres) to the target, and its gradient.
+    ///
+    /// The distance, metres, is interpolated trilinearly between the vertices of the grid. The
+    /// gradient is the derivative of that interpolation and has no unit. Outside the grid the
+    /// distance is that of the nearest position on the grid's border. The gradient is then zero
+    /// along each axis on which the point lies outside. A NaN coordinate gives a NaN distance.
     #[inline]
     pub fn sample(&self, point: Point) -> Sample {
         match self {
@@ -54,7 +60,7 @@ impl DistanceTransform {
         }
     }
 
-    /// Bytes that the transform occupies.
+    /// Bytes of memory that the transform occupies.
     pub fn bytes(&self) -> usize {
         match self {
             Self::Bricks(bricks) => bricks.bytes(),

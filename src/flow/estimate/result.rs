@@ -9,12 +9,12 @@ use crate::flow::objects::Objects;
 pub struct Estimate {
     /// N x 3 displacements from the source sweep's time to the target's, metres, ego motion
     /// included: the position in the target's frame minus the position in the source's frame. Zero
-    /// where `valid` is false.
+    /// for points without a flow.
     pub flow: Vec<Point>,
     /// N flags: true for points with a flow.
     pub valid: Vec<bool>,
-    /// N flags: true for points whose residual motion is at least [`crate::flow::DYNAMIC_M`]. None
-    /// where `ego` is none.
+    /// N flags: true for points whose residual motion is at least [`crate::flow::DYNAMIC_M`]. False
+    /// for points without a flow. None if `ego` is none.
     pub dynamic: Option<Vec<bool>>,
     /// The ego motion as target_from_source. None with [`crate::flow::Ego::Off`], and where a
     /// deadline left no time to estimate it.
@@ -29,7 +29,7 @@ pub struct Estimate {
     /// Name of the processor that ran the method, for reports: the device of a field, or the host's
     /// threads for objects.
     pub device: String,
-    /// Seconds before the method could begin, by the control's clock: selection, ground
+    /// Seconds of all stages before the method, by the control's clock: selection, ground
     /// segmentation, distance transform, ego motion and the registration of neighbor sweeps. Zero
     /// if the control keeps no time.
     pub precompute_seconds: f64,
@@ -66,9 +66,9 @@ impl Estimate {
 /// Results of a method besides the flow.
 #[derive(Clone, Debug)]
 pub enum Solution {
-    /// Of [`crate::flow::Method::Objects`].
+    /// The outcome of [`crate::flow::Method::Objects`].
     Objects(ObjectSolution),
-    /// Of [`crate::flow::Method::Field`].
+    /// The outcome of [`crate::flow::Method::Field`].
     Field(FieldSolution),
 }
 
@@ -77,12 +77,16 @@ pub enum Solution {
 pub struct ObjectSolution {
     /// The clusters of the source with their boxes and motions.
     pub objects: Objects,
-    /// Number of candidates that were searched: all of them, unless a deadline ended the search.
+    /// Number of candidates that were searched. It is `candidates`, unless a deadline ended the
+    /// search.
     pub searched: usize,
-    /// Number of candidates: clusters before fragments of one moving object were merged.
+    /// Number of candidates: clusters before fragments of one moving object were merged. Zero if a
+    /// deadline ended the search before or right after the clustering.
     pub candidates: usize,
-    /// Mean truncated distance of a searched cluster's points from the target after their motion,
-    /// metres, averaged over the searched clusters. Infinite where the search did not start.
+    /// Mean truncated distance of the points of a cluster from the target, metres, averaged over
+    /// the searched clusters. It is measured after the cluster's accepted motion, or at rest. Zero
+    /// if no cluster was searched; infinite if a deadline ended the search before or right after
+    /// the clustering.
     pub cost_m: f64,
 }
 
@@ -91,14 +95,14 @@ pub struct ObjectSolution {
 pub struct FieldSolution {
     /// Number of completed iterations; zero where the deadline allowed none.
     pub iterations: usize,
-    /// Iteration limit of this fit. A warm start or a deadline can make it differ from
-    /// [`crate::flow::FieldOptions::max_iterations`].
+    /// Iteration limit of this fit; zero if the deadline allowed no fit. A warm start or a deadline
+    /// can make it differ from [`crate::flow::FieldOptions::max_iterations`].
     pub max_iterations: usize,
-    /// Iteration, from 1, whose field is the result; the last one for an average. Zero without an
-    /// iteration.
+    /// The iteration, counted from 1, whose field is the result. For an average it is the last one.
+    /// Zero if none was done.
     pub best_iteration: usize,
     /// Mean loss of that iteration, metres; for an average, the moving average of the losses.
-    /// Comparable within one preset and pair. Infinite without an iteration.
+    /// Comparable within one preset and pair. Infinite if no iteration was done.
     pub best_loss: f64,
     /// Bytes of the distance transform; zero where the deadline left no time for one.
     pub distance_bytes: usize,

@@ -13,8 +13,9 @@ use crate::flow::options::{Ego, Method, Options};
 use crate::flow::problem::Problem;
 use crate::flow::select::select;
 
-/// Estimates the motion of every source point. A field is fitted on `backend`; all other stages run
-/// on its [`Backend::host`].
+/// Estimates the motion of the source points that `options` select; the other points get no flow. A
+/// field and its distance transform are computed on `backend`. All other stages run on its
+/// [`Backend::host`].
 ///
 /// A deadline is not an error: the result is the best flow that the time allows.
 ///
@@ -35,7 +36,7 @@ pub fn estimate(
 }
 
 /// Resumes the fit of a field from `snapshot`. Without a deadline, the result is bit-identical to
-/// that of an uninterrupted [`estimate`] on a device that rounds alike.
+/// that of an uninterrupted [`estimate`] on a device that rounds multiply-adds alike.
 ///
 /// # Errors
 /// As [`estimate`], and [`FlowError::Snapshot`] where the snapshot belongs to another problem,

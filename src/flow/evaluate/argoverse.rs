@@ -29,9 +29,9 @@ pub struct Argoverse2 {
     /// Mean angle between estimated and true flow with 0.1 s appended to each as a fourth
     /// component, radians.
     pub angle_error: f64,
-    /// Intersection over union of the predicted and the true dynamic mask: true positives over true
-    /// positives, false positives and false negatives. None without a predicted mask, without a
-    /// true mask, or if no point is dynamic in either.
+    /// Intersection over union of the predicted and the true dynamic mask: true positives over the
+    /// sum of true positives, false positives and false negatives. None without a predicted mask,
+    /// without a true mask, or if no scored point is dynamic in either.
     pub dynamic_iou: Option<f64>,
     /// Three-way EPE over all scored points, close or far; none without the dynamic and foreground
     /// masks.

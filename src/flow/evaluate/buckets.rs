@@ -21,8 +21,9 @@ const BUCKETS: usize = 51;
 /// taken out.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Bucket {
-    /// Lower bound of the true speed, metres per sweep interval: a multiple of 0.04 up to 2. Each
-    /// bucket is 0.04 wide, the last one unbounded.
+    /// Lower bound of the true speed, metres per sweep interval: a multiple of 0.04, up to 2. The
+    /// bucket includes it and ends below the next multiple. The bucket from 2 on has no upper
+    /// bound.
     pub from: f64,
     /// Number of points in the bucket.
     pub points: usize,
@@ -38,7 +39,7 @@ pub struct ClassError {
     /// EPE of the bucket of speeds below 0.04 m per sweep interval, metres; none if it is empty.
     pub static_epe: Option<f64>,
     /// Mean of the ratio of EPE to mean speed, over the other buckets that have points; none if
-    /// they are all empty. An estimate of the ego motion alone scores 1.
+    /// they are all empty. An estimate of the ego motion alone scores 1. The ratio has no unit.
     pub dynamic_error: Option<f64>,
     /// All buckets that have points, slowest first.
     pub buckets: Vec<Bucket>,
@@ -51,8 +52,8 @@ pub struct BucketReport {
     pub classes: Vec<ClassError>,
     /// Mean static error over the classes that have one, metres; none if no class has one.
     pub static_epe: Option<f64>,
-    /// Mean dynamic error over the classes that have one, the benchmark's main score; none if no
-    /// class has one.
+    /// Mean dynamic error over the classes that have one, the benchmark's main score, without unit;
+    /// none if no class has one.
     pub dynamic_error: Option<f64>,
 }
 
@@ -78,12 +79,13 @@ impl BucketNormalized {
 
     /// Adds the scored, close points of one pair. `flow` and the true flow (N x 3, metres) include
     /// the ego motion. `covered` (N flags) marks the rows for which the estimate has a flow.
-    /// `class` holds N class indices, or [`UNCLASSIFIED`].
+    /// `class` holds N class indices, each below the number of classes or [`UNCLASSIFIED`].
     ///
     /// # Errors
     /// - [`EvaluateError::Length`] if the arrays have different lengths.
     /// - [`EvaluateError::Missing`] if `truth` has no source cloud or no ego motion.
-    /// - [`EvaluateError::UnknownClass`] if a class index is out of range.
+    /// - [`EvaluateError::UnknownClass`] if a class index is neither below the number of classes
+    ///   nor [`UNCLASSIFIED`].
     ///
     /// Nothing is added then.
     pub fn add(
@@ -122,7 +124,8 @@ impl BucketNormalized {
         Ok(())
     }
 
-    /// The report over all pairs added so far.
+    /// The report over all pairs added so far. Without points its classes have no errors and no
+    /// buckets.
     pub fn finish(&self) -> BucketReport {
         let classes: Vec<ClassError> = self.cells.iter().map(class_error).collect();
         let static_epe = mean(classes.iter().filter_map(|class| class.static_epe));

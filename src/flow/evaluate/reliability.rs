@@ -15,6 +15,9 @@ const BINS: usize = 10;
 const CELLS: usize = 1000 * BINS;
 
 /// Accumulator of confidences and end-point errors over many pairs, in constant memory.
+///
+/// Confidences are counted in 10,000 cells of equal width. Points in the same cell are not
+/// distinguished: each counts with the mean error of its cell.
 #[derive(Clone, Debug)]
 pub struct Reliability {
     cells: Vec<Cell>,
@@ -37,12 +40,13 @@ pub struct Calibration {
     /// Expected calibration error, 0 to 1: the mean absolute difference between the confidence and
     /// the share of correct points over the bins, weighted by points (Guo et al. 2017).
     pub error: f64,
-    /// EPE of the half of the points with the higher confidence, metres.
+    /// EPE of the half of the points with the higher confidence, metres. A cell across the boundary
+    /// between the halves counts partly in each, with its mean error.
     pub sure_half_epe: f64,
     /// EPE of the other half, metres.
     pub rest_epe: f64,
-    /// Those of the ten bins of confidence, each 0.1 wide, that have points, lowest confidence
-    /// first.
+    /// The bins of the reliability diagram that have points, lowest confidence first. There are ten
+    /// bins, each 0.1 wide.
     pub bins: Vec<CalibrationBin>,
 }
 
@@ -66,7 +70,9 @@ impl Default for Reliability {
 }
 
 impl Reliability {
-    /// Adds a point with a confidence of 0 to 1 and an end-point error of `error_m` metres.
+    /// Adds a point with a confidence of 0 to 1 and an end-point error of `error_m` metres. A lower
+    /// confidence counts in the first bin, a higher one in the last. The values must not be NaN,
+    /// because the results that use them would be NaN.
     pub fn add(&mut self, confidence: f64, error_m: f64) {
         let cell = ((confidence * CELLS as f64) as usize).min(CELLS - 1);
         let cell = &mut self.cells[cell];
@@ -76,9 +82,10 @@ impl Reliability {
         cell.points += 1.0;
     }
 
-    /// Adds the scored points of one pair, with its flow (N x 3, metres) and N confidences.
+    /// Adds the scored points of one pair, with its flow (N x 3, metres) and N confidences, 0 to 1.
     /// `covered` (N flags) marks the rows for which the estimate has a flow. Points are scored
-    /// under the same conditions as for [`super::Metrics`].
+    /// under the same conditions as for [`super::Metrics`]. Confidences out of range are treated as
+    /// in [`Self::add`].
     ///
     /// # Errors
     /// [`EvaluateError::Length`] if the arrays have different lengths; nothing is added then.

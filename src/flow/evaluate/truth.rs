@@ -56,13 +56,14 @@ pub struct Truth<'a> {
     pub ground: Option<&'a [bool]>,
     /// Source points, N x 3 metres, in the sensor's frame. They determine which points are close.
     pub source: Option<&'a [Point]>,
-    /// Ego motion as target_from_source, which maps a static source point into the target's frame.
+    /// Ego motion as target_from_source, translation in metres. It maps a static source point into
+    /// the target's frame.
     pub ego: Option<&'a RigidTransform>,
 }
 
 impl<'a> Truth<'a> {
     /// Truth of a flow (N x 3, metres) and its valid mask (N flags) alone. Metrics that need more
-    /// are then omitted.
+    /// are then none, and [`super::BucketNormalized::add`] fails.
     pub fn new(flow: &'a [Point], valid: &'a [bool]) -> Self {
         Self {
             flow,

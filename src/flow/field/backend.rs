@@ -16,7 +16,8 @@ pub trait Backend: Send + Sync {
     fn host(&self) -> &Host;
 
     /// Builds the distance transform of `target` (M x 3, metres) on a grid that covers `target` and
-    /// `source` (N x 3, metres), both in the same frame. Checks `control` several times a second.
+    /// `source` (N x 3, metres), both in the same frame. Coordinates must not be NaN.
+    /// Checks `control` before each part of the work.
     ///
     /// # Errors
     /// - [`BackendError::Distance`] if the clouds or the options are refused, see
@@ -25,8 +26,10 @@ pub trait Backend: Send + Sync {
     /// - [`BackendError::Unsupported`] if the device lacks the metric or the sites of `options`. A
     ///   GPU has only [`crate::flow::distance::Metric::Euclidean`] with
     ///   [`crate::flow::distance::Sites::Cells`].
-    /// - [`BackendError::Memory`] if the transform and N points can never fit in the GPU's memory.
-    /// - [`BackendError::Busy`] if other pairs occupy that memory and release too little of it.
+    /// - [`BackendError::Memory`] if the transform and N points do not fit in the memory that the
+    ///   GPU allocated when it was opened, or a temporary buffer exceeds the GPU's largest buffer.
+    /// - [`BackendError::Busy`] if other pairs occupy that memory and release too little of it, or
+    ///   the GPU has no free memory for a temporary buffer.
     /// - [`BackendError::Lost`] or [`BackendError::Device`] if the GPU fails.
     fn transform(
         &self,
@@ -47,13 +50,14 @@ pub trait Backend: Send + Sync {
 /// The distance transform of a target cloud in a device's memory (FNSF Section 3.2).
 ///
 /// It gives the distance to the target, metres, sampled on a grid and interpolated trilinearly. A
-/// point outside the grid gets the value at the grid's border. All points are in the frame of the
-/// two clouds that it was built for. Dropping it frees the memory.
+/// point outside the grid gets the distance at the nearest position on the grid's border. All
+/// points are in the frame of the two clouds that it was built for. Dropping it frees the memory.
 pub trait Transform: Send {
-    /// Bytes that the transform occupies on the device.
+    /// Bytes of the device's memory that the transform occupies, without the source points.
     fn bytes(&self) -> usize;
 
-    /// N distances to the target, metres, one for each of `points` (N x 3, metres).
+    /// N distances to the target, metres, one for each of `points` (N x 3, metres). A point outside
+    /// the grid gets the distance at the nearest position on the grid's border.
     ///
     /// # Errors
     /// [`BackendError::Memory`], [`BackendError::Busy`], [`BackendError::Lost`] or
@@ -61,11 +65,13 @@ pub trait Transform: Send {
     fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError>;
 
     /// Starts a fit of a field to `source` (N x 3, metres) and returns it before its first
-    /// iteration. `source` has at least one point, and at most as many as the source that the
-    /// transform was built for. `seed` determines the initial parameters and the batches.
+    /// iteration. `source` must have at least one point, which is not checked. It must have at most
+    /// as many points as the source that the transform was built for; only a GPU refuses more.
+    /// `seed` determines the initial parameters and the batches.
     ///
     /// # Errors
-    /// - [`BackendError::Unsupported`] if the device lacks the precision of `options`.
+    /// - [`BackendError::Unsupported`] if the device lacks the precision of `options`. A CPU has
+    ///   only single precision. Half precision needs a GPU whose matrix units pass their self-test.
     /// - [`BackendError::Memory`] if a GPU has too little memory for the points or for the
     ///   gradients of a batch.
     /// - [`BackendError::Busy`] if all lanes of a GPU are in use.
@@ -78,11 +84,13 @@ pub trait Transform: Send {
     ) -> Result<Box<dyn Trainer + '_>, BackendError>;
 }
 
-/// A fit of a field in progress, see [`Transform::start`].
+/// A fit of a field in progress: it iterates, evaluates its result, and saves and restores its
+/// state. [`Transform::start`] makes it.
 pub trait Trainer: Send {
     /// Does up to `steps` iterations and reports the progress of each to `control`. Checks
     /// `control` before each iteration, or before each group of iterations that a GPU does at once.
-    /// Returns early if a snapshot is due, but only after at least one iteration.
+    /// Returns early if the fit ends or `control` interrupts, see [`Advance`]. After at least one
+    /// iteration it also returns early if a snapshot is due.
     ///
     /// # Errors
     /// [`BackendError::Busy`], [`BackendError::Lost`] or [`BackendError::Device`] if a GPU has no
@@ -90,10 +98,12 @@ pub trait Trainer: Send {
     fn advance(&mut self, steps: usize, control: &dyn Control) -> Result<Advance, BackendError>;
 
     /// The flow of the result so far at `points` (N x 3, metres): N x 3 displacements, metres. The
-    /// points need not be those of the fit.
+    /// points need not be those of the fit. Before the first iteration the result is the network
+    /// with its initial parameters.
     ///
     /// # Errors
-    /// As [`Backend::evaluate`].
+    /// [`BackendError::Memory`], [`BackendError::Busy`], [`BackendError::Lost`] or
+    /// [`BackendError::Device`] if a GPU has no memory for the points or fails. A CPU never fails.
     fn evaluate(&mut self, points: &[Point]) -> Result<Vec<Point>, BackendError>;
 
     /// The number of iterations, the loss and the time of the distance query so far.
@@ -102,18 +112,20 @@ pub trait Trainer: Send {
     /// A copy of the state that the following iterations and the result depend on.
     ///
     /// # Errors
-    /// As [`Self::advance`].
+    /// [`BackendError::Busy`], [`BackendError::Lost`] or [`BackendError::Device`] if a GPU has no
+    /// free memory or fails. A CPU never fails.
     fn state(&mut self) -> Result<TrainerState, BackendError>;
 
-    /// Continues from `state` instead. To continue another fit with the same bits, the points and
-    /// the options must be those of that fit.
+    /// Replaces the state of this fit by `state`. To continue the fit that `state` is from with the
+    /// same bits, this fit must have the same points, options and seed.
     ///
     /// # Errors
     /// [`BackendError::Lost`] if the GPU is lost. A CPU never fails.
     fn restore(&mut self, state: TrainerState) -> Result<(), BackendError>;
 
     /// Lowers the maximum number of iterations to `max_iterations`; a larger value has no effect. A
-    /// cosine schedule then falls to zero at the new maximum.
+    /// cosine schedule then falls to zero at the new maximum. If that many iterations are already
+    /// done, the next [`Self::advance`] does none.
     fn shorten(&mut self, max_iterations: usize);
 }
 
@@ -122,17 +134,17 @@ pub trait Trainer: Send {
 pub enum Advance {
     /// All steps were done, or a snapshot is due; more iterations may follow.
     Continues,
-    /// Early stopping fired.
+    /// Early stopping ended the fit.
     Converged,
     /// The maximum number of iterations of the options, or of [`Trainer::shorten`], is done.
     Exhausted,
-    /// A loss was not finite.
+    /// The loss of an iteration was not finite. That iteration does not count as done.
     Diverged,
-    /// The control interrupted the fit.
+    /// The control interrupted the fit, for the reason given.
     Interrupted(Interrupt),
 }
 
-/// The state of a fit, for reports.
+/// How far a fit has come: its iterations, its loss, and the time of its distance queries.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FitReport {
     /// Number of iterations done.
@@ -165,7 +177,8 @@ pub enum BackendError {
     /// No device matches the request, or the driver refused to open it.
     #[error("no such device: {0}")]
     NoDevice(String),
-    /// The device does not support the options.
+    /// The device does not support the metric, the sites or the precision asked for, or a
+    /// measurement is not possible on it. The text says which.
     #[error("the device cannot do this: {0}")]
     Unsupported(&'static str),
     /// The GPU has too little memory, for its kernels when it is opened or for this pair.
@@ -178,10 +191,12 @@ pub enum BackendError {
         /// Bytes that the device has for it.
         available: u64,
     },
-    /// Other pairs occupy the memory or the lanes of the GPU that this pair needs. Retry later.
+    /// The GPU has too little free memory now, or all its lanes are in use by other pairs. Retry
+    /// later.
     #[error("the memory of the device is taken by other pairs")]
     Busy,
-    /// The GPU was lost and must be reopened before further use.
+    /// The GPU was lost and must be opened again before further use: the driver reported an error,
+    /// it did not answer in time, or it was destroyed. The text is the reason.
     #[error("the device was lost: {0}")]
     Lost(String),
     /// The GPU rejected a command: a defect of this program or of the driver.

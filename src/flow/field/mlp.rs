@@ -10,11 +10,11 @@ use crate::flow::options::{InputNormalization, Start};
 
 /// Number of features of every hidden layer.
 pub const WIDTH: usize = 128;
-/// Number of layers from 128 to 128 features.
+/// Number of middle layers. Each maps 128 features to 128 features.
 pub const MIDDLE_LAYERS: usize = 7;
 /// Number of hidden layers: the first (3 -> 128) and the middle ones.
 pub const HIDDEN_LAYERS: usize = MIDDLE_LAYERS + 1;
-/// Number of parameters of the network: 116,483.
+/// Number of parameters of the network, weights and biases of all layers: 116,483.
 pub const PARAMETERS: usize = 4 * WIDTH + MIDDLE_LAYERS * (WIDTH * WIDTH + WIDTH) + 3 * WIDTH + 3;
 
 /// Output features per panel of a middle layer's weights. A kernel reads a panel as one stream.

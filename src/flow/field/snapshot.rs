@@ -86,7 +86,7 @@ impl Snapshot {
         }
     }
 
-    /// Number of iterations done.
+    /// Number of iterations that the fit had done when it was stopped.
     pub fn iterations(&self) -> usize {
         self.state.iterations
     }
@@ -110,7 +110,7 @@ impl Snapshot {
     }
 
     /// Reads the output of [`Self::to_bytes`]. Allocates nothing before the length and the checksum
-    /// have been verified.
+    /// have been verified. [`crate::flow::resume`] checks whether the snapshot fits a problem.
     ///
     /// # Errors
     /// [`SnapshotError::Sealed`] if the bytes are not a snapshot, are of another format version, or
@@ -141,10 +141,10 @@ impl Snapshot {
     }
 }
 
-/// Why a snapshot was refused.
+/// Why a snapshot could not be read or resumed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SnapshotError {
-    /// The bytes are not a valid snapshot of this format version.
+    /// The bytes are not a snapshot, are of another format version, or are truncated or altered.
     #[error("no snapshot: {0}")]
     Sealed(#[from] EnvelopeError),
     /// The snapshot was taken with other clouds, other options or another method.

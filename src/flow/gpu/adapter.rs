@@ -5,7 +5,7 @@ use core::str::FromStr;
 
 use crate::flow::field::BackendError;
 
-/// The kind of a GPU, fastest first.
+/// The kind of an adapter. The order is that of preference, the usually fastest first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum AdapterKind {
     /// A GPU with its own memory.
@@ -21,7 +21,7 @@ pub enum AdapterKind {
 }
 
 impl AdapterKind {
-    /// The name used in reports.
+    /// The name used in reports: `discrete`, `integrated`, `virtual`, `other` or `software`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Discrete => "discrete",
@@ -33,7 +33,7 @@ impl AdapterKind {
     }
 }
 
-/// A GPU that can be opened.
+/// A GPU, or a software device, that a driver offers. [`super::Gpu::open`] opens it.
 #[derive(Clone, Debug)]
 pub struct Adapter {
     /// Its index in the list of [`adapters`], from 0.
@@ -58,18 +58,19 @@ pub struct Adapter {
     pub(super) handle: wgpu::Adapter,
 }
 
-/// Selects a GPU. Parsed from text, a number is [`Self::Index`], an empty text [`Self::Any`], and
-/// any other text [`Self::Named`].
+/// Names the GPU that [`select`] returns. Parsed from text, a number is [`Self::Index`], an empty
+/// text [`Self::Any`], and any other text [`Self::Named`]. Parsing never fails.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Selector {
-    /// The first adapter that is not a software device, unless [`select`] is told to accept those.
+    /// The first of [`adapters`] that is not a software device. If the argument `software` of
+    /// [`select`] is true, the first of any kind.
     #[default]
     Any,
     /// The adapter with this [`Adapter::index`]. If there is none, the first whose name contains
-    /// the number.
+    /// the number, such as 4090. Both may be a software device.
     Index(usize),
     /// The first adapter with this [`Adapter::pci_id`] or with this text in its name, ignoring
-    /// case.
+    /// case. It may be a software device.
     Named(String),
 }
 
@@ -95,7 +96,8 @@ impl fmt::Display for Selector {
     }
 }
 
-/// All GPUs of the machine with a driver for Vulkan, Metal or DX12, fastest kind first.
+/// All GPUs and software devices of the machine with a driver for Vulkan, Metal or DX12, in the
+/// order of [`AdapterKind`]. Empty if there are none.
 pub fn adapters() -> Vec<Adapter> {
     let mut found: Vec<_> =
         pollster::block_on(instance().enumerate_adapters(wgpu::Backends::all()))
@@ -109,8 +111,8 @@ pub fn adapters() -> Vec<Adapter> {
     found
 }
 
-/// The GPU that `selector` selects. [`Selector::Any`] selects a software device only if `software`
-/// is true.
+/// The GPU that `selector` selects among [`adapters`]. [`Selector::Any`] selects a software device
+/// only if `software` is true. The other selectors ignore `software`.
 ///
 /// # Errors
 /// [`BackendError::NoDevice`] if no adapter matches; its text lists the adapters.

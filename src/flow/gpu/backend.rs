@@ -19,13 +19,15 @@ use crate::flow::options::FieldOptions;
 pub struct Gpu(Arc<Device>);
 
 impl Gpu {
-    /// Opens a GPU, builds its kernels and allocates its memory. Starts one host thread per core.
+    /// Opens a GPU, builds its kernels and allocates its memory. Starts a pool of host threads, one
+    /// per logical core unless the environment variable `RAYON_NUM_THREADS` is set.
     ///
     /// # Errors
     /// - [`BackendError::NoDevice`] if the driver refuses to open the GPU.
-    /// - [`BackendError::Memory`] if the GPU or the requested size has too little memory, or a
+    /// - [`BackendError::Memory`] if [`GpuOptions::memory_bytes`] is below the minimum or cannot be
+    ///   allocated. Without a requested size, if even the minimum cannot be allocated. Also if a
     ///   kernel cannot bind a buffer of the minimum size.
-    /// - [`BackendError::Lost`] if the driver rejects a kernel.
+    /// - [`BackendError::Lost`] if the driver rejects a kernel or loses the GPU meanwhile.
     /// - [`BackendError::Threads`] if the operating system cannot start the threads.
     pub fn open(adapter: &Adapter, options: &GpuOptions) -> Result<Self, BackendError> {
         Device::open(adapter, options).map(|device| Self(Arc::new(device)))
@@ -38,14 +40,15 @@ impl Gpu {
         self.0.context.budget.lanes as usize
     }
 
-    /// GPU memory that was allocated when the GPU was opened, bytes.
+    /// GPU memory that was allocated when the GPU was opened, bytes. It can be less than
+    /// [`GpuOptions::memory_bytes`].
     pub fn memory_bytes(&self) -> u64 {
         self.0.context.budget.bytes()
     }
 
     /// The tile that the GPU's matrix units multiply in half precision, such as
-    /// `16x16x16 f16 -> f32`. The first call runs the self-test of the matrix units, and all calls
-    /// return its result.
+    /// `16x16x16 f16 -> f32`. The self-test of the matrix units runs once, at the first call or at
+    /// the first fit in half precision. All calls return its result.
     ///
     /// # Errors
     /// The reason why half precision is not available on this GPU, as text: a missing feature or
@@ -55,7 +58,7 @@ impl Gpu {
         Ok(units.tile.name().to_owned())
     }
 
-    /// Whether the GPU is lost and must be opened again.
+    /// Whether the GPU is lost, or was destroyed, and must be opened again.
     pub fn is_lost(&self) -> bool {
         self.0.context.watchdog.check().is_err()
     }

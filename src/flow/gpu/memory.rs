@@ -14,8 +14,9 @@ pub struct GpuOptions {
     /// allocated, or is below the minimum, is refused with [`BackendError::Memory`].
     ///
     /// None stands for 2 GiB plus 256 MiB per lane on a discrete or virtual GPU, 1 GiB on an
-    /// integrated or unknown one, and 320 MiB plus 4 MiB per lane on a software device. This size
-    /// is halved, down to the minimum, until the allocation succeeds.
+    /// integrated one or one of unknown kind, and 320 MiB plus 4 MiB per lane on a software device.
+    /// This size is halved until the allocation succeeds. Opening fails with
+    /// [`BackendError::Memory`] if the size falls below the minimum.
     pub memory_bytes: Option<u64>,
 }
 

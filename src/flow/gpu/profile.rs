@@ -24,19 +24,20 @@ const BACKWARD: f64 = FORWARD - 2.0 * (3 * WIDTH) as f64;
 /// Time and work of one kernel in one iteration of a fit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct KernelTime {
-    /// Name of the kernel: `forward`, `distance_loss`, `backward`, `gradients`, `reduce_loss`, `step`, and
-    /// `transpose` in single or `halve` in half precision.
+    /// Name of the kernel: `forward`, `distance_loss`, `backward`, `gradients`, `reduce_loss`,
+    /// `step`, and `transpose` in single or `halve` in half precision.
     pub name: &'static str,
     /// Time by GPU timestamps, seconds: the minimum over all rounds.
     pub seconds: f64,
-    /// Number of floating-point operations, two per multiply-add; zero for a kernel without matrix
-    /// products.
+    /// Number of floating-point operations of the kernel's matrix products, two per multiply-add.
+    /// Zero for a kernel without matrix products.
     pub operations: f64,
 }
 
-/// Times each kernel of an iteration over all points of `source` in one precision, in `rounds`
-/// rounds, at least one. `source` (N x 3) and `target` (M x 3) are in metres, in the same frame.
-/// The GPU should do no other work meanwhile.
+/// Times each of the seven kernels of an iteration over all points of `source`, in the precision
+/// `precision`. It repeats the iteration `rounds` times; zero counts as one. `source` (N x 3, N at
+/// least 1) and `target` (M x 3) are in metres, in the same frame. The GPU should do no other work
+/// meanwhile.
 ///
 /// # Errors
 /// - [`BackendError::Unsupported`] if the memory cannot hold all points at once, the GPU has no
@@ -145,8 +146,9 @@ fn repeated_iteration(
     })
 }
 
-/// Peak arithmetic throughput of the GPU in single precision, in floating-point operations per
-/// second. It is measured with independent multiply-adds, of two operations each.
+/// Measures the peak arithmetic throughput of the GPU in single precision and returns it in
+/// floating-point operations per second. The GPU computes independent multiply-adds, of two
+/// operations each. It should do no other work meanwhile.
 ///
 /// # Errors
 /// - [`BackendError::Unsupported`] if the GPU has no timestamps.

@@ -6,11 +6,11 @@ pub struct GroundOptions {
     /// Upper tolerance at the origin, metres: points less than this above the surface are ground.
     /// Choose it below the height of objects on the ground and above the noise of the lidar.
     pub height_m: f32,
-    /// Growth of `height_m` with horizontal range, metres per metre. It ends at a range of 40 m. At
-    /// longer range the rings are farther apart, and the surface between them is less certain.
+    /// Growth of the upper tolerance with horizontal range, metres per metre. Beyond a range of 40
+    /// m the tolerance stays constant.
     pub height_slope: f32,
-    /// Lower tolerance, metres: points deeper than this below the surface are not ground but mirror
-    /// images.
+    /// Lower tolerance, metres: points this much or more below the surface are not ground. They are
+    /// taken for mirror images.
     pub depth_m: f32,
     /// Least share, 0 to 1, of the occupied 1 m x 1 m columns within 40 m that must be flat and on
     /// the surface. Below it, or with fewer than 16 such columns, the sweep has no ground: the

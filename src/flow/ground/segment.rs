@@ -52,17 +52,19 @@ const FLAT: f32 = 0.7;
 pub struct GroundSegmentation {
     /// N flags: true for points on the ground.
     pub ground: Vec<bool>,
-    /// Height of the frame's origin above the ground below it, metres: the lidar's height where the
-    /// origin is the lidar, near zero where the origin is on the road. None without ground.
+    /// Height of the frame's origin above the ground below it, metres. It is the lidar's height if
+    /// the origin is at the lidar, and near zero if the origin is on the road. None if no ground
+    /// was found.
     pub origin_height_m: Option<f32>,
 }
 
 /// Segments the ground of one sweep: N finite points, metres, x forward, y left, z up to within
 /// some degrees, with the vehicle near the origin.
 ///
-/// The flags do not depend on the points' order. Points at `|x|` or `|y|` of 128 m or more are
-/// never ground. Without sufficient evidence no point is ground: fewer than 16 flat columns of 1 m
-/// x 1 m within 40 m, or a smaller share of them than [`GroundOptions::min_share`].
+/// Points that are not finite must be removed first, because they can falsify the flags of others.
+/// The flag of a point does not depend on the order of the points. Points at `|x|` or `|y|` of 128
+/// m or more are never ground. Without sufficient evidence no point is ground: fewer than 16 flat
+/// columns of 1 m x 1 m within 40 m, or a smaller share of them than [`GroundOptions::min_share`].
 pub fn segment(points: &[Point], options: &GroundOptions) -> GroundSegmentation {
     let columns = Columns::new(points);
     let surface = fit(&columns);

@@ -62,7 +62,8 @@ impl Host {
         &self.name
     }
 
-    /// Clears the cache of ground masks and surfels, for measurements that repeat the same work.
+    /// Clears the cache of ground masks and surfels, so that a measurement that repeats the same
+    /// work computes them again.
     pub fn forget(&self) {
         self.sweep_cache.forget();
     }
@@ -76,9 +77,10 @@ impl Host {
     /// the rigid motion `target_from_source`. The method is generalized ICP (Segal et al. 2009),
     /// started from a coarse search around `prior`.
     ///
-    /// In directions that the clouds do not determine, the motion stays as in `prior`. Points that
-    /// are not finite are ignored. Where `control` interrupts, the result is the motion so far. The
-    /// result is bit-identical for any number of threads.
+    /// In directions that the clouds do not determine, the motion stays as in `prior`. It equals
+    /// `prior` if a cloud is empty or the clouds have nothing in common. Points that are not finite
+    /// are ignored. If `control` interrupts, the result is the motion so far. The result is
+    /// bit-identical for any number of threads.
     pub fn align(
         &self,
         source: &[Point],
@@ -105,9 +107,11 @@ impl Host {
         self.threads.install(|| found.collect())
     }
 
-    /// Searches `clouds` for moving objects, large clusters first. Where `control` interrupts or
-    /// too little time is left, the other clusters are static, and [`ObjectSearch::interrupted`] is
-    /// the reason. An interrupt before the first cluster can leave the lists of the result empty.
+    /// Searches `clouds` for moving objects, large clusters first. If `control` interrupts or too
+    /// little time is left, the other clusters are not searched, and [`ObjectSearch::interrupted`]
+    /// is the reason. A cluster that was not searched is static, unless it lies beside a larger
+    /// moving object whose motion fits it. An interrupt before the first cluster can leave the
+    /// lists of the result empty.
     pub fn find_objects(
         &self,
         clouds: &SearchClouds<'_>,

@@ -58,13 +58,14 @@ impl MotionField {
         ENVELOPE.close(bytes)
     }
 
-    /// Reads the bytes that [`Self::to_bytes`] wrote. Memory is allocated only for values that the
-    /// input really contains.
+    /// Reads the bytes that [`Self::to_bytes`] wrote. No more memory is allocated than the values
+    /// in `bytes` need.
     ///
     /// # Errors
-    /// [`EnvelopeError::Magic`] if the bytes are not a motion field, [`EnvelopeError::Version`] if
-    /// they are of another version, and [`EnvelopeError::Damaged`] if they are truncated or altered
-    /// or hold an invalid ego motion or object motion.
+    /// [`EnvelopeError::Magic`] if the bytes do not begin as a motion field,
+    /// [`EnvelopeError::Version`] if they are of another version, and [`EnvelopeError::Damaged`] if
+    /// they are truncated or altered or hold an ego motion or object motion that is not finite or
+    /// otherwise invalid. The parameters of a network are not checked.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, EnvelopeError> {
         let mut body = ENVELOPE.open(bytes)?;
         let ego = motion(&mut body)?;

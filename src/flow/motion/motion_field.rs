@@ -40,12 +40,16 @@ impl MotionField {
         }
     }
 
-    /// The residual motion in one sweep interval, N x 3 displacements in metres in the target's
-    /// frame, of points with these static positions (N x 3, metres), see
-    /// [`Self::static_positions`].
+    /// The residual motion in one sweep interval of N points: N x 3 displacements, metres, in the
+    /// target's frame.
+    ///
+    /// `static_positions` (N x 3, metres) are the points as [`Self::static_positions`] returns
+    /// them.
     ///
     /// # Errors
-    /// [`BackendError`] if the device fails, which happens only for a network on a GPU.
+    /// [`BackendError::Memory`], [`BackendError::Busy`], [`BackendError::Lost`] or
+    /// [`BackendError::Device`] if a GPU that evaluates a network has no memory for the points or
+    /// fails. A CPU never fails.
     pub fn residual(
         &self,
         backend: &dyn Backend,

@@ -7,7 +7,8 @@
 
 use super::features::ConfidenceFeatures;
 
-/// End-point error below which a flow counts as correct, metres: the threshold of the metric Acc5.
+/// End-point error below which a flow counts as correct, metres. It is the absolute threshold of
+/// the metric Acc5.
 pub const CONFIDENT_WITHIN_M: f32 = 0.05;
 
 /// Number of features.

@@ -9,10 +9,12 @@ use crate::flow::data::{DYNAMIC_M, OrientedBox, Point, RigidTransform, transform
 /// The clusters of a sweep of N rows.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Objects {
-    /// N indices into `clusters`, one for each row; [`Objects::NONE`] for rows in no cluster.
+    /// N indices into `clusters`, one for each row; [`Objects::NONE`] for rows in no cluster. No
+    /// row has a cluster if the search was interrupted before or right after the clustering.
     pub cluster: Vec<i32>,
     /// N confidences, 0 to 1: the probability that the end-point error of a row's flow is below
-    /// [`super::CONFIDENT_WITHIN_M`]. Zero for rows without a flow.
+    /// [`super::CONFIDENT_WITHIN_M`]. Zero for rows without a flow. Zero also for rows off the
+    /// ground if the search was interrupted before or right after the clustering.
     pub confidence: Vec<f32>,
     /// K clusters, in descending order of their number of points.
     pub clusters: Vec<Cluster>,
@@ -21,25 +23,28 @@ pub struct Objects {
 /// A cluster: a moving object with the fragments that share its motion, or a static set of points.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Cluster {
-    /// Number of points.
+    /// Number of rows of the sweep in this cluster.
     pub points: u32,
-    /// Whether it moves with respect to the world: its center's displacement, ego motion taken out,
-    /// is at least 0.05 m horizontally.
+    /// Whether it moves with respect to the world: in one sweep interval its center is displaced
+    /// horizontally by at least [`DYNAMIC_M`] (0.05 m), ego motion taken out.
     pub dynamic: bool,
-    /// Bounding box of its points in the source's frame, metres. Its length lies along the side
-    /// nearest to the motion, or along the longer side if the cluster is static.
+    /// Upright bounding box of its points in the source's frame, metres. If the search found a
+    /// motion, the box's length is the side whose direction is nearest to it. Otherwise it is the
+    /// longer side.
     pub bounds: OrientedBox,
     /// Velocity of its center with the ego motion taken out, m/s along the axes of the source's
-    /// frame: the displacement over [`crate::flow::Options::dt_s`]. Zero if it is static.
+    /// frame: the displacement over [`crate::flow::Options::dt_s`]. Zero if the search found no
+    /// motion. It can be above zero where `dynamic` is false.
     pub velocity: Point,
-    /// Yaw rate about the vertical, rad/s, positive counterclockwise. Zero if it is static.
+    /// Yaw rate about the vertical, rad/s, positive counterclockwise. Zero if the search found no
+    /// motion.
     pub yaw_rate: f32,
     /// Mean confidence of its points, 0 to 1.
     pub confidence: f32,
 }
 
 impl Objects {
-    /// Index for rows in no cluster.
+    /// The value in [`Self::cluster`] of a row in no cluster.
     pub const NONE: i32 = -1;
 
     /// Describes the clusters of a sweep of `count` rows. `rows` are the rows that took part, and

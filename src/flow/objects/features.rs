@@ -58,24 +58,28 @@ pub struct ConfidenceFeatures {
     /// frame, metres.
     pub range_m: f32,
     /// Residual: distance of the point, moved by its motion, from the target, metres. At most
-    /// [`ObjectOptions::truncation_m`].
+    /// [`ObjectOptions::truncation_m`], which it is if the moved point has no match.
     pub off_m: f32,
-    /// Whether the moved point has no match: no target point within [`ObjectOptions::match_m`], not
-    /// counting static matches of other clusters.
+    /// Whether the moved point has no match: no target point within [`ObjectOptions::match_m`].
+    /// Target points that coincide with another, clearly static cluster do not count.
     pub hidden: bool,
     /// Forward cost of the point's cluster, metres: the mean distance of the moved cluster from the
-    /// target.
+    /// target, each distance at most [`ObjectOptions::truncation_m`]. It is that maximum if the
+    /// point is in no cluster or its cluster was not searched.
     pub forward_m: f32,
     /// Backward cost of the point's cluster, metres: the mean distance of the target points around
-    /// the moved cluster from it.
+    /// the moved cluster from it, each distance at most [`ObjectOptions::truncation_m`]. It is that
+    /// maximum if there are no such target points, the point is in no cluster or its cluster was
+    /// not searched.
     pub backward_m: f32,
     /// Number of voxel-downsampled points of the point's cluster; zero if it is in none.
     pub points: usize,
     /// Decrease of the forward plus backward cost by the cluster's rejected hypothesis, metres.
     /// Zero if the point moves or there was no such hypothesis.
     pub refused_m: f32,
-    /// Share of the point's DBSCAN cluster, 0 to 1, that moves if the point moves, or is static if
-    /// the point is static. One for noise points.
+    /// Agreement of the point's DBSCAN cluster with the point, 0 to 1. For a moving point it is the
+    /// share of the cluster's downsampled points that move; for a static point, the share that are
+    /// static. One for a point in no DBSCAN cluster.
     pub together: f32,
     /// Length and height of the point's cluster, metres. The length is the larger of its extents
     /// along x and y. Zero if the point is in no cluster.

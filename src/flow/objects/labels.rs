@@ -8,15 +8,16 @@ use crate::flow::spatial::NOISE;
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ClusterLabels {
     /// N cluster indices, 0 to K - 1, one for each source point; [`ClusterLabels::NONE`] for a
-    /// point in no cluster. Points that were cut off from a moving object are in no cluster.
+    /// point in no cluster. If a cluster moves, those of its points that do not follow its motion
+    /// are in no cluster.
     pub of: Vec<u32>,
-    /// K entries, one for each cluster: the index of its motion among those of the moving objects;
-    /// none if the cluster is static.
+    /// K entries, one for each cluster: the index of its motion in [`super::ObjectMotions`]; none
+    /// if the cluster is static.
     pub motions: Vec<Option<u32>>,
 }
 
 impl ClusterLabels {
-    /// Label of a point in no cluster.
+    /// The value in [`Self::of`] of a point in no cluster.
     pub const NONE: u32 = NOISE;
 
     /// From the DBSCAN `labels` of the source points. `cluster_motion` gives for each DBSCAN

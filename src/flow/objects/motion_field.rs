@@ -16,7 +16,8 @@ const REACH_M: f32 = 0.5;
 /// The rigid motions of a pair's moving objects, as a field over space.
 ///
 /// A position has the motion of the nearest downsampled source point, if that point moves and is
-/// within 0.5 m. All other positions are static.
+/// less than 0.5 m away. All other positions are static. Each motion is a translation in x and y
+/// and a rotation about the vertical.
 #[derive(Debug)]
 pub struct ObjectMotions {
     motions: Vec<PlanarMotion>,
@@ -62,9 +63,12 @@ impl ObjectMotions {
         (&self.motions, moving.collect(), self.standing.in_order())
     }
 
-    /// Residual flow at N `positions`, N x 3 metres in the target's frame: the displacement in one
-    /// sweep interval beyond the ego motion. `positions` (N x 3, metres) are positions at the source's
-    /// time, transformed to the target's frame by the ego motion. They need not be source points.
+    /// The residual flow at `positions` (N x 3, metres): N x 3 displacements, metres, in one sweep
+    /// interval beyond the ego motion. Zero where a position is static.
+    ///
+    /// `positions` are positions at the source's time, transformed to the target's frame by the ego
+    /// motion. They need not be source points. The displacements are along the axes of the target's
+    /// frame.
     pub fn residual_at(&self, positions: &[Point]) -> Vec<Point> {
         positions
             .par_iter()

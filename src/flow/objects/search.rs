@@ -38,17 +38,19 @@ pub struct SearchClouds<'a> {
     /// pair alone.
     pub neighbors: &'a [AlignedSweep],
     /// The complete source and target, each in its own frame, with the ground and the points that
-    /// are not searched. They give the free-space evidence, so the origin of each frame must be at
-    /// the sensor or near it.
+    /// are not searched. Points that are not finite are ignored. The rays from each frame's origin
+    /// to its points show free space, so the origin must be at the sensor or near it.
     pub sweeps: [&'a [Point]; 2],
-    /// The ego motion; the identity if it is unknown.
+    /// The ego motion, from the source's frame to the target's, metres; the identity if it is
+    /// unknown.
     pub target_from_source: RigidTransform,
 }
 
 /// The result of an object search on a pair of N source points.
 #[derive(Debug)]
 pub struct ObjectSearch {
-    /// The rigid motions of the moving objects, as a field over space.
+    /// The rigid motions of the moving objects, as a field over space. It has none if the search
+    /// was interrupted before or right after the clustering.
     pub motions: ObjectMotions,
     /// The final cluster of each source point. Empty if the search was interrupted before or right
     /// after the clustering.
@@ -61,8 +63,9 @@ pub struct ObjectSearch {
     /// Number of DBSCAN clusters; zero if the search was interrupted before or right after the
     /// clustering.
     pub all_clusters: usize,
-    /// Mean forward cost of the clusters that were searched, metres, each with its accepted motion
-    /// or at rest. Zero if none was searched; infinite if the search was interrupted before or
+    /// Mean forward cost of the clusters that were searched, metres. The forward cost of a cluster
+    /// is the mean truncated distance of its points from the target, after its accepted motion or
+    /// at rest. Zero if no cluster was searched. Infinite if the search was interrupted before or
     /// right after the clustering.
     pub cost_m: f64,
     /// Why not all clusters were searched; none if all were. [`Interrupt::Deadline`] also stands

@@ -8,8 +8,8 @@ use crate::flow::distance::DistanceOptions;
 /// Adam minimizes the mean loss of the displaced source points (FNSF Section 3).
 #[derive(Clone, Debug, PartialEq)]
 pub struct FieldOptions {
-    /// Distance transform of the target, from which the loss takes its distances. A smaller cell is
-    /// more accurate, and costs memory and time.
+    /// Distance transform of the target, from which the loss takes its distances. Smaller cells are
+    /// more accurate, and cost memory and time.
     pub distance: DistanceOptions,
     /// The loss of one point.
     pub loss: LossOptions,
@@ -21,16 +21,18 @@ pub struct FieldOptions {
     pub learning_rate: f32,
     /// Schedule of the learning rate over the iterations.
     pub learning_rate_schedule: LearningRateSchedule,
-    /// Points per iteration (batch size), at least 1; none for all points. The points are shuffled
-    /// once and cut into nearly equal batches, which are used in turn. Larger batches give less
-    /// noisy gradients at a proportionally higher cost per iteration.
+    /// Maximum number of points per iteration (batch size); none for all points. Zero counts as 1.
+    /// If there are more points, they are shuffled once and cut into nearly equal batches, which
+    /// are used in turn. Larger batches give less noisy gradients at a proportionally higher cost
+    /// per iteration.
     pub batch: Option<usize>,
     /// Which iteration's parameters become the result.
     pub result: ResultChoice,
     /// Early stopping before `max_iterations`; none to do all iterations.
     pub early_stop: Option<EarlyStopOptions>,
-    /// Maximum number of iterations. The cosine schedule reaches a learning rate of zero there.
-    /// Under a deadline the same work may be divided into more iterations of smaller batches.
+    /// Maximum number of iterations; with zero the result is the initial network. The cosine
+    /// schedule reaches a learning rate of zero there. Under a deadline the same work may be
+    /// divided into more iterations of smaller batches.
     pub max_iterations: usize,
     /// Floating-point precision of the network's matrix products during the fit.
     pub precision: Precision,
@@ -96,8 +98,10 @@ impl FieldOptions {
         }
     }
 
-    /// Number of iterations that a fit without a deadline usually takes: all of them without early
-    /// stopping, otherwise at most 60. The published stopping rule ends fits after 36 to 115.
+    /// Expected number of iterations of a fit without a deadline, for the prediction of its cost.
+    ///
+    /// It is `max_iterations` without early stopping, otherwise the smaller of `max_iterations` and
+    /// 60. The published stopping rule ended the measured fits after 36 to 115 iterations.
     pub fn expected_iterations(&self) -> usize {
         match self.early_stop {
             None => self.max_iterations,
@@ -129,10 +133,10 @@ impl FieldOptions {
 }
 
 /// Options of a fit that starts from the field of the previous pair. They replace the options of
-/// the same name where the previous field explains the pair better than no residual motion.
+/// the same name if that field has a lower loss on the new pair than zero residual motion.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct WarmStart {
-    /// Maximum number of iterations. [`FieldOptions::max_iterations`] still applies.
+    /// Maximum number of iterations. Values above [`FieldOptions::max_iterations`] count as that.
     pub max_iterations: usize,
     /// Learning rate (Adam's step size) of the first iteration.
     pub learning_rate: f32,
@@ -165,32 +169,34 @@ impl DeadlineLimits {
 /// Loss of one point: `clamp(D(p + f), margin, truncation) + flow_penalty * |f|`.
 ///
 /// `D` is the distance to the target, `p` a source point after the ego motion, `f` its displacement
-/// by the field. The published loss is `D(p + f)` alone (FNSF eq. 6).
+/// by the field. If the margin exceeds the truncation, the truncation is used for both. The
+/// published loss is `D(p + f)` alone (FNSF eq. 6).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LossOptions {
-    /// Margin of the distance, metres. Smaller distances have no gradient: two sweeps sample a
-    /// static surface at different points, and following the samples is not motion. A larger margin
-    /// suppresses more sampling noise and hides slower motion.
+    /// Margin of the distance, metres. Smaller distances count as the margin and do not attract the
+    /// point. Two sweeps sample a static surface at different points, so small distances are no
+    /// evidence of motion. A larger margin suppresses more sampling noise and hides slower motion.
     pub margin_m: f32,
-    /// Growth of the margin with a point's range, metres per metre. The point spacing of a lidar
-    /// grows with range as well. The margin of a point is the larger of `margin_m` and
-    /// `margin_slope` times its range.
+    /// Growth of the margin with range, metres per metre. The margin of a point is the larger of
+    /// `margin_m` and `margin_slope` times its range, the distance from the origin of the target's
+    /// frame. The point spacing of a lidar grows with range as well.
     pub margin_slope: f32,
-    /// Adapts `margin_slope` to the density of the pair: this quantile, 0 to 1, of distance over
-    /// range.
+    /// Adapts `margin_slope` to the density of the pair. The ratio of each source point's distance
+    /// to its range is computed, and `margin_slope` is raised to this quantile of the ratios.
+    /// Values outside 0 to 1 are clamped.
     ///
-    /// It is taken after the ego motion and before the field moves the points, with ranges below 1
-    /// m counted as 1 m. It only raises the slope. A larger quantile gives a wider margin. Without
-    /// an ego motion it is ignored, because the distances then contain the ego motion. None keeps
-    /// `margin_slope`.
+    /// The distances to the target are taken after the ego motion and before the field moves the
+    /// points. Ranges below 1 m count as 1 m. The slope is never lowered. A larger quantile gives a
+    /// wider margin. Without an ego motion it is ignored, because the distances then contain the
+    /// ego motion. None keeps `margin_slope`.
     pub margin_quantile: Option<f32>,
-    /// Truncation of the distance, metres; none for no truncation. Larger distances have no
-    /// gradient, so that points without a counterpart in the target do not pull on the field. A
-    /// larger value admits counterparts farther away.
+    /// Truncation of the distance, metres, above the margin; none for no truncation. Larger
+    /// distances count as this one, so that points without a counterpart in the target do not pull
+    /// on the field. A larger value admits counterparts farther away.
     pub truncation_m: Option<f32>,
     /// Weight of the length of the displacement, metres of loss per metre of flow. Lengths below 1
-    /// mm count quadratically. The penalty keeps the field at zero where the distance has no
-    /// gradient. Larger values shorten all displacements.
+    /// mm count quadratically. The penalty keeps the field near zero where points lie within the
+    /// margin or beyond the truncation. Larger values shorten all displacements.
     pub flow_penalty: f32,
 }
 
@@ -202,7 +208,7 @@ pub enum InputNormalization {
     Raw,
     /// The mean of the cloud is subtracted, and the coordinates are divided by `scale_m`.
     Centered {
-        /// Length that becomes one, metres; above zero.
+        /// Length that becomes one, metres. It must be above zero.
         scale_m: f32,
     },
 }
@@ -228,13 +234,13 @@ pub enum LearningRateSchedule {
 /// Which iteration's parameters become the result.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum ResultChoice {
-    /// Those of the iteration with the lowest loss. As in the published code, the iteration at
-    /// which early stopping ends the fit does not count.
+    /// Those of the iteration with the lowest loss; of equal losses, the latest. As in the
+    /// published code, the iteration at which early stopping ends the fit does not count.
     Best,
     /// The exponential moving average of the parameters over the iterations.
     Average {
-        /// Weight of the previous average at each iteration, 0 to 1. Ramped up over the first
-        /// iterations. Larger values average over more iterations.
+        /// Weight of the previous average at each iteration, 0 to 1. After `n` iterations it is
+        /// limited to `n / (n + 10)`. Larger values average over more iterations.
         decay: f32,
     },
 }
@@ -270,8 +276,8 @@ impl Precision {
 /// ends after `patience` successive iterations without progress.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EarlyStopOptions {
-    /// Successive iterations without progress that end the fit, at least 1. Larger values give
-    /// longer fits.
+    /// Number of successive iterations without progress that end the fit. Zero counts as 1. Larger
+    /// values give longer fits.
     pub patience: usize,
     /// Decrease of the mean loss that counts as progress, metres. Larger values end the fit
     /// earlier.

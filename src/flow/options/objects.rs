@@ -9,15 +9,15 @@
 /// the choices.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ObjectOptions {
-    /// DBSCAN radius, metres: points within it of a core point join its cluster. Larger values
-    /// merge neighboring objects, smaller ones split sparse objects.
+    /// DBSCAN radius, metres, above zero. Points this close to a core point join its cluster.
+    /// Larger values merge neighboring objects, smaller ones split sparse objects.
     pub cluster_radius_m: f32,
     /// Least number of points within `cluster_radius_m`, the point itself included, that make a
     /// point a DBSCAN core point. Raising it turns sparse points into noise. Clusters with fewer
     /// voxel-downsampled points get no motion search.
     pub cluster_min_points: usize,
-    /// Voxel size of the downsampling of both clouds, metres: one point per voxel is kept. Larger
-    /// values are faster and coarser.
+    /// Voxel size of the downsampling of all clouds, metres, above zero. One point per voxel is
+    /// kept. Larger values are faster and coarser.
     pub voxel_m: f32,
     /// Radius of the neighborhood of a target normal: `[base, slope]`, metres and metres per metre
     /// of horizontal range. It is limited to `match_m`. Larger values give normals to sparser
@@ -28,13 +28,13 @@ pub struct ObjectOptions {
     /// the samples along a ring.
     pub height_weight: f32,
     /// Radius of the nearest-neighbor search, metres, with heights scaled by `height_weight`. A
-    /// point without a target point within it costs `truncation_m`. It is also the distance up to
-    /// which a cluster or point counts as adjacent to a moving object.
+    /// point without a target point within this radius costs `truncation_m`. A cluster or point is
+    /// adjacent to a moving object if they are this close.
     pub match_m: f32,
-    /// Static match distance, metres, with heights scaled by `height_weight`. A cluster counts as
-    /// clearly static if nine in ten of its points lie within it of the target. The target points
-    /// within it of such a cluster then belong to that cluster, and no other cluster is matched to
-    /// them. Larger values exclude more of the target.
+    /// Static match distance, metres, with heights scaled by `height_weight`. It must be at most
+    /// `match_m`. A cluster counts as clearly static if at least nine in ten of its points are this
+    /// close to the target. Target points this close to such a cluster belong to it, and no other
+    /// cluster is matched to them. Larger values exclude more of the target.
     pub static_match_m: f32,
     /// Weight of the full offset `d` to a target point, relative to its component along the normal
     /// `n`. The distance is `sqrt((n.d)^2 + (tangential_weight * |d|)^2)`, with heights in `|d|`
@@ -47,8 +47,8 @@ pub struct ObjectOptions {
     /// Largest displacement along x and along y in the Hough voting, metres per sweep interval. It
     /// limits the speed of the objects that can be found. The accumulator grows with its square.
     pub max_displacement_m: f32,
-    /// Bin size of the Hough voting over translations, metres. Points vote if their heights differ
-    /// by at most 1.5 bins.
+    /// Bin size of the Hough voting over translations, metres, above zero. Points vote if their
+    /// heights differ by at most 1.5 bins.
     pub bin_m: f32,
     /// Number of initial guesses taken from the peaks of the Hough voting, besides zero motion. The
     /// two of least cost are fitted. Larger values cost time.
@@ -93,10 +93,10 @@ pub struct ObjectOptions {
     /// the vacated positions that rays of the target passed through, and also of the newly occupied
     /// positions that rays of the source passed through. Larger values demand more evidence.
     pub min_free_space: f32,
-    /// Minimum sum of the two shares of free-space evidence, 0 to 2. Below it the cluster counts as
-    /// static: a motion of at least 0.4 m plus 0.02 m per metre of range is rejected, and a shorter
-    /// one is rejected if only neighbor evidence replaces the observability. Ignored where one of
-    /// the shares is unknown. Larger values reject more.
+    /// Minimum sum of the two shares of free-space evidence, 0 to 2. Below it, a motion of at least
+    /// 0.4 m plus 0.02 m per metre of range is rejected. A shorter one is rejected if only neighbor
+    /// evidence replaces the observability. Ignored where one of the shares is unknown. Larger
+    /// values reject more.
     pub min_free_space_far: f32,
     /// Assignment: maximum ratio of the cost with the motion of an adjacent moving object to the
     /// cost without it. A noise point below this ratio gets that motion, and so does a cluster
@@ -112,16 +112,17 @@ pub struct ObjectOptions {
     /// Acceptance: minimum height range, metres, between the 5th and the 95th percentile of a
     /// cluster with `ground_min_points` points or more. Larger values reject more flat clusters.
     pub ground_thickness_m: f32,
-    /// Number of sweeps in the window: the pair's two, plus neighbor sweeps of its sequence where
-    /// they exist. Values below 2 count as 2. More sweeps give more evidence, cost time, and delay
+    /// Number of sweeps in the window: the pair's two, and neighbor sweeps as far as the sequence
+    /// has them. Values below 2 count as 2. More sweeps give more evidence, cost time, and delay
     /// the result in a sequence. Without an ego motion no neighbor sweeps are used.
     pub sweeps: usize,
     /// Neighbor evidence that replaces `min_observability`: maximum ratio of the cost with the
-    /// motion to the cost without it. It must hold in the neighbor sweep nearest in time and in all
-    /// of them together. Smaller values are stricter.
+    /// motion to the cost without it. It must hold in the neighbor sweep nearest in time, and in
+    /// all neighbor sweeps together. Smaller values are stricter.
     pub neighbor_cost_ratio: f32,
-    /// Neighbor evidence: minimum decrease of that cost, metres, both directions added. Larger
-    /// values are stricter.
+    /// Neighbor evidence: minimum decrease of the cost by the motion, metres. The cost is the
+    /// distance from the cluster to the sweep plus that back. The decrease must reach it in the
+    /// nearest sweep, and in the weighted mean of all neighbor sweeps. Larger values are stricter.
     pub neighbor_gain_m: f32,
 }
 

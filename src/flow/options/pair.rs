@@ -17,11 +17,12 @@ pub struct Options {
     /// for all. Only the sampled source points get a flow. A field is fitted to the sampled points
     /// only. The object search uses all points.
     pub max_points: Option<usize>,
-    /// Half the side of the square crop around the sensor, metres: points with `|x|` or `|y|`
-    /// beyond it are excluded. None for no crop.
+    /// Half the side of the square crop around the origin of the sensor frame, metres. Points with
+    /// a larger `|x|` or `|y|` are excluded. None for no crop.
     pub crop_m: Option<f32>,
-    /// Time from the source sweep to the target sweep, seconds. Velocities are displacements
-    /// divided by it.
+    /// Time from the source sweep to the target sweep, seconds, above zero. The velocity of a
+    /// cluster is its displacement divided by this time, and its yaw rate is its rotation divided
+    /// by it.
     pub dt_s: f32,
     /// Handling of ground points.
     pub ground: Ground,
@@ -41,8 +42,10 @@ pub enum Method {
 }
 
 impl Options {
-    /// Window size: the number of sweeps that an estimate uses where a sequence has them, at least
-    /// the two of the pair. It is 2 for a field, and for objects with [`Ego::Off`].
+    /// The largest number of sweeps that an estimate uses, the two of the pair included.
+    ///
+    /// It is [`ObjectOptions::sweeps`], but at least 2. A field uses 2, and so do objects with
+    /// [`Ego::Off`]. An estimate uses fewer sweeps if its problem has fewer neighbor sweeps.
     pub fn sweeps(&self) -> usize {
         match &self.method {
             Method::Objects(objects) if self.ego != Ego::Off => objects.sweeps.max(2),
@@ -81,14 +84,15 @@ pub enum Ground {
     /// Ground points take part like all other points. Ground masks are ignored.
     Keep,
     /// Points of the problem's ground masks are excluded and get no flow. Without masks the
-    /// estimate fails.
+    /// estimate fails with [`crate::flow::FlowError::NoGroundMask`].
     Mask,
-    /// Points of the problem's ground masks are excluded. Without masks, those of
-    /// [`crate::flow::ground::segment()`] are.
+    /// Points of the problem's ground masks are excluded. Without masks,
+    /// [`crate::flow::ground::segment()`] with default options finds the points to exclude.
     ///
-    /// They get the ego-motion flow if the ego motion is separated and no points are sampled,
-    /// otherwise no flow. If fewer than [`crate::flow::MIN_POINTS`] other points remain in a cloud,
-    /// the ground of both clouds takes part.
+    /// Ground points get the flow of the ego motion if [`Options::ego`] is not [`Ego::Off`] and
+    /// [`Options::max_points`] is none. Otherwise they get no flow. If fewer than
+    /// [`crate::flow::MIN_POINTS`] other points remain in a cloud, the ground of both clouds takes
+    /// part.
     Auto,
 }
 
@@ -99,7 +103,7 @@ pub enum Ego {
     Off,
     /// Estimated by registration. The method estimates the residual motion.
     Auto,
-    /// Given as target_from_source, without a registration of the pair. The method estimates the
-    /// residual motion.
+    /// Given as target_from_source; the pair is not registered. The method estimates the residual
+    /// motion.
     Given(RigidTransform),
 }

@@ -4,16 +4,18 @@ use super::field::FieldOptions;
 use super::objects::ObjectOptions;
 use super::pair::{DEFAULT_DT_S, Ego, Ground, Method, Options};
 
-/// A named set of options.
+/// A named set of options, from which [`Preset::options`] makes the [`Options`] of an estimate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Preset {
-    /// Ego motion, then the rigid motion of each object from the two sweeps of the pair.
+    /// Registration of the ego motion, then an object search in the two sweeps of the pair.
     Default,
     /// As [`Preset::Default`], with a window of up to five sweeps of a sequence.
     Label,
-    /// Ego motion, then a short stochastic fit of a neural field to the residual motion.
+    /// Registration of the ego motion, then a fit of a neural field to the residual motion. Without
+    /// a deadline or a warm start it takes 150 iterations on batches of at most 2,048 points.
     Neural,
-    /// FNSF (ICCV 2023) with the settings of its published code.
+    /// FNSF (ICCV 2023) with the settings of its published code: a field fitted to the full motion,
+    /// ground included.
     Paper,
 }
 
@@ -31,8 +33,8 @@ impl Preset {
         }
     }
 
-    /// Whether the preset fits a neural field. Such a preset runs on a GPU where one is available,
-    /// and supports snapshots.
+    /// Whether the preset fits a neural field. Only such a preset uses a GPU and supports
+    /// snapshots.
     pub fn fits_field(self) -> bool {
         matches!(self.options(None).method, Method::Field(_))
     }

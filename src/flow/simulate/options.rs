@@ -20,17 +20,19 @@ pub struct StreetOptions {
     /// Number of sweeps, 1 to 1,000.
     pub sweeps: usize,
     /// Number of lasers, 1 to 256, between 2 degrees up and 24.8 degrees down, denser in the upper
-    /// half.
+    /// half. A single laser points 2 degrees up.
     pub beams: usize,
     /// Number of azimuth steps per turn, 16 to 8,192.
     pub azimuth_steps: usize,
     /// Number of moving cars, cyclists and pedestrians, 0 to 256.
     pub movers: usize,
-    /// Forward speed of the ego vehicle, 0 to 40 m/s; drawn from the seed if none, 5 to 11 m/s.
+    /// Forward speed of the ego vehicle, 0 to 40 m/s. If none, it is drawn from the seed, 5 to 11
+    /// m/s.
     pub speed_mps: Option<f64>,
-    /// Yaw rate of the ego vehicle at the first sweep, -1 to 1 rad/s, positive to the left; drawn
-    /// from the seed if none. The curve radius, speed over yaw rate, must be at least 40 m, so a
-    /// standing vehicle has a yaw rate of zero. The street winds, so the rate changes afterwards.
+    /// Yaw rate of the ego vehicle at the first sweep, -1 to 1 rad/s, positive to the left. The
+    /// curve radius, speed over yaw rate, must be at least 40 m, so a standing vehicle has a yaw
+    /// rate of zero. If none, it is drawn from the seed, with a radius of at least 250 m. The
+    /// street winds, so the rate changes after the first sweep.
     pub yaw_rate_rps: Option<f64>,
     /// Standard deviation of the range noise of each return, 0 to 1 m.
     pub range_noise_m: f64,
@@ -61,7 +63,7 @@ impl Default for StreetOptions {
 /// Why the options of a street, or the index of a sweep, were rejected.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum StreetError {
-    /// An option is out of range or not a number.
+    /// An option is out of range or not a number. The range of the yaw rate depends on the speed.
     #[error("{name} must lie between {low} and {high}, not {value}")]
     OutOfRange {
         /// Name of the option.

@@ -50,7 +50,8 @@ pub struct StreetSweep {
     pub object: Vec<i32>,
     /// N flags: true for ground points.
     pub ground: Vec<bool>,
-    /// Pose of the sensor: the transform from its frame to that of the world, metres, z up.
+    /// Pose of the sensor: the transform from its frame to the world's, translation in metres. The
+    /// world has z up.
     pub world_from_sensor: RigidTransform,
 }
 
@@ -74,7 +75,7 @@ pub struct SimulatedPair {
     pub ground_source: Vec<bool>,
     /// M flags: true for target points on the ground.
     pub ground_target: Vec<bool>,
-    /// Ego motion, which maps a static source point into the target's frame.
+    /// Ego motion, translation in metres. It maps a static source point into the target's frame.
     pub target_from_source: RigidTransform,
 }
 
@@ -140,7 +141,7 @@ impl Street {
 
     /// True depth image at the time of a sweep, without noise and loss. The camera is mounted at
     /// [`Camera::camera_from_lidar`] relative to the lidar. Pixels without a surface within 120 m
-    /// have no depth.
+    /// have the depth 0, which means unknown.
     ///
     /// # Errors
     /// [`StreetError::NoSuchSweep`] if the street has no sweep with this index.
@@ -210,7 +211,9 @@ impl Street {
     }
 
     /// True flow of the points of `frame`, a sweep of this street, to the time `at`. The time is in
-    /// sweep intervals since the first sweep, and may lie between sweeps or before `frame`.
+    /// sweep intervals since the first sweep. It may lie between sweeps, before `frame` or after
+    /// the last sweep, and must be finite. The computing time grows with the distance driven until
+    /// then.
     ///
     /// The result is N x 3 metres: the position at that time in the sensor frame of that time,
     /// minus the position in the sweep.
@@ -240,8 +243,9 @@ impl Street {
             .collect()
     }
 
-    /// Pose of the sensor, `world_from_sensor` in metres, at a time in sweep intervals since the
-    /// first sweep.
+    /// Pose of the sensor, `world_from_sensor` with the translation in metres, at a time in sweep
+    /// intervals since the first sweep. The time must be finite, and may be negative or after the
+    /// last sweep. The computing time grows with the distance driven until then.
     pub fn pose(&self, at: f64) -> RigidTransform {
         let x = self.terrain.advance(0.0, self.speed * seconds(at));
         let position = self.terrain.position(x, -LANE_M);
@@ -496,7 +500,7 @@ mod tests {
         assert_eq!(street.sweeps(), 2);
         assert!(street.sweep(2).is_err() && street.flow(2).is_err());
         let error = street.pair(1).unwrap_err();
-        assert_eq!(error.to_string(), "frame 2 of a street of 2 sweeps");
+        assert_eq!(error.to_string(), "sweep 2 of a street of 2 sweeps");
         let tight = StreetOptions {
             yaw_rate_rps: Some(0.9),
             ..small(0)

@@ -15,20 +15,23 @@ use crate::formats::ply::Ply;
 use crate::formats::sniff::recognize;
 
 /// Reads a flow in any of the formats that [`super::write_flow`] writes. Also reads `flow` of a
-/// pair's `.npz`, and Argoverse 2's `.feather`. The format is recognized by content. A file with at
-/// most [`MAX_POINTS`] rows is accepted, except for JSON, which has no limit.
+/// pair's `.npz`, and Argoverse 2's `.feather`. `bytes` is the whole file. The format is recognized
+/// by content. `name` is a file name or path; it only affects the error for a file of another kind.
+/// Files of more than [`MAX_POINTS`] rows are refused, except for JSON, which has no limit.
 ///
 /// # Errors
 /// - `Unrecognized` and `Ambiguous` as for [`recognize`].
 /// - `Malformed` for a file that violates its format or is truncated. Also for a cluster index that
-///   is not a whole number of 32 bits or has no cluster, and for a confidence outside of 0 to 1.
-/// - `Unsupported` for a file that holds a cloud, and for arrays or columns of another type or
+///   is not a whole number of 32 bits or not below the number of clusters, and for a confidence
+///   outside of 0 to 1.
+/// - `Unsupported` for raw floats, which hold a cloud, and for arrays or columns of another type or
 ///   shape.
-/// - `Missing` where the flow, or a part of the clusters, is missing.
-/// - `NotFinite` and `OutOfRange` for a displacement or other number that is not finite or over 1e6
-///   in magnitude.
-/// - `TooLarge` for too many rows, or a compressed file that unfolds to far more than its size.
-/// - `RowCount` where the columns differ in length.
+/// - `Missing` where the flow, or the center, size or velocity of the clusters, is missing.
+/// - `NotFinite` for a displacement or a number of a cluster that is not finite, and for a NaN in a
+///   mask. `OutOfRange` for a displacement or a number of a cluster over 1e6 in magnitude.
+/// - `TooLarge` for too many rows, for an `.npz` of more than 1,024 members, or where compressed
+///   data takes more than 4 GiB, or more than 32 MiB plus 32 times the size of the file.
+/// - `RowCount` where the columns differ in length, or another array of the clusters is missing.
 pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatError> {
     let file = match recognize(bytes, name)? {
         FileKind::Npy => FlowFile {

@@ -11,7 +11,8 @@ pub(super) const FLOW_AXES: [&str; 3] = ["flow_x", "flow_y", "flow_z"];
 /// A flow to be written: N rows, in the source's order.
 #[derive(Clone, Copy, Debug)]
 pub struct FlowTable<'a> {
-    /// N source points, metres. Rows without return may be NaN; PLY and PCD keep them so.
+    /// N source points, metres. Rows without return may be NaN. PLY and PCD contain the source
+    /// points, such rows included; the other formats do not.
     pub source: &'a [Point],
     /// N displacements from the source sweep's time to the target's, metres, ego motion included.
     /// Finite in every row.

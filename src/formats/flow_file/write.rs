@@ -16,24 +16,29 @@ use crate::formats::{feather, npy, pcd, ply};
 use crate::picture::{INVALID_COLOR, color, full_scale, shown_motion};
 
 /// The formats that flow is written in. Displacements are in metres. `dynamic`, `ego`, `cluster`,
-/// `confidence` and the clusters are written only where they are known.
+/// `confidence` and the clusters are written only where they are known, and only by the formats
+/// that list them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum FlowFormat {
-    /// `flow` N x 3 float32, `valid` and `dynamic` bool, `ego` 4 x 4 float64 (`target_from_source`,
-    /// row by row), `cluster` int32, `confidence` float32. The clusters have K rows each:
-    /// `clusters_points` uint32, `clusters_dynamic` bool; `clusters_center` (metres),
-    /// `clusters_size` (length, width, height in metres) and `clusters_velocity` (m/s), K x 3
-    /// float32; `clusters_yaw` (radians), `clusters_yaw_rate` (rad/s) and `clusters_confidence`,
+    /// Arrays `flow` N x 3 float32, `valid` and `dynamic` bool, `ego` 4 x 4 float64
+    /// (`target_from_source`, row by row, translation in metres), `cluster` int32, `confidence`
     /// float32.
+    ///
+    /// The K clusters are arrays of K rows:
+    /// - `clusters_points` uint32, `clusters_dynamic` bool.
+    /// - K x 3 float32: `clusters_center` (metres), `clusters_size` (length, width and height in
+    ///   metres) and `clusters_velocity` (m/s).
+    /// - float32: `clusters_yaw` (radians), `clusters_yaw_rate` (rad/s) and `clusters_confidence`
+    ///   (0 to 1).
     Npz,
     /// The displacements alone, N x 3 float32.
     Npy,
-    /// Argoverse 2's columns `flow_tx_m`, `flow_ty_m` and `flow_tz_m`, and `is_valid`,
-    /// `is_dynamic`, `cluster`, `confidence`. LZ4-compressed. Displacements are float32; Argoverse
-    /// 2 also accepts float16, which would round 1 m to half a millimetre.
+    /// Argoverse 2's columns `flow_tx_m`, `flow_ty_m` and `flow_tz_m`, float32. Also `is_valid` and
+    /// `is_dynamic` bool, `cluster` int32 and `confidence` float32. LZ4-compressed.
     Feather,
-    /// Binary little endian: source points x y z, `flow_x`, `flow_y`, `flow_z`, `valid`, `dynamic`,
-    /// `cluster`, `confidence`, and a color by direction of motion.
+    /// Binary little endian: source points x y z (metres) and `flow_x`, `flow_y`, `flow_z`,
+    /// float32. Then `valid` and `dynamic` uint8, `cluster` int32, `confidence` float32, and a
+    /// color by direction of motion, `red`, `green`, `blue`, uint8.
     Ply,
     /// Binary, with the fields of PLY; the color is packed into `rgb`.
     Pcd,
@@ -43,13 +48,13 @@ pub enum FlowFormat {
 }
 
 impl FlowFormat {
-    /// The endings that [`FlowFormat::from_path`] accepts.
+    /// The endings that [`FlowFormat::from_path`] accepts, as text for messages.
     pub const KNOWN: &'static str = ".npz, .npy, .feather, .ply, .pcd, .json";
 
-    /// The format of a file name's ending.
+    /// The format of a file name's ending, in upper or lower case.
     ///
     /// # Errors
-    /// `UnknownExtension`, which lists the known endings.
+    /// `UnknownExtension` for any other name; it lists the known endings.
     pub fn from_path(path: &std::path::Path) -> Result<Self, FormatError> {
         let name = path
             .file_name()
@@ -64,7 +69,7 @@ impl FlowFormat {
     /// The format of an ending, with or without its dot, in upper or lower case.
     ///
     /// # Errors
-    /// `UnknownExtension`, which lists the known endings.
+    /// `UnknownExtension` for any other ending; it lists the known ones.
     pub fn from_extension(extension: &str) -> Result<Self, FormatError> {
         let bare = extension
             .strip_prefix('.')
@@ -101,11 +106,14 @@ impl FlowFormat {
 
 /// Writes a flow of N rows.
 ///
+/// The source points are not checked: they may be NaN. The clusters and confidences are not checked
+/// either, and must be finite to be read back.
+///
 /// # Errors
 /// - `RowCount` where the table's lists differ in length.
 /// - `NotFinite` for a displacement that is NaN or infinite, and `OutOfRange` for one over 1e6 m
 ///   along an axis, also in rows that are not valid.
-/// - `Write` where writing to `out` fails, `Encode` where encoding fails.
+/// - `Write` where writing to `out` fails. For feather this is `Encode`, as is a failure to encode.
 pub fn write_flow<W: Write>(
     format: FlowFormat,
     table: &FlowTable<'_>,

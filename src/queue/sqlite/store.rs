@@ -35,7 +35,7 @@ const MAX_LISTED: u32 = 1000;
 /// The queue in one SQLite file of one machine. One thread writes, and reads run concurrently.
 ///
 /// Changes of durable jobs, other than leases, are on disk before they are acknowledged. A lock
-/// file admits one process at a time. The async methods need a tokio runtime.
+/// file lets only one process at a time open the queue. The async methods need a tokio runtime.
 pub struct SqliteQueue {
     writer: Writer,
     readers: [Arc<Mutex<Connection>>; READERS],
@@ -53,13 +53,14 @@ impl SqliteQueue {
     /// those of the recovery.
     ///
     /// Recovery requeues the durable jobs that were running when the queue was last open, and ends
-    /// those whose cancellation was requested. It counts a crash for each requeued job, unless
-    /// [`Queue::stopped`] was called. Ephemeral jobs that were queued or running are forgotten.
+    /// those whose cancellation was requested. It counts a crash for each of the others, unless
+    /// [`Queue::stopped`] was called. At crash number [`QueueOptions::max_crashes`] a job becomes a
+    /// dead letter instead. Ephemeral jobs that were queued or running are removed.
     ///
     /// # Errors
     /// - [`QueueError::Store`] if another process has the queue open, a file or the folder cannot
     ///   be used, the file has another schema version, or the writer thread cannot be started.
-    /// - [`QueueError::Full`] if the disk is full.
+    /// - [`QueueError::Full`] if the database cannot grow because the disk is full.
     pub fn open(
         folder: &Path,
         options: QueueOptions,
