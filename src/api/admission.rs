@@ -33,8 +33,8 @@ pub struct AdmissionLimits {
 ///
 /// It checks the number of points and the required kind of device, and predicts the cost of a job.
 /// It compares the predicted compute time of the queued jobs with the [`AdmissionLimits`]. An
-/// accepted job gets a [`Reservation`]. A job that is refused because too much is queued gets a
-/// retry delay.
+/// accepted job reserves its predicted compute time until it is in the queue. A job that is refused
+/// because too much is queued gets a retry delay.
 pub struct Admission {
     limits: AdmissionLimits,
     queue: Arc<dyn Queue>,

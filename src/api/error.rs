@@ -28,8 +28,8 @@ pub enum ApiError {
     /// The server has no device of the kind that the job requires.
     #[error("this server has no {}: leave device out, or ask another server", .0.name())]
     NoDevice(DeviceKind),
-    /// The request body arrived too slowly: no byte came for too long, or it lagged too far behind
-    /// 1 KiB/s.
+    /// The request body arrived too slowly: no byte came for too long, it lagged too far behind 1
+    /// KiB/s, or it paused while others needed its memory.
     #[error("the request's body came too slowly")]
     TooSlow,
     /// The client read the response so slowly that its memory was given to another one. The rest of

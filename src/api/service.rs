@@ -344,8 +344,8 @@ impl Service {
     }
 
     /// Cancels a job of the caller's tenant and returns it. A queued job ends at once. A running
-    /// one ends within an iteration of its fit or a cluster of its search, after this call has
-    /// returned. Of a sequence all pairs are cancelled. An ended job is not changed.
+    /// one ends after this call has returned, within a group of iterations of its fit or of
+    /// clusters of its search. Of a sequence all pairs are cancelled. An ended job is not changed.
     ///
     /// # Errors
     /// - [`ApiError::Forbidden`] if the caller may only read.
