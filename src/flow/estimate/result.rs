@@ -84,9 +84,8 @@ pub struct ObjectSolution {
     /// deadline ended the search before or right after the clustering.
     pub candidates: usize,
     /// Mean truncated distance of the points of a cluster from the target, metres, averaged over
-    /// the searched clusters. It is measured after the cluster's accepted motion, or at rest. Zero
-    /// if no cluster was searched; infinite if a deadline ended the search before or right after
-    /// the clustering.
+    /// the searched clusters. It is measured after the cluster's accepted motion, or at rest.
+    /// Infinite if no cluster was searched.
     pub cost_m: f64,
 }
 

@@ -65,8 +65,7 @@ pub struct ObjectSearch {
     pub all_clusters: usize,
     /// Mean forward cost of the clusters that were searched, metres. The forward cost of a cluster
     /// is the mean truncated distance of its points from the target, after its accepted motion or
-    /// at rest. Zero if no cluster was searched. Infinite if the search was interrupted before or
-    /// right after the clustering.
+    /// at rest. Infinite if no cluster was searched.
     pub cost_m: f64,
     /// Why not all clusters were searched; none if all were. [`Interrupt::Deadline`] also stands
     /// for too little time left before the deadline.
@@ -166,7 +165,10 @@ pub(crate) fn find_objects(
         motions,
         clusters,
         all_clusters: searched.len(),
-        cost_m: sum_m / clusters.max(1) as f64,
+        cost_m: match clusters {
+            0 => f64::INFINITY,
+            searched => sum_m / searched as f64,
+        },
         interrupted,
     }
 }
