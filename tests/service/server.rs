@@ -243,9 +243,11 @@ pub(crate) fn plain_get(address: &str, path: &str) -> Option<String> {
     Some(answer)
 }
 
-/// Waits until a job has ended, by long polling. Returns its JSON document.
+/// Waits until a job has ended, by long polling. Returns its JSON document. Fails if the job stands
+/// still for `PATIENCE`, however long it takes on a loaded machine.
 pub(crate) async fn ended(server: &Server, id: &str) -> Value {
-    let began = Instant::now();
+    let mut moved = Instant::now();
+    let mut before = Value::Null;
     loop {
         let url = server.url(&format!("/v1/jobs/{id}?wait=20"));
         let job: Value = reqwest::get(url)
@@ -258,6 +260,10 @@ pub(crate) async fn ended(server: &Server, id: &str) -> Value {
         if !matches!(state, "queued" | "running") {
             return job;
         }
-        assert!(began.elapsed() < PATIENCE * 3, "it has not ended: {job}");
+        if job != before {
+            moved = Instant::now();
+        }
+        assert!(moved.elapsed() < PATIENCE * 3, "it stands still: {job}");
+        before = job;
     }
 }
