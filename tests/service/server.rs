@@ -244,7 +244,7 @@ pub(crate) fn plain_get(address: &str, path: &str) -> Option<String> {
 }
 
 /// Waits until a job has ended, by long polling. Returns its JSON document. Fails if the job stands
-/// still for `PATIENCE`, however long it takes on a loaded machine.
+/// still for three times `PATIENCE`, however long it takes on a loaded machine.
 pub(crate) async fn ended(server: &Server, id: &str) -> Value {
     let mut moved = Instant::now();
     let mut before = Value::Null;
