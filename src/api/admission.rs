@@ -3,6 +3,7 @@
 //!
 //! A refusal includes a retry delay, computed from the same backlog that caused the refusal.
 
+use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -39,20 +40,33 @@ pub struct Admission {
     limits: AdmissionLimits,
     queue: Arc<dyn Queue>,
     cost: Arc<CostModel>,
-    reserved: Arc<Mutex<f64>>,
+    reserved: Arc<Mutex<Reserved>>,
 }
+
+/// Nominal seconds that are reserved for each tenant.
+type Reserved = HashMap<Tenant, f64>;
+
+/// Rounding of sums of reservations, seconds.
+const NOTHING_S: f64 = 1e-9;
 
 /// Predicted compute time that is reserved for a job until the job is in the queue. Released when
 /// dropped.
 #[derive(Debug)]
 pub struct Reservation {
     seconds: f64,
-    reserved: Arc<Mutex<f64>>,
+    tenant: Tenant,
+    reserved: Arc<Mutex<Reserved>>,
 }
 
 impl Drop for Reservation {
     fn drop(&mut self) {
-        *locked(&self.reserved) -= self.seconds;
+        let mut reserved = locked(&self.reserved);
+        if let Some(own) = reserved.get_mut(&self.tenant) {
+            *own -= self.seconds;
+            if *own < NOTHING_S {
+                reserved.remove(&self.tenant);
+            }
+        }
     }
 }
 
@@ -188,8 +202,7 @@ impl Admission {
 
     /// Reserves predicted compute time for a job, or refuses it with a retry delay from 1 s to 3600
     /// s. With zero nominal seconds it reserves nothing, and only tests whether a request body is
-    /// worth reading. Reservations count against the limit on all queued jobs, not against that of
-    /// a tenant.
+    /// worth reading. Reservations count as queued jobs.
     ///
     /// # Errors
     /// - [`ApiError::TenantLimit`] if the job would exceed the limit on the tenant's queued jobs.
@@ -201,23 +214,29 @@ impl Admission {
         let real = |nominal: f64| self.cost.seconds(nominal);
         let lanes = self.cost.lanes().total().max(1) as f64;
 
-        let own = real(backlog.queued_of(asked.tenant).seconds + asked.nominal_seconds);
+        let reserved_own = reserved.get(asked.tenant).copied().unwrap_or(0.0);
+        let reserved_all: f64 = reserved.values().sum();
+        let queued_own = backlog.queued_of(asked.tenant).seconds;
+        let own = real(queued_own + reserved_own + asked.nominal_seconds);
         let tenant_excess = own - self.limits.max_tenant_queue.as_secs_f64();
         if tenant_excess > 0.0 {
             return Err(ApiError::TenantLimit(retry_after(tenant_excess / lanes)));
         }
-        let all = real(backlog.queued().seconds + *reserved + asked.nominal_seconds);
+        let all = real(backlog.queued().seconds + reserved_all + asked.nominal_seconds);
         let mut excess = all - self.limits.max_queue.as_secs_f64();
         if asked.durability == Durability::Ephemeral {
-            let wait = self.wait(&backlog, asked, *reserved);
+            let wait = self.wait(&backlog, asked, reserved_all);
             excess = excess.max((wait - self.limits.max_wait.as_secs_f64()) * lanes);
         }
         if excess > 0.0 {
             return Err(ApiError::ServerFull(retry_after(excess / lanes)));
         }
-        *reserved += asked.nominal_seconds;
+        if asked.nominal_seconds > 0.0 {
+            *reserved.entry(asked.tenant.clone()).or_default() += asked.nominal_seconds;
+        }
         Ok(Reservation {
             seconds: asked.nominal_seconds,
+            tenant: asked.tenant.clone(),
             reserved: Arc::clone(&self.reserved),
         })
     }

@@ -15,13 +15,15 @@ use hyper::body::{Body, Frame};
 use tokio::sync::mpsc;
 use tower::ServiceExt;
 
-use super::admission::{Admission, AdmissionLimits};
+use super::admission::{Admission, AdmissionLimits, AdmissionRequest, Durability};
 use super::auth::Keys;
+use super::error::ApiError;
 use super::listener::bodies::RequestBody;
 use super::origin::Hosts;
 use super::routes::public_router;
 use super::service::{Service, ServiceLimits, ServiceParts};
 use crate::cost::{CostModel, Lanes};
+use crate::job::{Priority, Tenant};
 use crate::metrics::Metrics;
 use crate::queue::{Queue, QueueOptions, SqliteQueue};
 use crate::storage::Blobs;
@@ -159,4 +161,32 @@ fn no_reader_of_a_body_or_stream_keeps_its_thread_for_itself() {
             }
         }
     }
+}
+
+#[tokio::test]
+async fn submissions_at_the_same_time_count_against_the_limit_of_their_tenant() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let service = service(folder.path());
+    let [one, other] = ["one", "other"].map(|name| name.parse::<Tenant>().expect("a name"));
+    let admit = |tenant: &Tenant, nominal_seconds: f64| {
+        service.admission.admit(&AdmissionRequest {
+            tenant,
+            priority: Priority::Normal,
+            device: None,
+            nominal_seconds,
+            durability: Durability::Durable,
+        })
+    };
+    // More than half of the limit, by whatever factor nominal seconds become seconds.
+    let mut seconds = 1e6;
+    while admit(&one, seconds).is_err() {
+        seconds *= 0.75;
+    }
+    let first = admit(&one, seconds).expect("admitted");
+    let refused = admit(&one, seconds).expect_err("over the limit");
+    assert!(matches!(refused, ApiError::TenantLimit(_)), "{refused:?}");
+    let refused = admit(&other, seconds).expect_err("over the limit of all");
+    assert!(matches!(refused, ApiError::ServerFull(_)), "{refused:?}");
+    drop(first);
+    drop(admit(&one, seconds).expect("released"));
 }

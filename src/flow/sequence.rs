@@ -120,6 +120,26 @@ struct QueuedSweep {
 /// [`Problem::before`].
 ///
 /// Memory does not grow with the length of the sequence: fewer than two windows of sweeps are held.
+///
+/// ```
+/// use fnsf::flow::cpu::CpuBackend;
+/// use fnsf::flow::simulate::{Street, StreetOptions};
+/// use fnsf::flow::{Preset, Sequence, Sweep, Uncontrolled};
+///
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// let street = StreetOptions { beams: 16, azimuth_steps: 400, sweeps: 3, ..StreetOptions::default() };
+/// let street = Street::new(&street)?;
+/// let (backend, options) = (CpuBackend::new(None)?, Preset::Default.options(None));
+/// let mut sequence = Sequence::default();
+/// let mut flows = Vec::new();
+/// for index in 0..3 {
+///     let sweep = Sweep { points: street.sweep(index)?.points, ground: None };
+///     flows.extend(sequence.push(&backend, sweep, &options, &Uncontrolled)?);
+/// }
+/// assert_eq!(flows.len(), 2);
+/// # Ok(())
+/// # }
+/// ```
 #[derive(Clone, Debug, Default)]
 pub struct Sequence {
     /// Sweeps that a later pair may still use.

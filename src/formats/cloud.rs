@@ -43,6 +43,14 @@ impl From<Vec<Point>> for Cloud {
 /// `.npz` contains one cloud where it has exactly one array named `points`, `xyz` or `pc1`, or none
 /// of these and a single array of that shape. A 4 x 4 array counts only if the file has no other.
 ///
+/// ```
+/// let ply = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n\
+///            property float z\nend_header\n1 2 0.5\n";
+/// let cloud = fnsf::formats::read_cloud(ply.as_bytes(), None)?;
+/// assert_eq!(cloud.points, [[1.0, 2.0, 0.5]]);
+/// # Ok::<(), fnsf::formats::FormatError>(())
+/// ```
+///
 /// # Errors
 /// - `Unrecognized` and `Ambiguous` as for [`recognize`]. `Ambiguous` also for an `.npz` with
 ///   several clouds or with a pair (`pc1` and `pc2`).

@@ -1,0 +1,46 @@
+# What a developer runs. `just` lists it; `just test` is the check of every change.
+
+_list:
+    @{{just_executable()}} --list --unsorted
+
+# everything that a change must pass: formatting, lints, documentation, all tests
+test:
+    .ci/test
+
+# as CI: a GPU is required, then the demo, the checks of deploy/ and of the dependencies
+ci:
+    .ci/run
+
+# formatting and lints
+lint:
+    cargo fmt --check
+    cargo clippy --locked --all-targets -- -D warnings
+
+# the documentation of all items, private ones too
+doc:
+    RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps --document-private-items --open
+
+# unit tests of a module: just unit flow::objects
+unit module="":
+    cargo test --lib {{module}}
+
+# one of cli, formats, layering, numerics, service: just integration service sequences::
+integration suite filter="":
+    cargo test --test {{suite}} {{filter}}
+
+# one of the benchmarks in benches/
+bench name:
+    cargo bench --bench {{name}}
+
+# the tables of a page of docs/experiments: just experiment objects
+experiment name *arguments:
+    cargo bench --bench accuracy -- {{name}} {{arguments}}
+
+# a simulated street through the service, with the picture in demo/
+demo:
+    cargo run --release -- demo
+
+# the image's recipe, alerts, dashboard and Python client against a release build
+deploy-check:
+    cargo build --release --locked
+    deploy/check --install target/release/fnsf
