@@ -21,6 +21,7 @@ mod result_budget;
 mod results;
 mod routes;
 mod service;
+mod service_parts;
 #[cfg(test)]
 mod tests;
 mod upload_budget;
@@ -33,4 +34,5 @@ pub use error::ApiError;
 pub use listener::{ListenOptions, Listener, TlsError, tls_acceptor};
 pub use origin::Hosts;
 pub use routes::public_router;
-pub use service::{Service, ServiceLimits, ServiceParts};
+pub use service::Service;
+pub use service_parts::{ServiceLimits, ServiceParts};

@@ -14,6 +14,7 @@ use super::error::ApiError;
 use super::origin::Hosts;
 use super::permits::{FairQueue, TenantPermits};
 use super::result_budget::{ResultBudget, ResultLimits};
+use super::service_parts::{ServiceLimits, ServiceParts};
 use super::upload_budget::{UploadBudget, UploadLimits};
 use super::waiters::{Awaited, Ending, Waiters};
 use crate::health::StoreHealth;
@@ -28,32 +29,6 @@ const MAX_ARCHIVES: usize = 16;
 /// Maximum age of the last measurement of free disk space. When it is older, the disk is assumed to
 /// hang.
 const OLD: Duration = Duration::from_secs(15);
-
-/// Resource limits for requests.
-#[derive(Clone, Debug)]
-pub struct ServiceLimits {
-    /// Maximum size of one request body, bytes.
-    pub max_upload_bytes: u64,
-    /// Budget for all request bodies that are being received, and their clouds, bytes. With several
-    /// tenants, one tenant gets at most half of it, but always enough for one body of the maximum
-    /// size if the whole budget allows that.
-    pub max_uploads_bytes: u64,
-    /// Budget for all results that are being encoded and sent, bytes. With several tenants, one
-    /// tenant gets at most half of it.
-    pub max_answers_bytes: u64,
-    /// Free disk space below which new work is refused, bytes.
-    pub min_free_bytes: u64,
-    /// Number of free inodes below which new work is refused.
-    pub min_free_inodes: u64,
-    /// Maximum number of sweeps in one sequence.
-    pub max_sweeps: u32,
-    /// Maximum time without a byte of a request body. The time by which a body lags behind 1 KiB/s
-    /// is deducted.
-    pub body_idle: Duration,
-    /// Number of pairs of a streamed sequence that are computed ahead of the results that the
-    /// client has read.
-    pub stream_prefetch_pairs: usize,
-}
 
 /// The operations that both protocols call.
 pub struct Service {
@@ -82,26 +57,6 @@ pub struct Service {
     draining: AtomicBool,
     /// Cancelled to end event streams and long polls.
     pub(super) closing: CancellationToken,
-}
-
-/// The dependencies of a [`Service`].
-pub struct ServiceParts {
-    /// The job queue.
-    pub queue: Arc<dyn Queue>,
-    /// The blob store for payloads and results.
-    pub blobs: Blobs,
-    /// Decides whether the queue accepts a job.
-    pub admission: Admission,
-    /// The metrics registry.
-    pub metrics: Arc<Metrics>,
-    /// The API keys.
-    pub keys: Keys,
-    /// The host names that are accepted when there are no API keys.
-    pub hosts: Hosts,
-    /// The health of the store and its free disk space, as last measured.
-    pub store_health: Arc<StoreHealth>,
-    /// Resource limits for requests.
-    pub limits: ServiceLimits,
 }
 
 /// Why a job was not made durable.

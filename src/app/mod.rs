@@ -3,6 +3,7 @@
 mod devices;
 mod housekeeping;
 mod process;
+mod settings;
 mod shutdown;
 mod start;
 #[cfg(test)]

@@ -11,18 +11,19 @@ use tokio::task::{JoinHandle, JoinSet};
 use tokio_util::sync::CancellationToken;
 
 use super::devices::Pool;
+use super::settings::{admission_limits, keys, listen_options, queue_options, service_limits};
 use super::{housekeeping, process};
 use crate::api::{
-    Admission, AdmissionLimits, Caller, Hosts, Keys, ListenOptions, Listener, Readiness, Role,
-    Service, ServiceLimits, ServiceParts, admin_router, public_router, tls_acceptor,
+    Admission, Hosts, Keys, ListenOptions, Listener, Readiness, Service, ServiceParts,
+    admin_router, public_router, tls_acceptor,
 };
-use crate::config::{Config, LimitsConfig, QueueConfig};
+use crate::config::Config;
 use crate::cost::{CostModel, Lanes};
 use crate::engine::{Device, Health};
 use crate::health::{Heartbeat, StoreHealth};
-use crate::job::{DeviceKind, Priority, Tenant};
+use crate::job::DeviceKind;
 use crate::metrics::Metrics;
-use crate::queue::{Event, Queue, QueueOptions, SqliteQueue};
+use crate::queue::{Event, Queue, SqliteQueue};
 use crate::storage::Blobs;
 use crate::worker::{Drain, IsolationLock, StoreProbe, Worker, WorkerOptions};
 
@@ -401,73 +402,6 @@ fn warn_of_stranded_jobs(queue: &dyn Queue, lanes: Lanes) {
                  or cancel them"
             );
         }
-    }
-}
-
-fn keys(config: &Config) -> anyhow::Result<Keys> {
-    let mut keys = Keys::default();
-    if let Some(key) = &config.api_key {
-        let caller = Caller {
-            tenant: Tenant::default(),
-            role: Role::Write,
-            max_priority: Priority::High,
-        };
-        keys.add(key.reveal(), caller).context("api_key")?;
-    }
-    for key in &config.keys {
-        let tenant = key.tenant.parse().context("keys")?;
-        let caller = Caller {
-            tenant,
-            role: key.role,
-            max_priority: key.max_priority,
-        };
-        keys.add(key.key.reveal(), caller).context("keys")?;
-    }
-    Ok(keys)
-}
-
-fn queue_options(config: &QueueConfig) -> QueueOptions {
-    let seconds = Duration::from_secs;
-    QueueOptions {
-        max_attempts: config.max_attempts,
-        max_crashes: config.max_crashes,
-        lease: seconds(config.lease_seconds),
-        retry_delay: seconds(config.retry_delay_seconds),
-        time_to_live: seconds(config.time_to_live_seconds),
-        retention: seconds(config.retention_seconds),
-        answered_retention: seconds(config.sync_result_retention_seconds),
-    }
-}
-
-fn admission_limits(config: &LimitsConfig) -> AdmissionLimits {
-    AdmissionLimits {
-        max_points: config.max_points,
-        max_pair_bytes: config.max_job_memory_mib << 20,
-        max_wait: Duration::from_secs(config.max_wait_seconds),
-        max_queue: Duration::from_secs(config.max_queue_seconds),
-        max_tenant_queue: Duration::from_secs(config.max_tenant_queue_seconds),
-    }
-}
-
-fn service_limits(config: &LimitsConfig) -> ServiceLimits {
-    ServiceLimits {
-        max_upload_bytes: config.max_upload_mib << 20,
-        max_uploads_bytes: config.max_total_upload_mib << 20,
-        max_answers_bytes: config.max_answers_mib << 20,
-        min_free_bytes: config.min_free_disk_mib << 20,
-        min_free_inodes: config.min_free_inodes,
-        max_sweeps: config.max_sweeps,
-        body_idle: Duration::from_secs(config.body_timeout_seconds),
-        stream_prefetch_pairs: config.stream_prefetch_pairs,
-    }
-}
-
-fn listen_options(config: &LimitsConfig) -> ListenOptions {
-    ListenOptions {
-        max_connections: config.max_connections,
-        header_timeout: Duration::from_secs(config.header_timeout_seconds),
-        write_timeout: Duration::from_secs(config.write_timeout_seconds),
-        ..ListenOptions::default()
     }
 }
 

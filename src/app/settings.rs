@@ -1,0 +1,81 @@
+//! The options of the parts of a server, from its configuration.
+
+use std::time::Duration;
+
+use anyhow::Context;
+
+use crate::api::{AdmissionLimits, Caller, Keys, ListenOptions, Role, ServiceLimits};
+use crate::config::{Config, LimitsConfig, QueueConfig};
+use crate::job::{Priority, Tenant};
+use crate::queue::QueueOptions;
+
+/// The API keys: that of the default tenant, and those of tenants.
+///
+/// # Errors
+/// If a key or a tenant name is invalid, or a key is given twice.
+pub(super) fn keys(config: &Config) -> anyhow::Result<Keys> {
+    let mut keys = Keys::default();
+    if let Some(key) = &config.api_key {
+        let caller = Caller {
+            tenant: Tenant::default(),
+            role: Role::Write,
+            max_priority: Priority::High,
+        };
+        keys.add(key.reveal(), caller).context("api_key")?;
+    }
+    for key in &config.keys {
+        let tenant = key.tenant.parse().context("keys")?;
+        let caller = Caller {
+            tenant,
+            role: key.role,
+            max_priority: key.max_priority,
+        };
+        keys.add(key.key.reveal(), caller).context("keys")?;
+    }
+    Ok(keys)
+}
+
+pub(super) fn queue_options(config: &QueueConfig) -> QueueOptions {
+    let seconds = Duration::from_secs;
+    QueueOptions {
+        max_attempts: config.max_attempts,
+        max_crashes: config.max_crashes,
+        lease: seconds(config.lease_seconds),
+        retry_delay: seconds(config.retry_delay_seconds),
+        time_to_live: seconds(config.time_to_live_seconds),
+        retention: seconds(config.retention_seconds),
+        answered_retention: seconds(config.sync_result_retention_seconds),
+    }
+}
+
+pub(super) fn admission_limits(config: &LimitsConfig) -> AdmissionLimits {
+    AdmissionLimits {
+        max_points: config.max_points,
+        max_pair_bytes: config.max_job_memory_mib << 20,
+        max_wait: Duration::from_secs(config.max_wait_seconds),
+        max_queue: Duration::from_secs(config.max_queue_seconds),
+        max_tenant_queue: Duration::from_secs(config.max_tenant_queue_seconds),
+    }
+}
+
+pub(super) fn service_limits(config: &LimitsConfig) -> ServiceLimits {
+    ServiceLimits {
+        max_upload_bytes: config.max_upload_mib << 20,
+        max_uploads_bytes: config.max_total_upload_mib << 20,
+        max_answers_bytes: config.max_answers_mib << 20,
+        min_free_bytes: config.min_free_disk_mib << 20,
+        min_free_inodes: config.min_free_inodes,
+        max_sweeps: config.max_sweeps,
+        body_idle: Duration::from_secs(config.body_timeout_seconds),
+        stream_prefetch_pairs: config.stream_prefetch_pairs,
+    }
+}
+
+pub(super) fn listen_options(config: &LimitsConfig) -> ListenOptions {
+    ListenOptions {
+        max_connections: config.max_connections,
+        header_timeout: Duration::from_secs(config.header_timeout_seconds),
+        write_timeout: Duration::from_secs(config.write_timeout_seconds),
+        ..ListenOptions::default()
+    }
+}
