@@ -115,10 +115,12 @@ impl CostModel {
     /// Updates the factor of this kind: `nominal` seconds of work took `measured` seconds in a
     /// lane.
     ///
-    /// The ratio of measured to nominal seconds is clamped to 1e-3 to 1e3. The first one becomes
-    /// the factor. Each later one moves the factor's logarithm with weight 0.1, or with
-    /// proportionally less below 0.1 nominal seconds. A measurement is ignored below 0.02 nominal
-    /// seconds, or if its ratio is not a number.
+    /// The ratio `r = measured / nominal` is clamped to 1e-3 to 1e3. The first ratio becomes the
+    /// factor `f`. Each later one changes it by `ln f += w (ln r - ln f)`. The weight `w` is 0.1
+    /// for 0.1 nominal seconds or more. Below that, it is proportional to `nominal`.
+    ///
+    /// A measurement of less than 0.02 nominal seconds is ignored. So is one whose ratio is not a
+    /// number.
     pub fn learn(&self, kind: DeviceKind, nominal: f64, measured: f64) {
         let ratio = (measured / nominal).clamp(RANGE.0, RANGE.1);
         if !ratio.is_finite() || nominal < LEAST {

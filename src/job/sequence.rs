@@ -28,8 +28,9 @@ impl JobOptions {
         }
     }
 
-    /// Number of sweeps in the window of a pair, its own two included. Near the ends of a sequence
-    /// there may be fewer.
+    /// Number of sweeps in the window of a pair, its own two included. A sequence with fewer sweeps
+    /// has smaller windows. Near the ends of a sequence the window is shifted, not shortened; see
+    /// [`crate::flow::window`].
     pub fn sweeps(&self) -> usize {
         self.solver_options(usize::MAX).sweeps()
     }

@@ -270,7 +270,8 @@ pub enum Event {
     /// A job was leased for the first time.
     Started(Arc<Job>),
     /// A job was requeued: by the outcome of an attempt, an expired lease, the recovery, or
-    /// [`Queue::requeue`].
+    /// [`Queue::requeue`]. If that call requeues a sequence, each requeued pair sends it. The
+    /// sequence itself then sends it only if none of its pairs is requeued.
     Requeued(Arc<Job>),
     /// The lease of this job expired. Not sent if its cancellation was requested: such a job ends
     /// as cancelled.
