@@ -21,9 +21,9 @@ const ITERATIONS: usize = 12;
 /// Why a self-test failed.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum SelfTestError {
-    #[error("it failed its trial: {0}")]
+    #[error("it failed its self-test: {0}")]
     Failed(#[from] FlowError),
-    #[error("it failed its trial: its flow is off by {0} m")]
+    #[error("it failed its self-test: its flow is off by {0} m")]
     Off(f32),
     #[error("{0}")]
     Panicked(String),

@@ -125,7 +125,7 @@ impl Metrics {
         );
         registry.register(
             "device_ready",
-            "Whether a device has passed its trial",
+            "Whether a device has passed its self-test",
             self.device_ready.clone(),
         );
         registry.register(

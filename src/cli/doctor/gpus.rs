@@ -82,7 +82,7 @@ fn tried(adapter: &Adapter) -> String {
     let trial = Instant::now();
     let passed = match self_test_backend(&opened) {
         Ok(()) => format!(
-            "opened in {opening:.1} s, passed its trial in {:.2} s",
+            "opened in {opening:.1} s, passed its self-test in {:.2} s",
             trial.elapsed().as_secs_f64()
         ),
         Err(reason) => return format!("opened in {opening:.1} s, but {reason}"),
