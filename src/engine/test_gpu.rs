@@ -27,7 +27,7 @@ pub(crate) struct Switches {
     /// Whether a lane that takes its share of the device panics.
     pub(crate) tears: AtomicBool,
     /// Errors of the next self-tests, the next one last.
-    trials: Mutex<Vec<BackendError>>,
+    self_test_errors: Mutex<Vec<BackendError>>,
     /// Pairs with more points than this do not fit into memory; zero disables the limit.
     pub(crate) room: AtomicUsize,
     /// A pair with exactly this number of points causes the loss of the device; zero disables it.
@@ -50,17 +50,26 @@ impl Switches {
     }
 
     /// Makes the next self-test fail with this error.
-    pub(crate) fn fail_a_trial(&self, error: BackendError) {
-        self.trials.lock().expect("no panic holds it").push(error);
+    pub(crate) fn fail_a_self_test(&self, error: BackendError) {
+        self.self_test_errors
+            .lock()
+            .expect("no panic holds it")
+            .push(error);
     }
 
     /// Whether all injected self-test errors have occurred.
-    pub(crate) fn no_trial_fails(&self) -> bool {
-        self.trials.lock().expect("no panic holds it").is_empty()
+    pub(crate) fn no_self_test_fails(&self) -> bool {
+        self.self_test_errors
+            .lock()
+            .expect("no panic holds it")
+            .is_empty()
     }
 
     fn trial_error(&self) -> Option<BackendError> {
-        self.trials.lock().expect("no panic holds it").pop()
+        self.self_test_errors
+            .lock()
+            .expect("no panic holds it")
+            .pop()
     }
 
     /// Waits until this number of pairs is stopped at the brake.

@@ -165,7 +165,7 @@ async fn a_panic_in_one_lane_is_not_felt_in_another() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_trial_that_finds_no_room_beside_other_pairs_does_not_lose_the_device() {
+async fn a_self_test_that_finds_no_room_beside_other_pairs_does_not_lose_the_device() {
     for lack_of_room in [
         BackendError::Busy,
         BackendError::Memory {
@@ -178,18 +178,18 @@ async fn a_trial_that_finds_no_room_beside_other_pairs_does_not_lose_the_device(
         stand.ready().await;
         let lane = stand.device.lanes().next().expect("a lane");
         stand.switches.panics.store(1, Ordering::Relaxed);
-        stand.switches.fail_a_trial(lack_of_room);
+        stand.switches.fail_a_self_test(lack_of_room);
         let panicked = solved(&lane).await;
         assert!(matches!(panicked, Err(EngineError::Panicked(_))));
         solved(&lane).await.expect("it works again");
-        assert!(stand.switches.no_trial_fails(), "it was not tried");
+        assert!(stand.switches.no_self_test_fails(), "it was not tried");
         assert_eq!(stand.switches.openings.load(Ordering::Relaxed), 1);
         assert!(!stand.losses());
     }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_device_that_fails_its_trial_is_given_up_under_the_other_lanes_too() {
+async fn a_device_that_fails_its_self_test_is_given_up_under_the_other_lanes_too() {
     let stand = stand(2);
     stand.ready().await;
     stand.switches.brake.store(true, Ordering::Relaxed);
@@ -200,7 +200,7 @@ async fn a_device_that_fails_its_trial_is_given_up_under_the_other_lanes_too() {
         stand.switches.until_at_the_brake(1).await;
         stand.switches.panics.store(1, Ordering::Relaxed);
         let error = BackendError::Device("it computes nonsense".to_owned());
-        stand.switches.fail_a_trial(error);
+        stand.switches.fail_a_self_test(error);
         solved(&lanes[1]).await
     };
     let (at_work, slipped) = tokio::join!(at_work, slips);
