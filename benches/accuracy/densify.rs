@@ -11,7 +11,7 @@
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-use super::camera::camera;
+use super::camera::{camera, depth_row};
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::densify::{FlowEdge, LaterSweeps, Plan, densify};
 use fnsf::flow::depth::{Occlusion, project};
@@ -174,13 +174,7 @@ fn simulated(
     let seen = [&clouds[0], &clouds[1]].map(|cloud| project(&cloud.points, &camera));
     for (sum, image) in depths.iter_mut().zip([&own, &seen[0], &seen[1]]) {
         let image = image.without_occluded(&Occlusion::of(&camera));
-        let errors = image.errors(&truth)?;
-        let row = [
-            image.density(),
-            errors.mean_m,
-            errors.rmse_m,
-            errors.within_5_percent,
-        ];
+        let row = depth_row(&image, &truth)?;
         for (sum, value) in sum.iter_mut().zip(row) {
             *sum += value / STREETS as f64;
         }

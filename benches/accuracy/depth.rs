@@ -4,7 +4,7 @@
 //! the projection and its occlusion filter, and not the flow. With an argument, a picture is
 //! written to that file.
 
-use super::camera::camera;
+use super::camera::{camera, depth_row};
 use fnsf::flow::Point;
 use fnsf::flow::depth::{Occlusion, project};
 use fnsf::flow::simulate::{Street, StreetOptions};
@@ -38,13 +38,7 @@ pub(super) fn run(arguments: &[String]) -> anyhow::Result<()> {
                 if filtered {
                     image = image.without_occluded(&Occlusion::of(&camera));
                 }
-                let errors = image.errors(&truth)?;
-                let row = [
-                    image.density(),
-                    errors.mean_m,
-                    errors.rmse_m,
-                    errors.within_5_percent,
-                ];
+                let row = depth_row(&image, &truth)?;
                 for (sum, value) in sums.iter_mut().zip(row) {
                     *sum += value / SEEDS as f64;
                 }

@@ -371,8 +371,10 @@ pub trait Queue: Send + Sync {
     async fn watch(&self, id: JobId) -> Result<watch::Receiver<Arc<Job>>, QueueError>;
 
     /// Waits for the next job that a device of this kind may run, and leases it to `worker`, a name
-    /// that is stored with the job. Jobs that require the other kind are skipped. If the future is
-    /// dropped, a job may stay leased to nobody until its lease expires.
+    /// that is stored with the job. Jobs that require the other kind are skipped.
+    ///
+    /// If the future is dropped, the lease may already exist. The job is then queued again when the
+    /// lease expires.
     ///
     /// # Errors
     /// An error of the store.

@@ -87,7 +87,7 @@ pub(crate) fn pair_file(pair: &Pair) -> Vec<u8> {
     bytes
 }
 
-/// Two clusters, one of which moves. Every third row belongs to none.
+/// Two clusters. One of them moves. Every third point is in no cluster.
 pub(crate) fn objects(count: usize) -> Objects {
     let cluster = Cluster {
         points: count as u32 / 3,

@@ -81,7 +81,7 @@ fn ply(vertices: &str, before: &str) -> Vec<u8> {
     .into_bytes()
 }
 
-/// A stream of LZF back-references, each of which copies 264 earlier bytes.
+/// A stream of LZF back-references. Each one copies 264 earlier bytes.
 fn lzf_bomb() -> Vec<u8> {
     let mut packed = vec![0, 7];
     for _ in 0..150_000 {
