@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use crate::clouds::{form, medium_pair};
 use crate::raw_http::{
-    Besieged, CONTINUATION, DATA, END_HEADERS, END_STREAM, Frames, GOAWAY, HEADERS, PING,
-    RST_STREAM, SETTINGS, WINDOW_UPDATE, field, frame, head,
+    Besieged, CONTINUATION, DATA, END_HEADERS, END_STREAM, Frames, GOAWAY, HEADERS, MAX_GROWTH,
+    PING, RST_STREAM, SETTINGS, WINDOW_UPDATE, field, frame, head,
 };
 use crate::server::{PATIENCE, Server, ended};
 
@@ -218,10 +218,27 @@ async fn requests_that_are_refused_by_their_head_and_hang_up_keep_nothing_busy()
     assert!(siege.server.wait(PATIENCE).is_some(), "SIGTERM ends it");
 }
 
+/// A connection that asks for a result 60 times and reads none of the responses.
+fn asks_and_does_not_read(server: &Server, id: &str) -> Frames {
+    const INITIAL_WINDOW_SIZE: u16 = 4;
+    let mut window = INITIAL_WINDOW_SIZE.to_be_bytes().to_vec();
+    window.extend(0_u32.to_be_bytes());
+    let frames = Frames::open(server);
+    let mut bytes = frame(SETTINGS, 0, 0, &window);
+    for stream in streams(60) {
+        let mut block = head("GET", &format!("/v1/jobs/{id}/result"));
+        block.extend(field("accept", "application/json"));
+        bytes.extend(frame(HEADERS, END_HEADERS | END_STREAM, stream, &block));
+    }
+    frames.send(bytes);
+    frames
+}
+
 #[tokio::test]
 async fn answers_that_nobody_reads_are_bounded_and_given_up() {
-    let config = "[limits]\nwrite_timeout_seconds = 2\nmax_answers_mib = 64\n";
-    let siege = Besieged::new(config).await;
+    const BUDGET_MIB: u64 = 32;
+    let config = format!("[limits]\nwrite_timeout_seconds = 2\nmax_answers_mib = {BUDGET_MIB}\n");
+    let siege = Besieged::new(&config).await;
     let client = reqwest::Client::new();
     let sent = client
         .post(siege.server.url("/v1/jobs"))
@@ -232,39 +249,34 @@ async fn answers_that_nobody_reads_are_bounded_and_given_up() {
     let job: serde_json::Value = sent.json().await.expect("a job");
     let id = job["id"].as_str().expect("a name").to_owned();
     assert_eq!(ended(&siege.server, &id).await["state"], "succeeded");
-    const INITIAL_WINDOW_SIZE: u16 = 4;
-    let mut window = INITIAL_WINDOW_SIZE.to_be_bytes().to_vec();
-    window.extend(0_u32.to_be_bytes());
-    let held: Vec<Frames> = (0..4)
-        .map(|_| {
-            let frames = Frames::open(&siege.server);
-            let mut bytes = frame(SETTINGS, 0, 0, &window);
-            for stream in streams(60) {
-                let mut block = head("GET", &format!("/v1/jobs/{id}/result"));
-                block.extend(field("accept", "application/json"));
-                bytes.extend(frame(HEADERS, END_HEADERS | END_STREAM, stream, &block));
-            }
-            frames.send(bytes);
-            frames
-        })
-        .collect();
-    let answering: Vec<_> = held.into_iter().map(Frames::answer_pings).collect();
-    // 240 responses of some megabytes each. Together they may use at most a tenth of that.
-    let began = std::time::Instant::now();
-    while began.elapsed() < Duration::from_secs(2) {
-        let grown = siege.grown();
-        assert!(grown < 300 << 20, "{} MiB", grown >> 20);
-        std::thread::sleep(Duration::from_millis(20));
+    // The allocator may keep the budget of one attack. Four leaks of it would be seen.
+    for _ in 0..4 {
+        let answering: Vec<_> = (0..4)
+            .map(|_| asks_and_does_not_read(&siege.server, &id).answer_pings())
+            .collect();
+        // 240 responses of some megabytes each. Together they may use at most a tenth of that.
+        let began = std::time::Instant::now();
+        while began.elapsed() < Duration::from_secs(2) {
+            let grown = siege.grown();
+            assert!(grown < 150 << 20, "{} MiB", grown >> 20);
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        for connection in answering {
+            // Each connection is closed by the server although its pings are answered.
+            connection.join().expect("no panic");
+        }
+        // Their memory is available again.
+        let url = siege.server.url(&format!("/v1/jobs/{id}/result"));
+        let answer = client.get(url).send().await.expect("an answer");
+        assert_eq!(answer.status(), 200);
     }
-    for connection in answering {
-        // Each connection is closed by the server although its pings are answered.
-        connection.join().expect("no panic");
-    }
-    // Their memory is available again.
-    let url = siege.server.url(&format!("/v1/jobs/{id}/result"));
-    let answer = client.get(url).send().await.expect("an answer");
-    assert_eq!(answer.status(), 200);
-    siege.stands().await;
+    let grown = siege.grown();
+    assert!(
+        grown < (BUDGET_MIB << 20) + MAX_GROWTH,
+        "{} MiB",
+        grown >> 20
+    );
+    siege.serves().await;
 }
 
 #[tokio::test]

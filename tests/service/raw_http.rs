@@ -13,7 +13,7 @@ use crate::server::{Folder, PATIENCE, Server};
 pub(crate) const SMALL: &str = r#"{"preset": "neural", "max_points": 512}"#;
 
 /// Maximum memory growth of the server after an attack, bytes.
-const MAX_GROWTH: u64 = 64 << 20;
+pub(crate) const MAX_GROWTH: u64 = 64 << 20;
 
 /// A server under attack, and its resident memory before it.
 pub(crate) struct Besieged {
@@ -41,6 +41,11 @@ impl Besieged {
     /// panicked.
     pub(crate) async fn stands(&self) {
         self.has_not_grown();
+        self.serves().await;
+    }
+
+    /// Asserts that a pair is still solved and that nothing panicked.
+    pub(crate) async fn serves(&self) {
         serves(&self.server).await;
         let log = self.server.log();
         assert!(!log.contains("panicked"), "{log}");
