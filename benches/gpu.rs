@@ -142,7 +142,7 @@ fn pairs(gpu: &Gpu, pair: &SimulatedPair, sizes: &[usize]) -> Result<(), String>
     println!("| preset | points | iterations | precompute | query | network | total ms | EPE m |");
     println!("|---|---|---|---|---|---|---|---|");
     for &points in sizes {
-        for preset in Preset::with_field() {
+        for preset in Preset::with_gpu_kernels() {
             let mut runs = Vec::new();
             for seed in 0..=RUNS {
                 let options = Options {

@@ -15,8 +15,7 @@ use super::camera::{camera, depth_row};
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::densify::{FlowEdge, LaterSweeps, Plan, densify};
 use fnsf::flow::depth::{Occlusion, project};
-use fnsf::flow::distance::{DistanceOptions, Sites};
-use fnsf::flow::field::Backend;
+use fnsf::flow::distance::{DistanceOptions, DistanceTransform, Sites};
 use fnsf::flow::ground::{GroundOptions, segment};
 use fnsf::flow::simulate::{Street, StreetOptions, StreetSweep};
 use fnsf::flow::{DenseCloud, MotionField, Point, Preset, Residual, Sequence, Sweep, Uncontrolled};
@@ -210,10 +209,14 @@ fn real(backend: &CpuBackend, paths: &[String]) -> anyhow::Result<()> {
         ..DistanceOptions::default()
     };
     let target = &sweeps[into].points;
-    let transform = backend.transform(&cloud.points, target, &options, &Uncontrolled)?;
+    let transform = DistanceTransform::build(&cloud.points, target, &options, &Uncontrolled)?;
+    let off = |points: &[Point]| -> Vec<f32> {
+        let sampled = points.iter().map(|&point| transform.sample(point).distance);
+        sampled.collect()
+    };
     let ego_alone = carried(backend, &sweeps, &still(&fields), &plan)?;
-    let distances = transform.distances(&cloud.points)?;
-    let alone = transform.distances(&ego_alone.points)?;
+    let distances = off(&cloud.points);
+    let alone = off(&ego_alone.points);
     println!(
         "| age | static: median, m | mean to 0.5 m | mean | moving: mean, m | by ego motion alone, m |"
     );

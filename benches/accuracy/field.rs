@@ -14,8 +14,8 @@ use fnsf::flow::distance::{Metric, Sites};
 use fnsf::flow::evaluate::{Truth, evaluate};
 use fnsf::flow::field::Backend;
 use fnsf::flow::{
-    self, EarlyStopOptions, Ego, FieldOptions, Ground, InputNormalization, LearningRateSchedule,
-    Options, Preset, Problem, ResultChoice, Start,
+    self, DistanceLossOptions, EarlyStopOptions, Ego, FieldOptions, Ground, InputNormalization,
+    LearningRateSchedule, Options, Preset, Problem, ResultChoice, Start,
 };
 use fnsf::formats::{Pair, read_pair};
 
@@ -23,6 +23,11 @@ fn field(options: &mut Options) -> &mut FieldOptions {
     options
         .field_mut()
         .expect("the presets of this table fit a field")
+}
+
+fn distance_loss(options: &mut Options) -> &mut DistanceLossOptions {
+    let loss = field(options).loss.distance_mut();
+    loss.expect("the presets of this table use a distance transform")
 }
 
 /// A preset with a named change of its options.
@@ -51,16 +56,16 @@ const fn ours(name: &'static str, change: fn(&mut Options)) -> Variant {
 /// Stops after 100 iterations without a decrease of the loss by 0.05 mm.
 const PATIENT: EarlyStopOptions = EarlyStopOptions {
     patience: 100,
-    min_delta_m: 5e-5,
+    min_delta: 5e-5,
 };
 
 const VARIANTS: &[Variant] = &[
     paper("paper", |_| {}),
     paper("paper, chamfer transform", |o| {
-        field(o).distance.metric = Metric::Chamfer;
+        distance_loss(o).transform.metric = Metric::Chamfer;
     }),
     paper("paper, exact points", |o| {
-        field(o).distance.sites = Sites::Points;
+        distance_loss(o).transform.sites = Sites::Points;
     }),
     paper("paper, patience 100, 0.05 mm, 400 iterations", |o| {
         field(o).early_stop = Some(PATIENT);
@@ -73,7 +78,7 @@ const VARIANTS: &[Variant] = &[
         field(o).start = Start::ZeroFlow;
     }),
     paper("paper, truncation 2 m", |o| {
-        field(o).loss.truncation_m = Some(2.0);
+        distance_loss(o).truncation_m = Some(2.0);
     }),
     paper("paper, ego motion first", |o| o.ego = Ego::Auto),
     paper("paper, ego motion first, centered, zero start", |o| {
@@ -98,35 +103,35 @@ const VARIANTS: &[Variant] = &[
     ours("neural, no ego motion", |o| o.ego = Ego::Off),
     ours("neural, no margin", no_margin),
     ours("neural, margin 0.1 m at every range", |o| {
-        field(o).loss.margin_quantile = None;
+        distance_loss(o).margin_quantile = None;
     }),
     ours("neural, margin from 70% of the points", |o| {
-        field(o).loss.margin_quantile = Some(0.7);
+        distance_loss(o).margin_quantile = Some(0.7);
     }),
     ours("neural, margin from 80% of the points", |o| {
-        field(o).loss.margin_quantile = Some(0.8);
+        distance_loss(o).margin_quantile = Some(0.8);
     }),
     ours("neural, no flow penalty", |o| {
-        field(o).loss.flow_penalty = 0.0;
+        distance_loss(o).flow_penalty = 0.0;
     }),
     ours("neural, no margin, no flow penalty", |o| {
         no_margin(o);
-        field(o).loss.flow_penalty = 0.0;
+        distance_loss(o).flow_penalty = 0.0;
     }),
     ours("neural, flow penalty 0.01", |o| {
-        field(o).loss.flow_penalty = 0.01;
+        distance_loss(o).flow_penalty = 0.01;
     }),
     ours("neural, flow penalty 0.05", |o| {
-        field(o).loss.flow_penalty = 0.05;
+        distance_loss(o).flow_penalty = 0.05;
     }),
     ours("neural, no truncation", |o| {
-        field(o).loss.truncation_m = None;
+        distance_loss(o).truncation_m = None;
     }),
     ours("neural, truncation 0.5 m", |o| {
-        field(o).loss.truncation_m = Some(0.5);
+        distance_loss(o).truncation_m = Some(0.5);
     }),
     ours("neural, truncation 2 m", |o| {
-        field(o).loss.truncation_m = Some(2.0);
+        distance_loss(o).truncation_m = Some(2.0);
     }),
     ours("neural, raw inputs", |o| {
         field(o).inputs = InputNormalization::Raw;
@@ -144,7 +149,7 @@ const VARIANTS: &[Variant] = &[
         field(o).start = Start::Xavier;
     }),
     ours("neural, exact points", |o| {
-        field(o).distance.sites = Sites::Points;
+        distance_loss(o).transform.sites = Sites::Points;
     }),
     ours("neural, step size 0.008", |o| {
         field(o).learning_rate = 0.008;
@@ -180,8 +185,8 @@ const VARIANTS: &[Variant] = &[
 ];
 
 fn no_margin(options: &mut Options) {
-    options.field_mut().expect("a field").loss.margin_m = 0.0;
-    options.field_mut().expect("a field").loss.margin_quantile = None;
+    distance_loss(options).margin_m = 0.0;
+    distance_loss(options).margin_quantile = None;
 }
 
 /// The result of one seed.

@@ -20,6 +20,7 @@ from pathlib import Path
 import grpc
 from clouds import BadFile, Cloud, mean_length, read_cloud, write_flow
 
+PRESETS = ["default", "label", "neural", "paper", "nsfp-baseline", "nsfp-kdtree"]
 # 48 Ki points and their flags stay below the 1 MiB that the server takes in a message.
 CHUNK_POINTS = 48 * 1024
 REPOSITORY_PROTO = Path(__file__).resolve().parents[2] / "proto"
@@ -81,7 +82,7 @@ class Client:
         fields = {name: value for name, value in named.items() if value is not None}
         for name in ("preset", "ground", "ego", "priority"):
             if name in fields:
-                fields[name] = f"{name}_{fields[name]}".upper()
+                fields[name] = f"{name}_{fields[name]}".upper().replace("-", "_")
         return self.messages.Options(**fields)
 
     def _chunks(self, cloud):
@@ -272,7 +273,7 @@ def arguments_of(argv):
     sequence.set_defaults(run=run_sequence)
     for command in (pair, sequence):
         command.add_argument("--deadline", type=float, metavar="SECONDS", help="for the whole call; the best flow so far comes back")
-        command.add_argument("--preset", choices=["default", "label", "neural", "paper"])
+        command.add_argument("--preset", choices=PRESETS)
         command.add_argument("--seed", type=int)
         command.add_argument("--max-points", type=int)
         command.add_argument("--crop-m", type=float)

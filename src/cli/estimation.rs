@@ -22,12 +22,14 @@ pub(super) struct Estimation {
     /// Method of the estimate. default: ego motion, then one rigid motion for each moving object;
     /// all other points are static. label: as default, but each pair of a sequence is estimated
     /// from up to five sweeps, its own two among them. neural: ego motion, then a short fit of a
-    /// neural field to the remaining motion. paper: FNSF (ICCV 2023) with its published settings
+    /// neural field to the remaining motion. paper: FNSF (ICCV 2023) with its published settings.
+    /// nsfp-baseline: the baseline of that paper, a network fitted to the truncated Chamfer distance
+    /// on the CPU, minutes for full clouds. nsfp-kdtree: the same with k-d trees
     #[arg(long, value_enum, default_value_t)]
     preset: PresetChoice,
     /// Device for neural and paper: auto (a GPU, else the CPU), cpu, gpu, or gpu:CARD, where CARD
     /// is a GPU's number, PCI id or part of its name, as listed by fnsf doctor. default and label
-    /// are computed on the CPU whatever the device
+    /// are computed on the CPU whatever the device, and the nsfp presets refuse a GPU
     #[arg(long, value_name = "DEVICE", default_value_t)]
     device: DeviceArgument,
     /// CPU threads, 1 to 256; all cores by default. The result does not depend on it
@@ -40,9 +42,9 @@ pub(super) struct Estimation {
     /// Seed of all random choices; the same seed gives the same result, bit for bit
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
-    /// Sample this many points, at least 3; the other points get no flow. neural and paper sample
-    /// both clouds and use the sampled points alone. default and label use all points, and the
-    /// sampled source points get a flow. All points by default
+    /// Sample this many points, at least 3; the other points get no flow. default and label
+    /// use all points, and the sampled source points get a flow. The other presets sample both
+    /// clouds and use the sampled points alone. All points by default
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(3..))]
     max_points: Option<u32>,
     /// Half the side of a square crop about the sensor, in metres: points with |x| or |y| beyond R
@@ -57,12 +59,12 @@ pub(super) struct Estimation {
     /// Treatment of ground points. keep: like any other point. mask: points in the pair's masks
     /// ground1 and ground2 take no part and get no flow. auto: ground points, from the masks or
     /// else from ground segmentation, get the flow of the ego motion. By default auto, for paper
-    /// keep
+    /// and the nsfp presets keep
     #[arg(long, value_enum)]
     ground: Option<GroundChoice>,
     /// Ego motion between the sweeps. off: not estimated separately. auto: estimated first. FILE:
     /// given, as the 16 numbers of the 4 x 4 matrix target_from_source, row by row, or as an .npz
-    /// pair with ego_SE3. By default auto, for paper off
+    /// pair with ego_SE3. By default auto, for paper and the nsfp presets off
     #[arg(long, value_name = "off|auto|FILE")]
     ego: Option<String>,
     /// Poses of all sweeps, from which the ego motion is taken: KITTI's text (12 numbers a line), a
@@ -152,12 +154,12 @@ impl Estimation {
         })
     }
 
-    /// Opens the device. For presets that fit no field, `auto` opens the CPU backend and no GPU.
+    /// Opens the device. For presets without kernels for a GPU, `auto` opens the CPU backend.
     pub(super) fn open(&self) -> Result<Device<'_>, Failure> {
         let threads = self.threads.map(usize::from);
-        let fits = self.preset.preset().fits_field();
+        let runs_on_gpu = self.preset.preset().runs_on_gpu();
         let backend = match self.device.choice {
-            DeviceChoice::Auto if !fits => device::cpu(threads)?,
+            DeviceChoice::Auto if !runs_on_gpu => device::cpu(threads)?,
             _ => device::open(&self.device, threads)?,
         };
         Ok(Device {

@@ -119,7 +119,10 @@ pub(super) fn print_report(report: &Report) -> Result<(), Failure> {
         ))?;
     }
     if let Some(field) = &report.field {
-        let loss = field.best_loss_m.map(|loss| format!(", loss {loss:.4} m"));
+        let unit = &field.loss_unit;
+        let loss = field
+            .best_loss
+            .map(|loss| format!(", loss {loss:.4} {unit}"));
         let (seed, iterations, loss) = (report.seed, field.iterations, loss.unwrap_or_default());
         say(format_args!(
             "  preset {preset}, seed {seed}: {iterations} iterations ({reason}){loss}"

@@ -48,6 +48,6 @@ impl Control for Terminal {
     fn progress(&self, progress: Progress) {
         self.bar.set_length(progress.total as u64);
         self.bar.set_position(progress.done as u64);
-        self.bar.set_message(format!("loss {:.4} m", progress.loss));
+        self.bar.set_message(format!("loss {:.4}", progress.loss));
     }
 }

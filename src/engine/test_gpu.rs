@@ -7,9 +7,8 @@ use std::time::Duration;
 
 use super::types::{DeviceFactory, DeviceOptions, Opened, ReopenPolicy};
 use crate::flow::cpu::CpuBackend;
-use crate::flow::distance::DistanceOptions;
-use crate::flow::field::{Advance, Backend, BackendError, FitReport, Trainer, Transform};
-use crate::flow::{Control, FieldOptions, Host, Network, Point, TrainerState};
+use crate::flow::field::{Advance, Backend, BackendError, FitReport, PreparedTarget, Trainer};
+use crate::flow::{Control, FieldOptions, Host, LossOptions, Network, Point, TrainerState};
 use crate::job::DeviceKind;
 
 /// Points of the self-test's pair, which is exempt from the injected faults.
@@ -156,13 +155,13 @@ impl Backend for TestBackend {
         self.cpu.host()
     }
 
-    fn transform(
+    fn prepare_target(
         &self,
         source: &[Point],
         target: &[Point],
-        options: &DistanceOptions,
+        options: &LossOptions,
         control: &dyn Control,
-    ) -> Result<Box<dyn Transform>, BackendError> {
+    ) -> Result<Box<dyn PreparedTarget>, BackendError> {
         let on_trial = source.len() == TRIAL_POINTS;
         if !on_trial && taken(&self.switches.panics) {
             panic!("the device has slipped");
@@ -178,8 +177,8 @@ impl Backend for TestBackend {
                 available: room as u64,
             });
         }
-        Ok(Box::new(TestTransform {
-            cpu: self.cpu.transform(source, target, options, control)?,
+        Ok(Box::new(TestTarget {
+            cpu: self.cpu.prepare_target(source, target, options, control)?,
             switches: (!on_trial).then(|| Arc::clone(&self.switches)),
             lost: Arc::clone(&self.lost),
         }))
@@ -190,13 +189,13 @@ impl Backend for TestBackend {
     }
 }
 
-struct TestTransform {
-    cpu: Box<dyn Transform>,
+struct TestTarget {
+    cpu: Box<dyn PreparedTarget>,
     switches: Option<Arc<Switches>>,
     lost: Arc<AtomicBool>,
 }
 
-impl Transform for TestTransform {
+impl PreparedTarget for TestTarget {
     fn bytes(&self) -> usize {
         self.cpu.bytes()
     }

@@ -8,8 +8,8 @@
 use super::data::Point;
 use super::distance::DistanceTransform;
 use super::error::FlowError;
-use super::field::{LAID_OUT, PARAMETERS};
-use super::options::{FieldOptions, Method, Options};
+use super::field::{LAID_OUT, PARAMETERS, chamfer_work, check_chamfer};
+use super::options::{FieldOptions, LossOptions, Method, Options};
 use super::problem::Problem;
 use super::select::{find_ground, select};
 
@@ -29,6 +29,9 @@ const LABELLING: f64 = 4e5;
 const LABELLING_BYTES: usize = 448;
 /// Cost per point of selection, of the rigid transform and of the result, multiply-adds.
 const POINT: f64 = 3e4;
+/// Peak bytes per point of either cloud for the correspondences of a Chamfer distance: copies of the
+/// cloud and the deformed cloud, a k-d tree, the indices and the flow.
+const CORRESPONDENCE_BYTES: usize = 128;
 /// Parameter sets held at once: the network, its transposes, its optimizer and the result (6), and
 /// the largest number of gradient chunks (32).
 const PARAMETER_SETS: usize = 6 + 32;
@@ -48,7 +51,8 @@ pub struct Cost {
     /// Number of bricks of the distance transform; zero for a dense transform and for the object
     /// search.
     pub bricks: usize,
-    /// Bytes of the distance transform; zero for the object search. Equal to
+    /// Bytes of the prepared target, its distance transform or the cloud itself; zero for the object
+    /// search. Equal to
     /// [`super::FieldSolution::distance_bytes`] of a fit on the CPU without a deadline.
     pub transform_bytes: usize,
     /// Upper bound of the bytes held at once on a CPU with up to 28 threads, without the problem
@@ -152,20 +156,36 @@ fn object_cost(points: usize) -> MethodCost {
     }
 }
 
-/// The distance transform and the fit of a field.
-fn field_cost(
-    [source, target]: [&[Point]; 2],
-    options: &FieldOptions,
-) -> Result<MethodCost, FlowError> {
-    let transform = DistanceTransform::predict_cost(source, target, &options.distance)
-        .map_err(|error| FlowError::Backend(error.into()))?;
-    let batch = options.batch.unwrap_or(source.len()).min(source.len()) as f64;
+/// The preparation of the target, and the fit of a field.
+fn field_cost(clouds: [&[Point]; 2], options: &FieldOptions) -> Result<MethodCost, FlowError> {
+    let [source, target] = clouds;
+    let batch = options.batch.unwrap_or(source.len()).min(source.len());
     let iterations = options.expected_iterations() as f64;
-    let passes = iterations * PASSES * (batch + STEP_POINTS) + source.len() as f64;
-    Ok(MethodCost {
-        bricks: transform.bricks,
-        transform_bytes: transform.bytes,
-        bytes: transform.peak_bytes + PARAMETER_SETS * LAID_OUT * size_of::<f32>(),
-        multiply_adds: transform.multiply_adds + passes * PARAMETERS as f64,
-    })
+    let mut passes = iterations * PASSES * (batch as f64 + STEP_POINTS) + source.len() as f64;
+    let mut cost = match &options.loss {
+        LossOptions::Distance(loss) => {
+            let transform = DistanceTransform::predict_cost(source, target, &loss.transform);
+            let transform = transform.map_err(|error| FlowError::Backend(error.into()))?;
+            MethodCost {
+                bricks: transform.bricks,
+                transform_bytes: transform.bytes,
+                bytes: transform.peak_bytes,
+                multiply_adds: transform.multiply_adds,
+            }
+        }
+        LossOptions::Chamfer(loss) => {
+            check_chamfer(loss, target).map_err(FlowError::Backend)?;
+            // The flow is computed once more, for the correspondences.
+            passes += iterations * batch as f64;
+            MethodCost {
+                bricks: 0,
+                transform_bytes: size_of_val(target),
+                bytes: (batch + target.len()) * CORRESPONDENCE_BYTES,
+                multiply_adds: iterations * chamfer_work(loss.search, batch, target.len()),
+            }
+        }
+    };
+    cost.bytes += PARAMETER_SETS * LAID_OUT * size_of::<f32>();
+    cost.multiply_adds += passes * PARAMETERS as f64;
+    Ok(cost)
 }

@@ -29,7 +29,10 @@ pub enum InvalidOptions {
     /// Half precision (`f16`) with device `cpu`, which computes in single precision only.
     #[error("options: precision is \"f16\", which the CPU does not compute in")]
     HalfOnCpu,
-    /// Half precision with a preset that fits no field; with the name of the preset.
+    /// Device `gpu` with a preset whose field has no kernels for a GPU; with its name.
+    #[error("options: device is \"gpu\", but {0} is computed on the CPU alone: leave device out")]
+    NoGpuKernels(&'static str),
+    /// Half precision with a preset that fits no field on a GPU; with the name of the preset.
     #[error("options: precision is \"f16\", which {0} does not compute in: take preset neural")]
     HalfWithoutField(&'static str),
     /// The crop is not a positive, finite number of metres.

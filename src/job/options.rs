@@ -22,12 +22,14 @@ pub struct JobOptions {
     /// `default`: the rigid motion of each object, from the two sweeps of the pair; the remaining
     /// points move with the ego motion. `label`: as `default`, and a pair of a sequence uses up to
     /// five sweeps. `neural`: a short, robust fit of a neural field. `paper`: FNSF as published.
+    /// `nsfp-baseline`: the baseline that FNSF is compared with, a network fitted to the truncated
+    /// Chamfer distance. `nsfp-kdtree`: the same with k-d trees. Both take minutes for full clouds.
     pub preset: PresetChoice,
     /// Seed of the random numbers. On the same device, the same input, options and seed give a
     /// bit-identical result, unless a deadline ends the estimate.
     pub seed: u64,
     /// Maximum number of source points that get a flow, at least 3. They are chosen at random from
-    /// a larger cloud. `neural` and `paper` sample both clouds and use only the sampled points.
+    /// a larger cloud. Presets that fit a field sample both clouds and use only the sampled points.
     /// `default` and `label` compute from all points and return the flow of the sampled ones. If
     /// not given, no points are sampled.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -44,16 +46,18 @@ pub struct JobOptions {
     /// ground masks are left out and get no flow; refused if a mask is missing. `auto`: ground
     /// points are left out of the method and get the ego-motion flow, or none with `max_points` or
     /// without ego motion; they are taken from the masks, or from a ground segmentation if there
-    /// are none. Clouds that are nearly all ground keep it. Default: `auto`; `keep` with `paper`.
+    /// are none. Clouds that are nearly all ground keep it. Default: `auto`; `keep` with
+    /// `paper` and the `nsfp` presets.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ground: Option<GroundChoice>,
     /// The ego motion: `off` (not separated), `auto` (estimated first) or a 4 x 4 matrix
-    /// target_from_source, translation in metres. Default: `auto`; `off` with `paper`.
+    /// target_from_source, translation in metres. Default: `auto`; `off` with
+    /// `paper` and the `nsfp` presets.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<Object>)]
     pub ego: Option<EgoChoice>,
     /// The device for the computation. `neural` and `paper` can use a GPU. `default` and `label`
-    /// always compute on the host's CPU.
+    /// always compute on the host's CPU. The `nsfp` presets compute on the CPU and refuse `gpu`.
     pub device: DeviceChoice,
     /// `f32`: single precision. `f16`: half precision, for `neural` and `paper` on a GPU whose
     /// matrix units pass their self-test.
@@ -74,7 +78,7 @@ pub struct JobOptions {
 #[derive(
     Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema, clap::ValueEnum,
 )]
-#[serde(rename_all = "snake_case")]
+#[serde(rename_all = "kebab-case")]
 pub enum PresetChoice {
     /// Rigid motion of each object; the remaining points move with the ego motion.
     #[default]
@@ -85,6 +89,10 @@ pub enum PresetChoice {
     Neural,
     /// FNSF as published.
     Paper,
+    /// The baseline of FNSF's comparison: a network fitted to the truncated Chamfer distance.
+    NsfpBaseline,
+    /// As nsfp-baseline, with k-d trees for the nearest neighbors.
+    NsfpKdtree,
 }
 
 impl PresetChoice {
@@ -95,6 +103,8 @@ impl PresetChoice {
             Self::Label => Preset::Label,
             Self::Neural => Preset::Neural,
             Self::Paper => Preset::Paper,
+            Self::NsfpBaseline => Preset::NsfpBaseline,
+            Self::NsfpKdtree => Preset::NsfpKdtree,
         }
     }
 }
@@ -112,7 +122,8 @@ pub enum GroundChoice {
     Auto,
 }
 
-/// Precision of the factors in the network's matrix products.
+/// Precision of the network's matrix products during the fit of a field, see
+/// [`crate::flow::Precision`].
 #[derive(
     Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema, clap::ValueEnum,
 )]
@@ -121,7 +132,8 @@ pub enum PrecisionChoice {
     /// Single precision.
     #[default]
     F32,
-    /// Half precision, on the matrix units of a GPU.
+    /// Half-precision factors in the layers from 128 to 128 features, on the matrix units of a GPU.
+    /// Refused for the device `cpu` and for presets that fit no field.
     F16,
 }
 
@@ -244,8 +256,9 @@ impl JobOptions {
     /// # Errors
     /// The [`InvalidOptions`] of the first option that is refused:
     /// - `MaxPoints`, `Crop`, `Dt`, `Deadline` for a value out of range.
+    /// - `NoGpuKernels` for device `gpu` with a field that has no kernels for it.
     /// - `HalfOnCpu`, `HalfWithoutField` for `f16` with device `cpu` or a preset that fits no
-    ///   field.
+    ///   field on a GPU.
     /// - `ReferenceTime`, `Densify` for options of a dense cloud that are invalid for every
     ///   sequence.
     pub fn check(&self) -> Result<(), InvalidOptions> {
@@ -273,18 +286,29 @@ impl JobOptions {
             return Err(InvalidOptions::HalfOnCpu);
         }
         let preset = self.preset.preset();
-        if self.precision == PrecisionChoice::F16 && !preset.fits_field() {
+        if self.precision == PrecisionChoice::F16 && !preset.runs_on_gpu() {
             return Err(InvalidOptions::HalfWithoutField(preset.name()));
+        }
+        if self.device == DeviceChoice::Gpu && self.needs_cpu() {
+            return Err(InvalidOptions::NoGpuKernels(preset.name()));
         }
         self.densify.as_ref().map_or(Ok(()), Densify::check)
     }
 
-    /// The required kind of device; none if any kind will do. `f16` requires a GPU.
+    /// The required kind of device; none if any kind will do. `f16` requires a GPU, and a field that
+    /// has no kernels for a GPU requires a CPU.
     pub fn device_kind(&self) -> Option<DeviceKind> {
         match self.precision {
+            PrecisionChoice::F32 if self.needs_cpu() => Some(DeviceKind::Cpu),
             PrecisionChoice::F32 => self.device.kind(),
             PrecisionChoice::F16 => Some(DeviceKind::Gpu),
         }
+    }
+
+    /// Whether the preset fits a field that has no kernels for a GPU.
+    fn needs_cpu(&self) -> bool {
+        let preset = self.preset.preset();
+        preset.fits_field() && !preset.runs_on_gpu()
     }
 
     /// The solver's options. `points` is the number of points of the larger cloud. Points are
@@ -357,6 +381,7 @@ mod tests {
             ("label", false),
             ("neural", true),
             ("paper", true),
+            ("nsfp-kdtree", false),
         ] {
             let asked = options(&format!(r#"{{"preset":"{preset}","precision":"f16"}}"#));
             let refused = asked.err();

@@ -36,7 +36,7 @@ pub struct Report {
     /// The object search, with `default` and `label`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub objects: Option<ObjectsReport>,
-    /// The fit of a field, with `neural` and `paper`.
+    /// The fit of a field, with all presets but `default` and `label`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub field: Option<FieldReport>,
     /// Wall-clock seconds by phase.
@@ -64,7 +64,7 @@ pub struct ObjectsReport {
 }
 
 /// The result of the fit of a field.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct FieldReport {
     /// Number of finished iterations.
     pub iterations: usize,
@@ -73,32 +73,33 @@ pub struct FieldReport {
     pub max_iterations: usize,
     /// The iteration, from 1, whose field is the result; 0 if the deadline allowed no iteration.
     pub best_iteration: usize,
-    /// Loss of that iteration, metres; none if the deadline allowed no iteration.
-    pub best_loss_m: Option<f64>,
+    /// Loss of that iteration; none if the deadline allowed no iteration.
+    pub best_loss: Option<f64>,
+    /// Unit of the loss: `m`, or `m²` with a Chamfer distance (the `nsfp` presets).
+    pub loss_unit: String,
 }
 
-/// Wall-clock seconds of an estimate by phase. For a field they follow the breakdown in the FNSF
-/// paper.
+/// Wall-clock seconds of an estimate by phase.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PhaseSeconds {
-    /// Reading of files, if the same process read them.
+    /// Reading of files, if the same process read them. None in the service.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub load: Option<f64>,
     /// Selection, ground segmentation, distance transform, ego motion and the registration of
     /// neighbor sweeps.
     pub precompute: f64,
-    /// The object search.
+    /// The object search. None for a field.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub search: Option<f64>,
-    /// The distance queries of a field's fit.
+    /// The distance queries of a field's fit; 0 on a GPU without timestamps. None for an object
+    /// search.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub query: Option<f64>,
-    /// The rest of a field's fit, `total` less `precompute` and `query`: the network, the optimizer
-    /// and the evaluation of the result. Includes the distance queries on a GPU without timestamps.
-    /// None for an object search.
+    /// The rest of a field's fit: the network, the optimizer and the evaluation of the result.
+    /// Includes the distance queries on a GPU without timestamps. None for an object search.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub network: Option<f64>,
-    /// All phases.
+    /// The sum of the phases above, without those that are none.
     pub total: f64,
 }
 
@@ -132,7 +133,8 @@ impl Report {
                     iterations: solution.iterations,
                     max_iterations: solution.max_iterations,
                     best_iteration: solution.best_iteration,
-                    best_loss_m: finite(solution.best_loss),
+                    best_loss: finite(solution.best_loss),
+                    loss_unit: solution.loss_unit.to_owned(),
                 });
             }
         }
@@ -155,13 +157,13 @@ impl Report {
 
     /// The progress at the end of the estimate. For objects: the searched candidates, all
     /// candidates, and their mean cost in metres. For a field: the finished iterations, the
-    /// iteration limit, and the loss of the best iteration in metres. None if a deadline ended the
+    /// iteration limit, and the loss of the best iteration. None if a deadline ended the
     /// search at its start or allowed no iteration.
     pub fn progress(&self) -> Option<JobProgress> {
         let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
         let (done, total, loss) = match (&self.objects, &self.field) {
             (Some(objects), _) => (objects.searched, objects.candidates, objects.cost_m),
-            (None, Some(field)) => (field.iterations, field.max_iterations, field.best_loss_m),
+            (None, Some(field)) => (field.iterations, field.max_iterations, field.best_loss),
             (None, None) => return None,
         };
         loss.map(|loss| JobProgress {
@@ -213,6 +215,7 @@ mod tests {
                 max_iterations: 0,
                 best_iteration: 0,
                 best_loss: f64::INFINITY,
+                loss_unit: "m",
                 query_seconds: 0.0,
                 distance_bytes: 0,
             }),

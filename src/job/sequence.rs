@@ -56,6 +56,7 @@ mod tests {
             (r#"{"preset":"paper"}"#, false),
             (r#"{"preset":"paper","ego":"auto"}"#, false),
             (r#"{"preset":"label"}"#, false),
+            (r#"{"preset":"nsfp-kdtree"}"#, false),
         ] {
             let options = JobOptions::from_json(text.as_bytes()).expect("good options");
             assert_eq!(options.chained(), chained, "{text}");

@@ -118,7 +118,7 @@ pub struct Idempotency {
     /// The caller's key, unique per tenant.
     pub key: String,
     /// Hash of payload and options, computed by the caller. The same key with another fingerprint
-    /// is refused.
+    /// is refused, see [`Submission::idempotency`].
     pub fingerprint: [u8; 32],
 }
 

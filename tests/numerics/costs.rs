@@ -4,14 +4,22 @@ use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::distance::{DistanceError, Metric, Sites};
 use fnsf::flow::field::BackendError;
 use fnsf::flow::simulate::StreetOptions;
+use fnsf::flow::{
+    ChamferOptions, DistanceLossOptions, Ground, LossOptions, NearestSearch, Options, Preset,
+    Problem, estimate, predict_cost,
+};
 use fnsf::flow::{FlowError, Uncontrolled};
-use fnsf::flow::{Ground, Options, Preset, Problem, estimate, predict_cost};
 
 use super::scenes::{real_pair, solve, street};
 
 /// Bound on the memory beside the distance transform: sites, points and the network's working sets.
 const BESIDE_BYTES: usize = 48 << 20;
 const BESIDE_SHARE: f64 = 1.5;
+
+fn distance_loss(options: &mut Options) -> &mut DistanceLossOptions {
+    let field = options.field_mut().expect("a field");
+    field.loss.distance_mut().expect("a distance transform")
+}
 
 #[test]
 fn bytes_and_bricks_are_never_below_the_truth_and_not_far_above() {
@@ -30,7 +38,7 @@ fn bytes_and_bricks_are_never_below_the_truth_and_not_far_above() {
             for max_points in [None, Some(5000)] {
                 let mut options = Preset::Neural.options(max_points);
                 options.ground = Ground::Mask;
-                options.field_mut().expect("a field").distance.sites = sites;
+                distance_loss(&mut options).transform.sites = sites;
                 options.field_mut().expect("a field").max_iterations = 0;
                 let cost = predict_cost(&problem, &options).expect("it is taken");
                 let estimate = solve(&pair, &options);
@@ -67,9 +75,7 @@ fn work_grows_with_iterations_points_and_detail() {
     };
     assert!(change(|o| o.field_mut().expect("a field").max_iterations = 300) > work(&base));
     assert!(change(|o| o.field_mut().expect("a field").batch = None) > work(&base));
-    assert!(
-        change(|o| o.field_mut().expect("a field").distance.sites = Sites::Points) > work(&base)
-    );
+    assert!(change(|o| distance_loss(o).transform.sites = Sites::Points) > work(&base));
     assert!(change(|o| o.max_points = Some(1000)) < work(&base));
     assert!(work(&Preset::Paper.options(None)) > work(&base));
     let paper = predict_cost(&problem, &Preset::Paper.options(None)).expect("taken");
@@ -87,9 +93,9 @@ fn what_the_estimate_refuses_has_no_price() {
     let mut masked = options.clone();
     masked.ground = Ground::Mask;
     let mut tight = options.clone();
-    tight.field_mut().expect("a field").distance.max_bytes = 1000;
+    distance_loss(&mut tight).transform.max_bytes = 1000;
     let mut dense = tight.clone();
-    dense.field_mut().expect("a field").distance.metric = Metric::Chamfer;
+    distance_loss(&mut dense).transform.metric = Metric::Chamfer;
     let cases = [
         (&cloud[..2], None, &options),
         (&wide[..], None, &options),
@@ -111,7 +117,16 @@ fn what_the_estimate_refuses_has_no_price() {
         assert_eq!(refused.to_string(), truth.to_string());
         assert!(refused.is_input());
     }
+    let mut untruncated = Preset::NsfpBaseline.options(None);
+    untruncated.field_mut().expect("a field").loss = LossOptions::Chamfer(ChamferOptions {
+        truncation_m: f32::NAN,
+        search: NearestSearch::KdTree,
+    });
     let problem = Problem::pair(&cloud, &cloud);
+    let refused = predict_cost(&problem, &untruncated).expect_err("refused");
+    let truth = estimate(&backend, &problem, &untruncated, &Uncontrolled).expect_err("refused");
+    assert_eq!(refused.to_string(), truth.to_string());
+    assert!(refused.to_string().contains("truncation of NaN m"));
     assert!(matches!(
         predict_cost(&problem, &tight),
         Err(FlowError::Backend(BackendError::Distance(

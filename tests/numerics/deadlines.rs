@@ -8,7 +8,7 @@ use fnsf::flow::simulate::StreetOptions;
 use fnsf::flow::{Control, Estimate, FlowError, Interrupt, Preset, Problem, StopReason, estimate};
 use fnsf::formats::Pair;
 
-use super::scenes::street;
+use super::scenes::{shorten_chamfer, street};
 
 /// A clock that advances by one microsecond per reading, with an optional deadline in seconds.
 struct Clock {
@@ -50,7 +50,9 @@ fn run(pair: &Pair, preset: Preset, deadline: Option<f64>) -> Estimate {
     let backend = CpuBackend::new(Some(2)).expect("threads");
     let problem = Problem::pair(&pair.source, &pair.target);
     let clock = Clock::with(deadline);
-    estimate(&backend, &problem, &preset.options(None), &clock).expect("a flow")
+    let mut options = preset.options(None);
+    shorten_chamfer(&mut options);
+    estimate(&backend, &problem, &options, &clock).expect("a flow")
 }
 
 #[test]

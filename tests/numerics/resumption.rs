@@ -12,7 +12,7 @@ use fnsf::flow::{
 };
 use fnsf::formats::Pair;
 
-use super::scenes::street;
+use super::scenes::{shorten_chamfer, street};
 
 /// Requests a snapshot after some iterations and cancels the run once it has one.
 struct PutDown {
@@ -95,6 +95,7 @@ fn a_run_that_was_put_down_ends_with_the_bits_of_one_that_was_not() {
         let mut options = preset.options(None);
         let field = options.field_mut().expect("a field");
         field.batch = field.batch.map(|_| 700);
+        shorten_chamfer(&mut options);
         let undisturbed = run(&pair, &options, 2, None, &Onward).expect("a flow");
         let halfway = undisturbed.fit().expect("a fit").iterations / 2;
         for stops in [vec![1], vec![halfway], vec![2, 3, halfway, halfway + 5]] {

@@ -95,3 +95,12 @@ pub(crate) fn median_and_worst(pair: &Pair, options: &Options, seeds: u64) -> [f
     errors.sort_by(f64::total_cmp);
     [errors[errors.len() / 2], errors[errors.len() - 1]]
 }
+
+/// Limits the fit to a Chamfer distance to 30 iterations, each of which takes long.
+pub(crate) fn shorten_chamfer(options: &mut Options) {
+    if let Some(field) = options.field_mut()
+        && field.loss.distance().is_none()
+    {
+        field.max_iterations = 30;
+    }
+}

@@ -32,6 +32,8 @@ pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, Api
         Ok(proto::Preset::Label) => PresetChoice::Label,
         Ok(proto::Preset::Neural) => PresetChoice::Neural,
         Ok(proto::Preset::Paper) => PresetChoice::Paper,
+        Ok(proto::Preset::NsfpBaseline) => PresetChoice::NsfpBaseline,
+        Ok(proto::Preset::NsfpKdtree) => PresetChoice::NsfpKdtree,
         Err(_) => return Err(unknown("preset", message.preset)),
     };
     let ground = match proto::Ground::try_from(message.ground) {
@@ -192,7 +194,7 @@ pub(super) fn header(answer: &Answer) -> proto::FlowHeader {
     let seconds = report.seconds;
     let motion = report.ego_motion.as_ref();
     use proto::flow_header::Method;
-    let method = match (report.objects, report.field) {
+    let method = match (&report.objects, &report.field) {
         (Some(objects), _) => Some(Method::Objects(proto::ObjectSearch {
             clusters: count(objects.clusters),
             candidates: count(objects.candidates),
@@ -204,7 +206,8 @@ pub(super) fn header(answer: &Answer) -> proto::FlowHeader {
             iterations: count(field.iterations),
             max_iterations: count(field.max_iterations),
             best_iteration: count(field.best_iteration),
-            best_loss_m: field.best_loss_m,
+            best_loss: field.best_loss,
+            loss_unit: field.loss_unit.clone(),
         })),
         (None, None) => None,
     };

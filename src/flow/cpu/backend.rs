@@ -1,5 +1,4 @@
-//! The CPU backend: builds the distance transform, starts fits and evaluates networks on a thread
-//! pool.
+//! The CPU backend: prepares targets, starts fits and evaluates networks on a thread pool.
 
 use std::sync::Arc;
 
@@ -9,18 +8,23 @@ use super::inference;
 use super::isa::Isa;
 use super::kernels::Kernels;
 use super::model::{Mlp, Model};
+use super::nearest::{BruteForce, KdTrees};
 use super::tile::WorkingSets;
 use super::trainer::CpuTrainer;
-use crate::flow::data::{Control, Point, Random};
-use crate::flow::distance::{DistanceOptions, DistanceTransform};
+use crate::flow::data::{Control, Point, Random, Uncontrolled};
+use crate::flow::distance::DistanceTransform;
 use crate::flow::field::{
-    Backend, BackendError, Conditioning, DistanceLoss, Network, Schedule, Trainer, Transform, mlp,
+    Backend, BackendError, ChamferLoss, Conditioning, DistanceLoss, Loss, NearestSearcher, Network,
+    PreparedTarget, Schedule, Trainer, check_chamfer, length, mlp,
 };
 use crate::flow::host::Host;
-use crate::flow::options::{FieldOptions, Precision};
+use crate::flow::options::{
+    DistanceLossOptions, FieldOptions, LossOptions, NearestSearch, Precision,
+};
 
 /// A backend that computes in single precision on a pool of CPU threads.
 pub struct CpuBackend {
+    isa: Isa,
     kernels: Kernels,
     host: Host,
 }
@@ -45,6 +49,7 @@ impl CpuBackend {
     /// If `isa` is not one of [`Isa::available`].
     pub fn with_isa(isa: Isa, threads: Option<usize>) -> Result<Self, BackendError> {
         Ok(Self {
+            isa,
             kernels: Kernels::new(isa),
             host: Host::new(threads, Some(isa.name()))?,
         })
@@ -60,22 +65,41 @@ impl Backend for CpuBackend {
         &self.host
     }
 
-    fn transform(
+    fn prepare_target(
         &self,
         source: &[Point],
         target: &[Point],
-        options: &DistanceOptions,
+        options: &LossOptions,
         control: &dyn Control,
-    ) -> Result<Box<dyn Transform>, BackendError> {
+    ) -> Result<Box<dyn PreparedTarget>, BackendError> {
         let threads = self.host.threads();
-        let distance =
-            threads.install(|| DistanceTransform::build(source, target, options, control))?;
-        let (kernels, threads) = (self.kernels, Arc::clone(threads));
-        Ok(Box::new(CpuTransform {
-            kernels,
-            threads,
-            distance,
-        }))
+        let fits = Fits {
+            kernels: self.kernels,
+            threads: Arc::clone(threads),
+        };
+        match options {
+            LossOptions::Distance(DistanceLossOptions { transform, .. }) => {
+                let distance = threads
+                    .install(|| DistanceTransform::build(source, target, transform, control))?;
+                Ok(Box::new(TransformTarget { fits, distance }))
+            }
+            LossOptions::Chamfer(options) => {
+                check_chamfer(options, target)?;
+                let (threads, target) = (Arc::clone(threads), target.to_vec());
+                Ok(match options.search {
+                    NearestSearch::BruteForce => Box::new(CloudTarget {
+                        search: BruteForce::new(self.isa, threads, &target),
+                        fits,
+                        target,
+                    }),
+                    NearestSearch::KdTree => Box::new(CloudTarget {
+                        search: KdTrees::new(threads, &target),
+                        fits,
+                        target,
+                    }),
+                })
+            }
+        }
     }
 
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {
@@ -93,30 +117,21 @@ impl Backend for CpuBackend {
     }
 }
 
-/// A distance transform in memory, with the kernels and threads that fit a field to it.
-struct CpuTransform {
+/// What every fit on this backend needs.
+struct Fits {
     kernels: Kernels,
     threads: Arc<rayon::ThreadPool>,
-    distance: DistanceTransform,
 }
 
-impl Transform for CpuTransform {
-    fn bytes(&self) -> usize {
-        self.distance.bytes()
-    }
-
-    fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError> {
-        let sample = |&point: &Point| self.distance.sample(point).distance;
-        let sampled = || points.par_iter().map(sample).collect();
-        Ok(self.threads.install(sampled))
-    }
-
-    fn start(
+impl Fits {
+    /// Starts a fit of the network to `loss`.
+    fn start<'a>(
         &self,
+        loss: impl Loss + 'a,
         source: &[Point],
         options: &FieldOptions,
         seed: u64,
-    ) -> Result<Box<dyn Trainer + '_>, BackendError> {
+    ) -> Result<Box<dyn Trainer + 'a>, BackendError> {
         if options.precision == Precision::F16 {
             let text = "the CPU computes in single precision alone";
             return Err(BackendError::Unsupported(text));
@@ -125,13 +140,81 @@ impl Transform for CpuTransform {
         let parameters = mlp::initial(options.start, &mut random);
         let schedule = Schedule::new(source, options, &mut random);
         let model = Mlp::new(self.kernels, Conditioning::new(source, options.inputs));
-        let loss = DistanceLoss {
-            options: options.loss,
-            distance: &self.distance,
-        };
         let threads = Arc::clone(&self.threads);
         Ok(Box::new(CpuTrainer::new(
             threads, model, loss, schedule, parameters,
         )))
+    }
+}
+
+/// The error of a fit to another kind of loss than the one that the target was prepared for.
+const OTHER_LOSS: BackendError =
+    BackendError::Unsupported("the target was prepared for another kind of loss");
+
+/// A target's distance transform.
+struct TransformTarget {
+    fits: Fits,
+    distance: DistanceTransform,
+}
+
+impl PreparedTarget for TransformTarget {
+    fn bytes(&self) -> usize {
+        self.distance.bytes()
+    }
+
+    fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError> {
+        let sample = |&point: &Point| self.distance.sample(point).distance;
+        let sampled = || points.par_iter().map(sample).collect();
+        Ok(self.fits.threads.install(sampled))
+    }
+
+    fn start(
+        &self,
+        source: &[Point],
+        options: &FieldOptions,
+        seed: u64,
+    ) -> Result<Box<dyn Trainer + '_>, BackendError> {
+        let loss = DistanceLoss {
+            options: options.loss.distance().ok_or(OTHER_LOSS)?.clone(),
+            distance: &self.distance,
+        };
+        self.fits.start(loss, source, options, seed)
+    }
+}
+
+/// A target cloud with a search of nearest neighbors.
+struct CloudTarget<S: NearestSearcher> {
+    fits: Fits,
+    target: Vec<Point>,
+    search: S,
+}
+
+impl<S: NearestSearcher> PreparedTarget for CloudTarget<S> {
+    fn bytes(&self) -> usize {
+        size_of_val(self.target.as_slice())
+    }
+
+    fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError> {
+        let nearest = self.search.in_target(points, &Uncontrolled);
+        let nearest = nearest.map_err(BackendError::Interrupted)?;
+        let off = |(&[x, y, z], index): (&Point, u32)| {
+            let [to_x, to_y, to_z] = self.target[index as usize];
+            length([to_x - x, to_y - y, to_z - z])
+        };
+        Ok(points.iter().zip(nearest).map(off).collect())
+    }
+
+    fn start(
+        &self,
+        source: &[Point],
+        options: &FieldOptions,
+        seed: u64,
+    ) -> Result<Box<dyn Trainer + '_>, BackendError> {
+        let LossOptions::Chamfer(options_of_loss) = &options.loss else {
+            return Err(OTHER_LOSS);
+        };
+        check_chamfer(options_of_loss, &self.target)?;
+        let loss = ChamferLoss::new(*options_of_loss, &self.target, &self.search);
+        self.fits.start(loss, source, options, seed)
     }
 }

@@ -6,6 +6,8 @@ mod isa;
 mod kernels;
 mod mlp_kernels;
 mod model;
+mod nearest;
+mod nearest_kernels;
 mod profile;
 mod simd;
 mod tile;

@@ -21,6 +21,11 @@ pub(super) unsafe trait Lanes: Copy {
     unsafe fn load(from: *const f32) -> Self;
     unsafe fn store(self, to: *mut f32);
     unsafe fn add(self, other: Self) -> Self;
+    unsafe fn sub(self, other: Self) -> Self;
+    /// `self` where it is less than `other`, else `other`.
+    unsafe fn min(self, other: Self) -> Self;
+    /// `self` where `a < b`, else `other`.
+    unsafe fn where_less(self, a: Self, b: Self, other: Self) -> Self;
     /// `self * factor + addend`; fused on AVX-512 and AVX2 + FMA, rounded twice in plain Rust.
     unsafe fn mul_add(self, factor: Self, addend: Self) -> Self;
     /// `max(self, 0)`.
@@ -64,6 +69,24 @@ mod x86 {
         unsafe fn add(self, other: Self) -> Self {
             // SAFETY: the caller has avx512f.
             Self(unsafe { _mm512_add_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        unsafe fn sub(self, other: Self) -> Self {
+            // SAFETY: the caller has avx512f.
+            Self(unsafe { _mm512_sub_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        unsafe fn min(self, other: Self) -> Self {
+            // SAFETY: the caller has avx512f.
+            Self(unsafe { _mm512_min_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        unsafe fn where_less(self, a: Self, b: Self, other: Self) -> Self {
+            // SAFETY: the caller has avx512f.
+            unsafe {
+                let mask = _mm512_cmp_ps_mask::<_CMP_LT_OQ>(a.0, b.0);
+                Self(_mm512_mask_mov_ps(other.0, mask, self.0))
+            }
         }
         #[inline(always)]
         unsafe fn mul_add(self, factor: Self, addend: Self) -> Self {
@@ -114,6 +137,24 @@ mod x86 {
             Self(unsafe { _mm256_add_ps(self.0, other.0) })
         }
         #[inline(always)]
+        unsafe fn sub(self, other: Self) -> Self {
+            // SAFETY: the caller has avx2.
+            Self(unsafe { _mm256_sub_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        unsafe fn min(self, other: Self) -> Self {
+            // SAFETY: the caller has avx2.
+            Self(unsafe { _mm256_min_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        unsafe fn where_less(self, a: Self, b: Self, other: Self) -> Self {
+            // SAFETY: the caller has avx2.
+            unsafe {
+                let mask = _mm256_cmp_ps::<_CMP_LT_OQ>(a.0, b.0);
+                Self(_mm256_blendv_ps(other.0, self.0, mask))
+            }
+        }
+        #[inline(always)]
         unsafe fn mul_add(self, factor: Self, addend: Self) -> Self {
             // SAFETY: the caller has fma.
             Self(unsafe { _mm256_fmadd_ps(self.0, factor.0, addend.0) })
@@ -159,6 +200,25 @@ unsafe impl Lanes for F32x4 {
     #[inline(always)]
     unsafe fn add(self, other: Self) -> Self {
         Self(core::array::from_fn(|i| self.0[i] + other.0[i]))
+    }
+    #[inline(always)]
+    unsafe fn sub(self, other: Self) -> Self {
+        Self(core::array::from_fn(|i| self.0[i] - other.0[i]))
+    }
+    #[inline(always)]
+    unsafe fn min(self, other: Self) -> Self {
+        // SAFETY: as for this function.
+        unsafe { self.where_less(self, other, other) }
+    }
+    #[inline(always)]
+    unsafe fn where_less(self, a: Self, b: Self, other: Self) -> Self {
+        Self(core::array::from_fn(|i| {
+            if a.0[i] < b.0[i] {
+                self.0[i]
+            } else {
+                other.0[i]
+            }
+        }))
     }
     #[inline(always)]
     unsafe fn mul_add(self, factor: Self, addend: Self) -> Self {

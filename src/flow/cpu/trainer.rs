@@ -12,10 +12,10 @@ use rayon::prelude::*;
 use super::inference::evaluate;
 use super::model::Model;
 use super::tile::{TILE, WorkingSets};
-use crate::flow::data::{Control, Point, Progress};
+use crate::flow::data::{Control, Interrupt, Point, Progress};
 use crate::flow::field::{
-    Advance, BackendError, Chunks, EarlyStop, FitReport, Loss, Parameters, Schedule, Trainer,
-    TrainerState, reduction,
+    Advance, BackendError, Batch, Chunks, EarlyStop, FitReport, Loss, Parameters, Schedule,
+    Trainer, TrainerState, reduction,
 };
 
 /// Parameters that one thread sums and updates at a time.
@@ -50,7 +50,7 @@ pub(super) struct CpuTrainer<M: Model, L: Loss> {
     state: TrainerState,
     early_stop: Option<EarlyStop>,
     chunks: Vec<Chunk>,
-    /// Losses of the current iteration's points, metres.
+    /// Losses of the current iteration's points.
     losses: Vec<f32>,
     working_sets: WorkingSets<M::WorkingSet>,
     query_seconds: f64,
@@ -82,13 +82,16 @@ impl<M: Model, L: Loss> CpuTrainer<M, L> {
 
     /// One iteration: gradients, update of the result, Adam step. Returns the loss and whether
     /// early stopping fired; none if the loss is not finite.
-    fn iterate(&mut self, control: &dyn Control) -> Option<(f32, bool)> {
+    ///
+    /// # Errors
+    /// The interrupt of `control`, which abandons the iteration.
+    fn iterate(&mut self, control: &dyn Control) -> Result<Option<(f32, bool)>, Interrupt> {
         let batch = self.schedule.batch(self.state.iterations);
-        self.prepare(&batch, control);
+        self.prepare(&batch, control)?;
         let held = self.accumulate(batch, control);
         let loss = reduction::mean(&self.losses);
         if !loss.is_finite() {
-            return None;
+            return Ok(None);
         }
         let stop = self
             .early_stop
@@ -97,11 +100,11 @@ impl<M: Model, L: Loss> CpuTrainer<M, L> {
         self.keep(loss, stop);
         self.step(held);
         self.state.iterations += 1;
-        Some((loss, stop))
+        Ok(Some((loss, stop)))
     }
 
     /// Prepares the loss for `batch`.
-    fn prepare(&mut self, batch: &Range<usize>, control: &dyn Control) {
+    fn prepare(&mut self, batch: &Range<usize>, control: &dyn Control) -> Result<(), Interrupt> {
         let began = control.seconds();
         let points = &self.schedule.points[batch.clone()];
         let flow = || {
@@ -109,8 +112,13 @@ impl<M: Model, L: Loss> CpuTrainer<M, L> {
             let (model, sets) = (&self.model, &self.working_sets);
             evaluate(model, parameters, &self.threads, sets, points)
         };
-        self.loss.prepare(self.state.iterations, points, &flow);
+        let batch = Batch {
+            points,
+            flow: &flow,
+        };
+        self.loss.prepare(&batch, control)?;
         self.query_seconds += control.seconds() - began;
+        Ok(())
     }
 
     /// Forward pass, loss and backward pass over `batch`. Returns how many chunks hold its
@@ -289,8 +297,10 @@ impl<M: Model, L: Loss> Trainer for CpuTrainer<M, L> {
             if step > 0 && control.snapshot_due() {
                 return Ok(Advance::Continues);
             }
-            let Some((loss, stop)) = self.iterate(control) else {
-                return Ok(Advance::Diverged);
+            let (loss, stop) = match self.iterate(control) {
+                Ok(Some(done)) => done,
+                Ok(None) => return Ok(Advance::Diverged),
+                Err(interrupt) => return Ok(Advance::Interrupted(interrupt)),
             };
             control.progress(Progress {
                 done: self.state.iterations,

@@ -9,8 +9,9 @@ pub struct Progress {
     pub done: usize,
     /// Maximum number of iterations, or number of clusters.
     pub total: usize,
-    /// Mean loss of the latest iteration's points, metres. For an object search, the mean truncated
-    /// distance of the finished clusters from the target, metres.
+    /// Mean loss of the latest iteration's points, in the unit of the loss
+    /// ([`crate::flow::LossOptions::unit`]). For an object search, the mean truncated distance of
+    /// the finished clusters from the target, metres.
     pub loss: f64,
 }
 

@@ -5,9 +5,11 @@ use crate::flow::data::Interrupt;
 /// The distance metric.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Metric {
-    /// Euclidean distance on bricks: exact within the band, approximate beyond it.
+    /// Euclidean distance, see [`super::Bricks`]: exact at the grid's vertices within the band,
+    /// approximate beyond it.
     Euclidean,
-    /// The published code's chamfer metric on a dense grid: up to 12.8% too long.
+    /// The published code's chamfer metric on a dense grid, see [`super::DenseChamfer`]: up to
+    /// 12.8% too long.
     Chamfer,
 }
 

@@ -1,4 +1,4 @@
-//! Method field: distance transform, registration, then the fit of a neural field (FNSF).
+//! Method field: the target prepared, registration, then the fit of a neural field (FNSF, NSFP).
 
 use std::cell::LazyCell;
 
@@ -38,7 +38,7 @@ pub(super) fn residual_motion(
         .map(|snapshot| snapshot.state_for(*identity))
         .transpose()?;
     let clouds = [selection.source.as_slice(), &selection.target];
-    let prepared = field::prepare(backend, clouds, options, control)?;
+    let prepared = field::prepare_target(backend, clouds, options, control)?;
     let prior = before.and_then(|field| field.ego).unwrap_or_default();
     let ego = match (&prepared, input.options.ego) {
         (Some(prepared), ego) => {
@@ -84,8 +84,9 @@ pub(super) fn residual_motion(
             max_iterations: fitted.max_iterations,
             best_iteration: fitted.report.best_iteration,
             best_loss: fitted.report.best_loss,
+            loss_unit: options.loss.unit(),
             query_seconds: fitted.report.query_seconds,
-            distance_bytes: prepared.map_or(0, |prepared| prepared.transform.bytes()),
+            distance_bytes: prepared.map_or(0, |prepared| prepared.target.bytes()),
         }),
         stop_reason: fitted.stop_reason,
         device: backend.name(),
@@ -97,8 +98,11 @@ pub(super) fn residual_motion(
 /// field, and every option except the memory limit.
 fn identity(selection: &Selection, options: &Options, before: Option<&MotionField>) -> u64 {
     let mut options = options.clone();
-    if let Some(field) = options.field_mut() {
-        field.distance.max_bytes = 0;
+    if let Some(loss) = options
+        .field_mut()
+        .and_then(|field| field.loss.distance_mut())
+    {
+        loss.transform.max_bytes = 0;
     }
     let mut hash = Hash(Hash::default().of(format!("{options:?}").as_bytes()));
     let mut cloud = |points: &[Point]| {

@@ -100,10 +100,13 @@ pub struct FieldSolution {
     /// The iteration, counted from 1, whose field is the result. For an average it is the last one.
     /// Zero if none was done.
     pub best_iteration: usize,
-    /// Mean loss of that iteration, metres; for an average, the moving average of the losses.
-    /// Comparable within one preset and pair. Infinite if no iteration was done.
+    /// Mean loss of that iteration; for an average, the moving average of the losses. Comparable
+    /// within one preset and pair. Infinite if no iteration was done.
     pub best_loss: f64,
-    /// Bytes of the distance transform; zero where the deadline left no time for one.
+    /// The unit of the loss, see [`crate::flow::LossOptions::unit`].
+    pub loss_unit: &'static str,
+    /// Bytes of the distance transform, or of the target cloud with a Chamfer distance; zero where
+    /// the deadline left no time for one.
     pub distance_bytes: usize,
     /// Seconds of the distance queries in this run, without those before a resumed snapshot.
     ///

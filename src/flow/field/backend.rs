@@ -3,11 +3,11 @@
 use super::network::Network;
 use super::snapshot::TrainerState;
 use crate::flow::data::{Control, Interrupt, Point};
-use crate::flow::distance::{DistanceError, DistanceOptions};
+use crate::flow::distance::DistanceError;
 use crate::flow::host::{Host, HostError};
-use crate::flow::options::FieldOptions;
+use crate::flow::options::{FieldOptions, LossOptions};
 
-/// A device that builds distance transforms, fits fields to them and evaluates fitted networks.
+/// A device that prepares targets, fits fields to them and evaluates fitted networks.
 pub trait Backend: Send + Sync {
     /// The device's name, as reports show it.
     fn name(&self) -> String;
@@ -15,29 +15,33 @@ pub trait Backend: Send + Sync {
     /// The host's thread pool. Registration and the object search run there on every device.
     fn host(&self) -> &Host;
 
-    /// Builds the distance transform of `target` (M x 3, metres) on a grid that covers `target` and
-    /// `source` (N x 3, metres), both in the same frame. Coordinates must not be NaN.
-    /// Checks `control` before each part of the work.
+    /// Prepares `target` (M x 3, metres) for fits to the loss `options`: builds its distance
+    /// transform on a grid that covers `target` and `source` (N x 3, metres), or its k-d tree. Both
+    /// clouds are in the same frame. Coordinates must not be NaN. Checks `control` before each part
+    /// of a distance transform.
     ///
     /// # Errors
     /// - [`BackendError::Distance`] if the clouds or the options are refused, see
-    ///   [`crate::flow::distance::DistanceTransform::build`].
+    ///   [`crate::flow::distance::DistanceTransform::build`]. For a Chamfer distance only an empty
+    ///   target is refused.
+    /// - [`BackendError::Truncation`] if the truncation of a Chamfer distance is out of range.
     /// - [`BackendError::Interrupted`] if `control` interrupts.
-    /// - [`BackendError::Unsupported`] if the device lacks the metric or the sites of `options`. A
-    ///   GPU has only [`crate::flow::distance::Metric::Euclidean`] with
+    /// - [`BackendError::Unsupported`] if the device lacks the loss, or the metric or the sites of
+    ///   its distance transform. A GPU has only [`LossOptions::Distance`] with
+    ///   [`crate::flow::distance::Metric::Euclidean`] and
     ///   [`crate::flow::distance::Sites::Cells`].
     /// - [`BackendError::Memory`] if the transform and N points do not fit in the memory that the
     ///   GPU allocated when it was opened, or a temporary buffer exceeds the GPU's largest buffer.
     /// - [`BackendError::Busy`] if other pairs occupy that memory and release too little of it, or
     ///   the GPU has no free memory for a temporary buffer.
     /// - [`BackendError::Lost`] or [`BackendError::Device`] if the GPU fails.
-    fn transform(
+    fn prepare_target(
         &self,
         source: &[Point],
         target: &[Point],
-        options: &DistanceOptions,
+        options: &LossOptions,
         control: &dyn Control,
-    ) -> Result<Box<dyn Transform>, BackendError>;
+    ) -> Result<Box<dyn PreparedTarget>, BackendError>;
 
     /// The flow of `network` at `points` (N x 3, metres): N x 3 displacements, metres.
     ///
@@ -47,17 +51,20 @@ pub trait Backend: Send + Sync {
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError>;
 }
 
-/// The distance transform of a target cloud in a device's memory (FNSF Section 3.2).
+/// A target cloud that is prepared for a loss, in a device's memory: its distance transform (FNSF
+/// Section 3.2), or the cloud with what the search of nearest neighbors needs.
 ///
-/// It gives the distance to the target, metres, sampled on a grid and interpolated trilinearly. A
-/// point outside the grid gets the distance at the nearest position on the grid's border. All
-/// points are in the frame of the two clouds that it was built for. Dropping it frees the memory.
-pub trait Transform: Send {
-    /// Bytes of the device's memory that the transform occupies, without the source points.
+/// All points are in the frame of the two clouds that it was prepared with. Dropping it frees the
+/// memory.
+pub trait PreparedTarget: Send {
+    /// Bytes of the device's memory that it occupies, without the source points.
     fn bytes(&self) -> usize;
 
-    /// N distances to the target, metres, one for each of `points` (N x 3, metres). A point outside
-    /// the grid gets the distance at the nearest position on the grid's border.
+    /// N distances to the target, metres, one for each of `points` (N x 3, metres).
+    ///
+    /// Those of a distance transform are sampled on its grid and interpolated trilinearly. A point
+    /// outside the grid gets the distance at the nearest position on the grid's border. Without a
+    /// transform the distances are those to the nearest target points.
     ///
     /// # Errors
     /// [`BackendError::Memory`], [`BackendError::Busy`], [`BackendError::Lost`] or
@@ -66,12 +73,14 @@ pub trait Transform: Send {
 
     /// Starts a fit of a field to `source` (N x 3, metres) and returns it before its first
     /// iteration. `source` must have at least one point, which is not checked. It must have at most
-    /// as many points as the source that the transform was built for; only a GPU refuses more.
-    /// `seed` determines the initial parameters and the batches.
+    /// as many points as the source that the target was prepared with; only a GPU refuses more. The
+    /// loss of `options` must be the one that the target was prepared for, except for the margin,
+    /// the truncation and the penalty. `seed` determines the initial parameters and the batches.
     ///
     /// # Errors
-    /// - [`BackendError::Unsupported`] if the device lacks the precision of `options`. A CPU has
-    ///   only single precision. Half precision needs a GPU whose matrix units pass their self-test.
+    /// - [`BackendError::Unsupported`] if the target was prepared for another kind of loss, or the
+    ///   device lacks the precision of `options`. A CPU has only single precision. Half precision
+    ///   needs a GPU whose matrix units pass their self-test.
     /// - [`BackendError::Memory`] if a GPU has too little memory for the points or for the
     ///   gradients of a batch.
     /// - [`BackendError::Busy`] if all lanes of a GPU are in use.
@@ -85,7 +94,7 @@ pub trait Transform: Send {
 }
 
 /// A fit of a field in progress: it iterates, evaluates its result, and saves and restores its
-/// state. [`Transform::start`] makes it.
+/// state. [`PreparedTarget::start`] makes it.
 pub trait Trainer: Send {
     /// Does up to `steps` iterations and reports the progress of each to `control`. Checks
     /// `control` before each iteration, or before each group of iterations that a GPU does at once.
@@ -152,10 +161,10 @@ pub struct FitReport {
     /// The iteration, counted from 1, whose field [`Trainer::evaluate`] uses; the latest one if the
     /// result is a running average. Zero before the first iteration.
     pub best_iteration: usize,
-    /// Mean loss of that iteration, metres; for a running average, the running mean of the batches'
-    /// losses. Infinite before the first iteration.
+    /// Mean loss of that iteration, in the unit of the loss; for a running average, the running mean
+    /// of the batches' losses. Infinite before the first iteration.
     pub best_loss: f64,
-    /// Time of the distance queries so far, seconds. On a CPU it is the mean over the threads that
+    /// Time of the distance queries or of the correspondences so far, seconds. On a CPU it is the mean over the threads that
     /// ran them, by the control's clock. On a GPU it is estimated from timestamps. Zero without a
     /// clock or timestamps.
     pub query_seconds: f64,
@@ -168,6 +177,12 @@ pub enum BackendError {
     /// clouds span too much space, or `max_bytes` is too small.
     #[error(transparent)]
     Distance(DistanceError),
+    /// The truncation of a Chamfer distance is not a positive, finite number of metres.
+    #[error("a truncation of {truncation_m} m is not possible: choose more than 0 m")]
+    Truncation {
+        /// The requested truncation, metres.
+        truncation_m: f32,
+    },
     /// The control interrupted the distance transform, before the first iteration.
     #[error("interrupted before the first iteration")]
     Interrupted(Interrupt),

@@ -5,10 +5,12 @@
 //! transform fits. Then the network's speed is measured on some points. The remaining time, less a
 //! reserve for the final evaluation, determines the batch size and the number of iterations.
 
-use super::backend::{Backend, BackendError, Trainer, Transform};
+use super::backend::{Backend, BackendError, PreparedTarget, Trainer};
+use super::chamfer::chamfer_work;
 use super::error::FitError;
+use super::mlp::PARAMETERS;
 use crate::flow::data::{Control, EarlierDeadline, Interrupt, Point};
-use crate::flow::options::{DeadlineLimits, FieldOptions, LearningRateSchedule};
+use crate::flow::options::{DeadlineLimits, FieldOptions, LearningRateSchedule, LossOptions};
 
 /// With more time left than this, the requested transform is built directly, seconds per point of
 /// both clouds: twenty times the time of the transform on a slow core.
@@ -30,9 +32,11 @@ const MEASURED: usize = 1536;
 const LATENCY: f64 = 4e-4;
 /// Number of points of that second measurement.
 const MEASURED_WHERE_FAST: usize = 16 * MEASURED;
-/// Cost of an iteration relative to an evaluation, per point: forward pass, twice that for the
-/// backward pass, and the distance query.
-const ITERATION: f64 = 3.4;
+/// Cost of an iteration without its loss, relative to an evaluation, per point: forward pass, and
+/// twice that for the backward pass.
+const ITERATION: f64 = 3.0;
+/// Cost of a distance query, relative to an evaluation, per point.
+const DISTANCE_QUERY: f64 = 0.4;
 /// With a cosine schedule, a fit that is predicted to take up to this many times the available time
 /// is started unchanged. The prediction is rough, and the fit can be shortened later.
 const ROUGH: f64 = 1.35;
@@ -50,19 +54,20 @@ const STEPS_SHARE: f64 = 0.05;
 /// Iterations between two checks of whether the remaining ones fit.
 const ITERATIONS_AT_ONCE: usize = 8;
 
-/// The finest distance transform that the time allows.
+/// A prepared target, with the finest distance transform that the time allows.
 pub(crate) struct Prepared {
-    pub(crate) transform: Box<dyn Transform>,
-    /// Whether it has the cells of the options.
+    pub(crate) target: Box<dyn PreparedTarget>,
+    /// Whether its transform has the cells of the options; true without a transform.
     pub(crate) whole: bool,
+    target_points: usize,
 }
 
-/// The finest transform of `target` that fits in the time left, over a grid that covers both
-/// clouds; none if there is no time for any.
+/// Prepares `target` for the loss of `options`. A distance transform is the finest one that fits in
+/// the time left, over a grid that covers both clouds; none if there is no time for any.
 ///
 /// # Errors
 /// [`FitError`] if the clouds are refused, the control cancels or the device fails.
-pub(crate) fn prepare(
+pub(crate) fn prepare_target(
     backend: &dyn Backend,
     [source, target]: [&[Point]; 2],
     options: &FieldOptions,
@@ -72,25 +77,34 @@ pub(crate) fn prepare(
         control,
         reserve: 0.0,
     };
-    let transform = |coarser: f64, control: &dyn Control| {
-        let mut distance = options.distance.clone();
-        distance.cell_m *= coarser;
-        distance.band_m = distance.band_m.max(distance.cell_m);
-        match backend.transform(source, target, &distance, control) {
-            Ok(transform) => Ok(Some(transform)),
+    let prepare = |coarser: f64, control: &dyn Control| {
+        let mut loss = options.loss.clone();
+        if let Some(loss) = loss.distance_mut() {
+            let transform = &mut loss.transform;
+            transform.cell_m *= coarser;
+            transform.band_m = transform.band_m.max(transform.cell_m);
+        }
+        match backend.prepare_target(source, target, &loss, control) {
+            Ok(target) => Ok(Some(target)),
             Err(BackendError::Interrupted(Interrupt::Deadline)) => Ok(None),
             Err(BackendError::Interrupted(Interrupt::Cancelled)) => Err(FitError::Cancelled),
             Err(error) => Err(error.into()),
         }
     };
-    let prepared = |transform: Box<dyn Transform>, whole: bool| Prepared { transform, whole };
+    let prepared = |whole: bool| {
+        move |prepared: Box<dyn PreparedTarget>| Prepared {
+            target: prepared,
+            whole,
+            target_points: target.len(),
+        }
+    };
     let ample = AMPLE_SECONDS_PER_POINT * (source.len() + target.len()) as f64;
-    if control.seconds_left().is_none_or(|left| left > ample) {
-        let transform = transform(1.0, &on_time)?;
-        return Ok(transform.map(|transform| prepared(transform, true)));
+    let ample = control.seconds_left().is_none_or(|left| left > ample);
+    if ample || options.loss.distance().is_none() {
+        return Ok(prepare(1.0, &on_time)?.map(prepared(true)));
     }
     let began = control.seconds();
-    let Some(coarse) = transform(COARSE, &on_time)? else {
+    let Some(coarse) = prepare(COARSE, &on_time)? else {
         return Ok(None);
     };
     let took = control.seconds() - began;
@@ -103,12 +117,25 @@ pub(crate) fn prepare(
             control,
             reserve: left * (1.0 - GIVEN_UP_SHARE),
         };
-        match transform(coarser, &early)? {
-            Some(transform) => return Ok(Some(prepared(transform, coarser == 1.0))),
+        match prepare(coarser, &early)? {
+            Some(target) => return Ok(Some(prepared(coarser == 1.0)(target))),
             None => break,
         }
     }
-    Ok(Some(prepared(coarse, false)))
+    Ok(Some(prepared(false)(coarse)))
+}
+
+/// Cost of the loss of `batch` source points and its derivative, in evaluations of the network at
+/// one point.
+fn loss_cost(loss: &LossOptions, batch: usize, target_points: usize) -> f64 {
+    match loss {
+        LossOptions::Distance(_) => DISTANCE_QUERY * batch as f64,
+        // The flow is computed once more, for the correspondences.
+        LossOptions::Chamfer(options) => {
+            let work = chamfer_work(options.search, batch, target_points);
+            batch as f64 + work / PARAMETERS as f64
+        }
+    }
 }
 
 /// The measured speed of the network, and the time reserved for the final evaluation.
@@ -158,7 +185,10 @@ impl Throughput {
         left: f64,
     ) -> Option<FieldOptions> {
         let budget = (left - self.evaluation).max(0.0);
-        let iteration = |batch: usize| self.point * ITERATION * batch as f64;
+        let iteration = |batch: usize| {
+            let loss = loss_cost(&options.loss, batch, prepared.target_points);
+            self.point * (ITERATION * batch as f64 + loss)
+        };
         let asked = options.batch.unwrap_or(points).clamp(1, points.max(1));
         let needed = options.expected_iterations() as f64 * iteration(asked);
         let tolerance = match options.learning_rate_schedule {
@@ -174,9 +204,15 @@ impl Throughput {
             least_iterations,
         } = DeadlineLimits::new(has_ego);
         let wished = iterations.min(options.max_iterations) as f64;
-        let fitting = budget / (wished * iteration(1));
-        let batch = (fitting as usize / least * least).clamp(least, most.max(least));
-        let batch = batch.min(asked);
+        let batch = match options.loss {
+            LossOptions::Distance(_) => {
+                let fitting = budget / (wished * iteration(1));
+                let batch = (fitting as usize / least * least).clamp(least, most.max(least));
+                batch.min(asked)
+            }
+            // Target points have no counterparts in a small batch.
+            LossOptions::Chamfer(_) => asked,
+        };
         // Never more work than requested, even if it is divided into more iterations.
         let most = options.max_iterations.saturating_mul(asked) / batch;
         let fitting = ((budget / iteration(batch)) as usize).min(most);

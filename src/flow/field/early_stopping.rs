@@ -1,6 +1,6 @@
 //! Early stopping with an absolute threshold, as in the published code.
 //!
-//! The first loss is the initial best. A loss more than `min_delta_m` below the best is progress
+//! The first loss is the initial best. A loss more than `min_delta` below the best is progress
 //! and becomes the best. After `patience` iterations without progress, or at a loss that is not a
 //! number, the fit ends.
 
@@ -16,7 +16,7 @@ pub(crate) struct EarlyStop {
 /// The state of the rule.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct EarlyStopState {
-    /// The lowest loss that counted as progress, metres; none before the first loss.
+    /// The lowest loss that counted as progress; none before the first loss.
     pub(crate) best: Option<f32>,
     /// Iterations since then.
     pub(crate) without_progress: usize,
@@ -44,7 +44,7 @@ impl EarlyStop {
             return true;
         }
         match self.seen.best {
-            Some(best) if loss >= best - self.options.min_delta_m as f32 => {
+            Some(best) if loss >= best - self.options.min_delta as f32 => {
                 self.seen.without_progress += 1;
             }
             _ => {
@@ -65,7 +65,7 @@ mod tests {
     fn stops_at(patience: usize, losses: &[f32]) -> Option<usize> {
         let mut rule = EarlyStop::new(EarlyStopOptions {
             patience,
-            min_delta_m: 1e-3,
+            min_delta: 1e-3,
         });
         losses.iter().position(|&loss| rule.observe(loss))
     }

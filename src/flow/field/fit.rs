@@ -114,8 +114,8 @@ impl Fit<'_> {
             &mut options,
         )?;
         let start = |options: &FieldOptions| {
-            let transform = &prepared.transform;
-            transform.start(self.aligned, options, self.seed)
+            let target = &prepared.target;
+            target.start(self.aligned, options, self.seed)
         };
         let mut trainer = start(&options)?;
         let mut cut = !prepared.whole;
@@ -197,15 +197,17 @@ impl Fit<'_> {
     /// The options, with `margin_slope` raised to the configured quantile of distance over range.
     fn with_margin(&self) -> Result<FieldOptions, FitError> {
         let mut options = self.options.clone();
-        if let (Some(share), Some(_)) = (options.loss.margin_quantile, self.ego) {
-            let distances = self.prepared.transform.distances(self.aligned)?;
+        if let Some(loss) = options.loss.distance_mut()
+            && let (Some(share), Some(_)) = (loss.margin_quantile, self.ego)
+        {
+            let distances = self.prepared.target.distances(self.aligned)?;
             let ranges = self.aligned.iter().map(|&point| length(point).max(1.0));
             let slopes = distances
                 .iter()
                 .zip(ranges)
                 .map(|(d, range)| d / range)
                 .collect();
-            options.loss.margin_slope = options.loss.margin_slope.max(quantile(slopes, share));
+            loss.margin_slope = loss.margin_slope.max(quantile(slopes, share));
         }
         Ok(options)
     }

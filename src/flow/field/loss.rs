@@ -4,44 +4,55 @@
 //! [`Loss`] is the interface to the fit. [`DistanceLoss`] is FNSF's, of one deformed point in the
 //! distance transform. Every backend implements its formulas:
 //! `clamp(D(p + f), margin, truncation) + penalty * |f|`. With the published settings it is just
-//! `D(p + f)`, FNSF eq. 6.
+//! `D(p + f)`, FNSF eq. 6. The Chamfer distance is in `chamfer.rs`.
 
-use crate::flow::data::Point;
+use crate::flow::data::{Control, Interrupt, Point};
 use crate::flow::distance::{DistanceTransform, Sample};
-use crate::flow::options::LossOptions;
+use crate::flow::options::DistanceLossOptions;
 
 /// Flows shorter than this are penalized quadratically, so that the derivative is continuous.
 const SMALL_FLOW_M: f32 = 1e-3;
 
-/// The loss of one point, metres, and its derivative with respect to the flow.
+/// The loss of one point and its derivative with respect to the flow.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct PointLoss {
     pub(crate) value: f32,
     pub(crate) gradient: Point,
 }
 
+/// The points of one iteration.
+pub(crate) struct Batch<'a> {
+    pub(crate) points: &'a [Point],
+    /// Computes the flow of each point, metres.
+    pub(crate) flow: &'a dyn Fn() -> Vec<Point>,
+}
+
 /// A loss that a field can be fitted to. The fit minimizes the mean of [`Self::at`] over the points
 /// of each iteration.
 pub(crate) trait Loss: Send + Sync {
-    /// Prepares the iteration that follows `done` others over `points`. A loss that couples the
-    /// points, such as the Chamfer distance, calls `flow` for the flow of each point, metres, and
-    /// renews its correspondences.
-    fn prepare(&mut self, done: usize, points: &[Point], flow: &dyn Fn() -> Vec<Point>);
+    /// Prepares an iteration over `batch`. A loss that couples the points, such as the Chamfer
+    /// distance, finds its correspondences here.
+    ///
+    /// # Errors
+    /// The interrupt of `control`, which abandons the iteration.
+    fn prepare(&mut self, batch: &Batch<'_>, control: &dyn Control) -> Result<(), Interrupt>;
 
     /// The loss of `point` with `flow`. `index` is that of the point among those of the iteration.
     fn at(&self, index: usize, point: Point, flow: Point) -> PointLoss;
 }
 
 /// The loss of FNSF, eq. 6, with a margin, a truncation and a penalty on the flow: each deformed
-/// point's distance to the target, by the target's distance transform.
+/// point's distance to the target, metres, by the target's distance transform.
 pub(crate) struct DistanceLoss<'a> {
-    pub(crate) options: LossOptions,
+    pub(crate) options: DistanceLossOptions,
     pub(crate) distance: &'a DistanceTransform,
 }
 
 impl Loss for DistanceLoss<'_> {
     /// Nothing: the points are independent of each other.
-    fn prepare(&mut self, _: usize, _: &[Point], _: &dyn Fn() -> Vec<Point>) {}
+    fn prepare(&mut self, _: &Batch<'_>, _: &dyn Control) -> Result<(), Interrupt> {
+        Ok(())
+    }
 
     #[inline]
     fn at(&self, _: usize, point: Point, flow: Point) -> PointLoss {
@@ -50,7 +61,7 @@ impl Loss for DistanceLoss<'_> {
     }
 }
 
-impl LossOptions {
+impl DistanceLossOptions {
     /// The loss of `point` with `flow`, where `sample` is the distance transform at the deformed
     /// point.
     #[inline]
@@ -99,11 +110,11 @@ mod tests {
 
     /// The loss in a distance field of constant slope: finite differences are exact, and the only
     /// kinks are the loss's own.
-    fn value(options: &LossOptions, flow: [f64; 3]) -> f64 {
+    fn value(options: &DistanceLossOptions, flow: [f64; 3]) -> f64 {
         f64::from(loss(options, flow).value)
     }
 
-    fn loss(options: &LossOptions, flow: [f64; 3]) -> PointLoss {
+    fn loss(options: &DistanceLossOptions, flow: [f64; 3]) -> PointLoss {
         let gradient = [0.6f32, 0.0, -0.8];
         let flow = flow.map(|f| f as f32);
         let distance = 0.5 + gradient.iter().zip(flow).map(|(g, f)| g * f).sum::<f32>();
@@ -116,12 +127,11 @@ mod tests {
         // error of 6e-5.
         const TOLERANCE: f64 = 5e-4;
         const STEP: f64 = 1e-3;
-        let options = LossOptions {
+        let options = DistanceLossOptions {
             margin_m: 0.1,
-            margin_slope: 0.0,
-            margin_quantile: None,
             truncation_m: Some(2.0),
             flow_penalty: 0.3,
+            ..DistanceLossOptions::published()
         };
         for flow in [
             [0.2, 0.1, -0.3],
@@ -147,13 +157,7 @@ mod tests {
 
     #[test]
     fn the_published_loss_is_the_distance_itself() {
-        let options = LossOptions {
-            margin_m: 0.0,
-            margin_slope: 0.0,
-            margin_quantile: None,
-            truncation_m: None,
-            flow_penalty: 0.0,
-        };
+        let options = DistanceLossOptions::published();
         let sample = Sample {
             distance: 0.7,
             gradient: [0.0, 1.0, 0.0],
@@ -170,12 +174,10 @@ mod tests {
 
     #[test]
     fn points_within_the_margin_and_beyond_the_truncation_are_not_pulled() {
-        let options = LossOptions {
+        let options = DistanceLossOptions {
             margin_m: 0.1,
-            margin_slope: 0.0,
-            margin_quantile: None,
             truncation_m: Some(2.0),
-            flow_penalty: 0.0,
+            ..DistanceLossOptions::published()
         };
         for (distance, value) in [(0.05, 0.1), (3.0, 2.0)] {
             let loss = options.at(
@@ -198,12 +200,10 @@ mod tests {
 
     #[test]
     fn the_margin_grows_with_range() {
-        let options = LossOptions {
+        let options = DistanceLossOptions {
             margin_m: 0.1,
             margin_slope: 0.01,
-            margin_quantile: None,
-            truncation_m: None,
-            flow_penalty: 0.0,
+            ..DistanceLossOptions::published()
         };
         let sample = Sample {
             distance: 0.3,

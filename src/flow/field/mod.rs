@@ -3,6 +3,7 @@
 mod adam;
 mod backend;
 mod budget;
+mod chamfer;
 mod codec;
 mod early_stopping;
 mod error;
@@ -18,12 +19,13 @@ mod schedule;
 mod snapshot;
 mod warm_start;
 
-pub use backend::{Advance, Backend, BackendError, FitReport, Trainer, Transform};
+pub use backend::{Advance, Backend, BackendError, FitReport, PreparedTarget, Trainer};
 pub use mlp::{HIDDEN_LAYERS, MIDDLE_LAYERS, PARAMETERS, WIDTH};
 pub use network::Network;
 pub use snapshot::{Snapshot, SnapshotError, TrainerState};
 
-pub(crate) use budget::prepare;
+pub(crate) use budget::prepare_target;
+pub(crate) use chamfer::{ChamferLoss, NearestSearcher, chamfer_work, check_chamfer};
 pub(crate) use codec::{put_parameters, take_parameters};
 pub(crate) use early_stopping::EarlyStop;
 #[cfg(feature = "gpu")]
@@ -32,7 +34,7 @@ pub(crate) use error::FitError;
 pub(crate) use fit::{Fit, Fitted};
 #[cfg(test)]
 pub(crate) use loss::PointLoss;
-pub(crate) use loss::{DistanceLoss, Loss, length};
+pub(crate) use loss::{Batch, DistanceLoss, Loss, length};
 pub(crate) use mlp::{
     Conditioning, LAID_OUT, PANEL, first_layer, last_layer, middle_layer, transpose_middle_layers,
 };
@@ -43,6 +45,8 @@ pub(crate) use reduction::MOST_POINTS;
 pub(crate) use reduction::STRETCH;
 pub(crate) use reduction::{Chunks, tree_sum};
 #[cfg(test)]
-pub(crate) use reference::{ReferenceNetwork, first_losses};
+pub(crate) use reference::{
+    ReferenceLoss, ReferenceNetwork, chamfer_distance, first_losses, mean_distance,
+};
 pub(crate) use schedule::Schedule;
 pub(crate) use warm_start::Prior;

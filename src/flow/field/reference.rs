@@ -125,11 +125,32 @@ impl ReferenceNetwork {
     }
 }
 
-/// The mean distances of the published method in its first iterations over `source`, metres,
-/// initialized from `seed`, with Adam at a constant `rate`.
+/// A loss of a deformed cloud, and its derivative with respect to each deformed point.
+pub(crate) type ReferenceLoss<'a> = dyn Fn(&[[f64; 3]]) -> (f64, Vec<[f64; 3]>) + 'a;
+
+/// The mean distance of a deformed cloud in a distance transform, metres.
+pub(crate) fn mean_distance(
+    distance: &DistanceTransform,
+) -> impl Fn(&[[f64; 3]]) -> (f64, Vec<[f64; 3]>) {
+    |deformed| {
+        let count = deformed.len() as f64;
+        let samples = deformed
+            .iter()
+            .map(|point| distance.sample(point.map(|x| x as f32)));
+        let samples: Vec<_> = samples.collect();
+        let mean = samples.iter().map(|s| f64::from(s.distance) / count).sum();
+        let gradients = samples
+            .iter()
+            .map(|s| s.gradient.map(|g| f64::from(g) / count));
+        (mean, gradients.collect())
+    }
+}
+
+/// The losses of a fit of the network to `loss` in its first iterations over `source`, initialized
+/// from `seed`, with Adam at a constant `rate`.
 pub(crate) fn first_losses(
     source: &[Point],
-    distance: &DistanceTransform,
+    loss: &ReferenceLoss<'_>,
     seed: u64,
     rate: f64,
     iterations: i32,
@@ -138,19 +159,19 @@ pub(crate) fn first_losses(
     let zeros = vec![0.0; network.flat().len()];
     let mut moments = [zeros.clone(), zeros];
     let mut losses = Vec::new();
+    let inputs: Vec<[f64; 3]> = source.iter().map(|point| point.map(f64::from)).collect();
     for iteration in 1..=iterations {
         let mut gradients = ReferenceNetwork::read(&mlp::zeros());
-        let mut loss = 0.0;
-        for point in source {
-            let input = point.map(f64::from);
+        let deformed = |&input: &[f64; 3]| {
             let flow = network.forward(input);
-            let sample = distance.sample(core::array::from_fn(|a| (input[a] + flow[a]) as f32));
-            loss += f64::from(sample.distance) / source.len() as f64;
-            let pull = sample.gradient.map(|g| f64::from(g) / source.len() as f64);
+            [0, 1, 2].map(|a| input[a] + flow[a])
+        };
+        let (value, pulls) = loss(&inputs.iter().map(deformed).collect::<Vec<_>>());
+        for (&input, pull) in inputs.iter().zip(pulls) {
             network.backward(input, pull, &mut gradients);
         }
         network.adam_step(&gradients, &mut moments, iteration, rate);
-        losses.push(loss);
+        losses.push(value);
     }
     losses
 }
@@ -159,6 +180,43 @@ fn matrix(rows: usize, columns: usize, entry: impl Fn(usize, usize) -> f64) -> V
     (0..rows)
         .map(|r| (0..columns).map(|c| entry(r, c)).collect())
         .collect()
+}
+
+/// The truncated Chamfer distance between `deformed` and `target`, square metres, and its derivative
+/// with respect to each deformed point.
+pub(crate) fn chamfer_distance(
+    deformed: &[[f64; 3]],
+    target: &[Point],
+    truncation: f64,
+) -> (f64, Vec<[f64; 3]>) {
+    let target: Vec<[f64; 3]> = target.iter().map(|t| t.map(f64::from)).collect();
+    let squared = |a: [f64; 3], b: [f64; 3]| -> f64 { (0..3).map(|x| (a[x] - b[x]).powi(2)).sum() };
+    let nearest = |at: [f64; 3], sites: &[[f64; 3]]| {
+        let by_distance =
+            |&a: &usize, &b: &usize| squared(at, sites[a]).total_cmp(&squared(at, sites[b]));
+        let index = (0..sites.len()).min_by(by_distance).expect("a site");
+        (index, squared(at, sites[index]))
+    };
+    let mut gradients = vec![[0.0; 3]; deformed.len()];
+    let mut sum = 0.0;
+    let mut add = |row: usize, site: usize, square: f64, count: usize| {
+        if square < truncation * truncation {
+            sum += square / count as f64;
+            for axis in 0..3 {
+                let off = deformed[row][axis] - target[site][axis];
+                gradients[row][axis] += 2.0 * off / count as f64;
+            }
+        }
+    };
+    for (row, &at) in deformed.iter().enumerate() {
+        let (site, square) = nearest(at, &target);
+        add(row, site, square, deformed.len());
+    }
+    for (site, &at) in target.iter().enumerate() {
+        let (row, square) = nearest(at, deformed);
+        add(row, site, square, target.len());
+    }
+    (sum, gradients)
 }
 
 /// Euclidean distance from `at` to the nearest of `sites`.

@@ -8,7 +8,7 @@ use super::mlp::Conditioning;
 use super::network::Network;
 use super::snapshot::TrainerState;
 use crate::flow::data::{Point, RigidTransform, stride_sample};
-use crate::flow::options::FieldOptions;
+use crate::flow::options::{FieldOptions, LossOptions};
 
 /// Points on which the preceding pair's field is evaluated.
 const JUDGED: usize = 4096;
@@ -60,7 +60,7 @@ pub(crate) fn warm_start(
     Ok(None)
 }
 
-/// The mean loss of `points` displaced by `flows`, metres.
+/// The mean loss of `points` displaced by `flows`.
 fn mean_loss(
     prepared: &Prepared,
     options: &FieldOptions,
@@ -69,9 +69,19 @@ fn mean_loss(
 ) -> Result<f64, FitError> {
     let pairs = || points.iter().zip(flows);
     let moved = pairs().map(|(point, flow)| core::array::from_fn(|a| point[a] + flow[a]));
-    let distances = prepared.transform.distances(&moved.collect::<Vec<_>>())?;
+    let distances = prepared.target.distances(&moved.collect::<Vec<_>>())?;
     let losses = pairs()
         .zip(distances)
-        .map(|((&point, &flow), distance)| f64::from(options.loss.value(point, distance, flow)));
+        .map(|((&point, &flow), distance)| f64::from(value(&options.loss, point, distance, flow)));
     Ok(losses.sum::<f64>() / points.len() as f64)
+}
+
+/// The loss of `point` with `flow`, where the deformed point lies at `distance` from the target,
+/// metres. Of a Chamfer distance it is the source's part.
+fn value(loss: &LossOptions, point: Point, distance: f32, flow: Point) -> f32 {
+    match loss {
+        LossOptions::Distance(options) => options.value(point, distance, flow),
+        LossOptions::Chamfer(options) if distance < options.truncation_m => distance * distance,
+        LossOptions::Chamfer(_) => 0.0,
+    }
 }

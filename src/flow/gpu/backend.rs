@@ -9,10 +9,9 @@ use super::memory::GpuOptions;
 use super::trainer::GpuTrainer;
 use super::{distance, inference};
 use crate::flow::data::{Control, Point};
-use crate::flow::distance::DistanceOptions;
-use crate::flow::field::{Backend, BackendError, Network, Trainer, Transform};
+use crate::flow::field::{Backend, BackendError, Network, PreparedTarget, Trainer};
 use crate::flow::host::Host;
-use crate::flow::options::FieldOptions;
+use crate::flow::options::{FieldOptions, LossOptions};
 
 /// An opened GPU, as a [`Backend`]. Clones share it, and each can fit a pair from its own thread.
 #[derive(Clone)]
@@ -76,6 +75,10 @@ impl Gpu {
     }
 }
 
+/// The error of a fit to a Chamfer distance.
+pub(super) const NO_CHAMFER: BackendError =
+    BackendError::Unsupported("the Chamfer distance is computed on the CPU alone");
+
 impl Backend for Gpu {
     fn name(&self) -> String {
         self.0.name.clone()
@@ -85,14 +88,15 @@ impl Backend for Gpu {
         &self.0.host
     }
 
-    fn transform(
+    fn prepare_target(
         &self,
         source: &[Point],
         target: &[Point],
-        options: &DistanceOptions,
+        options: &LossOptions,
         control: &dyn Control,
-    ) -> Result<Box<dyn Transform>, BackendError> {
-        let built = distance::build(&self.0, source, target, options, control)?;
+    ) -> Result<Box<dyn PreparedTarget>, BackendError> {
+        let options = options.distance().ok_or(NO_CHAMFER)?;
+        let built = distance::build(&self.0, source, target, &options.transform, control)?;
         Ok(Box::new(built))
     }
 
@@ -101,7 +105,7 @@ impl Backend for Gpu {
     }
 }
 
-impl Transform for GpuTransform {
+impl PreparedTarget for GpuTransform {
     fn bytes(&self) -> usize {
         self.words as usize * 4
     }

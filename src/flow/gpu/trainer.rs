@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use super::backend::NO_CHAMFER;
 use super::batcher::Done;
 use super::device::Device;
 use super::distance::GpuTransform;
@@ -17,7 +18,7 @@ use crate::flow::field::{
     Advance, BackendError, Conditioning, EarlyStopState, FitReport, LAID_OUT, Parameters, Schedule,
     Trainer, TrainerState, mlp, transpose_middle_layers,
 };
-use crate::flow::options::{FieldOptions, Precision};
+use crate::flow::options::{DistanceLossOptions, FieldOptions, Precision};
 
 /// Target duration of a submission, seconds. The control and the GPU's health are checked once per
 /// submission.
@@ -64,6 +65,7 @@ impl Drop for Network {
 /// The network, its optimizer and the distance transform of the target.
 pub(super) struct GpuTrainer<'a> {
     transform: &'a GpuTransform,
+    loss: DistanceLossOptions,
     conditioning: Conditioning,
     schedule: Schedule,
     network: Network,
@@ -81,6 +83,7 @@ impl<'a> GpuTrainer<'a> {
         seed: u64,
     ) -> Result<Self, BackendError> {
         let device = &transform.device;
+        let loss = options.loss.distance().ok_or(NO_CHAMFER)?.clone();
         if options.precision == Precision::F16 {
             device.units()?;
         }
@@ -104,6 +107,7 @@ impl<'a> GpuTrainer<'a> {
             .write_buffer(&device.context.buffers.store, at, bytes);
         let mut trainer = Self {
             transform,
+            loss,
             network: Network::take(device)?,
             conditioning: Conditioning::new(source, options.inputs),
             schedule,
@@ -121,8 +125,7 @@ impl<'a> GpuTrainer<'a> {
 
     /// The lane's record, without the offsets of its tiles and chunks in a submission.
     pub(super) fn lane(&self) -> layout::Lane {
-        let options = &self.schedule.options;
-        let (loss, rule) = (&options.loss, options.early_stop);
+        let (loss, rule) = (&self.loss, self.schedule.options.early_stop);
         layout::Lane {
             transform: self.transform.record,
             network: self.network.number,
@@ -135,7 +138,7 @@ impl<'a> GpuTrainer<'a> {
             flow_penalty: loss.flow_penalty,
             average: self.schedule.ema_weight(0).is_some().into(),
             patience: rule.map_or(0, |rule| rule.patience.max(1) as u32),
-            min_delta: rule.map_or(0.0, |rule| rule.min_delta_m as f32),
+            min_delta: rule.map_or(0.0, |rule| rule.min_delta as f32),
             ..layout::Lane::default()
         }
     }

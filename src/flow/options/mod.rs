@@ -3,15 +3,17 @@
 //! The values of the presets are defined here and nowhere else.
 
 mod field;
+mod loss;
 mod objects;
 mod pair;
 mod preset;
 
 pub(crate) use field::DeadlineLimits;
 pub use field::{
-    EarlyStopOptions, FieldOptions, InputNormalization, LearningRateSchedule, LossOptions,
-    Precision, ResultChoice, Start, WarmStart,
+    EarlyStopOptions, FieldOptions, InputNormalization, LearningRateSchedule, Precision,
+    ResultChoice, Start, WarmStart,
 };
+pub use loss::{ChamferOptions, DistanceLossOptions, LossOptions, NearestSearch};
 pub use objects::ObjectOptions;
 pub use pair::{DEFAULT_DT_S, Ego, Ground, Method, Options};
 pub use preset::Preset;

@@ -1,6 +1,7 @@
 //! Presets: named sets of options.
 
 use super::field::FieldOptions;
+use super::loss::NearestSearch;
 use super::objects::ObjectOptions;
 use super::pair::{DEFAULT_DT_S, Ego, Ground, Method, Options};
 
@@ -17,31 +18,58 @@ pub enum Preset {
     /// FNSF (ICCV 2023) with the settings of its published code: a field fitted to the full motion,
     /// ground included.
     Paper,
+    /// The baseline of FNSF's comparison: the same network fitted to the truncated Chamfer distance,
+    /// whose nearest neighbors are searched among all points.
+    NsfpBaseline,
+    /// As [`Preset::NsfpBaseline`], with k-d trees for the nearest neighbors.
+    NsfpKdtree,
 }
 
 impl Preset {
     /// All presets.
-    pub const ALL: [Self; 4] = [Self::Default, Self::Label, Self::Neural, Self::Paper];
+    pub const ALL: [Self; 6] = [
+        Self::Default,
+        Self::Label,
+        Self::Neural,
+        Self::Paper,
+        Self::NsfpBaseline,
+        Self::NsfpKdtree,
+    ];
 
-    /// The name used by the command line and the service: `default`, `label`, `neural` or `paper`.
+    /// The name used by the command line and the service: `default`, `label`, `neural`, `paper`,
+    /// `nsfp-baseline` or `nsfp-kdtree`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Default => "default",
             Self::Label => "label",
             Self::Neural => "neural",
             Self::Paper => "paper",
+            Self::NsfpBaseline => "nsfp-baseline",
+            Self::NsfpKdtree => "nsfp-kdtree",
         }
     }
 
-    /// Whether the preset fits a neural field. Only such a preset uses a GPU and supports
-    /// snapshots.
+    /// Whether the preset fits a neural field. Only such a preset supports snapshots.
     pub fn fits_field(self) -> bool {
         matches!(self.options(None).method, Method::Field(_))
+    }
+
+    /// Whether the preset has kernels for a GPU.
+    pub fn runs_on_gpu(self) -> bool {
+        let options = self.options(None);
+        options
+            .field()
+            .is_some_and(|field| field.loss.distance().is_some())
     }
 
     /// The presets that fit a neural field.
     pub fn with_field() -> impl Iterator<Item = Self> {
         Self::ALL.into_iter().filter(|preset| preset.fits_field())
+    }
+
+    /// The presets that have kernels for a GPU.
+    pub fn with_gpu_kernels() -> impl Iterator<Item = Self> {
+        Self::ALL.into_iter().filter(|preset| preset.runs_on_gpu())
     }
 
     /// The options of the preset, with `max_points` as [`Options::max_points`].
@@ -57,10 +85,12 @@ impl Preset {
             }),
             Self::Neural => Method::Field(FieldOptions::neural()),
             Self::Paper => Method::Field(FieldOptions::published(max_points.is_some())),
+            Self::NsfpBaseline => Method::Field(FieldOptions::nsfp(NearestSearch::BruteForce)),
+            Self::NsfpKdtree => Method::Field(FieldOptions::nsfp(NearestSearch::KdTree)),
         };
         let (ground, ego) = match self {
             Self::Default | Self::Label | Self::Neural => (Ground::Auto, Ego::Auto),
-            Self::Paper => (Ground::Keep, Ego::Off),
+            Self::Paper | Self::NsfpBaseline | Self::NsfpKdtree => (Ground::Keep, Ego::Off),
         };
         Options {
             seed: 0,

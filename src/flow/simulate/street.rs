@@ -55,7 +55,8 @@ pub struct StreetSweep {
     pub world_from_sensor: RigidTransform,
 }
 
-/// Two consecutive sweeps and their ground truth. Flow and masks have one row per source point.
+/// Two consecutive sweeps of N and M points, and their ground truth. All lists have one row per
+/// source point, except `target` and `ground_target`, which have one per target point.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SimulatedPair {
     /// N points of the first sweep, metres, in its sensor frame.

@@ -48,11 +48,9 @@ impl Model for Translation {
     }
 }
 
-/// The squared distance to corresponding target points. These are the nearest ones to the deformed
-/// points, found again every few iterations.
+/// The squared distance to corresponding target points: the nearest ones to the deformed points.
 struct NearestPoint {
     target: Vec<Point>,
-    renewed_every: usize,
     nearest: Vec<Point>,
 }
 
@@ -63,10 +61,7 @@ impl NearestPoint {
 }
 
 impl Loss for NearestPoint {
-    fn prepare(&mut self, done: usize, points: &[Point], flow: &dyn Fn() -> Vec<Point>) {
-        if !done.is_multiple_of(self.renewed_every) {
-            return;
-        }
+    fn prepare(&mut self, batch: &Batch<'_>, _: &dyn Control) -> Result<(), Interrupt> {
         let nearest = |(point, flow): (&Point, Point)| {
             let deformed: Point = core::array::from_fn(|a| point[a] + flow[a]);
             let by_distance = |a: &&Point, b: &&Point| {
@@ -75,7 +70,9 @@ impl Loss for NearestPoint {
             let nearest = self.target.iter().min_by(by_distance);
             *nearest.expect("the target is not empty")
         };
-        self.nearest = points.iter().zip(flow()).map(nearest).collect();
+        let flow = (batch.flow)();
+        self.nearest = batch.points.iter().zip(flow).map(nearest).collect();
+        Ok(())
     }
 
     fn at(&self, index: usize, point: Point, flow: Point) -> PointLoss {
@@ -93,7 +90,6 @@ fn fitted_translation(threads: usize, iterations: usize) -> Point {
     let threads = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     let loss = NearestPoint {
         target,
-        renewed_every: 5,
         nearest: Vec::new(),
     };
     let mut options = FieldOptions::published(false);

@@ -11,7 +11,7 @@ use crate::flow::field::{Advance, Backend, BackendError};
 use crate::flow::gpu::adapter::{Selector, select};
 use crate::flow::gpu::backend::Gpu;
 use crate::flow::gpu::memory::GpuOptions;
-use crate::flow::options::Preset;
+use crate::flow::options::{DistanceLossOptions, LossOptions, Preset};
 use crate::flow::problem::Problem;
 
 /// Destroys the device after some iterations.
@@ -60,7 +60,7 @@ fn a_pair_that_never_fits_is_refused_before_it_takes_anything() {
         .flat_map(|x| (0..40u8).map(move |y| [x, y]))
         .flat_map(|[x, y]| (0..4u8).map(move |z| [x, y, z].map(|c| f32::from(c) * 8.0)))
         .collect();
-    let refused = gpu.transform(&cloud, &cloud, &DistanceOptions::default(), &Uncontrolled);
+    let refused = gpu.prepare_target(&cloud, &cloud, &Preset::Paper.field().loss, &Uncontrolled);
     match refused.err() {
         Some(BackendError::Memory {
             needed, available, ..
@@ -77,16 +77,22 @@ fn what_only_the_cpu_computes_is_refused_by_name() {
         return;
     };
     let [source, target] = clouds(100);
-    for (metric, sites) in [
-        (Metric::Chamfer, Sites::Cells),
-        (Metric::Euclidean, Sites::Points),
+    let distance = |metric: Metric, sites: Sites| {
+        LossOptions::Distance(DistanceLossOptions {
+            transform: DistanceOptions {
+                metric,
+                sites,
+                ..DistanceOptions::default()
+            },
+            ..DistanceLossOptions::published()
+        })
+    };
+    for loss in [
+        distance(Metric::Chamfer, Sites::Cells),
+        distance(Metric::Euclidean, Sites::Points),
+        Preset::NsfpBaseline.field().loss,
     ] {
-        let options = DistanceOptions {
-            metric,
-            sites,
-            ..DistanceOptions::default()
-        };
-        let refused = gpu.transform(&source, &target, &options, &Uncontrolled);
+        let refused = gpu.prepare_target(&source, &target, &loss, &Uncontrolled);
         assert!(matches!(
             refused.err(),
             Some(BackendError::Unsupported(text)) if text.contains("CPU")
@@ -102,7 +108,7 @@ fn more_pairs_than_lanes_are_told_to_come_back() {
     let [source, target] = clouds(100);
     let options = Preset::Paper.field();
     let transform = gpu
-        .transform(&source, &target, &options.distance, &Uncontrolled)
+        .prepare_target(&source, &target, &options.loss, &Uncontrolled)
         .expect("small clouds fit");
     let first = transform.start(&source, &options, 0).expect("a trainer");
     let second = transform.start(&source, &options, 0);
@@ -120,7 +126,7 @@ fn a_run_that_diverges_says_so() {
     let mut options = Preset::Paper.field();
     options.learning_rate = f32::INFINITY;
     let transform = gpu
-        .transform(&source, &target, &options.distance, &Uncontrolled)
+        .prepare_target(&source, &target, &options.loss, &Uncontrolled)
         .expect("small clouds fit");
     let mut trainer = transform.start(&source, &options, 0).expect("a trainer");
     let ended = trainer.advance(5, &Uncontrolled).expect("an answer");
@@ -141,7 +147,7 @@ fn an_interrupted_run_stops_between_submissions() {
     let [source, target] = clouds(100);
     let options = Preset::Paper.field();
     let transform = gpu
-        .transform(&source, &target, &options.distance, &Uncontrolled)
+        .prepare_target(&source, &target, &options.loss, &Uncontrolled)
         .expect("small clouds fit");
     let mut trainer = transform.start(&source, &options, 0).expect("a trainer");
     let ended = trainer.advance(5, &Now).expect("an answer");

@@ -4,7 +4,7 @@
 
 use super::kernels::{after_one, network, plain, transform};
 use super::whole::{Losses, end_point_error, solved, street};
-use super::{clouds, shared};
+use super::{clouds, distance_loss, shared};
 use crate::flow::cpu::CpuBackend;
 use crate::flow::data::Uncontrolled;
 use crate::flow::distance::DistanceTransform;
@@ -39,7 +39,7 @@ fn half_precision_is_refused_where_nothing_can_compute_it() {
     let options = half(Preset::Paper.field());
     let refused = |device: &dyn Backend| {
         let transform = device
-            .transform(&source, &target, &options.distance, &Uncontrolled)
+            .prepare_target(&source, &target, &options.loss, &Uncontrolled)
             .expect("small clouds fit");
         let refused = transform.start(&source, &options, 0).err();
         matches!(refused, Some(BackendError::Unsupported(text)) if text.contains("precision"))
@@ -147,7 +147,12 @@ fn gradients_in_half_precision_are_near_the_references_at_awkward_row_counts() {
         let (Some(_), Some(gpu)) = (with_units(), transform(source, &target)) else {
             return;
         };
-        let distance = DistanceTransform::build(source, &target, &options.distance, &Uncontrolled);
+        let distance = DistanceTransform::build(
+            source,
+            &target,
+            &distance_loss(&options).transform,
+            &Uncontrolled,
+        );
         let distance = distance.expect("small clouds fit");
         let reference = network();
         let mut expected = ReferenceNetwork::read(&mlp::zeros());
@@ -155,7 +160,7 @@ fn gradients_in_half_precision_are_near_the_references_at_awkward_row_counts() {
             let input = point.map(f64::from);
             let flow = reference.forward(input).map(|f| f as f32);
             let deformed = core::array::from_fn(|a| point[a] + flow[a]);
-            let loss = options.loss.at(point, distance.sample(deformed), flow);
+            let loss = distance_loss(&options).at(point, distance.sample(deformed), flow);
             let pull = loss.gradient.map(|g| f64::from(g) / rows as f64);
             reference.backward(input, pull, &mut expected);
         }
@@ -185,7 +190,7 @@ fn the_first_losses_in_half_precision_are_those_of_single_precision() {
     let [source, target] = clouds(1000);
     let losses = [plain(), half(plain())].map(|options| {
         let transform = gpu
-            .transform(&source, &target, &options.distance, &Uncontrolled)
+            .prepare_target(&source, &target, &options.loss, &Uncontrolled)
             .expect("small clouds fit");
         let losses = Losses::default();
         let mut trainer = transform.start(&source, &options, 0).expect("a trainer");
@@ -206,7 +211,7 @@ fn whole_runs_in_half_precision_find_the_flow_of_single_precision() {
         return;
     };
     let pair = street(1);
-    for preset in Preset::with_field() {
+    for preset in Preset::with_gpu_kernels() {
         let mut options = preset.options(Some(1500));
         let field = options.field_mut().expect("a field");
         field.max_iterations = 40;
@@ -239,7 +244,7 @@ fn pairs_of_both_precisions_at_once_have_the_bits_they_have_alone() {
     let fitted = |options: &FieldOptions| {
         let [source, target] = clouds(700);
         let transform = gpu
-            .transform(&source, &target, &options.distance, &Uncontrolled)
+            .prepare_target(&source, &target, &options.loss, &Uncontrolled)
             .expect("small clouds fit");
         let mut trainer = transform.start(&source, options, 0).expect("a trainer");
         trainer.advance(8, &Uncontrolled).expect("iterations");

@@ -1,11 +1,12 @@
 //! Each kernel against the double-precision reference, including sizes that are not multiples of a
 //! tile.
 
-use super::{clouds, shared};
+use super::{clouds, distance_loss, shared};
 use crate::flow::data::{Point, Random, Uncontrolled};
 use crate::flow::distance::{Bricks, DistanceOptions, DistanceTransform};
 use crate::flow::field::{
-    Backend, Conditioning, ReferenceNetwork, TrainerState, Transform, first_losses, mlp,
+    Backend, Conditioning, PreparedTarget, ReferenceNetwork, TrainerState, first_losses,
+    mean_distance, mlp,
 };
 use crate::flow::gpu::distance::{GpuTransform, build};
 use crate::flow::options::{FieldOptions, Preset, ResultChoice};
@@ -148,7 +149,7 @@ pub(super) fn after_one(
 #[test]
 fn every_gradient_is_the_references_at_awkward_row_counts() {
     let [cloud, target] = clouds(9000);
-    for preset in Preset::with_field() {
+    for preset in Preset::with_gpu_kernels() {
         let mut options = FieldOptions {
             loss: preset.field().loss,
             inputs: preset.field().inputs,
@@ -160,8 +161,12 @@ fn every_gradient_is_the_references_at_awkward_row_counts() {
             let Some(gpu) = transform(source, &target) else {
                 return;
             };
-            let distance =
-                DistanceTransform::build(source, &target, &options.distance, &Uncontrolled);
+            let distance = DistanceTransform::build(
+                source,
+                &target,
+                &distance_loss(&options).transform,
+                &Uncontrolled,
+            );
             let distance = distance.expect("small clouds fit");
             let reference = network();
             let conditioning = Conditioning::new(source, options.inputs);
@@ -170,7 +175,7 @@ fn every_gradient_is_the_references_at_awkward_row_counts() {
                 let input = conditioning.apply(point).map(f64::from);
                 let flow = reference.forward(input).map(|f| f as f32);
                 let deformed = core::array::from_fn(|a| point[a] + flow[a]);
-                let loss = options.loss.at(point, distance.sample(deformed), flow);
+                let loss = distance_loss(&options).at(point, distance.sample(deformed), flow);
                 let pull = loss.gradient.map(|g| f64::from(g) / rows as f64);
                 reference.backward(input, pull, &mut expected);
             }
@@ -226,11 +231,16 @@ fn the_first_losses_are_those_of_the_method_in_double_precision() {
     let Some(gpu) = shared() else {
         return;
     };
-    let distance = DistanceTransform::build(&source, &target, &options.distance, &Uncontrolled);
+    let distance = DistanceTransform::build(
+        &source,
+        &target,
+        &distance_loss(&options).transform,
+        &Uncontrolled,
+    );
     let distance = distance.expect("small clouds fit");
-    let expected = first_losses(&source, &distance, 0, RATE.into(), STEPS);
+    let expected = first_losses(&source, &mean_distance(&distance), 0, RATE.into(), STEPS);
     let transform = gpu
-        .transform(&source, &target, &options.distance, &Uncontrolled)
+        .prepare_target(&source, &target, &options.loss, &Uncontrolled)
         .expect("small clouds fit");
     let losses = super::whole::Losses::default();
     let mut trainer = transform.start(&source, &options, 0).expect("a trainer");

@@ -14,6 +14,7 @@ use super::adapter::adapters;
 use super::backend::Gpu;
 use super::memory::GpuOptions;
 use crate::flow::data::{Point, Random};
+use crate::flow::options::{DistanceLossOptions, FieldOptions};
 use crate::gpu_in_tests;
 
 /// Number of lanes of the shared GPU.
@@ -24,6 +25,11 @@ fn opened(options: &GpuOptions) -> Option<Gpu> {
     let adapters = adapters();
     gpu_in_tests::is_there(adapters.len())
         .then(|| Gpu::open(&adapters[0], options).expect("the card opens"))
+}
+
+/// The loss of `options`, which is one by distance transform.
+fn distance_loss(options: &FieldOptions) -> &DistanceLossOptions {
+    options.loss.distance().expect("a GPU has no other loss")
 }
 
 /// The GPU shared by the tests that leave it intact.

@@ -100,7 +100,7 @@ fn every_loss_of_a_run_in_batches_is_the_cpus() {
         let run = |device: &dyn Backend| {
             let [source, target] = clouds(1500);
             let transform = device
-                .transform(&source, &target, &options.distance, &Uncontrolled)
+                .prepare_target(&source, &target, &options.loss, &Uncontrolled)
                 .expect("small clouds fit");
             let losses = Losses::default();
             let mut trainer = transform.start(&source, &options, 0).expect("a trainer");
@@ -145,7 +145,7 @@ fn the_stopping_rule_and_the_best_are_the_cpus_for_the_same_losses() {
     options.learning_rate = 0.03;
     options.max_iterations = 120;
     let transform = gpu
-        .transform(&source, &target, &options.distance, &Uncontrolled)
+        .prepare_target(&source, &target, &options.loss, &Uncontrolled)
         .expect("small clouds fit");
     let losses = Losses::default();
     let mut trainer = transform.start(&source, &options, 0).expect("a trainer");
@@ -172,7 +172,7 @@ fn the_stopping_rule_and_the_best_are_the_cpus_for_the_same_losses() {
 fn fitted(device: &dyn Backend, points: usize, options: &FieldOptions, steps: usize) -> Vec<Point> {
     let [source, target] = clouds(points);
     let transform = device
-        .transform(&source, &target, &options.distance, &Uncontrolled)
+        .prepare_target(&source, &target, &options.loss, &Uncontrolled)
         .expect("small clouds fit");
     let mut trainer = transform.start(&source, options, 0).expect("a trainer");
     trainer.advance(steps, &Uncontrolled).expect("iterations");
@@ -217,7 +217,7 @@ fn a_pair_put_down_and_taken_up_again_has_the_same_bits() {
         let expected = fitted(gpu, 600, &options, 14);
         let [source, target] = clouds(600);
         let transform = gpu
-            .transform(&source, &target, &options.distance, &Uncontrolled)
+            .prepare_target(&source, &target, &options.loss, &Uncontrolled)
             .expect("small clouds fit");
         let mut first = transform.start(&source, &options, 0).expect("a trainer");
         first.advance(5, &Uncontrolled).expect("iterations");
