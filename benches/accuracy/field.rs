@@ -15,7 +15,7 @@ use fnsf::flow::evaluate::{Truth, evaluate};
 use fnsf::flow::field::Backend;
 use fnsf::flow::{
     self, DistanceLossOptions, EarlyStopOptions, Ego, FieldOptions, Ground, InputNormalization,
-    LearningRateSchedule, Options, Preset, Problem, ResultChoice, Start,
+    LearningRateSchedule, NetworkOptions, Options, Preset, Problem, ResultChoice, Start,
 };
 use fnsf::formats::{Pair, read_pair};
 
@@ -23,6 +23,11 @@ fn field(options: &mut Options) -> &mut FieldOptions {
     options
         .field_mut()
         .expect("the presets of this table fit a field")
+}
+
+fn network(options: &mut Options) -> &mut NetworkOptions {
+    let network = field(options).network_mut();
+    network.expect("the presets of this table fit a network")
 }
 
 fn distance_loss(options: &mut Options) -> &mut DistanceLossOptions {
@@ -72,10 +77,10 @@ const VARIANTS: &[Variant] = &[
         field(o).max_iterations = 400;
     }),
     paper("paper, centered inputs / 20 m", |o| {
-        field(o).inputs = InputNormalization::Centered { scale_m: 20.0 };
+        network(o).inputs = InputNormalization::Centered { scale_m: 20.0 };
     }),
     paper("paper, zero start", |o| {
-        field(o).start = Start::ZeroFlow;
+        network(o).start = Start::ZeroFlow;
     }),
     paper("paper, truncation 2 m", |o| {
         distance_loss(o).truncation_m = Some(2.0);
@@ -83,8 +88,8 @@ const VARIANTS: &[Variant] = &[
     paper("paper, ego motion first", |o| o.ego = Ego::Auto),
     paper("paper, ego motion first, centered, zero start", |o| {
         o.ego = Ego::Auto;
-        field(o).inputs = InputNormalization::Centered { scale_m: 20.0 };
-        field(o).start = Start::ZeroFlow;
+        network(o).inputs = InputNormalization::Centered { scale_m: 20.0 };
+        network(o).start = Start::ZeroFlow;
     }),
     paper(
         "paper, batches of 2,048, cosine, average, 150 iterations",
@@ -134,19 +139,19 @@ const VARIANTS: &[Variant] = &[
         distance_loss(o).truncation_m = Some(2.0);
     }),
     ours("neural, raw inputs", |o| {
-        field(o).inputs = InputNormalization::Raw;
+        network(o).inputs = InputNormalization::Raw;
     }),
     ours("neural, centered / 5 m", |o| {
-        field(o).inputs = InputNormalization::Centered { scale_m: 5.0 };
+        network(o).inputs = InputNormalization::Centered { scale_m: 5.0 };
     }),
     ours("neural, centered / 20 m", |o| {
-        field(o).inputs = InputNormalization::Centered { scale_m: 20.0 };
+        network(o).inputs = InputNormalization::Centered { scale_m: 20.0 };
     }),
     ours("neural, centered / 50 m", |o| {
-        field(o).inputs = InputNormalization::Centered { scale_m: 50.0 };
+        network(o).inputs = InputNormalization::Centered { scale_m: 50.0 };
     }),
     ours("neural, Xavier start", |o| {
-        field(o).start = Start::Xavier;
+        network(o).start = Start::Xavier;
     }),
     ours("neural, exact points", |o| {
         distance_loss(o).transform.sites = Sites::Points;

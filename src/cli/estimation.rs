@@ -24,12 +24,13 @@ pub(super) struct Estimation {
     /// from up to five sweeps, its own two among them. neural: ego motion, then a short fit of a
     /// neural field to the remaining motion. paper: FNSF (ICCV 2023) with its published settings.
     /// nsfp-baseline: the baseline of that paper, a network fitted to the truncated Chamfer distance
-    /// on the CPU, minutes for full clouds. nsfp-kdtree: the same with k-d trees
+    /// on the CPU, minutes for full clouds. nsfp-kdtree: the same with k-d trees. fnsf-linear,
+    /// nsfp-linear, nsfp-kdtree-linear: that paper's linear model with these losses
     #[arg(long, value_enum, default_value_t)]
     preset: PresetChoice,
     /// Device for neural and paper: auto (a GPU, else the CPU), cpu, gpu, or gpu:CARD, where CARD
     /// is a GPU's number, PCI id or part of its name, as listed by fnsf doctor. default and label
-    /// are computed on the CPU whatever the device, and the nsfp presets refuse a GPU
+    /// are computed on the CPU whatever the device, and the other presets refuse a GPU
     #[arg(long, value_name = "DEVICE", default_value_t)]
     device: DeviceArgument,
     /// CPU threads, 1 to 256; all cores by default. The result does not depend on it
@@ -58,13 +59,13 @@ pub(super) struct Estimation {
     dt: Option<f32>,
     /// Treatment of ground points. keep: like any other point. mask: points in the pair's masks
     /// ground1 and ground2 take no part and get no flow. auto: ground points, from the masks or
-    /// else from ground segmentation, get the flow of the ego motion. By default auto, for paper
-    /// and the nsfp presets keep
+    /// else from ground segmentation, get the flow of the ego motion. By default auto for
+    /// default, label and neural, else keep
     #[arg(long, value_enum)]
     ground: Option<GroundChoice>,
     /// Ego motion between the sweeps. off: not estimated separately. auto: estimated first. FILE:
     /// given, as the 16 numbers of the 4 x 4 matrix target_from_source, row by row, or as an .npz
-    /// pair with ego_SE3. By default auto, for paper and the nsfp presets off
+    /// pair with ego_SE3. By default auto for default, label and neural, else off
     #[arg(long, value_name = "off|auto|FILE")]
     ego: Option<String>,
     /// Poses of all sweeps, from which the ego motion is taken: KITTI's text (12 numbers a line), a

@@ -7,7 +7,9 @@ use std::time::Duration;
 
 use super::types::{DeviceFactory, DeviceOptions, Opened, ReopenPolicy};
 use crate::flow::cpu::CpuBackend;
-use crate::flow::field::{Advance, Backend, BackendError, FitReport, PreparedTarget, Trainer};
+use crate::flow::field::{
+    Advance, Backend, BackendError, FitReport, FittedField, PreparedTarget, Trainer,
+};
 use crate::flow::{Control, FieldOptions, Host, LossOptions, Network, Point, TrainerState};
 use crate::job::DeviceKind;
 
@@ -260,6 +262,10 @@ impl Trainer for TestTrainer<'_> {
 
     fn evaluate(&mut self, points: &[Point]) -> Result<Vec<Point>, BackendError> {
         self.cpu.evaluate(points)
+    }
+
+    fn fitted(&mut self) -> Result<FittedField, BackendError> {
+        self.cpu.fitted()
     }
 
     fn report(&self) -> FitReport {

@@ -8,8 +8,8 @@
 use super::data::Point;
 use super::distance::DistanceTransform;
 use super::error::FlowError;
-use super::field::{LAID_OUT, PARAMETERS, chamfer_work, check_chamfer};
-use super::options::{FieldOptions, LossOptions, Method, Options};
+use super::field::{LAID_OUT, LinearGrid, PARAMETERS, chamfer_work, check_chamfer};
+use super::options::{FieldOptions, LossOptions, Method, ModelOptions, Options};
 use super::problem::Problem;
 use super::select::{find_ground, select};
 
@@ -32,6 +32,10 @@ const POINT: f64 = 3e4;
 /// Peak bytes per point of either cloud for the correspondences of a Chamfer distance: copies of the
 /// cloud and the deformed cloud, a k-d tree, the indices and the flow.
 const CORRESPONDENCE_BYTES: usize = 128;
+/// Bytes per point of its place in the grid of the linear model, and of its derivatives.
+const PLACED_BYTES: usize = 64;
+/// Work of the linear model per point and iteration, with the distance query, multiply-adds.
+const BLENDED: f64 = 1e4;
 /// Parameter sets held at once: the network, its transposes, its optimizer and the result (6), and
 /// the largest number of gradient chunks (32).
 const PARAMETER_SETS: usize = 6 + 32;
@@ -185,7 +189,18 @@ fn field_cost(clouds: [&[Point]; 2], options: &FieldOptions) -> Result<MethodCos
             }
         }
     };
-    cost.bytes += PARAMETER_SETS * LAID_OUT * size_of::<f32>();
-    cost.multiply_adds += passes * PARAMETERS as f64;
+    match &options.model {
+        ModelOptions::Network(_) => {
+            cost.bytes += PARAMETER_SETS * LAID_OUT * size_of::<f32>();
+            cost.multiply_adds += passes * PARAMETERS as f64;
+        }
+        ModelOptions::Linear(linear) => {
+            let grid = LinearGrid::plan(source, linear);
+            let grid = grid.map_err(|error| FlowError::Backend(error.into()))?;
+            cost.bytes += grid.bytes() + source.len() * PLACED_BYTES;
+            let products = 2.0 * grid.product_work();
+            cost.multiply_adds += iterations * (products + batch as f64 * BLENDED);
+        }
+    }
     Ok(cost)
 }

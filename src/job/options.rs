@@ -23,7 +23,8 @@ pub struct JobOptions {
     /// points move with the ego motion. `label`: as `default`, and a pair of a sequence uses up to
     /// five sweeps. `neural`: a short, robust fit of a neural field. `paper`: FNSF as published.
     /// `nsfp-baseline`: the baseline that FNSF is compared with, a network fitted to the truncated
-    /// Chamfer distance. `nsfp-kdtree`: the same with k-d trees. Both take minutes for full clouds.
+    /// Chamfer distance. `nsfp-kdtree`: the same with k-d trees. `fnsf-linear`, `nsfp-linear`,
+    /// `nsfp-kdtree-linear`: FNSF's linear model with these three losses.
     pub preset: PresetChoice,
     /// Seed of the random numbers. On the same device, the same input, options and seed give a
     /// bit-identical result, unless a deadline ends the estimate.
@@ -47,17 +48,18 @@ pub struct JobOptions {
     /// points are left out of the method and get the ego-motion flow, or none with `max_points` or
     /// without ego motion; they are taken from the masks, or from a ground segmentation if there
     /// are none. Clouds that are nearly all ground keep it. Default: `auto`; `keep` with
-    /// `paper` and the `nsfp` presets.
+    /// the presets after `neural`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ground: Option<GroundChoice>,
     /// The ego motion: `off` (not separated), `auto` (estimated first) or a 4 x 4 matrix
-    /// target_from_source, translation in metres. Default: `auto`; `off` with
-    /// `paper` and the `nsfp` presets.
+    /// target_from_source, translation in metres. Default: `auto`; `off` with the presets after
+    /// `neural`.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<Object>)]
     pub ego: Option<EgoChoice>,
     /// The device for the computation. `neural` and `paper` can use a GPU. `default` and `label`
-    /// always compute on the host's CPU. The `nsfp` presets compute on the CPU and refuse `gpu`.
+    /// always compute on the host's CPU. The presets after `paper` compute on the CPU and refuse
+    /// `gpu`.
     pub device: DeviceChoice,
     /// `f32`: single precision. `f16`: half precision, for `neural` and `paper` on a GPU whose
     /// matrix units pass their self-test.
@@ -93,6 +95,12 @@ pub enum PresetChoice {
     NsfpBaseline,
     /// As nsfp-baseline, with k-d trees for the nearest neighbors.
     NsfpKdtree,
+    /// The linear model of FNSF's comparison, fitted to the distance transform.
+    FnsfLinear,
+    /// The linear model, fitted to the truncated Chamfer distance.
+    NsfpLinear,
+    /// As nsfp-linear, with k-d trees for the nearest neighbors.
+    NsfpKdtreeLinear,
 }
 
 impl PresetChoice {
@@ -105,6 +113,9 @@ impl PresetChoice {
             Self::Paper => Preset::Paper,
             Self::NsfpBaseline => Preset::NsfpBaseline,
             Self::NsfpKdtree => Preset::NsfpKdtree,
+            Self::FnsfLinear => Preset::FnsfLinear,
+            Self::NsfpLinear => Preset::NsfpLinear,
+            Self::NsfpKdtreeLinear => Preset::NsfpKdtreeLinear,
         }
     }
 }
@@ -336,8 +347,8 @@ impl JobOptions {
         if let Some(dt_s) = self.dt_s {
             options.dt_s = dt_s;
         }
-        if let Some(field) = options.field_mut() {
-            field.precision = match self.precision {
+        if let Some(network) = options.field_mut().and_then(|field| field.network_mut()) {
+            network.precision = match self.precision {
                 PrecisionChoice::F32 => Precision::F32,
                 PrecisionChoice::F16 => Precision::F16,
             };
@@ -371,7 +382,7 @@ mod tests {
         assert_eq!(
             half.solver_options(1000)
                 .field()
-                .map(|field| field.precision),
+                .and_then(|field| field.network().map(|network| network.precision)),
             Some(Precision::F16)
         );
         let refused = options(r#"{"precision":"f16","device":"cpu"}"#);

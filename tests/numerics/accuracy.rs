@@ -48,7 +48,8 @@ fn neural_beats_standing_still_and_the_published_method_on_a_simulated_street() 
     let pair = street(&small_street());
     let still = {
         let mut options = Preset::Paper.options(None);
-        options.field_mut().expect("a field").start = fnsf::flow::Start::ZeroFlow;
+        let field = options.field_mut().expect("a field");
+        field.network_mut().expect("a network").start = fnsf::flow::Start::ZeroFlow;
         options.field_mut().expect("a field").max_iterations = 0;
         score(&pair, &options).epe
     };

@@ -34,6 +34,9 @@ pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, Api
         Ok(proto::Preset::Paper) => PresetChoice::Paper,
         Ok(proto::Preset::NsfpBaseline) => PresetChoice::NsfpBaseline,
         Ok(proto::Preset::NsfpKdtree) => PresetChoice::NsfpKdtree,
+        Ok(proto::Preset::FnsfLinear) => PresetChoice::FnsfLinear,
+        Ok(proto::Preset::NsfpLinear) => PresetChoice::NsfpLinear,
+        Ok(proto::Preset::NsfpKdtreeLinear) => PresetChoice::NsfpKdtreeLinear,
         Err(_) => return Err(unknown("preset", message.preset)),
     };
     let ground = match proto::Ground::try_from(message.ground) {

@@ -4,9 +4,9 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use super::inference;
 use super::isa::Isa;
 use super::kernels::Kernels;
+use super::linear::{Encoder, Linear};
 use super::model::{Mlp, Model};
 use super::nearest::{BruteForce, KdTrees};
 use super::tile::WorkingSets;
@@ -14,12 +14,13 @@ use super::trainer::CpuTrainer;
 use crate::flow::data::{Control, Point, Random, Uncontrolled};
 use crate::flow::distance::DistanceTransform;
 use crate::flow::field::{
-    Backend, BackendError, ChamferLoss, Conditioning, DistanceLoss, Loss, NearestSearcher, Network,
-    PreparedTarget, Schedule, Trainer, check_chamfer, length, mlp,
+    Backend, BackendError, ChamferLoss, Conditioning, DistanceLoss, LinearGrid, Loss,
+    NearestSearcher, Network, Parameters, PreparedTarget, Schedule, Trainer, check_chamfer, length,
+    mlp,
 };
 use crate::flow::host::Host;
 use crate::flow::options::{
-    DistanceLossOptions, FieldOptions, LossOptions, NearestSearch, Precision,
+    DistanceLossOptions, FieldOptions, LossOptions, ModelOptions, NearestSearch, Precision,
 };
 
 /// A backend that computes in single precision on a pool of CPU threads.
@@ -74,7 +75,7 @@ impl Backend for CpuBackend {
     ) -> Result<Box<dyn PreparedTarget>, BackendError> {
         let threads = self.host.threads();
         let fits = Fits {
-            kernels: self.kernels,
+            isa: self.isa,
             threads: Arc::clone(threads),
         };
         match options {
@@ -103,28 +104,21 @@ impl Backend for CpuBackend {
     }
 
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {
-        let model = Mlp::new(self.kernels, network.conditioning);
         let threads = self.host.threads();
+        let model = Mlp::new(self.kernels, Arc::clone(threads), network.conditioning);
         let working_sets = WorkingSets::new(threads, || model.working_set());
-        let parameters = &network.parameters;
-        Ok(inference::evaluate(
-            &model,
-            parameters,
-            threads,
-            &working_sets,
-            points,
-        ))
+        Ok(model.evaluate(&network.parameters, points, &working_sets))
     }
 }
 
 /// What every fit on this backend needs.
 struct Fits {
-    kernels: Kernels,
+    isa: Isa,
     threads: Arc<rayon::ThreadPool>,
 }
 
 impl Fits {
-    /// Starts a fit of the network to `loss`.
+    /// Starts a fit of the model of `options` to `loss`.
     fn start<'a>(
         &self,
         loss: impl Loss + 'a,
@@ -132,18 +126,32 @@ impl Fits {
         options: &FieldOptions,
         seed: u64,
     ) -> Result<Box<dyn Trainer + 'a>, BackendError> {
-        if options.precision == Precision::F16 {
-            let text = "the CPU computes in single precision alone";
-            return Err(BackendError::Unsupported(text));
-        }
         let mut random = Random::stream(seed, 0);
-        let parameters = mlp::initial(options.start, &mut random);
-        let schedule = Schedule::new(source, options, &mut random);
-        let model = Mlp::new(self.kernels, Conditioning::new(source, options.inputs));
         let threads = Arc::clone(&self.threads);
-        Ok(Box::new(CpuTrainer::new(
-            threads, model, loss, schedule, parameters,
-        )))
+        match &options.model {
+            ModelOptions::Network(network) => {
+                if network.precision == Precision::F16 {
+                    let text = "the CPU computes in single precision alone";
+                    return Err(BackendError::Unsupported(text));
+                }
+                let parameters = mlp::initial(network.start, &mut random);
+                let schedule = Schedule::new(source, options, &mut random);
+                let conditioning = Conditioning::new(source, network.inputs);
+                let model = Mlp::new(Kernels::new(self.isa), Arc::clone(&threads), conditioning);
+                let trainer = CpuTrainer::new(threads, model, loss, schedule, parameters);
+                Ok(Box::new(trainer))
+            }
+            ModelOptions::Linear(linear) => {
+                let grid = LinearGrid::plan(source, linear)?;
+                let mut parameters = Parameters::zeros(3 * grid.channel());
+                grid.initial(&mut random, parameters.as_mut_slice());
+                let schedule = Schedule::new(source, options, &mut random);
+                let encoder = Encoder::new(self.isa, Arc::clone(&threads), grid);
+                let model = Linear::new(encoder, linear.variation_weight);
+                let trainer = CpuTrainer::new(threads, model, loss, schedule, parameters);
+                Ok(Box::new(trainer))
+            }
+        }
     }
 }
 

@@ -1,4 +1,4 @@
-//! Evaluation of a model at given points, in parallel tiles.
+//! The forward pass of a model over many points, in parallel tiles.
 
 use rayon::prelude::*;
 
@@ -7,8 +7,9 @@ use super::tile::{TILE, WorkingSets};
 use crate::flow::data::Point;
 use crate::flow::field::Parameters;
 
-/// The flow at each of the N `points`, N x 3 displacements in metres.
-pub(super) fn evaluate<M: Model>(
+/// The flow at each of the N `points`, N x 3 displacements in metres. They are the points of the
+/// model's last [`Model::place`], and `parameters` those of its last [`Model::update`].
+pub(super) fn forward<M: Model>(
     model: &M,
     parameters: &Parameters,
     threads: &rayon::ThreadPool,
@@ -19,9 +20,11 @@ pub(super) fn evaluate<M: Model>(
     threads.install(|| {
         flow.par_chunks_mut(TILE)
             .zip(points.par_chunks(TILE))
-            .for_each(|(flow, points)| {
+            .enumerate()
+            .for_each(|(tile, (flow, points))| {
                 let mut working_set = working_sets.own();
-                flow.copy_from_slice(model.forward(parameters, points, &mut working_set));
+                let index = tile * TILE;
+                flow.copy_from_slice(model.forward(parameters, points, index, &mut working_set));
             });
     });
     flow

@@ -11,6 +11,7 @@
     reason = "registers are named by row and vector, as in the formulas"
 )]
 
+use super::multiply::{Strided, multiply};
 use super::simd::Lanes;
 use super::tile::{ROW_STEP, STRIDE, TILE, Tile};
 use crate::flow::field::{
@@ -19,49 +20,6 @@ use crate::flow::field::{
 
 /// Partial sums of the last layer per output, independent of the register width.
 const SIDE_BY_SIDE: usize = 16;
-
-/// A strided matrix: its first element, the floats from one row to the next, and the floats from
-/// one step of the summed index to the next.
-#[derive(Clone, Copy)]
-struct Strided {
-    at: *const f32,
-    row: usize,
-    step: usize,
-}
-
-/// `acc[r][..] += sum_k a[r][k] * b[k][..]`: `ROWS` x `VECTORS` registers.
-///
-/// # Safety
-/// `a` has `ROWS` rows and `depth` steps. `b` has `depth` rows of `VECTORS` registers, `b_step`
-/// floats apart.
-#[inline(always)]
-unsafe fn multiply<L: Lanes, const ROWS: usize, const VECTORS: usize>(
-    acc: &mut [[L; VECTORS]; ROWS],
-    depth: usize,
-    a: Strided,
-    b: *const f32,
-    b_step: usize,
-) {
-    // SAFETY: guaranteed by the caller.
-    unsafe {
-        let mut a_at = a.at;
-        let mut b_at = b;
-        for _ in 0..depth {
-            let mut row = [L::splat(0.0); VECTORS];
-            for v in 0..VECTORS {
-                row[v] = L::load(b_at.add(v * L::COUNT));
-            }
-            for r in 0..ROWS {
-                let scale = L::splat(*a_at.add(r * a.row));
-                for v in 0..VECTORS {
-                    acc[r][v] = scale.mul_add(row[v], acc[r][v]);
-                }
-            }
-            a_at = a_at.add(a.step);
-            b_at = b_at.add(b_step);
-        }
-    }
-}
 
 /// Calls `body` with the first column of each register group of a 128-feature row, and the offset
 /// of that column's panel.

@@ -98,38 +98,31 @@ impl NearestSearcher for KdTrees {
 /// A k-d tree of a cloud with at least one point. All coordinates must be finite.
 struct KdTree(nabo::KDTree<f32, Site>);
 
-/// A point with its index in the cloud.
+/// A point in the form of the library.
 #[derive(Clone, Copy, Debug, Default)]
-struct Site {
-    point: Point,
-    index: u32,
-}
+struct Site(Point);
 
 impl nabo::Point<f32> for Site {
     const DIM: u32 = 3;
 
     fn set(&mut self, axis: u32, value: nabo::NotNan<f32>) {
-        self.point[axis as usize] = value.into_inner();
+        self.0[axis as usize] = value.into_inner();
     }
 
     fn get(&self, axis: u32) -> nabo::NotNan<f32> {
-        nabo::NotNan::new(self.point[axis as usize]).expect("the coordinates are finite")
+        nabo::NotNan::new(self.0[axis as usize]).expect("the coordinates are finite")
     }
 }
 
 impl KdTree {
     fn new(points: &[Point]) -> Self {
-        let sites = points.iter().enumerate().map(|(index, &point)| Site {
-            point,
-            index: index as u32,
-        });
-        Self(nabo::KDTree::new(&sites.collect::<Vec<_>>()))
+        let sites: Vec<Site> = points.iter().map(|&point| Site(point)).collect();
+        Self(nabo::KDTree::new(&sites))
     }
 
     fn nearest(&self, point: Point) -> u32 {
-        let query = Site { point, index: 0 };
-        let nearest = self.0.knn(1, &query);
-        nearest.first().map_or(0, |found| found.point.index)
+        let nearest = self.0.knn(1, &Site(point));
+        nearest.first().map_or(0, |found| found.index)
     }
 }
 
@@ -150,4 +143,52 @@ fn in_groups(
         })
     })?;
     Ok(nearest)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::data::{Random, Uncontrolled};
+
+    fn squared(a: Point, b: Point) -> f32 {
+        a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum()
+    }
+
+    #[test]
+    fn both_searches_find_equally_near_points_in_both_directions() {
+        // Rounding of fused and of separate products and sums.
+        const TOLERANCE: f32 = 1e-6;
+        let mut random = Random::new(11);
+        let mut cloud = |count: usize| -> Vec<Point> {
+            let mut axis = || random.uniform(-40.0, 40.0) as f32;
+            (0..count).map(|_| [axis(), axis(), axis()]).collect()
+        };
+        let same = vec![[3.0, -1.0, 2.0]; 1000];
+        for (target, points) in [
+            (cloud(1), cloud(1)),
+            (cloud(2000), cloud(700)),
+            (same.clone(), cloud(40)),
+            (cloud(40), same),
+        ] {
+            let threads = rayon::ThreadPoolBuilder::new().num_threads(2).build();
+            let threads = Arc::new(threads.expect("threads"));
+            let isa = Isa::available()[0];
+            let brute_force = BruteForce::new(isa, Arc::clone(&threads), &target);
+            let trees = KdTrees::new(threads, &target);
+            let found = |search: &dyn NearestSearcher| {
+                let into = search.in_target(&points, &Uncontrolled);
+                let of = search.of_target(&points, &Uncontrolled);
+                (into.expect("no interrupt"), of.expect("no interrupt"))
+            };
+            let (all, tree) = (found(&brute_force), found(&trees));
+            let near = |from: &[Point], to: &[Point], a: &[u32], b: &[u32]| {
+                for (&from, (&a, &b)) in from.iter().zip(a.iter().zip(b)) {
+                    let [a, b] = [a, b].map(|index| squared(from, to[index as usize]));
+                    assert!((a - b).abs() <= TOLERANCE * a, "{a} {b}");
+                }
+            };
+            near(&points, &target, &all.0, &tree.0);
+            near(&target, &points, &all.1, &tree.1);
+        }
+    }
 }

@@ -9,31 +9,23 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use super::inference::evaluate;
+use super::inference::forward;
 use super::model::Model;
 use super::tile::{TILE, WorkingSets};
 use crate::flow::data::{Control, Interrupt, Point, Progress};
 use crate::flow::field::{
-    Advance, BackendError, Batch, Chunks, EarlyStop, FitReport, Loss, Parameters, Schedule,
-    Trainer, TrainerState, reduction,
+    Advance, BackendError, Batch, Chunks, EarlyStop, FitReport, FittedField, Loss, Parameters,
+    Schedule, Trainer, TrainerState, check_state, reduction,
 };
 
-/// Parameters that one thread sums and updates at a time.
+/// Parameters that one thread updates at a time.
 const SLICE: usize = 4096;
 
-/// Chunk gradients held in memory at once. If a batch has more chunks, the held ones are summed
-/// into the first.
-const HELD: usize = 32;
-
-/// The gradient sum of one chunk, and the time of its losses.
-struct Chunk {
-    gradients: Parameters,
-    query_seconds: f64,
-}
-
-/// A chunk to compute: its points, and the output slice of their losses.
-struct Due<'a> {
-    chunk: &'a mut Chunk,
+/// A chunk to compute: its points, its gradients, and the output slice of their losses.
+struct Due<'a, G> {
+    gradients: &'a mut G,
+    /// Time of its losses, seconds.
+    query_seconds: &'a mut f64,
     /// Index of the first point in the batch.
     first: usize,
     points: &'a [Point],
@@ -49,7 +41,13 @@ pub(super) struct CpuTrainer<M: Model, L: Loss> {
     /// Parameters, moments, the result so far and the iteration counts.
     state: TrainerState,
     early_stop: Option<EarlyStop>,
-    chunks: Vec<Chunk>,
+    chunks: Vec<M::ChunkGradients>,
+    /// Times of the chunks' losses, seconds.
+    query_times: Vec<f64>,
+    /// Derivatives of the loss with respect to the parameters.
+    gradients: Parameters,
+    /// The batch that the model has placed.
+    placed: Option<Range<usize>>,
     /// Losses of the current iteration's points.
     losses: Vec<f32>,
     working_sets: WorkingSets<M::WorkingSet>,
@@ -73,8 +71,11 @@ impl<M: Model, L: Loss> CpuTrainer<M, L> {
             loss,
             early_stop: schedule.options.early_stop.map(EarlyStop::new),
             schedule,
+            gradients: parameters.zeros_like(),
             state: TrainerState::at_start(parameters),
             chunks: Vec::new(),
+            query_times: Vec::new(),
+            placed: None,
             losses: Vec::new(),
             query_seconds: 0.0,
         }
@@ -87,9 +88,13 @@ impl<M: Model, L: Loss> CpuTrainer<M, L> {
     /// The interrupt of `control`, which abandons the iteration.
     fn iterate(&mut self, control: &dyn Control) -> Result<Option<(f32, bool)>, Interrupt> {
         let batch = self.schedule.batch(self.state.iterations);
+        if self.placed.as_ref() != Some(&batch) {
+            self.model.place(&self.schedule.points[batch.clone()]);
+            self.placed = Some(batch.clone());
+        }
         self.prepare(&batch, control)?;
         let held = self.accumulate(batch, control);
-        let loss = reduction::mean(&self.losses);
+        let loss = reduction::mean(&self.losses) + self.model.regularization();
         if !loss.is_finite() {
             return Ok(None);
         }
@@ -110,7 +115,7 @@ impl<M: Model, L: Loss> CpuTrainer<M, L> {
         let flow = || {
             let parameters = &self.state.parameters;
             let (model, sets) = (&self.model, &self.working_sets);
-            evaluate(model, parameters, &self.threads, sets, points)
+            forward(model, parameters, &self.threads, sets, points)
         };
         let batch = Batch {
             points,
@@ -129,11 +134,11 @@ impl<M: Model, L: Loss> CpuTrainer<M, L> {
         let mut next = 0;
         let mut held = 0;
         while next < cut.count {
-            if held == HELD {
-                self.add_to_the_first();
+            if held == M::HELD {
+                self.model.add_to_the_first(&mut self.chunks[..held]);
                 held = 1;
             }
-            let now = (HELD - held).min(cut.count - next);
+            let now = (M::HELD - held).min(cut.count - next);
             self.compute(&batch, &cut, next..next + now, held, control);
             next += now;
             held += now;
@@ -154,22 +159,24 @@ impl<M: Model, L: Loss> CpuTrainer<M, L> {
         let threads = self.threads.current_num_threads().min(some.len()) as f64;
         let held = first + some.len();
         let parameters = &self.state.parameters;
-        let empty = || Chunk {
-            gradients: parameters.zeros_like(),
-            query_seconds: 0.0,
-        };
-        self.chunks.resize_with(held.max(self.chunks.len()), empty);
+        let most = held.max(self.chunks.len());
+        self.chunks
+            .resize_with(most, || self.model.chunk_gradients());
+        self.query_times.resize(most, 0.0);
         let points = &self.schedule.points[batch.clone()];
         let within =
             |range: Range<usize>| range.start.min(points.len())..range.end.min(points.len());
         let mut due = Vec::with_capacity(some.len());
         let mut losses = &mut self.losses[within(cut.points(some.start)).start..];
-        for (number, chunk) in some.zip(&mut self.chunks[first..held]) {
+        let chunks = self.chunks[first..held].iter_mut();
+        let chunks = chunks.zip(&mut self.query_times[first..held]);
+        for (number, (gradients, query_seconds)) in some.zip(chunks) {
             let own = within(cut.points(number));
             let (losses_here, rest) = core::mem::take(&mut losses).split_at_mut(own.len());
             losses = rest;
             due.push(Due {
-                chunk,
+                gradients,
+                query_seconds,
                 first: own.start,
                 points: &points[own],
                 losses: losses_here,
@@ -177,18 +184,19 @@ impl<M: Model, L: Loss> CpuTrainer<M, L> {
         }
         let weight = 1.0 / points.len() as f32;
         let (model, loss, working_sets) = (&self.model, &self.loss, &self.working_sets);
-        let run = |due: Due<'_>| {
+        let run = |due: Due<'_, M::ChunkGradients>| {
             let mut working_set = working_sets.own();
             let mut flow_gradients = [[0.0; 3]; TILE];
-            let Chunk {
+            let Due {
                 gradients,
                 query_seconds,
-            } = due.chunk;
-            gradients.as_mut_slice().fill(0.0);
+                ..
+            } = due;
+            model.clear(gradients);
             *query_seconds = 0.0;
             let mut index = due.first;
             for (points, losses) in due.points.chunks(TILE).zip(due.losses.chunks_mut(TILE)) {
-                let flow = model.forward(parameters, points, &mut working_set);
+                let flow = model.forward(parameters, points, index, &mut working_set);
                 let began = control.seconds();
                 for (row, seen) in losses.iter_mut().enumerate() {
                     let loss = loss.at(index, points[row], flow[row]);
@@ -202,22 +210,8 @@ impl<M: Model, L: Loss> CpuTrainer<M, L> {
             }
         };
         self.threads.install(|| due.into_par_iter().for_each(run));
-        let chunks = &self.chunks[first..held];
-        let query: f64 = chunks.iter().map(|chunk| chunk.query_seconds).sum();
+        let query: f64 = self.query_times[first..held].iter().sum();
         self.query_seconds += query / threads;
-    }
-
-    /// Adds the gradients of all other held chunks to those of the first, in order.
-    fn add_to_the_first(&mut self) {
-        let [first, others @ ..] = self.chunks.as_mut_slice() else {
-            return;
-        };
-        let slices = first.gradients.as_mut_slice().par_chunks_mut(SLICE);
-        self.threads.install(|| {
-            slices.enumerate().for_each(|(slice, sums)| {
-                add_slices(sums, others, slice);
-            });
-        });
     }
 
     /// Updates the result with the current parameters. As in the published code, the iteration at
@@ -254,34 +248,23 @@ impl<M: Model, L: Loss> CpuTrainer<M, L> {
         }
     }
 
-    /// Sums the chunks' gradients in order and takes one Adam step.
+    /// Takes one Adam step from the gradients of the held chunks.
     fn step(&mut self, held: usize) {
+        self.model
+            .gradient(&self.chunks[..held], &mut self.gradients);
         let adam = self.schedule.adam(self.state.iterations);
-        let chunks = &self.chunks[..held];
         let [means, squares] = &mut self.state.moments;
         let parameters = self.state.parameters.as_mut_slice().par_chunks_mut(SLICE);
         let means = means.as_mut_slice().par_chunks_mut(SLICE);
         let squares = squares.as_mut_slice().par_chunks_mut(SLICE);
-        let slices = parameters.zip(means).zip(squares).enumerate();
+        let gradients = self.gradients.as_slice().par_chunks(SLICE);
+        let slices = parameters.zip(means).zip(squares).zip(gradients);
         self.threads.install(|| {
-            slices.for_each(|(slice, ((parameters, means), squares))| {
-                let mut sums = [0.0f32; SLICE];
-                let sums = &mut sums[..parameters.len()];
-                add_slices(sums, chunks, slice);
-                adam.apply(sums, parameters, [means, squares]);
+            slices.for_each(|(((parameters, means), squares), gradients)| {
+                adam.apply(gradients, parameters, [means, squares]);
             });
         });
         self.model.update(&self.state.parameters);
-    }
-}
-
-/// Adds one slice of each chunk's gradients to `sums`, in order.
-fn add_slices(sums: &mut [f32], chunks: &[Chunk], slice: usize) {
-    for chunk in chunks {
-        let gradients = &chunk.gradients.as_slice()[slice * SLICE..];
-        for (sum, gradient) in sums.iter_mut().zip(gradients) {
-            *sum += gradient;
-        }
     }
 }
 
@@ -315,13 +298,12 @@ impl<M: Model, L: Loss> Trainer for CpuTrainer<M, L> {
     }
 
     fn evaluate(&mut self, points: &[Point]) -> Result<Vec<Point>, BackendError> {
-        Ok(evaluate(
-            &self.model,
-            &self.state.kept,
-            &self.threads,
-            &self.working_sets,
-            points,
-        ))
+        let parameters = &self.state.kept;
+        Ok(self.model.evaluate(parameters, points, &self.working_sets))
+    }
+
+    fn fitted(&mut self) -> Result<FittedField, BackendError> {
+        Ok(self.model.fitted(&self.state.kept))
     }
 
     fn report(&self) -> FitReport {
@@ -342,6 +324,7 @@ impl<M: Model, L: Loss> Trainer for CpuTrainer<M, L> {
     }
 
     fn restore(&mut self, state: TrainerState) -> Result<(), BackendError> {
+        check_state(&state, self.state.parameters.as_slice().len())?;
         let rule = self.schedule.options.early_stop;
         self.early_stop = rule.map(|options| EarlyStop::resumed(options, state.seen));
         self.model.update(&state.parameters);
@@ -354,7 +337,5 @@ impl<M: Model, L: Loss> Trainer for CpuTrainer<M, L> {
     }
 }
 
-#[cfg(test)]
-mod interface_tests;
 #[cfg(test)]
 mod tests;

@@ -53,7 +53,7 @@ pub trait Control: Sync {
     fn snapshot_due(&self) -> bool {
         false
     }
-    /// Receives the bytes of a due snapshot, about 1.9 MB, to be read by
+    /// Receives the bytes of a due snapshot, about 1.9 MB for a network, to be read by
     /// [`crate::flow::Snapshot::from_bytes`]. Only the fit of a field produces snapshots, and none
     /// after its deadline has altered it.
     fn snapshot(&self, _bytes: Vec<u8>) {}

@@ -7,7 +7,7 @@ use super::method::{Input, Solved};
 use super::result::{FieldSolution, Solution};
 use crate::flow::data::{Hash, Point, transform_points};
 use crate::flow::error::FlowError;
-use crate::flow::field::{self, Backend, Fit, Fitted, Prior, Snapshot};
+use crate::flow::field::{self, Backend, Fit, Fitted, FittedField, Prior, Snapshot};
 use crate::flow::motion::{MotionField, Residual};
 use crate::flow::options::{Ego, FieldOptions, Options};
 use crate::flow::select::Selection;
@@ -62,7 +62,7 @@ pub(super) fn residual_motion(
                     network,
                     has_ego: field.ego.is_some(),
                 }),
-                Residual::Still | Residual::Objects(_) => None,
+                Residual::Still | Residual::Linear(_) | Residual::Objects(_) => None,
             }),
             aligned: &aligned,
             ego: ego.as_ref(),
@@ -78,7 +78,11 @@ pub(super) fn residual_motion(
         ego,
         aligned,
         residual: fitted.residual,
-        motion: fitted.network.map_or(Residual::Still, Residual::Network),
+        motion: match fitted.field {
+            None => Residual::Still,
+            Some(FittedField::Network(network)) => Residual::Network(network),
+            Some(FittedField::Linear(field)) => Residual::Linear(field),
+        },
         solution: Solution::Field(FieldSolution {
             iterations: fitted.report.iterations,
             max_iterations: fitted.max_iterations,

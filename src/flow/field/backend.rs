@@ -1,5 +1,7 @@
 //! The interface between the fit and a compute device.
 
+use super::fitted::FittedField;
+use super::linear::LinearError;
 use super::network::Network;
 use super::snapshot::TrainerState;
 use crate::flow::data::{Control, Interrupt, Point};
@@ -81,6 +83,8 @@ pub trait PreparedTarget: Send {
     /// - [`BackendError::Unsupported`] if the target was prepared for another kind of loss, or the
     ///   device lacks the precision of `options`. A CPU has only single precision. Half precision
     ///   needs a GPU whose matrix units pass their self-test.
+    /// - [`BackendError::Linear`] if an option of the linear model is out of range, or its grid needs
+    ///   too much memory.
     /// - [`BackendError::Memory`] if a GPU has too little memory for the points or for the
     ///   gradients of a batch.
     /// - [`BackendError::Busy`] if all lanes of a GPU are in use.
@@ -115,6 +119,12 @@ pub trait Trainer: Send {
     /// [`BackendError::Device`] if a GPU has no memory for the points or fails. A CPU never fails.
     fn evaluate(&mut self, points: &[Point]) -> Result<Vec<Point>, BackendError>;
 
+    /// The result so far. Before the first iteration it is the model with its initial parameters.
+    ///
+    /// # Errors
+    /// As [`Self::state`].
+    fn fitted(&mut self) -> Result<FittedField, BackendError>;
+
     /// The number of iterations, the loss and the time of the distance query so far.
     fn report(&self) -> FitReport;
 
@@ -129,7 +139,8 @@ pub trait Trainer: Send {
     /// same bits, this fit must have the same points, options and seed.
     ///
     /// # Errors
-    /// [`BackendError::Lost`] if the GPU is lost. A CPU never fails.
+    /// [`BackendError::Unsupported`] if `state` has another number of parameters, and
+    /// [`BackendError::Lost`] if the GPU is lost.
     fn restore(&mut self, state: TrainerState) -> Result<(), BackendError>;
 
     /// Lowers the maximum number of iterations to `max_iterations`; a larger value has no effect. A
@@ -183,6 +194,9 @@ pub enum BackendError {
         /// The requested truncation, metres.
         truncation_m: f32,
     },
+    /// The linear model was refused: an option is out of range, or its grid needs too much memory.
+    #[error(transparent)]
+    Linear(#[from] LinearError),
     /// The control interrupted the distance transform, before the first iteration.
     #[error("interrupted before the first iteration")]
     Interrupted(Interrupt),
@@ -225,5 +239,18 @@ impl From<DistanceError> for BackendError {
             DistanceError::Interrupted(interrupt) => Self::Interrupted(interrupt),
             error => Self::Distance(error),
         }
+    }
+}
+
+/// Checks that `state` is that of a model with so many parameters.
+///
+/// # Errors
+/// [`BackendError::Unsupported`] if it is not.
+pub(crate) fn check_state(state: &TrainerState, parameters: usize) -> Result<(), BackendError> {
+    if state.parameters.as_slice().len() == parameters {
+        Ok(())
+    } else {
+        let text = "the state belongs to a model with another number of parameters";
+        Err(BackendError::Unsupported(text))
     }
 }

@@ -184,6 +184,11 @@ impl Throughput {
         points: usize,
         left: f64,
     ) -> Option<FieldOptions> {
+        // The speed of the linear model does not follow from that of its evaluation. It stops in
+        // time at any iteration.
+        if options.network().is_none() && prepared.whole {
+            return None;
+        }
         let budget = (left - self.evaluation).max(0.0);
         let iteration = |batch: usize| {
             let loss = loss_cost(&options.loss, batch, prepared.target_points);

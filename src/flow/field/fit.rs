@@ -4,8 +4,8 @@
 use super::backend::{Advance, Backend, FitReport, Trainer};
 use super::budget::{Loop, Prepared, Throughput, evaluate};
 use super::error::FitError;
+use super::fitted::FittedField;
 use super::loss::length;
-use super::network::Network;
 use super::snapshot::{Snapshot, TrainerState};
 use super::warm_start::{Prior, warm_start};
 use crate::flow::data::{Control, Interrupt, Point, RigidTransform, StopReason};
@@ -36,7 +36,7 @@ pub(crate) struct Fitted {
     /// N x 3: residual flow of each aligned source point, metres.
     pub(crate) residual: Vec<Point>,
     /// The field; none if there was no time for an iteration.
-    pub(crate) network: Option<Network>,
+    pub(crate) field: Option<FittedField>,
     pub(crate) report: FitReport,
     /// The maximum number of iterations, as shortened by the deadline.
     pub(crate) max_iterations: usize,
@@ -50,7 +50,7 @@ impl Fitted {
     pub(crate) fn nothing(points: usize, control: &dyn Control) -> Self {
         Self {
             residual: vec![[0.0; 3]; points],
-            network: None,
+            field: None,
             max_iterations: 0,
             report: FitReport {
                 iterations: 0,
@@ -90,11 +90,11 @@ impl Fit<'_> {
             ..
         } = started;
         let residual = evaluate(trainer.as_mut(), self.aligned, self.control)?;
-        let parameters = trainer.state()?.kept;
+        let field = trainer.fitted()?;
         Ok(Fitted {
             residual,
             max_iterations: options.max_iterations,
-            network: Some(Network::new(parameters, self.aligned, options.inputs)),
+            field: Some(field),
             report: trainer.report(),
             stop_reason,
             precomputed_at,

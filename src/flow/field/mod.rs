@@ -8,6 +8,8 @@ mod codec;
 mod early_stopping;
 mod error;
 mod fit;
+mod fitted;
+mod linear;
 mod loss;
 pub mod mlp;
 mod network;
@@ -19,7 +21,10 @@ mod schedule;
 mod snapshot;
 mod warm_start;
 
+pub(crate) use backend::check_state;
 pub use backend::{Advance, Backend, BackendError, FitReport, PreparedTarget, Trainer};
+pub use fitted::FittedField;
+pub use linear::{LinearError, LinearField};
 pub use mlp::{HIDDEN_LAYERS, MIDDLE_LAYERS, PARAMETERS, WIDTH};
 pub use network::Network;
 pub use snapshot::{Snapshot, SnapshotError, TrainerState};
@@ -32,8 +37,7 @@ pub(crate) use early_stopping::EarlyStop;
 pub(crate) use early_stopping::EarlyStopState;
 pub(crate) use error::FitError;
 pub(crate) use fit::{Fit, Fitted};
-#[cfg(test)]
-pub(crate) use loss::PointLoss;
+pub(crate) use linear::{LinearGrid, Placed, ROW};
 pub(crate) use loss::{Batch, DistanceLoss, Loss, length};
 pub(crate) use mlp::{
     Conditioning, LAID_OUT, PANEL, first_layer, last_layer, middle_layer, transpose_middle_layers,

@@ -7,7 +7,6 @@ use nalgebra::Vector3;
 use super::mlp::{Conditioning, WIDTH, first_layer, last_layer};
 use super::parameters::Parameters;
 use crate::flow::data::{Point, RigidTransform};
-use crate::flow::options::InputNormalization;
 
 /// The fitted coordinate network of one pair (FNSF Section 3): parameters and input normalization.
 ///
@@ -22,18 +21,6 @@ pub struct Network {
 }
 
 impl Network {
-    /// The network with `parameters` fitted to `points`, with the input normalization `inputs`.
-    pub(crate) fn new(
-        parameters: Parameters,
-        points: &[Point],
-        inputs: InputNormalization,
-    ) -> Self {
-        Self {
-            parameters,
-            conditioning: Conditioning::new(points, inputs),
-        }
-    }
-
     /// The parameters of the same field in another frame, for inputs normalized by `conditioning`.
     /// With `motion` as the transform to the new frame: `g'(p) = R g(motion^-1 p)`. The result is
     /// exact up to rounding: both rotations and the translation are absorbed by the first and last
@@ -96,6 +83,7 @@ mod tests {
     use crate::flow::data::transform_point;
     use crate::flow::field::backend::Backend;
     use crate::flow::field::mlp;
+    use crate::flow::options::InputNormalization;
 
     /// Metres: single-precision rounding of coordinates of 50 m and of features of that size.
     const ROUNDING_M: f32 = 2e-4;
@@ -112,7 +100,10 @@ mod tests {
         let (fitted, others) = (points(), points());
         let scales = [10.0, 8.0].map(|scale_m| InputNormalization::Centered { scale_m });
         let parameters = mlp::xavier(&mut Random::new(9));
-        let network = Network::new(parameters, &fitted, scales[0]);
+        let network = Network {
+            parameters,
+            conditioning: Conditioning::new(&fitted, scales[0]),
+        };
         let motion = RigidTransform::new([1.5, -0.4, 0.1].into(), [0.01, -0.02, 0.3].into());
         let seen: Vec<Point> = others
             .iter()

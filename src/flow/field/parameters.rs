@@ -3,7 +3,7 @@
 use bytemuck::{Pod, Zeroable};
 
 /// Floats of a cache line.
-const LINE: usize = 16;
+pub(super) const LINE: usize = 16;
 
 /// One cache line of floats.
 #[derive(Clone, Copy, Pod, Zeroable)]

@@ -3,24 +3,22 @@
 //! ```text
 //! identity u64 | iterations u64 | best iteration u64 | best loss f32
 //!   | stopping rule: has best u8, best f32, without progress u64
-//!   | parameters, means, squares, kept: f32 each
+//!   | number of parameters u64 | parameters, means, squares, kept: f32 each
 //! ```
 //!
 //! This is the body of an envelope, see `data/codec.rs`. Derived values (transposes, the order of
 //! the points) are not stored.
 
-use super::codec::{PARAMETERS_BYTES, put_parameters, take_parameters};
+use super::codec::{put_parameters, take_parameters};
 use super::early_stopping::EarlyStopState;
 use super::parameters::Parameters;
 use crate::flow::data::{Envelope, EnvelopeError};
 
 const ENVELOPE: Envelope = Envelope {
     magic: *b"FNSFSNAP",
-    version: 3,
-    body: Some(8 + 8 + 8 + 4 + 1 + 4 + 8 + ARRAYS * PARAMETERS_BYTES),
+    version: 4,
+    body: None,
 };
-/// Parameters, two moments, the kept parameters.
-const ARRAYS: usize = 4;
 
 /// The state of a fit between two iterations.
 ///
@@ -91,7 +89,7 @@ impl Snapshot {
         self.state.iterations
     }
 
-    /// The snapshot as 1.9 MB of bytes, with a header, a format version and a checksum.
+    /// The snapshot as bytes, 1.9 MB for a network, with a header, a format version and a checksum.
     pub fn to_bytes(&self) -> Vec<u8> {
         let state = &self.state;
         let mut bytes = ENVELOPE.begin();
@@ -102,6 +100,7 @@ impl Snapshot {
         bytes.push(u8::from(state.seen.best.is_some()));
         bytes.extend(state.seen.best.unwrap_or(0.0).to_le_bytes());
         bytes.extend((state.seen.without_progress as u64).to_le_bytes());
+        bytes.extend((state.parameters.as_slice().len() as u64).to_le_bytes());
         let [means, squares] = &state.moments;
         for array in [&state.parameters, means, squares, &state.kept] {
             put_parameters(&mut bytes, array);
@@ -127,10 +126,12 @@ impl Snapshot {
             best: (has_best != 0).then_some(best),
             without_progress: body.count()?,
         };
+        let floats = body.count()?;
+        let mut parameters = || take_parameters(&mut body, floats);
         let state = TrainerState {
-            parameters: take_parameters(&mut body)?,
-            moments: [take_parameters(&mut body)?, take_parameters(&mut body)?],
-            kept: take_parameters(&mut body)?,
+            parameters: parameters()?,
+            moments: [parameters()?, parameters()?],
+            kept: parameters()?,
             seen,
             iterations,
             best_iteration,

@@ -23,7 +23,7 @@ pub(crate) struct Prior<'a> {
 
 /// The initial state of a fit to `aligned` that starts from the preceding pair's field. Sets
 /// `options` to those of a warm start. None, with `options` unchanged, if the options have no warm
-/// start, there is no preceding field, only one of the pairs has an ego motion, or the field
+/// start or another model, there is no preceding field, only one of the pairs has an ego motion, or the field
 /// explains this pair no better than no motion.
 pub(crate) fn warm_start(
     backend: &dyn Backend,
@@ -39,7 +39,10 @@ pub(crate) fn warm_start(
     if prior.has_ego != ego.is_some() {
         return Ok(None);
     }
-    let conditioning = Conditioning::new(aligned, options.inputs);
+    let Some(model) = options.network() else {
+        return Ok(None);
+    };
+    let conditioning = Conditioning::new(aligned, model.inputs);
     let motion = ego.copied().unwrap_or_default();
     let transformed = Network {
         parameters: prior.network.transformed(&motion, &conditioning),

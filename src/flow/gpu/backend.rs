@@ -79,6 +79,10 @@ impl Gpu {
 pub(super) const NO_CHAMFER: BackendError =
     BackendError::Unsupported("the Chamfer distance is computed on the CPU alone");
 
+/// The error of a fit of the linear model.
+pub(super) const NO_LINEAR_MODEL: BackendError =
+    BackendError::Unsupported("the linear model is computed on the CPU alone");
+
 impl Backend for Gpu {
     fn name(&self) -> String {
         self.0.name.clone()

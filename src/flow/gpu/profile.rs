@@ -13,7 +13,7 @@ use super::tiling::{Cut, Plan};
 use crate::flow::data::{Point, Random, Uncontrolled};
 use crate::flow::distance::DistanceOptions;
 use crate::flow::field::{BackendError, MIDDLE_LAYERS, Schedule, WIDTH};
-use crate::flow::options::{FieldOptions, Precision};
+use crate::flow::options::{FieldOptions, ModelOptions, NetworkOptions, Precision};
 
 /// Floating-point operations of the forward pass, per point.
 const FORWARD: f64 = 2.0 * (3 * WIDTH + MIDDLE_LAYERS * WIDTH * WIDTH + 3 * WIDTH) as f64;
@@ -117,7 +117,10 @@ fn repeated_iteration(
     precision: Precision,
 ) -> Result<Request, BackendError> {
     let options = FieldOptions {
-        precision,
+        model: ModelOptions::Network(NetworkOptions {
+            precision,
+            ..NetworkOptions::published()
+        }),
         // The repeated iteration makes no progress and must not stop the fit.
         early_stop: None,
         ..FieldOptions::published(false)

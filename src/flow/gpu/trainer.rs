@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::backend::NO_CHAMFER;
+use super::backend::{NO_CHAMFER, NO_LINEAR_MODEL};
 use super::batcher::Done;
 use super::device::Device;
 use super::distance::GpuTransform;
@@ -14,9 +14,10 @@ use super::request::Request;
 use super::tiling::Cut;
 use super::{inference, layout};
 use crate::flow::data::{Control, Point, Progress, Random};
+use crate::flow::field::Network as FittedNetwork;
 use crate::flow::field::{
-    Advance, BackendError, Conditioning, EarlyStopState, FitReport, LAID_OUT, Parameters, Schedule,
-    Trainer, TrainerState, mlp, transpose_middle_layers,
+    Advance, BackendError, Conditioning, EarlyStopState, FitReport, FittedField, LAID_OUT,
+    Parameters, Schedule, Trainer, TrainerState, check_state, mlp, transpose_middle_layers,
 };
 use crate::flow::options::{DistanceLossOptions, FieldOptions, Precision};
 
@@ -65,6 +66,7 @@ impl Drop for Network {
 /// The network, its optimizer and the distance transform of the target.
 pub(super) struct GpuTrainer<'a> {
     transform: &'a GpuTransform,
+    precision: Precision,
     loss: DistanceLossOptions,
     conditioning: Conditioning,
     schedule: Schedule,
@@ -84,11 +86,12 @@ impl<'a> GpuTrainer<'a> {
     ) -> Result<Self, BackendError> {
         let device = &transform.device;
         let loss = options.loss.distance().ok_or(NO_CHAMFER)?.clone();
-        if options.precision == Precision::F16 {
+        let model = *options.network().ok_or(NO_LINEAR_MODEL)?;
+        if model.precision == Precision::F16 {
             device.units()?;
         }
         let mut random = Random::stream(seed, 0);
-        let parameters = mlp::initial(options.start, &mut random);
+        let parameters = mlp::initial(model.start, &mut random);
         let schedule = Schedule::new(source, options, &mut random);
         let chunks = Cut::new(schedule.largest_batch()).chunks.count as u64;
         if chunks > device.context.budget.chunks {
@@ -107,9 +110,10 @@ impl<'a> GpuTrainer<'a> {
             .write_buffer(&device.context.buffers.store, at, bytes);
         let mut trainer = Self {
             transform,
+            precision: model.precision,
             loss,
             network: Network::take(device)?,
-            conditioning: Conditioning::new(source, options.inputs),
+            conditioning: Conditioning::new(source, model.inputs),
             schedule,
             points,
             status: Status::default(),
@@ -165,7 +169,7 @@ impl<'a> GpuTrainer<'a> {
             status: self.status,
             steps: (done..done + steps).map(|done| self.step(done)).collect(),
             cut: Cut::new(self.schedule.largest_batch()),
-            precision: self.schedule.options.precision,
+            precision: self.precision,
         };
         let done = {
             let device = self.device();
@@ -245,6 +249,13 @@ impl Trainer for GpuTrainer<'_> {
         inference::evaluate(&self.device().context, networks, &self.lane(), points)
     }
 
+    fn fitted(&mut self) -> Result<FittedField, BackendError> {
+        Ok(FittedField::Network(FittedNetwork {
+            parameters: self.state()?.kept,
+            conditioning: self.conditioning,
+        }))
+    }
+
     fn report(&self) -> FitReport {
         FitReport {
             iterations: self.iterations(),
@@ -287,6 +298,7 @@ impl Trainer for GpuTrainer<'_> {
     }
 
     fn restore(&mut self, state: TrainerState) -> Result<(), BackendError> {
+        check_state(&state, LAID_OUT)?;
         let mut transposed = mlp::zeros();
         transpose_middle_layers(&state.parameters, &mut transposed);
         let [means, squares] = &state.moments;

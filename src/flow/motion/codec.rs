@@ -3,7 +3,7 @@
 //! ```text
 //! ego: present u8, rotation i j k w, translation x y z: f64 each
 //!   | residual u8: 0 static | 1 network: center x y z, scale, parameters: f32 each
-//!   | 2 objects: as in `objects/codec.rs`
+//!   | 2 objects: as in `objects/codec.rs` | 3 linear: as in `field/linear.rs`
 //! ```
 //!
 //! The envelope (magic, version, checksum) is that of `data/codec.rs`. A missing ego motion is
@@ -15,7 +15,9 @@ use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 
 use super::motion_field::{MotionField, Residual};
 use crate::flow::data::{Body, Envelope, EnvelopeError, RigidTransform};
-use crate::flow::field::{Conditioning, Network, put_parameters, take_parameters};
+use crate::flow::field::{
+    Conditioning, LAID_OUT, LinearField, Network, put_parameters, take_parameters,
+};
 use crate::flow::objects::ObjectMotions;
 
 const ENVELOPE: Envelope = Envelope {
@@ -26,6 +28,7 @@ const ENVELOPE: Envelope = Envelope {
 const STILL: u8 = 0;
 const NETWORK: u8 = 1;
 const OBJECTS: u8 = 2;
+const LINEAR: u8 = 3;
 /// Tolerance of a rotation quaternion's norm around 1: rounding of doubles.
 const UNIT: f64 = 1e-9;
 
@@ -49,6 +52,10 @@ impl MotionField {
                     bytes.extend(value.to_le_bytes());
                 }
                 put_parameters(&mut bytes, &network.parameters);
+            }
+            Residual::Linear(field) => {
+                bytes.push(LINEAR);
+                field.put(&mut bytes);
             }
             Residual::Objects(motions) => {
                 bytes.push(OBJECTS);
@@ -77,8 +84,9 @@ impl MotionField {
                     center: [body.single()?, body.single()?, body.single()?],
                     scale: body.single()?,
                 },
-                parameters: take_parameters(&mut body)?,
+                parameters: take_parameters(&mut body, LAID_OUT)?,
             }),
+            LINEAR => Residual::Linear(LinearField::take(&mut body)?),
             OBJECTS => Residual::Objects(Arc::new(ObjectMotions::take(&mut body)?)),
             _ => return Err(EnvelopeError::Damaged),
         };
@@ -106,7 +114,8 @@ fn motion(body: &mut Body<'_>) -> Result<Option<RigidTransform>, EnvelopeError> 
 mod tests {
     use super::*;
     use crate::flow::data::Random;
-    use crate::flow::field::mlp;
+    use crate::flow::field::{LinearGrid, mlp};
+    use crate::flow::options::LinearOptions;
 
     #[test]
     fn a_field_comes_back_from_its_bytes_and_altered_bytes_are_refused() {
@@ -118,7 +127,14 @@ mod tests {
                 scale: 0.1,
             },
         });
+        let cloud = [[0.0; 3], [9.0, 7.0, 1.0]];
+        let grid = LinearGrid::plan(&cloud, &LinearOptions::published()).expect("a small grid");
+        let linear = Residual::Linear(LinearField {
+            values: vec![0.25; 3 * grid.channel()],
+            grid,
+        });
         for (ego, residual) in [
+            (None, linear),
             (Some(motion), network.clone()),
             (None, network),
             (Some(motion), Residual::Still),

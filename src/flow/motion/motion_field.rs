@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use crate::flow::data::{Point, RigidTransform, transform_points};
-use crate::flow::field::{Backend, BackendError, Network};
+use crate::flow::field::{Backend, BackendError, LinearField, Network};
 use crate::flow::objects::ObjectMotions;
 
 /// The motion from the source sweep's time to the target's, defined at any point. It maps a point
@@ -25,6 +25,8 @@ pub enum Residual {
     Still,
     /// The network of a fitted field: a neural scene flow prior (FNSF Section 3).
     Network(Network),
+    /// The linear model of a fitted field.
+    Linear(LinearField),
     /// Rigid motions of the objects that an object search found.
     Objects(Arc<ObjectMotions>),
 }
@@ -58,6 +60,7 @@ impl MotionField {
         match &self.residual {
             Residual::Still => Ok(vec![[0.0; 3]; static_positions.len()]),
             Residual::Network(network) => backend.evaluate(network, static_positions),
+            Residual::Linear(field) => Ok(field.flow(static_positions, backend.host().threads())),
             Residual::Objects(motions) => Ok(motions.residual_at(static_positions)),
         }
     }

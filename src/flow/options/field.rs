@@ -1,19 +1,20 @@
-//! Options of the neural field fit (FNSF).
+//! Options of the fit of a field.
 
 use super::loss::{ChamferOptions, DistanceLossOptions, LossOptions, NearestSearch};
+use super::model::{
+    InputNormalization, LinearOptions, ModelOptions, NetworkOptions, Precision, Start,
+};
 
-/// Options of the fit of a neural field to one pair.
+/// Options of the fit of a field to one pair.
 ///
-/// The field is a ReLU MLP with 8 hidden layers of 128 features, from a point to its displacement.
-/// Adam minimizes the mean loss of the displaced source points (FNSF Section 3).
+/// The field is a model from a point to its displacement. Adam minimizes the mean loss of the
+/// displaced source points (FNSF Section 3).
 #[derive(Clone, Debug, PartialEq)]
 pub struct FieldOptions {
+    /// The model of the field.
+    pub model: ModelOptions,
     /// The loss that the field is fitted to.
     pub loss: LossOptions,
-    /// Normalization of the network's inputs.
-    pub inputs: InputNormalization,
-    /// Initial weights of the network.
-    pub start: Start,
     /// Learning rate (Adam's step size) of the first iteration.
     pub learning_rate: f32,
     /// Schedule of the learning rate over the iterations.
@@ -27,12 +28,10 @@ pub struct FieldOptions {
     pub result: ResultChoice,
     /// Early stopping before `max_iterations`; none to do all iterations.
     pub early_stop: Option<EarlyStopOptions>,
-    /// Maximum number of iterations; with zero the result is the initial network. The cosine
+    /// Maximum number of iterations; with zero the result is the initial model. The cosine
     /// schedule reaches a learning rate of zero there. Under a deadline the same work may be
     /// divided into more iterations of smaller batches.
     pub max_iterations: usize,
-    /// Floating-point precision of the network's matrix products during the fit.
-    pub precision: Precision,
     /// Warm start: in a sequence, the fit of a pair starts from the field of the previous pair, and
     /// the registration from its ego motion. With none, each pair starts from new weights and is
     /// independent of the others.
@@ -44,9 +43,8 @@ impl FieldOptions {
     pub(crate) fn published(sampled: bool) -> Self {
         let (learning_rate, patience) = if sampled { (0.01, 5) } else { (0.008, 10) };
         Self {
+            model: ModelOptions::Network(NetworkOptions::published()),
             loss: LossOptions::Distance(DistanceLossOptions::published()),
-            inputs: InputNormalization::Raw,
-            start: Start::Xavier,
             learning_rate,
             learning_rate_schedule: LearningRateSchedule::Constant,
             batch: None,
@@ -56,7 +54,6 @@ impl FieldOptions {
                 min_delta: 1e-3,
             }),
             max_iterations: 5000,
-            precision: Precision::F32,
             warm_start: None,
         }
     }
@@ -72,8 +69,11 @@ impl FieldOptions {
                 flow_penalty: 0.02,
                 ..DistanceLossOptions::published()
             }),
-            inputs: InputNormalization::Centered { scale_m: 10.0 },
-            start: Start::ZeroFlow,
+            model: ModelOptions::Network(NetworkOptions {
+                inputs: InputNormalization::Centered { scale_m: 10.0 },
+                start: Start::ZeroFlow,
+                precision: Precision::F32,
+            }),
             learning_rate: 0.004,
             learning_rate_schedule: LearningRateSchedule::Cosine,
             batch: Some(2048),
@@ -103,6 +103,35 @@ impl FieldOptions {
                 min_delta: 1e-4,
             }),
             ..Self::published(false)
+        }
+    }
+
+    /// These options with the linear model, and the rate and stopping rule of its published code.
+    pub(super) fn linear(self) -> Self {
+        Self {
+            model: ModelOptions::Linear(LinearOptions::published()),
+            learning_rate: 0.03,
+            early_stop: Some(EarlyStopOptions {
+                patience: 10,
+                min_delta: 1e-3,
+            }),
+            ..self
+        }
+    }
+
+    /// The options of the coordinate network; none for another model.
+    pub fn network(&self) -> Option<&NetworkOptions> {
+        match &self.model {
+            ModelOptions::Network(options) => Some(options),
+            ModelOptions::Linear(_) => None,
+        }
+    }
+
+    /// Mutable access to the options of the coordinate network; none for another model.
+    pub fn network_mut(&mut self) -> Option<&mut NetworkOptions> {
+        match &mut self.model {
+            ModelOptions::Network(options) => Some(options),
+            ModelOptions::Linear(_) => None,
         }
     }
 
@@ -183,31 +212,6 @@ impl DeadlineLimits {
     }
 }
 
-/// Normalization of the coordinates that the network takes as input.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum InputNormalization {
-    /// Coordinates in metres, without normalization. If the mean of the cloud is far from the
-    /// origin (more than 200 m along an axis, as in a map frame), the mean is subtracted.
-    Raw,
-    /// The mean of the cloud is subtracted, and the coordinates are divided by `scale_m`.
-    Centered {
-        /// Length that becomes one, metres. It must be above zero.
-        scale_m: f32,
-    },
-}
-
-/// Initial parameters of the network.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Start {
-    /// Xavier-uniform weights in every layer (Glorot and Bengio 2010, equation 16). The biases are
-    /// zero. Weights are drawn from `U(-a, a)` with `a = sqrt(6 / (inputs + outputs))` of the
-    /// layer. The length of the initial flow grows with the length of the network's input. With
-    /// raw coordinates it is about 0.2 m to 2 m, 50 m from the origin.
-    Xavier,
-    /// As [`Self::Xavier`], but the last layer is zero. The initial flow is zero.
-    ZeroFlow,
-}
-
 /// Schedule of the learning rate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LearningRateSchedule {
@@ -229,32 +233,6 @@ pub enum ResultChoice {
         /// limited to `n / (n + 10)`. Larger values average over more iterations.
         decay: f32,
     },
-}
-
-/// Floating-point precision of the network's matrix products during the fit.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Precision {
-    /// Single precision throughout.
-    #[default]
-    F32,
-    /// Half-precision factors in the layers from 128 to 128 features: features, weights and
-    /// derivatives are rounded before they are multiplied. Sums, parameters, the optimizer, the
-    /// other layers, the loss and the evaluation of the result remain in single precision. Requires
-    /// a GPU whose matrix units pass their self-test; every other device rejects it.
-    F16,
-}
-
-impl Precision {
-    /// All precisions.
-    pub const ALL: [Self; 2] = [Self::F32, Self::F16];
-
-    /// The name used by the command line and the service: `f32` or `f16`.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::F32 => "f32",
-            Self::F16 => "f16",
-        }
-    }
 }
 
 /// Early stopping, as in the published code. An iteration is progress if its mean loss is more than

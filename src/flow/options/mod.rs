@@ -4,16 +4,17 @@
 
 mod field;
 mod loss;
+mod model;
 mod objects;
 mod pair;
 mod preset;
 
 pub(crate) use field::DeadlineLimits;
-pub use field::{
-    EarlyStopOptions, FieldOptions, InputNormalization, LearningRateSchedule, Precision,
-    ResultChoice, Start, WarmStart,
-};
+pub use field::{EarlyStopOptions, FieldOptions, LearningRateSchedule, ResultChoice, WarmStart};
 pub use loss::{ChamferOptions, DistanceLossOptions, LossOptions, NearestSearch};
+pub use model::{
+    InputNormalization, LinearOptions, ModelOptions, NetworkOptions, Precision, Start,
+};
 pub use objects::ObjectOptions;
 pub use pair::{DEFAULT_DT_S, Ego, Ground, Method, Options};
 pub use preset::Preset;

@@ -23,21 +23,30 @@ pub enum Preset {
     NsfpBaseline,
     /// As [`Preset::NsfpBaseline`], with k-d trees for the nearest neighbors.
     NsfpKdtree,
+    /// The linear model of FNSF's comparison, fitted to the distance transform.
+    FnsfLinear,
+    /// The linear model, fitted to the truncated Chamfer distance.
+    NsfpLinear,
+    /// As [`Preset::NsfpLinear`], with k-d trees for the nearest neighbors.
+    NsfpKdtreeLinear,
 }
 
 impl Preset {
     /// All presets.
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 9] = [
         Self::Default,
         Self::Label,
         Self::Neural,
         Self::Paper,
         Self::NsfpBaseline,
         Self::NsfpKdtree,
+        Self::FnsfLinear,
+        Self::NsfpLinear,
+        Self::NsfpKdtreeLinear,
     ];
 
     /// The name used by the command line and the service: `default`, `label`, `neural`, `paper`,
-    /// `nsfp-baseline` or `nsfp-kdtree`.
+    /// `nsfp-baseline`, `nsfp-kdtree`, `fnsf-linear`, `nsfp-linear` or `nsfp-kdtree-linear`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Default => "default",
@@ -46,6 +55,9 @@ impl Preset {
             Self::Paper => "paper",
             Self::NsfpBaseline => "nsfp-baseline",
             Self::NsfpKdtree => "nsfp-kdtree",
+            Self::FnsfLinear => "fnsf-linear",
+            Self::NsfpLinear => "nsfp-linear",
+            Self::NsfpKdtreeLinear => "nsfp-kdtree-linear",
         }
     }
 
@@ -57,9 +69,9 @@ impl Preset {
     /// Whether the preset has kernels for a GPU.
     pub fn runs_on_gpu(self) -> bool {
         let options = self.options(None);
-        options
-            .field()
-            .is_some_and(|field| field.loss.distance().is_some())
+        let has_kernels =
+            |field: &FieldOptions| field.loss.distance().is_some() && field.network().is_some();
+        options.field().is_some_and(has_kernels)
     }
 
     /// The presets that fit a neural field.
@@ -87,10 +99,17 @@ impl Preset {
             Self::Paper => Method::Field(FieldOptions::published(max_points.is_some())),
             Self::NsfpBaseline => Method::Field(FieldOptions::nsfp(NearestSearch::BruteForce)),
             Self::NsfpKdtree => Method::Field(FieldOptions::nsfp(NearestSearch::KdTree)),
+            Self::FnsfLinear => Method::Field(FieldOptions::published(false).linear()),
+            Self::NsfpLinear => {
+                Method::Field(FieldOptions::nsfp(NearestSearch::BruteForce).linear())
+            }
+            Self::NsfpKdtreeLinear => {
+                Method::Field(FieldOptions::nsfp(NearestSearch::KdTree).linear())
+            }
         };
         let (ground, ego) = match self {
             Self::Default | Self::Label | Self::Neural => (Ground::Auto, Ego::Auto),
-            Self::Paper | Self::NsfpBaseline | Self::NsfpKdtree => (Ground::Keep, Ego::Off),
+            _ => (Ground::Keep, Ego::Off),
         };
         Options {
             seed: 0,

@@ -5,6 +5,7 @@ use std::sync::Mutex;
 use super::*;
 use crate::flow::cpu::backend::CpuBackend;
 use crate::flow::cpu::isa::Isa;
+use crate::flow::cpu::model::Mlp;
 use crate::flow::data::{Random, Uncontrolled};
 use crate::flow::distance::{DistanceOptions, DistanceTransform};
 use crate::flow::field::{
@@ -162,7 +163,7 @@ fn more_chunks_than_are_held_at_once_are_each_added_up_once() {
     const TOLERANCE: f64 = 1e-4;
     let points = 33 * MOST_POINTS;
     let chunks = Chunks::new(points).count;
-    assert!(chunks > HELD);
+    assert!(chunks > Mlp::HELD);
     let [source, target] = clouds(points);
     let mut options = Preset::Paper.field();
     options.early_stop = None;

@@ -26,11 +26,9 @@ fn with_units() -> Option<&'static Gpu> {
     }
 }
 
-fn half(options: FieldOptions) -> FieldOptions {
-    FieldOptions {
-        precision: Precision::F16,
-        ..options
-    }
+fn half(mut options: FieldOptions) -> FieldOptions {
+    options.network_mut().expect("a network").precision = Precision::F16;
+    options
 }
 
 #[test]

@@ -152,7 +152,7 @@ fn every_gradient_is_the_references_at_awkward_row_counts() {
     for preset in Preset::with_gpu_kernels() {
         let mut options = FieldOptions {
             loss: preset.field().loss,
-            inputs: preset.field().inputs,
+            model: preset.field().model,
             ..plain()
         };
         options.result = ResultChoice::Best;
@@ -169,7 +169,8 @@ fn every_gradient_is_the_references_at_awkward_row_counts() {
             );
             let distance = distance.expect("small clouds fit");
             let reference = network();
-            let conditioning = Conditioning::new(source, options.inputs);
+            let conditioning =
+                Conditioning::new(source, options.network().expect("a network").inputs);
             let mut expected = ReferenceNetwork::read(&mlp::zeros());
             for &point in source {
                 let input = conditioning.apply(point).map(f64::from);

@@ -1,0 +1,372 @@
+//! The linear model on the CPU. The formulas are in `field/linear.rs`.
+//!
+//! All sums are taken in an order that does not depend on the number of threads.
+
+use std::sync::Arc;
+
+use rayon::prelude::*;
+
+use super::isa::Isa;
+use super::model::Model;
+use super::product_kernels::{Factors, ProductKernel};
+use super::tile::{TILE, WorkingSets};
+use crate::flow::data::Point;
+use crate::flow::field::{FittedField, LinearField, LinearGrid, Parameters, Placed};
+
+/// Smoothing constant of the total variation, square metres, as in the published code.
+const SMOOTHING: f32 = 1e-5;
+
+/// The three products with the encodings of the axes.
+pub(super) struct Encoder {
+    kernel: ProductKernel,
+    threads: Arc<rayon::ThreadPool>,
+    grid: LinearGrid,
+    encodings: [Vec<f32>; 3],
+}
+
+impl Encoder {
+    pub(super) fn new(isa: Isa, threads: Arc<rayon::ThreadPool>, grid: LinearGrid) -> Self {
+        Self {
+            kernel: ProductKernel::new(isa),
+            threads,
+            grid,
+            encodings: [0, 1, 2].map(|axis| grid.encoding(axis)),
+        }
+    }
+
+    /// `to = (phi_x (x) phi_y (x) phi_z) from`. The encodings are symmetric, so this is also the
+    /// transposed product. `between` is overwritten.
+    fn apply(&self, from: &[f32], to: &mut [f32], between: &mut [f32]) {
+        let grid = &self.grid;
+        let [x, y, z] = grid.vertices;
+        let (row, plane, channel) = (grid.row(), grid.plane(), grid.channel());
+        let [along_x, along_y, along_z] = &self.encodings;
+        let across = |number: usize, out: &mut [f32], smoothed: &mut Vec<f32>| {
+            let factors = Factors {
+                a: &from[number * plane..(number + 1) * plane],
+                a_row: row,
+                b: along_x,
+                b_row: row,
+                rows: y,
+                depth: x,
+                columns: row,
+            };
+            self.kernel.multiply(factors, smoothed, row);
+            let factors = Factors {
+                a: along_y,
+                a_row: along_y.len() / y,
+                b: smoothed,
+                b_row: row,
+                rows: y,
+                depth: y,
+                columns: row,
+            };
+            self.kernel.multiply(factors, out, row);
+        };
+        let up = |number: usize, out: &mut [f32], between: &[f32]| {
+            let (of, level) = (number / z, number % z);
+            let stride = along_z.len() / z;
+            let factors = Factors {
+                a: &along_z[level * stride..],
+                a_row: stride,
+                b: &between[of * channel..(of + 1) * channel],
+                b_row: plane,
+                rows: 1,
+                depth: z,
+                columns: plane,
+            };
+            self.kernel.multiply(factors, out, plane);
+        };
+        self.threads.install(|| {
+            let planes = between.par_chunks_mut(plane).enumerate();
+            planes.for_each_init(
+                || vec![0.0; plane],
+                |smoothed, (number, out)| across(number, out, smoothed),
+            );
+            let planes = to.par_chunks_mut(plane).enumerate();
+            planes.for_each(|(number, out)| up(number, out, between));
+        });
+    }
+}
+
+/// The linear model with the displacements of its current weights.
+pub(super) struct Linear {
+    encoder: Encoder,
+    variation_weight: f32,
+    /// Displacements of the vertices, metres.
+    values: Vec<f32>,
+    /// Derivatives of the loss with respect to them.
+    value_gradients: Vec<f32>,
+    between: Vec<f32>,
+    /// Reciprocal length of the displacement's differences at each vertex, for each axis of the
+    /// displacement.
+    inverse_lengths: Vec<f32>,
+    variation: f32,
+    points: PlacedPoints,
+}
+
+/// The points of a batch on the grid.
+#[derive(Default)]
+struct PlacedPoints {
+    placed: Vec<Placed>,
+    /// Positions of the points in the order of their voxel's level.
+    order: Vec<u32>,
+    /// Where the points of each level begin in `order`, and the end of the last.
+    first: Vec<u32>,
+}
+
+impl Linear {
+    /// The model on the grid of `encoder`, with the weight of the total variation in the loss.
+    pub(super) fn new(encoder: Encoder, variation_weight: f32) -> Self {
+        let floats = 3 * encoder.grid.channel();
+        Self {
+            encoder,
+            variation_weight,
+            values: vec![0.0; floats],
+            value_gradients: vec![0.0; floats],
+            between: vec![0.0; floats],
+            inverse_lengths: vec![0.0; floats],
+            variation: 0.0,
+            points: PlacedPoints::default(),
+        }
+    }
+
+    /// Differences of the displacement at vertex `at` to its next neighbors.
+    #[inline]
+    fn differences(&self, values: &[f32], at: usize) -> [f32; 3] {
+        let grid = &self.encoder.grid;
+        [1, grid.row(), grid.plane()].map(|step| values[at + step] - values[at])
+    }
+
+    /// Number of vertices with a next neighbor along all axes.
+    fn inner(&self) -> f32 {
+        let inner: usize = self
+            .encoder
+            .grid
+            .vertices
+            .iter()
+            .map(|count| count - 1)
+            .product();
+        inner as f32
+    }
+
+    /// Computes the total variation (FNSF's published code): the mean over the vertices of the sum
+    /// over the axes of the flow of `sqrt(1e-5 + |differences|^2)`.
+    fn measure_variation(&mut self) {
+        let grid = self.encoder.grid;
+        let [x, y, z] = grid.vertices;
+        let (row, plane) = (grid.row(), grid.plane());
+        let mut inverse_lengths = core::mem::take(&mut self.inverse_lengths);
+        let level = |(number, inverse): (usize, &mut [f32])| {
+            inverse.fill(0.0);
+            if number % z + 1 == z {
+                return 0.0;
+            }
+            let values = &self.values[number * plane..];
+            let mut sum = 0.0;
+            for across in 0..y - 1 {
+                for at in across * row..across * row + x - 1 {
+                    let differences = self.differences(values, at);
+                    let square: f32 = differences.iter().map(|d| d * d).sum();
+                    let length = (SMOOTHING + square).sqrt();
+                    inverse[at] = 1.0 / length;
+                    sum += f64::from(length);
+                }
+            }
+            sum
+        };
+        let sums: Vec<f64> = self.encoder.threads.install(|| {
+            let levels = inverse_lengths.par_chunks_mut(plane).enumerate();
+            levels.map(level).collect()
+        });
+        self.inverse_lengths = inverse_lengths;
+        self.variation = (sums.iter().sum::<f64>() / f64::from(self.inner())) as f32;
+    }
+
+    /// The derivative of the loss with respect to the displacements of one level of vertices.
+    fn level_gradient(&self, number: usize, flow_gradients: &[Point], out: &mut [f32]) {
+        let grid = &self.encoder.grid;
+        let [x, y, z] = grid.vertices;
+        let (row, plane) = (grid.row(), grid.plane());
+        let (channel, level) = (number / z, number % z);
+        out.fill(0.0);
+        let points = &self.points;
+        // Points of the voxels above this level, then of those below it.
+        for (below, cell) in [Some(level), level.checked_sub(1)].into_iter().enumerate() {
+            let Some(cell) = cell.filter(|cell| cell + 1 < points.first.len()) else {
+                continue;
+            };
+            let own = points.first[cell] as usize..points.first[cell + 1] as usize;
+            for &position in &points.order[own] {
+                let Placed { cell, weights } = points.placed[position as usize];
+                let [wx, wy, wz] = weights;
+                let pull = wz[below] * flow_gradients[position as usize][channel];
+                let first = cell[1] as usize * row + cell[0] as usize;
+                for (across, wy) in wy.into_iter().enumerate() {
+                    let at = first + across * row;
+                    out[at] += wy * wx[0] * pull;
+                    out[at + 1] += wy * wx[1] * pull;
+                }
+            }
+        }
+        if self.variation_weight == 0.0 {
+            return;
+        }
+        let weight = self.variation_weight / self.inner();
+        let base = number * plane;
+        let difference = |at: usize, before: usize| {
+            (self.values[at] - self.values[before]) * self.inverse_lengths[before]
+        };
+        for across in 0..y {
+            for along in 0..x {
+                let own = across * row + along;
+                let at = base + own;
+                let mut sum = 0.0;
+                if along > 0 {
+                    sum += difference(at, at - 1);
+                }
+                if across > 0 {
+                    sum += difference(at, at - row);
+                }
+                if level > 0 {
+                    sum += difference(at, at - plane);
+                }
+                if along + 1 < x && across + 1 < y && level + 1 < z {
+                    let ahead: f32 = self.differences(&self.values, at).iter().sum();
+                    sum -= ahead * self.inverse_lengths[at];
+                }
+                out[own] += weight * sum;
+            }
+        }
+    }
+}
+
+impl Model for Linear {
+    type WorkingSet = [Point; TILE];
+    /// Derivatives with respect to the flows of the chunk's points.
+    type ChunkGradients = Vec<Point>;
+    const HELD: usize = usize::MAX;
+
+    fn working_set(&self) -> Self::WorkingSet {
+        [[0.0; 3]; TILE]
+    }
+
+    fn update(&mut self, parameters: &Parameters) {
+        let weights = &parameters.as_slice()[..self.values.len()];
+        self.encoder
+            .apply(weights, &mut self.values, &mut self.between);
+        if self.variation_weight > 0.0 {
+            self.measure_variation();
+        }
+    }
+
+    fn place(&mut self, points: &[Point]) {
+        let grid = &self.encoder.grid;
+        let placed = || points.par_iter().map(|&point| grid.place(point)).collect();
+        let placed: Vec<Placed> = self.encoder.threads.install(placed);
+        let mut first = vec![0u32; grid.vertices[2]];
+        for point in &placed {
+            first[point.cell[2] as usize + 1] += 1;
+        }
+        for level in 1..first.len() {
+            first[level] += first[level - 1];
+        }
+        let mut next = first.clone();
+        let mut order = vec![0; placed.len()];
+        for (position, point) in placed.iter().enumerate() {
+            let at = &mut next[point.cell[2] as usize];
+            order[*at as usize] = position as u32;
+            *at += 1;
+        }
+        self.points = PlacedPoints {
+            placed,
+            order,
+            first,
+        };
+    }
+
+    fn forward<'a>(
+        &self,
+        _: &Parameters,
+        points: &[Point],
+        index: usize,
+        flow: &'a mut Self::WorkingSet,
+    ) -> &'a [Point] {
+        let placed = &self.points.placed[index..index + points.len()];
+        for (flow, placed) in flow.iter_mut().zip(placed) {
+            *flow = placed.blend(&self.encoder.grid, &self.values);
+        }
+        &flow[..points.len()]
+    }
+
+    fn regularization(&self) -> f32 {
+        self.variation_weight * self.variation
+    }
+
+    fn chunk_gradients(&self) -> Self::ChunkGradients {
+        Vec::new()
+    }
+
+    fn clear(&self, chunk: &mut Self::ChunkGradients) {
+        chunk.clear();
+    }
+
+    fn backward(
+        &self,
+        _: &Parameters,
+        flow_gradients: &[Point],
+        _: &mut Self::WorkingSet,
+        chunk: &mut Self::ChunkGradients,
+    ) {
+        chunk.extend_from_slice(flow_gradients);
+    }
+
+    fn add_to_the_first(&self, _: &mut [Self::ChunkGradients]) {
+        unreachable!("all chunks are held");
+    }
+
+    fn gradient(&mut self, chunks: &[Self::ChunkGradients], gradients: &mut Parameters) {
+        let flow_gradients = chunks.concat();
+        let mut value_gradients = core::mem::take(&mut self.value_gradients);
+        self.encoder.threads.install(|| {
+            let levels = value_gradients.par_chunks_mut(self.encoder.grid.plane());
+            levels
+                .enumerate()
+                .for_each(|(number, out)| self.level_gradient(number, &flow_gradients, out));
+        });
+        let gradients = &mut gradients.as_mut_slice()[..value_gradients.len()];
+        self.encoder
+            .apply(&value_gradients, gradients, &mut self.between);
+        self.value_gradients = value_gradients;
+    }
+
+    fn evaluate(
+        &self,
+        parameters: &Parameters,
+        points: &[Point],
+        _: &WorkingSets<Self::WorkingSet>,
+    ) -> Vec<Point> {
+        self.field(parameters).flow(points, &self.encoder.threads)
+    }
+
+    fn fitted(&self, parameters: &Parameters) -> FittedField {
+        FittedField::Linear(self.field(parameters))
+    }
+}
+
+impl Linear {
+    /// The field with `parameters`.
+    fn field(&self, parameters: &Parameters) -> LinearField {
+        let mut values = vec![0.0; self.values.len()];
+        let mut between = vec![0.0; self.values.len()];
+        let weights = &parameters.as_slice()[..values.len()];
+        self.encoder.apply(weights, &mut values, &mut between);
+        LinearField {
+            grid: self.encoder.grid,
+            values,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;
