@@ -82,7 +82,7 @@ fn street(seed: u64) -> Result<SimulatedPair, String> {
     street.pair(0).map_err(|e| e.to_string())
 }
 
-fn solve(
+fn estimated(
     backend: &dyn Backend,
     pair: &SimulatedPair,
     options: &Options,
@@ -149,7 +149,7 @@ fn pairs(gpu: &Gpu, pair: &SimulatedPair, sizes: &[usize]) -> Result<(), String>
                     seed,
                     ..preset.options(Some(points))
                 };
-                let run = solve(gpu, pair, &options)?;
+                let run = estimated(gpu, pair, &options)?;
                 if seed > 0 {
                     runs.push(run);
                 }
@@ -191,7 +191,7 @@ fn batches(gpu: &Gpu, pair: &SimulatedPair, counts: &[usize]) -> Result<(), Stri
                                 seed: lane * rounds + round,
                                 ..Preset::Paper.options(Some(SMALL))
                             };
-                            solve(&gpu, pair, &options).map(|_| ())
+                            estimated(&gpu, pair, &options).map(|_| ())
                         })
                     })
                 })

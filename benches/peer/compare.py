@@ -17,13 +17,21 @@ from pathlib import Path
 from statistics import median
 
 PEER = Path(__file__).with_name("peer.py")
-FNSF_PRESETS = ("paper", "neural")
+METHODS = (
+    "paper",
+    "nsfp-baseline",
+    "nsfp-kdtree",
+    "fnsf-linear",
+    "nsfp-linear",
+    "nsfp-kdtree-linear",
+)
+METHODS_WITH_TRANSFORM = {"paper", "fnsf-linear"}
 PEER_DEVICES = {"cpu": "cpu", "gpu": "cuda"}
 
 
 @dataclass(frozen=True)
 class Contestant:
-    """One column of runs: fnsf with a preset, or the peer with a distance transform."""
+    """One row of runs: fnsf with a preset, or the peer with a method and a transform."""
 
     program: str
     variant: str
@@ -80,14 +88,16 @@ def run_fnsf(args: argparse.Namespace, preset: str, seed: int) -> Run:
         epe=metrics["epe"],
         acc5=metrics["acc5"],
         points=metrics["points"],
-        iterations=flow["iterations"],
+        iterations=flow["field"]["iterations"],
         peak_rss_bytes=flow["peak_rss_bytes"],
     )
 
 
-def run_peer(args: argparse.Namespace, transform: str, seed: int) -> Run:
-    """The peer, in the interpreter that runs this script."""
-    command = [sys.executable, str(PEER), str(args.pair), "--transform", transform]
+def run_peer(args: argparse.Namespace, variant: str, seed: int) -> Run:
+    """The peer, in the interpreter that runs this script. The variant is `method transform`."""
+    method, transform = variant.split()
+    command = [sys.executable, str(PEER), str(args.pair), "--method", method]
+    command += ["--transform", transform]
     command += ["--device", PEER_DEVICES[args.device.split(":")[0]]]
     report = run_json(command + problem_options(args, seed))
     return Run(
@@ -110,7 +120,7 @@ def run_all(args: argparse.Namespace, contestants: list[Contestant]) -> dict[Con
             run = runners[contestant.program](args, contestant.variant, seed)
             runs[contestant].append(run)
             progress = (
-                f"seed {seed}  {contestant.name:<16}  {run.seconds:8.3f} s  EPE {run.epe:.4f}"
+                f"seed {seed}  {contestant.name:<24}  {run.seconds:8.3f} s  EPE {run.epe:.4f}"
             )
             print(progress, file=sys.stderr)
     return runs
@@ -168,6 +178,10 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--threads", type=int, default=os.cpu_count())
     parser.add_argument("--device", default="cpu", help="cpu, gpu or gpu:CARD (default: cpu)")
+    parser.add_argument("--presets", nargs="+", default=["paper", "neural"], help="of fnsf")
+    parser.add_argument(
+        "--methods", choices=METHODS, nargs="+", default=["paper"], help="of the peer"
+    )
     parser.add_argument(
         "--transforms", choices=("edt", "fastgeodis"), nargs="+", default=["edt", "fastgeodis"]
     )
@@ -177,8 +191,10 @@ def parse_args() -> argparse.Namespace:
 def main() -> None:
     """Runs the comparison."""
     args = parse_args()
-    contestants = [Contestant("fnsf", preset) for preset in FNSF_PRESETS]
-    contestants += [Contestant("peer", transform) for transform in args.transforms]
+    contestants = [Contestant("fnsf", preset) for preset in args.presets]
+    for method in args.methods:
+        transforms = args.transforms if method in METHODS_WITH_TRANSFORM else ["edt"]
+        contestants += [Contestant("peer", f"{method} {transform}") for transform in transforms]
     print_table(args, run_all(args, contestants))
 
 

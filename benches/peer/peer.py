@@ -1,8 +1,10 @@
-"""Fast Neural Scene Flow (ICCV 2023) as published, in PyTorch: the peer of fnsf's benchmarks.
+"""Fast Neural Scene Flow (ICCV 2023) and what it is compared with, in PyTorch: the peer of fnsf's
+benchmarks.
 
-A coordinate network is fitted to one pair of clouds so that the moved source points lie where the
-distance transform of the target cloud is small. Nothing is shared with fnsf but the pair file, so a
-mistake there cannot hide here. All lengths are metres.
+A model is fitted to one pair of clouds so that the moved source points lie near the target. The
+methods have the names of fnsf's presets, and combine a model (`models.py`) with a loss
+(`losses.py`). Nothing is shared with fnsf but the pair file, so a mistake there cannot hide here.
+All lengths are metres.
 """
 
 import argparse
@@ -12,37 +14,48 @@ import os
 import resource
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from losses import Chamfer, DistanceMap, Loss, load_transform
+from models import LinearModel, build_network
 from torch import Tensor, nn
 
-CELLS_PER_METRE = 10
-CELL_M = 1 / CELLS_PER_METRE
-HIDDEN_LAYERS = 8
-HIDDEN_WIDTH = 128
 MAX_ITERATIONS = 5000
-MIN_DELTA_M = 1e-3
 PAIR_ARRAYS = ("pc1", "pc2", "flow", "valid", "ground1", "ground2")
-
-Transform = Callable[[Tensor], Tensor]
-"""Occupied vertices (bool, X x Y x Z) to the distance of every vertex to the nearest of them."""
 
 
 @dataclass(frozen=True)
-class Settings:
-    """What differs between the published full-cloud and sampled-cloud runs."""
+class Method:
+    """A model, a loss, and the published settings of their fit."""
 
+    model: str
+    loss: str
     learning_rate: float
     patience: int
+    min_delta: float
 
 
-FULL_CLOUD = Settings(learning_rate=0.008, patience=10)
-SAMPLED_CLOUD = Settings(learning_rate=0.01, patience=5)
+PAPER = Method("network", "distance", learning_rate=0.008, patience=10, min_delta=1e-3)
+BASELINE = Method("network", "chamfer", learning_rate=0.003, patience=100, min_delta=1e-4)
+LINEAR = {"model": "linear", "learning_rate": 0.03, "patience": 10, "min_delta": 1e-3}
+METHODS = {
+    "paper": PAPER,
+    "nsfp-baseline": BASELINE,
+    "nsfp-kdtree": replace(BASELINE, loss="kdtree"),
+    "fnsf-linear": replace(PAPER, **LINEAR),
+    "nsfp-linear": replace(BASELINE, **LINEAR),
+    "nsfp-kdtree-linear": replace(BASELINE, **LINEAR, loss="kdtree"),
+}
+
+
+def method(name: str, sampled: bool) -> Method:
+    """The method, with FNSF's published settings for sampled clouds where it has some."""
+    if name == "paper" and sampled:
+        return replace(PAPER, learning_rate=0.01, patience=5)
+    return METHODS[name]
 
 
 @dataclass(frozen=True)
@@ -61,23 +74,23 @@ def load_pair(path: Path) -> dict[str, Tensor]:
         return {name: torch.from_numpy(pair[name]) for name in PAIR_ARRAYS}
 
 
-def within_range(points: Tensor, range_m: float | None) -> Tensor:
-    """The points with |x|, |y| <= `range_m`; all of them without a range."""
-    if range_m is None:
+def within_crop(points: Tensor, crop_m: float | None) -> Tensor:
+    """The points with |x|, |y| <= `crop_m`; all of them without a crop."""
+    if crop_m is None:
         return torch.ones(len(points), dtype=torch.bool)
-    return (points[:, :2].abs() <= range_m).all(dim=1)
+    return (points[:, :2].abs() <= crop_m).all(dim=1)
 
 
 def select_points(
     pair: dict[str, Tensor],
-    range_m: float | None,
+    crop_m: float | None,
     mask_ground: bool,
     max_points: int | None,
     generator: torch.Generator,
 ) -> Problem:
     """Crops, takes the ground out, and samples both clouds with one and the same permutation."""
-    keep_source = within_range(pair["pc1"], range_m)
-    keep_target = within_range(pair["pc2"], range_m)
+    keep_source = within_crop(pair["pc1"], crop_m)
+    keep_target = within_crop(pair["pc2"], crop_m)
     if mask_ground:
         keep_source &= ~pair["ground1"]
         keep_target &= ~pair["ground2"]
@@ -95,92 +108,12 @@ def select_points(
     )
 
 
-def load_transform(name: str, threads: int) -> Transform:
-    """Imports the package behind a transform now, so that no import falls into the timing."""
-    return {"edt": load_edt, "fastgeodis": load_fastgeodis}[name](threads)
-
-
-def load_edt(threads: int) -> Transform:
-    """The exact Euclidean distance transform, which the paper describes; always on the CPU."""
-    import edt
-
-    def transform(occupied: Tensor) -> Tensor:
-        empty = (~occupied).cpu().numpy()
-        distances = edt.edt(empty, anisotropy=(CELL_M,) * 3, parallel=threads)
-        return torch.from_numpy(distances).to(occupied.device)
-
-    return transform
-
-
-def load_fastgeodis(_threads: int) -> Transform:
-    """The raster-scan transform that the published code calls: a chamfer metric, at most 13 % long.
-
-    It runs on the occupied vertices' device, with torch's threads.
-    """
-    import FastGeodis
-
-    def transform(occupied: Tensor) -> Tensor:
-        empty = (~occupied).float()[None, None]
-        image = torch.zeros_like(empty)
-        return FastGeodis.generalised_geodesic3d(image, empty, [CELL_M] * 3, 1e10, 0.0, 1)[0, 0]
-
-    return transform
-
-
-class DistanceMap:
-    """Distance to the rasterised target, on a dense grid that covers both clouds."""
-
-    def __init__(self, source: Tensor, target: Tensor, transform: Transform) -> None:
-        lowest = torch.minimum(source.amin(dim=0), target.amin(dim=0))
-        highest = torch.maximum(source.amax(dim=0), target.amax(dim=0))
-        self.origin = torch.floor(lowest * CELLS_PER_METRE - 1) / CELLS_PER_METRE
-        end = torch.ceil(highest * CELLS_PER_METRE + 1) / CELLS_PER_METRE
-        shape = torch.ceil((end - self.origin) * CELLS_PER_METRE).long() + 2
-        self.first = torch.zeros_like(self.origin)
-        self.last = (shape - 1).to(self.origin.dtype)
-
-        vertices = torch.round((target - self.origin) * CELLS_PER_METRE).long()
-        occupied = torch.zeros(shape.tolist(), dtype=torch.bool, device=target.device)
-        occupied[vertices.unbind(dim=1)] = True
-        self.distances = transform(occupied)[None, None]
-
-    def at(self, points: Tensor) -> Tensor:
-        """Trilinear distance at every point; an axis on which a point lies outside pulls nothing.
-
-        The clamp, not the sampler's border mode, is what zeroes that axis of the gradient.
-        """
-        cells = (points - self.origin) * CELLS_PER_METRE
-        inside = torch.clamp(cells, self.first, self.last)
-        zyx = (2 * inside / self.last - 1).flip(dims=(1,))
-        sampled = nn.functional.grid_sample(
-            self.distances,
-            zyx[None, :, None, None, :],
-            mode="bilinear",
-            padding_mode="border",
-            align_corners=True,
-        )
-        return sampled.flatten()
-
-
-def build_network() -> nn.Sequential:
-    """The coordinate network, point to flow, with Xavier-uniform weights and zero biases."""
-    widths = [3] + [HIDDEN_WIDTH] * HIDDEN_LAYERS
-    layers: list[nn.Module] = []
-    for inputs, outputs in pairwise(widths):
-        layers += [nn.Linear(inputs, outputs), nn.ReLU()]
-    network = nn.Sequential(*layers, nn.Linear(HIDDEN_WIDTH, 3))
-    for layer in network:
-        if isinstance(layer, nn.Linear):
-            nn.init.xavier_uniform_(layer.weight)
-            nn.init.zeros_(layer.bias)
-    return network
-
-
 class EarlyStopping:
     """Stops when the loss has not fallen by an absolute amount for `patience` calls, or is NaN."""
 
-    def __init__(self, patience: int) -> None:
+    def __init__(self, patience: int, min_delta: float) -> None:
         self.patience = patience
+        self.min_delta = min_delta
         self.best = math.inf
         self.stale = 0
 
@@ -188,7 +121,7 @@ class EarlyStopping:
         """Takes the next loss in."""
         if math.isnan(loss):
             return True
-        if loss < self.best - MIN_DELTA_M:
+        if loss < self.best - self.min_delta:
             self.best = loss
             self.stale = 0
         else:
@@ -196,25 +129,28 @@ class EarlyStopping:
         return self.stale >= self.patience
 
 
-def fit_flow(source: Tensor, target_map: DistanceMap, settings: Settings) -> tuple[Tensor, int]:
-    """Fits the network; returns the flow of the lowest loss and the number of Adam steps taken."""
-    network = build_network().to(source.device)
-    optimizer = torch.optim.Adam(network.parameters(), lr=settings.learning_rate)
-    stopping = EarlyStopping(settings.patience)
+def fit_flow(
+    source: Tensor, model: nn.Module, distance: Loss, settings: Method
+) -> tuple[Tensor, int]:
+    """Fits the model; returns the flow of the lowest loss and the number of Adam steps taken."""
+    optimizer = torch.optim.Adam(model.parameters(), lr=settings.learning_rate)
+    stopping = EarlyStopping(settings.patience, settings.min_delta)
     best_loss, best_flow = math.inf, torch.zeros_like(source)
     steps = 0
     while steps < MAX_ITERATIONS:
         optimizer.zero_grad()
-        flow = network(source)
-        loss = target_map.at(source + flow).mean()
+        flow = model(source)
+        loss = distance(source + flow)
+        if isinstance(model, LinearModel):
+            loss = loss + model.regularization()
         loss.backward()
         optimizer.step()
         steps += 1
-        loss_m = loss.item()
-        if stopping.should_stop(loss_m):
+        value = loss.item()
+        if stopping.should_stop(value):
             break
-        if loss_m <= best_loss:
-            best_loss, best_flow = loss_m, flow.detach()
+        if value <= best_loss:
+            best_loss, best_flow = value, flow.detach()
     return best_flow, steps
 
 
@@ -258,7 +194,7 @@ def run(args: argparse.Namespace) -> dict[str, object]:
     """Estimates the flow of one pair and scores it; only the estimate is timed."""
     torch.set_num_threads(args.threads)
     device = torch.device(args.device)
-    settings = FULL_CLOUD if args.max_points is None else SAMPLED_CLOUD
+    settings = method(args.method, args.max_points is not None)
     transform = load_transform(args.transform, args.threads)
     pair = load_pair(args.pair)
     warm_up(device)
@@ -266,12 +202,19 @@ def run(args: argparse.Namespace) -> dict[str, object]:
 
     start = now(device)
     mask_ground = args.ground == "mask"
-    problem = select_points(pair, args.range_m, mask_ground, args.max_points, generator)
+    problem = select_points(pair, args.crop_m, mask_ground, args.max_points, generator)
     source, target = problem.source.to(device), problem.target.to(device)
     selected = now(device)
-    target_map = DistanceMap(source, target, transform)
+    if settings.loss == "distance":
+        distance: Loss = DistanceMap(source, target, transform)
+    else:
+        distance = Chamfer(target, trees=settings.loss == "kdtree", threads=args.threads)
+    if settings.model == "network":
+        model: nn.Module = build_network().to(device)
+    else:
+        model = LinearModel(source).to(device)
     prepared = now(device)
-    flow, steps = fit_flow(source, target_map, settings)
+    flow, steps = fit_flow(source, model, distance, settings)
     fitted = now(device)
     flow = flow.cpu()
     end = now(device)
@@ -293,11 +236,12 @@ def parse_args() -> argparse.Namespace:
     """The command line; names and meanings follow `fnsf flow`."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("pair", type=Path, metavar="PAIR.npz")
-    parser.add_argument("--range-m", type=float, help="crop to |x|, |y| <= R (default: off)")
+    parser.add_argument("--crop-m", type=float, help="crop to |x|, |y| <= R (default: off)")
     parser.add_argument("--ground", choices=("keep", "mask"), default="mask")
     parser.add_argument("--max-points", type=int, help="sample both clouds (default: off)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=os.cpu_count())
+    parser.add_argument("--method", choices=tuple(METHODS), default="paper")
     parser.add_argument("--transform", choices=("edt", "fastgeodis"), default="edt")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--json", action="store_true", help="print one JSON object")

@@ -201,8 +201,8 @@ impl Lane {
     ///
     /// After an error the lane takes the next pair, unless [`Device::health`] or
     /// [`Lane::has_ended`] shows otherwise.
-    pub async fn solve(&self, work: Work) -> Result<Estimate, EngineError> {
-        self.run(move |backend, liveness| Ok(slot::solve(backend, work, liveness)?))
+    pub async fn estimate(&self, work: Work) -> Result<Estimate, EngineError> {
+        self.run(move |backend, liveness| Ok(slot::estimate(backend, work, liveness)?))
             .await
     }
 

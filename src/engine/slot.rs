@@ -158,7 +158,7 @@ fn classified<T>(
 }
 
 /// Estimates the flow of one pair, resuming from its snapshot if that is usable.
-pub(super) fn solve(
+pub(super) fn estimate(
     backend: &dyn Backend,
     work: Work,
     liveness: &Liveness,

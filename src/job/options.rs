@@ -375,6 +375,26 @@ mod tests {
     }
 
     #[test]
+    fn every_preset_has_its_name_and_goes_to_a_device_that_computes_it() {
+        for preset in Preset::ALL {
+            let asked = |device: &str| {
+                let (name, device) = (preset.name(), format!(r#""device":"{device}""#));
+                JobOptions::from_json(format!(r#"{{"preset":"{name}",{device}}}"#).as_bytes())
+            };
+            let options = asked("auto").expect("good options");
+            assert_eq!(options.preset.preset(), preset);
+            assert_eq!(
+                asked("cpu").map(|options| options.device),
+                Ok(DeviceChoice::Cpu)
+            );
+            let needs_cpu = preset.fits_field() && !preset.runs_on_gpu();
+            assert_eq!(options.device_kind(), needs_cpu.then_some(DeviceKind::Cpu));
+            let refused = needs_cpu.then_some(InvalidOptions::NoGpuKernels(preset.name()));
+            assert_eq!(asked("gpu").err(), refused);
+        }
+    }
+
+    #[test]
     fn half_precision_asks_for_a_gpu() {
         let options = |text: &str| JobOptions::from_json(text.as_bytes());
         let half = options(r#"{"preset":"neural","precision":"f16"}"#).expect("good options");

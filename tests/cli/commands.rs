@@ -339,6 +339,31 @@ fn objects_are_found_by_the_host_whatever_the_device_and_the_report_says_so() {
 }
 
 #[test]
+fn every_method_of_the_paper_gives_a_flow_and_refuses_a_gpu_that_it_has_no_kernels_for() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder);
+    let usual = ["flow", "street/pair_0000.npz", "--max-points", "300"];
+    for (preset, unit) in [
+        ("nsfp-baseline", "m²"),
+        ("nsfp-kdtree", "m²"),
+        ("fnsf-linear", "m"),
+        ("nsfp-linear", "m²"),
+        ("nsfp-kdtree-linear", "m²"),
+    ] {
+        let asked = ["--preset", preset, "--json"];
+        let report = json(folder, &[&usual[..], &asked].concat());
+        assert_eq!(report["stop_reason"], "converged", "{report}");
+        assert_eq!(report["field"]["loss_unit"], unit, "{report}");
+        let asked = ["--preset", preset, "--device", "gpu"];
+        let refused = fnsf(folder, &[&usual[..], &asked].concat());
+        assert_eq!((refused.code, refused.stdout.as_str()), (2, ""));
+        let said = &refused.stderr;
+        assert!(said.contains("is computed on the CPU alone"), "{said}");
+    }
+}
+
+#[test]
 fn half_precision_of_what_fits_no_field_is_refused_before_any_work() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();

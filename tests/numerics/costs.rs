@@ -10,7 +10,7 @@ use fnsf::flow::{
 };
 use fnsf::flow::{FlowError, Uncontrolled};
 
-use super::scenes::{real_pair, solve, street};
+use super::scenes::{estimated, real_pair, street};
 
 /// Bound on the memory beside the distance transform: sites, points and the network's working sets.
 const BESIDE_BYTES: usize = 48 << 20;
@@ -41,7 +41,7 @@ fn bytes_and_bricks_are_never_below_the_truth_and_not_far_above() {
                 distance_loss(&mut options).transform.sites = sites;
                 options.field_mut().expect("a field").max_iterations = 0;
                 let cost = predict_cost(&problem, &options).expect("it is taken");
-                let estimate = solve(&pair, &options);
+                let estimate = estimated(&pair, &options);
                 assert_eq!(cost.source_points, estimate.points);
                 assert_eq!(
                     cost.transform_bytes,

@@ -5,7 +5,7 @@ use fnsf::flow::cpu::{CpuBackend, Isa};
 use fnsf::flow::gpu::{Gpu, GpuOptions, adapters};
 
 use super::gpu_rule;
-use super::scenes::{real_pair, scored, solve_on};
+use super::scenes::{estimated_on, real_pair, scored};
 
 #[test]
 fn a_card_gives_the_cpus_flow_on_argoverse_2_bit_by_bit() {
@@ -19,12 +19,12 @@ fn a_card_gives_the_cpus_flow_on_argoverse_2_bit_by_bit() {
     let gpu = Gpu::open(&cards[0], &GpuOptions::default()).expect("the card opens");
     let mut options = Preset::Neural.options(Some(8192));
     options.crop_m = Some(51.2);
-    let card = solve_on(&gpu, &pair, &options);
+    let card = estimated_on(&gpu, &pair, &options);
     // Some GPUs round a product before the addition, as the portable kernels do. Others use fused
     // multiply-add, as the other kernels do.
     let cpus = Isa::available().into_iter().map(|isa| {
         let cpu = CpuBackend::with_isa(isa, Some(2)).expect("threads");
-        solve_on(&cpu, &pair, &options)
+        estimated_on(&cpu, &pair, &options)
     });
     let cpus: Vec<_> = cpus.collect();
     let errors: Vec<_> = cpus.iter().map(|cpu| scored(&pair, cpu).epe).collect();
@@ -33,6 +33,6 @@ fn a_card_gives_the_cpus_flow_on_argoverse_2_bit_by_bit() {
     // Twice the same bits, on fewer points because a software GPU is slow.
     let mut fewer = Preset::Neural.options(Some(1024));
     fewer.field_mut().expect("a field").max_iterations = 40;
-    let [first, second] = [(), ()].map(|()| solve_on(&gpu, &pair, &fewer).flow);
+    let [first, second] = [(), ()].map(|()| estimated_on(&gpu, &pair, &fewer).flow);
     assert!(first == second);
 }

@@ -6,7 +6,7 @@ use fnsf::flow::{
     Estimate, Ground, ObjectSolution, Preset, Problem, Solution, StopReason, Uncontrolled, estimate,
 };
 
-use super::scenes::{real_pair, score, solve, street};
+use super::scenes::{estimated, real_pair, score, street};
 
 #[test]
 fn movers_are_found_and_the_static_world_stands_still_on_real_pairs() {
@@ -55,7 +55,7 @@ fn what_is_dynamic_is_what_an_object_moves() {
         azimuth_steps: 800,
         ..StreetOptions::default()
     });
-    let estimate = solve(&pair, &Preset::Default.options(None));
+    let estimate = estimated(&pair, &Preset::Default.options(None));
     assert_eq!(estimate.stop_reason, StopReason::Completed);
     let search = search(&estimate);
     assert_eq!(search.searched, search.candidates);
@@ -90,12 +90,12 @@ fn points_that_are_drawn_have_the_flow_that_they_have_among_all_and_the_others_n
         ..StreetOptions::default()
     });
     for preset in [Preset::Default, Preset::Label] {
-        let all = solve(&pair, &preset.options(None));
+        let all = estimated(&pair, &preset.options(None));
         let mut chosen = Vec::new();
         for seed in [0, 1] {
             let mut options = preset.options(Some(DRAWN));
             options.seed = seed;
-            let drawn = solve(&pair, &options);
+            let drawn = estimated(&pair, &options);
             assert_eq!((drawn.points, drawn.ego), (DRAWN, all.ego));
             let [drawn_search, all_search] = [&drawn, &all].map(search);
             assert_eq!(drawn_search.searched, all_search.searched);

@@ -157,22 +157,18 @@ fn torn_and_altered_snapshots_are_refused() {
     let pair = small_street();
     let options = Preset::Neural.options(None);
     let bytes = put_down(&pair, &options, None, 1).to_bytes();
-    for length in 0..bytes.len() {
-        assert!(
-            Snapshot::from_bytes(&bytes[..length]).is_err(),
-            "cut at {length}"
-        );
-    }
-    let longer = [bytes.as_slice(), &[0]].concat();
-    assert!(matches!(
-        Snapshot::from_bytes(&longer),
-        Err(SnapshotError::Sealed(EnvelopeError::Length { .. }))
-    ));
     let indices = (0..EDGE)
         .chain((EDGE..bytes.len()).step_by(STRIDE))
         .chain(bytes.len() - EDGE..bytes.len());
+    let longer = [bytes.as_slice(), &[0]].concat();
+    assert!(matches!(
+        Snapshot::from_bytes(&longer),
+        Err(SnapshotError::Sealed(EnvelopeError::Damaged))
+    ));
     let mut altered = bytes.clone();
     for index in indices {
+        let torn = Snapshot::from_bytes(&bytes[..index]);
+        assert!(torn.is_err(), "cut at {index}");
         for flip in [1, 0x80, 0xFF] {
             altered[index] ^= flip;
             assert!(Snapshot::from_bytes(&altered).is_err(), "byte {index}");

@@ -40,13 +40,13 @@ pub(crate) fn street(options: &StreetOptions) -> Pair {
 }
 
 /// Estimates the pair without its ground points, on two CPU threads.
-pub(crate) fn solve(pair: &Pair, options: &Options) -> Estimate {
+pub(crate) fn estimated(pair: &Pair, options: &Options) -> Estimate {
     let backend = CpuBackend::new(Some(2)).expect("threads");
-    solve_on(&backend, pair, options)
+    estimated_on(&backend, pair, options)
 }
 
 /// Estimates the pair without its ground points, on the given backend.
-pub(crate) fn solve_on(backend: &dyn Backend, pair: &Pair, options: &Options) -> Estimate {
+pub(crate) fn estimated_on(backend: &dyn Backend, pair: &Pair, options: &Options) -> Estimate {
     let ground = pair.ground.as_ref().expect("the pair has ground masks");
     let problem = Problem {
         source: &pair.source,
@@ -64,7 +64,7 @@ pub(crate) fn solve_on(backend: &dyn Backend, pair: &Pair, options: &Options) ->
 
 /// The error metrics of the pair's flow, estimated with `options`.
 pub(crate) fn score(pair: &Pair, options: &Options) -> Metrics {
-    scored(pair, &solve(pair, options))
+    scored(pair, &estimated(pair, options))
 }
 
 /// The error metrics of an estimate of the pair.

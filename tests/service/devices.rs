@@ -94,7 +94,12 @@ async fn a_server_on_a_card_gives_it_the_jobs_that_ask_for_one() {
     assert!(server.metric("fnsf_device_lanes{device=\"gpu0\"}") >= 2.0);
     assert!((server.metric("fnsf_device_fallback")).abs() < 0.5);
     let mut devices = Vec::new();
-    for (preset, device) in [("neural", "gpu"), ("neural", "cpu"), ("default", "gpu")] {
+    for (preset, device) in [
+        ("neural", "gpu"),
+        ("neural", "cpu"),
+        ("default", "gpu"),
+        ("fnsf-linear", "auto"),
+    ] {
         let options =
             format!(r#"{{"preset": "{preset}", "device": "{device}", "max_points": 2048}}"#);
         let sent = reqwest::Client::new()
@@ -108,6 +113,7 @@ async fn a_server_on_a_card_gives_it_the_jobs_that_ask_for_one() {
         devices.push(job["report"]["device"].as_str().expect("a name").to_owned());
     }
     assert_ne!(devices[0], devices[1]);
+    assert_eq!(devices[1], devices[3]);
     // Objects are searched on the host, and the report names it.
     assert!(devices[2].starts_with("cpu ("), "{devices:?}");
 }

@@ -294,7 +294,7 @@ mod tests {
             change(&mut message);
             options(Some(message)).expect_err("a refusal").to_string()
         };
-        assert!(refused(|o| o.preset = 9).contains("preset has no value 9"));
+        assert!(refused(|o| o.preset = 99).contains("preset has no value 99"));
         assert!(refused(|o| o.priority = -1).contains("priority has no value -1"));
         assert!(refused(|o| o.device = "tpu".to_owned()).contains("device is"));
         assert!(refused(|o| o.precision = "f8".to_owned()).contains("precision is"));
@@ -313,6 +313,20 @@ mod tests {
             Ok(JobOptions::default())
         );
         assert_eq!(options(None), Ok(JobOptions::default()));
+    }
+
+    #[test]
+    fn every_preset_has_a_value_with_its_name() {
+        for preset in crate::flow::Preset::ALL {
+            let name = preset.name().replace('-', "_").to_uppercase();
+            let value = proto::Preset::from_str_name(&format!("PRESET_{name}"));
+            let message = proto::Options {
+                preset: value.expect("the protocol has the preset").into(),
+                ..proto::Options::default()
+            };
+            let read = options(Some(message)).expect("good options");
+            assert_eq!(read.preset.preset(), preset);
+        }
     }
 
     #[test]

@@ -165,11 +165,12 @@ impl Linear {
             let values = &self.values[number * plane..];
             let mut sum = 0.0;
             for across in 0..y - 1 {
-                for at in across * row..across * row + x - 1 {
-                    let differences = self.differences(values, at);
+                let inverse = &mut inverse[across * row..][..x - 1];
+                for (along, inverse) in inverse.iter_mut().enumerate() {
+                    let differences = self.differences(values, across * row + along);
                     let square: f32 = differences.iter().map(|d| d * d).sum();
                     let length = (SMOOTHING + square).sqrt();
-                    inverse[at] = 1.0 / length;
+                    *inverse = 1.0 / length;
                     sum += f64::from(length);
                 }
             }

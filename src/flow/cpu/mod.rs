@@ -1,7 +1,6 @@
 //! The CPU backend: vectorized network kernels on all cores. Independent of the GPU backend.
 
 mod backend;
-mod inference;
 mod isa;
 mod kernels;
 mod linear;

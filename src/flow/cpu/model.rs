@@ -4,9 +4,8 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use super::inference::forward;
 use super::kernels::Kernels;
-use super::tile::{Tile, WorkingSets};
+use super::tile::{TILE, Tile, WorkingSets};
 use crate::flow::data::Point;
 use crate::flow::field::{
     Conditioning, FittedField, Network, Parameters, mlp, transpose_middle_layers,
@@ -15,7 +14,7 @@ use crate::flow::field::{
 /// Parameters that one thread sums at a time.
 const SLICE: usize = 4096;
 
-/// A model that a field can be fitted with. It computes tiles of up to [`TILE`](super::tile::TILE)
+/// A model that a field can be fitted with. It computes tiles of up to [`TILE`]
 /// points, each in the working set of one thread. Tiles add up to chunks.
 pub(super) trait Model: Send + Sync {
     /// The working set of one thread.
@@ -86,6 +85,29 @@ pub(super) trait Model: Send + Sync {
         points: &[Point],
         working_sets: &WorkingSets<Self::WorkingSet>,
     ) -> Vec<Point>;
+}
+
+/// The flow at each of the N `points`, N x 3 displacements in metres. They are the points of the
+/// model's last [`Model::place`], and `parameters` those of its last [`Model::update`].
+pub(super) fn forward<M: Model>(
+    model: &M,
+    parameters: &Parameters,
+    threads: &rayon::ThreadPool,
+    working_sets: &WorkingSets<M::WorkingSet>,
+    points: &[Point],
+) -> Vec<Point> {
+    let mut flow = vec![[0.0; 3]; points.len()];
+    threads.install(|| {
+        flow.par_chunks_mut(TILE)
+            .zip(points.par_chunks(TILE))
+            .enumerate()
+            .for_each(|(tile, (flow, points))| {
+                let mut working_set = working_sets.own();
+                let index = tile * TILE;
+                flow.copy_from_slice(model.forward(parameters, points, index, &mut working_set));
+            });
+    });
+    flow
 }
 
 /// The coordinate network of FNSF, Section 3.

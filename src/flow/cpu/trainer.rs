@@ -9,8 +9,7 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use super::inference::forward;
-use super::model::Model;
+use super::model::{Model, forward};
 use super::tile::{TILE, WorkingSets};
 use crate::flow::data::{Control, Interrupt, Point, Progress};
 use crate::flow::field::{

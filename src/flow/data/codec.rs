@@ -14,8 +14,6 @@ const HEADER: usize = 8 + 4;
 pub(crate) struct Envelope {
     pub(crate) magic: [u8; 8],
     pub(crate) version: u32,
-    /// Length of the body in bytes, for formats of fixed length.
-    pub(crate) body: Option<usize>,
 }
 
 /// The reason why the bytes of a snapshot or of a motion field were rejected.
@@ -34,14 +32,6 @@ pub enum EnvelopeError {
         version: u32,
         /// The version that this program reads.
         expected: u32,
-    },
-    /// The length is not the fixed length of the format. Only snapshots have a fixed length.
-    #[error("{bytes} bytes, {expected} are expected")]
-    Length {
-        /// Actual number of bytes.
-        bytes: usize,
-        /// Expected number of bytes.
-        expected: usize,
     },
     /// The checksum does not match, bytes are missing or left over, or a value is invalid.
     #[error("the bytes are damaged")]
@@ -78,15 +68,6 @@ impl Envelope {
             return Err(EnvelopeError::Version {
                 version,
                 expected: self.version,
-            });
-        }
-        let whole = |body: usize| HEADER + body + size_of::<u64>();
-        if let Some(expected) = self.body.map(whole)
-            && bytes.len() != expected
-        {
-            return Err(EnvelopeError::Length {
-                bytes: bytes.len(),
-                expected,
             });
         }
         let (sound, checksum) = bytes.split_last_chunk().ok_or(EnvelopeError::Damaged)?;

@@ -9,7 +9,7 @@ use super::loss::length;
 use super::snapshot::{Snapshot, TrainerState};
 use super::warm_start::{Prior, warm_start};
 use crate::flow::data::{Control, Interrupt, Point, RigidTransform, StopReason};
-use crate::flow::options::FieldOptions;
+use crate::flow::options::{DeadlineLimits, FieldOptions};
 
 /// Most iterations of one call to a backend.
 const STEPS_AT_ONCE: usize = 64;
@@ -84,6 +84,9 @@ impl Fit<'_> {
         };
         let precomputed_at = self.control.seconds();
         let stop_reason = self.iterate(&mut started)?;
+        if stop_reason == StopReason::Deadline && self.is_worse_than_none(&started) {
+            return Ok(Fitted::nothing(self.aligned.len(), self.control));
+        }
         let Started {
             mut trainer,
             options,
@@ -99,6 +102,14 @@ impl Fit<'_> {
             stop_reason,
             precomputed_at,
         })
+    }
+
+    /// Whether a deadline ended the fit of a linear model after so few iterations that no flow is
+    /// better. That of a network is not started in this case.
+    fn is_worse_than_none(&self, started: &Started<'_>) -> bool {
+        let limits = DeadlineLimits::new(self.ego.is_some());
+        let least = limits.least_iterations.min(self.options.max_iterations);
+        self.options.network().is_none() && started.trainer.report().iterations < least
     }
 
     /// The trainer before its first iteration; none if the time left allows no useful fit.

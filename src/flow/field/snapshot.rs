@@ -17,7 +17,6 @@ use crate::flow::data::{Envelope, EnvelopeError};
 const ENVELOPE: Envelope = Envelope {
     magic: *b"FNSFSNAP",
     version: 4,
-    body: None,
 };
 
 /// The state of a fit between two iterations.

@@ -6,7 +6,7 @@ use super::adapter::Adapter;
 use super::device::Device;
 use super::distance::GpuTransform;
 use super::memory::GpuOptions;
-use super::trainer::GpuTrainer;
+use super::trainer::{GpuTrainer, NO_CHAMFER};
 use super::{distance, inference};
 use crate::flow::data::{Control, Point};
 use crate::flow::field::{Backend, BackendError, Network, PreparedTarget, Trainer};
@@ -74,14 +74,6 @@ impl Gpu {
         &self.0
     }
 }
-
-/// The error of a fit to a Chamfer distance.
-pub(super) const NO_CHAMFER: BackendError =
-    BackendError::Unsupported("the Chamfer distance is computed on the CPU alone");
-
-/// The error of a fit of the linear model.
-pub(super) const NO_LINEAR_MODEL: BackendError =
-    BackendError::Unsupported("the linear model is computed on the CPU alone");
 
 impl Backend for Gpu {
     fn name(&self) -> String {

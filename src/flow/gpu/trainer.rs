@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 
-use super::backend::{NO_CHAMFER, NO_LINEAR_MODEL};
 use super::batcher::Done;
 use super::device::Device;
 use super::distance::GpuTransform;
@@ -20,6 +19,14 @@ use crate::flow::field::{
     Parameters, Schedule, Trainer, TrainerState, check_state, mlp, transpose_middle_layers,
 };
 use crate::flow::options::{DistanceLossOptions, FieldOptions, Precision};
+
+/// The error of a fit to a Chamfer distance.
+pub(super) const NO_CHAMFER: BackendError =
+    BackendError::Unsupported("the Chamfer distance is computed on the CPU alone");
+
+/// The error of a fit of the linear model.
+const NO_LINEAR_MODEL: BackendError =
+    BackendError::Unsupported("the linear model is computed on the CPU alone");
 
 /// Target duration of a submission, seconds. The control and the GPU's health are checked once per
 /// submission.

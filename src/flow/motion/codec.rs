@@ -23,7 +23,6 @@ use crate::flow::objects::ObjectMotions;
 const ENVELOPE: Envelope = Envelope {
     magic: *b"FNSFFILD",
     version: 1,
-    body: None,
 };
 const STILL: u8 = 0;
 const NETWORK: u8 = 1;

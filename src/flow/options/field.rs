@@ -84,7 +84,6 @@ impl FieldOptions {
                 max_iterations: 75,
                 learning_rate: 0.004,
             }),
-            ..Self::published(false)
         }
     }
 
@@ -137,13 +136,15 @@ impl FieldOptions {
 
     /// Expected number of iterations of a fit without a deadline, for the prediction of its cost.
     ///
-    /// It is `max_iterations` without early stopping, otherwise the smaller of `max_iterations` and
-    /// 60, or 350 for a Chamfer distance. The published stopping rule of FNSF ended the measured fits
-    /// after 36 to 115 iterations. Those of its baseline took 347 and 349 (FNSF Section 4).
+    /// It is `max_iterations` without early stopping. Otherwise it is at most 60 for a network and a
+    /// distance transform, 1,500 for a network and a Chamfer distance, and 80 for the linear model.
+    /// The published stopping rules ended the measured fits after 36 to 115, 1,000 to 2,700, and 70
+    /// to 95 iterations.
     pub fn expected_iterations(&self) -> usize {
-        let stopped = match self.loss {
-            LossOptions::Distance(_) => 60,
-            LossOptions::Chamfer(_) => 350,
+        let stopped = match (&self.model, &self.loss) {
+            (ModelOptions::Linear(_), _) => 80,
+            (ModelOptions::Network(_), LossOptions::Distance(_)) => 60,
+            (ModelOptions::Network(_), LossOptions::Chamfer(_)) => 1500,
         };
         match self.early_stop {
             None => self.max_iterations,
