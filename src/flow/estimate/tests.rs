@@ -117,7 +117,10 @@ fn a_deadline_gives_the_best_flow_so_far_and_a_cancellation_gives_none() {
         let deadline = After(3, Interrupt::Deadline, AtomicUsize::new(0));
         let estimate = estimated(&pair, &options, &deadline).expect("a flow");
         assert_eq!(estimate.stop_reason, StopReason::Deadline);
-        assert_eq!(estimate.fit().expect("a fit").iterations, 3);
+        // A search of correspondences asks more often than once in an iteration.
+        let iterations = estimate.fit().expect("a fit").iterations;
+        let field = options.field().expect("a field");
+        assert!(iterations == 3 || field.loss.distance().is_none() && iterations < 3);
         assert!(estimate.flow.iter().flatten().all(|f| f.is_finite()));
         let cancel = After(3, Interrupt::Cancelled, AtomicUsize::new(0));
         let error = estimated(&pair, &options, &cancel).expect_err("cancelled");

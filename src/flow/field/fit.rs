@@ -104,9 +104,12 @@ impl Fit<'_> {
         })
     }
 
-    /// Whether a deadline ended the fit of a linear model after so few iterations that no flow is
-    /// better. That of a network is not started in this case.
+    /// Whether a deadline that was known before ended the fit of a linear model after so few
+    /// iterations that no flow is better. That of a network is not started in this case.
     fn is_worse_than_none(&self, started: &Started<'_>) -> bool {
+        if started.throughput.is_none() {
+            return false;
+        }
         let limits = DeadlineLimits::new(self.ego.is_some());
         let least = limits.least_iterations.min(self.options.max_iterations);
         self.options.network().is_none() && started.trainer.report().iterations < least

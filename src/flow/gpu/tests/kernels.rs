@@ -152,9 +152,10 @@ fn every_gradient_is_the_references_at_awkward_row_counts() {
     for preset in Preset::with_gpu_kernels() {
         let mut options = FieldOptions {
             loss: preset.field().loss,
-            model: preset.field().model,
             ..plain()
         };
+        let inputs = preset.field().network().expect("a network").inputs;
+        options.network_mut().expect("a network").inputs = inputs;
         options.result = ResultChoice::Best;
         for rows in [3, 63, 64, 65, 600] {
             let source = &cloud[..rows];
