@@ -355,7 +355,7 @@ fn every_method_of_the_paper_gives_a_flow_and_refuses_a_gpu_that_it_has_no_kerne
         let report = json(folder, &[&usual[..], &asked].concat());
         assert_eq!(report["stop_reason"], "converged", "{report}");
         assert_eq!(report["field"]["loss_unit"], unit, "{report}");
-        let asked = ["--preset", preset, "--device", "gpu"];
+        let asked = ["--preset", preset, "--device", "gpu", "--json"];
         let refused = fnsf(folder, &[&usual[..], &asked].concat());
         assert_eq!((refused.code, refused.stdout.as_str()), (2, ""));
         let said = &refused.stderr;
