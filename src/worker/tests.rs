@@ -19,7 +19,7 @@ use crate::queue::{Outcome, PairOf, Queue, QueueOptions, SqliteQueue, Submission
 use crate::storage::{Blob, Blobs, Fsync};
 
 /// Timeout, long enough for a loaded machine. Only a failing test waits this long.
-const PATIENCE: Duration = Duration::from_secs(30);
+const PATIENCE: Duration = Duration::from_secs(120);
 
 /// Points of the tests' pairs; differs from the pair of the self-test.
 const POINTS: usize = 900;
