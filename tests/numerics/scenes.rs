@@ -96,7 +96,7 @@ pub(crate) fn median_and_worst(pair: &Pair, options: &Options, seeds: u64) -> [f
     [errors[errors.len() / 2], errors[errors.len() - 1]]
 }
 
-/// Limits the fit to a Chamfer distance to 30 iterations, each of which takes long.
+/// Allows 30 iterations if the loss is a Chamfer distance. They are slow.
 pub(crate) fn shorten_chamfer(options: &mut Options) {
     if let Some(field) = options.field_mut()
         && field.loss.distance().is_none()

@@ -11,7 +11,7 @@ use super::model::Model;
 use super::product_kernels::{Factors, ProductKernel};
 use super::tile::{TILE, WorkingSets};
 use crate::flow::data::Point;
-use crate::flow::field::{FittedField, LinearField, LinearGrid, Parameters, Placed};
+use crate::flow::field::{FittedField, LinearField, LinearGrid, Parameters, Placed, grouped};
 
 /// Smoothing constant of the total variation, square metres, as in the published code.
 const SMOOTHING: f32 = 1e-5;
@@ -265,20 +265,8 @@ impl Model for Linear {
         let grid = &self.encoder.grid;
         let placed = || points.par_iter().map(|&point| grid.place(point)).collect();
         let placed: Vec<Placed> = self.encoder.threads.install(placed);
-        let mut first = vec![0u32; grid.vertices[2]];
-        for point in &placed {
-            first[point.cell[2] as usize + 1] += 1;
-        }
-        for level in 1..first.len() {
-            first[level] += first[level - 1];
-        }
-        let mut next = first.clone();
-        let mut order = vec![0; placed.len()];
-        for (position, point) in placed.iter().enumerate() {
-            let at = &mut next[point.cell[2] as usize];
-            order[*at as usize] = position as u32;
-            *at += 1;
-        }
+        let levels: Vec<u32> = placed.iter().map(|point| point.cell[2]).collect();
+        let (first, order) = grouped(&levels, grid.vertices[2] - 1);
         self.points = PlacedPoints {
             placed,
             order,

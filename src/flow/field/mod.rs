@@ -30,7 +30,7 @@ pub use network::Network;
 pub use snapshot::{Snapshot, SnapshotError, TrainerState};
 
 pub(crate) use budget::prepare_target;
-pub(crate) use chamfer::{ChamferLoss, NearestSearcher, chamfer_work, check_chamfer};
+pub(crate) use chamfer::{ChamferLoss, NearestSearcher, chamfer_work, check_chamfer, grouped};
 pub(crate) use codec::{put_parameters, take_parameters};
 pub(crate) use early_stopping::EarlyStop;
 #[cfg(feature = "gpu")]
