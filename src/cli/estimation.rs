@@ -24,8 +24,9 @@ pub(super) struct Estimation {
     /// from up to five sweeps, its own two among them. neural: ego motion, then a short fit of a
     /// neural field to the remaining motion. paper: FNSF (ICCV 2023) with its published settings.
     /// nsfp-baseline: the baseline of that paper, a network fitted to the truncated Chamfer distance
-    /// on the CPU, minutes for full clouds. nsfp-kdtree: the same with k-d trees. fnsf-linear,
-    /// nsfp-linear, nsfp-kdtree-linear: that paper's linear model with these losses
+    /// on the CPU, minutes for full clouds. nsfp: the same with NSFP's second network, which leads the
+    /// points back. nsfp-kdtree: the baseline with k-d trees. fnsf-linear, nsfp-linear,
+    /// nsfp-kdtree-linear: that paper's linear model with the three losses
     #[arg(long, value_enum, default_value_t)]
     preset: PresetChoice,
     /// Device for neural and paper: auto (a GPU, else the CPU), cpu, gpu, or gpu:CARD, where CARD

@@ -162,11 +162,49 @@ fn object_cost(points: usize) -> MethodCost {
 
 /// The preparation of the target, and the fit of a field.
 fn field_cost(clouds: [&[Point]; 2], options: &FieldOptions) -> Result<MethodCost, FlowError> {
-    let [source, target] = clouds;
+    let [source, _] = clouds;
     let batch = options.batch.unwrap_or(source.len()).min(source.len());
     let iterations = options.expected_iterations() as f64;
-    let mut passes = iterations * PASSES * (batch as f64 + STEP_POINTS) + source.len() as f64;
-    let mut cost = match &options.loss {
+    let mut cost = target_cost(clouds, batch, options)?;
+    let mut networks = 1;
+    if options.has_cycle() {
+        let back = target_cost([source, source], batch, options)?;
+        cost.bytes += back.bytes;
+        cost.multiply_adds += back.multiply_adds;
+        networks = 2;
+    }
+    match &options.model {
+        ModelOptions::Network(_) => {
+            // For the correspondences the flow is computed once more.
+            let again = if options.loss.distance().is_some() {
+                0.0
+            } else {
+                batch as f64
+            };
+            let passes = PASSES * (batch as f64 + STEP_POINTS) + again;
+            let passes = iterations * networks as f64 * passes + source.len() as f64;
+            cost.bytes += networks * PARAMETER_SETS * LAID_OUT * size_of::<f32>();
+            cost.multiply_adds += passes * PARAMETERS as f64;
+        }
+        ModelOptions::Linear(linear) => {
+            let grid = LinearGrid::plan(source, linear);
+            let grid = grid.map_err(|error| FlowError::Backend(error.into()))?;
+            cost.bytes += grid.bytes() + source.len() * PLACED_BYTES;
+            let products = 2.0 * grid.product_work();
+            cost.multiply_adds += iterations * (products + batch as f64 * BLENDED);
+        }
+    }
+    Ok(cost)
+}
+
+/// The preparation of a target, and the queries of its distances in all iterations.
+fn target_cost(
+    [source, target]: [&[Point]; 2],
+    batch: usize,
+    options: &FieldOptions,
+) -> Result<MethodCost, FlowError> {
+    let iterations = options.expected_iterations() as f64;
+    Ok(match &options.loss {
         LossOptions::Distance(loss) => {
             let transform = DistanceTransform::predict_cost(source, target, &loss.transform);
             let transform = transform.map_err(|error| FlowError::Backend(error.into()))?;
@@ -179,8 +217,6 @@ fn field_cost(clouds: [&[Point]; 2], options: &FieldOptions) -> Result<MethodCos
         }
         LossOptions::Chamfer(loss) => {
             check_chamfer(loss, target).map_err(FlowError::Backend)?;
-            // The flow is computed once more, for the correspondences.
-            passes += iterations * batch as f64;
             MethodCost {
                 bricks: 0,
                 transform_bytes: size_of_val(target),
@@ -188,19 +224,5 @@ fn field_cost(clouds: [&[Point]; 2], options: &FieldOptions) -> Result<MethodCos
                 multiply_adds: iterations * chamfer_work(loss.search, batch, target.len()),
             }
         }
-    };
-    match &options.model {
-        ModelOptions::Network(_) => {
-            cost.bytes += PARAMETER_SETS * LAID_OUT * size_of::<f32>();
-            cost.multiply_adds += passes * PARAMETERS as f64;
-        }
-        ModelOptions::Linear(linear) => {
-            let grid = LinearGrid::plan(source, linear);
-            let grid = grid.map_err(|error| FlowError::Backend(error.into()))?;
-            cost.bytes += grid.bytes() + source.len() * PLACED_BYTES;
-            let products = 2.0 * grid.product_work();
-            cost.multiply_adds += iterations * (products + batch as f64 * BLENDED);
-        }
-    }
-    Ok(cost)
+    })
 }

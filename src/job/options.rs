@@ -23,8 +23,9 @@ pub struct JobOptions {
     /// points move with the ego motion. `label`: as `default`, and a pair of a sequence uses up to
     /// five sweeps. `neural`: a short, robust fit of a neural field. `paper`: FNSF as published.
     /// `nsfp-baseline`: the baseline that FNSF is compared with, a network fitted to the truncated
-    /// Chamfer distance. `nsfp-kdtree`: the same with k-d trees. `fnsf-linear`, `nsfp-linear`,
-    /// `nsfp-kdtree-linear`: FNSF's linear model with these three losses.
+    /// Chamfer distance. `nsfp`: the same with NSFP's second network, which leads the points back.
+    /// `nsfp-kdtree`: the baseline with k-d trees. `fnsf-linear`, `nsfp-linear`,
+    /// `nsfp-kdtree-linear`: FNSF's linear model with the three losses.
     pub preset: PresetChoice,
     /// Seed of the random numbers. On the same device, the same input, options and seed give a
     /// bit-identical result, unless a deadline ends the estimate.
@@ -93,6 +94,8 @@ pub enum PresetChoice {
     Paper,
     /// The baseline of FNSF's comparison: a network fitted to the truncated Chamfer distance.
     NsfpBaseline,
+    /// NSFP: as nsfp-baseline, with a second network that leads the points back.
+    Nsfp,
     /// As nsfp-baseline, with k-d trees for the nearest neighbors.
     NsfpKdtree,
     /// The linear model of FNSF's comparison, fitted to the distance transform.
@@ -112,6 +115,7 @@ impl PresetChoice {
             Self::Neural => Preset::Neural,
             Self::Paper => Preset::Paper,
             Self::NsfpBaseline => Preset::NsfpBaseline,
+            Self::Nsfp => Preset::Nsfp,
             Self::NsfpKdtree => Preset::NsfpKdtree,
             Self::FnsfLinear => Preset::FnsfLinear,
             Self::NsfpLinear => Preset::NsfpLinear,

@@ -346,6 +346,7 @@ fn every_method_of_the_paper_gives_a_flow_and_refuses_a_gpu_that_it_has_no_kerne
     let usual = ["flow", "street/pair_0000.npz", "--max-points", "300"];
     for (preset, unit) in [
         ("nsfp-baseline", "m²"),
+        ("nsfp", "m²"),
         ("nsfp-kdtree", "m²"),
         ("fnsf-linear", "m"),
         ("nsfp-linear", "m²"),

@@ -33,6 +33,7 @@ pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, Api
         Ok(proto::Preset::Neural) => PresetChoice::Neural,
         Ok(proto::Preset::Paper) => PresetChoice::Paper,
         Ok(proto::Preset::NsfpBaseline) => PresetChoice::NsfpBaseline,
+        Ok(proto::Preset::Nsfp) => PresetChoice::Nsfp,
         Ok(proto::Preset::NsfpKdtree) => PresetChoice::NsfpKdtree,
         Ok(proto::Preset::FnsfLinear) => PresetChoice::FnsfLinear,
         Ok(proto::Preset::NsfpLinear) => PresetChoice::NsfpLinear,

@@ -7,14 +7,16 @@ use rayon::prelude::*;
 use super::isa::Isa;
 use super::kernels::Kernels;
 use super::linear::{Encoder, Linear};
-use super::model::{Mlp, Model};
+use super::mlp::Mlp;
+use super::mlp_cycle::MlpCycle;
+use super::model::Model;
 use super::nearest::{BruteForce, KdTrees};
 use super::tile::WorkingSets;
 use super::trainer::CpuTrainer;
 use crate::flow::data::{Control, Point, Random, Uncontrolled};
 use crate::flow::distance::DistanceTransform;
 use crate::flow::field::{
-    Backend, BackendError, ChamferLoss, Conditioning, DistanceLoss, LinearGrid, Loss,
+    Backend, BackendError, ChamferLoss, Conditioning, CycleLoss, DistanceLoss, LinearGrid, Loss,
     NearestSearcher, Network, Parameters, PreparedTarget, Schedule, Trainer, check_chamfer, length,
     mlp,
 };
@@ -82,21 +84,22 @@ impl Backend for CpuBackend {
             LossOptions::Distance(DistanceLossOptions { transform, .. }) => {
                 let distance = threads
                     .install(|| DistanceTransform::build(source, target, transform, control))?;
-                Ok(Box::new(TransformTarget { fits, distance }))
+                Ok(Box::new(TransformTarget {
+                    fits,
+                    distance: Arc::new(distance),
+                }))
             }
             LossOptions::Chamfer(options) => {
                 check_chamfer(options, target)?;
-                let (threads, target) = (Arc::clone(threads), target.to_vec());
+                let threads = Arc::clone(threads);
                 Ok(match options.search {
                     NearestSearch::BruteForce => Box::new(CloudTarget {
-                        search: BruteForce::new(self.isa, threads, &target),
+                        search: Arc::new(BruteForce::new(self.isa, threads, target)),
                         fits,
-                        target,
                     }),
                     NearestSearch::KdTree => Box::new(CloudTarget {
-                        search: KdTrees::new(threads, &target),
+                        search: Arc::new(KdTrees::new(threads, target)),
                         fits,
-                        target,
                     }),
                 })
             }
@@ -118,16 +121,17 @@ struct Fits {
 }
 
 impl Fits {
-    /// Starts a fit of the model of `options` to `loss`.
-    fn start<'a>(
+    /// Starts a fit of the model of `options` to `loss`. `to_source` makes the loss to the source,
+    /// which a cycle needs.
+    fn start<'a, L: Loss + 'a>(
         &self,
-        loss: impl Loss + 'a,
+        loss: L,
+        to_source: impl FnOnce() -> Result<L, BackendError>,
         source: &[Point],
         options: &FieldOptions,
         seed: u64,
     ) -> Result<Box<dyn Trainer + 'a>, BackendError> {
         let mut random = Random::stream(seed, 0);
-        let threads = Arc::clone(&self.threads);
         match &options.model {
             ModelOptions::Network(network) => {
                 if network.precision == Precision::F16 {
@@ -137,21 +141,42 @@ impl Fits {
                 let parameters = mlp::initial(network.start, &mut random);
                 let schedule = Schedule::new(source, options, &mut random);
                 let conditioning = Conditioning::new(source, network.inputs);
-                let model = Mlp::new(Kernels::new(self.isa), Arc::clone(&threads), conditioning);
-                let trainer = CpuTrainer::new(threads, model, loss, schedule, parameters);
-                Ok(Box::new(trainer))
+                let (kernels, threads) = (Kernels::new(self.isa), Arc::clone(&self.threads));
+                if network.cycle {
+                    let loss = CycleLoss {
+                        forward: loss,
+                        backward: to_source()?,
+                    };
+                    let model = MlpCycle::new(kernels, threads, conditioning);
+                    let parameters = MlpCycle::twice(&parameters);
+                    Ok(self.trainer(model, loss, schedule, parameters))
+                } else {
+                    let model = Mlp::new(kernels, threads, conditioning);
+                    Ok(self.trainer(model, loss, schedule, parameters))
+                }
             }
             ModelOptions::Linear(linear) => {
                 let grid = LinearGrid::plan(source, linear)?;
                 let mut parameters = Parameters::zeros(3 * grid.channel());
                 grid.initial(&mut random, parameters.as_mut_slice());
                 let schedule = Schedule::new(source, options, &mut random);
-                let encoder = Encoder::new(self.isa, Arc::clone(&threads), grid);
+                let encoder = Encoder::new(self.isa, Arc::clone(&self.threads), grid);
                 let model = Linear::new(encoder, linear.variation_weight);
-                let trainer = CpuTrainer::new(threads, model, loss, schedule, parameters);
-                Ok(Box::new(trainer))
+                Ok(self.trainer(model, loss, schedule, parameters))
             }
         }
+    }
+
+    /// The fit of `model` to `loss` from `parameters`.
+    fn trainer<'a, M: Model + 'a>(
+        &self,
+        model: M,
+        loss: impl Loss<M::Output> + 'a,
+        schedule: Schedule,
+        parameters: Parameters,
+    ) -> Box<dyn Trainer + 'a> {
+        let threads = Arc::clone(&self.threads);
+        Box::new(CpuTrainer::new(threads, model, loss, schedule, parameters))
     }
 }
 
@@ -162,7 +187,7 @@ const OTHER_LOSS: BackendError =
 /// A target's distance transform.
 struct TransformTarget {
     fits: Fits,
-    distance: DistanceTransform,
+    distance: Arc<DistanceTransform>,
 }
 
 impl PreparedTarget for TransformTarget {
@@ -182,31 +207,38 @@ impl PreparedTarget for TransformTarget {
         options: &FieldOptions,
         seed: u64,
     ) -> Result<Box<dyn Trainer + '_>, BackendError> {
-        let loss = DistanceLoss {
-            options: options.loss.distance().ok_or(OTHER_LOSS)?.clone(),
-            distance: &self.distance,
+        let loss_options = options.loss.distance().ok_or(OTHER_LOSS)?;
+        let loss = |distance: Arc<DistanceTransform>| DistanceLoss {
+            options: loss_options.clone(),
+            distance,
         };
-        self.fits.start(loss, source, options, seed)
+        let to_source = || {
+            let transform = &loss_options.transform;
+            let build = || DistanceTransform::build(source, source, transform, &Uncontrolled);
+            Ok(loss(Arc::new(self.fits.threads.install(build)?)))
+        };
+        let to_target = loss(Arc::clone(&self.distance));
+        self.fits.start(to_target, to_source, source, options, seed)
     }
 }
 
 /// A target cloud with a search of nearest neighbors.
 struct CloudTarget<S: NearestSearcher> {
     fits: Fits,
-    target: Vec<Point>,
-    search: S,
+    search: Arc<S>,
 }
 
 impl<S: NearestSearcher> PreparedTarget for CloudTarget<S> {
     fn bytes(&self) -> usize {
-        size_of_val(self.target.as_slice())
+        size_of_val(self.search.target())
     }
 
     fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError> {
         let nearest = self.search.in_target(points, &Uncontrolled);
         let nearest = nearest.map_err(BackendError::Interrupted)?;
+        let target = self.search.target();
         let off = |(&[x, y, z], index): (&Point, u32)| {
-            let [to_x, to_y, to_z] = self.target[index as usize];
+            let [to_x, to_y, to_z] = target[index as usize];
             length([to_x - x, to_y - y, to_z - z])
         };
         Ok(points.iter().zip(nearest).map(off).collect())
@@ -218,11 +250,17 @@ impl<S: NearestSearcher> PreparedTarget for CloudTarget<S> {
         options: &FieldOptions,
         seed: u64,
     ) -> Result<Box<dyn Trainer + '_>, BackendError> {
-        let LossOptions::Chamfer(options_of_loss) = &options.loss else {
+        let LossOptions::Chamfer(loss_options) = options.loss else {
             return Err(OTHER_LOSS);
         };
-        check_chamfer(options_of_loss, &self.target)?;
-        let loss = ChamferLoss::new(*options_of_loss, &self.target, &self.search);
-        self.fits.start(loss, source, options, seed)
+        check_chamfer(&loss_options, self.search.target())?;
+        let to_source = || {
+            Ok(ChamferLoss::new(
+                loss_options,
+                Arc::new(self.search.over(source)),
+            ))
+        };
+        let to_target = ChamferLoss::new(loss_options, Arc::clone(&self.search));
+        self.fits.start(to_target, to_source, source, options, seed)
     }
 }

@@ -16,10 +16,10 @@ use super::simd::F32x4;
 #[cfg(target_arch = "x86_64")]
 use super::simd::{F32x8, F32x16};
 use super::tile::Tile;
-use crate::flow::field::Parameters;
+use crate::flow::field::LAID_OUT;
 
-type Forward = unsafe fn(&Parameters, &mut Tile);
-type Backward = unsafe fn(&Parameters, &Parameters, &mut Tile, &mut Parameters);
+type Forward = unsafe fn(&[f32], &mut Tile);
+type Backward = unsafe fn(&[f32], &[f32], &mut Tile, &mut [f32]);
 
 /// The kernels of one instruction set.
 #[derive(Clone, Copy)]
@@ -54,8 +54,12 @@ impl Kernels {
     }
 
     /// `outputs = g(inputs)` for the tile's rows. Keeps the activations for [`Self::backward`].
-    pub(crate) fn forward(&self, parameters: &Parameters, tile: &mut Tile) {
-        // SAFETY: `new` checked the instruction set.
+    ///
+    /// # Panics
+    /// If `parameters` are not those of one network, [`LAID_OUT`] floats.
+    pub(crate) fn forward(&self, parameters: &[f32], tile: &mut Tile) {
+        assert_eq!(parameters.len(), LAID_OUT, "one network");
+        // SAFETY: `new` checked the instruction set, and the length is that of the layout.
         unsafe { (self.forward)(parameters, tile) }
     }
 
@@ -63,47 +67,53 @@ impl Kernels {
     /// `output_gradients` and the activations of the last [`Self::forward`]. `transposed` holds the
     /// transposed weights of the middle layers, see
     /// [`crate::flow::field::mlp::transpose_middle_layers`].
+    ///
+    /// # Panics
+    /// If an array is not that of one network, [`LAID_OUT`] floats.
     pub(crate) fn backward(
         &self,
-        parameters: &Parameters,
-        transposed: &Parameters,
+        parameters: &[f32],
+        transposed: &[f32],
         tile: &mut Tile,
-        gradients: &mut Parameters,
+        gradients: &mut [f32],
     ) {
-        // SAFETY: `new` checked the instruction set.
+        for array in [parameters, transposed, gradients] {
+            assert_eq!(array.len(), LAID_OUT, "one network");
+        }
+        // SAFETY: `new` checked the instruction set, and the lengths are those of the layout.
         unsafe { (self.backward)(parameters, transposed, tile, gradients) }
     }
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f")]
-unsafe fn forward_avx512(parameters: &Parameters, tile: &mut Tile) {
+unsafe fn forward_avx512(parameters: &[f32], tile: &mut Tile) {
     // SAFETY: avx512f is enabled.
     unsafe { forward::<F32x16, 12, 2>(parameters, tile) }
 }
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f")]
-unsafe fn backward_avx512(p: &Parameters, t: &Parameters, tile: &mut Tile, g: &mut Parameters) {
+unsafe fn backward_avx512(p: &[f32], t: &[f32], tile: &mut Tile, g: &mut [f32]) {
     // SAFETY: avx512f is enabled.
     unsafe { backward::<F32x16, 12, 8, 2>(p, t, tile, g) }
 }
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
-unsafe fn forward_avx2(parameters: &Parameters, tile: &mut Tile) {
+unsafe fn forward_avx2(parameters: &[f32], tile: &mut Tile) {
     // SAFETY: avx2 and fma are enabled.
     unsafe { forward::<F32x8, 6, 2>(parameters, tile) }
 }
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
-unsafe fn backward_avx2(p: &Parameters, t: &Parameters, tile: &mut Tile, g: &mut Parameters) {
+unsafe fn backward_avx2(p: &[f32], t: &[f32], tile: &mut Tile, g: &mut [f32]) {
     // SAFETY: avx2 and fma are enabled.
     unsafe { backward::<F32x8, 6, 2, 2>(p, t, tile, g) }
 }
-unsafe fn forward_portable(parameters: &Parameters, tile: &mut Tile) {
+unsafe fn forward_portable(parameters: &[f32], tile: &mut Tile) {
     // SAFETY: plain Rust needs no CPU feature.
     unsafe { forward::<F32x4, 6, 2>(parameters, tile) }
 }
-unsafe fn backward_portable(p: &Parameters, t: &Parameters, tile: &mut Tile, g: &mut Parameters) {
+unsafe fn backward_portable(p: &[f32], t: &[f32], tile: &mut Tile, g: &mut [f32]) {
     // SAFETY: plain Rust needs no CPU feature.
     unsafe { backward::<F32x4, 6, 2, 2>(p, t, tile, g) }
 }
@@ -112,8 +122,10 @@ unsafe fn backward_portable(p: &Parameters, t: &Parameters, tile: &mut Tile, g: 
 mod tests {
     use super::*;
     use crate::flow::data::Random;
-    use crate::flow::field::ReferenceNetwork;
-    use crate::flow::field::{MIDDLE_LAYERS, WIDTH, middle_layer, mlp, transpose_middle_layers};
+    use crate::flow::field::{
+        MIDDLE_LAYERS, Parameters, ReferenceNetwork, WIDTH, middle_layer, mlp,
+        transpose_middle_layers,
+    };
 
     /// Rounding error of single-precision sums of 128 and of 96 terms, through eight layers.
     const TOLERANCE: f64 = 2e-5;
@@ -153,13 +165,13 @@ mod tests {
     #[test]
     fn every_instruction_set_computes_the_network_at_awkward_row_counts() {
         let parameters = network();
-        let reference = ReferenceNetwork::read(&parameters);
+        let reference = ReferenceNetwork::read(parameters.as_slice());
         for isa in Isa::available() {
             let mut tile = Tile::new();
             for rows in ROWS {
                 let inputs = points(rows, 11);
                 tile.load(inputs.iter().copied());
-                Kernels::new(isa).forward(&parameters, &mut tile);
+                Kernels::new(isa).forward(parameters.as_slice(), &mut tile);
                 let values: Vec<f64> = tile.outputs[..rows]
                     .iter()
                     .flatten()
@@ -178,25 +190,33 @@ mod tests {
     #[test]
     fn every_instruction_set_computes_every_gradient_at_awkward_row_counts() {
         let parameters = network();
-        let reference = ReferenceNetwork::read(&parameters);
+        let reference = ReferenceNetwork::read(parameters.as_slice());
         let mut transposed = mlp::zeros();
-        transpose_middle_layers(&parameters, &mut transposed);
+        transpose_middle_layers(parameters.as_slice(), transposed.as_mut_slice());
         for isa in Isa::available() {
             let kernels = Kernels::new(isa);
             let mut tile = Tile::new();
             for rows in ROWS {
                 let (inputs, pulls) = (points(rows, 12), points(rows, 13));
                 let mut gradients = mlp::zeros();
-                let mut expected = ReferenceNetwork::read(&gradients);
+                let mut expected = ReferenceNetwork::read(gradients.as_slice());
                 tile.load(inputs.iter().copied());
-                kernels.forward(&parameters, &mut tile);
+                kernels.forward(parameters.as_slice(), &mut tile);
                 tile.output_gradients[..rows].copy_from_slice(&pulls);
-                kernels.backward(&parameters, &transposed, &mut tile, &mut gradients);
+                kernels.backward(
+                    parameters.as_slice(),
+                    transposed.as_slice(),
+                    &mut tile,
+                    gradients.as_mut_slice(),
+                );
                 for (input, pull) in inputs.iter().zip(&pulls) {
                     let (input, pull) = (input.map(f64::from), pull.map(f64::from));
                     reference.backward(input, pull, &mut expected);
                 }
-                let error = worst(&ReferenceNetwork::read(&gradients).flat(), &expected.flat());
+                let error = worst(
+                    &ReferenceNetwork::read(gradients.as_slice()).flat(),
+                    &expected.flat(),
+                );
                 assert!(error < TOLERANCE, "{isa:?}, {rows} rows: {error}");
             }
         }
@@ -207,9 +227,9 @@ mod tests {
         // Central differences in double precision. A step of 1e-6 crosses no ReLU kink for this
         // input.
         const STEP: f64 = 1e-6;
-        let mut reference = ReferenceNetwork::read(&network());
+        let mut reference = ReferenceNetwork::read(network().as_slice());
         let (input, pull) = ([0.4, -1.3, 0.8], [0.7, -0.2, 0.5]);
-        let mut gradients = ReferenceNetwork::read(&mlp::zeros());
+        let mut gradients = ReferenceNetwork::read(mlp::zeros().as_slice());
         reference.backward(input, pull, &mut gradients);
         let value = |network: &ReferenceNetwork| -> f64 {
             network

@@ -243,6 +243,7 @@ impl Linear {
 }
 
 impl Model for Linear {
+    type Output = Point;
     type WorkingSet = [Point; TILE];
     /// Derivatives with respect to the flows of the chunk's points.
     type ChunkGradients = Vec<Point>;
@@ -303,11 +304,11 @@ impl Model for Linear {
     fn backward(
         &self,
         _: &Parameters,
-        flow_gradients: &[Point],
+        output_gradients: &[Point],
         _: &mut Self::WorkingSet,
         chunk: &mut Self::ChunkGradients,
     ) {
-        chunk.extend_from_slice(flow_gradients);
+        chunk.extend_from_slice(output_gradients);
     }
 
     fn add_to_the_first(&self, _: &mut [Self::ChunkGradients]) {

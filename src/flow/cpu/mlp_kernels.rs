@@ -13,13 +13,10 @@
 
 use super::multiply::{Strided, multiply};
 use super::simd::Lanes;
-use super::tile::{ROW_STEP, STRIDE, TILE, Tile};
+use super::tile::{ROW_STEP, SIDE_BY_SIDE, STRIDE, TILE, Tile};
 use crate::flow::field::{
-    MIDDLE_LAYERS, PANEL, Parameters, WIDTH, first_layer, last_layer, middle_layer, tree_sum,
+    MIDDLE_LAYERS, PANEL, WIDTH, first_layer, last_layer, middle_layer, tree_sum,
 };
-
-/// Partial sums of the last layer per output, independent of the register width.
-const SIDE_BY_SIDE: usize = 16;
 
 /// Calls `body` with the first column of each register group of a 128-feature row, and the offset
 /// of that column's panel.
@@ -36,10 +33,11 @@ fn for_columns<L: Lanes, const VECTORS: usize>(mut body: impl FnMut(usize, usize
 /// `outputs = g(inputs)`, layer by layer.
 ///
 /// # Safety
-/// The caller has enabled the instruction set of `L`.
+/// The caller has enabled the instruction set of `L`, and every array of parameters has
+/// [`crate::flow::field::LAID_OUT`] floats.
 #[inline(always)]
 pub(super) unsafe fn forward<L: Lanes, const ROWS: usize, const VECTORS: usize>(
-    parameters: &Parameters,
+    parameters: &[f32],
     tile: &mut Tile,
 ) {
     const {
@@ -47,9 +45,9 @@ pub(super) unsafe fn forward<L: Lanes, const ROWS: usize, const VECTORS: usize>(
         assert!(SIDE_BY_SIDE.is_multiple_of(L::COUNT));
     }
     let rows = tile.padded_rows();
-    let weights = parameters.as_slice().as_ptr();
+    let weights = parameters.as_ptr();
     let activations = tile.activations.as_mut_slice().as_mut_ptr();
-    // SAFETY: every offset stays within the layouts that `Parameters` and `Tile` define.
+    // SAFETY: every offset stays within the layouts of a network and of `Tile`.
     unsafe {
         let at = first_layer();
         for column in (0..WIDTH).step_by(L::COUNT) {
@@ -118,7 +116,8 @@ pub(super) unsafe fn forward<L: Lanes, const ROWS: usize, const VECTORS: usize>(
 /// number.
 ///
 /// # Safety
-/// The caller has enabled the instruction set of `L`.
+/// The caller has enabled the instruction set of `L`, and every array of parameters has
+/// [`crate::flow::field::LAID_OUT`] floats.
 #[inline(always)]
 pub(super) unsafe fn backward<
     L: Lanes,
@@ -126,24 +125,24 @@ pub(super) unsafe fn backward<
     const TAIL: usize,
     const VECTORS: usize,
 >(
-    parameters: &Parameters,
-    transposed: &Parameters,
+    parameters: &[f32],
+    transposed: &[f32],
     tile: &mut Tile,
-    gradients: &mut Parameters,
+    gradients: &mut [f32],
 ) {
     const {
         assert!(ROW_STEP.is_multiple_of(ROWS) && PANEL.is_multiple_of(VECTORS * L::COUNT));
         assert!((WIDTH % ROWS).is_multiple_of(TAIL));
     }
     let rows = tile.padded_rows();
-    let weights = parameters.as_slice().as_ptr();
-    let transposes = transposed.as_slice().as_ptr();
-    let grads = gradients.as_mut_slice().as_mut_ptr();
+    let weights = parameters.as_ptr();
+    let transposes = transposed.as_ptr();
+    let grads = gradients.as_mut_ptr();
     let activations = tile.activations.as_slice().as_ptr();
     let [first, second] = &mut tile.deltas;
     let mut delta = first.as_mut_slice().as_mut_ptr();
     let mut next_delta = second.as_mut_slice().as_mut_ptr();
-    // SAFETY: every offset stays within the layouts that `Parameters` and `Tile` define.
+    // SAFETY: every offset stays within the layouts of a network and of `Tile`.
     unsafe {
         let at = last_layer();
         let h = activations.add(MIDDLE_LAYERS * TILE * STRIDE);

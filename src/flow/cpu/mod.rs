@@ -4,6 +4,8 @@ mod backend;
 mod isa;
 mod kernels;
 mod linear;
+mod mlp;
+mod mlp_cycle;
 mod mlp_kernels;
 mod model;
 mod multiply;

@@ -45,6 +45,19 @@ impl BruteForce {
 }
 
 impl NearestSearcher for BruteForce {
+    fn target(&self) -> &[Point] {
+        &self.target
+    }
+
+    fn over(&self, target: &[Point]) -> Self {
+        Self {
+            kernel: self.kernel,
+            threads: Arc::clone(&self.threads),
+            target: target.to_vec(),
+            sites: Sites::new(target),
+        }
+    }
+
     fn in_target(&self, points: &[Point], control: &dyn Control) -> Result<Vec<u32>, Interrupt> {
         self.search(points, &self.sites, control)
     }
@@ -86,6 +99,14 @@ impl KdTrees {
 }
 
 impl NearestSearcher for KdTrees {
+    fn target(&self) -> &[Point] {
+        &self.target
+    }
+
+    fn over(&self, target: &[Point]) -> Self {
+        Self::new(Arc::clone(&self.threads), target)
+    }
+
     fn in_target(&self, points: &[Point], control: &dyn Control) -> Result<Vec<u32>, Interrupt> {
         self.search(points, &self.tree, control)
     }

@@ -44,7 +44,7 @@ impl NetworkWorkload {
         let mut random = Random::new(1);
         let parameters = mlp::xavier(&mut random);
         let mut transposed = mlp::zeros();
-        transpose_middle_layers(&parameters, &mut transposed);
+        transpose_middle_layers(parameters.as_slice(), transposed.as_mut_slice());
         let mut point = || core::array::from_fn(|_| random.uniform(-1.0, 1.0) as f32);
         Self {
             kernels: Kernels::new(isa),
@@ -61,7 +61,8 @@ impl NetworkWorkload {
     pub fn forward(&mut self) -> f64 {
         for points in self.points.chunks(TILE) {
             self.tile.load(points.iter().copied());
-            self.kernels.forward(&self.parameters, &mut self.tile);
+            self.kernels
+                .forward(self.parameters.as_slice(), &mut self.tile);
         }
         (self.points.len() * FORWARD) as f64
     }
@@ -71,13 +72,14 @@ impl NetworkWorkload {
     pub fn forward_and_backward(&mut self) -> f64 {
         for points in self.points.chunks(TILE) {
             self.tile.load(points.iter().copied());
-            self.kernels.forward(&self.parameters, &mut self.tile);
+            self.kernels
+                .forward(self.parameters.as_slice(), &mut self.tile);
             self.tile.output_gradients[..points.len()].fill([0.1, -0.2, 0.3]);
             self.kernels.backward(
-                &self.parameters,
-                &self.transposed,
+                self.parameters.as_slice(),
+                self.transposed.as_slice(),
                 &mut self.tile,
-                &mut self.gradients,
+                self.gradients.as_mut_slice(),
             );
         }
         (self.points.len() * (FORWARD + BACKWARD)) as f64

@@ -2,7 +2,7 @@
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use crate::flow::field::{Aligned, HIDDEN_LAYERS, WIDTH};
+use crate::flow::field::{Aligned, HIDDEN_LAYERS, MIDDLE_LAYERS, WIDTH, first_layer, tree_sum};
 
 /// Points per tile. The activations of its eight hidden layers fill half of a 1 MiB cache.
 pub(crate) const TILE: usize = 96;
@@ -11,6 +11,8 @@ pub(super) const ROW_STEP: usize = 12;
 /// Floats from one point's features to the next point's. A stride of 128 would map the rows to few
 /// cache sets.
 pub(super) const STRIDE: usize = WIDTH + 16;
+/// Partial sums of a sum over the features, independent of the register width.
+pub(super) const SIDE_BY_SIDE: usize = 16;
 
 /// The working set of one thread: a tile's inputs, activations and deltas.
 pub(crate) struct Tile {
@@ -50,6 +52,30 @@ impl Tile {
         }
         self.inputs[self.rows..].fill([0.0; 3]);
         self.output_gradients[self.rows..].fill([0.0; 3]);
+    }
+
+    /// The derivative of `output_gradients . g(inputs)` with respect to each input, after a backward
+    /// pass of the network with `parameters`. Summed alike for all instruction sets.
+    pub(super) fn input_gradients(&self, parameters: &[f32]) -> impl Iterator<Item = [f32; 3]> {
+        // The backward pass leaves the derivatives of the first layer in the second array, because
+        // the number of middle layers is odd.
+        const { assert!(MIDDLE_LAYERS % 2 == 1) };
+        let deltas = self.deltas[1].as_slice().chunks_exact(STRIDE);
+        let weights = &parameters[first_layer().weights..][..3 * WIDTH];
+        deltas.take(self.rows).map(|delta| {
+            let mut gradient = [0.0; 3];
+            for (gradient, weights) in gradient.iter_mut().zip(weights.chunks_exact(WIDTH)) {
+                let mut sums = [0.0; SIDE_BY_SIDE];
+                let groups = delta[..WIDTH].chunks_exact(SIDE_BY_SIDE);
+                for (delta, weights) in groups.zip(weights.chunks_exact(SIDE_BY_SIDE)) {
+                    for (sum, (delta, weight)) in sums.iter_mut().zip(delta.iter().zip(weights)) {
+                        *sum += delta * weight;
+                    }
+                }
+                *gradient = tree_sum(sums);
+            }
+            gradient
+        })
     }
 
     /// Number of rows, padded to whole register tiles.

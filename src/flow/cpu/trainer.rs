@@ -13,8 +13,8 @@ use super::model::{Model, forward};
 use super::tile::{TILE, WorkingSets};
 use crate::flow::data::{Control, Interrupt, Point, Progress};
 use crate::flow::field::{
-    Advance, BackendError, Batch, Chunks, EarlyStop, FitReport, FittedField, Loss, Parameters,
-    Schedule, Trainer, TrainerState, check_state, reduction,
+    Advance, BackendError, Batch, Chunks, EarlyStop, FitReport, FittedField, Loss, Output,
+    Parameters, Schedule, Trainer, TrainerState, check_state, reduction,
 };
 
 /// Parameters that one thread updates at a time.
@@ -32,7 +32,7 @@ struct Due<'a, G> {
 }
 
 /// A model with its optimizer, the loss that it is fitted to, and the schedule of its iterations.
-pub(super) struct CpuTrainer<M: Model, L: Loss> {
+pub(super) struct CpuTrainer<M: Model, L: Loss<M::Output>> {
     threads: Arc<rayon::ThreadPool>,
     model: M,
     loss: L,
@@ -53,7 +53,7 @@ pub(super) struct CpuTrainer<M: Model, L: Loss> {
     query_seconds: f64,
 }
 
-impl<M: Model, L: Loss> CpuTrainer<M, L> {
+impl<M: Model, L: Loss<M::Output>> CpuTrainer<M, L> {
     /// A fit of `model` to `loss` that starts from `parameters`.
     pub(super) fn new(
         threads: Arc<rayon::ThreadPool>,
@@ -111,14 +111,14 @@ impl<M: Model, L: Loss> CpuTrainer<M, L> {
     fn prepare(&mut self, batch: &Range<usize>, control: &dyn Control) -> Result<(), Interrupt> {
         let began = control.seconds();
         let points = &self.schedule.points[batch.clone()];
-        let flow = || {
+        let outputs = || {
             let parameters = &self.state.parameters;
             let (model, sets) = (&self.model, &self.working_sets);
             forward(model, parameters, &self.threads, sets, points)
         };
         let batch = Batch {
             points,
-            flow: &flow,
+            outputs: &outputs,
         };
         self.loss.prepare(&batch, control)?;
         self.query_seconds += control.seconds() - began;
@@ -185,7 +185,7 @@ impl<M: Model, L: Loss> CpuTrainer<M, L> {
         let (model, loss, working_sets) = (&self.model, &self.loss, &self.working_sets);
         let run = |due: Due<'_, M::ChunkGradients>| {
             let mut working_set = working_sets.own();
-            let mut flow_gradients = [[0.0; 3]; TILE];
+            let mut output_gradients = [M::Output::default(); TILE];
             let Due {
                 gradients,
                 query_seconds,
@@ -195,17 +195,17 @@ impl<M: Model, L: Loss> CpuTrainer<M, L> {
             *query_seconds = 0.0;
             let mut index = due.first;
             for (points, losses) in due.points.chunks(TILE).zip(due.losses.chunks_mut(TILE)) {
-                let flow = model.forward(parameters, points, index, &mut working_set);
+                let outputs = model.forward(parameters, points, index, &mut working_set);
                 let began = control.seconds();
                 for (row, seen) in losses.iter_mut().enumerate() {
-                    let loss = loss.at(index, points[row], flow[row]);
+                    let loss = loss.at(index, points[row], outputs[row]);
                     *seen = loss.value;
-                    flow_gradients[row] = loss.gradient.map(|g| g * weight);
+                    output_gradients[row] = loss.gradient.scaled(weight);
                     index += 1;
                 }
                 *query_seconds += control.seconds() - began;
-                let flow_gradients = &flow_gradients[..points.len()];
-                model.backward(parameters, flow_gradients, &mut working_set, gradients);
+                let output_gradients = &output_gradients[..points.len()];
+                model.backward(parameters, output_gradients, &mut working_set, gradients);
             }
         };
         self.threads.install(|| due.into_par_iter().for_each(run));
@@ -267,7 +267,7 @@ impl<M: Model, L: Loss> CpuTrainer<M, L> {
     }
 }
 
-impl<M: Model, L: Loss> Trainer for CpuTrainer<M, L> {
+impl<M: Model, L: Loss<M::Output>> Trainer for CpuTrainer<M, L> {
     fn advance(&mut self, steps: usize, control: &dyn Control) -> Result<Advance, BackendError> {
         for step in 0..steps {
             if self.state.iterations >= self.schedule.options.max_iterations {

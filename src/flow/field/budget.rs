@@ -190,9 +190,10 @@ impl Throughput {
             return None;
         }
         let budget = (left - self.evaluation).max(0.0);
+        let networks = if options.has_cycle() { 2.0 } else { 1.0 };
         let iteration = |batch: usize| {
             let loss = loss_cost(&options.loss, batch, prepared.target_points);
-            self.point * (ITERATION * batch as f64 + loss)
+            networks * self.point * (ITERATION * batch as f64 + loss)
         };
         let asked = options.batch.unwrap_or(points).clamp(1, points.max(1));
         let needed = options.expected_iterations() as f64 * iteration(asked);

@@ -5,6 +5,8 @@
 //! truncation, it is `1/N sum_i [d(q_i) < r] d(q_i)^2 + 1/M sum_j [d(t_j) < r] d(t_j)^2`. The
 //! second sum is attributed to the source points that the target points are nearest to.
 
+use std::sync::Arc;
+
 use super::backend::BackendError;
 use super::loss::{Batch, Loss, PointLoss};
 use crate::flow::data::{Control, Interrupt, Point};
@@ -49,8 +51,16 @@ pub(crate) fn chamfer_work(search: NearestSearch, batch: usize, target: usize) -
     }
 }
 
-/// A search for nearest neighbors in a cloud that is given with each search.
+/// A search for nearest neighbors between a target and a cloud that is given with each search.
 pub(crate) trait NearestSearcher: Send + Sync {
+    /// The target cloud.
+    fn target(&self) -> &[Point];
+
+    /// A search of the same kind with another `target`, which has at least one point.
+    fn over(&self, target: &[Point]) -> Self
+    where
+        Self: Sized;
+
     /// The index of the nearest target point to each of `points`.
     ///
     /// # Errors
@@ -76,22 +86,20 @@ struct Correspondences {
 }
 
 /// The truncated Chamfer distance to a target cloud, square metres.
-pub(crate) struct ChamferLoss<'a, S: NearestSearcher> {
+pub(crate) struct ChamferLoss<S: NearestSearcher> {
     options: ChamferOptions,
-    target: &'a [Point],
-    search: &'a S,
+    search: Arc<S>,
     found: Correspondences,
     /// Points of the batch over points of the target: turns a mean over the batch into one over the
     /// target. Not a number if the fit has diverged.
     share: f32,
 }
 
-impl<'a, S: NearestSearcher> ChamferLoss<'a, S> {
-    /// The loss to `target`, in which `search` finds nearest neighbors.
-    pub(crate) fn new(options: ChamferOptions, target: &'a [Point], search: &'a S) -> Self {
+impl<S: NearestSearcher> ChamferLoss<S> {
+    /// The loss to the target of `search`.
+    pub(crate) fn new(options: ChamferOptions, search: Arc<S>) -> Self {
         Self {
             options,
-            target,
             search,
             found: Correspondences::default(),
             share: 0.0,
@@ -101,7 +109,7 @@ impl<'a, S: NearestSearcher> ChamferLoss<'a, S> {
     /// The squared distance and its derivative, both zero at and beyond the truncation.
     #[inline]
     fn squared(&self, deformed: Point, target: u32) -> PointLoss {
-        let target = self.target[target as usize];
+        let target = self.search.target()[target as usize];
         let off: Point = core::array::from_fn(|a| deformed[a] - target[a]);
         let value = off[0] * off[0] + off[1] * off[1] + off[2] * off[2];
         if value >= self.options.truncation_m * self.options.truncation_m {
@@ -117,9 +125,9 @@ impl<'a, S: NearestSearcher> ChamferLoss<'a, S> {
     }
 }
 
-impl<S: NearestSearcher> Loss for ChamferLoss<'_, S> {
+impl<S: NearestSearcher> Loss for ChamferLoss<S> {
     fn prepare(&mut self, batch: &Batch<'_>, control: &dyn Control) -> Result<(), Interrupt> {
-        let flow = (batch.flow)();
+        let flow = (batch.outputs)();
         let pairs = batch.points.iter().zip(&flow);
         let deformed: Vec<Point> = pairs
             .map(|(point, flow)| core::array::from_fn(|a| point[a] + flow[a]))
@@ -133,7 +141,7 @@ impl<S: NearestSearcher> Loss for ChamferLoss<'_, S> {
         let targets = self.search.in_target(&deformed, control)?;
         let nearest = self.search.of_target(&deformed, control)?;
         let (first, sources) = grouped(&nearest, deformed.len());
-        self.share = deformed.len() as f32 / self.target.len() as f32;
+        self.share = deformed.len() as f32 / self.search.target().len() as f32;
         self.found = Correspondences {
             targets,
             sources,
@@ -192,7 +200,7 @@ mod tests {
     use crate::flow::field::reference::chamfer_distance;
 
     /// A search in plain loops, in double precision.
-    struct Loops<'a>(&'a [Point]);
+    struct Loops(Vec<Point>);
 
     fn nearest(from: &[Point], to: &[Point]) -> Vec<u32> {
         let squared = |a: &Point, b: &Point| -> f64 {
@@ -210,13 +218,21 @@ mod tests {
             .collect()
     }
 
-    impl NearestSearcher for Loops<'_> {
+    impl NearestSearcher for Loops {
+        fn target(&self) -> &[Point] {
+            &self.0
+        }
+
+        fn over(&self, target: &[Point]) -> Self {
+            Self(target.to_vec())
+        }
+
         fn in_target(&self, points: &[Point], _: &dyn Control) -> Result<Vec<u32>, Interrupt> {
-            Ok(nearest(points, self.0))
+            Ok(nearest(points, &self.0))
         }
 
         fn of_target(&self, points: &[Point], _: &dyn Control) -> Result<Vec<u32>, Interrupt> {
-            Ok(nearest(self.0, points))
+            Ok(nearest(&self.0, points))
         }
     }
 
@@ -240,11 +256,11 @@ mod tests {
 
     /// The loss of each point and its derivative.
     fn losses(source: &[Point], target: &[Point], flow: &[Point]) -> Vec<PointLoss> {
-        let search = Loops(target);
-        let mut loss = ChamferLoss::new(OPTIONS, target, &search);
+        let search = Arc::new(Loops(target.to_vec()));
+        let mut loss = ChamferLoss::new(OPTIONS, search);
         let batch = Batch {
             points: source,
-            flow: &|| flow.to_vec(),
+            outputs: &|| flow.to_vec(),
         };
         loss.prepare(&batch, &Uncontrolled).expect("no interrupt");
         let rows = source.iter().zip(flow).enumerate();

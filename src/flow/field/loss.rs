@@ -4,7 +4,10 @@
 //! [`Loss`] is the interface to the fit. [`DistanceLoss`] is FNSF's, of one deformed point in the
 //! distance transform. Every backend implements its formulas:
 //! `clamp(D(p + f), margin, truncation) + penalty * |f|`. With the published settings it is just
-//! `D(p + f)`, FNSF eq. 6. The Chamfer distance is in `chamfer.rs`.
+//! `D(p + f)`, FNSF eq. 6. The Chamfer distance is in `chamfer.rs`, and the cycle of NSFP in
+//! `cycle.rs`.
+
+use std::sync::Arc;
 
 use crate::flow::data::{Control, Interrupt, Point};
 use crate::flow::distance::{DistanceTransform, Sample};
@@ -13,42 +16,65 @@ use crate::flow::options::DistanceLossOptions;
 /// Flows shorter than this are penalized quadratically, so that the derivative is continuous.
 const SMALL_FLOW_M: f32 = 1e-3;
 
-/// The loss of one point and its derivative with respect to the flow.
+/// What a model computes for a point: its flow, or its flow and the flow back from where it leads.
+/// The derivative of a loss with respect to it has the same type.
+pub(crate) trait Output: Copy + Default + Send + Sync {
+    /// All components times `factor`.
+    fn scaled(self, factor: f32) -> Self;
+}
+
+/// A flow, metres.
+impl Output for Point {
+    #[inline]
+    fn scaled(self, factor: f32) -> Self {
+        self.map(|component| component * factor)
+    }
+}
+
+/// A flow, and the flow back from the deformed point, metres.
+impl Output for [Point; 2] {
+    #[inline]
+    fn scaled(self, factor: f32) -> Self {
+        self.map(|flow| flow.scaled(factor))
+    }
+}
+
+/// The loss of one point and its derivative with respect to the output of the model.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct PointLoss {
+pub(crate) struct PointLoss<O = Point> {
     pub(crate) value: f32,
-    pub(crate) gradient: Point,
+    pub(crate) gradient: O,
 }
 
 /// The points of one iteration.
-pub(crate) struct Batch<'a> {
+pub(crate) struct Batch<'a, O = Point> {
     pub(crate) points: &'a [Point],
-    /// Computes the flow of each point, metres.
-    pub(crate) flow: &'a dyn Fn() -> Vec<Point>,
+    /// Computes the output of the model at each point.
+    pub(crate) outputs: &'a dyn Fn() -> Vec<O>,
 }
 
 /// A loss that a field can be fitted to. The fit minimizes the mean of [`Self::at`] over the points
-/// of each iteration.
-pub(crate) trait Loss: Send + Sync {
+/// of each iteration. `O` is the output of the models that it suits.
+pub(crate) trait Loss<O = Point>: Send + Sync {
     /// Prepares an iteration over `batch`. A loss that couples the points, such as the Chamfer
     /// distance, finds its correspondences here.
     ///
     /// # Errors
     /// The interrupt of `control`, which abandons the iteration.
-    fn prepare(&mut self, batch: &Batch<'_>, control: &dyn Control) -> Result<(), Interrupt>;
+    fn prepare(&mut self, batch: &Batch<'_, O>, control: &dyn Control) -> Result<(), Interrupt>;
 
-    /// The loss of `point` with `flow`. `index` is that of the point among those of the iteration.
-    fn at(&self, index: usize, point: Point, flow: Point) -> PointLoss;
+    /// The loss of `point` with `output`. `index` is that of the point among those of the iteration.
+    fn at(&self, index: usize, point: Point, output: O) -> PointLoss<O>;
 }
 
 /// The loss of FNSF, eq. 6, with a margin, a truncation and a penalty on the flow: each deformed
 /// point's distance to the target, metres, by the target's distance transform.
-pub(crate) struct DistanceLoss<'a> {
+pub(crate) struct DistanceLoss {
     pub(crate) options: DistanceLossOptions,
-    pub(crate) distance: &'a DistanceTransform,
+    pub(crate) distance: Arc<DistanceTransform>,
 }
 
-impl Loss for DistanceLoss<'_> {
+impl Loss for DistanceLoss {
     /// Nothing: the points are independent of each other.
     fn prepare(&mut self, _: &Batch<'_>, _: &dyn Control) -> Result<(), Interrupt> {
         Ok(())

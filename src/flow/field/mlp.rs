@@ -143,16 +143,13 @@ impl Conditioning {
     }
 }
 
-/// Writes the transposes of the middle layers, in the same panels, so that the backward kernels
-/// also read one stream.
-pub(crate) fn transpose_middle_layers(from: &Parameters, to: &mut Parameters) {
+/// Writes the transposes of the middle layers of one network, in the same panels, so that the
+/// backward kernels also read one stream.
+pub(crate) fn transpose_middle_layers(from: &[f32], to: &mut [f32]) {
     for layer in 0..MIDDLE_LAYERS {
         let at = middle_layer(layer);
         let weights = at.weights..at.bias;
-        transpose(
-            &from.as_slice()[weights.clone()],
-            &mut to.as_mut_slice()[weights],
-        );
+        transpose(&from[weights.clone()], &mut to[weights]);
     }
 }
 

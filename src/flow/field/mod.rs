@@ -5,6 +5,7 @@ mod backend;
 mod budget;
 mod chamfer;
 mod codec;
+mod cycle;
 mod early_stopping;
 mod error;
 mod fit;
@@ -32,13 +33,14 @@ pub use snapshot::{Snapshot, SnapshotError, TrainerState};
 pub(crate) use budget::prepare_target;
 pub(crate) use chamfer::{ChamferLoss, NearestSearcher, chamfer_work, check_chamfer, grouped};
 pub(crate) use codec::{put_parameters, take_parameters};
+pub(crate) use cycle::CycleLoss;
 pub(crate) use early_stopping::EarlyStop;
 #[cfg(feature = "gpu")]
 pub(crate) use early_stopping::EarlyStopState;
 pub(crate) use error::FitError;
 pub(crate) use fit::{Fit, Fitted};
 pub(crate) use linear::{LinearGrid, Placed, ROW};
-pub(crate) use loss::{Batch, DistanceLoss, Loss, length};
+pub(crate) use loss::{Batch, DistanceLoss, Loss, Output, length};
 pub(crate) use mlp::{
     Conditioning, LAID_OUT, PANEL, first_layer, last_layer, middle_layer, transpose_middle_layers,
 };
@@ -50,7 +52,8 @@ pub(crate) use reduction::STRETCH;
 pub(crate) use reduction::{Chunks, tree_sum};
 #[cfg(test)]
 pub(crate) use reference::{
-    ReferenceLoss, ReferenceNetwork, chamfer_distance, first_losses, mean_distance,
+    ReferenceLoss, ReferenceNetwork, chamfer_distance, cycle_loss, first_cycle_losses,
+    first_losses, mean_distance,
 };
 pub(crate) use schedule::Schedule;
 pub(crate) use warm_start::Prior;

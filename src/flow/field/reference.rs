@@ -6,11 +6,11 @@
 use super::mlp::{
     self, MIDDLE_LAYERS, PANEL, WIDTH, first_layer, last_layer, middle_layer, panel_index,
 };
-use super::parameters::Parameters;
 use crate::flow::data::{Point, Random};
 use crate::flow::distance::DistanceTransform;
 
 /// The network as dense matrices: `weights[layer][output][input]`, `biases[layer][output]`.
+#[derive(Clone)]
 pub(crate) struct ReferenceNetwork {
     pub(crate) weights: Vec<Vec<Vec<f64>>>,
     pub(crate) biases: Vec<Vec<f64>>,
@@ -18,9 +18,8 @@ pub(crate) struct ReferenceNetwork {
 
 impl ReferenceNetwork {
     /// Reads parameters or gradients from their memory layout, one by one.
-    pub(crate) fn read(parameters: &Parameters) -> Self {
+    pub(crate) fn read(floats: &[f32]) -> Self {
         assert_eq!(PANEL, 32, "the layout below is written for panels of 32");
-        let floats = parameters.as_slice();
         let at = |index: usize| f64::from(floats[index]);
         let mut weights = Vec::new();
         let mut biases = Vec::new();
@@ -62,13 +61,13 @@ impl ReferenceNetwork {
     }
 
     /// Adds to `gradients` the derivative of `output_gradient . g(input)` with respect to every
-    /// parameter.
+    /// parameter. Returns that with respect to the input.
     pub(crate) fn backward(
         &self,
         input: [f64; 3],
         output_gradient: [f64; 3],
         gradients: &mut Self,
-    ) {
+    ) -> [f64; 3] {
         let layers = self.activations(input);
         let mut delta = output_gradient.to_vec();
         for number in (0..self.weights.len()).rev() {
@@ -93,6 +92,7 @@ impl ReferenceNetwork {
                 })
                 .collect();
         }
+        [delta[0], delta[1], delta[2]]
     }
 
     /// Adam's step (Kingma and Ba 2015) number `iteration`, from 1.
@@ -155,13 +155,13 @@ pub(crate) fn first_losses(
     rate: f64,
     iterations: i32,
 ) -> Vec<f64> {
-    let mut network = ReferenceNetwork::read(&mlp::xavier(&mut Random::stream(seed, 0)));
+    let mut network = ReferenceNetwork::read(mlp::xavier(&mut Random::stream(seed, 0)).as_slice());
     let zeros = vec![0.0; network.flat().len()];
     let mut moments = [zeros.clone(), zeros];
     let mut losses = Vec::new();
     let inputs: Vec<[f64; 3]> = source.iter().map(|point| point.map(f64::from)).collect();
     for iteration in 1..=iterations {
-        let mut gradients = ReferenceNetwork::read(&mlp::zeros());
+        let mut gradients = ReferenceNetwork::read(mlp::zeros().as_slice());
         let deformed = |&input: &[f64; 3]| {
             let flow = network.forward(input);
             [0, 1, 2].map(|a| input[a] + flow[a])
@@ -172,6 +172,64 @@ pub(crate) fn first_losses(
         }
         network.adam_step(&gradients, &mut moments, iteration, rate);
         losses.push(value);
+    }
+    losses
+}
+
+/// NSFP's loss of two networks with the cycle, in plain loops: the truncated Chamfer distance of the
+/// deformed source to `target`, and that of the points led back to `source`. Adds its derivatives
+/// with respect to the parameters of both networks to `gradients`.
+pub(crate) fn cycle_loss(
+    [forward, backward]: [&ReferenceNetwork; 2],
+    [source, target]: [&[Point]; 2],
+    truncation: f64,
+    gradients: &mut [ReferenceNetwork; 2],
+) -> f64 {
+    let minus = |a: [f64; 3], b: [f64; 3]| [0, 1, 2].map(|axis| a[axis] - b[axis]);
+    let inputs: Vec<[f64; 3]> = source.iter().map(|point| point.map(f64::from)).collect();
+    let mut deformed = Vec::new();
+    let mut led_back = Vec::new();
+    for &input in &inputs {
+        let flow = forward.forward(input);
+        let there = [0, 1, 2].map(|axis| input[axis] + flow[axis]);
+        deformed.push(there);
+        led_back.push(minus(there, backward.forward(there)));
+    }
+    let (to_target, pulls) = chamfer_distance(&deformed, target, truncation);
+    let (to_source, pulls_back) = chamfer_distance(&led_back, source, truncation);
+    for (row, &input) in inputs.iter().enumerate() {
+        let back = pulls_back[row].map(|pull| -pull);
+        let through = backward.backward(deformed[row], back, &mut gradients[1]);
+        let pull = [0, 1, 2].map(|axis| pulls[row][axis] + pulls_back[row][axis] + through[axis]);
+        forward.backward(input, pull, &mut gradients[0]);
+    }
+    to_target + to_source
+}
+
+/// The losses of a fit of two networks in a cycle in its first iterations, as [`first_losses`].
+pub(crate) fn first_cycle_losses(
+    clouds: [&[Point]; 2],
+    truncation: f64,
+    seed: u64,
+    rate: f64,
+    iterations: i32,
+) -> Vec<f64> {
+    let network = mlp::xavier(&mut Random::stream(seed, 0));
+    let network = ReferenceNetwork::read(network.as_slice());
+    let zeros = ReferenceNetwork::read(mlp::zeros().as_slice());
+    let mut networks = [network.clone(), network];
+    let moments = vec![0.0; zeros.flat().len()];
+    let mut moments = [(); 2].map(|()| [moments.clone(), moments.clone()]);
+    let mut losses = Vec::new();
+    for iteration in 1..=iterations {
+        let mut gradients = [zeros.clone(), zeros.clone()];
+        let [forward, backward] = &networks;
+        let both = [forward, backward];
+        losses.push(cycle_loss(both, clouds, truncation, &mut gradients));
+        for ((network, gradients), moments) in networks.iter_mut().zip(&gradients).zip(&mut moments)
+        {
+            network.adam_step(gradients, moments, iteration, rate);
+        }
     }
     losses
 }

@@ -23,8 +23,8 @@ pub(crate) struct Prior<'a> {
 
 /// The initial state of a fit to `aligned` that starts from the preceding pair's field. Sets
 /// `options` to those of a warm start. None, with `options` unchanged, if the options have no warm
-/// start or another model, there is no preceding field, only one of the pairs has an ego motion, or the field
-/// explains this pair no better than no motion.
+/// start or a model that is not one network, there is no preceding field, only one of the pairs has
+/// an ego motion, or the field explains this pair no better than no motion.
 pub(crate) fn warm_start(
     backend: &dyn Backend,
     prepared: &Prepared,
@@ -39,7 +39,7 @@ pub(crate) fn warm_start(
     if prior.has_ego != ego.is_some() {
         return Ok(None);
     }
-    let Some(model) = options.network() else {
+    let Some(model) = options.network().filter(|network| !network.cycle) else {
         return Ok(None);
     };
     let conditioning = Conditioning::new(aligned, model.inputs);

@@ -183,7 +183,7 @@ fn fill(context: &Context, buffers: &Buffers, cut: Cut) {
         }
     }
     let mut transposed = mlp::zeros();
-    transpose_middle_layers(&parameters, &mut transposed);
+    transpose_middle_layers(parameters.as_slice(), transposed.as_mut_slice());
     let mut across = |width: f64| random.uniform(-width, width) as f32;
     let points: Vec<f32> = (0..3 * POINTS).map(|_| across(4.0)).collect();
     let loss_gradients: Vec<[f32; 4]> = (0..cut.tiles * TILE)

@@ -28,6 +28,10 @@ pub(super) const NO_CHAMFER: BackendError =
 const NO_LINEAR_MODEL: BackendError =
     BackendError::Unsupported("the linear model is computed on the CPU alone");
 
+/// The error of a fit with a cycle.
+const NO_CYCLE: BackendError =
+    BackendError::Unsupported("the cycle of two networks is computed on the CPU alone");
+
 /// Target duration of a submission, seconds. The control and the GPU's health are checked once per
 /// submission.
 const SUBMISSION_SECONDS: f64 = 0.03;
@@ -94,6 +98,9 @@ impl<'a> GpuTrainer<'a> {
         let device = &transform.device;
         let loss = options.loss.distance().ok_or(NO_CHAMFER)?.clone();
         let model = *options.network().ok_or(NO_LINEAR_MODEL)?;
+        if model.cycle {
+            return Err(NO_CYCLE);
+        }
         if model.precision == Precision::F16 {
             device.units()?;
         }
@@ -307,7 +314,7 @@ impl Trainer for GpuTrainer<'_> {
     fn restore(&mut self, state: TrainerState) -> Result<(), BackendError> {
         check_state(&state, LAID_OUT)?;
         let mut transposed = mlp::zeros();
-        transpose_middle_layers(&state.parameters, &mut transposed);
+        transpose_middle_layers(state.parameters.as_slice(), transposed.as_mut_slice());
         let [means, squares] = &state.moments;
         self.network.write(PARAMETERS, &state.parameters);
         self.network.write(TRANSPOSED, &transposed);

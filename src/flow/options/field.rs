@@ -73,6 +73,7 @@ impl FieldOptions {
                 inputs: InputNormalization::Centered { scale_m: 10.0 },
                 start: Start::ZeroFlow,
                 precision: Precision::F32,
+                cycle: false,
             }),
             learning_rate: 0.004,
             learning_rate_schedule: LearningRateSchedule::Cosine,
@@ -103,6 +104,24 @@ impl FieldOptions {
             }),
             ..Self::published(false)
         }
+    }
+
+    /// These options with the cycle consistency of NSFP.
+    pub(super) fn with_cycle(mut self) -> Self {
+        if let Some(network) = self.network_mut() {
+            network.cycle = true;
+        }
+        self
+    }
+
+    /// Whether the fit has kernels for a GPU: that of one network to a distance transform.
+    pub fn runs_on_gpu(&self) -> bool {
+        self.loss.distance().is_some() && self.network().is_some() && !self.has_cycle()
+    }
+
+    /// Whether the fit has the cycle consistency of NSFP.
+    pub fn has_cycle(&self) -> bool {
+        self.network().is_some_and(|network| network.cycle)
     }
 
     /// These options with the linear model, and the rate and stopping rule of its published code.

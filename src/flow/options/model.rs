@@ -18,6 +18,10 @@ pub struct NetworkOptions {
     pub start: Start,
     /// Floating-point precision of the network's matrix products during the fit.
     pub precision: Precision,
+    /// The cycle consistency of NSFP: a second network of the same shape leads each deformed source
+    /// point back, and the loss to the source is added to that to the target. It doubles the cost
+    /// of an iteration. The CPU alone has it.
+    pub cycle: bool,
 }
 
 impl NetworkOptions {
@@ -27,6 +31,7 @@ impl NetworkOptions {
             inputs: InputNormalization::Raw,
             start: Start::Xavier,
             precision: Precision::F32,
+            cycle: false,
         }
     }
 }

@@ -21,6 +21,9 @@ pub enum Preset {
     /// The baseline of FNSF's comparison: the same network fitted to the truncated Chamfer distance,
     /// whose nearest neighbors are searched among all points.
     NsfpBaseline,
+    /// NSFP (Li et al., NeurIPS 2021): as [`Preset::NsfpBaseline`], with a second network that leads
+    /// the deformed points back.
+    Nsfp,
     /// As [`Preset::NsfpBaseline`], with k-d trees for the nearest neighbors.
     NsfpKdtree,
     /// The linear model of FNSF's comparison, fitted to the distance transform.
@@ -33,12 +36,13 @@ pub enum Preset {
 
 impl Preset {
     /// All presets.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 10] = [
         Self::Default,
         Self::Label,
         Self::Neural,
         Self::Paper,
         Self::NsfpBaseline,
+        Self::Nsfp,
         Self::NsfpKdtree,
         Self::FnsfLinear,
         Self::NsfpLinear,
@@ -46,7 +50,8 @@ impl Preset {
     ];
 
     /// The name used by the command line and the service: `default`, `label`, `neural`, `paper`,
-    /// `nsfp-baseline`, `nsfp-kdtree`, `fnsf-linear`, `nsfp-linear` or `nsfp-kdtree-linear`.
+    /// `nsfp-baseline`, `nsfp`, `nsfp-kdtree`, `fnsf-linear`, `nsfp-linear` or
+    /// `nsfp-kdtree-linear`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Default => "default",
@@ -54,6 +59,7 @@ impl Preset {
             Self::Neural => "neural",
             Self::Paper => "paper",
             Self::NsfpBaseline => "nsfp-baseline",
+            Self::Nsfp => "nsfp",
             Self::NsfpKdtree => "nsfp-kdtree",
             Self::FnsfLinear => "fnsf-linear",
             Self::NsfpLinear => "nsfp-linear",
@@ -68,10 +74,9 @@ impl Preset {
 
     /// Whether the preset has kernels for a GPU.
     pub fn runs_on_gpu(self) -> bool {
-        let options = self.options(None);
-        let has_kernels =
-            |field: &FieldOptions| field.loss.distance().is_some() && field.network().is_some();
-        options.field().is_some_and(has_kernels)
+        self.options(None)
+            .field()
+            .is_some_and(FieldOptions::runs_on_gpu)
     }
 
     /// The presets that fit a neural field.
@@ -98,6 +103,7 @@ impl Preset {
             Self::Neural => Method::Field(FieldOptions::neural()),
             Self::Paper => Method::Field(FieldOptions::published(max_points.is_some())),
             Self::NsfpBaseline => Method::Field(FieldOptions::nsfp(NearestSearch::BruteForce)),
+            Self::Nsfp => Method::Field(FieldOptions::nsfp(NearestSearch::BruteForce).with_cycle()),
             Self::NsfpKdtree => Method::Field(FieldOptions::nsfp(NearestSearch::KdTree)),
             Self::FnsfLinear => Method::Field(FieldOptions::published(false).linear()),
             Self::NsfpLinear => {

@@ -153,7 +153,7 @@ fn gradients_in_half_precision_are_near_the_references_at_awkward_row_counts() {
         );
         let distance = distance.expect("small clouds fit");
         let reference = network();
-        let mut expected = ReferenceNetwork::read(&mlp::zeros());
+        let mut expected = ReferenceNetwork::read(mlp::zeros().as_slice());
         for &point in source {
             let input = point.map(f64::from);
             let flow = reference.forward(input).map(|f| f as f32);
@@ -164,7 +164,7 @@ fn gradients_in_half_precision_are_near_the_references_at_awkward_row_counts() {
         }
         // After the first step the mean of the gradients is a tenth of the gradient.
         let state = after_one(&gpu, source, &options);
-        let found = ReferenceNetwork::read(&state.moments[0]);
+        let found = ReferenceNetwork::read(state.moments[0].as_slice());
         for (layer, (found, expected)) in found.weights.iter().zip(&expected.weights).enumerate() {
             let found = found.iter().flatten().map(|g| g * 10.0);
             let pairs: Vec<_> = found.zip(expected.iter().flatten()).collect();
@@ -271,7 +271,8 @@ fn a_sweep_larger_than_the_memory_holds_at_once_has_the_gradient_of_all() {
     };
     let once = after_one(&gpu, &cloud, &half(plain()));
     let twice = after_one(&gpu, &twice, &half(plain()));
-    let [once, twice] = [once, twice].map(|state| ReferenceNetwork::read(&state.moments[0]).flat());
+    let [once, twice] =
+        [once, twice].map(|state| ReferenceNetwork::read(state.moments[0].as_slice()).flat());
     let scale = once.iter().fold(0.0f64, |most, g| most.max(g.abs()));
     for (a, b) in once.iter().zip(&twice) {
         assert!((a - b).abs() < TOLERANCE * scale, "{a} {b}");

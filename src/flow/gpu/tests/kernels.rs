@@ -105,7 +105,7 @@ pub(super) fn plain() -> FieldOptions {
 
 pub(super) fn network() -> ReferenceNetwork {
     let mut random = Random::stream(0, 0);
-    ReferenceNetwork::read(&mlp::xavier(&mut random))
+    ReferenceNetwork::read(mlp::xavier(&mut random).as_slice())
 }
 
 #[test]
@@ -172,7 +172,7 @@ fn every_gradient_is_the_references_at_awkward_row_counts() {
             let reference = network();
             let conditioning =
                 Conditioning::new(source, options.network().expect("a network").inputs);
-            let mut expected = ReferenceNetwork::read(&mlp::zeros());
+            let mut expected = ReferenceNetwork::read(mlp::zeros().as_slice());
             for &point in source {
                 let input = conditioning.apply(point).map(f64::from);
                 let flow = reference.forward(input).map(|f| f as f32);
@@ -188,7 +188,7 @@ fn every_gradient_is_the_references_at_awkward_row_counts() {
                 .as_mut_slice()
                 .iter_mut()
                 .for_each(|mean| *mean *= 10.0);
-            let gradients = ReferenceNetwork::read(means).flat();
+            let gradients = ReferenceNetwork::read(means.as_slice()).flat();
             let expected = expected.flat();
             let scale = expected.iter().fold(0.0f64, |most, g| most.max(g.abs()));
             for (index, (gradient, expected)) in gradients.iter().zip(&expected).enumerate() {
@@ -213,7 +213,8 @@ fn more_points_than_the_memory_holds_at_once_give_the_gradient_of_all() {
     };
     let once = after_one(&gpu, &cloud, &plain());
     let twice = after_one(&gpu, &twice, &plain());
-    let [once, twice] = [once, twice].map(|state| ReferenceNetwork::read(&state.moments[0]).flat());
+    let [once, twice] =
+        [once, twice].map(|state| ReferenceNetwork::read(state.moments[0].as_slice()).flat());
     let scale = once.iter().fold(0.0f64, |most, g| most.max(g.abs()));
     for (a, b) in once.iter().zip(&twice) {
         assert!((a - b).abs() < GRADIENT_TOLERANCE * scale, "{a} {b}");
