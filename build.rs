@@ -25,10 +25,12 @@ fn main() -> Result<(), Box<dyn Error>> {
     fs::create_dir_all(&client)?;
     tonic_prost_build::configure()
         .bytes(".")
+        .boxed(".fnsf.v1.Options.field")
         .build_client(false)
         .compile_fds(descriptors.clone())?;
     tonic_prost_build::configure()
         .bytes(".")
+        .boxed(".fnsf.v1.Options.field")
         .build_server(false)
         .build_transport(false)
         .out_dir(client)

@@ -13,7 +13,7 @@ use crate::flow::field::{Backend, BackendError};
 use crate::flow::{self, Ego, Estimate, FlowError, RigidTransform, Sequence, Sweep};
 use crate::formats::{self, SweepTime};
 use crate::job::{
-    DeviceChoice, EgoChoice, GroundChoice, JobOptions, PrecisionChoice, PresetChoice,
+    DeviceChoice, EgoChoice, FieldChoices, GroundChoice, JobOptions, PrecisionChoice, PresetChoice,
 };
 
 /// Options of the flow estimate.
@@ -82,6 +82,11 @@ pub(super) struct Estimation {
         conflicts_with = "ground"
     )]
     ground_raster: Option<PathBuf>,
+    #[command(
+        flatten,
+        next_help_heading = "Options of the fit, for presets that fit a field"
+    )]
+    field: FieldChoices,
 }
 
 fn positive(text: &str) -> Result<f32, String> {
@@ -111,6 +116,7 @@ impl Estimation {
             ego,
             device: self.device.choice,
             precision: self.precision,
+            field: self.field,
             ..JobOptions::default()
         };
         options.check().map_err(Failure::usage)?;
@@ -156,12 +162,16 @@ impl Estimation {
         })
     }
 
-    /// Opens the device. For presets without kernels for a GPU, `auto` opens the CPU backend.
+    /// Opens the device. For options without kernels for a GPU, `auto` opens the CPU backend.
     pub(super) fn open(&self) -> Result<Device<'_>, Failure> {
         let threads = self.threads.map(usize::from);
-        let runs_on_gpu = self.preset.preset().runs_on_gpu();
+        let options = JobOptions {
+            preset: self.preset,
+            field: self.field,
+            ..JobOptions::default()
+        };
         let backend = match self.device.choice {
-            DeviceChoice::Auto if !runs_on_gpu => device::cpu(threads)?,
+            DeviceChoice::Auto if !options.runs_on_gpu() => device::cpu(threads)?,
             _ => device::open(&self.device, threads)?,
         };
         Ok(Device {

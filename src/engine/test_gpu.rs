@@ -272,7 +272,7 @@ impl Trainer for TestTrainer<'_> {
         self.cpu.report()
     }
 
-    fn state(&mut self) -> Result<TrainerState, BackendError> {
+    fn state(&mut self) -> Result<Option<TrainerState>, BackendError> {
         self.cpu.state()
     }
 

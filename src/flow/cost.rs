@@ -110,7 +110,11 @@ pub fn predict_cost(problem: &Problem, options: &Options) -> Result<Cost, FlowEr
     let (source_points, target_points) = (selection.source.len(), selection.target.len());
     let method = match &options.method {
         Method::Objects(_) => object_cost(source_points + target_points),
-        Method::Field(field) => field_cost([&selection.source, &selection.target], field)?,
+        Method::Field(field) => {
+            let [source, target] =
+                [&selection.source, &selection.target].map(|cloud| field.seen(cloud));
+            field_cost([&source, &target], field)?
+        }
     };
     let registered = selection.registration_clouds.iter().flatten();
     let registered: usize = registered.map(Vec::len).sum();

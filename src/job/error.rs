@@ -29,12 +29,29 @@ pub enum InvalidOptions {
     /// Half precision (`f16`) with device `cpu`, which computes in single precision only.
     #[error("options: precision is \"f16\", which the CPU does not compute in")]
     HalfOnCpu,
-    /// Device `gpu` with a preset whose field has no kernels for a GPU; with its name.
-    #[error("options: device is \"gpu\", but {0} is computed on the CPU alone: leave device out")]
+    /// Device `gpu` with a field that has no kernels for a GPU; with the name of the preset.
+    #[error(
+        "options: device is \"gpu\", but {0} with these options is computed on the CPU alone: leave device out"
+    )]
     NoGpuKernels(&'static str),
     /// Half precision with a preset that fits no field on a GPU; with the name of the preset.
     #[error("options: precision is \"f16\", which {0} does not compute in: take preset neural")]
     HalfWithoutField(&'static str),
+    /// An option of `field` that the preset has no use for.
+    #[error("options: field.{option} has no effect with preset {preset}: leave it out")]
+    NoUse {
+        /// The name of the option.
+        option: &'static str,
+        /// The name of the preset.
+        preset: &'static str,
+    },
+    /// A value of `field` that is out of range, or a combination that is not possible; with the
+    /// reason.
+    #[error("options: {0}")]
+    FieldRange(&'static str),
+    /// A value of `field` that the fit refuses; with the reason.
+    #[error("options: field: {0}")]
+    Field(String),
     /// The crop is not a positive, finite number of metres.
     #[error("options: crop_m is {0}, a positive number of metres is needed")]
     Crop(f32),

@@ -5,6 +5,7 @@
 mod densify;
 mod device;
 mod error;
+mod field;
 mod id;
 mod options;
 mod record;
@@ -14,6 +15,7 @@ mod sequence;
 pub use densify::{Densify, LaterSweepsChoice};
 pub use device::{DeviceChoice, DeviceKind};
 pub use error::InvalidOptions;
+pub use field::FieldChoices;
 pub use id::{InvalidId, JobId, Tenant};
 pub use options::{EgoChoice, GroundChoice, JobOptions, PrecisionChoice, PresetChoice, Priority};
 pub use record::{Job, JobError, JobProgress, Kind, State};

@@ -12,7 +12,8 @@ use utoipa::ToSchema;
 use super::densify::Densify;
 use super::device::{DeviceChoice, DeviceKind};
 use super::error::{InvalidOptions, MAX_DEADLINE, MAX_DT_S};
-use crate::flow::{self, Ego, Ground, MIN_POINTS, Precision, Preset, RigidTransform};
+use super::field::FieldChoices;
+use crate::flow::{self, Ego, FieldOptions, Ground, MIN_POINTS, Precision, Preset, RigidTransform};
 use crate::formats::{ego_motion, matrix_rows};
 
 /// Options of a pair or of a sequence.
@@ -65,6 +66,9 @@ pub struct JobOptions {
     /// `f32`: single precision. `f16`: half precision, for `neural` and `paper` on a GPU whose
     /// matrix units pass their self-test.
     pub precision: PrecisionChoice,
+    /// Options of the fit, for the presets that fit a field.
+    #[serde(skip_serializing_if = "is_default")]
+    pub field: FieldChoices,
     /// Deadline, milliseconds after the arrival of the request, from 1 to 86,400,000 (one day). The
     /// best flow so far is then returned. A job that has not started by then expires. No deadline
     /// if not given.
@@ -242,6 +246,11 @@ impl<'de> Deserialize<'de> for EgoChoice {
     }
 }
 
+/// Whether nothing is chosen.
+fn is_default(choices: &FieldChoices) -> bool {
+    *choices == FieldChoices::default()
+}
+
 impl JobOptions {
     /// Reads the options from one JSON object and checks them.
     ///
@@ -271,6 +280,8 @@ impl JobOptions {
     /// # Errors
     /// The [`InvalidOptions`] of the first option that is refused:
     /// - `MaxPoints`, `Crop`, `Dt`, `Deadline` for a value out of range.
+    /// - `NoUse`, `FieldRange`, `Field` for an option of the fit that the preset has no use for, or
+    ///   that is out of range.
     /// - `NoGpuKernels` for device `gpu` with a field that has no kernels for it.
     /// - `HalfOnCpu`, `HalfWithoutField` for `f16` with device `cpu` or a preset that fits no
     ///   field on a GPU.
@@ -301,7 +312,9 @@ impl JobOptions {
             return Err(InvalidOptions::HalfOnCpu);
         }
         let preset = self.preset.preset();
-        if self.precision == PrecisionChoice::F16 && !preset.runs_on_gpu() {
+        let options = self.solver_options(usize::MAX);
+        self.field.check(preset.name(), options.field())?;
+        if self.precision == PrecisionChoice::F16 && !self.runs_on_gpu() {
             return Err(InvalidOptions::HalfWithoutField(preset.name()));
         }
         if self.device == DeviceChoice::Gpu && self.needs_cpu() {
@@ -320,10 +333,15 @@ impl JobOptions {
         }
     }
 
-    /// Whether the preset fits a field that has no kernels for a GPU.
+    /// Whether the options fit a field that has kernels for a GPU.
+    pub fn runs_on_gpu(&self) -> bool {
+        let options = self.solver_options(usize::MAX);
+        options.field().is_some_and(FieldOptions::runs_on_gpu)
+    }
+
+    /// Whether the options fit a field that has no kernels for a GPU.
     fn needs_cpu(&self) -> bool {
-        let preset = self.preset.preset();
-        preset.fits_field() && !preset.runs_on_gpu()
+        self.preset.preset().fits_field() && !self.runs_on_gpu()
     }
 
     /// The solver's options. `points` is the number of points of the larger cloud. Points are
@@ -350,6 +368,9 @@ impl JobOptions {
         }
         if let Some(dt_s) = self.dt_s {
             options.dt_s = dt_s;
+        }
+        if let Some(field) = options.field_mut() {
+            self.field.apply(field);
         }
         if let Some(network) = options.field_mut().and_then(|field| field.network_mut()) {
             network.precision = match self.precision {

@@ -120,7 +120,7 @@ fn what_the_estimate_refuses_has_no_price() {
     let mut untruncated = Preset::NsfpBaseline.options(None);
     untruncated.field_mut().expect("a field").loss = LossOptions::Chamfer(ChamferOptions {
         truncation_m: f32::NAN,
-        search: NearestSearch::KdTree,
+        ..ChamferOptions::published(NearestSearch::KdTree)
     });
     let problem = Problem::pair(&cloud, &cloud);
     let refused = predict_cost(&problem, &untruncated).expect_err("refused");

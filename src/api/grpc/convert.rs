@@ -11,8 +11,9 @@ use crate::api::results::Answer;
 use crate::flow::Cluster;
 use crate::formats::ego_motion;
 use crate::job::{
-    DenseReport, Densify, DeviceChoice, EgoChoice, GroundChoice, Job, JobError, JobId, JobOptions,
-    JobProgress, Kind, LaterSweepsChoice, PrecisionChoice, PresetChoice, Priority, State,
+    DenseReport, Densify, DeviceChoice, EgoChoice, FieldChoices, GroundChoice, Job, JobError,
+    JobId, JobOptions, JobProgress, Kind, LaterSweepsChoice, PrecisionChoice, PresetChoice,
+    Priority, State,
 };
 
 fn unknown(field: &str, number: i32) -> ApiError {
@@ -71,12 +72,32 @@ pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, Api
         ego: ego(message.ego, &message.ego_motion)?,
         device,
         precision,
+        field: message
+            .field
+            .map(|message| field(*message))
+            .unwrap_or_default(),
         deadline_ms: message.deadline_ms,
         priority,
         densify: message.densify.map(densify).transpose()?,
     };
     options.check()?;
     Ok(options)
+}
+
+fn field(message: proto::FieldOptions) -> FieldChoices {
+    FieldChoices {
+        cell_m: message.cell_m,
+        truncation_m: message.truncation_m,
+        voxel_m: message.voxel_m,
+        sigma_m: message.sigma_m,
+        variation_weight: message.variation_weight,
+        first_points: message.first_points,
+        double_every: message.double_every,
+        double_at_fall: message.double_at_fall,
+        renew_every: message.renew_every,
+        max_iterations: message.max_iterations,
+        bev: message.bev,
+    }
 }
 
 fn densify(message: proto::Densify) -> Result<Densify, ApiError> {

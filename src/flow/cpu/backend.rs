@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use super::isa::Isa;
 use super::kernels::Kernels;
 use super::linear::{Encoder, Linear};
-use super::mlp::Mlp;
+use super::mlp::{Mlp, Pass};
 use super::mlp_cycle::MlpCycle;
 use super::model::Model;
 use super::nearest::{BruteForce, KdTrees};
@@ -108,7 +108,12 @@ impl Backend for CpuBackend {
 
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {
         let threads = self.host.threads();
-        let model = Mlp::new(self.kernels, Arc::clone(threads), network.conditioning);
+        let pass = Pass {
+            kernels: self.kernels,
+            conditioning: network.conditioning,
+            flat: false,
+        };
+        let model = Mlp::new(pass, Arc::clone(threads));
         let working_sets = WorkingSets::new(threads, || model.working_set());
         Ok(model.evaluate(&network.parameters, points, &working_sets))
     }
@@ -140,20 +145,28 @@ impl Fits {
                 }
                 let parameters = mlp::initial(network.start, &mut random);
                 let schedule = Schedule::new(source, options, &mut random);
-                let conditioning = Conditioning::new(source, network.inputs);
-                let (kernels, threads) = (Kernels::new(self.isa), Arc::clone(&self.threads));
+                let pass = Pass {
+                    kernels: Kernels::new(self.isa),
+                    conditioning: Conditioning::new(source, network.inputs),
+                    flat: options.bev,
+                };
+                let threads = Arc::clone(&self.threads);
                 if network.cycle {
                     let loss = CycleLoss {
                         forward: loss,
                         backward: to_source()?,
                     };
-                    let model = MlpCycle::new(kernels, threads, conditioning);
+                    let model = MlpCycle::new(pass, threads);
                     let parameters = MlpCycle::twice(&parameters);
                     Ok(self.trainer(model, loss, schedule, parameters))
                 } else {
-                    let model = Mlp::new(kernels, threads, conditioning);
+                    let model = Mlp::new(pass, threads);
                     Ok(self.trainer(model, loss, schedule, parameters))
                 }
+            }
+            ModelOptions::Linear(_) if options.bev => {
+                let text = "the linear model has no bird's eye view";
+                Err(BackendError::Unsupported(text))
             }
             ModelOptions::Linear(linear) => {
                 let grid = LinearGrid::plan(source, linear)?;

@@ -9,7 +9,8 @@ use super::model::{Model, by_tiles};
 use super::tile::{Tile, WorkingSets};
 use crate::flow::data::Point;
 use crate::flow::field::{
-    Conditioning, FittedField, Network, Parameters, mlp, transpose_middle_layers,
+    Conditioning, FittedField, Network, Parameters, WIDTH, first_layer, last_layer, mlp,
+    transpose_middle_layers,
 };
 
 /// Parameters that one thread sums at a time.
@@ -22,6 +23,8 @@ pub(super) const HELD: usize = 32;
 pub(super) struct Pass {
     pub(super) kernels: Kernels,
     pub(super) conditioning: Conditioning,
+    /// Bird's eye view: the flow has no z. The points have z = 0.
+    pub(super) flat: bool,
 }
 
 impl Pass {
@@ -35,7 +38,45 @@ impl Pass {
         let rows = points.len();
         tile.load(points.map(|point| self.conditioning.apply(point)));
         self.kernels.forward(parameters, tile);
+        if self.flat {
+            tile.outputs.iter_mut().for_each(|flow| flow[2] = 0.0);
+        }
         &tile.outputs[..rows]
+    }
+
+    /// Adds the gradients of a tile to `gradients`, from its `output_gradients`. `transposed` are
+    /// the transposed weights of `parameters`.
+    pub(super) fn backward(
+        &self,
+        parameters: &[f32],
+        transposed: &[f32],
+        tile: &mut Tile,
+        gradients: &mut [f32],
+    ) {
+        if self.flat {
+            let rows = tile.output_gradients.iter_mut();
+            rows.for_each(|gradient| gradient[2] = 0.0);
+        }
+        self.kernels
+            .backward(parameters, transposed, tile, gradients);
+    }
+
+    /// The network with `parameters`. A flat one has no weights for z, so its flow does not depend
+    /// on it.
+    pub(super) fn fitted(&self, parameters: &[f32]) -> FittedField {
+        let mut network = mlp::zeros();
+        let floats = network.as_mut_slice();
+        floats.copy_from_slice(parameters);
+        if self.flat {
+            let (first, last) = (first_layer(), last_layer());
+            floats[first.weights + 2 * WIDTH..][..WIDTH].fill(0.0);
+            floats[last.weights + 2 * WIDTH..][..WIDTH].fill(0.0);
+            floats[last.bias + 2] = 0.0;
+        }
+        FittedField::Network(Network {
+            parameters: network,
+            conditioning: self.conditioning,
+        })
     }
 
     /// The flow of the network with `parameters` at any N `points`, N x 3 displacements in metres.
@@ -69,16 +110,9 @@ pub(super) struct Mlp {
 }
 
 impl Mlp {
-    pub(super) fn new(
-        kernels: Kernels,
-        threads: Arc<rayon::ThreadPool>,
-        conditioning: Conditioning,
-    ) -> Self {
+    pub(super) fn new(pass: Pass, threads: Arc<rayon::ThreadPool>) -> Self {
         Self {
-            pass: Pass {
-                kernels,
-                conditioning,
-            },
+            pass,
             threads,
             transposed: mlp::zeros(),
         }
@@ -127,8 +161,8 @@ impl Model for Mlp {
     ) {
         tile.output_gradients[..output_gradients.len()].copy_from_slice(output_gradients);
         let (parameters, transposed) = (parameters.as_slice(), self.transposed.as_slice());
-        let kernels = &self.pass.kernels;
-        kernels.backward(parameters, transposed, tile, chunk.as_mut_slice());
+        let chunk = chunk.as_mut_slice();
+        self.pass.backward(parameters, transposed, tile, chunk);
     }
 
     fn add_to_the_first(&self, chunks: &mut [Parameters]) {
@@ -140,10 +174,7 @@ impl Model for Mlp {
     }
 
     fn fitted(&self, parameters: &Parameters) -> FittedField {
-        FittedField::Network(Network {
-            parameters: parameters.clone(),
-            conditioning: self.pass.conditioning,
-        })
+        self.pass.fitted(parameters.as_slice())
     }
 
     fn evaluate(

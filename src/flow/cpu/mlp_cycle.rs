@@ -2,14 +2,11 @@
 
 use std::sync::Arc;
 
-use super::kernels::Kernels;
 use super::mlp::{HELD, Pass, add_to_the_first, sum};
 use super::model::Model;
 use super::tile::{TILE, Tile, WorkingSets};
 use crate::flow::data::Point;
-use crate::flow::field::{
-    Conditioning, FittedField, LAID_OUT, Network, Parameters, transpose_middle_layers,
-};
+use crate::flow::field::{FittedField, LAID_OUT, Parameters, transpose_middle_layers};
 
 /// The parameters of the forward network, then those of the backward network.
 const BOTH: usize = 2 * LAID_OUT;
@@ -31,16 +28,9 @@ pub(super) struct MlpCycle {
 }
 
 impl MlpCycle {
-    pub(super) fn new(
-        kernels: Kernels,
-        threads: Arc<rayon::ThreadPool>,
-        conditioning: Conditioning,
-    ) -> Self {
+    pub(super) fn new(pass: Pass, threads: Arc<rayon::ThreadPool>) -> Self {
         Self {
-            pass: Pass {
-                kernels,
-                conditioning,
-            },
+            pass,
             threads,
             transposed: Parameters::zeros(BOTH),
         }
@@ -115,7 +105,7 @@ impl Model for MlpCycle {
         let (forward, backward) = parameters.as_slice().split_at(LAID_OUT);
         let transposed = self.transposed.as_slice().split_at(LAID_OUT);
         let chunk = chunk.as_mut_slice().split_at_mut(LAID_OUT);
-        let kernels = &self.pass.kernels;
+        let pass = &self.pass;
         for (to, gradient) in tiles
             .backward
             .output_gradients
@@ -124,15 +114,15 @@ impl Model for MlpCycle {
         {
             *to = gradient[1];
         }
-        kernels.backward(backward, transposed.1, &mut tiles.backward, chunk.1);
+        pass.backward(backward, transposed.1, &mut tiles.backward, chunk.1);
         // The backward network's input is the deformed point, normalized.
         let inputs = tiles.backward.input_gradients(backward);
-        let scale = self.pass.conditioning.scale;
+        let scale = pass.conditioning.scale;
         let rows = tiles.forward.output_gradients.iter_mut().zip(inputs);
         for ((to, input), gradient) in rows.zip(output_gradients) {
             *to = core::array::from_fn(|a| gradient[0][a] + scale * input[a]);
         }
-        kernels.backward(forward, transposed.0, &mut tiles.forward, chunk.0);
+        pass.backward(forward, transposed.0, &mut tiles.forward, chunk.0);
     }
 
     fn add_to_the_first(&self, chunks: &mut [Parameters]) {
@@ -144,13 +134,7 @@ impl Model for MlpCycle {
     }
 
     fn fitted(&self, parameters: &Parameters) -> FittedField {
-        let mut forward = Parameters::zeros(LAID_OUT);
-        let parameters = &parameters.as_slice()[..LAID_OUT];
-        forward.as_mut_slice().copy_from_slice(parameters);
-        FittedField::Network(Network {
-            parameters: forward,
-            conditioning: self.pass.conditioning,
-        })
+        self.pass.fitted(&parameters.as_slice()[..LAID_OUT])
     }
 
     fn evaluate(
@@ -170,8 +154,9 @@ impl Model for MlpCycle {
 mod tests {
     use super::*;
     use crate::flow::cpu::isa::Isa;
+    use crate::flow::cpu::kernels::Kernels;
     use crate::flow::data::Random;
-    use crate::flow::field::{ReferenceNetwork, cycle_loss, mlp};
+    use crate::flow::field::{Conditioning, ReferenceNetwork, cycle_loss, mlp};
 
     fn cloud(count: usize, seed: u64) -> Vec<Point> {
         let mut random = Random::new(seed);
@@ -210,7 +195,12 @@ mod tests {
         let threads = rayon::ThreadPoolBuilder::new().num_threads(1).build();
         let threads = Arc::new(threads.expect("a thread"));
         for isa in Isa::available() {
-            let mut model = MlpCycle::new(Kernels::new(isa), Arc::clone(&threads), conditioning);
+            let pass = Pass {
+                kernels: Kernels::new(isa),
+                conditioning,
+                flat: false,
+            };
+            let mut model = MlpCycle::new(pass, Arc::clone(&threads));
             model.update(&parameters);
             for rows in [1, 11, 13, 96] {
                 let (points, pulls) = (cloud(rows, 3), cloud(2 * rows, 4));

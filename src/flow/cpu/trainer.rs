@@ -86,7 +86,9 @@ impl<M: Model, L: Loss<M::Output>> CpuTrainer<M, L> {
     /// # Errors
     /// The interrupt of `control`, which abandons the iteration.
     fn iterate(&mut self, control: &dyn Control) -> Result<Option<(f32, bool)>, Interrupt> {
-        let batch = self.schedule.batch(self.state.iterations);
+        let batch = self
+            .schedule
+            .batch(self.state.iterations, self.state.growth);
         if self.placed.as_ref() != Some(&batch) {
             self.model.place(&self.schedule.points[batch.clone()]);
             self.placed = Some(batch.clone());
@@ -97,14 +99,29 @@ impl<M: Model, L: Loss<M::Output>> CpuTrainer<M, L> {
         if !loss.is_finite() {
             return Ok(None);
         }
-        let stop = self
+        let stalled = self
             .early_stop
             .as_mut()
             .is_some_and(|rule| rule.observe(loss));
+        let stop = stalled && !self.schedule.is_growing(self.state.growth);
         self.keep(loss, stop);
         self.step(held);
         self.state.iterations += 1;
+        self.grow(loss, stalled);
         Ok(Some((loss, stop)))
+    }
+
+    /// Grows the batch where that is due. Losses of other batches are no measure, so the stopping
+    /// rule and the best iteration then begin anew.
+    fn grow(&mut self, loss: f32, stalled: bool) {
+        let state = &mut self.state;
+        let (growth, done) = (state.growth, state.iterations);
+        state.growth = self.schedule.grown(growth, done, loss, stalled);
+        if state.growth.doublings > growth.doublings {
+            state.best_loss = f32::INFINITY;
+            let rule = self.schedule.options.early_stop;
+            self.early_stop = rule.map(EarlyStop::new);
+        }
     }
 
     /// Prepares the loss for `batch`.
@@ -118,6 +135,8 @@ impl<M: Model, L: Loss<M::Output>> CpuTrainer<M, L> {
         };
         let batch = Batch {
             points,
+            range: batch,
+            done: self.state.iterations,
             outputs: &outputs,
         };
         self.loss.prepare(&batch, control)?;
@@ -128,7 +147,7 @@ impl<M: Model, L: Loss<M::Output>> CpuTrainer<M, L> {
     /// Forward pass, loss and backward pass over `batch`. Returns how many chunks hold its
     /// gradients.
     fn accumulate(&mut self, batch: Range<usize>, control: &dyn Control) -> usize {
-        let cut = Chunks::new(self.schedule.largest_batch());
+        let cut = Chunks::new(self.schedule.largest_batch(self.state.growth));
         self.losses.resize(batch.len(), 0.0);
         let mut next = 0;
         let mut held = 0;
@@ -314,12 +333,15 @@ impl<M: Model, L: Loss<M::Output>> Trainer for CpuTrainer<M, L> {
         }
     }
 
-    fn state(&mut self) -> Result<TrainerState, BackendError> {
+    fn state(&mut self) -> Result<Option<TrainerState>, BackendError> {
+        if self.loss.depends_on_earlier(self.state.iterations) {
+            return Ok(None);
+        }
         let rule = self.early_stop.as_ref();
-        Ok(TrainerState {
+        Ok(Some(TrainerState {
             seen: rule.map(EarlyStop::seen).unwrap_or_default(),
             ..self.state.clone()
-        })
+        }))
     }
 
     fn restore(&mut self, state: TrainerState) -> Result<(), BackendError> {

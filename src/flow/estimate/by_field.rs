@@ -37,8 +37,8 @@ pub(super) fn residual_motion(
     let state = snapshot
         .map(|snapshot| snapshot.state_for(*identity))
         .transpose()?;
-    let clouds = [selection.source.as_slice(), &selection.target];
-    let prepared = field::prepare_target(backend, clouds, options, control)?;
+    let [source, target] = [&selection.source, &selection.target].map(|cloud| options.seen(cloud));
+    let prepared = field::prepare_target(backend, [&source, &target], options, control)?;
     let prior = before.and_then(|field| field.ego).unwrap_or_default();
     let ego = match (&prepared, input.options.ego) {
         (Some(prepared), ego) => {
@@ -64,7 +64,7 @@ pub(super) fn residual_motion(
                 }),
                 Residual::Still | Residual::Linear(_) | Residual::Objects(_) => None,
             }),
-            aligned: &aligned,
+            aligned: &options.seen(&aligned),
             ego: ego.as_ref(),
             options,
             seed: input.options.seed,

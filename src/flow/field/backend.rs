@@ -128,12 +128,13 @@ pub trait Trainer: Send {
     /// The number of iterations, the loss and the time of the distance query so far.
     fn report(&self) -> FitReport;
 
-    /// A copy of the state that the following iterations and the result depend on.
+    /// A copy of the state that the following iterations and the result depend on. None while they
+    /// also depend on nearest neighbors of an earlier iteration, which are not part of it.
     ///
     /// # Errors
     /// [`BackendError::Busy`], [`BackendError::Lost`] or [`BackendError::Device`] if a GPU has no
     /// free memory or fails. A CPU never fails.
-    fn state(&mut self) -> Result<TrainerState, BackendError>;
+    fn state(&mut self) -> Result<Option<TrainerState>, BackendError>;
 
     /// Replaces the state of this fit by `state`. To continue the fit that `state` is from with the
     /// same bits, this fit must have the same points, options and seed.

@@ -5,6 +5,7 @@
 //! truncation, it is `1/N sum_i [d(q_i) < r] d(q_i)^2 + 1/M sum_j [d(t_j) < r] d(t_j)^2`. The
 //! second sum is attributed to the source points that the target points are nearest to.
 
+use core::ops::Range;
 use std::sync::Arc;
 
 use super::backend::BackendError;
@@ -25,14 +26,24 @@ pub(crate) fn check_chamfer(
     options: &ChamferOptions,
     target: &[Point],
 ) -> Result<(), BackendError> {
-    let truncation_m = options.truncation_m;
-    if !(truncation_m > 0.0 && truncation_m.is_finite()) {
-        return Err(BackendError::Truncation { truncation_m });
-    }
+    check_truncation(options)?;
     if target.is_empty() {
         return Err(DistanceError::EmptyTarget.into());
     }
     Ok(())
+}
+
+/// Checks the truncation of a Chamfer distance.
+///
+/// # Errors
+/// [`BackendError::Truncation`] if it is not positive and finite.
+pub(super) fn check_truncation(options: &ChamferOptions) -> Result<(), BackendError> {
+    let truncation_m = options.truncation_m;
+    if truncation_m > 0.0 && truncation_m.is_finite() {
+        Ok(())
+    } else {
+        Err(BackendError::Truncation { truncation_m })
+    }
 }
 
 /// Multiply-adds of the network that take as long as one distance of a brute-force search: seven
@@ -77,6 +88,8 @@ pub(crate) trait NearestSearcher: Send + Sync {
 /// The nearest neighbors of both clouds, found for one deformed source.
 #[derive(Default)]
 struct Correspondences {
+    /// The batch that they were found for.
+    range: Range<usize>,
     /// For each point of the batch, the index of its nearest target point.
     targets: Vec<u32>,
     /// Target points in the order of the source points that they are nearest to.
@@ -127,6 +140,9 @@ impl<S: NearestSearcher> ChamferLoss<S> {
 
 impl<S: NearestSearcher> Loss for ChamferLoss<S> {
     fn prepare(&mut self, batch: &Batch<'_>, control: &dyn Control) -> Result<(), Interrupt> {
+        if self.depends_on_earlier(batch.done) && self.found.range == *batch.range {
+            return Ok(());
+        }
         let flow = (batch.outputs)();
         let pairs = batch.points.iter().zip(&flow);
         let deformed: Vec<Point> = pairs
@@ -143,11 +159,17 @@ impl<S: NearestSearcher> Loss for ChamferLoss<S> {
         let (first, sources) = grouped(&nearest, deformed.len());
         self.share = deformed.len() as f32 / self.search.target().len() as f32;
         self.found = Correspondences {
+            range: batch.range.clone(),
             targets,
             sources,
             first,
         };
         Ok(())
+    }
+
+    fn depends_on_earlier(&self, done: usize) -> bool {
+        let renewal = self.options.renewal;
+        renewal.is_some_and(|renewal| !renewal.is_due(done))
     }
 
     #[inline]
@@ -239,6 +261,7 @@ mod tests {
     const OPTIONS: ChamferOptions = ChamferOptions {
         truncation_m: 2.0,
         search: NearestSearch::BruteForce,
+        renewal: None,
     };
 
     fn cloud(count: usize, seed: u64) -> Vec<Point> {
@@ -260,6 +283,8 @@ mod tests {
         let mut loss = ChamferLoss::new(OPTIONS, search);
         let batch = Batch {
             points: source,
+            range: &(0..source.len()),
+            done: 0,
             outputs: &|| flow.to_vec(),
         };
         loss.prepare(&batch, &Uncontrolled).expect("no interrupt");

@@ -30,6 +30,8 @@ impl<L: Loss> Loss<[Point; 2]> for CycleLoss<L> {
         let outputs = (batch.outputs)();
         let forward = Batch {
             points: batch.points,
+            range: batch.range,
+            done: batch.done,
             outputs: &|| outputs.iter().map(|output| output[0]).collect(),
         };
         self.forward.prepare(&forward, control)?;
@@ -39,9 +41,15 @@ impl<L: Loss> Loss<[Point; 2]> for CycleLoss<L> {
             .collect();
         let backward = Batch {
             points: &deformed,
+            range: batch.range,
+            done: batch.done,
             outputs: &|| outputs.iter().map(|output| output[1].map(|b| -b)).collect(),
         };
         self.backward.prepare(&backward, control)
+    }
+
+    fn depends_on_earlier(&self, done: usize) -> bool {
+        self.forward.depends_on_earlier(done)
     }
 
     #[inline]

@@ -190,8 +190,10 @@ impl Fit<'_> {
             let (steps, early) = clock.next(done, STEPS_AT_ONCE);
             match trainer.advance(steps, &early)? {
                 Advance::Continues if !*cut && control.snapshot_due() => {
-                    let snapshot = Snapshot::new((self.identity)(), trainer.state()?);
-                    control.snapshot(snapshot.to_bytes());
+                    if let Some(state) = trainer.state()? {
+                        let snapshot = Snapshot::new((self.identity)(), state);
+                        control.snapshot(snapshot.to_bytes());
+                    }
                 }
                 Advance::Continues => {}
                 Advance::Converged | Advance::Exhausted if *cut => return Ok(StopReason::Deadline),

@@ -73,27 +73,42 @@ pub enum LinearError {
     },
 }
 
+/// Checks the values of `options`, without the memory limit.
+///
+/// # Errors
+/// [`LinearError`] for a value out of range.
+pub(super) fn check_linear(options: &LinearOptions) -> Result<(), LinearError> {
+    let LinearOptions {
+        voxel_m,
+        sigma_m,
+        variation_weight: weight,
+        ..
+    } = *options;
+    if !(voxel_m >= 0.01 && voxel_m.is_finite()) {
+        return Err(LinearError::Voxel { voxel_m });
+    }
+    if !(0.5..=100.0).contains(&(sigma_m / voxel_m)) {
+        return Err(LinearError::Sigma { sigma_m, voxel_m });
+    }
+    if !(weight >= 0.0 && weight.is_finite()) {
+        return Err(LinearError::VariationWeight { weight });
+    }
+    Ok(())
+}
+
 impl LinearGrid {
     /// The grid over `points`, one to two voxels beyond them on each side.
     ///
     /// # Errors
     /// [`LinearError`] if an option is out of range or the grid needs too much memory.
     pub(crate) fn plan(points: &[Point], options: &LinearOptions) -> Result<Self, LinearError> {
+        check_linear(options)?;
         let LinearOptions {
             voxel_m,
             sigma_m,
-            variation_weight: weight,
             max_bytes: limit,
+            ..
         } = *options;
-        if !(voxel_m >= 0.01 && voxel_m.is_finite()) {
-            return Err(LinearError::Voxel { voxel_m });
-        }
-        if !(0.5..=100.0).contains(&(sigma_m / voxel_m)) {
-            return Err(LinearError::Sigma { sigma_m, voxel_m });
-        }
-        if !(weight >= 0.0 && weight.is_finite()) {
-            return Err(LinearError::VariationWeight { weight });
-        }
         let voxel = f64::from(voxel_m);
         let axis = |axis: usize| {
             let values = points.iter().map(|point| f64::from(point[axis]));

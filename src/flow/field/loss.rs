@@ -7,6 +7,7 @@
 //! `D(p + f)`, FNSF eq. 6. The Chamfer distance is in `chamfer.rs`, and the cycle of NSFP in
 //! `cycle.rs`.
 
+use core::ops::Range;
 use std::sync::Arc;
 
 use crate::flow::data::{Control, Interrupt, Point};
@@ -49,6 +50,10 @@ pub(crate) struct PointLoss<O = Point> {
 /// The points of one iteration.
 pub(crate) struct Batch<'a, O = Point> {
     pub(crate) points: &'a [Point],
+    /// Which of the source's points they are, in the order of the schedule.
+    pub(crate) range: &'a Range<usize>,
+    /// Number of iterations done before.
+    pub(crate) done: usize,
     /// Computes the output of the model at each point.
     pub(crate) outputs: &'a dyn Fn() -> Vec<O>,
 }
@@ -62,6 +67,11 @@ pub(crate) trait Loss<O = Point>: Send + Sync {
     /// # Errors
     /// The interrupt of `control`, which abandons the iteration.
     fn prepare(&mut self, batch: &Batch<'_, O>, control: &dyn Control) -> Result<(), Interrupt>;
+
+    /// Whether the iteration after `done` others depends on what an earlier one prepared.
+    fn depends_on_earlier(&self, _done: usize) -> bool {
+        false
+    }
 
     /// The loss of `point` with `output`. `index` is that of the point among those of the iteration.
     fn at(&self, index: usize, point: Point, output: O) -> PointLoss<O>;

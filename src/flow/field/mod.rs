@@ -4,6 +4,7 @@ mod adam;
 mod backend;
 mod budget;
 mod chamfer;
+mod check;
 mod codec;
 mod cycle;
 mod early_stopping;
@@ -55,5 +56,5 @@ pub(crate) use reference::{
     ReferenceLoss, ReferenceNetwork, chamfer_distance, cycle_loss, first_cycle_losses,
     first_losses, mean_distance,
 };
-pub(crate) use schedule::Schedule;
+pub(crate) use schedule::{GrowthState, Schedule};
 pub(crate) use warm_start::Prior;

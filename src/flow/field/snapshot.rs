@@ -3,6 +3,7 @@
 //! ```text
 //! identity u64 | iterations u64 | best iteration u64 | best loss f32
 //!   | stopping rule: has best u8, best f32, without progress u64
+//!   | growth of the batch: doublings u32, has loss u8, loss f32
 //!   | number of parameters u64 | parameters, means, squares, kept: f32 each
 //! ```
 //!
@@ -12,11 +13,12 @@
 use super::codec::{put_parameters, take_parameters};
 use super::early_stopping::EarlyStopState;
 use super::parameters::Parameters;
+use super::schedule::{GrowthState, MOST_DOUBLINGS};
 use crate::flow::data::{Envelope, EnvelopeError};
 
 const ENVELOPE: Envelope = Envelope {
     magic: *b"FNSFSNAP",
-    version: 4,
+    version: 5,
 };
 
 /// The state of a fit between two iterations.
@@ -33,6 +35,8 @@ pub struct TrainerState {
     pub(crate) kept: Parameters,
     /// State of early stopping; the default without early stopping.
     pub(crate) seen: EarlyStopState,
+    /// Growth of the batch; the default with a constant batch.
+    pub(crate) growth: GrowthState,
     pub(crate) iterations: usize,
     pub(crate) best_iteration: usize,
     pub(crate) best_loss: f32,
@@ -46,6 +50,7 @@ impl TrainerState {
             kept: parameters.clone(),
             parameters,
             seen: EarlyStopState::default(),
+            growth: GrowthState::default(),
             iterations: 0,
             best_iteration: 0,
             best_loss: f32::INFINITY,
@@ -99,6 +104,9 @@ impl Snapshot {
         bytes.push(u8::from(state.seen.best.is_some()));
         bytes.extend(state.seen.best.unwrap_or(0.0).to_le_bytes());
         bytes.extend((state.seen.without_progress as u64).to_le_bytes());
+        bytes.extend(state.growth.doublings.to_le_bytes());
+        bytes.push(u8::from(state.growth.loss.is_some()));
+        bytes.extend(state.growth.loss.unwrap_or(0.0).to_le_bytes());
         bytes.extend((state.parameters.as_slice().len() as u64).to_le_bytes());
         let [means, squares] = &state.moments;
         for array in [&state.parameters, means, squares, &state.kept] {
@@ -125,6 +133,13 @@ impl Snapshot {
             best: (has_best != 0).then_some(best),
             without_progress: body.count()?,
         };
+        let doublings = u32::from_le_bytes(body.take()?);
+        let [has_loss] = body.take()?;
+        let loss = f32::from_le_bytes(body.take()?);
+        let growth = GrowthState {
+            doublings: doublings.min(MOST_DOUBLINGS),
+            loss: (has_loss != 0).then_some(loss),
+        };
         let floats = body.count()?;
         let mut parameters = || take_parameters(&mut body, floats);
         let state = TrainerState {
@@ -132,6 +147,7 @@ impl Snapshot {
             moments: [parameters()?, parameters()?],
             kept: parameters()?,
             seen,
+            growth,
             iterations,
             best_iteration,
             best_loss,

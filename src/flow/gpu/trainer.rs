@@ -15,8 +15,9 @@ use super::{inference, layout};
 use crate::flow::data::{Control, Point, Progress, Random};
 use crate::flow::field::Network as FittedNetwork;
 use crate::flow::field::{
-    Advance, BackendError, Conditioning, EarlyStopState, FitReport, FittedField, LAID_OUT,
-    Parameters, Schedule, Trainer, TrainerState, check_state, mlp, transpose_middle_layers,
+    Advance, BackendError, Conditioning, EarlyStopState, FitReport, FittedField, GrowthState,
+    LAID_OUT, Parameters, Schedule, Trainer, TrainerState, check_state, mlp,
+    transpose_middle_layers,
 };
 use crate::flow::options::{DistanceLossOptions, FieldOptions, Precision};
 
@@ -31,6 +32,19 @@ const NO_LINEAR_MODEL: BackendError =
 /// The error of a fit with a cycle.
 const NO_CYCLE: BackendError =
     BackendError::Unsupported("the cycle of two networks is computed on the CPU alone");
+
+/// The error of a fit with a growing batch.
+const NO_GROWTH: BackendError = BackendError::Unsupported("batches grow on the CPU alone");
+
+/// The error of a fit in bird's eye view.
+const NO_BEV: BackendError =
+    BackendError::Unsupported("the bird's eye view is computed on the CPU alone");
+
+/// The growth of a constant batch.
+const CONSTANT: GrowthState = GrowthState {
+    doublings: 0,
+    loss: None,
+};
 
 /// Target duration of a submission, seconds. The control and the GPU's health are checked once per
 /// submission.
@@ -81,6 +95,7 @@ pub(super) struct GpuTrainer<'a> {
     loss: DistanceLossOptions,
     conditioning: Conditioning,
     schedule: Schedule,
+    cut: Cut,
     network: Network,
     /// Offset of the points in the store, in words.
     points: u32,
@@ -101,13 +116,20 @@ impl<'a> GpuTrainer<'a> {
         if model.cycle {
             return Err(NO_CYCLE);
         }
+        if options.growth.is_some() {
+            return Err(NO_GROWTH);
+        }
+        if options.bev {
+            return Err(NO_BEV);
+        }
         if model.precision == Precision::F16 {
             device.units()?;
         }
         let mut random = Random::stream(seed, 0);
         let parameters = mlp::initial(model.start, &mut random);
         let schedule = Schedule::new(source, options, &mut random);
-        let chunks = Cut::new(schedule.largest_batch()).chunks.count as u64;
+        let cut = Cut::new(schedule.largest_batch(CONSTANT));
+        let chunks = cut.chunks.count as u64;
         if chunks > device.context.budget.chunks {
             return Err(BackendError::Memory {
                 what: "gradients",
@@ -129,6 +151,7 @@ impl<'a> GpuTrainer<'a> {
             network: Network::take(device)?,
             conditioning: Conditioning::new(source, model.inputs),
             schedule,
+            cut,
             points,
             status: Status::default(),
             query_seconds: 0.0,
@@ -163,7 +186,7 @@ impl<'a> GpuTrainer<'a> {
 
     /// The record of the iteration that follows `done` others.
     fn step(&self, done: usize) -> layout::Step {
-        let batch = self.schedule.batch(done);
+        let batch = self.schedule.batch(done, CONSTANT);
         let adam = self.schedule.adam(done);
         layout::Step {
             first: batch.start as u32,
@@ -182,7 +205,7 @@ impl<'a> GpuTrainer<'a> {
             lane: self.lane(),
             status: self.status,
             steps: (done..done + steps).map(|done| self.step(done)).collect(),
-            cut: Cut::new(self.schedule.largest_batch()),
+            cut: self.cut,
             precision: self.precision,
         };
         let done = {
@@ -192,16 +215,50 @@ impl<'a> GpuTrainer<'a> {
         };
         self.status = done.status;
         if let Some(pace) = done.pace {
-            let tiles = Cut::new(self.schedule.largest_batch()).tiles * done.losses.len();
+            let tiles = self.cut.tiles * done.losses.len();
             self.query_seconds += pace.tile_query * tiles as f64;
         }
         Ok(done)
     }
 
+    /// The state, read from the GPU.
+    fn read_state(&mut self) -> Result<TrainerState, BackendError> {
+        let context = &self.device().context;
+        let bytes = ARRAYS as u64 * NETWORK_BYTES;
+        let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
+        let copy = context.empty(bytes, usage)?;
+        let mut encoder = context.encoder();
+        let from = self.network.at(PARAMETERS);
+        encoder.copy_buffer_to_buffer(&context.buffers.networks, from, &copy, 0, bytes);
+        let read = context.finish(encoder, &copy, bytes)?;
+        let array = |array: u64| {
+            let mut parameters = mlp::zeros();
+            let from = (array * NETWORK_BYTES) as usize;
+            let bytes = &read[from..from + NETWORK_BYTES as usize];
+            bytemuck::cast_slice_mut::<f32, u8>(&mut parameters.as_mut_slice()[..LAID_OUT])
+                .copy_from_slice(bytes);
+            parameters
+        };
+        let status = &self.status;
+        Ok(TrainerState {
+            parameters: array(PARAMETERS),
+            moments: [array(MEANS), array(SQUARES)],
+            kept: array(KEPT),
+            seen: EarlyStopState {
+                best: (status.seen == 1).then_some(status.seen_best),
+                without_progress: status.without_progress as usize,
+            },
+            iterations: status.iterations as usize,
+            best_iteration: status.best_iteration as usize,
+            growth: CONSTANT,
+            best_loss: widened(status.best_loss),
+        })
+    }
+
     /// The number of iterations for the next submission.
     fn stride(&self) -> usize {
         let seconds = self.device().batch.pace().map(|pace| {
-            let own = pace.tile * Cut::new(self.schedule.largest_batch()).tiles as f64;
+            let own = pace.tile * self.cut.tiles as f64;
             own.max(pace.iteration)
         });
         // Dispatched iterations after a stop have no effect.
@@ -265,7 +322,7 @@ impl Trainer for GpuTrainer<'_> {
 
     fn fitted(&mut self) -> Result<FittedField, BackendError> {
         Ok(FittedField::Network(FittedNetwork {
-            parameters: self.state()?.kept,
+            parameters: self.read_state()?.kept,
             conditioning: self.conditioning,
         }))
     }
@@ -279,36 +336,8 @@ impl Trainer for GpuTrainer<'_> {
         }
     }
 
-    fn state(&mut self) -> Result<TrainerState, BackendError> {
-        let context = &self.device().context;
-        let bytes = ARRAYS as u64 * NETWORK_BYTES;
-        let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
-        let copy = context.empty(bytes, usage)?;
-        let mut encoder = context.encoder();
-        let from = self.network.at(PARAMETERS);
-        encoder.copy_buffer_to_buffer(&context.buffers.networks, from, &copy, 0, bytes);
-        let read = context.finish(encoder, &copy, bytes)?;
-        let array = |array: u64| {
-            let mut parameters = mlp::zeros();
-            let from = (array * NETWORK_BYTES) as usize;
-            let bytes = &read[from..from + NETWORK_BYTES as usize];
-            bytemuck::cast_slice_mut::<f32, u8>(&mut parameters.as_mut_slice()[..LAID_OUT])
-                .copy_from_slice(bytes);
-            parameters
-        };
-        let status = &self.status;
-        Ok(TrainerState {
-            parameters: array(PARAMETERS),
-            moments: [array(MEANS), array(SQUARES)],
-            kept: array(KEPT),
-            seen: EarlyStopState {
-                best: (status.seen == 1).then_some(status.seen_best),
-                without_progress: status.without_progress as usize,
-            },
-            iterations: status.iterations as usize,
-            best_iteration: status.best_iteration as usize,
-            best_loss: widened(status.best_loss),
-        })
+    fn state(&mut self) -> Result<Option<TrainerState>, BackendError> {
+        self.read_state().map(Some)
     }
 
     fn restore(&mut self, state: TrainerState) -> Result<(), BackendError> {

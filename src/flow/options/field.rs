@@ -1,9 +1,12 @@
 //! Options of the fit of a field.
 
+use std::borrow::Cow;
+
 use super::loss::{ChamferOptions, DistanceLossOptions, LossOptions, NearestSearch};
 use super::model::{
     InputNormalization, LinearOptions, ModelOptions, NetworkOptions, Precision, Start,
 };
+use crate::flow::data::Point;
 
 /// Options of the fit of a field to one pair.
 ///
@@ -24,6 +27,9 @@ pub struct FieldOptions {
     /// are used in turn. Larger batches give less noisy gradients at a proportionally higher cost
     /// per iteration.
     pub batch: Option<usize>,
+    /// Growth of the batch during the fit, from `batch` points to all; none for a constant batch.
+    /// The CPU alone has it.
+    pub growth: Option<BatchGrowth>,
     /// Which iteration's parameters become the result.
     pub result: ResultChoice,
     /// Early stopping before `max_iterations`; none to do all iterations.
@@ -32,6 +38,9 @@ pub struct FieldOptions {
     /// schedule reaches a learning rate of zero there. Under a deadline the same work may be
     /// divided into more iterations of smaller batches.
     pub max_iterations: usize,
+    /// Bird's eye view: the fit sees the points' x and y alone, and the flow has no z, as in the
+    /// ablation of FNSF. For a network on the CPU.
+    pub bev: bool,
     /// Warm start: in a sequence, the fit of a pair starts from the field of the previous pair, and
     /// the registration from its ego motion. With none, each pair starts from new weights and is
     /// independent of the others.
@@ -48,12 +57,14 @@ impl FieldOptions {
             learning_rate,
             learning_rate_schedule: LearningRateSchedule::Constant,
             batch: None,
+            growth: None,
             result: ResultChoice::Best,
             early_stop: Some(EarlyStopOptions {
                 patience,
                 min_delta: 1e-3,
             }),
             max_iterations: 5000,
+            bev: false,
             warm_start: None,
         }
     }
@@ -78,9 +89,11 @@ impl FieldOptions {
             learning_rate: 0.004,
             learning_rate_schedule: LearningRateSchedule::Cosine,
             batch: Some(2048),
+            growth: None,
             result: ResultChoice::Average { decay: 0.9 },
             early_stop: None,
             max_iterations: 150,
+            bev: false,
             warm_start: Some(WarmStart {
                 max_iterations: 75,
                 learning_rate: 0.004,
@@ -93,10 +106,7 @@ impl FieldOptions {
     /// that of its text.
     pub(super) fn nsfp(search: NearestSearch) -> Self {
         Self {
-            loss: LossOptions::Chamfer(ChamferOptions {
-                truncation_m: 2.0,
-                search,
-            }),
+            loss: LossOptions::Chamfer(ChamferOptions::published(search)),
             learning_rate: 0.003,
             early_stop: Some(EarlyStopOptions {
                 patience: 100,
@@ -114,9 +124,21 @@ impl FieldOptions {
         self
     }
 
-    /// Whether the fit has kernels for a GPU: that of one network to a distance transform.
+    /// Whether the fit has kernels for a GPU: that of one network to a distance transform, with a
+    /// constant batch and in three dimensions.
     pub fn runs_on_gpu(&self) -> bool {
-        self.loss.distance().is_some() && self.network().is_some() && !self.has_cycle()
+        let one_network = self.network().is_some_and(|network| !network.cycle);
+        let plain = self.growth.is_none() && !self.bev;
+        one_network && self.loss.distance().is_some() && plain
+    }
+
+    /// The points as the fit sees them: with z = 0 in bird's eye view.
+    pub(crate) fn seen<'a>(&self, points: &'a [Point]) -> Cow<'a, [Point]> {
+        if self.bev {
+            Cow::Owned(points.iter().map(|&[x, y, _]| [x, y, 0.0]).collect())
+        } else {
+            Cow::Borrowed(points)
+        }
     }
 
     /// Whether the fit has the cycle consistency of NSFP.
@@ -186,6 +208,7 @@ impl FieldOptions {
         Self {
             learning_rate_schedule: LearningRateSchedule::Cosine,
             batch: Some(batch),
+            growth: None,
             result: ResultChoice::Average { decay: 0.9 },
             early_stop: None,
             max_iterations: iterations,
@@ -230,6 +253,20 @@ impl DeadlineLimits {
             least_iterations: if ego { 40 } else { 10 },
         }
     }
+}
+
+/// Growth of the batch during a fit: when it doubles. It stops at all points.
+///
+/// FNSF's Section 5 samples few points first and more later, without numbers; these are ours. Early
+/// stopping while points are missing doubles the batch instead of ending the fit, and with each
+/// doubling early stopping and the best iteration begin anew.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum BatchGrowth {
+    /// After every so many iterations. Zero counts as 1.
+    Iterations(usize),
+    /// Each time the mean loss has fallen by this share since the last doubling, 0 to 1. Values
+    /// outside are clamped.
+    LossFall(f32),
 }
 
 /// Schedule of the learning rate.

@@ -103,6 +103,37 @@ pub struct ChamferOptions {
     /// How nearest neighbors are searched. It does not change which ones they are, except among
     /// equally near ones.
     pub search: NearestSearch,
+    /// How often nearest neighbors are searched again; none for every iteration. Between two
+    /// searches each point keeps its neighbors.
+    pub renewal: Option<Renewal>,
+}
+
+impl ChamferOptions {
+    /// The truncation of FNSF's comparison, 2 m, with neighbors from every iteration.
+    pub fn published(search: NearestSearch) -> Self {
+        Self {
+            truncation_m: 2.0,
+            search,
+            renewal: None,
+        }
+    }
+}
+
+/// When the nearest neighbors of a Chamfer distance are searched again (FNSF Section 5, without
+/// numbers there).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Renewal {
+    /// Number of first iterations that each search again.
+    pub first: usize,
+    /// Number of iterations from one search to the next after those. Zero counts as 1.
+    pub every: usize,
+}
+
+impl Renewal {
+    /// Whether the iteration after `done` others searches again.
+    pub(crate) fn is_due(self, done: usize) -> bool {
+        done < self.first || (done - self.first).is_multiple_of(self.every.max(1))
+    }
 }
 
 /// How nearest neighbors are searched.

@@ -10,8 +10,10 @@ mod pair;
 mod preset;
 
 pub(crate) use field::DeadlineLimits;
-pub use field::{EarlyStopOptions, FieldOptions, LearningRateSchedule, ResultChoice, WarmStart};
-pub use loss::{ChamferOptions, DistanceLossOptions, LossOptions, NearestSearch};
+pub use field::{
+    BatchGrowth, EarlyStopOptions, FieldOptions, LearningRateSchedule, ResultChoice, WarmStart,
+};
+pub use loss::{ChamferOptions, DistanceLossOptions, LossOptions, NearestSearch, Renewal};
 pub use model::{
     InputNormalization, LinearOptions, ModelOptions, NetworkOptions, Precision, Start,
 };

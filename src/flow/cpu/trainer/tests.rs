@@ -12,7 +12,13 @@ use crate::flow::field::{
     Backend, MOST_POINTS, PreparedTarget, ReferenceLoss, chamfer_distance, first_cycle_losses,
     first_losses, mean_distance,
 };
-use crate::flow::options::{FieldOptions, Preset};
+use crate::flow::options::{BatchGrowth, FieldOptions, LossOptions, Preset, Renewal};
+
+/// The state of `trainer`.
+fn state(trainer: &mut dyn Trainer) -> TrainerState {
+    let state = trainer.state().expect("the cpu does not fail");
+    state.expect("the state is whole")
+}
 
 /// Records the losses.
 #[derive(Default)]
@@ -179,7 +185,7 @@ fn more_chunks_than_are_held_at_once_are_each_added_up_once() {
     // After one step from zero moments, the mean of the gradients is a tenth of the gradient. That
     // is the sum of the chunks' gradients. A trainer of one chunk's points finds that chunk's
     // gradient, up to the weight of the batch.
-    let whole = trainer.state().expect("the cpu does not fail").moments[0].clone();
+    let whole = state(trainer.as_mut()).moments[0].clone();
     let mut sums = vec![0.0f64; whole.as_slice().len()];
     for chunk in 0..chunks {
         let own = Chunks::new(points).points(chunk);
@@ -187,7 +193,7 @@ fn more_chunks_than_are_held_at_once_are_each_added_up_once() {
         let mut part = target.start(own, &options, 0).expect("a trainer");
         part.advance(1, &Uncontrolled)
             .expect("the cpu does not fail");
-        let state = part.state().expect("the cpu does not fail");
+        let state = state(part.as_mut());
         let share = own.len() as f64 / points as f64;
         for (sum, mean) in sums.iter_mut().zip(state.moments[0].as_slice()) {
             *sum += f64::from(*mean) * share;
@@ -269,5 +275,89 @@ fn a_target_for_one_kind_of_loss_refuses_a_fit_to_another() {
         let target = prepared(Isa::Portable, 1, &source, &target, options);
         let refused = target.start(&source, other, 0).err();
         assert!(matches!(refused, Some(BackendError::Unsupported(_))));
+    }
+}
+
+#[test]
+fn a_fit_with_growing_batches_and_rare_searches_resumes_with_the_same_bits() {
+    let mut renewed = Preset::NsfpBaseline.field();
+    let LossOptions::Chamfer(loss) = &mut renewed.loss else {
+        panic!("a Chamfer distance");
+    };
+    loss.renewal = Some(Renewal { first: 6, every: 5 });
+    let mut grown = Preset::Paper.field();
+    let mut both = renewed.clone();
+    for options in [&mut grown, &mut both] {
+        options.batch = Some(100);
+        options.growth = Some(BatchGrowth::LossFall(0.1));
+    }
+    let [source, target] = clouds(1500);
+    for options in [renewed, grown, both] {
+        let target = prepared(Isa::available()[0], 2, &source, &target, &options);
+        let start = || target.start(&source, &options, 0).expect("a trainer");
+        let advance = |trainer: &mut dyn Trainer, steps| {
+            let advance = trainer.advance(steps, &Uncontrolled);
+            assert_eq!(advance.expect("the cpu does not fail"), Advance::Continues);
+        };
+        let mut whole = start();
+        advance(whole.as_mut(), 17);
+        let mut resumed = start();
+        let mut stored = 0;
+        for done in 1..=17 {
+            advance(resumed.as_mut(), 1);
+            if let Some(state) = resumed.state().expect("the cpu does not fail") {
+                assert_eq!(state.iterations, done);
+                resumed = start();
+                resumed.restore(state).expect("its own state");
+                stored += 1;
+            }
+        }
+        assert!(stored > 5, "{stored} states");
+        let whole = whole.evaluate(&source).expect("the cpu does not fail");
+        let resumed = resumed.evaluate(&source).expect("the cpu does not fail");
+        assert_eq!(whole, resumed);
+    }
+}
+
+#[test]
+fn a_rare_search_keeps_the_neighbors_of_the_last_one() {
+    let mut options = Preset::NsfpKdtree.field();
+    let mut losses_of = |renewal| {
+        let LossOptions::Chamfer(loss) = &mut options.loss else {
+            panic!("a Chamfer distance");
+        };
+        loss.renewal = renewal;
+        fitted(Isa::available()[0], 2, &options, 12).0
+    };
+    let always = losses_of(None);
+    let rarely = losses_of(Some(Renewal { first: 4, every: 4 }));
+    // The fifth iteration searches, the sixth does not.
+    assert_eq!(always[..5], rarely[..5]);
+    assert_ne!(always[5..], rarely[5..]);
+    assert_eq!(always, losses_of(Some(Renewal { first: 0, every: 1 })));
+}
+
+#[test]
+fn in_birds_eye_view_the_flow_has_no_z_and_does_not_depend_on_it() {
+    for preset in [Preset::Paper, Preset::Nsfp] {
+        let mut options = preset.field();
+        options.bev = true;
+        let [source, target] = clouds(400);
+        let [source, target] = [&source, &target].map(|cloud| options.seen(cloud).into_owned());
+        let prepared = prepared(Isa::available()[0], 2, &source, &target, &options);
+        let mut trainer = prepared.start(&source, &options, 0).expect("a trainer");
+        trainer
+            .advance(20, &Uncontrolled)
+            .expect("the cpu does not fail");
+        let flow = trainer.evaluate(&source).expect("the cpu does not fail");
+        assert!(flow.iter().all(|flow| flow[2] == 0.0 && flow[0] != 0.0));
+        let Ok(FittedField::Network(network)) = trainer.fitted() else {
+            panic!("a network");
+        };
+        let backend = CpuBackend::new(Some(2)).expect("threads");
+        let lifted: Vec<Point> = source.iter().map(|&[x, y, _]| [x, y, 3.0]).collect();
+        for points in [&source, &lifted] {
+            assert_eq!(backend.evaluate(&network, points).expect("flows"), flow);
+        }
     }
 }

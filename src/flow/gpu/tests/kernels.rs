@@ -143,7 +143,7 @@ pub(super) fn after_one(
 ) -> TrainerState {
     let mut trainer = gpu.start(source, options, 0).expect("a trainer");
     trainer.advance(1, &Uncontrolled).expect("an iteration");
-    trainer.state().expect("an answer")
+    trainer.state().expect("an answer").expect("whole")
 }
 
 #[test]

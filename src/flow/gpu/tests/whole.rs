@@ -221,7 +221,7 @@ fn a_pair_put_down_and_taken_up_again_has_the_same_bits() {
             .expect("small clouds fit");
         let mut first = transform.start(&source, &options, 0).expect("a trainer");
         first.advance(5, &Uncontrolled).expect("iterations");
-        let state = first.state().expect("an answer");
+        let state = first.state().expect("an answer").expect("whole");
         drop(first);
         let mut second = transform.start(&source, &options, 0).expect("a trainer");
         second.restore(state).expect("memory");
