@@ -20,8 +20,8 @@ from pathlib import Path
 import grpc
 from clouds import BadFile, Cloud, mean_length, read_cloud, write_flow
 
-PRESETS = ["default", "label", "neural", "paper", "nsfp-baseline", "nsfp", "nsfp-kdtree"]
-PRESETS += ["fnsf-linear", "nsfp-linear", "nsfp-kdtree-linear"]
+PRESETS = ["default", "label", "neural", "paper", "nsfp-baseline", "nsfp"]
+PRESETS += ["nsfp++", "nsfp++-dt", "nsfp-kdtree", "fnsf-linear", "nsfp-linear", "nsfp-kdtree-linear"]
 # 48 Ki points and their flags stay below the 1 MiB that the server takes in a message.
 CHUNK_POINTS = 48 * 1024
 REPOSITORY_PROTO = Path(__file__).resolve().parents[2] / "proto"

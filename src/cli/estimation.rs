@@ -25,7 +25,8 @@ pub(super) struct Estimation {
     /// neural field to the remaining motion. paper: FNSF (ICCV 2023) with its published settings.
     /// nsfp-baseline: the baseline of that paper, a network fitted to the truncated Chamfer distance
     /// on the CPU, minutes for full clouds. nsfp: the same with NSFP's second network, which leads the
-    /// points back. nsfp-kdtree: the baseline with k-d trees. fnsf-linear, nsfp-linear,
+    /// points back. nsfp++, nsfp++-dt: ego motion, then a fit of this kind for each cluster of points,
+    /// with the Chamfer distance or distance transforms. nsfp-kdtree: the baseline with k-d trees. fnsf-linear, nsfp-linear,
     /// nsfp-kdtree-linear: that paper's linear model with the three losses
     #[arg(long, value_enum, default_value_t)]
     preset: PresetChoice,
@@ -61,12 +62,13 @@ pub(super) struct Estimation {
     /// Treatment of ground points. keep: like any other point. mask: points in the pair's masks
     /// ground1 and ground2 take no part and get no flow. auto: ground points, from the masks or
     /// else from ground segmentation, get the flow of the ego motion. By default auto for
-    /// default, label and neural, else keep
+    /// default, label, neural and nsfp++, else keep
     #[arg(long, value_enum)]
     ground: Option<GroundChoice>,
     /// Ego motion between the sweeps. off: not estimated separately. auto: estimated first. FILE:
     /// given, as the 16 numbers of the 4 x 4 matrix target_from_source, row by row, or as an .npz
-    /// pair with ego_SE3. By default auto for default, label and neural, else off
+    /// pair with ego_SE3. By default auto for default, label, neural and
+    /// nsfp++, else off
     #[arg(long, value_name = "off|auto|FILE")]
     ego: Option<String>,
     /// Poses of all sweeps, from which the ego motion is taken: KITTI's text (12 numbers a line), a

@@ -36,6 +36,11 @@ const CORRESPONDENCE_BYTES: usize = 128;
 const PLACED_BYTES: usize = 64;
 /// Work of the linear model per point and iteration, with the distance query, multiply-adds.
 const BLENDED: f64 = 1e4;
+/// Assumed number of points of a partition's cluster, in both clouds: the mean over the points of
+/// three sweeps is 300 to 1,900.
+const CLUSTER_POINTS: usize = 1000;
+/// Work of the local consistency per pair of points, multiply-adds.
+const CONSISTENCY: f64 = 20.0;
 /// Parameter sets held at once: the network, its transposes, its optimizer and the result (6), and
 /// the largest number of gradient chunks (32).
 const PARAMETER_SETS: usize = 6 + 32;
@@ -170,6 +175,10 @@ fn field_cost(clouds: [&[Point]; 2], options: &FieldOptions) -> Result<MethodCos
     let batch = options.batch.unwrap_or(source.len()).min(source.len());
     let iterations = options.expected_iterations() as f64;
     let mut cost = target_cost(clouds, batch, options)?;
+    if options.consistency_weight > 0.0 {
+        let others = batch.min(CLUSTER_POINTS) as f64;
+        cost.multiply_adds += iterations * batch as f64 * others * CONSISTENCY;
+    }
     let mut networks = 1;
     if options.has_cycle() {
         let back = target_cost([source, source], batch, options)?;
@@ -221,11 +230,15 @@ fn target_cost(
         }
         LossOptions::Chamfer(loss) => {
             check_chamfer(loss, target).map_err(FlowError::Backend)?;
+            let searched = match options.partition {
+                None => target.len(),
+                Some(_) => target.len().min(CLUSTER_POINTS),
+            };
             MethodCost {
                 bricks: 0,
                 transform_bytes: size_of_val(target),
                 bytes: (batch + target.len()) * CORRESPONDENCE_BYTES,
-                multiply_adds: iterations * chamfer_work(loss.search, batch, target.len()),
+                multiply_adds: iterations * chamfer_work(loss.search, batch, searched),
             }
         }
     })

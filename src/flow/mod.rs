@@ -67,7 +67,7 @@ pub use error::FlowError;
 pub use estimate::{Estimate, FieldSolution, ObjectSolution, Solution, estimate, resume};
 pub use field::{Network, Snapshot, SnapshotError, TrainerState};
 pub use host::{Host, HostError};
-pub use motion::{MotionField, Residual};
+pub use motion::{MotionField, Residual, SampledMotion};
 pub use objects::{
     CONFIDENT_WITHIN_M, Cluster, ClusterLabels, ConfidenceFeatures, ObjectMotions, ObjectSearch,
     Objects, SearchClouds, confidence_of_ground,

@@ -62,6 +62,19 @@ pub struct FieldChoices {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_iterations: Option<u32>,
+    /// Learning rate of the first iteration, above 0
+    #[arg(long, value_name = "RATE")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub learning_rate: Option<f32>,
+    /// Early stopping: ends the fit after N iterations without progress
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub patience: Option<u32>,
+    /// Early stopping: the decrease of the mean loss that counts as progress, in its unit, metres or
+    /// square metres; 0 or more
+    #[arg(long, value_name = "LOSS")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub min_delta: Option<f64>,
     /// Bird's eye view: the flow is estimated in x and y from the points' x and y alone. For a
     /// network, on the CPU
     #[arg(long)]
@@ -87,6 +100,7 @@ impl FieldChoices {
         let is_chamfer = matches!(loss, Some(LossOptions::Chamfer(_)));
         let is_linear = field.is_some_and(|field| matches!(field.model, ModelOptions::Linear(_)));
         let is_network = field.is_some_and(|field| field.network().is_some());
+        let stops = field.is_some_and(|field| field.early_stop.is_some());
         let uses = [
             ("cell_m", self.cell_m.is_some(), is_distance),
             ("truncation_m", self.truncation_m.is_some(), is_chamfer),
@@ -110,6 +124,13 @@ impl FieldChoices {
                 self.max_iterations.is_some(),
                 field.is_some(),
             ),
+            (
+                "learning_rate",
+                self.learning_rate.is_some(),
+                field.is_some(),
+            ),
+            ("patience", self.patience.is_some(), stops),
+            ("min_delta", self.min_delta.is_some(), stops),
             ("bev", self.bev, is_network),
         ];
         if let Some((option, ..)) = uses.into_iter().find(|&(_, given, used)| given && !used) {
@@ -133,10 +154,28 @@ impl FieldChoices {
                 "field.first_points needs one of field.double_every and field.double_at_fall, and they need it",
             );
         }
-        if [self.first_points, self.double_every, self.renew_every].contains(&Some(0)) {
+        let counts = [
+            self.first_points,
+            self.double_every,
+            self.renew_every,
+            self.patience,
+        ];
+        if counts.contains(&Some(0)) {
             return refused(
-                "field.first_points, field.double_every and field.renew_every are at least 1",
+                "field.first_points, double_every, renew_every and patience are at least 1",
             );
+        }
+        if self
+            .learning_rate
+            .is_some_and(|rate| !(rate > 0.0 && rate.is_finite()))
+        {
+            return refused("field.learning_rate is a finite number above 0");
+        }
+        if self
+            .min_delta
+            .is_some_and(|delta| !(delta >= 0.0 && delta.is_finite()))
+        {
+            return refused("field.min_delta is a finite number, 0 or more");
         }
         if self
             .double_at_fall
@@ -186,6 +225,11 @@ impl FieldChoices {
         }
         if let Some(most) = self.max_iterations {
             field.max_iterations = most as usize;
+        }
+        field.learning_rate = self.learning_rate.unwrap_or(field.learning_rate);
+        if let Some(rule) = &mut field.early_stop {
+            rule.patience = self.patience.map_or(rule.patience, |count| count as usize);
+            rule.min_delta = self.min_delta.unwrap_or(rule.min_delta);
         }
         field.bev = self.bev;
     }
@@ -304,6 +348,13 @@ mod tests {
                 "paper",
                 r#"{"max_iterations":0}"#,
                 "field.max_iterations is 1 to 1000000",
+            ),
+            ("paper", r#"{"learning_rate":0}"#, "a finite number above 0"),
+            ("paper", r#"{"min_delta":-1}"#, "a finite number, 0 or more"),
+            (
+                "neural",
+                r#"{"patience":5}"#,
+                "field.patience has no effect with preset neural",
             ),
             ("paper", r#"{"sigma":1}"#, "unknown field `sigma`"),
             (

@@ -2,6 +2,7 @@
 //!
 //! Shared by the protocols, the queue and the workers. Independent of them.
 
+mod choices;
 mod densify;
 mod device;
 mod error;
@@ -12,11 +13,12 @@ mod record;
 mod report;
 mod sequence;
 
+pub use choices::{EgoChoice, GroundChoice, PrecisionChoice, PresetChoice, Priority};
 pub use densify::{Densify, LaterSweepsChoice};
 pub use device::{DeviceChoice, DeviceKind};
 pub use error::InvalidOptions;
 pub use field::FieldChoices;
 pub use id::{InvalidId, JobId, Tenant};
-pub use options::{EgoChoice, GroundChoice, JobOptions, PrecisionChoice, PresetChoice, Priority};
+pub use options::JobOptions;
 pub use record::{Job, JobError, JobProgress, Kind, State};
 pub use report::{DenseReport, PhaseSeconds, Report};

@@ -3,18 +3,15 @@
 //! Every option has a default, and unknown keys are refused. This module maps the names to the
 //! solver's options. The values of the presets are in `flow/options/`.
 
-use std::str::FromStr;
-
-use serde::de::Error as _;
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+use super::choices::{EgoChoice, GroundChoice, PrecisionChoice, PresetChoice, Priority};
 use super::densify::Densify;
 use super::device::{DeviceChoice, DeviceKind};
 use super::error::{InvalidOptions, MAX_DEADLINE, MAX_DT_S};
 use super::field::FieldChoices;
-use crate::flow::{self, Ego, FieldOptions, Ground, MIN_POINTS, Precision, Preset, RigidTransform};
-use crate::formats::{ego_motion, matrix_rows};
+use crate::flow::{self, Ego, FieldOptions, Ground, MIN_POINTS, Precision};
 
 /// Options of a pair or of a sequence.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
@@ -25,7 +22,8 @@ pub struct JobOptions {
     /// five sweeps. `neural`: a short, robust fit of a neural field. `paper`: FNSF as published.
     /// `nsfp-baseline`: the baseline that FNSF is compared with, a network fitted to the truncated
     /// Chamfer distance. `nsfp`: the same with NSFP's second network, which leads the points back.
-    /// `nsfp-kdtree`: the baseline with k-d trees. `fnsf-linear`, `nsfp-linear`,
+    /// `nsfp++`, `nsfp++-dt`: ego motion, then a fit of this kind for each cluster, with the Chamfer
+    /// distance or distance transforms. `nsfp-kdtree`: the baseline with k-d trees. `fnsf-linear`, `nsfp-linear`,
     /// `nsfp-kdtree-linear`: FNSF's linear model with the three losses.
     pub preset: PresetChoice,
     /// Seed of the random numbers. On the same device, the same input, options and seed give a
@@ -49,13 +47,13 @@ pub struct JobOptions {
     /// ground masks are left out and get no flow; refused if a mask is missing. `auto`: ground
     /// points are left out of the method and get the ego-motion flow, or none with `max_points` or
     /// without ego motion; they are taken from the masks, or from a ground segmentation if there
-    /// are none. Clouds that are nearly all ground keep it. Default: `auto`; `keep` with
-    /// the presets after `neural`.
+    /// are none. Clouds that are nearly all ground keep it. Default: `auto`; `keep` with the presets
+    /// after `neural`, except `nsfp++` and `nsfp++-dt`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ground: Option<GroundChoice>,
     /// The ego motion: `off` (not separated), `auto` (estimated first) or a 4 x 4 matrix
     /// target_from_source, translation in metres. Default: `auto`; `off` with the presets after
-    /// `neural`.
+    /// `neural`, except `nsfp++` and `nsfp++-dt`.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<Object>)]
     pub ego: Option<EgoChoice>,
@@ -79,171 +77,6 @@ pub struct JobOptions {
     /// Also computes one dense cloud of a sequence, in addition to its flows.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub densify: Option<Densify>,
-}
-
-/// A named set of solver options.
-#[derive(
-    Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema, clap::ValueEnum,
-)]
-#[serde(rename_all = "kebab-case")]
-pub enum PresetChoice {
-    /// Rigid motion of each object; the remaining points move with the ego motion.
-    #[default]
-    Default,
-    /// As default, and a pair of a sequence also uses its neighbor sweeps.
-    Label,
-    /// A short, robust fit of a neural field.
-    Neural,
-    /// FNSF as published.
-    Paper,
-    /// The baseline of FNSF's comparison: a network fitted to the truncated Chamfer distance.
-    NsfpBaseline,
-    /// NSFP: as nsfp-baseline, with a second network that leads the points back.
-    Nsfp,
-    /// As nsfp-baseline, with k-d trees for the nearest neighbors.
-    NsfpKdtree,
-    /// The linear model of FNSF's comparison, fitted to the distance transform.
-    FnsfLinear,
-    /// The linear model, fitted to the truncated Chamfer distance.
-    NsfpLinear,
-    /// As nsfp-linear, with k-d trees for the nearest neighbors.
-    NsfpKdtreeLinear,
-}
-
-impl PresetChoice {
-    /// The solver's preset.
-    pub fn preset(self) -> Preset {
-        match self {
-            Self::Default => Preset::Default,
-            Self::Label => Preset::Label,
-            Self::Neural => Preset::Neural,
-            Self::Paper => Preset::Paper,
-            Self::NsfpBaseline => Preset::NsfpBaseline,
-            Self::Nsfp => Preset::Nsfp,
-            Self::NsfpKdtree => Preset::NsfpKdtree,
-            Self::FnsfLinear => Preset::FnsfLinear,
-            Self::NsfpLinear => Preset::NsfpLinear,
-            Self::NsfpKdtreeLinear => Preset::NsfpKdtreeLinear,
-        }
-    }
-}
-
-/// Treatment of ground points.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema, clap::ValueEnum)]
-#[serde(rename_all = "snake_case")]
-pub enum GroundChoice {
-    /// As any other point.
-    Keep,
-    /// Points marked in the masks ground1 and ground2 of the pair are left out.
-    Mask,
-    /// Ground points move with the ego motion. They are taken from the masks, or segmented if there
-    /// are no masks.
-    Auto,
-}
-
-/// Precision of the network's matrix products during the fit of a field, see
-/// [`crate::flow::Precision`].
-#[derive(
-    Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema, clap::ValueEnum,
-)]
-#[serde(rename_all = "snake_case")]
-pub enum PrecisionChoice {
-    /// Single precision.
-    #[default]
-    F32,
-    /// Half-precision factors in the layers from 128 to 128 features, on the matrix units of a GPU.
-    /// Refused for the device `cpu` and for presets that fit no field.
-    F16,
-}
-
-impl FromStr for PrecisionChoice {
-    type Err = InvalidOptions;
-
-    fn from_str(text: &str) -> Result<Self, Self::Err> {
-        match text {
-            "f32" => Ok(Self::F32),
-            "f16" => Ok(Self::F16),
-            _ => Err(InvalidOptions::Precision(text.to_owned())),
-        }
-    }
-}
-
-/// Priority of a job. Jobs of a higher priority always start first. Within one priority, tenants
-/// share fairly.
-#[derive(
-    Clone,
-    Copy,
-    Debug,
-    Default,
-    PartialEq,
-    Eq,
-    PartialOrd,
-    Ord,
-    Hash,
-    Serialize,
-    Deserialize,
-    ToSchema,
-)]
-#[serde(rename_all = "snake_case")]
-pub enum Priority {
-    /// Batch work.
-    Low,
-    /// The default.
-    #[default]
-    Normal,
-    /// Interactive work.
-    High,
-}
-
-impl Priority {
-    /// All priorities, lowest first.
-    pub const ALL: [Self; 3] = [Self::Low, Self::Normal, Self::High];
-
-    /// The name in requests and metrics.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Low => "low",
-            Self::Normal => "normal",
-            Self::High => "high",
-        }
-    }
-}
-
-/// The ego motion of a pair.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum EgoChoice {
-    /// Not removed: it is part of the flow that the method estimates.
-    Off,
-    /// Estimated first.
-    Auto,
-    /// Given as target_from_source, translation in metres.
-    Given(RigidTransform),
-}
-
-impl Serialize for EgoChoice {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        match self {
-            Self::Off => serializer.serialize_str("off"),
-            Self::Auto => serializer.serialize_str("auto"),
-            Self::Given(motion) => matrix_rows(motion).serialize(serializer),
-        }
-    }
-}
-
-impl<'de> Deserialize<'de> for EgoChoice {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let wanted = "ego is \"off\", \"auto\" or a 4 x 4 rigid matrix target_from_source";
-        match serde_json::Value::deserialize(deserializer)? {
-            serde_json::Value::String(name) if name == "off" => Ok(Self::Off),
-            serde_json::Value::String(name) if name == "auto" => Ok(Self::Auto),
-            rows @ serde_json::Value::Array(_) => {
-                let rows: [[f64; 4]; 4] =
-                    serde_json::from_value(rows).map_err(|_| D::Error::custom(wanted))?;
-                ego_motion(&rows).map(Self::Given).map_err(D::Error::custom)
-            }
-            _ => Err(D::Error::custom(wanted)),
-        }
-    }
 }
 
 /// Whether nothing is chosen.
@@ -385,6 +218,7 @@ impl JobOptions {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::flow::Preset;
 
     #[test]
     fn an_empty_object_is_the_default_and_every_option_comes_back() {

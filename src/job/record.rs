@@ -3,9 +3,9 @@
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+use super::choices::Priority;
 use super::device::DeviceKind;
 use super::id::{JobId, Tenant};
-use super::options::Priority;
 use crate::clock::Timestamp;
 
 /// The state of a job. The last four are final: only a requeue leaves them.

@@ -1,8 +1,9 @@
 //! The options of a sequence: whether its pairs depend on each other, and the number of sweeps that
 //! a pair uses.
 
+use super::choices::EgoChoice;
 use super::error::InvalidOptions;
-use super::options::{EgoChoice, JobOptions};
+use super::options::JobOptions;
 
 impl JobOptions {
     /// Rejects `densify`, which only a sequence that is submitted as a job can have.

@@ -347,6 +347,8 @@ fn every_method_of_the_paper_gives_a_flow_and_refuses_a_gpu_that_it_has_no_kerne
     for (preset, unit) in [
         ("nsfp-baseline", "m²"),
         ("nsfp", "m²"),
+        ("nsfp++", "m²"),
+        ("nsfp++-dt", "m"),
         ("nsfp-kdtree", "m²"),
         ("fnsf-linear", "m"),
         ("nsfp-linear", "m²"),

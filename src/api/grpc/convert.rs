@@ -35,6 +35,8 @@ pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, Api
         Ok(proto::Preset::Paper) => PresetChoice::Paper,
         Ok(proto::Preset::NsfpBaseline) => PresetChoice::NsfpBaseline,
         Ok(proto::Preset::Nsfp) => PresetChoice::Nsfp,
+        Ok(proto::Preset::NsfpPlusPlus) => PresetChoice::NsfpPlusPlus,
+        Ok(proto::Preset::NsfpPlusPlusDt) => PresetChoice::NsfpPlusPlusDt,
         Ok(proto::Preset::NsfpKdtree) => PresetChoice::NsfpKdtree,
         Ok(proto::Preset::FnsfLinear) => PresetChoice::FnsfLinear,
         Ok(proto::Preset::NsfpLinear) => PresetChoice::NsfpLinear,
@@ -96,6 +98,9 @@ fn field(message: proto::FieldOptions) -> FieldChoices {
         double_at_fall: message.double_at_fall,
         renew_every: message.renew_every,
         max_iterations: message.max_iterations,
+        learning_rate: message.learning_rate,
+        patience: message.patience,
+        min_delta: message.min_delta,
         bev: message.bev,
     }
 }

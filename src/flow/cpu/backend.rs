@@ -16,9 +16,9 @@ use super::trainer::CpuTrainer;
 use crate::flow::data::{Control, Point, Random, Uncontrolled};
 use crate::flow::distance::DistanceTransform;
 use crate::flow::field::{
-    Backend, BackendError, ChamferLoss, Conditioning, CycleLoss, DistanceLoss, LinearGrid, Loss,
-    NearestSearcher, Network, Parameters, PreparedTarget, Schedule, Trainer, check_chamfer, length,
-    mlp,
+    Backend, BackendError, ChamferLoss, Conditioning, ConsistencyLoss, CycleLoss, DistanceLoss,
+    LinearGrid, Loss, NearestSearcher, Network, Parameters, PreparedTarget, Schedule, Trainer,
+    check_chamfer, length, mlp,
 };
 use crate::flow::host::Host;
 use crate::flow::options::{
@@ -189,7 +189,13 @@ impl Fits {
         parameters: Parameters,
     ) -> Box<dyn Trainer + 'a> {
         let threads = Arc::clone(&self.threads);
-        Box::new(CpuTrainer::new(threads, model, loss, schedule, parameters))
+        let weight = schedule.options.consistency_weight;
+        if weight > 0.0 {
+            let loss = ConsistencyLoss::new(loss, weight, Arc::clone(&threads));
+            Box::new(CpuTrainer::new(threads, model, loss, schedule, parameters))
+        } else {
+            Box::new(CpuTrainer::new(threads, model, loss, schedule, parameters))
+        }
     }
 }
 

@@ -62,7 +62,10 @@ pub(super) fn residual_motion(
                     network,
                     has_ego: field.ego.is_some(),
                 }),
-                Residual::Still | Residual::Linear(_) | Residual::Objects(_) => None,
+                Residual::Still
+                | Residual::Linear(_)
+                | Residual::Objects(_)
+                | Residual::Sampled(_) => None,
             }),
             aligned: &options.seen(&aligned),
             ego: ego.as_ref(),

@@ -4,6 +4,7 @@
 //! Problem - select - ego motion - by objects or by field - Estimate
 //! ```
 
+mod by_cluster;
 mod by_field;
 mod by_objects;
 mod ego_motion;

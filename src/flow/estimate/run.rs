@@ -1,5 +1,6 @@
 //! The estimate of a pair: selection, ego motion, residual motion by the method, assembly.
 
+use super::by_cluster;
 use super::by_field;
 use super::by_objects;
 use super::method::{Input, Solved};
@@ -69,10 +70,14 @@ fn estimate_from(
         control,
     };
     let solved = match &options.method {
-        // Only a field fit has snapshots.
+        // Only the fit of one field has snapshots.
         Method::Objects(_) if snapshot.is_some() => return Err(SnapshotError::Foreign.into()),
         Method::Objects(objects) => by_objects::residual_motion(backend.host(), &input, objects)?,
-        Method::Field(field) => by_field::residual_motion(backend, &input, field, snapshot)?,
+        Method::Field(field) => match &field.partition {
+            Some(_) if snapshot.is_some() => return Err(SnapshotError::Foreign.into()),
+            Some(partition) => by_cluster::residual_motion(backend, &input, field, partition)?,
+            None => by_field::residual_motion(backend, &input, field, snapshot)?,
+        },
     };
     Ok(assemble(&input, solved, began))
 }

@@ -22,6 +22,12 @@ const SMALL_FLOW_M: f32 = 1e-3;
 pub(crate) trait Output: Copy + Default + Send + Sync {
     /// All components times `factor`.
     fn scaled(self, factor: f32) -> Self;
+
+    /// The flow.
+    fn flow(self) -> Point;
+
+    /// The same with `more` added to the flow.
+    fn plus_flow(self, more: Point) -> Self;
 }
 
 /// A flow, metres.
@@ -30,6 +36,16 @@ impl Output for Point {
     fn scaled(self, factor: f32) -> Self {
         self.map(|component| component * factor)
     }
+
+    #[inline]
+    fn flow(self) -> Point {
+        self
+    }
+
+    #[inline]
+    fn plus_flow(self, more: Point) -> Self {
+        core::array::from_fn(|a| self[a] + more[a])
+    }
 }
 
 /// A flow, and the flow back from the deformed point, metres.
@@ -37,6 +53,16 @@ impl Output for [Point; 2] {
     #[inline]
     fn scaled(self, factor: f32) -> Self {
         self.map(|flow| flow.scaled(factor))
+    }
+
+    #[inline]
+    fn flow(self) -> Point {
+        self[0]
+    }
+
+    #[inline]
+    fn plus_flow(self, more: Point) -> Self {
+        [self[0].plus_flow(more), self[1]]
     }
 }
 

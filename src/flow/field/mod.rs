@@ -6,6 +6,7 @@ mod budget;
 mod chamfer;
 mod check;
 mod codec;
+mod consistency;
 mod cycle;
 mod early_stopping;
 mod error;
@@ -34,6 +35,7 @@ pub use snapshot::{Snapshot, SnapshotError, TrainerState};
 pub(crate) use budget::prepare_target;
 pub(crate) use chamfer::{ChamferLoss, NearestSearcher, chamfer_work, check_chamfer, grouped};
 pub(crate) use codec::{put_parameters, take_parameters};
+pub(crate) use consistency::ConsistencyLoss;
 pub(crate) use cycle::CycleLoss;
 pub(crate) use early_stopping::EarlyStop;
 #[cfg(feature = "gpu")]

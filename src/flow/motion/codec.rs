@@ -4,6 +4,7 @@
 //! ego: present u8, rotation i j k w, translation x y z: f64 each
 //!   | residual u8: 0 static | 1 network: center x y z, scale, parameters: f32 each
 //!   | 2 objects: as in `objects/codec.rs` | 3 linear: as in `field/linear.rs`
+//!   | 4 sampled: as in `samples.rs`
 //! ```
 //!
 //! The envelope (magic, version, checksum) is that of `data/codec.rs`. A missing ego motion is
@@ -14,6 +15,7 @@ use std::sync::Arc;
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 
 use super::motion_field::{MotionField, Residual};
+use super::samples::SampledMotion;
 use crate::flow::data::{Body, Envelope, EnvelopeError, RigidTransform};
 use crate::flow::field::{
     Conditioning, LAID_OUT, LinearField, Network, put_parameters, take_parameters,
@@ -28,6 +30,7 @@ const STILL: u8 = 0;
 const NETWORK: u8 = 1;
 const OBJECTS: u8 = 2;
 const LINEAR: u8 = 3;
+const SAMPLED: u8 = 4;
 /// Tolerance of a rotation quaternion's norm around 1: rounding of doubles.
 const UNIT: f64 = 1e-9;
 
@@ -60,6 +63,10 @@ impl MotionField {
                 bytes.push(OBJECTS);
                 motions.put(&mut bytes);
             }
+            Residual::Sampled(motion) => {
+                bytes.push(SAMPLED);
+                motion.put(&mut bytes);
+            }
         }
         ENVELOPE.close(bytes)
     }
@@ -87,6 +94,7 @@ impl MotionField {
             }),
             LINEAR => Residual::Linear(LinearField::take(&mut body)?),
             OBJECTS => Residual::Objects(Arc::new(ObjectMotions::take(&mut body)?)),
+            SAMPLED => Residual::Sampled(Arc::new(SampledMotion::take(&mut body)?)),
             _ => return Err(EnvelopeError::Damaged),
         };
         body.end()?;
@@ -132,8 +140,11 @@ mod tests {
             values: vec![0.25; 3 * grid.channel()],
             grid,
         });
+        let cloud = cloud.to_vec();
+        let sampled = Residual::Sampled(Arc::new(SampledMotion::new(cloud.clone(), cloud)));
         for (ego, residual) in [
             (None, linear),
+            (Some(motion), sampled),
             (Some(motion), network.clone()),
             (None, network),
             (Some(motion), Residual::Still),

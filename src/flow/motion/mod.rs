@@ -2,5 +2,7 @@
 
 mod codec;
 mod motion_field;
+mod samples;
 
 pub use motion_field::{MotionField, Residual};
+pub use samples::SampledMotion;

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use super::samples::SampledMotion;
 use crate::flow::data::{Point, RigidTransform, transform_points};
 use crate::flow::field::{Backend, BackendError, LinearField, Network};
 use crate::flow::objects::ObjectMotions;
@@ -29,6 +30,8 @@ pub enum Residual {
     Linear(LinearField),
     /// Rigid motions of the objects that an object search found.
     Objects(Arc<ObjectMotions>),
+    /// The displacements of the source points, from fields fitted to their clusters.
+    Sampled(Arc<SampledMotion>),
 }
 
 impl MotionField {
@@ -62,6 +65,10 @@ impl MotionField {
             Residual::Network(network) => backend.evaluate(network, static_positions),
             Residual::Linear(field) => Ok(field.flow(static_positions, backend.host().threads())),
             Residual::Objects(motions) => Ok(motions.residual_at(static_positions)),
+            Residual::Sampled(motion) => {
+                let threads = backend.host().threads();
+                Ok(threads.install(|| motion.displacements_at(static_positions)))
+            }
         }
     }
 }

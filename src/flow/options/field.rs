@@ -6,6 +6,7 @@ use super::loss::{ChamferOptions, DistanceLossOptions, LossOptions, NearestSearc
 use super::model::{
     InputNormalization, LinearOptions, ModelOptions, NetworkOptions, Precision, Start,
 };
+use super::partition::PartitionOptions;
 use crate::flow::data::Point;
 
 /// Options of the fit of a field to one pair.
@@ -18,6 +19,11 @@ pub struct FieldOptions {
     pub model: ModelOptions,
     /// The loss that the field is fitted to.
     pub loss: LossOptions,
+    /// A field of its own for each cluster of the source; none for one field. The CPU alone has it.
+    pub partition: Option<PartitionOptions>,
+    /// Weight of the local consistency of NSFP++: the mean over the points of the sum of their
+    /// flow's distances from all other flows, metres. Zero for none. The CPU alone has it.
+    pub consistency_weight: f32,
     /// Learning rate (Adam's step size) of the first iteration.
     pub learning_rate: f32,
     /// Schedule of the learning rate over the iterations.
@@ -54,6 +60,8 @@ impl FieldOptions {
         Self {
             model: ModelOptions::Network(NetworkOptions::published()),
             loss: LossOptions::Distance(DistanceLossOptions::published()),
+            partition: None,
+            consistency_weight: 0.0,
             learning_rate,
             learning_rate_schedule: LearningRateSchedule::Constant,
             batch: None,
@@ -86,6 +94,8 @@ impl FieldOptions {
                 precision: Precision::F32,
                 cycle: false,
             }),
+            partition: None,
+            consistency_weight: 0.0,
             learning_rate: 0.004,
             learning_rate_schedule: LearningRateSchedule::Cosine,
             batch: Some(2048),
@@ -102,14 +112,14 @@ impl FieldOptions {
     }
 
     /// One network and the truncated Chamfer distance, as the baseline of FNSF's comparison. Rate
-    /// and stopping rule are those of NSFP's published code for dense clouds, and the truncation is
-    /// that of its text.
+    /// and stopping rule are those of NSFP's published code for sampled clouds, which end a fit after
+    /// as many iterations as FNSF's tables imply. The truncation is that of its text.
     pub(super) fn nsfp(search: NearestSearch) -> Self {
         Self {
             loss: LossOptions::Chamfer(ChamferOptions::published(search)),
-            learning_rate: 0.003,
+            learning_rate: 0.008,
             early_stop: Some(EarlyStopOptions {
-                patience: 100,
+                patience: 30,
                 min_delta: 1e-4,
             }),
             ..Self::published(false)
@@ -125,11 +135,21 @@ impl FieldOptions {
     }
 
     /// Whether the fit has kernels for a GPU: that of one network to a distance transform, with a
-    /// constant batch and in three dimensions.
+    /// constant batch, without a partition, in three dimensions.
     pub fn runs_on_gpu(&self) -> bool {
         let one_network = self.network().is_some_and(|network| !network.cycle);
-        let plain = self.growth.is_none() && !self.bev;
+        let whole = self.partition.is_none() && self.consistency_weight == 0.0;
+        let plain = whole && self.growth.is_none() && !self.bev;
         one_network && self.loss.distance().is_some() && plain
+    }
+
+    /// These options with the partition of NSFP++, its cycle and its local consistency.
+    pub(super) fn by_cluster(self) -> Self {
+        Self {
+            partition: Some(PartitionOptions::published()),
+            consistency_weight: 0.05,
+            ..self.with_cycle()
+        }
     }
 
     /// The points as the fit sees them: with z = 0 in bird's eye view.
@@ -178,14 +198,14 @@ impl FieldOptions {
     /// Expected number of iterations of a fit without a deadline, for the prediction of its cost.
     ///
     /// It is `max_iterations` without early stopping. Otherwise it is at most 60 for a network and a
-    /// distance transform, 1,500 for a network and a Chamfer distance, and 80 for the linear model.
-    /// The published stopping rules ended the measured fits after 36 to 115, 1,000 to 2,700, and 70
-    /// to 95 iterations.
+    /// distance transform, 250 for a network and a Chamfer distance, and 80 for the linear model.
+    /// The published stopping rules ended the measured fits after 36 to 115, 200 to 240, and 70 to 95
+    /// iterations.
     pub fn expected_iterations(&self) -> usize {
         let stopped = match (&self.model, &self.loss) {
             (ModelOptions::Linear(_), _) => 80,
             (ModelOptions::Network(_), LossOptions::Distance(_)) => 60,
-            (ModelOptions::Network(_), LossOptions::Chamfer(_)) => 1500,
+            (ModelOptions::Network(_), LossOptions::Chamfer(_)) => 250,
         };
         match self.early_stop {
             None => self.max_iterations,

@@ -7,6 +7,7 @@ mod loss;
 mod model;
 mod objects;
 mod pair;
+mod partition;
 mod preset;
 
 pub(crate) use field::DeadlineLimits;
@@ -19,4 +20,5 @@ pub use model::{
 };
 pub use objects::ObjectOptions;
 pub use pair::{DEFAULT_DT_S, Ego, Ground, Method, Options};
+pub use partition::PartitionOptions;
 pub use preset::Preset;

@@ -24,6 +24,11 @@ pub enum Preset {
     /// NSFP (Li et al., NeurIPS 2021): as [`Preset::NsfpBaseline`], with a second network that leads
     /// the deformed points back.
     Nsfp,
+    /// NSFP++ (Najibi et al., ECCV 2022): a fit as [`Preset::Nsfp`] for each cluster of the points,
+    /// after the registration of the ego motion.
+    NsfpPlusPlus,
+    /// As [`Preset::NsfpPlusPlus`], fitted to distance transforms.
+    NsfpPlusPlusDt,
     /// As [`Preset::NsfpBaseline`], with k-d trees for the nearest neighbors.
     NsfpKdtree,
     /// The linear model of FNSF's comparison, fitted to the distance transform.
@@ -36,13 +41,15 @@ pub enum Preset {
 
 impl Preset {
     /// All presets.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 12] = [
         Self::Default,
         Self::Label,
         Self::Neural,
         Self::Paper,
         Self::NsfpBaseline,
         Self::Nsfp,
+        Self::NsfpPlusPlus,
+        Self::NsfpPlusPlusDt,
         Self::NsfpKdtree,
         Self::FnsfLinear,
         Self::NsfpLinear,
@@ -50,8 +57,8 @@ impl Preset {
     ];
 
     /// The name used by the command line and the service: `default`, `label`, `neural`, `paper`,
-    /// `nsfp-baseline`, `nsfp`, `nsfp-kdtree`, `fnsf-linear`, `nsfp-linear` or
-    /// `nsfp-kdtree-linear`.
+    /// `nsfp-baseline`, `nsfp`, `nsfp++`, `nsfp++-dt`, `nsfp-kdtree`,
+    /// `fnsf-linear`, `nsfp-linear` or `nsfp-kdtree-linear`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Default => "default",
@@ -60,6 +67,8 @@ impl Preset {
             Self::Paper => "paper",
             Self::NsfpBaseline => "nsfp-baseline",
             Self::Nsfp => "nsfp",
+            Self::NsfpPlusPlus => "nsfp++",
+            Self::NsfpPlusPlusDt => "nsfp++-dt",
             Self::NsfpKdtree => "nsfp-kdtree",
             Self::FnsfLinear => "fnsf-linear",
             Self::NsfpLinear => "nsfp-linear",
@@ -104,6 +113,10 @@ impl Preset {
             Self::Paper => Method::Field(FieldOptions::published(max_points.is_some())),
             Self::NsfpBaseline => Method::Field(FieldOptions::nsfp(NearestSearch::BruteForce)),
             Self::Nsfp => Method::Field(FieldOptions::nsfp(NearestSearch::BruteForce).with_cycle()),
+            Self::NsfpPlusPlus => {
+                Method::Field(FieldOptions::nsfp(NearestSearch::BruteForce).by_cluster())
+            }
+            Self::NsfpPlusPlusDt => Method::Field(FieldOptions::published(false).by_cluster()),
             Self::NsfpKdtree => Method::Field(FieldOptions::nsfp(NearestSearch::KdTree)),
             Self::FnsfLinear => Method::Field(FieldOptions::published(false).linear()),
             Self::NsfpLinear => {
@@ -114,7 +127,11 @@ impl Preset {
             }
         };
         let (ground, ego) = match self {
-            Self::Default | Self::Label | Self::Neural => (Ground::Auto, Ego::Auto),
+            Self::Default
+            | Self::Label
+            | Self::Neural
+            | Self::NsfpPlusPlus
+            | Self::NsfpPlusPlusDt => (Ground::Auto, Ego::Auto),
             _ => (Ground::Keep, Ego::Off),
         };
         Options {

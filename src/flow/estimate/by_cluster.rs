@@ -1,0 +1,327 @@
+//! Method field with a partition: registration, then the fit of a field for each cluster of the
+//! source (NSFP++).
+
+use std::sync::Arc;
+
+use super::ego_motion::{ego_motion, has_time_for_all};
+use super::method::{Input, Solved};
+use super::result::{FieldSolution, Solution};
+use crate::flow::data::{
+    Control, EarlierDeadline, Interrupt, Point, Progress, RigidTransform, StopReason,
+    square_distance, transform_points,
+};
+use crate::flow::error::FlowError;
+use crate::flow::field::{self, Backend, Fit, Fitted};
+use crate::flow::motion::{Residual, SampledMotion};
+use crate::flow::options::{FieldOptions, PartitionOptions};
+use crate::flow::spatial::{NOISE, dbscan};
+
+/// A cluster with fewer points than this, or fewer candidates in the target, is static.
+const LEAST_POINTS: usize = 4;
+
+/// A cluster of the source and the target points that it is fitted to.
+struct Part {
+    /// Rows of the source.
+    rows: Vec<u32>,
+    target: Vec<Point>,
+}
+
+/// Estimates the residual motion by a fit for each cluster, the largest first. Clusters that the
+/// deadline leaves no time for are static.
+///
+/// # Errors
+/// [`FlowError`] where a fit is rejected or diverges, the control cancels or the device fails.
+pub(super) fn residual_motion(
+    backend: &dyn Backend,
+    input: &Input<'_>,
+    options: &FieldOptions,
+    partition: &PartitionOptions,
+) -> Result<Solved, FlowError> {
+    let Input {
+        selection, control, ..
+    } = *input;
+    let host = backend.host();
+    let whole = has_time_for_all(selection, control);
+    let prior = RigidTransform::identity();
+    let ego = ego_motion(host, selection, input.options.ego, &prior, whole, control);
+    let aligned = match &ego {
+        None => selection.source.clone(),
+        Some(motion) => transform_points(motion, &selection.source),
+    };
+    input.check_cancelled()?;
+    let clusters = || parts(&aligned, &selection.target, partition);
+    let parts = host.threads().install(clusters);
+    let precomputed_at = control.seconds();
+    let mut fits = Fits {
+        backend,
+        options,
+        seed: input.options.seed,
+        aligned: &aligned,
+        ego: ego.as_ref(),
+        residual: vec![[0.0; 3]; aligned.len()],
+        solution: FieldSolution {
+            iterations: 0,
+            max_iterations: 0,
+            best_iteration: 0,
+            best_loss: 0.0,
+            loss_unit: options.loss.unit(),
+            distance_bytes: 0,
+            query_seconds: 0.0,
+        },
+        stop_reason: StopReason::Converged,
+    };
+    let mut left: usize = parts.iter().map(|part| part.rows.len()).sum();
+    let fitted = left;
+    for (number, part) in parts.iter().enumerate() {
+        match control.interrupt() {
+            Some(Interrupt::Cancelled) => return Err(FlowError::Cancelled),
+            Some(Interrupt::Deadline) => {
+                fits.stop_reason = StopReason::Deadline;
+                break;
+            }
+            None => {}
+        }
+        // Each cluster has the share of the time left that it has of the points left.
+        let others = (left - part.rows.len()) as f64 / left as f64;
+        left -= part.rows.len();
+        fits.fit(
+            part,
+            &PartControl {
+                early: EarlierDeadline {
+                    control,
+                    reserve: control
+                        .seconds_left()
+                        .map_or(0.0, |left| left.max(0.0) * others),
+                },
+                number,
+                count: parts.len(),
+            },
+        )?;
+    }
+    let Fits {
+        residual,
+        mut solution,
+        stop_reason,
+        ..
+    } = fits;
+    solution.best_loss /= fitted.max(1) as f64;
+    let motion = SampledMotion::new(aligned.clone(), residual.clone());
+    Ok(Solved {
+        ego,
+        aligned,
+        residual,
+        motion: Residual::Sampled(Arc::new(motion)),
+        solution: Solution::Field(solution),
+        stop_reason,
+        device: backend.name(),
+        precomputed_at,
+    })
+}
+
+/// The fits of all clusters.
+struct Fits<'a> {
+    backend: &'a dyn Backend,
+    options: &'a FieldOptions,
+    seed: u64,
+    aligned: &'a [Point],
+    ego: Option<&'a RigidTransform>,
+    residual: Vec<Point>,
+    /// Sums over the clusters; of the loss, weighted by the number of points.
+    solution: FieldSolution,
+    stop_reason: StopReason,
+}
+
+impl Fits<'_> {
+    /// Fits a field to one cluster and takes over its flow.
+    ///
+    /// # Errors
+    /// As [`residual_motion`].
+    fn fit(&mut self, part: &Part, control: &dyn Control) -> Result<(), FlowError> {
+        let options = self.options;
+        let source: Vec<Point> = part
+            .rows
+            .iter()
+            .map(|&row| self.aligned[row as usize])
+            .collect();
+        let [source, target] = [&source, &part.target].map(|cloud| options.seen(cloud));
+        let clouds = [source.as_ref(), target.as_ref()];
+        let prepared = field::prepare_target(self.backend, clouds, options, control)?;
+        let fitted = match &prepared {
+            None => Fitted::nothing(source.len(), control),
+            Some(prepared) => Fit {
+                backend: self.backend,
+                prior: None,
+                aligned: &source,
+                ego: self.ego,
+                options,
+                seed: self.seed,
+                // No snapshot is due.
+                identity: &|| 0,
+                prepared,
+                control,
+            }
+            .run(None)?,
+        };
+        for (&row, flow) in part.rows.iter().zip(&fitted.residual) {
+            self.residual[row as usize] = *flow;
+        }
+        let (report, solution) = (&fitted.report, &mut self.solution);
+        solution.iterations += report.iterations;
+        solution.max_iterations += fitted.max_iterations;
+        solution.best_iteration += report.best_iteration;
+        solution.best_loss += report.best_loss * source.len() as f64;
+        solution.query_seconds += report.query_seconds;
+        let bytes = prepared.map_or(0, |prepared| prepared.target.bytes());
+        solution.distance_bytes = solution.distance_bytes.max(bytes);
+        self.stop_reason = match (self.stop_reason, fitted.stop_reason) {
+            (StopReason::Deadline, _) | (_, StopReason::Deadline) => StopReason::Deadline,
+            (StopReason::MaxIterations, _) => StopReason::MaxIterations,
+            (_, reason) => reason,
+        };
+        Ok(())
+    }
+}
+
+/// The control of one cluster's fit. Progress counts clusters, and there are no snapshots.
+struct PartControl<'a> {
+    early: EarlierDeadline<'a>,
+    /// Clusters done before.
+    number: usize,
+    count: usize,
+}
+
+impl Control for PartControl<'_> {
+    fn seconds(&self) -> f64 {
+        self.early.seconds()
+    }
+
+    fn seconds_left(&self) -> Option<f64> {
+        self.early.seconds_left()
+    }
+
+    fn interrupt(&self) -> Option<Interrupt> {
+        self.early.interrupt()
+    }
+
+    fn progress(&self, progress: Progress) {
+        self.early.progress(Progress {
+            done: self.number,
+            total: self.count,
+            loss: progress.loss,
+        });
+    }
+}
+
+/// The clusters of `source` with the target points around each, the largest first.
+fn parts(source: &[Point], target: &[Point], options: &PartitionOptions) -> Vec<Part> {
+    let labels = dbscan::clusters(source, options.radius_m, options.min_points);
+    let clusters = labels.iter().filter(|&&label| label != NOISE).max();
+    let mut rows = vec![Vec::new(); clusters.map_or(0, |&last| last as usize + 1)];
+    for (row, &label) in (0..).zip(&labels) {
+        if label != NOISE {
+            rows[label as usize].push(row);
+        }
+    }
+    let mut parts: Vec<Part> = rows
+        .into_iter()
+        .filter_map(|rows| {
+            let points = rows.iter().map(|&row| source[row as usize]);
+            let target = around(&points.collect::<Vec<_>>(), target, options.expansion_m);
+            (target.len() >= LEAST_POINTS).then_some(Part { rows, target })
+        })
+        .collect();
+    parts.sort_by_key(|part| std::cmp::Reverse(part.rows.len()));
+    parts
+}
+
+/// The target points that `cluster` is fitted to: those within its box in x and y, grown by
+/// `expansion_m`, and of them those nearest to its center, one fewer than the cluster has points.
+fn around(cluster: &[Point], target: &[Point], expansion_m: f32) -> Vec<Point> {
+    let axis = |axis: usize| {
+        let values = cluster.iter().map(|point| point[axis]);
+        values.fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), value| {
+            (low.min(value), high.max(value))
+        })
+    };
+    let [(west, east), (south, north)] = [axis(0), axis(1)];
+    let [wide, deep] = [east - west, north - south];
+    let longest = wide.max(deep).max(f32::MIN_POSITIVE);
+    let [more_x, more_y] = [wide, deep].map(|edge| expansion_m * edge / longest);
+    let inside = |&&[x, y, _]: &&Point| {
+        x > west - more_x && x < east + more_x && y > south - more_y && y < north + more_y
+    };
+    let mut found: Vec<Point> = target.iter().filter(inside).copied().collect();
+    let sum = |axis: usize| {
+        cluster
+            .iter()
+            .map(|point| f64::from(point[axis]))
+            .sum::<f64>()
+    };
+    let center = [0, 1, 2].map(|axis| (sum(axis) / cluster.len().max(1) as f64) as f32);
+    let most = cluster.len().min(found.len()).saturating_sub(1);
+    if most < found.len() && most > 0 {
+        let by_distance = |a: &Point, b: &Point| {
+            square_distance(*a, center).total_cmp(&square_distance(*b, center))
+        };
+        found.select_nth_unstable_by(most - 1, by_distance);
+    }
+    found.truncate(most);
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::data::Random;
+
+    /// `count` points in a box of 4 x 1 x 1.5 m at `x`.
+    fn car(count: usize, x: f32, seed: u64) -> Vec<Point> {
+        let mut random = Random::new(seed);
+        let mut axis = |half: f64| random.uniform(-half, half) as f32;
+        (0..count)
+            .map(|_| [x + axis(2.0), axis(0.5), axis(0.75)])
+            .collect()
+    }
+
+    #[test]
+    fn a_cluster_gets_the_target_points_in_its_grown_box_nearest_to_its_center() {
+        let options = PartitionOptions::published();
+        let source: Vec<Point> =
+            [car(200, 0.0, 1), car(90, 40.0, 2), vec![[90.0, 0.0, 0.0]]].concat();
+        // Beyond the first car's box by 2 m in x, 0.3 m and 1 m in y; the shorter edge grows by a
+        // quarter of 2.5 m.
+        let outside = [[0.0, 1.5, 0.0]];
+        let inside = [[4.0, 0.0, 0.0], [0.0, 0.8, 0.0]];
+        let target: Vec<Point> = [
+            car(100, 0.5, 3),
+            car(300, 40.5, 4),
+            inside.to_vec(),
+            outside.to_vec(),
+        ]
+        .concat();
+        let parts = parts(&source, &target, &options);
+        let sizes: Vec<_> = parts
+            .iter()
+            .map(|part| (part.rows.len(), part.target.len()))
+            .collect();
+        // 102 candidates for 200 points, and 300 for 90: one fewer than the smaller number.
+        assert_eq!(sizes, [(200, 101), (90, 89)]);
+        assert!(parts[0].target.contains(&inside[1]) && !parts[0].target.contains(&outside[0]));
+        let nearest = |point: &Point| square_distance(*point, [40.0, 0.0, 0.0]);
+        let farthest = parts[1].target.iter().map(nearest).fold(0.0, f32::max);
+        let nearer = target
+            .iter()
+            .filter(|point| nearest(point) < farthest * 0.98);
+        assert!(nearer.count() <= 95);
+    }
+
+    #[test]
+    fn a_cluster_without_counterparts_is_static() {
+        let parts = parts(
+            &car(50, 0.0, 1),
+            &car(50, 30.0, 2),
+            &PartitionOptions::published(),
+        );
+        assert!(parts.is_empty());
+    }
+}
