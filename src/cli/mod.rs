@@ -23,6 +23,7 @@ mod eval;
 mod flow;
 mod serve;
 mod synth;
+mod tables;
 
 use std::process::ExitCode;
 
@@ -50,6 +51,7 @@ enum Command {
     Densify(densify::Densify),
     Eval(eval::Eval),
     Synth(synth::Synth),
+    Tables(tables::Tables),
     Doctor(doctor::Doctor),
 }
 
@@ -63,6 +65,7 @@ pub fn run(arguments: Arguments) -> ExitCode {
         Command::Densify(command) => command.run(),
         Command::Eval(command) => command.run(),
         Command::Synth(command) => command.run(),
+        Command::Tables(command) => command.run(),
         Command::Doctor(command) => command.run(),
     };
     match done {

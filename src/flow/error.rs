@@ -2,7 +2,7 @@
 
 use super::data::MIN_POINTS;
 use super::distance::DistanceError;
-use super::field::{BackendError, FitError, SnapshotError};
+use super::field::{BackendError, FitError, LinearError, SnapshotError};
 
 /// The reason why an estimate was rejected or failed.
 #[derive(Debug, thiserror::Error)]
@@ -76,6 +76,7 @@ impl FlowError {
                     | DistanceError::Interrupted(_)
             ),
             Self::Backend(BackendError::Unsupported(_) | BackendError::Memory { .. }) => true,
+            Self::Backend(BackendError::Linear(LinearError::Memory { .. })) => true,
             Self::Cancelled | Self::Diverged { .. } | Self::Snapshot(_) | Self::Backend(_) => false,
         }
     }

@@ -1,4 +1,4 @@
-//! Pictures of flow from above, colored by direction, and of depth images.
+//! Pictures of flow from above, colored by direction, and of depth images; plots.
 //!
 //! Independent of files and of how flow and depth were computed.
 
@@ -9,10 +9,12 @@ mod boxes;
 mod canvas;
 mod depth;
 mod font;
+mod plot;
 mod top_down;
 
 pub use crate::picture::canvas::{Image, PictureError, write_png};
 pub use crate::picture::depth::{DepthPanel, depth_panels};
 pub use crate::picture::motion::{full_scale, shown_motion};
+pub use crate::picture::plot::{Axis, Plot, Series};
 pub use crate::picture::top_down::{TopDown, TopDownOptions, top_down};
 pub use crate::picture::wheel::{INVALID_COLOR, color};

@@ -7,3 +7,4 @@ mod gpu_rule;
 mod hostile;
 mod program;
 mod sequences;
+mod tables;

@@ -1,0 +1,117 @@
+//! The ablation of the distance transform's cells.
+
+use serde::Serialize;
+
+use super::measure::{Budget, RunError, measure};
+use crate::cli::failure::Failure;
+use crate::cli::output::say;
+use crate::cli::terminal::Terminal;
+use crate::flow::distance::DistanceOptions;
+use crate::flow::field::Backend;
+use crate::flow::{Options, Preset};
+use crate::formats::{Pair, PairTruth};
+
+/// The edges of FNSF's ablation, metres.
+const EDGES_M: [f64; 8] = [1.0, 0.5, 0.33, 0.2, 0.1, 0.05, 0.02, 0.01];
+
+/// One cell size on one pair.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct CellFigures {
+    pub(super) pair: String,
+    pub(super) cell_m: f64,
+    /// Why there are no figures; none if there are.
+    pub(super) refused: Option<String>,
+    /// Mean end-point error, metres.
+    pub(super) epe: f64,
+    pub(super) total_seconds: f64,
+    pub(super) precompute_seconds: f64,
+    /// Bytes of the distance transform.
+    pub(super) transform_bytes: usize,
+}
+
+/// Options of the ablation, with cells of `cell_m`.
+fn options(max_points: Option<usize>, bev: bool, cell_m: f64) -> Options {
+    let mut options = Preset::Paper.options(max_points);
+    if let Some(field) = options.field_mut() {
+        field.bev = bev;
+        if let Some(loss) = field.loss.distance_mut() {
+            let transform = &mut loss.transform;
+            transform.cell_m = cell_m;
+            let widest = DistanceOptions::MAX_BAND_CELLS * cell_m;
+            transform.band_m = transform.band_m.min(widest).max(cell_m);
+        }
+    }
+    options
+}
+
+/// What the ablation runs with.
+pub(super) struct Ablation<'a> {
+    pub(super) backend: &'a dyn Backend,
+    pub(super) max_points: Option<usize>,
+    pub(super) bev: bool,
+    pub(super) budget: Option<f64>,
+    /// Sets what the pair and the command line decide.
+    pub(super) common: &'a dyn Fn(&mut Options),
+    pub(super) terminal: &'a Terminal,
+}
+
+impl Ablation<'_> {
+    /// Measures and prints all cell sizes on one pair. A size that does not fit in memory has the
+    /// refusal as its row.
+    pub(super) fn run(
+        &self,
+        name: &str,
+        pair: &Pair,
+        truth: &PairTruth,
+    ) -> Result<Vec<CellFigures>, Failure> {
+        let mode = if self.bev { ", bird's eye view" } else { "" };
+        self.terminal.finish();
+        say(format_args!(
+            "\nCells of the distance transform, fnsf{mode}\n"
+        ))?;
+        say(format_args!(
+            "| cell, m | E, m | pre-compute, s | total, s | transform, MB |\n|---|---|---|---|---|"
+        ))?;
+        let mut all = Vec::new();
+        for cell_m in EDGES_M {
+            self.terminal.part(&format!("{name}, cells of {cell_m} m"));
+            let mut options = options(self.max_points, self.bev, cell_m);
+            (self.common)(&mut options);
+            let control = Budget::new(self.budget, self.terminal);
+            let figures = match measure(self.backend, pair, truth, &options, &control) {
+                Ok(run) => CellFigures {
+                    pair: name.to_owned(),
+                    cell_m,
+                    refused: None,
+                    epe: run.metrics.epe,
+                    total_seconds: run.total,
+                    precompute_seconds: run.precompute,
+                    transform_bytes: run.target_bytes.unwrap_or(0),
+                },
+                Err(RunError::Flow(error)) if error.is_input() => CellFigures {
+                    pair: name.to_owned(),
+                    cell_m,
+                    refused: Some(error.to_string()),
+                    epe: 0.0,
+                    total_seconds: 0.0,
+                    precompute_seconds: 0.0,
+                    transform_bytes: 0,
+                },
+                Err(error) => return Err(Failure::internal(error)),
+            };
+            self.terminal.finish();
+            match &figures.refused {
+                Some(why) => say(format_args!("| {cell_m} | {why} | | | |"))?,
+                None => say(format_args!(
+                    "| {cell_m} | {:.4} | {:.3} | {:.2} | {:.1} |",
+                    figures.epe,
+                    figures.precompute_seconds,
+                    figures.total_seconds,
+                    figures.transform_bytes as f64 / 1e6
+                ))?,
+            }
+            all.push(figures);
+        }
+        Ok(all)
+    }
+}

@@ -1,0 +1,111 @@
+//! The measurement of one method on one pair.
+
+use std::time::Instant;
+
+use crate::flow::evaluate::{EvaluateError, Metrics, Truth, evaluate};
+use crate::flow::field::Backend;
+use crate::flow::{
+    Control, FlowError, Interrupt, Options, Problem, Progress, StopReason, estimate, predict_cost,
+};
+use crate::formats::{Pair, PairTruth};
+
+/// The result of one run.
+#[derive(Clone, Debug)]
+pub(super) struct Run {
+    pub(super) metrics: Metrics,
+    /// Seconds before the first iteration, of the distance queries or correspondences, of the
+    /// network or other model, and in all.
+    pub(super) precompute: f64,
+    pub(super) query: f64,
+    pub(super) network: f64,
+    pub(super) total: f64,
+    /// Iterations; none for the object search.
+    pub(super) iterations: Option<usize>,
+    /// Bound of the memory, bytes.
+    pub(super) bytes: usize,
+    /// Bytes of the distance transform or of the target; none for the object search.
+    pub(super) target_bytes: Option<usize>,
+    /// Whether the budget ended the run.
+    pub(super) is_cut: bool,
+}
+
+/// A control with a budget that does not change the method: the run ends when it is spent.
+pub(super) struct Budget<'a> {
+    began: Instant,
+    seconds: Option<f64>,
+    terminal: &'a dyn Control,
+}
+
+impl<'a> Budget<'a> {
+    pub(super) fn new(seconds: Option<f64>, terminal: &'a dyn Control) -> Self {
+        Self {
+            began: Instant::now(),
+            seconds,
+            terminal,
+        }
+    }
+}
+
+impl Control for Budget<'_> {
+    fn seconds(&self) -> f64 {
+        self.began.elapsed().as_secs_f64()
+    }
+
+    fn interrupt(&self) -> Option<Interrupt> {
+        let is_spent = self.seconds.is_some_and(|most| self.seconds() > most);
+        is_spent.then_some(Interrupt::Deadline)
+    }
+
+    fn progress(&self, progress: Progress) {
+        self.terminal.progress(progress);
+    }
+}
+
+/// Why a run has no result.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum RunError {
+    /// The method failed or refused the pair.
+    #[error(transparent)]
+    Flow(#[from] FlowError),
+    /// The flow could not be scored.
+    #[error(transparent)]
+    Score(#[from] EvaluateError),
+}
+
+/// Runs a method on a pair and scores it.
+pub(super) fn measure(
+    backend: &dyn Backend,
+    pair: &Pair,
+    truth: &PairTruth,
+    options: &Options,
+    control: &Budget<'_>,
+) -> Result<Run, RunError> {
+    let mut problem = Problem::pair(&pair.source, &pair.target);
+    problem.ground = pair
+        .ground
+        .as_ref()
+        .map(|ground| [ground.source.as_slice(), &ground.target]);
+    let cost = predict_cost(&problem, options)?;
+    let estimate = estimate(backend, &problem, options, control)?;
+    let truth = Truth {
+        flow: &truth.flow,
+        valid: &truth.valid,
+        dynamic: truth.dynamic.as_deref(),
+        foreground: truth.foreground.as_deref(),
+        ground: pair.ground.as_ref().map(|ground| ground.source.as_slice()),
+        source: Some(&pair.source),
+        ego: pair.ego.as_ref(),
+    };
+    let query = estimate.fit().map_or(0.0, |fit| fit.query_seconds);
+    Ok(Run {
+        metrics: evaluate(&estimate.flow, &estimate.valid, &truth)?,
+        precompute: estimate.precompute_seconds,
+        query,
+        network: estimate.method_seconds() - query,
+        total: estimate.total_seconds,
+        iterations: estimate.fit().map(|fit| fit.iterations),
+        bytes: cost.bytes,
+        target_bytes: estimate.fit().map(|fit| fit.distance_bytes),
+        is_cut: estimate.stop_reason == StopReason::Deadline,
+    })
+}
