@@ -2,14 +2,13 @@
 
 use serde::Serialize;
 
-use super::measure::{Budget, RunError, measure};
+use super::measure::{Budget, RunError, Subject, measure};
 use crate::cli::failure::Failure;
 use crate::cli::output::say;
 use crate::cli::terminal::Terminal;
 use crate::flow::distance::DistanceOptions;
 use crate::flow::field::Backend;
 use crate::flow::{Options, Preset};
-use crate::formats::{Pair, PairTruth};
 
 /// The edges of FNSF's ablation, metres.
 const EDGES_M: [f64; 8] = [1.0, 0.5, 0.33, 0.2, 0.1, 0.05, 0.02, 0.01];
@@ -58,12 +57,8 @@ pub(super) struct Ablation<'a> {
 impl Ablation<'_> {
     /// Measures and prints all cell sizes on one pair. A size that does not fit in memory has the
     /// refusal as its row.
-    pub(super) fn run(
-        &self,
-        name: &str,
-        pair: &Pair,
-        truth: &PairTruth,
-    ) -> Result<Vec<CellFigures>, Failure> {
+    pub(super) fn run(&self, subject: &Subject) -> Result<Vec<CellFigures>, Failure> {
+        let name = &subject.name;
         let mode = if self.bev { ", bird's eye view" } else { "" };
         self.terminal.finish();
         say(format_args!(
@@ -78,9 +73,9 @@ impl Ablation<'_> {
             let mut options = options(self.max_points, self.bev, cell_m);
             (self.common)(&mut options);
             let control = Budget::new(self.budget, self.terminal);
-            let figures = match measure(self.backend, pair, truth, &options, &control) {
+            let figures = match measure(self.backend, subject, &options, &control) {
                 Ok(run) => CellFigures {
-                    pair: name.to_owned(),
+                    pair: name.clone(),
                     cell_m,
                     refused: None,
                     epe: run.metrics.epe,
@@ -89,7 +84,7 @@ impl Ablation<'_> {
                     transform_bytes: run.target_bytes.unwrap_or(0),
                 },
                 Err(RunError::Flow(error)) if error.is_input() => CellFigures {
-                    pair: name.to_owned(),
+                    pair: name.clone(),
                     cell_m,
                     refused: Some(error.to_string()),
                     epe: 0.0,

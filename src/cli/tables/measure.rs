@@ -72,14 +72,21 @@ pub(super) enum RunError {
     Score(#[from] EvaluateError),
 }
 
+/// A pair with its truth, and the name of its file.
+pub(super) struct Subject {
+    pub(super) name: String,
+    pub(super) pair: Pair,
+    pub(super) truth: PairTruth,
+}
+
 /// Runs a method on a pair and scores it.
 pub(super) fn measure(
     backend: &dyn Backend,
-    pair: &Pair,
-    truth: &PairTruth,
+    subject: &Subject,
     options: &Options,
     control: &Budget<'_>,
 ) -> Result<Run, RunError> {
+    let Subject { pair, truth, .. } = subject;
     let mut problem = Problem::pair(&pair.source, &pair.target);
     problem.ground = pair
         .ground

@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use super::cells::{Ablation, CellFigures};
 use super::figures::Figures;
-use super::measure::{Budget, measure};
+use super::measure::{Budget, Subject, measure};
 use super::rows::{ALL, Row, names};
 use super::{plots, print};
 use crate::cli::failure::Failure;
@@ -17,7 +17,7 @@ use crate::cli::terminal::Terminal;
 use crate::cli::{device, files};
 use crate::flow::field::Backend;
 use crate::flow::{Ego, Ground, Options};
-use crate::formats::{Pair, PairTruth};
+use crate::formats::Pair;
 use crate::job::GroundChoice;
 
 /// Compare the methods of the FNSF paper on pairs with ground truth.
@@ -84,6 +84,17 @@ fn method(name: &str) -> Result<&'static str, String> {
     found.ok_or_else(|| format!("{name:?} is none of {}", names()))
 }
 
+/// Reads a pair with both clouds and the truth.
+fn read(path: &Path) -> Result<Subject, Failure> {
+    let (truth, pair) = files::read_truth(path)?;
+    let name = path.display().to_string();
+    if pair.source.is_empty() {
+        let why = format!("{name} has labels alone: a pair with pc1, pc2 and flow is needed");
+        return Err(Failure::usage(anyhow!(why)));
+    }
+    Ok(Subject { name, pair, truth })
+}
+
 /// All figures, as `--json` writes them.
 #[derive(Serialize)]
 struct Document<'a> {
@@ -102,34 +113,23 @@ impl Tables {
         let mut methods = Vec::new();
         let mut cells = Vec::new();
         for path in &self.pairs {
-            let (mut truth, pair) = files::read_truth(path)?;
-            let name = path.display().to_string();
-            if pair.source.is_empty() {
-                let why =
-                    format!("{name} has labels alone: a pair with pc1, pc2 and flow is needed");
-                return Err(Failure::usage(anyhow!(why)));
-            }
-            self.measure_methods(
-                backend.as_ref(),
-                &name,
-                &pair,
-                &truth,
-                &terminal,
-                &mut methods,
-            )?;
+            let mut subject = read(path)?;
+            let found = self.measure_methods(backend.as_ref(), &subject, &terminal)?;
+            methods.extend(found);
             if self.cells {
                 if self.bev {
-                    truth.flow.iter_mut().for_each(|flow| flow[2] = 0.0);
+                    let flows = subject.truth.flow.iter_mut();
+                    flows.for_each(|flow| flow[2] = 0.0);
                 }
                 let ablation = Ablation {
                     backend: backend.as_ref(),
                     max_points: self.points(),
                     bev: self.bev,
                     budget: self.budget,
-                    common: &|options| self.set_common(options, &pair, 0),
+                    common: &|options| self.set_common(options, &subject.pair, 0),
                     terminal: &terminal,
                 };
-                cells.extend(ablation.run(&name, &pair, &truth)?);
+                cells.extend(ablation.run(&subject)?);
             }
         }
         self.write(&backend.name(), &methods, &cells)
@@ -139,12 +139,11 @@ impl Tables {
     fn measure_methods(
         &self,
         backend: &dyn Backend,
-        name: &str,
-        pair: &Pair,
-        truth: &PairTruth,
+        subject: &Subject,
         terminal: &Terminal,
-        all: &mut Vec<Figures>,
-    ) -> Result<(), Failure> {
+    ) -> Result<Vec<Figures>, Failure> {
+        let Subject { name, pair, .. } = subject;
+        let mut all = Vec::new();
         terminal.finish();
         say(format_args!("\n{name}\n"))?;
         print::heading()?;
@@ -156,7 +155,7 @@ impl Tables {
                 let mut options = row.options(self.points());
                 self.set_common(&mut options, pair, seed.into());
                 let control = Budget::new(self.budget, terminal);
-                let run = measure(backend, pair, truth, &options, &control);
+                let run = measure(backend, subject, &options, &control);
                 let run = run.with_context(|| format!("{name}, {}", row.name));
                 runs.push(run.map_err(Failure::bad_input)?);
             }
@@ -165,7 +164,7 @@ impl Tables {
             print::row(&figures)?;
             all.push(figures);
         }
-        Ok(())
+        Ok(all)
     }
 
     fn points(&self) -> Option<usize> {
