@@ -20,6 +20,7 @@ PEER = Path(__file__).with_name("peer.py")
 METHODS = (
     "paper",
     "nsfp-baseline",
+    "nsfp",
     "nsfp-kdtree",
     "fnsf-linear",
     "nsfp-linear",

@@ -14,6 +14,7 @@ import os
 import resource
 import sys
 import time
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -36,14 +37,16 @@ class Method:
     learning_rate: float
     patience: int
     min_delta: float
+    cycle: bool = False
 
 
 PAPER = Method("network", "distance", learning_rate=0.008, patience=10, min_delta=1e-3)
-BASELINE = Method("network", "chamfer", learning_rate=0.003, patience=100, min_delta=1e-4)
+BASELINE = Method("network", "chamfer", learning_rate=0.008, patience=30, min_delta=1e-4)
 LINEAR = {"model": "linear", "learning_rate": 0.03, "patience": 10, "min_delta": 1e-3}
 METHODS = {
     "paper": PAPER,
     "nsfp-baseline": BASELINE,
+    "nsfp": replace(BASELINE, cycle=True),
     "nsfp-kdtree": replace(BASELINE, loss="kdtree"),
     "fnsf-linear": replace(PAPER, **LINEAR),
     "nsfp-linear": replace(BASELINE, **LINEAR),
@@ -129,18 +132,32 @@ class EarlyStopping:
         return self.stale >= self.patience
 
 
+@dataclass(frozen=True)
+class Cycle:
+    """The second network of NSFP, which leads the moved points back, and its loss to the source."""
+
+    model: nn.Module
+    loss: Loss
+
+
 def fit_flow(
-    source: Tensor, model: nn.Module, distance: Loss, settings: Method
+    source: Tensor, model: nn.Module, distance: Loss, settings: Method, cycle: Cycle | None
 ) -> tuple[Tensor, int]:
     """Fits the model; returns the flow of the lowest loss and the number of Adam steps taken."""
-    optimizer = torch.optim.Adam(model.parameters(), lr=settings.learning_rate)
+    parameters = list(model.parameters())
+    if cycle is not None:
+        parameters += cycle.model.parameters()
+    optimizer = torch.optim.Adam(parameters, lr=settings.learning_rate)
     stopping = EarlyStopping(settings.patience, settings.min_delta)
     best_loss, best_flow = math.inf, torch.zeros_like(source)
     steps = 0
     while steps < MAX_ITERATIONS:
         optimizer.zero_grad()
         flow = model(source)
-        loss = distance(source + flow)
+        moved = source + flow
+        loss = distance(moved)
+        if cycle is not None:
+            loss = loss + cycle.loss(moved - cycle.model(moved))
         if isinstance(model, LinearModel):
             loss = loss + model.regularization()
         loss.backward()
@@ -205,16 +222,20 @@ def run(args: argparse.Namespace) -> dict[str, object]:
     problem = select_points(pair, args.crop_m, mask_ground, args.max_points, generator)
     source, target = problem.source.to(device), problem.target.to(device)
     selected = now(device)
-    if settings.loss == "distance":
-        distance: Loss = DistanceMap(source, target, transform)
-    else:
-        distance = Chamfer(target, trees=settings.loss == "kdtree", threads=args.threads)
+
+    def loss_to(cloud: Tensor) -> Loss:
+        if settings.loss == "distance":
+            return DistanceMap(source, cloud, transform)
+        return Chamfer(cloud, trees=settings.loss == "kdtree", threads=args.threads)
+
+    distance = loss_to(target)
     if settings.model == "network":
         model: nn.Module = build_network().to(device)
     else:
         model = LinearModel(source).to(device)
+    cycle = Cycle(deepcopy(model), loss_to(source)) if settings.cycle else None
     prepared = now(device)
-    flow, steps = fit_flow(source, model, distance, settings)
+    flow, steps = fit_flow(source, model, distance, settings, cycle)
     fitted = now(device)
     flow = flow.cpu()
     end = now(device)

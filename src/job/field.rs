@@ -4,7 +4,6 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::error::InvalidOptions;
-use crate::flow::distance::DistanceOptions;
 use crate::flow::{BatchGrowth, FieldOptions, LossOptions, ModelOptions, Renewal};
 
 /// Iterations that each search nearest neighbors again, before `renew_every` takes effect.
@@ -197,10 +196,7 @@ impl FieldChoices {
         match &mut field.loss {
             LossOptions::Distance(loss) => {
                 if let Some(cell_m) = self.cell_m {
-                    let transform = &mut loss.transform;
-                    transform.cell_m = cell_m;
-                    let widest = cell_m * DistanceOptions::MAX_BAND_CELLS;
-                    transform.band_m = transform.band_m.min(widest).max(cell_m);
+                    loss.transform.set_cell(cell_m);
                 }
             }
             LossOptions::Chamfer(loss) => {

@@ -11,6 +11,19 @@ use crate::flow::evaluate::{
 use crate::formats::{FlowFile, Pair, PairTruth};
 use crate::text::grouped;
 
+/// The truth of a pair, with the masks, the source and the ego motion that are known.
+pub(in crate::cli) fn truth_of<'a>(known: &'a PairTruth, pair: &'a Pair) -> Truth<'a> {
+    Truth {
+        flow: &known.flow,
+        valid: &known.valid,
+        dynamic: known.dynamic.as_deref(),
+        foreground: known.foreground.as_deref(),
+        ground: pair.ground.as_ref().map(|ground| ground.source.as_slice()),
+        source: (!pair.source.is_empty()).then_some(pair.source.as_slice()),
+        ego: pair.ego.as_ref(),
+    }
+}
+
 /// The scores of one flow, or of several together. Every scored point weighs the same, except in
 /// the bucket-normalized EPE, which is a mean over classes and speeds.
 pub(super) struct Scores {
@@ -39,16 +52,7 @@ impl Scores {
         known: &PairTruth,
         pair: &Pair,
     ) -> Result<(), EvaluateError> {
-        let source = (!pair.source.is_empty()).then_some(pair.source.as_slice());
-        let truth = Truth {
-            flow: &known.flow,
-            valid: &known.valid,
-            dynamic: known.dynamic.as_deref(),
-            foreground: known.foreground.as_deref(),
-            ground: pair.ground.as_ref().map(|ground| ground.source.as_slice()),
-            source,
-            ego: pair.ego.as_ref(),
-        };
+        let truth = truth_of(known, pair);
         let everywhere = vec![true; flow.flow.len()];
         let covered = flow.valid.as_deref().unwrap_or(&everywhere);
         self.paper.add(&flow.flow, covered, &truth)?;

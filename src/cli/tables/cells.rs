@@ -6,7 +6,6 @@ use super::measure::{Budget, RunError, Subject, measure};
 use crate::cli::failure::Failure;
 use crate::cli::output::say;
 use crate::cli::terminal::Terminal;
-use crate::flow::distance::DistanceOptions;
 use crate::flow::field::Backend;
 use crate::flow::{Options, Preset};
 
@@ -34,10 +33,7 @@ fn options(max_points: Option<usize>, bev: bool, cell_m: f64) -> Options {
     if let Some(field) = options.field_mut() {
         field.bev = bev;
         if let Some(loss) = field.loss.distance_mut() {
-            let transform = &mut loss.transform;
-            transform.cell_m = cell_m;
-            let widest = DistanceOptions::MAX_BAND_CELLS * cell_m;
-            transform.band_m = transform.band_m.min(widest).max(cell_m);
+            loss.transform.set_cell(cell_m);
         }
     }
     options

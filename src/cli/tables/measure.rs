@@ -2,7 +2,8 @@
 
 use std::time::Instant;
 
-use crate::flow::evaluate::{EvaluateError, Metrics, Truth, evaluate};
+use crate::cli::eval::truth_of;
+use crate::flow::evaluate::{EvaluateError, Metrics, evaluate};
 use crate::flow::field::Backend;
 use crate::flow::{
     Control, FlowError, Interrupt, Options, Problem, Progress, StopReason, estimate, predict_cost,
@@ -94,18 +95,9 @@ pub(super) fn measure(
         .map(|ground| [ground.source.as_slice(), &ground.target]);
     let cost = predict_cost(&problem, options)?;
     let estimate = estimate(backend, &problem, options, control)?;
-    let truth = Truth {
-        flow: &truth.flow,
-        valid: &truth.valid,
-        dynamic: truth.dynamic.as_deref(),
-        foreground: truth.foreground.as_deref(),
-        ground: pair.ground.as_ref().map(|ground| ground.source.as_slice()),
-        source: Some(&pair.source),
-        ego: pair.ego.as_ref(),
-    };
     let query = estimate.fit().map_or(0.0, |fit| fit.query_seconds);
     Ok(Run {
-        metrics: evaluate(&estimate.flow, &estimate.valid, &truth)?,
+        metrics: evaluate(&estimate.flow, &estimate.valid, &truth_of(truth, pair))?,
         precompute: estimate.precompute_seconds,
         query,
         network: estimate.method_seconds() - query,

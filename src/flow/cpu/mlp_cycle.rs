@@ -250,39 +250,32 @@ mod tests {
         const STEP: f64 = 1e-6;
         const TOLERANCE: f64 = 1e-6;
         let (source, target) = (cloud(19, 1), cloud(23, 2));
-        let [mut forward, mut backward] = halves(&parameters());
-        let zeros = || ReferenceNetwork::read(mlp::zeros().as_slice());
-        let value = |forward: &ReferenceNetwork, backward: &ReferenceNetwork| {
-            let mut unused = [zeros(), zeros()];
-            cycle_loss([forward, backward], [&source, &target], 2.0, &mut unused)
+        let mut networks = halves(&parameters());
+        let zeros = ReferenceNetwork::read(mlp::zeros().as_slice());
+        let loss = |networks: &[ReferenceNetwork; 2]| {
+            let mut gradients = [zeros.clone(), zeros.clone()];
+            let [forward, backward] = networks;
+            let both = [forward, backward];
+            let value = cycle_loss(both, [&source, &target], 2.0, &mut gradients);
+            (value, gradients)
         };
-        let mut gradients = [zeros(), zeros()];
-        let networks = [&forward, &backward];
-        cycle_loss(networks, [&source, &target], 2.0, &mut gradients);
+        let (_, gradients) = loss(&networks);
         for (layer, output, input) in [(0, 17, 2), (1, 3, 99), (7, 64, 5), (8, 1, 77)] {
-            let at = forward.weights[layer][output][input];
-            forward.weights[layer][output][input] = at + STEP;
-            let ahead = value(&forward, &backward);
-            forward.weights[layer][output][input] = at - STEP;
-            let slope = (ahead - value(&forward, &backward)) / (2.0 * STEP);
-            forward.weights[layer][output][input] = at;
-            let expected = gradients[0].weights[layer][output][input];
-            assert!(
-                (slope - expected).abs() < TOLERANCE,
-                "forward {layer}: {slope} {expected}"
-            );
-
-            let at = backward.weights[layer][output][input];
-            backward.weights[layer][output][input] = at + STEP;
-            let ahead = value(&forward, &backward);
-            backward.weights[layer][output][input] = at - STEP;
-            let slope = (ahead - value(&forward, &backward)) / (2.0 * STEP);
-            backward.weights[layer][output][input] = at;
-            let expected = gradients[1].weights[layer][output][input];
-            assert!(
-                (slope - expected).abs() < TOLERANCE,
-                "backward {layer}: {slope} {expected}"
-            );
+            for which in 0..2 {
+                let at = networks[which].weights[layer][output][input];
+                let mut value = |weight: f64| {
+                    networks[which].weights[layer][output][input] = weight;
+                    loss(&networks).0
+                };
+                let slope = (value(at + STEP) - value(at - STEP)) / (2.0 * STEP);
+                value(at);
+                let expected = gradients[which].weights[layer][output][input];
+                let error = (slope - expected).abs();
+                assert!(
+                    error < TOLERANCE,
+                    "network {which}, layer {layer}: {slope} {expected}"
+                );
+            }
         }
     }
 }

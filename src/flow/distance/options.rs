@@ -48,6 +48,13 @@ impl DistanceOptions {
     /// within 16-bit integers.
     pub const MAX_BAND_CELLS: f64 = 64.0;
 
+    /// Sets the edge of a cell, metres, and fits the band to the cells that it may have.
+    pub fn set_cell(&mut self, cell_m: f64) {
+        self.cell_m = cell_m;
+        let widest = cell_m * Self::MAX_BAND_CELLS;
+        self.band_m = self.band_m.min(widest).max(cell_m);
+    }
+
     /// The band's radius in whole cells.
     pub(crate) fn band_cells(&self) -> i32 {
         (self.band_m / self.cell_m).round() as i32

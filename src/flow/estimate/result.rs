@@ -89,7 +89,8 @@ pub struct ObjectSolution {
     pub cost_m: f64,
 }
 
-/// The outcome of the fit of a field.
+/// The outcome of the fit of a field. With a partition the numbers of iterations are sums over the
+/// clusters, the loss is the mean over their points, and the bytes are those of the largest.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FieldSolution {
     /// Number of completed iterations; zero where the deadline allowed none.

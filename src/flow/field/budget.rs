@@ -80,9 +80,7 @@ pub(crate) fn prepare_target(
     let prepare = |coarser: f64, control: &dyn Control| {
         let mut loss = options.loss.clone();
         if let Some(loss) = loss.distance_mut() {
-            let transform = &mut loss.transform;
-            transform.cell_m *= coarser;
-            transform.band_m = transform.band_m.max(transform.cell_m);
+            loss.transform.set_cell(loss.transform.cell_m * coarser);
         }
         match backend.prepare_target(source, target, &loss, control) {
             Ok(target) => Ok(Some(target)),

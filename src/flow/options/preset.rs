@@ -76,7 +76,8 @@ impl Preset {
         }
     }
 
-    /// Whether the preset fits a neural field. Only such a preset supports snapshots.
+    /// Whether the preset fits a neural field. Only such a preset supports snapshots, and only
+    /// without a partition.
     pub fn fits_field(self) -> bool {
         matches!(self.options(None).method, Method::Field(_))
     }
