@@ -94,6 +94,16 @@ fn a_run_that_was_put_down_ends_with_the_bits_of_one_that_was_not() {
     for preset in Preset::with_field() {
         let mut options = preset.options(None);
         let field = options.field_mut().expect("a field");
+        if field.partition.is_some() {
+            let other = put_down(&pair, &Preset::Paper.options(None), None, 1);
+            let refused = run(&pair, &options, 1, Some(other), &Onward);
+            let foreign = FlowError::Snapshot(SnapshotError::Foreign);
+            assert_eq!(
+                refused.err().map(|e| e.to_string()),
+                Some(foreign.to_string())
+            );
+            continue;
+        }
         field.batch = field.batch.map(|_| 700);
         shorten_chamfer(&mut options);
         let undisturbed = run(&pair, &options, 2, None, &Onward).expect("a flow");

@@ -345,7 +345,8 @@ mod tests {
     #[test]
     fn every_preset_has_a_value_with_its_name() {
         for preset in crate::flow::Preset::ALL {
-            let name = preset.name().replace('-', "_").to_uppercase();
+            let name = preset.name().replace('-', "_").replace('+', "_plus");
+            let name = name.to_uppercase();
             let value = proto::Preset::from_str_name(&format!("PRESET_{name}"));
             let message = proto::Options {
                 preset: value.expect("the protocol has the preset").into(),
