@@ -106,6 +106,59 @@ impl Scale {
     }
 }
 
+/// The place of a text: its baseline's point and the side that is there.
+struct Place {
+    at: [f64; 2],
+    anchor: &'static str,
+}
+
+/// The names beside points that are placed already.
+struct Names {
+    /// Pixels between which names fit.
+    within: [f64; 2],
+    /// Left, top, right and bottom of each.
+    taken: Vec<[f64; 4]>,
+}
+
+impl Names {
+    /// A place beside a point for a name of so many letters: the first of six that lies within the
+    /// axes and on no other name, else the first.
+    fn place(&mut self, [x, y]: [f64; 2], letters: usize) -> Place {
+        const LETTER: f64 = 6.6;
+        const HEIGHT: f64 = 12.0;
+        let width = letters as f64 * LETTER;
+        let sides = [
+            (8.0, -5.0, "start"),
+            (8.0, 14.0, "start"),
+            (-8.0, -5.0, "end"),
+            (-8.0, 14.0, "end"),
+            (0.0, -10.0, "middle"),
+            (0.0, 20.0, "middle"),
+        ];
+        let boxed = |(right, down, anchor): (f64, f64, &str)| {
+            let begin = match anchor {
+                "start" => x + right,
+                "end" => x + right - width,
+                _ => x - width / 2.0,
+            };
+            [begin, y + down - HEIGHT, begin + width, y + down]
+        };
+        let is_free = |&side: &(f64, f64, &str)| {
+            let [left, top, right, bottom] = boxed(side);
+            let apart = |other: &[f64; 4]| {
+                right < other[0] || other[2] < left || bottom < other[1] || other[3] < top
+            };
+            left >= self.within[0] && right <= self.within[1] && self.taken.iter().all(apart)
+        };
+        let side = sides.into_iter().find(is_free).unwrap_or(sides[0]);
+        self.taken.push(boxed(side));
+        Place {
+            at: [x + side.0, y + side.1],
+            anchor: side.2,
+        }
+    }
+}
+
 /// The text without the characters that have a meaning in SVG.
 fn escaped(text: &str) -> String {
     text.replace('&', "&amp;")
@@ -192,6 +245,10 @@ impl Plot<'_> {
              transform=\"rotate(-90 18 {middle:.1})\">{}</text>",
             escaped(self.axes[1].title)
         ));
+        let mut names = Names {
+            within: [left, right],
+            taken: Vec::new(),
+        };
         for (number, series) in self.series.iter().enumerate() {
             let color = COLORS[number % COLORS.len()];
             let places: Vec<_> = series
@@ -208,16 +265,17 @@ impl Plot<'_> {
                 ));
             }
             for (x, y, name) in places {
-                // Beside the point, on the side with more room.
-                let (side, anchor) = if x > (left + right) / 2.0 {
-                    (x - 8.0, "end")
-                } else {
-                    (x + 8.0, "start")
-                };
                 put(format_args!(
-                    "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"4\" fill=\"{color}\"/>\
-                     <text x=\"{side:.1}\" y=\"{:.1}\" text-anchor=\"{anchor}\" fill=\"{color}\">{}</text>",
-                    y - 5.0,
+                    "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"4\" fill=\"{color}\"/>"
+                ));
+                if name.is_empty() {
+                    continue;
+                }
+                let Place { at, anchor } = names.place([x, y], name.chars().count());
+                put(format_args!(
+                    "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"{anchor}\" fill=\"{color}\">{}</text>",
+                    at[0],
+                    at[1],
                     escaped(name)
                 ));
             }
