@@ -58,5 +58,7 @@ pub(crate) use reference::{
     ReferenceLoss, ReferenceNetwork, chamfer_distance, cycle_loss, first_cycle_losses,
     first_losses, mean_distance,
 };
-pub(crate) use schedule::{GrowthState, Schedule};
+#[cfg(feature = "gpu")]
+pub(crate) use schedule::GrowthState;
+pub(crate) use schedule::Schedule;
 pub(crate) use warm_start::Prior;
