@@ -139,6 +139,8 @@ impl<S: NearestSearcher> ChamferLoss<S> {
 }
 
 impl<S: NearestSearcher> Loss for ChamferLoss<S> {
+    const COUPLES: bool = true;
+
     fn prepare(&mut self, batch: &Batch<'_>, control: &dyn Control) -> Result<(), Interrupt> {
         if self.depends_on_earlier(batch.done) && self.found.range == *batch.range {
             return Ok(());

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use super::loss::{Batch, Loss, Output, PointLoss};
+use super::reduction::tree_sum;
 use crate::flow::data::{Control, Interrupt, Point};
 
 /// Points between two checks of the control.
@@ -37,15 +38,28 @@ impl<L> ConsistencyLoss<L> {
 }
 
 impl<O: Output, L: Loss<O>> Loss<O> for ConsistencyLoss<L> {
+    const COUPLES: bool = true;
+
     fn prepare(&mut self, batch: &Batch<'_, O>, control: &dyn Control) -> Result<(), Interrupt> {
-        self.loss.prepare(batch, control)?;
-        let flows: Vec<Point> = (batch.outputs)().into_iter().map(Output::flow).collect();
+        // Computed once for both.
+        let outputs = (batch.outputs)();
+        let shared = Batch {
+            points: batch.points,
+            range: batch.range,
+            done: batch.done,
+            outputs: &|| outputs.clone(),
+        };
+        self.loss.prepare(&shared, control)?;
+        let flows: Vec<Point> = outputs.iter().map(|output| output.flow()).collect();
+        let columns = Columns::new(&flows);
         self.terms.clear();
         for some in flows.chunks(ROWS) {
             if let Some(interrupt) = control.interrupt() {
                 return Err(interrupt);
             }
-            let terms = some.par_iter().map(|&flow| term(flow, &flows, self.weight));
+            let terms = some
+                .par_iter()
+                .map(|&flow| term(flow, &columns, self.weight));
             self.threads.install(|| self.terms.par_extend(terms));
         }
         Ok(())
@@ -66,22 +80,52 @@ impl<O: Output, L: Loss<O>> Loss<O> for ConsistencyLoss<L> {
     }
 }
 
-/// The term of one flow among all. A pair counts once in the term of each of its points, so the
-/// derivative of the sum is twice that of the own term.
-fn term(flow: Point, flows: &[Point], weight: f32) -> PointLoss {
-    let (mut sum, mut pull) = (0.0, [0.0; 3]);
-    for other in flows {
-        let off: Point = core::array::from_fn(|a| flow[a] - other[a]);
-        let length = (off[0] * off[0] + off[1] * off[1] + off[2] * off[2]).sqrt();
-        sum += length;
-        let inverse = 1.0 / length.max(SMALL_M);
-        for (pull, off) in pull.iter_mut().zip(off) {
-            *pull += off * inverse;
+/// Flows of a row of [`Columns`].
+const ROW: usize = 16;
+
+/// The flows, component by component, in rows of [`ROW`].
+struct Columns {
+    rows: Vec<[[f32; ROW]; 3]>,
+    /// Flows that the last row holds beyond those given. They are copies of the last flow.
+    copies: usize,
+}
+
+impl Columns {
+    fn new(flows: &[Point]) -> Self {
+        let row = |flows: &[Point]| {
+            let component =
+                |axis: usize| core::array::from_fn(|lane| flows[lane.min(flows.len() - 1)][axis]);
+            [component(0), component(1), component(2)]
+        };
+        Self {
+            rows: flows.chunks(ROW).map(row).collect(),
+            copies: flows.len().next_multiple_of(ROW) - flows.len(),
         }
     }
+}
+
+/// The term of one flow among all. A pair counts once in the term of each of its points, so the
+/// derivative of the sum is twice that of the own term.
+fn term(flow: Point, flows: &Columns, weight: f32) -> PointLoss {
+    let (mut sums, mut pulls) = ([0.0; ROW], [[0.0; ROW]; 3]);
+    let mut add = |row: &[[f32; ROW]; 3], lanes: usize| {
+        for lane in 0..lanes {
+            let off: Point = core::array::from_fn(|axis| flow[axis] - row[axis][lane]);
+            let length = (off[0] * off[0] + off[1] * off[1] + off[2] * off[2]).sqrt();
+            let inverse = 1.0 / length.max(SMALL_M);
+            sums[lane] += length;
+            for (pulls, off) in pulls.iter_mut().zip(off) {
+                pulls[lane] += off * inverse;
+            }
+        }
+    };
+    if let Some((last, whole)) = flows.rows.split_last() {
+        whole.iter().for_each(|row| add(row, ROW));
+        add(last, ROW - flows.copies);
+    }
     PointLoss {
-        value: weight * sum,
-        gradient: pull.map(|pull| 2.0 * weight * pull),
+        value: weight * tree_sum(sums),
+        gradient: pulls.map(|pulls| 2.0 * weight * tree_sum(pulls)),
     }
 }
 
@@ -94,6 +138,8 @@ mod tests {
     struct Nothing;
 
     impl Loss for Nothing {
+        const COUPLES: bool = false;
+
         fn prepare(&mut self, _: &Batch<'_>, _: &dyn Control) -> Result<(), Interrupt> {
             Ok(())
         }

@@ -22,11 +22,16 @@ fn moved(point: Point, flow: Point) -> Point {
 }
 
 impl<L: Loss> Loss<[Point; 2]> for CycleLoss<L> {
+    const COUPLES: bool = L::COUPLES;
+
     fn prepare(
         &mut self,
         batch: &Batch<'_, [Point; 2]>,
         control: &dyn Control,
     ) -> Result<(), Interrupt> {
+        if !L::COUPLES {
+            return Ok(());
+        }
         let outputs = (batch.outputs)();
         let forward = Batch {
             points: batch.points,

@@ -87,6 +87,9 @@ pub(crate) struct Batch<'a, O = Point> {
 /// A loss that a field can be fitted to. The fit minimizes the mean of [`Self::at`] over the points
 /// of each iteration. `O` is the output of the models that it suits.
 pub(crate) trait Loss<O = Point>: Send + Sync {
+    /// Whether it couples the points, so that [`Self::prepare`] has something to do.
+    const COUPLES: bool;
+
     /// Prepares an iteration over `batch`. A loss that couples the points, such as the Chamfer
     /// distance, finds its correspondences here.
     ///
@@ -111,6 +114,8 @@ pub(crate) struct DistanceLoss {
 }
 
 impl Loss for DistanceLoss {
+    const COUPLES: bool = false;
+
     /// Nothing: the points are independent of each other.
     fn prepare(&mut self, _: &Batch<'_>, _: &dyn Control) -> Result<(), Interrupt> {
         Ok(())
