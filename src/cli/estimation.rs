@@ -26,8 +26,8 @@ pub(super) struct Estimation {
     /// nsfp-baseline: the baseline of that paper, a network fitted to the truncated Chamfer distance
     /// on the CPU, minutes for full clouds. nsfp: the same with NSFP's second network, which leads the
     /// points back. nsfp++, nsfp++-dt: ego motion, then a fit of this kind for each cluster of points,
-    /// with the Chamfer distance or distance transforms. nsfp-kdtree: the baseline with k-d trees. fnsf-linear, nsfp-linear,
-    /// nsfp-kdtree-linear: that paper's linear model with the three losses
+    /// with the Chamfer distance or distance transforms. nsfp-kdtree: the baseline with k-d trees.
+    /// fnsf-linear, nsfp-linear, nsfp-kdtree-linear: that paper's linear model with the three losses
     #[arg(long, value_enum, default_value_t)]
     preset: PresetChoice,
     /// Device for neural and paper: auto (a GPU, else the CPU), cpu, gpu, or gpu:CARD, where CARD

@@ -6,8 +6,6 @@ use utoipa::ToSchema;
 use super::error::InvalidOptions;
 use crate::flow::{BatchGrowth, FieldOptions, LossOptions, ModelOptions, Renewal};
 
-/// Iterations that each search nearest neighbors again, before `renew_every` takes effect.
-const RENEWED_FIRST: usize = 50;
 /// The largest number of iterations of a fit.
 const MOST_ITERATIONS: u32 = 1_000_000;
 
@@ -94,6 +92,7 @@ impl FieldChoices {
         preset: &'static str,
         field: Option<&FieldOptions>,
     ) -> Result<(), InvalidOptions> {
+        let fits = field.is_some();
         let loss = field.map(|field| &field.loss);
         let is_distance = matches!(loss, Some(LossOptions::Distance(_)));
         let is_chamfer = matches!(loss, Some(LossOptions::Chamfer(_)));
@@ -110,24 +109,12 @@ impl FieldChoices {
                 self.variation_weight.is_some(),
                 is_linear,
             ),
-            ("first_points", self.first_points.is_some(), field.is_some()),
-            ("double_every", self.double_every.is_some(), field.is_some()),
-            (
-                "double_at_fall",
-                self.double_at_fall.is_some(),
-                field.is_some(),
-            ),
+            ("first_points", self.first_points.is_some(), fits),
+            ("double_every", self.double_every.is_some(), fits),
+            ("double_at_fall", self.double_at_fall.is_some(), fits),
             ("renew_every", self.renew_every.is_some(), is_chamfer),
-            (
-                "max_iterations",
-                self.max_iterations.is_some(),
-                field.is_some(),
-            ),
-            (
-                "learning_rate",
-                self.learning_rate.is_some(),
-                field.is_some(),
-            ),
+            ("max_iterations", self.max_iterations.is_some(), fits),
+            ("learning_rate", self.learning_rate.is_some(), fits),
             ("patience", self.patience.is_some(), stops),
             ("min_delta", self.min_delta.is_some(), stops),
             ("bev", self.bev, is_network),
@@ -201,10 +188,8 @@ impl FieldChoices {
             }
             LossOptions::Chamfer(loss) => {
                 loss.truncation_m = self.truncation_m.unwrap_or(loss.truncation_m);
-                loss.renewal = self.renew_every.map(|every| Renewal {
-                    first: RENEWED_FIRST,
-                    every: every as usize,
-                });
+                let renewal = |every| Renewal::after_warm_up(every as usize);
+                loss.renewal = self.renew_every.map(renewal);
             }
         }
         if let ModelOptions::Linear(linear) = &mut field.model {

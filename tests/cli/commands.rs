@@ -1,26 +1,15 @@
 //! Tests of every command of the command line, and of the fields of its JSON reports.
 
-use std::path::Path;
-
 use fnsf::flow::gpu::{Adapter, AdapterKind, adapters};
 
 use super::gpu_rule;
-use super::program::{fnsf, json};
-
-/// Simulates a small street in `folder/street`.
-fn street(folder: &Path) {
-    let ended = fnsf(
-        folder,
-        &["synth", "-o", "street", "--beams", "16", "--sweeps", "2"],
-    );
-    assert_eq!(ended.code, 0, "{}", ended.stderr);
-}
+use super::program::{fnsf, json, street};
 
 #[test]
 fn synth_flow_and_eval_work_hand_in_hand_in_every_output_format() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    street(folder);
+    street(folder, "2");
     let mut first = None;
     for format in ["npz", "npy", "feather", "ply", "pcd", "json"] {
         let out = format!("flow.{format}");
@@ -54,7 +43,7 @@ fn synth_flow_and_eval_work_hand_in_hand_in_every_output_format() {
 fn the_json_report_has_every_field_of_the_contract() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    street(folder);
+    street(folder, "2");
     let arguments = [
         "flow",
         "street/sweep_0000.pcd",
@@ -103,7 +92,7 @@ fn the_json_report_has_every_field_of_the_contract() {
 fn the_number_of_threads_does_not_change_the_file() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    street(folder);
+    street(folder, "2");
     let flow = |preset: &str, threads: &str, out: &str| {
         let arguments = [
             "flow",
@@ -128,7 +117,7 @@ fn the_number_of_threads_does_not_change_the_file() {
 fn a_known_ego_motion_can_be_given_as_text_or_as_a_pair() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    street(folder);
+    street(folder, "2");
     std::fs::write(
         folder.join("still.txt"),
         "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n",
@@ -226,7 +215,7 @@ fn a_reader_that_goes_away_is_no_failure() {
 fn clouds_far_from_the_origin_align_as_near_ones_do() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    street(folder);
+    street(folder, "2");
     // Single precision resolves 4 mm at 50 km. The motion is that of the same street at the origin.
     let shifted = |name: &str| {
         let pcd = std::fs::read(folder.join(name)).expect("written");
@@ -265,7 +254,7 @@ fn clouds_far_from_the_origin_align_as_near_ones_do() {
 fn a_field_that_is_fitted_far_from_the_origin_is_that_of_the_same_cloud_at_home() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    street(folder);
+    street(folder, "2");
     let pcd = std::fs::read(folder.join("street/sweep_0000.pcd")).expect("written");
     let cloud = fnsf::formats::read_cloud(&pcd, None)
         .expect("a cloud")
@@ -297,7 +286,7 @@ fn a_field_that_is_fitted_far_from_the_origin_is_that_of_the_same_cloud_at_home(
 fn auto_without_a_card_says_so_and_a_card_that_is_not_there_is_refused_with_advice() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    street(folder);
+    street(folder, "2");
     let flow = |device: &str| {
         let pair = "street/pair_0000.npz";
         let preset = ["--preset", "neural"];
@@ -322,7 +311,7 @@ fn auto_without_a_card_says_so_and_a_card_that_is_not_there_is_refused_with_advi
 fn objects_are_found_by_the_host_whatever_the_device_and_the_report_says_so() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    street(folder);
+    street(folder, "2");
     let pair = "street/pair_0000.npz";
     let flow = |device: &str| fnsf(folder, &["flow", pair, "--json", "--device", device]);
     let auto = flow("auto");
@@ -342,7 +331,7 @@ fn objects_are_found_by_the_host_whatever_the_device_and_the_report_says_so() {
 fn every_method_of_the_paper_gives_a_flow_and_refuses_a_gpu_that_it_has_no_kernels_for() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    street(folder);
+    street(folder, "2");
     let usual = ["flow", "street/pair_0000.npz", "--max-points", "300"];
     for (preset, unit) in [
         ("nsfp-baseline", "m²"),
@@ -370,7 +359,7 @@ fn every_method_of_the_paper_gives_a_flow_and_refuses_a_gpu_that_it_has_no_kerne
 fn half_precision_of_what_fits_no_field_is_refused_before_any_work() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    street(folder);
+    street(folder, "2");
     let pair = "street/pair_0000.npz";
     for preset in ["default", "label"] {
         let asked = ["--preset", preset, "--precision", "f16", "--json"];

@@ -31,3 +31,10 @@ pub(crate) fn json(folder: &Path, arguments: &[&str]) -> serde_json::Value {
     assert_eq!(ended.code, 0, "{arguments:?}: {}", ended.stderr);
     serde_json::from_str(&ended.stdout).expect("one JSON object")
 }
+
+/// Simulates a street of so many sweeps in the folder `street` of `folder`.
+pub(crate) fn street(folder: &Path, sweeps: &str) {
+    let arguments = ["synth", "-o", "street", "--beams", "16", "--sweeps", sweeps];
+    let ended = fnsf(folder, &arguments);
+    assert_eq!(ended.code, 0, "{}", ended.stderr);
+}

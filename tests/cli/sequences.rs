@@ -1,10 +1,8 @@
 //! Tests of sequences and dense clouds from the command line.
 
-use std::path::Path;
-
 use fnsf::formats::{read_cloud, read_depth_png, read_flow};
 
-use super::program::{fnsf, json};
+use super::program::{fnsf, json, street};
 
 const SWEEPS: [&str; 4] = [
     "street/sweep_0000.pcd",
@@ -15,19 +13,11 @@ const SWEEPS: [&str; 4] = [
 const CAMERA: &str = r#"{"width": 310, "height": 94, "k": [[180, 0, 155], [0, 180, 47], [0, 0, 1]],
     "camera_from_lidar": [[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]}"#;
 
-fn street(folder: &Path) {
-    let ended = fnsf(
-        folder,
-        &["synth", "-o", "street", "--beams", "16", "--sweeps", "4"],
-    );
-    assert_eq!(ended.code, 0, "{}", ended.stderr);
-}
-
 #[test]
 fn the_flows_of_a_sequence_are_numbered_and_the_first_is_that_of_its_pair_alone() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    street(folder);
+    street(folder, "4");
     let of = |sweeps: &[&str], out: &str| {
         let options = ["--preset", "neural", "--device", "cpu", "-o", out];
         let arguments = [&["flow"], sweeps, &options].concat();
@@ -53,7 +43,7 @@ fn the_flows_of_a_sequence_are_numbered_and_the_first_is_that_of_its_pair_alone(
 fn flows_that_wait_for_sweeps_to_come_are_numbered_and_reported_like_any() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    street(folder);
+    street(folder, "4");
     let options = [
         "--device", "cpu", "--preset", "label", "--json", "-o", "all.npz",
     ];
@@ -76,7 +66,7 @@ fn flows_that_wait_for_sweeps_to_come_are_numbered_and_reported_like_any() {
 fn a_dense_cloud_has_every_point_and_shows_more_than_one_sweep_through_a_camera() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    street(folder);
+    street(folder, "4");
     std::fs::write(folder.join("camera.json"), CAMERA).expect("written");
     for (into, preset, out) in [
         ("2", "neural", "dense.ply"),
@@ -149,7 +139,7 @@ fn a_dense_cloud_has_every_point_and_shows_more_than_one_sweep_through_a_camera(
 fn what_no_sequence_can_be_asked_is_refused_with_advice() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    street(folder);
+    street(folder, "4");
     let poses = "1 0 0 0 0 1 0 0 0 0 1 0\n";
     std::fs::write(folder.join("poses.txt"), poses).expect("written");
     let ego = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n";

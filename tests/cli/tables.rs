@@ -2,19 +2,13 @@
 
 use std::fs;
 
-use super::program::fnsf;
-
-/// A simulated pair with ground truth.
-fn street(folder: &std::path::Path) {
-    let arguments = ["synth", "-o", "street", "--sweeps", "2"];
-    assert_eq!(fnsf(folder, &arguments).code, 0);
-}
+use super::program::{fnsf, street};
 
 #[test]
 fn the_methods_come_side_by_side_as_text_csv_json_and_plots() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    street(folder);
+    street(folder, "2");
     let only = "fnsf,fnsf-sampled-loss,nsfp-kdtree-every-5,nsfp++-dt,default";
     let usual = ["tables", "street/pair_0000.npz", "--max-points", "500"];
     let more = ["--only", only, "--seeds", "2", "--cells", "--bev"];
@@ -58,7 +52,7 @@ fn the_methods_come_side_by_side_as_text_csv_json_and_plots() {
 fn a_run_beyond_its_budget_is_cut_and_says_so() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    street(folder);
+    street(folder, "2");
     let usual = ["tables", "street/pair_0000.npz", "--max-points", "2000"];
     let more = ["--only", "nsfp", "--budget", "0.5"];
     let done = fnsf(folder, &[&usual[..], &more].concat());
@@ -70,7 +64,7 @@ fn a_run_beyond_its_budget_is_cut_and_says_so() {
 fn what_cannot_be_tabled_is_refused_before_any_work() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    street(folder);
+    street(folder, "2");
     let pair = "street/pair_0000.npz";
     for (arguments, code, said) in [
         (

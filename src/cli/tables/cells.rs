@@ -19,6 +19,14 @@ pub(super) struct CellFigures {
     pub(super) cell_m: f64,
     /// Why there are no figures; none if there are.
     pub(super) refused: Option<String>,
+    /// The figures; none if the size was refused.
+    #[serde(flatten)]
+    pub(super) measured: Option<Measured>,
+}
+
+/// The figures of one cell size.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Measured {
     /// Mean end-point error, metres.
     pub(super) epe: f64,
     pub(super) total_seconds: f64,
@@ -69,31 +77,26 @@ impl Ablation<'_> {
             let mut options = options(self.max_points, self.bev, cell_m);
             (self.common)(&mut options);
             let control = Budget::new(self.budget, self.terminal);
-            let figures = match measure(self.backend, subject, &options, &control) {
-                Ok(run) => CellFigures {
-                    pair: name.clone(),
-                    cell_m,
-                    refused: None,
-                    epe: run.metrics.epe,
-                    total_seconds: run.total,
-                    precompute_seconds: run.precompute,
-                    transform_bytes: run.target_bytes.unwrap_or(0),
-                },
-                Err(RunError::Flow(error)) if error.is_input() => CellFigures {
-                    pair: name.clone(),
-                    cell_m,
-                    refused: Some(error.to_string()),
-                    epe: 0.0,
-                    total_seconds: 0.0,
-                    precompute_seconds: 0.0,
-                    transform_bytes: 0,
-                },
+            let (refused, measured) = match measure(self.backend, subject, &options, &control) {
+                Ok(run) => {
+                    let measured = Measured {
+                        epe: run.metrics.epe,
+                        total_seconds: run.total,
+                        precompute_seconds: run.precompute,
+                        transform_bytes: run.target_bytes.unwrap_or(0),
+                    };
+                    (None, Some(measured))
+                }
+                Err(RunError::Flow(error)) if error.is_input() => (Some(error.to_string()), None),
                 Err(error) => return Err(Failure::internal(error)),
             };
             self.terminal.finish();
-            match &figures.refused {
-                Some(why) => say(format_args!("| {cell_m} | {why} | | | |"))?,
+            match &measured {
                 None => say(format_args!(
+                    "| {cell_m} | {} | | | |",
+                    refused.as_deref().unwrap_or_default()
+                ))?,
+                Some(figures) => say(format_args!(
                     "| {cell_m} | {:.4} | {:.3} | {:.2} | {:.1} |",
                     figures.epe,
                     figures.precompute_seconds,
@@ -101,7 +104,12 @@ impl Ablation<'_> {
                     figures.transform_bytes as f64 / 1e6
                 ))?,
             }
-            all.push(figures);
+            all.push(CellFigures {
+                pair: name.clone(),
+                cell_m,
+                refused,
+                measured,
+            });
         }
         Ok(all)
     }

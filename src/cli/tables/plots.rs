@@ -3,7 +3,7 @@
 use std::io::Write as _;
 use std::path::Path;
 
-use super::cells::CellFigures;
+use super::cells::{CellFigures, Measured};
 use super::figures::Figures;
 use crate::cli::failure::Failure;
 use crate::cli::files;
@@ -62,16 +62,17 @@ pub(super) fn write(
     if cells.is_empty() {
         return Ok(());
     }
-    let of = |value: fn(&CellFigures) -> f64| -> Vec<Series> {
+    let of = |value: fn(&Measured) -> f64| -> Vec<Series> {
         let pairs = pairs(cells.iter().map(|row| &row.pair)).into_iter();
         let series = pairs.map(|pair| {
-            let rows = cells.iter();
-            let rows = rows.filter(|row| row.pair == *pair && row.refused.is_none());
+            let rows = cells.iter().filter(|row| row.pair == *pair);
+            let points = rows.filter_map(|row| {
+                let measured = row.measured.as_ref()?;
+                Some((row.cell_m, value(measured), String::new()))
+            });
             Series {
                 name: pair.clone(),
-                points: rows
-                    .map(|row| (row.cell_m, value(row), String::new()))
-                    .collect(),
+                points: points.collect(),
                 is_joined: true,
             }
         });

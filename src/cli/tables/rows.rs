@@ -35,7 +35,7 @@ fn unchanged(_: &mut Options) {}
 /// Renews the nearest neighbors in every `every`-th iteration, after the first 50.
 fn renewed(options: &mut Options, every: usize) {
     if let Some(LossOptions::Chamfer(loss)) = options.field_mut().map(|field| &mut field.loss) {
-        loss.renewal = Some(Renewal { first: 50, every });
+        loss.renewal = Some(Renewal::after_warm_up(every));
     }
 }
 

@@ -36,7 +36,7 @@ impl MlpCycle {
         }
     }
 
-    /// Parameters of which both networks start from `initial`.
+    /// The parameters of two networks. Both are equal to `initial`.
     pub(super) fn twice(initial: &Parameters) -> Parameters {
         let mut both = Parameters::zeros(BOTH);
         for half in both.as_mut_slice().chunks_exact_mut(LAID_OUT) {

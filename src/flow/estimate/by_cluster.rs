@@ -8,7 +8,7 @@ use super::method::{Input, Solved};
 use super::result::{FieldSolution, Solution};
 use crate::flow::data::{
     Control, EarlierDeadline, Interrupt, Point, Progress, RigidTransform, StopReason,
-    square_distance, transform_points,
+    square_distance,
 };
 use crate::flow::error::FlowError;
 use crate::flow::field::{self, Backend, Fit, Fitted};
@@ -44,10 +44,7 @@ pub(super) fn residual_motion(
     let whole = has_time_for_all(selection, control);
     let prior = RigidTransform::identity();
     let ego = ego_motion(host, selection, input.options.ego, &prior, whole, control);
-    let aligned = match &ego {
-        None => selection.source.clone(),
-        Some(motion) => transform_points(motion, &selection.source),
-    };
+    let aligned = input.aligned(ego.as_ref());
     input.check_cancelled()?;
     let clusters = || parts(&aligned, &selection.target, partition);
     let parts = host.threads().install(clusters);
@@ -68,10 +65,10 @@ pub(super) fn residual_motion(
             distance_bytes: 0,
             query_seconds: 0.0,
         },
+        fitted: 0,
         stop_reason: StopReason::Converged,
     };
     let mut left: usize = parts.iter().map(|part| part.rows.len()).sum();
-    let fitted = left;
     for (number, part) in parts.iter().enumerate() {
         match control.interrupt() {
             Some(Interrupt::Cancelled) => return Err(FlowError::Cancelled),
@@ -101,10 +98,14 @@ pub(super) fn residual_motion(
     let Fits {
         residual,
         mut solution,
+        fitted,
         stop_reason,
         ..
     } = fits;
-    solution.best_loss /= fitted.max(1) as f64;
+    solution.best_loss = match fitted {
+        0 => f64::INFINITY,
+        points => solution.best_loss / points as f64,
+    };
     let motion = SampledMotion::new(aligned.clone(), residual.clone());
     Ok(Solved {
         ego,
@@ -128,6 +129,8 @@ struct Fits<'a> {
     residual: Vec<Point>,
     /// Sums over the clusters; of the loss, weighted by the number of points.
     solution: FieldSolution,
+    /// Points of the clusters whose fit has done an iteration.
+    fitted: usize,
     stop_reason: StopReason,
 }
 
@@ -169,7 +172,10 @@ impl Fits<'_> {
         solution.iterations += report.iterations;
         solution.max_iterations += fitted.max_iterations;
         solution.best_iteration += report.best_iteration;
-        solution.best_loss += report.best_loss * source.len() as f64;
+        if report.iterations > 0 {
+            solution.best_loss += report.best_loss * source.len() as f64;
+            self.fitted += source.len();
+        }
         solution.query_seconds += report.query_seconds;
         let bytes = prepared.map_or(0, |prepared| prepared.target.bytes());
         solution.distance_bytes = solution.distance_bytes.max(bytes);

@@ -5,7 +5,7 @@ use std::cell::LazyCell;
 use super::ego_motion::ego_motion;
 use super::method::{Input, Solved};
 use super::result::{FieldSolution, Solution};
-use crate::flow::data::{Hash, Point, transform_points};
+use crate::flow::data::{Hash, Point};
 use crate::flow::error::FlowError;
 use crate::flow::field::{self, Backend, Fit, Fitted, FittedField, Prior, Snapshot};
 use crate::flow::motion::{MotionField, Residual};
@@ -48,10 +48,7 @@ pub(super) fn residual_motion(
         (None, Ego::Given(target_from_source)) => Some(target_from_source),
         (None, Ego::Auto | Ego::Off) => None,
     };
-    let aligned = match &ego {
-        None => selection.source.clone(),
-        Some(motion) => transform_points(motion, &selection.source),
-    };
+    let aligned = input.aligned(ego.as_ref());
     input.check_cancelled()?;
     let fitted = match &prepared {
         None => Fitted::nothing(aligned.len(), control),

@@ -5,7 +5,7 @@ use super::method::{Input, Solved};
 use super::neighbors::aligned_neighbors;
 use super::result::{ObjectSolution, Solution};
 use crate::flow::data::StopReason;
-use crate::flow::data::{Interrupt, Point, RigidTransform, transform_points};
+use crate::flow::data::{Interrupt, Point, RigidTransform};
 use crate::flow::error::FlowError;
 use crate::flow::host::Host;
 use crate::flow::motion::Residual;
@@ -31,10 +31,7 @@ pub(super) fn residual_motion(
     let prior = RigidTransform::identity();
     let ego = ego_motion(host, selection, input.options.ego, &prior, whole, control);
     let motion = ego.unwrap_or_default();
-    let aligned = match &ego {
-        None => selection.source.clone(),
-        Some(motion) => transform_points(motion, &selection.source),
-    };
+    let aligned = input.aligned(ego.as_ref());
     input.check_cancelled()?;
     let find_ground = |sweeps: &[&[Point]]| host.ground(sweeps);
     let neighbors = match &ego {

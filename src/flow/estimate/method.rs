@@ -2,7 +2,7 @@
 
 use super::result::Solution;
 use crate::flow::data::StopReason;
-use crate::flow::data::{Control, Interrupt, Point, RigidTransform};
+use crate::flow::data::{Control, Interrupt, Point, RigidTransform, transform_points};
 use crate::flow::error::FlowError;
 use crate::flow::motion::Residual;
 use crate::flow::options::Options;
@@ -18,6 +18,12 @@ pub(super) struct Input<'a> {
 }
 
 impl Input<'_> {
+    /// The selected source points, transformed by the ego motion where there is one.
+    pub(super) fn aligned(&self, ego: Option<&RigidTransform>) -> Vec<Point> {
+        let source = &self.selection.source;
+        ego.map_or_else(|| source.clone(), |motion| transform_points(motion, source))
+    }
+
     /// Returns early if the control has cancelled; a deadline is not an error.
     ///
     /// # Errors

@@ -130,6 +130,11 @@ pub struct Renewal {
 }
 
 impl Renewal {
+    /// A search in every `every`-th iteration, after 50 that each search.
+    pub fn after_warm_up(every: usize) -> Self {
+        Self { first: 50, every }
+    }
+
     /// Whether the iteration after `done` others searches again.
     pub(crate) fn is_due(self, done: usize) -> bool {
         done < self.first || (done - self.first).is_multiple_of(self.every.max(1))
