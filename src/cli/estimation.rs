@@ -23,23 +23,24 @@ pub(super) struct Estimation {
     /// all other points are static. label: as default, but each pair of a sequence is estimated
     /// from up to five sweeps, its own two among them. neural: ego motion, then a short fit of a
     /// neural field to the remaining motion. paper: FNSF (ICCV 2023) with its published settings.
-    /// nsfp-baseline: the baseline of that paper, a network fitted to the truncated Chamfer distance
-    /// on the CPU, minutes for full clouds. nsfp: the same with NSFP's second network, which leads the
+    /// nsfp-baseline: the baseline of that paper, a network fitted to the truncated Chamfer distance,
+    /// minutes for full clouds. nsfp: the same with NSFP's second network, which leads the
     /// points back. nsfp++, nsfp++-dt: ego motion, then a fit of this kind for each cluster of points,
     /// with the Chamfer distance or distance transforms. nsfp-kdtree: the baseline with k-d trees.
     /// fnsf-linear, nsfp-linear, nsfp-kdtree-linear: that paper's linear model with the three losses
     #[arg(long, value_enum, default_value_t)]
     preset: PresetChoice,
-    /// Device for neural and paper: auto (a GPU, else the CPU), cpu, gpu, or gpu:CARD, where CARD
-    /// is a GPU's number, PCI id or part of its name, as listed by fnsf doctor. default and label
-    /// are computed on the CPU whatever the device, and the other presets refuse a GPU
+    /// Device for neural, paper, fnsf-linear, nsfp-baseline and nsfp-linear: auto (a GPU, else the
+    /// CPU), cpu, gpu, or gpu:CARD, where CARD is a GPU's number, PCI id or part of its name, as
+    /// listed by fnsf doctor. default and label are computed on the CPU whatever the device, and the
+    /// other presets refuse a GPU
     #[arg(long, value_name = "DEVICE", default_value_t)]
     device: DeviceArgument,
     /// CPU threads, 1 to 256; all cores by default. The result does not depend on it
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: Option<u16>,
-    /// Precision of the factors in the network's matrix products. f16 needs preset neural or paper,
-    /// and a GPU whose matrix units pass the self-test of fnsf doctor
+    /// Precision of the factors in the network's matrix products. f16 needs preset neural, paper
+    /// or nsfp-baseline, and a GPU whose matrix units pass the self-test of fnsf doctor
     #[arg(long, value_enum, default_value_t)]
     precision: PrecisionChoice,
     /// Seed of all random choices; the same seed gives the same result, bit for bit

@@ -57,12 +57,12 @@ pub struct JobOptions {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<Object>)]
     pub ego: Option<EgoChoice>,
-    /// The device for the computation. `neural` and `paper` can use a GPU. `default` and `label`
-    /// always compute on the host's CPU. The presets after `paper` compute on the CPU and refuse
-    /// `gpu`.
+    /// The device for the computation. `neural`, `paper`, `fnsf-linear`, `nsfp-baseline` and
+    /// `nsfp-linear` can use a GPU. `default` and `label` always compute on the host's CPU. The
+    /// other presets compute on the CPU and refuse `gpu`.
     pub device: DeviceChoice,
-    /// `f32`: single precision. `f16`: half precision, for `neural` and `paper` on a GPU whose
-    /// matrix units pass their self-test.
+    /// `f32`: single precision. `f16`: half precision, for `neural`, `paper` and `nsfp-baseline` on a
+    /// GPU whose matrix units pass their self-test.
     pub precision: PrecisionChoice,
     /// Options of the fit, for the presets that fit a field.
     #[serde(skip_serializing_if = "is_default")]
@@ -147,7 +147,8 @@ impl JobOptions {
         let preset = self.preset.preset();
         let options = self.solver_options(usize::MAX);
         self.field.check(preset.name(), options.field())?;
-        if self.precision == PrecisionChoice::F16 && !self.runs_on_gpu() {
+        let in_half = options.field().is_some_and(FieldOptions::runs_in_half);
+        if self.precision == PrecisionChoice::F16 && !in_half {
             return Err(InvalidOptions::HalfWithoutField(preset.name()));
         }
         if self.device == DeviceChoice::Gpu && self.needs_cpu() {

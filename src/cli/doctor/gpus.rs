@@ -29,7 +29,7 @@ pub(super) fn report() -> Result<(), Failure> {
         say(format_args!("  auto takes the CPU"))?;
     }
     say(format_args!(
-        "  a card is for presets neural and paper; default and label compute on the CPU whatever the device"
+        "  a card is for presets neural, paper, fnsf-linear, nsfp-baseline and nsfp-linear; default and label compute on the CPU whatever the device"
     ))?;
     let hardware = |adapter: &&Adapter| adapter.kind != AdapterKind::Software;
     let found = Environment::here(adapters.iter().filter(hardware).count(), adapters.len());

@@ -11,10 +11,9 @@ use super::model::Model;
 use super::product_kernels::{Factors, ProductKernel};
 use super::tile::{TILE, WorkingSets};
 use crate::flow::data::Point;
-use crate::flow::field::{FittedField, LinearField, LinearGrid, Parameters, Placed, grouped};
-
-/// Smoothing constant of the total variation, square metres, as in the published code.
-const SMOOTHING: f32 = 1e-5;
+use crate::flow::field::{
+    FittedField, LinearField, LinearGrid, Parameters, Placed, VARIATION_SMOOTHING, reduction,
+};
 
 /// The three products with the encodings of the axes.
 pub(super) struct Encoder {
@@ -101,6 +100,7 @@ pub(super) struct Linear {
     /// Reciprocal length of the displacement's differences at each vertex, for each axis of the
     /// displacement.
     inverse_lengths: Vec<f32>,
+    /// Sum of these lengths.
     variation: f32,
     points: PlacedPoints,
 }
@@ -109,10 +109,8 @@ pub(super) struct Linear {
 #[derive(Default)]
 struct PlacedPoints {
     placed: Vec<Placed>,
-    /// Positions of the points in the order of their voxel's level.
-    order: Vec<u32>,
-    /// Where the points of each level begin in `order`, and the end of the last.
-    first: Vec<u32>,
+    /// Voxel and position of each, see [`LinearGrid::by_voxel`].
+    by_voxel: Vec<[u32; 2]>,
 }
 
 impl Linear {
@@ -138,50 +136,46 @@ impl Linear {
         [1, grid.row(), grid.plane()].map(|step| values[at + step] - values[at])
     }
 
-    /// Number of vertices with a next neighbor along all axes.
-    fn inner(&self) -> f32 {
-        let inner: usize = self
-            .encoder
-            .grid
-            .vertices
-            .iter()
-            .map(|count| count - 1)
-            .product();
-        inner as f32
+    /// The weight of the total variation in the loss over the number of vertices that it is a mean
+    /// of.
+    fn variation_share(&self) -> f32 {
+        self.encoder.grid.variation_share(self.variation_weight)
     }
 
-    /// Computes the total variation (FNSF's published code): the mean over the vertices of the sum
-    /// over the axes of the flow of `sqrt(1e-5 + |differences|^2)`.
+    /// Computes the total variation (FNSF's published code): the sum over the vertices and the axes
+    /// of the flow of `sqrt(1e-5 + |differences|^2)`. Vertices without a next neighbor along every
+    /// axis are left out.
     fn measure_variation(&mut self) {
         let grid = self.encoder.grid;
         let [x, y, z] = grid.vertices;
         let (row, plane) = (grid.row(), grid.plane());
         let mut inverse_lengths = core::mem::take(&mut self.inverse_lengths);
-        let level = |(number, inverse): (usize, &mut [f32])| {
+        let mut lengths = core::mem::take(&mut self.between);
+        let level = |(number, (inverse, lengths)): (usize, (&mut [f32], &mut [f32]))| {
             inverse.fill(0.0);
+            lengths.fill(0.0);
             if number % z + 1 == z {
-                return 0.0;
+                return;
             }
             let values = &self.values[number * plane..];
-            let mut sum = 0.0;
             for across in 0..y - 1 {
-                let inverse = &mut inverse[across * row..][..x - 1];
-                for (along, inverse) in inverse.iter_mut().enumerate() {
-                    let differences = self.differences(values, across * row + along);
+                for at in across * row..across * row + x - 1 {
+                    let differences = self.differences(values, at);
                     let square: f32 = differences.iter().map(|d| d * d).sum();
-                    let length = (SMOOTHING + square).sqrt();
-                    *inverse = 1.0 / length;
-                    sum += f64::from(length);
+                    lengths[at] = (VARIATION_SMOOTHING + square).sqrt();
+                    inverse[at] = 1.0 / lengths[at];
                 }
             }
-            sum
         };
-        let sums: Vec<f64> = self.encoder.threads.install(|| {
-            let levels = inverse_lengths.par_chunks_mut(plane).enumerate();
-            levels.map(level).collect()
+        self.encoder.threads.install(|| {
+            let levels = inverse_lengths
+                .par_chunks_mut(plane)
+                .zip(lengths.par_chunks_mut(plane));
+            levels.enumerate().for_each(level);
         });
+        self.variation = reduction::sum(&lengths);
         self.inverse_lengths = inverse_lengths;
-        self.variation = (sums.iter().sum::<f64>() / f64::from(self.inner())) as f32;
+        self.between = lengths;
     }
 
     /// The derivative of the loss with respect to the displacements of one level of vertices.
@@ -194,11 +188,14 @@ impl Linear {
         let points = &self.points;
         // Points of the voxels above this level, then of those below it.
         for (below, cell) in [Some(level), level.checked_sub(1)].into_iter().enumerate() {
-            let Some(cell) = cell.filter(|cell| cell + 1 < points.first.len()) else {
+            let Some(cell) = cell else {
                 continue;
             };
-            let own = points.first[cell] as usize..points.first[cell + 1] as usize;
-            for &position in &points.order[own] {
+            let first = |level: usize| {
+                let voxel = level as u32 * grid.voxels_of_a_level();
+                points.by_voxel.partition_point(|&[of, _]| of < voxel)
+            };
+            for &[_, position] in &points.by_voxel[first(cell)..first(cell + 1)] {
                 let Placed { cell, weights } = points.placed[position as usize];
                 let [wx, wy, wz] = weights;
                 let pull = wz[below] * flow_gradients[position as usize][channel];
@@ -213,7 +210,7 @@ impl Linear {
         if self.variation_weight == 0.0 {
             return;
         }
-        let weight = self.variation_weight / self.inner();
+        let weight = self.variation_share();
         let base = number * plane;
         let difference = |at: usize, before: usize| {
             (self.values[at] - self.values[before]) * self.inverse_lengths[before]
@@ -266,12 +263,9 @@ impl Model for Linear {
         let grid = &self.encoder.grid;
         let placed = || points.par_iter().map(|&point| grid.place(point)).collect();
         let placed: Vec<Placed> = self.encoder.threads.install(placed);
-        let levels: Vec<u32> = placed.iter().map(|point| point.cell[2]).collect();
-        let (first, order) = grouped(&levels, grid.vertices[2] - 1);
         self.points = PlacedPoints {
+            by_voxel: grid.by_voxel(&placed, 0..placed.len()),
             placed,
-            order,
-            first,
         };
     }
 
@@ -290,7 +284,7 @@ impl Model for Linear {
     }
 
     fn regularization(&self) -> f32 {
-        self.variation_weight * self.variation
+        self.variation_share() * self.variation
     }
 
     fn chunk_gradients(&self) -> Self::ChunkGradients {

@@ -199,7 +199,7 @@ impl<S: NearestSearcher> Loss for ChamferLoss<S> {
 
 /// The positions of `values`, grouped by value and ascending in each group: where the group of each
 /// value below `groups` begins, with the end of the last, and the positions.
-pub(crate) fn grouped(values: &[u32], groups: usize) -> (Vec<u32>, Vec<u32>) {
+fn grouped(values: &[u32], groups: usize) -> (Vec<u32>, Vec<u32>) {
     let mut first = vec![0u32; groups + 1];
     for &value in values {
         first[value as usize + 1] += 1;

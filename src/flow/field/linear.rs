@@ -20,6 +20,8 @@ pub(crate) const ROW: usize = 16;
 /// Arrays of the grid's size that a fit holds: weights, their gradients and moments, the result, the
 /// displacements with their gradients, and two of the products.
 const ARRAYS: usize = 9;
+/// Smoothing constant of the total variation, square metres, as in the published code.
+pub(crate) const VARIATION_SMOOTHING: f32 = 1e-5;
 /// Most vertices along an axis.
 const MOST_VERTICES: f64 = 65_536.0;
 
@@ -176,17 +178,29 @@ impl LinearGrid {
         self.plane() * self.vertices[2]
     }
 
+    /// A weight of the total variation over the number of vertices that it is a mean of: those with
+    /// a next neighbor along all axes.
+    pub(crate) fn variation_share(&self, weight: f32) -> f32 {
+        let inner: usize = self.vertices.iter().map(|count| count - 1).product();
+        weight / inner as f32
+    }
+
     /// Multiply-adds of the three products.
     pub(crate) fn product_work(&self) -> f64 {
         let along: usize = self.vertices.iter().sum();
         3.0 * self.channel() as f64 * along as f64
     }
 
+    /// Floats of a row of [`Self::encoding`].
+    pub(crate) fn encoding_row(&self, axis: usize) -> usize {
+        self.vertices[axis].next_multiple_of(ROW)
+    }
+
     /// The encoding of an axis: a symmetric matrix with rows padded to [`ROW`] floats. It is divided
     /// by the largest length of its rows.
     pub(crate) fn encoding(&self, axis: usize) -> Vec<f32> {
         let count = self.vertices[axis];
-        let stride = count.next_multiple_of(ROW);
+        let stride = self.encoding_row(axis);
         let voxels = f64::from(self.sigma_m) / f64::from(self.voxel_m);
         let gaussian = |i: usize, j: usize| {
             let off = i.abs_diff(j) as f64 / voxels;
@@ -222,56 +236,6 @@ impl LinearGrid {
     /// Rows of all three axes of the flow.
     pub(crate) fn rows(&self) -> usize {
         3 * self.vertices[1] * self.vertices[2]
-    }
-
-    /// Where `point` lies. Beyond the grid it is the nearest position on its border.
-    pub(crate) fn place(&self, point: Point) -> Placed {
-        let (voxel, sigma) = (f64::from(self.voxel_m), f64::from(self.sigma_m));
-        let kernel = |off: f64| (-0.25 * (off / sigma).powi(2)).exp();
-        let across = kernel(voxel);
-        let mut cell = [0; 3];
-        let mut weights = [[0.0; 2]; 3];
-        for axis in 0..3 {
-            let cells = (self.vertices[axis] - 1) as f64;
-            let off = f64::from(point[axis]) - f64::from(self.origin[axis]);
-            let at = (off / voxel).clamp(0.0, cells);
-            let lower = at.floor().min(cells - 1.0);
-            let near = (at - lower) * voxel;
-            let [low, high] = [kernel(near), kernel(voxel - near)];
-            let whole = 1.0 - across * across;
-            weights[axis] = [low - high * across, high - low * across].map(|w| (w / whole) as f32);
-            // A coordinate that is not a number counts as zero.
-            cell[axis] = lower as u32;
-        }
-        Placed { cell, weights }
-    }
-}
-
-/// A point's voxel, and the weights of its lower and upper vertices along each axis.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Placed {
-    pub(crate) cell: [u32; 3],
-    pub(crate) weights: [[f32; 2]; 3],
-}
-
-impl Placed {
-    /// The flow of the point, from the displacements of all vertices.
-    #[inline]
-    pub(crate) fn blend(&self, grid: &LinearGrid, values: &[f32]) -> Point {
-        let [x, y, z] = self.cell.map(|cell| cell as usize);
-        let [wx, wy, wz] = self.weights;
-        let first = z * grid.plane() + y * grid.row() + x;
-        core::array::from_fn(|channel| {
-            let values = &values[channel * grid.channel() + first..];
-            let mut sum = 0.0;
-            for (up, wz) in wz.into_iter().enumerate() {
-                for (across, wy) in wy.into_iter().enumerate() {
-                    let at = up * grid.plane() + across * grid.row();
-                    sum += wz * wy * (wx[0] * values[at] + wx[1] * values[at + 1]);
-                }
-            }
-            sum
-        })
     }
 }
 

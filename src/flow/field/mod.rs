@@ -17,6 +17,7 @@ mod loss;
 pub mod mlp;
 mod network;
 mod parameters;
+mod placed;
 pub(crate) mod reduction;
 #[cfg(test)]
 pub(crate) mod reference;
@@ -33,7 +34,7 @@ pub use network::Network;
 pub use snapshot::{Snapshot, SnapshotError, TrainerState};
 
 pub(crate) use budget::prepare_target;
-pub(crate) use chamfer::{ChamferLoss, NearestSearcher, chamfer_work, check_chamfer, grouped};
+pub(crate) use chamfer::{ChamferLoss, NearestSearcher, chamfer_work, check_chamfer};
 pub(crate) use codec::{put_parameters, take_parameters};
 pub(crate) use consistency::ConsistencyLoss;
 pub(crate) use cycle::CycleLoss;
@@ -42,12 +43,13 @@ pub(crate) use early_stopping::EarlyStop;
 pub(crate) use early_stopping::EarlyStopState;
 pub(crate) use error::FitError;
 pub(crate) use fit::{Fit, Fitted};
-pub(crate) use linear::{LinearGrid, Placed, ROW};
+pub(crate) use linear::{LinearGrid, ROW, VARIATION_SMOOTHING};
 pub(crate) use loss::{Batch, DistanceLoss, Loss, Output, length};
 pub(crate) use mlp::{
     Conditioning, LAID_OUT, PANEL, first_layer, last_layer, middle_layer, transpose_middle_layers,
 };
 pub(crate) use parameters::{Aligned, Parameters};
+pub(crate) use placed::Placed;
 #[cfg(any(feature = "gpu", test))]
 pub(crate) use reduction::MOST_POINTS;
 #[cfg(feature = "gpu")]

@@ -36,6 +36,15 @@ impl Chunks {
         }
     }
 
+    /// A batch of `points` points in one chunk of any size.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn one(points: usize) -> Self {
+        Self {
+            stretches: points.div_ceil(STRETCH).max(1),
+            count: 1,
+        }
+    }
+
     /// The points of a chunk. The range may extend beyond the end of the batch.
     pub(crate) fn points(&self, chunk: usize) -> Range<usize> {
         let first = |chunk: usize| chunk * self.stretches / self.count * STRETCH;
@@ -47,15 +56,20 @@ impl Chunks {
 const TILE: usize = 64;
 const SIDE_BY_SIDE: usize = 256;
 
-/// The mean of an iteration's losses, metres.
+/// The mean of an iteration's losses.
 pub(crate) fn mean(losses: &[f32]) -> f32 {
+    sum(losses) * (1.0 / losses.len() as f32)
+}
+
+/// The sum of `terms`.
+pub(crate) fn sum(terms: &[f32]) -> f32 {
     let mut sums = [0.0; SIDE_BY_SIDE];
-    for (tile, losses) in losses.chunks(TILE).enumerate() {
+    for (tile, terms) in terms.chunks(TILE).enumerate() {
         let mut padded = [0.0; TILE];
-        padded[..losses.len()].copy_from_slice(losses);
+        padded[..terms.len()].copy_from_slice(terms);
         sums[tile % SIDE_BY_SIDE] += tree_sum(padded);
     }
-    tree_sum(sums) * (1.0 / losses.len() as f32)
+    tree_sum(sums)
 }
 
 /// Tree sum of `N` terms, a power of two: the upper half is added to the lower half until one

@@ -3,10 +3,12 @@
 use std::sync::Arc;
 
 use super::adapter::Adapter;
+use super::chamfer::GpuCloud;
 use super::device::Device;
 use super::distance::GpuTransform;
+use super::loss::GpuTarget;
 use super::memory::GpuOptions;
-use super::trainer::{GpuTrainer, NO_CHAMFER};
+use super::trainer::GpuTrainer;
 use super::{distance, inference};
 use crate::flow::data::{Control, Point};
 use crate::flow::field::{Backend, BackendError, Network, PreparedTarget, Trainer};
@@ -91,9 +93,18 @@ impl Backend for Gpu {
         options: &LossOptions,
         control: &dyn Control,
     ) -> Result<Box<dyn PreparedTarget>, BackendError> {
-        let options = options.distance().ok_or(NO_CHAMFER)?;
-        let built = distance::build(&self.0, source, target, &options.transform, control)?;
-        Ok(Box::new(built))
+        Ok(match options {
+            LossOptions::Distance(options) => {
+                let transform = &options.transform;
+                Box::new(distance::build(
+                    &self.0, source, target, transform, control,
+                )?)
+            }
+            LossOptions::Chamfer(options) => {
+                let cloud = GpuCloud::new(&self.0, source.len(), target, options, control)?;
+                Box::new(cloud)
+            }
+        })
     }
 
     fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {
@@ -117,6 +128,27 @@ impl PreparedTarget for GpuTransform {
         options: &FieldOptions,
         seed: u64,
     ) -> Result<Box<dyn Trainer + '_>, BackendError> {
-        Ok(Box::new(GpuTrainer::new(self, source, options, seed)?))
+        let target = GpuTarget::Transform(self);
+        Ok(Box::new(GpuTrainer::new(target, source, options, seed)?))
+    }
+}
+
+impl PreparedTarget for GpuCloud {
+    fn bytes(&self) -> usize {
+        self.bytes()
+    }
+
+    fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError> {
+        self.distances(points)
+    }
+
+    fn start(
+        &self,
+        source: &[Point],
+        options: &FieldOptions,
+        seed: u64,
+    ) -> Result<Box<dyn Trainer + '_>, BackendError> {
+        let target = GpuTarget::Cloud(self);
+        Ok(Box::new(GpuTrainer::new(target, source, options, seed)?))
     }
 }

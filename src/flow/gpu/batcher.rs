@@ -11,14 +11,13 @@ use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
 use super::context::Context;
 use super::half::Units;
-use super::iteration::Phases;
+use super::iteration::{Phases, Program, SubmittedLoss, SubmittedModel};
 use super::layout::{STEPS, Status};
 use super::phase::{Clock, Phase};
 use super::request::{Request, write};
 use super::tiling::{Plan, Wave};
 use crate::flow::data::locked;
 use crate::flow::field::BackendError;
-use crate::flow::options::Precision;
 
 /// How long the submitting thread waits for further requests.
 const MOMENT: Duration = Duration::from_micros(300);
@@ -150,15 +149,16 @@ impl Batch {
 }
 
 impl State {
-    /// Takes requests in order of arrival, up to the capacity of the GPU, all with the precision of
-    /// the first one. The others remain in the queue.
+    /// Takes the first request and those that go with it in order of arrival, up to the capacity of
+    /// the GPU. The others remain in the queue.
     fn take(&mut self, context: &Context) -> Vec<(u64, Request)> {
-        let precision = self.waiting.first().map(|(_, request)| request.precision);
+        let first = self.waiting.first().map(|(_, request)| request.clone());
         let mut chunks = 0;
         let mut fitting = 0;
         let mut full = false;
         let taken = self.waiting.extract_if(.., |(_, request)| {
-            if full || Some(request.precision) != precision {
+            let goes = |first: &Request| fitting == 0 || request.goes_with(first);
+            if full || !first.as_ref().is_some_and(goes) {
                 return false;
             }
             chunks += request.cut.chunks.count as u64;
@@ -186,20 +186,27 @@ fn submit<'u>(
     let iterations = requests.iter().map(|request| request.steps.len());
     let iterations = iterations.max().unwrap_or(0);
     let cuts: Vec<_> = requests.iter().map(|request| request.cut).collect();
-    let plan = Plan::new(&cuts, context.budget.rows as usize);
-    write(context, &context.buffers, requests);
-    let precision = requests.first().map(|request| request.precision);
-    let units = match precision.unwrap_or_default() {
-        Precision::F32 => None,
-        Precision::F16 => Some(units()?),
+    let Some(first) = requests.first() else {
+        return Ok(Vec::new());
     };
-    let phases = Phases::bind(context, &context.buffers, &plan, requests.len(), units)?;
+    let model = SubmittedModel::of(&first.model, units)?;
+    let rows = match model {
+        // Its buffers hold all rows.
+        SubmittedModel::Linear(_) => usize::MAX,
+        _ => context.budget.rows as usize,
+    };
+    let loss = SubmittedLoss::of(requests);
+    let plan = Plan::new(&cuts, rows);
+    let program = Program::new(&plan, loss);
+    write(context, &context.buffers, requests);
+    let lanes = requests.len();
+    let phases = Phases::bind(context, &context.buffers, &plan, lanes, model, loss)?;
     let clock = Clock::new(context, MOMENTS);
 
     let mut encoder = context.encoder();
     for step in 0..iterations {
         let clock = clock.as_ref().filter(|_| step == 0);
-        iterate(&mut encoder, &phases, &plan, step, clock);
+        iterate(&mut encoder, &phases, &program, step, clock);
     }
     let status_bytes = (requests.len() * size_of::<Status>()) as u64;
     let loss_bytes = (requests.len() * STEPS * size_of::<f32>()) as u64;
@@ -216,10 +223,9 @@ fn submit<'u>(
 
     let (statuses, rest) = read.split_at(status_bytes as usize);
     let (losses, moments) = rest.split_at(loss_bytes as usize);
-    let first_wave = plan.waves[0].tiles as f64 / plan.tiles.len() as f64;
     let pace = clock.map(|clock| {
         let iteration = clock.seconds(moments, 0, 3);
-        let query = (clock.seconds(moments, 1, 2) / first_wave).min(iteration);
+        let query = (clock.seconds(moments, 1, 2) / program.query_share).min(iteration);
         let tiles = plan.tiles.len() as f64;
         TileThroughput {
             iteration,
@@ -249,38 +255,26 @@ fn submit<'u>(
 fn iterate(
     encoder: &mut wgpu::CommandEncoder,
     phases: &Phases<'_>,
-    plan: &Plan,
+    program: &Program,
     step: usize,
     clock: Option<&Clock>,
 ) {
-    let (first, rest) = (&plan.waves[0], &plan.waves[1..]);
-    let mut pass = match clock {
-        None => {
-            let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
-            phases.dispatch(&mut pass, Phase::Halve, step, first);
-            phases.dispatch(&mut pass, Phase::Forward, step, first);
-            phases.dispatch(&mut pass, Phase::DistanceLoss, step, first);
-            pass
-        }
-        Some(clock) => {
-            let mut pass = clock.pass(encoder, Some(0), None);
-            phases.dispatch(&mut pass, Phase::Halve, step, first);
-            phases.dispatch(&mut pass, Phase::Forward, step, first);
-            drop(pass);
-            let mut pass = clock.pass(encoder, Some(1), Some(2));
-            phases.dispatch(&mut pass, Phase::DistanceLoss, step, first);
-            drop(pass);
-            clock.pass(encoder, None, Some(3))
+    let parts = [&program.before_query, &program.query, &program.after_query];
+    let run = |pass: &mut wgpu::ComputePass<'_>, part: &[(Phase, Wave)]| {
+        for (phase, wave) in part {
+            phases.dispatch(pass, *phase, step, wave);
         }
     };
-    phases.dispatch(&mut pass, Phase::Backward, step, first);
-    phases.dispatch(&mut pass, Phase::Gradients, step, first);
-    for wave in rest {
-        for phase in Phase::OF_A_WAVE {
-            phases.dispatch(&mut pass, phase, step, wave);
+    match clock {
+        None => {
+            let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
+            parts.iter().for_each(|part| run(&mut pass, part));
         }
-    }
-    for phase in Phase::OF_THE_END {
-        phases.dispatch(&mut pass, phase, step, &Wave::default());
+        Some(clock) => {
+            let moments = [(Some(0), None), (Some(1), Some(2)), (None, Some(3))];
+            for (part, (begin, end)) in parts.into_iter().zip(moments) {
+                run(&mut clock.pass(encoder, begin, end), part);
+            }
+        }
     }
 }

@@ -7,12 +7,13 @@ use super::adapter::{Adapter, AdapterKind};
 use super::allocator::Allocator;
 use super::buffers::{Buffers, allocated};
 use super::health::Watchdog;
+use super::layout::ARRAYS;
 use super::matrix_units;
 use super::matrix_units::Tile;
 use super::memory::{Budget, GpuOptions};
 use super::pipelines::Kernels;
 use crate::flow::data::locked;
-use crate::flow::field::BackendError;
+use crate::flow::field::{BackendError, Parameters};
 
 /// Time without an answer after which a GPU counts as hung. It is well below the default job lease
 /// of 60 s.
@@ -155,6 +156,32 @@ impl Context {
     pub(super) fn encoder(&self) -> wgpu::CommandEncoder {
         let description = wgpu::CommandEncoderDescriptor::default();
         self.device.create_command_encoder(&description)
+    }
+
+    /// The arrays of a fit, of `floats` floats each, which begin at the byte `at` of `buffer`.
+    ///
+    /// # Errors
+    /// As [`Self::finish`] and [`Self::empty`].
+    pub(super) fn read_arrays(
+        &self,
+        buffer: &wgpu::Buffer,
+        at: u64,
+        floats: usize,
+    ) -> Result<[Parameters; ARRAYS], BackendError> {
+        let bytes = (ARRAYS * floats * size_of::<f32>()) as u64;
+        let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
+        let copy = self.empty(bytes, usage)?;
+        let mut encoder = self.encoder();
+        encoder.copy_buffer_to_buffer(buffer, at, &copy, 0, bytes);
+        let read = self.finish(encoder, &copy, bytes)?;
+        Ok(core::array::from_fn(|array| {
+            let mut parameters = Parameters::zeros(floats);
+            let bytes = &read[array * floats * size_of::<f32>()..];
+            let into = &mut parameters.as_mut_slice()[..floats];
+            let into = bytemuck::cast_slice_mut::<f32, u8>(into);
+            into.copy_from_slice(&bytes[..floats * size_of::<f32>()]);
+            parameters
+        }))
     }
 
     /// Submits the commands, waits for them, and returns the first `bytes` bytes of `buffer`.

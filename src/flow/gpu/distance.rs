@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 
+use super::allocation::{Allocation, POINT_WORDS};
 use super::buffers::spread;
 use super::context::Context;
 use super::device::Device;
@@ -16,42 +17,10 @@ use crate::flow::field::BackendError;
 
 /// 32-bit words of a brick's 512 16-bit codes.
 const BRICK_WORDS: u64 = 256;
-/// 32-bit words of a point.
-const POINT_WORDS: u64 = 3;
 /// Maximum number of points per sampling dispatch.
 const SAMPLED: usize = 1 << 20;
 /// Points per workgroup of `sample.wgsl`.
 const SAMPLE_GROUP: usize = 64;
-
-/// Words of the store for a distance transform, followed by the source points. Released on drop.
-struct Allocation {
-    device: Arc<Device>,
-    offset: u32,
-    pub(super) words: u64,
-}
-
-impl Allocation {
-    fn take(device: &Arc<Device>, words: u64, control: &dyn Control) -> Result<Self, BackendError> {
-        let offset = device
-            .context
-            .allocator
-            .take("distance transform", words, control)?;
-        Ok(Self {
-            device: Arc::clone(device),
-            offset: offset as u32,
-            words,
-        })
-    }
-}
-
-impl Drop for Allocation {
-    fn drop(&mut self) {
-        self.device
-            .context
-            .allocator
-            .give_back(self.offset.into(), self.words);
-    }
-}
 
 /// A distance transform in the GPU's store.
 pub(super) struct GpuTransform {
@@ -59,7 +28,7 @@ pub(super) struct GpuTransform {
     pub(super) record: layout::Transform,
     /// Words of the transform, without those of the points that follow it.
     pub(super) words: u64,
-    stretch: Allocation,
+    allocation: Allocation,
 }
 
 /// Builds the distance transform of `target` over a grid that covers both clouds, metres.
@@ -100,8 +69,8 @@ pub(super) fn build(
     ];
     let words = parts.iter().sum();
     let points = source.len() as u64 * POINT_WORDS;
-    let stretch = Allocation::take(device, words + points, control)?;
-    let mut offset = u64::from(stretch.offset);
+    let allocation = Allocation::take(device, "distance transform", words + points, control)?;
+    let mut offset = u64::from(allocation.offset);
     let offsets = parts.map(|words| {
         let own = offset;
         offset += words;
@@ -137,7 +106,7 @@ pub(super) fn build(
         device: Arc::clone(device),
         record,
         words,
-        stretch,
+        allocation,
     })
 }
 
@@ -190,18 +159,10 @@ fn fill_bricks(
 }
 
 impl GpuTransform {
-    /// Offset in the store of the points that are fitted, in words. There is room for the number of
-    /// source points that the transform was built for.
+    /// Offset in the store of `points` points that are fitted, in words. There is room for the
+    /// number of source points that the transform was built for.
     pub(super) fn room_for(&self, points: usize) -> Result<u32, BackendError> {
-        let (needed, available) = (points as u64 * POINT_WORDS, self.stretch.words - self.words);
-        if needed > available {
-            return Err(BackendError::Memory {
-                what: "points",
-                needed: needed * 4,
-                available: available * 4,
-            });
-        }
-        Ok(self.stretch.offset + self.words as u32)
+        self.allocation.room_for(points, self.words)
     }
 
     /// Distance (metres) and gradient at each of `points` (N x 3, metres).

@@ -1,12 +1,115 @@
-//! One iteration on the GPU: its kernels, their bindings and their dispatches.
+//! One iteration on the GPU: the order of its phases, and their bindings and dispatches.
 
 use super::buffers::{Buffers, spread};
+use super::chamfer::ChamferPhases;
 use super::context::Context;
 use super::half::{HalfPhases, Units};
 use super::layout::Part;
+use super::linear::{LinearFit, LinearPhases};
+use super::network::NetworkPhases;
 use super::phase::{Dispatch, Phase};
+use super::request::{LossKind, Model, Request};
 use super::tiling::{Plan, Wave};
-use crate::flow::field::{BackendError, LAID_OUT, MIDDLE_LAYERS};
+use crate::flow::field::{BackendError, LAID_OUT};
+use crate::flow::options::Precision;
+
+/// The model of all lanes of a submission.
+#[derive(Clone, Copy)]
+pub(super) enum SubmittedModel<'a> {
+    /// Networks in single precision.
+    Network,
+    /// Networks in half precision.
+    Half(&'a Units),
+    /// One linear model.
+    Linear(&'a LinearFit),
+}
+
+impl<'a> SubmittedModel<'a> {
+    /// The model of a request. `units` are the kernels of half precision.
+    ///
+    /// # Errors
+    /// Those of `units`.
+    pub(super) fn of<'u: 'a>(
+        model: &'a Model,
+        units: &dyn Fn() -> Result<&'u Units, BackendError>,
+    ) -> Result<Self, BackendError> {
+        Ok(match model {
+            Model::Network(Precision::F32) => Self::Network,
+            Model::Network(Precision::F16) => Self::Half(units()?),
+            Model::Linear(fit) => Self::Linear(fit),
+        })
+    }
+}
+
+/// The loss of all lanes of a submission.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum SubmittedLoss {
+    Distance,
+    /// The Chamfer distance, with the number of queries of the largest search.
+    Chamfer {
+        queries: usize,
+    },
+}
+
+impl SubmittedLoss {
+    /// The loss of `requests`, which go with each other.
+    pub(super) fn of(requests: &[&Request]) -> Self {
+        match requests.first().map(|request| request.loss) {
+            Some(LossKind::Chamfer) => {
+                let queries = requests.iter().map(|request| request.queries());
+                Self::Chamfer {
+                    queries: queries.max().unwrap_or_default(),
+                }
+            }
+            _ => Self::Distance,
+        }
+    }
+}
+
+/// The phases of an iteration in order, each with its wave.
+pub(super) struct Program {
+    pub(super) before_query: Vec<(Phase, Wave)>,
+    pub(super) query: Vec<(Phase, Wave)>,
+    pub(super) after_query: Vec<(Phase, Wave)>,
+    /// Share of all tiles whose query is in `query`.
+    pub(super) query_share: f64,
+}
+
+impl Program {
+    /// The phases of an iteration of `plan`. A search of nearest neighbors needs the flow of all
+    /// waves, so with more than one wave the forward pass is done twice.
+    pub(super) fn new(plan: &Plan, loss: SubmittedLoss) -> Self {
+        let (first, rest) = (plan.waves[0], &plan.waves[1..]);
+        let of_a_wave = |wave: &Wave| Phase::OF_A_WAVE.map(|phase| (phase, *wave));
+        let others = rest.iter().flat_map(of_a_wave);
+        let end = Phase::OF_THE_END.map(|phase| (phase, Wave::default()));
+        match loss {
+            SubmittedLoss::Distance => {
+                let [forward, loss, backward, gradients] = of_a_wave(&first);
+                let after = [backward, gradients].into_iter();
+                Self {
+                    before_query: vec![(Phase::Halve, first), forward],
+                    query: vec![loss],
+                    after_query: after.chain(others).chain(end).collect(),
+                    query_share: first.tiles as f64 / plan.tiles.len() as f64,
+                }
+            }
+            SubmittedLoss::Chamfer { .. } => {
+                let displaced = plan.waves.iter();
+                let displaced =
+                    displaced.flat_map(|&wave| [(Phase::Forward, wave), (Phase::Deform, wave)]);
+                let skipped = usize::from(rest.is_empty());
+                let first_wave = of_a_wave(&first).into_iter().skip(skipped);
+                Self {
+                    before_query: vec![(Phase::Halve, first)],
+                    query: displaced.chain([(Phase::Nearest, first)]).collect(),
+                    after_query: first_wave.chain(others).chain(end).collect(),
+                    query_share: 1.0,
+                }
+            }
+        }
+    }
+}
 
 /// The kernels of an iteration, bound to a submission's buffers.
 pub(super) struct Phases<'a> {
@@ -14,18 +117,32 @@ pub(super) struct Phases<'a> {
     lanes: u32,
     /// Number of rows of a layer's activations.
     rows: u32,
-    forward: wgpu::BindGroup,
-    distance_loss: wgpu::BindGroup,
-    backward: wgpu::BindGroup,
-    gradients: wgpu::BindGroup,
+    model: ModelPhases<'a>,
+    /// Length of the model's array of parameters, in vec4s.
+    parameters: u32,
+    loss: wgpu::BindGroup,
+    chamfer: Option<ChamferPhases<'a>>,
     reduce_loss: wgpu::BindGroup,
     step: wgpu::BindGroup,
-    transpose: wgpu::BindGroup,
-    half: Option<HalfPhases<'a>>,
+}
+
+/// The kernels of the model.
+enum ModelPhases<'a> {
+    Network(NetworkPhases<'a>),
+    Half(HalfPhases<'a>),
+    Linear(LinearPhases<'a>),
+}
+
+/// Where the model keeps what the common kernels read and write.
+struct ModelBuffers<'a> {
+    flows: &'a wgpu::Buffer,
+    loss_gradients: &'a wgpu::Buffer,
+    partials: &'a wgpu::Buffer,
+    arrays: &'a wgpu::Buffer,
 }
 
 impl<'a> Phases<'a> {
-    /// Binds the kernels for a submission of `lanes` lanes. With `units`, half precision is used.
+    /// Binds the kernels for a submission of `lanes` lanes.
     ///
     /// # Errors
     /// [`BackendError::Busy`] if the GPU has no free memory for the plan now.
@@ -34,47 +151,91 @@ impl<'a> Phases<'a> {
         buffers: &Buffers,
         plan: &Plan,
         lanes: usize,
-        units: Option<&'a Units>,
+        model: SubmittedModel<'a>,
+        loss: SubmittedLoss,
     ) -> Result<Self, BackendError> {
         let tiles = &context.filled(bytemuck::cast_slice(&plan.tiles))?;
         let chunks = &context.filled(bytemuck::cast_slice(&plan.chunks))?;
         let storage = wgpu::BufferUsages::STORAGE;
         let tile_losses = &context.empty(plan.tiles.len() as u64 * 4, storage)?;
+        let kernels = &context.kernels;
         let Buffers {
-            networks,
-            partials,
+            store,
             lanes: records,
             steps,
             statuses,
             losses,
             ..
         } = buffers;
-        let [forward, distance_loss, backward, gradients] =
-            bind_wave(context, buffers, [tiles, chunks, tile_losses]);
-        let half = units.map(|units| HalfPhases::bind(context, buffers, units, [tiles, chunks]));
-        let kernels = &context.kernels;
+        let own = match model {
+            SubmittedModel::Linear(fit) => ModelBuffers {
+                flows: &fit.flows,
+                loss_gradients: &fit.loss_gradients,
+                partials: &fit.gradients,
+                arrays: &fit.arrays,
+            },
+            _ => ModelBuffers {
+                flows: &buffers.flows,
+                loss_gradients: &buffers.loss_gradients,
+                partials: &buffers.partials,
+                arrays: &buffers.networks,
+            },
+        };
+        let loss_kernel = match loss {
+            SubmittedLoss::Distance => &kernels.distance_loss,
+            SubmittedLoss::Chamfer { .. } => &kernels.chamfer_loss,
+        };
         Ok(Self {
             context,
             lanes: lanes as u32,
             rows: buffers.rows() as u32,
-            forward,
-            distance_loss,
-            backward,
-            gradients,
+            parameters: match model {
+                SubmittedModel::Linear(fit) => fit.quads(),
+                _ => LAID_OUT as u32 / 4,
+            },
+            model: match model {
+                SubmittedModel::Network => {
+                    ModelPhases::Network(NetworkPhases::bind(context, buffers, [tiles, chunks]))
+                }
+                SubmittedModel::Half(units) => {
+                    ModelPhases::Half(HalfPhases::bind(context, buffers, units, [tiles, chunks]))
+                }
+                SubmittedModel::Linear(fit) => {
+                    ModelPhases::Linear(LinearPhases::bind(context, buffers, fit))
+                }
+            },
+            loss: context.bound(
+                loss_kernel,
+                &[
+                    store,
+                    records,
+                    steps,
+                    tiles,
+                    statuses,
+                    own.flows,
+                    own.loss_gradients,
+                    tile_losses,
+                ],
+            ),
+            chamfer: match loss {
+                SubmittedLoss::Distance => None,
+                SubmittedLoss::Chamfer { queries } => {
+                    let phases = ChamferPhases::bind(context, buffers, [tiles, own.flows], queries);
+                    Some(phases)
+                }
+            },
             reduce_loss: context.bound(
                 &kernels.reduce_loss,
                 &[records, steps, tile_losses, statuses, losses],
             ),
             step: context.bound(
                 &kernels.step,
-                &[records, steps, statuses, partials, networks],
+                &[records, steps, statuses, own.partials, own.arrays],
             ),
-            transpose: context.bound(&kernels.transpose, &[statuses, records, networks]),
-            half,
         })
     }
 
-    /// Dispatches one kernel of iteration `step`; the kernels that work by waves, over `wave`.
+    /// Dispatches one phase of iteration `step`; those that work by waves, over `wave`.
     pub(super) fn dispatch(
         &self,
         pass: &mut wgpu::ComputePass<'_>,
@@ -82,10 +243,7 @@ impl<'a> Phases<'a> {
         step: usize,
         wave: &Wave,
     ) {
-        let half = self.half.as_ref();
-        let half = half.and_then(|half| half.dispatches(phase, wave, self.lanes));
-        let own = || self.dispatches(phase, wave).into_iter().collect();
-        for (pipeline, group, [x, y]) in half.unwrap_or_else(own) {
+        for (pipeline, group, [x, y]) in self.dispatches(phase, wave) {
             pass.set_pipeline(pipeline);
             pass.set_bind_group(0, group, &[]);
             if !matches!(phase, Phase::Halve | Phase::Transpose) {
@@ -103,110 +261,40 @@ impl<'a> Phases<'a> {
         }
     }
 
-    /// The dispatch of a phase in single precision.
-    fn dispatches(&self, phase: Phase, wave: &Wave) -> Option<Dispatch<'_>> {
+    /// The dispatches of a phase, none if the model or the loss lacks it.
+    fn dispatches(&self, phase: Phase, wave: &Wave) -> Vec<Dispatch<'_>> {
         let kernels = &self.context.kernels;
-        let tiles = spread(wave.tiles as u32);
-        Some(match phase {
-            Phase::Halve => return None,
-            Phase::Forward => (&kernels.forward, &self.forward, tiles),
-            Phase::DistanceLoss => (&kernels.distance_loss, &self.distance_loss, tiles),
-            Phase::Backward => (&kernels.backward, &self.backward, tiles),
-            Phase::Gradients => {
-                let layers = MIDDLE_LAYERS as u32 + 2;
-                let groups = [wave.chunks as u32, layers];
-                (&kernels.gradients, &self.gradients, groups)
+        match phase {
+            Phase::Halve
+            | Phase::Forward
+            | Phase::Backward
+            | Phase::Gradients
+            | Phase::Transpose => match &self.model {
+                ModelPhases::Network(model) => model.dispatches(phase, wave, self.lanes),
+                ModelPhases::Half(model) => model.dispatches(phase, wave, self.lanes),
+                ModelPhases::Linear(model) => model.dispatches(phase),
+            },
+            Phase::Deform | Phase::Nearest => {
+                let chamfer = self.chamfer.iter();
+                chamfer
+                    .map(|chamfer| chamfer.dispatch(phase, wave, self.lanes))
+                    .collect()
             }
-            Phase::ReduceLoss => (&kernels.reduce_loss, &self.reduce_loss, [self.lanes, 1]),
+            Phase::Loss => {
+                let kernel = match self.chamfer {
+                    None => &kernels.distance_loss,
+                    Some(_) => &kernels.chamfer_loss,
+                };
+                vec![(kernel, &self.loss, spread(wave.tiles as u32))]
+            }
+            Phase::ReduceLoss => vec![(&kernels.reduce_loss, &self.reduce_loss, [self.lanes, 1])],
             Phase::Step => {
-                let groups = (LAID_OUT as u32 / 4).div_ceil(STEP_GROUP);
-                (&kernels.step, &self.step, [groups, self.lanes])
+                let groups = self.parameters.div_ceil(STEP_GROUP);
+                vec![(&kernels.step, &self.step, [groups, self.lanes])]
             }
-            Phase::Transpose => {
-                let squares = MIDDLE_LAYERS as u32 * SQUARES;
-                (&kernels.transpose, &self.transpose, [squares, self.lanes])
-            }
-        })
+        }
     }
 }
 
 /// Invocations per workgroup of `step.wgsl`.
 const STEP_GROUP: u32 = 128;
-/// Squares of 32 x 32 weights per layer, see `transpose.wgsl`.
-const SQUARES: u32 = 16;
-
-/// The bindings of the kernels that run for each wave: forward, distance_loss, backward and gradients.
-fn bind_wave(
-    context: &Context,
-    buffers: &Buffers,
-    [tiles, chunks, tile_losses]: [&wgpu::Buffer; 3],
-) -> [wgpu::BindGroup; 4] {
-    let Buffers {
-        store,
-        networks,
-        activations,
-        deltas,
-        flows,
-        loss_gradients,
-        partials,
-        lanes: records,
-        steps,
-        statuses,
-        ..
-    } = buffers;
-    let kernels = &context.kernels;
-    [
-        context.bound(
-            &kernels.forward,
-            &[
-                store,
-                networks,
-                records,
-                steps,
-                tiles,
-                statuses,
-                flows,
-                activations,
-            ],
-        ),
-        context.bound(
-            &kernels.distance_loss,
-            &[
-                store,
-                records,
-                steps,
-                tiles,
-                statuses,
-                flows,
-                loss_gradients,
-                tile_losses,
-            ],
-        ),
-        context.bound(
-            &kernels.backward,
-            &[
-                networks,
-                tiles,
-                statuses,
-                loss_gradients,
-                activations,
-                records,
-                deltas,
-            ],
-        ),
-        context.bound(
-            &kernels.gradients,
-            &[
-                store,
-                records,
-                steps,
-                chunks,
-                statuses,
-                activations,
-                deltas,
-                loss_gradients,
-                partials,
-            ],
-        ),
-    ]
-}

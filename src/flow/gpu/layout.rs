@@ -3,6 +3,8 @@
 
 use bytemuck::{Pod, Zeroable};
 
+use crate::flow::field::{Parameters, TrainerState};
+
 /// Points that one workgroup evaluates.
 pub(super) const TILE: usize = 64;
 /// Maximum number of iterations of a submission.
@@ -17,6 +19,27 @@ pub(super) const TRANSPOSED: u64 = 1;
 pub(super) const MEANS: u64 = 2;
 pub(super) const SQUARES: u64 = 3;
 pub(super) const KEPT: u64 = 4;
+
+/// The arrays of a fit's state, each with its index.
+pub(super) struct Arrays<'a>(pub(super) [(u64, &'a Parameters); 4]);
+
+impl<'a> Arrays<'a> {
+    /// Those of `state`.
+    pub(super) fn of(state: &'a TrainerState) -> Self {
+        let [means, squares] = &state.moments;
+        Self([
+            (PARAMETERS, &state.parameters),
+            (MEANS, means),
+            (SQUARES, squares),
+            (KEPT, &state.kept),
+        ])
+    }
+
+    /// The parameters.
+    pub(super) fn parameters(&self) -> &'a Parameters {
+        self.0[0].1
+    }
+}
 
 /// Offsets of a distance transform in the store, in 32-bit words, and its geometry.
 #[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
@@ -36,12 +59,55 @@ pub(super) struct Transform {
     pub(super) far_vertices: [u32; 3],
 }
 
+/// The clouds of a Chamfer distance: offsets in the store, in 32-bit words, and the target's size.
+#[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
+#[repr(C)]
+pub(super) struct Cloud {
+    pub(super) target_points: u32,
+    pub(super) targets: u32,
+    pub(super) deformed: u32,
+    pub(super) nearest: u32,
+    pub(super) sources: u32,
+}
+
+/// The grid of a linear model: `Grid` of `shaders/grid.wgsl`.
+#[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
+#[repr(C)]
+pub(super) struct Grid {
+    pub(super) vertices: [u32; 3],
+    pub(super) row: u32,
+    pub(super) plane: u32,
+    pub(super) channel: u32,
+    pub(super) variation: f32,
+}
+
+/// A point on that grid: `Placed` of `shaders/grid.wgsl`.
+#[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
+#[repr(C)]
+pub(super) struct Placed {
+    pub(super) cell: [u32; 3],
+    pub(super) weights: [f32; 6],
+}
+
+/// An axis of that grid: `Axis` of `shaders/contract.wgsl`.
+#[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
+#[repr(C)]
+pub(super) struct Axis {
+    pub(super) stride: u32,
+    pub(super) extent: u32,
+    pub(super) count: u32,
+    pub(super) pitch: u32,
+    pub(super) begin: u32,
+}
+
 /// The fit of one pair within one submission.
 #[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
 #[repr(C)]
 pub(super) struct Lane {
     pub(super) transform: Transform,
+    pub(super) cloud: Cloud,
     pub(super) network: u32,
+    pub(super) parameters: u32,
     pub(super) points: u32,
     pub(super) first_tile: u32,
     pub(super) tiles: u32,
@@ -69,6 +135,8 @@ pub(super) struct Step {
     pub(super) step_size: f32,
     pub(super) square_correction: f32,
     pub(super) ema_weight: f32,
+    pub(super) share: f32,
+    pub(super) searches: u32,
 }
 
 /// A tile: the points of one workgroup.
@@ -102,6 +170,7 @@ pub(super) struct Status {
     pub(super) without_progress: u32,
     pub(super) applies: u32,
     pub(super) improves: u32,
+    pub(super) regularization: f32,
 }
 
 /// [`Status::state`]: the stopping rule has fired.

@@ -5,10 +5,12 @@
 //! at the same time share the GPU's submissions.
 
 mod adapter;
+mod allocation;
 mod allocator;
 mod backend;
 mod batcher;
 mod buffers;
+mod chamfer;
 mod context;
 mod device;
 mod distance;
@@ -17,8 +19,11 @@ mod health;
 mod inference;
 mod iteration;
 mod layout;
+mod linear;
+mod loss;
 mod matrix_units;
 mod memory;
+mod network;
 mod phase;
 mod pipelines;
 mod profile;

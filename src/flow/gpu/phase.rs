@@ -5,15 +5,20 @@ use super::context::Context;
 /// A kernel of an iteration.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Phase {
-    /// Half precision only: rounds the weights for the other kernels, before the first wave.
+    /// Networks in half precision only: rounds the weights for the other kernels, before the first
+    /// wave.
     Halve,
     Forward,
-    DistanceLoss,
+    /// Chamfer distance only: the displaced points.
+    Deform,
+    /// Chamfer distance only: the nearest neighbors of both clouds.
+    Nearest,
+    Loss,
     Backward,
     Gradients,
     ReduceLoss,
     Step,
-    /// Single precision only.
+    /// Networks in single precision only.
     Transpose,
 }
 
@@ -22,12 +27,8 @@ pub(super) type Dispatch<'a> = (&'a wgpu::ComputePipeline, &'a wgpu::BindGroup, 
 
 impl Phase {
     /// The phases that run for each wave, in order.
-    pub(super) const OF_A_WAVE: [Self; 4] = [
-        Self::Forward,
-        Self::DistanceLoss,
-        Self::Backward,
-        Self::Gradients,
-    ];
+    pub(super) const OF_A_WAVE: [Self; 4] =
+        [Self::Forward, Self::Loss, Self::Backward, Self::Gradients];
     /// The phases that run after all waves, in order.
     pub(super) const OF_THE_END: [Self; 3] = [Self::ReduceLoss, Self::Step, Self::Transpose];
 }

@@ -10,7 +10,7 @@ macro_rules! source {
 }
 
 /// Entry point and source of each single-precision kernel.
-pub(super) const SOURCES: [(&str, &str); 10] = [
+pub(super) const SOURCES: [(&str, &str); 18] = [
     ("bricks", source!("bricks")),
     (
         "sample_points",
@@ -20,6 +20,26 @@ pub(super) const SOURCES: [(&str, &str); 10] = [
     (
         "distance_loss",
         source!("common", "arithmetic", "distance", "distance_loss"),
+    ),
+    ("deform", source!("common", "deform")),
+    ("nearest", source!("common", "nearest")),
+    (
+        "chamfer_loss",
+        source!("common", "arithmetic", "chamfer_loss"),
+    ),
+    ("contract", source!("common", "contract")),
+    (
+        "variation",
+        source!("common", "arithmetic", "grid", "variation"),
+    ),
+    (
+        "reduce_variation",
+        source!("common", "arithmetic", "grid", "reduce_variation"),
+    ),
+    ("blend", source!("common", "arithmetic", "grid", "blend")),
+    (
+        "vertex_gradients",
+        source!("common", "arithmetic", "grid", "vertex_gradients"),
     ),
     ("backward", source!("common", "backward")),
     ("gradients", source!("common", "gradients")),
@@ -65,6 +85,11 @@ pub(super) struct Kernels {
     /// [`Self::forward`] with the kept parameters and without storing activations.
     pub(super) evaluate: wgpu::ComputePipeline,
     pub(super) distance_loss: wgpu::ComputePipeline,
+    pub(super) deform: wgpu::ComputePipeline,
+    pub(super) nearest: wgpu::ComputePipeline,
+    pub(super) chamfer_loss: wgpu::ComputePipeline,
+    /// The linear model's kernels.
+    pub(super) linear: LinearKernels,
     pub(super) backward: wgpu::ComputePipeline,
     pub(super) gradients: wgpu::ComputePipeline,
     pub(super) reduce_loss: wgpu::ComputePipeline,
@@ -88,6 +113,16 @@ impl Kernels {
             forward: pipeline("forward", &[]),
             evaluate: pipeline("forward", &[("EVALUATES", 1.0)]),
             distance_loss: pipeline("distance_loss", &[]),
+            deform: pipeline("deform", &[]),
+            nearest: pipeline("nearest", &[]),
+            chamfer_loss: pipeline("chamfer_loss", &[]),
+            linear: LinearKernels {
+                contract: pipeline("contract", &[]),
+                variation: pipeline("variation", &[]),
+                reduce_variation: pipeline("reduce_variation", &[]),
+                blend: pipeline("blend", &[]),
+                vertex_gradients: pipeline("vertex_gradients", &[]),
+            },
             backward: pipeline("backward", &[]),
             gradients: pipeline("gradients", &[]),
             reduce_loss: pipeline("reduce_loss", &[]),
@@ -98,6 +133,16 @@ impl Kernels {
         watchdog.check()?;
         Ok(kernels)
     }
+}
+
+/// The pipelines of the linear model.
+#[derive(Debug)]
+pub(super) struct LinearKernels {
+    pub(super) contract: wgpu::ComputePipeline,
+    pub(super) variation: wgpu::ComputePipeline,
+    pub(super) reduce_variation: wgpu::ComputePipeline,
+    pub(super) blend: wgpu::ComputePipeline,
+    pub(super) vertex_gradients: wgpu::ComputePipeline,
 }
 
 /// The half-precision pipelines.

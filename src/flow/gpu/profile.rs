@@ -3,17 +3,21 @@
 
 use super::backend::Gpu;
 use super::buffers::spread;
+use super::chamfer::GpuCloud;
 use super::distance;
-use super::distance::GpuTransform;
-use super::iteration::Phases;
-use super::layout::{Lane, Status, Step};
+use super::iteration::{Phases, SubmittedLoss, SubmittedModel};
+use super::loss::GpuTarget;
 use super::phase::{Clock, Phase};
-use super::request::{Request, write};
+use super::request::write;
 use super::tiling::{Cut, Plan};
-use crate::flow::data::{Point, Random, Uncontrolled};
+use super::trainer::GpuTrainer;
+use crate::flow::data::{Point, Uncontrolled};
 use crate::flow::distance::DistanceOptions;
-use crate::flow::field::{BackendError, MIDDLE_LAYERS, Schedule, WIDTH};
-use crate::flow::options::{FieldOptions, ModelOptions, NetworkOptions, Precision};
+use crate::flow::field::{BackendError, MIDDLE_LAYERS, WIDTH};
+use crate::flow::options::{
+    ChamferOptions, FieldOptions, LossOptions, ModelOptions, NearestSearch, NetworkOptions,
+    Precision,
+};
 
 /// Floating-point operations of the forward pass, per point.
 const FORWARD: f64 = 2.0 * (3 * WIDTH + MIDDLE_LAYERS * WIDTH * WIDTH + 3 * WIDTH) as f64;
@@ -21,23 +25,31 @@ const FORWARD: f64 = 2.0 * (3 * WIDTH + MIDDLE_LAYERS * WIDTH * WIDTH + 3 * WIDT
 /// point.
 const BACKWARD: f64 = FORWARD - 2.0 * (3 * WIDTH) as f64;
 
+/// Floating-point operations of a squared distance.
+const DISTANCE: f64 = 8.0;
+
 /// Time and work of one kernel in one iteration of a fit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct KernelTime {
     /// Name of the kernel: `forward`, `distance_loss`, `backward`, `gradients`, `reduce_loss`,
-    /// `step`, and `transpose` in single or `halve` in half precision.
+    /// `step`, `transpose` in single or `halve` in half precision, and in single precision
+    /// `nearest` and `chamfer_loss`.
     pub name: &'static str,
     /// Time by GPU timestamps, seconds: the minimum over all rounds.
     pub seconds: f64,
-    /// Number of floating-point operations of the kernel's matrix products, two per multiply-add.
-    /// Zero for a kernel without matrix products.
+    /// Number of floating-point operations of the kernel's matrix products, two per multiply-add, or
+    /// of its squared distances. Zero for another kernel.
     pub operations: f64,
 }
 
-/// Times each of the seven kernels of an iteration over all points of `source`, in the precision
-/// `precision`. It repeats the iteration `rounds` times; zero counts as one. `source` (N x 3, N at
-/// least 1) and `target` (M x 3) are in metres, in the same frame. The GPU should do no other work
-/// meanwhile.
+/// A kernel to time: its name, its phase, and its floating-point operations.
+type Timed = (&'static str, Phase, f64);
+
+/// Times each of the kernels of an iteration over all points of `source`, in the precision
+/// `precision`: for a network, with a distance transform and, in single precision, with the Chamfer
+/// distance to all points of `target`. It repeats the iteration `rounds` times; zero counts as one.
+/// `source` (N x 3, N at least 1) and `target` (M x 3) are in metres, in the same frame. The GPU
+/// should do no other work meanwhile.
 ///
 /// # Errors
 /// - [`BackendError::Unsupported`] if the memory cannot hold all points at once, the GPU has no
@@ -54,31 +66,19 @@ pub fn kernel_times(
     rounds: usize,
 ) -> Result<Vec<KernelTime>, BackendError> {
     let device = gpu.device();
-    let context = &device.context;
-    let cut = Cut::new(source.len());
-    let plan = Plan::new(&[cut], context.budget.rows as usize);
-    let [wave] = plan.waves.as_slice() else {
-        let text = "the kernels are timed on what fits into the card's memory at once";
-        return Err(BackendError::Unsupported(text));
-    };
-    let built = distance::build(
-        device,
-        source,
-        target,
-        &DistanceOptions::default(),
-        &Uncontrolled,
-    )?;
-    let request = repeated_iteration(&built, source, cut, precision)?;
-    write(context, &context.buffers, &[&request]);
-    let units = match precision {
-        Precision::F32 => None,
-        Precision::F16 => Some(device.units()?),
-    };
-    let phases = Phases::bind(context, &context.buffers, &plan, 1, units)?;
     let points = source.len() as f64;
+    let network = FieldOptions {
+        model: ModelOptions::Network(NetworkOptions {
+            precision,
+            ..NetworkOptions::published()
+        }),
+        // The repeated iteration makes no progress and must not stop the fit.
+        early_stop: None,
+        ..FieldOptions::published(false)
+    };
     let kernels = [
         ("forward", Phase::Forward, points * FORWARD),
-        ("distance_loss", Phase::DistanceLoss, 0.0),
+        ("distance_loss", Phase::Loss, 0.0),
         ("backward", Phase::Backward, points * BACKWARD),
         ("gradients", Phase::Gradients, points * FORWARD),
         ("reduce_loss", Phase::ReduceLoss, 0.0),
@@ -88,15 +88,63 @@ pub fn kernel_times(
             Precision::F16 => ("halve", Phase::Halve, 0.0),
         },
     ];
-    let mut times = kernels.map(|(name, _, operations)| KernelTime {
+    let transform = DistanceOptions::default();
+    let built = distance::build(device, source, target, &transform, &Uncontrolled)?;
+    let on = GpuTarget::Transform(&built);
+    let mut times = timed(gpu, on, source, &network, &kernels, rounds)?;
+    if precision == Precision::F32 {
+        let distances = 2.0 * points * target.len() as f64;
+        let kernels = [
+            ("nearest", Phase::Nearest, distances * DISTANCE),
+            ("chamfer_loss", Phase::Loss, 0.0),
+        ];
+        let chamfer = ChamferOptions::published(NearestSearch::BruteForce);
+        let cloud = GpuCloud::new(device, source.len(), target, &chamfer, &Uncontrolled)?;
+        let options = FieldOptions {
+            loss: LossOptions::Chamfer(chamfer),
+            ..network
+        };
+        let on = GpuTarget::Cloud(&cloud);
+        times.extend(timed(gpu, on, source, &options, &kernels, rounds)?);
+    }
+    Ok(times)
+}
+
+/// Times `kernels` of an iteration over `source` that can be repeated: its step size is zero.
+fn timed(
+    gpu: &Gpu,
+    target: GpuTarget<'_>,
+    source: &[Point],
+    options: &FieldOptions,
+    kernels: &[Timed],
+    rounds: usize,
+) -> Result<Vec<KernelTime>, BackendError> {
+    let device = gpu.device();
+    let context = &device.context;
+    let cut = Cut::new(source.len());
+    let plan = Plan::new(&[cut], context.budget.rows as usize);
+    let [wave] = plan.waves.as_slice() else {
+        let text = "the kernels are timed on what fits into the card's memory at once";
+        return Err(BackendError::Unsupported(text));
+    };
+    // The network keeps its initial parameters, because the step size is zero.
+    let mut trainer = GpuTrainer::new(target, source, options, 0)?;
+    let mut request = trainer.request(1);
+    request.steps[0].step_size = 0.0;
+    write(context, &context.buffers, &[&request]);
+    let model = SubmittedModel::of(&request.model, &|| device.units())?;
+    let loss = SubmittedLoss::of(&[&request]);
+    let phases = Phases::bind(context, &context.buffers, &plan, 1, model, loss)?;
+    let start = |&(name, _, operations): &Timed| KernelTime {
         name,
         seconds: f64::INFINITY,
         operations,
-    });
+    };
+    let mut times: Vec<_> = kernels.iter().map(start).collect();
     for _ in 0..rounds.max(1) {
         let clock = clock(gpu, 2 * kernels.len() as u32)?;
         let mut encoder = context.encoder();
-        for (index, (_, phase, _)) in (0..).zip(kernels) {
+        for (index, &(_, phase, _)) in (0..).zip(kernels) {
             let mut pass = clock.pass(&mut encoder, Some(2 * index), Some(2 * index + 1));
             phases.dispatch(&mut pass, phase, 0, wave);
         }
@@ -106,47 +154,7 @@ pub fn kernel_times(
             time.seconds = time.seconds.min(seconds);
         }
     }
-    Ok(times.to_vec())
-}
-
-/// One iteration over all points that can be repeated: its step size is zero.
-fn repeated_iteration(
-    built: &GpuTransform,
-    source: &[Point],
-    cut: Cut,
-    precision: Precision,
-) -> Result<Request, BackendError> {
-    let options = FieldOptions {
-        model: ModelOptions::Network(NetworkOptions {
-            precision,
-            ..NetworkOptions::published()
-        }),
-        // The repeated iteration makes no progress and must not stop the fit.
-        early_stop: None,
-        ..FieldOptions::published(false)
-    };
-    let schedule = Schedule::new(source, &options, &mut Random::new(0));
-    // The network keeps its initial parameters, because the step size is zero.
-    let trainer = super::trainer::GpuTrainer::new(built, source, &options, 0)?;
-    let adam = schedule.adam(0);
-    Ok(Request {
-        lane: Lane {
-            tiles: cut.tiles as u32,
-            chunks: cut.chunks.count as u32,
-            ..trainer.lane()
-        },
-        status: Status::default(),
-        steps: vec![Step {
-            first: 0,
-            count: source.len() as u32,
-            weight: 1.0 / source.len() as f32,
-            step_size: 0.0,
-            square_correction: adam.square_correction,
-            ema_weight: 1.0,
-        }],
-        cut,
-        precision,
-    })
+    Ok(times)
 }
 
 /// Measures the peak arithmetic throughput of the GPU in single precision and returns it in

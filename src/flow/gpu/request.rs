@@ -1,10 +1,27 @@
 //! A request: the next iterations of one pair, and their records for the kernels.
 
+use std::sync::Arc;
+
 use super::buffers::Buffers;
 use super::context::Context;
 use super::layout::{Lane, STEPS, Status, Step};
+use super::linear::LinearFit;
 use super::tiling::Cut;
 use crate::flow::options::Precision;
+
+/// The model of a request.
+#[derive(Clone, Debug)]
+pub(super) enum Model {
+    Network(Precision),
+    Linear(Arc<LinearFit>),
+}
+
+/// The loss of a request.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum LossKind {
+    Distance,
+    Chamfer,
+}
 
 /// The next iterations of one pair.
 #[derive(Clone, Debug)]
@@ -14,8 +31,27 @@ pub(super) struct Request {
     /// One per requested iteration, at most [`STEPS`].
     pub(super) steps: Vec<Step>,
     pub(super) cut: Cut,
-    /// The same for all requests of a submission, because the kernels differ.
-    pub(super) precision: Precision,
+    pub(super) model: Model,
+    pub(super) loss: LossKind,
+}
+
+impl Request {
+    /// Whether both requests can be in one submission, which has one set of kernels.
+    pub(super) fn goes_with(&self, other: &Self) -> bool {
+        let same = match (&self.model, &other.model) {
+            (Model::Network(own), Model::Network(other)) => own == other,
+            // Its buffers are those of one fit.
+            _ => false,
+        };
+        same && self.loss == other.loss
+    }
+
+    /// Queries of the largest search of nearest neighbors.
+    pub(super) fn queries(&self) -> usize {
+        let batches = self.steps.iter().map(|step| step.count);
+        let largest = batches.chain([self.lane.cloud.targets]).max();
+        largest.unwrap_or_default() as usize
+    }
 }
 
 /// Writes the records of all requests to the buffers that the kernels read.

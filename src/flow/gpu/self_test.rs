@@ -9,12 +9,12 @@
 use super::buffers::Buffers;
 use super::context::Context;
 use super::half::Units;
-use super::iteration::Phases;
+use super::iteration::{Phases, SubmittedLoss, SubmittedModel};
 use super::layout::{Lane, Status, Step, TILE};
 use super::matrix_units::Tile;
 use super::memory::Budget;
 use super::phase::Phase;
-use super::request::{Request, write as write_request};
+use super::request::{LossKind, Model, Request, write as write_request};
 use super::tiling::{Cut, Plan};
 use crate::flow::data::Random;
 use crate::flow::field::{
@@ -119,8 +119,9 @@ fn computed(context: &Context, units: &Units) -> Result<[Computed; 2], BackendEr
     let buffers = Buffers::allocate(&context.device, &budget, more)?;
     let plan = Plan::new(&[cut], cut.tiles * TILE);
     fill(context, &buffers, cut);
-    let single = Phases::bind(context, &buffers, &plan, 1, None)?;
-    let half = Phases::bind(context, &buffers, &plan, 1, Some(units))?;
+    let bind = |model| Phases::bind(context, &buffers, &plan, 1, model, SubmittedLoss::Distance);
+    let single = bind(SubmittedModel::Network)?;
+    let half = bind(SubmittedModel::Half(units))?;
 
     let row_bytes = budget.row_bytes();
     let sizes = [
@@ -221,7 +222,8 @@ fn fill(context: &Context, buffers: &Buffers, cut: Cut) {
             ..Step::default()
         }],
         cut,
-        precision: Precision::F16,
+        model: Model::Network(Precision::F16),
+        loss: LossKind::Distance,
     };
     write_request(context, buffers, &[&request]);
 }

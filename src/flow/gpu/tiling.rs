@@ -26,6 +26,14 @@ impl Cut {
         }
     }
 
+    /// The same in one chunk of any size, for a model whose gradients are not summed by chunk.
+    pub(super) fn one(points: usize) -> Self {
+        Self {
+            chunks: Chunks::one(points),
+            ..Self::new(points)
+        }
+    }
+
     /// The tiles of a chunk.
     fn tiles_of(&self, chunk: usize) -> core::ops::Range<usize> {
         let points = self.chunks.points(chunk);

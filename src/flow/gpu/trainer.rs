@@ -2,43 +2,22 @@
 
 use std::sync::Arc;
 
-use super::batcher::Done;
+use super::batcher::{Done, TileThroughput};
 use super::device::Device;
-use super::distance::GpuTransform;
-use super::layout::{
-    ARRAYS, CONVERGED, DIVERGED, KEPT, MEANS, PARAMETERS, SQUARES, STEPS, Status, TRANSPOSED,
-};
+use super::layout::{ARRAYS, Arrays, CONVERGED, DIVERGED, STEPS, Status};
+use super::linear::LinearFit;
+use super::loss::{GpuLoss, GpuTarget};
 use super::memory::NETWORK_BYTES;
-use super::request::Request;
+use super::network::NetworkFit;
+use super::request::{Model, Request};
 use super::tiling::Cut;
 use super::{inference, layout};
 use crate::flow::data::{Control, Point, Progress, Random};
-use crate::flow::field::Network as FittedNetwork;
 use crate::flow::field::{
     Advance, BackendError, Conditioning, EarlyStopState, FitReport, FittedField, GrowthState,
-    LAID_OUT, Parameters, Schedule, Trainer, TrainerState, check_state, mlp,
-    transpose_middle_layers,
+    LAID_OUT, LinearGrid, Network, Parameters, Schedule, Trainer, TrainerState, check_state, mlp,
 };
-use crate::flow::options::{DistanceLossOptions, FieldOptions, Precision};
-
-/// The error of a fit to a Chamfer distance.
-pub(super) const NO_CHAMFER: BackendError =
-    BackendError::Unsupported("the Chamfer distance is computed on the CPU alone");
-
-/// The error of a fit of the linear model.
-const NO_LINEAR_MODEL: BackendError =
-    BackendError::Unsupported("the linear model is computed on the CPU alone");
-
-/// The error of a fit with a cycle.
-const NO_CYCLE: BackendError =
-    BackendError::Unsupported("the cycle of two networks is computed on the CPU alone");
-
-/// The error of a fit with a growing batch.
-const NO_GROWTH: BackendError = BackendError::Unsupported("batches grow on the CPU alone");
-
-/// The error of a fit in bird's eye view.
-const NO_BEV: BackendError =
-    BackendError::Unsupported("the bird's eye view is computed on the CPU alone");
+use crate::flow::options::{FieldOptions, ModelOptions, Precision};
 
 /// The growth of a constant batch.
 const CONSTANT: GrowthState = GrowthState {
@@ -53,167 +32,140 @@ const SUBMISSION_SECONDS: f64 = 0.03;
 const BLIND_STEPS: usize = 4;
 /// Maximum number of iterations per submission if a stopping rule may end the fit at any iteration.
 const STOPPABLE_STEPS: usize = 16;
-/// A network slot of the GPU. Released on drop.
-struct Network {
-    device: Arc<Device>,
-    number: u32,
+/// The model of a fit.
+enum GpuModel {
+    Network(NetworkFit),
+    Linear(Arc<LinearFit>),
 }
 
-impl Network {
-    fn take(device: &Arc<Device>) -> Result<Self, BackendError> {
-        let number = device.context.take_network()?;
-        device.batch.joined();
-        Ok(Self {
-            device: Arc::clone(device),
-            number,
-        })
-    }
-
-    /// Byte offset of one of the slot's arrays.
-    fn at(&self, array: u64) -> u64 {
-        (u64::from(self.number) * ARRAYS as u64 + array) * NETWORK_BYTES
-    }
-
-    fn write(&self, array: u64, parameters: &Parameters) {
-        let bytes = bytemuck::cast_slice(&parameters.as_slice()[..LAID_OUT]);
-        let queue = &self.device.context.queue;
-        queue.write_buffer(&self.device.context.buffers.networks, self.at(array), bytes);
-    }
-}
-
-impl Drop for Network {
-    fn drop(&mut self) {
-        self.device.batch.left();
-        self.device.context.give_network_back(self.number);
-    }
-}
-
-/// The network, its optimizer and the distance transform of the target.
+/// The model, its optimizer and the prepared target.
 pub(super) struct GpuTrainer<'a> {
-    transform: &'a GpuTransform,
-    precision: Precision,
-    loss: DistanceLossOptions,
-    conditioning: Conditioning,
+    device: Arc<Device>,
+    loss: GpuLoss<'a>,
+    model: GpuModel,
     schedule: Schedule,
     cut: Cut,
-    network: Network,
     /// Offset of the points in the store, in words.
     points: u32,
     status: Status,
+    /// Speed of the latest submission.
+    pace: Option<TileThroughput>,
     query_seconds: f64,
 }
 
 impl<'a> GpuTrainer<'a> {
     pub(super) fn new(
-        transform: &'a GpuTransform,
+        target: GpuTarget<'a>,
         source: &[Point],
         options: &FieldOptions,
         seed: u64,
     ) -> Result<Self, BackendError> {
-        let device = &transform.device;
-        let loss = options.loss.distance().ok_or(NO_CHAMFER)?.clone();
-        let model = *options.network().ok_or(NO_LINEAR_MODEL)?;
-        if model.cycle {
-            return Err(NO_CYCLE);
-        }
-        if options.growth.is_some() {
-            return Err(NO_GROWTH);
-        }
-        if options.bev {
-            return Err(NO_BEV);
-        }
-        if model.precision == Precision::F16 {
-            device.units()?;
-        }
+        let device = Arc::clone(target.device());
+        let loss = GpuLoss::new(target, &options.loss)?;
+        check_kernels(options)?;
         let mut random = Random::stream(seed, 0);
-        let parameters = mlp::initial(model.start, &mut random);
-        let schedule = Schedule::new(source, options, &mut random);
-        let cut = Cut::new(schedule.largest_batch(CONSTANT));
-        let chunks = cut.chunks.count as u64;
-        if chunks > device.context.budget.chunks {
-            return Err(BackendError::Memory {
-                what: "gradients",
-                needed: chunks * NETWORK_BYTES,
-                available: device.context.budget.chunk_bytes(),
-            });
-        }
-        let points = transform.room_for(schedule.points.len())?;
-        let at = u64::from(points) * 4;
-        let bytes = bytemuck::cast_slice(&schedule.points);
-        device
-            .context
-            .queue
-            .write_buffer(&device.context.buffers.store, at, bytes);
+        let (model, parameters, schedule, cut) = match &options.model {
+            ModelOptions::Network(network) => {
+                if network.precision == Precision::F16 {
+                    device.units()?;
+                }
+                let parameters = mlp::initial(network.start, &mut random);
+                let schedule = Schedule::new(source, options, &mut random);
+                let cut = Cut::new(schedule.largest_batch(CONSTANT));
+                check_chunks(&device, cut)?;
+                let conditioning = Conditioning::new(source, network.inputs);
+                let model = NetworkFit::take(&device, conditioning, network.precision)?;
+                (GpuModel::Network(model), parameters, schedule, cut)
+            }
+            ModelOptions::Linear(linear) => {
+                let grid = LinearGrid::plan(source, linear)?;
+                let mut parameters = Parameters::zeros(3 * grid.channel());
+                grid.initial(&mut random, parameters.as_mut_slice());
+                let schedule = Schedule::new(source, options, &mut random);
+                let cut = Cut::one(schedule.largest_batch(CONSTANT));
+                let model = LinearFit::new(&device, grid, linear.variation_weight, &schedule)?;
+                (GpuModel::Linear(Arc::new(model)), parameters, schedule, cut)
+            }
+        };
         let mut trainer = Self {
-            transform,
-            precision: model.precision,
+            points: target.write_points(&schedule.points)?,
+            device,
             loss,
-            network: Network::take(device)?,
-            conditioning: Conditioning::new(source, model.inputs),
+            model,
             schedule,
             cut,
-            points,
             status: Status::default(),
+            pace: None,
             query_seconds: 0.0,
         };
         trainer.restore(TrainerState::at_start(parameters))?;
         Ok(trainer)
     }
 
-    fn device(&self) -> &Arc<Device> {
-        &self.transform.device
-    }
-
     /// The lane's record, without the offsets of its tiles and chunks in a submission.
-    pub(super) fn lane(&self) -> layout::Lane {
-        let (loss, rule) = (&self.loss, self.schedule.options.early_stop);
-        layout::Lane {
-            transform: self.transform.record,
-            network: self.network.number,
+    fn lane(&self) -> layout::Lane {
+        let rule = self.schedule.options.early_stop;
+        let mut lane = layout::Lane {
             points: self.points,
-            center: self.conditioning.center,
-            scale: self.conditioning.scale,
-            margin: loss.margin_m,
-            margin_slope: loss.margin_slope,
-            truncation: loss.truncation_m.unwrap_or(f32::MAX),
-            flow_penalty: loss.flow_penalty,
             average: self.schedule.ema_weight(0).is_some().into(),
             patience: rule.map_or(0, |rule| rule.patience.max(1) as u32),
             min_delta: rule.map_or(0.0, |rule| rule.min_delta as f32),
             ..layout::Lane::default()
+        };
+        self.loss.describe(&mut lane);
+        match &self.model {
+            GpuModel::Network(network) => {
+                lane.network = network.number();
+                lane.parameters = LAID_OUT as u32 / 4;
+                lane.center = network.conditioning.center;
+                lane.scale = network.conditioning.scale;
+            }
+            GpuModel::Linear(linear) => lane.parameters = linear.quads(),
         }
+        lane
     }
 
     /// The record of the iteration that follows `done` others.
-    fn step(&self, done: usize) -> layout::Step {
+    fn step(&mut self, done: usize) -> layout::Step {
         let batch = self.schedule.batch(done, CONSTANT);
         let adam = self.schedule.adam(done);
-        layout::Step {
+        let mut step = layout::Step {
             first: batch.start as u32,
             count: batch.len() as u32,
             weight: 1.0 / batch.len() as f32,
             step_size: adam.step_size,
             square_correction: adam.square_correction,
             ema_weight: self.schedule.ema_weight(done).unwrap_or(1.0),
+            ..layout::Step::default()
+        };
+        self.loss.describe_step(&mut step, done, &batch);
+        step
+    }
+
+    /// The request for the next `steps` iterations.
+    pub(super) fn request(&mut self, steps: usize) -> Request {
+        let done = self.status.iterations as usize;
+        Request {
+            lane: self.lane(),
+            status: self.status,
+            steps: (done..done + steps).map(|done| self.step(done)).collect(),
+            cut: self.cut,
+            model: match &self.model {
+                GpuModel::Network(network) => Model::Network(network.precision),
+                GpuModel::Linear(linear) => Model::Linear(Arc::clone(linear)),
+            },
+            loss: self.loss.kind(),
         }
     }
 
     /// Runs up to `steps` iterations in one submission.
     fn submit(&mut self, steps: usize) -> Result<Done, BackendError> {
-        let done = self.status.iterations as usize;
-        let request = Request {
-            lane: self.lane(),
-            status: self.status,
-            steps: (done..done + steps).map(|done| self.step(done)).collect(),
-            cut: self.cut,
-            precision: self.precision,
-        };
-        let done = {
-            let device = self.device();
-            let units = || device.units();
-            device.batch.run(&device.context, &units, request)?
-        };
+        let request = self.request(steps);
+        let device = &self.device;
+        let units = || device.units();
+        let done = device.batch.run(&device.context, &units, request)?;
         self.status = done.status;
+        self.pace = done.pace;
         if let Some(pace) = done.pace {
             let tiles = self.cut.tiles * done.losses.len();
             self.query_seconds += pace.tile_query * tiles as f64;
@@ -221,43 +173,24 @@ impl<'a> GpuTrainer<'a> {
         Ok(done)
     }
 
-    /// The state, read from the GPU.
-    fn read_state(&mut self) -> Result<TrainerState, BackendError> {
-        let context = &self.device().context;
-        let bytes = ARRAYS as u64 * NETWORK_BYTES;
-        let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
-        let copy = context.empty(bytes, usage)?;
-        let mut encoder = context.encoder();
-        let from = self.network.at(PARAMETERS);
-        encoder.copy_buffer_to_buffer(&context.buffers.networks, from, &copy, 0, bytes);
-        let read = context.finish(encoder, &copy, bytes)?;
-        let array = |array: u64| {
-            let mut parameters = mlp::zeros();
-            let from = (array * NETWORK_BYTES) as usize;
-            let bytes = &read[from..from + NETWORK_BYTES as usize];
-            bytemuck::cast_slice_mut::<f32, u8>(&mut parameters.as_mut_slice()[..LAID_OUT])
-                .copy_from_slice(bytes);
-            parameters
-        };
-        let status = &self.status;
-        Ok(TrainerState {
-            parameters: array(PARAMETERS),
-            moments: [array(MEANS), array(SQUARES)],
-            kept: array(KEPT),
-            seen: EarlyStopState {
-                best: (status.seen == 1).then_some(status.seen_best),
-                without_progress: status.without_progress as usize,
-            },
-            iterations: status.iterations as usize,
-            best_iteration: status.best_iteration as usize,
-            growth: CONSTANT,
-            best_loss: widened(status.best_loss),
-        })
+    /// The arrays of the fit, read from the GPU.
+    fn read_arrays(&self) -> Result<[Parameters; ARRAYS], BackendError> {
+        match &self.model {
+            GpuModel::Network(network) => network.read(),
+            GpuModel::Linear(linear) => linear.read(&self.device.context),
+        }
     }
 
     /// The number of iterations for the next submission.
     fn stride(&self) -> usize {
-        let seconds = self.device().batch.pace().map(|pace| {
+        // Networks that are fitted to distance transforms share their submissions' speed.
+        let shared = matches!(self.model, GpuModel::Network(_))
+            && matches!(self.loss, GpuLoss::Distance { .. });
+        let pace = match shared {
+            true => self.device.batch.pace(),
+            false => self.pace,
+        };
+        let seconds = pace.map(|pace| {
             let own = pace.tile * self.cut.tiles as f64;
             own.max(pace.iteration)
         });
@@ -269,7 +202,7 @@ impl<'a> GpuTrainer<'a> {
         match seconds {
             Some(seconds) => ((SUBMISSION_SECONDS / seconds.max(1e-6)) as usize).clamp(1, most),
             // The first submission measures the GPU's speed.
-            None if self.device().context.tick.is_some() => 1,
+            None if self.device.context.tick.is_some() => 1,
             None => BLIND_STEPS,
         }
     }
@@ -316,15 +249,30 @@ impl Trainer for GpuTrainer<'_> {
     }
 
     fn evaluate(&mut self, points: &[Point]) -> Result<Vec<Point>, BackendError> {
-        let networks = &self.device().context.buffers.networks;
-        inference::evaluate(&self.device().context, networks, &self.lane(), points)
+        let context = &self.device.context;
+        match &self.model {
+            GpuModel::Network(_) => {
+                let networks = &context.buffers.networks;
+                inference::evaluate(context, networks, &self.lane(), points)
+            }
+            GpuModel::Linear(linear) => {
+                let field = linear.field(context)?;
+                Ok(field.flow(points, self.device.host.threads()))
+            }
+        }
     }
 
     fn fitted(&mut self) -> Result<FittedField, BackendError> {
-        Ok(FittedField::Network(FittedNetwork {
-            parameters: self.read_state()?.kept,
-            conditioning: self.conditioning,
-        }))
+        Ok(match &self.model {
+            GpuModel::Network(network) => {
+                let [.., kept] = network.read()?;
+                FittedField::Network(Network {
+                    parameters: kept,
+                    conditioning: network.conditioning,
+                })
+            }
+            GpuModel::Linear(linear) => FittedField::Linear(linear.field(&self.device.context)?),
+        })
     }
 
     fn report(&self) -> FitReport {
@@ -337,19 +285,39 @@ impl Trainer for GpuTrainer<'_> {
     }
 
     fn state(&mut self) -> Result<Option<TrainerState>, BackendError> {
-        self.read_state().map(Some)
+        let status = &self.status;
+        if self.loss.depends_on_earlier(status.iterations as usize) {
+            return Ok(None);
+        }
+        let [parameters, _, means, squares, kept] = self.read_arrays()?;
+        Ok(Some(TrainerState {
+            parameters,
+            moments: [means, squares],
+            kept,
+            seen: EarlyStopState {
+                best: (status.seen == 1).then_some(status.seen_best),
+                without_progress: status.without_progress as usize,
+            },
+            iterations: status.iterations as usize,
+            best_iteration: status.best_iteration as usize,
+            growth: CONSTANT,
+            best_loss: widened(status.best_loss),
+        }))
     }
 
     fn restore(&mut self, state: TrainerState) -> Result<(), BackendError> {
-        check_state(&state, LAID_OUT)?;
-        let mut transposed = mlp::zeros();
-        transpose_middle_layers(state.parameters.as_slice(), transposed.as_mut_slice());
-        let [means, squares] = &state.moments;
-        self.network.write(PARAMETERS, &state.parameters);
-        self.network.write(TRANSPOSED, &transposed);
-        self.network.write(MEANS, means);
-        self.network.write(SQUARES, squares);
-        self.network.write(KEPT, &state.kept);
+        let arrays = Arrays::of(&state);
+        match &self.model {
+            GpuModel::Network(network) => {
+                check_state(&state, LAID_OUT)?;
+                network.write(&arrays);
+            }
+            GpuModel::Linear(linear) => {
+                check_state(&state, linear.floats())?;
+                linear.write(&self.device.context, &arrays);
+            }
+        }
+        self.loss.forget();
         self.status = Status {
             iterations: state.iterations as u32,
             best_iteration: state.best_iteration as u32,
@@ -359,12 +327,42 @@ impl Trainer for GpuTrainer<'_> {
             without_progress: state.seen.without_progress as u32,
             ..Status::default()
         };
-        self.device().context.watchdog.check()
+        self.device.context.watchdog.check()
     }
 
     fn shorten(&mut self, max_iterations: usize) {
         self.schedule.shorten(max_iterations);
     }
+}
+
+/// Checks that the fit asks for nothing that the CPU alone has.
+fn check_kernels(options: &FieldOptions) -> Result<(), BackendError> {
+    let text = if options.has_cycle() {
+        "the cycle of two networks is computed on the CPU alone"
+    } else if options.consistency_weight > 0.0 {
+        "the local consistency is computed on the CPU alone"
+    } else if options.growth.is_some() {
+        "batches grow on the CPU alone"
+    } else if options.bev {
+        "the bird's eye view is computed on the CPU alone"
+    } else {
+        return Ok(());
+    };
+    Err(BackendError::Unsupported(text))
+}
+
+/// Checks that the gradients of a batch fit into the GPU's memory.
+fn check_chunks(device: &Device, cut: Cut) -> Result<(), BackendError> {
+    let budget = &device.context.budget;
+    let chunks = cut.chunks.count as u64;
+    if chunks <= budget.chunks {
+        return Ok(());
+    }
+    Err(BackendError::Memory {
+        what: "gradients",
+        needed: chunks * NETWORK_BYTES,
+        available: budget.chunk_bytes(),
+    })
 }
 
 /// On the GPU the largest finite float stands for infinity.

@@ -134,13 +134,21 @@ impl FieldOptions {
         self
     }
 
-    /// Whether the fit has kernels for a GPU: that of one network to a distance transform, with a
-    /// constant batch, without a partition, in three dimensions.
+    /// Whether the fit has kernels for a GPU: that of one network or linear model to a distance
+    /// transform or, by all distances, to a Chamfer distance, with a constant batch, without a
+    /// partition, in three dimensions.
     pub fn runs_on_gpu(&self) -> bool {
-        let one_network = self.network().is_some_and(|network| !network.cycle);
+        let searched = match &self.loss {
+            LossOptions::Distance(_) => true,
+            LossOptions::Chamfer(options) => options.search == NearestSearch::BruteForce,
+        };
         let whole = self.partition.is_none() && self.consistency_weight == 0.0;
-        let plain = whole && self.growth.is_none() && !self.bev;
-        one_network && self.loss.distance().is_some() && plain
+        searched && whole && self.growth.is_none() && !self.bev && !self.has_cycle()
+    }
+
+    /// Whether the fit has kernels in half precision: that of a network on a GPU.
+    pub fn runs_in_half(&self) -> bool {
+        self.network().is_some() && self.runs_on_gpu()
     }
 
     /// These options with the partition of NSFP++, its cycle and its local consistency.

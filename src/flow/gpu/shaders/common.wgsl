@@ -43,11 +43,24 @@ struct Transform {
     far_vertices: array<u32, 3>,
 }
 
+// The clouds of a Chamfer distance in the store: offsets, in words, and the size of the target.
+struct Cloud {
+    target_points: u32,
+    targets: u32,
+    // The batch's displaced points.
+    deformed: u32,
+    // The target point nearest to each of them, and the one of them nearest to each target point.
+    nearest: u32,
+    sources: u32,
+}
+
 // The fit of one pair within one submission.
 struct Lane {
     transform: Transform,
-    // Index of its network slot.
+    cloud: Cloud,
+    // Index of its arrays of parameters, and the length of one in vec4s.
     network: u32,
+    parameters: u32,
     // Offset of the source points in the store, words.
     points: u32,
     // Its tiles and chunks among those of the submission.
@@ -84,6 +97,10 @@ struct Step {
     square_correction: f32,
     // Weight of the new parameters in the running average.
     ema_weight: f32,
+    // Points of the batch over points of the target.
+    share: f32,
+    // 1 if nearest neighbors are searched, 0 if those of an earlier iteration are kept.
+    searches: u32,
 }
 
 // A tile of a lane's batch: the points of one workgroup.
@@ -114,6 +131,8 @@ struct Status {
     // Whether this iteration's gradients are applied, and whether it is the best so far.
     applies: u32,
     improves: u32,
+    // What the model adds to the mean loss of the points.
+    regularization: f32,
 }
 
 // Whether the lane is running and has this iteration.

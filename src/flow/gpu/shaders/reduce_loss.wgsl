@@ -1,8 +1,8 @@
 // Sums an iteration's losses and updates the lane's state: running, converged or diverged, and
 // whether the iteration is the best so far.
 //
-// One workgroup per lane. In: each tile's sum of losses. Out: the lane's status and the iteration's
-// mean loss. Mirrors EarlyStop::observe and the result that the CPU's trainer keeps. The iteration
+// One workgroup per lane. In: each tile's sum of losses, and the regularization in the lane's status.
+// Out: the lane's status and the iteration's loss. Mirrors EarlyStop::observe and the result that the CPU's trainer keeps. The iteration
 // at which the stopping rule fires is not a candidate for the best.
 
 var<immediate> part: Part;
@@ -39,7 +39,7 @@ fn reduce_loss(
     status.improves = 0u;
     if iterates(status, lanes[lane].steps, part.step) {
         let slot = lane * STEPS + part.step;
-        let loss = rounded(sums[0] * steps[slot].weight);
+        let loss = rounded(sums[0] * steps[slot].weight) + status.regularization;
         losses[slot] = loss;
         // False for NaN and infinity.
         if loss < 3.4e38 {

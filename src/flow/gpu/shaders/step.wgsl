@@ -1,7 +1,7 @@
 // Optimizer step: sums the chunks' gradients in order, updates the kept parameters and applies
 // Adam.
 //
-// One vec4 of one lane's network per invocation. In: partial gradients, statuses. Out: the lane's
+// One vec4 of one lane's parameters per invocation, of a network or of a linear model. In: partial gradients, statuses. Out: the lane's
 // parameters, moments and kept parameters. Mirrors AdamStep::apply.
 
 var<immediate> part: Part;
@@ -25,28 +25,29 @@ fn step(
     let lane = group.y;
     let slot = id.x;
     let status = statuses[lane];
-    if slot >= LAID_OUT || status.applies == 0u { return; }
+    let length = lanes[lane].parameters;
+    if slot >= length || status.applies == 0u { return; }
     let now = steps[lane * STEPS + part.step];
     var gradient = vec4(0.0);
     let first = lanes[lane].first_chunk;
     for (var chunk = 0u; chunk < lanes[lane].chunks; chunk++) {
-        gradient += partials[(first + chunk) * LAID_OUT + slot];
+        gradient += partials[(first + chunk) * length + slot];
     }
-    let at = lanes[lane].network * ARRAYS * LAID_OUT + slot;
-    let parameter = networks[at + PARAMETERS * LAID_OUT];
+    let at = lanes[lane].network * ARRAYS * length + slot;
+    let parameter = networks[at + PARAMETERS * length];
     if status.improves == 1u {
-        let kept = networks[at + KEPT * LAID_OUT];
+        let kept = networks[at + KEPT * length];
         let ema_weight = select(1.0, now.ema_weight, lanes[lane].average == 1u);
-        networks[at + KEPT * LAID_OUT] = select(kept + rounded4(ema_weight * (parameter - kept)), parameter, vec4(ema_weight == 1.0));
+        networks[at + KEPT * length] = select(kept + rounded4(ema_weight * (parameter - kept)), parameter, vec4(ema_weight == 1.0));
     }
-    let before = networks[at + MEANS * LAID_OUT];
-    let before_square = networks[at + SQUARES * LAID_OUT];
+    let before = networks[at + MEANS * length];
+    let before_square = networks[at + SQUARES * length];
     let mean = before + rounded4((gradient - before) * FRESH_MEAN);
     let square = before_square
         + rounded4((rounded4(gradient * gradient) - before_square) * FRESH_SQUARE);
     let scale = rounded4(root(square) * now.square_correction) + EPSILON;
     let stepped = parameter - quotient(rounded4(now.step_size * mean), scale);
-    networks[at + MEANS * LAID_OUT] = mean;
-    networks[at + SQUARES * LAID_OUT] = square;
-    networks[at + PARAMETERS * LAID_OUT] = stepped;
+    networks[at + MEANS * length] = mean;
+    networks[at + SQUARES * length] = square;
+    networks[at + PARAMETERS * length] = stepped;
 }

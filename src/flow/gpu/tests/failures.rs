@@ -11,7 +11,10 @@ use crate::flow::field::{Advance, Backend, BackendError};
 use crate::flow::gpu::adapter::{Selector, select};
 use crate::flow::gpu::backend::Gpu;
 use crate::flow::gpu::memory::GpuOptions;
-use crate::flow::options::{DistanceLossOptions, LossOptions, Preset};
+use crate::flow::options::{
+    BatchGrowth, DistanceLossOptions, FieldOptions, LinearOptions, LossOptions, ModelOptions,
+    Preset,
+};
 use crate::flow::problem::Problem;
 
 /// Destroys the device after some iterations.
@@ -90,13 +93,67 @@ fn what_only_the_cpu_computes_is_refused_by_name() {
     for loss in [
         distance(Metric::Chamfer, Sites::Cells),
         distance(Metric::Euclidean, Sites::Points),
-        Preset::NsfpBaseline.field().loss,
+        Preset::NsfpKdtree.field().loss,
     ] {
         let refused = gpu.prepare_target(&source, &target, &loss, &Uncontrolled);
         assert!(matches!(
             refused.err(),
             Some(BackendError::Unsupported(text)) if text.contains("CPU")
         ));
+    }
+    let usual = Preset::Paper.field();
+    let mut cycle = usual.clone();
+    cycle.network_mut().expect("a network").cycle = true;
+    let consistency = FieldOptions {
+        consistency_weight: 0.1,
+        ..usual.clone()
+    };
+    let growth = FieldOptions {
+        growth: Some(BatchGrowth::Iterations(5)),
+        ..usual.clone()
+    };
+    let bev = FieldOptions {
+        bev: true,
+        ..usual.clone()
+    };
+    let prepared = gpu.prepare_target(&source, &target, &usual.loss, &Uncontrolled);
+    let prepared = prepared.expect("small clouds fit");
+    for options in [cycle, consistency, growth, bev] {
+        assert!(!options.runs_on_gpu());
+        let refused = prepared.start(&source, &options, 0);
+        assert!(matches!(
+            refused.err(),
+            Some(BackendError::Unsupported(text)) if text.contains("CPU")
+        ));
+    }
+}
+
+#[test]
+fn a_grid_that_the_card_cannot_bind_is_refused_with_what_it_would_take() {
+    // 100 x 300 x 100 vertices: five arrays of three floats each are 180 MB.
+    let Some(gpu) = shared() else {
+        return;
+    };
+    let [source, target] = clouds(100);
+    let mut options = Preset::FnsfLinear.field();
+    options.model = ModelOptions::Linear(LinearOptions {
+        voxel_m: 0.04,
+        sigma_m: 0.1,
+        ..LinearOptions::published()
+    });
+    let prepared = gpu.prepare_target(&source, &target, &options.loss, &Uncontrolled);
+    let prepared = prepared.expect("small clouds fit");
+    let limit = u64::from(
+        gpu.device()
+            .context
+            .device
+            .limits()
+            .max_storage_buffer_binding_size,
+    );
+    match prepared.start(&source, &options, 0).err() {
+        Some(BackendError::Memory { needed, .. }) => assert!(needed > limit),
+        None => assert!(limit > 100 << 20),
+        Some(error) => panic!("{error}"),
     }
 }
 

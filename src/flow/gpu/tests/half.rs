@@ -4,7 +4,7 @@
 
 use super::kernels::{after_one, network, plain, transform};
 use super::whole::{Losses, end_point_error, solved, street};
-use super::{clouds, distance_loss, shared};
+use super::{clouds, distance_loss, shared, with_network_and_transform};
 use crate::flow::cpu::CpuBackend;
 use crate::flow::data::Uncontrolled;
 use crate::flow::distance::DistanceTransform;
@@ -209,7 +209,7 @@ fn whole_runs_in_half_precision_find_the_flow_of_single_precision() {
         return;
     };
     let pair = street(1);
-    for preset in Preset::with_gpu_kernels() {
+    for preset in with_network_and_transform() {
         let mut options = preset.options(Some(1500));
         let field = options.field_mut().expect("a field");
         field.max_iterations = 40;

@@ -1,7 +1,7 @@
 //! Each kernel against the double-precision reference, including sizes that are not multiples of a
 //! tile.
 
-use super::{clouds, distance_loss, shared};
+use super::{clouds, distance_loss, shared, with_network_and_transform};
 use crate::flow::data::{Point, Random, Uncontrolled};
 use crate::flow::distance::{Bricks, DistanceOptions, DistanceTransform};
 use crate::flow::field::{
@@ -149,7 +149,7 @@ pub(super) fn after_one(
 #[test]
 fn every_gradient_is_the_references_at_awkward_row_counts() {
     let [cloud, target] = clouds(9000);
-    for preset in Preset::with_gpu_kernels() {
+    for preset in with_network_and_transform() {
         let mut options = FieldOptions {
             loss: preset.field().loss,
             ..plain()

@@ -2,6 +2,7 @@
 //!
 //! They need an adapter; a software adapter suffices.
 
+mod chamfer;
 mod failures;
 mod half;
 mod kernels;
@@ -14,7 +15,7 @@ use super::adapter::adapters;
 use super::backend::Gpu;
 use super::memory::GpuOptions;
 use crate::flow::data::{Point, Random};
-use crate::flow::options::{DistanceLossOptions, FieldOptions};
+use crate::flow::options::{DistanceLossOptions, FieldOptions, Preset};
 use crate::gpu_in_tests;
 
 /// Number of lanes of the shared GPU.
@@ -29,7 +30,15 @@ fn opened(options: &GpuOptions) -> Option<Gpu> {
 
 /// The loss of `options`, which is one by distance transform.
 fn distance_loss(options: &FieldOptions) -> &DistanceLossOptions {
-    options.loss.distance().expect("a GPU has no other loss")
+    options.loss.distance().expect("a distance transform")
+}
+
+/// The presets that fit a network to a distance transform.
+fn with_network_and_transform() -> impl Iterator<Item = Preset> {
+    Preset::with_gpu_kernels().filter(|preset| {
+        let options = preset.field();
+        options.network().is_some() && options.loss.distance().is_some()
+    })
 }
 
 /// The GPU shared by the tests that leave it intact.

@@ -74,13 +74,17 @@ macro_rules! same_layout {
 fn host_and_shaders_agree_on_every_record() {
     same_layout!("distance_loss", Transform: origin_high, origin_low, inverse_cell, code_scale, vertices,
         blocks, tables, bricks, codes, far, far_pitch, far_vertices);
-    same_layout!("distance_loss", Lane: transform, network, points, first_tile, tiles, first_chunk, chunks,
+    same_layout!("nearest", Cloud: target_points, targets, deformed, nearest, sources);
+    same_layout!("distance_loss", Lane: transform, cloud, network, parameters, points, first_tile, tiles, first_chunk, chunks,
         center, scale, margin, margin_slope, truncation, flow_penalty, average, patience, min_delta, steps);
-    same_layout!("forward", Step: first, count, weight, step_size, square_correction, ema_weight);
+    same_layout!("forward", Step: first, count, weight, step_size, square_correction, ema_weight, share, searches);
     same_layout!("forward", Tile: lane, tile);
     same_layout!("gradients", Chunk: lane, first_row, rows, first_point);
     same_layout!("reduce_loss", Status: state, iterations, best_iteration, best_loss, seen, seen_best,
-        without_progress, applies, improves);
+        without_progress, applies, improves, regularization);
+    same_layout!("blend", Grid: vertices, row, plane, channel, variation);
+    same_layout!("blend", Placed: cell, weights);
+    same_layout!("contract", Axis: stride, extent, count, pitch, begin);
     same_layout!("forward", Part: step, first_tile, first_chunk, tiles, rows, nothing);
 }
 

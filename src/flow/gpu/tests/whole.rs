@@ -8,7 +8,7 @@ use crate::flow::data::{Control, Point, Progress, Uncontrolled};
 use crate::flow::estimate::{Estimate, estimate};
 use crate::flow::field::{Backend, EarlyStop};
 use crate::flow::motion::MotionField;
-use crate::flow::options::{FieldOptions, Ground, Options, Preset};
+use crate::flow::options::{FieldOptions, Ground, LossOptions, Options, Preset, Renewal};
 use crate::flow::problem::Problem;
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
 
@@ -72,12 +72,9 @@ fn a_card_finds_the_bits_of_the_cpu_that_rounds_as_it_does() {
         return;
     };
     let pair = street(1);
-    for (preset, ground) in [
-        (Preset::Neural, Ground::Auto),
-        (Preset::Paper, Ground::Keep),
-    ] {
+    for preset in Preset::with_gpu_kernels() {
         let mut options = preset.options(Some(1500));
-        options.ground = ground;
+        options.field_mut().expect("a field").max_iterations = 40;
         let found = |device: &dyn Backend| {
             let found = solved(device, &pair, &options);
             let fit = found.fit().expect("a fit");
@@ -96,7 +93,14 @@ fn every_loss_of_a_run_in_batches_is_the_cpus() {
     };
     let mut stopping = batched();
     stopping.early_stop = Preset::Paper.field().early_stop;
-    for options in [batched(), stopping] {
+    let in_batches = others().into_iter().map(|options| FieldOptions {
+        batch: Some(700),
+        ..options
+    });
+    for options in [batched(), stopping, renewed()]
+        .into_iter()
+        .chain(in_batches)
+    {
         let run = |device: &dyn Backend| {
             let [source, target] = clouds(1500);
             let transform = device
@@ -108,7 +112,7 @@ fn every_loss_of_a_run_in_batches_is_the_cpus() {
             let flow = trainer.evaluate(&source).expect("an answer");
             (losses.taken(), flow)
         };
-        assert_among(&run(gpu), |cpu| run(cpu), "losses and flow");
+        assert_among(&run(gpu), |cpu| run(cpu), &format!("{options:?}"));
     }
 }
 
@@ -179,6 +183,24 @@ fn fitted(device: &dyn Backend, points: usize, options: &FieldOptions, steps: us
     trainer.evaluate(&source).expect("an answer")
 }
 
+/// The published methods that have kernels, besides `paper`: the linear model and the Chamfer
+/// distance, together and apart.
+fn others() -> Vec<FieldOptions> {
+    let others = Preset::with_gpu_kernels();
+    let others = others.filter(|preset| !matches!(preset, Preset::Neural | Preset::Paper));
+    others.map(Preset::field).collect()
+}
+
+/// A Chamfer distance whose neighbors are searched in every third iteration after two.
+fn renewed() -> FieldOptions {
+    let mut options = Preset::NsfpBaseline.field();
+    let LossOptions::Chamfer(loss) = &mut options.loss else {
+        panic!("a Chamfer distance");
+    };
+    loss.renewal = Some(Renewal { first: 2, every: 3 });
+    options
+}
+
 fn batched() -> FieldOptions {
     let mut options = Preset::Neural.field();
     options.batch = Some(300);
@@ -192,7 +214,10 @@ fn a_pair_has_the_same_bits_alone_and_among_others() {
     };
     let sizes = [700, 901, 64];
     assert!(sizes.len() < LANES);
-    for options in [batched(), Preset::Paper.field()] {
+    for options in [batched(), Preset::Paper.field()]
+        .into_iter()
+        .chain(others())
+    {
         let alone = sizes.map(|points| fitted(gpu, points, &options, 12));
         let together = std::thread::scope(|scope| {
             let options = &options;
@@ -213,7 +238,8 @@ fn a_pair_put_down_and_taken_up_again_has_the_same_bits() {
     let Some(gpu) = shared() else {
         return;
     };
-    for options in [batched(), Preset::Paper.field()] {
+    let restored = [batched(), Preset::Paper.field(), renewed()];
+    for options in restored.into_iter().chain(others()) {
         let expected = fitted(gpu, 600, &options, 14);
         let [source, target] = clouds(600);
         let transform = gpu
@@ -227,6 +253,25 @@ fn a_pair_put_down_and_taken_up_again_has_the_same_bits() {
         second.restore(state).expect("memory");
         second.advance(9, &Uncontrolled).expect("iterations");
         assert!(second.evaluate(&source).expect("an answer") == expected);
+    }
+}
+
+#[test]
+fn a_fit_that_keeps_neighbors_has_no_state_of_its_own() {
+    let Some(gpu) = shared() else {
+        return;
+    };
+    let (options, [source, target]) = (renewed(), clouds(300));
+    let prepared = gpu
+        .prepare_target(&source, &target, &options.loss, &Uncontrolled)
+        .expect("small clouds fit");
+    let mut trainer = prepared.start(&source, &options, 0).expect("a trainer");
+    // After two iterations the third and each third one after it search.
+    for (done, whole) in [(2, true), (3, false), (4, false), (5, true)] {
+        let steps = done - trainer.report().iterations;
+        trainer.advance(steps, &Uncontrolled).expect("iterations");
+        let state = trainer.state().expect("an answer");
+        assert_eq!(state.is_some(), whole, "after {done} iterations");
     }
 }
 

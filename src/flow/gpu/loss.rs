@@ -1,0 +1,141 @@
+//! The prepared targets and the losses of fits on the GPU, as records for the kernels.
+
+use core::ops::Range;
+use std::sync::Arc;
+
+use super::chamfer::GpuCloud;
+use super::device::Device;
+use super::distance::GpuTransform;
+use super::layout;
+use super::request::LossKind;
+use crate::flow::data::Point;
+use crate::flow::field::BackendError;
+use crate::flow::options::{ChamferOptions, DistanceLossOptions, LossOptions};
+
+/// The error of a fit to another kind of loss than the one that the target was prepared for.
+const OTHER_LOSS: BackendError =
+    BackendError::Unsupported("the target was prepared for another kind of loss");
+
+/// A prepared target on the GPU.
+#[derive(Clone, Copy)]
+pub(super) enum GpuTarget<'a> {
+    Transform(&'a GpuTransform),
+    Cloud(&'a GpuCloud),
+}
+
+impl GpuTarget<'_> {
+    pub(super) fn device(&self) -> &Arc<Device> {
+        match self {
+            Self::Transform(target) => &target.device,
+            Self::Cloud(target) => &target.device,
+        }
+    }
+
+    /// Writes the points that are fitted behind the target, and returns their offset in words.
+    pub(super) fn write_points(&self, points: &[Point]) -> Result<u32, BackendError> {
+        let offset = match self {
+            Self::Transform(target) => target.room_for(points.len())?,
+            Self::Cloud(target) => target.room_for(points.len())?,
+        };
+        let context = &self.device().context;
+        let (store, bytes) = (&context.buffers.store, bytemuck::cast_slice(points));
+        context
+            .queue
+            .write_buffer(store, u64::from(offset) * 4, bytes);
+        Ok(offset)
+    }
+}
+
+/// The loss of a fit.
+pub(super) enum GpuLoss<'a> {
+    Distance {
+        target: &'a GpuTransform,
+        options: DistanceLossOptions,
+    },
+    Chamfer {
+        target: &'a GpuCloud,
+        options: ChamferOptions,
+        /// The batch that nearest neighbors were searched for last.
+        searched: Option<Range<usize>>,
+    },
+}
+
+impl<'a> GpuLoss<'a> {
+    pub(super) fn new(target: GpuTarget<'a>, options: &LossOptions) -> Result<Self, BackendError> {
+        Ok(match (target, options) {
+            (GpuTarget::Transform(target), LossOptions::Distance(options)) => Self::Distance {
+                target,
+                options: options.clone(),
+            },
+            (GpuTarget::Cloud(target), LossOptions::Chamfer(options)) => Self::Chamfer {
+                target,
+                options: *options,
+                searched: None,
+            },
+            _ => return Err(OTHER_LOSS),
+        })
+    }
+
+    pub(super) fn kind(&self) -> LossKind {
+        match self {
+            Self::Distance { .. } => LossKind::Distance,
+            Self::Chamfer { .. } => LossKind::Chamfer,
+        }
+    }
+
+    /// Writes its part of the lane's record.
+    pub(super) fn describe(&self, lane: &mut layout::Lane) {
+        match self {
+            Self::Distance { target, options } => {
+                lane.transform = target.record;
+                lane.margin = options.margin_m;
+                lane.margin_slope = options.margin_slope;
+                lane.truncation = options.truncation_m.unwrap_or(f32::MAX);
+                lane.flow_penalty = options.flow_penalty;
+            }
+            Self::Chamfer {
+                target, options, ..
+            } => {
+                lane.cloud = target.record;
+                lane.truncation = options.truncation_m;
+            }
+        }
+    }
+
+    /// Whether the iteration after `done` others keeps nearest neighbors of an earlier one.
+    pub(super) fn depends_on_earlier(&self, done: usize) -> bool {
+        match self {
+            Self::Distance { .. } => false,
+            Self::Chamfer { options, .. } => {
+                options.renewal.is_some_and(|renewal| !renewal.is_due(done))
+            }
+        }
+    }
+
+    /// Writes its part of the record of the iteration after `done` others, over `batch`.
+    pub(super) fn describe_step(
+        &mut self,
+        step: &mut layout::Step,
+        done: usize,
+        batch: &Range<usize>,
+    ) {
+        let kept = self.depends_on_earlier(done);
+        if let Self::Chamfer {
+            target, searched, ..
+        } = self
+        {
+            step.share = batch.len() as f32 / target.record.targets as f32;
+            if !kept || searched.as_ref() != Some(batch) {
+                step.searches = 1;
+                *searched = Some(batch.clone());
+            }
+        }
+    }
+
+    /// Forgets the nearest neighbors that were found.
+    pub(super) fn forget(&mut self) {
+        if let Self::Chamfer { searched, .. } = self {
+            *searched = None;
+        }
+    }
+}

@@ -1,0 +1,120 @@
+//! The search of nearest neighbors and the Chamfer distance on the GPU.
+
+use super::{clouds, shared};
+use crate::flow::cpu::{CpuBackend, Isa};
+use crate::flow::data::{Point, Random, Uncontrolled};
+use crate::flow::field::{Advance, Backend};
+use crate::flow::gpu::chamfer::GpuCloud;
+use crate::flow::options::{
+    ChamferOptions, EarlyStopOptions, FieldOptions, LossOptions, NearestSearch, Preset,
+};
+
+const OPTIONS: ChamferOptions = ChamferOptions {
+    truncation_m: 2.0,
+    search: NearestSearch::BruteForce,
+    renewal: None,
+};
+
+fn scattered(count: usize, seed: u64) -> Vec<Point> {
+    let mut random = Random::new(seed);
+    let mut point = || core::array::from_fn(|_| random.uniform(-40.0, 40.0) as f32);
+    (0..count).map(|_| point()).collect()
+}
+
+fn squared(a: Point, b: Point) -> f64 {
+    let off = |axis: usize| f64::from(a[axis]) - f64::from(b[axis]);
+    (0..3).map(|axis| off(axis).powi(2)).sum()
+}
+
+#[test]
+fn the_nearest_target_points_are_found_at_awkward_counts() {
+    // Rounding of single-precision differences and sums, relative to the squared distance.
+    const TOLERANCE: f64 = 1e-6;
+    let Some(gpu) = shared() else {
+        return;
+    };
+    for (points, targets) in [(0, 5), (1, 1), (63, 255), (64, 256), (65, 257), (700, 1500)] {
+        let (points, target) = (scattered(points, 1), scattered(targets, 2));
+        let cloud = GpuCloud::new(gpu.device(), points.len(), &target, &OPTIONS, &Uncontrolled);
+        let nearest = cloud.expect("it fits").nearest(&points).expect("an answer");
+        assert_eq!(nearest.len(), points.len());
+        for (&point, found) in points.iter().zip(nearest) {
+            let least = target.iter().map(|&site| squared(point, site));
+            let least = least.fold(f64::INFINITY, f64::min);
+            let found = squared(point, target[found as usize]);
+            assert!(
+                found <= least * (1.0 + TOLERANCE),
+                "{targets}: {found} {least}"
+            );
+        }
+    }
+    let same = vec![[1.0, 2.0, 3.0]; 600];
+    let cloud = GpuCloud::new(gpu.device(), 3, &same, &OPTIONS, &Uncontrolled);
+    let nearest = cloud.expect("it fits").nearest(&scattered(3, 4));
+    assert_eq!(
+        nearest.expect("an answer"),
+        [0; 3],
+        "the first of equally near ones"
+    );
+}
+
+#[test]
+fn distances_to_a_target_cloud_are_the_cpus() {
+    let Some(gpu) = shared() else {
+        return;
+    };
+    let (points, target) = (scattered(500, 5), scattered(800, 6));
+    let cpu = CpuBackend::new(Some(2)).expect("threads");
+    let loss = LossOptions::Chamfer(OPTIONS);
+    let [found, expected] = [gpu as &dyn Backend, &cpu].map(|device| {
+        let prepared = device.prepare_target(&points, &target, &loss, &Uncontrolled);
+        let prepared = prepared.expect("small clouds fit");
+        prepared.distances(&points).expect("distances")
+    });
+    assert_eq!(found, expected);
+}
+
+#[test]
+fn clouds_larger_than_the_memory_holds_at_once_have_the_loss_of_all() {
+    // The software adapter holds 8,192 rows, so each iteration takes two waves.
+    let Some(gpu) = shared() else {
+        return;
+    };
+    let [source, target] = clouds(9000);
+    let options = Preset::NsfpBaseline.field();
+    let run = |device: &dyn Backend| {
+        let prepared = device.prepare_target(&source, &target, &options.loss, &Uncontrolled);
+        let prepared = prepared.expect("the clouds fit");
+        let mut trainer = prepared.start(&source, &options, 0).expect("a trainer");
+        trainer.advance(2, &Uncontrolled).expect("iterations");
+        let losses = trainer.report().best_loss;
+        (losses, trainer.evaluate(&source).expect("a flow"))
+    };
+    let found = run(gpu);
+    let same = Isa::available().into_iter().any(|isa| {
+        let cpu = CpuBackend::with_isa(isa, Some(2)).expect("threads");
+        run(&cpu) == found
+    });
+    assert!(same, "{}", found.0);
+}
+
+#[test]
+fn a_flow_that_leaves_the_scene_ends_the_fit() {
+    let Some(gpu) = shared() else {
+        return;
+    };
+    let [source, target] = clouds(200);
+    for preset in [Preset::NsfpBaseline, Preset::NsfpLinear] {
+        let options = FieldOptions {
+            learning_rate: 1e9,
+            early_stop: None::<EarlyStopOptions>,
+            ..preset.field()
+        };
+        let prepared = gpu.prepare_target(&source, &target, &options.loss, &Uncontrolled);
+        let prepared = prepared.expect("small clouds fit");
+        let mut trainer = prepared.start(&source, &options, 0).expect("a trainer");
+        let ended = trainer.advance(5, &Uncontrolled).expect("iterations");
+        assert_eq!(ended, Advance::Diverged, "{preset:?}");
+        assert_eq!(trainer.report().iterations, 1, "{preset:?}");
+    }
+}
