@@ -1,12 +1,12 @@
 //! One iteration on the GPU: the order of its phases, and their bindings and dispatches.
 
 use super::buffers::{Buffers, spread};
-use super::chamfer::ChamferPhases;
+use super::chamfer_phases::ChamferPhases;
 use super::context::Context;
 use super::half::{HalfPhases, Units};
 use super::layout::Part;
 use super::linear::{LinearFit, LinearPhases};
-use super::network::NetworkPhases;
+use super::network_phases::NetworkPhases;
 use super::phase::{Dispatch, Phase};
 use super::request::{LossKind, Model, Request};
 use super::tiling::{Plan, Wave};

@@ -6,7 +6,6 @@ use rayon::prelude::*;
 
 use super::buffers::{Buffers, spread};
 use super::context::Context;
-use super::device::Device;
 use super::layout::{self, ARRAYS, Arrays, KEPT, Lane, PARAMETERS, Part, Status, TILE};
 use super::phase::{Dispatch, Phase};
 use crate::flow::field::{
@@ -45,19 +44,20 @@ pub(super) struct LinearFit {
 }
 
 impl LinearFit {
-    /// The fit of a model on `grid` to the points of `schedule`. Its arrays are not written yet.
+    /// The fit of a model on `grid` to the points of `schedule`, which are placed on the grid by
+    /// `threads`. Its arrays are not written yet.
     ///
     /// # Errors
     /// [`BackendError::Memory`] or [`BackendError::Busy`] if the GPU has too little memory.
     pub(super) fn new(
-        device: &Device,
+        context: &Context,
+        threads: &rayon::ThreadPool,
         grid: LinearGrid,
         variation_weight: f32,
         schedule: &Schedule,
     ) -> Result<Self, BackendError> {
-        let context = &device.context;
         let floats = 3 * grid.channel() as u64;
-        let limit = u64::from(context.device.limits().max_storage_buffer_binding_size);
+        let limit = context.device.limits().max_storage_buffer_binding_size;
         let needed = ARRAYS as u64 * floats * 4;
         if needed > limit {
             return Err(BackendError::Memory {
@@ -68,7 +68,7 @@ impl LinearFit {
         }
         let points = &schedule.points;
         let placed = || points.par_iter().map(|&point| grid.place(point)).collect();
-        let placed: Vec<Placed> = device.host.threads().install(placed);
+        let placed: Vec<Placed> = threads.install(placed);
         let mut by_voxel = Vec::with_capacity(points.len());
         for done in 0.. {
             let batch = schedule.batch(done, GrowthState::default());

@@ -83,7 +83,9 @@ impl<'a> GpuTrainer<'a> {
                 grid.initial(&mut random, parameters.as_mut_slice());
                 let schedule = Schedule::new(source, options, &mut random);
                 let cut = Cut::one(schedule.largest_batch(CONSTANT));
-                let model = LinearFit::new(&device, grid, linear.variation_weight, &schedule)?;
+                let (context, threads) = (&device.context, device.host.threads());
+                let weight = linear.variation_weight;
+                let model = LinearFit::new(context, threads, grid, weight, &schedule)?;
                 (GpuModel::Linear(Arc::new(model)), parameters, schedule, cut)
             }
         };

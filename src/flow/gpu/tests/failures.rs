@@ -143,13 +143,8 @@ fn a_grid_that_the_card_cannot_bind_is_refused_with_what_it_would_take() {
     });
     let prepared = gpu.prepare_target(&source, &target, &options.loss, &Uncontrolled);
     let prepared = prepared.expect("small clouds fit");
-    let limit = u64::from(
-        gpu.device()
-            .context
-            .device
-            .limits()
-            .max_storage_buffer_binding_size,
-    );
+    let limits = gpu.device().context.device.limits();
+    let limit = limits.max_storage_buffer_binding_size;
     match prepared.start(&source, &options, 0).err() {
         Some(BackendError::Memory { needed, .. }) => assert!(needed > limit),
         None => assert!(limit > 100 << 20),
