@@ -37,6 +37,8 @@ fn the_methods_come_side_by_side_as_text_csv_json_and_plots() {
     let json: serde_json::Value = serde_json::from_str(&json).expect("JSON");
     assert_eq!(json["methods"][0]["method"], "fnsf");
     assert_eq!(json["methods"][0]["paper_total_seconds"], 0.51);
+    let device = json["methods"][0]["device"].as_str().expect("a device");
+    assert!(device.starts_with("cpu"), "{device}");
     assert!(json["methods"][4]["iterations"].is_null());
     let cells = json["cells"].as_array().expect("cells");
     assert_eq!(cells.len(), 8);

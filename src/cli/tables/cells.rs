@@ -2,12 +2,13 @@
 
 use serde::Serialize;
 
+use super::devices::Devices;
 use super::measure::{Budget, RunError, Subject, measure};
 use crate::cli::failure::Failure;
 use crate::cli::output::say;
 use crate::cli::terminal::Terminal;
-use crate::flow::field::Backend;
-use crate::flow::{Options, Preset};
+use crate::flow::Options;
+use crate::job::{FieldChoices, JobOptions, PresetChoice};
 
 /// The edges of FNSF's ablation, metres.
 const EDGES_M: [f64; 8] = [1.0, 0.5, 0.33, 0.2, 0.1, 0.05, 0.02, 0.01];
@@ -35,26 +36,13 @@ pub(super) struct Measured {
     pub(super) transform_bytes: usize,
 }
 
-/// Options of the ablation, with cells of `cell_m`.
-fn options(max_points: Option<usize>, bev: bool, cell_m: f64) -> Options {
-    let mut options = Preset::Paper.options(max_points);
-    if let Some(field) = options.field_mut() {
-        field.bev = bev;
-        if let Some(loss) = field.loss.distance_mut() {
-            loss.transform.set_cell(cell_m);
-        }
-    }
-    options
-}
-
 /// What the ablation runs with.
 pub(super) struct Ablation<'a> {
-    pub(super) backend: &'a dyn Backend,
-    pub(super) max_points: Option<usize>,
+    pub(super) devices: &'a Devices,
     pub(super) bev: bool,
     pub(super) budget: Option<f64>,
-    /// Sets what the pair and the command line decide.
-    pub(super) common: &'a dyn Fn(&mut Options),
+    /// Adds what the pair and the command line decide.
+    pub(super) complete: &'a dyn Fn(JobOptions) -> Options,
     pub(super) terminal: &'a Terminal,
 }
 
@@ -74,10 +62,17 @@ impl Ablation<'_> {
         let mut all = Vec::new();
         for cell_m in EDGES_M {
             self.terminal.part(&format!("{name}, cells of {cell_m} m"));
-            let mut options = options(self.max_points, self.bev, cell_m);
-            (self.common)(&mut options);
+            let options = (self.complete)(JobOptions {
+                preset: PresetChoice::Paper,
+                field: FieldChoices {
+                    cell_m: Some(cell_m),
+                    bev: self.bev,
+                    ..FieldChoices::default()
+                },
+                ..JobOptions::default()
+            });
             let control = Budget::new(self.budget, self.terminal);
-            let (refused, measured) = match measure(self.backend, subject, &options, &control) {
+            let (refused, measured) = match measure(self.devices, subject, &options, &control) {
                 Ok(run) => {
                     let measured = Measured {
                         epe: run.metrics.epe,

@@ -13,6 +13,8 @@ pub(super) struct Figures {
     pub(super) method: &'static str,
     /// What the method is.
     pub(super) about: &'static str,
+    /// The device that it ran on.
+    pub(super) device: String,
     /// Number of runs, with seeds from 0.
     pub(super) seeds: usize,
     /// Scored points.
@@ -64,6 +66,7 @@ impl Figures {
             pair: pair.to_owned(),
             method: row.name,
             about: row.about,
+            device: first.map_or_else(String::new, |run| run.device.clone()),
             seeds: runs.len(),
             points: first.map_or(0, |run| run.metrics.points),
             epe: [

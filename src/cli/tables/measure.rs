@@ -2,9 +2,9 @@
 
 use std::time::Instant;
 
+use super::devices::Devices;
 use crate::cli::eval::truth_of;
 use crate::flow::evaluate::{EvaluateError, Metrics, evaluate};
-use crate::flow::field::Backend;
 use crate::flow::{
     Control, FlowError, Interrupt, Options, Problem, Progress, StopReason, estimate, predict_cost,
 };
@@ -13,6 +13,8 @@ use crate::formats::{Pair, PairTruth};
 /// The result of one run.
 #[derive(Clone, Debug)]
 pub(super) struct Run {
+    /// The device that the method ran on.
+    pub(super) device: String,
     pub(super) metrics: Metrics,
     /// Seconds before the first iteration, of the distance queries or correspondences, of the
     /// network or other model, and in all.
@@ -82,7 +84,7 @@ pub(super) struct Subject {
 
 /// Runs a method on a pair and scores it.
 pub(super) fn measure(
-    backend: &dyn Backend,
+    devices: &Devices,
     subject: &Subject,
     options: &Options,
     control: &Budget<'_>,
@@ -94,9 +96,11 @@ pub(super) fn measure(
         .as_ref()
         .map(|ground| [ground.source.as_slice(), &ground.target]);
     let cost = predict_cost(&problem, options)?;
+    let backend = devices.of(options);
     let estimate = estimate(backend, &problem, options, control)?;
     let query = estimate.fit().map_or(0.0, |fit| fit.query_seconds);
     Ok(Run {
+        device: backend.name(),
         metrics: evaluate(&estimate.flow, &estimate.valid, &truth_of(truth, pair))?,
         precompute: estimate.precompute_seconds,
         query,

@@ -1,6 +1,7 @@
 //! The `tables` command: the methods of the paper side by side on pairs with ground truth.
 
 mod cells;
+mod devices;
 mod figures;
 mod measure;
 mod plots;

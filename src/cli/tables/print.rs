@@ -82,17 +82,18 @@ pub(super) fn row(figures: &Figures) -> Result<(), Failure> {
 pub(super) fn write_csv(all: &[Figures], mut out: impl Write) -> io::Result<()> {
     writeln!(
         out,
-        "pair,method,seeds,points,epe,epe_low,epe_high,acc5,acc10,angle,epe_dynamic,\
+        "pair,method,device,seeds,points,epe,epe_low,epe_high,acc5,acc10,angle,epe_dynamic,\
          precompute_seconds,query_seconds,network_seconds,total_seconds,iterations,bytes,\
          target_bytes,cut,paper_epe,paper_acc5,paper_total_seconds"
     )?;
     let optional = |value: Option<f64>| value.map(|value| value.to_string()).unwrap_or_default();
     for row in all {
         let [epe, low, high] = row.epe;
-        let pair = row.pair.replace(['"', ',', '\n'], "_");
+        let plain = |text: &str| text.replace(['"', ',', '\n'], "_");
+        let (pair, device) = (plain(&row.pair), plain(&row.device));
         writeln!(
             out,
-            "{pair},{},{},{},{epe},{low},{high},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
+            "{pair},{},{device},{},{},{epe},{low},{high},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
             row.method,
             row.seeds,
             row.points,

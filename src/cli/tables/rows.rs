@@ -1,6 +1,6 @@
 //! The rows of the table: methods of FNSF's comparison, and what its paper reports for them.
 
-use crate::flow::{BatchGrowth, LossOptions, Options, Preset, Renewal};
+use crate::job::{FieldChoices, JobOptions, PresetChoice};
 
 /// What the paper reports for a method on full Argoverse clouds. None where it is not known here.
 #[derive(Clone, Copy, Debug, Default)]
@@ -19,8 +19,9 @@ pub(super) struct Row {
     pub(super) name: &'static str,
     /// What the row shows, in a few words.
     pub(super) about: &'static str,
-    preset: Preset,
-    change: fn(&mut Options),
+    preset: PresetChoice,
+    /// Options of the fit of so many points.
+    field: fn(usize) -> FieldChoices,
     pub(super) paper: PaperFigures,
 }
 
@@ -30,21 +31,16 @@ const UNKNOWN: PaperFigures = PaperFigures {
     total_seconds: None,
 };
 
-fn unchanged(_: &mut Options) {}
-
-/// Renews the nearest neighbors in every `every`-th iteration, after the first 50.
-fn renewed(options: &mut Options, every: usize) {
-    if let Some(LossOptions::Chamfer(loss)) = options.field_mut().map(|field| &mut field.loss) {
-        loss.renewal = Some(Renewal::after_warm_up(every));
-    }
+/// The options of the preset.
+fn usual(_: usize) -> FieldChoices {
+    FieldChoices::default()
 }
 
-/// Starts with a sixteenth of the points.
-fn grown(options: &mut Options, growth: BatchGrowth) {
-    let points = options.max_points;
-    if let Some(field) = options.field_mut() {
-        field.batch = Some(points.map_or(4096, |points| points.div_ceil(16)));
-        field.growth = Some(growth);
+/// A sixteenth of the points at first.
+fn sampled(points: usize) -> FieldChoices {
+    FieldChoices {
+        first_points: u32::try_from(points.div_ceil(16)).ok(),
+        ..FieldChoices::default()
     }
 }
 
@@ -53,8 +49,8 @@ pub(super) const ALL: [Row; 13] = [
     Row {
         name: "fnsf",
         about: "network, distance transform (preset paper)",
-        preset: Preset::Paper,
-        change: unchanged,
+        preset: PresetChoice::Paper,
+        field: usual,
         paper: PaperFigures {
             epe: Some(0.071),
             acc5: Some(0.8005),
@@ -64,8 +60,8 @@ pub(super) const ALL: [Row; 13] = [
     Row {
         name: "fnsf-linear",
         about: "linear model, distance transform",
-        preset: Preset::FnsfLinear,
-        change: unchanged,
+        preset: PresetChoice::FnsfLinear,
+        field: usual,
         paper: PaperFigures {
             epe: Some(0.106),
             acc5: Some(0.65),
@@ -75,22 +71,22 @@ pub(super) const ALL: [Row; 13] = [
     Row {
         name: "nsfp",
         about: "two networks, Chamfer distance, cycle",
-        preset: Preset::Nsfp,
-        change: unchanged,
+        preset: PresetChoice::Nsfp,
+        field: usual,
         paper: UNKNOWN,
     },
     Row {
         name: "nsfp-baseline",
         about: "network, Chamfer distance",
-        preset: Preset::NsfpBaseline,
-        change: unchanged,
+        preset: PresetChoice::NsfpBaseline,
+        field: usual,
         paper: UNKNOWN,
     },
     Row {
         name: "nsfp-kdtree",
         about: "network, Chamfer distance, k-d trees",
-        preset: Preset::NsfpKdtree,
-        change: unchanged,
+        preset: PresetChoice::NsfpKdtree,
+        field: usual,
         paper: PaperFigures {
             total_seconds: Some(6.25),
             ..UNKNOWN
@@ -99,15 +95,15 @@ pub(super) const ALL: [Row; 13] = [
     Row {
         name: "nsfp-linear",
         about: "linear model, Chamfer distance",
-        preset: Preset::NsfpLinear,
-        change: unchanged,
+        preset: PresetChoice::NsfpLinear,
+        field: usual,
         paper: UNKNOWN,
     },
     Row {
         name: "nsfp-kdtree-linear",
         about: "linear model, Chamfer distance, k-d trees",
-        preset: Preset::NsfpKdtreeLinear,
-        change: unchanged,
+        preset: PresetChoice::NsfpKdtreeLinear,
+        field: usual,
         paper: PaperFigures {
             total_seconds: Some(3.09),
             ..UNKNOWN
@@ -116,53 +112,64 @@ pub(super) const ALL: [Row; 13] = [
     Row {
         name: "nsfp++",
         about: "two networks a cluster, Chamfer distance, ego motion out",
-        preset: Preset::NsfpPlusPlus,
-        change: unchanged,
+        preset: PresetChoice::NsfpPlusPlus,
+        field: usual,
         paper: UNKNOWN,
     },
     Row {
         name: "nsfp++-dt",
         about: "two networks a cluster, distance transforms, ego motion out",
-        preset: Preset::NsfpPlusPlusDt,
-        change: unchanged,
+        preset: PresetChoice::NsfpPlusPlusDt,
+        field: usual,
         paper: UNKNOWN,
     },
     Row {
         name: "fnsf-sampled-time",
         about: "as fnsf, points double every 5 iterations from 1/16",
-        preset: Preset::Paper,
-        change: |options| grown(options, BatchGrowth::Iterations(5)),
+        preset: PresetChoice::Paper,
+        field: |points| FieldChoices {
+            double_every: Some(5),
+            ..sampled(points)
+        },
         paper: UNKNOWN,
     },
     Row {
         name: "fnsf-sampled-loss",
         about: "as fnsf, points double at each 20% fall of the loss",
-        preset: Preset::Paper,
-        change: |options| grown(options, BatchGrowth::LossFall(0.2)),
+        preset: PresetChoice::Paper,
+        field: |points| FieldChoices {
+            double_at_fall: Some(0.2),
+            ..sampled(points)
+        },
         paper: UNKNOWN,
     },
     Row {
         name: "nsfp-kdtree-every-5",
         about: "as nsfp-kdtree, neighbors every 5th iteration after 50",
-        preset: Preset::NsfpKdtree,
-        change: |options| renewed(options, 5),
+        preset: PresetChoice::NsfpKdtree,
+        field: |_| FieldChoices {
+            renew_every: Some(5),
+            ..FieldChoices::default()
+        },
         paper: UNKNOWN,
     },
     Row {
         name: "default",
         about: "object search, ego motion out (not of the paper)",
-        preset: Preset::Default,
-        change: unchanged,
+        preset: PresetChoice::Default,
+        field: usual,
         paper: UNKNOWN,
     },
 ];
 
 impl Row {
-    /// The options of the row, with `max_points` points of each cloud.
-    pub(super) fn options(&self, max_points: Option<usize>) -> Options {
-        let mut options = self.preset.options(max_points);
-        (self.change)(&mut options);
-        options
+    /// The options of the row, for clouds of up to `points` points that take part.
+    pub(super) fn options(&self, points: usize) -> JobOptions {
+        JobOptions {
+            preset: self.preset,
+            field: (self.field)(points),
+            ..JobOptions::default()
+        }
     }
 
     /// The row with this name.

@@ -7,25 +7,26 @@ use clap::Args;
 use serde::Serialize;
 
 use super::cells::{Ablation, CellFigures};
+use super::devices::Devices;
 use super::figures::Figures;
 use super::measure::{Budget, Subject, measure};
 use super::rows::{ALL, Row, names};
 use super::{plots, print};
+use crate::cli::device::DeviceArgument;
 use crate::cli::failure::Failure;
+use crate::cli::files;
 use crate::cli::output::say;
 use crate::cli::terminal::Terminal;
-use crate::cli::{device, files};
-use crate::flow::field::Backend;
-use crate::flow::{Ego, Ground, Options};
+use crate::flow::{Ego, Options};
 use crate::formats::Pair;
-use crate::job::GroundChoice;
+use crate::job::{GroundChoice, JobOptions};
 
 /// Compare the methods of the FNSF paper on pairs with ground truth.
 ///
 /// Each method estimates the flow of each pair and is scored by the paper's metrics. The points are
 /// those off the ground, where the pair has ground masks, and all points otherwise. With
-/// --max-points both clouds are sampled. Times are wall-clock seconds of this machine's CPU, from
-/// points in memory to flow in memory.
+/// --max-points both clouds are sampled. Times are wall-clock seconds of this machine, from points in
+/// memory to flow in memory.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
     fnsf tables pair.npz --max-points 8192\n  \
@@ -64,6 +65,10 @@ pub(crate) struct Tables {
     /// Runs --cells in bird's eye view, as the paper's ablation
     #[arg(long, requires = "cells")]
     bev: bool,
+    /// Device for the methods that have kernels for a GPU: cpu, gpu, gpu:CARD or auto, as with fnsf
+    /// flow. The others are computed on the CPU. JSON and CSV name the device of each
+    #[arg(long, value_name = "DEVICE", default_value = "cpu")]
+    device: DeviceArgument,
     /// CPU threads, 1 to 256; all cores by default
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: Option<u16>,
@@ -95,12 +100,16 @@ fn read(path: &Path) -> Result<Subject, Failure> {
     Ok(Subject { name, pair, truth })
 }
 
+/// Points of the larger cloud.
+fn largest(pair: &Pair) -> usize {
+    pair.source.len().max(pair.target.len())
+}
+
 /// All figures, as `--json` writes them.
 #[derive(Serialize)]
 struct Document<'a> {
     /// Version of the program.
     version: &'static str,
-    device: String,
     methods: &'a [Figures],
     cells: &'a [CellFigures],
 }
@@ -108,13 +117,13 @@ struct Document<'a> {
 impl Tables {
     pub(crate) fn run(&self) -> Result<(), Failure> {
         self.check()?;
-        let backend = device::cpu(self.threads.map(usize::from))?;
+        let devices = Devices::open(&self.device, self.threads.map(usize::from))?;
         let terminal = Terminal::new();
         let mut methods = Vec::new();
         let mut cells = Vec::new();
         for path in &self.pairs {
             let mut subject = read(path)?;
-            let found = self.measure_methods(backend.as_ref(), &subject, &terminal)?;
+            let found = self.measure_methods(&devices, &subject, &terminal)?;
             methods.extend(found);
             if self.cells {
                 if self.bev {
@@ -122,23 +131,22 @@ impl Tables {
                     flows.for_each(|flow| flow[2] = 0.0);
                 }
                 let ablation = Ablation {
-                    backend: backend.as_ref(),
-                    max_points: self.points(),
+                    devices: &devices,
                     bev: self.bev,
                     budget: self.budget,
-                    common: &|options| self.set_common(options, &subject.pair, 0),
+                    complete: &|options| self.complete(options, &subject.pair, 0),
                     terminal: &terminal,
                 };
                 cells.extend(ablation.run(&subject)?);
             }
         }
-        self.write(&backend.name(), &methods, &cells)
+        self.write(&methods, &cells)
     }
 
     /// Runs the methods on one pair and prints each row when it is known.
     fn measure_methods(
         &self,
-        backend: &dyn Backend,
+        devices: &Devices,
         subject: &Subject,
         terminal: &Terminal,
     ) -> Result<Vec<Figures>, Failure> {
@@ -152,10 +160,11 @@ impl Tables {
             let mut runs = Vec::new();
             for seed in 0..self.seeds {
                 terminal.part(&format!("{name}, {}, seed {seed}", row.name));
-                let mut options = row.options(self.points());
-                self.set_common(&mut options, pair, seed.into());
+                let drawn = self.max_points.map_or(usize::MAX, |points| points as usize);
+                let options = row.options(drawn.min(largest(pair)));
+                let options = self.complete(options, pair, seed.into());
                 let control = Budget::new(self.budget, terminal);
-                let run = measure(backend, subject, &options, &control);
+                let run = measure(devices, subject, &options, &control);
                 let run = run.with_context(|| format!("{name}, {}", row.name));
                 runs.push(run.map_err(Failure::bad_input)?);
             }
@@ -167,24 +176,26 @@ impl Tables {
         Ok(all)
     }
 
-    fn points(&self) -> Option<usize> {
-        self.max_points.map(|points| points as usize)
-    }
-
-    /// Sets what the pair and the command line decide for every method.
-    fn set_common(&self, options: &mut Options, pair: &Pair, seed: u64) {
-        options.seed = seed;
-        options.crop_m = self.crop_m;
-        let has_masks = pair.ground.is_some();
-        options.ground = match self.ground {
-            Some(GroundChoice::Keep) => Ground::Keep,
-            Some(GroundChoice::Mask) => Ground::Mask,
-            Some(GroundChoice::Auto) => Ground::Auto,
+    /// The solver's options, with what the pair and the command line decide for every method.
+    fn complete(&self, options: JobOptions, pair: &Pair, seed: u64) -> Options {
+        let preset = options.preset.preset().options(None);
+        let by_masks = match preset.ego {
+            Ego::Off => GroundChoice::Mask,
             // With an ego motion, the ground stays with the registration.
-            None if has_masks && options.ego == Ego::Off => Ground::Mask,
-            None if has_masks => Ground::Auto,
-            None => Ground::Keep,
+            _ => GroundChoice::Auto,
         };
+        let usual = match pair.ground {
+            Some(_) => by_masks,
+            None => GroundChoice::Keep,
+        };
+        let options = JobOptions {
+            seed,
+            max_points: self.max_points,
+            crop_m: self.crop_m,
+            ground: Some(self.ground.unwrap_or(usual)),
+            ..options
+        };
+        options.solver_options(largest(pair))
     }
 
     fn check(&self) -> Result<(), Failure> {
@@ -206,12 +217,7 @@ impl Tables {
         files::check_outputs(outputs, &self.pairs)
     }
 
-    fn write(
-        &self,
-        device: &str,
-        methods: &[Figures],
-        cells: &[CellFigures],
-    ) -> Result<(), Failure> {
+    fn write(&self, methods: &[Figures], cells: &[CellFigures]) -> Result<(), Failure> {
         let wrote = |path: &Path| say(format_args!("wrote {}", path.display()));
         if let Some(path) = &self.csv {
             files::write(path, |file| print::write_csv(methods, file))?;
@@ -220,7 +226,6 @@ impl Tables {
         if let Some(path) = &self.json {
             let document = Document {
                 version: env!("CARGO_PKG_VERSION"),
-                device: device.to_owned(),
                 methods,
                 cells,
             };
