@@ -58,7 +58,7 @@ struct State {
     done: HashMap<u64, Result<Done, BackendError>>,
     /// Whether a thread is submitting.
     submitting: bool,
-    /// Speed of the latest submission.
+    /// Speed of the latest submission of a kind that shares it.
     pace: Option<TileThroughput>,
 }
 
@@ -72,7 +72,7 @@ impl Batch {
         self.state().members += 1;
     }
 
-    /// Speed of the latest submission.
+    /// Speed of the latest submission of a kind that shares it.
     pub(super) fn pace(&self) -> Option<TileThroughput> {
         self.state().pace
     }
@@ -129,7 +129,9 @@ impl Batch {
             state.submitting = false;
             match submitted {
                 Ok(all) => {
-                    state.pace = all.first().and_then(|done| done.pace).or(state.pace);
+                    if requests.iter().all(|request| request.kind().shares_pace()) {
+                        state.pace = all.first().and_then(|done| done.pace).or(state.pace);
+                    }
                     let tickets = taken.iter().map(|(ticket, _)| *ticket);
                     state.done.extend(tickets.zip(all.into_iter().map(Ok)));
                 }
@@ -149,16 +151,16 @@ impl Batch {
 }
 
 impl State {
-    /// Takes the first request and those that go with it in order of arrival, up to the capacity of
-    /// the GPU. The others remain in the queue.
+    /// Takes the first request and the others of its kind in order of arrival, up to the capacity of
+    /// the GPU. The rest remains in the queue.
     fn take(&mut self, context: &Context) -> Vec<(u64, Request)> {
-        let first = self.waiting.first().map(|(_, request)| request.clone());
+        let kind = self.waiting.first().map(|(_, request)| request.kind());
         let mut chunks = 0;
         let mut fitting = 0;
         let mut full = false;
         let taken = self.waiting.extract_if(.., |(_, request)| {
-            let goes = |first: &Request| fitting == 0 || request.goes_with(first);
-            if full || !first.as_ref().is_some_and(goes) {
+            let alone = !request.kind().shares_submissions() && fitting > 0;
+            if full || alone || Some(request.kind()) != kind {
                 return false;
             }
             chunks += request.cut.chunks.count as u64;

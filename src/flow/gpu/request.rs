@@ -35,15 +35,41 @@ pub(super) struct Request {
     pub(super) loss: LossKind,
 }
 
-impl Request {
-    /// Whether both requests can be in one submission, which has one set of kernels.
-    pub(super) fn goes_with(&self, other: &Self) -> bool {
-        let same = match (&self.model, &other.model) {
-            (Model::Network(own), Model::Network(other)) => own == other,
-            // Its buffers are those of one fit.
-            _ => false,
+/// The kernels that a request needs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Kind {
+    /// The precision of the network; none for a linear model.
+    precision: Option<Precision>,
+    loss: LossKind,
+}
+
+impl Kind {
+    /// The kind of a fit of `model` to `loss`.
+    pub(super) fn new(model: &Model, loss: LossKind) -> Self {
+        let precision = match model {
+            Model::Network(precision) => Some(*precision),
+            Model::Linear(_) => None,
         };
-        same && self.loss == other.loss
+        Self { precision, loss }
+    }
+
+    /// Whether several fits of this kind can be in one submission. The buffers of a linear model are
+    /// those of one fit.
+    pub(super) fn shares_submissions(self) -> bool {
+        self.precision.is_some()
+    }
+
+    /// Whether a tile takes as long in every fit of this kind. That of a Chamfer distance or of a
+    /// linear model depends on the target or on the grid.
+    pub(super) fn shares_pace(self) -> bool {
+        self.precision.is_some() && self.loss == LossKind::Distance
+    }
+}
+
+impl Request {
+    /// The kernels that it needs.
+    pub(super) fn kind(&self) -> Kind {
+        Kind::new(&self.model, self.loss)
     }
 
     /// Queries of the largest search of nearest neighbors.

@@ -9,7 +9,7 @@ use super::linear::LinearFit;
 use super::loss::{GpuLoss, GpuTarget};
 use super::memory::NETWORK_BYTES;
 use super::network::NetworkFit;
-use super::request::{Model, Request};
+use super::request::{Kind, Model, Request};
 use super::tiling::Cut;
 use super::{inference, layout};
 use crate::flow::data::{Control, Point, Progress, Random};
@@ -36,6 +36,16 @@ const STOPPABLE_STEPS: usize = 16;
 enum GpuModel {
     Network(NetworkFit),
     Linear(Arc<LinearFit>),
+}
+
+impl GpuModel {
+    /// The model of a request.
+    fn submitted(&self) -> Model {
+        match self {
+            Self::Network(network) => Model::Network(network.precision),
+            Self::Linear(linear) => Model::Linear(Arc::clone(linear)),
+        }
+    }
 }
 
 /// The model, its optimizer and the prepared target.
@@ -152,10 +162,7 @@ impl<'a> GpuTrainer<'a> {
             status: self.status,
             steps: (done..done + steps).map(|done| self.step(done)).collect(),
             cut: self.cut,
-            model: match &self.model {
-                GpuModel::Network(network) => Model::Network(network.precision),
-                GpuModel::Linear(linear) => Model::Linear(Arc::clone(linear)),
-            },
+            model: self.model.submitted(),
             loss: self.loss.kind(),
         }
     }
@@ -185,10 +192,7 @@ impl<'a> GpuTrainer<'a> {
 
     /// The number of iterations for the next submission.
     fn stride(&self) -> usize {
-        // Networks that are fitted to distance transforms share their submissions' speed.
-        let shared = matches!(self.model, GpuModel::Network(_))
-            && matches!(self.loss, GpuLoss::Distance { .. });
-        let pace = match shared {
+        let pace = match Kind::new(&self.model.submitted(), self.loss.kind()).shares_pace() {
             true => self.device.batch.pace(),
             false => self.pace,
         };
