@@ -56,7 +56,7 @@ run() {
     return "$failed"
   fi
   printf '\n## av2_7fab, %s against cpu\n\n' "$gpu"
-  for preset in paper neural; do
+  for preset in paper neural fnsf-linear nsfp-baseline nsfp-linear; do
     for device in "$gpu" cpu; do
       "$from/fnsf" flow "$pair" -o /tmp/flow.npz --device "$device" --preset "$preset" \
         --max-points 8192 --ground mask --crop-m 51.2 --json &&

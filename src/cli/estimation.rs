@@ -39,8 +39,8 @@ pub(super) struct Estimation {
     /// CPU threads, 1 to 256; all cores by default. The result does not depend on it
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: Option<u16>,
-    /// Precision of the factors in the network's matrix products. f16 needs preset neural, paper
-    /// or nsfp-baseline, and a GPU whose matrix units pass the self-test of fnsf doctor
+    /// Precision of the factors in the network's matrix products. f16 needs preset neural or paper,
+    /// and a GPU whose matrix units pass the self-test of fnsf doctor
     #[arg(long, value_enum, default_value_t)]
     precision: PrecisionChoice,
     /// Seed of all random choices; the same seed gives the same result, bit for bit

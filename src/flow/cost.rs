@@ -33,7 +33,7 @@ const POINT: f64 = 3e4;
 /// cloud and the deformed cloud, a k-d tree, the indices and the flow.
 const CORRESPONDENCE_BYTES: usize = 128;
 /// Bytes per point of its place in the grid of the linear model, and of its derivatives.
-const PLACED_BYTES: usize = 64;
+const PLACED_BYTES: usize = 72;
 /// Work of the linear model per point and iteration, with the distance query, multiply-adds.
 const BLENDED: f64 = 1e4;
 /// Assumed number of points of a partition's cluster, in both clouds: the mean over the points of

@@ -34,9 +34,9 @@ pub enum InvalidOptions {
         "options: device is \"gpu\", but {0} with these options is computed on the CPU alone: leave device out"
     )]
     NoGpuKernels(&'static str),
-    /// Half precision with a preset that fits no field on a GPU; with the name of the preset.
+    /// Half precision with a preset that has no kernels for it; with the name of the preset.
     #[error("options: precision is \"f16\", which {0} does not compute in: take preset neural")]
-    HalfWithoutField(&'static str),
+    HalfWithoutKernels(&'static str),
     /// An option of `field` that the preset has no use for.
     #[error("options: field.{option} has no effect with preset {preset}: leave it out")]
     NoUse {

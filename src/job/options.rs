@@ -61,8 +61,8 @@ pub struct JobOptions {
     /// `nsfp-linear` can use a GPU. `default` and `label` always compute on the host's CPU. The
     /// other presets compute on the CPU and refuse `gpu`.
     pub device: DeviceChoice,
-    /// `f32`: single precision. `f16`: half precision, for `neural`, `paper` and `nsfp-baseline` on a
-    /// GPU whose matrix units pass their self-test.
+    /// `f32`: single precision. `f16`: half precision, for `neural` and `paper` on a GPU whose
+    /// matrix units pass their self-test.
     pub precision: PrecisionChoice,
     /// Options of the fit, for the presets that fit a field.
     #[serde(skip_serializing_if = "is_default")]
@@ -116,8 +116,8 @@ impl JobOptions {
     /// - `NoUse`, `FieldRange`, `Field` for an option of the fit that the preset has no use for, or
     ///   that is out of range.
     /// - `NoGpuKernels` for device `gpu` with a field that has no kernels for it.
-    /// - `HalfOnCpu`, `HalfWithoutField` for `f16` with device `cpu` or a preset that fits no
-    ///   field on a GPU.
+    /// - `HalfOnCpu`, `HalfWithoutKernels` for `f16` with device `cpu` or a preset without kernels
+    ///   in half precision.
     /// - `ReferenceTime`, `Densify` for options of a dense cloud that are invalid for every
     ///   sequence.
     pub fn check(&self) -> Result<(), InvalidOptions> {
@@ -149,7 +149,7 @@ impl JobOptions {
         self.field.check(preset.name(), options.field())?;
         let in_half = options.field().is_some_and(FieldOptions::runs_in_half);
         if self.precision == PrecisionChoice::F16 && !in_half {
-            return Err(InvalidOptions::HalfWithoutField(preset.name()));
+            return Err(InvalidOptions::HalfWithoutKernels(preset.name()));
         }
         if self.device == DeviceChoice::Gpu && self.needs_cpu() {
             return Err(InvalidOptions::NoGpuKernels(preset.name()));
@@ -278,7 +278,7 @@ mod tests {
             let refused = asked.err();
             assert_eq!(
                 refused,
-                (!fits).then_some(InvalidOptions::HalfWithoutField(preset))
+                (!fits).then_some(InvalidOptions::HalfWithoutKernels(preset))
             );
         }
         let single = options(r#"{"precision":"f32"}"#);

@@ -77,6 +77,7 @@ fn what_cannot_be_tabled_is_refused_before_any_work() {
         (vec!["--budget", "0"], 2, "--budget 0: a number above 0"),
         (vec!["--budget", "nan"], 2, "a number above 0"),
         (vec!["--bev"], 2, "--cells"),
+        (vec!["--device", "auto"], 2, "name cpu or gpu"),
         (vec!["--plots", "nowhere"], 2, "there is no such folder"),
         (vec!["--csv", pair], 2, "would be written over"),
     ] {

@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::devices::Devices;
-use super::measure::{Budget, RunError, Subject, measure};
+use super::measure::{Budget, Subject, measure};
 use crate::cli::failure::Failure;
 use crate::cli::output::say;
 use crate::cli::terminal::Terminal;
@@ -28,6 +28,8 @@ pub(super) struct CellFigures {
 /// The figures of one cell size.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Measured {
+    /// The device that it ran on.
+    pub(super) device: String,
     /// Mean end-point error, metres.
     pub(super) epe: f64,
     pub(super) total_seconds: f64,
@@ -75,6 +77,7 @@ impl Ablation<'_> {
             let (refused, measured) = match measure(self.devices, subject, &options, &control) {
                 Ok(run) => {
                     let measured = Measured {
+                        device: run.device,
                         epe: run.metrics.epe,
                         total_seconds: run.total,
                         precompute_seconds: run.precompute,
@@ -82,7 +85,7 @@ impl Ablation<'_> {
                     };
                     (None, Some(measured))
                 }
-                Err(RunError::Flow(error)) if error.is_input() => (Some(error.to_string()), None),
+                Err(error) if error.is_input() => (Some(error.to_string()), None),
                 Err(error) => return Err(Failure::internal(error)),
             };
             self.terminal.finish();

@@ -1,5 +1,7 @@
 //! The devices of the table: the CPU, and a GPU for the methods that have kernels for it.
 
+use anyhow::anyhow;
+
 use crate::cli::device;
 use crate::cli::device::DeviceArgument;
 use crate::cli::failure::Failure;
@@ -17,13 +19,16 @@ pub(super) struct Devices {
 impl Devices {
     /// Opens the CPU with `threads` threads, and the device asked for.
     pub(super) fn open(asked: &DeviceArgument, threads: Option<usize>) -> Result<Self, Failure> {
-        Ok(Self {
-            cpu: device::cpu(threads)?,
-            other: match asked.choice {
-                DeviceChoice::Cpu => None,
-                _ => Some(device::open(asked, threads)?),
-            },
-        })
+        let other = match asked.choice {
+            DeviceChoice::Cpu => None,
+            DeviceChoice::Gpu => Some(device::open(asked, threads)?),
+            DeviceChoice::Auto => {
+                let text = "--device auto: name cpu or gpu, so that it is known what is measured";
+                return Err(Failure::usage(anyhow!(text)));
+            }
+        };
+        let cpu = device::cpu(threads)?;
+        Ok(Self { cpu, other })
     }
 
     /// The device for a method with `options`.

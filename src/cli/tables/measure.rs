@@ -75,6 +75,16 @@ pub(super) enum RunError {
     Score(#[from] EvaluateError),
 }
 
+impl RunError {
+    /// Whether the pair or the options are at fault.
+    pub(super) fn is_input(&self) -> bool {
+        match self {
+            Self::Flow(error) => error.is_input(),
+            Self::Score(_) => true,
+        }
+    }
+}
+
 /// A pair with its truth, and the name of its file.
 pub(super) struct Subject {
     pub(super) name: String,

@@ -36,7 +36,7 @@ fn usual(_: usize) -> FieldChoices {
     FieldChoices::default()
 }
 
-/// A sixteenth of the points at first.
+/// A sixteenth of the larger cloud's points at first.
 fn sampled(points: usize) -> FieldChoices {
     FieldChoices {
         first_points: u32::try_from(points.div_ceil(16)).ok(),
@@ -163,7 +163,7 @@ pub(super) const ALL: [Row; 13] = [
 ];
 
 impl Row {
-    /// The options of the row, for clouds of up to `points` points that take part.
+    /// The options of the row, for clouds of up to `points` points, of which some may be left out.
     pub(super) fn options(&self, points: usize) -> JobOptions {
         JobOptions {
             preset: self.preset,

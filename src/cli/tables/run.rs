@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, anyhow};
+use anyhow::anyhow;
 use clap::Args;
 use serde::Serialize;
 
@@ -65,8 +65,8 @@ pub(crate) struct Tables {
     /// Runs --cells in bird's eye view, as the paper's ablation
     #[arg(long, requires = "cells")]
     bev: bool,
-    /// Device for the methods that have kernels for a GPU: cpu, gpu, gpu:CARD or auto, as with fnsf
-    /// flow. The others are computed on the CPU. JSON and CSV name the device of each
+    /// Device for the methods that have kernels for a GPU: cpu, gpu or gpu:CARD, as with fnsf flow.
+    /// The others are computed on the CPU. JSON and CSV name the device of each
     #[arg(long, value_name = "DEVICE", default_value = "cpu")]
     device: DeviceArgument,
     /// CPU threads, 1 to 256; all cores by default
@@ -165,8 +165,11 @@ impl Tables {
                 let options = self.complete(options, pair, seed.into());
                 let control = Budget::new(self.budget, terminal);
                 let run = measure(devices, subject, &options, &control);
-                let run = run.with_context(|| format!("{name}, {}", row.name));
-                runs.push(run.map_err(Failure::bad_input)?);
+                let what = || format!("{name}, {}", row.name);
+                runs.push(run.map_err(|error| match error.is_input() {
+                    true => Failure::bad_input(anyhow!(error).context(what())),
+                    false => Failure::internal(anyhow!(error).context(what())),
+                })?);
             }
             let figures = Figures::new(name, &row, &runs);
             terminal.finish();

@@ -28,12 +28,13 @@ pub trait Backend: Send + Sync {
     ///   target is refused.
     /// - [`BackendError::Truncation`] if the truncation of a Chamfer distance is out of range.
     /// - [`BackendError::Interrupted`] if `control` interrupts.
-    /// - [`BackendError::Unsupported`] if the device lacks the loss, or the metric or the sites of
-    ///   its distance transform. A GPU has only [`LossOptions::Distance`] with
+    /// - [`BackendError::Unsupported`] if the device lacks the search of a Chamfer distance, or the
+    ///   metric or the sites of a distance transform. A GPU has only
+    ///   [`crate::flow::options::NearestSearch::BruteForce`],
     ///   [`crate::flow::distance::Metric::Euclidean`] and
     ///   [`crate::flow::distance::Sites::Cells`].
-    /// - [`BackendError::Memory`] if the transform and N points do not fit in the memory that the
-    ///   GPU allocated when it was opened, or a temporary buffer exceeds the GPU's largest buffer.
+    /// - [`BackendError::Memory`] if the target and N points do not fit in the memory that the GPU
+    ///   allocated when it was opened, or a temporary buffer exceeds the GPU's largest buffer.
     /// - [`BackendError::Busy`] if other pairs occupy that memory and release too little of it, or
     ///   the GPU has no free memory for a temporary buffer.
     /// - [`BackendError::Lost`] or [`BackendError::Device`] if the GPU fails.
@@ -82,12 +83,14 @@ pub trait PreparedTarget: Send {
     /// # Errors
     /// - [`BackendError::Unsupported`] if the target was prepared for another kind of loss, or the
     ///   device lacks the precision of `options`. A CPU has only single precision. Half precision
-    ///   needs a GPU whose matrix units pass their self-test.
+    ///   needs a GPU whose matrix units pass their self-test. A GPU also lacks what
+    ///   [`FieldOptions::runs_on_gpu`] excludes.
     /// - [`BackendError::Linear`] if an option of the linear model is out of range, or its grid needs
     ///   too much memory.
-    /// - [`BackendError::Memory`] if a GPU has too little memory for the points or for the
-    ///   gradients of a batch.
-    /// - [`BackendError::Busy`] if all lanes of a GPU are in use.
+    /// - [`BackendError::Memory`] if a GPU has too little memory for the points, for the gradients of
+    ///   a batch, or for a linear model.
+    /// - [`BackendError::Busy`] if all lanes of a GPU are in use, or other linear models take its
+    ///   memory.
     /// - [`BackendError::Lost`] if the GPU is lost.
     fn start(
         &self,

@@ -1,4 +1,4 @@
-//! Allocator of the GPU's store: the buffer that holds the pairs' distance transforms and points.
+//! Allocator of the GPU's store: the buffer that holds the pairs' prepared targets and points.
 //!
 //! Sizes and offsets are in 32-bit words. Requests are served in order of arrival.
 

@@ -114,7 +114,7 @@ impl Backend for Gpu {
 
 impl PreparedTarget for GpuTransform {
     fn bytes(&self) -> usize {
-        self.words as usize * 4
+        self.allocation.target_bytes()
     }
 
     fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError> {
@@ -135,7 +135,7 @@ impl PreparedTarget for GpuTransform {
 
 impl PreparedTarget for GpuCloud {
     fn bytes(&self) -> usize {
-        self.bytes()
+        self.allocation.target_bytes()
     }
 
     fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError> {

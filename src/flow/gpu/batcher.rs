@@ -2,7 +2,7 @@
 //!
 //! A small pair leaves a large GPU idle, so requests that arrive at about the same time are
 //! submitted together. One of the waiting threads submits for all. Pairs stay independent: each has
-//! its own network and stopping rule, and its result is bit-identical to that of a fit alone.
+//! its own model and stopping rule, and its result is bit-identical to that of a fit alone.
 
 use core::time::Duration;
 use std::collections::HashMap;
@@ -11,11 +11,12 @@ use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
 use super::context::Context;
 use super::half::Units;
-use super::iteration::{Phases, Program, SubmittedLoss, SubmittedModel};
+use super::iteration::{Phases, SubmittedModel};
 use super::layout::{STEPS, Status};
-use super::phase::{Clock, Phase};
+use super::phase::Clock;
+use super::program::{Item, Program, SubmittedLoss};
 use super::request::{Request, write};
-use super::tiling::{Plan, Wave};
+use super::tiling::Plan;
 use crate::flow::data::locked;
 use crate::flow::field::BackendError;
 
@@ -51,7 +52,7 @@ pub(super) struct Batch {
 
 #[derive(Default)]
 struct State {
-    /// Number of pairs that are being fitted.
+    /// Number of networks that are being fitted.
     members: usize,
     next_ticket: u64,
     waiting: Vec<(u64, Request)>,
@@ -67,7 +68,7 @@ impl Batch {
         locked(&self.state)
     }
 
-    /// Registers a pair that is being fitted.
+    /// Registers a network that is being fitted.
     pub(super) fn joined(&self) {
         self.state().members += 1;
     }
@@ -77,7 +78,7 @@ impl Batch {
         self.state().pace
     }
 
-    /// Unregisters a pair whose fit has ended.
+    /// Unregisters a network whose fit has ended.
     pub(super) fn left(&self) {
         self.state().members -= 1;
         self.changed.notify_all();
@@ -110,7 +111,7 @@ impl Batch {
                 continue;
             }
             state.submitting = true;
-            let incomplete = |state: &mut State| state.waiting.len() < state.members;
+            let incomplete = |state: &mut State| state.shared_waiting() < state.members;
             state = self
                 .changed
                 .wait_timeout_while(state, MOMENT, incomplete)
@@ -129,7 +130,7 @@ impl Batch {
             state.submitting = false;
             match submitted {
                 Ok(all) => {
-                    if requests.iter().all(|request| request.kind().shares_pace()) {
+                    if requests[0].kind().shares_pace() {
                         state.pace = all.first().and_then(|done| done.pace).or(state.pace);
                     }
                     let tickets = taken.iter().map(|(ticket, _)| *ticket);
@@ -151,6 +152,12 @@ impl Batch {
 }
 
 impl State {
+    /// Number of waiting requests that can share a submission.
+    fn shared_waiting(&self) -> usize {
+        let shares = |(_, request): &&(u64, Request)| request.kind().shares_submissions();
+        self.waiting.iter().filter(shares).count()
+    }
+
     /// Takes the first request and the others of its kind in order of arrival, up to the capacity of
     /// the GPU. The rest remains in the queue.
     fn take(&mut self, context: &Context) -> Vec<(u64, Request)> {
@@ -208,7 +215,7 @@ fn submit<'u>(
     let mut encoder = context.encoder();
     for step in 0..iterations {
         let clock = clock.as_ref().filter(|_| step == 0);
-        iterate(&mut encoder, &phases, &program, step, clock);
+        iterate(&mut encoder, &phases, &program, step, clock)?;
     }
     let status_bytes = (requests.len() * size_of::<Status>()) as u64;
     let loss_bytes = (requests.len() * STEPS * size_of::<f32>()) as u64;
@@ -253,30 +260,43 @@ fn submit<'u>(
 }
 
 /// One iteration of all lanes. A timed iteration is split into several passes, because timestamps
-/// are taken at the boundaries of passes.
+/// are taken at the boundaries of passes. A long one is split into several submissions to the driver.
 fn iterate(
     encoder: &mut wgpu::CommandEncoder,
     phases: &Phases<'_>,
     program: &Program,
     step: usize,
     clock: Option<&Clock>,
-) {
-    let parts = [&program.before_query, &program.query, &program.after_query];
-    let run = |pass: &mut wgpu::ComputePass<'_>, part: &[(Phase, Wave)]| {
-        for (phase, wave) in part {
+) -> Result<(), BackendError> {
+    let run = |pass: &mut wgpu::ComputePass<'_>, items: &[Item]| {
+        for (phase, wave) in items {
             phases.dispatch(pass, *phase, step, wave);
         }
     };
-    match clock {
-        None => {
-            let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
-            parts.iter().for_each(|part| run(&mut pass, part));
-        }
-        Some(clock) => {
-            let moments = [(Some(0), None), (Some(1), Some(2)), (None, Some(3))];
-            for (part, (begin, end)) in parts.into_iter().zip(moments) {
-                run(&mut clock.pass(encoder, begin, end), part);
+    let untimed = wgpu::ComputePassDescriptor::default();
+    if clock.is_none() && program.is_whole() {
+        let mut pass = encoder.begin_compute_pass(&untimed);
+        let groups = program.parts().into_iter().flatten();
+        groups.for_each(|items| run(&mut pass, items));
+        return Ok(());
+    }
+    let moments = [(Some(0), None), (Some(1), Some(2)), (None, Some(3))];
+    for (groups, (begin, end)) in program.parts().into_iter().zip(moments) {
+        for (number, items) in groups.iter().enumerate() {
+            let is_last = number + 1 == groups.len();
+            let (begin, end) = (begin.filter(|_| number == 0), end.filter(|_| is_last));
+            {
+                let timed = clock.filter(|_| begin.is_some() || end.is_some());
+                let mut pass = match timed {
+                    Some(clock) => clock.pass(encoder, begin, end),
+                    None => encoder.begin_compute_pass(&untimed),
+                };
+                run(&mut pass, items);
+            }
+            if !is_last {
+                phases.context.flush(encoder)?;
             }
         }
     }
+    Ok(())
 }

@@ -7,11 +7,11 @@ use super::memory::{Budget, GpuOptions};
 use crate::flow::field::BackendError;
 
 /// Maximum number of workgroups along one dimension of a dispatch.
-const MOST_GROUPS: u32 = 65_535;
+pub(super) const MOST_GROUPS: u32 = 65_535;
 
 /// The buffers that are allocated when the GPU is opened, with the sizes of a [`Budget`].
 pub(super) struct Buffers {
-    /// Distance transforms and points.
+    /// Prepared targets and points.
     pub(super) store: wgpu::Buffer,
     pub(super) networks: wgpu::Buffer,
     pub(super) activations: wgpu::Buffer,
@@ -38,11 +38,7 @@ impl Buffers {
     ) -> Result<(Budget, Self), BackendError> {
         let asked = options.memory_bytes;
         let mut bytes = asked.unwrap_or_else(|| Budget::usual(adapter.kind, options.lanes));
-        // Buffers are bound as a whole.
-        let limits = device.limits();
-        let binding = limits
-            .max_storage_buffer_binding_size
-            .min(limits.max_buffer_size);
+        let binding = largest(device, wgpu::BufferUsages::STORAGE);
         loop {
             let budget = Budget::new(options.lanes, bytes, binding)?;
             match Self::allocate(device, &budget, wgpu::BufferUsages::empty()) {
@@ -96,6 +92,15 @@ impl Buffers {
     }
 }
 
+/// Bytes of the largest buffer with `usage`. A kernel binds its buffers as a whole.
+pub(super) fn largest(device: &wgpu::Device, usage: wgpu::BufferUsages) -> u64 {
+    let limits = device.limits();
+    match usage.contains(wgpu::BufferUsages::STORAGE) {
+        true => limits.max_buffer_size.min(limits.max_storage_buffer_binding_size),
+        false => limits.max_buffer_size,
+    }
+}
+
 /// Allocates a buffer.
 pub(super) fn allocated(
     device: &wgpu::Device,
@@ -103,7 +108,7 @@ pub(super) fn allocated(
     bytes: u64,
     usage: wgpu::BufferUsages,
 ) -> Result<wgpu::Buffer, BackendError> {
-    let limit = device.limits().max_buffer_size;
+    let limit = largest(device, usage);
     let refused = |available: u64| BackendError::Memory {
         what,
         needed: bytes,

@@ -5,46 +5,47 @@ use std::sync::Arc;
 use super::allocation::{Allocation, POINT_WORDS};
 use super::chamfer_phases::search_groups;
 use super::device::Device;
-use super::layout::{Cloud, Lane, Part, Status, Step};
+use super::layout::{Cloud, Lane, Part, Status, Step, TILE};
+use super::program::MOST_DISTANCES;
 use crate::flow::data::{Control, Point};
 use crate::flow::field::{BackendError, check_chamfer, length};
-use crate::flow::options::{ChamferOptions, NearestSearch};
+use crate::flow::options::ChamferOptions;
+
+/// The most points of a search apart from a fit.
+const SEARCHED: usize = 1 << 18;
 
 /// A target cloud in the GPU's store, with room for what its searches find.
 pub(super) struct GpuCloud {
     pub(super) device: Arc<Device>,
     pub(super) record: Cloud,
     target: Vec<Point>,
-    /// Words of the cloud and of its searches, without those of the source points that follow.
-    words: u64,
-    allocation: Allocation,
+    pub(super) allocation: Allocation,
 }
 
 impl GpuCloud {
-    /// Writes `target` to the store, with room for searches and fits of `source` points.
+    /// Writes `target` to the store, with room for searches and fits of `points` source
+    /// points.
     ///
     /// # Errors
     /// [`BackendError`] if the options are refused, the search is by k-d trees, the control
     /// interrupts, or the GPU has too little memory.
     pub(super) fn new(
         device: &Arc<Device>,
-        source: usize,
+        points: usize,
         target: &[Point],
         options: &ChamferOptions,
         control: &dyn Control,
     ) -> Result<Self, BackendError> {
         check_chamfer(options, target)?;
-        if options.search == NearestSearch::KdTree {
-            let text = "k-d trees are searched on the CPU alone";
+        if let Some(text) = options.lacks_gpu_kernels() {
             return Err(BackendError::Unsupported(text));
         }
-        let (source, targets) = (source as u64, target.len() as u64);
+        let (source, targets) = (points as u64, target.len() as u64);
         let deformed = targets * POINT_WORDS;
         let nearest = deformed + source * POINT_WORDS;
         let sources = nearest + source;
         let words = sources + targets;
-        let all = words + source * POINT_WORDS;
-        let allocation = Allocation::take(device, "target cloud", all, control)?;
+        let allocation = Allocation::take(device, "target cloud", words, points, control)?;
         let at = |words: u64| allocation.offset + words as u32;
         let record = Cloud {
             target_points: at(0),
@@ -61,19 +62,8 @@ impl GpuCloud {
             device: Arc::clone(device),
             record,
             target: target.to_vec(),
-            words,
             allocation,
         })
-    }
-
-    /// Bytes of the cloud and of what its searches find.
-    pub(super) fn bytes(&self) -> usize {
-        self.words as usize * 4
-    }
-
-    /// Offset in the store of `points` points that are fitted, in words.
-    pub(super) fn room_for(&self, points: usize) -> Result<u32, BackendError> {
-        self.allocation.room_for(points, self.words)
     }
 
     /// The distance from each of `points` to the nearest target point, metres.
@@ -89,11 +79,22 @@ impl GpuCloud {
         Ok(points.iter().zip(nearest).map(off).collect())
     }
 
-    /// The index of the target point nearest to each of `points`, in buffers of its own.
+    /// The index of the target point nearest to each of `points`. The search has buffers of its own,
+    /// because those of the store may hold the neighbors of a fit.
+    ///
+    /// # Errors
+    /// As [`Self::distances`].
     pub(super) fn nearest(&self, points: &[Point]) -> Result<Vec<u32>, BackendError> {
-        if points.is_empty() {
-            return Ok(Vec::new());
+        let most = (MOST_DISTANCES / self.target.len()).clamp(TILE, SEARCHED);
+        let mut found = Vec::with_capacity(points.len());
+        for points in points.chunks(most) {
+            found.extend(self.nearest_of_some(points)?);
         }
+        Ok(found)
+    }
+
+    /// The same in one search.
+    fn nearest_of_some(&self, points: &[Point]) -> Result<Vec<u32>, BackendError> {
         let context = &self.device.context;
         let (targets, count) = (self.target.len() as u64, points.len() as u64);
         let deformed = targets * POINT_WORDS;
@@ -126,18 +127,21 @@ impl GpuCloud {
         let statuses = context.filled(bytemuck::bytes_of(&Status::default()))?;
         let pipeline = &context.kernels.nearest;
         let group = context.bound(pipeline, &[&store, &lanes, &steps, &statuses]);
+        let tiles = points.len().div_ceil(TILE);
         let mut encoder = context.encoder();
         {
             let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
             pass.set_pipeline(pipeline);
             pass.set_bind_group(0, &group, &[]);
-            pass.set_immediates(0, bytemuck::bytes_of(&Part::default()));
+            let part = Part {
+                tiles: tiles as u32,
+                ..Part::default()
+            };
+            pass.set_immediates(0, bytemuck::bytes_of(&part));
             // Only the search of target points, in the first row.
-            pass.dispatch_workgroups(search_groups(points.len()), 1, 1);
+            pass.dispatch_workgroups(search_groups(tiles), 1, 1);
         }
-        let found = context.empty(count * 4, usage)?;
-        encoder.copy_buffer_to_buffer(&store, nearest * 4, &found, 0, count * 4);
-        let read = context.finish(encoder, &found, count * 4)?;
+        let read = context.finish_from(encoder, &store, nearest * 4, count * 4)?;
         let words = read.as_chunks::<4>().0.iter().take(points.len());
         Ok(words.map(|&bytes| u32::from_ne_bytes(bytes)).collect())
     }

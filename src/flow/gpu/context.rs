@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, mpsc};
 
 use super::adapter::{Adapter, AdapterKind};
 use super::allocator::Allocator;
-use super::buffers::{Buffers, allocated};
+use super::buffers::{Buffers, allocated, largest};
 use super::health::Watchdog;
 use super::layout::ARRAYS;
 use super::matrix_units;
@@ -38,6 +38,8 @@ pub(super) struct Context {
     /// The tile of its matrix units, or the reason why they cannot be used.
     pub(super) tile: Result<Tile, String>,
     networks: Mutex<Vec<u32>>,
+    /// One more owner for each fit of a linear model.
+    pub(super) linear_fits: Arc<()>,
     longest_silence: Duration,
 }
 
@@ -78,6 +80,7 @@ impl Context {
             kernels,
             buffers,
             allocator: Allocator::new(budget.store_words),
+            linear_fits: Arc::default(),
             networks: Mutex::new((0..budget.lanes as u32).rev().collect()),
             budget,
             tick: (!clock.is_empty()).then_some(period * 1e-9),
@@ -127,7 +130,7 @@ impl Context {
         bytes: u64,
         usage: wgpu::BufferUsages,
     ) -> Result<wgpu::Buffer, BackendError> {
-        let limit = self.device.limits().max_buffer_size;
+        let limit = largest(&self.device, usage);
         allocated(&self.device, "work", bytes.max(16), usage).map_err(|error| match error {
             BackendError::Memory { needed, .. } if needed <= limit => BackendError::Busy,
             error => error,
@@ -168,18 +171,14 @@ impl Context {
         at: u64,
         floats: usize,
     ) -> Result<[Parameters; ARRAYS], BackendError> {
-        let bytes = (ARRAYS * floats * size_of::<f32>()) as u64;
-        let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
-        let copy = self.empty(bytes, usage)?;
-        let mut encoder = self.encoder();
-        encoder.copy_buffer_to_buffer(buffer, at, &copy, 0, bytes);
-        let read = self.finish(encoder, &copy, bytes)?;
+        let bytes = floats * size_of::<f32>();
+        let all = (ARRAYS * bytes) as u64;
+        let read = self.finish_from(self.encoder(), buffer, at, all)?;
         Ok(core::array::from_fn(|array| {
             let mut parameters = Parameters::zeros(floats);
-            let bytes = &read[array * floats * size_of::<f32>()..];
             let into = &mut parameters.as_mut_slice()[..floats];
             let into = bytemuck::cast_slice_mut::<f32, u8>(into);
-            into.copy_from_slice(&bytes[..floats * size_of::<f32>()]);
+            into.copy_from_slice(&read[array * bytes..(array + 1) * bytes]);
             parameters
         }))
     }
@@ -187,21 +186,67 @@ impl Context {
     /// Submits the commands, waits for them, and returns the first `bytes` bytes of `buffer`.
     ///
     /// # Errors
-    /// [`BackendError::Lost`] if the GPU does not answer.
+    /// As [`Self::finish_from`].
     pub(super) fn finish(
+        &self,
+        encoder: wgpu::CommandEncoder,
+        buffer: &wgpu::Buffer,
+        bytes: u64,
+    ) -> Result<Vec<u8>, BackendError> {
+        self.finish_from(encoder, buffer, 0, bytes)
+    }
+
+    /// As [`Self::finish`], for the bytes of `buffer` from `at` on.
+    ///
+    /// # Errors
+    /// [`BackendError::Lost`] if the GPU does not answer, and [`BackendError::Busy`] if it has no
+    /// free memory.
+    pub(super) fn finish_from(
         &self,
         mut encoder: wgpu::CommandEncoder,
         buffer: &wgpu::Buffer,
+        at: u64,
         bytes: u64,
     ) -> Result<Vec<u8>, BackendError> {
         let usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
         let staging = self.empty(bytes, usage)?;
-        encoder.copy_buffer_to_buffer(buffer, 0, &staging, 0, bytes);
+        encoder.copy_buffer_to_buffer(buffer, at, &staging, 0, bytes);
         let submission = self.queue.submit([encoder.finish()]);
         let (mapped, answer) = mpsc::channel();
         staging.map_async(wgpu::MapMode::Read, .., move |result| {
             let _who_waits_may_have_given_up = mapped.send(result);
         });
+        self.wait(&submission)?;
+        // The thread that polls runs the callbacks, and another thread may still be running this
+        // one.
+        match answer.recv_timeout(self.longest_silence) {
+            Ok(Ok(())) => {}
+            Ok(Err(error)) => {
+                self.watchdog.check()?;
+                return Err(BackendError::Device(error.to_string()));
+            }
+            Err(_) => return Err(BackendError::Device("no memory was mapped".to_owned())),
+        }
+        let view = staging.get_mapped_range(..);
+        let view = view.map_err(|error| BackendError::Device(error.to_string()))?;
+        Ok(view.to_vec())
+    }
+
+    /// Submits the commands of `encoder`, waits for them, and leaves an empty encoder.
+    ///
+    /// # Errors
+    /// [`BackendError::Lost`] if the GPU does not answer.
+    pub(super) fn flush(&self, encoder: &mut wgpu::CommandEncoder) -> Result<(), BackendError> {
+        let commands = core::mem::replace(encoder, self.encoder());
+        let submission = self.queue.submit([commands.finish()]);
+        self.wait(&submission)
+    }
+
+    /// Waits for a submission.
+    ///
+    /// # Errors
+    /// [`BackendError::Lost`] if the GPU does not answer.
+    fn wait(&self, submission: &wgpu::SubmissionIndex) -> Result<(), BackendError> {
         let mut waited = Duration::ZERO;
         loop {
             self.watchdog.check()?;
@@ -219,19 +264,6 @@ impl Context {
                 self.watchdog.lost(format!("no answer for {seconds} s"));
             }
         }
-        self.watchdog.check()?;
-        // The thread that polls runs the callbacks, and another thread may still be running this
-        // one.
-        match answer.recv_timeout(self.longest_silence) {
-            Ok(Ok(())) => {}
-            Ok(Err(error)) => {
-                self.watchdog.check()?;
-                return Err(BackendError::Device(error.to_string()));
-            }
-            Err(_) => return Err(BackendError::Device("no memory was mapped".to_owned())),
-        }
-        let view = staging.get_mapped_range(..);
-        let view = view.map_err(|error| BackendError::Device(error.to_string()))?;
-        Ok(view.to_vec())
+        self.watchdog.check()
     }
 }

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use super::allocation::{Allocation, POINT_WORDS};
+use super::allocation::Allocation;
 use super::buffers::spread;
 use super::context::Context;
 use super::device::Device;
@@ -26,9 +26,7 @@ const SAMPLE_GROUP: usize = 64;
 pub(super) struct GpuTransform {
     pub(super) device: Arc<Device>,
     pub(super) record: layout::Transform,
-    /// Words of the transform, without those of the points that follow it.
-    pub(super) words: u64,
-    allocation: Allocation,
+    pub(super) allocation: Allocation,
 }
 
 /// Builds the distance transform of `target` over a grid that covers both clouds, metres.
@@ -68,8 +66,8 @@ pub(super) fn build(
         far.distances.len() as u64,
     ];
     let words = parts.iter().sum();
-    let points = source.len() as u64 * POINT_WORDS;
-    let allocation = Allocation::take(device, "distance transform", words + points, control)?;
+    let what = "distance transform";
+    let allocation = Allocation::take(device, what, words, source.len(), control)?;
     let mut offset = u64::from(allocation.offset);
     let offsets = parts.map(|words| {
         let own = offset;
@@ -105,7 +103,6 @@ pub(super) fn build(
     Ok(GpuTransform {
         device: Arc::clone(device),
         record,
-        words,
         allocation,
     })
 }
@@ -159,12 +156,6 @@ fn fill_bricks(
 }
 
 impl GpuTransform {
-    /// Offset in the store of `points` points that are fitted, in words. There is room for the
-    /// number of source points that the transform was built for.
-    pub(super) fn room_for(&self, points: usize) -> Result<u32, BackendError> {
-        self.allocation.room_for(points, self.words)
-    }
-
     /// Distance (metres) and gradient at each of `points` (N x 3, metres).
     pub(super) fn samples(&self, points: &[Point]) -> Result<Vec<Sample>, BackendError> {
         let mut samples = Vec::with_capacity(points.len());

@@ -1,6 +1,6 @@
-//! One iteration on the GPU: the order of its phases, and their bindings and dispatches.
+//! One iteration on the GPU: the bindings and dispatches of its phases.
 
-use super::buffers::{Buffers, spread};
+use super::buffers::{Buffers, MOST_GROUPS, spread};
 use super::chamfer_phases::ChamferPhases;
 use super::context::Context;
 use super::half::{HalfPhases, Units};
@@ -8,7 +8,8 @@ use super::layout::Part;
 use super::linear::{LinearFit, LinearPhases};
 use super::network_phases::NetworkPhases;
 use super::phase::{Dispatch, Phase};
-use super::request::{LossKind, Model, Request};
+use super::program::SubmittedLoss;
+use super::request::Model;
 use super::tiling::{Plan, Wave};
 use crate::flow::field::{BackendError, LAID_OUT};
 use crate::flow::options::Precision;
@@ -39,87 +40,63 @@ impl<'a> SubmittedModel<'a> {
             Model::Linear(fit) => Self::Linear(fit),
         })
     }
-}
 
-/// The loss of all lanes of a submission.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum SubmittedLoss {
-    Distance,
-    /// The Chamfer distance, with the number of queries of the largest search.
-    Chamfer {
-        queries: usize,
-    },
-}
-
-impl SubmittedLoss {
-    /// The loss of `requests`, which go with each other.
-    pub(super) fn of(requests: &[&Request]) -> Self {
-        match requests.first().map(|request| request.loss) {
-            Some(LossKind::Chamfer) => {
-                let queries = requests.iter().map(|request| request.queries());
-                Self::Chamfer {
-                    queries: queries.max().unwrap_or_default(),
-                }
-            }
-            _ => Self::Distance,
+    /// Length of an array of parameters, in vec4s.
+    fn parameters(self) -> u32 {
+        match self {
+            Self::Network | Self::Half(_) => LAID_OUT as u32 / 4,
+            Self::Linear(fit) => fit.quads(),
         }
     }
-}
 
-/// The phases of an iteration in order, each with its wave.
-pub(super) struct Program {
-    pub(super) before_query: Vec<(Phase, Wave)>,
-    pub(super) query: Vec<(Phase, Wave)>,
-    pub(super) after_query: Vec<(Phase, Wave)>,
-    /// Share of all tiles whose query is in `query`.
-    pub(super) query_share: f64,
-}
+    /// Where the model keeps what the common kernels read and write.
+    fn buffers<'b>(self, common: &'b Buffers) -> ModelBuffers<'b>
+    where
+        'a: 'b,
+    {
+        match self {
+            Self::Network | Self::Half(_) => ModelBuffers {
+                flows: &common.flows,
+                loss_gradients: &common.loss_gradients,
+                partials: &common.partials,
+                arrays: &common.networks,
+            },
+            Self::Linear(fit) => ModelBuffers {
+                flows: &fit.flows,
+                loss_gradients: &fit.loss_gradients,
+                partials: &fit.gradients,
+                arrays: &fit.arrays,
+            },
+        }
+    }
 
-impl Program {
-    /// The phases of an iteration of `plan`. A search of nearest neighbors needs the flow of all
-    /// waves, so with more than one wave the forward pass is done twice.
-    pub(super) fn new(plan: &Plan, loss: SubmittedLoss) -> Self {
-        let (first, rest) = (plan.waves[0], &plan.waves[1..]);
-        let of_a_wave = |wave: &Wave| Phase::OF_A_WAVE.map(|phase| (phase, *wave));
-        let others = rest.iter().flat_map(of_a_wave);
-        let end = Phase::OF_THE_END.map(|phase| (phase, Wave::default()));
-        match loss {
-            SubmittedLoss::Distance => {
-                let [forward, loss, backward, gradients] = of_a_wave(&first);
-                let after = [backward, gradients].into_iter();
-                Self {
-                    before_query: vec![(Phase::Halve, first), forward],
-                    query: vec![loss],
-                    after_query: after.chain(others).chain(end).collect(),
-                    query_share: first.tiles as f64 / plan.tiles.len() as f64,
-                }
+    /// The kernels of the model.
+    fn bound(
+        self,
+        context: &'a Context,
+        buffers: &Buffers,
+        records: [&wgpu::Buffer; 2],
+    ) -> ModelPhases<'a> {
+        match self {
+            Self::Network => ModelPhases::Network(NetworkPhases::bind(context, buffers, records)),
+            Self::Half(units) => {
+                ModelPhases::Half(HalfPhases::bind(context, buffers, units, records))
             }
-            SubmittedLoss::Chamfer { .. } => {
-                let displaced = plan.waves.iter();
-                let displaced =
-                    displaced.flat_map(|&wave| [(Phase::Forward, wave), (Phase::Deform, wave)]);
-                let skipped = usize::from(rest.is_empty());
-                let first_wave = of_a_wave(&first).into_iter().skip(skipped);
-                Self {
-                    before_query: vec![(Phase::Halve, first)],
-                    query: displaced.chain([(Phase::Nearest, first)]).collect(),
-                    after_query: first_wave.chain(others).chain(end).collect(),
-                    query_share: 1.0,
-                }
-            }
+            Self::Linear(fit) => ModelPhases::Linear(LinearPhases::bind(context, buffers, fit)),
         }
     }
 }
 
 /// The kernels of an iteration, bound to a submission's buffers.
 pub(super) struct Phases<'a> {
-    context: &'a Context,
+    pub(super) context: &'a Context,
     lanes: u32,
     /// Number of rows of a layer's activations.
     rows: u32,
     model: ModelPhases<'a>,
     /// Length of the model's array of parameters, in vec4s.
     parameters: u32,
+    loss_kernel: &'a wgpu::ComputePipeline,
     loss: wgpu::BindGroup,
     chamfer: Option<ChamferPhases<'a>>,
     reduce_loss: wgpu::BindGroup,
@@ -167,63 +144,23 @@ impl<'a> Phases<'a> {
             losses,
             ..
         } = buffers;
-        let own = match model {
-            SubmittedModel::Linear(fit) => ModelBuffers {
-                flows: &fit.flows,
-                loss_gradients: &fit.loss_gradients,
-                partials: &fit.gradients,
-                arrays: &fit.arrays,
-            },
-            _ => ModelBuffers {
-                flows: &buffers.flows,
-                loss_gradients: &buffers.loss_gradients,
-                partials: &buffers.partials,
-                arrays: &buffers.networks,
-            },
-        };
+        let own = model.buffers(buffers);
+        let read = [store, records, steps, tiles, statuses, own.flows];
+        let written = [own.loss_gradients, tile_losses];
         let loss_kernel = match loss {
             SubmittedLoss::Distance => &kernels.distance_loss,
             SubmittedLoss::Chamfer { .. } => &kernels.chamfer_loss,
         };
+        let has_search = loss != SubmittedLoss::Distance;
         Ok(Self {
             context,
             lanes: lanes as u32,
             rows: buffers.rows() as u32,
-            parameters: match model {
-                SubmittedModel::Linear(fit) => fit.quads(),
-                _ => LAID_OUT as u32 / 4,
-            },
-            model: match model {
-                SubmittedModel::Network => {
-                    ModelPhases::Network(NetworkPhases::bind(context, buffers, [tiles, chunks]))
-                }
-                SubmittedModel::Half(units) => {
-                    ModelPhases::Half(HalfPhases::bind(context, buffers, units, [tiles, chunks]))
-                }
-                SubmittedModel::Linear(fit) => {
-                    ModelPhases::Linear(LinearPhases::bind(context, buffers, fit))
-                }
-            },
-            loss: context.bound(
-                loss_kernel,
-                &[
-                    store,
-                    records,
-                    steps,
-                    tiles,
-                    statuses,
-                    own.flows,
-                    own.loss_gradients,
-                    tile_losses,
-                ],
-            ),
-            chamfer: match loss {
-                SubmittedLoss::Distance => None,
-                SubmittedLoss::Chamfer { queries } => {
-                    let phases = ChamferPhases::bind(context, buffers, [tiles, own.flows], queries);
-                    Some(phases)
-                }
-            },
+            parameters: model.parameters(),
+            model: model.bound(context, buffers, [tiles, chunks]),
+            loss_kernel,
+            loss: context.bound(loss_kernel, &[&read[..], &written].concat()),
+            chamfer: has_search.then(|| ChamferPhases::bind(context, buffers, [tiles, own.flows])),
             reduce_loss: context.bound(
                 &kernels.reduce_loss,
                 &[records, steps, tile_losses, statuses, losses],
@@ -281,15 +218,12 @@ impl<'a> Phases<'a> {
                     .collect()
             }
             Phase::Loss => {
-                let kernel = match self.chamfer {
-                    None => &kernels.distance_loss,
-                    Some(_) => &kernels.chamfer_loss,
-                };
-                vec![(kernel, &self.loss, spread(wave.tiles as u32))]
+                let groups = spread(wave.tiles as u32);
+                vec![(self.loss_kernel, &self.loss, groups)]
             }
             Phase::ReduceLoss => vec![(&kernels.reduce_loss, &self.reduce_loss, [self.lanes, 1])],
             Phase::Step => {
-                let groups = self.parameters.div_ceil(STEP_GROUP);
+                let groups = self.parameters.div_ceil(STEP_GROUP).min(MOST_GROUPS);
                 vec![(&kernels.step, &self.step, [groups, self.lanes])]
             }
         }

@@ -2,6 +2,8 @@
 //!
 //! A fit has buffers of its own, in addition to the GPU's budget, and submissions of its own.
 
+use std::sync::Arc;
+
 use rayon::prelude::*;
 
 use super::buffers::{Buffers, spread};
@@ -38,9 +40,12 @@ pub(super) struct LinearFit {
     values: wgpu::Buffer,
     value_gradients: wgpu::Buffer,
     between: [wgpu::Buffer; 2],
+    /// Empty without total variation.
     inverse_lengths: wgpu::Buffer,
     /// Sums of lengths of the total variation; none without it.
     sums: Option<wgpu::Buffer>,
+    /// Counts the fits on the GPU.
+    _alive: Arc<()>,
 }
 
 impl LinearFit {
@@ -48,7 +53,8 @@ impl LinearFit {
     /// `threads`. Its arrays are not written yet.
     ///
     /// # Errors
-    /// [`BackendError::Memory`] or [`BackendError::Busy`] if the GPU has too little memory.
+    /// [`BackendError::Busy`] if other linear models take the GPU's memory, and
+    /// [`BackendError::Memory`] if it is too small.
     pub(super) fn new(
         context: &Context,
         threads: &rayon::ThreadPool,
@@ -56,16 +62,27 @@ impl LinearFit {
         variation_weight: f32,
         schedule: &Schedule,
     ) -> Result<Self, BackendError> {
-        let floats = 3 * grid.channel() as u64;
-        let limit = context.device.limits().max_storage_buffer_binding_size;
-        let needed = ARRAYS as u64 * floats * 4;
-        if needed > limit {
-            return Err(BackendError::Memory {
+        let alive = Arc::clone(&context.linear_fits);
+        let fit = Self::allocated(context, threads, grid, variation_weight, schedule);
+        fit.map_err(|error| match error {
+            // Nobody else would release enough.
+            BackendError::Busy if Arc::strong_count(&alive) <= 2 => BackendError::Memory {
                 what: "linear model",
-                needed,
-                available: limit,
-            });
-        }
+                needed: grid.bytes() as u64,
+                available: 0,
+            },
+            error => error,
+        })
+    }
+
+    fn allocated(
+        context: &Context,
+        threads: &rayon::ThreadPool,
+        grid: LinearGrid,
+        variation_weight: f32,
+        schedule: &Schedule,
+    ) -> Result<Self, BackendError> {
+        let floats = 3 * grid.channel() as u64;
         let points = &schedule.points;
         let placed = || points.par_iter().map(|&point| grid.place(point)).collect();
         let placed: Vec<Placed> = threads.install(placed);
@@ -87,13 +104,15 @@ impl LinearFit {
             .collect();
         let storage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC;
         let array = || context.empty(floats * 4, storage);
-        let rows = (points.len().next_multiple_of(TILE)) as u64;
+        let rows = schedule.largest_batch(GrowthState::default());
+        let rows = rows.next_multiple_of(TILE) as u64;
         let share = grid.variation_share(variation_weight);
+        let varies = variation_weight > 0.0;
         let encoding = |axis: usize| context.filled(bytemuck::cast_slice(&grid.encoding(axis)));
         let axis = |axis: usize| context.filled(bytemuck::bytes_of(&axis_record(&grid, axis, 0)));
         let written = storage | wgpu::BufferUsages::COPY_DST;
         Ok(Self {
-            arrays: context.empty(needed, written)?,
+            arrays: context.empty(ARRAYS as u64 * floats * 4, written)?,
             gradients: array()?,
             flows: context.empty(rows * ROW_BYTES, storage)?,
             loss_gradients: context.empty(rows * ROW_BYTES, storage)?,
@@ -105,8 +124,9 @@ impl LinearFit {
             values: array()?,
             value_gradients: array()?,
             between: [array()?, array()?],
-            inverse_lengths: array()?,
-            sums: match variation_weight > 0.0 {
+            inverse_lengths: context.empty(if varies { floats * 4 } else { 0 }, storage)?,
+            _alive: Arc::clone(&context.linear_fits),
+            sums: match varies {
                 true => Some(context.empty(floats.div_ceil(TILE as u64) * 4, storage)?),
                 false => None,
             },

@@ -31,18 +31,12 @@ impl GpuTarget<'_> {
         }
     }
 
-    /// Writes the points that are fitted behind the target, and returns their offset in words.
+    /// Writes the points that are fitted, and returns their offset in words.
     pub(super) fn write_points(&self, points: &[Point]) -> Result<u32, BackendError> {
-        let offset = match self {
-            Self::Transform(target) => target.room_for(points.len())?,
-            Self::Cloud(target) => target.room_for(points.len())?,
-        };
-        let context = &self.device().context;
-        let (store, bytes) = (&context.buffers.store, bytemuck::cast_slice(points));
-        context
-            .queue
-            .write_buffer(store, u64::from(offset) * 4, bytes);
-        Ok(offset)
+        match self {
+            Self::Transform(target) => target.allocation.write_points(points),
+            Self::Cloud(target) => target.allocation.write_points(points),
+        }
     }
 }
 
@@ -55,8 +49,6 @@ pub(super) enum GpuLoss<'a> {
     Chamfer {
         target: &'a GpuCloud,
         options: ChamferOptions,
-        /// The batch that nearest neighbors were searched for last.
-        searched: Option<Range<usize>>,
     },
 }
 
@@ -70,7 +62,6 @@ impl<'a> GpuLoss<'a> {
             (GpuTarget::Cloud(target), LossOptions::Chamfer(options)) => Self::Chamfer {
                 target,
                 options: *options,
-                searched: None,
             },
             _ => return Err(OTHER_LOSS),
         })
@@ -93,9 +84,7 @@ impl<'a> GpuLoss<'a> {
                 lane.truncation = options.truncation_m.unwrap_or(f32::MAX);
                 lane.flow_penalty = options.flow_penalty;
             }
-            Self::Chamfer {
-                target, options, ..
-            } => {
+            Self::Chamfer { target, options } => {
                 lane.cloud = target.record;
                 lane.truncation = options.truncation_m;
             }
@@ -112,30 +101,29 @@ impl<'a> GpuLoss<'a> {
         }
     }
 
-    /// Writes its part of the record of the iteration after `done` others, over `batch`.
+    /// Writes its part of the record of the iteration after `done` others, over `batch`. `searched` is
+    /// the batch that nearest neighbors were searched for last.
     pub(super) fn describe_step(
-        &mut self,
+        &self,
         step: &mut layout::Step,
         done: usize,
         batch: &Range<usize>,
+        searched: &mut Option<Range<usize>>,
     ) {
-        let kept = self.depends_on_earlier(done);
-        if let Self::Chamfer {
-            target, searched, ..
-        } = self
-        {
+        if let Self::Chamfer { target, .. } = self {
             step.share = batch.len() as f32 / target.record.targets as f32;
-            if !kept || searched.as_ref() != Some(batch) {
+            if !self.depends_on_earlier(done) || searched.as_ref() != Some(batch) {
                 step.searches = 1;
                 *searched = Some(batch.clone());
             }
         }
     }
 
-    /// Forgets the nearest neighbors that were found.
-    pub(super) fn forget(&mut self) {
-        if let Self::Chamfer { searched, .. } = self {
-            *searched = None;
+    /// The number of `steps` that have a distance query or a search of nearest neighbors.
+    pub(super) fn queries(&self, steps: &[layout::Step]) -> usize {
+        match self {
+            Self::Distance { .. } => steps.len(),
+            Self::Chamfer { .. } => steps.iter().filter(|step| step.searches == 1).count(),
         }
     }
 }

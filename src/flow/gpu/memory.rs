@@ -1,5 +1,5 @@
-//! The GPU's memory budget. Memory is allocated once, when the GPU is opened, and divided among the
-//! buffers.
+//! The GPU's memory budget. It is allocated once, when the GPU is opened, and divided among the
+//! buffers. A linear model takes memory of its own, see gpu/linear.rs.
 
 use super::adapter::AdapterKind;
 use super::layout::{ARRAYS, TILE};
@@ -56,7 +56,7 @@ pub(super) struct Budget {
     pub(super) rows: u64,
     /// Chunks of gradients per submission.
     pub(super) chunks: u64,
-    /// Words of the store, for distance transforms and points.
+    /// Words of the store, for prepared targets and points.
     pub(super) store_words: u64,
 }
 

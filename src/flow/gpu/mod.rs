@@ -29,6 +29,7 @@ mod network_phases;
 mod phase;
 mod pipelines;
 mod profile;
+mod program;
 mod request;
 mod self_test;
 #[cfg(test)]

@@ -19,22 +19,22 @@ pub(super) const SOURCES: [(&str, &str); 18] = [
     ("forward", source!("common", "forward")),
     (
         "distance_loss",
-        source!("common", "arithmetic", "distance", "distance_loss"),
+        source!("common", "arithmetic", "tree_sum", "distance", "distance_loss"),
     ),
     ("deform", source!("common", "deform")),
-    ("nearest", source!("common", "nearest")),
+    ("nearest", source!("common", "points", "nearest")),
     (
         "chamfer_loss",
-        source!("common", "arithmetic", "chamfer_loss"),
+        source!("common", "arithmetic", "tree_sum", "points", "chamfer_loss"),
     ),
     ("contract", source!("common", "contract")),
     (
         "variation",
-        source!("common", "arithmetic", "grid", "variation"),
+        source!("common", "arithmetic", "tree_sum", "grid", "variation"),
     ),
     (
         "reduce_variation",
-        source!("common", "arithmetic", "grid", "reduce_variation"),
+        source!("common", "arithmetic", "tree_sum", "grid", "reduce_variation"),
     ),
     ("blend", source!("common", "arithmetic", "grid", "blend")),
     (
@@ -45,7 +45,7 @@ pub(super) const SOURCES: [(&str, &str); 18] = [
     ("gradients", source!("common", "gradients")),
     (
         "reduce_loss",
-        source!("common", "arithmetic", "reduce_loss"),
+        source!("common", "arithmetic", "tree_sum", "reduce_loss"),
     ),
     ("step", source!("common", "arithmetic", "step")),
     ("transpose", source!("common", "transpose")),

@@ -5,11 +5,13 @@ use super::backend::Gpu;
 use super::buffers::spread;
 use super::chamfer::GpuCloud;
 use super::distance;
-use super::iteration::{Phases, SubmittedLoss, SubmittedModel};
+use super::iteration::{Phases, SubmittedModel};
+use super::layout::TILE;
 use super::loss::GpuTarget;
 use super::phase::{Clock, Phase};
+use super::program::SubmittedLoss;
 use super::request::write;
-use super::tiling::{Cut, Plan};
+use super::tiling::{Cut, Plan, Wave};
 use super::trainer::GpuTrainer;
 use crate::flow::data::{Point, Uncontrolled};
 use crate::flow::distance::DistanceOptions;
@@ -33,7 +35,7 @@ const DISTANCE: f64 = 8.0;
 pub struct KernelTime {
     /// Name of the kernel: `forward`, `distance_loss`, `backward`, `gradients`, `reduce_loss`,
     /// `step`, `transpose` in single or `halve` in half precision, and in single precision
-    /// `nearest` and `chamfer_loss`.
+    /// `deform`, `nearest` and `chamfer_loss`.
     pub name: &'static str,
     /// Time by GPU timestamps, seconds: the minimum over all rounds.
     pub seconds: f64,
@@ -95,9 +97,12 @@ pub fn kernel_times(
     if precision == Precision::F32 {
         let distances = 2.0 * points * target.len() as f64;
         let kernels = [
+            ("forward", Phase::Forward, points * FORWARD),
+            ("deform", Phase::Deform, 0.0),
             ("nearest", Phase::Nearest, distances * DISTANCE),
             ("chamfer_loss", Phase::Loss, 0.0),
         ];
+        drop(built);
         let chamfer = ChamferOptions::published(NearestSearch::BruteForce);
         let cloud = GpuCloud::new(device, source.len(), target, &chamfer, &Uncontrolled)?;
         let options = FieldOptions {
@@ -105,7 +110,9 @@ pub fn kernel_times(
             ..network
         };
         let on = GpuTarget::Cloud(&cloud);
-        times.extend(timed(gpu, on, source, &options, &kernels, rounds)?);
+        let more = timed(gpu, on, source, &options, &kernels, rounds)?;
+        // Without the forward pass, which is the same.
+        times.extend(more.into_iter().skip(1));
     }
     Ok(times)
 }
@@ -128,13 +135,16 @@ fn timed(
         return Err(BackendError::Unsupported(text));
     };
     // The network keeps its initial parameters, because the step size is zero.
-    let mut trainer = GpuTrainer::new(target, source, options, 0)?;
-    let mut request = trainer.request(1);
-    request.steps[0].step_size = 0.0;
+    let request = GpuTrainer::new(target, source, options, 0)?.repeated_iteration();
     write(context, &context.buffers, &[&request]);
     let model = SubmittedModel::of(&request.model, &|| device.units())?;
     let loss = SubmittedLoss::of(&[&request]);
     let phases = Phases::bind(context, &context.buffers, &plan, 1, model, loss)?;
+    let largest = request.cloud_sizes().into_iter().max().unwrap_or_default();
+    let queries = Wave {
+        tiles: largest.div_ceil(TILE),
+        ..Wave::default()
+    };
     let start = |&(name, _, operations): &Timed| KernelTime {
         name,
         seconds: f64::INFINITY,
@@ -146,6 +156,10 @@ fn timed(
         let mut encoder = context.encoder();
         for (index, &(_, phase, _)) in (0..).zip(kernels) {
             let mut pass = clock.pass(&mut encoder, Some(2 * index), Some(2 * index + 1));
+            let wave = match phase {
+                Phase::Nearest => &queries,
+                _ => wave,
+            };
             phases.dispatch(&mut pass, phase, 0, wave);
         }
         let moments = read(gpu, encoder, &clock, 2 * kernels.len() as u64)?;

@@ -72,11 +72,10 @@ impl Request {
         Kind::new(&self.model, self.loss)
     }
 
-    /// Queries of the largest search of nearest neighbors.
-    pub(super) fn queries(&self) -> usize {
-        let batches = self.steps.iter().map(|step| step.count);
-        let largest = batches.chain([self.lane.cloud.targets]).max();
-        largest.unwrap_or_default() as usize
+    /// Points of the largest batch and of the target of a Chamfer distance.
+    pub(super) fn cloud_sizes(&self) -> [usize; 2] {
+        let batch = self.steps.iter().map(|step| step.count).max();
+        [batch.unwrap_or_default(), self.lane.cloud.targets].map(|points| points as usize)
     }
 }
 

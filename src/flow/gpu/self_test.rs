@@ -9,11 +9,12 @@
 use super::buffers::Buffers;
 use super::context::Context;
 use super::half::Units;
-use super::iteration::{Phases, SubmittedLoss, SubmittedModel};
+use super::iteration::{Phases, SubmittedModel};
 use super::layout::{Lane, Status, Step, TILE};
 use super::matrix_units::Tile;
 use super::memory::Budget;
 use super::phase::Phase;
+use super::program::SubmittedLoss;
 use super::request::{LossKind, Model, Request, write as write_request};
 use super::tiling::{Cut, Plan};
 use crate::flow::data::Random;

@@ -1,8 +1,10 @@
 //! The fit of one pair on the GPU. Submissions with other pairs are in gpu/batcher.rs.
 
+use core::ops::Range;
 use std::sync::Arc;
 
 use super::batcher::{Done, TileThroughput};
+use super::context::Context;
 use super::device::Device;
 use super::layout::{ARRAYS, Arrays, CONVERGED, DIVERGED, STEPS, Status};
 use super::linear::LinearFit;
@@ -15,15 +17,9 @@ use super::{inference, layout};
 use crate::flow::data::{Control, Point, Progress, Random};
 use crate::flow::field::{
     Advance, BackendError, Conditioning, EarlyStopState, FitReport, FittedField, GrowthState,
-    LAID_OUT, LinearGrid, Network, Parameters, Schedule, Trainer, TrainerState, check_state, mlp,
+    LAID_OUT, LinearField, LinearGrid, Network, Parameters, Schedule, Trainer, TrainerState, check_state, mlp,
 };
 use crate::flow::options::{FieldOptions, ModelOptions, Precision};
-
-/// The growth of a constant batch.
-const CONSTANT: GrowthState = GrowthState {
-    doublings: 0,
-    loss: None,
-};
 
 /// Target duration of a submission, seconds. The control and the GPU's health are checked once per
 /// submission.
@@ -58,8 +54,12 @@ pub(super) struct GpuTrainer<'a> {
     /// Offset of the points in the store, in words.
     points: u32,
     status: Status,
-    /// Speed of the latest submission.
+    /// The batch that nearest neighbors were searched for last.
+    searched: Option<Range<usize>>,
+    /// Speed of the latest submission whose first iteration had a query.
     pace: Option<TileThroughput>,
+    /// The field of a linear model, if it was computed since the last iteration.
+    decoded: Option<LinearField>,
     query_seconds: f64,
 }
 
@@ -72,16 +72,22 @@ impl<'a> GpuTrainer<'a> {
     ) -> Result<Self, BackendError> {
         let device = Arc::clone(target.device());
         let loss = GpuLoss::new(target, &options.loss)?;
-        check_kernels(options)?;
+        if let Some(text) = options.lacks_gpu_kernels() {
+            return Err(BackendError::Unsupported(text));
+        }
         let mut random = Random::stream(seed, 0);
         let (model, parameters, schedule, cut) = match &options.model {
             ModelOptions::Network(network) => {
                 if network.precision == Precision::F16 {
+                    if !options.runs_in_half() {
+                        let text = "half precision is for networks and distance transforms";
+                        return Err(BackendError::Unsupported(text));
+                    }
                     device.units()?;
                 }
                 let parameters = mlp::initial(network.start, &mut random);
                 let schedule = Schedule::new(source, options, &mut random);
-                let cut = Cut::new(schedule.largest_batch(CONSTANT));
+                let cut = Cut::new(schedule.largest_batch(GrowthState::default()));
                 check_chunks(&device, cut)?;
                 let conditioning = Conditioning::new(source, network.inputs);
                 let model = NetworkFit::take(&device, conditioning, network.precision)?;
@@ -92,7 +98,7 @@ impl<'a> GpuTrainer<'a> {
                 let mut parameters = Parameters::zeros(3 * grid.channel());
                 grid.initial(&mut random, parameters.as_mut_slice());
                 let schedule = Schedule::new(source, options, &mut random);
-                let cut = Cut::one(schedule.largest_batch(CONSTANT));
+                let cut = Cut::one(schedule.largest_batch(GrowthState::default()));
                 let (context, threads) = (&device.context, device.host.threads());
                 let weight = linear.variation_weight;
                 let model = LinearFit::new(context, threads, grid, weight, &schedule)?;
@@ -107,7 +113,9 @@ impl<'a> GpuTrainer<'a> {
             schedule,
             cut,
             status: Status::default(),
+            searched: None,
             pace: None,
+            decoded: None,
             query_seconds: 0.0,
         };
         trainer.restore(TrainerState::at_start(parameters))?;
@@ -137,9 +145,10 @@ impl<'a> GpuTrainer<'a> {
         lane
     }
 
-    /// The record of the iteration that follows `done` others.
-    fn step(&mut self, done: usize) -> layout::Step {
-        let batch = self.schedule.batch(done, CONSTANT);
+    /// The record of the iteration that follows `done` others. `searched` is the batch that nearest
+    /// neighbors were searched for last.
+    fn step(&self, done: usize, searched: &mut Option<Range<usize>>) -> layout::Step {
+        let batch = self.schedule.batch(done, GrowthState::default());
         let adam = self.schedule.adam(done);
         let mut step = layout::Step {
             first: batch.start as u32,
@@ -150,34 +159,49 @@ impl<'a> GpuTrainer<'a> {
             ema_weight: self.schedule.ema_weight(done).unwrap_or(1.0),
             ..layout::Step::default()
         };
-        self.loss.describe_step(&mut step, done, &batch);
+        self.loss.describe_step(&mut step, done, &batch, searched);
         step
     }
 
-    /// The request for the next `steps` iterations.
-    pub(super) fn request(&mut self, steps: usize) -> Request {
+    /// The request for the next `steps` iterations. `searched` is the batch that nearest neighbors
+    /// were searched for last, before the iterations and after them.
+    fn request(&self, steps: usize, searched: &mut Option<Range<usize>>) -> Request {
         let done = self.status.iterations as usize;
+        let steps = (done..done + steps).map(|done| self.step(done, searched));
         Request {
             lane: self.lane(),
             status: self.status,
-            steps: (done..done + steps).map(|done| self.step(done)).collect(),
+            steps: steps.collect(),
             cut: self.cut,
             model: self.model.submitted(),
             loss: self.loss.kind(),
         }
     }
 
+    /// The request for one iteration that can be repeated: its step size is zero.
+    pub(super) fn repeated_iteration(&self) -> Request {
+        let mut request = self.request(1, &mut None);
+        request.steps[0].step_size = 0.0;
+        request
+    }
+
     /// Runs up to `steps` iterations in one submission.
     fn submit(&mut self, steps: usize) -> Result<Done, BackendError> {
-        let request = self.request(steps);
+        let mut searched = self.searched.clone();
+        let request = self.request(steps, &mut searched);
+        let steps = request.steps.clone();
         let device = &self.device;
         let units = || device.units();
         let done = device.batch.run(&device.context, &units, request)?;
+        self.searched = searched;
+        self.decoded = None;
         self.status = done.status;
-        self.pace = done.pace;
-        if let Some(pace) = done.pace {
-            let tiles = self.cut.tiles * done.losses.len();
-            self.query_seconds += pace.tile_query * tiles as f64;
+        if self.loss.queries(&steps[..1]) > 0 {
+            self.pace = done.pace;
+        }
+        if let Some(pace) = self.pace {
+            let queries = self.loss.queries(&steps[..done.losses.len()]);
+            self.query_seconds += pace.tile_query * (self.cut.tiles * queries) as f64;
         }
         Ok(done)
     }
@@ -262,7 +286,7 @@ impl Trainer for GpuTrainer<'_> {
                 inference::evaluate(context, networks, &self.lane(), points)
             }
             GpuModel::Linear(linear) => {
-                let field = linear.field(context)?;
+                let field = decoded(&mut self.decoded, linear, context)?;
                 Ok(field.flow(points, self.device.host.threads()))
             }
         }
@@ -277,7 +301,10 @@ impl Trainer for GpuTrainer<'_> {
                     conditioning: network.conditioning,
                 })
             }
-            GpuModel::Linear(linear) => FittedField::Linear(linear.field(&self.device.context)?),
+            GpuModel::Linear(linear) => {
+                let field = decoded(&mut self.decoded, linear, &self.device.context)?;
+                FittedField::Linear(field.clone())
+            }
         })
     }
 
@@ -306,7 +333,7 @@ impl Trainer for GpuTrainer<'_> {
             },
             iterations: status.iterations as usize,
             best_iteration: status.best_iteration as usize,
-            growth: CONSTANT,
+            growth: GrowthState::default(),
             best_loss: widened(status.best_loss),
         }))
     }
@@ -323,7 +350,8 @@ impl Trainer for GpuTrainer<'_> {
                 linear.write(&self.device.context, &arrays);
             }
         }
-        self.loss.forget();
+        self.searched = None;
+        self.decoded = None;
         self.status = Status {
             iterations: state.iterations as u32,
             best_iteration: state.best_iteration as u32,
@@ -341,20 +369,16 @@ impl Trainer for GpuTrainer<'_> {
     }
 }
 
-/// Checks that the fit asks for nothing that the CPU alone has.
-fn check_kernels(options: &FieldOptions) -> Result<(), BackendError> {
-    let text = if options.has_cycle() {
-        "the cycle of two networks is computed on the CPU alone"
-    } else if options.consistency_weight > 0.0 {
-        "the local consistency is computed on the CPU alone"
-    } else if options.growth.is_some() {
-        "batches grow on the CPU alone"
-    } else if options.bev {
-        "the bird's eye view is computed on the CPU alone"
-    } else {
-        return Ok(());
-    };
-    Err(BackendError::Unsupported(text))
+/// The field of the result of a linear model, computed if `known` has none.
+fn decoded<'k>(
+    known: &'k mut Option<LinearField>,
+    linear: &LinearFit,
+    context: &Context,
+) -> Result<&'k LinearField, BackendError> {
+    Ok(match known {
+        Some(field) => field,
+        None => known.insert(linear.field(context)?),
+    })
 }
 
 /// Checks that the gradients of a batch fit into the GPU's memory.

@@ -138,17 +138,29 @@ impl FieldOptions {
     /// transform or, by all distances, to a Chamfer distance, with a constant batch, without a
     /// partition, in three dimensions.
     pub fn runs_on_gpu(&self) -> bool {
-        let searched = match &self.loss {
-            LossOptions::Distance(_) => true,
-            LossOptions::Chamfer(options) => options.search == NearestSearch::BruteForce,
+        let by_loss = match &self.loss {
+            LossOptions::Distance(_) => None,
+            LossOptions::Chamfer(options) => options.lacks_gpu_kernels(),
         };
-        let whole = self.partition.is_none() && self.consistency_weight == 0.0;
-        searched && whole && self.growth.is_none() && !self.bev && !self.has_cycle()
+        by_loss.is_none() && self.partition.is_none() && self.lacks_gpu_kernels().is_none()
     }
 
-    /// Whether the fit has kernels in half precision: that of a network on a GPU.
+    /// Whether the fit has kernels in half precision: that of a network to a distance transform.
     pub fn runs_in_half(&self) -> bool {
-        self.network().is_some() && self.runs_on_gpu()
+        self.network().is_some() && self.loss.distance().is_some() && self.runs_on_gpu()
+    }
+
+    /// What of the fit of one field a GPU cannot compute; none if it can compute all, apart from the
+    /// loss.
+    pub(crate) fn lacks_gpu_kernels(&self) -> Option<&'static str> {
+        let cpu_alone = [
+            (self.has_cycle(), "the cycle of two networks is computed on the CPU alone"),
+            (self.consistency_weight > 0.0, "the local consistency is computed on the CPU alone"),
+            (self.growth.is_some(), "batches grow on the CPU alone"),
+            (self.bev, "the bird's eye view is computed on the CPU alone"),
+        ];
+        let lacking = cpu_alone.into_iter().find(|(asked, _)| *asked);
+        lacking.map(|(_, text)| text)
     }
 
     /// These options with the partition of NSFP++, its cycle and its local consistency.

@@ -109,6 +109,12 @@ pub struct ChamferOptions {
 }
 
 impl ChamferOptions {
+    /// Why a GPU cannot compute it; none if it can.
+    pub(crate) fn lacks_gpu_kernels(&self) -> Option<&'static str> {
+        let by_trees = self.search == NearestSearch::KdTree;
+        by_trees.then_some("k-d trees are searched on the CPU alone")
+    }
+
     /// The truncation of FNSF's comparison, 2 m, with neighbors from every iteration.
     pub fn published(search: NearestSearch) -> Self {
         Self {

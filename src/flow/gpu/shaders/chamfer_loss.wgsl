@@ -21,13 +21,9 @@ const DIVERGED_M = 1e6;
 // Target points whose neighbors are in workgroup memory at once.
 const SITES = 1024u;
 
-var<workgroup> losses: array<f32, TILE>;
-var<workgroup> sources: array<u32, SITES>;
+const TERMS = TILE;
 
-fn point_at(at: u32, index: u32) -> vec3<f32> {
-    let first = at + index * 3u;
-    return bitcast<vec3<f32>>(vec3(store[first], store[first + 1u], store[first + 2u]));
-}
+var<workgroup> sources: array<u32, SITES>;
 
 // The squared distance (w) and its derivative (xyz), zero at and beyond the truncation.
 fn squared(deformed: vec3<f32>, target_point: vec3<f32>, truncation: f32) -> vec4<f32> {
@@ -75,18 +71,12 @@ fn chamfer_loss(
         }
     }
     // Written so that a coordinate that is not a number counts as beyond it.
-    if takes_part && !all(abs(deformed) <= vec3(DIVERGED_M)) {
+    if takes_part && step.searches == 1u && !all(abs(deformed) <= vec3(DIVERGED_M)) {
         sum = vec4(0.0, 0.0, 0.0, bitcast<f32>(0x7fc00000u ^ part.nothing));
     }
     pulls[row] = vec4(sum.xyz * step.weight, 0.0);
-    losses[local] = sum.w;
-    for (var stride = TILE / 2u; stride > 0u; stride /= 2u) {
-        workgroupBarrier();
-        if local < stride {
-            losses[local] += losses[local + stride];
-        }
-    }
+    let sum_of_losses = tree_sum(local, sum.w);
     if local == 0u {
-        tile_losses[part.first_tile + wave_tile] = losses[0];
+        tile_losses[part.first_tile + wave_tile] = sum_of_losses;
     }
 }

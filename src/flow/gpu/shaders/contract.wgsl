@@ -34,11 +34,11 @@ fn contract(
     let axis = axes[0];
     let along = at / axis.stride % axis.extent;
     var sum = 0.0;
-    // The padding of rows is zero.
+    // The encoding is symmetric. The padding of rows is zero.
     if along < axis.count {
         let line = axis.begin + at - along * axis.stride;
         for (var i = 0u; i < axis.count; i++) {
-            sum = fma(encoding[along * axis.pitch + i], inputs[line + i * axis.stride], sum);
+            sum = fma(encoding[i * axis.pitch + along], inputs[line + i * axis.stride], sum);
         }
     }
     outputs[at] = sum;

@@ -16,7 +16,7 @@ var<immediate> part: Part;
 // Flows shorter than this are penalized quadratically, metres.
 const SMALL_FLOW = 1e-3;
 
-var<workgroup> losses: array<f32, TILE>;
+const TERMS = TILE;
 
 @compute @workgroup_size(64)
 fn distance_loss(
@@ -54,14 +54,8 @@ fn distance_loss(
         loss = min(max(seen.distance, margin), truncation) + rounded(penalty * penalized);
     }
     pulls[row] = vec4(pull, 0.0);
-    losses[local] = loss;
-    for (var stride = TILE / 2u; stride > 0u; stride /= 2u) {
-        workgroupBarrier();
-        if local < stride {
-            losses[local] += losses[local + stride];
-        }
-    }
+    let sum_of_losses = tree_sum(local, loss);
     if local == 0u {
-        tile_losses[part.first_tile + wave_tile] = losses[0];
+        tile_losses[part.first_tile + wave_tile] = sum_of_losses;
     }
 }

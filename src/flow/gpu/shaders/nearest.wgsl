@@ -1,9 +1,9 @@
 // Nearest neighbors between the batch's displaced points and the target, by all distances.
 //
 // In: displaced points and target points. Out: the index of the nearest target point to each
-// displaced point (even y), and of the nearest displaced point to each target point (odd y). Of
-// equally near points it is the first. One query per invocation; the sites pass through workgroup
-// memory. Mirrors NearestKernel::search.
+// displaced point, and of the nearest displaced point to each target point. Workgroups with an even
+// y do the former, those with an odd y the latter. Of equally near points it is the first. One query
+// per invocation; the sites pass through workgroup memory. Mirrors NearestKernel::search.
 
 var<immediate> part: Part;
 @group(0) @binding(0) var<storage, read_write> store: array<u32>;
@@ -18,11 +18,6 @@ const SITES = 256u;
 const FAR = 0x1.fffffep+127f;
 
 var<workgroup> sites: array<vec4<f32>, SITES>;
-
-fn point_at(at: u32, index: u32) -> vec3<f32> {
-    let first = at + index * 3u;
-    return bitcast<vec3<f32>>(vec3(store[first], store[first + 1u], store[first + 2u]));
-}
 
 @compute @workgroup_size(64)
 fn nearest(
@@ -41,7 +36,9 @@ fn nearest(
     let count = select(step.count, cloud.targets, to_target);
     let site_points = select(cloud.deformed, cloud.target_points, to_target);
     let out = select(cloud.sources, cloud.nearest, to_target);
-    for (var tile = group.x; tile * QUERIES < queries; tile += groups.x) {
+    // The tiles of this dispatch, which has one part of a long search.
+    let end = min(part.first_tile + part.tiles, (queries + QUERIES - 1u) / QUERIES);
+    for (var tile = part.first_tile + group.x; tile < end; tile += groups.x) {
         let index = tile * QUERIES + local;
         let query = point_at(query_points, min(index, queries - 1u));
         var found = 0u;

@@ -1,9 +1,10 @@
 // Sums an iteration's losses and updates the lane's state: running, converged or diverged, and
 // whether the iteration is the best so far.
 //
-// One workgroup per lane. In: each tile's sum of losses, and the regularization in the lane's status.
-// Out: the lane's status and the iteration's loss. Mirrors EarlyStop::observe and the result that the CPU's trainer keeps. The iteration
-// at which the stopping rule fires is not a candidate for the best.
+// One workgroup per lane. In: each tile's sum of losses, and the regularization in the lane's
+// status. Out: the lane's status and the iteration's loss. Mirrors EarlyStop::observe and the result
+// that the CPU's trainer keeps. The iteration at which the stopping rule fires is not a candidate for
+// the best.
 
 var<immediate> part: Part;
 @group(0) @binding(0) var<storage, read> lanes: array<Lane>;
@@ -12,10 +13,9 @@ var<immediate> part: Part;
 @group(0) @binding(3) var<storage, read_write> statuses: array<Status>;
 @group(0) @binding(4) var<storage, read_write> losses: array<f32>;
 
-const THREADS = 256u;
-var<workgroup> sums: array<f32, THREADS>;
+const TERMS = 256u;
 
-@compute @workgroup_size(THREADS)
+@compute @workgroup_size(TERMS)
 fn reduce_loss(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
@@ -23,23 +23,17 @@ fn reduce_loss(
     let lane = group.x;
     let first = lanes[lane].first_tile;
     var sum = 0.0;
-    for (var tile = local; tile < lanes[lane].tiles; tile += THREADS) {
+    for (var tile = local; tile < lanes[lane].tiles; tile += TERMS) {
         sum += tile_losses[first + tile];
     }
-    sums[local] = sum;
-    for (var stride = THREADS / 2u; stride > 0u; stride /= 2u) {
-        workgroupBarrier();
-        if local < stride {
-            sums[local] += sums[local + stride];
-        }
-    }
+    let all = tree_sum(local, sum);
     if local > 0u { return; }
     var status = statuses[lane];
     status.applies = 0u;
     status.improves = 0u;
     if iterates(status, lanes[lane].steps, part.step) {
         let slot = lane * STEPS + part.step;
-        let loss = rounded(sums[0] * steps[slot].weight) + status.regularization;
+        let loss = rounded(all * steps[slot].weight) + status.regularization;
         losses[slot] = loss;
         // False for NaN and infinity.
         if loss < 3.4e38 {

@@ -1,8 +1,9 @@
 // Optimizer step: sums the chunks' gradients in order, updates the kept parameters and applies
 // Adam.
 //
-// One vec4 of one lane's parameters per invocation, of a network or of a linear model. In: partial gradients, statuses. Out: the lane's
-// parameters, moments and kept parameters. Mirrors AdamStep::apply.
+// Vec4s of one lane's parameters per invocation, of a network or of a linear model. In: partial
+// gradients, statuses. Out: the lane's parameters, moments and kept parameters. Mirrors
+// AdamStep::apply.
 
 var<immediate> part: Part;
 @group(0) @binding(0) var<storage, read> lanes: array<Lane>;
@@ -17,16 +18,24 @@ const EPSILON = vec4(1e-8);
 const FRESH_MEAN = vec4(0.1);
 const FRESH_SQUARE = vec4(0.001);
 
-@compute @workgroup_size(128)
+const INVOCATIONS = 128u;
+
+@compute @workgroup_size(INVOCATIONS)
 fn step(
     @builtin(global_invocation_id) id: vec3<u32>,
     @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
 ) {
     let lane = group.y;
-    let slot = id.x;
-    let status = statuses[lane];
+    if statuses[lane].applies == 0u { return; }
+    for (var slot = id.x; slot < lanes[lane].parameters; slot += groups.x * INVOCATIONS) {
+        update(lane, slot);
+    }
+}
+
+// Updates one vec4.
+fn update(lane: u32, slot: u32) {
     let length = lanes[lane].parameters;
-    if slot >= length || status.applies == 0u { return; }
     let now = steps[lane * STEPS + part.step];
     var gradient = vec4(0.0);
     let first = lanes[lane].first_chunk;
@@ -35,10 +44,11 @@ fn step(
     }
     let at = lanes[lane].network * ARRAYS * length + slot;
     let parameter = networks[at + PARAMETERS * length];
-    if status.improves == 1u {
+    if statuses[lane].improves == 1u {
         let kept = networks[at + KEPT * length];
         let ema_weight = select(1.0, now.ema_weight, lanes[lane].average == 1u);
-        networks[at + KEPT * length] = select(kept + rounded4(ema_weight * (parameter - kept)), parameter, vec4(ema_weight == 1.0));
+        let averaged = kept + rounded4(ema_weight * (parameter - kept));
+        networks[at + KEPT * length] = select(averaged, parameter, vec4(ema_weight == 1.0));
     }
     let before = networks[at + MEANS * length];
     let before_square = networks[at + SQUARES * length];

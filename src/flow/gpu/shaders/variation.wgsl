@@ -16,7 +16,7 @@ var<immediate> part: Part;
 // Smoothing constant, square metres.
 const SMOOTHING = 1e-5;
 
-var<workgroup> lengths: array<f32, TILE>;
+const TERMS = TILE;
 
 @compute @workgroup_size(64)
 fn variation(
@@ -44,14 +44,8 @@ fn variation(
         }
         inverse_lengths[at] = inverse;
     }
-    lengths[local] = length;
-    for (var stride = TILE / 2u; stride > 0u; stride /= 2u) {
-        workgroupBarrier();
-        if local < stride {
-            lengths[local] += lengths[local + stride];
-        }
-    }
+    let sum = tree_sum(local, length);
     if local == 0u {
-        sums[tile] = lengths[0];
+        sums[tile] = sum;
     }
 }
