@@ -127,20 +127,24 @@ def run_all(args: argparse.Namespace, contestants: list[Contestant]) -> dict[Con
     return runs
 
 
+def spread(values: list[float], digits: int) -> str:
+    """The median, with the range."""
+    return f"{median(values):.{digits}f} ({min(values):.{digits}f} to {max(values):.{digits}f})"
+
+
 def ratio_cell(runs: list[Run], baseline: list[Run]) -> str:
     """Median of the per-seed time ratios, with their range."""
     ratios = [run.seconds / base.seconds for run, base in zip(runs, baseline, strict=True)]
-    return f"{median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
+    return spread(ratios, 2)
 
 
 def table_row(contestant: Contestant, runs: list[Run], baselines: list[list[Run]]) -> str:
-    """One contestant's medians, its worst EPE, and its time over each fnsf preset's."""
+    """One contestant's medians, the range of its EPE, and its time over each fnsf preset's."""
     cells = [
         contestant.name,
         f"{median(run.seconds for run in runs):.3f}",
         f"{median(run.precompute for run in runs):.3f}",
-        f"{median(run.epe for run in runs):.4f}",
-        f"{max(run.epe for run in runs):.4f}",
+        spread([run.epe for run in runs], 4),
         f"{median(run.acc5 for run in runs):.3f}",
         f"{median(run.points for run in runs):.0f}",
         f"{median(run.iterations for run in runs):.0f}",
@@ -153,8 +157,8 @@ def table_row(contestant: Contestant, runs: list[Run], baselines: list[list[Run]
 def print_table(args: argparse.Namespace, runs: dict[Contestant, list[Run]]) -> None:
     """The caption, which says what was run, and the table."""
     presets = [contestant for contestant in runs if contestant.program == "fnsf"]
-    header = ["", "seconds", "precompute", "EPE (m)", "worst EPE", "Acc5", "points", "iterations"]
-    header += ["peak MiB", *(f"time / {preset.name}" for preset in presets)]
+    header = ["", "seconds", "precompute", "EPE (m)", "Acc5", "points", "iterations", "peak MiB"]
+    header += [*(f"time / {preset.name}" for preset in presets)]
     print(
         f"{args.pair}, range {args.crop_m or 'off'}, ground {args.ground}, "
         f"{args.max_points or 'all'} points, {args.device}, {args.threads} threads, "

@@ -158,8 +158,10 @@ impl Estimation {
         };
         let raster = self.ground_raster.as_deref().map(files::read_ground_raster);
         let name = |path: &PathBuf| path.to_string_lossy().into_owned();
+        let names: Vec<String> = paths.iter().map(name).collect();
+        warn_of_disorder(&names);
         Ok(Surroundings {
-            names: paths.iter().map(name).collect(),
+            names,
             poses,
             raster: raster.transpose()?,
         })
@@ -181,6 +183,18 @@ impl Estimation {
             asked: self,
             backend,
         })
+    }
+}
+
+/// Warns on stderr where the numbers in the names of the sweeps turn back.
+fn warn_of_disorder(names: &[String]) {
+    let names: Vec<&str> = names.iter().map(AsRef::as_ref).collect();
+    if let Some(at) = formats::turning_sweep(&names) {
+        let (sweep, next) = (names[at], names[at + 1]);
+        eprintln!(
+            "fnsf: warning: {sweep} is followed by {next}, against the order of the others: sweeps are \
+             taken as they are given, so give them in the order in which they were recorded"
+        );
     }
 }
 

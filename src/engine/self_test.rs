@@ -7,7 +7,7 @@ use super::panics::message;
 use super::types::{DeviceFactory, Opened};
 use crate::flow::cpu::CpuBackend;
 use crate::flow::field::{Backend, BackendError};
-use crate::flow::{self, FlowError, Point, Preset, Problem, Uncontrolled};
+use crate::flow::{self, FlowError, Point, Preset, Problem, Uncontrolled, largest};
 
 /// Translation of the scene (a wall and a post in front of it) between source and target, metres.
 const MOTION: [f32; 3] = [0.2, 0.1, 0.0];
@@ -24,8 +24,6 @@ const ITERATIONS: usize = 12;
 const COMPARED_ITERATIONS: usize = 3;
 /// Tolerance of the largest difference, metres.
 const COMPARED_TOLERANCE: f32 = 0.01;
-/// One in so many points takes part in the comparison.
-const COMPARED_STRIDE: usize = 4;
 
 /// Why a self-test failed.
 #[derive(Debug, thiserror::Error)]
@@ -108,11 +106,8 @@ fn compared_with_the_cpu(
     preset: Preset,
     clouds: [&[Point]; 2],
 ) -> Result<(), SelfTestError> {
-    let [source, target] = clouds.map(|cloud| -> Vec<Point> {
-        let some = cloud.iter().step_by(COMPARED_STRIDE);
-        some.copied().collect()
-    });
-    let problem = Problem::pair(&source, &target);
+    let [source, target] = clouds;
+    let problem = Problem::pair(source, target);
     let mut options = preset.options(None);
     if let Some(field) = options.field_mut() {
         field.max_iterations = COMPARED_ITERATIONS;
@@ -124,9 +119,7 @@ fn compared_with_the_cpu(
     let cpu = CpuBackend::new(Some(1)).map_err(FlowError::from)?;
     let (found, expected) = (flow_on(backend)?, flow_on(&cpu)?);
     let axes = found.iter().flatten().zip(expected.iter().flatten());
-    let differences = axes.map(|(found, expected)| (found - expected).abs());
-    // NaN counts as larger than any number.
-    let largest = differences.fold(0.0, |most: f32, off| if off <= most { most } else { off });
+    let largest = largest(axes.map(|(found, expected)| (found - expected).abs()));
     if largest <= COMPARED_TOLERANCE {
         Ok(())
     } else {

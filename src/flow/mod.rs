@@ -77,4 +77,4 @@ pub use problem::{NeighborSweep, Problem};
 pub use sequence::{Sequence, Sweep, is_window_final, window};
 
 #[cfg(feature = "service")]
-pub(crate) use data::locked;
+pub(crate) use data::{largest, locked};

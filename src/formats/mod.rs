@@ -7,6 +7,7 @@ mod error;
 mod limits;
 mod lines;
 mod sniff;
+mod sweep_order;
 mod timestamps;
 
 mod camera;
@@ -46,4 +47,5 @@ pub use crate::formats::pair::{
 };
 pub use crate::formats::poses::read_poses;
 pub use crate::formats::sniff::recognize;
+pub use sweep_order::turning_sweep;
 pub use timestamps::{SweepTime, TimeUnit};

@@ -195,6 +195,11 @@ impl ArrayPath<'_> {
     }
 }
 
+/// An array with so many rows and more columns than this is taken for transposed: its rows are x, y,
+/// z and perhaps others.
+const TRANSPOSED_ROWS: core::ops::RangeInclusive<usize> = 3..=8;
+const MOST_COLUMNS: usize = 64;
+
 /// The first three columns of an N x k array of floats, k >= 3, as N points in metres.
 ///
 /// The caller must check that the declared bytes exist. Memory is allocated for N points only.
@@ -215,6 +220,13 @@ pub(super) fn read_points<R: Read + ?Sized>(
             )));
         }
     };
+    if TRANSPOSED_ROWS.contains(&rows) && columns > MOST_COLUMNS {
+        return Err(kind.unsupported(format!(
+            "{} has shape {:?}, but each row is a point: save the transposed array, N x 3",
+            array_path.described(),
+            header.shape
+        )));
+    }
     let rows = check_rows(kind, rows as u64)?;
     let count = if header.fortran {
         rows * 3

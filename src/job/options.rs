@@ -273,6 +273,8 @@ mod tests {
             ("neural", true),
             ("paper", true),
             ("nsfp-kdtree", false),
+            ("nsfp-baseline", false),
+            ("fnsf-linear", false),
         ] {
             let asked = options(&format!(r#"{{"preset":"{preset}","precision":"f16"}}"#));
             let refused = asked.err();

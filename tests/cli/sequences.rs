@@ -40,6 +40,23 @@ fn the_flows_of_a_sequence_are_numbered_and_the_first_is_that_of_its_pair_alone(
 }
 
 #[test]
+fn sweeps_out_of_the_order_of_their_numbers_are_named() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder, "4");
+    let [a, b, c, _] = SWEEPS;
+    for (sweeps, warned) in [([a, b, c], false), ([c, b, a], false), ([a, c, b], true)] {
+        let done = fnsf(
+            folder,
+            &[&["flow"], &sweeps[..], &["-o", "out.npz"]].concat(),
+        );
+        assert_eq!(done.code, 0, "{}", done.stderr);
+        let warning = format!("{c} is followed by {b}");
+        assert_eq!(done.stderr.contains(&warning), warned, "{}", done.stderr);
+    }
+}
+
+#[test]
 fn flows_that_wait_for_sweeps_to_come_are_numbered_and_reported_like_any() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();

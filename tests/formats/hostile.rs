@@ -33,6 +33,19 @@ fn object_arrays_are_refused_by_name() {
 }
 
 #[test]
+fn a_transposed_cloud_is_refused_with_what_to_do() {
+    for (shape, floats) in [("(3, 65)", 195), ("(4, 1000)", 4000)] {
+        for fortran in [false, true] {
+            let refused = refusal(&npy("'<f4'", fortran, shape, &vec![0; floats * 4]));
+            assert!(refused.to_string().contains("transposed"), "{refused}");
+        }
+    }
+    // Few points with some features each are no transposed cloud.
+    let few = npy("'<f4'", false, "(3, 64)", &[0; 3 * 64 * 4]);
+    assert_eq!(read_cloud(&few, None).expect("a cloud").points.len(), 3);
+}
+
+#[test]
 fn values_that_are_no_place_are_refused_by_row_and_column() {
     let at = |value: f32| {
         npy(

@@ -44,7 +44,7 @@ pub(super) struct Ablation<'a> {
     pub(super) bev: bool,
     pub(super) budget: Option<f64>,
     /// Adds what the pair and the command line decide.
-    pub(super) complete: &'a dyn Fn(JobOptions) -> Options,
+    pub(super) complete: &'a dyn Fn(&JobOptions) -> Options,
     pub(super) terminal: &'a Terminal,
 }
 
@@ -64,7 +64,7 @@ impl Ablation<'_> {
         let mut all = Vec::new();
         for cell_m in EDGES_M {
             self.terminal.part(&format!("{name}, cells of {cell_m} m"));
-            let options = (self.complete)(JobOptions {
+            let options = (self.complete)(&JobOptions {
                 preset: PresetChoice::Paper,
                 field: FieldChoices {
                     cell_m: Some(cell_m),

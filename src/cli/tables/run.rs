@@ -162,7 +162,7 @@ impl Tables {
                 terminal.part(&format!("{name}, {}, seed {seed}", row.name));
                 let drawn = self.max_points.map_or(usize::MAX, |points| points as usize);
                 let options = row.options(drawn.min(largest(pair)));
-                let options = self.complete(options, pair, seed.into());
+                let options = self.complete(&options, pair, seed.into());
                 let control = Budget::new(self.budget, terminal);
                 let run = measure(devices, subject, &options, &control);
                 let what = || format!("{name}, {}", row.name);
@@ -180,7 +180,7 @@ impl Tables {
     }
 
     /// The solver's options, with what the pair and the command line decide for every method.
-    fn complete(&self, options: JobOptions, pair: &Pair, seed: u64) -> Options {
+    fn complete(&self, options: &JobOptions, pair: &Pair, seed: u64) -> Options {
         let preset = options.preset.preset().options(None);
         let by_masks = match preset.ego {
             Ego::Off => GroundChoice::Mask,
@@ -196,7 +196,7 @@ impl Tables {
             max_points: self.max_points,
             crop_m: self.crop_m,
             ground: Some(self.ground.unwrap_or(usual)),
-            ..options
+            ..options.clone()
         };
         options.solver_options(largest(pair))
     }

@@ -10,10 +10,9 @@ use super::isa::Isa;
 use super::model::Model;
 use super::product_kernels::{Factors, ProductKernel};
 use super::tile::{TILE, WorkingSets};
+use super::variation::Variation;
 use crate::flow::data::Point;
-use crate::flow::field::{
-    FittedField, LinearField, LinearGrid, Parameters, Placed, VARIATION_SMOOTHING, reduction,
-};
+use crate::flow::field::{FittedField, LinearField, LinearGrid, Parameters, Placed};
 
 /// The three products with the encodings of the axes.
 pub(super) struct Encoder {
@@ -97,11 +96,7 @@ pub(super) struct Linear {
     /// Derivatives of the loss with respect to them.
     value_gradients: Vec<f32>,
     between: Vec<f32>,
-    /// Reciprocal length of the displacement's differences at each vertex, for each axis of the
-    /// displacement.
-    inverse_lengths: Vec<f32>,
-    /// Sum of these lengths.
-    variation: f32,
+    variation: Variation,
     points: PlacedPoints,
 }
 
@@ -123,17 +118,9 @@ impl Linear {
             values: vec![0.0; floats],
             value_gradients: vec![0.0; floats],
             between: vec![0.0; floats],
-            inverse_lengths: vec![0.0; floats],
-            variation: 0.0,
+            variation: Variation::new(floats),
             points: PlacedPoints::default(),
         }
-    }
-
-    /// Differences of the displacement at vertex `at` to its next neighbors.
-    #[inline]
-    fn differences(&self, values: &[f32], at: usize) -> [f32; 3] {
-        let grid = &self.encoder.grid;
-        [1, grid.row(), grid.plane()].map(|step| values[at + step] - values[at])
     }
 
     /// The weight of the total variation in the loss over the number of vertices that it is a mean
@@ -142,47 +129,10 @@ impl Linear {
         self.encoder.grid.variation_share(self.variation_weight)
     }
 
-    /// Computes the total variation (FNSF's published code): the sum over the vertices and the axes
-    /// of the flow of `sqrt(1e-5 + |differences|^2)`. Vertices without a next neighbor along every
-    /// axis are left out.
-    fn measure_variation(&mut self) {
-        let grid = self.encoder.grid;
-        let [x, y, z] = grid.vertices;
-        let (row, plane) = (grid.row(), grid.plane());
-        let mut inverse_lengths = core::mem::take(&mut self.inverse_lengths);
-        let mut lengths = core::mem::take(&mut self.between);
-        let level = |(number, (inverse, lengths)): (usize, (&mut [f32], &mut [f32]))| {
-            inverse.fill(0.0);
-            lengths.fill(0.0);
-            if number % z + 1 == z {
-                return;
-            }
-            let values = &self.values[number * plane..];
-            for across in 0..y - 1 {
-                for at in across * row..across * row + x - 1 {
-                    let differences = self.differences(values, at);
-                    let square: f32 = differences.iter().map(|d| d * d).sum();
-                    lengths[at] = (VARIATION_SMOOTHING + square).sqrt();
-                    inverse[at] = 1.0 / lengths[at];
-                }
-            }
-        };
-        self.encoder.threads.install(|| {
-            let levels = inverse_lengths
-                .par_chunks_mut(plane)
-                .zip(lengths.par_chunks_mut(plane));
-            levels.enumerate().for_each(level);
-        });
-        self.variation = reduction::sum(&lengths);
-        self.inverse_lengths = inverse_lengths;
-        self.between = lengths;
-    }
-
     /// The derivative of the loss with respect to the displacements of one level of vertices.
     fn level_gradient(&self, number: usize, flow_gradients: &[Point], out: &mut [f32]) {
         let grid = &self.encoder.grid;
-        let [x, y, z] = grid.vertices;
-        let (row, plane) = (grid.row(), grid.plane());
+        let (row, [_, _, z]) = (grid.row(), grid.vertices);
         let (channel, level) = (number / z, number % z);
         out.fill(0.0);
         let points = &self.points;
@@ -211,31 +161,8 @@ impl Linear {
             return;
         }
         let weight = self.variation_share();
-        let base = number * plane;
-        let difference = |at: usize, before: usize| {
-            (self.values[at] - self.values[before]) * self.inverse_lengths[before]
-        };
-        for across in 0..y {
-            for along in 0..x {
-                let own = across * row + along;
-                let at = base + own;
-                let mut sum = 0.0;
-                if along > 0 {
-                    sum += difference(at, at - 1);
-                }
-                if across > 0 {
-                    sum += difference(at, at - row);
-                }
-                if level > 0 {
-                    sum += difference(at, at - plane);
-                }
-                if along + 1 < x && across + 1 < y && level + 1 < z {
-                    let ahead: f32 = self.differences(&self.values, at).iter().sum();
-                    sum -= ahead * self.inverse_lengths[at];
-                }
-                out[own] += weight * sum;
-            }
-        }
+        self.variation
+            .add_gradient(grid, &self.values, number, weight, out);
     }
 }
 
@@ -255,7 +182,9 @@ impl Model for Linear {
         self.encoder
             .apply(weights, &mut self.values, &mut self.between);
         if self.variation_weight > 0.0 {
-            self.measure_variation();
+            let (grid, threads) = (&self.encoder.grid, &self.encoder.threads);
+            let (values, between) = (&self.values, &mut self.between);
+            self.variation.measure(grid, values, between, threads);
         }
     }
 
@@ -284,7 +213,7 @@ impl Model for Linear {
     }
 
     fn regularization(&self) -> f32 {
-        self.variation_share() * self.variation
+        self.variation_share() * self.variation.sum
     }
 
     fn chunk_gradients(&self) -> Self::ChunkGradients {

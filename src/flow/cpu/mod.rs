@@ -16,6 +16,7 @@ mod profile;
 mod simd;
 mod tile;
 mod trainer;
+mod variation;
 
 pub use backend::CpuBackend;
 pub use isa::Isa;

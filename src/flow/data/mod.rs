@@ -5,6 +5,8 @@ mod aligned_sweep;
 mod codec;
 pub(crate) mod control;
 mod dense_cloud;
+#[cfg(feature = "gpu")]
+mod largest;
 mod lazy;
 mod lock;
 mod oriented_box;
@@ -23,6 +25,8 @@ pub use point::{DYNAMIC_M, MIN_POINTS, Point, RigidTransform};
 pub use stop_reason::StopReason;
 
 pub(crate) use codec::{Body, Envelope, Hash};
+#[cfg(feature = "gpu")]
+pub(crate) use largest::largest;
 pub(crate) use lazy::get_or_compute;
 pub(crate) use lock::locked;
 pub(crate) use point::{floor, square_distance, stride_sample, transform_point, transform_points};

@@ -71,6 +71,12 @@ impl Gpu {
         self.0.context.watchdog.lost("it was given up".to_owned());
     }
 
+    /// Mutable access to the device, for tests.
+    #[cfg(test)]
+    pub(super) fn device_mut(&mut self) -> &mut Arc<Device> {
+        &mut self.0
+    }
+
     /// The device that all clones share.
     pub(super) fn device(&self) -> &Arc<Device> {
         &self.0

@@ -206,7 +206,7 @@ fn submit<'u>(
     };
     let loss = SubmittedLoss::of(requests);
     let plan = Plan::new(&cuts, rows);
-    let program = Program::new(&plan, loss);
+    let program = Program::new(&plan, loss, context.most_distances);
     write(context, &context.buffers, requests);
     let lanes = requests.len();
     let phases = Phases::bind(context, &context.buffers, &plan, lanes, model, loss)?;
@@ -274,7 +274,7 @@ fn iterate(
         }
     };
     let untimed = wgpu::ComputePassDescriptor::default();
-    if clock.is_none() && program.is_whole() {
+    if clock.is_none() && program.is_whole {
         let mut pass = encoder.begin_compute_pass(&untimed);
         let groups = program.parts().into_iter().flatten();
         groups.for_each(|items| run(&mut pass, items));
@@ -293,7 +293,7 @@ fn iterate(
                 };
                 run(&mut pass, items);
             }
-            if !is_last {
+            if !program.is_whole {
                 phases.context.flush(encoder)?;
             }
         }

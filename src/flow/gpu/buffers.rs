@@ -96,7 +96,9 @@ impl Buffers {
 pub(super) fn largest(device: &wgpu::Device, usage: wgpu::BufferUsages) -> u64 {
     let limits = device.limits();
     match usage.contains(wgpu::BufferUsages::STORAGE) {
-        true => limits.max_buffer_size.min(limits.max_storage_buffer_binding_size),
+        true => limits
+            .max_buffer_size
+            .min(limits.max_storage_buffer_binding_size),
         false => limits.max_buffer_size,
     }
 }

@@ -6,7 +6,6 @@ use super::allocation::{Allocation, POINT_WORDS};
 use super::chamfer_phases::search_groups;
 use super::device::Device;
 use super::layout::{Cloud, Lane, Part, Status, Step, TILE};
-use super::program::MOST_DISTANCES;
 use crate::flow::data::{Control, Point};
 use crate::flow::field::{BackendError, check_chamfer, length};
 use crate::flow::options::ChamferOptions;
@@ -85,7 +84,7 @@ impl GpuCloud {
     /// # Errors
     /// As [`Self::distances`].
     pub(super) fn nearest(&self, points: &[Point]) -> Result<Vec<u32>, BackendError> {
-        let most = (MOST_DISTANCES / self.target.len()).clamp(TILE, SEARCHED);
+        let most = (self.device.context.most_distances / self.target.len()).clamp(TILE, SEARCHED);
         let mut found = Vec::with_capacity(points.len());
         for points in points.chunks(most) {
             found.extend(self.nearest_of_some(points)?);

@@ -24,6 +24,11 @@ const SOFTWARE_SILENCE: Duration = Duration::from_secs(120);
 /// purpose: a wait that times out while another thread finds the queue empty trips an assertion of
 /// wgpu 30 (gfx-rs/wgpu#9958), which loses the device.
 const POLL_INTERVAL: Duration = Duration::from_secs(2);
+/// Distances that are computed in one submission to the driver: 7 s at 1e10 a second.
+const MOST_DISTANCES: usize = 1 << 36;
+/// The same on a software device: 17 s at 1e9 a second.
+const SOFTWARE_DISTANCES: usize = 1 << 34;
+
 /// An opened GPU: its queue, its kernels, its buffers, its health.
 pub(super) struct Context {
     pub(super) device: wgpu::Device,
@@ -35,12 +40,14 @@ pub(super) struct Context {
     /// Seconds per tick of the GPU's timestamps; none if it has none.
     pub(super) tick: Option<f64>,
     pub(super) watchdog: Arc<Watchdog>,
+    /// One more owner for each fit of a linear model.
+    pub(super) linear_fits: Arc<()>,
     /// The tile of its matrix units, or the reason why they cannot be used.
     pub(super) tile: Result<Tile, String>,
     networks: Mutex<Vec<u32>>,
-    /// One more owner for each fit of a linear model.
-    pub(super) linear_fits: Arc<()>,
     longest_silence: Duration,
+    /// Distances that are computed in one submission to the driver.
+    pub(super) most_distances: usize,
 }
 
 impl Context {
@@ -80,11 +87,15 @@ impl Context {
             kernels,
             buffers,
             allocator: Allocator::new(budget.store_words),
-            linear_fits: Arc::default(),
             networks: Mutex::new((0..budget.lanes as u32).rev().collect()),
             budget,
             tick: (!clock.is_empty()).then_some(period * 1e-9),
             watchdog,
+            linear_fits: Arc::default(),
+            most_distances: match adapter.kind {
+                AdapterKind::Software => SOFTWARE_DISTANCES,
+                _ => MOST_DISTANCES,
+            },
             longest_silence: match adapter.kind {
                 AdapterKind::Software => SOFTWARE_SILENCE,
                 _ => LONGEST_SILENCE,
@@ -102,6 +113,11 @@ impl Context {
     pub(super) fn take_network(&self) -> Result<u32, BackendError> {
         let mut free = locked(&self.networks);
         free.pop().ok_or(BackendError::Busy)
+    }
+
+    /// Whether no network is being fitted.
+    pub(super) fn is_idle(&self) -> bool {
+        locked(&self.networks).len() as u64 == self.budget.lanes
     }
 
     pub(super) fn give_network_back(&self, network: u32) {

@@ -189,6 +189,7 @@ impl<'a> Phases<'a> {
                     first_tile: wave.first_tile as u32,
                     first_chunk: wave.first_chunk as u32,
                     tiles: wave.tiles as u32,
+                    first_row: wave.first_row as u32,
                     rows: self.rows,
                     nothing: 0,
                 };

@@ -186,6 +186,7 @@ pub(super) struct Part {
     pub(super) first_tile: u32,
     pub(super) first_chunk: u32,
     pub(super) tiles: u32,
+    pub(super) first_row: u32,
     pub(super) rows: u32,
     /// Always zero. The shader compilers cannot assume so, see `arithmetic.wgsl`.
     pub(super) nothing: u32,

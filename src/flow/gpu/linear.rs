@@ -65,12 +65,14 @@ impl LinearFit {
         let alive = Arc::clone(&context.linear_fits);
         let fit = Self::allocated(context, threads, grid, variation_weight, schedule);
         fit.map_err(|error| match error {
-            // Nobody else would release enough.
-            BackendError::Busy if Arc::strong_count(&alive) <= 2 => BackendError::Memory {
-                what: "linear model",
-                needed: grid.bytes() as u64,
-                available: 0,
-            },
+            // No other fit would release enough.
+            BackendError::Busy if Arc::strong_count(&alive) <= 2 && context.is_idle() => {
+                BackendError::Memory {
+                    what: "linear model",
+                    needed: grid.bytes() as u64,
+                    available: 0,
+                }
+            }
             error => error,
         })
     }

@@ -19,7 +19,13 @@ pub(super) const SOURCES: [(&str, &str); 18] = [
     ("forward", source!("common", "forward")),
     (
         "distance_loss",
-        source!("common", "arithmetic", "tree_sum", "distance", "distance_loss"),
+        source!(
+            "common",
+            "arithmetic",
+            "tree_sum",
+            "distance",
+            "distance_loss"
+        ),
     ),
     ("deform", source!("common", "deform")),
     ("nearest", source!("common", "points", "nearest")),
@@ -34,7 +40,13 @@ pub(super) const SOURCES: [(&str, &str); 18] = [
     ),
     (
         "reduce_variation",
-        source!("common", "arithmetic", "tree_sum", "grid", "reduce_variation"),
+        source!(
+            "common",
+            "arithmetic",
+            "tree_sum",
+            "grid",
+            "reduce_variation"
+        ),
     ),
     ("blend", source!("common", "arithmetic", "grid", "blend")),
     (

@@ -17,7 +17,7 @@ use super::phase::Phase;
 use super::program::SubmittedLoss;
 use super::request::{LossKind, Model, Request, write as write_request};
 use super::tiling::{Cut, Plan};
-use crate::flow::data::Random;
+use crate::flow::data::{Random, largest as largest_of};
 use crate::flow::field::{
     BackendError, HIDDEN_LAYERS, LAID_OUT, MIDDLE_LAYERS, WIDTH, last_layer, middle_layer, mlp,
     transpose_middle_layers,
@@ -80,12 +80,8 @@ fn run(context: &Context, units: &Units) -> Result<(), String> {
 /// The relative difference, if it exceeds the tolerance.
 fn compare(what: &str, single: &[f32], half: &[f32]) -> Result<(), String> {
     let largest = single.iter().fold(0.0f32, |most, x| most.max(x.abs()));
-    let differences = single
-        .iter()
-        .zip(half)
-        .map(|(a, b)| (a - b).abs() / largest);
-    // NaN counts as larger than any number.
-    let off = differences.fold(0.0, |most: f32, off| if off <= most { most } else { off });
+    let pairs = single.iter().zip(half);
+    let off = largest_of(pairs.map(|(a, b)| (a - b).abs() / largest));
     if off <= TOLERANCE {
         return Ok(());
     }

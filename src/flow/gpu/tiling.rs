@@ -45,6 +45,8 @@ impl Cut {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Wave {
     pub(super) first_tile: usize,
+    /// Row of the first tile; zero unless the wave is a piece of another.
+    pub(super) first_row: usize,
     pub(super) tiles: usize,
     pub(super) first_chunk: usize,
     pub(super) chunks: usize,

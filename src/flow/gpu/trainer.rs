@@ -17,7 +17,8 @@ use super::{inference, layout};
 use crate::flow::data::{Control, Point, Progress, Random};
 use crate::flow::field::{
     Advance, BackendError, Conditioning, EarlyStopState, FitReport, FittedField, GrowthState,
-    LAID_OUT, LinearField, LinearGrid, Network, Parameters, Schedule, Trainer, TrainerState, check_state, mlp,
+    LAID_OUT, LinearField, LinearGrid, Network, Parameters, Schedule, Trainer, TrainerState,
+    check_state, mlp,
 };
 use crate::flow::options::{FieldOptions, ModelOptions, Precision};
 

@@ -154,8 +154,14 @@ impl FieldOptions {
     /// loss.
     pub(crate) fn lacks_gpu_kernels(&self) -> Option<&'static str> {
         let cpu_alone = [
-            (self.has_cycle(), "the cycle of two networks is computed on the CPU alone"),
-            (self.consistency_weight > 0.0, "the local consistency is computed on the CPU alone"),
+            (
+                self.has_cycle(),
+                "the cycle of two networks is computed on the CPU alone",
+            ),
+            (
+                self.consistency_weight > 0.0,
+                "the local consistency is computed on the CPU alone",
+            ),
             (self.growth.is_some(), "batches grow on the CPU alone"),
             (self.bev, "the bird's eye view is computed on the CPU alone"),
         ];

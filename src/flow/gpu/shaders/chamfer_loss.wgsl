@@ -47,7 +47,7 @@ fn chamfer_loss(
     let step = steps[work.lane * STEPS + part.step];
     let cloud = lanes[work.lane].cloud;
     let truncation = lanes[work.lane].truncation;
-    let row = wave_tile * TILE + local;
+    let row = part.first_row + wave_tile * TILE + local;
     let index = work.tile * TILE + local;
     let takes_part = index < step.count;
     var deformed = vec3(0.0);

@@ -153,6 +153,8 @@ struct Part {
     first_chunk: u32,
     // Number of tiles of the wave.
     tiles: u32,
+    // Row of its first tile, for a kernel that works on pieces of waves.
+    first_row: u32,
     // Number of rows of a layer's activations.
     rows: u32,
     // Always zero, which no compiler can assume; see arithmetic.wgsl.

@@ -3,7 +3,7 @@
 
 var<workgroup> terms: array<f32, TERMS>;
 
-// The sum, in the first invocation.
+// The sum, for all invocations.
 fn tree_sum(local: u32, term: f32) -> f32 {
     terms[local] = term;
     for (var stride = TERMS / 2u; stride > 0u; stride /= 2u) {
@@ -12,5 +12,6 @@ fn tree_sum(local: u32, term: f32) -> f32 {
             terms[local] += terms[local + stride];
         }
     }
+    workgroupBarrier();
     return terms[0];
 }

@@ -3,7 +3,7 @@
 //
 // In: displacements of the vertices. Out: the reciprocal length at each vertex and axis of the flow,
 // zero without a next neighbor along every axis, and each workgroup's sum of lengths. Mirrors
-// Linear::measure_variation.
+// Variation::measure.
 
 var<immediate> part: Part;
 @group(0) @binding(0) var<storage, read> lanes: array<Lane>;

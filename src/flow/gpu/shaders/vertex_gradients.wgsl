@@ -2,7 +2,8 @@
 // in the voxels around a vertex, and that of the total variation. One vertex per invocation.
 //
 // In: the pulls of the batch, the batch's voxels and points in ascending order, displacements and
-// reciprocal lengths. Out: one float per vertex and axis of the flow. Mirrors Linear::level_gradient.
+// reciprocal lengths. Out: one float per vertex and axis of the flow. Mirrors Linear::level_gradient
+// and Variation::add_gradient.
 
 var<immediate> part: Part;
 @group(0) @binding(0) var<storage, read> lanes: array<Lane>;

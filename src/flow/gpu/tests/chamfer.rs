@@ -1,10 +1,14 @@
 //! The search of nearest neighbors and the Chamfer distance on the GPU.
 
-use super::{clouds, shared};
+use std::sync::Arc;
+
+use super::{clouds, opened, shared};
 use crate::flow::cpu::{CpuBackend, Isa};
 use crate::flow::data::{Point, Random, Uncontrolled};
 use crate::flow::field::{Advance, Backend};
+use crate::flow::gpu::backend::Gpu;
 use crate::flow::gpu::chamfer::GpuCloud;
+use crate::flow::gpu::memory::GpuOptions;
 use crate::flow::options::{
     ChamferOptions, EarlyStopOptions, FieldOptions, LossOptions, NearestSearch, Preset,
 };
@@ -96,6 +100,35 @@ fn clouds_larger_than_the_memory_holds_at_once_have_the_loss_of_all() {
         run(&cpu) == found
     });
     assert!(same, "{}", found.0);
+}
+
+#[test]
+fn iterations_in_pieces_have_the_bits_of_whole_ones() {
+    let opened = opened(&GpuOptions::default());
+    let (Some(whole), Some(mut pieces)) = (shared(), opened) else {
+        return;
+    };
+    let device = Arc::get_mut(pieces.device_mut()).expect("one owner");
+    // 900 x 1,500 points, both ways, take 2.7 million.
+    device.context.most_distances = 300_000;
+    let (source, target) = (scattered(900, 7), scattered(1500, 8));
+    for preset in [Preset::NsfpBaseline, Preset::NsfpLinear] {
+        let [expected, found] = [whole, &pieces].map(|gpu| {
+            let options = preset.field();
+            let prepared = gpu.prepare_target(&source, &target, &options.loss, &Uncontrolled);
+            let prepared = prepared.expect("small clouds fit");
+            let mut trainer = prepared.start(&source, &options, 0).expect("a trainer");
+            trainer.advance(4, &Uncontrolled).expect("iterations");
+            let losses = trainer.report().best_loss;
+            (losses, trainer.evaluate(&source).expect("a flow"))
+        });
+        assert!(expected == found, "{preset:?}: {} {}", expected.0, found.0);
+    }
+    let cloud = |gpu: &Gpu| {
+        let cloud = GpuCloud::new(gpu.device(), 900, &target, &OPTIONS, &Uncontrolled);
+        cloud.expect("it fits").nearest(&source).expect("an answer")
+    };
+    assert_eq!(cloud(&pieces), cloud(whole));
 }
 
 #[test]

@@ -85,7 +85,7 @@ fn host_and_shaders_agree_on_every_record() {
     same_layout!("blend", Grid: vertices, row, plane, channel, variation);
     same_layout!("blend", Placed: cell, weights);
     same_layout!("contract", Axis: stride, extent, count, pitch, begin);
-    same_layout!("forward", Part: step, first_tile, first_chunk, tiles, rows, nothing);
+    same_layout!("forward", Part: step, first_tile, first_chunk, tiles, first_row, rows, nothing);
 }
 
 #[test]

@@ -1,0 +1,85 @@
+//! The order of sweeps by the numbers in their file names.
+
+use core::cmp::Ordering;
+
+/// The text of a file name between its runs of digits, and the runs without leading zeros.
+fn parts(name: &str) -> (Vec<&str>, Vec<&str>) {
+    let file = name.rsplit(['/', '\\']).next().unwrap_or(name);
+    let is_digit = |letter: char| letter.is_ascii_digit();
+    let texts = file.split(is_digit).filter(|text| !text.is_empty());
+    let runs = file.split(|letter| !is_digit(letter));
+    let numbers = runs.filter(|digits| !digits.is_empty());
+    let plain = numbers.map(|digits| digits.trim_start_matches('0'));
+    (texts.collect(), plain.collect())
+}
+
+/// Compares two numbers without leading zeros.
+fn compared(a: &str, b: &str) -> Ordering {
+    a.len().cmp(&b.len()).then_with(|| a.cmp(b))
+}
+
+/// The index of the first sweep after which the numbers of the file names go the other way. None if
+/// they rise or fall throughout, or if the names differ in more than their numbers.
+///
+/// ```
+/// use fnsf::formats::turning_sweep;
+/// assert_eq!(turning_sweep(&["1.pcd", "10.pcd", "2.pcd"]), Some(1));
+/// assert_eq!(turning_sweep(&["1.pcd", "2.pcd", "10.pcd"]), None);
+/// ```
+pub fn turning_sweep(names: &[&str]) -> Option<usize> {
+    let parts: Vec<_> = names.iter().map(|name| parts(name)).collect();
+    let (first, rest) = parts.split_first()?;
+    let comparable =
+        |other: &(Vec<&str>, Vec<&str>)| other.0 == first.0 && other.1.len() == first.1.len();
+    if !rest.iter().all(comparable) {
+        return None;
+    }
+    let mut direction = Ordering::Equal;
+    for (index, pair) in parts.windows(2).enumerate() {
+        let numbers = pair[0].1.iter().zip(&pair[1].1);
+        let step = numbers.map(|(a, b)| compared(a, b));
+        let step = step.fold(Ordering::Equal, Ordering::then);
+        if step == direction.reverse() && step != Ordering::Equal {
+            return Some(index);
+        }
+        if direction == Ordering::Equal {
+            direction = step;
+        }
+    }
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::turning_sweep;
+
+    #[test]
+    fn numbers_that_turn_back_are_found_and_others_are_left_alone() {
+        for (names, turn) in [
+            (&["1.pcd", "10.pcd", "11.pcd", "2.pcd"][..], Some(2)),
+            (&["a/3.pcd", "a/2.pcd", "a/1.pcd"], None),
+            (&["3.pcd", "2.pcd", "5.pcd"], Some(1)),
+            (&["s_08.bin", "s_09.bin", "s_10.bin"], None),
+            (&["drive2_1.ply", "drive2_2.ply", "drive1_3.ply"], Some(1)),
+            (&["1.pcd", "1.pcd", "2.pcd"], None),
+            (&["source.ply", "target.ply"], None),
+            (&["before.ply", "after.ply", "b4.ply"], None),
+            (
+                &["9.bin", "1532402927647951.bin", "1532402927697731.bin"],
+                None,
+            ),
+            (
+                &[
+                    "9.pcd",
+                    "99999999999999999999998.pcd",
+                    "100000000000000000000000.pcd",
+                ],
+                None,
+            ),
+            (&["only.ply"], None),
+            (&[], None),
+        ] {
+            assert_eq!(turning_sweep(names), turn, "{names:?}");
+        }
+    }
+}
