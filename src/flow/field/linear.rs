@@ -20,6 +20,9 @@ pub(crate) const ROW: usize = 16;
 /// Arrays of the grid's size that a fit holds: weights, their gradients and moments, the result, the
 /// displacements with their gradients, and two of the products.
 const ARRAYS: usize = 9;
+/// Values of a Gaussian below this share of its peak count as zero. They are below the rounding of
+/// single precision, and numbers too small for its normal range make a processor many times slower.
+const NEGLIGIBLE: f64 = 1e-9;
 /// Smoothing constant of the total variation, square metres, as in the published code.
 pub(crate) const VARIATION_SMOOTHING: f32 = 1e-5;
 /// Most vertices along an axis.
@@ -204,7 +207,8 @@ impl LinearGrid {
         let voxels = f64::from(self.sigma_m) / f64::from(self.voxel_m);
         let gaussian = |i: usize, j: usize| {
             let off = i.abs_diff(j) as f64 / voxels;
-            (-0.5 * off * off).exp()
+            let value = (-0.5 * off * off).exp();
+            if value < NEGLIGIBLE { 0.0 } else { value }
         };
         let length = |i: usize| {
             (0..count)
