@@ -17,8 +17,8 @@ use crate::flow::data::{Control, Point, Random, Uncontrolled};
 use crate::flow::distance::DistanceTransform;
 use crate::flow::field::{
     Backend, BackendError, ChamferLoss, Conditioning, ConsistencyLoss, CycleLoss, DistanceLoss,
-    LinearGrid, Loss, NearestSearcher, Network, Parameters, PreparedTarget, Schedule, Trainer,
-    check_chamfer, length, mlp,
+    LinearGrid, Loss, NearestSearcher, Network, OTHER_LOSS, Parameters, PreparedTarget, Schedule,
+    Trainer, check_chamfer, length, mlp,
 };
 use crate::flow::host::Host;
 use crate::flow::options::{
@@ -198,10 +198,6 @@ impl Fits {
         }
     }
 }
-
-/// The error of a fit to another kind of loss than the one that the target was prepared for.
-const OTHER_LOSS: BackendError =
-    BackendError::Unsupported("the target was prepared for another kind of loss");
 
 /// A target's distance transform.
 struct TransformTarget {

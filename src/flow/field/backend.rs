@@ -246,6 +246,10 @@ impl From<DistanceError> for BackendError {
     }
 }
 
+/// The error of a fit to another kind of loss than the one that the target was prepared for.
+pub(crate) const OTHER_LOSS: BackendError =
+    BackendError::Unsupported("the target was prepared for another kind of loss");
+
 /// Checks that `state` is that of a model with so many parameters.
 ///
 /// # Errors

@@ -25,8 +25,8 @@ mod schedule;
 mod snapshot;
 mod warm_start;
 
-pub(crate) use backend::check_state;
 pub use backend::{Advance, Backend, BackendError, FitReport, PreparedTarget, Trainer};
+pub(crate) use backend::{OTHER_LOSS, check_state};
 pub use fitted::FittedField;
 pub use linear::{LinearError, LinearField};
 pub use mlp::{HIDDEN_LAYERS, MIDDLE_LAYERS, PARAMETERS, WIDTH};

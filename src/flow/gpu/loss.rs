@@ -9,12 +9,8 @@ use super::distance::GpuTransform;
 use super::layout;
 use super::request::LossKind;
 use crate::flow::data::Point;
-use crate::flow::field::BackendError;
+use crate::flow::field::{BackendError, OTHER_LOSS};
 use crate::flow::options::{ChamferOptions, DistanceLossOptions, LossOptions};
-
-/// The error of a fit to another kind of loss than the one that the target was prepared for.
-const OTHER_LOSS: BackendError =
-    BackendError::Unsupported("the target was prepared for another kind of loss");
 
 /// A prepared target on the GPU.
 #[derive(Clone, Copy)]

@@ -29,6 +29,7 @@ const SUBMISSION_SECONDS: f64 = 0.03;
 const BLIND_STEPS: usize = 4;
 /// Maximum number of iterations per submission if a stopping rule may end the fit at any iteration.
 const STOPPABLE_STEPS: usize = 16;
+
 /// The model of a fit.
 enum GpuModel {
     Network(NetworkFit),
