@@ -98,7 +98,8 @@ async fn a_server_on_a_card_gives_it_the_jobs_that_ask_for_one() {
         ("neural", "gpu"),
         ("neural", "cpu"),
         ("default", "gpu"),
-        ("fnsf-linear", "auto"),
+        ("nsfp-kdtree-linear", "auto"),
+        ("fnsf-linear", "gpu"),
     ] {
         let options =
             format!(r#"{{"preset": "{preset}", "device": "{device}", "max_points": 2048}}"#);
@@ -114,6 +115,7 @@ async fn a_server_on_a_card_gives_it_the_jobs_that_ask_for_one() {
     }
     assert_ne!(devices[0], devices[1]);
     assert_eq!(devices[1], devices[3]);
+    assert_eq!(devices[0], devices[4]);
     // Objects are searched on the host, and the report names it.
     assert!(devices[2].starts_with("cpu ("), "{devices:?}");
 }
