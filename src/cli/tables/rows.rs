@@ -163,7 +163,7 @@ pub(super) const ALL: [Row; 13] = [
 ];
 
 impl Row {
-    /// The options of the row, for clouds of up to `points` points, of which some may be left out.
+    /// The options of the row. `points` is the number of points of the larger cloud, or of its sample.
     pub(super) fn options(&self, points: usize) -> JobOptions {
         JobOptions {
             preset: self.preset,
