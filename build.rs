@@ -26,11 +26,13 @@ fn main() -> Result<(), Box<dyn Error>> {
     tonic_prost_build::configure()
         .bytes(".")
         .boxed(".fnsf.v1.Options.field")
+        .boxed(".fnsf.v1.EstimateSequenceResponse.Pair.outcome.header")
         .build_client(false)
         .compile_fds(descriptors.clone())?;
     tonic_prost_build::configure()
         .bytes(".")
         .boxed(".fnsf.v1.Options.field")
+        .boxed(".fnsf.v1.EstimateSequenceResponse.Pair.outcome.header")
         .build_server(false)
         .build_transport(false)
         .out_dir(client)

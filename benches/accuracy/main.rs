@@ -22,13 +22,14 @@ mod ground;
 mod labelled;
 mod neighbors;
 mod objects;
+mod overlap;
 mod registration;
 mod sequences;
 
 use std::process::ExitCode;
 
 const EXPERIMENTS: &str =
-    "confidence densify depth field ground neighbors objects registration sequences";
+    "confidence densify depth field ground neighbors objects overlap registration sequences";
 
 fn main() -> ExitCode {
     // Cargo adds `--bench`.
@@ -57,6 +58,7 @@ fn run(experiment: &str, arguments: Vec<String>) -> anyhow::Result<()> {
         "ground" => ground::run(),
         "neighbors" => neighbors::run(arguments).map_err(anyhow::Error::msg),
         "objects" => objects::run(arguments).map_err(anyhow::Error::msg),
+        "overlap" => overlap::run(),
         "registration" => registration::run(),
         "sequences" => sequences::run(arguments),
         other => anyhow::bail!("there is no such experiment; there are {EXPERIMENTS} ({other})"),

@@ -278,6 +278,8 @@ def arguments_of(argv):
         command.add_argument("--seed", type=int)
         command.add_argument("--max-points", type=int)
         command.add_argument("--crop-m", type=float)
+        command.add_argument("--min-range-m", type=float)
+        command.add_argument("--force", action="store_true", default=None)
         command.add_argument("--ground", choices=["keep", "mask", "auto"])
         command.add_argument("--ego", choices=["off", "auto"])
         command.add_argument("--priority", choices=["low", "normal", "high"])
@@ -286,7 +288,7 @@ def arguments_of(argv):
 
 def main(argv=None):
     arguments = arguments_of(argv)
-    names = ("preset", "seed", "max_points", "crop_m", "ground", "ego", "priority")
+    names = ("preset", "seed", "max_points", "crop_m", "min_range_m", "force", "ground", "ego", "priority")
     try:
         client = Client(arguments.server, arguments.api_key, arguments.tls, arguments.proto)
         options = client.options(**{name: getattr(arguments, name) for name in names})

@@ -55,6 +55,14 @@ pub(super) struct Estimation {
     /// take no part. No crop by default
     #[arg(long, value_name = "R", value_parser = positive)]
     crop_m: Option<f32>,
+    /// Leave out points nearer to the sensor than this, horizontally, in metres: the returns of the
+    /// vehicle itself. None by default
+    #[arg(long, value_name = "R", value_parser = positive)]
+    min_range_m: Option<f32>,
+    /// Estimate pairs that are otherwise refused: sweeps that do not show one scene, and coordinates
+    /// that are not metres. Without overlap the confidence is 0
+    #[arg(long)]
+    force: bool,
     /// Seconds from one sweep to the next, above 0 and at most 60; the velocities of objects are
     /// displacements over this time. By default the difference of the file names where they are
     /// timestamps, else 0.1
@@ -114,6 +122,8 @@ impl Estimation {
             seed: self.seed,
             max_points: self.max_points,
             crop_m: self.crop_m,
+            min_range_m: self.min_range_m,
+            force: self.force,
             dt_s: self.dt,
             ground: self.ground.or(raster.map(|_| GroundChoice::Auto)),
             ego,

@@ -134,6 +134,15 @@ pub(super) fn print_report(report: &Report) -> Result<(), Failure> {
             "  ego motion {x:.3}, {y:.3}, {z:.3} m (target from source)"
         ))?;
     }
+    for warning in &report.warnings {
+        eprintln!("fnsf: warning: {warning}");
+    }
+    if let Some(overlap) = report.overlap {
+        say(format_args!(
+            "  overlap {:.0}% of the source",
+            100.0 * overlap
+        ))?;
+    }
     Ok(())
 }
 

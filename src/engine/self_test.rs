@@ -95,6 +95,9 @@ fn compared(backend: &dyn Backend) -> Result<(), SelfTestError> {
     if !(error.is_finite() && error < TOLERANCE) {
         return Err(SelfTestError::Off(error));
     }
+    if backend.is_cpu() {
+        return Ok(());
+    }
     [Preset::NsfpBaseline, Preset::NsfpLinear]
         .into_iter()
         .try_for_each(|preset| compared_with_the_cpu(backend, preset, [&source, &target]))

@@ -106,8 +106,8 @@ pub fn neighbor_cost(points: usize) -> NeighborCost {
 /// distance transform. Computes no distances.
 ///
 /// # Errors
-/// [`FlowError::TooFewPoints`], [`FlowError::NoGroundMask`] or [`FlowError::GroundMaskLength`] for
-/// the pair, and [`FlowError::Backend`] if the distance transform is rejected: as
+/// [`FlowError::NotMetres`], [`FlowError::TooFewPoints`], [`FlowError::NoGroundMask`] or
+/// [`FlowError::GroundMaskLength`] for the pair, and [`FlowError::Backend`] if the distance transform is rejected: as
 /// [`super::estimate()`]. The ground masks of neighbor sweeps and the limits of a device are not
 /// checked.
 pub fn predict_cost(problem: &Problem, options: &Options) -> Result<Cost, FlowError> {

@@ -3,6 +3,7 @@
 use super::data::MIN_POINTS;
 use super::distance::DistanceError;
 use super::field::{BackendError, FitError, LinearError, SnapshotError};
+use super::options::LEAST_OVERLAP;
 
 /// The reason why an estimate was rejected or failed.
 #[derive(Debug, thiserror::Error)]
@@ -29,6 +30,30 @@ pub enum FlowError {
         flags: usize,
         /// Number of points in the cloud.
         points: usize,
+    },
+    /// After the alignment the two sweeps show too little of one scene, see
+    /// [`super::LEAST_OVERLAP`].
+    #[error(
+        "the sweeps do not show one scene: {:.0}% of what one shows is in the other after the best alignment, \
+         {:.0}% are needed: are they consecutive sweeps of one sensor, and is a given ego motion \
+         target_from_source? The option force estimates them all the same",
+        100.0 * overlap,
+        100.0 * LEAST_OVERLAP
+    )]
+    NoOverlap {
+        /// The overlap, 0 to 1.
+        overlap: f32,
+    },
+    /// The points of a sweep lie too far apart for metres, see [`super::MAX_SPREAD_M`].
+    #[error(
+        "half of the {cloud} cloud's points lie more than {spread_m:.0} m from their middle: coordinates are \
+         metres, are these millimetres? The option force estimates them all the same"
+    )]
+    NotMetres {
+        /// `source` or `target`.
+        cloud: &'static str,
+        /// Median distance of the points from their middle, metres.
+        spread_m: f32,
     },
     /// The control cancelled the estimate.
     #[error("the estimate was cancelled")]
@@ -62,12 +87,14 @@ impl From<FitError> for FlowError {
 impl FlowError {
     /// Whether the input or its options caused the error, rather than the machine.
     ///
-    /// True for too few points, a missing ground mask or one of the wrong length, an empty target,
+    /// True for sweeps of two scenes, coordinates that are not metres, too few points, a missing
+    /// ground mask or one of the wrong length, an empty target,
     /// clouds that span too much space, a pair that exceeds the allowed memory or the memory of the
     /// device, and an option that the device does not support. False for all other errors,
     /// including an invalid cell or band of the distance transform.
     pub fn is_input(&self) -> bool {
         match self {
+            Self::NoOverlap { .. } | Self::NotMetres { .. } => true,
             Self::TooFewPoints { .. } | Self::NoGroundMask | Self::GroundMaskLength { .. } => true,
             Self::Backend(BackendError::Distance(error)) => !matches!(
                 error,

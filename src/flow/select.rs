@@ -4,10 +4,10 @@
 
 use std::borrow::Cow;
 
-use super::data::{MIN_POINTS, Point, Random};
+use super::data::{MIN_POINTS, Point, Random, square_distance, stride_sample};
 use super::error::FlowError;
 use super::ground;
-use super::options::{Ego, Ground, Method, Options};
+use super::options::{Ego, Ground, MAX_SPREAD_M, Method, Options};
 use super::problem::{NeighborSweep, Problem};
 
 /// The selected points of a pair.
@@ -26,6 +26,9 @@ pub(crate) struct Selection {
     /// that are finite and within the crop. Ground is included, because it determines pitch, roll
     /// and height.
     pub(crate) registration_clouds: Option<[Vec<Point>; 2]>,
+    /// All points of the two clouds that `source` and `target` were sampled from; none where they
+    /// were not sampled.
+    pub(crate) undrawn: Option<[Vec<Point>; 2]>,
 }
 
 /// Ground segmentation of several sweeps: one mask per sweep. All points are finite and within the
@@ -40,13 +43,15 @@ pub(crate) fn find_ground(sweeps: &[&[Point]]) -> Vec<Vec<bool>> {
 /// Selects the points of `problem` by `options`.
 ///
 /// # Errors
-/// [`FlowError`] where a mask is missing or has another length, or where fewer than [`MIN_POINTS`]
-/// points of a cloud remain.
+/// [`FlowError`] where coordinates are not metres, a mask is missing or has another length, or fewer
+/// than [`MIN_POINTS`] points of a cloud remain.
 pub(crate) fn select(
     problem: &Problem,
     options: &Options,
     find: FindGround<'_>,
 ) -> Result<Selection, FlowError> {
+    check_metres("source", problem.source, options)?;
+    check_metres("target", problem.target, options)?;
     let given = problem.ground.map_or([None; 2], |masks| masks.map(Some));
     let sweeps = [(problem.source, given[0]), (problem.target, given[1])];
     let mut masks = ground_masks(sweeps, options, find)?;
@@ -65,6 +70,7 @@ pub(crate) fn select(
         _ => Vec::new(),
     };
     let mut output_rows: Vec<usize> = (0..rows.len()).collect();
+    let mut undrawn = None;
     if let Some(max_points) = options.max_points {
         // One permutation for both clouds, as in the published code. Each cloud draws from all of
         // its rows, because rows are in scan order.
@@ -78,6 +84,10 @@ pub(crate) fn select(
             // A sparse sample has no clusters, so the object search uses all points.
             Method::Objects(_) => output_rows = drawn(rows.len()),
             Method::Field(_) => {
+                undrawn = Some([
+                    points_at(&rows, problem.source),
+                    points_at(&target_rows, problem.target),
+                ]);
                 for rows in [&mut rows, &mut target_rows] {
                     *rows = drawn(rows.len()).iter().map(|&index| rows[index]).collect();
                 }
@@ -94,20 +104,65 @@ pub(crate) fn select(
         }
     }
     Ok(Selection {
-        source: rows.iter().map(|&row| problem.source[row]).collect(),
-        target: target_rows.iter().map(|&row| problem.target[row]).collect(),
+        source: points_at(&rows, problem.source),
+        target: points_at(&target_rows, problem.target),
         registration_clouds: (options.ego == Ego::Auto)
             .then(|| [problem.source, problem.target].map(|points| cropped(points, options))),
+        undrawn,
         rows,
         output_rows,
         ego_only_rows,
     })
 }
 
+fn points_at(rows: &[usize], points: &[Point]) -> Vec<Point> {
+    rows.iter().map(|&row| points[row]).collect()
+}
+
+/// Refuses points that lie too far apart for metres.
+///
+/// # Errors
+/// [`FlowError::NotMetres`].
+fn check_metres(cloud: &'static str, points: &[Point], options: &Options) -> Result<(), FlowError> {
+    /// Points that are looked at.
+    const SAMPLED: usize = 1024;
+    if options.force {
+        return Ok(());
+    }
+    let sampled = stride_sample(points, SAMPLED);
+    let finite = |point: &&Point| point.iter().all(|c| c.is_finite());
+    let axis = |a: usize| {
+        median(
+            sampled
+                .iter()
+                .filter(finite)
+                .map(|point| point[a])
+                .collect(),
+        )
+    };
+    let middle: Point = core::array::from_fn(axis);
+    let from_middle = sampled.iter().filter(finite);
+    let from_middle = from_middle.map(|&point| square_distance(point, middle).sqrt());
+    let spread_m = median(from_middle.collect());
+    if spread_m > MAX_SPREAD_M {
+        return Err(FlowError::NotMetres { cloud, spread_m });
+    }
+    Ok(())
+}
+
+/// The median; zero of no values.
+fn median(mut values: Vec<f32>) -> f32 {
+    let middle = values.len() / 2;
+    if values.is_empty() {
+        return 0.0;
+    }
+    *values.select_nth_unstable_by(middle, f32::total_cmp).1
+}
+
 /// The selected points of a neighbor sweep.
 ///
 /// # Errors
-/// As [`select`], except for the number of points.
+/// As [`select`], except for the number of points and the unit of the coordinates.
 pub(crate) fn select_neighbor(
     sweep: &NeighborSweep,
     options: &Options,
@@ -164,11 +219,12 @@ pub(crate) fn cropped(points: &[Point], options: &Options) -> Vec<Point> {
     kept.copied().collect()
 }
 
-/// Whether a point is finite and within the crop.
+/// Whether a point is finite, within the crop and not too near.
 pub(crate) fn is_in_crop([x, y, z]: Point, options: &Options) -> bool {
     let crop = options.crop_m.unwrap_or(f32::INFINITY);
     let finite = x.is_finite() && y.is_finite() && z.is_finite();
-    finite && x.abs() <= crop && y.abs() <= crop
+    let is_far = options.min_range_m.is_none_or(|least| x.hypot(y) >= least);
+    finite && x.abs() <= crop && y.abs() <= crop && is_far
 }
 
 fn rows_of_pair(

@@ -55,6 +55,9 @@ pub enum InvalidOptions {
     /// The crop is not a positive, finite number of metres.
     #[error("options: crop_m is {0}, a positive number of metres is needed")]
     Crop(f32),
+    /// The least range is not a positive, finite number of metres.
+    #[error("options: min_range_m is {0}, a positive number of metres is needed")]
+    MinRange(f32),
     /// The time between two sweeps, seconds, is not a number above 0 and at most 60.
     #[error("options: dt_s is {0}, more than 0 and at most {MAX_DT_S} seconds are possible")]
     Dt(f32),

@@ -39,6 +39,10 @@ pub struct JobOptions {
     /// if not given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub crop_m: Option<f32>,
+    /// Points nearer to the sensor than this, horizontally, metres, are ignored and get no flow. More
+    /// than 0. It leaves out the vehicle's own returns. None are left out if not given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub min_range_m: Option<f32>,
     /// Time between consecutive sweeps, seconds, for velocities: more than 0, at most 60. If not
     /// given, it is taken from the timestamps in the file names, or is 0.1 without them.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -67,6 +71,10 @@ pub struct JobOptions {
     /// Options of the fit, for the presets that fit a field.
     #[serde(skip_serializing_if = "is_default")]
     pub field: FieldChoices,
+    /// Also estimates pairs that are otherwise refused as nonsense: sweeps that do not show one scene,
+    /// and coordinates that are not metres. Without overlap the confidence is 0.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub force: bool,
     /// Deadline, milliseconds after the arrival of the request, from 1 to 86,400,000 (one day). The
     /// best flow so far is then returned. A job that has not started by then expires. No deadline
     /// if not given.
@@ -112,7 +120,7 @@ impl JobOptions {
     ///
     /// # Errors
     /// The [`InvalidOptions`] of the first option that is refused:
-    /// - `MaxPoints`, `Crop`, `Dt`, `Deadline` for a value out of range.
+    /// - `MaxPoints`, `Crop`, `MinRange`, `Dt`, `Deadline` for a value out of range.
     /// - `NoUse`, `FieldRange`, `Field` for an option of the fit that the preset has no use for, or
     ///   that is out of range.
     /// - `NoGpuKernels` for device `gpu` with a field that has no kernels for it.
@@ -130,6 +138,11 @@ impl JobOptions {
             && !(crop.is_finite() && crop > 0.0)
         {
             return Err(InvalidOptions::Crop(crop));
+        }
+        if let Some(least) = self.min_range_m
+            && !(least.is_finite() && least > 0.0)
+        {
+            return Err(InvalidOptions::MinRange(least));
         }
         if let Some(dt) = self.dt_s
             && !(dt > 0.0 && dt <= MAX_DT_S)
@@ -188,6 +201,8 @@ impl JobOptions {
             .options(drawn.filter(|&drawn| drawn < points));
         options.seed = self.seed;
         options.crop_m = self.crop_m;
+        options.min_range_m = self.min_range_m;
+        options.force = self.force;
         match self.ground {
             None => {}
             Some(GroundChoice::Keep) => options.ground = Ground::Keep,
@@ -224,7 +239,7 @@ mod tests {
     #[test]
     fn an_empty_object_is_the_default_and_every_option_comes_back() {
         assert_eq!(JobOptions::from_json(b"{}"), Ok(JobOptions::default()));
-        let text = br#"{"preset":"paper","seed":7,"max_points":8192,"crop_m":51.2,"dt_s":0.05,"ground":"mask",
+        let text = br#"{"preset":"paper","seed":7,"max_points":8192,"crop_m":51.2,"min_range_m":2.5,"force":true,"dt_s":0.05,"ground":"mask",
             "ego":[[1,0,0,2],[0,1,0,0],[0,0,1,0],[0,0,0,1]],"device":"cpu","deadline_ms":300,"priority":"high","densify":{"reference_time":1.5}}"#;
         let options = JobOptions::from_json(text).expect("good options");
         assert_eq!(options.preset, PresetChoice::Paper);
@@ -302,6 +317,7 @@ mod tests {
             ),
             (r#"{"max_points":2}"#, "max_points is 2"),
             (r#"{"crop_m":-1}"#, "crop_m is -1"),
+            (r#"{"min_range_m":0}"#, "min_range_m is 0"),
             (r#"{"dt_s":0}"#, "dt_s is 0"),
             (r#"{"deadline_ms":0}"#, "deadline_ms is 0"),
             (r#"{"ego":"yes"}"#, "ego is \"off\", \"auto\""),

@@ -5,7 +5,7 @@ use utoipa::ToSchema;
 
 use super::options::JobOptions;
 use super::record::JobProgress;
-use crate::flow::{DEFAULT_DT_S, Estimate, Solution};
+use crate::flow::{CERTAIN_OVERLAP, DEFAULT_DT_S, Estimate, Solution};
 use crate::formats::matrix_rows;
 
 /// The report of the estimate of one pair.
@@ -33,6 +33,16 @@ pub struct Report {
     /// The ego motion target_from_source as a 4 x 4 matrix, row by row, translation in metres. None
     /// if it was not separated, or a deadline left no time to estimate it.
     pub ego_motion: Option<[[f64; 4]; 4]>,
+    /// Share, 0 to 1, of the volume off the ground of the source that the target shows as well, after
+    /// the ego motion. A pair of one scene has 0.64 or more. Below 0.6 the confidences are lowered,
+    /// and below 0.35 the pair is refused. None for small clouds, and if a deadline left no time for
+    /// it.
+    #[serde(default)]
+    pub overlap: Option<f64>,
+    /// What is suspicious about the input, in words: both sweeps are the same points, or they share
+    /// little of what they show.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub warnings: Vec<String>,
     /// The object search, with `default` and `label`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub objects: Option<ObjectsReport>,
@@ -148,6 +158,8 @@ impl Report {
             stop_reason: estimate.stop_reason.name().to_owned(),
             device: estimate.device.clone(),
             ego_motion: estimate.ego.as_ref().map(matrix_rows),
+            overlap: estimate.overlap.map(decimal),
+            warnings: warnings(estimate),
             objects,
             field,
             seconds,
@@ -197,6 +209,25 @@ fn decimal(seconds: f32) -> f64 {
     shortest.unwrap_or_else(|_| seconds.into())
 }
 
+/// The warnings of a report.
+fn warnings(estimate: &Estimate) -> Vec<String> {
+    let same = estimate
+        .same_sweep
+        .then(|| "both sweeps are the same points".to_owned());
+    let little = estimate.overlap.filter(|&share| share < CERTAIN_OVERLAP);
+    let little = little.map(|share| {
+        let alignment = match estimate.ego {
+            Some(_) => "so the ego motion is doubtful",
+            None => "and no ego motion was separated that could align them",
+        };
+        format!(
+            "the sweeps share {:.0}% of what they show, {alignment}",
+            100.0 * share
+        )
+    });
+    same.into_iter().chain(little).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -208,6 +239,8 @@ mod tests {
             flow: Vec::new(),
             valid: Vec::new(),
             dynamic: None,
+            overlap: Some(0.5),
+            same_sweep: true,
             ego: None,
             points: 3,
             solution: Solution::Field(FieldSolution {

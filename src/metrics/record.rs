@@ -101,6 +101,11 @@ impl Metrics {
         self.prediction_ratio.observe(measured_over_predicted);
     }
 
+    /// Enters the overlap of one pair, 0 to 1, in `fnsf_overlap_ratio`.
+    pub fn aligned(&self, overlap: f32) {
+        self.overlap_ratio.observe(overlap.into());
+    }
+
     /// Counts a refused request in `fnsf_requests_rejected_total`; `reason` is one of
     /// [`super::REJECTIONS`].
     pub fn rejected(&self, reason: &'static str) {

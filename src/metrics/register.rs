@@ -92,6 +92,11 @@ impl Metrics {
             "Measured over predicted compute time",
             self.prediction_ratio.clone(),
         );
+        registry.register(
+            "overlap_ratio",
+            "Share of a sweep that the other sweep of the pair shows",
+            self.overlap_ratio.clone(),
+        );
     }
 
     /// The queue as it is.

@@ -33,6 +33,8 @@ const CLUSTERS: [f64; 10] = [
 ];
 /// Upper bounds of measured over predicted seconds.
 const RATIOS: [f64; 10] = [0.1, 0.25, 0.5, 0.7, 0.9, 1.1, 1.4, 2.0, 4.0, 10.0];
+/// Upper bounds of the overlap; pairs below 0.35 are refused.
+const OVERLAPS: [f64; 8] = [0.1, 0.2, 0.35, 0.5, 0.6, 0.7, 0.8, 0.9];
 
 /// Points an exemplar to a job.
 #[derive(Clone, Debug, Hash, PartialEq, Eq, EncodeLabelSet)]
@@ -101,6 +103,7 @@ pub struct Metrics {
     pub(super) snapshots: Counter,
     pub(super) resumed: Counter,
     pub(super) prediction_ratio: Histogram,
+    pub(super) overlap_ratio: Histogram,
 }
 
 fn seconds() -> Seconds {
@@ -141,6 +144,7 @@ impl Metrics {
             snapshots: Counter::default(),
             resumed: Counter::default(),
             prediction_ratio: Histogram::new(RATIOS),
+            overlap_ratio: Histogram::new(OVERLAPS),
         };
         metrics.fill(devices);
         let mut registry = Registry::with_prefix("fnsf");

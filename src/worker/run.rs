@@ -281,6 +281,10 @@ impl Worker {
                     None => Attempt::failed("input_refused", error, false),
                 }
             }
+            EngineError::Flow(FlowError::NoOverlap { overlap }) => {
+                self.metrics.aligned(*overlap);
+                Attempt::failed("no_overlap", error, false)
+            }
             EngineError::Flow(flow) if flow.is_input() => {
                 Attempt::failed("input_refused", error, false)
             }
@@ -332,6 +336,9 @@ impl Worker {
             }
         }
         phase("total", estimate.total_seconds);
+        if let Some(overlap) = estimate.overlap {
+            self.metrics.aligned(overlap);
+        }
         let resumed = job.attempt > 1;
         let cut = estimate.stop_reason == crate::flow::StopReason::Deadline;
         let predicted = self.cost.seconds_on(self.lane.kind(), job.cost_seconds);

@@ -10,9 +10,6 @@ use super::program::fnsf;
 /// Maximum memory for a file that is refused, bytes.
 const MEMORY: u64 = 100 << 20;
 
-/// Three points too far apart for a distance transform.
-const FAR: &str = "three far points.npy";
-
 /// An array in numpy's format, from its header and data.
 fn npy(descr: &str, shape: &str, data: &[u8]) -> Vec<u8> {
     let header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}\n");
@@ -71,7 +68,10 @@ fn corpus() -> Vec<(&'static str, Vec<u8>)> {
         ("no points.npy", points(&[])),
         ("one point.npy", points(&[[1.0, 2.0, 3.0]])),
         ("two far points.npy", points(&[[0.0; 3], [1e6, 0.0, 0.0]])),
-        (FAR, points(&[[0.0; 3], [1e6, 0.0, 0.0], [-1e6, 5.0, 5.0]])),
+        (
+            "three far points.npy",
+            points(&[[0.0; 3], [1e6, 0.0, 0.0], [-1e6, 5.0, 5.0]]),
+        ),
         ("huge count.ply", ply("4000000000", "0 0 0\n")),
         ("negative count.ply", ply("-5", "0 0 0\n")),
         ("short.ply", ply("3", "0 0 0\n1 1 1\n")),
@@ -131,13 +131,6 @@ fn every_hostile_file_gets_one_line_exit_code_65_and_little_memory() {
         if let Some(peak) = peak_memory(folder, &arguments) {
             assert!(peak < MEMORY, "{name}: {peak} bytes");
         }
-        if (*name, preset) == (FAR, "default") {
-            // The object search needs no distance transform, and its memory does not depend on the
-            // extent.
-            assert_eq!(ended.code, 0, "{name}: {}", ended.stderr);
-            std::fs::remove_file(folder.join("out.npz")).expect("it was written");
-            continue;
-        }
         assert_eq!(ended.code, 65, "{name}: {}", ended.stderr);
         assert_eq!(ended.stderr.lines().count(), 1, "{name}: {}", ended.stderr);
         assert!(
@@ -163,10 +156,21 @@ fn the_far_points_are_refused_for_their_extent() {
     let folder = tempfile::tempdir().expect("a folder");
     let cloud = points(&[[0.0; 3], [5e5, 0.0, 0.0], [-4e5, 5.0, 5.0], [0.0, 0.0, 5.0]]);
     std::fs::write(folder.path().join("far.npy"), cloud).expect("written");
+    let forced = |preset| {
+        let mut arguments = flow("far.npy", preset).to_vec();
+        arguments.push("--force");
+        fnsf(folder.path(), &arguments)
+    };
     let ended = fnsf(folder.path(), &flow("far.npy", "neural"));
+    assert_eq!(ended.code, 65);
+    assert!(ended.stderr.contains("millimetres"), "{}", ended.stderr);
+    let ended = forced("neural");
     assert_eq!(ended.code, 65);
     assert!(ended.stderr.contains("900000"), "{}", ended.stderr);
     assert!(ended.stderr.contains("crop_m"), "{}", ended.stderr);
+    // The object search needs no distance transform, and its memory does not depend on the extent.
+    let ended = forced("default");
+    assert_eq!(ended.code, 0, "{}", ended.stderr);
 }
 
 #[test]

@@ -13,6 +13,7 @@ mod gpu;
 mod gpu_rule;
 mod ground;
 mod labels;
+mod overlap;
 // cfg(test) is always set in this crate. It makes clippy treat the module as a test.
 #[cfg(test)]
 #[path = "../common/real_data.rs"]

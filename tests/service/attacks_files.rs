@@ -306,7 +306,7 @@ async fn clouds_at_the_edge_of_sense_get_the_same_verdict_on_both_doors() {
         ),
         ("the same cloud twice", cloud.clone(), cloud.clone(), solved),
         (
-            "a box of a million metres",
+            "a box of two thousand kilometres",
             row(-FAR).into_iter().chain(row(FAR)).collect(),
             row(FAR).into_iter().chain(row(-FAR)).collect(),
             refused,

@@ -192,6 +192,7 @@ async fn numbers_that_are_no_values_and_messages_out_of_order_are_refused() {
         vec![begin(|o| o.ego_motion = vec![1e308; 16])],
         vec![begin(|o| o.ego_motion = vec![0.0; 100_000])],
         vec![begin(|o| o.crop_m = Some(f32::INFINITY))],
+        vec![begin(|o| o.min_range_m = Some(f32::INFINITY))],
         vec![begin(|o| o.max_points = Some(0))],
         vec![begin(|o| o.deadline_ms = Some(u64::MAX))],
         vec![begin(|o| o.device = "../cpu\n".to_owned())],

@@ -113,6 +113,7 @@ async fn options_that_are_deep_huge_doubled_or_wrong_are_refused_by_name() {
         (r#"{"crop_m": 1e39}"#.to_owned(), 400),
         (r#"{"crop_m": -1}"#.to_owned(), 400),
         (r#"{"crop_m": NaN}"#.to_owned(), 400),
+        (r#"{"min_range_m": 0}"#.to_owned(), 400),
         (r#"{"deadline_ms": 18446744073709551615}"#.to_owned(), 400),
         (r#"{"deadline_ms": 0}"#.to_owned(), 400),
         (

@@ -21,6 +21,7 @@ mod gpu_rule;
 mod grpc;
 mod http;
 mod load;
+mod nonsense;
 mod objects;
 mod raw_http;
 mod readme;

@@ -69,6 +69,8 @@ pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, Api
         seed: message.seed,
         max_points: message.max_points,
         crop_m: message.crop_m,
+        min_range_m: message.min_range_m,
+        force: message.force,
         dt_s: message.dt_s,
         ground,
         ego: ego(message.ego, &message.ego_motion)?,
@@ -259,6 +261,8 @@ pub(super) fn header(answer: &Answer) -> proto::FlowHeader {
         }),
         dt_s: report.dt_s as f32,
         dt_assumed: report.dt_assumed,
+        overlap: report.overlap,
+        warnings: report.warnings.clone(),
         method,
     }
 }
@@ -334,6 +338,7 @@ mod tests {
         };
         assert!(refused(nowhere).contains("densify.reference_time is NaN"));
         assert!(refused(|o| o.crop_m = Some(f32::NAN)).contains("crop_m"));
+        assert!(refused(|o| o.min_range_m = Some(f32::NAN)).contains("min_range_m"));
         assert!(refused(|o| o.max_points = Some(1)).contains("max_points is 1"));
         assert_eq!(
             options(Some(proto::Options::default())),

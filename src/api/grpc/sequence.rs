@@ -314,7 +314,7 @@ async fn send(service: &Arc<Service>, pair: Pending, answers: &ResultBudget) -> 
             answers.send(message(Part::Pair(failed))).await.is_ok()
         }
         Ok(answer) => {
-            let head = header(Outcome::Header(convert::header(&answer)));
+            let head = header(Outcome::Header(Box::new(convert::header(&answer))));
             if answers.send(message(Part::Pair(head))).await.is_err() {
                 return false;
             }

@@ -52,6 +52,11 @@ impl Head {
         ];
         own.extend(
             report
+                .overlap
+                .map(|overlap| ("fnsf-overlap", format!("{overlap:.3}"))),
+        );
+        own.extend(
+            report
                 .objects
                 .map(|o| ("fnsf-clusters", o.clusters.to_string())),
         );

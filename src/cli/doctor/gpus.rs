@@ -8,6 +8,7 @@ use crate::cli::device::{best_card, software_is_welcome};
 use crate::cli::failure::Failure;
 use crate::cli::output::say;
 use crate::engine::self_test_backend;
+use crate::flow::Preset;
 use crate::flow::gpu;
 use crate::flow::gpu::{Adapter, AdapterKind, Gpu, GpuOptions};
 
@@ -28,8 +29,10 @@ pub(super) fn report() -> Result<(), Failure> {
     if taken.is_none() {
         say(format_args!("  auto takes the CPU"))?;
     }
+    let presets: Vec<_> = Preset::with_gpu_kernels().map(Preset::name).collect();
     say(format_args!(
-        "  a card is for presets neural, paper, fnsf-linear, nsfp-baseline and nsfp-linear; default and label compute on the CPU whatever the device"
+        "  a GPU computes presets {}; all other presets run on the CPU",
+        presets.join(", ")
     ))?;
     let hardware = |adapter: &&Adapter| adapter.kind != AdapterKind::Software;
     let found = Environment::here(adapters.iter().filter(hardware).count(), adapters.len());

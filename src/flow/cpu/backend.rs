@@ -68,6 +68,10 @@ impl Backend for CpuBackend {
         &self.host
     }
 
+    fn is_cpu(&self) -> bool {
+        true
+    }
+
     fn prepare_target(
         &self,
         source: &[Point],

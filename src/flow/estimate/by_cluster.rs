@@ -44,16 +44,16 @@ pub(super) fn residual_motion(
     let whole = has_time_for_all(selection, control);
     let prior = RigidTransform::identity();
     let ego = ego_motion(host, selection, input.options.ego, &prior, whole, control);
-    let aligned = input.aligned(ego.as_ref());
-    input.check_cancelled()?;
-    let clusters = || parts(&aligned, &selection.target, partition);
+    let alignment = input.align(host, ego)?;
+    let aligned = &alignment.aligned;
+    let clusters = || parts(aligned, &selection.target, partition);
     let parts = host.threads().install(clusters);
     let precomputed_at = control.seconds();
     let mut fits = Fits {
         backend,
         options,
         seed: input.options.seed,
-        aligned: &aligned,
+        aligned,
         ego: ego.as_ref(),
         residual: vec![[0.0; 3]; aligned.len()],
         solution: FieldSolution {
@@ -108,8 +108,7 @@ pub(super) fn residual_motion(
     };
     let motion = SampledMotion::new(aligned.clone(), residual.clone());
     Ok(Solved {
-        ego,
-        aligned,
+        alignment,
         residual,
         motion: Residual::Sampled(Arc::new(motion)),
         solution: Solution::Field(solution),

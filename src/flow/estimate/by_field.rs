@@ -48,8 +48,8 @@ pub(super) fn residual_motion(
         (None, Ego::Given(target_from_source)) => Some(target_from_source),
         (None, Ego::Auto | Ego::Off) => None,
     };
-    let aligned = input.aligned(ego.as_ref());
-    input.check_cancelled()?;
+    let alignment = input.align(backend.host(), ego)?;
+    let aligned = &alignment.aligned;
     let fitted = match &prepared {
         None => Fitted::nothing(aligned.len(), control),
         Some(prepared) => Fit {
@@ -64,7 +64,7 @@ pub(super) fn residual_motion(
                 | Residual::Objects(_)
                 | Residual::Sampled(_) => None,
             }),
-            aligned: &options.seen(&aligned),
+            aligned: &options.seen(aligned),
             ego: ego.as_ref(),
             options,
             seed: input.options.seed,
@@ -75,8 +75,7 @@ pub(super) fn residual_motion(
         .run(state)?,
     };
     Ok(Solved {
-        ego,
-        aligned,
+        alignment,
         residual: fitted.residual,
         motion: match fitted.field {
             None => Residual::Still,

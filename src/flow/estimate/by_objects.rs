@@ -31,8 +31,8 @@ pub(super) fn residual_motion(
     let prior = RigidTransform::identity();
     let ego = ego_motion(host, selection, input.options.ego, &prior, whole, control);
     let motion = ego.unwrap_or_default();
-    let aligned = input.aligned(ego.as_ref());
-    input.check_cancelled()?;
+    let alignment = input.align(host, ego)?;
+    let aligned = &alignment.aligned;
     let find_ground = |sweeps: &[&[Point]]| host.ground(sweeps);
     let neighbors = match &ego {
         None => Vec::new(),
@@ -40,7 +40,7 @@ pub(super) fn residual_motion(
     };
     let precomputed_at = control.seconds();
     let clouds = SearchClouds {
-        source: &aligned,
+        source: aligned,
         target: &selection.target,
         neighbors: &neighbors,
         sweeps: [problem.source, problem.target],
@@ -62,9 +62,8 @@ pub(super) fn residual_motion(
         )
     });
     Ok(Solved {
-        ego,
-        residual: search.residual_of(&aligned),
-        aligned,
+        residual: search.residual_of(aligned),
+        alignment,
         solution: Solution::Objects(ObjectSolution {
             objects,
             searched: search.clusters,

@@ -4,9 +4,11 @@ use super::result::Solution;
 use crate::flow::data::StopReason;
 use crate::flow::data::{Control, Interrupt, Point, RigidTransform, transform_points};
 use crate::flow::error::FlowError;
+use crate::flow::host::Host;
 use crate::flow::motion::Residual;
-use crate::flow::options::Options;
+use crate::flow::options::{LEAST_OVERLAP, Options};
 use crate::flow::problem::Problem;
+use crate::flow::registration::overlap;
 use crate::flow::select::Selection;
 
 /// The input of a method.
@@ -18,29 +20,62 @@ pub(super) struct Input<'a> {
 }
 
 impl Input<'_> {
-    /// The selected source points, transformed by the ego motion where there is one.
-    pub(super) fn aligned(&self, ego: Option<&RigidTransform>) -> Vec<Point> {
-        let source = &self.selection.source;
-        ego.map_or_else(|| source.clone(), |motion| transform_points(motion, source))
-    }
-
-    /// Returns early if the control has cancelled; a deadline is not an error.
+    /// The source in the target's frame by the ego motion `ego`, or as it is where there is none,
+    /// with its overlap. After a deadline the overlap is not measured.
     ///
     /// # Errors
+    /// [`FlowError::NoOverlap`] where an ego motion aligns sweeps of two scenes, and
     /// [`FlowError::Cancelled`] where the control has cancelled.
-    pub(super) fn check_cancelled(&self) -> Result<(), FlowError> {
-        match self.control.interrupt() {
-            Some(Interrupt::Cancelled) => Err(FlowError::Cancelled),
-            Some(Interrupt::Deadline) | None => Ok(()),
+    pub(super) fn align(
+        &self,
+        host: &Host,
+        ego: Option<RigidTransform>,
+    ) -> Result<Alignment, FlowError> {
+        let Selection {
+            source,
+            target,
+            undrawn,
+            ..
+        } = self.selection;
+        let moved = |points: &Vec<Point>| match &ego {
+            None => points.clone(),
+            Some(motion) => transform_points(motion, points),
+        };
+        let aligned = moved(source);
+        let measure = || match undrawn {
+            None => overlap(&aligned, target),
+            Some([source, target]) => overlap(&moved(source), target),
+        };
+        let overlap = match self.control.interrupt() {
+            Some(Interrupt::Cancelled) => return Err(FlowError::Cancelled),
+            Some(Interrupt::Deadline) => None,
+            None => host.threads().install(measure),
+        };
+        match overlap {
+            Some(overlap) if overlap < LEAST_OVERLAP && ego.is_some() && !self.options.force => {
+                Err(FlowError::NoOverlap { overlap })
+            }
+            overlap => Ok(Alignment {
+                ego,
+                aligned,
+                overlap,
+            }),
         }
     }
 }
 
-/// The result of a method, one row per selected source point.
-pub(super) struct Solved {
+/// The source in the target's frame.
+pub(super) struct Alignment {
     pub(super) ego: Option<RigidTransform>,
     /// The selected source points, transformed by the ego motion into the target's frame.
     pub(super) aligned: Vec<Point>,
+    /// The overlap of the two sweeps, see [`overlap()`].
+    pub(super) overlap: Option<f32>,
+}
+
+/// The result of a method, one row per selected source point.
+pub(super) struct Solved {
+    pub(super) alignment: Alignment,
     /// Residual displacement of each aligned point, metres, in the target's frame.
     pub(super) residual: Vec<Point>,
     /// The residual motion at any point.

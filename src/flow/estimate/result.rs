@@ -19,6 +19,13 @@ pub struct Estimate {
     /// The ego motion as target_from_source. None with [`crate::flow::Ego::Off`], and where a
     /// deadline left no time to estimate it.
     pub ego: Option<RigidTransform>,
+    /// Overlap of the two sweeps after the ego motion, 0 to 1: the share of the volume off the ground
+    /// of the source that the target shows as well, within 0.3 m. Below
+    /// [`crate::flow::LEAST_OVERLAP`] it is the larger of the shares of the two sweeps. None for
+    /// small clouds, and where a deadline left no time for it.
+    pub overlap: Option<f32>,
+    /// Whether both sweeps are the same points in the same order.
+    pub same_sweep: bool,
     /// Number of points that took part and have a flow. Ground points with the ego-motion flow
     /// alone are not counted.
     pub points: usize,

@@ -3,14 +3,14 @@
 use super::by_cluster;
 use super::by_field;
 use super::by_objects;
-use super::method::{Input, Solved};
+use super::method::{Alignment, Input, Solved};
 use super::result::{Estimate, Solution};
 use crate::flow::data::{Control, DYNAMIC_M, Point, transform_point};
 use crate::flow::error::FlowError;
 use crate::flow::field::{Backend, Snapshot, SnapshotError};
 use crate::flow::motion::MotionField;
 use crate::flow::objects::confidence_of_ground;
-use crate::flow::options::{Ego, Method, Options};
+use crate::flow::options::{CERTAIN_OVERLAP, Ego, LEAST_OVERLAP, Method, Options};
 use crate::flow::problem::Problem;
 use crate::flow::select::select;
 
@@ -23,6 +23,8 @@ use crate::flow::select::select;
 /// # Errors
 /// - [`FlowError::TooFewPoints`], [`FlowError::NoGroundMask`] or [`FlowError::GroundMaskLength`] if
 ///   the problem does not suit the options.
+/// - [`FlowError::NotMetres`] or [`FlowError::NoOverlap`] if the coordinates are not metres, or the
+///   sweeps do not show one scene after the ego motion. Not with [`Options::force`].
 /// - [`FlowError::Cancelled`] if the control cancels.
 /// - [`FlowError::Diverged`] if the loss of a field is not finite.
 /// - [`FlowError::Backend`] if the distance transform is rejected, or the device fails, is busy,
@@ -86,13 +88,17 @@ fn estimate_from(
 fn assemble(input: &Input<'_>, solved: Solved, began: f64) -> Estimate {
     let (source, selection) = (input.problem.source, input.selection);
     let Solved {
-        ego,
-        aligned,
+        alignment,
         residual,
         motion,
         mut solution,
         ..
     } = solved;
+    let Alignment {
+        ego,
+        aligned,
+        overlap,
+    } = alignment;
     let mut flow = vec![[0.0; 3]; source.len()];
     let mut valid = vec![false; source.len()];
     let mut dynamic = ego.map(|_| vec![false; source.len()]);
@@ -124,12 +130,15 @@ fn assemble(input: &Input<'_>, solved: Solved, began: f64) -> Estimate {
     }
     if let Some(objects) = objects {
         objects.clear_invalid(&valid);
+        objects.scale_confidence(certainty(overlap));
     }
     Estimate {
         flow,
         valid,
         dynamic,
         ego,
+        overlap,
+        same_sweep: source == input.problem.target,
         points: selection.output_rows.len(),
         solution,
         stop_reason: solved.stop_reason,
@@ -141,4 +150,11 @@ fn assemble(input: &Input<'_>, solved: Solved, began: f64) -> Estimate {
             residual: motion,
         },
     }
+}
+
+/// The factor of an overlap on all confidences: 1 from [`CERTAIN_OVERLAP`], 0 below
+/// [`LEAST_OVERLAP`], and linear between the two. An unknown overlap is no doubt.
+fn certainty(overlap: Option<f32>) -> f32 {
+    let share = |overlap| (overlap - LEAST_OVERLAP) / (CERTAIN_OVERLAP - LEAST_OVERLAP);
+    overlap.map_or(1.0, |overlap| share(overlap).clamp(0.0, 1.0))
 }

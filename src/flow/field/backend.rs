@@ -17,6 +17,12 @@ pub trait Backend: Send + Sync {
     /// The host's thread pool. Registration and the object search run there on every device.
     fn host(&self) -> &Host;
 
+    /// Whether the host's threads compute the fits. They are the reference that the self-test of
+    /// any other device is compared with.
+    fn is_cpu(&self) -> bool {
+        false
+    }
+
     /// Prepares `target` (M x 3, metres) for fits to the loss `options`: builds its distance
     /// transform on a grid that covers `target` and `source` (N x 3, metres), or its k-d tree. Both
     /// clouds are in the same frame. Coordinates must not be NaN. Checks `control` before each part

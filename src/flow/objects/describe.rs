@@ -106,6 +106,15 @@ impl Objects {
         objects
     }
 
+    /// Multiplies the confidences of rows and clusters by `factor`, 0 to 1.
+    pub(crate) fn scale_confidence(&mut self, factor: f32) {
+        let clusters = self.clusters.iter_mut();
+        let of_clusters = clusters.map(|cluster| &mut cluster.confidence);
+        for confidence in self.confidence.iter_mut().chain(of_clusters) {
+            *confidence *= factor;
+        }
+    }
+
     /// Sets the confidence of rows without a flow to zero.
     pub(crate) fn clear_invalid(&mut self, valid: &[bool]) {
         for (confidence, &valid) in self.confidence.iter_mut().zip(valid) {

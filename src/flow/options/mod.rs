@@ -19,6 +19,8 @@ pub use model::{
     InputNormalization, LinearOptions, ModelOptions, NetworkOptions, Precision, Start,
 };
 pub use objects::ObjectOptions;
-pub use pair::{DEFAULT_DT_S, Ego, Ground, Method, Options};
+pub use pair::{
+    CERTAIN_OVERLAP, DEFAULT_DT_S, Ego, Ground, LEAST_OVERLAP, MAX_SPREAD_M, Method, Options,
+};
 pub use partition::PartitionOptions;
 pub use preset::Preset;

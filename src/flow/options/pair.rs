@@ -7,6 +7,14 @@ use crate::flow::data::RigidTransform;
 /// Default time from the source sweep to the target sweep, seconds: a lidar at 10 Hz.
 pub const DEFAULT_DT_S: f32 = 0.1;
 
+/// Least overlap of a pair, 0 to 1. Sweeps of one scene have 0.64 or more, half a second apart and
+/// with 16 beams as well. Sweeps of two scenes have 0.26 at most (`docs/experiments/overlap.md`).
+pub const LEAST_OVERLAP: f32 = 0.35;
+/// Overlap from which the alignment counts as certain. Between the two the confidence falls.
+pub const CERTAIN_OVERLAP: f32 = 0.6;
+/// Largest median distance of a sweep's points from their middle, metres. Lidars reach 300 m.
+pub const MAX_SPREAD_M: f32 = 1000.0;
+
 /// Options of one estimate. Start from a [`super::Preset`] and change single values.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {
@@ -20,6 +28,9 @@ pub struct Options {
     /// Half the side of the square crop around the origin of the sensor frame, metres. Points with
     /// a larger `|x|` or `|y|` are excluded. None for no crop.
     pub crop_m: Option<f32>,
+    /// Least horizontal distance from the origin of the sensor frame, metres. Nearer points are
+    /// excluded: they are mostly the vehicle's own returns. None to keep them.
+    pub min_range_m: Option<f32>,
     /// Time from the source sweep to the target sweep, seconds, above zero. The velocity of a
     /// cluster is its displacement divided by this time, and its yaw rate is its rotation divided
     /// by it.
@@ -28,6 +39,9 @@ pub struct Options {
     pub ground: Ground,
     /// Handling of the ego motion.
     pub ego: Ego,
+    /// Whether pairs are estimated that are otherwise refused as nonsense: sweeps that do not show
+    /// one scene, and coordinates that are not metres.
+    pub force: bool,
     /// Method that estimates the residual motion.
     pub method: Method,
 }

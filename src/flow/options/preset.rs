@@ -139,6 +139,8 @@ impl Preset {
             seed: 0,
             max_points,
             crop_m: None,
+            min_range_m: None,
+            force: false,
             dt_s: DEFAULT_DT_S,
             ground,
             ego,

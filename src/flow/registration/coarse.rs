@@ -3,7 +3,8 @@
 //! A single coarse fit mostly recovers a rotation of 4 degrees together with a translation of 3 m.
 //! Vehicles drive forward and turn, so the initial guesses are translations along x and rotations
 //! about z. The correct motion scores 0.06 to 0.28. Rotated guesses are skipped where all guesses
-//! without rotation converge to one motion.
+//! without rotation converge to one motion. Guesses far from the prior are tried where no near one
+//! aligns the clouds.
 
 use nalgebra::{Isometry3, Vector3};
 use rayon::prelude::*;
@@ -25,12 +26,18 @@ const TRIAL: Schedule = Schedule {
     within_m: [3.0, 2.0],
     scale_m: [1.0, 0.3],
 };
-/// Translations of the initial guesses from the prior, along x, metres.
-const DRIVES_M: [f64; 3] = [0.0, 3.0, -3.0];
+/// Translations of the initial guesses from the prior, along x, metres. The first [`NEAR`] suffice
+/// for sweeps at 10 Hz, the others for 2 Hz.
+const DRIVES_M: [f64; 9] = [0.0, 3.0, -3.0, 6.0, -6.0, 9.0, -9.0, 12.0, -12.0];
 /// Rotations of the initial guesses from the prior, about z, degrees.
-const TURNS_DEG: [f64; 3] = [0.0, 4.0, -4.0];
+const TURNS_DEG: [f64; 9] = [0.0, 4.0, -4.0, 8.0, -8.0, 12.0, -12.0, 16.0, -16.0];
+/// Number of the translations and rotations of the guesses that are tried first.
+const NEAR: usize = 3;
 /// Score from which a fit counts as aligned. Fits that were not aligned scored up to 0.03.
 const PLAIN: f64 = 0.05;
+/// Score of the upright surfels from which a fit is not doubtful. Wrong fits scored up to 0.07, right
+/// ones 0.06 to 0.4.
+const UPRIGHT_PLAIN: f64 = 0.1;
 /// Fits that end closer to each other than this, metres and degrees, have converged to one motion.
 const SAME_M: f64 = 0.05;
 const SAME_DEG: f64 = 0.1;
@@ -60,11 +67,18 @@ pub(super) fn search(
         });
         tried.collect()
     };
-    let starts = starts(prior);
-    let (straight, turned) = starts.split_at(DRIVES_M.len());
-    let mut ends = tried(straight);
+    let near = 0..NEAR;
+    let mut ends = tried(&starts(prior, |drive, turn| {
+        near.contains(&drive) && turn == 0
+    }));
     if !agree(&ends) {
-        ends.extend(tried(turned));
+        let turned = |drive, turn| near.contains(&drive) && near.contains(&turn) && turn > 0;
+        ends.extend(tried(&starts(prior, turned)));
+    }
+    let is_doubtful = |(motion, _): &(_, _)| fit.upright_score(motion, &TRIAL) < UPRIGHT_PLAIN;
+    if !agree(&ends) && ends.iter().all(is_doubtful) {
+        let is_far = |drive, turn| !(near.contains(&drive) && near.contains(&turn));
+        ends.extend(tried(&starts(prior, is_far)));
     }
     let mut best = (*prior, 0.0);
     for (motion, score) in ends {
@@ -87,13 +101,19 @@ fn agree(ends: &[(RigidTransform, f64)]) -> bool {
     })
 }
 
-/// The initial guesses: the prior first, then translations and rotations from it.
-fn starts(prior: &RigidTransform) -> Vec<RigidTransform> {
-    let turned = |degrees: f64| {
-        let turn = Vector3::new(0.0, 0.0, degrees.to_radians());
-        DRIVES_M.map(|drive| Isometry3::new(Vector3::new(drive, 0.0, 0.0), turn) * prior)
-    };
-    TURNS_DEG.map(turned).into_iter().flatten().collect()
+/// The initial guesses about `prior` whose indices of translation and rotation `tries` accepts,
+/// those with the smallest rotation first.
+fn starts(prior: &RigidTransform, tries: impl Fn(usize, usize) -> bool) -> Vec<RigidTransform> {
+    let mut starts = Vec::new();
+    for (turn, degrees) in TURNS_DEG.into_iter().enumerate() {
+        for (drive, drive_m) in DRIVES_M.into_iter().enumerate() {
+            if tries(drive, turn) {
+                let angle = Vector3::new(0.0, 0.0, degrees.to_radians());
+                starts.push(Isometry3::new(Vector3::new(drive_m, 0.0, 0.0), angle) * prior);
+            }
+        }
+    }
+    starts
 }
 
 #[cfg(test)]

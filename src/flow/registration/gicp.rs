@@ -34,6 +34,8 @@ const SHORT_STEP_M: f64 = 2e-4;
 /// all translations together, or of that of one match of two planes. Two normals are uncertain by
 /// 1.4 degrees together. On some streets the weakest direction has 1%.
 const FREE: f64 = 3e-4;
+/// Bound on the z component of the normal of an upright surfel: steeper than 45 degrees.
+const UPRIGHT: f32 = 0.7;
 /// Least spread of the points that rotations are scaled by, metres.
 const LEAST_SPREAD_M: f64 = 1e-3;
 
@@ -126,6 +128,14 @@ impl<'a> Fit<'a> {
     pub(super) fn score(&self, motion: &RigidTransform, schedule: &Schedule) -> f64 {
         let (within_m, scale_m, _) = schedule.at(schedule.steps);
         self.sums(motion, within_m, scale_m).held / self.source.len().max(1) as f64
+    }
+
+    /// Score of the upright source surfels alone: ground matches ground after any motion on it.
+    pub(super) fn upright_score(&self, motion: &RigidTransform, schedule: &Schedule) -> f64 {
+        let (within_m, scale_m, _) = schedule.at(schedule.steps);
+        let is_upright = |surfel: &&Surfel| surfel.flat.normal[2].abs() < UPRIGHT;
+        let upright: Vec<Surfel> = self.source.iter().filter(is_upright).copied().collect();
+        self.sums_of(&upright, motion, within_m, scale_m).held / upright.len().max(1) as f64
     }
 
     fn sums(&self, motion: &RigidTransform, within_m: f32, scale_m: f64) -> Sums {

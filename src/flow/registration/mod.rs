@@ -12,8 +12,10 @@
 mod align;
 mod coarse;
 mod gicp;
+mod overlap;
 mod surfels;
 #[cfg(test)]
 mod tests;
 
 pub(crate) use align::{SurfelCloud, align};
+pub(crate) use overlap::overlap;

@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use super::{clouds, opened, shared};
+use super::{clouds, opened, scattered, shared};
 use crate::flow::cpu::{CpuBackend, Isa};
-use crate::flow::data::{Point, Random, Uncontrolled};
+use crate::flow::data::{Point, Uncontrolled};
 use crate::flow::field::{Advance, Backend};
 use crate::flow::gpu::backend::Gpu;
 use crate::flow::gpu::chamfer::GpuCloud;
@@ -19,11 +19,8 @@ const OPTIONS: ChamferOptions = ChamferOptions {
     renewal: None,
 };
 
-fn scattered(count: usize, seed: u64) -> Vec<Point> {
-    let mut random = Random::new(seed);
-    let mut point = || core::array::from_fn(|_| random.uniform(-40.0, 40.0) as f32);
-    (0..count).map(|_| point()).collect()
-}
+/// Half the sides of the box of the scattered points, metres.
+const SPREAD: [f64; 3] = [40.0; 3];
 
 fn squared(a: Point, b: Point) -> f64 {
     let off = |axis: usize| f64::from(a[axis]) - f64::from(b[axis]);
@@ -38,7 +35,7 @@ fn the_nearest_target_points_are_found_at_awkward_counts() {
         return;
     };
     for (points, targets) in [(0, 5), (1, 1), (63, 255), (64, 256), (65, 257), (700, 1500)] {
-        let (points, target) = (scattered(points, 1), scattered(targets, 2));
+        let (points, target) = (scattered(points, SPREAD, 1), scattered(targets, SPREAD, 2));
         let cloud = GpuCloud::new(gpu.device(), points.len(), &target, &OPTIONS, &Uncontrolled);
         let nearest = cloud.expect("it fits").nearest(&points).expect("an answer");
         assert_eq!(nearest.len(), points.len());
@@ -54,7 +51,7 @@ fn the_nearest_target_points_are_found_at_awkward_counts() {
     }
     let same = vec![[1.0, 2.0, 3.0]; 600];
     let cloud = GpuCloud::new(gpu.device(), 3, &same, &OPTIONS, &Uncontrolled);
-    let nearest = cloud.expect("it fits").nearest(&scattered(3, 4));
+    let nearest = cloud.expect("it fits").nearest(&scattered(3, SPREAD, 4));
     assert_eq!(
         nearest.expect("an answer"),
         [0; 3],
@@ -67,7 +64,7 @@ fn distances_to_a_target_cloud_are_the_cpus() {
     let Some(gpu) = shared() else {
         return;
     };
-    let (points, target) = (scattered(500, 5), scattered(800, 6));
+    let (points, target) = (scattered(500, SPREAD, 5), scattered(800, SPREAD, 6));
     let cpu = CpuBackend::new(Some(2)).expect("threads");
     let loss = LossOptions::Chamfer(OPTIONS);
     let [found, expected] = [gpu as &dyn Backend, &cpu].map(|device| {
@@ -111,7 +108,7 @@ fn iterations_in_pieces_have_the_bits_of_whole_ones() {
     let device = Arc::get_mut(pieces.device_mut()).expect("one owner");
     // 900 x 1,500 points, both ways, take 2.7 million.
     device.context.most_distances = 300_000;
-    let (source, target) = (scattered(900, 7), scattered(1500, 8));
+    let (source, target) = (scattered(900, SPREAD, 7), scattered(1500, SPREAD, 8));
     for preset in [Preset::NsfpBaseline, Preset::NsfpLinear] {
         let [expected, found] = [whole, &pieces].map(|gpu| {
             let options = preset.field();

@@ -1,7 +1,7 @@
 //! Each kernel against the double-precision reference, including sizes that are not multiples of a
 //! tile.
 
-use super::{clouds, distance_loss, shared, with_network_and_transform};
+use super::{clouds, distance_loss, scattered, shared, with_network_and_transform};
 use crate::flow::data::{Point, Random, Uncontrolled};
 use crate::flow::distance::{Bricks, DistanceOptions, DistanceTransform};
 use crate::flow::field::{
@@ -22,12 +22,6 @@ pub(super) fn transform(source: &[Point], target: &[Point]) -> Option<GpuTransfo
     let options = DistanceOptions::default();
     let built = build(adapter, source, target, &options, &Uncontrolled);
     Some(built.expect("small clouds fit"))
-}
-
-fn scattered(points: usize, spread: [f64; 3], seed: u64) -> Vec<Point> {
-    let mut random = Random::new(seed);
-    let mut point = || spread.map(|side| random.uniform(-side, side) as f32);
-    (0..points).map(|_| point()).collect()
 }
 
 fn street() -> [Vec<Point>; 2] {

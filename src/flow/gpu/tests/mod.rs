@@ -66,3 +66,10 @@ fn clouds(points: usize) -> [Vec<Point>; 2] {
     let target = source.iter().map(moved).collect();
     [source, target]
 }
+
+/// `count` points, uniform in a box of half the sides `spread`, metres.
+fn scattered(count: usize, spread: [f64; 3], seed: u64) -> Vec<Point> {
+    let mut random = Random::new(seed);
+    let mut point = || spread.map(|side| random.uniform(-side, side) as f32);
+    (0..count).map(|_| point()).collect()
+}
