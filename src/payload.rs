@@ -10,8 +10,8 @@ use crate::flow::{
 };
 use crate::formats::{SweepTime, TimeUnit};
 
-const CLOUD: &[u8; 8] = b"fnsfcld2";
-const FLOW: &[u8; 8] = b"fnsfflw3";
+const CLOUD: &[u8; 8] = b"fnsfcld3";
+const FLOW: &[u8; 8] = b"fnsfflw4";
 const DENSE: &[u8; 8] = b"fnsfdns1";
 
 /// Bytes of the checksum at the end: the first 16 bytes of the BLAKE3 hash.
@@ -31,6 +31,8 @@ pub struct StoredCloud {
     pub ground: Option<Vec<bool>>,
     /// The time of recording, if known.
     pub time: Option<SweepTime>,
+    /// The pose `world_from_sensor`, translation in metres, if known.
+    pub pose: Option<RigidTransform>,
 }
 
 /// The stored flow of a pair with N source points.
@@ -44,7 +46,7 @@ pub struct StoredFlow {
     /// N flags: true for points whose residual motion is at least 0.05 m, if the ego motion is
     /// known.
     pub dynamic: Option<Vec<bool>>,
-    /// Clusters of the points and confidence of their flow, if known.
+    /// Clusters of the points, confidence of their flow and chances that they move, if known.
     pub objects: Option<Objects>,
     /// The ego motion target_from_source, translation in metres, if known.
     pub ego: Option<RigidTransform>,
@@ -57,6 +59,7 @@ impl StoredCloud {
         out.points(&self.points);
         out.flags(self.ground.as_deref());
         out.time(self.time);
+        out.motion(self.pose.as_ref());
         out.finish()
     }
 
@@ -70,6 +73,7 @@ impl StoredCloud {
             points: reader.points()?,
             ground: reader.flags()?,
             time: reader.time()?,
+            pose: reader.motion()?,
         };
         reader.finish()?;
         Ok(cloud)
@@ -79,7 +83,7 @@ impl StoredCloud {
 impl StoredFlow {
     /// Encodes the flow. If its lists differ in length, the bytes cannot be decoded.
     pub fn to_bytes(&self) -> Vec<u8> {
-        let mut out = Writer::new(FLOW, self.flow.len(), 22 * self.flow.len());
+        let mut out = Writer::new(FLOW, self.flow.len(), 26 * self.flow.len());
         out.points(&self.flow);
         out.flags(Some(&self.valid));
         out.flags(self.dynamic.as_deref());
@@ -196,7 +200,8 @@ impl Writer {
             return;
         };
         self.words(objects.cluster.iter().map(|id| id.cast_unsigned()));
-        self.words(objects.confidence.iter().map(|chance| chance.to_bits()));
+        let chances = objects.confidence.iter().chain(&objects.moving);
+        self.words(chances.map(|chance| chance.to_bits()));
         self.0.extend((objects.clusters.len() as u64).to_le_bytes());
         for cluster in &objects.clusters {
             self.words([cluster.points, u32::from(cluster.dynamic)].into_iter());
@@ -204,7 +209,8 @@ impl Writer {
             let values = [&bounds.center, &bounds.size, velocity]
                 .into_iter()
                 .flatten();
-            let values = values.chain([&bounds.yaw, &cluster.yaw_rate, &cluster.confidence]);
+            let values = values.chain([&bounds.yaw, &cluster.yaw_rate]);
+            let values = values.chain([&cluster.confidence, &cluster.moving]);
             self.words(values.map(|value| value.to_bits()));
         }
     }
@@ -303,13 +309,14 @@ impl<'a> Reader<'a> {
     }
 
     fn objects(&mut self) -> Result<Option<Objects>, CorruptPayload> {
-        const WORDS: usize = 14;
+        const WORDS: usize = 15;
         let [there] = self.array()?;
         if there == 0 {
             return Ok(None);
         }
         let cluster = self.words()?.map(u32::cast_signed).collect();
         let confidence = self.words()?.map(f32::from_bits).collect();
+        let moving = self.words()?.map(f32::from_bits).collect();
         let count = u64::from_le_bytes(self.array()?);
         let bytes = usize::try_from(count).ok();
         let bytes = bytes.and_then(|count| count.checked_mul(4 * WORDS));
@@ -333,11 +340,13 @@ impl<'a> Reader<'a> {
                 velocity: point(8),
                 yaw_rate: value(12),
                 confidence: value(13),
+                moving: value(14),
             }
         });
         Ok(Some(Objects {
             cluster,
             confidence,
+            moving,
             clusters: clusters.collect(),
         }))
     }
@@ -407,6 +416,7 @@ mod tests {
             objects: Some(Objects {
                 cluster: vec![0, Objects::NONE],
                 confidence: vec![0.875, 0.0],
+                moving: vec![0.25, 0.0],
                 clusters: vec![Cluster {
                     points: 1,
                     dynamic: true,
@@ -418,6 +428,7 @@ mod tests {
                     velocity: [8.0, 9.0, 10.0],
                     yaw_rate: 11.0,
                     confidence: 0.5,
+                    moving: 0.375,
                 }],
             }),
             ego: Some(RigidTransform::new(
@@ -433,6 +444,7 @@ mod tests {
             points: vec![[1.5, f32::MIN_POSITIVE, -3.0]],
             ground: Some(vec![true]),
             time: SweepTime::from_name("315966265259836000.feather"),
+            pose: flow().ego,
         };
         assert!(cloud.time.is_some());
         assert_eq!(StoredCloud::from_bytes(&cloud.to_bytes()), Ok(cloud));

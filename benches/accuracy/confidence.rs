@@ -1,4 +1,5 @@
-//! Fits the logistic regression of the confidence, and evaluates its calibration.
+//! Fits the logistic regressions of the two chances of a point, its confidence and the chance that it
+//! moves, and evaluates their calibration.
 //!
 //! ```text
 //! FNSF_REAL_DATA=... cargo bench --bench accuracy -- confidence [DIAGRAM.svg]
@@ -24,11 +25,41 @@ const BEAMS: [usize; 2] = [64, 32];
 /// Number of training streets per number of beams.
 const STREETS: u64 = 12;
 
-/// The features of a point, and the end-point error of its flow.
+/// The features of a point, the end-point error of its flow, and whether it moves.
 struct Evaluated {
     kind: usize,
     features: Vec<f64>,
     error_m: f64,
+    /// None where the truth does not say it.
+    moves: Option<bool>,
+}
+
+/// A chance of a point.
+#[derive(Clone, Copy)]
+enum Chance {
+    /// That its error is below [`CONFIDENT_WITHIN_M`].
+    Within,
+    /// That it moves.
+    Moves,
+}
+
+impl Chance {
+    /// Number of features that it uses. The last feature of all, the displacement, makes the confidence
+    /// worse on streets that are not in the fit.
+    fn features(self) -> usize {
+        match self {
+            Self::Within => 12,
+            Self::Moves => 13,
+        }
+    }
+
+    /// Whether the chance is right about a point, where that is known.
+    fn is_right(self, point: &Evaluated) -> Option<bool> {
+        match self {
+            Self::Within => Some(point.error_m < f64::from(CONFIDENT_WITHIN_M)),
+            Self::Moves => point.moves,
+        }
+    }
 }
 
 /// The classes, each with separate weights: moving points, static points, ground points.
@@ -85,6 +116,7 @@ fn judged(backend: &dyn Backend, known: LabelledPair, weight: f64) -> Scene {
         let square = |a: usize| (known.source[row][a] + known.flow[row][a] - at[a]).powi(2);
         f64::from((square(0) + square(1) + square(2)).sqrt())
     };
+    let moves = |row: usize| known.dynamic.as_ref().map(|dynamic| dynamic[row]);
     let mut points = Vec::new();
     for (i, &row) in rows
         .iter()
@@ -97,6 +129,7 @@ fn judged(backend: &dyn Backend, known: LabelledPair, weight: f64) -> Scene {
             kind: usize::from(!evidence.moves),
             features: evidence.features().into_iter().map(f64::from).collect(),
             error_m: error(row, at),
+            moves: moves(row),
         });
     }
     for row in (0..known.source.len()).filter(|&row| known.ground[0][row] && known.valid[row]) {
@@ -107,6 +140,7 @@ fn judged(backend: &dyn Backend, known: LabelledPair, weight: f64) -> Scene {
                 kind: 2,
                 features: vec![1.0, f64::from(range)],
                 error_m: error(row, at),
+                moves: moves(row),
             });
         }
     }
@@ -117,28 +151,31 @@ fn judged(backend: &dyn Backend, known: LabelledPair, weight: f64) -> Scene {
     }
 }
 
-/// Fits the weights of one class by Newton's method on the penalized likelihood. The points of a
+/// Fits the weights of one class for one chance by Newton's method on the penalized likelihood. The points of a
 /// scene share its weight equally. All training streets together weigh as much as three labelled
 /// pairs.
-fn fitted(scenes: &[&Scene], kind: usize) -> Vec<f64> {
+fn fitted(scenes: &[&Scene], kind: usize, chance_of: Chance) -> Vec<f64> {
     const PENALTY: f64 = 1e-3;
     const STEPS: usize = 30;
     let count = scenes
         .iter()
         .flat_map(|s| &s.points)
         .find(|p| p.kind == kind)
-        .map_or(0, |p| p.features.len());
+        .map_or(0, |p| p.features.len().min(chance_of.features()));
     let mut weights = DVector::<f64>::zeros(count);
     for _ in 0..STEPS {
         let mut normal = DMatrix::<f64>::identity(count, count) * PENALTY;
         let mut gradient = -&weights * PENALTY;
         for scene in scenes {
-            let of_kind = || scene.points.iter().filter(|p| p.kind == kind);
+            let of_kind = || {
+                let points = scene.points.iter().filter(|p| p.kind == kind);
+                points.filter_map(|point| Some((point, chance_of.is_right(point)?)))
+            };
             let share = scene.weight / of_kind().count().max(1) as f64;
-            for point in of_kind() {
-                let features = DVector::from_column_slice(&point.features);
+            for (point, right) in of_kind() {
+                let features = DVector::from_column_slice(&point.features[..count]);
                 let chance = 1.0 / (1.0 + (-weights.dot(&features)).exp());
-                let right = f64::from(u8::from(point.error_m < f64::from(CONFIDENT_WITHIN_M)));
+                let right = f64::from(u8::from(right));
                 gradient.axpy(share * (right - chance), &features, 1.0);
                 normal.ger(share * chance * (1.0 - chance), &features, &features, 1.0);
             }
@@ -151,7 +188,7 @@ fn fitted(scenes: &[&Scene], kind: usize) -> Vec<f64> {
     weights.iter().copied().collect()
 }
 
-fn confidence(weights: &[Vec<f64>], point: &Evaluated) -> f64 {
+fn chance(weights: &[Vec<f64>], point: &Evaluated) -> f64 {
     let sum: f64 = weights[point.kind]
         .iter()
         .zip(&point.features)
@@ -160,7 +197,7 @@ fn confidence(weights: &[Vec<f64>], point: &Evaluated) -> f64 {
     1.0 / (1.0 + (-sum).exp())
 }
 
-/// The calibration of the confidence on the points off the ground of some scenes.
+/// The calibration of a chance on the points off the ground of some scenes.
 struct Told {
     calibration: Calibration,
     /// EPE of the half of the points with the smallest errors, divided by that of the other half.
@@ -169,7 +206,7 @@ struct Told {
 }
 
 impl Told {
-    fn new(scenes: &[&Scene], weights: &[Vec<f64>]) -> Result<Self, &'static str> {
+    fn new(scenes: &[&Scene], weights: &[Vec<f64>], of: Chance) -> Result<Self, &'static str> {
         let off_ground = scenes.iter().flat_map(|scene| &scene.points);
         let off_ground = || {
             off_ground
@@ -178,7 +215,9 @@ impl Told {
         };
         let mut reliability = Reliability::default();
         for point in off_ground() {
-            reliability.add(confidence(weights, point), point.error_m);
+            if let Some(right) = of.is_right(point) {
+                reliability.add(chance(weights, point), right, point.error_m);
+            }
         }
         let mut errors: Vec<f64> = off_ground().map(|point| point.error_m).collect();
         errors.sort_by(f64::total_cmp);
@@ -189,19 +228,29 @@ impl Told {
         })
     }
 
-    fn print(&self, name: &str) {
+    fn print(&self, name: &str, of: Chance) {
         let Calibration {
             points,
             error,
+            recall,
+            precision,
             sure_half_epe,
             rest_epe,
             ..
         } = self.calibration;
-        println!(
-            "| {name} | {points} | {sure_half_epe:.4} | {rest_epe:.4} | {:.2} | {:.2} | {error:.3} |",
-            sure_half_epe / rest_epe,
-            self.best,
-        );
+        let share = |share: Option<f64>| share.map_or("-".to_owned(), |s| format!("{s:.3}"));
+        match of {
+            Chance::Within => println!(
+                "| {name} | {points} | {sure_half_epe:.4} | {rest_epe:.4} | {:.2} | {:.2} | {error:.3} |",
+                sure_half_epe / rest_epe,
+                self.best,
+            ),
+            Chance::Moves => println!(
+                "| {name} | {points} | {} | {} | {error:.4} |",
+                share(recall),
+                share(precision)
+            ),
+        }
     }
 }
 
@@ -240,7 +289,7 @@ fn diagram(shown: &[(String, Told)]) -> String {
         );
         let line: Vec<String> = bins
             .iter()
-            .map(|bin| at(bin.confidence, bin.right))
+            .map(|bin| at(bin.chance, bin.right))
             .map(|(x, y)| format!("{x:.1},{y:.1}"))
             .collect();
         svg += &format!(
@@ -248,7 +297,7 @@ fn diagram(shown: &[(String, Told)]) -> String {
             line.join(" ")
         );
         for bin in bins {
-            let (x, y) = at(bin.confidence, bin.right);
+            let (x, y) = at(bin.chance, bin.right);
             let radius = 2.0 + 12.0 * bin.share.sqrt();
             svg += &format!(
                 "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"{radius:.1}\" fill=\"#1f77b4\" fill-opacity=\"0.6\"/>\n"
@@ -258,57 +307,90 @@ fn diagram(shown: &[(String, Told)]) -> String {
     svg + "</svg>\n"
 }
 
+/// All scenes: the labelled pairs, the streets of the fit, and those that are not in it.
+struct Scenes {
+    pairs: Vec<Scene>,
+    known: Vec<Scene>,
+    fresh: Vec<Scene>,
+    more: Vec<Scene>,
+}
+
+impl Scenes {
+    fn new() -> Result<Self, String> {
+        let backend = CpuBackend::new(None).map_err(|error| error.to_string())?;
+        let pairs = real_pairs()?.into_iter();
+        let weight = PAIRS.len() as f64 / (STREETS as usize * BEAMS.len()) as f64;
+        let streets = |seeds: std::ops::Range<u64>| -> Result<Vec<Scene>, String> {
+            let each = seeds.flat_map(|seed| BEAMS.map(|beams| street(seed, beams)));
+            each.map(|known| Ok(judged(&backend, known?, weight)))
+                .collect()
+        };
+        Ok(Self {
+            pairs: pairs.map(|pair| judged(&backend, pair, 1.0)).collect(),
+            known: streets(0..STREETS)?,
+            fresh: streets(100..110)?,
+            more: streets(400..410)?,
+        })
+    }
+
+    /// Fits the weights of a chance, prints them and the table of its calibration, and returns what
+    /// the diagram shows.
+    fn evaluate(&self, of: Chance) -> Result<Vec<(String, Told)>, String> {
+        let all: Vec<&Scene> = self.known.iter().chain(&self.pairs).collect();
+        let fitted = |scenes: &[&Scene]| -> Vec<Vec<f64>> {
+            let kinds = 0..KINDS.len();
+            kinds.map(|kind| fitted(scenes, kind, of)).collect()
+        };
+        let weights = fitted(&all);
+        for (kind, weights) in KINDS.iter().zip(&weights) {
+            println!("{kind}: {weights:.3?}");
+        }
+        match of {
+            Chance::Within => println!(
+                "\n| scenes | points | sure half | rest | ratio | best ratio | calibration error |\n\
+                 |---|---|---|---|---|---|---|"
+            ),
+            Chance::Moves => println!(
+                "\n| scenes | points | recall at 0.5 | precision at 0.5 | calibration error |\n\
+                 |---|---|---|---|---|"
+            ),
+        }
+        let told = |name: &str, scenes: &[&Scene], weights: &[Vec<f64>]| {
+            let told = Told::new(scenes, weights, of)?;
+            told.print(name, of);
+            Ok::<_, &'static str>((name.to_owned(), told))
+        };
+        let mut shown = Vec::new();
+        for (name, scenes) in [
+            ("fitted streets", &self.known),
+            ("streets 100 to 109", &self.fresh),
+            ("streets 400 to 409", &self.more),
+        ] {
+            shown.push(told(name, &scenes.iter().collect::<Vec<_>>(), &weights)?);
+        }
+        // The diagram shows one set of streets, and the pairs.
+        shown = vec![shown.swap_remove(1)];
+        for pair in &self.pairs {
+            if pair.points.iter().all(|point| of.is_right(point).is_none()) {
+                continue;
+            }
+            told(&pair.name, &[pair], &weights)?;
+            let others = all.iter().copied().filter(|other| other.name != pair.name);
+            let others = fitted(&others.collect::<Vec<_>>());
+            let name = format!("{}, left out of the fit", pair.name);
+            let (_, left_out) = told(&name, &[pair], &others)?;
+            shown.push((pair.name.clone(), left_out));
+        }
+        Ok(shown)
+    }
+}
+
 pub(super) fn run(arguments: &[String]) -> Result<(), String> {
-    let backend = CpuBackend::new(None).map_err(|error| error.to_string())?;
-    let pairs = real_pairs()?.into_iter();
-    let pairs: Vec<Scene> = pairs.map(|pair| judged(&backend, pair, 1.0)).collect();
-    let weight = PAIRS.len() as f64 / (STREETS as usize * BEAMS.len()) as f64;
-    let streets = |seeds: std::ops::Range<u64>| -> Result<Vec<Scene>, String> {
-        let each = seeds.flat_map(|seed| BEAMS.map(|beams| street(seed, beams)));
-        each.map(|known| Ok(judged(&backend, known?, weight)))
-            .collect()
-    };
-    let known = streets(0..STREETS)?;
-    let fresh = streets(100..110)?;
-    let more = streets(400..410)?;
-    let all: Vec<&Scene> = known.iter().chain(&pairs).collect();
-    let fitted = |scenes: &[&Scene]| -> Vec<Vec<f64>> {
-        (0..KINDS.len()).map(|kind| fitted(scenes, kind)).collect()
-    };
-    let weights = fitted(&all);
-    for (kind, weights) in KINDS.iter().zip(&weights) {
-        println!("{kind}: {weights:.3?}");
-    }
-    println!("\n| scenes | points | sure half | rest | ratio | best ratio | calibration error |");
-    println!("|---|---|---|---|---|---|---|");
-    let told = |name: &str, scenes: &[&Scene], weights: &[Vec<f64>]| {
-        let told = Told::new(scenes, weights)?;
-        told.print(name);
-        Ok::<_, &'static str>((name.to_owned(), told))
-    };
-    told(
-        "fitted streets",
-        &known.iter().collect::<Vec<_>>(),
-        &weights,
-    )?;
-    let mut shown = vec![told(
-        "streets 100 to 109",
-        &fresh.iter().collect::<Vec<_>>(),
-        &weights,
-    )?];
-    told(
-        "streets 400 to 409",
-        &more.iter().collect::<Vec<_>>(),
-        &weights,
-    )?;
-    for pair in &pairs {
-        told(&pair.name, &[pair], &weights)?;
-        let others = all.iter().copied().filter(|other| other.name != pair.name);
-        let others = fitted(&others.collect::<Vec<_>>());
-        let name = format!("{}, left out of the fit", pair.name);
-        let (_, left_out) = told(&name, &[pair], &others)?;
-        shown.push((pair.name.clone(), left_out));
-    }
+    let scenes = Scenes::new()?;
+    println!("## Chance that a point moves");
+    scenes.evaluate(Chance::Moves)?;
+    println!("\n## Confidence");
+    let shown = scenes.evaluate(Chance::Within)?;
     if let Some(path) = arguments.first() {
         std::fs::write(path, diagram(&shown)).map_err(|error| format!("{path}: {error}"))?;
     }

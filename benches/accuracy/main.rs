@@ -25,11 +25,11 @@ mod objects;
 mod overlap;
 mod registration;
 mod sequences;
+mod traffic;
 
 use std::process::ExitCode;
 
-const EXPERIMENTS: &str =
-    "confidence densify depth field ground neighbors objects overlap registration sequences";
+const EXPERIMENTS: &str = "confidence densify depth field ground neighbors objects overlap registration sequences traffic";
 
 fn main() -> ExitCode {
     // Cargo adds `--bench`.
@@ -61,6 +61,7 @@ fn run(experiment: &str, arguments: Vec<String>) -> anyhow::Result<()> {
         "overlap" => overlap::run(),
         "registration" => registration::run(),
         "sequences" => sequences::run(arguments),
+        "traffic" => traffic::run(&arguments),
         other => anyhow::bail!("there is no such experiment; there are {EXPERIMENTS} ({other})"),
     }
 }

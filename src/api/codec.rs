@@ -201,8 +201,8 @@ pub(super) fn read_cloud(
         formats::read_cloud_within(bytes, name, most).map_err(|error| in_part(part, error))?;
     Ok(StoredCloud {
         points: cloud.points,
-        ground: None,
         time: name.and_then(SweepTime::from_name),
+        ..StoredCloud::default()
     })
 }
 
@@ -225,12 +225,12 @@ pub(super) fn read_pair(
         StoredCloud {
             points: pair.source,
             ground: source,
-            time: None,
+            ..StoredCloud::default()
         },
         StoredCloud {
             points: pair.target,
             ground: target,
-            time: None,
+            ..StoredCloud::default()
         },
     ])
 }
@@ -251,7 +251,7 @@ pub(super) fn check_points(part: &str, points: &[crate::flow::Point]) -> Result<
     }
 }
 
-fn in_part(part: &str, error: formats::FormatError) -> ApiError {
+pub(super) fn in_part(part: &str, error: formats::FormatError) -> ApiError {
     match ApiError::from(error) {
         ApiError::TooLarge(text) => ApiError::TooLarge(format!("{part}: {text}")),
         ApiError::BadInput(text) => ApiError::BadInput(format!("{part}: {text}")),

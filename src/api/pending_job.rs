@@ -95,16 +95,16 @@ fn with_ground(cloud: Arc<StoredCloud>, options: &JobOptions) -> Arc<StoredCloud
     if cloud.ground.is_some() || options.ground != Ground::Auto {
         return cloud;
     }
-    let StoredCloud {
-        points,
-        ground,
-        time,
-    } = Arc::unwrap_or_clone(cloud);
-    let Sweep { points, ground } = Sweep { points, ground }.prepared(&options);
+    let cloud = Arc::unwrap_or_clone(cloud);
+    let sweep = Sweep {
+        points: cloud.points,
+        ground: cloud.ground,
+    };
+    let Sweep { points, ground } = sweep.prepared(&options);
     Arc::new(StoredCloud {
         points,
         ground,
-        time,
+        ..cloud
     })
 }
 
@@ -169,6 +169,7 @@ impl PendingJob {
         let cloud = cloud.into();
         let service = Arc::clone(&self.service);
         service.admission.check_points(cloud.points.len())?;
+        self.check_pose(&cloud)?;
         service.check_disk()?;
         let limit = service.limits.max_sweeps;
         if self.sweeps >= limit && self.request.pair == PairOf::ALONE {
@@ -226,6 +227,25 @@ impl PendingJob {
         written??;
         self.sweeps += 1;
         Ok(cloud)
+    }
+
+    /// Checks that all clouds have a pose or none has, and that a pose is not beside another ego
+    /// motion.
+    fn check_pose(&self, cloud: &StoredCloud) -> Result<(), ApiError> {
+        if cloud.pose.is_some() {
+            self.request.options.check_for_poses()?;
+        }
+        match &self.last {
+            Some((before, _)) if before.pose.is_some() != cloud.pose.is_some() => {
+                let text = format!(
+                    "sweeps {} and {}: one has a pose and the other has none",
+                    self.sweeps - 1,
+                    self.sweeps
+                );
+                Err(ApiError::BadRequest(text))
+            }
+            _ => Ok(()),
+        }
     }
 
     /// Submits the job: a pair of two clouds if `kind` is a pair, otherwise a sequence.
@@ -442,7 +462,7 @@ mod tests {
             let cloud = Arc::new(StoredCloud {
                 points,
                 ground,
-                time: None,
+                ..StoredCloud::default()
             });
             with_ground(cloud, &options(json)).ground.clone()
         };

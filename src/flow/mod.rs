@@ -69,8 +69,8 @@ pub use field::{Network, Snapshot, SnapshotError, TrainerState};
 pub use host::{Host, HostError};
 pub use motion::{MotionField, Residual, SampledMotion};
 pub use objects::{
-    CONFIDENT_WITHIN_M, Cluster, ClusterLabels, ConfidenceFeatures, ObjectMotions, ObjectSearch,
-    Objects, SearchClouds, confidence_of_ground,
+    CONFIDENT_WITHIN_M, Chances, Cluster, ClusterLabels, ConfidenceFeatures, ObjectMotions,
+    ObjectSearch, Objects, SearchClouds,
 };
 pub use options::*;
 pub use problem::{NeighborSweep, Problem};

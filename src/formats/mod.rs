@@ -45,7 +45,7 @@ pub use crate::formats::pair::{
     Av2Labels, Ground, Pair, PairTruth, is_pair, read_av2_labels, read_pair, read_pair_within,
     write_pair_npz,
 };
-pub use crate::formats::poses::read_poses;
+pub use crate::formats::poses::{PoseFile, read_poses};
 pub use crate::formats::sniff::recognize;
 pub use sweep_order::turning_sweep;
 pub use timestamps::{SweepTime, TimeUnit};

@@ -60,11 +60,7 @@ pub fn read_poses(bytes: &[u8], sweeps: &[&str]) -> Result<Vec<RigidTransform>, 
     if bytes.starts_with(feather::MAGIC) {
         return read_av2(bytes, sweeps);
     }
-    let poses = match bytes.trim_ascii_start().first() {
-        Some(b'[') => serde_json::from_slice(bytes)
-            .map_err(|error| KIND.malformed(format!("not an array of 4 x 4 matrices: {error}")))?,
-        _ => read_text(bytes)?,
-    };
+    let poses = read_list(bytes)?;
     let chosen: Option<Vec<&[[f64; 4]; 4]>> = if poses.len() == sweeps.len() {
         Some(poses.iter().collect())
     } else {
@@ -72,21 +68,84 @@ pub fn read_poses(bytes: &[u8], sweeps: &[&str]) -> Result<Vec<RigidTransform>, 
         sweeps.iter().map(pose).collect()
     };
     let Some(chosen) = chosen else {
-        return Err(FormatError::RowCount {
-            what: "the file of poses".to_owned(),
-            found: poses.len(),
-            expected: sweeps.len(),
-        });
+        return Err(wrong_count(poses.len(), sweeps.len()));
     };
-    let pose = |(frame, rows): (&&str, &[[f64; 4]; 4])| {
-        rigid_motion(rows).map_err(|_| {
-            KIND.malformed(format!(
-                "the pose of {} is no rigid transform of finite numbers",
-                shorten(frame)
-            ))
-        })
-    };
-    sweeps.iter().zip(chosen).map(pose).collect()
+    let poses = sweeps.iter().zip(chosen);
+    poses.map(|(sweep, rows)| rigid_pose(sweep, rows)).collect()
+}
+
+/// A file of poses from which the poses of a sequence are taken sweep by sweep, where the number of
+/// sweeps is not known in advance. Text and JSON have exactly one pose for every sweep, in order; see
+/// [`read_poses`] for the formats.
+pub enum PoseFile {
+    /// Matrices of text or JSON, in the order of the sweeps.
+    Listed(Vec<[[f64; 4]; 4]>),
+    /// The bytes of Argoverse 2's table.
+    Timed(Vec<u8>),
+}
+
+impl PoseFile {
+    /// Reads text or JSON; a table is read by [`Self::pose`].
+    ///
+    /// # Errors
+    /// `Malformed` and `TooLarge` as for [`read_poses`].
+    pub fn open(bytes: Vec<u8>) -> Result<Self, FormatError> {
+        if bytes.starts_with(feather::MAGIC) {
+            return Ok(Self::Timed(bytes));
+        }
+        Ok(Self::Listed(read_list(&bytes)?))
+    }
+
+    /// The pose `world_from_frame` of the sweep with index `index` from 0, whose file name is
+    /// `sweep`.
+    ///
+    /// # Errors
+    /// As for [`read_poses`]; `RowCount` where there is no pose with that index.
+    pub fn pose(&self, index: usize, sweep: &str) -> Result<RigidTransform, FormatError> {
+        match self {
+            Self::Timed(bytes) => Ok(read_av2(bytes, &[sweep])?[0]),
+            Self::Listed(poses) => match poses.get(index) {
+                Some(rows) => rigid_pose(sweep, rows),
+                None => Err(wrong_count(poses.len(), index + 1)),
+            },
+        }
+    }
+
+    /// Checks the number of poses after all `sweeps` sweeps.
+    ///
+    /// # Errors
+    /// `RowCount` where text or JSON has another number of poses.
+    pub fn check_count(&self, sweeps: usize) -> Result<(), FormatError> {
+        match self {
+            Self::Listed(poses) if poses.len() != sweeps => Err(wrong_count(poses.len(), sweeps)),
+            _ => Ok(()),
+        }
+    }
+}
+
+fn wrong_count(found: usize, expected: usize) -> FormatError {
+    FormatError::RowCount {
+        what: "the file of poses".to_owned(),
+        found,
+        expected,
+    }
+}
+
+fn read_list(bytes: &[u8]) -> Result<Vec<[[f64; 4]; 4]>, FormatError> {
+    match bytes.trim_ascii_start().first() {
+        Some(b'[') => serde_json::from_slice(bytes)
+            .map_err(|error| KIND.malformed(format!("not an array of 4 x 4 matrices: {error}"))),
+        _ => read_text(bytes),
+    }
+}
+
+fn rigid_pose(sweep: &str, rows: &[[f64; 4]; 4]) -> Result<RigidTransform, FormatError> {
+    rigid_motion(rows).map_err(|_| {
+        KIND.malformed(format!(
+            "the pose of {} is no rigid transform of finite numbers",
+            shorten(sweep)
+        ))
+    })
 }
 
 /// A file's name without folder, and without everything after its first dot.

@@ -72,8 +72,14 @@ pub enum InvalidOptions {
     #[error("options: densify: {0}")]
     Densify(PlanError),
     /// The ego motion is a given matrix, and the sequence has more than one pair.
-    #[error("options: a given ego is the motion of one pair, not of a sequence's: leave it out")]
+    #[error(
+        "options: a given ego is the motion of one pair, not of a sequence's: leave it out, or send the \
+         poses of the sweeps"
+    )]
     OneMotion,
+    /// The sweeps have poses, and the ego motion is off or a given matrix.
+    #[error("options: the poses of the sweeps give the ego motion: leave ego out")]
+    PosesAndEgo,
     /// `densify` is given for a single pair or for a streamed sequence.
     #[error("options: densify is for sequences that are submitted as jobs")]
     NoSequence,

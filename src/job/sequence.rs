@@ -29,6 +29,17 @@ impl JobOptions {
         }
     }
 
+    /// Rejects another ego motion beside the poses of the sweeps, which give it.
+    ///
+    /// # Errors
+    /// [`InvalidOptions::PosesAndEgo`] if the ego motion is off or a given matrix.
+    pub fn check_for_poses(&self) -> Result<(), InvalidOptions> {
+        match self.ego {
+            Some(EgoChoice::Off | EgoChoice::Given(_)) => Err(InvalidOptions::PosesAndEgo),
+            Some(EgoChoice::Auto) | None => Ok(()),
+        }
+    }
+
     /// Number of sweeps in the window of a pair, its own two included. A sequence with fewer sweeps
     /// has smaller windows. Near the ends of a sequence the window is shifted, not shortened; see
     /// [`crate::flow::window`].

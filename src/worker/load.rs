@@ -75,7 +75,9 @@ impl Worker {
             snapshots,
         );
         let mut solver = options.solver_options(points);
-        if job.backward
+        if let Some((source, target)) = source.pose.zip(target.pose) {
+            solver.ego = Ego::Given(target.inv_mul(&source));
+        } else if job.backward
             && let Ego::Given(target_from_source) = &mut solver.ego
         {
             // The given ego motion is from the earlier sweep to the later one.

@@ -113,8 +113,7 @@ impl Stand {
         for (index, points) in (0..).zip(clouds) {
             let cloud = StoredCloud {
                 points,
-                ground: None,
-                time: None,
+                ..StoredCloud::default()
             };
             let bytes = Bytes::from(cloud.to_bytes());
             let put = self.blobs.put(id, Blob::Sweep(index), bytes, Fsync::No);

@@ -64,6 +64,9 @@ fn several_flows_have_a_row_each_and_one_of_all_their_points() {
             number(confidence, "sure_half_epe") < number(confidence, "rest_epe"),
             "{report}"
         );
+        let moving = &report["moving"];
+        assert!(number(moving, "calibration_error") < 0.1, "{report}");
+        assert!(number(moving, "precision") > 0.5, "{report}");
         let classes = report["bucket_normalized"]["classes"].as_array();
         let classes = classes.expect("the truth holds source, ego motion and objects");
         let names: Vec<_> = classes.iter().map(|class| class["class"].clone()).collect();

@@ -75,7 +75,10 @@ fn a_flow_comes_back_from_every_format() {
         assert_eq!(read.flow, truth.flow, "{format:?}");
         if format == FlowFormat::Npy {
             assert_eq!((read.valid, read.dynamic), (None, None));
-            assert_eq!((read.cluster, read.confidence), (None, None));
+            assert_eq!(
+                (read.cluster, read.confidence, read.moving),
+                (None, None, None)
+            );
         } else {
             let objects = objects(500);
             let whole = matches!(format, FlowFormat::Npz | FlowFormat::Json);
@@ -86,6 +89,7 @@ fn a_flow_comes_back_from_every_format() {
             );
             assert_eq!(read.cluster, Some(objects.cluster), "{format:?}");
             assert_eq!(read.confidence, Some(objects.confidence), "{format:?}");
+            assert_eq!(read.moving, Some(objects.moving), "{format:?}");
             assert_eq!(read.valid.as_ref(), Some(&truth.valid), "{format:?}");
             assert_eq!(read.dynamic, truth.dynamic, "{format:?}");
         }
@@ -102,6 +106,7 @@ fn json_and_npz_hold_the_clusters_themselves() {
         serde_json::json!({
             "points": 16, "dynamic": true, "center": [1.0, 2.0, 3.0], "size": [4.0, 2.0, 1.5],
             "yaw": 0.5, "velocity": [0.5, -0.25, 0.0], "yaw_rate": 0.125, "confidence": 0.75,
+            "moving": 0.25,
         })
     );
     assert_eq!(json["clusters"].as_array().map(Vec::len), Some(2));
@@ -122,6 +127,7 @@ fn json_and_npz_hold_the_clusters_themselves() {
     assert!(array("clusters_dynamic").ends_with(&[1, 0]));
     assert!(array("clusters_yaw_rate").ends_with(&floats(&[0.125; 2])));
     assert!(array("clusters_confidence").ends_with(&floats(&[0.75; 2])));
+    assert!(array("clusters_moving").ends_with(&floats(&[0.25; 2])));
 }
 
 #[test]
@@ -131,6 +137,7 @@ fn senseless_clusters_and_chances_are_refused_by_name() {
         read_flow(text.as_bytes(), None).unwrap_err().to_string()
     };
     assert!(read(r#""confidence":[1.5]"#).contains("confidence is 1.5"));
+    assert!(read(r#""moving":[-0.5]"#).contains("moving is -0.5"));
     assert!(read(r#""cluster":[0,1]"#).contains("cluster"));
     let flow = npy("'<f4'", false, "(1, 3)", &floats(&[0.0; 3]));
     let half = npy("'<f4'", false, "(1,)", &floats(&[0.5]));
@@ -167,7 +174,8 @@ fn a_feather_flow_reads_with_arrows_own_reader() {
             "is_valid",
             "is_dynamic",
             "cluster",
-            "confidence"
+            "confidence",
+            "moving"
         ]
     );
     assert_eq!(

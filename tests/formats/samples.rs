@@ -100,6 +100,7 @@ pub(crate) fn objects(count: usize) -> Objects {
         velocity: [0.5, -0.25, 0.0],
         yaw_rate: 0.125,
         confidence: 0.75,
+        moving: 0.25,
     };
     let still = Cluster {
         dynamic: false,
@@ -109,6 +110,7 @@ pub(crate) fn objects(count: usize) -> Objects {
     Objects {
         cluster: (0..count as i32).map(|row| row % 3 - 1).collect(),
         confidence: (0..count).map(|row| (row % 5) as f32 / 4.0).collect(),
+        moving: (0..count).map(|row| (row % 9) as f32 / 8.0).collect(),
         clusters: vec![cluster, still],
     }
 }

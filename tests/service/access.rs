@@ -271,7 +271,7 @@ async fn codes(server: &Server, id: &str, shown: Option<&str>) -> [Code; 9] {
     for points in small_pair() {
         parts.push(sequence::Part::Sweep(sequence::Sweep::default()));
         parts.push(sequence::Part::Chunk(chunk(points)));
-        jobs.push(submit::Part::Next(submit::NextCloud {}));
+        jobs.push(submit::Part::Next(submit::NextCloud::default()));
         jobs.push(submit::Part::Chunk(chunk(points)));
     }
     let parts = parts

@@ -278,7 +278,7 @@ async fn submissions_and_sequences_out_of_order_are_refused() {
             idempotency_key: key.to_owned(),
         }))
     };
-    let next = Some(Part::Next(NextCloud {}));
+    let next = Some(Part::Next(NextCloud::default()));
     let piece = Some(Part::Chunk(chunk(&small_pair()[0])));
     for case in [
         vec![],

@@ -131,6 +131,7 @@ async fn a_sequence_is_answered_pair_by_pair_while_it_is_still_coming() {
         let head = Sweep {
             name: format!("sweep {number}"),
             points: Some(cloud.len() as u64),
+            ..Sweep::default()
         };
         send.send(message(Part::Sweep(head))).await.expect("open");
         for points in cloud.chunks(1000) {
@@ -182,7 +183,7 @@ async fn jobs_are_submitted_watched_listed_and_downloaded() {
             idempotency_key: "key".to_owned(),
         })];
         for points in small_pair() {
-            parts.push(Part::Next(NextCloud {}));
+            parts.push(Part::Next(NextCloud::default()));
             parts.extend(points.chunks(1000).map(|points| Part::Chunk(chunk(points))));
         }
         tokio_stream::iter(parts.into_iter().map(message))

@@ -23,6 +23,7 @@ mod http;
 mod load;
 mod nonsense;
 mod objects;
+mod poses;
 mod raw_http;
 mod readme;
 #[path = "../common/real_data.rs"]

@@ -46,6 +46,7 @@ async fn clusters_and_confidence_are_the_librarys_in_every_format_and_over_grpc(
             Some(&expected.confidence),
             "{media}"
         );
+        assert_eq!(read.moving.as_ref(), Some(&expected.moving), "{media}");
         let whole = ["application/x-npz", "application/json"].contains(&media);
         let clusters = whole.then(|| expected.clusters.clone());
         assert_eq!(read.clusters, clusters, "{media}");
@@ -56,7 +57,8 @@ async fn clusters_and_confidence_are_the_librarys_in_every_format_and_over_grpc(
         .estimate_flow(pair(medium_pair(), proto::Options::default()))
         .await;
     let mut answer = answer.expect("an answer").into_inner();
-    let (mut clusters, mut cluster, mut confidence) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut clusters, mut cluster) = (Vec::new(), Vec::new());
+    let (mut confidence, mut moving): (Vec<f32>, Vec<f32>) = (Vec::new(), Vec::new());
     let mut count = 0;
     while let Some(message) = answer.next().await {
         use proto::estimate_flow_response::Part;
@@ -70,14 +72,19 @@ async fn clusters_and_confidence_are_the_librarys_in_every_format_and_over_grpc(
                 clusters.extend(piece.clusters);
                 let (ids, _) = piece.cluster.as_chunks::<4>();
                 cluster.extend(ids.iter().map(|id| i32::from_le_bytes(*id)));
-                let (chances, _) = piece.confidence.as_chunks::<4>();
-                confidence.extend(chances.iter().map(|chance| f32::from_le_bytes(*chance)));
+                for (all, bytes) in [
+                    (&mut confidence, &piece.confidence),
+                    (&mut moving, &piece.moving),
+                ] {
+                    let (chances, _) = bytes.as_chunks::<4>();
+                    all.extend(chances.iter().map(|chance| f32::from_le_bytes(*chance)));
+                }
             }
         }
     }
     assert_eq!(
-        (cluster, confidence),
-        (expected.cluster, expected.confidence)
+        (cluster, confidence, moving),
+        (expected.cluster, expected.confidence, expected.moving)
     );
     assert_eq!(clusters.len(), expected.clusters.len());
     assert_eq!(count as usize, clusters.len());
@@ -89,10 +96,13 @@ async fn clusters_and_confidence_are_the_librarys_in_every_format_and_over_grpc(
         assert_eq!(found.center, cluster.bounds.center);
         assert_eq!(found.size, cluster.bounds.size);
         assert_eq!(found.velocity, cluster.velocity);
-        let scalars = [found.yaw, found.yaw_rate, found.confidence];
         assert_eq!(
-            scalars,
-            [cluster.bounds.yaw, cluster.yaw_rate, cluster.confidence]
+            [found.yaw, found.yaw_rate],
+            [cluster.bounds.yaw, cluster.yaw_rate]
+        );
+        assert_eq!(
+            [found.confidence, found.moving],
+            [cluster.confidence, cluster.moving]
         );
     }
 }

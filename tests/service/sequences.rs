@@ -203,7 +203,7 @@ async fn submitted(server: &Server, densify: Option<proto::Densify>) -> proto::J
         idempotency_key: String::new(),
     })];
     for points in sweeps() {
-        parts.push(Part::Next(NextCloud {}));
+        parts.push(Part::Next(NextCloud::default()));
         parts.push(Part::Chunk(chunk(points)));
     }
     let message = |part| proto::SubmitJobRequest { part: Some(part) };

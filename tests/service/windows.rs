@@ -68,7 +68,7 @@ async fn streamed(
     for (index, points) in sweeps().iter().enumerate() {
         parts.push(Part::Sweep(Sweep {
             name: index.to_string(),
-            points: None,
+            ..Sweep::default()
         }));
         match broken.filter(|_| index == 4) {
             None => parts.push(Part::Chunk(chunk(points))),

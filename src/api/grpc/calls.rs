@@ -19,6 +19,7 @@ use crate::api::listener::Asking;
 use crate::api::pending_job::{Accepted, PendingJob};
 use crate::api::result_budget::ReadProgress;
 use crate::api::service::{Service, Waited};
+use crate::api::upload_budget::UploadReservation;
 use crate::job::{InvalidId, Job, JobId, Kind, State};
 
 /// Number of response messages that are buffered for a slow client.
@@ -89,6 +90,19 @@ impl Calls {
 /// Parses a job id. A malformed id is reported as a job that does not exist.
 fn named(id: &str) -> Result<JobId, ApiError> {
     Ok(id.parse()?)
+}
+
+/// Adds a complete cloud, if there is one, to the job. `part` is its name for errors.
+async fn push(
+    pending: &mut PendingJob,
+    cloud: Option<CloudBuilder>,
+    part: &str,
+    room: &mut UploadReservation,
+) -> Result<(), ApiError> {
+    if let Some(cloud) = cloud {
+        pending.push(cloud.finish(part)?, Some(room.next())).await?;
+    }
+    Ok(())
 }
 
 /// The error for a malformed page token.
@@ -256,15 +270,14 @@ impl SceneFlow for Calls {
                         return Err(ApiError::BadRequest(text.to_owned()).into());
                     }
                 },
-                Some(Some(Part::Next(_))) | None => {
-                    if let Some(cloud) = cloud.replace(CloudBuilder::default()) {
-                        pending
-                            .push(cloud.finish(&index)?, Some(room.next()))
-                            .await?;
-                    }
-                    if part.is_none() {
-                        break;
-                    }
+                Some(Some(Part::Next(next))) => {
+                    let pose = convert::pose("the next cloud", &next.pose)?;
+                    let cloud = cloud.replace(CloudBuilder::with_pose(pose));
+                    push(&mut pending, cloud, &index, &mut room).await?;
+                }
+                None => {
+                    push(&mut pending, cloud, &index, &mut room).await?;
+                    break;
                 }
                 Some(_) => return Err(no_begin().into()),
             }

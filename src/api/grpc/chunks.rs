@@ -10,11 +10,11 @@ use crate::api::error::ApiError;
 use crate::api::results::Answer;
 use crate::api::service::Service;
 use crate::api::upload_budget::UploadReservation;
-use crate::flow::{DenseCloud, Point};
+use crate::flow::{DenseCloud, Point, RigidTransform};
 use crate::payload::{StoredCloud, points_from_le_bytes};
 
 /// Rows of flow in one chunk: below 1 MiB with all of its columns.
-const ROWS: usize = 45_000;
+const ROWS: usize = 38_000;
 
 /// Receives the next message, within the time limits of a body.
 ///
@@ -43,9 +43,18 @@ pub(super) async fn next<T>(
 pub(super) struct CloudBuilder {
     points: Vec<u8>,
     ground: Vec<bool>,
+    pose: Option<RigidTransform>,
 }
 
 impl CloudBuilder {
+    /// A cloud with the pose `world_from_sensor`, or none.
+    pub(super) fn with_pose(pose: Option<RigidTransform>) -> Self {
+        Self {
+            pose,
+            ..Self::default()
+        }
+    }
+
     /// Adds a chunk. `part` is the name of the cloud for error messages.
     ///
     /// # Errors
@@ -106,7 +115,8 @@ impl CloudBuilder {
         Ok(StoredCloud {
             points,
             ground,
-            time: None,
+            pose: self.pose,
+            ..StoredCloud::default()
         })
     }
 }
@@ -161,7 +171,8 @@ pub(super) fn pieces(
                 u8::from(flow.valid[row]) | u8::from(dynamic) << 1
             })
             .collect();
-        let (mut cluster, mut confidence, mut clusters) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut cluster, mut clusters) = (Vec::new(), Vec::new());
+        let (mut confidence, mut moving) = (Vec::new(), Vec::new());
         if let Some(objects) = &flow.objects {
             // The clusters are distributed over the rows by row index alone. A client that resumes
             // at a row has received the clusters of the rows before it.
@@ -170,14 +181,20 @@ pub(super) fn pieces(
             clusters.extend(described.iter().map(convert::cluster));
             let ids = objects.cluster[from..to].iter();
             cluster.extend(ids.flat_map(|id| id.to_le_bytes()));
-            let chances = objects.confidence[from..to].iter();
-            confidence.extend(chances.flat_map(|chance| chance.to_le_bytes()));
+            for (bytes, chances) in [
+                (&mut confidence, &objects.confidence),
+                (&mut moving, &objects.moving),
+            ] {
+                let chances = chances[from..to].iter();
+                bytes.extend(chances.flat_map(|chance| chance.to_le_bytes()));
+            }
         }
         proto::FlowChunk {
             flow: bytes.into(),
             flags: flags.into(),
             cluster: cluster.into(),
             confidence: confidence.into(),
+            moving: moving.into(),
             clusters,
         }
     })

@@ -8,8 +8,8 @@ use tonic::metadata::MetadataMap;
 use super::proto;
 use crate::api::error::ApiError;
 use crate::api::results::Answer;
-use crate::flow::Cluster;
-use crate::formats::ego_motion;
+use crate::flow::{Cluster, RigidTransform};
+use crate::formats::{ego_motion, rigid_motion};
 use crate::job::{
     DenseReport, Densify, DeviceChoice, EgoChoice, FieldChoices, GroundChoice, Job, JobError,
     JobId, JobOptions, JobProgress, Kind, LaterSweepsChoice, PrecisionChoice, PresetChoice,
@@ -130,13 +130,31 @@ fn ego(named: i32, motion: &[f64]) -> Result<Option<EgoChoice>, ApiError> {
         (proto::Ego::Off, 0) => Ok(Some(EgoChoice::Off)),
         (proto::Ego::Auto, 0) => Ok(Some(EgoChoice::Auto)),
         (proto::Ego::Unspecified, 16) => {
-            let rows =
-                core::array::from_fn(|row| core::array::from_fn(|column| motion[4 * row + column]));
-            let motion = ego_motion(&rows).map_err(|error| invalid(&error.to_string()))?;
+            let motion =
+                ego_motion(&matrix(motion)).map_err(|error| invalid(&error.to_string()))?;
             Ok(Some(EgoChoice::Given(motion)))
         }
         (proto::Ego::Unspecified, _) => Err(invalid("ego_motion has 16 numbers, row by row")),
         _ => Err(invalid("ego and ego_motion exclude each other")),
+    }
+}
+
+/// A 4 x 4 matrix from its 16 numbers, row by row.
+fn matrix(numbers: &[f64]) -> [[f64; 4]; 4] {
+    core::array::from_fn(|row| core::array::from_fn(|column| numbers[4 * row + column]))
+}
+
+/// The pose of a sweep: none, or 16 numbers. `sweep` is its name for errors, which may be empty.
+pub(super) fn pose(sweep: &str, numbers: &[f64]) -> Result<Option<RigidTransform>, ApiError> {
+    let sweep = if sweep.is_empty() { "a sweep" } else { sweep };
+    let refused = |text: String| ApiError::BadInput(format!("the pose of {sweep}: {text}"));
+    match numbers.len() {
+        0 => Ok(None),
+        16 => match rigid_motion(&matrix(numbers)) {
+            Ok(pose) => Ok(Some(pose)),
+            Err(error) => Err(refused(error.to_string())),
+        },
+        count => Err(refused(format!("{count} numbers where 16 are needed"))),
     }
 }
 
@@ -278,6 +296,7 @@ pub(super) fn cluster(cluster: &Cluster) -> proto::Cluster {
         velocity: cluster.velocity.to_vec(),
         yaw_rate: cluster.yaw_rate,
         confidence: cluster.confidence,
+        moving: cluster.moving,
     }
 }
 

@@ -177,9 +177,9 @@ impl Reader {
                     return Err(ApiError::BadRequest(text));
                 }
                 Some(Part::Sweep(sweep)) => current.replace(Coming {
+                    cloud: CloudBuilder::with_pose(convert::pose(&sweep.name, &sweep.pose)?),
                     name: sweep.name,
                     points: sweep.points,
-                    cloud: CloudBuilder::default(),
                 }),
                 Some(Part::Begin(_)) => return Err(no_begin()),
                 None if ended => current.take(),

@@ -10,7 +10,7 @@ use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::multipart::{Body, PairFiles, Part};
+use super::multipart::{Body, PairFiles, Part, bad_poses};
 use super::named::Named;
 use super::prefer::Prefer;
 use super::problem::Problem;
@@ -22,6 +22,7 @@ use crate::api::codec::AnswerFormat;
 use crate::api::error::ApiError;
 use crate::api::pending_job::{Accepted, PendingJob, ReceivedAt, Request as JobRequest};
 use crate::api::service::{MakeDurable, Service, Waited};
+use crate::formats::PoseFile;
 use crate::job::{Job, JobId, JobOptions, Kind, State as JobState};
 use crate::queue::PairOf;
 
@@ -167,6 +168,7 @@ async fn read_pair(
     while let Some(part) = body.next().await? {
         match part {
             Part::Options(read) => options = read,
+            Part::Poses(_) => return Err(poses_of_a_pair()),
             Part::File(part, name, bytes) => {
                 files.take(&part, name, bytes)?;
             }
@@ -213,7 +215,7 @@ pub(super) async fn submit_job(
 
 /// Submits a sequence of sweeps as a job, for the flow of each consecutive pair.
 ///
-/// The `options` part must precede the sweeps. The result is a zip archive with one flow per pair.
+/// The parts `options` and `poses` must precede the sweeps. The result is a zip archive with one flow per pair.
 /// Each pair is a separate job, and its flow is available as soon as that job has succeeded. With
 /// `densify` the result is one dense cloud: the points of all sweeps, transformed to one reference
 /// time.
@@ -275,13 +277,15 @@ async fn read_job(
     let mut files = PairFiles::default();
     let mut options = JobOptions::default();
     let mut sweeps: Option<PendingJob> = None;
+    let mut poses: Option<Arc<PoseFile>> = None;
     while let Some(part) = body.next().await? {
         match part {
-            Part::Options(_) if sweeps.is_some() => {
-                let text = "options come before the sweeps";
+            Part::Options(_) | Part::Poses(_) if sweeps.is_some() => {
+                let text = "options and poses come before the sweeps";
                 return Err(ApiError::BadRequest(text.to_owned()));
             }
             Part::Options(read) => options = read,
+            Part::Poses(read) => poses = Some(Arc::new(read)),
             Part::File(part, name, bytes) if part == "sweep" && files.is_empty() => {
                 let pending = match &mut sweeps {
                     Some(pending) => pending,
@@ -290,8 +294,8 @@ async fn read_job(
                         none.insert(PendingJob::begin(service, caller.clone(), request)?)
                     }
                 };
-                let index = format!("sweep {}", pending.sweeps());
-                let (cloud, room) = body.cloud(index, name, bytes).await?;
+                let index = pending.sweeps();
+                let (cloud, room) = body.sweep(index, name, bytes, poses.as_ref()).await?;
                 pending.push(cloud, Some(room)).await?;
             }
             Part::File(part, name, bytes) => files.take(&part, name, bytes)?,
@@ -302,7 +306,14 @@ async fn read_job(
             let text = "send source and target, or sweeps, but not both";
             Err(ApiError::BadRequest(text.to_owned()))
         }
-        Some(pending) => Ok((pending, Kind::Sequence)),
+        Some(pending) => {
+            if let Some(poses) = poses {
+                let counted = poses.check_count(pending.sweeps() as usize);
+                counted.map_err(bad_poses)?;
+            }
+            Ok((pending, Kind::Sequence))
+        }
+        None if poses.is_some() => Err(poses_of_a_pair()),
         None => {
             options.check_for_pairs()?;
             let request = asked.job_request(options, Durability::Durable);
@@ -311,6 +322,11 @@ async fn read_job(
             Ok((pending, Kind::Pair))
         }
     }
+}
+
+fn poses_of_a_pair() -> ApiError {
+    let text = "poses are those of a sequence's sweeps; a pair takes its motion as the option ego";
+    ApiError::BadRequest(text.to_owned())
 }
 
 /// The 202 response with the location of the job.

@@ -18,6 +18,7 @@ use crate::api::pending_job::PendingJob;
 use crate::api::service::Service;
 use crate::api::upload_budget::UploadReservation;
 use crate::formats;
+use crate::formats::{FormatError, PoseFile};
 use crate::job::JobOptions;
 use crate::payload::StoredCloud;
 
@@ -26,6 +27,9 @@ const MULTIPART: &[u8] = b"multipart/form-data";
 
 /// Maximum size of the `options` part, bytes.
 const MAX_OPTIONS: usize = 64 << 10;
+
+/// Maximum size of the `poses` part, bytes: more than 2,500 poses as JSON.
+const MAX_POSES: usize = 1 << 20;
 
 /// The parts of a request with one pair.
 #[derive(ToSchema)]
@@ -48,6 +52,12 @@ pub(super) struct PairBody {
 pub(super) struct SequenceBody {
     /// The options of the estimate, as one JSON object. This part must precede the sweeps.
     options: Option<JobOptions>,
+    /// The poses `world_from_sensor` of the sweeps: KITTI's text, a JSON array of 4 x 4 matrices, or
+    /// Argoverse 2's table. Text and JSON have one pose for each sweep, in order; the table has them
+    /// by the timestamps in the names of the sweeps. This part must precede the sweeps. By default
+    /// the ego motion is estimated.
+    #[schema(value_type = Option<String>, format = Binary)]
+    poses: Option<Vec<u8>>,
     /// The sweeps in the order of time, in any supported file format. Each sweep is a separate part
     /// named `sweep`.
     #[schema(value_type = Vec<String>, format = Binary)]
@@ -61,6 +71,7 @@ pub(super) struct Body {
     meter: Meter,
     room: UploadReservation,
     has_options: bool,
+    has_poses: bool,
     decode_seconds: f64,
 }
 
@@ -68,6 +79,8 @@ pub(super) struct Body {
 pub(super) enum Part {
     /// The options.
     Options(JobOptions),
+    /// The poses of the sweeps.
+    Poses(PoseFile),
     /// A file: the name of the part, the name of the file, and the contents.
     File(String, Option<String>, Vec<u8>),
 }
@@ -95,6 +108,7 @@ impl Body {
             meter,
             room: service.uploads.room(&caller.tenant),
             has_options: false,
+            has_poses: false,
             decode_seconds: 0.0,
         })
     }
@@ -126,12 +140,21 @@ impl Body {
                 let bytes = reading.whole(field, MAX_OPTIONS).await?;
                 Ok(Some(Part::Options(JobOptions::from_json(&bytes)?)))
             }
+            "poses" if self.has_poses => {
+                Err(ApiError::BadRequest("poses is there twice".to_owned()))
+            }
+            "poses" => {
+                self.has_poses = true;
+                let bytes = reading.whole(field, MAX_POSES).await?;
+                let read = move || PoseFile::open(bytes).map_err(bad_poses);
+                Ok(Some(Part::Poses(self.timed(read).await?)))
+            }
             "source" | "target" | "sweep" => {
                 let bytes = reading.whole(field, usize::MAX).await?;
                 Ok(Some(Part::File(name, file, bytes)))
             }
             other => Err(ApiError::BadRequest(format!(
-                "there is no part named {other:?}; known are source, target, sweep and options"
+                "there is no part named {other:?}; known are source, target, sweep, poses and options"
             ))),
         }
     }
@@ -155,6 +178,28 @@ impl Body {
             Ok((cloud, room))
         })
         .await
+    }
+
+    /// Decodes the sweep with index `index` as [`Body::cloud`], and gives it its pose.
+    ///
+    /// # Errors
+    /// Also [`ApiError::BadInput`] if `poses` has none for it.
+    pub(super) async fn sweep(
+        &mut self,
+        index: u32,
+        name: Option<String>,
+        bytes: Vec<u8>,
+        poses: Option<&Arc<PoseFile>>,
+    ) -> Result<(StoredCloud, UploadReservation), ApiError> {
+        let part = format!("sweep {index}");
+        let (mut cloud, room) = self.cloud(part, name.clone(), bytes).await?;
+        if let Some(poses) = poses {
+            let poses = Arc::clone(poses);
+            let name = name.unwrap_or_default();
+            let read = move || poses.pose(index as usize, &name).map_err(bad_poses);
+            cloud.pose = Some(self.timed(read).await?);
+        }
+        Ok((cloud, room))
     }
 
     /// Decodes a file that contains both clouds of a pair.
@@ -237,6 +282,11 @@ fn check_head(service: &Service, caller: &Caller, request: &Request) -> Result<(
         )));
     }
     Ok(())
+}
+
+/// The error of a file of poses.
+pub(super) fn bad_poses(error: FormatError) -> ApiError {
+    codec::in_part("poses", error)
 }
 
 fn not_multipart() -> ApiError {

@@ -30,7 +30,8 @@ pub(super) struct Scores {
     paper: Pool,
     argoverse2: Argoverse2Pool,
     buckets: BucketNormalized,
-    reliability: Reliability,
+    confidence: Reliability,
+    moving: Reliability,
 }
 
 impl Default for Scores {
@@ -39,7 +40,8 @@ impl Default for Scores {
             paper: Pool::default(),
             argoverse2: Argoverse2Pool::default(),
             buckets: BucketNormalized::new(CLASSES.len() as u8),
-            reliability: Reliability::default(),
+            confidence: Reliability::default(),
+            moving: Reliability::default(),
         }
     }
 }
@@ -70,8 +72,14 @@ impl Scores {
             self.buckets.add(&flow.flow, covered, &classes, &truth)?;
         }
         if let Some(confidence) = &flow.confidence {
-            self.reliability
-                .add_pair(&flow.flow, covered, confidence, &truth)?;
+            self.confidence
+                .add_confidence(&flow.flow, covered, confidence, &truth)?;
+        }
+        if let Some(moving) = &flow.moving
+            && truth.dynamic.is_some()
+        {
+            self.moving
+                .add_moving(&flow.flow, covered, moving, &truth)?;
         }
         Ok(())
     }
@@ -99,7 +107,8 @@ impl Scores {
                 three_way: argoverse2.three_way.map(ThreeWayReport::from),
             },
             bucket_normalized: BucketNormalizedReport::new(&self.buckets.finish()),
-            confidence: self.reliability.finish().map(ConfidenceReport::from),
+            confidence: self.confidence.finish().map(ConfidenceReport::from),
+            moving: self.moving.finish().map(MovingReport::from),
         })
     }
 }
@@ -121,6 +130,7 @@ pub(super) struct Report {
     argoverse2: Argoverse2Report,
     bucket_normalized: Option<BucketNormalizedReport>,
     confidence: Option<ConfidenceReport>,
+    moving: Option<MovingReport>,
 }
 
 #[derive(Debug, Serialize)]
@@ -161,6 +171,15 @@ struct ConfidenceReport {
     calibration_error: f64,
     sure_half_epe: f64,
     rest_epe: f64,
+}
+
+/// The chance that a point moves. Recall and precision are of the points with 0.5 or more; null where
+/// none moves, or none has that.
+#[derive(Debug, Serialize)]
+struct MovingReport {
+    calibration_error: f64,
+    recall: Option<f64>,
+    precision: Option<f64>,
 }
 
 impl From<ThreeWay> for ThreeWayReport {
@@ -211,10 +230,21 @@ impl From<Calibration> for ConfidenceReport {
     }
 }
 
+impl From<Calibration> for MovingReport {
+    fn from(calibration: Calibration) -> Self {
+        Self {
+            calibration_error: calibration.error,
+            recall: calibration.recall,
+            precision: calibration.precision,
+        }
+    }
+}
+
 impl Report {
     /// Prints the scores as text.
     pub(super) fn print(&self) -> Result<(), Failure> {
         let metres = |value: Option<f64>| value.map_or("-".to_owned(), |m| format!("{m:.4} m"));
+        let share = |value: Option<f64>| value.map_or("-".to_owned(), |v| format!("{v:.3}"));
         say(format_args!("{} points scored", grouped(self.points)))?;
         say(format_args!("  EPE          {:.4} m", self.epe))?;
         say(format_args!("    moving     {}", metres(self.epe_dynamic)))?;
@@ -235,7 +265,6 @@ impl Report {
             say(format_args!("  moving IoU   {iou:.4}"))?;
         }
         if let Some(buckets) = &self.bucket_normalized {
-            let share = |value: Option<f64>| value.map_or("-".to_owned(), |v| format!("{v:.3}"));
             say(format_args!(
                 "  bucket-normalized moving {}, static {} (within 35 m; 1 is no motion at all)",
                 share(buckets.dynamic_error),
@@ -246,6 +275,14 @@ impl Report {
             say(format_args!(
                 "  confidence   surer half {:.4} m, rest {:.4} m, calibration error {:.3}",
                 confidence.sure_half_epe, confidence.rest_epe, confidence.calibration_error
+            ))?;
+        }
+        if let Some(moving) = &self.moving {
+            say(format_args!(
+                "  moving from a chance of 0.5: recall {}, precision {}, calibration error {:.3}",
+                share(moving.recall),
+                share(moving.precision),
+                moving.calibration_error
             ))?;
         }
         Ok(())

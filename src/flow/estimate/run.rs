@@ -9,7 +9,7 @@ use crate::flow::data::{Control, DYNAMIC_M, Point, transform_point};
 use crate::flow::error::FlowError;
 use crate::flow::field::{Backend, Snapshot, SnapshotError};
 use crate::flow::motion::MotionField;
-use crate::flow::objects::confidence_of_ground;
+use crate::flow::objects::Chances;
 use crate::flow::options::{CERTAIN_OVERLAP, Ego, LEAST_OVERLAP, Method, Options};
 use crate::flow::problem::Problem;
 use crate::flow::select::select;
@@ -124,13 +124,15 @@ fn assemble(input: &Input<'_>, solved: Solved, began: f64) -> Estimate {
             flow[row] = core::array::from_fn(|a| to[a] - from[a]);
             valid[row] = true;
             if let Some(objects) = &mut objects {
-                objects.confidence[row] = confidence_of_ground(to[0].hypot(to[1]));
+                let chances = Chances::of_ground(to[0].hypot(to[1]));
+                objects.confidence[row] = chances.confidence;
+                objects.moving[row] = chances.moving;
             }
         }
     }
     if let Some(objects) = objects {
         objects.clear_invalid(&valid);
-        objects.scale_confidence(certainty(overlap));
+        objects.scale_chances(certainty(overlap));
     }
     Estimate {
         flow,

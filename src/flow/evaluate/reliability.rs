@@ -1,8 +1,9 @@
-//! Calibration of the confidence: reliability diagram and expected calibration error.
+//! Calibration of the two chances of a point: reliability diagram and expected calibration error.
 //!
-//! A point is correct if its end-point error is below [`CONFIDENT_WITHIN_M`]. The expected
-//! calibration error is the mean absolute difference between confidence and share of correct points
-//! over ten confidence bins, weighted by points (Guo et al. 2017).
+//! The confidence is right if the end-point error is below [`CONFIDENT_WITHIN_M`], the chance of
+//! motion if the point moves. The expected calibration error is the mean absolute difference
+//! between the chance and the share of points where it is right, over ten bins of the chance,
+//! weighted by points (Guo et al. 2017).
 
 use super::truth::{EvaluateError, Truth, double, end_point_error};
 use crate::flow::data::Point;
@@ -10,13 +11,13 @@ use crate::flow::objects::CONFIDENT_WITHIN_M;
 
 /// Bins of the reliability diagram.
 const BINS: usize = 10;
-/// Histogram cells of the confidence, in which errors are summed. Points in one cell are not
+/// Histogram cells of the chance, in which errors are summed. Points in one cell are not
 /// distinguished.
 const CELLS: usize = 1000 * BINS;
 
-/// Accumulator of confidences and end-point errors over many pairs, in constant memory.
+/// Accumulator of chances and end-point errors over many pairs, in constant memory.
 ///
-/// Confidences are counted in 10,000 cells of equal width. Points in the same cell are not
+/// Chances are counted in 10,000 cells of equal width. Points in the same cell are not
 /// distinguished: each counts with the mean error of its cell.
 #[derive(Clone, Debug)]
 pub struct Reliability {
@@ -25,22 +26,27 @@ pub struct Reliability {
 
 #[derive(Clone, Copy, Debug, Default)]
 struct Cell {
-    confidence: f64,
+    chance: f64,
     error_m: f64,
     right: f64,
     points: f64,
 }
 
-/// Calibration of a confidence. A point is correct if its end-point error is below
-/// [`CONFIDENT_WITHIN_M`].
+/// Calibration of a chance.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Calibration {
     /// Number of points.
     pub points: usize,
-    /// Expected calibration error, 0 to 1: the mean absolute difference between the confidence and
-    /// the share of correct points over the bins, weighted by points (Guo et al. 2017).
+    /// Expected calibration error, 0 to 1: the mean absolute difference between the chance and the
+    /// share of points where it is right over the bins, weighted by points (Guo et al. 2017).
     pub error: f64,
-    /// EPE of the half of the points with the higher confidence, metres. A cell across the boundary
+    /// Share, 0 to 1, of the points where the chance is right that have a chance of 0.5 or more. None
+    /// if it is right nowhere.
+    pub recall: Option<f64>,
+    /// Share, 0 to 1, of the points with a chance of 0.5 or more where it is right. None if there
+    /// are none.
+    pub precision: Option<f64>,
+    /// EPE of the half of the points with the higher chance, metres. A cell across the boundary
     /// between the halves counts partly in each, with its mean error.
     pub sure_half_epe: f64,
     /// EPE of the other half, metres.
@@ -55,9 +61,9 @@ pub struct Calibration {
 pub struct CalibrationBin {
     /// Share of all points that are in the bin, 0 to 1.
     pub share: f64,
-    /// Mean confidence of its points, 0 to 1.
-    pub confidence: f64,
-    /// Share of its points that are correct, 0 to 1.
+    /// Mean chance of its points, 0 to 1.
+    pub chance: f64,
+    /// Share of its points where the chance is right, 0 to 1.
     pub right: f64,
 }
 
@@ -70,15 +76,15 @@ impl Default for Reliability {
 }
 
 impl Reliability {
-    /// Adds a point with a confidence of 0 to 1 and an end-point error of `error_m` metres. A lower
-    /// confidence counts in the first bin, a higher one in the last. The values must not be NaN,
-    /// because the results that use them would be NaN.
-    pub fn add(&mut self, confidence: f64, error_m: f64) {
-        let cell = ((confidence * CELLS as f64) as usize).min(CELLS - 1);
+    /// Adds a point with a chance of 0 to 1, whether that is `right`, and an end-point error of
+    /// `error_m` metres. A lower chance counts in the first bin, a higher one in the last. The
+    /// values must not be NaN, because the results that use them would be NaN.
+    pub fn add(&mut self, chance: f64, right: bool, error_m: f64) {
+        let cell = ((chance * CELLS as f64) as usize).min(CELLS - 1);
         let cell = &mut self.cells[cell];
-        cell.confidence += confidence;
+        cell.chance += chance;
         cell.error_m += error_m;
-        cell.right += f64::from(u8::from(error_m < f64::from(CONFIDENT_WITHIN_M)));
+        cell.right += f64::from(u8::from(right));
         cell.points += 1.0;
     }
 
@@ -89,18 +95,49 @@ impl Reliability {
     ///
     /// # Errors
     /// [`EvaluateError::Length`] if the arrays have different lengths; nothing is added then.
-    pub fn add_pair(
+    pub fn add_confidence(
         &mut self,
         flow: &[Point],
         covered: &[bool],
         confidence: &[f32],
         truth: &Truth,
     ) -> Result<(), EvaluateError> {
+        let right = |_row: usize, error_m: f64| error_m < f64::from(CONFIDENT_WITHIN_M);
+        self.add_pair(flow, covered, confidence, truth, right)
+    }
+
+    /// As [`Self::add_confidence`], for N chances that the points move.
+    ///
+    /// # Errors
+    /// Also [`EvaluateError::Missing`] if the truth does not say which points move.
+    pub fn add_moving(
+        &mut self,
+        flow: &[Point],
+        covered: &[bool],
+        moving: &[f32],
+        truth: &Truth,
+    ) -> Result<(), EvaluateError> {
+        let missing = EvaluateError::Missing {
+            what: "dynamic mask",
+        };
+        let dynamic = truth.dynamic.ok_or(missing)?;
+        let right = |row: usize, _error_m: f64| dynamic[row];
+        self.add_pair(flow, covered, moving, truth, right)
+    }
+
+    fn add_pair(
+        &mut self,
+        flow: &[Point],
+        covered: &[bool],
+        chances: &[f32],
+        truth: &Truth,
+        right: impl Fn(usize, f64) -> bool,
+    ) -> Result<(), EvaluateError> {
         truth.check_lengths(flow, covered)?;
-        truth.check_length("the confidence", Some(confidence.len()))?;
+        truth.check_length("the chance", Some(chances.len()))?;
         for row in truth.scored(flow, covered) {
             let error_m = end_point_error(double(flow[row]), double(truth.flow[row]));
-            self.add(f64::from(confidence[row]), error_m);
+            self.add(f64::from(chances[row]), right(row, error_m), error_m);
         }
         Ok(())
     }
@@ -109,7 +146,7 @@ impl Reliability {
     pub fn finish(&self) -> Option<Calibration> {
         let sum = |cells: &[Cell]| {
             cells.iter().fold(Cell::default(), |sum, cell| Cell {
-                confidence: sum.confidence + cell.confidence,
+                chance: sum.chance + cell.chance,
                 error_m: sum.error_m + cell.error_m,
                 right: sum.right + cell.right,
                 points: sum.points + cell.points,
@@ -124,13 +161,14 @@ impl Reliability {
             .filter(|bin| bin.points > 0.0)
             .map(|bin| CalibrationBin {
                 share: bin.points / all.points,
-                confidence: bin.confidence / bin.points,
+                chance: bin.chance / bin.points,
                 right: bin.right / bin.points,
             })
             .collect();
         let off = bins
             .iter()
-            .map(|bin| bin.share * (bin.confidence - bin.right).abs());
+            .map(|bin| bin.share * (bin.chance - bin.right).abs());
+        let upper = sum(&self.cells[CELLS / 2..]);
         // The cell that contains the median counts partly in each half.
         let (mut left, mut sure_m) = (all.points / 2.0, 0.0);
         for cell in self.cells.iter().rev().filter(|cell| cell.points > 0.0) {
@@ -141,6 +179,8 @@ impl Reliability {
         Some(Calibration {
             points: all.points as usize,
             error: off.sum(),
+            recall: (all.right > 0.0).then(|| upper.right / all.right),
+            precision: (upper.points > 0.0).then(|| upper.right / upper.points),
             sure_half_epe: sure_m / (all.points / 2.0),
             rest_epe: (all.error_m - sure_m) / (all.points / 2.0),
             bins,
@@ -171,12 +211,13 @@ mod tests {
             (0.25, 0.5),
             (0.25, 0.1),
         ] {
-            reliability.add(confidence, error_m);
+            reliability.add(confidence, error_m < 0.05, error_m);
         }
         let found = reliability.finish().expect("points");
         assert_eq!(found.points, 6);
         let expected = 4.0 / 6.0 * 0.15 + 2.0 / 6.0 * 0.25;
         assert!((found.error - expected).abs() < ROUNDING, "{found:?}");
+        assert_eq!((found.recall, found.precision), (Some(1.0), Some(0.75)));
         // Three of the four points in the upper cell, each with the mean error of the cell.
         assert!((found.sure_half_epe - 0.09).abs() < ROUNDING, "{found:?}");
         let rest = (0.09 + 0.6) / 3.0;
@@ -188,8 +229,8 @@ mod tests {
     #[test]
     fn the_ends_of_the_scale_have_bins_too() {
         let mut reliability = Reliability::default();
-        reliability.add(0.0, 1.0);
-        reliability.add(1.0, 0.0);
+        reliability.add(0.0, false, 1.0);
+        reliability.add(1.0, true, 0.0);
         let found = reliability.finish().expect("points");
         assert_eq!((found.error, found.bins.len()), (0.0, 2));
         assert_eq!((found.sure_half_epe, found.rest_epe), (0.0, 1.0));
@@ -201,13 +242,27 @@ mod tests {
         let truth = Truth::new(&truth, &[true, false]);
         let mut reliability = Reliability::default();
         let flow = [[0.0; 3]; 2];
-        let added = reliability.add_pair(&flow, &[true; 2], &[0.5; 2], &truth);
+        let added = reliability.add_confidence(&flow, &[true; 2], &[0.5; 2], &truth);
         assert_eq!(added, Ok(()));
         assert_eq!(reliability.finish().map(|found| found.points), Some(1));
         assert!(
             reliability
-                .add_pair(&flow, &[true; 2], &[0.5], &truth)
+                .add_confidence(&flow, &[true; 2], &[0.5], &truth)
                 .is_err()
         );
+        assert!(
+            reliability
+                .add_moving(&flow, &[true; 2], &[0.5; 2], &truth)
+                .is_err()
+        );
+        let truth = Truth {
+            dynamic: Some(&[true, true]),
+            ..truth
+        };
+        let mut moving = Reliability::default();
+        let added = moving.add_moving(&flow, &[true; 2], &[0.75; 2], &truth);
+        assert_eq!(added, Ok(()));
+        let found = moving.finish().map(|found| (found.points, found.recall));
+        assert_eq!(found, Some((1, Some(1.0))));
     }
 }

@@ -1,9 +1,10 @@
-//! Confidence of a point's flow: the probability that its end-point error is below
-//! [`CONFIDENT_WITHIN_M`].
+//! Two chances of a point: its confidence, which is the probability that its end-point error is
+//! below [`CONFIDENT_WITHIN_M`], and the probability that it moves by at least
+//! [`crate::flow::DYNAMIC_M`].
 //!
-//! Logistic regressions on the features: one for moving points, one for static points and one for
-//! ground. They are fitted to labelled and simulated pairs (`benches/accuracy/confidence.rs`,
-//! `docs/experiments/confidence.md`).
+//! Logistic regressions on the same features, for each chance one of moving points, one of static
+//! points and one of ground. They are fitted to labelled and simulated pairs
+//! (`benches/accuracy/confidence.rs`, `docs/experiments/confidence.md`).
 
 use super::features::ConfidenceFeatures;
 
@@ -12,21 +13,68 @@ use super::features::ConfidenceFeatures;
 pub const CONFIDENT_WITHIN_M: f32 = 0.05;
 
 /// Number of features.
-const FEATURES: usize = 12;
+const FEATURES: usize = 13;
 
-/// Weights for moving points, in the order of [`ConfidenceFeatures::features`].
-const MOVING: [f32; FEATURES] = [
-    6.090, 0.710, -0.379, 0.340, -4.731, -3.398, -11.741, 0.000, 9.903, 0.619, -0.195, -4.113,
-];
-/// Weights for static points, in the same order.
-const STANDING: [f32; FEATURES] = [
-    3.015, -0.347, -0.085, -0.186, -1.031, 1.102, 1.412, -0.402, -2.539, 0.708, 0.529, 1.307,
-];
-/// Weights for ground, which gets the ego motion alone: of the constant, and of [`range`].
-const GROUND: [f32; 2] = [5.792, -0.522];
+/// Weights of the logistic regressions of one chance. Features beyond the weights are not used.
+struct Weights {
+    /// Of moving points, in the order of [`ConfidenceFeatures::features`].
+    moving: &'static [f32],
+    /// Of static points, in the same order.
+    standing: &'static [f32],
+    /// Of ground, which gets the ego motion alone: of the constant, and of [`range`].
+    ground: [f32; 2],
+}
+
+/// Weights of the confidence. It does not use the displacement.
+const WITHIN: Weights = Weights {
+    moving: &[
+        6.090, 0.710, -0.379, 0.340, -4.731, -3.398, -11.741, 0.000, 9.903, 0.619, -0.195, -4.113,
+    ],
+    standing: &[
+        3.015, -0.347, -0.085, -0.186, -1.031, 1.102, 1.412, -0.402, -2.539, 0.708, 0.529, 1.307,
+    ],
+    ground: [5.792, -0.522],
+};
+
+/// Weights of the chance that a point moves.
+const MOVES: Weights = Weights {
+    moving: &[
+        1.558, 1.855, 0.016, 0.002, -1.936, -9.556, -9.700, 0.000, 1.107, 3.667, -1.624, -6.284,
+        5.095,
+    ],
+    standing: &[
+        -3.015, 0.347, 0.085, 0.186, 1.031, -1.102, -1.412, 0.402, 2.539, -0.708, -0.529, -1.307,
+        0.000,
+    ],
+    ground: [-5.792, 0.522],
+};
+
+/// The two chances of a point, 0 to 1.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Chances {
+    /// The probability that the end-point error of the point's flow is below
+    /// [`CONFIDENT_WITHIN_M`].
+    pub confidence: f32,
+    /// The probability that the point is displaced by at least [`crate::flow::DYNAMIC_M`], ego
+    /// motion taken out.
+    pub moving: f32,
+}
+
+impl Chances {
+    /// The chances of a point that was taken for ground, whose flow is the ego motion alone. It
+    /// moves if it is of an object that the segmentation of the ground took in. `range_m` is its
+    /// horizontal distance from the origin of the target's frame, metres.
+    pub fn of_ground(range_m: f32) -> Self {
+        let features = [1.0, range(range_m)];
+        Self {
+            confidence: chance(&WITHIN.ground, &features),
+            moving: chance(&MOVES.ground, &features),
+        }
+    }
+}
 
 impl ConfidenceFeatures {
-    /// The 12 inputs of the logistic regression, without units and scaled to the order of one. In
+    /// The 13 inputs of the logistic regression, without units and scaled to the order of one. In
     /// this order, with the fields of this type and lengths in metres:
     ///
     /// - the constant 1,
@@ -40,7 +88,8 @@ impl ConfidenceFeatures {
     /// - `1 - together`,
     /// - `ln(1 + extent_m[0])`,
     /// - the square of that,
-    /// - `min(extent_m[1], 3) / 3`.
+    /// - `min(extent_m[1], 3) / 3`,
+    /// - `ln(1 + displacement_m / 0.1)`.
     pub fn features(&self) -> [f32; FEATURES] {
         /// Distance that is scaled to one, metres.
         const DISTANCE_M: f32 = 0.1;
@@ -61,24 +110,21 @@ impl ConfidenceFeatures {
             length,
             length * length,
             self.extent_m[1].min(HEIGHT_M) / HEIGHT_M,
+            (1.0 + self.displacement_m / DISTANCE_M).ln(),
         ]
     }
 
-    /// The probability, 0 to 1, that the end-point error of the point's flow is below
-    /// [`CONFIDENT_WITHIN_M`]. It is a logistic regression on [`Self::features`], with separate
-    /// weights for moving and static points. The weights are fitted by
-    /// `benches/accuracy/confidence.rs`; see `docs/experiments/confidence.md`.
-    pub fn confidence(&self) -> f32 {
-        let weights = if self.moves { &MOVING } else { &STANDING };
-        chance(weights, &self.features())
+    /// The chances of the point: logistic regressions on [`Self::features`], with separate weights
+    /// for moving and static points. The weights are fitted by `benches/accuracy/confidence.rs`; see
+    /// `docs/experiments/confidence.md`.
+    pub fn chances(&self) -> Chances {
+        let features = self.features();
+        let weights = |of: &Weights| if self.moves { of.moving } else { of.standing };
+        Chances {
+            confidence: chance(weights(&WITHIN), &features),
+            moving: chance(weights(&MOVES), &features),
+        }
     }
-}
-
-/// The probability, 0 to 1, that the end-point error of a ground point is below
-/// [`CONFIDENT_WITHIN_M`]. The flow of the point is the ego motion alone. `range_m` is its
-/// horizontal distance from the origin of the target's frame, metres.
-pub fn confidence_of_ground(range_m: f32) -> f32 {
-    chance(&GROUND, &[1.0, range(range_m)])
 }
 
 /// Logarithmic scale of ranges.

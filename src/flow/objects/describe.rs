@@ -16,6 +16,9 @@ pub struct Objects {
     /// [`super::CONFIDENT_WITHIN_M`]. Zero for rows without a flow. Zero also for rows off the
     /// ground if the search was interrupted before or right after the clustering.
     pub confidence: Vec<f32>,
+    /// N chances, 0 to 1: the probability that a row's point is displaced by at least
+    /// [`DYNAMIC_M`], ego motion taken out. Zero wherever the confidence is.
+    pub moving: Vec<f32>,
     /// K clusters, in descending order of their number of points.
     pub clusters: Vec<Cluster>,
 }
@@ -41,6 +44,8 @@ pub struct Cluster {
     pub yaw_rate: f32,
     /// Mean confidence of its points, 0 to 1.
     pub confidence: f32,
+    /// Mean of [`Objects::moving`] of its points, 0 to 1.
+    pub moving: f32,
 }
 
 impl Objects {
@@ -62,10 +67,12 @@ impl Objects {
         let mut objects = Self {
             cluster: vec![Self::NONE; count],
             confidence: vec![0.0; count],
+            moving: vec![0.0; count],
             clusters: Vec::new(),
         };
         for (&row, evidence) in rows.iter().zip(&search.evidence) {
-            objects.confidence[row] = evidence.confidence();
+            let chances = evidence.chances();
+            (objects.confidence[row], objects.moving[row]) = (chances.confidence, chances.moving);
         }
         let ClusterLabels { of, motions } = &search.parts;
         let mut members: Vec<Vec<usize>> = vec![Vec::new(); motions.len()];
@@ -79,10 +86,14 @@ impl Objects {
         }
         let described = motions.par_iter().zip(&members).map(|(&motion, members)| {
             let points: Vec<Point> = members.iter().map(|&i| points[i]).collect();
-            let sure: f32 = members.iter().map(|&i| objects.confidence[rows[i]]).sum();
+            let mean = |chances: &[f32]| {
+                let sum: f32 = members.iter().map(|&i| chances[rows[i]]).sum();
+                sum / members.len().max(1) as f32
+            };
             let mut cluster = Cluster {
                 points: points.len() as u32,
-                confidence: sure / points.len().max(1) as f32,
+                confidence: mean(&objects.confidence),
+                moving: mean(&objects.moving),
                 ..Cluster::default()
             };
             let Some(motion) = motion else {
@@ -106,20 +117,22 @@ impl Objects {
         objects
     }
 
-    /// Multiplies the confidences of rows and clusters by `factor`, 0 to 1.
-    pub(crate) fn scale_confidence(&mut self, factor: f32) {
+    /// Multiplies the confidences and the chances of motion of rows and clusters by `factor`, 0 to
+    /// 1.
+    pub(crate) fn scale_chances(&mut self, factor: f32) {
         let clusters = self.clusters.iter_mut();
-        let of_clusters = clusters.map(|cluster| &mut cluster.confidence);
-        for confidence in self.confidence.iter_mut().chain(of_clusters) {
-            *confidence *= factor;
+        let of_clusters = clusters.flat_map(|of| [&mut of.confidence, &mut of.moving]);
+        let of_rows = self.confidence.iter_mut().chain(&mut self.moving);
+        for chance in of_rows.chain(of_clusters) {
+            *chance *= factor;
         }
     }
 
-    /// Sets the confidence of rows without a flow to zero.
+    /// Sets the confidence and the chance of motion of rows without a flow to zero.
     pub(crate) fn clear_invalid(&mut self, valid: &[bool]) {
-        for (confidence, &valid) in self.confidence.iter_mut().zip(valid) {
-            if !valid {
-                *confidence = 0.0;
+        for chances in [&mut self.confidence, &mut self.moving] {
+            for (chance, _) in chances.iter_mut().zip(valid).filter(|&(_, valid)| !valid) {
+                *chance = 0.0;
             }
         }
     }
@@ -198,5 +211,12 @@ mod tests {
             assert!((0.0..=1.0).contains(&confidence));
             assert!(valid == (confidence > 0.0));
         }
+        let mean = |dynamic: bool| {
+            let clusters = objects.clusters.iter().filter(|c| c.dynamic == dynamic);
+            let chances: Vec<f32> = clusters.map(|cluster| cluster.moving).collect();
+            chances.iter().sum::<f32>() / chances.len() as f32
+        };
+        let (moves, stands) = (mean(true), mean(false));
+        assert!(moves > 0.5 && stands < 0.1, "{moves} {stands}");
     }
 }

@@ -6,7 +6,7 @@ use super::assign::Assignment;
 use super::hypothesis::{Cost, Hypothesis};
 use super::motion_field::ObjectMotions;
 use super::scene::Scene;
-use crate::flow::data::Point;
+use crate::flow::data::{Point, square_distance};
 use crate::flow::options::ObjectOptions;
 use crate::flow::spatial::NOISE;
 
@@ -57,6 +57,8 @@ pub struct ConfidenceFeatures {
     /// Horizontal distance of the point, ego motion taken out, from the origin of the target's
     /// frame, metres.
     pub range_m: f32,
+    /// Displacement of the point by its motion, ego motion taken out, metres. Zero if it is static.
+    pub displacement_m: f32,
     /// Residual: distance of the point, moved by its motion, from the target, metres. At most
     /// [`ObjectOptions::truncation_m`], which it is if the moved point has no match.
     pub off_m: f32,
@@ -130,15 +132,13 @@ pub(super) fn evidence(
     let rows = source.par_iter().zip(labels).zip(point_motion);
     rows.map(|((&position, &label), &owner)| {
         let moves = owner != NOISE;
-        let (cluster, at) = if moves {
+        let (cluster, way) = if moves {
             let way = motions.displacement(owner, position);
-            (
-                movers[owner as usize],
-                core::array::from_fn(|a| position[a] + way[a]),
-            )
+            (movers[owner as usize], way)
         } else {
-            (label, position)
+            (label, [0.0; 3])
         };
+        let at = core::array::from_fn(|a| position[a] + way[a]);
         let target = scene.match_of(at, cluster);
         let truncation = scene.options.truncation_m;
         let off_m = target.map_or(truncation, |target| scene.distance(at, target));
@@ -153,6 +153,7 @@ pub(super) fn evidence(
         ConfidenceFeatures {
             moves,
             range_m: position[0].hypot(position[1]),
+            displacement_m: square_distance(at, position).sqrt(),
             off_m,
             hidden: target.is_none(),
             forward_m: cost.forward_m,

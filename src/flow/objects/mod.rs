@@ -30,7 +30,7 @@ mod search;
 #[cfg(test)]
 mod tests;
 
-pub use confidence::{CONFIDENT_WITHIN_M, confidence_of_ground};
+pub use confidence::{CONFIDENT_WITHIN_M, Chances};
 pub use describe::{Cluster, Objects};
 pub use features::ConfidenceFeatures;
 pub use labels::ClusterLabels;

@@ -1,5 +1,5 @@
 //! Flow as one JSON object: `flow` [[x, y, z], ...] in metres, `valid`, and where known `dynamic`,
-//! `ego`, `cluster`, `confidence` and `clusters`.
+//! `ego`, `cluster`, `confidence`, `moving` and `clusters`.
 //!
 //! Other keys are ignored when reading, so that an answer of the service can be read back.
 
@@ -27,6 +27,8 @@ struct Written<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
     confidence: Option<&'a [f32]>,
     #[serde(skip_serializing_if = "Option::is_none")]
+    moving: Option<&'a [f32]>,
+    #[serde(skip_serializing_if = "Option::is_none")]
     clusters: Option<Vec<Described>>,
 }
 
@@ -37,6 +39,7 @@ struct Read {
     dynamic: Option<Vec<bool>>,
     cluster: Option<Vec<i32>>,
     confidence: Option<Vec<f64>>,
+    moving: Option<Vec<f64>>,
     clusters: Option<Vec<Described>>,
 }
 
@@ -51,17 +54,21 @@ pub(super) fn read(bytes: &[u8]) -> Result<FlowFile, FormatError> {
             check_value(KIND, row, "flow.z", z)?,
         ]);
     }
-    let chances = |chances: Vec<f64>| {
-        let rows = chances.into_iter().enumerate();
-        let checked = rows.map(|(row, chance)| check_chance(KIND, row, "confidence", chance));
-        checked.collect::<Result<Vec<f32>, _>>()
+    let chances = |name: &str, chances: Option<Vec<f64>>| {
+        let rows = |chances: Vec<f64>| -> Result<Vec<f32>, FormatError> {
+            let rows = chances.into_iter().enumerate();
+            rows.map(|(row, chance)| check_chance(KIND, row, name, chance))
+                .collect()
+        };
+        chances.map(rows).transpose()
     };
     Ok(FlowFile {
         flow,
         valid: read.valid,
         dynamic: read.dynamic,
         cluster: read.cluster,
-        confidence: read.confidence.map(chances).transpose()?,
+        confidence: chances("confidence", read.confidence)?,
+        moving: chances("moving", read.moving)?,
         clusters: read.clusters.map(clusters).transpose()?,
     })
 }
@@ -83,6 +90,7 @@ pub(super) fn write<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), 
             ego: table.ego.map(matrix_rows),
             cluster: objects.map(|objects| objects.cluster.as_slice()),
             confidence: objects.map(|objects| objects.confidence.as_slice()),
+            moving: objects.map(|objects| objects.moving.as_slice()),
             clusters: objects.map(|objects| objects.clusters.iter().map(Described::from).collect()),
         },
     )

@@ -19,10 +19,12 @@ pub(super) fn put<W: Write + Seek>(
     let Objects {
         cluster,
         confidence,
+        moving,
         clusters,
     } = objects;
     npz.array("cluster", |out| npy::write_ids(out, cluster))?;
     npz.array("confidence", |out| npy::write_values(out, confidence))?;
+    npz.array("moving", |out| npy::write_values(out, moving))?;
     let points: Vec<u32> = clusters.iter().map(|cluster| cluster.points).collect();
     npz.array("clusters_points", |out| npy::write_counts(out, &points))?;
     let dynamic: Vec<bool> = clusters.iter().map(|cluster| cluster.dynamic).collect();
@@ -40,7 +42,8 @@ pub(super) fn put<W: Write + Seek>(
     };
     values("clusters_yaw", |cluster| cluster.bounds.yaw)?;
     values("clusters_yaw_rate", |cluster| cluster.yaw_rate)?;
-    values("clusters_confidence", |cluster| cluster.confidence)
+    values("clusters_confidence", |cluster| cluster.confidence)?;
+    values("clusters_moving", |cluster| cluster.moving)
 }
 
 /// Reads the clusters that [`put`] writes. `None` where the file has none.
@@ -80,6 +83,7 @@ pub(super) fn take(npz: &mut Npz<'_>) -> Result<Option<Vec<Cluster>>, FormatErro
     let yaws = values("clusters_yaw", check_value)?;
     let yaw_rates = values("clusters_yaw_rate", check_value)?;
     let confidence = values("clusters_confidence", check_chance)?;
+    let moving = values("clusters_moving", check_chance)?;
     let clusters = (0..count).map(|row| Cluster {
         points: counts[row],
         dynamic: dynamic[row],
@@ -91,6 +95,7 @@ pub(super) fn take(npz: &mut Npz<'_>) -> Result<Option<Vec<Cluster>>, FormatErro
         velocity: velocities[row],
         yaw_rate: yaw_rates[row],
         confidence: confidence[row],
+        moving: moving[row],
     });
     Ok(Some(clusters.collect()))
 }
@@ -107,6 +112,7 @@ pub(super) struct Described {
     velocity: Point,
     yaw_rate: f32,
     confidence: f32,
+    moving: f32,
 }
 
 impl From<&Cluster> for Described {
@@ -120,6 +126,7 @@ impl From<&Cluster> for Described {
             velocity: cluster.velocity,
             yaw_rate: cluster.yaw_rate,
             confidence: cluster.confidence,
+            moving: cluster.moving,
         }
     }
 }
@@ -133,6 +140,7 @@ impl Described {
             check_value(kind, row, "clusters", f64::from(value))?;
         }
         check_chance(kind, row, "clusters.confidence", f64::from(self.confidence))?;
+        check_chance(kind, row, "clusters.moving", f64::from(self.moving))?;
         Ok(Cluster {
             points: self.points,
             dynamic: self.dynamic,
@@ -144,6 +152,7 @@ impl Described {
             velocity: self.velocity,
             yaw_rate: self.yaw_rate,
             confidence: self.confidence,
+            moving: self.moving,
         })
     }
 }

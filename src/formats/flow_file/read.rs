@@ -22,8 +22,8 @@ use crate::formats::sniff::recognize;
 /// # Errors
 /// - `Unrecognized` and `Ambiguous` as for [`recognize`].
 /// - `Malformed` for a file that violates its format or is truncated. Also for a cluster index that
-///   is not a whole number of 32 bits or not below the number of clusters, and for a confidence
-///   outside of 0 to 1.
+///   is not a whole number of 32 bits or not below the number of clusters, and for a
+///   confidence or a chance of motion outside of 0 to 1.
 /// - `Unsupported` for raw floats, which hold a cloud, and for arrays or columns of another type or
 ///   shape.
 /// - `Missing` where the flow, or the center, size or velocity of the clusters, is missing.
@@ -48,6 +48,9 @@ pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatErr
                 confidence: npz.column("confidence", |row, chance| {
                     check_chance(kind, row, "confidence", chance)
                 })?,
+                moving: npz.column("moving", |row, chance| {
+                    check_chance(kind, row, "moving", chance)
+                })?,
                 clusters: objects::take(&mut npz)?,
             }
         }
@@ -60,6 +63,9 @@ pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatErr
                 cluster: table.column("cluster", |row, id| check_id(kind, row, "cluster", id))?,
                 confidence: table.column("confidence", |row, chance| {
                     check_chance(kind, row, "confidence", chance)
+                })?,
+                moving: table.column("moving", |row, chance| {
+                    check_chance(kind, row, "moving", chance)
                 })?,
                 clusters: None,
             }
@@ -88,6 +94,7 @@ pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatErr
         ("dynamic", file.dynamic.as_ref().map(Vec::len)),
         ("cluster", file.cluster.as_ref().map(Vec::len)),
         ("confidence", file.confidence.as_ref().map(Vec::len)),
+        ("moving", file.moving.as_ref().map(Vec::len)),
     ] {
         check_count(what, rows.unwrap_or(count), count)?;
     }
@@ -116,7 +123,7 @@ impl Rows {
     /// For a file in which the columns exist for which `has` is true.
     fn new(kind: FileKind, has: impl Fn(&str) -> bool) -> Self {
         let mut wanted = FLOW_AXES.to_vec();
-        let columns = ["valid", "dynamic", "cluster", "confidence"];
+        let columns = ["valid", "dynamic", "cluster", "confidence", "moving"];
         wanted.extend(columns.into_iter().filter(|column| has(column)));
         let file = FlowFile {
             flow: Vec::new(),
@@ -124,6 +131,7 @@ impl Rows {
             dynamic: has("dynamic").then(Vec::new),
             cluster: has("cluster").then(Vec::new),
             confidence: has("confidence").then(Vec::new),
+            moving: has("moving").then(Vec::new),
             clusters: None,
         };
         Self { kind, wanted, file }
@@ -157,6 +165,9 @@ impl Rows {
             }
             if let Some(confidence) = &mut file.confidence {
                 confidence.push(check_chance(kind, row, "confidence", next())?);
+            }
+            if let Some(moving) = &mut file.moving {
+                moving.push(check_chance(kind, row, "moving", next())?);
             }
             Ok(())
         })?;

@@ -21,7 +21,8 @@ pub struct FlowTable<'a> {
     pub valid: &'a [bool],
     /// N flags: whether the point moves relative to the static world, where known.
     pub dynamic: Option<&'a [bool]>,
-    /// The clusters of the N points, and the confidence of their flow, where known.
+    /// The clusters of the N points, the confidence of their flow and the chance that they move,
+    /// where known.
     pub objects: Option<&'a Objects>,
     /// The ego motion `target_from_source`, where known.
     pub ego: Option<&'a RigidTransform>,
@@ -40,6 +41,8 @@ pub struct FlowFile {
     pub cluster: Option<Vec<i32>>,
     /// N probabilities, 0 to 1, that the row's flow is less than 0.05 m off.
     pub confidence: Option<Vec<f32>>,
+    /// N probabilities, 0 to 1, that the row's point moves by 0.05 m or more, ego motion taken out.
+    pub moving: Option<Vec<f32>>,
     /// The K clusters; only npz and JSON contain them.
     pub clusters: Option<Vec<Cluster>>,
 }

@@ -16,34 +16,34 @@ use crate::formats::{feather, npy, pcd, ply};
 use crate::picture::{INVALID_COLOR, color, full_scale, shown_motion};
 
 /// The formats that flow is written in. Displacements are in metres. `dynamic`, `ego`, `cluster`,
-/// `confidence` and the clusters are written only where they are known, and only by the formats
+/// `confidence`, `moving` and the clusters are written only where they are known, and only by the formats
 /// that list them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum FlowFormat {
     /// Arrays `flow` N x 3 float32, `valid` and `dynamic` bool, `ego` 4 x 4 float64
     /// (`target_from_source`, row by row, translation in metres), `cluster` int32, `confidence`
-    /// float32.
+    /// and `moving` float32.
     ///
     /// The K clusters are arrays of K rows:
     /// - `clusters_points` uint32, `clusters_dynamic` bool.
     /// - K x 3 float32: `clusters_center` (metres), `clusters_size` (length, width and height in
     ///   metres) and `clusters_velocity` (m/s).
-    /// - float32: `clusters_yaw` (radians), `clusters_yaw_rate` (rad/s) and `clusters_confidence`
-    ///   (0 to 1).
+    /// - float32: `clusters_yaw` (radians), `clusters_yaw_rate` (rad/s), `clusters_confidence` and
+    ///   `clusters_moving` (0 to 1).
     Npz,
     /// The displacements alone, N x 3 float32.
     Npy,
     /// Argoverse 2's columns `flow_tx_m`, `flow_ty_m` and `flow_tz_m`, float32. Also `is_valid` and
-    /// `is_dynamic` bool, `cluster` int32 and `confidence` float32. LZ4-compressed.
+    /// `is_dynamic` bool, `cluster` int32, `confidence` and `moving` float32. LZ4-compressed.
     Feather,
     /// Binary little endian: source points x y z (metres) and `flow_x`, `flow_y`, `flow_z`,
-    /// float32. Then `valid` and `dynamic` uint8, `cluster` int32, `confidence` float32, and a
+    /// float32. Then `valid` and `dynamic` uint8, `cluster` int32, `confidence` and `moving` float32, and a
     /// color by direction of motion, `red`, `green`, `blue`, uint8.
     Ply,
     /// Binary, with the fields of PLY; the color is packed into `rgb`.
     Pcd,
     /// An object with `flow`, `valid`, `dynamic`, `ego` (null where unknown), `cluster`,
-    /// `confidence`, `clusters`.
+    /// `confidence`, `moving`, `clusters`.
     Json,
 }
 
@@ -106,7 +106,7 @@ impl FlowFormat {
 
 /// Writes a flow of N rows.
 ///
-/// The source points are not checked: they may be NaN. The clusters and confidences are not checked
+/// The source points are not checked: they may be NaN. The clusters and chances are not checked
 /// either, and must be finite to be read back.
 ///
 /// # Errors
@@ -128,6 +128,7 @@ pub fn write_flow<W: Write>(
     if let Some(objects) = table.objects {
         check_count("cluster", objects.cluster.len(), count)?;
         check_count("confidence", objects.confidence.len(), count)?;
+        check_count("moving", objects.moving.len(), count)?;
     }
     check_points(format.kind(), "flow", table.flow)?;
     match format {
@@ -169,8 +170,13 @@ fn write_feather<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), For
     }
     if let Some(objects) = table.objects {
         columns.push(("cluster", Values::Ids(&objects.cluster)));
-        let confidence = objects.confidence.iter().copied();
-        columns.push(("confidence", Values::Floats(Box::new(confidence))));
+        for (name, chances) in [
+            ("confidence", &objects.confidence),
+            ("moving", &objects.moving),
+        ] {
+            let chances = chances.iter().copied();
+            columns.push((name, Values::Floats(Box::new(chances))));
+        }
     }
     feather::write(out, columns)
 }
@@ -197,7 +203,11 @@ fn write_ply<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatE
         properties.push(("uchar", "dynamic"));
     }
     if table.objects.is_some() {
-        properties.extend([("int", "cluster"), ("float", "confidence")]);
+        properties.extend([
+            ("int", "cluster"),
+            ("float", "confidence"),
+            ("float", "moving"),
+        ]);
     }
     properties.extend(["red", "green", "blue"].map(|channel| ("uchar", channel)));
     let comment = "flow is the displacement over the pair, metres, ego motion included";
@@ -215,7 +225,11 @@ fn write_pcd<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatE
         fields.push(("dynamic", 1, 'U'));
     }
     if table.objects.is_some() {
-        fields.extend([("cluster", 4, 'I'), ("confidence", 4, 'F')]);
+        fields.extend([
+            ("cluster", 4, 'I'),
+            ("confidence", 4, 'F'),
+            ("moving", 4, 'F'),
+        ]);
     }
     fields.push(("rgb", 4, 'F'));
     pcd::write_header(out, table.source.len(), &fields)?;
@@ -225,7 +239,7 @@ fn write_pcd<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatE
     })
 }
 
-/// Writes rows of point, displacement, flags, cluster, confidence and color, little endian.
+/// Writes rows of point, displacement, flags, cluster, chances and color, little endian.
 fn write_rows<W: Write>(
     table: &FlowTable<'_>,
     out: &mut W,
@@ -242,6 +256,7 @@ fn write_rows<W: Write>(
         if let Some(objects) = table.objects {
             bytes.extend(objects.cluster[row].to_le_bytes());
             bytes.extend(objects.confidence[row].to_le_bytes());
+            bytes.extend(objects.moving[row].to_le_bytes());
         }
         push_color(color, &mut bytes);
         if bytes.len() >= FLUSH_AT {
