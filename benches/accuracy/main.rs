@@ -17,6 +17,7 @@ mod clock;
 mod confidence;
 mod densify;
 mod depth;
+mod drive;
 mod field;
 mod ground;
 mod labelled;
@@ -25,11 +26,12 @@ mod objects;
 mod overlap;
 mod registration;
 mod sequences;
+mod tracks;
 mod traffic;
 
 use std::process::ExitCode;
 
-const EXPERIMENTS: &str = "confidence densify depth field ground neighbors objects overlap registration sequences traffic";
+const EXPERIMENTS: &str = "confidence densify depth field ground neighbors objects overlap registration sequences tracks traffic";
 
 fn main() -> ExitCode {
     // Cargo adds `--bench`.
@@ -61,6 +63,7 @@ fn run(experiment: &str, arguments: Vec<String>) -> anyhow::Result<()> {
         "overlap" => overlap::run(),
         "registration" => registration::run(),
         "sequences" => sequences::run(arguments),
+        "tracks" => tracks::run(&arguments),
         "traffic" => traffic::run(&arguments),
         other => anyhow::bail!("there is no such experiment; there are {EXPERIMENTS} ({other})"),
     }

@@ -76,6 +76,9 @@ const VARIANTS: &[Variant] = &[
         o.min_free_space_far = 0.0;
     }),
     label("walls may slide", |o| o.min_observability = 0.0),
+    label("rotation is no evidence", |o| {
+        o.min_normal_motion_m = f32::INFINITY;
+    }),
     label("moved clusters may lie anywhere", |o| {
         o.max_residual_m = f32::INFINITY;
     }),

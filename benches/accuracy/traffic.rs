@@ -10,15 +10,12 @@
 //! box: [`judged`] says which boxes count. `--list` prints one line for each object and pair.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
 
-use anyhow::Context;
 use fnsf::flow::cpu::CpuBackend;
-use fnsf::flow::{Estimate, Point, Preset, RigidTransform, Sequence, Sweep};
-use fnsf::formats::read_cloud;
-use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
+use fnsf::flow::{Estimate, Preset};
+use nalgebra::{Isometry3, Point3, Vector3};
 
-use super::clock::Clock;
+use super::drive::{Drive, TrackedBox, estimates, point3, read_drives};
 
 /// An object stands below the first residual motion, is slow from the second on, and fast from the
 /// third on, metres a sweep. Noise of the boxes hides whether it moves between the first two.
@@ -35,108 +32,8 @@ const JERK_M: f64 = 0.3;
 const POINTS: usize = 10;
 /// Largest share of the nearest-neighbor distance that the motion of a box may leave.
 const LEFT: f64 = 0.8;
-/// Margin of a box to the sides, and the height at its foot that counts as ground, metres.
-const MARGIN_M: f64 = 0.1;
-const FOOT_M: f64 = 0.2;
 /// Bounds of the groups by range, metres.
 const RANGES_M: [f64; 2] = [20.0, 40.0];
-
-/// A box of `tracks.json`, in the sensor's frame of its sweep.
-#[derive(serde::Deserialize)]
-struct TrackedBox {
-    /// A text or a number.
-    id: serde_json::Value,
-    #[serde(rename = "type")]
-    class: String,
-    center: [f64; 3],
-    size: [f64; 3],
-    yaw: f64,
-}
-
-impl TrackedBox {
-    fn pose(&self) -> RigidTransform {
-        Isometry3::from_parts(
-            Translation3::from(self.center),
-            UnitQuaternion::from_axis_angle(&Vector3::z_axis(), self.yaw),
-        )
-    }
-
-    fn holds(&self, point: Point) -> bool {
-        let [x, y, z] = self
-            .pose()
-            .inverse_transform_point(&point3(point))
-            .coords
-            .into();
-        let [length, width, height] = self.size.map(|side| side / 2.0);
-        x.abs() <= length + MARGIN_M
-            && y.abs() <= width + MARGIN_M
-            && (FOOT_M - height..=height + MARGIN_M).contains(&z)
-    }
-}
-
-fn point3(point: Point) -> Point3<f64> {
-    Point3::from(point.map(f64::from))
-}
-
-/// A drive: its sweeps in order, and the boxes of each by id.
-struct Drive {
-    name: &'static str,
-    sweeps: Vec<Vec<Point>>,
-    boxes: Vec<BTreeMap<String, TrackedBox>>,
-}
-
-impl Drive {
-    /// The sweeps `files`, numbered from `first`, with the boxes in `folder/tracks.json`.
-    fn read(
-        name: &'static str,
-        folder: &Path,
-        files: &[PathBuf],
-        first: usize,
-    ) -> anyhow::Result<Self> {
-        let read = |path: &PathBuf| {
-            let bytes = std::fs::read(path).with_context(|| path.display().to_string())?;
-            anyhow::Ok(read_cloud(&bytes, path.to_str())?.points)
-        };
-        let tracks = std::fs::read(folder.join("tracks.json"))?;
-        let mut tracks: BTreeMap<usize, Vec<TrackedBox>> = serde_json::from_slice(&tracks)?;
-        let boxes = (first..first + files.len()).map(|number| {
-            let boxes = tracks.remove(&number).unwrap_or_default();
-            boxes.into_iter().map(|b| (b.id.to_string(), b)).collect()
-        });
-        Ok(Self {
-            name,
-            boxes: boxes.collect(),
-            sweeps: files.iter().map(read).collect::<Result<_, _>>()?,
-        })
-    }
-
-    /// The estimates of all consecutive pairs, and the seconds that they took.
-    fn estimates(
-        &self,
-        backend: &CpuBackend,
-        preset: Preset,
-    ) -> anyhow::Result<(Vec<Estimate>, f64)> {
-        let options = preset.options(None);
-        let mut sequence = Sequence::default();
-        let clock = Clock::start();
-        let mut estimates = Vec::new();
-        for points in &self.sweeps {
-            let sweep = Sweep {
-                points: points.clone(),
-                ground: None,
-            };
-            estimates.extend(sequence.push(backend, sweep, &options, &clock)?);
-        }
-        loop {
-            let last = sequence.finish(backend, &clock)?;
-            if last.is_empty() {
-                break;
-            }
-            estimates.extend(last);
-        }
-        Ok((estimates, fnsf::flow::Control::seconds(&clock)))
-    }
-}
 
 /// An object of a pair whose box counts, with the estimated flow of its points.
 struct Judged<'a> {
@@ -330,26 +227,7 @@ pub(super) fn run(arguments: &[String]) -> anyhow::Result<()> {
         [only] if only == "--list" => true,
         _ => anyhow::bail!("its one argument is --list"),
     };
-    let data = std::env::var_os("FNSF_REAL_DATA").context("set FNSF_REAL_DATA")?;
-    let data = Path::new(&data);
-    let files = |folder: &str, digits: usize, numbers: std::ops::Range<usize>| {
-        let name = |number| data.join(folder).join(format!("{number:0digits$}.pcd"));
-        numbers.map(name).collect::<Vec<_>>()
-    };
-    let kitti = [
-        files("kitti_0000", 10, 0..11),
-        files("kitti_drive", 10, 11..40),
-    ]
-    .concat();
-    let drives = [
-        Drive::read(
-            "traffic",
-            &data.join("traffic"),
-            &files("traffic", 6, 10..30),
-            10,
-        )?,
-        Drive::read("kitti_drive", &data.join("kitti_drive"), &kitti, 0)?,
-    ];
+    let drives = read_drives()?;
     let backend = CpuBackend::new(None)?;
     println!(
         "| drive, preset | objects | moving | missed, % | EPE, m | standing | false motion, % |"
@@ -357,7 +235,7 @@ pub(super) fn run(arguments: &[String]) -> anyhow::Result<()> {
     println!("|---|---|---|---|---|---|---|");
     for drive in &drives {
         for preset in [Preset::Default, Preset::Label] {
-            let (estimates, seconds) = drive.estimates(&backend, preset)?;
+            let (estimates, seconds) = estimates(&drive.sweeps, &backend, preset)?;
             let mut groups: BTreeMap<&str, Sums> = BTreeMap::new();
             for index in 1..estimates.len() - 1 {
                 for judged in judged(drive, &estimates, index) {

@@ -24,6 +24,7 @@ mod service;
 mod service_parts;
 #[cfg(test)]
 mod tests;
+mod tracks;
 mod upload_budget;
 mod waiters;
 

@@ -158,7 +158,7 @@ impl Service {
 }
 
 /// Maps a missing blob to [`ApiError::ResultLost`].
-fn lost_or(id: JobId, error: BlobError) -> ApiError {
+pub(super) fn lost_or(id: JobId, error: BlobError) -> ApiError {
     if error.is_missing() {
         tracing::error!(%error, job = %id, "a result is lost");
         ApiError::ResultLost(id)

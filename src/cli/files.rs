@@ -12,6 +12,7 @@ use rustix::fs::{Access, access};
 use super::failure::Failure;
 use super::unfinished::Unfinished;
 use crate::flow::depth::Camera;
+use crate::flow::tracks::Track;
 use crate::flow::{Point, RigidTransform};
 use crate::formats;
 use crate::formats::{FileKind, FlowFile, FormatError, GroundRaster, Pair, PairTruth};
@@ -75,6 +76,16 @@ pub(super) fn read_pair(path: &Path) -> Result<Pair, Failure> {
 /// Reads a flow, in any format.
 pub(super) fn read_flow(path: &Path) -> Result<FlowFile, Failure> {
     read(path, formats::read_flow)
+}
+
+/// Whether a file has tracks.
+pub(super) fn is_tracks(path: &Path) -> Result<bool, Failure> {
+    Ok(formats::is_tracks(&read_bytes(path)?))
+}
+
+/// Reads tracks.
+pub(super) fn read_tracks(path: &Path) -> Result<Vec<Track>, Failure> {
+    read(path, |bytes, _| formats::read_tracks(bytes))
 }
 
 /// Reads ground truth: an `.npz` pair with `flow`, or Argoverse 2's labels.

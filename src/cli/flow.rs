@@ -2,6 +2,7 @@
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::anyhow;
 use clap::Args;
@@ -12,6 +13,7 @@ use super::files;
 use super::machine::peak_resident_bytes;
 use super::output::say;
 use super::terminal::Terminal;
+use super::tracks::TrackArguments;
 use crate::flow::{Control, Estimate, Point, Sequence, Sweep};
 use crate::formats::{FlowFormat, FlowTable, write_flow};
 use crate::job::Report;
@@ -31,7 +33,8 @@ use crate::text::grouped;
     fnsf flow a.feather b.feather -o flow.npz\n  \
     fnsf flow pair.npz --ground mask --crop-m 51.2 -o flow.ply --picture flow.png\n  \
     fnsf flow a.pcd b.pcd --preset paper --max-points 8192 --json\n  \
-    fnsf flow sweeps/*.pcd -o flows/flow.npz        flows/flow_0000.npz, flow_0001.npz, ...")]
+    fnsf flow sweeps/*.pcd -o flows/flow.npz        flows/flow_0000.npz, flow_0001.npz, ...\n  \
+    fnsf flow sweeps/*.pcd --preset label --tracks tracks.json --tracks-picture tracks.png")]
 pub(super) struct Flow {
     /// The sweeps, two or more, in the order in which they were recorded; or one .npz file with two
     /// sweeps, as arrays pc1 and pc2
@@ -49,13 +52,16 @@ pub(super) struct Flow {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
+    tracks: TrackArguments,
+    #[command(flatten)]
     estimation: Estimation,
 }
 
 /// A pair whose estimate is not complete, because its window may need later sweeps.
 struct Waiting {
     pair: usize,
-    source: Vec<Point>,
+    source: Arc<[Point]>,
+    target: Arc<[Point]>,
     /// Seconds spent on reading the target sweep.
     load: f64,
 }
@@ -194,12 +200,13 @@ impl Flow {
                 Sweeps::Files(files)
             }
         };
+        let mut tracking = self.tracks.start(sweeps.count(), &options)?;
         let surroundings = self.estimation.surroundings(&self.sweeps)?;
         let mut device = self.estimation.open()?;
         let mut sequence = Sequence::default();
         // The pairs that are not complete, and the points of the last sweep.
         let mut waiting: VecDeque<Waiting> = VecDeque::new();
-        let mut last = None::<Vec<Point>>;
+        let mut last = None::<Arc<[Point]>>;
         let count = sweeps.count();
         for index in 0..count {
             let began = terminal.seconds();
@@ -208,14 +215,15 @@ impl Flow {
                 Sweeps::Files(files) => surroundings.sweep(index, &files[index])?,
             };
             let load = terminal.seconds() - began;
-            let points = sweep.points.clone();
-            let larger = points.len().max(last.as_ref().map_or(0, Vec::len));
+            let points: Arc<[Point]> = sweep.points.as_slice().into();
+            let larger = points.len().max(last.as_ref().map_or(0, |last| last.len()));
             let pair = [index.saturating_sub(1), index];
             let solver_options = surroundings.options(&options, larger, pair);
-            if let Some(source) = last.replace(points) {
+            if let Some(source) = last.replace(Arc::clone(&points)) {
                 waiting.push_back(Waiting {
                     pair: pair[0],
                     source,
+                    target: points,
                     load,
                 });
             }
@@ -223,11 +231,14 @@ impl Flow {
             // Complete pairs are written before the next one is estimated, which may fail.
             loop {
                 terminal.finish();
-                for (estimate, pair) in found.iter().zip(waiting.drain(..found.len())) {
-                    let mut report = Report::new(
-                        estimate,
-                        &surroundings.timed(&options, [pair.pair, pair.pair + 1]),
-                    );
+                let complete = waiting.drain(..found.len());
+                for (estimate, pair) in found.iter_mut().zip(complete) {
+                    let options = surroundings.timed(&options, [pair.pair, pair.pair + 1]);
+                    if let Some(tracking) = &mut tracking {
+                        let dt_s = options.solver_options(0).dt_s;
+                        tracking.push([&pair.source, &pair.target], estimate, dt_s)?;
+                    }
+                    let mut report = Report::new(estimate, &options);
                     report.seconds.load = Some(pair.load);
                     report.seconds.total += pair.load;
                     report.peak_rss_bytes = peak_resident_bytes();
@@ -242,14 +253,15 @@ impl Flow {
                 }
             }
         }
-        Ok(())
+        tracking.map_or(Ok(()), |tracking| tracking.finish(self.json))
     }
 
     /// Refuses outputs that could not be written. Called before any work.
     fn check_outputs(&self) -> Result<(), Failure> {
-        if self.output.is_none() && self.picture.is_none() && !self.json {
+        let tracks: Vec<PathBuf> = self.tracks.outputs().cloned().collect();
+        if self.output.is_none() && self.picture.is_none() && tracks.is_empty() && !self.json {
             return Err(Failure::usage(anyhow!(
-                "nothing to do: give -o OUT, --picture OUT.png or --json"
+                "nothing to do: give -o OUT, --picture OUT.png, --tracks OUT.json or --json"
             )));
         }
         if let Some(output) = &self.output {
@@ -264,6 +276,7 @@ impl Flow {
         let named = [&self.output, &self.picture].into_iter().flatten();
         let outputs: Vec<PathBuf> = named
             .flat_map(|path| (0..pairs).map(|pair| numbered(path, pair, pairs)))
+            .chain(tracks)
             .collect();
         let known = self.estimation.files();
         files::check_outputs(&outputs, self.sweeps.iter().chain(&known))

@@ -15,6 +15,7 @@ mod files;
 mod machine;
 mod output;
 mod terminal;
+mod tracks;
 mod unfinished;
 
 mod demo;

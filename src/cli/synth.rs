@@ -9,14 +9,18 @@ use super::failure::Failure;
 use super::files;
 use super::output::say;
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
-use crate::formats::{CloudFormat, Ground, Pair, PairTruth, write_cloud, write_pair_npz};
+use crate::flow::tracks::Track;
+use crate::formats::{
+    CloudFormat, Ground, Pair, PairTruth, write_cloud, write_pair_npz, write_tracks,
+};
 use crate::text::grouped;
 
 /// Simulate a sequence of lidar sweeps with exact ground truth.
 ///
 /// Writes sweep_0000.pcd, sweep_0001.pcd, ... and, for each two consecutive sweeps, pair_0000.npz,
 /// ... A pair contains both clouds, the flow of every source point, the ego motion, and masks of
-/// dynamic points, points on objects and ground points.
+/// dynamic points, points on objects and ground points. tracks.json has the tracks of the moving
+/// objects.
 #[derive(Debug, Args)]
 #[command(after_help = "Example:\n  \
     fnsf synth -o street --sweeps 3 && fnsf flow street/pair_0000.npz -o flow.npz")]
@@ -73,9 +77,16 @@ impl Synth {
             .with_context(|| format!("cannot make {}", self.output.display()))
             .map_err(Failure::internal)?;
         let mut points = 0;
+        let mut tracks: Vec<Track> = Vec::new();
         for index in 0..self.sweeps {
             let frame = street.sweep(index).map_err(Failure::internal)?;
             points += frame.points.len();
+            let states = street.tracks(std::slice::from_ref(&frame));
+            tracks.resize_with(states.len(), Track::default);
+            for (track, state) in tracks.iter_mut().zip(states) {
+                track.id = state.id;
+                track.states.extend(state.states);
+            }
             let path = self.output.join(format!("sweep_{index:04}.pcd"));
             files::write(&path, |file| {
                 write_cloud(CloudFormat::Pcd, &frame.points, file)
@@ -86,6 +97,8 @@ impl Synth {
             let path = self.output.join(format!("pair_{index:04}.npz"));
             files::write(&path, |file| write_pair_npz(&pair, file))?;
         }
+        let path = self.output.join("tracks.json");
+        files::write(&path, |file| write_tracks(&tracks, file))?;
         say(format_args!(
             "{} sweeps, {} points, in {}",
             self.sweeps,

@@ -52,11 +52,12 @@ pub mod field;
 pub mod gpu;
 mod objects;
 
-// Densification, depth images, metrics and simulated data.
+// Tracks, densification, depth images, metrics and simulated data.
 pub mod densify;
 pub mod depth;
 pub mod evaluate;
 pub mod simulate;
+pub mod tracks;
 
 pub use cost::{Cost, NeighborCost, neighbor_cost, predict_cost};
 pub use data::{

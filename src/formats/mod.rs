@@ -1,4 +1,4 @@
-//! Files: clouds, pairs, flow, cameras, poses and depth images, in the common formats.
+//! Files: clouds, pairs, flow, tracks, cameras, poses and depth images, in the common formats.
 //!
 //! Formats are recognized by content, and sizes are checked before memory is allocated. Independent
 //! of the file system, jobs, solvers and the command line.
@@ -19,6 +19,7 @@ mod ground_raster;
 mod motion;
 mod pair;
 mod poses;
+mod tracks;
 
 mod bin;
 mod feather;
@@ -49,3 +50,4 @@ pub use crate::formats::poses::{PoseFile, read_poses};
 pub use crate::formats::sniff::recognize;
 pub use sweep_order::turning_sweep;
 pub use timestamps::{SweepTime, TimeUnit};
+pub use tracks::{is_tracks, read_tracks, write_tracks};

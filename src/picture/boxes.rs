@@ -19,18 +19,24 @@ pub(super) fn draw(
 ) {
     for cluster in clusters.iter().filter(|cluster| cluster.dynamic) {
         let corners = corners(&cluster.bounds).map(&pixel);
-        for (index, &corner) in corners.iter().enumerate() {
-            line(image, corner, corners[(index + 1) % corners.len()], width);
-        }
+        outline(image, corners, width, OUTLINE);
         let center = cluster.bounds.center;
         let velocity = cluster.velocity;
         let there = core::array::from_fn(|a| center[a] + LINE_S * velocity[a]);
-        line(image, pixel(center), pixel(there), width);
+        line(image, [pixel(center), pixel(there)], width, OUTLINE);
+    }
+}
+
+/// Draws the lines between `corners`, pixels, `width` pixels wide.
+pub(super) fn outline(image: &mut Image, corners: [[f32; 2]; 4], width: f32, color: Rgb) {
+    for (index, &corner) in corners.iter().enumerate() {
+        let next = corners[(index + 1) % corners.len()];
+        line(image, [corner, next], width, color);
     }
 }
 
 /// The corners of a box, with its margin, as seen from above, metres.
-fn corners(bounds: &OrientedBox) -> [Point; 4] {
+pub(super) fn corners(bounds: &OrientedBox) -> [Point; 4] {
     let [x, y, z] = bounds.center;
     let [length, width, _] = bounds.size.map(|side| side / 2.0 + MARGIN_M);
     let (sin, cos) = bounds.yaw.sin_cos();
@@ -41,7 +47,7 @@ fn corners(bounds: &OrientedBox) -> [Point; 4] {
 }
 
 /// A straight line; nothing where an end is not finite or far outside the image.
-fn line(image: &mut Image, [x0, y0]: [f32; 2], [x1, y1]: [f32; 2], width: f32) {
+pub(super) fn line(image: &mut Image, [[x0, y0], [x1, y1]]: [[f32; 2]; 2], width: f32, color: Rgb) {
     /// Longest line that is drawn, pixels: more than the width of any image.
     const LONGEST: f32 = 1e4;
     let length = (x1 - x0).hypot(y1 - y0);
@@ -52,7 +58,7 @@ fn line(image: &mut Image, [x0, y0]: [f32; 2], [x1, y1]: [f32; 2], width: f32) {
     for step in 0..=steps as u32 {
         let share = step as f32 / steps;
         let at = [x0 + share * (x1 - x0), y0 + share * (y1 - y0)];
-        image.disk(at, width / 2.0, OUTLINE, 0.9);
+        image.disk(at, width / 2.0, color, 0.9);
     }
 }
 

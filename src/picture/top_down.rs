@@ -9,12 +9,12 @@ use super::wheel::color;
 use crate::flow::{Cluster, Point, RigidTransform};
 use crate::text::grouped;
 
-const BACKGROUND: Rgb = [13, 16, 23];
-const STATIC: Rgb = [128, 139, 160];
+pub(super) const BACKGROUND: Rgb = [13, 16, 23];
+pub(super) const STATIC: Rgb = [128, 139, 160];
 const INVALID: Rgb = [190, 190, 190];
 const LINES: Rgb = [70, 82, 104];
 const LABELS: Rgb = [126, 140, 166];
-const TITLE: Rgb = [222, 228, 240];
+pub(super) const TITLE: Rgb = [222, 228, 240];
 const VEHICLE: Rgb = [240, 244, 255];
 
 /// Threshold between static and dynamic points that is common in scene flow, metres from the source
@@ -22,7 +22,7 @@ const VEHICLE: Rgb = [240, 244, 255];
 const MOVING_M: f32 = 0.05;
 
 /// Half ranges that a picture may have, metres.
-const RANGES_M: [f32; 10] = [
+pub(super) const RANGES_M: [f32; 10] = [
     10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 80.0, 100.0, 150.0, 200.0,
 ];
 
@@ -84,9 +84,9 @@ impl Default for TopDownOptions {
 
 /// The mapping from metres to pixels.
 #[derive(Clone, Copy)]
-struct View {
-    side: f32,
-    range_m: f32,
+pub(super) struct View {
+    pub(super) side: f32,
+    pub(super) range_m: f32,
 }
 
 impl View {
@@ -95,7 +95,7 @@ impl View {
     }
 
     /// The pixel of a point: x, forward, is up; y, left, is left.
-    fn pixel(&self, point: Point) -> [f32; 2] {
+    pub(super) fn pixel(&self, point: Point) -> [f32; 2] {
         let scale = self.pixels_per_metre();
         [
             self.side / 2.0 - point[1] * scale,
@@ -104,17 +104,17 @@ impl View {
     }
 
     /// Pixels per dot of the title's font.
-    fn dot(&self) -> i32 {
+    pub(super) fn dot(&self) -> i32 {
         ((self.side / 466.0).round() as i32).max(1)
     }
 
     /// Pixels per dot of the small labels' font.
-    fn small_dot(&self) -> i32 {
+    pub(super) fn small_dot(&self) -> i32 {
         (self.dot() * 2 / 3).max(1)
     }
 
     /// Pixels between the labels and the image's edge.
-    fn margin(&self) -> i32 {
+    pub(super) fn margin(&self) -> i32 {
         (self.side * 0.02) as i32
     }
 }
@@ -184,7 +184,7 @@ fn step_m(range_m: f32) -> f32 {
         .unwrap_or(100.0)
 }
 
-fn draw_rings(image: &mut Image, view: View) {
+pub(super) fn draw_rings(image: &mut Image, view: View) {
     let center = [view.side / 2.0; 2];
     let step = step_m(view.range_m);
     let dot = view.small_dot();
@@ -235,7 +235,7 @@ fn draw_points(
 }
 
 /// A car from above with a bright front, which marks the forward direction.
-fn draw_vehicle(image: &mut Image, view: View) {
+pub(super) fn draw_vehicle(image: &mut Image, view: View) {
     let scale = view.pixels_per_metre();
     let [length, width] = VEHICLE_M.map(|metres| metres * scale);
     let center = [view.side / 2.0; 2];
@@ -251,18 +251,35 @@ fn draw_vehicle(image: &mut Image, view: View) {
 }
 
 fn draw_title(image: &mut Image, view: View, scene: &TopDown<'_>, moving: usize) {
-    let dot = view.dot();
-    let margin = view.margin();
-    let title = if scene.ego.is_some() {
-        "Motion in the world"
-    } else {
-        "Total flow"
+    let points = grouped(scene.source.len());
+    let (title, note, counts) = match scene.ego {
+        Some(_) => (
+            "Motion in the world",
+            "flow relative to the ego motion",
+            format!("{points} points, {} moving", grouped(moving)),
+        ),
+        None => (
+            "Total flow",
+            "ego motion included",
+            format!("{points} points"),
+        ),
     };
-    let note = if scene.ego.is_some() {
-        "flow relative to the ego motion"
-    } else {
-        "ego motion included"
-    };
+    let mut notes = vec![note.to_owned(), counts];
+    let is_shown = |point: Point| point[0].abs().max(point[1].abs()) <= view.range_m;
+    let boxes = scene.clusters.iter();
+    let boxes = boxes.filter(|cluster| cluster.dynamic && is_shown(cluster.bounds.center));
+    if let boxes @ 1.. = boxes.count() {
+        notes.push(format!(
+            "{} moving boxes, and their displacement in 1 s",
+            grouped(boxes)
+        ));
+    }
+    draw_heading(image, view, title, &notes);
+}
+
+/// Draws a title at the top left, and small lines below it.
+pub(super) fn draw_heading(image: &mut Image, view: View, title: &str, notes: &[String]) {
+    let (dot, margin) = (view.dot(), view.margin());
     let style = TextStyle {
         dot,
         color: TITLE,
@@ -274,22 +291,8 @@ fn draw_title(image: &mut Image, view: View, scene: &TopDown<'_>, moving: usize)
         align: Align::Left,
     };
     image.text([margin, margin], title, style);
-    image.text([margin, margin + 11 * dot], note, small);
-    let points = grouped(scene.source.len());
-    let counts = match scene.ego {
-        Some(_) => format!("{points} points, {} moving", grouped(moving)),
-        None => format!("{points} points"),
-    };
-    image.text([margin, margin + 18 * dot], &counts, small);
-    let is_shown = |point: Point| point[0].abs().max(point[1].abs()) <= view.range_m;
-    let boxes = scene.clusters.iter();
-    let boxes = boxes.filter(|cluster| cluster.dynamic && is_shown(cluster.bounds.center));
-    if let boxes @ 1.. = boxes.count() {
-        let text = format!(
-            "{} moving boxes, and their displacement in 1 s",
-            grouped(boxes)
-        );
-        image.text([margin, margin + 25 * dot], &text, small);
+    for (note, below) in notes.iter().zip((11..).step_by(7)) {
+        image.text([margin, margin + below * dot], note, small);
     }
 }
 
@@ -333,7 +336,7 @@ fn rounded(value: f32) -> String {
     text.trim_end_matches('0').trim_end_matches('.').to_owned()
 }
 
-fn draw_scale_bar(image: &mut Image, view: View) {
+pub(super) fn draw_scale_bar(image: &mut Image, view: View) {
     let thick = view.small_dot();
     let margin = view.margin();
     let step = step_m(view.range_m);

@@ -1,6 +1,6 @@
 //! Tests of sequences and dense clouds from the command line.
 
-use fnsf::formats::{read_cloud, read_depth_png, read_flow};
+use fnsf::formats::{read_cloud, read_depth_png, read_flow, read_tracks};
 
 use super::program::{fnsf, json, street};
 
@@ -205,4 +205,51 @@ fn what_no_sequence_can_be_asked_is_refused_with_advice() {
             ended.stderr
         );
     }
+}
+
+#[test]
+fn tracks_of_a_sequence_are_written_drawn_and_scored() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    let arguments = ["synth", "-o", "street", "--beams", "32", "--sweeps", "7"];
+    assert_eq!(fnsf(folder, &arguments).code, 0);
+    let sweeps: Vec<String> = (0..7)
+        .map(|index| format!("street/sweep_{index:04}.pcd"))
+        .collect();
+    let sweeps: Vec<&str> = sweeps.iter().map(String::as_str).collect();
+    let outputs = ["--tracks", "tracks.json", "--tracks-picture", "tracks.png"];
+    let done = fnsf(folder, &[&["flow"], &sweeps[..], &outputs].concat());
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    assert!(done.stdout.contains(" tracks, "), "{}", done.stdout);
+    let bytes = std::fs::read(folder.join("tracks.json")).expect("written");
+    let tracks = read_tracks(&bytes).expect("tracks");
+    assert!(tracks.len() > 3, "{}", tracks.len());
+    let picture = std::fs::read(folder.join("tracks.png")).expect("written");
+    assert!(picture.starts_with(b"\x89PNG"));
+    let truth = ["--truth", "street/tracks.json"];
+    let score = json(
+        folder,
+        &[&["eval", "tracks.json"], &truth[..], &["--json"]].concat(),
+    );
+    let [truth, matches] = ["truth", "matches"].map(|key| score[key].as_u64().expect("a number"));
+    assert!(matches * 2 > truth, "{score}");
+    assert!(score["hota"].as_f64().is_some_and(|hota| hota > 0.3));
+}
+
+#[test]
+fn tracks_of_what_cannot_have_any_are_refused_before_any_work() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder, "4");
+    let refused = |sweeps: &[&str], options: &[&str]| {
+        let tracks = ["--tracks", "tracks.json"];
+        let done = fnsf(folder, &[&["flow"], sweeps, &tracks, options].concat());
+        assert_eq!(done.code, 2, "{}", done.stderr);
+        assert!(!folder.join("tracks.json").exists());
+        done.stderr
+    };
+    assert!(refused(&SWEEPS[..3], &[]).contains("tracks need 4 sweeps or more"));
+    assert!(refused(&SWEEPS, &["--preset", "paper"]).contains("--preset default or label"));
+    assert!(refused(&SWEEPS, &["--ego", "off"]).contains("ego motion"));
+    assert!(refused(&SWEEPS, &["--tracks-picture", "a.jpg"]).contains(".png"));
 }

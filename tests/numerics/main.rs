@@ -22,3 +22,4 @@ mod resumption;
 mod scenes;
 mod sequences;
 mod sweeps;
+mod tracks;

@@ -88,7 +88,7 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
             routes.push((method.expect("a method"), path.replace("{id}", &id)));
         }
     }
-    assert_eq!(routes.len(), 9);
+    assert_eq!(routes.len(), 10);
     for (method, path) in [
         ("GET", "/"),
         ("GET", "/v1"),
@@ -120,11 +120,8 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
         }
     }
     let own = format!("/v1/jobs/{id}");
-    let (events, result, requeue) = (
-        format!("{own}/events"),
-        format!("{own}/result"),
-        format!("{own}/requeue"),
-    );
+    let [events, result, requeue, tracks] =
+        ["events", "result", "requeue", "tracks"].map(|of| format!("{own}/{of}"));
     // Expected status for the reader, the other tenant and the writer.
     let expected = [
         (Method::POST, "/v1/flow", [403, 200, 200]),
@@ -134,13 +131,15 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
         (Method::GET, &own, [200, 404, 200]),
         (Method::GET, &events, [200, 404, 200]),
         (Method::GET, &result, [200, 404, 200]),
+        // The job is a pair.
+        (Method::GET, &tracks, [400, 404, 400]),
         (Method::POST, &requeue, [403, 404, 400]),
         (Method::DELETE, &own, [403, 404, 200]),
         (Method::GET, "/v1/nothing", [404, 404, 404]),
         (Method::PUT, "/v1/jobs", [405, 405, 405]),
         (Method::GET, "/metrics", [404, 404, 404]),
     ];
-    for (method, path) in &routes[..9] {
+    for (method, path) in &routes[..10] {
         let told = expected
             .iter()
             .any(|(known, at, _)| known == method && at == path);
@@ -238,7 +237,7 @@ fn showing<T>(message: T, shown: Option<&str>) -> Request<T> {
 }
 
 /// The status codes of the nine methods. Those that need a job id use `id`, a job of tenant a.
-async fn codes(server: &Server, id: &str, shown: Option<&str>) -> [Code; 9] {
+async fn codes(server: &Server, id: &str, shown: Option<&str>) -> [Code; 10] {
     use proto::estimate_sequence_request as sequence;
     use proto::submit_job_request as submit;
     let code =
@@ -306,6 +305,9 @@ async fn codes(server: &Server, id: &str, shown: Option<&str>) -> [Code; 9] {
         first_row: 0,
     };
     let fetched = calls.download_result(showing(asked, shown)).await;
+    let tracked = calls
+        .get_tracks(showing(proto::GetTracksRequest { id: id() }, shown))
+        .await;
     [
         code(flow.map(drop)),
         code(sequence.map(drop)),
@@ -316,6 +318,7 @@ async fn codes(server: &Server, id: &str, shown: Option<&str>) -> [Code; 9] {
         code(requeued.map(drop)),
         code(watched.map(drop)),
         code(fetched.map(drop)),
+        code(tracked.map(drop)),
     ]
 }
 
@@ -325,15 +328,16 @@ async fn every_call_of_grpc_takes_a_key_and_gives_only_what_it_opens() {
     let id = finished(&server).await;
     for shown in SHUT {
         let codes = codes(&server, &id, shown).await;
-        assert_eq!(codes, [Code::Unauthenticated; 9], "{shown:?}");
+        assert_eq!(codes, [Code::Unauthenticated; 10], "{shown:?}");
     }
-    // Estimate, sequence, submit; get, list, cancel, requeue, watch, download.
+    // Estimate, sequence, submit; get, list, cancel, requeue, watch, download, tracks.
     let (ok, no, none) = (Code::Ok, Code::PermissionDenied, Code::NotFound);
-    let succeeded = Code::InvalidArgument;
+    // The job has succeeded, and it is a pair.
+    let bad = Code::InvalidArgument;
     for (key, expected) in [
-        (READER, [no, no, no, ok, ok, no, no, ok, ok]),
-        (OTHER, [ok, ok, ok, none, ok, none, none, none, none]),
-        (WRITER, [ok, ok, ok, ok, ok, ok, succeeded, ok, ok]),
+        (READER, [no, no, no, ok, ok, no, no, ok, ok, bad]),
+        (OTHER, [ok, ok, ok, none, ok, none, none, none, none, none]),
+        (WRITER, [ok, ok, ok, ok, ok, ok, bad, ok, ok, bad]),
     ] {
         let shown = format!("Bearer {key}");
         assert_eq!(codes(&server, &id, Some(&shown)).await, expected, "{key}");

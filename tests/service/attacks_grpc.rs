@@ -14,7 +14,7 @@ use crate::raw_http::Besieged;
 use crate::server::{PATIENCE, Server};
 
 /// Every method of the public port.
-const METHODS: [&str; 13] = [
+const METHODS: [&str; 14] = [
     "fnsf.v1.SceneFlow/EstimateFlow",
     "fnsf.v1.SceneFlow/EstimateSequence",
     "fnsf.v1.SceneFlow/SubmitJob",
@@ -23,6 +23,7 @@ const METHODS: [&str; 13] = [
     "fnsf.v1.SceneFlow/CancelJob",
     "fnsf.v1.SceneFlow/RequeueJob",
     "fnsf.v1.SceneFlow/WatchJob",
+    "fnsf.v1.SceneFlow/GetTracks",
     "fnsf.v1.SceneFlow/DownloadResult",
     "grpc.health.v1.Health/Check",
     "grpc.health.v1.Health/Watch",

@@ -471,6 +471,7 @@ async fn the_documentation_names_every_route() {
         ("/v1/jobs/{id}/requeue", vec!["post"]),
         ("/v1/jobs/{id}/events", vec!["get"]),
         ("/v1/jobs/{id}/result", vec!["get"]),
+        ("/v1/jobs/{id}/tracks", vec!["get"]),
     ] {
         let known = paths
             .get(path)
@@ -478,7 +479,7 @@ async fn the_documentation_names_every_route() {
         let known: Vec<&String> = known.as_object().expect("methods").keys().collect();
         assert_eq!(known, methods, "{path}");
     }
-    assert_eq!(paths.len(), 7);
+    assert_eq!(paths.len(), 8);
     let page = reqwest::get(server.url("/docs/")).await.expect("an answer");
     assert_eq!(page.status(), StatusCode::OK);
 }

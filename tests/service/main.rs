@@ -32,4 +32,5 @@ mod retries;
 mod sequences;
 mod server;
 mod store_trouble;
+mod tracks;
 mod windows;

@@ -19,6 +19,7 @@ use crate::api::listener::Asking;
 use crate::api::pending_job::{Accepted, PendingJob};
 use crate::api::result_budget::ReadProgress;
 use crate::api::service::{Service, Waited};
+use crate::api::tracks::SequenceTracks;
 use crate::api::upload_budget::UploadReservation;
 use crate::job::{InvalidId, Job, JobId, Kind, State};
 
@@ -187,6 +188,7 @@ impl SceneFlow for Calls {
     type EstimateFlowStream = ResultBudget<proto::EstimateFlowResponse>;
     type EstimateSequenceStream = ResultBudget<proto::EstimateSequenceResponse>;
     type WatchJobStream = ResultBudget<proto::Job>;
+    type GetTracksStream = ResultBudget<proto::Track>;
     type DownloadResultStream = ResultBudget<proto::DownloadResultResponse>;
 
     async fn estimate_flow(
@@ -378,6 +380,17 @@ impl SceneFlow for Calls {
             }
         });
         Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
+    }
+
+    async fn get_tracks(
+        &self,
+        request: Request<proto::GetTracksRequest>,
+    ) -> Result<Response<Self::GetTracksStream>, Status> {
+        let call = Call::of(&request)?;
+        let job = self.named(&call, &request.get_ref().id).await?;
+        let SequenceTracks { tracks, .. } = self.service.tracks(&job).await?;
+        let messages = tracks.into_iter().map(|track| Ok(convert::track(&track)));
+        Ok(Response::new(Box::pin(tokio_stream::iter(messages))))
     }
 
     async fn download_result(

@@ -8,6 +8,7 @@ use tonic::metadata::MetadataMap;
 use super::proto;
 use crate::api::error::ApiError;
 use crate::api::results::Answer;
+use crate::flow::tracks::{Track, TrackState};
 use crate::flow::{Cluster, RigidTransform};
 use crate::formats::{ego_motion, rigid_motion};
 use crate::job::{
@@ -286,6 +287,23 @@ pub(super) fn header(answer: &Answer) -> proto::FlowHeader {
 }
 
 /// Converts a cluster.
+pub(super) fn track(track: &Track) -> proto::Track {
+    let state = |state: &TrackState| proto::TrackState {
+        sweep: state.sweep,
+        center: state.bounds.center.to_vec(),
+        size: state.bounds.size.to_vec(),
+        yaw: state.bounds.yaw,
+        velocity: state.velocity.to_vec(),
+        yaw_rate: state.yaw_rate,
+        points: state.points,
+        confidence: state.confidence,
+    };
+    proto::Track {
+        id: track.id,
+        states: track.states.iter().map(state).collect(),
+    }
+}
+
 pub(super) fn cluster(cluster: &Cluster) -> proto::Cluster {
     proto::Cluster {
         points: cluster.points,

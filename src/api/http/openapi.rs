@@ -37,6 +37,7 @@ impl Modify for Bearer {
         handlers::requeue_job,
         events::follow_job,
         results::result,
+        results::tracks,
     ),
     security((), ("key" = [])),
     modifiers(&Bearer),

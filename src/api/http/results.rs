@@ -216,6 +216,41 @@ pub(super) async fn result(
     head.answer(&headers, service.encoded(&job, format)).await
 }
 
+/// Returns the tracks of a sequence's moving objects as JSON.
+///
+/// While the sequence runs, the tracks are those of its first pairs, up to the first that has not
+/// succeeded. The header `fnsf-pairs` has their number.
+#[utoipa::path(
+    get,
+    path = "/v1/jobs/{id}/tracks",
+    tag = "jobs",
+    params(("id" = String, Path, description = "The sequence's name")),
+    responses(
+        (status = 200, description = "The tracks", content_type = "application/json"),
+        (status = 409, description = "No pair has succeeded", body = Problem, content_type = "application/problem+json"),
+        (status = "4XX", description = "A refusal", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+pub(super) async fn tracks(
+    State(service): State<Arc<Service>>,
+    Extension(caller): Extension<Caller>,
+    Named(id): Named,
+) -> Result<Response, ApiError> {
+    let job = service.job(&caller, id).await?;
+    let (encoded, pairs) = service.encoded_tracks(&job).await?;
+    let mut response = whole(encoded);
+    let headers = response.headers_mut();
+    headers.insert(
+        header::CONTENT_TYPE,
+        HeaderValue::from_static("application/json"),
+    );
+    headers.insert("fnsf-pairs", HeaderValue::from(pairs));
+    if let Ok(name) = HeaderValue::from_str(&job.id.to_string()) {
+        headers.insert("fnsf-job-id", name);
+    }
+    Ok(response)
+}
+
 /// The format of the flows in a zip archive, from the media types in `Accept` other than
 /// `application/zip`.
 fn entries_format(accept: Option<&str>) -> Result<AnswerFormat, ApiError> {

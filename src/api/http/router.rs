@@ -25,6 +25,7 @@ pub(crate) fn router(service: &Arc<Service>) -> Router {
         .route("/v1/jobs/{id}/requeue", post(handlers::requeue_job))
         .route("/v1/jobs/{id}/events", get(events::follow_job))
         .route("/v1/jobs/{id}/result", get(results::result))
+        .route("/v1/jobs/{id}/tracks", get(results::tracks))
         .merge(openapi::router())
         .method_not_allowed_fallback(problem::method)
         // Body sizes are limited while they are read, by the service's own limits.

@@ -1,7 +1,8 @@
-//! `fnsf eval`: how good flow files are.
+//! `fnsf eval`: how good files of flow or of tracks are.
 
 mod report;
 mod run;
+mod tracks;
 
 pub(super) use report::truth_of;
 pub(super) use run::Eval;

@@ -6,28 +6,34 @@ use anyhow::{Context, anyhow};
 use clap::Args;
 
 use super::report::{Report, Scores};
+use super::tracks;
 use crate::cli::failure::Failure;
 use crate::cli::files;
 use crate::cli::output::say;
 use crate::formats::{FlowFile, Pair, PairTruth};
 
-/// Compare flow files with ground truth.
+/// Compare flow files, or files of tracks, with ground truth.
 ///
 /// A point is scored if it is valid in the truth, not ground, and has a flow. End-point errors
 /// (EPE) are in metres, over the time from the source sweep to the target. For several flows, each
 /// has a row, and the last row is for all their points together.
+///
+/// Tracks (.json, as `fnsf flow --tracks` writes them) are compared with true tracks by the
+/// distance of centers in the plane, up to 2 m. True objects of 1 m/s and ten points or more are to
+/// be found, the others count neither for nor against.
 #[derive(Debug, Args)]
 #[command(override_usage = "fnsf eval FLOW... --truth TRUTH... [OPTIONS]")]
 #[command(after_help = "Examples:\n  \
     fnsf eval flow.npz --truth pair.npz\n  \
     fnsf eval flow.feather --truth flow_labels.feather --source sweep.feather --json\n  \
-    fnsf eval flows/*.npz --truth pairs/*.npz")]
+    fnsf eval flows/*.npz --truth pairs/*.npz\n  \
+    fnsf eval tracks.json --truth street/tracks.json")]
 pub(crate) struct Eval {
-    /// Flows in any format that `fnsf flow` writes
+    /// Flows in any format that `fnsf flow` writes, or tracks
     #[arg(required = true, value_name = "FLOW")]
     flows: Vec<PathBuf>,
     /// Ground truth of each flow, in the same order: an .npz pair with `flow` and `valid`, or
-    /// Argoverse 2's flow_labels.feather
+    /// Argoverse 2's flow_labels.feather; or true tracks
     #[arg(long, value_name = "TRUTH", required = true, num_args = 1..)]
     truth: Vec<PathBuf>,
     /// Source sweep of each flow, in the same order. Needed for the three-way and the
@@ -65,6 +71,9 @@ impl Eval {
                     files.len()
                 )));
             }
+        }
+        if files::is_tracks(&self.flows[0])? {
+            return tracks::run(&self.flows, &self.truth, self.json);
         }
         let names: Vec<String> = self
             .flows

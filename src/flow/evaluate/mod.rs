@@ -2,7 +2,7 @@
 //!
 //! Works on arrays in memory. The paper's metrics follow its evaluation code. The benchmarks are
 //! the Argoverse 2 scene flow task (three-way EPE) and its second edition (bucket-normalized EPE).
-//! The calibration of the confidence is measured as well.
+//! The calibration of the confidence and the tracks of a sequence are measured as well.
 
 mod argoverse;
 mod buckets;
@@ -10,6 +10,7 @@ mod classes;
 mod metrics;
 mod reliability;
 mod three_way;
+mod tracking;
 mod truth;
 
 pub use argoverse::{Argoverse2, Argoverse2Pool, evaluate_argoverse2};
@@ -18,4 +19,8 @@ pub use classes::{CLASSES, class_of_category, class_of_foreground};
 pub use metrics::{Metrics, Pool, evaluate};
 pub use reliability::{Calibration, CalibrationBin, Reliability};
 pub use three_way::{Part, ThreeWay};
+pub use tracking::{
+    MATCHED_WITHIN_M, TRACKED_FROM_MPS, TRACKED_FROM_POINTS, TrackedObject, TrackedSweep,
+    TrackingMetrics, TrackingPool, tracked_sweeps,
+};
 pub use truth::{CLOSE_HALF_WIDTH_M, EvaluateError, Truth};

@@ -35,7 +35,9 @@ pub(super) fn is_needed(
             !(is_static && seen.far)
                 && (found.observability >= options.min_observability
                     || has_gone(seen, options)
-                    || is_confirmed(neighbors, options) && !is_static)
+                    || !is_static
+                        && (found.normal_motion_m >= options.min_normal_motion_m
+                            || is_confirmed(neighbors, options)))
         }
 }
 
@@ -97,6 +99,7 @@ mod tests {
             cost: cost(0.03, 0.03),
             still: cost(0.25, 0.2),
             observability: 0.4,
+            normal_motion_m: 0.0,
             neighbors: NeighborEvidence::default(),
         }
     }
@@ -151,6 +154,18 @@ mod tests {
     #[test]
     fn a_wall_that_slides_in_its_plane_does_not_move() {
         assert!(!needed(|found| found.observability = 0.02));
+    }
+
+    #[test]
+    fn a_flat_side_that_turns_out_of_its_plane_moves_unless_it_is_seen_to_stay() {
+        let turns = |seen| {
+            needed_as_seen(seen, |found| {
+                (found.observability, found.normal_motion_m) = (0.02, 0.1);
+            })
+        };
+        assert!(turns(UNSEEN));
+        assert!(turns(seen(0.9, 0.2)));
+        assert!(!turns(seen(0.1, 0.1)));
     }
 
     #[test]

@@ -56,6 +56,8 @@ pub(super) struct Hypothesis {
     pub(super) still: Cost,
     /// Observability: how well the cluster's surfaces determine the motion along itself, 0 to 1.
     pub(super) observability: f32,
+    /// Displacement of the cluster's surfaces along their normals, root mean square, metres.
+    pub(super) normal_motion_m: f32,
     /// Evidence of the neighbor sweeps.
     pub(super) neighbors: NeighborEvidence,
 }
@@ -144,7 +146,8 @@ impl<'a> ClusterSearch<'a> {
     }
 
     /// The hypothesis of least cost. None where the cost `still` of standing still is so low that
-    /// no motion is needed, or where a motion hardly lowers it.
+    /// no motion is needed, or where a motion hardly lowers it. A motion that lowers it only by its
+    /// rotation must displace the surfaces along their normals.
     pub(super) fn search(&self, votes: &TranslationVotes, still: Cost) -> Option<Hypothesis> {
         let options = self.scene.options;
         let members = &self.scene.source.members[self.cluster as usize];
@@ -192,22 +195,25 @@ impl<'a> ClusterSearch<'a> {
                 fit_from(start);
             }
         }
-        if still.forward_m - best.cost.forward_m < options.min_gain_m {
+        let turned = members.len() >= TURNED;
+        let gains = |cost: Cost| still.forward_m - cost.forward_m >= options.min_gain_m;
+        let shifted = gains(best.cost);
+        if !(shifted || turned) {
             return None;
         }
-        let motion = self.fitted(
-            self.neighbors,
-            &self.rows,
-            &best.motion,
-            members.len() >= TURNED,
-            STEPS[1],
-        );
+        let motion = self.fitted(self.neighbors, &self.rows, &best.motion, turned, STEPS[1]);
         let BestHypothesis { motion, cost, .. } = self.tried(motion);
+        let normal_motion_m = self.normal_motion_m(&motion);
+        let turns = gains(cost) && normal_motion_m >= options.min_normal_motion_m;
+        if !(shifted || turns) {
+            return None;
+        }
         Some(Hypothesis {
             motion,
             cost,
             still,
             observability: self.observability(&motion),
+            normal_motion_m,
             neighbors: self.witnesses(&motion),
         })
     }
@@ -338,6 +344,26 @@ impl<'a> ClusterSearch<'a> {
             count += 1.0;
         }
         sum / f32::max(count, 1.0)
+    }
+
+    /// Root mean square of the displacement of the cluster's points along the normals of their
+    /// matches, metres. A surface that slides or turns in its own plane has 0. Points without a
+    /// normal do not count.
+    fn normal_motion_m(&self, motion: &PlanarMotion) -> f32 {
+        let mut sum = 0.0;
+        let mut count = 0.0;
+        for &row in &self.rows {
+            let from = self.scene.source.points[row as usize];
+            let to = motion.apply(from);
+            let normal = self.scene.match_of(to, self.cluster);
+            let normal = normal.map_or([0.0; 3], |target| self.scene.normal(target));
+            if normal != [0.0; 3] {
+                let along: f32 = (0..3).map(|a| normal[a] * (to[a] - from[a])).sum();
+                sum += along * along;
+                count += 1.0;
+            }
+        }
+        (sum / f32::max(count, 1.0)).sqrt()
     }
 
     /// The positions that the cluster leaves: its source points from which every point of the moved

@@ -89,6 +89,12 @@ pub struct ObjectOptions {
     /// normal counts 1/3. Free-space or neighbor evidence can replace it. Larger values reject more
     /// sliding surfaces.
     pub min_observability: f32,
+    /// Normal motion that replaces `min_observability`, metres: minimum root mean square of the
+    /// displacement of the cluster's surfaces along their normals. It is also required of a motion
+    /// whose translation alone does not reach `min_gain_m`. It finds the flat side of a vehicle that
+    /// turns. Ignored where free-space evidence says that the cluster stayed. Larger values reject
+    /// more.
+    pub min_normal_motion_m: f32,
     /// Free-space evidence that replaces `min_observability`, 0 to 1. It is the minimum share of
     /// the vacated positions that rays of the target passed through, and also of the newly occupied
     /// positions that rays of the source passed through. Larger values demand more evidence.
@@ -151,6 +157,7 @@ impl Default for ObjectOptions {
             min_evidence_slope: 3.0,
             max_residual_m: 0.15,
             min_observability: 0.1,
+            min_normal_motion_m: 0.08,
             min_free_space: 0.7,
             min_free_space_far: 0.3,
             adjacent_cost_ratio: 0.7,

@@ -139,6 +139,25 @@ impl Object {
         }
     }
 
+    /// The least and the largest coordinates of its solids in its frame, metres.
+    pub(super) fn extent(&self) -> [[f64; 3]; 2] {
+        let sides = |axis: usize| {
+            let parts = self.parts.iter();
+            parts.map(move |(shape, center)| (center[axis], shape.half_extents()[axis]))
+        };
+        let low = |axis| {
+            sides(axis)
+                .map(|(c, h)| c - h)
+                .fold(f64::INFINITY, f64::min)
+        };
+        let high = |axis| {
+            sides(axis)
+                .map(|(c, h)| c + h)
+                .fold(f64::NEG_INFINITY, f64::max)
+        };
+        [core::array::from_fn(low), core::array::from_fn(high)]
+    }
+
     /// Pose of the object, world_from_object, at a time in seconds.
     pub(super) fn pose(&self, terrain: &Terrain, seconds: f64) -> RigidTransform {
         let (position, yaw) = self.path.at(terrain, seconds);

@@ -33,6 +33,17 @@ struct Interval {
 }
 
 impl Shape {
+    /// Half extents of the bounding box along x, y, z, metres.
+    pub(super) fn half_extents(&self) -> [f64; 3] {
+        match *self {
+            Shape::Box(half) | Shape::Ellipsoid(half) => half,
+            Shape::Cylinder {
+                radius,
+                half_height,
+            } => [radius, radius, half_height],
+        }
+    }
+
     /// Radius of the bounding sphere, metres.
     pub(super) fn bounding_radius(&self) -> f64 {
         match *self {

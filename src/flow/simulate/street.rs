@@ -12,8 +12,9 @@ use super::scene::Target;
 use super::terrain::Terrain;
 use super::view;
 use super::world::World;
-use crate::flow::data::{Point, Random, RigidTransform};
+use crate::flow::data::{OrientedBox, Point, Random, RigidTransform};
 use crate::flow::depth::{Camera, DepthImage};
+use crate::flow::tracks::{Track, TrackState};
 
 /// Height of the sensor above the ground, metres.
 const SENSOR_HEIGHT_M: f64 = 1.73;
@@ -117,6 +118,59 @@ impl Street {
     /// without an object.
     pub fn kind(&self, object: i32) -> Option<Kind> {
         self.object(object).map(|object| object.kind)
+    }
+
+    /// The true tracks of the moving objects in `sweeps` of this street. The identity of an object
+    /// is its index plus 1. Each has a state in every sweep, with the box around the whole object,
+    /// its mean velocity until the next sweep, and its number of points off the ground; zero where
+    /// it is hidden.
+    pub fn tracks(&self, sweeps: &[StreetSweep]) -> Vec<Track> {
+        let shown = sweeps.iter().map(|sweep| {
+            let mut points = vec![0; self.movers.len()];
+            for (&object, ground) in sweep.object.iter().zip(&sweep.ground) {
+                let mover = usize::try_from(object).ok();
+                if let Some(points) = mover.and_then(|mover| points.get_mut(mover))
+                    && !ground
+                {
+                    *points += 1;
+                }
+            }
+            points
+        });
+        let shown: Vec<Vec<u32>> = shown.collect();
+        let track = |(mover, object): (usize, &Object)| {
+            let states = sweeps.iter().zip(&shown);
+            let states = states.map(|(sweep, shown)| self.state(object, sweep, shown[mover]));
+            Track {
+                id: mover as u32 + 1,
+                states: states.collect(),
+            }
+        };
+        self.movers.iter().enumerate().map(track).collect()
+    }
+
+    /// State of an object with `points` points in a sweep.
+    fn state(&self, object: &Object, sweep: &StreetSweep, points: u32) -> TrackState {
+        let [low, high] = object.extent();
+        let center = Point3::from([0, 1, 2].map(|a| low[a].midpoint(high[a])));
+        let sensor_from_world = sweep.world_from_sensor.inverse();
+        let [now, next] = [sweep.index, sweep.index + 1]
+            .map(|index| sensor_from_world * object.pose(&self.terrain, seconds(index as f64)));
+        let ahead = now.rotation * Vector3::x();
+        let velocity = (next * center - now * center) / SWEEP_SECONDS;
+        let turn = (next.rotation * now.rotation.inverse()).scaled_axis().z;
+        TrackState {
+            sweep: sweep.index as u32,
+            bounds: OrientedBox {
+                center: (now * center).coords.map(|c| c as f32).into(),
+                size: core::array::from_fn(|a| (high[a] - low[a]) as f32),
+                yaw: ahead.y.atan2(ahead.x) as f32,
+            },
+            velocity: velocity.map(|c| c as f32).into(),
+            yaw_rate: (turn / SWEEP_SECONDS) as f32,
+            points,
+            confidence: 1.0,
+        }
     }
 
     /// Computes the sweep with this index, from 0. The result is bit-identical for any order of
