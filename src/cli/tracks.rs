@@ -28,7 +28,7 @@ pub(super) struct TrackArguments {
     /// The flows that are written beside get the motions of tracks that their pairs missed
     #[arg(long, value_name = "OUT.json")]
     tracks: Option<PathBuf>,
-    /// File for a picture of the tracks from above, all in the frame of the first sweep
+    /// File for a picture of the tracks from above, all in the frame of the last sweep
     #[arg(long, value_name = "OUT.png")]
     tracks_picture: Option<PathBuf>,
 }

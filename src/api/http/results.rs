@@ -89,12 +89,7 @@ impl Head {
 
     /// Sets the headers that every response with a result has.
     fn describe(&self, response: &mut Response) {
-        let headers = response.headers_mut();
-        let mut set = |name: &'static str, value: String| {
-            if let Ok(value) = HeaderValue::from_str(&value) {
-                headers.insert(name, value);
-            }
-        };
+        let mut set = |name, value| set_header(response, name, value);
         set("content-type", self.media_type.to_owned());
         set("fnsf-job-id", self.job.id.to_string());
         set("etag", self.entity_tag());
@@ -133,6 +128,13 @@ impl Head {
         };
         self.describe(&mut response);
         Ok(response)
+    }
+}
+
+/// Sets a header, unless its value has characters that no header can have.
+fn set_header(response: &mut Response, name: &'static str, value: String) {
+    if let Ok(value) = HeaderValue::try_from(value) {
+        response.headers_mut().insert(name, value);
     }
 }
 
@@ -239,14 +241,12 @@ pub(super) async fn tracks(
     let job = service.job(&caller, id).await?;
     let (encoded, pairs) = service.encoded_tracks(&job).await?;
     let mut response = whole(encoded);
-    let headers = response.headers_mut();
-    headers.insert(
-        header::CONTENT_TYPE,
-        HeaderValue::from_static("application/json"),
-    );
-    headers.insert("fnsf-pairs", HeaderValue::from(pairs));
-    if let Ok(name) = HeaderValue::from_str(&job.id.to_string()) {
-        headers.insert("fnsf-job-id", name);
+    for (name, value) in [
+        ("content-type", "application/json".to_owned()),
+        ("fnsf-pairs", pairs.to_string()),
+        ("fnsf-job-id", job.id.to_string()),
+    ] {
+        set_header(&mut response, name, value);
     }
     Ok(response)
 }
@@ -322,19 +322,13 @@ async fn archive(
         }
     });
     let mut response = Body::from_stream(ReceiverStream::new(stream)).into_response();
-    let headers = response.headers_mut();
-    headers.insert(
-        header::CONTENT_TYPE,
-        HeaderValue::from_static("application/zip"),
-    );
     let name = format!("attachment; filename=\"{}.zip\"", sequence.id);
     for (header, value) in [
+        ("content-type", "application/zip".to_owned()),
         ("content-disposition", name),
         ("fnsf-job-id", sequence.id.to_string()),
     ] {
-        if let Ok(value) = HeaderValue::from_str(&value) {
-            headers.insert(header, value);
-        }
+        set_header(&mut response, header, value);
     }
     Ok(response)
 }

@@ -203,7 +203,7 @@ impl<'a> ClusterSearch<'a> {
         }
         let motion = self.fitted(self.neighbors, &self.rows, &best.motion, turned, STEPS[1]);
         let BestHypothesis { motion, cost, .. } = self.tried(motion);
-        let normal_motion_m = self.normal_motion_m(&motion);
+        let [observability, normal_motion_m] = self.on_surfaces(&motion);
         let turns = gains(cost) && normal_motion_m >= options.min_normal_motion_m;
         if !(shifted || turns) {
             return None;
@@ -212,7 +212,7 @@ impl<'a> ClusterSearch<'a> {
             motion,
             cost,
             still,
-            observability: self.observability(&motion),
+            observability,
             normal_motion_m,
             neighbors: self.witnesses(&motion),
         })
@@ -325,45 +325,40 @@ impl<'a> ClusterSearch<'a> {
         }
     }
 
-    /// Observability of a motion: the mean square of the cluster's normals along its translation, 0
-    /// for a wall that slides in its own plane, 1 for one that moves along its normal. Points
-    /// without a normal count as a third in every direction.
-    pub(super) fn observability(&self, motion: &PlanarMotion) -> f32 {
+    /// Observability and normal motion of a motion.
+    ///
+    /// Observability is the mean square of the cluster's normals along its translation, 0 for a
+    /// wall that slides in its own plane, 1 for one that moves along its normal. Points without a
+    /// normal count as a third in every direction.
+    ///
+    /// Normal motion is the root mean square of the displacement of the cluster's points along the
+    /// normals of their matches, metres. A surface that slides or turns in its own plane has 0.
+    /// Points without a normal do not count.
+    fn on_surfaces(&self, motion: &PlanarMotion) -> [f32; 2] {
         let length = motion.length_m().max(f32::MIN_POSITIVE);
         let [x, y] = motion.shift_m.map(|c| c / length);
-        let mut sum = 0.0;
-        let mut count = 0.0;
-        for target in self.matches(motion) {
-            let normal = self.scene.normal(target);
-            let along = normal[0] * x + normal[1] * y;
-            sum += if normal == [0.0; 3] {
-                HOLD_OF_A_POINT
-            } else {
-                along * along
-            };
-            count += 1.0;
-        }
-        sum / f32::max(count, 1.0)
-    }
-
-    /// Root mean square of the displacement of the cluster's points along the normals of their
-    /// matches, metres. A surface that slides or turns in its own plane has 0. Points without a
-    /// normal do not count.
-    fn normal_motion_m(&self, motion: &PlanarMotion) -> f32 {
-        let mut sum = 0.0;
-        let mut count = 0.0;
+        let (mut held, mut matched) = (0.0, 0.0);
+        let (mut moved, mut surfaces) = (0.0, 0.0);
         for &row in &self.rows {
             let from = self.scene.source.points[row as usize];
             let to = motion.apply(from);
-            let normal = self.scene.match_of(to, self.cluster);
-            let normal = normal.map_or([0.0; 3], |target| self.scene.normal(target));
-            if normal != [0.0; 3] {
-                let along: f32 = (0..3).map(|a| normal[a] * (to[a] - from[a])).sum();
-                sum += along * along;
-                count += 1.0;
+            let Some(target) = self.scene.match_of(to, self.cluster) else {
+                continue;
+            };
+            let normal = self.scene.normal(target);
+            matched += 1.0;
+            if normal == [0.0; 3] {
+                held += HOLD_OF_A_POINT;
+                continue;
             }
+            let along = normal[0] * x + normal[1] * y;
+            held += along * along;
+            let way: f32 = (0..3).map(|a| normal[a] * (to[a] - from[a])).sum();
+            moved += way * way;
+            surfaces += 1.0;
         }
-        (sum / f32::max(count, 1.0)).sqrt()
+        let observability = held / f32::max(matched, 1.0);
+        [observability, (moved / f32::max(surfaces, 1.0)).sqrt()]
     }
 
     /// The positions that the cluster leaves: its source points from which every point of the moved

@@ -9,8 +9,9 @@ use crate::flow::objects::Cluster;
 
 /// Largest length and width of a vehicle that is put together, metres.
 const VEHICLE_M: [f32; 2] = [6.5, 2.6];
-/// Least width of one of its parts, metres. Two persons are not parts of a vehicle.
-const PART_WIDTH_M: f32 = 1.2;
+/// Least length of the longer side of one of its parts, metres. Two persons are not parts of a
+/// vehicle.
+const PART_SIDE_M: f32 = 1.2;
 /// Largest gap between its parts, metres.
 const GAP_M: f32 = 1.0;
 /// Largest difference of their velocities, m/s.
@@ -63,7 +64,7 @@ fn is_one(a: &Carried, b: &Carried) -> bool {
     let apart = (Vector3::from(a.velocity) - Vector3::from(b.velocity)).norm();
     let width = |object: &Carried| object.bounds.size[0].min(object.bounds.size[1]);
     let is_wide =
-        |object: &Carried| object.bounds.size[0].max(object.bounds.size[1]) >= PART_WIDTH_M;
+        |object: &Carried| object.bounds.size[0].max(object.bounds.size[1]) >= PART_SIDE_M;
     // Cheap conditions first.
     if apart > SAME_VELOCITY || !(is_wide(a) || is_wide(b)) || width(a).max(width(b)) > VEHICLE_M[1]
     {
