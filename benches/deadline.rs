@@ -65,6 +65,7 @@ fn run(
         source: &pair.source,
         target: &pair.target,
         ground: Some([&ground.source, &ground.target]),
+        times: None,
         before: None,
         neighbors: &[],
     };

@@ -32,7 +32,12 @@ fn main() -> anyhow::Result<()> {
     let sweeps = (0..SWEEPS).map(|index| -> anyhow::Result<Sweep> {
         let points = street.sweep(index)?.points;
         let ground = None;
-        Ok(Sweep { points, ground }.prepared(&options))
+        Ok(Sweep {
+            points,
+            ground,
+            ..Sweep::default()
+        }
+        .prepared(&options))
     });
     let sweeps: Vec<Sweep> = sweeps.collect::<Result<_, _>>()?;
 

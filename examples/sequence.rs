@@ -26,6 +26,7 @@ fn main() -> anyhow::Result<()> {
         let sweep = Sweep {
             points: street.sweep(index)?.points,
             ground: None,
+            ..Sweep::default()
         };
         let new = sequence.push(&backend, sweep, &options, &Uncontrolled)?;
         println!("sweep {index}: {} flows", new.len());

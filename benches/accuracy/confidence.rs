@@ -101,6 +101,7 @@ fn judged(backend: &dyn Backend, known: LabelledPair, weight: f64) -> Scene {
         .map(|&row| moved(&ego, known.source[row]))
         .collect();
     let clouds = SearchClouds {
+        times: None,
         source: &aligned,
         target: &target,
         neighbors: &[],

@@ -88,7 +88,11 @@ fn still(fields: &Fields) -> Fields {
 
 fn ground_found(points: Vec<Point>) -> Sweep {
     let ground = Some(segment(&points, &GroundOptions::default()).ground);
-    Sweep { points, ground }
+    Sweep {
+        points,
+        ground,
+        ..Sweep::default()
+    }
 }
 
 fn distance(a: Point, b: Point) -> f64 {

@@ -125,6 +125,7 @@ pub(crate) fn estimates(
         let sweep = Sweep {
             points: points.clone(),
             ground: None,
+            ..Sweep::default()
         };
         estimates.extend(sequence.push(backend, sweep, &options, &clock)?);
     }

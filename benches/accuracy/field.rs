@@ -209,6 +209,7 @@ fn fitted(backend: &CpuBackend, pair: &Pair, options: &Options) -> Result<Run, S
         source: &pair.source,
         target: &pair.target,
         ground: ground.map(|g| [g.source.as_slice(), g.target.as_slice()]),
+        times: None,
         before: None,
         neighbors: &[],
     };

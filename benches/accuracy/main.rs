@@ -17,6 +17,7 @@ mod clock;
 mod confidence;
 mod densify;
 mod depth;
+mod deskew;
 mod drive;
 mod field;
 mod ground;
@@ -31,7 +32,7 @@ mod traffic;
 
 use std::process::ExitCode;
 
-const EXPERIMENTS: &str = "confidence densify depth field ground neighbors objects overlap registration sequences tracks traffic";
+const EXPERIMENTS: &str = "confidence densify deskew depth field ground neighbors objects overlap registration sequences tracks traffic";
 
 fn main() -> ExitCode {
     // Cargo adds `--bench`.
@@ -55,6 +56,7 @@ fn run(experiment: &str, arguments: Vec<String>) -> anyhow::Result<()> {
     match experiment {
         "confidence" => confidence::run(&arguments).map_err(anyhow::Error::msg),
         "densify" => densify::run(arguments),
+        "deskew" => deskew::run(arguments),
         "depth" => depth::run(&arguments),
         "field" => field::run(arguments).map_err(anyhow::Error::msg),
         "ground" => ground::run(),

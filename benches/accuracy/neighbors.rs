@@ -66,12 +66,14 @@ fn kitti() -> Result<Vec<LabelledPair>, String> {
         let sweep = Sweep {
             points: cloud.points,
             ground: None,
+            ..Sweep::default()
         };
         Ok((at, sweep.prepared(&options)))
     };
     let sweep = |points, ground| Sweep {
         points,
         ground: Some(ground),
+        ..Sweep::default()
     };
     Ok(vec![LabelledPair {
         name: "kitti_0000".to_owned(),
@@ -99,6 +101,7 @@ fn street(beams: usize, seed: u64, first: usize) -> Result<LabelledPair, String>
         Ok::<_, String>(Sweep {
             points: frame.points,
             ground: Some(frame.ground),
+            ..Sweep::default()
         })
     };
     let truth = street.pair(first).map_err(|e| e.to_string())?;
@@ -133,6 +136,7 @@ fn searched(
         .map(|(at, sweep)| NeighborSweep {
             points: &sweep.points,
             ground: sweep.ground.as_deref(),
+            times: None,
             at: *at,
         })
         .collect();
@@ -140,6 +144,7 @@ fn searched(
         source: &source.points,
         target: &target.points,
         ground: ground.map(|(source, target)| [source, target]),
+        times: None,
         before: None,
         neighbors: &neighbors,
     };

@@ -114,6 +114,7 @@ fn searched(backend: &CpuBackend, pair: &LabelledPair, options: &Options) -> Res
         source: &pair.source,
         target: &pair.target,
         ground: Some([&pair.ground[0], &pair.ground[1]]),
+        times: None,
         before: None,
         neighbors: &[],
     };

@@ -127,6 +127,7 @@ fn in_sequence(backend: &CpuBackend, drive: &Drive, options: &Options) -> anyhow
         let sweep = Sweep {
             points: points.clone(),
             ground: None,
+            ..Sweep::default()
         };
         let began = Instant::now();
         let estimates = sequence.push(backend, sweep, options, &Uncontrolled)?;

@@ -163,6 +163,7 @@ impl Admission {
             source: &source.points,
             target: &target.points,
             ground: ground.map(<[_; 2]>::from),
+            times: None,
             before: None,
             neighbors: &[],
         };

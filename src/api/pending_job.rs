@@ -99,8 +99,9 @@ fn with_ground(cloud: Arc<StoredCloud>, options: &JobOptions) -> Arc<StoredCloud
     let sweep = Sweep {
         points: cloud.points,
         ground: cloud.ground,
+        times: None,
     };
-    let Sweep { points, ground } = sweep.prepared(&options);
+    let Sweep { points, ground, .. } = sweep.prepared(&options);
     Arc::new(StoredCloud {
         points,
         ground,

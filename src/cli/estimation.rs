@@ -10,10 +10,11 @@ use super::failure::Failure;
 use super::terminal::Terminal;
 use super::{device, files};
 use crate::flow::field::{Backend, BackendError};
-use crate::flow::{self, Ego, Estimate, FlowError, RigidTransform, Sequence, Sweep};
-use crate::formats::{self, SweepTime};
+use crate::flow::{self, Ego, Estimate, FlowError, Point, RigidTransform, Sequence, Sweep};
+use crate::formats::{self, SweepTime, TimedCloud};
 use crate::job::{
-    DeviceChoice, EgoChoice, FieldChoices, GroundChoice, JobOptions, PrecisionChoice, PresetChoice,
+    DeviceChoice, EgoChoice, FieldChoices, GroundChoice, JobOptions, MAX_DT_S, PrecisionChoice,
+    PresetChoice,
 };
 
 /// Options of the flow estimate.
@@ -171,6 +172,7 @@ impl Estimation {
         let names: Vec<String> = paths.iter().map(name).collect();
         warn_of_disorder(&names);
         Ok(Surroundings {
+            clocks: vec![None; names.len()],
             names,
             poses,
             raster: raster.transpose()?,
@@ -253,24 +255,47 @@ impl Device<'_> {
     }
 }
 
-/// Poses and ground raster of a sequence's sweeps.
+/// The clock of a sweep whose points have times.
+#[derive(Clone, Copy, Debug)]
+struct SweepClock {
+    /// Time from the first point to the last, seconds.
+    duration_s: f64,
+    /// Time of the sweep on the sensor's clock, seconds.
+    sweep_s: Option<f64>,
+}
+
+/// Poses, clocks and ground raster of a sequence's sweeps.
 pub(super) struct Surroundings {
     /// File names of the sweeps; empty for a pair in one file.
     names: Vec<String>,
+    /// What is known of the clock of each sweep that was read.
+    clocks: Vec<Option<SweepClock>>,
     poses: Option<Vec<RigidTransform>>,
     raster: Option<formats::GroundRaster>,
 }
 
 impl Surroundings {
-    /// The options with the time between the two sweeps of a pair, where the options do not give it
-    /// and the file names do.
+    /// The options with the time between the two sweeps of a pair, where the options do not give it.
+    /// It is the difference of the timestamps in the file names, else of the sensor's clock, else
+    /// the duration of the source, because a spinning lidar does not pause between two turns.
     pub(super) fn timed(&self, options: &JobOptions, [source, target]: [usize; 2]) -> JobOptions {
         let mut options = options.clone();
         let time = |sweep: usize| SweepTime::from_name(self.names.get(sweep)?);
         options.dt_s = options
             .dt_s
-            .or_else(|| time(source)?.interval_s(time(target)?));
+            .or_else(|| time(source)?.interval_s(time(target)?))
+            .or_else(|| self.interval_s([source, target]));
         options
+    }
+
+    /// The time between two sweeps by the times of their points, seconds.
+    fn interval_s(&self, [source, target]: [usize; 2]) -> Option<f32> {
+        let clock = |sweep: usize| *self.clocks.get(sweep)?;
+        let [source, target] = [clock(source)?, clock(target)?];
+        let apart = source.sweep_s.zip(target.sweep_s);
+        let apart = apart.map(|(source, target)| (target - source).abs());
+        let apart = apart.filter(|&apart| apart > 0.0 && apart <= f64::from(MAX_DT_S));
+        Some(apart.unwrap_or(source.duration_s) as f32)
     }
 
     /// The solver's options for the pair of two sweeps, given by their indices. The larger sweep
@@ -292,9 +317,38 @@ impl Surroundings {
     /// mask.
     pub(super) fn sweep(&self, index: usize, path: &Path) -> Result<Sweep, Failure> {
         let points = files::read_cloud(path)?;
-        let ground = self.raster.as_ref().zip(self.poses.as_ref());
-        let ground = ground.map(|(raster, poses)| raster.ground(&points, &poses[index]));
-        Ok(Sweep { points, ground })
+        Ok(Sweep {
+            ground: self.ground(index, &points),
+            points,
+            times: None,
+        })
+    }
+
+    /// As [`Self::sweep`], with the times of the points.
+    pub(super) fn timed_sweep(&mut self, index: usize, path: &Path) -> Result<Sweep, Failure> {
+        let TimedCloud {
+            cloud,
+            times,
+            refused_times,
+        } = files::read_timed_cloud(path)?;
+        if let Some(refused) = refused_times {
+            eprintln!("fnsf: warning: {}: {refused}", path.display());
+        }
+        self.clocks[index] = times.as_ref().map(|times| SweepClock {
+            duration_s: times.duration_s,
+            sweep_s: times.sweep_s,
+        });
+        Ok(Sweep {
+            ground: self.ground(index, &cloud.points),
+            points: cloud.points,
+            times: times.map(|times| times.offsets_s),
+        })
+    }
+
+    /// The ground mask of a sweep, where a ground raster is given.
+    fn ground(&self, index: usize, points: &[Point]) -> Option<Vec<bool>> {
+        let raster = self.raster.as_ref().zip(self.poses.as_ref());
+        raster.map(|(raster, poses)| raster.ground(points, &poses[index]))
     }
 }
 

@@ -15,7 +15,7 @@ use crate::flow::depth::Camera;
 use crate::flow::tracks::Track;
 use crate::flow::{Point, RigidTransform};
 use crate::formats;
-use crate::formats::{FileKind, FlowFile, FormatError, GroundRaster, Pair, PairTruth};
+use crate::formats::{FileKind, FlowFile, FormatError, GroundRaster, Pair, PairTruth, TimedCloud};
 
 /// The largest file that is read, bytes.
 const MAX_FILE: u64 = 4 << 30;
@@ -52,6 +52,11 @@ fn read<T>(
 /// Reads one sweep, in any format.
 pub(super) fn read_cloud(path: &Path) -> Result<Vec<Point>, Failure> {
     read(path, formats::read_cloud).map(|cloud| cloud.points)
+}
+
+/// Reads one sweep with the times of its points, in any format.
+pub(super) fn read_timed_cloud(path: &Path) -> Result<TimedCloud, Failure> {
+    read(path, formats::read_timed_cloud)
 }
 
 /// Reads a pair of sweeps from one `.npz`.

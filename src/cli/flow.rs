@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::anyhow;
-use clap::Args;
+use clap::{Args, ValueEnum};
 
 use super::estimation::{Estimation, check_sequence};
 use super::failure::Failure;
@@ -51,10 +51,29 @@ pub(super) struct Flow {
     /// Print the report of each pair as one JSON object on stdout, instead of text
     #[arg(long)]
     json: bool,
+    /// Lead sweeps whose points have times (a field offset_ns, t, time or timestamp of ply, pcd and
+    /// feather) to one instant by the ego motion. auto: where the two sweeps of a pair then fit
+    /// clearly better, which they do not if they were deskewed before. on: always. off: the times are
+    /// not read. A deskewed flow starts from the deskewed points, and they are in the files that hold
+    /// points. With times, objects move for the real time between their points
+    #[arg(long, value_enum, default_value_t)]
+    deskew: DeskewChoice,
     #[command(flatten)]
     tracks: TrackArguments,
     #[command(flatten)]
     estimation: Estimation,
+}
+
+/// Whether sweeps are deskewed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+enum DeskewChoice {
+    /// Where the sweeps fit better then.
+    #[default]
+    Auto,
+    /// Always.
+    On,
+    /// Never: each sweep counts as measured at one instant.
+    Off,
 }
 
 /// A pair whose estimate is not complete, because its window may need later sweeps.
@@ -140,6 +159,16 @@ pub(super) fn print_report(report: &Report) -> Result<(), Failure> {
             "  ego motion {x:.3}, {y:.3}, {z:.3} m (target from source)"
         ))?;
     }
+    if let Some(deskew) = report.deskew {
+        let [given, deskewed] = deskew.distance_m.map(|m| 100.0 * m);
+        let outcome = match deskew.applied {
+            true => "deskewed",
+            false => "taken as they are",
+        };
+        say(format_args!(
+            "  sweeps {outcome}: near points {given:.2} cm from the target as given, {deskewed:.2} cm deskewed"
+        ))?;
+    }
     for warning in &report.warnings {
         eprintln!("fnsf: warning: {warning}");
     }
@@ -189,7 +218,11 @@ impl Flow {
                     Some(ground) => (Some(ground.source), Some(ground.target)),
                     None => (None, None),
                 };
-                let sweep = |points, ground| Sweep { points, ground };
+                let sweep = |points, ground| Sweep {
+                    points,
+                    ground,
+                    times: None,
+                };
                 Sweeps::Pair(Box::new([
                     sweep(pair.source, source),
                     sweep(pair.target, target),
@@ -201,7 +234,7 @@ impl Flow {
             }
         };
         let mut tracking = self.tracks.start(sweeps.count(), &options)?;
-        let surroundings = self.estimation.surroundings(&self.sweeps)?;
+        let mut surroundings = self.estimation.surroundings(&self.sweeps)?;
         let mut device = self.estimation.open()?;
         let mut sequence = Sequence::default();
         // The pairs that are not complete, and the points of the last sweep.
@@ -212,13 +245,17 @@ impl Flow {
             let began = terminal.seconds();
             let sweep = match &sweeps {
                 Sweeps::Pair(pair) => pair[index].clone(),
+                Sweeps::Files(files) if self.deskew != DeskewChoice::Off => {
+                    surroundings.timed_sweep(index, &files[index])?
+                }
                 Sweeps::Files(files) => surroundings.sweep(index, &files[index])?,
             };
             let load = terminal.seconds() - began;
             let points: Arc<[Point]> = sweep.points.as_slice().into();
             let larger = points.len().max(last.as_ref().map_or(0, |last| last.len()));
             let pair = [index.saturating_sub(1), index];
-            let solver_options = surroundings.options(&options, larger, pair);
+            let mut solver_options = surroundings.options(&options, larger, pair);
+            solver_options.always_deskew = self.deskew == DeskewChoice::On;
             if let Some(source) = last.replace(Arc::clone(&points)) {
                 waiting.push_back(Waiting {
                     pair: pair[0],
@@ -234,15 +271,16 @@ impl Flow {
                 let complete = waiting.drain(..found.len());
                 for (estimate, pair) in found.iter_mut().zip(complete) {
                     let options = surroundings.timed(&options, [pair.pair, pair.pair + 1]);
+                    let [source, target] = estimate.sweeps([&pair.source, &pair.target]);
                     if let Some(tracking) = &mut tracking {
                         let dt_s = options.solver_options(0).dt_s;
-                        tracking.push([&pair.source, &pair.target], estimate, dt_s)?;
+                        tracking.push([&source, &target], estimate, dt_s)?;
                     }
                     let mut report = Report::new(estimate, &options);
                     report.seconds.load = Some(pair.load);
                     report.seconds.total += pair.load;
                     report.peak_rss_bytes = peak_resident_bytes();
-                    self.put(estimate, &report, &pair.source, [pair.pair, count - 1])?;
+                    self.put(estimate, &report, &source, [pair.pair, count - 1])?;
                 }
                 if index + 1 < count {
                     break;

@@ -8,10 +8,11 @@ use clap::Args;
 use super::failure::Failure;
 use super::files;
 use super::output::say;
-use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
+use crate::flow::simulate::{SimulatedPair, Street, StreetError, StreetOptions};
 use crate::flow::tracks::Track;
 use crate::formats::{
-    CloudFormat, Ground, Pair, PairTruth, write_cloud, write_pair_npz, write_tracks,
+    CloudFormat, Ground, Pair, PairTruth, write_cloud, write_pair_npz, write_timed_pcd,
+    write_tracks,
 };
 use crate::text::grouped;
 
@@ -40,6 +41,13 @@ pub(super) struct Synth {
     /// Number of moving objects (cars, cyclists and pedestrians), at most 256
     #[arg(long, value_name = "N", default_value_t = StreetOptions::default().movers)]
     movers: usize,
+    /// Speed of the vehicle in m/s, 0 to 40. By default drawn from the seed, 5 to 11 m/s
+    #[arg(long, value_name = "M/S")]
+    speed_mps: Option<f64>,
+    /// Measure the columns of a sweep one after the other over 0.1 s, as a spinning lidar does.
+    /// sweep_0000.pcd, ... then have the field time. The clouds of a pair are deskewed
+    #[arg(long)]
+    rolling: bool,
 }
 
 /// A simulated pair with its ground truth, in the form in which files store it.
@@ -70,6 +78,8 @@ impl Synth {
             sweeps: self.sweeps,
             beams: self.beams,
             movers: self.movers,
+            speed_mps: self.speed_mps,
+            rolling: self.rolling,
             ..StreetOptions::default()
         })
         .map_err(Failure::usage)?;
@@ -88,12 +98,21 @@ impl Synth {
                 track.states.extend(state.states);
             }
             let path = self.output.join(format!("sweep_{index:04}.pcd"));
-            files::write(&path, |file| {
-                write_cloud(CloudFormat::Pcd, &frame.points, file)
+            files::write(&path, |file| match &frame.times {
+                None => write_cloud(CloudFormat::Pcd, &frame.points, file),
+                Some(times) => write_timed_pcd(&frame.points, times, file),
             })?;
         }
         for index in 0..self.sweeps.saturating_sub(1) {
-            let pair = labelled(street.pair(index).map_err(Failure::internal)?);
+            let mut pair = street.pair(index).map_err(Failure::internal)?;
+            if self.rolling {
+                let deskewed = |index| Ok(street.deskewed(&street.sweep(index)?));
+                let deskewed =
+                    deskewed(index).and_then(|source| Ok((source, deskewed(index + 1)?)));
+                let deskewed = deskewed.map_err(|error: StreetError| Failure::internal(error));
+                (pair.source, pair.target) = deskewed?;
+            }
+            let pair = labelled(pair);
             let path = self.output.join(format!("pair_{index:04}.npz"));
             files::write(&path, |file| write_pair_npz(&pair, file))?;
         }

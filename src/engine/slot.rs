@@ -10,7 +10,7 @@ use super::panics::message;
 use super::supervisor::{DeviceHandle, DeviceSupervisor, SelfTest};
 use super::types::{EngineError, Work};
 use crate::flow::field::{Backend, BackendError};
-use crate::flow::{self, Estimate, FlowError, NeighborSweep, Problem, Sweep};
+use crate::flow::{self, Estimate, FlowError, NeighborSweep, Problem};
 
 /// A message to a lane's thread.
 pub(super) enum Command {
@@ -168,19 +168,18 @@ pub(super) fn estimate(
         liveness,
     };
     let ground = work.ground.as_ref();
-    let neighbors = work.neighbors.iter().map(|(Sweep { points, ground }, at)| {
-        let ground = ground.as_deref();
-        NeighborSweep {
-            points,
-            ground,
-            at: *at,
-        }
+    let neighbors = work.neighbors.iter().map(|(sweep, at)| NeighborSweep {
+        points: &sweep.points,
+        ground: sweep.ground.as_deref(),
+        times: sweep.times.as_deref(),
+        at: *at,
     });
     let neighbors: Vec<NeighborSweep<'_>> = neighbors.collect();
     let problem = Problem {
         source: &work.source,
         target: &work.target,
         ground: ground.map(|[source, target]| [source.as_slice(), target.as_slice()]),
+        times: None,
         before: work.before.as_ref(),
         neighbors: &neighbors,
     };

@@ -31,6 +31,16 @@ pub enum FlowError {
         /// Number of points in the cloud.
         points: usize,
     },
+    /// A sweep does not have one time per point.
+    #[error("the {cloud} cloud has {points} points but {times} times")]
+    TimesLength {
+        /// `source`, `target` or `neighbor sweep`.
+        cloud: &'static str,
+        /// Number of times.
+        times: usize,
+        /// Number of points in the cloud.
+        points: usize,
+    },
     /// After the alignment the two sweeps show too little of one scene, see
     /// [`super::LEAST_OVERLAP`].
     #[error(
@@ -88,14 +98,14 @@ impl FlowError {
     /// Whether the input or its options caused the error, rather than the machine.
     ///
     /// True for sweeps of two scenes, coordinates that are not metres, too few points, a missing
-    /// ground mask or one of the wrong length, an empty target,
+    /// ground mask or one of the wrong length, times of the wrong length, an empty target,
     /// clouds that span too much space, a pair that exceeds the allowed memory or the memory of the
     /// device, and an option that the device does not support. False for all other errors,
     /// including an invalid cell or band of the distance transform.
     pub fn is_input(&self) -> bool {
         match self {
-            Self::NoOverlap { .. } | Self::NotMetres { .. } => true,
-            Self::TooFewPoints { .. } | Self::NoGroundMask | Self::GroundMaskLength { .. } => true,
+            Self::NoOverlap { .. } | Self::NotMetres { .. } | Self::TooFewPoints { .. } => true,
+            Self::NoGroundMask | Self::GroundMaskLength { .. } | Self::TimesLength { .. } => true,
             Self::Backend(BackendError::Distance(error)) => !matches!(
                 error,
                 DistanceError::Cell { .. }

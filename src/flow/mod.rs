@@ -37,6 +37,7 @@ mod sequence;
 
 // Shared data types, host threads and spatial indices.
 mod data;
+mod deskew;
 mod host;
 mod spatial;
 
@@ -65,7 +66,7 @@ pub use data::{
     OrientedBox, Point, Progress, RigidTransform, StopReason, Uncontrolled,
 };
 pub use error::FlowError;
-pub use estimate::{Estimate, FieldSolution, ObjectSolution, Solution, estimate, resume};
+pub use estimate::{Deskew, Estimate, FieldSolution, ObjectSolution, Solution, estimate, resume};
 pub use field::{Network, Snapshot, SnapshotError, TrainerState};
 pub use host::{Host, HostError};
 pub use motion::{MotionField, Residual, SampledMotion};

@@ -1,6 +1,7 @@
 //! The input of an estimate: a pair of sweeps with optional masks, prior and neighbor sweeps.
 
 use super::data::Point;
+use super::error::FlowError;
 use super::motion::MotionField;
 
 /// The input of an estimate: a pair of raw sweeps, with optional ground masks, previous motion
@@ -17,6 +18,10 @@ pub struct Problem<'a> {
     /// [`super::Ground::Keep`]. With [`super::Ground::Auto`] the ground is segmented where the
     /// masks are absent.
     pub ground: Option<[&'a [bool]; 2]>,
+    /// N and M times of the points, seconds after the time of their sweep; it may be negative. With
+    /// them and an ego motion the sweeps are deskewed where they fit better then. None
+    /// where they are unknown: each sweep then counts as measured at one instant.
+    pub times: Option<[&'a [f32]; 2]>,
     /// The motion field of the previous pair, whose target is this pair's source. None for an
     /// independent pair.
     ///
@@ -38,6 +43,8 @@ pub struct NeighborSweep<'a> {
     pub points: &'a [Point],
     /// K flags: true for ground points, as in [`Problem::ground`].
     pub ground: Option<&'a [bool]>,
+    /// K times of the points, as in [`Problem::times`].
+    pub times: Option<&'a [f32]>,
     /// Time of the sweep, in sweep intervals after the source. The sweep before the source is at
     /// -1, the sweep after the target at 2. The values 0 and 1 are the pair itself; they are not
     /// rejected but count its sweeps twice.
@@ -45,15 +52,39 @@ pub struct NeighborSweep<'a> {
 }
 
 impl<'a> Problem<'a> {
-    /// A pair without ground masks, previous motion field and neighbor sweeps.
+    /// A pair without ground masks, times, previous motion field and neighbor sweeps.
     pub fn pair(source: &'a [Point], target: &'a [Point]) -> Self {
         Self {
             source,
             target,
             ground: None,
+            times: None,
             before: None,
             neighbors: &[],
         }
+    }
+
+    /// Checks that all times have one row per point.
+    ///
+    /// # Errors
+    /// [`FlowError::TimesLength`].
+    pub(crate) fn check_times(&self) -> Result<(), FlowError> {
+        let pair = [("source", self.source), ("target", self.target)];
+        let pair = pair.into_iter().zip(self.times.into_iter().flatten());
+        let neighbors = self.neighbors.iter();
+        let neighbors =
+            neighbors.filter_map(|sweep| Some((("neighbor sweep", sweep.points), sweep.times?)));
+        for ((cloud, points), times) in pair.chain(neighbors) {
+            let [points, times] = [points.len(), times.len()];
+            if points != times {
+                return Err(FlowError::TimesLength {
+                    cloud,
+                    times,
+                    points,
+                });
+            }
+        }
+        Ok(())
     }
 
     /// The neighbor sweeps used by an estimate from `sweeps` sweeps in total: those nearest in time

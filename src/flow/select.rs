@@ -15,6 +15,8 @@ use super::problem::{NeighborSweep, Problem};
 pub(crate) struct Selection {
     /// Source row of each point of `source`.
     pub(crate) rows: Vec<usize>,
+    /// Target row of each point of `target`.
+    pub(crate) target_rows: Vec<usize>,
     pub(crate) source: Vec<Point>,
     pub(crate) target: Vec<Point>,
     /// Indices into `rows` of the points that get a flow. All of them, except where an object
@@ -110,6 +112,7 @@ pub(crate) fn select(
             .then(|| [problem.source, problem.target].map(|points| cropped(points, options))),
         undrawn,
         rows,
+        target_rows,
         output_rows,
         ego_only_rows,
     })
@@ -269,6 +272,7 @@ mod tests {
             source,
             target: source,
             ground: ground.map(|flags| [flags, flags]),
+            times: None,
             before: None,
             neighbors: &[],
         };
@@ -316,6 +320,7 @@ mod tests {
             source: &source,
             target: &source,
             ground: Some([&ground, &ground]),
+            times: None,
             before: None,
             neighbors: &[],
         };
@@ -388,6 +393,7 @@ mod tests {
             source: &[[0.0; 3]],
             target: &[[0.0; 3]],
             ground: None,
+            times: None,
             before: None,
             neighbors: &[],
         };

@@ -26,6 +26,8 @@ pub struct Sweep {
     pub points: Vec<Point>,
     /// N flags: true for ground points. None where the ground is unknown.
     pub ground: Option<Vec<bool>>,
+    /// N times of the points, see [`Problem::times`]. None where they are unknown.
+    pub times: Option<Vec<f32>>,
 }
 
 impl Sweep {
@@ -57,17 +59,18 @@ impl Sweep {
     /// order.
     ///
     /// # Panics
-    /// If the ground mask is so short that a point within the crop has no flag.
+    /// If the ground mask or the times are so short that a point within the crop has none.
     #[must_use]
     pub fn cropped(self, options: &Options) -> Self {
         let rows: Vec<usize> = (0..self.points.len())
             .filter(|&row| is_in_crop(self.points[row], options))
             .collect();
+        let kept = |flags: Vec<bool>| rows.iter().map(|&row| flags[row]).collect();
+        let measured = |times: Vec<f32>| rows.iter().map(|&row| times[row]).collect();
         Self {
             points: rows.iter().map(|&row| self.points[row]).collect(),
-            ground: self
-                .ground
-                .map(|ground| rows.iter().map(|&row| ground[row]).collect()),
+            ground: self.ground.map(kept),
+            times: self.times.map(measured),
         }
     }
 }
@@ -133,7 +136,7 @@ struct QueuedSweep {
 /// let mut sequence = Sequence::default();
 /// let mut flows = Vec::new();
 /// for index in 0..3 {
-///     let sweep = Sweep { points: street.sweep(index)?.points, ground: None };
+///     let sweep = Sweep { points: street.sweep(index)?.points, ..Sweep::default() };
 ///     flows.extend(sequence.push(&backend, sweep, &options, &Uncontrolled)?);
 /// }
 /// assert_eq!(flows.len(), 2);
@@ -244,21 +247,33 @@ impl Sequence {
         let (source, target) = (&self.at(pair).sweep, self.at(pair + 1));
         let ground = source.ground.as_deref();
         let ground = ground.zip(target.sweep.ground.as_deref());
+        let times = source.times.as_deref();
+        let times = times.zip(target.sweep.times.as_deref());
         let others = window(pair, self.count, self.sweeps);
         let others = others.filter(|&index| index != pair && index != pair + 1);
         let neighbors: Vec<NeighborSweep> = others
             .filter_map(|index| {
-                let Sweep { points, ground } = &self.at(index).sweep;
-                let ground = ground.as_deref();
+                let Sweep {
+                    points,
+                    ground,
+                    times,
+                } = &self.at(index).sweep;
+                let (ground, times) = (ground.as_deref(), times.as_deref());
                 // Sweeps more than 127 intervals away are skipped.
                 let at = i8::try_from(index as i64 - pair as i64).ok()?;
-                Some(NeighborSweep { points, ground, at })
+                Some(NeighborSweep {
+                    points,
+                    ground,
+                    times,
+                    at,
+                })
             })
             .collect();
         let problem = Problem {
             source: &source.points,
             target: &target.sweep.points,
             ground: ground.map(|(source, target)| [source, target]),
+            times: times.map(|(source, target)| [source, target]),
             before: self.before.as_ref(),
             neighbors: &neighbors,
         };

@@ -10,6 +10,7 @@ use super::limits::{MAX_COORDINATE_M, MAX_POINTS, check_value, check_within};
 use super::npz::Npz;
 use super::pcd::Pcd;
 use super::ply::Ply;
+use super::point_times::{PointTimes, TimesColumn, check_time};
 use super::scalar::{Scalar, write_floats};
 use super::sniff::recognize;
 use super::{bin, feather, npy, pcd, ply};
@@ -25,6 +26,17 @@ pub struct Cloud {
     /// Number of rows that are NaN in x, y and z, PCD's mark for a beam without return. They keep
     /// their row. Only PCD files have them.
     pub no_return: usize,
+}
+
+/// The points of one sweep with their times.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct TimedCloud {
+    /// The points.
+    pub cloud: Cloud,
+    /// The time of each point. None if the file has none, or the same for all points.
+    pub times: Option<PointTimes>,
+    /// Why the file's column of times is not used, if it is not that of one sweep.
+    pub refused_times: Option<String>,
 }
 
 impl From<Vec<Point>> for Cloud {
@@ -78,14 +90,45 @@ pub fn read_cloud_within(
     name: Option<&str>,
     most: usize,
 ) -> Result<Cloud, FormatError> {
+    read(bytes, name, most, false).map(|(cloud, _)| cloud)
+}
+
+/// As [`read_cloud`], with the times of the points, from PLY, PCD and feather files. A time is a
+/// field named `offset_ns`, `t`, `time`, `timestamp`, `offset_time` or `time_offset`, in seconds,
+/// milliseconds, microseconds or nanoseconds: in one of them the times span a sweep of 0.01 to 1 s.
+///
+/// # Errors
+/// As for [`read_cloud`], and `NotFinite` for a time that is NaN or infinite.
+pub fn read_timed_cloud(bytes: &[u8], name: Option<&str>) -> Result<TimedCloud, FormatError> {
+    let (cloud, column) = read(bytes, name, MAX_POINTS, true)?;
+    let times = column.map_or(Ok(None), |column| column.times());
+    let (times, refused_times) = match times {
+        Ok(times) => (times, None),
+        Err(refused) => (None, Some(refused)),
+    };
+    Ok(TimedCloud {
+        cloud,
+        times,
+        refused_times,
+    })
+}
+
+/// Reads a cloud and, where `timed`, the column of its points' times.
+fn read(
+    bytes: &[u8],
+    name: Option<&str>,
+    most: usize,
+    timed: bool,
+) -> Result<(Cloud, Option<TimesColumn>), FormatError> {
+    let untimed = |points: Vec<Point>| (Cloud::from(points), None);
     match recognize(bytes, name)? {
-        FileKind::Npy => npy::read_file(bytes, most).map(Cloud::from),
-        FileKind::Npz => read_npz(bytes, most).map(Cloud::from),
-        FileKind::Ply => read_ply(bytes, most).map(Cloud::from),
-        FileKind::Pcd => read_pcd(bytes, most),
-        FileKind::Feather => read_feather(bytes, most).map(Cloud::from),
+        FileKind::Npy => npy::read_file(bytes, most).map(untimed),
+        FileKind::Npz => read_npz(bytes, most).map(untimed),
+        FileKind::Ply => read_ply(bytes, most, timed),
+        FileKind::Pcd => read_pcd(bytes, most, timed),
+        FileKind::Feather => read_feather(bytes, most, timed),
         kind @ (FileKind::KittiBin | FileKind::NuscenesBin) => {
-            bin::read(bytes, kind, most).map(Cloud::from)
+            bin::read(bytes, kind, most).map(untimed)
         }
         FileKind::Json => Err(FileKind::Json.unsupported("json holds flow here, not clouds")),
         kind @ (FileKind::Las | FileKind::Png | FileKind::Camera | FileKind::Poses) => {
@@ -169,48 +212,93 @@ fn read_npz(bytes: &[u8], most: usize) -> Result<Vec<Point>, FormatError> {
     }
 }
 
-fn read_ply(bytes: &[u8], most: usize) -> Result<Vec<Point>, FormatError> {
+fn read_ply(
+    bytes: &[u8],
+    most: usize,
+    timed: bool,
+) -> Result<(Cloud, Option<TimesColumn>), FormatError> {
     let kind = FileKind::Ply;
     let ply = Ply::open(bytes)?;
     check_within(kind, ply.rows()?, most)?;
     refuse_integers(kind, |axis| ply.property(axis))?;
     let mut points = Vec::new();
-    ply.each(&AXES, |row, values| {
+    let mut times = TimesColumn::find(|name| timed && ply.property(name).is_some());
+    let wanted = wanted(times.as_ref());
+    ply.each(&wanted, |row, values| {
         if points.is_empty() {
             // `each` has checked the declared count against the size of the file before this call.
             points.reserve_exact(ply.rows()?);
         }
         points.push(point(kind, row, values)?);
+        if let (Some(times), Some(&time)) = (&mut times, values.get(AXES.len())) {
+            times.push(check_time(kind, row, times.name(), time)?);
+        }
         Ok(())
     })?;
-    Ok(points)
+    Ok((Cloud::from(points), times))
 }
 
-fn read_pcd(bytes: &[u8], most: usize) -> Result<Cloud, FormatError> {
+/// The names of the coordinates, and of the column of times.
+fn wanted(times: Option<&TimesColumn>) -> Vec<&'static str> {
+    AXES.into_iter()
+        .chain(times.map(TimesColumn::name))
+        .collect()
+}
+
+fn read_pcd(
+    bytes: &[u8],
+    most: usize,
+    timed: bool,
+) -> Result<(Cloud, Option<TimesColumn>), FormatError> {
     let kind = FileKind::Pcd;
     let pcd = Pcd::open(bytes)?;
     check_within(kind, pcd.rows(), most)?;
     refuse_integers(kind, |axis| pcd.field(axis))?;
     let mut cloud = Cloud::default();
-    pcd.each(&AXES, |row, values| {
+    let mut times = TimesColumn::find(|name| timed && pcd.field(name).is_some());
+    let wanted = wanted(times.as_ref());
+    pcd.each(&wanted, |row, values| {
         if cloud.points.is_empty() {
             cloud.points.reserve_exact(pcd.rows());
         }
-        if values.iter().all(|value| value.is_nan()) {
+        let [x, y, z, ..] = *values else {
+            return Ok(());
+        };
+        let returned = ![x, y, z].iter().all(|value| value.is_nan());
+        if returned {
+            cloud.points.push(point(kind, row, values)?);
+        } else {
             cloud.no_return += 1;
             cloud.points.push([f32::NAN; 3]);
-        } else {
-            cloud.points.push(point(kind, row, values)?);
+        }
+        if let (Some(times), Some(&time)) = (&mut times, values.get(AXES.len())) {
+            times.push(match returned {
+                true => check_time(kind, row, times.name(), time)?,
+                false => f64::NAN,
+            });
         }
         Ok(())
     })?;
-    Ok(cloud)
+    Ok((cloud, times))
 }
 
-fn read_feather(bytes: &[u8], most: usize) -> Result<Vec<Point>, FormatError> {
+fn read_feather(
+    bytes: &[u8],
+    most: usize,
+    timed: bool,
+) -> Result<(Cloud, Option<TimesColumn>), FormatError> {
+    let kind = FileKind::Feather;
     let table = Table::open(bytes)?;
-    check_within(FileKind::Feather, table.rows(), most)?;
-    read_columns(&table, AXES)
+    check_within(kind, table.rows(), most)?;
+    let points = read_columns(&table, AXES)?;
+    let mut times = TimesColumn::find(|name| timed && table.has(name));
+    if let Some(times) = &mut times {
+        table.each(times.name(), |row, value| {
+            times.push(check_time(kind, row, times.name(), value)?);
+            Ok(())
+        })?;
+    }
+    Ok((Cloud::from(points), times))
 }
 
 /// Three float columns of a feather table as N points or displacements, in metres.
@@ -279,6 +367,23 @@ pub enum CloudFormat {
     KittiBin,
 }
 
+/// Writes a sweep as PCD: N points, metres, and N times, seconds, in the field `time`.
+///
+/// # Errors
+/// As for [`write_cloud`].
+pub fn write_timed_pcd<W: Write>(
+    points: &[Point],
+    times: &[f32],
+    out: &mut W,
+) -> Result<(), FormatError> {
+    check_points(FileKind::Pcd, points)?;
+    let fields = ["x", "y", "z", "time"].map(|name| (name, 4, 'F'));
+    pcd::write_header(out, points.len(), &fields)?;
+    let rows = points.iter().zip(times);
+    let rows: Vec<[f32; 4]> = rows.map(|(&[x, y, z], &time)| [x, y, z, time]).collect();
+    write_floats(out, rows.as_flattened())
+}
+
 /// Writes a cloud of N points, metres.
 ///
 /// # Errors
@@ -298,15 +403,7 @@ pub fn write_cloud<W: Write>(
         CloudFormat::Feather => FileKind::Feather,
         CloudFormat::KittiBin => FileKind::KittiBin,
     };
-    let no_return =
-        |point: &Point| kind == FileKind::Pcd && point.iter().all(|value| value.is_nan());
-    for (row, values) in points
-        .iter()
-        .enumerate()
-        .filter(|(_, values)| !no_return(values))
-    {
-        point(kind, row, &values.map(f64::from))?;
-    }
+    check_points(kind, points)?;
     match format {
         CloudFormat::Npy => npy::write_points(out, points),
         CloudFormat::Ply => {
@@ -329,4 +426,18 @@ pub fn write_cloud<W: Write>(
         }
         CloudFormat::KittiBin => bin::write_kitti(out, points),
     }
+}
+
+/// Refuses coordinates that no reader accepts.
+fn check_points(kind: FileKind, points: &[Point]) -> Result<(), FormatError> {
+    let no_return =
+        |point: &Point| kind == FileKind::Pcd && point.iter().all(|value| value.is_nan());
+    for (row, values) in points
+        .iter()
+        .enumerate()
+        .filter(|(_, values)| !no_return(values))
+    {
+        point(kind, row, &values.map(f64::from))?;
+    }
+    Ok(())
 }

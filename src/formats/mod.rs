@@ -18,6 +18,7 @@ mod flow_file;
 mod ground_raster;
 mod motion;
 mod pair;
+mod point_times;
 mod poses;
 mod tracks;
 
@@ -33,7 +34,8 @@ mod scalar;
 
 pub use crate::formats::camera::{KITTI_SIZE_PX, read_camera, read_camera0_from_lidar};
 pub use crate::formats::cloud::{
-    Cloud, CloudFormat, declared_rows, read_cloud, read_cloud_within, write_cloud,
+    Cloud, CloudFormat, TimedCloud, declared_rows, read_cloud, read_cloud_within, read_timed_cloud,
+    write_cloud, write_timed_pcd,
 };
 pub use crate::formats::dense_file::{DENSE_FORMATS, DenseFormat, write_dense};
 pub use crate::formats::depth_png::{read_depth_png, write_depth_png};
@@ -46,6 +48,7 @@ pub use crate::formats::pair::{
     Av2Labels, Ground, Pair, PairTruth, is_pair, read_av2_labels, read_pair, read_pair_within,
     write_pair_npz,
 };
+pub use crate::formats::point_times::PointTimes;
 pub use crate::formats::poses::{PoseFile, read_poses};
 pub use crate::formats::sniff::recognize;
 pub use sweep_order::turning_sweep;

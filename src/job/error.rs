@@ -8,7 +8,7 @@ use crate::flow::densify::PlanError;
 /// The longest allowed deadline.
 pub(super) const MAX_DEADLINE: Duration = Duration::from_secs(24 * 60 * 60);
 /// The longest allowed time between two sweeps, seconds.
-pub(super) const MAX_DT_S: f32 = 60.0;
+pub const MAX_DT_S: f32 = 60.0;
 
 /// Why options are refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]

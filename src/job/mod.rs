@@ -16,7 +16,7 @@ mod sequence;
 pub use choices::{EgoChoice, GroundChoice, PrecisionChoice, PresetChoice, Priority};
 pub use densify::{Densify, LaterSweepsChoice};
 pub use device::{DeviceChoice, DeviceKind};
-pub use error::InvalidOptions;
+pub use error::{InvalidOptions, MAX_DT_S};
 pub use field::FieldChoices;
 pub use id::{InvalidId, JobId, Tenant};
 pub use options::JobOptions;

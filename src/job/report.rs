@@ -39,6 +39,9 @@ pub struct Report {
     /// it.
     #[serde(default)]
     pub overlap: Option<f64>,
+    /// Deskewing of the two sweeps, where the times of their points are known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub deskew: Option<DeskewReport>,
     /// What is suspicious about the input, in words: both sweeps are the same points, or they share
     /// little of what they show.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -54,6 +57,17 @@ pub struct Report {
     /// Peak resident memory of the process, bytes, if one process computed one pair.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub peak_rss_bytes: Option<u64>,
+}
+
+/// The deskewing of the two sweeps of a pair.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct DeskewReport {
+    /// Whether the deskewed sweeps are used. Otherwise they did not fit clearly better: the sweeps
+    /// were deskewed before, or the vehicle is slow.
+    pub applied: bool,
+    /// Mean distance, metres, of the source's points within 15 m from the target after the ego
+    /// motion: of the sweeps as they were given, and deskewed. Distances are truncated at 0.3 m.
+    pub distance_m: [f64; 2],
 }
 
 /// The result of an object search.
@@ -159,6 +173,10 @@ impl Report {
             device: estimate.device.clone(),
             ego_motion: estimate.ego.as_ref().map(matrix_rows),
             overlap: estimate.overlap.map(decimal),
+            deskew: estimate.deskew.as_ref().map(|deskew| DeskewReport {
+                applied: deskew.points.is_some(),
+                distance_m: deskew.distance_m.map(decimal),
+            }),
             warnings: warnings(estimate),
             objects,
             field,
@@ -236,6 +254,7 @@ mod tests {
     #[test]
     fn a_report_without_an_iteration_comes_back_from_its_json() {
         let estimate = Estimate {
+            deskew: None,
             flow: Vec::new(),
             valid: Vec::new(),
             dynamic: None,

@@ -103,7 +103,12 @@ impl Worker {
             let solver_options = Arc::clone(&solver_options);
             let read = move || {
                 let StoredCloud { points, ground, .. } = StoredCloud::from_bytes(&bytes)?;
-                let sweep = Sweep { points, ground }.prepared(&solver_options);
+                let sweep = Sweep {
+                    points,
+                    ground,
+                    times: None,
+                }
+                .prepared(&solver_options);
                 Ok::<_, CorruptPayload>(sweep.cropped(&solver_options))
             };
             let read = tokio::task::spawn_blocking(read).await;

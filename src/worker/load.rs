@@ -109,7 +109,12 @@ impl Worker {
             let Ok(at) = i8::try_from(at) else { continue };
             let bytes = self.blobs.get(owner, Blob::Sweep(index)).await?;
             let StoredCloud { points, ground, .. } = StoredCloud::from_bytes(&bytes)?;
-            around.push((Sweep { points, ground }, at));
+            let sweep = Sweep {
+                points,
+                ground,
+                times: None,
+            };
+            around.push((sweep, at));
         }
         Ok(around)
     }

@@ -1,6 +1,7 @@
 //! Tests of sequences and dense clouds from the command line.
 
-use fnsf::formats::{read_cloud, read_depth_png, read_flow, read_tracks};
+use fnsf::flow::Point;
+use fnsf::formats::{read_cloud, read_depth_png, read_flow, read_pair, read_tracks};
 
 use super::program::{fnsf, json, street};
 
@@ -252,4 +253,44 @@ fn tracks_of_what_cannot_have_any_are_refused_before_any_work() {
     assert!(refused(&SWEEPS, &["--preset", "paper"]).contains("--preset default or label"));
     assert!(refused(&SWEEPS, &["--ego", "off"]).contains("ego motion"));
     assert!(refused(&SWEEPS, &["--tracks-picture", "a.jpg"]).contains(".png"));
+}
+
+#[test]
+fn rolling_sweeps_are_deskewed_and_their_flow_starts_from_the_deskewed_points() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    let arguments = ["synth", "-o", "street", "--rolling", "--speed-mps", "25"];
+    assert_eq!(fnsf(folder, &arguments).code, 0);
+    let sweeps = ["flow", "street/sweep_0000.pcd", "street/sweep_0001.pcd"];
+    let run = |options: &[&str]| json(folder, &[&sweeps[..], options, &["--json"]].concat());
+    let report = run(&["-o", "flow.ply"]);
+    assert_eq!(report["deskew"]["applied"], true, "{report}");
+    let distance = |at: usize| report["deskew"]["distance_m"][at].as_f64();
+    assert!(distance(1) < distance(0), "{report}");
+    let dt_s = report["dt_s"].as_f64().expect("a number");
+    assert!((0.098..=0.1).contains(&dt_s), "the sweep lasts {dt_s} s");
+    let error = |output: &str| {
+        let truth = ["eval", output, "--truth", "street/pair_0000.npz", "--json"];
+        let score = json(folder, &truth);
+        score["epe_static"]
+            .as_f64()
+            .unwrap_or_else(|| panic!("{score}"))
+    };
+    let deskewed = error("flow.ply");
+    let points = |path: &str| {
+        let bytes = std::fs::read(folder.join(path)).expect("written");
+        read_cloud(&bytes, None).expect("a cloud").points
+    };
+    let truth = std::fs::read(folder.join("street/pair_0000.npz")).expect("written");
+    let truth = read_pair(&truth).expect("a pair").source;
+    let apart = |a: &[Point], b: &[Point]| -> f32 {
+        let off = |(a, b): (&Point, &Point)| (0..3).map(|i| (a[i] - b[i]).abs()).sum::<f32>();
+        a.iter().zip(b).map(off).sum::<f32>() / a.len() as f32
+    };
+    assert!(apart(&points("flow.ply"), &truth) < 0.02);
+    assert!(apart(&points("street/sweep_0000.pcd"), &truth) > 0.5);
+    let report = run(&["--deskew", "off", "-o", "raw.ply"]);
+    assert!(report.get("deskew").is_none(), "{report}");
+    let raw = error("raw.ply");
+    assert!(raw > 3.0 * deskewed, "{raw} {deskewed}");
 }

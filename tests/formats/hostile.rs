@@ -1,7 +1,10 @@
 //! Tests of invalid, truncated and oversized files: refused by name, cheaply and without a panic.
 
 use fnsf::flow::Point;
-use fnsf::formats::{FormatError, is_pair, read_av2_labels, read_cloud, read_flow, read_pair};
+use fnsf::formats::{
+    FormatError, is_pair, read_av2_labels, read_cloud, read_flow, read_pair, read_timed_cloud,
+    write_timed_pcd,
+};
 use proptest::prelude::*;
 
 use crate::samples::{
@@ -71,6 +74,17 @@ fn values_that_are_no_place_are_refused_by_row_and_column() {
         error.to_string().contains("2000000 m is out of range"),
         "{error}"
     );
+}
+
+#[test]
+fn a_time_that_is_not_finite_is_refused_by_row_and_column() {
+    let points = points(3);
+    let mut bytes = Vec::new();
+    write_timed_pcd(&points, &[0.0, f32::NAN, 0.1], &mut bytes).unwrap();
+    let refused = read_timed_cloud(&bytes, None).unwrap_err().to_string();
+    assert!(refused.contains("row 1, column time"), "{refused}");
+    // A reader that takes no times does not look at them.
+    assert_eq!(read_cloud(&bytes, None).unwrap().points, points);
 }
 
 #[test]
@@ -176,7 +190,15 @@ fn every_valid_file() -> Vec<(String, Vec<u8>)> {
     files.push(("ascii ply".to_owned(), ascii_ply()));
     files.push(("ascii pcd".to_owned(), ascii_pcd()));
     files.push(("compressed pcd".to_owned(), compressed_pcd(&points)));
+    files.push(("timed pcd".to_owned(), timed_pcd(&points)));
     files
+}
+
+fn timed_pcd(points: &[Point]) -> Vec<u8> {
+    let times: Vec<f32> = (0..points.len()).map(|row| row as f32 * 0.005).collect();
+    let mut bytes = Vec::new();
+    write_timed_pcd(points, &times, &mut bytes).unwrap();
+    bytes
 }
 
 fn ascii_ply() -> Vec<u8> {
@@ -211,6 +233,8 @@ fn compressed_pcd(points: &[Point]) -> Vec<u8> {
 /// Calls every reader. Returns whether any of them accepts the file.
 fn read_all(bytes: &[u8], name: Option<&str>) -> bool {
     let cloud = read_cloud(bytes, name).is_ok();
+    let timed = read_timed_cloud(bytes, name).is_ok();
+    assert!(cloud || !timed, "times make no file a cloud");
     let flow = read_flow(bytes, name).is_ok();
     let pair = read_pair(bytes).is_ok() && is_pair(bytes);
     let labels = read_av2_labels(bytes).is_ok();

@@ -3,7 +3,7 @@
 use fnsf::flow::Point;
 use fnsf::formats::{
     CloudFormat, FileKind, FlowFormat, FormatError, is_pair, read_av2_labels, read_cloud,
-    read_flow, read_pair, recognize, write_cloud,
+    read_flow, read_pair, read_timed_cloud, recognize, write_cloud, write_timed_pcd,
 };
 
 use crate::samples::{
@@ -23,6 +23,44 @@ fn a_cloud_comes_back_from_every_format() {
         assert_eq!(cloud.points, points, "{ending}");
         assert_eq!(cloud.no_return, 0);
     }
+}
+
+#[test]
+fn the_times_of_points_are_read_from_ply_pcd_and_feather() {
+    let points = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.0]];
+    let mut pcd = Vec::new();
+    write_timed_pcd(&points, &[0.0, 0.05, 0.1], &mut pcd).unwrap();
+    let ply = b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n\
+        property uint t\nproperty float z\nend_header\n1 2 0 3\n4 5 50000000 6\n7 8 100000000 9\n";
+    let column = |values: [f32; 3]| values.map(Some).to_vec();
+    let axes = [0, 1, 2].map(|axis| column(points.map(|point| point[axis])));
+    let [x, y, z] = axes;
+    let times = column([-100.0, -50.0, 0.0]);
+    let feather = feather(&[("x", x), ("y", y), ("z", z), ("time", times)]);
+    for (bytes, first) in [(&pcd, 0.0), (&ply.to_vec(), 0.0), (&feather, -0.1)] {
+        let read = read_timed_cloud(bytes, None).unwrap();
+        assert_eq!(read.cloud.points, points);
+        let times = read.times.expect("times");
+        assert!((times.duration_s - 0.1).abs() < 1e-6);
+        for (time, expected) in times.offsets_s.iter().zip([0.0, 0.05, 0.1]) {
+            assert!((time - first - expected).abs() < 1e-6, "{time}");
+        }
+    }
+    let untimed = read_timed_cloud(&cloud_file(CloudFormat::Npy, &points), None).unwrap();
+    assert_eq!((untimed.times, untimed.refused_times), (None, None));
+}
+
+#[test]
+fn rows_without_return_need_no_time() {
+    let pcd =
+        b"VERSION .7\nFIELDS x y z timestamp\nSIZE 4 4 4 8\nTYPE F F F F\nWIDTH 3\nHEIGHT 1\n\
+        POINTS 3\nDATA ascii\n1 2 3 1600000000.0\nnan nan nan nan\n4 5 6 1600000000.1\n";
+    let read = read_timed_cloud(pcd, None).unwrap();
+    assert_eq!(read.cloud.no_return, 1);
+    let times = read.times.expect("times");
+    assert_eq!(times.offsets_s[1], 0.0);
+    assert!((times.offsets_s[2] - 0.1).abs() < 1e-6);
+    assert!((times.sweep_s.expect("a clock") - 1.6e9).abs() < 1e-6);
 }
 
 #[test]

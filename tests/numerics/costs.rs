@@ -31,6 +31,7 @@ fn bytes_and_bricks_are_never_below_the_truth_and_not_far_above() {
             source: &pair.source,
             target: &pair.target,
             ground: Some([&ground.source, &ground.target]),
+            times: None,
             before: None,
             neighbors: &[],
         };
@@ -109,6 +110,7 @@ fn what_the_estimate_refuses_has_no_price() {
             source,
             target: &cloud,
             ground,
+            times: None,
             before: None,
             neighbors: &[],
         };

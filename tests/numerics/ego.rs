@@ -26,6 +26,7 @@ fn found(pair: &Pair, ground: Ground, max_points: Option<usize>) -> RigidTransfo
         source: &pair.source,
         target: &pair.target,
         ground: Some([&masks.source, &masks.target]),
+        times: None,
         before: None,
         neighbors: &[],
     };

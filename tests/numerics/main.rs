@@ -7,6 +7,7 @@ mod accuracy;
 mod costs;
 mod deadlines;
 mod depth;
+mod deskew;
 mod ego;
 mod gpu;
 #[path = "../common/gpu.rs"]

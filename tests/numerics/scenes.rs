@@ -52,6 +52,7 @@ pub(crate) fn estimated_on(backend: &dyn Backend, pair: &Pair, options: &Options
         source: &pair.source,
         target: &pair.target,
         ground: Some([&ground.source, &ground.target]),
+        times: None,
         before: None,
         neighbors: &[],
     };

@@ -29,7 +29,7 @@ fn drive(sweeps: usize) -> Street {
 fn sweep(points: Vec<Point>) -> Sweep {
     Sweep {
         points,
-        ground: None,
+        ..Sweep::default()
     }
 }
 
@@ -187,6 +187,7 @@ fn movers_are_carried_to_half_of_what_ego_motion_alone_leaves_and_the_static_wor
         .map(|frame| Sweep {
             points: frame.points.clone(),
             ground: Some(frame.ground.clone()),
+            ..Sweep::default()
         })
         .collect();
     let oldest = [0, FRAMES - 1];

@@ -26,6 +26,7 @@ fn alone(sweeps: &[Sweep], pair: usize, options: &Options, control: &dyn Control
     let others = others.map(|index| NeighborSweep {
         points: &sweeps[index].points,
         ground: sweeps[index].ground.as_deref(),
+        times: None,
         at: index as i8 - pair as i8,
     });
     let neighbors: Vec<NeighborSweep> = others.collect();
@@ -35,6 +36,7 @@ fn alone(sweeps: &[Sweep], pair: usize, options: &Options, control: &dyn Control
         source: &source.points,
         target: &target.points,
         ground: ground.map(<[_; 2]>::from),
+        times: None,
         before: None,
         neighbors: &neighbors,
     };
@@ -55,6 +57,7 @@ fn drive(seed: u64, sweeps: usize, beams: usize) -> (Street, Vec<Sweep>) {
         Sweep {
             points: frame.points,
             ground: Some(frame.ground),
+            ..Sweep::default()
         }
     };
     let sweeps = (0..sweeps).map(sweep).collect();
@@ -155,7 +158,11 @@ fn five_sweeps_beat_two_on_a_real_drive() {
         .expect("the pair was read from there")
         .join(NAME);
     let ground = pair.ground.clone().expect("the pair has ground masks");
-    let sweep = |points, ground| Sweep { points, ground };
+    let sweep = |points, ground| Sweep {
+        points,
+        ground,
+        ..Sweep::default()
+    };
     let mut sweeps = vec![
         sweep(pair.source.clone(), Some(ground.source)),
         sweep(pair.target.clone(), Some(ground.target)),

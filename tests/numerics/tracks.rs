@@ -37,6 +37,7 @@ fn estimates(sweeps: &[Vec<Point>]) -> Vec<Estimate> {
         let sweep = Sweep {
             points: points.clone(),
             ground: None,
+            ..Sweep::default()
         };
         sequence
             .push(&backend, sweep, &options, &Uncontrolled)

@@ -59,7 +59,7 @@ fn chained(
     for &index in indices {
         let sweep = Sweep {
             points: sweeps()[index].clone(),
-            ground: None,
+            ..Sweep::default()
         };
         let solver = options.solver_options(sweep.points.len());
         let estimates = sequence.push(backend, sweep, &solver, &Uncontrolled);
@@ -97,6 +97,7 @@ fn dense(options: &str) -> DenseCloud {
         .map(|points| Sweep {
             points: points.clone(),
             ground: finds_ground.then(|| segment(points, &GroundOptions::default()).ground),
+            times: None,
         })
         .collect();
     let plan = asked.plan(sweeps.len()).expect("a plan");

@@ -42,7 +42,7 @@ fn flows(preset: Preset, sweeps: &[Vec<Point>]) -> Vec<Vec<Point>> {
     for points in sweeps {
         let sweep = Sweep {
             points: points.clone(),
-            ground: None,
+            ..Sweep::default()
         };
         let pushed = sequence.push(&backend, sweep, &options, &Uncontrolled);
         found.extend(pushed.expect("a flow"));

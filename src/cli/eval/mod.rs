@@ -1,5 +1,6 @@
 //! `fnsf eval`: how good files of flow or of tracks are.
 
+mod buckets;
 mod report;
 mod run;
 mod tracks;

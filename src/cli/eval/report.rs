@@ -2,11 +2,12 @@
 
 use serde::Serialize;
 
+use super::buckets::BucketNormalizedReport;
 use crate::cli::failure::Failure;
 use crate::cli::output::say;
 use crate::flow::evaluate::{
-    Argoverse2Pool, BucketNormalized, BucketReport, CLASSES, Calibration, EvaluateError, Part,
-    Pool, Reliability, ThreeWay, Truth, class_of_category, class_of_foreground,
+    Argoverse2Pool, BucketNormalized, CLASSES, Calibration, EvaluateError, Part, Pool, Reliability,
+    ThreeWay, Truth, class_of_category, class_of_foreground,
 };
 use crate::formats::{FlowFile, Pair, PairTruth};
 use crate::text::grouped;
@@ -152,21 +153,6 @@ struct Argoverse2Report {
 }
 
 #[derive(Debug, Serialize)]
-struct BucketNormalizedReport {
-    dynamic_error: Option<f64>,
-    static_epe: Option<f64>,
-    classes: Vec<ClassReport>,
-}
-
-#[derive(Debug, Serialize)]
-struct ClassReport {
-    class: &'static str,
-    dynamic_error: Option<f64>,
-    static_epe: Option<f64>,
-    points: usize,
-}
-
-#[derive(Debug, Serialize)]
 struct ConfidenceReport {
     calibration_error: f64,
     sure_half_epe: f64,
@@ -196,27 +182,6 @@ impl From<ThreeWay> for ThreeWayReport {
             background_static: parts[2].epe,
             points: parts.map(|part| part.points),
         }
-    }
-}
-
-impl BucketNormalizedReport {
-    /// `None` where no point has a class.
-    fn new(report: &BucketReport) -> Option<Self> {
-        let classes = CLASSES.iter().zip(&report.classes);
-        let classes: Vec<ClassReport> = classes
-            .filter(|(_, error)| !error.buckets.is_empty())
-            .map(|(class, error)| ClassReport {
-                class,
-                dynamic_error: error.dynamic_error,
-                static_epe: error.static_epe,
-                points: error.buckets.iter().map(|bucket| bucket.points).sum(),
-            })
-            .collect();
-        (!classes.is_empty()).then_some(Self {
-            dynamic_error: report.dynamic_error,
-            static_epe: report.static_epe,
-            classes,
-        })
     }
 }
 
@@ -264,13 +229,6 @@ impl Report {
         if let Some(iou) = self.argoverse2.dynamic_iou {
             say(format_args!("  moving IoU   {iou:.4}"))?;
         }
-        if let Some(buckets) = &self.bucket_normalized {
-            say(format_args!(
-                "  bucket-normalized moving {}, static {} (within 35 m; 1 is no motion at all)",
-                share(buckets.dynamic_error),
-                metres(buckets.static_epe)
-            ))?;
-        }
         if let Some(confidence) = &self.confidence {
             say(format_args!(
                 "  confidence   surer half {:.4} m, rest {:.4} m, calibration error {:.3}",
@@ -285,7 +243,14 @@ impl Report {
                 moving.calibration_error
             ))?;
         }
-        Ok(())
+        self.print_buckets()
+    }
+
+    /// Prints the bucket-normalized errors by class and speed, where points have classes.
+    pub(super) fn print_buckets(&self) -> Result<(), Failure> {
+        self.bucket_normalized
+            .as_ref()
+            .map_or(Ok(()), BucketNormalizedReport::print)
     }
 
     /// Prints the scores as one row of a table.

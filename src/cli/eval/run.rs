@@ -111,6 +111,7 @@ impl Eval {
                 print_json(&report)?;
             } else {
                 report.print_row("all", width)?;
+                report.print_buckets()?;
             }
         }
         Ok(())

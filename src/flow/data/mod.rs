@@ -12,6 +12,7 @@ mod lock;
 mod oriented_box;
 mod point;
 mod rng;
+mod screw;
 mod stop_reason;
 
 pub use aligned_sweep::AlignedSweep;
@@ -31,3 +32,4 @@ pub(crate) use lazy::get_or_compute;
 pub(crate) use lock::locked;
 pub(crate) use point::{floor, square_distance, stride_sample, transform_point, transform_points};
 pub(crate) use rng::Random;
+pub(crate) use screw::Screw;

@@ -37,6 +37,7 @@ fn sweeps(count: usize) -> Vec<Sweep> {
         .map(|index| Sweep {
             points: vec![[index as f32, 0.0, 0.0], [f32::NAN; 3], [0.0, 1.0, 2.0]],
             ground: Some(vec![false, false, true]),
+            ..Sweep::default()
         })
         .collect()
 }

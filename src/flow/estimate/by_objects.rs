@@ -9,7 +9,7 @@ use crate::flow::data::{Interrupt, Point, RigidTransform};
 use crate::flow::error::FlowError;
 use crate::flow::host::Host;
 use crate::flow::motion::Residual;
-use crate::flow::objects::{Objects, SearchClouds};
+use crate::flow::objects::{Objects, SearchClouds, TimedPoints};
 use crate::flow::options::ObjectOptions;
 
 /// Estimates the residual motion by an object search on the host's threads.
@@ -39,16 +39,41 @@ pub(super) fn residual_motion(
         Some(ego) => aligned_neighbors(host, problem, input.options, ego, &find_ground, control)?,
     };
     let precomputed_at = control.seconds();
+    let is_deskewed = problem.source.as_ptr() != input.given[0].as_ptr();
+    let share = |times: &[f32]| -> Vec<f32> {
+        times.iter().map(|time| time / input.options.dt_s).collect()
+    };
+    let shares = problem
+        .times
+        .filter(|_| is_deskewed)
+        .map(|times| times.map(share));
     let clouds = SearchClouds {
         source: aligned,
         target: &selection.target,
         neighbors: &neighbors,
-        sweeps: [problem.source, problem.target],
+        sweeps: input.given,
+        times: shares
+            .as_ref()
+            .map(|[source, target]| [source.as_slice(), target]),
         target_from_source: motion,
     };
-    let search = host.find_objects(&clouds, options, control);
+    let mut search = host.find_objects(&clouds, options, control);
     if search.interrupted == Some(Interrupt::Cancelled) {
         return Err(FlowError::Cancelled);
+    }
+    if let Some([source_times, target_times]) = problem.times {
+        let at = |rows: &[usize], times: &[f32]| -> Vec<f32> {
+            rows.iter().map(|&row| times[row]).collect()
+        };
+        let source = TimedPoints {
+            points: aligned,
+            times: &at(&selection.rows, source_times),
+        };
+        let target = TimedPoints {
+            points: &selection.target,
+            times: &at(&selection.target_rows, target_times),
+        };
+        search.scale_to_interval(source, target, input.options.dt_s);
     }
     let objects = host.threads().install(|| {
         let (rows, source) = (&selection.rows, &selection.source);

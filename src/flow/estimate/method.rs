@@ -14,6 +14,8 @@ use crate::flow::select::Selection;
 /// The input of a method.
 pub(super) struct Input<'a> {
     pub(super) problem: &'a Problem<'a>,
+    /// The source and the target before they were deskewed, N and M points.
+    pub(super) given: [&'a [Point]; 2],
     pub(super) options: &'a Options,
     pub(super) selection: &'a Selection,
     pub(super) control: &'a dyn Control,

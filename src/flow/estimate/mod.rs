@@ -7,6 +7,7 @@
 mod by_cluster;
 mod by_field;
 mod by_objects;
+mod deskewing;
 mod ego_motion;
 mod method;
 mod neighbors;
@@ -15,5 +16,6 @@ mod run;
 #[cfg(test)]
 mod tests;
 
+pub use deskewing::Deskew;
 pub use result::{Estimate, FieldSolution, ObjectSolution, Solution};
 pub use run::{estimate, resume};

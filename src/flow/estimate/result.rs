@@ -1,5 +1,8 @@
 //! The result of an estimate.
 
+use std::sync::Arc;
+
+use super::deskewing::Deskew;
 use crate::flow::data::{Point, RigidTransform, StopReason};
 use crate::flow::motion::MotionField;
 use crate::flow::objects::Objects;
@@ -9,7 +12,7 @@ use crate::flow::objects::Objects;
 pub struct Estimate {
     /// N x 3 displacements from the source sweep's time to the target's, metres, ego motion
     /// included: the position in the target's frame minus the position in the source's frame. Zero
-    /// for points without a flow.
+    /// for points without a flow. The flow of a deskewed sweep starts from the deskewed points.
     pub flow: Vec<Point>,
     /// N flags: true for points with a flow.
     pub valid: Vec<bool>,
@@ -24,6 +27,9 @@ pub struct Estimate {
     /// [`crate::flow::LEAST_OVERLAP`] it is the larger of the shares of the two sweeps. None for
     /// small clouds, and where a deadline left no time for it.
     pub overlap: Option<f32>,
+    /// The deskewing of the two sweeps. None where the times of their points are unknown, without an
+    /// ego motion, while the vehicle stands, and where a deadline left no time for it.
+    pub deskew: Option<Deskew>,
     /// Whether both sweeps are the same points in the same order.
     pub same_sweep: bool,
     /// Number of points that took part and have a flow. Ground points with the ego-motion flow
@@ -51,6 +57,16 @@ impl Estimate {
     /// with its distance queries and its evaluation.
     pub fn method_seconds(&self) -> f64 {
         self.total_seconds - self.precompute_seconds
+    }
+
+    /// The source and the target of the pair, N and M points, as the flow takes them: deskewed, or
+    /// as they were `given`.
+    pub fn sweeps(&self, given: [&Arc<[Point]>; 2]) -> [Arc<[Point]>; 2] {
+        let deskewed = self
+            .deskew
+            .as_ref()
+            .and_then(|deskew| deskew.points.clone());
+        deskewed.unwrap_or_else(|| given.map(Arc::clone))
     }
 
     /// The objects; none for [`crate::flow::Method::Field`].

@@ -1,8 +1,11 @@
 //! The estimate of a pair: selection, ego motion, residual motion by the method, assembly.
 
+use std::borrow::Cow;
+
 use super::by_cluster;
 use super::by_field;
 use super::by_objects;
+use super::deskewing::deskew;
 use super::method::{Alignment, Input, Solved};
 use super::result::{Estimate, Solution};
 use crate::flow::data::{Control, DYNAMIC_M, Point, transform_point};
@@ -25,6 +28,7 @@ use crate::flow::select::select;
 ///   the problem does not suit the options.
 /// - [`FlowError::NotMetres`] or [`FlowError::NoOverlap`] if the coordinates are not metres, or the
 ///   sweeps do not show one scene after the ego motion. Not with [`Options::force`].
+/// - [`FlowError::TimesLength`] if a sweep does not have one time per point.
 /// - [`FlowError::Cancelled`] if the control cancels.
 /// - [`FlowError::Diverged`] if the loss of a field is not finite.
 /// - [`FlowError::Backend`] if the distance transform is rejected, or the device fails, is busy,
@@ -63,10 +67,26 @@ fn estimate_from(
     control: &dyn Control,
 ) -> Result<Estimate, FlowError> {
     let began = control.seconds();
+    let deskewed = deskew(backend.host(), problem, options, control)?;
+    let given = [problem.source, problem.target];
+    let (mut problem, mut options) = (*problem, Cow::Borrowed(options));
+    let neighbors;
+    if let Some(deskewed) = &deskewed {
+        options.to_mut().ego = Ego::Given(deskewed.ego);
+        neighbors = deskewed.neighbors(&problem);
+        problem.neighbors = &neighbors;
+        problem.ground = deskewed.ground(&problem, &options);
+        let deskew = deskewed.deskew.as_ref();
+        if let Some([source, target]) = deskew.and_then(|deskew| deskew.points.as_ref()) {
+            (problem.source, problem.target) = (source, target);
+        }
+    }
+    let (problem, options) = (&problem, options.as_ref());
     let find_ground = |sweeps: &[&[Point]]| backend.host().ground(sweeps);
     let selection = select(problem, options, &find_ground)?;
     let input = Input {
         problem,
+        given,
         options,
         selection: &selection,
         control,
@@ -81,7 +101,9 @@ fn estimate_from(
             None => by_field::residual_motion(backend, &input, field, snapshot)?,
         },
     };
-    Ok(assemble(&input, solved, began))
+    let mut estimate = assemble(&input, solved, began);
+    estimate.deskew = deskewed.and_then(|pair| pair.deskew);
+    Ok(estimate)
 }
 
 /// Maps the result for the selected points back to all source points.
@@ -140,6 +162,7 @@ fn assemble(input: &Input<'_>, solved: Solved, began: f64) -> Estimate {
         dynamic,
         ego,
         overlap,
+        deskew: None,
         same_sweep: source == input.problem.target,
         points: selection.output_rows.len(),
         solution,

@@ -49,6 +49,7 @@ fn estimated(
         source: &pair.source,
         target: &pair.target,
         ground: Some([&pair.ground_source, &pair.ground_target]),
+        times: None,
         before: None,
         neighbors: &[],
     };

@@ -7,7 +7,7 @@
 
 use std::f32::consts::{FRAC_PI_2, PI};
 
-use crate::flow::data::{Point, RigidTransform, transform_point};
+use crate::flow::data::{Point, RigidTransform, Screw, transform_point};
 
 /// Sides of the solid angles that rays are binned into, radians. Two rings of a 64-beam lidar fall
 /// into one bin.
@@ -48,16 +48,24 @@ pub(super) struct FreeSpaceEvidence {
 }
 
 impl FreeSpace {
-    /// From the raw source and target, metres, each in its own frame.
+    /// From the raw source and target, metres, each in its own frame. `times` are those of
+    /// [`super::SearchClouds::times`].
     pub(super) fn new(
-        [source, target]: [&[Point]; 2],
+        sweeps: [&[Point]; 2],
+        times: Option<[&[f32]; 2]>,
         target_from_source: &RigidTransform,
     ) -> Self {
-        let (source, target) = rayon::join(|| Rays::new(source), || Rays::new(target));
+        let source_from_target = target_from_source.inverse();
+        let path = Screw::of(&source_from_target);
+        let rays = |sweep: usize| {
+            let columns = times.map(|times| Columns::new(sweeps[sweep], times[sweep], &path));
+            Rays::new(sweeps[sweep], columns)
+        };
+        let (source, target) = rayon::join(|| rays(0), || rays(1));
         Self {
             source,
             target,
-            source_from_target: target_from_source.inverse(),
+            source_from_target,
         }
     }
 
@@ -80,11 +88,55 @@ impl FreeSpace {
 struct Rays {
     /// For each bin, the range of the nearest return, metres; infinite where there is none.
     shortest_m: Vec<f32>,
+    /// The sensor's motion during the sweep; none for a sweep that is taken at one instant.
+    columns: Option<Columns>,
+}
+
+/// The poses of a moving sensor by azimuth.
+struct Columns {
+    /// For each bin in azimuth, the transform from the sweep's frame to the sensor's frame at the
+    /// mean time of the points there.
+    measured_from_sweep: Vec<RigidTransform>,
+}
+
+impl Columns {
+    /// From the raw points of a sweep and their times in sweep intervals. `path` is the sensor's
+    /// motion in one interval, earlier_from_later.
+    fn new(points: &[Point], times: &[f32], path: &Screw) -> Self {
+        let mut sums = vec![[0.0_f64; 2]; AZIMUTHS];
+        for (&point, &time) in points.iter().zip(times) {
+            if point.iter().all(|c| c.is_finite()) {
+                let sum = &mut sums[direction(point).0 / ELEVATIONS];
+                *sum = [sum[0] + f64::from(time), sum[1] + 1.0];
+            }
+        }
+        let mut last = RigidTransform::identity();
+        let poses = sums.into_iter().map(|[sum, count]| {
+            if count > 0.0 {
+                last = path.at(sum / count).inverse();
+            }
+            last
+        });
+        Self {
+            measured_from_sweep: poses.collect(),
+        }
+    }
+
+    /// A position of the sweep's frame in the sensor's frame of the time at which the sensor looked
+    /// there.
+    fn as_measured(&self, position: Point) -> Point {
+        // The direction depends on the time, and the time on the direction.
+        const STEPS: usize = 2;
+        (0..STEPS).fold(position, |seen, _| {
+            let (angle, _) = direction(seen);
+            transform_point(&self.measured_from_sweep[angle / ELEVATIONS], position)
+        })
+    }
 }
 
 impl Rays {
     /// Rays to `points`. Points that are not finite are ignored.
-    fn new(points: &[Point]) -> Self {
+    fn new(points: &[Point], columns: Option<Columns>) -> Self {
         let mut shortest_m = vec![f32::INFINITY; AZIMUTHS * ELEVATIONS];
         for &point in points {
             let (angle, range_m) = direction(point);
@@ -92,11 +144,16 @@ impl Rays {
                 shortest_m[angle] = range_m.min(shortest_m[angle]);
             }
         }
-        Self { shortest_m }
+        Self {
+            shortest_m,
+            columns,
+        }
     }
 
     /// Whether all rays toward a position passed it; none where there are no rays.
     fn passed(&self, position: Point) -> Option<bool> {
+        let columns = self.columns.as_ref();
+        let position = columns.map_or(position, |columns| columns.as_measured(position));
         let (angle, range_m) = direction(position);
         let end_m = self.shortest_m[angle];
         let is_known = end_m.is_finite() && range_m.is_finite();
@@ -154,7 +211,8 @@ mod tests {
     #[test]
     fn a_pole_has_left_where_the_wall_behind_is_seen_and_come_where_it_was() {
         let sweeps = [sweep(0.0), sweep(1.0)];
-        let free_space = FreeSpace::new([&sweeps[0], &sweeps[1]], &RigidTransform::identity());
+        let free_space =
+            FreeSpace::new([&sweeps[0], &sweeps[1]], None, &RigidTransform::identity());
         let at = |x, y| (0..6_i8).map(|i| [x, y, f32::from(i) * 0.1]).collect();
         let [was, is]: [Vec<Point>; 2] = [at(10.0, 0.0), at(10.0, 1.0)];
         let seen = free_space.of(&was, &is, true);
@@ -167,11 +225,27 @@ mod tests {
     }
 
     #[test]
+    fn rays_of_a_moving_sensor_begin_where_it_was() {
+        // The sensor moves 2 m to the left in an interval, and looks ahead at the middle of it: it
+        // sees the pole 1 m to the right of where it is.
+        let raw = sweep(0.0);
+        let path = RigidTransform::translation(0.0, 2.0, 0.0);
+        let times = vec![0.5; raw.len()];
+        let sweeps = [raw.as_slice(); 2];
+        let free_space = FreeSpace::new(sweeps, Some([&times; 2]), &path.inverse());
+        let at = |y| -> Vec<Point> { (0..6_i8).map(|i| [9.5, y, f32::from(i) * 0.1]).collect() };
+        // In the target's frame, at its time.
+        assert_eq!(free_space.of(&at(1.0), &[], true).left, Some(0.0));
+        assert_eq!(free_space.of(&at(0.0), &[], true).left, Some(1.0));
+        assert_eq!(free_space.of(&at(2.0), &[], true).left, Some(1.0));
+    }
+
+    #[test]
     fn where_nobody_looked_or_few_places_are_nothing_is_known() {
         let sweep = [sweep(0.0), vec![[0.0; 3], [f32::NAN; 3], [0.1, 0.0, 0.0]]].concat();
         // Straight down and behind: the bin that a direction that is not a number falls into.
         let below = [vec![[-0.01, -1e-9, -2.0]], sweep.clone()].concat();
-        let free_space = FreeSpace::new([&below, &below], &RigidTransform::identity());
+        let free_space = FreeSpace::new([&below, &below], None, &RigidTransform::identity());
         let seen = |position: Point, count| free_space.of(&vec![position; count], &[], true);
         assert_eq!(seen([10.0, 5.0, 0.0], 6).left, Some(1.0));
         assert_eq!(seen([10.0, 5.0, 0.0], 4).left, None);

@@ -22,6 +22,7 @@ mod gauss_newton;
 mod hough;
 mod hypothesis;
 mod labels;
+mod measured_at;
 mod motion_field;
 mod neighbor_view;
 mod planar_motion;
@@ -37,4 +38,5 @@ pub use labels::ClusterLabels;
 pub use motion_field::ObjectMotions;
 pub use search::{ObjectSearch, SearchClouds};
 
+pub(crate) use measured_at::TimedPoints;
 pub(crate) use search::find_objects;

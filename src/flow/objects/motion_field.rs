@@ -109,6 +109,18 @@ impl ObjectMotions {
         self.motions[motion as usize].displacement(position)
     }
 
+    /// Number of motions.
+    pub(super) fn count(&self) -> usize {
+        self.motions.len()
+    }
+
+    /// Multiplies the motion of this index by `factor`.
+    pub(super) fn scale(&mut self, motion: u32, factor: f32) {
+        let motion = &mut self.motions[motion as usize];
+        motion.shift_m = motion.shift_m.map(|c| c * factor);
+        motion.turn *= factor;
+    }
+
     /// Rotation of the motion of this index about the vertical, radians, counterclockwise.
     pub(crate) fn turn(&self, motion: u32) -> f32 {
         self.motions[motion as usize].turn

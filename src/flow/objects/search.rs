@@ -41,6 +41,9 @@ pub struct SearchClouds<'a> {
     /// are not searched. Points that are not finite are ignored. The rays from each frame's origin
     /// to its points show free space, so the origin must be at the sensor or near it.
     pub sweeps: [&'a [Point]; 2],
+    /// Where `source` and `target` are deskewed: the times of the points of `sweeps`, which are not,
+    /// in sweep intervals after the time of their sweep.
+    pub times: Option<[&'a [f32]; 2]>,
     /// The ego motion, from the source's frame to the target's, metres; the identity if it is
     /// unknown.
     pub target_from_source: RigidTransform,
@@ -122,7 +125,7 @@ pub(crate) fn find_objects(
     let began = control.seconds();
     let downsampled = SourceCloud::new(source, &labels, options);
     let scene = Scene::new(&downsampled, target, options);
-    let free_space = FreeSpace::new(clouds.sweeps, &clouds.target_from_source);
+    let free_space = FreeSpace::new(clouds.sweeps, clouds.times, &clouds.target_from_source);
     let votes = TranslationVotes::new(&scene);
     let neighbors: Vec<NeighborView<'_>> = clouds
         .neighbors

@@ -38,6 +38,7 @@ fn wall(random: &mut Random, [from, to]: [f64; 2]) -> Vec<Point> {
 /// Two sweeps from the same position.
 fn clouds<'a>(source: &'a [Point], target: &'a [Point]) -> SearchClouds<'a> {
     SearchClouds {
+        times: None,
         source,
         target,
         neighbors: &[],

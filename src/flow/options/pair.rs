@@ -42,6 +42,8 @@ pub struct Options {
     /// Whether pairs are estimated that are otherwise refused as nonsense: sweeps that do not show
     /// one scene, and coordinates that are not metres.
     pub force: bool,
+    /// Whether sweeps with times are deskewed even where they do not fit better then.
+    pub always_deskew: bool,
     /// Method that estimates the residual motion.
     pub method: Method,
 }

@@ -144,6 +144,7 @@ impl Preset {
             dt_s: DEFAULT_DT_S,
             ground,
             ego,
+            always_deskew: false,
             method,
         }
     }

@@ -1,7 +1,7 @@
 //! Model of a spinning lidar: one ray per laser and azimuth step, with range noise and dropout.
 //!
-//! A sweep is taken at one instant. Columns run in parallel, each with its own random stream, so
-//! the sweep does not depend on the number of threads.
+//! A sweep consists of one or more views, each of a range of columns at one instant. Columns run in
+//! parallel, each with its own random stream, so the sweep does not depend on the number of threads.
 
 use std::f64::consts::{PI, TAU};
 
@@ -27,6 +27,14 @@ pub(super) struct Return {
     pub(super) point: Point,
     pub(super) object: i32,
     pub(super) is_ground: bool,
+}
+
+/// What a lidar sees at one instant.
+#[derive(Debug, Clone)]
+pub(super) struct View {
+    pub(super) world_from_sensor: RigidTransform,
+    /// Solids in the sensor's frame.
+    pub(super) targets: Vec<Target>,
 }
 
 /// A lidar with its lasers.
@@ -63,28 +71,37 @@ impl Lidar {
         }
     }
 
-    /// One sweep in the sensor frame, column by column, each from the top laser to the bottom one.
+    /// The returns of a sweep, one list for each of `views`: column by column, each from the top
+    /// laser to the bottom one, in the sensor's frame at the instant of the view. The views share
+    /// the columns of a turn evenly, in order.
     pub(super) fn sweep(
         &self,
         frame: usize,
         terrain: &Terrain,
-        world_from_sensor: &RigidTransform,
-        targets: &[Target],
-    ) -> Vec<Return> {
+        views: &[View],
+    ) -> Vec<Vec<Return>> {
         let stream =
             |column: usize| Random::stream(self.seed, (frame as u64) << 32 | column as u64);
         let step = TAU / self.azimuth_steps as f64;
         // The azimuths of a real sensor differ from turn to turn.
         let phase = stream(self.azimuth_steps).uniform(0.0, step);
-        let scene = self.prepare(terrain, world_from_sensor, targets, phase);
-        let columns: Vec<Vec<Return>> = (0..self.azimuth_steps)
-            .into_par_iter()
-            .map(|column| {
-                let azimuth = phase + column as f64 * step - PI;
-                self.shoot(&scene, column, azimuth, &mut stream(column))
-            })
-            .collect();
-        columns.concat()
+        let first = |view: usize| view * self.azimuth_steps / views.len();
+        let see = |(index, view): (usize, &View)| {
+            let scene = self.prepare(terrain, &view.world_from_sensor, &view.targets, phase);
+            let columns: Vec<Vec<Return>> = (first(index)..first(index + 1))
+                .into_par_iter()
+                .map(|column| {
+                    let azimuth = phase + column as f64 * step - PI;
+                    self.shoot(&scene, column, azimuth, &mut stream(column))
+                })
+                .collect();
+            columns.concat()
+        };
+        views
+            .par_iter()
+            .enumerate()
+            .map(|(index, view)| see((index, view)))
+            .collect()
     }
 
     fn shoot(

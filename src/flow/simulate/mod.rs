@@ -1,7 +1,8 @@
 //! Simulated street scanned by a spinning lidar, with the exact motion of every point.
 //!
-//! The options and their seed determine all data. Each sweep is taken at one instant: there is no
-//! rolling shutter. Independent of the estimation and of the metrics.
+//! The options and their seed determine all data. A sweep is taken at one instant or, with
+//! [`StreetOptions::rolling`], column by column over the sweep interval. Independent of the
+//! estimation and of the metrics.
 
 mod lidar;
 mod objects;

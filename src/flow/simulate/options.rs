@@ -41,6 +41,9 @@ pub struct StreetOptions {
     /// Factor on the probability that a return is lost, 0 (no loss) to 1. Far and grazing returns
     /// are lost more often.
     pub dropout: f64,
+    /// Whether the columns of a sweep are measured one after the other over the sweep interval, as
+    /// a spinning lidar does. Otherwise a sweep is taken at one instant.
+    pub rolling: bool,
 }
 
 impl Default for StreetOptions {
@@ -56,6 +59,7 @@ impl Default for StreetOptions {
             range_noise_m: 0.02,
             beam_bias_m: 0.01,
             dropout: 1.0,
+            rolling: false,
         }
     }
 }

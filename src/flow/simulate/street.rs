@@ -2,17 +2,23 @@
 //!
 //! The true flow is that of the measured point, noise included: it moves rigidly with the object or
 //! surface that the ray hit, and the ego vehicle moves as well. For a static point x2 = T x1.
+//!
+//! A point of a rolling sweep is measured at a time of its own. Its position p in the sensor's frame
+//! of that time is deskewed to x1, its position in the sensor's frame of the sweep's time. The flow
+//! starts at x1 and takes one sweep interval.
+
+use std::ops::Range;
 
 use nalgebra::{Point3, Translation3, Vector3};
 
-use super::lidar::Lidar;
+use super::lidar::{Lidar, View};
 use super::objects::{Kind, LANE_M, Object, traffic};
 use super::options::{SWEEP_SECONDS, StreetError, StreetOptions};
 use super::scene::Target;
 use super::terrain::Terrain;
 use super::view;
 use super::world::World;
-use crate::flow::data::{OrientedBox, Point, Random, RigidTransform};
+use crate::flow::data::{OrientedBox, Point, Random, RigidTransform, transform_point};
 use crate::flow::depth::{Camera, DepthImage};
 use crate::flow::tracks::{Track, TrackState};
 
@@ -20,6 +26,8 @@ use crate::flow::tracks::{Track, TrackState};
 const SENSOR_HEIGHT_M: f64 = 1.73;
 /// Wheelbase and track of the ego vehicle, metres.
 const EGO_STAND_M: [f64; 2] = [2.7, 1.6];
+/// Instants of a rolling sweep.
+const INSTANTS: usize = 125;
 /// Minimum residual displacement of a dynamic point, metres per sweep interval.
 const DYNAMIC_M: f64 = 0.05;
 
@@ -32,6 +40,7 @@ const DYNAMIC_M: f64 = 0.05;
 pub struct Street {
     sweeps: usize,
     speed: f64,
+    rolling: bool,
     terrain: Terrain,
     world: World,
     /// Moving objects.
@@ -39,20 +48,24 @@ pub struct Street {
     lidar: Lidar,
 }
 
-/// One sweep of N points in the sensor's frame, taken at one instant.
+/// One sweep of N points in the sensor's frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StreetSweep {
     /// Index of the sweep in the street, from 0.
     pub index: usize,
-    /// N points, metres, sensor frame: x forward, y left, z up, the ground near z = -1.73.
+    /// N points, metres, sensor frame of their own time: x forward, y left, z up, the ground near
+    /// z = -1.73.
     pub points: Vec<Point>,
+    /// N times of the points in a rolling sweep, seconds after the sweep's time. None for a sweep
+    /// that is taken at one instant.
+    pub times: Option<Vec<f32>>,
     /// N object indices; -1 for the ground and the static world. Moving objects come first, parked
     /// cars after them. An object keeps its index in all sweeps.
     pub object: Vec<i32>,
     /// N flags: true for ground points.
     pub ground: Vec<bool>,
-    /// Pose of the sensor: the transform from its frame to the world's, translation in metres. The
-    /// world has z up.
+    /// Pose of the sensor at the sweep's time: the transform from its frame to the world's,
+    /// translation in metres. The world has z up.
     pub world_from_sensor: RigidTransform,
 }
 
@@ -64,6 +77,8 @@ pub struct SimulatedPair {
     pub source: Vec<Point>,
     /// M points of the second sweep, metres, in its own sensor frame.
     pub target: Vec<Point>,
+    /// N and M times of the points, as in [`StreetSweep::times`].
+    pub times: Option<[Vec<f32>; 2]>,
     /// True flow, N x 3 metres per sweep interval, ego motion included.
     pub flow: Vec<Point>,
     /// N flags: true for points that move 0.05 m or more per sweep interval relative to the static
@@ -102,6 +117,7 @@ impl Street {
         Ok(Self {
             sweeps: options.sweeps,
             speed,
+            rolling: options.rolling,
             world: World::new(&terrain, travel, &mut random),
             movers: traffic(options.movers, speed, &terrain, &mut random),
             lidar: Lidar::new(options, &mut random),
@@ -180,17 +196,31 @@ impl Street {
     /// [`StreetError::NoSuchSweep`] if the street has no sweep with this index.
     pub fn sweep(&self, index: usize) -> Result<StreetSweep, StreetError> {
         self.check_sweep(index)?;
-        let world_from_sensor = self.pose(index as f64);
-        let targets = self.targets(index, &world_from_sensor);
-        let returns = self
-            .lidar
-            .sweep(index, &self.terrain, &world_from_sensor, &targets);
+        let instants = if self.rolling { INSTANTS } else { 1 };
+        let share = |instant: usize| instant as f64 / instants as f64;
+        let views = (0..instants).map(|instant| {
+            let at = index as f64 + share(instant);
+            let world_from_sensor = self.pose(at);
+            View {
+                targets: self.targets(at, &world_from_sensor),
+                world_from_sensor,
+            }
+        });
+        let views: Vec<View> = views.collect();
+        let seen = self.lidar.sweep(index, &self.terrain, &views);
+        let times = seen.iter().enumerate().flat_map(|(instant, returns)| {
+            let time = seconds(share(instant)) as f32;
+            returns.iter().map(move |_| time)
+        });
+        let times = self.rolling.then(|| times.collect());
+        let returns = seen.concat();
         Ok(StreetSweep {
             index,
             points: returns.iter().map(|hit| hit.point).collect(),
+            times,
             object: returns.iter().map(|hit| hit.object).collect(),
             ground: returns.iter().map(|hit| hit.is_ground).collect(),
-            world_from_sensor,
+            world_from_sensor: self.pose(index as f64),
         })
     }
 
@@ -203,7 +233,7 @@ impl Street {
     pub fn depth(&self, index: usize, camera: &Camera) -> Result<DepthImage, StreetError> {
         self.check_sweep(index)?;
         let world_from_camera = self.pose(index as f64) * camera.camera_from_lidar().inverse();
-        let targets = self.targets(index, &world_from_camera);
+        let targets = self.targets(index as f64, &world_from_camera);
         Ok(view::depth(
             camera,
             &self.terrain,
@@ -231,7 +261,8 @@ impl Street {
         let target = self.sweep(index + 1)?;
         let target_from_source = target.world_from_sensor.inv_mul(&source.world_from_sensor);
         let flow = self.flow_of(&source);
-        let dynamic = flow.iter().zip(&source.points).map(|(flow, &point)| {
+        let deskewed = self.deskewed(&source);
+        let dynamic = flow.iter().zip(deskewed).map(|(flow, point)| {
             let rigid = motion(&target_from_source, point);
             let residual = Vector3::from(flow.map(f64::from)) - rigid;
             residual.norm() >= DYNAMIC_M
@@ -242,6 +273,7 @@ impl Street {
             foreground: source.object.iter().map(|&object| object >= 0).collect(),
             source: source.points,
             target: target.points,
+            times: source.times.zip(target.times).map(<[_; 2]>::from),
             object: source.object,
             ground_source: source.ground,
             ground_target: target.ground,
@@ -271,31 +303,54 @@ impl Street {
     /// then.
     ///
     /// The result is N x 3 metres: the position at that time in the sensor frame of that time,
-    /// minus the position in the sweep.
+    /// minus the position in the sweep. A point of a rolling sweep starts from its deskewed
+    /// position, see [`Street::deskewed`], and an object moves for as long after the point's own
+    /// time.
     pub fn flow_to(&self, frame: &StreetSweep, at: f64) -> Vec<Point> {
         let now = frame.world_from_sensor;
         let next_from_world = self.pose(at).inverse();
-        let next_from_now = next_from_world * now;
-        let [now_seconds, next_seconds] = [frame.index as f64, at].map(seconds);
-        let moving: Vec<RigidTransform> = self
-            .movers
-            .iter()
-            .map(|object| {
-                let moved = object.pose(&self.terrain, next_seconds)
-                    * object.pose(&self.terrain, now_seconds).inverse();
-                next_from_world * moved * now
-            })
-            .collect();
-        let points = frame.points.iter().zip(&frame.object);
-        points
-            .map(|(&point, &object)| {
-                let mover = usize::try_from(object)
-                    .ok()
-                    .and_then(|index| moving.get(index));
-                let moved = motion(mover.unwrap_or(&next_from_now), point);
+        let way = seconds(at - frame.index as f64);
+        let deskewed = self.deskewed(frame);
+        let runs = instants(frame);
+        let flows = runs.flat_map(|(rows, time)| {
+            let began = seconds(frame.index as f64) + f64::from(time);
+            let moving: Vec<RigidTransform> = self
+                .movers
+                .iter()
+                .map(|object| {
+                    let moved = object.pose(&self.terrain, began + way)
+                        * object.pose(&self.terrain, began).inverse();
+                    next_from_world * moved * now
+                })
+                .collect();
+            let deskewed = &deskewed;
+            rows.map(move |row| {
+                let mover = usize::try_from(frame.object[row]).ok();
+                let mover = mover.and_then(|index| moving.get(index));
+                let still = next_from_world * now;
+                let moved = motion(mover.unwrap_or(&still), deskewed[row]);
                 moved.map(|component| component as f32).into()
             })
-            .collect()
+        });
+        flows.collect()
+    }
+
+    /// The points of a sweep of this street in the sensor's frame of the sweep's time, N x 3
+    /// metres: where the surfaces that they were measured on were when they were measured. Those of
+    /// a sweep that is taken at one instant are its points.
+    pub fn deskewed(&self, frame: &StreetSweep) -> Vec<Point> {
+        let sensor_from_world = frame.world_from_sensor.inverse();
+        let points = instants(frame).flat_map(|(rows, time)| {
+            let at = frame.index as f64 + f64::from(time) / SWEEP_SECONDS;
+            let then = sensor_from_world * self.pose(at);
+            rows.map(move |row| {
+                if time == 0.0 {
+                    return frame.points[row];
+                }
+                transform_point(&then, frame.points[row])
+            })
+        });
+        points.collect()
     }
 
     /// Pose of the sensor, `world_from_sensor` with the translation in metres, at a time in sweep
@@ -315,8 +370,8 @@ impl Street {
         self.movers.iter().chain(&self.world.parked).nth(index)
     }
 
-    /// All solids of the street at the time of a sweep, in the sensor's frame.
-    fn targets(&self, index: usize, world_from_sensor: &RigidTransform) -> Vec<Target> {
+    /// All solids of the street at a time, in sweep intervals, in the sensor's frame.
+    fn targets(&self, at: f64, world_from_sensor: &RigidTransform) -> Vec<Target> {
         let sensor_from_world = world_from_sensor.inverse();
         let still = self.world.solids.iter().map(|solid| Target {
             shape: solid.shape,
@@ -325,7 +380,7 @@ impl Street {
         });
         let objects = self.movers.iter().chain(&self.world.parked).zip(0..);
         let parts = objects.flat_map(|(object, number)| {
-            let pose = sensor_from_world * object.pose(&self.terrain, seconds(index as f64));
+            let pose = sensor_from_world * object.pose(&self.terrain, seconds(at));
             object.parts.iter().map(move |&(shape, center)| Target {
                 shape,
                 sensor_from_solid: pose * Translation3::from(center),
@@ -334,6 +389,23 @@ impl Street {
         });
         still.chain(parts).collect()
     }
+}
+
+/// The rows of a sweep that were measured at one time, and the time, seconds after the sweep's.
+fn instants(frame: &StreetSweep) -> impl Iterator<Item = (Range<usize>, f32)> {
+    let runs: Vec<(usize, f32)> = match &frame.times {
+        None => vec![(frame.points.len(), 0.0)],
+        Some(times) => {
+            let runs = times.chunk_by(|a, b| a == b);
+            runs.map(|run| (run.len(), run[0])).collect()
+        }
+    };
+    let mut first = 0;
+    runs.into_iter().map(move |(count, time)| {
+        let rows = first..first + count;
+        first = rows.end;
+        (rows, time)
+    })
 }
 
 /// Converts a time in sweep intervals to seconds.

@@ -213,3 +213,56 @@ fn frames_past_the_end_and_bad_options_are_refused() {
     };
     assert!(Street::new(&tight).is_err());
 }
+
+#[test]
+fn a_rolling_sweep_measures_each_column_at_a_time_of_its_own() {
+    /// Range noise, and the error of a laser, over which a return may miss its surface.
+    const NOISE_M: f64 = 0.12;
+    let options = StreetOptions {
+        rolling: true,
+        speed_mps: Some(20.0),
+        ..small(4)
+    };
+    let street = Street::new(&options).unwrap();
+    let sweep = street.sweep(1).unwrap();
+    let times = sweep.times.as_ref().unwrap();
+    assert_eq!((times[0], times.is_sorted()), (0.0, true));
+    assert!((0.098..0.1).contains(&f64::from(times[times.len() - 1])));
+    let movers = (0..times.len()).filter(|&row| (0..24).contains(&sweep.object[row]));
+    let movers: Vec<usize> = movers.collect();
+    assert!(movers.len() > 300);
+    for row in movers {
+        let at = 1.0 + f64::from(times[row]) / SWEEP_SECONDS;
+        let object = street.object(sweep.object[row]).unwrap();
+        let world = street.pose(at) * Point3::from(sweep.points[row].map(f64::from));
+        let local = object.pose(&street.terrain, seconds(at)).inverse() * world;
+        let parts = object.parts.iter();
+        let off = parts.map(|(shape, center)| shape.surface_distance(&(local.coords - center)));
+        let off = off.fold(f64::INFINITY, f64::min);
+        assert!(off < NOISE_M, "{off}");
+    }
+}
+
+#[test]
+fn the_flow_of_a_rolling_sweep_starts_from_its_deskewed_points() {
+    let options = StreetOptions {
+        rolling: true,
+        ..small(4)
+    };
+    let street = Street::new(&options).unwrap();
+    let pair = street.pair(0).unwrap();
+    let sweep = street.sweep(0).unwrap();
+    let deskewed = street.deskewed(&sweep);
+    let last = deskewed.len() - 1;
+    assert_eq!(deskewed[0], sweep.points[0]);
+    let moved = moved(deskewed[last], sweep.points[last].map(|c| -c)).norm();
+    assert!((0.4..1.2).contains(&moved), "{moved}");
+    for (row, &point) in deskewed.iter().enumerate() {
+        if !pair.dynamic[row] && pair.object[row] < 0 {
+            let rigid = motion(&pair.target_from_source, point);
+            let flow = Vector3::from(pair.flow[row].map(f64::from));
+            assert!((flow - rigid).norm() < SINGLE);
+        }
+    }
+    assert_eq!(street.flow(0).unwrap(), pair.flow);
+}
