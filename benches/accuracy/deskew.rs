@@ -59,8 +59,8 @@ const WAYS: [Way; 4] = [
     },
 ];
 
-pub(super) fn run(arguments: Vec<String>) -> anyhow::Result<()> {
-    let streets = match arguments.as_slice() {
+pub(super) fn run(arguments: &[String]) -> anyhow::Result<()> {
+    let streets = match arguments {
         [] => STREETS,
         [flag, range] if flag == "--streets" => {
             let (first, end) = range.split_once("..").context("--streets A..B")?;

@@ -56,7 +56,7 @@ fn run(experiment: &str, arguments: Vec<String>) -> anyhow::Result<()> {
     match experiment {
         "confidence" => confidence::run(&arguments).map_err(anyhow::Error::msg),
         "densify" => densify::run(arguments),
-        "deskew" => deskew::run(arguments),
+        "deskew" => deskew::run(&arguments),
         "depth" => depth::run(&arguments),
         "field" => field::run(arguments).map_err(anyhow::Error::msg),
         "ground" => ground::run(),

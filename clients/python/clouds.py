@@ -138,7 +138,38 @@ def write_flow(path, flow):
     arrays = {"flow": rows, "valid": flags & 1 != 0, "dynamic": flags & 2 != 0}
     if flow.header.ego_motion:
         arrays["ego"] = np.array(flow.header.ego_motion).reshape(4, 4)
+    if flow.cluster:
+        arrays["cluster"] = np.frombuffer(flow.cluster, dtype="<i4")
+        arrays["confidence"] = np.frombuffer(flow.confidence, dtype="<f4")
+        arrays["moving"] = np.frombuffer(flow.moving, dtype="<f4")
+        arrays.update(_clusters(np, flow.clusters))
     np.savez_compressed(path, **arrays)
+
+
+def _clusters(np, clusters):
+    """The clusters as the arrays that the fnsf program writes."""
+    kinds = {"points": "u4", "dynamic": "?", "center": "f4", "size": "f4", "yaw": "f4", "velocity": "f4"}
+    kinds |= {"yaw_rate": "f4", "confidence": "f4", "moving": "f4"}
+    widths = {name: 3 for name in ("center", "size", "velocity")}
+
+    def column(name, kind):
+        values = [getattr(cluster, name) for cluster in clusters]
+        return np.array([list(value) if name in widths else value for value in values], dtype=kind)
+
+    shape = {name: (-1, width) for name, width in widths.items()}
+    return {f"clusters_{name}": column(name, kind).reshape(shape.get(name, -1)) for name, kind in kinds.items()}
+
+
+def read_poses(path, sweeps):
+    """Poses world_from_sensor as 16 numbers each, from KITTI's text: 12 numbers a line, one line a sweep."""
+    lines = [line.split() for line in Path(path).read_text().splitlines() if line.strip()]
+    try:
+        rows = [[float(word) for word in line] for line in lines]
+    except ValueError as error:
+        raise BadFile(f"{path}: {error}") from None
+    if len(rows) != sweeps or any(len(row) != 12 for row in rows):
+        raise BadFile(f"{path}: {sweeps} lines of 12 numbers are needed, one line a sweep")
+    return [row + [0.0, 0.0, 0.0, 1.0] for row in rows]
 
 
 def mean_length(flow):

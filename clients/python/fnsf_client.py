@@ -3,12 +3,14 @@
 
     fnsf_client.py pair a.pcd b.pcd -o flow.npz
     fnsf_client.py sequence drive/*.pcd --interval 0.1
+    fnsf_client.py tracks JOB -o tracks.json
 
 As a library: Client.pair and Client.sequence take and give bytes and need no numpy.
 """
 
 import argparse
 import importlib
+import json
 import os
 import sys
 import tempfile
@@ -18,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import grpc
-from clouds import BadFile, Cloud, mean_length, read_cloud, write_flow
+from clouds import BadFile, Cloud, mean_length, read_cloud, read_poses, write_flow
 
 PRESETS = ["default", "label", "neural", "paper", "nsfp-baseline", "nsfp"]
 PRESETS += ["nsfp++", "nsfp++-dt", "nsfp-kdtree", "fnsf-linear", "nsfp-linear", "nsfp-kdtree-linear"]
@@ -51,11 +53,19 @@ def load_stubs(proto_root):
 
 @dataclass(frozen=True)
 class Flow:
-    """A header, packed float32 displacements, and a byte a row: bit 0 valid, bit 1 dynamic."""
+    """A header, and one value a row: packed float32 displacements, and a byte with bit 0 valid, bit 1 dynamic.
+
+    Of an object search also: the index of the row's cluster (packed int32, -1 for none), the chances that its flow is
+    right and that it moves (packed float32), and the clusters, each with its box, velocity and yaw rate.
+    """
 
     header: object
     rows: bytes
     flags: bytes
+    cluster: bytes = b""
+    confidence: bytes = b""
+    moving: bytes = b""
+    clusters: tuple = ()
 
 
 @dataclass(frozen=True)
@@ -113,17 +123,18 @@ class Client:
         return _joined(header, chunks)
 
     def sequence(self, sweeps, options=None, deadline=None):
-        """Yields a Pair for each two consecutive (name, Cloud) of `sweeps`, as soon as it is there.
+        """Yields a Pair for each two consecutive sweeps of `sweeps`, as soon as it is there.
 
-        `sweeps` is read from another thread, no faster than the server takes them.
+        A sweep is (name, Cloud), or (name, Cloud, pose) with the 16 numbers of world_from_sensor, row by row. `sweeps`
+        is read from another thread, no faster than the server takes them.
         """
         request, broken = self.messages.EstimateSequenceRequest, []
 
         def requests():
             yield request(begin=request.Begin(options=options))
             try:
-                for name, cloud in sweeps:
-                    yield request(sweep=request.Sweep(name=name))
+                for name, cloud, *pose in sweeps:
+                    yield request(sweep=request.Sweep(name=name, pose=pose[0] if pose else ()))
                     for chunk in self._chunks(cloud):
                         yield request(chunk=chunk)
             except Exception as error:
@@ -138,6 +149,10 @@ class Client:
             if broken:
                 raise broken[0] from None
             raise
+
+    def tracks(self, job):
+        """The tracks of a sequence's moving objects, by the id of its job: a list of the protocol's Track."""
+        return list(self.calls.GetTracks(self.messages.GetTracksRequest(id=job), metadata=self.metadata))
 
     @staticmethod
     def _pairs(answers):
@@ -155,7 +170,11 @@ class Client:
 
 
 def _joined(header, chunks):
-    return Flow(header, b"".join(chunk.flow for chunk in chunks), b"".join(chunk.flags for chunk in chunks))
+    def joined(name):
+        return b"".join(getattr(chunk, name) for chunk in chunks)
+
+    clusters = tuple(cluster for chunk in chunks for cluster in chunk.clusters)
+    return Flow(header, *map(joined, ("flow", "flags", "cluster", "confidence", "moving")), clusters)
 
 
 def describe(error):
@@ -226,6 +245,7 @@ def run_sequence(client, options, arguments):
         raise BadFile("a sequence has two sweeps or more")
     if arguments.output:
         Path(arguments.output).mkdir(parents=True, exist_ok=True)
+    poses = read_poses(arguments.poses, len(arguments.sweeps)) if arguments.poses else None
     clock, sent, came = Clock(), 0, []
 
     def sweeps():
@@ -234,7 +254,7 @@ def run_sequence(client, options, arguments):
             due = clock.start + place * arguments.interval
             time.sleep(max(0.0, due - time.monotonic()))
             cloud = read_cloud(path)
-            yield Path(path).name, cloud
+            yield (Path(path).name, cloud, poses[place]) if poses else (Path(path).name, cloud)
             sent += 1
             clock.say(f"sent   {Path(path).name}, {len(cloud)} points")
 
@@ -255,6 +275,15 @@ def run_sequence(client, options, arguments):
     return failed == 0 and len(came) == sweeps - 1
 
 
+def run_tracks(client, _options, arguments):
+    from google.protobuf.json_format import MessageToDict
+
+    tracks = client.tracks(arguments.job)
+    named = [MessageToDict(track, preserving_proto_field_name=True, always_print_fields_with_no_presence=True) for track in tracks]
+    Path(arguments.output).write_text(json.dumps({"tracks": named}))
+    print(f"{len(tracks)} tracks written to {arguments.output}")
+
+
 def arguments_of(argv):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--server", default="127.0.0.1:8080", help="host and port [default: %(default)s]")
@@ -271,7 +300,12 @@ def arguments_of(argv):
     sequence.add_argument("sweeps", nargs="+", metavar="SWEEP", help=".pcd, .npy, .npz or packed .f32, in order")
     sequence.add_argument("-o", "--output", metavar="DIR", help="write every flow into this folder")
     sequence.add_argument("--interval", type=float, default=0.0, metavar="SECONDS", help="between sweeps, as a sensor would")
+    sequence.add_argument("--poses", metavar="FILE", help="poses of all sweeps: 12 numbers a line, world_from_sensor")
     sequence.set_defaults(run=run_sequence)
+    tracks = commands.add_parser("tracks", help="the tracks of a sequence's moving objects, as JSON")
+    tracks.add_argument("job", help="the id of the sequence's job")
+    tracks.add_argument("-o", "--output", required=True, help=".json")
+    tracks.set_defaults(run=run_tracks)
     for command in (pair, sequence):
         command.add_argument("--deadline", type=float, metavar="SECONDS", help="for the whole call; the best flow so far comes back")
         command.add_argument("--preset", choices=PRESETS)
@@ -279,6 +313,7 @@ def arguments_of(argv):
         command.add_argument("--max-points", type=int)
         command.add_argument("--crop-m", type=float)
         command.add_argument("--min-range-m", type=float)
+        command.add_argument("--dt-s", type=float, metavar="SECONDS", help="from one sweep to the next")
         command.add_argument("--force", action="store_true", default=None)
         command.add_argument("--ground", choices=["keep", "mask", "auto"])
         command.add_argument("--ego", choices=["off", "auto"])
@@ -288,10 +323,10 @@ def arguments_of(argv):
 
 def main(argv=None):
     arguments = arguments_of(argv)
-    names = ("preset", "seed", "max_points", "crop_m", "min_range_m", "force", "ground", "ego", "priority")
+    names = ("preset", "seed", "max_points", "crop_m", "min_range_m", "dt_s", "force", "ground", "ego", "priority")
     try:
         client = Client(arguments.server, arguments.api_key, arguments.tls, arguments.proto)
-        options = client.options(**{name: getattr(arguments, name) for name in names})
+        options = client.options(**{name: getattr(arguments, name, None) for name in names})
         return 0 if arguments.run(client, options, arguments) in (None, True) else EXIT_FAILED
     except (BadFile, OSError) as error:
         print(f"fnsf_client: {error}", file=sys.stderr)

@@ -125,6 +125,7 @@ mod tests {
     fn near_points_fit_better_after_their_own_motion_alone() {
         let street = StreetOptions {
             seed: 5,
+            speed_mps: Some(30.0),
             rolling: true,
             ..StreetOptions::default()
         };

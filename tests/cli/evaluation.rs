@@ -78,8 +78,16 @@ fn several_flows_have_a_row_each_and_one_of_all_their_points() {
         &["eval", "a.npz", "b.feather", "--truth", first, second],
     );
     let rows: Vec<&str> = table.stdout.lines().collect();
-    assert_eq!(rows.len(), 4, "{}", table.stdout);
+    assert_eq!(rows.len(), 9, "{}", table.stdout);
     assert!(rows[0].contains("calibration") && rows[3].starts_with("all "));
+    let columns = |row: &str| row.split_whitespace().count();
+    let heading = "class static (m) moving 0.04-0.2 0.2-0.52 0.52-1 1-2 2-";
+    assert_eq!(
+        rows[5].split_whitespace().collect::<Vec<_>>().join(" "),
+        heading
+    );
+    assert!(rows[4].contains("bucket-normalized") && rows[8].trim().starts_with("mean"));
+    assert_eq!([rows[6], rows[7], rows[8]].map(columns), [8, 8, 3]);
 }
 
 #[test]

@@ -233,7 +233,7 @@ mod tests {
         let times = vec![0.5; raw.len()];
         let sweeps = [raw.as_slice(); 2];
         let free_space = FreeSpace::new(sweeps, Some([&times; 2]), &path.inverse());
-        let at = |y| -> Vec<Point> { (0..6_i8).map(|i| [9.5, y, f32::from(i) * 0.1]).collect() };
+        let at = |y| -> Vec<Point> { (0..6_i8).map(|i| [10.0, y, f32::from(i) * 0.1]).collect() };
         // In the target's frame, at its time.
         assert_eq!(free_space.of(&at(1.0), &[], true).left, Some(0.0));
         assert_eq!(free_space.of(&at(0.0), &[], true).left, Some(1.0));
