@@ -7,16 +7,16 @@ use std::sync::Arc;
 use anyhow::anyhow;
 use clap::{Args, ValueEnum};
 
-use super::estimation::{Estimation, check_sequence};
+use super::estimation::{Estimation, Surroundings, check_sequence};
 use super::failure::Failure;
 use super::files;
 use super::machine::peak_resident_bytes;
 use super::output::say;
 use super::terminal::Terminal;
 use super::tracks::TrackArguments;
-use crate::flow::{Control, Estimate, Point, Sequence, Sweep};
+use crate::flow::{Control, Ego, Estimate, Point, Sequence, Sweep};
 use crate::formats::{FlowFormat, FlowTable, write_flow};
-use crate::job::Report;
+use crate::job::{JobOptions, Report};
 use crate::picture;
 use crate::picture::{TopDown, TopDownOptions};
 use crate::text::grouped;
@@ -235,6 +235,7 @@ impl Flow {
         };
         let mut tracking = self.tracks.start(sweeps.count(), &options)?;
         let mut surroundings = self.estimation.surroundings(&self.sweeps)?;
+        self.check_deskew(&surroundings, &options)?;
         let mut device = self.estimation.open()?;
         let mut sequence = Sequence::default();
         // The pairs that are not complete, and the points of the last sweep.
@@ -245,10 +246,7 @@ impl Flow {
             let began = terminal.seconds();
             let sweep = match &sweeps {
                 Sweeps::Pair(pair) => pair[index].clone(),
-                Sweeps::Files(files) if self.deskew != DeskewChoice::Off => {
-                    surroundings.timed_sweep(index, &files[index])?
-                }
-                Sweeps::Files(files) => surroundings.sweep(index, &files[index])?,
+                Sweeps::Files(files) => self.read(&mut surroundings, index, &files[index])?,
             };
             let load = terminal.seconds() - began;
             let points: Arc<[Point]> = sweep.points.as_slice().into();
@@ -292,6 +290,44 @@ impl Flow {
             }
         }
         tracking.map_or(Ok(()), |tracking| tracking.finish(self.json))
+    }
+
+    /// Reads a sweep, with the times of its points unless they are not asked for.
+    fn read(
+        &self,
+        surroundings: &mut Surroundings,
+        index: usize,
+        path: &Path,
+    ) -> Result<Sweep, Failure> {
+        if self.deskew == DeskewChoice::Off {
+            return surroundings.sweep(index, path);
+        }
+        let sweep = surroundings.timed_sweep(index, path)?;
+        if self.deskew == DeskewChoice::On && sweep.times.is_none() {
+            let path = path.display();
+            return Err(Failure::usage(anyhow!(
+                "{path}: its points have no times, which --deskew on needs"
+            )));
+        }
+        Ok(sweep)
+    }
+
+    /// Refuses `--deskew on` where no sweep could be deskewed.
+    fn check_deskew(
+        &self,
+        surroundings: &Surroundings,
+        options: &JobOptions,
+    ) -> Result<(), Failure> {
+        let refused = if self.deskew != DeskewChoice::On {
+            return Ok(());
+        } else if self.sweeps.len() < 2 {
+            "the sweeps of an .npz pair have no times, which --deskew on needs"
+        } else if surroundings.options(options, 0, [0, 1]).ego == Ego::Off {
+            "--deskew on needs the ego motion: give --ego auto, or --poses"
+        } else {
+            return Ok(());
+        };
+        Err(Failure::usage(anyhow!(refused)))
     }
 
     /// Refuses outputs that could not be written. Called before any work.

@@ -294,3 +294,26 @@ fn rolling_sweeps_are_deskewed_and_their_flow_starts_from_the_deskewed_points() 
     let raw = error("raw.ply");
     assert!(raw > 3.0 * deskewed, "{raw} {deskewed}");
 }
+
+#[test]
+fn deskewing_is_refused_where_it_is_asked_for_and_cannot_be_done() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder, "2");
+    for (arguments, reason) in [
+        (vec!["street/pair_0000.npz"], "an .npz pair have no times"),
+        (
+            SWEEPS[..2].to_vec(),
+            "sweep_0000.pcd: its points have no times",
+        ),
+        (
+            [&SWEEPS[..2], &["--ego", "off"]].concat(),
+            "needs the ego motion",
+        ),
+    ] {
+        let asked = ["flow", "--deskew", "on", "--json"];
+        let done = fnsf(folder, &[&asked[..], &arguments].concat());
+        assert_eq!(done.code, 2, "{arguments:?}: {}", done.stderr);
+        assert!(done.stderr.contains(reason), "{}", done.stderr);
+    }
+}
