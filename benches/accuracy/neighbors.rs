@@ -14,9 +14,7 @@ use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::{Truth, evaluate};
 use fnsf::flow::field::Backend;
 use fnsf::flow::simulate::{Street, StreetOptions};
-use fnsf::flow::{
-    self, Ground, Method, NeighborSweep, ObjectOptions, Point, Preset, Problem, Sweep,
-};
+use fnsf::flow::{self, Ground, Method, ObjectOptions, Point, Preset, Problem, Sweep};
 use fnsf::formats::{read_cloud, read_pair};
 
 /// Numbers of beams, first sweeps of the pairs, and the range of street seeds.
@@ -130,15 +128,10 @@ fn searched(
     options.method = Method::Objects(label.clone());
     let [source, target] = &known.pair;
     let ground = source.ground.as_deref().zip(target.ground.as_deref());
-    let neighbors: Vec<NeighborSweep> = known
+    let neighbors: Vec<_> = known
         .neighbors
         .iter()
-        .map(|(at, sweep)| NeighborSweep {
-            points: &sweep.points,
-            ground: sweep.ground.as_deref(),
-            times: None,
-            at: *at,
-        })
+        .map(|(at, sweep)| sweep.as_neighbor(*at))
         .collect();
     let problem = Problem {
         source: &source.points,

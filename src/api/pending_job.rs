@@ -99,7 +99,7 @@ fn with_ground(cloud: Arc<StoredCloud>, options: &JobOptions) -> Arc<StoredCloud
     let sweep = Sweep {
         points: cloud.points,
         ground: cloud.ground,
-        times: None,
+        ..Sweep::default()
     };
     let Sweep { points, ground, .. } = sweep.prepared(&options);
     Arc::new(StoredCloud {

@@ -10,7 +10,7 @@ use super::panics::message;
 use super::supervisor::{DeviceHandle, DeviceSupervisor, SelfTest};
 use super::types::{EngineError, Work};
 use crate::flow::field::{Backend, BackendError};
-use crate::flow::{self, Estimate, FlowError, NeighborSweep, Problem};
+use crate::flow::{self, Estimate, FlowError, Problem};
 
 /// A message to a lane's thread.
 pub(super) enum Command {
@@ -168,13 +168,10 @@ pub(super) fn estimate(
         liveness,
     };
     let ground = work.ground.as_ref();
-    let neighbors = work.neighbors.iter().map(|(sweep, at)| NeighborSweep {
-        points: &sweep.points,
-        ground: sweep.ground.as_deref(),
-        times: sweep.times.as_deref(),
-        at: *at,
-    });
-    let neighbors: Vec<NeighborSweep<'_>> = neighbors.collect();
+    let neighbors = work.neighbors.iter();
+    let neighbors: Vec<_> = neighbors
+        .map(|(sweep, at)| sweep.as_neighbor(*at))
+        .collect();
     let problem = Problem {
         source: &work.source,
         target: &work.target,

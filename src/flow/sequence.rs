@@ -55,6 +55,18 @@ impl Sweep {
         self
     }
 
+    /// The sweep as a neighbor sweep of a pair, `at` intervals after the pair's source, see
+    /// [`NeighborSweep::at`].
+    #[must_use]
+    pub fn as_neighbor(&self, at: i8) -> NeighborSweep<'_> {
+        NeighborSweep {
+            points: &self.points,
+            ground: self.ground.as_deref(),
+            times: self.times.as_deref(),
+            at,
+        }
+    }
+
     /// The sweep restricted to points that are finite and within the crop of `options`, in the same
     /// order.
     ///
@@ -253,20 +265,9 @@ impl Sequence {
         let others = others.filter(|&index| index != pair && index != pair + 1);
         let neighbors: Vec<NeighborSweep> = others
             .filter_map(|index| {
-                let Sweep {
-                    points,
-                    ground,
-                    times,
-                } = &self.at(index).sweep;
-                let (ground, times) = (ground.as_deref(), times.as_deref());
                 // Sweeps more than 127 intervals away are skipped.
                 let at = i8::try_from(index as i64 - pair as i64).ok()?;
-                Some(NeighborSweep {
-                    points,
-                    ground,
-                    times,
-                    at,
-                })
+                Some(self.at(index).sweep.as_neighbor(at))
             })
             .collect();
         let problem = Problem {

@@ -10,7 +10,7 @@ use super::limits::{MAX_COORDINATE_M, MAX_POINTS, check_value, check_within};
 use super::npz::Npz;
 use super::pcd::Pcd;
 use super::ply::Ply;
-use super::point_times::{PointTimes, TimesColumn, check_time};
+use super::point_times::{PointTimes, TimesColumn};
 use super::scalar::{Scalar, write_floats};
 use super::sniff::recognize;
 use super::{bin, feather, npy, pcd, ply};
@@ -231,7 +231,7 @@ fn read_ply(
         }
         points.push(point(kind, row, values)?);
         if let (Some(times), Some(&time)) = (&mut times, values.get(AXES.len())) {
-            times.push(check_time(kind, row, times.name(), time)?);
+            times.push(kind, row, time)?;
         }
         Ok(())
     })?;
@@ -272,10 +272,10 @@ fn read_pcd(
             cloud.points.push([f32::NAN; 3]);
         }
         if let (Some(times), Some(&time)) = (&mut times, values.get(AXES.len())) {
-            times.push(match returned {
-                true => check_time(kind, row, times.name(), time)?,
-                false => f64::NAN,
-            });
+            match returned {
+                true => times.push(kind, row, time)?,
+                false => times.push_no_return(),
+            }
         }
         Ok(())
     })?;
@@ -293,10 +293,7 @@ fn read_feather(
     let points = read_columns(&table, AXES)?;
     let mut times = TimesColumn::find(|name| timed && table.has(name));
     if let Some(times) = &mut times {
-        table.each(times.name(), |row, value| {
-            times.push(check_time(kind, row, times.name(), value)?);
-            Ok(())
-        })?;
+        table.each(times.name(), |row, time| times.push(kind, row, time))?;
     }
     Ok((Cloud::from(points), times))
 }

@@ -63,6 +63,24 @@ pub(super) fn check_size(
     }
 }
 
+/// Refuses NaN and infinities.
+pub(super) fn check_finite(
+    kind: FileKind,
+    row: usize,
+    column: &str,
+    value: f64,
+) -> Result<f64, FormatError> {
+    if value.is_finite() {
+        return Ok(value);
+    }
+    Err(FormatError::NotFinite {
+        kind,
+        row,
+        column: column.to_owned(),
+        value,
+    })
+}
+
 /// A finite coordinate or displacement within [`MAX_COORDINATE_M`], in metres, as float32.
 pub(super) fn check_value(
     kind: FileKind,
@@ -70,14 +88,7 @@ pub(super) fn check_value(
     column: &str,
     value: f64,
 ) -> Result<f32, FormatError> {
-    if !value.is_finite() {
-        return Err(FormatError::NotFinite {
-            kind,
-            row,
-            column: column.to_owned(),
-            value,
-        });
-    }
+    check_finite(kind, row, column, value)?;
     if value.abs() > MAX_COORDINATE_M {
         return Err(FormatError::OutOfRange {
             kind,

@@ -1,6 +1,7 @@
 //! Times of the points of one sweep, in the units and from the origins that drivers write.
 
 use super::error::{FileKind, FormatError};
+use super::limits::check_finite;
 
 /// Names of a column of point times, the first that is there is read. `offset_ns` is Argoverse 2's,
 /// `t` is Ouster's, `time` Velodyne's, `timestamp` Hesai's, Robosense's and Livox's.
@@ -49,9 +50,23 @@ impl TimesColumn {
         self.name
     }
 
-    /// Adds the value of the next row. NaN stands for a row without return.
-    pub(super) fn push(&mut self, value: f64) {
-        self.values.push(value);
+    /// Adds the time of the next row.
+    ///
+    /// # Errors
+    /// [`FormatError::NotFinite`].
+    pub(super) fn push(
+        &mut self,
+        kind: FileKind,
+        row: usize,
+        time: f64,
+    ) -> Result<(), FormatError> {
+        self.values.push(check_finite(kind, row, self.name, time)?);
+        Ok(())
+    }
+
+    /// Adds a row without return.
+    pub(super) fn push_no_return(&mut self) {
+        self.values.push(f64::NAN);
     }
 
     /// The times; an explanation where they are not those of one sweep. None where all points have
@@ -97,34 +112,13 @@ impl TimesColumn {
     }
 }
 
-/// Refuses a time that is not finite.
-///
-/// # Errors
-/// [`FormatError::NotFinite`].
-pub(super) fn check_time(
-    kind: FileKind,
-    row: usize,
-    name: &str,
-    value: f64,
-) -> Result<f64, FormatError> {
-    if value.is_finite() {
-        return Ok(value);
-    }
-    Err(FormatError::NotFinite {
-        kind,
-        row,
-        column: name.to_owned(),
-        value,
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     fn times(name: &str, values: &[f64]) -> Result<Option<PointTimes>, String> {
         let mut column = TimesColumn::find(|known| known == name).expect("a column");
-        values.iter().for_each(|&value| column.push(value));
+        column.values.extend(values);
         column.times()
     }
 

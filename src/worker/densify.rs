@@ -106,7 +106,7 @@ impl Worker {
                 let sweep = Sweep {
                     points,
                     ground,
-                    times: None,
+                    ..Sweep::default()
                 }
                 .prepared(&solver_options);
                 Ok::<_, CorruptPayload>(sweep.cropped(&solver_options))

@@ -112,7 +112,7 @@ impl Worker {
             let sweep = Sweep {
                 points,
                 ground,
-                times: None,
+                ..Sweep::default()
             };
             around.push((sweep, at));
         }

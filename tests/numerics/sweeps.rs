@@ -4,8 +4,8 @@ use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::evaluate::Metrics;
 use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::flow::{
-    Control, Estimate, FlowError, Ground, NeighborSweep, Options, Preset, Problem, Sequence, Sweep,
-    Uncontrolled, estimate, window,
+    Control, Estimate, FlowError, Ground, Options, Preset, Problem, Sequence, Sweep, Uncontrolled,
+    estimate, window,
 };
 use fnsf::formats::{Pair, PairTruth, read_cloud};
 
@@ -23,13 +23,8 @@ fn seeing(sweeps: usize) -> Options {
 fn alone(sweeps: &[Sweep], pair: usize, options: &Options, control: &dyn Control) -> Estimate {
     let backend = CpuBackend::new(Some(2)).expect("threads");
     let others = (0..sweeps.len()).filter(|&index| index != pair && index != pair + 1);
-    let others = others.map(|index| NeighborSweep {
-        points: &sweeps[index].points,
-        ground: sweeps[index].ground.as_deref(),
-        times: None,
-        at: index as i8 - pair as i8,
-    });
-    let neighbors: Vec<NeighborSweep> = others.collect();
+    let others = others.map(|index| sweeps[index].as_neighbor(index as i8 - pair as i8));
+    let neighbors: Vec<_> = others.collect();
     let [source, target] = [pair, pair + 1].map(|index| &sweeps[index]);
     let ground = source.ground.as_deref().zip(target.ground.as_deref());
     let problem = Problem {

@@ -39,13 +39,12 @@ pub(super) fn residual_motion(
         Some(ego) => aligned_neighbors(host, problem, input.options, ego, &find_ground, control)?,
     };
     let precomputed_at = control.seconds();
-    let is_deskewed = problem.source.as_ptr() != input.given[0].as_ptr();
     let share = |times: &[f32]| -> Vec<f32> {
         times.iter().map(|time| time / input.options.dt_s).collect()
     };
     let shares = problem
         .times
-        .filter(|_| is_deskewed)
+        .filter(|_| input.is_deskewed)
         .map(|times| times.map(share));
     let clouds = SearchClouds {
         source: aligned,

@@ -16,6 +16,8 @@ pub(super) struct Input<'a> {
     pub(super) problem: &'a Problem<'a>,
     /// The source and the target before they were deskewed, N and M points.
     pub(super) given: [&'a [Point]; 2],
+    /// Whether the pair of `problem` is deskewed. If not, it is `given`.
+    pub(super) is_deskewed: bool,
     pub(super) options: &'a Options,
     pub(super) selection: &'a Selection,
     pub(super) control: &'a dyn Control,

@@ -70,6 +70,7 @@ fn estimate_from(
     let deskewed = deskew(backend.host(), problem, options, control)?;
     let given = [problem.source, problem.target];
     let (mut problem, mut options) = (*problem, Cow::Borrowed(options));
+    let mut is_deskewed = false;
     let neighbors;
     if let Some(deskewed) = &deskewed {
         options.to_mut().ego = Ego::Given(deskewed.ego);
@@ -79,6 +80,7 @@ fn estimate_from(
         let deskew = deskewed.deskew.as_ref();
         if let Some([source, target]) = deskew.and_then(|deskew| deskew.points.as_ref()) {
             (problem.source, problem.target) = (source, target);
+            is_deskewed = true;
         }
     }
     let (problem, options) = (&problem, options.as_ref());
@@ -87,6 +89,7 @@ fn estimate_from(
     let input = Input {
         problem,
         given,
+        is_deskewed,
         options,
         selection: &selection,
         control,

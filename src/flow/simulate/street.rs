@@ -249,7 +249,7 @@ impl Street {
     /// # Errors
     /// [`StreetError::NoSuchSweep`] if the street has no sweep with this index.
     pub fn flow(&self, index: usize) -> Result<Vec<Point>, StreetError> {
-        Ok(self.flow_of(&self.sweep(index)?))
+        Ok(self.flow_to(&self.sweep(index)?, (index + 1) as f64))
     }
 
     /// The sweeps `index` and `index + 1`, and their ground truth.
@@ -260,8 +260,8 @@ impl Street {
         let source = self.sweep(index)?;
         let target = self.sweep(index + 1)?;
         let target_from_source = target.world_from_sensor.inv_mul(&source.world_from_sensor);
-        let flow = self.flow_of(&source);
         let deskewed = self.deskewed(&source);
+        let flow = self.flow_from(&source, &deskewed, (index + 1) as f64);
         let dynamic = flow.iter().zip(deskewed).map(|(flow, point)| {
             let rigid = motion(&target_from_source, point);
             let residual = Vector3::from(flow.map(f64::from)) - rigid;
@@ -293,10 +293,6 @@ impl Street {
         }
     }
 
-    fn flow_of(&self, frame: &StreetSweep) -> Vec<Point> {
-        self.flow_to(frame, (frame.index + 1) as f64)
-    }
-
     /// True flow of the points of `frame`, a sweep of this street, to the time `at`. The time is in
     /// sweep intervals since the first sweep. It may lie between sweeps, before `frame` or after
     /// the last sweep, and must be finite. The computing time grows with the distance driven until
@@ -307,10 +303,13 @@ impl Street {
     /// position, see [`Street::deskewed`], and an object moves for as long after the point's own
     /// time.
     pub fn flow_to(&self, frame: &StreetSweep, at: f64) -> Vec<Point> {
+        self.flow_from(frame, &self.deskewed(frame), at)
+    }
+
+    fn flow_from(&self, frame: &StreetSweep, deskewed: &[Point], at: f64) -> Vec<Point> {
         let now = frame.world_from_sensor;
         let next_from_world = self.pose(at).inverse();
         let way = seconds(at - frame.index as f64);
-        let deskewed = self.deskewed(frame);
         let runs = instants(frame);
         let flows = runs.flat_map(|(rows, time)| {
             let began = seconds(frame.index as f64) + f64::from(time);
@@ -323,7 +322,6 @@ impl Street {
                     next_from_world * moved * now
                 })
                 .collect();
-            let deskewed = &deskewed;
             rows.map(move |row| {
                 let mover = usize::try_from(frame.object[row]).ok();
                 let mover = mover.and_then(|index| moving.get(index));
