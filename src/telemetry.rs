@@ -86,3 +86,16 @@ impl Drop for Telemetry {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn collectors_are_reached_with_tls_and_without() {
+        for endpoint in ["http://localhost:4317", "https://localhost:4317"] {
+            assert!(exporter(endpoint).is_ok(), "{endpoint}");
+        }
+        assert!(exporter("no URL").is_err());
+    }
+}

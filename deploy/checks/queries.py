@@ -19,7 +19,7 @@ RULES = DEPLOY / "prometheus/rules/fnsf.yml"
 FILLED_IN = {"$__rate_interval": "1m", "$instance": ".*"}
 # Labels that Prometheus adds when it scrapes.
 SCRAPED = {"instance", "job"}
-SELECTOR = re.compile(r"\b(fnsf_\w+)\s*(?:\{([^}]*)\})?")
+SELECTOR = re.compile(r"\b((?:fnsf|process)_\w+)\s*(?:\{([^}]*)\})?")
 MATCHER = re.compile(r'(\w+)\s*(=~|!=|!~|=)\s*"([^"]*)"')
 
 
@@ -100,7 +100,8 @@ def main(metrics, rules_out):
         recorded.append({"record": f"dashboard:query{number}", "expr": query})
     Path(rules_out).write_text(yaml.safe_dump({"groups": [{"name": "dashboard", "rules": recorded}]}))
     shown = {name for _, query in asked for name, _ in SELECTOR.findall(query)}
-    families = {re.sub(r"_(bucket|sum|count)$", "", name) for name in series}
+    # Those of the process have Prometheus' standard names, which other dashboards show.
+    families = {re.sub(r"_(bucket|sum|count)$", "", name) for name in series if name.startswith("fnsf_")}
     for family in sorted(families - {re.sub(r"_(bucket|sum|count)$", "", name) for name in shown}):
         faults.append(f"dashboard: {family} is shown nowhere")
     for fault in faults:

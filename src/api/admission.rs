@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use super::error::ApiError;
-use crate::cost::CostModel;
+use crate::cost::{CostModel, Lanes};
 use crate::flow::{self, Cost, Problem};
 use crate::job::{DeviceKind, JobOptions, Priority, Tenant};
 use crate::payload::StoredCloud;
@@ -107,9 +107,14 @@ impl Admission {
         }
     }
 
-    /// The maximum number of points in one cloud.
-    pub fn max_points(&self) -> usize {
-        self.limits.max_points
+    /// The limits on accepted work.
+    pub fn limits(&self) -> &AdmissionLimits {
+        &self.limits
+    }
+
+    /// The lanes that compute the jobs.
+    pub fn lanes(&self) -> Lanes {
+        self.cost.lanes()
     }
 
     /// Refuses a cloud with too many points.

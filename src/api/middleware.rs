@@ -17,6 +17,7 @@ use super::error::{ApiError, ErrorSpec};
 use super::listener::Asking;
 use super::pending_job::ReceivedAt;
 use super::service::Service;
+use super::trace_context::join_trace;
 use super::{grpc, origin};
 
 /// Adds the middleware and the fallback route to a router.
@@ -105,8 +106,10 @@ async fn count(State(service): State<Arc<Service>>, request: Request, next: Next
     let protocol = if is_grpc(&request) { "grpc" } else { "http" };
     let (method, path) = (request.method().clone(), request.uri().path().to_owned());
     let began = Instant::now();
-    let span = tracing::info_span!("request", protocol, %method, path);
-    let mut response = next.run(request).instrument(span).await;
+    let trace_id = tracing::field::Empty;
+    let span = tracing::info_span!("request", protocol, %method, path, trace_id);
+    join_trace(&span, request.headers());
+    let mut response = next.run(request).instrument(span.clone()).await;
     response.headers_mut().insert(
         "x-content-type-options",
         HeaderValue::from_static("nosniff"),
@@ -124,14 +127,14 @@ async fn count(State(service): State<Arc<Service>>, request: Request, next: Next
     if let Some(reason) = row.and_then(|row| row.rejection) {
         service.metrics.rejected(reason);
     }
-    tracing::debug!(
-        %method,
-        path,
-        status = status.as_u16(),
-        code = row.map(|row| row.code),
-        seconds = began.elapsed().as_secs_f64(),
-        "answered"
-    );
+    span.in_scope(|| {
+        tracing::debug!(
+            status = status.as_u16(),
+            code = row.map(|row| row.code),
+            seconds = began.elapsed().as_secs_f64(),
+            "answered"
+        );
+    });
     response
 }
 

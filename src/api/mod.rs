@@ -1,8 +1,8 @@
 //! The HTTP and gRPC interfaces, and the protocol-independent service behind them.
 //!
 //! `service` and the modules that it uses are shared by both protocols. HTTP types appear in
-//! `http`, gRPC types in `grpc`; `middleware`, `origin` and `listener` handle raw requests and
-//! connections.
+//! `http`, gRPC types in `grpc`; `middleware`, `origin`, `trace_context` and `listener` handle raw
+//! requests and connections.
 
 mod admin;
 mod admission;
@@ -24,6 +24,7 @@ mod service;
 mod service_parts;
 #[cfg(test)]
 mod tests;
+mod trace_context;
 mod tracks;
 mod upload_budget;
 mod waiters;

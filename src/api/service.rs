@@ -51,9 +51,8 @@ pub struct Service {
     pub(super) archives: Arc<TenantPermits>,
     /// Permit for reading and encoding one dense cloud at a time.
     pub(super) clouds: Semaphore,
-    /// Cancelled when the server is about to stop. The gRPC health service then reports
-    /// NOT_SERVING; requests are still served.
-    pub(super) leaving: CancellationToken,
+    /// Whether the server is ready, as `/readyz` says. The gRPC health service follows it.
+    pub(super) ready: watch::Sender<bool>,
     draining: AtomicBool,
     /// Cancelled to end event streams and long polls.
     pub(super) closing: CancellationToken,
@@ -118,7 +117,7 @@ impl Service {
             encoding: FairQueue::new(cores),
             archives: Arc::new(TenantPermits::new(MAX_ARCHIVES, several)),
             clouds: Semaphore::new(1),
-            leaving: CancellationToken::new(),
+            ready: watch::Sender::new(false),
             draining: AtomicBool::new(false),
             closing: CancellationToken::new(),
         }
@@ -144,11 +143,12 @@ impl Service {
         }
     }
 
-    /// Announces that the server is about to stop: the gRPC health service reports NOT_SERVING.
-    /// Requests are still served. It is the first step of a shutdown, before
-    /// [`Service::stop_accepting`].
-    pub fn leave(&self) {
-        self.leaving.cancel();
+    /// Sets whether the server is ready. Where it is not, the gRPC health service reports
+    /// NOT_SERVING; requests are still served. The first step of a shutdown, before
+    /// [`Service::stop_accepting`], is that it is no longer ready.
+    pub fn set_ready(&self, ready: bool) {
+        self.ready
+            .send_if_modified(|known| std::mem::replace(known, ready) != ready);
     }
 
     /// Refuses new work from now on, with [`ApiError::Draining`]. Results and running jobs stay

@@ -8,12 +8,16 @@ use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio::time::{interval, interval_at};
 
+use crate::api::{Readiness, Service};
 use crate::engine::Device;
 use crate::health::{HEARTBEAT, Heartbeat};
 use crate::metrics::Metrics;
 use crate::queue::{Event, Queue};
 use crate::storage::Blobs;
 use crate::worker::StoreProbe;
+
+/// Polling interval of the readiness, which gRPC health follows.
+const READINESS_INTERVAL: Duration = Duration::from_millis(200);
 
 /// Polling interval of the devices, and the period of their busy ratio.
 const PROBE_INTERVAL: Duration = Duration::from_secs(2);
@@ -46,7 +50,11 @@ pub(super) fn start(
     let (store, heartbeat) = (Arc::clone(health.0), Arc::clone(health.1));
     let mut tasks = JoinSet::new();
     tasks.spawn(beat(heartbeat));
-    tasks.spawn(watch_space(blobs.clone(), Arc::clone(&store)));
+    tasks.spawn(watch_space(
+        blobs.clone(),
+        Arc::clone(&store),
+        Arc::clone(metrics),
+    ));
     tasks.spawn(probe(store, Arc::clone(metrics)));
     tasks.spawn(listen(blobs.clone(), Arc::clone(metrics), heard));
     tasks.spawn(look(devices.to_vec(), Arc::clone(metrics)));
@@ -75,14 +83,24 @@ async fn beat(heartbeat: Arc<Heartbeat>) {
     }
 }
 
+/// Tells the service whether the server is ready.
+pub(super) async fn follow_readiness(readiness: Readiness, service: Arc<Service>) {
+    let mut ticks = interval(READINESS_INTERVAL);
+    loop {
+        ticks.tick().await;
+        service.set_ready(readiness.not_ready_reason().is_none());
+    }
+}
+
 /// Polls the free disk space. A hanging disk delays only this task.
-async fn watch_space(blobs: Blobs, store: Arc<StoreProbe>) {
+async fn watch_space(blobs: Blobs, store: Arc<StoreProbe>, metrics: Arc<Metrics>) {
     let mut ticks = interval(HEARTBEAT);
     loop {
         ticks.tick().await;
         let blobs = blobs.clone();
         if let Ok(Some(free)) = tokio::task::spawn_blocking(move || blobs.free_space()).await {
             store.health().has_free(free);
+            metrics.free_space(free);
         }
     }
 }

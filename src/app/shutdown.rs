@@ -35,7 +35,7 @@ impl App {
         let began = Instant::now();
         let deadline = began + Duration::from_secs(self.config.shutdown.timeout_seconds);
         self.draining.send_replace(true);
-        self.service.leave();
+        self.service.set_ready(false);
         tracing::info!("not ready any more");
         tokio::time::sleep(Duration::from_secs(
             self.config.shutdown.readiness_delay_seconds,

@@ -93,7 +93,7 @@ impl App {
         let keys_are_open = keys.is_open();
         let service = Arc::new(service(&stores, &cost, &metrics, keys, &config));
         let runtime = Arc::new(Heartbeat::default());
-        let upkeep = housekeeping::start(
+        let mut upkeep = housekeeping::start(
             &stores.queue,
             &stores.blobs,
             &metrics,
@@ -113,6 +113,8 @@ impl App {
                 ("the public port", listener.heartbeat()),
             ],
         };
+        let following = housekeeping::follow_readiness(readiness.clone(), Arc::clone(&service));
+        upkeep.spawn(following);
         let queue = stores.queue;
         let admin = serve_admin(config.admin_listen, readiness, &metrics, &queue, &cost)?;
         let stop_listening = CancellationToken::new();

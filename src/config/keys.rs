@@ -288,11 +288,24 @@ pub enum ConfigError {
     Together(String),
 }
 
+/// Whether Kubernetes sets the variable `name`, here without its prefix, in every container beside
+/// a Service named `fnsf-serve`. `PORT` is one of these if it holds an address instead of a number.
+/// No key of the configuration has such a name.
+fn is_of_a_kubernetes_service(name: &str, value: &str) -> bool {
+    let name = name.to_ascii_lowercase();
+    let one_of = |prefix: &str| name == prefix || name.starts_with(&format!("{prefix}_"));
+    (name == "port" && value.contains("://"))
+        || name.starts_with("port_")
+        || name == "service_host"
+        || one_of("service_port")
+}
+
 impl Config {
     /// Reads the defaults, the TOML `file`, the environment and `flags`. Each overrides the
     /// previous ones. Environment variables have the prefix `FNSF_SERVE_`. In their names `__`
-    /// goes one level down, as in `FNSF_SERVE_LIMITS__MAX_POINTS`. `flags` serializes to a map of
-    /// the keys that are given.
+    /// goes one level down, as in `FNSF_SERVE_LIMITS__MAX_POINTS`. Variables that Kubernetes sets
+    /// for a Service named `fnsf-serve` are ignored. `flags` serializes to a map of the keys that
+    /// are given.
     ///
     /// # Errors
     /// - [`ConfigError::File`] if `file` cannot be read or is not TOML.
@@ -320,7 +333,12 @@ impl Config {
             })?;
             figment = figment.merge(Toml::file_exact(path));
         }
-        let mut variables = Env::prefixed(PREFIX).split("__");
+        let mut variables = Env::prefixed(PREFIX)
+            .filter(|name| {
+                let value = std::env::var(format!("{PREFIX}{name}"));
+                !is_of_a_kubernetes_service(name.as_str(), value.as_deref().unwrap_or_default())
+            })
+            .split("__");
         if let Ok(key) = std::env::var(format!("{PREFIX}{API_KEY}")) {
             // Taken as a string: figment would parse a key of digits as a number.
             figment = figment.merge(Serialized::default("api_key", key));

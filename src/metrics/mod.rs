@@ -5,6 +5,7 @@
 
 mod exposition;
 mod labels;
+mod process;
 mod record;
 mod register;
 mod series;

@@ -11,6 +11,7 @@ use super::series::{
 };
 use crate::job::{Job, Priority};
 use crate::queue::Event;
+use crate::storage::FreeSpace;
 
 impl Metrics {
     /// Updates the metrics of jobs with an event of the queue:
@@ -124,6 +125,14 @@ impl Metrics {
     /// false after a failure of the store.
     pub fn store(&self, ready: bool) {
         self.store_ready.set(i64::from(ready));
+    }
+
+    /// Sets `fnsf_data_free_bytes` and `fnsf_data_free_inodes`, infinite where the file system does
+    /// not count them.
+    pub fn free_space(&self, free: FreeSpace) {
+        self.data_free_bytes.set(free.bytes as f64);
+        let inodes = free.inodes.map_or(f64::INFINITY, |inodes| inodes as f64);
+        self.data_free_inodes.set(inodes);
     }
 
     /// Adds `bytes` received bytes of a request body to `fnsf_upload_bytes_total`.

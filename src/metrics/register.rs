@@ -157,6 +157,17 @@ impl Metrics {
             "Whether the queue and the payloads could be written at the last look",
             self.store_ready.clone(),
         );
+        registry.register_with_unit(
+            "data_free",
+            "Free space of the file system that holds the payloads",
+            Unit::Bytes,
+            self.data_free_bytes.clone(),
+        );
+        registry.register(
+            "data_free_inodes",
+            "Files that can still be created there",
+            self.data_free_inodes.clone(),
+        );
         registry.register(
             "requests_rejected",
             "Requests refused, by reason",

@@ -11,6 +11,7 @@ use prometheus_client::metrics::histogram::Histogram;
 use prometheus_client::registry::Registry;
 
 use super::labels::{CLASSES, PHASES, PROTOCOLS, REJECTIONS};
+use super::process::ProcessCollector;
 use crate::flow::StopReason;
 use crate::job::{Priority, State};
 
@@ -96,6 +97,8 @@ pub struct Metrics {
     pub(super) device_lost: Family<DeviceLabel, Counter>,
     pub(super) device_fallback: Gauge,
     pub(super) store_ready: Gauge,
+    pub(super) data_free_bytes: Float,
+    pub(super) data_free_inodes: Float,
     pub(super) rejected: Family<Reason, Counter>,
     pub(super) requests: Family<ProtocolAndClass, Counter>,
     pub(super) connections: Gauge,
@@ -137,6 +140,8 @@ impl Metrics {
             device_lost: Family::default(),
             device_fallback: Gauge::default(),
             store_ready: Gauge::default(),
+            data_free_bytes: Float::default(),
+            data_free_inodes: Float::default(),
             rejected: Family::default(),
             requests: Family::default(),
             connections: Gauge::default(),
@@ -147,8 +152,9 @@ impl Metrics {
             overlap_ratio: Histogram::new(OVERLAPS),
         };
         metrics.fill(devices);
-        let mut registry = Registry::with_prefix("fnsf");
-        metrics.register(&mut registry);
+        let mut registry = Registry::default();
+        registry.register_collector(Box::new(ProcessCollector));
+        metrics.register(registry.sub_registry_with_prefix("fnsf"));
         Self {
             registry,
             ..metrics

@@ -227,6 +227,7 @@ fn each_protocol_has_one_room() {
         "api/listener",
         "api/routes.rs",
         "api/origin.rs",
+        "api/trace_context.rs",
         "api/grpc/",
     ];
     let stray: Vec<_> = http

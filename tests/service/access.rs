@@ -88,7 +88,7 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
             routes.push((method.expect("a method"), path.replace("{id}", &id)));
         }
     }
-    assert_eq!(routes.len(), 10);
+    assert_eq!(routes.len(), 11);
     for (method, path) in [
         ("GET", "/"),
         ("GET", "/v1"),
@@ -124,6 +124,7 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
         ["events", "result", "requeue", "tracks"].map(|of| format!("{own}/{of}"));
     // Expected status for the reader, the other tenant and the writer.
     let expected = [
+        (Method::GET, "/v1/info", [200, 200, 200]),
         (Method::POST, "/v1/flow", [403, 200, 200]),
         (Method::POST, "/v1/jobs", [403, 202, 202]),
         (Method::POST, "/v1/sequences", [403, 202, 202]),
@@ -139,7 +140,7 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
         (Method::PUT, "/v1/jobs", [405, 405, 405]),
         (Method::GET, "/metrics", [404, 404, 404]),
     ];
-    for (method, path) in &routes[..10] {
+    for (method, path) in &routes[..11] {
         let told = expected
             .iter()
             .any(|(known, at, _)| known == method && at == path);

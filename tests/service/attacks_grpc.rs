@@ -1,6 +1,7 @@
 //! Attacks on the gRPC protocol: false lengths, random bytes, unknown enum values, messages out of
 //! order.
 
+use std::io::Write;
 use std::time::Duration;
 
 use axum::http;
@@ -33,6 +34,17 @@ const METHODS: [&str; 14] = [
 
 /// The status of a call with raw bytes as its body; none if the stream was reset.
 async fn raw(server: &Server, method: &str, bytes: &[u8], ends: bool) -> Option<Code> {
+    raw_encoded(server, method, "identity", bytes, ends).await
+}
+
+/// As [`raw`], for messages with this `grpc-encoding`.
+async fn raw_encoded(
+    server: &Server,
+    method: &str,
+    encoding: &str,
+    bytes: &[u8],
+    ends: bool,
+) -> Option<Code> {
     let stream = tokio::net::TcpStream::connect(&server.public).await;
     let (client, connection) = h2::client::handshake(stream.expect("a connection"))
         .await
@@ -40,6 +52,7 @@ async fn raw(server: &Server, method: &str, bytes: &[u8], ends: bool) -> Option<
     let driving = tokio::spawn(connection);
     let request = http::Request::post(format!("http://localhost/{method}"))
         .header("content-type", "application/grpc")
+        .header("grpc-encoding", encoding)
         .header("te", "trailers")
         .body(())
         .expect("a request");
@@ -141,6 +154,39 @@ async fn garbage_is_refused_by_every_method() {
                 );
             }
         }
+    }
+    siege.stands().await;
+}
+
+#[tokio::test]
+async fn a_compressed_message_may_not_hold_more_than_an_uncompressed_one() {
+    let siege = Besieged::new("").await;
+    // Gigabytes of zeros are megabytes of gzip.
+    let mut bomb = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    let zeros = vec![0; 16 << 20];
+    for _ in 0..16 {
+        bomb.write_all(&zeros).expect("memory");
+    }
+    let bomb = bomb.finish().expect("memory");
+    for method in METHODS {
+        // A part that fits, as the limit is on what comes over the network too.
+        let length = bomb.len().min(1 << 20);
+        let framed = message(1, length as u32, &bomb[..length]);
+        let code = raw_encoded(&siege.server, method, "gzip", &framed, true).await;
+        let refused = matches!(
+            code,
+            Some(
+                Code::InvalidArgument
+                    | Code::OutOfRange
+                    | Code::ResourceExhausted
+                    | Code::Internal
+                    | Code::Unimplemented
+            )
+        );
+        assert!(
+            refused || method.contains("Reflection"),
+            "{method}: {code:?}"
+        );
     }
     siege.stands().await;
 }

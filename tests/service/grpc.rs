@@ -6,6 +6,7 @@ use fnsf::flow::Point;
 use fnsf::formats::read_flow;
 use fnsf::payload::points_from_le_bytes;
 use tokio_stream::{Stream, StreamExt};
+use tonic::codec::CompressionEncoding;
 use tonic::transport::{Channel, Endpoint};
 use tonic::{Code, Request};
 
@@ -68,6 +69,30 @@ pub(crate) fn pair(
     }
     let message = |part| proto::EstimateFlowRequest { part: Some(part) };
     tokio_stream::iter(parts.into_iter().map(message))
+}
+
+#[tokio::test]
+async fn messages_may_be_compressed_with_gzip() {
+    use proto::estimate_flow_response::Part;
+    let server = Server::start(&[]);
+    let mut flows = Vec::new();
+    for compressed in [false, true] {
+        let mut calls = client(&server).await;
+        if compressed {
+            calls = calls.send_compressed(CompressionEncoding::Gzip);
+        }
+        let sent = pair(small_pair(), proto::Options::default());
+        let answer = calls.estimate_flow(sent).await.expect("an answer");
+        let mut answer = answer.into_inner();
+        let mut flow = Vec::new();
+        while let Some(message) = answer.next().await {
+            if let Some(Part::Chunk(piece)) = message.expect("a message").part {
+                flow.extend(points_from_le_bytes(&piece.flow));
+            }
+        }
+        flows.push(flow);
+    }
+    assert!(!flows[0].is_empty() && flows[0] == flows[1]);
 }
 
 #[tokio::test]

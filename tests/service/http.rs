@@ -464,6 +464,7 @@ async fn the_documentation_names_every_route() {
     let document: Value = document.json().await.expect("JSON");
     let paths = document["paths"].as_object().expect("paths");
     for (path, methods) in [
+        ("/v1/info", vec!["get"]),
         ("/v1/flow", vec!["post"]),
         ("/v1/sequences", vec!["post"]),
         ("/v1/jobs", vec!["get", "post"]),
@@ -479,7 +480,7 @@ async fn the_documentation_names_every_route() {
         let known: Vec<&String> = known.as_object().expect("methods").keys().collect();
         assert_eq!(known, methods, "{path}");
     }
-    assert_eq!(paths.len(), 8);
+    assert_eq!(paths.len(), 9);
     let page = reqwest::get(server.url("/docs/")).await.expect("an answer");
     assert_eq!(page.status(), StatusCode::OK);
 }

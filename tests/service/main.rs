@@ -20,6 +20,7 @@ mod devices;
 mod gpu_rule;
 mod grpc;
 mod http;
+mod info;
 mod load;
 mod nonsense;
 mod objects;

@@ -3,15 +3,19 @@
 
 use std::net::TcpStream;
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use fnsf::flow::Point;
 use reqwest::StatusCode;
 use serde_json::Value;
+use tonic::transport::Endpoint;
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_client::HealthClient;
 
 use crate::clouds::{form, medium_pair, small_pair};
 use crate::raw_http::SMALL;
-use crate::server::{Folder, Server, ended, plain_get};
+use crate::server::{Folder, PATIENCE, Server, ended, plain_get};
 
 /// Immediate retries: with counted failures, a job would fail after three of them, within seconds.
 const CONFIG: &str = "[queue]\nretry_delay_seconds = 0\n";
@@ -95,6 +99,37 @@ async fn descriptors_that_connections_take_are_none_that_jobs_need() {
         .collect();
     assert!(held.len() > 300);
     all_succeed(&server, ids).await;
+}
+
+#[tokio::test]
+async fn grpc_health_follows_the_readiness() {
+    let server = Server::with_config(CONFIG);
+    let endpoint = Endpoint::from_shared(server.url("")).expect("a good address");
+    let channel = endpoint.connect().await.expect("a connection");
+    let until = async |expected: ServingStatus| {
+        for service in ["", "fnsf.v1.SceneFlow"] {
+            let asked = HealthCheckRequest {
+                service: service.to_owned(),
+            };
+            let began = Instant::now();
+            loop {
+                let mut health = HealthClient::new(channel.clone());
+                let answer = health.check(asked.clone()).await.expect("an answer");
+                if answer.into_inner().status() == expected {
+                    break;
+                }
+                assert!(began.elapsed() < PATIENCE, "{service} is not {expected:?}");
+                tokio::time::sleep(Duration::from_millis(50)).await;
+            }
+        }
+    };
+    until(ServingStatus::Serving).await;
+    let restore = break_folder(&server.data().join("blobs/jobs"));
+    // A refused upload reports the failure at once.
+    submit(&server).await.expect_err("refused");
+    until(ServingStatus::NotServing).await;
+    restore();
+    until(ServingStatus::Serving).await;
 }
 
 #[tokio::test]

@@ -27,7 +27,7 @@ use crate::job::{Job, JobId, JobOptions, Kind, State as JobState};
 use crate::queue::PairOf;
 
 /// Maximum duration of a long poll.
-const MAX_POLL: Duration = Duration::from_secs(60);
+pub(super) const MAX_POLL: Duration = Duration::from_secs(60);
 
 /// Default number of jobs on a page.
 const PAGE: u32 = 100;

@@ -2,6 +2,7 @@
 
 mod events;
 mod handlers;
+mod info;
 mod metered;
 mod multipart;
 mod named;

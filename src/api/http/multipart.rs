@@ -169,7 +169,7 @@ impl Body {
         name: Option<String>,
         bytes: Vec<u8>,
     ) -> Result<(StoredCloud, UploadReservation), ApiError> {
-        let most = self.service.admission.max_points();
+        let most = self.service.admission.limits().max_points;
         let mut room = self.room.another();
         self.timed(move || {
             // A small compressed file may decode to a large cloud.
@@ -211,7 +211,7 @@ impl Body {
         bytes: Vec<u8>,
     ) -> Result<([StoredCloud; 2], UploadReservation), ApiError> {
         const PART: &str = "source";
-        let most = self.service.admission.max_points();
+        let most = self.service.admission.limits().max_points;
         let mut room = self.room.another();
         self.timed(move || {
             room.hold(codec::unfolded_bytes(PART, &bytes, None, most)?)?;

@@ -3,12 +3,19 @@
 use std::sync::Arc;
 
 use axum::Router;
+use utoipa::openapi::header::HeaderBuilder;
+use utoipa::openapi::path::Operation;
+use utoipa::openapi::schema::{KnownFormat, Object, SchemaFormat, Type};
 use utoipa::openapi::security::{Http, HttpAuthScheme, SecurityScheme};
+use utoipa::openapi::{Content, RefOr};
 use utoipa::{Modify, OpenApi};
 use utoipa_swagger_ui::SwaggerUi;
 
-use super::{events, handlers, results};
+use super::results::{ARCHIVE, RESULT_HEADERS};
+use super::{events, handlers, info, results};
+use crate::api::codec::ANSWER_FORMATS;
 use crate::api::service::Service;
+use crate::formats::DENSE_FORMATS;
 
 struct Bearer;
 
@@ -17,6 +24,57 @@ impl Modify for Bearer {
         let scheme = SecurityScheme::Http(Http::new(HttpAuthScheme::Bearer));
         let components = document.components.get_or_insert_with(Default::default);
         components.add_security_scheme("key", scheme);
+    }
+}
+
+/// Adds to the responses with results the formats and headers that tables define.
+struct ResultFormats;
+
+impl Modify for ResultFormats {
+    fn modify(&self, document: &mut utoipa::openapi::OpenApi) {
+        let flow = || ANSWER_FORMATS.map(|(_, media, _)| media).into_iter();
+        let dense = DENSE_FORMATS.map(|(_, media, _)| media).into_iter();
+        let paths = &mut document.paths.paths;
+        if let Some(path) = paths.get_mut("/v1/flow") {
+            describe(path.post.as_mut(), &["200"], flow());
+        }
+        if let Some(path) = paths.get_mut("/v1/jobs/{id}/result") {
+            let all = flow().chain(dense).chain([ARCHIVE]);
+            describe(path.get.as_mut(), &["200", "206"], all);
+        }
+    }
+}
+
+/// Sets the media types and the headers of the responses of an operation that have a result.
+fn describe(
+    operation: Option<&mut Operation>,
+    statuses: &[&str],
+    media_types: impl Iterator<Item = &'static str>,
+) {
+    let Some(operation) = operation else { return };
+    let media_types: Vec<_> = media_types.collect();
+    for status in statuses {
+        let response = operation.responses.responses.get_mut(*status);
+        let Some(RefOr::T(response)) = response else {
+            continue;
+        };
+        for &media_type in &media_types {
+            let schema = match media_type {
+                "application/json" => Object::new(),
+                _ => Object::builder()
+                    .schema_type(Type::String)
+                    .format(Some(SchemaFormat::KnownFormat(KnownFormat::Binary)))
+                    .build(),
+            };
+            let content = Content::new(Some(schema));
+            response
+                .content
+                .insert(media_type.to_owned(), content.into());
+        }
+        for (name, text) in RESULT_HEADERS {
+            let header = HeaderBuilder::new().description(Some(text)).build();
+            response.headers.insert(name.to_owned(), header.into());
+        }
     }
 }
 
@@ -38,12 +96,14 @@ impl Modify for Bearer {
         events::follow_job,
         results::result,
         results::tracks,
+        info::info,
     ),
     security((), ("key" = [])),
-    modifiers(&Bearer),
+    modifiers(&Bearer, &ResultFormats),
     tags(
         (name = "flow", description = "A pair in, its flow out, on one call"),
         (name = "jobs", description = "Work that outlives the call"),
+        (name = "server", description = "What the server is and takes"),
     )
 )]
 struct Contract;

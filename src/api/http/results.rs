@@ -22,6 +22,33 @@ use crate::api::service::Service;
 use crate::formats::DenseFormat;
 use crate::job::{DenseReport, Job, Kind, State as JobState};
 
+/// The media type of the archive with the flows of a sequence.
+pub(super) const ARCHIVE: &str = "application/zip";
+
+/// The headers of responses with results, and their meanings.
+pub(super) const RESULT_HEADERS: [(&str, &str); 8] = [
+    ("Fnsf-Job-Id", "The id of the job."),
+    ("Fnsf-Stop-Reason", "Of a flow: why the estimate stopped."),
+    ("Fnsf-Seconds", "Compute time, seconds."),
+    (
+        "Fnsf-Overlap",
+        "Of a flow with ego motion: the overlap of the pair, 0 to 1.",
+    ),
+    (
+        "Fnsf-Clusters",
+        "Of an object search: the number of clusters.",
+    ),
+    ("Fnsf-Iterations", "Of a fit: the number of iterations."),
+    (
+        "ETag",
+        "The entity tag of the result, for If-None-Match and If-Range.",
+    ),
+    (
+        "Accept-Ranges",
+        "`bytes` where ranges of the result can be requested.",
+    ),
+];
+
 /// A response with the complete flow of a pair.
 pub(super) async fn flow(
     service: &Arc<Service>,
@@ -202,7 +229,7 @@ pub(super) async fn result(
         return Err(ApiError::HasExpired(id));
     }
     let accept = text(header::ACCEPT);
-    let wants_archive = accept.is_some_and(|accept| accept.contains("application/zip"));
+    let wants_archive = accept.is_some_and(|accept| accept.contains(ARCHIVE));
     if dense::is_dense(&job) && !wants_archive {
         let format = dense::accepted(accept)?;
         let head = Head::of_cloud(&job, &service.dense_report(&job)?, format);
@@ -256,7 +283,7 @@ pub(super) async fn tracks(
 fn entries_format(accept: Option<&str>) -> Result<AnswerFormat, ApiError> {
     let others = accept.unwrap_or_default().split(',').filter(|one| {
         let media = one.split(';').next().unwrap_or_default().trim();
-        !media.eq_ignore_ascii_case("application/zip")
+        !media.eq_ignore_ascii_case(ARCHIVE)
     });
     let others: Vec<&str> = others.collect();
     AnswerFormat::accepted(Some(&others.join(",")))
@@ -324,7 +351,7 @@ async fn archive(
     let mut response = Body::from_stream(ReceiverStream::new(stream)).into_response();
     let name = format!("attachment; filename=\"{}.zip\"", sequence.id);
     for (header, value) in [
-        ("content-type", "application/zip".to_owned()),
+        ("content-type", ARCHIVE.to_owned()),
         ("content-disposition", name),
         ("fnsf-job-id", sequence.id.to_string()),
     ] {

@@ -6,12 +6,13 @@ use axum::Router;
 use axum::extract::DefaultBodyLimit;
 use axum::routing::{get, post};
 
-use super::{events, handlers, openapi, problem, results};
+use super::{events, handlers, info, openapi, problem, results};
 use crate::api::service::Service;
 
 /// The HTTP routes, with the OpenAPI document and its page.
 pub(crate) fn router(service: &Arc<Service>) -> Router {
     Router::new()
+        .route("/v1/info", get(info::info))
         .route("/v1/flow", post(handlers::estimate))
         .route("/v1/sequences", post(handlers::submit_sequence))
         .route(
