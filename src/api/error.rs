@@ -311,7 +311,9 @@ impl From<QueueError> for ApiError {
         match error {
             QueueError::NotFound => Self::NotFound,
             QueueError::KeyReused(id) => Self::KeyReused(id),
-            QueueError::NotTerminal(_) => Self::BadRequest(error.to_string()),
+            QueueError::NotTerminal(_)
+            | QueueError::NotEnded(_)
+            | QueueError::PairOfSequence(_) => Self::BadRequest(error.to_string()),
             QueueError::Closed => Self::Draining,
             QueueError::GivenUp => Self::internal(error),
             QueueError::Store(_) => Self::store(error),

@@ -313,6 +313,22 @@ impl Service {
         Ok(self.queue.cancel(id).await?)
     }
 
+    /// Removes an ended job of the caller's tenant, with its sweeps and its result. Of a sequence
+    /// all pairs are removed.
+    ///
+    /// # Errors
+    /// - [`ApiError::NotEnded`] if the job has not ended.
+    /// - [`ApiError::BadRequest`] if it is a pair of a sequence.
+    /// - Otherwise as [`Service::cancel`].
+    pub async fn remove(&self, caller: &Caller, id: JobId) -> Result<(), ApiError> {
+        caller.may_write()?;
+        let job = self.job(caller, id).await?;
+        if !job.state.is_end() {
+            return Err(ApiError::NotEnded(id));
+        }
+        Ok(self.queue.remove(id).await?)
+    }
+
     /// Queues a job of the caller's tenant again, durable and without a deadline. The job must have
     /// ended without success, or its result must be lost. It is subject to admission control like a
     /// new job.

@@ -240,6 +240,12 @@ pub enum QueueError {
     /// lost. The value is its state.
     #[error("only a job that failed, expired or was cancelled is queued again: this one is {}", .0.name())]
     NotTerminal(State),
+    /// The job cannot be removed: it has not ended. The value is its state.
+    #[error("only a job that has ended is removed: this one is {}", .0.name())]
+    NotEnded(State),
+    /// The job cannot be removed: it is a pair of this sequence.
+    #[error("the job is a pair of sequence {0}, which is removed as a whole")]
+    PairOfSequence(JobId),
     /// The ephemeral job is being cancelled or was cancelled, and cannot become durable.
     #[error("the job is being cancelled")]
     GivenUp,
@@ -361,6 +367,16 @@ pub trait Queue: Send + Sync {
     /// [`QueueError::NotFound`] if there is no such job. [`QueueError::NotTerminal`] if it has not
     /// ended, or has succeeded and is not `lost`. Otherwise an error of the store.
     async fn requeue(&self, id: JobId, lost: bool) -> Result<Arc<Job>, QueueError>;
+
+    /// Removes an ended job and, of a sequence, its pairs: payload, snapshot and result go with
+    /// [`Event::Deleted`], and its idempotency key is free again. A job that another one follows is
+    /// removed after the end of that one.
+    ///
+    /// # Errors
+    /// [`QueueError::NotFound`] if there is no such job. [`QueueError::NotEnded`] if it has not
+    /// ended. [`QueueError::PairOfSequence`] if it is a pair of a sequence. Otherwise an error of
+    /// the store.
+    async fn remove(&self, id: JobId) -> Result<(), QueueError>;
 
     /// Subscribes to a job: its state and, while it runs, its progress. The channel keeps only the
     /// latest value, so a slow receiver misses values in between. It closes when the job has ended.

@@ -122,6 +122,7 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
     let own = format!("/v1/jobs/{id}");
     let [events, result, requeue, tracks] =
         ["events", "result", "requeue", "tracks"].map(|of| format!("{own}/{of}"));
+    let removal = format!("{own}?remove=true");
     // Expected status for the reader, the other tenant and the writer.
     let expected = [
         (Method::GET, "/v1/info", [200, 200, 200]),
@@ -136,6 +137,7 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
         (Method::GET, &tracks, [400, 404, 400]),
         (Method::POST, &requeue, [403, 404, 400]),
         (Method::DELETE, &own, [403, 404, 200]),
+        (Method::DELETE, &removal, [403, 404, 204]),
         (Method::GET, "/v1/nothing", [404, 404, 404]),
         (Method::PUT, "/v1/jobs", [405, 405, 405]),
         (Method::GET, "/metrics", [404, 404, 404]),
@@ -238,7 +240,7 @@ fn showing<T>(message: T, shown: Option<&str>) -> Request<T> {
 }
 
 /// The status codes of the nine methods. Those that need a job id use `id`, a job of tenant a.
-async fn codes(server: &Server, id: &str, shown: Option<&str>) -> [Code; 10] {
+async fn codes(server: &Server, id: &str, shown: Option<&str>) -> [Code; 11] {
     use proto::estimate_sequence_request as sequence;
     use proto::submit_job_request as submit;
     let code =
@@ -309,6 +311,10 @@ async fn codes(server: &Server, id: &str, shown: Option<&str>) -> [Code; 10] {
     let tracked = calls
         .get_tracks(showing(proto::GetTracksRequest { id: id() }, shown))
         .await;
+    // Last, as it removes the job.
+    let deleted = calls
+        .delete_job(showing(proto::DeleteJobRequest { id: id() }, shown))
+        .await;
     [
         code(flow.map(drop)),
         code(sequence.map(drop)),
@@ -320,6 +326,7 @@ async fn codes(server: &Server, id: &str, shown: Option<&str>) -> [Code; 10] {
         code(watched.map(drop)),
         code(fetched.map(drop)),
         code(tracked.map(drop)),
+        code(deleted.map(drop)),
     ]
 }
 
@@ -329,16 +336,19 @@ async fn every_call_of_grpc_takes_a_key_and_gives_only_what_it_opens() {
     let id = finished(&server).await;
     for shown in SHUT {
         let codes = codes(&server, &id, shown).await;
-        assert_eq!(codes, [Code::Unauthenticated; 10], "{shown:?}");
+        assert_eq!(codes, [Code::Unauthenticated; 11], "{shown:?}");
     }
-    // Estimate, sequence, submit; get, list, cancel, requeue, watch, download, tracks.
+    // Estimate, sequence, submit; get, list, cancel, requeue, watch, download, tracks, delete.
     let (ok, no, none) = (Code::Ok, Code::PermissionDenied, Code::NotFound);
     // The job has succeeded, and it is a pair.
     let bad = Code::InvalidArgument;
     for (key, expected) in [
-        (READER, [no, no, no, ok, ok, no, no, ok, ok, bad]),
-        (OTHER, [ok, ok, ok, none, ok, none, none, none, none, none]),
-        (WRITER, [ok, ok, ok, ok, ok, ok, bad, ok, ok, bad]),
+        (READER, [no, no, no, ok, ok, no, no, ok, ok, bad, no]),
+        (
+            OTHER,
+            [ok, ok, ok, none, ok, none, none, none, none, none, none],
+        ),
+        (WRITER, [ok, ok, ok, ok, ok, ok, bad, ok, ok, bad, ok]),
     ] {
         let shown = format!("Bearer {key}");
         assert_eq!(codes(&server, &id, Some(&shown)).await, expected, "{key}");

@@ -15,13 +15,14 @@ use crate::raw_http::Besieged;
 use crate::server::{PATIENCE, Server};
 
 /// Every method of the public port.
-const METHODS: [&str; 14] = [
+const METHODS: [&str; 15] = [
     "fnsf.v1.SceneFlow/EstimateFlow",
     "fnsf.v1.SceneFlow/EstimateSequence",
     "fnsf.v1.SceneFlow/SubmitJob",
     "fnsf.v1.SceneFlow/GetJob",
     "fnsf.v1.SceneFlow/ListJobs",
     "fnsf.v1.SceneFlow/CancelJob",
+    "fnsf.v1.SceneFlow/DeleteJob",
     "fnsf.v1.SceneFlow/RequeueJob",
     "fnsf.v1.SceneFlow/WatchJob",
     "fnsf.v1.SceneFlow/GetTracks",
@@ -279,6 +280,9 @@ async fn numbers_that_are_no_values_and_messages_out_of_order_are_refused() {
         let four = calls
             .watch_job(proto::WatchJobRequest { id: id.clone() })
             .await;
+        let six = calls
+            .delete_job(proto::DeleteJobRequest { id: id.clone() })
+            .await;
         let first_row = u64::MAX;
         let five = calls
             .download_result(proto::DownloadResultRequest { id, first_row })
@@ -289,6 +293,7 @@ async fn numbers_that_are_no_values_and_messages_out_of_order_are_refused() {
             three.map(drop),
             four.map(drop),
             five.map(drop),
+            six.map(drop),
         ];
         for code in codes {
             assert_eq!(code.expect_err("a refusal").code(), Code::NotFound);

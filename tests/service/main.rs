@@ -29,6 +29,7 @@ mod raw_http;
 mod readme;
 #[path = "../common/real_data.rs"]
 mod real_data;
+mod removal;
 mod retries;
 mod sequences;
 mod server;

@@ -343,6 +343,16 @@ impl SceneFlow for Calls {
         Ok(Response::new(convert::job(&job)))
     }
 
+    async fn delete_job(
+        &self,
+        request: Request<proto::DeleteJobRequest>,
+    ) -> Result<Response<proto::DeleteJobResponse>, Status> {
+        let call = Call::of(&request)?;
+        let id = named(&request.get_ref().id)?;
+        self.service.remove(&call.caller, id).await?;
+        Ok(Response::new(proto::DeleteJobResponse {}))
+    }
+
     async fn requeue_job(
         &self,
         request: Request<proto::RequeueJobRequest>,

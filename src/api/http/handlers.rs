@@ -436,24 +436,46 @@ pub(super) async fn list_jobs(
     }))
 }
 
-/// Cancels a job: at once if it is queued, within an iteration if it is running.
+/// The query parameters of a cancellation.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Deletion {
+    /// Whether to remove the job, which must have ended, instead of cancelling it.
+    #[serde(default)]
+    remove: bool,
+}
+
+/// Cancels a job: at once if it is queued, within an iteration if it is running. An ended job is not
+/// changed. With `remove=true` it is removed, with its sweeps and its result.
 #[utoipa::path(
     delete,
     path = "/v1/jobs/{id}",
     tag = "jobs",
-    params(("id" = String, Path, description = "The job's name")),
+    params(
+        ("id" = String, Path, description = "The job's name"),
+        ("remove" = Option<bool>, Query, description = "Remove the job, which must have ended, instead of cancelling it"),
+    ),
     responses(
         (status = 200, description = "The job; its end is asked for", body = JobView),
+        (status = 204, description = "The job is removed"),
+        (status = 400, description = "A pair of a sequence is not removed alone", body = Problem, content_type = "application/problem+json"),
         (status = 404, description = "No such job", body = Problem, content_type = "application/problem+json"),
+        (status = 409, description = "A job that has not ended is not removed", body = Problem, content_type = "application/problem+json"),
     )
 )]
-pub(super) async fn cancel_job(
+pub(super) async fn delete_job(
     State(service): State<Arc<Service>>,
     Extension(caller): Extension<Caller>,
     Named(id): Named,
-) -> Result<Json<JobView>, ApiError> {
+    deletion: Result<Query<Deletion>, axum::extract::rejection::QueryRejection>,
+) -> Result<Response, ApiError> {
+    let Query(deletion) = deletion.map_err(|error| ApiError::BadRequest(error.body_text()))?;
+    if deletion.remove {
+        service.remove(&caller, id).await?;
+        return Ok(StatusCode::NO_CONTENT.into_response());
+    }
     let job = service.cancel(&caller, id).await?;
-    Ok(Json(JobView::new(&job, &[])))
+    Ok(Json(JobView::new(&job, &[])).into_response())
 }
 
 /// Queues a job again that failed, expired or was cancelled, or whose result is lost. For a

@@ -91,7 +91,7 @@ fn describe(
         handlers::submit_job,
         handlers::list_jobs,
         handlers::get_job,
-        handlers::cancel_job,
+        handlers::delete_job,
         handlers::requeue_job,
         events::follow_job,
         results::result,

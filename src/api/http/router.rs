@@ -21,7 +21,7 @@ pub(crate) fn router(service: &Arc<Service>) -> Router {
         )
         .route(
             "/v1/jobs/{id}",
-            get(handlers::get_job).delete(handlers::cancel_job),
+            get(handlers::get_job).delete(handlers::delete_job),
         )
         .route("/v1/jobs/{id}/requeue", post(handlers::requeue_job))
         .route("/v1/jobs/{id}/events", get(events::follow_job))

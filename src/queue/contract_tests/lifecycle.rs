@@ -341,3 +341,65 @@ pub(crate) async fn a_probe_leaves_nothing(stand: &mut impl Stand) {
     assert!(listed.await.expect("a list").is_empty());
     assert!(heard.try_recv().is_err());
 }
+
+pub(crate) async fn an_ended_job_is_removed_when_its_owner_asks_for_it(stand: &mut impl Stand) {
+    let options = QueueOptions {
+        answered_retention: Duration::from_millis(40),
+        ..QueueOptions::default()
+    };
+    let (queue, mut events) = stand.open(options);
+    assert_eq!(
+        queue.remove(JobId::fresh()).await,
+        Err(QueueError::NotFound)
+    );
+
+    let job = submit(&queue, submission("a")).await;
+    let queued = queue.remove(job.id).await;
+    assert_eq!(queued, Err(QueueError::NotEnded(State::Queued)));
+    let held = lease(&queue).await;
+    let running = queue.remove(job.id).await;
+    assert_eq!(running, Err(QueueError::NotEnded(State::Running)));
+    finish(&queue, &held.job, done()).await;
+    queue.remove(job.id).await.expect("it has ended");
+    let gone = queue.job(&job.tenant, job.id).await;
+    assert_eq!(gone.map(drop), Err(QueueError::NotFound));
+    assert_eq!(queue.remove(job.id).await, Err(QueueError::NotFound));
+
+    let whole = submit(&queue, sequence(2)).await;
+    let pairs = queue.pairs(whole.id).await.expect("known");
+    for _ in 0..2 {
+        let held = lease(&queue).await;
+        finish(&queue, &held.job, done()).await;
+    }
+    let of_whole = queue.remove(pairs[0].id).await;
+    assert_eq!(of_whole, Err(QueueError::PairOfSequence(whole.id)));
+    queue.remove(whole.id).await.expect("it has ended");
+    let mut expected = vec![job.id, pairs[0].id, pairs[1].id, whole.id];
+    while let Some(next) = expected.first().copied() {
+        if let Event::Deleted(id) = events.recv().await.expect("an event") {
+            assert_eq!(id, next);
+            expected.remove(0);
+        }
+    }
+
+    // A job that another one follows is kept until that one has ended.
+    let first = submit(&queue, submission("a")).await;
+    let held = lease(&queue).await;
+    let next = Submission {
+        after: Some(first.id),
+        ..submission("a")
+    };
+    submit(&queue, next).await;
+    finish(&queue, &held.job, done()).await;
+    queue.remove(first.id).await.expect("it has ended");
+    tokio::time::sleep(Duration::from_millis(200)).await;
+    assert_eq!(state(&queue, &first).await, State::Succeeded);
+    let held = lease(&queue).await;
+    finish(&queue, &held.job, done()).await;
+    let began = std::time::Instant::now();
+    while queue.job(&first.tenant, first.id).await.is_ok() {
+        assert!(began.elapsed() < PATIENCE, "it is kept for nobody");
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    assert!(queue.is_empty().await.is_ok_and(|empty| !empty));
+}

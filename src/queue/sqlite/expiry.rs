@@ -114,6 +114,21 @@ fn look_after_queued(
     Ok(())
 }
 
+/// Removes an ended job before its retention is over.
+pub(super) fn remove(
+    connection: &Connection,
+    effects: &mut Effects,
+    options: &QueueOptions,
+    id: JobId,
+) -> Result<(), QueueError> {
+    let job = rows::get(connection, id)?;
+    match job.parent {
+        Some(sequence) => Err(QueueError::PairOfSequence(sequence)),
+        None if !job.state.is_end() => Err(QueueError::NotEnded(job.state)),
+        None => forget_or_keep(connection, effects, options, &job),
+    }
+}
+
 /// Removes an ended job whose retention is over. It is kept for longer while a job that follows it
 /// may still use its results.
 fn forget_or_keep(

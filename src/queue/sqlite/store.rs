@@ -258,6 +258,14 @@ impl Queue for SqliteQueue {
         self.writer.write(true, change).await
     }
 
+    async fn remove(&self, id: JobId) -> Result<(), QueueError> {
+        let options = self.options.clone();
+        let change = move |connection: &Connection, effects: &mut Effects| {
+            expiry::remove(connection, effects, &options, id)
+        };
+        self.writer.write(true, change).await
+    }
+
     async fn watch(&self, id: JobId) -> Result<watch::Receiver<Arc<Job>>, QueueError> {
         // Through the writer, so that no change falls between the query and the subscription.
         let shared = Arc::clone(&self.shared);
