@@ -80,12 +80,10 @@ fn moved(motion: &RigidTransform, point: Point) -> Point {
 /// Estimates a pair and collects the features and errors of its points. `weight` is the weight of
 /// the scene in a fit.
 fn judged(backend: &dyn Backend, known: LabelledPair, weight: f64) -> Scene {
-    let ego = backend.host().align(
-        &known.source,
-        &known.target,
-        &RigidTransform::identity(),
-        &Uncontrolled,
-    );
+    let rest = RigidTransform::identity();
+    let host = backend.host();
+    let found = host.align(&known.source, &known.target, &rest, &Uncontrolled);
+    let ego = found.motion;
     let off_ground = |points: &[Point], ground: &[bool]| -> Vec<usize> {
         (0..points.len())
             .filter(|&row| !ground[row] && points[row].iter().all(|c| c.is_finite()))

@@ -63,7 +63,7 @@ fn run(experiment: &str, arguments: Vec<String>) -> anyhow::Result<()> {
         "neighbors" => neighbors::run(arguments).map_err(anyhow::Error::msg),
         "objects" => objects::run(arguments).map_err(anyhow::Error::msg),
         "overlap" => overlap::run(),
-        "registration" => registration::run(),
+        "registration" => registration::run(&arguments),
         "sequences" => sequences::run(arguments),
         "tracks" => tracks::run(&arguments),
         "traffic" => traffic::run(&arguments),

@@ -1,4 +1,5 @@
-//! Accuracy of the ego motion on real and simulated pairs: rows of `docs/experiments/registration.md`.
+//! Accuracy of the ego motion on real and simulated pairs, and whether its covariance is honest: the
+//! tables of `docs/experiments/registration.md`.
 //!
 //! `FNSF_REAL_DATA` names the folder of the real pairs. Without it only simulated streets are used.
 
@@ -12,11 +13,15 @@ use fnsf::flow::{Point, RigidTransform, Uncontrolled};
 use fnsf::formats::read_pair;
 use nalgebra::{Isometry3, Point3, Vector3};
 
+use super::labelled::PAIRS;
+
 /// Number of shifts and rotations applied to both clouds together. They move the voxel borders, so
 /// that the voxel downsampling differs and the true motion does not.
 const OFFSETS: usize = 8;
 /// Number of seeds of each kind of street.
 const SEEDS: u64 = 12;
+/// Seeds of the streets that covariances are compared on. None of them was tuned on.
+const FRESH: std::ops::Range<u64> = 7000..7040;
 
 /// Two clouds and the true motion between them.
 struct Case {
@@ -63,26 +68,22 @@ impl Case {
     }
 }
 
-pub(super) fn run() -> anyhow::Result<()> {
+pub(super) fn run(arguments: &[String]) -> anyhow::Result<()> {
+    match arguments {
+        [] => accuracy(),
+        [table] if table == "certainty" => certainty(),
+        _ => anyhow::bail!("usage: registration [certainty]"),
+    }
+}
+
+fn accuracy() -> anyhow::Result<()> {
     println!("| pairs | points | motion | off, m | worst | off, degrees | worst | ms |");
     println!("|---|---|---|---|---|---|---|---|");
     let backend = CpuBackend::new(Some(1))?;
-    if let Some(folder) = std::env::var_os("FNSF_REAL_DATA").map(PathBuf::from) {
-        for name in ["av2_7fab", "kitti_0000", "small_gicp"] {
-            let pair = read_pair(&std::fs::read(folder.join(name).join("pair.npz"))?)?;
-            let ground = pair.ground.unwrap_or_default();
-            let all = Case {
-                source: pair.source,
-                target: pair.target,
-                truth: pair.ego.unwrap_or_default(),
-            };
-            let off = all.without([&ground.source, &ground.target]);
-            for (what, case) in [("", all), (", no ground", off)] {
-                row(&format!("{name}{what}"), &backend, &case.sweeps());
-                let back = case.backward();
-                row(&format!("{name}{what}, back"), &backend, &back.sweeps());
-            }
-        }
+    for (name, case) in real_cases()? {
+        row(&name, &backend, &case.sweeps());
+        let back = case.backward();
+        row(&format!("{name}, back"), &backend, &back.sweeps());
     }
     for (beams, azimuth_steps) in [(16, 1800), (32, 1800), (64, 2000), (128, 1024)] {
         for (speed, yaw_rate) in [(0.0, 0.0), (10.0, 0.25), (30.0, 0.7)] {
@@ -119,6 +120,100 @@ pub(super) fn run() -> anyhow::Result<()> {
     Ok(())
 }
 
+/// The real pairs, each with and without its ground; none if `FNSF_REAL_DATA` is not set.
+fn real_cases() -> anyhow::Result<Vec<(String, Case)>> {
+    let mut cases = Vec::new();
+    let folder = std::env::var_os("FNSF_REAL_DATA").map(PathBuf::from);
+    for (folder, name) in folder.iter().flat_map(|f| PAIRS.map(|name| (f, name))) {
+        let pair = read_pair(&std::fs::read(folder.join(name).join("pair.npz"))?)?;
+        let ground = pair.ground.unwrap_or_default();
+        let all = Case {
+            source: pair.source,
+            target: pair.target,
+            truth: pair.ego.unwrap_or_default(),
+        };
+        let off = all.without([&ground.source, &ground.target]);
+        cases.push((name.to_owned(), all));
+        cases.push((format!("{name}, no ground"), off));
+    }
+    Ok(cases)
+}
+
+/// How often the six components of the true ego motion lie within two standard deviations of the
+/// motion that was found.
+fn certainty() -> anyhow::Result<()> {
+    println!("| pairs | x, y, z | x, y, z, sigma | roll, pitch, yaw | sigma | within 2 sigma |");
+    println!("|---|---|---|---|---|---|");
+    let backend = CpuBackend::new(None)?;
+    for (name, case) in real_cases()? {
+        certainty_row(&name, &backend, &case.sweeps());
+    }
+    for (beams, speed_mps) in [(64, None), (64, Some(0.0)), (32, None), (16, None)] {
+        for suspension in [false, true] {
+            let mut streets = [Vec::new(), Vec::new()];
+            for seed in FRESH {
+                let options = StreetOptions {
+                    seed,
+                    beams,
+                    speed_mps,
+                    suspension,
+                    ..StreetOptions::default()
+                };
+                let pair = Street::new(&options)?.pair(0)?;
+                let all = Case {
+                    source: pair.source,
+                    target: pair.target,
+                    truth: pair.target_from_source,
+                };
+                streets[1].push(all.without([&pair.ground_source, &pair.ground_target]));
+                streets[0].push(all);
+            }
+            for (cases, ground) in streets.iter().zip(["", ", no ground"]) {
+                let stands = speed_mps.map_or("", |_| ", standing");
+                let body = if suspension { ", springs" } else { "" };
+                let name = format!("{beams} beams{stands}{body}{ground}");
+                certainty_row(&name, &backend, cases);
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Prints the root mean squares of the errors and of the standard deviations, millimetres and
+/// thousandths of a degree, and the share of components within two standard deviations.
+fn certainty_row(name: &str, backend: &CpuBackend, cases: &[Case]) {
+    let [mut errors, mut sigmas] = [[0.0; 6]; 2];
+    let mut within = 0;
+    let count = cases.len() as f64;
+    for case in cases {
+        let prior = RigidTransform::identity();
+        let host = backend.host();
+        let found = host.align(&case.source, &case.target, &prior, &Uncontrolled);
+        let shift = found.motion.translation.vector - case.truth.translation.vector;
+        let turn = (found.motion.rotation * case.truth.rotation.inverse()).scaled_axis();
+        let covariance = found.covariance.unwrap_or_default();
+        for (a, error) in shift.iter().chain(turn.iter()).enumerate() {
+            let unit = if a < 3 { 1e3 } else { 1e3_f64.to_degrees() };
+            let variance = covariance[(a, a)];
+            errors[a] += (error * unit).powi(2) / count;
+            sigmas[a] += variance * unit * unit / count;
+            within += usize::from(error.abs() < 2.0 * variance.sqrt());
+        }
+    }
+    let list = |squares: &[f64]| {
+        let roots = squares.iter().map(|square| format!("{:.1}", square.sqrt()));
+        roots.collect::<Vec<_>>().join(", ")
+    };
+    println!(
+        "| {name} | {} | {} | {} | {} | {:.2} |",
+        list(&errors[..3]),
+        list(&sigmas[..3]),
+        list(&errors[3..]),
+        list(&sigmas[3..]),
+        within as f64 / (6.0 * count)
+    );
+}
+
 /// The source rotated so that the yaw between the clouds is 5 degrees.
 fn five_degrees(case: &Case) -> Case {
     let own = case.truth.rotation.scaled_axis().z;
@@ -150,7 +245,8 @@ fn row(name: &str, backend: &CpuBackend, cases: &[Case]) {
         let prior = RigidTransform::identity();
         let found = backend
             .host()
-            .align(&case.source, &case.target, &prior, &Uncontrolled);
+            .align(&case.source, &case.target, &prior, &Uncontrolled)
+            .motion;
         times.push(start.elapsed().as_secs_f64() * 1e3);
         let gap = case.truth.inv_mul(&found);
         meters.push(gap.translation.vector.norm());

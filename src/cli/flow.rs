@@ -159,6 +159,14 @@ pub(super) fn print_report(report: &Report) -> Result<(), Failure> {
             "  ego motion {x:.3}, {y:.3}, {z:.3} m (target from source)"
         ))?;
     }
+    if let Some(covariance) = &report.ego_covariance {
+        let deviation: [f64; 6] = core::array::from_fn(|a| covariance[a][a].max(0.0).sqrt());
+        let [x, y, z] = [0, 1, 2].map(|a| 1e3 * deviation[a]);
+        let [roll, pitch, yaw] = [3, 4, 5].map(|a| deviation[a].to_degrees());
+        say(format_args!(
+            "    certain to {x:.1}, {y:.1}, {z:.1} mm; roll, pitch, yaw to {roll:.3}, {pitch:.3}, {yaw:.3} degrees"
+        ))?;
+    }
     if let Some(deskew) = report.deskew {
         let [given, deskewed] = deskew.distance_m.map(|m| 100.0 * m);
         let outcome = match deskew.applied {

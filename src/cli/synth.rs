@@ -48,6 +48,9 @@ pub(super) struct Synth {
     /// sweep_0000.pcd, ... then have the field time. The clouds of a pair are deskewed
     #[arg(long)]
     rolling: bool,
+    /// Let the body of the vehicle pitch, roll and heave on its springs
+    #[arg(long)]
+    suspension: bool,
 }
 
 /// A simulated pair with its ground truth, in the form in which files store it.
@@ -80,6 +83,7 @@ impl Synth {
             movers: self.movers,
             speed_mps: self.speed_mps,
             rolling: self.rolling,
+            suspension: self.suspension,
             ..StreetOptions::default()
         })
         .map_err(Failure::usage)?;

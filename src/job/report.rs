@@ -1,5 +1,6 @@
 //! The report of an estimate, printed by the command line and stored by the service.
 
+use nalgebra::Matrix6;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
@@ -7,6 +8,10 @@ use super::options::JobOptions;
 use super::record::JobProgress;
 use crate::flow::{CERTAIN_OVERLAP, DEFAULT_DT_S, Estimate, Solution};
 use crate::formats::matrix_rows;
+
+/// Standard deviations of the ego motion above which a report warns: metres and degrees.
+const UNSURE_M: f64 = 0.2;
+const UNSURE_DEG: f64 = 1.0;
 
 /// The report of the estimate of one pair.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
@@ -33,6 +38,12 @@ pub struct Report {
     /// The ego motion target_from_source as a 4 x 4 matrix, row by row, translation in metres. None
     /// if it was not separated, or a deadline left no time to estimate it.
     pub ego_motion: Option<[[f64; 4]; 4]>,
+    /// Covariance of the estimated ego motion, 6 x 6, row by row: of the position of the source's
+    /// origin in the target's frame (x, y, z, metres) and of the rotation about the target's axes (x,
+    /// y, z, radians). None if the ego motion was given or not separated, or a deadline left no time
+    /// for it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ego_covariance: Option<[[f64; 6]; 6]>,
     /// Share, 0 to 1, of the volume off the ground of the source that the target shows as well, after
     /// the ego motion. A pair of one scene has 0.64 or more. Below 0.6 the confidences are lowered,
     /// and below 0.35 the pair is refused. None for small clouds, and if a deadline left no time for
@@ -42,8 +53,8 @@ pub struct Report {
     /// Deskewing of the two sweeps, where the times of their points are known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub deskew: Option<DeskewReport>,
-    /// What is suspicious about the input, in words: both sweeps are the same points, or they share
-    /// little of what they show.
+    /// What is suspicious about the input, in words: both sweeps are the same points, they share
+    /// little of what they show, or they hardly determine the ego motion.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub warnings: Vec<String>,
     /// The object search, with `default` and `label`.
@@ -172,6 +183,9 @@ impl Report {
             stop_reason: estimate.stop_reason.name().to_owned(),
             device: estimate.device.clone(),
             ego_motion: estimate.ego.as_ref().map(matrix_rows),
+            ego_covariance: estimate.ego_covariance.map(|covariance| {
+                core::array::from_fn(|row| core::array::from_fn(|column| covariance[(row, column)]))
+            }),
             overlap: estimate.overlap.map(decimal),
             deskew: estimate.deskew.as_ref().map(|deskew| DeskewReport {
                 applied: deskew.points.is_some(),
@@ -243,7 +257,28 @@ fn warnings(estimate: &Estimate) -> Vec<String> {
             100.0 * share
         )
     });
-    same.into_iter().chain(little).collect()
+    let unsure = estimate.ego_covariance.as_ref().and_then(undetermined);
+    same.into_iter().chain(little).chain(unsure).collect()
+}
+
+/// What the sweeps hardly determine of the ego motion along the ground, in words. Height, pitch and
+/// roll are never far from how vehicles move.
+fn undetermined(covariance: &Matrix6<f64>) -> Option<String> {
+    let along = covariance.fixed_view::<2, 2>(0, 0).symmetric_eigen();
+    let worst = along.eigenvalues.imax();
+    let metres = along.eigenvalues[worst].max(0.0).sqrt();
+    let degrees = covariance[(5, 5)].max(0.0).sqrt().to_degrees();
+    let mut parts = Vec::new();
+    if metres > UNSURE_M {
+        let axis = along.eigenvectors.column(worst);
+        let (x, y) = (axis[0], axis[1]);
+        parts.push(format!("along ({x:.2}, {y:.2}, 0) to {metres:.1} m"));
+    }
+    if degrees > UNSURE_DEG {
+        parts.push(format!("in yaw to {degrees:.1} degrees"));
+    }
+    let parts = parts.join(" and ");
+    (!parts.is_empty()).then(|| format!("the sweeps determine the ego motion only {parts}"))
 }
 
 #[cfg(test)]
@@ -261,6 +296,7 @@ mod tests {
             overlap: Some(0.5),
             same_sweep: true,
             ego: None,
+            ego_covariance: Some(Matrix6::identity()),
             points: 3,
             solution: Solution::Field(FieldSolution {
                 iterations: 0,
@@ -281,6 +317,11 @@ mod tests {
             },
         };
         let report = Report::new(&estimate, &JobOptions::default());
+        let unsure = report.warnings.last().expect("a warning");
+        assert!(
+            unsure.contains("to 1.0 m and in yaw to 57.3 degrees"),
+            "{unsure}"
+        );
         assert_eq!(report.progress(), None);
         let json = serde_json::to_string(&report).expect("JSON");
         assert_eq!(serde_json::from_str::<Report>(&json).ok(), Some(report));

@@ -282,6 +282,10 @@ pub(super) fn header(answer: &Answer) -> proto::FlowHeader {
         dt_assumed: report.dt_assumed,
         overlap: report.overlap,
         warnings: report.warnings.clone(),
+        ego_covariance: report
+            .ego_covariance
+            .map(|rows| rows.as_flattened().to_vec())
+            .unwrap_or_default(),
         method,
     }
 }

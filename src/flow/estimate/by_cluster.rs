@@ -45,6 +45,7 @@ pub(super) fn residual_motion(
     let prior = RigidTransform::identity();
     let ego = ego_motion(host, selection, input.options.ego, &prior, whole, control);
     let alignment = input.align(host, ego)?;
+    let ego = alignment.ego;
     let aligned = &alignment.aligned;
     let clusters = || parts(aligned, &selection.target, partition);
     let parts = host.threads().install(clusters);

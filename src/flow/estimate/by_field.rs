@@ -10,6 +10,7 @@ use crate::flow::error::FlowError;
 use crate::flow::field::{self, Backend, Fit, Fitted, FittedField, Prior, Snapshot};
 use crate::flow::motion::{MotionField, Residual};
 use crate::flow::options::{Ego, FieldOptions, Options};
+use crate::flow::registration::Registration;
 use crate::flow::select::Selection;
 
 /// Estimates the residual motion by fitting a field on the backend, resumed from `snapshot` where
@@ -45,10 +46,11 @@ pub(super) fn residual_motion(
             let host = backend.host();
             ego_motion(host, selection, ego, &prior, prepared.whole, control)
         }
-        (None, Ego::Given(target_from_source)) => Some(target_from_source),
+        (None, Ego::Given(motion)) => Some(Registration::given(motion)),
         (None, Ego::Auto | Ego::Off) => None,
     };
     let alignment = input.align(backend.host(), ego)?;
+    let ego = alignment.ego;
     let aligned = &alignment.aligned;
     let fitted = match &prepared {
         None => Fitted::nothing(aligned.len(), control),

@@ -30,8 +30,9 @@ pub(super) fn residual_motion(
     let whole = has_time_for_all(selection, control);
     let prior = RigidTransform::identity();
     let ego = ego_motion(host, selection, input.options.ego, &prior, whole, control);
-    let motion = ego.unwrap_or_default();
     let alignment = input.align(host, ego)?;
+    let ego = alignment.ego;
+    let motion = ego.unwrap_or_default();
     let aligned = &alignment.aligned;
     let find_ground = |sweeps: &[&[Point]]| host.ground(sweeps);
     let neighbors = match &ego {

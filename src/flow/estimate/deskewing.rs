@@ -8,6 +8,7 @@ use crate::flow::error::FlowError;
 use crate::flow::host::Host;
 use crate::flow::options::{Ego, Ground, Options};
 use crate::flow::problem::{NeighborSweep, Problem};
+use crate::flow::registration::Registration;
 use crate::flow::select::{cropped, ground_masks};
 
 /// Remaining time above which a pair is deskewed, seconds per point. It takes two registrations.
@@ -42,7 +43,7 @@ pub(super) struct DeskewedPair {
     /// The deskewed points of the neighbor sweeps; empty where the pair is used as it was given.
     pub(super) neighbors: Vec<Vec<Point>>,
     /// The ego motion of the points that are used, target_from_source.
-    pub(super) ego: RigidTransform,
+    pub(super) ego: Registration,
 }
 
 /// Deskews the pair of `problem` and its neighbor sweeps, and decides by the fit of near points
@@ -69,7 +70,7 @@ pub(super) fn deskew(
         return Ok(None);
     };
     let align = |sweeps: [&[Point]; 2], prior: &RigidTransform| match options.ego {
-        Ego::Given(ego) => ego,
+        Ego::Given(ego) => Registration::given(ego),
         Ego::Auto | Ego::Off => {
             let [source, target] = sweeps.map(|points| cropped(points, options));
             host.align(&source, &target, prior, control)
@@ -78,7 +79,9 @@ pub(super) fn deskew(
     let ground = ground_of(host, problem, options)?;
     let given = [problem.source, problem.target];
     let rough = align(given, &RigidTransform::identity());
-    let stands = rough.translation.vector.norm() < STANDS[0] && rough.rotation.angle() < STANDS[1];
+    let motion = &rough.motion;
+    let stands =
+        motion.translation.vector.norm() < STANDS[0] && motion.rotation.angle() < STANDS[1];
     if stands && !options.always_deskew {
         return Ok(Some(DeskewedPair {
             deskew: None,
@@ -89,15 +92,15 @@ pub(super) fn deskew(
     }
     let move_back = |points: &[Point], times: &[f32]| {
         host.threads()
-            .install(|| deskewed(points, times, &rough, options.dt_s))
+            .install(|| deskewed(points, times, motion, options.dt_s))
     };
     let moved = [0, 1].map(|sweep| move_back(given[sweep], times[sweep]));
-    let fine = align([&moved[0], &moved[1]], &rough);
+    let fine = align([&moved[0], &moved[1]], motion);
     let distance = || {
         let fit = Fit::new(problem.source, ground.each_ref().map(Vec::as_slice));
         [
-            fit.distance_m(problem.source, problem.target, &rough),
-            fit.distance_m(&moved[0], &moved[1], &fine),
+            fit.distance_m(problem.source, problem.target, motion),
+            fit.distance_m(&moved[0], &moved[1], &fine.motion),
         ]
     };
     let distance_m = host.threads().install(distance);

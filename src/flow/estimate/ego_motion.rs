@@ -3,6 +3,7 @@
 use crate::flow::data::{Control, EarlierDeadline, Point, RigidTransform, stride_sample};
 use crate::flow::host::Host;
 use crate::flow::options::Ego;
+use crate::flow::registration::Registration;
 use crate::flow::select::Selection;
 
 /// Points sampled from each cloud for a registration under time pressure. Accuracy is then worse
@@ -21,6 +22,7 @@ pub(super) fn has_time_for_all(selection: &Selection, control: &dyn Control) -> 
 }
 
 /// The ego motion as target_from_source, with `prior` as the initial guess; none with [`Ego::Off`].
+/// That of [`Ego::Given`] has no covariance.
 ///
 /// Uses all points of the registration clouds if `whole` is set, otherwise a sample. At a deadline
 /// the registration returns its motion so far.
@@ -31,14 +33,14 @@ pub(super) fn ego_motion(
     prior: &RigidTransform,
     whole: bool,
     control: &dyn Control,
-) -> Option<RigidTransform> {
+) -> Option<Registration> {
     let on_time = EarlierDeadline {
         control,
         reserve: 0.0,
     };
     let align = |[source, target]: [&[Point]; 2]| host.align(source, target, prior, &on_time);
     match (ego, &selection.registration_clouds) {
-        (Ego::Given(target_from_source), _) => Some(target_from_source),
+        (Ego::Given(motion), _) => Some(Registration::given(motion)),
         (Ego::Auto, Some([source, target])) if whole => Some(align([source, target])),
         (Ego::Auto, Some(clouds)) => {
             let [source, target] = clouds

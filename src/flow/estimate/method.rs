@@ -1,5 +1,7 @@
 //! The common interface of the two methods: input and result.
 
+use nalgebra::Matrix6;
+
 use super::result::Solution;
 use crate::flow::data::StopReason;
 use crate::flow::data::{Control, Interrupt, Point, RigidTransform, transform_points};
@@ -8,7 +10,7 @@ use crate::flow::host::Host;
 use crate::flow::motion::Residual;
 use crate::flow::options::{LEAST_OVERLAP, Options};
 use crate::flow::problem::Problem;
-use crate::flow::registration::overlap;
+use crate::flow::registration::{Registration, overlap};
 use crate::flow::select::Selection;
 
 /// The input of a method.
@@ -33,7 +35,7 @@ impl Input<'_> {
     pub(super) fn align(
         &self,
         host: &Host,
-        ego: Option<RigidTransform>,
+        ego: Option<Registration>,
     ) -> Result<Alignment, FlowError> {
         let Selection {
             source,
@@ -41,6 +43,8 @@ impl Input<'_> {
             undrawn,
             ..
         } = self.selection;
+        let (ego, ego_covariance) =
+            ego.map_or((None, None), |found| (Some(found.motion), found.covariance));
         let moved = |points: &Vec<Point>| match &ego {
             None => points.clone(),
             Some(motion) => transform_points(motion, points),
@@ -61,6 +65,7 @@ impl Input<'_> {
             }
             overlap => Ok(Alignment {
                 ego,
+                ego_covariance,
                 aligned,
                 overlap,
             }),
@@ -71,6 +76,8 @@ impl Input<'_> {
 /// The source in the target's frame.
 pub(super) struct Alignment {
     pub(super) ego: Option<RigidTransform>,
+    /// Covariance of the ego motion, see [`Registration::covariance`].
+    pub(super) ego_covariance: Option<Matrix6<f64>>,
     /// The selected source points, transformed by the ego motion into the target's frame.
     pub(super) aligned: Vec<Point>,
     /// The overlap of the two sweeps, see [`overlap()`].

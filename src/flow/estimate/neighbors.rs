@@ -43,7 +43,7 @@ pub(super) fn aligned_neighbors(
         let step = if intervals < 0 { ego.inverse() } else { *ego };
         let repeated = 0..intervals.unsigned_abs();
         let prior = repeated.fold(RigidTransform::identity(), |all, _| step * all);
-        let motion = host.align(&whole, &target, &prior, control);
+        let motion = host.align(&whole, &target, &prior, control).motion;
         aligned.push(AlignedSweep {
             points: transform_points(&motion, &points),
             at: sweep.at,

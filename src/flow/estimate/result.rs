@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use nalgebra::Matrix6;
+
 use super::deskewing::Deskew;
 use crate::flow::data::{Point, RigidTransform, StopReason};
 use crate::flow::motion::MotionField;
@@ -22,6 +24,10 @@ pub struct Estimate {
     /// The ego motion as target_from_source. None with [`crate::flow::Ego::Off`], and where a
     /// deadline left no time to estimate it.
     pub ego: Option<RigidTransform>,
+    /// 6 x 6 covariance of the ego motion: of the position of the source's origin in the target's
+    /// frame (x, y, z, metres) and of the rotation about the target's axes (x, y, z, radians). None
+    /// without an ego motion, where it is given, and where a deadline left no time for it.
+    pub ego_covariance: Option<Matrix6<f64>>,
     /// Overlap of the two sweeps after the ego motion, 0 to 1: the share of the volume off the ground
     /// of the source that the target shows as well, within 0.3 m. Below
     /// [`crate::flow::LEAST_OVERLAP`] it is the larger of the shares of the two sweeps. None for

@@ -73,7 +73,7 @@ fn estimate_from(
     let mut is_deskewed = false;
     let neighbors;
     if let Some(deskewed) = &deskewed {
-        options.to_mut().ego = Ego::Given(deskewed.ego);
+        options.to_mut().ego = Ego::Given(deskewed.ego.motion);
         neighbors = deskewed.neighbors(&problem);
         problem.neighbors = &neighbors;
         problem.ground = deskewed.ground(&problem, &options);
@@ -105,7 +105,10 @@ fn estimate_from(
         },
     };
     let mut estimate = assemble(&input, solved, began);
-    estimate.deskew = deskewed.and_then(|pair| pair.deskew);
+    if let Some(pair) = deskewed {
+        estimate.ego_covariance = pair.ego.covariance;
+        estimate.deskew = pair.deskew;
+    }
     Ok(estimate)
 }
 
@@ -121,6 +124,7 @@ fn assemble(input: &Input<'_>, solved: Solved, began: f64) -> Estimate {
     } = solved;
     let Alignment {
         ego,
+        ego_covariance,
         aligned,
         overlap,
     } = alignment;
@@ -164,6 +168,7 @@ fn assemble(input: &Input<'_>, solved: Solved, began: f64) -> Estimate {
         valid,
         dynamic,
         ego,
+        ego_covariance,
         overlap,
         deskew: None,
         same_sweep: source == input.problem.target,

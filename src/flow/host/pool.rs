@@ -11,6 +11,7 @@ use super::sweep_cache::SweepCache;
 use crate::flow::data::{Control, Point, RigidTransform};
 use crate::flow::objects::{ObjectSearch, SearchClouds};
 use crate::flow::options::ObjectOptions;
+use crate::flow::registration::Registration;
 use crate::flow::{ground, objects, registration};
 
 /// A pool of CPU threads with a cache of the ground masks and the surfels of the latest sweeps.
@@ -74,7 +75,7 @@ impl Host {
     }
 
     /// Registers `source` (N x 3) to `target` (M x 3), metres, each in its own frame, and returns
-    /// the rigid motion `target_from_source`. The method is generalized ICP (Segal et al. 2009),
+    /// the rigid motion `target_from_source` with its covariance. The method is generalized ICP (Segal et al. 2009),
     /// started from a coarse search around `prior`.
     ///
     /// In directions that the clouds do not determine, the motion stays as in `prior`. It equals
@@ -87,7 +88,7 @@ impl Host {
         target: &[Point],
         prior: &RigidTransform,
         control: &dyn Control,
-    ) -> RigidTransform {
+    ) -> Registration {
         let known = [source, target].map(|points| self.sweep_cache.of(points));
         self.threads.install(|| {
             let (source, target) = rayon::join(|| known[0].surface(), || known[1].surface());

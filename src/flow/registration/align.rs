@@ -1,7 +1,10 @@
 //! Registration of two clouds: a coarse search, then a refinement.
 
+use nalgebra::Matrix6;
+
 use super::coarse;
 use super::gicp::{Fit, Schedule};
+use super::posterior::Prior;
 use super::surfels::{Columns, Surfels};
 use crate::flow::data::{Control, Point, RigidTransform};
 use crate::flow::spatial::voxel_mean;
@@ -38,10 +41,31 @@ impl SurfelCloud {
     }
 }
 
-/// The rigid motion `target_from_source` that aligns `source` with `target`, searched around
-/// `prior`. Where `control` interrupts, it is the motion so far. In directions that the clouds do
-/// not determine, the motion stays as in `prior`. It equals `prior` where the clouds have nothing
-/// in common.
+/// The ego motion of a pair, and how certain it is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Registration {
+    /// The rigid motion `target_from_source`.
+    pub motion: RigidTransform,
+    /// 6 x 6 covariance of the position of the source's origin (x, y, z, metres) and of the rotation
+    /// about the axes x, y, z (radians), in the target's frame. None where an interrupt left no time
+    /// for it.
+    pub covariance: Option<Matrix6<f64>>,
+}
+
+impl Registration {
+    /// A motion that is known from elsewhere.
+    pub(crate) fn given(motion: RigidTransform) -> Self {
+        Self {
+            motion,
+            covariance: None,
+        }
+    }
+}
+
+/// The most probable rigid motion `target_from_source` that aligns `source` with `target`, searched
+/// around `prior`, for a sensor on a vehicle. Where `control` interrupts, it is the motion so far.
+/// In directions that the clouds do not determine, the motion stays as in `prior`. It equals `prior`
+/// where the clouds have nothing in common.
 ///
 /// The result is bit-identical for any number of threads.
 pub(crate) fn align(
@@ -49,12 +73,15 @@ pub(crate) fn align(
     target: &SurfelCloud,
     prior: &RigidTransform,
     control: &dyn Control,
-) -> RigidTransform {
+) -> Registration {
     let found = coarse::search(&source.coarse, &target.coarse, prior, control);
     if control.interrupt().is_some() {
-        return found;
+        return Registration::given(found);
     }
     let target = target.fine.all();
     let source = source.fine.some(REFINED);
-    Fit::new(&source, target).run(&found, &REFINEMENT, control)
+    let prior = Prior::of_vehicle(prior);
+    let (motion, covariance) =
+        Fit::new(&source, target).run_with(&prior, &found, &REFINEMENT, control);
+    Registration { motion, covariance }
 }

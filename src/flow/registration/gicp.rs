@@ -14,6 +14,7 @@ use nalgebra::{
 };
 use rayon::prelude::*;
 
+use super::posterior::{Evidence, Posterior, Prior};
 use super::surfels::{AllSurfels, Surfel};
 use crate::flow::data::{Control, Point, RigidTransform};
 use crate::flow::spatial::PlaneFit;
@@ -21,6 +22,8 @@ use crate::flow::spatial::PlaneFit;
 /// Surfels whose sums one thread computes at a time. The partial sums are added in the surfels'
 /// order.
 const AT_ONCE: usize = 256;
+/// Neighboring surfels whose matches are taken to be off alike.
+const GROUP: usize = 32;
 /// Share of the steps over which the range and the scale shrink.
 const SHRINKING: f64 = 0.5;
 /// Variance of a perfect plane along its normal, where the variance across it is 1, and the factor
@@ -73,12 +76,18 @@ pub(super) struct Fit<'a> {
     spread_m: f64,
 }
 
-/// Sums over the matches: the normal equations and the total information.
-struct Sums {
-    normal: Matrix6<f64>,
-    gradient: Vector6<f64>,
+/// Sums over the matches: the normal equations, and what tells how certain they are.
+pub(super) struct Sums {
+    /// Second derivatives and gradient of half the weighted squared distances by a step of the
+    /// motion, with rotations in metres at the spread of the points.
+    pub(super) normal: Matrix6<f64>,
+    pub(super) gradient: Vector6<f64>,
+    /// Squares of the gradients of groups of neighboring matches.
+    pub(super) scatter: Matrix6<f64>,
+    /// The same where each match is off by the deviation of its surfels' points.
+    pub(super) noise: Matrix6<f64>,
     /// Weighted information about translations, summed over all directions.
-    held: f64,
+    pub(super) held: f64,
 }
 
 impl<'a> Fit<'a> {
@@ -105,13 +114,51 @@ impl<'a> Fit<'a> {
         schedule: &Schedule,
         control: &dyn Control,
     ) -> RigidTransform {
+        self.descend(start, schedule, control, |sums, _| Some(sums.update()))
+    }
+
+    /// The most probable motion after a fit from `start`, and its covariance as in [`Posterior`].
+    /// Where `control` interrupts, it is the motion so far; the covariance is none without a step.
+    pub(super) fn run_with(
+        &self,
+        prior: &Prior,
+        start: &RigidTransform,
+        schedule: &Schedule,
+        control: &dyn Control,
+    ) -> (RigidTransform, Option<Matrix6<f64>>) {
+        let mut covariance = None;
+        let motion = self.descend(start, schedule, control, |sums, motion| {
+            let center = (motion * self.center).coords;
+            let posterior = Evidence::of(sums).with(prior, motion, center, self.spread_m)?;
+            let Posterior {
+                step,
+                covariance: found,
+            } = posterior;
+            covariance = Some(found);
+            Some(step)
+        });
+        (motion, covariance)
+    }
+
+    /// The motion after the steps of a schedule that `next` gives from the sums at a motion. It ends
+    /// early after a short step, and where there is none.
+    fn descend(
+        &self,
+        start: &RigidTransform,
+        schedule: &Schedule,
+        control: &dyn Control,
+        mut next: impl FnMut(&Sums, &RigidTransform) -> Option<Vector6<f64>>,
+    ) -> RigidTransform {
         let mut motion = *start;
         for step in 0..schedule.steps {
             if control.interrupt().is_some() {
                 break;
             }
             let (within_m, scale_m, shrunk) = schedule.at(step);
-            let update = self.sums(&motion, within_m, scale_m).update();
+            let sums = self.sums(&motion, within_m, scale_m);
+            let Some(update) = next(&sums, &motion) else {
+                break;
+            };
             let [x, y, z, a, b, c] = update.into();
             let turn = UnitQuaternion::new(Vector3::new(a, b, c) / self.spread_m);
             let turn = Isometry3::rotation_wrt_point(turn, motion * self.center);
@@ -147,6 +194,8 @@ impl<'a> Fit<'a> {
         for sums in sums {
             all.normal += sums.normal;
             all.gradient += sums.gradient;
+            all.scatter += sums.scatter;
+            all.noise += sums.noise;
             all.held += sums.held;
         }
         all
@@ -162,7 +211,12 @@ impl<'a> Fit<'a> {
         let pivot = motion * self.center;
         let rotation = motion.rotation.to_rotation_matrix();
         let mut sums = Sums::default();
-        for surfel in surfels {
+        let mut group = Vector6::zeros();
+        for (index, surfel) in surfels.iter().enumerate() {
+            if index % GROUP == 0 {
+                sums.scatter += group * group.transpose();
+                group.fill(0.0);
+            }
             let moved = motion * double(surfel.point);
             let single = moved.map(|c| c as f32).into();
             let Some(nearest) = self.target.nearest(single, within_m) else {
@@ -193,10 +247,15 @@ impl<'a> Fit<'a> {
                 .copy_from(&(turning.transpose() * across));
             let [x, y, z] = pull.into();
             let [a, b, c] = (turning.transpose() * pull).into();
+            let gradient = Vector6::new(x, y, z, a, b, c) * weight;
+            let variance = f64::from(surfel.flat.variance + nearest.flat.variance);
             sums.normal += block * weight;
-            sums.gradient += Vector6::new(x, y, z, a, b, c) * weight;
+            sums.noise += block * (weight * weight * variance);
+            sums.gradient += gradient;
+            group += gradient;
             sums.held += information.trace() * weight;
         }
+        sums.scatter += group * group.transpose();
         sums
     }
 }
@@ -206,12 +265,19 @@ impl Default for Sums {
         Self {
             normal: Matrix6::zeros(),
             gradient: Vector6::zeros(),
+            scatter: Matrix6::zeros(),
+            noise: Matrix6::zeros(),
             held: 0.0,
         }
     }
 }
 
 impl Sums {
+    /// The eigenvalue of the normal equations up to which a direction is undetermined.
+    pub(super) fn undetermined(&self) -> f64 {
+        FREE * self.held.max(1.0)
+    }
+
     /// The step that minimizes the weighted, linearized squared distances, metres (rotations in
     /// metres at the points' spread). Components along undetermined directions are left out.
     fn update(&self) -> Vector6<f64> {
@@ -221,7 +287,7 @@ impl Sums {
         } = self.normal.symmetric_eigen();
         let mut update = Vector6::zeros();
         for (axis, &eigenvalue) in eigenvectors.column_iter().zip(&eigenvalues) {
-            if eigenvalue > FREE * self.held.max(1.0) {
+            if eigenvalue > self.undetermined() {
                 update -= axis * (axis.dot(&self.gradient) / eigenvalue);
             }
         }

@@ -3,19 +3,21 @@
 //!
 //! ```text
 //! two clouds - voxel downsampling - coarse surfels: fits from up to nine initial guesses
-//!   - fine surfels: refinement - motion
+//!   - fine surfels: refinement, weighed against how vehicles move - motion and covariance
 //! ```
 //!
 //! The distances are plane to plane with robust weights, and the search starts from a prior. The
-//! clouds must include the ground, which alone determines pitch, roll and height.
+//! clouds should include the ground. Without it little else determines pitch, roll and height.
 
 mod align;
 mod coarse;
 mod gicp;
 mod overlap;
+mod posterior;
 mod surfels;
 #[cfg(test)]
 mod tests;
 
+pub use align::Registration;
 pub(crate) use align::{SurfelCloud, align};
 pub(crate) use overlap::overlap;

@@ -24,6 +24,7 @@ fn aligned(
         prior,
         control,
     )
+    .motion
 }
 
 fn found(source: &[Point], target: &[Point]) -> RigidTransform {
@@ -100,6 +101,50 @@ fn drives_and_turns_of_streets_with_movers_are_found_from_rest() {
 }
 
 #[test]
+fn the_truth_lies_within_two_deviations_and_they_grow_without_ground() {
+    let [mut within, mut all] = [0; 2];
+    for seed in 20..26 {
+        let options = StreetOptions {
+            seed,
+            suspension: true,
+            ..StreetOptions::default()
+        };
+        let pair = Street::new(&options).unwrap().pair(0).unwrap();
+        let off = |points: &[Point], ground: &[bool]| -> Vec<Point> {
+            let rows = points.iter().zip(ground).filter(|(_, ground)| !**ground);
+            rows.map(|(&point, _)| point).collect()
+        };
+        let without = [
+            off(&pair.source, &pair.ground_source),
+            off(&pair.target, &pair.ground_target),
+        ];
+        let clouds = [[pair.source, pair.target], without];
+        let deviations = clouds.map(|[source, target]| {
+            let [source, target] = [source, target].map(|points| SurfelCloud::new(&points));
+            let rest = RigidTransform::identity();
+            let found = align(&source, &target, &rest, &Uncontrolled);
+            let covariance = found.covariance.expect("a covariance");
+            assert_eq!(covariance, covariance.transpose());
+            let shift =
+                found.motion.translation.vector - pair.target_from_source.translation.vector;
+            let turn =
+                (found.motion.rotation * pair.target_from_source.rotation.inverse()).scaled_axis();
+            for (a, error) in shift.iter().chain(turn.iter()).enumerate() {
+                within += usize::from(error.abs() < 2.0 * covariance[(a, a)].sqrt());
+                all += 1;
+            }
+            [2, 3, 4].map(|a| covariance[(a, a)].sqrt())
+        });
+        let [with, without] = deviations;
+        assert!(
+            without[0] > 3.0 * with[0] && without[1] > 3.0 * with[1],
+            "{deviations:?}"
+        );
+    }
+    assert!(10 * within >= 9 * all, "{within} of {all}");
+}
+
+#[test]
 fn five_metres_and_eight_degrees_are_found_from_rest_and_more_from_a_prior() {
     let pair = street(1, None, None);
     for truth in [
@@ -148,8 +193,12 @@ fn what_a_scene_leaves_free_stays_as_in_the_prior() {
     let (source, target) = (tunnel(0.0), tunnel(0.4));
     for along in [0.0, 1.3] {
         let prior = yaw([along, 0.0, 0.0], 0.0);
-        let found = aligned(&source, &target, &prior, &Uncontrolled);
-        assert_near(&found, &yaw([along, -0.4, 0.0], 0.0), "a tunnel");
+        let [source, target] = [&source, &target].map(|points| SurfelCloud::new(points));
+        let found = align(&source, &target, &prior, &Uncontrolled);
+        assert_near(&found.motion, &yaw([along, -0.4, 0.0], 0.0), "a tunnel");
+        let covariance = found.covariance.expect("a covariance");
+        let deviation = |a: usize| covariance[(a, a)].sqrt();
+        assert!(deviation(0) > 1.0 && deviation(1) < 0.01, "{covariance}");
     }
     let [x, y, z] = axes;
     let mut plain = |z_m: f64| {

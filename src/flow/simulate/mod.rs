@@ -10,6 +10,7 @@ mod options;
 mod scene;
 mod shapes;
 mod street;
+mod suspension;
 mod terrain;
 mod view;
 mod world;

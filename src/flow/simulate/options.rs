@@ -44,6 +44,9 @@ pub struct StreetOptions {
     /// Whether the columns of a sweep are measured one after the other over the sweep interval, as
     /// a spinning lidar does. Otherwise a sweep is taken at one instant.
     pub rolling: bool,
+    /// Whether the body of the ego vehicle pitches, rolls and heaves on its springs. Otherwise it
+    /// follows its four wheels on the road.
+    pub suspension: bool,
 }
 
 impl Default for StreetOptions {
@@ -60,6 +63,7 @@ impl Default for StreetOptions {
             beam_bias_m: 0.01,
             dropout: 1.0,
             rolling: false,
+            suspension: false,
         }
     }
 }

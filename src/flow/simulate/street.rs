@@ -15,6 +15,7 @@ use super::lidar::{Lidar, View};
 use super::objects::{Kind, LANE_M, Object, traffic};
 use super::options::{SWEEP_SECONDS, StreetError, StreetOptions};
 use super::scene::Target;
+use super::suspension::Suspension;
 use super::terrain::Terrain;
 use super::view;
 use super::world::World;
@@ -26,6 +27,8 @@ use crate::flow::tracks::{Track, TrackState};
 const SENSOR_HEIGHT_M: f64 = 1.73;
 /// Wheelbase and track of the ego vehicle, metres.
 const EGO_STAND_M: [f64; 2] = [2.7, 1.6];
+/// Distinguishes the random numbers of the vehicle's springs from those of the street.
+const SPRINGS: u64 = 0x5350_5249_4e47_5321;
 /// Instants of a rolling sweep.
 const INSTANTS: usize = 125;
 /// Minimum residual displacement of a dynamic point, metres per sweep interval.
@@ -41,6 +44,8 @@ pub struct Street {
     sweeps: usize,
     speed: f64,
     rolling: bool,
+    /// Springs of the ego vehicle.
+    suspension: Option<Suspension>,
     terrain: Terrain,
     world: World,
     /// Moving objects.
@@ -114,10 +119,13 @@ impl Street {
 
         let terrain = Terrain::new(curvature, &mut random);
         let travel = speed * SWEEP_SECONDS * options.sweeps as f64;
+        // Random numbers of its own: a street is the same with and without it.
+        let springs = || Suspension::new(&mut Random::new(options.seed ^ SPRINGS));
         Ok(Self {
             sweeps: options.sweeps,
             speed,
             rolling: options.rolling,
+            suspension: options.suspension.then(springs),
             world: World::new(&terrain, travel, &mut random),
             movers: traffic(options.movers, speed, &terrain, &mut random),
             lidar: Lidar::new(options, &mut random),
@@ -360,7 +368,12 @@ impl Street {
         let world_from_ego = self
             .terrain
             .seat(position, self.terrain.heading(x), EGO_STAND_M);
-        world_from_ego * Translation3::new(0.0, 0.0, SENSOR_HEIGHT_M)
+        let ego_from_body = self
+            .suspension
+            .as_ref()
+            .map(|springs| springs.body(seconds(at)));
+        let world_from_body = world_from_ego * ego_from_body.unwrap_or_default();
+        world_from_body * Translation3::new(0.0, 0.0, SENSOR_HEIGHT_M)
     }
 
     fn object(&self, object: i32) -> Option<&Object> {

@@ -10,6 +10,9 @@ const NEIGHBORS: f64 = 4.0;
 /// share of the variance along the first axis. Less flat neighborhoods are branches and wires. With
 /// a higher threshold, walls hit by a single ring are lost.
 const FLAT: f64 = 0.05;
+/// What is added to the thickness of a plane of [`NEIGHBORS`] points. It falls with the fifth power of
+/// their number: four points of one ring around a corner lie on a plane that is no surface.
+const UNCERTAIN: f32 = 1.2;
 /// Variances below this count as zero, square metres.
 const NO_SPREAD: f64 = 1e-12;
 
@@ -18,8 +21,11 @@ const NO_SPREAD: f64 = 1e-12;
 pub(crate) struct PlaneFit {
     /// Unit normal of either sign.
     pub(crate) normal: [f32; 3],
-    /// Variance along the normal over the variance along the second axis: 0 for a plane.
+    /// Variance along the normal over the variance along the second axis, and an addition for planes
+    /// of few points: 0 for a plane of many.
     pub(crate) thickness: f32,
+    /// Variance along the normal, square metres.
+    pub(crate) variance: f32,
 }
 
 /// Sums over the points around a center point, for their mean and covariance.
@@ -57,7 +63,10 @@ impl Neighborhood {
             return None;
         }
         let mean = self.sum / self.count;
-        flat(&(self.squares / self.count - mean * mean.transpose()))
+        let mean_square = self.squares / self.count;
+        let mut plane = flat(&(mean_square - mean * mean.transpose()))?;
+        plane.thickness += UNCERTAIN * (NEIGHBORS / self.count).powi(5) as f32;
+        Some(plane)
     }
 }
 
@@ -90,5 +99,6 @@ fn flat(spread: &Matrix3<f64>) -> Option<PlaneFit> {
     Some(PlaneFit {
         normal: [normal.x as f32, normal.y as f32, normal.z as f32],
         thickness: (least / middle).max(0.0) as f32,
+        variance: least.max(0.0) as f32,
     })
 }
