@@ -29,10 +29,11 @@ mod registration;
 mod sequences;
 mod tracks;
 mod traffic;
+mod walkers;
 
 use std::process::ExitCode;
 
-const EXPERIMENTS: &str = "confidence densify deskew depth field ground neighbors objects overlap registration sequences tracks traffic";
+const EXPERIMENTS: &str = "confidence densify deskew depth field ground neighbors objects overlap registration sequences tracks traffic walkers";
 
 fn main() -> ExitCode {
     // Cargo adds `--bench`.
@@ -67,6 +68,7 @@ fn run(experiment: &str, arguments: Vec<String>) -> anyhow::Result<()> {
         "sequences" => sequences::run(arguments),
         "tracks" => tracks::run(&arguments),
         "traffic" => traffic::run(&arguments),
+        "walkers" => walkers::run(&arguments),
         other => anyhow::bail!("there is no such experiment; there are {EXPERIMENTS} ({other})"),
     }
 }

@@ -5,7 +5,7 @@
 //! by a motion. A surface present in one sweep only fits best to an unrelated surface.
 
 use super::free_space::FreeSpaceEvidence;
-use super::hypothesis::{Hypothesis, NeighborEvidence};
+use super::hypothesis::Hypothesis;
 use crate::flow::data::Point;
 use crate::flow::options::ObjectOptions;
 
@@ -18,16 +18,21 @@ pub(super) fn is_needed(
     options: &ObjectOptions,
 ) -> bool {
     let neighbors = &found.neighbors;
-    let sweeps = 1.0 + neighbors.weight;
-    let still = (found.still.sum_m() + neighbors.still_m) / sweeps;
-    let moved = (found.cost.sum_m() + neighbors.moved_m) / sweeps;
+    let is_confirmed = neighbors.confirms(options);
+    // An object that the target hides may be seen in the neighbor sweeps.
+    let least_m = found.cost.forward_m.min(found.still.forward_m);
+    let is_hidden = is_confirmed && least_m > options.max_residual_m;
+    let target = if is_hidden { 0.0 } else { 1.0 };
+    let sweeps = target + neighbors.weight;
+    let still = (target * found.still.sum_m() + neighbors.still_m) / sweeps;
+    let moved = (target * found.cost.sum_m() + neighbors.moved_m) / sweeps;
     let gain = (still - moved) * sweeps;
     found.motion.length_m() >= options.min_motion_m
-        && found.still.forward_m - found.cost.forward_m >= options.min_gain_m
+        && (is_confirmed || found.still.forward_m - found.cost.forward_m >= options.min_gain_m)
         && moved <= options.max_cost_ratio * still
         && gain * points.len() as f32
             >= options.min_evidence_m + options.min_evidence_slope * found.motion.length_m()
-        && found.cost.forward_m <= options.max_residual_m
+        && (is_hidden || found.cost.forward_m <= options.max_residual_m)
         && !is_flat(points, options)
         && {
             let seen = seen();
@@ -36,23 +41,8 @@ pub(super) fn is_needed(
                 && (found.observability >= options.min_observability
                     || has_gone(seen, options)
                     || !is_static
-                        && (found.normal_motion_m >= options.min_normal_motion_m
-                            || is_confirmed(neighbors, options)))
+                        && (found.normal_motion_m >= options.min_normal_motion_m || is_confirmed))
         }
-}
-
-/// Whether the neighbor sweeps clearly confirm a motion, even one of low observability. A wall that
-/// seems to slide lies at its old position in all of them, whereas a bus has driven on. The nearest
-/// sweep must confirm the motion by itself, since by the time of a farther one the sliding wall may
-/// coincide with a surface behind it.
-fn is_confirmed(neighbors: &NeighborEvidence, options: &ObjectOptions) -> bool {
-    let is_plain = |[still_m, moved_m]: [f32; 2], weight: f32| {
-        moved_m <= options.neighbor_cost_ratio * still_m
-            && still_m - moved_m >= options.neighbor_gain_m * weight
-    };
-    neighbors.weight > 0.0
-        && is_plain(neighbors.nearest_m, 1.0)
-        && is_plain([neighbors.still_m, neighbors.moved_m], neighbors.weight)
 }
 
 /// Whether the free-space evidence confirms both that a cluster left its old position and that it
@@ -200,6 +190,7 @@ mod tests {
             still_m: still_m * 1.5,
             moved_m: moved_m * 1.5,
             nearest_m: [still_m, moved_m],
+            ..NeighborEvidence::default()
         };
         let slides = |neighbors| {
             needed(|found| {
@@ -229,6 +220,61 @@ mod tests {
         // A motion of sufficient observability is rejected where the neighbor sweeps show a static
         // cluster.
         assert!(!needed(|found| found.neighbors = neighbors(0.05, 0.5)));
+    }
+
+    /// Neighbor evidence of a slow object: little in the nearest sweep, more in farther ones.
+    fn slow(still_m: f32, moved_m: f32) -> NeighborEvidence {
+        NeighborEvidence {
+            weight: 1.5,
+            still_m: 0.15,
+            moved_m: 0.06,
+            nearest_m: [0.06, 0.04],
+            forward_m: [still_m, moved_m],
+            agree: true,
+        }
+    }
+
+    #[test]
+    fn a_slow_object_moves_though_it_gains_little_in_the_target() {
+        let walks = |neighbors| {
+            needed(|found| {
+                found.motion = PlanarMotion::still([0.0; 2]).shifted([0.12, 0.0]);
+                found.still.forward_m = 0.03;
+                found.still.backward_m = 0.04;
+                found.cost.forward_m = 0.02;
+                found.cost.backward_m = 0.02;
+                found.neighbors = neighbors;
+            })
+        };
+        assert!(walks(slow(0.07, 0.02)));
+        assert!(!walks(slow(0.07, 0.05)));
+        assert!(!walks(slow(0.03, 0.01)));
+        assert!(!walks(NeighborEvidence {
+            agree: false,
+            ..slow(0.07, 0.02)
+        }));
+    }
+
+    #[test]
+    fn an_object_that_the_target_hides_moves_if_the_neighbor_sweeps_show_it() {
+        let hidden = |neighbors| {
+            needed(|found| {
+                found.still.forward_m = 0.25;
+                found.cost.forward_m = 0.22;
+                found.cost.backward_m = 0.25;
+                found.neighbors = neighbors;
+            })
+        };
+        let seen = NeighborEvidence {
+            still_m: 0.4,
+            moved_m: 0.1,
+            ..slow(0.18, 0.05)
+        };
+        assert!(hidden(seen));
+        assert!(!hidden(NeighborEvidence {
+            agree: false,
+            ..seen
+        }));
     }
 
     #[test]

@@ -11,6 +11,7 @@ use super::neighbor_view::NeighborView;
 use super::planar_motion::PlanarMotion;
 use super::scene::Scene;
 use crate::flow::data::{Point, square_distance, stride_sample};
+use crate::flow::options::ObjectOptions;
 
 /// Points of a cluster that vote, that are fitted from an initial guess, and that costs are
 /// computed from.
@@ -74,6 +75,34 @@ pub(super) struct NeighborEvidence {
     pub(super) moved_m: f32,
     /// Costs in the sweep nearest in time, metres: standing still, and moved.
     pub(super) nearest_m: [f32; 2],
+    /// Mean forward costs in these sweeps, each with the same weight, metres: standing still, and
+    /// moved. A slow object is far from where it stood in the farthest of them.
+    pub(super) forward_m: [f32; 2],
+    /// Whether the motion costs less than standing still in each of them.
+    pub(super) agree: bool,
+}
+
+impl NeighborEvidence {
+    /// Whether the neighbor sweeps clearly confirm a motion, even one of low observability or one
+    /// that is too short to gain anything in the target. A wall that seems to slide lies at its old
+    /// position in all of them, whereas a bus has driven on.
+    ///
+    /// Either the nearest sweep confirms it by itself, since by the time of a farther one a sliding
+    /// wall may coincide with a surface behind it, or no sweep contradicts it and together they do,
+    /// each with the same weight: a slow object.
+    pub(super) fn confirms(&self, options: &ObjectOptions) -> bool {
+        let is_plain = |[still_m, moved_m]: [f32; 2], weight: f32| {
+            moved_m <= options.neighbor_cost_ratio * still_m
+                && still_m - moved_m >= options.neighbor_gain_m * weight
+        };
+        let [still_m, moved_m] = self.forward_m;
+        let is_slow = moved_m <= options.slow_cost_ratio * still_m
+            && still_m - moved_m >= options.slow_gain_m;
+        self.weight > 0.0
+            && (is_plain(self.nearest_m, 1.0)
+                && is_plain([self.still_m, self.moved_m], self.weight)
+                || self.agree && is_slow)
+    }
 }
 
 /// The best of the motions considered so far.
@@ -162,18 +191,21 @@ impl<'a> ClusterSearch<'a> {
             }
         }
         let standing = PlanarMotion::still(center);
-        if still.forward_m < options.static_fit_m {
+        if still.forward_m < options.static_fit_m && !self.left_slowly(&standing) {
             return None;
         }
         let few = stride_sample(members, MAX_FIT_POINTS);
         let way_m = |motion: &PlanarMotion| options.displacement_penalty * motion.length_m();
         let mut best = BestHypothesis::none();
-        let mut fit_from = |start: &PlanarMotion| {
-            let motion = self.fitted(&[], &few, start, false, STEPS[0]);
+        let mut fit_from = |start: &PlanarMotion, neighbors: &[NeighborView<'_>]| {
+            let motion = self.fitted(neighbors, &few, start, false, STEPS[0]);
             best.consider(self, motion, way_m(&motion));
             best.cost.forward_m
         };
-        if fit_from(&standing) >= options.close_fit_m {
+        if !self.neighbors.is_empty() {
+            fit_from(&standing, self.neighbors);
+        }
+        if fit_from(&standing, &[]) >= options.close_fit_m {
             let position = |row: u32| self.scene.source.points[row as usize];
             let voters: Vec<Point> = stride_sample(members, VOTERS)
                 .into_iter()
@@ -192,12 +224,13 @@ impl<'a> ClusterSearch<'a> {
                 }
             }
             for (_, start) in &promising {
-                fit_from(start);
+                fit_from(start, &[]);
             }
         }
         let turned = members.len() >= TURNED;
         let gains = |cost: Cost| still.forward_m - cost.forward_m >= options.min_gain_m;
-        let shifted = gains(best.cost);
+        let confirmed = |motion| self.witnesses(motion).confirms(options);
+        let shifted = gains(best.cost) || confirmed(&best.motion);
         if !(shifted || turned) {
             return None;
         }
@@ -216,6 +249,22 @@ impl<'a> ClusterSearch<'a> {
             normal_motion_m,
             neighbors: self.witnesses(&motion),
         })
+    }
+
+    /// Whether the cluster is away from where it stands both in a sweep before the pair and in one
+    /// after it, although it hardly is in the target: a slow object. A surface that is hidden in
+    /// some sweeps is away on one side alone.
+    fn left_slowly(&self, standing: &PlanarMotion) -> bool {
+        let left_m = self.scene.options.slow_gain_m;
+        let is_away = |moment: &&NeighborView<'_>| {
+            let sum = |sum, &row| sum + self.distance(&moment.scene, row, standing);
+            self.rows.iter().fold(0.0, sum) >= left_m * self.rows.len() as f32
+        };
+        let side = |before: bool| {
+            let mut side = self.neighbors.iter().filter(|m| (m.at < 0) == before);
+            side.any(|moment| is_away(&moment))
+        };
+        side(true) && side(false)
     }
 
     /// Direct search: the motion of least cost within a few small shifts of `start`.
@@ -268,7 +317,11 @@ impl<'a> ClusterSearch<'a> {
 
     /// Costs of a motion in the neighbor sweeps that show the cluster, moved or not.
     fn witnesses(&self, motion: &PlanarMotion) -> NeighborEvidence {
-        let mut all = NeighborEvidence::default();
+        let mut all = NeighborEvidence {
+            agree: true,
+            ..NeighborEvidence::default()
+        };
+        let mut shown = 0.0;
         let still = PlanarMotion::still(motion.center);
         for (number, moment) in self.neighbors.iter().enumerate() {
             let [moved, still] =
@@ -281,8 +334,13 @@ impl<'a> ClusterSearch<'a> {
                 all.weight += moment.weight;
                 all.moved_m += moment.weight * moved.sum_m();
                 all.still_m += moment.weight * still.sum_m();
+                all.agree &= moved.sum_m() <= still.sum_m();
+                shown += 1.0;
+                all.forward_m[0] += still.forward_m;
+                all.forward_m[1] += moved.forward_m;
             }
         }
+        all.forward_m = all.forward_m.map(|sum| sum / f32::max(shown, 1.0));
         all
     }
 

@@ -130,6 +130,14 @@ pub struct ObjectOptions {
     /// distance from the cluster to the sweep plus that back. The decrease must reach it in the
     /// nearest sweep, and in the weighted mean of all neighbor sweeps. Larger values are stricter.
     pub neighbor_gain_m: f32,
+    /// Neighbor evidence of a slow object, which also replaces `min_gain_m` and, where the target
+    /// does not show the object, `max_residual_m`: maximum ratio of the mean distance of the cluster
+    /// from the neighbor sweeps with the motion to that without it. Each sweep has the same weight,
+    /// and none may contradict the motion. Smaller values are stricter.
+    pub slow_cost_ratio: f32,
+    /// Neighbor evidence of a slow object: minimum decrease of that distance by the motion, metres.
+    /// Larger values are stricter.
+    pub slow_gain_m: f32,
 }
 
 impl Default for ObjectOptions {
@@ -167,6 +175,8 @@ impl Default for ObjectOptions {
             sweeps: 2,
             neighbor_cost_ratio: 0.7,
             neighbor_gain_m: 0.05,
+            slow_cost_ratio: 0.5,
+            slow_gain_m: 0.03,
         }
     }
 }
