@@ -9,12 +9,12 @@
 //! matches do not determine.
 
 use nalgebra::{
-    Isometry3, Matrix3, Matrix6, Point3, SymmetricEigen, Translation3, UnitQuaternion, Vector3,
-    Vector6,
+    Isometry3, Matrix3, Matrix6, Point3, Translation3, UnitQuaternion, Vector3, Vector6,
 };
 use rayon::prelude::*;
 
 use super::posterior::{Evidence, Posterior, Prior};
+use super::sums::Sums;
 use super::surfels::{AllSurfels, Surfel};
 use crate::flow::data::{Control, Point, RigidTransform};
 use crate::flow::spatial::PlaneFit;
@@ -33,10 +33,6 @@ const THIN: f64 = 1e-3;
 const THICKNESS: f64 = 0.1;
 /// A step shorter than this is the last, metres at the points' spread.
 const SHORT_STEP_M: f64 = 2e-4;
-/// A direction is undetermined where its eigenvalue is below this share of the information about
-/// all translations together, or of that of one match of two planes. Two normals are uncertain by
-/// 1.4 degrees together. On some streets the weakest direction has 1%.
-const FREE: f64 = 3e-4;
 /// Bound on the z component of the normal of an upright surfel: steeper than 45 degrees.
 const UPRIGHT: f32 = 0.7;
 /// Least spread of the points that rotations are scaled by, metres.
@@ -74,20 +70,6 @@ pub(super) struct Fit<'a> {
     /// its points from the centroid scales rotations to metres.
     center: Point3<f64>,
     spread_m: f64,
-}
-
-/// Sums over the matches: the normal equations, and what tells how certain they are.
-pub(super) struct Sums {
-    /// Second derivatives and gradient of half the weighted squared distances by a step of the
-    /// motion, with rotations in metres at the spread of the points.
-    pub(super) normal: Matrix6<f64>,
-    pub(super) gradient: Vector6<f64>,
-    /// Squares of the gradients of groups of neighboring matches.
-    pub(super) scatter: Matrix6<f64>,
-    /// The same where each match is off by the deviation of its surfels' points.
-    pub(super) noise: Matrix6<f64>,
-    /// Weighted information about translations, summed over all directions.
-    pub(super) held: f64,
 }
 
 impl<'a> Fit<'a> {
@@ -190,15 +172,7 @@ impl<'a> Fit<'a> {
         let sums: Vec<Sums> = chunks
             .map(|surfels| self.sums_of(surfels, motion, within_m, scale_m))
             .collect();
-        let mut all = Sums::default();
-        for sums in sums {
-            all.normal += sums.normal;
-            all.gradient += sums.gradient;
-            all.scatter += sums.scatter;
-            all.noise += sums.noise;
-            all.held += sums.held;
-        }
-        all
+        Sums::total(&sums)
     }
 
     fn sums_of(
@@ -257,41 +231,6 @@ impl<'a> Fit<'a> {
         }
         sums.scatter += group * group.transpose();
         sums
-    }
-}
-
-impl Default for Sums {
-    fn default() -> Self {
-        Self {
-            normal: Matrix6::zeros(),
-            gradient: Vector6::zeros(),
-            scatter: Matrix6::zeros(),
-            noise: Matrix6::zeros(),
-            held: 0.0,
-        }
-    }
-}
-
-impl Sums {
-    /// The eigenvalue of the normal equations up to which a direction is undetermined.
-    pub(super) fn undetermined(&self) -> f64 {
-        FREE * self.held.max(1.0)
-    }
-
-    /// The step that minimizes the weighted, linearized squared distances, metres (rotations in
-    /// metres at the points' spread). Components along undetermined directions are left out.
-    fn update(&self) -> Vector6<f64> {
-        let SymmetricEigen {
-            eigenvalues,
-            eigenvectors,
-        } = self.normal.symmetric_eigen();
-        let mut update = Vector6::zeros();
-        for (axis, &eigenvalue) in eigenvectors.column_iter().zip(&eigenvalues) {
-            if eigenvalue > self.undetermined() {
-                update -= axis * (axis.dot(&self.gradient) / eigenvalue);
-            }
-        }
-        update
     }
 }
 

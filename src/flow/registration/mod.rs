@@ -14,6 +14,7 @@ mod coarse;
 mod gicp;
 mod overlap;
 mod posterior;
+mod sums;
 mod surfels;
 #[cfg(test)]
 mod tests;

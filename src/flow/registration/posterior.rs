@@ -7,7 +7,7 @@
 
 use nalgebra::{Matrix3, Matrix6, SymmetricEigen, Vector3, Vector6};
 
-use super::gicp::Sums;
+use super::sums::Sums;
 use crate::flow::data::RigidTransform;
 
 /// Share of the variance of the points of a surfel, along its normal, that one match is off by.
