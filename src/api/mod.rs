@@ -22,6 +22,7 @@ mod results;
 mod routes;
 mod service;
 mod service_parts;
+mod sweep_order;
 #[cfg(test)]
 mod tests;
 mod trace_context;

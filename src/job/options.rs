@@ -72,7 +72,8 @@ pub struct JobOptions {
     #[serde(skip_serializing_if = "is_default")]
     pub field: FieldChoices,
     /// Also estimates pairs that are otherwise refused as nonsense: sweeps that do not show one scene,
-    /// and coordinates that are not metres. Without overlap the confidence is 0.
+    /// coordinates that are not metres, and sweeps out of the order of the numbers in their names.
+    /// Without overlap the confidence is 0.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub force: bool,
     /// Deadline, milliseconds after the arrival of the request, from 1 to 86,400,000 (one day). The

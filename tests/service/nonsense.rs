@@ -1,11 +1,14 @@
-//! Tests of input that is no pair: sweeps of two scenes, and coordinates that are not metres.
+//! Tests of input that makes no sense: sweeps of two scenes, coordinates that are not metres, and
+//! sweeps that are out of order.
 
 use fnsf::flow::Point;
 use fnsf::flow::simulate::{Street, StreetOptions};
+use fnsf::formats::CloudFormat;
+use reqwest::multipart::{Form, Part};
 use reqwest::{Response, StatusCode};
 use serde_json::Value;
 
-use crate::clouds::{form, small_pair};
+use crate::clouds::{file, form, small_pair};
 use crate::server::Server;
 
 /// A sweep of another street than that of [`small_pair`].
@@ -59,4 +62,33 @@ async fn coordinates_in_millimetres_are_refused_before_they_are_queued() {
     let problem: Value = refused.json().await.expect("a problem");
     assert!(problem.to_string().contains("millimetres"), "{problem}");
     assert_eq!(server.metric("fnsf_jobs_submitted_total"), 0.0);
+}
+
+#[tokio::test]
+async fn sweeps_whose_numbers_turn_back_are_refused_in_words_and_forced_ones_are_not() {
+    let server = Server::start(&[]);
+    let submit = async |options: &str| {
+        let form = Form::new().text("options", options.to_owned());
+        let sweep = |form: Form, number: u32| {
+            let bytes = file(CloudFormat::Npy, &small_pair()[0]);
+            form.part(
+                "sweep",
+                Part::bytes(bytes).file_name(format!("drive_{number}.npy")),
+            )
+        };
+        let form = [1, 10, 2].into_iter().fold(form, sweep);
+        let request = reqwest::Client::new().post(server.url("/v1/sequences"));
+        request.multipart(form).send().await.expect("an answer")
+    };
+    let refused = submit("{}").await;
+    assert_eq!(refused.status(), StatusCode::UNPROCESSABLE_ENTITY);
+    let problem = refused.text().await.expect("a problem");
+    assert!(
+        problem.contains("drive_10.npy") && problem.contains("force"),
+        "{problem}"
+    );
+    assert_eq!(
+        submit(r#"{"force":true}"#).await.status(),
+        StatusCode::ACCEPTED
+    );
 }

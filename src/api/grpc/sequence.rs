@@ -18,6 +18,7 @@ use crate::api::admission::Durability;
 use crate::api::error::ApiError;
 use crate::api::pending_job::{Accepted, ChainLink, PendingJob};
 use crate::api::service::{Service, Waited};
+use crate::api::sweep_order::SweepOrder;
 use crate::api::upload_budget::UploadReservation;
 use crate::flow::{is_window_final, window};
 use crate::formats::SweepTime;
@@ -102,6 +103,7 @@ pub(super) fn run(
             index: 0,
             count: 0,
             held: VecDeque::new(),
+            order: SweepOrder::default(),
             before: None,
             options: JobOptions::default(),
         };
@@ -126,6 +128,7 @@ struct Reader {
     /// contain.
     count: usize,
     held: VecDeque<Sweep>,
+    order: SweepOrder,
     /// The job of the pair before. With a warm start the next pair starts from its field.
     before: Option<JobId>,
     options: JobOptions,
@@ -197,6 +200,7 @@ impl Reader {
 
     /// Adds a complete sweep, and submits the pairs whose windows are final.
     async fn take(&mut self, coming: Coming, room: UploadReservation) -> Result<(), ApiError> {
+        self.order.push(&coming.name, self.options.force)?;
         self.held.push_back(coming.finish(room)?);
         self.count += 1;
         let sweeps = self.options.sweeps();

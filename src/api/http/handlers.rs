@@ -22,6 +22,7 @@ use crate::api::codec::AnswerFormat;
 use crate::api::error::ApiError;
 use crate::api::pending_job::{Accepted, PendingJob, ReceivedAt, Request as JobRequest};
 use crate::api::service::{MakeDurable, Service, Waited};
+use crate::api::sweep_order::SweepOrder;
 use crate::formats::PoseFile;
 use crate::job::{Job, JobId, JobOptions, Kind, State as JobState};
 use crate::queue::PairOf;
@@ -278,6 +279,7 @@ async fn read_job(
     let mut options = JobOptions::default();
     let mut sweeps: Option<PendingJob> = None;
     let mut poses: Option<Arc<PoseFile>> = None;
+    let mut order = SweepOrder::default();
     while let Some(part) = body.next().await? {
         match part {
             Part::Options(_) | Part::Poses(_) if sweeps.is_some() => {
@@ -287,6 +289,7 @@ async fn read_job(
             Part::Options(read) => options = read,
             Part::Poses(read) => poses = Some(Arc::new(read)),
             Part::File(part, name, bytes) if part == "sweep" && files.is_empty() => {
+                order.push(name.as_deref().unwrap_or_default(), options.force)?;
                 let pending = match &mut sweeps {
                     Some(pending) => pending,
                     none => {

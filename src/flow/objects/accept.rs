@@ -75,7 +75,7 @@ fn is_flat(points: &[Point], options: &ObjectOptions) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::flow::objects::hypothesis::Cost;
+    use crate::flow::objects::hypothesis::{Cost, NeighborEvidence};
     use crate::flow::objects::planar_motion::PlanarMotion;
 
     /// A hypothesis that passes every condition.
