@@ -142,6 +142,12 @@ pub(super) fn print_report(report: &Report) -> Result<(), Failure> {
         say(format_args!(
             "  preset {preset}: {clusters} clusters, {moving} move ({reason}){cost}"
         ))?;
+        if objects.own_points > 0 {
+            say(format_args!(
+                "  {} points of the vehicle itself have no flow",
+                grouped(objects.own_points)
+            ))?;
+        }
     }
     if let Some(field) = &report.field {
         let unit = &field.loss_unit;

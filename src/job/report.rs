@@ -96,6 +96,10 @@ pub struct ObjectsReport {
     /// motion, metres, averaged over the searched clusters. 0 if there was no cluster to search.
     /// None if a deadline ended the search at its start.
     pub cost_m: Option<f64>,
+    /// Number of points on the vehicle that carries the sensor: near to it and at rest relative to it.
+    /// They have no flow.
+    #[serde(default)]
+    pub own_points: usize,
 }
 
 /// The result of the fit of a field.
@@ -159,6 +163,7 @@ impl Report {
                     searched: solution.searched,
                     moving: clusters.iter().filter(|cluster| cluster.dynamic).count(),
                     cost_m: finite(solution.cost_m),
+                    own_points: solution.own_points,
                 });
             }
             Solution::Field(solution) => {

@@ -12,7 +12,8 @@ use super::scenes::{estimated, real_pair, score, street};
 fn movers_are_found_and_the_static_world_stands_still_on_real_pairs() {
     // EPE in metres: of all points, and of the moving points.
     for (name, epe_m, moving_m) in [
-        ("av2_7fab", 0.0155, 0.18),
+        // Half of the moving points of av2_7fab are one car that is found at 0.6 to 0.8 of its motion.
+        ("av2_7fab", 0.0155, 0.2),
         ("kitti_0000", 0.018, 0.057),
         ("small_gicp", 0.028, 0.0),
     ] {
@@ -39,6 +40,67 @@ fn movers_of_a_street_are_found_and_its_houses_kept_still_unlike_by_the_publishe
     assert!(moving <= published / 2.0, "{moving} against {published}");
     let [still, published] = [label, paper].map(|m| m.epe_static.expect("something stands"));
     assert!(still <= published / 3.0, "{still} against {published}");
+}
+
+#[test]
+fn the_vehicle_itself_has_no_flow_and_no_cluster() {
+    let mut pair = street(&StreetOptions {
+        azimuth_steps: 1000,
+        speed_mps: Some(8.0),
+        ..StreetOptions::default()
+    });
+    // A roof rack and a hood, 1 m around the sensor, measured 3 mm off in each sweep.
+    let first = pair.source.len();
+    let part = |index: usize| {
+        let along = (index % 40) as f32 * 0.05;
+        let across = (index / 40) as f32 * 0.06;
+        [along - 1.0, across - 0.6, -0.6 + 0.2 * along]
+    };
+    let noise = |index: usize, sweep: usize| ((index * 7 + sweep * 3) % 5) as f32 * 0.0015;
+    for (sweep, points) in [&mut pair.source, &mut pair.target].into_iter().enumerate() {
+        let measured = |index| part(index).map(|c| c + noise(index, sweep));
+        points.extend((0..800).map(measured));
+    }
+    let problem = Problem::pair(&pair.source, &pair.target);
+    let backend = fnsf::flow::cpu::CpuBackend::new(None).expect("threads");
+    let options = Preset::Default.options(None);
+    let estimate = estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
+    let found = search(&estimate);
+    assert!(found.own_points >= 700, "{}", found.own_points);
+    let left = |row: usize| !estimate.valid[row] && estimate.flow[row] == [0.0; 3];
+    let own = (first..pair.source.len()).filter(|&row| left(row)).count();
+    assert_eq!(own, found.own_points);
+    assert_eq!(estimate.valid.iter().filter(|&&valid| !valid).count(), own);
+    let objects = estimate.objects().expect("objects");
+    for cluster in objects.clusters.iter().filter(|cluster| cluster.dynamic) {
+        let [x, y, _] = cluster.bounds.center;
+        assert!(x.hypot(y) > 2.0, "{cluster:?}");
+    }
+}
+
+#[test]
+fn the_hood_of_a_real_vehicle_is_no_moving_object() {
+    let Some(folder) = super::real_data::real_data() else {
+        return;
+    };
+    let sweep = |name: &str| {
+        let bytes = std::fs::read(folder.join("traffic").join(name)).expect("a sweep");
+        fnsf::formats::read_cloud(&bytes, Some(name))
+            .expect("it is sound")
+            .points
+    };
+    let [source, target] = ["000010.pcd", "000011.pcd"].map(sweep);
+    let backend = fnsf::flow::cpu::CpuBackend::new(None).expect("threads");
+    let problem = Problem::pair(&source, &target);
+    let options = Preset::Default.options(None);
+    let estimate = estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
+    let dynamic = estimate.dynamic.expect("an ego motion");
+    let near = |row: &usize| source[*row][0].hypot(source[*row][1]) < 1.9;
+    let near: Vec<usize> = (0..source.len()).filter(near).collect();
+    assert!(near.len() > 4000);
+    let left = near.iter().filter(|&&row| !estimate.valid[row]).count();
+    assert!(10 * left > 9 * near.len(), "{left} of {}", near.len());
+    assert!(near.iter().filter(|&&row| dynamic[row]).count() * 50 < near.len());
 }
 
 fn search(estimate: &Estimate) -> &ObjectSolution {

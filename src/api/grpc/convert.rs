@@ -249,6 +249,7 @@ pub(super) fn header(answer: &Answer) -> proto::FlowHeader {
         (Some(objects), _) => Some(Method::Objects(proto::ObjectSearch {
             clusters: count(objects.clusters),
             candidates: count(objects.candidates),
+            own_points: objects.own_points as u64,
             searched: count(objects.searched),
             moving: count(objects.moving),
             cost_m: objects.cost_m,

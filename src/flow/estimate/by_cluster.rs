@@ -110,6 +110,7 @@ pub(super) fn residual_motion(
     let motion = SampledMotion::new(aligned.clone(), residual.clone());
     Ok(Solved {
         alignment,
+        own_rows: Vec::new(),
         residual,
         motion: Residual::Sampled(Arc::new(motion)),
         solution: Solution::Field(solution),

@@ -78,6 +78,7 @@ pub(super) fn residual_motion(
     };
     Ok(Solved {
         alignment,
+        own_rows: Vec::new(),
         residual: fitted.residual,
         motion: match fitted.field {
             None => Residual::Still,

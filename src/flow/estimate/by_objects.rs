@@ -75,7 +75,7 @@ pub(super) fn residual_motion(
         };
         search.scale_to_interval(source, target, input.options.dt_s);
     }
-    let objects = host.threads().install(|| {
+    let mut objects = host.threads().install(|| {
         let (rows, source) = (&selection.rows, &selection.source);
         Objects::new(
             problem.source.len(),
@@ -86,6 +86,10 @@ pub(super) fn residual_motion(
             input.options.dt_s,
         )
     });
+    let own_rows = match &alignment.ego {
+        Some(ego) => objects.take_own(ego, input.options.dt_s),
+        None => Vec::new(),
+    };
     Ok(Solved {
         residual: search.residual_of(aligned),
         alignment,
@@ -94,7 +98,9 @@ pub(super) fn residual_motion(
             searched: search.clusters,
             candidates: search.all_clusters,
             cost_m: search.cost_m,
+            own_points: own_rows.len(),
         }),
+        own_rows,
         stop_reason: match search.interrupted {
             Some(_) => StopReason::Deadline,
             None => StopReason::Completed,

@@ -92,6 +92,8 @@ pub(super) struct Solved {
     /// The residual motion at any point.
     pub(super) motion: Residual,
     pub(super) solution: Solution,
+    /// Source rows of the vehicle itself, which get no flow.
+    pub(super) own_rows: Vec<usize>,
     pub(super) stop_reason: StopReason,
     pub(super) device: String,
     /// End of the preparation (selection, distance transform, ego motion), in seconds of the

@@ -116,6 +116,8 @@ pub struct ObjectSolution {
     /// the searched clusters. It is measured after the cluster's accepted motion, or at rest.
     /// Infinite if no cluster was searched.
     pub cost_m: f64,
+    /// Number of source points on the vehicle that carries the sensor. They have no flow.
+    pub own_points: usize,
 }
 
 /// The outcome of the fit of a field. With a partition the numbers of iterations are sums over the

@@ -120,6 +120,7 @@ fn assemble(input: &Input<'_>, solved: Solved, began: f64) -> Estimate {
         residual,
         motion,
         mut solution,
+        own_rows,
         ..
     } = solved;
     let Alignment {
@@ -141,6 +142,15 @@ fn assemble(input: &Input<'_>, solved: Solved, began: f64) -> Estimate {
             dynamic[row] = square >= DYNAMIC_M * DYNAMIC_M;
         }
     }
+    for row in own_rows {
+        flow[row] = [0.0; 3];
+        valid[row] = false;
+        if let Some(dynamic) = &mut dynamic {
+            dynamic[row] = false;
+        }
+    }
+    let output = selection.output_rows.iter();
+    let points = output.filter(|&&i| valid[selection.rows[i]]).count();
     let mut objects = match &mut solution {
         Solution::Objects(solution) => Some(&mut solution.objects),
         Solution::Field(_) => None,
@@ -172,7 +182,7 @@ fn assemble(input: &Input<'_>, solved: Solved, began: f64) -> Estimate {
         overlap,
         deskew: None,
         same_sweep: source == input.problem.target,
-        points: selection.output_rows.len(),
+        points,
         solution,
         stop_reason: solved.stop_reason,
         device: solved.device,

@@ -25,6 +25,7 @@ mod labels;
 mod measured_at;
 mod motion_field;
 mod neighbor_view;
+mod own_vehicle;
 mod planar_motion;
 mod scene;
 mod search;

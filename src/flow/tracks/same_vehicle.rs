@@ -1,11 +1,10 @@
-//! Parts of one vehicle that are in different clusters, and the vehicle that carries the sensor.
+//! Parts of one vehicle that are in different clusters.
 
 use nalgebra::Vector3;
 
 use super::carried::Carried;
-use super::live_object::{LiveObject, Moment};
-use crate::flow::data::{OrientedBox, Point, square_distance, transform_point};
-use crate::flow::objects::Cluster;
+use super::live_object::LiveObject;
+use crate::flow::data::{OrientedBox, Point, square_distance};
 
 /// Largest length and width of a vehicle that is put together, metres.
 const VEHICLE_M: [f32; 2] = [6.5, 2.6];
@@ -18,12 +17,6 @@ const GAP_M: f32 = 1.0;
 const SAME_VELOCITY: f32 = 0.5;
 /// Sweeps over which this holds, one after the other.
 const TOGETHER: u32 = 5;
-/// Distance from the sensor within which a cluster can be a part of the vehicle that carries it,
-/// metres.
-const OWN_WITHIN_M: f32 = 3.0;
-/// Largest motion of such a part relative to the sensor, and least motion of the sensor, metres.
-const OWN_MOTION_M: [f32; 2] = [0.1, 0.2];
-
 /// Objects that move together, and for how many sweeps.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Companions(Vec<(u32, u32, u32)>);
@@ -82,16 +75,4 @@ fn is_one(a: &Carried, b: &Carried) -> bool {
     let both = [a.points.as_slice(), &b.points].concat();
     let whole = OrientedBox::enclosing(&both, Some([x, y]));
     whole.size[0] <= VEHICLE_M[0] && whole.size[1] <= VEHICLE_M[1]
-}
-
-/// Whether a cluster is a part of the vehicle that carries the sensor: near to the sensor, at rest
-/// relative to it, and moving.
-pub(super) fn is_own(cluster: &Cluster, moment: &Moment<'_>) -> bool {
-    let center = cluster.bounds.center;
-    let length = |a: Point, b: Point| square_distance(a, b).sqrt();
-    let moved = core::array::from_fn(|a| center[a] + cluster.velocity[a] * moment.dt_s);
-    let [relative, own] = OWN_MOTION_M;
-    center[0].hypot(center[1]) <= OWN_WITHIN_M
-        && length(transform_point(moment.ego, center), center) >= own
-        && length(transform_point(moment.ego, moved), center) <= relative
 }

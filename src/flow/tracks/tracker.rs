@@ -2,7 +2,7 @@
 
 use super::association::{Association, Candidate, associate};
 use super::live_object::{LiveObject, Moment, moves};
-use super::same_vehicle::{Companions, is_own};
+use super::same_vehicle::Companions;
 use super::track::Track;
 use crate::flow::data::{Point, RigidTransform};
 use crate::flow::estimate::Estimate;
@@ -176,7 +176,7 @@ fn candidates(points: &[Point], moment: &Moment<'_>) -> Vec<Candidate> {
         points: Vec::new(),
         center: cluster.bounds.center,
         velocity: cluster.velocity,
-        moves: moves(cluster) && !is_own(cluster, moment),
+        moves: moves(cluster),
     };
     let mut candidates: Vec<Candidate> = clusters.iter().map(candidate).collect();
     for (&cluster, &point) in cluster.iter().zip(points) {
