@@ -10,7 +10,7 @@ use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::multipart::{Body, PairFiles, Part, bad_poses};
+use super::multipart::{Body, PairFiles, Part, bad_poses, poses_of_a_pair};
 use super::named::Named;
 use super::prefer::Prefer;
 use super::problem::Problem;
@@ -325,11 +325,6 @@ async fn read_job(
             Ok((pending, Kind::Pair))
         }
     }
-}
-
-fn poses_of_a_pair() -> ApiError {
-    let text = "poses are those of a sequence's sweeps; a pair takes its motion as the option ego";
-    ApiError::BadRequest(text.to_owned())
 }
 
 /// The 202 response with the location of the job.

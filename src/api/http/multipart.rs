@@ -284,6 +284,12 @@ fn check_head(service: &Service, caller: &Caller, request: &Request) -> Result<(
     Ok(())
 }
 
+/// Poses that came with source and target.
+pub(super) fn poses_of_a_pair() -> ApiError {
+    let text = "poses are those of a sequence's sweeps; a pair takes its motion as the option ego";
+    ApiError::BadRequest(text.to_owned())
+}
+
 /// The error of a file of poses.
 pub(super) fn bad_poses(error: FormatError) -> ApiError {
     codec::in_part("poses", error)
