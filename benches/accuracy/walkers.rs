@@ -11,7 +11,9 @@ use fnsf::flow::simulate::{Kind, Street, StreetOptions};
 use fnsf::flow::{
     Ground, NeighborSweep, Options, Point, Preset, Problem, RigidTransform, Uncontrolled, estimate,
 };
-use nalgebra::{Point3, Vector3};
+use nalgebra::Vector3;
+
+use super::drive::point3;
 
 /// Sweeps of a street, and the source of the pair among them.
 const SWEEPS: usize = 5;
@@ -100,7 +102,7 @@ fn judge(
     let pair = street.pair(SOURCE)?;
     let neighbors: Vec<NeighborSweep<'_>> = sweeps
         .iter()
-        .filter(|sweep| preset == Preset::Label && !(SOURCE..SOURCE + 2).contains(&sweep.index))
+        .filter(|sweep| !(SOURCE..SOURCE + 2).contains(&sweep.index))
         .map(|sweep| NeighborSweep {
             points: &sweep.points,
             ground: Some(&sweep.ground),
@@ -157,6 +159,6 @@ fn judge(
 
 /// A flow without the ego motion, metres.
 fn residual(ego: &RigidTransform, point: Point, flow: Point) -> Vector3<f64> {
-    let point = Point3::from(point.map(f64::from));
+    let point = point3(point);
     Vector3::from(flow.map(f64::from)) - (ego * point - point)
 }

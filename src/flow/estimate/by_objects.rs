@@ -86,10 +86,7 @@ pub(super) fn residual_motion(
             input.options.dt_s,
         )
     });
-    let own_rows = match &alignment.ego {
-        Some(ego) => objects.take_own(ego, input.options.dt_s),
-        None => Vec::new(),
-    };
+    let own_rows = ego.map_or_else(Vec::new, |ego| objects.take_own(&ego, input.options.dt_s));
     Ok(Solved {
         residual: search.residual_of(aligned),
         alignment,

@@ -256,13 +256,9 @@ impl<'a> ClusterSearch<'a> {
     /// some sweeps is away on one side alone.
     fn left_slowly(&self, standing: &PlanarMotion) -> bool {
         let left_m = self.scene.options.slow_gain_m;
-        let is_away = |moment: &&NeighborView<'_>| {
-            let sum = |sum, &row| sum + self.distance(&moment.scene, row, standing);
-            self.rows.iter().fold(0.0, sum) >= left_m * self.rows.len() as f32
-        };
         let side = |before: bool| {
             let mut side = self.neighbors.iter().filter(|m| (m.at < 0) == before);
-            side.any(|moment| is_away(&moment))
+            side.any(|moment| self.forward_m(&moment.scene, standing) >= left_m)
         };
         side(true) && side(false)
     }
@@ -354,12 +350,17 @@ impl<'a> ClusterSearch<'a> {
 
     /// Cost, in the sweep of `scene`, of a motion that leads from the source to that sweep.
     fn cost_in(&self, scene: &Scene<'_>, motion: &PlanarMotion) -> Cost {
-        let distances = self.rows.iter();
-        let distances = distances.map(|&row| self.distance(scene, row, motion));
         Cost {
-            forward_m: distances.sum::<f32>() / self.rows.len().max(1) as f32,
+            forward_m: self.forward_m(scene, motion),
             backward_m: self.backward_m(scene, motion),
         }
+    }
+
+    /// Forward cost: mean truncated distance from the moved cluster to the sweep of `scene`, metres.
+    fn forward_m(&self, scene: &Scene<'_>, motion: &PlanarMotion) -> f32 {
+        let distances = self.rows.iter();
+        let distances = distances.map(|&row| self.distance(scene, row, motion));
+        distances.sum::<f32>() / self.rows.len().max(1) as f32
     }
 
     /// Backward cost: mean truncated distance from the points of `scene` around the moved cluster

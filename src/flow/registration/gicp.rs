@@ -96,7 +96,9 @@ impl<'a> Fit<'a> {
         schedule: &Schedule,
         control: &dyn Control,
     ) -> RigidTransform {
-        self.descend(start, schedule, control, |sums, _| Some(sums.update()))
+        self.descend(start, schedule, control, |sums, _| {
+            Some(sums.solved().step())
+        })
     }
 
     /// The most probable motion after a fit from `start`, and its covariance as in [`Posterior`].

@@ -5,9 +5,9 @@
 //! equations `A`, the scatter `B` of the gradients of groups of neighboring matches, and the noise
 //! `N` that the thickness of the surfels accounts for. Information is the inverse of a covariance.
 
-use nalgebra::{Matrix3, Matrix6, SymmetricEigen, Vector3, Vector6};
+use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
-use super::sums::Sums;
+use super::sums::{Solved, Sums};
 use crate::flow::data::RigidTransform;
 
 /// Share of the variance of the points of a surfel, along its normal, that one match is off by.
@@ -34,13 +34,8 @@ pub(super) struct Prior(RigidTransform);
 /// The information of the matches about a step of the motion, along the axes of their normal
 /// equations. Rotations are in metres at the spread of the points.
 pub(super) struct Evidence {
-    /// Orthonormal axes, one a column.
-    axes: Matrix6<f64>,
-    /// Whether the matches determine each axis. If not, nothing is known about it.
-    determined: [bool; 6],
+    solved: Solved,
     information: Matrix6<f64>,
-    /// The step that fits the matches best.
-    best: Vector6<f64>,
 }
 
 /// A Gaussian over steps: the most probable one, and the covariance of the motion after it.
@@ -80,14 +75,16 @@ impl Prior {
 
 impl Evidence {
     pub(super) fn of(sums: &Sums) -> Self {
-        let SymmetricEigen {
+        let solved = sums.solved();
+        let Solved {
+            axes,
             eigenvalues,
-            eigenvectors: axes,
-        } = sums.normal.symmetric_eigen();
+            determined,
+            ..
+        } = &solved;
         let free = sums.undetermined();
         // Part of the information along each axis that is not due to uncertain normals.
         let real = eigenvalues.map(|value| 1.0 - free / value.max(free));
-        let determined = core::array::from_fn(|i| real[i] > 0.0);
         let spread = sums.scatter + sums.noise * NOISE_SHARE;
         let spread = axes.transpose() * spread * axes;
         let covariance = Matrix6::from_fn(|i, j| {
@@ -98,17 +95,10 @@ impl Evidence {
             }
         });
         let inverse = covariance.try_inverse().unwrap_or_else(Matrix6::zeros);
-        let gradient = axes.transpose() * sums.gradient;
+        let shared = real * real.transpose();
         Self {
-            axes,
-            determined,
-            information: inverse.zip_map(&(real * real.transpose()), |value, real| {
-                value * real.sqrt()
-            }),
-            best: Vector6::from_fn(|i, _| match determined[i] {
-                true => -gradient[i] / eigenvalues[i],
-                false => 0.0,
-            }),
+            information: inverse.zip_map(&shared, |value, real| value * real.sqrt()),
+            solved,
         }
     }
 
@@ -123,6 +113,12 @@ impl Evidence {
         center: Vector3<f64>,
         spread_m: f64,
     ) -> Option<Posterior> {
+        let Solved {
+            axes,
+            determined,
+            best,
+            ..
+        } = &self.solved;
         // Takes a step to what it adds to the deviation.
         let arm = motion.translation.vector - center;
         let mut deviating = Matrix6::identity();
@@ -130,26 +126,26 @@ impl Evidence {
         deviating.fixed_view_mut::<3, 3>(0, 3).copy_from(&turning);
         let scaled = Matrix3::identity() / spread_m;
         deviating.fixed_view_mut::<3, 3>(3, 3).copy_from(&scaled);
-        let deviating = deviating * self.axes;
+        let deviating = deviating * axes;
 
         let deviation = prior.deviation(motion);
         let known = prior.information(&deviation, motion);
         let backward = deviating.transpose();
         let mut belief = backward * Matrix6::from_diagonal(&known) * deviating;
-        let mut pull = self.information * self.best;
+        let mut pull = self.information * best;
         pull -= backward * deviation.component_mul(&known);
         for i in 0..6 {
             for j in 0..6 {
-                if self.determined[i] != self.determined[j] {
+                if determined[i] != determined[j] {
                     belief[(i, j)] = 0.0;
                 }
             }
-            if !self.determined[i] {
+            if !determined[i] {
                 pull[i] = 0.0;
             }
         }
         let inverse = (self.information + belief).try_inverse()?;
-        let step = self.axes * (inverse * pull);
+        let step = axes * (inverse * pull);
         let covariance = deviating * inverse * backward;
         let is_finite = step.iter().all(|value| value.is_finite());
         is_finite.then(|| Posterior {

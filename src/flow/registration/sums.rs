@@ -6,6 +6,7 @@ use nalgebra::{Matrix6, SymmetricEigen, Vector6};
 /// all translations together, or of that of one match of two planes. Two normals are uncertain by
 /// 1.4 degrees together. On some streets the weakest direction has 1%.
 const FREE: f64 = 3e-4;
+
 /// Sums over the matches: the normal equations, and what tells how certain they are.
 pub(super) struct Sums {
     /// Second derivatives and gradient of half the weighted squared distances by a step of the
@@ -18,6 +19,18 @@ pub(super) struct Sums {
     pub(super) noise: Matrix6<f64>,
     /// Weighted information about translations, summed over all directions.
     pub(super) held: f64,
+}
+
+/// The solution of normal equations along their axes.
+pub(super) struct Solved {
+    /// Orthonormal axes, one a column.
+    pub(super) axes: Matrix6<f64>,
+    /// The information about each axis.
+    pub(super) eigenvalues: Vector6<f64>,
+    /// Whether the matches determine each axis. If not, nothing is known about it.
+    pub(super) determined: [bool; 6],
+    /// The step along each axis; zero along undetermined ones.
+    pub(super) best: Vector6<f64>,
 }
 
 impl Default for Sums {
@@ -51,19 +64,30 @@ impl Sums {
         FREE * self.held.max(1.0)
     }
 
-    /// The step that minimizes the weighted, linearized squared distances, metres (rotations in
-    /// metres at the points' spread). Components along undetermined directions are left out.
-    pub(super) fn update(&self) -> Vector6<f64> {
+    /// The axes of the normal equations, and the step along them that minimizes the weighted,
+    /// linearized squared distances.
+    pub(super) fn solved(&self) -> Solved {
         let SymmetricEigen {
             eigenvalues,
-            eigenvectors,
+            eigenvectors: axes,
         } = self.normal.symmetric_eigen();
-        let mut update = Vector6::zeros();
-        for (axis, &eigenvalue) in eigenvectors.column_iter().zip(&eigenvalues) {
-            if eigenvalue > self.undetermined() {
-                update -= axis * (axis.dot(&self.gradient) / eigenvalue);
-            }
+        let determined = core::array::from_fn(|i| eigenvalues[i] > self.undetermined());
+        let best = Vector6::from_fn(|i, _| match determined[i] {
+            true => -axes.column(i).dot(&self.gradient) / eigenvalues[i],
+            false => 0.0,
+        });
+        Solved {
+            axes,
+            eigenvalues,
+            determined,
+            best,
         }
-        update
+    }
+}
+
+impl Solved {
+    /// The step, metres (rotations in metres at the points' spread).
+    pub(super) fn step(&self) -> Vector6<f64> {
+        self.axes * self.best
     }
 }

@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use nalgebra::{Isometry3, Point3, Vector3};
 
 use super::align::{SurfelCloud, align};
+use super::posterior::Prior;
 use crate::flow::data::{Control, Interrupt, Point, Random, RigidTransform, Uncontrolled};
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
 
@@ -125,11 +126,8 @@ fn the_truth_lies_within_two_deviations_and_they_grow_without_ground() {
             let found = align(&source, &target, &rest, &Uncontrolled);
             let covariance = found.covariance.expect("a covariance");
             assert_eq!(covariance, covariance.transpose());
-            let shift =
-                found.motion.translation.vector - pair.target_from_source.translation.vector;
-            let turn =
-                (found.motion.rotation * pair.target_from_source.rotation.inverse()).scaled_axis();
-            for (a, error) in shift.iter().chain(turn.iter()).enumerate() {
+            let truth = Prior::of_vehicle(&pair.target_from_source);
+            for (a, error) in truth.deviation(&found.motion).iter().enumerate() {
                 within += usize::from(error.abs() < 2.0 * covariance[(a, a)].sqrt());
                 all += 1;
             }

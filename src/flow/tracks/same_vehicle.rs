@@ -17,6 +17,7 @@ const GAP_M: f32 = 1.0;
 const SAME_VELOCITY: f32 = 0.5;
 /// Sweeps over which this holds, one after the other.
 const TOGETHER: u32 = 5;
+
 /// Objects that move together, and for how many sweeps.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Companions(Vec<(u32, u32, u32)>);
