@@ -32,6 +32,12 @@ impl Timestamp {
         Self(self.0.saturating_add(millis(duration)))
     }
 
+    /// The same moment on a clock that is ahead by this many milliseconds.
+    #[must_use]
+    pub fn on_clock_ahead(self, ahead_ms: i64) -> Self {
+        Self(self.0.saturating_add(ahead_ms))
+    }
+
     /// Duration from this time to a later one; zero if `later` is earlier.
     pub fn until(self, later: Self) -> Duration {
         Duration::from_millis(u64::try_from(later.0 - self.0).unwrap_or(0))

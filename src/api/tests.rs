@@ -26,7 +26,7 @@ use super::service_parts::{ServiceLimits, ServiceParts};
 use crate::cost::{CostModel, Lanes};
 use crate::job::{Priority, Tenant};
 use crate::metrics::Metrics;
-use crate::queue::{Queue, QueueOptions, SqliteQueue};
+use crate::queue::{QueueOptions, open_sqlite};
 use crate::storage::Blobs;
 
 /// Time after which a request that has not returned counts as a busy loop.
@@ -52,8 +52,7 @@ impl<E: Clone + Unpin> Body for ForEver<E> {
 
 fn service(folder: &std::path::Path) -> Arc<Service> {
     let (events, _) = mpsc::unbounded_channel();
-    let queue = SqliteQueue::open(folder, QueueOptions::default(), events).expect("a queue");
-    let queue: Arc<dyn Queue> = Arc::new(queue);
+    let queue = open_sqlite(folder, QueueOptions::default(), events).expect("a queue");
     let cost = Arc::new(CostModel::new(Lanes { cpu: 1, gpu: 0 }));
     let long = Duration::from_secs(3600);
     let limits = AdmissionLimits {

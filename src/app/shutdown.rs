@@ -64,7 +64,7 @@ impl App {
             self.listener.abort();
         }
         self.upkeep.shutdown().await;
-        self.queue.stopped();
+        self.queue.stopped().await;
         tracing::info!(seconds = began.elapsed().as_secs_f64(), "stopped");
     }
 }

@@ -23,7 +23,7 @@ use crate::engine::{Device, Health};
 use crate::health::{Heartbeat, StoreHealth};
 use crate::job::DeviceKind;
 use crate::metrics::Metrics;
-use crate::queue::{Event, Queue, SqliteQueue};
+use crate::queue::{Event, Queue, open_sqlite};
 use crate::storage::Blobs;
 use crate::worker::{Drain, IsolationLock, StoreProbe, Worker, WorkerOptions};
 
@@ -224,9 +224,8 @@ impl Stores {
             .with_context(|| format!("cannot use {}", config.data_dir.display()))?;
         check_queue_is_there(config, &blobs)?;
         let may_be_new = blobs.is_empty()?;
-        let queue = SqliteQueue::open(&config.data_dir, queue_options(&config.queue), events)
+        let queue = open_sqlite(&config.data_dir, queue_options(&config.queue), events)
             .with_context(|| format!("cannot open the queue in {}", config.data_dir.display()))?;
-        let queue: Arc<dyn Queue> = Arc::new(queue);
         check_identity(queue.as_ref(), &blobs, may_be_new, config).await?;
         let health = Arc::new(StoreHealth::default());
         if let Some(free) = blobs.free_space() {

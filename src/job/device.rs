@@ -46,7 +46,8 @@ impl FromStr for DeviceChoice {
 }
 
 /// The kind of a device.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum DeviceKind {
     /// The CPU.
     Cpu,

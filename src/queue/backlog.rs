@@ -14,12 +14,12 @@ pub struct Load {
 }
 
 impl Load {
-    pub(super) fn add(&mut self, seconds: f64) {
+    fn add(&mut self, seconds: f64) {
         self.jobs += 1;
         self.seconds += seconds;
     }
 
-    pub(super) fn remove(&mut self, seconds: f64) {
+    fn remove(&mut self, seconds: f64) {
         self.jobs = self.jobs.saturating_sub(1);
         self.seconds = if self.jobs == 0 {
             0.0
@@ -118,14 +118,33 @@ impl Backlog {
         })
     }
 
+    /// Sets the queued load of a key.
+    pub(super) fn enter_many(&mut self, key: BacklogKey, load: Load) {
+        self.queued.insert(key, load);
+    }
+
+    /// Adds running load.
+    pub(super) fn start_many(&mut self, load: Load) {
+        self.running.jobs += load.jobs;
+        self.running.seconds += load.seconds;
+    }
+
+    /// The queued load of each key.
+    pub(super) fn queued_loads(&self) -> impl Iterator<Item = (&BacklogKey, Load)> {
+        self.queued.iter().map(|(key, load)| (key, *load))
+    }
+
     pub(super) fn entered(&mut self, job: &Job) {
         let load = self.queued.entry(BacklogKey::of(job)).or_default();
         load.add(job.cost_seconds);
     }
 
-    /// Sets the queued load of a key.
-    pub(super) fn enter_many(&mut self, key: BacklogKey, load: Load) {
-        self.queued.insert(key, load);
+    pub(super) fn started(&mut self, job: &Job) {
+        self.running.add(job.cost_seconds);
+    }
+
+    pub(super) fn stopped(&mut self, job: &Job) {
+        self.running.remove(job.cost_seconds);
     }
 
     pub(super) fn left(&mut self, job: &Job) {
@@ -136,13 +155,5 @@ impl Backlog {
                 self.queued.remove(&key);
             }
         }
-    }
-
-    pub(super) fn started(&mut self, job: &Job) {
-        self.running.add(job.cost_seconds);
-    }
-
-    pub(super) fn stopped(&mut self, job: &Job) {
-        self.running.remove(job.cost_seconds);
     }
 }

@@ -2,20 +2,28 @@
 //!
 //! Payloads and options are opaque to the queue. It orders the pairs of a sequence. A sequence may
 //! have a closing job, which is queued under the sequence's own id when all pairs have succeeded.
-//! [`Queue`] is the interface; [`SqliteQueue`] implements it on one machine. Independent of
-//! protocols, workers and solvers.
+//! [`Queue`] is the interface. The state transitions are written once, as statements of SQL, and run
+//! on one of two engines: [`open_sqlite`] for one process, [`open_postgres`] for many nodes.
+//! Independent of protocols, workers and solvers.
 
 mod backlog;
 #[cfg(test)]
 mod contract_tests;
+mod database;
+mod effects;
 mod lease;
+mod local;
+mod postgres;
+mod sql;
 mod sqlite;
 mod subscriptions;
+mod transitions;
 mod types;
 
 pub use backlog::{Backlog, Load};
 pub use lease::{Lease, LeaseHeartbeat, Signal};
-pub use sqlite::SqliteQueue;
+pub use postgres::{PostgresOptions, open_postgres};
+pub use sqlite::open_sqlite;
 pub use types::{
     Committed, Event, Filter, Idempotency, Outcome, PairOf, Queue, QueueError, QueueOptions,
     Submission, Submitted,

@@ -52,6 +52,32 @@ impl Watchers {
         }
     }
 
+    /// The watched jobs.
+    pub(super) fn jobs(&self) -> Vec<JobId> {
+        self.lock().keys().copied().collect()
+    }
+
+    /// Publishes the stored state of a job if it has changed. With `keep_progress` the progress
+    /// that was published last is newer than the stored one.
+    pub(super) fn refresh(&self, job: &Arc<Job>, keep_progress: bool) {
+        let is_changed = self.lock().get(&job.id).is_some_and(|sender| {
+            let known = sender.borrow();
+            let mut job = Job::clone(job);
+            if keep_progress {
+                job.progress = known.progress;
+            }
+            **known != job
+        });
+        if is_changed || job.state.is_end() {
+            self.push(job);
+        }
+    }
+
+    /// Ends the subscriptions to a job that was removed.
+    pub(super) fn forget(&self, id: JobId) {
+        self.lock().remove(&id);
+    }
+
     /// Publishes the progress of a running job.
     pub(super) fn progress(&self, id: JobId, attempt: u32, progress: JobProgress) {
         let senders = self.lock();

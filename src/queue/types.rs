@@ -141,7 +141,7 @@ pub struct Filter {
     /// Only jobs whose id is less than this one, so that they were created earlier. It need not be
     /// the id of a job. `None` for all jobs.
     pub before: Option<JobId>,
-    /// Maximum number of jobs. [`super::SqliteQueue`] returns at most 1000.
+    /// Maximum number of jobs, of which at most 1000 are returned.
     pub limit: u32,
 }
 
@@ -290,7 +290,7 @@ pub enum Event {
 }
 
 /// The job queue: submission, subscription, leases for workers, completion, cancellation and
-/// requeueing. [`super::SqliteQueue`] implements it.
+/// requeueing. [`super::open_sqlite`] and [`super::open_postgres`] open one.
 ///
 /// When a call returns `Ok` the change has taken effect. It is on disk if the job is durable,
 /// except for a lease. A job may run more than once: an expired lease requeues it, and only the
@@ -434,7 +434,7 @@ pub trait Queue: Send + Sync {
 
     /// Records a graceful shutdown. The next start then counts no crash for the jobs that could not
     /// be released.
-    fn stopped(&self);
+    async fn stopped(&self);
 
     /// The number that identifies this queue. A blob store with another number belongs to another
     /// queue.

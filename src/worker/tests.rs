@@ -15,7 +15,7 @@ use crate::flow::{MotionField, Point};
 use crate::job::{DeviceKind, Job, JobError, JobId, Kind, Priority, State, Tenant};
 use crate::metrics::Metrics;
 use crate::payload::{StoredCloud, StoredFlow};
-use crate::queue::{Outcome, PairOf, Queue, QueueOptions, SqliteQueue, Submission, Submitted};
+use crate::queue::{Outcome, PairOf, Queue, QueueOptions, Submission, Submitted, open_sqlite};
 use crate::storage::{Blob, Blobs, Fsync};
 
 /// Timeout, long enough for a loaded machine. Only a failing test waits this long.
@@ -44,8 +44,7 @@ async fn stand_with(lanes: usize, overflow_kind: Option<DeviceKind>) -> Stand {
         ..QueueOptions::default()
     };
     let (events, _) = mpsc::unbounded_channel();
-    let queue = SqliteQueue::open(folder.path(), options, events).expect("a queue");
-    let queue: Arc<dyn Queue> = Arc::new(queue);
+    let queue = open_sqlite(folder.path(), options, events).expect("a queue");
     let blobs = Blobs::open(&folder.path().join("blobs")).expect("a store");
     blobs.set_identity(queue.identity()).expect("written");
     let switches = Arc::new(Switches::default());

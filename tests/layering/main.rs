@@ -240,6 +240,12 @@ fn each_protocol_has_one_room() {
         [""; 0]
     );
     assert_eq!(uses_outside("", "queue/sqlite/", &["rusqlite"]), [""; 0]);
+    let outside = uses_outside(
+        "",
+        "queue/postgres/",
+        &["postgres::Client", "tokio_postgres"],
+    );
+    assert_eq!(outside, [""; 0]);
     assert_eq!(uses_outside("", "storage/", &["object_store"]), [""; 0]);
 }
 

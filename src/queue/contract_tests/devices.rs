@@ -10,7 +10,7 @@ fn needs(kind: DeviceKind) -> Submission {
 }
 
 pub(crate) async fn a_job_goes_only_to_the_kind_of_device_that_it_needs(stand: &mut impl Stand) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let gpu = submit(&queue, needs(DeviceKind::Gpu)).await;
     assert_eq!(gpu.device, Some(DeviceKind::Gpu));
     nothing_is_ready_for(&queue, DeviceKind::Cpu).await;
@@ -26,7 +26,7 @@ pub(crate) async fn a_job_goes_only_to_the_kind_of_device_that_it_needs(stand: &
 }
 
 pub(crate) async fn jobs_that_wait_for_one_kind_hold_up_no_other(stand: &mut impl Stand) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let urgent = Submission {
         priority: Priority::High,
         ..needs(DeviceKind::Gpu)
@@ -61,7 +61,7 @@ pub(crate) async fn a_job_that_moves_waits_for_the_other_kind_without_blame(
         max_crashes: 1,
         ..QueueOptions::default()
     };
-    let (queue, _events) = stand.open(options);
+    let (queue, _events) = stand.open(options).await;
     let job = submit(&queue, submission("a")).await;
     let held = lease_on(&queue, DeviceKind::Gpu).await;
     let moved = finish(&queue, &held.job, Outcome::Moved(DeviceKind::Cpu)).await;
@@ -81,7 +81,7 @@ pub(crate) async fn a_device_that_dies_under_a_job_again_and_again_ends_it(stand
         max_crashes: 3,
         ..QueueOptions::default()
     };
-    let (queue, _events) = stand.open(options);
+    let (queue, _events) = stand.open(options).await;
     let job = submit(&queue, submission("a")).await;
     let crash = || {
         Outcome::Crashed(JobError {
@@ -111,10 +111,10 @@ pub(crate) async fn a_device_that_dies_under_a_job_again_and_again_ends_it(stand
 }
 
 pub(crate) async fn jobs_for_a_kind_survive_a_crash(stand: &mut impl Stand) {
-    let (queue, events) = stand.open(QueueOptions::default());
+    let (queue, events) = stand.open(QueueOptions::default()).await;
     let waiting = submit(&queue, needs(DeviceKind::Gpu)).await;
     drop((queue, events));
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     nothing_is_ready_for(&queue, DeviceKind::Cpu).await;
     assert_eq!(lease_on(&queue, DeviceKind::Gpu).await.job.id, waiting.id);
 }

@@ -5,7 +5,7 @@ use super::*;
 pub(crate) async fn a_deadline_that_passes_in_the_queue_ends_the_job_without_any_worker(
     stand: &mut impl Stand,
 ) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let late = Submission {
         deadline: Some(Timestamp::now().after(Duration::from_millis(60))),
         ..submission("a")
@@ -19,7 +19,7 @@ pub(crate) async fn a_deadline_that_passes_in_the_queue_ends_the_job_without_any
 }
 
 pub(crate) async fn failures_are_retried_later_and_given_up_in_the_end(stand: &mut impl Stand) {
-    let (queue, _events) = stand.open(quick());
+    let (queue, _events) = stand.open(quick()).await;
     let job = submit(&queue, submission("a")).await;
     for attempt in 1..=3 {
         let held = lease(&queue).await;
@@ -46,7 +46,7 @@ pub(crate) async fn failures_are_retried_later_and_given_up_in_the_end(stand: &m
 }
 
 pub(crate) async fn an_error_of_the_input_is_not_retried(stand: &mut impl Stand) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     submit(&queue, submission("a")).await;
     let held = lease(&queue).await;
     let committed = finish(&queue, &held.job, failure(false)).await;
@@ -59,7 +59,7 @@ pub(crate) async fn an_error_of_the_input_is_not_retried(stand: &mut impl Stand)
 }
 
 pub(crate) async fn a_released_job_is_queued_again_without_blame(stand: &mut impl Stand) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     submit(&queue, submission("a")).await;
     for attempt in 1..=6 {
         let held = lease(&queue).await;
@@ -70,7 +70,7 @@ pub(crate) async fn a_released_job_is_queued_again_without_blame(stand: &mut imp
 }
 
 pub(crate) async fn a_silent_worker_loses_its_lease_and_its_late_result(stand: &mut impl Stand) {
-    let (queue, mut events) = stand.open(quick());
+    let (queue, mut events) = stand.open(quick()).await;
     let job = submit(&queue, submission("a")).await;
     let zombie = lease(&queue).await;
     let heir = lease(&queue).await;
@@ -97,7 +97,7 @@ pub(crate) async fn a_silent_worker_loses_its_lease_and_its_late_result(stand: &
 pub(crate) async fn a_crash_keeps_promises_and_forgets_what_nobody_waits_for(
     stand: &mut impl Stand,
 ) {
-    let (queue, events) = stand.open(QueueOptions::default());
+    let (queue, events) = stand.open(QueueOptions::default()).await;
     let running = submit(&queue, submission("a")).await;
     let held = lease(&queue).await;
     let waiting = submit(&queue, submission("a")).await;
@@ -112,7 +112,7 @@ pub(crate) async fn a_crash_keeps_promises_and_forgets_what_nobody_waits_for(
     finish(&queue, &other.job, done()).await;
     drop((queue, events));
 
-    let (queue, mut events) = stand.open(QueueOptions::default());
+    let (queue, mut events) = stand.open(QueueOptions::default()).await;
     assert_eq!(state(&queue, &ended).await, State::Succeeded);
     let gone = queue.job(&awaited.tenant, awaited.id).await;
     assert_eq!(gone, Err(QueueError::NotFound));
@@ -136,7 +136,7 @@ pub(crate) async fn a_job_that_kills_the_process_again_and_again_is_given_up(
         max_crashes: 3,
         ..QueueOptions::default()
     };
-    let (mut queue, mut events) = stand.open(options.clone());
+    let (mut queue, mut events) = stand.open(options.clone()).await;
     let job = submit(&queue, submission("a")).await;
     for crash in 1..=5 {
         let held = lease(&queue).await;
@@ -146,7 +146,7 @@ pub(crate) async fn a_job_that_kills_the_process_again_and_again_is_given_up(
             queue.make_durable(job.id).await.expect("known");
         }
         drop((queue, events));
-        (queue, events) = stand.open(options.clone());
+        (queue, events) = stand.open(options.clone()).await;
         let expected = if crash == 4 {
             State::Failed
         } else {
@@ -162,7 +162,7 @@ pub(crate) async fn a_job_that_kills_the_process_again_and_again_is_given_up(
 }
 
 pub(crate) async fn a_job_made_durable_survives(stand: &mut impl Stand) {
-    let (queue, events) = stand.open(QueueOptions::default());
+    let (queue, events) = stand.open(QueueOptions::default()).await;
     let awaited = Submission {
         durable: false,
         ..submission("a")
@@ -170,15 +170,17 @@ pub(crate) async fn a_job_made_durable_survives(stand: &mut impl Stand) {
     let job = submit(&queue, awaited).await;
     assert!(queue.make_durable(job.id).await.expect("known").durable);
     drop((queue, events));
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     assert_eq!(state(&queue, &job).await, State::Queued);
 }
 
 pub(crate) async fn ended_jobs_are_kept_for_a_while_and_then_forgotten(stand: &mut impl Stand) {
-    let (queue, mut events) = stand.open(QueueOptions {
-        retention: Duration::from_millis(80),
-        ..QueueOptions::default()
-    });
+    let (queue, mut events) = stand
+        .open(QueueOptions {
+            retention: Duration::from_millis(80),
+            ..QueueOptions::default()
+        })
+        .await;
     let job = submit(&queue, sequence(1)).await;
     let held = lease(&queue).await;
     finish(&queue, &held.job, done()).await;
@@ -199,7 +201,7 @@ pub(crate) async fn ended_jobs_are_kept_for_a_while_and_then_forgotten(stand: &m
 pub(crate) async fn an_abandoned_job_ends_and_gives_up_its_key_unless_it_was_promised(
     stand: &mut impl Stand,
 ) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let keyed = || Submission {
         durable: false,
         idempotency: Some(Idempotency {
@@ -221,7 +223,7 @@ pub(crate) async fn an_abandoned_job_ends_and_gives_up_its_key_unless_it_was_pro
 }
 
 pub(crate) async fn jobs_that_come_and_go_at_once_are_not_counted_any_more(stand: &mut impl Stand) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     for _ in 0..50 {
         let (_, first, second) = tokio::join!(
             async {
@@ -241,7 +243,7 @@ pub(crate) async fn jobs_that_come_and_go_at_once_are_not_counted_any_more(stand
 pub(crate) async fn a_cancelled_job_whose_worker_is_silent_is_not_tried_again(
     stand: &mut impl Stand,
 ) {
-    let (queue, _events) = stand.open(quick());
+    let (queue, _events) = stand.open(quick()).await;
     let job = submit(&queue, submission("a")).await;
     let silent = lease(&queue).await;
     queue.cancel(job.id).await.expect("known");
@@ -252,7 +254,7 @@ pub(crate) async fn a_cancelled_job_whose_worker_is_silent_is_not_tried_again(
 }
 
 pub(crate) async fn a_job_that_is_asked_for_again_waits_for_its_turn(stand: &mut impl Stand) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let old = submit(&queue, submission("a")).await;
     queue.cancel(old.id).await.expect("known");
     let mut waiting = Vec::new();

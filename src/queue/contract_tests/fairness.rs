@@ -46,7 +46,7 @@ async fn finish_next(queue: &Arc<dyn Queue>) -> Arc<Job> {
 pub(crate) async fn a_job_is_leased_only_when_the_one_that_it_comes_after_has_ended(
     stand: &mut impl Stand,
 ) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let first = submit(&queue, submission("a")).await;
     let urgent = Submission {
         priority: Priority::High,
@@ -71,7 +71,7 @@ pub(crate) async fn a_job_is_leased_only_when_the_one_that_it_comes_after_has_en
 pub(crate) async fn a_job_that_comes_after_one_that_has_ended_or_is_unknown_waits_for_nothing(
     stand: &mut impl Stand,
 ) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     submit(&queue, submission("a")).await;
     let ended = finish_next(&queue).await;
     let unknown = Submission {
@@ -87,7 +87,7 @@ pub(crate) async fn a_job_that_comes_after_one_that_has_ended_or_is_unknown_wait
 pub(crate) async fn a_job_that_waits_for_another_is_queued_but_nobody_is_late_with_it(
     stand: &mut impl Stand,
 ) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let job = submit(&queue, chain(3)).await;
     let pairs = queue.pairs(job.id).await.expect("known");
     let has_dependents: Vec<bool> = pairs.iter().map(|pair| pair.has_dependents).collect();
@@ -117,10 +117,10 @@ pub(crate) async fn a_chain_goes_on_behind_a_member_that_fails_is_cancelled_or_e
         retry_delay: Duration::from_millis(40),
         ..QueueOptions::default()
     };
-    let (queue, _events) = stand.open(options);
+    let (queue, _events) = stand.open(options).await;
     let first = submit(&queue, submission("a")).await;
     let expiring = Submission {
-        deadline: Some(Timestamp::now().after(Duration::from_millis(200))),
+        deadline: Some(Timestamp::now().after(Duration::from_millis(1500))),
         ..after(&first)
     };
     let expiring = submit(&queue, expiring).await;
@@ -146,7 +146,7 @@ pub(crate) async fn a_chain_goes_on_behind_a_member_that_fails_is_cancelled_or_e
 pub(crate) async fn a_chain_is_cancelled_whole_and_asked_for_again_in_its_order(
     stand: &mut impl Stand,
 ) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let job = submit(&queue, chain(4)).await;
     assert_eq!(finish_next(&queue).await.index, 0);
     let second = lease(&queue).await;
@@ -167,7 +167,7 @@ pub(crate) async fn a_chain_is_cancelled_whole_and_asked_for_again_in_its_order(
 }
 
 pub(crate) async fn a_chain_survives_a_crash_in_its_order(stand: &mut impl Stand) {
-    let (queue, events) = stand.open(QueueOptions::default());
+    let (queue, events) = stand.open(QueueOptions::default()).await;
     let job = submit(&queue, chain(3)).await;
     let awaited = Submission {
         durable: false,
@@ -179,7 +179,7 @@ pub(crate) async fn a_chain_survives_a_crash_in_its_order(stand: &mut impl Stand
     let held = lease(&queue).await;
     assert_eq!(held.job.index, 1);
     drop((queue, events));
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     assert_eq!(queue.backlog().queued().jobs, 3);
     let again = lease(&queue).await;
     assert_eq!((again.job.index, again.job.attempt), (1, 2));
@@ -194,7 +194,7 @@ pub(crate) async fn a_chain_survives_a_crash_in_its_order(stand: &mut impl Stand
 pub(crate) async fn chains_go_side_by_side_and_leave_other_tenants_their_share(
     stand: &mut impl Stand,
 ) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     for _ in 0..2 {
         submit(&queue, chain(6)).await;
     }
@@ -218,7 +218,7 @@ pub(crate) async fn what_others_come_after_is_kept_until_they_have_ended(stand: 
         answered_retention: Duration::from_millis(40),
         ..QueueOptions::default()
     };
-    let (queue, _events) = stand.open(options);
+    let (queue, _events) = stand.open(options).await;
     let awaited = |job| Submission {
         durable: false,
         ..job
@@ -239,7 +239,7 @@ pub(crate) async fn what_others_come_after_is_kept_until_they_have_ended(stand: 
 pub(crate) async fn a_sequence_with_something_left_to_do_is_leased_when_its_pairs_have_succeeded(
     stand: &mut impl Stand,
 ) {
-    let (queue, mut events) = stand.open(QueueOptions::default());
+    let (queue, mut events) = stand.open(QueueOptions::default()).await;
     let job = submit(&queue, closing()).await;
     assert_eq!((job.pairs, job.pairs_left), (4, 4));
     assert_eq!(queue.backlog().queued().jobs, 4);
@@ -268,7 +268,7 @@ pub(crate) async fn a_sequence_with_something_left_to_do_is_leased_when_its_pair
 }
 
 pub(crate) async fn what_is_left_of_a_sequence_counts_in_its_tenants_share(stand: &mut impl Stand) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let job = submit(&queue, closing()).await;
     for _ in 0..4 {
         finish_next(&queue).await;
@@ -293,14 +293,14 @@ pub(crate) async fn what_is_left_of_a_sequence_counts_in_its_tenants_share(stand
 pub(crate) async fn what_is_left_of_a_sequence_survives_crashes_and_is_retried_cancelled_and_asked_for_again(
     stand: &mut impl Stand,
 ) {
-    let (queue, events) = stand.open(quick());
+    let (queue, events) = stand.open(quick()).await;
     let job = submit(&queue, closing()).await;
     for _ in 0..4 {
         finish_next(&queue).await;
     }
     assert_eq!(lease(&queue).await.job.id, job.id);
     drop((queue, events));
-    let (queue, _events) = stand.open(quick());
+    let (queue, _events) = stand.open(quick()).await;
     assert_eq!(queue.backlog().queued().jobs, 1);
     let held = lease(&queue).await;
     assert_eq!((held.job.id, held.job.attempt), (job.id, 2));
@@ -329,7 +329,7 @@ pub(crate) async fn what_is_left_of_a_sequence_survives_crashes_and_is_retried_c
 pub(crate) async fn a_pair_that_fails_back_in_time_is_named_and_nothing_is_left_to_do(
     stand: &mut impl Stand,
 ) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let job = submit(&queue, closing()).await;
     for _ in 0..4 {
         let held = lease(&queue).await;

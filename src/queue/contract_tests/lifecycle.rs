@@ -5,7 +5,7 @@ use super::*;
 pub(crate) async fn a_submitted_job_is_leased_once_and_ends_with_its_outcome(
     stand: &mut impl Stand,
 ) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let job = submit(&queue, submission("a")).await;
     assert_eq!((job.state, job.attempt), (State::Queued, 0));
     assert_eq!(queue.backlog().queued().jobs, 1);
@@ -30,7 +30,7 @@ pub(crate) async fn a_submitted_job_is_leased_once_and_ends_with_its_outcome(
 pub(crate) async fn a_repeated_key_finds_the_first_job_and_another_payload_is_refused(
     stand: &mut impl Stand,
 ) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let keyed = |of: &str, print: u8| Submission {
         idempotency: Some(Idempotency {
             key: "k".to_owned(),
@@ -48,7 +48,7 @@ pub(crate) async fn a_repeated_key_finds_the_first_job_and_another_payload_is_re
 }
 
 pub(crate) async fn higher_priorities_go_first_and_equals_in_order(stand: &mut impl Stand) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let mut expected = Vec::new();
     for priority in [Priority::Low, Priority::Normal, Priority::High] {
         let mut jobs = Vec::new();
@@ -68,7 +68,7 @@ pub(crate) async fn higher_priorities_go_first_and_equals_in_order(stand: &mut i
 }
 
 pub(crate) async fn tenants_share_by_predicted_work(stand: &mut impl Stand) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     for _ in 0..60 {
         submit(&queue, submission("many")).await;
     }
@@ -101,7 +101,7 @@ pub(crate) async fn tenants_share_by_predicted_work(stand: &mut impl Stand) {
 }
 
 pub(crate) async fn a_cancelled_job_ends_at_once_or_through_its_worker(stand: &mut impl Stand) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let queued = submit(&queue, submission("a")).await;
     let ended = queue.cancel(queued.id).await.expect("known");
     assert_eq!(ended.state, State::Cancelled);
@@ -123,7 +123,7 @@ pub(crate) async fn a_cancelled_job_ends_at_once_or_through_its_worker(stand: &m
 }
 
 pub(crate) async fn a_sequence_ends_with_its_last_pair(stand: &mut impl Stand) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let job = submit(&queue, sequence(3)).await;
     assert_eq!((job.pairs, job.pairs_left), (3, 3));
     assert_eq!(queue.backlog().queued().jobs, 3);
@@ -147,7 +147,7 @@ pub(crate) async fn a_sequence_ends_with_its_last_pair(stand: &mut impl Stand) {
 }
 
 pub(crate) async fn a_pair_says_which_sweeps_it_is_of_and_found_from(stand: &mut impl Stand) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let amid = PairOf {
         index: 2,
         window: [0, 5],
@@ -177,7 +177,7 @@ pub(crate) async fn a_pair_says_which_sweeps_it_is_of_and_found_from(stand: &mut
 pub(crate) async fn a_sequence_is_cancelled_with_its_pairs_and_can_be_asked_for_again(
     stand: &mut impl Stand,
 ) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let job = submit(&queue, sequence(3)).await;
     let first = lease(&queue).await;
     finish(&queue, &first.job, done()).await;
@@ -207,7 +207,7 @@ pub(crate) async fn a_sequence_is_cancelled_with_its_pairs_and_can_be_asked_for_
 }
 
 pub(crate) async fn followers_see_every_state(stand: &mut impl Stand) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let job = submit(&queue, submission("a")).await;
     let mut news = queue.watch(job.id).await.expect("known");
     assert_eq!(news.borrow_and_update().state, State::Queued);
@@ -237,7 +237,7 @@ pub(crate) async fn followers_see_every_state(stand: &mut impl Stand) {
 }
 
 pub(crate) async fn lists_are_latest_first_in_pages_and_of_one_tenant(stand: &mut impl Stand) {
-    let (queue, _events) = stand.open(QueueOptions::default());
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
     let mut ids = Vec::new();
     for _ in 0..5 {
         ids.push(submit(&queue, submission("a")).await.id);
@@ -267,7 +267,7 @@ pub(crate) async fn lists_are_latest_first_in_pages_and_of_one_tenant(stand: &mu
 pub(crate) async fn a_job_that_was_given_up_frees_its_key_at_once_and_is_promised_to_nobody(
     stand: &mut impl Stand,
 ) {
-    let (queue, _) = stand.open(QueueOptions::default());
+    let (queue, _) = stand.open(QueueOptions::default()).await;
     let with_key = || Submission {
         durable: false,
         idempotency: Some(Idempotency {
@@ -303,7 +303,7 @@ pub(crate) async fn a_job_that_was_given_up_frees_its_key_at_once_and_is_promise
 }
 
 pub(crate) async fn a_job_whose_result_is_lost_can_be_asked_for_again(stand: &mut impl Stand) {
-    let (queue, _) = stand.open(QueueOptions::default());
+    let (queue, _) = stand.open(QueueOptions::default()).await;
     let job = submit(
         &queue,
         Submission {
@@ -328,7 +328,7 @@ pub(crate) async fn a_job_whose_result_is_lost_can_be_asked_for_again(stand: &mu
 }
 
 pub(crate) async fn a_probe_leaves_nothing(stand: &mut impl Stand) {
-    let (queue, mut heard) = stand.open(QueueOptions::default());
+    let (queue, mut heard) = stand.open(QueueOptions::default()).await;
     queue.probe().await.expect("it can be written");
     nothing_is_ready(&queue).await;
     assert_eq!(queue.backlog().queued().jobs, 0);
@@ -347,7 +347,7 @@ pub(crate) async fn an_ended_job_is_removed_when_its_owner_asks_for_it(stand: &m
         answered_retention: Duration::from_millis(40),
         ..QueueOptions::default()
     };
-    let (queue, mut events) = stand.open(options);
+    let (queue, mut events) = stand.open(options).await;
     assert_eq!(
         queue.remove(JobId::fresh()).await,
         Err(QueueError::NotFound)

@@ -3,12 +3,12 @@
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use super::leases;
-use super::shared::Shared;
 use super::writer::Writer;
 use crate::job::JobId;
 use crate::job::JobProgress;
 use crate::queue::lease::HeartbeatStore;
+use crate::queue::local::Local;
+use crate::queue::transitions::leases;
 use crate::queue::types::QueueOptions;
 use crate::sync::locked;
 
@@ -21,7 +21,7 @@ pub(super) struct SqliteHeartbeat {
     pub(super) id: JobId,
     pub(super) attempt: u32,
     pub(super) writer: Writer,
-    pub(super) shared: Arc<Shared>,
+    pub(super) local: Arc<Local>,
     pub(super) options: QueueOptions,
     pub(super) last: Mutex<Instant>,
     pub(super) latest: Mutex<Option<JobProgress>>,
@@ -31,7 +31,7 @@ impl HeartbeatStore for SqliteHeartbeat {
     fn beat(&self, progress: Option<JobProgress>) {
         if let Some(progress) = progress {
             *locked(&self.latest) = Some(progress);
-            self.shared
+            self.local
                 .watchers
                 .progress(self.id, self.attempt, progress);
         }
@@ -44,14 +44,13 @@ impl HeartbeatStore for SqliteHeartbeat {
         }
         let (id, attempt, options) = (self.id, self.attempt, self.options.clone());
         let progress = *locked(&self.latest);
-        self.writer.write_later(move |connection, _| {
-            leases::beat(connection, &options, id, attempt, progress)
-        });
+        self.writer
+            .write_later(move |sql, _| leases::beat(sql, &options, id, attempt, progress));
     }
 
     fn snapshot_kept(&self) {
         let (id, attempt) = (self.id, self.attempt);
         self.writer
-            .write_later(move |connection, _| leases::snapshot_kept(connection, id, attempt));
+            .write_later(move |sql, _| leases::snapshot_kept(sql, id, attempt));
     }
 }

@@ -7,16 +7,18 @@ use std::time::Duration;
 
 use rusqlite::{Connection, TransactionBehavior};
 
+use crate::queue::database::new_identity;
 use crate::queue::types::QueueError;
 
 /// The schema version that this program reads and writes; stored in `user_version`.
-pub(super) const VERSION: i64 = 6;
+pub(super) const VERSION: i64 = 7;
 
 /// `due` is the next time at which the expiry handles a row: the expiry or the end of the retry
 /// delay of a queued job, the end of a running job's lease, or the end of an ended job's retention.
 /// `ready` is the time since which a job can be leased. It is null while the job follows one that
 /// has not ended. For a sequence it is null until all of its pairs have succeeded and its closing
-/// job is queued.
+/// job is queued. `origin` is the node that accepted a job, and `holder` the node whose worker holds
+/// it or held it last.
 const TABLE: &str = "
 CREATE TABLE jobs (
     seq INTEGER PRIMARY KEY,
@@ -56,6 +58,8 @@ CREATE TABLE jobs (
     expires INTEGER NOT NULL,
     due INTEGER,
     worker TEXT,
+    origin INTEGER NOT NULL,
+    holder INTEGER,
     progress_done INTEGER,
     progress_total INTEGER,
     loss REAL,
@@ -76,6 +80,7 @@ CREATE INDEX jobs_tail ON jobs (tenant, priority, virtual_finish)
     WHERE state < 2 AND (kind = 0 OR ready IS NOT NULL);
 CREATE INDEX jobs_due ON jobs (due) WHERE due IS NOT NULL;
 CREATE INDEX jobs_after ON jobs (after) WHERE after IS NOT NULL AND state < 2;
+CREATE INDEX jobs_ephemeral ON jobs (origin) WHERE durable = 0 AND parent IS NULL AND state < 2;
 CREATE INDEX jobs_age ON jobs (ready) WHERE state = 0 AND ready IS NOT NULL;
 CREATE INDEX jobs_list ON jobs (tenant, id) WHERE parent IS NULL;
 CREATE INDEX jobs_list_by_state ON jobs (tenant, state, id) WHERE parent IS NULL;
@@ -106,21 +111,13 @@ fn open(path: &std::path::Path) -> Result<Connection, QueueError> {
     Ok(connection)
 }
 
-/// A random number that identifies this queue. The payload store records it, to detect a mismatch
-/// of the two.
-fn identity() -> i32 {
-    let bytes = *crate::job::JobId::fresh().as_bytes();
-    // The last bytes of a job id are random. Zero means that a file has no identity.
-    i32::from_le_bytes([bytes[12], bytes[13], bytes[14], bytes[15] | 1])
-}
-
 fn migrate(connection: &mut Connection) -> Result<(), QueueError> {
     let transaction = connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
     let found: i64 = transaction.pragma_query_value(None, "user_version", |row| row.get(0))?;
     match found {
         0 => {
             transaction.execute_batch(TABLE)?;
-            transaction.pragma_update(None, "application_id", identity())?;
+            transaction.pragma_update(None, "application_id", new_identity())?;
             transaction.pragma_update(None, "user_version", VERSION)?;
         }
         VERSION => {}
@@ -139,14 +136,4 @@ fn migrate(connection: &mut Connection) -> Result<(), QueueError> {
     }
     transaction.commit()?;
     Ok(())
-}
-
-impl From<rusqlite::Error> for QueueError {
-    fn from(error: rusqlite::Error) -> Self {
-        // Every database error counts as a fault of the machine, not of a job.
-        match error.sqlite_error_code() {
-            Some(rusqlite::ErrorCode::DiskFull) => Self::Full(error.to_string()),
-            _ => Self::Store(error.to_string()),
-        }
-    }
 }

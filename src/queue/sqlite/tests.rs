@@ -6,11 +6,15 @@ use std::time::{Duration, Instant};
 use rusqlite::params;
 use tokio::sync::mpsc;
 
-use super::store::SqliteQueue;
-use super::{expiry, fair_queue, leases, schema};
+use super::engine::{SqliteEngine, open_sqlite};
+use super::schema;
+use super::statements::SqliteSql;
 use crate::job::{DeviceKind, State};
 use crate::queue::contract_tests::{Stand, queue_contract, submission};
+use crate::queue::database::Engine;
 use crate::queue::lease::Signal;
+use crate::queue::sql::for_sqlite;
+use crate::queue::transitions::{expiry, fair_queue, leases};
 use crate::queue::types::{Event, Queue, QueueError, QueueOptions};
 
 /// A folder in which the queue is opened repeatedly.
@@ -23,13 +27,16 @@ impl Folder {
 }
 
 impl Stand for Folder {
-    fn open(&mut self, options: QueueOptions) -> (Arc<dyn Queue>, mpsc::UnboundedReceiver<Event>) {
+    async fn open(
+        &mut self,
+        options: QueueOptions,
+    ) -> (Arc<dyn Queue>, mpsc::UnboundedReceiver<Event>) {
         let (events, heard) = mpsc::unbounded_channel();
         // The previous queue may release its lock with a delay.
         let patience = Instant::now() + Duration::from_secs(10);
         loop {
-            match SqliteQueue::open(self.0.path(), options.clone(), events.clone()) {
-                Ok(queue) => return (Arc::new(queue), heard),
+            match open_sqlite(self.0.path(), options.clone(), events.clone()) {
+                Ok(queue) => return (queue, heard),
                 Err(error) => assert!(Instant::now() < patience, "{error}"),
             }
             std::thread::yield_now();
@@ -37,7 +44,7 @@ impl Stand for Folder {
     }
 }
 
-queue_contract!(Folder::new());
+queue_contract!(Some(Folder::new()));
 
 /// Rows in the table of the query plan test.
 const BACKLOG: u32 = 20_000;
@@ -45,7 +52,7 @@ const BACKLOG: u32 = 20_000;
 /// The query plan of a statement.
 fn plan(connection: &rusqlite::Connection, sql: &str, parameters: usize) -> String {
     let mut statement = connection
-        .prepare(&format!("EXPLAIN QUERY PLAN {sql}"))
+        .prepare(&format!("EXPLAIN QUERY PLAN {}", for_sqlite(sql)))
         .expect("a good statement");
     let values = vec![0i64; parameters];
     let details = statement
@@ -70,9 +77,9 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
                  durable, delayed, attempt, failures, crashes, delays, cost, virtual_start, \
                  virtual_finish, options, created, expires, due, error_retryable, dead, \
                  cancel_requested, device, backward, after, has_dependents, ready, closes, \
-                 sees_from, sees_to) \
+                 sees_from, sees_to, origin) \
                  VALUES (?1, 't', 0, 0, 0, 0, ?2, 0, 1, 0, 0, 0, 0, 0, \
-                 1.0, ?1, ?1 + 1, '{}', ?1, 9, 9, 0, 0, 0, ?3, 0, ?1, 0, ?1, 0, 0, 2)",
+                 1.0, ?1, ?1 + 1, '{}', ?1, 9, 9, 0, 0, 0, ?3, 0, ?1, 0, ?1, 0, 0, 2, 0)",
                 params![row, row % 3, row / 3 % 3],
             )
             .expect("a row");
@@ -83,47 +90,33 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
     let claim = plan(&connection, leases::FIRST_READY, 1);
     assert!(claim.contains("jobs_ready (device=?)"), "{claim}");
     for (sql, parameters) in [
-        (leases::FIRST_READY.to_owned(), 1),
-        (fair_queue::FOLLOWERS.to_owned(), 1),
-        (
-            "SELECT ready FROM jobs INDEXED BY jobs_age WHERE state = 0 AND ready IS NOT NULL \
-             ORDER BY ready LIMIT 1"
-                .to_owned(),
-            0,
-        ),
-        (
-            "SELECT min(virtual_start) FROM jobs INDEXED BY jobs_ready WHERE state = 0 AND \
-             ready IS NOT NULL AND delayed = 0 AND device = ?1 AND priority = ?2"
-                .to_owned(),
-            2,
-        ),
-        (
-            "SELECT max(virtual_finish) FROM jobs INDEXED BY jobs_tail WHERE state < 2 AND \
-             kind = 0 AND tenant = ?1 AND priority = ?2"
-                .to_owned(),
-            2,
-        ),
-        (
-            "SELECT min(due) FROM jobs INDEXED BY jobs_due WHERE due IS NOT NULL".to_owned(),
-            0,
-        ),
+        (leases::FIRST_READY, 1),
+        (fair_queue::FOLLOWERS, 1),
+        (fair_queue::FIRST_TAG, 2),
+        (fair_queue::LAST_OF_TENANT, 2),
+        (expiry::OLDEST, 0),
+        (expiry::NEXT_DUE, 0),
     ] {
-        let plan = plan(&connection, &sql, parameters);
+        let plan = plan(&connection, sql, parameters);
         assert!(!plan.contains("TEMP B-TREE"), "{sql}: {plan}");
         assert!(
             !plan.contains("SCAN jobs") || plan.contains("INDEX"),
             "{sql}: {plan}"
         );
     }
-    assert!(expiry::next_due(&connection).expect("an answer").is_some());
+    assert!(
+        expiry::next_due(&SqliteSql(&connection))
+            .expect("an answer")
+            .is_some()
+    );
 }
 
-#[test]
-fn a_second_process_is_refused_by_name() {
+#[tokio::test]
+async fn a_second_process_is_refused_by_name() {
     let mut folder = Folder::new();
-    let first = folder.open(QueueOptions::default());
+    let first = folder.open(QueueOptions::default()).await;
     let (events, _) = mpsc::unbounded_channel();
-    let second = SqliteQueue::open(folder.0.path(), QueueOptions::default(), events);
+    let second = open_sqlite(folder.0.path(), QueueOptions::default(), events);
     let error = second.err().expect("a refusal").to_string();
     assert!(error.contains("another process has the queue"), "{error}");
     drop(first);
@@ -151,7 +144,7 @@ fn a_file_of_another_version_is_refused_with_what_to_do_and_left_alone() {
 async fn submissions_at_the_same_time_share_commits_and_all_stand() {
     const JOBS: usize = 200;
     let mut folder = Folder::new();
-    let (queue, _events) = folder.open(QueueOptions::default());
+    let (queue, _events) = folder.open(QueueOptions::default()).await;
     let mut submissions = tokio::task::JoinSet::new();
     for _ in 0..JOBS {
         let queue = Arc::clone(&queue);
@@ -165,7 +158,7 @@ async fn submissions_at_the_same_time_share_commits_and_all_stand() {
     }
     assert_eq!(queue.backlog().queued().jobs, JOBS as u64);
     drop(queue);
-    let (queue, _events) = folder.open(QueueOptions::default());
+    let (queue, _events) = folder.open(QueueOptions::default()).await;
     assert_eq!(queue.backlog().queued().jobs, JOBS as u64);
 }
 
@@ -176,7 +169,7 @@ async fn a_lease_ends_by_signs_of_life_and_not_by_the_clock() {
         lease: Duration::from_secs(3),
         ..QueueOptions::default()
     };
-    let (queue, mut heard) = folder.open(options);
+    let (queue, mut heard) = folder.open(options).await;
     queue.submit(submission("a")).await.expect("accepted");
     let held = queue
         .lease("worker", DeviceKind::Cpu)
@@ -221,7 +214,7 @@ async fn a_job_that_an_orderly_stop_could_not_give_back_is_not_blamed() {
         ..QueueOptions::default()
     };
     let mut folder = Folder::new();
-    let (mut queue, _heard) = folder.open(options.clone());
+    let (mut queue, _heard) = folder.open(options.clone()).await;
     let job = submission("a");
     let (id, tenant) = (job.id, job.tenant.clone());
     queue.submit(job).await.expect("accepted");
@@ -231,9 +224,9 @@ async fn a_job_that_an_orderly_stop_could_not_give_back_is_not_blamed() {
             .await
             .expect("a lease");
         assert_eq!(held.job.id, id);
-        queue.stopped();
+        queue.stopped().await;
         drop((held, queue));
-        (queue, _) = folder.open(options.clone());
+        (queue, _) = folder.open(options.clone()).await;
     }
     // A restart without a graceful shutdown counts as a crash.
     let held = queue
@@ -241,7 +234,7 @@ async fn a_job_that_an_orderly_stop_could_not_give_back_is_not_blamed() {
         .await
         .expect("a lease");
     drop((held, queue));
-    let (queue, _heard) = folder.open(options);
+    let (queue, _heard) = folder.open(options).await;
     let job = queue.job(&tenant, id).await.expect("known");
     assert_eq!(job.state, State::Failed);
 }
@@ -250,11 +243,11 @@ async fn a_job_that_an_orderly_stop_could_not_give_back_is_not_blamed() {
 async fn a_queue_says_when_its_thread_has_ended() {
     let (events, _heard) = mpsc::unbounded_channel();
     let folder = Folder::new();
-    let queue = SqliteQueue::open(folder.0.path(), QueueOptions::default(), events);
-    let queue = queue.expect("a queue");
-    let ended = queue.shared.ended.clone();
-    assert!(!ended.is_cancelled());
-    drop(queue);
-    let ended = tokio::time::timeout(Duration::from_secs(20), ended.cancelled());
+    let engine = SqliteEngine::open(folder.0.path(), &QueueOptions::default(), events);
+    let engine = engine.expect("a queue");
+    let local = Arc::clone(engine.local());
+    assert!(!local.ended.is_cancelled());
+    drop(engine);
+    let ended = tokio::time::timeout(Duration::from_secs(20), local.ended.cancelled());
     ended.await.expect("in time");
 }

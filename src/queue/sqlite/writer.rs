@@ -11,10 +11,12 @@ use std::time::{Duration, Instant};
 use rusqlite::Connection;
 use tokio::sync::oneshot;
 
-use super::effects::Effects;
-use super::expiry;
-use super::shared::Shared;
+use super::statements::SqliteSql;
 use crate::clock::Timestamp;
+use crate::queue::effects::Effects;
+use crate::queue::local::Local;
+use crate::queue::sql::Sql;
+use crate::queue::transitions::expiry;
 use crate::queue::types::{QueueError, QueueOptions};
 
 /// Maximum number of changes in one transaction.
@@ -45,15 +47,15 @@ impl Writer {
     pub(super) fn start(
         connection: Connection,
         options: QueueOptions,
-        shared: Arc<Shared>,
+        local: Arc<Local>,
     ) -> Result<Self, QueueError> {
         let (commands, inbox) = channel();
         let thread = thread::Builder::new().name("queue".to_owned());
-        let ended = shared.ended.clone();
+        let ended = local.ended.clone();
         thread
             .spawn(move || {
                 let _even_by_a_panic = ended.drop_guard();
-                run(&connection, &options, &shared, &inbox);
+                run(&connection, &options, &local, &inbox);
             })
             .map_err(|error| QueueError::Store(error.to_string()))?;
         Ok(Self { commands })
@@ -63,12 +65,12 @@ impl Writer {
     pub(super) async fn write<T: Send + 'static>(
         &self,
         durable: bool,
-        change: impl FnOnce(&Connection, &mut Effects) -> Result<T, QueueError> + Send + 'static,
+        change: impl FnOnce(&dyn Sql, &mut Effects) -> Result<T, QueueError> + Send + 'static,
     ) -> Result<T, QueueError> {
         let (answer, answered) = oneshot::channel();
         let change: Change = Box::new(move |connection, effects| {
             let mut own = Effects::default();
-            let done = in_savepoint(connection, || change(connection, &mut own));
+            let done = in_savepoint(connection, |sql| change(sql, &mut own));
             if done.is_ok() {
                 effects.merge(own);
             }
@@ -87,10 +89,10 @@ impl Writer {
     /// Makes a change without waiting for it.
     pub(super) fn write_later(
         &self,
-        change: impl FnOnce(&Connection, &mut Effects) -> Result<(), QueueError> + Send + 'static,
+        change: impl FnOnce(&dyn Sql, &mut Effects) -> Result<(), QueueError> + Send + 'static,
     ) {
         let change: Change = Box::new(move |connection, effects| {
-            let done = in_savepoint(connection, || change(connection, effects));
+            let done = in_savepoint(connection, |sql| change(sql, effects));
             Box::new(move |committed| {
                 if let Err(error) = committed.and(done) {
                     tracing::warn!(%error, "a note of progress was not kept");
@@ -109,10 +111,10 @@ impl Writer {
 /// continues.
 fn in_savepoint<T>(
     connection: &Connection,
-    change: impl FnOnce() -> Result<T, QueueError>,
+    change: impl FnOnce(&dyn Sql) -> Result<T, QueueError>,
 ) -> Result<T, QueueError> {
     connection.prepare_cached("SAVEPOINT change")?.execute([])?;
-    let done = change();
+    let done = change(&SqliteSql(connection));
     if done.is_err() {
         connection
             .prepare_cached("ROLLBACK TO change")?
@@ -127,7 +129,7 @@ fn in_savepoint<T>(
 fn commit(
     connection: &Connection,
     options: &QueueOptions,
-    shared: &Shared,
+    local: &Local,
     commands: Vec<Command>,
     sweep_at: Option<Instant>,
 ) -> bool {
@@ -144,9 +146,14 @@ fn commit(
                 swept = true;
                 return;
             };
-            let lease_left = |id| shared.lease_left(id, options.lease, now);
             let mut own = Effects::default();
-            let sweep = || expiry::sweep(connection, &mut own, options, lease_left);
+            let sweep = |sql: &dyn Sql| {
+                for id in expiry::due(sql)? {
+                    let left = local.lease_left(id, options.lease, now);
+                    expiry::look_after(sql, &mut own, options, id, left)?;
+                }
+                Ok(())
+            };
             match in_savepoint(connection, sweep) {
                 Ok(()) => {
                     swept = true;
@@ -160,7 +167,7 @@ fn commit(
         },
     );
     if done.is_ok() {
-        shared.apply(effects);
+        local.apply(effects);
     } else if !connection.is_autocommit() {
         let _rolled_back = connection.execute_batch("ROLLBACK");
     }
@@ -170,13 +177,8 @@ fn commit(
     swept && done.is_ok()
 }
 
-fn run(
-    connection: &Connection,
-    options: &QueueOptions,
-    shared: &Shared,
-    inbox: &Receiver<Command>,
-) {
-    let mut next_due = expiry::next_due(connection).unwrap_or(None);
+fn run(connection: &Connection, options: &QueueOptions, local: &Local, inbox: &Receiver<Command>) {
+    let mut next_due = expiry::next_due(&SqliteSql(connection)).unwrap_or(None);
     let mut awake = Instant::now();
     loop {
         let now = Timestamp::now();
@@ -198,7 +200,7 @@ fn run(
         let was_away = awake.elapsed() > MAX_SLEEP + options.lease / 2;
         awake = Instant::now();
         if was_away {
-            shared.all_are_alive();
+            local.all_are_alive();
         }
         let sweeping = next_due.is_some_and(|due| due <= Timestamp::now());
         if commands.is_empty() && !sweeping {
@@ -207,13 +209,13 @@ fn run(
         let swept = commit(
             connection,
             options,
-            shared,
+            local,
             commands,
             sweeping.then_some(awake),
         );
         // A store that fails is not asked again at once.
         let later = Some(Timestamp::now().after(MAX_SLEEP));
-        next_due = match expiry::next_due(connection) {
+        next_due = match expiry::next_due(&SqliteSql(connection)) {
             Ok(due) if swept => due,
             Ok(due) => due.max(later),
             Err(error) => {
@@ -269,7 +271,7 @@ mod tests {
             .execute_batch("CREATE TABLE t (x)")
             .expect("a table");
         let insert = |connection: &Connection, _: &mut Effects| -> Reply {
-            let done = in_savepoint(connection, || {
+            let done = in_savepoint(connection, |_| {
                 Ok(connection.execute("INSERT INTO t VALUES (1)", [])?)
             });
             Box::new(move |committed| assert!(committed.and(done.map(drop)).is_err()))

@@ -3,21 +3,20 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use rusqlite::{Connection, OptionalExtension, params};
-
-use super::effects::Effects;
 use super::finish::{End, end};
 use super::rows;
 use super::rows::{COLUMNS, device_code};
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, State};
+use crate::queue::effects::Effects;
+use crate::queue::sql::{Sql, values};
 use crate::queue::types::{Committed, Event, Outcome, QueueError, QueueOptions};
 
-/// The statement that finds the first ready job of one device requirement. The query plan test also
-/// uses it.
-pub(super) const FIRST_READY: &str = "SELECT priority, virtual_start, seq FROM jobs \
+/// The statement that finds the first ready job of one device requirement. A job that another
+/// transaction is claiming is passed over. The query plan test also uses it.
+pub(in crate::queue) const FIRST_READY: &str = "SELECT priority, virtual_start, seq FROM jobs \
     INDEXED BY jobs_ready WHERE state = 0 AND ready IS NOT NULL AND delayed = 0 AND device = ?1 \
-    ORDER BY priority DESC, virtual_start, seq LIMIT 1";
+    ORDER BY priority DESC, virtual_start, seq LIMIT 1 FOR UPDATE SKIP LOCKED";
 
 /// Limit and back-off of storage failures that affect a single job. With the default retry delay
 /// the delays add up to about half an hour.
@@ -30,15 +29,13 @@ type BacklogKey = (core::cmp::Reverse<i64>, f64, i64);
 
 /// The first ready job among those for any device and those for this kind. Two index lookups, so
 /// that the jobs that wait for the other kind cost nothing.
-fn first_ready(connection: &Connection, kind: DeviceKind) -> Result<Option<i64>, QueueError> {
-    let mut statement = connection.prepare_cached(FIRST_READY)?;
+fn first_ready(sql: &dyn Sql, kind: DeviceKind) -> Result<Option<i64>, QueueError> {
     let mut first: Option<BacklogKey> = None;
     for need in [None, Some(kind)] {
-        let found: Option<BacklogKey> = statement
-            .query_row([device_code(need)], |row| {
-                Ok((core::cmp::Reverse(row.get(0)?), row.get(1)?, row.get(2)?))
-            })
-            .optional()?;
+        let found = match sql.first(FIRST_READY, values![device_code(need)])? {
+            None => None,
+            Some(row) => Some((core::cmp::Reverse(row.get(0)?), row.get(1)?, row.get(2)?)),
+        };
         let earlier = |one: BacklogKey, other: BacklogKey| if other < one { other } else { one };
         first = first.into_iter().chain(found).reduce(earlier);
     }
@@ -46,29 +43,31 @@ fn first_ready(connection: &Connection, kind: DeviceKind) -> Result<Option<i64>,
 }
 
 /// Leases the next job to `worker`, whose device is of this kind.
-pub(super) fn claim(
-    connection: &Connection,
+pub(in crate::queue) fn claim(
+    sql: &dyn Sql,
     effects: &mut Effects,
     options: &QueueOptions,
     worker: &str,
     kind: DeviceKind,
 ) -> Result<Option<Arc<Job>>, QueueError> {
-    let Some(seq) = first_ready(connection, kind)? else {
+    let Some(seq) = first_ready(sql, kind)? else {
         return Ok(None);
     };
-    let now = Timestamp::now();
-    let sql = format!(
-        "UPDATE jobs SET state = 1, attempt = attempt + 1, worker = ?1, due = ?2, \
-         started = coalesce(started, ?3) WHERE seq = ?4 RETURNING {COLUMNS}"
+    let now = sql.now();
+    let text = format!(
+        "UPDATE jobs SET state = 1, attempt = attempt + 1, worker = ?1, holder = ?2, due = ?3, \
+         started = coalesce(started, ?4) WHERE seq = ?5 RETURNING {COLUMNS}"
     );
-    let mut statement = connection.prepare_cached(&sql)?;
-    let until = now.after(options.lease).as_millis();
-    let job = statement
-        .query_row(params![worker, until, now.as_millis(), seq], rows::job)
-        .optional()?;
-    let Some(job) = job.map(Arc::new) else {
+    let until = now.after(options.lease);
+    let row = sql.first(&text, values![worker, sql.node(), until, now, seq])?;
+    let Some(row) = row else {
         return Ok(None);
     };
+    let mut job = rows::job(&row)?;
+    // The worker compares it with its own clock.
+    let by_own_clock = |deadline: Timestamp| deadline.on_clock_ahead(-sql.ahead_ms());
+    job.deadline = job.deadline.map(by_own_clock);
+    let job = Arc::new(job);
     effects.left.push(Arc::clone(&job));
     effects.started.push(Arc::clone(&job));
     effects.changed.push(Arc::clone(&job));
@@ -76,78 +75,72 @@ pub(super) fn claim(
         effects.events.push(Event::Started(Arc::clone(&job)));
     }
     if let Some(parent) = job.parent {
-        let sql = format!(
-            "UPDATE jobs SET state = 1, started = coalesce(started, ?2) \
-             WHERE id = ?1 AND state = 0 RETURNING {COLUMNS}"
+        // A transaction that holds the sequence may be waiting for this pair. The sequence is then
+        // left as it is, and the claim of its next pair starts it.
+        let text = format!(
+            "UPDATE jobs SET state = 1, started = coalesce(started, ?2) WHERE id = (SELECT id FROM \
+             jobs INDEXED BY jobs_id WHERE id = ?1 AND state = 0 FOR UPDATE SKIP LOCKED) \
+             RETURNING {COLUMNS}"
         );
-        let mut statement = connection.prepare_cached(&sql)?;
-        let begun = statement
-            .query_row(params![parent.as_bytes(), now.as_millis()], rows::job)
-            .optional()?;
-        effects.changed.extend(begun.map(Arc::new));
+        if let Some(begun) = sql.first(&text, values![parent, now])? {
+            effects.changed.push(Arc::new(rows::job(&begun)?));
+        }
     }
     Ok(Some(job))
 }
 
 /// Renews a lease and records progress. No effect if the lease is lost.
-pub(super) fn beat(
-    connection: &Connection,
+pub(in crate::queue) fn beat(
+    sql: &dyn Sql,
     options: &QueueOptions,
     id: JobId,
     attempt: u32,
     progress: Option<JobProgress>,
 ) -> Result<(), QueueError> {
-    let sql = "UPDATE jobs SET due = ?3, progress_done = coalesce(?4, progress_done), \
+    let text = "UPDATE jobs SET due = ?3, progress_done = coalesce(?4, progress_done), \
                progress_total = coalesce(?5, progress_total), loss = coalesce(?6, loss) \
                WHERE id = ?1 AND attempt = ?2 AND state = 1";
-    connection.prepare_cached(sql)?.execute(params![
-        id.as_bytes(),
+    let parameters = values![
+        id,
         attempt,
-        Timestamp::now().after(options.lease).as_millis(),
+        sql.now().after(options.lease),
         progress.map(|progress| progress.done),
         progress.map(|progress| progress.total),
         progress.map(|progress| progress.loss),
-    ])?;
+    ];
+    sql.query(text, parameters)?;
     Ok(())
 }
 
 /// Sets the remaining lease of a job whose worker is alive.
-pub(super) fn prolong(
-    connection: &Connection,
-    id: JobId,
-    left: Duration,
-) -> Result<(), QueueError> {
-    let until = Timestamp::now().after(left).as_millis();
-    connection
-        .prepare_cached("UPDATE jobs SET due = ?2 WHERE id = ?1 AND state = 1")?
-        .execute(params![id.as_bytes(), until])?;
+pub(super) fn prolong(sql: &dyn Sql, id: JobId, left: Duration) -> Result<(), QueueError> {
+    let text = "UPDATE jobs SET due = ?2 WHERE id = ?1 AND state = 1";
+    sql.query(text, values![id, sql.now().after(left)])?;
     Ok(())
 }
 
 /// Resets the crash counter after a snapshot.
-pub(super) fn snapshot_kept(
-    connection: &Connection,
+pub(in crate::queue) fn snapshot_kept(
+    sql: &dyn Sql,
     id: JobId,
     attempt: u32,
 ) -> Result<(), QueueError> {
-    let sql = "UPDATE jobs SET crashes = 0 WHERE id = ?1 AND attempt = ?2 AND state = 1";
-    connection
-        .prepare_cached(sql)?
-        .execute(params![id.as_bytes(), attempt])?;
+    let text = "UPDATE jobs SET crashes = 0 WHERE id = ?1 AND attempt = ?2 AND state = 1";
+    sql.query(text, values![id, attempt])?;
     Ok(())
 }
 
 /// Ends an attempt. The attempt number is the fencing token: only the attempt that holds the job
 /// counts.
-pub(super) fn finish(
-    connection: &Connection,
+pub(in crate::queue) fn finish(
+    sql: &dyn Sql,
     effects: &mut Effects,
     options: &QueueOptions,
     id: JobId,
     attempt: u32,
     outcome: Outcome,
 ) -> Result<Committed, QueueError> {
-    let job = match rows::find(connection, id)? {
+    let job = match rows::lock(sql, id)? {
         Some(job) if job.state == State::Running && job.attempt == attempt => job,
         _ => return Ok(Committed::Fenced),
     };
@@ -160,7 +153,7 @@ pub(super) fn finish(
     let state = match outcome {
         Outcome::Cancelled => {
             let how = End::default();
-            end(connection, effects, options, &job, State::Cancelled, &how)?
+            end(sql, effects, options, &job, State::Cancelled, &how)?
         }
         Outcome::Succeeded {
             stop_reason,
@@ -173,90 +166,87 @@ pub(super) fn finish(
                 progress,
                 ..End::default()
             };
-            end(connection, effects, options, &job, State::Succeeded, &how)?
+            end(sql, effects, options, &job, State::Succeeded, &how)?
         }
-        Outcome::Released => requeue_running(connection, effects, &job, Duration::ZERO)?,
+        Outcome::Released => requeue_running(sql, effects, &job, Duration::ZERO)?,
         Outcome::Moved(kind) => {
-            let sql = "UPDATE jobs SET device = ?2 WHERE id = ?1";
-            connection
-                .prepare_cached(sql)?
-                .execute(params![id.as_bytes(), device_code(Some(kind))])?;
-            let job = rows::get(connection, id)?;
-            requeue_running(connection, effects, &job, Duration::ZERO)?
+            let text = "UPDATE jobs SET device = ?2 WHERE id = ?1";
+            sql.query(text, values![id, device_code(Some(kind))])?;
+            let job = rows::get(sql, id)?;
+            requeue_running(sql, effects, &job, Duration::ZERO)?
         }
-        Outcome::Delayed(error) => delay(connection, effects, options, &job, error)?,
-        Outcome::Crashed(error) => crash(connection, effects, options, &job, error)?,
-        Outcome::Failed(error) => fail(connection, effects, options, &job, error)?,
+        Outcome::Delayed(error) => delay(sql, effects, options, &job, error)?,
+        Outcome::Crashed(error) => crash(sql, effects, options, &job, error)?,
+        Outcome::Failed(error) => fail(sql, effects, options, &job, error)?,
     };
     Ok(Committed::Yes(state))
 }
 
 /// Counts a failure: the job is retried after a delay, or ends.
 pub(super) fn fail(
-    connection: &Connection,
+    sql: &dyn Sql,
     effects: &mut Effects,
     options: &QueueOptions,
     job: &Job,
     error: JobError,
 ) -> Result<State, QueueError> {
-    let failures = count(connection, job, "failures")?;
+    let failures = count(sql, job, "failures")?;
     if error.retryable && failures < options.max_attempts {
         let doublings = (failures - 1).min(10);
         let delay = options.retry_delay.saturating_mul(1 << doublings);
-        return requeue_running(connection, effects, job, delay);
+        return requeue_running(sql, effects, job, delay);
     }
     let how = End {
         dead: error.retryable,
         error: Some(error),
         ..End::default()
     };
-    end(connection, effects, options, job, State::Failed, &how)
+    end(sql, effects, options, job, State::Failed, &how)
 }
 
 /// Counts a storage failure that affects only this job: it is requeued with growing delays, and
 /// becomes a dead letter in the end.
 fn delay(
-    connection: &Connection,
+    sql: &dyn Sql,
     effects: &mut Effects,
     options: &QueueOptions,
     job: &Job,
     error: JobError,
 ) -> Result<State, QueueError> {
-    let delays = count(connection, job, "delays")?;
+    let delays = count(sql, job, "delays")?;
     if delays < MAX_DELAYS {
         let first = FIRST_DELAY.max(options.retry_delay);
         let longer = first.saturating_mul(1 << delays.min(12)).min(LONGEST_DELAY);
-        return requeue_running(connection, effects, job, longer);
+        return requeue_running(sql, effects, job, longer);
     }
-    give_up(connection, effects, options, job, error)
+    give_up(sql, effects, options, job, error)
 }
 
 /// Counts a crash: the job is retried at once, or becomes a dead letter.
 pub(super) fn crash(
-    connection: &Connection,
+    sql: &dyn Sql,
     effects: &mut Effects,
     options: &QueueOptions,
     job: &Job,
     error: JobError,
 ) -> Result<State, QueueError> {
-    let crashes = count(connection, job, "crashes")?;
+    let crashes = count(sql, job, "crashes")?;
     if crashes < options.max_crashes {
-        return requeue_running(connection, effects, job, Duration::ZERO);
+        return requeue_running(sql, effects, job, Duration::ZERO);
     }
-    give_up(connection, effects, options, job, error)
+    give_up(sql, effects, options, job, error)
 }
 
 /// Increments a counter column of a job and returns its new value.
-fn count(connection: &Connection, job: &Job, counter: &str) -> Result<u32, QueueError> {
-    let sql =
+fn count(sql: &dyn Sql, job: &Job, counter: &str) -> Result<u32, QueueError> {
+    let text =
         format!("UPDATE jobs SET {counter} = {counter} + 1 WHERE id = ?1 RETURNING {counter}");
-    let mut statement = connection.prepare_cached(&sql)?;
-    Ok(statement.query_row([job.id.as_bytes()], |row| row.get(0))?)
+    sql.only(&text, values![job.id])?.get(0)
 }
 
 /// Ends a job as a dead letter.
 fn give_up(
-    connection: &Connection,
+    sql: &dyn Sql,
     effects: &mut Effects,
     options: &QueueOptions,
     job: &Job,
@@ -267,25 +257,24 @@ fn give_up(
         dead: true,
         ..End::default()
     };
-    end(connection, effects, options, job, State::Failed, &how)
+    end(sql, effects, options, job, State::Failed, &how)
 }
 
 /// Requeues a running job at its previous position. The attempt that held it is fenced off.
 pub(super) fn requeue_running(
-    connection: &Connection,
+    sql: &dyn Sql,
     effects: &mut Effects,
     job: &Job,
     delay: Duration,
 ) -> Result<State, QueueError> {
-    let sql = format!(
+    let text = format!(
         "UPDATE jobs SET state = 0, worker = NULL, delayed = ?2, \
-         due = CASE WHEN ?2 THEN min(?3, expires) ELSE expires END \
+         due = CASE WHEN ?2 = 1 AND ?3 < expires THEN ?3 ELSE expires END \
          WHERE id = ?1 RETURNING {COLUMNS}"
     );
-    let until = Timestamp::now().after(delay).as_millis();
-    let mut statement = connection.prepare_cached(&sql)?;
-    let parameters = params![job.id.as_bytes(), !delay.is_zero(), until];
-    let queued = Arc::new(statement.query_row(parameters, rows::job)?);
+    let until = sql.now().after(delay);
+    let row = sql.only(&text, values![job.id, !delay.is_zero(), until])?;
+    let queued = Arc::new(rows::job(&row)?);
     effects.stopped.push(Arc::clone(&queued));
     effects.entered.push(Arc::clone(&queued));
     effects.changed.push(Arc::clone(&queued));

@@ -1,9 +1,8 @@
-//! Conversion between database rows and jobs.
-
-use rusqlite::{Connection, OptionalExtension, Row};
+//! Conversion between rows and jobs, and the locks of rows.
 
 use crate::clock::Timestamp;
-use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, State, Tenant};
+use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, State};
+use crate::queue::sql::{Row, Sql, values};
 use crate::queue::types::QueueError;
 
 /// The columns that [`job`] reads, in its order.
@@ -45,10 +44,6 @@ pub(super) fn device_code(device: Option<DeviceKind>) -> i64 {
 pub(super) const DEVICES: [Option<DeviceKind>; 3] =
     [None, Some(DeviceKind::Cpu), Some(DeviceKind::Gpu)];
 
-pub(super) fn device_at(row: &Row<'_>, column: usize) -> rusqlite::Result<Option<DeviceKind>> {
-    from_code(row, column, &DEVICES)
-}
-
 pub(super) fn kind_code(kind: Kind) -> i64 {
     match kind {
         Kind::Pair => 0,
@@ -56,50 +51,26 @@ pub(super) fn kind_code(kind: Kind) -> i64 {
     }
 }
 
-/// Decodes a column as an index into a list of all values.
-fn from_code<T: Copy>(row: &Row<'_>, column: usize, all: &[T]) -> rusqlite::Result<T> {
-    let code: i64 = row.get(column)?;
-    let found = usize::try_from(code).ok().and_then(|code| all.get(code));
-    found
-        .copied()
-        .ok_or(rusqlite::Error::IntegralValueOutOfRange(column, code))
-}
-
-pub(super) fn priority_at(row: &Row<'_>, column: usize) -> rusqlite::Result<Priority> {
-    from_code(row, column, &Priority::ALL)
-}
-
-pub(super) fn tenant_at(row: &Row<'_>, column: usize) -> rusqlite::Result<Tenant> {
-    let name: String = row.get(column)?;
-    name.parse()
-        .map_err(|_| rusqlite::Error::InvalidColumnType(column, name, rusqlite::types::Type::Text))
-}
-
 /// Converts one row to a job.
-pub(super) fn job(row: &Row<'_>) -> rusqlite::Result<Job> {
-    let moment = |column: usize| -> rusqlite::Result<Option<Timestamp>> {
-        let millis: Option<i64> = row.get(column)?;
-        Ok(millis.map(Timestamp::from_millis))
-    };
+pub(super) fn job(row: &Row) -> Result<Job, QueueError> {
+    let moment = |column: usize| row.get::<Option<Timestamp>>(column);
     let done: Option<u32> = row.get(17)?;
     let code: Option<String> = row.get(21)?;
-    let parent: Option<[u8; 16]> = row.get(3)?;
-    let after: Option<[u8; 16]> = row.get(29)?;
     Ok(Job {
-        id: JobId::from_bytes(row.get(0)?),
-        tenant: tenant_at(row, 1)?,
-        kind: from_code(row, 2, &[Kind::Pair, Kind::Sequence])?,
-        parent: parent.map(JobId::from_bytes),
+        id: row.get(0)?,
+        tenant: row.get(1)?,
+        kind: row.choice(2, &[Kind::Pair, Kind::Sequence])?,
+        parent: row.get(3)?,
         index: row.get(4)?,
         pairs: row.get(5)?,
         pairs_left: row.get(6)?,
-        priority: priority_at(row, 7)?,
-        state: from_code(row, 8, &State::ALL)?,
+        priority: row.choice(7, &Priority::ALL)?,
+        state: row.choice(8, &State::ALL)?,
         durable: row.get(9)?,
         attempt: row.get(10)?,
         cost_seconds: row.get(11)?,
         options: row.get(12)?,
-        created: Timestamp::from_millis(row.get(13)?),
+        created: row.get(13)?,
         started: moment(14)?,
         finished: moment(15)?,
         deadline: moment(16)?,
@@ -123,9 +94,9 @@ pub(super) fn job(row: &Row<'_>) -> rusqlite::Result<Job> {
         dead: row.get(24)?,
         cancel_requested: row.get(25)?,
         report: row.get(26)?,
-        device: device_at(row, 27)?,
+        device: row.choice(27, &DEVICES)?,
         backward: row.get(28)?,
-        after: after.map(JobId::from_bytes),
+        after: row.get(29)?,
         has_dependents: row.get(30)?,
         ready: moment(31)?,
         window: [row.get(32)?, row.get(33)?],
@@ -134,22 +105,46 @@ pub(super) fn job(row: &Row<'_>) -> rusqlite::Result<Job> {
 }
 
 /// The job with this id, if there is one.
-pub(super) fn find(connection: &Connection, id: JobId) -> Result<Option<Job>, QueueError> {
-    let sql = format!("SELECT {COLUMNS} FROM jobs INDEXED BY jobs_id WHERE id = ?1");
-    let mut statement = connection.prepare_cached(&sql)?;
-    Ok(statement.query_row([id.as_bytes()], job).optional()?)
+pub(in crate::queue) fn find(sql: &dyn Sql, id: JobId) -> Result<Option<Job>, QueueError> {
+    let text = format!("SELECT {COLUMNS} FROM jobs INDEXED BY jobs_id WHERE id = ?1");
+    sql.first(&text, values![id])?.as_ref().map(job).transpose()
 }
 
 /// The job with this id.
-pub(super) fn get(connection: &Connection, id: JobId) -> Result<Job, QueueError> {
-    find(connection, id)?.ok_or(QueueError::NotFound)
+pub(in crate::queue) fn get(sql: &dyn Sql, id: JobId) -> Result<Job, QueueError> {
+    find(sql, id)?.ok_or(QueueError::NotFound)
 }
 
 /// The pairs of a sequence, in the order of submission.
-pub(super) fn pairs(connection: &Connection, parent: JobId) -> Result<Vec<Job>, QueueError> {
-    let sql =
-        format!("SELECT {COLUMNS} FROM jobs INDEXED BY jobs_parent WHERE parent = ?1 ORDER BY seq");
-    let mut statement = connection.prepare_cached(&sql)?;
-    let rows = statement.query_map([parent.as_bytes()], job)?;
-    Ok(rows.collect::<rusqlite::Result<_>>()?)
+pub(in crate::queue) fn pairs(sql: &dyn Sql, parent: JobId) -> Result<Vec<Job>, QueueError> {
+    read_pairs(sql, parent, "")
+}
+
+/// The job with this id, if there is one, until the commit changed by nobody else. Its sequence is
+/// locked with it.
+pub(super) fn lock(sql: &dyn Sql, id: JobId) -> Result<Option<Job>, QueueError> {
+    // Always first the sequence and then its pairs, or two transactions might wait for each other.
+    let sequence = "SELECT id FROM jobs INDEXED BY jobs_id WHERE id = coalesce((SELECT parent FROM \
+                    jobs INDEXED BY jobs_id WHERE id = ?1), ?1) FOR UPDATE";
+    sql.query(sequence, values![id])?;
+    let text = format!("SELECT {COLUMNS} FROM jobs INDEXED BY jobs_id WHERE id = ?1 FOR UPDATE");
+    sql.first(&text, values![id])?.as_ref().map(job).transpose()
+}
+
+/// The same for a job that is expected.
+pub(super) fn lock_known(sql: &dyn Sql, id: JobId) -> Result<Job, QueueError> {
+    lock(sql, id)?.ok_or(QueueError::NotFound)
+}
+
+/// The pairs of a sequence that is locked, in the order of submission, until the commit claimed by
+/// nobody.
+pub(super) fn lock_pairs(sql: &dyn Sql, parent: JobId) -> Result<Vec<Job>, QueueError> {
+    read_pairs(sql, parent, " FOR UPDATE")
+}
+
+fn read_pairs(sql: &dyn Sql, parent: JobId, lock: &str) -> Result<Vec<Job>, QueueError> {
+    let text = format!(
+        "SELECT {COLUMNS} FROM jobs INDEXED BY jobs_parent WHERE parent = ?1 ORDER BY seq{lock}"
+    );
+    sql.query(&text, values![parent])?.iter().map(job).collect()
 }

@@ -2,13 +2,11 @@
 
 use std::sync::Arc;
 
-use rusqlite::{Connection, params};
-
-use super::effects::Effects;
 use super::rows::{COLUMNS, state_code};
 use super::{fair_queue, rows};
-use crate::clock::Timestamp;
 use crate::job::{Job, JobError, JobId, JobProgress, Kind, State};
+use crate::queue::effects::Effects;
+use crate::queue::sql::{Sql, values};
 use crate::queue::types::{Event, QueueError, QueueOptions};
 
 /// Details of a job's end.
@@ -23,38 +21,38 @@ pub(super) struct End {
 
 /// Ends a queued or running job, and closes its sequence with the last pair.
 pub(super) fn end(
-    connection: &Connection,
+    sql: &dyn Sql,
     effects: &mut Effects,
     options: &QueueOptions,
     job: &Job,
     state: State,
     how: &End,
 ) -> Result<State, QueueError> {
-    let now = Timestamp::now();
+    let now = sql.now();
     let kept = if job.durable {
         options.retention
     } else {
         options.answered_retention
     };
     // A pair is forgotten with its sequence.
-    let forget = job.parent.is_none().then(|| now.after(kept).as_millis());
-    let sql = format!(
+    let forget = job.parent.is_none().then(|| now.after(kept));
+    let text = format!(
         "UPDATE jobs SET state = ?2, finished = ?3, due = ?4, stop_reason = ?5, report = ?6, \
          error_code = ?7, error_message = ?8, error_retryable = ?9, dead = ?10, worker = NULL, \
          delayed = 0, progress_done = coalesce(?11, progress_done), \
          progress_total = coalesce(?12, progress_total), loss = coalesce(?13, loss) \
          WHERE id = ?1 RETURNING {COLUMNS}"
     );
-    let mut statement = connection.prepare_cached(&sql)?;
     let error = how.error.as_ref();
-    let ended = Arc::new(statement.query_row(
-        params![
-            job.id.as_bytes(),
+    let row = sql.only(
+        &text,
+        values![
+            job.id,
             state_code(state),
-            now.as_millis(),
+            now,
             forget,
-            how.stop_reason,
-            how.report,
+            how.stop_reason.as_deref(),
+            how.report.as_deref(),
             error.map(|error| error.code.as_str()),
             error.map(|error| error.message.as_str()),
             error.is_some_and(|error| error.retryable),
@@ -63,8 +61,8 @@ pub(super) fn end(
             how.progress.map(|progress| progress.total),
             how.progress.map(|progress| progress.loss),
         ],
-        rows::job,
-    )?);
+    )?;
+    let ended = Arc::new(rows::job(&row)?);
     // A sequence counts in the load only while its closing job is queued or running.
     if job.kind == Kind::Pair || job.ready.is_some() {
         let list = if job.state == State::Running {
@@ -76,15 +74,14 @@ pub(super) fn end(
     }
     effects.changed.push(Arc::clone(&ended));
     effects.events.push(Event::Ended(ended));
-    fair_queue::release_followers(connection, effects, job)?;
+    fair_queue::release_followers(sql, effects, job)?;
     if let Some(parent) = job.parent {
-        let sql = format!(
+        let text = format!(
             "UPDATE jobs SET pairs_left = pairs_left - 1 WHERE id = ?1 RETURNING {COLUMNS}"
         );
-        let mut statement = connection.prepare_cached(&sql)?;
-        let parent = statement.query_row([parent.as_bytes()], rows::job)?;
+        let parent = rows::job(&sql.only(&text, values![parent])?)?;
         if parent.pairs_left == 0 {
-            close_sequence(connection, effects, options, &parent)?;
+            close_sequence(sql, effects, options, &parent)?;
         } else {
             effects.changed.push(Arc::new(parent));
         }
@@ -96,16 +93,16 @@ pub(super) fn end(
 /// first such pair. If all have succeeded, its closing job is queued, or it succeeds if it has
 /// none.
 fn close_sequence(
-    connection: &Connection,
+    sql: &dyn Sql,
     effects: &mut Effects,
     options: &QueueOptions,
     sequence: &Job,
 ) -> Result<(), QueueError> {
-    let pairs = rows::pairs(connection, sequence.id)?;
+    let pairs = rows::pairs(sql, sequence.id)?;
     let broken = pairs.iter().find(|pair| pair.state != State::Succeeded);
     let (state, error) = match broken {
-        None if fair_queue::closes(connection, sequence.id)? => {
-            fair_queue::ready_to_close(connection, effects, options, sequence)?;
+        None if fair_queue::closes(sql, sequence.id)? => {
+            fair_queue::ready_to_close(sql, effects, options, sequence)?;
             return Ok(());
         }
         None => (State::Succeeded, None),
@@ -124,35 +121,35 @@ fn close_sequence(
         error,
         ..End::default()
     };
-    end(connection, effects, options, sequence, state, &how)?;
+    end(sql, effects, options, sequence, state, &how)?;
     Ok(())
 }
 
 /// Cancels a job: a queued job ends at once, a running one through its worker.
-pub(super) fn cancel(
-    connection: &Connection,
+pub(in crate::queue) fn cancel(
+    sql: &dyn Sql,
     effects: &mut Effects,
     options: &QueueOptions,
     id: JobId,
 ) -> Result<Arc<Job>, QueueError> {
-    let job = rows::get(connection, id)?;
+    let job = rows::lock_known(sql, id)?;
     if job.state.is_end() {
         return Ok(Arc::new(job));
     }
-    let sql = "UPDATE jobs SET cancel_requested = 1 WHERE id = ?1";
-    connection.prepare_cached(sql)?.execute([id.as_bytes()])?;
+    let text = "UPDATE jobs SET cancel_requested = 1 WHERE id = ?1";
+    sql.query(text, values![id])?;
     match job.state {
         // Before its closing job, a sequence runs only through its pairs.
         _ if job.pairs_left > 0 => {
-            for pair in rows::pairs(connection, id)? {
+            for pair in rows::lock_pairs(sql, id)? {
                 if !pair.state.is_end() {
-                    cancel(connection, effects, options, pair.id)?;
+                    cancel(sql, effects, options, pair.id)?;
                 }
             }
         }
         State::Queued => {
             end(
-                connection,
+                sql,
                 effects,
                 options,
                 &job,
@@ -162,34 +159,35 @@ pub(super) fn cancel(
         }
         _ => effects.cancel.push(id),
     }
-    let job = Arc::new(rows::get(connection, id)?);
+    let job = Arc::new(rows::get(sql, id)?);
     effects.changed.push(Arc::clone(&job));
     Ok(job)
 }
 
 /// Requeues an ended job; of a sequence, the pairs that did not succeed and the closing job. A job
 /// that has succeeded is requeued only if its result is `lost`.
-pub(super) fn requeue(
-    connection: &Connection,
+pub(in crate::queue) fn requeue(
+    sql: &dyn Sql,
     effects: &mut Effects,
     options: &QueueOptions,
     id: JobId,
     lost: bool,
 ) -> Result<Arc<Job>, QueueError> {
-    let job = rows::get(connection, id)?;
+    let job = rows::lock_known(sql, id)?;
     if !job.state.is_end() || (job.state == State::Succeeded && !lost) {
         return Err(QueueError::NotTerminal(job.state));
     }
     let broken: Vec<Job> = match job.kind {
         Kind::Pair => Vec::new(),
-        Kind::Sequence => rows::pairs(connection, id)?
+        Kind::Sequence => rows::pairs(sql, id)?
             .into_iter()
             .filter(|pair| pair.state != State::Succeeded)
             .collect(),
     };
-    let expires = Timestamp::now().after(options.time_to_live).as_millis();
-    let sql = format!(
-        "UPDATE jobs SET state = 0, durable = 1, pairs_left = ?2, delayed = 0, failures = 0, crashes = 0, delays = 0, \
+    let expires = sql.now().after(options.time_to_live);
+    let text = format!(
+        "UPDATE jobs SET state = 0, durable = 1, pairs_left = ?2, delayed = 0, failures = 0, \
+         crashes = 0, delays = 0, \
          started = NULL, finished = NULL, deadline = NULL, expires = ?3, \
          due = CASE WHEN kind = 0 THEN ?3 END, stop_reason = NULL, report = NULL, \
          error_code = NULL, error_message = NULL, error_retryable = 0, dead = 0, \
@@ -198,12 +196,11 @@ pub(super) fn requeue(
     );
     // Like a new job, it is queued behind the jobs that its tenant has waiting now.
     let again = |job: &Job, left: usize| -> Result<Arc<Job>, QueueError> {
-        let tag = fair_queue::virtual_start(connection, &job.tenant, job.priority)?;
-        let mut statement = connection.prepare_cached(&sql)?;
-        let is_ready = job.kind == Kind::Pair && !fair_queue::is_held_back(connection, job.after)?;
-        let ready = is_ready.then(|| Timestamp::now().as_millis());
-        let parameters = params![job.id.as_bytes(), left as i64, expires, tag, ready];
-        Ok(Arc::new(statement.query_row(parameters, rows::job)?))
+        let is_ready = job.kind == Kind::Pair && !fair_queue::is_held_back(sql, job.after)?;
+        let tag = fair_queue::virtual_start(sql, &job.tenant, job.priority)?;
+        let ready = is_ready.then(|| sql.now());
+        let row = sql.only(&text, values![job.id, left as i64, expires, tag, ready])?;
+        Ok(Arc::new(rows::job(&row)?))
     };
     let mut job = again(&job, broken.len())?;
     let mut queued = Vec::new();
@@ -211,18 +208,17 @@ pub(super) fn requeue(
         queued.push(again(pair, 0)?);
     }
     if job.kind == Kind::Sequence && broken.is_empty() {
-        job = fair_queue::ready_to_close(connection, effects, options, &job)?;
+        job = fair_queue::ready_to_close(sql, effects, options, &job)?;
         effects.events.push(Event::Requeued(Arc::clone(&job)));
     }
     if job.kind == Kind::Pair {
         if let Some(parent) = job.parent {
-            let sql = format!(
-                "UPDATE jobs SET pairs_left = pairs_left + 1, finished = NULL, due = NULL, ready = NULL, \
-                 state = CASE WHEN state = 1 THEN 1 ELSE 0 END, error_code = NULL, dead = 0, \
-                 cancel_requested = 0 WHERE id = ?1 RETURNING {COLUMNS}"
+            let text = format!(
+                "UPDATE jobs SET pairs_left = pairs_left + 1, finished = NULL, due = NULL, \
+                 ready = NULL, state = CASE WHEN state = 1 THEN 1 ELSE 0 END, error_code = NULL, \
+                 dead = 0, cancel_requested = 0 WHERE id = ?1 RETURNING {COLUMNS}"
             );
-            let mut statement = connection.prepare_cached(&sql)?;
-            let parent = statement.query_row([parent.as_bytes()], rows::job)?;
+            let parent = rows::job(&sql.only(&text, values![parent])?)?;
             effects.changed.push(Arc::new(parent));
         }
         queued.push(Arc::clone(&job));
@@ -232,6 +228,39 @@ pub(super) fn requeue(
         effects.changed.push(Arc::clone(&pair));
         effects.entered.push(pair);
     }
+    effects.changed.push(Arc::clone(&job));
+    Ok(job)
+}
+
+/// Cancels an ephemeral job whose caller has disconnected.
+pub(in crate::queue) fn abandon(
+    sql: &dyn Sql,
+    effects: &mut Effects,
+    options: &QueueOptions,
+    id: JobId,
+) -> Result<(), QueueError> {
+    match rows::lock(sql, id)? {
+        Some(job) if !job.durable => cancel(sql, effects, options, id).map(drop),
+        _ => Ok(()),
+    }
+}
+
+/// Makes a job and its pairs durable.
+pub(in crate::queue) fn make_durable(
+    sql: &dyn Sql,
+    effects: &mut Effects,
+    options: &QueueOptions,
+    id: JobId,
+) -> Result<Arc<Job>, QueueError> {
+    let job = rows::lock_known(sql, id)?;
+    if !job.durable && job.cancel_requested {
+        return Err(QueueError::GivenUp);
+    }
+    let text = "UPDATE jobs SET durable = 1, due = CASE WHEN state > 1 AND parent IS NULL \
+                THEN finished + ?2 ELSE due END WHERE id = ?1 OR parent = ?1";
+    let retention = options.retention.as_millis() as i64;
+    sql.query(text, values![id, retention])?;
+    let job = Arc::new(rows::get(sql, id)?);
     effects.changed.push(Arc::clone(&job));
     Ok(job)
 }

@@ -2,8 +2,9 @@
 
 use std::sync::Arc;
 
+use super::backlog::Backlog;
+use super::types::Event;
 use crate::job::{Job, JobId};
-use crate::queue::types::Event;
 
 /// Updates of the backlog, running jobs, subscriptions and events that follow a commit.
 #[derive(Debug, Default)]
@@ -33,5 +34,25 @@ impl Effects {
         self.cancel.extend(other.cancel);
         self.changed.extend(other.changed);
         self.events.extend(other.events);
+    }
+
+    /// Changes the load as the commit did.
+    pub(super) fn change(&self, backlog: &mut Backlog) {
+        // A job may enter and leave in one commit, so entries are counted first.
+        self.entered.iter().for_each(|job| backlog.entered(job));
+        self.left.iter().for_each(|job| backlog.left(job));
+        self.stopped.iter().for_each(|job| backlog.stopped(job));
+        self.started.iter().for_each(|job| backlog.started(job));
+    }
+
+    /// The part that changes the load.
+    pub(super) fn of_load(&self) -> Self {
+        Self {
+            entered: self.entered.clone(),
+            left: self.left.clone(),
+            started: self.started.clone(),
+            stopped: self.stopped.clone(),
+            ..Self::default()
+        }
     }
 }

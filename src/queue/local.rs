@@ -1,0 +1,216 @@
+//! What this process knows of the queue: subscriptions, the backlog, and the jobs its workers hold.
+
+use std::collections::HashMap;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use tokio::sync::futures::Notified;
+use tokio::sync::{Notify, mpsc};
+use tokio_util::sync::CancellationToken;
+
+use super::backlog::Backlog;
+use super::effects::Effects;
+use super::lease::Flags;
+use super::subscriptions::Watchers;
+use super::types::Event;
+use crate::job::{DeviceKind, Job, JobId, State};
+use crate::sync::locked;
+
+/// In-memory state that is updated after each commit.
+pub(super) struct Local {
+    pub(super) watchers: Watchers,
+    pub(super) backlog: Mutex<Backlog>,
+    pub(super) running: Mutex<HashMap<JobId, Running>>,
+    /// Wakes the workers that wait for a job.
+    ready: Notify,
+    /// How often a job may have become ready.
+    changes: AtomicU64,
+    looks: [Look; DeviceKind::ALL.len()],
+    looked: Mutex<Instant>,
+    events: mpsc::UnboundedSender<Event>,
+    /// Cancelled when nothing can be written any more.
+    pub(super) ended: CancellationToken,
+}
+
+/// The last look for a job by the workers of one kind of device.
+#[derive(Debug, Default)]
+struct Look {
+    turn: tokio::sync::Mutex<()>,
+    /// The value of `changes` at which there was no job.
+    empty_at: AtomicU64,
+}
+
+/// A job that a worker of this process holds.
+pub(super) struct Running {
+    pub(super) attempt: u32,
+    pub(super) flags: Arc<Flags>,
+}
+
+impl Local {
+    pub(super) fn new(events: mpsc::UnboundedSender<Event>) -> Self {
+        Self {
+            watchers: Watchers::default(),
+            backlog: Mutex::default(),
+            running: Mutex::default(),
+            ready: Notify::new(),
+            changes: AtomicU64::new(1),
+            looks: Default::default(),
+            looked: Mutex::new(Instant::now()),
+            events,
+            ended: CancellationToken::new(),
+        }
+    }
+
+    /// The remaining lease of a job at `now`, by the last heartbeat on the monotonic clock; `None`
+    /// if it has expired. The lease on disk follows the wall clock, which may be set, and only
+    /// triggers this check.
+    pub(super) fn lease_left(&self, id: JobId, lease: Duration, now: Instant) -> Option<Duration> {
+        let last_beat = locked(&self.running).get(&id)?.flags.last_beat();
+        let left = lease.checked_sub(now.saturating_duration_since(last_beat))?;
+        (!left.is_zero()).then_some(left)
+    }
+
+    /// Counts a heartbeat for every worker, after a pause of the whole process in which they could
+    /// send none.
+    pub(super) fn all_are_alive(&self) {
+        for held in locked(&self.running).values() {
+            held.flags.beat();
+        }
+    }
+
+    /// Applies the effects of a commit.
+    pub(super) fn apply(&self, effects: Effects) {
+        effects.change(&mut locked(&self.backlog));
+        self.apply_to_running(&effects);
+        for job in &effects.changed {
+            self.watchers.push(job);
+        }
+        self.tell(effects);
+    }
+
+    /// Updates the jobs that workers of this process hold.
+    pub(super) fn apply_to_running(&self, effects: &Effects) {
+        let mut running = locked(&self.running);
+        for job in &effects.stopped {
+            if let Some(held) = running.remove(&job.id) {
+                held.flags.mark_lost();
+            }
+        }
+        for job in &effects.started {
+            let held = Running {
+                attempt: job.attempt,
+                flags: Arc::default(),
+            };
+            running.insert(job.id, held);
+        }
+        for job in effects.changed.iter().filter(|job| job.durable) {
+            if let Some(held) = running.get(&job.id) {
+                held.flags.make_durable();
+            }
+        }
+        for id in &effects.cancel {
+            if let Some(held) = running.get(id) {
+                held.flags.cancel();
+            }
+        }
+    }
+
+    /// Wakes the waiting workers and sends the events.
+    pub(super) fn tell(&self, effects: Effects) {
+        if !effects.entered.is_empty() || !effects.changed.is_empty() {
+            self.wake();
+        }
+        for event in effects.events {
+            let _nobody_listens_is_fine = self.events.send(event);
+        }
+    }
+
+    /// Wakes the workers that wait for a job: one may have become ready.
+    pub(super) fn wake(&self) {
+        self.changes.fetch_add(1, Ordering::Relaxed);
+        self.ready.notify_waiters();
+    }
+
+    /// A wait for the next [`Local::wake`] from now on.
+    pub(super) fn woken(&self) -> Notified<'_> {
+        self.ready.notified()
+    }
+
+    /// Has the workers look again, at most once in `interval`.
+    pub(super) fn look_again(&self, interval: Duration) {
+        let mut looked = locked(&self.looked);
+        if looked.elapsed() >= interval {
+            *looked = Instant::now();
+            self.changes.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Looks for a job with `claim`, unless another worker of this kind has just found none. The
+    /// workers of a kind look one after the other, so that many idle ones cost as much as one.
+    pub(super) async fn look<T, E>(
+        &self,
+        kind: DeviceKind,
+        claim: impl Future<Output = Result<Option<T>, E>>,
+    ) -> Result<Option<T>, E> {
+        let look = &self.looks[kind as usize];
+        let _turn = look.turn.lock().await;
+        let changes = self.changes.load(Ordering::Relaxed);
+        if look.empty_at.load(Ordering::Relaxed) == changes {
+            return Ok(None);
+        }
+        let found = claim.await?;
+        if found.is_none() {
+            look.empty_at.store(changes, Ordering::Relaxed);
+        }
+        Ok(found)
+    }
+
+    /// Takes over the state of a job as it was just read, `None` if it was removed: for the worker
+    /// that holds it and for its subscribers.
+    pub(super) fn refresh(&self, id: JobId, job: Option<&Arc<Job>>) {
+        let is_held = {
+            let mut running = locked(&self.running);
+            match (running.get(&id), job) {
+                (None, _) => false,
+                (Some(held), Some(job)) if job.attempt < held.attempt => {
+                    // It was read before it was claimed.
+                    return;
+                }
+                (Some(held), Some(job))
+                    if job.attempt == held.attempt && job.state == State::Running =>
+                {
+                    if job.cancel_requested {
+                        held.flags.cancel();
+                    }
+                    if job.durable {
+                        held.flags.make_durable();
+                    }
+                    true
+                }
+                (Some(held), _) => {
+                    held.flags.mark_lost();
+                    running.remove(&id);
+                    false
+                }
+            }
+        };
+        match job {
+            Some(job) => self.watchers.refresh(job, is_held),
+            None => self.watchers.forget(id),
+        }
+    }
+
+    /// The flags of a job that was just claimed.
+    pub(super) fn flags_of(&self, job: &Job) -> Arc<Flags> {
+        match locked(&self.running).get(&job.id) {
+            Some(held) if held.attempt == job.attempt => Arc::clone(&held.flags),
+            // The lease was lost after the claim.
+            _ => {
+                let flags = Flags::default();
+                flags.mark_lost();
+                Arc::new(flags)
+            }
+        }
+    }
+}

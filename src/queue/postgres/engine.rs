@@ -1,0 +1,186 @@
+//! The engine on PostgreSQL.
+
+use std::sync::Arc;
+use std::sync::atomic::AtomicI64;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use async_trait::async_trait;
+use tokio::sync::{mpsc, oneshot, watch};
+
+use super::bell::Changes;
+use super::heartbeat::PostgresHeartbeat;
+use super::pool::{Pool, spawn};
+use super::presence::Presence;
+use super::schema;
+use super::session::Session;
+use super::shared::Shared;
+use super::target::{PostgresOptions, Target};
+use super::upkeep::Upkeep;
+use crate::job::{Job, JobId};
+use crate::queue::database::{DatabaseQueue, Engine, Kept};
+use crate::queue::effects::Effects;
+use crate::queue::lease::HeartbeatStore;
+use crate::queue::local::Local;
+use crate::queue::sql::{Sql, values};
+use crate::queue::transitions;
+use crate::queue::types::{Event, Queue, QueueError, QueueOptions};
+
+/// Maximum time until a worker looks for a job again of which it was not told.
+const POLL_INTERVAL: Duration = Duration::from_secs(1);
+
+/// Opens the queue in a PostgreSQL database, as one of its nodes. The tables are created in an empty
+/// database. `events` receives the events of the changes that this node makes. The async methods of
+/// the queue need a tokio runtime.
+///
+/// Every change, leases included, is on the database's disk before it is acknowledged; heartbeats
+/// are not. A change waits up to 10 s for a database that is away, so that a restart of it is not
+/// seen. Jobs of nodes that have ended are recovered within 2 s, as [`open_sqlite`] recovers those
+/// of the process before; a node that is stopped but not ended loses them when its leases expire.
+///
+/// [`open_sqlite`]: crate::queue::open_sqlite
+///
+/// # Errors
+/// [`QueueError::Store`] if a URL cannot be read, the database cannot be reached or used, it has
+/// other tables or another schema version, or a thread cannot be started.
+pub async fn open_postgres(
+    target: &PostgresOptions,
+    options: QueueOptions,
+    events: mpsc::UnboundedSender<Event>,
+) -> Result<Arc<dyn Queue>, QueueError> {
+    let (target, own) = (target.clone(), options.clone());
+    let (answer, opened) = oneshot::channel();
+    // A connection blocks, which the threads of the runtime must not.
+    let opening = move || {
+        let _gone_is_fine = answer.send(PostgresEngine::open(&target, own, events));
+    };
+    thread::Builder::new()
+        .name("queue-open".to_owned())
+        .spawn(opening)
+        .map_err(|error| QueueError::Store(error.to_string()))?;
+    let engine = opened.await.map_err(|_| QueueError::Closed)??;
+    Ok(Arc::new(DatabaseQueue::new(engine, options)))
+}
+
+/// A node of a queue in a PostgreSQL database.
+struct PostgresEngine {
+    shared: Arc<Shared>,
+    pool: Pool,
+    identity: i32,
+}
+
+impl PostgresEngine {
+    fn open(
+        options: &PostgresOptions,
+        queue: QueueOptions,
+        events: mpsc::UnboundedSender<Event>,
+    ) -> Result<Self, QueueError> {
+        let target = Target::of(&options.url)?;
+        let direct = options.direct_url.as_deref().unwrap_or(&options.url);
+        let node = Arc::new(AtomicI64::new(0));
+        let session =
+            |target: &Target, place| Session::new(target.clone(), Arc::clone(&node), place);
+        let mut own = session(&Target::of(direct)?, 0);
+        let identity = schema::prepare(&mut own)?;
+        let local = Arc::new(Local::new(events));
+        let shared = Arc::new(Shared::new(local, queue, &options.name, &node));
+        let mut presence = Presence::new(Arc::clone(&shared), own);
+        presence.open()?;
+        let upkeep = Upkeep::new(Arc::clone(&shared), session(&target, 1));
+        let connections = i64::try_from(options.connections.max(1)).unwrap_or(1);
+        let sessions = (0..connections).map(|place| session(&target, 2 + place));
+        let ended = &shared.local.ended;
+        let pool = Pool::start(sessions.collect(), ended)?;
+        spawn("queue-upkeep", ended, move || upkeep.run())?;
+        spawn("queue-presence", ended, move || presence.run())?;
+        Ok(Self {
+            shared,
+            pool,
+            identity,
+        })
+    }
+}
+
+impl Drop for PostgresEngine {
+    fn drop(&mut self) {
+        self.shared.stop();
+    }
+}
+
+#[async_trait]
+impl Engine for PostgresEngine {
+    fn local(&self) -> &Arc<Local> {
+        &self.shared.local
+    }
+
+    async fn write<T, C>(&self, _: Kept, change: C) -> Result<T, QueueError>
+    where
+        T: Send + 'static,
+        C: Fn(&dyn Sql, &mut Effects) -> Result<T, QueueError> + Send + 'static,
+    {
+        // A crash of the database does not end the workers. If it forgot a claim, the next one would
+        // get the same attempt number, and two workers would hold the job.
+        let shared = Arc::clone(&self.shared);
+        let work = move |session: &mut Session, at: Instant| {
+            let commit = session.transact(Kept::Durably, at, change)?;
+            shared.committed(commit.effects, commit.transaction);
+            Ok(commit.value)
+        };
+        self.pool.run(work).await
+    }
+
+    async fn read<T, C>(&self, query: C) -> Result<T, QueueError>
+    where
+        T: Send + 'static,
+        C: Fn(&dyn Sql) -> Result<T, QueueError> + Send + 'static,
+    {
+        let work = move |session: &mut Session, at: Instant| session.read(at, query);
+        self.pool.run(work).await
+    }
+
+    async fn watch(&self, id: JobId) -> Result<watch::Receiver<Arc<Job>>, QueueError> {
+        let job = self.read(move |sql| transitions::get(sql, id)).await?;
+        let followed = self.shared.local.watchers.follow(&Arc::new(job));
+        // A change may have fallen between the query and the subscription.
+        let again = Changes {
+            jobs: [id].into(),
+            ..Changes::default()
+        };
+        self.shared.bell.elsewhere(again);
+        Ok(followed)
+    }
+
+    fn heartbeat(&self, job: &Job) -> Arc<dyn HeartbeatStore> {
+        Arc::new(PostgresHeartbeat {
+            id: job.id,
+            attempt: job.attempt,
+            shared: Arc::clone(&self.shared),
+        })
+    }
+
+    fn has_note_of_snapshot(&self, id: JobId, attempt: u32) -> bool {
+        self.shared.beats.has_note_of_snapshot(id, attempt)
+    }
+
+    fn poll_interval(&self) -> Option<Duration> {
+        Some(POLL_INTERVAL)
+    }
+
+    fn check(&self) -> Result<(), QueueError> {
+        Ok(())
+    }
+
+    async fn stopped(&self) {
+        let node = self.shared.node();
+        let change = move |sql: &dyn Sql, _: &mut Effects| {
+            sql.query("UPDATE nodes SET stopped = 1 WHERE id = ?1", values![node])
+        };
+        if let Err(error) = self.write(Kept::Durably, change).await {
+            tracing::warn!(%error, "the other nodes will take this end for a crash");
+        }
+    }
+
+    fn identity(&self) -> i32 {
+        self.identity
+    }
+}

@@ -1,0 +1,114 @@
+//! The nodes of the queue: each is alive for as long as a connection of its own holds its lock.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, Ordering};
+use std::time::{Duration, Instant};
+
+use super::locks::NODES;
+use super::session::Session;
+use crate::queue::database::Kept;
+use crate::queue::effects::Effects;
+use crate::queue::sql::{Sql, values};
+use crate::queue::transitions::expiry;
+use crate::queue::types::{QueueError, QueueOptions};
+
+/// After a start of the database, and after this node was cut off from it, the other nodes need
+/// this long to show that they are alive.
+pub(super) const GRACE: Duration = Duration::from_secs(3);
+
+/// A node without its lock is dead when it was so at two looks with this time between them.
+pub(super) const SECOND_LOOK: Duration = Duration::from_millis(600);
+
+/// Shows that this node is alive on the connection of the session, which stays open.
+pub(super) fn show(
+    session: &mut Session,
+    node: &Arc<AtomicI64>,
+    name: &str,
+) -> Result<(), QueueError> {
+    let known = node.load(Ordering::Relaxed);
+    let asked = Instant::now();
+    if known > 0 {
+        let lock = format!(
+            "SELECT id, pg_try_advisory_lock({NODES}, id) FROM nodes WHERE id = ?1 AND stopped = 0"
+        );
+        let shown = session.read(asked, |sql| sql.first(&lock, values![known]))?;
+        match shown.map(|row| row.get(1)).transpose()? {
+            Some(true) => return Ok(()),
+            Some(false) => {
+                let old = "the old connection of this node still holds its lock".to_owned();
+                return Err(QueueError::Store(old));
+            }
+            // The others have taken it for dead. It goes on as another node.
+            None => {}
+        }
+    }
+    let register = "INSERT INTO nodes (name, version, started) VALUES (?1, ?2, ?3) RETURNING id";
+    let version = env!("CARGO_PKG_VERSION");
+    let row = session.read(asked, |sql| {
+        sql.only(register, values![name, version, sql.now()])
+    })?;
+    let number: i64 = row.get(0)?;
+    let lock = format!("SELECT pg_advisory_lock({NODES}, ?1::integer)::text");
+    session.read(asked, |sql| sql.query(&lock, values![number]))?;
+    node.store(number, Ordering::Relaxed);
+    Ok(())
+}
+
+/// A node that does not hold its lock.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Silent {
+    pub(super) node: i64,
+    /// Whether it said that it stops.
+    stopped: bool,
+}
+
+/// The other nodes that do not hold their locks, and whether the database has only just started, so
+/// that they may be about to take them again.
+pub(super) fn silent(session: &mut Session, me: i64) -> Result<(Vec<Silent>, bool), QueueError> {
+    let text = format!(
+        "SELECT n.id, n.stopped FROM nodes n WHERE n.id <> ?1 \
+         AND NOT EXISTS (SELECT 1 FROM pg_locks l WHERE l.locktype = 'advisory' \
+             AND l.database = (SELECT oid FROM pg_database WHERE datname = current_database()) \
+             AND l.classid = {NODES}::oid AND l.objid = n.id::oid AND l.objsubid = 2 AND l.granted)"
+    );
+    let young = format!(
+        "SELECT now() < pg_postmaster_start_time() + interval '{} milliseconds'",
+        GRACE.as_millis()
+    );
+    session.read(Instant::now(), |sql| {
+        let is_young = sql.only(&young, &[])?.get(0)?;
+        let rows = sql.query(&text, values![me])?;
+        let silent = rows.iter().map(|row| {
+            Ok(Silent {
+                node: row.get(0)?,
+                stopped: row.get(1)?,
+            })
+        });
+        Ok((silent.collect::<Result<_, QueueError>>()?, is_young))
+    })
+}
+
+/// Recovers the jobs of a dead node and forgets the node. Several nodes may do so at once.
+pub(super) fn bury(
+    session: &mut Session,
+    dead: Silent,
+    options: &QueueOptions,
+    mut committed: impl FnMut(Effects, Option<u64>),
+) -> Result<(), QueueError> {
+    let Silent { node, stopped } = dead;
+    let left = session.read(Instant::now(), |sql| expiry::left_behind(sql, node))?;
+    for id in left {
+        let recover = |sql: &dyn Sql, effects: &mut Effects| {
+            expiry::recover(sql, effects, options, id, node, stopped)
+        };
+        let commit = session.transact(Kept::Durably, Instant::now(), recover)?;
+        committed(commit.effects, commit.transaction);
+    }
+    for forget in [
+        "DELETE FROM commits WHERE node = ?1",
+        "DELETE FROM nodes WHERE id = ?1",
+    ] {
+        session.read(Instant::now(), |sql| sql.query(forget, values![node]))?;
+    }
+    Ok(())
+}

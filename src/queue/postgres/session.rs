@@ -1,0 +1,301 @@
+//! One connection that is opened again when it is lost, and the transactions on it.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use postgres::{Client, SimpleQueryMessage};
+
+use super::statements::{Fault, PostgresSql, fault, refused};
+use super::target::Target;
+use crate::clock::Timestamp;
+use crate::queue::database::Kept;
+use crate::queue::effects::Effects;
+use crate::queue::sql::{Sql, values};
+use crate::queue::types::QueueError;
+
+/// For how long a change waits for a database that does not answer. A restart of the database takes
+/// less.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// The pause before a connection is opened again.
+const PAUSE: Duration = Duration::from_millis(100);
+
+/// How often a change is made again after a conflict with another transaction.
+const MAX_CONFLICTS: u32 = 10;
+
+/// A change that was committed.
+pub(super) struct Commit<T> {
+    pub(super) value: T,
+    pub(super) effects: Effects,
+    /// The number of the transaction; `None` if it has written nothing.
+    pub(super) transaction: Option<u64>,
+}
+
+/// Why a transaction was not committed.
+enum Failed {
+    /// The change is refused, or the database refuses a statement of it.
+    Refused(QueueError),
+    /// It was rolled back, and may be made again.
+    Again(Fault, QueueError),
+    /// The connection was lost during the commit of the transaction with this token.
+    Unknown(Option<Token>, QueueError),
+}
+
+/// Names one transaction of one session: what the session's row in `commits` holds if the
+/// transaction was committed. Numbers of transactions do not: after a crash the database gives
+/// those again that had not reached its disk.
+#[derive(Clone, Copy, Debug)]
+struct Token {
+    node: i64,
+    count: i64,
+}
+
+/// A connection, at most one at a time.
+pub(super) struct Session {
+    target: Target,
+    node: Arc<AtomicI64>,
+    /// The number of the session among those of its node.
+    place: i64,
+    /// Transactions so far.
+    count: i64,
+    client: Option<Client>,
+    opened: Instant,
+    opens: u64,
+    /// The time of the database less that of this process, milliseconds, as last measured.
+    ahead_ms: i64,
+}
+
+impl Session {
+    /// A connection that is opened when it is first used, on the thread that uses it. `node` is the
+    /// number of this node, and `place` that of the session in it.
+    pub(super) fn new(target: Target, node: Arc<AtomicI64>, place: i64) -> Self {
+        Self {
+            target,
+            node,
+            place,
+            count: 0,
+            client: None,
+            opened: Instant::now(),
+            opens: 0,
+            ahead_ms: 0,
+        }
+    }
+
+    /// The open connection.
+    pub(super) fn client(&mut self) -> Result<&mut Client, QueueError> {
+        let client = match self.client.take() {
+            Some(client) if !client.is_closed() => client,
+            _ => {
+                let client = self.target.connect()?;
+                self.opened = Instant::now();
+                self.opens += 1;
+                client
+            }
+        };
+        Ok(self.client.insert(client))
+    }
+
+    /// For how long the connection has been open.
+    pub(super) fn age(&self) -> Duration {
+        self.opened.elapsed()
+    }
+
+    /// How often the connection was opened.
+    pub(super) fn opens(&self) -> u64 {
+        self.opens
+    }
+
+    /// Closes the connection: the next use opens another one.
+    pub(super) fn close(&mut self) {
+        self.client = None;
+    }
+
+    /// Makes a change in a transaction, again and again while the database is away, until
+    /// [`PATIENCE`] has passed since `asked`. A commit of which no answer came is looked up.
+    pub(super) fn transact<T>(
+        &mut self,
+        kept: Kept,
+        asked: Instant,
+        change: impl Fn(&dyn Sql, &mut Effects) -> Result<T, QueueError>,
+    ) -> Result<Commit<T>, QueueError> {
+        let mut conflicts = 0;
+        loop {
+            let mut made = None;
+            let failed = self.attempt(kept, &change, &mut made).err();
+            let error = match failed {
+                None => return made.ok_or(QueueError::Closed),
+                Some(Failed::Refused(error)) => return Err(error),
+                Some(Failed::Again(Fault::Conflict, error)) => {
+                    conflicts += 1;
+                    if conflicts > MAX_CONFLICTS {
+                        return Err(error);
+                    }
+                    continue;
+                }
+                Some(Failed::Again(_, error)) => {
+                    self.close();
+                    error
+                }
+                Some(Failed::Unknown(token, error)) => {
+                    self.close();
+                    match token.map(|token| self.was_committed(token, asked)) {
+                        Some(Ok(true)) => return made.ok_or(error),
+                        Some(Ok(false)) | None => error,
+                        Some(Err(_)) => return Err(error),
+                    }
+                }
+            };
+            if asked.elapsed() > PATIENCE {
+                return Err(error);
+            }
+            thread::sleep(PAUSE);
+        }
+    }
+
+    /// Makes the change once. What it made is in `made` if only the answer to the commit is missing.
+    fn attempt<T>(
+        &mut self,
+        kept: Kept,
+        change: impl Fn(&dyn Sql, &mut Effects) -> Result<T, QueueError>,
+        made: &mut Option<Commit<T>>,
+    ) -> Result<(), Failed> {
+        let lost = |error| Failed::Again(Fault::Lost, error);
+        let again = |error: postgres::Error| Failed::Again(fault(&error), refused(&error));
+        let now = self.begin(kept).map_err(lost)?;
+        let node = self.node.load(Ordering::Relaxed);
+        self.count += 1;
+        let (place, count) = (self.place, self.count);
+        // Not a new connection: the transaction is open on this one.
+        let gone = || lost(QueueError::Store("the connection is gone".to_owned()));
+        let client = self.client.as_mut().ok_or_else(gone)?;
+        let mut effects = Effects::default();
+        let sql = PostgresSql::new(client, now, node);
+        let mut token = None;
+        let done = change(&sql, &mut effects).and_then(|value| {
+            let mut transaction = None;
+            if sql.wrote() {
+                let row = sql.only(NOTE_COMMIT, values![node, place, count])?;
+                let number: String = row.get(0)?;
+                transaction = number.parse().ok();
+                token = Some(Token { node, count });
+            }
+            Ok((value, transaction))
+        });
+        let (value, transaction) = match (done, sql.fault()) {
+            (Ok(done), None) => done,
+            (done, found) => {
+                let _a_lost_connection_does_it_too = client.batch_execute("ROLLBACK");
+                let error = done.err().unwrap_or(QueueError::Closed);
+                return Err(match found {
+                    None | Some(Fault::Refused) => Failed::Refused(error),
+                    Some(fault) => Failed::Again(fault, error),
+                });
+            }
+        };
+        *made = Some(Commit {
+            value,
+            effects,
+            transaction,
+        });
+        client.batch_execute("COMMIT").map_err(|error| {
+            match fault(&error) {
+                Fault::Lost => Failed::Unknown(token, refused(&error)),
+                // The database has answered: the transaction is rolled back.
+                Fault::Conflict => again(error),
+                Fault::Refused => Failed::Refused(refused(&error)),
+            }
+        })
+    }
+
+    /// Begins a transaction and returns the time of the database.
+    fn begin(&mut self, kept: Kept) -> Result<Timestamp, QueueError> {
+        let synchronous = match kept {
+            Kept::Durably => "on",
+            Kept::Soon => "off",
+        };
+        // A process that is stopped in the middle of a transaction must not hold its locks for long.
+        let text = format!(
+            "BEGIN; SET LOCAL synchronous_commit = {synchronous}; SET LOCAL lock_timeout = '10s'; \
+             SET LOCAL idle_in_transaction_session_timeout = '5s'; \
+             SELECT (extract(epoch FROM clock_timestamp()) * 1000)::bigint"
+        );
+        let answer = self.client()?.simple_query(&text);
+        let answer = answer.map_err(|error| refused(&error))?;
+        let time = answer.iter().find_map(|message| match message {
+            SimpleQueryMessage::Row(row) => row.get(0)?.parse().ok(),
+            _ => None,
+        });
+        let now = time.map(Timestamp::from_millis);
+        let now = now.ok_or_else(|| QueueError::Store("the database has no time".to_owned()))?;
+        self.ahead_ms = now.as_millis() - Timestamp::now().as_millis();
+        Ok(now)
+    }
+
+    /// Runs queries, each for itself.
+    pub(super) fn read<T>(
+        &mut self,
+        asked: Instant,
+        query: impl Fn(&dyn Sql) -> Result<T, QueueError>,
+    ) -> Result<T, QueueError> {
+        loop {
+            let node = self.node.load(Ordering::Relaxed);
+            let now = Timestamp::from_millis(Timestamp::now().as_millis() + self.ahead_ms);
+            let (done, is_lost) = match self.client() {
+                Err(error) => (Err(error), true),
+                Ok(client) => {
+                    let sql = PostgresSql::new(client, now, node);
+                    let done = query(&sql);
+                    let is_lost = sql.fault() == Some(Fault::Lost);
+                    (done, is_lost)
+                }
+            };
+            if !is_lost || asked.elapsed() > PATIENCE {
+                return done;
+            }
+            self.close();
+            thread::sleep(PAUSE);
+        }
+    }
+
+    /// Whether a transaction was committed, asked on another connection. The old connection is gone
+    /// or about to end its transaction: the row is locked until then.
+    fn was_committed(&mut self, token: Token, asked: Instant) -> Result<bool, QueueError> {
+        let place = self.place;
+        loop {
+            let last = self.transact_once(|sql| {
+                let row = sql.only(LAST_COMMIT, values![token.node, place])?;
+                row.get::<i64>(0)
+            });
+            match last {
+                Ok(last) => return Ok(last == token.count),
+                Err(error) if asked.elapsed() > 2 * PATIENCE => return Err(error),
+                Err(_) => self.close(),
+            }
+            thread::sleep(PAUSE);
+        }
+    }
+
+    /// Runs a query in a transaction of its own, once.
+    fn transact_once<T>(
+        &mut self,
+        query: impl Fn(&dyn Sql) -> Result<T, QueueError>,
+    ) -> Result<T, QueueError> {
+        let now = self.begin(Kept::Durably)?;
+        let node = self.node.load(Ordering::Relaxed);
+        let client = self.client()?;
+        let done = query(&PostgresSql::new(client, now, node));
+        let ended = client.batch_execute("COMMIT");
+        ended.map_err(|error| refused(&error)).and(done)
+    }
+}
+
+/// Notes a commit in its own transaction, and gives the number of the transaction.
+const NOTE_COMMIT: &str = "INSERT INTO commits (node, place, count) VALUES (?1, ?2, ?3) \
+    ON CONFLICT (node, place) DO UPDATE SET count = excluded.count \
+    RETURNING pg_current_xact_id()::text";
+
+/// Finds the last commit of a session. It waits for the end of a transaction that is still open.
+const LAST_COMMIT: &str = "INSERT INTO commits (node, place, count) VALUES (?1, ?2, 0) \
+    ON CONFLICT (node, place) DO UPDATE SET count = commits.count RETURNING count";

@@ -1,0 +1,70 @@
+//! What the threads of a node share.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
+
+use super::backlog::Ledger;
+use super::beats::Beats;
+use super::bell::{Bell, Changes};
+use crate::queue::effects::Effects;
+use crate::queue::local::Local;
+use crate::queue::types::QueueOptions;
+
+/// What the threads of a node share.
+pub(super) struct Shared {
+    pub(super) local: Arc<Local>,
+    pub(super) options: QueueOptions,
+    pub(super) name: String,
+    pub(super) node: Arc<AtomicI64>,
+    pub(super) ledger: Ledger,
+    pub(super) bell: Bell,
+    pub(super) beats: Beats,
+    stopping: AtomicBool,
+}
+
+impl Shared {
+    pub(super) fn new(
+        local: Arc<Local>,
+        options: QueueOptions,
+        name: &str,
+        node: &Arc<AtomicI64>,
+    ) -> Self {
+        Self {
+            local,
+            options,
+            name: name.to_owned(),
+            node: Arc::clone(node),
+            ledger: Ledger::default(),
+            bell: Bell::default(),
+            beats: Beats::default(),
+            stopping: AtomicBool::default(),
+        }
+    }
+
+    /// The number of this node.
+    pub(super) fn node(&self) -> i64 {
+        self.node.load(Ordering::Relaxed)
+    }
+
+    pub(super) fn is_stopping(&self) -> bool {
+        self.stopping.load(Ordering::Relaxed)
+    }
+
+    /// Ends the threads.
+    pub(super) fn stop(&self) {
+        self.stopping.store(true, Ordering::Relaxed);
+        self.bell.wake();
+    }
+
+    /// Applies the effects of a commit of this node. The subscribers are told by the upkeep, which
+    /// reads the jobs again: commits of several connections come here in any order.
+    pub(super) fn committed(&self, effects: Effects, transaction: Option<u64>) {
+        self.ledger.add(&self.local, &effects, transaction);
+        self.local.apply_to_running(&effects);
+        let changes = Changes::of(&effects);
+        if !changes.is_empty() {
+            self.bell.here(changes);
+        }
+        self.local.tell(effects);
+    }
+}

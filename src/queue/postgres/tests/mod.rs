@@ -1,0 +1,175 @@
+//! Contract tests of the queue on PostgreSQL, and tests of several nodes.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::mpsc;
+
+mod nodes;
+
+use super::engine::open_postgres;
+use super::target::PostgresOptions;
+use crate::queue::contract_tests::{Stand, queue_contract};
+use crate::queue::sql::for_postgres;
+use crate::queue::transitions::{expiry, fair_queue, leases};
+use crate::queue::types::{Event, Queue, QueueOptions};
+
+#[path = "../../../../tests/common/postgres_server.rs"]
+mod postgres_server;
+use postgres_server::{PostgresServer, own_postgres_server, postgres_server};
+
+/// The server of all tests, or one that a test may crash.
+#[derive(Clone)]
+enum Server {
+    Of(&'static PostgresServer),
+    Own(Arc<PostgresServer>),
+}
+
+impl std::ops::Deref for Server {
+    type Target = PostgresServer;
+
+    fn deref(&self) -> &PostgresServer {
+        match self {
+            Self::Of(server) => server,
+            Self::Own(server) => server,
+        }
+    }
+}
+
+/// A database in which the queue is opened repeatedly.
+struct Database {
+    server: Server,
+    url: String,
+}
+
+impl Database {
+    /// A new one; `None` without PostgreSQL.
+    fn new() -> Option<Self> {
+        Some(Self::on(Server::Of(postgres_server()?)))
+    }
+
+    fn on(server: Server) -> Self {
+        let url = server.database();
+        Self { server, url }
+    }
+
+    /// Opens the queue as one more node.
+    async fn node(
+        &self,
+        name: &str,
+        options: QueueOptions,
+    ) -> (Arc<dyn Queue>, mpsc::UnboundedReceiver<Event>) {
+        let (events, heard) = mpsc::unbounded_channel();
+        let queue = open_postgres(&self.options(name), options, events).await;
+        (queue.expect("a queue"), heard)
+    }
+
+    fn name(&self) -> &str {
+        self.url.rsplit('=').next().expect("a name")
+    }
+
+    fn options(&self, name: &str) -> PostgresOptions {
+        PostgresOptions {
+            url: self.url.clone(),
+            direct_url: None,
+            connections: 3,
+            name: name.to_owned(),
+        }
+    }
+
+    /// Waits until no node is alive: a queue that was dropped closes its connections a little later.
+    async fn is_left(&self) {
+        let alive = "SELECT count(*) FROM pg_locks l JOIN pg_database d ON d.oid = l.database \
+                     WHERE l.locktype = 'advisory' AND l.objsubid = 2 \
+                     AND d.datname = current_database()";
+        while self.server.sql(self.name(), alive) != "0" {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    }
+}
+
+impl Stand for Database {
+    async fn open(
+        &mut self,
+        options: QueueOptions,
+    ) -> (Arc<dyn Queue>, mpsc::UnboundedReceiver<Event>) {
+        self.is_left().await;
+        self.node("node", options).await
+    }
+}
+
+queue_contract!(Database::new());
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn another_schema_or_program_is_refused_with_what_to_do() {
+    let Some(database) = Database::new() else {
+        return;
+    };
+    let refusal = async |database: &Database| {
+        let (events, _) = mpsc::unbounded_channel();
+        let options = database.options("node");
+        let opened = open_postgres(&options, QueueOptions::default(), events).await;
+        opened.err().expect("a refusal").to_string()
+    };
+    database
+        .server
+        .sql(database.name(), "CREATE TABLE jobs (other text)");
+    let said = refusal(&database).await;
+    assert!(said.contains("a database of its own"), "{said}");
+    database.server.sql(database.name(), "DROP TABLE jobs");
+    drop(database.node("first", QueueOptions::default()).await);
+    database
+        .server
+        .sql(database.name(), "UPDATE meta SET version = 99");
+    let said = refusal(&database).await;
+    assert!(said.contains("schema version 99"), "{said}");
+    let nobody = Database {
+        server: database.server.clone(),
+        url: "host=/nowhere user=secret password=hidden".to_owned(),
+    };
+    let said = refusal(&nobody).await;
+    assert!(!said.contains("hidden"), "{said}");
+}
+
+#[tokio::test]
+async fn the_statements_of_the_hot_path_use_their_indexes() {
+    let Some(database) = Database::new() else {
+        return;
+    };
+    let (_queue, _heard) = database.node("one", QueueOptions::default()).await;
+    let run = |sql: &str| database.server.sql(database.name(), sql);
+    run(
+        "INSERT INTO jobs (id, tenant, kind, pair_index, pairs, pairs_left, priority, state, durable, \
+         delayed, attempt, failures, crashes, delays, cost, virtual_start, virtual_finish, options, \
+         created, expires, due, error_retryable, dead, cancel_requested, device, backward, after, \
+         has_dependents, ready, closes, sees_from, sees_to, origin) \
+         SELECT int8send(n), 't' || n % 10, 0, 0, 0, 0, n % 3, 0, 1, 0, 0, 0, 0, 0, 1, n, n + 1, '{}', \
+         n, 9, 9, 0, 0, 0, n / 3 % 3, 0, int8send(n), 0, n, 0, 0, 2, 1 \
+         FROM generate_series(1, 50000) AS n; ANALYZE jobs",
+    );
+    for (sql, index) in [
+        (leases::FIRST_READY, "jobs_ready"),
+        (fair_queue::FOLLOWERS, "jobs_after"),
+        (fair_queue::FIRST_TAG, "jobs_ready"),
+        (fair_queue::LAST_OF_TENANT, "jobs_tail"),
+        (expiry::OLDEST, "jobs_age"),
+        (expiry::NEXT_DUE, "jobs_due"),
+    ] {
+        let parameters = ["'t1'", "1"];
+        let mut text = for_postgres(sql);
+        let values = match index {
+            "jobs_tail" => parameters,
+            "jobs_after" => ["'\\x01'", "1"],
+            _ => ["1", "1"],
+        };
+        for (place, value) in ["$1", "$2"].iter().zip(values) {
+            text = text.replace(place, value);
+        }
+        let plan = run(&format!("EXPLAIN {text}"));
+        assert!(
+            plan.contains(index) && !plan.contains("Sort"),
+            "{text}: {plan}"
+        );
+        assert!(!plan.contains("Seq Scan"), "{text}: {plan}");
+    }
+}

@@ -1,0 +1,192 @@
+//! The thread that looks after the queue for this node: it reads the jobs that this process watches
+//! or holds, tells the other nodes what has changed, renews leases, and handles what is due.
+
+use std::sync::Arc;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use super::bell::Changes;
+use super::locks::SWEEP;
+use super::nodes::GRACE;
+use super::presence::CHANNEL;
+use super::session::Session;
+use super::shared::Shared;
+use crate::clock::Timestamp;
+use crate::job::JobId;
+use crate::queue::database::Kept;
+use crate::queue::effects::Effects;
+use crate::queue::sql::{Sql, values};
+use crate::queue::transitions;
+use crate::queue::transitions::{expiry, leases};
+use crate::queue::types::QueueError;
+use crate::sync::locked;
+
+/// How long the upkeep waits for changes of this process at most.
+const TICK: Duration = Duration::from_millis(250);
+
+/// Interval between two reads of all jobs that this process watches or holds.
+const READ_INTERVAL: Duration = Duration::from_secs(1);
+
+/// Minimum interval between two notifications: each takes a lock of the whole database.
+const TELL_INTERVAL: Duration = Duration::from_millis(100);
+
+/// Interval between two renewals of a lease; a quarter of the lease if that is shorter.
+const BEAT_INTERVAL: Duration = Duration::from_secs(1);
+
+/// The pause after an error.
+const PAUSE: Duration = Duration::from_millis(200);
+
+/// The upkeep of a node, on its own connection.
+pub(super) struct Upkeep {
+    shared: Arc<Shared>,
+    session: Session,
+    untold: Changes,
+    told: Instant,
+    read: Instant,
+    beaten: Instant,
+}
+
+impl Upkeep {
+    pub(super) fn new(shared: Arc<Shared>, session: Session) -> Self {
+        let now = Instant::now();
+        Self {
+            shared,
+            session,
+            untold: Changes::default(),
+            told: now,
+            read: now,
+            beaten: now,
+        }
+    }
+
+    /// Goes on until the queue is dropped.
+    pub(super) fn run(mut self) {
+        while !self.shared.is_stopping() {
+            if let Err(error) = self.turn() {
+                tracing::warn!(%error, "the queue's database cannot be looked after");
+                self.session.close();
+                thread::sleep(PAUSE);
+            }
+        }
+        if let Err(error) = self.beat() {
+            tracing::warn!(%error, "the last heartbeats were not written");
+        }
+    }
+
+    fn turn(&mut self) -> Result<(), QueueError> {
+        let rung = self.shared.bell.wait(self.patience());
+        let mut to_read = rung.elsewhere;
+        to_read.jobs.extend(rung.here.jobs.iter().copied());
+        self.untold.merge(rung.here);
+        if self.read.elapsed() >= READ_INTERVAL {
+            to_read.more = true;
+        }
+        if to_read.more {
+            self.read = Instant::now();
+        }
+        if rung.beat_now || self.beaten.elapsed() >= self.beat_interval() {
+            self.beat()?;
+        }
+        self.read_again(&to_read)?;
+        self.tell()?;
+        self.handle_what_is_due()
+    }
+
+    /// How long this turn waits for changes.
+    fn patience(&self) -> Duration {
+        let until_told = TELL_INTERVAL.saturating_sub(self.told.elapsed());
+        let until_beat = self.beat_interval().saturating_sub(self.beaten.elapsed());
+        match self.untold.is_empty() {
+            true => TICK.min(until_beat),
+            false => TICK.min(until_beat).min(until_told),
+        }
+    }
+
+    fn beat_interval(&self) -> Duration {
+        BEAT_INTERVAL.min(self.shared.options.lease / 4)
+    }
+
+    /// Renews the leases of which there were heartbeats.
+    fn beat(&mut self) -> Result<(), QueueError> {
+        self.beaten = Instant::now();
+        let options = &self.shared.options;
+        // One transaction for each: a cancellation locks the same rows in another order.
+        for ((id, attempt), beat) in self.shared.beats.take() {
+            let renew = |sql: &dyn Sql, _: &mut Effects| {
+                if beat.snapshot_kept {
+                    leases::snapshot_kept(sql, id, attempt)?;
+                }
+                leases::beat(sql, options, id, attempt, beat.progress)
+            };
+            self.session.transact(Kept::Soon, Instant::now(), renew)?;
+        }
+        Ok(())
+    }
+
+    /// Reads the jobs that this process watches or holds, as far as they may have changed.
+    fn read_again(&mut self, changes: &Changes) -> Result<(), QueueError> {
+        let local = &self.shared.local;
+        let held: Vec<JobId> = locked(&local.running).keys().copied().collect();
+        let watched = local.watchers.jobs();
+        let mut ids: Vec<JobId> = held.into_iter().chain(watched).collect();
+        ids.retain(|id| changes.contains(*id));
+        ids.sort_unstable();
+        ids.dedup();
+        for id in ids {
+            let job = self
+                .session
+                .read(Instant::now(), |sql| transitions::find(sql, id))?;
+            local.refresh(id, job.map(Arc::new).as_ref());
+        }
+        Ok(())
+    }
+
+    /// Tells the other nodes what has changed here.
+    fn tell(&mut self) -> Result<(), QueueError> {
+        if self.untold.is_empty() || self.told.elapsed() < TELL_INTERVAL {
+            return Ok(());
+        }
+        let payload = self.untold.to_payload();
+        let text = format!("SELECT pg_notify('{CHANNEL}', ?1)::text");
+        self.session.read(Instant::now(), |sql| {
+            sql.query(&text, values![payload.as_str()])
+        })?;
+        self.untold = Changes::default();
+        self.told = Instant::now();
+        Ok(())
+    }
+
+    /// Handles the rows that are due, unless another node does.
+    fn handle_what_is_due(&mut self) -> Result<(), QueueError> {
+        let is_due =
+            |due: Option<Timestamp>, sql: &dyn Sql| due.is_some_and(|due| due <= sql.now());
+        let due = self.session.read(Instant::now(), |sql| {
+            let next = expiry::next_due(sql)?;
+            if is_due(next, sql) {
+                expiry::due(sql)
+            } else {
+                Ok(Vec::new())
+            }
+        })?;
+        // While nobody could reach the database, nobody could renew a lease.
+        let may_expire = self.session.age() >= GRACE.min(self.shared.options.lease);
+        let options = &self.shared.options;
+        let lock = format!("SELECT pg_try_advisory_xact_lock({SWEEP}, 0)");
+        for id in due {
+            let look = |sql: &dyn Sql, effects: &mut Effects| {
+                if !sql.only(&lock, &[])?.get::<bool>(0)? {
+                    return Ok(false);
+                }
+                let left = (!may_expire).then_some(GRACE);
+                expiry::look_after(sql, effects, options, id, left)?;
+                Ok(true)
+            };
+            let commit = self.session.transact(Kept::Durably, Instant::now(), look)?;
+            self.shared.committed(commit.effects, commit.transaction);
+            if !commit.value {
+                break;
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,192 @@
+//! The engine on one SQLite file.
+
+use std::fs::{File, TryLockError};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use async_trait::async_trait;
+use rusqlite::Connection;
+use tokio::sync::{mpsc, watch};
+
+use super::files::{Files, RUNNING, STOPPED, run_mark};
+use super::heartbeat::SqliteHeartbeat;
+use super::schema;
+use super::statements::{NODE, SqliteSql};
+use super::writer::Writer;
+use crate::job::{Job, JobId};
+use crate::queue::database::{DatabaseQueue, Engine, Kept};
+use crate::queue::effects::Effects;
+use crate::queue::lease::HeartbeatStore;
+use crate::queue::local::Local;
+use crate::queue::sql::Sql;
+use crate::queue::transitions;
+use crate::queue::transitions::{expiry, lists};
+use crate::queue::types::{Event, Queue, QueueError, QueueOptions};
+use crate::sync::locked;
+
+/// Connections for reading.
+const READERS: usize = 2;
+
+/// Opens or creates the embedded queue in `folder`: one SQLite file, which one process at a time
+/// has open. `events` receives all events from now on, including those of the recovery. The async
+/// methods of the queue need a tokio runtime.
+///
+/// Changes of durable jobs, other than leases, are on disk before they are acknowledged.
+///
+/// Recovery requeues the durable jobs that were running when the queue was last open, and ends
+/// those whose cancellation was requested. It counts a crash for each of the others, unless
+/// [`Queue::stopped`] was called. At crash number [`QueueOptions::max_crashes`] a job becomes a
+/// dead letter instead. Ephemeral jobs that were queued or running are removed.
+///
+/// # Errors
+/// - [`QueueError::Store`] if another process has the queue open, a file or the folder cannot be
+///   used, the file has another schema version, or the writer thread cannot be started.
+/// - [`QueueError::Full`] if the database cannot grow because the disk is full.
+pub fn open_sqlite(
+    folder: &Path,
+    options: QueueOptions,
+    events: mpsc::UnboundedSender<Event>,
+) -> Result<Arc<dyn Queue>, QueueError> {
+    let engine = SqliteEngine::open(folder, &options, events)?;
+    Ok(Arc::new(DatabaseQueue::new(engine, options)))
+}
+
+/// One SQLite file. One thread writes, and reads run concurrently.
+pub(super) struct SqliteEngine {
+    writer: Writer,
+    readers: [Arc<Mutex<Connection>>; READERS],
+    next_reader: AtomicU64,
+    local: Arc<Local>,
+    options: QueueOptions,
+    identity: i32,
+    folder: PathBuf,
+    files: Files,
+    _lock: File,
+}
+
+impl SqliteEngine {
+    pub(super) fn open(
+        folder: &Path,
+        options: &QueueOptions,
+        events: mpsc::UnboundedSender<Event>,
+    ) -> Result<Self, QueueError> {
+        let store = |error: std::io::Error| {
+            QueueError::Store(format!("cannot use {}: {error}", folder.display()))
+        };
+        std::fs::create_dir_all(folder).map_err(store)?;
+        let lock_path = folder.join("queue.lock");
+        let mut options_of_lock = File::options();
+        let lock = options_of_lock.write(true).create(true).truncate(false);
+        let lock = lock.open(&lock_path).map_err(store)?;
+        match lock.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => {
+                return Err(QueueError::Store(format!(
+                    "another process has the queue in {} open",
+                    folder.display()
+                )));
+            }
+            Err(TryLockError::Error(error)) => return Err(store(error)),
+        }
+        let path = folder.join("queue.sqlite3");
+        let connection = schema::open_writer(&path)?;
+        let identity = connection.pragma_query_value(None, "application_id", |row| row.get(0))?;
+        let local = Arc::new(Local::new(events));
+        let mut effects = Effects::default();
+        connection.execute_batch("BEGIN IMMEDIATE")?;
+        let orderly = run_mark(folder, STOPPED, RUNNING);
+        let sql = SqliteSql(&connection);
+        for id in expiry::left_behind(&sql, NODE)? {
+            expiry::recover(&sql, &mut effects, options, id, NODE, orderly)?;
+        }
+        connection.execute_batch("COMMIT")?;
+        local.apply(effects);
+        // Now counted in the database itself.
+        *locked(&local.backlog) = lists::count_backlog(&SqliteSql(&connection))?;
+        let open_reader = || schema::open_reader(&path).map(|reader| Arc::new(Mutex::new(reader)));
+        Ok(Self {
+            readers: [open_reader()?, open_reader()?],
+            next_reader: AtomicU64::new(0),
+            writer: Writer::start(connection, options.clone(), Arc::clone(&local))?,
+            local,
+            options: options.clone(),
+            identity,
+            folder: folder.to_owned(),
+            files: Files::of([path, lock_path]).map_err(store)?,
+            _lock: lock,
+        })
+    }
+}
+
+#[async_trait]
+impl Engine for SqliteEngine {
+    fn local(&self) -> &Arc<Local> {
+        &self.local
+    }
+
+    async fn write<T, C>(&self, kept: Kept, change: C) -> Result<T, QueueError>
+    where
+        T: Send + 'static,
+        C: Fn(&dyn Sql, &mut Effects) -> Result<T, QueueError> + Send + 'static,
+    {
+        self.writer.write(kept == Kept::Durably, change).await
+    }
+
+    async fn read<T, C>(&self, query: C) -> Result<T, QueueError>
+    where
+        T: Send + 'static,
+        C: Fn(&dyn Sql) -> Result<T, QueueError> + Send + 'static,
+    {
+        let turn = self.next_reader.fetch_add(1, Ordering::Relaxed) as usize % READERS;
+        let reader = Arc::clone(&self.readers[turn]);
+        let read = tokio::task::spawn_blocking(move || query(&SqliteSql(&locked(&reader))));
+        read.await
+            .map_err(|error| QueueError::Store(error.to_string()))?
+    }
+
+    async fn watch(&self, id: JobId) -> Result<watch::Receiver<Arc<Job>>, QueueError> {
+        // Through the writer, so that no change falls between the query and the subscription.
+        let local = Arc::clone(&self.local);
+        let change = move |sql: &dyn Sql, _: &mut Effects| {
+            let job = Arc::new(transitions::get(sql, id)?);
+            Ok(local.watchers.follow(&job))
+        };
+        self.writer.write(false, change).await
+    }
+
+    fn heartbeat(&self, job: &Job) -> Arc<dyn HeartbeatStore> {
+        Arc::new(SqliteHeartbeat {
+            id: job.id,
+            attempt: job.attempt,
+            writer: self.writer.clone(),
+            local: Arc::clone(&self.local),
+            options: self.options.clone(),
+            last: Mutex::new(Instant::now()),
+            latest: Mutex::default(),
+        })
+    }
+
+    fn poll_interval(&self) -> Option<Duration> {
+        None
+    }
+
+    fn check(&self) -> Result<(), QueueError> {
+        if self.files.are_there() {
+            return Ok(());
+        }
+        let gone = "its files were removed or replaced while it was open".to_owned();
+        Err(QueueError::Store(gone))
+    }
+
+    async fn stopped(&self) {
+        if !run_mark(&self.folder, RUNNING, STOPPED) {
+            tracing::warn!("the next start will take this end for a crash");
+        }
+    }
+
+    fn identity(&self) -> i32 {
+        self.identity
+    }
+}

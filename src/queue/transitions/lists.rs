@@ -1,0 +1,80 @@
+//! Lists and counts of jobs.
+
+use std::sync::Arc;
+
+use super::rows;
+use super::rows::{COLUMNS, DEVICES, state_code};
+use crate::job::{Job, JobId, Priority, State};
+use crate::queue::backlog::{Backlog, BacklogKey, Load};
+use crate::queue::sql::{Row, Sql, Value, values};
+use crate::queue::types::{Filter, QueueError};
+
+/// Maximum number of rows in one list.
+const MAX_LISTED: u32 = 1000;
+
+/// The jobs that a filter selects, latest first.
+pub(in crate::queue) fn list(sql: &dyn Sql, filter: &Filter) -> Result<Vec<Arc<Job>>, QueueError> {
+    let before = filter.before.map_or([0xff; 16], |id| *id.as_bytes());
+    let (index, in_state) = match filter.state {
+        None => ("jobs_list", ""),
+        Some(_) => ("jobs_list_by_state", "AND state = ?4"),
+    };
+    let text = format!(
+        "SELECT {COLUMNS} FROM jobs INDEXED BY {index} WHERE parent IS NULL \
+         AND tenant = ?1 AND id < ?2 {in_state} ORDER BY id DESC LIMIT ?3"
+    );
+    let limit = filter.limit.min(MAX_LISTED);
+    let mut parameters = values![filter.tenant.as_str(), before.as_slice(), limit].to_vec();
+    parameters.extend(filter.state.map(|state| Value::Int(state_code(state))));
+    let rows = sql.query(&text, &parameters)?;
+    rows.iter()
+        .map(|row| rows::job(row).map(Arc::new))
+        .collect()
+}
+
+/// The ids in this list that belong to jobs, in the same order.
+pub(in crate::queue) fn known(sql: &dyn Sql, ids: &[JobId]) -> Result<Vec<JobId>, QueueError> {
+    let mut known = Vec::new();
+    for &id in ids {
+        if rows::find(sql, id)?.is_some() {
+            known.push(id);
+        }
+    }
+    Ok(known)
+}
+
+/// Whether there are no jobs.
+pub(in crate::queue) fn is_empty(sql: &dyn Sql) -> Result<bool, QueueError> {
+    Ok(sql.first("SELECT seq FROM jobs LIMIT 1", &[])?.is_none())
+}
+
+/// The statement that counts the load by state, tenant, priority and device requirement.
+pub(in crate::queue) const LOADS: &str = "SELECT state, tenant, priority, device, \
+    count(*) AS jobs, sum(cost) AS seconds FROM jobs WHERE state < 2 \
+    AND (kind = 0 OR ready IS NOT NULL) GROUP BY state, tenant, priority, device";
+
+/// The backlog of the rows of [`LOADS`].
+pub(in crate::queue) fn backlog_of(rows: &[Row]) -> Result<Backlog, QueueError> {
+    let mut backlog = Backlog::default();
+    for row in rows {
+        let load = Load {
+            jobs: u64::from(row.get::<u32>(4)?),
+            seconds: row.get(5)?,
+        };
+        let key = BacklogKey {
+            tenant: row.get(1)?,
+            priority: row.choice(2, &Priority::ALL)?,
+            device: row.choice(3, &DEVICES)?,
+        };
+        match row.choice(0, &State::ALL)? {
+            State::Queued => backlog.enter_many(key, load),
+            _ => backlog.start_many(load),
+        }
+    }
+    Ok(backlog)
+}
+
+/// Counts the queued and the running load.
+pub(in crate::queue) fn count_backlog(sql: &dyn Sql) -> Result<Backlog, QueueError> {
+    backlog_of(&sql.query(LOADS, &[])?)
+}
