@@ -53,25 +53,46 @@ impl Lanes {
     }
 }
 
-/// The learned factors from nominal to real seconds in a lane, one per kind of device.
+/// Lanes and rate of the devices of one kind on other nodes. The rate is nominal seconds of work
+/// per second.
+pub type Others = [(usize, f64); DeviceKind::ALL.len()];
+
+/// The learned factors from nominal to real seconds in a lane, one per kind of device, and the lanes
+/// of this process and of the other nodes.
 #[derive(Debug)]
 pub struct CostModel {
-    lanes: Lanes,
+    own: Lanes,
     log_factors: Mutex<[Option<f64>; DeviceKind::ALL.len()]>,
+    others: Mutex<Others>,
 }
 
 impl CostModel {
     /// A model without measurements. Its factors are 1.
     pub fn new(lanes: Lanes) -> Self {
         Self {
-            lanes,
+            own: lanes,
             log_factors: Mutex::default(),
+            others: Mutex::default(),
         }
     }
 
-    /// The lanes of the model.
+    /// The lanes of all nodes.
     pub fn lanes(&self) -> Lanes {
-        self.lanes
+        let [(cpu, _), (gpu, _)] = *locked(&self.others);
+        Lanes {
+            cpu: self.own.cpu + cpu,
+            gpu: self.own.gpu + gpu,
+        }
+    }
+
+    /// The lanes of this process.
+    pub fn own_lanes(&self) -> Lanes {
+        self.own
+    }
+
+    /// Takes over what the other nodes can do.
+    pub fn set_others(&self, others: Others) {
+        *locked(&self.others) = others;
     }
 
     /// Nominal seconds of a job of this cost: its multiply-adds divided by 2e11, plus 0.005 of
@@ -86,16 +107,31 @@ impl CostModel {
         points * PARAMETERS as f64 / NOMINAL_RATE
     }
 
-    /// Predicted real seconds of `nominal` seconds of work in a lane of this kind.
+    /// Predicted real seconds of `nominal` seconds of work in a lane of this kind: of this process
+    /// or, if it has none, of the mean of the other nodes.
     pub fn seconds_on(&self, kind: DeviceKind, nominal: f64) -> f64 {
+        let (lanes, rate) = locked(&self.others)[kind as usize];
+        if self.own.of(kind) == 0 && rate > 0.0 {
+            return nominal * lanes as f64 / rate;
+        }
         let log_factors = locked(&self.log_factors);
         nominal * log_factors[kind as usize].map_or(1.0, f64::exp)
     }
 
-    /// Nominal seconds of work that all lanes of one kind complete per second. Zero without such
-    /// lanes.
+    /// Nominal seconds of work that the lanes of one kind of this process complete per second. Zero
+    /// without such lanes.
+    pub fn own_rate(&self, kind: DeviceKind) -> f64 {
+        match self.own.of(kind) {
+            0 => 0.0,
+            lanes => lanes as f64 / self.seconds_on(kind, 1.0),
+        }
+    }
+
+    /// Nominal seconds of work that the lanes of one kind of all nodes complete per second. Zero
+    /// without such lanes.
     pub fn rate(&self, kind: DeviceKind) -> f64 {
-        self.lanes.of(kind) as f64 / self.seconds_on(kind, 1.0)
+        let (_, rate) = locked(&self.others)[kind as usize];
+        self.own_rate(kind) + rate
     }
 
     /// Nominal seconds of work that all lanes complete per second. Zero without lanes.
@@ -107,9 +143,12 @@ impl CostModel {
     }
 
     /// Predicted real seconds that `nominal` seconds of work occupy one lane, averaged over all
-    /// lanes. Without lanes the result is huge (more than 1e300 for one nominal second).
+    /// lanes. Without lanes the factor is 1: nodes that have some may join.
     pub fn seconds(&self, nominal: f64) -> f64 {
-        nominal * self.lanes.total().max(1) as f64 / self.total_rate().max(f64::MIN_POSITIVE)
+        match self.lanes().total() {
+            0 => nominal,
+            lanes => nominal * lanes as f64 / self.total_rate().max(f64::MIN_POSITIVE),
+        }
     }
 
     /// Updates the factor of this kind: `nominal` seconds of work took `measured` seconds in a
@@ -169,5 +208,16 @@ mod tests {
         // The five lanes complete 40.5 nominal seconds per second.
         assert!((model.seconds(40.5) - 5.0).abs() < 1e-9);
         assert!((model.seconds_on(DeviceKind::Cpu, 1.0) - 2.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_node_without_devices_predicts_by_those_of_the_others() {
+        let model = CostModel::new(Lanes::default());
+        assert_eq!((model.total_rate(), model.seconds(2.0)), (0.0, 2.0));
+        model.set_others([(4, 8.0), (0, 0.0)]);
+        assert_eq!(model.lanes(), Lanes { cpu: 4, gpu: 0 });
+        assert!((model.seconds(6.0) - 3.0).abs() < 1e-9);
+        assert!((model.seconds_on(DeviceKind::Cpu, 6.0) - 3.0).abs() < 1e-9);
+        assert_eq!(model.own_rate(DeviceKind::Cpu), 0.0);
     }
 }

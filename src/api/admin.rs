@@ -13,6 +13,7 @@ use axum::{Json, Router};
 use serde_json::json;
 use tokio::sync::watch;
 
+use super::fleet::{NodeView, capacities};
 use crate::clock::Timestamp;
 use crate::cost::CostModel;
 use crate::engine::Device;
@@ -23,7 +24,7 @@ use crate::queue::Queue;
 /// The inputs of the liveness and readiness checks.
 #[derive(Clone)]
 pub struct Readiness {
-    /// The devices. The server is ready if at least one of them is.
+    /// The devices. The server is ready if at least one of them is, or if it has none.
     pub devices: Vec<Device>,
     /// True once the server is about to stop.
     pub draining: watch::Receiver<bool>,
@@ -46,7 +47,8 @@ impl Readiness {
     }
 
     /// The reason why the server is not ready: it is about to stop, a loop has not run for 10 s,
-    /// the store fails, or no device is ready. `None` if it is ready.
+    /// the store fails, or no device is ready. `None` if it is ready. A node without devices needs
+    /// none.
     pub fn not_ready_reason(&self) -> Option<String> {
         if *self.draining.borrow() {
             return Some("the server is about to stop".to_owned());
@@ -56,6 +58,9 @@ impl Readiness {
         }
         if let Some(trouble) = self.store.trouble() {
             return Some(format!("the store does not work: {trouble}"));
+        }
+        if self.devices.is_empty() {
+            return None;
         }
         let mut reasons = Vec::new();
         for device in &self.devices {
@@ -77,6 +82,7 @@ struct Admin {
 ///
 /// - `GET /livez`: 503 if a loop has not run for 10 s.
 /// - `GET /readyz`: 503 if [`Readiness::not_ready_reason`] gives a reason.
+/// - `GET /nodes`: the processes that have the queue open, as JSON.
 /// - `GET /metrics`: the Prometheus text format, or OpenMetrics if `Accept` asks for it.
 pub fn admin_router(
     readiness: Readiness,
@@ -87,6 +93,7 @@ pub fn admin_router(
     Router::new()
         .route("/livez", get(alive))
         .route("/readyz", get(ready))
+        .route("/nodes", get(nodes))
         .route("/metrics", get(expose))
         .with_state(Admin {
             readiness,
@@ -113,6 +120,16 @@ fn verdict(word: &str, not_ready_reason: Option<String>) -> Response {
 
 async fn ready(State(admin): State<Admin>) -> Response {
     verdict("ready", admin.readiness.not_ready_reason())
+}
+
+async fn nodes(State(admin): State<Admin>) -> Response {
+    match admin.queue.nodes(capacities(&admin.cost)).await {
+        Ok(nodes) => {
+            let nodes: Vec<_> = nodes.into_iter().map(NodeView::from).collect();
+            Json(json!({ "nodes": nodes })).into_response()
+        }
+        Err(error) => verdict("nodes", Some(error.to_string())),
+    }
 }
 
 async fn expose(State(admin): State<Admin>, headers: HeaderMap) -> Response {

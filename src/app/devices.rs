@@ -10,7 +10,7 @@ use std::thread;
 
 use anyhow::{anyhow, bail};
 
-use crate::config::Config;
+use crate::config::{Config, NodeRole};
 use crate::cost::Lanes;
 use crate::engine::{DeviceFactory, DeviceOptions, Opened, ReopenPolicy, try_opening};
 use crate::flow::cpu::CpuBackend;
@@ -59,7 +59,9 @@ impl Pool {
             devices: Vec::new(),
             fell_back: false,
         };
-        for named in &config.devices {
+        // A node that only answers requests computes nothing.
+        let computes = config.role != NodeRole::Api;
+        for named in config.devices.iter().filter(|_| computes) {
             match named.as_str() {
                 "auto" => pool.add_the_best(config, probe)?,
                 "cpu" => pool.add_cpu(None)?,

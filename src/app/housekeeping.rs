@@ -8,7 +8,8 @@ use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio::time::{interval, interval_at};
 
-use crate::api::{Readiness, Service};
+use crate::api::{Readiness, Service, capacities, others};
+use crate::cost::CostModel;
 use crate::engine::Device;
 use crate::health::{HEARTBEAT, Heartbeat};
 use crate::metrics::Metrics;
@@ -37,6 +38,9 @@ const PROBE: Duration = Duration::from_secs(10);
 /// last recovery of the store is longer ago than `LAST_PROBE`.
 const FIRST_PROBE: Duration = Duration::from_secs(1);
 const LAST_PROBE: Duration = Duration::from_secs(30);
+
+/// Interval between two exchanges of the nodes.
+const EXCHANGE_INTERVAL: Duration = Duration::from_secs(2);
 
 /// Starts all background tasks.
 pub(super) fn start(
@@ -89,6 +93,18 @@ pub(super) async fn follow_readiness(readiness: Readiness, service: Arc<Service>
     loop {
         ticks.tick().await;
         service.set_ready(readiness.not_ready_reason().is_none());
+    }
+}
+
+/// Tells the other nodes what this one can do, and learns what they can.
+pub(super) async fn exchange(queue: Arc<dyn Queue>, cost: Arc<CostModel>) {
+    let mut ticks = interval(EXCHANGE_INTERVAL);
+    loop {
+        ticks.tick().await;
+        match queue.nodes(capacities(&cost)).await {
+            Ok(nodes) => cost.set_others(others(&nodes)),
+            Err(error) => tracing::debug!(%error, "the other nodes are not heard"),
+        }
     }
 }
 

@@ -6,6 +6,7 @@ mod process;
 mod settings;
 mod shutdown;
 mod start;
+mod stores;
 #[cfg(test)]
 mod tests;
 

@@ -1,4 +1,4 @@
-//! Process-wide operating system settings, made once at the start: open file limit, umask, SIGXFSZ.
+//! Process-wide settings, made once at the start: open file limit, umask, SIGXFSZ, TLS clients.
 
 use rustix::fs::Mode;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit, umask};
@@ -43,4 +43,9 @@ pub(super) fn survive_file_limits() {
         Ok(stream) => drop(stream),
         Err(error) => tracing::debug!(%error, "SIGXFSZ is as it was"),
     }
+}
+
+/// Names the cryptography of the process's TLS clients: that of its ports.
+pub(super) fn name_tls_provider() {
+    let _named_already = rustls::crypto::ring::default_provider().install_default();
 }

@@ -7,7 +7,7 @@ use anyhow::Context;
 use crate::api::{AdmissionLimits, Caller, Keys, ListenOptions, Role, ServiceLimits};
 use crate::config::{Config, LimitsConfig, QueueConfig};
 use crate::job::{Priority, Tenant};
-use crate::queue::QueueOptions;
+use crate::queue::{PostgresOptions, QueueOptions};
 
 /// The API keys: that of the default tenant, and those of tenants.
 ///
@@ -46,6 +46,22 @@ pub(super) fn queue_options(config: &QueueConfig) -> QueueOptions {
         retention: seconds(config.retention_seconds),
         answered_retention: seconds(config.sync_result_retention_seconds),
     }
+}
+
+/// The database of the queue; `None` if the queue is a file.
+pub(super) fn postgres_options(config: &Config) -> Option<PostgresOptions> {
+    let url = config.queue.postgres.as_ref()?;
+    let direct_url = config.queue.postgres_direct.as_ref();
+    let host = || std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    Some(PostgresOptions {
+        url: url.reveal().to_owned(),
+        direct_url: direct_url.map(|url| url.reveal().to_owned()),
+        connections: config.queue.postgres_connections,
+        name: config
+            .node
+            .clone()
+            .unwrap_or_else(|| host().trim().to_owned()),
+    })
 }
 
 pub(super) fn admission_limits(config: &LimitsConfig) -> AdmissionLimits {

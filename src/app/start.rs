@@ -6,31 +6,31 @@ use std::thread;
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
-use tokio::sync::{mpsc, watch};
+use tokio::sync::watch;
 use tokio::task::{JoinHandle, JoinSet};
 use tokio_util::sync::CancellationToken;
 
 use super::devices::Pool;
-use super::settings::{admission_limits, keys, listen_options, queue_options, service_limits};
+use super::settings::{admission_limits, keys, listen_options, service_limits};
+use super::stores::{Stores, warn_of_stranded_jobs};
 use super::{housekeeping, process};
 use crate::api::{
     Admission, Hosts, Keys, ListenOptions, Listener, Readiness, Service, ServiceParts,
     admin_router, public_router, tls_acceptor,
 };
-use crate::config::Config;
-use crate::cost::{CostModel, Lanes};
+use crate::config::{Config, NodeRole};
+use crate::cost::CostModel;
 use crate::engine::{Device, Health};
-use crate::health::{Heartbeat, StoreHealth};
+use crate::health::Heartbeat;
 use crate::job::DeviceKind;
 use crate::metrics::Metrics;
-use crate::queue::{Event, Queue, open_sqlite};
-use crate::storage::Blobs;
-use crate::worker::{Drain, IsolationLock, StoreProbe, Worker, WorkerOptions};
+use crate::queue::Queue;
+use crate::worker::{Drain, IsolationLock, Worker, WorkerOptions};
 
 /// A running server: its ports, devices, workers, stores and background tasks. [`App::drain`]
 /// stops it.
 pub struct App {
-    public: SocketAddr,
+    public: Option<SocketAddr>,
     admin: SocketAddr,
     pub(super) config: Config,
     pub(super) service: Arc<Service>,
@@ -49,13 +49,14 @@ impl App {
     /// in this order. When it returns, both ports answer. The devices may not have passed their
     /// self-tests yet.
     ///
-    /// It changes the process: the umask becomes 077, SIGXFSZ no longer ends the process, and the
-    /// limit of open files is raised to its hard limit.
+    /// It changes the process: the umask becomes 077, SIGXFSZ no longer ends the process, the limit
+    /// of open files is raised to its hard limit, and TLS clients use ring.
     ///
     /// # Errors
     /// - [`App::check`] refuses the configuration.
     /// - The data folder cannot be used, its disk is full, or another process uses it.
-    /// - The queue file has another schema version.
+    /// - The database or the bucket cannot be reached or used.
+    /// - The queue has another schema version.
     /// - The payloads are not those of the queue, or the queue file is missing beside payloads.
     /// - A TLS file cannot be used, or the certificate and the key do not match.
     /// - A port cannot be bound, or a thread cannot be started.
@@ -79,9 +80,12 @@ impl App {
         let keys = keys(&config)?;
         process::keep_files_private();
         process::survive_file_limits();
+        process::name_tls_provider();
         let open_files = process::raise_open_files();
         let (stores, events) = Stores::open(&config).await?;
-        warn_of_stranded_jobs(stores.queue.as_ref(), lanes);
+        if config.queue.postgres.is_none() {
+            warn_of_stranded_jobs(stores.queue.as_ref(), lanes);
+        }
 
         let mut devices = Vec::new();
         for device in pool.devices {
@@ -101,17 +105,27 @@ impl App {
             events,
             (&stores.probe, &runtime),
         );
-        let listener = open_listener(&config, !keys_are_open, open_files, &metrics).await?;
-        let public = listener.address()?;
+        upkeep.spawn(housekeeping::exchange(
+            Arc::clone(&stores.queue),
+            Arc::clone(&cost),
+        ));
+        let listener = match config.role {
+            NodeRole::Worker => None,
+            _ => Some(open_listener(&config, !keys_are_open, open_files, &metrics).await?),
+        };
+        let public = listener.as_ref().map(Listener::address).transpose()?;
+        let mut loops = vec![("the runtime", runtime)];
+        loops.extend(
+            listener
+                .as_ref()
+                .map(|listener| ("the public port", listener.heartbeat())),
+        );
         let (draining, drains) = watch::channel(false);
         let readiness = Readiness {
             devices: devices.clone(),
             draining: drains,
             store: stores.health,
-            loops: vec![
-                ("the runtime", runtime),
-                ("the public port", listener.heartbeat()),
-            ],
+            loops,
         };
         let following = housekeeping::follow_readiness(readiness.clone(), Arc::clone(&service));
         upkeep.spawn(following);
@@ -119,7 +133,13 @@ impl App {
         let admin = serve_admin(config.admin_listen, readiness, &metrics, &queue, &cost)?;
         let stop_listening = CancellationToken::new();
         let router = public_router(&service);
-        let listener = tokio::spawn(listener.serve(router, stop_listening.clone()));
+        let stop = stop_listening.clone();
+        let listener = tokio::spawn(async move {
+            match listener {
+                Some(listener) => listener.serve(router, stop).await,
+                None => stop.cancelled().await,
+            }
+        });
         Ok(Self {
             public,
             admin,
@@ -153,8 +173,8 @@ impl App {
         Ok(())
     }
 
-    /// The bound address of the public port, which serves HTTP and gRPC.
-    pub fn public_address(&self) -> SocketAddr {
+    /// The bound address of the public port, which serves HTTP and gRPC. `None` for a worker.
+    pub fn public_address(&self) -> Option<SocketAddr> {
         self.public
     }
 
@@ -163,13 +183,17 @@ impl App {
         self.admin
     }
 
-    /// Waits until a device has been opened and has passed its self-test. It waits for the first
+    /// Waits until a device has been opened and has passed its self-test; not at all without
+    /// devices. It waits for the first
     /// try of each device in the order of the configuration, and returns at the first success.
     ///
     /// # Errors
     /// If every device could not be opened or failed its self-test, with the reason of each. They
     /// are still retried in the background.
     pub async fn ready(&self) -> anyhow::Result<()> {
+        if self.devices.is_empty() {
+            return Ok(());
+        }
         let mut reasons = Vec::new();
         for device in &self.devices {
             let mut health = device.health();
@@ -208,40 +232,6 @@ impl App {
     }
 }
 
-/// The queue and the stores below the data directory.
-struct Stores {
-    queue: Arc<dyn Queue>,
-    blobs: Blobs,
-    health: Arc<StoreHealth>,
-    probe: Arc<StoreProbe>,
-}
-
-impl Stores {
-    /// Opens them and checks that they belong together. Returns the queue's events, too.
-    async fn open(config: &Config) -> anyhow::Result<(Self, mpsc::UnboundedReceiver<Event>)> {
-        let (events, heard) = mpsc::unbounded_channel();
-        let blobs = Blobs::open(&config.data_dir.join("blobs"))
-            .with_context(|| format!("cannot use {}", config.data_dir.display()))?;
-        check_queue_is_there(config, &blobs)?;
-        let may_be_new = blobs.is_empty()?;
-        let queue = open_sqlite(&config.data_dir, queue_options(&config.queue), events)
-            .with_context(|| format!("cannot open the queue in {}", config.data_dir.display()))?;
-        check_identity(queue.as_ref(), &blobs, may_be_new, config).await?;
-        let health = Arc::new(StoreHealth::default());
-        if let Some(free) = blobs.free_space() {
-            health.has_free(free);
-        }
-        let probe = StoreProbe::new(Arc::clone(&queue), blobs.clone(), Arc::clone(&health));
-        let stores = Self {
-            queue,
-            blobs,
-            health,
-            probe: Arc::new(probe),
-        };
-        Ok((stores, heard))
-    }
-}
-
 /// One worker for each lane of the devices.
 fn start_workers(
     devices: &[Device],
@@ -252,7 +242,7 @@ fn start_workers(
     config: &Config,
 ) -> JoinSet<()> {
     let isolation = Arc::new(IsolationLock::default());
-    let has_cpu = cost.lanes().cpu > 0;
+    let has_cpu = cost.own_lanes().cpu > 0;
     let mut workers = JoinSet::new();
     for lane in devices.iter().flat_map(Device::lanes) {
         let cpu_besides = lane.kind() == DeviceKind::Gpu && has_cpu;
@@ -330,6 +320,9 @@ async fn open_listener(
 /// Waits until the last device of a kind has worked, is lost, and does not come back.
 async fn devices_given_up(devices: &[Device]) -> String {
     let mut healths: Vec<_> = devices.iter().map(Device::health).collect();
+    if healths.is_empty() {
+        return std::future::pending().await;
+    }
     loop {
         if let Some(reason) = last_of_its_kind_is_gone(devices) {
             return reason;
@@ -351,59 +344,6 @@ fn last_of_its_kind_is_gone(devices: &[Device]) -> Option<String> {
             _ => None,
         })
     })
-}
-
-/// Refuses to make a new queue where payloads of an older one lie: its file was lost or moved, and
-/// all that it promised would be taken for rubbish.
-fn check_queue_is_there(config: &Config, blobs: &Blobs) -> anyhow::Result<()> {
-    let file = config.data_dir.join("queue.sqlite3");
-    if file.exists() || blobs.is_empty()? {
-        return Ok(());
-    }
-    Err(anyhow!(
-        "{} is missing, but payloads of its jobs lie in {}: put it back, or name another data_dir",
-        file.display(),
-        config.data_dir.join("blobs").display()
-    ))
-}
-
-/// Refuses payloads that are not the queue's: those of another one, or an empty folder where a
-/// volume should be. A queue and a store that are both new are made for each other.
-async fn check_identity(
-    queue: &dyn Queue,
-    blobs: &Blobs,
-    may_be_new: bool,
-    config: &Config,
-) -> anyhow::Result<()> {
-    let folder = config.data_dir.join("blobs");
-    let found = blobs.identity();
-    let found = found.with_context(|| format!("cannot use {}", folder.display()))?;
-    match found {
-        Some(identity) if identity == queue.identity() => Ok(()),
-        None if may_be_new && queue.is_empty().await? => Ok(blobs.set_identity(queue.identity())?),
-        _ => Err(anyhow!(
-            "the payloads in {} are not those of the queue's jobs: is their volume mounted? put them \
-             back, or name another data_dir",
-            folder.display()
-        )),
-    }
-}
-
-/// Jobs of an earlier start may wait for a kind of device that this one does not have: they would
-/// do so in silence until their time is over.
-fn warn_of_stranded_jobs(queue: &dyn Queue, lanes: Lanes) {
-    let backlog = queue.backlog();
-    for kind in DeviceKind::ALL {
-        let jobs = backlog.queued_only_for(kind).jobs;
-        if lanes.of(kind) == 0 && jobs > 0 {
-            tracing::warn!(
-                jobs,
-                needs = kind.name(),
-                "jobs wait for a kind of device that this server does not have: start it with one, \
-                 or cancel them"
-            );
-        }
-    }
 }
 
 /// Serves the admin port from a thread with a runtime of its own, to the end of the process.

@@ -60,7 +60,8 @@ async fn serve(gpus: Vec<DeviceOptions>, cpu: bool) -> Stand {
 
 impl Stand {
     fn url(&self, path: &str) -> String {
-        format!("http://{}{path}", self.app.public_address())
+        let address = self.app.public_address().expect("a public port");
+        format!("http://{address}{path}")
     }
 
     async fn submit(&self, options: Value) -> String {

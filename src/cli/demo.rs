@@ -114,9 +114,9 @@ impl Demo {
         })
         .await?;
         app.ready().await?;
+        let address = app.public_address().context("it has no public port")?;
         say(format_args!(
-            "the service runs at http://{}; POST /v1/jobs",
-            app.public_address()
+            "the service runs at http://{address}; POST /v1/jobs"
         ))
         .map_err(|failure| anyhow::anyhow!("{failure}"))?;
         let mut file = Vec::new();
@@ -131,7 +131,7 @@ impl Demo {
             seed: self.seed,
             ..JobOptions::default()
         };
-        let client = Client::new(app.public_address());
+        let client = Client::new(address);
         let options = options.to_json();
         let parts = [
             Part {

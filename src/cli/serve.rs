@@ -12,7 +12,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use super::failure::Failure;
 use super::output::say;
 use crate::app::App;
-use crate::config::{Config, LogFormat};
+use crate::config::{Config, LogFormat, NodeRole};
 use crate::telemetry::Telemetry;
 
 /// Time given to the remaining threads to end at shutdown.
@@ -48,6 +48,11 @@ pub(super) struct Serve {
 /// defaults.
 #[derive(Debug, Args, Serialize)]
 struct Flags {
+    /// What this process does: all, or only api (answers requests) or worker (computes jobs), with
+    /// queue.postgres in the configuration [default: all]
+    #[arg(long, value_enum, hide_possible_values = true)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    role: Option<NodeRole>,
     /// Address of HTTP and gRPC [default: 127.0.0.1:8080]
     #[arg(long, value_name = "ADDRESS")]
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -119,11 +124,15 @@ async fn serve(config: Config) -> Result<(), Failure> {
     let mut terminate = signal(SignalKind::terminate()).map_err(Failure::internal)?;
     let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::internal)?;
     let mut app = App::start(config).await.map_err(Failure::internal)?;
-    say(format_args!(
-        "fnsf serves HTTP and gRPC on {}, health and metrics on {}",
-        app.public_address(),
-        app.admin_address()
-    ))?;
+    let admin = app.admin_address();
+    match app.public_address() {
+        Some(public) => say(format_args!(
+            "fnsf serves HTTP and gRPC on {public}, health and metrics on {admin}"
+        ))?,
+        None => say(format_args!(
+            "fnsf computes jobs; health and metrics are on {admin}"
+        ))?,
+    }
     app.ready()
         .await
         .context("no device is ready")

@@ -32,12 +32,25 @@ const MAX_LANES: usize = 64;
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
-    /// Address of the public port, which serves both HTTP and gRPC. Port 0 takes a free port.
+    /// What this process does of the service.
+    pub role: NodeRole,
+    /// The name of this node, for operators. `None`: the name of the host.
+    pub node: Option<String>,
+    /// Address of the public port, which serves both HTTP and gRPC. Port 0 takes a free port. A
+    /// worker has no public port.
     pub listen: SocketAddr,
     /// Address of the admin port, which serves health checks and metrics. Port 0 takes a free port.
     pub admin_listen: SocketAddr,
-    /// Directory of the queue, the payloads and the results.
+    /// Directory of the queue, the payloads and the results, as far as `queue.postgres` and
+    /// `storage` name no other place.
     pub data_dir: PathBuf,
+    /// Bucket of the payloads and the results: `s3://bucket/prefix`, `gs://bucket/prefix` or
+    /// `az://container/prefix`. Keys, region and endpoint come from the variables that the vendors'
+    /// own programs read, such as `AWS_ACCESS_KEY_ID`. `None`: the folder `blobs` in `data_dir`.
+    pub storage: Option<String>,
+    /// Whether `data_dir` is one folder of all nodes, such as a network file system. Several nodes
+    /// need that or `storage`.
+    pub data_dir_is_shared: bool,
     /// Allow a listen address beyond loopback without any API key.
     pub allow_unauthenticated: bool,
     /// Host names besides localhost that requests may use on a loopback server without keys, such
@@ -74,6 +87,18 @@ pub struct Config {
     /// Destination of traces: an OTLP endpoint over gRPC, such as http://localhost:4317. No traces
     /// are sent without it.
     pub otlp_endpoint: Option<String>,
+}
+
+/// What a process does of the service.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum NodeRole {
+    /// It answers requests and computes jobs.
+    All,
+    /// It answers requests. Other nodes compute the jobs.
+    Api,
+    /// It computes jobs. Other nodes answer the requests.
+    Worker,
 }
 
 /// An API key.
@@ -158,6 +183,15 @@ pub struct LimitsConfig {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct QueueConfig {
+    /// URL of a PostgreSQL database that holds the queue of many nodes:
+    /// `postgres://user:password@host/database`. `None`: a file in `data_dir`, of this process
+    /// alone.
+    pub postgres: Option<Secret>,
+    /// URL of the same database without the pooler that `postgres` leads through. One connection of
+    /// each node needs it.
+    pub postgres_direct: Option<Secret>,
+    /// Number of connections to the database, 1 to 64. Two more are always open.
+    pub postgres_connections: usize,
     /// Failures after which a job is not retried, 1 to 1000.
     pub max_attempts: u32,
     /// Crashes without a new snapshot in between after which a job is not retried, 1 to 1000.
@@ -216,9 +250,13 @@ impl Default for Config {
     fn default() -> Self {
         const DAY: u64 = 24 * 60 * 60;
         Self {
+            role: NodeRole::All,
+            node: None,
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
             admin_listen: SocketAddr::from(([127, 0, 0, 1], 9090)),
             data_dir: PathBuf::from("fnsf-data"),
+            storage: None,
+            data_dir_is_shared: false,
             allow_unauthenticated: false,
             allowed_hosts: Vec::new(),
             api_key: None,
@@ -247,6 +285,9 @@ impl Default for Config {
                 stream_prefetch_pairs: 3,
             },
             queue: QueueConfig {
+                postgres: None,
+                postgres_direct: None,
+                postgres_connections: 4,
                 max_attempts: 3,
                 max_crashes: 5,
                 lease_seconds: 60,
@@ -359,6 +400,8 @@ impl Config {
     /// # Errors
     /// [`ConfigError::Together`] in these cases:
     /// - `listen` is beyond loopback, no API key is given, and `allow_unauthenticated` is false.
+    /// - `role` is not `all`, and `queue.postgres` is not given.
+    /// - `queue.postgres` is given without `storage` or `data_dir_is_shared`.
     /// - `devices` is empty.
     /// - A number is outside the range that its field states.
     /// - `shutdown.timeout_seconds` is less than `shutdown.readiness_delay_seconds` + 4.
@@ -366,10 +409,24 @@ impl Config {
     pub fn check(&self) -> Result<(), ConfigError> {
         let refuse = |text: &str| Err(ConfigError::Together(text.to_owned()));
         let open = self.api_key.is_none() && self.keys.is_empty();
-        if open && !self.listen.ip().is_loopback() && !self.allow_unauthenticated {
+        let answers = self.role != NodeRole::Worker;
+        if answers && open && !self.listen.ip().is_loopback() && !self.allow_unauthenticated {
             return refuse(
                 "listen goes beyond loopback and no key is needed: set api_key or keys, or \
                  allow_unauthenticated = true if the network keeps strangers out",
+            );
+        }
+        if self.role != NodeRole::All && self.queue.postgres.is_none() {
+            return refuse(
+                "role is not all, and a queue in data_dir is of this process alone: name a database \
+                 of all nodes in queue.postgres",
+            );
+        }
+        if self.queue.postgres.is_some() && self.storage.is_none() && !self.data_dir_is_shared {
+            return refuse(
+                "queue.postgres is for many nodes, and the payloads are in a folder of this one: name \
+                 a bucket in storage, or set data_dir_is_shared = true if every node sees the same \
+                 folder",
             );
         }
         if self.devices.is_empty() {

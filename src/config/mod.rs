@@ -8,5 +8,5 @@ mod keys;
 mod ranges;
 mod secret;
 
-pub use keys::{Config, ConfigError, LimitsConfig, LogConfig, LogFormat, QueueConfig};
+pub use keys::{Config, ConfigError, LimitsConfig, LogConfig, LogFormat, NodeRole, QueueConfig};
 pub use secret::Secret;

@@ -22,7 +22,7 @@ fn number(value: impl TryInto<u64>) -> u64 {
 
 impl Config {
     /// The range of every number: beyond it, conversions of units overflow and timers expire.
-    pub(super) fn ranges(&self) -> [Range; 24] {
+    pub(super) fn ranges(&self) -> [Range; 25] {
         const YEARS: u64 = 100 * 365 * 24 * 3600;
         const MIB: u64 = 1 << 43;
         let Self {
@@ -48,6 +48,7 @@ impl Config {
             range!(limits.body_timeout_seconds, 1, 3600),
             range!(limits.write_timeout_seconds, 1, 3600),
             range!(limits.stream_prefetch_pairs, 1, 1000),
+            range!(queue.postgres_connections, 1, 64),
             range!(queue.max_attempts, 1, 1000),
             range!(queue.max_crashes, 1, 1000),
             range!(queue.lease_seconds, 1, YEARS),

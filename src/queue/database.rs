@@ -10,6 +10,7 @@ use super::backlog::Backlog;
 use super::effects::Effects;
 use super::lease::{HeartbeatStore, Lease, LeaseHeartbeat};
 use super::local::Local;
+use super::node::{Capacities, Node};
 use super::sql::Sql;
 use super::transitions;
 use super::transitions::{expiry, leases, lists};
@@ -75,6 +76,9 @@ pub(super) trait Engine: Send + Sync + 'static {
     /// # Errors
     /// [`QueueError::Store`] if it is not.
     fn check(&self) -> Result<(), QueueError>;
+
+    /// As [`Queue::nodes`].
+    async fn nodes(&self, own: Capacities) -> Result<Vec<Node>, QueueError>;
 
     /// As [`Queue::stopped`].
     async fn stopped(&self);
@@ -252,6 +256,10 @@ impl<E: Engine> Queue for DatabaseQueue<E> {
 
     async fn is_empty(&self) -> Result<bool, QueueError> {
         self.engine.read(lists::is_empty).await
+    }
+
+    async fn nodes(&self, own: Capacities) -> Result<Vec<Node>, QueueError> {
+        self.engine.nodes(own).await
     }
 
     async fn stopped(&self) {

@@ -13,6 +13,7 @@ mod database;
 mod effects;
 mod lease;
 mod local;
+mod node;
 mod postgres;
 mod sql;
 mod sqlite;
@@ -22,6 +23,7 @@ mod types;
 
 pub use backlog::{Backlog, Load};
 pub use lease::{Lease, LeaseHeartbeat, Signal};
+pub use node::{Capacities, Capacity, Node};
 pub use postgres::{PostgresOptions, open_postgres};
 pub use sqlite::open_sqlite;
 pub use types::{

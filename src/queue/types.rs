@@ -9,6 +9,7 @@ use tokio::sync::watch;
 
 use super::backlog::Backlog;
 use super::lease::Lease;
+use super::node::{Capacities, Node};
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, State, Tenant};
 
@@ -431,6 +432,12 @@ pub trait Queue: Send + Sync {
     /// # Errors
     /// An error of the store.
     async fn is_empty(&self) -> Result<bool, QueueError>;
+
+    /// Tells the other nodes what this one can do, and returns all nodes, this one included.
+    ///
+    /// # Errors
+    /// An error of the store.
+    async fn nodes(&self, own: Capacities) -> Result<Vec<Node>, QueueError>;
 
     /// Records a graceful shutdown. The next start then counts no crash for the jobs that could not
     /// be released.

@@ -1,216 +1,153 @@
-//! Storage of payloads, snapshots and results: files in one folder, by job.
+//! The store of payloads, snapshots and results: a folder, or a bucket of an object store.
 //!
 //! A write is atomic. A durable write is on disk before the call returns; an ephemeral one does not
-//! wait for the disk. Independent of the content of the blobs.
+//! wait for the disk of a folder. Independent of the content of the blobs.
 
-use std::fs::{self, Permissions};
-use std::io::{self, Write};
-use std::os::unix::fs::PermissionsExt;
-use std::path::{Path as FilePath, PathBuf};
+use std::io;
+use std::path::Path as FilePath;
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use bytes::Bytes;
-use object_store::ObjectStoreExt;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
+use object_store::{ObjectStore, ObjectStoreExt};
 
-use crate::fault::Fault;
+use super::blob::{Blob, BlobError, FreeSpace, Fsync, path};
+use super::{bucket, folder};
 use crate::job::JobId;
 
-/// The store of payloads, snapshots, motion fields and results: files below one folder, by job.
-/// Clones share it. Its async methods need a tokio runtime.
-#[derive(Clone, Debug)]
-pub struct Blobs {
-    folder: Arc<FilePath>,
-    synced: Arc<LocalFileSystem>,
-    quick: Arc<LocalFileSystem>,
-}
-
-/// Whether a write waits for the disk.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Fsync {
-    /// It waits: the blob is on disk when the write returns.
-    Yes,
-    /// It does not wait: the blob survives a crash of the process, but perhaps not of the machine.
-    No,
-}
-
-/// A blob of a job.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Blob {
-    /// One of its sweeps, by index from 0.
-    Sweep(u32),
-    /// The latest snapshot of its optimization.
-    Snapshot,
-    /// The flow, or the dense cloud, of one attempt, by attempt number.
-    Result(u32),
-    /// The motion field of one attempt, by attempt number, for the jobs that follow and for the
-    /// dense cloud. A late attempt cannot change a field that was already read.
-    Field(u32),
-}
-
-/// Why an operation of the store failed. [`BlobError::fault`] classifies it.
-#[derive(Debug, thiserror::Error)]
-#[error("the blob store failed: {0}")]
-pub struct BlobError(#[from] object_store::Error);
-
-impl BlobError {
-    /// Whether the operation failed because the blob or file does not exist.
-    pub fn is_missing(&self) -> bool {
-        self.fault() == Fault::Missing
-    }
-
-    /// The cause: [`Fault::Missing`] if the blob or file does not exist, [`Fault::Full`] if no more
-    /// data can be written, otherwise [`Fault::Machine`].
-    pub fn fault(&self) -> Fault {
-        match &self.0 {
-            object_store::Error::NotFound { .. } => Fault::Missing,
-            error => Fault::of(error),
-        }
-    }
-}
-
-impl From<io::Error> for BlobError {
-    fn from(error: io::Error) -> Self {
-        Self(object_store::Error::Generic {
-            store: "files",
-            source: Box::new(error),
-        })
-    }
-}
-
-/// Free space of the file system that holds the store.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct FreeSpace {
-    /// Free bytes for unprivileged processes.
-    pub bytes: u64,
-    /// Files and folders that can still be created; `None` if the file system does not count them.
-    pub inodes: Option<u64>,
-}
-
-/// The file that holds the store's identity.
+/// The object that holds the store's identity.
 const IDENTITY: &str = "identity";
 
-/// The folder of a job. Ids begin with their time, so the jobs of one parent folder were created
-/// within about one minute.
-fn folder(id: JobId) -> String {
-    let name = id.to_string();
-    format!("jobs/{}/{name}", &name[..8])
+/// The store of payloads, snapshots, motion fields and results, by job. Clones share it. Its async
+/// methods need a tokio runtime.
+#[derive(Clone, Debug)]
+pub struct Blobs {
+    synced: Arc<dyn ObjectStore>,
+    quick: Arc<dyn ObjectStore>,
+    place: Place,
 }
 
-fn path(id: JobId, blob: Blob) -> Path {
-    let folder = folder(id);
-    Path::from(match blob {
-        Blob::Sweep(index) => format!("{folder}/sweep-{index}"),
-        Blob::Snapshot => format!("{folder}/snapshot"),
-        Blob::Result(attempt) => format!("{folder}/result-{attempt}"),
-        Blob::Field(attempt) => format!("{folder}/field-{attempt}"),
-    })
+/// Where the blobs are.
+#[derive(Clone, Debug)]
+enum Place {
+    Folder(Arc<FilePath>),
+    Bucket(Arc<str>),
 }
 
 impl Blobs {
-    /// Opens or creates the store in `folder`, and gives the folder the mode 0700.
+    /// Opens or creates the store in a folder, and gives the folder the mode 0700.
     ///
     /// # Errors
     /// If the folder cannot be created, opened or given that mode.
-    pub fn open(folder: &FilePath) -> Result<Self, BlobError> {
-        fs::create_dir_all(folder)?;
-        // An existing folder may have other permissions.
-        fs::set_permissions(folder, Permissions::from_mode(0o700))?;
+    pub fn open(root: &FilePath) -> Result<Self, BlobError> {
+        folder::prepare(root)?;
         let open = || -> Result<LocalFileSystem, BlobError> {
-            Ok(LocalFileSystem::new_with_prefix(folder)?.with_automatic_cleanup(true))
+            Ok(LocalFileSystem::new_with_prefix(root)?.with_automatic_cleanup(true))
         };
         Ok(Self {
-            folder: Arc::from(folder),
             synced: Arc::new(open()?.with_fsync(true)),
             quick: Arc::new(open()?),
+            place: Place::Folder(Arc::from(root)),
         })
     }
 
-    /// Free space of the file system that holds the store; `None` if the system does not report it.
-    /// The call blocks while the disk hangs, so it must not run on a thread of the async runtime.
-    pub fn free_space(&self) -> Option<FreeSpace> {
-        let filesystem = rustix::fs::statvfs(&*self.folder).ok()?;
-        Some(FreeSpace {
-            bytes: filesystem.f_bavail.saturating_mul(filesystem.f_frsize),
-            inodes: (filesystem.f_files > 0).then_some(filesystem.f_favail),
-        })
-    }
-
-    /// The identity of the store: the number of the queue that it belongs to, as
-    /// [`crate::queue::Queue::identity`] returns it. `None` if the file `identity` does not exist,
-    /// as in a new store.
+    /// Opens the store in a bucket: `s3://bucket/prefix`, `gs://bucket/prefix` or
+    /// `az://container/prefix`. Keys, region and endpoint come from the variables that the vendors'
+    /// own programs read, such as `AWS_ACCESS_KEY_ID`, `AWS_REGION` and `AWS_ENDPOINT_URL`. The
+    /// bucket is not asked yet.
     ///
     /// # Errors
-    /// If the file cannot be read. [`io::ErrorKind::InvalidData`] if it does not hold an `i32` in
-    /// decimal digits.
-    pub fn identity(&self) -> io::Result<Option<i32>> {
-        match fs::read_to_string(self.folder.join(IDENTITY)) {
-            Ok(text) => match text.trim().parse() {
-                Ok(identity) => Ok(Some(identity)),
-                Err(_) => Err(io::ErrorKind::InvalidData.into()),
-            },
-            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
-            Err(error) => Err(error),
+    /// If the URL is none of these, or a variable has a value that cannot be used.
+    pub fn open_bucket(url: &str) -> Result<Self, BlobError> {
+        let store = bucket::open(url)?;
+        Ok(Self {
+            synced: Arc::clone(&store),
+            quick: store,
+            place: Place::Bucket(Arc::from(url)),
+        })
+    }
+
+    /// Where the store is: the path of its folder, or the URL of its bucket.
+    pub fn location(&self) -> String {
+        match &self.place {
+            Place::Folder(root) => root.display().to_string(),
+            Place::Bucket(url) => (**url).to_owned(),
         }
     }
 
-    /// Writes the identity of the store to the file `identity`, replacing an earlier one, and waits
-    /// for the disk. [`Blobs::probe`] fails until the store has an identity.
-    ///
-    /// # Errors
-    /// If the file cannot be created, written, renamed or synced.
-    pub fn set_identity(&self, identity: i32) -> io::Result<()> {
-        // A crash leaves the earlier file or the new one, never an empty one.
-        let written = self.folder.join("identity.new");
-        let mut file = fs::File::create(&written)?;
-        writeln!(file, "{identity}")?;
-        file.sync_all()?;
-        fs::rename(&written, self.folder.join(IDENTITY))?;
-        fs::File::open(&self.folder)?.sync_all()
+    /// Free space of the file system that holds the store; `None` if the system does not report it
+    /// and for a bucket. The call blocks while the disk hangs, so it must not run on a thread of the
+    /// async runtime.
+    pub fn free_space(&self) -> Option<FreeSpace> {
+        match &self.place {
+            Place::Folder(root) => folder::free_space(root),
+            Place::Bucket(_) => None,
+        }
     }
 
-    /// Tests the store. It checks the `identity`, then writes, syncs, reads back and removes a file
-    /// of 64 KiB. Last it checks the free space: twice `needed` bytes, at least 4 MiB. This check
-    /// is skipped if the system does not report the free space.
+    /// The identity of the store: the number of the queue that it belongs to, as
+    /// [`crate::queue::Queue::identity`] returns it. `None` if the object `identity` does not exist,
+    /// as in a new store.
+    ///
+    /// # Errors
+    /// If the object cannot be read, or does not hold an `i32` in decimal digits.
+    pub async fn identity(&self) -> Result<Option<i32>, BlobError> {
+        let text = match self.quick.get(&Path::from(IDENTITY)).await {
+            Ok(found) => found.bytes().await?,
+            Err(object_store::Error::NotFound { .. }) => return Ok(None),
+            Err(error) => return Err(error.into()),
+        };
+        let number = String::from_utf8_lossy(&text).trim().parse();
+        let invalid = |_| BlobError::from(io::Error::from(io::ErrorKind::InvalidData));
+        number.map(Some).map_err(invalid)
+    }
+
+    /// Writes the identity of the store to the object `identity`, replacing an earlier one, and
+    /// waits for the disk. [`Blobs::probe`] fails until the store has an identity.
+    ///
+    /// # Errors
+    /// If it cannot be written.
+    pub async fn set_identity(&self, identity: i32) -> Result<(), BlobError> {
+        let text = format!("{identity}\n");
+        match &self.place {
+            Place::Folder(root) => {
+                let root = Arc::clone(root);
+                in_background(move || folder::write(&root, IDENTITY, &text)).await
+            }
+            Place::Bucket(_) => {
+                self.synced.put(&Path::from(IDENTITY), text.into()).await?;
+                Ok(())
+            }
+        }
+    }
+
+    /// Tests the store. It checks the `identity`, then writes, syncs, reads back and removes 64
+    /// KiB. Last it checks the free space of a folder: twice `needed` bytes, at least 4 MiB. This
+    /// check is skipped if the system does not report the free space.
     ///
     /// # Errors
     /// [`BlobError`] in these cases:
     /// - The store has another identity, or none.
-    /// - A file operation fails, or other bytes are read back.
-    /// - There is too little free space. Its fault is [`Fault::Full`].
+    /// - An operation fails, or other bytes are read back.
+    /// - There is too little free space. Its fault is [`Fault::Full`](crate::fault::Fault::Full).
     pub async fn probe(&self, identity: i32, needed: u64) -> Result<(), BlobError> {
-        const BYTES: usize = 64 << 10;
-        const ROOM: u64 = 4 << 20;
-        let (store, path) = (self.clone(), self.folder.join("jobs/probe"));
-        in_background(move || {
-            // A volume that is not mounted appears as an empty, writable folder.
-            if store.identity()? != Some(identity) {
-                return Err(io::Error::other(
-                    "the payloads are not there: is their volume mounted?",
-                ));
+        // A volume that is not mounted appears as an empty, writable folder.
+        if self.identity().await? != Some(identity) {
+            let gone = "the payloads are not there: is their volume mounted?";
+            return Err(io::Error::other(gone).into());
+        }
+        match &self.place {
+            Place::Folder(root) => {
+                let root = Arc::clone(root);
+                in_background(move || folder::probe(&root, needed)).await
             }
-            fs::create_dir_all(store.folder.join("jobs"))?;
-            let bytes = vec![7; BYTES];
-            let mut file = fs::File::create(&path)?;
-            file.write_all(&bytes)?;
-            file.sync_data()?;
-            let read = fs::read(&path)?;
-            fs::remove_file(&path)?;
-            if read != bytes {
-                return Err(io::ErrorKind::InvalidData.into());
-            }
-            let least = ROOM.max(needed.saturating_mul(2));
-            match store.free_space() {
-                Some(free) if free.bytes < least => Err(io::ErrorKind::StorageFull.into()),
-                _ => Ok(()),
-            }
-        })
-        .await
+            Place::Bucket(_) => bucket::probe(&*self.synced).await,
+        }
     }
 
-    /// Writes a blob atomically, replacing an existing one.
+    /// Writes a blob atomically, replacing an existing one. Large blobs go to a bucket in parts.
     ///
     /// # Errors
     /// If it cannot be written. The blob is then unchanged or, with [`Fsync::Yes`], possibly
@@ -222,11 +159,15 @@ impl Blobs {
         bytes: Bytes,
         sync: Fsync,
     ) -> Result<(), BlobError> {
+        let path = path(id, blob);
+        if let Place::Bucket(_) = self.place {
+            return bucket::put(&*self.synced, &path, bytes).await;
+        }
         let store = match sync {
             Fsync::Yes => &self.synced,
             Fsync::No => &self.quick,
         };
-        store.put(&path(id, blob), bytes.into()).await?;
+        store.put(&path, bytes.into()).await?;
         Ok(())
     }
 
@@ -248,11 +189,14 @@ impl Blobs {
     }
 
     /// Makes a blob durable that was written with [`Fsync::No`]: reads it and writes it again with
-    /// [`Fsync::Yes`].
+    /// [`Fsync::Yes`]. In a bucket it is durable already.
     ///
     /// # Errors
     /// If there is none ([`BlobError::is_missing`]), or it cannot be read or written.
     pub async fn sync(&self, id: JobId, blob: Blob) -> Result<(), BlobError> {
+        if let Place::Bucket(_) = self.place {
+            return Ok(());
+        }
         let bytes = self.get(id, blob).await?;
         self.put(id, blob, bytes, Fsync::Yes).await
     }
@@ -272,120 +216,63 @@ impl Blobs {
     /// without blobs.
     ///
     /// # Errors
-    /// If a file cannot be removed. Others may have been removed by then.
+    /// If a blob cannot be removed. Others may have been removed by then.
     pub async fn remove_job(&self, id: JobId) -> Result<(), BlobError> {
-        let folder = self.folder.join(folder(id));
-        in_background(move || {
-            match fs::remove_dir_all(&folder) {
-                Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
-                _ => {}
+        match &self.place {
+            Place::Folder(root) => {
+                let root = Arc::clone(root);
+                in_background(move || folder::remove_job(&root, id)).await
             }
-            // This fails while the folder holds other jobs, as intended.
-            let _not_empty = folder.parent().map(fs::remove_dir);
-            Ok(())
-        })
-        .await
+            Place::Bucket(_) => bucket::remove_job(&*self.quick, id).await,
+        }
     }
 
     /// Whether the store holds no blobs of any job.
     ///
     /// # Errors
-    /// If the folder cannot be listed.
-    pub fn is_empty(&self) -> Result<bool, BlobError> {
-        // An interrupted probe leaves a file; jobs are folders.
-        Ok(!entries(&self.folder.join("jobs"))?
-            .iter()
-            .any(|path| path.is_dir()))
+    /// If the store cannot be listed.
+    pub async fn is_empty(&self) -> Result<bool, BlobError> {
+        match &self.place {
+            Place::Folder(root) => {
+                let root = Arc::clone(root);
+                in_background(move || folder::is_empty(&root)).await
+            }
+            Place::Bucket(_) => bucket::is_empty(&*self.quick).await,
+        }
     }
 
     /// The jobs whose folder and files were all last changed more than `age` ago. The remains of
-    /// interrupted writes count as files.
+    /// interrupted writes count as files. None for a bucket, which may be too large to list: a rule
+    /// of its own expires what is old.
     ///
     /// # Errors
-    /// If the store cannot be listed.
+    /// If the folder cannot be listed.
     pub async fn jobs_older_than(&self, age: Duration) -> Result<Vec<JobId>, BlobError> {
-        let root = self.folder.join("jobs");
-        in_background(move || {
-            let limit = SystemTime::now().checked_sub(age);
-            let is_old = |path: &FilePath| is_older(path, limit);
-            let mut found = Vec::new();
-            for minute in entries(&root)? {
-                for job in entries(&minute)? {
-                    let name = job.file_name().unwrap_or_default().to_string_lossy();
-                    let Ok(id) = name.parse() else { continue };
-                    let mut all_old = is_old(&job)?;
-                    for blob in entries(&job)? {
-                        all_old &= is_old(&blob)?;
-                    }
-                    if all_old {
-                        found.push(id);
-                    }
-                }
+        match &self.place {
+            Place::Folder(root) => {
+                let root = Arc::clone(root);
+                in_background(move || folder::jobs_older_than(&root, age)).await
             }
-            Ok(found)
-        })
-        .await
+            Place::Bucket(_) => Ok(Vec::new()),
+        }
     }
 
     /// Removes the remains of interrupted writes that were last changed more than `age` ago.
-    /// Returns the number of files removed.
+    /// Returns the number of files removed. None for a bucket, whose own rule ends uploads that were
+    /// interrupted.
     ///
     /// # Errors
-    /// If the store cannot be listed or a file cannot be removed. Others may have been removed by
+    /// If the folder cannot be listed or a file cannot be removed. Others may have been removed by
     /// then.
     pub async fn remove_cut_off(&self, age: Duration) -> Result<usize, BlobError> {
-        let root = self.folder.join("jobs");
-        in_background(move || {
-            let limit = SystemTime::now().checked_sub(age);
-            let mut removed = 0;
-            for minute in entries(&root)? {
-                for job in entries(&minute)? {
-                    for blob in entries(&job)? {
-                        if is_staged(&blob) && is_older(&blob, limit)? {
-                            fs::remove_file(&blob)?;
-                            removed += 1;
-                        }
-                    }
-                }
+        match &self.place {
+            Place::Folder(root) => {
+                let root = Arc::clone(root);
+                in_background(move || folder::remove_cut_off(&root, age)).await
             }
-            Ok(removed)
-        })
-        .await
-    }
-}
-
-/// Whether a file is a staged write, such as `sweep-0#1`, which is renamed when it is complete.
-fn is_staged(path: &FilePath) -> bool {
-    let name = path.file_name().unwrap_or_default().to_string_lossy();
-    name.rsplit_once('#')
-        .is_some_and(|(_, number)| number.bytes().all(|byte| byte.is_ascii_digit()))
-}
-
-/// Whether a file was last changed before `limit`. A file that is gone meanwhile counts as older.
-fn is_older(path: &FilePath, limit: Option<SystemTime>) -> io::Result<bool> {
-    match fs::metadata(path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(true),
-        about => {
-            let changed = about?.modified()?;
-            Ok(limit.is_some_and(|limit| changed < limit))
+            Place::Bucket(_) => Ok(0),
         }
     }
-}
-
-/// The entries of a folder; empty if the folder does not exist or is not a folder.
-fn entries(folder: &FilePath) -> io::Result<Vec<PathBuf>> {
-    let listed = match fs::read_dir(folder) {
-        Err(error)
-            if matches!(
-                error.kind(),
-                io::ErrorKind::NotFound | io::ErrorKind::NotADirectory
-            ) =>
-        {
-            return Ok(Vec::new());
-        }
-        listed => listed?,
-    };
-    listed.map(|entry| Ok(entry?.path())).collect()
 }
 
 /// Runs blocking file operations outside the async runtime's workers.
@@ -398,21 +285,25 @@ async fn in_background<T: Send + 'static>(
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
+    use super::super::blob;
     use super::*;
+    use crate::fault::Fault;
 
     #[tokio::test]
     async fn blobs_come_back_and_go_with_their_job() {
         let folder = tempfile::tempdir().expect("a folder");
         let blobs = Blobs::open(folder.path()).expect("a store");
         assert!(blobs.free_space().is_some_and(|free| free.bytes > 0));
-        assert!(blobs.is_empty().expect("a list"));
+        assert!(blobs.is_empty().await.expect("a list"));
         assert!(blobs.probe(7, 0).await.is_err(), "it is no store yet");
-        blobs.set_identity(7).expect("written");
+        blobs.set_identity(7).await.expect("written");
         blobs.probe(7, 0).await.expect("it can be written");
         assert!(blobs.probe(8, 0).await.is_err(), "it is another store");
         let full = blobs.probe(7, u64::MAX).await.expect_err("too much");
         assert_eq!(full.fault(), Fault::Full);
-        assert!(blobs.is_empty().expect("a list"));
+        assert!(blobs.is_empty().await.expect("a list"));
         let (id, other) = (JobId::fresh(), JobId::fresh());
         let all = [
             Blob::Sweep(0),
@@ -447,7 +338,7 @@ mod tests {
         let (kept, orphan) = (JobId::fresh(), JobId::fresh());
         let put = blobs.put(kept, Blob::Sweep(0), Bytes::from("whole"), Fsync::No);
         put.await.expect("written");
-        let lies = |id: JobId, name: &str| folder.path().join(super::folder(id)).join(name);
+        let lies = |id: JobId, name: &str| folder.path().join(blob::folder(id)).join(name);
         let orphans = lies(orphan, "sweep-0#1");
         fs::create_dir_all(orphans.parent().expect("a folder")).expect("made");
         for staged in [orphans, lies(kept, "result-1#12")] {

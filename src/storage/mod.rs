@@ -1,5 +1,9 @@
 //! Storage of payloads, snapshots, motion fields and results.
 
+mod blob;
 mod blobs;
+mod bucket;
+mod folder;
 
-pub use crate::storage::blobs::{Blob, BlobError, Blobs, FreeSpace, Fsync};
+pub use blob::{Blob, BlobError, FreeSpace, Fsync};
+pub use blobs::Blobs;

@@ -46,7 +46,7 @@ async fn stand_with(lanes: usize, overflow_kind: Option<DeviceKind>) -> Stand {
     let (events, _) = mpsc::unbounded_channel();
     let queue = open_sqlite(folder.path(), options, events).expect("a queue");
     let blobs = Blobs::open(&folder.path().join("blobs")).expect("a store");
-    blobs.set_identity(queue.identity()).expect("written");
+    blobs.set_identity(queue.identity()).await.expect("written");
     let switches = Arc::new(Switches::default());
     let metrics = Arc::new(Metrics::new(&["fragile"]));
     let device = Device::start(switches.gpu("fragile", lanes), &metrics).expect("a thread");

@@ -1,4 +1,4 @@
-//! A PostgreSQL server of the test process's own: a new cluster in a temporary folder, on a Unix
+//! A PostgreSQL server of the tests: a new cluster in a temporary folder, on a Unix
 //! socket there.
 
 use std::io::{BufRead, BufReader};
@@ -6,20 +6,13 @@ use std::os::unix::fs::PermissionsExt;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-/// The server of this process, started by its first user.
+/// A new server, which the test may crash.
 ///
 /// Without PostgreSQL the test is skipped with a message, unless `FNSF_REQUIRE_POSTGRES=1` makes it
 /// fail.
-pub(crate) fn postgres_server() -> Option<&'static PostgresServer> {
-    static SERVER: OnceLock<Option<PostgresServer>> = OnceLock::new();
-    SERVER.get_or_init(own_postgres_server).as_ref()
-}
-
-/// A server of the test's own, which it may crash. `None` as for [`postgres_server`].
-pub(crate) fn own_postgres_server() -> Option<PostgresServer> {
+pub(crate) fn start_postgres() -> Option<PostgresServer> {
     let server = programs().map(|programs| PostgresServer::start(&programs));
     let is_required = std::env::var_os("FNSF_REQUIRE_POSTGRES").is_some_and(|value| value == "1");
     assert!(

@@ -21,10 +21,10 @@ const CONFIG: &str =
     "[queue]\nretry_delay_seconds = 1\nsnapshot_interval_ms = 50\nmax_crashes = 40\n";
 
 /// A deterministic random number generator (SplitMix64).
-struct Dice(u64);
+pub(crate) struct Dice(pub(crate) u64);
 
 impl Dice {
-    fn below(&mut self, limit: u64) -> u64 {
+    pub(crate) fn below(&mut self, limit: u64) -> u64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut mixed = self.0;
         mixed = (mixed ^ (mixed >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -34,7 +34,7 @@ impl Dice {
 }
 
 /// The options of job `job`: a few kinds of small jobs, the same in every run.
-fn options(job: usize) -> String {
+pub(crate) fn options(job: usize) -> String {
     let seed = job % 7;
     match job % 5 {
         0 => format!(r#"{{"seed": {seed}, "preset": "paper", "max_points": 2048}}"#),
@@ -59,7 +59,7 @@ async fn submit(server: &Server, client: &reqwest::Client, job: usize) -> Option
     Some(view["id"].as_str()?.to_owned())
 }
 
-async fn fetch(server: &Server, client: &reqwest::Client, id: &str) -> Vec<u8> {
+pub(crate) async fn fetch(server: &Server, client: &reqwest::Client, id: &str) -> Vec<u8> {
     let url = server.url(&format!("/v1/jobs/{id}/result"));
     let answer = client.get(url).send().await.expect("an answer");
     assert_eq!(answer.status(), StatusCode::OK, "{id}");
@@ -145,7 +145,7 @@ async fn every_acknowledged_job_ends_once_with_the_undisturbed_result_however_of
 }
 
 /// The number of durable jobs in the server's list.
-async fn list_all(server: &Server, client: &reqwest::Client) -> usize {
+pub(crate) async fn list_all(server: &Server, client: &reqwest::Client) -> usize {
     let (mut count, mut before) = (0, String::new());
     loop {
         let url = server.url(&format!("/v1/jobs?limit=500{before}"));

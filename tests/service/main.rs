@@ -16,6 +16,7 @@ mod attacks_requests;
 mod clouds;
 mod crash_recovery;
 mod devices;
+mod fleet;
 #[path = "../common/gpu.rs"]
 mod gpu_rule;
 mod grpc;
@@ -23,8 +24,12 @@ mod http;
 mod info;
 mod load;
 mod nonsense;
+#[path = "../common/object_server.rs"]
+mod object_server;
 mod objects;
 mod poses;
+#[path = "../common/postgres_server.rs"]
+mod postgres_server;
 mod raw_http;
 mod readme;
 #[path = "../common/real_data.rs"]

@@ -60,7 +60,17 @@ impl Server {
         Self::start_as(shell, &Folder::new(), config, &[])
     }
 
+    /// A new node of a queue that others share, with these variables of the environment.
+    pub(crate) fn node(config: &str, role: &str, variables: &[(&str, &str)]) -> Self {
+        let mut program = Command::new(env!("CARGO_BIN_EXE_fnsf"));
+        program.envs(variables.iter().copied());
+        let arguments = ["--role", role, "--device", "cpu:1"];
+        Self::start_as(program, &Folder::new(), config, &arguments)
+    }
+
     fn start_as(mut program: Command, folder: &Folder, config: &str, arguments: &[&str]) -> Self {
+        // The clients of the tests need one.
+        let _is_named = rustls::crypto::ring::default_provider().install_default();
         let file: PathBuf = folder.path().join("fnsf.toml");
         std::fs::write(&file, config).expect("a file");
         let mut child = program
@@ -93,10 +103,15 @@ impl Server {
             .filter(|word| word.starts_with("127.0.0.1:"))
             .map(str::to_owned)
             .collect();
-        let [public, admin] = addresses.try_into().unwrap_or_else(|_| {
-            let log = log.lock().expect("no panic holds it");
-            panic!("it said {said:?} and logged {log}")
-        });
+        let (public, admin) = match addresses.as_slice() {
+            [public, admin] => (public.clone(), admin.clone()),
+            // A worker.
+            [admin] => (String::new(), admin.clone()),
+            _ => {
+                let log = log.lock().expect("no panic holds it");
+                panic!("it said {said:?} and logged {log}")
+            }
+        };
         let server = Self {
             child,
             public,

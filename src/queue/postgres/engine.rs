@@ -10,6 +10,7 @@ use tokio::sync::{mpsc, oneshot, watch};
 
 use super::bell::Changes;
 use super::heartbeat::PostgresHeartbeat;
+use super::nodes;
 use super::pool::{Pool, spawn};
 use super::presence::Presence;
 use super::schema;
@@ -22,6 +23,7 @@ use crate::queue::database::{DatabaseQueue, Engine, Kept};
 use crate::queue::effects::Effects;
 use crate::queue::lease::HeartbeatStore;
 use crate::queue::local::Local;
+use crate::queue::node::{Capacities, Node};
 use crate::queue::sql::{Sql, values};
 use crate::queue::transitions;
 use crate::queue::types::{Event, Queue, QueueError, QueueOptions};
@@ -168,6 +170,11 @@ impl Engine for PostgresEngine {
 
     fn check(&self) -> Result<(), QueueError> {
         Ok(())
+    }
+
+    async fn nodes(&self, own: Capacities) -> Result<Vec<Node>, QueueError> {
+        self.write(Kept::Soon, move |sql, _| nodes::exchange(sql, own))
+            .await
     }
 
     async fn stopped(&self) {

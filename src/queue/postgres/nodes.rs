@@ -8,7 +8,8 @@ use super::locks::NODES;
 use super::session::Session;
 use crate::queue::database::Kept;
 use crate::queue::effects::Effects;
-use crate::queue::sql::{Sql, values};
+use crate::queue::node::{Capacities, Capacity, Node};
+use crate::queue::sql::{Row, Sql, values};
 use crate::queue::transitions::expiry;
 use crate::queue::types::{QueueError, QueueOptions};
 
@@ -52,6 +53,36 @@ pub(super) fn show(
     session.read(asked, |sql| sql.query(&lock, values![number]))?;
     node.store(number, Ordering::Relaxed);
     Ok(())
+}
+
+/// Writes what this node can do, and reads all nodes.
+pub(super) fn exchange(sql: &dyn Sql, own: Capacities) -> Result<Vec<Node>, QueueError> {
+    let [cpu, gpu] = own;
+    let tell = "UPDATE nodes SET cpu_lanes = ?2, cpu_rate = ?3, gpu_lanes = ?4, gpu_rate = ?5 \
+                WHERE id = ?1";
+    let me = sql.node();
+    sql.query(tell, values![me, cpu.lanes, cpu.rate, gpu.lanes, gpu.rate])?;
+    let text = "SELECT id, name, version, started, cpu_lanes, cpu_rate, gpu_lanes, gpu_rate \
+                FROM nodes ORDER BY id";
+    let nodes = sql.query(text, &[])?;
+    let node = |row: &Row| {
+        let capacity = |column| -> Result<Capacity, QueueError> {
+            Ok(Capacity {
+                lanes: row.get(column)?,
+                rate: row.get(column + 1)?,
+            })
+        };
+        let number = row.get(0)?;
+        Ok(Node {
+            number,
+            name: row.get(1)?,
+            version: row.get(2)?,
+            started: row.get(3)?,
+            is_this: number == me,
+            capacities: [capacity(4)?, capacity(6)?],
+        })
+    };
+    nodes.iter().map(node).collect()
 }
 
 /// A node that does not hold its lock.

@@ -25,7 +25,11 @@ const TABLES: [&str; 17] = [
         name text NOT NULL,
         version text NOT NULL,
         started bigint NOT NULL,
-        stopped smallint NOT NULL DEFAULT 0
+        stopped smallint NOT NULL DEFAULT 0,
+        cpu_lanes integer NOT NULL DEFAULT 0,
+        cpu_rate double precision NOT NULL DEFAULT 0,
+        gpu_lanes integer NOT NULL DEFAULT 0,
+        gpu_rate double precision NOT NULL DEFAULT 0
     )",
     "CREATE TABLE commits (
         node integer NOT NULL,

@@ -15,11 +15,13 @@ use super::heartbeat::SqliteHeartbeat;
 use super::schema;
 use super::statements::{NODE, SqliteSql};
 use super::writer::Writer;
+use crate::clock::Timestamp;
 use crate::job::{Job, JobId};
 use crate::queue::database::{DatabaseQueue, Engine, Kept};
 use crate::queue::effects::Effects;
 use crate::queue::lease::HeartbeatStore;
 use crate::queue::local::Local;
+use crate::queue::node::{Capacities, Node};
 use crate::queue::sql::Sql;
 use crate::queue::transitions;
 use crate::queue::transitions::{expiry, lists};
@@ -63,6 +65,7 @@ pub(super) struct SqliteEngine {
     identity: i32,
     folder: PathBuf,
     files: Files,
+    opened: Timestamp,
     _lock: File,
 }
 
@@ -115,6 +118,7 @@ impl SqliteEngine {
             identity,
             folder: folder.to_owned(),
             files: Files::of([path, lock_path]).map_err(store)?,
+            opened: Timestamp::now(),
             _lock: lock,
         })
     }
@@ -178,6 +182,17 @@ impl Engine for SqliteEngine {
         }
         let gone = "its files were removed or replaced while it was open".to_owned();
         Err(QueueError::Store(gone))
+    }
+
+    async fn nodes(&self, capacities: Capacities) -> Result<Vec<Node>, QueueError> {
+        Ok(vec![Node {
+            number: NODE,
+            name: self.folder.display().to_string(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            started: self.opened,
+            is_this: true,
+            capacities,
+        }])
     }
 
     async fn stopped(&self) {

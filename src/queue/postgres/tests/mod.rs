@@ -1,6 +1,6 @@
 //! Contract tests of the queue on PostgreSQL, and tests of several nodes.
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use tokio::sync::mpsc;
@@ -16,7 +16,13 @@ use crate::queue::types::{Event, Queue, QueueOptions};
 
 #[path = "../../../../tests/common/postgres_server.rs"]
 mod postgres_server;
-use postgres_server::{PostgresServer, own_postgres_server, postgres_server};
+use postgres_server::{PostgresServer, start_postgres};
+
+/// The server of all tests of this process that crash none, started by the first of them.
+fn shared_postgres() -> Option<&'static PostgresServer> {
+    static SERVER: OnceLock<Option<PostgresServer>> = OnceLock::new();
+    SERVER.get_or_init(start_postgres).as_ref()
+}
 
 /// The server of all tests, or one that a test may crash.
 #[derive(Clone)]
@@ -45,7 +51,7 @@ struct Database {
 impl Database {
     /// A new one; `None` without PostgreSQL.
     fn new() -> Option<Self> {
-        Some(Self::on(Server::Of(postgres_server()?)))
+        Some(Self::on(Server::Of(shared_postgres()?)))
     }
 
     fn on(server: Server) -> Self {

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
-use super::{Database, Server, own_postgres_server};
+use super::{Database, Server, start_postgres};
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, JobId, JobProgress, Priority, State};
 use crate::queue::contract_tests::{done, submission};
@@ -158,7 +158,7 @@ async fn a_node_that_loses_its_connections_goes_on_and_keeps_its_jobs() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_crash_of_the_database_loses_no_promise_and_blames_no_job() {
-    let Some(server) = own_postgres_server() else {
+    let Some(server) = start_postgres() else {
         return;
     };
     let database = Database::on(Server::Own(Arc::new(server)));

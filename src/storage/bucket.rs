@@ -1,0 +1,90 @@
+//! The part of the store that only a bucket of an object store has.
+
+use std::io;
+use std::sync::Arc;
+
+use bytes::Bytes;
+use futures_util::{StreamExt, TryStreamExt};
+use object_store::path::Path;
+use object_store::prefix::PrefixStore;
+use object_store::{ObjectStore, ObjectStoreExt, WriteMultipart, parse_url_opts};
+use url::Url;
+
+use super::blob::{BlobError, folder};
+use crate::job::JobId;
+
+/// Larger blobs are written in parts, each of which is retried by itself.
+const WHOLE_BYTES: usize = 64 << 20;
+
+/// Bytes of a part.
+const PART_BYTES: usize = 16 << 20;
+
+/// Opens a bucket by its URL, with the variables of the environment.
+pub(super) fn open(url: &str) -> Result<Arc<dyn ObjectStore>, BlobError> {
+    let invalid = |text: String| BlobError::from(io::Error::new(io::ErrorKind::InvalidInput, text));
+    let parsed = Url::parse(url).map_err(|error| invalid(format!("{url:?}: {error}")))?;
+    if !["s3", "gs", "az"].contains(&parsed.scheme()) {
+        return Err(invalid(format!(
+            "{url:?} is no s3://bucket, gs://bucket or az://container"
+        )));
+    }
+    let (store, prefix) = parse_url_opts(&parsed, std::env::vars())?;
+    Ok(Arc::new(PrefixStore::new(store, prefix)))
+}
+
+/// Writes, reads back and removes 64 KiB.
+pub(super) async fn probe(store: &dyn ObjectStore) -> Result<(), BlobError> {
+    const BYTES: usize = 64 << 10;
+    // Several nodes may test the bucket at once.
+    let path = Path::from(format!("probe/{}", JobId::fresh()));
+    let bytes = Bytes::from(vec![7; BYTES]);
+    store.put(&path, bytes.clone().into()).await?;
+    let read = store.get(&path).await?.bytes().await?;
+    store.delete(&path).await?;
+    if read != bytes {
+        return Err(io::Error::from(io::ErrorKind::InvalidData).into());
+    }
+    Ok(())
+}
+
+/// Writes a blob, a large one in parts.
+pub(super) async fn put(
+    store: &dyn ObjectStore,
+    path: &Path,
+    bytes: Bytes,
+) -> Result<(), BlobError> {
+    const PARTS_AT_ONCE: usize = 4;
+    if bytes.len() <= WHOLE_BYTES {
+        store.put(path, bytes.into()).await?;
+        return Ok(());
+    }
+    let upload = store.put_multipart(path).await?;
+    let mut writer = WriteMultipart::new_with_chunk_size(upload, PART_BYTES);
+    let mut rest = bytes;
+    while !rest.is_empty() {
+        writer.wait_for_capacity(PARTS_AT_ONCE).await?;
+        writer.put(rest.split_to(PART_BYTES.min(rest.len())));
+    }
+    writer.finish().await?;
+    Ok(())
+}
+
+/// Removes all blobs of a job.
+pub(super) async fn remove_job(store: &dyn ObjectStore, id: JobId) -> Result<(), BlobError> {
+    let prefix = Path::from(folder(id));
+    let paths = store.list(Some(&prefix)).map_ok(|found| found.location);
+    let mut removed = store.delete_stream(paths.boxed());
+    while let Some(removed) = removed.next().await {
+        match removed {
+            Ok(_) | Err(object_store::Error::NotFound { .. }) => {}
+            Err(error) => return Err(error.into()),
+        }
+    }
+    Ok(())
+}
+
+/// Whether there are no blobs of any job.
+pub(super) async fn is_empty(store: &dyn ObjectStore) -> Result<bool, BlobError> {
+    let first = store.list(Some(&Path::from("jobs"))).try_next().await?;
+    Ok(first.is_none())
+}

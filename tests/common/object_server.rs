@@ -1,0 +1,87 @@
+//! An object store of the test process's own: moto, which speaks the protocol of S3, on a free port.
+
+use std::net::TcpListener;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// A running object store with one empty bucket, `farm`. It is killed on drop.
+pub(crate) struct ObjectServer {
+    child: Child,
+    address: String,
+}
+
+impl ObjectServer {
+    /// Starts one. Without moto the test is skipped with a message, unless `FNSF_REQUIRE_MOTO=1`
+    /// makes it fail.
+    pub(crate) fn start() -> Option<Self> {
+        let is_there = Command::new("python3")
+            .args(["-c", "import moto.server"])
+            .stderr(Stdio::null())
+            .status()
+            .is_ok_and(|status| status.success());
+        let is_required = std::env::var_os("FNSF_REQUIRE_MOTO").is_some_and(|value| value == "1");
+        assert!(
+            is_there || !is_required,
+            "FNSF_REQUIRE_MOTO is set and moto is not installed: pip install 'moto[server]'"
+        );
+        if !is_there {
+            eprintln!("moto is not installed: what needs an object store is not tested");
+            return None;
+        }
+        let free = TcpListener::bind("127.0.0.1:0").expect("a port");
+        let port = free.local_addr().expect("an address").port();
+        drop(free);
+        let child = Command::new("python3")
+            .args([
+                "-m",
+                "moto.server",
+                "-H",
+                "127.0.0.1",
+                "-p",
+                &port.to_string(),
+            ])
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .expect("moto starts");
+        let server = Self {
+            child,
+            address: format!("127.0.0.1:{port}"),
+        };
+        let began = Instant::now();
+        while !server.makes_a_bucket() {
+            assert!(
+                began.elapsed() < Duration::from_secs(60),
+                "it does not answer"
+            );
+            std::thread::sleep(Duration::from_millis(50));
+        }
+        Some(server)
+    }
+
+    fn makes_a_bucket(&self) -> bool {
+        let url = format!("http://{}/farm", self.address);
+        let made = Command::new("curl")
+            .args(["-sf", "-o", "/dev/null", "-X", "PUT", &url])
+            .status();
+        made.is_ok_and(|status| status.success())
+    }
+
+    /// The variables of the environment that lead a client to it.
+    pub(crate) fn variables(&self) -> Vec<(&'static str, String)> {
+        vec![
+            ("AWS_ENDPOINT_URL", format!("http://{}", self.address)),
+            ("AWS_ALLOW_HTTP", "true".to_owned()),
+            ("AWS_ACCESS_KEY_ID", "test".to_owned()),
+            ("AWS_SECRET_ACCESS_KEY", "test".to_owned()),
+            ("AWS_REGION", "us-east-1".to_owned()),
+        ]
+    }
+}
+
+impl Drop for ObjectServer {
+    fn drop(&mut self) {
+        let _it_may_have_ended = self.child.kill();
+        let _reaped = self.child.wait();
+    }
+}
