@@ -157,8 +157,7 @@ async fn run(path: &PathBuf) {
     let url = format!("http://{address}/v1/flow");
     let _is_named = rustls::crypto::ring::default_provider().install_default();
     let client = reqwest::Client::new();
-    let endpoint =
-        tonic::transport::Endpoint::from_shared(format!("http://{address}"));
+    let endpoint = tonic::transport::Endpoint::from_shared(format!("http://{address}"));
     let channel = endpoint.unwrap().connect().await.unwrap();
     let mut calls = proto::scene_flow_client::SceneFlowClient::new(channel);
     let threads = std::thread::available_parallelism().map_or(1, usize::from);

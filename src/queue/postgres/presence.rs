@@ -104,7 +104,11 @@ impl Presence {
         }
         let opens = self.session.opens();
         show(&mut self.session, &self.shared.node, &self.shared.name)?;
-        let listen = format!("LISTEN {CHANNEL}");
+        // The database notices within seconds when the machine of this node is gone.
+        let listen = format!(
+            "SET tcp_keepalives_idle = 5; SET tcp_keepalives_interval = 1; \
+             SET tcp_keepalives_count = 5; LISTEN {CHANNEL}"
+        );
         let listening = self.session.client()?.batch_execute(&listen);
         listening.map_err(|error| refused(&error))?;
         if self.session.opens() != opens {
