@@ -1,6 +1,7 @@
 //! The queue of many nodes: jobs a second against nodes, fair shares, and claims from a long queue.
 //!
-//! `cargo bench --bench queue` starts a PostgreSQL server of its own. The nodes are in this process;
+//! `cargo bench --bench queue` starts a PostgreSQL server of its own. The words `throughput`,
+//! `shares` and `claims` after `--` choose among the measurements. The nodes are in this process;
 //! each has its own connections, and 16 lanes that sleep for the cost of their jobs.
 #![expect(
     clippy::print_stdout,
@@ -34,6 +35,10 @@ const LANES: usize = 16;
 
 /// Cost of a job, nominal seconds, for which a lane sleeps.
 const COST_S: f64 = 0.3;
+
+/// Pairs of a sequence, and tenants that submit them.
+const PAIRS: u32 = 150;
+const TENANTS: usize = 8;
 
 /// For how long jobs are counted.
 const COUNTED: Duration = Duration::from_secs(15);
@@ -117,8 +122,9 @@ async fn throughput(server: &PostgresServer) {
     println!("jobs a second: lanes that sleep {COST_S} s a job, and lanes that do not sleep");
     let folder = tempfile::tempdir().unwrap();
     let sqlite = embedded(folder.path());
-    for _ in 0..100 {
-        let submitted = sqlite.submit(submission("a", 500, COST_S)).await;
+    for turn in 0..600 {
+        let tenant = format!("tenant-{}", turn % TENANTS);
+        let submitted = sqlite.submit(submission(&tenant, PAIRS, COST_S)).await;
         submitted.unwrap();
     }
     let queues = [sqlite];
@@ -134,9 +140,11 @@ async fn throughput(server: &PostgresServer) {
             queues.push(queue);
             heard.push(events);
         }
-        for turn in 0..200 {
+        for turn in 0..600 {
             let queue = &queues[turn % nodes];
-            queue.submit(submission("a", 500, COST_S)).await.unwrap();
+            let tenant = format!("tenant-{}", turn % TENANTS);
+            let submission = submission(&tenant, PAIRS, COST_S);
+            queue.submit(submission).await.unwrap();
         }
         let sleeping = jobs_a_second(&queues, true).await;
         let busy = jobs_a_second(&queues, false).await;
@@ -234,7 +242,19 @@ async fn main() {
     let Some(server) = start_postgres() else {
         return;
     };
-    throughput(&server).await;
-    shares(&server).await;
-    long_queue(&server).await;
+    let asked: Vec<String> = std::env::args().skip(1).collect();
+    let is_asked = |name: &str| {
+        let known = ["throughput", "shares", "claims"];
+        let none = !asked.iter().any(|asked| known.contains(&asked.as_str()));
+        none || asked.iter().any(|asked| asked == name)
+    };
+    if is_asked("throughput") {
+        throughput(&server).await;
+    }
+    if is_asked("shares") {
+        shares(&server).await;
+    }
+    if is_asked("claims") {
+        long_queue(&server).await;
+    }
 }

@@ -8,10 +8,9 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 
 use super::locks::COUNT;
-use super::session::Session;
+use super::session::{Flush, Session};
 use crate::job::{DeviceKind, Priority};
 use crate::queue::backlog::{Backlog, BacklogKey, Load};
-use crate::queue::database::Kept;
 use crate::queue::effects::Effects;
 use crate::queue::local::Local;
 use crate::queue::sql::{Sql, values};
@@ -96,7 +95,7 @@ pub(super) fn refresh(
     local: &Local,
 ) -> Result<Duration, QueueError> {
     let began = Instant::now();
-    let commit = session.transact(Kept::Soon, began, |sql, _: &mut Effects| {
+    let commit = session.transact(Flush::Never, began, |sql, _: &mut Effects| {
         count_if_old(sql)?;
         sql.only("SELECT snapshot, load FROM summary", &[])
     })?;

@@ -17,6 +17,8 @@ pub(super) struct Changes {
     pub(super) more: bool,
     /// Whether a job may have become ready to be leased.
     pub(super) ready: bool,
+    /// Whether somebody waits for one of the changes: a caller, or a worker that is to stop.
+    pub(super) urgent: bool,
 }
 
 impl Changes {
@@ -30,11 +32,13 @@ impl Changes {
             _ => None,
         }));
         let is_ready = |job: &Arc<Job>| job.state == State::Queued && job.ready.is_some();
-        let ready = effects.entered.iter().chain(&effects.changed).any(is_ready);
+        let jobs_changed = || effects.entered.iter().chain(&effects.changed);
+        let ready = jobs_changed().any(is_ready);
         Self {
             jobs,
             more: false,
             ready,
+            urgent: !effects.cancel.is_empty() || !jobs_changed().all(|job| job.durable),
         }
     }
 
@@ -46,6 +50,7 @@ impl Changes {
         self.jobs.extend(other.jobs);
         self.more |= other.more;
         self.ready |= other.ready;
+        self.urgent |= other.urgent;
     }
 
     /// Whether the row of this job may have changed.

@@ -14,7 +14,7 @@ use super::nodes;
 use super::pool::{Pool, spawn};
 use super::presence::Presence;
 use super::schema;
-use super::session::Session;
+use super::session::{Flush, Session};
 use super::shared::Shared;
 use super::target::{PostgresOptions, Target};
 use super::upkeep::Upkeep;
@@ -115,16 +115,20 @@ impl Engine for PostgresEngine {
         &self.shared.local
     }
 
-    async fn write<T, C>(&self, _: Kept, change: C) -> Result<T, QueueError>
+    async fn write<T, C>(&self, kept: Kept, change: C) -> Result<T, QueueError>
     where
         T: Send + 'static,
         C: Fn(&dyn Sql, &mut Effects) -> Result<T, QueueError> + Send + 'static,
     {
         // A crash of the database does not end the workers. If it forgot a claim, the next one would
         // get the same attempt number, and two workers would hold the job.
+        let flush = match kept {
+            Kept::Durably => Flush::Always,
+            Kept::Soon => Flush::IfWritten,
+        };
         let shared = Arc::clone(&self.shared);
         let work = move |session: &mut Session, at: Instant| {
-            let commit = session.transact(Kept::Durably, at, change)?;
+            let commit = session.transact(flush, at, change)?;
             shared.committed(commit.effects, commit.transaction);
             Ok(commit.value)
         };

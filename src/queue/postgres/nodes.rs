@@ -5,8 +5,7 @@ use std::sync::atomic::{AtomicI64, Ordering};
 use std::time::{Duration, Instant};
 
 use super::locks::NODES;
-use super::session::Session;
-use crate::queue::database::Kept;
+use super::session::{Flush, Session};
 use crate::queue::effects::Effects;
 use crate::queue::node::{Capacities, Capacity, Node};
 use crate::queue::sql::{Row, Sql, values};
@@ -119,6 +118,12 @@ pub(super) fn silent(session: &mut Session, me: i64) -> Result<(Vec<Silent>, boo
     })
 }
 
+/// The number of nodes.
+pub(super) fn count(session: &mut Session) -> Result<u32, QueueError> {
+    let text = "SELECT count(*) FROM nodes";
+    session.read(Instant::now(), |sql| sql.only(text, &[])?.get(0))
+}
+
 /// Recovers the jobs of a dead node and forgets the node. Several nodes may do so at once.
 pub(super) fn bury(
     session: &mut Session,
@@ -132,7 +137,7 @@ pub(super) fn bury(
         let recover = |sql: &dyn Sql, effects: &mut Effects| {
             expiry::recover(sql, effects, options, id, node, stopped)
         };
-        let commit = session.transact(Kept::Durably, Instant::now(), recover)?;
+        let commit = session.transact(Flush::Always, Instant::now(), recover)?;
         committed(commit.effects, commit.transaction);
     }
     for forget in [

@@ -2,17 +2,18 @@
 //! ends.
 
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::thread;
 use std::time::{Duration, Instant};
 
 use postgres::fallible_iterator::FallibleIterator;
 
-use super::backlog;
 use super::bell::Changes;
 use super::nodes::{GRACE, SECOND_LOOK, Silent, bury, show, silent};
 use super::session::Session;
 use super::shared::Shared;
 use super::statements::refused;
+use super::{backlog, nodes};
 use crate::queue::types::QueueError;
 
 /// The channel of the notifications.
@@ -91,6 +92,8 @@ impl Presence {
         }
         if self.counted.elapsed() >= backlog::INTERVAL {
             backlog::refresh(&mut self.session, &self.shared.ledger, &self.shared.local)?;
+            let nodes = nodes::count(&mut self.session)?;
+            self.shared.nodes.store(nodes, Ordering::Relaxed);
             self.counted = Instant::now();
         }
         Ok(())

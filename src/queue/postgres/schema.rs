@@ -3,8 +3,8 @@
 use std::time::Instant;
 
 use super::locks::SCHEMA;
-use super::session::Session;
-use crate::queue::database::{Kept, new_identity};
+use super::session::{Flush, Session};
+use crate::queue::database::new_identity;
 use crate::queue::effects::Effects;
 use crate::queue::sql::{Sql, values};
 use crate::queue::types::QueueError;
@@ -114,7 +114,7 @@ const TABLES: [&str; 17] = [
 /// identifies the queue.
 pub(super) fn prepare(session: &mut Session) -> Result<i32, QueueError> {
     let identity = new_identity();
-    let commit = session.transact(Kept::Durably, Instant::now(), |sql, _: &mut Effects| {
+    let commit = session.transact(Flush::Always, Instant::now(), |sql, _: &mut Effects| {
         create(sql, identity)
     })?;
     Ok(commit.value)

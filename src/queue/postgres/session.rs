@@ -10,7 +10,6 @@ use postgres::{Client, SimpleQueryMessage};
 use super::statements::{Fault, PostgresSql, fault, refused};
 use super::target::Target;
 use crate::clock::Timestamp;
-use crate::queue::database::Kept;
 use crate::queue::effects::Effects;
 use crate::queue::sql::{Sql, values};
 use crate::queue::types::QueueError;
@@ -24,6 +23,20 @@ const PAUSE: Duration = Duration::from_millis(100);
 
 /// How often a change is made again after a conflict with another transaction.
 const MAX_CONFLICTS: u32 = 10;
+
+/// Whether a change is on disk before it is acknowledged.
+///
+/// Transactions are committed without waiting for the disk, so that their locks are free at once. A
+/// flush afterwards waits for the disk, which then has this commit and all before it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Flush {
+    /// Also if nothing was written: what was read may be a commit that is not on disk.
+    Always,
+    /// If something was written.
+    IfWritten,
+    /// Not at all.
+    Never,
+}
 
 /// A change that was committed.
 pub(super) struct Commit<T> {
@@ -116,14 +129,14 @@ impl Session {
     /// [`PATIENCE`] has passed since `asked`. A commit of which no answer came is looked up.
     pub(super) fn transact<T>(
         &mut self,
-        kept: Kept,
+        flush: Flush,
         asked: Instant,
         change: impl Fn(&dyn Sql, &mut Effects) -> Result<T, QueueError>,
     ) -> Result<Commit<T>, QueueError> {
         let mut conflicts = 0;
         loop {
             let mut made = None;
-            let failed = self.attempt(kept, &change, &mut made).err();
+            let failed = self.attempt(flush, &change, &mut made).err();
             let error = match failed {
                 None => return made.ok_or(QueueError::Closed),
                 Some(Failed::Refused(error)) => return Err(error),
@@ -157,13 +170,12 @@ impl Session {
     /// Makes the change once. What it made is in `made` if only the answer to the commit is missing.
     fn attempt<T>(
         &mut self,
-        kept: Kept,
+        flush: Flush,
         change: impl Fn(&dyn Sql, &mut Effects) -> Result<T, QueueError>,
         made: &mut Option<Commit<T>>,
     ) -> Result<(), Failed> {
         let lost = |error| Failed::Again(Fault::Lost, error);
-        let again = |error: postgres::Error| Failed::Again(fault(&error), refused(&error));
-        let now = self.begin(kept).map_err(lost)?;
+        let now = self.begin("off").map_err(lost)?;
         let node = self.node.load(Ordering::Relaxed);
         self.count += 1;
         let (place, count) = (self.place, self.count);
@@ -175,7 +187,7 @@ impl Session {
         let mut token = None;
         let done = change(&sql, &mut effects).and_then(|value| {
             let mut transaction = None;
-            if sql.wrote() {
+            if sql.wrote() && flush != Flush::Never {
                 let row = sql.only(NOTE_COMMIT, values![node, place, count])?;
                 let number: String = row.get(0)?;
                 transaction = number.parse().ok();
@@ -199,22 +211,23 @@ impl Session {
             effects,
             transaction,
         });
-        client.batch_execute("COMMIT").map_err(|error| {
-            match fault(&error) {
-                Fault::Lost => Failed::Unknown(token, refused(&error)),
-                // The database has answered: the transaction is rolled back.
-                Fault::Conflict => again(error),
-                Fault::Refused => Failed::Refused(refused(&error)),
-            }
+        let committed = client.batch_execute("COMMIT");
+        let kept = committed.and_then(|()| match flush {
+            Flush::IfWritten if token.is_none() => Ok(()),
+            Flush::Never => Ok(()),
+            _ => client.batch_execute(FLUSH),
+        });
+        kept.map_err(|error| match fault(&error) {
+            Fault::Lost => Failed::Unknown(token, refused(&error)),
+            // The database has answered: the transaction is rolled back.
+            Fault::Conflict => Failed::Again(Fault::Conflict, refused(&error)),
+            Fault::Refused => Failed::Refused(refused(&error)),
         })
     }
 
-    /// Begins a transaction and returns the time of the database.
-    fn begin(&mut self, kept: Kept) -> Result<Timestamp, QueueError> {
-        let synchronous = match kept {
-            Kept::Durably => "on",
-            Kept::Soon => "off",
-        };
+    /// Begins a transaction and returns the time of the database. `synchronous` is `on` if its
+    /// commit waits for the disk.
+    fn begin(&mut self, synchronous: &str) -> Result<Timestamp, QueueError> {
         // A process that is stopped in the middle of a transaction must not hold its locks for long.
         let text = format!(
             "BEGIN; SET LOCAL synchronous_commit = {synchronous}; SET LOCAL lock_timeout = '10s'; \
@@ -277,12 +290,13 @@ impl Session {
         }
     }
 
-    /// Runs a query in a transaction of its own, once.
+    /// Runs a statement in a transaction of its own, once. What it finds is on disk when it
+    /// returns.
     fn transact_once<T>(
         &mut self,
         query: impl Fn(&dyn Sql) -> Result<T, QueueError>,
     ) -> Result<T, QueueError> {
-        let now = self.begin(Kept::Durably)?;
+        let now = self.begin("on")?;
         let node = self.node.load(Ordering::Relaxed);
         let client = self.client()?;
         let done = query(&PostgresSql::new(client, now, node));
@@ -290,6 +304,10 @@ impl Session {
         ended.map_err(|error| refused(&error)).and(done)
     }
 }
+
+/// Waits until all that is committed is on disk: the commit of a message that nobody reads does.
+const FLUSH: &str = "BEGIN; SET LOCAL synchronous_commit = on; \
+    SELECT pg_logical_emit_message(true, 'fnsf', ''); COMMIT";
 
 /// Notes a commit in its own transaction, and gives the number of the transaction.
 const NOTE_COMMIT: &str = "INSERT INTO commits (node, place, count) VALUES (?1, ?2, ?3) \

@@ -1,7 +1,7 @@
 //! What the threads of a node share.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU32, Ordering};
 
 use super::backlog::Ledger;
 use super::beats::Beats;
@@ -19,6 +19,8 @@ pub(super) struct Shared {
     pub(super) ledger: Ledger,
     pub(super) bell: Bell,
     pub(super) beats: Beats,
+    /// Number of nodes, as last counted.
+    pub(super) nodes: AtomicU32,
     stopping: AtomicBool,
 }
 
@@ -37,6 +39,7 @@ impl Shared {
             ledger: Ledger::default(),
             bell: Bell::default(),
             beats: Beats::default(),
+            nodes: AtomicU32::new(1),
             stopping: AtomicBool::default(),
         }
     }

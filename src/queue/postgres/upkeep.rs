@@ -2,6 +2,7 @@
 //! or holds, tells the other nodes what has changed, renews leases, and handles what is due.
 
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -9,15 +10,13 @@ use super::bell::Changes;
 use super::locks::SWEEP;
 use super::nodes::GRACE;
 use super::presence::CHANNEL;
-use super::session::Session;
+use super::session::{Flush, Session};
 use super::shared::Shared;
 use crate::clock::Timestamp;
 use crate::job::JobId;
-use crate::queue::database::Kept;
 use crate::queue::effects::Effects;
 use crate::queue::sql::{Sql, values};
-use crate::queue::transitions;
-use crate::queue::transitions::{expiry, leases};
+use crate::queue::transitions::{expiry, leases, lists};
 use crate::queue::types::QueueError;
 use crate::sync::locked;
 
@@ -27,8 +26,15 @@ const TICK: Duration = Duration::from_millis(250);
 /// Interval between two reads of all jobs that this process watches or holds.
 const READ_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Minimum interval between two notifications: each takes a lock of the whole database.
+/// Minimum interval between two notifications of a node: each takes a lock of the whole database,
+/// and each node hears all of them.
 const TELL_INTERVAL: Duration = Duration::from_millis(100);
+
+/// Nodes beyond which notifications that nobody waits for are sent less often.
+const FEW_NODES: u32 = 4;
+
+/// Maximum number of jobs in one statement or transaction.
+const AT_ONCE: usize = 64;
 
 /// Interval between two renewals of a lease; a quarter of the lease if that is shorter.
 const BEAT_INTERVAL: Duration = Duration::from_secs(1);
@@ -94,12 +100,21 @@ impl Upkeep {
 
     /// How long this turn waits for changes.
     fn patience(&self) -> Duration {
-        let until_told = TELL_INTERVAL.saturating_sub(self.told.elapsed());
+        let until_told = self.tell_interval().saturating_sub(self.told.elapsed());
         let until_beat = self.beat_interval().saturating_sub(self.beaten.elapsed());
         match self.untold.is_empty() {
             true => TICK.min(until_beat),
             false => TICK.min(until_beat).min(until_told),
         }
+    }
+
+    /// The interval between notifications, longer in a large fleet unless somebody waits.
+    fn tell_interval(&self) -> Duration {
+        if self.untold.urgent {
+            return TELL_INTERVAL;
+        }
+        let nodes = self.shared.nodes.load(Ordering::Relaxed);
+        TELL_INTERVAL * (nodes / FEW_NODES).max(1)
     }
 
     fn beat_interval(&self) -> Duration {
@@ -110,15 +125,20 @@ impl Upkeep {
     fn beat(&mut self) -> Result<(), QueueError> {
         self.beaten = Instant::now();
         let options = &self.shared.options;
-        // One transaction for each: a cancellation locks the same rows in another order.
-        for ((id, attempt), beat) in self.shared.beats.take() {
+        let mut beats: Vec<_> = self.shared.beats.take().into_iter().collect();
+        // A cancellation locks the pairs of a sequence in this order, too.
+        beats.sort_unstable_by_key(|((id, _), _)| *id);
+        for beats in beats.chunks(AT_ONCE) {
             let renew = |sql: &dyn Sql, _: &mut Effects| {
-                if beat.snapshot_kept {
-                    leases::snapshot_kept(sql, id, attempt)?;
+                for ((id, attempt), beat) in beats {
+                    if beat.snapshot_kept {
+                        leases::snapshot_kept(sql, *id, *attempt)?;
+                    }
+                    leases::beat(sql, options, *id, *attempt, beat.progress)?;
                 }
-                leases::beat(sql, options, id, attempt, beat.progress)
+                Ok(())
             };
-            self.session.transact(Kept::Soon, Instant::now(), renew)?;
+            self.session.transact(Flush::Never, Instant::now(), renew)?;
         }
         Ok(())
     }
@@ -132,18 +152,20 @@ impl Upkeep {
         ids.retain(|id| changes.contains(*id));
         ids.sort_unstable();
         ids.dedup();
-        for id in ids {
-            let job = self
+        for ids in ids.chunks(AT_ONCE) {
+            let found = self
                 .session
-                .read(Instant::now(), |sql| transitions::find(sql, id))?;
-            local.refresh(id, job.map(Arc::new).as_ref());
+                .read(Instant::now(), |sql| lists::find_all(sql, ids))?;
+            for id in ids {
+                local.refresh(*id, found.iter().find(|job| job.id == *id));
+            }
         }
         Ok(())
     }
 
     /// Tells the other nodes what has changed here.
     fn tell(&mut self) -> Result<(), QueueError> {
-        if self.untold.is_empty() || self.told.elapsed() < TELL_INTERVAL {
+        if self.untold.is_empty() || self.told.elapsed() < self.tell_interval() {
             return Ok(());
         }
         let payload = self.untold.to_payload();
@@ -181,7 +203,7 @@ impl Upkeep {
                 expiry::look_after(sql, effects, options, id, left)?;
                 Ok(true)
             };
-            let commit = self.session.transact(Kept::Durably, Instant::now(), look)?;
+            let commit = self.session.transact(Flush::Always, Instant::now(), look)?;
             self.shared.committed(commit.effects, commit.transaction);
             if !commit.value {
                 break;

@@ -34,13 +34,34 @@ pub(in crate::queue) fn list(sql: &dyn Sql, filter: &Filter) -> Result<Vec<Arc<J
 
 /// The ids in this list that belong to jobs, in the same order.
 pub(in crate::queue) fn known(sql: &dyn Sql, ids: &[JobId]) -> Result<Vec<JobId>, QueueError> {
+    const AT_ONCE: usize = 64;
     let mut known = Vec::new();
-    for &id in ids {
-        if rows::find(sql, id)?.is_some() {
-            known.push(id);
-        }
+    for ids in ids.chunks(AT_ONCE) {
+        let found = find_all(sql, ids)?;
+        let is_known = |id: &JobId| found.iter().any(|job| job.id == *id);
+        known.extend(ids.iter().copied().filter(is_known));
     }
     Ok(known)
+}
+
+/// The jobs with these ids, in any order. A few ids at a time: each is a parameter.
+pub(in crate::queue) fn find_all(
+    sql: &dyn Sql,
+    ids: &[JobId],
+) -> Result<Vec<Arc<Job>>, QueueError> {
+    if ids.is_empty() {
+        return Ok(Vec::new());
+    }
+    let places: Vec<_> = (1..=ids.len()).map(|place| format!("?{place}")).collect();
+    let text = format!(
+        "SELECT {COLUMNS} FROM jobs INDEXED BY jobs_id WHERE id IN ({})",
+        places.join(", ")
+    );
+    let parameters: Vec<_> = ids.iter().map(|id| Value::from(*id)).collect();
+    let rows = sql.query(&text, &parameters)?;
+    rows.iter()
+        .map(|row| rows::job(row).map(Arc::new))
+        .collect()
 }
 
 /// Whether there are no jobs.

@@ -17,5 +17,5 @@ mod rows;
 mod submit;
 
 pub(super) use finish::{abandon, cancel, make_durable, requeue};
-pub(super) use rows::{find, get, pairs};
+pub(super) use rows::{get, pairs};
 pub(super) use submit::{probe, submit};

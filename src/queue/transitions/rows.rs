@@ -124,9 +124,17 @@ pub(in crate::queue) fn pairs(sql: &dyn Sql, parent: JobId) -> Result<Vec<Job>, 
 /// locked with it.
 pub(super) fn lock(sql: &dyn Sql, id: JobId) -> Result<Option<Job>, QueueError> {
     // Always first the sequence and then its pairs, or two transactions might wait for each other.
-    let sequence = "SELECT id FROM jobs INDEXED BY jobs_id WHERE id = coalesce((SELECT parent FROM \
-                    jobs INDEXED BY jobs_id WHERE id = ?1), ?1) FOR UPDATE";
-    sql.query(sequence, values![id])?;
+    let sequence = format!(
+        "SELECT {COLUMNS} FROM jobs INDEXED BY jobs_id WHERE id = coalesce((SELECT parent FROM jobs \
+         INDEXED BY jobs_id WHERE id = ?1), ?1) FOR UPDATE"
+    );
+    let Some(first) = sql.first(&sequence, values![id])? else {
+        return Ok(None);
+    };
+    let first = job(&first)?;
+    if first.id == id {
+        return Ok(Some(first));
+    }
     let text = format!("SELECT {COLUMNS} FROM jobs INDEXED BY jobs_id WHERE id = ?1 FOR UPDATE");
     sql.first(&text, values![id])?.as_ref().map(job).transpose()
 }
