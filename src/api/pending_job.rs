@@ -291,12 +291,20 @@ impl PendingJob {
         const TRIES: u32 = 5;
         let durable = self.request.durability == Durability::Durable;
         for _ in 0..TRIES {
-            let (mut job, new) = match self.service.queue.submit(submission.clone()).await? {
+            let submitted = self.service.queue.submit(submission.clone()).await;
+            // With an error of the store nobody knows whether the job was accepted.
+            let is_unknown = matches!(&submitted, Err(error) if error.is_of_the_machine());
+            self.submitted |= is_unknown && !self.is_unknown_to_the_queue().await;
+            let (mut job, new) = match submitted? {
                 Submitted::New(job) => {
                     self.submitted = true;
                     (job, true)
                 }
-                Submitted::Known(job) => (job, false),
+                Submitted::Known(job) => {
+                    // It may be this one: a repetition finds what the queue had accepted.
+                    self.submitted |= job.id == self.id;
+                    (job, false)
+                }
             };
             let mut awaited = None;
             if durable && !job.durable {
@@ -425,6 +433,15 @@ impl PendingJob {
             }),
             durable: self.request.durability == Durability::Durable,
         })
+    }
+}
+
+impl PendingJob {
+    /// Whether the queue says that it has no such job. If it cannot say, the payload is kept: the
+    /// search for orphans finds it later.
+    async fn is_unknown_to_the_queue(&self) -> bool {
+        let known = self.service.queue.known(vec![self.id]).await;
+        known.is_ok_and(|known| known.is_empty())
     }
 }
 

@@ -17,8 +17,8 @@ pub(super) struct Effects {
     pub(super) started: Vec<Arc<Job>>,
     /// Jobs that a worker held and now does not.
     pub(super) stopped: Vec<Arc<Job>>,
-    /// Running jobs whose cancellation was requested.
-    pub(super) cancel: Vec<JobId>,
+    /// Running jobs whose cancellation was requested, and their attempts.
+    pub(super) cancel: Vec<(JobId, u32)>,
     /// All jobs with a changed row.
     pub(super) changed: Vec<Arc<Job>>,
     /// Events for the metrics and the cleanup of blobs.

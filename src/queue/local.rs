@@ -45,6 +45,9 @@ struct Look {
 pub(super) struct Running {
     pub(super) attempt: u32,
     pub(super) flags: Arc<Flags>,
+    since: Instant,
+    /// Whether the worker that asked for a job got this one. It may have stopped waiting.
+    is_taken: bool,
 }
 
 impl Local {
@@ -92,15 +95,28 @@ impl Local {
     /// Updates the jobs that workers of this process hold.
     pub(super) fn apply_to_running(&self, effects: &Effects) {
         let mut running = locked(&self.running);
+        // Commits of several connections may come here in another order than they were made.
+        let holds = |held: &Running, attempt| held.attempt == attempt;
         for job in &effects.stopped {
-            if let Some(held) = running.remove(&job.id) {
+            if let Some(held) = running.get(&job.id)
+                && holds(held, job.attempt)
+            {
                 held.flags.mark_lost();
+                running.remove(&job.id);
             }
         }
         for job in &effects.started {
+            if running
+                .get(&job.id)
+                .is_some_and(|held| held.attempt > job.attempt)
+            {
+                continue;
+            }
             let held = Running {
                 attempt: job.attempt,
                 flags: Arc::default(),
+                since: Instant::now(),
+                is_taken: false,
             };
             running.insert(job.id, held);
         }
@@ -109,8 +125,10 @@ impl Local {
                 held.flags.make_durable();
             }
         }
-        for id in &effects.cancel {
-            if let Some(held) = running.get(id) {
+        for (id, attempt) in &effects.cancel {
+            if let Some(held) = running.get(id)
+                && holds(held, *attempt)
+            {
                 held.flags.cancel();
             }
         }
@@ -201,10 +219,22 @@ impl Local {
         }
     }
 
+    /// The claimed jobs that no worker has taken for this long.
+    pub(super) fn not_taken(&self, for_long: Duration) -> Vec<(JobId, u32)> {
+        let running = locked(&self.running);
+        let left = running
+            .iter()
+            .filter(|(_, held)| !held.is_taken && held.since.elapsed() > for_long);
+        left.map(|(id, held)| (*id, held.attempt)).collect()
+    }
+
     /// The flags of a job that was just claimed.
     pub(super) fn flags_of(&self, job: &Job) -> Arc<Flags> {
-        match locked(&self.running).get(&job.id) {
-            Some(held) if held.attempt == job.attempt => Arc::clone(&held.flags),
+        match locked(&self.running).get_mut(&job.id) {
+            Some(held) if held.attempt == job.attempt => {
+                held.is_taken = true;
+                Arc::clone(&held.flags)
+            }
             // The lease was lost after the claim.
             _ => {
                 let flags = Flags::default();
@@ -212,5 +242,50 @@ impl Local {
                 Arc::new(flags)
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::queue::contract_tests::{done, submission};
+    use crate::queue::types::{QueueOptions, Submitted};
+    use crate::queue::{Outcome, open_sqlite};
+
+    #[tokio::test]
+    async fn a_commit_that_comes_late_takes_no_job_from_its_next_attempt() {
+        // Two attempts at one job, as a queue makes them.
+        let folder = tempfile::tempdir().expect("a folder");
+        let (events, _heard) = mpsc::unbounded_channel();
+        let queue = open_sqlite(folder.path(), QueueOptions::default(), events.clone());
+        let queue = queue.expect("a queue");
+        let Ok(Submitted::New(_)) = queue.submit(submission("a")).await else {
+            panic!("it is new");
+        };
+        let first = queue.lease("worker", DeviceKind::Cpu).await;
+        let first = first.expect("a lease").job;
+        let released = queue.finish(first.id, first.attempt, Outcome::Released);
+        released.await.expect("the store works");
+        let second = queue.lease("worker", DeviceKind::Cpu).await;
+        let second = second.expect("a lease").job;
+
+        let local = Local::new(events);
+        let started = |job: &Arc<Job>| Effects {
+            started: vec![Arc::clone(job)],
+            ..Effects::default()
+        };
+        local.apply_to_running(&started(&first));
+        local.apply_to_running(&started(&second));
+        let flags = local.flags_of(&second);
+        local.apply_to_running(&Effects {
+            stopped: vec![Arc::clone(&first)],
+            cancel: vec![(first.id, first.attempt)],
+            ..Effects::default()
+        });
+        local.apply_to_running(&started(&first));
+        assert!(Arc::ptr_eq(&flags, &local.flags_of(&second)));
+        assert_eq!(local.not_taken(Duration::ZERO), []);
+        let ended = queue.finish(second.id, second.attempt, done()).await;
+        ended.expect("the store works");
     }
 }

@@ -29,6 +29,15 @@ pub(super) trait Sql {
     /// them.
     fn node(&self) -> i64;
 
+    /// Checks that the other nodes have not taken this one for dead: they would not look after what
+    /// it takes.
+    ///
+    /// # Errors
+    /// [`QueueError::Store`] if they have.
+    fn check_node(&self) -> Result<(), QueueError> {
+        Ok(())
+    }
+
     /// Excludes other transactions that give fair tags to this tenant's jobs of this priority,
     /// until the end of this transaction.
     ///

@@ -52,9 +52,11 @@ impl Watchers {
         }
     }
 
-    /// The watched jobs.
+    /// The watched jobs. Those without subscribers are forgotten.
     pub(super) fn jobs(&self) -> Vec<JobId> {
-        self.lock().keys().copied().collect()
+        let mut senders = self.lock();
+        senders.retain(|_, sender| sender.receiver_count() > 0);
+        senders.keys().copied().collect()
     }
 
     /// Publishes the stored state of a job if it has changed. With `keep_progress` the progress

@@ -8,7 +8,7 @@ use bytes::Bytes;
 use super::load::StoreError;
 use super::run::{Attempt, Done, Worker, failure};
 use crate::fault::Fault;
-use crate::job::Job;
+use crate::job::{Job, State};
 use crate::queue::{Committed, Lease, Outcome, QueueError};
 use crate::storage::{Blob, BlobError, Fsync};
 
@@ -35,11 +35,23 @@ impl Worker {
                     tracing::warn!(%error, job = %job.id, "a snapshot was not removed");
                 }
             }
+            Ok(Committed::Fenced) if self.has_this_result(job).await => {
+                tracing::info!(job = %job.id, "the outcome had been kept");
+            }
             Ok(Committed::Fenced) => {
                 tracing::warn!(job = %job.id, attempt = job.attempt, "a late result was thrown away");
                 self.remove_attempt(job).await;
             }
             Err(error) => tracing::error!(%error, job = %job.id, "an outcome was not kept"),
+        }
+    }
+
+    /// Whether the job has succeeded by this attempt: the queue had kept an outcome of which no answer
+    /// came. If the queue cannot say, the result is kept, too.
+    async fn has_this_result(&self, job: &Job) -> bool {
+        match self.queue.job(&job.tenant, job.id).await {
+            Ok(now) => now.state == State::Succeeded && now.attempt == job.attempt,
+            Err(error) => error.is_of_the_machine(),
         }
     }
 

@@ -88,15 +88,16 @@ impl Ledger {
 }
 
 /// Counts the load if the last count of any node is older than [`INTERVAL`], and takes the last
-/// count over. Returns how long it took.
+/// count over. With `at_once` it counts however old the last count is.
 pub(super) fn refresh(
     session: &mut Session,
     ledger: &Ledger,
     local: &Local,
-) -> Result<Duration, QueueError> {
+    at_once: bool,
+) -> Result<(), QueueError> {
     let began = Instant::now();
     let commit = session.transact(Flush::Never, began, |sql, _: &mut Effects| {
-        count_if_old(sql)?;
+        count_if_old(sql, at_once)?;
         sql.only("SELECT snapshot, load FROM summary", &[])
     })?;
     let (snapshot, load): (String, String) = (commit.value.get(0)?, commit.value.get(1)?);
@@ -106,13 +107,13 @@ pub(super) fn refresh(
         let load = load.to_backlog().ok_or_else(unreadable)?;
         ledger.counted(local, snapshot, load);
     }
-    Ok(began.elapsed())
+    Ok(())
 }
 
-fn count_if_old(sql: &dyn Sql) -> Result<(), QueueError> {
+fn count_if_old(sql: &dyn Sql, at_once: bool) -> Result<(), QueueError> {
     // A count that takes long is made less often.
     let due = "SELECT taken FROM summary WHERE taken <= ?1";
-    if sql.first(due, values![sql.now()])?.is_none() {
+    if !at_once && sql.first(due, values![sql.now()])?.is_none() {
         return Ok(());
     }
     let lock = format!("SELECT pg_try_advisory_xact_lock({COUNT}, 0)");

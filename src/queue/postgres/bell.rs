@@ -25,7 +25,7 @@ impl Changes {
     /// The changes of a commit.
     pub(super) fn of(effects: &Effects) -> Self {
         let mut jobs: HashSet<_> = effects.changed.iter().map(|job| job.id).collect();
-        jobs.extend(effects.cancel.iter().copied());
+        jobs.extend(effects.cancel.iter().map(|(id, _)| *id));
         jobs.extend(effects.stopped.iter().map(|job| job.id));
         jobs.extend(effects.events.iter().filter_map(|event| match event {
             Event::Deleted(id) => Some(*id),

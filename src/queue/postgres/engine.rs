@@ -1,7 +1,6 @@
 //! The engine on PostgreSQL.
 
 use std::sync::Arc;
-use std::sync::atomic::AtomicI64;
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -17,6 +16,7 @@ use super::schema;
 use super::session::{Flush, Session};
 use super::shared::Shared;
 use super::target::{PostgresOptions, Target};
+use super::this_node::ThisNode;
 use super::upkeep::Upkeep;
 use crate::job::{Job, JobId};
 use crate::queue::database::{DatabaseQueue, Engine, Kept};
@@ -79,13 +79,12 @@ impl PostgresEngine {
     ) -> Result<Self, QueueError> {
         let target = Target::of(&options.url)?;
         let direct = options.direct_url.as_deref().unwrap_or(&options.url);
-        let node = Arc::new(AtomicI64::new(0));
-        let session =
-            |target: &Target, place| Session::new(target.clone(), Arc::clone(&node), place);
+        let me = Arc::new(ThisNode::new());
+        let session = |target: &Target, place| Session::new(target.clone(), Arc::clone(&me), place);
         let mut own = session(&Target::of(direct)?, 0);
         let identity = schema::prepare(&mut own)?;
         let local = Arc::new(Local::new(events));
-        let shared = Arc::new(Shared::new(local, queue, &options.name, &node));
+        let shared = Arc::new(Shared::new(local, queue, &options.name, &me));
         let mut presence = Presence::new(Arc::clone(&shared), own);
         presence.open()?;
         let upkeep = Upkeep::new(Arc::clone(&shared), session(&target, 1));
@@ -184,7 +183,10 @@ impl Engine for PostgresEngine {
     async fn stopped(&self) {
         let node = self.shared.node();
         let change = move |sql: &dyn Sql, _: &mut Effects| {
-            sql.query("UPDATE nodes SET stopped = 1 WHERE id = ?1", values![node])
+            sql.query(
+                "UPDATE nodes SET stopped = ?2 WHERE id = ?1",
+                values![node, nodes::STOPPED],
+            )
         };
         if let Err(error) = self.write(Kept::Durably, change).await {
             tracing::warn!(%error, "the other nodes will take this end for a crash");

@@ -25,6 +25,7 @@ mod statements;
 mod target;
 #[cfg(test)]
 mod tests;
+mod this_node;
 mod upkeep;
 
 pub use engine::open_postgres;

@@ -1,11 +1,10 @@
 //! The nodes of the queue: each is alive for as long as a connection of its own holds its lock.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicI64, Ordering};
 use std::time::{Duration, Instant};
 
 use super::locks::NODES;
 use super::session::{Flush, Session};
+use super::this_node::ThisNode;
 use crate::queue::effects::Effects;
 use crate::queue::node::{Capacities, Capacity, Node};
 use crate::queue::sql::{Row, Sql, values};
@@ -14,18 +13,21 @@ use crate::queue::types::{QueueError, QueueOptions};
 
 /// After a start of the database, and after this node was cut off from it, the other nodes need
 /// this long to show that they are alive.
-pub(super) const GRACE: Duration = Duration::from_secs(3);
+pub(super) const GRACE: Duration = Duration::from_secs(2);
 
 /// A node without its lock is dead when it was so at two looks with this time between them.
 pub(super) const SECOND_LOOK: Duration = Duration::from_millis(600);
 
+/// Values of `stopped` in the row of a node: it said that it stops, or the others took it for dead.
+pub(super) const STOPPED: i64 = 1;
+const DEAD: i64 = 2;
+
+/// Number of the latest nodes whose last commits are remembered.
+const COMMITS_OF: i64 = 1000;
+
 /// Shows that this node is alive on the connection of the session, which stays open.
-pub(super) fn show(
-    session: &mut Session,
-    node: &Arc<AtomicI64>,
-    name: &str,
-) -> Result<(), QueueError> {
-    let known = node.load(Ordering::Relaxed);
+pub(super) fn show(session: &mut Session, me: &ThisNode, name: &str) -> Result<(), QueueError> {
+    let known = me.number();
     let asked = Instant::now();
     if known > 0 {
         let lock = format!(
@@ -42,15 +44,20 @@ pub(super) fn show(
             None => {}
         }
     }
-    let register = "INSERT INTO nodes (name, version, started) VALUES (?1, ?2, ?3) RETURNING id";
+    // One statement: the others must not see a node without its lock.
+    let register = format!(
+        "WITH node AS (INSERT INTO nodes (name, version, started) VALUES (?1, ?2, ?3) RETURNING id) \
+         SELECT id, pg_advisory_lock({NODES}, id)::text FROM node"
+    );
     let version = env!("CARGO_PKG_VERSION");
     let row = session.read(asked, |sql| {
-        sql.only(register, values![name, version, sql.now()])
+        sql.only(&register, values![name, version, sql.now()])
     })?;
     let number: i64 = row.get(0)?;
-    let lock = format!("SELECT pg_advisory_lock({NODES}, ?1::integer)::text");
-    session.read(asked, |sql| sql.query(&lock, values![number]))?;
-    node.store(number, Ordering::Relaxed);
+    // A node may still look up its last commits for a while after it was taken for dead.
+    let forget = "DELETE FROM commits WHERE node < ?1";
+    session.read(asked, |sql| sql.query(forget, values![number - COMMITS_OF]))?;
+    me.set_number(number);
     Ok(())
 }
 
@@ -92,36 +99,47 @@ pub(super) struct Silent {
     stopped: bool,
 }
 
-/// The other nodes that do not hold their locks, and whether the database has only just started, so
-/// that they may be about to take them again.
-pub(super) fn silent(session: &mut Session, me: i64) -> Result<(Vec<Silent>, bool), QueueError> {
+/// The other nodes as far as their locks tell.
+#[derive(Debug, Default)]
+pub(super) struct Look {
+    /// Those that do not hold their locks.
+    pub(super) silent: Vec<Silent>,
+    /// Number of those that do.
+    pub(super) alive: u32,
+    /// Whether the database has only just started, so that the silent ones may be about to take
+    /// their locks again.
+    pub(super) is_young: bool,
+}
+
+/// Looks at the locks of the other nodes.
+pub(super) fn look(session: &mut Session, me: i64) -> Result<Look, QueueError> {
     let text = format!(
-        "SELECT n.id, n.stopped FROM nodes n WHERE n.id <> ?1 \
-         AND NOT EXISTS (SELECT 1 FROM pg_locks l WHERE l.locktype = 'advisory' \
+        "SELECT n.id, n.stopped, EXISTS (SELECT 1 FROM pg_locks l WHERE l.locktype = 'advisory' \
              AND l.database = (SELECT oid FROM pg_database WHERE datname = current_database()) \
-             AND l.classid = {NODES}::oid AND l.objid = n.id::oid AND l.objsubid = 2 AND l.granted)"
+             AND l.classid = {NODES}::oid AND l.objid = n.id::oid AND l.objsubid = 2 \
+             AND l.granted) FROM nodes n WHERE n.id <> ?1"
     );
     let young = format!(
         "SELECT now() < pg_postmaster_start_time() + interval '{} milliseconds'",
         GRACE.as_millis()
     );
     session.read(Instant::now(), |sql| {
-        let is_young = sql.only(&young, &[])?.get(0)?;
-        let rows = sql.query(&text, values![me])?;
-        let silent = rows.iter().map(|row| {
-            Ok(Silent {
+        let mut look = Look {
+            is_young: sql.only(&young, &[])?.get(0)?,
+            ..Look::default()
+        };
+        for row in sql.query(&text, values![me])? {
+            if row.get(2)? {
+                look.alive += 1;
+                continue;
+            }
+            look.silent.push(Silent {
                 node: row.get(0)?,
-                stopped: row.get(1)?,
-            })
-        });
-        Ok((silent.collect::<Result<_, QueueError>>()?, is_young))
+                stopped: row.get::<i64>(1)? == STOPPED,
+            });
+        }
+        Ok(look)
     })
-}
-
-/// The number of nodes.
-pub(super) fn count(session: &mut Session) -> Result<u32, QueueError> {
-    let text = "SELECT count(*) FROM nodes";
-    session.read(Instant::now(), |sql| sql.only(text, &[])?.get(0))
 }
 
 /// Recovers the jobs of a dead node and forgets the node. Several nodes may do so at once.
@@ -132,6 +150,9 @@ pub(super) fn bury(
     mut committed: impl FnMut(Effects, Option<u64>),
 ) -> Result<(), QueueError> {
     let Silent { node, stopped } = dead;
+    // From now on it claims nothing under this number.
+    let mark = "UPDATE nodes SET stopped = ?2 WHERE id = ?1 AND stopped = 0";
+    session.read(Instant::now(), |sql| sql.query(mark, values![node, DEAD]))?;
     let left = session.read(Instant::now(), |sql| expiry::left_behind(sql, node))?;
     for id in left {
         let recover = |sql: &dyn Sql, effects: &mut Effects| {
@@ -140,11 +161,7 @@ pub(super) fn bury(
         let commit = session.transact(Flush::Always, Instant::now(), recover)?;
         committed(commit.effects, commit.transaction);
     }
-    for forget in [
-        "DELETE FROM commits WHERE node = ?1",
-        "DELETE FROM nodes WHERE id = ?1",
-    ] {
-        session.read(Instant::now(), |sql| sql.query(forget, values![node]))?;
-    }
+    let forget = "DELETE FROM nodes WHERE id = ?1";
+    session.read(Instant::now(), |sql| sql.query(forget, values![node]))?;
     Ok(())
 }

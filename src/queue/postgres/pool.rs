@@ -8,7 +8,7 @@ use std::time::Instant;
 use tokio::sync::oneshot;
 use tokio_util::sync::CancellationToken;
 
-use super::session::Session;
+use super::session::{PATIENCE, Session};
 use crate::queue::types::QueueError;
 use crate::sync::locked;
 
@@ -43,7 +43,12 @@ impl Pool {
         let (answer, answered) = oneshot::channel();
         let at = Instant::now();
         let work: Work = Box::new(move |session| {
-            let _gone_is_fine = answer.send(work(session, at));
+            // Behind many others that waited for the database in vain.
+            let done = match at.elapsed() > PATIENCE && !session.is_open() {
+                true => Err(QueueError::Store("the database does not answer".to_owned())),
+                false => work(session, at),
+            };
+            let _gone_is_fine = answer.send(done);
         });
         self.work.send(work).map_err(|_| QueueError::Closed)?;
         answered.await.map_err(|_| QueueError::Closed)?

@@ -8,12 +8,12 @@ use std::time::{Duration, Instant};
 
 use postgres::fallible_iterator::FallibleIterator;
 
+use super::backlog;
 use super::bell::Changes;
-use super::nodes::{GRACE, SECOND_LOOK, Silent, bury, show, silent};
+use super::nodes::{GRACE, SECOND_LOOK, Silent, bury, look, show};
 use super::session::Session;
 use super::shared::Shared;
 use super::statements::refused;
-use super::{backlog, nodes};
 use crate::queue::types::QueueError;
 
 /// The channel of the notifications.
@@ -56,19 +56,26 @@ impl Presence {
         self.show()?;
         loop {
             let node = self.shared.node();
-            let (first, _) = silent(&mut self.session, node)?;
-            if first.is_empty() {
+            let first = look(&mut self.session, node)?;
+            if first.silent.is_empty() {
+                break;
+            }
+            if first.alive > 0 {
+                // The others know whether these have only lost their connections.
                 break;
             }
             thread::sleep(SECOND_LOOK);
-            let (second, is_young) = silent(&mut self.session, node)?;
-            for dead in second.into_iter().filter(|node| first.contains(node)) {
-                if !is_young {
+            let second = look(&mut self.session, node)?;
+            if second.is_young || self.session.age() < GRACE {
+                continue;
+            }
+            for dead in second.silent {
+                if first.silent.contains(&dead) {
                     self.bury(dead)?;
                 }
             }
         }
-        backlog::refresh(&mut self.session, &self.shared.ledger, &self.shared.local)?;
+        self.count(true)?;
         Ok(())
     }
 
@@ -91,12 +98,15 @@ impl Presence {
             self.looked = Instant::now();
         }
         if self.counted.elapsed() >= backlog::INTERVAL {
-            backlog::refresh(&mut self.session, &self.shared.ledger, &self.shared.local)?;
-            let nodes = nodes::count(&mut self.session)?;
-            self.shared.nodes.store(nodes, Ordering::Relaxed);
+            self.count(false)?;
             self.counted = Instant::now();
         }
         Ok(())
+    }
+
+    fn count(&mut self, at_once: bool) -> Result<(), QueueError> {
+        let (ledger, local) = (&self.shared.ledger, &self.shared.local);
+        backlog::refresh(&mut self.session, ledger, local, at_once)
     }
 
     /// Shows the node and listens, on a connection that was opened since the last time.
@@ -106,12 +116,8 @@ impl Presence {
             return Ok(());
         }
         let opens = self.session.opens();
-        show(&mut self.session, &self.shared.node, &self.shared.name)?;
-        // The database notices within seconds when the machine of this node is gone.
-        let listen = format!(
-            "SET tcp_keepalives_idle = 5; SET tcp_keepalives_interval = 1; \
-             SET tcp_keepalives_count = 5; LISTEN {CHANNEL}"
-        );
+        show(&mut self.session, &self.shared.me, &self.shared.name)?;
+        let listen = format!("LISTEN {CHANNEL}");
         let listening = self.session.client()?.batch_execute(&listen);
         listening.map_err(|error| refused(&error))?;
         if self.session.opens() != opens {
@@ -148,10 +154,12 @@ impl Presence {
 
     /// Recovers the jobs of the nodes that were without their locks at this look and the last one.
     fn look_for_the_dead(&mut self) -> Result<(), QueueError> {
-        let (now, is_young) = silent(&mut self.session, self.shared.node())?;
-        if is_young || self.session.age() < GRACE {
+        let look = look(&mut self.session, self.shared.node())?;
+        self.shared.nodes.store(look.alive + 1, Ordering::Relaxed);
+        if look.is_young || self.session.age() < GRACE {
             return Ok(());
         }
+        let now = look.silent;
         let before = std::mem::replace(&mut self.suspects, now.clone());
         for dead in now.into_iter().filter(|node| before.contains(node)) {
             tracing::warn!(

@@ -1,22 +1,21 @@
 //! One connection that is opened again when it is lost, and the transactions on it.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicI64, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use postgres::{Client, SimpleQueryMessage};
+use postgres::Client;
 
 use super::statements::{Fault, PostgresSql, fault, refused};
 use super::target::Target;
-use crate::clock::Timestamp;
+use super::this_node::ThisNode;
 use crate::queue::effects::Effects;
 use crate::queue::sql::{Sql, values};
 use crate::queue::types::QueueError;
 
 /// For how long a change waits for a database that does not answer. A restart of the database takes
 /// less.
-const PATIENCE: Duration = Duration::from_secs(10);
+pub(super) const PATIENCE: Duration = Duration::from_secs(10);
 
 /// The pause before a connection is opened again.
 const PAUSE: Duration = Duration::from_millis(100);
@@ -68,7 +67,7 @@ struct Token {
 /// A connection, at most one at a time.
 pub(super) struct Session {
     target: Target,
-    node: Arc<AtomicI64>,
+    me: Arc<ThisNode>,
     /// The number of the session among those of its node.
     place: i64,
     /// Transactions so far.
@@ -76,23 +75,20 @@ pub(super) struct Session {
     client: Option<Client>,
     opened: Instant,
     opens: u64,
-    /// The time of the database less that of this process, milliseconds, as last measured.
-    ahead_ms: i64,
 }
 
 impl Session {
-    /// A connection that is opened when it is first used, on the thread that uses it. `node` is the
-    /// number of this node, and `place` that of the session in it.
-    pub(super) fn new(target: Target, node: Arc<AtomicI64>, place: i64) -> Self {
+    /// A connection that is opened when it is first used, on the thread that uses it. `place` is the
+    /// number of the session in this node.
+    pub(super) fn new(target: Target, me: Arc<ThisNode>, place: i64) -> Self {
         Self {
             target,
-            node,
+            me,
             place,
             count: 0,
             client: None,
             opened: Instant::now(),
             opens: 0,
-            ahead_ms: 0,
         }
     }
 
@@ -101,13 +97,29 @@ impl Session {
         let client = match self.client.take() {
             Some(client) if !client.is_closed() => client,
             _ => {
-                let client = self.target.connect()?;
+                let mut client = self.target.connect()?;
+                // The database ends the connection of a machine that is gone, and of a process that
+                // does not read.
+                let settings = format!(
+                    "SET tcp_keepalives_idle = 5; SET tcp_keepalives_interval = 1; \
+                     SET tcp_keepalives_count = 5; SET tcp_user_timeout = 10000; {}",
+                    self.me.query()
+                );
+                let answer = client.simple_query(&settings);
+                self.me.read(&answer.map_err(|error| refused(&error))?)?;
                 self.opened = Instant::now();
                 self.opens += 1;
                 client
             }
         };
         Ok(self.client.insert(client))
+    }
+
+    /// Whether a connection is open.
+    pub(super) fn is_open(&self) -> bool {
+        self.client
+            .as_ref()
+            .is_some_and(|client| !client.is_closed())
     }
 
     /// For how long the connection has been open.
@@ -142,7 +154,7 @@ impl Session {
                 Some(Failed::Refused(error)) => return Err(error),
                 Some(Failed::Again(Fault::Conflict, error)) => {
                     conflicts += 1;
-                    if conflicts > MAX_CONFLICTS {
+                    if conflicts > MAX_CONFLICTS || asked.elapsed() > PATIENCE {
                         return Err(error);
                     }
                     continue;
@@ -175,15 +187,15 @@ impl Session {
         made: &mut Option<Commit<T>>,
     ) -> Result<(), Failed> {
         let lost = |error| Failed::Again(Fault::Lost, error);
-        let now = self.begin("off").map_err(lost)?;
-        let node = self.node.load(Ordering::Relaxed);
+        self.begin("off").map_err(lost)?;
+        let node = self.me.number();
         self.count += 1;
         let (place, count) = (self.place, self.count);
         // Not a new connection: the transaction is open on this one.
         let gone = || lost(QueueError::Store("the connection is gone".to_owned()));
         let client = self.client.as_mut().ok_or_else(gone)?;
         let mut effects = Effects::default();
-        let sql = PostgresSql::new(client, now, node);
+        let sql = PostgresSql::new(client, &self.me);
         let mut token = None;
         let done = change(&sql, &mut effects).and_then(|value| {
             let mut transaction = None;
@@ -225,25 +237,18 @@ impl Session {
         })
     }
 
-    /// Begins a transaction and returns the time of the database. `synchronous` is `on` if its
+    /// Begins a transaction, and reads the clock of the database. `synchronous` is `on` if its
     /// commit waits for the disk.
-    fn begin(&mut self, synchronous: &str) -> Result<Timestamp, QueueError> {
+    fn begin(&mut self, synchronous: &str) -> Result<(), QueueError> {
         // A process that is stopped in the middle of a transaction must not hold its locks for long.
         let text = format!(
             "BEGIN; SET LOCAL synchronous_commit = {synchronous}; SET LOCAL lock_timeout = '10s'; \
-             SET LOCAL idle_in_transaction_session_timeout = '5s'; \
-             SELECT (extract(epoch FROM clock_timestamp()) * 1000)::bigint"
+             SET LOCAL idle_in_transaction_session_timeout = '5s'; {}",
+            self.me.query()
         );
         let answer = self.client()?.simple_query(&text);
         let answer = answer.map_err(|error| refused(&error))?;
-        let time = answer.iter().find_map(|message| match message {
-            SimpleQueryMessage::Row(row) => row.get(0)?.parse().ok(),
-            _ => None,
-        });
-        let now = time.map(Timestamp::from_millis);
-        let now = now.ok_or_else(|| QueueError::Store("the database has no time".to_owned()))?;
-        self.ahead_ms = now.as_millis() - Timestamp::now().as_millis();
-        Ok(now)
+        self.me.read(&answer)
     }
 
     /// Runs queries, each for itself.
@@ -253,12 +258,11 @@ impl Session {
         query: impl Fn(&dyn Sql) -> Result<T, QueueError>,
     ) -> Result<T, QueueError> {
         loop {
-            let node = self.node.load(Ordering::Relaxed);
-            let now = Timestamp::from_millis(Timestamp::now().as_millis() + self.ahead_ms);
+            let me = Arc::clone(&self.me);
             let (done, is_lost) = match self.client() {
                 Err(error) => (Err(error), true),
                 Ok(client) => {
-                    let sql = PostgresSql::new(client, now, node);
+                    let sql = PostgresSql::new(client, &me);
                     let done = query(&sql);
                     let is_lost = sql.fault() == Some(Fault::Lost);
                     (done, is_lost)
@@ -296,10 +300,10 @@ impl Session {
         &mut self,
         query: impl Fn(&dyn Sql) -> Result<T, QueueError>,
     ) -> Result<T, QueueError> {
-        let now = self.begin("on")?;
-        let node = self.node.load(Ordering::Relaxed);
+        self.begin("on")?;
+        let me = Arc::clone(&self.me);
         let client = self.client()?;
-        let done = query(&PostgresSql::new(client, now, node));
+        let done = query(&PostgresSql::new(client, &me));
         let ended = client.batch_execute("COMMIT");
         ended.map_err(|error| refused(&error)).and(done)
     }

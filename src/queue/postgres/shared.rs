@@ -1,11 +1,12 @@
 //! What the threads of a node share.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU32, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
 use super::backlog::Ledger;
 use super::beats::Beats;
 use super::bell::{Bell, Changes};
+use super::this_node::ThisNode;
 use crate::queue::effects::Effects;
 use crate::queue::local::Local;
 use crate::queue::types::QueueOptions;
@@ -15,7 +16,7 @@ pub(super) struct Shared {
     pub(super) local: Arc<Local>,
     pub(super) options: QueueOptions,
     pub(super) name: String,
-    pub(super) node: Arc<AtomicI64>,
+    pub(super) me: Arc<ThisNode>,
     pub(super) ledger: Ledger,
     pub(super) bell: Bell,
     pub(super) beats: Beats,
@@ -29,13 +30,13 @@ impl Shared {
         local: Arc<Local>,
         options: QueueOptions,
         name: &str,
-        node: &Arc<AtomicI64>,
+        me: &Arc<ThisNode>,
     ) -> Self {
         Self {
             local,
             options,
             name: name.to_owned(),
-            node: Arc::clone(node),
+            me: Arc::clone(me),
             ledger: Ledger::default(),
             bell: Bell::default(),
             beats: Beats::default(),
@@ -46,7 +47,7 @@ impl Shared {
 
     /// The number of this node.
     pub(super) fn node(&self) -> i64 {
-        self.node.load(Ordering::Relaxed)
+        self.me.number()
     }
 
     pub(super) fn is_stopping(&self) -> bool {

@@ -13,6 +13,7 @@ use postgres::types::private::BytesMut;
 use postgres::types::{FromSql, IsNull, ToSql, Type, to_sql_checked};
 
 use super::locks::SHARES;
+use super::this_node::ThisNode;
 use crate::clock::Timestamp;
 use crate::job::{Priority, Tenant};
 use crate::queue::sql::{Row, Sql, Value, for_postgres};
@@ -35,18 +36,19 @@ pub(super) struct PostgresSql<'a> {
     now: Timestamp,
     since: Instant,
     node: i64,
+    is_alive: bool,
     fault: Cell<Option<Fault>>,
     wrote: Cell<bool>,
 }
 
 impl<'a> PostgresSql<'a> {
-    /// `now` is the time of the database at this moment.
-    pub(super) fn new(client: &'a mut Client, now: Timestamp, node: i64) -> Self {
+    pub(super) fn new(client: &'a mut Client, me: &ThisNode) -> Self {
         Self {
             client: RefCell::new(client),
-            now,
+            now: me.now(),
             since: Instant::now(),
-            node,
+            node: me.number(),
+            is_alive: me.is_alive(),
             fault: Cell::default(),
             wrote: Cell::default(),
         }
@@ -101,6 +103,14 @@ impl Sql for PostgresSql<'_> {
 
     fn node(&self) -> i64 {
         self.node
+    }
+
+    fn check_node(&self) -> Result<(), QueueError> {
+        if self.is_alive {
+            return Ok(());
+        }
+        let dead = "the other nodes have taken this one for dead: it joins again in a moment";
+        Err(QueueError::Store(dead.to_owned()))
     }
 
     fn lock_share(&self, tenant: &Tenant, priority: Priority) -> Result<(), QueueError> {

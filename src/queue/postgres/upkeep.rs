@@ -17,7 +17,7 @@ use crate::job::JobId;
 use crate::queue::effects::Effects;
 use crate::queue::sql::{Sql, values};
 use crate::queue::transitions::{expiry, leases, lists};
-use crate::queue::types::QueueError;
+use crate::queue::types::{Outcome, QueueError};
 use crate::sync::locked;
 
 /// How long the upkeep waits for changes of this process at most.
@@ -32,6 +32,12 @@ const TELL_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Nodes beyond which notifications that nobody waits for are sent less often.
 const FEW_NODES: u32 = 4;
+
+/// How long rows that are due are handled in one turn.
+const AT_A_TIME: Duration = Duration::from_millis(50);
+
+/// Time after which a claimed job is given back that no worker took.
+const NOT_TAKEN: Duration = Duration::from_secs(2);
 
 /// Maximum number of jobs in one statement or transaction.
 const AT_ONCE: usize = 64;
@@ -50,6 +56,8 @@ pub(super) struct Upkeep {
     told: Instant,
     read: Instant,
     beaten: Instant,
+    /// Whether rows are due that the last turn had no time for.
+    is_behind: bool,
 }
 
 impl Upkeep {
@@ -62,6 +70,7 @@ impl Upkeep {
             told: now,
             read: now,
             beaten: now,
+            is_behind: false,
         }
     }
 
@@ -94,17 +103,19 @@ impl Upkeep {
             self.beat()?;
         }
         self.read_again(&to_read)?;
-        self.tell()?;
-        self.handle_what_is_due()
+        self.handle_what_is_due()?;
+        self.give_back()?;
+        self.tell()
     }
 
     /// How long this turn waits for changes.
     fn patience(&self) -> Duration {
         let until_told = self.tell_interval().saturating_sub(self.told.elapsed());
         let until_beat = self.beat_interval().saturating_sub(self.beaten.elapsed());
+        let tick = if self.is_behind { Duration::ZERO } else { TICK };
         match self.untold.is_empty() {
-            true => TICK.min(until_beat),
-            false => TICK.min(until_beat).min(until_told),
+            true => tick.min(until_beat),
+            false => tick.min(until_beat).min(until_told),
         }
     }
 
@@ -178,7 +189,23 @@ impl Upkeep {
         Ok(())
     }
 
-    /// Handles the rows that are due, unless another node does.
+    /// Gives back the jobs that were claimed for a worker that had stopped waiting.
+    fn give_back(&mut self) -> Result<(), QueueError> {
+        for (id, attempt) in self.shared.local.not_taken(NOT_TAKEN) {
+            let options = &self.shared.options;
+            let release = |sql: &dyn Sql, effects: &mut Effects| {
+                leases::finish(sql, effects, options, id, attempt, Outcome::Released)
+            };
+            let commit = self
+                .session
+                .transact(Flush::IfWritten, Instant::now(), release)?;
+            self.shared.committed(commit.effects, commit.transaction);
+        }
+        Ok(())
+    }
+
+    /// Handles the rows that are due, unless another node does, for a moment: heartbeats and
+    /// cancellations are not to wait.
     fn handle_what_is_due(&mut self) -> Result<(), QueueError> {
         let is_due =
             |due: Option<Timestamp>, sql: &dyn Sql| due.is_some_and(|due| due <= sql.now());
@@ -194,7 +221,13 @@ impl Upkeep {
         let may_expire = self.session.age() >= GRACE.min(self.shared.options.lease);
         let options = &self.shared.options;
         let lock = format!("SELECT pg_try_advisory_xact_lock({SWEEP}, 0)");
+        let began = Instant::now();
+        self.is_behind = false;
         for id in due {
+            if began.elapsed() > AT_A_TIME {
+                self.is_behind = true;
+                break;
+            }
             let look = |sql: &dyn Sql, effects: &mut Effects| {
                 if !sql.only(&lock, &[])?.get::<bool>(0)? {
                     return Ok(false);
@@ -203,7 +236,14 @@ impl Upkeep {
                 expiry::look_after(sql, effects, options, id, left)?;
                 Ok(true)
             };
-            let commit = self.session.transact(Flush::Always, Instant::now(), look)?;
+            let commit = match self.session.transact(Flush::Always, Instant::now(), look) {
+                Ok(commit) => commit,
+                Err(error) => {
+                    // It does not keep the others from being handled.
+                    tracing::error!(%error, job = %id, "a job that is due is not handled");
+                    continue;
+                }
+            };
             self.shared.committed(commit.effects, commit.transaction);
             if !commit.value {
                 break;

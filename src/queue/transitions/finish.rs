@@ -157,7 +157,7 @@ pub(in crate::queue) fn cancel(
                 &End::default(),
             )?;
         }
-        _ => effects.cancel.push(id),
+        _ => effects.cancel.push((id, job.attempt)),
     }
     let job = Arc::new(rows::get(sql, id)?);
     effects.changed.push(Arc::clone(&job));

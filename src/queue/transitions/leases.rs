@@ -12,11 +12,18 @@ use crate::queue::effects::Effects;
 use crate::queue::sql::{Sql, values};
 use crate::queue::types::{Committed, Event, Outcome, QueueError, QueueOptions};
 
-/// The statement that finds the first ready job of one device requirement. A job that another
-/// transaction is claiming is passed over. The query plan test also uses it.
+/// The statement that finds the first ready job of one device requirement. The query plan test also
+/// uses it.
 pub(in crate::queue) const FIRST_READY: &str = "SELECT priority, virtual_start, seq FROM jobs \
     INDEXED BY jobs_ready WHERE state = 0 AND ready IS NOT NULL AND delayed = 0 AND device = ?1 \
-    ORDER BY priority DESC, virtual_start, seq LIMIT 1 FOR UPDATE SKIP LOCKED";
+    ORDER BY priority DESC, virtual_start, seq LIMIT 1";
+
+/// What locks the job that [`FIRST_READY`] finds. A job that another transaction is claiming is
+/// passed over.
+const AND_LOCK: &str = " FOR UPDATE SKIP LOCKED";
+
+/// How often a worker looks again at once where another one was faster.
+const LOOKS: u32 = 3;
 
 /// Limit and back-off of storage failures that affect a single job. With the default retry delay
 /// the delays add up to about half an hour.
@@ -30,16 +37,33 @@ type BacklogKey = (core::cmp::Reverse<i64>, f64, i64);
 /// The first ready job among those for any device and those for this kind. Two index lookups, so
 /// that the jobs that wait for the other kind cost nothing.
 fn first_ready(sql: &dyn Sql, kind: DeviceKind) -> Result<Option<i64>, QueueError> {
-    let mut first: Option<BacklogKey> = None;
-    for need in [None, Some(kind)] {
-        let found = match sql.first(FIRST_READY, values![device_code(need)])? {
-            None => None,
-            Some(row) => Some((core::cmp::Reverse(row.get(0)?), row.get(1)?, row.get(2)?)),
+    let find = |need, lock: &str| -> Result<Option<BacklogKey>, QueueError> {
+        let text = format!("{FIRST_READY}{lock}");
+        match sql.first(&text, values![device_code(need)])? {
+            None => Ok(None),
+            Some(row) => Ok(Some((
+                core::cmp::Reverse(row.get(0)?),
+                row.get(1)?,
+                row.get(2)?,
+            ))),
+        }
+    };
+    for _ in 0..LOOKS {
+        // A job of the class that is not chosen must not be hidden from other workers by a lock.
+        let (any, own) = match find(Some(kind), "")? {
+            None => (None, None),
+            own => (find(None, "")?, own),
         };
-        let earlier = |one: BacklogKey, other: BacklogKey| if other < one { other } else { one };
-        first = first.into_iter().chain(found).reduce(earlier);
+        let prefers_own = own.is_some() && any.is_none_or(|any| own.is_some_and(|own| own < any));
+        let need = prefers_own.then_some(kind);
+        match find(need, AND_LOCK)? {
+            Some((_, _, seq)) => return Ok(Some(seq)),
+            // Others are claiming all that there is.
+            None if own.is_none() => return Ok(None),
+            None => {}
+        }
     }
-    Ok(first.map(|(_, _, seq)| seq))
+    Ok(None)
 }
 
 /// Leases the next job to `worker`, whose device is of this kind.
@@ -50,6 +74,7 @@ pub(in crate::queue) fn claim(
     worker: &str,
     kind: DeviceKind,
 ) -> Result<Option<Arc<Job>>, QueueError> {
+    sql.check_node()?;
     let Some(seq) = first_ready(sql, kind)? else {
         return Ok(None);
     };

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use super::finish::make_durable;
 use super::rows::{COLUMNS, device_code, kind_code, priority_code};
 use super::{fair_queue, rows};
 use crate::job::{Job, JobId, Kind, State, Tenant};
@@ -16,8 +17,11 @@ pub(in crate::queue) fn submit(
     options: &QueueOptions,
     submission: &Submission,
 ) -> Result<Submitted, QueueError> {
-    if let Some(known) = known(sql, submission)? {
-        return Ok(Submitted::Known(Arc::new(known)));
+    if let Some(known) = known(sql, effects, options, submission)? {
+        return Ok(Submitted::Known(known));
+    }
+    if !submission.durable {
+        sql.check_node()?;
     }
     let is_held_back = fair_queue::is_held_back(sql, submission.after)?;
     let mut tag = fair_queue::virtual_start(sql, &submission.tenant, submission.priority)?;
@@ -64,12 +68,17 @@ pub(in crate::queue) fn submit(
 }
 
 /// The job to which the idempotency key of a submission belongs, if it is the same submission.
-fn known(sql: &dyn Sql, submission: &Submission) -> Result<Option<Job>, QueueError> {
+fn known(
+    sql: &dyn Sql,
+    effects: &mut Effects,
+    options: &QueueOptions,
+    submission: &Submission,
+) -> Result<Option<Arc<Job>>, QueueError> {
     let Some(idempotency) = &submission.idempotency else {
         return Ok(None);
     };
     let tenant = submission.tenant.as_str();
-    let text = "SELECT id, fingerprint FROM jobs INDEXED BY jobs_key \
+    let text = "SELECT id, fingerprint, origin FROM jobs INDEXED BY jobs_key \
                 WHERE tenant = ?1 AND idempotency_key = ?2";
     let Some(row) = sql.first(text, values![tenant, idempotency.key.as_str()])? else {
         return Ok(None);
@@ -85,11 +94,14 @@ fn known(sql: &dyn Sql, submission: &Submission) -> Result<Option<Job>, QueueErr
         sql.query(free, values![id])?;
         return Ok(None);
     }
-    if fingerprint == idempotency.fingerprint {
-        Ok(Some(known))
-    } else {
-        Err(QueueError::KeyReused(id))
+    if fingerprint != idempotency.fingerprint {
+        return Err(QueueError::KeyReused(id));
     }
+    if !known.durable && row.get::<i64>(2)? != sql.node() {
+        // Its caller came back at another node: the first one must not cancel it.
+        return make_durable(sql, effects, options, id).map(Some);
+    }
+    Ok(Some(Arc::new(known)))
 }
 
 /// Inserts a job and deletes it again: exercises the writes of a submission.
