@@ -293,8 +293,9 @@ impl PendingJob {
         for _ in 0..TRIES {
             let submitted = self.service.queue.submit(submission.clone()).await;
             // With an error of the store nobody knows whether the job was accepted.
-            let is_unknown = matches!(&submitted, Err(error) if error.is_of_the_machine());
-            self.submitted |= is_unknown && !self.is_unknown_to_the_queue().await;
+            if matches!(&submitted, Err(error) if error.is_of_the_machine()) {
+                self.submitted = self.service.may_be_queued(self.id).await;
+            }
             let (mut job, new) = match submitted? {
                 Submitted::New(job) => {
                     self.submitted = true;
@@ -433,15 +434,6 @@ impl PendingJob {
             }),
             durable: self.request.durability == Durability::Durable,
         })
-    }
-}
-
-impl PendingJob {
-    /// Whether the queue says that it has no such job. If it cannot say, the payload is kept: the
-    /// search for orphans finds it later.
-    async fn is_unknown_to_the_queue(&self) -> bool {
-        let known = self.service.queue.known(vec![self.id]).await;
-        known.is_ok_and(|known| known.is_empty())
     }
 }
 

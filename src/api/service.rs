@@ -465,6 +465,13 @@ impl Service {
         }
     }
 
+    /// Whether the queue may have this job. If it cannot say, the payload is kept, and goes later as
+    /// one without a job.
+    pub(super) async fn may_be_queued(&self, id: JobId) -> bool {
+        let known = self.queue.known(vec![id]).await;
+        !known.is_ok_and(|known| known.is_empty())
+    }
+
     /// Removes all blobs stored under `id`, for an upload that became no job. A failure is logged
     /// and otherwise ignored.
     pub async fn forget_blobs(&self, id: JobId) {

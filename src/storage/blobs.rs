@@ -14,6 +14,7 @@ use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt};
 
 use super::blob::{Blob, BlobError, FreeSpace, Fsync, path};
+use super::bucket::BucketError;
 use super::{bucket, folder};
 use crate::job::JobId;
 
@@ -60,7 +61,7 @@ impl Blobs {
     ///
     /// # Errors
     /// If the URL is none of these, or a variable has a value that cannot be used.
-    pub fn open_bucket(url: &str) -> Result<Self, BlobError> {
+    pub fn open_bucket(url: &str) -> Result<Self, BucketError> {
         let store = bucket::open(url)?;
         Ok(Self {
             synced: Arc::clone(&store),

@@ -19,16 +19,24 @@ const WHOLE_BYTES: usize = 64 << 20;
 /// Bytes of a part.
 const PART_BYTES: usize = 16 << 20;
 
+/// Why a bucket cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum BucketError {
+    /// The text is no URL of a bucket.
+    #[error("{0:?} is no s3://bucket, gs://bucket or az://container")]
+    Url(String),
+    /// A variable of the environment has a value that cannot be used.
+    #[error("the settings of the bucket cannot be used")]
+    Settings(#[source] object_store::Error),
+}
+
 /// Opens a bucket by its URL, with the variables of the environment.
-pub(super) fn open(url: &str) -> Result<Arc<dyn ObjectStore>, BlobError> {
-    let invalid = |text: String| BlobError::from(io::Error::new(io::ErrorKind::InvalidInput, text));
-    let parsed = Url::parse(url).map_err(|error| invalid(format!("{url:?}: {error}")))?;
-    if !["s3", "gs", "az"].contains(&parsed.scheme()) {
-        return Err(invalid(format!(
-            "{url:?} is no s3://bucket, gs://bucket or az://container"
-        )));
-    }
-    let (store, prefix) = parse_url_opts(&parsed, std::env::vars())?;
+pub(super) fn open(url: &str) -> Result<Arc<dyn ObjectStore>, BucketError> {
+    let is_known = |parsed: &Url| ["s3", "gs", "az"].contains(&parsed.scheme());
+    let parsed = Url::parse(url).ok().filter(is_known);
+    let parsed = parsed.ok_or_else(|| BucketError::Url(url.to_owned()))?;
+    let opened = parse_url_opts(&parsed, std::env::vars());
+    let (store, prefix) = opened.map_err(BucketError::Settings)?;
     Ok(Arc::new(PrefixStore::new(store, prefix)))
 }
 

@@ -10,6 +10,9 @@ use std::time::{Duration, SystemTime};
 use super::blob::{FreeSpace, folder};
 use crate::job::JobId;
 
+/// The names of the files of probes begin with this.
+const PROBE: &str = "probe-";
+
 /// Creates the folder and gives it the mode 0700.
 pub(super) fn prepare(root: &Path) -> io::Result<()> {
     fs::create_dir_all(root)?;
@@ -42,7 +45,8 @@ pub(super) fn write(root: &Path, name: &str, text: &str) -> io::Result<()> {
 pub(super) fn probe(root: &Path, needed: u64) -> io::Result<()> {
     const BYTES: usize = 64 << 10;
     const ROOM: u64 = 4 << 20;
-    let path = root.join("jobs/probe");
+    // Several nodes may test the folder at once.
+    let path = root.join(format!("jobs/{PROBE}{}", JobId::fresh()));
     fs::create_dir_all(root.join("jobs"))?;
     let bytes = vec![7; BYTES];
     let mut file = fs::File::create(&path)?;
@@ -101,12 +105,17 @@ pub(super) fn jobs_older_than(root: &Path, age: Duration) -> io::Result<Vec<JobI
     Ok(found)
 }
 
-/// Removes the remains of interrupted writes that were last changed more than `age` ago, and counts
-/// them.
+/// Removes the remains of interrupted writes and probes that were last changed more than `age` ago,
+/// and counts them.
 pub(super) fn remove_cut_off(root: &Path, age: Duration) -> io::Result<usize> {
     let limit = SystemTime::now().checked_sub(age);
     let mut removed = 0;
     for minute in entries(&root.join("jobs"))? {
+        let name = minute.file_name().unwrap_or_default().to_string_lossy();
+        if name.starts_with(PROBE) && is_older(&minute, limit)? {
+            fs::remove_file(&minute)?;
+            removed += 1;
+        }
         for job in entries(&minute)? {
             for blob in entries(&job)? {
                 if is_staged(&blob) && is_older(&blob, limit)? {

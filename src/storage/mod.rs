@@ -7,3 +7,4 @@ mod folder;
 
 pub use blob::{Blob, BlobError, FreeSpace, Fsync};
 pub use blobs::Blobs;
+pub use bucket::BucketError;
