@@ -292,7 +292,7 @@ impl PendingJob {
         let durable = self.request.durability == Durability::Durable;
         for _ in 0..TRIES {
             let submitted = self.service.queue.submit(submission.clone()).await;
-            // With an error of the store nobody knows whether the job was accepted.
+            // After an error of the store the job may have been accepted.
             if matches!(&submitted, Err(error) if error.is_of_the_machine()) {
                 self.submitted = self.service.may_be_queued(self.id).await;
             }

@@ -24,11 +24,22 @@ use crate::sync::locked;
 /// When a change is on disk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Kept {
-    /// Before it is acknowledged: somebody was promised it.
+    /// Before the change is acknowledged.
     Durably,
-    /// Soon. Where a crash of the database would not end the workers, too, before it is
-    /// acknowledged.
+    /// SQLite: some time after the acknowledgement. PostgreSQL: before it, because its crash does
+    /// not end the workers.
     Soon,
+}
+
+impl Kept {
+    /// For a change of a job.
+    fn of_job(is_durable: bool) -> Self {
+        if is_durable {
+            Self::Durably
+        } else {
+            Self::Soon
+        }
+    }
 }
 
 /// A database that runs the state transitions.
@@ -116,14 +127,10 @@ impl<E: Engine> DatabaseQueue<E> {
 #[async_trait]
 impl<E: Engine> Queue for DatabaseQueue<E> {
     async fn submit(&self, submission: Submission) -> Result<Submitted, QueueError> {
-        let kept = if submission.durable {
-            Kept::Durably
-        } else {
-            Kept::Soon
-        };
-        self.change(kept, move |sql, effects, options| {
-            transitions::submit(sql, effects, options, &submission)
-        })
+        self.change(
+            Kept::of_job(submission.durable),
+            move |sql, effects, options| transitions::submit(sql, effects, options, &submission),
+        )
         .await
     }
 
@@ -222,13 +229,8 @@ impl<E: Engine> Queue for DatabaseQueue<E> {
         let is_durable = locked(&self.engine.local().running)
             .get(&id)
             .is_some_and(|held| held.flags.is_durable());
-        let kept = if is_durable {
-            Kept::Durably
-        } else {
-            Kept::Soon
-        };
         let has_snapshot = self.engine.has_note_of_snapshot(id, attempt);
-        self.change(kept, move |sql, effects, options| {
+        self.change(Kept::of_job(is_durable), move |sql, effects, options| {
             if has_snapshot {
                 leases::snapshot_kept(sql, id, attempt)?;
             }

@@ -114,8 +114,7 @@ impl Blobs {
         let text = format!("{identity}\n");
         match &self.place {
             Place::Folder(root) => {
-                let root = Arc::clone(root);
-                in_background(move || folder::write(&root, IDENTITY, &text)).await
+                in_folder(root, move |root| folder::write(root, IDENTITY, &text)).await
             }
             Place::Bucket(_) => {
                 self.synced.put(&Path::from(IDENTITY), text.into()).await?;
@@ -140,10 +139,7 @@ impl Blobs {
             return Err(io::Error::other(gone).into());
         }
         match &self.place {
-            Place::Folder(root) => {
-                let root = Arc::clone(root);
-                in_background(move || folder::probe(&root, needed)).await
-            }
+            Place::Folder(root) => in_folder(root, move |root| folder::probe(root, needed)).await,
             Place::Bucket(_) => bucket::probe(&*self.synced).await,
         }
     }
@@ -220,10 +216,7 @@ impl Blobs {
     /// If a blob cannot be removed. Others may have been removed by then.
     pub async fn remove_job(&self, id: JobId) -> Result<(), BlobError> {
         match &self.place {
-            Place::Folder(root) => {
-                let root = Arc::clone(root);
-                in_background(move || folder::remove_job(&root, id)).await
-            }
+            Place::Folder(root) => in_folder(root, move |root| folder::remove_job(root, id)).await,
             Place::Bucket(_) => bucket::remove_job(&*self.quick, id).await,
         }
     }
@@ -234,10 +227,7 @@ impl Blobs {
     /// If the store cannot be listed.
     pub async fn is_empty(&self) -> Result<bool, BlobError> {
         match &self.place {
-            Place::Folder(root) => {
-                let root = Arc::clone(root);
-                in_background(move || folder::is_empty(&root)).await
-            }
+            Place::Folder(root) => in_folder(root, folder::is_empty).await,
             Place::Bucket(_) => bucket::is_empty(&*self.quick).await,
         }
     }
@@ -251,8 +241,7 @@ impl Blobs {
     pub async fn jobs_older_than(&self, age: Duration) -> Result<Vec<JobId>, BlobError> {
         match &self.place {
             Place::Folder(root) => {
-                let root = Arc::clone(root);
-                in_background(move || folder::jobs_older_than(&root, age)).await
+                in_folder(root, move |root| folder::jobs_older_than(root, age)).await
             }
             Place::Bucket(_) => Ok(Vec::new()),
         }
@@ -268,19 +257,20 @@ impl Blobs {
     pub async fn remove_cut_off(&self, age: Duration) -> Result<usize, BlobError> {
         match &self.place {
             Place::Folder(root) => {
-                let root = Arc::clone(root);
-                in_background(move || folder::remove_cut_off(&root, age)).await
+                in_folder(root, move |root| folder::remove_cut_off(root, age)).await
             }
             Place::Bucket(_) => Ok(0),
         }
     }
 }
 
-/// Runs blocking file operations outside the async runtime's workers.
-async fn in_background<T: Send + 'static>(
-    work: impl FnOnce() -> io::Result<T> + Send + 'static,
+/// Runs blocking operations on a folder outside the async runtime's workers.
+async fn in_folder<T: Send + 'static>(
+    root: &Arc<FilePath>,
+    work: impl FnOnce(&FilePath) -> io::Result<T> + Send + 'static,
 ) -> Result<T, BlobError> {
-    let done = tokio::task::spawn_blocking(work).await;
+    let root = Arc::clone(root);
+    let done = tokio::task::spawn_blocking(move || work(&root)).await;
     Ok(done.map_err(io::Error::other)??)
 }
 

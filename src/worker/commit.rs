@@ -46,8 +46,8 @@ impl Worker {
         }
     }
 
-    /// Whether the job has succeeded by this attempt: the queue had kept an outcome of which no answer
-    /// came. If the queue cannot say, the result is kept, too.
+    /// Whether the job has succeeded by this attempt. Then the queue had kept the outcome, and its
+    /// answer was lost. If the queue cannot be read, the result is kept.
     async fn has_this_result(&self, job: &Job) -> bool {
         match self.queue.job(&job.tenant, job.id).await {
             Ok(now) => now.state == State::Succeeded && now.attempt == job.attempt,

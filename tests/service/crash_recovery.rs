@@ -59,7 +59,7 @@ async fn submit(server: &Server, client: &reqwest::Client, job: usize) -> Option
     Some(view["id"].as_str()?.to_owned())
 }
 
-pub(crate) async fn fetch(server: &Server, client: &reqwest::Client, id: &str) -> Vec<u8> {
+async fn fetch(server: &Server, client: &reqwest::Client, id: &str) -> Vec<u8> {
     let url = server.url(&format!("/v1/jobs/{id}/result"));
     let answer = client.get(url).send().await.expect("an answer");
     assert_eq!(answer.status(), StatusCode::OK, "{id}");
@@ -119,14 +119,26 @@ async fn every_acknowledged_job_ends_once_with_the_undisturbed_result_however_of
     let listed = list_all(&server, &client).await;
     assert_eq!(listed, jobs, "there are jobs that nobody asked for");
 
+    let ids: Vec<_> = (0..jobs).map(|job| acknowledged[&job].clone()).collect();
+    let attempts = end_undisturbed(&server, &client, &ids).await;
+    println!("{kills} kills, {jobs} jobs, {attempts} attempts");
+}
+
+/// Waits until these jobs have succeeded, and compares their flows with those of an undisturbed run.
+/// The ids are in the order of the jobs' numbers. Returns the number of attempts.
+pub(crate) async fn end_undisturbed(
+    server: &Server,
+    client: &reqwest::Client,
+    ids: &[String],
+) -> u64 {
     let mut attempts = 0;
-    for job in 0..jobs {
-        let view = ended(&server, &acknowledged[&job]).await;
+    for id in ids {
+        let view = ended(server, id).await;
         assert_eq!(view["state"], "succeeded", "{view}");
         attempts += view["attempt"].as_u64().expect("a number");
     }
     let mut undisturbed: HashMap<String, Vec<u8>> = HashMap::new();
-    for job in 0..jobs {
+    for (job, id) in ids.iter().enumerate() {
         let expected = undisturbed.entry(options(job)).or_default();
         if expected.is_empty() {
             let sent = client
@@ -138,10 +150,10 @@ async fn every_acknowledged_job_ends_once_with_the_undisturbed_result_however_of
             assert_eq!(sent.status(), StatusCode::OK);
             *expected = sent.bytes().await.expect("a body").to_vec();
         }
-        let found = fetch(&server, &client, &acknowledged[&job]).await;
+        let found = fetch(server, client, id).await;
         assert!(found == *expected, "job {job} is another flow");
     }
-    println!("{kills} kills, {jobs} jobs, {attempts} attempts");
+    attempts
 }
 
 /// The number of durable jobs in the server's list.

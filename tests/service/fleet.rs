@@ -1,7 +1,6 @@
 //! Tests of many nodes over one database and one object store: nodes are killed and frozen, and the
 //! database crashes.
 
-use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -9,10 +8,10 @@ use reqwest::StatusCode;
 use serde_json::Value;
 
 use crate::clouds::{form, small_pair};
-use crate::crash_recovery::{Dice, fetch, list_all, options};
+use crate::crash_recovery::{Dice, end_undisturbed, list_all, options};
 use crate::object_server::ObjectServer;
 use crate::postgres_server::{PostgresServer, start_postgres};
-use crate::server::{PATIENCE, Server, ended, plain_get};
+use crate::server::{PATIENCE, Server, plain_get};
 
 /// Default number of jobs. `FNSF_FLEET_JOBS` overrides it.
 const JOBS: usize = 60;
@@ -166,28 +165,7 @@ async fn every_acknowledged_job_ends_once_while_nodes_are_killed_and_frozen_and_
         assert_eq!(again, *id, "job {job} was lost or repeated");
     }
     assert_eq!(list_all(server, &client).await, jobs);
-    let mut attempts = 0;
-    for id in &ids {
-        let view = ended(server, id).await;
-        assert_eq!(view["state"], "succeeded", "{view}");
-        attempts += view["attempt"].as_u64().expect("a number");
-    }
-    let mut undisturbed: HashMap<String, Vec<u8>> = HashMap::new();
-    for (job, id) in ids.iter().enumerate() {
-        let expected = undisturbed.entry(options(job)).or_default();
-        if expected.is_empty() {
-            let sent = client
-                .post(server.url("/v1/flow"))
-                .multipart(form(small_pair(), &options(job)))
-                .send()
-                .await
-                .expect("an answer");
-            assert_eq!(sent.status(), StatusCode::OK);
-            *expected = sent.bytes().await.expect("a body").to_vec();
-        }
-        let found = fetch(server, &client, id).await;
-        assert!(found == *expected, "job {job} is another flow");
-    }
+    let attempts = end_undisturbed(server, &client, &ids).await;
     println!(
         "{jobs} jobs, {attempts} attempts, {kills} kills, {crashes} crashes of the database, \
          {freezes} freezes in {:.0} s",

@@ -17,7 +17,8 @@ pub(super) struct Changes {
     pub(super) more: bool,
     /// Whether a job may have become ready to be leased.
     pub(super) ready: bool,
-    /// Whether somebody waits for one of the changes: a caller, or a worker that is to stop.
+    /// Whether the other nodes are to be told at once: of a cancellation, or of a job whose caller
+    /// waits.
     pub(super) urgent: bool,
 }
 
@@ -133,7 +134,7 @@ impl Bell {
         std::mem::take(&mut *rung)
     }
 
-    /// Wakes the upkeep without a change.
+    /// Has the upkeep read all jobs that this process watches or holds.
     pub(super) fn wake(&self) {
         let more = Changes {
             more: true,

@@ -28,7 +28,7 @@ use crate::queue::sql::{Sql, values};
 use crate::queue::transitions;
 use crate::queue::types::{Event, Queue, QueueError, QueueOptions};
 
-/// Maximum time until a worker looks for a job again of which it was not told.
+/// Interval at which idle workers look for a job, if no notification wakes them.
 const POLL_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Opens the queue in a PostgreSQL database, as one of its nodes. The tables are created in an empty
@@ -126,11 +126,8 @@ impl Engine for PostgresEngine {
             Kept::Soon => Flush::IfWritten,
         };
         let shared = Arc::clone(&self.shared);
-        let work = move |session: &mut Session, at: Instant| {
-            let commit = session.transact(flush, at, change)?;
-            shared.committed(commit.effects, commit.transaction);
-            Ok(commit.value)
-        };
+        let work =
+            move |session: &mut Session, at: Instant| shared.change(session, flush, at, change);
         self.pool.run(work).await
     }
 

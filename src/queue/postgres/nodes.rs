@@ -4,12 +4,13 @@ use std::time::{Duration, Instant};
 
 use super::locks::NODES;
 use super::session::{Flush, Session};
+use super::shared::Shared;
 use super::this_node::ThisNode;
 use crate::queue::effects::Effects;
 use crate::queue::node::{Capacities, Capacity, Node};
 use crate::queue::sql::{Row, Sql, values};
 use crate::queue::transitions::expiry;
-use crate::queue::types::{QueueError, QueueOptions};
+use crate::queue::types::QueueError;
 
 /// After a start of the database, and after this node was cut off from it, the other nodes need
 /// this long to show that they are alive.
@@ -143,12 +144,7 @@ pub(super) fn look(session: &mut Session, me: i64) -> Result<Look, QueueError> {
 }
 
 /// Recovers the jobs of a dead node and forgets the node. Several nodes may do so at once.
-pub(super) fn bury(
-    session: &mut Session,
-    dead: Silent,
-    options: &QueueOptions,
-    mut committed: impl FnMut(Effects, Option<u64>),
-) -> Result<(), QueueError> {
+pub(super) fn bury(session: &mut Session, dead: Silent, shared: &Shared) -> Result<(), QueueError> {
     let Silent { node, stopped } = dead;
     // From now on it claims nothing under this number.
     let mark = "UPDATE nodes SET stopped = ?2 WHERE id = ?1 AND stopped = 0";
@@ -156,10 +152,9 @@ pub(super) fn bury(
     let left = session.read(Instant::now(), |sql| expiry::left_behind(sql, node))?;
     for id in left {
         let recover = |sql: &dyn Sql, effects: &mut Effects| {
-            expiry::recover(sql, effects, options, id, node, stopped)
+            expiry::recover(sql, effects, &shared.options, id, node, stopped)
         };
-        let commit = session.transact(Flush::Always, Instant::now(), recover)?;
-        committed(commit.effects, commit.transaction);
+        shared.change(session, Flush::Always, Instant::now(), recover)?;
     }
     let forget = "DELETE FROM nodes WHERE id = ?1";
     session.read(Instant::now(), |sql| sql.query(forget, values![node]))?;

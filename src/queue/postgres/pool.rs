@@ -43,7 +43,7 @@ impl Pool {
         let (answer, answered) = oneshot::channel();
         let at = Instant::now();
         let work: Work = Box::new(move |session| {
-            // Behind many others that waited for the database in vain.
+            // The call has waited behind others while the database was away.
             let done = match at.elapsed() > PATIENCE && !session.is_open() {
                 true => Err(QueueError::Store("the database does not answer".to_owned())),
                 false => work(session, at),

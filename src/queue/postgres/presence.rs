@@ -57,11 +57,8 @@ impl Presence {
         loop {
             let node = self.shared.node();
             let first = look(&mut self.session, node)?;
-            if first.silent.is_empty() {
-                break;
-            }
-            if first.alive > 0 {
-                // The others know whether these have only lost their connections.
+            // Others that are alive know whether the silent ones have only lost their connections.
+            if first.silent.is_empty() || first.alive > 0 {
                 break;
             }
             thread::sleep(SECOND_LOOK);
@@ -71,12 +68,11 @@ impl Presence {
             }
             for dead in second.silent {
                 if first.silent.contains(&dead) {
-                    self.bury(dead)?;
+                    bury(&mut self.session, dead, &self.shared)?;
                 }
             }
         }
-        self.count(true)?;
-        Ok(())
+        self.count(true)
     }
 
     /// Goes on until the queue is dropped.
@@ -166,20 +162,8 @@ impl Presence {
                 node = dead.node,
                 "a node has ended: its jobs are queued again"
             );
-            self.bury(dead)?;
+            bury(&mut self.session, dead, &self.shared)?;
         }
         Ok(())
-    }
-
-    fn bury(&mut self, dead: Silent) -> Result<(), QueueError> {
-        let shared = Arc::clone(&self.shared);
-        bury(
-            &mut self.session,
-            dead,
-            &self.shared.options,
-            |effects, transaction| {
-                shared.committed(effects, transaction);
-            },
-        )
     }
 }

@@ -15,9 +15,9 @@ const VERSION: i64 = 1;
 /// `jobs` has the columns of the embedded queue, with the same meanings. Rows change often, so
 /// pages keep room for new versions of a row, and the table is vacuumed early.
 ///
-/// `nodes` has a row for each process that takes part. `commits` has the last commit of each of its
-/// connections, so that a commit can be looked up of which no answer came. `summary` has one row: the load as it was
-/// last counted.
+/// `nodes` has a row for each process that takes part. `commits` has the last commit of each
+/// connection of a node: it decides whether a transaction was committed whose answer was lost.
+/// `summary` has one row, the last count of the load.
 const TABLES: [&str; 17] = [
     "CREATE TABLE meta (version bigint NOT NULL, identity bigint NOT NULL)",
     "CREATE TABLE nodes (

@@ -137,8 +137,9 @@ impl Session {
         self.client = None;
     }
 
-    /// Makes a change in a transaction, again and again while the database is away, until
-    /// [`PATIENCE`] has passed since `asked`. A commit of which no answer came is looked up.
+    /// Makes a change in a transaction. While the database is away it is tried again, until
+    /// [`PATIENCE`] has passed since `asked`. If the answer to the commit is lost, another connection
+    /// asks whether the transaction was committed.
     pub(super) fn transact<T>(
         &mut self,
         flush: Flush,
@@ -191,9 +192,7 @@ impl Session {
         let node = self.me.number();
         self.count += 1;
         let (place, count) = (self.place, self.count);
-        // Not a new connection: the transaction is open on this one.
-        let gone = || lost(QueueError::Store("the connection is gone".to_owned()));
-        let client = self.client.as_mut().ok_or_else(gone)?;
+        let client = in_transaction(&mut self.client).map_err(lost)?;
         let mut effects = Effects::default();
         let sql = PostgresSql::new(client, &self.me);
         let mut token = None;
@@ -223,18 +222,20 @@ impl Session {
             effects,
             transaction,
         });
+        let unknown = |error| Failed::Unknown(token, refused(&error));
         let committed = client.batch_execute("COMMIT");
-        let kept = committed.and_then(|()| match flush {
-            Flush::IfWritten if token.is_none() => Ok(()),
-            Flush::Never => Ok(()),
-            _ => client.batch_execute(FLUSH),
-        });
-        kept.map_err(|error| match fault(&error) {
-            Fault::Lost => Failed::Unknown(token, refused(&error)),
+        committed.map_err(|error| match fault(&error) {
+            Fault::Lost => unknown(error),
             // The database has answered: the transaction is rolled back.
             Fault::Conflict => Failed::Again(Fault::Conflict, refused(&error)),
             Fault::Refused => Failed::Refused(refused(&error)),
-        })
+        })?;
+        match flush {
+            Flush::IfWritten if token.is_none() => Ok(()),
+            Flush::Never => Ok(()),
+            // It is committed, and may not be on disk.
+            _ => client.batch_execute(FLUSH).map_err(unknown),
+        }
     }
 
     /// Begins a transaction, and reads the clock of the database. `synchronous` is `on` if its
@@ -301,15 +302,21 @@ impl Session {
         query: impl Fn(&dyn Sql) -> Result<T, QueueError>,
     ) -> Result<T, QueueError> {
         self.begin("on")?;
-        let me = Arc::clone(&self.me);
-        let client = self.client()?;
-        let done = query(&PostgresSql::new(client, &me));
+        let client = in_transaction(&mut self.client)?;
+        let done = query(&PostgresSql::new(client, &self.me));
         let ended = client.batch_execute("COMMIT");
         ended.map_err(|error| refused(&error)).and(done)
     }
 }
 
-/// Waits until all that is committed is on disk: the commit of a message that nobody reads does.
+/// The connection on which a transaction is open: never a new one.
+fn in_transaction(client: &mut Option<Client>) -> Result<&mut Client, QueueError> {
+    let gone = || QueueError::Store("the connection is gone".to_owned());
+    client.as_mut().ok_or_else(gone)
+}
+
+/// Waits until every commit so far is on disk. It commits an empty message, because that waits for
+/// the disk.
 const FLUSH: &str = "BEGIN; SET LOCAL synchronous_commit = on; \
     SELECT pg_logical_emit_message(true, 'fnsf', ''); COMMIT";
 

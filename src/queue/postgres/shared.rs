@@ -2,14 +2,17 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::time::Instant;
 
 use super::backlog::Ledger;
 use super::beats::Beats;
 use super::bell::{Bell, Changes};
+use super::session::{Flush, Session};
 use super::this_node::ThisNode;
 use crate::queue::effects::Effects;
 use crate::queue::local::Local;
-use crate::queue::types::QueueOptions;
+use crate::queue::sql::Sql;
+use crate::queue::types::{QueueError, QueueOptions};
 
 /// What the threads of a node share.
 pub(super) struct Shared {
@@ -60,9 +63,22 @@ impl Shared {
         self.bell.wake();
     }
 
+    /// Makes a change on a connection of this node and applies its effects.
+    pub(super) fn change<T>(
+        &self,
+        session: &mut Session,
+        flush: Flush,
+        asked: Instant,
+        change: impl Fn(&dyn Sql, &mut Effects) -> Result<T, QueueError>,
+    ) -> Result<T, QueueError> {
+        let commit = session.transact(flush, asked, change)?;
+        self.committed(commit.effects, commit.transaction);
+        Ok(commit.value)
+    }
+
     /// Applies the effects of a commit of this node. The subscribers are told by the upkeep, which
     /// reads the jobs again: commits of several connections come here in any order.
-    pub(super) fn committed(&self, effects: Effects, transaction: Option<u64>) {
+    fn committed(&self, effects: Effects, transaction: Option<u64>) {
         self.ledger.add(&self.local, &effects, transaction);
         self.local.apply_to_running(&effects);
         let changes = Changes::of(&effects);

@@ -12,7 +12,6 @@ use super::nodes::GRACE;
 use super::presence::CHANNEL;
 use super::session::{Flush, Session};
 use super::shared::Shared;
-use crate::clock::Timestamp;
 use crate::job::JobId;
 use crate::queue::effects::Effects;
 use crate::queue::sql::{Sql, values};
@@ -39,7 +38,7 @@ const AT_A_TIME: Duration = Duration::from_millis(50);
 /// Time after which a claimed job is given back that no worker took.
 const NOT_TAKEN: Duration = Duration::from_secs(2);
 
-/// Maximum number of jobs in one statement or transaction.
+/// Maximum number of heartbeats in one transaction.
 const AT_ONCE: usize = 64;
 
 /// Interval between two renewals of a lease; a quarter of the lease if that is shorter.
@@ -163,13 +162,11 @@ impl Upkeep {
         ids.retain(|id| changes.contains(*id));
         ids.sort_unstable();
         ids.dedup();
-        for ids in ids.chunks(AT_ONCE) {
-            let found = self
-                .session
-                .read(Instant::now(), |sql| lists::find_all(sql, ids))?;
-            for id in ids {
-                local.refresh(*id, found.iter().find(|job| job.id == *id));
-            }
+        let found = self
+            .session
+            .read(Instant::now(), |sql| lists::find_all(sql, &ids))?;
+        for id in ids {
+            local.refresh(id, found.get(&id));
         }
         Ok(())
     }
@@ -196,10 +193,9 @@ impl Upkeep {
             let release = |sql: &dyn Sql, effects: &mut Effects| {
                 leases::finish(sql, effects, options, id, attempt, Outcome::Released)
             };
-            let commit = self
-                .session
-                .transact(Flush::IfWritten, Instant::now(), release)?;
-            self.shared.committed(commit.effects, commit.transaction);
+            let session = &mut self.session;
+            self.shared
+                .change(session, Flush::IfWritten, Instant::now(), release)?;
         }
         Ok(())
     }
@@ -207,16 +203,7 @@ impl Upkeep {
     /// Handles the rows that are due, unless another node does, for a moment: heartbeats and
     /// cancellations are not to wait.
     fn handle_what_is_due(&mut self) -> Result<(), QueueError> {
-        let is_due =
-            |due: Option<Timestamp>, sql: &dyn Sql| due.is_some_and(|due| due <= sql.now());
-        let due = self.session.read(Instant::now(), |sql| {
-            let next = expiry::next_due(sql)?;
-            if is_due(next, sql) {
-                expiry::due(sql)
-            } else {
-                Ok(Vec::new())
-            }
-        })?;
+        let due = self.session.read(Instant::now(), expiry::due)?;
         // While nobody could reach the database, nobody could renew a lease.
         let may_expire = self.session.age() >= GRACE.min(self.shared.options.lease);
         let options = &self.shared.options;
@@ -236,17 +223,18 @@ impl Upkeep {
                 expiry::look_after(sql, effects, options, id, left)?;
                 Ok(true)
             };
-            let commit = match self.session.transact(Flush::Always, Instant::now(), look) {
-                Ok(commit) => commit,
+            let session = &mut self.session;
+            match self
+                .shared
+                .change(session, Flush::Always, Instant::now(), look)
+            {
+                Ok(true) => {}
+                // Another node handles what is due.
+                Ok(false) => break,
+                // It does not keep the others from being handled.
                 Err(error) => {
-                    // It does not keep the others from being handled.
                     tracing::error!(%error, job = %id, "a job that is due is not handled");
-                    continue;
                 }
-            };
-            self.shared.committed(commit.effects, commit.transaction);
-            if !commit.value {
-                break;
             }
         }
         Ok(())

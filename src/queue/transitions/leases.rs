@@ -221,12 +221,8 @@ pub(super) fn fail(
         let delay = options.retry_delay.saturating_mul(1 << doublings);
         return requeue_running(sql, effects, job, delay);
     }
-    let how = End {
-        dead: error.retryable,
-        error: Some(error),
-        ..End::default()
-    };
-    end(sql, effects, options, job, State::Failed, &how)
+    let is_dead = error.retryable;
+    give_up(sql, effects, options, job, error, is_dead)
 }
 
 /// Counts a storage failure that affects only this job: it is requeued with growing delays, and
@@ -244,7 +240,7 @@ fn delay(
         let longer = first.saturating_mul(1 << delays.min(12)).min(LONGEST_DELAY);
         return requeue_running(sql, effects, job, longer);
     }
-    give_up(sql, effects, options, job, error)
+    give_up(sql, effects, options, job, error, true)
 }
 
 /// Counts a crash: the job is retried at once, or becomes a dead letter.
@@ -259,7 +255,7 @@ pub(super) fn crash(
     if crashes < options.max_crashes {
         return requeue_running(sql, effects, job, Duration::ZERO);
     }
-    give_up(sql, effects, options, job, error)
+    give_up(sql, effects, options, job, error, true)
 }
 
 /// Increments a counter column of a job and returns its new value.
@@ -269,17 +265,18 @@ fn count(sql: &dyn Sql, job: &Job, counter: &str) -> Result<u32, QueueError> {
     sql.only(&text, values![job.id])?.get(0)
 }
 
-/// Ends a job as a dead letter.
+/// Ends a job that failed. `dead`: as a dead letter.
 fn give_up(
     sql: &dyn Sql,
     effects: &mut Effects,
     options: &QueueOptions,
     job: &Job,
     error: JobError,
+    dead: bool,
 ) -> Result<State, QueueError> {
     let how = End {
         error: Some(error),
-        dead: true,
+        dead,
         ..End::default()
     };
     end(sql, effects, options, job, State::Failed, &how)

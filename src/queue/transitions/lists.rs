@@ -1,5 +1,6 @@
 //! Lists and counts of jobs.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 
 use super::rows;
@@ -34,34 +35,32 @@ pub(in crate::queue) fn list(sql: &dyn Sql, filter: &Filter) -> Result<Vec<Arc<J
 
 /// The ids in this list that belong to jobs, in the same order.
 pub(in crate::queue) fn known(sql: &dyn Sql, ids: &[JobId]) -> Result<Vec<JobId>, QueueError> {
-    const AT_ONCE: usize = 64;
-    let mut known = Vec::new();
-    for ids in ids.chunks(AT_ONCE) {
-        let found = find_all(sql, ids)?;
-        let is_known = |id: &JobId| found.iter().any(|job| job.id == *id);
-        known.extend(ids.iter().copied().filter(is_known));
-    }
-    Ok(known)
+    let found = find_all(sql, ids)?;
+    let known = ids.iter().copied().filter(|id| found.contains_key(id));
+    Ok(known.collect())
 }
 
-/// The jobs with these ids, in any order. A few ids at a time: each is a parameter.
+/// The jobs with these ids.
 pub(in crate::queue) fn find_all(
     sql: &dyn Sql,
     ids: &[JobId],
-) -> Result<Vec<Arc<Job>>, QueueError> {
-    if ids.is_empty() {
-        return Ok(Vec::new());
+) -> Result<HashMap<JobId, Arc<Job>>, QueueError> {
+    // Each id is a parameter.
+    const AT_ONCE: usize = 64;
+    let mut found = HashMap::new();
+    for ids in ids.chunks(AT_ONCE) {
+        let places: Vec<_> = (1..=ids.len()).map(|place| format!("?{place}")).collect();
+        let text = format!(
+            "SELECT {COLUMNS} FROM jobs INDEXED BY jobs_id WHERE id IN ({})",
+            places.join(", ")
+        );
+        let parameters: Vec<_> = ids.iter().map(|id| Value::from(*id)).collect();
+        for row in sql.query(&text, &parameters)? {
+            let job = rows::job(&row)?;
+            found.insert(job.id, Arc::new(job));
+        }
     }
-    let places: Vec<_> = (1..=ids.len()).map(|place| format!("?{place}")).collect();
-    let text = format!(
-        "SELECT {COLUMNS} FROM jobs INDEXED BY jobs_id WHERE id IN ({})",
-        places.join(", ")
-    );
-    let parameters: Vec<_> = ids.iter().map(|id| Value::from(*id)).collect();
-    let rows = sql.query(&text, &parameters)?;
-    rows.iter()
-        .map(|row| rows::job(row).map(Arc::new))
-        .collect()
+    Ok(found)
 }
 
 /// Whether there are no jobs.
