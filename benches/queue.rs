@@ -75,6 +75,7 @@ fn submission(tenant: &str, pairs: u32, cost_seconds: f64) -> Submission {
         device: None,
         cost_seconds,
         options: "{}".to_owned(),
+        labels: Vec::new(),
         deadline: None,
         idempotency: None,
         durable: true,

@@ -249,6 +249,31 @@ impl Admission {
 }
 
 impl Admission {
+    /// The model of costs, which knows the lanes of all nodes.
+    pub(super) fn cost(&self) -> &CostModel {
+        &self.cost
+    }
+
+    /// Predicted seconds until a new job without cost is started that has this tenant, priority and
+    /// requirement.
+    pub(super) fn predicted_wait(
+        &self,
+        backlog: &Backlog,
+        tenant: &Tenant,
+        priority: Priority,
+        device: Option<DeviceKind>,
+    ) -> f64 {
+        let asked = AdmissionRequest {
+            tenant,
+            priority,
+            device,
+            nominal_seconds: 0.0,
+            durability: Durability::Durable,
+        };
+        let reserved = locked(&self.reserved).values().sum();
+        self.wait(backlog, &asked, reserved)
+    }
+
     /// Predicted seconds until a new job is started. All lanes share the jobs that may run on any
     /// device; the jobs that require one kind of device come on top. A job for any device waits for
     /// the kind that is free first.

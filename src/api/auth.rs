@@ -7,7 +7,9 @@ use constant_time_eq::constant_time_eq_32;
 use serde::{Deserialize, Serialize};
 
 use super::error::ApiError;
-use crate::job::{Priority, Tenant};
+use super::share::ShareToken;
+use crate::clock::Timestamp;
+use crate::job::{Job, JobId, Priority, Tenant};
 
 /// What a caller may do. Each role includes the rights of those before it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -17,6 +19,8 @@ pub enum Role {
     Read,
     /// Also submit, cancel and requeue jobs.
     Write,
+    /// Also see the queued work of all tenants, the devices and the nodes.
+    Operate,
 }
 
 /// An authenticated caller, or any caller of a server without keys.
@@ -28,6 +32,8 @@ pub struct Caller {
     pub role: Role,
     /// The highest priority that the caller's jobs may have.
     pub max_priority: Priority,
+    /// The only job that the caller may read, with its pairs, if it has a share link.
+    pub shared_job: Option<JobId>,
 }
 
 impl Caller {
@@ -41,6 +47,23 @@ impl Caller {
         } else {
             Err(ApiError::Priority(self.max_priority))
         }
+    }
+
+    /// Refuses callers with a share link.
+    ///
+    /// # Errors
+    /// [`ApiError::Forbidden`].
+    pub(super) fn has_key(&self) -> Result<(), ApiError> {
+        match self.shared_job {
+            None => Ok(()),
+            Some(_) => Err(ApiError::Forbidden),
+        }
+    }
+
+    /// Whether the caller may read this job of its tenant.
+    pub(super) fn may_read(&self, job: &Job) -> bool {
+        self.shared_job
+            .is_none_or(|shared| shared == job.id || Some(shared) == job.parent)
     }
 
     /// Refuses callers with read access only.
@@ -123,17 +146,20 @@ impl Keys {
     ///
     /// `authorization` is the value of its `Authorization` header: `Bearer KEY`, where the case of
     /// `Bearer` does not matter. A server without keys ignores it. Every caller is then the default
-    /// tenant with [`Role::Write`] and priorities up to [`Priority::High`].
+    /// tenant with [`Role::Operate`] and priorities up to [`Priority::High`]. Instead of a key, the
+    /// token of a share link identifies a caller who may read one job.
     ///
     /// # Errors
-    /// [`ApiError::Unauthenticated`] if the server has keys and the value is missing, has another
-    /// form, or has an unknown key.
+    /// - [`ApiError::Unauthenticated`] if the server has keys and the value is missing, has another
+    ///   form, or has an unknown key.
+    /// - [`ApiError::LinkExpired`] if the token of a share link has expired.
     pub fn caller(&self, authorization: Option<&str>) -> Result<Caller, ApiError> {
         if self.is_open() {
             return Ok(Caller {
                 tenant: Tenant::default(),
-                role: Role::Write,
+                role: Role::Operate,
                 max_priority: Priority::High,
+                shared_job: None,
             });
         }
         let shown = authorization.and_then(|value| {
@@ -148,7 +174,32 @@ impl Keys {
                 found = Some(caller);
             }
         }
-        found.cloned().ok_or(ApiError::Unauthenticated)
+        match found {
+            Some(caller) => Ok(caller.clone()),
+            None => self.guest(shown.unwrap_or_default()),
+        }
+    }
+
+    /// The caller that the token of a share link identifies.
+    fn guest(&self, shown: &str) -> Result<Caller, ApiError> {
+        let token = ShareToken::parse(shown).ok_or(ApiError::Unauthenticated)?;
+        let signer = self.known.iter().find(|(key, _)| token.is_signed_by(key));
+        let (_, signer) = signer.ok_or(ApiError::Unauthenticated)?;
+        token.check_expiry(Timestamp::now())?;
+        Ok(Caller {
+            tenant: signer.tenant.clone(),
+            role: Role::Read,
+            max_priority: Priority::Low,
+            shared_job: Some(token.job),
+        })
+    }
+
+    /// The token of a share link to a job of this tenant. `None` on a server without keys, where a
+    /// reader needs no token.
+    pub(super) fn share(&self, tenant: &Tenant, job: JobId, expires: Timestamp) -> Option<String> {
+        let mut known = self.known.iter();
+        let (key, _) = known.find(|(_, caller)| caller.tenant == *tenant)?;
+        Some(ShareToken::sign(key, job, expires).to_string())
     }
 }
 
@@ -161,7 +212,37 @@ mod tests {
             tenant: tenant.parse().expect("a good name"),
             role,
             max_priority: Priority::Normal,
+            shared_job: None,
         }
+    }
+
+    #[test]
+    fn a_share_link_identifies_a_reader_of_one_job_until_it_expires() {
+        let mut keys = Keys::default();
+        let job = JobId::fresh();
+        let now = Timestamp::now();
+        let soon = now.after(std::time::Duration::from_secs(60));
+        let tenant: Tenant = "a".parse().expect("a name");
+        assert_eq!(keys.share(&tenant, job, soon), None);
+        keys.add("0123456789abcdef", caller("a", Role::Write))
+            .expect("a key");
+        let link = |expires| keys.share(&tenant, job, expires).expect("a key");
+        let guest = keys.caller(Some(&format!("Bearer {}", link(soon))));
+        let guest = guest.expect("a good link");
+        assert_eq!(
+            (guest.tenant.clone(), guest.role),
+            (tenant.clone(), Role::Read)
+        );
+        assert_eq!(guest.shared_job, Some(job));
+        assert_eq!(guest.has_key(), Err(ApiError::Forbidden));
+        let expired = keys.caller(Some(&format!("Bearer {}", link(now))));
+        assert_eq!(expired, Err(ApiError::LinkExpired));
+        let mut others = Keys::default();
+        others
+            .add("fedcba9876543210", caller("a", Role::Write))
+            .expect("a key");
+        let foreign = others.caller(Some(&format!("Bearer {}", link(soon))));
+        assert_eq!(foreign, Err(ApiError::Unauthenticated));
     }
 
     #[test]

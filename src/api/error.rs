@@ -39,8 +39,11 @@ pub enum ApiError {
     /// The key is missing or unknown.
     #[error("a valid key is needed: send Authorization: Bearer KEY")]
     Unauthenticated,
-    /// The key has read access only.
-    #[error("this key may only read")]
+    /// The share link has expired.
+    #[error("this link has expired: ask for a new one")]
+    LinkExpired,
+    /// The role of the key, or the share link, does not permit the request.
+    #[error("this key or link does not permit that")]
     Forbidden,
     /// The requested priority is above the maximum of the key, which is given.
     #[error("this key's jobs may be of priority {} at most", .0.name())]
@@ -55,6 +58,9 @@ pub enum ApiError {
     /// There is no such job, or it belongs to another tenant.
     #[error("no job has this name")]
     NotFound,
+    /// The job has no sweep with the requested index.
+    #[error("the job has no sweep with this index: GET its scene for those that it has")]
+    NoSweep(JobId),
     /// There is no such route.
     #[error("there is nothing here; GET /docs lists what there is")]
     NoRoute,
@@ -153,7 +159,7 @@ const fn row(
 const LONGEST_TEXT: usize = 1024;
 
 /// All errors.
-const ERRORS: [ErrorSpec; 31] = [
+const ERRORS: [ErrorSpec; 33] = [
     row("bad_request", 400, 3, false, Some("bad_input")),
     row("invalid_options", 400, 3, false, Some("bad_input")),
     row("bad_input", 422, 3, false, Some("bad_input")),
@@ -162,10 +168,12 @@ const ERRORS: [ErrorSpec; 31] = [
     row("too_slow", 408, 4, true, Some("too_slow")),
     row("taken_too_slowly", 503, 14, true, Some("too_slow")),
     row("unauthenticated", 401, 16, false, Some("unauthorized")),
+    row("link_expired", 401, 16, false, Some("unauthorized")),
     row("forbidden", 403, 7, false, Some("unauthorized")),
     row("priority", 403, 7, false, Some("unauthorized")),
     row("foreign_site", 403, 7, false, Some("unauthorized")),
     row("not_found", 404, 5, false, None),
+    row("no_sweep", 404, 5, false, None),
     row("no_route", 404, 12, false, None),
     row("method_not_allowed", 405, 12, false, None),
     row("not_acceptable", 406, 3, false, None),
@@ -222,10 +230,12 @@ impl ApiError {
             Self::TooSlow => "too_slow",
             Self::TakenTooSlowly => "taken_too_slowly",
             Self::Unauthenticated => "unauthenticated",
+            Self::LinkExpired => "link_expired",
             Self::Forbidden => "forbidden",
             Self::Priority(_) => "priority",
             Self::ForeignSite => "foreign_site",
             Self::NotFound => "not_found",
+            Self::NoSweep(_) => "no_sweep",
             Self::NoRoute => "no_route",
             Self::Method => "method_not_allowed",
             Self::NotAcceptable(_) => "not_acceptable",
@@ -279,6 +289,7 @@ impl ApiError {
     pub fn job(&self) -> Option<JobId> {
         match self {
             Self::KeyReused(id)
+            | Self::NoSweep(id)
             | Self::NotEnded(id)
             | Self::JobFailed(id, _)
             | Self::Expired(id)
@@ -380,10 +391,12 @@ mod tests {
             ApiError::TooSlow,
             ApiError::TakenTooSlowly,
             ApiError::Unauthenticated,
+            ApiError::LinkExpired,
             ApiError::Forbidden,
             ApiError::Priority(Priority::Normal),
             ApiError::ForeignSite,
             ApiError::NotFound,
+            ApiError::NoSweep(id),
             ApiError::NoRoute,
             ApiError::Method,
             ApiError::NotAcceptable(text()),

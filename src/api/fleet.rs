@@ -1,6 +1,8 @@
-//! The nodes of a queue: what this one can do, what the others can, and the view of all of them.
+//! The nodes of a queue: what this one can do, what the others can, and the views of devices and
+//! nodes.
 
 use serde::Serialize;
+use utoipa::ToSchema;
 
 use crate::clock::Timestamp;
 use crate::cost::{CostModel, Others};
@@ -27,8 +29,21 @@ pub fn others(nodes: &[Node]) -> Others {
     sum
 }
 
-/// A node, as `GET /nodes` shows it.
-#[derive(Debug, Serialize)]
+/// A device of this node.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct DeviceView {
+    /// Its name in metrics and logs.
+    pub name: String,
+    /// Its kind.
+    pub kind: &'static str,
+    /// Number of pairs that it computes at the same time.
+    pub lanes: usize,
+    /// Why it is not ready. Null if it is ready.
+    pub not_ready: Option<String>,
+}
+
+/// A node.
+#[derive(Debug, Serialize, ToSchema)]
 pub(super) struct NodeView {
     /// Its number, which no other node has had.
     number: i64,
@@ -37,6 +52,7 @@ pub(super) struct NodeView {
     /// The version of its program.
     version: String,
     /// When it started.
+    #[schema(value_type = String)]
     started: Timestamp,
     /// Whether it is the one that answers.
     is_this: bool,
@@ -45,7 +61,7 @@ pub(super) struct NodeView {
 }
 
 /// The devices of one kind of a node.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
 struct CapacityView {
     /// The kind.
     kind: &'static str,

@@ -33,10 +33,12 @@ pub(super) fn guarded(router: Router, service: &Arc<Service>) -> Router {
         .layer(middleware::from_fn_with_state(state, count))
 }
 
-/// Whether a path is accessible without a key: the API documentation and the gRPC health service.
+/// Whether a path is accessible without a key: the API documentation, the console and the gRPC
+/// health service.
 fn is_open(path: &str) -> bool {
-    matches!(path, "/openapi.json" | "/docs")
+    matches!(path, "/" | "/openapi.json" | "/docs")
         || path.starts_with("/docs/")
+        || path.starts_with("/console/")
         || path.starts_with("/grpc.health.v1.Health/")
 }
 

@@ -427,6 +427,7 @@ impl PendingJob {
             priority: options.priority,
             device: options.device_kind(),
             options: options.to_json(),
+            labels: options.labels.texts(),
             deadline: left.map(|left| Timestamp::now().after(left)),
             idempotency: key.map(|key| Idempotency {
                 key,

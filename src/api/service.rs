@@ -11,6 +11,7 @@ use tokio_util::sync::CancellationToken;
 use super::admission::{Admission, AdmissionRequest, Durability};
 use super::auth::{Caller, Keys};
 use super::error::ApiError;
+use super::fleet::DeviceView;
 use super::origin::Hosts;
 use super::permits::{FairQueue, TenantPermits};
 use super::result_budget::{ResultBudget, ResultLimits};
@@ -34,6 +35,7 @@ const OLD: Duration = Duration::from_secs(15);
 pub struct Service {
     pub(super) queue: Arc<dyn Queue>,
     pub(super) blobs: Blobs,
+    pub(super) devices: Box<dyn Fn() -> Vec<DeviceView> + Send + Sync>,
     pub(super) admission: Admission,
     pub(super) metrics: Arc<Metrics>,
     pub(super) keys: Keys,
@@ -104,6 +106,7 @@ impl Service {
         Self {
             queue: parts.queue,
             blobs: parts.blobs,
+            devices: parts.devices,
             admission: parts.admission,
             uploads: Arc::new(UploadBudget::new(uploads, Arc::clone(&parts.metrics))),
             answers: ResultBudget::new(ResultLimits::new(limits.max_answers_bytes, several)),
@@ -128,7 +131,7 @@ impl Service {
     ///
     /// # Errors
     /// [`ApiError::Unauthenticated`] if the server has keys and the value is missing, has another
-    /// form, or has an unknown key.
+    /// form, or has an unknown key. [`ApiError::LinkExpired`] for the token of an expired link.
     pub fn caller(&self, authorization: Option<&str>) -> Result<Caller, ApiError> {
         self.keys.caller(authorization)
     }
@@ -252,11 +255,16 @@ impl Service {
     /// The job `id` of the caller's tenant, which may be a pair of a sequence.
     ///
     /// # Errors
-    /// - [`ApiError::NotFound`] if there is no such job, or another tenant owns it.
+    /// - [`ApiError::NotFound`] if there is no such job, another tenant owns it, or the caller's
+    ///   share link is to another job.
     /// - [`ApiError::StoreUnavailable`], [`ApiError::DiskFull`] or [`ApiError::Draining`] if the
     ///   queue fails or is closed.
     pub async fn job(&self, caller: &Caller, id: JobId) -> Result<Arc<Job>, ApiError> {
-        Ok(self.queue.job(&caller.tenant, id).await?)
+        let job = self.queue.job(&caller.tenant, id).await?;
+        if !caller.may_read(&job) {
+            return Err(ApiError::NotFound);
+        }
+        Ok(job)
     }
 
     /// The forward pairs of a sequence in order. Empty for a pair.
@@ -276,22 +284,26 @@ impl Service {
     }
 
     /// The jobs of the caller's tenant, latest first. The pairs of sequences are not listed.
-    /// `state` filters by state, `before` returns only older jobs, and `limit` is the maximum
+    /// `state` filters by state, `label` (`name=value`) by label, `before` returns only older jobs, and `limit` is the maximum
     /// number of jobs.
     ///
     /// # Errors
+    /// [`ApiError::Forbidden`] for a caller with a share link.
     /// [`ApiError::StoreUnavailable`], [`ApiError::DiskFull`] or [`ApiError::Draining`] if the
     /// queue fails or is closed.
     pub async fn jobs(
         &self,
         caller: &Caller,
         state: Option<State>,
+        label: Option<String>,
         before: Option<JobId>,
         limit: u32,
     ) -> Result<Vec<Arc<Job>>, ApiError> {
+        caller.has_key()?;
         let filter = Filter {
             tenant: caller.tenant.clone(),
             state,
+            label,
             before,
             limit,
         };

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use super::admission::Admission;
 use super::auth::Keys;
+use super::fleet::DeviceView;
 use super::origin::Hosts;
 use crate::health::StoreHealth;
 use crate::metrics::Metrics;
@@ -17,6 +18,8 @@ pub struct ServiceParts {
     pub queue: Arc<dyn Queue>,
     /// The blob store for payloads and results.
     pub blobs: Blobs,
+    /// Tells the devices of this process, as they are at the moment.
+    pub devices: Box<dyn Fn() -> Vec<DeviceView> + Send + Sync>,
     /// Decides whether the queue accepts a job.
     pub admission: Admission,
     /// The metrics registry.

@@ -65,6 +65,7 @@ fn service(folder: &std::path::Path) -> Arc<Service> {
     Arc::new(Service::new(ServiceParts {
         admission: Admission::new(limits, Arc::clone(&queue), cost),
         queue,
+        devices: Box::new(Vec::new),
         blobs: Blobs::open(&folder.join("blobs")).expect("a store"),
         metrics: Arc::new(Metrics::new(&["cpu"])),
         keys: Keys::default(),
@@ -112,7 +113,7 @@ async fn asked(service: &Arc<Service>, path: &str, media: &str, body: AnyBody) -
         .body(body)
         .expect("a request");
     let answered = async {
-        let answer = public_router(service).oneshot(request).await;
+        let answer = public_router(service, true).oneshot(request).await;
         let Ok(answer) = answer;
         answer.into_body().collect().await.is_ok()
     };

@@ -18,8 +18,9 @@ pub(super) fn keys(config: &Config) -> anyhow::Result<Keys> {
     if let Some(key) = &config.api_key {
         let caller = Caller {
             tenant: Tenant::default(),
-            role: Role::Write,
+            role: Role::Operate,
             max_priority: Priority::High,
+            shared_job: None,
         };
         keys.add(key.reveal(), caller).context("api_key")?;
     }
@@ -29,6 +30,7 @@ pub(super) fn keys(config: &Config) -> anyhow::Result<Keys> {
             tenant,
             role: key.role,
             max_priority: key.max_priority,
+            shared_job: None,
         };
         keys.add(key.key.reveal(), caller).context("keys")?;
     }

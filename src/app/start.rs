@@ -15,7 +15,7 @@ use super::settings::{admission_limits, keys, listen_options, service_limits};
 use super::stores::{Stores, warn_of_stranded_jobs};
 use super::{housekeeping, process};
 use crate::api::{
-    Admission, Hosts, Keys, ListenOptions, Listener, Readiness, Service, ServiceParts,
+    Admission, DeviceView, Hosts, Keys, ListenOptions, Listener, Readiness, Service, ServiceParts,
     admin_router, public_router, tls_acceptor,
 };
 use crate::config::{Config, NodeRole};
@@ -95,7 +95,7 @@ impl App {
         let workers_drain = Drain::default();
         let workers = start_workers(&devices, &stores, &cost, &metrics, &workers_drain, &config);
         let keys_are_open = keys.is_open();
-        let service = Arc::new(service(&stores, &cost, &metrics, keys, &config));
+        let service = Arc::new(service(&stores, &devices, &cost, &metrics, keys, &config));
         let runtime = Arc::new(Heartbeat::default());
         let mut upkeep = housekeeping::start(
             &stores.queue,
@@ -132,7 +132,7 @@ impl App {
         let queue = stores.queue;
         let admin = serve_admin(config.admin_listen, readiness, &metrics, &queue, &cost)?;
         let stop_listening = CancellationToken::new();
-        let router = public_router(&service);
+        let router = public_router(&service, config.console);
         let stop = stop_listening.clone();
         let listener = tokio::spawn(async move {
             match listener {
@@ -268,15 +268,18 @@ fn start_workers(
 /// The service behind both protocols.
 fn service(
     stores: &Stores,
+    devices: &[Device],
     cost: &Arc<CostModel>,
     metrics: &Arc<Metrics>,
     keys: Keys,
     config: &Config,
 ) -> Service {
     let is_loopback = config.listen.ip().is_loopback();
+    let own = devices.to_vec();
     Service::new(ServiceParts {
         queue: Arc::clone(&stores.queue),
         blobs: stores.blobs.clone(),
+        devices: Box::new(move || own.iter().map(device_view).collect()),
         admission: Admission::new(
             admission_limits(&config.limits),
             Arc::clone(&stores.queue),
@@ -288,6 +291,15 @@ fn service(
         store_health: Arc::clone(&stores.health),
         limits: service_limits(&config.limits),
     })
+}
+
+fn device_view(device: &Device) -> DeviceView {
+    DeviceView {
+        name: device.name().to_owned(),
+        kind: device.kind().name(),
+        lanes: device.lanes().len(),
+        not_ready: device.not_ready_reason(),
+    }
 }
 
 /// The public port, with no more connections than the system allows open files.

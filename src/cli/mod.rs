@@ -25,6 +25,7 @@ mod flow;
 mod serve;
 mod synth;
 mod tables;
+mod view;
 
 use std::process::ExitCode;
 
@@ -38,6 +39,8 @@ use clap::{Parser, Subcommand};
     fnsf serve                                 HTTP and gRPC on 127.0.0.1:8080\n  \
     fnsf flow a.pcd b.pcd -o flow.npz          two sweeps, any format\n  \
     fnsf flow a.pcd b.pcd --picture flow.png   the same, to look at\n  \
+    fnsf view a.pcd b.pcd                      the same in 3-D, in a browser
+  \
     fnsf densify *.pcd --reference-time 5 -o dense.laz   a drive's sweeps as one dense cloud")]
 pub struct Arguments {
     #[command(subcommand)]
@@ -51,6 +54,7 @@ enum Command {
     Flow(flow::Flow),
     Densify(densify::Densify),
     Eval(eval::Eval),
+    View(Box<view::View>),
     Synth(synth::Synth),
     Tables(tables::Tables),
     Doctor(doctor::Doctor),
@@ -65,6 +69,7 @@ pub fn run(arguments: Arguments) -> ExitCode {
         Command::Flow(command) => command.run(),
         Command::Densify(command) => command.run(),
         Command::Eval(command) => command.run(),
+        Command::View(command) => command.run(),
         Command::Synth(command) => command.run(),
         Command::Tables(command) => command.run(),
         Command::Doctor(command) => command.run(),

@@ -71,6 +71,10 @@ struct Flags {
     #[arg(long = "device", value_name = "DEVICE")]
     #[serde(skip_serializing_if = "Vec::is_empty")]
     devices: Vec<String>,
+    /// Serve no pages for browsers at /
+    #[arg(long = "no-console", action = clap::ArgAction::SetFalse)]
+    #[serde(skip_serializing_if = "Clone::clone")]
+    console: bool,
     #[command(flatten)]
     #[serde(skip_serializing_if = "LogFlags::is_empty")]
     log: LogFlags,

@@ -57,6 +57,8 @@ pub struct Config {
     /// as that of a reverse proxy. Other host names are refused, because a browser could be made to
     /// send requests from another site's page.
     pub allowed_hosts: Vec<String>,
+    /// Serve the console, pages for browsers, at `/` of the public port.
+    pub console: bool,
     /// One API key for the tenant `default`, with full access: 16 or more printable ASCII
     /// characters without white space at the ends.
     pub api_key: Option<Secret>,
@@ -108,7 +110,7 @@ pub struct KeyConfig {
     /// Tenant that owns the jobs created and read with the key: 1 to 64 letters, digits, `-`, `_`
     /// or `.`.
     pub tenant: String,
-    /// Permissions of the key: read or write.
+    /// Permissions of the key: read, write or operate.
     pub role: Role,
     /// The key: 16 or more printable ASCII characters without white space at the ends. Each key is
     /// given once.
@@ -257,6 +259,7 @@ impl Default for Config {
             data_dir: PathBuf::from("fnsf-data"),
             storage: None,
             data_dir_is_shared: false,
+            console: true,
             allow_unauthenticated: false,
             allowed_hosts: Vec::new(),
             api_key: None,

@@ -4,7 +4,7 @@ use std::io::{Cursor, Write};
 
 use super::error::{FileKind, FormatError, shorten};
 use super::limits::{check_points, check_value};
-use super::npz::NpzWriter;
+use super::npz::{Npz, NpzWriter};
 use super::pair::check_count;
 use super::sniff::ending;
 use super::{las, npy, pcd, ply};
@@ -38,6 +38,15 @@ pub const DENSE_FORMATS: [(DenseFormat, &str, &str); 5] = [
     (DenseFormat::Laz, "application/vnd.laszip", "laz"),
     (DenseFormat::Las, "application/vnd.las", "las"),
 ];
+
+/// Whether `bytes` are an npz with a dense cloud rather than one sweep or a pair.
+pub fn is_dense(bytes: &[u8]) -> bool {
+    Npz::open(bytes).is_ok_and(|npz| {
+        ["points", "sweep", "age", "dynamic"]
+            .iter()
+            .all(|name| npz.has(name))
+    })
+}
 
 impl DenseFormat {
     /// The endings that [`DenseFormat::from_path`] accepts, as text for messages.

@@ -37,7 +37,7 @@ pub use crate::formats::cloud::{
     Cloud, CloudFormat, TimedCloud, declared_rows, read_cloud, read_cloud_within, read_timed_cloud,
     write_cloud, write_timed_pcd,
 };
-pub use crate::formats::dense_file::{DENSE_FORMATS, DenseFormat, write_dense};
+pub use crate::formats::dense_file::{DENSE_FORMATS, DenseFormat, is_dense, write_dense};
 pub use crate::formats::depth_png::{read_depth_png, write_depth_png};
 pub use crate::formats::error::{FileKind, FormatError};
 pub use crate::formats::flow_file::{FlowFile, FlowFormat, FlowTable, read_flow, write_flow};

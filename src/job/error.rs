@@ -61,6 +61,15 @@ pub enum InvalidOptions {
     /// The time between two sweeps, seconds, is not a number above 0 and at most 60.
     #[error("options: dt_s is {0}, more than 0 and at most {MAX_DT_S} seconds are possible")]
     Dt(f32),
+    /// There are more labels than possible; with their number.
+    #[error("options: {0} labels are too many, 16 are possible")]
+    Labels(usize),
+    /// A label whose name or value is refused; with its name.
+    #[error(
+        "options: label {0:?}: a name has 1 to 63 letters, digits, '-', '_', '.' or '/', a value at most \
+         255 bytes without control characters"
+    )]
+    Label(String),
     /// The deadline, milliseconds, is zero or longer than a day.
     #[error("options: deadline_ms is {0}, 1 to {max} are possible", max = MAX_DEADLINE.as_millis())]
     Deadline(u64),

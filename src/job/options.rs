@@ -11,6 +11,7 @@ use super::densify::Densify;
 use super::device::{DeviceChoice, DeviceKind};
 use super::error::{InvalidOptions, MAX_DEADLINE, MAX_DT_S};
 use super::field::FieldChoices;
+use super::labels::Labels;
 use crate::flow::{self, Ego, FieldOptions, Ground, MIN_POINTS, Precision};
 
 /// Options of a pair or of a sequence.
@@ -83,6 +84,10 @@ pub struct JobOptions {
     pub deadline_ms: Option<u64>,
     /// Priority of the job. Jobs of a higher priority start first.
     pub priority: Priority,
+    /// Labels of the job, by which lists can be filtered: values by name. At most 16; names of 1 to
+    /// 63 letters, digits, `-`, `_`, `.` or `/`, values of at most 255 bytes.
+    #[serde(skip_serializing_if = "Labels::is_empty")]
+    pub labels: Labels,
     /// Also computes one dense cloud of a sequence, in addition to its flows.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub densify: Option<Densify>,
@@ -127,6 +132,7 @@ impl JobOptions {
     /// - `NoGpuKernels` for device `gpu` with a field that has no kernels for it.
     /// - `HalfOnCpu`, `HalfWithoutKernels` for `f16` with device `cpu` or a preset without kernels
     ///   in half precision.
+    /// - `Labels`, `Label` for labels that are too many or malformed.
     /// - `ReferenceTime`, `Densify` for options of a dense cloud that are invalid for every
     ///   sequence.
     pub fn check(&self) -> Result<(), InvalidOptions> {
@@ -168,6 +174,7 @@ impl JobOptions {
         if self.device == DeviceChoice::Gpu && self.needs_cpu() {
             return Err(InvalidOptions::NoGpuKernels(preset.name()));
         }
+        self.labels.check()?;
         self.densify.as_ref().map_or(Ok(()), Densify::check)
     }
 
@@ -241,7 +248,7 @@ mod tests {
     fn an_empty_object_is_the_default_and_every_option_comes_back() {
         assert_eq!(JobOptions::from_json(b"{}"), Ok(JobOptions::default()));
         let text = br#"{"preset":"paper","seed":7,"max_points":8192,"crop_m":51.2,"min_range_m":2.5,"force":true,"dt_s":0.05,"ground":"mask",
-            "ego":[[1,0,0,2],[0,1,0,0],[0,0,1,0],[0,0,0,1]],"device":"cpu","deadline_ms":300,"priority":"high","densify":{"reference_time":1.5}}"#;
+            "ego":[[1,0,0,2],[0,1,0,0],[0,0,1,0],[0,0,0,1]],"device":"cpu","deadline_ms":300,"priority":"high","labels":{"drive":"7"},"densify":{"reference_time":1.5}}"#;
         let options = JobOptions::from_json(text).expect("good options");
         assert_eq!(options.preset, PresetChoice::Paper);
         assert_eq!(

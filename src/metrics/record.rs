@@ -9,7 +9,7 @@ use super::exposition;
 use super::series::{
     DeviceLabel, JobLabel, Metrics, Outcome, Phase, ProtocolAndClass, Reason, Seconds, Urgency,
 };
-use crate::job::{Job, Priority};
+use crate::job::{Job, Priority, State};
 use crate::queue::Event;
 use crate::storage::FreeSpace;
 
@@ -105,6 +105,17 @@ impl Metrics {
     /// Enters the overlap of one pair, 0 to 1, in `fnsf_overlap_ratio`.
     pub fn aligned(&self, overlap: f32) {
         self.overlap_ratio.observe(overlap.into());
+    }
+
+    /// The number of pairs that have ended since the start, by the name of their state.
+    pub fn finished_pairs(&self) -> Vec<(&'static str, u64)> {
+        let ends = State::ALL.into_iter().filter(|state| state.is_end());
+        let count = |state: State| {
+            let outcome = state.name();
+            let counter = self.finished.get_or_create(&Outcome { outcome });
+            (outcome, counter.get())
+        };
+        ends.map(count).collect()
     }
 
     /// Counts a refused request in `fnsf_requests_rejected_total`; `reason` is one of

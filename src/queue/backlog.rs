@@ -129,6 +129,13 @@ impl Backlog {
         self.running.seconds += load.seconds;
     }
 
+    /// The queued load by tenant, priority and required kind of device, without empty ones.
+    pub fn rows(&self) -> Vec<(Tenant, Priority, Option<DeviceKind>, Load)> {
+        let rows = self.queued.iter().filter(|(_, load)| load.jobs > 0);
+        rows.map(|(key, load)| (key.tenant.clone(), key.priority, key.device, *load))
+            .collect()
+    }
+
     /// The queued load of each key.
     pub(super) fn queued_loads(&self) -> impl Iterator<Item = (&BacklogKey, Load)> {
         self.queued.iter().map(|(key, load)| (key, *load))

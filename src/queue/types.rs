@@ -45,6 +45,8 @@ pub struct Submission {
     pub cost_seconds: f64,
     /// The options, as JSON; opaque to the queue.
     pub options: String,
+    /// Texts by which [`Queue::list`] finds the job. Of a sequence, they are not those of its pairs.
+    pub labels: Vec<String>,
     /// Time at which the best flow so far is returned. A job that is still queued then expires. It
     /// does not apply to a closing job. `None`: [`QueueOptions::time_to_live`] limits the wait.
     pub deadline: Option<Timestamp>,
@@ -75,6 +77,7 @@ impl Submission {
             device: None,
             cost_seconds: 0.0,
             options: String::new(),
+            labels: Vec::new(),
             deadline: None,
             idempotency: None,
             durable: true,
@@ -139,6 +142,8 @@ pub struct Filter {
     pub tenant: Tenant,
     /// Their state; `None` for any.
     pub state: Option<State>,
+    /// A label that they have; `None` for any.
+    pub label: Option<String>,
     /// Only jobs whose id is less than this one, so that they were created earlier. It need not be
     /// the id of a job. `None` for all jobs.
     pub before: Option<JobId>,

@@ -125,6 +125,7 @@ impl Stand {
             pair: PairOf::ALONE,
             pairs: Vec::new(),
             finalizer_seconds: None,
+            labels: Vec::new(),
             after,
             has_dependents: true,
             priority: Priority::Normal,

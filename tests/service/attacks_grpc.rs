@@ -303,6 +303,7 @@ async fn numbers_that_are_no_values_and_messages_out_of_order_are_refused() {
         state,
         page_size,
         page_token: page_token.to_owned(),
+        label: String::new(),
     };
     calls
         .list_jobs(list(0, u32::MAX, ""))

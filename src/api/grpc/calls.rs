@@ -313,6 +313,7 @@ impl SceneFlow for Calls {
         let call = Call::of(&request)?;
         let asked = request.into_inner();
         let state = convert::wanted_state(asked.state)?;
+        let label = Some(asked.label).filter(|label| !label.is_empty());
         let limit = match asked.page_size {
             0 => PAGE,
             size => size.min(1000),
@@ -323,7 +324,7 @@ impl SceneFlow for Calls {
         };
         let jobs = self
             .service
-            .jobs(&call.caller, state, before, limit)
+            .jobs(&call.caller, state, label, before, limit)
             .await?;
         let full = jobs.len() == limit as usize;
         let next = jobs.last().filter(|_| full).map(|job| job.id.to_string());

@@ -13,7 +13,7 @@ use crate::flow::{Cluster, RigidTransform};
 use crate::formats::{ego_motion, rigid_motion};
 use crate::job::{
     DenseReport, Densify, DeviceChoice, EgoChoice, FieldChoices, GroundChoice, Job, JobError,
-    JobId, JobOptions, JobProgress, Kind, LaterSweepsChoice, PrecisionChoice, PresetChoice,
+    JobId, JobOptions, JobProgress, Kind, Labels, LaterSweepsChoice, PrecisionChoice, PresetChoice,
     Priority, State,
 };
 
@@ -83,6 +83,7 @@ pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, Api
             .unwrap_or_default(),
         deadline_ms: message.deadline_ms,
         priority,
+        labels: Labels(message.labels.into_iter().collect()),
         densify: message.densify.map(densify).transpose()?,
     };
     options.check()?;
@@ -207,6 +208,7 @@ pub(super) fn job(job: &Job) -> proto::Job {
         pair_ids: Vec::new(),
         pairs: job.pairs,
         pairs_left: job.pairs_left,
+        labels: Labels::of_options(&job.options).0.into_iter().collect(),
     }
 }
 

@@ -1,4 +1,4 @@
-//! The handlers of the job routes: estimate, submit, get, list, cancel and requeue.
+//! The handlers of the job routes: estimate, submit, get, cancel and requeue.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -7,8 +7,7 @@ use axum::Json;
 use axum::extract::{Extension, Query, Request, State};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use serde::{Deserialize, Serialize};
-use utoipa::ToSchema;
+use serde::Deserialize;
 
 use super::multipart::{Body, PairFiles, Part, bad_poses, poses_of_a_pair};
 use super::named::Named;
@@ -24,14 +23,11 @@ use crate::api::pending_job::{Accepted, PendingJob, ReceivedAt, Request as JobRe
 use crate::api::service::{MakeDurable, Service, Waited};
 use crate::api::sweep_order::SweepOrder;
 use crate::formats::PoseFile;
-use crate::job::{Job, JobId, JobOptions, Kind, State as JobState};
+use crate::job::{Job, JobOptions, Kind};
 use crate::queue::PairOf;
 
 /// Maximum duration of a long poll.
 pub(super) const MAX_POLL: Duration = Duration::from_secs(60);
-
-/// Default number of jobs on a page.
-const PAGE: u32 = 100;
 
 /// The parameters of a submission from its headers.
 struct RequestHeaders {
@@ -168,7 +164,7 @@ async fn read_pair(
     let (mut files, mut options) = (PairFiles::default(), JobOptions::default());
     while let Some(part) = body.next().await? {
         match part {
-            Part::Options(read) => options = read,
+            Part::Options(read) => options = *read,
             Part::Poses(_) => return Err(poses_of_a_pair()),
             Part::File(part, name, bytes) => {
                 files.take(&part, name, bytes)?;
@@ -286,7 +282,7 @@ async fn read_job(
                 let text = "options and poses come before the sweeps";
                 return Err(ApiError::BadRequest(text.to_owned()));
             }
-            Part::Options(read) => options = read,
+            Part::Options(read) => options = *read,
             Part::Poses(read) => poses = Some(Arc::new(read)),
             Part::File(part, name, bytes) if part == "sweep" && files.is_empty() => {
                 order.push(name.as_deref().unwrap_or_default(), options.force)?;
@@ -381,57 +377,6 @@ pub(super) async fn get_job(
     }
     let pairs = service.pairs(&job).await?;
     Ok(Json(JobView::new(&job, &pairs)))
-}
-
-/// The query parameters of a list request.
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct Page {
-    /// Only jobs in this state.
-    state: Option<JobState>,
-    /// Maximum number of jobs, 1 to 1000. The default is 100.
-    limit: Option<u32>,
-    /// Only jobs older than this job id: the value of `next` on the page before.
-    before: Option<String>,
-}
-
-/// A page of jobs, latest first.
-#[derive(Debug, Serialize, ToSchema)]
-pub(super) struct JobPage {
-    /// The jobs. The pairs of a sequence are not listed as separate jobs.
-    jobs: Vec<JobView>,
-    /// The value of `before` for the next page. Null on the last page.
-    next: Option<String>,
-}
-
-/// Lists the caller's jobs, latest first.
-#[utoipa::path(
-    get,
-    path = "/v1/jobs",
-    tag = "jobs",
-    params(
-        ("state" = Option<JobState>, Query, description = "Only those in this state"),
-        ("limit" = Option<u32>, Query, description = "At most so many, 1 to 1000; 100 by default"),
-        ("before" = Option<String>, Query, description = "Only those before this one: next of the page before"),
-    ),
-    responses((status = 200, description = "A page of jobs", body = JobPage))
-)]
-pub(super) async fn list_jobs(
-    State(service): State<Arc<Service>>,
-    Extension(caller): Extension<Caller>,
-    page: Result<Query<Page>, axum::extract::rejection::QueryRejection>,
-) -> Result<Json<JobPage>, ApiError> {
-    let Query(page) = page.map_err(|error| ApiError::BadRequest(error.body_text()))?;
-    let before = page.before.as_deref().map(str::parse::<JobId>).transpose();
-    let before = before.map_err(|error| ApiError::BadRequest(format!("before: {error}")))?;
-    let limit = page.limit.unwrap_or(PAGE).clamp(1, 1000);
-    let jobs = service.jobs(&caller, page.state, before, limit).await?;
-    let full = jobs.len() == limit as usize;
-    let next = jobs.last().filter(|_| full).map(|job| job.id.to_string());
-    Ok(Json(JobPage {
-        jobs: jobs.iter().map(|job| JobView::new(job, &[])).collect(),
-        next,
-    }))
 }
 
 /// The query parameters of a cancellation.

@@ -78,7 +78,7 @@ pub(super) struct Body {
 /// One part of a body.
 pub(super) enum Part {
     /// The options.
-    Options(JobOptions),
+    Options(Box<JobOptions>),
     /// The poses of the sweeps.
     Poses(PoseFile),
     /// A file: the name of the part, the name of the file, and the contents.
@@ -138,7 +138,8 @@ impl Body {
             "options" => {
                 self.has_options = true;
                 let bytes = reading.whole(field, MAX_OPTIONS).await?;
-                Ok(Some(Part::Options(JobOptions::from_json(&bytes)?)))
+                let options = JobOptions::from_json(&bytes)?;
+                Ok(Some(Part::Options(Box::new(options))))
             }
             "poses" if self.has_poses => {
                 Err(ApiError::BadRequest("poses is there twice".to_owned()))

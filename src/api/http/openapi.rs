@@ -12,7 +12,7 @@ use utoipa::{Modify, OpenApi};
 use utoipa_swagger_ui::SwaggerUi;
 
 use super::results::{ARCHIVE, RESULT_HEADERS};
-use super::{events, handlers, info, results};
+use super::{events, handlers, info, list, queue, results, scene, share, street};
 use crate::api::codec::ANSWER_FORMATS;
 use crate::api::service::Service;
 use crate::formats::DENSE_FORMATS;
@@ -89,13 +89,18 @@ fn describe(
         handlers::estimate,
         handlers::submit_sequence,
         handlers::submit_job,
-        handlers::list_jobs,
+        list::list_jobs,
         handlers::get_job,
         handlers::delete_job,
         handlers::requeue_job,
         events::follow_job,
         results::result,
         results::tracks,
+        scene::scene,
+        scene::sweep,
+        share::share,
+        queue::queue,
+        street::street,
         info::info,
     ),
     security((), ("key" = [])),

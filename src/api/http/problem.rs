@@ -62,7 +62,7 @@ impl IntoResponse for ApiError {
             Self::Range(length) => HeaderValue::from_str(&format!("bytes */{length}")).ok(),
             _ => None,
         };
-        let unauthenticated = self == Self::Unauthenticated;
+        let unauthenticated = matches!(self, Self::Unauthenticated | Self::LinkExpired);
         let row = self.row();
         let problem = Problem::from(self);
         let status = StatusCode::from_u16(problem.status);

@@ -159,14 +159,14 @@ impl Head {
 }
 
 /// Sets a header, unless its value has characters that no header can have.
-fn set_header(response: &mut Response, name: &'static str, value: String) {
+pub(super) fn set_header(response: &mut Response, name: &'static str, value: String) {
     if let Ok(value) = HeaderValue::try_from(value) {
         response.headers_mut().insert(name, value);
     }
 }
 
 /// A response with all bytes and their number.
-fn whole(encoded: Encoded) -> Response {
+pub(super) fn whole(encoded: Encoded) -> Response {
     let length = HeaderValue::from(encoded.len());
     let mut response = Body::from_stream(encoded.into_pieces()).into_response();
     response

@@ -140,10 +140,50 @@ pub(crate) async fn a_sequence_ends_with_its_last_pair(stand: &mut impl Stand) {
     let filter = Filter {
         tenant: tenant("a"),
         state: None,
+        label: None,
         before: None,
         limit: 10,
     };
     assert_eq!(queue.list(filter).await.expect("a list").len(), 1);
+}
+
+pub(crate) async fn jobs_are_found_by_their_labels_until_they_are_removed(stand: &mut impl Stand) {
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
+    let labelled = |of: &str, label: &str| Submission {
+        labels: vec!["all=1".to_owned(), label.to_owned()],
+        ..submission(of)
+    };
+    let first = submit(&queue, labelled("a", "drive=1")).await.id;
+    let sequence = Submission {
+        labels: vec!["drive=2".to_owned()],
+        ..sequence(2)
+    };
+    submit(&queue, sequence).await;
+    let second = submit(&queue, labelled("a", "drive=1")).await.id;
+    submit(&queue, labelled("b", "drive=1")).await;
+    let found = |label: &str, state, before| {
+        let filter = Filter {
+            tenant: tenant("a"),
+            state,
+            label: Some(label.to_owned()),
+            before,
+            limit: 10,
+        };
+        let queue = Arc::clone(&queue);
+        async move {
+            let jobs = queue.list(filter).await.expect("a list");
+            jobs.iter().map(|job| job.id).collect::<Vec<_>>()
+        }
+    };
+    assert_eq!(found("drive=1", None, None).await, [second, first]);
+    assert_eq!(found("all=1", None, Some(second)).await, [first]);
+    assert_eq!(found("drive=2", None, None).await.len(), 1);
+    assert_eq!(found("drive", None, None).await, []);
+    queue.cancel(first).await.expect("known");
+    let cancelled = Some(State::Cancelled);
+    assert_eq!(found("drive=1", cancelled, None).await, [first]);
+    queue.remove(first).await.expect("it has ended");
+    assert_eq!(found("drive=1", None, None).await, [second]);
 }
 
 pub(crate) async fn a_pair_says_which_sweeps_it_is_of_and_found_from(stand: &mut impl Stand) {
@@ -248,6 +288,7 @@ pub(crate) async fn lists_are_latest_first_in_pages_and_of_one_tenant(stand: &mu
         let filter = Filter {
             tenant: tenant("a"),
             state,
+            label: None,
             before,
             limit,
         };
@@ -335,6 +376,7 @@ pub(crate) async fn a_probe_leaves_nothing(stand: &mut impl Stand) {
     let listed = queue.list(Filter {
         tenant: Tenant::default(),
         state: None,
+        label: None,
         before: None,
         limit: 10,
     });

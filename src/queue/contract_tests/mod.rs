@@ -61,6 +61,7 @@ macro_rules! queue_contract {
             a_cancelled_job_whose_worker_is_silent_is_not_tried_again,
             a_job_that_is_asked_for_again_waits_for_its_turn,
             a_sequence_ends_with_its_last_pair,
+            jobs_are_found_by_their_labels_until_they_are_removed,
             a_pair_says_which_sweeps_it_is_of_and_found_from,
             a_sequence_is_cancelled_with_its_pairs_and_can_be_asked_for_again,
             ended_jobs_are_kept_for_a_while_and_then_forgotten,

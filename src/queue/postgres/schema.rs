@@ -10,15 +10,15 @@ use crate::queue::sql::{Sql, values};
 use crate::queue::types::QueueError;
 
 /// The schema version that this program reads and writes.
-const VERSION: i64 = 1;
+const VERSION: i64 = 2;
 
 /// `jobs` has the columns of the embedded queue, with the same meanings. Rows change often, so
 /// pages keep room for new versions of a row, and the table is vacuumed early.
 ///
 /// `nodes` has a row for each process that takes part. `commits` has the last commit of each
 /// connection of a node: it decides whether a transaction was committed whose answer was lost.
-/// `summary` has one row, the last count of the load.
-const TABLES: [&str; 17] = [
+/// `labels` has one row for each label of a job, with the job's tenant as `owner`. `summary` has one row, the last count of the load.
+const TABLES: [&str; 19] = [
     "CREATE TABLE meta (version bigint NOT NULL, identity bigint NOT NULL)",
     "CREATE TABLE nodes (
         id integer GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
@@ -108,6 +108,13 @@ const TABLES: [&str; 17] = [
     "CREATE INDEX jobs_list ON jobs (tenant, id) WHERE parent IS NULL",
     "CREATE INDEX jobs_list_by_state ON jobs (tenant, state, id) WHERE parent IS NULL",
     "CREATE INDEX jobs_parent ON jobs (parent) WHERE parent IS NOT NULL",
+    "CREATE TABLE labels (
+        owner text COLLATE \"C\" NOT NULL,
+        label text COLLATE \"C\" NOT NULL,
+        job bytea NOT NULL,
+        PRIMARY KEY (owner, label, job)
+    )",
+    "CREATE INDEX labels_job ON labels (job)",
 ];
 
 /// Creates the tables in an empty database, or checks their version. Returns the number that

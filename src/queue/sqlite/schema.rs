@@ -11,7 +11,7 @@ use crate::queue::database::new_identity;
 use crate::queue::types::QueueError;
 
 /// The schema version that this program reads and writes; stored in `user_version`.
-pub(super) const VERSION: i64 = 7;
+pub(super) const VERSION: i64 = 8;
 
 /// `due` is the next time at which the expiry handles a row: the expiry or the end of the retry
 /// delay of a queued job, the end of a running job's lease, or the end of an ended job's retention.
@@ -19,6 +19,8 @@ pub(super) const VERSION: i64 = 7;
 /// has not ended. For a sequence it is null until all of its pairs have succeeded and its closing
 /// job is queued. `origin` is the node that accepted a job, and `holder` the node whose worker holds
 /// it or held it last.
+///
+/// `labels` has one row for each label of a job, with the job's tenant as `owner`.
 const TABLE: &str = "
 CREATE TABLE jobs (
     seq INTEGER PRIMARY KEY,
@@ -85,6 +87,13 @@ CREATE INDEX jobs_age ON jobs (ready) WHERE state = 0 AND ready IS NOT NULL;
 CREATE INDEX jobs_list ON jobs (tenant, id) WHERE parent IS NULL;
 CREATE INDEX jobs_list_by_state ON jobs (tenant, state, id) WHERE parent IS NULL;
 CREATE INDEX jobs_parent ON jobs (parent) WHERE parent IS NOT NULL;
+CREATE TABLE labels (
+    owner TEXT NOT NULL,
+    label TEXT NOT NULL,
+    job BLOB NOT NULL,
+    PRIMARY KEY (owner, label, job)
+) WITHOUT ROWID;
+CREATE INDEX labels_job ON labels (job);
 ";
 
 /// Opens the connection of the writer.

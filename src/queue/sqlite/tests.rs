@@ -9,13 +9,13 @@ use tokio::sync::mpsc;
 use super::engine::{SqliteEngine, open_sqlite};
 use super::schema;
 use super::statements::SqliteSql;
-use crate::job::{DeviceKind, State};
+use crate::job::{DeviceKind, State, Tenant};
 use crate::queue::contract_tests::{Stand, queue_contract, submission};
 use crate::queue::database::Engine;
 use crate::queue::lease::Signal;
 use crate::queue::sql::for_sqlite;
-use crate::queue::transitions::{expiry, fair_queue, leases};
-use crate::queue::types::{Event, Queue, QueueError, QueueOptions};
+use crate::queue::transitions::{expiry, fair_queue, leases, lists};
+use crate::queue::types::{Event, Filter, Queue, QueueError, QueueOptions};
 
 /// A folder in which the queue is opened repeatedly.
 struct Folder(tempfile::TempDir);
@@ -103,6 +103,23 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
             !plan.contains("SCAN jobs") || plan.contains("INDEX"),
             "{sql}: {plan}"
         );
+    }
+    for (state, label) in [(false, false), (true, false), (false, true), (true, true)] {
+        let filter = Filter {
+            tenant: Tenant::default(),
+            state: state.then_some(State::Failed),
+            label: label.then(|| "drive=1".to_owned()),
+            before: None,
+            limit: 50,
+        };
+        let sql = lists::statement(&filter);
+        let plan = plan(
+            &connection,
+            &sql,
+            3 + usize::from(state) + usize::from(label),
+        );
+        assert!(!plan.contains("TEMP B-TREE"), "{sql}: {plan}");
+        assert!(!plan.contains("SCAN"), "{sql}: {plan}");
     }
     assert!(
         expiry::next_due(&SqliteSql(&connection))

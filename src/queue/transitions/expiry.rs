@@ -165,6 +165,7 @@ fn forget(sql: &dyn Sql, effects: &mut Effects, id: JobId) -> Result<(), QueueEr
     }
     sql.query("DELETE FROM jobs WHERE parent = ?1", values![id])?;
     sql.query("DELETE FROM jobs WHERE id = ?1", values![id])?;
+    sql.query("DELETE FROM labels WHERE job = ?1", values![id])?;
     effects.events.push(Event::Deleted(id));
     Ok(())
 }

@@ -16,21 +16,34 @@ const MAX_LISTED: u32 = 1000;
 /// The jobs that a filter selects, latest first.
 pub(in crate::queue) fn list(sql: &dyn Sql, filter: &Filter) -> Result<Vec<Arc<Job>>, QueueError> {
     let before = filter.before.map_or([0xff; 16], |id| *id.as_bytes());
+    let limit = filter.limit.min(MAX_LISTED);
+    let mut parameters = values![filter.tenant.as_str(), before.as_slice(), limit].to_vec();
+    parameters.extend(filter.state.map(|state| Value::Int(state_code(state))));
+    parameters.extend(filter.label.as_deref().map(Value::from));
+    let rows = sql.query(&statement(filter), &parameters)?;
+    rows.iter()
+        .map(|row| rows::job(row).map(Arc::new))
+        .collect()
+}
+
+/// The statement of a list. Its parameters are the tenant, the id before which jobs are listed, the
+/// limit and, where the filter has them, the state and the label.
+pub(in crate::queue) fn statement(filter: &Filter) -> String {
     let (index, in_state) = match filter.state {
         None => ("jobs_list", ""),
         Some(_) => ("jobs_list_by_state", "AND state = ?4"),
     };
-    let text = format!(
-        "SELECT {COLUMNS} FROM jobs INDEXED BY {index} WHERE parent IS NULL \
-         AND tenant = ?1 AND id < ?2 {in_state} ORDER BY id DESC LIMIT ?3"
-    );
-    let limit = filter.limit.min(MAX_LISTED);
-    let mut parameters = values![filter.tenant.as_str(), before.as_slice(), limit].to_vec();
-    parameters.extend(filter.state.map(|state| Value::Int(state_code(state))));
-    let rows = sql.query(&text, &parameters)?;
-    rows.iter()
-        .map(|row| rows::job(row).map(Arc::new))
-        .collect()
+    match filter.label {
+        None => format!(
+            "SELECT {COLUMNS} FROM jobs INDEXED BY {index} WHERE parent IS NULL \
+             AND tenant = ?1 AND id < ?2 {in_state} ORDER BY id DESC LIMIT ?3"
+        ),
+        Some(_) => format!(
+            "SELECT {COLUMNS} FROM labels JOIN jobs INDEXED BY jobs_id ON jobs.id = labels.job \
+             WHERE owner = ?1 AND job < ?2 AND label = ?{} {in_state} ORDER BY job DESC LIMIT ?3",
+            4 + usize::from(filter.state.is_some())
+        ),
+    }
 }
 
 /// The ids in this list that belong to jobs, in the same order.

@@ -46,6 +46,7 @@ pub(in crate::queue) fn submit(
                     after: before.filter(|_| of.chained),
                     has_dependents: next.is_some_and(|next| next.chained),
                     idempotency: None,
+                    labels: Vec::new(),
                     ..submission.clone()
                 };
                 let place = Place {
@@ -188,5 +189,11 @@ fn insert(
             sql.node(),
         ],
     )?;
+    for label in &submission.labels {
+        sql.query(
+            "INSERT INTO labels (owner, label, job) VALUES (?1, ?2, ?3)",
+            values![submission.tenant.as_str(), label.as_str(), submission.id],
+        )?;
+    }
     rows::job(&row)
 }

@@ -1,0 +1,198 @@
+/**
+ * The page of one job: its progress, its life, and the viewer on its sweeps and flows.
+ */
+
+import { call, download, events, isShared, json, Refusal } from "../api.js";
+import { button, el, fill, notice, progressBar } from "../dom.js";
+import { openScene } from "../scene.js";
+import { count, duration } from "../text.js";
+import { createViewer } from "../viewer/viewer.js";
+import { lifeOf } from "./life.js";
+
+const ENDS = ["succeeded", "failed", "cancelled", "expired"];
+
+/** Shows the page of the job `id`. */
+export async function jobPage(page, signal, id) {
+  const path = `/v1/jobs/${encodeURIComponent(id)}`;
+  const [job, info] = await Promise.all([json(path), json("/v1/info")]);
+  const parts = {
+    head: el("div", { class: "job-head" }),
+    host: el("div", { class: "viewer", data: { test: "viewer" } }),
+    life: el("section", { class: "panel life", "aria-label": "The job" }),
+    picture: null,
+  };
+  fill(page, parts.head, parts.host, parts.life);
+  const update = (job) => {
+    fill(parts.head, headOf(job, path, info));
+    fill(parts.life, lifeOf(job));
+    void showPicture(parts, job, path, signal);
+  };
+  update(job);
+  await follow(job, path, signal, parts, update);
+}
+
+/** Follows the events of a job until it ends. */
+async function follow(job, path, signal, parts, update) {
+  let latest = job;
+  const onEvent = async (name, data) => {
+    if (name === "progress") showProgress(parts.head, data);
+    else {
+      // The event of a sequence does not list its pairs.
+      latest = data.kind === "sequence" ? await json(path) : data;
+      if (!signal.aborted) update(latest);
+    }
+  };
+  while (!signal.aborted && !ENDS.includes(latest.state)) {
+    try {
+      await events(`${path}/events`, signal, (name, data) => void onEvent(name, data));
+      latest = await json(path);
+      update(latest);
+    } catch (error) {
+      if (signal.aborted) return;
+      if (error instanceof Refusal && error.status >= 400 && error.status < 500) throw error;
+    }
+    await new Promise((resolve) => setTimeout(resolve, 1000));
+  }
+}
+
+/** Creates the viewer when there is something to draw, and tells it of new flows. */
+async function showPicture(parts, job, path, signal) {
+  if (parts.picture === "loading" || parts.drawn === stamp(job)) return;
+  const { picture } = parts;
+  parts.picture = "loading";
+  try {
+    const scene = picture?.scene ?? (await openScene(`${path}/scene`));
+    if (picture) await scene.refresh();
+    if (signal.aborted) return;
+    const viewer = picture?.viewer ?? createViewer(parts.host, scene);
+    if (picture) await viewer.reload();
+    else signal.addEventListener("abort", () => viewer.dispose());
+    parts.drawn = stamp(job);
+    parts.picture = { scene, viewer };
+  } catch (error) {
+    parts.picture = picture;
+    if (!signal.aborted) fill(parts.host, el("p", { class: "failure", role: "alert" }, error.message));
+  }
+}
+
+/** What the picture depends on. */
+function stamp(job) {
+  return `${job.state} ${job.attempt} ${job.pairs?.ended ?? 0}`;
+}
+
+function headOf(job, path, info) {
+  return [
+    el(
+      "div",
+      { class: "title" },
+      el("h1", {}, job.kind === "sequence" ? "Sequence" : "Pair"),
+      el("code", { class: "id" }, job.id),
+      el("span", { class: `state ${job.state}`, data: { test: "state" } }, job.state),
+      job.dead_letter ? el("span", { class: "state failed" }, "given up") : null,
+      el("div", { class: "actions" }, actionsOf(job, path, info)),
+    ),
+    progressOf(job),
+    job.error ? el("div", { class: "failure", role: "alert" }, `${job.error.message} (${job.error.code})`) : null,
+    (job.report?.warnings ?? []).map((text) => el("div", { class: "warning" }, text)),
+  ];
+}
+
+/** The progress of a job that has not ended. */
+function progressOf(job) {
+  if (ENDS.includes(job.state)) return null;
+  const bar = progressBar("Progress");
+  const text = el("span", { data: { test: "progress-text" } });
+  const box = el("div", { class: "progress", data: { test: "progress" } }, bar, text);
+  if (job.pairs) {
+    bar.value = job.pairs.ended / Math.max(1, job.pairs.total);
+    text.textContent = `${job.pairs.ended} of ${job.pairs.total} pairs`;
+  } else if (job.progress) setProgress(bar, text, job.progress);
+  else text.textContent = job.state === "queued" ? "waits for a device" : "starts";
+  return box;
+}
+
+function setProgress(bar, text, { done, total, loss }) {
+  bar.value = total > 0 ? done / total : 0;
+  text.textContent = `${count(done)} of ${count(total)}, loss ${loss.toFixed(4)} m`;
+}
+
+function showProgress(head, progress) {
+  const box = head.querySelector(".progress");
+  if (box) setProgress(box.querySelector("progress"), box.querySelector("span"), progress);
+}
+
+function actionsOf(job, path, info) {
+  const hasEnded = ENDS.includes(job.state);
+  const act = (method, target, done) => async () => {
+    try {
+      await call(target, { method });
+      notice(done);
+    } catch (error) {
+      notice(error.message, "bad");
+    }
+  };
+  const actions = [];
+  if (job.state === "succeeded") actions.push(downloads(job, path, info));
+  if (isShared()) return actions;
+  if (!hasEnded) {
+    actions.push(button("Cancel", act("DELETE", path, "The job is being cancelled."), { data: { test: "cancel" } }));
+  }
+  if (hasEnded && job.state !== "succeeded") {
+    const requeue = async () => {
+      await act("POST", job.links.requeue, "The job is queued again.")();
+      dispatchEvent(new HashChangeEvent("hashchange"));
+    };
+    actions.push(button("Queue again", requeue, { data: { test: "requeue" } }));
+  }
+  if (job.state === "succeeded") actions.push(button("Share", () => void share(path), { data: { test: "share" } }));
+  if (hasEnded) {
+    const remove = async () => {
+      if (!confirm("Remove the job, its sweeps and its result?")) return;
+      await act("DELETE", `${path}?remove=true`, "The job is removed.")();
+      location.hash = "#/jobs";
+    };
+    actions.push(button("Remove", remove, { class: "quiet", data: { test: "remove" } }));
+  }
+  return actions;
+}
+
+/** A menu with the result in each format. */
+function downloads(job, path, info) {
+  const isDense = Boolean(job.options?.densify);
+  const archive = { media_type: "application/zip", extension: "zip" };
+  const formats = job.kind === "pair" ? info.formats.flow : isDense ? [...info.formats.dense, archive] : [archive];
+  const items = formats.map(({ media_type: type, extension }) =>
+    button(`.${extension}`, () => download(`${path}/result`, type, `${job.id}.${extension}`), { class: "quiet" }),
+  );
+  if (job.kind === "sequence") {
+    items.push(button("tracks", () => download(`${path}/tracks`, "application/json", `${job.id}.tracks.json`), { class: "quiet" }));
+  }
+  return el("details", { class: "menu", data: { test: "downloads" } }, el("summary", { class: "button" }, "Download"), el("div", {}, items));
+}
+
+/** Creates a link for readers without a key, and shows it. */
+async function share(path) {
+  const link = await json(`${path}/share`, { method: "POST" });
+  const address = new URL(link.path, location.origin).href;
+  const input = el("input", { type: "text", readonly: true, "aria-label": "Link", data: { test: "share-link" } });
+  input.value = address;
+  const words = link.expires_at
+    ? `Whoever has this link can look at the job until ${new Date(link.expires_at).toLocaleString()}.`
+    : "This server needs no key, so the link does not expire.";
+  const dialog = el(
+    "dialog",
+    { "aria-label": "Share link", on: { close: () => dialog.remove() } },
+    el("h2", {}, "Share link"),
+    el("p", {}, words),
+    input,
+    el(
+      "div",
+      { class: "actions" },
+      button("Copy", () => void navigator.clipboard?.writeText(address), { class: "primary" }),
+      button("Close", () => dialog.close()),
+    ),
+  );
+  document.body.append(dialog);
+  dialog.showModal();
+  input.select();
+}

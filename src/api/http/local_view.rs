@@ -1,0 +1,114 @@
+//! The console on files of this machine, without a service: `fnsf view`.
+
+use std::sync::Arc;
+
+use axum::extract::{Path, Request, State};
+use axum::http::header;
+use axum::middleware::{self, Next};
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use axum::{Json, Router};
+use bytes::Bytes;
+
+use super::console;
+use super::scene::{PACKED, Scene, ScenePair};
+use crate::api::error::ApiError;
+use crate::api::origin::{self, Hosts};
+use crate::job::State as JobState;
+
+/// What to show, encoded for the console.
+#[derive(Debug, Default)]
+pub struct LocalScene {
+    /// A name for people.
+    pub name: String,
+    /// The sweeps, with their names: packed little-endian float32, x y z in metres.
+    pub sweeps: Vec<(String, Bytes)>,
+    /// The pairs of consecutive sweeps that have a flow.
+    pub pairs: Vec<LocalPair>,
+    /// The tracks, as JSON.
+    pub tracks: Option<Bytes>,
+    /// A dense cloud, as npz.
+    pub dense: Option<Bytes>,
+}
+
+/// A flow from one sweep to the next.
+#[derive(Debug)]
+pub struct LocalPair {
+    /// Index of the source sweep.
+    pub source: usize,
+    /// Seconds from source to target.
+    pub dt_s: f64,
+    /// The ego motion target_from_source, row by row, if it is known.
+    pub ego: Option<[[f64; 4]; 4]>,
+    /// The flow, as npz.
+    pub flow: Bytes,
+}
+
+/// The console with one scene, at `/#/view`. Pages of other sites are refused.
+pub fn view_router(scene: LocalScene) -> Router {
+    Router::new()
+        .route("/view/scene", get(describe))
+        .route("/view/sweeps/{index}", get(sweep))
+        .route("/view/flows/{index}", get(flow))
+        .route("/view/tracks", get(tracks))
+        .route("/view/dense", get(dense))
+        .with_state(Arc::new(scene))
+        .merge(console::router())
+        .fallback(|| async { ApiError::NoRoute })
+        .layer(middleware::from_fn(check_origin))
+}
+
+async fn check_origin(request: Request, next: Next) -> Response {
+    let own = Hosts(Some(Vec::new()));
+    match origin::check(&own, &request) {
+        Ok(()) => next.run(request).await,
+        Err(error) => error.into_response(),
+    }
+}
+
+async fn describe(State(scene): State<Arc<LocalScene>>) -> Json<Scene> {
+    let pair = |(index, pair): (usize, &LocalPair)| ScenePair {
+        source: pair.source,
+        target: pair.source + 1,
+        state: JobState::Succeeded,
+        dt_s: Some(pair.dt_s),
+        ego: pair.ego,
+        flow: format!("/view/flows/{index}"),
+    };
+    let sweeps = 0..scene.sweeps.len();
+    Json(Scene {
+        name: scene.name.clone(),
+        sweeps: sweeps
+            .map(|index| format!("/view/sweeps/{index}"))
+            .collect(),
+        sweep_names: scene.sweeps.iter().map(|(name, _)| name.clone()).collect(),
+        pairs: scene.pairs.iter().enumerate().map(pair).collect(),
+        tracks: scene.tracks.as_ref().map(|_| "/view/tracks".to_owned()),
+        dense: scene.dense.as_ref().map(|_| "/view/dense".to_owned()),
+    })
+}
+
+/// The bytes with their media type, or 404.
+fn found(bytes: Option<&Bytes>, media_type: &'static str) -> Response {
+    match bytes {
+        Some(bytes) => ([(header::CONTENT_TYPE, media_type)], bytes.clone()).into_response(),
+        None => ApiError::NoRoute.into_response(),
+    }
+}
+
+async fn sweep(State(scene): State<Arc<LocalScene>>, Path(index): Path<usize>) -> Response {
+    found(scene.sweeps.get(index).map(|(_, bytes)| bytes), PACKED)
+}
+
+async fn flow(State(scene): State<Arc<LocalScene>>, Path(index): Path<usize>) -> Response {
+    let flow = scene.pairs.get(index).map(|pair| &pair.flow);
+    found(flow, "application/x-npz")
+}
+
+async fn tracks(State(scene): State<Arc<LocalScene>>) -> Response {
+    found(scene.tracks.as_ref(), "application/json")
+}
+
+async fn dense(State(scene): State<Arc<LocalScene>>) -> Response {
+    found(scene.dense.as_ref(), "application/x-npz")
+}

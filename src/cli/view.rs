@@ -1,0 +1,302 @@
+//! `fnsf view`: sweeps and their flow in 3-D, in a browser on this machine.
+
+use std::net::{Ipv4Addr, TcpListener};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, anyhow};
+use bytes::Bytes;
+use clap::Args;
+use tokio::signal::unix::{SignalKind, signal};
+use tokio_util::sync::CancellationToken;
+
+use super::estimation::{Estimation, check_sequence};
+use super::failure::Failure;
+use super::files;
+use super::output::say;
+use super::terminal::Terminal;
+use crate::api::{ListenOptions, Listener, LocalPair, LocalScene, view_router};
+use crate::flow::tracks::{ClusteredSweep, Tracker};
+use crate::flow::{Estimate, Objects, Point, Sequence, Sweep};
+use crate::formats::{
+    FlowFile, FlowFormat, FlowTable, is_dense, is_pair, matrix_rows, write_flow, write_tracks,
+};
+use crate::job::JobOptions;
+
+/// Fewest sweeps for which tracks are shown: an object must move in three pairs.
+const FEWEST_SWEEPS: usize = 4;
+
+/// Look at sweeps, their flow and their moving objects in 3-D.
+///
+/// Estimates the flow of each pair first, unless --flow gives it or --no-flow leaves it out. Then
+/// serves one page on 127.0.0.1 and prints its address, until Ctrl-C. Nothing leaves this machine.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:\n  \
+    fnsf view a.pcd b.pcd\n  \
+    fnsf view sweeps/*.bin --preset label\n  \
+    fnsf view a.feather b.feather --flow flow.npz\n  \
+    fnsf view dense.npz                         a dense cloud that fnsf densify has written")]
+pub(super) struct View {
+    /// The sweeps, in the order in which they were recorded; one .npz file with two sweeps; or one
+    /// cloud
+    #[arg(required = true, value_name = "FILE")]
+    files: Vec<PathBuf>,
+    /// The flows of the pairs, in order, as fnsf flow has written them. They are not estimated then
+    #[arg(long, value_name = "FLOW", num_args = 1.., conflicts_with = "no_flow")]
+    flow: Vec<PathBuf>,
+    /// The tracks of the sequence, as fnsf flow --tracks has written them
+    #[arg(long, value_name = "TRACKS.json")]
+    tracks: Option<PathBuf>,
+    /// Show the sweeps alone
+    #[arg(long)]
+    no_flow: bool,
+    /// Port of the page. A free one by default
+    #[arg(long, value_name = "PORT", default_value_t = 0)]
+    port: u16,
+    #[command(flatten)]
+    estimation: Estimation,
+}
+
+impl View {
+    pub(super) fn run(&self) -> Result<(), Failure> {
+        let socket = TcpListener::bind((Ipv4Addr::LOCALHOST, self.port))
+            .with_context(|| format!("cannot listen on port {}", self.port))
+            .map_err(Failure::internal)?;
+        let scene = self.scene()?;
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .enable_all()
+            .build()
+            .map_err(Failure::internal)?;
+        runtime.block_on(serve(scene, socket))
+    }
+
+    /// Reads the files, and estimates what is missing.
+    fn scene(&self) -> Result<LocalScene, Failure> {
+        let name = match self.files.as_slice() {
+            [first, .., last] => format!("{} to {}", file_name(first), file_name(last)),
+            files => files
+                .first()
+                .map(|path| file_name(path))
+                .unwrap_or_default(),
+        };
+        if let [file] = self.files.as_slice() {
+            let bytes = files::read_bytes(file)?;
+            if is_dense(&bytes) {
+                return Ok(LocalScene {
+                    name,
+                    dense: Some(bytes.into()),
+                    ..LocalScene::default()
+                });
+            }
+        }
+        let (sweeps, mut scene) = self.sweeps()?;
+        scene.name = name;
+        if !self.flow.is_empty() {
+            scene.pairs = self.given_flows(&sweeps)?;
+        } else if !self.no_flow && sweeps.len() > 1 {
+            self.estimate(&sweeps, &mut scene)?;
+        }
+        if let Some(path) = &self.tracks {
+            files::read_tracks(path)?;
+            scene.tracks = Some(files::read_bytes(path)?.into());
+        }
+        Ok(scene)
+    }
+
+    fn sweeps(&self) -> Result<(Vec<Sweep>, LocalScene), Failure> {
+        let mut sweeps = Vec::new();
+        let mut names = Vec::new();
+        let sweep = |points: Vec<Point>, ground: Option<Vec<bool>>| Sweep {
+            points,
+            ground,
+            times: None,
+        };
+        let is_both = match self.files.as_slice() {
+            [file] => is_pair(&files::read_bytes(file)?),
+            _ => false,
+        };
+        if is_both {
+            let pair = files::read_pair(&self.files[0])?;
+            let (source, target) = pair.ground.map(|g| (g.source, g.target)).unzip();
+            sweeps.extend([sweep(pair.source, source), sweep(pair.target, target)]);
+            names.extend(["source".to_owned(), "target".to_owned()]);
+        } else {
+            let surroundings = self.estimation.surroundings(&self.files)?;
+            for (index, path) in self.files.iter().enumerate() {
+                sweeps.push(surroundings.sweep(index, path)?);
+                names.push(file_name(path));
+            }
+        }
+        let packed = sweeps.iter().map(|sweep| pack(&sweep.points));
+        let scene = LocalScene {
+            sweeps: names.into_iter().zip(packed).collect(),
+            ..LocalScene::default()
+        };
+        Ok((sweeps, scene))
+    }
+
+    fn given_flows(&self, sweeps: &[Sweep]) -> Result<Vec<LocalPair>, Failure> {
+        if self.flow.len() + 1 != sweeps.len() {
+            return Err(Failure::usage(anyhow!(
+                "{} sweeps have {} pairs, but --flow names {} files",
+                sweeps.len(),
+                sweeps.len() - 1,
+                self.flow.len()
+            )));
+        }
+        let options = self.estimation.options()?;
+        let surroundings = self.estimation.surroundings(&self.files)?;
+        let mut pairs = Vec::new();
+        for (source, path) in self.flow.iter().enumerate() {
+            let file = files::read_flow(path)?;
+            let points = &sweeps[source].points;
+            if file.flow.len() != points.len() {
+                return Err(Failure::bad_input(anyhow!(
+                    "{}: {} rows, but the source has {} points",
+                    path.display(),
+                    file.flow.len(),
+                    points.len()
+                )));
+            }
+            let is_npz = path.extension().is_some_and(|ending| ending == "npz");
+            let flow = match is_npz && file.valid.is_some() {
+                // It has the ego motion, too.
+                true => files::read_bytes(path)?.into(),
+                false => encoded(file, points)?,
+            };
+            let timed = surroundings.timed(&options, [source, source + 1]);
+            pairs.push(local(source, &timed, None, flow));
+        }
+        Ok(pairs)
+    }
+
+    /// Estimates the flow of each pair and, for a sequence, the tracks.
+    fn estimate(&self, sweeps: &[Sweep], scene: &mut LocalScene) -> Result<(), Failure> {
+        let terminal = Terminal::new();
+        let options = self.estimation.options()?;
+        if self.files.len() > 1 {
+            check_sequence(&options, sweeps.len())?;
+        }
+        let surroundings = self.estimation.surroundings(&self.files)?;
+        let mut device = self.estimation.open()?;
+        let mut sequence = Sequence::default();
+        let mut estimates: Vec<Estimate> = Vec::new();
+        for (index, sweep) in sweeps.iter().enumerate() {
+            let pair = [index.saturating_sub(1), index];
+            let points = pair.map(|sweep| sweeps[sweep].points.len());
+            let points = points[0].max(points[1]);
+            let solver = surroundings.options(&options, points, pair);
+            estimates.extend(device.push(&mut sequence, sweep, &solver, &terminal)?);
+        }
+        loop {
+            let found = device.finish(&mut sequence, &terminal)?;
+            if found.is_empty() {
+                break;
+            }
+            estimates.extend(found);
+        }
+        terminal.finish();
+        let mut tracker = (sweeps.len() >= FEWEST_SWEEPS).then(Tracker::default);
+        for (source, estimate) in estimates.into_iter().enumerate() {
+            let timed = surroundings.timed(&options, [source, source + 1]);
+            let points = &sweeps[source].points;
+            let dt_s = timed.solver_options(0).dt_s;
+            tracker = tracker.filter(|_| estimate.objects().is_some() && estimate.ego.is_some());
+            if let Some(tracker) = &mut tracker {
+                let sweep = ClusteredSweep::new(points, &estimate, dt_s);
+                let tracked = sweep.and_then(|sweep| tracker.push(&sweep));
+                tracked.map_err(Failure::internal)?;
+            }
+            let flow = npz(&FlowTable {
+                source: points,
+                flow: &estimate.flow,
+                valid: &estimate.valid,
+                dynamic: estimate.dynamic.as_deref(),
+                objects: estimate.objects(),
+                ego: estimate.ego.as_ref(),
+            })?;
+            let ego = estimate.ego.as_ref().map(matrix_rows);
+            scene.pairs.push(local(source, &timed, ego, flow));
+        }
+        if let Some(tracker) = tracker {
+            let mut text = Vec::new();
+            write_tracks(&tracker.finish(), &mut text).map_err(Failure::internal)?;
+            scene.tracks = Some(text.into());
+        }
+        Ok(())
+    }
+}
+
+fn file_name(path: &Path) -> String {
+    let name = path.file_name().unwrap_or_default();
+    name.to_string_lossy().into_owned()
+}
+
+/// Packed little-endian float32.
+fn pack(points: &[Point]) -> Bytes {
+    let values = points.as_flattened().iter();
+    values.flat_map(|value| value.to_le_bytes()).collect()
+}
+
+fn local(
+    source: usize,
+    options: &JobOptions,
+    ego: Option<[[f64; 4]; 4]>,
+    flow: Bytes,
+) -> LocalPair {
+    LocalPair {
+        source,
+        dt_s: options.solver_options(0).dt_s.into(),
+        ego,
+        flow,
+    }
+}
+
+fn npz(table: &FlowTable<'_>) -> Result<Bytes, Failure> {
+    let mut bytes = Vec::new();
+    write_flow(FlowFormat::Npz, table, &mut bytes).map_err(Failure::internal)?;
+    Ok(bytes.into())
+}
+
+/// A flow file of another format as npz.
+fn encoded(file: FlowFile, points: &[Point]) -> Result<Bytes, Failure> {
+    let columns = (file.cluster, file.confidence, file.moving, file.clusters);
+    let objects = match columns {
+        (Some(cluster), Some(confidence), Some(moving), Some(clusters)) => Some(Objects {
+            cluster,
+            confidence,
+            moving,
+            clusters,
+        }),
+        _ => None,
+    };
+    npz(&FlowTable {
+        source: points,
+        flow: &file.flow,
+        valid: &file.valid.unwrap_or_else(|| vec![true; points.len()]),
+        dynamic: file.dynamic.as_deref(),
+        objects: objects.as_ref(),
+        ego: None,
+    })
+}
+
+/// Serves the page until Ctrl-C or SIGTERM.
+async fn serve(scene: LocalScene, socket: TcpListener) -> Result<(), Failure> {
+    let options = ListenOptions {
+        max_answer_bytes: 4 << 30,
+        ..ListenOptions::default()
+    };
+    socket.set_nonblocking(true).map_err(Failure::internal)?;
+    let listener = Listener::on(socket, options).map_err(Failure::internal)?;
+    let address = listener.address().map_err(Failure::internal)?;
+    let mut terminate = signal(SignalKind::terminate()).map_err(Failure::internal)?;
+    say(format_args!(
+        "look at http://{address}/#/view; Ctrl-C ends it"
+    ))?;
+    let stop = CancellationToken::new();
+    tokio::select! {
+        () = listener.serve(view_router(scene), stop) => {}
+        _ = tokio::signal::ctrl_c() => {}
+        _ = terminate.recv() => {}
+    }
+    Ok(())
+}
