@@ -19,7 +19,7 @@ export async function jobPage(page, signal, id) {
     head: el("div", { class: "job-head" }),
     host: el("div", { class: "viewer", data: { test: "viewer" } }),
     life: el("section", { class: "panel life", "aria-label": "The job" }),
-    picture: null,
+    viewer: null,
   };
   fill(page, parts.head, parts.host, parts.life);
   const update = (job) => {
@@ -55,24 +55,35 @@ async function follow(job, path, signal, parts, update) {
   }
 }
 
-/** Creates the viewer when there is something to draw, and tells it of new flows. */
+/** Keeps the picture in step with the job: one drawing at a time, then the latest state of the job. */
 async function showPicture(parts, job, path, signal) {
-  if (parts.picture === "loading" || parts.drawn === stamp(job)) return;
-  const { picture } = parts;
-  parts.picture = "loading";
+  parts.wanted = job;
+  if (parts.isDrawing) return;
+  parts.isDrawing = true;
   try {
-    const scene = picture?.scene ?? (await openScene(`${path}/scene`));
-    if (picture) await scene.refresh();
-    if (signal.aborted) return;
-    const viewer = picture?.viewer ?? createViewer(parts.host, scene);
-    if (picture) await viewer.reload();
-    else signal.addEventListener("abort", () => viewer.dispose());
-    parts.drawn = stamp(job);
-    parts.picture = { scene, viewer };
+    while (!signal.aborted && parts.drawn !== stamp(parts.wanted)) {
+      const drawn = stamp(parts.wanted);
+      await drawPicture(parts, path, signal);
+      parts.drawn = drawn;
+    }
   } catch (error) {
-    parts.picture = picture;
     if (!signal.aborted) fill(parts.host, el("p", { class: "failure", role: "alert" }, error.message));
+  } finally {
+    parts.isDrawing = false;
   }
+}
+
+/** Creates the viewer, or tells it of new flows. */
+async function drawPicture(parts, path, signal) {
+  if (parts.viewer) {
+    await parts.scene.refresh();
+    await parts.viewer.reload();
+    return;
+  }
+  parts.scene = await openScene(`${path}/scene`);
+  if (signal.aborted) return;
+  parts.viewer = createViewer(parts.host, parts.scene);
+  signal.addEventListener("abort", () => parts.viewer.dispose());
 }
 
 /** What the picture depends on. */

@@ -29,7 +29,7 @@ export function rowsOfPoint(frame, row) {
   if (!pair.valid[row]) return [...rows, ["Flow", "none"]];
   const speed = (motion) => `${(Math.hypot(...motion) / pair.dt).toFixed(2)} m/s`;
   rows.push(["Flow", metres(triple(pair.flow))]);
-  if (residual) rows.push(["Own motion", metres(triple(residual))], ["Speed", speed(triple(residual))]);
+  if (residual) rows.push(["Residual motion", metres(triple(residual))], ["Speed", speed(triple(residual))]);
   else rows.push(["Speed", speed(triple(pair.flow))]);
   if (pair.confidence) rows.push(["Confidence", percent(pair.confidence[row])]);
   if (pair.moving) rows.push(["Moves", percent(pair.moving[row])]);

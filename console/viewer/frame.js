@@ -10,7 +10,7 @@ const HEIGHTS = [-0.5, 4];
 
 /** The names of the colors of points, with what they need of a pair. */
 export const COLORS = {
-  residual: { text: "own motion", needs: (frame) => frame.residual, why: "the ego motion is not known" },
+  residual: { text: "residual motion", needs: (frame) => frame.residual, why: "the ego motion is not known" },
   flow: { text: "flow", needs: (frame) => frame.pair, why: "there is no flow" },
   height: { text: "height", needs: () => true },
   cluster: { text: "cluster", needs: (frame) => frame.pair?.cluster, why: "the method finds no clusters" },

@@ -8,7 +8,7 @@ import { VIEWS } from "./camera.js";
 
 /** Layers of a pair, with the word for a reader. */
 const LAYERS = [
-  ["moved", "moved source", "The source, moved by its flow to the time below"],
+  ["moved", "moved", "The source, moved by its flow to the time below"],
   ["source", "source", "The source at its own time"],
   ["target", "target", "The later sweep"],
   ["boxes", "objects", "Moving objects and their velocities"],

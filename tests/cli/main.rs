@@ -8,3 +8,4 @@ mod hostile;
 mod program;
 mod sequences;
 mod tables;
+mod view;

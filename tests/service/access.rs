@@ -68,11 +68,17 @@ async fn ask(server: &Server, method: &Method, path: &str, shown: Option<&str>) 
     if let Some(shown) = shown {
         request = request.header("authorization", shown);
     }
-    if *method == Method::POST && !path.ends_with("requeue") {
+    if *method == Method::POST && !path.ends_with("requeue") && !path.ends_with("share") {
         request = request.multipart(form(small_pair(), SMALL));
     }
     let answer = request.send().await.expect("an answer");
     answer.status().as_u16()
+}
+
+/// A path of the documentation with its parameters filled in.
+fn fill(path: &str, id: &str) -> String {
+    let path = path.replace("{id}", id);
+    path.replace("{index}", "0").replace("{sweep}", "0")
 }
 
 #[tokio::test]
@@ -85,12 +91,11 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
     for (path, methods) in document["paths"].as_object().expect("paths") {
         for method in methods.as_object().expect("methods").keys() {
             let method = method.to_uppercase().parse::<Method>();
-            routes.push((method.expect("a method"), path.replace("{id}", &id)));
+            routes.push((method.expect("a method"), fill(path, &id)));
         }
     }
-    assert_eq!(routes.len(), 11);
+    assert_eq!(routes.len(), 16);
     for (method, path) in [
-        ("GET", "/"),
         ("GET", "/v1"),
         ("GET", "/v1/flow"),
         ("PUT", "/v1/jobs"),
@@ -108,6 +113,8 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
         ("GET", "/openapi.json/../v1/jobs"),
         ("GET", "/openapi.jsonx"),
         ("GET", "/docsx"),
+        ("GET", "/consolex"),
+        ("GET", "/console/../v1/jobs"),
         ("GET", "/grpc.health.v1.Healthx/Check"),
         ("POST", "/fnsf.v1.SceneFlow/ListJobs"),
     ] {
@@ -122,6 +129,7 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
     let own = format!("/v1/jobs/{id}");
     let [events, result, requeue, tracks] =
         ["events", "result", "requeue", "tracks"].map(|of| format!("{own}/{of}"));
+    let [scene, sweep, share] = ["scene", "sweeps/0", "share"].map(|of| format!("{own}/{of}"));
     let removal = format!("{own}?remove=true");
     // Expected status for the reader, the other tenant and the writer.
     let expected = [
@@ -135,6 +143,11 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
         (Method::GET, &result, [200, 404, 200]),
         // The job is a pair.
         (Method::GET, &tracks, [400, 404, 400]),
+        (Method::GET, &scene, [200, 404, 200]),
+        (Method::GET, &sweep, [200, 404, 200]),
+        (Method::POST, &share, [200, 404, 200]),
+        (Method::GET, "/v1/queue", [200, 200, 200]),
+        (Method::GET, "/v1/street/0", [200, 200, 200]),
         (Method::POST, &requeue, [403, 404, 400]),
         (Method::DELETE, &own, [403, 404, 200]),
         (Method::DELETE, &removal, [403, 404, 204]),
@@ -142,7 +155,7 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
         (Method::PUT, "/v1/jobs", [405, 405, 405]),
         (Method::GET, "/metrics", [404, 404, 404]),
     ];
-    for (method, path) in &routes[..11] {
+    for (method, path) in &routes[..16] {
         let told = expected
             .iter()
             .any(|(known, at, _)| known == method && at == path);
@@ -155,7 +168,7 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
             assert_eq!(status, expected, "{method} {path} with {key}");
         }
     }
-    for open in ["/openapi.json", "/docs", "/docs/"] {
+    for open in ["/", "/console/main.js", "/openapi.json", "/docs", "/docs/"] {
         assert_eq!(ask(&server, &Method::GET, open, None).await, 200, "{open}");
     }
     // The admin port needs no key: it exposes no jobs and listens on loopback.

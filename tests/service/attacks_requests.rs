@@ -40,6 +40,9 @@ async fn a_name_that_is_no_jobs_is_not_found_whatever_it_holds() {
             ("POST", "/requeue"),
             ("GET", "/events"),
             ("GET", "/result"),
+            ("GET", "/scene"),
+            ("GET", "/sweeps/0"),
+            ("POST", "/share"),
         ] {
             let name = name.replace(' ', "%20");
             let head = "host: localhost\r\nconnection: close\r\n\r\n";

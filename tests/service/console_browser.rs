@@ -116,7 +116,7 @@ async fn two_files_become_a_picture_that_can_be_asked() {
     let picked = browser.run(script).await;
     assert!(picked["row"].is_number(), "{picked}");
     let card = browser.find("card").await.text().await.expect("text");
-    assert!(card.contains("Own motion"), "{card}");
+    assert!(card.contains("Residual motion"), "{card}");
 
     // The threshold hides points and boxes.
     let shown = number(&browser, &format!("{STATE}.pointsDrawn")).await;

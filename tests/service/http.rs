@@ -474,6 +474,11 @@ async fn the_documentation_names_every_route() {
         ("/v1/jobs/{id}/events", vec!["get"]),
         ("/v1/jobs/{id}/result", vec!["get"]),
         ("/v1/jobs/{id}/tracks", vec!["get"]),
+        ("/v1/jobs/{id}/scene", vec!["get"]),
+        ("/v1/jobs/{id}/sweeps/{index}", vec!["get"]),
+        ("/v1/jobs/{id}/share", vec!["post"]),
+        ("/v1/queue", vec!["get"]),
+        ("/v1/street/{sweep}", vec!["get"]),
     ] {
         let known = paths
             .get(path)
@@ -481,7 +486,7 @@ async fn the_documentation_names_every_route() {
         let known: Vec<&String> = known.as_object().expect("methods").keys().collect();
         assert_eq!(known, methods, "{path}");
     }
-    assert_eq!(paths.len(), 9);
+    assert_eq!(paths.len(), 14);
     let page = reqwest::get(server.url("/docs/")).await.expect("an answer");
     assert_eq!(page.status(), StatusCode::OK);
 }

@@ -1,0 +1,139 @@
+//! Tests of `fnsf view`: the page of local files, over a real socket.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+
+use fnsf::formats::{read_cloud, read_flow};
+use serde_json::Value;
+
+use crate::program::{fnsf, street};
+
+/// A running `fnsf view`. It is killed on drop.
+struct View {
+    child: Child,
+    address: String,
+}
+
+impl View {
+    fn start(folder: &Path, arguments: &[&str]) -> Self {
+        let mut child = Command::new(env!("CARGO_BIN_EXE_fnsf"))
+            .arg("view")
+            .args(arguments)
+            .current_dir(folder)
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()
+            .expect("the program starts");
+        let mut line = String::new();
+        let stdout = child.stdout.take().expect("piped");
+        BufReader::new(stdout).read_line(&mut line).expect("a line");
+        let address = line
+            .split("http://")
+            .nth(1)
+            .and_then(|rest| rest.split('/').next())
+            .unwrap_or_else(|| panic!("no address in {line:?}"))
+            .to_owned();
+        Self { child, address }
+    }
+
+    /// The status and the body of a path. `headers` end with a line break each.
+    fn get(&self, path: &str, headers: &str) -> (u16, Vec<u8>) {
+        let mut stream = TcpStream::connect(&self.address).expect("it listens");
+        let address = &self.address;
+        let host = match headers.contains("Host:") {
+            true => String::new(),
+            false => format!("Host: {address}\r\n"),
+        };
+        write!(
+            stream,
+            "GET {path} HTTP/1.1\r\n{host}{headers}Connection: close\r\n\r\n"
+        )
+        .expect("sent");
+        let mut answer = Vec::new();
+        stream.read_to_end(&mut answer).expect("an answer");
+        let head = answer.windows(4).position(|four| four == b"\r\n\r\n");
+        let body = answer.split_off(head.expect("a head") + 4);
+        let head = String::from_utf8(answer).expect("text");
+        let status = head
+            .split(' ')
+            .nth(1)
+            .and_then(|status| status.parse().ok());
+        (status.expect("a status"), body)
+    }
+
+    fn scene(&self) -> Value {
+        let (status, body) = self.get("/view/scene", "");
+        assert_eq!(status, 200);
+        serde_json::from_slice(&body).expect("JSON")
+    }
+}
+
+impl Drop for View {
+    fn drop(&mut self) {
+        let _is_gone = self.child.kill();
+        let _ended = self.child.wait();
+    }
+}
+
+#[test]
+fn sweeps_are_shown_with_the_flow_that_is_estimated_and_their_tracks() {
+    let folder = tempfile::tempdir().expect("a folder");
+    street(folder.path(), "4");
+    let names: Vec<String> = (0..4)
+        .map(|at| format!("street/sweep_000{at}.pcd"))
+        .collect();
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    let view = View::start(folder.path(), &names);
+    let scene = view.scene();
+    assert_eq!(scene["sweep_names"][3], "sweep_0003.pcd");
+    let bytes = std::fs::read(folder.path().join(names[1])).expect("a file");
+    let sent = read_cloud(&bytes, None).expect("a cloud").points;
+    let (_, packed) = view.get(scene["sweeps"][1].as_str().expect("a path"), "");
+    assert_eq!(fnsf::payload::points_from_le_bytes(&packed), sent);
+    assert_eq!(scene["pairs"].as_array().map(Vec::len), Some(3));
+    let (_, flow) = view.get(scene["pairs"][1]["flow"].as_str().expect("a path"), "");
+    let flow = read_flow(&flow, None).expect("a flow");
+    assert_eq!(flow.flow.len(), sent.len());
+    assert!(flow.clusters.is_some() && scene["pairs"][1]["ego"].is_array());
+    let (status, tracks) = view.get("/view/tracks", "");
+    assert_eq!(status, 200);
+    assert!(fnsf::formats::read_tracks(&tracks).is_ok());
+    let (_, page) = view.get("/", "");
+    assert!(String::from_utf8_lossy(&page).contains("/console/main.js"));
+    for absent in ["/view/sweeps/4", "/view/dense", "/v1/jobs"] {
+        assert_eq!(view.get(absent, "").0, 404, "{absent}");
+    }
+    // Pages of other sites, also those that have rebound a name.
+    assert_eq!(
+        view.get("/view/scene", "Origin: http://site.example\r\n").0,
+        403
+    );
+    assert_eq!(view.get("/view/scene", "Host: site.example\r\n").0, 403);
+}
+
+#[test]
+fn a_given_flow_is_shown_as_it_is_and_one_of_other_sweeps_is_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    street(folder.path(), "3");
+    let [a, b, c] = [0, 1, 2].map(|at| format!("street/sweep_000{at}.pcd"));
+    for flow in ["flow.npz", "flow.ply"] {
+        let ended = fnsf(folder.path(), &["flow", &a, &b, "-o", flow]);
+        assert_eq!(ended.code, 0, "{}", ended.stderr);
+        let view = View::start(folder.path(), &[&a, &b, "--flow", flow]);
+        let (_, shown) = view.get("/view/flows/0", "");
+        let shown = read_flow(&shown, None).expect("a flow");
+        let given = std::fs::read(folder.path().join(flow)).expect("a file");
+        let given = read_flow(&given, None).expect("a flow");
+        assert_eq!(shown.flow, given.flow, "{flow}");
+    }
+    let too_few = fnsf(folder.path(), &["view", &a, &b, &c, "--flow", "flow.npz"]);
+    assert_eq!(too_few.code, 2);
+    assert!(too_few.stderr.contains("2 pairs"), "{}", too_few.stderr);
+    let other = fnsf(folder.path(), &["view", &c, &b, "--flow", "flow.npz"]);
+    assert_eq!(other.code, 65);
+    assert!(other.stderr.contains("rows"), "{}", other.stderr);
+    let alone = View::start(folder.path(), &[&a, &b, "--no-flow"]);
+    assert_eq!(alone.scene()["pairs"].as_array().map(Vec::len), Some(0));
+}
