@@ -60,13 +60,13 @@ function throughputTile(history) {
   });
   const recent = rates.slice(-15);
   const mean = recent.reduce((sum, rate) => sum + rate, 0) / Math.max(1, recent.length);
-  return tile("Throughput", `${count(mean)} pairs/min`, "of this node", rates);
+  return tile("Throughput", count(mean), "pairs a minute on this node", rates);
 }
 
 function endedTile(view) {
   const failed = view.ended.filter(({ state }) => state !== "succeeded" && state !== "cancelled");
   const bad = failed.reduce((sum, { pairs }) => sum + pairs, 0);
-  return tile("Ended", `${count(pairsEnded(view))} pairs`, `${count(bad)} failed or expired, since this node's start`);
+  return tile("Ended", count(pairsEnded(view)), `pairs since this node's start, ${count(bad)} failed or expired`);
 }
 
 function table(title, names, rows, empty) {

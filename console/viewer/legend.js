@@ -21,7 +21,7 @@ export function showLegend(element, color, scale, dt, rest) {
   element.hidden = !color;
   const name = COLORS[color]?.text ?? { sweep: "sweep", dynamic: "moving points" }[color];
   const title = el("p", { class: "fv-title" }, `Color: ${name}`);
-  if (scale) fill(element, title, wheel(rest), el("p", {}, `full color from ${scale} m`, el("br"), `${(scale / dt).toFixed(1)} m/s`));
+  if (scale) fill(element, title, wheel(rest), el("p", {}, `full color from ${Number(scale.toPrecision(2))} m`, el("br"), `${(scale / dt).toFixed(1)} m/s`));
   else if (ENDS[color]) fill(element, title, bar(), el("p", { class: "fv-ends" }, ENDS[color].map((end) => el("span", {}, end))));
   else fill(element, title);
 }

@@ -33,7 +33,7 @@ impl View {
             .split("http://")
             .nth(1)
             .and_then(|rest| rest.split('/').next())
-            .unwrap_or_else(|| panic!("no address in {line:?}"))
+            .expect("an address")
             .to_owned();
         Self { child, address }
     }

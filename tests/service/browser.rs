@@ -119,10 +119,15 @@ impl Browser {
         found.unwrap_or_else(|error| panic!("{selector} does not appear: {error}"))
     }
 
-    /// Clicks the element with this `data-test`.
+    /// Clicks the element with this `data-test`. It is found again if the page has just replaced it.
     pub(crate) async fn click(&self, test: &str) {
-        let clicked = self.find(test).await.click().await;
-        clicked.unwrap_or_else(|error| panic!("{test} cannot be clicked: {error}"));
+        let began = Instant::now();
+        while let Err(error) = self.find(test).await.click().await {
+            assert!(
+                error.is_stale_element_reference() && began.elapsed() < PATIENCE,
+                "{test} cannot be clicked: {error}"
+            );
+        }
     }
 
     /// Puts files into the file input with this `data-test`.

@@ -10,10 +10,9 @@ use super::assets::{ASSETS, Asset};
 /// The page of `/`.
 const PAGE: &str = "index.html";
 
-/// What the pages may load: nothing of another host, no inline scripts and styles. Pictures and
-/// downloads are made in the page (`blob:`).
+/// What the pages may load: nothing of another host, no inline scripts and styles.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
-     img-src 'self' blob: data:; connect-src 'self'; base-uri 'none'; form-action 'none'; \
+     img-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; \
      frame-ancestors 'none'";
 
 /// The routes of the console. They need no key and no state.

@@ -131,10 +131,12 @@ pub(super) async fn scene(
 pub(super) async fn sweep(
     State(service): State<Arc<Service>>,
     Extension(caller): Extension<Caller>,
-    path: Result<Path<(String, u32)>, axum::extract::rejection::PathRejection>,
+    path: Result<Path<(String, String)>, axum::extract::rejection::PathRejection>,
 ) -> Result<Response, ApiError> {
-    let Path((id, index)) = path.map_err(|error| ApiError::BadRequest(error.body_text()))?;
+    // As with a job's id, a path of another form is one that does not exist.
+    let Path((id, index)) = path.map_err(|_| ApiError::NotFound)?;
     let job = service.job(&caller, id.parse()?).await?;
+    let index = index.parse().map_err(|_| ApiError::NoSweep(job.id))?;
     let mut response = whole(service.packed_sweep(&job, index).await?);
     set_header(&mut response, "content-type", PACKED.to_owned());
     Ok(response)
