@@ -8,6 +8,7 @@ WORKDIR /build
 COPY Cargo.toml Cargo.lock build.rs ./
 COPY proto proto
 COPY benches benches
+COPY console console
 COPY src src
 # Crates and what is compiled from them live in caches outside the layers: a change in src compiles src alone.
 # The program is copied out, because a cache is not part of the image.
