@@ -90,6 +90,29 @@ fn every_job_option_is_described() {
     assert_eq!(gone, [""; 0]);
 }
 
+#[test]
+fn the_image_is_built_from_every_folder_that_the_program_includes() {
+    let mut files = Vec::new();
+    crate::collect(&root().join("src"), &mut files);
+    let recipe = read("Dockerfile");
+    let mut folders = Vec::new();
+    for file in files {
+        let text = fs::read_to_string(&file).expect("a source is readable");
+        let included = text.split("include_bytes!(").skip(1);
+        let paths = included.filter_map(|rest| between(rest, "\"", "\""));
+        // A path that leaves the folder of sources: "../../../console/".
+        let outside = paths.filter(|path| path.starts_with("../"));
+        folders.extend(outside.map(|path| path.trim_start_matches("../").to_owned()));
+    }
+    assert!(folders.contains(&"console/".to_owned()), "{folders:?}");
+    let is_left_out = |folder: &String| {
+        let folder = folder.split('/').next().unwrap_or_default();
+        !recipe.contains(&format!("COPY {folder} "))
+    };
+    folders.retain(is_left_out);
+    assert_eq!(folders, [""; 0]);
+}
+
 /// All pages of the repository but those of its dependencies and outputs.
 fn pages(folder: &Path, found: &mut Vec<PathBuf>) {
     for entry in fs::read_dir(folder).expect("a folder is readable") {
