@@ -124,11 +124,12 @@ export class Scene {
   }
 
   async #loadTracks() {
-    if (!this.#described.tracks) return [];
+    // Tracks begin with the first pair.
+    if (!this.#described.tracks || this.pairs[0]?.state !== "succeeded") return [];
     try {
       return (await json(this.#described.tracks)).tracks;
     } catch (error) {
-      // A sequence without clusters, or without an ended pair, has no tracks.
+      // A method without clusters gives no tracks.
       if (error instanceof Refusal) return [];
       throw error;
     }
