@@ -176,12 +176,7 @@ impl Writer {
     }
 
     fn points(&mut self, points: &[Point]) {
-        if cfg!(target_endian = "little") {
-            self.0.extend_from_slice(bytemuck::cast_slice(points));
-        } else {
-            let values = points.as_flattened().iter();
-            self.0.extend(values.flat_map(|value| value.to_le_bytes()));
-        }
+        put_points(points, &mut self.0);
     }
 
     fn flags(&mut self, flags: Option<&[bool]>) {
@@ -386,6 +381,22 @@ impl<'a> Reader<'a> {
         } else {
             Err(CorruptPayload("too long"))
         }
+    }
+}
+
+/// Points as packed little-endian float32 triples: x, y, z; 12 bytes each.
+pub fn points_to_le_bytes(points: &[Point]) -> Vec<u8> {
+    let mut bytes = Vec::with_capacity(size_of_val(points));
+    put_points(points, &mut bytes);
+    bytes
+}
+
+fn put_points(points: &[Point], bytes: &mut Vec<u8>) {
+    if cfg!(target_endian = "little") {
+        bytes.extend_from_slice(bytemuck::cast_slice(points));
+    } else {
+        let values = points.as_flattened().iter();
+        bytes.extend(values.flat_map(|value| value.to_le_bytes()));
     }
 }
 

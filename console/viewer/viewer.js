@@ -131,7 +131,7 @@ export class Viewer {
     this.state.hasTracks = this.#tracks.length > 0;
     if (this.#closing.signal.aborted) return;
     if (this.state.dense) await this.#showDense();
-    if (this.frame) await this.#loadEgos();
+    if (this.frame) this.#collectEgos();
     this.#refresh();
   }
 
@@ -154,7 +154,7 @@ export class Viewer {
       if (isFirst) this.#firstView();
       else if (pair && !this.hadPair) this.#firstColor();
       this.hadPair ||= pair !== null;
-      await this.#loadEgos();
+      this.#collectEgos();
       this.#picture.take(this.frame);
       this.#refresh();
     } catch (error) {
@@ -185,7 +185,7 @@ export class Viewer {
   }
 
   /** The ego motions that lead the past of the tracks to the shown sweep. */
-  async #loadEgos() {
+  #collectEgos() {
     if (this.frame.pair?.ego) this.#egos.set(this.state.sweep, this.frame.pair.ego);
     for (const pair of this.#scene.pairs) {
       if (pair.ego && !this.#egos.has(pair.source)) this.#egos.set(pair.source, pair.ego.flat());

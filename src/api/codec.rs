@@ -6,7 +6,7 @@ use super::error::ApiError;
 use crate::formats;
 use crate::formats::{FlowFormat, FlowTable, MAX_COORDINATE_M, SweepTime};
 use crate::job::Report;
-use crate::payload::{StoredCloud, StoredFlow};
+use crate::payload::{StoredCloud, StoredFlow, points_to_le_bytes};
 
 /// A format for the encoded flow.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -95,10 +95,7 @@ impl AnswerFormat {
         job: &str,
     ) -> Result<Vec<u8>, ApiError> {
         let format = match self {
-            Self::Packed => {
-                let values = flow.flow.as_flattened().iter();
-                return Ok(values.flat_map(|value| value.to_le_bytes()).collect());
-            }
+            Self::Packed => return Ok(points_to_le_bytes(&flow.flow)),
             Self::File(format) => format,
         };
         let source = if self.needs_points() {

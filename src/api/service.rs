@@ -417,7 +417,7 @@ impl Service {
     async fn sync_frames(&self, job: &Job) -> Result<(), ApiError> {
         let sweeps = match job.kind {
             Kind::Pair => job.window[0]..job.window[1],
-            Kind::Sequence => 0..1 + self.pairs(job).await?.len() as u32,
+            Kind::Sequence => 0..self.sweeps(job).await? as u32,
         };
         let (owner, _) = job.sweeps();
         for index in sweeps {

@@ -7,7 +7,7 @@ use super::result_budget::Encoded;
 use super::results::lost_or;
 use super::service::Service;
 use crate::job::{Job, JobId, Kind};
-use crate::payload::StoredCloud;
+use crate::payload::{StoredCloud, points_to_le_bytes};
 use crate::storage::Blob;
 
 impl Service {
@@ -41,8 +41,7 @@ impl Service {
         let bytes = bytes.map_err(|error| lost_or(job.id, error))?;
         let pack = move || {
             let cloud = StoredCloud::from_bytes(&bytes).map_err(ApiError::internal)?;
-            let values = cloud.points.as_flattened().iter();
-            Ok(values.flat_map(|value| value.to_le_bytes()).collect())
+            Ok(points_to_le_bytes(&cloud.points))
         };
         Ok(room.hold(self.compute(&job.tenant, pack).await?))
     }

@@ -21,6 +21,7 @@ use crate::formats::{
     FlowFile, FlowFormat, FlowTable, is_dense, is_pair, matrix_rows, write_flow, write_tracks,
 };
 use crate::job::JobOptions;
+use crate::payload::points_to_le_bytes;
 
 /// Fewest sweeps for which tracks are shown: an object must move in three pairs.
 const FEWEST_SWEEPS: usize = 4;
@@ -126,7 +127,9 @@ impl View {
                 names.push(file_name(path));
             }
         }
-        let packed = sweeps.iter().map(|sweep| pack(&sweep.points));
+        let packed = sweeps
+            .iter()
+            .map(|sweep| points_to_le_bytes(&sweep.points).into());
         let scene = LocalScene {
             sweeps: names.into_iter().zip(packed).collect(),
             ..LocalScene::default()
@@ -229,12 +232,6 @@ impl View {
 fn file_name(path: &Path) -> String {
     let name = path.file_name().unwrap_or_default();
     name.to_string_lossy().into_owned()
-}
-
-/// Packed little-endian float32.
-fn pack(points: &[Point]) -> Bytes {
-    let values = points.as_flattened().iter();
-    values.flat_map(|value| value.to_le_bytes()).collect()
 }
 
 fn local(

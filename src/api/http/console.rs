@@ -6,6 +6,7 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 
 use super::assets::{ASSETS, Asset};
+use super::results::is_known;
 
 /// The page of `/`.
 const PAGE: &str = "index.html";
@@ -35,9 +36,7 @@ pub(super) fn router<S: Clone + Send + Sync + 'static>() -> Router<S> {
 
 /// The file, or 304 if the browser has it.
 fn answer(asset: &'static Asset, tag: &str, headers: &HeaderMap) -> Response {
-    let known = headers.get(header::IF_NONE_MATCH);
-    let is_known = known.is_some_and(|known| known.as_bytes().ends_with(tag.as_bytes()));
-    let mut response = match is_known {
+    let mut response = match is_known(headers, tag) {
         true => StatusCode::NOT_MODIFIED.into_response(),
         false => asset.bytes.into_response(),
     };

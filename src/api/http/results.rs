@@ -139,14 +139,7 @@ impl Head {
         let text =
             |name: header::HeaderName| headers.get(name).and_then(|value| value.to_str().ok());
         let tag = self.entity_tag();
-        // Weak comparison, as RFC 9110 (13.1.2) requires. A proxy may have marked the tag as weak.
-        let matches = |tags: &str| {
-            tags.split(',').map(str::trim).any(|one| {
-                let one = one.strip_prefix("W/").unwrap_or(one);
-                one == tag || one == "*"
-            })
-        };
-        let mut response = if text(header::IF_NONE_MATCH).is_some_and(matches) {
+        let mut response = if is_known(headers, &tag) {
             StatusCode::NOT_MODIFIED.into_response()
         } else {
             let encoded = encoded.await?;
@@ -156,6 +149,17 @@ impl Head {
         self.describe(&mut response);
         Ok(response)
     }
+}
+
+/// Whether the client has the entity with this tag, by `If-None-Match`. Weak comparison, as RFC 9110
+/// (13.1.2) requires: a proxy may have marked the tag as weak.
+pub(super) fn is_known(headers: &HeaderMap, tag: &str) -> bool {
+    let tags = headers.get(header::IF_NONE_MATCH);
+    let tags = tags.and_then(|tags| tags.to_str().ok()).unwrap_or_default();
+    tags.split(',').map(str::trim).any(|one| {
+        let one = one.strip_prefix("W/").unwrap_or(one);
+        one == tag || one == "*"
+    })
 }
 
 /// Sets a header, unless its value has characters that no header can have.
