@@ -43,6 +43,8 @@ pub mod picture;
 #[cfg(feature = "service")]
 pub mod queue;
 #[cfg(feature = "service")]
+pub mod remote;
+#[cfg(feature = "service")]
 pub mod storage;
 #[cfg(feature = "service")]
 mod sync;
@@ -50,6 +52,8 @@ mod sync;
 pub mod telemetry;
 #[cfg(feature = "service")]
 mod text;
+#[cfg(feature = "service")]
+mod trace;
 #[cfg(feature = "service")]
 pub mod worker;
 

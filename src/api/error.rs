@@ -8,6 +8,7 @@ use crate::fault::Fault;
 use crate::formats::FormatError;
 use crate::job::{DeviceKind, InvalidId, InvalidOptions, JobError, JobId, Priority};
 use crate::queue::QueueError;
+use crate::remote::{NotTold, Webhooks};
 use crate::storage::BlobError;
 
 /// Why a request was refused, or why its job has no result.
@@ -298,6 +299,18 @@ impl ApiError {
             | Self::ResultLost(id) => Some(*id),
             _ => None,
         }
+    }
+
+    /// The refusal of a webhook that a caller names.
+    pub(super) fn webhook(webhooks: &Webhooks, error: &NotTold) -> Self {
+        Self::InvalidOptions(match webhooks.are_off() {
+            true => {
+                "options: webhook: this server tells no webhooks; its operator names those that it \
+                     may tell in remote.webhooks"
+                    .to_owned()
+            }
+            false => format!("options: webhook: {error}"),
+        })
     }
 
     /// Logs an error and returns [`ApiError::Internal`], which gives the client no details.

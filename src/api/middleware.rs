@@ -15,10 +15,10 @@ use tracing::Instrument;
 
 use super::error::{ApiError, ErrorSpec};
 use super::listener::Asking;
-use super::pending_job::ReceivedAt;
+use super::pending_job::Received;
 use super::service::Service;
-use super::trace_context::join_trace;
 use super::{grpc, origin};
+use crate::trace;
 
 /// Adds the middleware and the fallback route to a router.
 pub(super) fn guarded(router: Router, service: &Arc<Service>) -> Router {
@@ -60,23 +60,23 @@ async fn check_key(
     mut request: Request,
     next: Next,
 ) -> Response {
-    request.extensions_mut().insert(ReceivedAt(Instant::now()));
     if observes(&request)
         && let Some(asking) = request.extensions().get::<Asking>()
     {
         asking.observes();
     }
     let mut sent = origin::check_host_is_one(&request);
-    if service.keys.is_open() {
+    let keys = service.keys.get();
+    if keys.is_open() {
         sent = sent.and_then(|()| origin::check(&service.hosts, &request));
     }
     if let Err(error) = sent {
         return refused(&request, error);
     }
     let shown = request.headers().get(header::AUTHORIZATION);
-    match service.caller(shown.and_then(|value| value.to_str().ok())) {
+    match keys.caller(shown.and_then(|value| value.to_str().ok())) {
         Ok(caller) => {
-            let several = service.keys.has_several_tenants();
+            let several = keys.has_several_tenants();
             if let Some(asking) = request.extensions().get::<Asking>()
                 && !asking.is_known(&caller.tenant, several)
             {
@@ -104,13 +104,17 @@ async fn no_route(request: Request) -> Response {
 }
 
 /// Counts the response, and the rejection if it is one.
-async fn count(State(service): State<Arc<Service>>, request: Request, next: Next) -> Response {
+async fn count(State(service): State<Arc<Service>>, mut request: Request, next: Next) -> Response {
     let protocol = if is_grpc(&request) { "grpc" } else { "http" };
     let (method, path) = (request.method().clone(), request.uri().path().to_owned());
     let began = Instant::now();
     let trace_id = tracing::field::Empty;
     let span = tracing::info_span!("request", protocol, %method, path, trace_id);
-    join_trace(&span, request.headers());
+    let parent = request.headers().get(trace::TRACEPARENT);
+    let trace = trace::join(&span, parent.and_then(|value| value.to_str().ok()));
+    request
+        .extensions_mut()
+        .insert(Received { at: began, trace });
     let mut response = next.run(request).instrument(span.clone()).await;
     response.headers_mut().insert(
         "x-content-type-options",

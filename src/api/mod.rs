@@ -1,7 +1,7 @@
 //! The HTTP and gRPC interfaces, and the protocol-independent service behind them.
 //!
 //! `service` and the modules that it uses are shared by both protocols. HTTP types appear in
-//! `http`, gRPC types in `grpc`; `middleware`, `origin`, `trace_context` and `listener` handle raw
+//! `http`, gRPC types in `grpc`; `middleware`, `origin` and `listener` handle raw
 //! requests and connections.
 
 mod admin;
@@ -30,7 +30,6 @@ mod sweep_order;
 mod sweeps;
 #[cfg(test)]
 mod tests;
-mod trace_context;
 mod tracks;
 mod upload_budget;
 mod waiters;
@@ -41,7 +40,7 @@ pub use auth::{Caller, InvalidKey, Keys, MIN_KEY, Role};
 pub use error::ApiError;
 pub use fleet::{DeviceView, capacities, others};
 pub use http::{LocalPair, LocalScene, view_router};
-pub use listener::{ListenOptions, Listener, TlsError, tls_acceptor};
+pub use listener::{ListenOptions, Listener, TlsError, TlsSetup, tls_acceptor};
 pub use origin::Hosts;
 pub use routes::public_router;
 pub use service::Service;

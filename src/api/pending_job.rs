@@ -34,8 +34,8 @@ pub(super) struct Request {
     pub durability: Durability,
     /// The idempotency key: a repeated submission with the same key finds the job of the first one.
     pub idempotency_key: Option<String>,
-    /// The arrival time of the request. Deadlines count from here.
-    pub arrived: Instant,
+    /// When the request arrived, and in which trace. Deadlines count from its arrival.
+    pub received: Received,
     /// The deadline of the call itself, relative to its arrival, if there is one.
     pub time_left: Option<Duration>,
     /// The position in a chain of pairs that are submitted one by one. `None` outside of a chain.
@@ -63,9 +63,14 @@ pub(super) struct Accepted {
     pub(super) awaited: Option<Awaited>,
 }
 
-/// The arrival time of a request: a request extension.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct ReceivedAt(pub(super) Instant);
+/// The arrival of a request: a request extension.
+#[derive(Clone, Debug)]
+pub(super) struct Received {
+    /// When it arrived.
+    pub(super) at: Instant,
+    /// Its span, as the value of a `traceparent` header. `None` if it belongs to no trace.
+    pub(super) trace: Option<String>,
+}
 
 /// A job that is being assembled.
 pub(super) struct PendingJob {
@@ -127,6 +132,15 @@ impl PendingJob {
         service
             .admission
             .check_device(request.options.device_kind())?;
+        if let Some(url) = &request.options.webhook {
+            if request.durability == Durability::Ephemeral {
+                let text =
+                    "options: webhook is for submitted jobs: this call has the flow in its answer";
+                return Err(ApiError::InvalidOptions(text.to_owned()));
+            }
+            let checked = service.webhooks.check(url);
+            checked.map_err(|error| ApiError::webhook(&service.webhooks, &error))?;
+        }
         if let Some(key) = &request.idempotency_key
             && (key.is_empty() || key.len() > MAX_KEY)
         {
@@ -410,7 +424,7 @@ impl PendingJob {
         let link = self.request.link;
         let options = &self.request.options;
         let asked = options.deadline_ms.map(Duration::from_millis);
-        let spent = self.request.arrived.elapsed();
+        let spent = self.request.received.at.elapsed();
         let asked = asked.into_iter().chain(self.request.time_left).min();
         let left = asked.map(|asked| asked.saturating_sub(spent));
         let key = self.request.idempotency_key.clone();
@@ -428,6 +442,8 @@ impl PendingJob {
             device: options.device_kind(),
             options: options.to_json(),
             labels: options.labels.texts(),
+            trace: self.request.received.trace.clone(),
+            webhook: options.webhook.clone(),
             deadline: left.map(|left| Timestamp::now().after(left)),
             idempotency: key.map(|key| Idempotency {
                 key,

@@ -22,7 +22,9 @@ use crate::health::StoreHealth;
 use crate::job::{Job, JobId, JobOptions, Kind, Priority, State, Tenant};
 use crate::metrics::Metrics;
 use crate::queue::{Filter, Queue, QueueError};
+use crate::remote::Webhooks;
 use crate::storage::{Blob, Blobs, FreeSpace};
+use crate::sync::Exchange;
 
 /// Maximum number of zip archives and dense clouds that are being sent at the same time.
 const MAX_ARCHIVES: usize = 16;
@@ -38,8 +40,9 @@ pub struct Service {
     pub(super) devices: Box<dyn Fn() -> Vec<DeviceView> + Send + Sync>,
     pub(super) admission: Admission,
     pub(super) metrics: Arc<Metrics>,
-    pub(super) keys: Keys,
+    pub(super) keys: Exchange<Keys>,
     pub(super) hosts: Hosts,
+    pub(super) webhooks: Webhooks,
     store_health: Arc<StoreHealth>,
     pub(super) limits: ServiceLimits,
     pub(super) uploads: Arc<UploadBudget>,
@@ -112,8 +115,9 @@ impl Service {
             answers: ResultBudget::new(ResultLimits::new(limits.max_answers_bytes, several)),
             waiters: Arc::default(),
             metrics: parts.metrics,
-            keys: parts.keys,
+            keys: Exchange::new(parts.keys),
             hosts: parts.hosts,
+            webhooks: parts.webhooks,
             store_health: parts.store_health,
             limits: parts.limits,
             compute: FairQueue::new(cores),
@@ -126,14 +130,14 @@ impl Service {
         }
     }
 
-    /// The caller that the value of an `Authorization` header identifies: `Bearer KEY`. A server
-    /// without keys accepts every caller as the default tenant with full rights.
-    ///
-    /// # Errors
-    /// [`ApiError::Unauthenticated`] if the server has keys and the value is missing, has another
-    /// form, or has an unknown key. [`ApiError::LinkExpired`] for the token of an expired link.
-    pub fn caller(&self, authorization: Option<&str>) -> Result<Caller, ApiError> {
-        self.keys.caller(authorization)
+    /// Whether requests need no key.
+    pub fn has_no_keys(&self) -> bool {
+        self.keys.get().is_open()
+    }
+
+    /// Exchanges the keys. Requests from now on need one of the new ones.
+    pub fn exchange_keys(&self, keys: Keys) {
+        self.keys.set(keys);
     }
 
     /// Counts an error that occurs after the response has begun, when the middleware has already

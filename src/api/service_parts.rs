@@ -10,6 +10,7 @@ use super::origin::Hosts;
 use crate::health::StoreHealth;
 use crate::metrics::Metrics;
 use crate::queue::Queue;
+use crate::remote::Webhooks;
 use crate::storage::Blobs;
 
 /// The dependencies of a [`crate::api::Service`].
@@ -28,6 +29,8 @@ pub struct ServiceParts {
     pub keys: Keys,
     /// The host names that are accepted when there are no API keys.
     pub hosts: Hosts,
+    /// The webhooks that jobs may name.
+    pub webhooks: Webhooks,
     /// The health of the store and its free disk space, as last measured.
     pub store_health: Arc<StoreHealth>,
     /// Resource limits for requests.

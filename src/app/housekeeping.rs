@@ -4,7 +4,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use tokio::sync::mpsc;
+use tokio::sync::{Notify, mpsc};
 use tokio::task::JoinSet;
 use tokio::time::{interval, interval_at};
 
@@ -48,7 +48,7 @@ pub(super) fn start(
     blobs: &Blobs,
     metrics: &Arc<Metrics>,
     devices: &[Device],
-    heard: mpsc::UnboundedReceiver<Event>,
+    events: (mpsc::UnboundedReceiver<Event>, Arc<Notify>),
     health: (&Arc<StoreProbe>, &Arc<Heartbeat>),
 ) -> JoinSet<()> {
     let (store, heartbeat) = (Arc::clone(health.0), Arc::clone(health.1));
@@ -60,20 +60,27 @@ pub(super) fn start(
         Arc::clone(metrics),
     ));
     tasks.spawn(probe(store, Arc::clone(metrics)));
-    tasks.spawn(listen(blobs.clone(), Arc::clone(metrics), heard));
+    tasks.spawn(listen(Arc::clone(metrics), events.0, events.1));
     tasks.spawn(look(devices.to_vec(), Arc::clone(metrics)));
     tasks.spawn(clean(Arc::clone(queue), blobs.clone()));
     tasks
 }
 
-/// Counts queue events in the metrics, and removes the blobs of forgotten jobs.
-async fn listen(blobs: Blobs, metrics: Arc<Metrics>, mut heard: mpsc::UnboundedReceiver<Event>) {
+/// Counts queue events in the metrics, and rings for the outbox where one may have filled it.
+async fn listen(
+    metrics: Arc<Metrics>,
+    mut heard: mpsc::UnboundedReceiver<Event>,
+    bell: Arc<Notify>,
+) {
     while let Some(event) = heard.recv().await {
         metrics.observe(&event);
-        if let Event::Deleted(id) = event
-            && let Err(error) = blobs.remove_job(id).await
-        {
-            tracing::warn!(%error, job = %id, "a forgotten job left something behind");
+        let rings = match &event {
+            Event::Deleted(_) => true,
+            Event::Ended(job) => job.webhook.is_some(),
+            _ => false,
+        };
+        if rings {
+            bell.notify_one();
         }
     }
 }

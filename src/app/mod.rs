@@ -2,7 +2,9 @@
 
 mod devices;
 mod housekeeping;
+mod outbox;
 mod process;
+mod reload;
 mod settings;
 mod shutdown;
 mod start;

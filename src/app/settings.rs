@@ -5,9 +5,10 @@ use std::time::Duration;
 use anyhow::Context;
 
 use crate::api::{AdmissionLimits, Caller, Keys, ListenOptions, Role, ServiceLimits};
-use crate::config::{Config, LimitsConfig, QueueConfig};
+use crate::config::{Config, LimitsConfig, QueueConfig, RemoteConfig};
 use crate::job::{Priority, Tenant};
 use crate::queue::{PostgresOptions, QueueOptions};
+use crate::remote::{Allowed, SigningSecret};
 
 /// The API keys: that of the default tenant, and those of tenants.
 ///
@@ -35,6 +36,24 @@ pub(super) fn keys(config: &Config) -> anyhow::Result<Keys> {
         keys.add(key.key.reveal(), caller).context("keys")?;
     }
     Ok(keys)
+}
+
+/// The webhooks that jobs may name, and the key of their signatures.
+///
+/// # Errors
+/// If a prefix or the secret is invalid, or prefixes are without a secret.
+pub(super) fn webhooks(config: &RemoteConfig) -> anyhow::Result<(Allowed, Option<SigningSecret>)> {
+    let allowed = Allowed::new(&config.webhooks, &["https", "http"]).context("remote.webhooks")?;
+    let secret = config.webhook_secret.as_ref();
+    let secret = secret.map(|secret| SigningSecret::parse(secret.reveal()));
+    let secret = secret.transpose().context("remote.webhook_secret")?;
+    if secret.is_none() && !allowed.is_empty() {
+        anyhow::bail!(
+            "remote.webhooks needs remote.webhook_secret, by which receivers know that a notice is \
+             genuine: make one with echo whsec_$(openssl rand -base64 32)"
+        );
+    }
+    Ok((allowed, secret))
 }
 
 pub(super) fn queue_options(config: &QueueConfig) -> QueueOptions {

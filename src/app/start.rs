@@ -11,12 +11,13 @@ use tokio::task::{JoinHandle, JoinSet};
 use tokio_util::sync::CancellationToken;
 
 use super::devices::Pool;
-use super::settings::{admission_limits, keys, listen_options, service_limits};
+use super::outbox::Outbox;
+use super::settings::{admission_limits, keys, listen_options, service_limits, webhooks};
 use super::stores::{Stores, warn_of_stranded_jobs};
 use super::{housekeeping, process};
 use crate::api::{
     Admission, DeviceView, Hosts, Keys, ListenOptions, Listener, Readiness, Service, ServiceParts,
-    admin_router, public_router, tls_acceptor,
+    TlsSetup, admin_router, public_router, tls_acceptor,
 };
 use crate::config::{Config, NodeRole};
 use crate::cost::CostModel;
@@ -25,6 +26,7 @@ use crate::health::Heartbeat;
 use crate::job::DeviceKind;
 use crate::metrics::Metrics;
 use crate::queue::Queue;
+use crate::remote::Webhooks;
 use crate::worker::{Drain, IsolationLock, Worker, WorkerOptions};
 
 /// A running server: its ports, devices, workers, stores and background tasks. [`App::drain`]
@@ -39,6 +41,7 @@ pub struct App {
     pub(super) workers_drain: Drain,
     pub(super) draining: watch::Sender<bool>,
     pub(super) queue: Arc<dyn Queue>,
+    pub(super) tls: Option<Arc<TlsSetup>>,
     pub(super) listener: JoinHandle<()>,
     pub(super) stop_listening: CancellationToken,
     pub(super) upkeep: JoinSet<()>,
@@ -78,6 +81,7 @@ impl App {
             );
         }
         let keys = keys(&config)?;
+        let (allowed, secret) = webhooks(&config.remote)?;
         process::keep_files_private();
         process::survive_file_limits();
         process::name_tls_provider();
@@ -95,23 +99,41 @@ impl App {
         let workers_drain = Drain::default();
         let workers = start_workers(&devices, &stores, &cost, &metrics, &workers_drain, &config);
         let keys_are_open = keys.is_open();
-        let service = Arc::new(service(&stores, &devices, &cost, &metrics, keys, &config));
+        let webhooks = Webhooks::new(allowed, secret, config.remote.allow_private_addresses);
+        let parts = (keys, webhooks.clone());
+        let service = Arc::new(service(&stores, &devices, &cost, &metrics, parts, &config));
         let runtime = Arc::new(Heartbeat::default());
+        let outbox = Outbox {
+            queue: Arc::clone(&stores.queue),
+            blobs: stores.blobs.clone(),
+            webhooks,
+            metrics: Arc::clone(&metrics),
+            bell: Arc::default(),
+        };
         let mut upkeep = housekeeping::start(
             &stores.queue,
             &stores.blobs,
             &metrics,
             &devices,
-            events,
+            (events, Arc::clone(&outbox.bell)),
             (&stores.probe, &runtime),
         );
+        upkeep.spawn(outbox.run());
         upkeep.spawn(housekeeping::exchange(
             Arc::clone(&stores.queue),
             Arc::clone(&cost),
         ));
+        let tls = tls(&config)?;
         let listener = match config.role {
             NodeRole::Worker => None,
-            _ => Some(open_listener(&config, !keys_are_open, open_files, &metrics).await?),
+            _ => {
+                let mut options = listen_options(&config.limits);
+                options.needs_key = !keys_are_open;
+                Some(
+                    open_listener(config.listen, tls.clone(), options, open_files, &metrics)
+                        .await?,
+                )
+            }
         };
         let public = listener.as_ref().map(Listener::address).transpose()?;
         let mut loops = vec![("the runtime", runtime)];
@@ -150,6 +172,7 @@ impl App {
             workers_drain,
             draining,
             queue,
+            tls,
             listener,
             stop_listening,
             upkeep,
@@ -166,10 +189,12 @@ impl App {
     /// - An API key is shorter than 16 characters, is given twice, is not printable ASCII, or has
     ///   white space at an end.
     /// - A tenant name is not 1 to 64 letters, digits, `-`, `_` or `.`.
+    /// - A prefix or the secret of webhooks is invalid, or the secret is missing.
     pub fn check(config: &Config) -> anyhow::Result<()> {
         config.check()?;
         Pool::unopened(config)?;
         keys(config)?;
+        webhooks(&config.remote)?;
         Ok(())
     }
 
@@ -271,7 +296,7 @@ fn service(
     devices: &[Device],
     cost: &Arc<CostModel>,
     metrics: &Arc<Metrics>,
-    keys: Keys,
+    (keys, webhooks): (Keys, Webhooks),
     config: &Config,
 ) -> Service {
     let is_loopback = config.listen.ip().is_loopback();
@@ -287,6 +312,7 @@ fn service(
         ),
         metrics: Arc::clone(metrics),
         keys,
+        webhooks,
         hosts: Hosts(is_loopback.then(|| config.allowed_hosts.clone())),
         store_health: Arc::clone(&stores.health),
         limits: service_limits(&config.limits),
@@ -302,19 +328,23 @@ fn device_view(device: &Device) -> DeviceView {
     }
 }
 
+/// The certificate and the key of the public port.
+fn tls(config: &Config) -> anyhow::Result<Option<Arc<TlsSetup>>> {
+    let Some(tls) = &config.tls else {
+        return Ok(None);
+    };
+    let acceptor = tls_acceptor(&tls.certificate, &tls.key)?;
+    Ok(Some(Arc::new(TlsSetup::new(acceptor))))
+}
+
 /// The public port, with no more connections than the system allows open files.
 async fn open_listener(
-    config: &Config,
-    needs_key: bool,
+    address: SocketAddr,
+    tls: Option<Arc<TlsSetup>>,
+    mut options: ListenOptions,
     open_files: Option<usize>,
     metrics: &Arc<Metrics>,
 ) -> anyhow::Result<Listener> {
-    let tls = match &config.tls {
-        None => None,
-        Some(tls) => Some(tls_acceptor(&tls.certificate, &tls.key)?),
-    };
-    let mut options = listen_options(&config.limits);
-    options.needs_key = needs_key;
     if let Some(most) = open_files.filter(|&most| most < options.max_connections) {
         tracing::warn!(
             connections = most,
@@ -323,10 +353,10 @@ async fn open_listener(
         );
         options.max_connections = most.max(1);
     }
-    let listener = Listener::bind(config.listen, tls, options, Some(Arc::clone(metrics)));
+    let listener = Listener::bind(address, tls, options, Some(Arc::clone(metrics)));
     listener
         .await
-        .with_context(|| format!("cannot listen on {}", config.listen))
+        .with_context(|| format!("cannot listen on {address}"))
 }
 
 /// Waits until the last device of a kind has worked, is lost, and does not come back.

@@ -12,7 +12,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use super::failure::Failure;
 use super::output::say;
 use crate::app::App;
-use crate::config::{Config, LogFormat, NodeRole};
+use crate::config::{Config, ConfigError, LogFormat, NodeRole};
 use crate::telemetry::Telemetry;
 
 /// Time given to the remaining threads to end at shutdown.
@@ -29,6 +29,7 @@ const TO_LET_GO: Duration = Duration::from_secs(1);
 #[command(after_help = "Examples:\n  \
     fnsf serve\n  \
     fnsf serve --listen 0.0.0.0:8080 --config fnsf.toml\n  \
+    kill -HUP $(pidof fnsf)    # read API keys and TLS files again\n  \
     curl -F source=@a.pcd -F target=@b.pcd localhost:8080/v1/flow -o flow.npz")]
 pub(super) struct Serve {
     /// Configuration file, TOML; --print-config lists its keys
@@ -114,19 +115,24 @@ impl Serve {
             .enable_all()
             .build()
             .map_err(Failure::internal)?;
-        let served = runtime.block_on(serve(config));
+        let read_again = || Config::load(self.config.as_deref(), &self.flags);
+        let served = runtime.block_on(serve(config, read_again));
         // A thread that is blocked in disk I/O must not keep the process alive.
         runtime.shutdown_timeout(TO_LET_GO);
         served
     }
 }
 
-async fn serve(config: Config) -> Result<(), Failure> {
+async fn serve(
+    config: Config,
+    read_again: impl Fn() -> Result<Config, ConfigError>,
+) -> Result<(), Failure> {
     let telemetry = Telemetry::start(&config.log, config.otlp_endpoint.as_deref());
     let _flushed_at_the_end = telemetry.map_err(Failure::usage)?;
     // The handlers are installed before the server starts, so that no signal is missed.
     let mut terminate = signal(SignalKind::terminate()).map_err(Failure::internal)?;
     let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::internal)?;
+    let mut hang_up = signal(SignalKind::hangup()).map_err(Failure::internal)?;
     let mut app = App::start(config).await.map_err(Failure::internal)?;
     let admin = app.admin_address();
     match app.public_address() {
@@ -141,23 +147,40 @@ async fn serve(config: Config) -> Result<(), Failure> {
         .await
         .context("no device is ready")
         .map_err(Failure::internal)?;
-    let done = tokio::select! {
-        _ = terminate.recv() => {
-            tracing::info!("SIGTERM");
-            Ok(())
-        }
-        _ = interrupt.recv() => {
-            tracing::info!("SIGINT");
-            Ok(())
-        }
-        reason = app.given_up() => {
-            tracing::error!(reason, "this process cannot go on: stopping, for a fresh one");
-            Err(Failure::internal(anyhow!("this process cannot go on: {reason}")))
+    let done = loop {
+        tokio::select! {
+            _ = terminate.recv() => {
+                tracing::info!("SIGTERM");
+                break Ok(());
+            }
+            _ = interrupt.recv() => {
+                tracing::info!("SIGINT");
+                break Ok(());
+            }
+            _ = hang_up.recv() => reload(&app, read_again()),
+            reason = app.given_up() => {
+                tracing::error!(reason, "this process cannot go on: stopping, for a fresh one");
+                break Err(Failure::internal(anyhow!("this process cannot go on: {reason}")));
+            }
         }
     };
     tokio::select! {
         () = app.drain() => done,
         _ = terminate.recv() => done,
         _ = interrupt.recv() => done,
+    }
+}
+
+/// Takes the keys and the TLS files of the configuration as it is now, or goes on with those before.
+fn reload(app: &App, config: Result<Config, ConfigError>) {
+    let done = config.map_err(anyhow::Error::from);
+    match done.and_then(|config| app.reload(&config)) {
+        Ok(()) => tracing::info!("SIGHUP: keys and TLS files are read again"),
+        Err(error) => {
+            tracing::error!(
+                error = format!("{error:#}"),
+                "SIGHUP: keys and TLS files stay as they were"
+            );
+        }
     }
 }

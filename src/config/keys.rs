@@ -9,6 +9,7 @@ use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};
 
+use super::remote::RemoteConfig;
 use super::secret::Secret;
 use super::secret::wrong_values;
 use crate::api::Role;
@@ -82,6 +83,8 @@ pub struct Config {
     pub limits: LimitsConfig,
     /// Retries, leases and retention of jobs.
     pub queue: QueueConfig,
+    /// Other servers that callers may name.
+    pub remote: RemoteConfig,
     /// Times of the shutdown.
     pub shutdown: ShutdownConfig,
     /// Log format and filter.
@@ -300,6 +303,7 @@ impl Default for Config {
                 sync_result_retention_seconds: 60,
                 snapshot_interval_ms: 1000,
             },
+            remote: RemoteConfig::default(),
             shutdown: ShutdownConfig {
                 readiness_delay_seconds: 0,
                 timeout_seconds: 30,

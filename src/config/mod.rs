@@ -6,7 +6,9 @@
 
 mod keys;
 mod ranges;
+mod remote;
 mod secret;
 
 pub use keys::{Config, ConfigError, LimitsConfig, LogConfig, LogFormat, NodeRole, QueueConfig};
+pub use remote::RemoteConfig;
 pub use secret::Secret;

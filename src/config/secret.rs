@@ -90,7 +90,7 @@ impl<'de> Visitor<'de> for SecretVisitor {
 /// The errors of figment as one line, key by key. The values of keys that may be secret are left
 /// out.
 pub(super) fn wrong_values(error: figment::Error) -> String {
-    const SECRET: [&str; 3] = ["api_key", "keys", "tls"];
+    const SECRET: [&str; 4] = ["api_key", "keys", "remote", "tls"];
     let said = error.into_iter().map(|mut error| {
         let is_secret = error.path.first();
         if !is_secret.is_some_and(|first| SECRET.contains(&first.as_str())) {

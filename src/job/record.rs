@@ -164,9 +164,19 @@ pub struct Job {
     /// The report as JSON: a [`Report`](super::Report), or a [`DenseReport`](super::DenseReport) of
     /// a sequence with a dense cloud. None before success, and for other sequences.
     pub report: Option<String>,
+    /// The span of the request that submitted the job, as the value of a `traceparent` header (W3C
+    /// Trace Context). None if the request belongs to no trace.
+    pub trace: Option<String>,
+    /// The URL that is told of the job's end. None for the pairs of a sequence.
+    pub webhook: Option<String>,
 }
 
 impl Job {
+    /// The id of the trace that the job belongs to, 32 hexadecimal digits.
+    pub fn trace_id(&self) -> Option<&str> {
+        self.trace.as_deref()?.split('-').nth(1)
+    }
+
     /// For a pair: the job that owns its stored sweeps, and the indices of its source and its
     /// target among them. For a sequence the first value is its own id, and the indices have no
     /// meaning.

@@ -132,6 +132,12 @@ impl Metrics {
             .inc();
     }
 
+    /// Counts an attempt to tell a webhook in `fnsf_webhooks_total`; `outcome` is one of
+    /// [`super::WEBHOOK_OUTCOMES`].
+    pub fn webhook(&self, outcome: &'static str) {
+        self.webhooks.get_or_create(&Outcome { outcome }).inc();
+    }
+
     /// Sets `fnsf_store_ready`: true after a probe has written and read the queue and the blobs,
     /// false after a failure of the store.
     pub fn store(&self, ready: bool) {

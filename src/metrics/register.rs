@@ -175,6 +175,11 @@ impl Metrics {
         );
         registry.register("requests", "Requests answered", self.requests.clone());
         registry.register("connections", "Open connections", self.connections.clone());
+        registry.register(
+            "webhooks",
+            "Attempts to tell webhooks of the end of a job",
+            self.webhooks.clone(),
+        );
         registry.register_with_unit(
             "upload",
             "Bytes of request bodies",

@@ -10,7 +10,7 @@ use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::Histogram;
 use prometheus_client::registry::Registry;
 
-use super::labels::{CLASSES, PHASES, PROTOCOLS, REJECTIONS};
+use super::labels::{CLASSES, PHASES, PROTOCOLS, REJECTIONS, WEBHOOK_OUTCOMES};
 use super::process::ProcessCollector;
 use crate::flow::StopReason;
 use crate::job::{Priority, State};
@@ -102,6 +102,7 @@ pub struct Metrics {
     pub(super) rejected: Family<Reason, Counter>,
     pub(super) requests: Family<ProtocolAndClass, Counter>,
     pub(super) connections: Gauge,
+    pub(super) webhooks: Family<Outcome, Counter>,
     pub(super) upload_bytes: Counter,
     pub(super) snapshots: Counter,
     pub(super) resumed: Counter,
@@ -145,6 +146,7 @@ impl Metrics {
             rejected: Family::default(),
             requests: Family::default(),
             connections: Gauge::default(),
+            webhooks: Family::default(),
             upload_bytes: Counter::default(),
             snapshots: Counter::default(),
             resumed: Counter::default(),
@@ -176,6 +178,9 @@ impl Metrics {
         }
         for reason in REJECTIONS {
             drop(self.rejected.get_or_create(&Reason { reason }));
+        }
+        for outcome in WEBHOOK_OUTCOMES {
+            drop(self.webhooks.get_or_create(&Outcome { outcome }));
         }
         for priority in Priority::ALL {
             drop(self.queue_depth.get_or_create(&Urgency {

@@ -13,9 +13,9 @@ use super::local::Local;
 use super::node::{Capacities, Node};
 use super::sql::Sql;
 use super::transitions;
-use super::transitions::{expiry, leases, lists};
+use super::transitions::{expiry, leases, lists, outbox};
 use super::types::{
-    Committed, Filter, Outcome, Queue, QueueError, QueueOptions, Submission, Submitted,
+    Committed, Filter, Outcome, Outgoing, Queue, QueueError, QueueOptions, Submission, Submitted,
 };
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobId, Tenant};
@@ -237,6 +237,20 @@ impl<E: Engine> Queue for DatabaseQueue<E> {
             leases::finish(sql, effects, options, id, attempt, outcome.clone())
         })
         .await
+    }
+
+    async fn take_outgoing(&self, limit: u32, hold: Duration) -> Result<Vec<Outgoing>, QueueError> {
+        // A write would cost every idle node a commit.
+        if !self.engine.read(outbox::has_due).await? {
+            return Ok(Vec::new());
+        }
+        self.change(Kept::Soon, move |sql, _, _| outbox::take(sql, limit, hold))
+            .await
+    }
+
+    async fn settle(&self, actions: Vec<(i64, Option<Duration>)>) -> Result<(), QueueError> {
+        self.change(Kept::Soon, move |sql, _, _| outbox::settle(sql, &actions))
+            .await
     }
 
     fn backlog(&self) -> Backlog {

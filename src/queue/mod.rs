@@ -27,6 +27,6 @@ pub use node::{Capacities, Capacity, Node};
 pub use postgres::{PostgresOptions, open_postgres};
 pub use sqlite::open_sqlite;
 pub use types::{
-    Committed, Event, Filter, Idempotency, Outcome, PairOf, Queue, QueueError, QueueOptions,
-    Submission, Submitted,
+    Action, Committed, Event, Filter, Idempotency, Outcome, Outgoing, PairOf, Queue, QueueError,
+    QueueOptions, Submission, Submitted,
 };

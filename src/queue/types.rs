@@ -47,6 +47,11 @@ pub struct Submission {
     pub options: String,
     /// Texts by which [`Queue::list`] finds the job. Of a sequence, they are not those of its pairs.
     pub labels: Vec<String>,
+    /// The span of the request, as the value of a `traceparent` header. `None` without a trace.
+    pub trace: Option<String>,
+    /// The URL that is told of the job's end, by an [`Outgoing`] action. Of a sequence, it is not told
+    /// of the pairs.
+    pub webhook: Option<String>,
     /// Time at which the best flow so far is returned. A job that is still queued then expires. It
     /// does not apply to a closing job. `None`: [`QueueOptions::time_to_live`] limits the wait.
     pub deadline: Option<Timestamp>,
@@ -78,6 +83,8 @@ impl Submission {
             cost_seconds: 0.0,
             options: String::new(),
             labels: Vec::new(),
+            trace: None,
+            webhook: None,
             deadline: None,
             idempotency: None,
             durable: true,
@@ -274,7 +281,7 @@ impl QueueError {
     }
 }
 
-/// An event of the queue, for the metrics and the cleanup of blobs.
+/// An event of the queue, for the metrics.
 #[derive(Clone, Debug)]
 pub enum Event {
     /// A job was accepted. A sequence sends it for each pair and for itself.
@@ -291,8 +298,36 @@ pub enum Event {
     /// A job ended. A sequence sends it for each pair and for itself. An ephemeral job that the
     /// recovery removes before its end does not send it.
     Ended(Arc<Job>),
-    /// A job was removed from the queue: its payload, snapshot and result can be removed.
+    /// A job was removed from the queue. Its files are removed by an [`Outgoing`] action.
     Deleted(JobId),
+}
+
+/// An action outside the queue that a commit has promised. It stays in the outbox of the queue until
+/// [`Queue::settle`] reports it done, so it may be done more than once.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Outgoing {
+    /// Its number: no other action of the queue has it, and repetitions keep it.
+    pub number: i64,
+    /// The job that it is about.
+    pub job: JobId,
+    /// Number of times that it was taken, this one included.
+    pub attempts: u32,
+    /// What to do.
+    pub action: Action,
+}
+
+/// What an [`Outgoing`] action does.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Action {
+    /// Removes payload, snapshot and result of a job that the queue has forgotten.
+    RemoveFiles,
+    /// Sends a body to a URL: that of a job that has ended.
+    Notify {
+        /// Where to.
+        url: String,
+        /// The JSON of [`crate::job::ended_notice`].
+        body: String,
+    },
 }
 
 /// The job queue: submission, subscription, leases for workers, completion, cancellation and
@@ -375,7 +410,7 @@ pub trait Queue: Send + Sync {
     async fn requeue(&self, id: JobId, lost: bool) -> Result<Arc<Job>, QueueError>;
 
     /// Removes an ended job and, of a sequence, its pairs: payload, snapshot and result go with
-    /// [`Event::Deleted`], and its idempotency key is free again. A job that another one follows is
+    /// [`Action::RemoveFiles`], and its idempotency key is free again. A job that another one follows is
     /// removed after the end of that one.
     ///
     /// # Errors
@@ -414,6 +449,20 @@ pub trait Queue: Send + Sync {
         attempt: u32,
         outcome: Outcome,
     ) -> Result<Committed, QueueError>;
+
+    /// Takes up to `limit` due actions of the outbox, the earliest first. No other node gets them for
+    /// `hold`; an action that is not settled until then is due again.
+    ///
+    /// # Errors
+    /// An error of the store.
+    async fn take_outgoing(&self, limit: u32, hold: Duration) -> Result<Vec<Outgoing>, QueueError>;
+
+    /// Ends actions of the outbox: removes those that are done, and makes the others due after the
+    /// delay that is given.
+    ///
+    /// # Errors
+    /// An error of the store.
+    async fn settle(&self, actions: Vec<(i64, Option<Duration>)>) -> Result<(), QueueError>;
 
     /// The load of the jobs that are queued and running now.
     fn backlog(&self) -> Backlog;

@@ -33,11 +33,6 @@ impl<E: Into<StoreError>> From<E> for Unprepared {
 
 impl Worker {
     /// Densifies a sequence and returns how the attempt ended.
-    #[tracing::instrument(
-        name = "densify",
-        skip_all,
-        fields(job = %lease.job.id, attempt = lease.job.attempt, device = self.lane.device().name())
-    )]
     pub(super) async fn densify(&self, lease: &Lease) -> Attempt {
         let control = Arc::new(DenseControl::new(
             lease.heartbeat.clone(),

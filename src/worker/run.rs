@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
+use tracing::{Instrument, Span};
 
 use super::isolation::IsolationGuard;
 use super::isolation::IsolationLock;
@@ -21,6 +22,7 @@ use crate::metrics::Metrics;
 use crate::payload::{StoredDense, StoredFlow};
 use crate::queue::{Lease, Outcome, Queue, QueueError, Signal};
 use crate::storage::Blobs;
+use crate::trace;
 
 /// Options of a worker.
 #[derive(Clone, Debug)]
@@ -126,10 +128,13 @@ impl Worker {
             };
             match lease {
                 Ok(lease) => {
+                    let span = self.span(&lease.job);
                     let attempt = match (self.apart(&lease, &mut inside).await, lease.job.kind) {
                         (Some(ended), _) => ended,
-                        (None, Kind::Pair) => self.attempt(&lease).await,
-                        (None, Kind::Sequence) => self.densify(&lease).await,
+                        (None, Kind::Pair) => self.attempt(&lease).instrument(span.clone()).await,
+                        (None, Kind::Sequence) => {
+                            self.densify(&lease).instrument(span.clone()).await
+                        }
                     };
                     drop(inside);
                     if let Some(before) = committing.take() {
@@ -137,9 +142,10 @@ impl Worker {
                     }
                     // The device continues with the next job while this result is being stored.
                     let worker = self.clone();
-                    committing = Some(tokio::spawn(async move {
+                    let commit = async move {
                         alive(&lease, worker.commit(&lease, attempt)).await;
-                    }));
+                    };
+                    committing = Some(tokio::spawn(commit.instrument(span)));
                 }
                 Err(QueueError::Closed) => break,
                 Err(error) => self.store.health().failed(&error),
@@ -148,6 +154,16 @@ impl Worker {
         if let Some(last) = committing {
             let _its_own_errors_are_logged = last.await;
         }
+    }
+
+    /// The span of an attempt, in the trace of the request that submitted the job.
+    fn span(&self, job: &Job) -> Span {
+        let device = self.lane.device().name();
+        let trace_id = tracing::field::Empty;
+        let span =
+            tracing::info_span!("attempt", job = %job.id, attempt = job.attempt, device, trace_id);
+        trace::join(&span, job.trace.as_deref());
+        span
     }
 
     /// Isolates a suspect job, so that another crash affects only this job. Returns the end of the
@@ -208,11 +224,6 @@ impl Worker {
     }
 
     /// Runs one attempt at a pair and returns how it ended.
-    #[tracing::instrument(
-        name = "attempt",
-        skip_all,
-        fields(job = %lease.job.id, attempt = lease.job.attempt, device = self.lane.device().name())
-    )]
     async fn attempt(&self, lease: &Lease) -> Attempt {
         let job = &lease.job;
         let (work, keeper, options) = match alive(lease, self.prepare(lease)).await {

@@ -126,6 +126,8 @@ impl Stand {
             pairs: Vec::new(),
             finalizer_seconds: None,
             labels: Vec::new(),
+            trace: None,
+            webhook: None,
             after,
             has_dependents: true,
             priority: Priority::Normal,

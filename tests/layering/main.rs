@@ -227,7 +227,6 @@ fn each_protocol_has_one_room() {
         "api/listener",
         "api/routes.rs",
         "api/origin.rs",
-        "api/trace_context.rs",
         "api/grpc/",
     ];
     let stray: Vec<_> = http

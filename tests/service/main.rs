@@ -37,10 +37,13 @@ mod raw_http;
 mod readme;
 #[path = "../common/real_data.rs"]
 mod real_data;
+mod reload;
 mod removal;
 mod retries;
 mod sequences;
 mod server;
 mod store_trouble;
 mod tracks;
+mod upgrade;
+mod webhooks;
 mod windows;

@@ -10,18 +10,18 @@ use super::convert;
 use crate::api::admission::Durability;
 use crate::api::auth::Caller;
 use crate::api::error::ApiError;
-use crate::api::pending_job::{ReceivedAt, Request as JobRequest};
+use crate::api::pending_job::{Received, Request as JobRequest};
 use crate::job::JobOptions;
 use crate::queue::PairOf;
 
 /// A stream of responses.
 pub(super) type ResultBudget<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
-/// The caller, the arrival time, and the remaining time of a call.
+/// The caller, the arrival, and the remaining time of a call.
 #[derive(Clone)]
 pub(super) struct Call {
     pub(super) caller: Caller,
-    pub(super) arrived: Instant,
+    pub(super) received: Received,
     time_left: Option<Duration>,
 }
 
@@ -33,10 +33,13 @@ impl Call {
     pub(super) fn of<T>(request: &Request<T>) -> Result<Self, ApiError> {
         let extensions = request.extensions();
         let caller = extensions.get::<Caller>().cloned();
-        let arrived = extensions.get::<ReceivedAt>().map(|arrived| arrived.0);
+        let received = extensions.get::<Received>().cloned();
         Ok(Self {
             caller: caller.ok_or(ApiError::Unauthenticated)?,
-            arrived: arrived.unwrap_or_else(Instant::now),
+            received: received.unwrap_or_else(|| Received {
+                at: Instant::now(),
+                trace: None,
+            }),
             time_left: convert::time_left(request.metadata()),
         })
     }
@@ -49,7 +52,7 @@ impl Call {
             options,
             durability,
             idempotency_key: None,
-            arrived: self.arrived,
+            received: self.received.clone(),
             time_left: self.time_left.filter(|_| awaited),
             link: None,
             pair: PairOf::ALONE,

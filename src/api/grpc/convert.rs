@@ -84,6 +84,7 @@ pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, Api
         deadline_ms: message.deadline_ms,
         priority,
         labels: Labels(message.labels.into_iter().collect()),
+        webhook: Some(message.webhook).filter(|url| !url.is_empty()),
         densify: message.densify.map(densify).transpose()?,
     };
     options.check()?;
@@ -209,6 +210,7 @@ pub(super) fn job(job: &Job) -> proto::Job {
         pairs: job.pairs,
         pairs_left: job.pairs_left,
         labels: Labels::of_options(&job.options).0.into_iter().collect(),
+        trace_id: job.trace_id().unwrap_or_default().to_owned(),
     }
 }
 

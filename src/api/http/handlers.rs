@@ -19,7 +19,7 @@ use crate::api::admission::Durability;
 use crate::api::auth::Caller;
 use crate::api::codec::AnswerFormat;
 use crate::api::error::ApiError;
-use crate::api::pending_job::{Accepted, PendingJob, ReceivedAt, Request as JobRequest};
+use crate::api::pending_job::{Accepted, PendingJob, Received, Request as JobRequest};
 use crate::api::service::{MakeDurable, Service, Waited};
 use crate::api::sweep_order::SweepOrder;
 use crate::formats::PoseFile;
@@ -33,11 +33,11 @@ pub(super) const MAX_POLL: Duration = Duration::from_secs(60);
 struct RequestHeaders {
     prefer: Prefer,
     key: Option<String>,
-    arrived: ReceivedAt,
+    received: Received,
 }
 
 impl RequestHeaders {
-    fn of(headers: &HeaderMap, arrived: ReceivedAt) -> Result<Self, ApiError> {
+    fn of(headers: &HeaderMap, received: Received) -> Result<Self, ApiError> {
         let key = match headers.get("idempotency-key") {
             None => None,
             Some(value) => {
@@ -50,7 +50,7 @@ impl RequestHeaders {
         Ok(Self {
             prefer: Prefer::from_headers(headers),
             key,
-            arrived,
+            received,
         })
     }
 
@@ -60,7 +60,7 @@ impl RequestHeaders {
             options,
             durability,
             idempotency_key: self.key.clone(),
-            arrived: self.arrived.0,
+            received: self.received.clone(),
             time_left: self.prefer.wait.filter(|_| wait_is_deadline),
             link: None,
             pair: PairOf::ALONE,
@@ -95,7 +95,7 @@ impl RequestHeaders {
 pub(super) async fn estimate(
     State(service): State<Arc<Service>>,
     Extension(caller): Extension<Caller>,
-    Extension(arrived): Extension<ReceivedAt>,
+    Extension(received): Extension<Received>,
     headers: HeaderMap,
     request: Request,
 ) -> Result<Response, ApiError> {
@@ -103,7 +103,7 @@ pub(super) async fn estimate(
         .get(header::ACCEPT)
         .and_then(|value| value.to_str().ok());
     let format = AnswerFormat::accepted(accept)?;
-    let asked = RequestHeaders::of(&headers, arrived)?;
+    let asked = RequestHeaders::of(&headers, received)?;
     let durability = match asked.prefer {
         Prefer {
             respond_async: true,
@@ -202,11 +202,11 @@ async fn read_pair(
 pub(super) async fn submit_job(
     State(service): State<Arc<Service>>,
     Extension(caller): Extension<Caller>,
-    Extension(arrived): Extension<ReceivedAt>,
+    Extension(received): Extension<Received>,
     headers: HeaderMap,
     request: Request,
 ) -> Result<Response, ApiError> {
-    let asked = RequestHeaders::of(&headers, arrived)?;
+    let asked = RequestHeaders::of(&headers, received)?;
     submit(&service, caller, &asked, request).await
 }
 
@@ -231,11 +231,11 @@ pub(super) async fn submit_job(
 pub(super) async fn submit_sequence(
     service: State<Arc<Service>>,
     caller: Extension<Caller>,
-    arrived: Extension<ReceivedAt>,
+    received: Extension<Received>,
     headers: HeaderMap,
     request: Request,
 ) -> Result<Response, ApiError> {
-    submit_job(service, caller, arrived, headers, request).await
+    submit_job(service, caller, received, headers, request).await
 }
 
 /// Reads a body with source and target, or with sweeps, and submits it as a durable job.

@@ -73,7 +73,7 @@ pub(super) async fn share(
     caller.has_key()?;
     let job = service.job(&caller, id).await?;
     let expires = Timestamp::now().after(Duration::from_secs(seconds));
-    let token = service.keys.share(&caller.tenant, job.id, expires);
+    let token = service.keys.get().share(&caller.tenant, job.id, expires);
     let path = format!("/#/jobs/{}", job.id);
     Ok(Json(ShareLink {
         path: match &token {

@@ -42,6 +42,8 @@ pub(super) struct JobView {
     /// The report on the estimate. For a sequence with `densify`, the report on its dense cloud.
     #[schema(value_type = Option<Reported>)]
     report: Option<Box<RawValue>>,
+    /// The id of the trace of the request that submitted the job.
+    trace_id: Option<String>,
     /// The pairs of a sequence.
     #[serde(skip_serializing_if = "Option::is_none")]
     pairs: Option<PairsView>,
@@ -125,6 +127,7 @@ impl JobView {
             dead_letter: job.dead,
             options: raw(&job.options),
             report: job.report.as_deref().and_then(raw),
+            trace_id: job.trace_id().map(str::to_owned),
             pairs: (job.kind == Kind::Sequence).then(|| PairsView {
                 total: job.pairs,
                 ended: job.pairs - job.pairs_left,

@@ -12,4 +12,4 @@ mod stall;
 
 pub(super) use connections::Asking;
 pub(crate) use serve::HasRoom;
-pub use serve::{ListenOptions, Listener, TlsError, tls_acceptor};
+pub use serve::{ListenOptions, Listener, TlsError, TlsSetup, tls_acceptor};

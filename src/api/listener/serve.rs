@@ -39,6 +39,7 @@ use super::handshake::Opening;
 use super::stall::Stall;
 use crate::health::{HEARTBEAT, Heartbeat};
 use crate::metrics::Metrics;
+use crate::sync::Exchange;
 
 /// The limits of a port and its connections.
 #[derive(Clone, Debug)]
@@ -139,10 +140,25 @@ const EVICTION: Duration = Duration::from_millis(200);
 /// A bound TCP port, which [`Listener::serve`] serves over HTTP/1.1 and HTTP/2.
 pub struct Listener {
     listener: TcpListener,
-    tls: Option<TlsAcceptor>,
+    tls: Option<Arc<TlsSetup>>,
     options: ListenOptions,
     metrics: Option<Arc<Metrics>>,
     heartbeat: Arc<Heartbeat>,
+}
+
+/// The certificate and the key of a port, which can be exchanged.
+pub struct TlsSetup(Exchange<TlsAcceptor>);
+
+impl TlsSetup {
+    /// The setup of a port that begins with this acceptor.
+    pub fn new(acceptor: TlsAcceptor) -> Self {
+        Self(Exchange::new(acceptor))
+    }
+
+    /// Exchanges the acceptor of the connections from now on.
+    pub fn set(&self, acceptor: TlsAcceptor) {
+        self.0.set(acceptor);
+    }
 }
 
 /// Why TLS cannot be configured.
@@ -193,7 +209,7 @@ impl Listener {
     /// The error of the operating system, for example if the address is in use.
     pub async fn bind(
         address: SocketAddr,
-        tls: Option<TlsAcceptor>,
+        tls: Option<Arc<TlsSetup>>,
         options: ListenOptions,
         metrics: Option<Arc<Metrics>>,
     ) -> std::io::Result<Self> {
@@ -276,7 +292,8 @@ impl Listener {
             };
             let entry = table.enter(address);
             let (router, stop) = (router.clone(), stop.clone());
-            let (tls, options) = (self.tls.clone(), self.options.clone());
+            let tls = self.tls.as_ref().map(|tls| tls.0.get());
+            let options = self.options.clone();
             let answers = Arc::clone(&answers);
             let open = self.metrics.as_ref().map(|metrics| metrics.connection());
             connections.spawn(async move {
@@ -307,7 +324,7 @@ async fn room_for(room: &Arc<Semaphore>, table: &Connections) -> Option<OwnedSem
 
 async fn converse(
     stream: TcpStream,
-    tls: Option<TlsAcceptor>,
+    tls: Option<Arc<TlsAcceptor>>,
     options: &ListenOptions,
     served: Served,
     stop: CancellationToken,

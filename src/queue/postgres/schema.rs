@@ -10,15 +10,39 @@ use crate::queue::sql::{Sql, values};
 use crate::queue::types::QueueError;
 
 /// The schema version that this program reads and writes.
-const VERSION: i64 = 2;
+const VERSION: i64 = 3;
+
+/// The oldest schema version that is upgraded.
+const OLDEST: i64 = 2;
+
+/// The changes from each version to the next, beginning with [`OLDEST`]. Nodes of the version before
+/// may still run: they must get along with the tables.
+const UPGRADES: [&[&str]; (VERSION - OLDEST) as usize] = [&[
+    "ALTER TABLE jobs ADD COLUMN trace text, ADD COLUMN webhook text",
+    OUTBOX,
+    OUTBOX_DUE,
+]];
+
+const OUTBOX: &str = "CREATE TABLE outbox (
+        seq bigint GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
+        job bytea NOT NULL,
+        due bigint NOT NULL,
+        attempts bigint NOT NULL,
+        url text,
+        body text
+    ) WITH (autovacuum_vacuum_scale_factor = 0, autovacuum_vacuum_threshold = 1000)";
+
+const OUTBOX_DUE: &str = "CREATE INDEX outbox_due ON outbox (due)";
 
 /// `jobs` has the columns of the embedded queue, with the same meanings. Rows change often, so
 /// pages keep room for new versions of a row, and the table is vacuumed early.
 ///
 /// `nodes` has a row for each process that takes part. `commits` has the last commit of each
 /// connection of a node: it decides whether a transaction was committed whose answer was lost.
-/// `labels` has one row for each label of a job, with the job's tenant as `owner`. `summary` has one row, the last count of the load.
-const TABLES: [&str; 19] = [
+/// `labels` has one row for each label of a job, with the job's tenant as `owner`. `outbox` has one
+/// row for each action outside the database that a commit has promised: a notice to `url`, or without
+/// one the removal of the job's files. `summary` has one row, the last count of the load.
+const TABLES: [&str; 21] = [
     "CREATE TABLE meta (version bigint NOT NULL, identity bigint NOT NULL)",
     "CREATE TABLE nodes (
         id integer GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
@@ -88,7 +112,9 @@ const TABLES: [&str; 19] = [
         error_retryable smallint NOT NULL,
         dead smallint NOT NULL,
         cancel_requested smallint NOT NULL,
-        report text
+        report text,
+        trace text,
+        webhook text
     ) WITH (fillfactor = 70, autovacuum_vacuum_scale_factor = 0.02,
             autovacuum_vacuum_cost_delay = 0, autovacuum_analyze_scale_factor = 0.05)",
     "CREATE UNIQUE INDEX jobs_id ON jobs (id)",
@@ -115,6 +141,8 @@ const TABLES: [&str; 19] = [
         PRIMARY KEY (owner, label, job)
     )",
     "CREATE INDEX labels_job ON labels (job)",
+    OUTBOX,
+    OUTBOX_DUE,
 ];
 
 /// Creates the tables in an empty database, or checks their version. Returns the number that
@@ -156,7 +184,21 @@ fn create(sql: &dyn Sql, identity: i32) -> Result<i32, QueueError> {
     }
     let row = sql.only("SELECT version, identity FROM meta", &[])?;
     let version: i64 = row.get(0)?;
-    if version != VERSION {
+    if (OLDEST..VERSION).contains(&version) {
+        for change in UPGRADES[(version - OLDEST) as usize..]
+            .iter()
+            .copied()
+            .flatten()
+        {
+            sql.query(change, &[])?;
+        }
+        sql.query("UPDATE meta SET version = ?1", values![VERSION])?;
+        tracing::info!(
+            from = version,
+            to = VERSION,
+            "the queue's database is upgraded"
+        );
+    } else if version != VERSION {
         return Err(QueueError::Store(format!(
             "the queue's database has schema version {version}, this program knows {VERSION}: run \
              the program of that version"

@@ -11,7 +11,25 @@ use crate::queue::database::new_identity;
 use crate::queue::types::QueueError;
 
 /// The schema version that this program reads and writes; stored in `user_version`.
-pub(super) const VERSION: i64 = 8;
+pub(super) const VERSION: i64 = 9;
+
+/// The oldest schema version that is upgraded.
+const OLDEST: i64 = 8;
+
+/// The changes from each version to the next, beginning with [`OLDEST`].
+const UPGRADES: [&str; (VERSION - OLDEST) as usize] = ["
+ALTER TABLE jobs ADD COLUMN trace TEXT;
+ALTER TABLE jobs ADD COLUMN webhook TEXT;
+CREATE TABLE outbox (
+    seq INTEGER PRIMARY KEY AUTOINCREMENT,
+    job BLOB NOT NULL,
+    due INTEGER NOT NULL,
+    attempts INTEGER NOT NULL,
+    url TEXT,
+    body TEXT
+);
+CREATE INDEX outbox_due ON outbox (due);
+"];
 
 /// `due` is the next time at which the expiry handles a row: the expiry or the end of the retry
 /// delay of a queued job, the end of a running job's lease, or the end of an ended job's retention.
@@ -20,7 +38,9 @@ pub(super) const VERSION: i64 = 8;
 /// job is queued. `origin` is the node that accepted a job, and `holder` the node whose worker holds
 /// it or held it last.
 ///
-/// `labels` has one row for each label of a job, with the job's tenant as `owner`.
+/// `labels` has one row for each label of a job, with the job's tenant as `owner`. `outbox` has one
+/// row for each action outside the database that a commit has promised: a notice to `url`, or without
+/// one the removal of the job's files.
 const TABLE: &str = "
 CREATE TABLE jobs (
     seq INTEGER PRIMARY KEY,
@@ -71,7 +91,9 @@ CREATE TABLE jobs (
     error_retryable INTEGER NOT NULL,
     dead INTEGER NOT NULL,
     cancel_requested INTEGER NOT NULL,
-    report TEXT
+    report TEXT,
+    trace TEXT,
+    webhook TEXT
 );
 CREATE UNIQUE INDEX jobs_id ON jobs (id);
 CREATE UNIQUE INDEX jobs_key ON jobs (tenant, idempotency_key) WHERE idempotency_key IS NOT NULL;
@@ -94,6 +116,15 @@ CREATE TABLE labels (
     PRIMARY KEY (owner, label, job)
 ) WITHOUT ROWID;
 CREATE INDEX labels_job ON labels (job);
+CREATE TABLE outbox (
+    seq INTEGER PRIMARY KEY AUTOINCREMENT,
+    job BLOB NOT NULL,
+    due INTEGER NOT NULL,
+    attempts INTEGER NOT NULL,
+    url TEXT,
+    body TEXT
+);
+CREATE INDEX outbox_due ON outbox (due);
 ";
 
 /// Opens the connection of the writer.
@@ -130,10 +161,17 @@ fn migrate(connection: &mut Connection) -> Result<(), QueueError> {
             transaction.pragma_update(None, "user_version", VERSION)?;
         }
         VERSION => {}
-        older if older < VERSION => {
+        older @ OLDEST..VERSION => {
+            for upgrade in &UPGRADES[(older - OLDEST) as usize..] {
+                transaction.execute_batch(upgrade)?;
+            }
+            transaction.pragma_update(None, "user_version", VERSION)?;
+            tracing::info!(from = older, to = VERSION, "the queue's file is upgraded");
+        }
+        older if older < OLDEST => {
             return Err(QueueError::Store(format!(
-                "the queue's file has version {older} of a program that was never released, this \
-                 one knows {VERSION}: name another data_dir"
+                "the queue's file has version {older}, this program upgrades {OLDEST} and later: \
+                 name another data_dir"
             )));
         }
         newer => {

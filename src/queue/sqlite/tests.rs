@@ -14,7 +14,7 @@ use crate::queue::contract_tests::{Stand, queue_contract, submission};
 use crate::queue::database::Engine;
 use crate::queue::lease::Signal;
 use crate::queue::sql::for_sqlite;
-use crate::queue::transitions::{expiry, fair_queue, leases, lists};
+use crate::queue::transitions::{expiry, fair_queue, leases, lists, outbox};
 use crate::queue::types::{Event, Filter, Queue, QueueError, QueueOptions};
 
 /// A folder in which the queue is opened repeatedly.
@@ -96,6 +96,7 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
         (fair_queue::LAST_OF_TENANT, 2),
         (expiry::OLDEST, 0),
         (expiry::NEXT_DUE, 0),
+        (outbox::DUE, 2),
     ] {
         let plan = plan(&connection, sql, parameters);
         assert!(!plan.contains("TEMP B-TREE"), "{sql}: {plan}");

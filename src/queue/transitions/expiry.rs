@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::finish::End;
-use super::{fair_queue, finish, leases, rows};
+use super::{fair_queue, finish, leases, outbox, rows};
 use crate::clock::Timestamp;
 use crate::job::{Job, JobError, JobId, Kind, State};
 use crate::queue::effects::Effects;
@@ -160,13 +160,14 @@ fn forget_or_keep(
 
 /// Removes an ended job and its pairs.
 fn forget(sql: &dyn Sql, effects: &mut Effects, id: JobId) -> Result<(), QueueError> {
-    for pair in rows::pairs(sql, id)? {
-        effects.events.push(Event::Deleted(pair.id));
+    let pairs = rows::pairs(sql, id)?;
+    for id in pairs.iter().map(|pair| pair.id).chain([id]) {
+        outbox::remove_files(sql, id)?;
+        effects.events.push(Event::Deleted(id));
     }
     sql.query("DELETE FROM jobs WHERE parent = ?1", values![id])?;
     sql.query("DELETE FROM jobs WHERE id = ?1", values![id])?;
     sql.query("DELETE FROM labels WHERE job = ?1", values![id])?;
-    effects.events.push(Event::Deleted(id));
     Ok(())
 }
 

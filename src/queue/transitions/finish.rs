@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::rows::{COLUMNS, state_code};
-use super::{fair_queue, rows};
+use super::{fair_queue, outbox, rows};
 use crate::job::{Job, JobError, JobId, JobProgress, Kind, State};
 use crate::queue::effects::Effects;
 use crate::queue::sql::{Sql, values};
@@ -72,6 +72,7 @@ pub(super) fn end(
         };
         list.push(Arc::clone(&ended));
     }
+    outbox::notify(sql, &ended)?;
     effects.changed.push(Arc::clone(&ended));
     effects.events.push(Event::Ended(ended));
     fair_queue::release_followers(sql, effects, job)?;

@@ -13,6 +13,7 @@ pub(super) mod fair_queue;
 mod finish;
 pub(super) mod leases;
 pub(super) mod lists;
+pub(super) mod outbox;
 mod rows;
 mod submit;
 

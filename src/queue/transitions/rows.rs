@@ -10,7 +10,7 @@ pub(super) const COLUMNS: &str = "id, tenant, kind, parent, pair_index, pairs, p
     state, durable, attempt, cost, options, created, started, finished, deadline, progress_done, \
     progress_total, loss, stop_reason, error_code, error_message, error_retryable, dead, \
     cancel_requested, report, device, backward, after, has_dependents, ready, sees_from, sees_to, \
-    crashes";
+    crashes, trace, webhook";
 
 pub(super) fn state_code(state: State) -> i64 {
     match state {
@@ -101,6 +101,8 @@ pub(super) fn job(row: &Row) -> Result<Job, QueueError> {
         ready: moment(31)?,
         window: [row.get(32)?, row.get(33)?],
         crashes: row.get(34)?,
+        trace: row.get(35)?,
+        webhook: row.get(36)?,
     })
 }
 

@@ -47,6 +47,7 @@ pub(in crate::queue) fn submit(
                     has_dependents: next.is_some_and(|next| next.chained),
                     idempotency: None,
                     labels: Vec::new(),
+                    webhook: None,
                     ..submission.clone()
                 };
                 let place = Place {
@@ -151,10 +152,10 @@ fn insert(
          device, state, durable, delayed, attempt, failures, crashes, delays, cost, \
          virtual_start, virtual_finish, options, idempotency_key, fingerprint, created, deadline, \
          expires, due, error_retryable, dead, cancel_requested, backward, after, has_dependents, \
-         ready, closes, sees_from, sees_to, origin) \
+         ready, closes, sees_from, sees_to, origin, trace, webhook) \
          VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?6, ?7, ?19, 0, ?8, 0, 0, 0, 0, 0, \
          ?9, ?10, ?11, ?12, ?13, ?14, ?15, ?16, ?17, ?18, 0, 0, 0, ?20, ?21, ?22, ?23, ?24, ?25, \
-         ?26, ?27) RETURNING {COLUMNS}"
+         ?26, ?27, ?28, ?29) RETURNING {COLUMNS}"
     );
     let idempotency = submission.idempotency.as_ref();
     let row = sql.only(
@@ -187,6 +188,8 @@ fn insert(
             submission.pair.window[0],
             submission.pair.window[1],
             sql.node(),
+            submission.trace.as_deref(),
+            submission.webhook.as_deref(),
         ],
     )?;
     for label in &submission.labels {

@@ -1,0 +1,19 @@
+//! Other servers that callers may name.
+
+use serde::{Deserialize, Serialize};
+
+use super::secret::Secret;
+
+/// Other servers that callers may name. By default none.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RemoteConfig {
+    /// Prefixes of the URLs that jobs may name as their webhook, such as
+    /// `https://hooks.example.com/fnsf/`. Each ends with a slash.
+    pub webhooks: Vec<String>,
+    /// Secret of the signatures of webhooks: `whsec_` and at least 24 random bytes in base64. Needed
+    /// with `webhooks`.
+    pub webhook_secret: Option<Secret>,
+    /// Allow private addresses, such as 10.0.0.1 and this machine, behind these prefixes.
+    pub allow_private_addresses: bool,
+}
