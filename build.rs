@@ -25,12 +25,14 @@ fn main() -> Result<(), Box<dyn Error>> {
     fs::create_dir_all(&client)?;
     tonic_prost_build::configure()
         .bytes(".")
+        .boxed(".fnsf.v1.SubmitJobRequest.Begin.options")
         .boxed(".fnsf.v1.Options.field")
         .boxed(".fnsf.v1.EstimateSequenceResponse.Pair.outcome.header")
         .build_client(false)
         .compile_fds(descriptors.clone())?;
     tonic_prost_build::configure()
         .bytes(".")
+        .boxed(".fnsf.v1.SubmitJobRequest.Begin.options")
         .boxed(".fnsf.v1.Options.field")
         .boxed(".fnsf.v1.EstimateSequenceResponse.Pair.outcome.header")
         .build_server(false)

@@ -76,6 +76,8 @@ fn submission(tenant: &str, pairs: u32, cost_seconds: f64) -> Submission {
         cost_seconds,
         options: "{}".to_owned(),
         labels: Vec::new(),
+        trace: None,
+        webhook: None,
         deadline: None,
         idempotency: None,
         durable: true,

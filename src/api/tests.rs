@@ -27,7 +27,7 @@ use crate::cost::{CostModel, Lanes};
 use crate::job::{Priority, Tenant};
 use crate::metrics::Metrics;
 use crate::queue::{QueueOptions, open_sqlite};
-use crate::remote::{Allowed, Webhooks};
+use crate::remote::Webhooks;
 use crate::storage::Blobs;
 
 /// Time after which a request that has not returned counts as a busy loop.
@@ -70,7 +70,7 @@ fn service(folder: &std::path::Path) -> Arc<Service> {
         blobs: Blobs::open(&folder.join("blobs")).expect("a store"),
         metrics: Arc::new(Metrics::new(&["cpu"])),
         keys: Keys::default(),
-        webhooks: Webhooks::new(Allowed::default(), None, false),
+        webhooks: Webhooks::off(),
         hosts: Hosts(None),
         store_health: Arc::default(),
         limits: ServiceLimits {

@@ -1,5 +1,6 @@
 //! The server process: assembles the components, starts them in order, and stops them in order.
 
+mod backup;
 mod devices;
 mod housekeeping;
 mod outbox;
@@ -12,4 +13,5 @@ mod stores;
 #[cfg(test)]
 mod tests;
 
+pub use backup::{Backup, backup, restore};
 pub use start::App;

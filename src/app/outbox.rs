@@ -94,12 +94,8 @@ impl Outbox {
         self.metrics
             .webhook(if again { "retried" } else { "given_up" });
         let attempt = one.attempts;
-        match again {
-            true => tracing::info!(%error, job = %one.job, attempt, "a webhook was not told"),
-            false => {
-                tracing::warn!(%error, job = %one.job, attempt, "a webhook is not told any more")
-            }
-        }
+        let (job, then) = (one.job, if again { "again later" } else { "no more" });
+        tracing::warn!(%error, %job, attempt, then, "a webhook was not told");
         again
     }
 }

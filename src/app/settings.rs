@@ -38,22 +38,23 @@ pub(super) fn keys(config: &Config) -> anyhow::Result<Keys> {
     Ok(keys)
 }
 
-/// The webhooks that jobs may name, and the key of their signatures.
+/// The webhooks that jobs may name, and the key of their signatures; `None` if there are none.
 ///
 /// # Errors
 /// If a prefix or the secret is invalid, or prefixes are without a secret.
-pub(super) fn webhooks(config: &RemoteConfig) -> anyhow::Result<(Allowed, Option<SigningSecret>)> {
+pub(super) fn webhooks(config: &RemoteConfig) -> anyhow::Result<Option<(Allowed, SigningSecret)>> {
     let allowed = Allowed::new(&config.webhooks, &["https", "http"]).context("remote.webhooks")?;
     let secret = config.webhook_secret.as_ref();
     let secret = secret.map(|secret| SigningSecret::parse(secret.reveal()));
     let secret = secret.transpose().context("remote.webhook_secret")?;
-    if secret.is_none() && !allowed.is_empty() {
-        anyhow::bail!(
+    match secret {
+        _ if allowed.is_empty() => Ok(None),
+        Some(secret) => Ok(Some((allowed, secret))),
+        None => anyhow::bail!(
             "remote.webhooks needs remote.webhook_secret, by which receivers know that a notice is \
              genuine: make one with echo whsec_$(openssl rand -base64 32)"
-        );
+        ),
     }
-    Ok((allowed, secret))
 }
 
 pub(super) fn queue_options(config: &QueueConfig) -> QueueOptions {

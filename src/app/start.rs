@@ -81,7 +81,7 @@ impl App {
             );
         }
         let keys = keys(&config)?;
-        let (allowed, secret) = webhooks(&config.remote)?;
+        let webhooks = webhooks(&config.remote)?;
         process::keep_files_private();
         process::survive_file_limits();
         process::name_tls_provider();
@@ -99,7 +99,11 @@ impl App {
         let workers_drain = Drain::default();
         let workers = start_workers(&devices, &stores, &cost, &metrics, &workers_drain, &config);
         let keys_are_open = keys.is_open();
-        let webhooks = Webhooks::new(allowed, secret, config.remote.allow_private_addresses);
+        let allows_private = config.remote.allow_private_addresses;
+        let webhooks = match webhooks {
+            None => Webhooks::off(),
+            Some((allowed, secret)) => Webhooks::new(allowed, secret, allows_private),
+        };
         let parts = (keys, webhooks.clone());
         let service = Arc::new(service(&stores, &devices, &cost, &metrics, parts, &config));
         let runtime = Arc::new(Heartbeat::default());

@@ -1,98 +1,120 @@
-//! A minimal HTTP/1.1 client for the demo: requests to one server, each over a new TCP connection.
+//! The HTTP client of the commands that talk to a server.
 
-use std::net::SocketAddr;
+use std::path::PathBuf;
 
 use anyhow::{Context, anyhow};
-use bytes::Bytes;
-use http_body_util::{BodyExt, Full};
-use hyper::body::Incoming;
-use hyper::{Request, Response, StatusCode};
-use hyper_util::rt::TokioIo;
+use clap::Args;
+use reqwest::multipart::Form;
+use reqwest::{Method, RequestBuilder, Response};
 use serde_json::Value;
-use tokio::net::TcpStream;
+use url::Url;
 
-/// The boundary between the parts of a multipart body. The files that are sent must not contain it.
-const BOUNDARY: &str = "fnsf-2f1d9c7e5b3a-boundary";
+use super::failure::Failure;
 
-/// One part of a `multipart/form-data` body.
-pub(super) struct Part<'a> {
-    /// The form field's name.
-    pub(super) name: &'a str,
-    /// The file name, for parts that are files.
-    pub(super) file: Option<&'a str>,
-    /// The content.
-    pub(super) bytes: &'a [u8],
+/// Which server to talk to.
+#[derive(Debug, Args)]
+pub(super) struct ServerFlags {
+    /// Address of the server
+    #[arg(
+        long,
+        value_name = "URL",
+        env = "FNSF_SERVER",
+        default_value = "http://127.0.0.1:8080"
+    )]
+    server: Url,
+    /// File with the API key; otherwise it is taken from FNSF_API_KEY
+    #[arg(long, value_name = "FILE")]
+    key_file: Option<PathBuf>,
+}
+
+impl ServerFlags {
+    /// A client of this server.
+    pub(super) fn client(&self) -> Result<Client, Failure> {
+        let key = match &self.key_file {
+            None => std::env::var("FNSF_API_KEY").ok(),
+            Some(path) => Some(
+                std::fs::read_to_string(path)
+                    .with_context(|| format!("cannot read {}", path.display()))
+                    .map_err(Failure::usage)?,
+            ),
+        };
+        let key = key.map(|key| key.trim().to_owned());
+        Client::new(self.server.clone(), key.filter(|key| !key.is_empty())).map_err(Failure::usage)
+    }
+}
+
+/// Runs a command that talks to a server.
+///
+/// # Errors
+/// That of the command, or an internal one if the runtime cannot be started.
+pub(super) fn block_on<T>(command: impl Future<Output = Result<T, Failure>>) -> Result<T, Failure> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build();
+    runtime.map_err(Failure::internal)?.block_on(command)
 }
 
 /// A client of one server.
 pub(super) struct Client {
-    server: SocketAddr,
+    server: Url,
+    key: Option<String>,
+    http: reqwest::Client,
 }
 
 impl Client {
-    pub(super) fn new(server: SocketAddr) -> Self {
-        Self { server }
+    pub(super) fn new(server: Url, key: Option<String>) -> anyhow::Result<Self> {
+        if !matches!(server.scheme(), "http" | "https") {
+            return Err(anyhow!(
+                "{server} is no address such as http://127.0.0.1:8080"
+            ));
+        }
+        let _named_already = rustls::crypto::ring::default_provider().install_default();
+        let http = reqwest::Client::builder()
+            .user_agent(concat!("fnsf/", env!("CARGO_PKG_VERSION")))
+            .build()?;
+        Ok(Self { server, key, http })
     }
 
-    async fn send(&self, request: Request<Full<Bytes>>) -> anyhow::Result<Response<Incoming>> {
-        let stream = TcpStream::connect(self.server).await?;
-        let (mut sender, connection) =
-            hyper::client::conn::http1::handshake(TokioIo::new(stream)).await?;
-        tokio::spawn(connection);
-        let response = sender.send_request(request).await?;
+    /// A request to a path, which may have a query.
+    pub(super) fn request(&self, method: Method, path: &str) -> anyhow::Result<RequestBuilder> {
+        let request = self.http.request(method, self.server.join(path)?);
+        Ok(match &self.key {
+            None => request,
+            Some(key) => request.bearer_auth(key),
+        })
+    }
+
+    /// Sends a request. An answer other than 2xx is an error with the reason that the server gives.
+    pub(super) async fn send(&self, request: RequestBuilder) -> anyhow::Result<Response> {
+        let unreachable = || format!("cannot reach {}", self.server);
+        let response = request.send().await.with_context(unreachable)?;
         if response.status().is_success() {
             return Ok(response);
         }
         let status = response.status();
-        let problem = response.into_body().collect().await?.to_bytes();
-        let problem: Value = serde_json::from_slice(&problem).unwrap_or_default();
+        let problem: Value = response.json().await.unwrap_or_default();
         let detail = problem["detail"].as_str().unwrap_or("without a word");
-        Err(anyhow!("the service answered {status}: {detail}"))
+        Err(anyhow!("the server answered {status}: {detail}"))
     }
 
-    /// Posts a multipart form and returns the JSON of the accepted job. Any status except 202
-    /// Accepted is an error.
-    pub(super) async fn post(&self, path: &str, parts: &[Part<'_>]) -> anyhow::Result<Value> {
-        let mut body = Vec::new();
-        for part in parts {
-            let file = part.file.map(|file| format!("; filename=\"{file}\""));
-            let head = format!(
-                "--{BOUNDARY}\r\ncontent-disposition: form-data; name=\"{}\"{}\r\n\r\n",
-                part.name,
-                file.unwrap_or_default()
-            );
-            body.extend(head.as_bytes());
-            body.extend(part.bytes);
-            body.extend(b"\r\n");
+    /// Sends a request without a body, and reads the JSON of its answer; null of an empty one.
+    pub(super) async fn call(&self, method: Method, path: &str) -> anyhow::Result<Value> {
+        let body = self
+            .send(self.request(method, path)?)
+            .await?
+            .bytes()
+            .await?;
+        match body.is_empty() {
+            true => Ok(Value::Null),
+            false => serde_json::from_slice(&body).context("the answer is no JSON"),
         }
-        body.extend(format!("--{BOUNDARY}--\r\n").as_bytes());
-        let request = Request::post(path)
-            .header("host", self.server.to_string())
-            .header(
-                "content-type",
-                format!("multipart/form-data; boundary={BOUNDARY}"),
-            )
-            .body(Full::from(body))?;
-        let response = self.send(request).await?;
-        if response.status() != StatusCode::ACCEPTED {
-            return Err(anyhow!("the service answered {}", response.status()));
-        }
-        let body = response.into_body().collect().await?.to_bytes();
-        serde_json::from_slice(&body).context("the answer is no JSON")
     }
 
-    /// Fetches the body at a path.
-    pub(super) async fn get(&self, path: &str) -> anyhow::Result<Bytes> {
-        let request = Request::get(path)
-            .header("host", self.server.to_string())
-            .body(Full::default())?;
-        Ok(self
-            .send(request)
-            .await?
-            .into_body()
-            .collect()
-            .await?
-            .to_bytes())
+    /// Posts a form, and reads the JSON of its answer.
+    pub(super) async fn post(&self, path: &str, form: Form) -> anyhow::Result<Value> {
+        let request = self.request(Method::POST, path)?.multipart(form);
+        let answer = self.send(request).await?.json().await;
+        answer.context("the answer is no JSON")
     }
 
     /// Reads server-sent events until the stream ends, and calls `tell` with the name and data of
@@ -102,15 +124,10 @@ impl Client {
         path: &str,
         mut tell: impl FnMut(&str, &Value),
     ) -> anyhow::Result<()> {
-        let request = Request::get(path)
-            .header("host", self.server.to_string())
-            .body(Full::default())?;
-        let mut body = self.send(request).await?.into_body();
+        let mut response = self.send(self.request(Method::GET, path)?).await?;
         let mut text = String::new();
-        while let Some(frame) = body.frame().await {
-            if let Ok(piece) = frame?.into_data() {
-                text.push_str(&String::from_utf8_lossy(&piece));
-            }
+        while let Some(piece) = response.chunk().await? {
+            text.push_str(&String::from_utf8_lossy(&piece));
             while let Some(end) = text.find("\n\n") {
                 let event: String = text.drain(..end + 2).collect();
                 let field = |key: &str| {

@@ -4,21 +4,22 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use clap::Args;
-use serde_json::Value;
+use reqwest::Method;
+use reqwest::multipart::{Form, Part};
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::client::{Client, Part};
+use super::client::Client;
 use super::eval::print_score;
 use super::failure::Failure;
 use super::files;
 use super::flow::print_report;
 use super::output::say;
+use super::submit::until_ended;
 use super::synth::labelled;
 use super::terminal::Terminal;
 use crate::app::App;
 use crate::config::Config;
 use crate::flow::simulate::{Street, StreetOptions};
-use crate::flow::{Control, Progress};
 use crate::formats::{FlowFile, Pair, read_flow, rigid_motion, write_pair_npz};
 use crate::job::{JobOptions, Report};
 use crate::picture;
@@ -131,30 +132,13 @@ impl Demo {
             seed: self.seed,
             ..JobOptions::default()
         };
-        let client = Client::new(address);
-        let options = options.to_json();
-        let parts = [
-            Part {
-                name: "options",
-                file: None,
-                bytes: options.as_bytes(),
-            },
-            Part {
-                name: "source",
-                file: Some("pair.npz"),
-                bytes: &file,
-            },
-        ];
-        let job = client.post("/v1/jobs", &parts).await?;
-        let link = |name: &str| job["links"][name].as_str().unwrap_or_default().to_owned();
+        let client = Client::new(format!("http://{address}").parse()?, None)?;
+        let form = Form::new()
+            .text("options", options.to_json())
+            .part("source", Part::bytes(file).file_name("pair.npz"));
+        let job = client.post("/v1/jobs", form).await?;
         let terminal = Terminal::new();
-        let mut last = Value::Null;
-        client
-            .follow(&link("events"), |event, data| match event {
-                "progress" => terminal.progress(progress(data)),
-                _ => last = data.clone(),
-            })
-            .await?;
+        let mut last = until_ended(&client, &job, &terminal).await?;
         terminal.finish();
         if last["state"] != "succeeded" {
             let why = last["error"]["message"]
@@ -162,22 +146,15 @@ impl Demo {
                 .unwrap_or("without a word");
             return Err(anyhow::anyhow!("the job ended as {}: {why}", last["state"]));
         }
-        let bytes = client.get(&link("result")).await?.to_vec();
+        let result = job["links"]["result"].as_str().unwrap_or_default();
+        let result = client.send(client.request(Method::GET, result)?).await?;
+        let bytes = result.bytes().await?.to_vec();
         app.drain().await;
         Ok(Answer {
             flow: read_flow(&bytes, None)?,
             report: serde_json::from_value(last["report"].take())?,
             bytes,
         })
-    }
-}
-
-fn progress(data: &Value) -> Progress {
-    let count = |key: &str| data[key].as_u64().unwrap_or(0) as usize;
-    Progress {
-        done: count("done"),
-        total: count("total"),
-        loss: data["loss"].as_f64().unwrap_or(0.0),
     }
 }
 

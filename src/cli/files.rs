@@ -222,7 +222,7 @@ pub(super) fn check_outputs<'a>(
 
 /// The absolute path of a file that exists or is to be created, with links and dots resolved.
 /// `None` where its folder does not exist.
-fn place_of(path: &Path) -> Option<PathBuf> {
+pub(super) fn place_of(path: &Path) -> Option<PathBuf> {
     const LINKS: usize = 40;
     let mut path = path.to_owned();
     for _ in 0..LINKS {

@@ -6,6 +6,7 @@
     reason = "printing is what a command line is for"
 )]
 
+mod backup;
 mod client;
 mod densify;
 mod device;
@@ -22,7 +23,9 @@ mod demo;
 mod doctor;
 mod eval;
 mod flow;
+mod jobs;
 mod serve;
+mod submit;
 mod synth;
 mod tables;
 mod view;
@@ -51,6 +54,10 @@ pub struct Arguments {
 enum Command {
     Demo(demo::Demo),
     Serve(Box<serve::Serve>),
+    Submit(Box<submit::Submit>),
+    Jobs(jobs::Jobs),
+    Backup(backup::Backup),
+    Restore(backup::Restore),
     Flow(flow::Flow),
     Densify(densify::Densify),
     Eval(eval::Eval),
@@ -66,6 +73,10 @@ pub fn run(arguments: Arguments) -> ExitCode {
     let done = match arguments.command {
         Command::Demo(command) => command.run(),
         Command::Serve(command) => command.run(),
+        Command::Submit(command) => command.run(),
+        Command::Jobs(command) => command.run(),
+        Command::Backup(command) => command.run(),
+        Command::Restore(command) => command.run(),
         Command::Flow(command) => command.run(),
         Command::Densify(command) => command.run(),
         Command::Eval(command) => command.run(),

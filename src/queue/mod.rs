@@ -25,7 +25,7 @@ pub use backlog::{Backlog, Load};
 pub use lease::{Lease, LeaseHeartbeat, Signal};
 pub use node::{Capacities, Capacity, Node};
 pub use postgres::{PostgresOptions, open_postgres};
-pub use sqlite::open_sqlite;
+pub use sqlite::{CopiedQueue, copy_sqlite, open_sqlite, read_copy};
 pub use types::{
     Action, Committed, Event, Filter, Idempotency, Outcome, Outgoing, PairOf, Queue, QueueError,
     QueueOptions, Submission, Submitted,

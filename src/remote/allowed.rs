@@ -117,7 +117,7 @@ mod tests {
             ("s3://drives-2/2026/x", NotAllowed::Elsewhere),
             ("file:///data/../etc/passwd", NotAllowed::Elsewhere),
             ("https://user@a.example/in/x", NotAllowed::Malformed),
-            ("https://a.example/in/%2e%2e/x", NotAllowed::Malformed),
+            ("https://a.example/in/%2e%2e/x", NotAllowed::Elsewhere),
             ("https://a.example/in/..%2Fx", NotAllowed::Malformed),
             ("https://a.example/in/x#f", NotAllowed::Malformed),
             ("a.example/in/x", NotAllowed::Malformed),

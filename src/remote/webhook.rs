@@ -8,6 +8,7 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use hmac::{Hmac, KeyInit, Mac};
 use sha2::Sha256;
+use url::Url;
 
 use super::allowed::{Allowed, NotAllowed};
 use super::client::{client, literal_is_reachable};
@@ -80,36 +81,37 @@ impl NotTold {
 
 /// Tells webhooks. Clones share the connections.
 #[derive(Clone)]
-pub struct Webhooks(Arc<Parts>);
+pub struct Webhooks(Option<Arc<Parts>>);
 
 struct Parts {
     allowed: Allowed,
-    secret: Option<SigningSecret>,
+    secret: SigningSecret,
     allows_private: bool,
     client: reqwest::Client,
 }
 
 impl Webhooks {
-    /// Webhooks below the `allowed` URLs, signed with `secret`. Without a secret nothing is allowed.
+    /// No webhook is allowed.
+    pub fn off() -> Self {
+        Self(None)
+    }
+
+    /// Webhooks below the `allowed` URLs, signed with `secret`.
     ///
     /// # Panics
     /// As [`client`].
-    pub fn new(allowed: Allowed, secret: Option<SigningSecret>, allows_private: bool) -> Self {
-        Self(Arc::new(Parts {
-            allowed: if secret.is_some() {
-                allowed
-            } else {
-                Allowed::default()
-            },
+    pub fn new(allowed: Allowed, secret: SigningSecret, allows_private: bool) -> Self {
+        Self(Some(Arc::new(Parts {
+            allowed,
             secret,
             allows_private,
             client: client(allows_private),
-        }))
+        })))
     }
 
     /// Whether no webhook is allowed.
     pub fn are_off(&self) -> bool {
-        self.0.allowed.is_empty()
+        self.0.is_none()
     }
 
     /// Checks a URL that a caller names.
@@ -120,10 +122,11 @@ impl Webhooks {
         self.reachable(url).map(drop)
     }
 
-    fn reachable(&self, url: &str) -> Result<url::Url, NotTold> {
-        let url = self.0.allowed.check(url)?;
-        match literal_is_reachable(&url, self.0.allows_private) {
-            true => Ok(url),
+    fn reachable(&self, url: &str) -> Result<(&Parts, Url), NotTold> {
+        let parts = self.0.as_deref().ok_or(NotAllowed::Elsewhere)?;
+        let url = parts.allowed.check(url)?;
+        match literal_is_reachable(&url, parts.allows_private) {
+            true => Ok((parts, url)),
             false => Err(NotTold::Private),
         }
     }
@@ -140,12 +143,9 @@ impl Webhooks {
         seconds: i64,
         body: String,
     ) -> Result<(), NotTold> {
-        let url = self.reachable(url)?;
-        let Some(secret) = &self.0.secret else {
-            return Err(NotAllowed::Elsewhere.into());
-        };
-        let signature = secret.sign(id, seconds, &body);
-        let request = self.0.client.post(url).timeout(TIMEOUT);
+        let (parts, url) = self.reachable(url)?;
+        let signature = parts.secret.sign(id, seconds, &body);
+        let request = parts.client.post(url).timeout(TIMEOUT);
         let request = request
             .header("content-type", "application/json")
             .header("webhook-id", id)

@@ -3,8 +3,10 @@
 mod blob;
 mod blobs;
 mod bucket;
+mod copy;
 mod folder;
 
 pub use blob::{Blob, BlobError, FreeSpace, Fsync};
 pub use blobs::Blobs;
 pub use bucket::BucketError;
+pub use copy::{Copied, copy_store, keep_only};

@@ -280,7 +280,7 @@ async fn codes(server: &Server, id: &str, shown: Option<&str>) -> [Code; 11] {
         options: Some(options()),
     })];
     let mut jobs = vec![submit::Part::Begin(submit::Begin {
-        options: Some(options()),
+        options: Some(Box::new(options())),
         ..submit::Begin::default()
     })];
     for points in small_pair() {

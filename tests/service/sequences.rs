@@ -200,7 +200,7 @@ fn grpc_options(densify: Option<proto::Densify>) -> proto::Options {
 async fn submitted(server: &Server, densify: Option<proto::Densify>) -> proto::Job {
     use proto::submit_job_request::{Begin, NextCloud, Part};
     let mut parts = vec![Part::Begin(Begin {
-        options: Some(grpc_options(densify)),
+        options: Some(Box::new(grpc_options(densify))),
         idempotency_key: String::new(),
     })];
     for points in sweeps() {

@@ -254,7 +254,7 @@ impl SceneFlow for Calls {
             Some(Part::Begin(begin)) => begin,
             _ => return Err(no_begin().into()),
         };
-        let options = convert::options(begin.options)?;
+        let options = convert::options(begin.options.map(|options| *options))?;
         let dense = options.densify.is_some();
         let mut job_request = call.job_request(options, Durability::Durable);
         let key = begin.idempotency_key;

@@ -8,6 +8,7 @@ mod devices;
 mod failures;
 mod fairness;
 mod lifecycle;
+mod outbox;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -85,6 +86,8 @@ macro_rules! queue_contract {
             a_sequence_with_something_left_to_do_is_leased_when_its_pairs_have_succeeded,
             what_is_left_of_a_sequence_survives_crashes_and_is_retried_cancelled_and_asked_for_again,
             a_pair_that_fails_back_in_time_is_named_and_nothing_is_left_to_do,
+            the_end_of_a_job_is_told_once_per_end_and_not_of_the_pairs_of_a_sequence,
+            what_is_promised_is_taken_once_and_again_after_its_hold_or_delay_or_a_crash,
         }
     };
     ($stand:expr; $($name:ident,)*) => {
@@ -102,6 +105,7 @@ pub(crate) use super::contract_tests::devices::*;
 pub(crate) use super::contract_tests::failures::*;
 pub(crate) use super::contract_tests::fairness::*;
 pub(crate) use super::contract_tests::lifecycle::*;
+pub(crate) use super::contract_tests::outbox::*;
 pub(crate) use queue_contract;
 
 fn tenant(name: &str) -> Tenant {

@@ -15,26 +15,42 @@ pub(super) struct Beat {
 
 /// The heartbeats since the last write, by job and attempt.
 #[derive(Debug, Default)]
-pub(super) struct Beats(Mutex<HashMap<(JobId, u32), Beat>>);
+pub(super) struct Beats(Mutex<Collected>);
+
+#[derive(Debug, Default)]
+struct Collected {
+    waiting: HashMap<(JobId, u32), Beat>,
+    /// Those that are being written: what they say is not in the database yet.
+    leaving: HashMap<(JobId, u32), Beat>,
+}
 
 impl Beats {
     /// Whether a snapshot of this attempt was stored and that is not written yet.
     pub(super) fn has_note_of_snapshot(&self, id: JobId, attempt: u32) -> bool {
         let beats = locked(&self.0);
-        let beat = beats.get(&(id, attempt));
-        beat.is_some_and(|beat| beat.snapshot_kept)
+        [&beats.waiting, &beats.leaving]
+            .iter()
+            .filter_map(|of| of.get(&(id, attempt)))
+            .any(|beat| beat.snapshot_kept)
     }
 
     /// Adds a heartbeat.
     pub(super) fn add(&self, id: JobId, attempt: u32, beat: Beat) {
         let mut beats = locked(&self.0);
-        let known = beats.entry((id, attempt)).or_default();
+        let known = beats.waiting.entry((id, attempt)).or_default();
         known.progress = beat.progress.or(known.progress);
         known.snapshot_kept |= beat.snapshot_kept;
     }
 
-    /// All of them.
+    /// All of them, to be written. [`Beats::written`] ends the write.
     pub(super) fn take(&self) -> HashMap<(JobId, u32), Beat> {
-        std::mem::take(&mut locked(&self.0))
+        let mut beats = locked(&self.0);
+        beats.leaving = std::mem::take(&mut beats.waiting);
+        beats.leaving.clone()
+    }
+
+    /// Those that were taken are in the database.
+    pub(super) fn written(&self) {
+        locked(&self.0).leaving.clear();
     }
 }

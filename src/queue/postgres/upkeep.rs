@@ -150,6 +150,7 @@ impl Upkeep {
             };
             self.session.transact(Flush::Never, Instant::now(), renew)?;
         }
+        self.shared.beats.written();
         Ok(())
     }
 

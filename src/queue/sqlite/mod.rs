@@ -4,6 +4,7 @@
 //! admits one process at a time, so jobs that were running when the last process ended can be
 //! requeued at once.
 
+mod backup;
 mod engine;
 mod files;
 mod heartbeat;
@@ -13,4 +14,5 @@ mod statements;
 mod tests;
 mod writer;
 
+pub use backup::{CopiedQueue, copy_sqlite, read_copy};
 pub use engine::open_sqlite;

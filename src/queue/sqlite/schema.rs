@@ -14,7 +14,7 @@ use crate::queue::types::QueueError;
 pub(super) const VERSION: i64 = 9;
 
 /// The oldest schema version that is upgraded.
-const OLDEST: i64 = 8;
+pub(super) const OLDEST: i64 = 8;
 
 /// The changes from each version to the next, beginning with [`OLDEST`].
 const UPGRADES: [&str; (VERSION - OLDEST) as usize] = ["

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use rusqlite::params;
+use rusqlite::{Connection, params};
 use tokio::sync::mpsc;
 
 use super::engine::{SqliteEngine, open_sqlite};
@@ -50,7 +50,7 @@ queue_contract!(Some(Folder::new()));
 const BACKLOG: u32 = 20_000;
 
 /// The query plan of a statement.
-fn plan(connection: &rusqlite::Connection, sql: &str, parameters: usize) -> String {
+fn plan(connection: &Connection, sql: &str, parameters: usize) -> String {
     let mut statement = connection
         .prepare(&format!("EXPLAIN QUERY PLAN {}", for_sqlite(sql)))
         .expect("a good statement");
@@ -141,10 +141,34 @@ async fn a_second_process_is_refused_by_name() {
 }
 
 #[test]
+fn a_file_that_was_upgraded_has_the_tables_of_a_new_one() {
+    let tables = |connection: &Connection| -> Vec<String> {
+        let mut tables = connection
+            .prepare(
+                "SELECT m.name || ' ' || coalesce(c.name, '') || ' ' || coalesce(c.type, '') FROM \
+                 sqlite_master m LEFT JOIN pragma_table_xinfo(m.name) c ORDER BY m.name, c.cid",
+            )
+            .expect("a list");
+        let rows = tables.query_map([], |row| row.get(0)).expect("a list");
+        rows.collect::<rusqlite::Result<_>>().expect("text")
+    };
+    let folder = Folder::new();
+    let path = folder.0.path().join("queue.sqlite3");
+    let old = Connection::open(&path).expect("a file");
+    let frozen = include_str!("../../../tests/service/frozen/version_8/queue.sql");
+    old.execute_batch(frozen).expect("a queue");
+    drop(old);
+    let upgraded = schema::open_writer(&path).expect("a queue");
+    let other = Folder::new();
+    let fresh = schema::open_writer(&other.0.path().join("queue.sqlite3")).expect("a queue");
+    assert_eq!(tables(&upgraded), tables(&fresh));
+}
+
+#[test]
 fn a_file_of_another_version_is_refused_with_what_to_do_and_left_alone() {
     for (version, said) in [
         (schema::VERSION + 1, "run the newer program"),
-        (schema::VERSION - 1, "name another data_dir"),
+        (schema::OLDEST - 1, "name another data_dir"),
     ] {
         let folder = Folder::new();
         let path = folder.0.path().join("queue.sqlite3");

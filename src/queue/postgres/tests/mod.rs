@@ -9,10 +9,11 @@ mod nodes;
 
 use super::engine::open_postgres;
 use super::target::PostgresOptions;
-use crate::queue::contract_tests::{Stand, queue_contract};
+use crate::job::DeviceKind;
+use crate::queue::contract_tests::{Stand, queue_contract, submission};
 use crate::queue::sql::for_postgres;
 use crate::queue::transitions::{expiry, fair_queue, leases};
-use crate::queue::types::{Event, Queue, QueueOptions};
+use crate::queue::types::{Event, Queue, QueueOptions, Submitted};
 
 #[path = "../../../../tests/common/postgres_server.rs"]
 mod postgres_server;
@@ -135,6 +136,35 @@ async fn another_schema_or_program_is_refused_with_what_to_do() {
     };
     let said = refusal(&nobody).await;
     assert!(!said.contains("hidden"), "{said}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_database_of_the_version_before_is_upgraded_and_keeps_its_jobs() {
+    let Some(database) = Database::new() else {
+        return;
+    };
+    let (queue, heard) = database.node("first", QueueOptions::default()).await;
+    let job = queue.submit(submission("a")).await.expect("a queue");
+    drop((queue, heard));
+    database.is_left().await;
+    let run = |sql: &str| database.server.sql(database.name(), sql);
+    let columns = "SELECT string_agg(table_name || column_name || data_type, ' ' ORDER BY table_name, \
+                   ordinal_position) FROM information_schema.columns WHERE table_schema = 'public'";
+    let fresh = run(columns);
+    // What version 2 had.
+    run(
+        "ALTER TABLE jobs DROP COLUMN trace, DROP COLUMN webhook; DROP TABLE outbox; \
+         UPDATE meta SET version = 2",
+    );
+    let (queue, _heard) = database.node("second", QueueOptions::default()).await;
+    // A column that is dropped keeps its number.
+    assert_eq!(run(columns), fresh);
+    assert_eq!(run("SELECT version FROM meta"), "3");
+    let held = queue.lease("worker", DeviceKind::Cpu).await.expect("a job");
+    let Submitted::New(job) = job else {
+        unreachable!("it was new");
+    };
+    assert_eq!(held.job.id, job.id);
 }
 
 #[tokio::test]

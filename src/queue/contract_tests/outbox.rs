@@ -1,0 +1,107 @@
+//! The outbox: what a commit has promised is done by one node at a time, and not forgotten.
+
+use super::*;
+use crate::queue::types::{Action, Outgoing};
+
+const HOLD: Duration = Duration::from_secs(60);
+
+fn told(of: &str, url: &str) -> Submission {
+    Submission {
+        webhook: Some(url.to_owned()),
+        ..submission(of)
+    }
+}
+
+async fn take(queue: &Arc<dyn Queue>, hold: Duration) -> Vec<Outgoing> {
+    queue
+        .take_outgoing(10, hold)
+        .await
+        .expect("the store works")
+}
+
+pub(crate) async fn the_end_of_a_job_is_told_once_per_end_and_not_of_the_pairs_of_a_sequence(
+    stand: &mut impl Stand,
+) {
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
+    let silent = submit(&queue, submission("a")).await;
+    let held = lease(&queue).await;
+    assert_eq!(held.job.id, silent.id);
+    finish(&queue, &held.job, done()).await;
+    assert_eq!(take(&queue, HOLD).await, []);
+
+    let job = submit(&queue, told("a", "https://a.example/x")).await;
+    queue.cancel(job.id).await.expect("it is cancelled");
+    let ends = take(&queue, HOLD).await;
+    let [end] = &ends[..] else {
+        unreachable!("one notice: {ends:?}");
+    };
+    assert_eq!((end.job, end.attempts), (job.id, 1));
+    let Action::Notify { url, body } = &end.action else {
+        unreachable!("it is a notice: {end:?}");
+    };
+    assert_eq!(url, "https://a.example/x");
+    assert!(
+        body.contains("job.cancelled") && body.contains(&job.id.to_string()),
+        "{body}"
+    );
+    // Asked for again, it has another end.
+    queue.requeue(job.id, false).await.expect("it is queued");
+    let held = lease(&queue).await;
+    finish(&queue, &held.job, done()).await;
+    let again = take(&queue, HOLD).await;
+    assert_eq!(again.len(), 1);
+    assert_ne!(again[0].number, end.number);
+
+    let whole = Submission {
+        webhook: Some("https://a.example/y".to_owned()),
+        ..sequence(2)
+    };
+    let whole = submit(&queue, whole).await;
+    for _ in 0..2 {
+        let held = lease(&queue).await;
+        finish(&queue, &held.job, done()).await;
+    }
+    let ends = take(&queue, HOLD).await;
+    assert_eq!(
+        ends.iter().map(|end| end.job).collect::<Vec<_>>(),
+        [whole.id]
+    );
+}
+
+pub(crate) async fn what_is_promised_is_taken_once_and_again_after_its_hold_or_delay_or_a_crash(
+    stand: &mut impl Stand,
+) {
+    const SHORT: Duration = Duration::from_millis(300);
+    let (queue, events) = stand.open(QueueOptions::default()).await;
+    let job = submit(&queue, told("a", "https://a.example/x")).await;
+    queue.cancel(job.id).await.expect("it is cancelled");
+    let first = take(&queue, SHORT).await;
+    assert_eq!(first.len(), 1);
+    assert_eq!(take(&queue, HOLD).await, [], "another node holds it");
+    tokio::time::sleep(SHORT * 2).await;
+    let second = take(&queue, HOLD).await;
+    let seen: Vec<_> = second
+        .iter()
+        .map(|one| (one.number, one.attempts))
+        .collect();
+    assert_eq!(seen, [(first[0].number, 2)]);
+    let later = vec![(first[0].number, Some(SHORT))];
+    queue.settle(later).await.expect("settled");
+    assert_eq!(take(&queue, HOLD).await, [], "it is due later");
+    tokio::time::sleep(SHORT * 2).await;
+    assert_eq!(take(&queue, SHORT).await.len(), 1);
+
+    drop((queue, events));
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
+    tokio::time::sleep(SHORT * 2).await;
+    let third = take(&queue, HOLD).await;
+    assert_eq!(third.len(), 1, "a crash has lost it");
+    let done = vec![(third[0].number, None)];
+    queue.settle(done).await.expect("settled");
+
+    // The files of a removed job are removed the same way.
+    queue.remove(job.id).await.expect("it has ended");
+    let removal = take(&queue, HOLD).await;
+    let seen: Vec<_> = removal.iter().map(|one| (one.job, &one.action)).collect();
+    assert_eq!(seen, [(job.id, &Action::RemoveFiles)]);
+}
