@@ -98,6 +98,7 @@ function headOf(job, path, info) {
       { class: "title" },
       el("h1", {}, job.kind === "sequence" ? "Sequence" : "Pair"),
       el("code", { class: "id" }, job.id),
+      job.trace_id ? el("code", { class: "id", title: "Trace" }, `trace ${job.trace_id}`) : null,
       el("span", { class: `state ${job.state}`, data: { test: "state" } }, job.state),
       job.dead_letter ? el("span", { class: "state failed" }, "given up") : null,
       el("div", { class: "actions" }, actionsOf(job, path, info)),
