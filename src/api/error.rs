@@ -8,7 +8,7 @@ use crate::fault::Fault;
 use crate::formats::FormatError;
 use crate::job::{DeviceKind, InvalidId, InvalidOptions, JobError, JobId, Priority};
 use crate::queue::QueueError;
-use crate::remote::{NotTold, Webhooks};
+use crate::remote::{NotFetched, NotTold, Webhooks};
 use crate::storage::BlobError;
 
 /// Why a request was refused, or why its job has no result.
@@ -23,6 +23,9 @@ pub enum ApiError {
     /// A file cannot be decoded, or a pair cannot be solved.
     #[error("{0}")]
     BadInput(String),
+    /// A sweep that is named by a URI cannot be fetched at the moment.
+    #[error("{0}")]
+    SourceUnavailable(String),
     /// The request exceeds a limit on bytes, points, sweeps or memory.
     #[error("{0}")]
     TooLarge(String),
@@ -160,10 +163,11 @@ const fn row(
 const LONGEST_TEXT: usize = 1024;
 
 /// All errors.
-const ERRORS: [ErrorSpec; 33] = [
+const ERRORS: [ErrorSpec; 34] = [
     row("bad_request", 400, 3, false, Some("bad_input")),
     row("invalid_options", 400, 3, false, Some("bad_input")),
     row("bad_input", 422, 3, false, Some("bad_input")),
+    row("source_unavailable", 502, 14, true, None),
     row("too_large", 413, 3, false, Some("too_large")),
     row("no_device", 422, 9, false, Some("no_device")),
     row("too_slow", 408, 4, true, Some("too_slow")),
@@ -226,6 +230,7 @@ impl ApiError {
             Self::BadRequest(_) => "bad_request",
             Self::InvalidOptions(_) => "invalid_options",
             Self::BadInput(_) => "bad_input",
+            Self::SourceUnavailable(_) => "source_unavailable",
             Self::TooLarge(_) => "too_large",
             Self::NoDevice(_) => "no_device",
             Self::TooSlow => "too_slow",
@@ -311,6 +316,19 @@ impl ApiError {
             }
             false => format!("options: webhook: {error}"),
         })
+    }
+
+    /// The refusal of a sweep that a caller names in the part `part`.
+    pub(super) fn source(part: &str, error: &NotFetched) -> Self {
+        let text = format!("{part}: {error}");
+        match error {
+            NotFetched::Failed(_) => Self::SourceUnavailable(text),
+            NotFetched::Missing(_) => Self::BadInput(text),
+            NotFetched::Off
+            | NotFetched::NotAllowed(_)
+            | NotFetched::Private
+            | NotFetched::Hash => Self::BadRequest(text),
+        }
     }
 
     /// Logs an error and returns [`ApiError::Internal`], which gives the client no details.

@@ -22,7 +22,7 @@ use crate::health::StoreHealth;
 use crate::job::{Job, JobId, JobOptions, Kind, Priority, State, Tenant};
 use crate::metrics::Metrics;
 use crate::queue::{Filter, Queue, QueueError};
-use crate::remote::Webhooks;
+use crate::remote::{Sources, Webhooks};
 use crate::storage::{Blob, Blobs, FreeSpace};
 use crate::sync::Exchange;
 
@@ -43,6 +43,7 @@ pub struct Service {
     pub(super) keys: Exchange<Keys>,
     pub(super) hosts: Hosts,
     pub(super) webhooks: Webhooks,
+    pub(super) sources: Sources,
     store_health: Arc<StoreHealth>,
     pub(super) limits: ServiceLimits,
     pub(super) uploads: Arc<UploadBudget>,
@@ -118,6 +119,7 @@ impl Service {
             keys: Exchange::new(parts.keys),
             hosts: parts.hosts,
             webhooks: parts.webhooks,
+            sources: parts.sources,
             store_health: parts.store_health,
             limits: parts.limits,
             compute: FairQueue::new(cores),

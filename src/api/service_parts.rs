@@ -10,7 +10,7 @@ use super::origin::Hosts;
 use crate::health::StoreHealth;
 use crate::metrics::Metrics;
 use crate::queue::Queue;
-use crate::remote::Webhooks;
+use crate::remote::{Sources, Webhooks};
 use crate::storage::Blobs;
 
 /// The dependencies of a [`crate::api::Service`].
@@ -31,6 +31,8 @@ pub struct ServiceParts {
     pub hosts: Hosts,
     /// The webhooks that jobs may name.
     pub webhooks: Webhooks,
+    /// The places that sweeps may be fetched from.
+    pub sources: Sources,
     /// The health of the store and its free disk space, as last measured.
     pub store_health: Arc<StoreHealth>,
     /// Resource limits for requests.

@@ -27,7 +27,7 @@ use crate::cost::{CostModel, Lanes};
 use crate::job::{Priority, Tenant};
 use crate::metrics::Metrics;
 use crate::queue::{QueueOptions, open_sqlite};
-use crate::remote::Webhooks;
+use crate::remote::{Sources, Webhooks};
 use crate::storage::Blobs;
 
 /// Time after which a request that has not returned counts as a busy loop.
@@ -71,6 +71,7 @@ fn service(folder: &std::path::Path) -> Arc<Service> {
         metrics: Arc::new(Metrics::new(&["cpu"])),
         keys: Keys::default(),
         webhooks: Webhooks::off(),
+        sources: Sources::default(),
         hosts: Hosts(None),
         store_health: Arc::default(),
         limits: ServiceLimits {

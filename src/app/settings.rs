@@ -8,7 +8,7 @@ use crate::api::{AdmissionLimits, Caller, Keys, ListenOptions, Role, ServiceLimi
 use crate::config::{Config, LimitsConfig, QueueConfig, RemoteConfig};
 use crate::job::{Priority, Tenant};
 use crate::queue::{PostgresOptions, QueueOptions};
-use crate::remote::{Allowed, SigningSecret};
+use crate::remote::{Allowed, SOURCE_SCHEMES, SigningSecret};
 
 /// The API keys: that of the default tenant, and those of tenants.
 ///
@@ -36,6 +36,14 @@ pub(super) fn keys(config: &Config) -> anyhow::Result<Keys> {
         keys.add(key.key.reveal(), caller).context("keys")?;
     }
     Ok(keys)
+}
+
+/// The places that sweeps may be fetched from.
+///
+/// # Errors
+/// If a prefix is invalid.
+pub(super) fn sources(config: &RemoteConfig) -> anyhow::Result<Allowed> {
+    Allowed::new(&config.sweeps, &SOURCE_SCHEMES).context("remote.sweeps")
 }
 
 /// The webhooks that jobs may name, and the key of their signatures; `None` if there are none.

@@ -8,6 +8,10 @@ use super::secret::Secret;
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RemoteConfig {
+    /// Prefixes of the URIs by which requests may name sweeps instead of sending them, such as
+    /// `s3://drives/2026/`, `https://data.example.com/` or `file:///mnt/drives/`. Each ends with a
+    /// slash.
+    pub sweeps: Vec<String>,
     /// Prefixes of the URLs that jobs may name as their webhook, such as
     /// `https://hooks.example.com/fnsf/`. Each ends with a slash.
     pub webhooks: Vec<String>,

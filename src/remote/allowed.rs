@@ -51,6 +51,11 @@ impl Allowed {
         self.0.is_empty()
     }
 
+    /// The prefixes.
+    pub(super) fn prefixes(&self) -> &[Url] {
+        &self.0
+    }
+
     /// Checks a URL: scheme, host and port are those of a prefix, and its path lies below the
     /// prefix's path.
     ///

@@ -62,3 +62,14 @@ pub(super) fn literal_is_reachable(url: &Url, allows_private: bool) -> bool {
         Some(Host::Domain(_)) | None => true,
     }
 }
+
+/// An error with its causes. The URL may hold a secret of its owner, so it is left out.
+pub(super) fn chain(error: &dyn std::error::Error) -> String {
+    let mut texts = Vec::new();
+    let mut next = error.source().or(Some(error));
+    while let Some(error) = next {
+        texts.push(error.to_string());
+        next = error.source();
+    }
+    texts.join(": ")
+}

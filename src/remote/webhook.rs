@@ -11,7 +11,7 @@ use sha2::Sha256;
 use url::Url;
 
 use super::allowed::{Allowed, NotAllowed};
-use super::client::{client, literal_is_reachable};
+use super::client::{chain, client, literal_is_reachable};
 
 /// Time of one notice, from the connection to the end of the answer's headers.
 const TIMEOUT: Duration = Duration::from_secs(15);
@@ -158,17 +158,6 @@ impl Webhooks {
             Err(error) => Err(NotTold::Failed(chain(&error))),
         }
     }
-}
-
-/// An error with its causes. The URL may hold a secret of its owner, so it is left out.
-fn chain(error: &dyn std::error::Error) -> String {
-    let mut texts = Vec::new();
-    let mut next = error.source().or(Some(error));
-    while let Some(error) = next {
-        texts.push(error.to_string());
-        next = error.source();
-    }
-    texts.join(": ")
 }
 
 #[cfg(test)]

@@ -44,6 +44,7 @@ mod removal;
 mod retries;
 mod sequences;
 mod server;
+mod sources;
 mod store_trouble;
 mod tracks;
 mod upgrade;

@@ -68,6 +68,13 @@ impl Server {
         Self::start_as(program, &Folder::new(), config, &arguments)
     }
 
+    /// A server with these variables of the environment.
+    pub(crate) fn start_with(folder: &Folder, config: &str, variables: &[(&str, String)]) -> Self {
+        let mut program = Command::new(env!("CARGO_BIN_EXE_fnsf"));
+        program.envs(variables.iter().map(|(name, value)| (name, value)));
+        Self::start_as(program, folder, config, &[])
+    }
+
     fn start_as(mut program: Command, folder: &Folder, config: &str, arguments: &[&str]) -> Self {
         // The clients of the tests need one.
         let _is_named = rustls::crypto::ring::default_provider().install_default();

@@ -21,12 +21,16 @@ use crate::formats;
 use crate::formats::{FormatError, PoseFile};
 use crate::job::JobOptions;
 use crate::payload::StoredCloud;
+use crate::remote::Sources;
 
 /// The required media type.
 const MULTIPART: &[u8] = b"multipart/form-data";
 
 /// Maximum size of the `options` part, bytes.
 const MAX_OPTIONS: usize = 64 << 10;
+
+/// Maximum length of a URI, bytes.
+const MAX_URI: usize = 4 << 10;
 
 /// Maximum size of the `poses` part, bytes: more than 2,500 poses as JSON.
 const MAX_POSES: usize = 1 << 20;
@@ -42,6 +46,10 @@ pub(super) struct PairBody {
     /// The later sweep.
     #[schema(value_type = Option<String>, format = Binary)]
     target: Option<Vec<u8>>,
+    /// URI of the earlier sweep, in place of `source`; `#blake3=` and its hash may follow.
+    source_uri: Option<String>,
+    /// URI of the later sweep, in place of `target`.
+    target_uri: Option<String>,
     /// The options of the estimate, as one JSON object.
     options: Option<JobOptions>,
 }
@@ -62,6 +70,8 @@ pub(super) struct SequenceBody {
     /// named `sweep`.
     #[schema(value_type = Vec<String>, format = Binary)]
     sweep: Vec<Vec<u8>>,
+    /// URIs of sweeps, each in place of a part `sweep`.
+    sweep_uri: Vec<String>,
 }
 
 /// A multipart body that is being read.
@@ -154,8 +164,18 @@ impl Body {
                 let bytes = reading.whole(field, usize::MAX).await?;
                 Ok(Some(Part::File(name, file, bytes)))
             }
+            "source_uri" | "target_uri" | "sweep_uri" => {
+                let uri = reading.whole(field, MAX_URI).await?;
+                let uri = String::from_utf8_lossy(&uri);
+                let (file, bytes) = reading
+                    .fetch(&self.service.sources, &name, uri.trim())
+                    .await?;
+                let part = name.trim_end_matches("_uri").to_owned();
+                Ok(Some(Part::File(part, Some(file), bytes)))
+            }
             other => Err(ApiError::BadRequest(format!(
-                "there is no part named {other:?}; known are source, target, sweep, poses and options"
+                "there is no part named {other:?}; known are source, target, sweep, each also with \
+                 _uri, poses and options"
             ))),
         }
     }
@@ -341,13 +361,43 @@ impl Reading<'_> {
                     "a part has more than {limit} bytes"
                 )));
             }
-            if bytes.capacity() - bytes.len() < piece.len() {
-                // Doubling the capacity would take twice the size of a large file.
-                bytes.reserve_exact(piece.len().max(bytes.len() / 4));
-            }
-            bytes.extend_from_slice(&piece);
+            append(&mut bytes, &piece);
         }
     }
+
+    /// Fetches the file that the part `part` names. It counts as if it were sent in its place. Returns
+    /// the name of the file and its content.
+    async fn fetch(
+        &mut self,
+        sources: &Sources,
+        part: &str,
+        uri: &str,
+    ) -> Result<(String, Vec<u8>), ApiError> {
+        let refused = |error| ApiError::source(part, &error);
+        let opened = self.room.wait(sources.open(uri)).await?;
+        let mut download = opened.map_err(refused)?;
+        let mut bytes = Vec::new();
+        while let Some(piece) = self.room.wait(download.pieces.next()).await? {
+            let piece = piece.map_err(refused)?;
+            self.room.take(piece.len())?;
+            append(&mut bytes, &piece);
+        }
+        match download.blake3 {
+            Some(expected) if blake3::hash(&bytes) != expected => Err(ApiError::BadInput(format!(
+                "{part}: the file has another hash than the URI"
+            ))),
+            _ => Ok((download.name, bytes)),
+        }
+    }
+}
+
+/// Appends a piece of a file.
+fn append(bytes: &mut Vec<u8>, piece: &[u8]) {
+    if bytes.capacity() - bytes.len() < piece.len() {
+        // Doubling the capacity would take twice the size of a large file.
+        bytes.reserve_exact(piece.len().max(bytes.len() / 4));
+    }
+    bytes.extend_from_slice(piece);
 }
 
 #[expect(clippy::needless_pass_by_value, reason = "it is for map_err")]
