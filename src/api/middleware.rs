@@ -14,8 +14,8 @@ use tower_http::catch_panic::CatchPanicLayer;
 use tracing::Instrument;
 
 use super::error::{ApiError, ErrorSpec};
+use super::job_request::Received;
 use super::listener::Asking;
-use super::pending_job::Received;
 use super::service::Service;
 use super::{grpc, origin};
 use crate::trace;

@@ -13,6 +13,7 @@ mod error;
 mod fleet;
 mod grpc;
 mod http;
+mod job_request;
 mod listener;
 mod middleware;
 mod origin;

@@ -5,7 +5,7 @@
 //! that, its blobs are removed.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bytes::Bytes;
 use tokio::task::JoinHandle;
@@ -14,6 +14,7 @@ use super::admission::{AdmissionRequest, Durability, Reservation};
 use super::auth::Caller;
 use super::dense::Finalizer;
 use super::error::ApiError;
+use super::job_request::Request;
 use super::service::{MakeDurable, Service};
 use super::upload_budget::UploadReservation;
 use super::waiters::Awaited;
@@ -25,33 +26,6 @@ use crate::payload::StoredCloud;
 use crate::queue::{Idempotency, PairOf, Submission, Submitted};
 use crate::storage::{Blob, BlobError, Fsync};
 
-/// The parameters of a job, without its clouds.
-#[derive(Clone, Debug)]
-pub(super) struct Request {
-    /// The options of the estimate.
-    pub options: JobOptions,
-    /// Whether the caller waits for the result.
-    pub durability: Durability,
-    /// The idempotency key: a repeated submission with the same key finds the job of the first one.
-    pub idempotency_key: Option<String>,
-    /// When the request arrived, and in which trace. Deadlines count from its arrival.
-    pub received: Received,
-    /// The deadline of the call itself, relative to its arrival, if there is one.
-    pub time_left: Option<Duration>,
-    /// The position in a chain of pairs that are submitted one by one. `None` outside of a chain.
-    pub link: Option<ChainLink>,
-    /// The pair and its window within the clouds that follow. [`PairOf::ALONE`] for the first two
-    /// clouds.
-    pub pair: PairOf,
-}
-
-/// The position of a pair in a chain.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct ChainLink {
-    /// The pair before it, if there is one.
-    pub after: Option<JobId>,
-}
-
 /// A job that was accepted.
 pub(super) struct Accepted {
     /// The job.
@@ -61,15 +35,6 @@ pub(super) struct Accepted {
     /// The registration of the caller as a waiter, if the job depends on its callers. Dropping it
     /// as the last one cancels the job.
     pub(super) awaited: Option<Awaited>,
-}
-
-/// The arrival of a request: a request extension.
-#[derive(Clone, Debug)]
-pub(super) struct Received {
-    /// When it arrived.
-    pub(super) at: Instant,
-    /// Its span, as the value of a `traceparent` header. `None` if it belongs to no trace.
-    pub(super) trace: Option<String>,
 }
 
 /// A job that is being assembled.

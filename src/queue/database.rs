@@ -11,11 +11,12 @@ use super::effects::Effects;
 use super::lease::{HeartbeatStore, Lease, LeaseHeartbeat};
 use super::local::Local;
 use super::node::{Capacities, Node};
+use super::outgoing::Outgoing;
 use super::sql::Sql;
 use super::transitions;
 use super::transitions::{expiry, leases, lists, outbox};
 use super::types::{
-    Committed, Filter, Outcome, Outgoing, Queue, QueueError, QueueOptions, Submission, Submitted,
+    Committed, Filter, Outcome, Queue, QueueError, QueueOptions, Submission, Submitted,
 };
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobId, Tenant};

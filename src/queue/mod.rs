@@ -14,6 +14,7 @@ mod effects;
 mod lease;
 mod local;
 mod node;
+mod outgoing;
 mod postgres;
 mod sql;
 mod sqlite;
@@ -24,9 +25,10 @@ mod types;
 pub use backlog::{Backlog, Load};
 pub use lease::{Lease, LeaseHeartbeat, Signal};
 pub use node::{Capacities, Capacity, Node};
+pub use outgoing::{Action, Outgoing};
 pub use postgres::{PostgresOptions, open_postgres};
 pub use sqlite::{CopiedQueue, copy_sqlite, open_sqlite, read_copy};
 pub use types::{
-    Action, Committed, Event, Filter, Idempotency, Outcome, Outgoing, PairOf, Queue, QueueError,
-    QueueOptions, Submission, Submitted,
+    Committed, Event, Filter, Idempotency, Outcome, PairOf, Queue, QueueError, QueueOptions,
+    Submission, Submitted,
 };

@@ -10,6 +10,7 @@ use tokio::sync::watch;
 use super::backlog::Backlog;
 use super::lease::Lease;
 use super::node::{Capacities, Node};
+use super::outgoing::Outgoing;
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, State, Tenant};
 
@@ -302,34 +303,6 @@ pub enum Event {
     Deleted(JobId),
 }
 
-/// An action outside the queue that a commit has promised. It stays in the outbox of the queue until
-/// [`Queue::settle`] reports it done, so it may be done more than once.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Outgoing {
-    /// Its number: no other action of the queue has it, and repetitions keep it.
-    pub number: i64,
-    /// The job that it is about.
-    pub job: JobId,
-    /// Number of times that it was taken, this one included.
-    pub attempts: u32,
-    /// What to do.
-    pub action: Action,
-}
-
-/// What an [`Outgoing`] action does.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Action {
-    /// Removes payload, snapshot and result of a job that the queue has forgotten.
-    RemoveFiles,
-    /// Sends a body to a URL: that of a job that has ended.
-    Notify {
-        /// Where to.
-        url: String,
-        /// The JSON of [`crate::job::ended_notice`].
-        body: String,
-    },
-}
-
 /// The job queue: submission, subscription, leases for workers, completion, cancellation and
 /// requeueing. [`super::open_sqlite`] and [`super::open_postgres`] open one.
 ///
@@ -410,7 +383,7 @@ pub trait Queue: Send + Sync {
     async fn requeue(&self, id: JobId, lost: bool) -> Result<Arc<Job>, QueueError>;
 
     /// Removes an ended job and, of a sequence, its pairs: payload, snapshot and result go with
-    /// [`Action::RemoveFiles`], and its idempotency key is free again. A job that another one follows is
+    /// [`Action::RemoveFiles`](super::Action::RemoveFiles), and its idempotency key is free again. A job that another one follows is
     /// removed after the end of that one.
     ///
     /// # Errors

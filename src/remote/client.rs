@@ -39,7 +39,7 @@ impl Resolve for PublicNames {
 ///
 /// # Panics
 /// If no TLS provider was installed for the process.
-pub fn client(allows_private: bool) -> reqwest::Client {
+pub(super) fn client(allows_private: bool) -> reqwest::Client {
     let builder = reqwest::Client::builder()
         .redirect(Policy::none())
         .no_proxy()

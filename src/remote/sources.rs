@@ -98,7 +98,7 @@ impl Sources {
     /// [`BucketError`] of a bucket that cannot be used.
     ///
     /// # Panics
-    /// As [`client`].
+    /// If no TLS provider was installed for the process.
     pub fn new(allowed: Allowed, allows_private: bool) -> Result<Self, BucketError> {
         if allowed.is_empty() {
             return Ok(Self::default());

@@ -99,7 +99,7 @@ impl Webhooks {
     /// Webhooks below the `allowed` URLs, signed with `secret`.
     ///
     /// # Panics
-    /// As [`client`].
+    /// If no TLS provider was installed for the process.
     pub fn new(allowed: Allowed, secret: SigningSecret, allows_private: bool) -> Self {
         Self(Some(Arc::new(Parts {
             allowed,

@@ -135,7 +135,7 @@ fn what_the_server_refuses_is_said_in_its_words() {
             KEY,
             &["submit", "a.pcd", "a.pcd", "-o", "f.npz"],
             70,
-            "a.pcd",
+            "unrecognized file",
         ),
         (
             KEY,

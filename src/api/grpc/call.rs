@@ -10,7 +10,7 @@ use super::convert;
 use crate::api::admission::Durability;
 use crate::api::auth::Caller;
 use crate::api::error::ApiError;
-use crate::api::pending_job::{Received, Request as JobRequest};
+use crate::api::job_request::{Received, Request as JobRequest};
 use crate::job::JobOptions;
 use crate::queue::PairOf;
 

@@ -1,7 +1,7 @@
 //! The outbox: what a commit has promised is done by one node at a time, and not forgotten.
 
 use super::*;
-use crate::queue::types::{Action, Outgoing};
+use crate::queue::outgoing::{Action, Outgoing};
 
 const HOLD: Duration = Duration::from_secs(60);
 

@@ -6,8 +6,9 @@
 use std::time::Duration;
 
 use crate::job::{Job, JobId, ended_notice};
+use crate::queue::outgoing::{Action, Outgoing};
 use crate::queue::sql::{Row, Sql, values};
-use crate::queue::types::{Action, Outgoing, QueueError};
+use crate::queue::types::QueueError;
 
 /// The statement that finds due rows. The query plan test also uses it.
 pub(in crate::queue) const DUE: &str =

@@ -1,0 +1,31 @@
+//! Actions outside the queue that its outbox holds.
+
+use crate::job::JobId;
+
+/// An action outside the queue that a commit has promised. It stays in the outbox of the queue until
+/// [`Queue::settle`](super::Queue::settle) reports it done, so it may be done more than once.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Outgoing {
+    /// Its number: no other action of the queue has it, and repetitions keep it.
+    pub number: i64,
+    /// The job that it is about.
+    pub job: JobId,
+    /// Number of times that it was taken, this one included.
+    pub attempts: u32,
+    /// What to do.
+    pub action: Action,
+}
+
+/// What an [`Outgoing`] action does.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Action {
+    /// Removes payload, snapshot and result of a job that the queue has forgotten.
+    RemoveFiles,
+    /// Sends a body to a URL: that of a job that has ended.
+    Notify {
+        /// Where to.
+        url: String,
+        /// The JSON of [`crate::job::ended_notice`].
+        body: String,
+    },
+}
