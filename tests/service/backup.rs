@@ -4,9 +4,8 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use reqwest::Client;
-use serde_json::Value;
 
-use crate::clouds::{form, small_pair};
+use crate::clouds::{accepted, form, small_pair};
 use crate::server::{Folder, Server, ended};
 
 /// Number of jobs; `FNSF_BACKUP_JOBS` overrides it.
@@ -44,13 +43,7 @@ async fn submit(server: &Server) -> String {
     let sent = Client::new()
         .post(server.url("/v1/jobs"))
         .multipart(form(small_pair(), "{}"));
-    let job: Value = sent
-        .send()
-        .await
-        .expect("an answer")
-        .json()
-        .await
-        .expect("a job");
+    let job = accepted(sent).await;
     job["id"].as_str().expect("an id").to_owned()
 }
 

@@ -5,7 +5,9 @@ use std::sync::OnceLock;
 use fnsf::flow::Point;
 use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::formats::{CloudFormat, write_cloud};
+use reqwest::RequestBuilder;
 use reqwest::multipart::{Form, Part};
+use serde_json::Value;
 
 /// A simulated pair of about five thousand points.
 pub(crate) fn small_pair() -> &'static [Vec<Point>; 2] {
@@ -35,6 +37,12 @@ pub(crate) fn file(format: CloudFormat, points: &[Point]) -> Vec<u8> {
     let mut bytes = Vec::new();
     write_cloud(format, points, &mut bytes).expect("written");
     bytes
+}
+
+/// Sends a submission. Returns the JSON of the accepted job.
+pub(crate) async fn accepted(submission: RequestBuilder) -> Value {
+    let answer = submission.send().await.expect("an answer");
+    answer.json().await.expect("a job")
 }
 
 /// A multipart body with source, target and options.

@@ -6,7 +6,7 @@ use fnsf::formats::read_cloud;
 use reqwest::{Client, Method, Response};
 use serde_json::{Value, json};
 
-use crate::clouds::{form, small_pair};
+use crate::clouds::{accepted, form, small_pair};
 use crate::raw_http::SMALL;
 use crate::server::Server;
 
@@ -60,13 +60,7 @@ async fn finished(server: &Server, key: &str, options: &str) -> Value {
     if !key.is_empty() {
         request = request.bearer_auth(key);
     }
-    let job: Value = request
-        .send()
-        .await
-        .expect("an answer")
-        .json()
-        .await
-        .expect("a job");
+    let job = accepted(request).await;
     let id = job["id"].as_str().expect("an id");
     let job = get_json(server, &format!("/v1/jobs/{id}?wait=60"), key).await;
     assert_eq!(job["state"], "succeeded", "{job}");

@@ -9,7 +9,7 @@ use reqwest::StatusCode;
 use serde_json::Value;
 use tokio::task::JoinSet;
 
-use crate::clouds::{form, medium_pair, small_pair};
+use crate::clouds::{accepted, form, medium_pair, small_pair};
 use crate::server::{Folder, Server, ended, plain_get};
 
 /// A job of a few hundredths of a second.
@@ -274,13 +274,7 @@ async fn a_deadline_in_the_queue_ends_the_job_while_every_device_is_busy() {
         medium_pair(),
         r#"{"preset": "paper", "priority": "high"}"#,
     ));
-    let busy: Value = busy
-        .send()
-        .await
-        .expect("an answer")
-        .json()
-        .await
-        .expect("a job");
+    let busy = accepted(busy).await;
     let began = Instant::now();
     let late = client.post(server.url("/v1/flow")).multipart(form(
         small_pair(),
@@ -307,13 +301,7 @@ async fn small_jobs_do_not_wait_behind_a_long_one_while_another_device_is_free()
     let long = client
         .post(server.url("/v1/jobs"))
         .multipart(form(medium_pair(), r#"{"preset": "paper"}"#));
-    let long: Value = long
-        .send()
-        .await
-        .expect("an answer")
-        .json()
-        .await
-        .expect("a job");
+    let long = accepted(long).await;
     let id = long["id"].as_str().expect("a name");
     for _ in 0..5 {
         let small = client

@@ -1,10 +1,9 @@
 //! Tests of the removal of ended jobs by their owners.
 
 use reqwest::{Client, StatusCode};
-use serde_json::Value;
 use tonic::Code;
 
-use crate::clouds::{form, small_pair};
+use crate::clouds::{accepted, form, small_pair};
 use crate::grpc::{client, proto};
 use crate::raw_http::SMALL;
 use crate::server::{PATIENCE, Server, ended};
@@ -15,13 +14,7 @@ async fn finished(server: &Server) -> String {
         .post(server.url("/v1/jobs"))
         .header("idempotency-key", "the-same")
         .multipart(form(small_pair(), SMALL));
-    let job: Value = sent
-        .send()
-        .await
-        .expect("an answer")
-        .json()
-        .await
-        .expect("a job");
+    let job = accepted(sent).await;
     let id = job["id"].as_str().expect("an id").to_owned();
     assert_eq!(ended(server, &id).await["state"], "succeeded");
     id
@@ -79,13 +72,7 @@ async fn a_job_that_has_not_ended_is_not_removed() {
     let sent = Client::new()
         .post(server.url("/v1/jobs"))
         .multipart(form(crate::clouds::medium_pair(), paper));
-    let job: Value = sent
-        .send()
-        .await
-        .expect("an answer")
-        .json()
-        .await
-        .expect("a job");
+    let job = accepted(sent).await;
     let id = job["id"].as_str().expect("an id").to_owned();
     let removal = server.url(&format!("/v1/jobs/{id}?remove=true"));
     assert_eq!(delete(&removal).await, StatusCode::CONFLICT);

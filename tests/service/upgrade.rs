@@ -7,6 +7,7 @@ use reqwest::Client;
 use reqwest::multipart::{Form, Part};
 use serde_json::Value;
 
+use crate::clouds::accepted;
 use crate::server::{Folder, Server, ended};
 
 /// The options of the frozen job with an idempotency key.
@@ -90,13 +91,7 @@ async fn an_idempotency_key_of_an_older_version_finds_its_job() {
         .post(server.url("/v1/jobs"))
         .header("idempotency-key", "frozen-key")
         .multipart(form);
-    let job: Value = sent
-        .send()
-        .await
-        .expect("an answer")
-        .json()
-        .await
-        .expect("a job");
+    let job = accepted(sent).await;
     assert_eq!(job["id"], known["id"], "{job}");
 }
 

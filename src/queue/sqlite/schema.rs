@@ -17,9 +17,13 @@ pub(super) const VERSION: i64 = 9;
 pub(super) const OLDEST: i64 = 8;
 
 /// The changes from each version to the next, beginning with [`OLDEST`].
-const UPGRADES: [&str; (VERSION - OLDEST) as usize] = ["
-ALTER TABLE jobs ADD COLUMN trace TEXT;
-ALTER TABLE jobs ADD COLUMN webhook TEXT;
+const UPGRADES: [&[&str]; (VERSION - OLDEST) as usize] = [&[
+    "ALTER TABLE jobs ADD COLUMN trace TEXT",
+    "ALTER TABLE jobs ADD COLUMN webhook TEXT",
+    OUTBOX,
+]];
+
+const OUTBOX: &str = "
 CREATE TABLE outbox (
     seq INTEGER PRIMARY KEY AUTOINCREMENT,
     job BLOB NOT NULL,
@@ -29,7 +33,7 @@ CREATE TABLE outbox (
     body TEXT
 );
 CREATE INDEX outbox_due ON outbox (due);
-"];
+";
 
 /// `due` is the next time at which the expiry handles a row: the expiry or the end of the retry
 /// delay of a queued job, the end of a running job's lease, or the end of an ended job's retention.
@@ -116,15 +120,6 @@ CREATE TABLE labels (
     PRIMARY KEY (owner, label, job)
 ) WITHOUT ROWID;
 CREATE INDEX labels_job ON labels (job);
-CREATE TABLE outbox (
-    seq INTEGER PRIMARY KEY AUTOINCREMENT,
-    job BLOB NOT NULL,
-    due INTEGER NOT NULL,
-    attempts INTEGER NOT NULL,
-    url TEXT,
-    body TEXT
-);
-CREATE INDEX outbox_due ON outbox (due);
 ";
 
 /// Opens the connection of the writer.
@@ -157,13 +152,18 @@ fn migrate(connection: &mut Connection) -> Result<(), QueueError> {
     match found {
         0 => {
             transaction.execute_batch(TABLE)?;
+            transaction.execute_batch(OUTBOX)?;
             transaction.pragma_update(None, "application_id", new_identity())?;
             transaction.pragma_update(None, "user_version", VERSION)?;
         }
         VERSION => {}
         older @ OLDEST..VERSION => {
-            for upgrade in &UPGRADES[(older - OLDEST) as usize..] {
-                transaction.execute_batch(upgrade)?;
+            for change in UPGRADES[(older - OLDEST) as usize..]
+                .iter()
+                .copied()
+                .flatten()
+            {
+                transaction.execute_batch(change)?;
             }
             transaction.pragma_update(None, "user_version", VERSION)?;
             tracing::info!(from = older, to = VERSION, "the queue's file is upgraded");
