@@ -144,3 +144,29 @@ fn a_certificate_that_cannot_be_used_refuses_to_start() {
     assert!(matches!(ended.status.code(), Some(2 | 70)), "{log}");
     assert!(log.contains(".pem"), "{log}");
 }
+
+#[tokio::test]
+async fn a_certificate_is_exchanged_without_a_restart() {
+    let folder = Folder::new();
+    if !certificate(folder.path()) {
+        return;
+    }
+    let server = Server::start_in(&folder, &config(&folder), &[]);
+    drop(secure(&server, &folder, &["http/1.1"]).await);
+    // A client that trusts the new certificate alone finds it.
+    certificate(folder.path());
+    server.signal("HUP");
+    server.until("it has read the files", || {
+        server.log().contains("are read again")
+    });
+    drop(secure(&server, &folder, &["http/1.1"]).await);
+    // A key that does not belong to the certificate changes nothing.
+    let kept = std::fs::read(folder.path().join("certificate.pem")).expect("a file");
+    certificate(folder.path());
+    std::fs::write(folder.path().join("certificate.pem"), &kept).expect("written");
+    server.signal("HUP");
+    server.until("it has refused the files", || {
+        server.log().contains("stay as they were")
+    });
+    drop(secure(&server, &folder, &["http/1.1"]).await);
+}
