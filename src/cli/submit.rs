@@ -40,7 +40,7 @@ pub(super) struct Submit {
     /// Label of the job; repeat it for several
     #[arg(long, value_name = "NAME=VALUE")]
     label: Vec<String>,
-    /// URL that is told of the job's end
+    /// Webhook: a URL to which the server posts a notice when the job ends
     #[arg(long, value_name = "URL")]
     webhook: Option<String>,
     /// More options, a JSON object as in the API

@@ -88,8 +88,8 @@ pub struct JobOptions {
     /// 63 letters, digits, `-`, `_`, `.` or `/`, values of at most 255 bytes.
     #[serde(skip_serializing_if = "Labels::is_empty")]
     pub labels: Labels,
-    /// URL that is told of the job's end: an https address that the server's configuration allows. Only
-    /// for submitted jobs. Nobody is told if not given.
+    /// Webhook: a URL to which the server posts a notice when the job ends. The server's configuration
+    /// must allow the URL. Only for submitted jobs. No notice is sent if not given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub webhook: Option<String>,
     /// Also computes one dense cloud of a sequence, in addition to its flows.

@@ -73,7 +73,8 @@ pub enum NotTold {
 }
 
 impl NotTold {
-    /// Whether a later attempt may succeed. 410 Gone says that nobody listens any more.
+    /// Whether a later attempt may succeed. Status 410 (Gone) means that the receiver was removed, so it
+    /// is not retried.
     pub fn is_worth_a_retry(&self) -> bool {
         matches!(self, Self::Failed(_)) || matches!(self, Self::Status(status) if *status != 410)
     }

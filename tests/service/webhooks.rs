@@ -136,7 +136,7 @@ async fn the_end_of_a_job_is_told_signed_and_again_until_the_receiver_takes_it()
 #[tokio::test]
 async fn a_notice_that_a_kill_prevented_is_told_by_the_next_process() {
     let receiver = Receiver::default();
-    // Nobody listens on this port until the server was killed.
+    // The receiver starts on this port after the server is killed. Until then the port is closed.
     let free = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
     let address = free.local_addr().expect("an address");
     drop(free);
