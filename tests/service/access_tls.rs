@@ -12,7 +12,7 @@ use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 
 use crate::raw_http::{connect, exchange, status, until_closed};
-use crate::server::{Folder, Server};
+use crate::server::{FREE_PORTS, Folder, Server};
 
 const REQUEST: &[u8] = b"GET /v1/jobs HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n";
 
@@ -127,13 +127,7 @@ fn a_certificate_that_cannot_be_used_refuses_to_start() {
     let file = path.join("fnsf.toml");
     std::fs::write(&file, config(&folder)).expect("a file");
     let ended = Command::new(env!("CARGO_BIN_EXE_fnsf"))
-        .args([
-            "serve",
-            "--listen",
-            "127.0.0.1:0",
-            "--admin-listen",
-            "127.0.0.1:0",
-        ])
+        .args(FREE_PORTS)
         .arg("--data-dir")
         .arg(path.join("data"))
         .arg("--config")

@@ -12,6 +12,15 @@ use serde_json::Value;
 /// Timeout that suffices on a loaded machine. Only a failing test waits this long.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
 
+/// Arguments of a server that takes free ports.
+pub(crate) const FREE_PORTS: [&str; 5] = [
+    "serve",
+    "--listen",
+    "127.0.0.1:0",
+    "--admin-listen",
+    "127.0.0.1:0",
+];
+
 /// A running server. It is killed on drop.
 pub(crate) struct Server {
     child: Child,
@@ -81,13 +90,7 @@ impl Server {
         let file: PathBuf = folder.path().join("fnsf.toml");
         std::fs::write(&file, config).expect("a file");
         let mut child = program
-            .args([
-                "serve",
-                "--listen",
-                "127.0.0.1:0",
-                "--admin-listen",
-                "127.0.0.1:0",
-            ])
+            .args(FREE_PORTS)
             .arg("--data-dir")
             .arg(folder.path().join("data"))
             .arg("--config")

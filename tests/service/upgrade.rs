@@ -8,7 +8,7 @@ use reqwest::multipart::{Form, Part};
 use serde_json::Value;
 
 use crate::clouds::accepted;
-use crate::server::{Folder, Server, ended};
+use crate::server::{FREE_PORTS, Folder, Server, ended};
 
 /// The options of the frozen job with an idempotency key.
 const OPTIONS: &str = r#"{"ground": "keep", "labels": {"state": "succeeded"}}"#;
@@ -105,13 +105,7 @@ async fn data_of_a_newer_version_is_refused_by_name() {
         .expect("set");
     drop(queue);
     let refused = std::process::Command::new(env!("CARGO_BIN_EXE_fnsf"))
-        .args([
-            "serve",
-            "--listen",
-            "127.0.0.1:0",
-            "--admin-listen",
-            "127.0.0.1:0",
-        ])
+        .args(FREE_PORTS)
         .args(["--device", "cpu:1", "--data-dir"])
         .arg(folder.path().join("data"))
         .output()
