@@ -18,7 +18,7 @@ pub mod api;
 pub mod app;
 #[cfg(feature = "service")]
 pub mod cli;
-#[cfg(feature = "service")]
+#[cfg(feature = "formats")]
 pub mod clock;
 #[cfg(feature = "service")]
 pub mod config;
@@ -28,17 +28,17 @@ pub mod cost;
 pub mod engine;
 #[cfg(feature = "service")]
 pub mod fault;
-#[cfg(feature = "service")]
+#[cfg(feature = "formats")]
 pub mod formats;
 #[cfg(feature = "service")]
 pub mod health;
-#[cfg(feature = "service")]
+#[cfg(feature = "formats")]
 pub mod job;
 #[cfg(feature = "service")]
 pub mod metrics;
 #[cfg(feature = "service")]
 pub mod payload;
-#[cfg(feature = "service")]
+#[cfg(feature = "formats")]
 pub mod picture;
 #[cfg(feature = "service")]
 pub mod queue;
@@ -50,7 +50,7 @@ pub mod storage;
 mod sync;
 #[cfg(feature = "service")]
 pub mod telemetry;
-#[cfg(feature = "service")]
+#[cfg(feature = "formats")]
 mod text;
 #[cfg(feature = "service")]
 mod trace;
