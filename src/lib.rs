@@ -44,6 +44,8 @@ pub mod picture;
 pub mod queue;
 #[cfg(feature = "service")]
 pub mod remote;
+#[cfg(feature = "formats")]
+pub mod scores;
 #[cfg(feature = "service")]
 pub mod storage;
 #[cfg(feature = "service")]

@@ -5,12 +5,13 @@ use std::path::PathBuf;
 use anyhow::{Context, anyhow};
 use clap::Args;
 
-use super::report::{Report, Scores};
+use super::print::{print, print_buckets, print_heading, print_row};
 use super::tracks;
 use crate::cli::failure::Failure;
 use crate::cli::files;
 use crate::cli::output::say;
 use crate::formats::{FlowFile, Pair, PairTruth};
+use crate::scores::{Report, Scores};
 
 /// Compare flow files, or files of tracks, with ground truth.
 ///
@@ -54,7 +55,7 @@ pub(crate) struct Eval {
 pub(crate) fn print_score(flow: &FlowFile, truth: &PairTruth, pair: &Pair) -> Result<(), Failure> {
     let mut scores = Scores::default();
     scores.add(flow, truth, pair).map_err(Failure::bad_input)?;
-    scores.report(None).map_err(Failure::bad_input)?.print()
+    print(&scores.report(None).map_err(Failure::bad_input)?)
 }
 
 impl Eval {
@@ -82,7 +83,7 @@ impl Eval {
             .collect();
         let width = names.iter().map(String::len).fold("flow".len(), usize::max);
         if flows > 1 && !self.json {
-            Report::print_heading(width)?;
+            print_heading(width)?;
         }
         let mut all = Scores::default();
         for (index, name) in names.iter().enumerate() {
@@ -100,9 +101,9 @@ impl Eval {
             if self.json {
                 print_json(&report)?;
             } else if flows > 1 {
-                report.print_row(name, width)?;
+                print_row(&report, name, width)?;
             } else {
-                report.print()?;
+                print(&report)?;
             }
         }
         if flows > 1 {
@@ -110,8 +111,8 @@ impl Eval {
             if self.json {
                 print_json(&report)?;
             } else {
-                report.print_row("all", width)?;
-                report.print_buckets()?;
+                print_row(&report, "all", width)?;
+                print_buckets(&report)?;
             }
         }
         Ok(())

@@ -3,12 +3,12 @@
 use std::time::Instant;
 
 use super::devices::Devices;
-use crate::cli::eval::truth_of;
 use crate::flow::evaluate::{EvaluateError, Metrics, evaluate};
 use crate::flow::{
     Control, FlowError, Interrupt, Options, Problem, Progress, StopReason, estimate, predict_cost,
 };
 use crate::formats::{Pair, PairTruth};
+use crate::scores::truth_of;
 
 /// The result of one run.
 #[derive(Clone, Debug)]

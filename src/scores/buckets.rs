@@ -2,38 +2,47 @@
 
 use serde::Serialize;
 
-use crate::cli::failure::Failure;
-use crate::cli::output::say;
 use crate::flow::evaluate::{Bucket, BucketReport, CLASSES, ClassError};
 
 /// Lower bounds of the ranges of speed, metres a sweep interval: the bounds of buckets. The first is
 /// that of the slowest moving bucket, and the last range has no upper bound.
-const SPEEDS_M: [f64; 5] = [0.04, 0.2, 0.52, 1.0, 2.0];
+pub const SPEEDS_M: [f64; 5] = [0.04, 0.2, 0.52, 1.0, 2.0];
 
-/// Bucket-normalized errors, as `--json` prints them.
+/// Bucket-normalized errors: ratios of error to speed, and errors of static points in metres.
 #[derive(Debug, Serialize)]
-pub(super) struct BucketNormalizedReport {
-    pub(super) dynamic_error: Option<f64>,
-    static_epe: Option<f64>,
-    classes: Vec<ClassReport>,
+pub struct BucketNormalizedReport {
+    /// Mean over the classes; none where none moves.
+    pub dynamic_error: Option<f64>,
+    /// Mean over the classes, metres.
+    pub static_epe: Option<f64>,
+    /// The classes that have points.
+    pub classes: Vec<ClassReport>,
 }
 
+/// Errors of a class.
 #[derive(Debug, Serialize)]
-struct ClassReport {
-    class: &'static str,
-    dynamic_error: Option<f64>,
-    static_epe: Option<f64>,
-    points: usize,
-    speeds: Vec<SpeedReport>,
+pub struct ClassReport {
+    /// Name of the class.
+    pub class: &'static str,
+    /// Mean over the buckets of speed.
+    pub dynamic_error: Option<f64>,
+    /// EPE of static points, metres.
+    pub static_epe: Option<f64>,
+    /// Number of points.
+    pub points: usize,
+    /// The errors by ranges of speed, see [`SPEEDS_M`].
+    pub speeds: Vec<SpeedReport>,
 }
 
 /// The dynamic error of a range of speed: the mean over its buckets.
 #[derive(Debug, Serialize)]
-struct SpeedReport {
+pub struct SpeedReport {
     /// Lower bound of the true speed, metres a sweep interval.
-    from: f64,
-    dynamic_error: Option<f64>,
-    points: usize,
+    pub from: f64,
+    /// Mean over the buckets.
+    pub dynamic_error: Option<f64>,
+    /// Number of points.
+    pub points: usize,
 }
 
 impl SpeedReport {
@@ -84,37 +93,5 @@ impl BucketNormalizedReport {
             static_epe: report.static_epe,
             classes,
         })
-    }
-
-    /// Prints a table: a row for each class, and one for their mean.
-    pub(super) fn print(&self) -> Result<(), Failure> {
-        let value = |value: Option<f64>, digits| {
-            value.map_or("-".to_owned(), |value| format!("{value:.digits$}"))
-        };
-        say(format_args!(
-            "  bucket-normalized, within 35 m: error over speed, 1 is no motion at all; speeds in m a sweep"
-        ))?;
-        let bounds = SPEEDS_M.iter().skip(1).map(|end| format!("{end}"));
-        let ranges = SPEEDS_M.iter().zip(bounds.chain([String::new()]));
-        let heading: String = ranges
-            .map(|(from, end)| format!("{:>10}", format!("{from}-{end}")))
-            .collect();
-        say(format_args!(
-            "    {:<22}{:>10}{:>9}{heading}",
-            "class", "static (m)", "moving"
-        ))?;
-        for of in &self.classes {
-            let speeds = of.speeds.iter();
-            let speeds: String = speeds
-                .map(|speed| format!("{:>10}", value(speed.dynamic_error, 3)))
-                .collect();
-            let (still, moving) = (value(of.static_epe, 4), value(of.dynamic_error, 3));
-            say(format_args!(
-                "    {:<22}{still:>10}{moving:>9}{speeds}",
-                of.class
-            ))?;
-        }
-        let (still, moving) = (value(self.static_epe, 4), value(self.dynamic_error, 3));
-        say(format_args!("    {:<22}{still:>10}{moving:>9}", "mean"))
     }
 }
