@@ -40,7 +40,11 @@ experiment name *arguments:
 demo:
     cargo run --release -- demo
 
-# the image's recipe, alerts, dashboard and Python client against a release build
+# the Python package: wheel, lints, types, tests
+python:
+    clients/python/check
+
+# the image's recipe, alerts and dashboard against a release build
 deploy-check:
     cargo build --release --locked
     deploy/check --install target/release/fnsf

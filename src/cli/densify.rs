@@ -1,6 +1,6 @@
 //! `fnsf densify`: a sequence's sweeps accumulated in one dense cloud and one dense depth image.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use anyhow::anyhow;
@@ -12,9 +12,11 @@ use super::failure::Failure;
 use super::files;
 use super::output::say;
 use super::terminal::Terminal;
-use crate::flow::densify::{DensifyError, FlowEdge, Plan, carrier, densify};
+use crate::flow::densify::{
+    DensifyError, FieldStep, FlowEdge, Plan, carrier, densify, estimate_fields,
+};
 use crate::flow::depth::{Camera, DepthImage, Occlusion, project};
-use crate::flow::{Control, DenseCloud, Estimate, MotionField, Point, Sequence, Sweep};
+use crate::flow::{Control, DenseCloud, MotionField, Point, Sweep};
 use crate::formats::{DenseFormat, FormatError, write_dense, write_depth_png};
 use crate::job::JobOptions;
 use crate::job::LaterSweepsChoice;
@@ -265,49 +267,18 @@ fn fit(
     options: &JobOptions,
     terminal: &Terminal,
 ) -> Result<BTreeMap<FlowEdge, MotionField>, Failure> {
-    let mut fields: BTreeMap<FlowEdge, MotionField> = BTreeMap::new();
     let pairs = plan.edges().len();
-    for chain in plan.chains() {
-        let (mut sequence, mut waiting) = (Sequence::default(), VecDeque::from(chain));
-        let mut last = None;
-        for index in way(&waiting, sweeps.len()) {
-            terminal.part(&format!("pair {} of {pairs}", fields.len() + 1));
-            let before = last.replace(index).unwrap_or(index);
+    estimate_fields(plan, |sequence, step| match step {
+        FieldStep::Push {
+            before,
+            index,
+            done,
+        } => {
+            terminal.part(&format!("pair {} of {pairs}", done + 1));
             let larger = sweeps[before].points.len().max(sweeps[index].points.len());
             let solver_options = surroundings.options(options, larger, [before, index]);
-            let found = device.push(&mut sequence, &sweeps[index], &solver_options, terminal)?;
-            fields.extend(fields_of_edges(found, &mut waiting));
-            if waiting.is_empty() {
-                break;
-            }
+            device.push(sequence, &sweeps[index], &solver_options, terminal)
         }
-        while !waiting.is_empty() {
-            let rest = device.finish(&mut sequence, terminal)?;
-            fields.extend(fields_of_edges(rest, &mut waiting));
-        }
-    }
-    Ok(fields)
-}
-
-/// The sweeps to push so that the edges of a chain are estimated, in order, out of a sequence of
-/// `sweeps`. They go on past the chain's end to the end of the sequence, because the windows of the
-/// chain's last pairs may contain them.
-fn way(chain: &VecDeque<FlowEdge>, sweeps: usize) -> Vec<usize> {
-    match chain.front() {
-        None => Vec::new(),
-        Some(edge) if edge.source < edge.target => (edge.source..sweeps).collect(),
-        Some(edge) => (0..=edge.source).rev().collect(),
-    }
-}
-
-/// Pairs the estimates with the edges at the front of the queue, and removes these edges.
-fn fields_of_edges(
-    estimates: Vec<Estimate>,
-    waiting: &mut VecDeque<FlowEdge>,
-) -> Vec<(FlowEdge, MotionField)> {
-    let edges = waiting.drain(..estimates.len().min(waiting.len()));
-    edges
-        .zip(estimates)
-        .map(|(edge, estimate)| (edge, estimate.motion))
-        .collect()
+        FieldStep::Finish => device.finish(sequence, terminal),
+    })
 }

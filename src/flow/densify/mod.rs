@@ -13,10 +13,12 @@
 mod accumulate;
 mod advect;
 mod error;
+mod fields;
 mod plan;
 #[cfg(test)]
 mod tests;
 
 pub use accumulate::{carrier, densify};
 pub use error::DensifyError;
+pub use fields::{FieldStep, estimate_fields};
 pub use plan::{FlowEdge, LaterSweeps, Plan, PlanError};

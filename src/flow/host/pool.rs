@@ -69,6 +69,13 @@ impl Host {
         self.sweep_cache.forget();
     }
 
+    /// Does `work` on these threads: for functions that take no backend and compute in parallel, such
+    /// as those of [`crate::flow::ground`] and [`crate::flow::simulate`]. Elsewhere they use rayon's
+    /// global threads.
+    pub fn install<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
+        self.threads.install(work)
+    }
+
     /// The thread pool.
     pub(crate) fn threads(&self) -> &Arc<rayon::ThreadPool> {
         &self.threads

@@ -64,7 +64,10 @@ impl MotionField {
             Residual::Still => Ok(vec![[0.0; 3]; static_positions.len()]),
             Residual::Network(network) => backend.evaluate(network, static_positions),
             Residual::Linear(field) => Ok(field.flow(static_positions, backend.host().threads())),
-            Residual::Objects(motions) => Ok(motions.residual_at(static_positions)),
+            Residual::Objects(motions) => {
+                let threads = backend.host().threads();
+                Ok(threads.install(|| motions.residual_at(static_positions)))
+            }
             Residual::Sampled(motion) => {
                 let threads = backend.host().threads();
                 Ok(threads.install(|| motion.displacements_at(static_positions)))

@@ -1,0 +1,179 @@
+//! The estimates of a sequence, sweep by sweep, with the tracks of its moving objects.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
+
+use fnsf::flow::tracks::{ClusteredSweep, Tracker, correct};
+use fnsf::flow::{self, Ego, Estimate, Point, Sweep};
+use fnsf::job::JobOptions;
+use pyo3::prelude::*;
+use pyo3::types::PyList;
+
+use crate::arrays::{Mask, Matrix, PointArray, Values, column, motion, points};
+use crate::errors::{Error, input, internal};
+use crate::estimate::{Place, answer, options_of};
+use crate::objects;
+use crate::supervision::Watch;
+
+/// A pair whose estimate may need later sweeps.
+struct Waiting {
+    sweeps: [Arc<[Point]>; 2],
+    options: JobOptions,
+}
+
+/// What a sequence keeps between two calls.
+struct State {
+    place: Place,
+    sequence: flow::Sequence,
+    waiting: VecDeque<Waiting>,
+    last: Option<Arc<[Point]>>,
+    tracker: Option<Tracker>,
+}
+
+/// The estimates of the consecutive pairs of a sequence.
+#[pyclass(frozen, module = "fnsf._native")]
+pub(crate) struct Sequence(Mutex<State>);
+
+impl Sequence {
+    /// The state. One thread at a time may push.
+    fn state(&self) -> PyResult<MutexGuard<'_, State>> {
+        match self.0.try_lock() {
+            Ok(state) => Ok(state),
+            Err(TryLockError::Poisoned(state)) => Ok(state.into_inner()),
+            Err(TryLockError::WouldBlock) => Err(Error::new_err(
+                "another thread uses this sequence: sweeps are pushed one after the other",
+            )),
+        }
+    }
+}
+
+impl State {
+    /// The complete pairs as dictionaries, corrected by the tracks where they are kept.
+    fn complete<'py>(
+        &mut self,
+        py: Python<'py>,
+        estimates: Vec<Estimate>,
+        out: &Bound<'py, PyList>,
+    ) -> PyResult<()> {
+        for mut estimate in estimates {
+            let pair = self.waiting.pop_front();
+            let pair = pair.ok_or_else(|| internal("an estimate without its pair"))?;
+            let [source, target] = estimate.sweeps([&pair.sweeps[0], &pair.sweeps[1]]);
+            if let Some(tracker) = &mut self.tracker {
+                let dt_s = pair.options.solver_options(0).dt_s;
+                let sweep = ClusteredSweep::new(&source, &estimate, dt_s).map_err(input)?;
+                let tracked = tracker.push(&sweep).map_err(internal)?;
+                correct(&mut estimate, [&source, &target], &tracked, dt_s);
+            }
+            let [source, target] = &pair.sweeps;
+            out.append(answer(py, estimate, &pair.options, [source, target])?)?;
+        }
+        Ok(())
+    }
+}
+
+#[pymethods]
+impl Sequence {
+    #[new]
+    #[pyo3(signature = (options, *, device="auto", threads=None, track=false))]
+    fn new(
+        py: Python<'_>,
+        options: &str,
+        device: &str,
+        threads: Option<usize>,
+        track: bool,
+    ) -> PyResult<Self> {
+        let options = options_of(options)?;
+        Ok(Self(Mutex::new(State {
+            place: Place::open(py, device, threads, options)?,
+            sequence: flow::Sequence::default(),
+            waiting: VecDeque::new(),
+            last: None,
+            tracker: track.then(Tracker::default),
+        })))
+    }
+
+    /// Adds a sweep, N x 3 metres, and returns the pairs that are complete with it. `ego` and `dt_s`
+    /// are those of the pair that has the sweep as its target.
+    #[pyo3(signature = (sweep, *, mask=None, times=None, ego=None, dt_s=None, deadline=None, progress=None))]
+    #[expect(
+        clippy::too_many_arguments,
+        reason = "the arguments of the Python method, named at its only call"
+    )]
+    fn push<'py>(
+        &self,
+        py: Python<'py>,
+        sweep: PointArray<'py>,
+        mask: Option<Mask<'py>>,
+        times: Option<Values<'py>>,
+        ego: Option<Matrix<'py>>,
+        dt_s: Option<f32>,
+        deadline: Option<f64>,
+        progress: Option<Bound<'py, PyAny>>,
+    ) -> PyResult<Bound<'py, PyList>> {
+        let watch = Watch::new(deadline)?;
+        let mut state = self.state()?;
+        let state = &mut *state;
+        let cloud: Arc<[Point]> = points("sweep", &sweep)?.into();
+        let count = cloud.len();
+        let mask = mask.map(|mask| column("the ground mask", &mask, count));
+        let times = times.map(|times| column("times", &times, count));
+        let sweep = Sweep {
+            points: cloud.to_vec(),
+            ground: mask.transpose()?,
+            times: times.transpose()?,
+        };
+        let mut options = state.place.options.clone();
+        options.dt_s = dt_s.or(options.dt_s);
+        options.check().map_err(input)?;
+        let larger = count.max(state.last.as_ref().map_or(0, |last| last.len()));
+        let mut solver = options.solver_options(larger);
+        if let Some(ego) = ego {
+            solver.ego = Ego::Given(motion("ego", &ego)?);
+        }
+        let sequence = &mut state.sequence;
+        let estimates = state.place.run(py, &watch, progress.as_ref(), |backend| {
+            sequence.push(backend, sweep.clone(), &solver, &watch)
+        })?;
+        if let Some(last) = state.last.replace(Arc::clone(&cloud)) {
+            let sweeps = [last, cloud];
+            state.waiting.push_back(Waiting { sweeps, options });
+        }
+        let complete = PyList::empty(py);
+        state.complete(py, estimates, &complete)?;
+        Ok(complete)
+    }
+
+    /// Returns the remaining pairs at the end of the sequence.
+    #[pyo3(signature = (*, deadline=None, progress=None))]
+    fn finish<'py>(
+        &self,
+        py: Python<'py>,
+        deadline: Option<f64>,
+        progress: Option<Bound<'py, PyAny>>,
+    ) -> PyResult<Bound<'py, PyList>> {
+        let watch = Watch::new(deadline)?;
+        let mut state = self.state()?;
+        let state = &mut *state;
+        let complete = PyList::empty(py);
+        while !state.waiting.is_empty() {
+            let sequence = &mut state.sequence;
+            let estimates = state.place.run(py, &watch, progress.as_ref(), |backend| {
+                sequence.finish(backend, &watch)
+            })?;
+            if estimates.is_empty() {
+                break;
+            }
+            state.complete(py, estimates, &complete)?;
+        }
+        Ok(complete)
+    }
+
+    /// The tracks of the pairs that are complete, as a structured array; none where they are not
+    /// kept.
+    fn tracks<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
+        let tracker = self.state()?.tracker.clone();
+        let tracks = tracker.map(|tracker| objects::tracks(py, &tracker.finish()));
+        tracks.transpose()
+    }
+}

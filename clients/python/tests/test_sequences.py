@@ -1,0 +1,88 @@
+"""Sequences, tracks and dense clouds."""
+
+import json
+import subprocess
+
+import numpy as np
+import pytest
+
+import fnsf
+
+
+@pytest.fixture(scope="module")
+def files(street, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("street")
+    paths = [folder / f"{index:06}.pcd" for index in range(len(street))]
+    for index, path in enumerate(paths):
+        fnsf.write(path, street.sweep(index).points)
+    return paths
+
+
+def test_a_sequence_has_the_bits_and_the_tracks_of_the_command_line(program, street, files, tmp_path):
+    command = [program, "flow", *files, "--preset", "label", "--dt", "0.1", "-o", tmp_path / "flow.npz"]
+    subprocess.run([*command, "--tracks", tmp_path / "tracks.json"], check=True, capture_output=True)
+    sequence, flows = fnsf.Sequence(track=True, dt_s=0.1), []
+    for index in range(len(street)):
+        flows += sequence.push(street.sweep(index).points)
+    flows += sequence.finish()
+    assert len(flows) == len(street) - 1 and sequence.finish() == []
+    for index, flow in enumerate(flows):
+        theirs = fnsf.read_flow(tmp_path / f"flow_{index:04}.npz")
+        assert np.array_equal(flow.flow, theirs.flow) and np.array_equal(flow.clusters, theirs.clusters)
+    states = [
+        (track["id"], state)
+        for track in json.loads((tmp_path / "tracks.json").read_text())["tracks"]
+        for state in track["states"]
+    ]
+    tracks = sequence.tracks()
+    assert len(tracks) == len(states) > 0
+    for ours, (identity, theirs) in zip(tracks, states, strict=True):
+        assert ours["id"] == identity
+        for name, value in theirs.items():
+            assert np.allclose(ours[name], value), name
+
+
+def test_known_motions_and_masks_are_taken(street):
+    sequence = fnsf.Sequence(preset="default")
+    assert sequence.tracks() is None
+    pair = street.pair(0)
+    sequence.push(pair.source, ground=pair.masks[0])
+    (flow,) = sequence.push(pair.target, ground=pair.masks[1], ego=pair.ego, dt_s=0.2)
+    assert np.allclose(flow.ego, pair.ego)
+    assert flow.report["dt_s"] == 0.2
+    refused = fnsf.Sequence(preset="default")
+    refused.push(pair.source)
+    with pytest.raises(fnsf.InputError, match="0 usable points"):
+        refused.push(np.zeros((0, 3)))
+    assert len(refused.push(pair.target)) == 1
+
+
+def test_a_dense_cloud_has_the_bits_of_the_command_line(program, street, files, tmp_path):
+    command = [program, "densify", *files[:4], "--reference-time", "1.5", "-o", tmp_path / "dense.npz"]
+    subprocess.run(command, check=True, capture_output=True)
+    told = []
+    clouds = [street.sweep(index).points for index in range(4)]
+    cloud = fnsf.densify(clouds, 1.5, dt_s=0.1, progress=lambda *step: told.append(step))
+    with np.load(tmp_path / "dense.npz") as theirs:
+        for name in ["points", "sweep", "age", "dynamic", "converged"]:
+            assert np.array_equal(getattr(cloud, name), theirs[name]), name
+    assert told
+    for ending in ["npz", "ply", "pcd", "laz", "las"]:
+        cloud.save(tmp_path / f"dense.{ending}")
+        assert (tmp_path / f"dense.{ending}").stat().st_size > len(cloud)
+
+
+def test_poses_lead_a_dense_cloud(street):
+    clouds, poses = [street.sweep(index).points for index in range(3)], [street.pose(index) for index in range(3)]
+    masks = [street.pair(0).masks[0], street.pair(0).masks[1], street.pair(1).masks[1]]
+    cloud = fnsf.densify(clouds, 2, poses=poses, masks=masks, later_sweeps="inverse")
+    assert len(cloud) == sum(map(len, clouds))
+    # The static world does not drift: a ground point of sweep 0 lies where its pose says.
+    moved = clouds[0] @ (np.linalg.inv(poses[2]) @ poses[0])[:3, :3].T + (np.linalg.inv(poses[2]) @ poses[0])[:3, 3]
+    still = (cloud.sweep == 0) & ~cloud.dynamic
+    assert np.abs(cloud.points[still] - moved[~cloud.dynamic[cloud.sweep == 0]]).max() < 1e-3
+    for wrong, said in [({"poses": poses[:2]}, "2 poses for 3 sweeps"), ({"masks": masks[:2]}, "2 masks for 3 sweeps")]:
+        with pytest.raises(fnsf.InputError, match=said):
+            fnsf.densify(clouds, 1, **wrong)
+    with pytest.raises(fnsf.InputError, match="outside the sequence"):
+        fnsf.densify(clouds, 7)
