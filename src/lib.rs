@@ -35,6 +35,8 @@ pub mod health;
 #[cfg(feature = "formats")]
 pub mod job;
 #[cfg(feature = "service")]
+pub mod label;
+#[cfg(feature = "service")]
 pub mod metrics;
 #[cfg(feature = "service")]
 pub mod payload;

@@ -73,7 +73,7 @@ pub(super) fn open(
     threads: Option<usize>,
 ) -> Result<Box<dyn Backend>, Failure> {
     match device.choice {
-        DeviceChoice::Cpu => cpu(threads),
+        DeviceChoice::Cpu => cpu(threads).map_err(Failure::internal),
         DeviceChoice::Gpu => {
             let opened = gpu::select(&device.adapter, software_is_welcome())
                 .and_then(|adapter| open_card(&adapter));
@@ -86,17 +86,17 @@ pub(super) fn open(
             Ok(opened) => Ok(opened),
             Err(error) => {
                 stand_in(&error);
-                cpu(threads)
+                cpu(threads).map_err(Failure::internal)
             }
         },
     }
 }
 
 /// The CPU backend, with `threads` threads or one per core.
-pub(super) fn cpu(threads: Option<usize>) -> Result<Box<dyn Backend>, Failure> {
+pub(super) fn cpu(threads: Option<usize>) -> Result<Box<dyn Backend>, BackendError> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let opened = CpuBackend::new(Some(threads.unwrap_or(cores)));
-    Ok(Box::new(opened.map_err(Failure::internal)?))
+    let opened = CpuBackend::new(Some(threads.unwrap_or(cores)))?;
+    Ok(Box::new(opened))
 }
 
 /// Warns on stderr that the CPU is used instead of a GPU.

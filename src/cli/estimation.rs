@@ -11,10 +11,9 @@ use super::terminal::Terminal;
 use super::{device, files};
 use crate::flow::field::{Backend, BackendError};
 use crate::flow::{self, Ego, Estimate, FlowError, Point, RigidTransform, Sequence, Sweep};
-use crate::formats::{self, SweepTime, TimedCloud};
+use crate::formats::{self, PointTimes, SweepClock, TimedCloud, pair_interval_s};
 use crate::job::{
-    DeviceChoice, EgoChoice, FieldChoices, GroundChoice, JobOptions, MAX_DT_S, PrecisionChoice,
-    PresetChoice,
+    DeviceChoice, EgoChoice, FieldChoices, GroundChoice, JobOptions, PrecisionChoice, PresetChoice,
 };
 
 /// Options of the flow estimate.
@@ -188,7 +187,9 @@ impl Estimation {
             ..JobOptions::default()
         };
         let backend = match self.device.choice {
-            DeviceChoice::Auto if !options.runs_on_gpu() => device::cpu(threads)?,
+            DeviceChoice::Auto if !options.runs_on_gpu() => {
+                device::cpu(threads).map_err(Failure::internal)?
+            }
             _ => device::open(&self.device, threads)?,
         };
         Ok(Device {
@@ -240,28 +241,28 @@ impl Device<'_> {
 
     fn tried(
         &mut self,
-        mut work: impl FnMut(&dyn Backend) -> Result<Vec<Estimate>, FlowError>,
+        work: impl FnMut(&dyn Backend) -> Result<Vec<Estimate>, FlowError>,
     ) -> Result<Vec<Estimate>, Failure> {
+        Ok(self.with_fallback(work)?)
+    }
+
+    /// Does `work` on the device, with the same fallback as `push`.
+    pub(super) fn with_fallback<T>(
+        &mut self,
+        mut work: impl FnMut(&dyn Backend) -> Result<T, FlowError>,
+    ) -> Result<T, FlowError> {
         match work(self.backend.as_ref()) {
             Err(FlowError::Backend(error @ BackendError::Memory { .. }))
                 if self.asked.device.choice == DeviceChoice::Auto =>
             {
                 device::stand_in(&error);
-                self.backend = device::cpu(self.asked.threads.map(usize::from))?;
-                Ok(work(self.backend.as_ref())?)
+                let threads = self.asked.threads.map(usize::from);
+                self.backend = device::cpu(threads)?;
+                work(self.backend.as_ref())
             }
-            done => Ok(done?),
+            done => done,
         }
     }
-}
-
-/// The clock of a sweep whose points have times.
-#[derive(Clone, Copy, Debug)]
-struct SweepClock {
-    /// Time from the first point to the last, seconds.
-    duration_s: f64,
-    /// Time of the sweep on the sensor's clock, seconds.
-    sweep_s: Option<f64>,
 }
 
 /// Poses, clocks and ground raster of a sequence's sweeps.
@@ -276,26 +277,13 @@ pub(super) struct Surroundings {
 
 impl Surroundings {
     /// The options with the time between the two sweeps of a pair, where the options do not give it.
-    /// It is the difference of the timestamps in the file names, else of the sensor's clock, else
-    /// the duration of the source, because a spinning lidar does not pause between two turns.
     pub(super) fn timed(&self, options: &JobOptions, [source, target]: [usize; 2]) -> JobOptions {
         let mut options = options.clone();
-        let time = |sweep: usize| SweepTime::from_name(self.names.get(sweep)?);
-        options.dt_s = options
-            .dt_s
-            .or_else(|| time(source)?.interval_s(time(target)?))
-            .or_else(|| self.interval_s([source, target]));
+        let pair = [source, target];
+        let names = pair.map(|sweep| self.names.get(sweep).map_or("", String::as_str));
+        let clocks = pair.map(|sweep| self.clocks.get(sweep).copied().flatten());
+        options.dt_s = options.dt_s.or_else(|| pair_interval_s(names, clocks));
         options
-    }
-
-    /// The time between two sweeps by the times of their points, seconds.
-    fn interval_s(&self, [source, target]: [usize; 2]) -> Option<f32> {
-        let clock = |sweep: usize| *self.clocks.get(sweep)?;
-        let [source, target] = [clock(source)?, clock(target)?];
-        let apart = source.sweep_s.zip(target.sweep_s);
-        let apart = apart.map(|(source, target)| (target - source).abs());
-        let apart = apart.filter(|&apart| apart > 0.0 && apart <= f64::from(MAX_DT_S));
-        Some(apart.unwrap_or(source.duration_s) as f32)
     }
 
     /// The solver's options for the pair of two sweeps, given by their indices. The larger sweep
@@ -334,10 +322,7 @@ impl Surroundings {
         if let Some(refused) = refused_times {
             eprintln!("fnsf: warning: {}: {refused}", path.display());
         }
-        self.clocks[index] = times.as_ref().map(|times| SweepClock {
-            duration_s: times.duration_s,
-            sweep_s: times.sweep_s,
-        });
+        self.clocks[index] = times.as_ref().map(PointTimes::clock);
         Ok(Sweep {
             ground: self.ground(index, &cloud.points),
             points: cloud.points,

@@ -17,6 +17,7 @@ enum Kind {
     Usage,
     BadInput,
     Internal,
+    TryAgain,
     ReaderGone,
 }
 
@@ -45,6 +46,14 @@ impl Failure {
         }
     }
 
+    /// Trying again may help: exit code 75.
+    pub(super) fn try_again(error: impl Into<anyhow::Error>) -> Self {
+        Self {
+            kind: Kind::TryAgain,
+            error: error.into(),
+        }
+    }
+
     /// The reader of stdout closed the pipe. This is not an error: exit code 0 and no message.
     pub(super) fn reader_gone(error: impl Into<anyhow::Error>) -> Self {
         Self {
@@ -64,6 +73,7 @@ impl Failure {
             Kind::Usage => 2,
             Kind::BadInput => 65,
             Kind::Internal => 70,
+            Kind::TryAgain => 75,
         })
     }
 }

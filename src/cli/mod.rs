@@ -24,6 +24,7 @@ mod doctor;
 mod eval;
 mod flow;
 mod jobs;
+mod label;
 mod serve;
 mod submit;
 mod synth;
@@ -44,7 +45,8 @@ use clap::{Parser, Subcommand};
     fnsf flow a.pcd b.pcd --picture flow.png   the same, to look at\n  \
     fnsf view a.pcd b.pcd                      the same in 3-D, in a browser
   \
-    fnsf densify *.pcd --reference-time 5 -o dense.laz   a drive's sweeps as one dense cloud")]
+    fnsf densify *.pcd --reference-time 5 -o dense.laz   a drive's sweeps as one dense cloud\n  \
+    fnsf label drives/ -o labels               the flows of many drives, in shards")]
 pub struct Arguments {
     #[command(subcommand)]
     command: Command,
@@ -61,6 +63,7 @@ enum Command {
     Flow(flow::Flow),
     Densify(densify::Densify),
     Eval(eval::Eval),
+    Label(Box<label::Label>),
     View(Box<view::View>),
     Synth(synth::Synth),
     Tables(tables::Tables),
@@ -68,7 +71,7 @@ enum Command {
 }
 
 /// Runs the command and returns its exit code: 0 success, 2 usage error, 65 bad input, 70 internal
-/// error. Prints a failure as one line on stderr. A closed stdout is a success.
+/// error, 75 try again. Prints a failure as one line on stderr. A closed stdout is a success.
 pub fn run(arguments: Arguments) -> ExitCode {
     let done = match arguments.command {
         Command::Demo(command) => command.run(),
@@ -80,6 +83,7 @@ pub fn run(arguments: Arguments) -> ExitCode {
         Command::Flow(command) => command.run(),
         Command::Densify(command) => command.run(),
         Command::Eval(command) => command.run(),
+        Command::Label(command) => command.run(),
         Command::View(command) => command.run(),
         Command::Synth(command) => command.run(),
         Command::Tables(command) => command.run(),

@@ -77,7 +77,7 @@ pub use objects::{
 pub use options::*;
 pub use problem::{NeighborSweep, Problem};
 pub use registration::Registration;
-pub use sequence::{Sequence, Sweep, is_window_final, window};
+pub use sequence::{Sequence, Sweep, WindowedPair, is_window_final, window};
 
 #[cfg(feature = "service")]
 pub(crate) use data::{largest, locked};

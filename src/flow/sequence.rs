@@ -120,6 +120,64 @@ fn before_pair(sweeps: usize) -> usize {
     (sweeps - 1) / 2
 }
 
+/// A pair of a sequence, to be estimated by itself from the sweeps of its [`window`].
+#[derive(Clone, Copy, Debug)]
+pub struct WindowedPair<'a> {
+    /// Index of the pair's earlier sweep.
+    pub pair: usize,
+    /// Number of sweeps in the sequence, more than `pair + 1`.
+    pub count: usize,
+    /// Window size in sweeps.
+    pub sweeps: usize,
+    /// The motion field of the pair before, see [`Problem::before`].
+    pub before: Option<&'a MotionField>,
+}
+
+impl WindowedPair<'_> {
+    /// Estimates the pair. `sweep` returns the sweeps of the window by their index, as
+    /// [`Sweep::prepared`] returns them. A neighbor sweep for which it returns none is left out.
+    ///
+    /// The result has the bits of [`Sequence`] where all sweeps are there.
+    ///
+    /// # Errors
+    /// As [`estimate`].
+    ///
+    /// # Panics
+    /// If `sweep` returns none for a sweep of the pair.
+    pub fn estimate<'s>(
+        &self,
+        backend: &dyn Backend,
+        sweep: impl Fn(usize) -> Option<&'s Sweep>,
+        options: &Options,
+        control: &dyn Control,
+    ) -> Result<Estimate, FlowError> {
+        let of_pair = |index| sweep(index).expect("both sweeps of the pair are there");
+        let (source, target) = (of_pair(self.pair), of_pair(self.pair + 1));
+        let ground = source.ground.as_deref();
+        let ground = ground.zip(target.ground.as_deref());
+        let times = source.times.as_deref();
+        let times = times.zip(target.times.as_deref());
+        let others = window(self.pair, self.count, self.sweeps);
+        let others = others.filter(|&index| index != self.pair && index != self.pair + 1);
+        let neighbors: Vec<NeighborSweep> = others
+            .filter_map(|index| {
+                // Sweeps more than 127 intervals away are skipped.
+                let at = i8::try_from(index as i64 - self.pair as i64).ok()?;
+                Some(sweep(index)?.as_neighbor(at))
+            })
+            .collect();
+        let problem = Problem {
+            source: &source.points,
+            target: &target.points,
+            ground: ground.map(|(source, target)| [source, target]),
+            times: times.map(|(source, target)| [source, target]),
+            before: self.before,
+            neighbors: &neighbors,
+        };
+        estimate(backend, &problem, options, control)
+    }
+}
+
 /// A sweep, and the options of the pair that has it as its target.
 #[derive(Clone, Debug)]
 struct QueuedSweep {
@@ -256,29 +314,18 @@ impl Sequence {
         pair: usize,
         control: &dyn Control,
     ) -> Result<Estimate, FlowError> {
-        let (source, target) = (&self.at(pair).sweep, self.at(pair + 1));
-        let ground = source.ground.as_deref();
-        let ground = ground.zip(target.sweep.ground.as_deref());
-        let times = source.times.as_deref();
-        let times = times.zip(target.sweep.times.as_deref());
-        let others = window(pair, self.count, self.sweeps);
-        let others = others.filter(|&index| index != pair && index != pair + 1);
-        let neighbors: Vec<NeighborSweep> = others
-            .filter_map(|index| {
-                // Sweeps more than 127 intervals away are skipped.
-                let at = i8::try_from(index as i64 - pair as i64).ok()?;
-                Some(self.at(index).sweep.as_neighbor(at))
-            })
-            .collect();
-        let problem = Problem {
-            source: &source.points,
-            target: &target.sweep.points,
-            ground: ground.map(|(source, target)| [source, target]),
-            times: times.map(|(source, target)| [source, target]),
+        let windowed = WindowedPair {
+            pair,
+            count: self.count,
+            sweeps: self.sweeps,
             before: self.before.as_ref(),
-            neighbors: &neighbors,
         };
-        estimate(backend, &problem, &target.options, control)
+        windowed.estimate(
+            backend,
+            |index| Some(&self.at(index).sweep),
+            &self.at(pair + 1).options,
+            control,
+        )
     }
 
     fn at(&self, index: usize) -> &QueuedSweep {

@@ -7,7 +7,7 @@
 use std::io::{Read, Write};
 use std::sync::Arc;
 
-use arrow_array::{ArrayRef, BooleanArray, Float32Array, Int32Array, RecordBatch};
+use arrow_array::{ArrayRef, BooleanArray, Float16Array, Float32Array, Int32Array, RecordBatch};
 use arrow_ipc::writer::{FileWriter, IpcWriteOptions};
 use arrow_ipc::{CompressionType, Endianness, Message, Precision, Type};
 
@@ -353,6 +353,7 @@ fn layout(field: &arrow_ipc::Field<'_>) -> Option<(Stored, usize)> {
 /// A column to be written.
 pub(super) enum Values<'a> {
     Floats(Box<dyn Iterator<Item = f32> + 'a>),
+    Halves(Box<dyn Iterator<Item = f32> + 'a>),
     Flags(&'a [bool]),
     Ids(&'a [i32]),
 }
@@ -366,6 +367,9 @@ pub(super) fn write<W: Write>(
     let array = |(name, values)| {
         let array: ArrayRef = match values {
             Values::Floats(values) => Arc::new(Float32Array::from_iter_values(values)),
+            Values::Halves(values) => Arc::new(Float16Array::from_iter_values(
+                values.map(half::f16::from_f32),
+            )),
             Values::Flags(flags) => Arc::new(BooleanArray::from(flags.to_vec())),
             Values::Ids(ids) => Arc::new(Int32Array::from(ids.to_vec())),
         };

@@ -10,6 +10,7 @@ mod sniff;
 mod sweep_order;
 mod timestamps;
 
+mod av2_challenge;
 mod camera;
 mod cloud;
 mod dense_file;
@@ -32,6 +33,7 @@ mod pcd;
 mod ply;
 mod scalar;
 
+pub use crate::formats::av2_challenge::{Av2Challenge, read_av2_mask, write_av2_challenge};
 pub use crate::formats::camera::{KITTI_SIZE_PX, read_camera, read_camera0_from_lidar};
 pub use crate::formats::cloud::{
     Cloud, CloudFormat, TimedCloud, declared_rows, read_cloud, read_cloud_within, read_timed_cloud,
@@ -51,6 +53,6 @@ pub use crate::formats::pair::{
 pub use crate::formats::point_times::PointTimes;
 pub use crate::formats::poses::{PoseFile, read_poses};
 pub use crate::formats::sniff::recognize;
-pub use sweep_order::turning_sweep;
-pub use timestamps::{SweepTime, TimeUnit};
+pub use sweep_order::{compare_names, turning_sweep};
+pub use timestamps::{SweepClock, SweepTime, TimeUnit, pair_interval_s};
 pub use tracks::{is_tracks, read_tracks, write_tracks};

@@ -2,6 +2,7 @@
 
 use super::error::{FileKind, FormatError};
 use super::limits::check_finite;
+use super::timestamps::SweepClock;
 
 /// Names of a column of point times, the first that is there is read. `offset_ns` is Argoverse 2's,
 /// `t` is Ouster's, `time` Velodyne's, `timestamp` Hesai's, Robosense's and Livox's.
@@ -29,6 +30,16 @@ pub struct PointTimes {
     pub duration_s: f64,
     /// Time of the sweep on the sensor's clock, seconds, if the file has it.
     pub sweep_s: Option<f64>,
+}
+
+impl PointTimes {
+    /// The clock of the sweep.
+    pub fn clock(&self) -> SweepClock {
+        SweepClock {
+            duration_s: self.duration_s,
+            sweep_s: self.sweep_s,
+        }
+    }
 }
 
 /// The values of a column of point times, one for each row read so far.

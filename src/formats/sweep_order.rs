@@ -18,6 +18,22 @@ fn compared(a: &str, b: &str) -> Ordering {
     a.len().cmp(&b.len()).then_with(|| a.cmp(b))
 }
 
+/// Compares two file names by the numbers in them, so that `2.pcd` comes before `10.pcd`. Names that
+/// differ in more than their numbers, or not even in them, are compared as text.
+pub fn compare_names(one: &str, other: &str) -> Ordering {
+    let (texts, numbers) = parts(one);
+    let (other_texts, other_numbers) = parts(other);
+    let by_numbers = match texts == other_texts && numbers.len() == other_numbers.len() {
+        true => {
+            let pairs = numbers.iter().zip(&other_numbers);
+            let steps = pairs.map(|(a, b)| compared(a, b));
+            steps.fold(Ordering::Equal, Ordering::then)
+        }
+        false => Ordering::Equal,
+    };
+    by_numbers.then_with(|| one.cmp(other))
+}
+
 /// The index of the first sweep after which the numbers of the file names go the other way. None if
 /// they rise or fall throughout, or if the names differ in more than their numbers.
 ///

@@ -23,6 +23,33 @@ pub enum TimeUnit {
     Milliseconds,
 }
 
+/// The clock of a sweep whose points have times.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SweepClock {
+    /// Time from the first point to the last, seconds.
+    pub duration_s: f64,
+    /// Time of the sweep on the sensor's clock, seconds, where it is known.
+    pub sweep_s: Option<f64>,
+}
+
+/// Seconds between the two sweeps of a pair, by what is known of them. It is the difference of the
+/// timestamps in their `names`, else of the sensor's clock, else the duration of the source, because a
+/// spinning lidar does not pause between two turns. None if nothing is known.
+pub fn pair_interval_s(names: [&str; 2], clocks: [Option<SweepClock>; 2]) -> Option<f32> {
+    let [source, target] = names.map(SweepTime::from_name);
+    let by_names = source.zip(target);
+    by_names
+        .and_then(|(source, target)| source.interval_s(target))
+        .or_else(|| {
+            let [source, target] = clocks;
+            let (source, target) = source.zip(target)?;
+            let apart = source.sweep_s.zip(target.sweep_s);
+            let apart = apart.map(|(source, target)| (target - source).abs());
+            let apart = apart.filter(|&apart| apart > 0.0 && apart <= MAX_INTERVAL_S);
+            Some(apart.unwrap_or(source.duration_s) as f32)
+        })
+}
+
 impl SweepTime {
     /// The time in a file name or path; none if it holds no timestamp.
     ///

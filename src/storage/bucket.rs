@@ -35,6 +35,8 @@ pub(super) fn open(url: &str) -> Result<Arc<dyn ObjectStore>, BucketError> {
     let is_known = |parsed: &Url| ["s3", "gs", "az"].contains(&parsed.scheme());
     let parsed = Url::parse(url).ok().filter(is_known);
     let parsed = parsed.ok_or_else(|| BucketError::Url(url.to_owned()))?;
+    // The client of the bucket needs one.
+    let _named_already = rustls::crypto::ring::default_provider().install_default();
     let opened = parse_url_opts(&parsed, std::env::vars());
     let (store, prefix) = opened.map_err(BucketError::Settings)?;
     Ok(Arc::new(PrefixStore::new(store, prefix)))

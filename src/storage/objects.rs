@@ -1,17 +1,19 @@
-//! Objects of other people's buckets, for reading.
+//! Objects of a folder or a bucket that belongs to other people, by name: sweeps and labels.
 
+use std::path::Path as FilePath;
 use std::sync::Arc;
 
 use bytes::Bytes;
 use futures_util::stream::BoxStream;
 use futures_util::{StreamExt, TryStreamExt};
+use object_store::local::LocalFileSystem;
 use object_store::path::Path;
-use object_store::{ObjectStore, ObjectStoreExt};
+use object_store::{ObjectStore, ObjectStoreExt, PutMode};
 
 use super::blob::BlobError;
 use super::bucket::{self, BucketError};
 
-/// The objects below a prefix of a bucket.
+/// The objects below a prefix of a bucket, or the files below a folder. Clones share the connections.
 #[derive(Clone, Debug)]
 pub struct Objects(Arc<dyn ObjectStore>);
 
@@ -25,7 +27,17 @@ impl Objects {
         bucket::open(url).map(Self)
     }
 
-    /// Reads the object at a path below the prefix, piece by piece.
+    /// Opens a folder, which must exist. New files are on disk before a write returns.
+    ///
+    /// # Errors
+    /// [`BlobError`] if it cannot be opened.
+    pub fn open_folder(root: &FilePath) -> Result<Self, BlobError> {
+        let folder = LocalFileSystem::new_with_prefix(root)?;
+        Ok(Self(Arc::new(folder.with_fsync(true))))
+    }
+
+    /// Reads the object at a path below the prefix, piece by piece. The path may be encoded as in a
+    /// URL.
     ///
     /// # Errors
     /// [`BlobError`] if there is none or it cannot be read.
@@ -36,5 +48,79 @@ impl Objects {
         let path = Path::from_url_path(path).map_err(object_store::Error::from)?;
         let found = self.0.get(&path).await?;
         Ok(found.into_stream().map_err(BlobError::from).boxed())
+    }
+
+    /// Reads a whole object of at most `most` bytes.
+    ///
+    /// # Errors
+    /// [`BlobError`] if there is none, it is larger, or it cannot be read.
+    pub async fn read_whole(&self, path: &str, most: u64) -> Result<Bytes, BlobError> {
+        let path = Path::parse(path).map_err(object_store::Error::from)?;
+        let found = self.0.get(&path).await?;
+        if found.meta.size > most {
+            return Err(std::io::Error::from(std::io::ErrorKind::FileTooLarge).into());
+        }
+        Ok(found.bytes().await?)
+    }
+
+    /// The paths of all objects below a path, in no order.
+    ///
+    /// # Errors
+    /// [`BlobError`].
+    pub async fn all(&self, below: &str) -> Result<Vec<String>, BlobError> {
+        let below = Path::parse(below).map_err(object_store::Error::from)?;
+        let found = self.0.list(Some(&below));
+        let paths = found.map_ok(|found| found.location.to_string());
+        Ok(paths.try_collect().await?)
+    }
+
+    /// The names of the folders and of the objects directly below a path, each in order.
+    ///
+    /// # Errors
+    /// [`BlobError`].
+    pub async fn entries(&self, below: &str) -> Result<[Vec<String>; 2], BlobError> {
+        let below = Path::parse(below).map_err(object_store::Error::from)?;
+        let found = self.0.list_with_delimiter(Some(&below)).await?;
+        let name = |path: &Path| path.filename().unwrap_or_default().to_owned();
+        let mut folders: Vec<String> = found.common_prefixes.iter().map(name).collect();
+        let objects = found.objects.iter().map(|object| name(&object.location));
+        let mut objects: Vec<String> = objects.collect();
+        folders.sort();
+        objects.sort();
+        Ok([folders, objects])
+    }
+
+    /// Writes an object unless there is one. Returns whether it was written. Of several writers one
+    /// alone writes it.
+    ///
+    /// # Errors
+    /// [`BlobError`].
+    pub async fn put_new(&self, path: &str, bytes: Bytes) -> Result<bool, BlobError> {
+        let path = Path::parse(path).map_err(object_store::Error::from)?;
+        let written = self.0.put_opts(&path, bytes.into(), PutMode::Create.into());
+        match written.await {
+            Ok(_) => Ok(true),
+            Err(object_store::Error::AlreadyExists { .. }) => Ok(false),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    /// Writes an object, replacing an earlier one.
+    ///
+    /// # Errors
+    /// [`BlobError`].
+    pub async fn put(&self, path: &str, bytes: Bytes) -> Result<(), BlobError> {
+        let path = Path::parse(path).map_err(object_store::Error::from)?;
+        self.0.put(&path, bytes.into()).await?;
+        Ok(())
+    }
+
+    /// Removes an object.
+    ///
+    /// # Errors
+    /// [`BlobError`].
+    pub async fn remove(&self, path: &str) -> Result<(), BlobError> {
+        let path = Path::parse(path).map_err(object_store::Error::from)?;
+        Ok(self.0.delete(&path).await?)
     }
 }

@@ -67,6 +67,36 @@ impl ObjectServer {
         made.is_ok_and(|status| status.success())
     }
 
+    fn curl(&self, path: &str, arguments: &[&str]) -> Command {
+        let url = format!("http://{}/farm/{path}", self.address);
+        let mut curl = Command::new("curl");
+        let signed = [
+            "-sf",
+            "--aws-sigv4",
+            "aws:amz:us-east-1:s3",
+            "--user",
+            "test:test",
+        ];
+        curl.args(signed).args(arguments).arg(url);
+        curl
+    }
+
+    /// Reads an object of the bucket.
+    pub(crate) fn get(&self, path: &str) -> Vec<u8> {
+        let read = self.curl(path, &[]).output().expect("curl starts");
+        assert!(read.status.success(), "{path}");
+        read.stdout
+    }
+
+    /// Writes an object into the bucket.
+    pub(crate) fn put(&self, path: &str, bytes: &[u8]) {
+        let file = tempfile::NamedTempFile::new().expect("a file");
+        std::fs::write(file.path(), bytes).expect("writable");
+        let name = file.path().to_string_lossy().into_owned();
+        let written = self.curl(path, &["-T", &name]).status();
+        assert!(written.is_ok_and(|status| status.success()), "{path}");
+    }
+
     /// The variables of the environment that lead a client to it.
     pub(crate) fn variables(&self) -> Vec<(&'static str, String)> {
         vec![

@@ -27,7 +27,7 @@ impl Devices {
                 return Err(Failure::usage(anyhow!(text)));
             }
         };
-        let cpu = device::cpu(threads)?;
+        let cpu = device::cpu(threads).map_err(Failure::internal)?;
         Ok(Self { cpu, other })
     }
 

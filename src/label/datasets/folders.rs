@@ -1,0 +1,123 @@
+//! Drives that are folders of sweeps.
+
+use super::super::places::{Place, PlaceError};
+use super::super::plan::{Drive, DriveSweep, key_of, stem};
+use super::{Dataset, DatasetError};
+use crate::formats::{compare_names, read_poses};
+
+/// Endings of sweeps.
+const ENDINGS: [&str; 5] = [".pcd", ".ply", ".bin", ".npy", ".feather"];
+/// The deepest folder that is looked into.
+const MAX_DEPTH: usize = 12;
+/// Where sweeps lie below a log of Argoverse 2.
+const AV2_SWEEPS: &str = "sensors/lidar";
+/// Where sweeps lie below a drive of KITTI.
+const KITTI_SWEEPS: [&str; 2] = ["velodyne_points/data", "velodyne"];
+
+/// Whether a folder is one of those that a data set keeps its sweeps in.
+fn is_asked_for(folder: &str, dataset: Dataset) -> bool {
+    let ends = |end: &str| folder == end || folder.ends_with(&format!("/{end}"));
+    match dataset {
+        Dataset::Argoverse2 => ends(AV2_SWEEPS),
+        Dataset::Kitti => KITTI_SWEEPS.into_iter().any(ends) || folder.contains("velodyne/"),
+        Dataset::Folders | Dataset::Nuscenes => true,
+    }
+}
+
+/// The name of a drive: its folder, without the part that every drive of its data set has.
+fn name(folder: &str) -> String {
+    let ends = [AV2_SWEEPS, KITTI_SWEEPS[0], KITTI_SWEEPS[1]];
+    let bare = ends.into_iter().find_map(|end| folder.strip_suffix(end));
+    let bare = bare.unwrap_or(folder).trim_matches('/');
+    let parts = bare.split('/').filter(|part| !part.is_empty());
+    parts.map(key_of).collect::<Vec<_>>().join("/")
+}
+
+/// The drives below a place: folders with two sweeps or more.
+pub(super) async fn drives(place: &Place, dataset: Dataset) -> Result<Vec<Drive>, DatasetError> {
+    let mut drives = Vec::new();
+    let mut waiting = vec![(String::new(), 0)];
+    while let Some((folder, depth)) = waiting.pop() {
+        let [folders, files] = place.entries(&folder).await?;
+        let is_sweep = |name: &String| ENDINGS.iter().any(|end| name.ends_with(end));
+        let mut sweeps: Vec<String> = files.into_iter().filter(is_sweep).collect();
+        if sweeps.len() > 1 && is_asked_for(&folder, dataset) {
+            sweeps.sort_by(|one, other| compare_names(one, other));
+            drives.push(drive(place, &folder, &sweeps).await?);
+        }
+        if depth < MAX_DEPTH {
+            // Taken from the end, so the first comes last.
+            let below = folders
+                .into_iter()
+                .rev()
+                .filter(|name| !name.starts_with('_'));
+            let path = |name: String| match folder.is_empty() {
+                true => name,
+                false => format!("{folder}/{name}"),
+            };
+            waiting.extend(below.map(|name| (path(name), depth + 1)));
+        }
+    }
+    Ok(drives)
+}
+
+async fn drive(place: &Place, folder: &str, files: &[String]) -> Result<Drive, DatasetError> {
+    let path = |file: &str| match folder.is_empty() {
+        true => file.to_owned(),
+        false => format!("{folder}/{file}"),
+    };
+    let mut sweeps: Vec<DriveSweep> = files
+        .iter()
+        .map(|file| DriveSweep {
+            uri: place.uri(&path(file)),
+            key: key_of(stem(file)),
+            pose: None,
+            time_s: None,
+        })
+        .collect();
+    if let Some(log) = folder.strip_suffix(AV2_SWEEPS) {
+        let file = format!("{log}city_SE3_egovehicle.feather");
+        match place.read(&file).await {
+            Err(PlaceError::Missing(_)) => {}
+            Err(error) => return Err(error.into()),
+            Ok(bytes) => {
+                let names: Vec<&str> = files.iter().map(String::as_str).collect();
+                let poses = read_poses(&bytes, &names).map_err(|error| DatasetError::Table {
+                    file: place.uri(&file),
+                    what: error.to_string(),
+                })?;
+                for (sweep, pose) in sweeps.iter_mut().zip(poses) {
+                    sweep.pose = Some(pose);
+                }
+            }
+        }
+    }
+    Ok(Drive {
+        name: name(folder),
+        sweeps,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn drives_have_the_names_of_their_data_sets() {
+        for (folder, expected) in [
+            ("7fab/sensors/lidar", "7fab"),
+            (
+                "2011_09_26/2011_09_26_drive_0005_sync/velodyne_points/data",
+                "2011_09_26/2011_09_26_drive_0005_sync",
+            ),
+            ("sequences/04/velodyne", "sequences/04"),
+            ("my drives/7", "my_drives/7"),
+            ("", ""),
+        ] {
+            assert_eq!(name(folder), expected);
+        }
+        assert!(is_asked_for("x/sensors/lidar", Dataset::Argoverse2));
+        assert!(!is_asked_for("x/sensors/cameras", Dataset::Argoverse2));
+        assert!(is_asked_for("training/velodyne/0007", Dataset::Kitti));
+    }
+}

@@ -1,0 +1,143 @@
+//! The end of a run: is everything there, one report, and `_SUCCESS`.
+
+use std::collections::{BTreeSet, HashMap, HashSet};
+
+use bytes::Bytes;
+use tokio::runtime::Builder;
+
+use super::layout::Layout;
+use super::places::Place;
+use super::plan::Plan;
+use super::report::{Outcome, RowReport, read_lines};
+use super::run::{LabelError, tracks_path};
+use super::settings::Settings;
+use super::shard::Shard;
+
+/// The report of all pairs.
+const REPORT: &str = "_report.csv";
+/// Says that every pair is labelled or refused.
+const SUCCESS: &str = "_SUCCESS";
+
+/// What a run has come to.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Finalized {
+    /// Pairs of the plan that the layout asks for.
+    pub pairs: usize,
+    /// Pairs whose output is there.
+    pub labelled: usize,
+    /// Pairs that cannot be labelled.
+    pub refused: Vec<RowReport>,
+    /// Pairs that are to be tried again.
+    pub missing: usize,
+    /// The shards of `count` that hold the missing pairs.
+    pub missing_shards: Vec<Shard>,
+}
+
+impl Finalized {
+    /// Whether nothing is missing.
+    pub fn is_complete(&self) -> bool {
+        self.missing == 0
+    }
+}
+
+/// Compares the outputs with the plan. Writes `_report.csv`, and `_SUCCESS` where nothing is missing.
+/// `shards` is the number of shards by which missing pairs are named.
+///
+/// # Errors
+/// [`LabelError`].
+pub fn finalize(
+    plan: &Plan,
+    layout: Layout,
+    output: &Place,
+    shards: usize,
+) -> Result<Finalized, LabelError> {
+    let runtime = Builder::new_current_thread().enable_all().build()?;
+    runtime.block_on(async {
+        let settings = Settings::read(output).await?;
+        if settings.layout != layout.name() || settings.plan != plan.hash() {
+            return Err(LabelError::BadRun(
+                output.uri("run.json"),
+                "it is of another manifest or another layout".to_owned(),
+            ));
+        }
+        let all: HashSet<String> = output.all("").await?.into_iter().collect();
+        let mut reports: HashMap<String, RowReport> = HashMap::new();
+        // The names begin with the time of the attempt.
+        let is_part = |path: &&String| path.starts_with("_report/");
+        let parts: BTreeSet<&String> = all.iter().filter(is_part).collect();
+        for part in parts {
+            for report in read_lines(&output.read(part).await?) {
+                let known = reports.get(&report.key).is_some_and(RowReport::is_there);
+                if !known || report.is_there() {
+                    reports.insert(report.key.clone(), report);
+                }
+            }
+        }
+        let mut found = Finalized::default();
+        let mut missing: HashSet<(usize, usize)> = HashSet::new();
+        let mut table = csv::Writer::from_writer(Vec::new());
+        let heading = [
+            "key", "source", "target", "outcome", "error", "seconds", "points", "moving", "overlap",
+        ];
+        let unwritten = |error: csv::Error| LabelError::Machine(std::io::Error::other(error));
+        table.write_record(heading).map_err(unwritten)?;
+        let whole = settings.tracks;
+        for (drive, pair) in plan.all_pairs().filter(|&(_, pair)| layout.asks_for(pair)) {
+            let of = &plan.drives()[drive];
+            let key = of.key(pair);
+            let report = reports.get(&key);
+            let is_there = all.contains(&layout.path(&of.name, pair, &key))
+                && (!whole || all.contains(&tracks_path(&of.name)));
+            let refused = report.filter(|report| report.outcome == Outcome::Refused);
+            let outcome = match (is_there, refused) {
+                (true, _) => "labelled",
+                (false, Some(_)) => "refused",
+                (false, None) => "missing",
+            };
+            found.pairs += 1;
+            match outcome {
+                "labelled" => found.labelled += 1,
+                "refused" => found.refused.extend(refused.cloned()),
+                _ => {
+                    found.missing += 1;
+                    missing.insert((drive, pair));
+                }
+            }
+            let number = |value: Option<String>| value.unwrap_or_default();
+            table
+                .write_record([
+                    key.clone(),
+                    of.sweeps[pair].uri.clone(),
+                    of.sweeps[pair + 1].uri.clone(),
+                    outcome.to_owned(),
+                    number(report.and_then(|of| of.error.clone())),
+                    number(report.and_then(|of| of.seconds).map(|s| format!("{s:.4}"))),
+                    number(report.and_then(|of| of.points).map(|n| n.to_string())),
+                    number(report.and_then(|of| of.moving).map(|n| n.to_string())),
+                    number(report.and_then(|of| of.overlap).map(|o| format!("{o:.4}"))),
+                ])
+                .map_err(unwritten)?;
+        }
+        let bytes = table
+            .into_inner()
+            .map_err(|error| unwritten(error.into_error().into()))?;
+        output.put(REPORT, Bytes::from(bytes)).await?;
+        if found.is_complete() {
+            let text = format!(
+                "{} labelled, {} refused\n",
+                found.labelled,
+                found.refused.len()
+            );
+            output.put(SUCCESS, Bytes::from(text)).await?;
+        } else {
+            let count = shards;
+            let shards = (0..count).map(|index| Shard { index, count });
+            let holds = |shard: &Shard| {
+                let pairs = shard.pairs(plan, whole);
+                pairs.iter().any(|pair| missing.contains(pair))
+            };
+            found.missing_shards = shards.filter(holds).collect();
+        }
+        Ok(found)
+    })
+}

@@ -1,0 +1,102 @@
+//! Layouts of the output: the name and the bytes of a pair's file.
+
+use crate::flow::{Estimate, Point};
+use crate::formats::{
+    Av2Challenge, FlowFormat, FlowTable, FormatError, write_av2_challenge, write_flow,
+};
+
+/// How the outputs lie and what they hold.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Layout {
+    /// DRIVE/SWEEP.npz, all that is known of the flow.
+    #[default]
+    Npz,
+    /// DRIVE/SWEEP.feather: flow, valid, dynamic, cluster, confidence, moving.
+    Feather,
+    /// Argoverse 2, first challenge: DRIVE/TIMESTAMP.feather, the rows of --masks.
+    Av2V1,
+    /// Argoverse 2, second challenge: DRIVE/INDEX.feather of every fifth pair, and metadata.json.
+    Av2V2,
+    /// Argoverse 2, third challenge: DRIVE/TIMESTAMP.feather.
+    Av2V3,
+}
+
+/// Pairs of the second challenge are this many sweeps apart.
+const V2_STRIDE: usize = 5;
+
+impl Layout {
+    /// The name as on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Npz => "npz",
+            Self::Feather => "feather",
+            Self::Av2V1 => "av2-v1",
+            Self::Av2V2 => "av2-v2",
+            Self::Av2V3 => "av2-v3",
+        }
+    }
+
+    fn challenge(self) -> Option<Av2Challenge> {
+        match self {
+            Self::Npz | Self::Feather => None,
+            Self::Av2V1 => Some(Av2Challenge::One),
+            Self::Av2V2 => Some(Av2Challenge::Two),
+            Self::Av2V3 => Some(Av2Challenge::Three),
+        }
+    }
+
+    /// Whether it asks for the rows of masks.
+    pub fn needs_masks(self) -> bool {
+        self == Self::Av2V1
+    }
+
+    /// Whether it asks for a pair of a drive, by its index.
+    pub(super) fn asks_for(self, pair: usize) -> bool {
+        self != Self::Av2V2 || pair.is_multiple_of(V2_STRIDE)
+    }
+
+    /// The name of a pair's file: `drive` is the drive's name, `key` that of the pair without ending.
+    pub(super) fn path(self, drive: &str, pair: usize, key: &str) -> String {
+        match self {
+            Self::Npz => format!("{key}.npz"),
+            Self::Feather | Self::Av2V1 | Self::Av2V3 => format!("{key}.feather"),
+            Self::Av2V2 => format!("{drive}/{pair:010}.feather"),
+        }
+    }
+
+    /// Files of the whole run: name and text.
+    pub(super) fn run_files(self) -> &'static [(&'static str, &'static str)] {
+        match self {
+            Self::Av2V2 => &[("metadata.json", "{\"Is Supervised?\": false}\n")],
+            Self::Npz | Self::Feather | Self::Av2V1 | Self::Av2V3 => &[],
+        }
+    }
+
+    /// The bytes of a pair's file. `source` are the N points that the flow starts from. `mask` has a
+    /// flag for each.
+    ///
+    /// # Errors
+    /// [`FormatError`] if the mask is that of another sweep, or a number cannot be written.
+    pub(super) fn bytes(
+        self,
+        source: &[Point],
+        estimate: &Estimate,
+        mask: Option<&[bool]>,
+    ) -> Result<Vec<u8>, FormatError> {
+        let table = FlowTable {
+            source,
+            flow: &estimate.flow,
+            valid: &estimate.valid,
+            dynamic: estimate.dynamic.as_deref(),
+            objects: estimate.objects(),
+            ego: estimate.ego.as_ref(),
+        };
+        let mut bytes = Vec::new();
+        match self.challenge() {
+            Some(challenge) => write_av2_challenge(challenge, &table, mask, &mut bytes)?,
+            None if self == Self::Npz => write_flow(FlowFormat::Npz, &table, &mut bytes)?,
+            None => write_flow(FlowFormat::Feather, &table, &mut bytes)?,
+        }
+        Ok(bytes)
+    }
+}

@@ -1,0 +1,32 @@
+//! Bulk labelling: the flows of all pairs of many drives, by any number of processes.
+//!
+//! ```text
+//! manifest, folder or data set - Plan - Shard - read ahead - estimate - write ahead - labels
+//! ```
+//!
+//! The processes share nothing but the output. The name of a pair's output is a function of the pair,
+//! and an output is written only where there is none. So a process that dies loses the pair that it
+//! computed, and two that do the same pair leave one output.
+
+mod datasets;
+mod finalize;
+mod layout;
+mod manifest;
+mod pipeline;
+mod places;
+mod plan;
+mod report;
+mod run;
+mod settings;
+mod shard;
+
+pub use datasets::{Dataset, DatasetError};
+pub use finalize::{Finalized, finalize};
+pub use layout::Layout;
+pub use manifest::{ManifestError, read_manifest};
+pub use places::{Place, PlaceError};
+pub use plan::{Drive, DriveSweep, Plan, PlanError};
+pub use report::{Outcome, RowReport};
+pub use run::{Done, Inputs, LabelError, Solver, Told, open_plan, run};
+pub use settings::{OtherRun, Settings};
+pub use shard::{Shard, ShardError};

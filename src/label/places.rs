@@ -1,0 +1,234 @@
+//! Places of files: paths of this machine, and URIs of object stores.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+
+use bytes::Bytes;
+use url::Url;
+
+use crate::storage::{BlobError, BucketError, Objects};
+use crate::sync::locked;
+
+/// Most bytes of a file that is read.
+const MAX_FILE: u64 = 4 << 30;
+
+/// Why a place cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum PlaceError {
+    /// The URI is none that can be read.
+    #[error("{0:?} is no path and no file://, s3://, gs:// or az:// URI")]
+    Uri(String),
+    /// The bucket cannot be used.
+    #[error(transparent)]
+    Bucket(#[from] BucketError),
+    /// There is no such file.
+    #[error("{0} is not there")]
+    Missing(String),
+    /// The file cannot be read or written now.
+    #[error("{uri}: {source}")]
+    Failed {
+        /// The file.
+        uri: String,
+        /// The reason.
+        source: BlobError,
+    },
+}
+
+impl PlaceError {
+    /// Whether trying again may help: the file is there, and its store failed.
+    pub fn may_pass(&self) -> bool {
+        matches!(self, Self::Failed { .. })
+    }
+
+    fn new(uri: &str, error: BlobError) -> Self {
+        match error.is_missing() {
+            true => Self::Missing(uri.to_owned()),
+            false => Self::Failed {
+                uri: uri.to_owned(),
+                source: error,
+            },
+        }
+    }
+}
+
+/// The buckets that are open. Clones share them.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Places(Arc<Mutex<HashMap<String, Objects>>>);
+
+/// A URI taken apart: the root of its store, and the path below it.
+fn parts(uri: &str) -> Result<(Option<String>, String), PlaceError> {
+    if !uri.contains("://") {
+        return Ok((None, uri.to_owned()));
+    }
+    let unknown = || PlaceError::Uri(uri.to_owned());
+    let url = Url::parse(uri).map_err(|_| unknown())?;
+    if url.scheme() == "file" {
+        let path = url.to_file_path().map_err(|()| unknown())?;
+        return Ok((None, path.to_string_lossy().into_owned()));
+    }
+    let host = url
+        .host_str()
+        .filter(|_| ["s3", "gs", "az"].contains(&url.scheme()));
+    let root = format!("{}://{}", url.scheme(), host.ok_or_else(unknown)?);
+    // Not the path of the parsed URL, which is encoded.
+    let path = uri
+        .split_once("://")
+        .and_then(|(_, rest)| rest.split_once('/'));
+    Ok((Some(root), path.map_or("", |(_, path)| path).to_owned()))
+}
+
+impl Places {
+    fn bucket(&self, root: &str) -> Result<Objects, PlaceError> {
+        let mut open = locked(&self.0);
+        if let Some(known) = open.get(root) {
+            return Ok(known.clone());
+        }
+        let objects = Objects::open(root)?;
+        open.insert(root.to_owned(), objects.clone());
+        Ok(objects)
+    }
+
+    /// Reads a whole file of at most 4 GiB.
+    pub(super) async fn read(&self, uri: &str) -> Result<Bytes, PlaceError> {
+        let failed = |error: BlobError| PlaceError::new(uri, error);
+        match parts(uri)? {
+            (Some(root), path) => {
+                let bucket = self.bucket(&root)?;
+                bucket.read_whole(&path, MAX_FILE).await.map_err(failed)
+            }
+            (None, path) => {
+                let about = tokio::fs::metadata(&path).await;
+                let about = about.map_err(|error| failed(error.into()))?;
+                if about.len() > MAX_FILE {
+                    return Err(failed(
+                        std::io::Error::from(std::io::ErrorKind::FileTooLarge).into(),
+                    ));
+                }
+                let read = tokio::fs::read(&path).await;
+                read.map(Bytes::from).map_err(|error| failed(error.into()))
+            }
+        }
+    }
+
+    /// Opens a folder or a prefix of a bucket.
+    pub(super) fn open(&self, uri: &str) -> Result<Place, PlaceError> {
+        match parts(uri)? {
+            (Some(root), path) => Ok(Place {
+                objects: self.bucket(&root)?,
+                prefix: path.trim_matches('/').to_owned(),
+                base: root,
+            }),
+            (None, path) => {
+                let root = absolute(Path::new(&path));
+                let opened = Objects::open_folder(&root);
+                Ok(Place {
+                    objects: opened.map_err(|error| PlaceError::new(uri, error))?,
+                    prefix: String::new(),
+                    base: root.to_string_lossy().into_owned(),
+                })
+            }
+        }
+    }
+}
+
+fn absolute(path: &Path) -> PathBuf {
+    path.canonicalize().unwrap_or_else(|_| path.to_owned())
+}
+
+/// The files below a folder or below a prefix of a bucket, by their relative paths.
+#[derive(Clone, Debug)]
+pub struct Place {
+    objects: Objects,
+    prefix: String,
+    base: String,
+}
+
+impl Place {
+    /// Opens a folder, or a prefix of a bucket such as `s3://bucket/prefix`. The folder must exist.
+    ///
+    /// # Errors
+    /// [`PlaceError`].
+    pub fn open(uri: &str) -> Result<Self, PlaceError> {
+        Places::default().open(uri)
+    }
+
+    fn path(&self, below: &str) -> String {
+        match (self.prefix.is_empty(), below.is_empty()) {
+            (true, _) => below.to_owned(),
+            (false, true) => self.prefix.clone(),
+            (false, false) => format!("{}/{below}", self.prefix),
+        }
+    }
+
+    /// The path or URI of a file below it.
+    pub fn uri(&self, below: &str) -> String {
+        format!("{}/{}", self.base.trim_end_matches('/'), self.path(below))
+    }
+
+    /// Reads a whole file.
+    pub(super) async fn read(&self, below: &str) -> Result<Bytes, PlaceError> {
+        let read = self.objects.read_whole(&self.path(below), MAX_FILE).await;
+        read.map_err(|error| PlaceError::new(&self.uri(below), error))
+    }
+
+    /// The names of the folders and of the files directly below a path, each in order.
+    pub(super) async fn entries(&self, below: &str) -> Result<[Vec<String>; 2], PlaceError> {
+        let found = self.objects.entries(&self.path(below)).await;
+        found.map_err(|error| PlaceError::new(&self.uri(below), error))
+    }
+
+    /// The relative paths of all files below a path.
+    pub(super) async fn all(&self, below: &str) -> Result<Vec<String>, PlaceError> {
+        let found = self.objects.all(&self.path(below)).await;
+        let found = found.map_err(|error| PlaceError::new(&self.uri(below), error))?;
+        let skip = match self.prefix.is_empty() {
+            true => 0,
+            false => self.prefix.len() + 1,
+        };
+        Ok(found
+            .into_iter()
+            .map(|mut path| path.split_off(skip))
+            .collect())
+    }
+
+    /// Writes a file unless there is one; whether it was written.
+    pub(super) async fn put_new(&self, below: &str, bytes: Bytes) -> Result<bool, PlaceError> {
+        let written = self.objects.put_new(&self.path(below), bytes).await;
+        written.map_err(|error| PlaceError::new(&self.uri(below), error))
+    }
+
+    /// Writes a file, replacing an earlier one.
+    pub(super) async fn put(&self, below: &str, bytes: Bytes) -> Result<(), PlaceError> {
+        let written = self.objects.put(&self.path(below), bytes).await;
+        written.map_err(|error| PlaceError::new(&self.uri(below), error))
+    }
+
+    /// Removes a file.
+    pub(super) async fn remove(&self, below: &str) -> Result<(), PlaceError> {
+        let removed = self.objects.remove(&self.path(below)).await;
+        removed.map_err(|error| PlaceError::new(&self.uri(below), error))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn uris_are_taken_apart_and_unknown_ones_are_refused() {
+        let taken = |uri: &str| parts(uri).map(|(root, path)| (root.unwrap_or_default(), path));
+        let both = |root: &str, path: &str| (root.to_owned(), path.to_owned());
+        for (uri, expected) in [
+            ("a/b.pcd", both("", "a/b.pcd")),
+            ("file:///a/b%20c.pcd", both("", "/a/b c.pcd")),
+            ("s3://bucket/a b/c.pcd", both("s3://bucket", "a b/c.pcd")),
+            ("gs://bucket", both("gs://bucket", "")),
+        ] {
+            assert_eq!(taken(uri).expect(uri), expected);
+        }
+        for uri in ["ftp://a/b", "s3:///x", "://"] {
+            assert!(matches!(parts(uri), Err(PlaceError::Uri(_))), "{uri}");
+        }
+    }
+}

@@ -1,0 +1,191 @@
+//! The plan: the drives, their sweeps, and the names of the outputs.
+
+use std::collections::HashMap;
+
+use crate::flow::RigidTransform;
+
+/// One sweep of a drive.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DriveSweep {
+    /// The path of its file or the URI of its object.
+    pub uri: String,
+    /// Its part of the names of outputs.
+    pub key: String,
+    /// Pose of the sensor, world_from_sensor, where it is known.
+    pub pose: Option<RigidTransform>,
+    /// Seconds of its time, on any clock of the drive, where they are known.
+    pub time_s: Option<f64>,
+}
+
+/// Consecutive sweeps of one sensor.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Drive {
+    /// Its part of the names of outputs; it may have several parts, separated by `/`.
+    pub name: String,
+    /// Two sweeps or more, in the order in which they were recorded.
+    pub sweeps: Vec<DriveSweep>,
+}
+
+impl Drive {
+    /// Number of pairs.
+    pub fn pairs(&self) -> usize {
+        self.sweeps.len().saturating_sub(1)
+    }
+
+    /// The name of the output of a pair, without its ending.
+    pub fn key(&self, pair: usize) -> String {
+        let key = &self.sweeps[pair].key;
+        match self.name.is_empty() {
+            true => key.clone(),
+            false => format!("{}/{key}", self.name),
+        }
+    }
+}
+
+/// Why drives are no plan.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum PlanError {
+    /// There is no drive of two sweeps.
+    #[error("there is no pair: a drive has two sweeps or more")]
+    Empty,
+    /// Two pairs have one output.
+    #[error("{first} and {second} would both be written as {key}: give them other names or drives")]
+    SameKey {
+        /// The sweep of the first pair.
+        first: String,
+        /// The sweep of the second pair.
+        second: String,
+        /// The name of the output.
+        key: String,
+    },
+}
+
+/// All drives, in order.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Plan {
+    drives: Vec<Drive>,
+}
+
+impl Plan {
+    /// A plan of drives. Drives of one sweep are left out.
+    ///
+    /// # Errors
+    /// [`PlanError`].
+    pub fn new(mut drives: Vec<Drive>) -> Result<Self, PlanError> {
+        drives.retain(|drive| drive.pairs() > 0);
+        if drives.is_empty() {
+            return Err(PlanError::Empty);
+        }
+        let mut known: HashMap<String, &str> = HashMap::new();
+        for drive in &drives {
+            for pair in 0..drive.pairs() {
+                let uri = &drive.sweeps[pair].uri;
+                if let Some(first) = known.insert(drive.key(pair), uri) {
+                    return Err(PlanError::SameKey {
+                        first: first.to_owned(),
+                        second: uri.clone(),
+                        key: drive.key(pair),
+                    });
+                }
+            }
+        }
+        Ok(Self { drives })
+    }
+
+    /// The drives.
+    pub fn drives(&self) -> &[Drive] {
+        &self.drives
+    }
+
+    /// Number of pairs.
+    pub fn pairs(&self) -> usize {
+        self.drives.iter().map(Drive::pairs).sum()
+    }
+
+    /// All pairs in order: the index of the drive, and of the pair in the drive.
+    pub fn all_pairs(&self) -> impl Iterator<Item = (usize, usize)> {
+        let drives = self.drives.iter().enumerate();
+        drives.flat_map(|(drive, of)| (0..of.pairs()).map(move |pair| (drive, pair)))
+    }
+
+    /// A hash of all names of outputs and of all sweeps, in order.
+    pub fn hash(&self) -> String {
+        let mut hasher = blake3::Hasher::new();
+        for drive in &self.drives {
+            for sweep in &drive.sweeps {
+                for part in [&drive.name, &sweep.key, &sweep.uri] {
+                    hasher.update(part.as_bytes());
+                    hasher.update(&[0]);
+                }
+            }
+        }
+        hasher.finalize().to_hex().to_string()
+    }
+}
+
+/// A part of a name of outputs: letters, digits, `.`, `-` and `_` of the text, the others as `_`.
+pub(super) fn key_of(text: &str) -> String {
+    let plain = |letter: char| match letter {
+        'a'..='z' | 'A'..='Z' | '0'..='9' | '.' | '-' | '_' => letter,
+        _ => '_',
+    };
+    let key: String = text.chars().map(plain).collect();
+    // Outputs that begin so are the run's own, and a part of dots alone is a folder.
+    match key.starts_with('_') || key.chars().all(|letter| letter == '.') {
+        true => format!("x{key}"),
+        false => key,
+    }
+}
+
+/// The name of a file without its folder and without everything from its first dot.
+pub(super) fn stem(name: &str) -> &str {
+    let file = name.rsplit(['/', '\\']).next().unwrap_or(name);
+    file.split('.').next().unwrap_or(file)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn drive(name: &str, keys: &[&str]) -> Drive {
+        let sweep = |key: &&str| DriveSweep {
+            uri: format!("{key}.pcd"),
+            key: key_of(key),
+            pose: None,
+            time_s: None,
+        };
+        Drive {
+            name: name.to_owned(),
+            sweeps: keys.iter().map(sweep).collect(),
+        }
+    }
+
+    #[test]
+    fn every_pair_has_a_name_of_its_own() {
+        let plan = Plan::new(vec![
+            drive("a", &["0", "1", "2"]),
+            drive("one", &["0"]),
+            drive("b/c", &["0", "1"]),
+        ]);
+        let plan = plan.expect("a plan");
+        let keys: Vec<String> = plan
+            .all_pairs()
+            .map(|(drive, pair)| plan.drives()[drive].key(pair))
+            .collect();
+        assert_eq!(keys, ["a/0", "a/1", "b/c/0"]);
+        assert_eq!(plan.pairs(), 3);
+        let twice = Plan::new(vec![drive("a", &["0", "1"]), drive("a", &["0", "2"])]);
+        assert!(matches!(twice, Err(PlanError::SameKey { .. })));
+        assert_eq!(Plan::new(vec![drive("a", &["0"])]), Err(PlanError::Empty));
+    }
+
+    #[test]
+    fn names_lead_nowhere_else() {
+        let names = ["a b", "../x", "..", "_SUCCESS", "Übung", "7.pcd.bin"].map(key_of);
+        assert_eq!(
+            names,
+            ["a_b", ".._x", "x..", "x_SUCCESS", "x_bung", "7.pcd.bin"]
+        );
+        assert_eq!(stem("a/b/0012.pcd.bin"), "0012");
+    }
+}

@@ -1,0 +1,112 @@
+//! The settings of a run, which all its processes share: `run.json` in the output.
+
+use bytes::Bytes;
+use serde::{Deserialize, Serialize};
+
+use super::layout::Layout;
+use super::places::{Place, PlaceError};
+use super::plan::Plan;
+use super::run::LabelError;
+use crate::job::{DeviceChoice, JobOptions};
+
+/// The file that holds them.
+const FILE: &str = "run.json";
+
+/// What determines the outputs of a run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Settings {
+    /// Version of the program.
+    pub fnsf: String,
+    /// Options of the estimates, as JSON.
+    pub options: serde_json::Value,
+    /// Name of the layout.
+    pub layout: String,
+    /// Whether the ego motion is that of the plan's poses.
+    pub poses: bool,
+    /// Whether tracks are written, and correct the flows.
+    pub tracks: bool,
+    /// Number of pairs of the plan.
+    pub pairs: usize,
+    /// Hash of the plan's names and sweeps.
+    pub plan: String,
+}
+
+/// The output belongs to a run with other settings.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "the output belongs to a run with another {differing}: {theirs} there, {ours} here; choose a new output"
+)]
+pub struct OtherRun {
+    /// The first setting that differs.
+    pub differing: String,
+    /// Its value in the output.
+    pub theirs: String,
+    /// Its value here.
+    pub ours: String,
+}
+
+impl Settings {
+    /// The settings of a run of this program.
+    pub fn new(
+        plan: &Plan,
+        options: &JobOptions,
+        layout: Layout,
+        [poses, tracks]: [bool; 2],
+    ) -> Self {
+        let options = JobOptions {
+            // Farms have mixed machines. On two devices fields differ by rounding.
+            device: DeviceChoice::default(),
+            ..options.clone()
+        };
+        Self {
+            fnsf: env!("CARGO_PKG_VERSION").to_owned(),
+            options: serde_json::from_str(&options.to_json()).unwrap_or_default(),
+            layout: layout.name().to_owned(),
+            poses,
+            tracks,
+            pairs: plan.pairs(),
+            plan: plan.hash(),
+        }
+    }
+
+    /// Writes the settings into a new output, or compares them with those of an output that has some.
+    ///
+    /// # Errors
+    /// [`LabelError::OtherRun`], and [`LabelError::Place`].
+    pub(super) async fn agree(&self, output: &Place) -> Result<(), LabelError> {
+        let text = serde_json::to_vec_pretty(self).expect("settings have a JSON form");
+        if output.put_new(FILE, Bytes::from(text)).await? {
+            return Ok(());
+        }
+        let theirs = Self::read(output).await?;
+        match theirs.difference(self) {
+            None => Ok(()),
+            Some(other) => Err(LabelError::OtherRun(other)),
+        }
+    }
+
+    /// Reads the settings of an output.
+    pub(super) async fn read(output: &Place) -> Result<Self, LabelError> {
+        let bytes = match output.read(FILE).await {
+            Err(PlaceError::Missing(_)) => return Err(LabelError::NoRun(output.uri(""))),
+            read => read?,
+        };
+        serde_json::from_slice(&bytes)
+            .map_err(|error| LabelError::BadRun(output.uri(FILE), error.to_string()))
+    }
+
+    fn difference(&self, ours: &Self) -> Option<OtherRun> {
+        let values =
+            [self, ours].map(|settings| serde_json::to_value(settings).unwrap_or_default());
+        let [theirs, ours] = &values;
+        let names = theirs.as_object()?.keys();
+        let differing = names
+            .into_iter()
+            .find(|name| theirs[*name] != ours[*name])?;
+        Some(OtherRun {
+            differing: differing.clone(),
+            theirs: theirs[differing].to_string(),
+            ours: ours[differing].to_string(),
+        })
+    }
+}
