@@ -1,20 +1,23 @@
 //! The end of a run: is everything there, one report, and `_SUCCESS`.
 
 use std::collections::{BTreeSet, HashMap, HashSet};
+use std::time::Duration;
 
 use bytes::Bytes;
 use tokio::runtime::Builder;
 
-use super::layout::Layout;
+use super::error::LabelError;
+use super::layout::{Layout, tracks_path};
 use super::places::Place;
 use super::plan::Plan;
 use super::report::{Outcome, RowReport, read_lines};
-use super::run::{LabelError, tracks_path};
 use super::settings::Settings;
 use super::shard::Shard;
 
 /// The report of all pairs.
 const REPORT: &str = "_report.csv";
+/// A write that has not ended after this time has been cut off.
+const CUT_OFF: Duration = Duration::from_secs(60);
 /// Says that every pair is labelled or refused.
 const SUCCESS: &str = "_SUCCESS";
 
@@ -60,6 +63,7 @@ pub fn finalize(
                 "it is of another manifest or another layout".to_owned(),
             ));
         }
+        output.remove_cut_off(CUT_OFF)?;
         let all: HashSet<String> = output.all("").await?.into_iter().collect();
         let mut reports: HashMap<String, RowReport> = HashMap::new();
         // The names begin with the time of the attempt.

@@ -100,3 +100,11 @@ impl Layout {
         Ok(bytes)
     }
 }
+
+/// The file of a drive's tracks.
+pub(super) fn tracks_path(drive: &str) -> String {
+    match drive.is_empty() {
+        true => "tracks.json".to_owned(),
+        false => format!("{drive}/tracks.json"),
+    }
+}

@@ -9,7 +9,10 @@
 //! computed, and two that do the same pair leave one output.
 
 mod datasets;
+mod error;
+mod estimates;
 mod finalize;
+mod io;
 mod layout;
 mod manifest;
 mod pipeline;
@@ -19,14 +22,18 @@ mod report;
 mod run;
 mod settings;
 mod shard;
+mod tally;
+mod types;
 
 pub use datasets::{Dataset, DatasetError};
+pub use error::{LabelError, OtherRun};
 pub use finalize::{Finalized, finalize};
 pub use layout::Layout;
 pub use manifest::{ManifestError, read_manifest};
 pub use places::{Place, PlaceError};
 pub use plan::{Drive, DriveSweep, Plan, PlanError};
 pub use report::{Outcome, RowReport};
-pub use run::{Done, Inputs, LabelError, Solver, Told, open_plan, run};
-pub use settings::{OtherRun, Settings};
+pub use run::{open_plan, run};
+pub use settings::Settings;
 pub use shard::{Shard, ShardError};
+pub use types::{Done, Inputs, Solver, Told};

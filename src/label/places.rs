@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use bytes::Bytes;
 use url::Url;
@@ -202,6 +203,12 @@ impl Place {
     pub(super) async fn put(&self, below: &str, bytes: Bytes) -> Result<(), PlaceError> {
         let written = self.objects.put(&self.path(below), bytes).await;
         written.map_err(|error| PlaceError::new(&self.uri(below), error))
+    }
+
+    /// Removes the remains of writes that were cut off more than `age` ago.
+    pub(super) fn remove_cut_off(&self, age: Duration) -> Result<usize, PlaceError> {
+        let removed = self.objects.remove_cut_off(age);
+        removed.map_err(|error| PlaceError::new(&self.uri(""), error))
     }
 
     /// Removes a file.

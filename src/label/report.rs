@@ -44,6 +44,9 @@ pub struct RowReport {
     /// Share of the scene that both sweeps show, 0 to 1.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub overlap: Option<f32>,
+    /// Whether it is of the tracks of a drive, and not of a pair.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub tracks: bool,
     /// Sweeps around the pair that could not be read, and were left out.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub left_out: Vec<String>,
@@ -62,6 +65,7 @@ impl RowReport {
             points: None,
             moving: None,
             overlap: None,
+            tracks: false,
             left_out: Vec::new(),
         }
     }

@@ -3,10 +3,10 @@
 use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 
+use super::error::{LabelError, OtherRun};
 use super::layout::Layout;
 use super::places::{Place, PlaceError};
 use super::plan::Plan;
-use super::run::LabelError;
 use crate::job::{DeviceChoice, JobOptions};
 
 /// The file that holds them.
@@ -29,20 +29,6 @@ pub struct Settings {
     pub pairs: usize,
     /// Hash of the plan's names and sweeps.
     pub plan: String,
-}
-
-/// The output belongs to a run with other settings.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "the output belongs to a run with another {differing}: {theirs} there, {ours} here; choose a new output"
-)]
-pub struct OtherRun {
-    /// The first setting that differs.
-    pub differing: String,
-    /// Its value in the output.
-    pub theirs: String,
-    /// Its value here.
-    pub ours: String,
 }
 
 impl Settings {

@@ -128,6 +128,25 @@ pub(super) fn remove_cut_off(root: &Path, age: Duration) -> io::Result<usize> {
     Ok(removed)
 }
 
+/// Removes the remains of interrupted writes in a folder and in all folders below it that were last
+/// changed more than `age` ago, and counts them.
+pub(super) fn remove_staged_below(root: &Path, age: Duration) -> io::Result<usize> {
+    let limit = SystemTime::now().checked_sub(age);
+    let mut removed = 0;
+    let mut folders = vec![root.to_owned()];
+    while let Some(folder) = folders.pop() {
+        for path in entries(&folder)? {
+            if path.is_dir() {
+                folders.push(path);
+            } else if is_staged(&path) && is_older(&path, limit)? {
+                fs::remove_file(&path)?;
+                removed += 1;
+            }
+        }
+    }
+    Ok(removed)
+}
+
 /// Whether a file is a staged write, such as `sweep-0#1`, which is renamed when it is complete.
 fn is_staged(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default().to_string_lossy();

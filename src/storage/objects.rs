@@ -2,6 +2,7 @@
 
 use std::path::Path as FilePath;
 use std::sync::Arc;
+use std::time::Duration;
 
 use bytes::Bytes;
 use futures_util::stream::BoxStream;
@@ -12,10 +13,15 @@ use object_store::{ObjectStore, ObjectStoreExt, PutMode};
 
 use super::blob::BlobError;
 use super::bucket::{self, BucketError};
+use super::folder::remove_staged_below;
 
 /// The objects below a prefix of a bucket, or the files below a folder. Clones share the connections.
 #[derive(Clone, Debug)]
-pub struct Objects(Arc<dyn ObjectStore>);
+pub struct Objects {
+    store: Arc<dyn ObjectStore>,
+    /// The folder; none for a bucket.
+    folder: Option<Arc<FilePath>>,
+}
 
 impl Objects {
     /// Opens `s3://bucket/prefix/`, `gs://bucket/prefix/` or `az://container/prefix/`, with the
@@ -24,7 +30,10 @@ impl Objects {
     /// # Errors
     /// [`BucketError`].
     pub fn open(url: &str) -> Result<Self, BucketError> {
-        bucket::open(url).map(Self)
+        Ok(Self {
+            store: bucket::open(url)?,
+            folder: None,
+        })
     }
 
     /// Opens a folder, which must exist. New files are on disk before a write returns.
@@ -33,7 +42,21 @@ impl Objects {
     /// [`BlobError`] if it cannot be opened.
     pub fn open_folder(root: &FilePath) -> Result<Self, BlobError> {
         let folder = LocalFileSystem::new_with_prefix(root)?;
-        Ok(Self(Arc::new(folder.with_fsync(true))))
+        Ok(Self {
+            store: Arc::new(folder.with_fsync(true)),
+            folder: Some(Arc::from(root)),
+        })
+    }
+
+    /// Removes the remains of writes that were cut off more than `age` ago, and counts them. A bucket
+    /// has none.
+    ///
+    /// # Errors
+    /// If a folder cannot be listed, or a file cannot be removed.
+    pub fn remove_cut_off(&self, age: Duration) -> Result<usize, BlobError> {
+        let folder = self.folder.as_deref();
+        let removed = folder.map_or(Ok(0), |folder| remove_staged_below(folder, age));
+        Ok(removed?)
     }
 
     /// Reads the object at a path below the prefix, piece by piece. The path may be encoded as in a
@@ -46,7 +69,7 @@ impl Objects {
         path: &str,
     ) -> Result<BoxStream<'static, Result<Bytes, BlobError>>, BlobError> {
         let path = Path::from_url_path(path).map_err(object_store::Error::from)?;
-        let found = self.0.get(&path).await?;
+        let found = self.store.get(&path).await?;
         Ok(found.into_stream().map_err(BlobError::from).boxed())
     }
 
@@ -56,7 +79,7 @@ impl Objects {
     /// [`BlobError`] if there is none, it is larger, or it cannot be read.
     pub async fn read_whole(&self, path: &str, most: u64) -> Result<Bytes, BlobError> {
         let path = Path::parse(path).map_err(object_store::Error::from)?;
-        let found = self.0.get(&path).await?;
+        let found = self.store.get(&path).await?;
         if found.meta.size > most {
             return Err(std::io::Error::from(std::io::ErrorKind::FileTooLarge).into());
         }
@@ -69,7 +92,7 @@ impl Objects {
     /// [`BlobError`].
     pub async fn all(&self, below: &str) -> Result<Vec<String>, BlobError> {
         let below = Path::parse(below).map_err(object_store::Error::from)?;
-        let found = self.0.list(Some(&below));
+        let found = self.store.list(Some(&below));
         let paths = found.map_ok(|found| found.location.to_string());
         Ok(paths.try_collect().await?)
     }
@@ -80,7 +103,7 @@ impl Objects {
     /// [`BlobError`].
     pub async fn entries(&self, below: &str) -> Result<[Vec<String>; 2], BlobError> {
         let below = Path::parse(below).map_err(object_store::Error::from)?;
-        let found = self.0.list_with_delimiter(Some(&below)).await?;
+        let found = self.store.list_with_delimiter(Some(&below)).await?;
         let name = |path: &Path| path.filename().unwrap_or_default().to_owned();
         let mut folders: Vec<String> = found.common_prefixes.iter().map(name).collect();
         let objects = found.objects.iter().map(|object| name(&object.location));
@@ -97,7 +120,9 @@ impl Objects {
     /// [`BlobError`].
     pub async fn put_new(&self, path: &str, bytes: Bytes) -> Result<bool, BlobError> {
         let path = Path::parse(path).map_err(object_store::Error::from)?;
-        let written = self.0.put_opts(&path, bytes.into(), PutMode::Create.into());
+        let written = self
+            .store
+            .put_opts(&path, bytes.into(), PutMode::Create.into());
         match written.await {
             Ok(_) => Ok(true),
             Err(object_store::Error::AlreadyExists { .. }) => Ok(false),
@@ -111,7 +136,7 @@ impl Objects {
     /// [`BlobError`].
     pub async fn put(&self, path: &str, bytes: Bytes) -> Result<(), BlobError> {
         let path = Path::parse(path).map_err(object_store::Error::from)?;
-        self.0.put(&path, bytes.into()).await?;
+        self.store.put(&path, bytes.into()).await?;
         Ok(())
     }
 
@@ -121,6 +146,6 @@ impl Objects {
     /// [`BlobError`].
     pub async fn remove(&self, path: &str) -> Result<(), BlobError> {
         let path = Path::parse(path).map_err(object_store::Error::from)?;
-        Ok(self.0.delete(&path).await?)
+        Ok(self.store.delete(&path).await?)
     }
 }

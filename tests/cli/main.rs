@@ -1,14 +1,22 @@
 //! Tests of the program from outside: real files, real processes, exit codes.
 
+#![expect(
+    clippy::print_stderr,
+    reason = "helpers of tests say what they leave out"
+)]
+
 mod commands;
 mod evaluation;
 #[path = "../common/gpu.rs"]
 mod gpu_rule;
 mod hostile;
 mod label;
+mod label_datasets;
 #[path = "../common/object_server.rs"]
 mod object_server;
 mod program;
+#[path = "../common/real_data.rs"]
+mod real_data;
 mod sequences;
 mod tables;
 mod view;

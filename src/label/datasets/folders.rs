@@ -1,9 +1,9 @@
 //! Drives that are folders of sweeps.
 
-use super::super::places::{Place, PlaceError};
-use super::super::plan::{Drive, DriveSweep, key_of, stem};
-use super::{Dataset, DatasetError};
+use super::dataset::{Dataset, DatasetError};
 use crate::formats::{compare_names, read_poses};
+use crate::label::places::{Place, PlaceError};
+use crate::label::plan::{Drive, DriveSweep, key_of, stem};
 
 /// Endings of sweeps.
 const ENDINGS: [&str; 5] = [".pcd", ".ply", ".bin", ".npy", ".feather"];

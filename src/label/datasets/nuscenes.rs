@@ -6,10 +6,10 @@ use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
-use super::super::places::Place;
-use super::super::plan::{Drive, DriveSweep, key_of};
-use super::{Dataset, DatasetError};
+use super::dataset::{Dataset, DatasetError};
 use crate::flow::RigidTransform;
+use crate::label::places::Place;
+use crate::label::plan::{Drive, DriveSweep, key_of};
 
 /// The channel of the lidar.
 const CHANNEL: &str = "LIDAR_TOP";

@@ -1,0 +1,225 @@
+//! The estimates of a shard, pair by pair.
+
+use std::collections::BTreeMap;
+use std::sync::mpsc::{Receiver, Sender, SyncSender};
+
+use super::io::{At, Io, Loaded, Output, Unread, Wanted};
+use super::layout::tracks_path;
+use super::report::{Outcome, RowReport};
+use super::types::Solver;
+use crate::flow::tracks::{ClusteredSweep, Tracker, correct};
+use crate::flow::{Control, Ego, Estimate, FlowError, Point, WindowedPair, window};
+use crate::formats::{SweepClock, pair_interval_s, read_av2_mask, write_tracks};
+use crate::job::{JobOptions, MAX_DT_S};
+
+/// The estimates, in order, with the sweeps that they need.
+pub(super) struct Estimates<'a> {
+    pub(super) io: &'a Io<'a>,
+    pub(super) read: Receiver<(At, Result<Loaded, Unread>)>,
+    pub(super) held: BTreeMap<At, Result<Loaded, Unread>>,
+    pub(super) outputs: SyncSender<Output>,
+    pub(super) reports: Sender<RowReport>,
+    pub(super) tracking: Tracking,
+}
+
+/// The tracks of the drive that is being labelled.
+#[derive(Default)]
+pub(super) enum Tracking {
+    /// No pair of the drive was estimated yet.
+    #[default]
+    NotBegun,
+    /// All pairs so far have an estimate.
+    Begun(Box<Tracker>),
+    /// A pair has no estimate: the tracks end before it.
+    Ended,
+}
+
+impl Estimates<'_> {
+    /// Labels a pair: its output goes to the writer, a failure to the reports.
+    pub(super) fn label(
+        &mut self,
+        wanted: &Wanted,
+        solver: &mut dyn Solver,
+        control: &dyn Control,
+    ) {
+        let inputs = self.io.inputs;
+        let drive = &inputs.plan.drives()[wanted.drive];
+        let [source, target] = [wanted.pair, wanted.pair + 1].map(|at| &drive.sweeps[at].uri);
+        let mut report = RowReport::new(drive.key(wanted.pair), source, target);
+        let done = self.estimate(wanted, solver, control, &mut report);
+        if let Err((outcome, reason)) = done {
+            let _the_tally_is_there = self.reports.send(report.ended(outcome, &reason));
+            if inputs.tracks {
+                let tracking = std::mem::replace(&mut self.tracking, Tracking::Ended);
+                self.write_tracks_of(wanted.drive, tracking);
+            }
+        }
+        if inputs.tracks && wanted.pair + 1 == drive.pairs() {
+            let tracking = std::mem::take(&mut self.tracking);
+            self.write_tracks_of(wanted.drive, tracking);
+        }
+    }
+
+    fn estimate(
+        &mut self,
+        wanted: &Wanted,
+        solver: &mut dyn Solver,
+        control: &dyn Control,
+        report: &mut RowReport,
+    ) -> Result<(), (Outcome, String)> {
+        let inputs = self.io.inputs;
+        let drive = &inputs.plan.drives()[wanted.drive];
+        let count = drive.sweeps.len();
+        let size = inputs.options.solver_options(0).sweeps();
+        self.gather(wanted, count, size);
+        let at = |index: usize| self.held.get(&(wanted.drive, index));
+        let loaded = |index: usize| at(index).and_then(|loaded| loaded.as_ref().ok());
+        for index in window(wanted.pair, count, size) {
+            let Some(Err(unread)) = at(index) else {
+                continue;
+            };
+            if index == wanted.pair || index == wanted.pair + 1 {
+                let outcome = match unread.may_pass {
+                    true => Outcome::Failed,
+                    false => Outcome::Refused,
+                };
+                return Err((outcome, unread.reason.clone()));
+            }
+            report.left_out.push(unread.reason.clone());
+        }
+        let mask = self.mask(wanted)?;
+        let pair = [wanted.pair, wanted.pair + 1];
+        let [source, target] = pair.map(|index| loaded(index).expect("both sweeps were read"));
+        let options = self.options(wanted, [source.clock, target.clock]);
+        let larger = source.points.len().max(target.points.len());
+        let mut solver_options = options.solver_options(larger);
+        if inputs.poses {
+            let poses = pair.map(|index| drive.sweeps[index].pose.unwrap_or_default());
+            solver_options.ego = Ego::Given(poses[1].inv_mul(&poses[0]));
+        }
+        let windowed = WindowedPair {
+            pair: wanted.pair,
+            count,
+            sweeps: size,
+            before: None,
+        };
+        let sweep = |index: usize| Some(&loaded(index)?.sweep);
+        let solved =
+            solver.solve(&|backend| windowed.estimate(backend, sweep, &solver_options, control));
+        let mut estimate = solved.map_err(|error| failed(&error))?;
+        let [source, target] = estimate.sweeps([&source.points, &target.points]);
+        if inputs.tracks {
+            if matches!(self.tracking, Tracking::NotBegun) {
+                self.tracking = Tracking::Begun(Box::default());
+            }
+            if let Tracking::Begun(tracker) = &mut self.tracking {
+                let dt_s = solver_options.dt_s;
+                let refused = |error: &dyn ToString| (Outcome::Refused, error.to_string());
+                let sweep = ClusteredSweep::new(&source, &estimate, dt_s);
+                let sweep = sweep.map_err(|error| refused(&error))?;
+                let tracked = tracker.push(&sweep).map_err(|error| refused(&error))?;
+                correct(&mut estimate, [&source, &target], &tracked, dt_s);
+            }
+        }
+        if wanted.is_there {
+            return Ok(());
+        }
+        self.put(wanted, &source, &estimate, mask.as_deref(), report.clone());
+        Ok(())
+    }
+
+    /// Takes the sweeps of a window, and drops those that no later pair needs.
+    fn gather(&mut self, wanted: &Wanted, count: usize, size: usize) {
+        let range = window(wanted.pair, count, size);
+        self.held = self.held.split_off(&(wanted.drive, range.start));
+        let last = (wanted.drive, range.end - 1);
+        while !self.held.contains_key(&last) {
+            let Ok((at, mut loaded)) = self.read.recv() else {
+                break;
+            };
+            if let Ok(loaded) = &mut loaded {
+                let sweep = std::mem::take(&mut loaded.sweep);
+                loaded.sweep = sweep.prepared(&self.io.inputs.options.solver_options(usize::MAX));
+            }
+            self.held.insert(at, loaded);
+        }
+    }
+
+    /// The rows that the layout asks for.
+    fn mask(&self, wanted: &Wanted) -> Result<Option<Vec<bool>>, (Outcome, String)> {
+        let Some(masks) = &self.io.inputs.masks else {
+            return Ok(None);
+        };
+        let read = || self.io.runtime.block_on(masks.read(&wanted.path));
+        let bytes = self.io.patiently(read).map_err(|error| {
+            let outcome = match error.may_pass() {
+                true => Outcome::Failed,
+                false => Outcome::Refused,
+            };
+            (outcome, format!("its mask: {error}"))
+        })?;
+        let mask = read_av2_mask(&bytes);
+        mask.map(Some)
+            .map_err(|error| (Outcome::Refused, format!("its mask: {error}")))
+    }
+
+    /// The options of a pair, with the time between its sweeps.
+    fn options(&self, wanted: &Wanted, clocks: [Option<SweepClock>; 2]) -> JobOptions {
+        let mut options = self.io.inputs.options.clone();
+        let sweeps = &self.io.inputs.plan.drives()[wanted.drive].sweeps[wanted.pair..];
+        let times = sweeps[0].time_s.zip(sweeps[1].time_s);
+        let apart = times.map(|(source, target)| (target - source).abs() as f32);
+        let names = [&sweeps[0].uri, &sweeps[1].uri].map(String::as_str);
+        options.dt_s = options
+            .dt_s
+            .or(apart.filter(|&apart| apart > 0.0 && apart <= MAX_DT_S))
+            .or_else(|| pair_interval_s(names, clocks));
+        options
+    }
+
+    fn put(
+        &self,
+        wanted: &Wanted,
+        source: &[Point],
+        estimate: &Estimate,
+        mask: Option<&[bool]>,
+        report: RowReport,
+    ) {
+        let output = Output {
+            path: wanted.path.clone(),
+            bytes: self.io.inputs.layout.bytes(source, estimate, mask),
+            report: report.with(estimate),
+        };
+        let _the_writer_is_there = self.outputs.send(output);
+    }
+
+    /// Writes the tracks of a drive. They were written before if they have ended.
+    fn write_tracks_of(&self, drive: usize, tracking: Tracking) {
+        let tracker = match tracking {
+            Tracking::NotBegun => Tracker::default(),
+            Tracking::Begun(tracker) => *tracker,
+            Tracking::Ended => return,
+        };
+        let name = &self.io.inputs.plan.drives()[drive].name;
+        let mut bytes = Vec::new();
+        let written = write_tracks(&tracker.finish(), &mut bytes);
+        let path = tracks_path(name);
+        let _the_writer_is_there = self.outputs.send(Output {
+            report: RowReport {
+                tracks: true,
+                ..RowReport::new(path.clone(), name, name)
+            },
+            path,
+            bytes: written.map(|()| bytes),
+        });
+    }
+}
+
+/// What became of a pair whose estimate failed.
+fn failed(error: &FlowError) -> (Outcome, String) {
+    let outcome = match error.is_input() {
+        true => Outcome::Refused,
+        false => Outcome::Failed,
+    };
+    (outcome, error.to_string())
+}
