@@ -82,11 +82,18 @@ class Flow:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes the flow. The ending gives the format: .npz, .npy, .feather, .ply, .pcd or .json."""
+        name = os.path.basename(os.fspath(path))
+        _files.put(path, self._written_as(name))
+
+    def to_bytes(self, ending: str = "npz") -> bytes:
+        """The bytes of a file with this ending, as `save` writes it."""
+        return self._written_as(f"flow.{ending}")
+
+    def _written_as(self, name: str) -> bytes:
         objects = None
         if self.cluster is not None and self.confidence is not None and self.moving is not None:
             objects = (self.cluster, self.confidence, self.moving, self._clusters())
-        name = os.path.basename(os.fspath(path))
-        _files.put(path, _native.write_flow(name, self._columns(), objects))
+        return _native.write_flow(name, self._columns(), objects)
 
     def picture(self, path: str | os.PathLike[str]) -> None:
         """Writes a picture of the flow from above as .png, colored by the direction of motion."""

@@ -1,0 +1,187 @@
+"""Labels of many pairs on engines that exist: Ray Data and Spark.
+
+    import fnsf.bulk, ray
+    pairs = ray.data.read_parquet("pairs.parquet")            # columns key, source, target
+    done = fnsf.bulk.ray_label(pairs, "s3://lake/flow/run-7", preset="default", num_cpus=2)
+    done.write_parquet("s3://lake/flow/run-7-report")
+
+A label is written under the name of its key, and a key that is there is not computed again: a run that was cut off goes
+on. Without such an engine use the program's `fnsf label`.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+import uuid
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from . import _native
+from ._files import Sweep
+from ._flow import flow
+
+COLUMNS = ("key", "source", "target", "outcome", "error", "seconds", "points", "moving")
+"""The columns of the report."""
+ENDINGS = ("npz", "feather", "npy", "ply", "pcd", "json")
+
+
+class Labeller:
+    """Labels pairs: one for each actor or task.
+
+    Args:
+        output: folder or URI for the labels.
+        ending: format of the labels: npz, feather, npy, ply, pcd or json.
+        options: as in `flow`.
+    """
+
+    def __init__(self, output: str, *, ending: str = "npz", **options: Any) -> None:
+        if ending not in ENDINGS:
+            raise _native.InputError(f"labels are {', '.join(ENDINGS)}, not {ending}")
+        self._output, self._ending, self._options = output.rstrip("/"), ending, options
+
+    def __call__(self, batch: Mapping[str, Any]) -> dict[str, Any]:
+        """Labels the rows of a batch: columns key, source and target. Returns the columns of the report."""
+        rows = zip(batch["key"], batch["source"], batch["target"], strict=True)
+        reports = [self.label(str(key), str(source), str(target)) for key, source, target in rows]
+        # One type a column, so that batches of all kinds have one schema.
+        types = {"seconds": np.float64, "points": np.int64, "moving": np.int64}
+        return {name: np.array([report[name] for report in reports], dtype=types.get(name, object)) for name in COLUMNS}
+
+    def label(self, key: str, source: str, target: str) -> dict[str, Any]:
+        """Labels one pair, unless its label is there. A pair that cannot be labelled is refused, not raised."""
+        report: dict[str, Any] = dict.fromkeys(COLUMNS, "")
+        report |= {"key": key, "source": source, "target": target, "seconds": 0.0, "points": 0, "moving": 0}
+        path = f"{self._output}/{key}.{self._ending}"
+        if _exists(path):
+            return report | {"outcome": "found"}
+        began = time.monotonic()
+        try:
+            first, second = _sweep(source), _sweep(target)
+            times = None
+            if first.times is not None and second.times is not None:
+                times = (first.times, second.times)
+            found = flow(first.points, second.points, times=times, **self._options)
+        except (_native.InputError, FileNotFoundError) as error:
+            return report | {"outcome": "refused", "error": str(error)}
+        written = _put_new(path, found.to_bytes(self._ending))
+        return report | {
+            "outcome": "labelled" if written else "raced",
+            "seconds": time.monotonic() - began,
+            "points": len(found),
+            "moving": 0 if found.clusters is None else int(found.clusters["dynamic"].sum()),
+        }
+
+
+def _filesystem(uri: str) -> tuple[Any, str]:
+    """The file system of a path or URI, and the path in it."""
+    from pyarrow import fs
+
+    if "://" not in uri:
+        uri = os.path.abspath(uri)
+    filesystem, path = fs.FileSystem.from_uri(uri)
+    return filesystem, path
+
+
+def _exists(uri: str) -> bool:
+    from pyarrow import fs
+
+    filesystem, path = _filesystem(uri)
+    return bool(filesystem.get_file_info(path).type == fs.FileType.File)
+
+
+def _sweep(uri: str) -> Sweep:
+    filesystem, path = _filesystem(uri)
+    with filesystem.open_input_file(path) as file:
+        return Sweep(**_native.read_sweep(file.read(), uri))
+
+
+def _put_new(uri: str, data: bytes) -> bool:
+    """Writes a file unless there is one; whether it was written. It is there whole, or not at all.
+
+    In a bucket, two writers of one key write the same bytes, and the later one stays.
+    """
+    from pyarrow import fs
+
+    filesystem, path = _filesystem(uri)
+    if not isinstance(filesystem, fs.LocalFileSystem):
+        with filesystem.open_output_stream(path) as stream:
+            stream.write(data)
+        return True
+    folder = os.path.dirname(path)
+    os.makedirs(folder, exist_ok=True)
+    part = os.path.join(folder, f".{uuid.uuid4()}.part")
+    try:
+        with open(part, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        # A link, unlike a rename, does not replace a file that is there.
+        os.link(part, path)
+    except FileExistsError:
+        return False
+    finally:
+        os.unlink(part)
+    return True
+
+
+def ray_label(
+    dataset: Any,
+    output: str,
+    *,
+    ending: str = "npz",
+    concurrency: int | tuple[int, int] = 1,
+    num_cpus: float = 1,
+    num_gpus: float = 0,
+    batch_size: int = 8,
+    **options: Any,
+) -> Any:
+    """The report of the labels of a Ray dataset with the columns key, source and target, as a Ray dataset.
+
+    Args:
+        dataset: a `ray.data.Dataset`.
+        output: folder or URI for the labels; every node must reach it.
+        ending: format of the labels.
+        concurrency: number of actors, or the least and the most.
+        num_cpus: CPUs of an actor, which uses as many threads.
+        num_gpus: GPUs of an actor, for presets that fit a field.
+        batch_size: rows that an actor takes at once, and computes again if it dies before their report.
+        options: as in `flow`.
+    """
+    options.setdefault("threads", max(1, int(num_cpus)))
+    return dataset.map_batches(
+        Labeller,
+        fn_constructor_args=(output,),
+        fn_constructor_kwargs={"ending": ending, **options},
+        concurrency=concurrency,
+        num_cpus=num_cpus,
+        num_gpus=num_gpus,
+        batch_size=batch_size,
+    )
+
+
+def spark_label(frame: Any, output: str, *, ending: str = "npz", **options: Any) -> Any:
+    """The report of the labels of a Spark data frame with the columns key, source and target, as a data frame.
+
+    Args:
+        frame: a `pyspark.sql.DataFrame`. Its partitions are the tasks: some hundred rows each are a good size.
+        output: folder or URI for the labels; every node must reach it.
+        ending: format of the labels.
+        options: as in `flow`. `threads` should be `spark.task.cpus`.
+    """
+    options.setdefault("threads", 1)
+
+    def label(frames: Iterator[Any]) -> Iterator[Any]:
+        import pandas
+
+        labeller = Labeller(output, ending=ending, **options)
+        for rows in frames:
+            # A batch of Arrow is thousands of rows: a report for each is passed on as it is done.
+            for first in range(0, len(rows), 8):
+                yield pandas.DataFrame(labeller(rows.iloc[first : first + 8]))
+
+    types = {"seconds": "double", "points": "long", "moving": "long"}
+    schema = ", ".join(f"{name} {types.get(name, 'string')}" for name in COLUMNS)
+    return frame.mapInPandas(label, schema=schema)

@@ -1,0 +1,58 @@
+"""Labels of many pairs, without an engine."""
+
+import os
+import threading
+
+import numpy as np
+import pytest
+
+import fnsf
+
+pytest.importorskip("pyarrow")
+from fnsf.bulk import COLUMNS, Labeller
+
+
+@pytest.fixture
+def table(street, tmp_path):
+    for index in range(4):
+        fnsf.write(tmp_path / f"{index}.pcd", street.sweep(index).points)
+    keys = [f"drive/{index}" for index in range(3)]
+    return {
+        "key": np.array(keys, dtype=object),
+        "source": np.array([str(tmp_path / f"{index}.pcd") for index in range(3)], dtype=object),
+        "target": np.array([f"file://{tmp_path / f'{index + 1}.pcd'}" for index in range(3)], dtype=object),
+    }
+
+
+def test_rows_are_labelled_once_and_have_the_flow_of_their_pair(table, street, tmp_path):
+    labeller = Labeller(str(tmp_path / "labels"), preset="default")
+    report = labeller(table)
+    assert tuple(report) == COLUMNS
+    assert list(report["outcome"]) == ["labelled"] * 3
+    assert report["points"].dtype == np.int64 and report["moving"].sum() > 0
+    flow = fnsf.read_flow(tmp_path / "labels/drive/1.npz")
+    assert np.array_equal(flow.flow, fnsf.flow(street.sweep(1).points, street.sweep(2).points).flow)
+    assert list(labeller(table)["outcome"]) == ["found"] * 3
+    assert sorted(os.listdir(tmp_path / "labels/drive")) == ["0.npz", "1.npz", "2.npz"]
+
+
+def test_rows_that_cannot_be_used_are_refused(table, tmp_path):
+    table["source"][0] = str(tmp_path / "none.pcd")
+    (tmp_path / "2.pcd").write_bytes(b"# .PCD v0.7\n")
+    report = Labeller(str(tmp_path / "labels"))(table)
+    assert list(report["outcome"]) == ["refused"] * 3
+    assert "none.pcd" in report["error"][0] and "2.pcd" in report["error"][1]
+    with pytest.raises(fnsf.InputError, match="labels are npz"):
+        Labeller("x", ending="obj")
+
+
+def test_racing_writers_leave_one_label(table, tmp_path):
+    outcomes = []
+    labeller = Labeller(str(tmp_path / "labels"), ending="feather")
+    threads = [threading.Thread(target=lambda: outcomes.extend(labeller(table)["outcome"])) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(outcomes) == 24 and outcomes.count("labelled") == 3
+    assert sorted(os.listdir(tmp_path / "labels/drive")) == ["0.feather", "1.feather", "2.feather"]
