@@ -101,7 +101,7 @@ function dropPanel(choose, chosen, send, outcome, form) {
     },
     input,
     el("p", { class: "big" }, "Drop two sweeps or more here"),
-    el("p", { class: "hint" }, "pcd, ply, npy, npz, KITTI bin, nuScenes pcd.bin, Argoverse feather"),
+    el("p", { class: "hint" }, "pcd, ply, npy, npz, las, KITTI bin, nuScenes pcd.bin, Argoverse feather"),
     el("label", { for: "files", class: "button" }, "Choose files"),
   );
   return el("section", { class: "panel", "aria-label": "Files" }, zone, chosen, form.element, el("div", { class: "actions" }, send), outcome);

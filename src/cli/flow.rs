@@ -23,7 +23,7 @@ use crate::text::grouped;
 
 /// Estimate the displacement of every point between two sweeps, or for each pair of a sequence.
 ///
-/// Reads npz, npy, ply, pcd, KITTI bin, nuScenes pcd.bin and Argoverse 2 feather, recognized by
+/// Reads npz, npy, ply, pcd, las, KITTI bin, nuScenes pcd.bin and Argoverse 2 feather, recognized by
 /// content. The flow has one row per source point, in metres: the point's position at the target's
 /// time in the target's frame, minus its position in the source's frame. Each flow of a sequence is
 /// written as soon as it is estimated. With neural, the fit of a pair starts from the pair before.

@@ -6,6 +6,7 @@ use std::io::Write;
 
 use super::error::{FileKind, FormatError, shorten};
 use super::feather::{Table, Values};
+use super::las_read::Las;
 use super::limits::{MAX_COORDINATE_M, MAX_POINTS, check_value, check_within};
 use super::npz::Npz;
 use super::pcd::Pcd;
@@ -93,8 +94,8 @@ pub fn read_cloud_within(
     read(bytes, name, most, false).map(|(cloud, _)| cloud)
 }
 
-/// As [`read_cloud`], with the times of the points, from PLY, PCD and feather files. A time is a
-/// field named `offset_ns`, `t`, `time`, `timestamp`, `offset_time` or `time_offset`, in seconds,
+/// As [`read_cloud`], with the times of the points, from PLY, PCD, feather and LAS files. A time is the
+/// GPS time of LAS, or a field named `offset_ns`, `t`, `time`, `timestamp`, `offset_time` or `time_offset`, in seconds,
 /// milliseconds, microseconds or nanoseconds: in one of them the times span a sweep of 0.01 to 1 s.
 ///
 /// # Errors
@@ -131,7 +132,8 @@ fn read(
             bin::read(bytes, kind, most).map(untimed)
         }
         FileKind::Json => Err(FileKind::Json.unsupported("json holds flow here, not clouds")),
-        kind @ (FileKind::Las | FileKind::Png | FileKind::Camera | FileKind::Poses) => {
+        FileKind::Las => read_las(bytes, most, timed),
+        kind @ (FileKind::Png | FileKind::Camera | FileKind::Poses) => {
             Err(kind.unsupported("no cloud is read from it"))
         }
     }
@@ -163,6 +165,7 @@ pub fn declared_rows(bytes: &[u8], name: Option<&str>) -> Result<usize, FormatEr
         FileKind::Ply => Ply::open(bytes)?.rows(),
         FileKind::Pcd => Ok(Pcd::open(bytes)?.rows()),
         FileKind::Feather => Ok(Table::open(bytes)?.rows()),
+        FileKind::Las => Ok(Las::open(bytes)?.rows()),
         // Raw floats: an upper bound, from the size of a point.
         _ => Ok(bytes.len() / size_of::<Point>()),
     }
@@ -295,6 +298,26 @@ fn read_feather(
     if let Some(times) = &mut times {
         table.each(times.name(), |row, time| times.push(kind, row, time))?;
     }
+    Ok((Cloud::from(points), times))
+}
+
+fn read_las(
+    bytes: &[u8],
+    most: usize,
+    timed: bool,
+) -> Result<(Cloud, Option<TimesColumn>), FormatError> {
+    let kind = FileKind::Las;
+    let las = Las::open(bytes)?;
+    check_within(kind, las.rows(), most)?;
+    let mut points = Vec::with_capacity(las.rows());
+    let mut times = TimesColumn::find(|name| timed && las.has_times() && name == "timestamp");
+    las.each(|row, [x, y, z, time]| {
+        points.push(point(kind, row, &[x, y, z])?);
+        match &mut times {
+            Some(times) => times.push(kind, row, time),
+            None => Ok(()),
+        }
+    })?;
     Ok((Cloud::from(points), times))
 }
 

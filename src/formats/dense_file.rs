@@ -7,11 +7,11 @@ use super::limits::{check_points, check_value};
 use super::npz::{Npz, NpzWriter};
 use super::pair::check_count;
 use super::sniff::ending;
-use super::{las, npy, pcd, ply};
+use super::{las_write, npy, pcd, ply};
 use crate::flow::DenseCloud;
 
 /// The formats in which a dense cloud of M points is written. Positions are in metres, ages in
-/// sweeps. All except LAS and LAZ can be read back as clouds.
+/// sweeps. All except LAZ can be read back as clouds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum DenseFormat {
     /// `points` M x 3 float32; M each: `sweep` uint32, `age` float32, `dynamic` bool, `converged`
@@ -124,8 +124,8 @@ pub fn write_dense<W: Write>(
         DenseFormat::Npz => write_npz(cloud, out),
         DenseFormat::Ply => write_ply(cloud, out),
         DenseFormat::Pcd => write_pcd(cloud, out),
-        DenseFormat::Laz => las::write(cloud, true, out),
-        DenseFormat::Las => las::write(cloud, false, out),
+        DenseFormat::Laz => las_write::write(cloud, true, out),
+        DenseFormat::Las => las_write::write(cloud, false, out),
     }
 }
 

@@ -21,7 +21,7 @@ pub enum FileKind {
     Feather,
     /// JSON: a flow, or the similarity transform of a ground raster.
     Json,
-    /// LAS, or LAZ, its compressed form. Written only.
+    /// LAS, or LAZ, its compressed form, which is written only.
     Las,
     /// PNG: a depth image, 16-bit gray.
     Png,

@@ -25,7 +25,8 @@ mod tracks;
 
 mod bin;
 mod feather;
-mod las;
+mod las_read;
+mod las_write;
 mod lzf;
 mod npy;
 mod npz;

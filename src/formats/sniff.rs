@@ -2,7 +2,7 @@
 //! distinctive.
 
 use super::error::{FileKind, FormatError};
-use super::{bin, feather, npy};
+use super::{bin, feather, las_read, npy};
 
 /// Number of lines in which a PCD header must start; comments may precede it.
 const MAX_COMMENT_LINES: usize = 32;
@@ -33,6 +33,9 @@ pub fn recognize(bytes: &[u8], name: Option<&str>) -> Result<FileKind, FormatErr
     }
     if bytes.starts_with(feather::MAGIC) {
         return Ok(FileKind::Feather);
+    }
+    if bytes.starts_with(las_read::MAGIC) {
+        return Ok(FileKind::Las);
     }
     if is_pcd(bytes) {
         return Ok(FileKind::Pcd);
@@ -86,10 +89,9 @@ fn is_json(bytes: &[u8]) -> bool {
 
 /// A message for common kinds of files that are not supported.
 fn known_stranger(bytes: &[u8]) -> Option<&'static str> {
-    let beginnings: [(&[u8], &str); 6] = [
+    let beginnings: [(&[u8], &str); 5] = [
         (b"FEA1", "it is feather version 1; write version 2"),
         (b"\x89HDF", "it is HDF5; export the arrays as npz"),
-        (b"LASF", "it is LAS or LAZ; convert it to ply or pcd"),
         (b"\x1f\x8b", "it is gzip-compressed; unpack it first"),
         (b"ASTM-E57", "it is E57; convert it to ply or pcd"),
         (

@@ -2,11 +2,12 @@
 
 use fnsf::flow::Point;
 use fnsf::formats::{
-    FormatError, is_pair, read_av2_labels, read_cloud, read_flow, read_pair, read_timed_cloud,
-    write_timed_pcd,
+    DenseFormat, FormatError, is_pair, read_av2_labels, read_cloud, read_flow, read_pair,
+    read_timed_cloud, write_timed_pcd,
 };
 use proptest::prelude::*;
 
+use crate::las::file as las_file;
 use crate::samples::{
     CLOUD_FORMATS, FLOW_FORMATS, cloud_file, feather, floats, flow_file, lzf_literals, npy, npz,
     pair, pair_file, points,
@@ -167,7 +168,7 @@ fn strangers_are_named() {
     let named = |bytes: &[u8]| refusal(bytes).to_string();
     assert!(named(b"").contains("empty"));
     assert!(named(b"\x89HDF\r\n\x1a\n").contains("HDF5"));
-    assert!(named(b"LASF....").contains("LAS"));
+    assert!(named(b"LASF....").contains("las"));
     assert!(named(b"\x1f\x8b\x08").contains("gzip"));
     assert!(named(b"\x80\x04\x95").contains("pickle"));
     let error = read_cloud(b"hello", Some("a.ply")).unwrap_err().to_string();
@@ -191,6 +192,7 @@ fn every_valid_file() -> Vec<(String, Vec<u8>)> {
     files.push(("ascii pcd".to_owned(), ascii_pcd()));
     files.push(("compressed pcd".to_owned(), compressed_pcd(&points)));
     files.push(("timed pcd".to_owned(), timed_pcd(&points)));
+    files.push(("las".to_owned(), las_file(DenseFormat::Las, &points)));
     files
 }
 

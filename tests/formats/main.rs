@@ -11,6 +11,8 @@ mod dense;
 #[cfg(test)]
 mod hostile;
 #[cfg(test)]
+mod las;
+#[cfg(test)]
 mod poses;
 #[cfg(test)]
 mod real_data;

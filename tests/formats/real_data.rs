@@ -14,7 +14,7 @@ const SAME: f32 = 0.0;
 /// The flow in `pair.npz` is the float32 flow of the labels.
 const SAME_FLOW_M: f32 = 1e-6;
 
-fn real(path: &str) -> Option<Vec<u8>> {
+pub(crate) fn real(path: &str) -> Option<Vec<u8>> {
     let path = folder::real_data()?.join(path);
     Some(std::fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display())))
 }

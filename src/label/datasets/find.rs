@@ -31,7 +31,7 @@ pub(in crate::label) async fn drives_of(
                 Dataset::Argoverse2 => "LOG/sensors/lidar/*.feather",
                 Dataset::Kitti => "velodyne_points/data/*.bin or velodyne/*.bin",
                 Dataset::Folders | Dataset::Nuscenes => {
-                    "a folder with two files .pcd, .ply, .bin, .npy or .feather"
+                    "a folder with two files .pcd, .ply, .bin, .npy, .feather or .las"
                 }
             },
         }),

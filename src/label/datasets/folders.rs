@@ -6,7 +6,7 @@ use crate::label::places::{Place, PlaceError};
 use crate::label::plan::{Drive, DriveSweep, key_of, stem};
 
 /// Endings of sweeps.
-const ENDINGS: [&str; 5] = [".pcd", ".ply", ".bin", ".npy", ".feather"];
+const ENDINGS: [&str; 6] = [".pcd", ".ply", ".bin", ".npy", ".feather", ".las"];
 /// The deepest folder that is looked into.
 const MAX_DEPTH: usize = 12;
 /// Where sweeps lie below a log of Argoverse 2.

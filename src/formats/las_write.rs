@@ -1,4 +1,4 @@
-//! LAS and LAZ, the formats of surveying; written only.
+//! Writes LAS and LAZ, the formats of surveying.
 //!
 //! Version 1.4, point format 0, with the age as an extra dimension.
 
