@@ -40,6 +40,10 @@ experiment name *arguments:
 demo:
     cargo run --release -- demo
 
+# the protocol: lints, and no change that breaks clients
+proto:
+    proto/check
+
 # the Python package: wheel, lints, types, tests
 python:
     clients/python/check

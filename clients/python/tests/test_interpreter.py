@@ -129,6 +129,8 @@ print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
     )
     if said.strip() == "no GPU":
+        if os.environ.get("FNSF_REQUIRE_GPU") == "1":
+            pytest.fail("FNSF_REQUIRE_GPU is set and there is no GPU")
         pytest.skip("no GPU and no driver that computes on the CPU")
     assert said.strip() == "0"
 
