@@ -88,14 +88,7 @@ struct Waiting {
 /// Writes the flow in the format given by the path's ending.
 fn write(estimate: &Estimate, source: &[Point], path: &Path) -> Result<(), Failure> {
     let format = FlowFormat::from_path(path).map_err(Failure::usage)?;
-    let table = FlowTable {
-        source,
-        flow: &estimate.flow,
-        valid: &estimate.valid,
-        dynamic: estimate.dynamic.as_deref(),
-        objects: estimate.objects(),
-        ego: estimate.ego.as_ref(),
-    };
+    let table = FlowTable::new(source, estimate);
     files::write(path, |file| write_flow(format, &table, file))
 }
 

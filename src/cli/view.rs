@@ -209,14 +209,7 @@ impl View {
                 let tracked = sweep.and_then(|sweep| tracker.push(&sweep));
                 tracked.map_err(Failure::internal)?;
             }
-            let flow = npz(&FlowTable {
-                source: points,
-                flow: &estimate.flow,
-                valid: &estimate.valid,
-                dynamic: estimate.dynamic.as_deref(),
-                objects: estimate.objects(),
-                ego: estimate.ego.as_ref(),
-            })?;
+            let flow = npz(&FlowTable::new(points, &estimate))?;
             let ego = estimate.ego.as_ref().map(matrix_rows);
             scene.pairs.push(local(source, &timed, ego, flow));
         }

@@ -83,14 +83,7 @@ impl Layout {
         estimate: &Estimate,
         mask: Option<&[bool]>,
     ) -> Result<Vec<u8>, FormatError> {
-        let table = FlowTable {
-            source,
-            flow: &estimate.flow,
-            valid: &estimate.valid,
-            dynamic: estimate.dynamic.as_deref(),
-            objects: estimate.objects(),
-            ego: estimate.ego.as_ref(),
-        };
+        let table = FlowTable::new(source, estimate);
         let mut bytes = Vec::new();
         match self.challenge() {
             Some(challenge) => write_av2_challenge(challenge, &table, mask, &mut bytes)?,

@@ -40,6 +40,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<sequence::Sequence>()?;
     module.add_class::<street::Street>()?;
     module.add_function(wrap_pyfunction!(protocol, module)?)?;
+    module.add_function(wrap_pyfunction!(objects::object_types, module)?)?;
     module.add_function(wrap_pyfunction!(device::device_name, module)?)?;
     module.add_function(wrap_pyfunction!(estimate::estimate, module)?)?;
     module.add_function(wrap_pyfunction!(dense::densify, module)?)?;

@@ -65,12 +65,8 @@ const STATE: [Field; 9] = [
     ("confidence", "f4", 1),
 ];
 
-/// An array of `rows` with the fields named. The array is writable and owns its memory.
-fn structured<'py>(
-    py: Python<'py>,
-    fields: &[Field],
-    rows: &[impl Pod],
-) -> PyResult<Bound<'py, PyAny>> {
+/// The type of a structured array with these fields.
+fn dtype<'py>(py: Python<'py>, fields: &[Field]) -> PyResult<Bound<'py, PyAny>> {
     let numpy = py.import("numpy")?;
     let fields: Vec<Bound<'py, PyAny>> = fields
         .iter()
@@ -81,11 +77,25 @@ fn structured<'py>(
         .collect::<PyResult<_>>()?;
     let aligned = PyDict::new(py);
     aligned.set_item("align", true)?;
-    let dtype = numpy.call_method("dtype", (fields,), Some(&aligned))?;
+    numpy.call_method("dtype", (fields,), Some(&aligned))
+}
+
+/// An array of `rows` with the fields named. The array is writable and owns its memory.
+fn structured<'py>(
+    py: Python<'py>,
+    fields: &[Field],
+    rows: &[impl Pod],
+) -> PyResult<Bound<'py, PyAny>> {
     let bytes = PyBytes::new(py, bytemuck::cast_slice(rows));
-    numpy
-        .call_method1("frombuffer", (bytes, dtype))?
+    py.import("numpy")?
+        .call_method1("frombuffer", (bytes, dtype(py, fields)?))?
         .call_method0("copy")
+}
+
+/// The types of the arrays of clusters and of tracks.
+#[pyfunction]
+pub(crate) fn object_types(py: Python<'_>) -> PyResult<(Bound<'_, PyAny>, Bound<'_, PyAny>)> {
+    Ok((dtype(py, &CLUSTER)?, dtype(py, &STATE)?))
 }
 
 /// K clusters.

@@ -1,9 +1,6 @@
 //! A flow with what is known about its rows, out and back in.
 
-use crate::flow::Cluster;
-use crate::flow::Objects;
-use crate::flow::Point;
-use crate::flow::RigidTransform;
+use crate::flow::{Cluster, Estimate, Objects, Point, RigidTransform};
 
 /// Property names of a displacement in PLY and PCD.
 pub(super) const FLOW_AXES: [&str; 3] = ["flow_x", "flow_y", "flow_z"];
@@ -26,6 +23,21 @@ pub struct FlowTable<'a> {
     pub objects: Option<&'a Objects>,
     /// The ego motion `target_from_source`, where known.
     pub ego: Option<&'a RigidTransform>,
+}
+
+impl<'a> FlowTable<'a> {
+    /// The flow of an estimate. `source` are the N points that it starts from, see
+    /// [`Estimate::sweeps`].
+    pub fn new(source: &'a [Point], estimate: &'a Estimate) -> Self {
+        Self {
+            source,
+            flow: &estimate.flow,
+            valid: &estimate.valid,
+            dynamic: estimate.dynamic.as_deref(),
+            objects: estimate.objects(),
+            ego: estimate.ego.as_ref(),
+        }
+    }
 }
 
 /// A flow of N rows as read from a file, with the optional columns that the file has.

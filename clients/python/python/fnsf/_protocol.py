@@ -93,34 +93,8 @@ def chunks(points: Points, mask: Mask | None) -> Iterator[Any]:
         yield MESSAGES["Chunk"](points=piece.astype("<f4", copy=False).tobytes(), ground=flags)
 
 
-CLUSTER = np.dtype(
-    [
-        ("points", "u4"),
-        ("dynamic", "?"),
-        ("center", "f4", (3,)),
-        ("size", "f4", (3,)),
-        ("yaw", "f4"),
-        ("velocity", "f4", (3,)),
-        ("yaw_rate", "f4"),
-        ("confidence", "f4"),
-        ("moving", "f4"),
-    ],
-    align=True,
-)
-STATE = np.dtype(
-    [
-        ("id", "u4"),
-        ("sweep", "u4"),
-        ("points", "u4"),
-        ("center", "f4", (3,)),
-        ("size", "f4", (3,)),
-        ("yaw", "f4"),
-        ("velocity", "f4", (3,)),
-        ("yaw_rate", "f4"),
-        ("confidence", "f4"),
-    ],
-    align=True,
-)
+CLUSTER, STATE = _native.object_types()
+"""The types of the arrays of clusters and of tracks."""
 
 
 def _row(message: Any, dtype: Any, **more: int) -> tuple[Any, ...]:
