@@ -7,7 +7,7 @@ use bytes::Bytes;
 use tokio::runtime::Builder;
 
 use super::error::LabelError;
-use super::layout::{Layout, tracks_path};
+use super::layout::{Layout, SETTINGS_FILE, tracks_path};
 use super::places::Place;
 use super::plan::Plan;
 use super::report::{Outcome, RowReport, read_lines};
@@ -59,7 +59,7 @@ pub fn finalize(
         let settings = Settings::read(output).await?;
         if settings.layout != layout.name() || settings.plan != plan.hash() {
             return Err(LabelError::BadRun(
-                output.uri("run.json"),
+                output.uri(SETTINGS_FILE),
                 "it is of another manifest or another layout".to_owned(),
             ));
         }

@@ -21,6 +21,9 @@ pub enum Layout {
     Av2V3,
 }
 
+/// The file with the settings of a run, in its output.
+pub(super) const SETTINGS_FILE: &str = "run.json";
+
 /// Pairs of the second challenge are this many sweeps apart.
 const V2_STRIDE: usize = 5;
 

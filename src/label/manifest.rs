@@ -9,6 +9,7 @@
 //! world_from_sensor. Other columns are ignored.
 
 use std::collections::HashMap;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use arrow_array::RecordBatch;
 use arrow_array::cast::AsArray;
@@ -74,7 +75,12 @@ pub fn read_manifest(bytes: Bytes, folder: Option<&str>) -> Result<Vec<Drive>, M
         return Err(ManifestError::TooLarge);
     }
     let table = match bytes.starts_with(b"PAR1") {
-        true => read_parquet(bytes)?,
+        true => {
+            // The reader of Parquet panics at some damaged files.
+            let read = catch_unwind(AssertUnwindSafe(|| read_parquet(bytes)));
+            let damaged = |_| ManifestError::Unreadable("the Parquet file is damaged".to_owned());
+            read.map_err(damaged)??
+        }
         false => read_csv(&bytes)?,
     };
     let has = |name: &str| table.names.iter().any(|known| known == name);

@@ -4,13 +4,10 @@ use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 
 use super::error::{LabelError, OtherRun};
-use super::layout::Layout;
+use super::layout::{Layout, SETTINGS_FILE};
 use super::places::{Place, PlaceError};
 use super::plan::Plan;
 use crate::job::{DeviceChoice, JobOptions};
-
-/// The file that holds them.
-const FILE: &str = "run.json";
 
 /// What determines the outputs of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -61,7 +58,7 @@ impl Settings {
     /// [`LabelError::OtherRun`], and [`LabelError::Place`].
     pub(super) async fn agree(&self, output: &Place) -> Result<(), LabelError> {
         let text = serde_json::to_vec_pretty(self).expect("settings have a JSON form");
-        if output.put_new(FILE, Bytes::from(text)).await? {
+        if output.put_new(SETTINGS_FILE, Bytes::from(text)).await? {
             return Ok(());
         }
         let theirs = Self::read(output).await?;
@@ -73,12 +70,12 @@ impl Settings {
 
     /// Reads the settings of an output.
     pub(super) async fn read(output: &Place) -> Result<Self, LabelError> {
-        let bytes = match output.read(FILE).await {
+        let bytes = match output.read(SETTINGS_FILE).await {
             Err(PlaceError::Missing(_)) => return Err(LabelError::NoRun(output.uri(""))),
             read => read?,
         };
         serde_json::from_slice(&bytes)
-            .map_err(|error| LabelError::BadRun(output.uri(FILE), error.to_string()))
+            .map_err(|error| LabelError::BadRun(output.uri(SETTINGS_FILE), error.to_string()))
     }
 
     fn difference(&self, ours: &Self) -> Option<OtherRun> {

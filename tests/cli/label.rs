@@ -131,6 +131,14 @@ fn labels_have_the_bits_of_a_sequence_whatever_the_shards() {
         "{}",
         again.stdout
     );
+    // An output below the input is no drive.
+    for _ in 0..2 {
+        let inside = label(
+            folder,
+            &["drives", "-o", "drives/out", "--layout", "feather"],
+        );
+        assert!(inside.stdout.contains("of 15 pairs"), "{}", inside.stdout);
+    }
     let end = label(folder, &["drives", "-o", "parts", "--finalize"]);
     assert_eq!(end.code, 0, "{}", end.stderr);
     let success = fs::read_to_string(folder.join("parts/_SUCCESS")).expect("written");

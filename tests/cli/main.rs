@@ -12,6 +12,7 @@ mod gpu_rule;
 mod hostile;
 mod label;
 mod label_datasets;
+mod label_manifest;
 #[path = "../common/object_server.rs"]
 mod object_server;
 mod program;

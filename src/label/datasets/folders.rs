@@ -2,6 +2,7 @@
 
 use super::dataset::{Dataset, DatasetError};
 use crate::formats::{compare_names, read_poses};
+use crate::label::layout::SETTINGS_FILE;
 use crate::label::places::{Place, PlaceError};
 use crate::label::plan::{Drive, DriveSweep, key_of, stem};
 
@@ -39,6 +40,10 @@ pub(super) async fn drives(place: &Place, dataset: Dataset) -> Result<Vec<Drive>
     let mut waiting = vec![(String::new(), 0)];
     while let Some((folder, depth)) = waiting.pop() {
         let [folders, files] = place.entries(&folder).await?;
+        if files.iter().any(|file| file == SETTINGS_FILE) {
+            // The output of a run, which may lie below its input.
+            continue;
+        }
         let is_sweep = |name: &String| ENDINGS.iter().any(|end| name.ends_with(end));
         let mut sweeps: Vec<String> = files.into_iter().filter(is_sweep).collect();
         if sweeps.len() > 1 && is_asked_for(&folder, dataset) {

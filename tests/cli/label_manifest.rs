@@ -1,0 +1,137 @@
+//! Tests of manifests as Parquet: every type of column that common writers use, and damaged files.
+
+use std::sync::Arc;
+
+use arrow_array::builder::{Float64Builder, ListBuilder};
+use arrow_array::{
+    ArrayRef, Int32Array, Int64Array, LargeStringArray, RecordBatch, StringArray, StringViewArray,
+};
+use bytes::Bytes;
+use fnsf::label::{ManifestError, read_manifest};
+use parquet::arrow::ArrowWriter;
+use parquet::basic::{Compression, ZstdLevel};
+use parquet::file::properties::WriterProperties;
+
+const SWEEPS: [&str; 3] = ["a/0.pcd", "s3://lake/1.pcd", "a/2.pcd"];
+
+fn file(columns: Vec<(&str, ArrayRef)>, compression: Compression) -> Bytes {
+    let batch = RecordBatch::try_from_iter(columns).expect("columns");
+    let properties = WriterProperties::builder()
+        .set_compression(compression)
+        .build();
+    let mut out = Vec::new();
+    let mut writer =
+        ArrowWriter::try_new(&mut out, batch.schema(), Some(properties)).expect("a writer");
+    writer.write(&batch).expect("written");
+    writer.close().expect("closed");
+    Bytes::from(out)
+}
+
+fn poses() -> ArrayRef {
+    let mut list = ListBuilder::new(Float64Builder::new());
+    for row in 0..3 {
+        let pose = [
+            1.0,
+            0.0,
+            0.0,
+            f64::from(row),
+            0.0,
+            1.0,
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            1.0,
+            0.0,
+        ];
+        list.values().append_slice(&pose);
+        list.append(true);
+    }
+    Arc::new(list.finish())
+}
+
+fn sweeps(compression: Compression) -> Bytes {
+    file(
+        vec![
+            (
+                "drive",
+                Arc::new(LargeStringArray::from(vec!["d"; 3])) as ArrayRef,
+            ),
+            ("sweep", Arc::new(StringArray::from(SWEEPS.to_vec()))),
+            (
+                "timestamp_ns",
+                Arc::new(Int64Array::from(vec![
+                    100_000_000,
+                    200_000_000,
+                    300_000_000,
+                ])),
+            ),
+            ("pose", poses()),
+            ("weather", Arc::new(Int32Array::from(vec![1, 2, 3]))),
+        ],
+        compression,
+    )
+}
+
+#[test]
+fn sweeps_are_read_from_every_common_compression() {
+    let zstd = Compression::ZSTD(ZstdLevel::default());
+    for compression in [
+        Compression::UNCOMPRESSED,
+        Compression::SNAPPY,
+        zstd,
+        Compression::LZ4_RAW,
+    ] {
+        let drives = read_manifest(sweeps(compression), Some("/data")).expect("drives");
+        assert_eq!(drives.len(), 1);
+        let found: Vec<&str> = drives[0]
+            .sweeps
+            .iter()
+            .map(|sweep| sweep.uri.as_str())
+            .collect();
+        assert_eq!(found, ["/data/a/0.pcd", "s3://lake/1.pcd", "/data/a/2.pcd"]);
+        let last = &drives[0].sweeps[2];
+        assert_eq!(last.pose.map(|pose| pose.translation.x), Some(2.0));
+        assert!((last.time_s.expect("a time") - 0.3).abs() < 1e-9);
+    }
+}
+
+#[test]
+fn pairs_are_read_and_other_types_are_named() {
+    let text = |values: [&str; 2]| Arc::new(StringViewArray::from(values.to_vec())) as ArrayRef;
+    let columns = vec![
+        ("source", text(["/a", "/b"])),
+        ("target", text(["/b", "/c"])),
+    ];
+    let drives = read_manifest(file(columns, Compression::SNAPPY), None).expect("drives");
+    assert_eq!(
+        drives.iter().map(|drive| drive.key(0)).collect::<Vec<_>>(),
+        ["a", "b"]
+    );
+    let numbers: ArrayRef = Arc::new(Int32Array::from(vec![1]));
+    let wrong = read_manifest(file(vec![("sweep", numbers)], Compression::SNAPPY), None);
+    let wrong = wrong.expect_err("numbers are no sweeps").to_string();
+    assert!(wrong.contains("sweep has type Int32"), "{wrong}");
+}
+
+#[test]
+fn damaged_tables_are_refused() {
+    let whole = sweeps(Compression::SNAPPY);
+    for length in (4..whole.len()).step_by(7) {
+        let cut = read_manifest(whole.slice(..length), None);
+        assert!(matches!(cut, Err(ManifestError::Unreadable(_))), "{length}");
+    }
+    // A changed byte may change a value or a name: what counts is that nothing ends the program.
+    let mut state = 1_u64;
+    for _ in 0..2000 {
+        let mut bytes = whole.to_vec();
+        for _ in 0..3 {
+            state = state
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1_442_695_040_888_963_407);
+            let at = (state >> 33) as usize % bytes.len();
+            bytes[at] ^= (state >> 25) as u8 | 1;
+        }
+        let _either = read_manifest(Bytes::from(bytes), None);
+    }
+}
