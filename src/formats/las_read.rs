@@ -145,9 +145,9 @@ impl<'a> Las<'a> {
     ) -> Result<(), FormatError> {
         for (row, record) in self.records.chunks_exact(self.stride).enumerate() {
             let mut values = [f64::NAN; 4];
-            for axis in 0..3 {
+            for (axis, value) in values.iter_mut().take(3).enumerate() {
                 let steps = i32::from_le_bytes(bytes_at(record, 4 * axis)?);
-                values[axis] = f64::from(steps) * self.scale[axis] + self.offset[axis];
+                *value = f64::from(steps) * self.scale[axis] + self.offset[axis];
             }
             if let Some(at) = self.time_at {
                 values[3] = f64::from_le_bytes(bytes_at(record, at)?);
