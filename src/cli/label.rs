@@ -160,6 +160,8 @@ impl Label {
             Some("--known-poses gives the ego motion that --ego off leaves out".to_owned())
         } else if self.layout.needs_masks() != self.masks.is_some() {
             Some("--layout av2-v1 and --masks belong together".to_owned())
+        } else if self.tracks && self.layout == Layout::Av2V2 {
+            Some("tracks need every pair, and --layout av2-v2 has every fifth".to_owned())
         } else if self.tracks && !matches!(solver.method, Method::Objects(_)) {
             Some("tracks need clusters: use --preset default or label".to_owned())
         } else if self.tracks && !self.known_poses && solver.ego == Ego::Off {

@@ -78,12 +78,12 @@ impl Estimates<'_> {
             let Some(Err(unread)) = at(index) else {
                 continue;
             };
+            // A label does not depend on whether a store failed for a while.
+            if unread.may_pass {
+                return Err((Outcome::Failed, unread.reason.clone()));
+            }
             if index == wanted.pair || index == wanted.pair + 1 {
-                let outcome = match unread.may_pass {
-                    true => Outcome::Failed,
-                    false => Outcome::Refused,
-                };
-                return Err((outcome, unread.reason.clone()));
+                return Err((Outcome::Refused, unread.reason.clone()));
             }
             report.left_out.push(unread.reason.clone());
         }

@@ -324,6 +324,10 @@ fn an_output_belongs_to_one_run() {
         (&["--known-poses"][..], "has no pose"),
         (&["--layout", "av2-v1"], "belong together"),
         (&["--tracks", "--preset", "paper"], "tracks need clusters"),
+        (
+            &["--tracks", "--layout", "av2-v2"],
+            "tracks need every pair",
+        ),
         (&["--ego", "x.txt"], "x.txt"),
         (&["--shard", "4/4"], "no shard"),
         (&["--shard-from-env"], "names no shard"),
