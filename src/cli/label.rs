@@ -122,15 +122,8 @@ impl Solver for Device<'_> {
 #[derive(Serialize)]
 struct Summary<'a> {
     shard: String,
-    pairs: usize,
-    found: usize,
-    labelled: usize,
-    raced: usize,
-    refused: usize,
-    failed: usize,
-    stopped: bool,
-    seconds: f64,
-    troubles: &'a [RowReport],
+    #[serde(flatten)]
+    done: &'a Done,
 }
 
 impl Label {
@@ -232,15 +225,7 @@ impl Label {
         if self.json {
             let summary = Summary {
                 shard: shard.to_string(),
-                pairs: done.pairs,
-                found: done.found,
-                labelled: done.labelled,
-                raced: done.raced,
-                refused: done.refused,
-                failed: done.failed,
-                stopped: done.stopped,
-                seconds: done.seconds,
-                troubles: &done.troubles,
+                done,
             };
             let json = serde_json::to_string(&summary).map_err(Failure::internal)?;
             return say(format_args!("{json}"));

@@ -9,7 +9,7 @@ use clap::Args;
 use super::failure::Failure;
 use super::files;
 use super::output::say;
-use crate::flow::tracks::{ClusteredSweep, Tracker, correct};
+use crate::flow::tracks::{Tracker, push_and_correct};
 use crate::flow::{Ego, Estimate, Method, Point, RigidTransform};
 use crate::formats::write_tracks;
 use crate::job::JobOptions;
@@ -104,10 +104,8 @@ impl Tracking<'_> {
         dt_s: f32,
     ) -> Result<(), Failure> {
         let [source, target] = sweeps;
-        let sweep = ClusteredSweep::new(source, estimate, dt_s);
-        let tracked = sweep.and_then(|sweep| self.tracker.push(&sweep));
-        let tracked = tracked.map_err(Failure::internal)?;
-        self.corrected += correct(estimate, [source, target], &tracked, dt_s);
+        let corrected = push_and_correct(&mut self.tracker, [source, target], estimate, dt_s);
+        self.corrected += corrected.map_err(Failure::internal)?;
         if let (Some(ego), Some(pose)) = (estimate.ego, self.poses.last()) {
             self.poses.push(pose * ego.inverse());
         }

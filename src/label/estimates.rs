@@ -7,7 +7,7 @@ use super::io::{At, Io, Loaded, Output, Unread, Wanted};
 use super::layout::tracks_path;
 use super::report::{Outcome, RowReport};
 use super::types::Solver;
-use crate::flow::tracks::{ClusteredSweep, Tracker, correct};
+use crate::flow::tracks::{Tracker, push_and_correct};
 use crate::flow::{Control, Ego, Estimate, FlowError, Point, WindowedPair, window};
 use crate::formats::{SweepClock, pair_interval_s, read_av2_mask, write_tracks};
 use crate::job::{JobOptions, MAX_DT_S};
@@ -79,11 +79,9 @@ impl Estimates<'_> {
                 continue;
             };
             // A label does not depend on whether a store failed for a while.
-            if unread.may_pass {
-                return Err((Outcome::Failed, unread.reason.clone()));
-            }
-            if index == wanted.pair || index == wanted.pair + 1 {
-                return Err((Outcome::Refused, unread.reason.clone()));
+            if unread.may_pass || index == wanted.pair || index == wanted.pair + 1 {
+                let outcome = Outcome::of_trouble(unread.may_pass);
+                return Err((outcome, unread.reason.clone()));
             }
             report.left_out.push(unread.reason.clone());
         }
@@ -114,11 +112,8 @@ impl Estimates<'_> {
             }
             if let Tracking::Begun(tracker) = &mut self.tracking {
                 let dt_s = solver_options.dt_s;
-                let refused = |error: &dyn ToString| (Outcome::Refused, error.to_string());
-                let sweep = ClusteredSweep::new(&source, &estimate, dt_s);
-                let sweep = sweep.map_err(|error| refused(&error))?;
-                let tracked = tracker.push(&sweep).map_err(|error| refused(&error))?;
-                correct(&mut estimate, [&source, &target], &tracked, dt_s);
+                let tracked = push_and_correct(tracker, [&source, &target], &mut estimate, dt_s);
+                tracked.map_err(|error| (Outcome::Refused, error.to_string()))?;
             }
         }
         if wanted.is_there {
@@ -152,10 +147,7 @@ impl Estimates<'_> {
         };
         let read = || self.io.runtime.block_on(masks.read(&wanted.path));
         let bytes = self.io.patiently(read).map_err(|error| {
-            let outcome = match error.may_pass() {
-                true => Outcome::Failed,
-                false => Outcome::Refused,
-            };
+            let outcome = Outcome::of_trouble(error.may_pass());
             (outcome, format!("its mask: {error}"))
         })?;
         let mask = read_av2_mask(&bytes);
@@ -217,9 +209,5 @@ impl Estimates<'_> {
 
 /// What became of a pair whose estimate failed.
 fn failed(error: &FlowError) -> (Outcome, String) {
-    let outcome = match error.is_input() {
-        true => Outcome::Refused,
-        false => Outcome::Failed,
-    };
-    (outcome, error.to_string())
+    (Outcome::of_trouble(!error.is_input()), error.to_string())
 }

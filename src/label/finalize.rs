@@ -93,20 +93,22 @@ pub fn finalize(
             let is_there = all.contains(&layout.path(&of.name, pair, &key))
                 && (!whole || all.contains(&tracks_path(&of.name)));
             let refused = report.filter(|report| report.outcome == Outcome::Refused);
-            let outcome = match (is_there, refused) {
-                (true, _) => "labelled",
-                (false, Some(_)) => "refused",
-                (false, None) => "missing",
-            };
             found.pairs += 1;
-            match outcome {
-                "labelled" => found.labelled += 1,
-                "refused" => found.refused.extend(refused.cloned()),
-                _ => {
+            let outcome = match (is_there, refused) {
+                (true, _) => {
+                    found.labelled += 1;
+                    "labelled"
+                }
+                (false, Some(refused)) => {
+                    found.refused.push(refused.clone());
+                    "refused"
+                }
+                (false, None) => {
                     found.missing += 1;
                     missing.insert((drive, pair));
+                    "missing"
                 }
-            }
+            };
             let number = |value: Option<String>| value.unwrap_or_default();
             table
                 .write_record([

@@ -17,7 +17,7 @@ use bytes::Bytes;
 use parquet::arrow::ProjectionMask;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
-use super::plan::{Drive, DriveSweep, key_of, stem};
+use super::plan::{Drive, DriveSweep, drive_name, key_of, stem};
 use crate::flow::RigidTransform;
 use crate::formats::rigid_motion;
 
@@ -208,12 +208,6 @@ fn located(uri: &str, folder: Option<&str>) -> String {
         }
         _ => uri.to_owned(),
     }
-}
-
-/// The name of a drive: each of its parts by itself.
-fn drive_name(text: &str) -> String {
-    let parts = text.split('/').filter(|part| !part.is_empty());
-    parts.map(key_of).collect::<Vec<_>>().join("/")
 }
 
 fn sweeps(table: &Table, folder: Option<&str>) -> Result<Vec<Drive>, ManifestError> {

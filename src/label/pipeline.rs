@@ -56,7 +56,7 @@ pub(super) fn label(
             estimates.label(wanted, solver, control);
             tally.take(told);
         }
-        // The reader stops when nobody takes its sweeps, and the writer when nothing comes.
+        // This closes both channels. The reader and the writer end with theirs.
         drop(estimates);
         tally.finish(told)
     })

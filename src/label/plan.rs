@@ -137,6 +137,12 @@ pub(super) fn key_of(text: &str) -> String {
     }
 }
 
+/// The name of a drive: each part of a path by itself, as [`key_of`] gives it.
+pub(super) fn drive_name(path: &str) -> String {
+    let parts = path.split('/').filter(|part| !part.is_empty());
+    parts.map(key_of).collect::<Vec<_>>().join("/")
+}
+
 /// The name of a file without its folder and without everything from its first dot.
 pub(super) fn stem(name: &str) -> &str {
     let file = name.rsplit(['/', '\\']).next().unwrap_or(name);

@@ -18,6 +18,16 @@ pub enum Outcome {
     Failed,
 }
 
+impl Outcome {
+    /// Of what did not succeed, by whether trying again may help.
+    pub(super) fn of_trouble(may_pass: bool) -> Self {
+        match may_pass {
+            true => Self::Failed,
+            false => Self::Refused,
+        }
+    }
+}
+
 /// The report of a pair.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RowReport {

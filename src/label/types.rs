@@ -1,5 +1,7 @@
 //! The input and the outcome of a run.
 
+use serde::Serialize;
+
 use super::layout::Layout;
 use super::places::Place;
 use super::plan::Plan;
@@ -58,7 +60,7 @@ pub struct Told {
 }
 
 /// The end of a run.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Done {
     /// Pairs of the shard.
     pub pairs: usize,

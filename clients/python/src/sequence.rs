@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
 
-use fnsf::flow::tracks::{ClusteredSweep, Tracker, correct};
+use fnsf::flow::tracks::{Tracker, push_and_correct};
 use fnsf::flow::{self, Ego, Estimate, Point, Sweep};
 use fnsf::job::JobOptions;
 use pyo3::prelude::*;
@@ -61,9 +61,8 @@ impl State {
             let [source, target] = estimate.sweeps([&pair.sweeps[0], &pair.sweeps[1]]);
             if let Some(tracker) = &mut self.tracker {
                 let dt_s = pair.options.solver_options(0).dt_s;
-                let sweep = ClusteredSweep::new(&source, &estimate, dt_s).map_err(input)?;
-                let tracked = tracker.push(&sweep).map_err(internal)?;
-                correct(&mut estimate, [&source, &target], &tracked, dt_s);
+                push_and_correct(tracker, [&source, &target], &mut estimate, dt_s)
+                    .map_err(input)?;
             }
             let [source, target] = &pair.sweeps;
             out.append(answer(py, estimate, &pair.options, [source, target])?)?;

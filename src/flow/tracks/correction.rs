@@ -5,7 +5,7 @@
 //! them nearer to the target than standing still.
 
 use super::carried::Carried;
-use super::tracker::TrackedCluster;
+use super::tracker::{ClusteredSweep, TrackError, TrackedCluster, Tracker};
 use crate::flow::data::{DYNAMIC_M, Point, transform_points};
 use crate::flow::estimate::{Estimate, Solution};
 use crate::flow::spatial::ColumnIndex;
@@ -16,6 +16,22 @@ const TRUNCATION_M: f32 = 0.3;
 const AROUND_M: f32 = 0.3;
 /// A row stands if the motion leads it farther from the target by more than this, metres.
 const FARTHER_M: f32 = 0.05;
+
+/// Pushes the source of a pair to the tracker, and corrects the estimate of the pair by [`correct`],
+/// whose arguments and result these are.
+///
+/// # Errors
+/// [`TrackError`]; the tracker and the estimate are then unchanged.
+pub fn push_and_correct(
+    tracker: &mut Tracker,
+    [source, target]: [&[Point]; 2],
+    estimate: &mut Estimate,
+    dt_s: f32,
+) -> Result<usize, TrackError> {
+    let sweep = ClusteredSweep::new(source, estimate, dt_s)?;
+    let tracked = tracker.push(&sweep)?;
+    Ok(correct(estimate, [source, target], &tracked, dt_s))
+}
 
 /// Gives the rows of missed clusters the motion of their objects, and returns the number of these
 /// rows.

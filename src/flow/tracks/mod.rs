@@ -18,6 +18,6 @@ mod same_vehicle;
 mod track;
 mod tracker;
 
-pub use correction::correct;
+pub use correction::{correct, push_and_correct};
 pub use track::{Track, TrackState};
 pub use tracker::{ClusteredSweep, TrackError, TrackedCluster, Tracker};

@@ -4,7 +4,7 @@ use super::dataset::{Dataset, DatasetError};
 use crate::formats::{compare_names, read_poses};
 use crate::label::layout::SETTINGS_FILE;
 use crate::label::places::{Place, PlaceError};
-use crate::label::plan::{Drive, DriveSweep, key_of, stem};
+use crate::label::plan::{Drive, DriveSweep, drive_name, key_of, stem};
 
 /// Endings of sweeps.
 const ENDINGS: [&str; 6] = [".pcd", ".ply", ".bin", ".npy", ".feather", ".las"];
@@ -29,9 +29,7 @@ fn is_asked_for(folder: &str, dataset: Dataset) -> bool {
 fn name(folder: &str) -> String {
     let ends = [AV2_SWEEPS, KITTI_SWEEPS[0], KITTI_SWEEPS[1]];
     let bare = ends.into_iter().find_map(|end| folder.strip_suffix(end));
-    let bare = bare.unwrap_or(folder).trim_matches('/');
-    let parts = bare.split('/').filter(|part| !part.is_empty());
-    parts.map(key_of).collect::<Vec<_>>().join("/")
+    drive_name(bare.unwrap_or(folder))
 }
 
 /// The drives below a place: folders with two sweeps or more.
