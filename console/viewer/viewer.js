@@ -44,6 +44,8 @@ export class Viewer {
   #tracks = [];
   #egos = new Map();
   #asked = 0;
+  /** The sweep that was asked for last; it may still be loading. */
+  #wanted = 0;
   #isDue = false;
   #playedAt = 0;
   #born = performance.now();
@@ -121,7 +123,7 @@ export class Viewer {
 
   /** Shows what has become available since: flows, tracks, the dense cloud. */
   async reload() {
-    if (this.#scene.sweeps > 0) await this.show(this.state.sweep);
+    if (this.#scene.sweeps > 0) await this.show(this.#wanted);
     await this.#loadRest();
   }
 
@@ -139,6 +141,7 @@ export class Viewer {
   async show(index) {
     const asked = (this.#asked += 1);
     const sweep = Math.min(this.#scene.sweeps - 1, Math.max(0, index));
+    this.#wanted = sweep;
     const isFirst = !this.frame;
     if (isFirst) this.#say("Loading the sweeps …");
     try {
