@@ -133,7 +133,7 @@ fn write_npz<W: Write>(cloud: &DenseCloud, out: &mut W) -> Result<(), FormatErro
     let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
     npz.points("points", &cloud.points)?;
     npz.array("sweep", |out| npy::write_counts(out, &cloud.sweep))?;
-    npz.array("age", |out| npy::write_values(out, &cloud.age))?;
+    npz.values("age", &cloud.age)?;
     npz.mask("dynamic", &cloud.dynamic)?;
     npz.mask("converged", &cloud.converged)?;
     out.write_all(npz.finish()?.get_ref())?;

@@ -23,8 +23,8 @@ pub(super) fn put<W: Write + Seek>(
         clusters,
     } = objects;
     npz.array("cluster", |out| npy::write_ids(out, cluster))?;
-    npz.array("confidence", |out| npy::write_values(out, confidence))?;
-    npz.array("moving", |out| npy::write_values(out, moving))?;
+    npz.values("confidence", confidence)?;
+    npz.values("moving", moving)?;
     let points: Vec<u32> = clusters.iter().map(|cluster| cluster.points).collect();
     npz.array("clusters_points", |out| npy::write_counts(out, &points))?;
     let dynamic: Vec<bool> = clusters.iter().map(|cluster| cluster.dynamic).collect();
@@ -38,7 +38,7 @@ pub(super) fn put<W: Write + Seek>(
     points("clusters_velocity", |cluster| cluster.velocity)?;
     let mut values = |name: &str, value: fn(&Cluster) -> f32| {
         let values: Vec<f32> = clusters.iter().map(value).collect();
-        npz.array(name, |out| npy::write_values(out, &values))
+        npz.values(name, &values)
     };
     values("clusters_yaw", |cluster| cluster.bounds.yaw)?;
     values("clusters_yaw_rate", |cluster| cluster.yaw_rate)?;
