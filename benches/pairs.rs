@@ -1,4 +1,4 @@
-//! Whole pairs: every preset at several sizes, on all cores.
+//! Whole pairs: the phases of `default`, and every preset at several sizes.
 //!
 //! ```text
 //! FNSF_REAL_DATA=... cargo bench --bench pairs
@@ -9,10 +9,10 @@ mod common;
 
 use std::time::Instant;
 
-use common::{median, scenes};
+use common::{Scene, median, scenes, street};
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::field::Backend;
-use fnsf::flow::{Control, Estimate, Options, Preset, Problem, estimate};
+use fnsf::flow::{Control, Estimate, Options, Preset, Problem, Solution, estimate};
 
 const SEEDS: u64 = 3;
 
@@ -31,11 +31,84 @@ fn queries(estimate: &Estimate) -> f64 {
 }
 
 fn main() -> Result<(), String> {
+    let scenes = scenes()?;
+    objects_by_phase(&scenes)?;
+    presets_by_size(&scenes)
+}
+
+/// Numbers of beams and azimuth steps of the streets beside the pairs. The last has a million
+/// points.
+const STREETS: [[usize; 2]; 4] = [[32, 2000], [64, 2000], [128, 2000], [128, 8192]];
+/// Rounds of the table by phase. All scenes take turns in each.
+const ROUNDS: usize = 7;
+
+/// The phases of `default`, by scene and number of threads.
+fn objects_by_phase(pairs: &[Scene]) -> Result<(), String> {
+    let mut scenes: Vec<Scene> = Vec::new();
+    for [beams, azimuth_steps] in STREETS {
+        scenes.push(street(beams, azimuth_steps)?);
+    }
+    // The first of the pairs is a street.
+    let scenes: Vec<&Scene> = pairs[1..].iter().chain(&scenes).collect();
+    let options = Preset::Default.options(None);
+    println!("`default`, whole sweeps, nothing given; medians of {ROUNDS} rounds in turn, ms\n");
+    println!(
+        "| scene | points | threads | ground | ego motion | clouds | clusters | assignment | rest | all |"
+    );
+    println!("|---|---|---|---|---|---|---|---|---|---|");
+    let backends = [1, 2].map(|threads| CpuBackend::new(Some(threads)));
+    let [one, two] = backends.map(|backend| backend.map_err(|e| e.to_string()));
+    let backends = [one?, two?];
+    let mut runs = vec![[const { Vec::new() }; 2]; scenes.len()];
+    for _ in 0..ROUNDS {
+        for (scene, runs) in scenes.iter().zip(&mut runs) {
+            let problem = Problem::pair(&scene.source, &scene.target);
+            for (backend, runs) in backends.iter().zip(runs) {
+                backend.host().forget();
+                let clock = Clock(Instant::now());
+                let estimate = estimate(backend, &problem, &options, &clock);
+                runs.push(phases(&estimate.map_err(|e| e.to_string())?));
+            }
+        }
+    }
+    for (scene, runs) in scenes.iter().zip(&runs) {
+        for (threads, runs) in (1..).zip(runs) {
+            let of = |phase: usize| median(runs.iter().map(|run: &[f64; 7]| run[phase]).collect());
+            let ms: Vec<String> = (0..7).map(|phase| format!("{:.1}", of(phase))).collect();
+            let (name, points) = (&scene.name, scene.source.len());
+            println!("| {name} | {points} | {threads} | {} |", ms.join(" | "));
+        }
+    }
+    println!();
+    Ok(())
+}
+
+/// Milliseconds of the phases of an object search, and of all of them.
+fn phases(estimate: &Estimate) -> [f64; 7] {
+    let Solution::Objects(solution) = &estimate.solution else {
+        return [f64::NAN; 7];
+    };
+    let search = solution.seconds;
+    let found = search.preparation + search.clusters + search.assignment;
+    [
+        estimate.selection_seconds,
+        estimate.precompute_seconds - estimate.selection_seconds,
+        search.preparation,
+        search.clusters,
+        search.assignment,
+        estimate.method_seconds() - found,
+        estimate.total_seconds,
+    ]
+    .map(|seconds| seconds * 1e3)
+}
+
+/// Every preset by the number of points.
+fn presets_by_size(scenes: &[Scene]) -> Result<(), String> {
     let backend = CpuBackend::new(None).map_err(|e| e.to_string())?;
     println!("{}; medians of {SEEDS} seeds, seconds\n", backend.name());
     println!("| scene | points | preset | iterations | precompute | query | network | total |");
     println!("|---|---|---|---|---|---|---|---|");
-    for scene in scenes()? {
+    for scene in scenes {
         for points in [8192, 50_000, usize::MAX] {
             for preset in Preset::ALL {
                 let max_points = (points < scene.source.len()).then_some(points);

@@ -16,12 +16,14 @@ pub(crate) struct Scene {
 /// The simulated street and the real pairs in the folder `FNSF_REAL_DATA`, if it is set. The clouds
 /// are uncropped and include the ground.
 pub(crate) fn scenes() -> Result<Vec<Scene>, String> {
-    let street = Street::new(&StreetOptions::default()).map_err(|e| e.to_string())?;
-    let pair = street.pair(0).map_err(|e| e.to_string())?;
+    let StreetOptions {
+        beams,
+        azimuth_steps,
+        ..
+    } = StreetOptions::default();
     let mut scenes = vec![Scene {
         name: "simulated street".to_owned(),
-        source: pair.source,
-        target: pair.target,
+        ..street(beams, azimuth_steps)?
     }];
     if let Some(folder) = std::env::var_os("FNSF_REAL_DATA") {
         for name in ["av2_7fab", "kitti_0000", "small_gicp"] {
@@ -36,6 +38,22 @@ pub(crate) fn scenes() -> Result<Vec<Scene>, String> {
         }
     }
     Ok(scenes)
+}
+
+/// The first pair of the default street with another lidar.
+pub(crate) fn street(beams: usize, azimuth_steps: usize) -> Result<Scene, String> {
+    let options = StreetOptions {
+        beams,
+        azimuth_steps,
+        ..StreetOptions::default()
+    };
+    let pair = Street::new(&options).and_then(|street| street.pair(0));
+    let pair = pair.map_err(|e| e.to_string())?;
+    Ok(Scene {
+        name: format!("street, {beams} beams"),
+        source: pair.source,
+        target: pair.target,
+    })
 }
 
 /// The upper median of the values.

@@ -71,7 +71,7 @@ impl<'a> Fit<'a> {
         let index = ColumnIndex::new(&reached, TRUNCATION_M);
         let distance = |&row: &usize| {
             let moved = transform_point(ego, source[row]);
-            let nearest = index.nearest(moved, TRUNCATION_M, |_| true);
+            let nearest = index.nearest(moved, TRUNCATION_M);
             nearest.map_or(TRUNCATION_M, |(_, square)| square.sqrt())
         };
         let distances: Vec<f32> = self.rows.par_iter().map(distance).collect();

@@ -39,6 +39,7 @@ mod sequence;
 mod data;
 mod deskew;
 mod host;
+mod simd;
 mod spatial;
 
 // Ground segmentation and ego motion.
@@ -72,7 +73,7 @@ pub use host::{Host, HostError};
 pub use motion::{MotionField, Residual, SampledMotion};
 pub use objects::{
     CONFIDENT_WITHIN_M, Chances, Cluster, ClusterLabels, ConfidenceFeatures, ObjectMotions,
-    ObjectSearch, Objects, SearchClouds,
+    ObjectSearch, Objects, SearchClouds, SearchSeconds,
 };
 pub use options::*;
 pub use problem::{NeighborSweep, Problem};

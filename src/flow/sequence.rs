@@ -15,7 +15,7 @@ use super::error::FlowError;
 use super::estimate::{Estimate, estimate};
 use super::field::Backend;
 use super::motion::MotionField;
-use super::options::{Ground, Options};
+use super::options::{Ego, Ground, Options};
 use super::problem::{NeighborSweep, Problem};
 use super::select::{FindGround, find_ground, ground_masks, is_in_crop};
 
@@ -247,7 +247,11 @@ impl Sequence {
         control: &dyn Control,
     ) -> Result<Vec<Estimate>, FlowError> {
         // Segmented once for all pairs that use the sweep.
-        let find = |sweeps: &[&[Point]]| backend.host().ground(sweeps);
+        let host = backend.host();
+        let find = |sweeps: &[&[Point]]| match options.ego {
+            Ego::Auto => host.ground_and_surfels(sweeps),
+            Ego::Given(_) | Ego::Off => host.ground(sweeps),
+        };
         let sweep = sweep.prepared_by(options, &find);
         if self.count == 0 {
             self.sweeps = options.sweeps();

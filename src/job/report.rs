@@ -314,6 +314,7 @@ mod tests {
             }),
             stop_reason: StopReason::Deadline,
             device: "cpu".to_owned(),
+            selection_seconds: 0.0,
             precompute_seconds: 0.0,
             total_seconds: 0.0,
             motion: MotionField {

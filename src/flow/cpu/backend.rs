@@ -4,7 +4,6 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use super::isa::Isa;
 use super::kernels::Kernels;
 use super::linear::{Encoder, Linear};
 use super::mlp::{Mlp, Pass};
@@ -24,6 +23,7 @@ use crate::flow::host::Host;
 use crate::flow::options::{
     DistanceLossOptions, FieldOptions, LossOptions, ModelOptions, NearestSearch, Precision,
 };
+use crate::flow::simd::Isa;
 
 /// A backend that computes in single precision on a pool of CPU threads.
 pub struct CpuBackend {

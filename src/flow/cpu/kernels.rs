@@ -9,14 +9,14 @@
     reason = "calls into code compiled for instruction sets that were checked"
 )]
 
-use super::isa::Isa;
 use super::mlp_kernels::{backward, forward};
-use super::simd::F32x4;
+use crate::flow::simd::F32x4;
+use crate::flow::simd::Isa;
 
-#[cfg(target_arch = "x86_64")]
-use super::simd::{F32x8, F32x16};
 use super::tile::Tile;
 use crate::flow::field::LAID_OUT;
+#[cfg(target_arch = "x86_64")]
+use crate::flow::simd::{F32x8, F32x16};
 
 type Forward = unsafe fn(&[f32], &mut Tile);
 type Backward = unsafe fn(&[f32], &[f32], &mut Tile, &mut [f32]);

@@ -6,13 +6,13 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use super::isa::Isa;
 use super::model::Model;
 use super::product_kernels::{Factors, ProductKernel};
 use super::tile::{TILE, WorkingSets};
 use super::variation::Variation;
 use crate::flow::data::Point;
 use crate::flow::field::{FittedField, LinearField, LinearGrid, Parameters, Placed};
+use crate::flow::simd::Isa;
 
 /// The three products with the encodings of the axes.
 pub(super) struct Encoder {

@@ -153,10 +153,10 @@ impl Model for MlpCycle {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::flow::cpu::isa::Isa;
     use crate::flow::cpu::kernels::Kernels;
     use crate::flow::data::Random;
     use crate::flow::field::{Conditioning, ReferenceNetwork, cycle_loss, mlp};
+    use crate::flow::simd::Isa;
 
     fn cloud(count: usize, seed: u64) -> Vec<Point> {
         let mut random = Random::new(seed);

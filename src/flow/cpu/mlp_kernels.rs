@@ -12,11 +12,11 @@
 )]
 
 use super::multiply::{Strided, multiply};
-use super::simd::Lanes;
 use super::tile::{ROW_STEP, SIDE_BY_SIDE, STRIDE, TILE, Tile};
 use crate::flow::field::{
     MIDDLE_LAYERS, PANEL, WIDTH, first_layer, last_layer, middle_layer, tree_sum,
 };
+use crate::flow::simd::Lanes;
 
 /// Calls `body` with the first column of each register group of a 128-feature row, and the offset
 /// of that column's panel.

@@ -1,7 +1,6 @@
 //! The CPU backend: vectorized network kernels on all cores. Independent of the GPU backend.
 
 mod backend;
-mod isa;
 mod kernels;
 mod linear;
 mod mlp;
@@ -13,11 +12,10 @@ mod nearest;
 mod nearest_kernels;
 mod product_kernels;
 mod profile;
-mod simd;
 mod tile;
 mod trainer;
 mod variation;
 
+pub use crate::flow::simd::Isa;
 pub use backend::CpuBackend;
-pub use isa::Isa;
 pub use profile::{NetworkWorkload, multiply_add_peak};

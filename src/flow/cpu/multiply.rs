@@ -8,7 +8,7 @@
     reason = "registers are named by row and vector, as in the formulas"
 )]
 
-use super::simd::Lanes;
+use crate::flow::simd::Lanes;
 
 /// A strided matrix: its first element, the floats from one row to the next, and the floats from
 /// one step of the summed index to the next.

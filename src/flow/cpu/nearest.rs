@@ -4,10 +4,10 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use super::isa::Isa;
 use super::nearest_kernels::{NearestKernel, QUERIES, Sites};
 use crate::flow::data::{Control, Interrupt, Point, control};
 use crate::flow::field::NearestSearcher;
+use crate::flow::simd::Isa;
 
 /// Queries between two checks of the control.
 const GROUP: usize = 4 * QUERIES;

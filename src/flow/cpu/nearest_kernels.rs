@@ -10,12 +10,12 @@
     reason = "calls into code compiled for instruction sets that were checked"
 )]
 
-use super::isa::Isa;
-use super::simd::{F32x4, Lanes};
-#[cfg(target_arch = "x86_64")]
-use super::simd::{F32x8, F32x16};
 use crate::flow::data::Point;
 use crate::flow::field::Aligned;
+use crate::flow::simd::Isa;
+use crate::flow::simd::{F32x4, Lanes};
+#[cfg(target_arch = "x86_64")]
+use crate::flow::simd::{F32x8, F32x16};
 
 /// Queries of one call of the kernel: four registers of AVX-512.
 pub(super) const QUERIES: usize = 64;

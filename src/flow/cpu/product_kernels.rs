@@ -4,12 +4,12 @@
     reason = "calls into code compiled for instruction sets that were checked"
 )]
 
-use super::isa::Isa;
 use super::multiply::{Strided, multiply};
-use super::simd::{F32x4, Lanes};
-#[cfg(target_arch = "x86_64")]
-use super::simd::{F32x8, F32x16};
 use crate::flow::field::ROW;
+use crate::flow::simd::Isa;
+use crate::flow::simd::{F32x4, Lanes};
+#[cfg(target_arch = "x86_64")]
+use crate::flow::simd::{F32x8, F32x16};
 
 /// The two factors of a product, row by row.
 #[derive(Clone, Copy)]

@@ -7,15 +7,15 @@
     reason = "the peak is measured with the same registers as the kernels"
 )]
 
-use super::isa::Isa;
 use super::kernels::Kernels;
-use super::simd::{F32x4, Lanes};
+use crate::flow::simd::Isa;
+use crate::flow::simd::{F32x4, Lanes};
 
-#[cfg(target_arch = "x86_64")]
-use super::simd::{F32x8, F32x16};
 use super::tile::{TILE, Tile};
 use crate::flow::data::{Point, Random};
 use crate::flow::field::{MIDDLE_LAYERS, Parameters, WIDTH, mlp, transpose_middle_layers};
+#[cfg(target_arch = "x86_64")]
+use crate::flow::simd::{F32x8, F32x16};
 
 /// Floating-point operations of the forward pass per point.
 const FORWARD: usize = 2 * (3 * WIDTH + MIDDLE_LAYERS * WIDTH * WIDTH + 3 * WIDTH);

@@ -96,6 +96,7 @@ pub(super) fn residual_motion(
             candidates: search.all_clusters,
             cost_m: search.cost_m,
             own_points: own_rows.len(),
+            seconds: search.seconds,
         }),
         own_rows,
         stop_reason: match search.interrupted {

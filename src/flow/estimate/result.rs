@@ -7,7 +7,7 @@ use nalgebra::Matrix6;
 use super::deskewing::Deskew;
 use crate::flow::data::{Point, RigidTransform, StopReason};
 use crate::flow::motion::MotionField;
-use crate::flow::objects::Objects;
+use crate::flow::objects::{Objects, SearchSeconds};
 
 /// The motion of every source point of a pair.
 #[derive(Clone, Debug)]
@@ -48,6 +48,9 @@ pub struct Estimate {
     /// Name of the processor that ran the method, for reports: the device of a field, or the host's
     /// threads for objects.
     pub device: String,
+    /// Seconds of the first stage, by the control's clock: deskewing, selection and ground
+    /// segmentation. Zero if the control keeps no time.
+    pub selection_seconds: f64,
     /// Seconds of all stages before the method, by the control's clock: selection, ground
     /// segmentation, distance transform, ego motion and the registration of neighbor sweeps. Zero
     /// if the control keeps no time.
@@ -118,6 +121,8 @@ pub struct ObjectSolution {
     pub cost_m: f64,
     /// Number of source points on the vehicle that carries the sensor. They have no flow.
     pub own_points: usize,
+    /// Seconds of the phases of the search.
+    pub seconds: SearchSeconds,
 }
 
 /// The outcome of the fit of a field. With a partition the numbers of iterations are sums over the

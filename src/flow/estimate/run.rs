@@ -86,6 +86,7 @@ fn estimate_from(
     let (problem, options) = (&problem, options.as_ref());
     let find_ground = |sweeps: &[&[Point]]| backend.host().ground(sweeps);
     let selection = select(problem, options, &find_ground)?;
+    let selected_at = control.seconds();
     let input = Input {
         problem,
         given,
@@ -104,7 +105,7 @@ fn estimate_from(
             None => by_field::residual_motion(backend, &input, field, snapshot)?,
         },
     };
-    let mut estimate = assemble(&input, solved, began);
+    let mut estimate = assemble(&input, solved, [began, selected_at]);
     if let Some(pair) = deskewed {
         estimate.ego_covariance = pair.ego.covariance;
         estimate.deskew = pair.deskew;
@@ -113,7 +114,8 @@ fn estimate_from(
 }
 
 /// Maps the result for the selected points back to all source points.
-fn assemble(input: &Input<'_>, solved: Solved, began: f64) -> Estimate {
+/// The times are those of its begin and of the end of the selection.
+fn assemble(input: &Input<'_>, solved: Solved, [began, selected_at]: [f64; 2]) -> Estimate {
     let (source, selection) = (input.problem.source, input.selection);
     let Solved {
         alignment,
@@ -186,6 +188,7 @@ fn assemble(input: &Input<'_>, solved: Solved, began: f64) -> Estimate {
         solution,
         stop_reason: solved.stop_reason,
         device: solved.device,
+        selection_seconds: selected_at - began,
         precompute_seconds: solved.precomputed_at - began,
         total_seconds: input.control.seconds() - began,
         motion: MotionField {

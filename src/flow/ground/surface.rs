@@ -118,20 +118,30 @@ fn relaxed(pulls: &[[f32; 2]], side: usize) -> Vec<f32> {
     // Mirror boundary: a border of padding nodes that copy the nearest node.
     let padded = side + 2;
     let mut corrections = vec![0.0_f32; padded * padded];
-    let shares: Vec<f32> = pulls
+    // The factor of the four neighbors' sum, and what is added to it.
+    let factors: Vec<[f32; 2]> = pulls
         .iter()
-        .map(|[weight, _]| 1.0 / (weight + 4.0 * STIFFNESS))
+        .map(|[weight, pull]| [STIFFNESS, *pull].map(|value| value / (weight + 4.0 * STIFFNESS)))
         .collect();
+    let mut known = vec![0.0_f32; side];
     for _ in 0..ROUNDS {
         for row in 0..side {
             let first = (row + 1) * padded + 1;
-            for column in 0..side {
-                let (node, at) = (row * side + column, first + column);
-                let around = corrections[at - 1]
-                    + corrections[at + 1]
-                    + corrections[at - padded]
-                    + corrections[at + padded];
-                corrections[at] = (pulls[node][1] + STIFFNESS * around) * shares[node];
+            let factors = &factors[row * side..(row + 1) * side];
+            // All but the neighbor before is known, and the sums do not wait for each other.
+            let above = &corrections[first - padded..first - padded + side];
+            let below = &corrections[first + padded..first + padded + side];
+            let after = &corrections[first + 1..first + 1 + side];
+            for (column, known) in known.iter_mut().enumerate() {
+                let around = after[column] + above[column] + below[column];
+                let [factor, pull] = factors[column];
+                *known = pull + factor * around;
+            }
+            let mut before = corrections[first - 1];
+            let nodes = corrections[first..first + side].iter_mut();
+            for ((node, known), [factor, _]) in nodes.zip(&known).zip(factors) {
+                before = known + factor * before;
+                *node = before;
             }
             corrections[first - 1] = corrections[first];
             corrections[first + side] = corrections[first + side - 1];

@@ -115,6 +115,20 @@ impl Host {
         self.threads.install(|| found.collect())
     }
 
+    /// [`Self::ground`], while the other threads compute the surfels of the sweeps, which their
+    /// registration needs next.
+    pub(crate) fn ground_and_surfels(&self, sweeps: &[&[Point]]) -> Vec<Vec<bool>> {
+        let surfels = || {
+            for points in sweeps {
+                self.sweep_cache.of(points).surface();
+            }
+        };
+        let (ground, ()) = self
+            .threads
+            .install(|| rayon::join(|| self.ground(sweeps), surfels));
+        ground
+    }
+
     /// Searches `clouds` for moving objects, large clusters first. If `control` interrupts or too
     /// little time is left, the other clusters are not searched, and [`ObjectSearch::interrupted`]
     /// is the reason. A cluster that was not searched is static, unless it lies beside a larger

@@ -35,7 +35,7 @@ impl SampledMotion {
     /// The displacements of N `positions` (N x 3, metres): N x 3, metres.
     pub fn displacements_at(&self, positions: &[Point]) -> Vec<Point> {
         let at = |&position: &Point| {
-            let nearest = self.index.nearest(position, REACH_M, |_| true);
+            let nearest = self.index.nearest(position, REACH_M);
             nearest.map_or([0.0; 3], |(row, _)| self.displacements[row as usize])
         };
         positions.par_iter().map(at).collect()

@@ -4,6 +4,7 @@
 //! A sparse static surface can always be fitted a little better to the samples of the other sweep
 //! by a motion. A surface present in one sweep only fits best to an unrelated surface.
 
+use super::evidence::is_evidence;
 use super::free_space::FreeSpaceEvidence;
 use super::hypothesis::Hypothesis;
 use crate::flow::data::Point;
@@ -30,8 +31,7 @@ pub(super) fn is_needed(
     found.motion.length_m() >= options.min_motion_m
         && (is_confirmed || found.still.forward_m - found.cost.forward_m >= options.min_gain_m)
         && moved <= options.max_cost_ratio * still
-        && gain * points.len() as f32
-            >= options.min_evidence_m + options.min_evidence_slope * found.motion.length_m()
+        && is_evidence(gain, points.len(), found.motion.length_m(), options)
         && (is_hidden || found.cost.forward_m <= options.max_residual_m)
         && !is_flat(points, options)
         && {
@@ -75,7 +75,8 @@ fn is_flat(points: &[Point], options: &ObjectOptions) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::flow::objects::hypothesis::{Cost, NeighborEvidence};
+    use crate::flow::objects::cluster_cost::Cost;
+    use crate::flow::objects::evidence::NeighborEvidence;
     use crate::flow::objects::planar_motion::PlanarMotion;
 
     /// A hypothesis that passes every condition.

@@ -7,7 +7,8 @@
 
 use rayon::prelude::*;
 
-use super::hypothesis::{ClusterSearch, Hypothesis};
+use super::cluster_cost::ClusterSearch;
+use super::hypothesis::Hypothesis;
 use super::neighbor_view::NeighborView;
 use super::planar_motion::PlanarMotion;
 use super::scene::Scene;

@@ -2,6 +2,8 @@
 
 use rayon::prelude::*;
 
+use super::confidence::Chances;
+use super::features::ConfidenceFeatures;
 use super::labels::ClusterLabels;
 use super::search::ObjectSearch;
 use crate::flow::data::{DYNAMIC_M, OrientedBox, Point, RigidTransform, transform_point};
@@ -70,8 +72,9 @@ impl Objects {
             moving: vec![0.0; count],
             clusters: Vec::new(),
         };
-        for (&row, evidence) in rows.iter().zip(&search.evidence) {
-            let chances = evidence.chances();
+        let chances = search.evidence.par_iter().map(ConfidenceFeatures::chances);
+        let chances: Vec<Chances> = chances.collect();
+        for (&row, chances) in rows.iter().zip(chances) {
             (objects.confidence[row], objects.moving[row]) = (chances.confidence, chances.moving);
         }
         let ClusterLabels { of, motions } = &search.parts;

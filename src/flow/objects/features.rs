@@ -3,7 +3,8 @@
 use rayon::prelude::*;
 
 use super::assign::Assignment;
-use super::hypothesis::{Cost, Hypothesis};
+use super::cluster_cost::Cost;
+use super::hypothesis::Hypothesis;
 use super::motion_field::ObjectMotions;
 use super::scene::Scene;
 use crate::flow::data::{Point, square_distance};

@@ -6,7 +6,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::hypothesis::ClusterSearch;
+use super::cluster_cost::ClusterSearch;
 use super::neighbor_view::NeighborView;
 use super::planar_motion::PlanarMotion;
 use super::scene::Scene;
@@ -14,14 +14,14 @@ use crate::flow::data::{Point, stride_sample};
 
 /// Steps between two searches for the target points around a cluster.
 const STEPS_BETWEEN_LOOKS: usize = 4;
-/// Scale of the robust weight (Geman and McClure) in the first half of the steps and in the second,
-/// metres.
+/// Scale of the robust weight (Geman and McClure), metres: in the first half of the steps at most,
+/// and in the others.
 const SCALES_M: [f32; 2] = [0.2, 0.1];
 /// Damping of the translation and of the rotation of a step, relative to the total weight.
 const DAMPING: [f64; 2] = [1e-3, 0.05];
 /// Total weight below which there is no step.
 const LEAST_WEIGHT: f64 = 1e-6;
-/// A shorter step in the second half is the last, metres.
+/// A shorter step is the last at its scale, metres.
 const SHORT_STEP_M: f64 = 1e-3;
 
 impl ClusterSearch<'_> {
@@ -43,8 +43,10 @@ impl ClusterSearch<'_> {
                 .map(|moment| (&moment.scene, moment.at, moment.weight)),
         );
         let mut touched = vec![Vec::new(); views.len()];
+        let mut is_fine = false;
         for step in 0..steps {
-            let mut sums = Sums::new(SCALES_M[usize::from(step >= steps / 2)]);
+            is_fine |= step >= steps / 2;
+            let mut sums = Sums::new(SCALES_M[usize::from(is_fine)]);
             for (&(scene, at, weight), touched) in views.iter().zip(&mut touched) {
                 let by_then = motion.repeated(at);
                 if step % STEPS_BETWEEN_LOOKS == 0 {
@@ -52,16 +54,17 @@ impl ClusterSearch<'_> {
                     *touched = stride_sample(&all, rows.len());
                 }
                 sums.look(&motion, &by_then, at, weight);
+                let map = by_then.map();
                 for &row in rows {
-                    let moved = by_then.apply(scene.source.points[row as usize]);
+                    let moved = map.apply(scene.source.points[row as usize]);
                     if let Some(target) = scene.match_of(moved, self.cluster) {
                         sums.add(scene, moved, target);
                     }
                 }
                 for &target in touched.iter() {
-                    let position = by_then.undo(scene.target[target as usize]);
+                    let position = map.undo(scene.target[target as usize]);
                     if let Some(origin) = scene.origin_of(position, self.cluster) {
-                        let moved = by_then.apply(scene.source.points[origin as usize]);
+                        let moved = map.apply(scene.source.points[origin as usize]);
                         sums.add(scene, moved, target);
                     }
                 }
@@ -71,8 +74,11 @@ impl ClusterSearch<'_> {
             };
             motion = motion.shifted([x as f32, y as f32]);
             motion.turn += turn as f32;
-            if step > steps / 2 && x.hypot(y) < SHORT_STEP_M {
-                break;
+            if x.hypot(y) < SHORT_STEP_M {
+                if is_fine {
+                    break;
+                }
+                is_fine = true;
             }
         }
         motion
@@ -91,8 +97,9 @@ struct Sums {
     /// Weight of the sweep.
     share: f32,
     square_scale: f32,
-    normal: Matrix3<f64>,
-    gradient: Vector3<f64>,
+    /// The upper triangle of the symmetric matrix, row by row.
+    normal: [f64; 6],
+    gradient: [f64; 3],
     weight: f64,
 }
 
@@ -104,8 +111,8 @@ impl Sums {
             swing: [0.0; 2],
             share: 1.0,
             square_scale: scale_m * scale_m,
-            normal: Matrix3::zeros(),
-            gradient: Vector3::zeros(),
+            normal: [0.0; 6],
+            gradient: [0.0; 3],
             weight: 0.0,
         }
     }
@@ -138,50 +145,56 @@ impl Sums {
             scene.options.tangential_weight
         };
         let along = normal[0] * away[0] + normal[1] * away[1] + normal[2] * away[2];
+        // The row of the distance along the normal, and the two rows of those along x and y, which
+        // are [t k, 0, t tx] and [0, t k, t ty] with the tangential weight t.
+        let [a, b] = [k * normal[0], k * normal[1]].map(f64::from);
+        let c = f64::from(normal[0] * tx + normal[1] * ty);
+        let across = f64::from(tangential_weight * tangential_weight);
+        let [k, along] = [k, along].map(f64::from);
+        let [tx, ty, x, y] = [tx, ty, away[0], away[1]].map(f64::from);
         let rows = [
-            (
-                [
-                    k * normal[0],
-                    k * normal[1],
-                    normal[0] * tx + normal[1] * ty,
-                ],
-                along,
-            ),
-            (
-                [tangential_weight * k, 0.0, tangential_weight * tx],
-                tangential_weight * away[0],
-            ),
-            (
-                [0.0, tangential_weight * k, tangential_weight * ty],
-                tangential_weight * away[1],
-            ),
+            a * a + across * k * k,
+            a * b,
+            a * c + across * k * tx,
+            b * b + across * k * k,
+            b * c + across * k * ty,
+            c * c + across * (tx * tx + ty * ty),
         ];
-        for (jacobian, residual) in rows {
-            let jacobian = Vector3::from(jacobian.map(f64::from));
-            self.normal += jacobian * jacobian.transpose() * weight;
-            self.gradient += jacobian * (weight * f64::from(residual));
+        for (sum, row) in self.normal.iter_mut().zip(rows) {
+            *sum += row * weight;
+        }
+        let rows = [
+            a * along + across * k * x,
+            b * along + across * k * y,
+            c * along + across * (tx * x + ty * y),
+        ];
+        for (sum, row) in self.gradient.iter_mut().zip(rows) {
+            *sum += row * weight;
         }
         self.weight += weight;
     }
 
     /// The step: a translation along x and y, metres, and a rotation, radians. None where there are
     /// no matches.
-    fn step(mut self, turned: bool) -> Option<[f64; 3]> {
+    fn step(self, turned: bool) -> Option<[f64; 3]> {
         if self.weight < LEAST_WEIGHT {
             return None;
         }
+        let [xx, xy, xt, yy, yt, tt] = self.normal;
+        let mut normal = Matrix3::new(xx, xy, xt, xy, yy, yt, xt, yt, tt);
+        let mut gradient = Vector3::from(self.gradient);
         let [shift, turn] = DAMPING;
         for (axis, damping) in [shift, shift, turn].into_iter().enumerate() {
-            self.normal[(axis, axis)] += damping * self.weight;
+            normal[(axis, axis)] += damping * self.weight;
         }
         if !turned {
             for axis in 0..2 {
-                self.normal[(axis, 2)] = 0.0;
-                self.normal[(2, axis)] = 0.0;
+                normal[(axis, 2)] = 0.0;
+                normal[(2, axis)] = 0.0;
             }
-            self.gradient[2] = 0.0;
+            gradient[2] = 0.0;
         }
-        let step = self.normal.cholesky()?.solve(&self.gradient);
+        let step = normal.cholesky()?.solve(&gradient);
         Some(step.into())
     }
 }

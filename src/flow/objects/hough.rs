@@ -3,6 +3,8 @@
 //! Every pair of a source point and a target point at about its height votes for the translation
 //! between them (ICP-Flow, Lin et al. 2024).
 
+use std::cmp::Reverse;
+
 use super::scene::Scene;
 use crate::flow::data::Point;
 use crate::flow::options::ObjectOptions;
@@ -42,56 +44,53 @@ impl TranslationVotes {
         }
     }
 
-    /// At most `most` translations along x and y of the source `points`, metres, in descending
-    /// order of votes. Of equal votes, the shorter translation comes first.
-    pub(super) fn peaks(&self, points: &[Point], most: usize) -> Vec<[f32; 2]> {
-        let side = 2 * self.half + 1;
+    /// At most `most` translations along x and y of the source `points`, of at most `reach_m` along
+    /// each, metres, in descending order of votes. Of equal votes, the shorter translation comes
+    /// first.
+    pub(super) fn peaks(&self, points: &[Point], most: usize, reach_m: f32) -> Vec<[f32; 2]> {
+        let half = self.half.min((reach_m / self.bin_m).ceil() as i32);
+        let side = 2 * half + 1;
         let mut votes = vec![0_u32; (side * side) as usize];
         let mut last = vec![u32::MAX; votes.len()];
         for (&point, voter) in points.iter().zip(0..) {
-            self.near.within_square(
-                point,
-                self.half as f32 * self.bin_m,
-                self.within_m,
-                |other| {
+            self.near
+                .within_square(point, half as f32 * self.bin_m, self.within_m, |other| {
                     let shift = [0, 1].map(|a| ((other[a] - point[a]) / self.bin_m).round());
-                    if shift.iter().all(|bins| bins.abs() <= self.half as f32) {
+                    if shift.iter().all(|bins| bins.abs() <= half as f32) {
                         let [x, y] = shift.map(|bins| bins as i32);
-                        let bin = ((y + self.half) * side + x + self.half) as usize;
+                        let bin = ((y + half) * side + x + half) as usize;
                         // A source point votes once for a translation, however dense the target is.
                         if last[bin] != voter {
                             last[bin] = voter;
                             votes[bin] += 1;
                         }
                     }
-                },
-            );
+                });
         }
         let at = |x: i32, y: i32| {
-            let inside = x.abs() <= self.half && y.abs() <= self.half;
+            let inside = x.abs() <= half && y.abs() <= half;
             if inside {
-                votes[((y + self.half) * side + x + self.half) as usize]
+                votes[((y + half) * side + x + half) as usize]
             } else {
                 0
             }
         };
-        let mut all = Vec::new();
-        for y in -self.half..=self.half {
-            for x in -self.half..=self.half {
+        let mut open = Vec::new();
+        for y in -half..=half {
+            for x in -half..=half {
                 let beside = at(x - 1, y) + at(x + 1, y) + at(x, y - 1) + at(x, y + 1);
                 let smooth = 2 * at(x, y) + beside;
                 if smooth > 0 {
-                    all.push((std::cmp::Reverse(smooth), x * x + y * y, x, y));
+                    open.push((smooth, Reverse((x * x + y * y, x, y))));
                 }
             }
         }
-        all.sort_unstable();
         let mut peaks: Vec<[i32; 2]> = Vec::new();
-        for (_, _, x, y) in all {
-            let apart = |&[a, b]: &[i32; 2]| (a - x).abs().max((b - y).abs()) > PEAKS_APART;
-            if peaks.len() < most && peaks.iter().all(apart) {
-                peaks.push([x, y]);
-            }
+        while peaks.len() < most
+            && let Some(&(_, Reverse((_, x, y)))) = open.iter().max()
+        {
+            peaks.push([x, y]);
+            open.retain(|&(_, Reverse((_, a, b)))| (a - x).abs().max((b - y).abs()) > PEAKS_APART);
         }
         let peaks = peaks.into_iter();
         peaks
@@ -104,7 +103,7 @@ impl TranslationVotes {
 mod tests {
     use super::*;
     use crate::flow::data::Random;
-    use crate::flow::objects::scene::SourceCloud;
+    use crate::flow::objects::clouds::{SourceCloud, TargetCloud};
     use crate::flow::spatial::NOISE;
 
     #[test]
@@ -119,8 +118,8 @@ mod tests {
             .map(|&[x, y, z]| [x + shift[0], y + shift[1], z]);
         let target: Vec<Point> = moved.collect();
         let downsampled = SourceCloud::new(&source, &[NOISE; 80], &options);
-        let scene = Scene::new(&downsampled, &target, &options);
-        let peaks = TranslationVotes::new(&scene).peaks(&source, 4);
+        let scene = Scene::new(&downsampled, &TargetCloud::new(&target, &options), &options);
+        let peaks = TranslationVotes::new(&scene).peaks(&source, 4, 3.0);
         assert_eq!(peaks.len(), 4);
         let [x, y] = [0, 1].map(|a| (peaks[0][a] - shift[a]).abs());
         assert!(x <= options.bin_m && y <= options.bin_m, "{peaks:?}");
@@ -136,10 +135,14 @@ mod tests {
     fn points_without_a_target_have_no_peaks() {
         let options = ObjectOptions::default();
         let downsampled = SourceCloud::new(&[[0.0; 3]], &[NOISE], &options);
-        let scene = Scene::new(&downsampled, &[[50.0; 3]], &options);
+        let scene = Scene::new(
+            &downsampled,
+            &TargetCloud::new(&[[50.0; 3]], &options),
+            &options,
+        );
         assert!(
             TranslationVotes::new(&scene)
-                .peaks(&[[0.0; 3]], 4)
+                .peaks(&[[0.0; 3]], 4, 3.0)
                 .is_empty()
         );
     }

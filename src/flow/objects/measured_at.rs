@@ -48,7 +48,7 @@ impl ObjectSearch {
                 let from = source.points[row];
                 let way = self.motions.displacement(motion as u32, from);
                 let moved = core::array::from_fn(|a| from[a] + way[a]);
-                let (found, _) = met.nearest(moved, MET_M, |_| true)?;
+                let (found, _) = met.nearest(moved, MET_M)?;
                 Some(target.times[found as usize] - source.times[row])
             };
             let later: Vec<f32> = stride_sample(rows, SAMPLED)
@@ -71,6 +71,7 @@ mod tests {
     use crate::flow::objects::labels::ClusterLabels;
     use crate::flow::objects::motion_field::ObjectMotions;
     use crate::flow::objects::planar_motion::PlanarMotion;
+    use crate::flow::objects::search::SearchSeconds;
 
     /// The x of a motion of 1 m after scaling, where the target's points were measured `later`
     /// seconds after the source's.
@@ -90,6 +91,7 @@ mod tests {
             clusters: 1,
             all_clusters: 1,
             cost_m: 0.0,
+            seconds: SearchSeconds::default(),
             interrupted: None,
         };
         let from = TimedPoints {

@@ -13,9 +13,12 @@
 
 mod accept;
 mod assign;
+mod clouds;
+mod cluster_cost;
 mod codec;
 mod confidence;
 mod describe;
+mod evidence;
 mod features;
 mod free_space;
 mod gauss_newton;
@@ -37,7 +40,7 @@ pub use describe::{Cluster, Objects};
 pub use features::ConfidenceFeatures;
 pub use labels::ClusterLabels;
 pub use motion_field::ObjectMotions;
-pub use search::{ObjectSearch, SearchClouds};
+pub use search::{ObjectSearch, SearchClouds, SearchSeconds};
 
 pub(crate) use measured_at::TimedPoints;
 pub(crate) use search::find_objects;

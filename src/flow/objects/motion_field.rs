@@ -44,7 +44,7 @@ impl ObjectMotions {
         let moving = ColumnIndex::new(&moving, 2.0 * REACH_M);
         // A static point farther from all moving points is never the nearest to a position that may
         // move.
-        let matters = |point: Point| moving.nearest(point, 2.0 * REACH_M, |_| true).is_some();
+        let matters = |point: Point| moving.nearest(point, 2.0 * REACH_M).is_some();
         let standing = of(false).map(|(&point, _)| point);
         let standing: Vec<Point> = standing.filter(|&point| matters(point)).collect();
         Self {
@@ -85,10 +85,10 @@ impl ObjectMotions {
 
     /// The index of the motion at a position; [`NOISE`] where it is static.
     fn owner(&self, position: Point) -> u32 {
-        let Some((row, square)) = self.moving.nearest(position, REACH_M, |_| true) else {
+        let Some((row, square)) = self.moving.nearest(position, REACH_M) else {
             return NOISE;
         };
-        let stands = self.standing.nearest(position, square.sqrt(), |_| true);
+        let stands = self.standing.nearest(position, square.sqrt());
         match stands {
             Some(_) => NOISE,
             None => self.point_motion[row as usize],

@@ -3,8 +3,9 @@
 //! At constant velocity, a cluster has moved once for each sweep interval between the source and
 //! the neighbor sweep.
 
+use super::clouds::{SourceCloud, TargetCloud};
 use super::planar_motion::PlanarMotion;
-use super::scene::{Scene, SourceCloud};
+use super::scene::Scene;
 use crate::flow::data::AlignedSweep;
 use crate::flow::options::ObjectOptions;
 
@@ -18,16 +19,18 @@ pub(super) struct NeighborView<'a> {
 }
 
 impl<'a> NeighborView<'a> {
+    /// From a sweep and its downsampled points.
     pub(super) fn new(
         source: &'a SourceCloud,
         sweep: &AlignedSweep,
+        cloud: &TargetCloud,
         options: &'a ObjectOptions,
     ) -> Self {
         // The weight falls with the square of the time difference, over which the velocity may have
         // changed.
         let away = f32::from(sweep.at).abs().max(1.0);
         Self {
-            scene: Scene::new(source, &sweep.points, options),
+            scene: Scene::new(source, cloud, options),
             at: sweep.at,
             weight: 1.0 / (away * away),
         }

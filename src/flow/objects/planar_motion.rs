@@ -58,29 +58,22 @@ impl PlanarMotion {
         }
     }
 
+    /// The motion as a map of many points.
+    pub(super) fn map(&self) -> MotionMap {
+        MotionMap {
+            motion: *self,
+            sin_cos: self.turn.sin_cos(),
+        }
+    }
+
     /// Position of a point after the motion.
-    #[inline]
-    pub(super) fn apply(&self, [x, y, z]: Point) -> Point {
-        let (sin, cos) = self.turn.sin_cos();
-        let [a, b] = [x - self.center[0], y - self.center[1]];
-        [
-            self.center[0] + self.shift_m[0] + cos * a - sin * b,
-            self.center[1] + self.shift_m[1] + sin * a + cos * b,
-            z,
-        ]
+    pub(super) fn apply(&self, point: Point) -> Point {
+        self.map().apply(point)
     }
 
     /// Position of a point before the motion: the inverse of [`Self::apply`].
-    #[inline]
-    pub(super) fn undo(&self, [x, y, z]: Point) -> Point {
-        let (sin, cos) = self.turn.sin_cos();
-        let a = x - self.center[0] - self.shift_m[0];
-        let b = y - self.center[1] - self.shift_m[1];
-        [
-            self.center[0] + cos * a + sin * b,
-            self.center[1] - sin * a + cos * b,
-            z,
-        ]
+    pub(super) fn undo(&self, point: Point) -> Point {
+        self.map().undo(point)
     }
 
     /// Displacement of a point, metres.
@@ -92,6 +85,45 @@ impl PlanarMotion {
     /// Displacement of the center, metres.
     pub(super) fn length_m(&self) -> f32 {
         self.shift_m[0].hypot(self.shift_m[1])
+    }
+}
+
+/// A planar motion with the sine and cosine of its rotation.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct MotionMap {
+    motion: PlanarMotion,
+    sin_cos: (f32, f32),
+}
+
+impl MotionMap {
+    /// Position of a point after the motion.
+    #[inline]
+    pub(super) fn apply(&self, [x, y, z]: Point) -> Point {
+        let PlanarMotion {
+            shift_m, center, ..
+        } = self.motion;
+        let (sin, cos) = self.sin_cos;
+        let [a, b] = [x - center[0], y - center[1]];
+        [
+            center[0] + shift_m[0] + cos * a - sin * b,
+            center[1] + shift_m[1] + sin * a + cos * b,
+            z,
+        ]
+    }
+
+    /// Position of a point before the motion.
+    #[inline]
+    pub(super) fn undo(&self, [x, y, z]: Point) -> Point {
+        let PlanarMotion {
+            shift_m, center, ..
+        } = self.motion;
+        let (sin, cos) = self.sin_cos;
+        let [a, b] = [x - center[0] - shift_m[0], y - center[1] - shift_m[1]];
+        [
+            center[0] + cos * a + sin * b,
+            center[1] - sin * a + cos * b,
+            z,
+        ]
     }
 }
 

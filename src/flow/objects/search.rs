@@ -1,29 +1,34 @@
 //! The object search on a pair: clustering, the search for each cluster's motion, acceptance and
 //! assignment.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
+
 use rayon::prelude::*;
 
+use super::clouds::{SourceCloud, TargetCloud};
+use super::cluster_cost::ClusterSearch;
 use super::features::ConfidenceFeatures;
 use super::features::{Findings, SearchedCluster};
 use super::free_space::FreeSpace;
 use super::hough::TranslationVotes;
-use super::hypothesis::{ClusterSearch, Hypothesis};
+use super::hypothesis::Hypothesis;
 use super::labels::ClusterLabels;
 use super::motion_field::ObjectMotions;
 use super::neighbor_view::NeighborView;
-use super::scene::{Scene, SourceCloud};
+use super::scene::Scene;
 use super::{accept, assign, features, free_space};
 use crate::flow::data::AlignedSweep;
-use crate::flow::data::{Control, Interrupt, Point, Progress, RigidTransform};
+use crate::flow::data::{Control, Interrupt, Point, Progress, RigidTransform, locked};
 use crate::flow::options::ObjectOptions;
 use crate::flow::spatial::NOISE;
 use crate::flow::spatial::dbscan;
 
-/// Clusters between two checks of `control`.
+/// Clusters between two reports of progress.
 const CLUSTERS_AT_ONCE: usize = 32;
-/// Expected time to prepare the scene, relative to that of the clustering: 2 to 4, with a margin.
-const SCENE: f64 = 5.0;
-/// Expected time of the stages after the cluster searches, relative to that of the scene.
+/// Expected time to match the clouds, relative to that of preparing each: 0.1 to 0.2, with a margin.
+const SCENES: f64 = 0.3;
+/// Expected time of the stages after the cluster searches, relative to that of all before them.
 const REST: f64 = 0.5;
 
 /// The clouds of an object search, metres.
@@ -70,9 +75,23 @@ pub struct ObjectSearch {
     /// is the mean truncated distance of its points from the target, after its accepted motion or
     /// at rest. Infinite if no cluster was searched.
     pub cost_m: f64,
+    /// Seconds of the phases, by the control's clock.
+    pub seconds: SearchSeconds,
     /// Why not all clusters were searched; none if all were. [`Interrupt::Deadline`] also stands
     /// for too little time left before the deadline.
     pub interrupted: Option<Interrupt>,
+}
+
+/// Seconds of the phases of an object search, by the control's clock. Zero if it keeps no time, and
+/// for phases that an interrupt left out.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct SearchSeconds {
+    /// Clustering, downsampling, normals, rays, and the indices of the clouds.
+    pub preparation: f64,
+    /// The search of all clusters.
+    pub clusters: f64,
+    /// The assignment of motions to clusters and points, and their confidence features.
+    pub assignment: f64,
 }
 
 impl ObjectSearch {
@@ -100,6 +119,7 @@ impl ObjectSearch {
             clusters: 0,
             all_clusters: 0,
             cost_m: f64::INFINITY,
+            seconds: SearchSeconds::default(),
             interrupted: Some(interrupted),
         }
     }
@@ -117,22 +137,37 @@ pub(crate) fn find_objects(
         return ObjectSearch::nothing(interrupt);
     }
     let began = control.seconds();
-    let labels = dbscan::clusters(source, options.cluster_radius_m, options.cluster_min_points);
-    let clustering = control.seconds() - began;
-    if let Some(interrupt) = out_of_time(control, clustering * SCENE) {
+    let clustered = || {
+        let labels = dbscan::clusters(source, options.cluster_radius_m, options.cluster_min_points);
+        let cloud = SourceCloud::new(source, &labels, options);
+        (labels, cloud)
+    };
+    let others = || -> Vec<TargetCloud> {
+        let sweeps =
+            std::iter::once(target).chain(clouds.neighbors.iter().map(|sweep| &sweep.points[..]));
+        let sweeps: Vec<&[Point]> = sweeps.collect();
+        sweeps
+            .par_iter()
+            .map(|sweep| TargetCloud::new(sweep, options))
+            .collect()
+    };
+    let free_space = || FreeSpace::new(clouds.sweeps, clouds.times, &clouds.target_from_source);
+    let ((labels, downsampled), (others, free_space)) =
+        rayon::join(clustered, || rayon::join(others, free_space));
+    let clouds_seconds = control.seconds() - began;
+    if let Some(interrupt) = out_of_time(control, clouds_seconds * SCENES) {
         return ObjectSearch::nothing(interrupt);
     }
-    let began = control.seconds();
-    let downsampled = SourceCloud::new(source, &labels, options);
-    let scene = Scene::new(&downsampled, target, options);
-    let free_space = FreeSpace::new(clouds.sweeps, clouds.times, &clouds.target_from_source);
+    let scene = Scene::new(&downsampled, &others[0], options);
     let votes = TranslationVotes::new(&scene);
     let neighbors: Vec<NeighborView<'_>> = clouds
         .neighbors
         .par_iter()
-        .map(|sweep| NeighborView::new(&downsampled, sweep, options))
+        .zip(&others[1..])
+        .map(|(sweep, cloud)| NeighborView::new(&downsampled, sweep, cloud, options))
         .collect();
-    let rest = (control.seconds() - began) * REST;
+    let prepared_at = control.seconds();
+    let rest = (prepared_at - began) * REST;
 
     let views = Views {
         scene: &scene,
@@ -143,9 +178,18 @@ pub(crate) fn find_objects(
     let Progressed {
         searched,
         clusters,
-        sum_m,
         interrupted,
+        ..
     } = search_all(&views, rest, control);
+    let costs = searched.iter().flatten();
+    let costs = costs.map(|found| f64::from(found.cost().forward_m));
+    let sum_m: f64 = costs.sum();
+    let unsearched = SearchedCluster::not(options);
+    let searched = searched
+        .into_iter()
+        .map(|found| found.unwrap_or(unsearched));
+    let searched: Vec<SearchedCluster> = searched.collect();
+    let searched_at = control.seconds();
     let needed: Vec<_> = searched.iter().map(SearchedCluster::found).collect();
     let spread = assign::spread(&scene, &neighbors, &needed);
     let (movers, numbers) = numbered(&needed);
@@ -162,15 +206,22 @@ pub(crate) fn find_objects(
         movers: &movers,
         point_motion: &point_motion,
     };
+    let evidence = features::evidence(&findings, source, &labels);
+    let parts = ClusterLabels::new(&labels, &spread.cluster_motion, &point_motion, movers.len());
     ObjectSearch {
-        evidence: features::evidence(&findings, source, &labels),
-        parts: ClusterLabels::new(&labels, &spread.cluster_motion, &point_motion, movers.len()),
+        evidence,
+        parts,
         motions,
         clusters,
         all_clusters: searched.len(),
         cost_m: match clusters {
             0 => f64::INFINITY,
             searched => sum_m / searched as f64,
+        },
+        seconds: SearchSeconds {
+            preparation: prepared_at - began,
+            clusters: searched_at - prepared_at,
+            assignment: control.seconds() - searched_at,
         },
         interrupted,
     }
@@ -186,13 +237,30 @@ struct Views<'a> {
 
 /// The clusters as searched so far.
 struct Progressed {
-    /// Of each cluster; clusters that were not searched stand still.
-    searched: Vec<SearchedCluster>,
+    /// Of each cluster, if it was searched.
+    searched: Vec<Option<SearchedCluster>>,
     /// Clusters that were searched.
     clusters: usize,
-    /// The sum of their costs, metres.
+    /// The sum of their costs, metres, in the order in which they were finished.
     sum_m: f64,
     interrupted: Option<Interrupt>,
+}
+
+impl Progressed {
+    /// Adds the result of a cluster, and reports every group of clusters.
+    fn add(&mut self, cluster: u32, found: SearchedCluster, control: &dyn Control) {
+        self.searched[cluster as usize] = Some(found);
+        self.sum_m += f64::from(found.cost().forward_m);
+        self.clusters += 1;
+        let total = self.searched.len();
+        if self.clusters.is_multiple_of(CLUSTERS_AT_ONCE) || self.clusters == total {
+            control.progress(Progress {
+                done: self.clusters,
+                total,
+                loss: self.sum_m / self.clusters as f64,
+            });
+        }
+    }
 }
 
 /// Why a search must end, where the control ends it or less than `needed` seconds are left.
@@ -206,33 +274,33 @@ fn search_all(views: &Views<'_>, rest: f64, control: &dyn Control) -> Progressed
     let members = &views.scene.source.members;
     let mut order: Vec<u32> = (0..members.len() as u32).collect();
     order.sort_by_key(|&cluster| std::cmp::Reverse(members[cluster as usize].len()));
-    let mut progressed = Progressed {
-        searched: vec![SearchedCluster::not(views.scene.options); order.len()],
+    let progressed = Mutex::new(Progressed {
+        searched: vec![None; order.len()],
         clusters: 0,
         sum_m: 0.0,
         interrupted: None,
+    });
+    // Each thread takes the largest cluster that is left.
+    let next = AtomicUsize::new(0);
+    let search_next = || -> Option<()> {
+        let cluster = *order.get(next.fetch_add(1, Ordering::Relaxed))?;
+        if let Some(interrupt) = out_of_time(control, rest) {
+            next.store(order.len(), Ordering::Relaxed);
+            locked(&progressed).interrupted = Some(interrupt);
+            return None;
+        }
+        let found = search(views, cluster);
+        locked(&progressed).add(cluster, found, control);
+        Some(())
     };
-    for some in order.chunks(CLUSTERS_AT_ONCE) {
-        progressed.interrupted = out_of_time(control, rest);
-        if progressed.interrupted.is_some() {
-            break;
+    rayon::scope(|scope| {
+        for _ in 0..rayon::current_num_threads() {
+            scope.spawn(|_| while search_next().is_some() {});
         }
-        let found: Vec<SearchedCluster> = some
-            .par_iter()
-            .map(|&cluster| search(views, cluster))
-            .collect();
-        for (&cluster, found) in some.iter().zip(found) {
-            progressed.searched[cluster as usize] = found;
-            progressed.sum_m += f64::from(found.cost().forward_m);
-        }
-        progressed.clusters += some.len();
-        control.progress(Progress {
-            done: progressed.clusters,
-            total: order.len(),
-            loss: progressed.sum_m / progressed.clusters as f64,
-        });
-    }
+    });
     progressed
+        .into_inner()
+        .unwrap_or_else(PoisonError::into_inner)
 }
 
 /// The clusters with a motion, and of each cluster its index among them or [`NOISE`].

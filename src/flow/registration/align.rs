@@ -5,7 +5,7 @@ use nalgebra::Matrix6;
 use super::coarse;
 use super::gicp::{Fit, Schedule};
 use super::posterior::Prior;
-use super::surfels::{Columns, Surfels};
+use super::surfels::Surfels;
 use crate::flow::data::{Control, Point, RigidTransform};
 use crate::flow::spatial::voxel_mean;
 
@@ -36,7 +36,7 @@ impl SurfelCloud {
         let thin = voxel_mean(points, VOXEL_M);
         Self {
             coarse: coarse::coarse(&thin),
-            fine: Surfels::new(Columns::new(&thin, CELL_M)),
+            fine: Surfels::new(&thin, CELL_M),
         }
     }
 }

@@ -10,7 +10,7 @@ use nalgebra::{Isometry3, Vector3};
 use rayon::prelude::*;
 
 use super::gicp::{Fit, Schedule};
-use super::surfels::{Columns, Surfels};
+use super::surfels::Surfels;
 use crate::flow::data::{Control, Point, RigidTransform};
 use crate::flow::spatial::voxel_mean;
 
@@ -47,7 +47,7 @@ const BETTER: f64 = 0.01;
 
 /// Coarse surfels of a voxel-downsampled cloud.
 pub(super) fn coarse(points: &[Point]) -> Surfels {
-    Surfels::new(Columns::new(&voxel_mean(points, VOXEL_M), CELL_M))
+    Surfels::new(&voxel_mean(points, VOXEL_M), CELL_M)
 }
 
 /// The motion near `prior` with the best score, accurate to some centimetres; `prior` where no fit

@@ -43,7 +43,7 @@ fn shown(cloud: &[Point], other: &[Point]) -> Option<f32> {
     }
     let is_shown = |&&row: &&u32| {
         let point = cloud[row as usize];
-        near.nearest(point, WITHIN_M, |_| true).is_some()
+        near.nearest(point, WITHIN_M).is_some()
     };
     let shown = sampled.par_iter().filter(is_shown).count();
     Some(shown as f32 / sampled.len() as f32)

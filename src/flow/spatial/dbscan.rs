@@ -3,8 +3,12 @@
 //! The diagonal of a cell is the radius, so that all points of a cell lie within the radius of each
 //! other. A cell with enough points holds core points only, without a distance computation.
 
+use std::borrow::Cow;
+use std::ops::Range;
+
 use rayon::prelude::*;
 
+use super::key_table::KeyTable;
 use super::voxel::voxel_first;
 use crate::flow::data::{Point, floor, square_distance};
 
@@ -12,6 +16,10 @@ use crate::flow::data::{Point, floor, square_distance};
 /// radius over `VOXELS`.
 const FULL: usize = 64;
 const VOXELS: f32 = 16.0;
+/// Points of a lidar sweep in a cell, or fewer.
+const EXPECTED: usize = 2;
+/// Parts of the grid that are connected each by itself.
+const PARTS: usize = 32;
 
 /// Label of a point that belongs to no cluster.
 pub(crate) const NOISE: u32 = u32::MAX;
@@ -24,49 +32,39 @@ pub(crate) const NOISE: u32 = u32::MAX;
 pub(crate) fn clusters(points: &[Point], radius_m: f32, least: usize) -> Vec<u32> {
     let grid = Cells::new(points, radius_m / 3_f32.sqrt());
     let square = radius_m * radius_m;
-    let core: Vec<Vec<bool>> = (0..grid.cells.len())
-        .into_par_iter()
-        .map(|cell| grid.cores(cell, square, least))
-        .collect();
-    let cores: Vec<Vec<u32>> = (0..grid.cells.len())
+    let cores: Vec<Cow<'_, [u32]>> = (0..grid.len())
         .into_par_iter()
         .map(|cell| {
-            let members = grid.members(cell).iter().zip(&core[cell]);
-            let cores = members.filter(|&(_, &is_core)| is_core);
-            few(points, cores.map(|(&row, _)| row).collect(), radius_m)
-        })
-        .collect();
-    let distance = |a: u32, b: u32| square_distance(points[a as usize], points[b as usize]);
-    // Pairs of cells with core points within the radius. The relation is symmetric, so later cells
-    // suffice.
-    let touching: Vec<Vec<usize>> = (0..grid.cells.len())
-        .into_par_iter()
-        .map(|cell| {
-            if cores[cell].is_empty() {
-                return Vec::new();
+            let members = grid.members(cell);
+            if members.len() < least {
+                Cow::Owned(grid.cores(cell, square, least))
+            } else if members.len() <= FULL {
+                Cow::Borrowed(members)
+            } else {
+                Cow::Owned(few(points, members, radius_m))
             }
-            let touches =
-                |&a: &u32, other: usize| cores[other].iter().any(|&b| distance(a, b) <= square);
-            let later = grid.within(cell).into_iter().filter(|&other| other > cell);
-            later
-                .filter(|&other| cores[cell].iter().any(|a| touches(a, other)))
-                .collect()
         })
         .collect();
-    let mut sets = Sets::new(grid.cells.len());
-    for (cell, others) in touching.iter().enumerate() {
-        for &other in others {
-            sets.join(cell as u32, other as u32);
+    let root = connected(&grid, &cores, square);
+    // A core point takes the set of its cell, any other point that of the nearest core point.
+    let mut labels = vec![NOISE; points.len()];
+    let mut others: Vec<(usize, u32)> = Vec::new();
+    for (cell, &root) in root.iter().enumerate() {
+        let members = grid.members(cell);
+        let mut cores = cores[cell].iter().peekable();
+        for &row in members {
+            if members.len() >= least || cores.next_if_eq(&&row).is_some() {
+                labels[row as usize] = root;
+            } else {
+                others.push((cell, row));
+            }
         }
     }
-    // A core point takes the set of its cell, any other point that of the nearest core point.
-    let root: Vec<u32> = (0..grid.cells.len() as u32)
-        .map(|cell| sets.root(cell))
-        .collect();
-    let beside = |cell: usize, row: u32| {
+    let distance = |a: u32, b: u32| square_distance(points[a as usize], points[b as usize]);
+    let beside = |&(cell, row): &(usize, u32)| {
         let mut best = (f32::INFINITY, NOISE);
         for other in grid.within(cell) {
-            for &core in &cores[other] {
+            for &core in cores[other].iter() {
                 let far = distance(row, core);
                 if far <= square && far < best.0 {
                     best = (far, root[other]);
@@ -75,36 +73,67 @@ pub(crate) fn clusters(points: &[Point], radius_m: f32, least: usize) -> Vec<u32
         }
         best.1
     };
-    let found: Vec<Vec<(u32, u32)>> = (0..grid.cells.len())
-        .into_par_iter()
-        .map(|cell| {
-            let members = grid.members(cell).iter().zip(&core[cell]);
-            members
-                .map(|(&row, &is_core)| {
-                    let root = if is_core {
-                        root[cell]
-                    } else {
-                        beside(cell, row)
-                    };
-                    (row, root)
-                })
-                .collect()
-        })
-        .collect();
-    let mut labels = vec![NOISE; points.len()];
-    for (row, root) in found.into_iter().flatten() {
-        labels[row as usize] = root;
+    let found: Vec<u32> = others.par_iter().map(beside).collect();
+    for (&(_, row), label) in others.iter().zip(found) {
+        labels[row as usize] = label;
     }
-    renumber(&mut labels, grid.cells.len());
+    renumber(&mut labels, grid.len());
     labels
 }
 
-/// The rows or, where they are many, one row for each small voxel, which bounds the time to compare
-/// two full cells. Cells that touch by less than a voxel may then stay separate.
-fn few(points: &[Point], rows: Vec<u32>, radius_m: f32) -> Vec<u32> {
-    if rows.len() <= FULL {
-        return rows;
+/// Of each cell the root of its set. Cells are in one set if a chain of core points, each within the
+/// radius of the next, connects them.
+fn connected(grid: &Cells<'_>, cores: &[Cow<'_, [u32]>], square: f32) -> Vec<u32> {
+    let touches = |cell: usize, other: usize| {
+        let distance = |a: u32, b: u32| {
+            let [a, b] = [a, b].map(|row| grid.points[row as usize]);
+            square_distance(a, b)
+        };
+        let near = |&a: &u32| cores[other].iter().any(|&b| distance(a, b) <= square);
+        cores[cell].iter().any(near)
+    };
+    // The relation is symmetric, so later cells suffice. Cells that are connected already are not
+    // compared, which spares most pairs.
+    let part = grid.len().div_ceil(PARTS).max(1);
+    let parts: Vec<(Sets, Vec<(usize, usize)>)> = (0..PARTS)
+        .into_par_iter()
+        .map(|number| {
+            let first = number * part;
+            let end = (first + part).min(grid.len());
+            let mut inside = Sets::new(end.saturating_sub(first));
+            let mut across = Vec::new();
+            for cell in (first..end).filter(|&cell| !cores[cell].is_empty()) {
+                for other in grid.within(cell).filter(|&other| other > cell) {
+                    if other >= end {
+                        if touches(cell, other) {
+                            across.push((cell, other));
+                        }
+                    } else {
+                        let [a, b] = [cell, other].map(|cell| (cell - first) as u32);
+                        if inside.root(a) != inside.root(b) && touches(cell, other) {
+                            inside.join(a, b);
+                        }
+                    }
+                }
+            }
+            (inside, across)
+        })
+        .collect();
+    let mut sets = Sets::new(grid.len());
+    for (number, (mut inside, across)) in parts.into_iter().enumerate() {
+        let first = (number * part) as u32;
+        for cell in 0..inside.0.len() as u32 {
+            sets.join(first + cell, first + inside.root(cell));
+        }
+        for (cell, other) in across {
+            sets.join(cell as u32, other as u32);
+        }
     }
+    (0..grid.len() as u32).map(|cell| sets.root(cell)).collect()
+}
+
+/// One row for each small voxel, which bounds the time to compare two full cells. Cells that touch by less than a voxel may then stay separate.
+fn few(points: &[Point], rows: &[u32], radius_m: f32) -> Vec<u32> {
     let of_cell: Vec<Point> = rows.iter().map(|&row| points[row as usize]).collect();
     let kept = voxel_first(&of_cell, radius_m / VOXELS);
     kept.into_iter().map(|i| rows[i as usize]).collect()
@@ -127,12 +156,23 @@ fn renumber(labels: &mut [u32], roots: usize) {
 /// Points in cubic cells.
 struct Cells<'a> {
     points: &'a [Point],
-    /// Key of each cell and the index of its first member in `rows`, sorted by key.
+    /// Key of each cell and the index of its first member in `rows`, sorted by key. A sentinel closes
+    /// the list.
     cells: Vec<(u64, u32)>,
     rows: Vec<u32>,
-    /// Key of each column (a cell's key without the height) and the index of its first cell. A
-    /// sentinel closes the list.
-    columns: Vec<(u64, u32)>,
+    columns: Vec<Column>,
+    /// The column of each cell.
+    column_of: Vec<u32>,
+}
+
+/// The cells of one x and y.
+struct Column {
+    /// A cell's key without the height.
+    key: u64,
+    cells: Range<u32>,
+    /// For each x from two cells before to two cells after, the columns from two cells before to two
+    /// cells after in y.
+    around: [Range<u32>; 5],
 }
 
 /// Bound on a cell's index along an axis, on each side of the origin.
@@ -142,76 +182,76 @@ const HEIGHT: u64 = 21;
 
 impl<'a> Cells<'a> {
     fn new(points: &'a [Point], side_m: f32) -> Self {
-        let mut keyed: Vec<(u64, u32)> = points
+        // Points out of range belong to no cell.
+        let in_reach = |&row: &u32| {
+            let point = points[row as usize];
+            point.iter().all(|c| (c / side_m).abs() < REACH)
+        };
+        let rows: Vec<u32> = (0..points.len() as u32).filter(in_reach).collect();
+        let keys: Vec<u64> = rows
             .iter()
-            .zip(0..)
-            // Points out of range belong to no cell.
-            .filter(|(point, _)| point.iter().all(|c| (c / side_m).abs() < REACH))
-            .map(|(&point, row)| (key(point, side_m), row))
+            .map(|&row| key(points[row as usize], side_m))
             .collect();
-        keyed.par_sort_unstable();
-        let mut cells: Vec<(u64, u32)> = Vec::new();
-        let mut columns: Vec<(u64, u32)> = Vec::new();
-        for (&(key, _), begin) in keyed.iter().zip(0..) {
-            if cells.last().is_none_or(|&(last, _)| last != key) {
-                let column = key >> HEIGHT;
-                if columns.last().is_none_or(|&(last, _)| last != column) {
-                    columns.push((column, cells.len() as u32));
-                }
-                cells.push((key, begin));
-            }
+        let mut table = KeyTable::<u32>::new(points.len() / EXPECTED);
+        for &key in &keys {
+            *table.entry(key) += 1;
         }
-        columns.push((u64::MAX, cells.len() as u32));
+        // Counting sort: the number of a cell's members becomes the place of the next one.
+        let mut cells: Vec<(u64, u32)> = Vec::new();
+        let mut next = 0;
+        for key in table.sorted() {
+            cells.push((key, next));
+            let members = table.entry(key);
+            next += core::mem::replace(members, next);
+        }
+        cells.push((u64::MAX, next));
+        let mut sorted = vec![0; rows.len()];
+        for (&row, &key) in rows.iter().zip(&keys) {
+            let place = table.entry(key);
+            sorted[*place as usize] = row;
+            *place += 1;
+        }
+        let (columns, column_of) = columns(&cells[..cells.len() - 1]);
         Self {
             points,
             cells,
-            rows: keyed.into_iter().map(|(_, row)| row).collect(),
+            rows: sorted,
             columns,
+            column_of,
         }
+    }
+
+    /// Number of cells.
+    fn len(&self) -> usize {
+        self.cells.len() - 1
     }
 
     fn members(&self, cell: usize) -> &[u32] {
-        let end = self
-            .cells
-            .get(cell + 1)
-            .map_or(self.rows.len(), |&(_, begin)| begin as usize);
-        &self.rows[self.cells[cell].1 as usize..end]
+        &self.rows[self.cells[cell].1 as usize..self.cells[cell + 1].1 as usize]
     }
 
-    /// The cells that may hold points within the radius of this cell's points, this cell included.
-    fn within(&self, cell: usize) -> Vec<usize> {
-        let key = self.cells[cell].0;
-        let (column, z) = (key >> HEIGHT, key & ((1 << HEIGHT) - 1));
-        let mut found = Vec::with_capacity(32);
-        for dx in [-2_i64, -1, 0, 1, 2] {
-            let row = column.wrapping_add_signed((dx << HEIGHT) - 2);
-            let mut at = self.columns.partition_point(|&(other, _)| other < row);
-            while let Some(&(other, begin)) = self.columns.get(at)
-                && other <= row + 4
-            {
-                let end = self.columns[at + 1].1;
-                let begin = begin as usize;
-                let cells = &self.cells[begin..end as usize];
-                let height = |key: u64| key & ((1 << HEIGHT) - 1);
-                let low = cells.partition_point(|&(key, _)| height(key) + 2 < z);
-                let near = cells[low..].iter();
-                let near = near.take_while(|&&(key, _)| height(key) <= z + 2).count();
-                found.extend(begin + low..begin + low + near);
-                at += 1;
-            }
-        }
-        found
+    /// The cells that may hold points within the radius of this cell's points, this cell included,
+    /// in ascending order.
+    fn within(&self, cell: usize) -> impl Iterator<Item = usize> {
+        let height = |key: u64| key & ((1 << HEIGHT) - 1);
+        let z = height(self.cells[cell].0);
+        let around = &self.columns[self.column_of[cell] as usize].around;
+        let columns = around
+            .iter()
+            .flat_map(|range| &self.columns[range.start as usize..range.end as usize]);
+        columns.flat_map(move |column| {
+            let range = column.cells.start as usize..column.cells.end as usize;
+            let cells = &self.cells[range.clone()];
+            let low = range.start + cells.partition_point(|&(key, _)| height(key) + 2 < z);
+            let is_near = move |&cell: &usize| height(self.cells[cell].0) <= z + 2;
+            (low..range.end).take_while(is_near)
+        })
     }
 
-    /// Which of a cell's members are core points: those with `least` points within the radius.
-    fn cores(&self, cell: usize, square: f32, least: usize) -> Vec<bool> {
-        let members = self.members(cell);
-        if members.len() >= least {
-            return vec![true; members.len()];
-        }
-        let within = self.within(cell);
+    /// The core points among a cell's members: those with `least` points within the radius.
+    fn cores(&self, cell: usize, square: f32, least: usize) -> Vec<u32> {
         let is_core = |&row: &u32| {
-            let near = within.iter().flat_map(|&other| self.members(other));
+            let near = self.within(cell).flat_map(|other| self.members(other));
             near.filter(|&&other| {
                 square_distance(self.points[row as usize], self.points[other as usize]) <= square
             })
@@ -219,8 +259,41 @@ impl<'a> Cells<'a> {
             .count()
                 >= least
         };
-        members.iter().map(is_core).collect()
+        self.members(cell).iter().copied().filter(is_core).collect()
     }
+}
+
+/// The columns of the sorted `cells`, and the column of each cell.
+fn columns(cells: &[(u64, u32)]) -> (Vec<Column>, Vec<u32>) {
+    let mut columns: Vec<Column> = Vec::new();
+    let mut column_of = Vec::with_capacity(cells.len());
+    for (&(key, _), cell) in cells.iter().zip(0..) {
+        let key = key >> HEIGHT;
+        match columns.last_mut() {
+            Some(last) if last.key == key => last.cells.end = cell + 1,
+            _ => columns.push(Column {
+                key,
+                cells: cell..cell + 1,
+                around: core::array::from_fn(|_| 0..0),
+            }),
+        }
+        column_of.push(columns.len() as u32 - 1);
+    }
+    // The columns ascend, and so do the columns around them.
+    for (offset, dx) in (-2_i64..=2).enumerate() {
+        let (mut begin, mut end) = (0, 0);
+        for column in 0..columns.len() {
+            let middle = columns[column].key.wrapping_add_signed(dx << HEIGHT);
+            while columns.get(begin).is_some_and(|c| c.key < middle - 2) {
+                begin += 1;
+            }
+            while columns.get(end).is_some_and(|c| c.key <= middle + 2) {
+                end += 1;
+            }
+            columns[column].around[offset] = begin as u32..end as u32;
+        }
+    }
+    (columns, column_of)
 }
 
 fn key(point: Point, side_m: f32) -> u64 {

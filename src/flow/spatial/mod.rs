@@ -1,11 +1,15 @@
 //! Spatial indices and point-set geometry: column index, DBSCAN, plane fit and voxel downsampling.
 
 mod column_index;
+mod column_kernels;
 pub(crate) mod dbscan;
+mod key_table;
 mod plane;
+mod slots;
+mod tiles;
 mod voxel;
 
-pub(crate) use column_index::ColumnIndex;
+pub(crate) use column_index::{ColumnIndex, Marks, SlotLabels};
 pub(crate) use dbscan::NOISE;
 pub(crate) use plane::{Neighborhood, PlaneFit};
-pub(crate) use voxel::{REACH, voxel_first, voxel_mean};
+pub(crate) use voxel::{voxel_first, voxel_mean};

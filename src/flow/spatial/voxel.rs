@@ -1,43 +1,49 @@
 //! Voxel downsampling: one point a voxel, so that near rings weigh no more than far walls.
 
+use super::key_table::KeyTable;
 use crate::flow::data::{Point, floor};
 
 /// Bound on a voxel's index along an axis, on each side of the origin.
-pub(crate) const REACH: f32 = (1 << 20) as f32;
+const REACH: f32 = (1 << 20) as f32;
+/// Points of a lidar sweep in a voxel, or fewer.
+const EXPECTED: usize = 2;
 
-/// Voxel downsampling to the mean of each voxel's points, metres, with voxels of `side_m` metres.
-/// The means are ordered by voxel: x, then y, then z. Points beyond [`REACH`] voxels and points
-/// that are not finite are dropped.
+/// Voxel downsampling to the mean of each voxel's points, metres, with voxels of `side_m` metres, in
+/// the order of their first points. Points beyond [`REACH`] voxels and points that are not finite are
+/// dropped.
 pub(crate) fn voxel_mean(points: &[Point], side_m: f32) -> Vec<Point> {
-    let is_in_reach = |point: &Point| point.iter().all(|c| (c / side_m).abs() < REACH);
-    let rows = (0..points.len() as u32).filter(|&row| is_in_reach(&points[row as usize]));
-    let keyed = sorted_by_voxel(points, rows, side_m);
-    let voxels = keyed.chunk_by(|(key, _), (next, _)| key == next);
-    voxels.map(|voxel| mean(points, voxel)).collect()
+    let is_in_reach = |point: &&Point| point.iter().all(|c| (c / side_m).abs() < REACH);
+    let mut numbers = KeyTable::<u32>::new(points.len() / EXPECTED);
+    let mut sums: Vec<([f64; 3], f64)> = Vec::new();
+    for point in points.iter().filter(is_in_reach) {
+        // Zero is the number of a new voxel.
+        let number = numbers.entry(key(*point, side_m));
+        if *number == 0 {
+            sums.push(([0.0; 3], 0.0));
+            *number = sums.len() as u32;
+        }
+        let (sum, count) = &mut sums[*number as usize - 1];
+        for (sum, &c) in sum.iter_mut().zip(point) {
+            *sum += f64::from(c);
+        }
+        *count += 1.0;
+    }
+    let means = sums.into_iter();
+    means
+        .map(|(sum, count)| sum.map(|sum| (sum / count) as f32))
+        .collect()
 }
 
 /// Voxel downsampling to the first row of each voxel of `side_m` metres. The rows are in ascending
 /// order. Points beyond [`REACH`] voxels share the outermost voxels. All coordinates must be
 /// finite.
 pub(crate) fn voxel_first(points: &[Point], side_m: f32) -> Vec<u32> {
-    let mut keyed = sorted_by_voxel(points, 0..points.len() as u32, side_m);
-    keyed.dedup_by_key(|&mut (voxel, _)| voxel);
-    let mut rows: Vec<u32> = keyed.into_iter().map(|(_, row)| row).collect();
-    rows.sort_unstable();
-    rows
-}
-
-/// The voxel's key of each row and the row itself, ordered by key and then by row.
-fn sorted_by_voxel(
-    points: &[Point],
-    rows: impl Iterator<Item = u32>,
-    side_m: f32,
-) -> Vec<(u64, u32)> {
-    let mut keyed: Vec<(u64, u32)> = rows
-        .map(|row| (key(points[row as usize], side_m), row))
-        .collect();
-    keyed.sort_unstable();
-    keyed
+    let mut seen = KeyTable::<bool>::new(points.len() / EXPECTED);
+    let is_first = |row: &u32| {
+        let seen = seen.entry(key(points[*row as usize], side_m));
+        !core::mem::replace(seen, true)
+    };
+    (0..points.len() as u32).filter(is_first).collect()
 }
 
 /// The key of a point's voxel: 21 bits an axis, x in the highest.
@@ -47,27 +53,22 @@ fn key(point: Point, side_m: f32) -> u64 {
     x << 42 | y << 21 | z
 }
 
-fn mean(points: &[Point], voxel: &[(u64, u32)]) -> Point {
-    let mut sum = [0.0; 3];
-    for &(_, row) in voxel {
-        for (sum, c) in sum.iter_mut().zip(points[row as usize]) {
-            *sum += f64::from(c);
-        }
-    }
-    sum.map(|sum| (sum / voxel.len() as f64) as f32)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn a_voxel_keeps_the_mean_of_its_points_whatever_their_order() {
+    fn a_voxel_keeps_the_mean_of_its_points_in_the_order_of_the_first_ones() {
         let mut points = vec![[0.1, 0.1, 0.1], [-0.1, 0.1, 0.1], [0.3, 0.1, 0.1]];
-        let thin = voxel_mean(&points, 0.5);
-        assert_eq!(thin, [[-0.1, 0.1, 0.1], [0.2, 0.1, 0.1]]);
+        assert_eq!(
+            voxel_mean(&points, 0.5),
+            [[0.2, 0.1, 0.1], [-0.1, 0.1, 0.1]]
+        );
         points.swap(0, 1);
-        assert_eq!(voxel_mean(&points, 0.5), thin);
+        assert_eq!(
+            voxel_mean(&points, 0.5),
+            [[-0.1, 0.1, 0.1], [0.2, 0.1, 0.1]]
+        );
     }
 
     #[test]

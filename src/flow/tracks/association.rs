@@ -144,7 +144,7 @@ fn shares(from: &[&[Point]], to: &[&[Point]]) -> Vec<Vec<(usize, f32)>> {
     let index = ColumnIndex::new(&all, REACH_M);
     let of = |points: &&[Point]| {
         let sample = stride_sample(points, SAMPLED);
-        let nearest = |&point: &Point| index.nearest(point, REACH_M, |_| true);
+        let nearest = |&point: &Point| index.nearest(point, REACH_M);
         let mut hits: Vec<usize> = sample
             .iter()
             .filter_map(nearest)

@@ -99,7 +99,7 @@ pub fn correct(
 /// metres.
 fn farther_m(target: &ColumnIndex, still: &[Point], moved: &[Point]) -> Vec<f32> {
     let distance = |point: Point| {
-        let nearest = target.nearest(point, TRUNCATION_M, |_| true);
+        let nearest = target.nearest(point, TRUNCATION_M);
         nearest.map_or(TRUNCATION_M, |(_, square)| square.sqrt())
     };
     let pairs = still.iter().zip(moved);

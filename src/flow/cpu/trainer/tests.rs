@@ -4,7 +4,6 @@ use std::sync::Mutex;
 
 use super::*;
 use crate::flow::cpu::backend::CpuBackend;
-use crate::flow::cpu::isa::Isa;
 use crate::flow::cpu::mlp::Mlp;
 use crate::flow::data::{Random, Uncontrolled};
 use crate::flow::distance::{DistanceOptions, DistanceTransform};
@@ -13,6 +12,7 @@ use crate::flow::field::{
     first_losses, mean_distance,
 };
 use crate::flow::options::{BatchGrowth, FieldOptions, LossOptions, Preset, Renewal};
+use crate::flow::simd::Isa;
 
 /// The state of `trainer`.
 fn state(trainer: &mut dyn Trainer) -> TrainerState {

@@ -19,15 +19,21 @@ impl Isa {
         let mut sets = Vec::new();
         #[cfg(target_arch = "x86_64")]
         {
-            if is_x86_feature_detected!("avx512f") {
+            let counts_bits = is_x86_feature_detected!("popcnt");
+            if is_x86_feature_detected!("avx512f") && counts_bits {
                 sets.push(Self::Avx512);
             }
-            if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+            if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") && counts_bits {
                 sets.push(Self::Avx2);
             }
         }
         sets.push(Self::Portable);
         sets
+    }
+
+    /// The fastest instruction set of this machine.
+    pub(in crate::flow) fn fastest() -> Self {
+        Self::available()[0]
     }
 
     /// The name shown in reports and by `fnsf doctor`: `AVX-512`, `AVX2 + FMA` or `portable`.

@@ -14,7 +14,7 @@
 /// `COUNT` is the number of floats that `load` reads and `store` writes. Every function requires
 /// the CPU features of the implementation; `load` and `store` require `COUNT` valid floats at the
 /// pointer.
-pub(super) unsafe trait Lanes: Copy {
+pub(in crate::flow) unsafe trait Lanes: Copy {
     /// Floats in one register.
     const COUNT: usize;
     unsafe fn splat(value: f32) -> Self;
@@ -32,19 +32,26 @@ pub(super) unsafe trait Lanes: Copy {
     unsafe fn relu(self) -> Self;
     /// `self` where `gate > 0`, else 0.
     unsafe fn where_positive(self, gate: Self) -> Self;
+    unsafe fn mul(self, other: Self) -> Self;
+    /// `self` where `a == b`, else `other`.
+    unsafe fn where_equal(self, a: Self, b: Self, other: Self) -> Self;
+    /// One bit a float, the first one lowest: whether it is less than that of `other`.
+    unsafe fn less(self, other: Self) -> u32;
+    /// The least of the floats, none of which is NaN.
+    unsafe fn least(self) -> f32;
 }
 
 #[cfg(target_arch = "x86_64")]
-pub(super) use x86::{F32x8, F32x16};
+pub(in crate::flow) use x86::{F32x8, F32x16};
 
 #[cfg(target_arch = "x86_64")]
 mod x86 {
-    use crate::flow::cpu::simd::Lanes;
+    use crate::flow::simd::lanes::Lanes;
     use core::arch::x86_64::*;
 
     /// An AVX-512 register of 16 floats.
     #[derive(Clone, Copy)]
-    pub(in crate::flow::cpu) struct F32x16(__m512);
+    pub(in crate::flow) struct F32x16(__m512);
 
     // SAFETY: 16 floats fill the register.
     unsafe impl Lanes for F32x16 {
@@ -106,11 +113,34 @@ mod x86 {
                 Self(_mm512_maskz_mov_ps(mask, self.0))
             }
         }
+        #[inline(always)]
+        unsafe fn mul(self, other: Self) -> Self {
+            // SAFETY: the caller has avx512f.
+            Self(unsafe { _mm512_mul_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        unsafe fn where_equal(self, a: Self, b: Self, other: Self) -> Self {
+            // SAFETY: the caller has avx512f.
+            unsafe {
+                let mask = _mm512_cmp_ps_mask::<_CMP_EQ_OQ>(a.0, b.0);
+                Self(_mm512_mask_mov_ps(other.0, mask, self.0))
+            }
+        }
+        #[inline(always)]
+        unsafe fn less(self, other: Self) -> u32 {
+            // SAFETY: the caller has avx512f.
+            u32::from(unsafe { _mm512_cmp_ps_mask::<_CMP_LT_OQ>(self.0, other.0) })
+        }
+        #[inline(always)]
+        unsafe fn least(self) -> f32 {
+            // SAFETY: the caller has avx512f.
+            unsafe { _mm512_reduce_min_ps(self.0) }
+        }
     }
 
     /// An AVX register of 8 floats, with FMA.
     #[derive(Clone, Copy)]
-    pub(in crate::flow::cpu) struct F32x8(__m256);
+    pub(in crate::flow) struct F32x8(__m256);
 
     // SAFETY: 8 floats fill the register.
     unsafe impl Lanes for F32x8 {
@@ -172,12 +202,44 @@ mod x86 {
                 Self(_mm256_and_ps(mask, self.0))
             }
         }
+        #[inline(always)]
+        unsafe fn mul(self, other: Self) -> Self {
+            // SAFETY: the caller has avx2.
+            Self(unsafe { _mm256_mul_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        unsafe fn where_equal(self, a: Self, b: Self, other: Self) -> Self {
+            // SAFETY: the caller has avx2.
+            unsafe {
+                let mask = _mm256_cmp_ps::<_CMP_EQ_OQ>(a.0, b.0);
+                Self(_mm256_blendv_ps(other.0, self.0, mask))
+            }
+        }
+        #[inline(always)]
+        unsafe fn less(self, other: Self) -> u32 {
+            // SAFETY: the caller has avx2.
+            let mask = unsafe { _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_LT_OQ>(self.0, other.0)) };
+            mask.cast_unsigned()
+        }
+        #[inline(always)]
+        unsafe fn least(self) -> f32 {
+            // SAFETY: the caller has avx2.
+            unsafe {
+                let four = _mm_min_ps(
+                    _mm256_castps256_ps128(self.0),
+                    _mm256_extractf128_ps::<1>(self.0),
+                );
+                let two = _mm_min_ps(four, _mm_movehl_ps(four, four));
+                let one = _mm_min_ss(two, _mm_shuffle_ps::<1>(two, two));
+                _mm_cvtss_f32(one)
+            }
+        }
     }
 }
 
 /// Four floats in plain Rust, which most targets compile to one register.
 #[derive(Clone, Copy)]
-pub(super) struct F32x4([f32; 4]);
+pub(in crate::flow) struct F32x4([f32; 4]);
 
 // SAFETY: the array has 4 floats.
 unsafe impl Lanes for F32x4 {
@@ -235,5 +297,27 @@ unsafe impl Lanes for F32x4 {
         Self(core::array::from_fn(|i| {
             if gate.0[i] > 0.0 { self.0[i] } else { 0.0 }
         }))
+    }
+    #[inline(always)]
+    unsafe fn mul(self, other: Self) -> Self {
+        Self(core::array::from_fn(|i| self.0[i] * other.0[i]))
+    }
+    #[inline(always)]
+    unsafe fn where_equal(self, a: Self, b: Self, other: Self) -> Self {
+        Self(core::array::from_fn(|i| {
+            if a.0[i] == b.0[i] {
+                self.0[i]
+            } else {
+                other.0[i]
+            }
+        }))
+    }
+    #[inline(always)]
+    unsafe fn less(self, other: Self) -> u32 {
+        (0..4).fold(0, |bits, i| bits | u32::from(self.0[i] < other.0[i]) << i)
+    }
+    #[inline(always)]
+    unsafe fn least(self) -> f32 {
+        self.0.into_iter().fold(f32::INFINITY, f32::min)
     }
 }

@@ -1,0 +1,106 @@
+//! The two clouds of an object search: voxel-downsampled and indexed, each by itself.
+//!
+//! Heights are scaled down for matching, since the rings of a lidar are far apart and the samples
+//! along a ring are not.
+
+use rayon::prelude::*;
+
+use crate::flow::data::Point;
+use crate::flow::options::ObjectOptions;
+use crate::flow::spatial::{ColumnIndex, NOISE, Neighborhood, SlotLabels, voxel_first};
+
+/// The source with the ego motion taken out, voxel-downsampled.
+pub(super) struct SourceCloud {
+    /// One point a voxel, metres in the target's frame.
+    pub(super) points: Vec<Point>,
+    /// The cluster of each point, or [`NOISE`].
+    pub(super) labels: Vec<u32>,
+    /// For each cluster, the indices of its points in `points`.
+    pub(super) members: Vec<Vec<u32>>,
+    /// The points with scaled heights.
+    pub(super) low: Vec<Point>,
+    /// Index of `low`, and the cluster of each of its points.
+    pub(super) near: ColumnIndex,
+    pub(super) clusters: SlotLabels,
+}
+
+impl SourceCloud {
+    /// Downsamples `source`. `labels` are the clusters of its points.
+    pub(super) fn new(source: &[Point], labels: &[u32], options: &ObjectOptions) -> Self {
+        let kept = voxel_first(source, options.voxel_m);
+        let labels: Vec<u32> = kept.iter().map(|&row| labels[row as usize]).collect();
+        let points: Vec<Point> = kept.iter().map(|&row| source[row as usize]).collect();
+        let low: Vec<Point> = points.iter().map(|&p| lowered(p, options)).collect();
+        let clusters = labels.iter().filter(|&&label| label != NOISE).max();
+        let mut members = vec![Vec::new(); clusters.map_or(0, |&last| last as usize + 1)];
+        for (&label, row) in labels.iter().zip(0..) {
+            if label != NOISE {
+                members[label as usize].push(row);
+            }
+        }
+        let near = ColumnIndex::new(&low, column_m(options));
+        Self {
+            clusters: near.labels(&labels),
+            near,
+            points,
+            labels,
+            members,
+            low,
+        }
+    }
+}
+
+/// The target or a neighbor sweep, voxel-downsampled.
+pub(super) struct TargetCloud {
+    /// One point a voxel, metres in the target's frame.
+    pub(super) points: Vec<Point>,
+    /// The points with scaled heights.
+    pub(super) low: Vec<Point>,
+    /// Unit normals of the points; zero where the surface is not flat.
+    pub(super) normals: Vec<Point>,
+    /// Index of `low` for static matches.
+    pub(super) near: ColumnIndex,
+}
+
+impl TargetCloud {
+    /// Downsamples `target`, metres in the target's frame.
+    pub(super) fn new(target: &[Point], options: &ObjectOptions) -> Self {
+        let mut points: Vec<Point> = voxel_first(target, options.voxel_m)
+            .into_iter()
+            .map(|row| target[row as usize])
+            .collect();
+        let upright = ColumnIndex::sorted(&mut points, column_m(options));
+        let low: Vec<Point> = points.iter().map(|&p| lowered(p, options)).collect();
+        let normals = points
+            .par_iter()
+            .map(|&point| normal(&upright, point, options));
+        Self {
+            normals: normals.collect(),
+            near: ColumnIndex::new(&low, 2.0 * options.static_match_m),
+            points,
+            low,
+        }
+    }
+}
+
+/// The unit normal of the surface around a point; zero where it is not flat.
+fn normal(near: &ColumnIndex, point: Point, options: &ObjectOptions) -> Point {
+    let range = point[0].hypot(point[1]);
+    let [base, slope] = options.normal_m;
+    let radius = (base + slope * range).min(options.match_m);
+    let mut neighborhood = Neighborhood::of(point);
+    near.within(point, radius, |_, other| neighborhood.add(other));
+    let flat = neighborhood.flat();
+    flat.map_or([0.0; 3], |flat| flat.normal)
+}
+
+/// Side of the columns of the indices, metres: most matches lie within a quarter of `match_m`.
+pub(super) fn column_m(options: &ObjectOptions) -> f32 {
+    0.5 * options.match_m
+}
+
+/// The point with its height scaled.
+#[inline]
+pub(super) fn lowered([x, y, z]: Point, options: &ObjectOptions) -> Point {
+    [x, y, z * options.height_weight]
+}

@@ -1,0 +1,170 @@
+//! Square columns of space, found through tiles of 8 x 8 columns.
+//!
+//! A hash table finds a tile. One bit for each of its columns says whether the column holds points,
+//! and the number of bits before it is its place among the tile's columns. Memory is therefore
+//! proportional to the columns that hold points, however far apart they lie.
+
+use std::ops::Range;
+
+use super::key_table::KeyTable;
+use crate::flow::data::Point;
+
+/// Bound on a column's index along an axis, on each side of the origin. Points beyond it share the
+/// outermost column.
+const REACH: f32 = (1 << 30) as f32;
+/// Binary logarithm of the columns along the side of a tile.
+const SIDE_BITS: i32 = 3;
+const SIDE: i32 = 1 << SIDE_BITS;
+
+/// A tile that holds points.
+#[derive(Clone, Copy, Debug, Default)]
+struct Tile {
+    /// One bit a column that holds points, x in the high bits and y in the low ones.
+    occupied: u64,
+    /// Index of its first column that holds points.
+    first: u32,
+}
+
+/// The columns that hold points, numbered by tile and then by x and y, and the range of the points
+/// of each.
+#[derive(Debug)]
+pub(super) struct Tiles {
+    column_m: f32,
+    columns_per_m: f32,
+    table: KeyTable<Tile>,
+    /// Index of the first point of each column, and the number of points at the end.
+    begins: Vec<u32>,
+}
+
+impl Tiles {
+    /// Divides `points` into columns with a side of `column_m` metres. Also returns the input rows
+    /// in the order of the columns; within a column they ascend.
+    pub(super) fn new(points: &[Point], column_m: f32) -> (Self, Vec<u32>) {
+        let columns_per_m = 1.0 / column_m;
+        let columns = points.iter().map(|&point| column_of(point, columns_per_m));
+        let columns: Vec<[i32; 2]> = columns.collect();
+        let mut table = KeyTable::<Tile>::new(0);
+        for &column in &columns {
+            table.entry(key(tile_of(column))).occupied |= bit(column);
+        }
+        let mut count = 0;
+        for key in table.sorted() {
+            let tile = table.entry(key);
+            tile.first = count;
+            count += tile.occupied.count_ones();
+        }
+        // Neighboring points often lie in one tile.
+        let mut last = (key([i32::MIN; 2]), Tile::default());
+        let numbers = columns.iter().map(|&column| {
+            let wanted = key(tile_of(column));
+            if wanted != last.0 {
+                last = (wanted, table.get(wanted).copied().unwrap_or_default());
+            }
+            last.1.first + (last.1.occupied & (bit(column) - 1)).count_ones()
+        });
+        let numbers: Vec<u32> = numbers.collect();
+        // Counting sort.
+        let mut begins = vec![0_u32; count as usize + 1];
+        for &number in &numbers {
+            begins[number as usize] += 1;
+        }
+        let mut sum = 0;
+        for begin in &mut begins {
+            sum += core::mem::replace(begin, sum);
+        }
+        let mut next = begins.clone();
+        let mut rows = vec![0_u32; points.len()];
+        for (&number, row) in numbers.iter().zip(0..) {
+            let next = &mut next[number as usize];
+            rows[*next as usize] = row;
+            *next += 1;
+        }
+        let tiles = Self {
+            column_m,
+            columns_per_m,
+            table,
+            begins,
+        };
+        (tiles, rows)
+    }
+
+    /// Side of a column, metres.
+    pub(super) fn column_m(&self) -> f32 {
+        self.column_m
+    }
+
+    /// Calls `see` with ranges of points that together are all points of the columns that touch the
+    /// square of half side `half_m` metres around `center`. The ranges ascend.
+    #[inline(always)]
+    pub(super) fn each_run(&self, center: Point, half_m: f32, mut see: impl FnMut(Range<usize>)) {
+        let corner = |side_m: f32| {
+            let [x, y, z] = center;
+            column_of([x + side_m, y + side_m, z], self.columns_per_m)
+        };
+        let ([left, low], [right, high]) = (corner(-half_m), corner(half_m));
+        let (mut tile_x, last_x) = (left >> SIDE_BITS, right >> SIDE_BITS);
+        // `while` compiles to less than `for` over an inclusive range.
+        while tile_x <= last_x {
+            let (x_low, x_high) = inside(left, right, tile_x);
+            let (mut tile_y, last_y) = (low >> SIDE_BITS, high >> SIDE_BITS);
+            while tile_y <= last_y {
+                if let Some(&tile) = self.table.get(key([tile_x, tile_y])) {
+                    let (y_low, y_high) = inside(low, high, tile_y);
+                    let row = ((2_u64 << (y_high - y_low)) - 1) << y_low;
+                    let mut place = x_low << SIDE_BITS;
+                    while place <= x_high << SIDE_BITS {
+                        let wanted = (tile.occupied & row << place).count_ones();
+                        if wanted > 0 {
+                            let before = tile.occupied & ((1 << (place + y_low)) - 1);
+                            let first = (tile.first + before.count_ones()) as usize;
+                            let end = self.begins[first + wanted as usize];
+                            see(self.begins[first] as usize..end as usize);
+                        }
+                        place += SIDE.cast_unsigned();
+                    }
+                }
+                tile_y += 1;
+            }
+            tile_x += 1;
+        }
+    }
+}
+
+/// The part of the columns from `low` to `high` that lies in a tile, counted from the tile's side.
+#[inline(always)]
+fn inside(low: i32, high: i32, tile: i32) -> (u32, u32) {
+    let begin = tile << SIDE_BITS;
+    let [low, high] = [low.max(begin), high.min(begin + SIDE - 1)];
+    (
+        (low - begin).cast_unsigned(),
+        (high - begin).cast_unsigned(),
+    )
+}
+
+/// Indices of the column that a point lies in. They grow with the coordinates, rounding included.
+#[inline(always)]
+fn column_of([x, y, _]: Point, columns_per_m: f32) -> [i32; 2] {
+    [x, y].map(|c| {
+        let columns = c * columns_per_m;
+        let columns = if columns < REACH { columns } else { REACH };
+        let columns = if columns > -REACH { columns } else { -REACH };
+        let toward_zero = columns as i32;
+        toward_zero - i32::from(toward_zero as f32 > columns)
+    })
+}
+
+fn tile_of(column: [i32; 2]) -> [i32; 2] {
+    column.map(|index| index >> SIDE_BITS)
+}
+
+/// The bit of a column in its tile.
+fn bit([x, y]: [i32; 2]) -> u64 {
+    1 << ((x & (SIDE - 1)) << SIDE_BITS | y & (SIDE - 1))
+}
+
+/// The key of a tile. Keys are in the order of x and then of y.
+#[inline(always)]
+fn key(tile: [i32; 2]) -> u64 {
+    let [x, y] = tile.map(|index| index.cast_unsigned() ^ 1 << 31);
+    u64::from(x) << 32 | u64::from(y)
+}
