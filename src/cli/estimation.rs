@@ -1,5 +1,6 @@
 //! Command-line options of the flow estimate, shared by `flow` and `densify`.
 
+use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
@@ -7,10 +8,11 @@ use clap::Args;
 
 use super::device::DeviceArgument;
 use super::failure::Failure;
-use super::terminal::Terminal;
 use super::{device, files};
 use crate::flow::field::{Backend, BackendError};
-use crate::flow::{self, Ego, Estimate, FlowError, Point, RigidTransform, Sequence, Sweep};
+use crate::flow::{
+    self, Control, Ego, Estimate, FlowError, Point, RigidTransform, Sequence, Sweep,
+};
 use crate::formats::{self, PointTimes, SweepClock, TimedCloud, pair_interval_s};
 use crate::job::{
     DeviceChoice, EgoChoice, FieldChoices, GroundChoice, JobOptions, PrecisionChoice, PresetChoice,
@@ -170,9 +172,12 @@ impl Estimation {
         let name = |path: &PathBuf| path.to_string_lossy().into_owned();
         let names: Vec<String> = paths.iter().map(name).collect();
         warn_of_disorder(&names);
+        let known = names
+            .into_iter()
+            .map(|name| KnownSweep { name, clock: None });
         Ok(Surroundings {
-            clocks: vec![None; names.len()],
-            names,
+            known: known.collect(),
+            forgotten: 0,
             poses,
             raster: raster.transpose()?,
         })
@@ -225,18 +230,18 @@ impl Device<'_> {
         sequence: &mut Sequence,
         sweep: &Sweep,
         options: &flow::Options,
-        terminal: &Terminal,
+        control: &dyn Control,
     ) -> Result<Vec<Estimate>, Failure> {
-        self.tried(|backend| sequence.push(backend, sweep.clone(), options, terminal))
+        self.tried(|backend| sequence.push(backend, sweep.clone(), options, control))
     }
 
     /// Returns the remaining pairs at the end of a sequence, with the same fallback as `push`.
     pub(super) fn finish(
         &mut self,
         sequence: &mut Sequence,
-        terminal: &Terminal,
+        control: &dyn Control,
     ) -> Result<Vec<Estimate>, Failure> {
-        self.tried(|backend| sequence.finish(backend, terminal))
+        self.tried(|backend| sequence.finish(backend, control))
     }
 
     fn tried(
@@ -267,21 +272,50 @@ impl Device<'_> {
 
 /// Poses, clocks and ground raster of a sequence's sweeps.
 pub(super) struct Surroundings {
-    /// File names of the sweeps; empty for a pair in one file.
-    names: Vec<String>,
-    /// What is known of the clock of each sweep that was read.
-    clocks: Vec<Option<SweepClock>>,
+    /// The sweeps that were not forgotten; empty for a pair in one file.
+    known: VecDeque<KnownSweep>,
+    /// Number of sweeps before them.
+    forgotten: usize,
     poses: Option<Vec<RigidTransform>>,
     raster: Option<formats::GroundRaster>,
 }
 
+/// What is known of a sweep besides its points.
+struct KnownSweep {
+    /// The name of its file.
+    name: String,
+    /// What is known of its clock, once it was read.
+    clock: Option<SweepClock>,
+}
+
 impl Surroundings {
+    /// Adds a sweep to the end of the sequence.
+    pub(super) fn add(&mut self, path: &Path) {
+        self.known.push_back(KnownSweep {
+            name: path.to_string_lossy().into_owned(),
+            clock: None,
+        });
+    }
+
+    /// The index of the next sweep that is added.
+    pub(super) fn end(&self) -> usize {
+        self.forgotten + self.known.len()
+    }
+
+    /// Forgets the sweeps before the one with index `index`.
+    pub(super) fn forget_before(&mut self, index: usize) {
+        let count = index.saturating_sub(self.forgotten).min(self.known.len());
+        self.known.drain(..count);
+        self.forgotten += count;
+    }
+
     /// The options with the time between the two sweeps of a pair, where the options do not give it.
     pub(super) fn timed(&self, options: &JobOptions, [source, target]: [usize; 2]) -> JobOptions {
         let mut options = options.clone();
         let pair = [source, target];
-        let names = pair.map(|sweep| self.names.get(sweep).map_or("", String::as_str));
-        let clocks = pair.map(|sweep| self.clocks.get(sweep).copied().flatten());
+        let known = pair.map(|sweep| self.known.get(sweep.checked_sub(self.forgotten)?));
+        let names = known.map(|sweep| sweep.map_or("", |sweep| sweep.name.as_str()));
+        let clocks = known.map(|sweep| sweep?.clock);
         options.dt_s = options.dt_s.or_else(|| pair_interval_s(names, clocks));
         options
     }
@@ -322,7 +356,10 @@ impl Surroundings {
         if let Some(refused) = refused_times {
             eprintln!("fnsf: warning: {}: {refused}", path.display());
         }
-        self.clocks[index] = times.as_ref().map(PointTimes::clock);
+        let known = index.checked_sub(self.forgotten);
+        if let Some(sweep) = known.and_then(|index| self.known.get_mut(index)) {
+            sweep.clock = times.as_ref().map(PointTimes::clock);
+        }
         Ok(Sweep {
             ground: self.ground(index, &cloud.points),
             points: cloud.points,

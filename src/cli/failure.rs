@@ -62,6 +62,11 @@ impl Failure {
         }
     }
 
+    /// Whether an input file or its content is the reason.
+    pub(super) fn is_of_input(&self) -> bool {
+        self.kind == Kind::BadInput
+    }
+
     /// Whether the failure is printed.
     pub(super) fn is_worth_a_word(&self) -> bool {
         self.kind != Kind::ReaderGone

@@ -7,6 +7,7 @@
 
 mod commands;
 mod evaluation;
+mod follow;
 #[path = "../common/gpu.rs"]
 mod gpu_rule;
 mod hostile;

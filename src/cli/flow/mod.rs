@@ -1,0 +1,104 @@
+//! `fnsf flow`: scene flow of one pair, or of the consecutive pairs of a sequence.
+
+mod arguments;
+mod follow;
+mod output;
+mod pairs;
+mod print;
+
+use std::path::Path;
+
+pub(super) use self::arguments::Flow;
+use self::follow::{Arrivals, Latencies};
+use self::output::Arrival;
+use self::pairs::{Pairs, Taken};
+pub(super) use self::print::print_report;
+use super::estimation::check_sequence;
+use super::failure::Failure;
+use super::files;
+use crate::flow::{Control, Sweep};
+use crate::job::JobOptions;
+
+impl Flow {
+    pub(super) fn run(&self) -> Result<(), Failure> {
+        self.check_outputs()?;
+        let options = self.estimation.options()?;
+        self.follow.check(&self.tracks, &self.estimation)?;
+        if let Some(folder) = &self.follow.follow {
+            return self.run_folder(folder, options);
+        }
+        let mut given = None;
+        match self.sweeps.as_slice() {
+            [pair] => given = Some(files::read_pair(pair)?),
+            files => check_sequence(&options, files.len())?,
+        }
+        let count = given.as_ref().map_or(self.sweeps.len(), |_| 2);
+        let tracking = self.tracks.start(count, &options)?;
+        let surroundings = self.estimation.surroundings(&self.sweeps)?;
+        self.check_deskew(&surroundings, &options)?;
+        let mut pairs = Pairs::new(self, options, surroundings, tracking, count - 1)?;
+        match given {
+            Some(pair) => {
+                let (source, target) = match pair.ground {
+                    Some(ground) => (Some(ground.source), Some(ground.target)),
+                    None => (None, None),
+                };
+                for (points, ground) in [(pair.source, source), (pair.target, target)] {
+                    let sweep = Sweep {
+                        points,
+                        ground,
+                        times: None,
+                    };
+                    pairs.push(&sweep, Taken::default())?;
+                }
+            }
+            None => {
+                for path in &self.sweeps {
+                    let (sweep, taken) = pairs.read(path)?;
+                    pairs.push(&sweep, taken)?;
+                }
+            }
+        }
+        pairs.finish()
+    }
+
+    /// Estimates the pairs of a folder's sweeps as they are written.
+    fn run_folder(&self, folder: &Path, options: JobOptions) -> Result<(), Failure> {
+        check_sequence(&options, usize::MAX)?;
+        let surroundings = self.estimation.surroundings(&[])?;
+        let mut arrivals = Arrivals::watch(folder, &self.follow)?;
+        let mut pairs = Pairs::new(self, options, surroundings, None, usize::MAX)?;
+        let mut latencies = Latencies::default();
+        while let Some(arrived) = arrivals.next()? {
+            let waiting = arrivals.waiting();
+            pairs.surroundings.add(&arrived.path);
+            let taken = pairs.read(&arrived.path).and_then(|(sweep, taken)| {
+                let taken = Taken {
+                    arrived: Some(Arrival {
+                        due_s: self.follow.due_s(&arrived, pairs.terminal.seconds()),
+                        written: arrived.written,
+                        waiting,
+                    }),
+                    ..taken
+                };
+                pairs.push(&sweep, taken)
+            });
+            match taken {
+                Ok(()) => latencies.add(&pairs.take_latencies()),
+                // One bad sweep is no reason to miss all later ones.
+                Err(failure) if failure.is_of_input() => {
+                    let path = arrived.path.display();
+                    eprintln!(
+                        "fnsf: warning: {path}: {failure}; the sequence starts again after it"
+                    );
+                    pairs.restart();
+                }
+                Err(failure) => return Err(failure),
+            }
+        }
+        pairs.flush()?;
+        latencies.add(&pairs.take_latencies());
+        eprintln!("fnsf: {latencies}");
+        Ok(())
+    }
+}
