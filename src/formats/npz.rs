@@ -192,7 +192,7 @@ fn broken(error: zip::result::ZipError) -> FormatError {
 }
 
 /// Writes arrays one by one into an archive, as `numpy.savez` does. Flags and integers are
-/// compressed. Floats are not: it would take a third of a flow's time and save a fifth of the bytes.
+/// compressed. Floats are not: compressed, the file of a flow is only 3% smaller.
 pub(super) struct NpzWriter<W: Write + Seek> {
     archive: ZipWriter<W>,
 }

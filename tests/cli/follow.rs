@@ -185,6 +185,11 @@ fn what_does_not_go_with_a_folder_is_refused() {
         (with(&["--tracks", "t.json"]), 2, "tracks"),
         (with(&["--poses", "poses.txt"]), 2, "--poses"),
         (with(&["street/sweep_0000.pcd"]), 2, "cannot be used with"),
+        (
+            with(&["--deskew", "on", "--ego", "off"]),
+            2,
+            "--deskew on needs the ego motion",
+        ),
         (with(&["--idle-s", "0"]), 2, "positive"),
         (with(&["--due-ms", "0"]), 2, "--due-ms"),
         (vec!["flow", "--follow", "incoming"], 2, "--output"),

@@ -91,7 +91,7 @@ impl Flow {
     ) -> Result<(), Failure> {
         let refused = if self.deskew != DeskewChoice::On {
             return Ok(());
-        } else if self.sweeps.len() < 2 {
+        } else if self.sweeps.len() < 2 && self.follow.follow.is_none() {
             "the sweeps of an .npz pair have no times, which --deskew on needs"
         } else if surroundings.options(options, 0, [0, 1]).ego == Ego::Off {
             "--deskew on needs the ego motion: give --ego auto, or --poses"

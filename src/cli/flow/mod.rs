@@ -66,6 +66,7 @@ impl Flow {
     fn run_folder(&self, folder: &Path, options: JobOptions) -> Result<(), Failure> {
         check_sequence(&options, usize::MAX)?;
         let surroundings = self.estimation.surroundings(&[])?;
+        self.check_deskew(&surroundings, &options)?;
         let mut arrivals = Arrivals::watch(folder, &self.follow)?;
         let mut pairs = Pairs::new(self, options, surroundings, None, usize::MAX)?;
         let mut latencies = Latencies::default();

@@ -52,9 +52,11 @@ pub(super) struct Hypothesis {
 /// The best of the motions considered so far.
 struct BestHypothesis {
     motion: PlanarMotion,
+    /// Cost in the target.
     cost: Cost,
-    /// Value that is minimized, metres: the cost in the target and in the neighbor sweeps, plus a
-    /// penalty.
+    /// Cost in the target and in the neighbor sweeps, metres.
+    total_m: f32,
+    /// Value that is minimized, metres: the total cost plus a penalty.
     value_m: f32,
 }
 
@@ -67,6 +69,7 @@ impl BestHypothesis {
                 forward_m: f32::INFINITY,
                 backward_m: f32::INFINITY,
             },
+            total_m: f32::INFINITY,
             value_m: f32::INFINITY,
         }
     }
@@ -83,11 +86,13 @@ impl BestHypothesis {
         let Some(cost) = mover.cost_below(&motion, self.value_m - more_m, around) else {
             return;
         };
-        let value_m = cost.sum_m() + more_m + mover.neighbor_cost_m(&motion);
+        let neighbors_m = mover.neighbor_cost_m(&motion);
+        let value_m = cost.sum_m() + more_m + neighbors_m;
         if value_m < self.value_m {
             *self = Self {
                 motion,
                 cost,
+                total_m: cost.sum_m() + neighbors_m,
                 value_m,
             };
         }
@@ -149,14 +154,13 @@ impl ClusterSearch<'_> {
         if !(shifted || turned) {
             return None;
         }
-        let cost_m = |best: &BestHypothesis| best.cost.sum_m() + self.neighbor_cost_m(&best.motion);
         let [after_fit, after_search] = LEAST_LEFT;
-        let mut is_left = is_open(&best.motion, after_fit * cost_m(&best));
+        let mut is_left = is_open(&best.motion, after_fit * best.total_m);
         if is_left {
             let motion = self.fitted(self.neighbors, &self.rows, &best.motion, turned, STEPS[1]);
             best = BestHypothesis::none();
             best.consider(self, motion, 0.0, None);
-            is_left = is_open(&best.motion, after_search * cost_m(&best));
+            is_left = is_open(&best.motion, after_search * best.total_m);
         }
         if is_left {
             self.try_shifts(&mut best);

@@ -28,8 +28,9 @@ use crate::flow::spatial::dbscan;
 const CLUSTERS_AT_ONCE: usize = 32;
 /// Expected time to match the clouds, relative to that of preparing each: 0.1 to 0.2, with a margin.
 const SCENES: f64 = 0.3;
-/// Expected time of the stages after the cluster searches, relative to that of all before them.
-const REST: f64 = 0.5;
+/// Expected time of the stages after the cluster searches, relative to that of all before them: 0.6
+/// to 1, the latter with a million points.
+const REST: f64 = 1.0;
 
 /// The clouds of an object search, metres.
 #[derive(Clone, Copy, Debug)]

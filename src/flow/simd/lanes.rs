@@ -37,7 +37,7 @@ pub(in crate::flow) unsafe trait Lanes: Copy {
     unsafe fn where_equal(self, a: Self, b: Self, other: Self) -> Self;
     /// One bit a float, the first one lowest: whether it is less than that of `other`.
     unsafe fn less(self, other: Self) -> u32;
-    /// The least of the floats, none of which is NaN.
+    /// The minimum of the floats. No float may be NaN.
     unsafe fn least(self) -> f32;
 }
 
