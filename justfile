@@ -36,6 +36,15 @@ bench name:
 experiment name *arguments:
     cargo bench --bench accuracy -- {{name}} {{arguments}}
 
+# fuzz targets, all or some, so many minutes together: just fuzz 30 pcd queue
+fuzz minutes *targets:
+    fuzz/run {{minutes}} {{targets}}
+
+# a server under load, kills and pauses: just soak 60 --state /tmp/soak
+soak minutes *options:
+    cargo build --release --locked
+    tests/soak/run {{minutes}} {{options}}
+
 # a simulated street through the service, with the picture in demo/
 demo:
     cargo run --release -- demo

@@ -32,14 +32,19 @@ impl Fault {
     /// Classifies an error by the first operating system error in its chain of causes. Without one
     /// it is [`Fault::Machine`].
     pub fn of(error: &(dyn Error + 'static)) -> Self {
+        Self::io_error(error).map_or(Self::Machine, Self::of_io)
+    }
+
+    /// The first operating system error in the chain of causes of an error.
+    pub fn io_error<'a>(error: &'a (dyn Error + 'static)) -> Option<&'a io::Error> {
         let mut cause = Some(error);
         while let Some(error) = cause {
             if let Some(error) = error.downcast_ref::<io::Error>() {
-                return Self::of_io(error);
+                return Some(error);
             }
             cause = error.source();
         }
-        Self::Machine
+        None
     }
 }
 

@@ -1,4 +1,4 @@
-//! Formatting of numbers for people.
+//! Text for people: numbers, and text from outside.
 
 /// Formats `1234567` as `1,234,567`.
 pub(crate) fn grouped(number: usize) -> String {
@@ -13,9 +13,45 @@ pub(crate) fn grouped(number: usize) -> String {
     out
 }
 
+/// Text from outside on one line: control characters, which would steer a terminal, as escapes.
+#[cfg(feature = "service")]
+pub(crate) fn printable(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for letter in text.chars() {
+        match letter {
+            '\n' | '\r' => out.push(' '),
+            letter if letter.is_control() => out.extend(letter.escape_default()),
+            letter => out.push(letter),
+        }
+    }
+    out
+}
+
+/// A URL without its user and password.
+#[cfg(feature = "service")]
+pub(crate) fn without_user(url: &str) -> String {
+    let Some((scheme, rest)) = url.split_once("://") else {
+        return url.to_owned();
+    };
+    let end = rest.find(['/', '?', '#']).unwrap_or(rest.len());
+    match rest[..end].rfind('@') {
+        None => url.to_owned(),
+        Some(at) => format!("{scheme}://{}", &rest[at + 1..]),
+    }
+}
+
 #[cfg(test)]
 mod tests {
-    use super::grouped;
+    use super::*;
+
+    #[cfg(feature = "service")]
+    #[test]
+    fn text_from_outside_steers_no_terminal_and_shows_no_password() {
+        assert_eq!(printable("a\x1b[31m\nb\u{9b}"), "a\\u{1b}[31m b\\u{9b}");
+        assert_eq!(without_user("https://u:p@h/a@b"), "https://h/a@b");
+        assert_eq!(without_user("s3://bucket/a@b"), "s3://bucket/a@b");
+        assert_eq!(without_user("u:p@h"), "u:p@h");
+    }
 
     #[test]
     fn digits_are_grouped_by_three() {

@@ -7,7 +7,7 @@ use constant_time_eq::constant_time_eq_32;
 use serde::{Deserialize, Serialize};
 
 use super::error::ApiError;
-use super::share::ShareToken;
+use super::share::{self, ShareToken};
 use crate::clock::Timestamp;
 use crate::job::{Job, JobId, Priority, Tenant};
 
@@ -103,7 +103,25 @@ pub enum InvalidKey {
 /// All keys of a server. Only hashes of the keys are stored.
 #[derive(Clone, Debug, Default)]
 pub struct Keys {
-    known: Vec<([u8; 32], Caller)>,
+    known: Vec<Known>,
+}
+
+#[derive(Clone, Debug)]
+struct Known {
+    hash: [u8; 32],
+    /// The key that signs share links. It is slow to derive, because a link can be tried with guessed keys.
+    signer: [u8; 32],
+    caller: Caller,
+}
+
+/// The key of a bearer token.
+fn bearer(authorization: Option<&str>) -> Option<&str> {
+    let (scheme, key) = authorization?.split_once(' ')?;
+    scheme.eq_ignore_ascii_case("bearer").then_some(key.trim())
+}
+
+fn hash_of(key: &str) -> [u8; 32] {
+    *blake3::hash(key.as_bytes()).as_bytes()
 }
 
 impl Keys {
@@ -122,17 +140,21 @@ impl Keys {
         if key.trim() != key || !key.bytes().all(|byte| matches!(byte, b' '..=b'~')) {
             return Err(InvalidKey::Unsendable(caller.tenant));
         }
-        let hash = *blake3::hash(key.as_bytes()).as_bytes();
-        if self.known.iter().any(|(known, _)| *known == hash) {
+        let hash = hash_of(key);
+        if self.known.iter().any(|known| known.hash == hash) {
             return Err(InvalidKey::Twice(caller.tenant));
         }
-        self.known.push((hash, caller));
+        self.known.push(Known {
+            hash,
+            signer: share::signer(&hash),
+            caller,
+        });
         Ok(())
     }
 
     /// Whether there are keys of more than one tenant.
     pub fn has_several_tenants(&self) -> bool {
-        let mut tenants = self.known.iter().map(|(_, caller)| &caller.tenant);
+        let mut tenants = self.known.iter().map(|known| &known.caller.tenant);
         let first = tenants.next();
         tenants.any(|tenant| Some(tenant) != first)
     }
@@ -162,16 +184,13 @@ impl Keys {
                 shared_job: None,
             });
         }
-        let shown = authorization.and_then(|value| {
-            let (scheme, key) = value.split_once(' ')?;
-            scheme.eq_ignore_ascii_case("bearer").then_some(key.trim())
-        });
-        let hash = *blake3::hash(shown.unwrap_or_default().as_bytes()).as_bytes();
+        let shown = bearer(authorization);
+        let hash = hash_of(shown.unwrap_or_default());
         // All keys are compared, so the response time does not depend on the key that matches.
         let mut found = None;
-        for (known, caller) in &self.known {
-            if constant_time_eq_32(known, &hash) {
-                found = Some(caller);
+        for known in &self.known {
+            if constant_time_eq_32(&known.hash, &hash) {
+                found = Some(&known.caller);
             }
         }
         match found {
@@ -183,8 +202,9 @@ impl Keys {
     /// The caller that the token of a share link identifies.
     fn guest(&self, shown: &str) -> Result<Caller, ApiError> {
         let token = ShareToken::parse(shown).ok_or(ApiError::Unauthenticated)?;
-        let signer = self.known.iter().find(|(key, _)| token.is_signed_by(key));
-        let (_, signer) = signer.ok_or(ApiError::Unauthenticated)?;
+        let mut known = self.known.iter();
+        let signer = known.find(|known| token.is_signed_by(&known.signer));
+        let signer = &signer.ok_or(ApiError::Unauthenticated)?.caller;
         token.check_expiry(Timestamp::now())?;
         Ok(Caller {
             tenant: signer.tenant.clone(),
@@ -194,12 +214,19 @@ impl Keys {
         })
     }
 
-    /// The token of a share link to a job of this tenant. `None` on a server without keys, where a
-    /// reader needs no token.
-    pub(super) fn share(&self, tenant: &Tenant, job: JobId, expires: Timestamp) -> Option<String> {
+    /// The token of a share link to a job, signed by the key in the value of the header `authorization`:
+    /// without this key in the configuration it is void. `None` on a server without keys, where a reader
+    /// needs no token.
+    pub(super) fn share(
+        &self,
+        authorization: Option<&str>,
+        job: JobId,
+        expires: Timestamp,
+    ) -> Option<String> {
+        let hash = hash_of(bearer(authorization).unwrap_or_default());
         let mut known = self.known.iter();
-        let (key, _) = known.find(|(_, caller)| caller.tenant == *tenant)?;
-        Some(ShareToken::sign(key, job, expires).to_string())
+        let key = known.find(|known| constant_time_eq_32(&known.hash, &hash))?;
+        Some(ShareToken::sign(&key.signer, job, expires).to_string())
     }
 }
 
@@ -223,10 +250,13 @@ mod tests {
         let now = Timestamp::now();
         let soon = now.after(std::time::Duration::from_secs(60));
         let tenant: Tenant = "a".parse().expect("a name");
-        assert_eq!(keys.share(&tenant, job, soon), None);
-        keys.add("0123456789abcdef", caller("a", Role::Write))
-            .expect("a key");
-        let link = |expires| keys.share(&tenant, job, expires).expect("a key");
+        assert_eq!(keys.share(None, job, soon), None);
+        for key in ["of another user", "0123456789abcdef"] {
+            let padded = format!("{key:_<16}");
+            keys.add(&padded, caller("a", Role::Write)).expect("a key");
+        }
+        let own = Some("Bearer 0123456789abcdef");
+        let link = |expires| keys.share(own, job, expires).expect("a key");
         let guest = keys.caller(Some(&format!("Bearer {}", link(soon))));
         let guest = guest.expect("a good link");
         assert_eq!(
@@ -238,8 +268,9 @@ mod tests {
         let expired = keys.caller(Some(&format!("Bearer {}", link(now))));
         assert_eq!(expired, Err(ApiError::LinkExpired));
         let mut others = Keys::default();
+        // The key that signed it is gone; another one of the tenant is not.
         others
-            .add("fedcba9876543210", caller("a", Role::Write))
+            .add("of another user_", caller("a", Role::Write))
             .expect("a key");
         let foreign = others.caller(Some(&format!("Bearer {}", link(soon))));
         assert_eq!(foreign, Err(ApiError::Unauthenticated));

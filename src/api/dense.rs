@@ -9,6 +9,7 @@ use std::sync::Arc;
 use super::admission::Admission;
 use super::codec;
 use super::error::ApiError;
+use super::lost::damaged;
 use super::result_budget::{Encoded, ResultReservation};
 use super::service::Service;
 use crate::cost::CostModel;
@@ -153,7 +154,8 @@ impl Service {
 
     async fn read_dense(&self, job: &Job) -> Result<DenseCloud, ApiError> {
         let bytes = self.result_bytes(job).await?;
-        let read = move || StoredDense::from_bytes(&bytes).map_err(ApiError::internal);
+        let id = job.id;
+        let read = move || StoredDense::from_bytes(&bytes).map_err(|error| damaged(id, error));
         let StoredDense(cloud) = self.compute(&job.tenant, read).await?;
         Ok(cloud)
     }
@@ -175,18 +177,21 @@ impl Service {
         }
         Self::check_success(job)?;
         let room = self.room_for_result(job).await?;
-        let _turn = self.clouds.acquire().await.map_err(ApiError::internal)?;
+        let turn = Arc::clone(&self.clouds).acquire_owned().await;
+        let turn = turn.map_err(ApiError::internal)?;
         if let Some(made) = self.answers.made(&name) {
             return Ok(made);
         }
         let began = std::time::Instant::now();
         let cloud = self.read_dense(job).await?;
         let encode = move || {
+            // The work goes on when its caller has gone, and so do its turn and its memory.
+            let _turn = turn;
             let mut bytes = Vec::new();
             write_dense(format, &cloud, &mut bytes).map_err(ApiError::internal)?;
-            Ok(bytes)
+            Ok(room.hold(bytes))
         };
-        let encoded = room.hold(self.compute(&job.tenant, encode).await?);
+        let encoded = self.compute(&job.tenant, encode).await?;
         self.answers.keep(name, &encoded);
         self.metrics
             .phase("encode", began.elapsed().as_secs_f64(), Some(job));

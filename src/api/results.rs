@@ -9,11 +9,12 @@ use bytes::Bytes;
 use super::codec::AnswerFormat;
 use super::dense::is_dense;
 use super::error::ApiError;
+use super::lost::{damaged, lost_or};
 use super::result_budget::{Encoded, ResultReservation};
 use super::service::Service;
-use crate::job::{Job, JobId, Kind, Report, State};
+use crate::job::{Job, Kind, Report, State};
 use crate::payload::{StoredCloud, StoredFlow};
-use crate::storage::{Blob, BlobError};
+use crate::storage::Blob;
 
 /// A flow with its report, ready to be sent.
 #[derive(Clone)]
@@ -29,17 +30,21 @@ pub struct Answer {
 }
 
 impl Service {
-    /// Whether a job has succeeded but its result is missing from the store.
+    /// Whether a job has succeeded but its result is missing from the store, or damaged.
     pub(super) async fn result_is_lost(&self, job: &Job) -> Result<bool, ApiError> {
         let has_result = job.kind == Kind::Pair || is_dense(job);
         if job.state != State::Succeeded || !has_result {
             return Ok(false);
         }
-        match self.blobs.size(job.id, Blob::Result(job.attempt)).await {
-            Ok(_) => Ok(false),
-            Err(error) if error.is_missing() => Ok(true),
-            Err(error) => Err(error.into()),
-        }
+        let is_lost = |error| match error {
+            ApiError::ResultLost(_) => Ok(true),
+            error => Err(error),
+        };
+        let read = match is_dense(job) {
+            true => self.dense_cloud(job).await.map(drop),
+            false => self.flow(job).await.map(drop),
+        };
+        read.map_or_else(is_lost, |()| Ok(false))
     }
 
     /// Reserves memory to read, decode and encode a job's result.
@@ -89,22 +94,28 @@ impl Service {
     ///   [`ApiError::Expired`] if the job has not succeeded.
     /// - [`ApiError::BadRequest`] for a sequence.
     /// - [`ApiError::ServerFull`] if no memory for the result becomes free within 5 s.
-    /// - [`ApiError::ResultLost`] if the stored flow is missing.
+    /// - [`ApiError::ResultLost`] if the stored flow is missing or damaged.
     /// - [`ApiError::StoreUnavailable`] or [`ApiError::DiskFull`] if the store fails.
-    /// - [`ApiError::Internal`] if the stored flow or report cannot be decoded, or the job failed
-    ///   without a stored reason.
+    /// - [`ApiError::Internal`] if the stored report cannot be decoded, or the job failed without a
+    ///   stored reason.
     pub async fn answer(&self, job: &Arc<Job>) -> Result<Answer, ApiError> {
         let report = Self::report(job)?;
-        let mut room = self.room_for_result(job).await?;
-        let bytes = self.result_bytes(job).await?;
-        let flow = StoredFlow::from_bytes(&bytes).map_err(ApiError::internal)?;
-        room.shrink(2 * bytes.len());
+        let (flow, room) = self.flow(job).await?;
         Ok(Answer {
             job: Arc::clone(job),
             report,
             flow: Arc::new(flow),
             room: Arc::new(room),
         })
+    }
+
+    /// The stored flow of a pair.
+    async fn flow(&self, job: &Job) -> Result<(StoredFlow, ResultReservation), ApiError> {
+        let mut room = self.room_for_result(job).await?;
+        let bytes = self.result_bytes(job).await?;
+        let flow = StoredFlow::from_bytes(&bytes).map_err(|error| damaged(job.id, error))?;
+        room.shrink(2 * bytes.len());
+        Ok((flow, room))
     }
 
     /// Encodes the flow of a pair that has succeeded. Returns the cached result of an earlier
@@ -124,7 +135,7 @@ impl Service {
         }
         let began = std::time::Instant::now();
         let room = self.room_for_result(job).await?;
-        let _turn = self.encoding.wait(&job.tenant).await;
+        let turn = self.encoding.wait(&job.tenant).await;
         if let Some(made) = self.answers.made(&name) {
             return Ok(made);
         }
@@ -137,32 +148,26 @@ impl Service {
             None
         };
         let id = job.id.to_string();
+        let job_id = job.id;
         let encode = move || {
-            let flow = StoredFlow::from_bytes(&bytes).map_err(ApiError::internal)?;
+            // The work goes on when its caller has gone, and so do its turn and its memory.
+            let _turn = turn;
+            let flow = StoredFlow::from_bytes(&bytes).map_err(|error| damaged(job_id, error))?;
             let cloud = points
                 .map(|bytes| StoredCloud::from_bytes(&bytes))
                 .transpose();
             let points = cloud
-                .map_err(ApiError::internal)?
+                .map_err(|error| damaged(job_id, error))?
                 .unwrap_or_default()
                 .points;
-            format.encode(&flow, &points, &report, &id)
+            let encoded = format.encode(&flow, &points, &report, &id)?;
+            Ok::<_, ApiError>(room.hold(encoded))
         };
         let done = tokio::task::spawn_blocking(encode).await;
-        let encoded = room.hold(done.map_err(ApiError::internal)??);
+        let encoded = done.map_err(ApiError::internal)??;
         self.answers.keep(name, &encoded);
         self.metrics
             .phase("encode", began.elapsed().as_secs_f64(), Some(job));
         Ok(encoded)
-    }
-}
-
-/// Maps a missing blob to [`ApiError::ResultLost`].
-pub(super) fn lost_or(id: JobId, error: BlobError) -> ApiError {
-    if error.is_missing() {
-        tracing::error!(%error, job = %id, "a result is lost");
-        ApiError::ResultLost(id)
-    } else {
-        error.into()
     }
 }

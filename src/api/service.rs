@@ -21,13 +21,16 @@ use super::waiters::{Awaited, Ending, Waiters};
 use crate::health::StoreHealth;
 use crate::job::{Job, JobId, JobOptions, Kind, Priority, State, Tenant};
 use crate::metrics::Metrics;
-use crate::queue::{Filter, Queue, QueueError};
+use crate::queue::{Queue, QueueError};
 use crate::remote::{Sources, Webhooks};
 use crate::storage::{Blob, Blobs, FreeSpace};
 use crate::sync::Exchange;
 
 /// Maximum number of zip archives and dense clouds that are being sent at the same time.
 const MAX_ARCHIVES: usize = 16;
+
+/// Maximum number of sweeps that are fetched by URI at a time.
+const MAX_FETCHES: usize = 32;
 
 /// Maximum age of the last measurement of free disk space. When it is older, the disk is assumed to
 /// hang.
@@ -56,7 +59,9 @@ pub struct Service {
     /// while the client reads.
     pub(super) archives: Arc<TenantPermits>,
     /// Permit for reading and encoding one dense cloud at a time.
-    pub(super) clouds: Semaphore,
+    pub(super) clouds: Arc<Semaphore>,
+    /// Permits for sweeps that are fetched by URI.
+    pub(super) fetches: FairQueue,
     /// Whether the server is ready, as `/readyz` says. The gRPC health service follows it.
     pub(super) ready: watch::Sender<bool>,
     draining: AtomicBool,
@@ -125,7 +130,8 @@ impl Service {
             compute: FairQueue::new(cores),
             encoding: FairQueue::new(cores),
             archives: Arc::new(TenantPermits::new(MAX_ARCHIVES, several)),
-            clouds: Semaphore::new(1),
+            clouds: Arc::new(Semaphore::new(1)),
+            fetches: FairQueue::new(MAX_FETCHES),
             ready: watch::Sender::new(false),
             draining: AtomicBool::new(false),
             closing: CancellationToken::new(),
@@ -193,9 +199,13 @@ impl Service {
         tenant: &Tenant,
         work: impl FnOnce() -> Result<T, ApiError> + Send + 'static,
     ) -> Result<T, ApiError> {
-        let _turn = self.compute.wait(tenant).await;
-        let done = tokio::task::spawn_blocking(work).await;
-        done.map_err(ApiError::internal)?
+        let turn = self.compute.wait(tenant).await;
+        let done = tokio::task::spawn_blocking(move || {
+            // The work goes on when its caller has gone, and so does its turn.
+            let _turn = turn;
+            work()
+        });
+        done.await.map_err(ApiError::internal)?
     }
 
     /// Refuses new work when the disk is nearly full (bytes or inodes), or when the store fails or
@@ -287,33 +297,6 @@ impl Service {
                 Ok(pairs)
             }
         }
-    }
-
-    /// The jobs of the caller's tenant, latest first. The pairs of sequences are not listed.
-    /// `state` filters by state, `label` (`name=value`) by label, `before` returns only older jobs, and `limit` is the maximum
-    /// number of jobs.
-    ///
-    /// # Errors
-    /// [`ApiError::Forbidden`] for a caller with a share link.
-    /// [`ApiError::StoreUnavailable`], [`ApiError::DiskFull`] or [`ApiError::Draining`] if the
-    /// queue fails or is closed.
-    pub async fn jobs(
-        &self,
-        caller: &Caller,
-        state: Option<State>,
-        label: Option<String>,
-        before: Option<JobId>,
-        limit: u32,
-    ) -> Result<Vec<Arc<Job>>, ApiError> {
-        caller.has_key()?;
-        let filter = Filter {
-            tenant: caller.tenant.clone(),
-            state,
-            label,
-            before,
-            limit,
-        };
-        Ok(self.queue.list(filter).await?)
     }
 
     /// Cancels a job of the caller's tenant and returns it. A queued job ends at once. A running

@@ -1,8 +1,8 @@
 //! Share links: tokens that give read access to one job until they expire.
 //!
 //! A token is sent like a key: `Authorization: Bearer share.JOB.EXPIRY.CODE`. `EXPIRY` is in
-//! milliseconds since 1970, UTC. `CODE` is a keyed hash of job and expiry. Its key is derived from an API key, so
-//! every node with this API key accepts the token, and nothing is stored. Without the API key in the
+//! milliseconds since 1970, UTC. `CODE` is a keyed hash of job and expiry. Its key is derived from the API key of
+//! the caller who shares, so every node with this API key accepts the token, and nothing is stored. Without the API key in the
 //! configuration the token is void.
 
 use constant_time_eq::constant_time_eq_32;
@@ -15,7 +15,11 @@ use crate::job::JobId;
 const PREFIX: &str = "share";
 
 /// Context of the key derivation.
-const CONTEXT: &str = "fnsf share links of jobs, version 1";
+const CONTEXT: &str = "fnsf share links of jobs, version 2";
+
+/// Rounds of the key derivation: some ten milliseconds, so that who has a link tries a hundred API keys
+/// a second and not millions.
+const ROUNDS: u32 = 1 << 16;
 
 /// The content of a token, not yet verified.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -28,12 +32,12 @@ pub(super) struct ShareToken {
 }
 
 impl ShareToken {
-    /// A token for `job` that is signed by the hash of an API key.
-    pub(super) fn sign(key_hash: &[u8; 32], job: JobId, expires: Timestamp) -> Self {
+    /// A token for `job`, signed by the [`signer`] of an API key.
+    pub(super) fn sign(signer: &[u8; 32], job: JobId, expires: Timestamp) -> Self {
         Self {
             job,
             expires,
-            code: code(key_hash, job, expires),
+            code: code(signer, job, expires),
         }
     }
 
@@ -52,9 +56,9 @@ impl ShareToken {
         })
     }
 
-    /// Whether the hash of this API key has signed the token. The comparison takes constant time.
-    pub(super) fn is_signed_by(&self, key_hash: &[u8; 32]) -> bool {
-        constant_time_eq_32(&self.code, &code(key_hash, self.job, self.expires))
+    /// Whether this [`signer`] has signed the token. The comparison takes constant time.
+    pub(super) fn is_signed_by(&self, signer: &[u8; 32]) -> bool {
+        constant_time_eq_32(&self.code, &code(signer, self.job, self.expires))
     }
 
     /// Refuses a token after its expiry.
@@ -78,10 +82,18 @@ impl std::fmt::Display for ShareToken {
     }
 }
 
-fn code(key_hash: &[u8; 32], job: JobId, expires: Timestamp) -> [u8; 32] {
-    let key = blake3::derive_key(CONTEXT, key_hash);
+/// The key that signs tokens, from the hash of an API key.
+pub(super) fn signer(key_hash: &[u8; 32]) -> [u8; 32] {
+    let mut key = blake3::derive_key(CONTEXT, key_hash);
+    for _ in 0..ROUNDS {
+        key = *blake3::hash(&key).as_bytes();
+    }
+    key
+}
+
+fn code(signer: &[u8; 32], job: JobId, expires: Timestamp) -> [u8; 32] {
     let text = format!("{job}.{}", expires.as_millis());
-    *blake3::keyed_hash(&key, text.as_bytes()).as_bytes()
+    *blake3::keyed_hash(signer, text.as_bytes()).as_bytes()
 }
 
 #[cfg(test)]

@@ -3,8 +3,8 @@
 //! Independent of HTTP and gRPC types.
 
 use super::error::ApiError;
+use super::lost::{damaged, lost_or};
 use super::result_budget::Encoded;
-use super::results::lost_or;
 use super::service::Service;
 use crate::job::{Job, JobId, Kind};
 use crate::payload::{StoredCloud, points_to_le_bytes};
@@ -39,11 +39,12 @@ impl Service {
         let room = self.answers.room(&job.tenant, FACTOR * size).await?;
         let bytes = self.blobs.get(owner, blob).await;
         let bytes = bytes.map_err(|error| lost_or(job.id, error))?;
+        let id = job.id;
         let pack = move || {
-            let cloud = StoredCloud::from_bytes(&bytes).map_err(ApiError::internal)?;
-            Ok(points_to_le_bytes(&cloud.points))
+            let cloud = StoredCloud::from_bytes(&bytes).map_err(|error| damaged(id, error))?;
+            Ok(room.hold(points_to_le_bytes(&cloud.points)))
         };
-        Ok(room.hold(self.compute(&job.tenant, pack).await?))
+        self.compute(&job.tenant, pack).await
     }
 
     /// Where a sweep of a job is stored.

@@ -5,8 +5,8 @@
 use std::sync::Arc;
 
 use super::error::ApiError;
+use super::lost::{damaged, lost_or};
 use super::result_budget::Encoded;
-use super::results::lost_or;
 use super::service::Service;
 use crate::flow::tracks::{ClusteredSweep, Track, Tracker};
 use crate::formats::write_tracks;
@@ -73,15 +73,18 @@ impl Service {
     /// Adds the source sweep of a pair to the tracker.
     async fn track(&self, mut tracker: Tracker, pair: &Arc<Job>) -> Result<Tracker, ApiError> {
         let dt_s = Self::report(pair)?.dt_s as f32;
-        let _room = self.room_for_result(pair).await?;
-        let _turn = self.encoding.wait(&pair.tenant).await;
+        let room = self.room_for_result(pair).await?;
+        let turn = self.encoding.wait(&pair.tenant).await;
         let flow = self.result_bytes(pair).await?;
         let (owner, [source, _]) = pair.sweeps();
         let cloud = self.blobs.get(owner, Blob::Sweep(source)).await;
         let cloud = cloud.map_err(|error| lost_or(pair.id, error))?;
+        let id = pair.id;
         let track = move || {
-            let flow = StoredFlow::from_bytes(&flow).map_err(ApiError::internal)?;
-            let cloud = StoredCloud::from_bytes(&cloud).map_err(ApiError::internal)?;
+            // The work goes on when its caller has gone, and so do its turn and its memory.
+            let _held = (turn, room);
+            let flow = StoredFlow::from_bytes(&flow).map_err(|error| damaged(id, error))?;
+            let cloud = StoredCloud::from_bytes(&cloud).map_err(|error| damaged(id, error))?;
             let (Some(objects), Some(ego)) = (&flow.objects, &flow.ego) else {
                 let text =
                     "tracks need clusters and the ego motion: use the preset default or label";

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context, bail};
 
+use super::process::keep_files_private;
 use crate::queue::{copy_sqlite, read_copy};
 use crate::storage::{Copied, copy_store, keep_only};
 
@@ -27,13 +28,27 @@ pub struct Backup {
 /// If `to` exists and is not empty, `data_dir` has no queue of this program's version or no payloads,
 /// or a file cannot be read or written.
 pub fn backup(data_dir: &Path, to: &Path) -> anyhow::Result<Backup> {
-    make_empty(to)?;
+    keep_files_private();
     let (blobs, copy) = (data_dir.join("blobs"), to.join("blobs"));
     if !blobs.join("identity").exists() {
         bail!(
             "{} has no payloads of a queue: of nodes with queue.postgres or storage, back up the \
              database and the bucket",
             data_dir.display()
+        );
+    }
+    make_empty(to)?;
+    let inside = |folder: &Path| {
+        Some(
+            to.canonicalize()
+                .ok()?
+                .starts_with(folder.canonicalize().ok()?),
+        )
+    };
+    if inside(data_dir) == Some(true) {
+        bail!(
+            "{} lies in the data directory: name a folder outside of it",
+            to.display()
         );
     }
     let copying = || format!("cannot copy {} to {}", blobs.display(), copy.display());
@@ -64,6 +79,7 @@ pub fn restore(from: &Path, data_dir: &Path) -> anyhow::Result<Backup> {
     if identity.trim() != queue.identity.to_string() {
         bail!("the queue and the payloads of the backup are not of one server");
     }
+    keep_files_private();
     make_empty(data_dir)?;
     let copying = || format!("cannot copy {} to {}", from.display(), data_dir.display());
     let files = copy_store(&from.join("blobs"), &data_dir.join("blobs")).with_context(copying)?;

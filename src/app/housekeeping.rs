@@ -27,6 +27,9 @@ const PROBE_INTERVAL: Duration = Duration::from_secs(2);
 /// its job is accepted, so a young payload without a job is normal.
 const ORPHANS: Duration = Duration::from_secs(3600);
 
+/// Time from the start to the first scan: a server that is often started again scans, too.
+const FIRST_SCAN: Duration = Duration::from_secs(300);
+
 /// Orphans removed in one scan, oldest first. A crash leaves a few. Far more than this point to a
 /// fault, and the limit leaves an operator time to find it.
 const MOST_ORPHANS: usize = 1000;
@@ -183,7 +186,7 @@ async fn look(devices: Vec<Device>, metrics: Arc<Metrics>) {
 
 /// Removes orphaned payloads. A crash interrupted their upload, so their job was never accepted.
 async fn clean(queue: Arc<dyn Queue>, blobs: Blobs) {
-    let mut ticks = interval_at(tokio::time::Instant::now() + ORPHANS, ORPHANS);
+    let mut ticks = interval_at(tokio::time::Instant::now() + FIRST_SCAN, ORPHANS);
     loop {
         ticks.tick().await;
         match blobs.remove_cut_off(ORPHANS).await {

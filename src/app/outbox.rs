@@ -1,25 +1,34 @@
 //! The actions that the queue has promised and that lie outside of it: removing the files of forgotten
 //! jobs, and telling webhooks of the end of jobs.
 
+use std::collections::HashMap;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use futures_util::StreamExt;
 use futures_util::stream::FuturesUnordered;
+use futures_util::{FutureExt, StreamExt};
 use tokio::sync::Notify;
 
 use crate::clock::Timestamp;
 use crate::metrics::Metrics;
-use crate::queue::{Action, Outgoing, Queue};
+use crate::queue::{Action, Outgoing, Queue, Settled};
 use crate::remote::Webhooks;
 use crate::storage::Blobs;
 
 /// Number of actions at a time.
-const AT_ONCE: u32 = 64;
+const AT_ONCE: usize = 64;
 
 /// Time for which no other node gets the actions that this one has taken. It is longer than the
 /// slowest of them.
 const HOLD: Duration = Duration::from_secs(60);
+
+/// Number of notices that one receiver is told at a time.
+const OF_ONE_RECEIVER: usize = 8;
+/// A receiver that has this many to answer and has been silent for this long is left alone.
+const ANSWERS_WITHIN: Duration = Duration::from_secs(2);
+/// When a further notice of a receiver is taken again that answers, and of one that does not.
+const BUSY_DELAY: Duration = Duration::from_millis(200);
+const SILENT_DELAY: Duration = Duration::from_secs(15);
 
 /// Maximum time between two looks into the outbox: what other nodes have left is found then.
 const POLL: Duration = Duration::from_secs(2);
@@ -41,33 +50,57 @@ pub(super) struct Outbox {
     pub(super) bell: Arc<Notify>,
 }
 
+/// An action that has been tried: its number, what has become of it, and the receiver that it went to.
+type Tried = (i64, Settled, Option<String>);
+
 impl Outbox {
-    /// Goes on for as long as the server runs.
+    /// Goes on for as long as the server runs. An action that takes long holds up no other one, except
+    /// those of its own receiver.
     pub(super) async fn run(self) {
+        let mut receivers = Receivers::default();
+        let mut acting = FuturesUnordered::new();
         loop {
-            match self.queue.take_outgoing(AT_ONCE, HOLD).await {
-                Ok(taken) if taken.is_empty() => {}
-                Ok(taken) => {
-                    self.work_off(taken).await;
-                    continue;
+            let room = (AT_ONCE - acting.len()) as u32;
+            let taken = match room {
+                0 => Vec::new(),
+                room => self
+                    .queue
+                    .take_outgoing(room, HOLD)
+                    .await
+                    .unwrap_or_else(|error| {
+                        tracing::debug!(%error, "the outbox cannot be read");
+                        Vec::new()
+                    }),
+            };
+            let found = !taken.is_empty();
+            let mut settled = Vec::new();
+            for one in taken {
+                match receivers.begin(&one, Instant::now()) {
+                    Ok(receiver) => acting.push(self.act(one, receiver)),
+                    Err(delay) => settled.push((one.number, Settled::NotTried(delay))),
                 }
-                Err(error) => tracing::debug!(%error, "the outbox cannot be read"),
             }
-            let _either = tokio::time::timeout(POLL, self.bell.notified()).await;
+            if !found {
+                let soon = tokio::time::timeout(POLL, self.bell.notified());
+                tokio::select! {
+                    Some(tried) = acting.next() => settled.push(receivers.end(tried)),
+                    _either = soon => {}
+                }
+            }
+            while let Some(Some(tried)) = acting.next().now_or_never() {
+                settled.push(receivers.end(tried));
+            }
+            // Otherwise they are due again when the hold is over.
+            if !settled.is_empty()
+                && let Err(error) = self.queue.settle(settled).await
+            {
+                tracing::warn!(%error, "what was done is done again");
+            }
         }
     }
 
-    async fn work_off(&self, taken: Vec<Outgoing>) {
-        let all: FuturesUnordered<_> = taken.iter().map(|one| self.act(one)).collect();
-        let ended = all.collect().await;
-        // Otherwise they are due again when the hold is over.
-        if let Err(error) = self.queue.settle(ended).await {
-            tracing::warn!(%error, "what was done is done again");
-        }
-    }
-
-    /// Does one action. Returns its number, and the delay of its repetition if it failed.
-    async fn act(&self, one: &Outgoing) -> (i64, Option<Duration>) {
+    /// Does one action.
+    async fn act(&self, one: Outgoing, receiver: Option<String>) -> Tried {
         let again = match &one.action {
             Action::RemoveFiles => match self.blobs.remove_job(one.job).await {
                 Ok(()) => false,
@@ -76,9 +109,13 @@ impl Outbox {
                     true
                 }
             },
-            Action::Notify { url, body } => self.tell(one, url, body).await,
+            Action::Notify { url, body } => self.tell(&one, url, body).await,
         };
-        (one.number, again.then(|| delay(one.attempts)))
+        let settled = match again {
+            true => Settled::Again(delay(one.attempts)),
+            false => Settled::Done,
+        };
+        (one.number, settled, receiver)
     }
 
     /// Tells a webhook. Returns whether it is to be told again.
@@ -100,6 +137,59 @@ impl Outbox {
     }
 }
 
+/// What the receivers of webhooks are doing, by host and port.
+#[derive(Debug, Default)]
+struct Receivers(HashMap<String, Receiver>);
+
+#[derive(Debug)]
+struct Receiver {
+    /// Notices that it is being told.
+    told: usize,
+    /// When it last answered, or was first told after it had nothing to answer.
+    moved: Instant,
+}
+
+impl Receivers {
+    /// Begins an action. Returns its receiver, or after which time it is to be taken again: a receiver is
+    /// told a few notices at a time, and one that does not answer is left alone for a while.
+    fn begin(&mut self, one: &Outgoing, now: Instant) -> Result<Option<String>, Duration> {
+        let Action::Notify { url, .. } = &one.action else {
+            return Ok(None);
+        };
+        let host = url.split('/').nth(2).unwrap_or_default();
+        let new = || Receiver {
+            told: 0,
+            moved: now,
+        };
+        let receiver = self.0.entry(host.to_owned()).or_insert_with(new);
+        if receiver.told >= OF_ONE_RECEIVER {
+            return Err(match now - receiver.moved > ANSWERS_WITHIN {
+                true => SILENT_DELAY,
+                false => BUSY_DELAY,
+            });
+        }
+        if receiver.told == 0 {
+            receiver.moved = now;
+        }
+        receiver.told += 1;
+        Ok(Some(host.to_owned()))
+    }
+
+    /// Ends an action.
+    fn end(&mut self, (number, settled, host): Tried) -> (i64, Settled) {
+        if let Some(host) = host
+            && let Some(receiver) = self.0.get_mut(&host)
+        {
+            receiver.told -= 1;
+            receiver.moved = Instant::now();
+            if receiver.told == 0 {
+                self.0.remove(&host);
+            }
+        }
+        (number, settled)
+    }
+}
+
 /// The delay after this many failures.
 fn delay(attempts: u32) -> Duration {
     let doubled = FIRST_DELAY.saturating_mul(1 << attempts.saturating_sub(1).min(20));
@@ -109,6 +199,40 @@ fn delay(attempts: u32) -> Duration {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_receiver_that_does_not_answer_keeps_no_place_of_others() {
+        let notice = |host: &str| Outgoing {
+            number: 1,
+            job: crate::job::JobId::fresh(),
+            attempts: 1,
+            action: Action::Notify {
+                url: format!("https://{host}/hook"),
+                body: String::new(),
+            },
+        };
+        let mut receivers = Receivers::default();
+        let start = Instant::now();
+        for _ in 0..OF_ONE_RECEIVER {
+            let begun = receivers.begin(&notice("silent:8443"), start);
+            assert_eq!(begun, Ok(Some("silent:8443".to_owned())));
+        }
+        assert_eq!(
+            receivers.begin(&notice("silent:8443"), start),
+            Err(BUSY_DELAY)
+        );
+        let later = start + ANSWERS_WITHIN * 2;
+        assert_eq!(
+            receivers.begin(&notice("silent:8443"), later),
+            Err(SILENT_DELAY)
+        );
+        assert!(receivers.begin(&notice("other"), later).is_ok());
+        for host in ["other", "silent:8443"] {
+            let tried = (1, Settled::Done, Some(host.to_owned()));
+            assert_eq!(receivers.end(tried), (1, Settled::Done));
+        }
+        assert!(receivers.begin(&notice("silent:8443"), later).is_ok());
+    }
 
     #[test]
     fn a_webhook_is_tried_for_about_a_day() {

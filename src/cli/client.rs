@@ -10,6 +10,7 @@ use serde_json::Value;
 use url::Url;
 
 use super::failure::Failure;
+use crate::text::without_user;
 
 /// Which server to talk to.
 #[derive(Debug, Args)]
@@ -86,7 +87,7 @@ impl Client {
 
     /// Sends a request. An answer other than 2xx is an error with the reason that the server gives.
     pub(super) async fn send(&self, request: RequestBuilder) -> anyhow::Result<Response> {
-        let unreachable = || format!("cannot reach {}", self.server);
+        let unreachable = || format!("cannot reach {}", without_user(self.server.as_str()));
         let response = request.send().await.with_context(unreachable)?;
         if response.status().is_success() {
             return Ok(response);

@@ -4,6 +4,7 @@ use std::fmt;
 use std::process::ExitCode;
 
 use crate::flow::FlowError;
+use crate::text::printable;
 
 /// A failed command.
 #[derive(Debug)]
@@ -97,6 +98,6 @@ impl fmt::Display for Failure {
     /// The error and its causes, on one line.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let line = format!("{:#}", self.error);
-        f.write_str(&line.replace(['\n', '\r'], " "))
+        f.write_str(&printable(&line))
     }
 }

@@ -20,13 +20,21 @@ use crate::formats::{FileKind, FlowFile, FormatError, GroundRaster, Pair, PairTr
 /// The largest file that is read, bytes.
 const MAX_FILE: u64 = 4 << 30;
 
+/// Whether a file that is to be written lies directly in a folder.
+pub(super) fn is_in(path: &Path, folder: &Path) -> bool {
+    let folder = fs::canonicalize(folder).ok();
+    place_of(path).is_some_and(|path| path.parent() == folder.as_deref())
+}
+
 /// Reads a whole file of at most 4 GiB.
 pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, Failure> {
     let read = || -> anyhow::Result<Vec<u8>> {
         let mut bytes = Vec::new();
-        File::open(path)?
-            .take(MAX_FILE + 1)
-            .read_to_end(&mut bytes)?;
+        let file = File::open(path)?;
+        if file.metadata()?.len() > MAX_FILE {
+            return Err(anyhow!("more than {MAX_FILE} bytes"));
+        }
+        file.take(MAX_FILE + 1).read_to_end(&mut bytes)?;
         if bytes.len() as u64 > MAX_FILE {
             return Err(anyhow!("more than {MAX_FILE} bytes"));
         }

@@ -19,8 +19,8 @@ use crate::flow::field::Backend;
 use crate::flow::{Control, Ego, Estimate, FlowError, Method};
 use crate::job::{EgoChoice, JobOptions};
 use crate::label::{
-    Done, Inputs, LabelError, Layout, Place, Plan, RowReport, Shard, Solver, Told, finalize,
-    open_plan, run,
+    Dataset, Done, Inputs, LabelError, Layout, Place, Plan, RowReport, Shard, Solver, Told,
+    finalize, open_plan, run,
 };
 
 /// How often progress is a line, where stderr is no terminal.
@@ -133,6 +133,12 @@ impl Label {
         if !self.output.contains("://") && !self.finalize {
             let made = std::fs::create_dir_all(Path::new(&self.output));
             made.map_err(|error| Failure::usage(anyhow!("{}: {error}", self.output)))?;
+            let place = |text: &str| Path::new(text).canonicalize().ok();
+            let (_, input) = Dataset::of_place(&self.manifest);
+            if place(input).is_some_and(|input| place(&self.output) == Some(input)) {
+                let text = "the output is the folder of the sweeps: choose a folder of its own";
+                return Err(Failure::usage(anyhow!(text)));
+            }
         }
         let output = Place::open(&self.output).map_err(LabelError::from)?;
         match self.finalize {

@@ -4,6 +4,7 @@ use std::fmt;
 use std::io::{self, Write};
 
 use super::failure::Failure;
+use crate::text::printable;
 
 /// Prints one line on stdout.
 ///
@@ -12,7 +13,10 @@ use super::failure::Failure;
 /// write error.
 pub(super) fn say(line: fmt::Arguments<'_>) -> Result<(), Failure> {
     let mut stdout = io::stdout().lock();
-    writeln!(stdout, "{line}").map_err(|error| match error.kind() {
+    // The names of files may have been chosen by others. A text of several lines is our own.
+    let line = line.to_string();
+    let lines: Vec<String> = line.split('\n').map(printable).collect();
+    writeln!(stdout, "{}", lines.join("\n")).map_err(|error| match error.kind() {
         io::ErrorKind::BrokenPipe => Failure::reader_gone(error),
         _ => Failure::internal(error),
     })

@@ -6,9 +6,10 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use figment::Figment;
-use figment::providers::{Env, Format, Serialized, Toml};
+use figment::providers::{Env, Serialized};
 use serde::{Deserialize, Serialize};
 
+use super::file::ConfigFile;
 use super::remote::RemoteConfig;
 use super::secret::Secret;
 use super::secret::wrong_values;
@@ -368,7 +369,7 @@ impl Config {
                 reason: error.to_string(),
             })?;
             // figment's own message would quote the line, which may contain a key.
-            let _table: toml::Table = toml::from_str(&text).map_err(|error| {
+            let table: toml::Table = toml::from_str(&text).map_err(|error| {
                 let before = error.span().map_or(0, |span| span.start).min(text.len());
                 let line = 1 + text.as_bytes()[..before]
                     .iter()
@@ -379,7 +380,8 @@ impl Config {
                     reason: format!("line {line}: {}", error.message()),
                 }
             })?;
-            figment = figment.merge(Toml::file_exact(path));
+            // What was read is used: a pipe cannot be read twice.
+            figment = figment.merge(ConfigFile { path, table });
         }
         let mut variables = Env::prefixed(PREFIX)
             .filter(|name| {

@@ -4,6 +4,7 @@
 //! Unknown keys are refused. Secrets are never printed. Independent of the parts of the server that
 //! use the values.
 
+mod file;
 mod keys;
 mod ranges;
 mod remote;

@@ -10,6 +10,7 @@ use std::sync::Arc;
 use arrow_array::{ArrayRef, BooleanArray, Float16Array, Float32Array, Int32Array, RecordBatch};
 use arrow_ipc::writer::{FileWriter, IpcWriteOptions};
 use arrow_ipc::{CompressionType, Endianness, Message, Precision, Type};
+use flatbuffers::VerifierOptions;
 
 use super::error::{FileKind, FormatError, shorten};
 use super::limits::{check_rows, unfold_limit};
@@ -24,6 +25,9 @@ pub(super) const FLOW_COLUMNS: [&str; 3] = ["flow_tx_m", "flow_ty_m", "flow_tz_m
 
 /// Largest padding that writers may add to a buffer, bytes.
 const BUFFER_PADDING: u64 = 64;
+
+/// The most columns of a file.
+const MAX_COLUMNS: usize = 1024;
 
 /// Bytes of a decoded point; used to limit the number of rows that a file may declare.
 const POINT_BYTES: u64 = 12;
@@ -44,9 +48,9 @@ struct Column {
     buffer: usize,
 }
 
-/// One record batch: its metadata, its body and its number of rows.
+/// One record batch: its description, its body and its number of rows.
 struct Batch<'a> {
-    metadata: &'a [u8],
+    header: arrow_ipc::RecordBatch<'a>,
     body: &'a [u8],
     rows: usize,
 }
@@ -70,11 +74,16 @@ impl<'a> Table<'a> {
             .ok()
             .and_then(|len| before.len().checked_sub(len))
             .ok_or_else(|| KIND.malformed("the footer is longer than the file"))?;
-        let footer = arrow_ipc::root_as_footer(&before[footer_start..])
+        let footer = &before[footer_start..];
+        let footer = arrow_ipc::root_as_footer_with_opts(&verifier(footer), footer)
             .map_err(|_| KIND.malformed("the footer breaks arrow's rules"))?;
         let schema = footer.schema().ok_or_else(|| KIND.malformed("no schema"))?;
         if schema.endianness() != Endianness::Little {
             return Err(KIND.unsupported("big-endian columns"));
+        }
+        let fields = schema.fields().map_or(0, |fields| fields.len());
+        if fields > MAX_COLUMNS {
+            return Err(KIND.too_large(format!("{fields} columns, {MAX_COLUMNS} are the most")));
         }
         let mut columns = Vec::new();
         let mut buffer = 0;
@@ -111,12 +120,12 @@ impl<'a> Table<'a> {
                 .get(body_start..end)
                 .ok_or_else(outside)?;
             end_of_last = end;
-            let length = batch_of(message(metadata)?)?.length();
-            let length = u64::try_from(length)
+            let header = batch_of(message(metadata)?)?;
+            let length = u64::try_from(header.length())
                 .map_err(|_| KIND.malformed("a record batch of negative length"))?;
             rows = rows.saturating_add(length);
             batches.push(Batch {
-                metadata,
+                header,
                 body,
                 rows: check_rows(KIND, length)?,
             });
@@ -231,7 +240,7 @@ impl<'a> Batch<'a> {
     /// A reader of one column's data, which decompresses as it reads.
     fn open(&self, node: usize, column: &Column) -> Result<Box<dyn Read + 'a>, FormatError> {
         let lacks = || KIND.malformed(format!("a batch lacks column {}", shorten(&column.name)));
-        let batch = batch_of(message(self.metadata)?)?;
+        let batch = &self.header;
         let nodes = batch.nodes().ok_or_else(lacks)?;
         let buffers = batch.buffers().ok_or_else(lacks)?;
         if node >= nodes.len() || column.buffer >= buffers.len() {
@@ -290,13 +299,24 @@ impl<'a> Batch<'a> {
     }
 }
 
+/// The limits of the check of a flatbuffer. Tables of a buffer may share their parts, so that it says far
+/// more than it holds: it says at most this many times its own length.
+fn verifier(buffer: &[u8]) -> VerifierOptions {
+    const RATIO: usize = 8;
+    const FLOOR: usize = 64 << 10;
+    VerifierOptions {
+        max_apparent_size: buffer.len().saturating_mul(RATIO).saturating_add(FLOOR),
+        ..VerifierOptions::default()
+    }
+}
+
 /// The flatbuffer message after its length prefix.
 fn message(metadata: &[u8]) -> Result<Message<'_>, FormatError> {
     let continued = metadata.strip_prefix(&[0xff; 4]).unwrap_or(metadata);
     let flat = continued
         .get(4..)
         .ok_or_else(|| KIND.malformed("a batch without metadata"))?;
-    arrow_ipc::root_as_message(flat)
+    arrow_ipc::root_as_message_with_opts(&verifier(flat), flat)
         .map_err(|_| KIND.malformed("a batch's metadata breaks arrow's rules"))
 }
 

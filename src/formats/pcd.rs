@@ -8,7 +8,7 @@ use std::io::Write;
 
 use super::error::{FileKind, FormatError, shorten};
 use super::limits::{check_rows, check_size, unfold_limit};
-use super::lines::next_line;
+use super::lines::{header_line, next_line};
 use super::lzf;
 use super::scalar::{ByteOrder, Scalar};
 
@@ -59,10 +59,10 @@ impl<'a> Pcd<'a> {
         let mut entries = Entries::default();
         let mut rest = bytes;
         let encoding = loop {
-            if bytes.len() - rest.len() > MAX_HEADER {
-                return Err(KIND.malformed("no DATA line in the first 64 KiB"));
-            }
-            let line = next_line(&mut rest).ok_or_else(|| KIND.malformed("no DATA line"))?;
+            let left = MAX_HEADER.saturating_sub(bytes.len() - rest.len());
+            let line = header_line(&mut rest, left)
+                .map_err(|_| KIND.malformed("no DATA line in the first 64 KiB"))?
+                .ok_or_else(|| KIND.malformed("no DATA line"))?;
             let line = std::str::from_utf8(line)
                 .map_err(|_| KIND.malformed("the header is not text"))?
                 .trim();

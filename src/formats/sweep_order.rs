@@ -18,20 +18,18 @@ fn compared(a: &str, b: &str) -> Ordering {
     a.len().cmp(&b.len()).then_with(|| a.cmp(b))
 }
 
-/// Compares two file names by the numbers in them, so that `2.pcd` comes before `10.pcd`. Names that
-/// differ in more than their numbers, or not even in them, are compared as text.
+/// Compares two file names by the text around their numbers, then by the numbers, so that `2.pcd` comes
+/// before `10.pcd`, then as text. It is a total order of names of all kinds.
 pub fn compare_names(one: &str, other: &str) -> Ordering {
     let (texts, numbers) = parts(one);
     let (other_texts, other_numbers) = parts(other);
-    let by_numbers = match texts == other_texts && numbers.len() == other_numbers.len() {
-        true => {
-            let pairs = numbers.iter().zip(&other_numbers);
-            let steps = pairs.map(|(a, b)| compared(a, b));
-            steps.fold(Ordering::Equal, Ordering::then)
-        }
-        false => Ordering::Equal,
-    };
-    by_numbers.then_with(|| one.cmp(other))
+    let pairs = numbers.iter().zip(&other_numbers);
+    let steps = pairs.map(|(a, b)| compared(a, b));
+    texts
+        .cmp(&other_texts)
+        .then(numbers.len().cmp(&other_numbers.len()))
+        .then_with(|| steps.fold(Ordering::Equal, Ordering::then))
+        .then_with(|| one.cmp(other))
 }
 
 /// The index of the first sweep after which the numbers of the file names go the other way. None if
@@ -67,7 +65,24 @@ pub fn turning_sweep(names: &[&str]) -> Option<usize> {
 
 #[cfg(test)]
 mod tests {
-    use super::turning_sweep;
+    use super::{compare_names, turning_sweep};
+
+    #[test]
+    fn names_of_several_kinds_have_one_order() {
+        // As text `9.b` comes before `9.bin`, by number `9.bin` before `10.bin`.
+        let names = ["9.bin", "10.bin", "9.b", "x9.bin", "9", "09.bin"];
+        for one in names {
+            for other in names {
+                let order = compare_names(one, other);
+                assert_eq!(order, compare_names(other, one).reverse());
+                for third in names {
+                    if order.is_le() && compare_names(other, third).is_le() {
+                        assert!(compare_names(one, third).is_le(), "{one} {other} {third}");
+                    }
+                }
+            }
+        }
+    }
 
     #[test]
     fn numbers_that_turn_back_are_found_and_others_are_left_alone() {

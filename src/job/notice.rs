@@ -18,6 +18,7 @@ struct Notice<'a> {
 #[derive(Serialize)]
 struct Data<'a> {
     id: String,
+    tenant: &'a str,
     kind: Kind,
     state: State,
     labels: Labels,
@@ -29,13 +30,14 @@ struct Data<'a> {
 }
 
 /// The notice of a job's end, as JSON: type `job.` and the state, the time of the end, and the job's
-/// id, kind, state, labels, stop reason, error and path.
+/// id, tenant, kind, state, labels, stop reason, error and path.
 pub fn ended_notice(job: &Job) -> String {
     let notice = Notice {
         kind: format!("job.{}", job.state.name()),
         timestamp: job.finished.map(|at| at.to_string()).unwrap_or_default(),
         data: Data {
             id: job.id.to_string(),
+            tenant: job.tenant.as_str(),
             kind: job.kind,
             state: job.state,
             labels: Labels::of_options(&job.options),

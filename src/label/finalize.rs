@@ -7,7 +7,7 @@ use bytes::Bytes;
 use tokio::runtime::Builder;
 
 use super::error::LabelError;
-use super::layout::{Layout, SETTINGS_FILE, tracks_path};
+use super::layout::{Layout, SETTINGS_FILE, check_outputs, tracks_path};
 use super::places::Place;
 use super::plan::Plan;
 use super::report::{Outcome, RowReport, read_lines};
@@ -17,7 +17,7 @@ use super::shard::Shard;
 /// The report of all pairs.
 const REPORT: &str = "_report.csv";
 /// A write that has not ended after this time has been cut off.
-const CUT_OFF: Duration = Duration::from_secs(60);
+const CUT_OFF: Duration = Duration::from_secs(3600);
 /// Says that every pair is labelled or refused.
 const SUCCESS: &str = "_SUCCESS";
 
@@ -63,6 +63,7 @@ pub fn finalize(
                 "it is of another manifest or another layout".to_owned(),
             ));
         }
+        check_outputs(plan, layout, settings.tracks)?;
         output.remove_cut_off(CUT_OFF)?;
         let all: HashSet<String> = output.all("").await?.into_iter().collect();
         let mut reports: HashMap<String, RowReport> = HashMap::new();
@@ -136,13 +137,14 @@ pub fn finalize(
             );
             output.put(SUCCESS, Bytes::from(text)).await?;
         } else {
-            let count = shards;
-            let shards = (0..count).map(|index| Shard { index, count });
-            let holds = |shard: &Shard| {
-                let pairs = shard.pairs(plan, whole);
-                pairs.iter().any(|pair| missing.contains(pair))
+            let missing = missing.into_iter();
+            let missing = missing.map(|pair| Shard::of(pair, plan, whole, shards));
+            let missing: BTreeSet<usize> = missing.collect();
+            let shard = |index| Shard {
+                index,
+                count: shards,
             };
-            found.missing_shards = shards.filter(holds).collect();
+            found.missing_shards = missing.into_iter().map(shard).collect();
         }
         Ok(found)
     })

@@ -1,5 +1,8 @@
 //! Layouts of the output: the name and the bytes of a pair's file.
 
+use std::collections::HashMap;
+
+use super::plan::{Plan, PlanError};
 use crate::flow::{Estimate, Point};
 use crate::formats::{
     Av2Challenge, FlowFormat, FlowTable, FormatError, write_av2_challenge, write_flow,
@@ -95,6 +98,38 @@ impl Layout {
         }
         Ok(bytes)
     }
+}
+
+/// Refuses a plan of which two outputs have one name, or one is a folder of another.
+pub(super) fn check_outputs(plan: &Plan, layout: Layout, tracks: bool) -> Result<(), PlanError> {
+    let mut known: HashMap<String, &str> = HashMap::new();
+    let pairs = plan.all_pairs().filter(|&(_, pair)| layout.asks_for(pair));
+    let pairs = pairs.map(|(drive, pair)| {
+        let of = &plan.drives()[drive];
+        (layout.path(&of.name, pair, &of.key(pair)), &of.sweeps[pair])
+    });
+    let tracks = plan.drives().iter().filter(|_| tracks);
+    let tracks = tracks.map(|drive| (tracks_path(&drive.name), &drive.sweeps[0]));
+    for (path, sweep) in pairs.chain(tracks) {
+        if let Some(first) = known.insert(path.clone(), &sweep.uri) {
+            return Err(PlanError::SameKey {
+                first: first.to_owned(),
+                second: sweep.uri.clone(),
+                key: path,
+            });
+        }
+    }
+    for (path, second) in &known {
+        let folders = path.match_indices('/').map(|(end, _)| &path[..end]);
+        if let Some((folder, first)) = folders.into_iter().find_map(|at| known.get_key_value(at)) {
+            return Err(PlanError::FileAndFolder {
+                first: (*first).to_owned(),
+                second: (*second).to_owned(),
+                key: folder.clone(),
+            });
+        }
+    }
+    Ok(())
 }
 
 /// The file of a drive's tracks.

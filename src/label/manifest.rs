@@ -10,12 +10,14 @@
 
 use std::collections::HashMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
 
 use arrow_array::RecordBatch;
 use arrow_array::cast::AsArray;
+use arrow_schema::{DataType as Type, Field, Schema};
 use bytes::Bytes;
 use parquet::arrow::ProjectionMask;
-use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+use parquet::arrow::arrow_reader::{ArrowReaderOptions, ParquetRecordBatchReaderBuilder};
 
 use super::plan::{Drive, DriveSweep, drive_name, key_of, stem};
 use crate::flow::RigidTransform;
@@ -126,7 +128,21 @@ fn read_csv(bytes: &[u8]) -> Result<Table, ManifestError> {
 
 fn read_parquet(bytes: Bytes) -> Result<Table, ManifestError> {
     let unreadable = |error: &dyn std::fmt::Display| ManifestError::Unreadable(error.to_string());
-    let builder = ParquetRecordBatchReaderBuilder::try_new(bytes);
+    // Values of a dictionary stay in it: as views, many rows of one long value take little memory.
+    let plain = ArrowReaderOptions::new().with_skip_arrow_metadata(true);
+    let stored =
+        ParquetRecordBatchReaderBuilder::try_new_with_options(bytes.clone(), plain.clone());
+    let stored = stored.map_err(|error| unreadable(&error))?;
+    let views = stored.schema().fields().iter().map(|field| {
+        let kind = match field.data_type() {
+            Type::Utf8 => Type::Utf8View,
+            kind => kind.clone(),
+        };
+        Field::new(field.name(), kind, field.is_nullable())
+    });
+    let views = Arc::new(Schema::new(views.collect::<Vec<_>>()));
+    let builder =
+        ParquetRecordBatchReaderBuilder::try_new_with_options(bytes, plain.with_schema(views));
     let builder = builder.map_err(|error| unreadable(&error))?;
     let rows = builder.metadata().file_metadata().num_rows();
     if usize::try_from(rows).map_or(true, |rows| rows > MAX_ROWS) {
@@ -144,19 +160,21 @@ fn read_parquet(bytes: Bytes) -> Result<Table, ManifestError> {
         names,
         rows: Vec::new(),
     };
+    let mut left = MAX_BYTES;
     for batch in reader.map_err(|error| unreadable(&error))? {
         let batch = batch.map_err(|error| unreadable(&error))?;
-        take(&batch, &mut table.rows)?;
+        take(&batch, &mut table.rows, &mut left)?;
     }
     Ok(table)
 }
 
-/// Takes the rows of a batch: text as it is, numbers as text, lists of numbers as `[1,2]`.
+/// Takes the rows of a batch: text as it is, numbers as text, lists of numbers as `[1,2]`. The texts of
+/// all batches have at most `left` bytes, which are counted down.
 fn take(
     batch: &RecordBatch,
     rows: &mut Vec<HashMap<&'static str, String>>,
+    left: &mut usize,
 ) -> Result<(), ManifestError> {
-    use arrow_schema::DataType as Type;
     let first = rows.len();
     rows.resize_with(first + batch.num_rows(), HashMap::new);
     for (field, column) in batch.schema().fields().iter().zip(batch.columns()) {
@@ -194,6 +212,9 @@ fn take(
                 Type::FixedSizeList(_, _) => numbers(column.as_fixed_size_list().value(row))?,
                 _ => return Err(other()),
             };
+            *left = left
+                .checked_sub(text.len())
+                .ok_or(ManifestError::TooLarge)?;
             rows[first + row].insert(name, text);
         }
     }

@@ -1,6 +1,7 @@
 //! Places of files: paths of this machine, and URIs of object stores.
 
 use std::collections::HashMap;
+use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -23,6 +24,14 @@ pub enum PlaceError {
     /// The bucket cannot be used.
     #[error(transparent)]
     Bucket(#[from] BucketError),
+    /// It can never be read: it is no file, too large, or has an impossible name.
+    #[error("{uri}: {source}")]
+    Unusable {
+        /// The place.
+        uri: String,
+        /// The reason.
+        source: BlobError,
+    },
     /// There is no such file.
     #[error("{0} is not there")]
     Missing(String),
@@ -43,12 +52,11 @@ impl PlaceError {
     }
 
     fn new(uri: &str, error: BlobError) -> Self {
-        match error.is_missing() {
-            true => Self::Missing(uri.to_owned()),
-            false => Self::Failed {
-                uri: uri.to_owned(),
-                source: error,
-            },
+        let uri = uri.to_owned();
+        match error {
+            error if error.is_missing() => Self::Missing(uri),
+            error if error.is_unusable() => Self::Unusable { uri, source: error },
+            error => Self::Failed { uri, source: error },
         }
     }
 }
@@ -101,10 +109,13 @@ impl Places {
             (None, path) => {
                 let about = tokio::fs::metadata(&path).await;
                 let about = about.map_err(|error| failed(error.into()))?;
+                let unusable = |kind: ErrorKind| failed(io::Error::from(kind).into());
+                if !about.is_file() {
+                    // Reading a pipe or a device may never end.
+                    return Err(unusable(ErrorKind::InvalidInput));
+                }
                 if about.len() > MAX_FILE {
-                    return Err(failed(
-                        std::io::Error::from(std::io::ErrorKind::FileTooLarge).into(),
-                    ));
+                    return Err(unusable(ErrorKind::FileTooLarge));
                 }
                 let read = tokio::fs::read(&path).await;
                 read.map(Bytes::from).map_err(|error| failed(error.into()))
@@ -167,6 +178,12 @@ impl Place {
         format!("{}/{}", self.base.trim_end_matches('/'), self.path(below))
     }
 
+    /// A folder below it without links; none in a bucket.
+    pub(super) fn without_links(&self, below: &str) -> Option<PathBuf> {
+        let is_folder = !self.base.contains("://");
+        is_folder.then(|| Path::new(&self.uri(below)).canonicalize().ok())?
+    }
+
     /// Reads a whole file.
     pub(super) async fn read(&self, below: &str) -> Result<Bytes, PlaceError> {
         let read = self.objects.read_whole(&self.path(below), MAX_FILE).await;
@@ -205,9 +222,10 @@ impl Place {
         written.map_err(|error| PlaceError::new(&self.uri(below), error))
     }
 
-    /// Removes the remains of writes that were cut off more than `age` ago.
+    /// Removes the remains of writes of a run's files that were cut off more than `age` ago.
     pub(super) fn remove_cut_off(&self, age: Duration) -> Result<usize, PlaceError> {
-        let removed = self.objects.remove_cut_off(age);
+        const ENDINGS: [&str; 6] = [".npz", ".feather", ".json", ".jsonl", ".csv", "_SUCCESS"];
+        let removed = self.objects.remove_cut_off(&ENDINGS, age);
         removed.map_err(|error| PlaceError::new(&self.uri(""), error))
     }
 

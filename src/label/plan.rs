@@ -58,6 +58,18 @@ pub enum PlanError {
         /// The name of the output.
         key: String,
     },
+    /// The output of one pair is the folder of another one's.
+    #[error(
+        "{key} would be the output of {first} and the folder of that of {second}: give them other names"
+    )]
+    FileAndFolder {
+        /// The sweep of the first pair.
+        first: String,
+        /// The sweep of the second pair.
+        second: String,
+        /// The name.
+        key: String,
+    },
 }
 
 /// All drives, in order.

@@ -9,7 +9,7 @@ use tokio::runtime::{Builder, Runtime};
 use super::datasets::{Dataset, drives_of};
 use super::error::LabelError;
 use super::io::{Io, Wanted};
-use super::layout::tracks_path;
+use super::layout::{check_outputs, tracks_path};
 use super::manifest::read_manifest;
 use super::pipeline::label;
 use super::places::{Place, PlaceError, Places};
@@ -129,6 +129,7 @@ pub fn run(
     told: &mut dyn FnMut(&Told),
 ) -> Result<Done, LabelError> {
     let began = Instant::now();
+    check_outputs(inputs.plan, inputs.layout, inputs.tracks)?;
     if inputs.poses {
         let sweeps = inputs.plan.drives().iter().flat_map(|drive| &drive.sweeps);
         if let Some(sweep) = sweeps.into_iter().find(|sweep| sweep.pose.is_none()) {

@@ -4,7 +4,7 @@ use std::env;
 use std::fmt;
 use std::str::FromStr;
 
-use super::plan::Plan;
+use super::plan::{Drive, Plan};
 
 /// Shard `index` of `count`, counted from 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -97,12 +97,27 @@ impl Shard {
         Err(ShardError::NotInEnvironment)
     }
 
+    /// The index of the shard of `count` that holds a pair, given by the indices of its drive and of the
+    /// pair.
+    pub(super) fn of(
+        (drive, pair): (usize, usize),
+        plan: &Plan,
+        whole_drives: bool,
+        count: usize,
+    ) -> usize {
+        let before = plan.drives()[..drive]
+            .iter()
+            .map(Drive::pairs)
+            .sum::<usize>();
+        let number = if whole_drives { before } else { before + pair };
+        holder(number, plan.pairs(), count)
+    }
+
     /// Its pairs, in order: the indices of the drive and of the pair. Consecutive pairs stay
     /// together, so that a sweep is read once. With `whole_drives` a drive is in one shard.
     pub fn pairs(&self, plan: &Plan, whole_drives: bool) -> Vec<(usize, usize)> {
         let all = plan.pairs();
-        // Number n belongs to the shard whose part of 0..all holds it.
-        let is_own = |number: usize| number * self.count / all == self.index;
+        let is_own = |number: usize| holder(number, all, self.count) == self.index;
         let mut first = 0;
         let mut pairs = Vec::new();
         for (index, drive) in plan.drives().iter().enumerate() {
@@ -115,10 +130,15 @@ impl Shard {
     }
 }
 
+/// The index of the shard that holds number `number` of 0..`all`: each has one part of it.
+fn holder(number: usize, all: usize, count: usize) -> usize {
+    (number as u128 * count as u128 / all as u128) as usize
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::label::plan::{Drive, DriveSweep};
+    use crate::label::plan::DriveSweep;
 
     fn plan(sizes: &[usize]) -> Plan {
         let drive = |(index, &size): (usize, &usize)| Drive {

@@ -11,7 +11,7 @@ use super::effects::Effects;
 use super::lease::{HeartbeatStore, Lease, LeaseHeartbeat};
 use super::local::Local;
 use super::node::{Capacities, Node};
-use super::outgoing::Outgoing;
+use super::outgoing::{Outgoing, Settled};
 use super::sql::Sql;
 use super::transitions;
 use super::transitions::{expiry, leases, lists, outbox};
@@ -249,7 +249,7 @@ impl<E: Engine> Queue for DatabaseQueue<E> {
             .await
     }
 
-    async fn settle(&self, actions: Vec<(i64, Option<Duration>)>) -> Result<(), QueueError> {
+    async fn settle(&self, actions: Vec<(i64, Settled)>) -> Result<(), QueueError> {
         self.change(Kept::Soon, move |sql, _, _| outbox::settle(sql, &actions))
             .await
     }

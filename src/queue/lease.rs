@@ -4,6 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
+use super::time;
 use crate::job::{Job, JobProgress};
 use crate::sync::locked;
 
@@ -46,7 +47,7 @@ impl Default for Flags {
             cancel: AtomicBool::default(),
             lost: AtomicBool::default(),
             durable: AtomicBool::default(),
-            last_beat: Mutex::new(Instant::now()),
+            last_beat: Mutex::new(time::monotonic()),
         }
     }
 }
@@ -71,7 +72,7 @@ impl Flags {
     /// Records a heartbeat.
     pub(super) fn beat(&self) {
         let mut last = locked(&self.last_beat);
-        *last = Instant::now();
+        *last = time::monotonic();
     }
 
     /// Time of the last heartbeat.

@@ -13,6 +13,7 @@ use super::backlog::Backlog;
 use super::effects::Effects;
 use super::lease::Flags;
 use super::subscriptions::Watchers;
+use super::time;
 use super::types::Event;
 use crate::job::{DeviceKind, Job, JobId, State};
 use crate::sync::locked;
@@ -115,7 +116,7 @@ impl Local {
             let held = Running {
                 attempt: job.attempt,
                 flags: Arc::default(),
-                since: Instant::now(),
+                since: time::monotonic(),
                 is_taken: false,
             };
             running.insert(job.id, held);
@@ -224,7 +225,7 @@ impl Local {
         let running = locked(&self.running);
         let left = running
             .iter()
-            .filter(|(_, held)| !held.is_taken && held.since.elapsed() > for_long);
+            .filter(|(_, held)| !held.is_taken && time::monotonic() - held.since > for_long);
         left.map(|(id, held)| (*id, held.attempt)).collect()
     }
 

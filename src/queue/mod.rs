@@ -19,14 +19,17 @@ mod postgres;
 mod sql;
 mod sqlite;
 mod subscriptions;
+mod time;
 mod transitions;
 mod types;
 
 pub use backlog::{Backlog, Load};
 pub use lease::{Lease, LeaseHeartbeat, Signal};
 pub use node::{Capacities, Capacity, Node};
-pub use outgoing::{Action, Outgoing};
+pub use outgoing::{Action, Outgoing, Settled};
 pub use postgres::{PostgresOptions, open_postgres};
+#[cfg(any(test, feature = "fuzzing"))]
+pub use sqlite::simulation;
 pub use sqlite::{CopiedQueue, copy_sqlite, open_sqlite, read_copy};
 pub use types::{
     Committed, Event, Filter, Idempotency, Outcome, PairOf, Queue, QueueError, QueueOptions,

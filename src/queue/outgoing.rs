@@ -1,5 +1,7 @@
 //! Actions outside the queue that its outbox holds.
 
+use std::time::Duration;
+
 use crate::job::JobId;
 
 /// An action outside the queue that a commit has promised. It stays in the outbox of the queue until
@@ -14,6 +16,17 @@ pub struct Outgoing {
     pub attempts: u32,
     /// What to do.
     pub action: Action,
+}
+
+/// What has become of an [`Outgoing`] action.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Settled {
+    /// It is done, or given up.
+    Done,
+    /// It failed, and is due again after a delay.
+    Again(Duration),
+    /// It was not tried, and is due after a delay. The attempt does not count.
+    NotTried(Duration),
 }
 
 /// What an [`Outgoing`] action does.

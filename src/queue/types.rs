@@ -10,7 +10,7 @@ use tokio::sync::watch;
 use super::backlog::Backlog;
 use super::lease::Lease;
 use super::node::{Capacities, Node};
-use super::outgoing::Outgoing;
+use super::outgoing::{Outgoing, Settled};
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, State, Tenant};
 
@@ -430,12 +430,12 @@ pub trait Queue: Send + Sync {
     /// An error of the store.
     async fn take_outgoing(&self, limit: u32, hold: Duration) -> Result<Vec<Outgoing>, QueueError>;
 
-    /// Ends actions of the outbox: removes those that are done, and makes the others due after the
-    /// delay that is given.
+    /// Ends actions of the outbox: removes those that are done, and makes the others due after their
+    /// delay.
     ///
     /// # Errors
     /// An error of the store.
-    async fn settle(&self, actions: Vec<(i64, Option<Duration>)>) -> Result<(), QueueError>;
+    async fn settle(&self, actions: Vec<(i64, Settled)>) -> Result<(), QueueError>;
 
     /// The load of the jobs that are queued and running now.
     fn backlog(&self) -> Backlog;

@@ -33,7 +33,8 @@ fn is_public_v4(address: Ipv4Addr) -> bool {
 fn is_public_v6(address: Ipv6Addr) -> bool {
     let [first, second, ..] = address.segments();
     // Of IPv6, only 2000::/3 is given to the internet; 2001:db8::/32 is for documentation.
-    first & 0xe000 == 0x2000 && !(first == 0x2001 && second == 0x0db8)
+    // 2001::/32 is Teredo, which leads to an IPv4 address.
+    first & 0xe000 == 0x2000 && !(first == 0x2001 && (second == 0x0db8 || second == 0))
 }
 
 /// The IPv4 address that an IPv6 address leads to: mapped, compatible, NAT64 (RFC 6052) and 6to4

@@ -2,6 +2,11 @@
 
 use url::Url;
 
+use crate::text::without_user;
+
+/// The longest URL, bytes.
+const MAX_BYTES: usize = 2048;
+
 /// A prefix that cannot be used.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{0:?} is not a prefix such as https://data.example.com/drives/: {1}")]
@@ -10,8 +15,10 @@ pub struct InvalidPrefix(String, &'static str);
 /// Why a URL is refused.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum NotAllowed {
-    /// It is not a URL, or has a user, a password or a fragment.
-    #[error("is not a plain URL with a host, without user, password and fragment")]
+    /// It is not a URL, has more than 2,048 bytes, or has a user, a password or a fragment.
+    #[error(
+        "is not a plain URL with a host and at most 2048 bytes, without user, password and fragment"
+    )]
     Malformed,
     /// No prefix covers it.
     #[error("is not below an address that this server allows")]
@@ -29,7 +36,7 @@ impl Allowed {
     /// [`InvalidPrefix`] of the first that is something else.
     pub fn new(prefixes: &[String], schemes: &[&str]) -> Result<Self, InvalidPrefix> {
         let read = |text: &String| {
-            let wrong = |why| InvalidPrefix(text.clone(), why);
+            let wrong = |why| InvalidPrefix(without_user(text), why);
             let url = plain(text).ok_or(wrong("no plain URL"))?;
             if !schemes.contains(&url.scheme()) {
                 return Err(wrong("another scheme than those possible here"));
@@ -76,18 +83,20 @@ impl Allowed {
     }
 }
 
-/// A URL with a host, or of a file; without user, password and fragment, and without escaped dots and
-/// slashes in its path, which another server may read as a way upward.
+/// A URL with a host, or of a file; without user, password and fragment, and without a path that another
+/// server may read as a way upward: with escaped dots, slashes or percent signs, or a part such as `..;`.
 fn plain(text: &str) -> Option<Url> {
-    let url = Url::parse(text).ok()?;
+    let url = Url::parse(text).ok().filter(|_| text.len() <= MAX_BYTES)?;
     let path = url.path().to_ascii_lowercase();
     let is_plain = url.username().is_empty()
         && url.password().is_none()
         && url.fragment().is_none()
         && (url.has_host() || url.scheme() == "file")
-        && !["%2e", "%2f", "%5c", "%00"]
+        && !["%2e", "%2f", "%5c", "%00", "%25"]
             .iter()
-            .any(|code| path.contains(code));
+            .any(|code| path.contains(code))
+        // Some servers read what follows a semicolon as a parameter of the part before it.
+        && !path.split('/').any(|part| part.starts_with(".."));
     is_plain.then_some(url)
 }
 

@@ -50,7 +50,11 @@ impl From<BlobError> for NotFetched {
     fn from(error: BlobError) -> Self {
         match error.is_missing() {
             true => Self::Missing("no object has this name".to_owned()),
-            false => Self::Failed(error.to_string()),
+            // It may tell of addresses and answers that are not the caller's.
+            false => {
+                tracing::warn!(%error, "a sweep cannot be fetched from its bucket");
+                Self::Failed("its bucket cannot be read".to_owned())
+            }
         }
     }
 }

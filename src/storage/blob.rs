@@ -41,6 +41,27 @@ impl BlobError {
         self.fault() == Fault::Missing
     }
 
+    /// Whether a name leads to nothing that can be read as a file, now and later: a folder, a device, a
+    /// loop of links, a file that is too large, or an impossible name.
+    pub fn is_unusable(&self) -> bool {
+        const LOOP: i32 = rustix::io::Errno::LOOP.raw_os_error();
+        use io::ErrorKind::{
+            FileTooLarge, InvalidFilename, InvalidInput, IsADirectory, NotADirectory,
+        };
+        let kinds = [
+            FileTooLarge,
+            InvalidFilename,
+            InvalidInput,
+            IsADirectory,
+            NotADirectory,
+        ];
+        let of_system = Fault::io_error(&self.0);
+        matches!(self.0, object_store::Error::InvalidPath { .. })
+            || of_system.is_some_and(|error| {
+                kinds.contains(&error.kind()) || error.raw_os_error() == Some(LOOP)
+            })
+    }
+
     /// The cause: [`Fault::Missing`] if the blob or file does not exist, [`Fault::Full`] if no more
     /// data can be written, otherwise [`Fault::Machine`].
     pub fn fault(&self) -> Fault {

@@ -37,6 +37,10 @@ pub fn copy_store(from: &Path, to: &Path) -> io::Result<Copied> {
 }
 
 fn copy_folder(from: &Path, to: &Path, copied: &mut Copied) -> io::Result<()> {
+    if fs::symlink_metadata(from).is_ok_and(|about| about.is_symlink()) {
+        let text = format!("{} is a link, and a store has none", from.display());
+        return Err(io::Error::other(text));
+    }
     let entries = match fs::read_dir(from) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
         entries => entries?,

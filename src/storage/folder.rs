@@ -86,7 +86,7 @@ pub(super) fn is_empty(root: &Path) -> io::Result<bool> {
 
 /// The jobs whose folder and files were all last changed more than `age` ago.
 pub(super) fn jobs_older_than(root: &Path, age: Duration) -> io::Result<Vec<JobId>> {
-    let limit = SystemTime::now().checked_sub(age);
+    let limit = own_time(&root.join("jobs")).checked_sub(age);
     let is_old = |path: &Path| is_older(path, limit);
     let mut found = Vec::new();
     for minute in entries(&root.join("jobs"))? {
@@ -108,7 +108,7 @@ pub(super) fn jobs_older_than(root: &Path, age: Duration) -> io::Result<Vec<JobI
 /// Removes the remains of interrupted writes and probes that were last changed more than `age` ago,
 /// and counts them.
 pub(super) fn remove_cut_off(root: &Path, age: Duration) -> io::Result<usize> {
-    let limit = SystemTime::now().checked_sub(age);
+    let limit = own_time(&root.join("jobs")).checked_sub(age);
     let mut removed = 0;
     for minute in entries(&root.join("jobs"))? {
         let name = minute.file_name().unwrap_or_default().to_string_lossy();
@@ -118,7 +118,7 @@ pub(super) fn remove_cut_off(root: &Path, age: Duration) -> io::Result<usize> {
         }
         for job in entries(&minute)? {
             for blob in entries(&job)? {
-                if is_staged(&blob) && is_older(&blob, limit)? {
+                if staged_of(&blob).is_some() && is_older(&blob, limit)? {
                     fs::remove_file(&blob)?;
                     removed += 1;
                 }
@@ -128,17 +128,29 @@ pub(super) fn remove_cut_off(root: &Path, age: Duration) -> io::Result<usize> {
     Ok(removed)
 }
 
-/// Removes the remains of interrupted writes in a folder and in all folders below it that were last
-/// changed more than `age` ago, and counts them.
-pub(super) fn remove_staged_below(root: &Path, age: Duration) -> io::Result<usize> {
-    let limit = SystemTime::now().checked_sub(age);
+/// Removes the remains of interrupted writes of files with one of these endings, in a folder and in all
+/// folders below it, that were last changed more than `age` ago, and counts them. Links are not followed.
+pub(super) fn remove_staged_below(
+    root: &Path,
+    endings: &[&str],
+    age: Duration,
+) -> io::Result<usize> {
+    let limit = own_time(root).checked_sub(age);
     let mut removed = 0;
     let mut folders = vec![root.to_owned()];
     while let Some(folder) = folders.pop() {
         for path in entries(&folder)? {
-            if path.is_dir() {
+            let kind = match fs::symlink_metadata(&path) {
+                Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
+                about => about?.file_type(),
+            };
+            if kind.is_dir() {
                 folders.push(path);
-            } else if is_staged(&path) && is_older(&path, limit)? {
+            } else if kind.is_file()
+                && staged_of(&path)
+                    .is_some_and(|name| endings.iter().any(|end| name.ends_with(end)))
+                && is_older(&path, limit)?
+            {
                 fs::remove_file(&path)?;
                 removed += 1;
             }
@@ -147,20 +159,33 @@ pub(super) fn remove_staged_below(root: &Path, age: Duration) -> io::Result<usiz
     Ok(removed)
 }
 
-/// Whether a file is a staged write, such as `sweep-0#1`, which is renamed when it is complete.
-fn is_staged(path: &Path) -> bool {
-    let name = path.file_name().unwrap_or_default().to_string_lossy();
-    name.rsplit_once('#')
-        .is_some_and(|(_, number)| number.bytes().all(|byte| byte.is_ascii_digit()))
+/// The time by the clock of a folder's file system, which may be another machine's. Where nothing can be
+/// written, the time of this machine.
+fn own_time(folder: &Path) -> SystemTime {
+    // Named as a staged write and as a probe, so that a crash leaves nothing for long.
+    let path = folder.join(format!("{PROBE}{}.json#0", JobId::fresh()));
+    let file = fs::create_dir_all(folder).and_then(|()| fs::File::create(&path));
+    let changed = file.and_then(|file| file.metadata()?.modified());
+    let _not_there = fs::remove_file(&path);
+    changed.unwrap_or_else(|_| SystemTime::now())
 }
 
-/// Whether a file was last changed before `limit`. A file that is gone meanwhile counts as older.
+/// The name under which a staged write, such as `sweep-0#1`, will be renamed when it is complete. None if
+/// the file is no staged write.
+fn staged_of(path: &Path) -> Option<String> {
+    let name = path.file_name()?.to_string_lossy();
+    let (name, number) = name.rsplit_once('#')?;
+    let is_number = !number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit());
+    is_number.then(|| name.to_owned())
+}
+
+/// Whether a file was last changed by `limit`. A file that is gone meanwhile counts as older.
 fn is_older(path: &Path, limit: Option<SystemTime>) -> io::Result<bool> {
     match fs::metadata(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(true),
         about => {
             let changed = about?.modified()?;
-            Ok(limit.is_some_and(|limit| changed < limit))
+            Ok(limit.is_some_and(|limit| changed <= limit))
         }
     }
 }

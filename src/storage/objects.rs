@@ -48,14 +48,14 @@ impl Objects {
         })
     }
 
-    /// Removes the remains of writes that were cut off more than `age` ago, and counts them. A bucket
-    /// has none.
+    /// Removes the remains of writes of objects with one of these endings that were cut off more than
+    /// `age` ago, and counts them. A bucket has none.
     ///
     /// # Errors
     /// If a folder cannot be listed, or a file cannot be removed.
-    pub fn remove_cut_off(&self, age: Duration) -> Result<usize, BlobError> {
+    pub fn remove_cut_off(&self, endings: &[&str], age: Duration) -> Result<usize, BlobError> {
         let folder = self.folder.as_deref();
-        let removed = folder.map_or(Ok(0), |folder| remove_staged_below(folder, age));
+        let removed = folder.map_or(Ok(0), |folder| remove_staged_below(folder, endings, age));
         Ok(removed?)
     }
 

@@ -190,6 +190,11 @@ fn what_does_not_go_with_a_folder_is_refused() {
             2,
             "--deskew on needs the ego motion",
         ),
+        (
+            vec!["flow", "--follow", "incoming", "-o", "incoming/flow.npz"],
+            2,
+            "the folder that is followed",
+        ),
         (with(&["--idle-s", "0"]), 2, "positive"),
         (with(&["--due-ms", "0"]), 2, "--due-ms"),
         (vec!["flow", "--follow", "incoming"], 2, "--output"),

@@ -109,6 +109,15 @@ fn bombs() -> Vec<(&'static str, Vec<u8>)> {
         ("npz that unfolds a thousandfold", zip_bomb(40_000_000)),
         ("npz of many members", many_members()),
         ("feather whose buffers lie", feather_bomb()),
+        (
+            "feather whose columns share a long name",
+            feather_of_one_name(),
+        ),
+        ("ply whose header has no end", endless(b"ply\ncomment ")),
+        (
+            "pcd whose header has no end",
+            endless(b"VERSION .7\nFIELDS "),
+        ),
     ]
 }
 
@@ -160,5 +169,38 @@ fn feather_bomb() -> Vec<u8> {
     for index in indices {
         bytes[index..index + 8].copy_from_slice(&(1_u64 << 62).to_le_bytes());
     }
+    bytes
+}
+
+/// A header whose line goes on for megabytes, in short words.
+fn endless(beginning: &[u8]) -> Vec<u8> {
+    let mut bytes = beginning.to_vec();
+    bytes.extend(b"a ".repeat(1_900_000));
+    bytes
+}
+
+/// A file of 900 columns that share one field, whose name has a megabyte.
+fn feather_of_one_name() -> Vec<u8> {
+    let mut builder = flatbuffers::FlatBufferBuilder::new();
+    let name = builder.create_string(&"n".repeat(1 << 20));
+    let float = arrow_ipc::FloatingPointBuilder::new(&mut builder).finish();
+    let mut field = arrow_ipc::FieldBuilder::new(&mut builder);
+    field.add_name(name);
+    field.add_type_type(arrow_ipc::Type::FloatingPoint);
+    field.add_type_(float.as_union_value());
+    let field = field.finish();
+    let fields = builder.create_vector(&[field; 900]);
+    let mut schema = arrow_ipc::SchemaBuilder::new(&mut builder);
+    schema.add_fields(fields);
+    let schema = schema.finish();
+    let mut footer = arrow_ipc::FooterBuilder::new(&mut builder);
+    footer.add_schema(schema);
+    let footer = footer.finish();
+    builder.finish(footer, None);
+    let footer = builder.finished_data();
+    let mut bytes = b"ARROW1\0\0".to_vec();
+    bytes.extend(footer);
+    bytes.extend((footer.len() as i32).to_le_bytes());
+    bytes.extend(b"ARROW1");
     bytes
 }

@@ -54,6 +54,27 @@ async fn flow(server: &Server, id: &str) -> Vec<u8> {
     flow.bytes().await.expect("a flow").to_vec()
 }
 
+#[tokio::test]
+async fn a_backup_is_for_its_user_alone_and_lies_outside_of_the_data() {
+    use std::os::unix::fs::PermissionsExt;
+    let server = Server::start(&[]);
+    let id = submit(&server).await;
+    ended(&server, &id).await;
+    let folder = Folder::new();
+    let (copy, restored) = (folder.path().join("copy"), folder.path().join("restored"));
+    assert!(backup(&server, &copy).status.success());
+    assert!(restore(&copy, &restored).status.success());
+    for place in [&copy, &restored] {
+        for name in ["", "queue.sqlite3", "blobs"] {
+            let about = std::fs::metadata(place.join(name)).expect("it is there");
+            assert_eq!(about.permissions().mode() & 0o077, 0, "{name}");
+        }
+    }
+    let inside = backup(&server, &server.data().join("blobs/jobs/copy"));
+    let said = String::from_utf8_lossy(&inside.stderr).into_owned();
+    assert!(said.contains("lies in the data directory"), "{said}");
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_backup_beside_a_busy_server_has_every_job_that_was_acknowledged_before() {
     let server = Server::start(&[]);

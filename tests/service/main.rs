@@ -13,6 +13,7 @@ mod attacks_files;
 mod attacks_grpc;
 mod attacks_http2;
 mod attacks_requests;
+mod attacks_tenants;
 mod backup;
 mod browser;
 mod clouds;

@@ -322,15 +322,11 @@ impl SceneFlow for Calls {
             "" => None,
             token => Some(token.parse::<JobId>().map_err(bad_page)?),
         };
-        let jobs = self
-            .service
-            .jobs(&call.caller, state, label, before, limit)
-            .await?;
-        let full = jobs.len() == limit as usize;
-        let next = jobs.last().filter(|_| full).map(|job| job.id.to_string());
+        let listed = self.service.jobs(&call.caller, state, label, before, limit);
+        let (jobs, next) = listed.await?;
         Ok(Response::new(proto::ListJobsResponse {
             jobs: jobs.iter().map(|job| convert::job(job)).collect(),
-            next_page_token: next.unwrap_or_default(),
+            next_page_token: next.map(|id| id.to_string()).unwrap_or_default(),
         }))
     }
 

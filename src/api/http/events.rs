@@ -24,6 +24,7 @@ const HEARTBEAT: Duration = Duration::from_secs(15);
 /// The state of an event stream.
 struct Told {
     service: Arc<Service>,
+    caller: Caller,
     news: watch::Receiver<Arc<Job>>,
     last: Option<(JobState, u32, u32)>,
     ended: bool,
@@ -52,6 +53,7 @@ pub(super) async fn follow_job(
     let news = service.watch(&caller, id).await?;
     let told = Told {
         service,
+        caller,
         news,
         last: None,
         ended: false,
@@ -83,7 +85,7 @@ async fn next(mut told: Told) -> Option<(Result<Event, Infallible>, Told)> {
         Some(progress) if same_state => Event::default().event("progress").json_data(progress),
         _ => Event::default()
             .event("state")
-            .json_data(JobView::new(&job, &[])),
+            .json_data(JobView::shown_to(&told.caller, &job, &[])),
     };
     let event = event.unwrap_or_default().id(id);
     Some((Ok(event), told))

@@ -377,7 +377,7 @@ pub(super) async fn get_job(
         };
     }
     let pairs = service.pairs(&job).await?;
-    Ok(Json(JobView::new(&job, &pairs)))
+    Ok(Json(JobView::shown_to(&caller, &job, &pairs)))
 }
 
 /// The query parameters of a cancellation.

@@ -2,16 +2,21 @@
 
 use std::sync::Arc;
 
-use axum::Json;
 use axum::extract::{Extension, Query, State};
+use axum::http::header;
+use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+use super::results::whole;
 use super::view::JobView;
 use crate::api::auth::Caller;
 use crate::api::error::ApiError;
 use crate::api::service::Service;
-use crate::job::{JobId, State as JobState};
+use crate::job::{Job, JobId, State as JobState};
+
+/// Upper bound on the text of a job on a page, without its options and its report, bytes.
+const VIEW_BYTES: usize = 2048;
 
 /// Default number of jobs on a page.
 const PAGE: u32 = 100;
@@ -56,18 +61,22 @@ pub(super) async fn list_jobs(
     State(service): State<Arc<Service>>,
     Extension(caller): Extension<Caller>,
     page: Result<Query<Page>, axum::extract::rejection::QueryRejection>,
-) -> Result<Json<JobPage>, ApiError> {
+) -> Result<Response, ApiError> {
     let Query(page) = page.map_err(|error| ApiError::BadRequest(error.body_text()))?;
     let before = page.before.as_deref().map(str::parse::<JobId>).transpose();
     let before = before.map_err(|error| ApiError::BadRequest(format!("before: {error}")))?;
     let limit = page.limit.unwrap_or(PAGE).clamp(1, 1000);
-    let jobs = service
-        .jobs(&caller, page.state, page.label, before, limit)
-        .await?;
-    let full = jobs.len() == limit as usize;
-    let next = jobs.last().filter(|_| full).map(|job| job.id.to_string());
-    Ok(Json(JobPage {
-        jobs: jobs.iter().map(|job| JobView::new(job, &[])).collect(),
-        next,
-    }))
+    let listed = service.jobs(&caller, page.state, page.label, before, limit);
+    let (jobs, next) = listed.await?;
+    let texts = |job: &Arc<Job>| job.options.len() + job.report.as_ref().map_or(0, String::len);
+    let bytes = jobs.iter().map(|job| VIEW_BYTES + texts(job)).sum();
+    let room = service.answers.room(&caller.tenant, bytes).await?;
+    let view = |job: &Arc<Job>| JobView::shown_to(&caller, job, &[]);
+    let page = JobPage {
+        jobs: jobs.iter().map(view).collect(),
+        next: next.map(|id| id.to_string()),
+    };
+    let text = serde_json::to_vec(&page).map_err(ApiError::internal)?;
+    let media = [(header::CONTENT_TYPE, "application/json")];
+    Ok((media, whole(room.hold(text))).into_response())
 }

@@ -15,6 +15,7 @@ use crate::api::auth::Caller;
 use crate::api::codec;
 use crate::api::error::ApiError;
 use crate::api::pending_job::PendingJob;
+use crate::api::permits::FairQueue;
 use crate::api::service::Service;
 use crate::api::upload_budget::UploadReservation;
 use crate::formats;
@@ -136,6 +137,7 @@ impl Body {
         };
         self.meter.understood();
         let mut reading = Reading {
+            fetches: &self.service.fetches,
             room: &mut self.room,
             meter: &self.meter,
         };
@@ -341,6 +343,7 @@ async fn drain<E>(pieces: impl Stream<Item = Result<usize, E>>) {
 
 /// The reservation and the meter that reading a part updates.
 struct Reading<'a> {
+    fetches: &'a FairQueue,
     room: &'a mut UploadReservation,
     meter: &'a Meter,
 }
@@ -374,6 +377,8 @@ impl Reading<'_> {
         uri: &str,
     ) -> Result<(String, Vec<u8>), ApiError> {
         let refused = |error| ApiError::source(part, &error);
+        let tenant = self.room.tenant().clone();
+        let _turn = self.fetches.wait(&tenant).await;
         let opened = self.room.wait(sources.open(uri)).await?;
         let mut download = opened.map_err(refused)?;
         let mut bytes = Vec::new();

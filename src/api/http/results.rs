@@ -348,7 +348,7 @@ async fn archive(
         };
         let done = write().and_then(|()| Ok(zip.finish().map(drop)?));
         if let Err(error) = done {
-            tracing::warn!(%error, "an archive was not finished");
+            tracing::debug!(%error, "an archive was not finished");
             let _gone_is_fine = pieces.try_send(Err(std::io::Error::other("not finished")));
         }
     });

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use axum::Json;
 use axum::extract::{Extension, Query, State};
+use axum::http::{HeaderMap, header};
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
@@ -43,8 +44,8 @@ pub(super) struct ShareLink {
 
 /// Creates a link with which others can read the job, its sweeps and its results without a key.
 ///
-/// The link expires. It cannot be used to list, submit, cancel or remove jobs. Removing the key of
-/// the tenant from the configuration makes its links void.
+/// The link expires. It cannot be used to list, submit, cancel or remove jobs. Without the key of
+/// the caller who made it in the configuration, a link is void.
 #[utoipa::path(
     post,
     path = "/v1/jobs/{id}/share",
@@ -62,6 +63,7 @@ pub(super) async fn share(
     State(service): State<Arc<Service>>,
     Extension(caller): Extension<Caller>,
     Named(id): Named,
+    headers: HeaderMap,
     terms: Result<Query<Terms>, axum::extract::rejection::QueryRejection>,
 ) -> Result<Json<ShareLink>, ApiError> {
     let Query(terms) = terms.map_err(|error| ApiError::BadRequest(error.body_text()))?;
@@ -73,7 +75,9 @@ pub(super) async fn share(
     caller.has_key()?;
     let job = service.job(&caller, id).await?;
     let expires = Timestamp::now().after(Duration::from_secs(seconds));
-    let token = service.keys.get().share(&caller.tenant, job.id, expires);
+    let shown = headers.get(header::AUTHORIZATION);
+    let shown = shown.and_then(|value| value.to_str().ok());
+    let token = service.keys.get().share(shown, job.id, expires);
     let path = format!("/#/jobs/{}", job.id);
     Ok(Json(ShareLink {
         path: match &token {

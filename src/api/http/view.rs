@@ -3,9 +3,10 @@
 use std::sync::Arc;
 
 use serde::Serialize;
-use serde_json::value::RawValue;
+use serde_json::value::{RawValue, Value};
 use utoipa::ToSchema;
 
+use crate::api::auth::Caller;
 use crate::job::{Job, JobError, JobProgress, Kind, State};
 
 /// A job.
@@ -102,7 +103,27 @@ pub(super) fn path(job: &Job) -> String {
     format!("/v1/jobs/{}", job.id)
 }
 
+/// The options as a caller may see them: a webhook's URL may hold a secret of who submitted the job, and
+/// labels are not for who has a link to it.
+fn options_for(caller: &Caller, options: &str) -> Option<Box<RawValue>> {
+    let mut shown: serde_json::Map<String, Value> = serde_json::from_str(options).ok()?;
+    shown.remove("webhook");
+    if caller.shared_job.is_some() {
+        shown.remove("labels");
+    }
+    serde_json::value::to_raw_value(&shown).ok()
+}
+
 impl JobView {
+    /// The representation of a job as this caller may see it.
+    pub(super) fn shown_to(caller: &Caller, job: &Job, pairs: &[Arc<Job>]) -> Self {
+        let mut view = Self::new(job, pairs);
+        if caller.may_write().is_err() {
+            view.options = options_for(caller, &job.options);
+        }
+        view
+    }
+
     /// The representation of a job. `pairs` are the pairs to include for a sequence.
     pub(super) fn new(job: &Job, pairs: &[Arc<Job>]) -> Self {
         let raw = |text: &str| RawValue::from_string(text.to_owned()).ok();

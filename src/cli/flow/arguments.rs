@@ -117,6 +117,15 @@ impl Flow {
         {
             return Err(Failure::usage(anyhow!("a picture's name ends in .png")));
         }
+        let named = [&self.output, &self.picture].into_iter().flatten();
+        if let Some(folder) = &self.follow.follow
+            && let Some(output) = named.clone().find(|path| files::is_in(path, folder))
+        {
+            return Err(Failure::usage(anyhow!(
+                "{} would be written into the folder that is followed: choose another one",
+                output.display()
+            )));
+        }
         let pairs = self.sweeps.len().saturating_sub(1).max(1);
         let named = [&self.output, &self.picture].into_iter().flatten();
         let outputs: Vec<PathBuf> = named

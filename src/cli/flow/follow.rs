@@ -189,6 +189,8 @@ impl Arrivals {
         if let Some(path) = event.paths.into_iter().next()
             && is_sweep(&path)
             && !self.present.remove(&path)
+            // Reading a pipe may never end.
+            && path.is_file()
         {
             self.waiting.push_back(path);
         }

@@ -1,5 +1,7 @@
 //! Drives that are folders of sweeps.
 
+use std::collections::HashSet;
+
 use super::dataset::{Dataset, DatasetError};
 use crate::formats::{compare_names, read_poses};
 use crate::label::layout::SETTINGS_FILE;
@@ -36,7 +38,14 @@ fn name(folder: &str) -> String {
 pub(super) async fn drives(place: &Place, dataset: Dataset) -> Result<Vec<Drive>, DatasetError> {
     let mut drives = Vec::new();
     let mut waiting = vec![(String::new(), 0)];
+    // Links may lead to a folder by many ways.
+    let mut seen = HashSet::new();
     while let Some((folder, depth)) = waiting.pop() {
+        if let Some(path) = place.without_links(&folder)
+            && !seen.insert(path)
+        {
+            continue;
+        }
         let [folders, files] = place.entries(&folder).await?;
         if files.iter().any(|file| file == SETTINGS_FILE) {
             // The output of a run, which may lie below its input.

@@ -1,7 +1,7 @@
 //! The outbox: what a commit has promised is done by one node at a time, and not forgotten.
 
 use super::*;
-use crate::queue::outgoing::{Action, Outgoing};
+use crate::queue::outgoing::{Action, Outgoing, Settled};
 
 const HOLD: Duration = Duration::from_secs(60);
 
@@ -85,18 +85,23 @@ pub(crate) async fn what_is_promised_is_taken_once_and_again_after_its_hold_or_d
         .map(|one| (one.number, one.attempts))
         .collect();
     assert_eq!(seen, [(first[0].number, 2)]);
-    let later = vec![(first[0].number, Some(SHORT))];
+    let later = vec![(first[0].number, Settled::Again(SHORT))];
     queue.settle(later).await.expect("settled");
     assert_eq!(take(&queue, HOLD).await, [], "it is due later");
     tokio::time::sleep(SHORT * 2).await;
-    assert_eq!(take(&queue, SHORT).await.len(), 1);
+    let third = take(&queue, SHORT).await;
+    assert_eq!(third[0].attempts, 3);
+    let not_tried = vec![(first[0].number, Settled::NotTried(Duration::ZERO))];
+    queue.settle(not_tried).await.expect("settled");
+    let third = take(&queue, SHORT).await;
+    assert_eq!(third[0].attempts, 3, "it counts as an attempt");
 
     drop((queue, events));
     let (queue, _events) = stand.open(QueueOptions::default()).await;
     tokio::time::sleep(SHORT * 2).await;
     let third = take(&queue, HOLD).await;
     assert_eq!(third.len(), 1, "a crash has lost it");
-    let done = vec![(third[0].number, None)];
+    let done = vec![(third[0].number, Settled::Done)];
     queue.settle(done).await.expect("settled");
 
     // The files of a removed job are removed the same way.

@@ -204,5 +204,12 @@ fn create(sql: &dyn Sql, identity: i32) -> Result<i32, QueueError> {
              the program of that version"
         )));
     }
+    let open = "SELECT has_database_privilege('public', current_database(), 'CONNECT')";
+    if sql.only(open, &[])?.get(0)? {
+        tracing::warn!(
+            "every login of the database server may connect to the queue's database and hold its locks: \
+             REVOKE CONNECT, TEMPORARY ON DATABASE its_name FROM PUBLIC"
+        );
+    }
     row.get(1)
 }

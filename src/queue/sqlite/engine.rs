@@ -4,7 +4,7 @@ use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use async_trait::async_trait;
 use rusqlite::Connection;
@@ -97,17 +97,9 @@ impl SqliteEngine {
         let connection = schema::open_writer(&path)?;
         let identity = connection.pragma_query_value(None, "application_id", |row| row.get(0))?;
         let local = Arc::new(Local::new(events));
-        let mut effects = Effects::default();
-        connection.execute_batch("BEGIN IMMEDIATE")?;
-        let orderly = run_mark(folder, STOPPED, RUNNING);
-        let sql = SqliteSql(&connection);
-        for id in expiry::left_behind(&sql, NODE)? {
-            expiry::recover(&sql, &mut effects, options, id, NODE, orderly)?;
-        }
-        connection.execute_batch("COMMIT")?;
-        local.apply(effects);
-        // Now counted in the database itself.
-        *locked(&local.backlog) = lists::count_backlog(&SqliteSql(&connection))?;
+        recover(&connection, options, &local, || {
+            run_mark(folder, STOPPED, RUNNING)
+        })?;
         let open_reader = || schema::open_reader(&path).map(|reader| Arc::new(Mutex::new(reader)));
         Ok(Self {
             readers: [open_reader()?, open_reader()?],
@@ -122,6 +114,27 @@ impl SqliteEngine {
             _lock: lock,
         })
     }
+}
+
+/// Takes over what the last process left behind. `orderly` tells whether it had stopped in order.
+pub(super) fn recover(
+    connection: &Connection,
+    options: &QueueOptions,
+    local: &Local,
+    orderly: impl FnOnce() -> bool,
+) -> Result<(), QueueError> {
+    let sql = SqliteSql(connection);
+    let mut effects = Effects::default();
+    connection.execute_batch("BEGIN IMMEDIATE")?;
+    let orderly = orderly();
+    for id in expiry::left_behind(&sql, NODE)? {
+        expiry::recover(&sql, &mut effects, options, id, NODE, orderly)?;
+    }
+    connection.execute_batch("COMMIT")?;
+    local.apply(effects);
+    // Now counted in the database itself.
+    *locked(&local.backlog) = lists::count_backlog(&sql)?;
+    Ok(())
 }
 
 #[async_trait]
@@ -161,15 +174,12 @@ impl Engine for SqliteEngine {
     }
 
     fn heartbeat(&self, job: &Job) -> Arc<dyn HeartbeatStore> {
-        Arc::new(SqliteHeartbeat {
-            id: job.id,
-            attempt: job.attempt,
-            writer: self.writer.clone(),
-            local: Arc::clone(&self.local),
-            options: self.options.clone(),
-            last: Mutex::new(Instant::now()),
-            latest: Mutex::default(),
-        })
+        Arc::new(SqliteHeartbeat::new(
+            job,
+            &self.writer,
+            &self.local,
+            &self.options,
+        ))
     }
 
     fn poll_interval(&self) -> Option<Duration> {

@@ -4,10 +4,10 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use super::writer::Writer;
-use crate::job::JobId;
-use crate::job::JobProgress;
+use crate::job::{Job, JobId, JobProgress};
 use crate::queue::lease::HeartbeatStore;
 use crate::queue::local::Local;
+use crate::queue::time;
 use crate::queue::transitions::leases;
 use crate::queue::types::QueueOptions;
 use crate::sync::locked;
@@ -18,13 +18,33 @@ const BEAT: Duration = Duration::from_secs(1);
 /// The heartbeat of one lease. Every progress update goes to the subscribers; a renewal goes to
 /// disk once a second, or every quarter of the lease if that is shorter.
 pub(super) struct SqliteHeartbeat {
-    pub(super) id: JobId,
-    pub(super) attempt: u32,
-    pub(super) writer: Writer,
-    pub(super) local: Arc<Local>,
-    pub(super) options: QueueOptions,
-    pub(super) last: Mutex<Instant>,
-    pub(super) latest: Mutex<Option<JobProgress>>,
+    id: JobId,
+    attempt: u32,
+    writer: Writer,
+    local: Arc<Local>,
+    options: QueueOptions,
+    last: Mutex<Instant>,
+    latest: Mutex<Option<JobProgress>>,
+}
+
+impl SqliteHeartbeat {
+    /// The heartbeat of a job that was just claimed.
+    pub(super) fn new(
+        job: &Job,
+        writer: &Writer,
+        local: &Arc<Local>,
+        options: &QueueOptions,
+    ) -> Self {
+        Self {
+            id: job.id,
+            attempt: job.attempt,
+            writer: writer.clone(),
+            local: Arc::clone(local),
+            options: options.clone(),
+            last: Mutex::new(time::monotonic()),
+            latest: Mutex::default(),
+        }
+    }
 }
 
 impl HeartbeatStore for SqliteHeartbeat {
@@ -37,10 +57,10 @@ impl HeartbeatStore for SqliteHeartbeat {
         }
         {
             let mut last = locked(&self.last);
-            if last.elapsed() < BEAT.min(self.options.lease / 4) {
+            if time::monotonic() - *last < BEAT.min(self.options.lease / 4) {
                 return;
             }
-            *last = Instant::now();
+            *last = time::monotonic();
         }
         let (id, attempt, options) = (self.id, self.attempt, self.options.clone());
         let progress = *locked(&self.latest);

@@ -9,6 +9,8 @@ mod engine;
 mod files;
 mod heartbeat;
 mod schema;
+#[cfg(any(test, feature = "fuzzing"))]
+pub mod simulation;
 mod statements;
 #[cfg(test)]
 mod tests;

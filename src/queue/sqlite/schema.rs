@@ -3,6 +3,8 @@
 //! One row per job. Every statement that must stay fast at a million rows names its index, and a
 //! test checks its query plan: the planner's own choice costs a thousand times more.
 
+use std::fs::Permissions;
+use std::os::unix::fs::PermissionsExt;
 use std::time::Duration;
 
 use rusqlite::{Connection, TransactionBehavior};
@@ -125,6 +127,10 @@ CREATE INDEX labels_job ON labels (job);
 /// Opens the connection of the writer.
 pub(super) fn open_writer(path: &std::path::Path) -> Result<Connection, QueueError> {
     let mut connection = open(path)?;
+    // A file that was copied may have been readable for others; the log gets its mode.
+    if let Err(error) = std::fs::set_permissions(path, Permissions::from_mode(0o600)) {
+        tracing::warn!(%error, "the queue's file keeps its mode");
+    }
     connection.pragma_update(None, "journal_mode", "WAL")?;
     migrate(&mut connection)?;
     Ok(connection)
@@ -146,13 +152,19 @@ fn open(path: &std::path::Path) -> Result<Connection, QueueError> {
     Ok(connection)
 }
 
+/// Creates the tables and indexes.
+pub(super) fn create(connection: &Connection) -> Result<(), QueueError> {
+    connection.execute_batch(TABLE)?;
+    connection.execute_batch(OUTBOX)?;
+    Ok(())
+}
+
 fn migrate(connection: &mut Connection) -> Result<(), QueueError> {
     let transaction = connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
     let found: i64 = transaction.pragma_query_value(None, "user_version", |row| row.get(0))?;
     match found {
         0 => {
-            transaction.execute_batch(TABLE)?;
-            transaction.execute_batch(OUTBOX)?;
+            create(&transaction)?;
             transaction.pragma_update(None, "application_id", new_identity())?;
             transaction.pragma_update(None, "user_version", VERSION)?;
         }

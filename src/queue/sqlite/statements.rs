@@ -6,6 +6,7 @@ use rusqlite::{Connection, params_from_iter};
 use crate::clock::Timestamp;
 use crate::job::{Priority, Tenant};
 use crate::queue::sql::{Row, Sql, Value, for_sqlite};
+use crate::queue::time;
 use crate::queue::types::QueueError;
 
 /// The number of the only node.
@@ -28,7 +29,7 @@ impl Sql for SqliteSql<'_> {
     }
 
     fn now(&self) -> Timestamp {
-        Timestamp::now()
+        time::wall()
     }
 
     fn node(&self) -> i64 {

@@ -16,6 +16,7 @@ use crate::clock::Timestamp;
 use crate::queue::effects::Effects;
 use crate::queue::local::Local;
 use crate::queue::sql::Sql;
+use crate::queue::time;
 use crate::queue::transitions::expiry;
 use crate::queue::types::{QueueError, QueueOptions};
 
@@ -31,7 +32,8 @@ type Change = Box<dyn FnOnce(&Connection, &mut Effects) -> Reply + Send>;
 /// Sends the result to the caller after the commit or rollback.
 type Reply = Box<dyn FnOnce(Result<(), QueueError>) + Send>;
 
-struct Command {
+/// A change, and whether its commit waits for the disk.
+pub(super) struct Command {
     durable: bool,
     change: Change,
 }
@@ -43,22 +45,28 @@ pub(super) struct Writer {
 }
 
 impl Writer {
+    /// A handle, and the inbox of its commands.
+    pub(super) fn new() -> (Self, Receiver<Command>) {
+        let (commands, inbox) = channel();
+        (Self { commands }, inbox)
+    }
+
     /// Starts the thread. The recovery of `connection` must be complete.
     pub(super) fn start(
         connection: Connection,
         options: QueueOptions,
         local: Arc<Local>,
     ) -> Result<Self, QueueError> {
-        let (commands, inbox) = channel();
+        let (writer, inbox) = Self::new();
         let thread = thread::Builder::new().name("queue".to_owned());
         let ended = local.ended.clone();
         thread
             .spawn(move || {
                 let _even_by_a_panic = ended.drop_guard();
-                run(&connection, &options, &local, &inbox);
+                Turns::new(connection, options, local).run(&inbox);
             })
             .map_err(|error| QueueError::Store(error.to_string()))?;
-        Ok(Self { commands })
+        Ok(writer)
     }
 
     /// Makes a change and waits for its commit; if `durable`, until it is on disk.
@@ -177,19 +185,56 @@ fn commit(
     swept && done.is_ok()
 }
 
-fn run(connection: &Connection, options: &QueueOptions, local: &Local, inbox: &Receiver<Command>) {
-    let mut next_due = expiry::next_due(&SqliteSql(connection)).unwrap_or(None);
-    let mut awake = Instant::now();
-    loop {
-        let now = Timestamp::now();
-        let sleep = next_due
-            .map_or(MAX_SLEEP, |due| now.until(due))
-            .min(MAX_SLEEP);
-        let first = match inbox.recv_timeout(sleep) {
-            Ok(command) => Some(command),
-            Err(RecvTimeoutError::Timeout) => None,
-            Err(RecvTimeoutError::Disconnected) => return,
-        };
+/// The work of the writer thread.
+pub(super) struct Turns {
+    connection: Connection,
+    options: QueueOptions,
+    local: Arc<Local>,
+    next_due: Option<Timestamp>,
+    /// When the last turn began.
+    awake: Instant,
+}
+
+impl Turns {
+    /// The recovery of `connection` must be complete.
+    pub(super) fn new(connection: Connection, options: QueueOptions, local: Arc<Local>) -> Self {
+        Self {
+            next_due: expiry::next_due(&SqliteSql(&connection)).unwrap_or(None),
+            connection,
+            options,
+            local,
+            awake: time::monotonic(),
+        }
+    }
+
+    /// The connection, between two turns.
+    #[cfg(any(test, feature = "fuzzing"))]
+    pub(super) fn connection(&mut self) -> &mut Connection {
+        &mut self.connection
+    }
+
+    /// Ends the work.
+    #[cfg(any(test, feature = "fuzzing"))]
+    pub(super) fn into_connection(self) -> Connection {
+        self.connection
+    }
+
+    /// Takes turns until the last handle is dropped.
+    fn run(&mut self, inbox: &Receiver<Command>) {
+        loop {
+            let now = time::wall();
+            let sleep = self.next_due.map_or(MAX_SLEEP, |due| now.until(due));
+            let first = match inbox.recv_timeout(sleep.min(MAX_SLEEP)) {
+                Ok(command) => Some(command),
+                Err(RecvTimeoutError::Timeout) => None,
+                Err(RecvTimeoutError::Disconnected) => return,
+            };
+            self.turn(first, inbox);
+        }
+    }
+
+    /// Commits `first` and what is in the inbox, and does what is due.
+    pub(super) fn turn(&mut self, first: Option<Command>, inbox: &Receiver<Command>) {
         let mut commands: Vec<Command> = first.into_iter().collect();
         while commands.len() < AT_ONCE
             && let Ok(command) = inbox.try_recv()
@@ -197,25 +242,25 @@ fn run(connection: &Connection, options: &QueueOptions, local: &Local, inbox: &R
             commands.push(command);
         }
         // A delay of half a lease means that the process was paused, and its workers with it.
-        let was_away = awake.elapsed() > MAX_SLEEP + options.lease / 2;
-        awake = Instant::now();
-        if was_away {
-            local.all_are_alive();
+        let now = time::monotonic();
+        if now - self.awake > MAX_SLEEP + self.options.lease / 2 {
+            self.local.all_are_alive();
         }
-        let sweeping = next_due.is_some_and(|due| due <= Timestamp::now());
+        self.awake = now;
+        let sweeping = self.next_due.is_some_and(|due| due <= time::wall());
         if commands.is_empty() && !sweeping {
-            continue;
+            return;
         }
         let swept = commit(
-            connection,
-            options,
-            local,
+            &self.connection,
+            &self.options,
+            &self.local,
             commands,
-            sweeping.then_some(awake),
+            sweeping.then_some(now),
         );
         // A store that fails is not asked again at once.
-        let later = Some(Timestamp::now().after(MAX_SLEEP));
-        next_due = match expiry::next_due(&SqliteSql(connection)) {
+        let later = Some(time::wall().after(MAX_SLEEP));
+        self.next_due = match expiry::next_due(&SqliteSql(&self.connection)) {
             Ok(due) if swept => due,
             Ok(due) => due.max(later),
             Err(error) => {

@@ -6,7 +6,7 @@
 use std::time::Duration;
 
 use crate::job::{Job, JobId, ended_notice};
-use crate::queue::outgoing::{Action, Outgoing};
+use crate::queue::outgoing::{Action, Outgoing, Settled};
 use crate::queue::sql::{Row, Sql, values};
 use crate::queue::types::QueueError;
 
@@ -80,16 +80,21 @@ fn outgoing(row: &Row) -> Result<Outgoing, QueueError> {
 /// Removes the rows that are done, and makes the others due after their delay.
 pub(in crate::queue) fn settle(
     sql: &dyn Sql,
-    actions: &[(i64, Option<Duration>)],
+    actions: &[(i64, Settled)],
 ) -> Result<(), QueueError> {
-    for (number, delay) in actions {
-        match delay {
-            None => sql.query("DELETE FROM outbox WHERE seq = ?1", values![*number])?,
-            Some(delay) => sql.query(
-                "UPDATE outbox SET due = ?2 WHERE seq = ?1",
-                values![*number, sql.now().after(*delay)],
-            )?,
+    for (number, settled) in actions {
+        let (delay, tries) = match *settled {
+            Settled::Done => {
+                sql.query("DELETE FROM outbox WHERE seq = ?1", values![*number])?;
+                continue;
+            }
+            Settled::Again(delay) => (delay, 0),
+            Settled::NotTried(delay) => (delay, 1),
         };
+        sql.query(
+            "UPDATE outbox SET due = ?2, attempts = attempts - ?3 WHERE seq = ?1",
+            values![*number, sql.now().after(delay), tries],
+        )?;
     }
     Ok(())
 }

@@ -55,6 +55,8 @@ class Labeller:
         report: dict[str, Any] = dict.fromkeys(COLUMNS, "")
         report |= {"key": key, "source": source, "target": target, "seconds": 0.0, "points": 0, "moving": 0}
         path = f"{self._output}/{key}.{self._ending}"
+        if any(part in ("", ".", "..") for part in key.split("/")):
+            return report | {"outcome": "refused", "error": f"the key {key!r} is no name below the output"}
         if _exists(path):
             return report | {"outcome": "found"}
         began = time.monotonic()
@@ -81,6 +83,9 @@ def _filesystem(uri: str) -> tuple[Any, str]:
 
     if "://" not in uri:
         uri = os.path.abspath(uri)
+    elif "?" in uri:
+        # It could name another server, which would get the credentials of this one.
+        raise _native.InputError(f"{uri}: a URI of a bucket has no options")
     filesystem, path = fs.FileSystem.from_uri(uri)
     return filesystem, path
 
