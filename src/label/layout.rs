@@ -100,7 +100,7 @@ impl Layout {
     }
 }
 
-/// Refuses a plan of which two outputs have one name, or one is a folder of another.
+/// Checks the names of the outputs: each is used once, and none is the folder of another output.
 pub(super) fn check_outputs(plan: &Plan, layout: Layout, tracks: bool) -> Result<(), PlanError> {
     let mut known: HashMap<String, &str> = HashMap::new();
     let pairs = plan.all_pairs().filter(|&(_, pair)| layout.asks_for(pair));

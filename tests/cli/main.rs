@@ -13,6 +13,7 @@ mod gpu_rule;
 mod hostile;
 mod label;
 mod label_datasets;
+mod label_hostile;
 mod label_manifest;
 #[path = "../common/object_server.rs"]
 mod object_server;

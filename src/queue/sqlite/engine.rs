@@ -137,6 +137,21 @@ pub(super) fn recover(
     Ok(())
 }
 
+/// Subscribes to a job: through the writer, so that no change falls between the query and the
+/// subscription.
+pub(super) async fn watch(
+    writer: &Writer,
+    local: &Arc<Local>,
+    id: JobId,
+) -> Result<watch::Receiver<Arc<Job>>, QueueError> {
+    let local = Arc::clone(local);
+    let change = move |sql: &dyn Sql, _: &mut Effects| {
+        let job = Arc::new(transitions::get(sql, id)?);
+        Ok(local.watchers.follow(&job))
+    };
+    writer.write(false, change).await
+}
+
 #[async_trait]
 impl Engine for SqliteEngine {
     fn local(&self) -> &Arc<Local> {
@@ -164,13 +179,7 @@ impl Engine for SqliteEngine {
     }
 
     async fn watch(&self, id: JobId) -> Result<watch::Receiver<Arc<Job>>, QueueError> {
-        // Through the writer, so that no change falls between the query and the subscription.
-        let local = Arc::clone(&self.local);
-        let change = move |sql: &dyn Sql, _: &mut Effects| {
-            let job = Arc::new(transitions::get(sql, id)?);
-            Ok(local.watchers.follow(&job))
-        };
-        self.writer.write(false, change).await
+        watch(&self.writer, &self.local, id).await
     }
 
     fn heartbeat(&self, job: &Job) -> Arc<dyn HeartbeatStore> {

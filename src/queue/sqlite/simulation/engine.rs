@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use async_trait::async_trait;
-use tokio::sync::watch;
+use tokio::sync::watch::Receiver;
 
 use crate::job::{Job, JobId};
 use crate::queue::database::{Engine, Kept};
@@ -13,10 +13,10 @@ use crate::queue::lease::HeartbeatStore;
 use crate::queue::local::Local;
 use crate::queue::node::{Capacities, Node};
 use crate::queue::sql::Sql;
+use crate::queue::sqlite::engine::watch;
 use crate::queue::sqlite::heartbeat::SqliteHeartbeat;
 use crate::queue::sqlite::statements::SqliteSql;
 use crate::queue::sqlite::writer::{Turns, Writer};
-use crate::queue::transitions;
 use crate::queue::types::{QueueError, QueueOptions};
 use crate::sync::locked;
 
@@ -50,13 +50,8 @@ impl Engine for SimulatedEngine {
         query(&SqliteSql(locked(&self.turns).connection()))
     }
 
-    async fn watch(&self, id: JobId) -> Result<watch::Receiver<Arc<Job>>, QueueError> {
-        let local = Arc::clone(&self.local);
-        let change = move |sql: &dyn Sql, _: &mut Effects| {
-            let job = Arc::new(transitions::get(sql, id)?);
-            Ok(local.watchers.follow(&job))
-        };
-        self.writer.write(false, change).await
+    async fn watch(&self, id: JobId) -> Result<Receiver<Arc<Job>>, QueueError> {
+        watch(&self.writer, &self.local, id).await
     }
 
     fn heartbeat(&self, job: &Job) -> Arc<dyn HeartbeatStore> {

@@ -159,7 +159,7 @@ impl Process {
     /// Ends the process. All calls must have been dropped.
     pub(super) fn end(self) -> Disk {
         drop(self.queue);
-        let turns = Arc::into_inner(self.turns).expect("nobody else has the writer");
+        let turns = Arc::into_inner(self.turns).expect("all other handles are dropped");
         Disk {
             connection: turns
                 .into_inner()

@@ -57,7 +57,7 @@ pub(super) struct Promises {
     ended_now: HashSet<(JobId, u32)>,
     /// Jobs that were queued again in the writer's turn: what was asked for before counts no more.
     again_now: HashSet<JobId>,
-    /// Attempts whose end nobody waits to hear of.
+    /// Attempts whose `finish` call was dropped before its answer.
     unheard: HashSet<(JobId, u32)>,
     /// Jobs that were asked for again by a call that may not have been answered yet.
     asked_again: HashSet<JobId>,
@@ -66,7 +66,7 @@ pub(super) struct Promises {
     ever_ended: HashSet<JobId>,
     forgotten: HashSet<JobId>,
     files_removed: HashSet<JobId>,
-    /// Whether the machine has lost its power: what nobody waited for may be gone.
+    /// Whether the machine has lost its power. Commits that had not reached the disk are lost then.
     lost_power: bool,
 }
 
@@ -352,7 +352,7 @@ impl Promises {
             self.jobs
         );
         for (id, Notices { ends, told }) in &self.notices {
-            // An end that nobody waited for may be lost with the power, and happen again.
+            // A power failure may undo an end whose commit had not reached the disk. The job ends again.
             let enough = told.len() == *ends || self.lost_power && told.len() <= *ends;
             assert!(
                 enough,
@@ -361,7 +361,8 @@ impl Promises {
             );
         }
         let kept: Vec<_> = self.forgotten.difference(&self.files_removed).collect();
-        // What nobody waited for is lost with the power; the store's own search finds such files.
+        // A power failure loses commits that had not reached the disk. The search for orphaned
+        // payloads finds such files.
         assert!(
             kept.is_empty() || self.lost_power,
             "the files of {kept:?} are kept"

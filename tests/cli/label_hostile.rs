@@ -1,0 +1,105 @@
+//! Tests of bulk labelling with names, links and files that cannot work.
+
+use std::fs;
+use std::process::Command;
+
+use super::label::{drives, label, labels};
+
+#[test]
+fn names_and_files_that_cannot_work_are_refused_and_do_not_hang() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    drives(folder, 1, "4");
+    let made = Command::new("mkfifo").arg(folder.join("pipe")).status();
+    assert!(made.expect("mkfifo").success());
+    let sweep = |index: usize| format!("drives/d0/sweep_{index:04}.pcd");
+    let mut rows = "source,target,drive,id\n".to_owned();
+    for source in ["pipe", "/dev/zero", "drives", "drives/d0/sweep_0000.pcd/x"] {
+        rows += &format!("{source},{},z,{}\n", sweep(1), rows.lines().count());
+    }
+    rows += &format!("{},{},z,good\n", sweep(0), sweep(1));
+    fs::write(folder.join("strange.csv"), rows).expect("writable");
+    let done = label(folder, &["strange.csv", "-o", "strange"]);
+    // Nothing of it will ever work: the farm is not told to try again.
+    assert_eq!(done.code, 65, "{}", done.stderr);
+    assert_eq!(labels(&folder.join("strange")).len(), 1);
+
+    let rows = (0..3).map(|id| format!("{},{},z,{id}\n", sweep(id), sweep(id + 1)));
+    let rows = format!("source,target,drive,id\n{}", rows.collect::<String>());
+    fs::write(folder.join("pairs.csv"), rows).expect("writable");
+    for more in [&["--layout", "av2-v2"][..], &["--tracks"]] {
+        let refused = label(folder, &[&["pairs.csv", "-o", "one"], more].concat());
+        assert!(
+            refused.stderr.contains("would both be written"),
+            "{}",
+            refused.stderr
+        );
+    }
+    let rows = format!(
+        "source,target,drive,id\n{0},{1},a,b\n{0},{1},a/b.npz,c\n",
+        sweep(0),
+        sweep(1)
+    );
+    fs::write(folder.join("nested.csv"), rows).expect("writable");
+    let refused = label(folder, &["nested.csv", "-o", "nested"]);
+    assert!(
+        refused.stderr.contains("the folder of that of"),
+        "{}",
+        refused.stderr
+    );
+    let refused = label(folder, &["drives", "-o", "drives"]);
+    assert_eq!(refused.code, 2, "{}", refused.stderr);
+
+    // Links multiply nothing.
+    for name in ["up1", "up2"] {
+        std::os::unix::fs::symlink("..", folder.join("drives").join(name)).expect("a link");
+    }
+    let done = label(folder, &["drives", "-o", "linked"]);
+    assert!(
+        done.stdout.contains("3 of 3 pairs"),
+        "{} {}",
+        done.stdout,
+        done.stderr
+    );
+}
+
+#[test]
+fn the_end_of_a_run_removes_its_own_remains_alone() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    drives(folder, 1, "2");
+    assert_eq!(label(folder, &["drives", "-o", "labels"]).code, 0);
+    fs::create_dir(folder.join("outside")).expect("a folder");
+    let users = [
+        "labels/#notes.txt#",
+        "labels/C#",
+        "labels/frame#12",
+        "outside/a.npz#3",
+    ];
+    let remains = "labels/d0/sweep_0000.npz#7";
+    for name in users.iter().chain([&remains]) {
+        fs::write(folder.join(name), "x").expect("writable");
+        let old = Command::new("touch")
+            .args(["-d", "3 hours ago", name])
+            .current_dir(folder)
+            .status();
+        assert!(old.expect("touch").success());
+    }
+    std::os::unix::fs::symlink("../outside", folder.join("labels/link")).expect("a link");
+    let done = label(
+        folder,
+        &[
+            "drives",
+            "-o",
+            "labels",
+            "--finalize",
+            "--shards",
+            "4000000000",
+        ],
+    );
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    for name in users {
+        assert!(folder.join(name).exists(), "{name}");
+    }
+    assert!(!folder.join(remains).exists());
+}
