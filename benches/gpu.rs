@@ -1,5 +1,5 @@
 //! GPU benchmark: each kernel against the measured arithmetic peak of the GPU, whole pairs of four
-//! sizes, and many small pairs at once.
+//! sizes, many small pairs at once, and object searches with and without the GPU.
 //!
 //! ```text
 //! cargo bench --bench gpu -- [CARD] [--points N,N,...] [--pairs N,N,...]
@@ -9,18 +9,18 @@
 //! `benches/gpu.sh` runs this benchmark, the tests and the PyTorch peer from prebuilt programs.
 #![expect(clippy::print_stdout, reason = "a benchmark prints its figures")]
 
-#[expect(dead_code, reason = "scenes are other benchmarks'")]
 mod common;
 
 use std::time::Instant;
 
-use common::median;
+use common::{median, scenes};
+use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::field::Backend;
 use fnsf::flow::gpu::{
     Gpu, GpuOptions, KernelTime, Selector, arithmetic_peak, kernel_times, select,
 };
 use fnsf::flow::simulate::{SimulatedPair, Street, StreetOptions};
-use fnsf::flow::{Control, Estimate, Options, Precision, Preset, Problem, estimate};
+use fnsf::flow::{Control, Estimate, Options, Precision, Preset, Problem, Solution, estimate};
 
 /// Timed runs of each pair, after one warm-up run.
 const RUNS: u64 = 5;
@@ -210,6 +210,66 @@ fn batches(gpu: &Gpu, pair: &SimulatedPair, counts: &[usize]) -> Result<(), Stri
     Ok(())
 }
 
+/// Object searches with their clusters searched by the host's threads and by the GPU, in turn.
+fn objects(gpu: &Gpu) -> Result<(), String> {
+    const ALIKE_M: f32 = 0.02;
+    let cpu = CpuBackend::new(None).map_err(|e| e.to_string())?;
+    println!(
+        "| scene | points | clusters | host: clusters ms | all ms | GPU: clusters ms | all ms | alike |"
+    );
+    println!("|---|---|---|---|---|---|---|---|");
+    let options = Preset::Default.options(None);
+    for scene in scenes()? {
+        let problem = Problem::pair(&scene.source, &scene.target);
+        let backends = [&cpu as &dyn Backend, gpu];
+        let mut runs = [const { Vec::new() }; 2];
+        for run in 0..=RUNS {
+            for (backend, runs) in backends.iter().zip(&mut runs) {
+                backend.host().forget();
+                let clock = Clock(Instant::now());
+                let found = estimate(*backend, &problem, &options, &clock);
+                let found = found.map_err(|e| e.to_string())?;
+                if run > 0 {
+                    runs.push(found);
+                }
+            }
+        }
+        let [host, card] = &runs;
+        let ms = |runs: &[Estimate]| {
+            let of = |value: &dyn Fn(&Estimate) -> f64| median(runs.iter().map(value).collect());
+            [of(&cluster_seconds), of(&|e| e.total_seconds)].map(|seconds| seconds * 1e3)
+        };
+        let ([host_ms, host_all_ms], [card_ms, card_all_ms]) = (ms(host), ms(card));
+        let pairs = host[0].flow.iter().zip(&card[0].flow);
+        let alike = pairs.filter(|(a, b)| (0..3).all(|axis| (a[axis] - b[axis]).abs() < ALIKE_M));
+        println!(
+            "| {} | {} | {} | {host_ms:.1} | {host_all_ms:.1} | {card_ms:.1} | {card_all_ms:.1} | {:.4} |",
+            scene.name,
+            scene.source.len(),
+            clusters(&host[0]),
+            alike.count() as f64 / host[0].flow.len() as f64,
+        );
+    }
+    println!();
+    Ok(())
+}
+
+/// Seconds of the search of all clusters.
+fn cluster_seconds(estimate: &Estimate) -> f64 {
+    match &estimate.solution {
+        Solution::Objects(objects) => objects.seconds.clusters,
+        Solution::Field(_) => f64::NAN,
+    }
+}
+
+/// Number of clusters that were searched.
+fn clusters(estimate: &Estimate) -> usize {
+    match &estimate.solution {
+        Solution::Objects(objects) => objects.searched,
+        Solution::Field(_) => 0,
+    }
+}
+
 /// Seconds of the distance queries of a field; zero of an object search.
 fn queries(estimate: &Estimate) -> f64 {
     estimate.fit().map_or(0.0, |fit| fit.query_seconds)
@@ -236,6 +296,7 @@ fn main() -> Result<(), String> {
         if tiles.is_empty() { "none" } else { &tiles }
     );
     let pair = street(1)?;
+    objects(&gpu)?;
     kernels(&gpu, &pair, &asked.points)?;
     pairs(&gpu, &pair, &asked.points)?;
     batches(&gpu, &pair, &asked.pairs)

@@ -29,9 +29,11 @@ build() {
   place() { install "$(executable "$1" "$2")" "$to/$3"; }
   cargo build --locked --release --bin fnsf --message-format json | place bin fnsf fnsf
   cargo bench --locked --bench gpu --no-run --message-format json | place bench gpu bench-gpu
+  cargo bench --locked --bench side_by_side --no-run --message-format json |
+    place bench side_by_side bench-side-by-side
   cargo test --locked --lib --no-run --message-format json | place lib fnsf test-lib
   cargo test --locked --test numerics --no-run --message-format json | place test numerics test-numerics
-  strip "$to"/fnsf "$to"/bench-gpu "$to"/test-lib "$to"/test-numerics
+  strip "$to"/fnsf "$to"/bench-gpu "$to"/bench-side-by-side "$to"/test-lib "$to"/test-numerics
   echo "built into $to: $(du -sh "$to" | cut -f1)"
 }
 

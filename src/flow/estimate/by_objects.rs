@@ -7,17 +7,19 @@ use super::result::{ObjectSolution, Solution};
 use crate::flow::data::StopReason;
 use crate::flow::data::{Interrupt, Point, RigidTransform};
 use crate::flow::error::FlowError;
-use crate::flow::host::Host;
+use crate::flow::field::{Backend, BackendError};
 use crate::flow::motion::Residual;
-use crate::flow::objects::{Objects, SearchClouds, TimedPoints};
+use crate::flow::objects::{ClusterDevice, Objects, PackedScene, SearchClouds, TimedPoints};
 use crate::flow::options::ObjectOptions;
 
-/// Estimates the residual motion by an object search on the host's threads.
+/// Estimates the residual motion by an object search. The device searches the clusters if it has
+/// kernels for it, and the host's threads do the rest.
 ///
 /// # Errors
-/// [`FlowError`] where the ground mask of a neighbor sweep is rejected or the control cancels.
+/// [`FlowError`] where the ground mask of a neighbor sweep is rejected, the control cancels, or the
+/// device fails.
 pub(super) fn residual_motion(
-    host: &Host,
+    backend: &dyn Backend,
     input: &Input<'_>,
     options: &ObjectOptions,
 ) -> Result<Solved, FlowError> {
@@ -27,6 +29,7 @@ pub(super) fn residual_motion(
         control,
         ..
     } = *input;
+    let host = backend.host();
     let whole = has_time_for_all(selection, control);
     let prior = RigidTransform::identity();
     let ego = ego_motion(host, selection, input.options.ego, &prior, whole, control);
@@ -57,7 +60,11 @@ pub(super) fn residual_motion(
             .map(|[source, target]| [source.as_slice(), target]),
         target_from_source: motion,
     };
-    let mut search = host.find_objects(&clouds, options, control);
+    let on_device =
+        |scene: &PackedScene, is_over: &dyn Fn() -> bool| backend.search_clusters(scene, is_over);
+    let device: Option<&ClusterDevice<'_, BackendError>> =
+        backend.searches_clusters().then_some(&on_device);
+    let mut search = host.find_objects_with(&clouds, options, device, control)?;
     if search.interrupted == Some(Interrupt::Cancelled) {
         return Err(FlowError::Cancelled);
     }
@@ -103,8 +110,12 @@ pub(super) fn residual_motion(
             Some(_) => StopReason::Deadline,
             None => StopReason::Completed,
         },
+        device: if search.on_device {
+            backend.name()
+        } else {
+            host.name().to_owned()
+        },
         motion: Residual::Objects(search.motions.into()),
-        device: host.name().to_owned(),
         precomputed_at,
     })
 }

@@ -98,7 +98,7 @@ fn estimate_from(
     let solved = match &options.method {
         // Only the fit of one field has snapshots.
         Method::Objects(_) if snapshot.is_some() => return Err(SnapshotError::Foreign.into()),
-        Method::Objects(objects) => by_objects::residual_motion(backend.host(), &input, objects)?,
+        Method::Objects(objects) => by_objects::residual_motion(backend, &input, objects)?,
         Method::Field(field) => match &field.partition {
             Some(_) if snapshot.is_some() => return Err(SnapshotError::Foreign.into()),
             Some(partition) => by_cluster::residual_motion(backend, &input, field, partition)?,

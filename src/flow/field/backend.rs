@@ -7,6 +7,7 @@ use super::snapshot::TrainerState;
 use crate::flow::data::{Control, Interrupt, Point};
 use crate::flow::distance::DistanceError;
 use crate::flow::host::{Host, HostError};
+use crate::flow::objects::{FoundRecord, PackedScene};
 use crate::flow::options::{FieldOptions, LossOptions};
 
 /// A device that prepares targets, fits fields to them and evaluates fitted networks.
@@ -14,13 +15,35 @@ pub trait Backend: Send + Sync {
     /// The device's name, as reports show it.
     fn name(&self) -> String;
 
-    /// The host's thread pool. Registration and the object search run there on every device.
+    /// The host's thread pool. Registration and the object search run there on every device, but for
+    /// the clusters of [`Self::searches_clusters`].
     fn host(&self) -> &Host;
 
     /// Whether the host's threads compute the fits. They are the reference that the self-test of
     /// any other device is compared with.
     fn is_cpu(&self) -> bool {
         false
+    }
+
+    /// Whether the device searches the clusters of an object search, instead of the host's threads.
+    fn searches_clusters(&self) -> bool {
+        false
+    }
+
+    /// Searches the clusters of a scene in their order, until `is_over` is true. Returns what was
+    /// found of the first ones.
+    ///
+    /// # Errors
+    /// [`BackendError::Unsupported`] on a device that searches none. [`BackendError::Memory`],
+    /// [`BackendError::Busy`], [`BackendError::Lost`] or [`BackendError::Device`] if a GPU has no
+    /// memory for the scene or fails.
+    fn search_clusters(
+        &self,
+        scene: &PackedScene,
+        is_over: &dyn Fn() -> bool,
+    ) -> Result<Vec<FoundRecord>, BackendError> {
+        let _nothing_is_searched = (scene, is_over);
+        Err(BackendError::Unsupported("it searches no clusters"))
     }
 
     /// Prepares `target` (M x 3, metres) for fits to the loss `options`: builds its distance

@@ -13,6 +13,7 @@ use super::{distance, inference};
 use crate::flow::data::{Control, Point};
 use crate::flow::field::{Backend, BackendError, Network, PreparedTarget, Trainer};
 use crate::flow::host::Host;
+use crate::flow::objects::{FoundRecord, PackedScene};
 use crate::flow::options::{FieldOptions, LossOptions};
 
 /// An opened GPU, as a [`Backend`]. Clones share it, and each can fit a pair from its own thread.
@@ -90,6 +91,18 @@ impl Backend for Gpu {
 
     fn host(&self) -> &Host {
         &self.0.host
+    }
+
+    fn searches_clusters(&self) -> bool {
+        true
+    }
+
+    fn search_clusters(
+        &self,
+        scene: &PackedScene,
+        is_over: &dyn Fn() -> bool,
+    ) -> Result<Vec<FoundRecord>, BackendError> {
+        self.0.search_clusters(scene, is_over)
     }
 
     fn prepare_target(

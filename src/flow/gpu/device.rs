@@ -2,7 +2,7 @@
 
 use std::sync::OnceLock;
 
-use super::adapter::Adapter;
+use super::adapter::{Adapter, AdapterKind};
 use super::batcher::Batch;
 use super::context::Context;
 use super::half::Units;
@@ -17,6 +17,9 @@ pub(super) struct Device {
     pub(super) batch: Batch,
     pub(super) host: Host,
     pub(super) name: String,
+    pub(super) kind: AdapterKind,
+    /// The kernel of the object search.
+    pub(super) clusters: OnceLock<wgpu::ComputePipeline>,
     units: OnceLock<Result<Units, String>>,
 }
 
@@ -34,6 +37,8 @@ impl Device {
                 "{} ({}, {})",
                 adapter.name, adapter.interface, adapter.driver
             ),
+            kind: adapter.kind,
+            clusters: OnceLock::new(),
             units: OnceLock::new(),
         })
     }

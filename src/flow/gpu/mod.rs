@@ -12,6 +12,7 @@ mod batcher;
 mod buffers;
 mod chamfer;
 mod chamfer_phases;
+mod cluster_search;
 mod context;
 mod device;
 mod distance;

@@ -64,6 +64,22 @@ pub(super) const SOURCES: [(&str, &str); 18] = [
     ("multiply_adds", source!("multiply_adds")),
 ];
 
+/// Entry point and source of the kernel that searches clusters.
+pub(super) const CLUSTER_SOURCE: (&str, &str) = (
+    "search_clusters",
+    source!(
+        "objects/records",
+        "objects/index",
+        "objects/measure",
+        "objects/votes",
+        "objects/state",
+        "objects/fit",
+        "objects/evidence",
+        "objects/stages",
+        "objects/search"
+    ),
+);
+
 macro_rules! half_sources {
     ($tile:literal) => {
         [
@@ -200,7 +216,7 @@ impl HalfKernels {
 }
 
 /// Builds the pipeline of the kernel `name`.
-fn pipeline(
+pub(super) fn pipeline(
     device: &wgpu::Device,
     sources: &[(&str, &str)],
     name: &str,

@@ -3,13 +3,14 @@
 //!
 //! Results that depend on a single sweep are cached.
 
+use core::convert::Infallible;
 use std::sync::Arc;
 
 use rayon::prelude::*;
 
 use super::sweep_cache::SweepCache;
 use crate::flow::data::{Control, Point, RigidTransform};
-use crate::flow::objects::{ObjectSearch, SearchClouds};
+use crate::flow::objects::{ClusterDevice, ObjectSearch, SearchClouds};
 use crate::flow::options::ObjectOptions;
 use crate::flow::registration::Registration;
 use crate::flow::{ground, objects, registration};
@@ -140,7 +141,22 @@ impl Host {
         options: &ObjectOptions,
         control: &dyn Control,
     ) -> ObjectSearch {
-        let find = || objects::find_objects(clouds, options, control);
+        let on_host: Result<_, Infallible> = self.find_objects_with(clouds, options, None, control);
+        on_host.unwrap_or_else(|never| match never {})
+    }
+
+    /// [`Self::find_objects`] with the clusters searched by `device`, if there is one.
+    ///
+    /// # Errors
+    /// That of the device.
+    pub(crate) fn find_objects_with<E: Send>(
+        &self,
+        clouds: &SearchClouds<'_>,
+        options: &ObjectOptions,
+        device: Option<&ClusterDevice<'_, E>>,
+        control: &dyn Control,
+    ) -> Result<ObjectSearch, E> {
+        let find = || objects::find_objects(clouds, options, device, control);
         self.threads.install(find)
     }
 }

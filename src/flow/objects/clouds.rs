@@ -50,6 +50,20 @@ impl SourceCloud {
     }
 }
 
+impl SourceCloud {
+    /// The mean position of the points `rows` along x and y, metres.
+    pub(super) fn center(&self, rows: &[u32]) -> [f32; 2] {
+        let count = rows.len() as f32;
+        let mut center = [0.0; 2];
+        for &row in rows {
+            for (center, c) in center.iter_mut().zip(self.points[row as usize]) {
+                *center += c / count;
+            }
+        }
+        center
+    }
+}
+
 /// The target or a neighbor sweep, voxel-downsampled.
 pub(super) struct TargetCloud {
     /// One point a voxel, metres in the target's frame.

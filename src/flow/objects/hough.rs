@@ -44,6 +44,21 @@ impl TranslationVotes {
         }
     }
 
+    /// The target points that pairs are formed with.
+    pub(super) fn near(&self) -> &ColumnIndex {
+        &self.near
+    }
+
+    /// Bins on each side of the zero translation.
+    pub(super) fn half(&self) -> i32 {
+        self.half
+    }
+
+    /// Largest height difference of a pair that votes, metres.
+    pub(super) fn within_m(&self) -> f32 {
+        self.within_m
+    }
+
     /// At most `most` translations along x and y of the source `points`, of at most `reach_m` along
     /// each, metres, in descending order of votes. Of equal votes, the shorter translation comes
     /// first.

@@ -107,16 +107,7 @@ impl ClusterSearch<'_> {
         let options = self.scene.options;
         let members = &self.scene.source.members[self.cluster as usize];
         let count = members.len() as f32;
-        let mut center = [0.0; 2];
-        for &row in members {
-            for (center, c) in center
-                .iter_mut()
-                .zip(self.scene.source.points[row as usize])
-            {
-                *center += c / count;
-            }
-        }
-        let standing = PlanarMotion::still(center);
+        let standing = PlanarMotion::still(self.scene.source.center(members));
         if still.forward_m < options.static_fit_m && !self.left_slowly(&standing) {
             return None;
         }

@@ -90,6 +90,7 @@ mod tests {
             evidence: Vec::new(),
             clusters: 1,
             all_clusters: 1,
+            on_device: false,
             cost_m: 0.0,
             seconds: SearchSeconds::default(),
             interrupted: None,

@@ -29,6 +29,7 @@ mod measured_at;
 mod motion_field;
 mod neighbor_view;
 mod own_vehicle;
+mod packed;
 mod planar_motion;
 mod scene;
 mod search;
@@ -40,7 +41,12 @@ pub use describe::{Cluster, Objects};
 pub use features::ConfidenceFeatures;
 pub use labels::ClusterLabels;
 pub use motion_field::ObjectMotions;
+pub use packed::{FoundRecord, PackedScene};
 pub use search::{ObjectSearch, SearchClouds, SearchSeconds};
 
 pub(crate) use measured_at::TimedPoints;
-pub(crate) use search::find_objects;
+pub(crate) use search::{ClusterDevice, find_objects};
+
+/// What the kernel that searches clusters is compared with, for tests of its records.
+#[cfg(test)]
+pub(crate) use packed::{ClusterRecord, SceneRecord, ViewRecord};

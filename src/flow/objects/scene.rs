@@ -86,6 +86,26 @@ impl<'a> Scene<'a> {
         free.map(|(slot, _)| slot as u32).or(own)
     }
 
+    /// The indices of the target points that are no static match, and of the static matches.
+    pub(super) fn indices(&self) -> [&ColumnIndex; 2] {
+        [&self.free, &self.taken]
+    }
+
+    /// The cluster that explains each static match, in the order of its index.
+    pub(super) fn owners(&self) -> impl Iterator<Item = u32> {
+        self.owners.all(self.taken.len())
+    }
+
+    /// For each cluster, whether it is clearly static.
+    pub(super) fn statics(&self) -> &[bool] {
+        &self.is_static
+    }
+
+    /// Unit normals of the target points; zero where the surface is not flat.
+    pub(super) fn normals(&self) -> &[Point] {
+        &self.normals
+    }
+
     /// Whether some static matches may be those of `cluster`.
     fn has_static_matches(&self, cluster: u32) -> bool {
         self.is_static.get(cluster as usize) == Some(&true)

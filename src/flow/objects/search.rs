@@ -7,7 +7,7 @@ use std::sync::{Mutex, PoisonError};
 use rayon::prelude::*;
 
 use super::clouds::{SourceCloud, TargetCloud};
-use super::cluster_cost::ClusterSearch;
+use super::cluster_cost::{ClusterSearch, Cost};
 use super::features::ConfidenceFeatures;
 use super::features::{Findings, SearchedCluster};
 use super::free_space::FreeSpace;
@@ -16,6 +16,7 @@ use super::hypothesis::Hypothesis;
 use super::labels::ClusterLabels;
 use super::motion_field::ObjectMotions;
 use super::neighbor_view::NeighborView;
+use super::packed::{FoundRecord, PackedScene};
 use super::scene::Scene;
 use super::{accept, assign, features, free_space};
 use crate::flow::data::AlignedSweep;
@@ -76,6 +77,8 @@ pub struct ObjectSearch {
     /// is the mean truncated distance of its points from the target, after its accepted motion or
     /// at rest. Infinite if no cluster was searched.
     pub cost_m: f64,
+    /// Whether a device searched the clusters, and not the host's threads.
+    pub on_device: bool,
     /// Seconds of the phases, by the control's clock.
     pub seconds: SearchSeconds,
     /// Why not all clusters were searched; none if all were. [`Interrupt::Deadline`] also stands
@@ -120,22 +123,32 @@ impl ObjectSearch {
             clusters: 0,
             all_clusters: 0,
             cost_m: f64::INFINITY,
+            on_device: false,
             seconds: SearchSeconds::default(),
             interrupted: Some(interrupted),
         }
     }
 }
 
-/// Searches `clouds` for moving objects. Large clusters are searched first. Clusters that were not
-/// searched because `control` interrupted or the time was too short are static.
-pub(crate) fn find_objects(
+/// Searches the clusters of a scene, the first ones first, until the second argument is true.
+pub(crate) type ClusterDevice<'a, E> =
+    dyn Fn(&PackedScene, &dyn Fn() -> bool) -> Result<Vec<FoundRecord>, E> + Sync + 'a;
+
+/// Searches `clouds` for moving objects. Large clusters are searched first, by `device` if there is
+/// one whose limits the options keep. Clusters that were not searched because `control` interrupted
+/// or the time was too short are static.
+///
+/// # Errors
+/// That of the device.
+pub(crate) fn find_objects<E: Send>(
     clouds: &SearchClouds<'_>,
     options: &ObjectOptions,
+    device: Option<&ClusterDevice<'_, E>>,
     control: &dyn Control,
-) -> ObjectSearch {
+) -> Result<ObjectSearch, E> {
     let SearchClouds { source, target, .. } = *clouds;
     if let Some(interrupt) = out_of_time(control, 0.0) {
-        return ObjectSearch::nothing(interrupt);
+        return Ok(ObjectSearch::nothing(interrupt));
     }
     let began = control.seconds();
     let clustered = || {
@@ -157,7 +170,7 @@ pub(crate) fn find_objects(
         rayon::join(clustered, || rayon::join(others, free_space));
     let clouds_seconds = control.seconds() - began;
     if let Some(interrupt) = out_of_time(control, clouds_seconds * SCENES) {
-        return ObjectSearch::nothing(interrupt);
+        return Ok(ObjectSearch::nothing(interrupt));
     }
     let scene = Scene::new(&downsampled, &others[0], options);
     let votes = TranslationVotes::new(&scene);
@@ -176,12 +189,21 @@ pub(crate) fn find_objects(
         free_space: &free_space,
         votes: &votes,
     };
+    let order = views.large_first();
+    let packed = device.and_then(|device| {
+        let packed = PackedScene::new(&scene, &neighbors, &votes, &order)?;
+        Some((device, packed))
+    });
+    let on_device = packed.is_some();
     let Progressed {
         searched,
         clusters,
         interrupted,
         ..
-    } = search_all(&views, rest, control);
+    } = match packed {
+        Some((device, packed)) => search_on(device, &packed, &views, rest, control)?,
+        None => search_all(&views, &order, rest, control),
+    };
     let costs = searched.iter().flatten();
     let costs = costs.map(|found| f64::from(found.cost().forward_m));
     let sum_m: f64 = costs.sum();
@@ -209,7 +231,7 @@ pub(crate) fn find_objects(
     };
     let evidence = features::evidence(&findings, source, &labels);
     let parts = ClusterLabels::new(&labels, &spread.cluster_motion, &point_motion, movers.len());
-    ObjectSearch {
+    Ok(ObjectSearch {
         evidence,
         parts,
         motions,
@@ -219,13 +241,14 @@ pub(crate) fn find_objects(
             0 => f64::INFINITY,
             searched => sum_m / searched as f64,
         },
+        on_device,
         seconds: SearchSeconds {
             preparation: prepared_at - began,
             clusters: searched_at - prepared_at,
             assignment: control.seconds() - searched_at,
         },
         interrupted,
-    }
+    })
 }
 
 /// What the search of a cluster reads.
@@ -234,6 +257,16 @@ struct Views<'a> {
     neighbors: &'a [NeighborView<'a>],
     free_space: &'a FreeSpace,
     votes: &'a TranslationVotes,
+}
+
+impl Views<'_> {
+    /// The clusters in the order in which they are searched.
+    fn large_first(&self) -> Vec<u32> {
+        let members = &self.scene.source.members;
+        let mut order: Vec<u32> = (0..members.len() as u32).collect();
+        order.sort_by_key(|&cluster| std::cmp::Reverse(members[cluster as usize].len()));
+        order
+    }
 }
 
 /// The clusters as searched so far.
@@ -248,6 +281,16 @@ struct Progressed {
 }
 
 impl Progressed {
+    /// None of so many clusters is searched.
+    fn none(clusters: usize) -> Self {
+        Self {
+            searched: vec![None; clusters],
+            clusters: 0,
+            sum_m: 0.0,
+            interrupted: None,
+        }
+    }
+
     /// Adds the result of a cluster, and reports every group of clusters.
     fn add(&mut self, cluster: u32, found: SearchedCluster, control: &dyn Control) {
         self.searched[cluster as usize] = Some(found);
@@ -270,17 +313,38 @@ fn out_of_time(control: &dyn Control, needed: f64) -> Option<Interrupt> {
     control.interrupt().or(late.then_some(Interrupt::Deadline))
 }
 
-/// Searches all clusters, large ones first, as long as `rest` seconds are left for what follows.
-fn search_all(views: &Views<'_>, rest: f64, control: &dyn Control) -> Progressed {
-    let members = &views.scene.source.members;
-    let mut order: Vec<u32> = (0..members.len() as u32).collect();
-    order.sort_by_key(|&cluster| std::cmp::Reverse(members[cluster as usize].len()));
-    let progressed = Mutex::new(Progressed {
-        searched: vec![None; order.len()],
-        clusters: 0,
-        sum_m: 0.0,
-        interrupted: None,
+/// Searches all clusters on a device, as long as `rest` seconds are left for what follows. The host
+/// judges what it finds.
+fn search_on<E>(
+    device: &ClusterDevice<'_, E>,
+    packed: &PackedScene,
+    views: &Views<'_>,
+    rest: f64,
+    control: &dyn Control,
+) -> Result<Progressed, E> {
+    let is_over = || out_of_time(control, rest).is_some();
+    let found = device(packed, &is_over)?;
+    let all = packed.clusters.par_iter().zip(&found);
+    let judged = all.map(|(cluster, found)| {
+        let (still, best) = found.unpacked(cluster);
+        let mover = ClusterSearch::new(views.scene, views.neighbors, cluster.label);
+        judged(views, &mover, still, best)
     });
+    let judged: Vec<SearchedCluster> = judged.collect();
+    let mut progressed = Progressed::none(packed.clusters.len());
+    for (cluster, found) in packed.clusters.iter().zip(judged) {
+        progressed.add(cluster.label, found, control);
+    }
+    if found.len() < packed.clusters.len() {
+        progressed.interrupted = out_of_time(control, rest).or(Some(Interrupt::Deadline));
+    }
+    Ok(progressed)
+}
+
+/// Searches all clusters in `order` on the host's threads, as long as `rest` seconds are left for what
+/// follows.
+fn search_all(views: &Views<'_>, order: &[u32], rest: f64, control: &dyn Control) -> Progressed {
+    let progressed = Mutex::new(Progressed::none(order.len()));
     // Each thread takes the largest cluster that is left.
     let next = AtomicUsize::new(0);
     let search_next = || -> Option<()> {
@@ -319,28 +383,30 @@ fn numbered(found: &[Option<Hypothesis>]) -> (Vec<u32>, Vec<u32>) {
 
 /// Searches for the motion of one cluster.
 fn search(views: &Views<'_>, cluster: u32) -> SearchedCluster {
-    let Views {
-        scene,
-        neighbors,
-        free_space,
-        votes,
-    } = *views;
-    let members = &scene.source.members[cluster as usize];
-    let mover = ClusterSearch::new(scene, neighbors, cluster);
+    let scene = views.scene;
+    let mover = ClusterSearch::new(scene, views.neighbors, cluster);
     let still = mover.standing_still();
-    if members.len() < scene.options.cluster_min_points {
-        return SearchedCluster {
-            still,
-            best: None,
-            needed: false,
-        };
-    }
-    let points: Vec<Point> = members
-        .iter()
-        .map(|&row| scene.source.points[row as usize])
-        .collect();
-    let best = mover.search(votes, still);
+    let members = &scene.source.members[cluster as usize];
+    let is_searched = members.len() >= scene.options.cluster_min_points;
+    let best = is_searched.then(|| mover.search(views.votes, still));
+    judged(views, &mover, still, best.flatten())
+}
+
+/// The result for a cluster with its best hypothesis: whether it is accepted.
+fn judged(
+    views: &Views<'_>,
+    mover: &ClusterSearch<'_>,
+    still: Cost,
+    best: Option<Hypothesis>,
+) -> SearchedCluster {
+    let Views {
+        scene, free_space, ..
+    } = *views;
     let needed = best.is_some_and(|found| {
+        let members = scene.source.members[mover.cluster as usize].iter();
+        let points: Vec<Point> = members
+            .map(|&row| scene.source.points[row as usize])
+            .collect();
         let seen = || {
             let motion = &found.motion;
             let [x, y] = motion.center;

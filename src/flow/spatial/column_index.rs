@@ -5,6 +5,7 @@
 
 use super::column_kernels::{Wanted, each_level, each_near, nearest};
 use super::slots::{MOST_LANES, Slots, padded};
+use super::tiles::Tiles;
 use crate::flow::data::Point;
 use crate::flow::simd::Isa;
 
@@ -48,6 +49,11 @@ impl ColumnIndex {
     /// The input rows in the order of the slots.
     pub(crate) fn rows(&self) -> &[u32] {
         &self.rows
+    }
+
+    /// The columns.
+    pub(super) fn tiles(&self) -> &Tiles {
+        &self.slots.tiles
     }
 
     /// All points in their input order.
@@ -166,7 +172,7 @@ impl ColumnIndex {
     }
 
     #[inline]
-    fn point(&self, slot: usize) -> Point {
+    pub(super) fn point(&self, slot: usize) -> Point {
         [0, 1, 2].map(|axis: usize| self.slots.axes[axis][slot])
     }
 }
@@ -176,6 +182,18 @@ impl ColumnIndex {
 pub(crate) struct SlotLabels(Vec<f32>);
 
 impl SlotLabels {
+    /// The label of each slot; `u32::MAX` is no label.
+    pub(crate) fn all(&self, slots: usize) -> impl Iterator<Item = u32> {
+        let labels = self.0[..slots].iter();
+        labels.map(|&label| {
+            if label.is_nan() {
+                u32::MAX
+            } else {
+                label as u32
+            }
+        })
+    }
+
     /// Whether the slot has this label.
     pub(crate) fn is(&self, slot: u32, wanted: u32) -> bool {
         self.0[slot as usize] == label(wanted)

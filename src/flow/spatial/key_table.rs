@@ -64,10 +64,20 @@ impl<V: Copy + Default> KeyTable<V> {
         &mut self.slots[slot].1
     }
 
+    /// Number of keys.
+    pub(super) fn len(&self) -> usize {
+        self.used
+    }
+
+    /// The keys and their values, in no order.
+    pub(super) fn all(&self) -> impl Iterator<Item = (u64, V)> {
+        let slots = self.slots.iter().copied();
+        slots.filter(|&(key, _)| key != VACANT)
+    }
+
     /// The keys in ascending order.
     pub(super) fn sorted(&self) -> Vec<u64> {
-        let keys = self.slots.iter().map(|&(key, _)| key);
-        let mut keys: Vec<u64> = keys.filter(|&key| key != VACANT).collect();
+        let mut keys: Vec<u64> = self.all().map(|(key, _)| key).collect();
         keys.sort_unstable();
         keys
     }

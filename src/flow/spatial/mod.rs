@@ -3,6 +3,7 @@
 mod column_index;
 mod column_kernels;
 pub(crate) mod dbscan;
+mod index_words;
 mod key_table;
 mod plane;
 mod slots;
@@ -11,5 +12,6 @@ mod voxel;
 
 pub(crate) use column_index::{ColumnIndex, Marks, SlotLabels};
 pub(crate) use dbscan::NOISE;
+pub(crate) use index_words::IndexRecord;
 pub(crate) use plane::{Neighborhood, PlaneFit};
 pub(crate) use voxel::{voxel_first, voxel_mean};

@@ -88,6 +88,27 @@ impl Tiles {
         (tiles, rows)
     }
 
+    /// Number of tiles that hold points.
+    pub(super) fn count(&self) -> usize {
+        self.table.len()
+    }
+
+    /// The tiles: indices, one bit a column that holds points, and the first of these columns.
+    pub(super) fn all(&self) -> impl Iterator<Item = ([i32; 2], u64, u32)> {
+        let tiles = self.table.all();
+        tiles.map(|(key, tile)| (tile_at(key), tile.occupied, tile.first))
+    }
+
+    /// Index of the first point of each column, and the number of points at the end.
+    pub(super) fn begins(&self) -> &[u32] {
+        &self.begins
+    }
+
+    /// Side of a column, metres, and its inverse.
+    pub(super) fn sides(&self) -> [f32; 2] {
+        [self.column_m, self.columns_per_m]
+    }
+
     /// Side of a column, metres.
     pub(super) fn column_m(&self) -> f32 {
         self.column_m
@@ -167,4 +188,9 @@ fn bit([x, y]: [i32; 2]) -> u64 {
 fn key(tile: [i32; 2]) -> u64 {
     let [x, y] = tile.map(|index| index.cast_unsigned() ^ 1 << 31);
     u64::from(x) << 32 | u64::from(y)
+}
+
+/// The tile of a key.
+fn tile_at(key: u64) -> [i32; 2] {
+    [(key >> 32) as u32, key as u32].map(|index| (index ^ 1 << 31).cast_signed())
 }

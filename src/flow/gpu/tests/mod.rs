@@ -6,6 +6,7 @@ mod chamfer;
 mod failures;
 mod half;
 mod kernels;
+mod objects;
 mod shaders;
 mod whole;
 

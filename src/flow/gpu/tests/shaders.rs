@@ -4,8 +4,11 @@ use core::mem::offset_of;
 
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 
+use crate::flow::gpu::cluster_search::Part;
 use crate::flow::gpu::layout;
-use crate::flow::gpu::pipelines::{HALF_SOURCES, SOURCES};
+use crate::flow::gpu::pipelines::{CLUSTER_SOURCE, HALF_SOURCES, SOURCES};
+use crate::flow::objects::{ClusterRecord, FoundRecord, SceneRecord, ViewRecord};
+use crate::flow::spatial::IndexRecord;
 
 fn parsed(name: &str, source: &str) -> naga::Module {
     naga::front::wgsl::parse_str(source)
@@ -19,12 +22,15 @@ fn every_shader_is_valid_and_fits_the_smallest_workgroup_memory() {
         | Capabilities::SHADER_FLOAT16
         | Capabilities::SUBGROUP
         | Capabilities::COOPERATIVE_MATRIX;
-    let single = SOURCES.map(|kernel| (kernel, Capabilities::IMMEDIATES));
+    let single = SOURCES
+        .into_iter()
+        .chain([CLUSTER_SOURCE])
+        .map(|kernel| (kernel, Capabilities::IMMEDIATES));
     let half = HALF_SOURCES
         .as_flattened()
         .iter()
         .map(|&kernel| (kernel, half));
-    for ((name, source), capabilities) in single.into_iter().chain(half) {
+    for ((name, source), capabilities) in single.chain(half) {
         let module = parsed(name, source);
         let mut validator = Validator::new(ValidationFlags::all(), capabilities);
         let info = validator
@@ -86,6 +92,32 @@ fn host_and_shaders_agree_on_every_record() {
     same_layout!("blend", Placed: cell, weights);
     same_layout!("contract", Axis: stride, extent, count, pitch, begin);
     same_layout!("forward", Part: step, first_tile, first_chunk, tiles, first_row, rows, nothing);
+}
+
+macro_rules! same_cluster_layout {
+    ($shader_record:literal, $record:ident: $($field:ident),+) => {
+        let (fields, size) = layout(CLUSTER_SOURCE.1, $shader_record);
+        let ours = vec![$((stringify!($field).to_owned(), offset_of!($record, $field))),+];
+        assert_eq!(fields, ours, $shader_record);
+        assert_eq!(size, size_of::<$record>(), $shader_record);
+    };
+}
+
+#[test]
+fn host_and_cluster_kernel_agree_on_every_record() {
+    same_cluster_layout!("Index", IndexRecord: table, mask, salt, begins, points, labels, count, column_m,
+        columns_per_m);
+    same_cluster_layout!("View", ViewRecord: free, taken, targets, normals, at, weight);
+    same_cluster_layout!("Scene", SceneRecord: source, positions, rows, statics, static_words, voted, views,
+        scratch_words, mark_words, half_bins, bin_m, vote_within_m, cluster_min_points, initial_guesses,
+        height_weight, match_m, tangential_weight, truncation_m, close_fit_m, displacement_penalty, static_fit_m,
+        min_motion_m, min_gain_m, min_evidence_m, min_evidence_slope, max_residual_m, min_normal_motion_m,
+        neighbor_cost_ratio, neighbor_gain_m, slow_cost_ratio, slow_gain_m);
+    same_cluster_layout!("Cluster", ClusterRecord: label, members, count, center_x, center_y);
+    same_cluster_layout!("Found", FoundRecord: still_forward, still_backward, is_found, shift_x, shift_y, turn,
+        forward, backward, observability, normal_motion, weight, still, moved, nearest_still, nearest_moved,
+        forward_still, forward_moved, agree);
+    same_cluster_layout!("Part", Part: first, count);
 }
 
 #[test]

@@ -1,0 +1,284 @@
+//! The scene of an object search as 32-bit words and records, for the kernel that searches its
+//! clusters on a GPU. The kernel's records mirror those here.
+
+use bytemuck::{Pod, Zeroable};
+
+use super::cluster_cost::Cost;
+use super::evidence::NeighborEvidence;
+use super::hough::TranslationVotes;
+use super::hypothesis::Hypothesis;
+use super::neighbor_view::NeighborView;
+use super::planar_motion::PlanarMotion;
+use super::scene::Scene;
+use crate::flow::data::Point;
+use crate::flow::options::ObjectOptions;
+use crate::flow::spatial::IndexRecord;
+
+/// Points of a sample of a sweep around a cluster, and words of a bin of the votes.
+const JUDGED: usize = 200;
+const BIN_WORDS: usize = 2;
+/// Limits of the kernel: sweeps that clusters are matched to, initial guesses, and bins of the votes
+/// on each side.
+const MOST_VIEWS: usize = 8;
+const MOST_GUESSES: usize = 16;
+const MOST_BINS: i32 = 120;
+
+/// A sweep that clusters are matched to.
+#[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
+#[repr(C)]
+pub(crate) struct ViewRecord {
+    pub(crate) free: IndexRecord,
+    pub(crate) taken: IndexRecord,
+    pub(crate) targets: u32,
+    pub(crate) normals: u32,
+    pub(crate) at: i32,
+    pub(crate) weight: f32,
+}
+
+/// The source cloud, the options, and what all clusters share.
+#[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
+#[repr(C)]
+pub(crate) struct SceneRecord {
+    pub(crate) source: IndexRecord,
+    pub(crate) positions: u32,
+    pub(crate) rows: u32,
+    pub(crate) statics: u32,
+    pub(crate) static_words: u32,
+    pub(crate) voted: IndexRecord,
+    pub(crate) views: u32,
+    pub(crate) scratch_words: u32,
+    pub(crate) mark_words: u32,
+    pub(crate) half_bins: i32,
+    pub(crate) bin_m: f32,
+    pub(crate) vote_within_m: f32,
+    pub(crate) cluster_min_points: u32,
+    pub(crate) initial_guesses: u32,
+    pub(crate) height_weight: f32,
+    pub(crate) match_m: f32,
+    pub(crate) tangential_weight: f32,
+    pub(crate) truncation_m: f32,
+    pub(crate) close_fit_m: f32,
+    pub(crate) displacement_penalty: f32,
+    pub(crate) static_fit_m: f32,
+    pub(crate) min_motion_m: f32,
+    pub(crate) min_gain_m: f32,
+    pub(crate) min_evidence_m: f32,
+    pub(crate) min_evidence_slope: f32,
+    pub(crate) max_residual_m: f32,
+    pub(crate) min_normal_motion_m: f32,
+    pub(crate) neighbor_cost_ratio: f32,
+    pub(crate) neighbor_gain_m: f32,
+    pub(crate) slow_cost_ratio: f32,
+    pub(crate) slow_gain_m: f32,
+}
+
+/// A cluster to be searched.
+#[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
+#[repr(C)]
+pub(crate) struct ClusterRecord {
+    pub(crate) label: u32,
+    pub(crate) members: u32,
+    pub(crate) count: u32,
+    pub(crate) center_x: f32,
+    pub(crate) center_y: f32,
+}
+
+/// What the search of a cluster found.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct FoundRecord {
+    pub(crate) still_forward: f32,
+    pub(crate) still_backward: f32,
+    pub(crate) is_found: u32,
+    pub(crate) shift_x: f32,
+    pub(crate) shift_y: f32,
+    pub(crate) turn: f32,
+    pub(crate) forward: f32,
+    pub(crate) backward: f32,
+    pub(crate) observability: f32,
+    pub(crate) normal_motion: f32,
+    pub(crate) weight: f32,
+    pub(crate) still: f32,
+    pub(crate) moved: f32,
+    pub(crate) nearest_still: f32,
+    pub(crate) nearest_moved: f32,
+    pub(crate) forward_still: f32,
+    pub(crate) forward_moved: f32,
+    pub(crate) agree: u32,
+}
+
+impl FoundRecord {
+    /// The cost at rest, and the hypothesis of a cluster.
+    pub(super) fn unpacked(&self, cluster: &ClusterRecord) -> (Cost, Option<Hypothesis>) {
+        let cost = |forward_m, backward_m| Cost {
+            forward_m,
+            backward_m,
+        };
+        let still = cost(self.still_forward, self.still_backward);
+        let found = (self.is_found == 1).then(|| Hypothesis {
+            motion: PlanarMotion {
+                shift_m: [self.shift_x, self.shift_y],
+                turn: self.turn,
+                center: [cluster.center_x, cluster.center_y],
+            },
+            cost: cost(self.forward, self.backward),
+            still,
+            observability: self.observability,
+            normal_motion_m: self.normal_motion,
+            neighbors: NeighborEvidence {
+                weight: self.weight,
+                still_m: self.still,
+                moved_m: self.moved,
+                nearest_m: [self.nearest_still, self.nearest_moved],
+                forward_m: [self.forward_still, self.forward_moved],
+                agree: self.agree == 1,
+            },
+        });
+        (still, found)
+    }
+}
+
+/// The scene of an object search, packed for the kernel.
+#[derive(Debug)]
+pub struct PackedScene {
+    /// Indices, points and rows; records hold offsets into them.
+    pub(crate) words: Vec<u32>,
+    pub(crate) scene: SceneRecord,
+    pub(crate) views: Vec<ViewRecord>,
+    /// The clusters, large ones first.
+    pub(crate) clusters: Vec<ClusterRecord>,
+}
+
+impl PackedScene {
+    /// Packs the target `scene`, the `neighbors` and the clusters in the given `order`. None where
+    /// the options exceed the limits of the kernel.
+    pub(super) fn new(
+        scene: &Scene<'_>,
+        neighbors: &[NeighborView<'_>],
+        votes: &TranslationVotes,
+        order: &[u32],
+    ) -> Option<Self> {
+        let options = scene.options;
+        let fits = neighbors.len() < MOST_VIEWS
+            && options.initial_guesses <= MOST_GUESSES
+            && votes.half() <= MOST_BINS;
+        if !fits {
+            return None;
+        }
+        let mut words = Vec::new();
+        let source = scene.source;
+        let mut record = scene_record(options, votes);
+        record.source = source.near.write_words(&mut words);
+        record.source.labels = words.len() as u32;
+        let rows = source.near.rows();
+        words.extend(rows.iter().map(|&row| source.labels[row as usize]));
+        record.rows = words.len() as u32;
+        words.extend_from_slice(rows);
+        record.positions = write_points(&mut words, &source.points);
+        record.voted = votes.near().write_words(&mut words);
+        let neighbors_of = |moment: &NeighborView<'_>| (i32::from(moment.at), moment.weight);
+        let views = std::iter::once((scene, (1, 1.0)))
+            .chain(neighbors.iter().map(|n| (&n.scene, neighbors_of(n))));
+        let views: Vec<(&Scene<'_>, (i32, f32))> = views.collect();
+        record.views = views.len() as u32;
+        record.static_words = source.members.len().div_ceil(32) as u32;
+        record.statics = words.len() as u32;
+        for (scene, _) in &views {
+            words.extend(bits(scene.statics()));
+        }
+        let mut mark_words = 0;
+        let view_records = views.iter().map(|&(scene, (at, weight))| {
+            mark_words = mark_words.max(scene.target.len().div_ceil(32));
+            view_record(scene, at, weight, &mut words)
+        });
+        let view_records: Vec<ViewRecord> = view_records.collect();
+        let side = 2 * record.half_bins as usize + 1;
+        let scratch_words = mark_words + views.len() * JUDGED + BIN_WORDS * side * side;
+        record.mark_words = mark_words as u32;
+        record.scratch_words = scratch_words as u32;
+        let clusters = order.iter().map(|&label| {
+            let members = &source.members[label as usize];
+            let [center_x, center_y] = source.center(members);
+            let record = ClusterRecord {
+                label,
+                members: words.len() as u32,
+                count: members.len() as u32,
+                center_x,
+                center_y,
+            };
+            words.extend_from_slice(members);
+            record
+        });
+        let clusters = clusters.collect();
+        Some(Self {
+            words,
+            scene: record,
+            views: view_records,
+            clusters,
+        })
+    }
+}
+
+/// The record of what the options say; the rest is zero.
+fn scene_record(options: &ObjectOptions, votes: &TranslationVotes) -> SceneRecord {
+    SceneRecord {
+        half_bins: votes.half(),
+        bin_m: options.bin_m,
+        vote_within_m: votes.within_m(),
+        cluster_min_points: u32::try_from(options.cluster_min_points).unwrap_or(u32::MAX),
+        initial_guesses: options.initial_guesses as u32,
+        height_weight: options.height_weight,
+        match_m: options.match_m,
+        tangential_weight: options.tangential_weight,
+        truncation_m: options.truncation_m,
+        close_fit_m: options.close_fit_m,
+        displacement_penalty: options.displacement_penalty,
+        static_fit_m: options.static_fit_m,
+        min_motion_m: options.min_motion_m,
+        min_gain_m: options.min_gain_m,
+        min_evidence_m: options.min_evidence_m,
+        min_evidence_slope: options.min_evidence_slope,
+        max_residual_m: options.max_residual_m,
+        min_normal_motion_m: options.min_normal_motion_m,
+        neighbor_cost_ratio: options.neighbor_cost_ratio,
+        neighbor_gain_m: options.neighbor_gain_m,
+        slow_cost_ratio: options.slow_cost_ratio,
+        slow_gain_m: options.slow_gain_m,
+        ..SceneRecord::default()
+    }
+}
+
+/// Appends a sweep to `words`.
+fn view_record(scene: &Scene<'_>, at: i32, weight: f32, words: &mut Vec<u32>) -> ViewRecord {
+    let [free, taken] = scene.indices();
+    let free = free.write_words(words);
+    let mut taken = taken.write_words(words);
+    taken.labels = words.len() as u32;
+    words.extend(scene.owners());
+    ViewRecord {
+        free,
+        taken,
+        targets: write_points(words, &scene.target),
+        normals: write_points(words, scene.normals()),
+        at,
+        weight,
+    }
+}
+
+/// Appends points and returns their offset.
+fn write_points(words: &mut Vec<u32>, points: &[Point]) -> u32 {
+    let offset = words.len() as u32;
+    words.extend(points.as_flattened().iter().map(|c| c.to_bits()));
+    offset
+}
+
+/// One bit a flag, in words.
+fn bits(flags: &[bool]) -> impl Iterator<Item = u32> {
+    flags.chunks(32).map(|flags| {
+        let bits = flags
+            .iter()
+            .zip(0..)
+            .map(|(&flag, bit)| u32::from(flag) << bit);
+        bits.sum()
+    })
+}
