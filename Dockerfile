@@ -9,6 +9,8 @@ COPY Cargo.toml Cargo.lock build.rs ./
 COPY proto proto
 COPY benches benches
 COPY console console
+COPY clients/python/Cargo.toml clients/python/build.rs clients/python/
+COPY clients/python/src clients/python/src
 COPY src src
 # Crates and what is compiled from them live in caches outside the layers: a change in src compiles src alone.
 # The program is copied out, because a cache is not part of the image.

@@ -14,13 +14,13 @@ ci:
 # formatting and lints
 lint:
     cargo fmt --check
-    cargo clippy --locked --all-targets -- -D warnings
+    cargo clippy --locked --release --all-targets -- -D warnings
 
 # the documentation of all items, private ones too
 doc:
     RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps --document-private-items --open
 
-# unit tests of a module: just unit flow::objects
+# unit tests of a module, built quickly: just unit flow::objects
 unit module="":
     cargo test --lib {{module}}
 

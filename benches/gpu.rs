@@ -2,7 +2,7 @@
 //! sizes, many small pairs at once, and object searches with and without the GPU.
 //!
 //! ```text
-//! cargo bench --bench gpu -- [CARD] [--points N,N,...] [--pairs N,N,...]
+//! cargo bench --bench gpu -- [CARD] [--points N,N,...] [--pairs N,N,...] [--tables NAME,NAME,...]
 //! ```
 //!
 //! `CARD` is an index, a PCI id or a part of the name. The default is the first hardware GPU.
@@ -17,7 +17,7 @@ use common::{median, scenes};
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::field::Backend;
 use fnsf::flow::gpu::{
-    Gpu, GpuOptions, KernelTime, Selector, arithmetic_peak, kernel_times, select,
+    Adapter, Gpu, GpuOptions, KernelTime, Selector, arithmetic_peak, kernel_times, select,
 };
 use fnsf::flow::simulate::{SimulatedPair, Street, StreetOptions};
 use fnsf::flow::{Control, Estimate, Options, Precision, Preset, Problem, Solution, estimate};
@@ -26,6 +26,8 @@ use fnsf::flow::{Control, Estimate, Options, Precision, Preset, Problem, Solutio
 const RUNS: u64 = 5;
 /// Rounds of each kernel.
 const ROUNDS: usize = 10;
+/// The tables, in the order in which they are made by default.
+const TABLES: [&str; 4] = ["kernels", "objects", "pairs", "batches"];
 /// Points of each pair in the batch measurement.
 const SMALL: usize = 8192;
 
@@ -43,6 +45,7 @@ struct Arguments {
     card: Selector,
     points: Vec<usize>,
     pairs: Vec<usize>,
+    tables: Vec<String>,
 }
 
 impl Arguments {
@@ -51,6 +54,7 @@ impl Arguments {
             card: Selector::Any,
             points: vec![SMALL, 50_000, 90_000, 150_000],
             pairs: vec![1, 8, 64],
+            tables: TABLES.map(str::to_owned).to_vec(),
         };
         let mut arguments = std::env::args().skip(1).filter(|word| word != "--bench");
         while let Some(word) = arguments.next() {
@@ -63,6 +67,10 @@ impl Arguments {
             match word.as_str() {
                 "--points" => asked.points = list(arguments.next())?,
                 "--pairs" => asked.pairs = list(arguments.next())?,
+                "--tables" => {
+                    let names = arguments.next().ok_or("a list of tables is missing")?;
+                    asked.tables = names.split(',').map(str::to_owned).collect();
+                }
                 card => asked.card = card.parse().map_err(|_| "no card")?,
             }
         }
@@ -210,10 +218,17 @@ fn batches(gpu: &Gpu, pair: &SimulatedPair, counts: &[usize]) -> Result<(), Stri
     Ok(())
 }
 
-/// Object searches with their clusters searched by the host's threads and by the GPU, in turn.
-fn objects(gpu: &Gpu) -> Result<(), String> {
+/// Object searches with their clusters searched by a few threads of the host and by the GPU, in turn.
+fn objects(adapter: &Adapter) -> Result<(), String> {
     const ALIKE_M: f32 = 0.02;
-    let cpu = CpuBackend::new(None).map_err(|e| e.to_string())?;
+    const HOST_THREADS: usize = 4;
+    let cpu = CpuBackend::new(Some(HOST_THREADS)).map_err(|e| e.to_string())?;
+    let options = GpuOptions {
+        host_threads: Some(HOST_THREADS),
+        ..GpuOptions::default()
+    };
+    let gpu = &Gpu::open(adapter, &options).map_err(|e| e.to_string())?;
+    println!("`default`, {HOST_THREADS} threads of the host\n");
     println!(
         "| scene | points | clusters | host: clusters ms | all ms | GPU: clusters ms | all ms | alike |"
     );
@@ -282,6 +297,7 @@ fn main() -> Result<(), String> {
     let options = GpuOptions {
         lanes,
         memory_bytes: None,
+        ..GpuOptions::default()
     };
     let gpu = Gpu::open(&adapter, &options).map_err(|e| e.to_string())?;
     println!(
@@ -296,8 +312,14 @@ fn main() -> Result<(), String> {
         if tiles.is_empty() { "none" } else { &tiles }
     );
     let pair = street(1)?;
-    objects(&gpu)?;
-    kernels(&gpu, &pair, &asked.points)?;
-    pairs(&gpu, &pair, &asked.points)?;
-    batches(&gpu, &pair, &asked.pairs)
+    for table in &asked.tables {
+        match table.as_str() {
+            "kernels" => kernels(&gpu, &pair, &asked.points)?,
+            "objects" => objects(&adapter)?,
+            "pairs" => pairs(&gpu, &pair, &asked.points)?,
+            "batches" => batches(&gpu, &pair, &asked.pairs)?,
+            other => return Err(format!("{other}: the tables are {}", TABLES.join(", "))),
+        }
+    }
+    Ok(())
 }

@@ -8,7 +8,6 @@
 //! `4x2` is four lanes of two threads each. By default the lanes times their threads are the cores.
 #![expect(clippy::print_stdout, reason = "a benchmark prints its figures")]
 
-#[expect(dead_code, reason = "medians of scenes are other benchmarks'")]
 mod common;
 
 use std::thread::available_parallelism;

@@ -10,10 +10,10 @@ use std::thread;
 
 use anyhow::{anyhow, bail};
 
-use crate::config::{Config, NodeRole};
+use super::processor::Processor;
+use crate::config::{Config, MAX_LANES, NodeRole};
 use crate::cost::Lanes;
 use crate::engine::{DeviceFactory, DeviceOptions, Opened, ReopenPolicy, try_opening};
-use crate::flow::cpu::CpuBackend;
 use crate::flow::field::{Backend, BackendError};
 use crate::flow::gpu;
 use crate::flow::gpu::{Adapter, AdapterKind, Gpu, GpuOptions, Selector};
@@ -21,6 +21,10 @@ use crate::job::DeviceKind;
 
 /// Default number of lanes of a hardware GPU. Small pairs alone leave a large GPU idle.
 const GPU_LANES: usize = 8;
+
+/// Threads of a CPU for each of its lanes, by default. With fewer, a pair takes longer and hardly more
+/// pairs are done.
+const THREADS_OF_A_LANE: usize = 2;
 
 /// Default number of lanes of a software GPU, which shares the CPU cores with everything else.
 const SOFTWARE_LANES: usize = 2;
@@ -64,10 +68,10 @@ impl Pool {
         for named in config.devices.iter().filter(|_| computes) {
             match named.as_str() {
                 "auto" => pool.add_the_best(config, probe)?,
-                "cpu" => pool.add_cpu(None)?,
+                "cpu" => pool.add_cpu(None, config)?,
                 "gpu" => pool.add_every_gpu(config)?,
                 other => match other.split_once(':') {
-                    Some(("cpu", threads)) => pool.add_cpu(Some(threads))?,
+                    Some(("cpu", threads)) => pool.add_cpu(Some(threads), config)?,
                     Some(("gpu", adapter)) if !adapter.is_empty() => {
                         let Ok(selector) = Selector::from_str(adapter);
                         pool.add_gpu(chosen(&selector, config)?, config);
@@ -119,7 +123,7 @@ impl Pool {
             return Ok(());
         }
         self.fell_back = true;
-        self.add_cpu(None)
+        self.add_cpu(None, config)
     }
 
     fn add_every_gpu(&mut self, config: &Config) -> anyhow::Result<()> {
@@ -138,7 +142,7 @@ impl Pool {
         Ok(())
     }
 
-    fn add_cpu(&mut self, threads: Option<&str>) -> anyhow::Result<()> {
+    fn add_cpu(&mut self, threads: Option<&str>, config: &Config) -> anyhow::Result<()> {
         let cores = thread::available_parallelism().map_or(1, usize::from);
         let threads = match threads {
             None => Some(cores.min(256)),
@@ -146,11 +150,13 @@ impl Pool {
         };
         let threads = threads.filter(|threads| (1..=256).contains(threads));
         let threads = threads.ok_or_else(|| anyhow!("devices: \"cpu:THREADS\" takes 1 to 256"))?;
+        let lanes = config.cpu_lanes.unwrap_or(threads / THREADS_OF_A_LANE);
+        let lanes = lanes.clamp(1, MAX_LANES).min(threads);
         let open: DeviceFactory = Box::new(move || {
-            let backend = CpuBackend::new(Some(threads))?;
-            Ok(Box::new(Processor(Arc::new(backend))))
+            let opened = Processor::new(threads, lanes)?;
+            Ok(Box::new(opened))
         });
-        self.add(DeviceKind::Cpu, 1, open);
+        self.add(DeviceKind::Cpu, lanes, open);
         Ok(())
     }
 
@@ -189,6 +195,7 @@ fn adapter_factory(adapter: Adapter, config: &Config) -> (usize, DeviceFactory) 
     let options = GpuOptions {
         lanes,
         memory_bytes: config.gpu_memory_mib.map(|mib| mib << 20),
+        ..GpuOptions::default()
     };
     let open: DeviceFactory = Box::new(move || {
         let opened = Gpu::open(&found_again(&adapter)?, &options)?;
@@ -262,22 +269,6 @@ fn found_again(adapter: &Adapter) -> Result<Adapter, BackendError> {
     Ok(alike.swap_remove(twin.unwrap_or(0)))
 }
 
-/// The CPU backend with a fixed number of threads.
-struct Processor(Arc<CpuBackend>);
-
-impl Opened for Processor {
-    fn lane(&self) -> Arc<dyn Backend> {
-        Arc::<CpuBackend>::clone(&self.0)
-    }
-
-    fn is_lost(&self) -> bool {
-        false
-    }
-
-    /// The threads end when the last lane drops the backend.
-    fn destroy(&self) {}
-}
-
 impl Opened for Gpu {
     fn lane(&self) -> Arc<dyn Backend> {
         Arc::new(self.clone())
@@ -307,11 +298,11 @@ mod tests {
     }
 
     #[test]
-    fn processors_are_numbered_and_have_a_lane_each() {
-        let pool = pool(&["cpu", "cpu:2"]).expect("devices");
+    fn processors_are_numbered_and_have_a_lane_for_two_threads() {
+        let pool = pool(&["cpu:3", "cpu:8"]).expect("devices");
         let names: Vec<_> = pool.devices.iter().map(|device| &device.name).collect();
         assert_eq!(names, ["cpu0", "cpu1"]);
-        assert_eq!(pool.lanes(), Lanes { cpu: 2, gpu: 0 });
+        assert_eq!(pool.lanes(), Lanes { cpu: 5, gpu: 0 });
         assert!(!pool.fell_back);
     }
 
@@ -399,6 +390,7 @@ mod tests {
         let options = GpuOptions {
             lanes,
             memory_bytes: None,
+            ..GpuOptions::default()
         };
         let gpu = Gpu::open(&adapter, &options).expect("it opens");
         assert_eq!(gpu.lanes(), lanes);

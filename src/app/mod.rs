@@ -5,6 +5,7 @@ mod devices;
 mod housekeeping;
 mod outbox;
 mod process;
+mod processor;
 mod reload;
 mod settings;
 mod shutdown;

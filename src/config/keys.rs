@@ -26,8 +26,8 @@ const API_KEY: &str = "API_KEY";
 /// Minimum time to interrupt running jobs and to close connections, seconds.
 const MIN_DRAIN_SECONDS: u64 = 4;
 
-/// Maximum number of lanes of a GPU. Each lane is a thread and takes a share of the GPU memory.
-const MAX_LANES: usize = 64;
+/// Maximum number of lanes of a device. Each lane is a thread, and takes a share of a GPU's memory.
+pub(crate) const MAX_LANES: usize = 64;
 
 /// The complete configuration of the server. [`Config::check`] checks the ranges of its values,
 /// [`App::check`](crate::app::App::check) also the devices, API keys and tenants.
@@ -72,6 +72,9 @@ pub struct Config {
     /// all cores, at most 256. `cpu:4`: four threads, 1 to 256. `gpu`: every GPU. `gpu:CARD`: one
     /// GPU by index, PCI id or part of its name.
     pub devices: Vec<String>,
+    /// Number of pairs that the threads of a CPU compute at the same time, 1 to 64. `None`: half of the
+    /// threads. No more than there are threads.
+    pub cpu_lanes: Option<usize>,
     /// Number of pairs that one GPU computes at the same time, 1 to 64. `None`: 8, or 2 for a
     /// software driver. Fewer are used if the GPU cannot hold as many networks.
     pub gpu_lanes: Option<usize>,
@@ -270,6 +273,7 @@ impl Default for Config {
             keys: Vec::new(),
             tls: None,
             devices: vec!["auto".to_owned()],
+            cpu_lanes: None,
             gpu_lanes: None,
             gpu_memory_mib: None,
             allow_software_gpu: false,
@@ -441,11 +445,12 @@ impl Config {
         if self.devices.is_empty() {
             return refuse("devices is empty: name at least one, such as \"cpu\"");
         }
-        if self
-            .gpu_lanes
-            .is_some_and(|lanes| !(1..=MAX_LANES).contains(&lanes))
-        {
+        let are_lanes = |lanes: Option<usize>| lanes.is_none_or(|n| (1..=MAX_LANES).contains(&n));
+        if !are_lanes(self.gpu_lanes) {
             return refuse("gpu_lanes must be 1 to 64");
+        }
+        if !are_lanes(self.cpu_lanes) {
+            return refuse("cpu_lanes must be 1 to 64");
         }
         if self.gpu_memory_mib == Some(0) {
             return refuse("gpu_memory_mib must be at least 1");

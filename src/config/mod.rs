@@ -10,6 +10,7 @@ mod ranges;
 mod remote;
 mod secret;
 
+pub(crate) use keys::MAX_LANES;
 pub use keys::{Config, ConfigError, LimitsConfig, LogConfig, LogFormat, NodeRole, QueueConfig};
 pub use remote::RemoteConfig;
 pub use secret::Secret;

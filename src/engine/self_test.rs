@@ -7,7 +7,7 @@ use super::panics::message;
 use super::types::{DeviceFactory, Opened};
 use crate::flow::cpu::CpuBackend;
 use crate::flow::field::{Backend, BackendError};
-use crate::flow::{self, FlowError, Point, Preset, Problem, Uncontrolled, largest};
+use crate::flow::{self, Ego, FlowError, Point, Preset, Problem, Uncontrolled, largest};
 
 /// Translation of the scene (a wall and a post in front of it) between source and target, metres.
 const MOTION: [f32; 3] = [0.2, 0.1, 0.0];
@@ -98,12 +98,15 @@ fn compared(backend: &dyn Backend) -> Result<(), SelfTestError> {
     if backend.is_cpu() {
         return Ok(());
     }
+    let searched = backend.searches_clusters().then_some(Preset::Default);
     [Preset::NsfpBaseline, Preset::NsfpLinear]
         .into_iter()
+        .chain(searched)
         .try_for_each(|preset| compared_with_the_cpu(backend, preset, [&source, &target]))
 }
 
-/// Compares a few iterations of a preset with those of the CPU. They are too few to find a motion.
+/// Compares a preset with the CPU: a few iterations of a field, which are too few to find a motion, or
+/// the search of clusters.
 fn compared_with_the_cpu(
     backend: &dyn Backend,
     preset: Preset,
@@ -114,6 +117,9 @@ fn compared_with_the_cpu(
     let mut options = preset.options(None);
     if let Some(field) = options.field_mut() {
         field.max_iterations = COMPARED_ITERATIONS;
+    } else {
+        // All clusters move.
+        options.ego = Ego::Off;
     }
     let flow_on = |device: &dyn Backend| {
         let estimate = flow::estimate(device, &problem, &options, &Uncontrolled)?;

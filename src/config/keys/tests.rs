@@ -28,6 +28,7 @@ fn unknown_keys_and_wrong_values_are_refused_by_name() {
         ("listen = \"0.0.0.0:8080\"", "listen goes beyond loopback"),
         ("devices = []", "devices is empty"),
         ("gpu_lanes = 0", "gpu_lanes"),
+        ("cpu_lanes = 65", "cpu_lanes"),
         ("gpu_memory_mib = 0", "gpu_memory_mib"),
         (
             "[limits]\nmax_upload_mib = 17592186044416",

@@ -43,6 +43,24 @@ impl CpuBackend {
         Self::with_isa(Isa::available()[0], threads)
     }
 
+    /// A backend beside this one, with `threads` threads of its own. Both share what is known of the
+    /// latest sweeps.
+    ///
+    /// # Errors
+    /// [`BackendError::Threads`] if the operating system cannot start the threads.
+    pub fn beside(&self, threads: usize) -> Result<Self, BackendError> {
+        Ok(Self {
+            isa: self.isa,
+            kernels: Kernels::new(self.isa),
+            host: self.host.beside(threads, Some(self.isa.name()))?,
+        })
+    }
+
+    /// Number of threads.
+    pub fn threads(&self) -> usize {
+        self.host.threads().current_num_threads()
+    }
+
     /// A backend with the instruction set `isa`, on `threads` threads as in [`Self::new`].
     ///
     /// # Errors

@@ -16,13 +16,17 @@ use crate::flow::host::Host;
 use crate::flow::objects::{FoundRecord, PackedScene};
 use crate::flow::options::{FieldOptions, LossOptions};
 
+/// Host threads up to which the GPU searches clusters. On an H200 it takes half of the time of four
+/// threads, as long as eight, and three times as long as sixteen.
+const FEW_THREADS: usize = 4;
+
 /// An opened GPU, as a [`Backend`]. Clones share it, and each can fit a pair from its own thread.
 #[derive(Clone)]
 pub struct Gpu(Arc<Device>);
 
 impl Gpu {
-    /// Opens a GPU, builds its kernels and allocates its memory. Starts a pool of host threads, one
-    /// per logical core unless the environment variable `RAYON_NUM_THREADS` is set.
+    /// Opens a GPU, builds its kernels and allocates its memory. Starts a pool of host threads, as
+    /// [`GpuOptions::host_threads`] says.
     ///
     /// # Errors
     /// - [`BackendError::NoDevice`] if the driver refuses to open the GPU.
@@ -94,7 +98,7 @@ impl Backend for Gpu {
     }
 
     fn searches_clusters(&self) -> bool {
-        true
+        self.0.host.threads().current_num_threads() <= FEW_THREADS && self.0.has_cluster_kernel()
     }
 
     fn search_clusters(

@@ -10,6 +10,9 @@ use crate::flow::objects::{FoundRecord, PackedScene};
 /// Clusters that are searched between two looks at the caller's clock, and on a software device.
 const AT_ONCE: usize = 2048;
 const SOFTWARE_AT_ONCE: usize = 64;
+/// Invocations of a workgroup, and bytes of its memory; records.wgsl and measure.wgsl have the same.
+const GROUP: u32 = 512;
+pub(super) const GROUP_BYTES: u32 = 32 << 10;
 /// Most workgroups of a dispatch; each takes further clusters in turn. And most bytes of their
 /// scratch.
 const MOST_GROUPS: u64 = 1024;
@@ -51,7 +54,8 @@ impl Device {
             context.filled(bytemuck::cast_slice(&packed.clusters))?,
             context.empty(groups * scratch, wgpu::BufferUsages::STORAGE)?,
         ];
-        let buffers: Vec<_> = bound.iter().chain([&results]).collect();
+        let points = context.filled(bytemuck::cast_slice(&packed.points))?;
+        let buffers: Vec<_> = bound.iter().chain([&results, &points]).collect();
         let group = context.bound(pipeline, &buffers);
         let at_once = match self.kind {
             AdapterKind::Software => SOFTWARE_AT_ONCE,
@@ -81,6 +85,14 @@ impl Device {
             );
         }
         Ok(found)
+    }
+
+    /// Whether the GPU can run the kernel that searches clusters.
+    pub(super) fn has_cluster_kernel(&self) -> bool {
+        let limits = self.context.device.limits();
+        limits.max_compute_invocations_per_workgroup >= GROUP
+            && limits.max_compute_workgroup_size_x >= GROUP
+            && limits.max_compute_workgroup_storage_size >= GROUP_BYTES
     }
 
     /// The kernel, which is built at the first search.

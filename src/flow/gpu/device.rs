@@ -32,7 +32,7 @@ impl Device {
         Ok(Self {
             context: Context::open(adapter, options)?,
             batch: Batch::default(),
-            host: Host::new(None, None)?,
+            host: Host::new(options.host_threads, None)?,
             name: format!(
                 "{} ({}, {})",
                 adapter.name, adapter.interface, adapter.driver

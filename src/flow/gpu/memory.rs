@@ -18,6 +18,9 @@ pub struct GpuOptions {
     /// This size is halved until the allocation succeeds. Opening fails with
     /// [`BackendError::Memory`] if the size falls below the minimum.
     pub memory_bytes: Option<u64>,
+    /// Threads of the host for the stages that it computes. None stands for the environment variable
+    /// `RAYON_NUM_THREADS` if it is set, else for one thread per logical core.
+    pub host_threads: Option<usize>,
 }
 
 impl Default for GpuOptions {
@@ -25,6 +28,7 @@ impl Default for GpuOptions {
         Self {
             lanes: 1,
             memory_bytes: None,
+            host_threads: None,
         }
     }
 }

@@ -215,6 +215,28 @@ impl HalfKernels {
     }
 }
 
+/// Compiles a kernel. Accesses to memory are checked, and loops are not counted: a counter of
+/// iterations keeps drivers from unrolling a loop, and arrays that should be registers then lie in
+/// memory.
+#[expect(
+    unsafe_code,
+    reason = "wgpu requires it for loops that are not counted"
+)]
+fn module(device: &wgpu::Device, entry: &str, text: &str) -> wgpu::ShaderModule {
+    let description = wgpu::ShaderModuleDescriptor {
+        label: Some(entry),
+        source: wgpu::ShaderSource::Wgsl(text.into()),
+    };
+    let checks = wgpu::ShaderRuntimeChecks {
+        force_loop_bounding: false,
+        ..wgpu::ShaderRuntimeChecks::checked()
+    };
+    // SAFETY: the caller must ensure that no loop is infinite. The sources are those of this folder.
+    // Their loops count up to a number that is fixed or read once, or walk over a table that is half
+    // full at most.
+    unsafe { device.create_shader_module_trusted(description, checks) }
+}
+
 /// Builds the pipeline of the kernel `name`.
 pub(super) fn pipeline(
     device: &wgpu::Device,
@@ -224,10 +246,7 @@ pub(super) fn pipeline(
 ) -> wgpu::ComputePipeline {
     let text = sources.iter().find(|(entry, _)| *entry == name);
     let (entry, text) = text.unwrap_or(&sources[0]);
-    let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
-        label: Some(entry),
-        source: wgpu::ShaderSource::Wgsl((*text).into()),
-    });
+    let module = module(device, entry, text);
     device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
         label: Some(entry),
         layout: None,

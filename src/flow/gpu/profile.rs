@@ -30,6 +30,9 @@ const BACKWARD: f64 = FORWARD - 2.0 * (3 * WIDTH) as f64;
 /// Floating-point operations of a squared distance.
 const DISTANCE: f64 = 8.0;
 
+/// Seconds that a GPU computes before its clocks are high: an idle one lowers them.
+const WARM_SECONDS: f64 = 0.5;
+
 /// Time and work of one kernel in one iteration of a fit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct KernelTime {
@@ -49,7 +52,8 @@ type Timed = (&'static str, Phase, f64);
 
 /// Times each of the kernels of an iteration over all points of `source`, in the precision
 /// `precision`: for a network, with a distance transform and, in single precision, with the Chamfer
-/// distance to all points of `target`. It repeats the iteration `rounds` times; zero counts as one.
+/// distance to all points of `target`. It repeats the iteration `rounds` times, zero counts as one, and
+/// until the GPU has computed for half a second, since an idle GPU lowers its clocks.
 /// `source` (N x 3, N at least 1) and `target` (M x 3) are in metres, in the same frame. The GPU
 /// should do no other work meanwhile.
 ///
@@ -151,7 +155,9 @@ fn timed(
         operations,
     };
     let mut times: Vec<_> = kernels.iter().map(start).collect();
-    for _ in 0..rounds.max(1) {
+    let (mut done, mut busy) = (0, 0.0);
+    while done < rounds.max(1) || busy < WARM_SECONDS {
+        done += 1;
         let clock = clock(gpu, 2 * kernels.len() as u32)?;
         let mut encoder = context.encoder();
         for (index, &(_, phase, _)) in (0..).zip(kernels) {
@@ -166,6 +172,7 @@ fn timed(
         for (index, time) in times.iter_mut().enumerate() {
             let seconds = clock.seconds(&moments, 2 * index, 2 * index + 1);
             time.seconds = time.seconds.min(seconds);
+            busy += seconds;
         }
     }
     Ok(times)
@@ -180,9 +187,9 @@ fn timed(
 /// - [`BackendError::Busy`] if the GPU has no free memory for the measurement.
 /// - [`BackendError::Lost`] or [`BackendError::Device`] if the GPU fails.
 pub fn arithmetic_peak(gpu: &Gpu) -> Result<f64, BackendError> {
-    /// Workgroups, invocations per workgroup, and operations per invocation: eight chains of 512
-    /// multiply-adds of vec4s, see `multiply_adds.wgsl`.
-    const GROUPS: u32 = 4096;
+    /// Fewest and most workgroups, invocations per workgroup, and operations per invocation: eight
+    /// chains of 512 multiply-adds of vec4s, see `multiply_adds.wgsl`.
+    const GROUPS: [u32; 2] = [64, 1 << 20];
     const GROUP: f64 = 128.0;
     const OPERATIONS: f64 = 8.0 * 512.0 * 4.0 * 2.0;
     let device = gpu.device();
@@ -192,8 +199,10 @@ pub fn arithmetic_peak(gpu: &Gpu) -> Result<f64, BackendError> {
     let pipeline = &context.kernels.multiply_adds;
     let group = context.bound(pipeline, &[&factors, &sums]);
     let mut best = 0.0f64;
-    // Starts with 1/64 of the workgroups, so that a slow GPU is not busy for seconds.
-    for groups in [GROUPS / 64, GROUPS / 8, GROUPS, GROUPS] {
+    // Starts with few workgroups, so that a slow GPU is not busy for seconds.
+    let [mut groups, most] = GROUPS;
+    let mut busy = 0.0;
+    while busy < WARM_SECONDS {
         let clock = clock(gpu, 2)?;
         let mut encoder = context.encoder();
         {
@@ -206,8 +215,9 @@ pub fn arithmetic_peak(gpu: &Gpu) -> Result<f64, BackendError> {
         let moments = read(gpu, encoder, &clock, 2)?;
         let seconds = clock.seconds(&moments, 0, 1);
         best = best.max(f64::from(groups) * GROUP * OPERATIONS / seconds);
-        if seconds > 0.2 {
-            break;
+        busy += seconds;
+        if seconds < WARM_SECONDS / 10.0 {
+            groups = most.min(2 * groups);
         }
     }
     Ok(best)

@@ -58,6 +58,17 @@ impl Host {
         })
     }
 
+    /// Threads of its own that share the cache of this pool, as in [`Self::new`].
+    ///
+    /// # Errors
+    /// [`HostError`] where the operating system cannot start the threads.
+    pub(crate) fn beside(&self, threads: usize, known: Option<&str>) -> Result<Self, HostError> {
+        Ok(Self {
+            sweep_cache: Arc::clone(&self.sweep_cache),
+            ..Self::new(Some(threads), known)?
+        })
+    }
+
     /// Name for reports: the instruction set of the CPU backend, if given, and the number of
     /// threads.
     pub fn name(&self) -> &str {

@@ -14,12 +14,13 @@ use crate::flow::data::Point;
 use crate::flow::options::ObjectOptions;
 use crate::flow::spatial::IndexRecord;
 
-/// Points of a sample of a sweep around a cluster, and words of a bin of the votes.
+/// Most points of a sample of a sweep around a cluster, and words of a bin of the votes.
 const JUDGED: usize = 200;
 const BIN_WORDS: usize = 2;
-/// Limits of the kernel: sweeps that clusters are matched to, initial guesses, and bins of the votes
-/// on each side.
+/// Limits of the kernel: sweeps that clusters are matched to, points of one, initial guesses, and bins
+/// of the votes on each side.
 const MOST_VIEWS: usize = 8;
+const MOST_POINTS: usize = 32 * 4096;
 const MOST_GUESSES: usize = 16;
 const MOST_BINS: i32 = 120;
 
@@ -47,7 +48,6 @@ pub(crate) struct SceneRecord {
     pub(crate) voted: IndexRecord,
     pub(crate) views: u32,
     pub(crate) scratch_words: u32,
-    pub(crate) mark_words: u32,
     pub(crate) half_bins: i32,
     pub(crate) bin_m: f32,
     pub(crate) vote_within_m: f32,
@@ -141,8 +141,10 @@ impl FoundRecord {
 /// The scene of an object search, packed for the kernel.
 #[derive(Debug)]
 pub struct PackedScene {
-    /// Indices, points and rows; records hold offsets into them.
+    /// Tiles, columns and rows; records hold offsets into them.
     pub(crate) words: Vec<u32>,
+    /// Points and normals; records hold offsets into them.
+    pub(crate) points: Vec<[f32; 4]>,
     pub(crate) scene: SceneRecord,
     pub(crate) views: Vec<ViewRecord>,
     /// The clusters, large ones first.
@@ -151,7 +153,7 @@ pub struct PackedScene {
 
 impl PackedScene {
     /// Packs the target `scene`, the `neighbors` and the clusters in the given `order`. None where
-    /// the options exceed the limits of the kernel.
+    /// the options or the sweeps exceed the limits of the kernel.
     pub(super) fn new(
         scene: &Scene<'_>,
         neighbors: &[NeighborView<'_>],
@@ -159,23 +161,27 @@ impl PackedScene {
         order: &[u32],
     ) -> Option<Self> {
         let options = scene.options;
+        let scenes = || std::iter::once(scene).chain(neighbors.iter().map(|n| &n.scene));
         let fits = neighbors.len() < MOST_VIEWS
+            && scenes().all(|scene| scene.target.len() <= MOST_POINTS)
             && options.initial_guesses <= MOST_GUESSES
             && votes.half() <= MOST_BINS;
         if !fits {
             return None;
         }
-        let mut words = Vec::new();
+        let (mut words, mut points) = (Vec::new(), Vec::new());
         let source = scene.source;
-        let mut record = scene_record(options, votes);
-        record.source = source.near.write_words(&mut words);
-        record.source.labels = words.len() as u32;
         let rows = source.near.rows();
-        words.extend(rows.iter().map(|&row| source.labels[row as usize]));
+        let labels = rows.iter().map(|&row| source.labels[row as usize]);
+        let mut record = scene_record(options, votes);
+        record.source = source.near.write_words(labels, &mut words, &mut points);
         record.rows = words.len() as u32;
         words.extend_from_slice(rows);
-        record.positions = write_points(&mut words, &source.points);
-        record.voted = votes.near().write_words(&mut words);
+        record.positions = write_points(&mut points, &source.points);
+        let unlabelled = std::iter::repeat(0);
+        record.voted = votes
+            .near()
+            .write_words(unlabelled, &mut words, &mut points);
         let neighbors_of = |moment: &NeighborView<'_>| (i32::from(moment.at), moment.weight);
         let views = std::iter::once((scene, (1, 1.0)))
             .chain(neighbors.iter().map(|n| (&n.scene, neighbors_of(n))));
@@ -186,15 +192,21 @@ impl PackedScene {
         for (scene, _) in &views {
             words.extend(bits(scene.statics()));
         }
-        let mut mark_words = 0;
         let view_records = views.iter().map(|&(scene, (at, weight))| {
-            mark_words = mark_words.max(scene.target.len().div_ceil(32));
-            view_record(scene, at, weight, &mut words)
+            let [free, taken] = scene.indices();
+            let unlabelled = std::iter::repeat(0);
+            ViewRecord {
+                free: free.write_words(unlabelled, &mut words, &mut points),
+                taken: taken.write_words(scene.owners(), &mut words, &mut points),
+                targets: write_points(&mut points, &scene.target),
+                normals: write_points(&mut points, scene.normals()),
+                at,
+                weight,
+            }
         });
         let view_records: Vec<ViewRecord> = view_records.collect();
         let side = 2 * record.half_bins as usize + 1;
-        let scratch_words = mark_words + views.len() * JUDGED + BIN_WORDS * side * side;
-        record.mark_words = mark_words as u32;
+        let scratch_words = views.len() * JUDGED + BIN_WORDS * side * side;
         record.scratch_words = scratch_words as u32;
         let clusters = order.iter().map(|&label| {
             let members = &source.members[label as usize];
@@ -212,6 +224,7 @@ impl PackedScene {
         let clusters = clusters.collect();
         Some(Self {
             words,
+            points,
             scene: record,
             views: view_records,
             clusters,
@@ -248,27 +261,10 @@ fn scene_record(options: &ObjectOptions, votes: &TranslationVotes) -> SceneRecor
     }
 }
 
-/// Appends a sweep to `words`.
-fn view_record(scene: &Scene<'_>, at: i32, weight: f32, words: &mut Vec<u32>) -> ViewRecord {
-    let [free, taken] = scene.indices();
-    let free = free.write_words(words);
-    let mut taken = taken.write_words(words);
-    taken.labels = words.len() as u32;
-    words.extend(scene.owners());
-    ViewRecord {
-        free,
-        taken,
-        targets: write_points(words, &scene.target),
-        normals: write_points(words, scene.normals()),
-        at,
-        weight,
-    }
-}
-
-/// Appends points and returns their offset.
-fn write_points(words: &mut Vec<u32>, points: &[Point]) -> u32 {
-    let offset = words.len() as u32;
-    words.extend(points.as_flattened().iter().map(|c| c.to_bits()));
+/// Appends `all` to `points` and returns the offset of the first.
+fn write_points(points: &mut Vec<[f32; 4]>, all: &[Point]) -> u32 {
+    let offset = points.len() as u32;
+    points.extend(all.iter().map(|&[x, y, z]| [x, y, z, 0.0]));
     offset
 }
 

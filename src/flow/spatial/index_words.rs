@@ -25,10 +25,8 @@ pub(crate) struct IndexRecord {
     pub(crate) salt: u32,
     /// The first point of each column, and the number of points at the end.
     pub(crate) begins: u32,
-    /// Coordinates of the points in the order of the slots, three words each.
+    /// The first of its points, which are in the order of the slots.
     pub(crate) points: u32,
-    /// One label a slot, where the caller has placed them.
-    pub(crate) labels: u32,
     /// Number of points.
     pub(crate) count: u32,
     /// Side of a column, metres, and its inverse.
@@ -37,8 +35,14 @@ pub(crate) struct IndexRecord {
 }
 
 impl ColumnIndex {
-    /// Appends the index to `words`.
-    pub(crate) fn write_words(&self, words: &mut Vec<u32>) -> IndexRecord {
+    /// Appends the tiles and columns to `words`, and the points to `points`: coordinates, and the
+    /// bits of their labels. There is a label for each slot.
+    pub(crate) fn write_words(
+        &self,
+        labels: impl Iterator<Item = u32>,
+        words: &mut Vec<u32>,
+        points: &mut Vec<[f32; 4]>,
+    ) -> IndexRecord {
         let tiles = self.tiles();
         let (slots, salt) = table(tiles);
         let [column_m, columns_per_m] = tiles.sides();
@@ -54,8 +58,12 @@ impl ColumnIndex {
         words.extend_from_slice(slots.as_flattened());
         record.begins = words.len() as u32;
         words.extend_from_slice(tiles.begins());
-        record.points = words.len() as u32;
-        words.extend((0..self.len()).flat_map(|slot| self.point(slot).map(f32::to_bits)));
+        record.points = points.len() as u32;
+        let slots = (0..self.len()).zip(labels);
+        points.extend(slots.map(|(slot, label)| {
+            let [x, y, z] = self.point(slot);
+            [x, y, z, f32::from_bits(label)]
+        }));
         record
     }
 }
@@ -120,8 +128,12 @@ mod tests {
             .collect();
         let index = ColumnIndex::new(&points, 0.35);
         let mut words = vec![7; 3];
-        let record = index.write_words(&mut words);
+        let mut placed = vec![[0.0; 4]; 5];
+        let record = index.write_words(0..4000, &mut words, &mut placed);
         assert_eq!(record.count, 4000);
+        assert_eq!((record.points, placed.len()), (5, 4005));
+        let [x, y, z, label] = placed[12];
+        assert_eq!(([x, y, z], label.to_bits()), (index.point(7), 7));
         let mut tiles = 0;
         for (tile, occupied, first) in index.tiles().all() {
             let mut slot = hash(tile, record.salt) & record.mask;
@@ -140,7 +152,6 @@ mod tests {
             tiles += 1;
         }
         assert!(tiles > 100);
-        let last = (record.points - 1) as usize;
-        assert_eq!(words[last], 4000);
+        assert_eq!(words.last(), Some(&4000));
     }
 }

@@ -19,8 +19,10 @@ use crate::flow::data::{Point, Random};
 use crate::flow::options::{DistanceLossOptions, FieldOptions, Preset};
 use crate::gpu_in_tests;
 
-/// Number of lanes of the shared GPU.
+/// Number of lanes that a test fills.
 const LANES: usize = 4;
+/// Number of lanes of the shared GPU: those that all tests fill at the same time on many cores.
+const SHARED_LANES: usize = 64;
 
 /// Opens the first adapter for one test; none if the machine has none.
 fn opened(options: &GpuOptions) -> Option<Gpu> {
@@ -46,8 +48,11 @@ fn with_network_and_transform() -> impl Iterator<Item = Preset> {
 fn shared() -> Option<&'static Gpu> {
     static SHARED: OnceLock<Option<Gpu>> = OnceLock::new();
     let options = GpuOptions {
-        lanes: LANES,
-        memory_bytes: None,
+        lanes: SHARED_LANES,
+        // Few, so that it searches clusters itself.
+        host_threads: Some(2),
+
+        ..GpuOptions::default()
     };
     SHARED.get_or_init(|| opened(&options)).as_ref()
 }

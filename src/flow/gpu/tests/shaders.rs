@@ -4,7 +4,7 @@ use core::mem::offset_of;
 
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 
-use crate::flow::gpu::cluster_search::Part;
+use crate::flow::gpu::cluster_search::{GROUP_BYTES, Part};
 use crate::flow::gpu::layout;
 use crate::flow::gpu::pipelines::{CLUSTER_SOURCE, HALF_SOURCES, SOURCES};
 use crate::flow::objects::{ClusterRecord, FoundRecord, SceneRecord, ViewRecord};
@@ -17,7 +17,7 @@ fn parsed(name: &str, source: &str) -> naga::Module {
 
 #[test]
 fn every_shader_is_valid_and_fits_the_smallest_workgroup_memory() {
-    const WORKGROUP_BYTES: u32 = 32 << 10;
+    const WORKGROUP_BYTES: u32 = GROUP_BYTES;
     let half = Capabilities::IMMEDIATES
         | Capabilities::SHADER_FLOAT16
         | Capabilities::SUBGROUP
@@ -105,11 +105,11 @@ macro_rules! same_cluster_layout {
 
 #[test]
 fn host_and_cluster_kernel_agree_on_every_record() {
-    same_cluster_layout!("Index", IndexRecord: table, mask, salt, begins, points, labels, count, column_m,
+    same_cluster_layout!("Index", IndexRecord: table, mask, salt, begins, points, count, column_m,
         columns_per_m);
     same_cluster_layout!("View", ViewRecord: free, taken, targets, normals, at, weight);
     same_cluster_layout!("Scene", SceneRecord: source, positions, rows, statics, static_words, voted, views,
-        scratch_words, mark_words, half_bins, bin_m, vote_within_m, cluster_min_points, initial_guesses,
+        scratch_words, half_bins, bin_m, vote_within_m, cluster_min_points, initial_guesses,
         height_weight, match_m, tangential_weight, truncation_m, close_fit_m, displacement_penalty, static_fit_m,
         min_motion_m, min_gain_m, min_evidence_m, min_evidence_slope, max_residual_m, min_normal_motion_m,
         neighbor_cost_ratio, neighbor_gain_m, slow_cost_ratio, slow_gain_m);

@@ -106,9 +106,10 @@ fn nearest_in(index: Index, center: vec3<f32>, square: f32, half_m: f32, label: 
     var walk = begin_walk(index, center.xy, half_m);
     while next_run(index, &walk) {
         for (var slot = walk.begin; slot < walk.end; slot++) {
-            let away = center - point_at(index.points, slot);
+            let point = points[index.points + slot];
+            let away = center - point.xyz;
             let here = dot(away, away);
-            let is_wanted = label == VACANT || words[index.labels + slot] == label;
+            let is_wanted = label == VACANT || bitcast<u32>(point.w) == label;
             if here < found.square && is_wanted {
                 found = Nearest(slot, here);
             }

@@ -29,18 +29,23 @@ struct Request {
     half_bins: i32,
 }
 
-const TERMS = 12u;
+const TERMS = 10u;
 
 var<workgroup> request: Request;
 var<workgroup> cluster: Cluster;
 // The sum of each term, over the workgroup.
 var<workgroup> sums: array<f32, TERMS>;
-var<workgroup> partial: array<array<f32, GROUP>, TERMS>;
+var<workgroup> partial: array<f32, GROUP>;
 var<workgroup> counts: array<u32, GROUP>;
 // Number of the points around the cluster, by view.
 var<workgroup> around_counts: array<u32, MOST_VIEWS>;
 
-// The workgroup's words of scratch: marks, points around by view, votes.
+// Most points of a view, one bit each.
+const MARK_WORDS = 4096u;
+
+var<workgroup> marks: array<atomic<u32>, MARK_WORDS>;
+
+// The workgroup's words of scratch: points around by view, votes.
 var<private> own_scratch: u32;
 
 // The product with the rotation's sine and cosine.
@@ -78,7 +83,7 @@ fn has_static_matches(view: u32) -> bool {
 // Point `index` of `count` sampled ones of the cluster.
 fn member(index: u32, count: u32) -> vec3<f32> {
     let row = words[cluster.members + index * cluster.count / count];
-    return point_at(scene.positions, row);
+    return points[scene.positions + row].xyz;
 }
 
 // The target point of a view that is nearest to a position, or VACANT.
@@ -109,17 +114,19 @@ fn distance_to(position: vec3<f32>, target_point: vec3<f32>, normal: vec3<f32>) 
     return min(sqrt(select(plain, square, is_flat)), scene.truncation_m);
 }
 
-// Marks the points of an index less than `match_m` from a position. Marks begin at bit `first`.
-fn mark(index: Index, center: vec3<f32>, first: u32, label: u32) {
+// Marks the points of an index less than `match_m` from a position. Marks begin at bit `first`. The
+// invocations of a team share the points.
+fn mark(index: Index, center: vec3<f32>, first: u32, label: u32, member: u32) {
     let square = scene.match_m * scene.match_m;
     var walk = begin_walk(index, center.xy, scene.match_m);
     while next_run(index, &walk) {
-        for (var slot = walk.begin; slot < walk.end; slot++) {
-            let away = center - point_at(index.points, slot);
-            let is_wanted = label == VACANT || words[index.labels + slot] == label;
+        for (var slot = walk.begin + member; slot < walk.end; slot += TEAM) {
+            let point = points[index.points + slot];
+            let away = center - point.xyz;
+            let is_wanted = label == VACANT || bitcast<u32>(point.w) == label;
             if dot(away, away) < square && is_wanted {
                 let bit = first + slot;
-                atomicOr(&scratch[own_scratch + bit / 32u], 1u << (bit % 32u));
+                atomicOr(&marks[bit / 32u], 1u << (bit % 32u));
             }
         }
     }
@@ -131,19 +138,17 @@ fn look_around(local: u32, view: u32) {
     let slots = free.count + views[view].taken.count;
     let mark_words = (slots + 31u) / 32u;
     for (var word = local; word < mark_words; word += GROUP) {
-        atomicStore(&scratch[own_scratch + word], 0u);
+        atomicStore(&marks[word], 0u);
     }
-    storageBarrier();
     workgroupBarrier();
     let map = map_of(request.around);
-    for (var i = local; i < request.rows; i += GROUP) {
+    for (var i = local / TEAM; i < request.rows; i += GROUP / TEAM) {
         let position = lowered(applied(map, member(i, request.rows)));
-        mark(free, position, 0u, VACANT);
+        mark(free, position, 0u, VACANT, local % TEAM);
         if has_static_matches(view) {
-            mark(views[view].taken, position, free.count, cluster.label);
+            mark(views[view].taken, position, free.count, cluster.label, local % TEAM);
         }
     }
-    storageBarrier();
     workgroupBarrier();
     // Each invocation counts the marks of its share of the words, in order.
     let share = (mark_words + GROUP - 1u) / GROUP;
@@ -151,7 +156,7 @@ fn look_around(local: u32, view: u32) {
     let end = min(begin + share, mark_words);
     var count = 0u;
     for (var word = begin; word < end; word++) {
-        count += countOneBits(atomicLoad(&scratch[own_scratch + word]));
+        count += countOneBits(atomicLoad(&marks[word]));
     }
     counts[local] = count;
     for (var stride = 1u; stride < GROUP; stride *= 2u) {
@@ -165,9 +170,9 @@ fn look_around(local: u32, view: u32) {
     let all = counts[GROUP - 1u];
     let kept = min(all, request.most);
     var rank = counts[local] - count;
-    let sample = own_scratch + scene.mark_words + view * JUDGED;
+    let sample = own_scratch + view * JUDGED;
     for (var word = begin; word < end; word++) {
-        var bits = atomicLoad(&scratch[own_scratch + word]);
+        var bits = atomicLoad(&marks[word]);
         while bits != 0u {
             let bit = countTrailingZeros(bits);
             bits &= bits - 1u;
@@ -226,7 +231,7 @@ fn measure(local: u32) {
     let map = map_of(request.motion);
     let rows = request.rows;
     let around = select(around_counts[view], 0u, kind == SURFACES);
-    let sample = own_scratch + scene.mark_words + view * JUDGED;
+    let sample = own_scratch + view * JUDGED;
     var terms: array<f32, TERMS>;
     for (var i = local; i < rows + around; i += GROUP) {
         let is_forward = i < rows;
@@ -239,18 +244,18 @@ fn measure(local: u32) {
             is_matched = to != VACANT;
         } else {
             to = atomicLoad(&scratch[sample + i - rows]);
-            let position = undone(map, point_at(views[view].targets, to));
+            let position = undone(map, points[views[view].targets + to].xyz);
             let origin = nearest_of(scene.source, lowered(position), scene.match_m, cluster.label);
             is_matched = origin.slot != VACANT;
             if is_matched {
-                start = point_at(scene.positions, words[scene.rows + origin.slot]);
+                start = points[scene.positions + words[scene.rows + origin.slot]].xyz;
             }
         }
         var distance = scene.truncation_m;
         if is_matched {
             let moved = applied(map, start);
-            let target_point = point_at(views[view].targets, to);
-            let normal = point_at(views[view].normals, to);
+            let target_point = points[views[view].targets + to].xyz;
+            let normal = points[views[view].normals + to].xyz;
             distance = distance_to(moved, target_point, normal);
             if kind == FIT {
                 add_match(&terms, moved, target_point, normal);
@@ -262,19 +267,16 @@ fn measure(local: u32) {
             terms[select(1u, 0u, is_forward)] += distance;
         }
     }
-    for (var term = 0u; term < TERMS; term++) {
-        partial[term][local] = terms[term];
-    }
-    for (var stride = GROUP / 2u; stride > 0u; stride /= 2u) {
+    let used = select(select(2u, 4u, kind == SURFACES), TERMS, kind == FIT);
+    for (var term = 0u; term < used; term++) {
         workgroupBarrier();
-        if local < stride {
-            for (var term = 0u; term < TERMS; term++) {
-                partial[term][local] += partial[term][local + stride];
-            }
+        partial[local] = terms[term];
+        for (var stride = GROUP / 2u; stride > 0u; stride /= 2u) {
+            workgroupBarrier();
+            if local < stride { partial[local] += partial[local + stride]; }
         }
+        if local == 0u { sums[term] = partial[0]; }
     }
-    workgroupBarrier();
-    if local < TERMS { sums[local] = partial[local][0]; }
     workgroupBarrier();
 }
 

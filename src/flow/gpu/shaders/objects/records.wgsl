@@ -1,5 +1,5 @@
 // The records of the object search. PackedScene of flow/objects has the same; a test compares their
-// offsets. Offsets are in 32-bit words of `words`.
+// offsets. Offsets of points are into `points`; all others are into `words`.
 
 // A column index: the hash table of its tiles, its columns and its points in the order of slots.
 struct Index {
@@ -11,10 +11,8 @@ struct Index {
     salt: u32,
     // The first point of each column.
     begins: u32,
-    // Three words a point.
+    // The first of its points, whose labels are their fourth component.
     points: u32,
-    // A label for each slot; no meaning where there are none.
-    labels: u32,
     count: u32,
     column_m: f32,
     columns_per_m: f32,
@@ -24,7 +22,7 @@ struct Index {
 struct View {
     free: Index,
     taken: Index,
-    // Points and normals of the slots of `free`, then of those of `taken`.
+    // Points and normals of the slots of `free`, then of those of `taken`. Heights are not scaled.
     targets: u32,
     normals: u32,
     // Sweep intervals after the source.
@@ -46,10 +44,8 @@ struct Scene {
     // The target points that vote.
     voted: Index,
     views: u32,
-    // Words of a workgroup's scratch.
+    // Words of a workgroup's scratch: a sample of the points around by view, and the votes.
     scratch_words: u32,
-    // Of these, those of the marks, and of the votes.
-    mark_words: u32,
     // Bins on each side of the zero translation.
     half_bins: i32,
     bin_m: f32,
@@ -130,15 +126,13 @@ var<immediate> part: Part;
 @group(0) @binding(3) var<storage, read> clusters: array<Cluster>;
 @group(0) @binding(4) var<storage, read_write> scratch: array<atomic<u32>>;
 @group(0) @binding(5) var<storage, read_write> results: array<Found>;
+@group(0) @binding(6) var<storage, read> points: array<vec4<f32>>;
 
 // Invocations of a workgroup, which searches one cluster at a time.
-const GROUP = 128u;
+const GROUP = 512u;
+// Invocations that share the points around one position.
+const TEAM = 16u;
 // Points of a cluster that costs are computed from, and of the sweep around it.
 const JUDGED = 200u;
 const MOST_VIEWS = 8u;
 const INFINITE = 0x1.fffffep+127f;
-
-fn point_at(offset: u32, index: u32) -> vec3<f32> {
-    let at = offset + 3u * index;
-    return bitcast<vec3<f32>>(vec3(words[at], words[at + 1u], words[at + 2u]));
-}

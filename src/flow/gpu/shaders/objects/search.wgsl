@@ -21,7 +21,7 @@ fn advance() {
     }
 }
 
-@compute @workgroup_size(128)
+@compute @workgroup_size(512)
 fn search_clusters(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,

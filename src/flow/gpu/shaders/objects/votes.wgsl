@@ -13,7 +13,7 @@ var<workgroup> best_votes: array<u32, GROUP>;
 var<workgroup> best_orders: array<u32, GROUP>;
 
 fn bin_words(bin: u32) -> u32 {
-    return own_scratch + scene.mark_words + scene.views * JUDGED + 2u * bin;
+    return own_scratch + scene.views * JUDGED + 2u * bin;
 }
 
 fn votes_at(x: i32, y: i32, half: i32) -> u32 {
@@ -35,12 +35,12 @@ fn vote(local: u32) {
     storageBarrier();
     workgroupBarrier();
     let voters = min(cluster.count, VOTERS);
-    for (var voter = local; voter < voters; voter += GROUP) {
+    for (var voter = local / TEAM; voter < voters; voter += GROUP / TEAM) {
         let start = member(voter, voters);
         var walk = begin_walk(scene.voted, start.xy, f32(half) * scene.bin_m);
         while next_run(scene.voted, &walk) {
-            for (var slot = walk.begin; slot < walk.end; slot++) {
-                let away = point_at(scene.voted.points, slot) - start;
+            for (var slot = walk.begin + local % TEAM; slot < walk.end; slot += TEAM) {
+                let away = points[scene.voted.points + slot].xyz - start;
                 let shift = vec2<i32>(round(away.xy / scene.bin_m));
                 if abs(away.z) < scene.vote_within_m && all(abs(shift) <= vec2(half)) {
                     let bin = u32((shift.y + half) * side + shift.x + half);
