@@ -31,8 +31,8 @@ build() {
   cargo bench --locked --bench gpu --no-run --message-format json | place bench gpu bench-gpu
   cargo bench --locked --bench side_by_side --no-run --message-format json |
     place bench side_by_side bench-side-by-side
-  cargo test --locked --lib --no-run --message-format json | place lib fnsf test-lib
-  cargo test --locked --test numerics --no-run --message-format json | place test numerics test-numerics
+  cargo test --locked --release --lib --no-run --message-format json | place lib fnsf test-lib
+  cargo test --locked --release --test numerics --no-run --message-format json | place test numerics test-numerics
   strip "$to"/fnsf "$to"/bench-gpu "$to"/bench-side-by-side "$to"/test-lib "$to"/test-numerics
   echo "built into $to: $(du -sh "$to" | cut -f1)"
 }
@@ -50,8 +50,10 @@ run() {
     FNSF_REQUIRE_GPU=1 "$from"/$tests >"$log" 2>&1 || failed=1
     grep -E '^test result|FAILED|panicked' "$log" || true
   done
-  printf '\n## Kernels, pairs, batches\n\n'
+  printf '\n## Kernels, objects, pairs, batches\n\n'
   timeout 300 "$from/bench-gpu" ${card:+"$card"} || failed=1
+  printf '\n## Lanes of the host\n\n'
+  timeout 200 "$from/bench-side-by-side" || failed=1
   local pair="${FNSF_REAL_DATA:-}/av2_7fab/pair.npz"
   if [ ! -f "$pair" ]; then
     echo "FNSF_REAL_DATA names no folder with av2_7fab: no real pair was measured"

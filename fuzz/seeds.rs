@@ -3,7 +3,9 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
+use arrow_array::{ArrayRef, RecordBatch, StringArray};
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::depth::DepthImage;
 use fnsf::flow::{Estimate, Point, Preset, Problem, Uncontrolled, estimate};
@@ -12,6 +14,9 @@ use fnsf::formats::{
     write_cloud, write_dense, write_depth_png, write_flow, write_pair_npz, write_timed_pcd,
 };
 use fnsf::payload::{StoredCloud, StoredDense, StoredFlow};
+use parquet::arrow::ArrowWriter;
+use parquet::basic::Compression;
+use parquet::file::properties::WriterProperties;
 
 /// Writes the seeds of all targets into folders of their names.
 pub(crate) fn write(folder: &Path) {
@@ -25,6 +30,7 @@ pub(crate) fn write(folder: &Path) {
     seeds.flows(&source, &target, &found);
     seeds.payloads(&source, &found);
     seeds.texts();
+    seeds.manifests();
     seeds.requests(&source[..20], &target[..20]);
     seeds.steps();
 }
@@ -146,6 +152,30 @@ impl Seeds {
         bytes.extend(4_u64.to_le_bytes());
         bytes.extend([0; 4 * 4 * 4]);
         self.put("snapshot", "fit", &bytes);
+    }
+
+    /// Manifests as Parquet: two columns of text, with each compression.
+    fn manifests(&self) {
+        let text = |rows: [&str; 3]| Arc::new(StringArray::from(rows.to_vec())) as ArrayRef;
+        let columns = [
+            ("drive", text(["d", "d", "e"])),
+            ("sweep", text(["0.pcd", "1.pcd", "s3://lake/2.pcd"])),
+        ];
+        let batch = RecordBatch::try_from_iter(columns).expect("columns");
+        for (name, compression) in [
+            ("plain", Compression::UNCOMPRESSED),
+            ("snappy", Compression::SNAPPY),
+            ("lz4", Compression::LZ4_RAW),
+        ] {
+            let properties = WriterProperties::builder().set_compression(compression);
+            let mut bytes = Vec::new();
+            let mut writer =
+                ArrowWriter::try_new(&mut bytes, batch.schema(), Some(properties.build()))
+                    .expect("a writer");
+            writer.write(&batch).expect("written");
+            writer.close().expect("closed");
+            self.put("parquet", name, &bytes);
+        }
     }
 
     fn texts(&self) {

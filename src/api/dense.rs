@@ -16,7 +16,9 @@ use crate::cost::CostModel;
 use crate::flow::densify::Plan;
 use crate::flow::{DenseCloud, window};
 use crate::formats::{DENSE_FORMATS, DenseFormat, write_dense};
-use crate::job::{DenseReport, Densify, InvalidOptions, Job, JobOptions, Kind, LaterSweepsChoice};
+use crate::job::{
+    DenseReport, Densify, InvalidOptions, Job, JobId, JobOptions, Kind, LaterSweepsChoice,
+};
 use crate::payload::StoredDense;
 use crate::queue::PairOf;
 
@@ -114,6 +116,15 @@ impl Admission {
     }
 }
 
+/// The dense cloud of a stored result.
+///
+/// # Errors
+/// That of [`damaged`].
+fn decoded(id: JobId, stored: &[u8]) -> Result<DenseCloud, ApiError> {
+    let StoredDense(cloud) = StoredDense::from_bytes(stored).map_err(|error| damaged(id, error))?;
+    Ok(cloud)
+}
+
 /// Whether the result of a job is a dense cloud.
 pub(super) fn is_dense(job: &Job) -> bool {
     let options = || JobOptions::from_json(job.options.as_bytes()).ok();
@@ -149,15 +160,11 @@ impl Service {
     ) -> Result<(Arc<DenseCloud>, ResultReservation), ApiError> {
         Self::check_success(job)?;
         let room = self.room_for_result(job).await?;
-        Ok((Arc::new(self.read_dense(job).await?), room))
-    }
-
-    async fn read_dense(&self, job: &Job) -> Result<DenseCloud, ApiError> {
         let bytes = self.result_bytes(job).await?;
         let id = job.id;
-        let read = move || StoredDense::from_bytes(&bytes).map_err(|error| damaged(id, error));
-        let StoredDense(cloud) = self.compute(&job.tenant, read).await?;
-        Ok(cloud)
+        // The work goes on when its caller has gone, and so does its memory.
+        let read = move || Ok((Arc::new(decoded(id, &bytes)?), room));
+        self.compute(&job.tenant, read).await
     }
 
     /// Encodes a sequence's dense cloud in a format. Returns the cached result of an earlier
@@ -183,10 +190,13 @@ impl Service {
             return Ok(made);
         }
         let began = std::time::Instant::now();
-        let cloud = self.read_dense(job).await?;
+        let stored = self.result_bytes(job).await?;
+        let id = job.id;
         let encode = move || {
             // The work goes on when its caller has gone, and so do its turn and its memory.
             let _turn = turn;
+            let cloud = decoded(id, &stored)?;
+            drop(stored);
             let mut bytes = Vec::new();
             write_dense(format, &cloud, &mut bytes).map_err(ApiError::internal)?;
             Ok(room.hold(bytes))

@@ -5,7 +5,7 @@ use reqwest::StatusCode;
 use serde_json::Value;
 use tonic::Code;
 
-use crate::clouds::{form, small_pair};
+use crate::clouds::{form, medium_pair, small_pair};
 use crate::gpu_rule;
 use crate::grpc::{self, proto};
 use crate::server::{Server, ended};
@@ -68,6 +68,28 @@ async fn half_precision_of_what_fits_no_field_is_refused_at_both_doors_and_names
         refused.message().contains("take preset neural"),
         "{refused}"
     );
+}
+
+#[tokio::test]
+async fn pairs_side_by_side_on_one_cpu_have_the_flow_of_a_pair_alone() {
+    let server = Server::start(&["--device", "cpu:4"]);
+    let info = reqwest::get(server.url("/v1/info")).await;
+    let info: Value = info.expect("an answer").json().await.expect("JSON");
+    assert_eq!(info["devices"][0]["lanes"], 2, "{info}");
+    let flow = || async {
+        let sent = reqwest::Client::new()
+            .post(server.url("/v1/flow"))
+            .header("accept", "application/x-npy")
+            .multipart(form(medium_pair(), "{}"))
+            .send()
+            .await
+            .expect("an answer");
+        assert_eq!(sent.status(), StatusCode::OK);
+        sent.bytes().await.expect("a flow")
+    };
+    let alone = flow().await;
+    let many = futures_util::future::join_all((0..6).map(|_| flow())).await;
+    assert!(many.iter().all(|flow| *flow == alone));
 }
 
 #[tokio::test]
