@@ -445,12 +445,9 @@ impl Config {
         if self.devices.is_empty() {
             return refuse("devices is empty: name at least one, such as \"cpu\"");
         }
-        let are_lanes = |lanes: Option<usize>| lanes.is_none_or(|n| (1..=MAX_LANES).contains(&n));
-        if !are_lanes(self.gpu_lanes) {
-            return refuse("gpu_lanes must be 1 to 64");
-        }
-        if !are_lanes(self.cpu_lanes) {
-            return refuse("cpu_lanes must be 1 to 64");
+        let mut lanes = [self.cpu_lanes, self.gpu_lanes].into_iter().flatten();
+        if lanes.any(|lanes| !(1..=MAX_LANES).contains(&lanes)) {
+            return refuse("cpu_lanes and gpu_lanes must be 1 to 64");
         }
         if self.gpu_memory_mib == Some(0) {
             return refuse("gpu_memory_mib must be at least 1");

@@ -120,11 +120,13 @@ async fn the_log_of_a_request_has_the_trace_of_its_caller() {
         .get(server.url("/v1/info"))
         .header("traceparent", format!("00-{trace}-b7ad6b7169203331-01"));
     assert_eq!(asked.send().await.expect("an answer").status(), 200);
+    let is_wanted = |line: &&str| line.contains("\"answered\"") && line.contains("/v1/info");
+    // The log is written beside the answers.
+    server.until("the line of the request", || {
+        server.log().lines().any(|line| is_wanted(&line))
+    });
     let log = server.log();
-    let line = log
-        .lines()
-        .find(|line| line.contains("\"answered\"") && line.contains("/v1/info"));
-    let line = line.unwrap_or_else(|| panic!("no line of the request: {log}"));
+    let line = log.lines().find(is_wanted).expect("the line");
     assert!(line.contains(trace), "{line}");
 }
 

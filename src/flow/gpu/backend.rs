@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::adapter::Adapter;
+use super::adapter::{Adapter, AdapterKind};
 use super::chamfer::GpuCloud;
 use super::device::Device;
 use super::distance::GpuTransform;
@@ -98,7 +98,10 @@ impl Backend for Gpu {
     }
 
     fn searches_clusters(&self) -> bool {
-        self.0.host.threads().current_num_threads() <= FEW_THREADS && self.0.has_cluster_kernel()
+        let threads = self.0.host.threads().current_num_threads();
+        self.0.kind != AdapterKind::Software
+            && threads <= FEW_THREADS
+            && self.0.has_cluster_kernel()
     }
 
     fn search_clusters(

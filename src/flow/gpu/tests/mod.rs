@@ -49,9 +49,6 @@ fn shared() -> Option<&'static Gpu> {
     static SHARED: OnceLock<Option<Gpu>> = OnceLock::new();
     let options = GpuOptions {
         lanes: SHARED_LANES,
-        // Few, so that it searches clusters itself.
-        host_threads: Some(2),
-
         ..GpuOptions::default()
     };
     SHARED.get_or_init(|| opened(&options)).as_ref()
