@@ -140,6 +140,10 @@ impl FoundRecord {
 
 /// The scene of an object search, packed for the kernel.
 #[derive(Debug)]
+#[cfg_attr(
+    not(feature = "gpu"),
+    expect(dead_code, reason = "only the kernel of a GPU reads it")
+)]
 pub struct PackedScene {
     /// Tiles, columns and rows; records hold offsets into them.
     pub(crate) words: Vec<u32>,
