@@ -9,7 +9,7 @@ use arrow_array::{
 use bytes::Bytes;
 use fnsf::label::{ManifestError, read_manifest};
 use parquet::arrow::ArrowWriter;
-use parquet::basic::{Compression, ZstdLevel};
+use parquet::basic::{Compression, Encoding, ZstdLevel};
 use parquet::file::properties::WriterProperties;
 
 const SWEEPS: [&str; 3] = ["a/0.pcd", "s3://lake/1.pcd", "a/2.pcd"];
@@ -134,4 +134,32 @@ fn damaged_tables_are_refused() {
         }
         let _either = read_manifest(Bytes::from(bytes), None);
     }
+}
+
+#[test]
+fn a_dictionary_that_claims_more_values_than_it_has_bytes_is_refused() {
+    let mut bytes = sweeps(Compression::UNCOMPRESSED).to_vec();
+    // The first page is the dictionary of drives: one value of five bytes.
+    let header = [0x15, 4, 0x15, 10, 0x15, 10, 0x4c, 0x15, 2];
+    assert_eq!(bytes[4..13], header);
+    bytes[12] = 126;
+    let error = read_manifest(Bytes::from(bytes), None).expect_err("63 values");
+    assert!(error.to_string().contains("claims 63 values"), "{error}");
+}
+
+#[test]
+fn columns_stored_as_differences_are_refused_by_the_name_of_their_encoding() {
+    let text: ArrayRef = Arc::new(StringArray::from(SWEEPS.to_vec()));
+    let batch = RecordBatch::try_from_iter([("sweep", text)]).expect("columns");
+    let properties = WriterProperties::builder()
+        .set_dictionary_enabled(false)
+        .set_encoding(Encoding::DELTA_BYTE_ARRAY)
+        .build();
+    let mut out = Vec::new();
+    let mut writer =
+        ArrowWriter::try_new(&mut out, batch.schema(), Some(properties)).expect("a writer");
+    writer.write(&batch).expect("written");
+    writer.close().expect("closed");
+    let error = read_manifest(Bytes::from(out), None).expect_err("differences");
+    assert!(error.to_string().contains("DELTA_BYTE_ARRAY"), "{error}");
 }

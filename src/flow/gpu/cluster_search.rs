@@ -11,7 +11,7 @@ use crate::flow::objects::{FoundRecord, PackedScene};
 const AT_ONCE: usize = 2048;
 const SOFTWARE_AT_ONCE: usize = 64;
 /// Invocations of a workgroup, and bytes of its memory; records.wgsl and measure.wgsl have the same.
-const GROUP: u32 = 512;
+pub(super) const GROUP: u32 = 512;
 pub(super) const GROUP_BYTES: u32 = 32 << 10;
 /// Most workgroups of a dispatch; each takes further clusters in turn. And most bytes of their
 /// scratch.

@@ -13,16 +13,16 @@ use super::scene::Scene;
 use crate::flow::data::{Point, stride_sample};
 
 /// Steps between two searches for the target points around a cluster.
-const STEPS_BETWEEN_LOOKS: usize = 4;
+pub(super) const STEPS_BETWEEN_LOOKS: usize = 4;
 /// Scale of the robust weight (Geman and McClure), metres: in the first half of the steps at most,
 /// and in the others.
-const SCALES_M: [f32; 2] = [0.2, 0.1];
+pub(super) const SCALES_M: [f32; 2] = [0.2, 0.1];
 /// Damping of the translation and of the rotation of a step, relative to the total weight.
-const DAMPING: [f64; 2] = [1e-3, 0.05];
+pub(super) const DAMPING: [f64; 2] = [1e-3, 0.05];
 /// Total weight below which there is no step.
-const LEAST_WEIGHT: f64 = 1e-6;
+pub(super) const LEAST_WEIGHT: f64 = 1e-6;
 /// A shorter step is the last at its scale, metres.
-const SHORT_STEP_M: f64 = 1e-3;
+pub(super) const SHORT_STEP_M: f64 = 1e-3;
 
 impl ClusterSearch<'_> {
     /// Fits the motion of the cluster's points `rows`, from `start`, to the target and to the

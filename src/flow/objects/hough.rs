@@ -14,7 +14,7 @@ use crate::flow::spatial::voxel_first;
 /// Largest height difference of a pair that votes, in bins.
 const LEVEL_BINS: f32 = 1.5;
 /// Two peaks are more than this many bins apart.
-const PEAKS_APART: i32 = 2;
+pub(super) const PEAKS_APART: i32 = 2;
 
 /// The target points that pairs are formed with, and the bins of the votes.
 pub(super) struct TranslationVotes {

@@ -13,25 +13,25 @@ use super::planar_motion::PlanarMotion;
 use crate::flow::data::{Point, square_distance, stride_sample};
 
 /// Points of a cluster that vote, and that are fitted from an initial guess.
-const VOTERS: usize = 64;
-const MAX_FIT_POINTS: usize = 100;
+pub(super) const VOTERS: usize = 64;
+pub(super) const MAX_FIT_POINTS: usize = 100;
 /// Initial guesses that are fitted besides the zero motion: those of least cost before the fit.
-const PROMISING: usize = 2;
+pub(super) const PROMISING: usize = 2;
 /// Steps of the fit from each initial guess, and of the last fit.
-const STEPS: [usize; 2] = [10, 20];
+pub(super) const STEPS: [usize; 2] = [10, 20];
 /// Shifts of the direct search, metres, each applied up to [`TRIES`] times.
-const SHIFTS_M: [f32; 3] = [0.1, 0.05, 0.025];
-const TRIES: usize = 4;
+pub(super) const SHIFTS_M: [f32; 3] = [0.1, 0.05, 0.025];
+pub(super) const TRIES: usize = 4;
 /// Least share of a cost that the last fit, and that the direct search after it, leave. On real and
 /// simulated pairs they leave 0.64 and 0.73 of it or more.
-const LEAST_LEFT: [f32; 2] = [0.5, 0.6];
+pub(super) const LEAST_LEFT: [f32; 2] = [0.5, 0.6];
 /// Distance by which they shorten a motion at most, metres, but for one in a hundred.
-const SHORTENED_M: f32 = 0.25;
+pub(super) const SHORTENED_M: f32 = 0.25;
 /// Number of points from which a rotation is fitted as well.
-const TURNED: usize = 40;
+pub(super) const TURNED: usize = 40;
 /// Observability of a point without a normal in every direction: the mean over normals of all
 /// directions.
-const HOLD_OF_A_POINT: f32 = 1.0 / 3.0;
+pub(super) const HOLD_OF_A_POINT: f32 = 1.0 / 3.0;
 
 /// The best motion of a cluster, with its evidence.
 #[derive(Clone, Copy, Debug)]

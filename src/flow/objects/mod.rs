@@ -47,6 +47,8 @@ pub use search::{ObjectSearch, SearchClouds, SearchSeconds};
 pub(crate) use measured_at::TimedPoints;
 pub(crate) use search::{ClusterDevice, find_objects};
 
+#[cfg(test)]
+pub(crate) use packed::shared_constants;
 /// What the kernel that searches clusters is compared with, for tests of its records.
 #[cfg(test)]
 pub(crate) use packed::{ClusterRecord, SceneRecord, ViewRecord};

@@ -282,3 +282,45 @@ fn bits(flags: &[bool]) -> impl Iterator<Item = u32> {
         bits.sum()
     })
 }
+
+/// The constants that the kernel has as well: its name of each, and the value here.
+#[cfg(test)]
+pub(crate) fn shared_constants() -> Vec<(&'static str, f32)> {
+    use super::{gauss_newton, hough, hypothesis};
+    let [guess_steps, last_steps] = hypothesis::STEPS;
+    let [coarse_m, fine_m] = gauss_newton::SCALES_M;
+    let [shift_damping, turn_damping] = gauss_newton::DAMPING;
+    let [left_by_fit, left_by_search] = hypothesis::LEAST_LEFT;
+    let sizes = hypothesis::SHIFTS_M;
+    assert!(sizes.windows(2).all(|pair| pair[1] == 0.5 * pair[0]));
+    vec![
+        ("JUDGED", JUDGED as f32),
+        ("MOST_VIEWS", MOST_VIEWS as f32),
+        ("MARK_WORDS", (MOST_POINTS / 32) as f32),
+        ("MOST_PEAKS", MOST_GUESSES as f32),
+        ("PEAKS_APART", hough::PEAKS_APART as f32),
+        ("VOTERS", hypothesis::VOTERS as f32),
+        ("MOST_FITTED", hypothesis::MAX_FIT_POINTS as f32),
+        ("PROMISING", hypothesis::PROMISING as f32),
+        ("TRIES", hypothesis::TRIES as f32),
+        ("TURNED", hypothesis::TURNED as f32),
+        ("SHORTENED_M", hypothesis::SHORTENED_M),
+        ("HOLD_OF_A_POINT", hypothesis::HOLD_OF_A_POINT),
+        ("GUESS_STEPS", guess_steps as f32),
+        ("LAST_STEPS", last_steps as f32),
+        ("FIRST_SHIFT_M", sizes[0]),
+        ("SHIFT_SIZES", sizes.len() as f32),
+        ("LEFT_BY_FIT", left_by_fit),
+        ("LEFT_BY_SEARCH", left_by_search),
+        (
+            "STEPS_BETWEEN_LOOKS",
+            gauss_newton::STEPS_BETWEEN_LOOKS as f32,
+        ),
+        ("COARSE_M", coarse_m),
+        ("FINE_M", fine_m),
+        ("SHIFT_DAMPING", shift_damping as f32),
+        ("TURN_DAMPING", turn_damping as f32),
+        ("LEAST_WEIGHT", gauss_newton::LEAST_WEIGHT as f32),
+        ("SHORT_STEP_M", gauss_newton::SHORT_STEP_M as f32),
+    ]
+}

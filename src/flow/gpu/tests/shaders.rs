@@ -4,10 +4,10 @@ use core::mem::offset_of;
 
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 
-use crate::flow::gpu::cluster_search::{GROUP_BYTES, Part};
+use crate::flow::gpu::cluster_search::{GROUP, GROUP_BYTES, Part};
 use crate::flow::gpu::layout;
 use crate::flow::gpu::pipelines::{CLUSTER_SOURCE, HALF_SOURCES, SOURCES};
-use crate::flow::objects::{ClusterRecord, FoundRecord, SceneRecord, ViewRecord};
+use crate::flow::objects::{ClusterRecord, FoundRecord, SceneRecord, ViewRecord, shared_constants};
 use crate::flow::spatial::IndexRecord;
 
 fn parsed(name: &str, source: &str) -> naga::Module {
@@ -121,6 +121,15 @@ fn host_and_cluster_kernel_agree_on_every_record() {
 }
 
 #[test]
+fn host_and_cluster_kernel_agree_on_every_constant() {
+    let source = CLUSTER_SOURCE.1;
+    assert_eq!(number(source, "GROUP"), GROUP as f32);
+    for (name, value) in shared_constants() {
+        assert_eq!(number(source, name), value, "{name}");
+    }
+}
+
+#[test]
 fn host_and_brick_kernel_agree_on_every_record() {
     let source = SOURCES[0].1;
     assert_eq!(layout(source, "Plan").1, size_of::<layout::BrickPlan>());
@@ -129,14 +138,21 @@ fn host_and_brick_kernel_agree_on_every_record() {
 
 /// The value of an integer constant of a shader.
 fn constant(source: &str, name: &str) -> usize {
+    let value = number(source, name);
+    assert_eq!(value.fract(), 0.0, "{name}");
+    value as usize
+}
+
+/// The value of a constant of a shader: a literal, or a quotient of two.
+fn number(source: &str, name: &str) -> f32 {
     let line = source
         .lines()
         .find_map(|line| line.strip_prefix(&format!("const {name} = ")));
     let value = line.unwrap_or_else(|| panic!("no {name}"));
-    value
-        .trim_end_matches("u;")
-        .parse()
-        .unwrap_or_else(|_| panic!("{name} = {value}"))
+    let literals = value.trim_end_matches(';').split(" / ");
+    let numbers = literals.map(|literal| literal.trim_end_matches('u').parse::<f32>());
+    let numbers = numbers.map(|number| number.unwrap_or_else(|_| panic!("{name} = {value}")));
+    numbers.reduce(|a, b| a / b).expect("a value")
 }
 
 #[test]

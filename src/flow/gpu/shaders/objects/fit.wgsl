@@ -6,7 +6,7 @@ fn ask_step(view: u32) {
     let by_then = repeated(motion, views[view].at);
     let gaps = f32(views[view].at);
     let swing = gaps * (gaps - 1.0) / 2.0;
-    let scale_m = select(0.2, 0.1, search.is_fine);
+    let scale_m = select(COARSE_M, FINE_M, search.is_fine);
     request.kind = FIT;
     request.view = view;
     request.motion = by_then;
@@ -33,7 +33,7 @@ fn fit(start: Motion, view_count: u32, rows: u32, is_turned: bool, steps: u32) {
 
 fn fit_guess(stage: u32, start: Motion, view_count: u32) {
     search.stage = stage;
-    fit(start, view_count, min(cluster.count, MOST_FITTED), false, 10u);
+    fit(start, view_count, min(cluster.count, MOST_FITTED), false, GUESS_STEPS);
 }
 
 fn begin_step() {
@@ -49,9 +49,9 @@ fn solved() -> vec4<f32> {
     let weight = n[9];
     if !(weight >= LEAST_WEIGHT) { return vec4(0.0); }
     let coupled = select(0.0, 1.0, search.is_turned);
-    let xx = n[0] + 1e-3 * weight;
-    let yy = n[3] + 1e-3 * weight;
-    let tt = n[5] + 0.05 * weight;
+    let xx = n[0] + SHIFT_DAMPING * weight;
+    let yy = n[3] + SHIFT_DAMPING * weight;
+    let tt = n[5] + TURN_DAMPING * weight;
     let xt = n[2] * coupled;
     let yt = n[4] * coupled;
     // Cholesky.

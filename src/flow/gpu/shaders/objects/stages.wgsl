@@ -86,9 +86,9 @@ fn fitted() {
     search.is_shifted = gains() || confirmed();
     if !(search.is_shifted || is_turned) {
         request.kind = END;
-    } else if is_open(search.best, 0.5 * search.best_total) {
+    } else if is_open(search.best, LEFT_BY_FIT * search.best_total) {
         search.stage = LAST_FIT;
-        fit(search.best, scene.views, judged_rows(), is_turned, 20u);
+        fit(search.best, scene.views, judged_rows(), is_turned, LAST_STEPS);
     } else {
         ask_surfaces();
     }
@@ -96,7 +96,7 @@ fn fitted() {
 
 fn ask_shift() {
     search.stage = SHIFT;
-    let size = 0.1 / f32(1u << search.size);
+    let size = FIRST_SHIFT_M / f32(1u << search.size);
     let sign = select(size, -size, search.direction % 2u == 1u);
     evaluate(shifted(search.center, select(vec2(0.0, sign), vec2(sign, 0.0), search.direction < 2u)), scene.views);
 }
@@ -116,7 +116,7 @@ fn next_shift() {
         }
         search.center = search.best;
     }
-    if search.size < 3u {
+    if search.size < SHIFT_SIZES {
         ask_shift();
     } else {
         ask_surfaces();
@@ -177,7 +177,7 @@ fn evaluated() {
             search.tries = 0u;
             search.direction = 0u;
             search.center = search.best;
-            if is_open(search.best, 0.6 * search.best_total) { ask_shift(); } else { ask_surfaces(); }
+            if is_open(search.best, LEFT_BY_SEARCH * search.best_total) { ask_shift(); } else { ask_surfaces(); }
         }
         default: {
             consider(0.0);

@@ -10,9 +10,23 @@ const LAST_FIT = 5u;
 const SHIFT = 6u;
 
 const MOST_FITTED = 100u;
+// Steps of the fit from an initial guess, and of the last fit.
+const GUESS_STEPS = 10u;
+const LAST_STEPS = 20u;
+// The scale of the robust weight in the first half of the steps, and in the others.
+const COARSE_M = 0.2;
+const FINE_M = 0.1;
+const SHIFT_DAMPING = 1e-3;
+const TURN_DAMPING = 0.05;
 const PROMISING = 2u;
 const STEPS_BETWEEN_LOOKS = 4u;
 const TRIES = 4u;
+// The first shift of the direct search; each of the others is half of the one before.
+const FIRST_SHIFT_M = 0.1;
+const SHIFT_SIZES = 3u;
+// Least share of a cost that the last fit, and that the direct search after it, leave.
+const LEFT_BY_FIT = 0.5;
+const LEFT_BY_SEARCH = 0.6;
 const TURNED = 40u;
 const SHORT_STEP_M = 1e-3;
 const LEAST_WEIGHT = 1e-6;

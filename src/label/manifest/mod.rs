@@ -8,16 +8,13 @@
 //! Further columns of sweeps: `time_s` (seconds) or `timestamp_ns`, and `pose`, 12 or 16 numbers of
 //! world_from_sensor. Other columns are ignored.
 
+mod pages;
+mod parquet;
+
 use std::collections::HashMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::Arc;
 
-use arrow_array::RecordBatch;
-use arrow_array::cast::AsArray;
-use arrow_schema::{DataType as Type, Field, Schema};
 use bytes::Bytes;
-use parquet::arrow::ProjectionMask;
-use parquet::arrow::arrow_reader::{ArrowReaderOptions, ParquetRecordBatchReaderBuilder};
 
 use super::plan::{Drive, DriveSweep, drive_name, key_of, stem};
 use crate::flow::RigidTransform;
@@ -79,7 +76,7 @@ pub fn read_manifest(bytes: Bytes, folder: Option<&str>) -> Result<Vec<Drive>, M
     let table = match bytes.starts_with(b"PAR1") {
         true => {
             // The reader of Parquet panics at some damaged files.
-            let read = catch_unwind(AssertUnwindSafe(|| read_parquet(bytes)));
+            let read = catch_unwind(AssertUnwindSafe(|| parquet::read(bytes)));
             let damaged = |_| ManifestError::Unreadable("the Parquet file is damaged".to_owned());
             read.map_err(damaged)??
         }
@@ -124,101 +121,6 @@ fn read_csv(bytes: &[u8]) -> Result<Table, ManifestError> {
         rows.push(values.collect());
     }
     Ok(Table { names, rows })
-}
-
-fn read_parquet(bytes: Bytes) -> Result<Table, ManifestError> {
-    let unreadable = |error: &dyn std::fmt::Display| ManifestError::Unreadable(error.to_string());
-    // Values of a dictionary stay in it: as views, many rows of one long value take little memory.
-    let plain = ArrowReaderOptions::new().with_skip_arrow_metadata(true);
-    let stored =
-        ParquetRecordBatchReaderBuilder::try_new_with_options(bytes.clone(), plain.clone());
-    let stored = stored.map_err(|error| unreadable(&error))?;
-    let views = stored.schema().fields().iter().map(|field| {
-        let kind = match field.data_type() {
-            Type::Utf8 => Type::Utf8View,
-            kind => kind.clone(),
-        };
-        Field::new(field.name(), kind, field.is_nullable())
-    });
-    let views = Arc::new(Schema::new(views.collect::<Vec<_>>()));
-    let builder =
-        ParquetRecordBatchReaderBuilder::try_new_with_options(bytes, plain.with_schema(views));
-    let builder = builder.map_err(|error| unreadable(&error))?;
-    let rows = builder.metadata().file_metadata().num_rows();
-    if usize::try_from(rows).map_or(true, |rows| rows > MAX_ROWS) {
-        return Err(ManifestError::TooLarge);
-    }
-    let fields = builder.schema().fields().iter();
-    let names: Vec<String> = fields.map(|field| field.name().clone()).collect();
-    let indices = names.iter().enumerate();
-    let indices = indices
-        .filter(|(_, name)| known(name).is_some())
-        .map(|(index, _)| index);
-    let mask = ProjectionMask::roots(builder.parquet_schema(), indices);
-    let reader = builder.with_projection(mask).with_batch_size(8192).build();
-    let mut table = Table {
-        names,
-        rows: Vec::new(),
-    };
-    let mut left = MAX_BYTES;
-    for batch in reader.map_err(|error| unreadable(&error))? {
-        let batch = batch.map_err(|error| unreadable(&error))?;
-        take(&batch, &mut table.rows, &mut left)?;
-    }
-    Ok(table)
-}
-
-/// Takes the rows of a batch: text as it is, numbers as text, lists of numbers as `[1,2]`. The texts of
-/// all batches have at most `left` bytes, which are counted down.
-fn take(
-    batch: &RecordBatch,
-    rows: &mut Vec<HashMap<&'static str, String>>,
-    left: &mut usize,
-) -> Result<(), ManifestError> {
-    let first = rows.len();
-    rows.resize_with(first + batch.num_rows(), HashMap::new);
-    for (field, column) in batch.schema().fields().iter().zip(batch.columns()) {
-        let Some(name) = known(field.name()) else {
-            continue;
-        };
-        let other = || ManifestError::Unreadable(format!("{name} has type {}", field.data_type()));
-        for row in 0..batch.num_rows() {
-            if column.is_null(row) {
-                continue;
-            }
-            let numbers = |list: arrow_array::ArrayRef| -> Result<String, ManifestError> {
-                let values = list.as_primitive_opt::<arrow_array::types::Float64Type>();
-                let values = values.ok_or_else(other)?.values();
-                Ok(serde_json::to_string(&values[..]).unwrap_or_default())
-            };
-            let text = match field.data_type() {
-                Type::Utf8 => column.as_string::<i32>().value(row).to_owned(),
-                Type::LargeUtf8 => column.as_string::<i64>().value(row).to_owned(),
-                Type::Utf8View => column.as_string_view().value(row).to_owned(),
-                Type::Int64 => {
-                    let values = column.as_primitive::<arrow_array::types::Int64Type>();
-                    values.value(row).to_string()
-                }
-                Type::UInt64 => {
-                    let values = column.as_primitive::<arrow_array::types::UInt64Type>();
-                    values.value(row).to_string()
-                }
-                Type::Float64 => {
-                    let values = column.as_primitive::<arrow_array::types::Float64Type>();
-                    values.value(row).to_string()
-                }
-                Type::List(_) => numbers(column.as_list::<i32>().value(row))?,
-                Type::LargeList(_) => numbers(column.as_list::<i64>().value(row))?,
-                Type::FixedSizeList(_, _) => numbers(column.as_fixed_size_list().value(row))?,
-                _ => return Err(other()),
-            };
-            *left = left
-                .checked_sub(text.len())
-                .ok_or(ManifestError::TooLarge)?;
-            rows[first + row].insert(name, text);
-        }
-    }
-    Ok(())
 }
 
 /// A path or URI of the manifest; relative paths are below its folder.
