@@ -6,6 +6,7 @@ use std::time::Duration;
 use tokio::sync::mpsc;
 
 mod nodes;
+mod same_answers;
 
 use super::engine::open_postgres;
 use super::target::PostgresOptions;

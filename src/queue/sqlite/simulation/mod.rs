@@ -18,7 +18,7 @@ mod engine;
 mod process;
 mod promises;
 mod rows;
-mod steps;
+pub(in crate::queue) mod steps;
 #[cfg(test)]
 mod tests;
 mod world;

@@ -7,17 +7,17 @@ use crate::job::{DeviceKind, JobError, JobId, Kind, Priority};
 use crate::queue::types::{Idempotency, Outcome, PairOf, Submission};
 
 /// Workers.
-pub(super) const WORKERS: usize = 4;
+pub(in crate::queue) const WORKERS: usize = 4;
 
 /// The unread bytes of a schedule; zeros after its end.
-pub(super) struct Bytes<'a>(&'a [u8]);
+pub(in crate::queue) struct Bytes<'a>(&'a [u8]);
 
 impl<'a> Bytes<'a> {
-    pub(super) fn new(bytes: &'a [u8]) -> Self {
+    pub(in crate::queue) fn new(bytes: &'a [u8]) -> Self {
         Self(bytes)
     }
 
-    pub(super) fn is_empty(&self) -> bool {
+    pub(in crate::queue) fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
@@ -44,7 +44,7 @@ impl<'a> Bytes<'a> {
 
 /// One step.
 #[derive(Debug)]
-pub(super) enum Step {
+pub(in crate::queue) enum Step {
     Submit(Box<Submission>),
     /// A worker asks for a job, unless it has one or waits for one.
     Lease(usize, DeviceKind),
@@ -85,7 +85,7 @@ pub(super) enum Step {
 
 impl Step {
     /// The next step. `jobs` tells how many jobs were submitted, `now` is the time.
-    pub(super) fn next(bytes: &mut Bytes<'_>, jobs: &[JobId], now: Timestamp) -> Self {
+    pub(in crate::queue) fn next(bytes: &mut Bytes<'_>, jobs: &[JobId], now: Timestamp) -> Self {
         let worker = |bytes: &mut Bytes<'_>| bytes.index(WORKERS);
         let job = |bytes: &mut Bytes<'_>| bytes.index(jobs.len().max(1));
         match bytes.byte() % 32 {
@@ -206,7 +206,7 @@ fn outcome(bytes: &mut Bytes<'_>) -> Outcome {
 }
 
 /// A success.
-pub(super) fn succeeded() -> Outcome {
+pub(in crate::queue) fn succeeded() -> Outcome {
     Outcome::Succeeded {
         stop_reason: None,
         report: "{}".to_owned(),
