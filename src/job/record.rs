@@ -7,6 +7,7 @@ use super::choices::Priority;
 use super::device::DeviceKind;
 use super::id::{JobId, Tenant};
 use crate::clock::Timestamp;
+use crate::flow::StopReason;
 
 /// The state of a job. The last four are final: only a requeue leaves them.
 #[derive(
@@ -175,6 +176,11 @@ impl Job {
     /// The id of the trace that the job belongs to, 32 hexadecimal digits.
     pub fn trace_id(&self) -> Option<&str> {
         self.trace.as_deref()?.split('-').nth(1)
+    }
+
+    /// Whether a deadline stopped it before its flow was as good as it could be.
+    pub fn is_cut_short(&self) -> bool {
+        self.stop_reason.as_deref() == Some(StopReason::Deadline.name())
     }
 
     /// For a pair: the job that owns its stored sweeps, and the indices of its source and its

@@ -371,8 +371,8 @@ pub trait Queue: Send + Sync {
     async fn abandon(&self, id: JobId) -> Result<(), QueueError>;
 
     /// Requeues an ended job, makes it durable and removes its deadline. All counters but the
-    /// attempt number are reset. Of a sequence, the pairs that did not succeed and the closing job
-    /// are requeued. A requeued pair reopens its sequence.
+    /// attempt number are reset. Of a sequence, the pairs that did not succeed, those that a deadline
+    /// stopped early, and the closing job are requeued. A requeued pair reopens its sequence.
     ///
     /// A job that has succeeded is requeued only if `lost` is true. It says that the job's result
     /// is lost; for a sequence, the result of its closing job.

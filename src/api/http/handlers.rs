@@ -423,7 +423,7 @@ pub(super) async fn delete_job(
 }
 
 /// Queues a job again that failed, expired or was cancelled, or whose result is lost. For a
-/// sequence, the pairs that did not succeed are queued again.
+/// sequence, the pairs that did not succeed, or that a deadline stopped early, are queued again.
 #[utoipa::path(
     post,
     path = "/v1/jobs/{id}/requeue",

@@ -246,6 +246,33 @@ pub(crate) async fn a_sequence_is_cancelled_with_its_pairs_and_can_be_asked_for_
     assert_eq!(error.message, "pair 0: it broke");
 }
 
+pub(crate) async fn a_sequence_that_is_asked_for_again_repeats_what_a_deadline_stopped_early(
+    stand: &mut impl Stand,
+) {
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
+    let job = submit(&queue, sequence(3)).await;
+    for reason in ["deadline", "converged"] {
+        let held = lease(&queue).await;
+        let outcome = Outcome::Succeeded {
+            stop_reason: Some(reason.to_owned()),
+            report: "{}".to_owned(),
+            progress: None,
+        };
+        finish(&queue, &held.job, outcome).await;
+    }
+    queue.cancel(job.id).await.expect("known");
+    reaches(&queue, &job, State::Cancelled).await;
+
+    let again = queue.requeue(job.id, false).await.expect("it has ended");
+    assert_eq!(again.pairs_left, 2);
+    for index in [0, 2] {
+        let held = lease(&queue).await;
+        assert_eq!(held.job.index, index);
+        finish(&queue, &held.job, done()).await;
+    }
+    reaches(&queue, &job, State::Succeeded).await;
+}
+
 pub(crate) async fn followers_see_every_state(stand: &mut impl Stand) {
     let (queue, _events) = stand.open(QueueOptions::default()).await;
     let job = submit(&queue, submission("a")).await;

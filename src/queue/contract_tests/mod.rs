@@ -67,6 +67,7 @@ macro_rules! queue_contract {
             a_sequence_is_cancelled_with_its_pairs_and_can_be_asked_for_again,
             ended_jobs_are_kept_for_a_while_and_then_forgotten,
             an_ended_job_is_removed_when_its_owner_asks_for_it,
+            a_sequence_that_is_asked_for_again_repeats_what_a_deadline_stopped_early,
             followers_see_every_state,
             lists_are_latest_first_in_pages_and_of_one_tenant,
             a_job_goes_only_to_the_kind_of_device_that_it_needs,

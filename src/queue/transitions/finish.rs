@@ -178,11 +178,11 @@ pub(in crate::queue) fn requeue(
     if !job.state.is_end() || (job.state == State::Succeeded && !lost) {
         return Err(QueueError::NotTerminal(job.state));
     }
-    let broken: Vec<Job> = match job.kind {
+    let unfinished: Vec<Job> = match job.kind {
         Kind::Pair => Vec::new(),
         Kind::Sequence => rows::pairs(sql, id)?
             .into_iter()
-            .filter(|pair| pair.state != State::Succeeded)
+            .filter(|pair| pair.state != State::Succeeded || pair.is_cut_short())
             .collect(),
     };
     let expires = sql.now().after(options.time_to_live);
@@ -203,12 +203,12 @@ pub(in crate::queue) fn requeue(
         let row = sql.only(&text, values![job.id, left as i64, expires, tag, ready])?;
         Ok(Arc::new(rows::job(&row)?))
     };
-    let mut job = again(&job, broken.len())?;
+    let mut job = again(&job, unfinished.len())?;
     let mut queued = Vec::new();
-    for pair in &broken {
+    for pair in &unfinished {
         queued.push(again(pair, 0)?);
     }
-    if job.kind == Kind::Sequence && broken.is_empty() {
+    if job.kind == Kind::Sequence && unfinished.is_empty() {
         job = fair_queue::ready_to_close(sql, effects, options, &job)?;
         effects.events.push(Event::Requeued(Arc::clone(&job)));
     }
