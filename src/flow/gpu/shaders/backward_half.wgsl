@@ -26,12 +26,22 @@ fn right(weights: u32, summed: u32, column: u32) -> Right {
     return coopLoad<Right>(&halves[weights + tile_place(column, summed)], BLOCK);
 }
 
+// Whether a feature is active, a bit for each point. They are read ahead of the stores: a load that
+// follows a store to another buffer waits for it.
+fn gates_of(layer: u32, row: u32, feature: u32) -> u32 {
+    var gates = 0u;
+    for (var point = 0u; point < POINTS; point++) {
+        let slot = (layer * part.rows + row + point) * WIDTH + feature;
+        gates |= select(0u, 1u << point, activations[slot] > 0.0);
+    }
+    return gates;
+}
+
 // Stores a point's derivative, zero where the feature is inactive, as input of the previous layer.
-fn keep(layer: u32, row: u32, point: u32, feature: u32, sum: f32, count: f32) {
-    let slot = (layer * part.rows + row + point) * WIDTH + feature;
-    let delta = select(0.0, sum, activations[slot] > 0.0);
+fn keep(layer: u32, row: u32, point: u32, feature: u32, sum: f32, unscaled: f32, gates: u32) {
+    let delta = select(0.0, sum, (gates >> point & 1u) == 1u);
     inputs[point * INPUT_PITCH + feature] = halved(delta);
-    deltas[slot] = delta / count;
+    deltas[(layer * part.rows + row + point) * WIDTH + feature] = delta * unscaled;
 }
 
 @compute @workgroup_size(128)
@@ -51,7 +61,9 @@ fn backward_half(
     if part.step >= lanes[work.lane].steps { return; }
     let network = lanes[work.lane].network * ARRAYS * LAID_OUT * 4u;
     let count = f32(steps[work.lane * STEPS + part.step].count);
+    let unscaled = 1.0 / count;
     let row = wave_half * POINTS;
+    var gates = gates_of(MIDDLE_LAYERS, row, local);
 
     {
         let at = network + LAST * 4u + local;
@@ -59,16 +71,17 @@ fn backward_half(
         for (var point = 0u; point < POINTS; point++) {
             let pull = pulls[row + point].xyz * count;
             let sum = fma(pull.x, weights.x, fma(pull.y, weights.y, pull.z * weights.z));
-            keep(MIDDLE_LAYERS, row, point, local, sum, count);
+            keep(MIDDLE_LAYERS, row, point, local, sum, unscaled, gates);
         }
     }
     for (var done = 0u; done < MIDDLE_LAYERS; done++) {
         let layer = MIDDLE_LAYERS - 1u - done;
         workgroupBarrier();
+        gates = gates_of(layer, row, local);
         multiply((work.lane * MIDDLE_LAYERS + layer) * LAYER_HALVES, subgroup, subgroups);
         workgroupBarrier();
         for (var point = 0u; point < POINTS; point++) {
-            keep(layer, row, point, local, products[point * PRODUCT_PITCH + local], count);
+            keep(layer, row, point, local, products[point * PRODUCT_PITCH + local], unscaled, gates);
         }
     }
 }

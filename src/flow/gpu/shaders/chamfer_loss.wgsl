@@ -18,12 +18,19 @@ var<immediate> part: Part;
 
 // Coordinates beyond this mean that a fit has diverged, metres.
 const DIVERGED_M = 1e6;
-// Target points whose neighbors are in workgroup memory at once.
+// Target points that are looked at together, and by one invocation.
 const SITES = 1024u;
+const OWN_SITES = SITES / TILE;
+
+// No point.
+const NONE = 0xffffffffu;
 
 const TERMS = TILE;
 
-var<workgroup> sources: array<u32, SITES>;
+// Number of each invocation's target points to which a point of this tile is nearest, and all of
+// these target points in their order, with the number of that point within the tile.
+var<workgroup> counts: array<u32, TILE>;
+var<workgroup> ours: array<vec4<f32>, SITES>;
 
 // The squared distance (w) and its derivative (xyz), zero at and beyond the truncation.
 fn squared(deformed: vec3<f32>, target_point: vec3<f32>, truncation: f32) -> vec4<f32> {
@@ -57,15 +64,34 @@ fn chamfer_loss(
         sum = squared(deformed, point_at(cloud.target_points, store[cloud.nearest + index]), truncation);
     }
     for (var first = 0u; first < cloud.targets; first += SITES) {
-        workgroupBarrier();
-        for (var i = local; i < SITES; i += TILE) {
-            sources[i] = store[cloud.sources + min(first + i, cloud.targets - 1u)];
+        let own_first = first + local * OWN_SITES;
+        var sources: array<u32, OWN_SITES>;
+        var count = 0u;
+        for (var i = 0u; i < OWN_SITES; i++) {
+            sources[i] = store[cloud.sources + min(own_first + i, cloud.targets - 1u)];
+            if own_first + i >= cloud.targets { sources[i] = NONE; }
+            count += u32(sources[i] / TILE == work.tile);
         }
         workgroupBarrier();
-        let some = min(SITES, cloud.targets - first);
-        for (var i = 0u; i < some; i++) {
-            if sources[i] == index {
-                let own = squared(deformed, point_at(cloud.target_points, first + i), truncation);
+        counts[local] = count;
+        workgroupBarrier();
+        var place = 0u;
+        var total = 0u;
+        for (var i = 0u; i < TILE; i++) {
+            place += select(0u, counts[i], i < local);
+            total += counts[i];
+        }
+        for (var i = 0u; i < OWN_SITES; i++) {
+            if sources[i] / TILE == work.tile {
+                let site = point_at(cloud.target_points, own_first + i);
+                ours[place] = vec4(site, f32(sources[i] % TILE));
+                place++;
+            }
+        }
+        workgroupBarrier();
+        for (var i = 0u; i < total; i++) {
+            if ours[i].w == f32(local) {
+                let own = squared(deformed, ours[i].xyz, truncation);
                 sum += rounded4(step.share * own);
             }
         }

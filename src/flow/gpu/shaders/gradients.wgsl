@@ -21,10 +21,14 @@ var<immediate> part: Part;
 @group(0) @binding(7) var<storage, read> pulls: array<vec4<f32>>;
 @group(0) @binding(8) var<storage, read_write> partials: array<vec4<f32>>;
 
-// Rows that are loaded together by an invocation with a single sum.
+// Rows that are loaded together.
 const ROWS = 8u;
 
-@compute @workgroup_size(256)
+// Activations and deltas of some rows of a middle layer.
+var<workgroup> some_above: array<vec4<f32>, 256>;
+var<workgroup> some_below: array<vec4<f32>, 256>;
+
+@compute @workgroup_size(128)
 fn gradients(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
@@ -40,50 +44,56 @@ fn gradients(
     }
 }
 
-// 8 inputs x 8 outputs per invocation, in registers.
+// 8 inputs x 16 outputs per invocation, in registers.
 fn middle_layer(layer: u32, chunk: Chunk, slot: u32, local: u32) {
-    let input = local / 16u;
-    let output = local % 16u;
+    let input = local / 8u;
+    let output = local % 8u;
     let above = (layer * part.rows + chunk.first_row) * QUADS;
     let below = ((layer + 1u) * part.rows + chunk.first_row) * QUADS;
-    // Products of four inputs with four outputs: inputs of the lower and of the upper half, each
-    // with outputs of the lower and of the upper half.
-    var low_low: array<vec4<f32>, 4>;
-    var low_high: array<vec4<f32>, 4>;
-    var high_low: array<vec4<f32>, 4>;
-    var high_high: array<vec4<f32>, 4>;
-    var bias_low = vec4(0.0);
-    var bias_high = vec4(0.0);
-    for (var row = 0u; row < chunk.rows; row++) {
-        let h_low = activations[above + row * QUADS + input];
-        let h_high = activations[above + row * QUADS + input + 16u];
-        let d_low = deltas[below + row * QUADS + output];
-        let d_high = deltas[below + row * QUADS + output + 16u];
-        for (var i = 0u; i < 4u; i++) {
-            low_low[i] = fma(vec4(h_low[i]), d_low, low_low[i]);
-            low_high[i] = fma(vec4(h_low[i]), d_high, low_high[i]);
-            high_low[i] = fma(vec4(h_high[i]), d_low, high_low[i]);
-            high_high[i] = fma(vec4(h_high[i]), d_high, high_high[i]);
+    // Products of eight inputs, four of the lower and four of the upper half, with four outputs of each
+    // panel.
+    var sums: array<array<vec4<f32>, 4>, 8>;
+    var biases: array<vec4<f32>, 4>;
+    // The next rows are loaded while the products of these are added.
+    var next: array<vec4<f32>, 4>;
+    for (var i = 0u; i < 2u; i++) {
+        next[i] = activations[above + local + i * 128u];
+        next[i + 2u] = deltas[below + local + i * 128u];
+    }
+    for (var first = 0u; first < chunk.rows; first += ROWS) {
+        workgroupBarrier();
+        for (var i = 0u; i < 2u; i++) {
+            some_above[local + i * 128u] = next[i];
+            some_below[local + i * 128u] = next[i + 2u];
         }
-        if input == 0u {
-            bias_low += d_low;
-            bias_high += d_high;
+        workgroupBarrier();
+        let at = min(first + ROWS, chunk.rows - ROWS) * QUADS + local;
+        for (var i = 0u; i < 2u; i++) {
+            next[i] = activations[above + at + i * 128u];
+            next[i + 2u] = deltas[below + at + i * 128u];
+        }
+        for (var row = 0u; row < ROWS; row++) {
+            let h_low = some_above[row * QUADS + input];
+            let h_high = some_above[row * QUADS + input + 16u];
+            for (var panel = 0u; panel < 4u; panel++) {
+                let d = some_below[row * QUADS + output + panel * 8u];
+                for (var i = 0u; i < 4u; i++) {
+                    sums[i][panel] = fma(vec4(h_low[i]), d, sums[i][panel]);
+                    sums[i + 4u][panel] = fma(vec4(h_high[i]), d, sums[i + 4u][panel]);
+                }
+                if input == 0u { biases[panel] += d; }
+            }
         }
     }
     let weights = slot + MIDDLE + layer * MIDDLE_STRIDE;
-    let low = weights + output / 8u * 1024u + output % 8u;
-    let high = low + 2048u;
-    for (var i = 0u; i < 4u; i++) {
-        let k_low = (input * 4u + i) * 8u;
-        let k_high = k_low + 512u;
-        partials[low + k_low] = low_low[i];
-        partials[high + k_low] = low_high[i];
-        partials[low + k_high] = high_low[i];
-        partials[high + k_high] = high_high[i];
-    }
-    if input == 0u {
-        partials[weights + MIDDLE_BIAS + output] = bias_low;
-        partials[weights + MIDDLE_BIAS + output + 16u] = bias_high;
+    for (var panel = 0u; panel < 4u; panel++) {
+        let at = weights + panel * 1024u + output;
+        for (var i = 0u; i < 4u; i++) {
+            let k = (input * 4u + i) * 8u;
+            partials[at + k] = sums[i][panel];
+            partials[at + k + 512u] = sums[i + 4u][panel];
+        }
+        if input == 0u { partials[weights + MIDDLE_BIAS + output + panel * 8u] = biases[panel]; }
     }
 }
 
