@@ -134,7 +134,7 @@ impl Side {
                 let mut told: Vec<String> = taken.iter().map(told).collect();
                 told.sort();
                 self.outgoing.extend(taken);
-                self.outgoing.sort_by_key(told_of);
+                self.outgoing.sort_by_key(told);
                 format!("{told:?}")
             }
             Step::Settle(index, is_done) => {
@@ -188,13 +188,16 @@ impl Side {
     }
 }
 
-fn told_of(outgoing: &Outgoing) -> (JobId, bool) {
-    let removes = matches!(outgoing.action, Action::RemoveFiles);
-    (outgoing.job, removes)
-}
-
+/// An action, of a job by its id. Ids of pairs are the queue's own, those of the schedule are small.
 fn told(outgoing: &Outgoing) -> String {
-    format!("{:?} {}", told_of(outgoing), outgoing.attempts)
+    let id = outgoing.job.to_string();
+    let job = if id.starts_with("00000000") {
+        &id
+    } else {
+        "a pair"
+    };
+    let removes = matches!(outgoing.action, Action::RemoveFiles);
+    format!("{job} {removes} {}", outgoing.attempts)
 }
 
 /// Leases on both sides: the embedded queue says whether a job is ready.
