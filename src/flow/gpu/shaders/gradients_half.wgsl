@@ -24,6 +24,9 @@ const PIECES_ACROSS = WIDTH / (4u * SIDE);
 const PIECE_COUNT = WIDTH / (2u * SIDE) * PIECES_ACROSS;
 // Outputs that are adjacent in a network's memory.
 const PANEL = 32u;
+// Invocations, and points whose features one of them loads at once: every second one.
+const THREADS = 256u;
+const OWN_POINTS = POINTS * WIDTH / THREADS;
 
 var<workgroup> above: array<f16, 4352>;
 var<workgroup> below: array<f16, 4352>;
@@ -34,7 +37,7 @@ fn panel_place(input: u32, output: u32) -> u32 {
     return (output / PANEL * WIDTH + input) * PANEL + output % PANEL;
 }
 
-@compute @workgroup_size(256)
+@compute @workgroup_size(THREADS)
 fn gradients_half(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
@@ -66,15 +69,29 @@ fn gradients_half(
         var s12 = Sums();
         var s13 = Sums();
         var bias = 0.0;
+        // The next points are loaded while the products of these are added.
+        var next_above: array<f32, OWN_POINTS>;
+        var next_below: array<f32, OWN_POINTS>;
+        for (var i = 0u; i < OWN_POINTS; i++) {
+            let at = (local / WIDTH + 2u * i) * WIDTH;
+            next_above[i] = activations[upper + at];
+            next_below[i] = deltas[lower + at];
+        }
         for (var row = 0u; row < chunk.rows; row += POINTS) {
             workgroupBarrier();
-            for (var point = local / WIDTH; point < POINTS; point += 2u) {
-                let delta = deltas[lower + (row + point) * WIDTH];
-                bias += delta;
-                above[point * INPUT_PITCH + feature] = halved(activations[upper + (row + point) * WIDTH]);
-                below[point * INPUT_PITCH + feature] = halved(delta * count);
+            for (var i = 0u; i < OWN_POINTS; i++) {
+                let at = (local / WIDTH + 2u * i) * INPUT_PITCH + feature;
+                bias += next_below[i];
+                above[at] = halved(next_above[i]);
+                below[at] = halved(next_below[i] * count);
             }
             workgroupBarrier();
+            let next = min(row + POINTS, chunk.rows - POINTS);
+            for (var i = 0u; i < OWN_POINTS; i++) {
+                let at = (next + local / WIDTH + 2u * i) * WIDTH;
+                next_above[i] = activations[upper + at];
+                next_below[i] = deltas[lower + at];
+            }
             if piece >= PIECE_COUNT { continue; }
             for (var k = 0u; k < POINTS; k += SIDE) {
                 let at = k * INPUT_PITCH;

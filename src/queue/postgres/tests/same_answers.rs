@@ -131,11 +131,11 @@ impl Side {
             Step::Remove(index) => answer(queue.remove(job(index)?).await, |()| "done".to_owned()),
             Step::TakeOutgoing => {
                 let taken = queue.take_outgoing(1000, HOLD).await.expect("the outbox");
-                let mut told: Vec<String> = taken.iter().map(told).collect();
-                told.sort();
+                let mut actions: Vec<String> = taken.iter().map(told).collect();
+                actions.sort();
                 self.outgoing.extend(taken);
                 self.outgoing.sort_by_key(told);
-                format!("{told:?}")
+                format!("{actions:?}")
             }
             Step::Settle(index, is_done) => {
                 let index = index.checked_rem(self.outgoing.len())?;
