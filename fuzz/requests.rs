@@ -6,14 +6,8 @@ use std::time::Duration;
 
 use axum::body::Body;
 use axum::http::{Request, Version};
-use fnsf::api::{
-    Admission, AdmissionLimits, Hosts, Keys, Service, ServiceLimits, ServiceParts, public_router,
-};
-use fnsf::cost::{CostModel, Lanes};
-use fnsf::metrics::Metrics;
+use fnsf::api::{Service, ServiceParts, public_router};
 use fnsf::queue::{QueueOptions, open_sqlite};
-use fnsf::remote::{Sources, Webhooks};
-use fnsf::storage::Blobs;
 use http_body_util::BodyExt;
 use libfuzzer_sys::Corpus;
 use tokio::runtime::Runtime;
@@ -42,37 +36,7 @@ impl Stand {
         let runtime = { runtime }.enable_all().build().expect("a runtime");
         let (events, _) = tokio::sync::mpsc::unbounded_channel();
         let queue = open_sqlite(folder.path(), QueueOptions::default(), events).expect("a queue");
-        let cost = Arc::new(CostModel::new(Lanes { cpu: 1, gpu: 0 }));
-        let long = Duration::from_secs(3600);
-        let limits = AdmissionLimits {
-            max_points: 1000,
-            max_pair_bytes: 1 << 30,
-            max_wait: long,
-            max_queue: long,
-            max_tenant_queue: long,
-        };
-        let service = Service::new(ServiceParts {
-            admission: Admission::new(limits, Arc::clone(&queue), cost),
-            queue,
-            devices: Box::new(Vec::new),
-            blobs: Blobs::open(&folder.path().join("blobs")).expect("a store"),
-            metrics: Arc::new(Metrics::new(&["cpu"])),
-            keys: Keys::default(),
-            webhooks: Webhooks::off(),
-            sources: Sources::default(),
-            hosts: Hosts(None),
-            store_health: Arc::default(),
-            limits: ServiceLimits {
-                max_upload_bytes: 1 << 20,
-                max_uploads_bytes: 1 << 20,
-                max_answers_bytes: 1 << 20,
-                min_free_bytes: 0,
-                min_free_inodes: 0,
-                max_sweeps: 10,
-                body_idle: PATIENCE,
-                stream_prefetch_pairs: 1,
-            },
-        });
+        let service = Service::new(ServiceParts::alone(queue, folder.path(), PATIENCE));
         Self {
             runtime,
             service: Arc::new(service),

@@ -39,6 +39,50 @@ pub struct ServiceParts {
     pub limits: ServiceLimits,
 }
 
+#[cfg(any(test, feature = "fuzzing"))]
+impl ServiceParts {
+    /// The parts of a service without workers, keys or neighbors, with small limits: `queue`, and blobs
+    /// in `folder`. A body may be silent for `body_idle`.
+    ///
+    /// # Panics
+    /// If the folder cannot be used.
+    pub fn alone(queue: Arc<dyn Queue>, folder: &std::path::Path, body_idle: Duration) -> Self {
+        use super::admission::AdmissionLimits;
+        use crate::cost::{CostModel, Lanes};
+        let cost = Arc::new(CostModel::new(Lanes { cpu: 1, gpu: 0 }));
+        let long = Duration::from_secs(3600);
+        let limits = AdmissionLimits {
+            max_points: 1000,
+            max_pair_bytes: 1 << 30,
+            max_wait: long,
+            max_queue: long,
+            max_tenant_queue: long,
+        };
+        Self {
+            admission: Admission::new(limits, Arc::clone(&queue), cost),
+            queue,
+            devices: Box::new(Vec::new),
+            blobs: Blobs::open(&folder.join("blobs")).expect("a store"),
+            metrics: Arc::new(Metrics::new(&["cpu"])),
+            keys: Keys::default(),
+            webhooks: Webhooks::off(),
+            sources: Sources::default(),
+            hosts: Hosts(None),
+            store_health: Arc::default(),
+            limits: ServiceLimits {
+                max_upload_bytes: 1 << 20,
+                max_uploads_bytes: 1 << 20,
+                max_answers_bytes: 1 << 20,
+                min_free_bytes: 0,
+                min_free_inodes: 0,
+                max_sweeps: 10,
+                body_idle,
+                stream_prefetch_pairs: 1,
+            },
+        }
+    }
+}
+
 /// Resource limits for requests.
 #[derive(Clone, Debug)]
 pub struct ServiceLimits {

@@ -15,20 +15,14 @@ use hyper::body::{Body, Frame};
 use tokio::sync::mpsc;
 use tower::ServiceExt;
 
-use super::admission::{Admission, AdmissionLimits, AdmissionRequest, Durability};
-use super::auth::Keys;
+use super::admission::{AdmissionRequest, Durability};
 use super::error::ApiError;
 use super::listener::bodies::RequestBody;
-use super::origin::Hosts;
 use super::routes::public_router;
 use super::service::Service;
-use super::service_parts::{ServiceLimits, ServiceParts};
-use crate::cost::{CostModel, Lanes};
+use super::service_parts::ServiceParts;
 use crate::job::{Priority, Tenant};
-use crate::metrics::Metrics;
 use crate::queue::{QueueOptions, open_sqlite};
-use crate::remote::{Sources, Webhooks};
-use crate::storage::Blobs;
 
 /// Time after which a request that has not returned counts as a busy loop.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -54,37 +48,7 @@ impl<E: Clone + Unpin> Body for ForEver<E> {
 fn service(folder: &std::path::Path) -> Arc<Service> {
     let (events, _) = mpsc::unbounded_channel();
     let queue = open_sqlite(folder, QueueOptions::default(), events).expect("a queue");
-    let cost = Arc::new(CostModel::new(Lanes { cpu: 1, gpu: 0 }));
-    let long = Duration::from_secs(3600);
-    let limits = AdmissionLimits {
-        max_points: 1000,
-        max_pair_bytes: 1 << 30,
-        max_wait: long,
-        max_queue: long,
-        max_tenant_queue: long,
-    };
-    Arc::new(Service::new(ServiceParts {
-        admission: Admission::new(limits, Arc::clone(&queue), cost),
-        queue,
-        devices: Box::new(Vec::new),
-        blobs: Blobs::open(&folder.join("blobs")).expect("a store"),
-        metrics: Arc::new(Metrics::new(&["cpu"])),
-        keys: Keys::default(),
-        webhooks: Webhooks::off(),
-        sources: Sources::default(),
-        hosts: Hosts(None),
-        store_health: Arc::default(),
-        limits: ServiceLimits {
-            max_upload_bytes: 1 << 20,
-            max_uploads_bytes: 1 << 20,
-            max_answers_bytes: 1 << 20,
-            min_free_bytes: 0,
-            min_free_inodes: 0,
-            max_sweeps: 10,
-            body_idle: A_MOMENT,
-            stream_prefetch_pairs: 1,
-        },
-    }))
+    Arc::new(Service::new(ServiceParts::alone(queue, folder, A_MOMENT)))
 }
 
 /// The sources: as they are, or wrapped in [`RequestBody`] as the listener does.
