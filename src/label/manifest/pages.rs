@@ -163,6 +163,21 @@ impl Header {
     }
 }
 
+/// The structs in the struct of a page's kind. A reader skips them.
+const STATISTICS: usize = usize::MAX;
+
+/// Whether a field of a header's structs has the type that the format gives it. A reader takes that type for
+/// granted, and would read the rest from the wrong byte on.
+fn is_of_its_type(parent: usize, id: usize, stored: u8) -> bool {
+    match (parent, id) {
+        (STATISTICS, _) => true,
+        (0, 1..=4) | (5, 1..=4) | (7, 1..=2) | (8, 1..=6) => stored == 5,
+        (7, 3) | (8, 7) => stored == 1 || stored == 2,
+        (0, 5..=8) | (5, 5) | (8, 8) => stored == 12,
+        _ => false,
+    }
+}
+
 /// What is left of the bytes of a struct in Thrift's compact protocol.
 struct Input<'a>(&'a [u8]);
 
@@ -184,6 +199,9 @@ impl Input<'_> {
             // The step of the ids. 0 would let an id follow that may be lower.
             let step = usize::from(field >> 4);
             id += (step > 0).then_some(step)?;
+            if !is_of_its_type(parent, id, field & 15) {
+                return None;
+            }
             match field & 15 {
                 // True and false.
                 1 | 2 => {}
@@ -202,7 +220,7 @@ impl Input<'_> {
                 }
                 // A struct in a struct of the header holds statistics: its numbers have no place.
                 12 if depth < MAX_DEPTH => {
-                    let child = if depth == 0 { id } else { usize::MAX };
+                    let child = if depth == 0 { id } else { STATISTICS };
                     self.read_struct(child, depth + 1, numbers)?;
                 }
                 _ => return None,
@@ -263,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn a_field_that_comes_twice_or_is_negative_is_refused() {
+    fn a_field_that_comes_twice_is_negative_or_of_another_type_is_refused() {
         // The long form of an id could name field 2 again.
         let mut twice = DATA.to_vec();
         twice.splice(24..24, [0x05, 4, 200, 1]);
@@ -271,6 +289,12 @@ mod tests {
         let mut negative = DATA;
         negative[6] = 121;
         assert_eq!(Header::parse(&negative), None);
+        // The compressed size as a number of 64 bits, and its bytes as those of a text.
+        for other in [0x16, 0x18] {
+            let mut typed = DATA;
+            typed[5] = other;
+            assert_eq!(Header::parse(&typed), None);
+        }
     }
 
     #[test]

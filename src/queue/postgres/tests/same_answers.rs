@@ -17,7 +17,7 @@ use crate::queue::lease::Lease;
 use crate::queue::open_sqlite;
 use crate::queue::outgoing::{Action, Outgoing, Settled};
 use crate::queue::simulation::steps::{Bytes, Step, WORKERS, succeeded};
-use crate::queue::types::{Filter, QueueError, Submitted};
+use crate::queue::types::{Filter, Outcome, QueueError, Submitted};
 
 /// Number of schedules; `FNSF_ANSWERS` overrides it.
 const SCHEDULES: u64 = 8;
@@ -81,6 +81,14 @@ fn answer<T>(result: Result<T, QueueError>, told: impl FnOnce(T) -> String) -> S
     }
 }
 
+/// The outcome, but for one after which a job waits for seconds.
+fn at_once(outcome: &Outcome) -> Outcome {
+    match outcome {
+        Outcome::Delayed(error) => Outcome::Failed(error.clone()),
+        other => other.clone(),
+    }
+}
+
 impl Side {
     fn new((queue, events): (Arc<dyn Queue>, mpsc::UnboundedReceiver<Event>)) -> Self {
         Self {
@@ -110,12 +118,12 @@ impl Side {
             }
             Step::Finish(worker, ref outcome) => {
                 let job = self.leases[worker].take()?.job;
-                let ended = queue.finish(job.id, job.attempt, outcome.clone()).await;
+                let ended = queue.finish(job.id, job.attempt, at_once(outcome)).await;
                 answer(ended, |committed| format!("{committed:?}"))
             }
             Step::FinishAgain(worker, ref outcome) => {
                 let (id, attempt) = self.past[worker]?;
-                let ended = queue.finish(id, attempt, outcome.clone()).await;
+                let ended = queue.finish(id, attempt, at_once(outcome)).await;
                 answer(ended, |committed| format!("{committed:?}"))
             }
             Step::Cancel(index) => answer(queue.cancel(job(index)?).await, |job| described(&job)),
