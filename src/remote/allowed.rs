@@ -84,7 +84,8 @@ impl Allowed {
 }
 
 /// A URL with a host, or of a file; without user, password and fragment, and without a path that another
-/// server may read as a way upward: with escaped dots, slashes or percent signs, or a part such as `..;`.
+/// server may read as a way upward: with a backslash, with escaped dots, slashes or percent signs, or a part
+/// such as `..;`.
 fn plain(text: &str) -> Option<Url> {
     let url = Url::parse(text).ok().filter(|_| text.len() <= MAX_BYTES)?;
     let path = url.path().to_ascii_lowercase();
@@ -92,7 +93,7 @@ fn plain(text: &str) -> Option<Url> {
         && url.password().is_none()
         && url.fragment().is_none()
         && (url.has_host() || url.scheme() == "file")
-        && !["%2e", "%2f", "%5c", "%00", "%25"]
+        && !["\\", "%2e", "%2f", "%5c", "%00", "%25"]
             .iter()
             .any(|code| path.contains(code))
         // Some servers read what follows a semicolon as a parameter of the part before it.
@@ -133,6 +134,7 @@ mod tests {
             ("https://user@a.example/in/x", NotAllowed::Malformed),
             ("https://a.example/in/%2e%2e/x", NotAllowed::Elsewhere),
             ("https://a.example/in/..%2Fx", NotAllowed::Malformed),
+            ("s3://drives/2026/a\\..\\..\\x", NotAllowed::Malformed),
             ("https://a.example/in/x#f", NotAllowed::Malformed),
             ("a.example/in/x", NotAllowed::Malformed),
             ("", NotAllowed::Malformed),

@@ -202,7 +202,9 @@ fn the_first_losses_in_half_precision_are_those_of_single_precision() {
 
 #[test]
 fn whole_runs_in_half_precision_find_the_flow_of_single_precision() {
-    // As between the GPU and the CPU: with the same seed, rounding makes two runs diverge.
+    // As between the GPU and the CPU: with the same seed, rounding makes two runs diverge. Losses of two
+    // runs were 6% apart on an NVIDIA H200. The means of several runs are nearer to each other.
+    const RUNS: u64 = 4;
     const LOSS: f64 = 0.05;
     const ERROR_M: f64 = 0.03;
     let Some(gpu) = with_units() else {
@@ -214,9 +216,10 @@ fn whole_runs_in_half_precision_find_the_flow_of_single_precision() {
         let field = options.field_mut().expect("a field");
         field.max_iterations = 40;
         let precisions = [field.clone(), half(field.clone())];
-        let [single, half] = precisions.map(|field| {
+        let run = |field: &FieldOptions, seed: u64| {
             let options = Options {
-                method: Method::Field(field),
+                method: Method::Field(field.clone()),
+                seed,
                 ..options.clone()
             };
             let estimate = solved(gpu, &pair, &options);
@@ -225,11 +228,15 @@ fn whole_runs_in_half_precision_find_the_flow_of_single_precision() {
                 rows.filter(|&(_, &valid)| valid).map(|(&p, _)| p).collect()
             };
             let error = end_point_error(&kept(&estimate.flow), &kept(&pair.flow));
-            (estimate.fit().expect("a fit").best_loss, error)
+            [estimate.fit().expect("a fit").best_loss, error]
+        };
+        let [single, half] = precisions.map(|field| {
+            let runs: Vec<_> = (0..RUNS).map(|seed| run(&field, seed)).collect();
+            [0, 1].map(|figure| runs.iter().map(|run| run[figure]).sum::<f64>() / RUNS as f64)
         });
-        let loss = (half.0 - single.0).abs() / single.0;
+        let loss = (half[0] - single[0]).abs() / single[0];
         assert!(loss < LOSS, "{preset:?}: {half:?} {single:?}");
-        let error = (half.1 - single.1).abs();
+        let error = (half[1] - single[1]).abs();
         assert!(error < ERROR_M, "{preset:?}: {half:?} {single:?}");
     }
 }
