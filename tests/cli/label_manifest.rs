@@ -15,10 +15,12 @@ use parquet::file::properties::WriterProperties;
 const SWEEPS: [&str; 3] = ["a/0.pcd", "s3://lake/1.pcd", "a/2.pcd"];
 
 fn file(columns: Vec<(&str, ArrayRef)>, compression: Compression) -> Bytes {
+    let properties = WriterProperties::builder().set_compression(compression);
+    written(columns, properties.build())
+}
+
+fn written(columns: Vec<(&str, ArrayRef)>, properties: WriterProperties) -> Bytes {
     let batch = RecordBatch::try_from_iter(columns).expect("columns");
-    let properties = WriterProperties::builder()
-        .set_compression(compression)
-        .build();
     let mut out = Vec::new();
     let mut writer =
         ArrowWriter::try_new(&mut out, batch.schema(), Some(properties)).expect("a writer");
@@ -150,16 +152,10 @@ fn a_dictionary_that_claims_more_values_than_it_has_bytes_is_refused() {
 #[test]
 fn columns_stored_as_differences_are_refused_by_the_name_of_their_encoding() {
     let text: ArrayRef = Arc::new(StringArray::from(SWEEPS.to_vec()));
-    let batch = RecordBatch::try_from_iter([("sweep", text)]).expect("columns");
     let properties = WriterProperties::builder()
         .set_dictionary_enabled(false)
-        .set_encoding(Encoding::DELTA_BYTE_ARRAY)
-        .build();
-    let mut out = Vec::new();
-    let mut writer =
-        ArrowWriter::try_new(&mut out, batch.schema(), Some(properties)).expect("a writer");
-    writer.write(&batch).expect("written");
-    writer.close().expect("closed");
-    let error = read_manifest(Bytes::from(out), None).expect_err("differences");
+        .set_encoding(Encoding::DELTA_BYTE_ARRAY);
+    let bytes = written(vec![("sweep", text)], properties.build());
+    let error = read_manifest(bytes, None).expect_err("differences");
     assert!(error.to_string().contains("DELTA_BYTE_ARRAY"), "{error}");
 }
