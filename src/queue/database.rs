@@ -46,6 +46,9 @@ impl Kept {
 /// A database that runs the state transitions.
 #[async_trait]
 pub(super) trait Engine: Send + Sync + 'static {
+    /// As [`Queue::engine`].
+    const NAME: &'static str;
+
     /// What this process knows of the queue.
     fn local(&self) -> &Arc<Local>;
 
@@ -285,6 +288,10 @@ impl<E: Engine> Queue for DatabaseQueue<E> {
 
     fn identity(&self) -> i32 {
         self.engine.identity()
+    }
+
+    fn engine(&self) -> &'static str {
+        E::NAME
     }
 
     async fn ended(&self) {

@@ -474,6 +474,9 @@ pub trait Queue: Send + Sync {
     /// queue.
     fn identity(&self) -> i32;
 
+    /// The name of what keeps this queue: `sqlite` or `postgres`.
+    fn engine(&self) -> &'static str;
+
     /// Returns when the writer has ended. Only a new process can write again.
     async fn ended(&self);
 

@@ -199,6 +199,7 @@ async fn nodes_know_each_other_and_a_node_without_devices_has_its_jobs_done_by_t
         let answer = client.get(api.url("/v1/info")).send().await;
         answer.expect("an answer").json().await.expect("JSON")
     };
+    assert_eq!(info().await["queue"], "postgres");
     while info().await["devices"][0]["lanes"] != 1 {
         tokio::time::sleep(Duration::from_millis(100)).await;
     }

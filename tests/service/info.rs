@@ -22,6 +22,7 @@ async fn info_has_the_limits_of_the_configuration_and_the_devices_that_compute()
     let info: Value = serde_json::from_str(&text(server.url("/v1/info")).await).expect("JSON");
     assert_eq!(info["version"], env!("CARGO_PKG_VERSION"));
     assert_eq!(info["presets"][0], "default");
+    assert_eq!(info["queue"], "sqlite");
     let limits = &info["limits"];
     assert_eq!(limits["max_points"], 70_000);
     assert_eq!(limits["max_sweeps"], 9);

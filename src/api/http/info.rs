@@ -21,6 +21,8 @@ pub(super) struct Info {
     version: &'static str,
     /// The values of the option `preset`. The first is the default.
     presets: [&'static str; Preset::ALL.len()],
+    /// What keeps the queue: `sqlite` for one process, `postgres` for many nodes.
+    queue: &'static str,
     /// The kinds of device that compute jobs.
     devices: Vec<DeviceInfo>,
     /// The formats of results.
@@ -79,7 +81,7 @@ fn formats<F>(table: &[(F, &'static str, &'static str)]) -> Vec<Format> {
     table.iter().map(format).collect()
 }
 
-/// Returns the version of the server, its presets, devices, formats and limits. They are constant
+/// Returns the version of the server, its presets, queue, devices, formats and limits. They are constant
 /// while the server runs.
 #[utoipa::path(
     get,
@@ -97,6 +99,7 @@ pub(super) async fn info(State(service): State<Arc<Service>>) -> Json<Info> {
     Json(Info {
         version: env!("CARGO_PKG_VERSION"),
         presets: Preset::ALL.map(Preset::name),
+        queue: service.queue.engine(),
         devices: devices.filter(|device| device.lanes > 0).collect(),
         formats: Formats {
             flow: formats(&ANSWER_FORMATS),

@@ -110,6 +110,8 @@ impl Drop for PostgresEngine {
 
 #[async_trait]
 impl Engine for PostgresEngine {
+    const NAME: &'static str = "postgres";
+
     fn local(&self) -> &Arc<Local> {
         &self.shared.local
     }

@@ -154,6 +154,8 @@ pub(super) async fn watch(
 
 #[async_trait]
 impl Engine for SqliteEngine {
+    const NAME: &'static str = "sqlite";
+
     fn local(&self) -> &Arc<Local> {
         &self.local
     }

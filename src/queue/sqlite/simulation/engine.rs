@@ -30,6 +30,8 @@ pub(super) struct SimulatedEngine {
 
 #[async_trait]
 impl Engine for SimulatedEngine {
+    const NAME: &'static str = "sqlite";
+
     fn local(&self) -> &Arc<Local> {
         &self.local
     }
