@@ -10,60 +10,19 @@
 
 mod pages;
 mod parquet;
+mod table;
 
 use std::collections::HashMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use bytes::Bytes;
 
+pub use table::ManifestError;
+use table::{MAX_BYTES, MAX_ROWS, Table, known};
+
 use super::plan::{Drive, DriveSweep, drive_name, key_of, stem};
 use crate::flow::RigidTransform;
 use crate::formats::rigid_motion;
-
-/// Most bytes of a manifest.
-const MAX_BYTES: usize = 1 << 30;
-/// Most rows of a manifest.
-const MAX_ROWS: usize = 50_000_000;
-/// The columns that are read.
-const COLUMNS: [&str; 8] = [
-    "drive",
-    "sweep",
-    "source",
-    "target",
-    "id",
-    "time_s",
-    "timestamp_ns",
-    "pose",
-];
-
-/// Why a manifest cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum ManifestError {
-    /// It is no table.
-    #[error("the manifest is no CSV and no Parquet table: {0}")]
-    Unreadable(String),
-    /// It is too large.
-    #[error("the manifest is too large: at most 1 GiB and 50,000,000 rows are read")]
-    TooLarge,
-    /// A column is missing.
-    #[error("the manifest has the columns {0}: drive and sweep are needed, or source and target")]
-    Columns(String),
-    /// A row has a wrong value.
-    #[error("the manifest, row {row}: {what}")]
-    Row {
-        /// Number of the row, from 1, without the heading.
-        row: usize,
-        /// What is wrong.
-        what: String,
-    },
-}
-
-/// The values of the known columns, as text, one row after the other.
-#[derive(Debug, Default)]
-struct Table {
-    names: Vec<String>,
-    rows: Vec<HashMap<&'static str, String>>,
-}
 
 /// Reads the drives of a manifest. Relative paths are below `folder`, where one is given.
 ///
@@ -90,10 +49,6 @@ pub fn read_manifest(bytes: Bytes, folder: Option<&str>) -> Result<Vec<Drive>, M
     } else {
         Err(ManifestError::Columns(table.names.join(", ")))
     }
-}
-
-fn known(name: &str) -> Option<&'static str> {
-    COLUMNS.into_iter().find(|known| *known == name)
 }
 
 fn read_csv(bytes: &[u8]) -> Result<Table, ManifestError> {

@@ -13,7 +13,7 @@ use parquet::arrow::arrow_reader::{
 };
 
 use super::pages::CheckedPages;
-use super::{COLUMNS, MAX_BYTES, MAX_ROWS, ManifestError, Table, known};
+use super::table::{COLUMNS, MAX_BYTES, MAX_ROWS, ManifestError, Table, known};
 
 /// Most values that a row has in all columns: a pose has 16.
 const VALUES_PER_ROW: usize = 16 + COLUMNS.len();
