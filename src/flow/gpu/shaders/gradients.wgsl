@@ -21,14 +21,16 @@ var<immediate> part: Part;
 @group(0) @binding(7) var<storage, read> pulls: array<vec4<f32>>;
 @group(0) @binding(8) var<storage, read_write> partials: array<vec4<f32>>;
 
-// Rows that are loaded together.
+const THREADS = 128u;
+// Rows that are loaded together, and vec4s of them that an invocation of a middle layer loads.
 const ROWS = 8u;
+const OWN_QUADS = ROWS * QUADS / THREADS;
 
 // Activations and deltas of some rows of a middle layer.
-var<workgroup> some_above: array<vec4<f32>, 256>;
-var<workgroup> some_below: array<vec4<f32>, 256>;
+var<workgroup> some_above: array<vec4<f32>, ROWS * QUADS>;
+var<workgroup> some_below: array<vec4<f32>, ROWS * QUADS>;
 
-@compute @workgroup_size(128)
+@compute @workgroup_size(THREADS)
 fn gradients(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
@@ -55,22 +57,22 @@ fn middle_layer(layer: u32, chunk: Chunk, slot: u32, local: u32) {
     var sums: array<array<vec4<f32>, 4>, 8>;
     var biases: array<vec4<f32>, 4>;
     // The next rows are loaded while the products of these are added.
-    var next: array<vec4<f32>, 4>;
-    for (var i = 0u; i < 2u; i++) {
-        next[i] = activations[above + local + i * 128u];
-        next[i + 2u] = deltas[below + local + i * 128u];
+    var next: array<vec4<f32>, 2u * OWN_QUADS>;
+    for (var i = 0u; i < OWN_QUADS; i++) {
+        next[i] = activations[above + local + i * THREADS];
+        next[i + OWN_QUADS] = deltas[below + local + i * THREADS];
     }
     for (var first = 0u; first < chunk.rows; first += ROWS) {
         workgroupBarrier();
-        for (var i = 0u; i < 2u; i++) {
-            some_above[local + i * 128u] = next[i];
-            some_below[local + i * 128u] = next[i + 2u];
+        for (var i = 0u; i < OWN_QUADS; i++) {
+            some_above[local + i * THREADS] = next[i];
+            some_below[local + i * THREADS] = next[i + OWN_QUADS];
         }
         workgroupBarrier();
         let at = min(first + ROWS, chunk.rows - ROWS) * QUADS + local;
-        for (var i = 0u; i < 2u; i++) {
-            next[i] = activations[above + at + i * 128u];
-            next[i + 2u] = deltas[below + at + i * 128u];
+        for (var i = 0u; i < OWN_QUADS; i++) {
+            next[i] = activations[above + at + i * THREADS];
+            next[i + OWN_QUADS] = deltas[below + at + i * THREADS];
         }
         for (var row = 0u; row < ROWS; row++) {
             let h_low = some_above[row * QUADS + input];
