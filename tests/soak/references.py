@@ -40,13 +40,15 @@ def _of(soak: Soak, case: Case) -> dict[str, dict[str, str]]:
     """Digests of the result of one case in every format."""
     options = {**case.options, "labels": {"reference": case.name, "case": case.name}}
     view = soak.call("POST", "/v1/jobs", TENANT, form(case.parts, options)).json()
-    while view.get("state") not in ENDS:
-        view = soak.call("GET", f"/v1/jobs/{view['id']}?wait=30", TENANT).json()
-    if view["state"] != "succeeded":
+    job = view.get("id")
+    while job and view.get("id") == job and view["state"] not in ENDS:
+        view = soak.call("GET", f"/v1/jobs/{job}?wait=30", TENANT).json()
+    # An answer without the job is an error's, such as that an acknowledged job is not there.
+    if view.get("state") != "succeeded":
         raise RuntimeError(f"the reference of {case.name} fails: {view}")
     found = {}
     for name, media in case.formats.items():
-        answer = soak.call("GET", f"/v1/jobs/{view['id']}/result", TENANT, headers={"Accept": media})
+        answer = soak.call("GET", f"/v1/jobs/{job}/result", TENANT, headers={"Accept": media})
         found[name] = digest(name, answer.body)
     return found
 

@@ -49,7 +49,12 @@ impl CheckedPages {
                     "a dictionary of {bytes} bytes claims {values} values"
                 ))
             }
-            Kind::Data { values, .. } => {
+            Kind::Data { values, encoding } => {
+                if let Some(name) = refused_encoding(encoding) {
+                    return refused(format!(
+                        "a column has the encoding {name}: write it plain or with a dictionary"
+                    ));
+                }
                 let left = self
                     .values_left
                     .fetch_update(Relaxed, Relaxed, |left| left.checked_sub(values));
@@ -82,7 +87,6 @@ impl ChunkReader for CheckedPages {
                 "the header of a page is damaged or of an unknown kind".to_owned(),
             )
         })?;
-        header.check_encoding()?;
         self.check(&header)?;
         self.bytes.get_read(start)
     }
@@ -141,25 +145,18 @@ impl Header {
             kind,
         })
     }
+}
 
-    /// Refuses encodings by differences: their own headers claim counts, inside of the compressed bytes.
-    fn check_encoding(&self) -> Result<()> {
-        match self.kind {
-            // PLAIN, PLAIN_DICTIONARY, RLE, RLE_DICTIONARY.
-            Kind::Data { encoding, .. } if ![0, 2, 3, 8].contains(&encoding) => {
-                let name = match encoding {
-                    5 => "DELTA_BINARY_PACKED".to_owned(),
-                    6 => "DELTA_LENGTH_BYTE_ARRAY".to_owned(),
-                    7 => "DELTA_BYTE_ARRAY".to_owned(),
-                    9 => "BYTE_STREAM_SPLIT".to_owned(),
-                    other => format!("number {other}"),
-                };
-                refused(format!(
-                    "a column has the encoding {name}: write it plain or with a dictionary"
-                ))
-            }
-            _ => Ok(()),
-        }
+/// The name of an encoding that is refused, such as those by differences: their own headers claim counts,
+/// inside of the compressed bytes. None for PLAIN, PLAIN_DICTIONARY, RLE and RLE_DICTIONARY.
+fn refused_encoding(encoding: u64) -> Option<String> {
+    match encoding {
+        0 | 2 | 3 | 8 => None,
+        5 => Some("DELTA_BINARY_PACKED".to_owned()),
+        6 => Some("DELTA_LENGTH_BYTE_ARRAY".to_owned()),
+        7 => Some("DELTA_BYTE_ARRAY".to_owned()),
+        9 => Some("BYTE_STREAM_SPLIT".to_owned()),
+        other => Some(format!("number {other}")),
     }
 }
 
@@ -327,7 +324,7 @@ mod tests {
             values: 1,
             encoding: 7,
         };
-        let error = page(8, 8, delta).check_encoding().expect_err("differences");
+        let error = file.check(&page(8, 8, delta)).expect_err("differences");
         assert!(error.to_string().contains("DELTA_BYTE_ARRAY"), "{error}");
     }
 }
