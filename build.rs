@@ -25,6 +25,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     fs::create_dir_all(&client)?;
     tonic_prost_build::configure()
         .bytes(".")
+        .boxed(".fnsf.v1.EstimateFlowRequest.Begin.options")
+        .boxed(".fnsf.v1.EstimateSequenceRequest.Begin.options")
         .boxed(".fnsf.v1.SubmitJobRequest.Begin.options")
         .boxed(".fnsf.v1.Options.field")
         .boxed(".fnsf.v1.EstimateSequenceResponse.Pair.outcome.header")
@@ -32,6 +34,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         .compile_fds(descriptors.clone())?;
     tonic_prost_build::configure()
         .bytes(".")
+        .boxed(".fnsf.v1.EstimateFlowRequest.Begin.options")
+        .boxed(".fnsf.v1.EstimateSequenceRequest.Begin.options")
         .boxed(".fnsf.v1.SubmitJobRequest.Begin.options")
         .boxed(".fnsf.v1.Options.field")
         .boxed(".fnsf.v1.EstimateSequenceResponse.Pair.outcome.header")

@@ -78,6 +78,7 @@ fn submission(tenant: &str, pairs: u32, cost_seconds: f64) -> Submission {
         labels: Vec::new(),
         trace: None,
         webhook: None,
+        result_uri: None,
         deadline: None,
         idempotency: None,
         durable: true,

@@ -101,7 +101,7 @@ fn messages(clouds: &[Vec<Point>; 2]) -> Vec<proto::EstimateFlowRequest> {
         ..proto::Options::default()
     };
     let mut parts = vec![Part::Begin(Begin {
-        options: Some(options),
+        options: Some(Box::new(options)),
         ..Begin::default()
     })];
     for (points, cloud) in clouds

@@ -10,9 +10,9 @@ use std::time::Duration;
 use super::error::ApiError;
 use crate::cost::{CostModel, Lanes};
 use crate::flow::{self, Cost, Problem};
-use crate::job::{DeviceKind, JobOptions, Priority, Tenant};
+use crate::job::{DeviceKind, Job, JobOptions, Priority, Tenant};
 use crate::payload::StoredCloud;
-use crate::queue::{Backlog, Queue};
+use crate::queue::{Backlog, Queue, Standing};
 use crate::sync::locked;
 
 /// Limits on accepted work.
@@ -231,7 +231,9 @@ impl Admission {
         let all = real(backlog.queued().seconds + reserved_all + asked.nominal_seconds);
         let mut excess = all - self.limits.max_queue.as_secs_f64();
         if asked.durability == Durability::Ephemeral {
-            let wait = self.wait(&backlog, asked, reserved_all);
+            let share = backlog.share_of(asked.tenant, asked.priority).seconds;
+            let share = share + asked.nominal_seconds;
+            let wait = self.wait(&backlog, asked.priority, asked.device, share, reserved_all);
             excess = excess.max((wait - self.limits.max_wait.as_secs_f64()) * lanes);
         }
         if excess > 0.0 {
@@ -263,23 +265,31 @@ impl Admission {
         priority: Priority,
         device: Option<DeviceKind>,
     ) -> f64 {
-        let asked = AdmissionRequest {
-            tenant,
-            priority,
-            device,
-            nominal_seconds: 0.0,
-            durability: Durability::Durable,
-        };
+        let share = backlog.share_of(tenant, priority).seconds;
         let reserved = locked(&self.reserved).values().sum();
-        self.wait(backlog, &asked, reserved)
+        self.wait(backlog, priority, device, share, reserved)
     }
 
-    /// Predicted seconds until a new job is started. All lanes share the jobs that may run on any
+    /// Predicted seconds until a queued job is started.
+    pub(super) fn predicted_start(&self, job: &Job, standing: Standing) -> f64 {
+        let backlog = self.queue.backlog();
+        let share = standing.share_seconds;
+        self.wait(&backlog, job.priority, job.device, share, 0.0)
+    }
+
+    /// Predicted seconds until a job is started before which its tenant is served `share` nominal seconds,
+    /// with `reserved` nominal seconds besides. All lanes share the jobs that may run on any
     /// device; the jobs that require one kind of device come on top. A job for any device waits for
     /// the kind that is free first.
-    fn wait(&self, backlog: &Backlog, asked: &AdmissionRequest<'_>, reserved: f64) -> f64 {
-        let ahead =
-            |device| backlog.ahead_of(asked.tenant, asked.priority, asked.nominal_seconds, device);
+    fn wait(
+        &self,
+        backlog: &Backlog,
+        priority: Priority,
+        device: Option<DeviceKind>,
+        share: f64,
+        reserved: f64,
+    ) -> f64 {
+        let ahead = |kind| backlog.ahead_of(priority, share, kind);
         let running = backlog.running();
         // Running jobs delay a new one only where they occupy every lane.
         let occupied = if running.jobs < self.cost.lanes().total() as u64 {
@@ -289,7 +299,7 @@ impl Admission {
         };
         let shared = ahead(None) + occupied + reserved;
         let kinds = DeviceKind::ALL.into_iter().filter(|kind| {
-            self.cost.lanes().of(*kind) > 0 && asked.device.is_none_or(|asked| asked == *kind)
+            self.cost.lanes().of(*kind) > 0 && device.is_none_or(|asked| asked == *kind)
         });
         let own = kinds.map(|kind| ahead(Some(kind)) / self.cost.rate(kind));
         shared / self.cost.total_rate() + own.reduce(f64::min).unwrap_or(0.0)

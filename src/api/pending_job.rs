@@ -12,6 +12,7 @@ use tokio::task::JoinHandle;
 
 use super::admission::{AdmissionRequest, Durability, Reservation};
 use super::auth::Caller;
+use super::deliver;
 use super::dense::Finalizer;
 use super::error::ApiError;
 use super::job_request::Request;
@@ -103,8 +104,17 @@ impl PendingJob {
                     "options: webhook is for submitted jobs: this call has the flow in its answer";
                 return Err(ApiError::InvalidOptions(text.to_owned()));
             }
-            let checked = service.webhooks.check(url);
-            checked.map_err(|error| ApiError::webhook(&service.webhooks, &error))?;
+            let webhooks = &service.remotes.webhooks;
+            let checked = webhooks.check(url);
+            checked.map_err(|error| ApiError::webhook(webhooks, &error))?;
+        }
+        if let Some(uri) = &request.options.result_uri {
+            if request.durability == Durability::Ephemeral {
+                let text = "options: result_uri is for submitted jobs: this call has the flow in \
+                            its answer";
+                return Err(ApiError::InvalidOptions(text.to_owned()));
+            }
+            deliver::check_place(&service.remotes.deliveries, uri)?;
         }
         if let Some(key) = &request.idempotency_key
             && (key.is_empty() || key.len() > MAX_KEY)
@@ -254,6 +264,7 @@ impl PendingJob {
                 return Err(ApiError::BadRequest(text.to_owned()));
             }
         }
+        deliver::check_form(&self.request.options, kind)?;
         let submission = self.submission(kind)?;
         let index = self.admit(&submission)?;
         let committed = tokio::spawn(self.commit(submission, index));
@@ -409,6 +420,7 @@ impl PendingJob {
             labels: options.labels.texts(),
             trace: self.request.received.trace.clone(),
             webhook: options.webhook.clone(),
+            result_uri: options.result_uri.clone(),
             deadline: left.map(|left| Timestamp::now().after(left)),
             idempotency: key.map(|key| Idempotency {
                 key,

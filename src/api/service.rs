@@ -22,7 +22,7 @@ use crate::health::StoreHealth;
 use crate::job::{Job, JobId, JobOptions, Kind, Priority, State, Tenant};
 use crate::metrics::Metrics;
 use crate::queue::{Queue, QueueError};
-use crate::remote::{Sources, Webhooks};
+use crate::remote::Remotes;
 use crate::storage::{Blob, Blobs, FreeSpace};
 use crate::sync::Exchange;
 
@@ -45,8 +45,7 @@ pub struct Service {
     pub(super) metrics: Arc<Metrics>,
     pub(super) keys: Exchange<Keys>,
     pub(super) hosts: Hosts,
-    pub(super) webhooks: Webhooks,
-    pub(super) sources: Sources,
+    pub(super) remotes: Remotes,
     store_health: Arc<StoreHealth>,
     pub(super) limits: ServiceLimits,
     pub(super) uploads: Arc<UploadBudget>,
@@ -123,8 +122,7 @@ impl Service {
             metrics: parts.metrics,
             keys: Exchange::new(parts.keys),
             hosts: parts.hosts,
-            webhooks: parts.webhooks,
-            sources: parts.sources,
+            remotes: parts.remotes,
             store_health: parts.store_health,
             limits: parts.limits,
             compute: FairQueue::new(cores),

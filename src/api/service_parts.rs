@@ -10,7 +10,7 @@ use super::origin::Hosts;
 use crate::health::StoreHealth;
 use crate::metrics::Metrics;
 use crate::queue::Queue;
-use crate::remote::{Sources, Webhooks};
+use crate::remote::Remotes;
 use crate::storage::Blobs;
 
 /// The dependencies of a [`crate::api::Service`].
@@ -29,10 +29,8 @@ pub struct ServiceParts {
     pub keys: Keys,
     /// The host names that are accepted when there are no API keys.
     pub hosts: Hosts,
-    /// The webhooks that jobs may name.
-    pub webhooks: Webhooks,
-    /// The places that sweeps may be fetched from.
-    pub sources: Sources,
+    /// The places on other servers that callers may name.
+    pub remotes: Remotes,
     /// The health of the store and its free disk space, as last measured.
     pub store_health: Arc<StoreHealth>,
     /// Resource limits for requests.
@@ -65,8 +63,7 @@ impl ServiceParts {
             blobs: Blobs::open(&folder.join("blobs")).expect("a store"),
             metrics: Arc::new(Metrics::new(&["cpu"])),
             keys: Keys::default(),
-            webhooks: Webhooks::off(),
-            sources: Sources::default(),
+            remotes: Remotes::default(),
             hosts: Hosts(None),
             store_health: Arc::default(),
             limits: ServiceLimits {

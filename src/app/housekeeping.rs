@@ -79,7 +79,7 @@ async fn listen(
         metrics.observe(&event);
         let rings = match &event {
             Event::Deleted(_) => true,
-            Event::Ended(job) => job.webhook.is_some(),
+            Event::Ended(job) => job.webhook.is_some() || job.delivery.is_some(),
             _ => false,
         };
         if rings {

@@ -3,6 +3,7 @@
 mod backup;
 mod devices;
 mod housekeeping;
+mod migrate;
 mod outbox;
 mod process;
 mod processor;
@@ -15,4 +16,5 @@ mod stores;
 mod tests;
 
 pub use backup::{Backup, backup, restore};
+pub use migrate::migrate;
 pub use start::App;

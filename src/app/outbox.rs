@@ -1,5 +1,5 @@
 //! The actions that the queue has promised and that lie outside of it: removing the files of forgotten
-//! jobs, and telling webhooks of the end of jobs.
+//! jobs, delivering results, and telling webhooks of the end of jobs.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -9,7 +9,9 @@ use futures_util::stream::FuturesUnordered;
 use futures_util::{FutureExt, StreamExt};
 use tokio::sync::Notify;
 
+use crate::api::Service;
 use crate::clock::Timestamp;
+use crate::job::Job;
 use crate::metrics::Metrics;
 use crate::queue::{Action, Outgoing, Queue, Settled};
 use crate::remote::Webhooks;
@@ -22,7 +24,7 @@ const AT_ONCE: usize = 64;
 /// slowest of them.
 const HOLD: Duration = Duration::from_secs(60);
 
-/// Number of notices that one receiver is told at a time.
+/// Number of notices that one receiver is told, and of results that one bucket gets, at a time.
 const OF_ONE_RECEIVER: usize = 8;
 /// A receiver that has this many to answer and has been silent for this long is left alone.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(2);
@@ -37,13 +39,14 @@ const POLL: Duration = Duration::from_secs(2);
 const FIRST_DELAY: Duration = Duration::from_secs(5);
 /// Maximum delay.
 const MAX_DELAY: Duration = Duration::from_secs(2 * 3600);
-/// Number of attempts at a webhook: the last one is about a day after the first.
+/// Number of attempts at a webhook or a delivery: the last one is about a day after the first.
 const MAX_ATTEMPTS: u32 = 20;
 
 /// Does the actions of an outbox.
 pub(super) struct Outbox {
     pub(super) queue: Arc<dyn Queue>,
     pub(super) blobs: Blobs,
+    pub(super) service: Arc<Service>,
     pub(super) webhooks: Webhooks,
     pub(super) metrics: Arc<Metrics>,
     /// Rung when a job has ended or was forgotten.
@@ -101,49 +104,73 @@ impl Outbox {
 
     /// Does one action.
     async fn act(&self, one: Outgoing, receiver: Option<String>) -> Tried {
-        let again = match &one.action {
+        let settled = match &one.action {
             Action::RemoveFiles => match self.blobs.remove_job(one.job).await {
-                Ok(()) => false,
+                Ok(()) => Settled::Done,
                 Err(error) => {
                     tracing::warn!(%error, job = %one.job, "a forgotten job left something behind");
-                    true
+                    Settled::Again(delay(one.attempts))
                 }
             },
+            Action::Deliver(job) => self.deliver(&one, job).await,
             Action::Notify { url, body } => self.tell(&one, url, body).await,
-        };
-        let settled = match again {
-            true => Settled::Again(delay(one.attempts)),
-            false => Settled::Done,
         };
         (one.number, settled, receiver)
     }
 
-    /// Tells a webhook. Returns whether it is to be told again.
-    async fn tell(&self, one: &Outgoing, url: &str, body: &str) -> bool {
+    /// Delivers a result.
+    async fn deliver(&self, one: &Outgoing, job: &Arc<Job>) -> Settled {
+        let Err(error) = self.service.deliver(job).await else {
+            self.metrics.delivery("delivered");
+            return Settled::Done;
+        };
+        let settled = failed(one, error.is_worth_a_retry());
+        self.metrics.delivery(outcome(settled));
+        let attempt = one.attempts;
+        tracing::warn!(%error, job = %one.job, attempt, then = outcome(settled), "a result was not delivered");
+        settled
+    }
+
+    /// Tells a webhook.
+    async fn tell(&self, one: &Outgoing, url: &str, body: &str) -> Settled {
         let id = format!("msg_{}_{}", one.job, one.number);
         let now = Timestamp::now().as_millis() / 1000;
         let told = self.webhooks.tell(url, &id, now, body.to_owned()).await;
         let Err(error) = told else {
             self.metrics.webhook("delivered");
-            return false;
+            return Settled::Done;
         };
-        let again = error.is_worth_a_retry() && one.attempts < MAX_ATTEMPTS;
-        self.metrics
-            .webhook(if again { "retried" } else { "given_up" });
+        let settled = failed(one, error.is_worth_a_retry());
+        self.metrics.webhook(outcome(settled));
         let attempt = one.attempts;
-        let (job, then) = (one.job, if again { "again later" } else { "no more" });
-        tracing::warn!(%error, %job, attempt, then, "a webhook was not told");
-        again
+        tracing::warn!(%error, job = %one.job, attempt, then = outcome(settled), "a webhook was not told");
+        settled
     }
 }
 
-/// What the receivers of webhooks are doing, by host and port.
+/// What becomes of an action that has failed.
+fn failed(one: &Outgoing, is_worth_a_retry: bool) -> Settled {
+    match is_worth_a_retry && one.attempts < MAX_ATTEMPTS {
+        true => Settled::Again(delay(one.attempts)),
+        false => Settled::GivenUp,
+    }
+}
+
+/// The name of a failure's outcome in the metrics.
+fn outcome(settled: Settled) -> &'static str {
+    match settled {
+        Settled::GivenUp => "given_up",
+        _ => "retried",
+    }
+}
+
+/// What the receivers of notices and results are doing, by host and port or bucket.
 #[derive(Debug, Default)]
 struct Receivers(HashMap<String, Receiver>);
 
 #[derive(Debug)]
 struct Receiver {
-    /// Notices that it is being told.
+    /// Notices and results that it is being sent.
     told: usize,
     /// When it last answered, or was first told after it had nothing to answer.
     moved: Instant,
@@ -153,7 +180,12 @@ impl Receivers {
     /// Begins an action. Returns its receiver, or after which time it is to be taken again: a receiver is
     /// told a few notices at a time, and one that does not answer is left alone for a while.
     fn begin(&mut self, one: &Outgoing, now: Instant) -> Result<Option<String>, Duration> {
-        let Action::Notify { url, .. } = &one.action else {
+        let url = match &one.action {
+            Action::RemoveFiles => None,
+            Action::Deliver(job) => job.delivery.as_ref().map(|delivery| &delivery.uri),
+            Action::Notify { url, .. } => Some(url),
+        };
+        let Some(url) = url else {
             return Ok(None);
         };
         let host = url.split('/').nth(2).unwrap_or_default();

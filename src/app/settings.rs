@@ -8,7 +8,7 @@ use crate::api::{AdmissionLimits, Caller, Keys, ListenOptions, Role, ServiceLimi
 use crate::config::{Config, LimitsConfig, QueueConfig, RemoteConfig};
 use crate::job::{Priority, Tenant};
 use crate::queue::{PostgresOptions, QueueOptions};
-use crate::remote::{Allowed, SOURCE_SCHEMES, SigningSecret};
+use crate::remote::{Allowed, DELIVERY_SCHEMES, SOURCE_SCHEMES, SigningSecret};
 
 /// The API keys: that of the default tenant, and those of tenants.
 ///
@@ -44,6 +44,14 @@ pub(super) fn keys(config: &Config) -> anyhow::Result<Keys> {
 /// If a prefix is invalid.
 pub(super) fn sources(config: &RemoteConfig) -> anyhow::Result<Allowed> {
     Allowed::new(&config.sweeps, &SOURCE_SCHEMES).context("remote.sweeps")
+}
+
+/// The places that results may be delivered to.
+///
+/// # Errors
+/// If a prefix is invalid.
+pub(super) fn deliveries(config: &RemoteConfig) -> anyhow::Result<Allowed> {
+    Allowed::new(&config.results, &DELIVERY_SCHEMES).context("remote.results")
 }
 
 /// The webhooks that jobs may name, and the key of their signatures; `None` if there are none.

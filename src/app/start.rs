@@ -12,7 +12,9 @@ use tokio_util::sync::CancellationToken;
 
 use super::devices::Pool;
 use super::outbox::Outbox;
-use super::settings::{admission_limits, keys, listen_options, service_limits, sources, webhooks};
+use super::settings::{
+    admission_limits, deliveries, keys, listen_options, service_limits, sources, webhooks,
+};
 use super::stores::{Stores, warn_of_stranded_jobs};
 use super::{housekeeping, process};
 use crate::api::{
@@ -26,7 +28,7 @@ use crate::health::Heartbeat;
 use crate::job::DeviceKind;
 use crate::metrics::Metrics;
 use crate::queue::Queue;
-use crate::remote::{Sources, Webhooks};
+use crate::remote::{Deliveries, Remotes, Sources, Webhooks};
 use crate::worker::{Drain, IsolationLock, Worker, WorkerOptions};
 
 /// A running server: its ports, devices, workers, stores and background tasks. [`App::drain`]
@@ -83,6 +85,7 @@ impl App {
         let keys = keys(&config)?;
         let webhooks = webhooks(&config.remote)?;
         let places = sources(&config.remote)?;
+        let results = deliveries(&config.remote)?;
         process::keep_files_private();
         process::survive_file_limits();
         process::name_tls_provider();
@@ -102,16 +105,22 @@ impl App {
         let keys_are_open = keys.is_open();
         let allows_private = config.remote.allow_private_addresses;
         let webhooks = match webhooks {
-            None => Webhooks::off(),
+            None => Webhooks::default(),
             Some((allowed, secret)) => Webhooks::new(allowed, secret, allows_private),
         };
         let sources = Sources::new(places, allows_private).context("remote.sweeps")?;
-        let parts = (keys, webhooks.clone(), sources);
+        let remotes = Remotes {
+            webhooks: webhooks.clone(),
+            sources,
+            deliveries: Deliveries::new(results).context("remote.results")?,
+        };
+        let parts = (keys, remotes);
         let service = Arc::new(service(&stores, &devices, &cost, &metrics, parts, &config));
         let runtime = Arc::new(Heartbeat::default());
         let outbox = Outbox {
             queue: Arc::clone(&stores.queue),
             blobs: stores.blobs.clone(),
+            service: Arc::clone(&service),
             webhooks,
             metrics: Arc::clone(&metrics),
             bell: Arc::default(),
@@ -195,13 +204,14 @@ impl App {
     /// - An API key is shorter than 16 characters, is given twice, is not printable ASCII, or has
     ///   white space at an end.
     /// - A tenant name is not 1 to 64 letters, digits, `-`, `_` or `.`.
-    /// - A prefix of sweeps, a prefix or the secret of webhooks is invalid, or the secret is missing.
+    /// - A prefix of sweeps or results, a prefix or the secret of webhooks is invalid, or the secret is missing.
     pub fn check(config: &Config) -> anyhow::Result<()> {
         config.check()?;
         Pool::unopened(config)?;
         keys(config)?;
         webhooks(&config.remote)?;
         sources(&config.remote)?;
+        deliveries(&config.remote)?;
         Ok(())
     }
 
@@ -303,7 +313,7 @@ fn service(
     devices: &[Device],
     cost: &Arc<CostModel>,
     metrics: &Arc<Metrics>,
-    (keys, webhooks, sources): (Keys, Webhooks, Sources),
+    (keys, remotes): (Keys, Remotes),
     config: &Config,
 ) -> Service {
     let is_loopback = config.listen.ip().is_loopback();
@@ -319,8 +329,7 @@ fn service(
         ),
         metrics: Arc::clone(metrics),
         keys,
-        webhooks,
-        sources,
+        remotes,
         hosts: Hosts(is_loopback.then(|| config.allowed_hosts.clone())),
         store_health: Arc::clone(&stores.health),
         limits: service_limits(&config.limits),

@@ -25,6 +25,7 @@ mod eval;
 mod flow;
 mod jobs;
 mod label;
+mod migrate;
 mod serve;
 mod submit;
 mod synth;
@@ -60,6 +61,7 @@ enum Command {
     Jobs(jobs::Jobs),
     Backup(backup::Backup),
     Restore(backup::Restore),
+    Migrate(migrate::Migrate),
     Flow(flow::Flow),
     Densify(densify::Densify),
     Eval(eval::Eval),
@@ -80,6 +82,7 @@ pub fn run(arguments: Arguments) -> ExitCode {
         Command::Jobs(command) => command.run(),
         Command::Backup(command) => command.run(),
         Command::Restore(command) => command.run(),
+        Command::Migrate(command) => command.run(),
         Command::Flow(command) => command.run(),
         Command::Densify(command) => command.run(),
         Command::Eval(command) => command.run(),

@@ -43,6 +43,10 @@ pub(super) struct Submit {
     /// Webhook: a URL to which the server posts a notice when the job ends
     #[arg(long, value_name = "URL")]
     webhook: Option<String>,
+    /// URI to which the server writes the result, such as s3://labels/0001.feather; of a sequence with
+    /// {index} for the index of each pair
+    #[arg(long, value_name = "URI")]
+    result_uri: Option<String>,
     /// More options, a JSON object as in the API
     #[arg(long, value_name = "JSON", default_value = "{}")]
     options: String,
@@ -69,8 +73,10 @@ impl Submit {
         if let Some(preset) = &self.preset {
             object.insert("preset".to_owned(), json!(preset));
         }
-        if let Some(webhook) = &self.webhook {
-            object.insert("webhook".to_owned(), json!(webhook));
+        for (name, value) in [("webhook", &self.webhook), ("result_uri", &self.result_uri)] {
+            if let Some(value) = value {
+                object.insert(name.to_owned(), json!(value));
+            }
         }
         for label in &self.label {
             let (name, value) = label.split_once('=').context("--label is NAME=VALUE")?;

@@ -12,6 +12,9 @@ pub struct RemoteConfig {
     /// `s3://drives/2026/`, `https://data.example.com/` or `file:///mnt/drives/`. Each ends with a
     /// slash.
     pub sweeps: Vec<String>,
+    /// Prefixes of the URIs to which jobs may have their results delivered, such as
+    /// `s3://labels/2026/`. Each ends with a slash.
+    pub results: Vec<String>,
     /// Prefixes of the URLs that jobs may name as their webhook, such as
     /// `https://hooks.example.com/fnsf/`. Each ends with a slash.
     pub webhooks: Vec<String>,

@@ -3,6 +3,7 @@
 //! Shared by the protocols, the queue and the workers. Independent of them.
 
 mod choices;
+mod delivery;
 mod densify;
 mod device;
 mod error;
@@ -16,6 +17,7 @@ mod report;
 mod sequence;
 
 pub use choices::{EgoChoice, GroundChoice, PrecisionChoice, PresetChoice, Priority};
+pub use delivery::{Delivery, DeliveryState, PAIR_INDEX, uri_of_pair};
 pub use densify::{Densify, LaterSweepsChoice};
 pub use device::{DeviceChoice, DeviceKind};
 pub use error::{InvalidOptions, MAX_DT_S};

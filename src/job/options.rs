@@ -92,6 +92,12 @@ pub struct JobOptions {
     /// must allow the URL. Only for submitted jobs. No notice is sent if not given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub webhook: Option<String>,
+    /// URI to which the server writes the result, such as `s3://labels/drive-7/0001.feather`: the ending
+    /// chooses the format. In that of a sequence `{index}` stands for the index of each pair; with
+    /// `densify` it is that of the dense cloud. The server's configuration must allow the URI. Only for
+    /// submitted jobs.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub result_uri: Option<String>,
     /// Also computes one dense cloud of a sequence, in addition to its flows.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub densify: Option<Densify>,

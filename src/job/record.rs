@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::choices::Priority;
+use super::delivery::Delivery;
 use super::device::DeviceKind;
 use super::id::{JobId, Tenant};
 use crate::clock::Timestamp;
@@ -170,6 +171,8 @@ pub struct Job {
     pub trace: Option<String>,
     /// The URL that is told of the job's end. None for the pairs of a sequence.
     pub webhook: Option<String>,
+    /// The delivery of its result. None if it stays here.
+    pub delivery: Option<Delivery>,
 }
 
 impl Job {

@@ -35,5 +35,6 @@ pub const PROTOCOLS: [&str; 2] = ["http", "grpc"];
 /// below 500, and an error with an HTTP status of 500 or above. A gRPC error counts by the HTTP
 /// status of the same error.
 pub const CLASSES: [&str; 3] = ["ok", "client_error", "server_error"];
-/// Values of the label `outcome` of `fnsf_webhooks_total`: told, to be told again, and given up.
-pub const WEBHOOK_OUTCOMES: [&str; 3] = ["delivered", "retried", "given_up"];
+/// Values of the label `outcome` of `fnsf_webhooks_total` and `fnsf_deliveries_total`: done, to be done
+/// again, and given up.
+pub const DELIVERY_OUTCOMES: [&str; 3] = ["delivered", "retried", "given_up"];

@@ -10,6 +10,6 @@ mod record;
 mod register;
 mod series;
 
-pub use labels::{CLASSES, PHASES, PROTOCOLS, REJECTIONS, WEBHOOK_OUTCOMES};
+pub use labels::{CLASSES, DELIVERY_OUTCOMES, PHASES, PROTOCOLS, REJECTIONS};
 pub use record::ConnectionGuard;
 pub use series::Metrics;

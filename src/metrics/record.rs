@@ -132,8 +132,14 @@ impl Metrics {
             .inc();
     }
 
+    /// Counts an attempt to deliver a result in `fnsf_deliveries_total`; `outcome` is one of
+    /// [`super::DELIVERY_OUTCOMES`].
+    pub fn delivery(&self, outcome: &'static str) {
+        self.deliveries.get_or_create(&Outcome { outcome }).inc();
+    }
+
     /// Counts an attempt to tell a webhook in `fnsf_webhooks_total`; `outcome` is one of
-    /// [`super::WEBHOOK_OUTCOMES`].
+    /// [`super::DELIVERY_OUTCOMES`].
     pub fn webhook(&self, outcome: &'static str) {
         self.webhooks.get_or_create(&Outcome { outcome }).inc();
     }

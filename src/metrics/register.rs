@@ -180,6 +180,11 @@ impl Metrics {
             "Attempts to tell webhooks of the end of a job",
             self.webhooks.clone(),
         );
+        registry.register(
+            "deliveries",
+            "Attempts to write results to the places of their submitters",
+            self.deliveries.clone(),
+        );
         registry.register_with_unit(
             "upload",
             "Bytes of request bodies",

@@ -10,7 +10,7 @@ use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::Histogram;
 use prometheus_client::registry::Registry;
 
-use super::labels::{CLASSES, PHASES, PROTOCOLS, REJECTIONS, WEBHOOK_OUTCOMES};
+use super::labels::{CLASSES, DELIVERY_OUTCOMES, PHASES, PROTOCOLS, REJECTIONS};
 use super::process::ProcessCollector;
 use crate::flow::StopReason;
 use crate::job::{Priority, State};
@@ -103,6 +103,7 @@ pub struct Metrics {
     pub(super) requests: Family<ProtocolAndClass, Counter>,
     pub(super) connections: Gauge,
     pub(super) webhooks: Family<Outcome, Counter>,
+    pub(super) deliveries: Family<Outcome, Counter>,
     pub(super) upload_bytes: Counter,
     pub(super) snapshots: Counter,
     pub(super) resumed: Counter,
@@ -147,6 +148,7 @@ impl Metrics {
             requests: Family::default(),
             connections: Gauge::default(),
             webhooks: Family::default(),
+            deliveries: Family::default(),
             upload_bytes: Counter::default(),
             snapshots: Counter::default(),
             resumed: Counter::default(),
@@ -179,7 +181,8 @@ impl Metrics {
         for reason in REJECTIONS {
             drop(self.rejected.get_or_create(&Reason { reason }));
         }
-        for outcome in WEBHOOK_OUTCOMES {
+        for outcome in DELIVERY_OUTCOMES {
+            drop(self.deliveries.get_or_create(&Outcome { outcome }));
             drop(self.webhooks.get_or_create(&Outcome { outcome }));
         }
         for priority in Priority::ALL {

@@ -81,31 +81,29 @@ impl Backlog {
         self.sum(|key| key.tenant == *tenant)
     }
 
-    /// Predicted compute time of the queued jobs that run before a new job of `tenant`, nominal
-    /// seconds. `cost_seconds` is the predicted compute time of the new job, nominal seconds.
+    /// Queued load of one tenant at one priority, for all devices.
+    pub fn share_of(&self, tenant: &Tenant, priority: Priority) -> Load {
+        self.sum(|key| key.priority == priority && key.tenant == *tenant)
+    }
+
+    /// Predicted compute time of the queued jobs that run before a job, nominal seconds.
+    /// `share_seconds` is the work of the job's own tenant at its priority until then: before a new
+    /// job that of [`Backlog::share_of`], for the job's end its own cost besides.
     ///
     /// Only jobs with exactly this `device` requirement count (`None`: any device). Running jobs
-    /// do not count. All jobs of higher priority count. Of the same priority, the jobs of `tenant`
-    /// count in full. Each other tenant counts up to its fair share: `cost_seconds` plus the queued
-    /// work of `tenant` at this priority, for all devices.
+    /// do not count. All jobs of higher priority count. Of the same priority, each tenant counts up
+    /// to `share_seconds`: by fair queueing each is served as much.
     pub fn ahead_of(
         &self,
-        tenant: &Tenant,
         priority: Priority,
-        cost_seconds: f64,
+        share_seconds: f64,
         device: Option<DeviceKind>,
     ) -> f64 {
         let higher = self.sum(|key| key.priority > priority && key.device == device);
         let equals = |key: &&BacklogKey| key.priority == priority && key.device == device;
-        let own = self.sum(|key| key.priority == priority && key.tenant == *tenant);
         let waiting = self.queued.iter().filter(|(key, _)| equals(key));
-        // By fair queueing, each other tenant is served as much work as this one until the new job
-        // is done.
         let equal: f64 = waiting
-            .map(|(key, load)| match key.tenant == *tenant {
-                true => load.seconds,
-                false => load.seconds.min(own.seconds + cost_seconds),
-            })
+            .map(|(_, load)| load.seconds.min(share_seconds))
             .sum();
         higher.seconds + equal
     }

@@ -14,9 +14,9 @@ use super::node::{Capacities, Node};
 use super::outgoing::{Outgoing, Settled};
 use super::sql::Sql;
 use super::transitions;
-use super::transitions::{expiry, leases, lists, outbox};
+use super::transitions::{expiry, leases, lists, outbox, standing};
 use super::types::{
-    Committed, Filter, Outcome, Queue, QueueError, QueueOptions, Submission, Submitted,
+    Committed, Filter, Outcome, Queue, QueueError, QueueOptions, Standing, Submission, Submitted,
 };
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobId, Tenant};
@@ -163,6 +163,11 @@ impl<E: Engine> Queue for DatabaseQueue<E> {
 
     async fn list(&self, filter: Filter) -> Result<Vec<Arc<Job>>, QueueError> {
         self.engine.read(move |sql| lists::list(sql, &filter)).await
+    }
+
+    async fn standing(&self, id: JobId) -> Result<Option<Standing>, QueueError> {
+        let found = self.engine.read(move |sql| standing::standing(sql, id));
+        found.await
     }
 
     async fn cancel(&self, id: JobId) -> Result<Arc<Job>, QueueError> {

@@ -13,6 +13,7 @@ mod database;
 mod effects;
 mod lease;
 mod local;
+mod migration;
 mod node;
 mod outgoing;
 mod postgres;
@@ -25,13 +26,14 @@ mod types;
 
 pub use backlog::{Backlog, Load};
 pub use lease::{Lease, LeaseHeartbeat, Signal};
+pub use migration::Migration;
 pub use node::{Capacities, Capacity, Node};
 pub use outgoing::{Action, Outgoing, Settled};
-pub use postgres::{PostgresOptions, open_postgres};
+pub use postgres::{PostgresOptions, migrate_postgres, open_postgres};
 #[cfg(any(test, feature = "fuzzing"))]
 pub use sqlite::simulation;
-pub use sqlite::{CopiedQueue, copy_sqlite, open_sqlite, read_copy};
+pub use sqlite::{CopiedQueue, copy_sqlite, migrate_sqlite, open_sqlite, read_copy};
 pub use types::{
     Committed, Event, Filter, Idempotency, Outcome, PairOf, Queue, QueueError, QueueOptions,
-    Submission, Submitted,
+    Standing, Submission, Submitted,
 };

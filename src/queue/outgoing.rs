@@ -1,12 +1,13 @@
 //! Actions outside the queue that its outbox holds.
 
+use std::sync::Arc;
 use std::time::Duration;
 
-use crate::job::JobId;
+use crate::job::{Job, JobId};
 
 /// An action outside the queue that a commit has promised. It stays in the outbox of the queue until
 /// [`Queue::settle`](super::Queue::settle) reports it done, so it may be done more than once.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Outgoing {
     /// Its number: no other action of the queue has it, and repetitions keep it.
     pub number: i64,
@@ -21,8 +22,10 @@ pub struct Outgoing {
 /// What has become of an [`Outgoing`] action.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Settled {
-    /// It is done, or given up.
+    /// It is done.
     Done,
+    /// It failed, and is not tried again.
+    GivenUp,
     /// It failed, and is due again after a delay.
     Again(Duration),
     /// It was not tried, and is due after a delay. The attempt does not count.
@@ -30,11 +33,14 @@ pub enum Settled {
 }
 
 /// What an [`Outgoing`] action does.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub enum Action {
     /// Removes payload, snapshot and result of a job that the queue has forgotten.
     RemoveFiles,
-    /// Sends a body to a URL: that of a job that has ended.
+    /// Writes the result of a job that has succeeded to the URI of its [`Job::delivery`].
+    Deliver(Arc<Job>),
+    /// Sends a body to a URL: that of a job that has ended. What the job delivers was delivered before,
+    /// or given up.
     Notify {
         /// Where to.
         url: String,

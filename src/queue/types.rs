@@ -53,6 +53,9 @@ pub struct Submission {
     /// The URL that is told of the job's end, by an [`Outgoing`] action. Of a sequence, it is not told
     /// of the pairs.
     pub webhook: Option<String>,
+    /// The URI that the result is delivered to, by an [`Outgoing`] action. Of a sequence, it is that of
+    /// the closing job or, with [`PAIR_INDEX`](crate::job::PAIR_INDEX) in it, those of the forward pairs.
+    pub result_uri: Option<String>,
     /// Time at which the best flow so far is returned. A job that is still queued then expires. It
     /// does not apply to a closing job. `None`: [`QueueOptions::time_to_live`] limits the wait.
     pub deadline: Option<Timestamp>,
@@ -86,6 +89,7 @@ impl Submission {
             labels: Vec::new(),
             trace: None,
             webhook: None,
+            result_uri: None,
             deadline: None,
             idempotency: None,
             durable: true,
@@ -141,6 +145,21 @@ pub enum Submitted {
     New(Arc<Job>),
     /// The idempotency key belongs to this job, which was accepted before; no job was added.
     Known(Arc<Job>),
+}
+
+/// Where a queued job stands among those that are ready to start.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Standing {
+    /// Number of ready jobs that start before it, at most [`Standing::MOST`].
+    pub ahead: i64,
+    /// Work of its tenant at its priority that is served before it, nominal seconds
+    /// ([`crate::cost`]). Other tenants are served as much in that time.
+    pub share_seconds: f64,
+}
+
+impl Standing {
+    /// Jobs ahead are counted up to this number.
+    pub const MOST: i64 = 10_000;
 }
 
 /// Selects the jobs to list, latest first.
@@ -354,6 +373,13 @@ pub trait Queue: Send + Sync {
     /// # Errors
     /// An error of the store.
     async fn list(&self, filter: Filter) -> Result<Vec<Arc<Job>>, QueueError>;
+
+    /// The standing of a queued job. Of a sequence it is that of its first queued pair or of its closing
+    /// job. `None` if nothing of the job is queued.
+    ///
+    /// # Errors
+    /// An error of the store.
+    async fn standing(&self, id: JobId) -> Result<Option<Standing>, QueueError>;
 
     /// Cancels a job and, for a sequence, its pairs. Returns the job as it is then. A queued job
     /// ends at once. The worker of a running job receives [`super::Signal::Cancel`], and the job

@@ -12,7 +12,8 @@ use url::Url;
 
 use super::allowed::{Allowed, NotAllowed};
 use super::client::{client, literal_is_reachable};
-use crate::storage::{BlobError, BucketError, Objects};
+use super::places::Places;
+use crate::storage::{BlobError, BucketError};
 
 /// The schemes of URIs that can be read.
 pub const SOURCE_SCHEMES: [&str; 6] = ["https", "http", "s3", "gs", "az", "file"];
@@ -90,7 +91,7 @@ pub struct Sources(Option<Arc<Parts>>);
 
 struct Parts {
     allowed: Allowed,
-    buckets: Vec<(Url, Objects)>,
+    places: Places,
     allows_private: bool,
     client: reqwest::Client,
 }
@@ -107,11 +108,8 @@ impl Sources {
         if allowed.is_empty() {
             return Ok(Self::default());
         }
-        let buckets = allowed.prefixes().iter();
-        let buckets = buckets.filter(|url| ["s3", "gs", "az"].contains(&url.scheme()));
-        let opened = buckets.map(|url| Ok((url.clone(), Objects::open(url.as_str())?)));
         Ok(Self(Some(Arc::new(Parts {
-            buckets: opened.collect::<Result<_, BucketError>>()?,
+            places: Places::open(allowed.prefixes())?,
             allowed,
             allows_private,
             client: client(allows_private),
@@ -169,13 +167,7 @@ impl Parts {
         &self,
         url: &Url,
     ) -> Result<BoxStream<'static, Result<Bytes, NotFetched>>, NotFetched> {
-        let below = |(prefix, objects): &(Url, Objects)| {
-            let is_same = prefix.scheme() == url.scheme() && prefix.host() == url.host();
-            let rest = url.path().strip_prefix(prefix.path()).filter(|_| is_same)?;
-            Some((rest.to_owned(), objects.clone()))
-        };
-        let found = self.buckets.iter().find_map(below);
-        let (path, objects) = found.ok_or(NotAllowed::Elsewhere)?;
+        let (objects, path) = self.places.find(url).ok_or(NotAllowed::Elsewhere)?;
         let pieces = objects.read(&path).await?;
         Ok(pieces.map_err(NotFetched::from).boxed())
     }

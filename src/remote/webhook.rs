@@ -80,8 +80,8 @@ impl NotTold {
     }
 }
 
-/// Tells webhooks. Clones share the connections.
-#[derive(Clone)]
+/// Tells webhooks; by default none is allowed. Clones share the connections.
+#[derive(Clone, Default)]
 pub struct Webhooks(Option<Arc<Parts>>);
 
 struct Parts {
@@ -92,11 +92,6 @@ struct Parts {
 }
 
 impl Webhooks {
-    /// No webhook is allowed.
-    pub fn off() -> Self {
-        Self(None)
-    }
-
     /// Webhooks below the `allowed` URLs, signed with `secret`.
     ///
     /// # Panics

@@ -130,6 +130,16 @@ impl Objects {
         }
     }
 
+    /// Writes an object, replacing an earlier one; a large one in parts. The path may be encoded as in a
+    /// URL.
+    ///
+    /// # Errors
+    /// [`BlobError`].
+    pub async fn write(&self, path: &str, bytes: Bytes) -> Result<(), BlobError> {
+        let path = Path::from_url_path(path).map_err(object_store::Error::from)?;
+        bucket::put(&*self.store, &path, bytes).await
+    }
+
     /// Writes an object, replacing an earlier one.
     ///
     /// # Errors

@@ -128,6 +128,7 @@ impl Stand {
             labels: Vec::new(),
             trace: None,
             webhook: None,
+            result_uri: None,
             after,
             has_dependents: true,
             priority: Priority::Normal,

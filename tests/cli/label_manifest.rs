@@ -149,6 +149,43 @@ fn a_dictionary_that_claims_more_values_than_it_has_bytes_is_refused() {
     assert!(error.to_string().contains("claims 63 values"), "{error}");
 }
 
+/// Replaces the number of rows of all row groups and columns in the footer, but not that of the file.
+fn with_rows_of_groups(file: &[u8], from: [u8; 3], to: &[u8]) -> Bytes {
+    let (body, end) = file.split_at(file.len() - 8);
+    let length = u32::from_le_bytes([end[0], end[1], end[2], end[3]]) as usize;
+    let (pages, footer) = body.split_at(body.len() - length);
+    let mut places = footer.windows(3).enumerate();
+    let mut places = places
+        .by_ref()
+        .filter(|(_, window)| *window == from)
+        .map(|(place, _)| place);
+    let of_file = places.next().expect("the rows of the file") + from.len();
+    let mut changed = footer[..of_file].to_vec();
+    let mut rest = &footer[of_file..];
+    while let Some(place) = rest.windows(3).position(|window| window == from) {
+        changed.extend(&rest[..place]);
+        changed.extend(to);
+        rest = &rest[place + from.len()..];
+    }
+    changed.extend(rest);
+    let length = (changed.len() as u32).to_le_bytes();
+    Bytes::from([pages, &changed, &length, b"PAR1"].concat())
+}
+
+#[test]
+fn row_groups_that_claim_more_rows_than_the_file_are_refused() {
+    let column = Arc::new(StringArray::from(vec!["a"; 100])) as ArrayRef;
+    let file = file(vec![("other", column)], Compression::UNCOMPRESSED);
+    // A number of 64 bits as a field of Thrift's compact protocol: 100, and 40 million.
+    let (hundred, many) = ([0x16, 0xc8, 0x01], [0x16, 0x80, 0xd0, 0xa5, 0x26]);
+    assert!(with_rows_of_groups(&file, hundred, &hundred) == file);
+    let lies = with_rows_of_groups(&file, hundred, &many);
+    let error = read_manifest(lies, None)
+        .expect_err("more rows")
+        .to_string();
+    assert!(error.contains("more than the 100 rows"), "{error}");
+}
+
 #[test]
 fn columns_stored_as_differences_are_refused_by_the_name_of_their_encoding() {
     let text: ArrayRef = Arc::new(StringArray::from(SWEEPS.to_vec()));

@@ -49,7 +49,7 @@ impl ObjectServer {
             address: format!("127.0.0.1:{port}"),
         };
         let began = Instant::now();
-        while !server.makes_a_bucket() {
+        while !server.makes_a_bucket("farm") {
             assert!(
                 began.elapsed() < Duration::from_secs(60),
                 "it does not answer"
@@ -59,8 +59,9 @@ impl ObjectServer {
         Some(server)
     }
 
-    fn makes_a_bucket(&self) -> bool {
-        let url = format!("http://{}/farm", self.address);
+    /// Makes a bucket. Returns whether it is there then.
+    pub(crate) fn makes_a_bucket(&self, name: &str) -> bool {
+        let url = format!("http://{}/{name}", self.address);
         let made = Command::new("curl")
             .args(["-sf", "-o", "/dev/null", "-X", "PUT", &url])
             .status();

@@ -277,7 +277,7 @@ async fn codes(server: &Server, id: &str, shown: Option<&str>) -> [Code; 11] {
         .estimate_flow(showing(pair(small_pair(), options()), shown))
         .await;
     let mut parts = vec![sequence::Part::Begin(sequence::Begin {
-        options: Some(options()),
+        options: Some(Box::new(options())),
     })];
     let mut jobs = vec![submit::Part::Begin(submit::Begin {
         options: Some(Box::new(options())),

@@ -210,7 +210,7 @@ async fn numbers_that_are_no_values_and_messages_out_of_order_are_refused() {
         let mut options = proto::Options::default();
         change(&mut options);
         Some(Part::Begin(Begin {
-            options: Some(options),
+            options: Some(Box::new(options)),
             progress_ms: u32::MAX,
         }))
     };

@@ -53,7 +53,7 @@ pub(crate) fn pair(
 ) -> impl Stream<Item = proto::EstimateFlowRequest> + Send + 'static {
     use proto::estimate_flow_request::{Begin, CloudChunk, Part};
     let mut parts = vec![Part::Begin(Begin {
-        options: Some(options),
+        options: Some(Box::new(options)),
         progress_ms: 20,
     })];
     for (points, cloud) in clouds
@@ -148,7 +148,7 @@ async fn a_sequence_is_answered_pair_by_pair_while_it_is_still_coming() {
         ..proto::Options::default()
     };
     let begin = Part::Begin(Begin {
-        options: Some(options),
+        options: Some(Box::new(options)),
     });
     send.send(message(begin)).await.expect("open");
     let sweep = async |number: usize| {

@@ -21,6 +21,7 @@ mod command_line;
 mod console;
 mod console_browser;
 mod crash_recovery;
+mod deliveries;
 mod devices;
 mod fleet;
 #[path = "../common/gpu.rs"]

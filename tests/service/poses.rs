@@ -138,7 +138,10 @@ async fn the_ego_motions_of_a_stream_and_of_a_job_over_grpc_are_those_of_the_pos
 
     let mut parts = vec![Part::Begin(Begin::default())];
     for ((points, _), pose) in drive()[..2].iter().zip(flat) {
-        parts.push(Part::Next(NextCloud { pose }));
+        parts.push(Part::Next(NextCloud {
+            pose,
+            ..NextCloud::default()
+        }));
         parts.push(Part::Chunk(chunk(points)));
     }
     let message = |part| proto::SubmitJobRequest { part: Some(part) };

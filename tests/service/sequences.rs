@@ -162,7 +162,7 @@ async fn streamed(server: &Server) -> Vec<Vec<Point>> {
     use proto::estimate_sequence_request::{Begin, Part, Sweep};
     use proto::estimate_sequence_response::Part as Answer;
     let mut parts = vec![Part::Begin(Begin {
-        options: Some(grpc_options(None)),
+        options: Some(Box::new(grpc_options(None))),
     })];
     for points in sweeps() {
         parts.push(Part::Sweep(Sweep::default()));
@@ -445,7 +445,7 @@ async fn a_dense_cloud_that_cannot_be_made_is_refused_with_clear_words_and_costs
     let begin = proto::EstimateSequenceRequest {
         part: Some(proto::estimate_sequence_request::Part::Begin(
             proto::estimate_sequence_request::Begin {
-                options: Some(grpc_options(into())),
+                options: Some(Box::new(grpc_options(into()))),
             },
         )),
     };

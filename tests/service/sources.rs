@@ -197,3 +197,50 @@ async fn sweeps_are_fetched_from_a_bucket() {
     refuse(&server, "s3://farm/other/a.npy", "bad_request").await;
     refuse(&server, "s3://another/drives/a.npy", "bad_request").await;
 }
+
+#[tokio::test]
+async fn sweeps_may_be_named_by_uri_over_grpc_too() {
+    use crate::grpc::proto::submit_job_request::{Begin, NextCloud, Part};
+    use crate::grpc::{chunk, client, proto};
+    let (_folder, prefix) = folder();
+    let server = Server::with_config(&config(&prefix, false));
+    let mut calls = client(&server).await;
+    let named = |name: &str| {
+        Part::Next(NextCloud {
+            uri: format!("{prefix}{name}"),
+            ..NextCloud::default()
+        })
+    };
+    let request = |parts: Vec<Part>| {
+        let begin = Part::Begin(Begin::default());
+        let message = |part| proto::SubmitJobRequest { part: Some(part) };
+        tokio_stream::iter(std::iter::once(begin).chain(parts).map(message))
+    };
+    let sent = || {
+        let points = chunk(&small_pair()[1]);
+        [Part::Next(NextCloud::default()), Part::Chunk(points)]
+    };
+    let mut flows = Vec::new();
+    for parts in [
+        vec![named("a.npy"), named("b.npy")],
+        [vec![named("a.npy")], sent().to_vec()].concat(),
+    ] {
+        let job = calls.submit_job(request(parts)).await.expect("accepted");
+        let job = ended(&server, &job.into_inner().id).await;
+        let path = job["links"]["result"].as_str().expect("a path");
+        let flow = Client::new().get(server.url(path)).send().await;
+        flows.push(flow.expect("an answer").bytes().await.expect("a flow"));
+    }
+    assert!(flows[0] == flows[1]);
+    for (parts, said) in [
+        (vec![named("../secret.npy"), named("b.npy")], "not below"),
+        (vec![named("missing.npy"), named("b.npy")], "not there"),
+        (
+            [vec![named("a.npy")], sent()[1..].to_vec()].concat(),
+            "send next first",
+        ),
+    ] {
+        let refused = calls.submit_job(request(parts)).await.expect_err(said);
+        assert!(refused.message().contains(said), "{refused}");
+    }
+}

@@ -114,3 +114,31 @@ async fn data_of_a_newer_version_is_refused_by_name() {
     let said = String::from_utf8_lossy(&refused.stderr);
     assert!(said.contains("version 1000"), "{said}");
 }
+
+#[test]
+fn a_queue_is_upgraded_without_a_server_unless_one_runs() {
+    let migrate = |data: &Path| {
+        let run = std::process::Command::new(env!("CARGO_BIN_EXE_fnsf"))
+            .args(["migrate", "--data-dir"])
+            .arg(data)
+            .output()
+            .expect("it runs");
+        let said = String::from_utf8_lossy(&[run.stdout, run.stderr].concat()).into_owned();
+        (run.status.code(), said)
+    };
+    let folder = thaw();
+    let data = folder.path().join("data");
+    let (code, said) = migrate(&data);
+    assert_eq!(code, Some(0), "{said}");
+    assert!(said.contains("upgraded from schema version 8"), "{said}");
+    let (code, said) = migrate(&data);
+    assert_eq!(code, Some(0), "{said}");
+    assert!(said.contains("already"), "{said}");
+    let _server = Server::start_in(&folder, "", &[]);
+    let (code, said) = migrate(&data);
+    assert_eq!(code, Some(70), "{said}");
+    assert!(said.contains("another process"), "{said}");
+    let (code, said) = migrate(&folder.path().join("other"));
+    assert_eq!(code, Some(70), "{said}");
+    assert!(said.contains("has no queue"), "{said}");
+}

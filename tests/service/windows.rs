@@ -60,10 +60,10 @@ async fn streamed(
     use proto::estimate_sequence_request::{Begin, Part, Sweep};
     use proto::estimate_sequence_response::Part as Answer;
     let mut parts = vec![Part::Begin(Begin {
-        options: Some(proto::Options {
+        options: Some(Box::new(proto::Options {
             preset: proto::Preset::Label.into(),
             ..proto::Options::default()
-        }),
+        })),
     })];
     for (index, points) in sweeps().iter().enumerate() {
         parts.push(Part::Sweep(Sweep {

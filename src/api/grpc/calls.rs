@@ -19,9 +19,11 @@ use crate::api::listener::Asking;
 use crate::api::pending_job::{Accepted, PendingJob};
 use crate::api::result_budget::ReadProgress;
 use crate::api::service::{Service, Waited};
+use crate::api::sweep_order::SweepOrder;
 use crate::api::tracks::SequenceTracks;
 use crate::api::upload_budget::UploadReservation;
 use crate::job::{InvalidId, Job, JobId, Kind, State};
+use crate::payload::StoredCloud;
 
 /// Number of response messages that are buffered for a slow client.
 const AHEAD: usize = 4;
@@ -254,8 +256,9 @@ impl SceneFlow for Calls {
             Some(Part::Begin(begin)) => begin,
             _ => return Err(no_begin().into()),
         };
-        let options = convert::options(begin.options.map(|options| *options))?;
-        let dense = options.densify.is_some();
+        let options = convert::options(begin.options)?;
+        let (dense, force) = (options.densify.is_some(), options.force);
+        let mut order = SweepOrder::default();
         let mut job_request = call.job_request(options, Durability::Durable);
         let key = begin.idempotency_key;
         job_request.idempotency_key = (!key.is_empty()).then_some(key);
@@ -274,8 +277,19 @@ impl SceneFlow for Calls {
                 },
                 Some(Some(Part::Next(next))) => {
                     let pose = convert::pose("the next cloud", &next.pose)?;
-                    let cloud = cloud.replace(CloudBuilder::with_pose(pose));
-                    push(&mut pending, cloud, &index, &mut room).await?;
+                    push(&mut pending, cloud.take(), &index, &mut room).await?;
+                    if next.uri.is_empty() {
+                        cloud = Some(CloudBuilder::with_pose(pose));
+                    } else {
+                        let index = format!("cloud {}", pending.sweeps());
+                        let (name, bytes) = service.fetch(&mut room, &index, &next.uri).await?;
+                        order.push(&name, force)?;
+                        let decoded = service.decode(room.another(), index, Some(name), bytes);
+                        let (cloud, room) = decoded.await?;
+                        pending
+                            .push(StoredCloud { pose, ..cloud }, Some(room))
+                            .await?;
+                    }
                 }
                 None => {
                     push(&mut pending, cloud, &index, &mut room).await?;
@@ -289,8 +303,13 @@ impl SceneFlow for Calls {
         } else {
             Kind::Pair
         };
-        let accepted = pending.submit(kind).await?;
-        Ok(Response::new(convert::job(&accepted.job)))
+        let Accepted { job, .. } = pending.submit(kind).await?;
+        // The job is accepted, even where the queue cannot be asked now.
+        let wait = service.waiting(&job).await.unwrap_or_default();
+        Ok(Response::new(proto::Job {
+            wait: wait.map(convert::wait),
+            ..convert::job(&job)
+        }))
     }
 
     async fn get_job(
@@ -302,6 +321,7 @@ impl SceneFlow for Calls {
         let mut message = convert::job(&job);
         let pairs = self.service.pairs(&job).await?;
         message.pair_ids = pairs.iter().map(|pair| pair.id.to_string()).collect();
+        message.wait = self.service.waiting(&job).await?.map(convert::wait);
         Ok(Response::new(message))
     }
 

@@ -8,13 +8,14 @@ use tonic::metadata::MetadataMap;
 use super::proto;
 use crate::api::error::ApiError;
 use crate::api::results::Answer;
+use crate::api::waiting::Waiting;
 use crate::flow::tracks::{Track, TrackState};
 use crate::flow::{Cluster, RigidTransform};
 use crate::formats::{ego_motion, rigid_motion};
 use crate::job::{
-    DenseReport, Densify, DeviceChoice, EgoChoice, FieldChoices, GroundChoice, Job, JobError,
-    JobId, JobOptions, JobProgress, Kind, Labels, LaterSweepsChoice, PrecisionChoice, PresetChoice,
-    Priority, State,
+    Delivery, DeliveryState, DenseReport, Densify, DeviceChoice, EgoChoice, FieldChoices,
+    GroundChoice, Job, JobError, JobId, JobOptions, JobProgress, Kind, Labels, LaterSweepsChoice,
+    PrecisionChoice, PresetChoice, Priority, State,
 };
 
 fn unknown(field: &str, number: i32) -> ApiError {
@@ -25,7 +26,7 @@ fn unknown(field: &str, number: i32) -> ApiError {
 ///
 /// # Errors
 /// [`ApiError::InvalidOptions`].
-pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, ApiError> {
+pub(super) fn options(message: Option<Box<proto::Options>>) -> Result<JobOptions, ApiError> {
     let Some(message) = message else {
         return Ok(JobOptions::default());
     };
@@ -85,6 +86,7 @@ pub(super) fn options(message: Option<proto::Options>) -> Result<JobOptions, Api
         priority,
         labels: Labels(message.labels.into_iter().collect()),
         webhook: Some(message.webhook).filter(|url| !url.is_empty()),
+        result_uri: Some(message.result_uri).filter(|uri| !uri.is_empty()),
         densify: message.densify.map(densify).transpose()?,
     };
     options.check()?;
@@ -187,7 +189,7 @@ fn state(state: State) -> proto::State {
     }
 }
 
-/// Converts a job. `pair_ids` remains empty.
+/// Converts a job. `pair_ids` and `wait` remain empty.
 pub(super) fn job(job: &Job) -> proto::Job {
     let moment = |moment: Option<crate::clock::Timestamp>| {
         moment.map(|moment| moment.to_string()).unwrap_or_default()
@@ -211,6 +213,28 @@ pub(super) fn job(job: &Job) -> proto::Job {
         pairs_left: job.pairs_left,
         labels: Labels::of_options(&job.options).0.into_iter().collect(),
         trace_id: job.trace_id().unwrap_or_default().to_owned(),
+        delivery: job.delivery.as_ref().map(delivery),
+        wait: None,
+    }
+}
+
+fn delivery(delivery: &Delivery) -> proto::Delivery {
+    let state = match delivery.state {
+        DeliveryState::Pending => proto::DeliveryState::Pending,
+        DeliveryState::Delivered => proto::DeliveryState::Delivered,
+        DeliveryState::GivenUp => proto::DeliveryState::GivenUp,
+    };
+    proto::Delivery {
+        uri: delivery.uri.clone(),
+        state: state.into(),
+    }
+}
+
+/// Converts the wait of a queued job.
+pub(super) fn wait(waiting: Waiting) -> proto::Wait {
+    proto::Wait {
+        ahead: waiting.ahead,
+        seconds: waiting.seconds,
     }
 }
 
@@ -369,7 +393,9 @@ mod tests {
         let refused = |change: fn(&mut proto::Options)| {
             let mut message = proto::Options::default();
             change(&mut message);
-            options(Some(message)).expect_err("a refusal").to_string()
+            options(Some(Box::new(message)))
+                .expect_err("a refusal")
+                .to_string()
         };
         assert!(refused(|o| o.preset = 99).contains("preset has no value 99"));
         assert!(refused(|o| o.priority = -1).contains("priority has no value -1"));
@@ -386,10 +412,7 @@ mod tests {
         assert!(refused(|o| o.crop_m = Some(f32::NAN)).contains("crop_m"));
         assert!(refused(|o| o.min_range_m = Some(f32::NAN)).contains("min_range_m"));
         assert!(refused(|o| o.max_points = Some(1)).contains("max_points is 1"));
-        assert_eq!(
-            options(Some(proto::Options::default())),
-            Ok(JobOptions::default())
-        );
+        assert_eq!(options(Some(Box::default())), Ok(JobOptions::default()));
         assert_eq!(options(None), Ok(JobOptions::default()));
     }
 
@@ -403,7 +426,7 @@ mod tests {
                 preset: value.expect("the protocol has the preset").into(),
                 ..proto::Options::default()
             };
-            let read = options(Some(message)).expect("good options");
+            let read = options(Some(Box::new(message))).expect("good options");
             assert_eq!(read.preset.preset(), preset);
         }
     }

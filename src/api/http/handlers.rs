@@ -115,13 +115,13 @@ pub(super) async fn estimate(
     let Accepted { job, awaited, .. } =
         submit_pair(&service, caller, &asked, durability, request).await?;
     if durability == Durability::Durable {
-        return Ok(accepted(&job, asked.prefer));
+        return Ok(accepted(&service, &job, asked.prefer).await);
     }
     let longest = asked.prefer.wait.filter(|_| asked.prefer.respond_async);
     let response = match service.wait(job.id, longest).await? {
         Waited::Ended(job) => results::flow(&service, &job, format).await,
         Waited::StillOpen(job) if longest.is_some() => match service.make_durable(&job).await {
-            Ok(job) => Ok(accepted(&job, asked.prefer)),
+            Ok(job) => Ok(accepted(&service, &job, asked.prefer).await),
             Err(MakeDurable::GivenUp) => Err(ApiError::Cancelled(job.id)),
             Err(MakeDurable::Failed(error)) => return Err(error),
         },
@@ -258,7 +258,7 @@ async fn submit(
     service
         .metrics
         .phase("decode", body.decode_seconds(), Some(&job));
-    let mut response = accepted(&job, Prefer::default());
+    let mut response = accepted(service, &job, Prefer::default()).await;
     if !new {
         *response.status_mut() = StatusCode::OK;
     }
@@ -325,8 +325,11 @@ async fn read_job(
 }
 
 /// The 202 response with the location of the job.
-fn accepted(job: &Arc<Job>, prefer: Prefer) -> Response {
-    let mut response = (StatusCode::ACCEPTED, Json(JobView::new(job, &[]))).into_response();
+async fn accepted(service: &Service, job: &Arc<Job>, prefer: Prefer) -> Response {
+    // The job is accepted, even where the queue cannot be asked now.
+    let wait = service.waiting(job).await.unwrap_or_default();
+    let view = JobView::new(job, &[]).with_wait(wait);
+    let mut response = (StatusCode::ACCEPTED, Json(view)).into_response();
     let headers = response.headers_mut();
     let mut set = |name: &'static str, value: String| {
         if let Ok(value) = HeaderValue::from_str(&value) {
@@ -377,7 +380,10 @@ pub(super) async fn get_job(
         };
     }
     let pairs = service.pairs(&job).await?;
-    Ok(Json(JobView::shown_to(&caller, &job, &pairs)))
+    let wait = service.waiting(&job).await?;
+    Ok(Json(
+        JobView::shown_to(&caller, &job, &pairs).with_wait(wait),
+    ))
 }
 
 /// The query parameters of a cancellation.

@@ -14,15 +14,14 @@ use super::metered::{Meter, metered};
 use crate::api::auth::Caller;
 use crate::api::codec;
 use crate::api::error::ApiError;
+use crate::api::fetch::append;
 use crate::api::pending_job::PendingJob;
-use crate::api::permits::FairQueue;
 use crate::api::service::Service;
 use crate::api::upload_budget::UploadReservation;
 use crate::formats;
 use crate::formats::{FormatError, PoseFile};
 use crate::job::JobOptions;
 use crate::payload::StoredCloud;
-use crate::remote::Sources;
 
 /// The required media type.
 const MULTIPART: &[u8] = b"multipart/form-data";
@@ -137,7 +136,6 @@ impl Body {
         };
         self.meter.understood();
         let mut reading = Reading {
-            fetches: &self.service.fetches,
             room: &mut self.room,
             meter: &self.meter,
         };
@@ -169,9 +167,8 @@ impl Body {
             "source_uri" | "target_uri" | "sweep_uri" => {
                 let uri = reading.whole(field, MAX_URI).await?;
                 let uri = String::from_utf8_lossy(&uri);
-                let (file, bytes) = reading
-                    .fetch(&self.service.sources, &name, uri.trim())
-                    .await?;
+                let fetched = self.service.fetch(&mut self.room, &name, uri.trim());
+                let (file, bytes) = fetched.await?;
                 let part = name.trim_end_matches("_uri").to_owned();
                 Ok(Some(Part::File(part, Some(file), bytes)))
             }
@@ -192,15 +189,11 @@ impl Body {
         name: Option<String>,
         bytes: Vec<u8>,
     ) -> Result<(StoredCloud, UploadReservation), ApiError> {
-        let most = self.service.admission.limits().max_points;
-        let mut room = self.room.another();
-        self.timed(move || {
-            // A small compressed file may decode to a large cloud.
-            room.hold(codec::unfolded_bytes(&part, &bytes, name.as_deref(), most)?)?;
-            let cloud = codec::read_cloud(&part, &bytes, name.as_deref(), most)?;
-            Ok((cloud, room))
-        })
-        .await
+        let began = Instant::now();
+        let room = self.room.another();
+        let decoded = self.service.decode(room, part, name, bytes).await?;
+        self.decode_seconds += began.elapsed().as_secs_f64();
+        Ok(decoded)
     }
 
     /// Decodes the sweep with index `index` as [`Body::cloud`], and gives it its pose.
@@ -343,7 +336,6 @@ async fn drain<E>(pieces: impl Stream<Item = Result<usize, E>>) {
 
 /// The reservation and the meter that reading a part updates.
 struct Reading<'a> {
-    fetches: &'a FairQueue,
     room: &'a mut UploadReservation,
     meter: &'a Meter,
 }
@@ -367,42 +359,6 @@ impl Reading<'_> {
             append(&mut bytes, &piece);
         }
     }
-
-    /// Fetches the file that the part `part` names. It counts as if it were sent in its place. Returns
-    /// the name of the file and its content.
-    async fn fetch(
-        &mut self,
-        sources: &Sources,
-        part: &str,
-        uri: &str,
-    ) -> Result<(String, Vec<u8>), ApiError> {
-        let refused = |error| ApiError::source(part, &error);
-        let tenant = self.room.tenant().clone();
-        let _turn = self.fetches.wait(&tenant).await;
-        let opened = self.room.wait(sources.open(uri)).await?;
-        let mut download = opened.map_err(refused)?;
-        let mut bytes = Vec::new();
-        while let Some(piece) = self.room.wait(download.pieces.next()).await? {
-            let piece = piece.map_err(refused)?;
-            self.room.take(piece.len())?;
-            append(&mut bytes, &piece);
-        }
-        match download.blake3 {
-            Some(expected) if blake3::hash(&bytes) != expected => Err(ApiError::BadInput(format!(
-                "{part}: the file has another hash than the URI"
-            ))),
-            _ => Ok((download.name, bytes)),
-        }
-    }
-}
-
-/// Appends a piece of a file.
-fn append(bytes: &mut Vec<u8>, piece: &[u8]) {
-    if bytes.capacity() - bytes.len() < piece.len() {
-        // Doubling the capacity would take twice the size of a large file.
-        bytes.reserve_exact(piece.len().max(bytes.len() / 4));
-    }
-    bytes.extend_from_slice(piece);
 }
 
 #[expect(clippy::needless_pass_by_value, reason = "it is for map_err")]

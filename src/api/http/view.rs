@@ -7,7 +7,8 @@ use serde_json::value::{RawValue, Value};
 use utoipa::ToSchema;
 
 use crate::api::auth::Caller;
-use crate::job::{Job, JobError, JobProgress, Kind, State};
+use crate::api::waiting::Waiting;
+use crate::job::{DeliveryState, Job, JobError, JobProgress, Kind, State};
 
 /// A job.
 #[derive(Debug, Serialize, ToSchema)]
@@ -30,6 +31,12 @@ pub(super) struct JobView {
     attempt: u32,
     /// The progress of the estimate.
     progress: Option<JobProgress>,
+    /// How long the job waits. Only present when a single queued job is requested or accepted.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    wait: Option<Waiting>,
+    /// Where the result is delivered to, if the job has a `result_uri`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    delivery: Option<DeliveryView>,
     /// Why the estimate stopped: `completed`, `converged`, `max_iterations` or `deadline`.
     stop_reason: Option<String>,
     /// Why the job failed.
@@ -59,6 +66,15 @@ pub(super) struct JobView {
 enum Reported {
     Flow(Box<crate::job::Report>),
     Cloud(crate::job::DenseReport),
+}
+
+/// The delivery of a result.
+#[derive(Debug, Serialize, ToSchema)]
+struct DeliveryView {
+    /// The URI of the object.
+    uri: String,
+    /// How far the delivery is.
+    state: DeliveryState,
 }
 
 /// The pairs of a sequence, and its progress.
@@ -103,13 +119,14 @@ pub(super) fn path(job: &Job) -> String {
     format!("/v1/jobs/{}", job.id)
 }
 
-/// The options as a caller may see them: a webhook's URL may hold a secret of who submitted the job, and
-/// labels are not for who has a link to it.
+/// The options as a caller may see them: a webhook's URL may hold a secret of who submitted the job.
+/// Labels and places of results are not for who has a link to it.
 fn options_for(caller: &Caller, options: &str) -> Option<Box<RawValue>> {
     let mut shown: serde_json::Map<String, Value> = serde_json::from_str(options).ok()?;
     shown.remove("webhook");
     if caller.shared_job.is_some() {
         shown.remove("labels");
+        shown.remove("result_uri");
     }
     serde_json::value::to_raw_value(&shown).ok()
 }
@@ -121,7 +138,15 @@ impl JobView {
         if caller.may_write().is_err() {
             view.options = options_for(caller, &job.options);
         }
+        if caller.shared_job.is_some() {
+            view.delivery = None;
+        }
         view
+    }
+
+    /// The representation with the time that the job waits.
+    pub(super) fn with_wait(self, wait: Option<Waiting>) -> Self {
+        Self { wait, ..self }
     }
 
     /// The representation of a job. `pairs` are the pairs to include for a sequence.
@@ -143,6 +168,11 @@ impl JobView {
             deadline: job.deadline.map(|moment| moment.to_string()),
             attempt: job.attempt,
             progress: job.progress,
+            wait: None,
+            delivery: job.delivery.as_ref().map(|delivery| DeliveryView {
+                uri: delivery.uri.clone(),
+                state: delivery.state,
+            }),
             stop_reason: job.stop_reason.clone(),
             error: job.error.clone(),
             dead_letter: job.dead,

@@ -66,6 +66,12 @@ pub(super) fn read(bytes: Bytes) -> Result<Table, ManifestError> {
     let mut left = MAX_BYTES;
     for batch in reader.map_err(|error| unreadable(&error))? {
         let batch = batch.map_err(|error| unreadable(&error))?;
+        // Without a known column the row groups alone say how many rows there are.
+        if table.rows.len() + batch.num_rows() > rows {
+            return Err(unreadable(&format!(
+                "it holds more than the {rows} rows that it claims"
+            )));
+        }
         take(&batch, &mut table.rows, &mut left)?;
     }
     Ok(table)

@@ -42,11 +42,7 @@ pub(crate) async fn jobs_that_wait_for_one_kind_hold_up_no_other(stand: &mut imp
     assert_eq!(lease_on(&queue, DeviceKind::Cpu).await.job.id, second.id);
     nothing_is_ready_for(&queue, DeviceKind::Cpu).await;
     assert_eq!(lease_on(&queue, DeviceKind::Gpu).await.job.id, urgent.id);
-    let tenant = tenant("b");
-    let ahead = |kind| {
-        let backlog = queue.backlog();
-        backlog.ahead_of(&tenant, Priority::Low, 1.0, kind)
-    };
+    let ahead = |kind| queue.backlog().ahead_of(Priority::Low, 1.0, kind);
     assert_eq!(ahead(Some(DeviceKind::Gpu)), 20.0);
     let only_for = |kind| queue.backlog().queued_only_for(kind).jobs;
     assert_eq!(DeviceKind::ALL.map(only_for), [0, 20]);

@@ -43,6 +43,53 @@ async fn finish_next(queue: &Arc<dyn Queue>) -> Arc<Job> {
     held.job
 }
 
+pub(crate) async fn a_queued_job_knows_how_many_start_before_it(stand: &mut impl Stand) {
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
+    let of = async |job: &Job| queue.standing(job.id).await.expect("an answer");
+    let mut mine = Vec::new();
+    for _ in 0..3 {
+        mine.push(submit(&queue, submission("a")).await);
+    }
+    let other = submit(&queue, submission("b")).await;
+    let urgent = Submission {
+        priority: Priority::High,
+        device: Some(DeviceKind::Gpu),
+        ..submission("c")
+    };
+    let urgent = submit(&queue, urgent).await;
+    let whole = submit(&queue, sequence(2)).await;
+    // The tenants take turns, and the urgent job needs another kind of device than a job for CPUs.
+    let expected = [(1, 0.0), (3, 1.0), (4, 2.0)];
+    for (job, (ahead, share_seconds)) in mine.iter().zip(expected) {
+        let standing = Standing {
+            ahead,
+            share_seconds,
+        };
+        assert_eq!(of(job).await, Some(standing));
+    }
+    assert_eq!(of(&other).await.map(|found| found.ahead), Some(2));
+    assert_eq!(of(&urgent).await.map(|found| found.ahead), Some(0));
+    let on_cpu = Submission {
+        device: Some(DeviceKind::Cpu),
+        ..submission("d")
+    };
+    let on_cpu = submit(&queue, on_cpu).await;
+    // Behind those that came before with the same tag.
+    assert_eq!(of(&on_cpu).await.map(|found| found.ahead), Some(2));
+    // A sequence stands where its first pair does.
+    assert_eq!(of(&whole).await.map(|found| found.share_seconds), Some(3.0));
+    let held = lease_on(&queue, DeviceKind::Cpu).await;
+    assert_eq!(held.job.id, mine[0].id);
+    assert_eq!(of(&held.job).await, None);
+    assert_eq!(
+        of(&mine[1]).await.map(|found| found.share_seconds),
+        Some(1.0)
+    );
+    queue.cancel(mine[1].id).await.expect("cancelled");
+    assert_eq!(of(&mine[1]).await, None);
+    assert_eq!(queue.standing(JobId::fresh()).await, Ok(None));
+}
+
 pub(crate) async fn a_job_is_leased_only_when_the_one_that_it_comes_after_has_ended(
     stand: &mut impl Stand,
 ) {

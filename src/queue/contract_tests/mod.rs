@@ -19,7 +19,7 @@ use tokio::time::timeout;
 use super::lease::{Lease, Signal};
 use super::types::{
     Committed, Event, Filter, Idempotency, Outcome, PairOf, Queue, QueueError, QueueOptions,
-    Submission, Submitted,
+    Standing, Submission, Submitted,
 };
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, State, Tenant};
@@ -45,6 +45,7 @@ macro_rules! queue_contract {
             a_repeated_key_finds_the_first_job_and_another_payload_is_refused,
             higher_priorities_go_first_and_equals_in_order,
             tenants_share_by_predicted_work,
+            a_queued_job_knows_how_many_start_before_it,
             a_cancelled_job_ends_at_once_or_through_its_worker,
             a_deadline_that_passes_in_the_queue_ends_the_job_without_any_worker,
             failures_are_retried_later_and_given_up_in_the_end,
@@ -89,6 +90,9 @@ macro_rules! queue_contract {
             a_pair_that_fails_back_in_time_is_named_and_nothing_is_left_to_do,
             the_end_of_a_job_is_told_once_per_end_and_not_of_the_pairs_of_a_sequence,
             what_is_promised_is_taken_once_and_again_after_its_hold_or_delay_or_a_crash,
+            a_result_is_delivered_before_the_end_of_its_job_is_told,
+            each_forward_pair_of_a_sequence_is_delivered_and_then_its_end_is_told,
+            nothing_is_delivered_of_a_job_that_was_removed_or_is_done_again,
         }
     };
     ($stand:expr; $($name:ident,)*) => {

@@ -23,6 +23,7 @@ use crate::queue::database::{DatabaseQueue, Engine, Kept};
 use crate::queue::effects::Effects;
 use crate::queue::lease::HeartbeatStore;
 use crate::queue::local::Local;
+use crate::queue::migration::Migration;
 use crate::queue::node::{Capacities, Node};
 use crate::queue::sql::{Sql, values};
 use crate::queue::transitions;
@@ -51,17 +52,41 @@ pub async fn open_postgres(
     events: mpsc::UnboundedSender<Event>,
 ) -> Result<Arc<dyn Queue>, QueueError> {
     let (target, own) = (target.clone(), options.clone());
-    let (answer, opened) = oneshot::channel();
-    // A connection blocks, which the threads of the runtime must not.
-    let opening = move || {
-        let _gone_is_fine = answer.send(PostgresEngine::open(&target, own, events));
+    let engine = apart(move || PostgresEngine::open(&target, own, events)).await?;
+    Ok(Arc::new(DatabaseQueue::new(engine, options)))
+}
+
+/// Creates the tables of the queue in an empty database, or upgrades those of an older version. Nodes may
+/// run meanwhile.
+///
+/// # Errors
+/// As [`open_postgres`].
+pub async fn migrate_postgres(target: &PostgresOptions) -> Result<Migration, QueueError> {
+    let url = target
+        .direct_url
+        .as_deref()
+        .unwrap_or(&target.url)
+        .to_owned();
+    let migrating = move || {
+        let mut session = Session::new(Target::of(&url)?, Arc::new(ThisNode::new()), 0);
+        Ok(schema::prepare(&mut session)?.migration)
+    };
+    apart(migrating).await
+}
+
+/// Runs work on a thread of its own: a connection blocks, which the threads of the runtime must not.
+async fn apart<T: Send + 'static>(
+    work: impl FnOnce() -> Result<T, QueueError> + Send + 'static,
+) -> Result<T, QueueError> {
+    let (answer, done) = oneshot::channel();
+    let working = move || {
+        let _gone_is_fine = answer.send(work());
     };
     thread::Builder::new()
         .name("queue-open".to_owned())
-        .spawn(opening)
+        .spawn(working)
         .map_err(|error| QueueError::Store(error.to_string()))?;
-    let engine = opened.await.map_err(|_| QueueError::Closed)??;
-    Ok(Arc::new(DatabaseQueue::new(engine, options)))
+    done.await.map_err(|_| QueueError::Closed)?
 }
 
 /// A node of a queue in a PostgreSQL database.
@@ -82,7 +107,7 @@ impl PostgresEngine {
         let me = Arc::new(ThisNode::new());
         let session = |target: &Target, place| Session::new(target.clone(), Arc::clone(&me), place);
         let mut own = session(&Target::of(direct)?, 0);
-        let identity = schema::prepare(&mut own)?;
+        let identity = schema::prepare(&mut own)?.identity;
         let local = Arc::new(Local::new(events));
         let shared = Arc::new(Shared::new(local, queue, &options.name, &me));
         let mut presence = Presence::new(Arc::clone(&shared), own);

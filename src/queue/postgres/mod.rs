@@ -28,5 +28,5 @@ mod tests;
 mod this_node;
 mod upkeep;
 
-pub use engine::open_postgres;
+pub use engine::{migrate_postgres, open_postgres};
 pub use target::PostgresOptions;

@@ -6,22 +6,29 @@ use super::locks::SCHEMA;
 use super::session::{Flush, Session};
 use crate::queue::database::new_identity;
 use crate::queue::effects::Effects;
+use crate::queue::migration::Migration;
 use crate::queue::sql::{Sql, values};
 use crate::queue::types::QueueError;
 
 /// The schema version that this program reads and writes.
-const VERSION: i64 = 3;
+const VERSION: i64 = 4;
 
 /// The oldest schema version that is upgraded.
 const OLDEST: i64 = 2;
 
 /// The changes from each version to the next, beginning with [`OLDEST`]. Nodes of the version before
 /// may still run: they must get along with the tables.
-const UPGRADES: [&[&str]; (VERSION - OLDEST) as usize] = [&[
-    "ALTER TABLE jobs ADD COLUMN trace text, ADD COLUMN webhook text",
-    OUTBOX,
-    OUTBOX_DUE,
-]];
+const UPGRADES: [&[&str]; (VERSION - OLDEST) as usize] = [
+    &[
+        "ALTER TABLE jobs ADD COLUMN trace text, ADD COLUMN webhook text",
+        OUTBOX,
+        OUTBOX_DUE,
+    ],
+    &[
+        "ALTER TABLE jobs ADD COLUMN result_uri text, ADD COLUMN delivery smallint",
+        OUTBOX_JOB,
+    ],
+];
 
 const OUTBOX: &str = "CREATE TABLE outbox (
         seq bigint GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
@@ -33,6 +40,7 @@ const OUTBOX: &str = "CREATE TABLE outbox (
     ) WITH (autovacuum_vacuum_scale_factor = 0, autovacuum_vacuum_threshold = 1000)";
 
 const OUTBOX_DUE: &str = "CREATE INDEX outbox_due ON outbox (due)";
+const OUTBOX_JOB: &str = "CREATE INDEX outbox_job ON outbox (job)";
 
 /// `jobs` has the columns of the embedded queue, with the same meanings. Rows change often, so
 /// pages keep room for new versions of a row, and the table is vacuumed early.
@@ -40,9 +48,10 @@ const OUTBOX_DUE: &str = "CREATE INDEX outbox_due ON outbox (due)";
 /// `nodes` has a row for each process that takes part. `commits` has the last commit of each
 /// connection of a node: it decides whether a transaction was committed whose answer was lost.
 /// `labels` has one row for each label of a job, with the job's tenant as `owner`. `outbox` has one
-/// row for each action outside the database that a commit has promised: a notice to `url`, or without
-/// one the removal of the job's files. `summary` has one row, the last count of the load.
-const TABLES: [&str; 21] = [
+/// row for each action outside the database that a commit has promised: a notice to `url`, without a
+/// `body` the delivery of the job's result to it, and without a `url` the removal of the job's files.
+/// `summary` has one row, the last count of the load.
+const TABLES: [&str; 22] = [
     "CREATE TABLE meta (version bigint NOT NULL, identity bigint NOT NULL)",
     "CREATE TABLE nodes (
         id integer GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
@@ -114,7 +123,9 @@ const TABLES: [&str; 21] = [
         cancel_requested smallint NOT NULL,
         report text,
         trace text,
-        webhook text
+        webhook text,
+        result_uri text,
+        delivery smallint
     ) WITH (fillfactor = 70, autovacuum_vacuum_scale_factor = 0.02,
             autovacuum_vacuum_cost_delay = 0, autovacuum_analyze_scale_factor = 0.05)",
     "CREATE UNIQUE INDEX jobs_id ON jobs (id)",
@@ -143,11 +154,20 @@ const TABLES: [&str; 21] = [
     "CREATE INDEX labels_job ON labels (job)",
     OUTBOX,
     OUTBOX_DUE,
+    OUTBOX_JOB,
 ];
 
-/// Creates the tables in an empty database, or checks their version. Returns the number that
-/// identifies the queue.
-pub(super) fn prepare(session: &mut Session) -> Result<i32, QueueError> {
+/// A database with the tables of this program's version.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Prepared {
+    /// The number that identifies the queue.
+    pub(super) identity: i32,
+    /// The versions before and now.
+    pub(super) migration: Migration,
+}
+
+/// Creates the tables in an empty database, or upgrades those of an older version.
+pub(super) fn prepare(session: &mut Session) -> Result<Prepared, QueueError> {
     let identity = new_identity();
     let commit = session.transact(Flush::Always, Instant::now(), |sql, _: &mut Effects| {
         create(sql, identity)
@@ -155,13 +175,14 @@ pub(super) fn prepare(session: &mut Session) -> Result<i32, QueueError> {
     Ok(commit.value)
 }
 
-fn create(sql: &dyn Sql, identity: i32) -> Result<i32, QueueError> {
+fn create(sql: &dyn Sql, identity: i32) -> Result<Prepared, QueueError> {
     // Nodes that start at the same time create the tables once.
     let lock = format!("SELECT pg_advisory_xact_lock({SCHEMA}, 0)::text");
     sql.query(&lock, &[])?;
     let there = "SELECT to_regclass('meta') IS NOT NULL, to_regclass('jobs') IS NOT NULL";
     let row = sql.only(there, &[])?;
-    match (row.get(0)?, row.get(1)?) {
+    let is_there: bool = row.get(0)?;
+    match (is_there, row.get(1)?) {
         (true, _) => {}
         (false, true) => {
             let other = "its database has a table jobs that is not of fnsf: give the queue a \
@@ -211,5 +232,11 @@ fn create(sql: &dyn Sql, identity: i32) -> Result<i32, QueueError> {
              REVOKE CONNECT, TEMPORARY ON DATABASE its_name FROM PUBLIC"
         );
     }
-    row.get(1)
+    Ok(Prepared {
+        identity: row.get(1)?,
+        migration: Migration {
+            from: if is_there { version } else { 0 },
+            to: VERSION,
+        },
+    })
 }

@@ -21,6 +21,7 @@ use crate::queue::database::{DatabaseQueue, Engine, Kept};
 use crate::queue::effects::Effects;
 use crate::queue::lease::HeartbeatStore;
 use crate::queue::local::Local;
+use crate::queue::migration::Migration;
 use crate::queue::node::{Capacities, Node};
 use crate::queue::sql::Sql;
 use crate::queue::transitions;
@@ -79,20 +80,7 @@ impl SqliteEngine {
             QueueError::Store(format!("cannot use {}: {error}", folder.display()))
         };
         std::fs::create_dir_all(folder).map_err(store)?;
-        let lock_path = folder.join("queue.lock");
-        let mut options_of_lock = File::options();
-        let lock = options_of_lock.write(true).create(true).truncate(false);
-        let lock = lock.open(&lock_path).map_err(store)?;
-        match lock.try_lock() {
-            Ok(()) => {}
-            Err(TryLockError::WouldBlock) => {
-                return Err(QueueError::Store(format!(
-                    "another process has the queue in {} open",
-                    folder.display()
-                )));
-            }
-            Err(TryLockError::Error(error)) => return Err(store(error)),
-        }
+        let (lock, lock_path) = lock(folder)?;
         let path = folder.join("queue.sqlite3");
         let connection = schema::open_writer(&path)?;
         let identity = connection.pragma_query_value(None, "application_id", |row| row.get(0))?;
@@ -114,6 +102,40 @@ impl SqliteEngine {
             _lock: lock,
         })
     }
+}
+
+/// Locks the queue in a folder for this process. Returns the lock's file and its path.
+fn lock(folder: &Path) -> Result<(File, PathBuf), QueueError> {
+    let store = |error: std::io::Error| {
+        QueueError::Store(format!("cannot use {}: {error}", folder.display()))
+    };
+    let path = folder.join("queue.lock");
+    let mut options = File::options();
+    let options = options.write(true).create(true).truncate(false);
+    let lock = options.open(&path).map_err(store)?;
+    match lock.try_lock() {
+        Ok(()) => Ok((lock, path)),
+        Err(TryLockError::WouldBlock) => Err(QueueError::Store(format!(
+            "another process has the queue in {} open",
+            folder.display()
+        ))),
+        Err(TryLockError::Error(error)) => Err(store(error)),
+    }
+}
+
+/// Upgrades the file of the queue in `folder` to the schema version of this program.
+///
+/// # Errors
+/// As [`open_sqlite`].
+pub fn migrate_sqlite(folder: &Path) -> Result<Migration, QueueError> {
+    let _lock = lock(folder)?;
+    let path = folder.join("queue.sqlite3");
+    let from = schema::version(&Connection::open(&path)?)?;
+    schema::open_writer(&path)?;
+    Ok(Migration {
+        from,
+        to: schema::VERSION,
+    })
 }
 
 /// Takes over what the last process left behind. `orderly` tells whether it had stopped in order.

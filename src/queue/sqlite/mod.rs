@@ -17,4 +17,4 @@ mod tests;
 mod writer;
 
 pub use backup::{CopiedQueue, copy_sqlite, read_copy};
-pub use engine::open_sqlite;
+pub use engine::{migrate_sqlite, open_sqlite};

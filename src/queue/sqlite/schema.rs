@@ -13,17 +13,24 @@ use crate::queue::database::new_identity;
 use crate::queue::types::QueueError;
 
 /// The schema version that this program reads and writes; stored in `user_version`.
-pub(super) const VERSION: i64 = 9;
+pub(super) const VERSION: i64 = 10;
 
 /// The oldest schema version that is upgraded.
 pub(super) const OLDEST: i64 = 8;
 
 /// The changes from each version to the next, beginning with [`OLDEST`].
-const UPGRADES: [&[&str]; (VERSION - OLDEST) as usize] = [&[
-    "ALTER TABLE jobs ADD COLUMN trace TEXT",
-    "ALTER TABLE jobs ADD COLUMN webhook TEXT",
-    OUTBOX,
-]];
+const UPGRADES: [&[&str]; (VERSION - OLDEST) as usize] = [
+    &[
+        "ALTER TABLE jobs ADD COLUMN trace TEXT",
+        "ALTER TABLE jobs ADD COLUMN webhook TEXT",
+        OUTBOX,
+    ],
+    &[
+        "ALTER TABLE jobs ADD COLUMN result_uri TEXT",
+        "ALTER TABLE jobs ADD COLUMN delivery INTEGER",
+        OUTBOX_JOB,
+    ],
+];
 
 const OUTBOX: &str = "
 CREATE TABLE outbox (
@@ -37,6 +44,8 @@ CREATE TABLE outbox (
 CREATE INDEX outbox_due ON outbox (due);
 ";
 
+const OUTBOX_JOB: &str = "CREATE INDEX outbox_job ON outbox (job);";
+
 /// `due` is the next time at which the expiry handles a row: the expiry or the end of the retry
 /// delay of a queued job, the end of a running job's lease, or the end of an ended job's retention.
 /// `ready` is the time since which a job can be leased. It is null while the job follows one that
@@ -45,8 +54,8 @@ CREATE INDEX outbox_due ON outbox (due);
 /// it or held it last.
 ///
 /// `labels` has one row for each label of a job, with the job's tenant as `owner`. `outbox` has one
-/// row for each action outside the database that a commit has promised: a notice to `url`, or without
-/// one the removal of the job's files.
+/// row for each action outside the database that a commit has promised: a notice to `url`, without a
+/// `body` the delivery of the job's result to it, and without a `url` the removal of the job's files.
 const TABLE: &str = "
 CREATE TABLE jobs (
     seq INTEGER PRIMARY KEY,
@@ -99,7 +108,9 @@ CREATE TABLE jobs (
     cancel_requested INTEGER NOT NULL,
     report TEXT,
     trace TEXT,
-    webhook TEXT
+    webhook TEXT,
+    result_uri TEXT,
+    delivery INTEGER
 );
 CREATE UNIQUE INDEX jobs_id ON jobs (id);
 CREATE UNIQUE INDEX jobs_key ON jobs (tenant, idempotency_key) WHERE idempotency_key IS NOT NULL;
@@ -156,13 +167,18 @@ fn open(path: &std::path::Path) -> Result<Connection, QueueError> {
 pub(super) fn create(connection: &Connection) -> Result<(), QueueError> {
     connection.execute_batch(TABLE)?;
     connection.execute_batch(OUTBOX)?;
+    connection.execute_batch(OUTBOX_JOB)?;
     Ok(())
+}
+
+/// The schema version of a file; 0 of an empty one.
+pub(super) fn version(connection: &Connection) -> Result<i64, QueueError> {
+    Ok(connection.pragma_query_value(None, "user_version", |row| row.get(0))?)
 }
 
 fn migrate(connection: &mut Connection) -> Result<(), QueueError> {
     let transaction = connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
-    let found: i64 = transaction.pragma_query_value(None, "user_version", |row| row.get(0))?;
-    match found {
+    match version(&transaction)? {
         0 => {
             create(&transaction)?;
             transaction.pragma_update(None, "application_id", new_identity())?;

@@ -14,7 +14,7 @@ use crate::queue::contract_tests::{Stand, queue_contract, submission};
 use crate::queue::database::Engine;
 use crate::queue::lease::Signal;
 use crate::queue::sql::for_sqlite;
-use crate::queue::transitions::{expiry, fair_queue, leases, lists, outbox};
+use crate::queue::transitions::{expiry, fair_queue, leases, lists, outbox, standing};
 use crate::queue::types::{Event, Filter, Queue, QueueError, QueueOptions};
 
 /// A folder in which the queue is opened repeatedly.
@@ -93,10 +93,13 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
         (leases::FIRST_READY, 1),
         (fair_queue::FOLLOWERS, 1),
         (fair_queue::FIRST_TAG, 2),
+        (standing::HIGHER, 3),
+        (standing::EARLIER, 5),
         (fair_queue::LAST_OF_TENANT, 2),
         (expiry::OLDEST, 0),
         (expiry::NEXT_DUE, 0),
         (outbox::DUE, 2),
+        (outbox::UNDELIVERED, 1),
     ] {
         let plan = plan(&connection, sql, parameters);
         assert!(!plan.contains("TEMP B-TREE"), "{sql}: {plan}");

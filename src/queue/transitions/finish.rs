@@ -72,6 +72,7 @@ pub(super) fn end(
         };
         list.push(Arc::clone(&ended));
     }
+    outbox::deliver(sql, &ended)?;
     outbox::notify(sql, &ended)?;
     effects.changed.push(Arc::clone(&ended));
     effects.events.push(Event::Ended(ended));
@@ -192,7 +193,8 @@ pub(in crate::queue) fn requeue(
          started = NULL, finished = NULL, deadline = NULL, expires = ?3, \
          due = CASE WHEN kind = 0 THEN ?3 END, stop_reason = NULL, report = NULL, \
          error_code = NULL, error_message = NULL, error_retryable = 0, dead = 0, \
-         cancel_requested = 0, progress_done = NULL, virtual_start = ?4, virtual_finish = ?4 + cost, \
+         cancel_requested = 0, progress_done = NULL, \
+         delivery = CASE WHEN result_uri IS NOT NULL THEN 0 END, virtual_start = ?4, virtual_finish = ?4 + cost, \
          ready = ?5 WHERE id = ?1 RETURNING {COLUMNS}"
     );
     // Like a new job, it is queued behind the jobs that its tenant has waiting now.

@@ -15,6 +15,7 @@ pub(super) mod leases;
 pub(super) mod lists;
 pub(super) mod outbox;
 mod rows;
+pub(super) mod standing;
 mod submit;
 
 pub(super) use finish::{abandon, cancel, make_durable, requeue};

@@ -3,20 +3,44 @@
 //! A row is written in the transaction that ends or removes a job, so that no crash loses it. A node
 //! takes the rows that are due, and holds them for a while.
 
+use std::sync::Arc;
 use std::time::Duration;
 
-use crate::job::{Job, JobId, ended_notice};
+use super::rows;
+use super::rows::delivery_code;
+use crate::job::{DeliveryState, Job, JobId, State, ended_notice};
 use crate::queue::outgoing::{Action, Outgoing, Settled};
-use crate::queue::sql::{Row, Sql, values};
+use crate::queue::sql::{Sql, values};
 use crate::queue::types::QueueError;
 
 /// The statement that finds due rows. The query plan test also uses it.
 pub(in crate::queue) const DUE: &str =
     "SELECT seq FROM outbox INDEXED BY outbox_due WHERE due <= ?1 ORDER BY due LIMIT ?2";
 
+/// A delivery may take this many times as long as other actions.
+const DELIVERY_HOLDS: u32 = 10;
+
+/// When a notice is looked at again whose job is still delivering its result.
+const NOTICE_DELAY: Duration = Duration::from_millis(500);
+
+/// The statement that finds a delivery of a job or of one of its pairs. The query plan test also uses it.
+pub(in crate::queue) const UNDELIVERED: &str = "SELECT seq FROM outbox INDEXED BY outbox_job \
+    WHERE job IN (SELECT ?1 UNION ALL SELECT id FROM jobs INDEXED BY jobs_parent WHERE parent = ?1) \
+    AND url IS NOT NULL AND body IS NULL LIMIT 1";
+
 /// Promises to remove the files of a job.
 pub(super) fn remove_files(sql: &dyn Sql, id: JobId) -> Result<(), QueueError> {
     insert(sql, id, None, None)
+}
+
+/// Promises to deliver the result of a job that has succeeded, if there is a place for it.
+pub(super) fn deliver(sql: &dyn Sql, ended: &Job) -> Result<(), QueueError> {
+    match &ended.delivery {
+        Some(delivery) if ended.state == State::Succeeded => {
+            insert(sql, ended.id, Some(&delivery.uri), None)
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Promises to tell the webhook of a job, if it has one, of its end.
@@ -49,52 +73,94 @@ pub(in crate::queue) fn take(
     limit: u32,
     hold: Duration,
 ) -> Result<Vec<Outgoing>, QueueError> {
-    let now = sql.now();
     let due = sql.query(
         &format!("{DUE} FOR UPDATE SKIP LOCKED"),
-        values![now, i64::from(limit)],
+        values![sql.now(), i64::from(limit)],
     )?;
-    let text = "UPDATE outbox SET due = ?2, attempts = attempts + 1 WHERE seq = ?1 \
-                RETURNING seq, job, attempts, url, body";
-    let again = now.after(hold);
-    due.iter()
-        .map(|row| outgoing(&sql.only(text, values![row.get::<i64>(0)?, again])?))
-        .collect()
+    let mut taken = Vec::new();
+    for row in &due {
+        taken.extend(take_row(sql, row.get(0)?, hold)?);
+    }
+    Ok(taken)
 }
 
-fn outgoing(row: &Row) -> Result<Outgoing, QueueError> {
-    Ok(Outgoing {
-        number: row.get(0)?,
-        job: row.get(1)?,
-        attempts: row.get(2)?,
-        action: match row.get(3)? {
-            None => Action::RemoveFiles,
-            Some(url) => Action::Notify {
-                url,
-                body: row.get(4)?,
-            },
+/// Takes one row. `None` if there is nothing to do (any more), or not yet.
+fn take_row(sql: &dyn Sql, number: i64, hold: Duration) -> Result<Option<Outgoing>, QueueError> {
+    let text = "SELECT job, url, body FROM outbox WHERE seq = ?1";
+    let row = sql.only(text, values![number])?;
+    let job: JobId = row.get(0)?;
+    let (url, body): (Option<String>, Option<String>) = (row.get(1)?, row.get(2)?);
+    let (action, hold) = match (url, body) {
+        (None, _) => (Action::RemoveFiles, hold),
+        (Some(_), None) => match rows::find(sql, job)? {
+            Some(job) if job.state == State::Succeeded => {
+                (Action::Deliver(Arc::new(job)), hold * DELIVERY_HOLDS)
+            }
+            // It was removed, or is done again and then delivered by another row.
+            _ => {
+                sql.query("DELETE FROM outbox WHERE seq = ?1", values![number])?;
+                return Ok(None);
+            }
         },
-    })
+        (Some(_), Some(_)) if is_being_delivered(sql, job)? => {
+            put_off(sql, number, NOTICE_DELAY, 0)?;
+            return Ok(None);
+        }
+        (Some(url), Some(body)) => (Action::Notify { url, body }, hold),
+    };
+    let text = "UPDATE outbox SET due = ?2, attempts = attempts + 1 WHERE seq = ?1 \
+                RETURNING attempts";
+    let row = sql.only(text, values![number, sql.now().after(hold)])?;
+    Ok(Some(Outgoing {
+        number,
+        job,
+        attempts: row.get(0)?,
+        action,
+    }))
 }
 
-/// Removes the rows that are done, and makes the others due after their delay.
+/// Whether the result of a job, or of a pair of it, is still to be delivered.
+fn is_being_delivered(sql: &dyn Sql, job: JobId) -> Result<bool, QueueError> {
+    Ok(sql.first(UNDELIVERED, values![job])?.is_some())
+}
+
+/// Makes a row due after a delay, and does not count this many of its attempts.
+fn put_off(sql: &dyn Sql, number: i64, delay: Duration, attempts: i64) -> Result<(), QueueError> {
+    sql.query(
+        "UPDATE outbox SET due = ?2, attempts = attempts - ?3 WHERE seq = ?1",
+        values![number, sql.now().after(delay), attempts],
+    )?;
+    Ok(())
+}
+
+/// Removes the rows that are done or given up, and makes the others due after their delay.
 pub(in crate::queue) fn settle(
     sql: &dyn Sql,
     actions: &[(i64, Settled)],
 ) -> Result<(), QueueError> {
     for (number, settled) in actions {
-        let (delay, tries) = match *settled {
-            Settled::Done => {
-                sql.query("DELETE FROM outbox WHERE seq = ?1", values![*number])?;
-                continue;
-            }
-            Settled::Again(delay) => (delay, 0),
-            Settled::NotTried(delay) => (delay, 1),
-        };
-        sql.query(
-            "UPDATE outbox SET due = ?2, attempts = attempts - ?3 WHERE seq = ?1",
-            values![*number, sql.now().after(delay), tries],
-        )?;
+        match *settled {
+            Settled::Done => remove(sql, *number, DeliveryState::Delivered)?,
+            Settled::GivenUp => remove(sql, *number, DeliveryState::GivenUp)?,
+            Settled::Again(delay) => put_off(sql, *number, delay, 0)?,
+            Settled::NotTried(delay) => put_off(sql, *number, delay, 1)?,
+        }
+    }
+    Ok(())
+}
+
+/// Removes a row. If it is a delivery, notes its state with the job, unless the job is done again
+/// meanwhile.
+fn remove(sql: &dyn Sql, number: i64, state: DeliveryState) -> Result<(), QueueError> {
+    let text = "DELETE FROM outbox WHERE seq = ?1 RETURNING job, url, body";
+    let Some(row) = sql.first(text, values![number])? else {
+        return Ok(());
+    };
+    let (url, body): (Option<String>, Option<String>) = (row.get(1)?, row.get(2)?);
+    if url.is_some() && body.is_none() {
+        let text = "UPDATE jobs SET delivery = ?2 WHERE id = ?1 AND state = 2";
+        let job: JobId = row.get(0)?;
+        sql.query(text, values![job, delivery_code(state)])?;
     }
     Ok(())
 }

@@ -1,7 +1,9 @@
 //! Conversion between rows and jobs, and the locks of rows.
 
 use crate::clock::Timestamp;
-use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, State};
+use crate::job::{
+    Delivery, DeliveryState, DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, State,
+};
 use crate::queue::sql::{Row, Sql, values};
 use crate::queue::types::QueueError;
 
@@ -10,7 +12,7 @@ pub(super) const COLUMNS: &str = "id, tenant, kind, parent, pair_index, pairs, p
     state, durable, attempt, cost, options, created, started, finished, deadline, progress_done, \
     progress_total, loss, stop_reason, error_code, error_message, error_retryable, dead, \
     cancel_requested, report, device, backward, after, has_dependents, ready, sees_from, sees_to, \
-    crashes, trace, webhook";
+    crashes, trace, webhook, result_uri, delivery";
 
 pub(super) fn state_code(state: State) -> i64 {
     match state {
@@ -48,6 +50,15 @@ pub(super) fn kind_code(kind: Kind) -> i64 {
     match kind {
         Kind::Pair => 0,
         Kind::Sequence => 1,
+    }
+}
+
+/// The code of a delivery's state: its index in [`DeliveryState::ALL`].
+pub(super) fn delivery_code(state: DeliveryState) -> i64 {
+    match state {
+        DeliveryState::Pending => 0,
+        DeliveryState::Delivered => 1,
+        DeliveryState::GivenUp => 2,
     }
 }
 
@@ -103,6 +114,13 @@ pub(super) fn job(row: &Row) -> Result<Job, QueueError> {
         crashes: row.get(34)?,
         trace: row.get(35)?,
         webhook: row.get(36)?,
+        delivery: match row.get(37)? {
+            None => None,
+            Some(uri) => Some(Delivery {
+                uri,
+                state: row.choice(38, &DeliveryState::ALL)?,
+            }),
+        },
     })
 }
 

@@ -3,12 +3,12 @@
 use std::sync::Arc;
 
 use super::finish::make_durable;
-use super::rows::{COLUMNS, device_code, kind_code, priority_code};
+use super::rows::{COLUMNS, delivery_code, device_code, kind_code, priority_code};
 use super::{fair_queue, rows};
-use crate::job::{Job, JobId, Kind, State, Tenant};
+use crate::job::{DeliveryState, Job, JobId, Kind, State, Tenant, uri_of_pair};
 use crate::queue::effects::Effects;
 use crate::queue::sql::{Sql, values};
-use crate::queue::types::{Event, QueueError, QueueOptions, Submission, Submitted};
+use crate::queue::types::{Event, PairOf, QueueError, QueueOptions, Submission, Submitted};
 
 /// Accepts a job and, for a sequence, its pairs.
 pub(in crate::queue) fn submit(
@@ -48,6 +48,7 @@ pub(in crate::queue) fn submit(
                     idempotency: None,
                     labels: Vec::new(),
                     webhook: None,
+                    result_uri: uri_of(submission, of),
                     ..submission.clone()
                 };
                 let place = Place {
@@ -67,6 +68,12 @@ pub(in crate::queue) fn submit(
     }
     effects.events.push(Event::Submitted(Arc::clone(&job)));
     Ok(Submitted::New(job))
+}
+
+/// The URI that the flow of a sequence's pair is delivered to.
+fn uri_of(sequence: &Submission, pair: &PairOf) -> Option<String> {
+    let uri = sequence.result_uri.as_deref().filter(|_| !pair.backward)?;
+    uri_of_pair(uri, pair.index)
 }
 
 /// The job to which the idempotency key of a submission belongs, if it is the same submission.
@@ -152,12 +159,15 @@ fn insert(
          device, state, durable, delayed, attempt, failures, crashes, delays, cost, \
          virtual_start, virtual_finish, options, idempotency_key, fingerprint, created, deadline, \
          expires, due, error_retryable, dead, cancel_requested, backward, after, has_dependents, \
-         ready, closes, sees_from, sees_to, origin, trace, webhook) \
+         ready, closes, sees_from, sees_to, origin, trace, webhook, result_uri, delivery) \
          VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?6, ?7, ?19, 0, ?8, 0, 0, 0, 0, 0, \
          ?9, ?10, ?11, ?12, ?13, ?14, ?15, ?16, ?17, ?18, 0, 0, 0, ?20, ?21, ?22, ?23, ?24, ?25, \
-         ?26, ?27, ?28, ?29) RETURNING {COLUMNS}"
+         ?26, ?27, ?28, ?29, ?30, ?31) RETURNING {COLUMNS}"
     );
     let idempotency = submission.idempotency.as_ref();
+    // The URI of a sequence may be that of its pairs.
+    let result_uri = submission.result_uri.as_deref();
+    let result_uri = result_uri.filter(|uri| uri_of_pair(uri, 0).is_none());
     let row = sql.only(
         &text,
         values![
@@ -190,6 +200,8 @@ fn insert(
             sql.node(),
             submission.trace.as_deref(),
             submission.webhook.as_deref(),
+            result_uri,
+            result_uri.map(|_| delivery_code(DeliveryState::Pending)),
         ],
     )?;
     for label in &submission.labels {

@@ -13,7 +13,7 @@ use super::target::PostgresOptions;
 use crate::job::DeviceKind;
 use crate::queue::contract_tests::{Stand, queue_contract, submission};
 use crate::queue::sql::for_postgres;
-use crate::queue::transitions::{expiry, fair_queue, leases};
+use crate::queue::transitions::{expiry, fair_queue, leases, standing};
 use crate::queue::types::{Event, Queue, QueueOptions, Submitted};
 
 #[path = "../../../../tests/common/postgres_server.rs"]
@@ -188,6 +188,8 @@ async fn the_statements_of_the_hot_path_use_their_indexes() {
         (leases::FIRST_READY, "jobs_ready"),
         (fair_queue::FOLLOWERS, "jobs_after"),
         (fair_queue::FIRST_TAG, "jobs_ready"),
+        (standing::HIGHER, "jobs_ready"),
+        (standing::EARLIER, "jobs_ready"),
         (fair_queue::LAST_OF_TENANT, "jobs_tail"),
         (expiry::OLDEST, "jobs_age"),
         (expiry::NEXT_DUE, "jobs_due"),
@@ -200,6 +202,9 @@ async fn the_statements_of_the_hot_path_use_their_indexes() {
             _ => ["1", "1"],
         };
         for (place, value) in ["$1", "$2"].iter().zip(values) {
+            text = text.replace(place, value);
+        }
+        for (place, value) in [("$3", "10000"), ("$4", "25000"), ("$5", "1")] {
             text = text.replace(place, value);
         }
         let plan = run(&format!("EXPLAIN {text}"));

@@ -54,7 +54,7 @@ fn described(job: &Job) -> String {
     let ends = (job.started.is_some(), job.finished.is_some());
     format!(
         "{} {:?} {:?} {:?} {:?} {:?} {} of {} left, {chain:?} {ends:?} durable {} attempt {} crashes {} dead {} \
-         cancelled {} {error:?} {:?} {:?} {:?}",
+         cancelled {} {error:?} {:?} {:?} {:?} {:?}",
         name(job),
         job.tenant,
         job.kind,
@@ -70,6 +70,7 @@ fn described(job: &Job) -> String {
         job.cancel_requested,
         job.report,
         job.webhook,
+        job.delivery,
         job.window,
     )
 }
@@ -108,6 +109,10 @@ impl Side {
             Step::Submit(ref submission) => {
                 let mut submission = submission.clone();
                 submission.deadline = None;
+                // When a notice that waits for a delivery is looked at again depends on the clock.
+                submission.webhook = submission
+                    .webhook
+                    .filter(|_| submission.result_uri.is_none());
                 answer(
                     queue.submit(*submission).await,
                     |submitted| match submitted {
@@ -204,8 +209,12 @@ fn told(outgoing: &Outgoing) -> String {
     } else {
         "a pair"
     };
-    let removes = matches!(outgoing.action, Action::RemoveFiles);
-    format!("{job} {removes} {}", outgoing.attempts)
+    let action = match outgoing.action {
+        Action::RemoveFiles => "remove",
+        Action::Deliver(_) => "deliver",
+        Action::Notify { .. } => "notify",
+    };
+    format!("{job} {action} {}", outgoing.attempts)
 }
 
 /// Leases on both sides, if the embedded queue has a job that is ready. Otherwise PostgreSQL is not asked: a

@@ -7,6 +7,7 @@
 //!   all pairs have succeeded.
 //! - Cancelled: after a cancellation a job does not succeed.
 //! - Told: every end of a job with a webhook is told, and the files of every forgotten job are removed.
+//! - Delivered: what a job delivers was delivered, or given up, before its end is told.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -64,6 +65,8 @@ pub(super) struct Promises {
     keys: HashMap<String, JobId>,
     /// Jobs that have ended once; they may have been queued again since.
     ever_ended: HashSet<JobId>,
+    /// Jobs whose result is to be delivered, with their sequences.
+    undelivered: HashMap<JobId, Option<JobId>>,
     forgotten: HashSet<JobId>,
     files_removed: HashSet<JobId>,
     /// Whether the machine has lost its power. Commits that had not reached the disk are lost then.
@@ -185,6 +188,7 @@ impl Promises {
                     || job
                         .parent
                         .is_some_and(|parent| self.asked_again.contains(&parent));
+                self.undelivered.remove(&job.id);
                 let fact = self.jobs.entry(job.id).or_default();
                 if fact.end.take().is_some() {
                     assert!(was_asked, "{} has ended and is queued again", job.id);
@@ -207,6 +211,7 @@ impl Promises {
             }
             Event::Ended(job) => self.ended(job),
             Event::Deleted(id) => {
+                self.undelivered.remove(id);
                 let fact = self.jobs.remove(id);
                 assert!(
                     fact.is_none_or(|fact| fact.end.is_some() || !fact.is_durable),
@@ -229,6 +234,10 @@ impl Promises {
             job.id
         );
         fact.end = Some(job.state);
+        self.undelivered.remove(&job.id);
+        if job.state == State::Succeeded && job.delivery.is_some() {
+            self.undelivered.insert(job.id, job.parent);
+        }
         self.ever_ended.insert(job.id);
         if job.webhook.is_some() {
             self.notices.entry(job.id).or_default().ends += 1;
@@ -327,7 +336,7 @@ impl Promises {
     /// Actions were taken from the outbox.
     pub(super) fn taken(&mut self, actions: &[Outgoing]) {
         for action in actions {
-            match action.action {
+            match &action.action {
                 Action::RemoveFiles => {
                     assert!(
                         !self.jobs.contains_key(&action.job),
@@ -336,11 +345,27 @@ impl Promises {
                     );
                     self.files_removed.insert(action.job);
                 }
+                Action::Deliver(_) => {}
                 Action::Notify { .. } => {
+                    let of_job = |(id, parent): (&JobId, &Option<JobId>)| {
+                        *id == action.job || *parent == Some(action.job)
+                    };
+                    assert!(
+                        !self.undelivered.iter().any(of_job),
+                        "{}: its end is told before its result is delivered",
+                        action.job
+                    );
                     let notices = self.notices.entry(action.job).or_default();
                     notices.told.insert(action.number);
                 }
             }
+        }
+    }
+
+    /// An action is reported done.
+    pub(super) fn settled(&mut self, action: &Outgoing) {
+        if let Action::Deliver(_) = action.action {
+            self.undelivered.remove(&action.job);
         }
     }
 

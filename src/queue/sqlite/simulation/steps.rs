@@ -148,6 +148,12 @@ fn submission(bytes: &mut Bytes<'_>, jobs: &[JobId], now: Timestamp) -> Submissi
         window: [index, index + 2],
         chained: Bytes::bit(flags, 2),
     };
+    let of_device = bytes.byte();
+    let closes = is_sequence && Bytes::bit(more, 3);
+    let result_uri = match is_sequence && !closes {
+        true => "s3://results/{index}.npz",
+        false => "s3://results/one.npz",
+    };
     let follows = Bytes::bit(flags, 3) && Bytes::bit(more, 4) && !is_sequence;
     Submission {
         id: next_id(jobs),
@@ -156,7 +162,7 @@ fn submission(bytes: &mut Bytes<'_>, jobs: &[JobId], now: Timestamp) -> Submissi
             false => Kind::Pair,
         },
         pairs: (0..count * u32::from(is_sequence)).map(pair).collect(),
-        finalizer_seconds: (is_sequence && Bytes::bit(more, 3)).then_some(2.0),
+        finalizer_seconds: closes.then_some(2.0),
         after: jobs.last().copied().filter(|_| follows),
         has_dependents: Bytes::bit(more, 5),
         priority: match more >> 6 {
@@ -164,7 +170,7 @@ fn submission(bytes: &mut Bytes<'_>, jobs: &[JobId], now: Timestamp) -> Submissi
             3 => Priority::High,
             _ => Priority::Normal,
         },
-        device: match bytes.byte() % 8 {
+        device: match of_device % 8 {
             0 => Some(DeviceKind::Cpu),
             1 => Some(DeviceKind::Gpu),
             _ => None,
@@ -176,6 +182,7 @@ fn submission(bytes: &mut Bytes<'_>, jobs: &[JobId], now: Timestamp) -> Submissi
             false => Vec::new(),
         },
         webhook: Bytes::bit(flags, 5).then(|| "https://hooks.example/".to_owned()),
+        result_uri: Bytes::bit(of_device, 3).then(|| result_uri.to_owned()),
         deadline: (Bytes::bit(flags, 6) && Bytes::bit(more, 1))
             .then(|| now.after(Duration::from_millis(bytes.choice(&ADVANCES_MS)))),
         idempotency: (Bytes::bit(flags, 7) && Bytes::bit(more, 0)).then(|| Idempotency {

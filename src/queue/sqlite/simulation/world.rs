@@ -244,6 +244,9 @@ impl World {
         }
         let action = self.outgoing.swap_remove(index % self.outgoing.len());
         let number = action.number;
+        if is_done {
+            self.promises.settled(&action);
+        }
         let settled = match is_done {
             true => Settled::Done,
             false => Settled::Again(Duration::from_secs(1)),
