@@ -10,12 +10,12 @@ use crate::queue::types::{QueueError, Standing};
 /// plan test also uses it.
 pub(in crate::queue) const HIGHER: &str = "SELECT count(*) FROM (SELECT seq FROM jobs \
     INDEXED BY jobs_ready WHERE state = 0 AND ready IS NOT NULL AND delayed = 0 AND device = ?1 \
-    AND priority > ?2 LIMIT ?3) AS some";
+    AND priority > ?2 LIMIT ?3) AS ahead";
 
 /// The same for those of the same priority with an earlier tag.
 pub(in crate::queue) const EARLIER: &str = "SELECT count(*) FROM (SELECT seq FROM jobs \
     INDEXED BY jobs_ready WHERE state = 0 AND ready IS NOT NULL AND delayed = 0 AND device = ?1 \
-    AND priority = ?2 AND virtual_start <= ?4 AND (virtual_start < ?4 OR seq < ?5) LIMIT ?3) AS some";
+    AND priority = ?2 AND virtual_start <= ?4 AND (virtual_start < ?4 OR seq < ?5) LIMIT ?3) AS ahead";
 
 /// The standing of a queued job. Of a sequence it is that of its first queued pair or of its closing job.
 /// `None` if nothing of the job is queued.

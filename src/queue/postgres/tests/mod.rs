@@ -8,10 +8,11 @@ use tokio::sync::mpsc;
 mod nodes;
 mod same_answers;
 
-use super::engine::open_postgres;
+use super::engine::{migrate_postgres, open_postgres};
 use super::target::PostgresOptions;
 use crate::job::DeviceKind;
 use crate::queue::contract_tests::{Stand, queue_contract, submission};
+use crate::queue::migration::Migration;
 use crate::queue::sql::for_postgres;
 use crate::queue::transitions::{expiry, fair_queue, leases, standing};
 use crate::queue::types::{Event, Queue, QueueOptions, Submitted};
@@ -140,32 +141,44 @@ async fn another_schema_or_program_is_refused_with_what_to_do() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_database_of_the_version_before_is_upgraded_and_keeps_its_jobs() {
-    let Some(database) = Database::new() else {
-        return;
-    };
-    let (queue, heard) = database.node("first", QueueOptions::default()).await;
-    let job = queue.submit(submission("a")).await.expect("a queue");
-    drop((queue, heard));
-    database.is_left().await;
-    let run = |sql: &str| database.server.sql(database.name(), sql);
-    let columns = "SELECT string_agg(table_name || column_name || data_type, ' ' ORDER BY table_name, \
-                   ordinal_position) FROM information_schema.columns WHERE table_schema = 'public'";
-    let fresh = run(columns);
-    // What version 2 had.
-    run(
-        "ALTER TABLE jobs DROP COLUMN trace, DROP COLUMN webhook; DROP TABLE outbox; \
-         UPDATE meta SET version = 2",
-    );
-    let (queue, _heard) = database.node("second", QueueOptions::default()).await;
-    // A column that is dropped keeps its number.
-    assert_eq!(run(columns), fresh);
-    assert_eq!(run("SELECT version FROM meta"), "3");
-    let held = queue.lease("worker", DeviceKind::Cpu).await.expect("a job");
-    let Submitted::New(job) = job else {
-        unreachable!("it was new");
-    };
-    assert_eq!(held.job.id, job.id);
+async fn a_database_of_an_older_version_is_upgraded_and_keeps_its_jobs() {
+    // What turns the tables into those of each older version.
+    const SINCE_3: &str = "ALTER TABLE jobs DROP COLUMN result_uri, DROP COLUMN delivery";
+    let since_2 = format!("{SINCE_3}, DROP COLUMN trace, DROP COLUMN webhook; DROP TABLE outbox");
+    for (version, change) in [
+        (3, format!("{SINCE_3}; DROP INDEX outbox_job")),
+        (2, since_2),
+    ] {
+        let Some(database) = Database::new() else {
+            return;
+        };
+        let (queue, heard) = database.node("first", QueueOptions::default()).await;
+        let job = queue.submit(submission("a")).await.expect("a queue");
+        drop((queue, heard));
+        database.is_left().await;
+        let run = |sql: &str| database.server.sql(database.name(), sql);
+        let columns = "SELECT string_agg(table_name || column_name || data_type, ' ' \
+                       ORDER BY table_name, ordinal_position) FROM information_schema.columns \
+                       WHERE table_schema = 'public'";
+        let indexes = "SELECT string_agg(indexname, ' ' ORDER BY indexname) FROM pg_indexes";
+        let fresh = [columns, indexes].map(run);
+        run(&format!("{change}; UPDATE meta SET version = {version}"));
+        let migrated = migrate_postgres(&database.options("second")).await;
+        let upgrade = Migration {
+            from: version,
+            to: 4,
+        };
+        assert_eq!(migrated, Ok(upgrade));
+        // A column that is dropped keeps its number.
+        assert_eq!([columns, indexes].map(run), fresh);
+        assert_eq!(run("SELECT version FROM meta"), "4");
+        let (queue, _heard) = database.node("second", QueueOptions::default()).await;
+        let held = queue.lease("worker", DeviceKind::Cpu).await.expect("a job");
+        let Submitted::New(job) = job else {
+            unreachable!("it was new");
+        };
+        assert_eq!(held.job.id, job.id);
+    }
 }
 
 #[tokio::test]
