@@ -3,6 +3,8 @@
 # One image for CPUs and for NVIDIA GPUs: see deploy/README.md.
 
 FROM rust:1.95.0-slim-bookworm AS builder
+# The program holds the list of its crates: `cargo audit bin fnsf` reads it.
+RUN cargo install cargo-auditable --version 0.7.7 --locked
 WORKDIR /build
 # Targets that the manifest names must be there, whether they are built or not.
 COPY Cargo.toml Cargo.lock build.rs ./
@@ -16,7 +18,7 @@ COPY src src
 # The program is copied out, because a cache is not part of the image.
 RUN --mount=type=cache,target=/usr/local/cargo/registry \
     --mount=type=cache,target=/build/target,sharing=locked \
-    cargo build --release --locked --bin fnsf && install -D target/release/fnsf /out/fnsf
+    cargo auditable build --release --locked --bin fnsf && install -D --strip target/release/fnsf /out/fnsf
 
 
 # Drivers are mounted in from the host and built against its C library: an older base would fail to load them, silently.
@@ -30,13 +32,18 @@ LABEL org.opencontainers.image.title="fnsf" \
       org.opencontainers.image.revision="${REVISION}"
 
 # The Vulkan loader, and the GL, EGL and X libraries that NVIDIA's Vulkan driver is linked with even where nothing is
-# drawn. Versions are those of the pinned release: Ubuntu drops older ones, so pins here would only break rebuilds.
+# drawn. The dispatchers of GL and EGL are unpacked and not installed: their packages depend on Mesa and LLVM, 280 MB
+# that nothing here uses. Versions are those of the pinned release: Ubuntu drops older ones, so pins would break rebuilds.
+WORKDIR /tmp/dispatchers
 # hadolint ignore=DL3008
 RUN apt-get update \
     && apt-get install -y --no-install-recommends \
         ca-certificates tini \
-        libvulkan1 libegl1 libgl1 libglvnd0 libglx0 libx11-6 libxcb1 libxext6 \
-    && rm -rf /var/lib/apt/lists/*
+        libvulkan1 libglvnd0 libx11-6 libxcb1 libxext6 \
+    && apt-get download libegl1 libgl1 libglx0 \
+    && for package in ./*.deb; do dpkg-deb --extract "$package" /; done \
+    && rm -rf ./*.deb /var/lib/apt/lists/* \
+    && ldconfig
 
 COPY deploy/image/nvidia_icd.json /etc/vulkan/icd.d/nvidia_icd.json
 COPY --chmod=755 deploy/image/probe /usr/local/bin/probe

@@ -13,10 +13,11 @@ use super::local::Local;
 use super::node::{Capacities, Node};
 use super::outgoing::{Outgoing, Settled};
 use super::sql::Sql;
+use super::standing::Standing;
 use super::transitions;
 use super::transitions::{expiry, leases, lists, outbox, standing};
 use super::types::{
-    Committed, Filter, Outcome, Queue, QueueError, QueueOptions, Standing, Submission, Submitted,
+    Committed, Filter, Outcome, Queue, QueueError, QueueOptions, Submission, Submitted,
 };
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobId, Tenant};

@@ -19,6 +19,7 @@ mod outgoing;
 mod postgres;
 mod sql;
 mod sqlite;
+mod standing;
 mod subscriptions;
 mod time;
 mod transitions;
@@ -33,7 +34,8 @@ pub use postgres::{PostgresOptions, migrate_postgres, open_postgres};
 #[cfg(any(test, feature = "fuzzing"))]
 pub use sqlite::simulation;
 pub use sqlite::{CopiedQueue, copy_sqlite, migrate_sqlite, open_sqlite, read_copy};
+pub use standing::Standing;
 pub use types::{
     Committed, Event, Filter, Idempotency, Outcome, PairOf, Queue, QueueError, QueueOptions,
-    Standing, Submission, Submitted,
+    Submission, Submitted,
 };

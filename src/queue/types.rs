@@ -11,6 +11,7 @@ use super::backlog::Backlog;
 use super::lease::Lease;
 use super::node::{Capacities, Node};
 use super::outgoing::{Outgoing, Settled};
+use super::standing::Standing;
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, State, Tenant};
 
@@ -145,21 +146,6 @@ pub enum Submitted {
     New(Arc<Job>),
     /// The idempotency key belongs to this job, which was accepted before; no job was added.
     Known(Arc<Job>),
-}
-
-/// Where a queued job stands among those that are ready to start.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Standing {
-    /// Number of ready jobs that start before it, at most [`Standing::MOST`].
-    pub ahead: i64,
-    /// Work of its tenant at its priority that is served before it, nominal seconds
-    /// ([`crate::cost`]). Other tenants are served as much in that time.
-    pub share_seconds: f64,
-}
-
-impl Standing {
-    /// Jobs ahead are counted up to this number.
-    pub const MOST: i64 = 10_000;
 }
 
 /// Selects the jobs to list, latest first.

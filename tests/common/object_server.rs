@@ -59,6 +59,11 @@ impl ObjectServer {
         Some(server)
     }
 
+    /// Host and port.
+    pub(crate) fn address(&self) -> &str {
+        &self.address
+    }
+
     /// Makes a bucket. Returns whether it is there then.
     pub(crate) fn makes_a_bucket(&self, name: &str) -> bool {
         let url = format!("http://{}/{name}", self.address);

@@ -21,15 +21,16 @@ const OF_A_ROLE: usize = 3;
 
 /// A database, an object store, and how nodes are started on them.
 #[derive(Clone)]
-struct Farm {
+pub(crate) struct Farm {
     database: Arc<PostgresServer>,
-    objects: Arc<ObjectServer>,
-    config: String,
+    url: String,
+    pub(crate) objects: Arc<ObjectServer>,
+    pub(crate) config: String,
 }
 
 impl Farm {
     /// `None` without PostgreSQL or moto.
-    fn start(queue: &str) -> Option<Self> {
+    pub(crate) fn start(queue: &str) -> Option<Self> {
         let database = start_postgres()?;
         let objects = ObjectServer::start()?;
         let url = database.database();
@@ -40,12 +41,24 @@ impl Farm {
         );
         Some(Self {
             database: Arc::new(database),
+            url,
             objects: Arc::new(objects),
             config,
         })
     }
 
-    fn node(&self, role: &str) -> Server {
+    /// The URL of the database.
+    pub(crate) fn url(&self) -> &str {
+        &self.url
+    }
+
+    /// Runs a statement in the database and returns what it says.
+    pub(crate) fn sql(&self, text: &str) -> String {
+        let name = self.url.rsplit('=').next().expect("a name");
+        self.database.sql(name, text)
+    }
+
+    pub(crate) fn node(&self, role: &str) -> Server {
         let variables = self.objects.variables();
         let variables: Vec<_> = variables.iter().map(|(k, v)| (*k, v.as_str())).collect();
         Server::node(&self.config, role, &variables)
@@ -118,7 +131,7 @@ async fn every_acknowledged_job_ends_once_while_nodes_are_killed_and_frozen_and_
     let (mut turn, mut kills, mut crashes, mut freezes) = (0, 0, 0, 0);
     let began = Instant::now();
     let open = "SELECT count(*) FROM jobs WHERE state < 2";
-    while !submitting.is_finished() || farm.database.sql("test0", open) != "0" {
+    while !submitting.is_finished() || farm.sql(open) != "0" {
         assert!(
             began.elapsed() < Duration::from_secs(120 + 4 * jobs as u64),
             "it does not end"

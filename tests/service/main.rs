@@ -30,6 +30,7 @@ mod grpc;
 mod http;
 mod info;
 mod load;
+mod network_cut;
 mod nonsense;
 #[path = "../common/object_server.rs"]
 mod object_server;

@@ -17,9 +17,10 @@ use tokio::sync::mpsc;
 use tokio::time::timeout;
 
 use super::lease::{Lease, Signal};
+use super::standing::Standing;
 use super::types::{
     Committed, Event, Filter, Idempotency, Outcome, PairOf, Queue, QueueError, QueueOptions,
-    Standing, Submission, Submitted,
+    Submission, Submitted,
 };
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, State, Tenant};

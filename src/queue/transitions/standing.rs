@@ -4,7 +4,8 @@ use super::fair_queue::virtual_now;
 use super::rows::{DEVICES, device_code};
 use crate::job::{DeviceKind, JobId, Priority};
 use crate::queue::sql::{Sql, values};
-use crate::queue::types::{QueueError, Standing};
+use crate::queue::standing::Standing;
+use crate::queue::types::QueueError;
 
 /// The statement that counts the ready jobs of a higher priority, of one device requirement. The query
 /// plan test also uses it.
