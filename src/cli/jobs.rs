@@ -116,7 +116,12 @@ async fn find(client: &Client, filter: &Filter, limit: usize) -> Result<Vec<Valu
     let mut before: Option<String> = None;
     loop {
         let mut query = Serializer::new(String::new());
-        query.append_pair("limit", &PAGE.to_string());
+        // Of failed jobs, only some are dead letters.
+        let wanted = match filter.dead_letters {
+            true => PAGE,
+            false => PAGE.min(limit - found.len()),
+        };
+        query.append_pair("limit", &wanted.to_string());
         let failed = filter.dead_letters.then_some("failed");
         let pairs = [
             ("state", filter.state.as_deref().or(failed)),

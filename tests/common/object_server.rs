@@ -66,7 +66,7 @@ impl ObjectServer {
 
     /// Makes a bucket. Returns whether it is there then.
     pub(crate) fn makes_a_bucket(&self, name: &str) -> bool {
-        let url = format!("http://{}/{name}", self.address);
+        let url = format!("http://{}/{name}", self.address());
         let made = Command::new("curl")
             .args(["-sf", "-o", "/dev/null", "-X", "PUT", &url])
             .status();
@@ -74,7 +74,7 @@ impl ObjectServer {
     }
 
     fn curl(&self, path: &str, arguments: &[&str]) -> Command {
-        let url = format!("http://{}/farm/{path}", self.address);
+        let url = format!("http://{}/farm/{path}", self.address());
         let mut curl = Command::new("curl");
         let signed = [
             "-sf",
@@ -106,7 +106,7 @@ impl ObjectServer {
     /// The variables of the environment that lead a client to it.
     pub(crate) fn variables(&self) -> Vec<(&'static str, String)> {
         vec![
-            ("AWS_ENDPOINT_URL", format!("http://{}", self.address)),
+            ("AWS_ENDPOINT_URL", format!("http://{}", self.address())),
             ("AWS_ALLOW_HTTP", "true".to_owned()),
             ("AWS_ACCESS_KEY_ID", "test".to_owned()),
             ("AWS_SECRET_ACCESS_KEY", "test".to_owned()),

@@ -134,7 +134,21 @@ def test_a_job_is_cancelled_and_queued_again(server, pair):
         waiting = client.submit([pair.source, pair.target], preset="paper", field=long)
         with pytest.raises(TimeoutError):
             client.wait(waiting.id, timeout=0.5)
-        client.cancel(waiting.id)
+        behind = [client.submit([pair.source, pair.target], preset="paper", field=long) for _ in range(20)]
+        last = client.job(behind[-1].id)
+        assert last.state == "queued" and last.ahead is not None and last.ahead > 0 and last.starts_in > 0
+        for job in [waiting, *behind]:
+            client.cancel(job.id)
+
+
+def test_places_are_named_that_the_server_may_refuse(server, pair):
+    with server.client() as client:
+        with pytest.raises(ServerError, match=r"remote\.sweeps") as refused:
+            client.submit(["s3://bucket/a.pcd", pair.target])
+        assert refused.value.code == "bad_request"
+        with pytest.raises(ServerError, match=r"remote\.results") as refused:
+            client.submit([pair.source, pair.target], result_uri="s3://bucket/flow.npz")
+        assert refused.value.code == "invalid_options"
 
 
 def test_a_submission_and_a_wait_live_through_a_killed_server(server, pair):

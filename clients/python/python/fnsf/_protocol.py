@@ -56,7 +56,7 @@ def plain(prefix: str, enum: Any, number: int) -> str:
     return name.removeprefix(f"{prefix}_").lower()
 
 
-SUBMITTED = frozenset({"priority", "deadline_ms", "device", "labels", "webhook", "densify"})
+SUBMITTED = frozenset({"priority", "deadline_ms", "device", "labels", "webhook", "result_uri", "densify"})
 """Options that only a server knows."""
 
 

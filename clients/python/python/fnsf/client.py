@@ -73,6 +73,14 @@ class Job:
     pairs_left: int
     labels: Mapping[str, str]
     trace_id: str
+    result_uri: str | None
+    """Where the result is written to, where the job was submitted with `result_uri`."""
+    delivery: Literal["pending", "delivered", "given_up"] | None
+    """How far that is."""
+    ahead: int | None
+    """Jobs that start before this one, where `job` and `submit` find it queued; None where there are 10,000 or more."""
+    starts_in: float | None
+    """Predicted seconds until it starts, where `job` and `submit` find it queued."""
 
     @property
     def ended(self) -> bool:
@@ -123,6 +131,9 @@ def _service_config() -> str:
 def _job(message: Any) -> Job:
     states = message.DESCRIPTOR.fields_by_name["state"].enum_type
     error = f"{message.error.code}: {message.error.message}" if message.HasField("error") else None
+    delivery = message.delivery if message.HasField("delivery") else None
+    deliveries = message.DESCRIPTOR.fields_by_name["delivery"].message_type.fields_by_name["state"].enum_type
+    wait = message.wait if message.HasField("wait") else None
     return Job(
         id=message.id,
         state=_protocol.plain("STATE", states, message.state),  # type: ignore[arg-type]
@@ -140,6 +151,10 @@ def _job(message: Any) -> Job:
         pairs_left=message.pairs_left,
         labels=dict(message.labels),
         trace_id=message.trace_id,
+        result_uri=delivery.uri if delivery else None,
+        delivery=_protocol.plain("DELIVERY_STATE", deliveries, delivery.state) if delivery else None,  # type: ignore[arg-type]
+        ahead=wait.ahead if wait and wait.HasField("ahead") else None,
+        starts_in=wait.seconds if wait else None,
     )
 
 
@@ -309,13 +324,15 @@ class Client:
         that the work is done once.
 
         Args:
-            sweeps: two for a pair, more for a sequence: arrays, N x 3 metres, or `NamedSweep`.
+            sweeps: two for a pair, more for a sequence: arrays, N x 3 metres, `NamedSweep`, or texts, the URIs of
+                files that the server fetches.
             idempotency_key: a repeated submission with the same key finds the first one's job.
             retry_for: seconds.
-            options: those of `Options`, and `priority`, `device`, `deadline_ms`, `labels`, `webhook`, `densify`.
+            options: those of `Options`, and `priority`, `device`, `deadline_ms`, `labels`, `webhook`, `result_uri`,
+                `densify`.
         """
         key = idempotency_key or str(uuid.uuid4())
-        taken = [_sweep(index, sweep) for index, sweep in enumerate(sweeps)]
+        taken = [sweep if isinstance(sweep, str) else _sweep(index, sweep) for index, sweep in enumerate(sweeps)]
         message = _protocol.options_message(options)
         request = _protocol.MESSAGES["SubmitJobRequest"]
         begin = _protocol.nested("SubmitJobRequest", "Begin")
@@ -323,7 +340,11 @@ class Client:
 
         def requests() -> Iterator[Any]:
             yield request(begin=begin(options=message, idempotency_key=key))
-            for points, mask, pose, _ in taken:
+            for one in taken:
+                if isinstance(one, str):
+                    yield request(next=following(uri=one))
+                    continue
+                points, mask, pose, _ = one
                 yield request(next=following(pose=pose))
                 for chunk in _protocol.chunks(points, mask):
                     yield request(chunk=chunk)
