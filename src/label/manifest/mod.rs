@@ -8,9 +8,11 @@
 //! Further columns of sweeps: `time_s` (seconds) or `timestamp_ns`, and `pose`, 12 or 16 numbers of
 //! world_from_sensor. Other columns are ignored.
 
+mod footer;
 mod pages;
 mod parquet;
 mod table;
+mod thrift;
 
 use std::collections::HashMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};

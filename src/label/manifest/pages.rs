@@ -13,6 +13,8 @@ use bytes::Bytes;
 use parquet::errors::{ParquetError, Result};
 use parquet::file::reader::{ChunkReader, Length};
 
+use super::thrift::Input;
+
 /// Uncompressed bytes that any page may have.
 const PAGE_BYTES: u64 = 8 << 20;
 /// Uncompressed bytes that a larger page may have for each compressed byte.
@@ -122,7 +124,7 @@ impl Header {
     fn parse(bytes: &[u8]) -> Option<Self> {
         let mut numbers = [[None; 9]; 9];
         let mut input = Input(bytes);
-        input.read_struct(0, 0, &mut numbers)?;
+        read_struct(&mut input, 0, 0, &mut numbers)?;
         let number = |parent: usize, field: usize| numbers[parent][field];
         let kind = match number(0, 1)? {
             0 => Kind::Data {
@@ -175,78 +177,49 @@ fn is_of_its_type(parent: usize, id: usize, stored: u8) -> bool {
     }
 }
 
-/// What is left of the bytes of a struct in Thrift's compact protocol.
-struct Input<'a>(&'a [u8]);
-
-impl Input<'_> {
-    /// Reads the fields of a struct up to its end. Numbers that are not negative go to
-    /// `numbers[parent][id]`, where the array has that place; those of the structs in it to `numbers[id]`.
-    fn read_struct(
-        &mut self,
-        parent: usize,
-        depth: usize,
-        numbers: &mut [[Option<u64>; 9]; 9],
-    ) -> Option<()> {
-        let mut id = 0;
-        loop {
-            let field = self.byte()?;
-            if field == 0 {
-                return Some(());
-            }
-            // The step of the ids. 0 would let an id follow that may be lower.
-            let step = usize::from(field >> 4);
-            id += (step > 0).then_some(step)?;
-            if !is_of_its_type(parent, id, field & 15) {
-                return None;
-            }
-            match field & 15 {
-                // True and false.
-                1 | 2 => {}
-                3 => drop(self.byte()?),
-                // 16, 32 and 64 bits, in zigzag form.
-                4..=6 => {
-                    let zigzag = self.varint()?;
-                    if let Some(place) = numbers.get_mut(parent).and_then(|row| row.get_mut(id)) {
-                        *place = (zigzag & 1 == 0).then_some(zigzag >> 1);
-                    }
-                }
-                7 => self.skip(8)?,
-                8 => {
-                    let length = self.varint()?;
-                    self.skip(usize::try_from(length).ok()?)?;
-                }
-                // A struct in a struct of the header holds statistics: its numbers have no place.
-                12 if depth < MAX_DEPTH => {
-                    let child = if depth == 0 { id } else { STATISTICS };
-                    self.read_struct(child, depth + 1, numbers)?;
-                }
-                _ => return None,
-            }
+/// Reads the fields of a struct up to its end. Numbers that are not negative go to
+/// `numbers[parent][id]`, where the array has that place; those of the structs in it to `numbers[id]`.
+fn read_struct(
+    input: &mut Input<'_>,
+    parent: usize,
+    depth: usize,
+    numbers: &mut [[Option<u64>; 9]; 9],
+) -> Option<()> {
+    let mut id = 0;
+    loop {
+        let field = input.byte()?;
+        if field == 0 {
+            return Some(());
         }
-    }
-
-    fn byte(&mut self) -> Option<u8> {
-        let (first, rest) = self.0.split_first()?;
-        self.0 = rest;
-        Some(*first)
-    }
-
-    fn skip(&mut self, count: usize) -> Option<()> {
-        self.0 = self.0.get(count..)?;
-        Some(())
-    }
-
-    /// A number of at most 64 bits, seven a byte, the lowest first.
-    fn varint(&mut self) -> Option<u64> {
-        let mut number = 0;
-        for shift in (0..63).step_by(7) {
-            let byte = self.byte()?;
-            number |= u64::from(byte & 127) << shift;
-            if byte & 128 == 0 {
-                return Some(number);
-            }
+        // The step of the ids. 0 would let an id follow that may be lower.
+        let step = usize::from(field >> 4);
+        id += (step > 0).then_some(step)?;
+        if !is_of_its_type(parent, id, field & 15) {
+            return None;
         }
-        None
+        match field & 15 {
+            // True and false.
+            1 | 2 => {}
+            3 => drop(input.byte()?),
+            // 16, 32 and 64 bits, in zigzag form.
+            4..=6 => {
+                let zigzag = input.varint()?;
+                if let Some(place) = numbers.get_mut(parent).and_then(|row| row.get_mut(id)) {
+                    *place = (zigzag & 1 == 0).then_some(zigzag >> 1);
+                }
+            }
+            7 => input.skip(8)?,
+            8 => {
+                let length = input.varint()?;
+                input.skip(usize::try_from(length).ok()?)?;
+            }
+            // A struct in a struct of the header holds statistics: its numbers have no place.
+            12 if depth < MAX_DEPTH => {
+                let child = if depth == 0 { id } else { STATISTICS };
+                read_struct(input, child, depth + 1, numbers)?;
+            }
+            _ => return None,
+        }
     }
 }
 

@@ -12,6 +12,7 @@ use parquet::arrow::arrow_reader::{
     ArrowReaderMetadata, ArrowReaderOptions, ParquetRecordBatchReaderBuilder,
 };
 
+use super::footer;
 use super::pages::CheckedPages;
 use super::table::{COLUMNS, MAX_BYTES, MAX_ROWS, ManifestError, Table, known};
 
@@ -24,6 +25,7 @@ const VALUES_PER_ROW: usize = 16 + COLUMNS.len();
 /// [`ManifestError`]. The reader may panic at a damaged file.
 pub(super) fn read(bytes: Bytes) -> Result<Table, ManifestError> {
     let unreadable = |error: &dyn std::fmt::Display| ManifestError::Unreadable(error.to_string());
+    footer::check(&bytes).map_err(|error| unreadable(&error))?;
     // Values of a dictionary stay in it: as views, many rows of one long value take little memory.
     let plain = ArrowReaderOptions::new().with_skip_arrow_metadata(true);
     let stored = ArrowReaderMetadata::load(&bytes, plain.clone());
