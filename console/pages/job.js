@@ -8,8 +8,11 @@ import { openScene } from "../scene.js";
 import { count, duration } from "../text.js";
 import { createViewer } from "../viewer/viewer.js";
 import { lifeOf } from "./life.js";
+import { repeat } from "./live.js";
 
 const ENDS = ["succeeded", "failed", "cancelled", "expired"];
+/** Seconds between two looks at a queued job: how long it waits changes without an event. */
+const LOOK_SECONDS = 3;
 
 /** Shows the page of the job `id`. */
 export async function jobPage(page, signal, id) {
@@ -37,11 +40,17 @@ async function follow(job, path, signal, parts, update) {
   const onEvent = async (name, data) => {
     if (name === "progress") showProgress(parts.head, data);
     else {
-      // The event of a sequence does not list its pairs.
-      latest = data.kind === "sequence" ? await json(path) : data;
+      // The event of a sequence does not list its pairs, and that of a queued job not how long it waits.
+      latest = data.kind === "sequence" || data.state === "queued" ? await json(path) : data;
       if (!signal.aborted) update(latest);
     }
   };
+  const look = async () => {
+    if (latest.state !== "queued") return;
+    latest = await json(path);
+    if (!signal.aborted) update(latest);
+  };
+  repeat(LOOK_SECONDS, signal, look, () => {}).catch(() => {});
   while (!signal.aborted && !ENDS.includes(latest.state)) {
     try {
       await events(`${path}/events`, signal, (name, data) => void onEvent(name, data));
@@ -119,8 +128,15 @@ function progressOf(job) {
     bar.value = job.pairs.ended / Math.max(1, job.pairs.total);
     text.textContent = `${job.pairs.ended} of ${job.pairs.total} pairs`;
   } else if (job.progress) setProgress(bar, text, job.progress);
-  else text.textContent = job.state === "queued" ? "waits for a device" : "starts";
+  else text.textContent = job.state === "queued" ? waitOf(job.wait) : "starts";
   return box;
+}
+
+/** How long a queued job waits. */
+function waitOf(wait) {
+  if (!wait) return "waits for a device";
+  const ahead = wait.ahead === null ? "10,000 or more jobs are" : wait.ahead === 1 ? "1 job is" : `${count(wait.ahead)} jobs are`;
+  return `waits for a device: ${ahead} ahead, it starts in about ${duration(wait.seconds)}`;
 }
 
 function setProgress(bar, text, { done, total, loss }) {
