@@ -4,7 +4,7 @@
 //! footer = FileMetaData in Thrift's compact protocol, its length (32 bits, little-endian), PAR1
 //! ```
 
-use super::thrift::{Found, Input};
+use super::thrift::{BINARY, DOUBLE, FALSE, Found, I8, I16, I32, I64, Input, LIST, STRUCT, TRUE};
 
 /// Most bytes of a footer.
 const MAX_BYTES: usize = 8 << 20;
@@ -30,10 +30,13 @@ pub(super) fn check(file: &[u8]) -> Result<(), String> {
     }
     let from = body.len().checked_sub(length).ok_or_else(damaged)?;
     let (mut elements, mut children) = (0, 0);
-    let walked = Input(&body[from..]).walk(&mut Vec::new(), &mut |path, found| match found {
-        Found::List(count) if path == [SCHEMA] => elements = count,
-        Found::Number(count) if path == CHILDREN => children = children.max(count),
-        _ => {}
+    let walked = Input(&body[from..]).walk(&mut Vec::new(), &mut |path, found| {
+        match found {
+            Found::List(count, _) if path == [SCHEMA] => elements = count,
+            Found::Number(count) if path == CHILDREN => children = children.max(count),
+            _ => {}
+        }
+        is_of_its_type(path, found)
     });
     walked.ok_or_else(damaged)?;
     if usize::try_from(children).is_ok_and(|children| children > elements) {
@@ -42,6 +45,78 @@ pub(super) fn check(file: &[u8]) -> Result<(), String> {
         ));
     }
     Ok(())
+}
+
+/// Whether a field has the type that the format gives it. A reader takes that type for granted, and would
+/// read the rest from the wrong byte on. Fields that the format does not have are skipped by their type.
+fn is_of_its_type(path: &[i64], found: Found) -> bool {
+    let Some((kind, elements)) = type_of(path) else {
+        return true;
+    };
+    match found {
+        Found::Field(TRUE | FALSE) => kind == TRUE,
+        Found::Field(stored) => kind == stored,
+        Found::List(_, stored) => elements == stored,
+        Found::Number(_) => true,
+    }
+}
+
+/// The type of a field by the ids from `FileMetaData` on, and that of its elements if it is a list.
+fn type_of(path: &[i64]) -> Option<(u8, u8)> {
+    let one = |kind| Some((kind, 0));
+    let list = |kind| Some((LIST, kind));
+    let (&id, around) = path.split_last()?;
+    match (around, id) {
+        // FileMetaData.
+        ([], 1) => one(I32),
+        ([], 2 | 4 | 5 | 7) => list(STRUCT),
+        ([], 3) => one(I64),
+        ([], 6 | 9) => one(BINARY),
+        ([], 8) => one(STRUCT),
+        // SchemaElement, its logical type and the parts of that.
+        ([2], 1..=3 | 5..=9) => one(I32),
+        ([2], 4) => one(BINARY),
+        ([2], 10) => one(STRUCT),
+        ([2, 10], 1..=18) => one(STRUCT),
+        ([2, 10, 5], 1 | 2) => one(I32),
+        ([2, 10, 7 | 8], 1) => one(TRUE),
+        ([2, 10, 7 | 8], 2) | ([2, 10, 7 | 8, 2], 1..=3) => one(STRUCT),
+        ([2, 10, 10 | 16], 1) => one(I8),
+        ([2, 10, 10], 2) => one(TRUE),
+        ([2, 10, 17 | 18], 1) => one(BINARY),
+        ([2, 10, 18], 2) => one(I32),
+        // RowGroup and its order.
+        ([4], 1 | 4) => list(STRUCT),
+        ([4], 2 | 3 | 5 | 6) => one(I64),
+        ([4], 7) => one(I16),
+        ([4, 4], 1) => one(I32),
+        ([4, 4], 2 | 3) => one(TRUE),
+        // ColumnChunk, and its ColumnMetaData.
+        ([4, 1], 1 | 9) => one(BINARY),
+        ([4, 1], 2 | 4 | 6) => one(I64),
+        ([4, 1], 3 | 8) => one(STRUCT),
+        ([4, 1], 5 | 7) => one(I32),
+        ([4, 1, 3], 1 | 4 | 15) => one(I32),
+        ([4, 1, 3], 2) => list(I32),
+        ([4, 1, 3], 3) => list(BINARY),
+        ([4, 1, 3], 5..=7 | 9..=11 | 14) => one(I64),
+        ([4, 1, 3], 8 | 13) => list(STRUCT),
+        ([4, 1, 3], 12 | 16 | 17) => one(STRUCT),
+        // KeyValue, Statistics, PageEncodingStats, SizeStatistics, GeospatialStatistics.
+        ([5] | [4, 1, 3, 8], 1 | 2) => one(BINARY),
+        ([4, 1, 3, 12], 1 | 2 | 5 | 6) => one(BINARY),
+        ([4, 1, 3, 12], 3 | 4) => one(I64),
+        ([4, 1, 3, 12], 7 | 8) => one(TRUE),
+        ([4, 1, 3, 13], 1..=3) => one(I32),
+        ([4, 1, 3, 16], 1) => one(I64),
+        ([4, 1, 3, 16], 2 | 3) => list(I64),
+        ([4, 1, 3, 17], 1) => one(STRUCT),
+        ([4, 1, 3, 17], 2) => list(I32),
+        ([4, 1, 3, 17, 1], 1..=8) => one(DOUBLE),
+        // ColumnOrder.
+        ([7], _) => one(STRUCT),
+        _ => None,
+    }
 }
 
 #[cfg(test)]
@@ -68,6 +143,20 @@ mod tests {
             error.contains("claims 63 others, the schema has 2"),
             "{error}"
         );
+    }
+
+    #[test]
+    fn a_field_of_another_type_than_the_formats_is_refused() {
+        let whole = metadata(2);
+        // The number of children as a number of 64 bits, and the name of a column as a struct.
+        for (place, other) in [(4, 0x56), (9, 0x3c)] {
+            let mut typed = whole.clone();
+            typed[place] = other;
+            assert!(check(&file(&typed)).is_err(), "{place}");
+        }
+        // A field that the format does not have, by the long form of its id.
+        let unknown = [&whole[..whole.len() - 1], &[0x08, 0xc8, 0x01, 1, b'x', 0]].concat();
+        check(&file(&unknown)).expect("it is skipped");
     }
 
     #[test]
