@@ -166,7 +166,7 @@ impl Drop for Worker {
 async fn until(farm: &Farm, what: &str, query: &str, least: i64) {
     let began = Instant::now();
     while farm.sql(query).parse::<i64>().expect("a number") < least {
-        assert!(began.elapsed() < PATIENCE * 3, "in vain: {what}");
+        assert!(began.elapsed() < PATIENCE * 3, "not in time: {what}");
         tokio::time::sleep(Duration::from_millis(50)).await;
     }
 }
