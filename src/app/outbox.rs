@@ -11,7 +11,6 @@ use tokio::sync::Notify;
 
 use crate::api::Service;
 use crate::clock::Timestamp;
-use crate::job::Job;
 use crate::metrics::Metrics;
 use crate::queue::{Action, Outgoing, Queue, Settled};
 use crate::remote::Webhooks;
@@ -112,38 +111,37 @@ impl Outbox {
                     Settled::Again(delay(one.attempts))
                 }
             },
-            Action::Deliver(job) => self.deliver(&one, job).await,
-            Action::Notify { url, body } => self.tell(&one, url, body).await,
+            Action::Deliver(job) => {
+                let tried = self.service.deliver(job).await;
+                let tried = tried.map_err(|error| (error.is_worth_a_retry(), error));
+                self.end(&one, Metrics::delivery, tried)
+            }
+            Action::Notify { url, body } => {
+                let id = format!("msg_{}_{}", one.job, one.number);
+                let now = Timestamp::now().as_millis() / 1000;
+                let tried = self.webhooks.tell(url, &id, now, body.clone()).await;
+                let tried = tried.map_err(|error| (error.is_worth_a_retry(), error));
+                self.end(&one, Metrics::webhook, tried)
+            }
         };
         (one.number, settled, receiver)
     }
 
-    /// Delivers a result.
-    async fn deliver(&self, one: &Outgoing, job: &Arc<Job>) -> Settled {
-        let Err(error) = self.service.deliver(job).await else {
-            self.metrics.delivery("delivered");
+    /// Counts the end of an attempt that reached out, or tells why it failed and whether a later one may succeed.
+    fn end<E: std::fmt::Display>(
+        &self,
+        one: &Outgoing,
+        count: fn(&Metrics, &'static str),
+        tried: Result<(), (bool, E)>,
+    ) -> Settled {
+        let Err((is_worth_a_retry, error)) = tried else {
+            count(&self.metrics, "delivered");
             return Settled::Done;
         };
-        let settled = failed(one, error.is_worth_a_retry());
-        self.metrics.delivery(outcome(settled));
-        let attempt = one.attempts;
-        tracing::warn!(%error, job = %one.job, attempt, then = outcome(settled), "a result was not delivered");
-        settled
-    }
-
-    /// Tells a webhook.
-    async fn tell(&self, one: &Outgoing, url: &str, body: &str) -> Settled {
-        let id = format!("msg_{}_{}", one.job, one.number);
-        let now = Timestamp::now().as_millis() / 1000;
-        let told = self.webhooks.tell(url, &id, now, body.to_owned()).await;
-        let Err(error) = told else {
-            self.metrics.webhook("delivered");
-            return Settled::Done;
-        };
-        let settled = failed(one, error.is_worth_a_retry());
-        self.metrics.webhook(outcome(settled));
-        let attempt = one.attempts;
-        tracing::warn!(%error, job = %one.job, attempt, then = outcome(settled), "a webhook was not told");
+        let settled = failed(one, is_worth_a_retry);
+        let then = outcome(settled);
+        count(&self.metrics, then);
+        tracing::warn!(%error, job = %one.job, attempt = one.attempts, then, "a result or a notice did not arrive");
         settled
     }
 }

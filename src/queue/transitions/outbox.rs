@@ -10,12 +10,11 @@ use super::rows;
 use super::rows::delivery_code;
 use crate::job::{DeliveryState, Job, JobId, State, ended_notice};
 use crate::queue::outgoing::{Action, Outgoing, Settled};
-use crate::queue::sql::{Sql, values};
+use crate::queue::sql::{Row, Sql, values};
 use crate::queue::types::QueueError;
 
 /// The statement that finds due rows. The query plan test also uses it.
-pub(in crate::queue) const DUE: &str =
-    "SELECT seq FROM outbox INDEXED BY outbox_due WHERE due <= ?1 ORDER BY due LIMIT ?2";
+pub(in crate::queue) const DUE: &str = "SELECT seq, job, url, body FROM outbox INDEXED BY outbox_due WHERE due <= ?1 ORDER BY due LIMIT ?2";
 
 /// A delivery may take this many times as long as other actions.
 const DELIVERY_HOLDS: u32 = 10;
@@ -79,17 +78,15 @@ pub(in crate::queue) fn take(
     )?;
     let mut taken = Vec::new();
     for row in &due {
-        taken.extend(take_row(sql, row.get(0)?, hold)?);
+        taken.extend(take_row(sql, row, hold)?);
     }
     Ok(taken)
 }
 
 /// Takes one row. `None` if there is nothing to do (any more), or not yet.
-fn take_row(sql: &dyn Sql, number: i64, hold: Duration) -> Result<Option<Outgoing>, QueueError> {
-    let text = "SELECT job, url, body FROM outbox WHERE seq = ?1";
-    let row = sql.only(text, values![number])?;
-    let job: JobId = row.get(0)?;
-    let (url, body): (Option<String>, Option<String>) = (row.get(1)?, row.get(2)?);
+fn take_row(sql: &dyn Sql, row: &Row, hold: Duration) -> Result<Option<Outgoing>, QueueError> {
+    let (number, job): (i64, JobId) = (row.get(0)?, row.get(1)?);
+    let (url, body): (Option<String>, Option<String>) = (row.get(2)?, row.get(3)?);
     let (action, hold) = match (url, body) {
         (None, _) => (Action::RemoveFiles, hold),
         (Some(_), None) => match rows::find(sql, job)? {
