@@ -41,7 +41,7 @@ impl Control for Clock {
 fn small_street() -> Pair {
     street(&StreetOptions {
         beams: 16,
-        azimuth_steps: 500,
+        azimuth_steps: 125,
         ..StreetOptions::default()
     })
 }
