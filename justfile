@@ -13,8 +13,8 @@ ci:
 
 # formatting and lints
 lint:
-    cargo fmt --check
-    cargo clippy --locked --release --all-targets -- -D warnings
+    cargo fmt --all --check
+    PYO3_NO_PYTHON=1 cargo clippy --locked --release --workspace --all-targets -- -D warnings
 
 # the documentation of all items, private ones too
 doc:

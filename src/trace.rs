@@ -60,7 +60,8 @@ mod tests {
     use std::sync::{Arc, Mutex};
 
     use opentelemetry::trace::TracerProvider;
-    use opentelemetry_sdk::trace::{InMemorySpanExporter, SdkTracerProvider};
+    use opentelemetry_sdk::error::OTelSdkResult;
+    use opentelemetry_sdk::trace::{SdkTracerProvider, SpanData, SpanExporter};
     use tracing_subscriber::fmt::MakeWriter;
     use tracing_subscriber::layer::SubscriberExt;
 
@@ -89,14 +90,22 @@ mod tests {
         }
     }
 
+    /// Keeps the spans that are exported.
+    #[derive(Clone, Debug, Default)]
+    struct Spans(Arc<Mutex<Vec<SpanData>>>);
+
+    impl SpanExporter for Spans {
+        async fn export(&self, batch: Vec<SpanData>) -> OTelSdkResult {
+            self.0.lock().expect("spans").extend(batch);
+            Ok(())
+        }
+    }
+
     /// The log of one request with this `traceparent` and of the attempt at its job, and the spans
     /// that were exported for them.
-    fn logged(
-        traceparent: Option<&str>,
-        exports: bool,
-    ) -> (String, Vec<opentelemetry_sdk::trace::SpanData>) {
+    fn logged(traceparent: Option<&str>, exports: bool) -> (String, Vec<SpanData>) {
         let lines = Lines::default();
-        let exporter = InMemorySpanExporter::default();
+        let exporter = Spans::default();
         let provider = SdkTracerProvider::builder()
             .with_simple_exporter(exporter.clone())
             .build();
@@ -115,7 +124,7 @@ mod tests {
             attempt.in_scope(|| tracing::info!("done"));
         });
         let text = lines.0.lock().expect("lines").clone();
-        let spans = exporter.get_finished_spans().expect("spans");
+        let spans = exporter.0.lock().expect("spans").clone();
         (String::from_utf8(text).expect("text"), spans)
     }
 

@@ -3,6 +3,7 @@
 //! source files without comments.
 
 mod circles;
+mod dependencies;
 mod docs;
 
 use std::fs;

@@ -6,43 +6,22 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use fantoccini::elements::Element;
-use fantoccini::wd::WebDriverCompatibleCommand;
-use fantoccini::{Client, ClientBuilder, Locator};
-use hyper_util::client::legacy::connect::HttpConnector;
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
 use serde_json::{Value, json};
 
 use crate::server::PATIENCE;
+use crate::webdriver::{Element, Session};
 
 /// A browser with one open page. It is closed on drop.
 pub(crate) struct Browser {
     driver: Child,
-    /// The driver's client, for what has no shorter form here.
-    pub(crate) client: Client,
+    page: Session,
 }
 
 /// Size of the window.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Window(pub(crate) u32, pub(crate) u32);
-
-/// Fetches the messages of the page's console, and of what the browser refused to load.
-#[derive(Debug)]
-struct Log;
-
-impl WebDriverCompatibleCommand for Log {
-    fn endpoint(
-        &self,
-        base: &url::Url,
-        session: Option<&str>,
-    ) -> Result<url::Url, url::ParseError> {
-        base.join(&format!("session/{}/se/log", session.unwrap_or_default()))
-    }
-
-    fn method_and_body(&self, _url: &url::Url) -> (axum::http::Method, Option<String>) {
-        let body = json!({ "type": "browser" }).to_string();
-        (axum::http::Method::POST, Some(body))
-    }
-}
 
 impl Browser {
     /// Starts one. Without a driver the test is skipped with a message, unless
@@ -88,14 +67,11 @@ impl Browser {
             "goog:chromeOptions": { "args": arguments },
             "goog:loggingPrefs": { "browser": "ALL" },
         });
-        let capabilities = capabilities.as_object().expect("an object").clone();
         let address = format!("http://127.0.0.1:{port}");
         let began = Instant::now();
         loop {
-            let mut builder = ClientBuilder::new(HttpConnector::new());
-            let client = builder.capabilities(capabilities.clone());
-            match client.connect(&address).await {
-                Ok(client) => return Some(Self { driver, client }),
+            match Session::open(&address, &capabilities).await {
+                Ok(page) => return Some(Self { driver, page }),
                 Err(error) => assert!(began.elapsed() < PATIENCE, "no browser: {error}"),
             }
             tokio::time::sleep(Duration::from_millis(100)).await;
@@ -104,19 +80,28 @@ impl Browser {
 
     /// Opens an address.
     pub(crate) async fn open(&self, url: &str) {
-        self.client.goto(url).await.expect("a page");
+        let opened = self.page.post("/url", json!({ "url": url })).await;
+        opened.expect("a page");
     }
 
     /// The element with this `data-test`, when it is there.
-    pub(crate) async fn find(&self, test: &str) -> Element {
+    pub(crate) async fn find(&self, test: &str) -> Element<'_> {
         self.css(&format!("[data-test='{test}']")).await
     }
 
     /// The first element that a CSS selector selects, when it is there.
-    pub(crate) async fn css(&self, selector: &str) -> Element {
-        let waited = self.client.wait().at_most(PATIENCE);
-        let found = waited.for_element(Locator::Css(selector)).await;
-        found.unwrap_or_else(|error| panic!("{selector} does not appear: {error}"))
+    pub(crate) async fn css(&self, selector: &str) -> Element<'_> {
+        let began = Instant::now();
+        loop {
+            match self.page.find(selector).await {
+                Ok(element) => return element,
+                Err(error) => assert!(
+                    error.is_of_a_missing_element() && began.elapsed() < PATIENCE,
+                    "{selector} does not appear: {error}"
+                ),
+            }
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
     }
 
     /// Clicks the element with this `data-test`. It is found again if the page has just replaced it.
@@ -124,7 +109,7 @@ impl Browser {
         let began = Instant::now();
         while let Err(error) = self.find(test).await.click().await {
             assert!(
-                error.is_stale_element_reference() && began.elapsed() < PATIENCE,
+                error.is_of_a_missing_element() && began.elapsed() < PATIENCE,
                 "{test} cannot be clicked: {error}"
             );
         }
@@ -139,7 +124,13 @@ impl Browser {
 
     /// Runs a script in the page, as the body of a function, and returns what it returns.
     pub(crate) async fn run(&self, script: &str) -> Value {
-        let ran = self.client.execute(script, Vec::new()).await;
+        let ran = self.page.run(script, false).await;
+        ran.unwrap_or_else(|error| panic!("{script} fails: {error}"))
+    }
+
+    /// Runs a script that calls `arguments[0]` with what it returns.
+    pub(crate) async fn run_until_called(&self, script: &str) -> Value {
+        let ran = self.page.run(script, true).await;
         ran.unwrap_or_else(|error| panic!("{script} fails: {error}"))
     }
 
@@ -160,7 +151,11 @@ impl Browser {
 
     /// Errors in the page's console since the last call, and violations of its policy.
     pub(crate) async fn log(&self) -> Vec<String> {
-        let entries = self.client.issue_cmd(Log).await.expect("a log");
+        let entries = self
+            .page
+            .post("/se/log", json!({ "type": "browser" }))
+            .await;
+        let entries = entries.expect("a log");
         let entries = entries.as_array().cloned().unwrap_or_default();
         let severe = entries.iter().filter(|entry| entry["level"] == "SEVERE");
         severe
@@ -182,7 +177,9 @@ impl Browser {
     /// Takes a picture of the window, keeps it in `target/screenshots`, and counts its pixels by
     /// color.
     pub(crate) async fn picture(&self, name: &str) -> Picture {
-        let bytes = self.client.screenshot().await.expect("a picture");
+        let encoded = self.page.get("/screenshot").await.expect("a picture");
+        let encoded = encoded.as_str().expect("text");
+        let bytes = STANDARD.decode(encoded).expect("Base64");
         let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("../screenshots");
         std::fs::create_dir_all(&folder).expect("a folder");
         std::fs::write(folder.join(format!("{name}.png")), &bytes).expect("a file");
@@ -191,8 +188,7 @@ impl Browser {
 
     /// Closes the browser.
     pub(crate) async fn close(self) {
-        let closed = self.client.clone().close().await;
-        closed.expect("it closes");
+        self.page.close().await.expect("it closes");
     }
 }
 

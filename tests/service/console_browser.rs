@@ -233,7 +233,8 @@ async fn a_key_opens_the_console_and_a_share_link_one_job_until_it_expires() {
     browser.click("submit").await;
     browser.click("share").await;
     let link = browser.find("share-link").await;
-    let link = link.prop("value").await.expect("a value").expect("a link");
+    let link = link.property("value").await.expect("a value");
+    let link = link.as_str().expect("a link");
     // The key is kept for the tab alone.
     let stored = browser
         .run("return Object.values(localStorage).join()")
@@ -302,11 +303,8 @@ async fn the_pages_are_accessible_in_light_dark_and_narrow_windows() {
                 .until("document.querySelector('main h1') && !document.querySelector('.loading')")
                 .await;
             browser.run(&axe).await;
-            let found = browser.client.execute_async(
-                "axe.run(document, { resultTypes: ['violations'] }).then(arguments[0])",
-                Vec::new(),
-            );
-            let found = found.await.expect("a report");
+            let check = "axe.run(document, { resultTypes: ['violations'] }).then(arguments[0])";
+            let found = browser.run_until_called(check).await;
             let violations = found["violations"].as_array().cloned().unwrap_or_default();
             let serious: Vec<String> = violations
                 .iter()

@@ -124,7 +124,7 @@ async fn a_server_on_a_card_gives_it_the_jobs_that_ask_for_one() {
         ("fnsf-linear", "gpu"),
     ] {
         let options =
-            format!(r#"{{"preset": "{preset}", "device": "{device}", "max_points": 2048}}"#);
+            format!(r#"{{"preset": "{preset}", "device": "{device}", "max_points": 512}}"#);
         let sent = reqwest::Client::new()
             .post(server.url("/v1/jobs"))
             .multipart(form(small_pair(), &options))

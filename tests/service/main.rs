@@ -51,5 +51,6 @@ mod sources;
 mod store_trouble;
 mod tracks;
 mod upgrade;
+mod webdriver;
 mod webhooks;
 mod windows;
