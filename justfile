@@ -14,7 +14,7 @@ ci:
 # formatting and lints
 lint:
     cargo fmt --all --check
-    PYO3_NO_PYTHON=1 cargo clippy --locked --release --workspace --all-targets -- -D warnings
+    PYO3_NO_PYTHON=1 PYO3_BUILD_EXTENSION_MODULE=1 cargo clippy --locked --release --workspace --all-targets -- -D warnings
 
 # the documentation of all items, private ones too
 doc:

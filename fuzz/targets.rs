@@ -1,17 +1,18 @@
 //! The targets, and the run of one input.
 
-use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
 use libfuzzer_sys::Corpus;
 
-use crate::{clouds, estimate, memory, metadata, payloads, queue, requests, rows, seeds, settings};
+#[cfg(feature = "fuzzing")]
+use crate::queue;
+use crate::{clouds, estimate, memory, metadata, payloads, requests, rows, settings};
 
 /// One target.
 pub(crate) struct Target {
-    name: &'static str,
+    pub(crate) name: &'static str,
     /// What it reads.
-    what: &'static str,
+    pub(crate) what: &'static str,
     /// Memory that an input may take, MiB.
     memory_mib: usize,
     run: fn(&[u8]) -> Corpus,
@@ -35,8 +36,8 @@ const fn target(
     }
 }
 
-/// All targets.
-const TARGETS: [Target; 25] = [
+/// All targets. That of the queue needs its simulation.
+pub(crate) const TARGETS: &[Target] = &[
     target("npy", "arrays of NumPy", FILE, clouds::npy),
     target(
         "npz",
@@ -124,6 +125,7 @@ const TARGETS: [Target; 25] = [
         64,
         rows::older,
     ),
+    #[cfg(feature = "fuzzing")]
     target(
         "queue",
         "schedules of the queue against its promises",
@@ -144,26 +146,10 @@ const TARGETS: [Target; 25] = [
     ),
 ];
 
-static CHOSEN: OnceLock<&Target> = OnceLock::new();
 static PANICKED: AtomicBool = AtomicBool::new(false);
 
-/// Takes the target from the environment, or lists all targets and ends.
-pub(crate) fn choose() {
-    if let Some(folder) = std::env::var_os("FNSF_FUZZ_SEEDS") {
-        seeds::write(folder.as_ref());
-        std::process::exit(0);
-    }
-    let name = std::env::var("FNSF_FUZZ_TARGET").unwrap_or_default();
-    let Some(target) = TARGETS.iter().find(|target| target.name == name) else {
-        for target in &TARGETS {
-            println!("{:<12} {}", target.name, target.what);
-        }
-        std::process::exit(i32::from(!name.is_empty()));
-    };
-    let _first = CHOSEN.set(target);
-    // libFuzzer's hook ends the process at every panic, but some are caught by design: that of a
-    // dependency by its caller, and that of a task by the service.
-    let _aborts = std::panic::take_hook();
+/// Notes every panic from now on, in any thread.
+pub(crate) fn note_panics() {
     let report = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |panic| {
         PANICKED.store(true, Relaxed);
@@ -176,11 +162,12 @@ pub(crate) fn forgive_panic() {
     PANICKED.store(false, Relaxed);
 }
 
-/// Runs one input.
-pub(crate) fn run(bytes: &[u8]) -> Corpus {
-    let target = CHOSEN.get().expect("chosen at the start");
-    memory::allow(target.memory_mib << 20);
-    let kept = (target.run)(bytes);
-    assert!(!PANICKED.load(Relaxed), "a thread panicked");
-    kept
+impl Target {
+    /// Runs one input.
+    pub(crate) fn run(&self, bytes: &[u8]) -> Corpus {
+        memory::allow(self.memory_mib << 20);
+        let kept = (self.run)(bytes);
+        assert!(!PANICKED.load(Relaxed), "a thread panicked");
+        kept
+    }
 }

@@ -1,12 +1,14 @@
 //! What a service is made of: its dependencies and limits.
 
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::admission::Admission;
+use super::admission::{Admission, AdmissionLimits};
 use super::auth::Keys;
 use super::fleet::DeviceView;
 use super::origin::Hosts;
+use crate::cost::{CostModel, Lanes};
 use crate::health::StoreHealth;
 use crate::metrics::Metrics;
 use crate::queue::Queue;
@@ -37,16 +39,13 @@ pub struct ServiceParts {
     pub limits: ServiceLimits,
 }
 
-#[cfg(any(test, feature = "fuzzing"))]
 impl ServiceParts {
-    /// The parts of a service without workers, keys or neighbors, with small limits: `queue`, and blobs
-    /// in `folder`. A body may be silent for `body_idle`.
+    /// The parts of a service without workers, keys or neighbors, with small limits, for tests: `queue`, and
+    /// blobs in `folder`. A body may be silent for `body_idle`.
     ///
     /// # Panics
     /// If the folder cannot be used.
-    pub fn alone(queue: Arc<dyn Queue>, folder: &std::path::Path, body_idle: Duration) -> Self {
-        use super::admission::AdmissionLimits;
-        use crate::cost::{CostModel, Lanes};
+    pub fn alone(queue: Arc<dyn Queue>, folder: &Path, body_idle: Duration) -> Self {
         let cost = Arc::new(CostModel::new(Lanes { cpu: 1, gpu: 0 }));
         let long = Duration::from_secs(3600);
         let limits = AdmissionLimits {

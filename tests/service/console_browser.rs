@@ -254,7 +254,7 @@ async fn a_key_opens_the_console_and_a_share_link_one_job_until_it_expires() {
 
     // Another browser, without the key.
     let browser = Browser::start(WIDE, false).await.expect("a browser");
-    browser.open(&link).await;
+    browser.open(link).await;
     shows_flow(&browser).await;
     assert_eq!(
         browser

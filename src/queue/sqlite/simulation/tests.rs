@@ -1,5 +1,7 @@
 //! Schedules by the thousand.
 
+use std::io::Read;
+
 use rand_core::{Rng, SeedableRng};
 
 use super::run;
@@ -17,5 +19,20 @@ fn no_schedule_breaks_a_promise() {
         random.fill_bytes(&mut bytes);
         let run = std::panic::catch_unwind(|| run(&bytes));
         assert!(run.is_ok(), "seed {seed}");
+    }
+}
+
+#[test]
+fn no_schedule_that_the_fuzz_target_has_kept_breaks_a_promise() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/fuzz/corpus/queue.zip");
+    let corpus = std::fs::File::open(path).expect("a corpus");
+    let mut corpus = zip::ZipArchive::new(corpus).expect("an archive");
+    assert!(corpus.len() > 10);
+    for index in 0..corpus.len() {
+        let mut schedule = corpus.by_index(index).expect("a schedule");
+        let mut bytes = Vec::new();
+        schedule.read_to_end(&mut bytes).expect("its bytes");
+        let run = std::panic::catch_unwind(|| run(&bytes));
+        assert!(run.is_ok(), "schedule {index}");
     }
 }
