@@ -1,10 +1,12 @@
 //! Files of clouds, pairs and flows: whatever is accepted is within the limits, agrees between the
 //! readers, and is read again as it was written.
 
+use std::ops::ControlFlow;
+
 use fnsf::formats::{
     CloudFormat, FileKind, MAX_COORDINATE_M, declared_rows, is_pair, read_av2_labels,
     read_av2_mask, read_cloud, read_cloud_within, read_flow, read_pair, read_pair_within,
-    read_poses, read_timed_cloud, recognize, write_cloud, write_pair_npz,
+    read_poses, read_recording, read_timed_cloud, recognize, write_cloud, write_pair_npz,
 };
 use libfuzzer_sys::Corpus;
 
@@ -37,6 +39,25 @@ pub(crate) fn bin(bytes: &[u8]) -> Corpus {
     for name in ["a.bin", "a.kitti.bin", "a.pcd.bin"] {
         cloud(bytes, Some(name));
     }
+    Corpus::Keep
+}
+
+/// Recordings: every cloud is decoded, and has finite points and a time for each or none.
+pub(crate) fn mcap(bytes: &[u8]) -> Corpus {
+    if recognize(bytes, None).ok() != Some(FileKind::Mcap) {
+        return Corpus::Reject;
+    }
+    let _read = read_recording(bytes, |message| {
+        if let Ok(sweep) = message.sweep() {
+            let is_finite = |value: &f32| value.is_finite();
+            assert!(sweep.points.iter().flatten().all(is_finite));
+            if let Some(times) = sweep.times {
+                assert_eq!(times.offsets_s.len(), sweep.points.len());
+                assert!(times.offsets_s.iter().all(is_finite));
+            }
+        }
+        ControlFlow::Continue(())
+    });
     Corpus::Keep
 }
 

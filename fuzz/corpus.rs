@@ -52,6 +52,8 @@ fn inputs(target: &str, seeds: &Path) -> BTreeMap<String, Vec<u8>> {
 /// `fuzz/run --corpus` tells which.
 #[test]
 fn no_input_that_was_ever_found_panics_hangs_takes_memory_or_breaks_a_promise() {
+    // Tokio's thread-local is made first, so that it outlives the service that a target keeps in another.
+    let _none = tokio::runtime::Handle::try_current();
     let seeds = tempfile::tempdir().expect("a folder");
     seeds::write(seeds.path());
     targets::note_panics();

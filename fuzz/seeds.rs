@@ -29,6 +29,7 @@ pub(crate) fn write(folder: &Path) {
     let found = found(&source, &target);
     seeds.flows(&source, &target, &found);
     seeds.payloads(&source, &found);
+    seeds.recordings();
     seeds.texts();
     seeds.manifests();
     seeds.requests(&source[..20], &target[..20]);
@@ -176,6 +177,24 @@ impl Seeds {
             writer.close().expect("closed");
             self.put("parquet", name, &bytes);
         }
+    }
+
+    fn recordings(&self) {
+        self.put(
+            "mcap",
+            "ros1",
+            include_bytes!("../tests/formats/recordings/ros1_lz4.mcap"),
+        );
+        self.put(
+            "mcap",
+            "ros2",
+            include_bytes!("../tests/formats/recordings/ros2_zstd.mcap"),
+        );
+        self.put(
+            "mcap",
+            "plain",
+            include_bytes!("../tests/formats/recordings/ros2_none.mcap"),
+        );
     }
 
     fn texts(&self) {

@@ -59,6 +59,7 @@ pub(crate) const TARGETS: &[Target] = &[
         clouds::feather,
     ),
     target("las", "LAS", FILE, clouds::las),
+    target("mcap", "recordings with clouds of ROS", FILE, clouds::mcap),
     target("bin", "raw floats of KITTI and nuScenes", FILE, clouds::bin),
     target(
         "json",

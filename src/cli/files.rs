@@ -10,6 +10,7 @@ use anyhow::{Context, anyhow};
 use rustix::fs::{Access, access};
 
 use super::failure::Failure;
+use super::laz;
 use super::unfinished::Unfinished;
 use crate::flow::depth::Camera;
 use crate::flow::tracks::Track;
@@ -45,14 +46,14 @@ pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, Failure> {
         .map_err(Failure::bad_input)
 }
 
-/// Reads a file and passes its bytes and name to `reader`.
+/// Reads a file, unpacks LAZ, and passes its bytes and name to `reader`.
 fn read<T>(
     path: &Path,
     reader: impl FnOnce(&[u8], Option<&str>) -> Result<T, FormatError>,
 ) -> Result<T, Failure> {
-    let bytes = read_bytes(path)?;
     let name = path.file_name().map(|name| name.to_string_lossy());
-    reader(&bytes, name.as_deref())
+    laz::unpacked(read_bytes(path)?)
+        .and_then(|bytes| Ok(reader(&bytes, name.as_deref())?))
         .with_context(|| path.display().to_string())
         .map_err(Failure::bad_input)
 }

@@ -25,11 +25,13 @@ mod eval;
 mod flow;
 mod jobs;
 mod label;
+mod laz;
 mod migrate;
 mod serve;
 mod submit;
 mod synth;
 mod tables;
+mod unpack;
 mod view;
 
 use std::process::ExitCode;
@@ -68,6 +70,7 @@ enum Command {
     Label(Box<label::Label>),
     View(Box<view::View>),
     Synth(synth::Synth),
+    Unpack(unpack::Unpack),
     Tables(tables::Tables),
     Doctor(doctor::Doctor),
 }
@@ -89,6 +92,7 @@ pub fn run(arguments: Arguments) -> ExitCode {
         Command::Label(command) => command.run(),
         Command::View(command) => command.run(),
         Command::Synth(command) => command.run(),
+        Command::Unpack(command) => command.run(),
         Command::Tables(command) => command.run(),
         Command::Doctor(command) => command.run(),
     };

@@ -133,6 +133,8 @@ fn read(
         }
         FileKind::Json => Err(FileKind::Json.unsupported("json holds flow here, not clouds")),
         FileKind::Las => read_las(bytes, most, timed),
+        FileKind::Mcap => Err(FileKind::Mcap
+            .unsupported("a recording has many sweeps; fnsf unpack writes them as files")),
         kind @ (FileKind::Png | FileKind::Camera | FileKind::Poses) => {
             Err(kind.unsupported("no cloud is read from it"))
         }

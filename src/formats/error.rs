@@ -23,6 +23,8 @@ pub enum FileKind {
     Json,
     /// LAS, or LAZ, its compressed form, which is written only.
     Las,
+    /// A recording of a robot, with the clouds of many sweeps.
+    Mcap,
     /// PNG: a depth image, 16-bit gray.
     Png,
     /// A camera: this project's JSON, or KITTI's calibration text.
@@ -45,6 +47,7 @@ impl fmt::Display for FileKind {
             Self::Feather => "feather",
             Self::Json => "json",
             Self::Las => "las",
+            Self::Mcap => "mcap",
             Self::Png => "png",
             Self::Camera => "camera",
             Self::Poses => "poses",

@@ -28,6 +28,7 @@ mod feather;
 mod las_read;
 mod las_write;
 mod lzf;
+mod mcap;
 mod npy;
 mod npz;
 mod pcd;
@@ -46,6 +47,7 @@ pub use crate::formats::error::{FileKind, FormatError};
 pub use crate::formats::flow_file::{FlowFile, FlowFormat, FlowTable, read_flow, write_flow};
 pub use crate::formats::ground_raster::GroundRaster;
 pub use crate::formats::limits::{MAX_COORDINATE_M, MAX_POINTS};
+pub use crate::formats::mcap::{CloudMessage, RecordedSweep, read_recording};
 pub use crate::formats::motion::{ego_motion, matrix_rows, read_motion, rigid_motion};
 pub use crate::formats::pair::{
     Av2Labels, Ground, Pair, PairTruth, is_pair, read_av2_labels, read_pair, read_pair_within,

@@ -2,7 +2,7 @@
 //! distinctive.
 
 use super::error::{FileKind, FormatError};
-use super::{bin, feather, las_read, npy};
+use super::{bin, feather, las_read, mcap, npy};
 
 /// Number of lines in which a PCD header must start; comments may precede it.
 const MAX_COMMENT_LINES: usize = 32;
@@ -36,6 +36,9 @@ pub fn recognize(bytes: &[u8], name: Option<&str>) -> Result<FileKind, FormatErr
     }
     if bytes.starts_with(las_read::MAGIC) {
         return Ok(FileKind::Las);
+    }
+    if bytes.starts_with(mcap::MAGIC) {
+        return Ok(FileKind::Mcap);
     }
     if is_pcd(bytes) {
         return Ok(FileKind::Pcd);

@@ -15,6 +15,7 @@ mod label;
 mod label_datasets;
 mod label_hostile;
 mod label_manifest;
+mod laz;
 #[path = "../common/object_server.rs"]
 mod object_server;
 mod program;
@@ -22,4 +23,5 @@ mod program;
 mod real_data;
 mod sequences;
 mod tables;
+mod unpack;
 mod view;

@@ -17,6 +17,8 @@ mod poses;
 #[cfg(test)]
 mod real_data;
 #[cfg(test)]
+mod recordings;
+#[cfg(test)]
 mod round_trips;
 #[cfg(test)]
 mod samples;

@@ -84,7 +84,11 @@ pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatErr
         kind @ (FileKind::KittiBin | FileKind::NuscenesBin) => {
             return Err(kind.unsupported("it holds a cloud, not flow"));
         }
-        kind @ (FileKind::Las | FileKind::Png | FileKind::Camera | FileKind::Poses) => {
+        kind @ (FileKind::Las
+        | FileKind::Mcap
+        | FileKind::Png
+        | FileKind::Camera
+        | FileKind::Poses) => {
             return Err(kind.unsupported("no flow is read from it"));
         }
     };

@@ -1,0 +1,257 @@
+//! `fnsf unpack`: the sweeps of a recording as files.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::BufReader;
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, anyhow};
+use clap::Args;
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+
+use super::failure::Failure;
+use super::files;
+use super::output::say;
+use crate::formats::{
+    CloudFormat, CloudMessage, FormatError, read_recording, write_cloud, write_timed_pcd,
+};
+use crate::text::{grouped, printable};
+
+/// Bytes that are read at a time.
+const BUFFER: usize = 1 << 20;
+
+/// Write the sweeps of an MCAP recording as files.
+///
+/// Point clouds of ROS 1 and ROS 2 (sensor_msgs/PointCloud2) become files DIR/TOPIC/STAMP.pcd, one for each
+/// message. STAMP is the time in the message's header in nanoseconds. The times of the points are kept, for
+/// --deskew. Points whose coordinates are not finite are left out and counted.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:\n  \
+    fnsf unpack drive.mcap --list                         # topics with clouds\n  \
+    fnsf unpack drive.mcap -o sweeps --topic /lidar/top   # one of them\n  \
+    fnsf flow sweeps/lidar_top/*.pcd -o flow.npz          # then, as any sweeps")]
+pub(super) struct Unpack {
+    /// Recording: MCAP, chunks not compressed or by lz4 or zstd
+    #[arg(value_name = "FILE")]
+    recording: PathBuf,
+    /// Folder for the sweeps, with a folder for each topic; created if missing
+    #[arg(short, long, value_name = "DIR", required_unless_present = "list")]
+    output: Option<PathBuf>,
+    /// Take this topic only, as the recording names it
+    #[arg(long, value_name = "TOPIC")]
+    topic: Option<String>,
+    /// Leave out so many sweeps of each topic at the beginning
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    skip: usize,
+    /// Write at most so many sweeps of each topic
+    #[arg(long, value_name = "N")]
+    limit: Option<usize>,
+    /// Print the topics with clouds and the number of their messages; write nothing
+    #[arg(long, conflicts_with = "output")]
+    list: bool,
+}
+
+/// What was found on one topic.
+#[derive(Default)]
+struct Topic {
+    messages: usize,
+    sweeps: usize,
+    points: usize,
+    dropped: usize,
+    timed: usize,
+    /// Why the times of the points of a sweep are not used.
+    refused_times: Option<String>,
+    /// Time of the last sweep, nanoseconds.
+    last: Option<u64>,
+    /// Messages with the time of the one before, which were left out.
+    repeated: usize,
+}
+
+impl Unpack {
+    pub(super) fn run(&self) -> Result<(), Failure> {
+        let unreadable = || format!("cannot read {}", self.recording.display());
+        let open = || -> std::io::Result<(File, u64)> {
+            let file = File::open(&self.recording)?;
+            let length = file.metadata()?.len();
+            Ok((file, length))
+        };
+        let (file, length) = open()
+            .with_context(unreadable)
+            .map_err(Failure::bad_input)?;
+        let bar = bar(length);
+        let mut topics: BTreeMap<String, Topic> = BTreeMap::new();
+        let mut damaged = 0;
+        let mut failure = None;
+        let bytes = bar.wrap_read(BufReader::with_capacity(BUFFER, file));
+        let read = read_recording(bytes, |message| {
+            if self
+                .topic
+                .as_ref()
+                .is_some_and(|topic| topic != message.topic)
+            {
+                return ControlFlow::Continue(());
+            }
+            let topic = topics.entry(message.topic.to_owned()).or_default();
+            topic.messages += 1;
+            let limit = self.limit.unwrap_or(usize::MAX);
+            if topic.sweeps >= limit && self.topic.is_some() {
+                return ControlFlow::Break(());
+            }
+            if self.list || topic.messages <= self.skip || topic.sweeps >= limit {
+                return ControlFlow::Continue(());
+            }
+            match self.write(message, topic) {
+                Ok(()) => ControlFlow::Continue(()),
+                Err(Stop::Damaged(error)) => {
+                    damaged += 1;
+                    bar.suspend(|| complain(message, &error));
+                    ControlFlow::Continue(())
+                }
+                Err(Stop::Failed(error)) => {
+                    failure = Some(error);
+                    ControlFlow::Break(())
+                }
+            }
+        });
+        bar.finish_and_clear();
+        if let Some(failure) = failure {
+            return Err(failure);
+        }
+        self.report(&topics)?;
+        read.with_context(|| self.recording.display().to_string())
+            .map_err(Failure::bad_input)?;
+        if damaged > 0 {
+            let message = format!("{damaged} clouds cannot be read; the others are written");
+            return Err(Failure::bad_input(anyhow!(message)));
+        }
+        Ok(())
+    }
+
+    /// Writes one sweep.
+    fn write(&self, message: &CloudMessage<'_>, topic: &mut Topic) -> Result<(), Stop> {
+        let sweep = message.sweep().map_err(Stop::Damaged)?;
+        let stamp = match sweep.stamp_ns {
+            0 => message.logged_ns,
+            stamp => stamp,
+        };
+        if topic.last == Some(stamp) {
+            topic.repeated += 1;
+            return Ok(());
+        }
+        let output = self.output.as_deref().unwrap_or(Path::new("."));
+        let folder = output.join(folder_of(message.topic));
+        fs::create_dir_all(&folder)
+            .with_context(|| format!("cannot make {}", folder.display()))
+            .map_err(|error| Stop::Failed(Failure::internal(error)))?;
+        let path = folder.join(format!("{stamp:019}.pcd"));
+        let written = files::write(&path, |file| match &sweep.times {
+            None => write_cloud(CloudFormat::Pcd, &sweep.points, file),
+            Some(times) => write_timed_pcd(&sweep.points, &times.offsets_s, file),
+        });
+        written.map_err(Stop::Failed)?;
+        topic.last = Some(stamp);
+        topic.sweeps += 1;
+        topic.points += sweep.points.len();
+        topic.dropped += sweep.dropped;
+        topic.timed += usize::from(sweep.times.is_some());
+        topic.refused_times = topic.refused_times.take().or(sweep.refused_times);
+        Ok(())
+    }
+
+    fn report(&self, topics: &BTreeMap<String, Topic>) -> Result<(), Failure> {
+        if topics.is_empty() {
+            let message = match &self.topic {
+                None => "no clouds of sensor_msgs/PointCloud2 are in it".to_owned(),
+                Some(topic) => {
+                    format!("no clouds are on the topic {topic}; --list shows the topics")
+                }
+            };
+            let message = format!("{}: {message}", self.recording.display());
+            return Err(Failure::bad_input(anyhow!(message)));
+        }
+        for (name, topic) in topics {
+            if self.list {
+                say(format_args!("{name}: {} clouds", grouped(topic.messages)))?;
+                continue;
+            }
+            let output = self.output.as_deref().unwrap_or(Path::new("."));
+            say(format_args!(
+                "{name}: {} sweeps, {} points, in {}",
+                grouped(topic.sweeps),
+                grouped(topic.points),
+                output.join(folder_of(name)).display()
+            ))?;
+            if topic.dropped > 0 {
+                let dropped = grouped(topic.dropped);
+                say(format_args!(
+                    "  {dropped} points without finite coordinates are left out"
+                ))?;
+            }
+            if topic.repeated > 0 {
+                let repeated = grouped(topic.repeated);
+                say(format_args!(
+                    "  {repeated} clouds with the time of the one before are left out"
+                ))?;
+            }
+            match &topic.refused_times {
+                Some(why) => say(format_args!(
+                    "  the times of the points are not used: {why}"
+                ))?,
+                None if topic.timed > 0 => say(format_args!("  with the times of the points"))?,
+                None => {}
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Why a sweep was not written.
+enum Stop {
+    Damaged(FormatError),
+    Failed(Failure),
+}
+
+fn complain(message: &CloudMessage<'_>, error: &FormatError) {
+    let (topic, logged) = (printable(message.topic), message.logged_ns);
+    eprintln!("fnsf: the cloud on {topic} of {logged} ns is left out: {error}");
+}
+
+/// The folder of a topic: its name with `_` for everything but letters, digits and `-`.
+fn folder_of(topic: &str) -> String {
+    let plain = |letter: char| match letter {
+        letter if letter.is_ascii_alphanumeric() || letter == '-' => letter,
+        _ => '_',
+    };
+    let name: String = topic
+        .trim_matches('/')
+        .chars()
+        .take(100)
+        .map(plain)
+        .collect();
+    match name.is_empty() {
+        true => "clouds".to_owned(),
+        false => name,
+    }
+}
+
+/// A bar of the bytes that are read, where stderr is a terminal.
+fn bar(length: u64) -> ProgressBar {
+    let style =
+        ProgressStyle::with_template("{wide_bar:.cyan/blue} {bytes} of {total_bytes}  {eta} left");
+    let bar = ProgressBar::with_draw_target(Some(length), ProgressDrawTarget::stderr());
+    bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+    bar
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_folder_of_a_topic_is_a_plain_name() {
+        assert_eq!(folder_of("/lidar/top/points"), "lidar_top_points");
+        assert_eq!(folder_of("/../a b"), "___a_b");
+        assert_eq!(folder_of("/"), "clouds");
+    }
+}

@@ -1,0 +1,14 @@
+//! Recordings of robots: MCAP files with point clouds of ROS 1 and ROS 2, read as a stream.
+//!
+//! The records are walked from the beginning, without the index, so that a recording that was cut off
+//! gives what it has. Every length is checked against the bytes that are there.
+
+mod chunk;
+mod point_cloud;
+mod recording;
+mod records;
+mod wire;
+
+pub use point_cloud::RecordedSweep;
+pub use recording::{CloudMessage, read_recording};
+pub(super) use records::MAGIC;

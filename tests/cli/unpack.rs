@@ -1,0 +1,109 @@
+//! Tests of `fnsf unpack`.
+
+use std::path::Path;
+
+use fnsf::formats::read_timed_cloud;
+
+use super::program::fnsf;
+
+const RECORDING: &[u8] = include_bytes!("../formats/recordings/ros2_zstd.mcap");
+
+fn names(folder: &Path) -> Vec<String> {
+    let files = std::fs::read_dir(folder).expect("a folder");
+    let mut names: Vec<String> = files
+        .map(|file| {
+            file.expect("a file")
+                .file_name()
+                .to_string_lossy()
+                .into_owned()
+        })
+        .collect();
+    names.sort();
+    names
+}
+
+#[test]
+fn the_sweeps_of_a_recording_become_files_with_their_times() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    std::fs::write(folder.join("drive.mcap"), RECORDING).expect("a file");
+    let listed = fnsf(folder, &["unpack", "drive.mcap", "--list"]);
+    assert_eq!(
+        (listed.code, listed.stdout.trim()),
+        (0, "/lidar/top: 3 clouds")
+    );
+    let done = fnsf(folder, &["unpack", "drive.mcap", "-o", "sweeps"]);
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    for words in [
+        "3 sweeps, 117 points",
+        "3 points without finite",
+        "with the times",
+    ] {
+        assert!(done.stdout.contains(words), "{}", done.stdout);
+    }
+    let topic = folder.join("sweeps/lidar_top");
+    let names = names(&topic);
+    assert_eq!(names[1], "1700000000100000000.pcd");
+    let sweep = std::fs::read(topic.join(&names[2])).expect("a sweep");
+    let sweep = read_timed_cloud(&sweep, None).expect("a sweep");
+    assert_eq!(sweep.cloud.points[0], [2.0, -3.0, 1.0]);
+    let times = sweep.times.expect("times").offsets_s;
+    assert!((times[38] - 0.0975).abs() < 1e-6, "{times:?}");
+    let some = [
+        "unpack",
+        "drive.mcap",
+        "-o",
+        "some",
+        "--skip",
+        "1",
+        "--limit",
+        "1",
+    ];
+    assert_eq!(fnsf(folder, &some).code, 0);
+    assert_eq!(
+        self::names(&folder.join("some/lidar_top")),
+        [names[1].clone()]
+    );
+}
+
+#[test]
+fn a_recording_that_ends_early_gives_its_sweeps_and_exit_code_65() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    let length = RECORDING.len();
+    // Without the summary and the last chunk.
+    std::fs::write(folder.join("drive.mcap"), &RECORDING[..length * 6 / 10]).expect("a file");
+    let done = fnsf(folder, &["unpack", "drive.mcap", "-o", "sweeps"]);
+    assert_eq!(done.code, 65, "{}", done.stdout);
+    assert!(
+        done.stderr.contains("middle of a record"),
+        "{}",
+        done.stderr
+    );
+    assert!(!names(&folder.join("sweeps/lidar_top")).is_empty());
+}
+
+#[test]
+fn a_recording_without_the_topic_or_without_clouds_is_refused_in_words() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    std::fs::write(folder.join("drive.mcap"), RECORDING).expect("a file");
+    for (arguments, said) in [
+        (
+            vec!["unpack", "drive.mcap", "-o", "x", "--topic", "/chatter"],
+            "--list shows",
+        ),
+        (
+            vec!["unpack", "nothing.mcap", "-o", "x"],
+            "cannot read nothing.mcap",
+        ),
+        (
+            vec!["flow", "drive.mcap", "drive.mcap", "--json"],
+            "fnsf unpack",
+        ),
+    ] {
+        let ended = fnsf(folder, &arguments);
+        assert_eq!(ended.code, 65, "{}", ended.stderr);
+        assert!(ended.stderr.contains(said), "{}", ended.stderr);
+    }
+}
