@@ -118,9 +118,14 @@ impl Unpack {
         if let Some(failure) = failure {
             return Err(failure);
         }
+        let read = read
+            .with_context(|| self.recording.display().to_string())
+            .map_err(Failure::bad_input);
+        if topics.is_empty() {
+            return read.and_then(|()| Err(self.nothing_found()));
+        }
         self.report(&topics)?;
-        read.with_context(|| self.recording.display().to_string())
-            .map_err(Failure::bad_input)?;
+        read?;
         if damaged > 0 {
             let message = format!("{damaged} clouds cannot be read; the others are written");
             return Err(Failure::bad_input(anyhow!(message)));
@@ -159,17 +164,18 @@ impl Unpack {
         Ok(())
     }
 
+    fn nothing_found(&self) -> Failure {
+        let message = match &self.topic {
+            None => "no clouds of sensor_msgs/PointCloud2 are in it".to_owned(),
+            Some(topic) => {
+                format!("no clouds are on the topic {topic}; --list shows the topics")
+            }
+        };
+        let message = format!("{}: {message}", self.recording.display());
+        Failure::bad_input(anyhow!(message))
+    }
+
     fn report(&self, topics: &BTreeMap<String, Topic>) -> Result<(), Failure> {
-        if topics.is_empty() {
-            let message = match &self.topic {
-                None => "no clouds of sensor_msgs/PointCloud2 are in it".to_owned(),
-                Some(topic) => {
-                    format!("no clouds are on the topic {topic}; --list shows the topics")
-                }
-            };
-            let message = format!("{}: {message}", self.recording.display());
-            return Err(Failure::bad_input(anyhow!(message)));
-        }
         for (name, topic) in topics {
             if self.list {
                 say(format_args!("{name}: {} clouds", grouped(topic.messages)))?;

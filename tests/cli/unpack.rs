@@ -87,11 +87,16 @@ fn a_recording_that_ends_early_gives_its_sweeps_and_exit_code_65() {
 fn a_recording_without_the_topic_or_without_clouds_is_refused_in_words() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
+    std::fs::write(folder.join("text.mcap"), "no recording").expect("a file");
     std::fs::write(folder.join("drive.mcap"), RECORDING).expect("a file");
     for (arguments, said) in [
         (
             vec!["unpack", "drive.mcap", "-o", "x", "--topic", "/chatter"],
             "--list shows",
+        ),
+        (
+            vec!["unpack", "text.mcap", "-o", "x"],
+            "does not begin as a recording",
         ),
         (
             vec!["unpack", "nothing.mcap", "-o", "x"],
