@@ -1,23 +1,10 @@
 //! Tests of compressed LAS files, which the command line alone reads.
 
-use fnsf::flow::{DenseCloud, Point};
-use fnsf::formats::{DenseFormat, read_cloud, read_pair, write_dense};
+use fnsf::flow::Point;
+use fnsf::formats::{DenseFormat, read_cloud, read_pair};
 
+use super::dense_file::dense_file as file;
 use super::program::{fnsf, json, street};
-
-fn file(format: DenseFormat, points: &[Point]) -> Vec<u8> {
-    let count = points.len();
-    let cloud = DenseCloud {
-        points: points.to_vec(),
-        sweep: vec![0; count],
-        age: vec![0.0; count],
-        dynamic: vec![false; count],
-        converged: vec![true; count],
-    };
-    let mut bytes = Vec::new();
-    write_dense(format, &cloud, &mut bytes).expect("written");
-    bytes
-}
 
 #[test]
 fn sweeps_as_laz_have_the_flow_of_the_same_sweeps_as_las() {

@@ -6,6 +6,8 @@
 )]
 
 mod commands;
+#[path = "../common/dense_file.rs"]
+mod dense_file;
 mod evaluation;
 mod follow;
 #[path = "../common/gpu.rs"]

@@ -7,7 +7,7 @@ use fnsf::formats::{
 };
 use proptest::prelude::*;
 
-use crate::las::file as las_file;
+use crate::dense_file::dense_file as las_file;
 use crate::samples::{
     CLOUD_FORMATS, FLOW_FORMATS, cloud_file, feather, floats, flow_file, lzf_literals, npy, npz,
     pair, pair_file, points,

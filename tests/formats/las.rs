@@ -3,28 +3,12 @@
 
 use std::io::Cursor;
 
-use fnsf::flow::{DenseCloud, Point};
-use fnsf::formats::{
-    DenseFormat, FormatError, declared_rows, read_cloud, read_timed_cloud, write_dense,
-};
+use fnsf::flow::Point;
+use fnsf::formats::{DenseFormat, FormatError, declared_rows, read_cloud, read_timed_cloud};
 
+use crate::dense_file::dense_file as file;
 use crate::real_data::real;
 use crate::samples::points;
-
-/// A file of a dense cloud.
-pub(crate) fn file(format: DenseFormat, points: &[Point]) -> Vec<u8> {
-    let count = points.len();
-    let cloud = DenseCloud {
-        points: points.to_vec(),
-        sweep: vec![0; count],
-        age: vec![0.5; count],
-        dynamic: vec![false; count],
-        converged: vec![true; count],
-    };
-    let mut bytes = Vec::new();
-    write_dense(format, &cloud, &mut bytes).expect("written");
-    bytes
-}
 
 #[test]
 fn what_is_written_comes_back_to_the_millimetre() {

@@ -9,6 +9,9 @@ mod decompression_bombs;
 #[cfg(test)]
 mod dense;
 #[cfg(test)]
+#[path = "../common/dense_file.rs"]
+mod dense_file;
+#[cfg(test)]
 mod hostile;
 #[cfg(test)]
 mod las;

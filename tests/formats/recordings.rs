@@ -1,5 +1,7 @@
-//! Recordings of robots. The files were written by the Python packages `mcap` and `mcap-ros2-support`: on one
-//! topic clouds of 40 points, 0.1 s apart, of which point 5 is NaN, and on another one texts.
+//! Tests of recordings of robots.
+//!
+//! The Python packages `mcap` and `mcap-ros2-support` wrote the files. Each has clouds of 40 points on one topic,
+//! 0.1 s apart. Point 5 of every cloud is NaN. The files of ROS 2 have a second topic with texts.
 
 use std::ops::ControlFlow;
 
