@@ -144,8 +144,7 @@ impl Unpack {
             topic.repeated += 1;
             return Ok(());
         }
-        let output = self.output.as_deref().unwrap_or(Path::new("."));
-        let folder = output.join(folder_of(message.topic));
+        let folder = self.folder(message.topic);
         fs::create_dir_all(&folder)
             .with_context(|| format!("cannot make {}", folder.display()))
             .map_err(|error| Stop::Failed(Failure::internal(error)))?;
@@ -162,6 +161,12 @@ impl Unpack {
         topic.timed += usize::from(sweep.times.is_some());
         topic.refused_times = topic.refused_times.take().or(sweep.refused_times);
         Ok(())
+    }
+
+    /// The folder of a topic's sweeps.
+    fn folder(&self, topic: &str) -> PathBuf {
+        let output = self.output.as_deref().unwrap_or(Path::new("."));
+        output.join(folder_of(topic))
     }
 
     fn nothing_found(&self) -> Failure {
@@ -181,12 +186,11 @@ impl Unpack {
                 say(format_args!("{name}: {} clouds", grouped(topic.messages)))?;
                 continue;
             }
-            let output = self.output.as_deref().unwrap_or(Path::new("."));
             say(format_args!(
                 "{name}: {} sweeps, {} points, in {}",
                 grouped(topic.sweeps),
                 grouped(topic.points),
-                output.join(folder_of(name)).display()
+                self.folder(name).display()
             ))?;
             if topic.dropped > 0 {
                 let dropped = grouped(topic.dropped);

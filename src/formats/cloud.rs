@@ -102,11 +102,7 @@ pub fn read_cloud_within(
 /// As for [`read_cloud`], and `NotFinite` for a time that is NaN or infinite.
 pub fn read_timed_cloud(bytes: &[u8], name: Option<&str>) -> Result<TimedCloud, FormatError> {
     let (cloud, column) = read(bytes, name, MAX_POINTS, true)?;
-    let times = column.map_or(Ok(None), |column| column.times());
-    let (times, refused_times) = match times {
-        Ok(times) => (times, None),
-        Err(refused) => (None, Some(refused)),
-    };
+    let (times, refused_times) = TimesColumn::used(column);
     Ok(TimedCloud {
         cloud,
         times,

@@ -80,12 +80,20 @@ impl TimesColumn {
         self.values.push(f64::NAN);
     }
 
+    /// The times of a column that a file may have; or why they are not used.
+    pub(super) fn used(column: Option<Self>) -> (Option<PointTimes>, Option<String>) {
+        match column.map_or(Ok(None), |column| column.times()) {
+            Ok(times) => (times, None),
+            Err(refused) => (None, Some(refused)),
+        }
+    }
+
     /// The times; an explanation where they are not those of one sweep. None where all points have
     /// the same time.
     ///
     /// The duration determines the unit. The time of the sweep is the origin of the column if that is
     /// at most two durations away from the points, otherwise the first point's.
-    pub(super) fn times(&self) -> Result<Option<PointTimes>, String> {
+    fn times(&self) -> Result<Option<PointTimes>, String> {
         let finite = || {
             self.values
                 .iter()

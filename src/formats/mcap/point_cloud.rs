@@ -166,10 +166,7 @@ impl<'a> PointCloud<'a> {
                 }
             }
         }
-        let (times, refused_times) = match column.map_or(Ok(None), |column| column.times()) {
-            Ok(times) => (times, None),
-            Err(refused) => (None, Some(refused)),
-        };
+        let (times, refused_times) = TimesColumn::used(column);
         Ok(RecordedSweep {
             stamp_ns: self.stamp_ns,
             points,
