@@ -195,7 +195,9 @@ async fn a_real_card_that_is_destroyed_in_the_middle_of_a_job_is_opened_again_an
     };
     let stand = serve(vec![gpu], true).await;
     let id = stand
-        .submit(json!({"device": "gpu", "preset": "paper", "max_points": 1000}))
+        .submit(json!({
+            "device": "gpu", "preset": "paper", "max_points": 500, "field": {"max_iterations": 100}
+        }))
         .await;
     let elsewhere = stand
         .submit(json!({"device": "cpu", "preset": "neural"}))

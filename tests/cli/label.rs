@@ -98,26 +98,26 @@ fn signal(child: &Child, name: &str) {
 fn labels_have_the_bits_of_a_sequence_whatever_the_shards() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    drives(folder, 3, "6");
+    drives(folder, 2, "5");
     let whole = label(folder, &["drives", "-o", "whole"]);
     assert_eq!(whole.code, 0, "{}", whole.stderr);
-    assert!(whole.stdout.contains("15 of 15 pairs"), "{}", whole.stdout);
+    assert!(whole.stdout.contains("8 of 8 pairs"), "{}", whole.stdout);
     for shard in ["0/4", "1/4", "2/4", "3/4"] {
         let done = label(folder, &["drives", "-o", "parts", "--shard", shard]);
         assert_eq!(done.code, 0, "{}", done.stderr);
     }
     let found = labels(&folder.join("whole"));
-    assert_eq!(found.len(), 15);
+    assert_eq!(found.len(), 8);
     assert_same(&found, &labels(&folder.join("parts")));
-    for drive in 0..3 {
-        let sweeps: Vec<String> = (0..6)
+    for drive in 0..2 {
+        let sweeps: Vec<String> = (0..5)
             .map(|sweep| format!("drives/d{drive}/sweep_{sweep:04}.pcd"))
             .collect();
         let sweeps: Vec<&str> = sweeps.iter().map(String::as_str).collect();
         let options = ["--preset", "label", "-o", "flow.npz"];
         let done = fnsf(folder, &[&["flow"], &sweeps[..], &options].concat());
         assert_eq!(done.code, 0, "{}", done.stderr);
-        for pair in 0..5 {
+        for pair in 0..4 {
             let theirs = fs::read(folder.join(format!("flow_{pair:04}.npz"))).expect("written");
             assert!(
                 found[&format!("d{drive}/sweep_{pair:04}.npz")] == theirs,
@@ -127,7 +127,7 @@ fn labels_have_the_bits_of_a_sequence_whatever_the_shards() {
     }
     let again = label(folder, &["drives", "-o", "parts"]);
     assert!(
-        again.stdout.contains("15 were there before"),
+        again.stdout.contains("8 were there before"),
         "{}",
         again.stdout
     );
@@ -137,19 +137,19 @@ fn labels_have_the_bits_of_a_sequence_whatever_the_shards() {
             folder,
             &["drives", "-o", "drives/out", "--layout", "feather"],
         );
-        assert!(inside.stdout.contains("of 15 pairs"), "{}", inside.stdout);
+        assert!(inside.stdout.contains("of 8 pairs"), "{}", inside.stdout);
     }
     let end = label(folder, &["drives", "-o", "parts", "--finalize"]);
     assert_eq!(end.code, 0, "{}", end.stderr);
     let success = fs::read_to_string(folder.join("parts/_SUCCESS")).expect("written");
-    assert_eq!(success, "15 labelled, 0 refused\n");
+    assert_eq!(success, "8 labelled, 0 refused\n");
     let report = fs::read_to_string(folder.join("parts/_report.csv")).expect("written");
     assert_eq!(
         report
             .lines()
             .filter(|line| line.contains(",labelled,"))
             .count(),
-        15
+        8
     );
 }
 
@@ -157,7 +157,7 @@ fn labels_have_the_bits_of_a_sequence_whatever_the_shards() {
 fn killed_processes_on_the_same_rows_leave_every_label_once() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    drives(folder, 3, "8");
+    drives(folder, 2, "7");
     let reference = label(folder, &["drives", "-o", "reference"]);
     assert_eq!(reference.code, 0, "{}", reference.stderr);
     let output = folder.join("labels");
@@ -188,7 +188,7 @@ fn killed_processes_on_the_same_rows_leave_every_label_once() {
 fn a_signal_finishes_the_pair_and_the_next_process_goes_on() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    drives(folder, 2, "12");
+    drives(folder, 2, "8");
     for name in ["-TERM", "-INT"] {
         let out = format!("labels{name}");
         let mut stopped = start(folder, &["drives", "-o", &out], &[]);
@@ -213,7 +213,7 @@ fn a_signal_finishes_the_pair_and_the_next_process_goes_on() {
         assert!(!folder.join(&out).join("_SUCCESS").exists());
         let rest = label(folder, &["drives", "-o", &out]);
         assert_eq!(rest.code, 0, "{}", rest.stderr);
-        assert_eq!(labels(&folder.join(&out)).len(), 22);
+        assert_eq!(labels(&folder.join(&out)).len(), 14);
     }
 }
 
@@ -348,7 +348,7 @@ fn an_output_belongs_to_one_run() {
 fn tracks_of_whole_drives_are_those_of_a_sequence() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    drives(folder, 2, "6");
+    drives(folder, 2, "5");
     let arguments = ["drives", "-o", "labels", "--tracks", "--dt", "0.1"];
     let mut cut_off = start(folder, &arguments, &[]);
     await_labels(&folder.join("labels"), 2);
@@ -356,7 +356,7 @@ fn tracks_of_whole_drives_are_those_of_a_sequence() {
     cut_off.wait().expect("it has ended");
     let done = label(folder, &arguments);
     assert_eq!(done.code, 0, "{}", done.stderr);
-    let sweeps: Vec<String> = (0..6)
+    let sweeps: Vec<String> = (0..5)
         .map(|sweep| format!("drives/d1/sweep_{sweep:04}.pcd"))
         .collect();
     let sweeps: Vec<&str> = sweeps.iter().map(String::as_str).collect();
@@ -373,11 +373,11 @@ fn tracks_of_whole_drives_are_those_of_a_sequence() {
     let flow = fnsf(folder, &[&["flow"], &sweeps[..], &options].concat());
     assert_eq!(flow.code, 0, "{}", flow.stderr);
     let found = labels(&folder.join("labels"));
-    assert_eq!(found.len(), 2 * 6);
+    assert_eq!(found.len(), 2 * 5);
     let tracks = fs::read(folder.join("tracks.json")).expect("written");
     assert!(found["d1/tracks.json"] == tracks);
     assert!(!read_tracks(&tracks).expect("tracks").is_empty());
-    for pair in 0..5 {
+    for pair in 0..4 {
         let theirs = fs::read(folder.join(format!("flow_{pair:04}.npz"))).expect("written");
         assert!(
             found[&format!("d1/sweep_{pair:04}.npz")] == theirs,

@@ -1,13 +1,13 @@
-//! The tests' dependencies, read from `cargo tree`.
+//! The dependencies of the tests and of the Python package, read from `cargo tree`.
 
 use std::collections::BTreeSet;
 use std::process::Command;
 
-/// The packages that are built for these kinds of dependencies: name, version, features.
-fn packages(edges: &str) -> BTreeSet<String> {
+/// The packages that are built for these kinds of dependencies of a package: name, version, features.
+fn packages(of: &str, edges: &str) -> BTreeSet<String> {
     let listed = Command::new(env!("CARGO"))
         .args(["tree", "--locked", "--offline", "--prefix", "none"])
-        .args(["--format", "{p} {f}", "--edges", edges])
+        .args(["--package", of, "--format", "{p} {f}", "--edges", edges])
         .current_dir(env!("CARGO_MANIFEST_DIR"))
         .output()
         .expect("cargo starts");
@@ -18,21 +18,38 @@ fn packages(edges: &str) -> BTreeSet<String> {
     lines.lines().map(without_mark).collect()
 }
 
-/// Otherwise all that depends on one with more features would be compiled twice: for the tests, and
-/// for the program.
-#[test]
-fn no_dependency_of_the_tests_adds_a_feature_to_one_of_the_program() {
-    let program = packages("normal,build");
-    let tests = packages("normal,build,dev");
+/// The packages of `others` that the program has, too, but with other features. All that depends on
+/// one would be compiled twice.
+fn with_other_features(others: BTreeSet<String>) -> Vec<String> {
+    let program = packages("fnsf", "normal,build");
     let named = |line: &str| line.split(' ').take(2).collect::<Vec<_>>().join(" ");
     let known: BTreeSet<String> = program.iter().map(|line| named(line)).collect();
     assert!(known.len() > 200, "{} packages are listed", known.len());
-    let more: Vec<&String> = tests
-        .difference(&program)
-        .filter(|line| known.contains(&named(line)))
-        .collect();
+    let differ = others.into_iter();
+    let differ = differ.filter(|line| known.contains(&named(line)) && !program.contains(line));
+    differ.collect()
+}
+
+#[test]
+fn no_dependency_of_the_tests_adds_a_feature_to_one_of_the_program() {
+    let more = with_other_features(packages("fnsf", "normal,build,dev"));
     assert!(
         more.is_empty(),
         "the tests ask for more features, put them into [dependencies]: {more:#?}"
+    );
+}
+
+#[test]
+fn the_python_package_is_built_from_the_dependencies_of_the_program() {
+    /// `cargo tree` shows what build scripts need of tempfile as if the program needed it.
+    const BELOW_TEMPFILE: [&str; 3] = ["linux-raw-sys ", "once_cell ", "rustix "];
+    let mut differ = with_other_features(packages("fnsf-python", "normal,build"));
+    differ.retain(|line| !BELOW_TEMPFILE.iter().any(|name| line.starts_with(name)));
+    differ.extend(with_other_features(packages("fnsf-python", "normal")));
+    // It is the library without the service.
+    differ.retain(|line| !line.starts_with("fnsf v"));
+    assert!(
+        differ.is_empty(),
+        "these have other features than in the program, see clients/python/Cargo.toml: {differ:#?}"
     );
 }

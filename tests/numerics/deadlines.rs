@@ -52,6 +52,9 @@ fn run(pair: &Pair, preset: Preset, deadline: Option<f64>) -> Estimate {
     let clock = Clock::with(deadline);
     let mut options = preset.options(None);
     shorten_chamfer(&mut options);
+    if let Some(field) = options.field_mut() {
+        field.max_iterations = field.max_iterations.min(150);
+    }
     estimate(&backend, &problem, &options, &clock).expect("a flow")
 }
 

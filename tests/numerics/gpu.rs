@@ -17,7 +17,7 @@ fn a_card_gives_the_cpus_flow_on_argoverse_2_bit_by_bit() {
         return;
     }
     let gpu = Gpu::open(&cards[0], &GpuOptions::default()).expect("the card opens");
-    let mut options = Preset::Neural.options(Some(4096));
+    let mut options = Preset::Neural.options(Some(2048));
     options.crop_m = Some(51.2);
     let card = estimated_on(&gpu, &pair, &options);
     // Some GPUs round a product before the addition, as the portable kernels do. Others use fused

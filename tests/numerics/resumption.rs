@@ -58,7 +58,7 @@ impl Control for Onward {}
 fn small_street() -> Pair {
     street(&StreetOptions {
         beams: 16,
-        azimuth_steps: 400,
+        azimuth_steps: 200,
         ..StreetOptions::default()
     })
 }

@@ -29,8 +29,8 @@ async fn submit(server: &Server, client: &reqwest::Client, options: &str, key: &
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_stop_under_load_loses_nothing_and_ends_in_time_with_open_streams() {
-    const DEADLINE: Duration = Duration::from_secs(8);
-    let config = "[shutdown]\nreadiness_delay_seconds = 1\ntimeout_seconds = 8\n";
+    const DEADLINE: Duration = Duration::from_secs(5);
+    let config = "[shutdown]\nreadiness_delay_seconds = 1\ntimeout_seconds = 5\n";
     let folder = Folder::new();
     let mut server = Server::start_in(&folder, config, &[]);
     let client = reqwest::Client::new();
@@ -88,7 +88,7 @@ async fn a_stop_under_load_loses_nothing_and_ends_in_time_with_open_streams() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn ten_times_too_much_is_refused_with_a_time_to_come_back_and_health_answers_at_once() {
     /// Seconds of overload. `FNSF_OVERLOAD_SECONDS` overrides it.
-    const SECONDS: u64 = 8;
+    const SECONDS: u64 = 5;
     const CALLERS: usize = 60;
     const MAX_WAIT: Duration = Duration::from_secs(2);
     /// Memory growth that is not a leak: the buffers of sixty connections.
@@ -201,7 +201,7 @@ key = "the key of few jobs!"
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_tenant_with_few_jobs_waits_for_two_of_the_others_at_most() {
     /// Number of queued jobs. `FNSF_FLOOD` overrides it.
-    const FLOOD: usize = 300;
+    const FLOOD: usize = 120;
     let asked = std::env::var("FNSF_FLOOD").ok();
     let flood = asked.and_then(|flood| flood.parse().ok()).unwrap_or(FLOOD);
     let server = Arc::new(Server::with_config(KEYS));
@@ -327,14 +327,14 @@ async fn small_jobs_do_not_wait_behind_a_long_one_while_another_device_is_free()
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_number_of_series_does_not_grow_with_the_jobs() {
     /// Number of jobs. `FNSF_FLOOD` overrides it.
-    const FLOOD: usize = 150;
+    const FLOOD: usize = 60;
     let asked = std::env::var("FNSF_FLOOD").ok();
     let flood = asked.and_then(|flood| flood.parse().ok()).unwrap_or(FLOOD);
     let server = Server::start(&[]);
     let client = reqwest::Client::new();
     let mut counts = Vec::new();
     let mut asked_for = 0;
-    for jobs in [0, 100, flood] {
+    for jobs in [0, 30, flood] {
         for _ in asked_for..jobs {
             submit(
                 &server,

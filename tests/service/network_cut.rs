@@ -16,8 +16,8 @@ use crate::crash_recovery::{end_undisturbed, list_all, options};
 use crate::fleet::Farm;
 use crate::server::{FREE_PORTS, Folder, PATIENCE, plain_get};
 
-const JOBS: usize = 60;
-const CUTS: usize = 3;
+const JOBS: usize = 30;
+const CUTS: usize = 2;
 /// Longer than a lease of the farm.
 const CUT: Duration = Duration::from_secs(8);
 

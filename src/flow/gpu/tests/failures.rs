@@ -35,7 +35,8 @@ fn a_card_lost_in_the_middle_of_a_run_fails_the_run_and_can_be_opened_again() {
     };
     let [source, target] = clouds(500);
     let problem = Problem::pair(&source, &target);
-    let options = Preset::Neural.options(None);
+    let mut options = Preset::Neural.options(None);
+    options.field_mut().expect("a field").max_iterations = 20;
     let killed = estimate(&gpu, &problem, &options, &Kill(&gpu, AtomicUsize::new(0)));
     assert!(
         matches!(killed, Err(FlowError::Backend(BackendError::Lost(_)))),

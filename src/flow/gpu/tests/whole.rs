@@ -73,8 +73,8 @@ fn a_card_finds_the_bits_of_the_cpu_that_rounds_as_it_does() {
     };
     let pair = street(1);
     for preset in Preset::with_gpu_kernels() {
-        let mut options = preset.options(Some(1500));
-        options.field_mut().expect("a field").max_iterations = 40;
+        let mut options = preset.options(Some(700));
+        options.field_mut().expect("a field").max_iterations = 24;
         let found = |device: &dyn Backend| {
             let found = solved(device, &pair, &options);
             let fit = found.fit().expect("a fit");
@@ -87,14 +87,14 @@ fn a_card_finds_the_bits_of_the_cpu_that_rounds_as_it_does() {
 
 #[test]
 fn every_loss_of_a_run_in_batches_is_the_cpus() {
-    const STEPS: usize = 40;
+    const STEPS: usize = 24;
     let Some(gpu) = shared() else {
         return;
     };
     let mut stopping = batched();
     stopping.early_stop = Preset::Paper.field().early_stop;
     let in_batches = others().into_iter().map(|options| FieldOptions {
-        batch: Some(700),
+        batch: Some(300),
         ..options
     });
     for options in [batched(), stopping, renewed()]
@@ -102,7 +102,7 @@ fn every_loss_of_a_run_in_batches_is_the_cpus() {
         .chain(in_batches)
     {
         let run = |device: &dyn Backend| {
-            let [source, target] = clouds(1500);
+            let [source, target] = clouds(700);
             let transform = device
                 .prepare_target(&source, &target, &options.loss, &Uncontrolled)
                 .expect("small clouds fit");
@@ -209,21 +209,22 @@ fn batched() -> FieldOptions {
 
 #[test]
 fn a_pair_has_the_same_bits_alone_and_among_others() {
+    const STEPS: usize = 8;
     let Some(gpu) = shared() else {
         return;
     };
-    let sizes = [700, 901, 64];
+    let sizes = [400, 601, 64];
     assert!(sizes.len() < LANES);
     for options in [batched(), Preset::Paper.field()]
         .into_iter()
         .chain(others())
     {
-        let alone = sizes.map(|points| fitted(gpu, points, &options, 12));
+        let alone = sizes.map(|points| fitted(gpu, points, &options, STEPS));
         let together = std::thread::scope(|scope| {
             let options = &options;
             let pairs = sizes.map(|points| {
                 let gpu = gpu.clone();
-                scope.spawn(move || fitted(&gpu, points, options, 12))
+                scope.spawn(move || fitted(&gpu, points, options, STEPS))
             });
             pairs.map(|pair| pair.join().expect("no panic"))
         });
