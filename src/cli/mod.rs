@@ -22,6 +22,7 @@ mod unfinished;
 mod demo;
 mod doctor;
 mod eval;
+mod export;
 mod flow;
 mod jobs;
 mod label;
@@ -71,6 +72,7 @@ enum Command {
     View(Box<view::View>),
     Synth(synth::Synth),
     Unpack(unpack::Unpack),
+    Export(export::Export),
     Tables(tables::Tables),
     Doctor(doctor::Doctor),
 }
@@ -93,6 +95,7 @@ pub fn run(arguments: Arguments) -> ExitCode {
         Command::View(command) => command.run(),
         Command::Synth(command) => command.run(),
         Command::Unpack(command) => command.run(),
+        Command::Export(command) => command.run(),
         Command::Tables(command) => command.run(),
         Command::Doctor(command) => command.run(),
     };

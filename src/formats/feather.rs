@@ -7,7 +7,10 @@
 use std::io::{Read, Write};
 use std::sync::Arc;
 
-use arrow_array::{ArrayRef, BooleanArray, Float16Array, Float32Array, Int32Array, RecordBatch};
+use arrow_array::{
+    ArrayRef, BooleanArray, Float16Array, Float32Array, Float64Array, Int32Array, Int64Array,
+    RecordBatch, StringArray,
+};
 use arrow_ipc::writer::{FileWriter, IpcWriteOptions};
 use arrow_ipc::{CompressionType, Endianness, Message, Precision, Type};
 use flatbuffers::VerifierOptions;
@@ -376,6 +379,9 @@ pub(super) enum Values<'a> {
     Halves(Box<dyn Iterator<Item = f32> + 'a>),
     Flags(&'a [bool]),
     Ids(&'a [i32]),
+    Integers(&'a [i64]),
+    Doubles(&'a [f64]),
+    Texts(&'a [String]),
 }
 
 /// Writes one record batch, LZ4-compressed as in Argoverse 2.
@@ -392,6 +398,9 @@ pub(super) fn write<W: Write>(
             )),
             Values::Flags(flags) => Arc::new(BooleanArray::from(flags.to_vec())),
             Values::Ids(ids) => Arc::new(Int32Array::from(ids.to_vec())),
+            Values::Integers(values) => Arc::new(Int64Array::from(values.to_vec())),
+            Values::Doubles(values) => Arc::new(Float64Array::from(values.to_vec())),
+            Values::Texts(texts) => Arc::new(StringArray::from_iter_values(texts)),
         };
         (name, array)
     };

@@ -11,6 +11,7 @@ mod sweep_order;
 mod timestamps;
 
 mod av2_challenge;
+mod boxes;
 mod camera;
 mod cloud;
 mod dense_file;
@@ -36,6 +37,7 @@ mod ply;
 mod scalar;
 
 pub use crate::formats::av2_challenge::{Av2Challenge, read_av2_mask, write_av2_challenge};
+pub use crate::formats::boxes::{BoxLayout, BoxSequence, LayoutFile};
 pub use crate::formats::camera::{KITTI_SIZE_PX, read_camera, read_camera0_from_lidar};
 pub use crate::formats::cloud::{
     Cloud, CloudFormat, TimedCloud, declared_rows, read_cloud, read_cloud_within, read_timed_cloud,

@@ -9,6 +9,7 @@ mod commands;
 #[path = "../common/dense_file.rs"]
 mod dense_file;
 mod evaluation;
+mod export;
 mod follow;
 #[path = "../common/gpu.rs"]
 mod gpu_rule;

@@ -17,6 +17,7 @@ FLOW = ["flow_tx_m", "flow_ty_m", "flow_tz_m"]
 SWEEPS = ["315966265259836000", "315966265360032000"]
 evaluation = pytest.importorskip("av2.evaluation.scene_flow.eval")
 archive = pytest.importorskip("av2.evaluation.scene_flow.make_submission_archive")
+cuboids = pytest.importorskip("av2.structures.cuboid")
 
 
 @pytest.fixture
@@ -79,3 +80,17 @@ def test_the_published_code_validates_the_labels_and_gives_them_the_scores_of_fn
     ]:
         assert theirs[name] == pytest.approx(value, rel=1e-9), name
     assert theirs["EPE 3-Way Average"] < 0.06
+
+
+def test_av2_reads_the_annotations(exported, states):
+    folder, names = exported("av2", "REGULAR_VEHICLE")
+    read = cuboids.CuboidList.from_feather(folder / "annotations.feather")
+    known = sorted(states.items(), key=lambda known: (known[0][1], known[0][0]))
+    assert len(read) == len(known)
+    for cuboid, ((_, sweep), state) in zip(read, known, strict=True):
+        assert cuboid.timestamp_ns == int(names[sweep])
+        assert cuboid.category == "REGULAR_VEHICLE"
+        np.testing.assert_allclose(cuboid.xyz_center_m, state["center"], atol=1e-6)
+        np.testing.assert_allclose(cuboid.dims_lwh_m, state["size"], atol=1e-6)
+        ahead = cuboid.dst_SE3_object.rotation[:2, 0]
+        np.testing.assert_allclose(ahead, [np.cos(state["yaw"]), np.sin(state["yaw"])], atol=1e-6)

@@ -1,0 +1,47 @@
+//! The layouts, and the files of each.
+
+use super::av2_annotations;
+use super::layout_file::LayoutFile;
+use super::sequence::BoxSequence;
+use super::supervisely::{self, Project};
+use super::sustechpoints;
+use crate::formats::error::FormatError;
+
+/// A layout of labelling tools or of a data set.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BoxLayout {
+    /// Supervisely, point cloud episodes: objects with figures in the frames of one sequence.
+    Supervisely,
+    /// CVAT, "Sly Point Cloud Format 1.0": a file of figures for each sweep.
+    Cvat,
+    /// SUSTechPOINTS: label/SWEEP.json beside lidar/SWEEP.pcd.
+    Sustechpoints,
+    /// Argoverse 2: annotations.feather. The names of the sweeps are their times in nanoseconds.
+    Av2,
+}
+
+impl BoxLayout {
+    /// Where the cloud of a sweep lies, as pcd, in the folder of the layout. None where the layout has
+    /// no clouds.
+    pub fn cloud_path(self, sweep: &str) -> Option<String> {
+        match self {
+            Self::Supervisely | Self::Cvat => Some(supervisely::cloud_path(sweep)),
+            Self::Sustechpoints => Some(format!("lidar/{sweep}.pcd")),
+            Self::Av2 => None,
+        }
+    }
+
+    /// The files of the boxes. The same sequence gives the same bytes.
+    ///
+    /// # Errors
+    /// `Unsupported` for [`BoxLayout::Av2`] and a sweep without a time in its name, and
+    /// [`FormatError::Write`] if arrow fails.
+    pub fn files(self, sequence: &BoxSequence<'_>) -> Result<Vec<LayoutFile>, FormatError> {
+        Ok(match self {
+            Self::Supervisely => supervisely::files(sequence, Project::Episode),
+            Self::Cvat => supervisely::files(sequence, Project::Clouds),
+            Self::Sustechpoints => sustechpoints::files(sequence),
+            Self::Av2 => vec![av2_annotations::file(sequence)?],
+        })
+    }
+}

@@ -1,0 +1,135 @@
+//! Tests of `fnsf export`.
+
+use std::fs;
+use std::path::Path;
+
+use fnsf::formats::{CloudFormat, read_cloud, read_tracks, write_cloud};
+use serde_json::Value;
+
+use super::program::fnsf;
+
+/// Simulates a drive of four sweeps, with its tracks.
+fn drive(folder: &Path) {
+    let size = ["--beams", "8", "--sweeps", "4"];
+    let made = fnsf(folder, &[&["synth", "-o", "."], &size[..]].concat());
+    assert_eq!(made.code, 0, "{}", made.stderr);
+}
+
+fn sweeps() -> [String; 4] {
+    [0, 1, 2, 3].map(|sweep| format!("sweep_{sweep:04}.pcd"))
+}
+
+fn json(path: &Path) -> Value {
+    let bytes = fs::read(path).expect("a file");
+    serde_json::from_slice(&bytes).expect("JSON")
+}
+
+#[test]
+fn tracks_become_a_project_of_each_tool_with_the_clouds_beside() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    drive(folder);
+    let tracks = fs::read(folder.join("tracks.json")).expect("tracks");
+    let tracks = read_tracks(&tracks).expect("tracks");
+    let boxes: usize = tracks.iter().map(|track| track.states.len()).sum();
+    // A sweep of another format is converted.
+    let cloud = fs::read(folder.join("sweep_0003.pcd")).expect("a sweep");
+    let cloud = read_cloud(&cloud, None).expect("a sweep").points;
+    let mut npy = Vec::new();
+    write_cloud(CloudFormat::Npy, &cloud, &mut npy).expect("written");
+    fs::write(folder.join("sweep_0003.npy"), npy).expect("written");
+    let mut sweeps = sweeps();
+    sweeps[3] = "sweep_0003.npy".to_owned();
+    let sweeps: Vec<&str> = sweeps.iter().map(String::as_str).collect();
+    for (layout, clouds) in [
+        ("supervisely", "ds0/pointcloud"),
+        ("cvat", "ds0/pointcloud"),
+        ("sustechpoints", "lidar"),
+    ] {
+        let options = ["--layout", layout, "-o", layout, "--class", "Car"];
+        let done = fnsf(
+            folder,
+            &[&["export", "tracks.json"], &sweeps[..], &options].concat(),
+        );
+        assert_eq!(done.code, 0, "{}", done.stderr);
+        let said = format!(
+            "{} tracks, {boxes} boxes in 4 sweeps, 4 clouds",
+            tracks.len()
+        );
+        assert!(done.stdout.starts_with(&said), "{}", done.stdout);
+        let clouds = folder.join(layout).join(clouds);
+        let copied = fs::read(clouds.join("sweep_0000.pcd")).expect("a cloud");
+        assert!(copied == fs::read(folder.join("sweep_0000.pcd")).expect("a sweep"));
+        let converted = fs::read(clouds.join("sweep_0003.pcd")).expect("a cloud");
+        assert!(read_cloud(&converted, None).expect("a cloud").points == cloud);
+    }
+    let episode = json(&folder.join("supervisely/ds0/annotation.json"));
+    assert_eq!(
+        episode["objects"].as_array().map(Vec::len),
+        Some(tracks.len())
+    );
+    assert_eq!(episode["objects"][0]["classTitle"], "Car");
+    let figures = |sweep: &Value| sweep["figures"].as_array().map_or(0, Vec::len);
+    let frames = episode["frames"].as_array().expect("frames");
+    assert_eq!(frames.iter().map(figures).sum::<usize>(), boxes);
+    let cloud = json(&folder.join("cvat/ds0/ann/sweep_0002.pcd.json"));
+    assert_eq!(figures(&cloud), figures(&frames[2]));
+    let labels = json(&folder.join("sustechpoints/label/sweep_0002.json"));
+    assert_eq!(labels.as_array().map(Vec::len), Some(figures(&frames[2])));
+}
+
+#[test]
+fn sweeps_that_are_named_by_their_times_become_annotations_of_argoverse_2() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    drive(folder);
+    let sweeps = sweeps();
+    let sweeps: Vec<&str> = sweeps.iter().map(String::as_str).collect();
+    let options = ["--layout", "av2", "-o", "av2"];
+    let refused = fnsf(
+        folder,
+        &[&["export", "tracks.json"], &sweeps[..], &options].concat(),
+    );
+    assert_eq!(refused.code, 65);
+    assert!(
+        refused.stderr.contains("by their nanoseconds"),
+        "{}",
+        refused.stderr
+    );
+    let named: Vec<String> = (0..4)
+        .map(|sweep| format!("31596626{sweep}359836000.pcd"))
+        .collect();
+    for (from, to) in sweeps.iter().zip(&named) {
+        fs::rename(folder.join(from), folder.join(to)).expect("renamed");
+    }
+    let named: Vec<&str> = named.iter().map(String::as_str).collect();
+    let done = fnsf(
+        folder,
+        &[&["export", "tracks.json"], &named[..], &options].concat(),
+    );
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    let written = fs::read(folder.join("av2/annotations.feather")).expect("annotations");
+    assert!(written.starts_with(b"ARROW1"));
+}
+
+#[test]
+fn tracks_of_another_sequence_and_sweeps_of_one_name_are_refused_before_anything_is_written() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    drive(folder);
+    let [one, two, three, _] = sweeps();
+    for (sweeps, said) in [
+        ([&one, &two, &three], "the last of the 3 given is sweep 2"),
+        ([&one, &two, &one], "two sweeps have the name sweep_0000"),
+    ] {
+        let sweeps = sweeps.map(String::as_str);
+        let options = ["--layout", "cvat", "-o", "out"];
+        let refused = fnsf(
+            folder,
+            &[&["export", "tracks.json"], &sweeps[..], &options].concat(),
+        );
+        assert_eq!(refused.code, 65, "{}", refused.stderr);
+        assert!(refused.stderr.contains(said), "{}", refused.stderr);
+    }
+    assert!(!folder.join("out").exists());
+}
