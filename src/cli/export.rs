@@ -6,12 +6,12 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use clap::{Args, ValueEnum};
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use super::failure::Failure;
 use super::files;
 use super::output::say;
-use crate::formats::{BoxLayout, BoxSequence, CloudFormat, FormatError, write_cloud};
+use super::terminal::bar;
+use crate::formats::{BoxLayout, BoxSequence, CloudFormat, FormatError, read_cloud, write_cloud};
 use crate::text::grouped;
 
 /// Write the boxes of tracks as labelling tools take them.
@@ -107,7 +107,10 @@ impl Export {
 
     /// Writes the clouds of the sweeps, where the layout has them. Returns their number.
     fn clouds(&self, names: &[String]) -> Result<usize, Failure> {
-        let bar = bar(names.len());
+        let bar = bar(
+            names.len() as u64,
+            "{wide_bar:.cyan/blue} {pos} of {len} sweeps",
+        );
         let mut clouds = 0;
         for (sweep, name) in self.sweeps.iter().zip(names) {
             bar.inc(1);
@@ -115,12 +118,15 @@ impl Export {
                 continue;
             };
             clouds += 1;
-            let points = files::read_cloud(sweep)?;
-            // A pcd keeps its other columns.
             if sweep.extension().is_some_and(|ending| ending == "pcd") {
+                // It keeps its other columns.
                 let bytes = files::read_bytes(sweep)?;
+                read_cloud(&bytes, sweep.to_str())
+                    .with_context(|| sweep.display().to_string())
+                    .map_err(Failure::bad_input)?;
                 self.write(&path, |out| std::io::Write::write_all(out, &bytes))?;
             } else {
+                let points = files::read_cloud(sweep)?;
                 self.write::<FormatError>(&path, |out| {
                     write_cloud(CloudFormat::Pcd, &points, out)
                 })?;
@@ -143,12 +149,4 @@ impl Export {
             .map_err(Failure::internal)?;
         files::write(&path, writer)
     }
-}
-
-/// A bar of the sweeps, where stderr is a terminal.
-fn bar(sweeps: usize) -> ProgressBar {
-    let style = ProgressStyle::with_template("{wide_bar:.cyan/blue} {pos} of {len} sweeps");
-    let bar = ProgressBar::with_draw_target(Some(sweeps as u64), ProgressDrawTarget::stderr());
-    bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
-    bar
 }

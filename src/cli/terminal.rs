@@ -1,4 +1,4 @@
-//! The command line's `Control`: a clock and a progress bar.
+//! Progress bars, and the command line's `Control`: a clock and one of them.
 
 use std::time::Instant;
 
@@ -50,4 +50,12 @@ impl Control for Terminal {
         self.bar.set_position(progress.done as u64);
         self.bar.set_message(format!("loss {:.4}", progress.loss));
     }
+}
+
+/// A bar of a known length in indicatif's template, shown where stderr is a terminal.
+pub(super) fn bar(length: u64, template: &str) -> ProgressBar {
+    let style = ProgressStyle::with_template(template);
+    let bar = ProgressBar::with_draw_target(Some(length), ProgressDrawTarget::stderr());
+    bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+    bar
 }

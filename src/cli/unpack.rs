@@ -8,11 +8,11 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use clap::Args;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use super::failure::Failure;
 use super::files;
 use super::output::say;
+use super::terminal::bar;
 use crate::formats::{
     CloudFormat, CloudMessage, FormatError, read_recording, write_cloud, write_timed_pcd,
 };
@@ -79,7 +79,10 @@ impl Unpack {
         let (file, length) = open()
             .with_context(unreadable)
             .map_err(Failure::bad_input)?;
-        let bar = bar(length);
+        let bar = bar(
+            length,
+            "{wide_bar:.cyan/blue} {bytes} of {total_bytes}  {eta} left",
+        );
         let mut topics: BTreeMap<String, Topic> = BTreeMap::new();
         let mut damaged = 0;
         let mut failure = None;
@@ -243,15 +246,6 @@ fn folder_of(topic: &str) -> String {
         true => "clouds".to_owned(),
         false => name,
     }
-}
-
-/// A bar of the bytes that are read, where stderr is a terminal.
-fn bar(length: u64) -> ProgressBar {
-    let style =
-        ProgressStyle::with_template("{wide_bar:.cyan/blue} {bytes} of {total_bytes}  {eta} left");
-    let bar = ProgressBar::with_draw_target(Some(length), ProgressDrawTarget::stderr());
-    bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
-    bar
 }
 
 #[cfg(test)]

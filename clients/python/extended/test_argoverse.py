@@ -17,7 +17,6 @@ FLOW = ["flow_tx_m", "flow_ty_m", "flow_tz_m"]
 SWEEPS = ["315966265259836000", "315966265360032000"]
 evaluation = pytest.importorskip("av2.evaluation.scene_flow.eval")
 archive = pytest.importorskip("av2.evaluation.scene_flow.make_submission_archive")
-cuboids = pytest.importorskip("av2.structures.cuboid")
 
 
 @pytest.fixture
@@ -83,6 +82,8 @@ def test_the_published_code_validates_the_labels_and_gives_them_the_scores_of_fn
 
 
 def test_av2_reads_the_annotations(exported, states):
+    from av2.structures import cuboid as cuboids
+
     folder, names = exported("av2", "REGULAR_VEHICLE")
     read = cuboids.CuboidList.from_feather(folder / "annotations.feather")
     known = sorted(states.items(), key=lambda known: (known[0][1], known[0][0]))
