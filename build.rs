@@ -1,16 +1,16 @@
 //! Compiles the protobuf definitions, without protoc, if the feature `service` is enabled: the
 //! server code for the library and the client code for the tests.
 
-use std::env;
-use std::error::Error;
-use std::fs;
-use std::path::PathBuf;
+#[cfg(not(feature = "service"))]
+fn main() {
+    println!("cargo:rerun-if-changed=build.rs");
+}
 
-fn main() -> Result<(), Box<dyn Error>> {
+#[cfg(feature = "service")]
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    use std::{env, fs, path::PathBuf};
+
     println!("cargo:rerun-if-changed=proto");
-    if env::var_os("CARGO_FEATURE_SERVICE").is_none() {
-        return Ok(());
-    }
     let mut compiler = protox::Compiler::new(["proto"])?;
     compiler
         .include_imports(true)
@@ -23,22 +23,19 @@ fn main() -> Result<(), Box<dyn Error>> {
     )?;
     let client = out.join("client");
     fs::create_dir_all(&client)?;
-    tonic_prost_build::configure()
-        .bytes(".")
-        .boxed(".fnsf.v1.EstimateFlowRequest.Begin.options")
-        .boxed(".fnsf.v1.EstimateSequenceRequest.Begin.options")
-        .boxed(".fnsf.v1.SubmitJobRequest.Begin.options")
-        .boxed(".fnsf.v1.Options.field")
-        .boxed(".fnsf.v1.EstimateSequenceResponse.Pair.outcome.header")
+    let builder = || {
+        tonic_prost_build::configure()
+            .bytes(".")
+            .boxed(".fnsf.v1.EstimateFlowRequest.Begin.options")
+            .boxed(".fnsf.v1.EstimateSequenceRequest.Begin.options")
+            .boxed(".fnsf.v1.SubmitJobRequest.Begin.options")
+            .boxed(".fnsf.v1.Options.field")
+            .boxed(".fnsf.v1.EstimateSequenceResponse.Pair.outcome.header")
+    };
+    builder()
         .build_client(false)
         .compile_fds(descriptors.clone())?;
-    tonic_prost_build::configure()
-        .bytes(".")
-        .boxed(".fnsf.v1.EstimateFlowRequest.Begin.options")
-        .boxed(".fnsf.v1.EstimateSequenceRequest.Begin.options")
-        .boxed(".fnsf.v1.SubmitJobRequest.Begin.options")
-        .boxed(".fnsf.v1.Options.field")
-        .boxed(".fnsf.v1.EstimateSequenceResponse.Pair.outcome.header")
+    builder()
         .build_server(false)
         .build_transport(false)
         .out_dir(client)

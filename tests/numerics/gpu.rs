@@ -17,7 +17,9 @@ fn a_card_gives_the_cpus_flow_on_argoverse_2_bit_by_bit() {
         return;
     }
     let gpu = Gpu::open(&cards[0], &GpuOptions::default()).expect("the card opens");
+    // A software GPU is slow: a bit that differs does so from its iteration on.
     let mut options = Preset::Neural.options(Some(2048));
+    options.field_mut().expect("a field").max_iterations = 60;
     options.crop_m = Some(51.2);
     let card = estimated_on(&gpu, &pair, &options);
     // Some GPUs round a product before the addition, as the portable kernels do. Others use fused
@@ -30,9 +32,7 @@ fn a_card_gives_the_cpus_flow_on_argoverse_2_bit_by_bit() {
     let errors: Vec<_> = cpus.iter().map(|cpu| scored(&pair, cpu).epe).collect();
     let same = cpus.iter().any(|cpu| cpu.flow == card.flow);
     assert!(same, "{} {errors:?}", scored(&pair, &card).epe);
-    // Twice the same bits, on fewer points because a software GPU is slow.
-    let mut fewer = Preset::Neural.options(Some(1024));
-    fewer.field_mut().expect("a field").max_iterations = 40;
-    let [first, second] = [(), ()].map(|()| estimated_on(&gpu, &pair, &fewer).flow);
+    options.field_mut().expect("a field").max_iterations = 20;
+    let [first, second] = [(), ()].map(|()| estimated_on(&gpu, &pair, &options).flow);
     assert!(first == second);
 }

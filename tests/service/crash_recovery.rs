@@ -37,7 +37,7 @@ impl Dice {
 pub(crate) fn options(job: usize) -> String {
     let seed = job % 7;
     match job % 5 {
-        0 => format!(r#"{{"seed": {seed}, "preset": "paper", "max_points": 2048}}"#),
+        0 => format!(r#"{{"seed": {seed}, "preset": "paper", "max_points": 1024}}"#),
         1 => format!(r#"{{"seed": {seed}, "max_points": 512}}"#),
         _ => format!(r#"{{"seed": {seed}, "preset": "neural", "max_points": 512}}"#),
     }
@@ -188,7 +188,7 @@ async fn a_killed_job_goes_on_from_its_snapshot() {
         Form::new()
             .part("source", part(0))
             .part("target", part(1))
-            .text("options", r#"{"preset": "paper"}"#)
+            .text("options", r#"{"preset": "paper", "max_points": 8192}"#)
     };
     let sent = client
         .post(server.url("/v1/jobs"))

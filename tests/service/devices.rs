@@ -123,8 +123,12 @@ async fn a_server_on_a_card_gives_it_the_jobs_that_ask_for_one() {
         ("nsfp-kdtree-linear", "auto"),
         ("fnsf-linear", "gpu"),
     ] {
+        let field = match preset {
+            "default" => "",
+            _ => r#", "field": {"max_iterations": 60}"#,
+        };
         let options =
-            format!(r#"{{"preset": "{preset}", "device": "{device}", "max_points": 512}}"#);
+            format!(r#"{{"preset": "{preset}", "device": "{device}", "max_points": 512{field}}}"#);
         let sent = reqwest::Client::new()
             .post(server.url("/v1/jobs"))
             .multipart(form(small_pair(), &options))

@@ -36,7 +36,7 @@ impl Farm {
         let url = database.database();
         let config = format!(
             "storage = \"s3://farm/fnsf\"\n[queue]\npostgres = \"{url}\"\n\
-             retry_delay_seconds = 1\nsnapshot_interval_ms = 50\nmax_crashes = 1000\n\
+             retry_delay_seconds = 1\nsnapshot_interval_ms = 250\nmax_crashes = 1000\n\
              max_attempts = 1000\n{queue}"
         );
         Some(Self {

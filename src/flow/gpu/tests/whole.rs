@@ -74,7 +74,7 @@ fn a_card_finds_the_bits_of_the_cpu_that_rounds_as_it_does() {
     let pair = street(1);
     for preset in Preset::with_gpu_kernels() {
         let mut options = preset.options(Some(700));
-        options.field_mut().expect("a field").max_iterations = 24;
+        options.field_mut().expect("a field").max_iterations = 10;
         let found = |device: &dyn Backend| {
             let found = solved(device, &pair, &options);
             let fit = found.fit().expect("a fit");
@@ -87,7 +87,7 @@ fn a_card_finds_the_bits_of_the_cpu_that_rounds_as_it_does() {
 
 #[test]
 fn every_loss_of_a_run_in_batches_is_the_cpus() {
-    const STEPS: usize = 24;
+    const STEPS: usize = 10;
     let Some(gpu) = shared() else {
         return;
     };
