@@ -32,7 +32,7 @@ use crate::{job, picture};
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
     fnsf densify sweeps/*.pcd --reference-time 5 -o dense.ply\n  \
-    fnsf densify sweeps/*.pcd --reference-time 4.5 -o between.laz\n  \
+    fnsf densify sweeps/*.pcd --reference-time 4.5 -o between.laz --picture above.png\n  \
     fnsf densify sweeps/*.bin --reference-time 3 --camera calib.txt --depth depth.png -o dense.npz")]
 pub(super) struct Densify {
     /// The sweeps, two or more, in the order in which they were recorded
@@ -60,9 +60,9 @@ pub(super) struct Densify {
     /// 0 where it is unknown
     #[arg(long, value_name = "OUT.png", requires = "camera")]
     depth: Option<PathBuf>,
-    /// File for a picture that shows the depth image of the sweep nearest to the reference time
-    /// above the dense one
-    #[arg(long, value_name = "OUT.png", requires = "camera")]
+    /// File for a picture: the dense cloud from above. With a camera, the depth image of the sweep
+    /// nearest to the reference time above the dense one
+    #[arg(long, value_name = "OUT.png")]
     picture: Option<PathBuf>,
     /// Print the report as one JSON object on stdout, instead of text
     #[arg(long)]
@@ -149,7 +149,13 @@ impl Densify {
             files::write(path, |file| write_dense(format, &cloud, file))?;
         }
         let density = match &camera {
-            None => None,
+            None => {
+                if let Some(path) = &self.picture {
+                    let image = picture::dense_from_above(&cloud);
+                    files::write(path, |file| picture::write_png(&image, file))?;
+                }
+                None
+            }
             Some(camera) => Some(self.put_depth(camera, &cloud)?),
         };
         let count = |flags: &[bool], which: bool| flags.iter().filter(|&&f| f == which).count();
@@ -174,7 +180,7 @@ impl Densify {
         let outputs = [&self.output, &self.depth, &self.picture];
         if outputs.iter().all(|output| output.is_none()) && !self.json {
             return Err(Failure::usage(anyhow!(
-                "nothing to do: give -o OUT, --depth OUT.png or --json"
+                "nothing to do: give -o OUT, --depth OUT.png, --picture OUT.png or --json"
             )));
         }
         if let Some(output) = &self.output {

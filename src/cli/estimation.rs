@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, anyhow};
+use anyhow::anyhow;
 use clap::Args;
 
 use super::device::DeviceArgument;
@@ -157,16 +157,7 @@ impl Estimation {
         }
         let poses = match &self.poses {
             None => None,
-            Some(file) => {
-                let names: Vec<_> = paths
-                    .iter()
-                    .map(|path| path.file_name().unwrap_or_default().to_string_lossy())
-                    .collect();
-                let names: Vec<&str> = names.iter().map(AsRef::as_ref).collect();
-                let poses = formats::read_poses(&files::read_bytes(file)?, &names);
-                let poses = poses.with_context(|| file.display().to_string());
-                Some(poses.map_err(Failure::bad_input)?)
-            }
+            Some(file) => Some(files::read_poses(file, paths)?),
         };
         let raster = self.ground_raster.as_deref().map(files::read_ground_raster);
         let name = |path: &PathBuf| path.to_string_lossy().into_owned();

@@ -1,29 +1,36 @@
-//! `fnsf export`: the boxes of tracks, and their sweeps, as labelling tools take them.
+//! `fnsf export`: the boxes of tracks, and their sweeps, as labelling tools and viewers take them.
 
 use std::ffi::OsStr;
 use std::fs;
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use clap::{Args, ValueEnum};
+use indicatif::ProgressBar;
 
 use super::failure::Failure;
 use super::files;
 use super::output::say;
 use super::terminal::bar;
-use crate::formats::{BoxLayout, BoxSequence, CloudFormat, FormatError, read_cloud, write_cloud};
+use crate::flow::RigidTransform;
+use crate::formats::{
+    BoxLayout, BoxSequence, CloudFormat, FormatError, SceneRecording, read_cloud, write_cloud,
+};
 use crate::text::grouped;
 
-/// Write the boxes of tracks as labelling tools take them.
+/// Write the boxes of tracks as labelling tools and viewers take them.
 ///
 /// TRACKS.json comes from `fnsf flow --tracks` or `fnsf label --tracks`. A track is one object with one
 /// identity, and has a box of one size in each of its sweeps. Where it is hidden, its box is predicted.
-/// The sweeps are written beside, as pcd. The folder, or a zip of it, is what the tool imports.
+/// The sweeps are written beside, as pcd. The folder, or a zip of it, is what the tool imports. With
+/// `--layout mcap` all is one recording, DIR/scene.mcap.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
     fnsf flow sweeps/*.pcd -o flow.npz --tracks tracks.json\n  \
     fnsf export tracks.json sweeps/*.pcd --layout supervisely -o project\n  \
-    fnsf export tracks.json sweeps/*.pcd --layout cvat -o project && (cd project && zip -r ../project.zip .)")]
+    fnsf export tracks.json sweeps/*.pcd --layout cvat -o project && (cd project && zip -r ../project.zip .)\n  \
+    fnsf export tracks.json sweeps/*.pcd --layout mcap --poses poses.txt -o scene")]
 pub(super) struct Export {
     /// Tracks of a sequence
     #[arg(value_name = "TRACKS.json")]
@@ -40,9 +47,15 @@ pub(super) struct Export {
     /// Class of all boxes, one that the tool's project has. Argoverse 2 has REGULAR_VEHICLE, for one
     #[arg(long, value_name = "NAME", default_value = "mover")]
     class: String,
+    /// Poses of all sweeps, for the motion of the sensor in --layout mcap: the formats of fnsf flow --poses
+    #[arg(long, value_name = "FILE")]
+    poses: Option<PathBuf>,
 }
 
-/// A [`BoxLayout`] by its name.
+/// The recording of [`Layout::Mcap`].
+const RECORDING: &str = "scene.mcap";
+
+/// A [`BoxLayout`] by its name, or a recording.
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum Layout {
     /// Supervisely, point cloud episodes
@@ -53,15 +66,19 @@ enum Layout {
     Sustechpoints,
     /// Argoverse 2: annotations.feather, of sweeps that are named by their nanoseconds
     Av2,
+    /// MCAP with the messages of Foxglove: clouds, boxes, velocities, and with --poses the motion of the sensor
+    Mcap,
 }
 
-impl From<Layout> for BoxLayout {
-    fn from(layout: Layout) -> Self {
-        match layout {
-            Layout::Supervisely => Self::Supervisely,
-            Layout::Cvat => Self::Cvat,
-            Layout::Sustechpoints => Self::Sustechpoints,
-            Layout::Av2 => Self::Av2,
+impl Layout {
+    /// None for a recording.
+    fn boxes(self) -> Option<BoxLayout> {
+        match self {
+            Self::Supervisely => Some(BoxLayout::Supervisely),
+            Self::Cvat => Some(BoxLayout::Cvat),
+            Self::Sustechpoints => Some(BoxLayout::Sustechpoints),
+            Self::Av2 => Some(BoxLayout::Av2),
+            Self::Mcap => None,
         }
     }
 }
@@ -77,20 +94,29 @@ fn name_of(sweep: &Path) -> Result<String, Failure> {
 
 impl Export {
     pub(super) fn run(&self) -> Result<(), Failure> {
+        let boxes_only = self.layout.boxes();
+        if boxes_only.is_some() && self.poses.is_some() {
+            return Err(Failure::usage(anyhow!("--poses is for --layout mcap")));
+        }
         let tracks = files::read_tracks(&self.tracks)?;
         let names: Result<Vec<String>, Failure> =
             self.sweeps.iter().map(|sweep| name_of(sweep)).collect();
         let names = names?;
         let unusable = || self.tracks.display().to_string();
         let sequence = BoxSequence::new(&tracks, &names, &self.class);
-        let written = sequence.and_then(|sequence| BoxLayout::from(self.layout).files(&sequence));
-        let written = written.with_context(unusable).map_err(Failure::bad_input)?;
-        for file in &written {
-            self.write(&file.path, |out| {
-                std::io::Write::write_all(out, &file.bytes)
-            })?;
-        }
-        let clouds = self.clouds(&names)?;
+        let sequence = sequence
+            .with_context(unusable)
+            .map_err(Failure::bad_input)?;
+        let clouds = match boxes_only {
+            None => self.recording(&sequence)?,
+            Some(layout) => {
+                let written = layout.files(&sequence).with_context(unusable);
+                for file in &written.map_err(Failure::bad_input)? {
+                    self.write(&file.path, |out| out.write_all(&file.bytes))?;
+                }
+                self.clouds(layout, &names)?
+            }
+        };
         let boxes: usize = tracks.iter().map(|track| track.states.len()).sum();
         let clouds = match clouds {
             0 => String::new(),
@@ -106,15 +132,12 @@ impl Export {
     }
 
     /// Writes the clouds of the sweeps, where the layout has them. Returns their number.
-    fn clouds(&self, names: &[String]) -> Result<usize, Failure> {
-        let bar = bar(
-            names.len() as u64,
-            "{wide_bar:.cyan/blue} {pos} of {len} sweeps",
-        );
+    fn clouds(&self, layout: BoxLayout, names: &[String]) -> Result<usize, Failure> {
+        let bar = self.bar();
         let mut clouds = 0;
         for (sweep, name) in self.sweeps.iter().zip(names) {
             bar.inc(1);
-            let Some(path) = BoxLayout::from(self.layout).cloud_path(name) else {
+            let Some(path) = layout.cloud_path(name) else {
                 continue;
             };
             clouds += 1;
@@ -124,7 +147,7 @@ impl Export {
                 read_cloud(&bytes, sweep.to_str())
                     .with_context(|| sweep.display().to_string())
                     .map_err(Failure::bad_input)?;
-                self.write(&path, |out| std::io::Write::write_all(out, &bytes))?;
+                self.write(&path, |out| out.write_all(&bytes))?;
             } else {
                 let points = files::read_cloud(sweep)?;
                 self.write::<FormatError>(&path, |out| {
@@ -136,11 +159,46 @@ impl Export {
         Ok(clouds)
     }
 
+    /// Writes the recording. Returns the number of its clouds.
+    fn recording(&self, sequence: &BoxSequence<'_>) -> Result<usize, Failure> {
+        let poses = self.poses.as_ref();
+        let poses = poses.map(|file| files::read_poses(file, &self.sweeps));
+        let poses: Option<Vec<RigidTransform>> = poses.transpose()?;
+        let bar = self.bar();
+        let mut unreadable = None;
+        let written = self.write(RECORDING, |out| {
+            let mut scene = SceneRecording::start(sequence, poses.as_deref(), out)?;
+            for sweep in &self.sweeps {
+                bar.inc(1);
+                match files::read_cloud(sweep) {
+                    Ok(points) => scene.sweep(&points)?,
+                    Err(failure) => {
+                        unreadable = Some(failure);
+                        return Err(io::Error::other("a sweep cannot be read"));
+                    }
+                }
+            }
+            scene.finish()
+        });
+        bar.finish_and_clear();
+        match unreadable {
+            Some(failure) => Err(failure),
+            None => written.map(|()| self.sweeps.len()),
+        }
+    }
+
+    fn bar(&self) -> ProgressBar {
+        bar(
+            self.sweeps.len() as u64,
+            "{wide_bar:.cyan/blue} {pos} of {len} sweeps",
+        )
+    }
+
     /// Writes a file of the layout.
     fn write<E: std::error::Error + Send + Sync + 'static>(
         &self,
         path: &str,
-        writer: impl FnOnce(&mut std::io::BufWriter<fs::File>) -> Result<(), E>,
+        writer: impl FnOnce(&mut io::BufWriter<fs::File>) -> Result<(), E>,
     ) -> Result<(), Failure> {
         let path = self.output.join(path);
         let folder = path.parent().unwrap_or(&self.output);

@@ -63,6 +63,18 @@ pub(super) fn read_cloud(path: &Path) -> Result<Vec<Point>, Failure> {
     read(path, formats::read_cloud).map(|cloud| cloud.points)
 }
 
+/// Reads the poses `world_from_frame` of the sweeps at `paths`.
+pub(super) fn read_poses(file: &Path, paths: &[PathBuf]) -> Result<Vec<RigidTransform>, Failure> {
+    let names = paths.iter();
+    let names = names.map(|path| path.file_name().unwrap_or_default().to_string_lossy());
+    let names: Vec<_> = names.collect();
+    let names: Vec<&str> = names.iter().map(AsRef::as_ref).collect();
+    let poses = formats::read_poses(&read_bytes(file)?, &names);
+    poses
+        .with_context(|| file.display().to_string())
+        .map_err(Failure::bad_input)
+}
+
 /// Reads one sweep with the times of its points, in any format.
 pub(super) fn read_timed_cloud(path: &Path) -> Result<TimedCloud, Failure> {
     read(path, formats::read_timed_cloud)

@@ -1,6 +1,6 @@
 //! `fnsf unpack`: the sweeps of a recording as files.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::fs::{self, File};
 use std::io::BufReader;
 use std::ops::ControlFlow;
@@ -55,6 +55,8 @@ pub(super) struct Unpack {
 /// What was found on one topic.
 #[derive(Default)]
 struct Topic {
+    /// Where its sweeps are written.
+    folder: PathBuf,
     messages: usize,
     sweeps: usize,
     points: usize,
@@ -84,6 +86,7 @@ impl Unpack {
             "{wide_bar:.cyan/blue} {bytes} of {total_bytes}  {eta} left",
         );
         let mut topics: BTreeMap<String, Topic> = BTreeMap::new();
+        let mut folders = HashSet::new();
         let mut damaged = 0;
         let mut failure = None;
         let bytes = bar.wrap_read(BufReader::with_capacity(BUFFER, file));
@@ -95,7 +98,12 @@ impl Unpack {
             {
                 return ControlFlow::Continue(());
             }
-            let topic = topics.entry(message.topic.to_owned()).or_default();
+            let topic = topics
+                .entry(message.topic.to_owned())
+                .or_insert_with(|| Topic {
+                    folder: self.folder(message.topic, &mut folders),
+                    ..Topic::default()
+                });
             topic.messages += 1;
             let limit = self.limit.unwrap_or(usize::MAX);
             if topic.sweeps >= limit && self.topic.is_some() {
@@ -147,8 +155,8 @@ impl Unpack {
             topic.repeated += 1;
             return Ok(());
         }
-        let folder = self.folder(message.topic);
-        fs::create_dir_all(&folder)
+        let folder = &topic.folder;
+        fs::create_dir_all(folder)
             .with_context(|| format!("cannot make {}", folder.display()))
             .map_err(|error| Stop::Failed(Failure::internal(error)))?;
         let path = folder.join(format!("{stamp:019}.pcd"));
@@ -166,10 +174,18 @@ impl Unpack {
         Ok(())
     }
 
-    /// The folder of a topic's sweeps.
-    fn folder(&self, topic: &str) -> PathBuf {
+    /// The folder of a topic's sweeps, which is none of the others `taken`.
+    fn folder(&self, topic: &str, taken: &mut HashSet<String>) -> PathBuf {
         let output = self.output.as_deref().unwrap_or(Path::new("."));
-        output.join(folder_of(topic))
+        let plain = folder_of(topic);
+        let mut name = plain.clone();
+        for number in 2.. {
+            if taken.insert(name.clone()) {
+                break;
+            }
+            name = format!("{plain}.{number}");
+        }
+        output.join(name)
     }
 
     fn nothing_found(&self) -> Failure {
@@ -193,7 +209,7 @@ impl Unpack {
                 "{name}: {} sweeps, {} points, in {}",
                 grouped(topic.sweeps),
                 grouped(topic.points),
-                self.folder(name).display()
+                topic.folder.display()
             ))?;
             if topic.dropped > 0 {
                 let dropped = grouped(topic.dropped);
@@ -257,5 +273,22 @@ mod tests {
         assert_eq!(folder_of("/lidar/top/points"), "lidar_top_points");
         assert_eq!(folder_of("/../a b"), "___a_b");
         assert_eq!(folder_of("/"), "clouds");
+    }
+
+    #[test]
+    fn topics_whose_plain_names_are_the_same_have_folders_of_their_own() {
+        let unpack = Unpack {
+            recording: PathBuf::new(),
+            output: Some("out".into()),
+            topic: None,
+            skip: 0,
+            limit: None,
+            list: false,
+        };
+        let mut taken = HashSet::new();
+        let folders = ["/lidar/top", "/lidar_top", "/lidar/low", "/lidar top"]
+            .map(|topic| unpack.folder(topic, &mut taken));
+        let expected = ["lidar_top", "lidar_top.2", "lidar_low", "lidar_top.3"];
+        assert_eq!(folders, expected.map(|name| Path::new("out").join(name)));
     }
 }

@@ -22,6 +22,7 @@ mod motion;
 mod pair;
 mod point_times;
 mod poses;
+mod semantic_kitti;
 mod tracks;
 
 mod bin;
@@ -37,7 +38,7 @@ mod ply;
 mod scalar;
 
 pub use crate::formats::av2_challenge::{Av2Challenge, read_av2_mask, write_av2_challenge};
-pub use crate::formats::boxes::{BoxLayout, BoxSequence, LayoutFile};
+pub use crate::formats::boxes::{BoxLayout, BoxSequence, LayoutFile, SceneRecording};
 pub use crate::formats::camera::{KITTI_SIZE_PX, read_camera, read_camera0_from_lidar};
 pub use crate::formats::cloud::{
     Cloud, CloudFormat, TimedCloud, declared_rows, read_cloud, read_cloud_within, read_timed_cloud,
@@ -57,6 +58,7 @@ pub use crate::formats::pair::{
 };
 pub use crate::formats::point_times::PointTimes;
 pub use crate::formats::poses::{PoseFile, read_poses};
+pub use crate::formats::semantic_kitti::moving_labels;
 pub use crate::formats::sniff::recognize;
 pub use sweep_order::{compare_names, turning_sweep};
 pub use timestamps::{SweepClock, SweepTime, TimeUnit, pair_interval_s};

@@ -23,6 +23,17 @@ pub enum TimeUnit {
     Milliseconds,
 }
 
+impl TimeUnit {
+    /// Nanoseconds of one tick.
+    fn nanoseconds(self) -> u64 {
+        match self {
+            Self::Nanoseconds => 1,
+            Self::Microseconds => 1_000,
+            Self::Milliseconds => 1_000_000,
+        }
+    }
+}
+
 /// The clock of a sweep whose points have times.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SweepClock {
@@ -73,15 +84,16 @@ impl SweepTime {
         found.next_back()
     }
 
+    /// The time in nanoseconds. None if 64 bits do not hold it.
+    pub fn nanoseconds(self) -> Option<u64> {
+        self.ticks.checked_mul(self.unit.nanoseconds())
+    }
+
     /// Seconds between two sweeps, in either order. None if the units differ, the times are the
     /// same, or they are more than 60 s apart.
     pub fn interval_s(self, other: Self) -> Option<f32> {
-        let unit = match self.unit {
-            TimeUnit::Nanoseconds => 1e-9,
-            TimeUnit::Microseconds => 1e-6,
-            TimeUnit::Milliseconds => 1e-3,
-        };
-        let seconds = self.ticks.abs_diff(other.ticks) as f64 * unit;
+        let ticks = self.ticks.abs_diff(other.ticks) as f64;
+        let seconds = ticks * self.unit.nanoseconds() as f64 * 1e-9;
         let is_interval = self.unit == other.unit && seconds > 0.0 && seconds <= MAX_INTERVAL_S;
         is_interval.then_some(seconds as f32)
     }

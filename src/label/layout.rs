@@ -5,7 +5,8 @@ use std::collections::HashMap;
 use super::plan::{Plan, PlanError};
 use crate::flow::{Estimate, Point};
 use crate::formats::{
-    Av2Challenge, FlowFormat, FlowTable, FormatError, write_av2_challenge, write_flow,
+    Av2Challenge, FlowFormat, FlowTable, FormatError, moving_labels, write_av2_challenge,
+    write_flow,
 };
 
 /// How the outputs lie and what they hold.
@@ -16,6 +17,9 @@ pub enum Layout {
     Npz,
     /// DRIVE/SWEEP.feather: flow, valid, dynamic, cluster, confidence, moving.
     Feather,
+    /// SemanticKITTI: DRIVE/labels/SWEEP.label, 251 for a point that moves and 9 for one that does not.
+    #[value(name = "semantickitti")]
+    SemanticKitti,
     /// Argoverse 2, first challenge: DRIVE/TIMESTAMP.feather, the rows of --masks.
     Av2V1,
     /// Argoverse 2, second challenge: DRIVE/INDEX.feather of every fifth pair, and metadata.json.
@@ -36,18 +40,10 @@ impl Layout {
         match self {
             Self::Npz => "npz",
             Self::Feather => "feather",
+            Self::SemanticKitti => "semantickitti",
             Self::Av2V1 => "av2-v1",
             Self::Av2V2 => "av2-v2",
             Self::Av2V3 => "av2-v3",
-        }
-    }
-
-    fn challenge(self) -> Option<Av2Challenge> {
-        match self {
-            Self::Npz | Self::Feather => None,
-            Self::Av2V1 => Some(Av2Challenge::One),
-            Self::Av2V2 => Some(Av2Challenge::Two),
-            Self::Av2V3 => Some(Av2Challenge::Three),
         }
     }
 
@@ -65,6 +61,10 @@ impl Layout {
     pub(super) fn path(self, drive: &str, pair: usize, key: &str) -> String {
         match self {
             Self::Npz => format!("{key}.npz"),
+            Self::SemanticKitti => match key.rsplit_once('/') {
+                Some((folder, sweep)) => format!("{folder}/labels/{sweep}.label"),
+                None => format!("labels/{key}.label"),
+            },
             Self::Feather | Self::Av2V1 | Self::Av2V3 => format!("{key}.feather"),
             Self::Av2V2 => format!("{drive}/{pair:010}.feather"),
         }
@@ -74,7 +74,7 @@ impl Layout {
     pub(super) fn run_files(self) -> &'static [(&'static str, &'static str)] {
         match self {
             Self::Av2V2 => &[("metadata.json", "{\"Is Supervised?\": false}\n")],
-            Self::Npz | Self::Feather | Self::Av2V1 | Self::Av2V3 => &[],
+            Self::Npz | Self::Feather | Self::SemanticKitti | Self::Av2V1 | Self::Av2V3 => &[],
         }
     }
 
@@ -91,10 +91,14 @@ impl Layout {
     ) -> Result<Vec<u8>, FormatError> {
         let table = FlowTable::new(source, estimate);
         let mut bytes = Vec::new();
-        match self.challenge() {
-            Some(challenge) => write_av2_challenge(challenge, &table, mask, &mut bytes)?,
-            None if self == Self::Npz => write_flow(FlowFormat::Npz, &table, &mut bytes)?,
-            None => write_flow(FlowFormat::Feather, &table, &mut bytes)?,
+        let out = &mut bytes;
+        match self {
+            Self::Npz => write_flow(FlowFormat::Npz, &table, out)?,
+            Self::Feather => write_flow(FlowFormat::Feather, &table, out)?,
+            Self::SemanticKitti => bytes = moving_labels(&table),
+            Self::Av2V1 => write_av2_challenge(Av2Challenge::One, &table, mask, out)?,
+            Self::Av2V2 => write_av2_challenge(Av2Challenge::Two, &table, mask, out)?,
+            Self::Av2V3 => write_av2_challenge(Av2Challenge::Three, &table, mask, out)?,
         }
         Ok(bytes)
     }

@@ -1,4 +1,4 @@
-//! Pictures of flow and of tracks from above, and of depth images; plots.
+//! Pictures of flow, of tracks and of dense clouds from above, and of depth images; plots.
 //!
 //! Independent of files and of how flow and depth were computed.
 
@@ -7,6 +7,7 @@ mod wheel;
 
 mod boxes;
 mod canvas;
+mod dense;
 mod depth;
 mod font;
 mod plot;
@@ -14,6 +15,7 @@ mod top_down;
 mod tracks;
 
 pub use crate::picture::canvas::{Image, PictureError, write_png};
+pub use crate::picture::dense::dense_from_above;
 pub use crate::picture::depth::{DepthPanel, depth_panels};
 pub use crate::picture::motion::{full_scale, shown_motion};
 pub use crate::picture::plot::{Axis, Plot, Series};

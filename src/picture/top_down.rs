@@ -160,15 +160,19 @@ pub fn top_down(scene: &TopDown<'_>, options: &TopDownOptions) -> Image {
 /// Half the width, metres, of the square that holds nearly all points with a flow.
 fn choose_range(scene: &TopDown) -> f32 {
     let rows = scene.source.iter().zip(scene.valid);
-    let mut reach: Vec<f32> = rows
-        .filter(|(_, valid)| **valid)
-        .map(|(point, _)| point[0].abs().max(point[1].abs()))
-        .filter(|m| m.is_finite())
-        .collect();
+    let points = rows.filter(|(_, valid)| **valid);
+    range_m(points.map(|(point, _)| *point), COVERED)
+}
+
+/// The smallest of [`RANGES_M`] whose square holds this share of the points, the largest if none does. 50 m
+/// without points.
+pub(super) fn range_m(points: impl Iterator<Item = Point>, share: f64) -> f32 {
+    let reach = points.map(|point| point[0].abs().max(point[1].abs()));
+    let mut reach: Vec<f32> = reach.filter(|m| m.is_finite()).collect();
     if reach.is_empty() {
         return RANGES_M[4];
     }
-    let index = ((reach.len() - 1) as f64 * COVERED) as usize;
+    let index = ((reach.len() - 1) as f64 * share) as usize;
     let (_, wanted, _) = reach.select_nth_unstable_by(index, f32::total_cmp);
     RANGES_M
         .into_iter()

@@ -4,7 +4,7 @@ use super::boxes::{corners, line, outline};
 use super::canvas::{Align, Image, Rgb, TextStyle};
 use super::top_down::{
     BACKGROUND, RANGES_M, STATIC, TITLE, View, draw_heading, draw_rings, draw_scale_bar,
-    draw_vehicle,
+    draw_vehicle, range_m,
 };
 use super::wheel::color;
 use crate::flow::tracks::{Track, TrackState};
@@ -46,14 +46,7 @@ impl TracksFromAbove<'_> {
     fn range_m(&self) -> f32 {
         let states = self.tracks.iter().flat_map(|track| &track.states);
         let centers = states.filter_map(|state| self.center(state));
-        let mut reach: Vec<f32> = centers.map(|[x, y, _]| x.abs().max(y.abs())).collect();
-        reach.sort_unstable_by(f32::total_cmp);
-        let index = (reach.len().saturating_sub(1) as f64 * COVERED) as usize;
-        let wanted = reach.get(index).copied().unwrap_or(0.0);
-        let mut ranges = RANGES_M.into_iter();
-        ranges
-            .find(|&range| range >= wanted.max(RANGES_M[1]))
-            .unwrap_or(RANGES_M[RANGES_M.len() - 1])
+        range_m(centers, COVERED).max(RANGES_M[1])
     }
 }
 

@@ -113,6 +113,61 @@ fn sweeps_that_are_named_by_their_times_become_annotations_of_argoverse_2() {
 }
 
 #[test]
+fn a_sequence_becomes_one_recording_with_the_motion_of_the_sensor_where_poses_are_given() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    drive(folder);
+    let sweeps = sweeps();
+    let sweeps: Vec<&str> = sweeps.iter().map(String::as_str).collect();
+    let export = |options: &[&str]| {
+        let all = [&["export", "tracks.json"], &sweeps[..], options].concat();
+        fnsf(folder, &all)
+    };
+    let done = export(&["--layout", "mcap", "-o", "scene"]);
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    assert!(
+        done.stdout.contains("in 4 sweeps, 4 clouds"),
+        "{}",
+        done.stdout
+    );
+    let still = fs::read(folder.join("scene/scene.mcap")).expect("a recording");
+    let has = |recording: &[u8], text: &str| {
+        let text = text.as_bytes();
+        recording.windows(text.len()).any(|at| at == text)
+    };
+    assert!(has(&still, "/objects") && !has(&still, "/tf"));
+    fs::write(
+        folder.join("poses.txt"),
+        "1 0 0 2 0 1 0 0 0 0 1 0\n".repeat(4),
+    )
+    .expect("poses");
+    let poses = ["--poses", "poses.txt"];
+    let done = export(&[&["--layout", "mcap", "-o", "moved"], &poses[..]].concat());
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    let moved = fs::read(folder.join("moved/scene.mcap")).expect("a recording");
+    assert!(has(&moved, "/tf"));
+    // It is a recording, though not one of a robot.
+    let none = fnsf(folder, &["unpack", "moved/scene.mcap", "--list"]);
+    assert!(
+        none.stderr.contains("no clouds of sensor_msgs/PointCloud2"),
+        "{}",
+        none.stderr
+    );
+
+    let refused = export(&[&["--layout", "cvat", "-o", "cvat"], &poses[..]].concat());
+    assert_eq!(refused.code, 2);
+    fs::write(folder.join("sweep_0002.pcd"), "no cloud").expect("written");
+    let refused = export(&["--layout", "mcap", "-o", "damaged"]);
+    assert_eq!(refused.code, 65);
+    assert!(
+        refused.stderr.contains("sweep_0002.pcd"),
+        "{}",
+        refused.stderr
+    );
+    assert!(!folder.join("damaged/scene.mcap").exists());
+}
+
+#[test]
 fn tracks_of_another_sequence_and_sweeps_of_one_name_are_refused_before_anything_is_written() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();

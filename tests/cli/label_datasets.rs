@@ -64,7 +64,28 @@ fn kitti_lies_in_folders_of_velodyne() {
     label(folder, &["odometry", "-o", "b"]);
     let second = folder.join("b/sequences/04/000000.npz");
     assert!(fs::read(first).expect("written") == fs::read(second).expect("written"));
-    let none = fnsf(folder, &["label", "av2:raw", "-o", "c"]);
+    // A label for each point, in the folders of SemanticKITTI.
+    label(
+        folder,
+        &["odometry", "-o", "c", "--layout", "semantickitti"],
+    );
+    let labels = fs::read(folder.join("c/sequences/04/labels/000000.label")).expect("written");
+    let cloud = fs::read(folder.join("odometry/sequences/04/velodyne/000000.bin"));
+    assert_eq!(labels.len() / 4, cloud.expect("a sweep").len() / 16);
+    let flow = fs::read(folder.join("b/sequences/04/000000.npz")).expect("written");
+    let flow = read_flow(&flow, Some("flow.npz")).expect("a flow");
+    let (valid, dynamic) = (flow.valid.expect("known"), flow.dynamic.expect("known"));
+    let flags = valid.iter().zip(&dynamic);
+    for (label, (valid, dynamic)) in labels.chunks(4).zip(flags) {
+        let expected = match (valid, dynamic) {
+            (false, _) => 0,
+            (true, false) => 9,
+            (true, true) => 251,
+        };
+        assert_eq!(label, [expected, 0, 0, 0]);
+    }
+    assert!(dynamic.contains(&true) && dynamic.contains(&false));
+    let none = fnsf(folder, &["label", "av2:raw", "-o", "d"]);
     assert_eq!(none.code, 65);
     assert!(none.stderr.contains("sensors/lidar"), "{}", none.stderr);
 }

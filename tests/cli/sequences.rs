@@ -138,9 +138,13 @@ fn a_dense_cloud_has_every_point_and_shows_more_than_one_sweep_through_a_camera(
         "cpu",
         "-o",
         "near.ply",
+        "--picture",
+        "above.png",
     ];
     let done = fnsf(folder, &[&["densify"], &SWEEPS[..], &cropped].concat());
     assert_eq!(done.code, 0, "{}", done.stderr);
+    let picture = std::fs::read(folder.join("above.png")).expect("written");
+    assert!(picture.starts_with(b"\x89PNG"));
     let bytes = std::fs::read(folder.join("near.ply")).expect("written");
     let points = read_cloud(&bytes, Some("near.ply"))
         .expect("a cloud")

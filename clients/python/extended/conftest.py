@@ -31,9 +31,9 @@ def tracks(drive):
 
 @pytest.fixture
 def exported(drive, tmp_path):
-    def export(layout, name="Car"):
+    def export(layout, name="Car", options=()):
         sweeps = sorted(drive.glob("3*.pcd"))
-        called("export", drive / "tracks.json", *sweeps, "--layout", layout, "--class", name, "-o", tmp_path)
+        called("export", drive / "tracks.json", *sweeps, "--layout", layout, "--class", name, "-o", tmp_path, *options)
         return tmp_path, [sweep.stem for sweep in sweeps]
 
     return export

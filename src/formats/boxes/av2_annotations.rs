@@ -4,18 +4,12 @@ use super::layout_file::LayoutFile;
 use super::sequence::BoxSequence;
 use crate::formats::error::{FileKind, FormatError};
 use crate::formats::feather::{Values, write};
-use crate::formats::timestamps::{SweepTime, TimeUnit};
+use crate::formats::timestamps::SweepTime;
 
 /// Nanoseconds of a sweep, from its name.
 fn stamp_ns(name: &str) -> Result<i64, FormatError> {
-    let stamp = SweepTime::from_name(name).and_then(|time| {
-        let unit = match time.unit {
-            TimeUnit::Nanoseconds => 1,
-            TimeUnit::Microseconds => 1_000,
-            TimeUnit::Milliseconds => 1_000_000,
-        };
-        i64::try_from(time.ticks.checked_mul(unit)?).ok()
-    });
+    let stamp = SweepTime::from_name(name).and_then(SweepTime::nanoseconds);
+    let stamp = stamp.and_then(|stamp| i64::try_from(stamp).ok());
     stamp.ok_or_else(|| {
         FileKind::Feather.unsupported(format!(
             "annotations of Argoverse 2 have the times of sweeps, and the name {name} has none: name \

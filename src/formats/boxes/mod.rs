@@ -1,14 +1,16 @@
-//! Boxes of tracks in the layouts of labelling tools and data sets.
+//! Boxes of tracks in the layouts of labelling tools and data sets, and as recordings for viewers.
 
 mod av2_annotations;
 mod layout;
 mod layout_file;
 #[cfg(test)]
 mod samples;
+mod scene;
 mod sequence;
 mod supervisely;
 mod sustechpoints;
 
 pub use crate::formats::boxes::layout::BoxLayout;
 pub use crate::formats::boxes::layout_file::LayoutFile;
+pub use crate::formats::boxes::scene::SceneRecording;
 pub use crate::formats::boxes::sequence::BoxSequence;

@@ -83,6 +83,11 @@ impl<'a> BoxSequence<'a> {
         names.zip(self.boxes.iter().map(Vec::as_slice))
     }
 
+    /// Tracks and states of the sweep `index`.
+    pub(super) fn boxes(&self, index: usize) -> &[(&'a Track, &'a TrackState)] {
+        &self.boxes[index]
+    }
+
     /// The identity of something in this sequence: the same in every run, and another in another
     /// sequence.
     pub(super) fn key(&self, of: &str) -> Uuid {

@@ -14,12 +14,16 @@ const MAX_RECORD: u64 = 1 << 30;
 /// Bytes of an operation code and a length.
 const HEAD: usize = 9;
 
-const FOOTER: u8 = 0x02;
-const SCHEMA: u8 = 0x03;
-const CHANNEL: u8 = 0x04;
-const MESSAGE: u8 = 0x05;
-const CHUNK: u8 = 0x06;
-const DATA_END: u8 = 0x0f;
+pub(super) const HEADER: u8 = 0x01;
+pub(super) const FOOTER: u8 = 0x02;
+pub(super) const SCHEMA: u8 = 0x03;
+pub(super) const CHANNEL: u8 = 0x04;
+pub(super) const MESSAGE: u8 = 0x05;
+pub(super) const CHUNK: u8 = 0x06;
+pub(super) const MESSAGE_INDEX: u8 = 0x07;
+pub(super) const CHUNK_INDEX: u8 = 0x08;
+pub(super) const STATISTICS: u8 = 0x0b;
+pub(super) const DATA_END: u8 = 0x0f;
 
 /// The records that are read, with their contents.
 #[derive(Clone, Copy)]
