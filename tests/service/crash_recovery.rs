@@ -12,7 +12,7 @@ use crate::clouds::{file, form, medium_pair, small_pair};
 use crate::server::{Folder, Server, ended};
 
 /// Default number of kills. `FNSF_KILLS` overrides it.
-const KILLS: usize = 16;
+const KILLS: usize = 12;
 /// Jobs submitted per kill.
 const JOBS_A_KILL: usize = 3;
 

@@ -14,7 +14,7 @@ use crate::postgres_server::{PostgresServer, start_postgres};
 use crate::server::{PATIENCE, Server, plain_get};
 
 /// Default number of jobs. `FNSF_FLEET_JOBS` overrides it.
-const JOBS: usize = 36;
+const JOBS: usize = 24;
 
 /// Nodes of each role.
 const OF_A_ROLE: usize = 3;

@@ -16,7 +16,7 @@ use crate::crash_recovery::{end_undisturbed, list_all, options};
 use crate::fleet::Farm;
 use crate::server::{FREE_PORTS, Folder, PATIENCE, plain_get};
 
-const JOBS: usize = 30;
+const JOBS: usize = 20;
 const CUTS: usize = 2;
 /// Longer than a lease of the farm.
 const CUT: Duration = Duration::from_secs(8);
