@@ -106,9 +106,9 @@ impl<W: Write> RecordingWriter<W> {
     }
 
     fn record(&mut self, code: u8, content: &Content) -> io::Result<()> {
-        let mut record = Vec::with_capacity(content.0.len() + 9);
-        append(&mut record, code, content);
-        self.write(&record)
+        self.write(&[code])?;
+        self.write(&(content.0.len() as u64).to_le_bytes())?;
+        self.write(&content.0)
     }
 
     /// Adds a channel. Returns its number.
@@ -214,15 +214,11 @@ impl<W: Write> RecordingWriter<W> {
             .u64(first)
             .u64(last)
             .counted(&counts.0);
-        let (schemas, channels) = (
-            std::mem::take(&mut self.schemas),
-            std::mem::take(&mut self.channels),
-        );
-        self.write(&schemas)?;
-        self.write(&channels)?;
-        self.record(STATISTICS, &statistics)?;
-        let chunks = std::mem::take(&mut self.chunks);
-        self.write(&chunks)?;
+        let mut index = std::mem::take(&mut self.schemas);
+        index.append(&mut self.channels);
+        append(&mut index, STATISTICS, &statistics);
+        index.append(&mut self.chunks);
+        self.write(&index)?;
         let footer = Content::default().u64(summary).u64(0).u32(0);
         self.record(FOOTER, &footer)?;
         self.write(MAGIC)?;
