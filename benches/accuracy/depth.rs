@@ -61,7 +61,7 @@ pub(super) fn run(arguments: &[String]) -> anyhow::Result<()> {
         let panel = |(title, image)| DepthPanel { title, image };
         let titles = ["1 sweep", "10 sweeps", "10 sweeps, filtered", "truth"];
         let panels: Vec<DepthPanel<'_>> = titles.into_iter().zip(&pictures).map(panel).collect();
-        write_png(&depth_panels(&panels), std::fs::File::create(path)?)?;
+        write_png(&depth_panels(&panels), &mut std::fs::File::create(path)?)?;
     }
     Ok(())
 }

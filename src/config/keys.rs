@@ -9,7 +9,7 @@ use figment::Figment;
 use figment::providers::{Env, Serialized};
 use serde::{Deserialize, Serialize};
 
-use super::file::ConfigFile;
+use super::layer::Layer;
 use super::remote::RemoteConfig;
 use super::secret::Secret;
 use super::secret::wrong_values;
@@ -366,6 +366,16 @@ impl Config {
     ///   names the key and its source.
     /// - [`ConfigError::Together`] as [`Config::check`].
     pub fn load(file: Option<&Path>, flags: &impl Serialize) -> Result<Self, ConfigError> {
+        let flags = Layer::command_line(flags);
+        Self::load_beneath(
+            file,
+            flags.map_err(|error| ConfigError::Value(wrong_values(*error)))?,
+        )
+    }
+
+    /// As [`Self::load`]. It is not generic, so that it is compiled once.
+    fn load_beneath(file: Option<&Path>, flags: Layer) -> Result<Self, ConfigError> {
+        let wrong = |error: Box<_>| ConfigError::Value(wrong_values(*error));
         let mut figment = Figment::from(Serialized::defaults(Self::default()));
         if let Some(path) = file {
             let text = std::fs::read_to_string(path).map_err(|error| ConfigError::File {
@@ -385,7 +395,7 @@ impl Config {
                 }
             })?;
             // What was read is used: a pipe cannot be read twice.
-            figment = figment.merge(ConfigFile { path, table });
+            figment = figment.merge(Layer::file(path, &table).map_err(wrong)?);
         }
         let mut variables = Env::prefixed(PREFIX)
             .filter(|name| {
@@ -400,9 +410,9 @@ impl Config {
         }
         let config: Self = figment
             .merge(variables)
-            .merge(Serialized::defaults(flags))
+            .merge(flags)
             .extract()
-            .map_err(|error| ConfigError::Value(wrong_values(error)))?;
+            .map_err(|error| wrong(Box::new(error)))?;
         config.check()?;
         Ok(config)
     }

@@ -4,8 +4,8 @@
 //! Unknown keys are refused. Secrets are never printed. Independent of the parts of the server that
 //! use the values.
 
-mod file;
 mod keys;
+mod layer;
 mod ranges;
 mod remote;
 mod secret;

@@ -51,11 +51,11 @@ pub fn read_av2_mask(bytes: &[u8]) -> Result<Vec<bool>, FormatError> {
 /// # Errors
 /// - `RowCount` if the mask has another length than the table.
 /// - `Encode` if writing fails.
-pub fn write_av2_challenge<W: Write>(
+pub fn write_av2_challenge(
     challenge: Av2Challenge,
     table: &FlowTable<'_>,
     mask: Option<&[bool]>,
-    out: &mut W,
+    out: &mut dyn Write,
 ) -> Result<(), FormatError> {
     let rows = table.source.len();
     if let Some(mask) = mask {

@@ -101,7 +101,7 @@ pub(super) fn read(bytes: &[u8], kind: FileKind, most: usize) -> Result<Vec<Poin
 }
 
 /// Writes KITTI rows with intensity 0.
-pub(super) fn write_kitti<W: Write>(out: &mut W, points: &[Point]) -> Result<(), FormatError> {
+pub(super) fn write_kitti(out: &mut dyn Write, points: &[Point]) -> Result<(), FormatError> {
     let rows: Vec<[f32; 4]> = points.iter().map(|[x, y, z]| [*x, *y, *z, 0.0]).collect();
     write_floats(out, rows.as_flattened())?;
     Ok(())

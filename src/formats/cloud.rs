@@ -389,10 +389,10 @@ pub enum CloudFormat {
 ///
 /// # Errors
 /// As for [`write_cloud`].
-pub fn write_timed_pcd<W: Write>(
+pub fn write_timed_pcd(
     points: &[Point],
     times: &[f32],
-    out: &mut W,
+    out: &mut dyn Write,
 ) -> Result<(), FormatError> {
     check_points(FileKind::Pcd, points)?;
     let fields = ["x", "y", "z", "time"].map(|name| (name, 4, 'F'));
@@ -409,10 +409,10 @@ pub fn write_timed_pcd<W: Write>(
 ///   accepted in PCD.
 /// - `OutOfRange` for a coordinate over 1e6 m in magnitude.
 /// - `Write` where writing to `out` fails. For feather this is `Encode`, as is a failure to encode.
-pub fn write_cloud<W: Write>(
+pub fn write_cloud(
     format: CloudFormat,
     points: &[Point],
-    out: &mut W,
+    out: &mut dyn Write,
 ) -> Result<(), FormatError> {
     let kind = match format {
         CloudFormat::Npy => FileKind::Npy,

@@ -1,6 +1,6 @@
 //! Dense cloud files, written only: one row per point, with its sweep, age and flags.
 
-use std::io::{Cursor, Write};
+use std::io::Write;
 
 use super::error::{FileKind, FormatError, shorten};
 use super::limits::{check_points, check_value};
@@ -105,10 +105,10 @@ impl DenseFormat {
 /// - `OutOfRange` for a coordinate over 1e6 m or an age over 1e6 sweeps in magnitude.
 /// - `Unsupported` for a sweep index over 65,535 in LAS and LAZ.
 /// - `Write` where writing to `out` fails, `Encode` where encoding fails.
-pub fn write_dense<W: Write>(
+pub fn write_dense(
     format: DenseFormat,
     cloud: &DenseCloud,
-    out: &mut W,
+    out: &mut dyn Write,
 ) -> Result<(), FormatError> {
     let count = cloud.points.len();
     check_count("sweep", cloud.sweep.len(), count)?;
@@ -129,18 +129,18 @@ pub fn write_dense<W: Write>(
     }
 }
 
-fn write_npz<W: Write>(cloud: &DenseCloud, out: &mut W) -> Result<(), FormatError> {
-    let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
+fn write_npz(cloud: &DenseCloud, out: &mut dyn Write) -> Result<(), FormatError> {
+    let mut npz = NpzWriter::new();
     npz.points("points", &cloud.points)?;
     npz.array("sweep", |out| npy::write_counts(out, &cloud.sweep))?;
     npz.values("age", &cloud.age)?;
     npz.mask("dynamic", &cloud.dynamic)?;
     npz.mask("converged", &cloud.converged)?;
-    out.write_all(npz.finish()?.get_ref())?;
+    out.write_all(&npz.finish()?)?;
     Ok(())
 }
 
-fn write_ply<W: Write>(cloud: &DenseCloud, out: &mut W) -> Result<(), FormatError> {
+fn write_ply(cloud: &DenseCloud, out: &mut dyn Write) -> Result<(), FormatError> {
     let properties = [
         ("float", "x"),
         ("float", "y"),
@@ -155,7 +155,7 @@ fn write_ply<W: Write>(cloud: &DenseCloud, out: &mut W) -> Result<(), FormatErro
     write_rows(cloud, out)
 }
 
-fn write_pcd<W: Write>(cloud: &DenseCloud, out: &mut W) -> Result<(), FormatError> {
+fn write_pcd(cloud: &DenseCloud, out: &mut dyn Write) -> Result<(), FormatError> {
     let fields = [
         ("x", 4, 'F'),
         ("y", 4, 'F'),
@@ -170,7 +170,7 @@ fn write_pcd<W: Write>(cloud: &DenseCloud, out: &mut W) -> Result<(), FormatErro
 }
 
 /// Writes rows of point, sweep, age and flags, little endian.
-fn write_rows<W: Write>(cloud: &DenseCloud, out: &mut W) -> Result<(), FormatError> {
+fn write_rows(cloud: &DenseCloud, out: &mut dyn Write) -> Result<(), FormatError> {
     const FLUSH_AT: usize = 64 << 10;
     let mut bytes = Vec::with_capacity(FLUSH_AT + 64);
     for (row, point) in cloud.points.iter().enumerate() {

@@ -24,7 +24,7 @@ const PIXEL_BYTES: u64 = 6;
 /// # Errors
 /// `RowCount` where the number of depths does not match the image's size. `Encode` for an image
 /// without pixels, and where encoding or writing fails.
-pub fn write_depth_png<W: Write>(image: &DepthImage, out: W) -> Result<usize, FormatError> {
+pub fn write_depth_png(image: &DepthImage, out: &mut dyn Write) -> Result<usize, FormatError> {
     let pixels = image.width as usize * image.height as usize;
     check_count("the depth image", image.metres.len(), pixels)?;
     let mut dropped = 0;

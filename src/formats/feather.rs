@@ -385,8 +385,8 @@ pub(super) enum Values<'a> {
 }
 
 /// Writes one record batch, LZ4-compressed as in Argoverse 2.
-pub(super) fn write<W: Write>(
-    out: &mut W,
+pub(super) fn write(
+    out: &mut dyn Write,
     columns: Vec<(&str, Values<'_>)>,
 ) -> Result<(), FormatError> {
     let encode = |error| KIND.encode(error);

@@ -25,10 +25,10 @@ const AGE_BYTES: u16 = 4;
 ///
 /// # Errors
 /// `Unsupported` for sweep indices over 65,535, `Encode` and `Write` where writing fails.
-pub(super) fn write<W: Write>(
+pub(super) fn write(
     cloud: &DenseCloud,
     compressed: bool,
-    out: &mut W,
+    out: &mut dyn Write,
 ) -> Result<(), FormatError> {
     let encode = |error| KIND.encode(error);
     let mut builder = Builder::from(Version::new(1, 4));

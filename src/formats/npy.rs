@@ -332,8 +332,8 @@ pub(super) fn read_file(bytes: &[u8], most: usize) -> Result<Vec<Point>, FormatE
 }
 
 /// Writes the header of a C-order array; `descr` and `shape` are Python literals.
-pub(super) fn write_header<W: Write>(
-    out: &mut W,
+pub(super) fn write_header(
+    out: &mut dyn Write,
     descr: &str,
     shape: &str,
 ) -> Result<(), FormatError> {
@@ -352,13 +352,13 @@ pub(super) fn write_header<W: Write>(
 }
 
 /// Writes N x 3 float32, little endian.
-pub(super) fn write_points<W: Write>(out: &mut W, points: &[Point]) -> Result<(), FormatError> {
+pub(super) fn write_points(out: &mut dyn Write, points: &[Point]) -> Result<(), FormatError> {
     write_header(out, "<f4", &format!("({}, 3)", points.len()))?;
     write_floats(out, points.as_flattened())
 }
 
 /// Writes N booleans.
-pub(super) fn write_mask<W: Write>(out: &mut W, mask: &[bool]) -> Result<(), FormatError> {
+pub(super) fn write_mask(out: &mut dyn Write, mask: &[bool]) -> Result<(), FormatError> {
     write_header(out, "|b1", &format!("({},)", mask.len()))?;
     let bytes: Vec<u8> = mask.iter().map(|&flag| u8::from(flag)).collect();
     out.write_all(&bytes)?;
@@ -366,7 +366,7 @@ pub(super) fn write_mask<W: Write>(out: &mut W, mask: &[bool]) -> Result<(), For
 }
 
 /// Writes N int32, little endian.
-pub(super) fn write_ids<W: Write>(out: &mut W, ids: &[i32]) -> Result<(), FormatError> {
+pub(super) fn write_ids(out: &mut dyn Write, ids: &[i32]) -> Result<(), FormatError> {
     write_header(out, "<i4", &format!("({},)", ids.len()))?;
     let bytes: Vec<u8> = ids.iter().flat_map(|id| id.to_le_bytes()).collect();
     out.write_all(&bytes)?;
@@ -374,7 +374,7 @@ pub(super) fn write_ids<W: Write>(out: &mut W, ids: &[i32]) -> Result<(), Format
 }
 
 /// Writes N uint32, little endian.
-pub(super) fn write_counts<W: Write>(out: &mut W, counts: &[u32]) -> Result<(), FormatError> {
+pub(super) fn write_counts(out: &mut dyn Write, counts: &[u32]) -> Result<(), FormatError> {
     write_header(out, "<u4", &format!("({},)", counts.len()))?;
     let bytes: Vec<u8> = counts.iter().flat_map(|n| n.to_le_bytes()).collect();
     out.write_all(&bytes)?;
@@ -382,16 +382,13 @@ pub(super) fn write_counts<W: Write>(out: &mut W, counts: &[u32]) -> Result<(), 
 }
 
 /// Writes N float32, little endian.
-pub(super) fn write_values<W: Write>(out: &mut W, values: &[f32]) -> Result<(), FormatError> {
+pub(super) fn write_values(out: &mut dyn Write, values: &[f32]) -> Result<(), FormatError> {
     write_header(out, "<f4", &format!("({},)", values.len()))?;
     write_floats(out, values)
 }
 
 /// Writes a 4 x 4 float64 matrix, row by row, little endian.
-pub(super) fn write_matrix<W: Write>(
-    out: &mut W,
-    matrix: &[[f64; 4]; 4],
-) -> Result<(), FormatError> {
+pub(super) fn write_matrix(out: &mut dyn Write, matrix: &[[f64; 4]; 4]) -> Result<(), FormatError> {
     write_header(out, "<f8", "(4, 4)")?;
     for value in matrix.as_flattened() {
         out.write_all(&value.to_le_bytes())?;

@@ -4,7 +4,7 @@
 //! before it is decompressed.
 
 use std::cell::Cell;
-use std::io::{Cursor, Read, Seek, Write};
+use std::io::{Cursor, Read, Write};
 
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
@@ -193,14 +193,15 @@ fn broken(error: zip::result::ZipError) -> FormatError {
 
 /// Writes arrays one by one into an archive, as `numpy.savez` does. Flags and integers are
 /// compressed. Floats are not: compressed, the file of a flow is only 3% smaller.
-pub(super) struct NpzWriter<W: Write + Seek> {
-    archive: ZipWriter<W>,
+pub(super) struct NpzWriter {
+    archive: ZipWriter<Cursor<Vec<u8>>>,
 }
 
-impl<W: Write + Seek> NpzWriter<W> {
-    pub(super) fn new(out: W) -> Self {
+impl NpzWriter {
+    /// An empty archive in memory.
+    pub(super) fn new() -> Self {
         Self {
-            archive: ZipWriter::new(out),
+            archive: ZipWriter::new(Cursor::new(Vec::new())),
         }
     }
 
@@ -208,7 +209,7 @@ impl<W: Write + Seek> NpzWriter<W> {
     pub(super) fn array(
         &mut self,
         name: &str,
-        write: impl FnOnce(&mut ZipWriter<W>) -> Result<(), FormatError>,
+        write: impl FnOnce(&mut dyn Write) -> Result<(), FormatError>,
     ) -> Result<(), FormatError> {
         self.add(name, CompressionMethod::Deflated, write)
     }
@@ -217,7 +218,7 @@ impl<W: Write + Seek> NpzWriter<W> {
         &mut self,
         name: &str,
         method: CompressionMethod,
-        write: impl FnOnce(&mut ZipWriter<W>) -> Result<(), FormatError>,
+        write: impl FnOnce(&mut dyn Write) -> Result<(), FormatError>,
     ) -> Result<(), FormatError> {
         // A fixed time stamp, so that the same flow gives the same bytes.
         let options = SimpleFileOptions::default()
@@ -252,7 +253,9 @@ impl<W: Write + Seek> NpzWriter<W> {
         self.array(name, |out| npy::write_matrix(out, matrix))
     }
 
-    pub(super) fn finish(self) -> Result<W, FormatError> {
-        self.archive.finish().map_err(|error| KIND.encode(error))
+    /// Ends the archive and returns its bytes.
+    pub(super) fn finish(self) -> Result<Vec<u8>, FormatError> {
+        let archive = self.archive.finish();
+        Ok(archive.map_err(|error| KIND.encode(error))?.into_inner())
     }
 }

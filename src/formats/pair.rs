@@ -3,7 +3,7 @@
 //! Read from `.npz` with the array names that are common in scene flow, and from Argoverse 2's
 //! labels.
 
-use std::io::{Cursor, Write};
+use std::io::Write;
 
 use super::cloud::read_columns;
 use super::error::{FileKind, FormatError};
@@ -214,8 +214,8 @@ pub(super) fn check_count(what: &str, found: usize, expected: usize) -> Result<(
 ///   are therefore refused.
 /// - `OutOfRange` for a coordinate or displacement over 1e6 m in magnitude.
 /// - `Write` where writing to `out` fails, `Encode` where encoding fails.
-pub fn write_pair_npz<W: Write>(pair: &Pair, out: &mut W) -> Result<(), FormatError> {
-    let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
+pub fn write_pair_npz(pair: &Pair, out: &mut dyn Write) -> Result<(), FormatError> {
+    let mut npz = NpzWriter::new();
     let count = pair.source.len();
     let mut points = |name: &str, points: &[Point]| {
         check_points(KIND, name, points)?;
@@ -255,7 +255,7 @@ pub fn write_pair_npz<W: Write>(pair: &Pair, out: &mut W) -> Result<(), FormatEr
     if let Some(ego) = &pair.ego {
         npz.matrix("ego_SE3", &matrix_rows(ego))?;
     }
-    out.write_all(npz.finish()?.get_ref())?;
+    out.write_all(&npz.finish()?)?;
     Ok(())
 }
 

@@ -306,8 +306,8 @@ fn ascii_row(
 }
 
 /// Writes the header of a binary file of `rows` points; fields as (name, size in bytes, type).
-pub(super) fn write_header<W: Write>(
-    out: &mut W,
+pub(super) fn write_header(
+    out: &mut dyn Write,
     rows: usize,
     fields: &[(&str, u8, char)],
 ) -> Result<(), FormatError> {

@@ -289,8 +289,8 @@ fn scalar(name: &str) -> Option<Scalar> {
 }
 
 /// Writes the header of a little-endian file of `rows` vertices; properties as (type, name).
-pub(super) fn write_header<W: Write>(
-    out: &mut W,
+pub(super) fn write_header(
+    out: &mut dyn Write,
     rows: usize,
     comments: &[&str],
     properties: &[(&str, &str)],

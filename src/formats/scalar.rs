@@ -103,7 +103,7 @@ impl Scalar {
 }
 
 /// Writes float32, little endian.
-pub(super) fn write_floats<W: Write>(out: &mut W, values: &[f32]) -> Result<(), FormatError> {
+pub(super) fn write_floats(out: &mut dyn Write, values: &[f32]) -> Result<(), FormatError> {
     const PER_CHUNK: usize = 2048;
     let mut bytes = Vec::with_capacity(PER_CHUNK * 4);
     for chunk in values.chunks(PER_CHUNK) {

@@ -86,7 +86,7 @@ impl StateJson {
 ///
 /// # Errors
 /// [`FormatError::Write`] if the writer fails.
-pub fn write_tracks<W: Write>(tracks: &[Track], out: &mut W) -> Result<(), FormatError> {
+pub fn write_tracks(tracks: &[Track], out: &mut dyn Write) -> Result<(), FormatError> {
     let tracks = tracks.iter().map(|track| TrackJson {
         id: track.id,
         states: track.states.iter().map(StateJson::from).collect(),

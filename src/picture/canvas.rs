@@ -154,7 +154,7 @@ impl Image {
 ///
 /// # Errors
 /// [`PictureError`] where encoding or writing to `out` fails.
-pub fn write_png<W: Write>(image: &Image, out: W) -> Result<(), PictureError> {
+pub fn write_png(image: &Image, out: &mut dyn Write) -> Result<(), PictureError> {
     let mut encoder = png::Encoder::new(out, image.width, image.height);
     encoder.set_color(png::ColorType::Rgb);
     encoder.set_depth(png::BitDepth::Eight);

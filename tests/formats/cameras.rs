@@ -186,7 +186,7 @@ fn what_the_format_cannot_hold_is_dropped_and_counted() {
     assert_eq!(read.metres[1..], [0.0; 5]);
     assert!((read.metres[0] - 255.99).abs() <= 0.5 / 256.0);
     let torn = DepthImage { width: 7, ..image };
-    let error = write_depth_png(&torn, Vec::new()).unwrap_err();
+    let error = write_depth_png(&torn, &mut Vec::new()).unwrap_err();
     assert!(matches!(error, FormatError::RowCount { .. }), "{error}");
 }
 

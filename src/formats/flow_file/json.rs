@@ -79,7 +79,7 @@ fn clusters(described: Vec<Described>) -> Result<Vec<Cluster>, FormatError> {
     checked.collect()
 }
 
-pub(super) fn write<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatError> {
+pub(super) fn write(table: &FlowTable<'_>, out: &mut dyn Write) -> Result<(), FormatError> {
     let objects = table.objects;
     serde_json::to_writer(
         &mut *out,

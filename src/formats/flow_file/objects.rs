@@ -1,7 +1,5 @@
 //! Clusters as npz arrays and as JSON objects: writing and reading.
 
-use std::io::{Seek, Write};
-
 use serde::{Deserialize, Serialize};
 
 use crate::flow::{Cluster, Objects, OrientedBox, Point};
@@ -12,10 +10,7 @@ use crate::formats::npz::{Npz, NpzWriter};
 use crate::formats::pair::check_count;
 
 /// Writes the cluster arrays that [`super::FlowFormat::Npz`] lists.
-pub(super) fn put<W: Write + Seek>(
-    objects: &Objects,
-    npz: &mut NpzWriter<W>,
-) -> Result<(), FormatError> {
+pub(super) fn put(objects: &Objects, npz: &mut NpzWriter) -> Result<(), FormatError> {
     let Objects {
         cluster,
         confidence,

@@ -1,6 +1,6 @@
 //! Writes flows.
 
-use std::io::{Cursor, Write};
+use std::io::Write;
 
 use super::table::FLOW_AXES;
 use super::table::FlowTable;
@@ -114,10 +114,10 @@ impl FlowFormat {
 /// - `NotFinite` for a displacement that is NaN or infinite, and `OutOfRange` for one over 1e6 m
 ///   along an axis, also in rows that are not valid.
 /// - `Write` where writing to `out` fails. For feather this is `Encode`, as is a failure to encode.
-pub fn write_flow<W: Write>(
+pub fn write_flow(
     format: FlowFormat,
     table: &FlowTable<'_>,
-    out: &mut W,
+    out: &mut dyn Write,
 ) -> Result<(), FormatError> {
     let count = table.source.len();
     check_count("flow", table.flow.len(), count)?;
@@ -141,8 +141,8 @@ pub fn write_flow<W: Write>(
     }
 }
 
-fn write_npz<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatError> {
-    let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
+fn write_npz(table: &FlowTable<'_>, out: &mut dyn Write) -> Result<(), FormatError> {
+    let mut npz = NpzWriter::new();
     npz.points("flow", table.flow)?;
     npz.mask("valid", table.valid)?;
     if let Some(dynamic) = table.dynamic {
@@ -154,11 +154,11 @@ fn write_npz<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatE
     if let Some(found) = table.objects {
         objects::put(found, &mut npz)?;
     }
-    out.write_all(npz.finish()?.get_ref())?;
+    out.write_all(&npz.finish()?)?;
     Ok(())
 }
 
-fn write_feather<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatError> {
+fn write_feather(table: &FlowTable<'_>, out: &mut dyn Write) -> Result<(), FormatError> {
     let axis = |axis: usize| -> Values<'_> {
         Values::Floats(Box::new(table.flow.iter().map(move |flow| flow[axis])))
     };
@@ -195,7 +195,7 @@ fn colors(table: &FlowTable<'_>) -> Vec<[u8; 3]> {
     motion.iter().zip(table.valid).map(color_of).collect()
 }
 
-fn write_ply<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatError> {
+fn write_ply(table: &FlowTable<'_>, out: &mut dyn Write) -> Result<(), FormatError> {
     let mut properties = vec![("float", "x"), ("float", "y"), ("float", "z")];
     properties.extend(FLOW_AXES.map(|axis| ("float", axis)));
     properties.push(("uchar", "valid"));
@@ -217,7 +217,7 @@ fn write_ply<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatE
     })
 }
 
-fn write_pcd<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatError> {
+fn write_pcd(table: &FlowTable<'_>, out: &mut dyn Write) -> Result<(), FormatError> {
     let mut fields = vec![("x", 4, 'F'), ("y", 4, 'F'), ("z", 4, 'F')];
     fields.extend(FLOW_AXES.map(|axis| (axis, 4, 'F')));
     fields.push(("valid", 1, 'U'));
@@ -240,9 +240,9 @@ fn write_pcd<W: Write>(table: &FlowTable<'_>, out: &mut W) -> Result<(), FormatE
 }
 
 /// Writes rows of point, displacement, flags, cluster, chances and color, little endian.
-fn write_rows<W: Write>(
+fn write_rows(
     table: &FlowTable<'_>,
-    out: &mut W,
+    out: &mut dyn Write,
     push_color: impl Fn([u8; 3], &mut Vec<u8>),
 ) -> Result<(), FormatError> {
     const FLUSH_AT: usize = 64 << 10;

@@ -1,0 +1,47 @@
+//! Values of one source, as a provider for figment: a configuration file, or the command line.
+
+use std::path::Path;
+
+use figment::error::Kind;
+use figment::value::{Dict, Map, Value};
+use figment::{Metadata, Profile, Provider};
+use serde::Serialize;
+
+/// The values of a source, with its name for errors.
+pub(super) struct Layer {
+    metadata: Metadata,
+    values: Dict,
+}
+
+impl Layer {
+    /// The values of the file at `path`.
+    pub(super) fn file(path: &Path, table: &toml::Table) -> Result<Self, Box<figment::Error>> {
+        let metadata = Metadata::from("TOML file", path);
+        let values = dict_of(table)?;
+        Ok(Self { metadata, values })
+    }
+
+    /// The keys that the command line gives. `flags` serializes to a map.
+    pub(super) fn command_line(flags: &impl Serialize) -> Result<Self, Box<figment::Error>> {
+        let metadata = Metadata::named("the command line");
+        let values = dict_of(flags)?;
+        Ok(Self { metadata, values })
+    }
+}
+
+fn dict_of(values: &impl Serialize) -> Result<Dict, Box<figment::Error>> {
+    let value = Value::serialize(values)?;
+    let actual = value.to_actual();
+    let dict = value.into_dict();
+    dict.ok_or_else(|| Box::new(Kind::InvalidType(actual, "a map".to_owned()).into()))
+}
+
+impl Provider for Layer {
+    fn metadata(&self) -> Metadata {
+        self.metadata.clone()
+    }
+
+    fn data(&self) -> Result<Map<Profile, Dict>, figment::Error> {
+        Ok(Profile::Default.collect(self.values.clone()))
+    }
+}
