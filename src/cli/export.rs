@@ -30,6 +30,7 @@ use crate::text::grouped;
     fnsf flow sweeps/*.pcd -o flow.npz --tracks tracks.json\n  \
     fnsf export tracks.json sweeps/*.pcd --layout supervisely -o project\n  \
     fnsf export tracks.json sweeps/*.pcd --layout cvat -o project && (cd project && zip -r ../project.zip .)\n  \
+    fnsf export tracks.json sweeps/*.pcd --layout kitti-tracking --camera calib.txt --class Car -o kitti\n  \
     fnsf export tracks.json sweeps/*.pcd --layout mcap --poses poses.txt -o scene")]
 pub(super) struct Export {
     /// Tracks of a sequence
@@ -50,6 +51,10 @@ pub(super) struct Export {
     /// Poses of all sweeps, for the motion of the sensor in --layout mcap: the formats of fnsf flow --poses
     #[arg(long, value_name = "FILE")]
     poses: Option<PathBuf>,
+    /// Calibration of KITTI, for --layout kitti-tracking: calib_cam_to_cam.txt with calib_velo_to_cam.txt in
+    /// the same folder, or the calibration of the tracking or object benchmark
+    #[arg(long, value_name = "FILE")]
+    camera: Option<PathBuf>,
 }
 
 /// The recording of [`Layout::Mcap`].
@@ -66,21 +71,10 @@ enum Layout {
     Sustechpoints,
     /// Argoverse 2: annotations.feather, of sweeps that are named by their nanoseconds
     Av2,
+    /// KITTI's tracking benchmark: label_02/0000.txt with the boxes that the camera sees
+    KittiTracking,
     /// MCAP with the messages of Foxglove: clouds, boxes, velocities, and with --poses the motion of the sensor
     Mcap,
-}
-
-impl Layout {
-    /// None for a recording.
-    fn boxes(self) -> Option<BoxLayout> {
-        match self {
-            Self::Supervisely => Some(BoxLayout::Supervisely),
-            Self::Cvat => Some(BoxLayout::Cvat),
-            Self::Sustechpoints => Some(BoxLayout::Sustechpoints),
-            Self::Av2 => Some(BoxLayout::Av2),
-            Self::Mcap => None,
-        }
-    }
 }
 
 /// The name of a sweep: its file name without ending.
@@ -94,10 +88,7 @@ fn name_of(sweep: &Path) -> Result<String, Failure> {
 
 impl Export {
     pub(super) fn run(&self) -> Result<(), Failure> {
-        let boxes_only = self.layout.boxes();
-        if boxes_only.is_some() && self.poses.is_some() {
-            return Err(Failure::usage(anyhow!("--poses is for --layout mcap")));
-        }
+        let boxes_only = self.boxes_only()?;
         let tracks = files::read_tracks(&self.tracks)?;
         let names: Result<Vec<String>, Failure> =
             self.sweeps.iter().map(|sweep| name_of(sweep)).collect();
@@ -129,6 +120,34 @@ impl Export {
             grouped(names.len()),
             self.output.display()
         ))
+    }
+
+    /// The layout of boxes. None for a recording.
+    fn boxes_only(&self) -> Result<Option<BoxLayout>, Failure> {
+        if self.poses.is_some() && !matches!(self.layout, Layout::Mcap) {
+            return Err(Failure::usage(anyhow!("--poses is for --layout mcap")));
+        }
+        if self.camera.is_some() && !matches!(self.layout, Layout::KittiTracking) {
+            return Err(Failure::usage(anyhow!(
+                "--camera is for --layout kitti-tracking"
+            )));
+        }
+        let layout = match (self.layout, &self.camera) {
+            (Layout::Supervisely, _) => BoxLayout::Supervisely,
+            (Layout::Cvat, _) => BoxLayout::Cvat,
+            (Layout::Sustechpoints, _) => BoxLayout::Sustechpoints,
+            (Layout::Av2, _) => BoxLayout::Av2,
+            (Layout::KittiTracking, Some(camera)) => {
+                BoxLayout::KittiTracking(files::read_kitti_camera(camera)?)
+            }
+            (Layout::KittiTracking, None) => {
+                return Err(Failure::usage(anyhow!(
+                    "--layout kitti-tracking needs --camera"
+                )));
+            }
+            (Layout::Mcap, _) => return Ok(None),
+        };
+        Ok(Some(layout))
     }
 
     /// Writes the clouds of the sweeps, where the layout has them. Returns their number.

@@ -16,7 +16,9 @@ use crate::flow::depth::Camera;
 use crate::flow::tracks::Track;
 use crate::flow::{Point, RigidTransform};
 use crate::formats;
-use crate::formats::{FileKind, FlowFile, FormatError, GroundRaster, Pair, PairTruth, TimedCloud};
+use crate::formats::{
+    FileKind, FlowFile, FormatError, GroundRaster, KittiCamera, Pair, PairTruth, TimedCloud,
+};
 
 /// The largest file that is read, bytes.
 const MAX_FILE: u64 = 4 << 30;
@@ -180,14 +182,30 @@ pub(super) fn read_ground_raster(path: &Path) -> Result<GroundRaster, Failure> {
 /// Reads a camera: from one file, or from KITTI's `calib_cam_to_cam.txt` with
 /// `calib_velo_to_cam.txt` in the same folder.
 pub(super) fn read_camera(path: &Path) -> Result<Camera, Failure> {
+    read_calibration(path, formats::read_camera)
+}
+
+/// Reads KITTI's camera from a calibration as [`read_camera`]'s. JSON has no camera 0.
+pub(super) fn read_kitti_camera(path: &Path) -> Result<KittiCamera, Failure> {
+    read_calibration(path, |bytes, second| {
+        Ok(KittiCamera {
+            camera: formats::read_camera(bytes, second)?,
+            camera0_from_lidar: formats::read_camera0_from_lidar(bytes, second)?,
+        })
+    })
+}
+
+/// Reads a calibration, and the file that goes with KITTI's `calib_cam_to_cam.txt`.
+fn read_calibration<T>(
+    path: &Path,
+    reader: impl FnOnce(&[u8], Option<&[u8]>) -> Result<T, FormatError>,
+) -> Result<T, Failure> {
     let beside = path.with_file_name("calib_velo_to_cam.txt");
     let is_first = path
         .file_name()
         .is_some_and(|name| name == "calib_cam_to_cam.txt");
     let second = is_first.then(|| read_bytes(&beside)).transpose()?;
-    read(path, |bytes, _| {
-        formats::read_camera(bytes, second.as_deref())
-    })
+    read(path, |bytes, _| reader(bytes, second.as_deref()))
 }
 
 /// Refuses outputs that cannot be written, and outputs that are the same file as an input or

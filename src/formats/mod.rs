@@ -38,7 +38,7 @@ mod ply;
 mod scalar;
 
 pub use crate::formats::av2_challenge::{Av2Challenge, read_av2_mask, write_av2_challenge};
-pub use crate::formats::boxes::{BoxLayout, BoxSequence, LayoutFile, SceneRecording};
+pub use crate::formats::boxes::{BoxLayout, BoxSequence, KittiCamera, LayoutFile, SceneRecording};
 pub use crate::formats::camera::{KITTI_SIZE_PX, read_camera, read_camera0_from_lidar};
 pub use crate::formats::cloud::{
     Cloud, CloudFormat, TimedCloud, declared_rows, read_cloud, read_cloud_within, read_timed_cloud,

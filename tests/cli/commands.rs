@@ -335,7 +335,7 @@ fn every_method_of_the_paper_gives_a_flow_and_refuses_a_gpu_that_it_has_no_kerne
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     street(folder, "2");
-    let usual = ["flow", "street/pair_0000.npz", "--max-points", "300"];
+    let usual = ["flow", "street/pair_0000.npz", "--max-points", "100"];
     for (preset, unit) in [
         ("nsfp-baseline", "m²"),
         ("nsfp", "m²"),

@@ -95,8 +95,8 @@ fn lzf_bomb() -> Vec<u8> {
 }
 
 #[tokio::test]
-async fn bombs_and_lying_counts_are_refused_a_hundred_times_in_little_memory() {
-    const TRIES: usize = 100;
+async fn bombs_and_lying_counts_are_refused_again_and_again_in_little_memory() {
+    const TRIES: usize = 20;
     let siege = Besieged::new("").await;
     let good = file(CloudFormat::Npy, &small_pair()[0]);
     let nested = zip(&[("pc1.npy", &zip(&[("pc1.npy", &good)]))]);

@@ -24,8 +24,8 @@ use crate::grpc::{chunk, client, pair, proto};
 use crate::server::{Folder, PATIENCE, Server, ended};
 
 /// Few points, so that a pair is quick. The dense cloud contains all points.
-const FLOWS: &str = r#"{"preset": "neural", "max_points": 1024, "ground": "auto"}"#;
-const DENSE: &str = r#"{"preset": "neural", "max_points": 1024, "ground": "auto", "densify": {"reference_time": 1.5}}"#;
+const FLOWS: &str = r#"{"preset": "neural", "max_points": 512, "ground": "auto"}"#;
+const DENSE: &str = r#"{"preset": "neural", "max_points": 512, "ground": "auto", "densify": {"reference_time": 1.5}}"#;
 
 /// The sweeps of a short simulated drive.
 fn sweeps() -> &'static [Vec<Point>] {
@@ -189,7 +189,7 @@ async fn streamed(server: &Server) -> Vec<Vec<Point>> {
 fn grpc_options(densify: Option<proto::Densify>) -> proto::Options {
     proto::Options {
         preset: proto::Preset::Neural.into(),
-        max_points: Some(1024),
+        max_points: Some(512),
         ground: proto::Ground::Auto.into(),
         densify,
         ..proto::Options::default()

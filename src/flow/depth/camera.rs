@@ -194,6 +194,33 @@ impl Camera {
         ))
     }
 
+    /// The sides left, top, right and bottom of the rectangle around the projections of a convex
+    /// body with these corners, pixels, cut at the image's sides. The corners are in the lidar's
+    /// frame, metres. Corners nearer than 0.1 m along the optical axis are taken to that depth.
+    ///
+    /// None if the rectangle lies outside the image, or all corners lie nearer or behind.
+    pub fn bounds(&self, corners: &[[f64; 3]]) -> Option<[f64; 4]> {
+        let Intrinsics { fx, fy, cx, cy } = self.intrinsics;
+        let mut sides = [f64::MAX, f64::MAX, f64::MIN, f64::MIN];
+        let mut is_ahead = false;
+        for &corner in corners {
+            let seen = self.camera_from_lidar * Point3::from(corner);
+            is_ahead |= seen.z >= NEAR_M;
+            let depth = seen.z.max(NEAR_M);
+            let (column, row) = (fx * seen.x / depth + cx, fy * seen.y / depth + cy);
+            sides = [
+                sides[0].min(column),
+                sides[1].min(row),
+                sides[2].max(column),
+                sides[3].max(row),
+            ];
+        }
+        let last = [self.width, self.height].map(|side| f64::from(side - 1));
+        let [left, top] = [sides[0].max(0.0), sides[1].max(0.0)];
+        let [right, bottom] = [sides[2].min(last[0]), sides[3].min(last[1])];
+        (is_ahead && left < right && top < bottom).then_some([left, top, right, bottom])
+    }
+
     /// The ray through the center of a pixel, in the camera's frame, scaled to a depth of 1 m. The
     /// pixel may lie outside the image.
     pub fn ray(&self, column: u32, row: u32) -> Vector3<f64> {
@@ -216,6 +243,22 @@ mod tests {
 
     fn camera() -> Camera {
         Camera::new(PLAIN, RigidTransform::identity(), [40, 20]).unwrap()
+    }
+
+    #[test]
+    fn a_body_is_bounded_by_its_corners_and_cut_at_the_image() {
+        let bounds = |corners: &[[f64; 3]]| camera().bounds(corners);
+        assert_eq!(
+            bounds(&[[-0.5, -0.5, 10.0], [0.5, 1.0, 10.0]]),
+            Some([15.0, 7.5, 25.0, 15.0])
+        );
+        assert_eq!(
+            bounds(&[[-9.0, -9.0, 10.0], [0.0, 9.0, 10.0]]),
+            Some([0.0, 0.0, 20.0, 19.0])
+        );
+        assert_eq!(bounds(&[[5.0, 0.0, 10.0], [9.0, 1.0, 10.0]]), None);
+        assert_eq!(bounds(&[[-1.0, -1.0, -10.0], [1.0, 1.0, -9.0]]), None);
+        assert!(bounds(&[[-1.0, -1.0, -10.0], [1.0, 1.0, 9.0]]).is_some());
     }
 
     #[test]

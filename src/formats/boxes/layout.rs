@@ -1,6 +1,7 @@
 //! The layouts, and the files of each.
 
 use super::av2_annotations;
+use super::kitti_tracking::{self, KittiCamera};
 use super::layout_file::LayoutFile;
 use super::sequence::BoxSequence;
 use super::supervisely::{self, Project};
@@ -8,7 +9,7 @@ use super::sustechpoints;
 use crate::formats::error::FormatError;
 
 /// A layout of labelling tools or of a data set.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub enum BoxLayout {
     /// Supervisely, point cloud episodes: objects with figures in the frames of one sequence.
     Supervisely,
@@ -18,6 +19,8 @@ pub enum BoxLayout {
     Sustechpoints,
     /// Argoverse 2: annotations.feather. The names of the sweeps are their times in nanoseconds.
     Av2,
+    /// KITTI's tracking benchmark: label_02/0000.txt, of the boxes that a camera sees.
+    KittiTracking(KittiCamera),
 }
 
 impl BoxLayout {
@@ -27,21 +30,23 @@ impl BoxLayout {
         match self {
             Self::Supervisely | Self::Cvat => Some(supervisely::cloud_path(sweep)),
             Self::Sustechpoints => Some(format!("lidar/{sweep}.pcd")),
-            Self::Av2 => None,
+            Self::Av2 | Self::KittiTracking(_) => None,
         }
     }
 
     /// The files of the boxes. The same sequence gives the same bytes.
     ///
     /// # Errors
-    /// `Unsupported` for [`BoxLayout::Av2`] and a sweep without a time in its name, and
-    /// [`FormatError::Write`] if arrow fails.
+    /// `Unsupported` for [`BoxLayout::Av2`] and a sweep without a time in its name, and for
+    /// [`BoxLayout::KittiTracking`] and a class that is not one word. [`FormatError::Write`] if arrow
+    /// fails.
     pub fn files(self, sequence: &BoxSequence<'_>) -> Result<Vec<LayoutFile>, FormatError> {
         Ok(match self {
             Self::Supervisely => supervisely::files(sequence, Project::Episode),
             Self::Cvat => supervisely::files(sequence, Project::Clouds),
             Self::Sustechpoints => sustechpoints::files(sequence),
             Self::Av2 => vec![av2_annotations::file(sequence)?],
+            Self::KittiTracking(camera) => vec![kitti_tracking::file(sequence, &camera)?],
         })
     }
 }

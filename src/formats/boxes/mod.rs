@@ -1,6 +1,7 @@
 //! Boxes of tracks in the layouts of labelling tools and data sets, and as recordings for viewers.
 
 mod av2_annotations;
+mod kitti_tracking;
 mod layout;
 mod layout_file;
 #[cfg(test)]
@@ -10,6 +11,7 @@ mod sequence;
 mod supervisely;
 mod sustechpoints;
 
+pub use crate::formats::boxes::kitti_tracking::KittiCamera;
 pub use crate::formats::boxes::layout::BoxLayout;
 pub use crate::formats::boxes::layout_file::LayoutFile;
 pub use crate::formats::boxes::scene::SceneRecording;

@@ -73,7 +73,7 @@ fn a_card_finds_the_bits_of_the_cpu_that_rounds_as_it_does() {
     };
     let pair = street(1);
     for preset in Preset::with_gpu_kernels() {
-        let mut options = preset.options(Some(700));
+        let mut options = preset.options(Some(400));
         options.field_mut().expect("a field").max_iterations = 10;
         let found = |device: &dyn Backend| {
             let found = solved(device, &pair, &options);
@@ -94,7 +94,7 @@ fn every_loss_of_a_run_in_batches_is_the_cpus() {
     let mut stopping = batched();
     stopping.early_stop = Preset::Paper.field().early_stop;
     let in_batches = others().into_iter().map(|options| FieldOptions {
-        batch: Some(300),
+        batch: Some(150),
         ..options
     });
     for options in [batched(), stopping, renewed()]
@@ -102,7 +102,7 @@ fn every_loss_of_a_run_in_batches_is_the_cpus() {
         .chain(in_batches)
     {
         let run = |device: &dyn Backend| {
-            let [source, target] = clouds(700);
+            let [source, target] = clouds(400);
             let transform = device
                 .prepare_target(&source, &target, &options.loss, &Uncontrolled)
                 .expect("small clouds fit");
@@ -203,17 +203,17 @@ fn renewed() -> FieldOptions {
 
 fn batched() -> FieldOptions {
     let mut options = Preset::Neural.field();
-    options.batch = Some(300);
+    options.batch = Some(150);
     options
 }
 
 #[test]
 fn a_pair_has_the_same_bits_alone_and_among_others() {
-    const STEPS: usize = 8;
+    const STEPS: usize = 6;
     let Some(gpu) = shared() else {
         return;
     };
-    let sizes = [400, 601, 64];
+    let sizes = [200, 301, 64];
     assert!(sizes.len() < LANES);
     for options in [batched(), Preset::Paper.field()]
         .into_iter()
@@ -241,8 +241,8 @@ fn a_pair_put_down_and_taken_up_again_has_the_same_bits() {
     };
     let restored = [batched(), Preset::Paper.field(), renewed()];
     for options in restored.into_iter().chain(others()) {
-        let expected = fitted(gpu, 600, &options, 14);
-        let [source, target] = clouds(600);
+        let expected = fitted(gpu, 300, &options, 14);
+        let [source, target] = clouds(300);
         let transform = gpu
             .prepare_target(&source, &target, &options.loss, &Uncontrolled)
             .expect("small clouds fit");
