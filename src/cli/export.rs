@@ -98,12 +98,17 @@ impl Export {
         let sequence = sequence
             .with_context(unusable)
             .map_err(Failure::bad_input)?;
+        let mut in_image = String::new();
         let clouds = match boxes_only {
             None => self.recording(&sequence)?,
             Some(layout) => {
                 let written = layout.files(&sequence).with_context(unusable);
                 for file in &written.map_err(Failure::bad_input)? {
                     self.write(&file.path, |out| out.write_all(&file.bytes))?;
+                    if let BoxLayout::KittiTracking(_) = layout {
+                        let lines = file.bytes.iter().filter(|&&byte| byte == b'\n').count();
+                        in_image = format!(", {} of them in the image", grouped(lines));
+                    }
                 }
                 self.clouds(layout, &names)?
             }
@@ -114,7 +119,7 @@ impl Export {
             clouds => format!(", {} clouds", grouped(clouds)),
         };
         say(format_args!(
-            "{} tracks, {} boxes in {} sweeps{clouds}, in {}",
+            "{} tracks, {} boxes in {} sweeps{in_image}{clouds}, in {}",
             grouped(tracks.len()),
             grouped(boxes),
             grouped(names.len()),

@@ -113,6 +113,67 @@ fn sweeps_that_are_named_by_their_times_become_annotations_of_argoverse_2() {
 }
 
 #[test]
+fn boxes_that_a_camera_sees_become_labels_of_kittis_tracking_benchmark() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    drive(folder);
+    // The camera looks along the lidar's x axis.
+    fs::write(
+        folder.join("calib.txt"),
+        "P2: 700 0 600 0 0 700 180 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n\
+         Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n",
+    )
+    .expect("written");
+    let sweeps = sweeps();
+    let sweeps: Vec<&str> = sweeps.iter().map(String::as_str).collect();
+    let export = |options: &[&str]| {
+        let all = [&["export", "tracks.json"], &sweeps[..], options].concat();
+        fnsf(folder, &all)
+    };
+    let kitti = ["--layout", "kitti-tracking", "-o", "kitti"];
+    let camera = ["--camera", "calib.txt"];
+    let done = export(&[&kitti[..], &camera, &["--class", "Car"]].concat());
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    let labels = fs::read_to_string(folder.join("kitti/label_02/0000.txt")).expect("labels");
+    let said = format!("{} of them in the image", labels.lines().count());
+    assert!(done.stdout.contains(&said), "{}", done.stdout);
+    let tracks = fs::read(folder.join("tracks.json")).expect("tracks");
+    let tracks = read_tracks(&tracks).expect("tracks");
+    let mut seen = 0;
+    for line in labels.lines() {
+        let words: Vec<&str> = line.split(' ').collect();
+        assert_eq!((words.len(), words[2]), (18, "Car"));
+        let track = tracks.iter().find(|track| track.id.to_string() == words[1]);
+        let mut states = track.expect("a track").states.iter();
+        let state = states.find(|state| state.sweep.to_string() == words[0]);
+        let bounds = &state.expect("a state").bounds;
+        let number = |column: usize| words[column].parse::<f32>().expect("a number");
+        let [x, y, z] = bounds.center;
+        let place = [-y, -(z - bounds.size[2] / 2.0), x];
+        for (axis, place) in place.into_iter().enumerate() {
+            assert!((number(13 + axis) - place).abs() < 1e-4, "{line}");
+        }
+        // The camera is far from all boxes, and its image is narrower than a right angle.
+        assert!(x > 0.0 && y.abs() < x + bounds.size[0], "{line}");
+        seen += 1;
+    }
+    assert!(seen > 0, "the street has movers ahead");
+
+    let refused = export(&kitti);
+    assert_eq!(refused.code, 2);
+    assert!(
+        refused.stderr.contains("needs --camera"),
+        "{}",
+        refused.stderr
+    );
+    let refused = export(&[&["--layout", "cvat", "-o", "cvat"], &camera[..]].concat());
+    assert_eq!(refused.code, 2);
+    let refused = export(&[&kitti[..], &camera, &["--class", "large truck"]].concat());
+    assert_eq!(refused.code, 65);
+    assert!(refused.stderr.contains("one word"), "{}", refused.stderr);
+}
+
+#[test]
 fn a_sequence_becomes_one_recording_with_the_motion_of_the_sensor_where_poses_are_given() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
