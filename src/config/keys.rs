@@ -1,27 +1,14 @@
 //! The configuration of the server: its keys, their defaults and their checks.
-//!
-//! Values are read from defaults, a TOML file, the environment and the command line, in that order.
 
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use figment::Figment;
-use figment::providers::{Env, Serialized};
 use serde::{Deserialize, Serialize};
 
-use super::layer::Layer;
 use super::remote::RemoteConfig;
 use super::secret::Secret;
-use super::secret::wrong_values;
 use crate::api::Role;
 use crate::job::Priority;
-
-/// Prefix of environment variables. `__` descends one level, as in
-/// `FNSF_SERVE_LIMITS__MAX_POINTS=200000`.
-const PREFIX: &str = "FNSF_SERVE_";
-
-/// Name, after the prefix, of the variable that holds `api_key`.
-const API_KEY: &str = "API_KEY";
 
 /// Minimum time to interrupt running jobs and to close connections, seconds.
 const MIN_DRAIN_SECONDS: u64 = 4;
@@ -341,82 +328,7 @@ pub enum ConfigError {
     Together(String),
 }
 
-/// Whether Kubernetes sets the variable `name`, here without its prefix, in every container beside
-/// a Service named `fnsf-serve`. `PORT` is one of these if it holds an address instead of a number.
-/// No key of the configuration has such a name.
-fn is_of_a_kubernetes_service(name: &str, value: &str) -> bool {
-    let name = name.to_ascii_lowercase();
-    let one_of = |prefix: &str| name == prefix || name.starts_with(&format!("{prefix}_"));
-    (name == "port" && value.contains("://"))
-        || name.starts_with("port_")
-        || name == "service_host"
-        || one_of("service_port")
-}
-
 impl Config {
-    /// Reads the defaults, the TOML `file`, the environment and `flags`. Each overrides the
-    /// previous ones. Environment variables have the prefix `FNSF_SERVE_`. In their names `__`
-    /// goes one level down, as in `FNSF_SERVE_LIMITS__MAX_POINTS`. Variables that Kubernetes sets
-    /// for a Service named `fnsf-serve` are ignored. `flags` serializes to a map of the keys that
-    /// are given.
-    ///
-    /// # Errors
-    /// - [`ConfigError::File`] if `file` cannot be read or is not TOML.
-    /// - [`ConfigError::Value`] if a key is unknown, or a value has the wrong type or form. It
-    ///   names the key and its source.
-    /// - [`ConfigError::Together`] as [`Config::check`].
-    pub fn load(file: Option<&Path>, flags: &impl Serialize) -> Result<Self, ConfigError> {
-        let flags = Layer::command_line(flags);
-        Self::load_beneath(
-            file,
-            flags.map_err(|error| ConfigError::Value(wrong_values(*error)))?,
-        )
-    }
-
-    /// As [`Self::load`]. It is not generic, so that it is compiled once.
-    fn load_beneath(file: Option<&Path>, flags: Layer) -> Result<Self, ConfigError> {
-        let wrong = |error: Box<_>| ConfigError::Value(wrong_values(*error));
-        let mut figment = Figment::from(Serialized::defaults(Self::default()));
-        if let Some(path) = file {
-            let text = std::fs::read_to_string(path).map_err(|error| ConfigError::File {
-                path: path.display().to_string(),
-                reason: error.to_string(),
-            })?;
-            // figment's own message would quote the line, which may contain a key.
-            let table: toml::Table = toml::from_str(&text).map_err(|error| {
-                let before = error.span().map_or(0, |span| span.start).min(text.len());
-                let line = 1 + text.as_bytes()[..before]
-                    .iter()
-                    .filter(|&&b| b == b'\n')
-                    .count();
-                ConfigError::File {
-                    path: path.display().to_string(),
-                    reason: format!("line {line}: {}", error.message()),
-                }
-            })?;
-            // What was read is used: a pipe cannot be read twice.
-            figment = figment.merge(Layer::file(path, &table).map_err(wrong)?);
-        }
-        let mut variables = Env::prefixed(PREFIX)
-            .filter(|name| {
-                let value = std::env::var(format!("{PREFIX}{name}"));
-                !is_of_a_kubernetes_service(name.as_str(), value.as_deref().unwrap_or_default())
-            })
-            .split("__");
-        if let Ok(key) = std::env::var(format!("{PREFIX}{API_KEY}")) {
-            // Taken as a string: figment would parse a key of digits as a number.
-            figment = figment.merge(Serialized::default("api_key", key));
-            variables = variables.ignore(&["api_key"]);
-        }
-        let config: Self = figment
-            .merge(variables)
-            .merge(flags)
-            .extract()
-            .map_err(|error| wrong(Box::new(error)))?;
-        config.check()?;
-        Ok(config)
-    }
-
     /// Checks ranges, and values that must agree with each other. The texts in `devices`, the API
     /// keys and the tenants are not checked.
     ///

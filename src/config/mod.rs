@@ -6,6 +6,7 @@
 
 mod keys;
 mod layer;
+mod load;
 mod ranges;
 mod remote;
 mod secret;

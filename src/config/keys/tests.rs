@@ -2,6 +2,7 @@
 
 use super::*;
 use std::io::Write;
+use std::path::Path;
 
 #[derive(Serialize)]
 struct Nothing {}
