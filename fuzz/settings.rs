@@ -1,5 +1,6 @@
 //! What people write: options of jobs, the server's configuration, manifests and URLs.
 
+use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::Path;
 use std::sync::OnceLock;
@@ -75,7 +76,8 @@ pub(crate) fn config(bytes: &[u8]) -> Corpus {
         let mut file = std::fs::File::create(path).expect("a file");
         file.write_all(text).expect("a file");
         drop(file);
-        Config::load(Some(Path::new(path)), &())
+        // No flags: flags are a map.
+        Config::load(Some(Path::new(path)), &BTreeMap::<&str, &str>::new())
     };
     if let Ok(config) = load(bytes) {
         let printed = config.to_toml().expect("every configuration has a text");

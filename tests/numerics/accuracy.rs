@@ -31,7 +31,7 @@ fn the_published_method_reaches_its_published_error_on_argoverse_2() {
 #[test]
 fn neural_is_no_worse_than_the_published_method_and_no_seed_strays() {
     const STRAY: f64 = 1.5;
-    /// Both methods get this number of points. All points take ten times as long.
+    /// Both methods get this number of points. With all points `paper` takes much longer.
     const POINTS: usize = 16_384;
     for name in ["av2_7fab", "kitti_0000", "small_gicp"] {
         let Some(pair) = real_pair(name) else { return };
