@@ -7,6 +7,9 @@ use figment::value::{Dict, Map, Value};
 use figment::{Metadata, Profile, Provider};
 use serde::Serialize;
 
+use super::keys::ConfigError;
+use super::secret::wrong_values;
+
 /// The values of a source, with its name for errors.
 pub(super) struct Layer {
     metadata: Metadata,
@@ -15,25 +18,32 @@ pub(super) struct Layer {
 
 impl Layer {
     /// The values of the file at `path`.
-    pub(super) fn file(path: &Path, table: &toml::Table) -> Result<Self, Box<figment::Error>> {
+    ///
+    /// # Errors
+    /// [`ConfigError::Value`].
+    pub(super) fn file(path: &Path, table: &toml::Table) -> Result<Self, ConfigError> {
         let metadata = Metadata::from("TOML file", path);
         let values = dict_of(table)?;
         Ok(Self { metadata, values })
     }
 
     /// The keys that the command line gives. `flags` serializes to a map.
-    pub(super) fn command_line(flags: &impl Serialize) -> Result<Self, Box<figment::Error>> {
+    ///
+    /// # Errors
+    /// [`ConfigError::Value`], also for what is no map.
+    pub(super) fn command_line(flags: &impl Serialize) -> Result<Self, ConfigError> {
         let metadata = Metadata::named("the command line");
         let values = dict_of(flags)?;
         Ok(Self { metadata, values })
     }
 }
 
-fn dict_of(values: &impl Serialize) -> Result<Dict, Box<figment::Error>> {
-    let value = Value::serialize(values)?;
+fn dict_of(values: &impl Serialize) -> Result<Dict, ConfigError> {
+    let wrong = |error| ConfigError::Value(wrong_values(error));
+    let value = Value::serialize(values).map_err(wrong)?;
     let actual = value.to_actual();
     let dict = value.into_dict();
-    dict.ok_or_else(|| Box::new(Kind::InvalidType(actual, "a map".to_owned()).into()))
+    dict.ok_or_else(|| wrong(Kind::InvalidType(actual, "a map".to_owned()).into()))
 }
 
 impl Provider for Layer {

@@ -61,20 +61,14 @@ impl Config {
     ///   names the key and its source.
     /// - [`ConfigError::Together`] as [`Config::check`].
     pub fn load(file: Option<&Path>, flags: &impl Serialize) -> Result<Self, ConfigError> {
-        let flags = Layer::command_line(flags);
-        Self::load_beneath(
-            file,
-            flags.map_err(|error| ConfigError::Value(wrong_values(*error)))?,
-        )
+        Self::load_beneath(file, Layer::command_line(flags)?)
     }
 
     /// As [`Self::load`]. It is not generic, so that it is compiled once.
     fn load_beneath(file: Option<&Path>, flags: Layer) -> Result<Self, ConfigError> {
-        let wrong = |error: Box<_>| ConfigError::Value(wrong_values(*error));
         let mut figment = Figment::from(Serialized::defaults(Self::default()));
         if let Some(path) = file {
-            let layer = Layer::file(path, &table_of(path)?);
-            figment = figment.merge(layer.map_err(wrong)?);
+            figment = figment.merge(Layer::file(path, &table_of(path)?)?);
         }
         let mut variables = Env::prefixed(PREFIX)
             .filter(|name| {
@@ -91,7 +85,7 @@ impl Config {
             .merge(variables)
             .merge(flags)
             .extract()
-            .map_err(|error| wrong(Box::new(error)))?;
+            .map_err(|error| ConfigError::Value(wrong_values(error)))?;
         config.check()?;
         Ok(config)
     }
