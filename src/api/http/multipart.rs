@@ -41,11 +41,11 @@ const MAX_POSES: usize = 1 << 20;
 pub(super) struct PairBody {
     /// The earlier sweep, in any supported file format. Alternatively an .npz file with both sweeps
     /// as `pc1` and `pc2`; then `target` is omitted.
-    #[schema(value_type = String, format = Binary)]
+    #[schema(value_type = String, format = Binary, required = false)]
     source: Vec<u8>,
     /// The later sweep.
-    #[schema(value_type = Option<String>, format = Binary)]
-    target: Option<Vec<u8>>,
+    #[schema(value_type = String, format = Binary, required = false)]
+    target: Vec<u8>,
     /// URI of the earlier sweep, in place of `source`; `#blake3=` and its hash may follow.
     source_uri: Option<String>,
     /// URI of the later sweep, in place of `target`.
@@ -64,13 +64,14 @@ pub(super) struct SequenceBody {
     /// Argoverse 2's table. Text and JSON have one pose for each sweep, in order; the table has them
     /// by the timestamps in the names of the sweeps. This part must precede the sweeps. By default
     /// the ego motion is estimated.
-    #[schema(value_type = Option<String>, format = Binary)]
-    poses: Option<Vec<u8>>,
+    #[schema(value_type = String, format = Binary, required = false)]
+    poses: Vec<u8>,
     /// The sweeps in the order of time, in any supported file format. Each sweep is a separate part
     /// named `sweep`.
-    #[schema(value_type = Vec<String>, format = Binary)]
+    #[schema(value_type = Vec<String>, format = Binary, required = false)]
     sweep: Vec<Vec<u8>>,
     /// URIs of sweeps, each in place of a part `sweep`.
+    #[schema(required = false)]
     sweep_uri: Vec<String>,
 }
 

@@ -7,7 +7,7 @@ use utoipa::openapi::header::HeaderBuilder;
 use utoipa::openapi::path::Operation;
 use utoipa::openapi::schema::{KnownFormat, Object, SchemaFormat, Type};
 use utoipa::openapi::security::{Http, HttpAuthScheme, SecurityScheme};
-use utoipa::openapi::{Content, RefOr};
+use utoipa::openapi::{Content, RefOr, Schema};
 use utoipa::{Modify, OpenApi};
 use utoipa_swagger_ui::SwaggerUi;
 
@@ -27,7 +27,8 @@ impl Modify for Bearer {
     }
 }
 
-/// Adds to the responses with results the formats and headers that tables define.
+/// Adds to the responses with results the formats and headers that tables define, and a schema to all
+/// bodies.
 struct ResultFormats;
 
 impl Modify for ResultFormats {
@@ -41,6 +42,34 @@ impl Modify for ResultFormats {
         if let Some(path) = paths.get_mut("/v1/jobs/{id}/result") {
             let all = flow().chain(dense).chain([ARCHIVE]);
             describe(path.get.as_mut(), &["200", "206"], all);
+        }
+        // Without one, generators of clients leave the response out.
+        let operations = paths.values_mut();
+        let operations = operations.flat_map(|path| [path.get.as_mut(), path.post.as_mut()]);
+        for operation in operations.flatten() {
+            for response in operation.responses.responses.values_mut() {
+                let RefOr::T(response) = response else {
+                    continue;
+                };
+                for (media_type, content) in &mut response.content {
+                    let RefOr::T(content) = content else { continue };
+                    let schema = || RefOr::from(Schema::from(body_of(media_type)));
+                    content.schema.get_or_insert_with(schema);
+                }
+            }
+        }
+    }
+}
+
+/// The schema of a body that only its media type describes.
+fn body_of(media_type: &str) -> Object {
+    let text = Object::builder().schema_type(Type::String);
+    match media_type {
+        "application/json" => Object::new(),
+        media_type if media_type.starts_with("text/") => text.build(),
+        _ => {
+            let binary = SchemaFormat::KnownFormat(KnownFormat::Binary);
+            text.format(Some(binary)).build()
         }
     }
 }
@@ -59,14 +88,7 @@ fn describe(
             continue;
         };
         for &media_type in &media_types {
-            let schema = match media_type {
-                "application/json" => Object::new(),
-                _ => Object::builder()
-                    .schema_type(Type::String)
-                    .format(Some(SchemaFormat::KnownFormat(KnownFormat::Binary)))
-                    .build(),
-            };
-            let content = Content::new(Some(schema));
+            let content = Content::new(Some(body_of(media_type)));
             response
                 .content
                 .insert(media_type.to_owned(), content.into());
