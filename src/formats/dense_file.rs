@@ -9,18 +9,20 @@ use super::pair::check_count;
 use super::sniff::ending;
 use super::{las_write, npy, pcd, ply};
 use crate::flow::DenseCloud;
+use crate::picture::DenseColors;
 
 /// The formats in which a dense cloud of M points is written. Positions are in metres, ages in
-/// sweeps. All except LAZ can be read back as clouds.
+/// sweeps. All except LAZ can be read back as clouds. Ply, pcd, LAZ and LAS have the colors of
+/// [`DenseColors`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum DenseFormat {
     /// `points` M x 3 float32; M each: `sweep` uint32, `age` float32, `dynamic` bool, `converged`
     /// bool.
     Npz,
     /// Binary little endian: x y z float32, `sweep` uint32, `age` float32, `dynamic` and
-    /// `converged` uint8.
+    /// `converged` uint8; `red`, `green`, `blue` uint8.
     Ply,
-    /// Binary, with the same fields as PLY.
+    /// Binary, with the same fields as PLY; the color is packed into `rgb`.
     Pcd,
     /// LAS 1.4, compressed, with a resolution of 1 mm. The sweep is the point source id, the age
     /// the extra dimension `age` (float32). Bit 0 of the user data marks dynamic points. The
@@ -149,10 +151,15 @@ fn write_ply(cloud: &DenseCloud, out: &mut dyn Write) -> Result<(), FormatError>
         ("float", "age"),
         ("uchar", "dynamic"),
         ("uchar", "converged"),
+        ("uchar", "red"),
+        ("uchar", "green"),
+        ("uchar", "blue"),
     ];
     let comment = "age is in sweeps, positive where a point was measured before";
     ply::write_header(out, cloud.points.len(), &[comment], &properties)?;
-    write_rows(cloud, out)
+    write_rows(cloud, out, |[red, green, blue], row| {
+        row.extend([red, green, blue]);
+    })
 }
 
 fn write_pcd(cloud: &DenseCloud, out: &mut dyn Write) -> Result<(), FormatError> {
@@ -164,13 +171,19 @@ fn write_pcd(cloud: &DenseCloud, out: &mut dyn Write) -> Result<(), FormatError>
         ("age", 4, 'F'),
         ("dynamic", 1, 'U'),
         ("converged", 1, 'U'),
+        ("rgb", 4, 'F'),
     ];
     pcd::write_header(out, cloud.points.len(), &fields)?;
-    write_rows(cloud, out)
+    write_rows(cloud, out, |color, row| row.extend(pcd::rgb(color)))
 }
 
-/// Writes rows of point, sweep, age and flags, little endian.
-fn write_rows(cloud: &DenseCloud, out: &mut dyn Write) -> Result<(), FormatError> {
+/// Writes rows of point, sweep, age, flags and color, little endian.
+fn write_rows(
+    cloud: &DenseCloud,
+    out: &mut dyn Write,
+    push_color: impl Fn([u8; 3], &mut Vec<u8>),
+) -> Result<(), FormatError> {
+    let colors = DenseColors::of(cloud);
     const FLUSH_AT: usize = 64 << 10;
     let mut bytes = Vec::with_capacity(FLUSH_AT + 64);
     for (row, point) in cloud.points.iter().enumerate() {
@@ -179,6 +192,7 @@ fn write_rows(cloud: &DenseCloud, out: &mut dyn Write) -> Result<(), FormatError
         bytes.extend(cloud.age[row].to_le_bytes());
         bytes.push(u8::from(cloud.dynamic[row]));
         bytes.push(u8::from(cloud.converged[row]));
+        push_color(colors.color(row), &mut bytes);
         if bytes.len() >= FLUSH_AT {
             out.write_all(&bytes)?;
             bytes.clear();

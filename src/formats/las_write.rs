@@ -1,14 +1,15 @@
 //! Writes LAS and LAZ, the formats of surveying.
 //!
-//! Version 1.4, point format 0, with the age as an extra dimension.
+//! Version 1.4, point format 2, which has colors, with the age as an extra dimension.
 
 use std::io::{Cursor, Write};
 
 use las::point::Format;
-use las::{Builder, Point, Transform, Vector, Version, Vlr, Writer};
+use las::{Builder, Color, Point, Transform, Vector, Version, Vlr, Writer};
 
 use super::error::{FileKind, FormatError};
 use crate::flow::DenseCloud;
+use crate::picture::DenseColors;
 
 const KIND: FileKind = FileKind::Las;
 
@@ -42,6 +43,7 @@ pub(super) fn write(
         z: step,
     };
     builder.point_format = Format {
+        has_color: true,
         extra_bytes: AGE_BYTES,
         is_compressed: compressed,
         ..Format::default()
@@ -51,6 +53,7 @@ pub(super) fn write(
     builder.vlrs.push(age_record());
     let header = builder.into_header().map_err(encode)?;
     let mut writer = Writer::new(Cursor::new(Vec::new()), header).map_err(encode)?;
+    let colors = DenseColors::of(cloud);
     for (row, point) in cloud.points.iter().enumerate() {
         let [x, y, z] = point.map(f64::from);
         let sweep = cloud.sweep[row];
@@ -70,6 +73,7 @@ pub(super) fn write(
             // The withheld flag is LAS's mark for a point that should not be used.
             is_withheld: !cloud.converged[row],
             point_source_id,
+            color: Some(wide(colors.color(row))),
             extra_bytes: cloud.age[row].to_le_bytes().to_vec(),
             ..Point::default()
         };
@@ -77,6 +81,12 @@ pub(super) fn write(
     }
     out.write_all(writer.into_inner().map_err(encode)?.get_ref())?;
     Ok(())
+}
+
+/// A color in 16 bits a channel.
+fn wide([red, green, blue]: [u8; 3]) -> Color {
+    let [red, green, blue] = [red, green, blue].map(|value| u16::from(value) * 257);
+    Color { red, green, blue }
 }
 
 /// The variable-length record that names and types the extra bytes of every point.

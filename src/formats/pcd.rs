@@ -305,6 +305,11 @@ fn ascii_row(
     (found == numbers).then_some(())
 }
 
+/// The bytes of PCL's field `rgb`: the number 0x00rrggbb, reinterpreted as a float.
+pub(super) fn rgb([red, green, blue]: [u8; 3]) -> [u8; 4] {
+    [blue, green, red, 0]
+}
+
 /// Writes the header of a binary file of `rows` points; fields as (name, size in bytes, type).
 pub(super) fn write_header(
     out: &mut dyn Write,

@@ -15,7 +15,7 @@ mod top_down;
 mod tracks;
 
 pub use crate::picture::canvas::{Image, PictureError, write_png};
-pub use crate::picture::dense::dense_from_above;
+pub use crate::picture::dense::{DenseColors, dense_from_above};
 pub use crate::picture::depth::{DepthPanel, depth_panels};
 pub use crate::picture::motion::{full_scale, shown_motion};
 pub use crate::picture::plot::{Axis, Plot, Series};

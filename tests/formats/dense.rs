@@ -5,6 +5,7 @@ use std::path::Path;
 
 use fnsf::flow::DenseCloud;
 use fnsf::formats::{DENSE_FORMATS, DenseFormat, FormatError, read_cloud, write_dense};
+use fnsf::picture::DenseColors;
 
 use crate::samples::{pattern, points};
 
@@ -38,26 +39,37 @@ fn a_dense_cloud_reads_back_as_a_cloud() {
     }
 }
 
-/// Ply and pcd share their row layout: 12 bytes of coordinates, 4 of the sweep index, 4 of the age,
-/// and one byte per mask.
+/// A row of ply and of pcd has 12 bytes of coordinates, 4 of the sweep index, 4 of the age, one byte per
+/// mask, and the color: in ply red, green, blue, in pcd blue, green, red and 0.
 #[test]
-fn ply_and_pcd_rows_hold_sweep_age_and_masks() {
-    const STRIDE: usize = 22;
+fn ply_and_pcd_rows_hold_sweep_age_masks_and_color() {
     let dense = dense(50);
-    let ply = file(DenseFormat::Ply, &dense);
-    let pcd = file(DenseFormat::Pcd, &dense);
-    let rows = &ply[ply.len() - 50 * STRIDE..];
-    assert!(pcd.ends_with(rows));
-    for (row, bytes) in rows.chunks_exact(STRIDE).enumerate() {
-        assert_eq!(bytes[12..16], dense.sweep[row].to_le_bytes());
-        assert_eq!(bytes[16..20], dense.age[row].to_le_bytes());
-        let masks = [dense.dynamic[row], dense.converged[row]].map(u8::from);
-        assert_eq!(bytes[20..], masks);
+    let colors = DenseColors::of(&dense);
+    for (format, stride) in [(DenseFormat::Ply, 25), (DenseFormat::Pcd, 26)] {
+        let bytes = file(format, &dense);
+        let (header, rows) = bytes.split_at(bytes.len() - 50 * stride);
+        for (row, bytes) in rows.chunks_exact(stride).enumerate() {
+            assert_eq!(bytes[12..16], dense.sweep[row].to_le_bytes());
+            assert_eq!(bytes[16..20], dense.age[row].to_le_bytes());
+            let masks = [dense.dynamic[row], dense.converged[row]].map(u8::from);
+            assert_eq!(bytes[20..22], masks);
+            let [red, green, blue] = colors.color(row);
+            match format {
+                DenseFormat::Ply => assert_eq!(bytes[22..], [red, green, blue]),
+                _ => assert_eq!(bytes[22..], [blue, green, red, 0]),
+            }
+        }
+        let header = String::from_utf8_lossy(header).into_owned();
+        for words in match format {
+            DenseFormat::Ply => ["property uint sweep\nproperty float age\n", "uchar red\n"],
+            _ => [
+                "FIELDS x y z sweep age dynamic converged rgb\n",
+                "SIZE 4 4 4 4 4 1 1 4\n",
+            ],
+        } {
+            assert!(header.contains(words), "{header}");
+        }
     }
-    let header = String::from_utf8_lossy(&ply[..ply.len() - rows.len()]).into_owned();
-    assert!(header.contains("property uint sweep\nproperty float age\nproperty uchar dynamic"));
-    let header = String::from_utf8_lossy(&pcd[..pcd.len() - rows.len()]).into_owned();
-    assert!(header.contains("FIELDS x y z sweep age dynamic converged\nSIZE 4 4 4 4 4 1 1\n"));
 }
 
 #[test]
@@ -82,6 +94,7 @@ fn npz_arrays_have_the_types_that_they_are_documented_with() {
 #[test]
 fn las_and_laz_come_back_through_another_reader() {
     let dense = dense(2000);
+    let colors = DenseColors::of(&dense);
     for format in [DenseFormat::Laz, DenseFormat::Las] {
         let mut reader = las::Reader::new(Cursor::new(file(format, &dense))).unwrap();
         assert_eq!(reader.header().number_of_points(), 2000);
@@ -101,6 +114,9 @@ fn las_and_laz_come_back_through_another_reader() {
             assert_eq!(point.extra_bytes, dense.age[row].to_le_bytes());
             assert_eq!(point.user_data == 1, dense.dynamic[row]);
             assert_eq!(point.is_withheld, !dense.converged[row]);
+            let color = point.color.expect("a color");
+            let found = [color.red, color.green, color.blue].map(|value| value / 257);
+            assert_eq!(found, colors.color(row).map(u16::from));
         }
     }
     let laz = file(DenseFormat::Laz, &dense);

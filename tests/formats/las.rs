@@ -58,8 +58,8 @@ fn headers_that_lie_are_refused_before_memory_is_taken() {
         (25, &[5][..], "version 1.5"),
         (24, &[2], "version 2."),
         (104, &[11], "point format 11"),
-        (104, &[6], "points of format 6 have 30 bytes"),
-        (105, &0_u16.to_le_bytes(), "have 20 bytes, its have 0"),
+        (104, &[7], "points of format 7 have 36 bytes"),
+        (105, &0_u16.to_le_bytes(), "have 26 bytes, its have 0"),
         (
             96,
             &u32::MAX.to_le_bytes(),

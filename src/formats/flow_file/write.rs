@@ -233,10 +233,7 @@ fn write_pcd(table: &FlowTable<'_>, out: &mut dyn Write) -> Result<(), FormatErr
     }
     fields.push(("rgb", 4, 'F'));
     pcd::write_header(out, table.source.len(), &fields)?;
-    // PCL's convention: 0x00rrggbb, reinterpreted as a float.
-    write_rows(table, out, |[red, green, blue], row| {
-        row.extend([blue, green, red, 0]);
-    })
+    write_rows(table, out, |color, row| row.extend(pcd::rgb(color)))
 }
 
 /// Writes rows of point, displacement, flags, cluster, chances and color, little endian.
