@@ -1,12 +1,15 @@
 //! Files of clouds, pairs and flows: whatever is accepted is within the limits, agrees between the
 //! readers, and is read again as it was written.
 
+use std::io::ErrorKind;
 use std::ops::ControlFlow;
+use std::sync::Arc;
 
 use fnsf::formats::{
-    CloudFormat, FileKind, MAX_COORDINATE_M, declared_rows, is_pair, read_av2_labels,
-    read_av2_mask, read_cloud, read_cloud_within, read_flow, read_pair, read_pair_within,
-    read_poses, read_recording, read_timed_cloud, recognize, write_cloud, write_pair_npz,
+    CloudFormat, FileKind, MAX_COORDINATE_M, Scene, SceneSweep, declared_rows, is_pair,
+    read_av2_labels, read_av2_mask, read_cloud, read_cloud_within, read_flow, read_pair,
+    read_pair_within, read_poses, read_recording, read_timed_cloud, recognize, write_cloud,
+    write_pair_npz,
 };
 use libfuzzer_sys::Corpus;
 
@@ -58,6 +61,43 @@ pub(crate) fn mcap(bytes: &[u8]) -> Corpus {
         }
         ControlFlow::Continue(())
     });
+    Corpus::Keep
+}
+
+/// Scenes: every sweep and its truth, of finite numbers and with a row for each point.
+pub(crate) fn scene(bytes: &[u8]) -> Corpus {
+    if recognize(bytes, None).ok() != Some(FileKind::Hdf5) {
+        return Corpus::Reject;
+    }
+    let length = bytes.len() as u64;
+    let bytes: Arc<[u8]> = bytes.into();
+    let read_at = move |offset: u64, into: &mut [u8]| {
+        let rest = usize::try_from(offset)
+            .ok()
+            .and_then(|from| bytes.get(from..));
+        let found = rest.and_then(|rest| rest.get(..into.len()));
+        into.copy_from_slice(found.ok_or(ErrorKind::UnexpectedEof)?);
+        Ok(())
+    };
+    let Ok(scene) = Scene::open(length, read_at) else {
+        return Corpus::Keep;
+    };
+    let mut before: Option<SceneSweep> = None;
+    for index in 0..scene.names().len().min(4) {
+        let Ok(sweep) = scene.sweep(index) else {
+            before = None;
+            continue;
+        };
+        assert!(sweep.points.iter().flatten().all(|value| value.is_finite()));
+        if let Some(source) = &before
+            && let Ok(Some(pair)) = scene.pair(index - 1, [source, &sweep])
+        {
+            let truth = pair.truth.expect("a flow");
+            assert_eq!(truth.flow.len(), pair.source.len());
+            assert!(truth.flow.iter().flatten().all(|value| value.is_finite()));
+        }
+        before = Some(sweep);
+    }
     Corpus::Keep
 }
 

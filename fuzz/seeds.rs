@@ -195,6 +195,16 @@ impl Seeds {
             "plain",
             include_bytes!("../tests/formats/recordings/ros2_none.mcap"),
         );
+        self.put(
+            "scene",
+            "plain",
+            include_bytes!("../tests/formats/scenes/plain.h5"),
+        );
+        self.put(
+            "scene",
+            "gzip",
+            include_bytes!("../tests/formats/scenes/gzip.h5"),
+        );
     }
 
     fn texts(&self) {

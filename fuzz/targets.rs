@@ -60,6 +60,12 @@ pub(crate) const TARGETS: &[Target] = &[
     ),
     target("las", "LAS", FILE, clouds::las),
     target("mcap", "recordings with clouds of ROS", FILE, clouds::mcap),
+    target(
+        "scene",
+        "scenes of OpenSceneFlow, HDF5",
+        FILE,
+        clouds::scene,
+    ),
     target("bin", "raw floats of KITTI and nuScenes", FILE, clouds::bin),
     target(
         "json",

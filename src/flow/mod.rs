@@ -64,7 +64,7 @@ pub mod tracks;
 pub use cost::{Cost, NeighborCost, neighbor_cost, predict_cost};
 pub use data::{
     AlignedSweep, Control, DYNAMIC_M, DenseCloud, EnvelopeError, Interrupt, MIN_POINTS,
-    OrientedBox, Point, Progress, RigidTransform, StopReason, Uncontrolled,
+    OrientedBox, Point, Progress, RigidTransform, StopReason, Uncontrolled, rigid_motion_between,
 };
 pub use error::FlowError;
 pub use estimate::{Deskew, Estimate, FieldSolution, ObjectSolution, Solution, estimate, resume};

@@ -129,8 +129,9 @@ fn read(
         }
         FileKind::Json => Err(FileKind::Json.unsupported("json holds flow here, not clouds")),
         FileKind::Las => read_las(bytes, most, timed),
-        FileKind::Mcap => Err(FileKind::Mcap
-            .unsupported("a recording has many sweeps; fnsf unpack writes them as files")),
+        kind @ (FileKind::Mcap | FileKind::Hdf5) => {
+            Err(kind.unsupported("it has many sweeps; fnsf unpack writes them as files"))
+        }
         kind @ (FileKind::Png | FileKind::Camera | FileKind::Poses) => {
             Err(kind.unsupported("no cloud is read from it"))
         }

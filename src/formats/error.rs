@@ -25,6 +25,8 @@ pub enum FileKind {
     Las,
     /// A recording of a robot, with the clouds of many sweeps.
     Mcap,
+    /// HDF5: a scene of OpenSceneFlow, with many sweeps.
+    Hdf5,
     /// PNG: a depth image, 16-bit gray.
     Png,
     /// A camera: this project's JSON, or KITTI's calibration text.
@@ -48,6 +50,7 @@ impl fmt::Display for FileKind {
             Self::Json => "json",
             Self::Las => "las",
             Self::Mcap => "mcap",
+            Self::Hdf5 => "hdf5",
             Self::Png => "png",
             Self::Camera => "camera",
             Self::Poses => "poses",

@@ -22,6 +22,7 @@ mod motion;
 mod pair;
 mod point_times;
 mod poses;
+mod scene;
 mod semantic_kitti;
 mod tracks;
 
@@ -58,6 +59,7 @@ pub use crate::formats::pair::{
 };
 pub use crate::formats::point_times::PointTimes;
 pub use crate::formats::poses::{PoseFile, read_poses};
+pub use crate::formats::scene::{Scene, SceneSweep};
 pub use crate::formats::semantic_kitti::moving_labels;
 pub use crate::formats::sniff::recognize;
 pub use sweep_order::{compare_names, turning_sweep};

@@ -183,7 +183,7 @@ fn read_truth(npz: &mut Npz<'_>, count: usize) -> Result<Option<PairTruth>, Form
 }
 
 /// Which points have a category.
-fn of_some_category(category: &[u8]) -> Vec<bool> {
+pub(super) fn of_some_category(category: &[u8]) -> Vec<bool> {
     category.iter().map(|&category| category != 0).collect()
 }
 

@@ -52,8 +52,13 @@ impl TimesColumn {
     /// The column of point times among those for which `has` holds.
     pub(super) fn find(has: impl Fn(&str) -> bool) -> Option<Self> {
         let name = NAMES.into_iter().find(|name| has(name))?;
+        Some(Self::named(name))
+    }
+
+    /// A column of another name, which the format determines.
+    pub(super) fn named(name: &'static str) -> Self {
         let values = Vec::new();
-        Some(Self { name, values })
+        Self { name, values }
     }
 
     /// The name of the column.

@@ -40,6 +40,9 @@ pub fn recognize(bytes: &[u8], name: Option<&str>) -> Result<FileKind, FormatErr
     if bytes.starts_with(mcap::MAGIC) {
         return Ok(FileKind::Mcap);
     }
+    if bytes.starts_with(b"\x89HDF\r\n\x1a\n") {
+        return Ok(FileKind::Hdf5);
+    }
     if is_pcd(bytes) {
         return Ok(FileKind::Pcd);
     }
@@ -92,9 +95,8 @@ fn is_json(bytes: &[u8]) -> bool {
 
 /// A message for common kinds of files that are not supported.
 fn known_stranger(bytes: &[u8]) -> Option<&'static str> {
-    let beginnings: [(&[u8], &str); 5] = [
+    let beginnings: [(&[u8], &str); 4] = [
         (b"FEA1", "it is feather version 1; write version 2"),
-        (b"\x89HDF", "it is HDF5; export the arrays as npz"),
         (b"\x1f\x8b", "it is gzip-compressed; unpack it first"),
         (b"ASTM-E57", "it is E57; convert it to ply or pcd"),
         (

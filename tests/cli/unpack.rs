@@ -2,11 +2,12 @@
 
 use std::path::Path;
 
-use fnsf::formats::read_timed_cloud;
+use fnsf::formats::{read_pair, read_timed_cloud};
 
 use super::program::fnsf;
 
 const RECORDING: &[u8] = include_bytes!("../formats/recordings/ros2_zstd.mcap");
+const SCENE: &[u8] = include_bytes!("../formats/scenes/gzip.h5");
 
 fn names(folder: &Path) -> Vec<String> {
     let files = std::fs::read_dir(folder).expect("a folder");
@@ -111,4 +112,48 @@ fn a_recording_without_the_topic_or_without_clouds_is_refused_in_words() {
         assert_eq!(ended.code, 65, "{}", ended.stderr);
         assert!(ended.stderr.contains(said), "{}", ended.stderr);
     }
+}
+
+#[test]
+fn the_sweeps_of_a_scene_become_files_and_pairs_with_their_truth() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    std::fs::write(folder.join("a.scene.h5"), SCENE).expect("a file");
+    let listed = fnsf(folder, &["unpack", "a.scene.h5", "--list"]);
+    assert_eq!(
+        (listed.code, listed.stdout.trim()),
+        (0, "a_scene: 2 sweeps")
+    );
+    let done = fnsf(folder, &["unpack", "a.scene.h5", "-o", "drives"]);
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    for words in [
+        "2 sweeps, 212 points",
+        "1 pairs with true flow and ground masks",
+        "with the times",
+    ] {
+        assert!(done.stdout.contains(words), "{}", done.stdout);
+    }
+    let found = names(&folder.join("drives/a_scene"));
+    let (first, second) = ("1700000000000000000", "1700000000100000000");
+    let expected = [
+        format!("{first}.npz"),
+        format!("{first}.pcd"),
+        format!("{second}.pcd"),
+    ];
+    assert_eq!(found, expected);
+    let pair = std::fs::read(folder.join("drives/a_scene").join(&found[0])).expect("a pair");
+    let pair = read_pair(&pair).expect("a pair");
+    assert_eq!((pair.source.len(), pair.target.len()), (106, 106));
+    assert!(pair.truth.is_some() && pair.ground.is_some() && pair.ego.is_some());
+    // One sweep alone has no pair.
+    let one = ["unpack", "a.scene.h5", "-o", "one", "--skip", "1"];
+    assert_eq!(fnsf(folder, &one).code, 0);
+    assert_eq!(
+        names(&folder.join("one/a_scene")),
+        [format!("{second}.pcd")]
+    );
+    let topic = ["unpack", "a.scene.h5", "-o", "x", "--topic", "/lidar"];
+    let refused = fnsf(folder, &topic);
+    assert_eq!(refused.code, 2, "{}", refused.stderr);
+    assert!(refused.stderr.contains("recordings"), "{}", refused.stderr);
 }

@@ -25,3 +25,5 @@ mod recordings;
 mod round_trips;
 #[cfg(test)]
 mod samples;
+#[cfg(test)]
+mod scenes;

@@ -11,6 +11,7 @@ mod lazy;
 mod lock;
 mod oriented_box;
 mod point;
+mod rigid_motion;
 mod rng;
 mod screw;
 mod stop_reason;
@@ -23,6 +24,7 @@ pub(crate) use control::EarlierDeadline;
 pub use dense_cloud::DenseCloud;
 pub use oriented_box::OrientedBox;
 pub use point::{DYNAMIC_M, MIN_POINTS, Point, RigidTransform};
+pub use rigid_motion::rigid_motion_between;
 pub use stop_reason::StopReason;
 
 pub(crate) use codec::{Body, Envelope, Hash};

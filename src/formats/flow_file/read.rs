@@ -86,6 +86,7 @@ pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatErr
         }
         kind @ (FileKind::Las
         | FileKind::Mcap
+        | FileKind::Hdf5
         | FileKind::Png
         | FileKind::Camera
         | FileKind::Poses) => {

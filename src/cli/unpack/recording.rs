@@ -1,56 +1,23 @@
-//! `fnsf unpack`: the sweeps of a recording as files.
+//! The sweeps of a recording as files.
 
 use std::collections::{BTreeMap, HashSet};
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::BufReader;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
-use clap::Args;
 
-use super::failure::Failure;
-use super::files;
-use super::output::say;
-use super::terminal::bar;
-use crate::formats::{
-    CloudFormat, CloudMessage, FormatError, read_recording, write_cloud, write_timed_pcd,
-};
+use super::arguments::Unpack;
+use super::sweep_file::{folder_of, write_sweep};
+use crate::cli::failure::Failure;
+use crate::cli::output::say;
+use crate::cli::terminal::bar;
+use crate::formats::{CloudMessage, FormatError, read_recording};
 use crate::text::{grouped, printable};
 
 /// Bytes that are read at a time.
 const BUFFER: usize = 1 << 20;
-
-/// Write the sweeps of an MCAP recording as files.
-///
-/// Point clouds of ROS 1 and ROS 2 (sensor_msgs/PointCloud2) become files DIR/TOPIC/STAMP.pcd, one for each
-/// message. STAMP is the time in the message's header in nanoseconds. The times of the points are kept, for
-/// --deskew. Points whose coordinates are not finite are left out and counted.
-#[derive(Debug, Args)]
-#[command(after_help = "Examples:\n  \
-    fnsf unpack drive.mcap --list                         # topics with clouds\n  \
-    fnsf unpack drive.mcap -o sweeps --topic /lidar/top   # one of them\n  \
-    fnsf flow sweeps/lidar_top/*.pcd -o flow.npz          # then, as any sweeps")]
-pub(super) struct Unpack {
-    /// Recording: MCAP, chunks not compressed or by lz4 or zstd
-    #[arg(value_name = "FILE")]
-    recording: PathBuf,
-    /// Folder for the sweeps, with a folder for each topic; created if missing
-    #[arg(short, long, value_name = "DIR", required_unless_present = "list")]
-    output: Option<PathBuf>,
-    /// Take this topic only, as the recording names it
-    #[arg(long, value_name = "TOPIC")]
-    topic: Option<String>,
-    /// Leave out so many sweeps of each topic at the beginning
-    #[arg(long, value_name = "N", default_value_t = 0)]
-    skip: usize,
-    /// Write at most so many sweeps of each topic
-    #[arg(long, value_name = "N")]
-    limit: Option<usize>,
-    /// Print the topics with clouds and the number of their messages; write nothing
-    #[arg(long, conflicts_with = "output")]
-    list: bool,
-}
 
 /// What was found on one topic.
 #[derive(Default)]
@@ -71,16 +38,7 @@ struct Topic {
 }
 
 impl Unpack {
-    pub(super) fn run(&self) -> Result<(), Failure> {
-        let unreadable = || format!("cannot read {}", self.recording.display());
-        let open = || -> std::io::Result<(File, u64)> {
-            let file = File::open(&self.recording)?;
-            let length = file.metadata()?.len();
-            Ok((file, length))
-        };
-        let (file, length) = open()
-            .with_context(unreadable)
-            .map_err(Failure::bad_input)?;
+    pub(super) fn recording(&self, file: File, length: u64) -> Result<(), Failure> {
         let bar = bar(
             length,
             "{wide_bar:.cyan/blue} {bytes} of {total_bytes}  {eta} left",
@@ -130,7 +88,7 @@ impl Unpack {
             return Err(failure);
         }
         let read = read
-            .with_context(|| self.recording.display().to_string())
+            .with_context(|| self.file.display().to_string())
             .map_err(Failure::bad_input);
         if topics.is_empty() {
             return read.and_then(|()| Err(self.nothing_found()));
@@ -155,16 +113,8 @@ impl Unpack {
             topic.repeated += 1;
             return Ok(());
         }
-        let folder = &topic.folder;
-        fs::create_dir_all(folder)
-            .with_context(|| format!("cannot make {}", folder.display()))
-            .map_err(|error| Stop::Failed(Failure::internal(error)))?;
-        let path = folder.join(format!("{stamp:019}.pcd"));
-        let written = files::write(&path, |file| match &sweep.times {
-            None => write_cloud(CloudFormat::Pcd, &sweep.points, file),
-            Some(times) => write_timed_pcd(&sweep.points, &times.offsets_s, file),
-        });
-        written.map_err(Stop::Failed)?;
+        let path = topic.folder.join(format!("{stamp:019}.pcd"));
+        write_sweep(&path, &sweep.points, sweep.times.as_ref()).map_err(Stop::Failed)?;
         topic.last = Some(stamp);
         topic.sweeps += 1;
         topic.points += sweep.points.len();
@@ -195,7 +145,7 @@ impl Unpack {
                 format!("no clouds are on the topic {topic}; --list shows the topics")
             }
         };
-        let message = format!("{}: {message}", self.recording.display());
+        let message = format!("{}: {message}", self.file.display());
         Failure::bad_input(anyhow!(message))
     }
 
@@ -246,39 +196,14 @@ fn complain(message: &CloudMessage<'_>, error: &FormatError) {
     eprintln!("fnsf: the cloud on {topic} of {logged} ns is left out: {error}");
 }
 
-/// The folder of a topic: its name with `_` for everything but letters, digits and `-`.
-fn folder_of(topic: &str) -> String {
-    let plain = |letter: char| match letter {
-        letter if letter.is_ascii_alphanumeric() || letter == '-' => letter,
-        _ => '_',
-    };
-    let name: String = topic
-        .trim_matches('/')
-        .chars()
-        .take(100)
-        .map(plain)
-        .collect();
-    match name.is_empty() {
-        true => "clouds".to_owned(),
-        false => name,
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn the_folder_of_a_topic_is_a_plain_name() {
-        assert_eq!(folder_of("/lidar/top/points"), "lidar_top_points");
-        assert_eq!(folder_of("/../a b"), "___a_b");
-        assert_eq!(folder_of("/"), "clouds");
-    }
-
-    #[test]
     fn topics_whose_plain_names_are_the_same_have_folders_of_their_own() {
         let unpack = Unpack {
-            recording: PathBuf::new(),
+            file: PathBuf::new(),
             output: Some("out".into()),
             topic: None,
             skip: 0,
