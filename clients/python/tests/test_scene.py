@@ -9,7 +9,7 @@ import pytest
 import fnsf
 
 h5py = pytest.importorskip("h5py")
-from fnsf.scene import main, write_flows
+from fnsf.scene import main, write_flows  # noqa: E402
 
 STAMPS = [str(1_700_000_000_000_000_000 + index * 100_000_000) for index in range(3)]
 

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 
 from . import _native
 from ._files import read_flow
@@ -26,9 +27,9 @@ def write_flows(
 ) -> tuple[int, int]:
     """Writes the flows of a folder into a scene.
 
-    The flow of the sweep STAMP, `labels/STAMP.npz` or `.feather`, becomes the array `STAMP/name`: N x 3 float32, metres,
-    ego motion included. Points without a flow get the ego motion, and NaN where that is not known. An array of this
-    name is replaced. All flows are read and checked before the file is changed; h5py changes it in place.
+    The flow of the sweep STAMP, `labels/STAMP.npz` or `.feather`, becomes the array `STAMP/name`: N x 3 float32 in
+    metres, ego motion included. Points without a flow get the ego motion, and NaN where that is not known. An array
+    of this name is replaced. All flows are read and checked before the file is changed; h5py changes it in place.
 
     Args:
         scene: HDF5 file with a group for each sweep.
@@ -65,7 +66,7 @@ def _label(labels: str | os.PathLike[str], stamp: str) -> str | None:
     return next((path for path in paths if os.path.exists(path)), None)
 
 
-def _rows(path: str, lidar: h5py.Dataset) -> np.ndarray:
+def _rows(path: str, lidar: h5py.Dataset) -> npt.NDArray[np.float32]:
     """The rows of a flow, one for each point."""
     flow = read_flow(path)
     if len(flow.flow) != len(lidar):
