@@ -15,7 +15,8 @@ use super::output::say;
 use super::terminal::bar;
 use crate::flow::RigidTransform;
 use crate::formats::{
-    BoxLayout, BoxSequence, CloudFormat, FormatError, SceneRecording, read_cloud, write_cloud,
+    BoxLayout, BoxSequence, CloudFormat, FormatError, NuscenesScene, SceneRecording, read_cloud,
+    write_cloud,
 };
 use crate::text::grouped;
 
@@ -31,6 +32,7 @@ use crate::text::grouped;
     fnsf export tracks.json sweeps/*.pcd --layout supervisely -o project\n  \
     fnsf export tracks.json sweeps/*.pcd --layout cvat -o project && (cd project && zip -r ../project.zip .)\n  \
     fnsf export tracks.json sweeps/*.pcd --layout kitti-tracking --camera calib.txt --class Car -o kitti\n  \
+    fnsf export tracks.json sweeps/*.pcd.bin --layout nuscenes-tracking --tables v1.0-mini --class car -o results\n  \
     fnsf export tracks.json sweeps/*.pcd --layout mcap --poses poses.txt -o scene")]
 pub(super) struct Export {
     /// Tracks of a sequence
@@ -55,13 +57,17 @@ pub(super) struct Export {
     /// the same folder, or the calibration of the tracking or object benchmark
     #[arg(long, value_name = "FILE")]
     camera: Option<PathBuf>,
+    /// Tables of nuScenes, for --layout nuscenes-tracking: a folder such as v1.0-mini. Sweeps are found in them by
+    /// their file names
+    #[arg(long, value_name = "DIR")]
+    tables: Option<PathBuf>,
 }
 
 /// The recording of [`Layout::Mcap`].
 const RECORDING: &str = "scene.mcap";
 
 /// A [`BoxLayout`] by its name, or a recording.
-#[derive(Clone, Copy, Debug, ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Layout {
     /// Supervisely, point cloud episodes
     Supervisely,
@@ -73,8 +79,19 @@ enum Layout {
     Av2,
     /// KITTI's tracking benchmark: label_02/0000.txt with the boxes that the camera sees
     KittiTracking,
+    /// KITTI's raw data: tracklet_labels.xml
+    KittiTracklets,
+    /// nuScenes' tracking task: tracking.json with the boxes of key frames
+    NuscenesTracking,
     /// MCAP with the messages of Foxglove: clouds, boxes, velocities, and with --poses the motion of the sensor
     Mcap,
+}
+
+impl Layout {
+    fn name(self) -> String {
+        let value = self.to_possible_value().expect("no layout is hidden");
+        value.get_name().to_owned()
+    }
 }
 
 /// The name of a sweep: its file name without ending.
@@ -88,7 +105,14 @@ fn name_of(sweep: &Path) -> Result<String, Failure> {
 
 impl Export {
     pub(super) fn run(&self) -> Result<(), Failure> {
-        let boxes_only = self.boxes_only()?;
+        self.check_options()?;
+        let scenes = match self.layout {
+            Layout::NuscenesTracking => {
+                files::read_nuscenes(self.needed(self.tables.as_ref(), "--tables")?)?
+            }
+            _ => Vec::new(),
+        };
+        let boxes_only = self.boxes_only(&scenes)?;
         let tracks = files::read_tracks(&self.tracks)?;
         let names: Result<Vec<String>, Failure> =
             self.sweeps.iter().map(|sweep| name_of(sweep)).collect();
@@ -127,36 +151,49 @@ impl Export {
         ))
     }
 
+    /// Refuses options of other layouts.
+    fn check_options(&self) -> Result<(), Failure> {
+        for (option, is_given, layout) in [
+            ("--poses", self.poses.is_some(), Layout::Mcap),
+            ("--camera", self.camera.is_some(), Layout::KittiTracking),
+            ("--tables", self.tables.is_some(), Layout::NuscenesTracking),
+        ] {
+            if is_given && self.layout != layout {
+                let layout = layout.name();
+                return Err(Failure::usage(anyhow!("{option} is for --layout {layout}")));
+            }
+        }
+        Ok(())
+    }
+
+    /// The file of an option that the layout cannot do without.
+    fn needed<'a>(&self, file: Option<&'a PathBuf>, option: &str) -> Result<&'a PathBuf, Failure> {
+        let layout = self.layout.name();
+        file.ok_or_else(|| Failure::usage(anyhow!("--layout {layout} needs {option}")))
+    }
+
     /// The layout of boxes. None for a recording.
-    fn boxes_only(&self) -> Result<Option<BoxLayout>, Failure> {
-        if self.poses.is_some() && !matches!(self.layout, Layout::Mcap) {
-            return Err(Failure::usage(anyhow!("--poses is for --layout mcap")));
-        }
-        if self.camera.is_some() && !matches!(self.layout, Layout::KittiTracking) {
-            return Err(Failure::usage(anyhow!(
-                "--camera is for --layout kitti-tracking"
-            )));
-        }
-        let layout = match (self.layout, &self.camera) {
-            (Layout::Supervisely, _) => BoxLayout::Supervisely,
-            (Layout::Cvat, _) => BoxLayout::Cvat,
-            (Layout::Sustechpoints, _) => BoxLayout::Sustechpoints,
-            (Layout::Av2, _) => BoxLayout::Av2,
-            (Layout::KittiTracking, Some(camera)) => {
+    fn boxes_only<'a>(
+        &self,
+        scenes: &'a [NuscenesScene],
+    ) -> Result<Option<BoxLayout<'a>>, Failure> {
+        Ok(Some(match self.layout {
+            Layout::Supervisely => BoxLayout::Supervisely,
+            Layout::Cvat => BoxLayout::Cvat,
+            Layout::Sustechpoints => BoxLayout::Sustechpoints,
+            Layout::Av2 => BoxLayout::Av2,
+            Layout::KittiTracking => {
+                let camera = self.needed(self.camera.as_ref(), "--camera")?;
                 BoxLayout::KittiTracking(files::read_kitti_camera(camera)?)
             }
-            (Layout::KittiTracking, None) => {
-                return Err(Failure::usage(anyhow!(
-                    "--layout kitti-tracking needs --camera"
-                )));
-            }
-            (Layout::Mcap, _) => return Ok(None),
-        };
-        Ok(Some(layout))
+            Layout::KittiTracklets => BoxLayout::KittiTracklets,
+            Layout::NuscenesTracking => BoxLayout::NuscenesTracking(scenes),
+            Layout::Mcap => return Ok(None),
+        }))
     }
 
     /// Writes the clouds of the sweeps, where the layout has them. Returns their number.
-    fn clouds(&self, layout: BoxLayout, names: &[String]) -> Result<usize, Failure> {
+    fn clouds(&self, layout: BoxLayout<'_>, names: &[String]) -> Result<usize, Failure> {
         let bar = self.bar();
         let mut clouds = 0;
         for (sweep, name) in self.sweeps.iter().zip(names) {

@@ -17,7 +17,8 @@ use crate::flow::tracks::Track;
 use crate::flow::{Point, RigidTransform};
 use crate::formats;
 use crate::formats::{
-    FileKind, FlowFile, FormatError, GroundRaster, KittiCamera, Pair, PairTruth, TimedCloud,
+    FileKind, FlowFile, FormatError, GroundRaster, KittiCamera, NUSCENES_TABLES, NuscenesScene,
+    Pair, PairTruth, TimedCloud,
 };
 
 /// The largest file that is read, bytes.
@@ -193,6 +194,17 @@ pub(super) fn read_kitti_camera(path: &Path) -> Result<KittiCamera, Failure> {
             camera0_from_lidar: formats::read_camera0_from_lidar(bytes, second)?,
         })
     })
+}
+
+/// Reads the scenes of nuScenes from the folder of its tables, such as `v1.0-mini`.
+pub(super) fn read_nuscenes(tables: &Path) -> Result<Vec<NuscenesScene>, Failure> {
+    let mut files: [Vec<u8>; NUSCENES_TABLES.len()] = Default::default();
+    for (file, name) in files.iter_mut().zip(NUSCENES_TABLES) {
+        *file = read_bytes(&tables.join(name).with_extension("json"))?;
+    }
+    formats::read_nuscenes(&files)
+        .with_context(|| tables.display().to_string())
+        .map_err(Failure::bad_input)
 }
 
 /// Reads a calibration, and the file that goes with KITTI's `calib_cam_to_cam.txt`.

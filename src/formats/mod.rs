@@ -19,6 +19,7 @@ mod depth_png;
 mod flow_file;
 mod ground_raster;
 mod motion;
+mod nuscenes;
 mod pair;
 mod point_times;
 mod poses;
@@ -53,6 +54,7 @@ pub use crate::formats::ground_raster::GroundRaster;
 pub use crate::formats::limits::{MAX_COORDINATE_M, MAX_POINTS};
 pub use crate::formats::mcap::{CloudMessage, RecordedSweep, read_recording};
 pub use crate::formats::motion::{ego_motion, matrix_rows, read_motion, rigid_motion};
+pub use crate::formats::nuscenes::{NUSCENES_TABLES, NuscenesScene, NuscenesSweep, read_nuscenes};
 pub use crate::formats::pair::{
     Av2Labels, Ground, Pair, PairTruth, is_pair, read_av2_labels, read_pair, read_pair_within,
     write_pair_npz,

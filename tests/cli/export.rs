@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use fnsf::formats::{CloudFormat, read_cloud, read_tracks, write_cloud};
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use super::program::fnsf;
 
@@ -19,7 +19,7 @@ fn sweeps() -> [String; 4] {
     [0, 1, 2, 3].map(|sweep| format!("sweep_{sweep:04}.pcd"))
 }
 
-fn json(path: &Path) -> Value {
+fn read_json(path: &Path) -> Value {
     let bytes = fs::read(path).expect("a file");
     serde_json::from_slice(&bytes).expect("JSON")
 }
@@ -63,7 +63,7 @@ fn tracks_become_a_project_of_each_tool_with_the_clouds_beside() {
         let converted = fs::read(clouds.join("sweep_0003.pcd")).expect("a cloud");
         assert!(read_cloud(&converted, None).expect("a cloud").points == cloud);
     }
-    let episode = json(&folder.join("supervisely/ds0/annotation.json"));
+    let episode = read_json(&folder.join("supervisely/ds0/annotation.json"));
     assert_eq!(
         episode["objects"].as_array().map(Vec::len),
         Some(tracks.len())
@@ -72,9 +72,9 @@ fn tracks_become_a_project_of_each_tool_with_the_clouds_beside() {
     let figures = |sweep: &Value| sweep["figures"].as_array().map_or(0, Vec::len);
     let frames = episode["frames"].as_array().expect("frames");
     assert_eq!(frames.iter().map(figures).sum::<usize>(), boxes);
-    let cloud = json(&folder.join("cvat/ds0/ann/sweep_0002.pcd.json"));
+    let cloud = read_json(&folder.join("cvat/ds0/ann/sweep_0002.pcd.json"));
     assert_eq!(figures(&cloud), figures(&frames[2]));
-    let labels = json(&folder.join("sustechpoints/label/sweep_0002.json"));
+    let labels = read_json(&folder.join("sustechpoints/label/sweep_0002.json"));
     assert_eq!(labels.as_array().map(Vec::len), Some(figures(&frames[2])));
 }
 
@@ -171,6 +171,98 @@ fn boxes_that_a_camera_sees_become_labels_of_kittis_tracking_benchmark() {
     let refused = export(&[&kitti[..], &camera, &["--class", "large truck"]].concat());
     assert_eq!(refused.code, 65);
     assert!(refused.stderr.contains("one word"), "{}", refused.stderr);
+}
+
+/// Tables of nuScenes with the four sweeps; every second is a key frame. The lidar is 10 m ahead of
+/// the vehicle, and that 10 m ahead of the map's origin.
+fn nuscenes_tables(folder: &Path) {
+    let place = json!({"translation": [10, 0, 0], "rotation": [1, 0, 0, 0]});
+    let row = |rest: Value| {
+        let mut row = place.clone();
+        let object = row.as_object_mut().expect("an object");
+        object.extend(rest.as_object().expect("an object").clone());
+        row
+    };
+    let data = (0..4).map(|sweep| {
+        json!({"token": format!("d{sweep}"), "sample_token": format!("s{}", sweep / 2),
+            "ego_pose_token": "p", "calibrated_sensor_token": "c", "is_key_frame": sweep % 2 == 0,
+            "filename": format!("sweeps/LIDAR_TOP/sweep_{sweep:04}.pcd"), "timestamp": sweep})
+    });
+    for (name, rows) in [
+        ("sensor", json!([{"token": "l", "channel": "LIDAR_TOP"}])),
+        (
+            "calibrated_sensor",
+            json!([row(json!({"token": "c", "sensor_token": "l"}))]),
+        ),
+        ("sample_data", data.collect()),
+        ("ego_pose", json!([row(json!({"token": "p"}))])),
+        (
+            "sample",
+            json!([{"token": "s0", "scene_token": "z"}, {"token": "s1", "scene_token": "z"}]),
+        ),
+        ("scene", json!([{"token": "z", "name": "scene-0061"}])),
+    ] {
+        let path = folder.join("v1.0-mini").join(format!("{name}.json"));
+        fs::create_dir_all(path.parent().expect("a folder")).expect("made");
+        fs::write(path, rows.to_string()).expect("written");
+    }
+}
+
+#[test]
+fn boxes_of_key_frames_become_results_of_nuscenes_and_all_of_them_tracklets_of_kitti() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    drive(folder);
+    nuscenes_tables(folder);
+    let sweeps = sweeps();
+    let sweeps: Vec<&str> = sweeps.iter().map(String::as_str).collect();
+    let export = |options: &[&str]| {
+        let all = [&["export", "tracks.json"], &sweeps[..], options].concat();
+        fnsf(folder, &all)
+    };
+    let tracks = fs::read(folder.join("tracks.json")).expect("tracks");
+    let tracks = read_tracks(&tracks).expect("tracks");
+    let nuscenes = ["--layout", "nuscenes-tracking", "-o", "results"];
+    let tables = ["--tables", "v1.0-mini"];
+    let done = export(&[&nuscenes[..], &tables, &["--class", "car"]].concat());
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    let results = read_json(&folder.join("results/tracking.json"));
+    for (sample, sweep) in [("s0", 0), ("s1", 2)] {
+        let boxes = results["results"][sample].as_array().expect("boxes");
+        let in_sweep = tracks.iter().filter_map(|track| {
+            let state = track.states.iter().find(|state| state.sweep == sweep)?;
+            Some((track.id.to_string(), state))
+        });
+        let in_sweep: Vec<_> = in_sweep.collect();
+        assert_eq!(boxes.len(), in_sweep.len());
+        for (found, (id, state)) in boxes.iter().zip(&in_sweep) {
+            assert_eq!(found["tracking_id"], **id);
+            let along = found["translation"][0].as_f64().expect("a number");
+            assert!((along - f64::from(state.bounds.center[0]) - 20.0).abs() < 1e-6);
+        }
+    }
+    for (options, code, said) in [
+        (&nuscenes[..], 2, "needs --tables"),
+        (&[&nuscenes[..], &tables].concat(), 65, "tracks the classes"),
+        (
+            &[&nuscenes[..], &["--tables", "nowhere"]].concat(),
+            65,
+            "nowhere/sensor.json",
+        ),
+    ] {
+        let refused = export(options);
+        assert_eq!(refused.code, code, "{}", refused.stderr);
+        assert!(refused.stderr.contains(said), "{}", refused.stderr);
+    }
+
+    let done = export(&["--layout", "kitti-tracklets", "-o", "raw"]);
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    let text = fs::read_to_string(folder.join("raw/tracklet_labels.xml")).expect("tracklets");
+    let states = tracks.iter().map(|track| track.states.len());
+    assert_eq!(text.matches("<tx>").count(), states.sum::<usize>());
+    assert_eq!(text.matches("<objectType>mover<").count(), tracks.len());
+    let refused = export(&[&["--layout", "kitti-tracklets", "-o", "raw"], &tables[..]].concat());
+    assert_eq!(refused.code, 2);
 }
 
 #[test]

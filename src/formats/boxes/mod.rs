@@ -2,8 +2,10 @@
 
 mod av2_annotations;
 mod kitti_tracking;
+mod kitti_tracklets;
 mod layout;
 mod layout_file;
+mod nuscenes_tracking;
 #[cfg(test)]
 mod samples;
 mod scene;
