@@ -80,6 +80,7 @@ def test_datumaro_reads_the_tracklets_of_kitti(exported, drive, tracks, states):
 
 
 def test_the_devkit_of_nuscenes_reads_the_results_of_its_tracking_task(exported, drive, states, tmp_path):
+    from nuscenes.eval.common.config import config_factory
     from nuscenes.eval.common.loaders import load_prediction
     from nuscenes.eval.tracking.data_classes import TrackingBox
 
@@ -107,6 +108,8 @@ def test_the_devkit_of_nuscenes_reads_the_results_of_its_tracking_task(exported,
     for name, rows in tables.items():
         Path(tmp_path, f"{name}.json").write_text(json.dumps(rows))
     folder, _ = exported("nuscenes-tracking", "car", ["--tables", tmp_path])
+    # The classes of the task are known when its configuration has been read.
+    config_factory("tracking_nips_2019")
     boxes, meta = load_prediction(str(folder / "tracking.json"), 500, TrackingBox)
     assert meta["use_lidar"] is True
     seen = 0
