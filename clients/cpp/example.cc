@@ -59,7 +59,7 @@ int main(int argc, char** argv) {
   while (call->Read(&answer)) {
     if (answer.has_header()) {
       const auto& header = answer.header();
-      std::cout << header.valid_points() << " of " << header.points() << " points, " << header.stop_reason() << ", "
+      std::cout << header.valid_points() << " of " << header.points() << " points, " << v1::StopReason_Name(header.stop_reason()) << ", "
                 << header.objects().moving() << " objects move\n";
     } else if (answer.has_chunk()) {
       out << answer.chunk().flow();

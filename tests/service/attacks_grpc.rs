@@ -243,7 +243,7 @@ async fn numbers_that_are_no_values_and_messages_out_of_order_are_refused() {
         vec![begin(|o| o.min_range_m = Some(f32::INFINITY))],
         vec![begin(|o| o.max_points = Some(0))],
         vec![begin(|o| o.deadline_ms = Some(u64::MAX))],
-        vec![begin(|o| o.device = "../cpu\n".to_owned())],
+        vec![begin(|o| o.device = 1_000_000)],
         vec![good.clone(), cloud(0, 12, 0)],
         vec![good.clone(), cloud(99, 12, 0)],
         vec![good.clone(), cloud(-1, 12, 0)],

@@ -26,7 +26,7 @@ async fn a_job_for_a_kind_of_device_that_is_not_here_is_refused_at_both_doors() 
         assert_eq!(problem["retryable"], false);
     }
     let options = proto::Options {
-        device: "gpu".to_owned(),
+        device: proto::Device::Gpu.into(),
         ..proto::Options::default()
     };
     let mut calls = grpc::client(&server).await;
@@ -55,7 +55,7 @@ async fn half_precision_of_what_fits_no_field_is_refused_at_both_doors_and_names
     let detail = problem["detail"].as_str().unwrap_or_default();
     assert!(detail.contains("take preset neural"), "{problem}");
     let options = proto::Options {
-        precision: "f16".to_owned(),
+        precision: proto::Precision::F16.into(),
         ..proto::Options::default()
     };
     let mut calls = grpc::client(&server).await;

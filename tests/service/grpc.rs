@@ -118,7 +118,7 @@ async fn a_pair_gives_the_bits_that_http_gives() {
         }
     }
     let header = header.expect("a header");
-    assert_eq!(header.stop_reason, "max_iterations");
+    assert_eq!(header.stop_reason(), proto::StopReason::MaxIterations);
     assert_eq!(header.points as usize, flow.len());
     assert_eq!(flags.len(), flow.len());
     assert!(progress > 0, "no progress was told");
@@ -272,10 +272,10 @@ async fn a_calls_deadline_goes_into_the_optimization() {
     let mut reason = None;
     while let Some(message) = answer.next().await {
         if let Some(Part::Header(header)) = message.expect("in time").part {
-            reason = Some(header.stop_reason);
+            reason = Some(header.stop_reason());
         }
     }
-    assert_eq!(reason.as_deref(), Some("deadline"));
+    assert_eq!(reason, Some(proto::StopReason::Deadline));
 }
 
 #[tokio::test]

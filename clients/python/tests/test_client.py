@@ -2,6 +2,7 @@
 
 import threading
 import time
+from datetime import datetime, timezone
 
 import numpy as np
 import pytest
@@ -100,6 +101,8 @@ def test_jobs_are_submitted_found_and_removed(server, pair, street):
         assert job.kind == "pair" and job.labels == {"drive": "7"}
         ended = client.wait(job.id, timeout=60)
         assert ended.state == "succeeded" and ended.ended and ended.stop_reason == "completed"
+        assert ended.created_at <= ended.started_at <= ended.finished_at
+        assert abs((datetime.now(timezone.utc) - ended.created_at).total_seconds()) < 60
         assert np.array_equal(client.result(job.id).flow, fnsf.flow(pair.source, pair.target).flow)
         assert [found.id for found in client.jobs(label="drive=7")] == [job.id]
         assert list(client.jobs(state="failed")) == []

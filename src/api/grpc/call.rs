@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use tokio_stream::Stream;
 use tonic::{Request, Status};
 
-use super::convert;
+use super::requests;
 use crate::api::admission::Durability;
 use crate::api::auth::Caller;
 use crate::api::error::ApiError;
@@ -40,7 +40,7 @@ impl Call {
                 at: Instant::now(),
                 trace: None,
             }),
-            time_left: convert::time_left(request.metadata()),
+            time_left: requests::time_left(request.metadata()),
         })
     }
 

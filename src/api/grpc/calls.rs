@@ -11,7 +11,7 @@ use tonic::{Request, Response, Status, Streaming};
 use super::call::{Call, ResultBudget, no_begin};
 use super::chunks::CloudBuilder;
 use super::proto::{self, scene_flow_server::SceneFlow};
-use super::{chunks, convert, sequence};
+use super::{chunks, convert, requests, sequence};
 use crate::api::admission::Durability;
 use crate::api::dense;
 use crate::api::error::ApiError;
@@ -60,7 +60,7 @@ impl Calls {
             _ => return Err(no_begin()),
         };
         let pause = u64::from(begin.progress_ms);
-        let options = convert::options(begin.options)?;
+        let options = requests::options(begin.options)?;
         options.check_for_pairs().map_err(ApiError::from)?;
         self.service
             .check_room(&call.caller, Some(&options), awaited)?;
@@ -256,7 +256,7 @@ impl SceneFlow for Calls {
             Some(Part::Begin(begin)) => begin,
             _ => return Err(no_begin().into()),
         };
-        let options = convert::options(begin.options)?;
+        let options = requests::options(begin.options)?;
         let (dense, force) = (options.densify.is_some(), options.force);
         let mut order = SweepOrder::default();
         let mut job_request = call.job_request(options, Durability::Durable);
@@ -276,7 +276,7 @@ impl SceneFlow for Calls {
                     }
                 },
                 Some(Some(Part::Next(next))) => {
-                    let pose = convert::pose("the next cloud", &next.pose)?;
+                    let pose = requests::pose("the next cloud", &next.pose)?;
                     push(&mut pending, cloud.take(), &index, &mut room).await?;
                     if next.uri.is_empty() {
                         cloud = Some(CloudBuilder::with_pose(pose));
@@ -332,7 +332,7 @@ impl SceneFlow for Calls {
         const PAGE: u32 = 100;
         let call = Call::of(&request)?;
         let asked = request.into_inner();
-        let state = convert::wanted_state(asked.state)?;
+        let state = requests::wanted_state(asked.state)?;
         let label = Some(asked.label).filter(|label| !label.is_empty());
         let limit = match asked.page_size {
             0 => PAGE,

@@ -18,6 +18,7 @@ mod convert;
     reason = "generated code names everything in full"
 )]
 mod proto;
+mod requests;
 mod router;
 mod sequence;
 mod status;

@@ -13,7 +13,7 @@ use tonic::{Status, Streaming};
 
 use super::call::{Call, no_begin};
 use super::chunks::CloudBuilder;
-use super::{chunks, convert, proto};
+use super::{chunks, convert, proto, requests};
 use crate::api::admission::Durability;
 use crate::api::error::ApiError;
 use crate::api::job_request::ChainLink;
@@ -143,7 +143,7 @@ impl Reader {
         let Some(Part::Begin(begin)) = first.and_then(|message| message.part) else {
             return Err(no_begin());
         };
-        let options = convert::options(begin.options)?;
+        let options = requests::options(begin.options)?;
         options.check_for_pairs()?;
         options.check_for_sequence(usize::MAX)?;
         self.options = options;
@@ -181,7 +181,7 @@ impl Reader {
                     return Err(ApiError::BadRequest(text));
                 }
                 Some(Part::Sweep(sweep)) => current.replace(Coming {
-                    cloud: CloudBuilder::with_pose(convert::pose(&sweep.name, &sweep.pose)?),
+                    cloud: CloudBuilder::with_pose(requests::pose(&sweep.name, &sweep.pose)?),
                     name: sweep.name,
                     points: sweep.points,
                 }),

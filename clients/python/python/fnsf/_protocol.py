@@ -50,10 +50,16 @@ def word(prefix: str, value: str) -> str:
     return f"{prefix}_{value.replace('++', '_plus_plus').replace('-', '_')}".upper()
 
 
-def plain(prefix: str, enum: Any, number: int) -> str:
-    """The word of a value of an enumeration."""
+def plain(message: Any, field: str) -> Any:
+    """The word of an enumeration's value, such as `max_iterations`; None where it is not set."""
+    number = getattr(message, field)
+    if number == 0:
+        return None
+    enum = message.DESCRIPTOR.fields_by_name[field].enum_type
+    # The name of each value begins with that of its enumeration.
+    prefix = enum.values_by_number[0].name.removesuffix("UNSPECIFIED")
     name: str = enum.values_by_number[number].name
-    return name.removeprefix(f"{prefix}_").lower()
+    return name.removeprefix(prefix).lower()
 
 
 SUBMITTED = frozenset({"priority", "deadline_ms", "device", "labels", "webhook", "result_uri", "densify"})
@@ -71,7 +77,7 @@ def options_message(options: Mapping[str, Any]) -> Any:
         given["ego"] = word("ego", ego)
     elif ego is not None:
         given["ego_motion"] = _arrays.matrix("ego", ego).ravel().tolist()
-    for name in ("preset", "ground", "priority"):
+    for name in ("preset", "ground", "priority", "device", "precision"):
         if name in given:
             given[name] = word(name, given[name])
     if "densify" in given:
@@ -92,6 +98,9 @@ def chunks(points: Points, mask: Mask | None) -> Iterator[Any]:
         flags = b"" if mask is None else mask[first : first + CHUNK_POINTS].tobytes()
         yield MESSAGES["Chunk"](points=piece.astype("<f4", copy=False).tobytes(), ground=flags)
 
+
+UNITS = {"metres": "m", "square_metres": "m²", None: ""}
+"""The units of losses."""
 
 CLUSTER, STATE = _native.object_types()
 """The types of the arrays of clusters and of tracks."""
@@ -128,6 +137,10 @@ def flow(header: Any, pieces: list[Any], source: Points | None) -> Flow:
     )
     # 64-bit numbers are strings in protobuf's JSON.
     report.update(points=header.points, valid_points=header.valid_points)
+    # The words of the program.
+    report["stop_reason"] = plain(header, "stop_reason")
+    if header.WhichOneof("method") == "field":
+        report["field"]["loss_unit"] = UNITS[plain(header.field, "loss_unit")]
     return Flow(
         flow=_joined(pieces, "flow", "<f4").reshape(-1, 3),
         valid=(flags & 1).astype(bool),

@@ -15,6 +15,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from typing import Any, Literal, TypeVar
 
 import grpc
@@ -54,14 +55,13 @@ class Job:
 
     id: str
     state: Literal["queued", "running", "succeeded", "failed", "cancelled", "expired"]
-    kind: str
-    """`pair` or `sequence`."""
-    created_at: str
-    """RFC 3339, UTC; so are the other times."""
-    started_at: str
-    finished_at: str
+    kind: Literal["pair", "sequence"]
+    created_at: datetime
+    """UTC; so are the other times."""
+    started_at: datetime | None
+    finished_at: datetime | None
     attempt: int
-    stop_reason: str
+    stop_reason: Literal["completed", "converged", "max_iterations", "deadline"] | None
     done: int
     """Iterations or clusters that are done, of `total`."""
     total: int
@@ -129,20 +129,21 @@ def _service_config() -> str:
 
 
 def _job(message: Any) -> Job:
-    states = message.DESCRIPTOR.fields_by_name["state"].enum_type
+    def moment(name: str) -> Any:
+        return getattr(message, name).ToDatetime(timezone.utc) if message.HasField(name) else None
+
     error = f"{message.error.code}: {message.error.message}" if message.HasField("error") else None
     delivery = message.delivery if message.HasField("delivery") else None
-    deliveries = message.DESCRIPTOR.fields_by_name["delivery"].message_type.fields_by_name["state"].enum_type
     wait = message.wait if message.HasField("wait") else None
     return Job(
         id=message.id,
-        state=_protocol.plain("STATE", states, message.state),  # type: ignore[arg-type]
-        kind=message.kind,
-        created_at=message.created_at,
-        started_at=message.started_at,
-        finished_at=message.finished_at,
+        state=_protocol.plain(message, "state"),
+        kind=_protocol.plain(message, "kind"),
+        created_at=moment("created_at"),
+        started_at=moment("started_at"),
+        finished_at=moment("finished_at"),
         attempt=message.attempt,
-        stop_reason=message.stop_reason,
+        stop_reason=_protocol.plain(message, "stop_reason"),
         done=message.progress.done,
         total=message.progress.total,
         error=error,
@@ -152,7 +153,7 @@ def _job(message: Any) -> Job:
         labels=dict(message.labels),
         trace_id=message.trace_id,
         result_uri=delivery.uri if delivery else None,
-        delivery=_protocol.plain("DELIVERY_STATE", deliveries, delivery.state) if delivery else None,  # type: ignore[arg-type]
+        delivery=_protocol.plain(delivery, "state") if delivery else None,
         ahead=wait.ahead if wait and wait.HasField("ahead") else None,
         starts_in=wait.seconds if wait else None,
     )
