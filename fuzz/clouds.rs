@@ -7,9 +7,9 @@ use std::sync::Arc;
 
 use fnsf::formats::{
     CloudFormat, FileKind, MAX_COORDINATE_M, Scene, SceneSweep, declared_rows, is_pair,
-    read_av2_labels, read_av2_mask, read_cloud, read_cloud_within, read_flow, read_pair,
-    read_pair_within, read_poses, read_recording, read_timed_cloud, recognize, write_cloud,
-    write_pair_npz,
+    read_av2_labels, read_av2_mask, read_cloud, read_cloud_within, read_flow, read_intensity,
+    read_pair, read_pair_within, read_poses, read_recording, read_timed_cloud, recognize,
+    write_cloud, write_pair_npz,
 };
 use libfuzzer_sys::Corpus;
 
@@ -125,6 +125,11 @@ fn cloud(bytes: &[u8], name: Option<&str>) {
     if let Ok(timed) = timed {
         // NaN marks a beam without return.
         assert_eq!(timed.cloud.points.len(), cloud.points.len());
+    }
+    if let Ok(Some(intensities)) = read_intensity(bytes, name)
+        && recognize(bytes, name).is_ok_and(|kind| kind != FileKind::Npz)
+    {
+        assert_eq!(intensities.len(), cloud.points.len());
     }
     let rows = declared_rows(bytes, name).expect("a readable file declares its rows");
     assert!(rows >= cloud.points.len(), "{rows} rows are declared");

@@ -75,7 +75,7 @@ impl Seeds {
             (DenseFormat::Npz, "npz"),
         ] {
             let mut bytes = Vec::new();
-            write_dense(format, &dense, &mut bytes).expect("a cloud");
+            write_dense(format, &dense, None, &mut bytes).expect("a cloud");
             self.put(target, &format!("{name}-dense"), &bytes);
         }
         let stored = StoredDense(dense).to_bytes();

@@ -198,7 +198,7 @@ impl Service {
             let cloud = decoded(id, &stored)?;
             drop(stored);
             let mut bytes = Vec::new();
-            write_dense(format, &cloud, &mut bytes).map_err(ApiError::internal)?;
+            write_dense(format, &cloud, None, &mut bytes).map_err(ApiError::internal)?;
             Ok(room.hold(bytes))
         };
         let encoded = self.compute(&job.tenant, encode).await?;

@@ -115,11 +115,18 @@ impl Densify {
         let surroundings = self.estimation.surroundings(&self.sweeps)?;
         let mut device = self.estimation.open()?;
         let solver_options = options.solver_options(usize::MAX);
+        let mut intensities = self.output.is_some().then(Vec::new);
         let read = |(index, path): (usize, &PathBuf)| {
-            Ok(surroundings
-                .sweep(index, path)?
-                .prepared(&solver_options)
-                .cropped(&solver_options))
+            let sweep = surroundings.sweep(index, path)?;
+            let sweep = sweep.prepared(&solver_options);
+            if let Some(mut known) = intensities.take() {
+                let rows = sweep.rows_in_crop(&solver_options);
+                intensities = files::read_intensity(path, sweep.points.len())?.map(|values| {
+                    known.push(rows.into_iter().map(|row| values[row]).collect());
+                    known
+                });
+            }
+            Ok(sweep.cropped(&solver_options))
         };
         let sweeps = self.sweeps.iter().enumerate().map(read);
         let sweeps: Vec<Sweep> = sweeps.collect::<Result<_, Failure>>()?;
@@ -146,7 +153,10 @@ impl Densify {
 
         if let Some(path) = &self.output {
             let format = DenseFormat::from_path(path).map_err(Failure::usage)?;
-            files::write(path, |file| write_dense(format, &cloud, file))?;
+            let intensity = intensities.map(|known| by_row(known, &cloud));
+            files::write(path, |file| {
+                write_dense(format, &cloud, intensity.as_deref(), file)
+            })?;
         }
         let density = match &camera {
             None => {
@@ -262,6 +272,15 @@ impl Densify {
         }
         Ok(())
     }
+}
+
+/// The values of the rows of a dense cloud, from those of each sweep. The cloud has the rows of a sweep in
+/// the order of the sweep.
+fn by_row(by_sweep: Vec<Vec<f32>>, cloud: &DenseCloud) -> Vec<f32> {
+    let mut values: Vec<_> = by_sweep.into_iter().map(Vec::into_iter).collect();
+    let rows = cloud.sweep.iter();
+    rows.filter_map(|&sweep| values.get_mut(sweep as usize)?.next())
+        .collect()
 }
 
 /// The motion fields of all edges of the plan.

@@ -66,6 +66,21 @@ pub(super) fn read_cloud(path: &Path) -> Result<Vec<Point>, Failure> {
     read(path, formats::read_cloud).map(|cloud| cloud.points)
 }
 
+/// Reads the intensities of the `points` points of a sweep. None where its file has none.
+pub(super) fn read_intensity(path: &Path, points: usize) -> Result<Option<Vec<f32>>, Failure> {
+    read(path, |bytes, name| {
+        let found = formats::read_intensity(bytes, name)?;
+        match found.as_ref().map(Vec::len) {
+            Some(found) if found != points => Err(FormatError::RowCount {
+                what: "intensity".to_owned(),
+                found,
+                expected: points,
+            }),
+            _ => Ok(found),
+        }
+    })
+}
+
 /// Reads the poses `world_from_frame` of the sweeps at `paths`.
 pub(super) fn read_poses(file: &Path, paths: &[PathBuf]) -> Result<Vec<RigidTransform>, Failure> {
     let names = paths.iter();

@@ -265,7 +265,7 @@ fn encoded(file: FlowFile, points: &[Point]) -> Result<Bytes, Failure> {
         valid: &file.valid.unwrap_or_else(|| vec![true; points.len()]),
         dynamic: file.dynamic.as_deref(),
         objects: objects.as_ref(),
-        ego: None,
+        ego: file.ego.as_ref(),
     })
 }
 

@@ -67,16 +67,20 @@ impl Sweep {
         }
     }
 
-    /// The sweep restricted to points that are finite and within the crop of `options`, in the same
-    /// order.
+    /// The rows of points that are finite and within the crop of `options`.
+    pub fn rows_in_crop(&self, options: &Options) -> Vec<usize> {
+        let rows = 0..self.points.len();
+        rows.filter(|&row| is_in_crop(self.points[row], options))
+            .collect()
+    }
+
+    /// The sweep restricted to its [`Self::rows_in_crop`], in the same order.
     ///
     /// # Panics
     /// If the ground mask or the times are so short that a point within the crop has none.
     #[must_use]
     pub fn cropped(self, options: &Options) -> Self {
-        let rows: Vec<usize> = (0..self.points.len())
-            .filter(|&row| is_in_crop(self.points[row], options))
-            .collect();
+        let rows = self.rows_in_crop(options);
         let kept = |flags: Vec<bool>| rows.iter().map(|&row| flags[row]).collect();
         let measured = |times: Vec<f32>| rows.iter().map(|&row| times[row]).collect();
         Self {

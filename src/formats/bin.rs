@@ -5,6 +5,7 @@
 //! row width that gives plausible values.
 
 use std::io::Write;
+use std::slice::ChunksExact;
 
 use super::error::{FileKind, FormatError};
 use super::limits::{check_rows, check_value, check_within};
@@ -82,6 +83,19 @@ fn float(bytes: &[u8]) -> f32 {
 
 /// Reads all rows of a file of known format, at most `most`.
 pub(super) fn read(bytes: &[u8], kind: FileKind, most: usize) -> Result<Vec<Point>, FormatError> {
+    let rows = rows(bytes, kind)?;
+    check_within(kind, rows.len(), most)?;
+    let point = |(row, raw): (usize, &[u8])| {
+        let axis = |axis: usize, name: &str| {
+            check_value(kind, row, name, f64::from(float(&raw[axis * 4..])))
+        };
+        Ok([axis(0, "x")?, axis(1, "y")?, axis(2, "z")?])
+    };
+    rows.enumerate().map(point).collect()
+}
+
+/// The rows of a file of known format.
+fn rows(bytes: &[u8], kind: FileKind) -> Result<ChunksExact<'_, u8>, FormatError> {
     let row_len = width(kind) * 4;
     if !bytes.len().is_multiple_of(row_len) {
         return Err(kind.malformed(format!(
@@ -89,15 +103,13 @@ pub(super) fn read(bytes: &[u8], kind: FileKind, most: usize) -> Result<Vec<Poin
             bytes.len()
         )));
     }
-    let rows = check_rows(kind, (bytes.len() / row_len) as u64)?;
-    check_within(kind, rows, most)?;
-    let point = |(row, raw): (usize, &[u8])| {
-        let axis = |axis: usize, name: &str| {
-            check_value(kind, row, name, f64::from(float(&raw[axis * 4..])))
-        };
-        Ok([axis(0, "x")?, axis(1, "y")?, axis(2, "z")?])
-    };
-    bytes.chunks_exact(row_len).enumerate().map(point).collect()
+    check_rows(kind, (bytes.len() / row_len) as u64)?;
+    Ok(bytes.chunks_exact(row_len))
+}
+
+/// Reads the intensities of all rows of a file of known format.
+pub(super) fn read_intensity(bytes: &[u8], kind: FileKind) -> Result<Vec<f32>, FormatError> {
+    Ok(rows(bytes, kind)?.map(|row| float(&row[12..])).collect())
 }
 
 /// Writes KITTI rows with intensity 0.

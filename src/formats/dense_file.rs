@@ -3,7 +3,7 @@
 use std::io::Write;
 
 use super::error::{FileKind, FormatError, shorten};
-use super::limits::{check_points, check_value};
+use super::limits::{check_finite, check_points, check_value};
 use super::npz::{Npz, NpzWriter};
 use super::pair::check_count;
 use super::sniff::ending;
@@ -13,7 +13,8 @@ use crate::picture::DenseColors;
 
 /// The formats in which a dense cloud of M points is written. Positions are in metres, ages in
 /// sweeps. All except LAZ can be read back as clouds. Ply, pcd, LAZ and LAS have the colors of
-/// [`DenseColors`].
+/// [`DenseColors`]. Where the sweeps have intensities, every format has them as well: as `intensity`
+/// float32, in LAZ and LAS in 16 bits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum DenseFormat {
     /// `points` M x 3 float32; M each: `sweep` uint32, `age` float32, `dynamic` bool, `converged`
@@ -99,17 +100,21 @@ impl DenseFormat {
     }
 }
 
-/// Writes a dense cloud of M points.
+/// Writes a dense cloud of M points. `intensity` has M values, none where they are not known.
+///
+/// LAZ and LAS have intensities of 0 to 65,535. Ones of at most 1, and others of at most 255, are
+/// scaled to that range.
 ///
 /// # Errors
 /// - `RowCount` where the cloud's lists differ in length.
-/// - `NotFinite` for a coordinate or age that is NaN or infinite.
+/// - `NotFinite` for a coordinate, age or intensity that is NaN or infinite.
 /// - `OutOfRange` for a coordinate over 1e6 m or an age over 1e6 sweeps in magnitude.
 /// - `Unsupported` for a sweep index over 65,535 in LAS and LAZ.
 /// - `Write` where writing to `out` fails, `Encode` where encoding fails.
 pub fn write_dense(
     format: DenseFormat,
     cloud: &DenseCloud,
+    intensity: Option<&[f32]>,
     out: &mut dyn Write,
 ) -> Result<(), FormatError> {
     let count = cloud.points.len();
@@ -122,28 +127,45 @@ pub fn write_dense(
     for (row, &age) in cloud.age.iter().enumerate() {
         check_value(kind, row, "age", f64::from(age))?;
     }
+    if let Some(values) = intensity {
+        check_count("intensity", values.len(), count)?;
+        for (row, &value) in values.iter().enumerate() {
+            check_finite(kind, row, "intensity", f64::from(value))?;
+        }
+    }
     match format {
-        DenseFormat::Npz => write_npz(cloud, out),
-        DenseFormat::Ply => write_ply(cloud, out),
-        DenseFormat::Pcd => write_pcd(cloud, out),
-        DenseFormat::Laz => las_write::write(cloud, true, out),
-        DenseFormat::Las => las_write::write(cloud, false, out),
+        DenseFormat::Npz => write_npz(cloud, intensity, out),
+        DenseFormat::Ply => write_ply(cloud, intensity, out),
+        DenseFormat::Pcd => write_pcd(cloud, intensity, out),
+        DenseFormat::Laz => las_write::write(cloud, intensity, true, out),
+        DenseFormat::Las => las_write::write(cloud, intensity, false, out),
     }
 }
 
-fn write_npz(cloud: &DenseCloud, out: &mut dyn Write) -> Result<(), FormatError> {
+fn write_npz(
+    cloud: &DenseCloud,
+    intensity: Option<&[f32]>,
+    out: &mut dyn Write,
+) -> Result<(), FormatError> {
     let mut npz = NpzWriter::new();
     npz.points("points", &cloud.points)?;
     npz.array("sweep", |out| npy::write_counts(out, &cloud.sweep))?;
     npz.values("age", &cloud.age)?;
     npz.mask("dynamic", &cloud.dynamic)?;
     npz.mask("converged", &cloud.converged)?;
+    if let Some(intensity) = intensity {
+        npz.values("intensity", intensity)?;
+    }
     out.write_all(&npz.finish()?)?;
     Ok(())
 }
 
-fn write_ply(cloud: &DenseCloud, out: &mut dyn Write) -> Result<(), FormatError> {
-    let properties = [
+fn write_ply(
+    cloud: &DenseCloud,
+    intensity: Option<&[f32]>,
+    out: &mut dyn Write,
+) -> Result<(), FormatError> {
+    let mut properties = vec![
         ("float", "x"),
         ("float", "y"),
         ("float", "z"),
@@ -155,15 +177,20 @@ fn write_ply(cloud: &DenseCloud, out: &mut dyn Write) -> Result<(), FormatError>
         ("uchar", "green"),
         ("uchar", "blue"),
     ];
+    properties.extend(intensity.map(|_| ("float", "intensity")));
     let comment = "age is in sweeps, positive where a point was measured before";
     ply::write_header(out, cloud.points.len(), &[comment], &properties)?;
-    write_rows(cloud, out, |[red, green, blue], row| {
+    write_rows(cloud, intensity, out, |[red, green, blue], row| {
         row.extend([red, green, blue]);
     })
 }
 
-fn write_pcd(cloud: &DenseCloud, out: &mut dyn Write) -> Result<(), FormatError> {
-    let fields = [
+fn write_pcd(
+    cloud: &DenseCloud,
+    intensity: Option<&[f32]>,
+    out: &mut dyn Write,
+) -> Result<(), FormatError> {
+    let mut fields = vec![
         ("x", 4, 'F'),
         ("y", 4, 'F'),
         ("z", 4, 'F'),
@@ -173,13 +200,17 @@ fn write_pcd(cloud: &DenseCloud, out: &mut dyn Write) -> Result<(), FormatError>
         ("converged", 1, 'U'),
         ("rgb", 4, 'F'),
     ];
+    fields.extend(intensity.map(|_| ("intensity", 4, 'F')));
     pcd::write_header(out, cloud.points.len(), &fields)?;
-    write_rows(cloud, out, |color, row| row.extend(pcd::rgb(color)))
+    write_rows(cloud, intensity, out, |color, row| {
+        row.extend(pcd::rgb(color));
+    })
 }
 
-/// Writes rows of point, sweep, age, flags and color, little endian.
+/// Writes rows of point, sweep, age, flags, color and intensity, little endian.
 fn write_rows(
     cloud: &DenseCloud,
+    intensity: Option<&[f32]>,
     out: &mut dyn Write,
     push_color: impl Fn([u8; 3], &mut Vec<u8>),
 ) -> Result<(), FormatError> {
@@ -193,6 +224,9 @@ fn write_rows(
         bytes.push(u8::from(cloud.dynamic[row]));
         bytes.push(u8::from(cloud.converged[row]));
         push_color(colors.color(row), &mut bytes);
+        if let Some(intensity) = intensity {
+            bytes.extend(intensity[row].to_le_bytes());
+        }
         if bytes.len() >= FLUSH_AT {
             out.write_all(&bytes)?;
             bytes.clear();

@@ -134,6 +134,13 @@ impl<'a> Las<'a> {
         self.time_at.is_some()
     }
 
+    /// The intensity of each row.
+    pub(super) fn intensities(&self) -> impl Iterator<Item = u16> {
+        // It follows the three coordinates in every point format.
+        let records = self.records.chunks_exact(self.stride);
+        records.map(|record| u16::from_le_bytes([record[12], record[13]]))
+    }
+
     /// Calls `take` for each row with x, y and z in the file's unit, and the GPS time; NaN without
     /// one.
     ///

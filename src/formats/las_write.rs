@@ -28,6 +28,7 @@ const AGE_BYTES: u16 = 4;
 /// `Unsupported` for sweep indices over 65,535, `Encode` and `Write` where writing fails.
 pub(super) fn write(
     cloud: &DenseCloud,
+    intensity: Option<&[f32]>,
     compressed: bool,
     out: &mut dyn Write,
 ) -> Result<(), FormatError> {
@@ -54,6 +55,7 @@ pub(super) fn write(
     let header = builder.into_header().map_err(encode)?;
     let mut writer = Writer::new(Cursor::new(Vec::new()), header).map_err(encode)?;
     let colors = DenseColors::of(cloud);
+    let scale = intensity.map_or(1.0, scale_to_16_bits);
     for (row, point) in cloud.points.iter().enumerate() {
         let [x, y, z] = point.map(f64::from);
         let sweep = cloud.sweep[row];
@@ -73,6 +75,7 @@ pub(super) fn write(
             // The withheld flag is LAS's mark for a point that should not be used.
             is_withheld: !cloud.converged[row],
             point_source_id,
+            intensity: intensity.map_or(0, |values| (values[row] * scale).round() as u16),
             color: Some(wide(colors.color(row))),
             extra_bytes: cloud.age[row].to_le_bytes().to_vec(),
             ..Point::default()
@@ -81,6 +84,16 @@ pub(super) fn write(
     }
     out.write_all(writer.into_inner().map_err(encode)?.get_ref())?;
     Ok(())
+}
+
+/// The factor that leads intensities to 0 to 65,535, from 0 to 1 or 0 to 255 where they are of these.
+fn scale_to_16_bits(intensity: &[f32]) -> f32 {
+    let largest = intensity.iter().copied().fold(0.0, f32::max);
+    match largest {
+        ..=1.0 => 65_535.0,
+        ..=255.0 => 257.0,
+        _ => 1.0,
+    }
 }
 
 /// A color in 16 bits a channel.

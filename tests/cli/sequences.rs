@@ -1,7 +1,11 @@
 //! Tests of sequences and dense clouds from the command line.
 
+use std::collections::HashMap;
+
 use fnsf::flow::Point;
-use fnsf::formats::{read_cloud, read_depth_png, read_flow, read_pair, read_tracks};
+use fnsf::formats::{
+    read_cloud, read_depth_png, read_flow, read_intensity, read_pair, read_tracks,
+};
 
 use super::program::{fnsf, json, street};
 
@@ -154,6 +158,58 @@ fn a_dense_cloud_has_every_point_and_shows_more_than_one_sweep_through_a_camera(
         points
             .iter()
             .all(|[x, y, _]| x.abs() < 25.0 && y.abs() < 25.0)
+    );
+}
+
+#[test]
+fn a_dense_cloud_keeps_the_intensities_of_its_sweeps() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder, "4");
+    // KITTI's rows. The intensity of a row tells its number.
+    let intensity = |row: usize| (row % 1000) as f32 / 1000.0;
+    let mut clouds = Vec::new();
+    for sweep in SWEEPS {
+        let bytes = std::fs::read(folder.join(sweep)).expect("written");
+        let points = read_cloud(&bytes, Some(sweep)).expect("a cloud").points;
+        let rows = points.iter().enumerate();
+        let rows = rows.flat_map(|(row, &[x, y, z])| [x, y, z, intensity(row)]);
+        let bytes: Vec<u8> = rows.flat_map(f32::to_le_bytes).collect();
+        std::fs::write(folder.join(sweep).with_extension("kitti.bin"), bytes).expect("written");
+        clouds.push(points);
+    }
+    let bins = SWEEPS.map(|sweep| sweep.replace(".pcd", ".kitti.bin"));
+    let bins: Vec<&str> = bins.iter().map(String::as_str).collect();
+    let densify = |sweeps: &[&str]| {
+        let options = "--reference-time 1 --crop-m 20 --device cpu -o near.ply";
+        let options: Vec<&str> = options.split(' ').collect();
+        let done = fnsf(folder, &[&["densify"], sweeps, &options].concat());
+        (done, std::fs::read(folder.join("near.ply")))
+    };
+    let (done, dense) = densify(&bins);
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    let dense = dense.expect("written");
+    let points = read_cloud(&dense, None).expect("a cloud").points;
+    let found = read_intensity(&dense, None).expect("a column");
+    let found = found.expect("intensities");
+    assert_eq!(found.len(), points.len());
+    // Points of sweep 1, whose time is the reference time, stay where they are.
+    let place = |point: [f32; 3]| point.map(f32::to_bits);
+    let of_sweep = clouds[1].iter().enumerate();
+    let of_sweep: HashMap<_, _> = of_sweep.map(|(row, &point)| (place(point), row)).collect();
+    let rows = points.iter().zip(&found);
+    let known = rows.filter_map(|(&point, &found)| Some((*of_sweep.get(&place(point))?, found)));
+    let known: Vec<(usize, f32)> = known.collect();
+    assert!(known.len() * 5 > points.len(), "{}", known.len());
+    for (row, found) in known {
+        assert_eq!(found, intensity(row));
+    }
+    // One sweep without intensities: there is no column.
+    let (done, dense) = densify(&[bins[0], bins[1], SWEEPS[2], bins[3]]);
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    assert_eq!(
+        read_intensity(&dense.expect("written"), None).expect("a cloud"),
+        None
     );
 }
 

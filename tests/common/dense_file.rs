@@ -14,6 +14,6 @@ pub(crate) fn dense_file(format: DenseFormat, points: &[Point]) -> Vec<u8> {
         converged: vec![true; count],
     };
     let mut bytes = Vec::new();
-    write_dense(format, &cloud, &mut bytes).expect("written");
+    write_dense(format, &cloud, None, &mut bytes).expect("written");
     bytes
 }

@@ -4,7 +4,9 @@ use std::io::Cursor;
 use std::path::Path;
 
 use fnsf::flow::DenseCloud;
-use fnsf::formats::{DENSE_FORMATS, DenseFormat, FormatError, read_cloud, write_dense};
+use fnsf::formats::{
+    DENSE_FORMATS, DenseFormat, FormatError, read_cloud, read_intensity, write_dense,
+};
 use fnsf::picture::DenseColors;
 
 use crate::samples::{pattern, points};
@@ -24,7 +26,7 @@ fn dense(count: usize) -> DenseCloud {
 
 fn file(format: DenseFormat, cloud: &DenseCloud) -> Vec<u8> {
     let mut bytes = Vec::new();
-    write_dense(format, cloud, &mut bytes).unwrap();
+    write_dense(format, cloud, None, &mut bytes).unwrap();
     bytes
 }
 
@@ -92,6 +94,47 @@ fn npz_arrays_have_the_types_that_they_are_documented_with() {
 }
 
 #[test]
+fn intensities_are_in_every_format() {
+    let dense = dense(300);
+    let intensity: Vec<f32> = (0..300).map(|row| (row % 256) as f32).collect();
+    let written = |format, intensity: &[f32]| {
+        let mut bytes = Vec::new();
+        let written = write_dense(format, &dense, Some(intensity), &mut bytes);
+        written.map(|()| bytes)
+    };
+    for (format, _, ending) in DENSE_FORMATS {
+        let bytes = written(format, &intensity).unwrap();
+        if format == DenseFormat::Laz {
+            let mut reader = las::Reader::new(Cursor::new(bytes)).unwrap();
+            let read = reader.read_all().unwrap();
+            let read: Vec<f32> = read
+                .points()
+                .map(|p| f32::from(p.unwrap().intensity))
+                .collect();
+            assert_eq!(read[255], 65_535.0);
+            continue;
+        }
+        let scale = if format == DenseFormat::Las {
+            257.0
+        } else {
+            1.0
+        };
+        let expected: Vec<f32> = intensity.iter().map(|value| value * scale).collect();
+        let read = read_intensity(&bytes, None).unwrap().expect("intensities");
+        assert!(read == expected, "{ending}");
+        assert!(read_cloud(&bytes, None).unwrap().points.len() == 300);
+        // Without intensities there is no column of them. LAS always has one.
+        let none = read_intensity(&file(format, &dense), None).unwrap();
+        assert_eq!(none.is_some(), format == DenseFormat::Las, "{ending}");
+    }
+    let error = written(DenseFormat::Ply, &intensity[1..]).unwrap_err();
+    assert!(matches!(error, FormatError::RowCount { .. }), "{error}");
+    let unknown = [&intensity[1..], &[f32::NAN]].concat();
+    let error = written(DenseFormat::Ply, &unknown).unwrap_err();
+    assert!(error.to_string().contains("intensity"), "{error}");
+}
+
+#[test]
 fn las_and_laz_come_back_through_another_reader() {
     let dense = dense(2000);
     let colors = DenseColors::of(&dense);
@@ -129,7 +172,7 @@ fn las_and_laz_come_back_through_another_reader() {
 fn a_sweep_past_sixteen_bits_is_refused_in_las_alone() {
     let mut dense = dense(3);
     dense.sweep[1] = 65_536;
-    let error = write_dense(DenseFormat::Laz, &dense, &mut Vec::new()).unwrap_err();
+    let error = write_dense(DenseFormat::Laz, &dense, None, &mut Vec::new()).unwrap_err();
     let text = error.to_string();
     assert!(text.contains("row 1 has sweep 65536; write npz"), "{text}");
     file(DenseFormat::Npz, &dense);
@@ -140,18 +183,18 @@ fn a_dense_cloud_that_no_reader_would_take_is_refused() {
     for (format, ..) in DENSE_FORMATS {
         let mut short = dense(4);
         short.converged.pop();
-        let error = write_dense(format, &short, &mut Vec::new()).unwrap_err();
+        let error = write_dense(format, &short, None, &mut Vec::new()).unwrap_err();
         assert!(matches!(error, FormatError::RowCount { .. }), "{error}");
         let mut lost = dense(4);
         lost.points[2][1] = f32::NAN;
-        let error = write_dense(format, &lost, &mut Vec::new()).unwrap_err();
+        let error = write_dense(format, &lost, None, &mut Vec::new()).unwrap_err();
         assert!(
             matches!(error, FormatError::NotFinite { row: 2, .. }),
             "{error}"
         );
         let mut ageless = dense(4);
         ageless.age[3] = f32::INFINITY;
-        assert!(write_dense(format, &ageless, &mut Vec::new()).is_err());
+        assert!(write_dense(format, &ageless, None, &mut Vec::new()).is_err());
     }
 }
 

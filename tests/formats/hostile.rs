@@ -2,8 +2,8 @@
 
 use fnsf::flow::Point;
 use fnsf::formats::{
-    DenseFormat, FormatError, is_pair, read_av2_labels, read_cloud, read_flow, read_pair,
-    read_timed_cloud, write_timed_pcd,
+    DenseFormat, FormatError, is_pair, read_av2_labels, read_cloud, read_flow, read_intensity,
+    read_pair, read_timed_cloud, write_timed_pcd,
 };
 use proptest::prelude::*;
 
@@ -236,6 +236,7 @@ fn read_all(bytes: &[u8], name: Option<&str>) -> bool {
     let cloud = read_cloud(bytes, name).is_ok();
     let timed = read_timed_cloud(bytes, name).is_ok();
     assert!(cloud || !timed, "times make no file a cloud");
+    let _intensities_alone_make_no_cloud = read_intensity(bytes, name);
     let flow = read_flow(bytes, name).is_ok();
     let pair = read_pair(bytes).is_ok() && is_pair(bytes);
     let labels = read_av2_labels(bytes).is_ok();

@@ -125,6 +125,11 @@ fn a_flow_comes_back_from_every_format() {
                 whole.then_some(objects.clusters),
                 "{format:?}"
             );
+            assert_eq!(read.ego.is_some(), whole, "{format:?}");
+            if let Some(ego) = read.ego {
+                let apart = ego.to_homogeneous() - pair.ego.unwrap().to_homogeneous();
+                assert!(apart.amax() < 1e-12, "{format:?}");
+            }
             assert_eq!(read.cluster, Some(objects.cluster), "{format:?}");
             assert_eq!(read.confidence, Some(objects.confidence), "{format:?}");
             assert_eq!(read.moving, Some(objects.moving), "{format:?}");

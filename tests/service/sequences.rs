@@ -154,7 +154,7 @@ pub(crate) async fn pair_flows(server: &Server, job: &Value) -> Vec<Vec<Point>> 
 /// A dense cloud encoded as the service sends it.
 fn packed(format: DenseFormat, cloud: &DenseCloud) -> Vec<u8> {
     let mut bytes = Vec::new();
-    write_dense(format, cloud, &mut bytes).expect("written");
+    write_dense(format, cloud, None, &mut bytes).expect("written");
     bytes
 }
 

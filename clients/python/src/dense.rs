@@ -166,7 +166,7 @@ pub(crate) fn write_dense<'py>(
     let watch = Watch::new(None)?;
     let written = supervised(py, &watch, None, || {
         let mut bytes = Vec::new();
-        formats::write_dense(format, &cloud, &mut bytes).map(|()| bytes)
+        formats::write_dense(format, &cloud, None, &mut bytes).map(|()| bytes)
     })?;
     Ok(PyBytes::new(py, &written.map_err(internal)?))
 }

@@ -94,6 +94,7 @@ pub(crate) fn read_flow<'py>(
     let clusters = file.clusters.as_ref();
     let clusters = clusters.map(|clusters| objects::clusters(py, clusters));
     answer.set_item("clusters", clusters.transpose()?)?;
+    answer.set_item("ego", file.ego.as_ref().map(|ego| from_motion(py, ego)))?;
     Ok(answer)
 }
 

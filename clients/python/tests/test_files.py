@@ -32,6 +32,7 @@ def test_a_flow_comes_back_from_every_format(pair, tmp_path, ending):
             assert np.array_equal(getattr(again, name), getattr(flow, name)), name
     if ending in ("npz", "json"):
         assert np.array_equal(again.clusters, flow.clusters)
+        assert np.allclose(again.ego, flow.ego, atol=1e-12)
     with pytest.raises(fnsf.Error, match="no motion field"):
         again(pair.source)
 

@@ -10,7 +10,7 @@ use super::table::{FlowFile, FlowTable};
 use crate::flow::{Cluster, Point};
 use crate::formats::error::{FileKind, FormatError};
 use crate::formats::limits::{check_chance, check_value};
-use crate::formats::motion::matrix_rows;
+use crate::formats::motion::{ego_motion, matrix_rows};
 
 const KIND: FileKind = FileKind::Json;
 
@@ -41,6 +41,7 @@ struct Read {
     confidence: Option<Vec<f64>>,
     moving: Option<Vec<f64>>,
     clusters: Option<Vec<Described>>,
+    ego: Option<[[f64; 4]; 4]>,
 }
 
 pub(super) fn read(bytes: &[u8]) -> Result<FlowFile, FormatError> {
@@ -70,6 +71,7 @@ pub(super) fn read(bytes: &[u8]) -> Result<FlowFile, FormatError> {
         confidence: chances("confidence", read.confidence)?,
         moving: chances("moving", read.moving)?,
         clusters: read.clusters.map(clusters).transpose()?,
+        ego: read.ego.as_ref().map(ego_motion).transpose()?,
     })
 }
 

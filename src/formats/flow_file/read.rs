@@ -7,6 +7,7 @@ use crate::formats::cloud::read_columns;
 use crate::formats::error::{FileKind, FormatError};
 use crate::formats::feather::{FLOW_COLUMNS, Table};
 use crate::formats::limits::{MAX_POINTS, check_chance, check_flag, check_id, check_value};
+use crate::formats::motion::ego_motion;
 use crate::formats::npy;
 use crate::formats::npz::Npz;
 use crate::formats::pair::{check_count, flags};
@@ -27,6 +28,7 @@ use crate::formats::sniff::recognize;
 /// - `Unsupported` for raw floats, which hold a cloud, and for arrays or columns of another type or
 ///   shape.
 /// - `Missing` where the flow, or the center, size or velocity of the clusters, is missing.
+/// - `Motion` for an ego motion that is not rigid.
 /// - `NotFinite` for a displacement or a number of a cluster that is not finite, and for a NaN in a
 ///   mask. `OutOfRange` for a displacement or a number of a cluster over 1e6 in magnitude.
 /// - `TooLarge` for too many rows, for an `.npz` of more than 1,024 members, or where compressed
@@ -52,6 +54,7 @@ pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatErr
                     check_chance(kind, row, "moving", chance)
                 })?,
                 clusters: objects::take(&mut npz)?,
+                ego: npz.matrix("ego")?.as_ref().map(ego_motion).transpose()?,
             }
         }
         kind @ FileKind::Feather => {
@@ -67,7 +70,7 @@ pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatErr
                 moving: table.column("moving", |row, chance| {
                     check_chance(kind, row, "moving", chance)
                 })?,
-                clusters: None,
+                ..FlowFile::default()
             }
         }
         kind @ FileKind::Ply => {
@@ -131,13 +134,12 @@ impl Rows {
         let columns = ["valid", "dynamic", "cluster", "confidence", "moving"];
         wanted.extend(columns.into_iter().filter(|column| has(column)));
         let file = FlowFile {
-            flow: Vec::new(),
             valid: has("valid").then(Vec::new),
             dynamic: has("dynamic").then(Vec::new),
             cluster: has("cluster").then(Vec::new),
             confidence: has("confidence").then(Vec::new),
             moving: has("moving").then(Vec::new),
-            clusters: None,
+            ..FlowFile::default()
         };
         Self { kind, wanted, file }
     }

@@ -57,4 +57,6 @@ pub struct FlowFile {
     pub moving: Option<Vec<f32>>,
     /// The K clusters; only npz and JSON contain them.
     pub clusters: Option<Vec<Cluster>>,
+    /// The ego motion `target_from_source`, metres; only npz and JSON contain it.
+    pub ego: Option<RigidTransform>,
 }
