@@ -65,6 +65,11 @@ fn main() -> anyhow::Result<()> {
     );
 
     let mut file = BufWriter::new(File::create(&path)?);
-    write_dense(DenseFormat::from_path(Path::new(&path))?, &cloud, &mut file)?;
+    write_dense(
+        DenseFormat::from_path(Path::new(&path))?,
+        &cloud,
+        None,
+        &mut file,
+    )?;
     Ok(())
 }
