@@ -1,4 +1,4 @@
-//! LZF decompression, as used by PCD's `binary_compressed`.
+//! LZF decompression, as used by PCD's `binary_compressed` and by h5py.
 //!
 //! A control byte below 32 starts a run of literals; any other starts a reference back into the
 //! output. The caller must check `expected` against its limits.

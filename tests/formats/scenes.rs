@@ -1,7 +1,7 @@
 //! Tests of scenes of OpenSceneFlow.
 //!
-//! The Python package `h5py` wrote the files: `plain.h5` as it does by itself, `gzip.h5` in its newest form, in
-//! compressed pieces. Each has two sweeps of 106 points, 0.1 s apart, with the flow of the first.
+//! The Python package `h5py` wrote the files: `plain.h5` as it does by itself, `gzip.h5` and `lzf.h5` in its newest
+//! form, in compressed pieces. Each has two sweeps of 106 points, 0.1 s apart, with the flow of the first.
 
 use std::f64::consts::PI;
 use std::sync::Arc;
@@ -11,7 +11,8 @@ use fnsf::formats::{FormatError, Pair, Scene, SceneSweep, read_cloud};
 
 const PLAIN: &[u8] = include_bytes!("scenes/plain.h5");
 const GZIP: &[u8] = include_bytes!("scenes/gzip.h5");
-const ALL: [&[u8]; 2] = [PLAIN, GZIP];
+const LZF: &[u8] = include_bytes!("scenes/lzf.h5");
+const ALL: [&[u8]; 3] = [PLAIN, GZIP, LZF];
 const POINTS: usize = 106;
 
 fn open(bytes: &[u8]) -> Result<Scene, FormatError> {

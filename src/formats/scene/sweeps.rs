@@ -3,14 +3,17 @@
 use std::io;
 use std::sync::Arc;
 
+use hdf5_reader::error::Error;
 use hdf5_reader::group::Group;
+use hdf5_reader::messages::filter_pipeline::FilterDescription;
 use hdf5_reader::storage::RangeRequestStorage;
-use hdf5_reader::{Hdf5File, OpenOptions};
+use hdf5_reader::{FilterRegistry, Hdf5File, OpenOptions};
 
 use super::arrays::{Array, KIND, malformed};
 use crate::flow::Point;
 use crate::formats::error::FormatError;
 use crate::formats::limits::{check_flag, check_value, unfold_limit};
+use crate::formats::lzf;
 use crate::formats::pair::check_count;
 use crate::formats::point_times::{PointTimes, TimesColumn};
 
@@ -37,6 +40,24 @@ pub struct SceneSweep {
     pub refused_times: Option<String>,
 }
 
+/// The number of the filter LZF, which h5py brings along.
+const LZF: u16 = 32000;
+
+/// What unfolds the chunks of arrays: the filters of HDF5 itself, and LZF. A chunk has at most `limit`
+/// bytes.
+fn filters(limit: usize) -> FilterRegistry {
+    let mut filters = FilterRegistry::new();
+    let unfold = move |filter: &FilterDescription, packed: &[u8], _: usize| {
+        let size = filter.client_data.get(2).map(|&size| size as usize);
+        let size = size.filter(|&size| size <= limit);
+        let size =
+            size.ok_or_else(|| Error::InvalidData("the size of a chunk by LZF".to_owned()))?;
+        lzf::decompress(packed, size).map_err(Error::DecompressionError)
+    };
+    filters.register(LZF, Box::new(unfold));
+    filters
+}
+
 impl Scene {
     /// Opens a file of `length` bytes. `read_at` fills its buffer with the bytes from an offset.
     ///
@@ -57,7 +78,8 @@ impl Scene {
         let options = OpenOptions::default()
             .with_max_read_bytes(limit)
             .with_max_chunk_bytes(limit)
-            .with_chunk_cache_bytes(0);
+            .with_chunk_cache_bytes(0)
+            .with_filter_registry(filters(limit));
         let file = Hdf5File::from_storage_with_options(Arc::new(storage), options);
         let file = file.map_err(|error| malformed(&error))?;
         let root = file.root_group().map_err(|error| malformed(&error))?;
