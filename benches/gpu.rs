@@ -1,5 +1,5 @@
 //! GPU benchmark: each kernel against the measured arithmetic peak of the GPU, whole pairs of four
-//! sizes, many small pairs at once, and object searches with and without the GPU.
+//! sizes, many small pairs at once, and object searches with and without the GPU, alone and on lanes.
 //!
 //! ```text
 //! cargo bench --bench gpu -- [CARD] [--points N,N,...] [--pairs N,N,...] [--tables NAME,NAME,...]
@@ -27,7 +27,7 @@ const RUNS: u64 = 5;
 /// Rounds of each kernel.
 const ROUNDS: usize = 10;
 /// The tables, in the order in which they are made by default.
-const TABLES: [&str; 4] = ["kernels", "objects", "pairs", "batches"];
+const TABLES: [&str; 5] = ["kernels", "objects", "lanes", "pairs", "batches"];
 /// Points of each pair in the batch measurement.
 const SMALL: usize = 8192;
 
@@ -188,31 +188,94 @@ fn batches(gpu: &Gpu, pair: &SimulatedPair, counts: &[usize]) -> Result<(), Stri
     for &count in counts {
         let count = count.min(gpu.lanes());
         let rounds = 3;
-        let began = Instant::now();
-        std::thread::scope(|scope| {
-            let lanes: Vec<_> = (0..count as u64)
-                .map(|lane| {
-                    let gpu = gpu.clone();
-                    scope.spawn(move || {
-                        (0..rounds).try_for_each(|round| {
-                            let options = Options {
-                                seed: lane * rounds + round,
-                                ..Preset::Paper.options(Some(SMALL))
-                            };
-                            estimated(&gpu, pair, &options).map(|_| ())
-                        })
-                    })
-                })
-                .collect();
-            lanes.into_iter().try_for_each(|lane| {
-                let panicked = |_| "a lane panicked".to_owned();
-                lane.join().map_err(panicked)?
+        let gpus = vec![gpu.clone(); count];
+        let seconds = at_once(&gpus, |gpu, lane| {
+            (0..rounds).try_for_each(|round| {
+                let options = Options {
+                    seed: lane as u64 * rounds + round,
+                    ..Preset::Paper.options(Some(SMALL))
+                };
+                estimated(gpu, pair, &options).map(|_| ())
             })
         })?;
-        let seconds = began.elapsed().as_secs_f64();
         let rate = (count as u64 * rounds) as f64 / seconds;
         let one = *alone.get_or_insert(rate);
         println!("| {count} | {seconds:.2} | {rate:.1} | {:.1} |", rate / one);
+    }
+    println!();
+    Ok(())
+}
+
+/// Seconds in which every lane has done its work, all at the same time.
+fn at_once(
+    lanes: &[Gpu],
+    work: impl Fn(&Gpu, usize) -> Result<(), String> + Sync,
+) -> Result<f64, String> {
+    let began = Instant::now();
+    std::thread::scope(|scope| {
+        let work = &work;
+        let lanes = lanes.iter().enumerate();
+        let lanes: Vec<_> = lanes
+            .map(|(lane, gpu)| scope.spawn(move || work(gpu, lane)))
+            .collect();
+        lanes.into_iter().try_for_each(|lane| {
+            let panicked = |_| "a lane panicked".to_owned();
+            lane.join().map_err(panicked)?
+        })
+    })?;
+    Ok(began.elapsed().as_secs_f64())
+}
+
+/// Whole sweeps by `default` on lanes that share the threads of the host, as in the service. Clusters are
+/// searched by the host and by the GPU, in turn.
+fn lanes(adapter: &Adapter) -> Result<(), String> {
+    const COUNTS: [usize; 3] = [1, 8, 16];
+    const PAIRS: usize = 3;
+    let opened = [0, usize::MAX].map(|cluster_threads| {
+        let options = GpuOptions {
+            lanes: COUNTS[2],
+            cluster_threads,
+            ..GpuOptions::default()
+        };
+        Gpu::open(adapter, &options).map_err(|e| e.to_string())
+    });
+    let [host, card] = opened;
+    let gpus = [host?, card?];
+    println!("| scene | lanes | threads each | host: pairs a second | GPU: pairs a second |");
+    println!("|---|---|---|---|---|");
+    let options = Preset::Default.options(None);
+    for scene in scenes()? {
+        for count in COUNTS {
+            let threads = (gpus[0].host_threads() / count).max(1);
+            let mut rates = [const { Vec::new() }; 2];
+            for round in 0..=PAIRS {
+                for (gpu, rates) in gpus.iter().zip(&mut rates) {
+                    let lanes = (0..count).map(|_| gpu.beside(threads));
+                    let lanes: Result<Vec<Gpu>, _> = lanes.collect();
+                    let lanes = lanes.map_err(|e| e.to_string())?;
+                    let seconds = at_once(&lanes, |gpu, lane| {
+                        (0..PAIRS).try_for_each(|pair| {
+                            // Sweeps that no other pair has: lanes share what is known of one.
+                            let first = (round * count + lane) * PAIRS + pair;
+                            let problem =
+                                Problem::pair(&scene.source[first..], &scene.target[first..]);
+                            let clock = Clock(Instant::now());
+                            let found = estimate(gpu, &problem, &options, &clock);
+                            found.map(|_| ()).map_err(|e| e.to_string())
+                        })
+                    })?;
+                    // The first round is not counted.
+                    if round > 0 {
+                        rates.push((count * PAIRS) as f64 / seconds);
+                    }
+                }
+            }
+            let [host, card] = rates.map(median);
+            println!(
+                "| {} | {count} | {threads} | {host:.1} | {card:.1} |",
+                scene.name
+            );
+        }
     }
     println!();
     Ok(())
@@ -316,6 +379,7 @@ fn main() -> Result<(), String> {
         match table.as_str() {
             "kernels" => kernels(&gpu, &pair, &asked.points)?,
             "objects" => objects(&adapter)?,
+            "lanes" => lanes(&adapter)?,
             "pairs" => pairs(&gpu, &pair, &asked.points)?,
             "batches" => batches(&gpu, &pair, &asked.pairs)?,
             other => return Err(format!("{other}: the tables are {}", TABLES.join(", "))),

@@ -5,16 +5,16 @@
 
 use std::collections::HashSet;
 use std::str::FromStr;
-use std::sync::Arc;
 use std::thread;
 
 use anyhow::{anyhow, bail};
 
-use super::processor::Processor;
+use super::shared_threads::{SharedThreads, Threaded};
 use crate::config::{Config, MAX_LANES, NodeRole};
 use crate::cost::Lanes;
-use crate::engine::{DeviceFactory, DeviceOptions, Opened, ReopenPolicy, try_opening};
-use crate::flow::field::{Backend, BackendError};
+use crate::engine::{DeviceFactory, DeviceOptions, ReopenPolicy, try_opening};
+use crate::flow::cpu::CpuBackend;
+use crate::flow::field::BackendError;
 use crate::flow::gpu;
 use crate::flow::gpu::{Adapter, AdapterKind, Gpu, GpuOptions, Selector};
 use crate::job::DeviceKind;
@@ -153,8 +153,8 @@ impl Pool {
         let lanes = config.cpu_lanes.unwrap_or(threads / THREADS_OF_A_LANE);
         let lanes = lanes.clamp(1, MAX_LANES).min(threads);
         let open: DeviceFactory = Box::new(move || {
-            let opened = Processor::new(threads, lanes)?;
-            Ok(Box::new(opened))
+            let cpu = CpuBackend::new(Some(threads))?;
+            Ok(Box::new(SharedThreads::new(cpu, lanes)))
         });
         self.add(DeviceKind::Cpu, lanes, open);
         Ok(())
@@ -198,8 +198,8 @@ fn adapter_factory(adapter: Adapter, config: &Config) -> (usize, DeviceFactory) 
         ..GpuOptions::default()
     };
     let open: DeviceFactory = Box::new(move || {
-        let opened = Gpu::open(&found_again(&adapter)?, &options)?;
-        Ok(Box::new(opened))
+        let gpu = Gpu::open(&found_again(&adapter)?, &options)?;
+        Ok(Box::new(SharedThreads::new(gpu, options.lanes)))
     });
     (lanes, open)
 }
@@ -269,9 +269,13 @@ fn found_again(adapter: &Adapter) -> Result<Adapter, BackendError> {
     Ok(alike.swap_remove(twin.unwrap_or(0)))
 }
 
-impl Opened for Gpu {
-    fn lane(&self) -> Arc<dyn Backend> {
-        Arc::new(self.clone())
+impl Threaded for Gpu {
+    fn threads(&self) -> usize {
+        self.host_threads()
+    }
+
+    fn beside(&self, threads: usize) -> Result<Self, BackendError> {
+        Gpu::beside(self, threads)
     }
 
     fn is_lost(&self) -> bool {
@@ -288,6 +292,8 @@ mod tests {
     use std::cell::Cell;
 
     use super::*;
+    use crate::engine::Opened;
+    use crate::flow::field::Backend;
     use crate::gpu_in_tests;
 
     fn pool(devices: &[&str]) -> anyhow::Result<Pool> {
@@ -375,6 +381,32 @@ mod tests {
             }
         }
         assert_eq!(kept, ["0000:01:00.0", "0000:02:00.0", "", ""]);
+    }
+
+    #[test]
+    fn the_lanes_of_a_card_share_its_memory_and_its_loss() {
+        let adapters = gpu::adapters();
+        if !gpu_in_tests::is_there(adapters.len()) {
+            return;
+        }
+        let Some(adapter) = adapters.into_iter().next() else {
+            return;
+        };
+        let options = GpuOptions {
+            lanes: 2,
+            host_threads: Some(4),
+            ..GpuOptions::default()
+        };
+        let gpu = Gpu::open(&adapter, &options).expect("it opens");
+        let shared = SharedThreads::new(gpu.clone(), 2);
+        let lanes = [shared.lane(), shared.lane()];
+        let threads = lanes.each_ref().map(|lane| lane.host().name().to_owned());
+        assert_eq!(threads, ["cpu (4 threads)", "cpu (2 threads)"]);
+        let half = gpu.beside(2).expect("threads");
+        assert_eq!(half.memory_bytes(), gpu.memory_bytes());
+        assert_eq!(half.searches_clusters(), gpu.searches_clusters());
+        shared.destroy();
+        assert!(shared.is_lost() && half.is_lost() && gpu.is_lost());
     }
 
     #[test]

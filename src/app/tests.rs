@@ -10,6 +10,7 @@ use serde_json::{Value, json};
 use tokio::time::timeout;
 
 use super::devices::Pool;
+use super::shared_threads::SharedThreads;
 use super::start::App;
 use crate::config::Config;
 use crate::engine::{DeviceOptions, Health, Opened, ReopenPolicy, Switches};
@@ -189,7 +190,7 @@ async fn a_real_card_that_is_destroyed_in_the_middle_of_a_job_is_opened_again_an
             };
             let gpu = Gpu::open(&adapter, &options)?;
             known.lock().expect("no panic holds it").push(gpu.clone());
-            Ok(Box::new(gpu) as Box<dyn Opened>)
+            Ok(Box::new(SharedThreads::new(gpu, 2)) as Box<dyn Opened>)
         }),
         reopening: ReopenPolicy::default(),
     };

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::adapter::{Adapter, AdapterKind};
+use super::adapter::Adapter;
 use super::chamfer::GpuCloud;
 use super::device::Device;
 use super::distance::GpuTransform;
@@ -15,10 +15,6 @@ use crate::flow::field::{Backend, BackendError, Network, PreparedTarget, Trainer
 use crate::flow::host::Host;
 use crate::flow::objects::{FoundRecord, PackedScene};
 use crate::flow::options::{FieldOptions, LossOptions};
-
-/// Host threads up to which the GPU searches clusters. On an H200 it takes half of the time of four
-/// threads, as long as eight, and three times as long as sixteen.
-const FEW_THREADS: usize = 4;
 
 /// An opened GPU, as a [`Backend`]. Clones share it, and each can fit a pair from its own thread.
 #[derive(Clone)]
@@ -37,6 +33,20 @@ impl Gpu {
     /// - [`BackendError::Threads`] if the operating system cannot start the threads.
     pub fn open(adapter: &Adapter, options: &GpuOptions) -> Result<Self, BackendError> {
         Device::open(adapter, options).map(|device| Self(Arc::new(device)))
+    }
+
+    /// The same GPU, with `threads` threads of the host of its own. Both share the GPU's memory and
+    /// submissions, and what is known of the latest sweeps.
+    ///
+    /// # Errors
+    /// [`BackendError::Threads`] if the operating system cannot start the threads.
+    pub fn beside(&self, threads: usize) -> Result<Self, BackendError> {
+        self.0.beside(threads).map(|device| Self(Arc::new(device)))
+    }
+
+    /// Number of threads of the host.
+    pub fn host_threads(&self) -> usize {
+        self.0.host.threads().current_num_threads()
     }
 
     /// The number of lanes: pairs that can be fitted at the same time. It is smaller than
@@ -98,10 +108,7 @@ impl Backend for Gpu {
     }
 
     fn searches_clusters(&self) -> bool {
-        let threads = self.0.host.threads().current_num_threads();
-        self.0.kind != AdapterKind::Software
-            && threads <= FEW_THREADS
-            && self.0.has_cluster_kernel()
+        self.0.searches_clusters
     }
 
     fn search_clusters(

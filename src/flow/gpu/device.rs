@@ -1,9 +1,10 @@
 //! An opened GPU with the state that all pairs on it share.
 
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
 
 use super::adapter::{Adapter, AdapterKind};
 use super::batcher::Batch;
+use super::cluster_search::has_cluster_kernel;
 use super::context::Context;
 use super::half::Units;
 use super::memory::GpuOptions;
@@ -11,16 +12,18 @@ use super::self_test::tested_units;
 use crate::flow::field::BackendError;
 use crate::flow::host::Host;
 
-/// An opened GPU, shared by all fits on it.
+/// An opened GPU with threads of the host. Clones share all of it.
+#[derive(Clone)]
 pub(super) struct Device {
-    pub(super) context: Context,
-    pub(super) batch: Batch,
+    pub(super) context: Arc<Context>,
+    pub(super) batch: Arc<Batch>,
     pub(super) host: Host,
     pub(super) name: String,
-    pub(super) kind: AdapterKind,
+    /// Whether the GPU searches clusters.
+    pub(super) searches_clusters: bool,
     /// The kernel of the object search.
-    pub(super) clusters: OnceLock<wgpu::ComputePipeline>,
-    units: OnceLock<Result<Units, String>>,
+    pub(super) clusters: Arc<OnceLock<wgpu::ComputePipeline>>,
+    units: Arc<OnceLock<Result<Units, String>>>,
 }
 
 impl Device {
@@ -29,17 +32,34 @@ impl Device {
     /// # Errors
     /// [`BackendError`] if the driver refuses, or the GPU has too little memory.
     pub(super) fn open(adapter: &Adapter, options: &GpuOptions) -> Result<Self, BackendError> {
+        let context = Context::open(adapter, options)?;
+        let host = Host::new(options.host_threads, None)?;
+        let threads = host.threads().current_num_threads();
+        let lanes = context.budget.lanes as usize;
         Ok(Self {
-            context: Context::open(adapter, options)?,
-            batch: Batch::default(),
-            host: Host::new(options.host_threads, None)?,
+            searches_clusters: adapter.kind != AdapterKind::Software
+                && threads <= options.cluster_threads.saturating_mul(lanes)
+                && has_cluster_kernel(&context),
+            context: Arc::new(context),
+            batch: Arc::default(),
+            host,
             name: format!(
                 "{} ({}, {})",
                 adapter.name, adapter.interface, adapter.driver
             ),
-            kind: adapter.kind,
-            clusters: OnceLock::new(),
-            units: OnceLock::new(),
+            clusters: Arc::default(),
+            units: Arc::default(),
+        })
+    }
+
+    /// The same GPU, with `threads` threads of the host of its own.
+    ///
+    /// # Errors
+    /// [`BackendError::Threads`] if the operating system cannot start the threads.
+    pub(super) fn beside(&self, threads: usize) -> Result<Self, BackendError> {
+        Ok(Self {
+            host: self.host.beside(threads, None)?,
+            ..self.clone()
         })
     }
 

@@ -107,7 +107,8 @@ fn iterations_in_pieces_have_the_bits_of_whole_ones() {
     };
     let device = Arc::get_mut(pieces.device_mut()).expect("one owner");
     // 900 x 1,500 points, both ways, take 2.7 million.
-    device.context.most_distances = 300_000;
+    let context = Arc::get_mut(&mut device.context).expect("one owner");
+    context.most_distances = 300_000;
     let (source, target) = (scattered(900, SPREAD, 7), scattered(1500, SPREAD, 8));
     for preset in [Preset::NsfpBaseline, Preset::NsfpLinear] {
         let [expected, found] = [whole, &pieces].map(|gpu| {
