@@ -1,7 +1,7 @@
 //! `fnsf densify`: a sequence's sweeps accumulated in one dense cloud and one dense depth image.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::anyhow;
 use clap::Args;
@@ -121,8 +121,8 @@ impl Densify {
             let sweep = sweep.prepared(&solver_options);
             if let Some(mut known) = intensities.take() {
                 let rows = sweep.rows_in_crop(&solver_options);
-                intensities = files::read_intensity(path, sweep.points.len())?.map(|values| {
-                    known.push(rows.into_iter().map(|row| values[row]).collect());
+                intensities = usable_intensities(path, &sweep, &rows).map(|values| {
+                    known.push(values);
                     known
                 });
             }
@@ -271,6 +271,27 @@ impl Densify {
             say(format_args!("  wrote {}", path.display()))?;
         }
         Ok(())
+    }
+}
+
+/// The intensities of the `rows` of a sweep. None without one, and with a warning where they cannot be used.
+fn usable_intensities(path: &Path, sweep: &Sweep, rows: &[usize]) -> Option<Vec<f32>> {
+    let warn = |why: &str| {
+        eprintln!("fnsf: warning: {why}: its intensities are left out");
+        None
+    };
+    let values = match files::read_intensity(path, sweep.points.len()) {
+        Ok(values) => values?,
+        Err(failure) => return warn(&failure.to_string()),
+    };
+    let known = rows.iter().map(|&row| values[row]);
+    match rows.iter().find(|&&row| !values[row].is_finite()) {
+        Some(row) => warn(&format!(
+            "{}: row {row} is {}",
+            path.display(),
+            values[*row]
+        )),
+        None => Some(known.collect()),
     }
 }
 

@@ -17,11 +17,11 @@ fn named(has: impl Fn(&str) -> bool) -> Option<&'static str> {
 }
 
 /// The intensity of each row of a file that [`read_cloud`](super::read_cloud) reads, as the file has
-/// it: a column named `intensity` of npz, PLY, PCD and feather, the fourth float of a raw file, and that
-/// of LAS. None where the file has none. An npz may have another number of intensities than points.
+/// it: a column of one of the names of npz, PLY, PCD and feather, the fourth float of a raw file, and that of
+/// LAS. None where the file has none. An npz may have another number of intensities than points.
 ///
 /// # Errors
-/// As for [`read_cloud`](super::read_cloud).
+/// As for [`read_cloud`](super::read_cloud), but that values need not be finite.
 pub fn read_intensity(bytes: &[u8], name: Option<&str>) -> Result<Option<Vec<f32>>, FormatError> {
     let mut found = Vec::new();
     let mut take = |_: usize, values: &[f64]| {

@@ -86,7 +86,8 @@ pub(super) fn write(
     Ok(())
 }
 
-/// The factor that leads intensities to 0 to 65,535, from 0 to 1 or 0 to 255 where they are of these.
+/// The factor from the range of the intensities to 0 to 65,535. The range is 0 to 1 or 0 to 255 where no
+/// value is larger, else that of LAS itself.
 fn scale_to_16_bits(intensity: &[f32]) -> f32 {
     let largest = intensity.iter().copied().fold(0.0, f32::max);
     match largest {

@@ -3,6 +3,9 @@
 //! A control byte below 32 starts a run of literals; any other starts a reference back into the
 //! output. The caller must check `expected` against its limits.
 
+/// The most bytes that a byte unfolds to: a reference of three bytes gives 264.
+pub(super) const MOST_UNFOLDED: usize = 88;
+
 /// Decompresses `packed` into exactly `expected` bytes; the error gives the position of the fault.
 pub(super) fn decompress(packed: &[u8], expected: usize) -> Result<Vec<u8>, String> {
     let mut out: Vec<u8> = Vec::with_capacity(expected);

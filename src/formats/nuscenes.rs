@@ -162,12 +162,16 @@ fn table<T: DeserializeOwned>(index: usize, bytes: &[u8]) -> Result<Vec<T>, Form
     serde_json::from_slice(bytes).map_err(|error| malformed(index, error))
 }
 
-/// A motion of a translation and of a rotation w, x, y, z. None where the rotation has no length.
+/// A motion of a translation, metres, and of a rotation w, x, y, z. None where the rotation does not have
+/// the length 1 or the translation is longer than the way around the earth.
 fn motion([x, y, z]: [f64; 3], [w, i, j, k]: [f64; 4]) -> Option<RigidTransform> {
-    let rotation = UnitQuaternion::try_new(Quaternion::new(w, i, j, k), 0.5)?;
+    const ROUND_M: f64 = 4e7;
+    const OFF: f64 = 1e-3;
+    let rotation = Quaternion::new(w, i, j, k);
     let translation = Translation3::new(x, y, z);
-    let is_finite = translation.vector.iter().all(|value| value.is_finite());
-    is_finite.then(|| RigidTransform::from_parts(translation, rotation))
+    let is_motion = (rotation.norm() - 1.0).abs() < OFF && translation.vector.amax() <= ROUND_M;
+    let rotation = UnitQuaternion::from_quaternion(rotation);
+    is_motion.then(|| RigidTransform::from_parts(translation, rotation))
 }
 
 #[cfg(test)]
@@ -230,12 +234,16 @@ mod tests {
             let refused = read(tables).expect_err("a damaged table").to_string();
             assert!(refused.contains(said), "{refused}");
         }
-        let mut tables = tables();
-        tables[1][0]["rotation"] = json!([0, 0, 0, 0]);
-        let refused = read(tables).expect_err("no rotation").to_string();
-        assert!(
-            refused.contains("calibrated_sensor.json: c is no motion"),
-            "{refused}"
-        );
+        for (column, none) in [
+            ("rotation", json!([0, 0, 0, 0])),
+            ("rotation", json!([1e200, 0, 0, 0])),
+            ("translation", json!([1e300, 0, 0])),
+        ] {
+            let mut tables = tables();
+            tables[1][0][column] = none;
+            let refused = read(tables).expect_err("no motion").to_string();
+            let said = "calibrated_sensor.json: c is no motion";
+            assert!(refused.contains(said), "{refused}");
+        }
     }
 }

@@ -236,7 +236,13 @@ fn read_all(bytes: &[u8], name: Option<&str>) -> bool {
     let cloud = read_cloud(bytes, name).is_ok();
     let timed = read_timed_cloud(bytes, name).is_ok();
     assert!(cloud || !timed, "times make no file a cloud");
-    let _intensities_alone_make_no_cloud = read_intensity(bytes, name);
+    if let (Ok(cloud), Ok(Some(found))) = (read_cloud(bytes, name), read_intensity(bytes, name)) {
+        let is_npz = bytes.starts_with(b"PK");
+        assert!(
+            is_npz || found.len() == cloud.points.len(),
+            "intensities of all points"
+        );
+    }
     let flow = read_flow(bytes, name).is_ok();
     let pair = read_pair(bytes).is_ok() && is_pair(bytes);
     let labels = read_av2_labels(bytes).is_ok();

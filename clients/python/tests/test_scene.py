@@ -67,6 +67,13 @@ def test_a_scene_is_unpacked_labelled_and_gets_its_flows(scene, program, tmp_pat
             assert error.mean() < 0.05
 
 
+def label(scene, stamp):
+    """A flow of nothing for each point."""
+    with h5py.File(scene) as file:
+        count = len(file[stamp]["lidar"])
+    return {"flow": np.zeros((count, 3), np.float32), "valid": np.ones(count, bool)}
+
+
 def test_points_without_a_flow_move_with_the_ego_motion(scene, tmp_path):
     with h5py.File(scene) as file:
         points = file[STAMPS[0]]["lidar"][:, :3]
@@ -90,8 +97,10 @@ def test_flows_of_other_sweeps_change_nothing(scene, tmp_path):
     np.savez(tmp_path / f"{STAMPS[1]}.npz", flow=np.zeros((5, 3), np.float32), valid=np.ones(5, bool))
     with pytest.raises(fnsf.InputError, match="5 rows"):
         write_flows(scene, tmp_path)
-    with pytest.raises(fnsf.InputError, match="of the data set itself"):
-        write_flows(scene, tmp_path, name="flow")
+    np.savez(tmp_path / f"{STAMPS[1]}.npz", **label(scene, STAMPS[1]))
+    for name, said in [("flow", "of the data set itself"), ("", "no name"), ("a/b", "no name")]:
+        with pytest.raises(fnsf.InputError, match=said):
+            write_flows(scene, tmp_path, name=name)
     os.mkdir(tmp_path / "empty")
     with pytest.raises(fnsf.InputError, match="no flow of a sweep"):
         write_flows(scene, tmp_path / "empty")

@@ -139,7 +139,8 @@ pub(super) fn header(answer: &Answer) -> proto::FlowHeader {
             best_loss: field.best_loss,
             loss_unit: match field.loss_unit.as_str() {
                 "m" => proto::LossUnit::Metres,
-                _ => proto::LossUnit::SquareMetres,
+                "m²" => proto::LossUnit::SquareMetres,
+                _ => proto::LossUnit::Unspecified,
             }
             .into(),
         })),

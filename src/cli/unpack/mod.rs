@@ -18,11 +18,15 @@ impl Unpack {
     pub(super) fn run(&self) -> Result<(), Failure> {
         let open = || -> std::io::Result<(File, u64, bool)> {
             let file = File::open(&self.file)?;
-            let length = file.metadata()?.len();
+            let about = file.metadata()?;
             let mut beginning = [0; 8];
-            let read = file.read_at(&mut beginning, 0)?;
+            // A scene is read here and there. A recording may come through a pipe.
+            let read = match about.is_file() {
+                true => file.read_at(&mut beginning, 0)?,
+                false => 0,
+            };
             let kind = recognize(&beginning[..read], None);
-            Ok((file, length, kind.ok() == Some(FileKind::Hdf5)))
+            Ok((file, about.len(), kind.ok() == Some(FileKind::Hdf5)))
         };
         let (file, length, is_scene) = open()
             .with_context(|| format!("cannot read {}", self.file.display()))

@@ -7,7 +7,8 @@ use std::fmt::{self, Write};
 
 use super::layout_file::LayoutFile;
 use super::sequence::BoxSequence;
-use crate::flow::tracks::Track;
+use crate::flow::tracks::{Track, TrackState};
+use crate::formats::error::{FileKind, FormatError};
 
 /// What the data set says of a pose: hidden objects are interpolated, the others labelled.
 const INTERPOLATED: u8 = 1;
@@ -40,13 +41,26 @@ impl Class {
 }
 
 /// The tracklets of a sequence. Sweeps are numbered from 0.
-pub(super) fn file(sequence: &BoxSequence<'_>) -> LayoutFile {
+///
+/// # Errors
+/// `Unsupported` for a track that has no state in a sweep between its first and its last: a tracklet
+/// has the number of its first sweep alone.
+pub(super) fn file(sequence: &BoxSequence<'_>) -> Result<LayoutFile, FormatError> {
+    for track in sequence.tracks {
+        let has_gap = |pair: &[TrackState]| pair[0].sweep + 1 != pair[1].sweep;
+        if let Some(pair) = track.states.windows(2).find(|pair| has_gap(pair)) {
+            return Err(FileKind::Json.unsupported(format!(
+                "track {} has no box between the sweeps {} and {}, and a tracklet has one in each",
+                track.id, pair[0].sweep, pair[1].sweep
+            )));
+        }
+    }
     let mut text = String::new();
     write(&mut text, sequence).expect("a string takes all text");
-    LayoutFile {
+    Ok(LayoutFile {
         path: "tracklet_labels.xml".to_owned(),
         bytes: text.into_bytes(),
-    }
+    })
 }
 
 fn write(out: &mut String, sequence: &BoxSequence<'_>) -> fmt::Result {
@@ -127,7 +141,7 @@ mod tests {
     fn a_track_is_an_item_with_a_pose_in_each_sweep_on_its_lower_face() {
         let (tracks, names) = (tracks(), names());
         let sequence = BoxSequence::new(&tracks, &names, "Van & <trailer>").expect("a sequence");
-        let file = file(&sequence);
+        let file = file(&sequence).expect("a file");
         assert_eq!(file.path, "tracklet_labels.xml");
         let text = String::from_utf8(file.bytes).expect("text");
         assert!(text.contains("<count>2</count>\n<item_version>1</item_version>"));
@@ -144,5 +158,17 @@ mod tests {
         for class in 0..4 {
             assert_eq!(text.matches(&format!("class_id=\"{class}\"")).count(), 1);
         }
+    }
+
+    #[test]
+    fn a_track_with_a_gap_is_refused() {
+        let (mut tracks, names) = (tracks(), names());
+        tracks[0].states.remove(1);
+        let sequence = BoxSequence::new(&tracks, &names, "Van").expect("a sequence");
+        let refused = file(&sequence).expect_err("a gap").to_string();
+        assert!(
+            refused.contains("track 1 has no box between the sweeps 0 and 2"),
+            "{refused}"
+        );
     }
 }

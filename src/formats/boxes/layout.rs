@@ -49,7 +49,8 @@ impl BoxLayout<'_> {
     ///
     /// # Errors
     /// `Unsupported` for [`BoxLayout::Av2`] and a sweep without a time in its name, for
-    /// [`BoxLayout::KittiTracking`] and a class that is not one word, and for
+    /// [`BoxLayout::KittiTracking`] and a class that is not one word, for [`BoxLayout::KittiTracklets`] and a
+    /// track with a gap, and for
     /// [`BoxLayout::NuscenesTracking`] and a class or a sweep that the data set does not have.
     /// [`FormatError::Write`] if arrow fails.
     pub fn files(self, sequence: &BoxSequence<'_>) -> Result<Vec<LayoutFile>, FormatError> {
@@ -59,7 +60,7 @@ impl BoxLayout<'_> {
             Self::Sustechpoints => sustechpoints::files(sequence),
             Self::Av2 => vec![av2_annotations::file(sequence)?],
             Self::KittiTracking(camera) => vec![kitti_tracking::file(sequence, &camera)?],
-            Self::KittiTracklets => vec![kitti_tracklets::file(sequence)],
+            Self::KittiTracklets => vec![kitti_tracklets::file(sequence)?],
             Self::NuscenesTracking(scenes) => vec![nuscenes_tracking::file(sequence, scenes)?],
         })
     }

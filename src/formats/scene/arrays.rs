@@ -77,6 +77,25 @@ impl Array {
     }
 }
 
+/// Bytes of the arrays of a group that are read, as it declares them.
+pub(super) fn declared_bytes(group: &Group) -> u64 {
+    const READ: [&str; 6] = [
+        "lidar",
+        "ground_mask",
+        "lidar_dt",
+        "flow",
+        "flow_is_valid",
+        "flow_category_indices",
+    ];
+    let arrays = READ.into_iter().filter_map(|name| group.dataset(name).ok());
+    let bytes = arrays.map(|array| {
+        let size = scalar(array.dtype()).map_or(0, Scalar::size) as u64;
+        let numbers = array.shape().iter().copied();
+        numbers.fold(size, u64::saturating_mul)
+    });
+    bytes.fold(0, u64::saturating_add)
+}
+
 /// The type of an array's numbers. A boolean of h5py is an enumeration of bytes.
 fn scalar(datatype: &Datatype) -> Option<Scalar> {
     Some(match datatype {

@@ -1,6 +1,7 @@
 //! The sweeps of a scene.
 
 use std::io;
+use std::ops::RangeInclusive;
 use std::sync::Arc;
 
 use hdf5_reader::error::Error;
@@ -9,7 +10,7 @@ use hdf5_reader::messages::filter_pipeline::FilterDescription;
 use hdf5_reader::storage::RangeRequestStorage;
 use hdf5_reader::{FilterRegistry, Hdf5File, OpenOptions};
 
-use super::arrays::{Array, KIND, malformed};
+use super::arrays::{Array, KIND, declared_bytes, malformed};
 use crate::flow::Point;
 use crate::formats::error::FormatError;
 use crate::formats::limits::{check_flag, check_value, unfold_limit};
@@ -48,10 +49,13 @@ const LZF: u16 = 32000;
 fn filters(limit: usize) -> FilterRegistry {
     let mut filters = FilterRegistry::new();
     let unfold = move |filter: &FilterDescription, packed: &[u8], _: usize| {
-        let size = filter.client_data.get(2).map(|&size| size as usize);
-        let size = size.filter(|&size| size <= limit);
-        let size =
-            size.ok_or_else(|| Error::InvalidData("the size of a chunk by LZF".to_owned()))?;
+        let declared = filter.client_data.get(2).copied().unwrap_or_default();
+        let most = limit.min(packed.len().saturating_mul(lzf::MOST_UNFOLDED));
+        let size = usize::try_from(declared).ok().filter(|&size| size <= most);
+        let size = size.ok_or_else(|| {
+            let packed = packed.len();
+            Error::InvalidData(format!("LZF: {packed} bytes declare {declared}"))
+        })?;
         lzf::decompress(packed, size).map_err(Error::DecompressionError)
     };
     filters.register(LZF, Box::new(unfold));
@@ -64,6 +68,7 @@ impl Scene {
     /// # Errors
     /// - `Malformed` for a file that violates the format.
     /// - `Missing` without a group that is named by a time.
+    /// - `TooLarge` for arrays that together have far more bytes than the file.
     pub fn open(
         length: u64,
         read_at: impl Fn(u64, &mut [u8]) -> io::Result<()> + Send + Sync + 'static,
@@ -92,6 +97,16 @@ impl Scene {
         sweeps.sort_unstable();
         if sweeps.is_empty() {
             return Err(KIND.missing("a group for each sweep, named by its time", &groups));
+        }
+        // Many names may lead to one array. A group that cannot be read is an error of its sweep.
+        let groups = sweeps.iter().filter_map(|(_, name)| root.group(name).ok());
+        let declared = groups.fold(0, |sum: u64, group| {
+            sum.saturating_add(declared_bytes(&group))
+        });
+        if declared > limit as u64 {
+            return Err(KIND.too_large(format!(
+                "its arrays declare {declared} bytes, far more than a file of {length} bytes holds"
+            )));
         }
         Ok(Self { file, sweeps })
     }
@@ -127,7 +142,7 @@ impl Scene {
     /// There is no sweep of this index.
     pub fn sweep(&self, index: usize) -> Result<SceneSweep, FormatError> {
         let group = self.group(index)?;
-        let points = vectors(&group, "lidar")?;
+        let points = vectors(&group, "lidar", 3..=usize::MAX)?;
         let points = points.ok_or_else(|| KIND.missing("the array lidar", &[]))?;
         let ground = flags(&group, "ground_mask", points.len())?;
         let mut column = None;
@@ -149,12 +164,16 @@ impl Scene {
     }
 }
 
-/// An array of displacements or points.
-pub(super) fn vectors(group: &Group, name: &str) -> Result<Option<Vec<Point>>, FormatError> {
+/// An array of displacements or points: its first three columns, of so many.
+pub(super) fn vectors(
+    group: &Group,
+    name: &str,
+    columns: RangeInclusive<usize>,
+) -> Result<Option<Vec<Point>>, FormatError> {
     let Some(array) = Array::read(group, name)? else {
         return Ok(None);
     };
-    if array.columns < 3 {
+    if !columns.contains(&array.columns) {
         let text = format!("{name} has {} columns, not 3", array.columns);
         return Err(KIND.unsupported(text));
     }
@@ -178,6 +197,10 @@ pub(super) fn per_point(
     let array = Array::read(group, name)?;
     if let Some(array) = &array {
         check_count(name, array.rows, count)?;
+        if array.columns != 1 {
+            let text = format!("{name} has {} columns, not 1", array.columns);
+            return Err(KIND.unsupported(text));
+        }
     }
     Ok(array)
 }

@@ -16,9 +16,10 @@ impl Scene {
     /// The pair of a sweep and the one after it, with its truth: `flow` (N x 3, metres), `flow_is_valid`
     /// and `flow_category_indices` (N). None where the sweep has no flow.
     ///
-    /// The ego motion is the rigid motion of the true flow of the points of no object. The file's own
-    /// `ego_motion` and `pose` are not read: they are the vehicle's, and the points are in the sensor's
-    /// frame. None where these points do not move as one.
+    /// The ego motion is the rigid motion of the true flow of the valid points of no category. None where
+    /// there are fewer than 100 of them, or where they do not move as one. The file's own `ego_motion` and
+    /// `pose` are not read: in files of Argoverse 2 they are the vehicle's, and the points are in the
+    /// sensor's frame.
     ///
     /// # Errors
     /// As for [`Self::sweep`], and `Malformed` for a category that is not 0 to 255.
@@ -32,7 +33,7 @@ impl Scene {
     ) -> Result<Option<Pair>, FormatError> {
         let group = self.group(index)?;
         let count = source.points.len();
-        let Some(flow) = vectors(&group, "flow")? else {
+        let Some(flow) = vectors(&group, "flow", 3..=3)? else {
             return Ok(None);
         };
         check_count("flow", flow.len(), count)?;

@@ -51,15 +51,19 @@ def word(prefix: str, value: str) -> str:
 
 
 def plain(message: Any, field: str) -> Any:
-    """The word of an enumeration's value, such as `max_iterations`; None where it is not set."""
+    """The word of an enumeration's value, such as `max_iterations`; None where it is not set.
+
+    A value that only a newer protocol has is its number.
+    """
     number = getattr(message, field)
+    values = message.DESCRIPTOR.fields_by_name[field].enum_type.values_by_number
     if number == 0:
         return None
-    enum = message.DESCRIPTOR.fields_by_name[field].enum_type
+    if number not in values:
+        return str(number)
     # The name of each value begins with that of its enumeration.
-    prefix = enum.values_by_number[0].name.removesuffix("UNSPECIFIED")
-    name: str = enum.values_by_number[number].name
-    return name.removeprefix(prefix).lower()
+    prefix = values[0].name.removesuffix("UNSPECIFIED")
+    return values[number].name.removeprefix(prefix).lower()
 
 
 SUBMITTED = frozenset({"priority", "deadline_ms", "device", "labels", "webhook", "result_uri", "densify"})
@@ -140,7 +144,8 @@ def flow(header: Any, pieces: list[Any], source: Points | None) -> Flow:
     # The words of the program.
     report["stop_reason"] = plain(header, "stop_reason")
     if header.WhichOneof("method") == "field":
-        report["field"]["loss_unit"] = UNITS[plain(header.field, "loss_unit")]
+        unit = plain(header.field, "loss_unit")
+        report["field"]["loss_unit"] = UNITS.get(unit, unit)
     return Flow(
         flow=_joined(pieces, "flow", "<f4").reshape(-1, 3),
         valid=(flags & 1).astype(bool),

@@ -29,7 +29,8 @@ def write_flows(
 
     The flow of the sweep STAMP, `labels/STAMP.npz` or `.feather`, becomes the array `STAMP/name`: N x 3 float32 in
     metres, ego motion included. Points without a flow get the ego motion, and NaN where that is not known. An array
-    of this name is replaced. All flows are read and checked before the file is changed; h5py changes it in place.
+    of this name is replaced, if this function wrote it: it has the attribute `fnsf`. All flows are read and checked
+    before the file is changed; h5py changes it in place.
 
     Args:
         scene: HDF5 file with a group for each sweep.
@@ -40,15 +41,18 @@ def write_flows(
         The number of flows that were written, and of sweeps in the file.
 
     Raises:
-        InputError: A flow has not one row for each point, or there is no flow of any sweep.
+        InputError: A flow has not one row for each point, there is no flow of any sweep, or the file has an array of
+            this name of its own.
     """
-    if name in ("lidar", "ground_mask", "pose", "flow", "flow_is_valid", "flow_category_indices", "ego_motion"):
-        raise _native.InputError(f"{name} is an array of the data set itself")
+    if not name or "/" in name:
+        raise _native.InputError(f"{name!r} is no name of an array")
     with h5py.File(scene, "r") as file:
         stamps = [stamp for stamp in file if stamp.isdecimal() and "lidar" in file[stamp]]
         found = {stamp: path for stamp in stamps if (path := _label(labels, stamp))}
         for stamp, path in found.items():
             _rows(path, file[stamp]["lidar"])
+            if name in file[stamp] and "fnsf" not in file[stamp][name].attrs:
+                raise _native.InputError(f"{stamp}/{name} is an array of the data set itself")
     if not found:
         raise _native.InputError(f"{os.fspath(labels)} has no flow of a sweep in {os.fspath(scene)}")
     with h5py.File(scene, "r+") as file:
@@ -57,7 +61,7 @@ def write_flows(
             rows = _rows(path, group["lidar"])
             if name in group:
                 del group[name]
-            group.create_dataset(name, data=rows)
+            group.create_dataset(name, data=rows).attrs["fnsf"] = True
     return len(found), len(stamps)
 
 
