@@ -228,7 +228,7 @@ fn at_once(
 
 /// Whole sweeps by `default` on lanes that share the threads of the host, as in the service. Clusters are
 /// searched by the host and by the GPU, in turn.
-fn lanes(adapter: &Adapter) -> Result<(), String> {
+fn on_lanes(adapter: &Adapter) -> Result<(), String> {
     const COUNTS: [usize; 3] = [1, 8, 16];
     const PAIRS: usize = 3;
     let opened = [0, usize::MAX].map(|cluster_threads| {
@@ -379,7 +379,7 @@ fn main() -> Result<(), String> {
         match table.as_str() {
             "kernels" => kernels(&gpu, &pair, &asked.points)?,
             "objects" => objects(&adapter)?,
-            "lanes" => lanes(&adapter)?,
+            "lanes" => on_lanes(&adapter)?,
             "pairs" => pairs(&gpu, &pair, &asked.points)?,
             "batches" => batches(&gpu, &pair, &asked.pairs)?,
             other => return Err(format!("{other}: the tables are {}", TABLES.join(", "))),

@@ -13,13 +13,17 @@ pub(crate) fn grouped(number: usize) -> String {
     out
 }
 
-/// Text from outside on one line: control characters, which would steer a terminal, as escapes.
+/// Text from outside on one line: control characters, which would steer a terminal, and those that
+/// turn the direction of the text around them, as escapes.
 #[cfg(feature = "service")]
 pub(crate) fn printable(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for letter in text.chars() {
         match letter {
             '\n' | '\r' => out.push(' '),
+            '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => {
+                out.extend(letter.escape_unicode());
+            }
             letter if letter.is_control() => out.extend(letter.escape_default()),
             letter => out.push(letter),
         }
@@ -48,6 +52,7 @@ mod tests {
     #[test]
     fn text_from_outside_steers_no_terminal_and_shows_no_password() {
         assert_eq!(printable("a\x1b[31m\nb\u{9b}"), "a\\u{1b}[31m b\\u{9b}");
+        assert_eq!(printable("a\u{202e}b\u{2069}é"), "a\\u{202e}b\\u{2069}é");
         assert_eq!(without_user("https://u:p@h/a@b"), "https://h/a@b");
         assert_eq!(without_user("s3://bucket/a@b"), "s3://bucket/a@b");
         assert_eq!(without_user("u:p@h"), "u:p@h");

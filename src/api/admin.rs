@@ -5,8 +5,9 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::extract::State;
+use axum::extract::{Request, State};
 use axum::http::{HeaderMap, StatusCode, header};
+use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, Router};
@@ -14,6 +15,8 @@ use serde_json::json;
 use tokio::sync::watch;
 
 use super::fleet::{NodeView, capacities};
+use super::origin;
+use super::origin::Hosts;
 use crate::clock::Timestamp;
 use crate::cost::CostModel;
 use crate::engine::Device;
@@ -78,18 +81,21 @@ struct Admin {
     cost: Arc<CostModel>,
 }
 
-/// The routes of the admin port. They need no key.
+/// The routes of the admin port. They need no key. A page of another site cannot call them: `hosts` are
+/// the names of the host that are accepted.
 ///
 /// - `GET /livez`: 503 if a loop has not run for 10 s.
 /// - `GET /readyz`: 503 if [`Readiness::not_ready_reason`] gives a reason.
 /// - `GET /nodes`: the processes that have the queue open, as JSON.
 /// - `GET /metrics`: the Prometheus text format, or OpenMetrics if `Accept` asks for it.
 pub fn admin_router(
+    hosts: Hosts,
     readiness: Readiness,
     metrics: Arc<Metrics>,
     queue: Arc<dyn Queue>,
     cost: Arc<CostModel>,
 ) -> Router {
+    let hosts = Arc::new(hosts);
     Router::new()
         .route("/livez", get(alive))
         .route("/readyz", get(ready))
@@ -101,6 +107,15 @@ pub fn admin_router(
             queue,
             cost,
         })
+        .layer(from_fn_with_state(hosts, own_pages))
+}
+
+/// Refuses calls that a page of another site has made.
+async fn own_pages(State(hosts): State<Arc<Hosts>>, request: Request, next: Next) -> Response {
+    match origin::check(&hosts, &request) {
+        Ok(()) => next.run(request).await,
+        Err(error) => error.into_response(),
+    }
 }
 
 async fn alive(State(admin): State<Admin>) -> Response {

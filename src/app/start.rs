@@ -167,7 +167,7 @@ impl App {
         let following = housekeeping::follow_readiness(readiness.clone(), Arc::clone(&service));
         upkeep.spawn(following);
         let queue = stores.queue;
-        let admin = serve_admin(config.admin_listen, readiness, &metrics, &queue, &cost)?;
+        let admin = serve_admin(&config, readiness, &metrics, &queue, &cost)?;
         let stop_listening = CancellationToken::new();
         let router = public_router(&service, config.console);
         let stop = stop_listening.clone();
@@ -407,16 +407,19 @@ fn last_of_its_kind_is_gone(devices: &[Device]) -> Option<String> {
 
 /// Serves the admin port from a thread with a runtime of its own, to the end of the process.
 fn serve_admin(
-    address: SocketAddr,
+    config: &Config,
     readiness: Readiness,
     metrics: &Arc<Metrics>,
     queue: &Arc<dyn Queue>,
     cost: &Arc<CostModel>,
 ) -> anyhow::Result<SocketAddr> {
+    let address = config.admin_listen;
     let socket = std::net::TcpListener::bind(address)
         .with_context(|| format!("cannot listen on {address}"))?;
     let bound = socket.local_addr()?;
+    let is_loopback = bound.ip().is_loopback();
     let router = admin_router(
+        Hosts(is_loopback.then(|| config.allowed_hosts.clone())),
         readiness,
         Arc::clone(metrics),
         Arc::clone(queue),

@@ -10,7 +10,7 @@ use serde::Serialize;
 use super::estimation::{Device, Estimation, Surroundings, check_sequence};
 use super::failure::Failure;
 use super::files;
-use super::output::say;
+use super::output::{complain, say};
 use super::terminal::Terminal;
 use crate::flow::densify::{
     DensifyError, FieldStep, FlowEdge, Plan, carrier, densify, estimate_fields,
@@ -222,7 +222,9 @@ impl Densify {
             })?;
             if dropped > 0 {
                 let count = grouped(dropped);
-                eprintln!("fnsf: warning: {count} pixels are farther than a depth image can say");
+                complain(format_args!(
+                    "warning: {count} pixels are farther than a depth image can say"
+                ));
             }
         }
         if let Some(path) = &self.picture {
@@ -277,7 +279,7 @@ impl Densify {
 /// The intensities of the `rows` of a sweep. None without one, and with a warning where they cannot be used.
 fn usable_intensities(path: &Path, sweep: &Sweep, rows: &[usize]) -> Option<Vec<f32>> {
     let warn = |why: &str| {
-        eprintln!("fnsf: warning: {why}: its intensities are left out");
+        complain(format_args!("warning: {why}: its intensities are left out"));
         None
     };
     let values = match files::read_intensity(path, sweep.points.len()) {

@@ -6,6 +6,7 @@ use std::str::FromStr;
 use anyhow::{Context, anyhow};
 
 use super::failure::Failure;
+use super::output::complain;
 use crate::flow::cpu::CpuBackend;
 use crate::flow::field::{Backend, BackendError};
 use crate::flow::gpu;
@@ -101,7 +102,7 @@ pub(super) fn cpu(threads: Option<usize>) -> Result<Box<dyn Backend>, BackendErr
 
 /// Warns on stderr that the CPU is used instead of a GPU.
 pub(super) fn stand_in(error: &BackendError) {
-    eprintln!("fnsf: warning: the CPU does the work: {error}");
+    complain(format_args!("warning: the CPU does the work: {error}"));
 }
 
 fn open_card(adapter: &Adapter) -> Result<Box<dyn Backend>, BackendError> {

@@ -8,6 +8,7 @@ use clap::Args;
 
 use super::device::DeviceArgument;
 use super::failure::Failure;
+use super::output::complain;
 use super::{device, files};
 use crate::flow::field::{Backend, BackendError};
 use crate::flow::{
@@ -200,10 +201,10 @@ fn warn_of_disorder(names: &[String]) {
     let names: Vec<&str> = names.iter().map(AsRef::as_ref).collect();
     if let Some(at) = formats::turning_sweep(&names) {
         let (sweep, next) = (names[at], names[at + 1]);
-        eprintln!(
-            "fnsf: warning: {sweep} is followed by {next}, against the order of the others: sweeps are \
+        complain(format_args!(
+            "warning: {sweep} is followed by {next}, against the order of the others: sweeps are \
              taken as they are given, so give them in the order in which they were recorded"
-        );
+        ));
     }
 }
 
@@ -345,7 +346,7 @@ impl Surroundings {
             refused_times,
         } = files::read_timed_cloud(path)?;
         if let Some(refused) = refused_times {
-            eprintln!("fnsf: warning: {}: {refused}", path.display());
+            complain(format_args!("warning: {}: {refused}", path.display()));
         }
         let known = index.checked_sub(self.forgotten);
         if let Some(sweep) = known.and_then(|index| self.known.get_mut(index)) {

@@ -261,11 +261,6 @@ impl Export {
         path: &str,
         writer: impl FnOnce(&mut io::BufWriter<fs::File>) -> Result<(), E>,
     ) -> Result<(), Failure> {
-        let path = self.output.join(path);
-        let folder = path.parent().unwrap_or(&self.output);
-        fs::create_dir_all(folder)
-            .with_context(|| format!("cannot make {}", folder.display()))
-            .map_err(Failure::internal)?;
-        files::write(&path, writer)
+        files::write_below(&self.output, Path::new(path), writer)
     }
 }

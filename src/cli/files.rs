@@ -325,13 +325,47 @@ pub(super) fn write<E: std::error::Error + Send + Sync + 'static>(
             writer(&mut file)?;
             return Ok(file.flush()?);
         }
-        let (unfinished, file) = Unfinished::beside(&index)?;
-        let mut file = BufWriter::new(file);
-        writer(&mut file)?;
-        file.flush()?;
-        Ok(unfinished.rename(&index)?)
+        replace(&index, writer)
     };
     written()
         .with_context(|| format!("cannot write {}", path.display()))
         .map_err(Failure::internal)
+}
+
+/// Writes a file below `folder` under a name that is not the user's own. Makes its folders. A link of this
+/// name is replaced, not followed.
+///
+/// # Errors
+/// An internal failure where it cannot be written, and where a folder on the way is a link that leads out
+/// of `folder`.
+pub(super) fn write_below<E: std::error::Error + Send + Sync + 'static>(
+    folder: &Path,
+    name: &Path,
+    writer: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
+) -> Result<(), Failure> {
+    let path = folder.join(name);
+    let written = || -> anyhow::Result<()> {
+        let parent = path.parent().unwrap_or(folder);
+        fs::create_dir_all(parent)?;
+        let inner = fs::canonicalize(parent)?;
+        if !inner.starts_with(fs::canonicalize(folder)?) {
+            return Err(anyhow!("a link leads out of {}", folder.display()));
+        }
+        replace(&inner.join(path.file_name().unwrap_or_default()), writer)
+    };
+    written()
+        .with_context(|| format!("cannot write {}", path.display()))
+        .map_err(Failure::internal)
+}
+
+/// Writes a file under a temporary name, and renames it to `path`.
+fn replace<E: std::error::Error + Send + Sync + 'static>(
+    path: &Path,
+    writer: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
+) -> anyhow::Result<()> {
+    let (unfinished, file) = Unfinished::beside(path)?;
+    let mut file = BufWriter::new(file);
+    writer(&mut file)?;
+    file.flush()?;
+    Ok(unfinished.rename(path)?)
 }

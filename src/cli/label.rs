@@ -14,7 +14,7 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use super::estimation::{Device, Estimation, check_sequence};
 use super::failure::Failure;
-use super::output::say;
+use super::output::{complain, say};
 use crate::flow::field::Backend;
 use crate::flow::{Control, Ego, Estimate, FlowError, Method};
 use crate::job::{EgoChoice, JobOptions};
@@ -310,7 +310,9 @@ fn stop_on_signals() -> Result<Arc<AtomicBool>, Failure> {
             };
             next().await;
             told.store(true, Ordering::Relaxed);
-            eprintln!("fnsf: the pair that is computed is finished; a second signal ends at once");
+            complain(format_args!(
+                "the pair that is computed is finished; a second signal ends at once"
+            ));
             let number = next().await.as_raw_value();
             process::exit(128 + number)
         })
@@ -357,7 +359,9 @@ impl Shown {
             if self.last.elapsed() >= LINE_EVERY {
                 self.last = Instant::now();
                 let (shard, done, total) = (self.shard, told.done, told.total);
-                eprintln!("fnsf: shard {shard}: {done} of {total} pairs, {text}");
+                complain(format_args!(
+                    "shard {shard}: {done} of {total} pairs, {text}"
+                ));
             }
             return;
         }

@@ -1,10 +1,6 @@
 //! The command line: one file per subcommand. The only module that prints.
 //!
 //! Results go to stdout, progress and errors to stderr. No other module depends on this one.
-#![expect(
-    clippy::print_stderr,
-    reason = "printing is what a command line is for"
-)]
 
 mod backup;
 mod client;
@@ -103,7 +99,7 @@ pub fn run(arguments: Arguments) -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
             if failure.is_worth_a_word() {
-                eprintln!("fnsf: {failure}");
+                output::complain(format_args!("{failure}"));
             }
             failure.exit_code()
         }

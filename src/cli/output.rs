@@ -1,4 +1,4 @@
-//! Output on stdout. A closed pipe (`fnsf doctor | head -1`) is not an error.
+//! Lines on stdout and stderr. A closed pipe (`fnsf doctor | head -1`) is not an error.
 
 use std::fmt;
 use std::io::{self, Write};
@@ -13,11 +13,22 @@ use crate::text::printable;
 /// write error.
 pub(super) fn say(line: fmt::Arguments<'_>) -> Result<(), Failure> {
     let mut stdout = io::stdout().lock();
-    // The names of files may have been chosen by others. A text of several lines is our own.
-    let line = line.to_string();
-    let lines: Vec<String> = line.split('\n').map(printable).collect();
-    writeln!(stdout, "{}", lines.join("\n")).map_err(|error| match error.kind() {
+    writeln!(stdout, "{}", shown(line)).map_err(|error| match error.kind() {
         io::ErrorKind::BrokenPipe => Failure::reader_gone(error),
         _ => Failure::internal(error),
     })
+}
+
+/// Prints a warning or an error on stderr, after the name of the program.
+#[expect(clippy::print_stderr, reason = "all of it is printed here")]
+pub(super) fn complain(line: fmt::Arguments<'_>) {
+    eprintln!("fnsf: {}", shown(line));
+}
+
+/// Text without what steers a terminal. The names of files may have been chosen by others. A text of
+/// several lines is our own.
+fn shown(text: fmt::Arguments<'_>) -> String {
+    let text = text.to_string();
+    let lines: Vec<String> = text.split('\n').map(printable).collect();
+    lines.join("\n")
 }

@@ -23,10 +23,15 @@ const UNFOLD_CEILING: u64 = 4 << 30;
 
 /// Bytes to which a compressed file of `file_len` bytes may decompress, all its parts together.
 pub(super) fn unfold_limit(file_len: usize) -> u64 {
-    let by_length = (file_len as u64)
+    unfold_budget(file_len as u64).min(UNFOLD_CEILING)
+}
+
+/// Bytes to which `packed` bytes of a stream may decompress, all its parts together: without the ceiling
+/// of what is in memory at once.
+pub(super) fn unfold_budget(packed: u64) -> u64 {
+    packed
         .saturating_mul(UNFOLD_RATIO)
-        .saturating_add(UNFOLD_FLOOR);
-    by_length.min(UNFOLD_CEILING)
+        .saturating_add(UNFOLD_FLOOR)
 }
 
 /// Refuses more rows than [`MAX_POINTS`].

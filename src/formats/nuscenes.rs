@@ -93,8 +93,8 @@ struct SampleData {
 /// [`NUSCENES_TABLES`] names, in its order.
 ///
 /// # Errors
-/// `Malformed` for a table that is not one, for a sweep without a pose or scene, and for a rotation
-/// or translation that is none.
+/// `Malformed` for a table that is not one, for a sweep without a pose or scene or with a file outside
+/// of the data set, and for a rotation or translation that is none.
 pub fn read_nuscenes<T: AsRef<[u8]>>(tables: &[T; 6]) -> Result<Vec<NuscenesScene>, FormatError> {
     let [sensors, mounts, data, poses, samples, scenes] = tables.each_ref().map(AsRef::as_ref);
     let sensors: Vec<Sensor> = table(0, sensors)?;
@@ -136,6 +136,11 @@ pub fn read_nuscenes<T: AsRef<[u8]>>(tables: &[T; 6]) -> Result<Vec<NuscenesScen
         let (pose, scene) = pose.zip(scene).ok_or_else(|| {
             malformed(2, format_args!("{} has no pose or no scene", row.filename))
         })?;
+        let mut names = row.filename.split('/');
+        if names.any(|name| matches!(name, "" | "." | "..")) {
+            let what = format_args!("{} is no file of the data set", row.filename);
+            return Err(malformed(2, what));
+        }
         found.entry(scene).or_default().push(NuscenesSweep {
             world_from_sensor: pose * mount,
             sample: row.is_key_frame.then_some(row.sample_token),
@@ -233,6 +238,12 @@ mod tests {
             tables[index] = rows;
             let refused = read(tables).expect_err("a damaged table").to_string();
             assert!(refused.contains(said), "{refused}");
+        }
+        for file in ["../../private.bin", "/private.bin", "sweeps//a.bin"] {
+            let mut tables = tables();
+            tables[2][0]["filename"] = json!(file);
+            let refused = read(tables).expect_err("another file").to_string();
+            assert!(refused.contains("is no file of the data set"), "{refused}");
         }
         for (column, none) in [
             ("rotation", json!([0, 0, 0, 0])),

@@ -1,12 +1,15 @@
 //! Places of files: paths of this machine, and URIs of object stores.
 
 use std::collections::HashMap;
-use std::io::{self, ErrorKind};
+use std::fs::OpenOptions;
+use std::io::{self, ErrorKind, Read};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
+use rustix::fs::OFlags;
 use url::Url;
 
 use crate::storage::{BlobError, BucketError, Objects};
@@ -106,20 +109,7 @@ impl Places {
                 let bucket = self.bucket(&root)?;
                 bucket.read_whole(&path, MAX_FILE).await.map_err(failed)
             }
-            (None, path) => {
-                let about = tokio::fs::metadata(&path).await;
-                let about = about.map_err(|error| failed(error.into()))?;
-                let unusable = |kind: ErrorKind| failed(io::Error::from(kind).into());
-                if !about.is_file() {
-                    // Reading a pipe or a device may never end.
-                    return Err(unusable(ErrorKind::InvalidInput));
-                }
-                if about.len() > MAX_FILE {
-                    return Err(unusable(ErrorKind::FileTooLarge));
-                }
-                let read = tokio::fs::read(&path).await;
-                read.map(Bytes::from).map_err(|error| failed(error.into()))
-            }
+            (None, path) => read_file(path).await.map_err(|error| failed(error.into())),
         }
     }
 
@@ -142,6 +132,28 @@ impl Places {
             }
         }
     }
+}
+
+/// Reads a whole file of at most 4 GiB, and no more of it than it had when it was opened. What is no
+/// regular file is refused: a pipe or a device may never end.
+async fn read_file(path: String) -> io::Result<Bytes> {
+    let read = move || {
+        let mut options = OpenOptions::new();
+        // Opening a pipe would wait for its writer.
+        options.custom_flags(OFlags::NONBLOCK.bits() as i32);
+        let file = options.read(true).open(path)?;
+        let about = file.metadata()?;
+        if !about.is_file() {
+            return Err(io::Error::from(ErrorKind::InvalidInput));
+        }
+        if about.len() > MAX_FILE {
+            return Err(io::Error::from(ErrorKind::FileTooLarge));
+        }
+        let mut bytes = Vec::new();
+        file.take(about.len()).read_to_end(&mut bytes)?;
+        Ok(bytes.into())
+    };
+    tokio::task::spawn_blocking(read).await?
 }
 
 fn absolute(path: &Path) -> PathBuf {
@@ -184,9 +196,12 @@ impl Place {
         is_folder.then(|| Path::new(&self.uri(below)).canonicalize().ok())?
     }
 
-    /// Reads a whole file.
+    /// Reads a whole file of at most 4 GiB.
     pub(super) async fn read(&self, below: &str) -> Result<Bytes, PlaceError> {
-        let read = self.objects.read_whole(&self.path(below), MAX_FILE).await;
+        let read = match self.base.contains("://") {
+            true => self.objects.read_whole(&self.path(below), MAX_FILE).await,
+            false => read_file(self.uri(below)).await.map_err(BlobError::from),
+        };
         read.map_err(|error| PlaceError::new(&self.uri(below), error))
     }
 

@@ -14,7 +14,15 @@ fn names_and_files_that_cannot_work_are_refused_and_do_not_hang() {
     assert!(made.expect("mkfifo").success());
     let sweep = |index: usize| format!("drives/d0/sweep_{index:04}.pcd");
     let mut rows = "source,target,drive,id\n".to_owned();
-    for source in ["pipe", "/dev/zero", "drives", "drives/d0/sweep_0000.pcd/x"] {
+    // The last says that it is empty, and never ends.
+    let strange = [
+        "pipe",
+        "/dev/zero",
+        "drives",
+        "drives/d0/sweep_0000.pcd/x",
+        "/proc/self/pagemap",
+    ];
+    for source in strange {
         rows += &format!("{source},{},z,{}\n", sweep(1), rows.lines().count());
     }
     rows += &format!("{},{},z,good\n", sweep(0), sweep(1));
@@ -60,6 +68,29 @@ fn names_and_files_that_cannot_work_are_refused_and_do_not_hang() {
         "{} {}",
         done.stdout,
         done.stderr
+    );
+}
+
+#[test]
+fn a_pipe_in_the_place_of_poses_is_refused_and_does_not_hang() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    drives(folder, 1, "3");
+    let log = folder.join("av2/log/sensors/lidar");
+    fs::create_dir_all(&log).expect("made");
+    for sweep in 0..2 {
+        let from = folder.join(format!("drives/d0/sweep_{sweep:04}.pcd"));
+        fs::copy(from, log.join(format!("31596626{sweep}359836000.pcd"))).expect("copied");
+    }
+    let poses = folder.join("av2/log/city_SE3_egovehicle.feather");
+    let made = Command::new("mkfifo").arg(&poses).status();
+    assert!(made.expect("mkfifo").success());
+    let refused = label(folder, &["av2", "-o", "labels"]);
+    assert_eq!(refused.code, 65, "{}", refused.stderr);
+    assert!(
+        refused.stderr.contains("city_SE3_egovehicle"),
+        "{}",
+        refused.stderr
     );
 }
 

@@ -59,6 +59,18 @@ fn sweeps_out_of_the_order_of_their_numbers_are_named() {
         let warning = format!("{c} is followed by {b}");
         assert_eq!(done.stderr.contains(&warning), warned, "{}", done.stderr);
     }
+    // Names may have been chosen by others, and steer no terminal.
+    let names = [1, 10, 2].map(|sweep| format!("\u{1b}]52;c;x\u{7}{sweep}.pcd"));
+    for (from, name) in [a, c, b].into_iter().zip(&names) {
+        std::fs::rename(folder.join(from), folder.join(name)).expect("renamed");
+    }
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    let done = fnsf(
+        folder,
+        &[&["flow"], &names[..], &["-o", "out.npz"]].concat(),
+    );
+    assert!(done.stderr.contains("is followed by"), "{}", done.stderr);
+    assert!(!done.stderr.contains('\u{1b}') && !done.stdout.contains('\u{1b}'));
 }
 
 #[test]

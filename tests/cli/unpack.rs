@@ -157,3 +157,46 @@ fn the_sweeps_of_a_scene_become_files_and_pairs_with_their_truth() {
     assert_eq!(refused.code, 2, "{}", refused.stderr);
     assert!(refused.stderr.contains("recordings"), "{}", refused.stderr);
 }
+
+#[test]
+fn links_in_the_output_are_not_followed_and_a_pipe_is_read() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    std::fs::write(folder.join("scene.h5"), SCENE).expect("a file");
+    std::fs::write(folder.join("mine"), "precious").expect("a file");
+    let file = folder.join("drives/scene/1700000000000000000.pcd");
+    std::fs::create_dir_all(folder.join("drives/scene")).expect("made");
+    std::os::unix::fs::symlink(folder.join("mine"), &file).expect("a link");
+    let done = fnsf(folder, &["unpack", "scene.h5", "-o", "drives"]);
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    let mine = std::fs::read(folder.join("mine")).expect("there");
+    assert_eq!(mine, b"precious");
+    assert!(std::fs::symlink_metadata(&file).expect("there").is_file());
+
+    std::fs::create_dir_all(folder.join("elsewhere")).expect("made");
+    std::fs::create_dir_all(folder.join("linked")).expect("made");
+    let link = folder.join("linked/scene");
+    std::os::unix::fs::symlink(folder.join("elsewhere"), link).expect("a link");
+    let refused = fnsf(folder, &["unpack", "scene.h5", "-o", "linked"]);
+    assert_ne!(refused.code, 0);
+    assert!(
+        refused.stderr.contains("leads out of linked"),
+        "{}",
+        refused.stderr
+    );
+    assert!(names(&folder.join("elsewhere")).is_empty());
+
+    std::fs::write(folder.join("drive.mcap"), RECORDING).expect("a file");
+    let program = env!("CARGO_BIN_EXE_fnsf");
+    let piped = std::process::Command::new("sh")
+        .args([
+            "-c",
+            "cat drive.mcap | \"$0\" unpack /dev/stdin --list",
+            program,
+        ])
+        .current_dir(folder)
+        .output()
+        .expect("a shell");
+    let listed = String::from_utf8_lossy(&piped.stdout).into_owned();
+    assert!(listed.contains("/lidar/top: 3 clouds"), "{listed}");
+}

@@ -130,11 +130,11 @@ fn lies_about_sizes_are_refused_before_memory_is_taken() {
         (endless, "too large"),
         (
             recording(0x06, &chunk(u64::MAX, "lz4", &[0; 30])),
-            "unfolds to",
+            "unfold to",
         ),
         (
             recording(0x06, &chunk(100 << 20, "lz4", &many_zeros)),
-            "unfolds to",
+            "unfold to",
         ),
         (
             recording(0x06, &chunk(1 << 20, "lz4", &many_zeros)),
@@ -150,6 +150,34 @@ fn lies_about_sizes_are_refused_before_memory_is_taken() {
         let (sweeps, read) = sweeps(&bytes);
         let words = read.expect_err(said).to_string();
         assert!(sweeps.is_empty() && words.contains(said), "{words}");
+    }
+}
+
+#[test]
+fn chunks_that_are_small_one_by_one_and_names_without_end_are_refused() {
+    let zeros = |size: usize| {
+        use std::io::Write;
+        let mut encoder = lz4_flex::frame::FrameEncoder::new(Vec::new());
+        encoder.write_all(&vec![0; size]).expect("memory");
+        encoder.finish().expect("a frame")
+    };
+    // Each unfolds to less than 32 MiB, and both to more. Nine zeros are a record of no kind that is read.
+    let size = 9 * 2_300_000;
+    let mut bytes = recording(0x06, &chunk(size as u64, "lz4", &zeros(size)));
+    let again = bytes[8..].to_vec();
+    bytes.extend(again);
+    let (_, read) = sweeps(&bytes);
+    let words = read.expect_err("a bomb").to_string();
+    assert!(words.contains("unfold to 41400000"), "{words}");
+
+    let long = "a".repeat(1 << 20);
+    let text = |text: &str| [&(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat();
+    let schema = [&1_u16.to_le_bytes()[..], &text(&long)].concat();
+    let channel = [&[1, 0, 1, 0][..], &text(&long), &text("cdr")].concat();
+    for (code, body) in [(0x03, schema), (0x04, channel)] {
+        let (_, read) = sweeps(&recording(code, &body));
+        let words = read.expect_err("a long name").to_string();
+        assert!(words.contains("a name of 1048576 bytes"), "{words}");
     }
 }
 

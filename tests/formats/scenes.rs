@@ -123,6 +123,14 @@ fn a_changed_byte_is_read_or_refused_and_never_gives_a_number_that_is_not_finite
     }
 }
 
+/// Ten groups link to one array, which is declared and was never written.
+#[test]
+fn arrays_that_together_have_far_more_bytes_than_the_file_are_refused() {
+    let refused = open(include_bytes!("scenes/linked.h5")).err();
+    let refused = refused.expect("a bomb").to_string();
+    assert!(refused.contains("declare 240000000 bytes"), "{refused}");
+}
+
 #[test]
 fn an_hdf5_file_of_something_else_is_refused_with_what_is_needed() {
     // The groups are not named by a time.

@@ -179,6 +179,20 @@ async fn every_route_of_http_takes_a_key_and_gives_only_what_it_opens() {
         assert_eq!(answer.status(), 200, "{open}");
         assert!(!answer.text().await.expect("text").contains(&id));
     }
+    // A page of another site, also one whose name leads to this machine, does not read it.
+    let own = server.admin.to_string();
+    for (host, origin) in [
+        ("evil.example:9090", None),
+        (own.as_str(), Some("https://evil.example")),
+    ] {
+        let mut request = Client::new().get(format!("http://{own}/nodes"));
+        request = request.header("host", host);
+        if let Some(origin) = origin {
+            request = request.header("origin", origin);
+        }
+        let answer = request.send().await.expect("an answer");
+        assert_eq!(answer.status(), 403, "{host} {origin:?}");
+    }
     let closed = reqwest::get(format!("http://{}/v1/jobs", server.admin)).await;
     assert_eq!(closed.expect("an answer").status(), 404);
 }

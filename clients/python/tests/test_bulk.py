@@ -46,6 +46,46 @@ def test_rows_that_cannot_be_used_are_refused(table, tmp_path):
         Labeller("x", ending="obj")
 
 
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "abfss://x@evil.example/c/0.pcd",
+        "abfss://evil.example:443/c/0.pcd",
+        "abfs://a:secret@evil/c/0.pcd",
+        "s3://bucket/0.pcd?endpoint_override=evil.example",
+        "s3://key:secret@bucket/0.pcd",
+        "hdfs://evil.example/0.pcd",
+        "file://evil.example/0.pcd",
+        "abfss://c@evil.example#.dfs.core.windows.net/0.pcd",
+    ],
+)
+def test_no_row_names_a_server_that_would_get_the_credentials_of_this_one(table, tmp_path, monkeypatch, uri):
+    from pyarrow import fs
+
+    def never(uri):
+        raise AssertionError(f"{uri} was opened")
+
+    table["source"][:] = uri
+    table["target"][:] = uri
+    monkeypatch.setattr(fs, "FileSystem", type("FileSystem", (), {"from_uri": staticmethod(never)}))
+    report = Labeller(str(tmp_path / "labels"))(table)
+    assert list(report["outcome"]) == ["refused"] * 3
+
+
+def test_a_row_that_cannot_be_written_does_not_stop_the_others(table, tmp_path):
+    (tmp_path / "labels/taken.npz").mkdir(parents=True)
+    (tmp_path / "labels/file").write_text("")
+    good = table["key"][0]
+    for key in ["a?b", "a#b", "x" * 300, "../a", "/a", "a//b", "a\0b", "taken", "file/a"]:
+        table["key"][1] = key
+        report = Labeller(str(tmp_path / "labels"), preset="default")(table)
+        assert report["outcome"][0] in ("labelled", "found"), good
+        assert report["outcome"][1] == "refused", key
+    os.mkfifo(tmp_path / "pipe")
+    table["key"][1], table["source"][1] = "drive/1", str(tmp_path / "pipe")
+    assert Labeller(str(tmp_path / "labels"))(table)["outcome"][1] == "refused"
+
+
 def test_racing_writers_leave_one_label(table, tmp_path):
     outcomes = []
     labeller = Labeller(str(tmp_path / "labels"), ending="feather")

@@ -67,6 +67,20 @@ def test_a_scene_is_unpacked_labelled_and_gets_its_flows(scene, program, tmp_pat
             assert error.mean() < 0.05
 
 
+def test_a_link_to_another_file_is_not_followed(scene, tmp_path):
+    other = tmp_path / "other.h5"
+    scene.rename(other)
+    before = other.read_bytes()
+    with h5py.File(scene, "w") as file:
+        file[STAMPS[0]] = h5py.ExternalLink(str(other), STAMPS[0])
+        file[STAMPS[1]] = h5py.SoftLink(f"/{STAMPS[0]}")
+    np.savez(tmp_path / f"{STAMPS[0]}.npz", **label(other, STAMPS[0]))
+    np.savez(tmp_path / f"{STAMPS[1]}.npz", **label(other, STAMPS[0]))
+    with pytest.raises(fnsf.InputError, match="no flow of a sweep"):
+        write_flows(scene, tmp_path)
+    assert other.read_bytes() == before
+
+
 def label(scene, stamp):
     """A flow of nothing for each point."""
     with h5py.File(scene) as file:

@@ -13,6 +13,7 @@ use notify::{Event, RecursiveMode, Watcher};
 
 use crate::cli::estimation::Estimation;
 use crate::cli::failure::Failure;
+use crate::cli::output::complain;
 use crate::cli::tracks::TrackArguments;
 use crate::formats::compare_names;
 
@@ -179,9 +180,9 @@ impl Arrivals {
     fn add(&mut self, event: notify::Result<Event>) -> Result<(), Failure> {
         let event = event.map_err(Failure::internal)?;
         if event.need_rescan() {
-            eprintln!(
-                "fnsf: warning: the system lost events of the folder, so that sweeps may be missing"
-            );
+            complain(format_args!(
+                "warning: the system lost events of the folder, so that sweeps may be missing"
+            ));
         }
         if !completes(event.kind) {
             return Ok(());
@@ -212,10 +213,10 @@ impl Arrivals {
             true => "a smaller --due-ms leaves less for each",
             false => "--due-ms gives each flow a time",
         };
-        eprintln!(
-            "fnsf: warning: {count} sweeps wait, because flows take longer than the time between \
+        complain(format_args!(
+            "warning: {count} sweeps wait, because flows take longer than the time between \
              sweeps: {advice}"
-        );
+        ));
     }
 }
 

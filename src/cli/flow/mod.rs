@@ -16,6 +16,7 @@ pub(super) use self::print::print_report;
 use super::estimation::check_sequence;
 use super::failure::Failure;
 use super::files;
+use super::output::complain;
 use crate::flow::{Control, Sweep};
 use crate::job::JobOptions;
 
@@ -89,9 +90,9 @@ impl Flow {
                 // One bad sweep is no reason to miss all later ones.
                 Err(failure) if failure.is_of_input() => {
                     let path = arrived.path.display();
-                    eprintln!(
-                        "fnsf: warning: {path}: {failure}; the sequence starts again after it"
-                    );
+                    complain(format_args!(
+                        "warning: {path}: {failure}; the sequence starts again after it"
+                    ));
                     pairs.restart();
                 }
                 Err(failure) => return Err(failure),
@@ -99,7 +100,7 @@ impl Flow {
         }
         pairs.flush()?;
         latencies.add(&pairs.take_latencies());
-        eprintln!("fnsf: {latencies}");
+        complain(format_args!("{latencies}"));
         Ok(())
     }
 }

@@ -1,7 +1,7 @@
 //! The report of a pair as text.
 
 use crate::cli::failure::Failure;
-use crate::cli::output::say;
+use crate::cli::output::{complain, say};
 use crate::job::Report;
 use crate::text::grouped;
 
@@ -73,7 +73,7 @@ pub(in crate::cli) fn print_report(report: &Report) -> Result<(), Failure> {
         ))?;
     }
     for warning in &report.warnings {
-        eprintln!("fnsf: warning: {warning}");
+        complain(format_args!("warning: {warning}"));
     }
     if let Some(overlap) = report.overlap {
         say(format_args!(

@@ -1,6 +1,6 @@
 //! The arguments of `fnsf unpack`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 
@@ -41,4 +41,11 @@ pub(in crate::cli) struct Unpack {
     /// Print the topics with clouds and the number of their messages, or of sweeps; write nothing
     #[arg(long, conflicts_with = "output")]
     pub(super) list: bool,
+}
+
+impl Unpack {
+    /// The folder for the sweeps.
+    pub(super) fn output(&self) -> &Path {
+        self.output.as_deref().unwrap_or(Path::new("."))
+    }
 }

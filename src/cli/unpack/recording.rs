@@ -4,14 +4,14 @@ use std::collections::{BTreeMap, HashSet};
 use std::fs::File;
 use std::io::BufReader;
 use std::ops::ControlFlow;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::{Context, anyhow};
 
 use super::arguments::Unpack;
 use super::sweep_file::{folder_of, write_sweep};
 use crate::cli::failure::Failure;
-use crate::cli::output::say;
+use crate::cli::output::{complain, say};
 use crate::cli::terminal::bar;
 use crate::formats::{CloudMessage, FormatError, read_recording};
 use crate::text::{grouped, printable};
@@ -19,10 +19,13 @@ use crate::text::{grouped, printable};
 /// Bytes that are read at a time.
 const BUFFER: usize = 1 << 20;
 
+/// The most topics with clouds.
+const MAX_TOPICS: usize = 4096;
+
 /// What was found on one topic.
 #[derive(Default)]
 struct Topic {
-    /// Where its sweeps are written.
+    /// The folder of its sweeps in the output.
     folder: PathBuf,
     messages: usize,
     sweeps: usize,
@@ -56,10 +59,15 @@ impl Unpack {
             {
                 return ControlFlow::Continue(());
             }
+            if topics.len() >= MAX_TOPICS && !topics.contains_key(message.topic) {
+                let text = format!("it has more than {MAX_TOPICS} topics");
+                failure = Some(Failure::bad_input(anyhow!(text)));
+                return ControlFlow::Break(());
+            }
             let topic = topics
                 .entry(message.topic.to_owned())
                 .or_insert_with(|| Topic {
-                    folder: self.folder(message.topic, &mut folders),
+                    folder: Self::folder(message.topic, &mut folders),
                     ..Topic::default()
                 });
             topic.messages += 1;
@@ -74,7 +82,7 @@ impl Unpack {
                 Ok(()) => ControlFlow::Continue(()),
                 Err(Stop::Damaged(error)) => {
                     damaged += 1;
-                    bar.suspend(|| complain(message, &error));
+                    bar.suspend(|| leave_out(message, &error));
                     ControlFlow::Continue(())
                 }
                 Err(Stop::Failed(error)) => {
@@ -113,8 +121,9 @@ impl Unpack {
             topic.repeated += 1;
             return Ok(());
         }
-        let path = topic.folder.join(format!("{stamp:019}.pcd"));
-        write_sweep(&path, &sweep.points, sweep.times.as_ref()).map_err(Stop::Failed)?;
+        let name = topic.folder.join(format!("{stamp:019}.pcd"));
+        write_sweep(self.output(), &name, &sweep.points, sweep.times.as_ref())
+            .map_err(Stop::Failed)?;
         topic.last = Some(stamp);
         topic.sweeps += 1;
         topic.points += sweep.points.len();
@@ -124,9 +133,8 @@ impl Unpack {
         Ok(())
     }
 
-    /// The folder of a topic's sweeps, which is none of the others `taken`.
-    fn folder(&self, topic: &str, taken: &mut HashSet<String>) -> PathBuf {
-        let output = self.output.as_deref().unwrap_or(Path::new("."));
+    /// The folder of a topic's sweeps in the output, which is none of the others `taken`.
+    fn folder(topic: &str, taken: &mut HashSet<String>) -> PathBuf {
         let plain = folder_of(topic);
         let mut name = plain.clone();
         for number in 2.. {
@@ -135,7 +143,7 @@ impl Unpack {
             }
             name = format!("{plain}.{number}");
         }
-        output.join(name)
+        name.into()
     }
 
     fn nothing_found(&self) -> Failure {
@@ -159,7 +167,7 @@ impl Unpack {
                 "{name}: {} sweeps, {} points, in {}",
                 grouped(topic.sweeps),
                 grouped(topic.points),
-                topic.folder.display()
+                self.output().join(&topic.folder).display()
             ))?;
             if topic.dropped > 0 {
                 let dropped = grouped(topic.dropped);
@@ -191,9 +199,11 @@ enum Stop {
     Failed(Failure),
 }
 
-fn complain(message: &CloudMessage<'_>, error: &FormatError) {
+fn leave_out(message: &CloudMessage<'_>, error: &FormatError) {
     let (topic, logged) = (printable(message.topic), message.logged_ns);
-    eprintln!("fnsf: the cloud on {topic} of {logged} ns is left out: {error}");
+    complain(format_args!(
+        "the cloud on {topic} of {logged} ns is left out: {error}"
+    ));
 }
 
 #[cfg(test)]
@@ -202,18 +212,10 @@ mod tests {
 
     #[test]
     fn topics_whose_plain_names_are_the_same_have_folders_of_their_own() {
-        let unpack = Unpack {
-            file: PathBuf::new(),
-            output: Some("out".into()),
-            topic: None,
-            skip: 0,
-            limit: None,
-            list: false,
-        };
         let mut taken = HashSet::new();
         let folders = ["/lidar/top", "/lidar_top", "/lidar/low", "/lidar top"]
-            .map(|topic| unpack.folder(topic, &mut taken));
+            .map(|topic| Unpack::folder(topic, &mut taken));
         let expected = ["lidar_top", "lidar_top.2", "lidar_low", "lidar_top.3"];
-        assert_eq!(folders, expected.map(|name| Path::new("out").join(name)));
+        assert_eq!(folders, expected.map(PathBuf::from));
     }
 }

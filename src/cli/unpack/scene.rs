@@ -10,7 +10,7 @@ use super::arguments::Unpack;
 use super::sweep_file::{folder_of, write_sweep};
 use crate::cli::failure::Failure;
 use crate::cli::files;
-use crate::cli::output::say;
+use crate::cli::output::{complain, say};
 use crate::cli::terminal::bar;
 use crate::formats::{FormatError, Scene, SceneSweep, write_pair_npz};
 use crate::text::grouped;
@@ -47,13 +47,12 @@ impl Unpack {
             let sweeps = grouped(scene.names().len());
             return say(format_args!("{name}: {sweeps} sweeps"));
         }
-        let folder = self.output.as_deref().unwrap_or(Path::new(".")).join(&name);
-        let written = self.write_scene(&scene, &folder)?;
+        let written = self.write_scene(&scene, Path::new(&name))?;
         say(format_args!(
             "{name}: {} sweeps, {} points, in {}",
             grouped(written.sweeps),
             grouped(written.points),
-            folder.display()
+            self.output().join(&name).display()
         ))?;
         if written.pairs > 0 {
             let pairs = grouped(written.pairs);
@@ -84,7 +83,7 @@ impl Unpack {
         }
     }
 
-    /// Writes the sweeps, and the pairs whose flow is known.
+    /// Writes the sweeps, and the pairs whose flow is known, to a folder in the output.
     fn write_scene(&self, scene: &Scene, folder: &Path) -> Result<Written, Failure> {
         let names: Vec<&str> = scene.names().collect();
         let end = self.skip.saturating_add(self.limit.unwrap_or(usize::MAX));
@@ -97,15 +96,15 @@ impl Unpack {
         let mut before: Option<SceneSweep> = None;
         for index in range {
             bar.inc(1);
-            let mut complain = |error: &FormatError, what: &str, index: usize| {
+            let mut leave_out = |error: &FormatError, what: &str, index: usize| {
                 written.damaged += 1;
                 let name = names[index];
-                bar.suspend(|| eprintln!("fnsf: the {what} {name} is left out: {error}"));
+                bar.suspend(|| complain(format_args!("the {what} {name} is left out: {error}")));
             };
             let sweep = match scene.sweep(index) {
                 Ok(sweep) => sweep,
                 Err(error) => {
-                    complain(&error, "sweep", index);
+                    leave_out(&error, "sweep", index);
                     before = None;
                     continue;
                 }
@@ -116,13 +115,14 @@ impl Unpack {
             let pair = match pair.transpose() {
                 Ok(pair) => pair.flatten(),
                 Err(error) => {
-                    complain(&error, "truth of", index - 1);
+                    leave_out(&error, "truth of", index - 1);
                     None
                 }
             };
             let path =
                 |index: usize, ending: &str| folder.join(format!("{}.{ending}", names[index]));
-            write_sweep(&path(index, "pcd"), &sweep.points, sweep.times.as_ref())?;
+            let times = sweep.times.as_ref();
+            write_sweep(self.output(), &path(index, "pcd"), &sweep.points, times)?;
             written.sweeps += 1;
             written.points += sweep.points.len();
             written.timed += usize::from(sweep.times.is_some());
@@ -131,7 +131,9 @@ impl Unpack {
                 .take()
                 .or_else(|| sweep.refused_times.clone());
             if let Some(pair) = pair {
-                files::write(&path(index - 1, "npz"), |file| write_pair_npz(&pair, file))?;
+                files::write_below(self.output(), &path(index - 1, "npz"), |file| {
+                    write_pair_npz(&pair, file)
+                })?;
                 written.pairs += 1;
                 written.grounded += usize::from(pair.ground.is_some());
                 written.without_ego += usize::from(pair.ego.is_none());

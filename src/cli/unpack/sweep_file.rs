@@ -1,27 +1,20 @@
 //! The files of sweeps, and the names of their folders.
 
-use std::fs;
 use std::path::Path;
-
-use anyhow::Context;
 
 use crate::cli::failure::Failure;
 use crate::cli::files;
 use crate::flow::Point;
 use crate::formats::{CloudFormat, PointTimes, write_cloud, write_timed_pcd};
 
-/// Writes a sweep, with the times of its points where they are known. Makes its folder.
+/// Writes a sweep below the folder `output`, with the times of its points where they are known.
 pub(super) fn write_sweep(
-    path: &Path,
+    output: &Path,
+    name: &Path,
     points: &[Point],
     times: Option<&PointTimes>,
 ) -> Result<(), Failure> {
-    if let Some(folder) = path.parent() {
-        fs::create_dir_all(folder)
-            .with_context(|| format!("cannot make {}", folder.display()))
-            .map_err(Failure::internal)?;
-    }
-    files::write(path, |file| match times {
+    files::write_below(output, name, |file| match times {
         None => write_cloud(CloudFormat::Pcd, points, file),
         Some(times) => write_timed_pcd(points, &times.offsets_s, file),
     })

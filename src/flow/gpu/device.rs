@@ -19,6 +19,7 @@ pub(super) struct Device {
     pub(super) batch: Arc<Batch>,
     pub(super) host: Host,
     pub(super) name: String,
+    pub(super) kind: AdapterKind,
     /// Whether the GPU searches clusters.
     pub(super) searches_clusters: bool,
     /// The kernel of the object search.
@@ -47,6 +48,7 @@ impl Device {
                 "{} ({}, {})",
                 adapter.name, adapter.interface, adapter.driver
             ),
+            kind: adapter.kind,
             clusters: Arc::default(),
             units: Arc::default(),
         })

@@ -5,15 +5,26 @@ use std::io::Read;
 
 use super::wire::{KIND, Wire};
 use crate::formats::error::{FormatError, shorten};
-use crate::formats::limits::unfold_limit;
+use crate::formats::limits::{unfold_budget, unfold_limit};
+
+/// What the chunks of a recording have unfolded to so far, bytes.
+#[derive(Default)]
+pub(super) struct Unfolded {
+    packed: u64,
+    unfolded: u64,
+}
 
 /// The records of a chunk.
 ///
 /// # Errors
 /// - `Malformed` if it does not unfold to the size that it declares.
 /// - `Unsupported` for a compression other than none, lz4 and zstd.
-/// - `TooLarge` if it declares more than 32 MiB plus 32 times its own size.
-pub(super) fn unfold(chunk: &[u8]) -> Result<Cow<'_, [u8]>, FormatError> {
+/// - `TooLarge` if all chunks `so_far` and this one declare more than 32 MiB plus 32 times their own
+///   sizes.
+pub(super) fn unfold<'a>(
+    chunk: &'a [u8],
+    so_far: &mut Unfolded,
+) -> Result<Cow<'a, [u8]>, FormatError> {
     let mut wire = Wire::packed(chunk);
     let _times = (wire.u64()?, wire.u64()?);
     let size = wire.u64()?;
@@ -25,11 +36,13 @@ pub(super) fn unfold(chunk: &[u8]) -> Result<Cow<'_, [u8]>, FormatError> {
         .ok()
         .and_then(|length| records.get(..length));
     let records = records.ok_or_else(|| KIND.malformed("a chunk is longer than its record"))?;
-    let limit = unfold_limit(records.len());
-    if size > limit {
+    so_far.packed += records.len() as u64;
+    so_far.unfolded = so_far.unfolded.saturating_add(size);
+    let limit = unfold_budget(so_far.packed).min(unfold_limit(usize::MAX));
+    if size > limit || so_far.unfolded > unfold_budget(so_far.packed) {
         return Err(KIND.too_large(format!(
-            "a chunk of {} bytes unfolds to {size}, {limit} are the most",
-            records.len()
+            "chunks of {} bytes unfold to {}",
+            so_far.packed, so_far.unfolded
         )));
     }
     let unfolded = match compression {

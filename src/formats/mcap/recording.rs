@@ -16,6 +16,9 @@ const SCHEMAS: [&str; 2] = ["sensor_msgs/msg/PointCloud2", "sensor_msgs/PointClo
 /// The most channels and schemas of a recording.
 const MAX_NAMES: usize = 65_536;
 
+/// The most bytes of the name of a schema, a topic or an encoding.
+const MAX_NAME: usize = 4 << 10;
+
 /// A message with a point cloud.
 #[derive(Clone, Copy, Debug)]
 pub struct CloudMessage<'a> {
@@ -52,18 +55,19 @@ struct Channel {
 /// - `Malformed` for a file that is no recording, violates the format, or ends before its end record.
 ///   The messages before that were taken.
 /// - `Unsupported` for a compression that is not known.
-/// - `TooLarge` for a record or a chunk over 1 GiB, and for a chunk that unfolds to more than 32 MiB plus
-///   32 times its size.
+/// - `TooLarge` for a record or a chunk over 1 GiB, for a name over 4 KiB, and for chunks that unfold to more
+///   than 32 MiB plus 32 times their sizes.
 pub fn read_recording<R: Read>(
     recording: R,
     mut take: impl FnMut(&CloudMessage<'_>) -> ControlFlow<()>,
 ) -> Result<(), FormatError> {
     let mut records = Records::open(recording)?;
     let mut known = Known::default();
+    let mut so_far = chunk::Unfolded::default();
     while let Some(record) = records.read_next()? {
         let taken = match record {
             Record::Chunk(chunk) => {
-                let unfolded = chunk::unfold(chunk)?;
+                let unfolded = chunk::unfold(chunk, &mut so_far)?;
                 let mut inner = unfolded.as_ref();
                 let mut taken = ControlFlow::Continue(());
                 while taken.is_continue()
@@ -80,6 +84,16 @@ pub fn read_recording<R: Read>(
         }
     }
     Ok(())
+}
+
+/// The name of a schema, a topic or an encoding.
+fn name<'a>(wire: &mut Wire<'a>) -> Result<&'a str, FormatError> {
+    let name = wire.text()?;
+    if name.len() > MAX_NAME {
+        let length = name.len();
+        return Err(KIND.too_large(format!("a name of {length} bytes, {MAX_NAME} are the most")));
+    }
+    Ok(name)
 }
 
 /// The schemas and channels so far.
@@ -104,13 +118,13 @@ impl Known {
             Record::Schema(body) => {
                 let mut wire = Wire::packed(body);
                 let id = wire.u16()?;
-                let name = wire.text()?;
+                let name = name(&mut wire)?;
                 self.schemas.insert(id, name.to_owned());
             }
             Record::Channel(body) => {
                 let mut wire = Wire::packed(body);
                 let (id, schema) = (wire.u16()?, wire.u16()?);
-                let (topic, encoding) = (wire.text()?, wire.text()?);
+                let (topic, encoding) = (name(&mut wire)?, name(&mut wire)?);
                 let is_cloud = self
                     .schemas
                     .get(&schema)

@@ -228,7 +228,7 @@ impl<W: Write> RecordingWriter<W> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::chunk::unfold;
+    use super::super::chunk::{Unfolded, unfold};
     use super::super::records::{Record, Records, split};
     use super::*;
 
@@ -258,7 +258,7 @@ mod tests {
                 Record::Schema(_) | Record::Channel(_) => described += 1,
                 Record::Message(_) => panic!("a message outside of a chunk"),
                 Record::Chunk(chunk) => {
-                    let chunk = unfold(chunk).expect("records");
+                    let chunk = unfold(chunk, &mut Unfolded::default()).expect("records");
                     let mut rest = chunk.as_ref();
                     while let Some(record) = split(&mut rest).expect("whole records") {
                         if let Record::Message(message) = record {

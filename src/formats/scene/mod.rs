@@ -1,6 +1,7 @@
 //! Scenes of OpenSceneFlow: one HDF5 file with many sweeps, and their truth where it is known.
 
 mod arrays;
+mod filters;
 mod sweeps;
 mod truth;
 

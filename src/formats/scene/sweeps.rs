@@ -4,17 +4,15 @@ use std::io;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
-use hdf5_reader::error::Error;
 use hdf5_reader::group::Group;
-use hdf5_reader::messages::filter_pipeline::FilterDescription;
 use hdf5_reader::storage::RangeRequestStorage;
-use hdf5_reader::{FilterRegistry, Hdf5File, OpenOptions};
+use hdf5_reader::{Hdf5File, OpenOptions};
 
 use super::arrays::{Array, KIND, declared_bytes, malformed};
+use super::filters::filters;
 use crate::flow::Point;
 use crate::formats::error::FormatError;
 use crate::formats::limits::{check_flag, check_value, unfold_limit};
-use crate::formats::lzf;
 use crate::formats::pair::check_count;
 use crate::formats::point_times::{PointTimes, TimesColumn};
 
@@ -39,27 +37,6 @@ pub struct SceneSweep {
     pub times: Option<PointTimes>,
     /// Why the times of the points are not used.
     pub refused_times: Option<String>,
-}
-
-/// The number of the filter LZF, which h5py brings along.
-const LZF: u16 = 32000;
-
-/// What unfolds the chunks of arrays: the filters of HDF5 itself, and LZF. A chunk has at most `limit`
-/// bytes.
-fn filters(limit: usize) -> FilterRegistry {
-    let mut filters = FilterRegistry::new();
-    let unfold = move |filter: &FilterDescription, packed: &[u8], _: usize| {
-        let declared = filter.client_data.get(2).copied().unwrap_or_default();
-        let most = limit.min(packed.len().saturating_mul(lzf::MOST_UNFOLDED));
-        let size = usize::try_from(declared).ok().filter(|&size| size <= most);
-        let size = size.ok_or_else(|| {
-            let packed = packed.len();
-            Error::InvalidData(format!("LZF: {packed} bytes declare {declared}"))
-        })?;
-        lzf::decompress(packed, size).map_err(Error::DecompressionError)
-    };
-    filters.register(LZF, Box::new(unfold));
-    filters
 }
 
 impl Scene {

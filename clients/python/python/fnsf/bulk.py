@@ -12,6 +12,7 @@ on. Without such an engine use the program's `fnsf label`.
 from __future__ import annotations
 
 import os
+import re
 import time
 import uuid
 from collections.abc import Iterator, Mapping
@@ -20,12 +21,28 @@ from typing import Any
 import numpy as np
 
 from . import _native
-from ._files import Sweep
+from ._files import MAX_FILE, Sweep
 from ._flow import flow
 
 COLUMNS = ("key", "source", "target", "outcome", "error", "seconds", "points", "moving")
 """The columns of the report."""
 ENDINGS = ("npz", "feather", "npy", "ply", "pcd", "json")
+
+
+PART = r"[^/\\?#\x00-\x1f\x7f]{1,200}"
+KEY = re.compile(rf"{PART}(/{PART}){{0,19}}")
+"""Parts of up to 200 letters, without what has a meaning in a URI."""
+REFUSED = (_native.InputError, ValueError, FileNotFoundError, NotADirectoryError, IsADirectoryError)
+"""What another try does not mend. Other errors are those of a disk or a network: the engine tries again."""
+# Other schemes, and Azure's other ways to name a server, would send the credentials of this machine there.
+AUTHORITY = {
+    "file": re.compile(""),
+    "s3": re.compile(r"[A-Za-z0-9._-]+"),
+    "gs": re.compile(r"[A-Za-z0-9._-]+"),
+    "abfs": re.compile(r"([A-Za-z0-9-]+@)?[A-Za-z0-9-]+(\.(dfs|blob)\.core\.windows\.net)?"),
+}
+AUTHORITY |= {"gcs": AUTHORITY["gs"], "abfss": AUTHORITY["abfs"]}
+"""What may stand between `://` and the path, by scheme."""
 
 
 class Labeller:
@@ -54,21 +71,21 @@ class Labeller:
         """Labels one pair, unless its label is there. A pair that cannot be labelled is refused, not raised."""
         report: dict[str, Any] = dict.fromkeys(COLUMNS, "")
         report |= {"key": key, "source": source, "target": target, "seconds": 0.0, "points": 0, "moving": 0}
-        path = f"{self._output}/{key}.{self._ending}"
-        if any(part in ("", ".", "..") for part in key.split("/")):
-            return report | {"outcome": "refused", "error": f"the key {key!r} is no name below the output"}
-        if _exists(path):
-            return report | {"outcome": "found"}
+        if not KEY.fullmatch(key) or any(part in (".", "..") for part in key.split("/")):
+            return report | {"outcome": "refused", "error": f"the key {key[:200]!r} is no name below the output"}
         began = time.monotonic()
         try:
+            path = f"{self._output}/{key}.{self._ending}"
+            if _exists(path):
+                return report | {"outcome": "found"}
             first, second = _sweep(source), _sweep(target)
             times = None
             if first.times is not None and second.times is not None:
                 times = (first.times, second.times)
             found = flow(first.points, second.points, times=times, **self._options)
-        except (_native.InputError, FileNotFoundError) as error:
+            written = _put_new(path, found.to_bytes(self._ending))
+        except REFUSED as error:
             return report | {"outcome": "refused", "error": str(error)}
-        written = _put_new(path, found.to_bytes(self._ending))
         return report | {
             "outcome": "labelled" if written else "raced",
             "seconds": time.monotonic() - began,
@@ -81,11 +98,13 @@ def _filesystem(uri: str) -> tuple[Any, str]:
     """The file system of a path or URI, and the path in it."""
     from pyarrow import fs
 
-    if "://" not in uri:
-        uri = os.path.abspath(uri)
-    elif "?" in uri:
-        # It could name another server, which would get the credentials of this one.
-        raise _native.InputError(f"{uri}: a URI of a bucket has no options")
+    scheme, separator, rest = uri.partition("://")
+    if not separator:
+        return fs.LocalFileSystem(), os.path.abspath(uri)
+    authority = AUTHORITY.get(scheme)
+    if authority is None or not authority.fullmatch(rest.split("/")[0]) or set(uri) & set("?#\\"):
+        known = ", ".join(f"{scheme}://" for scheme in AUTHORITY)
+        raise _native.InputError(f"{uri}: a file has a path or a URI of a bucket without options: {known}")
     filesystem, path = fs.FileSystem.from_uri(uri)
     return filesystem, path
 
@@ -98,9 +117,17 @@ def _exists(uri: str) -> bool:
 
 
 def _sweep(uri: str) -> Sweep:
+    from pyarrow import fs
+
     filesystem, path = _filesystem(uri)
+    about = filesystem.get_file_info(path)
+    if about.type == fs.FileType.NotFound:
+        raise FileNotFoundError(f"there is no {uri}")
+    # A pipe may never end.
+    if about.type != fs.FileType.File or about.size > MAX_FILE:
+        raise _native.InputError(f"{uri} is no file of at most {MAX_FILE} bytes")
     with filesystem.open_input_file(path) as file:
-        return Sweep(**_native.read_sweep(file.read(), uri))
+        return Sweep(**_native.read_sweep(file.read(about.size), uri))
 
 
 def _put_new(uri: str, data: bytes) -> bool:
@@ -126,6 +153,8 @@ def _put_new(uri: str, data: bytes) -> bool:
         # A link, unlike a rename, does not replace a file that is there.
         os.link(part, path)
     except FileExistsError:
+        if os.path.isdir(path):
+            raise IsADirectoryError(f"{path} is a folder") from None
         return False
     finally:
         os.unlink(part)

@@ -47,7 +47,7 @@ def write_flows(
     if not name or "/" in name:
         raise _native.InputError(f"{name!r} is no name of an array")
     with h5py.File(scene, "r") as file:
-        stamps = [stamp for stamp in file if stamp.isdecimal() and "lidar" in file[stamp]]
+        stamps = [stamp for stamp in file if stamp.isascii() and stamp.isdigit() and _is_own(file, stamp)]
         found = {stamp: path for stamp in stamps if (path := _label(labels, stamp))}
         for stamp, path in found.items():
             _rows(path, file[stamp]["lidar"])
@@ -63,6 +63,14 @@ def write_flows(
                 del group[name]
             group.create_dataset(name, data=rows).attrs["fnsf"] = True
     return len(found), len(stamps)
+
+
+def _is_own(file: h5py.File, stamp: str) -> bool:
+    """Whether a sweep lies in this file. A link may lead to another one, which would be changed."""
+    if not isinstance(file.get(stamp, getlink=True), h5py.HardLink) or not isinstance(file[stamp], h5py.Group):
+        return False
+    group = file[stamp]
+    return isinstance(group.get("lidar", getlink=True), h5py.HardLink) and group.file == file
 
 
 def _label(labels: str | os.PathLike[str], stamp: str) -> str | None:
