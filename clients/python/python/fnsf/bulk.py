@@ -32,7 +32,14 @@ ENDINGS = ("npz", "feather", "npy", "ply", "pcd", "json")
 PART = r"[^/\\?#\x00-\x1f\x7f]{1,200}"
 KEY = re.compile(rf"{PART}(/{PART}){{0,19}}")
 """Parts of up to 200 letters, without what has a meaning in a URI."""
-REFUSED = (_native.InputError, ValueError, FileNotFoundError, NotADirectoryError, IsADirectoryError)
+REFUSED = (
+    _native.InputError,
+    ValueError,
+    FileExistsError,
+    FileNotFoundError,
+    IsADirectoryError,
+    NotADirectoryError,
+)
 """What another try does not mend. Other errors are those of a disk or a network: the engine tries again."""
 # Other schemes, and Azure's other ways to name a server, would send the credentials of this machine there.
 AUTHORITY = {
