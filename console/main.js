@@ -25,7 +25,7 @@ function pageOf(path) {
   if (first === "jobs" && second) return [jobPage, second];
   if (first === "jobs") return [jobsPage, null];
   if (first === "queue") return [queuePage, null];
-  if (first === "view") return [localPage, null];
+  if (first === "view") return [localPage, second];
   return [tryPage, null];
 }
 

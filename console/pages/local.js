@@ -6,9 +6,9 @@ import { el, fill } from "../dom.js";
 import { openScene } from "../scene.js";
 import { createViewer } from "../viewer/viewer.js";
 
-/** Shows the page. */
-export async function localPage(page, signal) {
-  const scene = await openScene("/view/scene");
+/** Shows the page. The secret is that of the address. */
+export async function localPage(page, signal, secret) {
+  const scene = await openScene(`/view/${secret}/scene`);
   const host = el("div", { class: "viewer whole" });
   fill(page, el("h1", { class: "visually-hidden" }, scene.name), host);
   const viewer = createViewer(host, scene);

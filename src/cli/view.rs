@@ -8,6 +8,7 @@ use bytes::Bytes;
 use clap::Args;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
+use uuid::Uuid;
 
 use super::estimation::{Estimation, check_sequence};
 use super::failure::Failure;
@@ -279,12 +280,14 @@ async fn serve(scene: LocalScene, socket: TcpListener) -> Result<(), Failure> {
     let listener = Listener::on(socket, options).map_err(Failure::internal)?;
     let address = listener.address().map_err(Failure::internal)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(Failure::internal)?;
+    // Other logins of the machine reach the port as well.
+    let secret = Uuid::now_v7().simple().to_string();
     say(format_args!(
-        "look at http://{address}/#/view; Ctrl-C ends it"
+        "look at http://{address}/#/view/{secret} - Ctrl-C ends it"
     ))?;
     let stop = CancellationToken::new();
     tokio::select! {
-        () = listener.serve(view_router(scene), stop) => {}
+        () = listener.serve(view_router(scene, &secret), stop) => {}
         _ = tokio::signal::ctrl_c() => {}
         _ = terminate.recv() => {}
     }

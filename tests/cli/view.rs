@@ -14,6 +14,8 @@ use crate::program::{fnsf, street};
 struct View {
     child: Child,
     address: String,
+    /// The path of the scene, with its secret.
+    root: String,
 }
 
 impl View {
@@ -29,13 +31,14 @@ impl View {
         let mut line = String::new();
         let stdout = child.stdout.take().expect("piped");
         BufReader::new(stdout).read_line(&mut line).expect("a line");
-        let address = line
-            .split("http://")
-            .nth(1)
-            .and_then(|rest| rest.split('/').next())
-            .expect("an address")
-            .to_owned();
-        Self { child, address }
+        let shown = line.split("http://").nth(1).expect("an address");
+        let shown = shown.split(' ').next().expect("an address");
+        let (address, root) = shown.split_once("/#").expect("a page");
+        Self {
+            child,
+            address: address.to_owned(),
+            root: root.to_owned(),
+        }
     }
 
     /// The status and the body of a path. `headers` end with a line break each.
@@ -64,7 +67,7 @@ impl View {
     }
 
     fn scene(&self) -> Value {
-        let (status, body) = self.get("/view/scene", "");
+        let (status, body) = self.get(&format!("{}/scene", self.root), "");
         assert_eq!(status, 200);
         serde_json::from_slice(&body).expect("JSON")
     }
@@ -97,20 +100,27 @@ fn sweeps_are_shown_with_the_flow_that_is_estimated_and_their_tracks() {
     let flow = read_flow(&flow, None).expect("a flow");
     assert_eq!(flow.flow.len(), sent.len());
     assert!(flow.clusters.is_some() && scene["pairs"][1]["ego"].is_array());
-    let (status, tracks) = view.get("/view/tracks", "");
+    let root = &view.root;
+    let (status, tracks) = view.get(&format!("{root}/tracks"), "");
     assert_eq!(status, 200);
     assert!(fnsf::formats::read_tracks(&tracks).is_ok());
     let (_, page) = view.get("/", "");
     assert!(String::from_utf8_lossy(&page).contains("/console/main.js"));
-    for absent in ["/view/sweeps/4", "/view/dense", "/v1/jobs"] {
-        assert_eq!(view.get(absent, "").0, 404, "{absent}");
+    for absent in [
+        format!("{root}/sweeps/4"),
+        format!("{root}/dense"),
+        "/v1/jobs".to_owned(),
+        // Without the secret of the address.
+        "/view/scene".to_owned(),
+        format!("/view/{}/scene", "0".repeat(32)),
+    ] {
+        assert_eq!(view.get(&absent, "").0, 404, "{absent}");
     }
     // Pages of other sites, also those that have rebound a name.
-    assert_eq!(
-        view.get("/view/scene", "Origin: http://site.example\r\n").0,
-        403
-    );
-    assert_eq!(view.get("/view/scene", "Host: site.example\r\n").0, 403);
+    let scene = format!("{root}/scene");
+    for foreign in ["Origin: http://site.example\r\n", "Host: site.example\r\n"] {
+        assert_eq!(view.get(&scene, foreign).0, 403, "{foreign}");
+    }
 }
 
 #[test]
@@ -122,7 +132,7 @@ fn a_given_flow_is_shown_as_it_is_and_one_of_other_sweeps_is_refused() {
         let ended = fnsf(folder.path(), &["flow", &a, &b, "-o", flow]);
         assert_eq!(ended.code, 0, "{}", ended.stderr);
         let view = View::start(folder.path(), &[&a, &b, "--flow", flow]);
-        let (_, shown) = view.get("/view/flows/0", "");
+        let (_, shown) = view.get(&format!("{}/flows/0", view.root), "");
         let shown = read_flow(&shown, None).expect("a flow");
         let given = std::fs::read(folder.path().join(flow)).expect("a file");
         let given = read_flow(&given, None).expect("a flow");

@@ -31,7 +31,10 @@ def generated(server, tmp_path_factory):
     folder = tmp_path_factory.mktemp("generated")
     with urllib.request.urlopen(f"{server}/openapi.json") as answer:
         (folder / "openapi.json").write_bytes(answer.read())
+    # The generator does not know the type of a PCD.
+    (folder / "config.yaml").write_text("content_type_overrides:\n  application/x-pcd: application/octet-stream\n")
     command = [sys.executable, "-m", "openapi_python_client", "generate", "--path", "openapi.json", "--meta", "none"]
+    command += ["--config", "config.yaml"]
     # A warning is a piece that is missing.
     done = subprocess.run([*command, "--fail-on-warning"], cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -61,7 +64,7 @@ def test_a_pair_gets_its_flow_on_one_call(server, generated, drive):
 def test_a_sequence_is_submitted_followed_and_fetched(server, generated, drive):
     client = generated("client").Client(server)
     models, jobs = generated("models"), "api.jobs"
-    options = models.JobOptions(preset=models.PresetChoice("default"), labels=None)
+    options = models.JobOptions(preset=models.PresetChoice("default"), labels=models.Labels.from_dict({"drive": "7"}))
     body = models.SequenceBody(options=options, sweep=files(generated, drive))
     job = generated(f"{jobs}.submit_sequence").sync(client=client, body=body)
     assert isinstance(job, models.JobView)

@@ -44,15 +44,31 @@ pub struct LocalPair {
     pub flow: Bytes,
 }
 
-/// The console with one scene, at `/#/view`. Pages of other sites are refused.
-pub fn view_router(scene: LocalScene) -> Router {
+/// What the routes share.
+#[derive(Clone)]
+struct Shown {
+    scene: Arc<LocalScene>,
+    /// The path of the scene, with its secret.
+    root: Arc<str>,
+}
+
+/// The console with one scene, at `/#/view/SECRET`: whoever has a login on the machine can connect, and
+/// only who knows the address sees the scene. Pages of other sites are refused.
+pub fn view_router(scene: LocalScene, secret: &str) -> Router {
+    let root = format!("/view/{secret}");
+    let shown = Shown {
+        scene: Arc::new(scene),
+        root: root.as_str().into(),
+    };
+    let routes = Router::new()
+        .route("/scene", get(describe))
+        .route("/sweeps/{index}", get(sweep))
+        .route("/flows/{index}", get(flow))
+        .route("/tracks", get(tracks))
+        .route("/dense", get(dense))
+        .with_state(shown);
     Router::new()
-        .route("/view/scene", get(describe))
-        .route("/view/sweeps/{index}", get(sweep))
-        .route("/view/flows/{index}", get(flow))
-        .route("/view/tracks", get(tracks))
-        .route("/view/dense", get(dense))
-        .with_state(Arc::new(scene))
+        .nest(&root, routes)
         .merge(console::router())
         .fallback(|| async { ApiError::NoRoute })
         .layer(middleware::from_fn(check_origin))
@@ -66,25 +82,25 @@ async fn check_origin(request: Request, next: Next) -> Response {
     }
 }
 
-async fn describe(State(scene): State<Arc<LocalScene>>) -> Json<Scene> {
+async fn describe(State(Shown { scene, root }): State<Shown>) -> Json<Scene> {
     let pair = |(index, pair): (usize, &LocalPair)| ScenePair {
         source: pair.source,
         target: pair.source + 1,
         state: JobState::Succeeded,
         dt_s: Some(pair.dt_s),
         ego: pair.ego,
-        flow: format!("/view/flows/{index}"),
+        flow: format!("{root}/flows/{index}"),
     };
     let sweeps = 0..scene.sweeps.len();
     Json(Scene {
         name: scene.name.clone(),
         sweeps: sweeps
-            .map(|index| format!("/view/sweeps/{index}"))
+            .map(|index| format!("{root}/sweeps/{index}"))
             .collect(),
         sweep_names: scene.sweeps.iter().map(|(name, _)| name.clone()).collect(),
         pairs: scene.pairs.iter().enumerate().map(pair).collect(),
-        tracks: scene.tracks.as_ref().map(|_| "/view/tracks".to_owned()),
-        dense: scene.dense.as_ref().map(|_| "/view/dense".to_owned()),
+        tracks: scene.tracks.as_ref().map(|_| format!("{root}/tracks")),
+        dense: scene.dense.as_ref().map(|_| format!("{root}/dense")),
     })
 }
 
@@ -96,19 +112,19 @@ fn found(bytes: Option<&Bytes>, media_type: &'static str) -> Response {
     }
 }
 
-async fn sweep(State(scene): State<Arc<LocalScene>>, Path(index): Path<usize>) -> Response {
+async fn sweep(State(Shown { scene, .. }): State<Shown>, Path(index): Path<usize>) -> Response {
     found(scene.sweeps.get(index).map(|(_, bytes)| bytes), PACKED)
 }
 
-async fn flow(State(scene): State<Arc<LocalScene>>, Path(index): Path<usize>) -> Response {
+async fn flow(State(Shown { scene, .. }): State<Shown>, Path(index): Path<usize>) -> Response {
     let flow = scene.pairs.get(index).map(|pair| &pair.flow);
     found(flow, "application/x-npz")
 }
 
-async fn tracks(State(scene): State<Arc<LocalScene>>) -> Response {
+async fn tracks(State(Shown { scene, .. }): State<Shown>) -> Response {
     found(scene.tracks.as_ref(), "application/json")
 }
 
-async fn dense(State(scene): State<Arc<LocalScene>>) -> Response {
+async fn dense(State(Shown { scene, .. }): State<Shown>) -> Response {
     found(scene.dense.as_ref(), "application/x-npz")
 }
