@@ -108,7 +108,7 @@ impl Backend for Gpu {
     }
 
     fn searches_clusters(&self) -> bool {
-        self.0.searches_clusters
+        self.0.searches_clusters && self.0.has_cluster_kernel()
     }
 
     fn search_clusters(

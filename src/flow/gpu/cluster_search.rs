@@ -87,20 +87,20 @@ impl Device {
         Ok(found)
     }
 
+    /// Whether the GPU can run the kernel that searches clusters.
+    pub(super) fn has_cluster_kernel(&self) -> bool {
+        let limits = self.context.device.limits();
+        limits.max_compute_invocations_per_workgroup >= GROUP
+            && limits.max_compute_workgroup_size_x >= GROUP
+            && limits.max_compute_workgroup_storage_size >= GROUP_BYTES
+    }
+
     /// The kernel, which is built at the first search.
     fn cluster_pipeline(&self) -> Result<&wgpu::ComputePipeline, BackendError> {
         let pipeline = self.clusters.get_or_init(|| built(&self.context));
         self.context.watchdog.check()?;
         Ok(pipeline)
     }
-}
-
-/// Whether a GPU can run the kernel that searches clusters.
-pub(super) fn has_cluster_kernel(context: &Context) -> bool {
-    let limits = context.device.limits();
-    limits.max_compute_invocations_per_workgroup >= GROUP
-        && limits.max_compute_workgroup_size_x >= GROUP
-        && limits.max_compute_workgroup_storage_size >= GROUP_BYTES
 }
 
 /// Bytes of so many records.

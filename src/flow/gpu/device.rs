@@ -4,7 +4,6 @@ use std::sync::{Arc, OnceLock};
 
 use super::adapter::{Adapter, AdapterKind};
 use super::batcher::Batch;
-use super::cluster_search::has_cluster_kernel;
 use super::context::Context;
 use super::half::Units;
 use super::memory::GpuOptions;
@@ -20,7 +19,7 @@ pub(super) struct Device {
     pub(super) host: Host,
     pub(super) name: String,
     pub(super) kind: AdapterKind,
-    /// Whether the GPU searches clusters.
+    /// Whether the GPU searches clusters, if it can run their kernel.
     pub(super) searches_clusters: bool,
     /// The kernel of the object search.
     pub(super) clusters: Arc<OnceLock<wgpu::ComputePipeline>>,
@@ -39,8 +38,7 @@ impl Device {
         let lanes = context.budget.lanes as usize;
         Ok(Self {
             searches_clusters: adapter.kind != AdapterKind::Software
-                && threads <= options.cluster_threads.saturating_mul(lanes)
-                && has_cluster_kernel(&context),
+                && threads <= options.cluster_threads.saturating_mul(lanes),
             context: Arc::new(context),
             batch: Arc::default(),
             host,
